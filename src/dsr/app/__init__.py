@@ -1,0 +1,1 @@
+"""Configuration and commands: the only part that knows Hydra."""

@@ -1,0 +1,113 @@
+"""From a configuration group to the object that it describes.
+
+A group's file names its class or function as ``target``; the other keys are the arguments. So the schema of a group is
+the signature of its target, and a new method needs a module and a file, nothing else.
+"""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+import types
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
+
+import torch
+
+from dsr.app.schema import ConfigError
+
+_MISSING = "???"
+_ABOUT = ("name", "label", "target", "weights_file", "weights_source")
+
+
+def build(group: str, node: Mapping[str, Any], given: Mapping[str, Any] | None = None) -> Any:
+    """Return what a configuration group describes.
+
+    Args:
+        group: its name, for messages.
+        node: its content: ``name``, ``target``, perhaps ``label``, and arguments of the target.
+        given: values of the whole run (scale, weights, device, ...); the target gets those that its signature names.
+
+    Raises:
+        ConfigError: a key is unknown, missing or of another type, or the target refuses a value.
+
+    """
+    target = _load(group, node)
+    parameters = inspect.signature(target).parameters
+    hints = get_type_hints(target.__init__ if inspect.isclass(target) else target)
+    given = {key: value for key, value in (given or {}).items() if key in parameters}
+    arguments = {key: value for key, value in node.items() if key not in _ABOUT}
+    own = [key for key in parameters if key not in given]
+    for key, value in arguments.items():
+        if key not in own:
+            known = ", ".join(own) or "none"
+            raise ConfigError(f"{group}.{key}: unknown key; {group}={node.get('name')} takes {known}")
+        if value == _MISSING:
+            raise ConfigError(f"{group}.{key}: {group}={node.get('name')} needs it: {group}.{key}=...")
+        if key in hints and not _fits(value, hints[key]):
+            raise ConfigError(f"{group}.{key}: expected {_describe(hints[key])}, got {value!r}")
+    try:
+        return target(**arguments, **given)
+    except (ValueError, OSError) as error:
+        raise ConfigError(str(error)) from error
+
+
+def takes(group: str, node: Mapping[str, Any], key: str) -> bool:
+    """Return whether the target of a group has a parameter ``key``."""
+    return key in inspect.signature(_load(group, node)).parameters
+
+
+def pick_device(name: str) -> torch.device:
+    """Return the device of that name; ``auto`` is the first GPU where there is one, else the CPU.
+
+    Raises:
+        ConfigError: there is no such device here.
+
+    """
+    if name == "auto":
+        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    try:
+        device = torch.device(name)
+        torch.empty(0, device=device)
+    except (RuntimeError, AssertionError, NotImplementedError) as error:  # each backend has its own way to refuse
+        raise ConfigError(f"device: expected auto, cpu or a device of this machine, got {name!r}") from error
+    return device
+
+
+def _load(group: str, node: Mapping[str, Any]) -> Any:
+    """Return the class or function that a group names."""
+    path = node.get("target")
+    if not isinstance(path, str) or "." not in path:
+        raise ConfigError(f"{group}.target: expected module.name of a class or function, got {path!r}")
+    module, _, name = path.rpartition(".")
+    try:
+        return getattr(importlib.import_module(module), name)
+    except (ImportError, AttributeError) as error:
+        raise ConfigError(f"{group}.target: cannot import {path!r} ({error})") from error
+
+
+def _fits(value: Any, hint: Any) -> bool:
+    """Return whether a configuration value is of an annotated type."""
+    origin = get_origin(hint)
+    if origin in (Union, types.UnionType):
+        return any(_fits(value, choice) for choice in get_args(hint))
+    if origin is Literal:
+        return value in get_args(hint)
+    if origin is not None and issubclass(origin, Sequence):
+        return isinstance(value, list) and all(_fits(item, get_args(hint)[0]) for item in value)
+    accepted: Any = {float: (int, float), Path: str}.get(hint, hint)
+    return isinstance(value, accepted) and (hint is bool or not isinstance(value, bool))
+
+
+def _describe(hint: Any) -> str:
+    """Return a type for a reader."""
+    origin = get_origin(hint)
+    if origin in (Union, types.UnionType):
+        return " or ".join(_describe(choice) for choice in get_args(hint))
+    if origin is Literal:
+        return "one of " + ", ".join(map(str, get_args(hint)))
+    if origin is not None and issubclass(origin, Sequence):
+        return f"a list of {_describe(get_args(hint)[0])}"
+    names = {float: "a number", int: "a whole number", str: "text", bool: "true or false", type(None): "null"}
+    return names.get(hint, getattr(hint, "__name__", str(hint)))

@@ -1,0 +1,183 @@
+"""The command behind ``eval.py``."""
+
+from __future__ import annotations
+
+import functools
+import random
+import sys
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import torch
+from omegaconf import DictConfig, OmegaConf
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+from dsr.app import rundir
+from dsr.app.build import build, pick_device, takes
+from dsr.app.schema import ConfigError, EvalConfig
+from dsr.evaluation import Outcome, StalePredictionError, Study, one_line, predict, score
+from dsr.quality.lpips import LPIPS, TRUNK_URL, load_lpips
+from dsr.quality.scores import catalogue
+from dsr.report.pictures import save_picture
+from dsr.report.tables import score_table
+from dsr.sample import DepthSample
+
+_LOG_WIDTH = 110
+"""Columns of the table where the output is not a terminal."""
+
+
+def evaluate(config: DictConfig) -> pd.DataFrame:
+    """Evaluate one method on one data set: write predictions, scores and pictures, print a table.
+
+    Args:
+        config: composed from ``conf/eval.yaml``.
+
+    Returns:
+        The content of ``scores.csv``.
+
+    Raises:
+        ConfigError: the configuration cannot be run, or a scene failed (the others' results are written).
+
+    """
+    settings = _settings(config)
+    plain: dict[str, Any] = OmegaConf.to_container(config, resolve=True)  # type: ignore[assignment]
+    console = Console()
+    if not console.is_terminal:
+        console = Console(width=_LOG_WIDTH)
+    device = pick_device(settings.device)
+    study, identity = _study(settings, plain, device)
+    folder = Path(settings.output_dir or rundir.default_directory("eval", plain, identity))
+    rundir.claim(folder, plain, identity)
+    _seed(settings.seed)
+    try:
+        outcome = predict(study, folder, functools.partial(_progress, console), overwrite=settings.overwrite)
+    except StalePredictionError as error:
+        raise ConfigError(str(error)) from error
+    network = _lpips(settings.metrics.lpips_trunk) if settings.metrics.lpips else None
+    metrics = catalogue(None if network is None else network.to(device))
+    label = str(settings.method.get("label", study.method_name))
+    illustrate = functools.partial(_illustrate, folder, label)
+    scores = score(study, folder, metrics, outcome, functools.partial(_progress, console), illustrate)
+    _report(console, folder, scores, label, outcome)
+    if outcome.failures:
+        count = f"{len(outcome.failures)} of {len(study.source.scenes())} scenes failed"
+        raise ConfigError(f"{count}: {', '.join(outcome.failures)}; the others are in {folder}")
+    return scores
+
+
+def _settings(config: DictConfig) -> EvalConfig:
+    """Return the checked configuration as plain Python."""
+    settings = OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(EvalConfig), config))
+    if not isinstance(settings, EvalConfig):
+        raise ConfigError(f"expected the configuration of eval.py, got {type(settings).__name__}")
+    settings.check()
+    return settings
+
+
+def _study(settings: EvalConfig, plain: Mapping[str, Any], device: torch.device) -> tuple[Study, dict[str, Any]]:
+    """Build what the configuration describes, and what identifies its predictions."""
+    source = build("dataset", settings.dataset)
+    downsampling = build("downsampling", settings.downsampling)
+    weights = _weights(settings)
+    given = {
+        "scale": settings.scale,
+        "weights": weights,
+        "precision": settings.precision,
+        "device": device,
+        "seed": settings.seed,
+    }
+    method = build("method", settings.method, given)
+    identity = rundir.identity_of(plain, None if weights is None else rundir.file_hash(weights), device)
+    names = (str(settings.downsampling["name"]), str(settings.method["name"]))
+    study = Study(source, downsampling, names[0], settings.scale, method, names[1], settings.seed, identity, device)
+    return study, identity
+
+
+def _weights(settings: EvalConfig) -> Path | None:
+    """Return the file of weights for the method; None for a method that has no use for one."""
+    name = settings.method["name"]
+    given = None if settings.weights is None else Path(settings.weights).expanduser()
+    if not takes("method", settings.method, "weights"):
+        if given is not None:
+            print(f"note: method={name} has no weights; weights={given} is not used", file=sys.stderr)  # noqa: T201
+        return None
+    file = settings.method.get("weights_file")
+    if given is None:
+        source = settings.method.get("weights_source")
+        raise ConfigError(f"weights: method={name} needs weights=FILE, or a directory with {file} (from {source})")
+    if given.is_dir() and file is not None:
+        given = given / str(file)
+    if not given.is_file():
+        raise ConfigError(f"weights: expected a file of weights for method={name}, got {given} (no such file)")
+    return given
+
+
+def _seed(seed: int) -> None:
+    """Seed every global generator; what dsr itself draws comes from explicit ones."""
+    random.seed(seed)
+    np.random.seed(seed % 2**32)  # noqa: NPY002 - the legacy generator, for libraries that use it
+    torch.manual_seed(seed)
+
+
+@functools.cache
+def _lpips(trunk: str | None) -> LPIPS | None:
+    """Return the LPIPS network; without a trunk, None and one line that says what to do."""
+    try:
+        return load_lpips(None if trunk is None else Path(trunk).expanduser())
+    except OSError as error:
+        if trunk is not None:
+            raise ConfigError(str(error)) from error
+        print(  # noqa: T201
+            f"LPIPS_v is left out: AlexNet's weights {one_line(error)}; "
+            f"get {TRUNK_URL} and set metrics.lpips_trunk=FILE or $DSR_LPIPS_TRUNK",
+            file=sys.stderr,
+        )
+        return None
+    except ValueError as error:
+        raise ConfigError(f"metrics.lpips_trunk: {error}") from error
+
+
+def _progress(console: Console, items: Sequence[str], description: str) -> Iterable[str]:
+    """Show a bar with the time left while the items are worked on."""
+    columns = (
+        TextColumn("{task.description:<8}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TextColumn("left"),
+        TimeRemainingColumn(),
+        TextColumn("{task.fields[item]}"),
+    )
+    with Progress(*columns, console=console, disable=not console.is_terminal) as progress:
+        task = progress.add_task(description, total=len(items), item="")
+        for item in items:
+            progress.update(task, item=item)
+            yield item
+            progress.advance(task)
+        progress.update(task, item="")
+
+
+def _illustrate(
+    folder: Path, label: str, sample: DepthSample, depth: torch.Tensor, scores: Mapping[str, float]
+) -> None:
+    save_picture(folder / "pictures" / f"{sample.scene}.png", sample, depth, scores, label)
+
+
+def _report(console: Console, folder: Path, scores: pd.DataFrame, label: str, outcome: Outcome) -> None:
+    """Print the table, and what a reader should know."""
+    if not scores.empty:
+        console.print(score_table(scores, label))
+    for scene, notes in outcome.notes.items():
+        console.print(f"note: {scene}: {'; '.join(notes)}", highlight=False, soft_wrap=True)
+    if outcome.unscored:
+        scenes = ", ".join(outcome.unscored)
+        console.print(f"note: no truth to score against: {scenes}", highlight=False, soft_wrap=True)
+    if outcome.reused:
+        console.print(f"predictions re-used: {len(outcome.reused)} (overwrite=true makes them anew)", highlight=False)
+    console.print(f"results: {folder}", highlight=False, soft_wrap=True)
+    for message in outcome.failures.values():
+        print(f"error: {message}", file=sys.stderr)  # noqa: T201

@@ -1,0 +1,126 @@
+"""The directory of a run: named by its configuration, never another run's, never silently overwritten."""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import importlib.metadata
+import json
+import platform
+import subprocess
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from omegaconf import OmegaConf
+
+import dsr
+from dsr.app.schema import ConfigError
+from dsr.atomic import write_text
+
+_PACKAGES = (
+    "dsr", "hydra-core", "lightning", "numpy", "omegaconf", "opencv-python-headless",
+    "pandas", "scikit-image", "scipy", "torch", "torchmetrics",
+)  # fmt: skip
+_NOT_IDENTITY = ("output_dir", "overwrite", "metrics", "weights")  # of the weights, the content counts
+_PREDICTING_CODE = ("sample.py", "degrade.py", "geometry", "methods", "data")
+
+
+def identity_of(config: Mapping[str, Any], weights_hash: str | None, device: torch.device) -> dict[str, Any]:
+    """Return all that a run's predictions depend on, as plain values: settings, weights, kind of device, code."""
+    kept = {key: value for key, value in config.items() if key not in _NOT_IDENTITY}
+    return {**kept, "device": device.type, "weights_sha256": weights_hash, "code": code_hash()}
+
+
+def default_directory(kind: str, config: Mapping[str, Any], identity: Mapping[str, Any]) -> Path:
+    """Return outputs/KIND/DATASET_DOWNSAMPLING_xSCALE_METHOD_HASH; the same configuration leads to the same one."""
+    digest = hashlib.sha256(json.dumps(identity, sort_keys=True).encode()).hexdigest()[:8]
+    names = (config["dataset"]["name"], config["downsampling"]["name"], f"x{config['scale']}", config["method"]["name"])
+    return Path("outputs") / kind / "_".join((*names, digest))
+
+
+def claim(folder: Path, config: Mapping[str, Any], identity: Mapping[str, Any]) -> None:
+    """Make ``folder`` the directory of this run, with its ``config.yaml`` and ``versions.json``.
+
+    Raises:
+        ConfigError: something else is there already and ``overwrite`` is not set.
+
+    """
+    record = folder / "versions.json"
+    if folder.exists() and not folder.is_dir():
+        raise ConfigError(f"output_dir: expected a directory, {folder} is a file")
+    if folder.is_dir() and any(folder.iterdir()) and not config["overwrite"]:
+        try:
+            before = json.loads(record.read_text(encoding="utf-8"))["identity"]
+        except (OSError, ValueError, KeyError, TypeError):
+            raise ConfigError(
+                f"output_dir: {folder} holds files of something else; another output_dir keeps them"
+            ) from None
+        changed = _changes(before, json.loads(json.dumps(identity)))
+        if changed:
+            raise ConfigError(
+                f"output_dir: {folder} holds a run with another {', '.join(changed)}; "
+                "another output_dir keeps it, overwrite=true replaces it"
+            )
+    write_text(folder / "config.yaml", OmegaConf.to_yaml(OmegaConf.create(dict(config))))
+    write_text(record, json.dumps({**versions(), "identity": dict(identity)}, indent=1) + "\n")
+
+
+def versions() -> dict[str, Any]:
+    """Return the versions of packages, Python and this project, and the accelerator."""
+    packages = {}
+    for name in _PACKAGES:
+        try:
+            packages[name] = importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:
+            packages[name] = "not installed"
+    accelerator = torch.cuda.get_device_name() if torch.cuda.is_available() else None
+    return {
+        "packages": packages,
+        "python": platform.python_version(),
+        "platform": platform.platform(),
+        "git_commit": _git("rev-parse", "HEAD"),
+        "git_dirty": bool(_git("status", "--porcelain", "--untracked-files=no")),
+        "accelerator": accelerator,
+        "cpu_threads": torch.get_num_threads(),
+    }
+
+
+@functools.cache
+def code_hash() -> str:
+    """Return a hash of the code that makes predictions, so that those of older code are not taken for new ones."""
+    package = Path(dsr.__file__).parent
+    digest = hashlib.sha256()
+    for name in _PREDICTING_CODE:
+        path = package / name
+        for file in [path] if path.is_file() else sorted(path.rglob("*.py")):
+            digest.update(file.relative_to(package).as_posix().encode() + b"\0" + file.read_bytes())
+    return digest.hexdigest()[:16]
+
+
+def file_hash(path: Path) -> str:
+    """Return the SHA-256 of a file."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def _changes(before: Mapping[str, Any], now: Mapping[str, Any], prefix: str = "") -> list[str]:
+    """Return the keys, dotted, whose values differ."""
+    changed = []
+    for key in sorted(before.keys() | now.keys()):
+        old, new = before.get(key), now.get(key)
+        if isinstance(old, dict) and isinstance(new, dict):
+            changed += _changes(old, new, f"{prefix}{key}.")
+        elif old != new:
+            changed.append(f"{prefix}{key}")
+    return changed
+
+
+def _git(*arguments: str) -> str | None:
+    """Return what git says of the checkout that this package runs from; None outside of one."""
+    command = ["git", "-C", str(Path(dsr.__file__).parent), *arguments]
+    try:
+        return subprocess.run(command, capture_output=True, text=True, check=True, timeout=10).stdout.strip()  # noqa: S603
+    except (OSError, subprocess.SubprocessError):
+        return None

@@ -1,0 +1,1 @@
+"""Data sets: each module reads one and yields DepthSamples."""

@@ -1,0 +1,49 @@
+"""What every data set is."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Protocol
+
+from dsr.sample import Scene
+
+
+class SceneSource(Protocol):
+    """A data set: named scenes that are loaded one at a time.
+
+    Attributes:
+        name: as in ``scores.csv``.
+
+    """
+
+    name: str
+
+    def scenes(self) -> list[str]:
+        """Return the names of the scenes, in order."""
+        ...
+
+    def load(self, scene: str) -> Scene:
+        """Return one scene.
+
+        Raises:
+            ValueError: what is on disk is not what it should be; the message names the file.
+
+        """
+        ...
+
+    def fingerprint(self, scene: str) -> str:
+        """Return a text that changes when the scene's content does."""
+        ...
+
+
+def chosen(available: Sequence[str], wanted: Sequence[str] | None) -> list[str]:
+    """Return the scenes to use: those wanted, or all.
+
+    Raises:
+        ValueError: a wanted scene is not available.
+
+    """
+    for name in wanted or ():
+        if name not in available:
+            raise ValueError(f"dataset.scenes: {name!r} is not there; expected some of {', '.join(available)}")
+    return list(available) if wanted is None else list(wanted)

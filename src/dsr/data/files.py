@@ -1,0 +1,183 @@
+"""Reading pictures, range maps and cameras from files: whatever is wrong is one line that names the file."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import math
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from dsr.geometry.camera import RANGE_TYPES, Camera, RangeType
+
+MAP_SUFFIXES = (".npy", ".png", ".tiff", ".tif", ".pfm")
+_METRES = {"m": 1.0, "mm": 1e-3}
+_NUMBERS = ("width", "height", "fx", "fy", "cx", "cy")
+_OPTIONAL = ("range_type", "baseline", "baseline_unit", "doffs", "depth_unit", "hole_value")
+
+
+def read_rgb(path: Path) -> np.ndarray:
+    """Return a picture as uint8 RGB, (H, W, 3).
+
+    Raises:
+        ValueError: it is missing, damaged or no picture.
+
+    """
+    picture = _decode(path, cv2.IMREAD_COLOR)
+    return cv2.cvtColor(picture, cv2.COLOR_BGR2RGB)
+
+
+def read_map(path: Path) -> np.ndarray:
+    """Return a one-channel map of floats, 16- or 32-bit whole numbers as float64, (H, W).
+
+    Raises:
+        ValueError: it is missing, damaged, of another shape, or has 8-bit values (too coarse for a surface).
+
+    """
+    values = _load_npy(path) if path.suffix.lower() == ".npy" else _decode(path, cv2.IMREAD_UNCHANGED)
+    if values.ndim != 2:
+        raise ValueError(f"{path}: expected one channel (height x width), got shape {values.shape}")
+    if values.dtype.kind not in "fiu" or (values.dtype.kind in "iu" and values.dtype.itemsize == 1):
+        raise ValueError(f"{path}: expected 16-bit or floating point values, got {values.dtype} (too coarse for depth)")
+    return values.astype(np.float64)
+
+
+def read_mask(path: Path) -> np.ndarray:
+    """Return a mask, (H, W) bool: True where the picture is not 0.
+
+    Raises:
+        ValueError: it is missing or damaged.
+
+    """
+    return _decode(path, cv2.IMREAD_GRAYSCALE) > 0
+
+
+@dataclass(frozen=True)
+class CameraFile:
+    """What a ``camera.json`` says.
+
+    Args:
+        camera: in pixels and metres.
+        range_type: how the maps beside it count; None where it does not say.
+        depth_unit: metres per value in depth files; None where it does not say.
+        hole_value: the value that stands for a hole in files that cannot hold NaN; None for none.
+
+    """
+
+    camera: Camera
+    range_type: RangeType | None
+    depth_unit: float | None
+    hole_value: float | None
+
+
+def read_camera(path: Path) -> CameraFile:
+    """Return the content of a ``camera.json``.
+
+    Raises:
+        ValueError: it is missing or damaged, or a key is missing, unknown or out of range.
+
+    """
+    if not path.is_file():
+        raise ValueError(f"{path}: expected a camera file, there is none")
+    try:
+        entries = json.loads(path.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise ValueError(f"{path}: expected JSON, got: {error}") from error
+    if not isinstance(entries, dict):
+        raise ValueError(f"{path}: expected a JSON object, got {type(entries).__name__}")
+    for key in entries:
+        if key not in (*_NUMBERS, *_OPTIONAL):
+            raise ValueError(f"{path}: {key}: unknown key; expected {', '.join((*_NUMBERS, *_OPTIONAL))}")
+    numbers = {key: _number(path, entries, key) for key in _NUMBERS}
+    range_type = entries.get("range_type")
+    if range_type is not None and range_type not in RANGE_TYPES:
+        raise ValueError(f"{path}: range_type: expected one of {', '.join(RANGE_TYPES)}, got {range_type!r}")
+    baseline = None
+    if entries.get("baseline") is not None:
+        baseline = _number(path, entries, "baseline") * _unit(path, entries, "baseline_unit", numeric=False)
+    try:
+        camera = Camera(
+            width=_whole(numbers.pop("width")),
+            height=_whole(numbers.pop("height")),
+            **numbers,
+            baseline=baseline,
+            doffs=_number(path, entries, "doffs") if "doffs" in entries else 0.0,
+        )
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
+    return CameraFile(
+        camera,
+        range_type,
+        _unit(path, entries, "depth_unit", numeric=True) if "depth_unit" in entries else None,
+        _number(path, entries, "hole_value") if "hole_value" in entries else None,
+    )
+
+
+def _number(path: Path, entries: dict[str, Any], key: str) -> float:
+    """Return a finite number, or say what is there instead."""
+    value = entries.get(key)
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
+        came = repr(value) if key in entries else "nothing"
+        raise ValueError(f"{path}: {key}: expected a number, got {came}")
+    return float(value)
+
+
+def _whole(value: float) -> int:
+    """Return a whole number as int."""
+    if not value.is_integer():
+        raise ValueError(f"camera size: expected whole numbers of pixels, got {value:g}")
+    return int(value)
+
+
+def _unit(path: Path, entries: dict[str, Any], key: str, *, numeric: bool) -> float:
+    """Return metres per unit of the unit that a key names; metres where the key is missing."""
+    value = entries.get(key, "m")
+    if isinstance(value, str) and value in _METRES:
+        return _METRES[value]
+    if numeric and isinstance(value, (int, float)) and not isinstance(value, bool) and 0 < value < math.inf:
+        return float(value)
+    choices = "m, mm" + (" or a positive number of metres per value" if numeric else "")
+    raise ValueError(f"{path}: {key}: expected {choices}, got {value!r}")
+
+
+def _load_npy(path: Path) -> np.ndarray:
+    if not path.is_file():
+        raise ValueError(f"{path}: expected a file, there is none")
+    try:
+        return np.load(path, allow_pickle=False)
+    except (ValueError, OSError, EOFError) as error:
+        raise ValueError(f"{path}: expected a NumPy array, got a damaged or foreign file ({error})") from error
+
+
+def _decode(path: Path, flags: int) -> np.ndarray:
+    """Return the pixels of a picture file."""
+    if not path.is_file():
+        raise ValueError(f"{path}: expected a picture, there is none")
+    content = path.read_bytes()
+    try:
+        with _quiet_stderr():
+            pixels = cv2.imdecode(np.frombuffer(content, np.uint8), flags) if content else None
+    except cv2.error:
+        pixels = None
+    if pixels is None:
+        raise ValueError(f"{path}: expected a picture, got a damaged or foreign file of {len(content)} bytes")
+    return pixels
+
+
+@contextlib.contextmanager
+def _quiet_stderr() -> Iterator[None]:
+    """Keep the decoders' own messages (libpng, OpenCV) off the terminal: our one line says it all."""
+    kept = os.dup(2)
+    with open(os.devnull, "wb") as nowhere:  # noqa: PTH123 - a device
+        os.dup2(nowhere.fileno(), 2)
+    try:
+        yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)

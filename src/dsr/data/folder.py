@@ -1,0 +1,168 @@
+"""``dataset=folder``: one folder a scene.
+
+    DIR/SCENE/rgb.png (or .jpg, .jpeg)
+              camera.json
+              depth.* or disparity.*         fine depth; .npy, .png (16 bit), .tiff, .pfm
+              mask.png                       optional; 0 where the fine depth is unknown
+              depth_lr4.*, disparity_lr4.*   optional; a measured coarse map, here at x4, disparity in its own pixels
+
+Depth and disparity follow ``camera.json``; see :func:`dsr.data.files.read_camera` for its keys.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from dsr.data.base import chosen
+from dsr.data.files import MAP_SUFFIXES, CameraFile, read_camera, read_map, read_mask, read_rgb
+from dsr.geometry.camera import Camera, RangeType, from_range
+from dsr.sample import Scene
+
+_RGB_NAMES = ("rgb.png", "rgb.jpg", "rgb.jpeg")
+_QUANTITIES = ("depth", "disparity")
+_COARSE = re.compile(r"(depth|disparity)_lr(\d+)")
+
+
+class Folder:
+    """The scenes of a directory.
+
+    Args:
+        root: the directory.
+        scenes: names of the ones to use; None for all.
+        name: as in ``scores.csv``.
+
+    Raises:
+        ValueError: the directory is missing or has no scene.
+
+    """
+
+    def __init__(self, root: str, scenes: Sequence[str] | None = None, name: str = "folder") -> None:
+        self.name = name
+        self._root = Path(root).expanduser()
+        if not self._root.is_dir():
+            raise ValueError(f"dataset.root: expected a directory of scenes, got {root} (no such directory)")
+        found = sorted(path.name for path in self._root.iterdir() if path.is_dir() and not path.name.startswith("."))
+        if not found:
+            raise ValueError(f"dataset.root: expected a folder per scene in {root}, there is none")
+        self._scenes = chosen(found, scenes)
+
+    def scenes(self) -> list[str]:
+        """Return the names of the scenes, in order."""
+        return list(self._scenes)
+
+    def load(self, scene: str) -> Scene:
+        """Return one scene; see :class:`dsr.data.base.SceneSource`."""
+        return load_scene(self._root / scene, self.name)
+
+    def fingerprint(self, scene: str) -> str:
+        """Return the SHA-256 of the scene's files."""
+        digest = hashlib.sha256()
+        for path in sorted(path for path in (self._root / scene).iterdir() if path.is_file()):
+            digest.update(path.name.encode() + b"\0" + path.read_bytes())
+        return digest.hexdigest()
+
+
+def load_scene(folder: Path, dataset: str) -> Scene:
+    """Return the scene in ``folder``.
+
+    Raises:
+        ValueError: a file is missing, damaged, or does not fit the others; the message names it.
+
+    """
+    description = read_camera(folder / "camera.json")
+    camera = description.camera
+    rgb_path = _first(folder, _RGB_NAMES)
+    rgb = read_rgb(rgb_path)
+    _expect_size(rgb_path, rgb.shape[:2], (camera.height, camera.width))
+    measured = {}
+    for path in sorted(folder.iterdir()):
+        match = _COARSE.fullmatch(path.stem)
+        if match and path.suffix.lower() in MAP_SUFFIXES:
+            factor = int(match[2])
+            size = (camera.width // max(factor, 1), camera.height // max(factor, 1))
+            if factor < 1 or not all(size):
+                raise ValueError(f"{path}: expected a factor that the {camera.height} x {camera.width} photo allows")
+            measured[factor] = _read_depth(path, match[1], description, camera.rescale(*size))
+    fine = _find_fine(folder)
+    depth = None if fine is None else _read_depth(fine, fine.stem, description, camera, folder / "mask.png")
+    if depth is None and not measured:
+        names = " or ".join(f"{name}.{{npy,png,tiff,pfm}}" for name in _QUANTITIES)
+        raise ValueError(f"{folder}: expected {names}, there is none")
+    pixels = torch.from_numpy(rgb).permute(2, 0, 1).float() / 255
+    return Scene(dataset, folder.name, pixels, camera, depth, measured)
+
+
+def _first(folder: Path, names: Sequence[str]) -> Path:
+    """Return the first of the files that is there; the first name where none is, for its reader to miss."""
+    return next((folder / name for name in names if (folder / name).is_file()), folder / names[0])
+
+
+def _find_fine(folder: Path) -> Path | None:
+    """Return the file of the fine depth, None where there is none."""
+    found = [folder / f"{name}{suffix}" for name in _QUANTITIES for suffix in MAP_SUFFIXES]
+    found = [path for path in found if path.is_file()]
+    if len(found) > 1:
+        raise ValueError(f"{folder}: expected one fine depth map, got {', '.join(path.name for path in found)}")
+    return found[0] if found else None
+
+
+def _read_depth(
+    path: Path, quantity: str, description: CameraFile, camera: Camera, mask_path: Path | None = None
+) -> Tensor:
+    """Return a map as orthogonal depth, (1, H, W) in metres, NaN in holes."""
+    values = read_map(path)
+    _expect_size(path, values.shape, (camera.height, camera.width))
+    unit = 1.0 if quantity == "disparity" else _depth_unit(path, description)
+    values[np.isinf(values)] = np.nan  # Middlebury's mark of an unknown disparity
+    if description.hole_value is not None:
+        values[values == description.hole_value] = np.nan
+    if mask_path is not None and mask_path.is_file():
+        mask = read_mask(mask_path)
+        _expect_size(mask_path, mask.shape, values.shape)
+        values[~mask] = np.nan
+    if np.isnan(values).all():
+        raise ValueError(f"{path}: expected at least one known pixel, all are holes")
+    low = np.nanmin(values)
+    if low <= 0 and not (quantity == "disparity" and low > -camera.doffs):
+        raise ValueError(
+            f"{path}: expected positive values, got {low:g} in {np.mean(values <= 0):.2%} of the pixels "
+            '(mark holes by NaN, by mask.png, or by "hole_value" in camera.json)'
+        )
+    return from_range(torch.from_numpy(values)[None] * unit, camera, _range_type(path, quantity, description))
+
+
+def _depth_unit(path: Path, description: CameraFile) -> float:
+    """Return metres per value of a depth file; whole numbers do not tell it by themselves."""
+    if description.depth_unit is not None:
+        return description.depth_unit
+    if path.suffix.lower() == ".png":
+        raise ValueError(f'{path}: expected its unit in camera.json: "depth_unit": "m", "mm" or metres per value')
+    return 1.0
+
+
+def _range_type(path: Path, quantity: str, description: CameraFile) -> RangeType:
+    """Return the range type of a map, from its name and the camera file."""
+    if quantity == "disparity":
+        if description.range_type not in (None, "disparity"):
+            raise ValueError(f"{path}: camera.json's range_type is {description.range_type!r}, expected 'disparity'")
+        if description.camera.baseline is None:
+            raise ValueError(f'{path}: expected "baseline" in camera.json, which disparity needs')
+        return "disparity"
+    if description.range_type == "disparity":
+        raise ValueError(f"{path}: camera.json's range_type is 'disparity', expected 'orthogonal' or 'perspective'")
+    return description.range_type or "orthogonal"
+
+
+def _expect_size(path: Path, size: tuple[int, ...], expected: tuple[int, ...]) -> None:
+    if tuple(size) != tuple(expected):
+        raise ValueError(
+            f"{path}: expected {expected[0]} x {expected[1]} pixels (height x width, from camera.json), "
+            f"got {' x '.join(map(str, size))}"
+        )

@@ -1,0 +1,189 @@
+"""Downsampling models: how a fine depth map becomes a coarse one.
+
+Every model is a separable kernel, applied as two small matrices, so it is exact, batched and differentiable, and knows
+holes: an average runs over the known pixels alone. Kernels for factor f, in fine pixels from the coarse pixel's centre:
+
+- ``box``: the mean of the f x f block.
+- ``nearest``: the block's pixel [f // 2, f // 2], as in ``depth[f // 2 :: f, f // 2 :: f]``.
+- ``bilinear``, ``bicubic`` (a = -0.5): antialiased, their kernels stretched by f, as Pillow resizes.
+- ``gaussian``: standard deviation ``sigma`` * f, cut at three of them.
+
+Where a kernel would reach over the border it is cut and normalised.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+import torch
+from torch import Tensor
+
+from dsr.geometry.camera import Camera, RangeType, from_range, to_range
+from dsr.sample import DepthSample, Scene
+
+Kernel = Literal["box", "nearest", "bilinear", "bicubic", "gaussian"]
+SCALES = (2, 4, 8, 16)
+_LEAST_WEIGHT = 0.5
+
+
+@dataclass(frozen=True)
+class Downsampling:
+    """A downsampling model.
+
+    Args:
+        kernel: see the module.
+        sigma: standard deviation of the gaussian as a fraction of the scale factor.
+        range_type: the range type that is averaged; None for the one that the method works on, as in the paper.
+
+    Raises:
+        ValueError: an unknown kernel or a sigma that is not positive.
+
+    """
+
+    kernel: Kernel
+    sigma: float = 0.5
+    range_type: RangeType | None = None
+
+    def __post_init__(self) -> None:
+        """Check the values."""
+        if self.kernel not in get_args(Kernel):
+            raise ValueError(f"downsampling: expected one of {', '.join(get_args(Kernel))}, got {self.kernel!r}")
+        if not self.sigma > 0:
+            raise ValueError(f"downsampling.sigma: expected a positive fraction of the scale, got {self.sigma}")
+
+    def camera(self, camera: Camera, scale: int) -> Camera:
+        """Return the camera of the coarse map; ``nearest`` looks along other rays than the centred kernels do."""
+        if self.kernel == "nearest":
+            return camera.decimate(scale, scale // 2)
+        return camera.rescale(camera.width // scale, camera.height // scale)
+
+    def __call__(self, values: Tensor, scale: int) -> Tensor:
+        """Downsample maps.
+
+        A coarse pixel whose block has no known pixel is a hole. Where less than half of a kernel's weight falls on
+        known pixels, the mean of the block's known pixels stands in.
+
+        Args:
+            values: (..., H, W), NaN where unknown; H and W divisible by ``scale``.
+            scale: the factor.
+
+        Returns:
+            (..., H / scale, W / scale).
+
+        Raises:
+            ValueError: the scale does not divide the size.
+
+        """
+        height, width = values.shape[-2:]
+        if height % scale or width % scale:
+            raise ValueError(f"downsampling: expected a size divisible by {scale}, got {height} x {width}")
+        if self.kernel == "nearest":
+            return values[..., scale // 2 :: scale, scale // 2 :: scale]
+        known = values.isfinite()
+        if bool(known.all()):
+            return self._apply(values, scale)
+        filled, weight = torch.where(known, values, 0), known.to(values.dtype)
+        mean, share = self._apply(filled, scale), self._apply(weight, scale)
+        box = Downsampling("box")
+        block_mean, block_share = box._apply(filled, scale), box._apply(weight, scale)
+        tiny = torch.finfo(values.dtype).tiny
+        smooth = mean / share.clamp(min=_LEAST_WEIGHT)
+        coarse = torch.where(share >= _LEAST_WEIGHT, smooth, block_mean / block_share.clamp(min=tiny))
+        return torch.where(block_share > 0, coarse, torch.nan)
+
+    def _apply(self, values: Tensor, scale: int) -> Tensor:
+        """Return the plain weighted averages of complete maps."""
+        rows = self._matrix(values.shape[-2], scale).to(values)
+        columns = self._matrix(values.shape[-1], scale).to(values)
+        return rows @ values @ columns.T
+
+    def _matrix(self, size: int, scale: int) -> Tensor:
+        """Return the kernel's weights, (size / scale, size); every row sums to 1."""
+        centres = (torch.arange(size // scale, dtype=torch.float64) + 0.5) * scale - 0.5
+        distance = (torch.arange(size, dtype=torch.float64) - centres[:, None]) / scale
+        weights = _PROFILES[self.kernel](distance.abs(), self.sigma)
+        return weights / weights.sum(dim=1, keepdim=True)
+
+
+def _box(x: Tensor, _: float) -> Tensor:
+    return (x < 0.5).double()
+
+
+def _triangle(x: Tensor, _: float) -> Tensor:
+    return (1 - x).clamp(min=0)
+
+
+def _keys(x: Tensor, _: float) -> Tensor:
+    """Cubic convolution (Keys 1981) with a = -0.5."""
+    near = (1.5 * x - 2.5) * x * x + 1
+    far = ((-0.5 * x + 2.5) * x - 4) * x + 2
+    return torch.where(x < 1, near, torch.where(x < 2, far, 0))
+
+
+def _gaussian(x: Tensor, sigma: float) -> Tensor:
+    return torch.exp(-0.5 * (x / sigma).square()) * (x <= 3 * sigma)
+
+
+_PROFILES: dict[str, Callable[[Tensor, float], Tensor]] = {
+    "box": _box,
+    "bilinear": _triangle,
+    "bicubic": _keys,
+    "gaussian": _gaussian,
+}
+
+
+@dataclass(frozen=True)
+class Measured:
+    """The stand-in for a downsampling model where the scene brings a coarse map that a sensor measured."""
+
+
+def make_sample(scene: Scene, scale: int, downsampling: Downsampling | Measured, range_type: RangeType) -> DepthSample:
+    """Return the super-resolution problem that a scene poses.
+
+    A size that the scale does not divide is cropped at the bottom and the right, and the sample's notes say so.
+
+    Args:
+        scene: the fine maps.
+        scale: the upsampling factor, one of 2, 4, 8, 16.
+        downsampling: the model, or :class:`Measured` for the scene's own coarse map.
+        range_type: the type that the method works on.
+
+    Raises:
+        ValueError: the scene lacks what the problem needs, or a value is out of range.
+
+    """
+    if scale not in SCALES:
+        raise ValueError(f"scale: expected one of {', '.join(map(str, SCALES))}, got {scale}")
+    if isinstance(downsampling, Measured):
+        return _measured_sample(scene, scale)
+    if scene.depth is None:
+        raise ValueError(f"{scene.name}: expected a fine depth map to downsample, there is none")
+    rgb, depth, camera = scene.rgb, scene.depth, scene.camera
+    notes: tuple[str, ...] = ()
+    height, width = (size // scale * scale for size in (camera.height, camera.width))
+    if not height or not width:
+        size = f"{camera.height} x {camera.width}"
+        raise ValueError(f"{scene.name}: expected at least {scale} x {scale} pixels, got {size}")
+    if (height, width) != (camera.height, camera.width):
+        notes = (f"cropped from {camera.height} x {camera.width} to {height} x {width}, which {scale} divides",)
+        rgb, depth, camera = rgb[:, :height, :width], depth[:, :height, :width], camera.crop(0, 0, height, width)
+    coarse_camera = downsampling.camera(camera, scale)
+    range_type = downsampling.range_type or range_type
+    fine = to_range(depth, camera, range_type)
+    if range_type == "disparity":  # in the coarse camera's pixels
+        fine = fine / scale
+    coarse = from_range(downsampling(fine, scale), coarse_camera, range_type)
+    return DepthSample(scene.dataset, scene.name, rgb, coarse, camera, coarse_camera, scale, depth, notes)
+
+
+def _measured_sample(scene: Scene, scale: int) -> DepthSample:
+    """Return the sample of a scene with a measured coarse map."""
+    if scale not in scene.measured:
+        have = ", ".join(f"x{factor}" for factor in scene.measured) or "none"
+        raise ValueError(f"{scene.name}: downsampling=measured expects a coarse map at x{scale}, the scene has {have}")
+    camera = scene.camera
+    coarse_camera = camera.rescale(camera.width // scale, camera.height // scale)
+    coarse = scene.measured[scale]
+    return DepthSample(scene.dataset, scene.name, scene.rgb, coarse, camera, coarse_camera, scale, scene.depth)

@@ -1,0 +1,292 @@
+"""Evaluation in two passes: predictions to files, then scores from files.
+
+A prediction is ``predictions/SCENE.npz``: ``depth`` (H, W) in metres, NaN in holes, and ``config``, a JSON text of all
+that it came from. A prediction whose stored config is the wanted one is not made again, so an interrupted run goes on
+where it stopped. One scene that fails does not keep the others from their results.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+import zipfile
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+import pandas as pd
+import torch
+from torch import Tensor
+
+from dsr.atomic import replacing, write_text
+from dsr.data.base import SceneSource
+from dsr.degrade import Downsampling, Measured, make_sample
+from dsr.methods.base import Upsampler
+from dsr.quality.scores import WORST, Metric, score_image
+from dsr.sample import DepthSample
+
+SCORE_COLUMNS = (
+    "dataset",
+    "scene",
+    "scale",
+    "downsampling",
+    "method",
+    "seed",
+    "metric",
+    "variant",
+    "value",
+    "valid_share",
+)
+
+
+class Progress(Protocol):
+    """Shows how far a pass over scenes is: ``for scene in progress(scenes, "predict")``."""
+
+    def __call__(self, items: Sequence[str], description: str) -> Iterable[str]:
+        """Return the items, one at a time."""
+        ...
+
+
+@dataclass(frozen=True)
+class Study:
+    """What is evaluated: one method on one data set under one downsampling model.
+
+    Args:
+        source: the data set.
+        downsampling: the model.
+        downsampling_name: as in ``scores.csv``.
+        scale: the upsampling factor.
+        method: the method.
+        method_name: as in ``scores.csv``.
+        seed: of whatever is random.
+        config: all that the predictions depend on besides the scene, as plain values; stored with each.
+        device: where predictions and scores are computed.
+
+    """
+
+    source: SceneSource
+    downsampling: Downsampling | Measured
+    downsampling_name: str
+    scale: int
+    method: Upsampler
+    method_name: str
+    seed: int
+    config: Mapping[str, Any]
+    device: torch.device = field(default=torch.device("cpu"))
+
+    def sample(self, scene: str) -> DepthSample:
+        """Return the problem that a scene poses.
+
+        Raises:
+            ValueError: the scene's files are not as they should be.
+
+        """
+        return make_sample(self.source.load(scene), self.scale, self.downsampling, self.method.range_type)
+
+    def stored_config(self, scene: str) -> dict[str, Any]:
+        """Return what a prediction of this scene depends on."""
+        return {**self.config, "scene": scene, "scene_content": self.source.fingerprint(scene)}
+
+
+@dataclass
+class Outcome:
+    """What a pass over the scenes led to.
+
+    Args:
+        made, reused: scenes whose prediction was computed, or found on disk.
+        failures: scene and what was wrong, one line each.
+        notes: scene and what a reader of the scores should know.
+        seconds: computing time per scene.
+        unscored: scenes without a fine depth map to compare with.
+
+    """
+
+    made: list[str] = field(default_factory=list)
+    reused: list[str] = field(default_factory=list)
+    failures: dict[str, str] = field(default_factory=dict)
+    notes: dict[str, list[str]] = field(default_factory=dict)
+    seconds: dict[str, float] = field(default_factory=dict)
+    unscored: list[str] = field(default_factory=list)
+
+
+class StalePredictionError(ValueError):
+    """A prediction on disk was made from something else, and nobody allowed to overwrite it."""
+
+
+def predict(study: Study, folder: Path, progress: Progress, *, overwrite: bool = False) -> Outcome:
+    """Write the prediction of every scene that has none yet to ``folder / "predictions"``.
+
+    Args:
+        study: what to evaluate.
+        folder: the run's directory.
+        progress: shows how far it is.
+        overwrite: whether predictions on disk are made anew, whatever they came from.
+
+    Raises:
+        StalePredictionError: a prediction of another configuration is there and ``overwrite`` is not set.
+
+    """
+    outcome = Outcome()
+    for scene in progress(study.source.scenes(), "predict"):
+        path = prediction_path(folder, scene)
+        try:
+            config = study.stored_config(scene)
+            if not overwrite and _is_current(path, config):
+                outcome.reused.append(scene)
+                continue
+            outcome.seconds[scene] = _predict_scene(study, scene, path, config, outcome)
+            outcome.made.append(scene)
+        except StalePredictionError:
+            raise
+        except (ValueError, OSError) as error:
+            outcome.failures[scene] = one_line(error)
+    return outcome
+
+
+def score(
+    study: Study,
+    folder: Path,
+    metrics: tuple[Metric, ...],
+    outcome: Outcome,
+    progress: Progress,
+    illustrate: Callable[[DepthSample, Tensor, Mapping[str, float]], None],
+) -> pd.DataFrame:
+    """Score the predictions in ``folder``; write ``scores.csv`` and ``summary.json``.
+
+    Args:
+        study: what was evaluated.
+        folder: the run's directory.
+        metrics: from :func:`dsr.quality.scores.catalogue`.
+        outcome: of :func:`predict`; failures and scenes without truth are added to it.
+        progress: shows how far it is.
+        illustrate: draws a picture from a sample, the predicted depth and its worst-of-four scores.
+
+    Returns:
+        The content of ``scores.csv``.
+
+    """
+    rows: list[dict[str, Any]] = []
+    for scene in progress([name for name in study.source.scenes() if name not in outcome.failures], "score"):
+        try:
+            sample = study.sample(scene)
+            depth = load_prediction(prediction_path(folder, scene))
+            new = list(_score_scene(study, sample, depth, metrics))
+        except (ValueError, OSError) as error:
+            outcome.failures[scene] = one_line(error)
+            continue
+        if sample.depth is None:
+            outcome.unscored.append(scene)
+        if sample.notes:
+            outcome.notes[scene] = list(sample.notes)
+        rows += new
+        illustrate(sample, depth, {row["metric"]: row["value"] for row in new if row["variant"] in ("", WORST)})
+    scores = pd.DataFrame(rows, columns=list(SCORE_COLUMNS))
+    with replacing(folder / "scores.csv") as temporary:
+        scores.to_csv(temporary, index=False)
+    write_text(folder / "summary.json", json.dumps(summary(study, scores, outcome), indent=1) + "\n")
+    return scores
+
+
+def summary(study: Study, scores: pd.DataFrame, outcome: Outcome) -> dict[str, Any]:
+    """Return means over the scenes of each metric (worst of four lights where it has lights) and how the run went."""
+    worst = scores[scores["variant"].isin(["", WORST])]
+    means = worst.groupby("metric", sort=False)["value"].mean()
+    return {
+        "dataset": study.source.name,
+        "scale": study.scale,
+        "downsampling": study.downsampling_name,
+        "method": study.method_name,
+        "seed": study.seed,
+        "scenes": scores["scene"].nunique(),
+        "mean": {str(name): float(value) for name, value in means.items()},
+        "seconds": outcome.seconds,
+        "predicted": outcome.made,
+        "reused": outcome.reused,
+        "without_truth": outcome.unscored,
+        "notes": outcome.notes,
+        "failures": outcome.failures,
+    }
+
+
+def prediction_path(folder: Path, scene: str) -> Path:
+    """Return where a scene's prediction is kept."""
+    return folder / "predictions" / f"{scene}.npz"
+
+
+def load_prediction(path: Path) -> Tensor:
+    """Return a predicted depth map, (1, H, W) in metres.
+
+    Raises:
+        ValueError: the file is missing or damaged.
+
+    """
+    try:
+        with np.load(path) as kept:
+            return torch.from_numpy(kept["depth"])[None]
+    except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:
+        raise ValueError(f"{path}: expected a prediction, got a missing or damaged file ({one_line(error)})") from error
+
+
+def one_line(error: BaseException) -> str:
+    """Return an error's message on one line."""
+    return " ".join(str(error).split()) or type(error).__name__
+
+
+def _is_current(path: Path, config: Mapping[str, Any]) -> bool:
+    """Return whether the prediction on disk was made from ``config``."""
+    try:
+        with np.load(path) as kept:
+            stored = json.loads(str(kept["config"]))
+    except FileNotFoundError:
+        return False
+    except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile):
+        raise StalePredictionError(f"{path}: damaged; overwrite=true makes it anew") from None
+    wanted = json.loads(json.dumps(config))
+    if stored == wanted:
+        return True
+    changed = sorted(key for key in stored.keys() | wanted.keys() if stored.get(key) != wanted.get(key))
+    raise StalePredictionError(
+        f"{path}: made with another {', '.join(changed)}; overwrite=true replaces it, another output_dir keeps it"
+    )
+
+
+def _predict_scene(study: Study, scene: str, path: Path, config: Mapping[str, Any], outcome: Outcome) -> float:
+    """Compute and write one prediction; return the seconds that the method took."""
+    sample = study.sample(scene)
+    start = time.perf_counter()
+    depth = study.method(sample)
+    seconds = time.perf_counter() - start
+    expected = (1, sample.camera.height, sample.camera.width)
+    if tuple(depth.shape) != expected:
+        raise ValueError(f"{scene}: {study.method_name} gave depth of shape {tuple(depth.shape)}, expected {expected}")
+    with replacing(path) as temporary:
+        np.savez_compressed(temporary, depth=depth[0].cpu().numpy(), config=json.dumps(dict(config), sort_keys=True))
+    return seconds
+
+
+def _score_scene(
+    study: Study, sample: DepthSample, depth: Tensor, metrics: tuple[Metric, ...]
+) -> Iterator[dict[str, Any]]:
+    """Yield the rows of one scene; none where there is no truth."""
+    if sample.depth is None:
+        return
+    if depth.shape != sample.depth.shape:
+        came, expected = tuple(depth.shape), tuple(sample.depth.shape)
+        raise ValueError(f"{sample.scene}: expected a prediction of shape {expected}, got {came}")
+    rays = sample.camera.rays(device=study.device)
+    truth = sample.depth.to(study.device, torch.float64)
+    for result in score_image(depth.to(study.device, torch.float64), truth, rays, metrics):
+        yield {
+            "dataset": sample.dataset,
+            "scene": sample.scene,
+            "scale": sample.scale,
+            "downsampling": study.downsampling_name,
+            "method": study.method_name,
+            "seed": study.seed,
+            "metric": result.metric,
+            "variant": result.variant,
+            "value": result.value,
+            "valid_share": result.valid_share,
+        }

@@ -1,0 +1,1 @@
+"""Cameras, surfaces and their renderings."""

@@ -1,0 +1,157 @@
+"""Pinhole cameras and the three range types.
+
+Frame: x right, y down, z forward. Pixel centres sit at integer coordinates, so pixel (row v, column u) looks along the
+ray r(u, v) = ((u - cx) / fx, (v - cy) / fy, 1).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Literal, get_args
+
+import torch
+from torch import Tensor
+
+RangeType = Literal["orthogonal", "perspective", "disparity"]
+RANGE_TYPES: tuple[RangeType, ...] = get_args(RangeType)
+VIRTUAL_BASELINE = 0.2
+"""Baseline in metres of the virtual stereo pair that stands in where a camera has none (Voynov et al. 2019)."""
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A pinhole camera, optionally the left one of a rectified stereo pair.
+
+    Args:
+        width, height: image size in pixels.
+        fx, fy: focal lengths in pixels. A negative ``fy`` (ICL-NUIM) says that the calibration's y axis points up; as
+            points here always have y down, its absolute value is kept.
+        cx, cy: principal point in pixels, pixel centres at integers.
+        baseline: distance to the second camera in metres, None where there is none.
+        doffs: difference of the two principal points' x in pixels.
+
+    Raises:
+        ValueError: a value is not finite, a size or focal length is not positive.
+
+    """
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    baseline: float | None = None
+    doffs: float = 0.0
+
+    def __post_init__(self) -> None:
+        """Check every field and take the absolute value of ``fy``."""
+        for name in ("width", "height"):
+            value = getattr(self, name)
+            if int(value) != value or value < 1:
+                raise ValueError(f"camera {name}: expected a positive whole number, got {value!r}")
+        for name in ("fx", "fy", "cx", "cy", "doffs"):
+            if not math.isfinite(getattr(self, name)):
+                raise ValueError(f"camera {name}: expected a finite number, got {getattr(self, name)!r}")
+        if self.fx <= 0:
+            raise ValueError(f"camera fx: expected a positive number of pixels, got {self.fx!r}")
+        if self.fy == 0:
+            raise ValueError("camera fy: expected a number of pixels other than 0")
+        if self.baseline is not None and not (math.isfinite(self.baseline) and self.baseline > 0):
+            raise ValueError(f"camera baseline: expected a positive number of metres, got {self.baseline!r}")
+        object.__setattr__(self, "fy", abs(self.fy))
+
+    def crop(self, top: int, left: int, height: int, width: int) -> Camera:
+        """Return the camera of the ``height x width`` window whose first pixel is (``top``, ``left``)."""
+        inside = 0 <= top <= top + height <= self.height and 0 <= left <= left + width <= self.width
+        if not inside or height < 1 or width < 1:
+            raise ValueError(
+                f"crop: expected a window within {self.height} x {self.width}, "
+                f"got {height} x {width} at row {top}, column {left}"
+            )
+        return replace(self, width=width, height=height, cx=self.cx - left, cy=self.cy - top, doffs=self.doffs)
+
+    def rescale(self, width: int, height: int) -> Camera:
+        """Return the camera of the same view, resampled to ``width x height`` pixels that cover the same area.
+
+        The image's outer edge (half a pixel beyond the first pixel centre) stays where it is, as for box downsampling:
+        fx' = fx * s, cx' = (cx + 0.5) * s - 0.5 with s = width / self.width; disparities, in pixels, scale by s too.
+        """
+        sx, sy = width / self.width, height / self.height
+        return replace(
+            self,
+            width=width,
+            height=height,
+            fx=self.fx * sx,
+            fy=self.fy * sy,
+            cx=(self.cx + 0.5) * sx - 0.5,
+            cy=(self.cy + 0.5) * sy - 0.5,
+            doffs=self.doffs * sx,
+        )
+
+    def decimate(self, factor: int, offset: float) -> Camera:
+        """Return the camera whose pixel (i, j) is this one's (i * factor + offset, j * factor + offset)."""
+        return replace(
+            self,
+            width=self.width // factor,
+            height=self.height // factor,
+            fx=self.fx / factor,
+            fy=self.fy / factor,
+            cx=(self.cx - offset) / factor,
+            cy=(self.cy - offset) / factor,
+            doffs=self.doffs / factor,
+        )
+
+    def rays(self, *, dtype: torch.dtype = torch.float64, device: torch.device | str = "cpu") -> Tensor:
+        """Return the rays r(u, v) with z = 1, shape (3, H, W)."""
+        x = (torch.arange(self.width, dtype=dtype, device=device) - self.cx) / self.fx
+        y = (torch.arange(self.height, dtype=dtype, device=device) - self.cy) / self.fy
+        shape = (self.height, self.width)
+        return torch.stack((x.expand(shape), y[:, None].expand(shape), torch.ones(shape, dtype=dtype, device=device)))
+
+    def ray_lengths(self, *, dtype: torch.dtype = torch.float64, device: torch.device | str = "cpu") -> Tensor:
+        """Return |r(u, v)|, shape (H, W): the perspective depth of a point with orthogonal depth 1."""
+        return self.rays(dtype=dtype, device=device).square().sum(dim=0).sqrt()
+
+
+def to_range(depth: Tensor, camera: Camera, range_type: RangeType) -> Tensor:
+    """Convert orthogonal depth to another range type; NaN (a hole) stays NaN.
+
+    Args:
+        depth: (..., H, W) distance to the image plane in metres.
+        camera: the camera of these very pixels.
+        range_type: ``orthogonal`` (metres), ``perspective`` (metres along the ray, p = z |r|) or ``disparity``
+            (pixels, d = baseline * fx / z - doffs, with a virtual baseline of 0.2 m where the camera has none).
+
+    Returns:
+        (..., H, W) in the unit of the type.
+
+    """
+    if range_type == "orthogonal":
+        return depth
+    if range_type == "perspective":
+        return depth * camera.ray_lengths(dtype=depth.dtype, device=depth.device)
+    if range_type == "disparity":
+        return _stereo_constant(camera) / depth - camera.doffs
+    raise ValueError(f"range_type: expected one of {', '.join(RANGE_TYPES)}, got {range_type!r}")
+
+
+def from_range(values: Tensor, camera: Camera, range_type: RangeType) -> Tensor:
+    """Convert a range map to orthogonal depth in metres: the inverse of :func:`to_range`.
+
+    A disparity at or below -doffs lies at or beyond infinity and becomes NaN, a hole.
+    """
+    if range_type == "orthogonal":
+        return values
+    if range_type == "perspective":
+        return values / camera.ray_lengths(dtype=values.dtype, device=values.device)
+    if range_type == "disparity":
+        shifted = values + camera.doffs
+        return torch.where(shifted > 0, _stereo_constant(camera) / shifted, torch.nan)
+    raise ValueError(f"range_type: expected one of {', '.join(RANGE_TYPES)}, got {range_type!r}")
+
+
+def _stereo_constant(camera: Camera) -> float:
+    """Return baseline * fx in metre pixels."""
+    return (VIRTUAL_BASELINE if camera.baseline is None else camera.baseline) * camera.fx

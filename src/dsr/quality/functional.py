@@ -1,0 +1,250 @@
+"""The paper's metrics: pure functions of a pair of depth maps, one value per image (and light).
+
+Voynov et al., *Perceptual Deep Depth Super-Resolution*, ICCV 2019, section 3, with the conventions that reproduce its
+tables. Lower is better throughout; units are metres and fractions. A :class:`SurfacePair` computes what the metrics
+share - masks, perspective depths, normals, renderings - once, when first asked for.
+
+    pair = SurfacePair(prediction, target, camera.rays()[None])
+    rmse_v(pair)      # (B,)
+    dssim_v(pair)     # (B, 4), lights e1..e4
+
+Masks: a pixel counts where both depths are known; a normal where all the pixels that it needs are. What is unknown is
+left out of every mean, and is 0 in both renderings where a window reaches it. An image with nothing to score gets NaN.
+"""
+
+from __future__ import annotations
+
+from functools import cached_property
+
+import torch
+from torch import Tensor
+
+from dsr.geometry.shading import lights, shade
+from dsr.geometry.surface import length, normal_mask, normals_of
+
+SSIM_WINDOW = 7
+SSIM_DATA_RANGE = 2.0
+BUMPINESS_CLIP = 0.05
+BUMPINESS_DISPARITY = 20.48
+"""k in px m: baseline 14 mm x focal length 100 mm x 512 px / 35 mm (4D light field benchmark, scene "origami")."""
+
+
+class SurfacePair:
+    """Two depth maps of the same pixels, and what metrics derive from them.
+
+    Args:
+        prediction, target: (B, 1, H, W) orthogonal depth in metres; NaN is a hole.
+        rays: (B or 1, 3, H, W) rays with z = 1, see :meth:`dsr.geometry.camera.Camera.rays`.
+        mask: (B, 1, H, W) bool, further pixels to leave out; None for none.
+
+    Raises:
+        ValueError: shapes or types do not fit together.
+
+    """
+
+    def __init__(self, prediction: Tensor, target: Tensor, rays: Tensor, mask: Tensor | None = None) -> None:
+        if prediction.dim() != 4 or prediction.shape[1] != 1 or prediction.shape != target.shape:
+            raise ValueError(
+                "prediction, target: expected two depth maps of shape (B, 1, H, W), "
+                f"got {tuple(prediction.shape)} and {tuple(target.shape)}"
+            )
+        if rays.dim() != 4 or rays.shape[1] != 3 or rays.shape[-2:] != target.shape[-2:]:
+            raise ValueError(
+                f"rays: expected shape (B or 1, 3, {target.shape[-2]}, {target.shape[-1]}), got {tuple(rays.shape)}"
+            )
+        if mask is not None and (mask.dtype != torch.bool or mask.shape != target.shape):
+            came = f"{mask.dtype} {tuple(mask.shape)}"
+            raise ValueError(f"mask: expected bool of shape {tuple(target.shape)}, got {came}")
+        known = prediction.isfinite() & target.isfinite()
+        self.depth_mask = known if mask is None else known & mask
+        self.complete = bool(self.depth_mask.all())
+        self.rays = rays.to(target.dtype)
+        self.prediction, self.target = prediction, target
+        if not self.complete:  # a finite stand-in keeps NaN out of sums and gradients
+            self.prediction = torch.where(self.depth_mask, prediction, 1.0)
+            self.target = torch.where(self.depth_mask, target, 1.0)
+
+    @cached_property
+    def normals(self) -> tuple[Tensor, Tensor]:
+        """The two normal maps, (B, 3, H, W); meaningful where ``normal_mask`` is set."""
+        return normals_of(self.prediction, self.rays), normals_of(self.target, self.rays)
+
+    @cached_property
+    def normal_mask(self) -> Tensor:
+        """(B, 1, H, W) bool: where both normals are known."""
+        return self.depth_mask if self.complete else normal_mask(self.depth_mask)
+
+    @cached_property
+    def shadings(self) -> tuple[Tensor, Tensor]:
+        """The two maps of e . n for the four lights, (B, 4, H, W), unclipped; 0 where unknown."""
+        directions = lights(dtype=self.target.dtype, device=self.target.device)
+        first, second = (shade(normals, directions) for normals in self.normals)
+        return self._blank(first), self._blank(second)
+
+    @cached_property
+    def renderings(self) -> tuple[Tensor, Tensor]:
+        """The two maps of clip(e . n, 0, 1) for the four lights, (B, 4, H, W); 0 where unknown."""
+        first, second = self.shadings
+        return first.clamp(0, 1), second.clamp(0, 1)
+
+    @cached_property
+    def ray_lengths(self) -> Tensor:
+        """(B or 1, 1, H, W): the perspective depth of a point with orthogonal depth 1."""
+        return length(self.rays)
+
+    @cached_property
+    def perspective_error(self) -> Tensor:
+        """(B, 1, H, W) absolute difference of the perspective depths in metres; 0 where unknown."""
+        error = (self.prediction - self.target).abs() * self.ray_lengths
+        return error if self.complete else error * self.depth_mask
+
+    @cached_property
+    def rendering_error(self) -> Tensor:
+        """(B, 4, H, W) absolute difference of the renderings; 0 where unknown."""
+        first, second = self.renderings
+        return (first - second).abs()
+
+    @cached_property
+    def ssim_mask(self) -> Tensor:
+        """(B, 1, H - 6, W - 6) bool: window centres whose normal is known."""
+        return self.normal_mask[..., SSIM_WINDOW // 2 : -(SSIM_WINDOW // 2), SSIM_WINDOW // 2 : -(SSIM_WINDOW // 2)]
+
+    @cached_property
+    def bumpiness_mask(self) -> Tensor:
+        """(B, 1, H, W) bool: where the 5 x 5 pixels that a second derivative needs are known, or outside the map."""
+        if self.complete:
+            return self.depth_mask
+        unknown = (~self.depth_mask).to(self.target.dtype)
+        return torch.nn.functional.max_pool2d(unknown, 5, stride=1, padding=2) == 0
+
+    def _blank(self, values: Tensor) -> Tensor:
+        """Return ``values`` with 0 where a normal is unknown."""
+        return values if self.complete else values * self.normal_mask
+
+
+def rmse_d(pair: SurfacePair) -> Tensor:
+    """Return the RMS difference of the perspective depths in metres, (B,)."""
+    return _mean(pair.perspective_error.square(), pair.depth_mask).sqrt().squeeze(1)
+
+
+def bad_pix_d(pair: SurfacePair, threshold: float, *, relative: bool = False) -> Tensor:
+    """Return the share of pixels whose perspective depths differ by more than a threshold, (B,).
+
+    Args:
+        pair: the two surfaces.
+        threshold: in metres, or as a fraction of the target where ``relative``.
+        relative: see ``threshold``.
+
+    """
+    limit = pair.target * pair.ray_lengths * threshold if relative else threshold
+    return _mean(pair.perspective_error > limit, pair.depth_mask).squeeze(1)
+
+
+def mse_v(pair: SurfacePair) -> Tensor:
+    """Return MSE_v, (B,): the mean squared difference of the unclipped renderings under e1, e2, e3 (eq. 3).
+
+    As these lights are orthonormal it is the mean squared difference of the normal maps' three components.
+    """
+    first, second = pair.normals
+    return _mean((first - second).square().mean(dim=1, keepdim=True), pair.normal_mask).squeeze(1)
+
+
+def rmse_v(pair: SurfacePair) -> Tensor:
+    """Return RMSE_v = sqrt(MSE_v), (B,)."""
+    return mse_v(pair).sqrt()
+
+
+def rmse_v1(pair: SurfacePair) -> Tensor:
+    """Return RMSE_v^1 per light, (B, 4): the RMS difference of the unclipped renderings e . n."""
+    first, second = pair.shadings
+    return _mean((first - second).square(), pair.normal_mask).sqrt()
+
+
+def bad_pix_v(pair: SurfacePair, threshold: float) -> Tensor:
+    """Return per light the share of pixels whose renderings differ by more than ``threshold`` / 255, (B, 4)."""
+    return _mean(pair.rendering_error > threshold / 255, pair.normal_mask)
+
+
+def dssim_v(pair: SurfacePair) -> Tensor:
+    """Return DSSIM_v = 1 - SSIM per light, (B, 4).
+
+    SSIM (Wang et al. 2004) with a 7 x 7 uniform window, sample covariance and a data range of 2; windows that would
+    reach over the border are left out.
+
+    Raises:
+        ValueError: the map is smaller than a window.
+
+    """
+    first, second = pair.renderings
+    if min(first.shape[-2:]) < SSIM_WINDOW:
+        raise ValueError(f"DSSIM_v: expected a map of at least 7 x 7 pixels, got {tuple(first.shape[-2:])}")
+    lights_apart = zip(first.unbind(1), second.unbind(1), strict=True)  # one light's maps stay in the cache
+    return torch.cat([1 - _mean(_ssim_map(x, y)[:, None], pair.ssim_mask) for x, y in lights_apart], dim=1)
+
+
+def bumpiness_d(pair: SurfacePair) -> Tensor:
+    """Return Bumpiness_d, (B,): 100 x the mean of min(0.05, |Hessian of k / z1 - k / z0|).
+
+    Metric of the 4D light field benchmark (Honauer et al. 2016), with k in px m as if its camera had seen the scene.
+    Derivatives are Scharr filters, 0 on the map's outermost pixel after each.
+    """
+    difference = BUMPINESS_DISPARITY * (1 / pair.prediction - 1 / pair.target)
+    if not pair.complete:
+        difference = difference * pair.depth_mask
+    along_v, along_u = _scharr(difference)
+    squares = sum(second.square() for first in (along_v, along_u) for second in _scharr(first))
+    assert isinstance(squares, Tensor)  # noqa: S101 - sum() of tensors is one
+    return 100 * _mean(squares.sqrt().clamp(max=BUMPINESS_CLIP), pair.bumpiness_mask).squeeze(1)
+
+
+def _mean(values: Tensor, mask: Tensor) -> Tensor:
+    """Return the mean over the last two axes of ``values`` (B, C, H, W) where ``mask`` (B, 1, H, W) is set, (B, C)."""
+    if bool(mask.all()):
+        return values.mean(dim=(-2, -1)) if values.is_floating_point() else values.double().mean(dim=(-2, -1))
+    total = torch.where(mask, values, 0).sum(dim=(-2, -1), dtype=None if values.is_floating_point() else torch.float64)
+    return total / mask.sum(dim=(-2, -1))
+
+
+def _ssim_map(x: Tensor, y: Tensor) -> Tensor:
+    """Return SSIM at every window inside the map, (B, H, W) -> (B, H - 6, W - 6)."""
+    area = SSIM_WINDOW**2
+    to_sample_covariance = area / (area - 1)
+    c1, c2 = (0.01 * SSIM_DATA_RANGE) ** 2, (0.03 * SSIM_DATA_RANGE) ** 2
+    mean_x, mean_y = _window_sum(x) / area, _window_sum(y) / area
+    product, squares = mean_x * mean_y, mean_x.square() + mean_y.square()
+    covariance = to_sample_covariance * (_window_sum(x * y) / area - product)
+    variances = to_sample_covariance * (_window_sum(x.square() + y.square()) / area - squares)
+    return (2 * product + c1) * (2 * covariance + c2) / ((squares + c1) * (variances + c2))
+
+
+def _window_sum(values: Tensor) -> Tensor:
+    """Return the sums over all 7 x 7 windows inside the map, (..., H, W) -> (..., H - 6, W - 6).
+
+    Seven terms in four additions per axis: pairs, fours, four + two + one.
+    """
+    for axis in (-2, -1):
+        size = values.shape[axis] - SSIM_WINDOW + 1
+        pairs = values.narrow(axis, 0, size + 5) + values.narrow(axis, 1, size + 5)
+        fours = pairs.narrow(axis, 0, size) + pairs.narrow(axis, 2, size)
+        values = fours + pairs.narrow(axis, 4, size) + values.narrow(axis, 6, size)
+    return values
+
+
+def _scharr(values: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the Scharr responses along v and along u, (B, 1, H, W) each; the outermost pixel is 0.
+
+    The response to a ramp of slope 1 per pixel is 2 (edge weights 1, 0, -1; smoothing 3/16, 10/16, 3/16).
+    """
+    along_v = values[..., 2:, :] - values[..., :-2, :]
+    along_u = values[..., :, 2:] - values[..., :, :-2]
+    along_v = _smooth(along_v, dim=-1)
+    along_u = _smooth(along_u, dim=-2)
+    pad = torch.nn.functional.pad
+    return pad(along_v, (1, 1, 1, 1)), pad(along_u, (1, 1, 1, 1))
+
+
+def _smooth(values: Tensor, dim: int) -> Tensor:
+    """Return the (3, 10, 3) / 16 average along ``dim``, two pixels shorter."""
+    size = values.shape[dim] - 2
+    outer = values.narrow(dim, 0, size) + values.narrow(dim, 2, size)
+    return outer * (3 / 16) + values.narrow(dim, 1, size) * (10 / 16)

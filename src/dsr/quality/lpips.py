@@ -1,0 +1,191 @@
+"""LPIPS v0.1 with the AlexNet trunk, without torchvision.
+
+Zhang et al., *The Unreasonable Effectiveness of Deep Features as a Perceptual Metric*, CVPR 2018. The linear heads come
+with torchmetrics. The trunk is torchvision's ImageNet AlexNet, found by :func:`find_trunk`.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+import urllib.error
+from collections.abc import Iterator
+from pathlib import Path
+
+import torch
+import torchmetrics.functional.image as heads_home
+from torch import Tensor, nn
+
+from dsr.quality.functional import SurfacePair
+
+TRUNK_FILE = "alexnet-owt-7be5be79.pth"
+TRUNK_URL = f"https://download.pytorch.org/models/{TRUNK_FILE}"
+TRUNK_HASH = "7be5be79"
+"""First digits of the official file's SHA-256, as its name carries them."""
+_MEAN = (-0.030, -0.088, -0.188)
+_STD = (0.458, 0.448, 0.450)
+_CONVOLUTIONS = {  # index in torchvision's `features`: (in, out, kernel, stride, padding)
+    0: (3, 64, 11, 4, 2),
+    3: (64, 192, 5, 1, 2),
+    6: (192, 384, 3, 1, 1),
+    8: (384, 256, 3, 1, 1),
+    10: (256, 256, 3, 1, 1),
+}
+_POOL_BEFORE = (3, 6)
+_DOWNLOAD_TIMEOUT = 15.0
+MIN_SIZE = 31
+"""Smallest height and width in pixels that the trunk's poolings leave a feature of."""
+
+
+class LPIPS(nn.Module):
+    """Learned perceptual image patch similarity, version 0.1, AlexNet.
+
+    Args:
+        trunk: state dict of torchvision's AlexNet (``features.*``; further keys are ignored).
+
+    Raises:
+        ValueError: a tensor is missing or has another shape.
+
+    """
+
+    mean: Tensor
+    std: Tensor
+
+    def __init__(self, trunk: dict[str, Tensor]) -> None:
+        super().__init__()
+        self.convolutions = nn.ModuleDict(
+            {str(i): nn.Conv2d(a, b, k, stride=s, padding=p) for i, (a, b, k, s, p) in _CONVOLUTIONS.items()}
+        )
+        for index, layer in self.convolutions.items():
+            for name, parameter in layer.named_parameters():
+                value = trunk.get(f"features.{index}.{name}")
+                if not isinstance(value, Tensor) or value.shape != parameter.shape:
+                    came = "nothing" if value is None else str(tuple(getattr(value, "shape", ())))
+                    expected = tuple(parameter.shape)
+                    raise ValueError(f"features.{index}.{name}: expected a tensor of shape {expected}, got {came}")
+                parameter.data.copy_(value)
+        for level, head in enumerate(_linear_heads()):
+            self.register_buffer(f"head{level}", head)
+        self.register_buffer("mean", torch.tensor(_MEAN).view(1, 3, 1, 1))
+        self.register_buffer("std", torch.tensor(_STD).view(1, 3, 1, 1))
+        self.requires_grad_(requires_grad=False)
+        self.eval()
+
+    def features(self, images: Tensor) -> list[Tensor]:
+        """Return the five feature maps, each of unit length along its channels.
+
+        Args:
+            images: (B, 3, H, W) in [-1, 1].
+
+        """
+        maps, values = [], (images - self.mean) / self.std
+        for index, layer in self.convolutions.items():
+            if int(index) in _POOL_BEFORE:
+                values = nn.functional.max_pool2d(values, 3, stride=2)
+            values = nn.functional.relu(layer(values))
+            maps.append(values / (values.square().sum(dim=1, keepdim=True) + 1e-20).sqrt())
+        return maps
+
+    def forward(self, first: Tensor, second: Tensor, mask: Tensor | None = None) -> Tensor:
+        """Return the distance of two images, (B,).
+
+        Args:
+            first: (B, 3, H, W) in [-1, 1], at least 31 x 31.
+            second: likewise.
+            mask: (B, 1, H, W) bool; each feature weighs as much as the share of its pixels that is known. None for all.
+
+        Raises:
+            ValueError: the images are smaller than the trunk can take.
+
+        """
+        if min(first.shape[-2:]) < MIN_SIZE:
+            came = tuple(first.shape[-2:])
+            raise ValueError(f"LPIPS: expected images of at least {MIN_SIZE} x {MIN_SIZE} pixels, got {came}")
+        total = first.new_zeros(len(first))
+        for level, (a, b) in enumerate(zip(self.features(first), self.features(second), strict=True)):
+            distance = ((a - b).square() * getattr(self, f"head{level}")).sum(dim=1)  # (B, h, w)
+            if mask is None:
+                total = total + distance.mean(dim=(-2, -1))
+            else:
+                weight = nn.functional.adaptive_avg_pool2d(mask.to(a.dtype), (a.shape[-2], a.shape[-1])).squeeze(1)
+                total = total + (distance * weight).sum(dim=(-2, -1)) / weight.sum(dim=(-2, -1))
+        return total
+
+
+def lpips_v(pair: SurfacePair, network: LPIPS) -> Tensor:
+    """Return LPIPS_v per light, (B, 4): LPIPS of the renderings, repeated to three channels, scaled to [-1, 1].
+
+    Args:
+        pair: the two surfaces.
+        network: on the pair's device.
+
+    """
+    batch, count, height, width = pair.renderings[0].shape
+    as_images = [
+        (2 * maps.to(network.mean.dtype) - 1).reshape(batch * count, 1, height, width).expand(-1, 3, -1, -1)
+        for maps in pair.renderings
+    ]
+    mask = None if pair.complete else pair.normal_mask.repeat_interleave(count, dim=0)
+    return network(*as_images, mask).view(batch, count)
+
+
+def find_trunk(configured: Path | None) -> Path:
+    """Return the file of AlexNet's weights: the configured one, the torch hub cache's, or downloaded into that cache.
+
+    Args:
+        configured: a file, or None to look on.
+
+    Raises:
+        FileNotFoundError: the configured file does not exist.
+        OSError: it is not in the cache and could not be downloaded; nothing half-written is left.
+
+    """
+    if configured is not None:
+        if not configured.is_file():
+            raise FileNotFoundError(f"metrics.lpips_trunk: expected a file, got {configured} (no such file)")
+        return configured
+    cached = Path(torch.hub.get_dir()) / "checkpoints" / TRUNK_FILE
+    if not cached.is_file():
+        cached.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            with _socket_timeout(_DOWNLOAD_TIMEOUT):
+                torch.hub.download_url_to_file(TRUNK_URL, str(cached), hash_prefix=TRUNK_HASH, progress=True)
+        except (urllib.error.URLError, RuntimeError, TimeoutError) as error:  # RuntimeError: another hash
+            raise OSError(f"could not be downloaded: {getattr(error, 'reason', error)}") from error
+    return cached
+
+
+def load_lpips(configured: Path | None = None) -> LPIPS:
+    """Return the LPIPS network with the trunk that :func:`find_trunk` finds.
+
+    Raises:
+        ValueError: the file is not a state dict of AlexNet.
+        OSError: no trunk can be had.
+
+    """
+    path = find_trunk(configured)
+    try:
+        trunk = torch.load(path, map_location="cpu", weights_only=True)
+        if not isinstance(trunk, dict):
+            raise ValueError(f"expected a state dict, got {type(trunk).__name__}")
+        return LPIPS(trunk)
+    except Exception as error:  # torch.load raises whatever a damaged file makes it stumble over
+        reason = str(error) if isinstance(error, ValueError) else "not a file of plain tensors"
+        raise ValueError(f"{path}: expected the weights of torchvision's AlexNet: {reason}") from error
+
+
+def _linear_heads() -> list[Tensor]:
+    """Return the five linear heads of LPIPS v0.1, each (1, C, 1, 1), from the torchmetrics wheel."""
+    file = Path(heads_home.__file__).parent / "lpips_models" / "alex.pth"
+    state = torch.load(file, map_location="cpu", weights_only=True)
+    return [state[f"lin{level}.model.1.weight"] for level in range(len(_CONVOLUTIONS))]
+
+
+@contextlib.contextmanager
+def _socket_timeout(seconds: float) -> Iterator[None]:
+    before = socket.getdefaulttimeout()
+    socket.setdefaulttimeout(seconds)
+    try:
+        yield
+    finally:
+        socket.setdefaulttimeout(before)

@@ -1,0 +1,138 @@
+"""torchmetrics classes of the paper's metrics: the mean over images, worst of four lights unless told otherwise.
+
+    metrics = visual_metrics(network)                       # a MetricCollection
+    metrics.update(SurfacePair(prediction, target, rays))
+    metrics.compute()                                       # {"RMSE_d": ..., "DSSIM_v": ..., ...}
+
+Masks, normals and renderings are computed once for all the metrics of a collection, by the pair.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+import torchmetrics
+from torch import Tensor
+
+from dsr.quality.functional import SurfacePair
+from dsr.quality.lpips import LPIPS
+from dsr.quality.scores import VARIANTS, WORST, Metric, catalogue
+
+
+class PerImageMean(torchmetrics.Metric):
+    """Mean over images of one metric; an image with nothing to score is left out.
+
+    Args:
+        metric: from :func:`dsr.quality.scores.catalogue`.
+        variant: ``max`` (worst of four lights), ``avg`` or one of e1..e4; without effect on metrics without lights.
+        **settings: as for every torchmetrics class.
+
+    Raises:
+        ValueError: an unknown variant.
+
+    """
+
+    higher_is_better = False
+    is_differentiable = False
+    full_state_update = False
+    total: Tensor
+    count: Tensor
+
+    def __init__(self, metric: Metric, variant: str = WORST, **settings: Any) -> None:
+        super().__init__(**settings)
+        if variant not in VARIANTS:
+            raise ValueError(f"variant: expected one of {', '.join(VARIANTS)}, got {variant!r}")
+        self._metric = metric
+        self._variant = variant if metric.per_light else ""
+        self.add_state("total", torch.zeros((), dtype=torch.float64), dist_reduce_fx="sum")
+        self.add_state("count", torch.zeros((), dtype=torch.float64), dist_reduce_fx="sum")
+
+    @torch.no_grad()
+    def update(self, pair: SurfacePair) -> None:
+        """Add a batch of pairs."""
+        values = self._metric.variants(pair)[self._variant]
+        known = values.isfinite()
+        self.total += torch.where(known, values, 0).sum().to(self.total)
+        self.count += known.sum().to(self.count)
+
+    def compute(self) -> Tensor:
+        """Return the mean, NaN where no image could be scored."""
+        return self.total / self.count
+
+
+def _named(name: str) -> Metric:
+    return next(metric for metric in catalogue() if metric.name == name)
+
+
+class RMSEd(PerImageMean):
+    """RMSE_d in metres."""
+
+    def __init__(self, **settings: Any) -> None:
+        super().__init__(_named("RMSE_d"), **settings)
+
+
+class BadPixD(PerImageMean):
+    """BadPix_d: threshold 1, 5 or 10, in cm or in percent of the target where ``relative``."""
+
+    def __init__(self, threshold: int = 5, *, relative: bool = False, **settings: Any) -> None:
+        super().__init__(_named(f"BadPix_d_{threshold}{'pct' if relative else 'cm'}"), **settings)
+
+
+class BadPixV(PerImageMean):
+    """BadPix_v: threshold 1, 5 or 10 of 255."""
+
+    def __init__(self, threshold: int = 5, variant: str = WORST, **settings: Any) -> None:
+        super().__init__(_named(f"BadPix_v_{threshold}"), variant, **settings)
+
+
+class DSSIMv(PerImageMean):
+    """DSSIM_v."""
+
+    def __init__(self, variant: str = WORST, **settings: Any) -> None:
+        super().__init__(_named("DSSIM_v"), variant, **settings)
+
+
+class LPIPSv(PerImageMean):
+    """LPIPS_v.
+
+    Args:
+        network: kept out of the module tree, so that no checkpoint ever holds it.
+        variant: as for :class:`PerImageMean`.
+        **settings: as for every torchmetrics class.
+
+    """
+
+    def __init__(self, network: LPIPS, variant: str = WORST, **settings: Any) -> None:
+        metric = next(metric for metric in catalogue(network) if metric.name == "LPIPS_v")
+        super().__init__(metric, variant, **settings)
+
+
+class RMSEv(PerImageMean):
+    """RMSE_v."""
+
+    def __init__(self, **settings: Any) -> None:
+        super().__init__(_named("RMSE_v"), **settings)
+
+
+class RMSEv1(PerImageMean):
+    """RMSE_v^1."""
+
+    def __init__(self, variant: str = WORST, **settings: Any) -> None:
+        super().__init__(_named("RMSE_v1"), variant, **settings)
+
+
+class BumpinessD(PerImageMean):
+    """Bumpiness_d."""
+
+    def __init__(self, **settings: Any) -> None:
+        super().__init__(_named("Bumpiness_d"), **settings)
+
+
+def visual_metrics(network: LPIPS | None = None, **settings: Any) -> torchmetrics.MetricCollection:
+    """Return every metric of the catalogue, worst of four lights, as one collection.
+
+    Compute groups stay off: they would merge metrics that differ in a threshold alone.
+    """
+    metrics: dict[str, Any] = {metric.name: PerImageMean(metric, **settings) for metric in catalogue(network)}
+    return torchmetrics.MetricCollection(metrics, compute_groups=False)

@@ -1,0 +1,142 @@
+"""One picture per scene: photo, depth maps in pseudo-colour, renderings under the four lights, errors."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import matplotlib as mpl
+import numpy as np
+import torch
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from torch import Tensor
+
+from dsr.atomic import replacing
+from dsr.geometry.shading import LIGHT_NAMES, render
+from dsr.geometry.surface import normals_of
+from dsr.report.tables import METRICS
+from dsr.sample import DepthSample
+
+_HOLE_COLOUR = "#d684b4"
+_PANEL = 3.2
+_ABOVE = 0.8
+_BETWEEN = 0.95
+"""Inches of a panel's width, of the room for the heading, and of that for a colour bar and a title between panels."""
+_DPI = 160
+"""At five panels of 3.2 inches a panel has 512 pixels."""
+
+
+def save_picture(path: Path, sample: DepthSample, depth: Tensor, scores: Mapping[str, float], label: str) -> None:
+    """Draw a scene's result and write it atomically.
+
+    Args:
+        path: a PNG.
+        sample: what the method was given.
+        depth: (1, H, W) the result in metres, NaN in holes.
+        scores: worst-of-four scores in raw units, by metric; empty where there is no truth.
+        label: the method's name.
+
+    """
+    truth = sample.depth
+    rows = 2 if truth is None else 3
+    height, width = depth.shape[-2:]
+    panel = _PANEL * min(max(height / width, 0.4), 2.5)
+    figure_height = _ABOVE + rows * (panel + _BETWEEN)
+    figure = Figure(figsize=(5 * _PANEL + 0.6, figure_height))
+    FigureCanvasAgg(figure)
+    axes = figure.subplots(rows, 5, squeeze=False)
+    bottom, top = _BETWEEN / figure_height, 1 - _ABOVE / figure_height
+    figure.subplots_adjust(left=0.01, right=0.99, bottom=bottom, top=top, wspace=0.04, hspace=_BETWEEN / panel)
+    for axis in axes.flat:
+        axis.set_axis_off()
+    limits = _limits(depth if truth is None else truth)
+    axes[0, 0].imshow(sample.rgb.permute(1, 2, 0).numpy())
+    axes[0, 0].set_title(f"photo, {width} x {height}")
+    _show_depth(axes[0, 1], sample.depth_lr, limits, f"input, {sample.camera_lr.width} x {sample.camera_lr.height}")
+    _show_depth(axes[0, 2], depth, limits, label)
+    _show_renderings(axes[1], sample, depth, label)
+    if truth is not None:
+        _show_depth(axes[0, 3], truth, limits, "truth")
+        _show_error(axes[0, 4], depth - truth)
+        _show_renderings(axes[2], sample, truth, "truth")
+        _show_angles(axes[1, 4], sample, depth, truth)
+        _write_scores(axes[2, 4], scores)
+    maps = (depth, sample.depth_lr) if truth is None else (depth, sample.depth_lr, truth)
+    holes = "" if all(bool(values.isfinite().all()) for values in maps) else " (pink: holes)"
+    heading = f"{sample.dataset} / {sample.scene}, {label} x{sample.scale}{holes}"
+    figure.suptitle(heading, fontsize=16, y=1 - 0.12 / figure_height)
+    with replacing(path) as temporary:
+        figure.savefig(temporary, dpi=_DPI)
+
+
+def _limits(depth: Tensor) -> tuple[float, float]:
+    """Return the 1st and 99th percentile of the known depths: one outlier does not take all the colours."""
+    low, high = np.nanpercentile(depth.numpy(), [1, 99])
+    return float(low), float(max(high, low + 1e-6))
+
+
+def _colours(name: str) -> Any:
+    """Return a colour map that shows holes in grey."""
+    return mpl.colormaps[name].with_extremes(bad=_HOLE_COLOUR)
+
+
+def _show_depth(axis: Axes, depth: Tensor, limits: tuple[float, float], title: str) -> None:
+    """Draw depth in metres, (1, H, W)."""
+    low, high = limits
+    image = axis.imshow(depth[0].numpy(), cmap=_colours("viridis"), vmin=low, vmax=high, interpolation="nearest")
+    axis.set_title(title)
+    _colour_bar(axis, image, "depth, m")
+
+
+def _show_error(axis: Axes, difference: Tensor) -> None:
+    """Draw the signed error, (1, H, W) in metres, in centimetres."""
+    centimetres = 100 * difference[0].numpy()
+    known = centimetres[np.isfinite(centimetres)]
+    limit = max(float(np.percentile(np.abs(known), 98)), 0.1) if known.size else 1.0
+    image = axis.imshow(centimetres, cmap=_colours("RdBu_r"), vmin=-limit, vmax=limit, interpolation="nearest")
+    axis.set_title("error")
+    _colour_bar(axis, image, "result - truth, cm", extend="both")
+
+
+def _show_renderings(axes: np.ndarray, sample: DepthSample, depth: Tensor, title: str) -> None:
+    """Draw the renderings of a depth map, (1, H, W), under the four lights."""
+    normals = _normals(sample, depth)
+    for axis, name, shades in zip(axes, LIGHT_NAMES, render(normals)[0], strict=False):
+        axis.imshow(shades.numpy(), cmap=_colours("gray"), vmin=0, vmax=1, interpolation="nearest")
+        axis.set_title(f"{title} under {name}")
+
+
+def _show_angles(axis: Axes, sample: DepthSample, depth: Tensor, truth: Tensor) -> None:
+    """Draw the angle between the two normals in degrees."""
+    cosine = (_normals(sample, depth) * _normals(sample, truth)).sum(dim=1)[0]
+    degrees = torch.rad2deg(torch.arccos(cosine.clamp(-1, 1))).numpy()
+    image = axis.imshow(degrees, cmap=_colours("magma"), vmin=0, vmax=60, interpolation="nearest")
+    axis.set_title("error of the normals")
+    _colour_bar(axis, image, "degrees", extend="max")
+
+
+def _colour_bar(axis: Axes, image: Any, label: str, extend: str = "neither") -> None:
+    """Put a colour bar under a panel without moving it."""
+    height = axis.get_window_extent().height / axis.figure.dpi
+    place = axis.inset_axes((0.1, -0.19 / height, 0.8, 0.09 / height))
+    bar = axis.figure.colorbar(image, cax=place, orientation="horizontal", extend=extend)
+    bar.set_label(label, labelpad=1)
+
+
+def _normals(sample: DepthSample, depth: Tensor) -> Tensor:
+    """Return the normals of a depth map, (1, 3, H, W), NaN where unknown."""
+    return normals_of(depth.double()[None], sample.camera.rays()[None])
+
+
+def _write_scores(axis: Axes, scores: Mapping[str, float]) -> None:
+    """Write the scores in the paper's units."""
+    lines = [
+        f"{heading:<9}{unit:<8}{scores[name] * factor:>9.{digits}f}"
+        for name, (heading, unit, factor, digits) in METRICS.items()
+        if name in scores
+    ]
+    text = "\n".join(["scores, lower is better", *lines])
+    axis.text(0, 0.95, text, family="monospace", fontsize=11, va="top", linespacing=1.6, transform=axis.transAxes)

@@ -1,0 +1,97 @@
+"""Scores in the units of the paper's tables, beside the published values."""
+
+from __future__ import annotations
+
+import functools
+from importlib import resources
+
+import pandas as pd
+from rich import box
+from rich.table import Table
+
+METRICS: dict[str, tuple[str, str, float, int]] = {
+    "RMSE_d": ("RMSE_d", "mm", 1e3, 1),
+    "BadPix_d_5cm": ("BadPix_d", "5 cm, %", 1e2, 2),
+    "BadPix_v_5": ("BadPix_v", "5, %", 1e2, 1),
+    "DSSIM_v": ("DSSIM_v", "1/1000", 1e3, 0),
+    "LPIPS_v": ("LPIPS_v", "1/1000", 1e3, 0),
+    "Bumpiness_d": ("Bump_d", "", 1.0, 2),
+    "RMSE_v": ("RMSE_v", "1/1000", 1e3, 0),
+}
+"""The columns of the paper's tables: heading, unit, factor from raw units, digits after the point."""
+RECREATED = {
+    "cube_high_freq": "Cube, high-frequency texture",
+    "cube_no_texture": "Cube, no texture",
+    "sphere_cylinder_high_freq": "Sphere and cylinder, high-frequency texture",
+    "sphere_cylinder_low_freq": "Sphere and cylinder, low-frequency texture",
+    "sphere_cylinder_no_texture": "Sphere and cylinder, no texture",
+}
+"""Embedded SimGeo scenes and the scene of the paper that each re-creates."""
+_PUBLISHED_DOWNSAMPLING = "box"
+
+
+@functools.cache
+def published() -> pd.DataFrame:
+    """Return the paper's figures in its units, one row per scene, method and scale."""
+    with resources.files("dsr.report").joinpath("published.csv").open(encoding="utf-8") as file:
+        return pd.read_csv(file)
+
+
+def published_row(scene: str, method: str, scale: int) -> pd.Series | None:
+    """Return the paper's figures for a scene (by our name or its own) and a method (by its name in the paper)."""
+    table = published()
+    name = RECREATED.get(scene, scene).casefold()
+    rows = table[(table["scene"].str.casefold() == name) & (table["method"] == method) & (table["scale"] == scale)]
+    return None if rows.empty else rows.iloc[0]
+
+
+def in_paper_units(scores: pd.DataFrame) -> pd.DataFrame:
+    """Return scene x metric of one run's scores, in the paper's units, worst of four lights.
+
+    Args:
+        scores: the content of one ``scores.csv``.
+
+    """
+    worst = scores[scores["variant"].fillna("").isin(["", "max"])]
+    wide = worst.pivot_table(index="scene", columns="metric", values="value", sort=False)
+    wide = wide[[name for name in METRICS if name in wide]]
+    return wide.mul(pd.Series({name: METRICS[name][2] for name in wide}))
+
+
+def score_table(scores: pd.DataFrame, label: str) -> Table:
+    """Return the terminal's table of one run: each scene, the paper's values below ours, and our mean.
+
+    Args:
+        scores: the content of one ``scores.csv``.
+        label: the method's name in the paper.
+
+    """
+    ours = in_paper_units(scores)
+    scale, downsampling = int(scores["scale"].iloc[0]), str(scores["downsampling"].iloc[0])
+    title = f"{label} on {scores['dataset'].iloc[0]}, x{scale}, {downsampling} downsampling - lower is better"
+    table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
+    table.add_column("scene", overflow="fold")
+    table.add_column("from")
+    for name in ours:
+        heading, unit, *_ = METRICS[str(name)]
+        table.add_column(f"{heading}\n{unit}", justify="right", no_wrap=True)
+    starred = False
+    for scene, values in ours.iterrows():
+        table.add_row(str(scene), "dsr", *_cells(values))
+        paper = published_row(str(scene), label, scale) if downsampling == _PUBLISHED_DOWNSAMPLING else None
+        if paper is not None:
+            recreated = scene in RECREATED
+            starred |= recreated
+            table.add_row("", "paper*" if recreated else "paper", *_cells(paper[list(ours)]), style="dim")
+    if len(ours) > 1:
+        table.add_section()
+        table.add_row("mean", "dsr", *_cells(ours.mean()), style="bold")
+    if starred:
+        table.caption = "* of the paper's own file; the embedded scene re-creates its description"
+        table.caption_justify = "left"
+    return table
+
+
+def _cells(values: pd.Series) -> list[str]:
+    """Return a row's values as text, with as many digits as each metric's column has."""
+    return [f"{value:.{METRICS[str(name)][3]}f}" if pd.notna(value) else "-" for name, value in values.items()]

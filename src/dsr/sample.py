@@ -1,0 +1,124 @@
+"""The records that flow through everything: a scene as a data set has it, and a sample as a method gets it.
+
+Depth is orthogonal depth (distance to the image plane) in metres. A hole is NaN, never 0.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor
+
+from dsr.geometry.camera import Camera
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A photo and its fine depth, before any downsampling.
+
+    Args:
+        dataset, name: together they identify the scene.
+        rgb: (3, H, W) floating point, in [0, 1].
+        camera: the camera of both.
+        depth: (1, H, W) true depth, or None where it is not known.
+        measured: coarse depth maps that a sensor measured, (1, H / factor, W / factor) by factor.
+
+    Raises:
+        ValueError: a shape, range or unit is not as above.
+
+    """
+
+    dataset: str
+    name: str
+    rgb: Tensor
+    camera: Camera
+    depth: Tensor | None = None
+    measured: Mapping[int, Tensor] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        """Check shapes and value ranges."""
+        _expect_rgb(self.name, self.rgb, self.camera)
+        if self.depth is None and not self.measured:
+            raise ValueError(f"{self.name}: expected a depth map, fine or measured, got none")
+        if self.depth is not None:
+            _expect_depth(self.name, "depth", self.depth, (self.camera.height, self.camera.width))
+        for factor, coarse in self.measured.items():
+            size = (self.camera.height // factor, self.camera.width // factor)
+            _expect_depth(self.name, f"measured depth at x{factor}", coarse, size)
+
+
+@dataclass(frozen=True)
+class DepthSample:
+    """A photo, a coarse depth map, and the fine one where it is known.
+
+    Args:
+        dataset, scene: names; together they identify the sample.
+        rgb: (3, H, W) floating point, in [0, 1].
+        depth_lr: (1, h, w) coarse depth, H = h * scale and W = w * scale.
+        camera: the camera of the photo and of ``depth``.
+        camera_lr: the camera of ``depth_lr``.
+        scale: the upsampling factor.
+        depth: (1, H, W) true fine depth, or None where it is not known.
+        notes: what somebody who reads the scores should know, such as "cropped from 513 x 512".
+
+    Raises:
+        ValueError: a shape, range or unit is not as above.
+
+    """
+
+    dataset: str
+    scene: str
+    rgb: Tensor
+    depth_lr: Tensor
+    camera: Camera
+    camera_lr: Camera
+    scale: int
+    depth: Tensor | None = None
+    notes: tuple[str, ...] = field(default=())
+
+    def __post_init__(self) -> None:
+        """Check shapes, value ranges and cameras against each other."""
+        _expect_rgb(self.scene, self.rgb, self.camera)
+        size, coarse_size = (self.camera.height, self.camera.width), (self.camera_lr.height, self.camera_lr.width)
+        if (coarse_size[0] * self.scale, coarse_size[1] * self.scale) != size:
+            raise ValueError(
+                f"{self.scene}: depth_lr: expected {size[0] // self.scale} x {size[1] // self.scale} (the photo's "
+                f"{size[0]} x {size[1]} at scale {self.scale}), got {coarse_size[0]} x {coarse_size[1]}"
+            )
+        _expect_depth(self.scene, "depth_lr", self.depth_lr, coarse_size)
+        if self.depth is not None:
+            _expect_depth(self.scene, "depth", self.depth, size)
+
+    @property
+    def mask_lr(self) -> Tensor:
+        """(1, h, w) bool: where the coarse depth is known."""
+        return self.depth_lr.isfinite()
+
+    @property
+    def mask(self) -> Tensor | None:
+        """(1, H, W) bool: where the true depth is known; None where there is no truth."""
+        return None if self.depth is None else self.depth.isfinite()
+
+
+def _expect_shape(scene: str, name: str, value: Tensor, shape: tuple[int, ...]) -> None:
+    if tuple(value.shape) != shape:
+        raise ValueError(f"{scene}: {name}: expected shape {shape}, got {tuple(value.shape)}")
+
+
+def _expect_rgb(scene: str, rgb: Tensor, camera: Camera) -> None:
+    _expect_shape(scene, "rgb", rgb, (3, camera.height, camera.width))
+    if not rgb.is_floating_point() or not bool(((rgb >= 0) & (rgb <= 1)).all()):
+        raise ValueError(f"{scene}: rgb: expected floating point values in [0, 1]")
+
+
+def _expect_depth(scene: str, name: str, depth: Tensor, size: tuple[int, int]) -> None:
+    _expect_shape(scene, name, depth, (1, *size))
+    if not depth.is_floating_point():
+        raise ValueError(f"{scene}: {name}: expected floating point metres, got {depth.dtype}")
+    if bool((depth.isinf() | (depth <= 0)).any()):
+        came = "inf" if bool(depth.isinf().any()) else f"{depth.nan_to_num(nan=torch.inf).min().item():g}"
+        raise ValueError(f"{scene}: {name}: expected positive depth, and NaN where a pixel is a hole; got {came}")
+    if not bool(depth.isfinite().any()):
+        raise ValueError(f"{scene}: {name}: expected at least one known pixel, all are holes")
