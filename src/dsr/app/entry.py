@@ -35,20 +35,34 @@ def run_command(conf: Path, name: str, command: Callable[[DictConfig], Any]) -> 
     if not conf.is_dir():
         fail(f"{conf}: expected the directory of the configuration files; run the command in a checkout of the project")
     os.environ.setdefault("HYDRA_FULL_ERROR", "1")  # exceptions arrive here instead of being printed by Hydra
+    failures: list[str] = []
+
+    def job(config: DictConfig) -> None:
+        try:
+            command(config)
+        except ConfigError as error:  # a multirun goes on with its other jobs
+            failures.append(str(error))
+            print_error(str(error))
+
     try:
-        hydra.main(version_base="1.3", config_path=str(conf.resolve()), config_name=name)(command)()
+        hydra.main(version_base="1.3", config_path=str(conf.resolve()), config_name=name)(job)()
     except KeyboardInterrupt:
         print("interrupted; what is finished is kept, the same command goes on from there", file=sys.stderr)  # noqa: T201
         sys.exit(INTERRUPTED)
-    except ConfigError as error:
-        fail(str(error))
     except (HydraException, OmegaConfBaseException) as error:
         fail(explain(error, conf, name))
+    if failures:
+        sys.exit(USAGE_ERROR)
+
+
+def print_error(message: str) -> None:
+    """Print one line on stderr."""
+    print(f"error: {' '.join(message.split())}", file=sys.stderr, flush=True)  # noqa: T201
 
 
 def fail(message: str) -> None:
-    """Print one line and exit with 2."""
-    print(f"error: {' '.join(message.split())}", file=sys.stderr)  # noqa: T201
+    """Print one line on stderr and exit with 2."""
+    print_error(message)
     sys.exit(USAGE_ERROR)
 
 

@@ -12,13 +12,13 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import torch
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from dsr.app import rundir
 from dsr.app.build import build, pick_device, takes
-from dsr.app.schema import ConfigError, EvalConfig
+from dsr.app.schema import ConfigError, EvalConfig, plain_config
 from dsr.evaluation import Outcome, StalePredictionError, Study, one_line, predict, score
 from dsr.quality.lpips import LPIPS, TRUNK_URL, load_lpips
 from dsr.quality.scores import catalogue
@@ -43,8 +43,8 @@ def evaluate(config: DictConfig) -> pd.DataFrame:
         ConfigError: the configuration cannot be run, or a scene failed (the others' results are written).
 
     """
-    settings = _settings(config)
-    plain: dict[str, Any] = OmegaConf.to_container(config, resolve=True)  # type: ignore[assignment]
+    plain = plain_config(config)
+    settings = EvalConfig.of(plain)
     console = Console()
     if not console.is_terminal:
         console = Console(width=_LOG_WIDTH)
@@ -67,15 +67,6 @@ def evaluate(config: DictConfig) -> pd.DataFrame:
         count = f"{len(outcome.failures)} of {len(study.source.scenes())} scenes failed"
         raise ConfigError(f"{count}: {', '.join(outcome.failures)}; the others are in {folder}")
     return scores
-
-
-def _settings(config: DictConfig) -> EvalConfig:
-    """Return the checked configuration as plain Python."""
-    settings = OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(EvalConfig), config))
-    if not isinstance(settings, EvalConfig):
-        raise ConfigError(f"expected the configuration of eval.py, got {type(settings).__name__}")
-    settings.check()
-    return settings
 
 
 def _study(settings: EvalConfig, plain: Mapping[str, Any], device: torch.device) -> tuple[Study, dict[str, Any]]:

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
 from typing import Any
 
 from hydra.core.config_store import ConfigStore
-from omegaconf import MISSING
+from omegaconf import MISSING, DictConfig, OmegaConf
 
 from dsr.degrade import SCALES
 
@@ -45,6 +46,24 @@ class EvalConfig:
     output_dir: str | None = None
     overwrite: bool = False
 
+    @classmethod
+    def of(cls, plain: Mapping[str, Any]) -> EvalConfig:
+        """Return the checked settings of a composed configuration.
+
+        Raises:
+            ConfigError: a key is unknown or missing, or a value is not one of its choices.
+
+        """
+        names = [entry.name for entry in fields(cls)]
+        for key, value in plain.items():
+            if key not in names:
+                raise ConfigError(f"{key}: unknown key; expected {', '.join(names)}")
+            if value == MISSING:
+                raise ConfigError(f"{key}: missing; give it as {key}=...")
+        settings = cls(**{**plain, "metrics": MetricsConfig(**plain["metrics"])})
+        settings.check()
+        return settings
+
     def check(self) -> None:
         """Check the values that a type cannot.
 
@@ -58,6 +77,11 @@ class EvalConfig:
             raise ConfigError(f"precision: expected one of {', '.join(PRECISIONS)}, got {self.precision}")
         if self.seed < 0:
             raise ConfigError(f"seed: expected 0 or a positive number, got {self.seed}")
+
+
+def plain_config(config: DictConfig) -> dict[str, Any]:
+    """Return a composed configuration as plain Python, interpolations resolved; what is missing is "???"."""
+    return OmegaConf.to_container(config, resolve=True)  # type: ignore[return-value]
 
 
 def register() -> None:

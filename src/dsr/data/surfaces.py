@@ -1,0 +1,162 @@
+"""Surfaces that rays hit, in closed form: plane, sphere, box, cylinder.
+
+Frame: that of :mod:`dsr.geometry.camera` (x right, y down, z forward, metres). Points and directions are float64 arrays
+of shape (3, N).
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Field = Callable[[Array], Array]
+
+
+class Surface(ABC):
+    """An opaque surface seen from outside."""
+
+    @abstractmethod
+    def hit(self, origin: Array, direction: Array) -> Array:
+        """Return the smallest t > 0 with origin + t * direction on the surface, inf where there is none, shape (N,)."""
+
+    @abstractmethod
+    def normal(self, points: Array) -> Array:
+        """Return the outward unit normals at ``points`` on the surface, shape (3, N)."""
+
+    def visibility(self, origin: Array, direction: Array, spread: float) -> Array:
+        """Return how much of a light patch at origin + direction is seen, 0 to 1, shape (N,).
+
+        ``spread`` is the radius of the patch in metres; surfaces with a closed form treat the patch as a point.
+        """
+        return np.asarray(self.hit(origin, direction) >= 1, dtype=np.float64)
+
+    def openness(self, points: Array, normals: Array) -> Array:
+        """Return how much of the surroundings the surface leaves open at its ``points``, 0 to 1, shape (N,)."""
+        return np.ones(points.shape[1])
+
+
+@dataclass(frozen=True, eq=False)
+class Plane(Surface):
+    """The plane through ``point`` with the unit normal ``facing``, both of shape (3,)."""
+
+    point: Array
+    facing: Array
+
+    def hit(self, origin: Array, direction: Array) -> Array:
+        """Return where the rays meet the plane; rays along it or away from it never do."""
+        slope = self.facing @ direction
+        t = (self.facing @ self.point - self.facing @ origin) / np.where(slope < 0, slope, np.nan)
+        return np.where(t > 0, t, np.inf)
+
+    def normal(self, points: Array) -> Array:
+        """Return the one normal for every point."""
+        return np.broadcast_to(self.facing[:, None], points.shape)
+
+
+@dataclass(frozen=True, eq=False)
+class Convex(Surface):
+    """A convex body: a ray is inside it for one interval of its parameter.
+
+    Args:
+        centre: (3,) in metres.
+        axes: (3, 3) rotation whose columns are the body's own axes.
+
+    """
+
+    centre: Array
+    axes: Array
+
+    def local(self, points: Array) -> Array:
+        """Return ``points`` in the body's own frame, shape (3, N)."""
+        return self.axes.T @ (points - self.centre[:, None])
+
+    @abstractmethod
+    def span(self, origin: Array, direction: Array) -> tuple[Array, Array]:
+        """Return the parameters at which rays, in the body's own frame, enter and leave; enter > leave: a miss."""
+
+    @abstractmethod
+    def local_normal(self, points: Array) -> Array:
+        """Return the unit normals in the body's own frame, shape (3, N)."""
+
+    def hit(self, origin: Array, direction: Array) -> Array:
+        """Return where the rays enter the body."""
+        enter, leave = self.span(self.local(origin), self.axes.T @ direction)
+        return np.where((enter <= leave) & (enter > 0), enter, np.inf)
+
+    def normal(self, points: Array) -> Array:
+        """Return the outward unit normals."""
+        return self.axes @ self.local_normal(self.local(points))
+
+
+@dataclass(frozen=True, eq=False)
+class Sphere(Convex):
+    """A sphere of ``radius`` metres."""
+
+    radius: float
+
+    def span(self, origin: Array, direction: Array) -> tuple[Array, Array]:
+        """Return the roots of |origin + t direction| = radius."""
+        return _round_span(origin, direction, self.radius)
+
+    def local_normal(self, points: Array) -> Array:
+        """Return the directions from the centre."""
+        return points / np.sqrt((points**2).sum(0))
+
+
+@dataclass(frozen=True, eq=False)
+class Box(Convex):
+    """A box with the half edges ``half`` (3,) in metres."""
+
+    half: Array
+
+    def span(self, origin: Array, direction: Array) -> tuple[Array, Array]:
+        """Return the overlap of the three slabs."""
+        spans = [_slab_span(origin[i], direction[i], self.half[i]) for i in range(3)]
+        return np.maximum.reduce([s[0] for s in spans]), np.minimum.reduce([s[1] for s in spans])
+
+    def local_normal(self, points: Array) -> Array:
+        """Return the axis of the face nearest to each point."""
+        face = np.argmax(np.abs(points) - self.half[:, None], axis=0)
+        return np.where(np.arange(3)[:, None] == face, np.sign(points), 0.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Cylinder(Convex):
+    """A capped cylinder along its own y axis, ``radius`` and ``half`` height in metres."""
+
+    radius: float
+    half: float
+
+    def span(self, origin: Array, direction: Array) -> tuple[Array, Array]:
+        """Return the overlap of the endless cylinder and the slab between the caps."""
+        side = _round_span(origin[::2], direction[::2], self.radius)
+        caps = _slab_span(origin[1], direction[1], self.half)
+        return np.maximum(side[0], caps[0]), np.minimum(side[1], caps[1])
+
+    def local_normal(self, points: Array) -> Array:
+        """Return the axis on the caps and the direction from the axis on the side."""
+        across = np.maximum(np.hypot(points[0], points[2]), 1e-300)
+        cap = np.abs(points[1]) - self.half > across - self.radius
+        side = np.stack((points[0] / across, np.zeros_like(across), points[2] / across))
+        return np.where(cap, np.sign(points[1]) * np.array([[0.0], [1.0], [0.0]]), side)
+
+
+def _slab_span(origin: Array, direction: Array, half: float) -> tuple[Array, Array]:
+    """Return when |origin + t direction| <= half, all of shape (N,)."""
+    slope = np.where(direction == 0, 1e-300, direction)
+    middle, reach = -origin / slope, half / np.abs(slope)
+    return middle - reach, middle + reach
+
+
+def _round_span(origin: Array, direction: Array, radius: float) -> tuple[Array, Array]:
+    """Return when the length of origin + t direction (k, N) is <= radius; (inf, -inf) on a miss."""
+    square = np.maximum((direction**2).sum(0), 1e-300)
+    middle = -(origin * direction).sum(0) / square
+    nearest = ((origin + middle * direction) ** 2).sum(0)
+    reach = np.sqrt(np.maximum(radius**2 - nearest, 0) / square)
+    return np.where(nearest <= radius**2, middle - reach, np.inf), middle + reach

@@ -1,0 +1,282 @@
+"""MSG-Net, the multi-scale guided depth super-resolution network, and what goes in and comes out of it.
+
+Hui, Loy, Tang, *Depth Map Super-Resolution by Deep Multi-Scale Guidance*, ECCV 2016 (variant ``hui``), and the version
+that Voynov et al., *Perceptual Deep Depth Super-Resolution*, ICCV 2019, trained for renderings (variant ``voynov``).
+
+The network refines what is left of the normalised low-resolution disparity once its 3 x 3 mean is taken away, guided by
+a normalised intensity image; the mean itself is upsampled bicubically and added back. Everything here is plain torch:
+batched, differentiable, on any device, for any image size.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Literal, NamedTuple
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+VariantName = Literal["hui", "voynov"]
+SCALES = (2, 4, 8, 16)
+FEATURES = 32
+
+
+@dataclass(frozen=True)
+class MSGVariant:
+    """What tells the two published networks and their inputs apart.
+
+    Args:
+        name: the variant's name.
+        shared_slopes: each PReLU has a single slope, else one per channel.
+        activate_output: a PReLU follows the reconstruction too.
+        same_size: the output has scale * h rows, else scale * h - 1 (Caffe's transposed convolutions, which know no
+            output padding), and likewise columns; the guidance has the output's size.
+        rgb_weights, rgb_offset: guidance = weights . (R, G, B in 0..255) + offset, clipped to 0..255.
+        drift_compensation: the output's mean over a flat probe is taken off the output, see :func:`output_drift`.
+
+    """
+
+    name: VariantName
+    shared_slopes: bool
+    activate_output: bool
+    same_size: bool
+    rgb_weights: tuple[float, float, float]
+    rgb_offset: float
+    drift_compensation: bool
+
+
+VARIANTS = MappingProxyType(
+    {
+        # BT.601 luma with its 16..235 range.
+        "hui": MSGVariant("hui", False, False, False, (65.481 / 255, 128.553 / 255, 24.966 / 255), 16.0, False),
+        # The released code takes YCbCr's inverse for its forward transform; the weights were trained on this image.
+        "voynov": MSGVariant("voynov", True, True, True, (1.0, -0.34414, -0.71414), 128 * (0.34414 + 0.71414), True),
+    }
+)
+
+
+class ConvLayer(nn.Module):
+    """A convolution that keeps the size, or a transposed one that doubles it, and its PReLU."""
+
+    def __init__(self, conv: nn.Conv2d | nn.ConvTranspose2d, slopes: int) -> None:
+        """Put ``slopes`` (1, one per channel, or 0 for none) PReLU parameters behind ``conv``."""
+        super().__init__()
+        self.conv = conv
+        self.activation = nn.PReLU(slopes) if slopes else nn.Identity()
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Map (B, C_in, H, W) to (B, C_out, H', W')."""
+        x = self.conv(x)
+        # In place, without a second map of this size, but only where no gradient can ever be asked for.
+        if isinstance(self.activation, nn.PReLU) and self.activation.num_parameters == 1 and torch.is_inference(x):
+            return functional.leaky_relu_(x, float(self.activation.weight))
+        return self.activation(x)
+
+
+class Level(nn.Module):
+    """One doubling of the resolution: transposed convolution, fusion with the guidance, refinement."""
+
+    def __init__(self, up: ConvLayer, fuse: ConvLayer, refine: ConvLayer) -> None:
+        """Take the three layers."""
+        super().__init__()
+        self.up, self.fuse, self.refine = up, fuse, refine
+
+    def forward(self, depth: Tensor, guide: Tensor) -> Tensor:
+        """Map depth features (B, C, h, w) and guidance features (B, 32, H, W) to (B, 32, H, W), H about 2 h."""
+        return self.refine(self.fuse(torch.cat((guide, self.up(depth)), dim=1)))
+
+
+class MSGNet(nn.Module):
+    """The network of both variants; modules are registered in the order in which data passes them.
+
+    Args:
+        scale: upsampling factor, 2, 4, 8 or 16; log2(scale) levels.
+        variant: ``hui`` or ``voynov``.
+
+    """
+
+    def __init__(self, scale: int, variant: VariantName = "voynov") -> None:
+        super().__init__()
+        if scale not in SCALES:
+            raise ValueError(f"scale: expected one of {SCALES}, got {scale!r}")
+        if variant not in VARIANTS:
+            raise ValueError(f"variant: expected one of {', '.join(VARIANTS)}, got {variant!r}")
+        self.scale = scale
+        self.variant = VARIANTS[variant]
+        levels = scale.bit_length() - 1
+        self.guidance = nn.ModuleList([self._conv(1, 49, kernel=7), self._conv(49, FEATURES)])
+        self.guidance.extend(self._conv(FEATURES, FEATURES) for _ in range(levels - 1))
+        padding = 1 if self.variant.same_size else 0
+        self.pool = nn.MaxPool2d(3, stride=2, padding=padding, ceil_mode=not self.variant.same_size)
+        self.stem = self._conv(1, 2 * FEATURES)
+        self.levels = nn.ModuleList(
+            Level(self._up(first=i == 0), self._conv(2 * FEATURES, FEATURES), self._conv(FEATURES, FEATURES))
+            for i in range(levels)
+        )
+        self.smooth = self._conv(FEATURES, FEATURES)
+        self.reconstruct = self._conv(FEATURES, 1, active=self.variant.activate_output)
+
+    def forward(self, guidance: Tensor, depth: Tensor) -> Tensor:
+        """Map normalised inputs to the high-resolution residual.
+
+        Args:
+            guidance: (B, 1, H, W) of :func:`guidance_map`, the size being ``output_size`` of the depth's.
+            depth: (B, 1, h, w) normalised disparity minus its mean, see :func:`normalised`.
+
+        Returns:
+            (B, 1, H, W) residual, in units of the disparity's range.
+
+        """
+        if guidance.shape[-2:] != self.output_size(depth):
+            raise ValueError(
+                f"guidance: expected {tuple(self.output_size(depth))} for depth of {tuple(depth.shape[-2:])} at scale "
+                f"{self.scale} ({self.variant.name}), got {tuple(guidance.shape[-2:])}"
+            )
+        x = self.stem(depth)
+        for level, guide in zip(self.levels, reversed(self._pyramid(guidance)), strict=True):
+            x = level(x, guide)  # (B, 32, 2 h, 2 w), (B, 32, 4 h, 4 w), ...
+        return self.reconstruct(self.smooth(x))
+
+    def output_size(self, depth: Tensor) -> torch.Size:
+        """Return (H, W) for depth of (..., h, w)."""
+        lost = 0 if self.variant.same_size else 1
+        return torch.Size(self.scale * n - lost for n in depth.shape[-2:])
+
+    def rows_seen(self, rows: int) -> int:
+        """Return how many low-resolution rows (times scale, guidance rows) the outputs 0 .. ``rows`` - 1 depend on.
+
+        Holds for columns as well, and for the ``voynov`` variant's padding. Followed backwards from the output along
+        the depth branch: a 5 x 5 convolution needs 2 rows more, and output o of a transposed convolution reads inputs
+        up to (o + 2) // 2. The guidance branch never needs more than that, at any scale.
+        """
+        seen = rows + 4  # reconstruction, smoothing
+        for _ in self.levels:
+            seen = (seen + 4 + 1) // 2 + 1  # refinement and fusion, then the transposed convolution
+        return seen + 2
+
+    def _pyramid(self, guidance: Tensor) -> list[Tensor]:
+        """Return the guidance features from the full resolution down, (B, 32, H, W), (B, 32, H / 2, W / 2), ..."""
+        pyramid = [self.guidance[1](self.guidance[0](guidance))]
+        for layer in self.guidance[2:]:
+            pyramid.append(self.pool(layer(pyramid[-1])))
+        return pyramid
+
+    def _slopes(self, channels: int) -> int:
+        return 1 if self.variant.shared_slopes else channels
+
+    def _conv(self, before: int, after: int, *, kernel: int = 5, active: bool = True) -> ConvLayer:
+        conv = nn.Conv2d(before, after, kernel, padding=kernel // 2)
+        return ConvLayer(conv, self._slopes(after) if active else 0)
+
+    def _up(self, *, first: bool) -> ConvLayer:
+        padding = 2 if first or self.variant.same_size else 1
+        extra = 1 if self.variant.same_size else 0
+        before = 2 * FEATURES if first else FEATURES
+        conv = nn.ConvTranspose2d(before, FEATURES, 5, stride=2, padding=padding, output_padding=extra)
+        return ConvLayer(conv, self._slopes(FEATURES))
+
+
+class Normalised(NamedTuple):
+    """A map brought to 0..1 per sample, (B, 1, H, W), and the minimum and span (B, 1, 1, 1) to undo it with."""
+
+    values: Tensor
+    minimum: Tensor
+    span: Tensor
+
+
+def normalised(x: Tensor) -> Normalised:
+    """Return (x - min) / (max - min) per sample of (B, 1, H, W), over the finite values; the others become 0.
+
+    A constant map becomes 0 with a span of 0. Where nothing is finite the minimum is NaN.
+    """
+    known, dims = x.isfinite(), (-3, -2, -1)
+    least = x.masked_fill(~known, torch.inf).amin(dims, keepdim=True)
+    span = x.masked_fill(~known, -torch.inf).amax(dims, keepdim=True) - least  # -inf where nothing is finite
+    values = torch.where(known, x - least, 0) / torch.where(span > 0, span, 1)
+    return Normalised(values, torch.where(span >= 0, least, torch.nan), span)
+
+
+def mean3x3(x: Tensor) -> Tensor:
+    """Return the 3 x 3 mean of (B, 1, H, W); borders are mirrored, edge pixels repeated."""
+    return functional.avg_pool2d(functional.pad(x, (1, 1, 1, 1), mode="replicate"), 3, stride=1)
+
+
+def upsample_bicubic(x: Tensor, scale: int) -> Tensor:
+    """Upsample (B, 1, h, w) to (B, 1, scale h, scale w): Keys' cubic kernel with a = -0.5, as Pillow resizes.
+
+    Beyond the border the kernel is cut off and renormalised.
+    """
+    size = [scale * n for n in x.shape[-2:]]
+    return functional.interpolate(x, size=size, mode="bicubic", align_corners=False, antialias=True)
+
+
+def guidance_map(rgb: Tensor, variant: MSGVariant) -> Tensor:
+    """Return the guidance (B, 1, H, W), in 0..1, of a photo (B, 3, H, W) in 0..1.
+
+    An intensity (see :class:`MSGVariant`), normalised, less its 3 x 3 mean, normalised again.
+    """
+    weights = torch.tensor(variant.rgb_weights, dtype=rgb.dtype, device=rgb.device)[:, None, None]
+    intensity = ((255 * rgb * weights).sum(-3, keepdim=True) + variant.rgb_offset).clip(0, 255)
+    intensity = normalised(intensity).values
+    return normalised(intensity - mean3x3(intensity)).values
+
+
+def output_drift(net: MSGNet, guidance: Tensor, disparity: Tensor, *, crop: bool = True) -> Tensor:
+    """Return the constant that the network adds by itself, (B, 1, 1, 1).
+
+    The normalised disparity's first quarter of rows and columns is set to 0.5, and the network's output averaged over
+    rows h // 16 .. h // 4 - h // 16 and columns likewise, where h, w is the low-resolution size and the indices count
+    high-resolution pixels (so did the released code). 0 where that region is empty.
+
+    Args:
+        net: the network, of the ``voynov`` variant.
+        guidance: (B, 1, H, W) of :func:`guidance_map`.
+        disparity: (B, 1, h, w) of :func:`normalised`.
+        crop: run the network only on the inputs which those pixels see: the same value for far less work.
+
+    """
+    height, width = disparity.shape[-2:]
+    rows, columns = (slice(n // 16, n // 4 - n // 16) for n in (height, width))
+    if rows.stop <= rows.start or columns.stop <= columns.start:
+        return disparity.new_zeros((len(disparity), 1, 1, 1))
+    probe = disparity.clone()
+    probe[..., : height // 4, : width // 4] = 0.5
+    probe = probe - mean3x3(probe)
+    if crop:
+        height, width = (min(n, net.rows_seen(s.stop)) for n, s in ((height, rows), (width, columns)))
+    guidance = guidance[..., : net.scale * height, : net.scale * width]
+    output = residual(net, guidance, probe[..., :height, :width])
+    return output[..., rows, columns].mean((-2, -1), keepdim=True)
+
+
+def residual(net: MSGNet, guidance: Tensor, depth: Tensor) -> Tensor:
+    """Run the network in its own precision; the output has the dtype of ``depth``, at least float32."""
+    dtype = net.stem.conv.weight.dtype
+    return net(guidance.to(dtype), depth.to(dtype)).to(torch.promote_types(depth.dtype, torch.float32))
+
+
+def upsample_disparity(net: MSGNet, rgb: Tensor, disparity: Tensor, *, crop_drift: bool = True) -> Tensor:
+    """Upsample disparity with a photo's guidance.
+
+    Args:
+        net: the network.
+        rgb: (B, 3, H, W) in 0..1, with H = scale * h and W = scale * w.
+        disparity: (B, 1, h, w); non-finite values are holes.
+        crop_drift: see :func:`output_drift`.
+
+    Returns:
+        (B, 1, H, W) in the unit of the input, (B, 1, H - 1, W - 1) for the ``hui`` variant. It can be negative, and
+        is NaN for a sample without a finite value.
+
+    """
+    values, minimum, span = normalised(disparity)
+    low_pass = mean3x3(values)
+    height, width = net.output_size(values)
+    guidance = guidance_map(rgb, net.variant)[..., :height, :width]
+    output = residual(net, guidance, values - low_pass)
+    if net.variant.drift_compensation:
+        output = output - output_drift(net, guidance, values, crop=crop_drift)
+    output = output + upsample_bicubic(low_pass, net.scale)[..., :height, :width]
+    return output * span + minimum

@@ -1,0 +1,271 @@
+"""MSG-Net and its pre- and post-processing, against SciPy, Pillow and its own slow ways."""
+
+from __future__ import annotations
+
+import copy
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from scipy import ndimage
+from torch import Tensor
+
+from dsr.geometry.camera import Camera, from_range, to_range
+from dsr.methods.msg import MSG
+from dsr.methods.msg_net import (
+    SCALES,
+    VARIANTS,
+    MSGNet,
+    VariantName,
+    guidance_map,
+    mean3x3,
+    normalised,
+    output_drift,
+    upsample_bicubic,
+    upsample_disparity,
+)
+from dsr.sample import DepthSample
+
+
+def _net(scale: int, variant: VariantName = "voynov") -> MSGNet:
+    torch.manual_seed(scale)
+    return MSGNet(scale, variant).eval()
+
+
+def _scene(scale: int, height: int, width: int, batch: int = 1) -> tuple[Tensor, Tensor]:
+    """Return a photo and a coarse disparity map, random but smooth enough to resemble one."""
+    generator = torch.Generator().manual_seed(height + width)
+    rgb = torch.rand((batch, 3, scale * height, scale * width), generator=generator)
+    disparity = 20 + 5 * torch.rand((batch, 1, height, width), generator=generator, dtype=torch.float64)
+    return rgb, disparity
+
+
+def _sample(scale: int, height: int, width: int, doffs: float = 0.0) -> DepthSample:
+    rgb, disparity = _scene(scale, height, width)
+    camera = Camera(scale * width, scale * height, 600.0, 600.0, 3.0, 4.0, baseline=0.2, doffs=doffs)
+    coarse = camera.rescale(width, height)
+    depth = from_range(disparity[0] / scale, coarse, "disparity")
+    return DepthSample("test", "scene", rgb[0], depth, camera, coarse, scale)
+
+
+@pytest.mark.parametrize(("scale", "parameters"), [(4, 326_015), (8, 454_147)])
+def test_the_voynov_network_has_the_published_number_of_parameters(scale: int, parameters: int) -> None:
+    assert sum(value.numel() for value in MSGNet(scale).parameters()) == parameters
+
+
+@pytest.mark.parametrize("scale", SCALES)
+@pytest.mark.parametrize("size", [(1, 3), (5, 4)])
+def test_the_voynov_network_covers_every_pixel_and_the_hui_network_all_but_the_last(
+    scale: int, size: tuple[int, int]
+) -> None:
+    rgb, disparity = _scene(scale, *size, batch=2)
+    rows, columns = (scale * n for n in size)
+    assert upsample_disparity(_net(scale), rgb, disparity).shape == (2, 1, rows, columns)
+    assert upsample_disparity(_net(scale, "hui"), rgb, disparity).shape == (2, 1, rows - 1, columns - 1)
+
+
+def test_the_hui_networks_sizes_are_caffes_511_255_127() -> None:
+    net = _net(8, "hui")
+    with torch.inference_mode():
+        pyramid = net._pyramid(torch.zeros(1, 1, 511, 39))
+        assert [tuple(features.shape[-2:]) for features in pyramid] == [(511, 39), (255, 19), (127, 9)]
+        assert net(torch.zeros(1, 1, 511, 39), torch.zeros(1, 1, 64, 5)).shape == (1, 1, 511, 39)
+
+
+def test_a_guidance_of_another_size_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"guidance: expected \(32, 32\).*got \(31, 32\)"):
+        _net(4)(torch.zeros(1, 1, 31, 32), torch.zeros(1, 1, 8, 8))
+
+
+def test_an_unknown_scale_or_variant_is_refused() -> None:
+    with pytest.raises(ValueError, match="scale: expected one of"):
+        MSGNet(3)
+    with pytest.raises(ValueError, match="variant: expected one of hui, voynov, got 'caffe'"):
+        MSGNet(4, "caffe")  # type: ignore[arg-type]
+
+
+def test_the_3x3_mean_is_scipys_with_mirrored_borders() -> None:
+    x = torch.rand(2, 1, 5, 7, dtype=torch.float64)
+    expected = [ndimage.convolve(image, np.full((3, 3), 1 / 9), mode="reflect") for image in x[:, 0].numpy()]
+    torch.testing.assert_close(mean3x3(x)[:, 0], torch.from_numpy(np.stack(expected)))
+
+
+@pytest.mark.parametrize("scale", [2, 4, 8])
+def test_bicubic_upsampling_is_pillows_on_a_float_image(scale: int) -> None:
+    image = np.random.default_rng(0).random((6, 9), dtype=np.float32)
+    expected = np.asarray(Image.fromarray(image).resize((9 * scale, 6 * scale), Image.Resampling.BICUBIC))
+    ours = upsample_bicubic(torch.from_numpy(image)[None, None], scale)[0, 0]
+    torch.testing.assert_close(ours, torch.from_numpy(expected.copy()), rtol=0, atol=1e-6)
+
+
+def test_normalisation_is_per_sample_over_finite_values_and_holes_become_0() -> None:
+    x = torch.tensor([[2.0, torch.nan, 6.0], [3.0, torch.inf, 4.0]])[:, None, None]
+    values, minimum, span = normalised(x)
+    assert values[:, 0, 0].tolist() == [[0, 0, 1], [0, 0, 1]]
+    assert (minimum.flatten().tolist(), span.flatten().tolist()) == ([2, 3], [4, 1])
+
+
+@pytest.mark.parametrize("variant", list(VARIANTS))
+def test_a_constant_map_stays_constant_and_a_map_without_values_becomes_holes(variant: VariantName) -> None:
+    rgb, disparity = torch.full((2, 3, 64, 64), 0.3), torch.full((2, 1, 16, 16), 7.0, dtype=torch.float64)
+    disparity[1] = torch.nan
+    fine = upsample_disparity(_net(4, variant), rgb, disparity)
+    assert bool((fine[0] == 7).all())
+    assert bool(fine[1].isnan().all())
+
+
+def test_guidance_of_the_hui_variant_is_bt601_luma_less_its_mean() -> None:
+    rgb = torch.rand(1, 3, 6, 5, dtype=torch.float64)
+    red, green, blue = rgb[0].numpy()
+    luma = 16 + 65.481 * red + 128.553 * green + 24.966 * blue
+    luma = (luma - luma.min()) / (luma.max() - luma.min())
+    luma -= ndimage.uniform_filter(luma, 3, mode="reflect")
+    expected = (luma - luma.min()) / (luma.max() - luma.min())
+    torch.testing.assert_close(guidance_map(rgb, VARIANTS["hui"])[0, 0], torch.from_numpy(expected))
+
+
+def test_guidance_of_the_voynov_variant_is_the_released_codes_clipped_red() -> None:
+    rgb = torch.rand(1, 3, 6, 5, dtype=torch.float64)
+    red, green, blue = 255 * rgb[0].numpy()
+    luma = np.clip(red - 0.34414 * (green - 128) - 0.71414 * (blue - 128), 0, 255)
+    luma = (luma - luma.min()) / (luma.max() - luma.min())
+    luma -= ndimage.uniform_filter(luma, 3, mode="reflect")
+    expected = (luma - luma.min()) / (luma.max() - luma.min())
+    torch.testing.assert_close(guidance_map(rgb, VARIANTS["voynov"])[0, 0], torch.from_numpy(expected))
+
+
+@pytest.mark.parametrize("variant", list(VARIANTS))
+def test_a_batch_of_two_equals_two_singles(variant: VariantName) -> None:
+    net, (rgb, disparity) = _net(4, variant), _scene(4, 20, 17, batch=2)
+    disparity[1] *= 3
+    disparity[1, 0, 2, 3] = torch.nan
+    with torch.inference_mode():
+        together = upsample_disparity(net, rgb, disparity)
+        alone = torch.cat([upsample_disparity(net, rgb[i : i + 1], disparity[i : i + 1]) for i in range(2)])
+    torch.testing.assert_close(together, alone, rtol=0, atol=1e-4)  # of a range of 15
+
+
+def test_pre_and_postprocessing_have_the_gradients_of_finite_differences() -> None:
+    rgb, disparity = _scene(2, 3, 4)
+    disparity[0, 0, 1, 2] = torch.nan
+    known = disparity.isfinite()
+
+    def around_an_absent_network(rgb: Tensor, values: Tensor) -> Tensor:
+        filled = torch.full_like(disparity, torch.nan).masked_scatter(known, values)
+        low, minimum, span = normalised(filled)
+        outside = upsample_bicubic(mean3x3(low), 2) * guidance_map(rgb, VARIANTS["voynov"])
+        return outside * span + minimum
+
+    inputs = (rgb.double().requires_grad_(), disparity[known].requires_grad_())
+    assert torch.autograd.gradcheck(around_an_absent_network, inputs)
+
+
+def test_training_reaches_every_parameter_also_around_holes() -> None:
+    net, (rgb, disparity) = _net(4).train(), _scene(4, 16, 16)
+    disparity[0, 0, 2, 2] = torch.nan
+    upsample_disparity(net, rgb, disparity.requires_grad_()).square().mean().backward()
+    gradients = [disparity.grad, *(value.grad for value in net.parameters())]
+    assert all(gradient is not None and bool(gradient.isfinite().all()) for gradient in gradients)
+
+
+@pytest.mark.parametrize(
+    ("scale", "height", "width"),
+    [(2, 40, 90), (4, 64, 40), (4, 16, 33), (4, 9, 90), (4, 20, 20), (8, 40, 30), (8, 8, 8), (16, 20, 16), (4, 4, 4)],
+)
+def test_drift_of_the_crop_is_that_of_the_whole_image(scale: int, height: int, width: int) -> None:
+    net, (rgb, disparity) = _net(scale), _scene(scale, height, width, batch=2)
+    guidance, values = guidance_map(rgb, net.variant), normalised(disparity).values
+    with torch.inference_mode():
+        fast, slow = (output_drift(net, guidance, values, crop=crop) for crop in (True, False))
+    assert slow.shape == (2, 1, 1, 1)
+    torch.testing.assert_close(fast, slow, rtol=0, atol=1e-6)
+
+
+def test_drift_is_the_mean_of_the_output_for_a_probe_of_one_half() -> None:
+    net, (rgb, disparity) = _net(4), _scene(4, 32, 48)
+    guidance, probe = guidance_map(rgb, net.variant), normalised(disparity).values
+    with torch.inference_mode():
+        drift = output_drift(net, guidance, probe)
+        probe[..., :8, :12] = 0.5
+        low_pass = torch.from_numpy(ndimage.convolve(probe[0, 0].numpy(), np.full((3, 3), 1 / 9), mode="reflect"))
+        output = net(guidance, (probe - low_pass).float())
+    assert drift.item() == pytest.approx(output[0, 0, 2:6, 3:9].mean().item(), abs=1e-6)
+
+
+def test_drift_is_0_where_its_region_is_empty() -> None:
+    net, (rgb, disparity) = _net(4), _scene(4, 3, 40)
+    assert output_drift(net, guidance_map(rgb, net.variant), normalised(disparity).values).tolist() == [[[[0.0]]]]
+
+
+@pytest.mark.parametrize("scale", SCALES)
+@pytest.mark.parametrize("rows", [1, 4, 7])
+def test_outputs_depend_on_no_input_beyond_the_rows_seen(scale: int, rows: int) -> None:
+    net = _net(scale).double()
+    seen = net.rows_seen(rows)
+    height = seen + 6
+    guidance = torch.rand(1, 1, scale * height, scale, dtype=torch.float64, requires_grad=True)
+    depth = torch.rand(1, 1, height, 1, dtype=torch.float64, requires_grad=True)
+    net(guidance, depth)[..., :rows, :].square().sum().backward()
+    assert guidance.grad is not None
+    assert depth.grad is not None
+    used = [int(grad.abs().sum((0, 1, 3)).nonzero().max()) + 1 for grad in (guidance.grad, depth.grad)]
+    assert used[0] <= scale * seen
+    assert used[1] == seen
+
+
+@pytest.mark.parametrize("variant", list(VARIANTS))
+def test_channels_last_and_inference_mode_change_nothing(variant: VariantName) -> None:
+    net, (rgb, disparity) = _net(4, variant), _scene(4, 24, 31)
+    with torch.no_grad():
+        plain = upsample_disparity(net, rgb, disparity, crop_drift=False)
+    fast = copy.deepcopy(net).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    with torch.inference_mode():
+        torch.testing.assert_close(upsample_disparity(fast, rgb, disparity), plain, rtol=0, atol=1e-5 * 5)
+
+
+@pytest.mark.parametrize("variant", ["hui", "voynov"])
+def test_bfloat16_stays_within_a_thousandth_of_the_range(variant: VariantName) -> None:
+    sample, net = _sample(4, 32, 40), _net(4, variant)
+    exact = to_range(MSG(net)(sample), sample.camera, "disparity")
+    rounded = to_range(MSG(net, "bfloat16")(sample), sample.camera, "disparity")
+    assert bool((exact.isnan() == rounded.isnan()).all())
+    difference = (exact - rounded).nan_to_num().abs() / 5
+    assert 0 < float(difference.max()) < 0.001  # 0.0002 measured
+
+
+@pytest.mark.parametrize("doffs", [0.0, 30.0])
+def test_the_method_keeps_a_plane_at_its_depth_with_and_without_a_disparity_offset(doffs: float) -> None:
+    sample = _sample(4, 8, 8, doffs)
+    flat = DepthSample("test", "flat", sample.rgb, torch.full((1, 8, 8), 2.5), sample.camera, sample.camera_lr, 4)
+    depth = MSG(_net(4))(flat)
+    assert depth.shape == (1, 32, 32)
+    torch.testing.assert_close(depth, torch.full_like(depth, 2.5))
+
+
+def test_the_hui_method_leaves_its_last_row_and_column_as_holes() -> None:
+    depth = MSG(_net(4, "hui"))(_sample(4, 8, 9))
+    assert depth.shape == (1, 32, 36)
+    assert bool(depth[0, -1].isnan().all())
+    assert bool(depth[0, :, -1].isnan().all())
+    assert bool(depth[0, :-1, :-1].isfinite().all())
+
+
+def test_disparity_that_is_not_positive_becomes_a_hole() -> None:
+    net = _net(4, "hui")
+    torch.nn.init.constant_(net.get_parameter("reconstruct.conv.bias"), -100.0)
+    assert bool(MSG(net)(_sample(4, 8, 8)).isnan().all())
+
+
+def test_the_method_leaves_the_network_that_it_was_given_alone() -> None:
+    net = MSGNet(4).train()
+    MSG(net, "bfloat16")
+    assert net.training
+    assert all(value.dtype == torch.float32 and value.requires_grad for value in net.parameters())
+
+
+def test_a_sample_of_another_scale_or_an_unknown_precision_is_refused() -> None:
+    with pytest.raises(ValueError, match="scene: expected scale 4, the network's, got 2"):
+        MSG(_net(4))(_sample(2, 8, 8))
+    with pytest.raises(ValueError, match="precision: expected one of float32, bfloat16, got 'float16'"):
+        MSG(_net(4), "float16")  # type: ignore[arg-type]
