@@ -35,14 +35,24 @@ class SurfacePair:
     Args:
         prediction, target: (B, 1, H, W) orthogonal depth in metres; NaN is a hole.
         rays: (B or 1, 3, H, W) rays with z = 1, see :meth:`dsr.geometry.camera.Camera.rays`.
-        mask: (B, 1, H, W) bool, further pixels to leave out; None for none.
+        mask: (B, 1, H, W) bool, the pixels to look at; None for all.
+        image_dtype: of normals and renderings, None for the depth's. float32 halves the time that they take and moves
+            scores by about 1e-7; depths and their differences stay in their own dtype.
 
     Raises:
         ValueError: shapes or types do not fit together.
 
     """
 
-    def __init__(self, prediction: Tensor, target: Tensor, rays: Tensor, mask: Tensor | None = None) -> None:
+    def __init__(
+        self,
+        prediction: Tensor,
+        target: Tensor,
+        rays: Tensor,
+        mask: Tensor | None = None,
+        *,
+        image_dtype: torch.dtype | None = None,
+    ) -> None:
         if prediction.dim() != 4 or prediction.shape[1] != 1 or prediction.shape != target.shape:
             raise ValueError(
                 "prediction, target: expected two depth maps of shape (B, 1, H, W), "
@@ -59,6 +69,7 @@ class SurfacePair:
         self.depth_mask = known if mask is None else known & mask
         self.complete = bool(self.depth_mask.all())
         self.rays = rays.to(target.dtype)
+        self.image_dtype = image_dtype or target.dtype
         self.prediction, self.target = prediction, target
         if not self.complete:  # a finite stand-in keeps NaN out of sums and gradients
             self.prediction = torch.where(self.depth_mask, prediction, 1.0)
@@ -67,7 +78,8 @@ class SurfacePair:
     @cached_property
     def normals(self) -> tuple[Tensor, Tensor]:
         """The two normal maps, (B, 3, H, W); meaningful where ``normal_mask`` is set."""
-        return normals_of(self.prediction, self.rays), normals_of(self.target, self.rays)
+        first, second = (normals_of(depth, self.rays, self.image_dtype) for depth in (self.prediction, self.target))
+        return first, second
 
     @cached_property
     def normal_mask(self) -> Tensor:
@@ -77,7 +89,7 @@ class SurfacePair:
     @cached_property
     def shadings(self) -> tuple[Tensor, Tensor]:
         """The two maps of e . n for the four lights, (B, 4, H, W), unclipped; 0 where unknown."""
-        directions = lights(dtype=self.target.dtype, device=self.target.device)
+        directions = lights(dtype=self.image_dtype, device=self.target.device)
         first, second = (shade(normals, directions) for normals in self.normals)
         return self._blank(first), self._blank(second)
 
@@ -188,7 +200,7 @@ def bumpiness_d(pair: SurfacePair) -> Tensor:
     Metric of the 4D light field benchmark (Honauer et al. 2016), with k in px m as if its camera had seen the scene.
     Derivatives are Scharr filters, 0 on the map's outermost pixel after each.
     """
-    difference = BUMPINESS_DISPARITY * (1 / pair.prediction - 1 / pair.target)
+    difference = (BUMPINESS_DISPARITY * (1 / pair.prediction - 1 / pair.target)).to(pair.image_dtype)
     if not pair.complete:
         difference = difference * pair.depth_mask
     along_v, along_u = _scharr(difference)
@@ -207,14 +219,15 @@ def _mean(values: Tensor, mask: Tensor) -> Tensor:
 
 def _ssim_map(x: Tensor, y: Tensor) -> Tensor:
     """Return SSIM at every window inside the map, (B, H, W) -> (B, H - 6, W - 6)."""
+    # With sums over N pixels in place of means, numerators and denominators each times N (N - 1) N^2 / 4 or so:
     area = SSIM_WINDOW**2
-    to_sample_covariance = area / (area - 1)
-    c1, c2 = (0.01 * SSIM_DATA_RANGE) ** 2, (0.03 * SSIM_DATA_RANGE) ** 2
-    mean_x, mean_y = _window_sum(x) / area, _window_sum(y) / area
-    product, squares = mean_x * mean_y, mean_x.square() + mean_y.square()
-    covariance = to_sample_covariance * (_window_sum(x * y) / area - product)
-    variances = to_sample_covariance * (_window_sum(x.square() + y.square()) / area - squares)
-    return (2 * product + c1) * (2 * covariance + c2) / ((squares + c1) * (variances + c2))
+    c1 = (0.01 * SSIM_DATA_RANGE) ** 2 * area**2
+    c2 = (0.03 * SSIM_DATA_RANGE) ** 2 * area * (area - 1)  # N - 1: sample covariance
+    sum_x, sum_y = _window_sum(x), _window_sum(y)
+    product, squares = sum_x * sum_y, torch.addcmul(sum_x.square(), sum_y, sum_y)
+    covariance = c2 / 2 - torch.sub(product, _window_sum(x * y), alpha=area)
+    variances = c2 - torch.sub(squares, _window_sum(torch.addcmul(x.square(), y, y)), alpha=area)
+    return 4 * (product + c1 / 2) * covariance / ((squares + c1) * variances)
 
 
 def _window_sum(values: Tensor) -> Tensor:

@@ -45,6 +45,8 @@ class Metric:
 
     def share(self, pair: SurfacePair) -> Tensor:
         """Return the share of the pixels that the metric would use in a complete map and that are known, (B,)."""
+        if pair.complete:
+            return torch.ones(len(pair.target), dtype=torch.float64)
         return self.mask(pair).double().mean(dim=(-3, -2, -1))
 
 
@@ -115,7 +117,7 @@ def score_image(prediction: Tensor, target: Tensor, rays: Tensor, metrics: tuple
     rows, columns = _covered(prediction)
     kept = (rows.stop - rows.start) * (columns.stop - columns.start) / target.numel()
     window = (..., rows, columns)
-    pair = SurfacePair(prediction[window][None], target[window][None], rays[window][None])
+    pair = SurfacePair(prediction[window][None], target[window][None], rays[window][None], image_dtype=torch.float32)
     for metric in metrics:
         share = metric.share(pair).item() * kept
         for variant, value in metric.variants(pair).items():
