@@ -26,9 +26,9 @@ def normals_of(depth: Tensor, rays: Tensor, dtype: torch.dtype | None = None) ->
     First-order forward differences along u and v, the last column's and row's differences repeated:
     n = dP/dv x dP/du, normalised (Voynov et al. 2019, section 3, with the border as its authors evaluate it).
 
-    For a pinhole camera the product is known in closed form. With z' and z'' the depths of the neighbours along u and v,
-    it is, up to a positive factor, n = (fx (z' - z) z'', fy (z'' - z) z', -z' z'' - x n_x - y n_y), as n . r = -z' z''.
-    Unlike differences of points this loses no digits but in z' - z itself.
+    For a pinhole camera the product is known in closed form. With z' and z'' the depths of the neighbours along u and
+    v it is, up to a positive factor, n = (fx (z' - z) z'', fy (z'' - z) z', -z' z'' - x n_x - y n_y), as
+    n . r = -z' z''. Unlike differences of points this loses no digits but in z' - z itself.
 
     Args:
         depth: (B, 1, H, W) orthogonal depth in metres, H and W at least 2. Where it is NaN
