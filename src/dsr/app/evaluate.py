@@ -93,7 +93,7 @@ def _weights(settings: EvalConfig) -> Path | None:
     name = settings.method["name"]
     given = None if settings.weights is None else Path(settings.weights).expanduser()
     if not takes("method", settings.method, "weights"):
-        if given is not None:
+        if given is not None and not given.is_dir():  # a directory serves all methods of a multirun
             print(f"note: method={name} has no weights; weights={given} is not used", file=sys.stderr)  # noqa: T201
         return None
     file = settings.method.get("weights_file")
