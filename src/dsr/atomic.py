@@ -1,4 +1,4 @@
-"""Files that appear whole or not at all."""
+"""Files that appear whole or not at all, and archives of arrays that are read whole or refused."""
 
 from __future__ import annotations
 
@@ -7,6 +7,8 @@ import os
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
+
+import numpy as np
 
 
 @contextlib.contextmanager
@@ -25,6 +27,21 @@ def replacing(path: Path) -> Iterator[Path]:
         temporary.replace(path)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def read_arrays(path: Path) -> dict[str, np.ndarray]:
+    """Return the arrays of an ``.npz`` file.
+
+    Raises:
+        FileNotFoundError: there is none.
+        ValueError: it is damaged or something else.
+
+    """
+    with path.open("rb") as file:
+        try:
+            return dict(np.load(file).items())
+        except Exception as error:  # a damaged archive makes NumPy raise BadZipFile, EOFError, zlib.error, ...
+            raise ValueError(f"{path}: expected an archive of arrays, got a damaged or foreign file") from error
 
 
 def write_text(path: Path, text: str) -> None:

@@ -175,6 +175,7 @@ def make_sample(scene: Scene, scale: int, downsampling: Downsampling | Measured,
     if range_type == "disparity":  # in the coarse camera's pixels
         fine = fine / scale
     coarse = from_range(downsampling(fine, scale), coarse_camera, range_type)
+    coarse = torch.where(coarse > 0, coarse, torch.nan)  # bicubic may undershoot beside a depth step
     return DepthSample(scene.dataset, scene.name, rgb, coarse, camera, coarse_camera, scale, depth, notes)
 
 

@@ -1,15 +1,15 @@
 """Evaluation in two passes: predictions to files, then scores from files.
 
-A prediction is ``predictions/SCENE.npz``: ``depth`` (H, W) in metres, NaN in holes, and ``config``, a JSON text of all
-that it came from. A prediction whose stored config is the wanted one is not made again, so an interrupted run goes on
-where it stopped. One scene that fails does not keep the others from their results.
+A prediction is ``predictions/SCENE.npz``: ``depth`` (H, W) in metres, NaN in holes; ``config``, a JSON text of all that
+it came from; and the ``seconds`` that it took. A prediction whose stored config is the wanted one is not made again, so
+an interrupted run goes on where it stopped. One scene that fails does not keep the others from their results.
 """
 
 from __future__ import annotations
 
 import json
+import re
 import time
-import zipfile
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -20,7 +20,7 @@ import pandas as pd
 import torch
 from torch import Tensor
 
-from dsr.atomic import replacing, write_text
+from dsr.atomic import read_arrays, replacing, write_text
 from dsr.data.base import SceneSource
 from dsr.degrade import Downsampling, Measured, make_sample
 from dsr.methods.base import Upsampler
@@ -133,15 +133,17 @@ def predict(study: Study, folder: Path, progress: Progress, *, overwrite: bool =
         path = prediction_path(folder, scene)
         try:
             config = study.stored_config(scene)
-            if not overwrite and _is_current(path, config):
+            seconds = None if overwrite else _seconds_of_current(path, config)
+            if seconds is None:
+                outcome.seconds[scene] = _predict_scene(study, scene, path, config)
+                outcome.made.append(scene)
+            else:
+                outcome.seconds[scene] = seconds
                 outcome.reused.append(scene)
-                continue
-            outcome.seconds[scene] = _predict_scene(study, scene, path, config, outcome)
-            outcome.made.append(scene)
         except StalePredictionError:
             raise
         except (ValueError, OSError) as error:
-            outcome.failures[scene] = one_line(error)
+            outcome.failures[scene] = _failure(scene, error)
     return outcome
 
 
@@ -173,15 +175,14 @@ def score(
             sample = study.sample(scene)
             depth = load_prediction(prediction_path(folder, scene))
             new = list(_score_scene(study, sample, depth, metrics))
+            rows += new
+            if sample.depth is None:
+                outcome.unscored.append(scene)
+            if sample.notes:
+                outcome.notes[scene] = list(sample.notes)
+            illustrate(sample, depth, {row["metric"]: row["value"] for row in new if row["variant"] in ("", WORST)})
         except (ValueError, OSError) as error:
-            outcome.failures[scene] = one_line(error)
-            continue
-        if sample.depth is None:
-            outcome.unscored.append(scene)
-        if sample.notes:
-            outcome.notes[scene] = list(sample.notes)
-        rows += new
-        illustrate(sample, depth, {row["metric"]: row["value"] for row in new if row["variant"] in ("", WORST)})
+            outcome.failures[scene] = _failure(scene, error)
     scores = pd.DataFrame(rows, columns=list(SCORE_COLUMNS))
     with replacing(folder / "scores.csv") as temporary:
         scores.to_csv(temporary, index=False)
@@ -223,10 +224,9 @@ def load_prediction(path: Path) -> Tensor:
 
     """
     try:
-        with np.load(path) as kept:
-            return torch.from_numpy(kept["depth"])[None]
-    except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:
-        raise ValueError(f"{path}: expected a prediction, got a missing or damaged file ({one_line(error)})") from error
+        return torch.from_numpy(read_arrays(path)["depth"])[None]
+    except (OSError, KeyError, ValueError, TypeError) as error:
+        raise ValueError(f"{path}: expected a prediction, got a missing or damaged file") from error
 
 
 def one_line(error: BaseException) -> str:
@@ -234,25 +234,32 @@ def one_line(error: BaseException) -> str:
     return " ".join(str(error).split()) or type(error).__name__
 
 
-def _is_current(path: Path, config: Mapping[str, Any]) -> bool:
-    """Return whether the prediction on disk was made from ``config``."""
+def _failure(scene: str, error: BaseException) -> str:
+    """Return an error's message on one line that names the scene."""
+    message = one_line(error)
+    named = re.search(rf"(^|[/\\]){re.escape(scene)}[/\\:.]", message)  # first, or in a path
+    return message if named else f"{scene}: {message}"
+
+
+def _seconds_of_current(path: Path, config: Mapping[str, Any]) -> float | None:
+    """Return how long the prediction on disk took if it was made from ``config``; None if there is none."""
     try:
-        with np.load(path) as kept:
-            stored = json.loads(str(kept["config"]))
+        arrays = read_arrays(path)
+        stored, seconds = dict(json.loads(str(arrays["config"]))), float(arrays["seconds"])
     except FileNotFoundError:
-        return False
-    except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile):
+        return None
+    except (OSError, KeyError, ValueError, TypeError):
         raise StalePredictionError(f"{path}: damaged; overwrite=true makes it anew") from None
     wanted = json.loads(json.dumps(config))
     if stored == wanted:
-        return True
+        return seconds
     changed = sorted(key for key in stored.keys() | wanted.keys() if stored.get(key) != wanted.get(key))
     raise StalePredictionError(
         f"{path}: made with another {', '.join(changed)}; overwrite=true replaces it, another output_dir keeps it"
     )
 
 
-def _predict_scene(study: Study, scene: str, path: Path, config: Mapping[str, Any], outcome: Outcome) -> float:
+def _predict_scene(study: Study, scene: str, path: Path, config: Mapping[str, Any]) -> float:
     """Compute and write one prediction; return the seconds that the method took."""
     sample = study.sample(scene)
     start = time.perf_counter()
@@ -262,7 +269,9 @@ def _predict_scene(study: Study, scene: str, path: Path, config: Mapping[str, An
     if tuple(depth.shape) != expected:
         raise ValueError(f"{scene}: {study.method_name} gave depth of shape {tuple(depth.shape)}, expected {expected}")
     with replacing(path) as temporary:
-        np.savez_compressed(temporary, depth=depth[0].cpu().numpy(), config=json.dumps(dict(config), sort_keys=True))
+        np.savez_compressed(
+            temporary, depth=depth[0].cpu().numpy(), config=json.dumps(dict(config), sort_keys=True), seconds=seconds
+        )
     return seconds
 
 

@@ -45,6 +45,8 @@ class Scene:
         if self.depth is not None:
             _expect_depth(self.name, "depth", self.depth, (self.camera.height, self.camera.width))
         for factor, coarse in self.measured.items():
+            if factor < 1:
+                raise ValueError(f"{self.name}: measured: expected a positive factor, got {factor}")
             size = (self.camera.height // factor, self.camera.width // factor)
             _expect_depth(self.name, f"measured depth at x{factor}", coarse, size)
 
@@ -81,6 +83,8 @@ class DepthSample:
     def __post_init__(self) -> None:
         """Check shapes, value ranges and cameras against each other."""
         _expect_rgb(self.scene, self.rgb, self.camera)
+        if self.scale < 1:
+            raise ValueError(f"{self.scene}: scale: expected a positive whole number, got {self.scale}")
         size, coarse_size = (self.camera.height, self.camera.width), (self.camera_lr.height, self.camera_lr.width)
         if (coarse_size[0] * self.scale, coarse_size[1] * self.scale) != size:
             raise ValueError(

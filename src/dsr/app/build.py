@@ -69,7 +69,7 @@ def pick_device(name: str) -> torch.device:
         return torch.device("cuda" if torch.cuda.is_available() else "cpu")
     try:
         device = torch.device(name)
-        torch.empty(0, device=device)
+        torch.zeros(1, device=device).item()
     except (RuntimeError, AssertionError, NotImplementedError) as error:  # each backend has its own way to refuse
         raise ConfigError(f"device: expected auto, cpu or a device of this machine, got {name!r}") from error
     return device
@@ -82,9 +82,12 @@ def _load(group: str, node: Mapping[str, Any]) -> Any:
         raise ConfigError(f"{group}.target: expected module.name of a class or function, got {path!r}")
     module, _, name = path.rpartition(".")
     try:
-        return getattr(importlib.import_module(module), name)
-    except (ImportError, AttributeError) as error:
+        target = getattr(importlib.import_module(module), name)
+    except (ImportError, AttributeError, TypeError, ValueError) as error:
         raise ConfigError(f"{group}.target: cannot import {path!r} ({error})") from error
+    if not callable(target):
+        raise ConfigError(f"{group}.target: expected a class or function, {path!r} is none")
+    return target
 
 
 def _fits(value: Any, hint: Any) -> bool:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import hydra
-from hydra.errors import HydraException, MissingConfigException
+from hydra.errors import HydraException, MissingConfigException, OverrideParseException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
@@ -36,6 +36,7 @@ def run_command(conf: Path, name: str, command: Callable[[DictConfig], Any]) -> 
         fail(f"{conf}: expected the directory of the configuration files; run the command in a checkout of the project")
     os.environ.setdefault("HYDRA_FULL_ERROR", "1")  # exceptions arrive here instead of being printed by Hydra
     failures: list[str] = []
+    _expect_choices(conf)
 
     def job(config: DictConfig) -> None:
         try:
@@ -69,13 +70,21 @@ def fail(message: str) -> None:
 def explain(error: Exception, conf: Path, name: str) -> str:
     """Return what is wrong with a configuration, on one line, with the choices where a name is mistyped."""
     if isinstance(error, MissingConfigException) and error.missing_cfg_file is not None:
-        group, _, choice = str(error.missing_cfg_file).rpartition("/")
-        files = sorted(path.stem for path in (conf / group).glob("*.yaml")) if group else []
-        if files:
-            return f"{group}={choice}: unknown; expected one of {', '.join(files)}"
-        groups = ", ".join(sorted(path.name for path in conf.iterdir() if path.is_dir()))
-        return f"{group or choice}: no such group of choices; expected one of {groups}"
+        return _explain_missing(str(error.missing_cfg_file), conf, name)
+    if isinstance(error, OverrideParseException):
+        return _explain_syntax(error.override)
     text = " ".join(str(error).split())
+    several = re.match(r"Ambiguous value for argument '([^=]+)=(.*?)' 1\.", text)
+    if several:
+        key, values = several.groups()
+        return (
+            f"{key}: got several values; -m runs each of them, {key}=[{values}] is a list, '{key}=\"{values}\"' a text"
+        )
+    return _explain_value(error, text, conf, name)
+
+
+def _explain_value(error: Exception, text: str, conf: Path, name: str) -> str:
+    """Return which key of an override is unknown, or does not take its value."""
     cause = error.__cause__
     key = re.search(r"Could not override '([^']+)'", text)
     if key:
@@ -83,9 +92,36 @@ def explain(error: Exception, conf: Path, name: str) -> str:
             return f"{key[1]}: {_first_line(cause)}"
         return f"{key[1]}: unknown key; expected {', '.join(_siblings(key[1], conf, name))}"
     value = re.match(r"Error merging override (\S+?)=", text)
-    if value and cause is not None:
-        return f"{value[1]}: {_first_line(cause)}"
-    return text
+    return f"{value[1]}: {_first_line(cause)}" if value and cause is not None else text
+
+
+def _explain_missing(file: str, conf: Path, name: str) -> str:
+    """Return what there is instead of a configuration file that is not there."""
+    group, _, choice = file.rpartition("/")
+    if not group:
+        return f"--config-name {choice}: unknown; expected {name}"
+    files = sorted(path.stem for path in (conf / group).glob("*.yaml"))
+    if files:
+        return f"{group}={choice}: unknown; expected one of {', '.join(files)}"
+    return f"{group}: no such group of choices; expected one of {', '.join(sorted(_groups(conf)))}"
+
+
+def _explain_syntax(override: str) -> str:
+    """Return how to write an argument that Hydra cannot read."""
+    key, equals, value = override.partition("=")
+    if not equals:
+        return f"{override}: expected KEY=VALUE"
+    quoted = re.sub(r"[^\[\],{}:]+", r'"\g<0>"', value) if value.startswith("[") else f'"{value}"'
+    return f"{key}: cannot read the value {value}; special characters need quotes within quotes: '{key}={quoted}'"
+
+
+def _expect_choices(conf: Path) -> None:
+    """Exit where the command line takes away a choice that must be made."""
+    for argument in sys.argv[1:]:
+        group, equals, choice = argument.partition("=")
+        if equals and choice in ("", "null") and group in _groups(conf):
+            choices = ", ".join(sorted(path.stem for path in (conf / group).glob("*.yaml")))
+            fail(f"{argument}: expected one of {choices}")
 
 
 def _first_line(error: BaseException) -> str:

@@ -50,7 +50,9 @@ def evaluate(config: DictConfig) -> pd.DataFrame:
         console = Console(width=_LOG_WIDTH)
     device = pick_device(settings.device)
     study, identity = _study(settings, plain, device)
-    folder = Path(settings.output_dir or rundir.default_directory("eval", plain, identity))
+    if settings.metrics.lpips and settings.metrics.lpips_trunk is not None:
+        _lpips(settings.metrics.lpips_trunk)  # a wrong one is refused before anything is written
+    folder = Path(settings.output_dir or rundir.default_directory("eval", plain, identity)).expanduser()
     rundir.claim(folder, plain, identity)
     _seed(settings.seed)
     try:
@@ -64,8 +66,9 @@ def evaluate(config: DictConfig) -> pd.DataFrame:
     scores = score(study, folder, metrics, outcome, functools.partial(_progress, console), illustrate)
     _report(console, folder, scores, label, outcome)
     if outcome.failures:
-        count = f"{len(outcome.failures)} of {len(study.source.scenes())} scenes failed"
-        raise ConfigError(f"{count}: {', '.join(outcome.failures)}; the others are in {folder}")
+        total = len(study.source.scenes())
+        rest = f"; the others are in {folder}" if len(outcome.failures) < total else ""
+        raise ConfigError(f"{len(outcome.failures)} of {total} scenes failed: {', '.join(outcome.failures)}{rest}")
     return scores
 
 
@@ -163,12 +166,12 @@ def _report(console: Console, folder: Path, scores: pd.DataFrame, label: str, ou
     if not scores.empty:
         console.print(score_table(scores, label))
     for scene, notes in outcome.notes.items():
-        console.print(f"note: {scene}: {'; '.join(notes)}", highlight=False, soft_wrap=True)
+        console.print(f"note: {scene}: {'; '.join(notes)}", markup=False, highlight=False, soft_wrap=True)
     if outcome.unscored:
         scenes = ", ".join(outcome.unscored)
-        console.print(f"note: no truth to score against: {scenes}", highlight=False, soft_wrap=True)
+        console.print(f"note: no truth to score against: {scenes}", markup=False, highlight=False, soft_wrap=True)
     if outcome.reused:
         console.print(f"predictions re-used: {len(outcome.reused)} (overwrite=true makes them anew)", highlight=False)
-    console.print(f"results: {folder}", highlight=False, soft_wrap=True)
+    console.print(f"results: {folder}", markup=False, highlight=False, soft_wrap=True)
     for message in outcome.failures.values():
         print(f"error: {message}", file=sys.stderr)  # noqa: T201

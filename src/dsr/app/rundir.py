@@ -44,7 +44,7 @@ def claim(folder: Path, config: Mapping[str, Any], identity: Mapping[str, Any]) 
     """Make ``folder`` the directory of this run, with its ``config.yaml`` and ``versions.json``.
 
     Raises:
-        ConfigError: something else is there already and ``overwrite`` is not set.
+        ConfigError: something else is there already and ``overwrite`` is not set, or the directory cannot be written.
 
     """
     record = folder / "versions.json"
@@ -52,7 +52,7 @@ def claim(folder: Path, config: Mapping[str, Any], identity: Mapping[str, Any]) 
         raise ConfigError(f"output_dir: expected a directory, {folder} is a file")
     if folder.is_dir() and any(folder.iterdir()) and not config["overwrite"]:
         try:
-            before = json.loads(record.read_text(encoding="utf-8"))["identity"]
+            before = dict(json.loads(record.read_text(encoding="utf-8"))["identity"])
         except (OSError, ValueError, KeyError, TypeError):
             raise ConfigError(
                 f"output_dir: {folder} holds files of something else; another output_dir keeps them"
@@ -63,8 +63,11 @@ def claim(folder: Path, config: Mapping[str, Any], identity: Mapping[str, Any]) 
                 f"output_dir: {folder} holds a run with another {', '.join(changed)}; "
                 "another output_dir keeps it, overwrite=true replaces it"
             )
-    write_text(folder / "config.yaml", OmegaConf.to_yaml(OmegaConf.create(dict(config))))
-    write_text(record, json.dumps({**versions(), "identity": dict(identity)}, indent=1) + "\n")
+    try:
+        write_text(record, json.dumps({**versions(), "identity": dict(identity)}, indent=1) + "\n")
+        write_text(folder / "config.yaml", OmegaConf.to_yaml(OmegaConf.create(dict(config))))
+    except OSError as error:
+        raise ConfigError(f"output_dir: expected a directory to write to, got {folder} ({error.strerror})") from error
 
 
 def versions() -> dict[str, Any]:

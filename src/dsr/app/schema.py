@@ -12,6 +12,7 @@ from omegaconf import MISSING, DictConfig, OmegaConf
 from dsr.degrade import SCALES
 
 PRECISIONS = ("float32", "bfloat16")
+_GROUPS = ("dataset", "downsampling", "method", "metrics")
 
 
 class ConfigError(ValueError):
@@ -58,7 +59,7 @@ class EvalConfig:
         for key, value in plain.items():
             if key not in names:
                 raise ConfigError(f"{key}: unknown key; expected {', '.join(names)}")
-            if value == MISSING:
+            if value == MISSING or (value is None and key in _GROUPS):
                 raise ConfigError(f"{key}: missing; give it as {key}=...")
         settings = cls(**{**plain, "metrics": MetricsConfig(**plain["metrics"])})
         settings.check()

@@ -40,9 +40,12 @@ def chosen(available: Sequence[str], wanted: Sequence[str] | None) -> list[str]:
     """Return the scenes to use: those wanted, or all.
 
     Raises:
-        ValueError: a wanted scene is not available.
+        ValueError: a wanted scene is not available or is named twice, or none is wanted.
 
     """
+    if wanted is not None and (not wanted or len(set(wanted)) < len(wanted)):
+        came = ", ".join(wanted) or "an empty list"
+        raise ValueError(f"dataset.scenes: expected names, each once, or null for all; got {came}")
     for name in wanted or ():
         if name not in available:
             raise ValueError(f"dataset.scenes: {name!r} is not there; expected some of {', '.join(available)}")

@@ -18,6 +18,8 @@ from dsr.geometry.camera import RANGE_TYPES, Camera, RangeType
 
 MAP_SUFFIXES = (".npy", ".png", ".tiff", ".tif", ".pfm")
 _METRES = {"m": 1.0, "mm": 1e-3}
+_LARGEST = 1e12
+"""Beyond it, no number in a camera file means anything."""
 _NUMBERS = ("width", "height", "fx", "fy", "cx", "cy")
 _OPTIONAL = ("range_type", "baseline", "baseline_unit", "doffs", "depth_unit", "hole_value")
 
@@ -87,7 +89,7 @@ def read_camera(path: Path) -> CameraFile:
         raise ValueError(f"{path}: expected a camera file, there is none")
     try:
         entries = json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise ValueError(f"{path}: expected JSON, got: {error}") from error
     if not isinstance(entries, dict):
         raise ValueError(f"{path}: expected a JSON object, got {type(entries).__name__}")
@@ -101,14 +103,10 @@ def read_camera(path: Path) -> CameraFile:
     baseline = None
     if entries.get("baseline") is not None:
         baseline = _number(path, entries, "baseline") * _unit(path, entries, "baseline_unit", numeric=False)
+    width, height = (_whole(path, key, numbers.pop(key)) for key in ("width", "height"))
+    doffs = _number(path, entries, "doffs") if "doffs" in entries else 0.0
     try:
-        camera = Camera(
-            width=_whole(numbers.pop("width")),
-            height=_whole(numbers.pop("height")),
-            **numbers,
-            baseline=baseline,
-            doffs=_number(path, entries, "doffs") if "doffs" in entries else 0.0,
-        )
+        camera = Camera(width, height, **numbers, baseline=baseline, doffs=doffs)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
     return CameraFile(
@@ -122,16 +120,16 @@ def read_camera(path: Path) -> CameraFile:
 def _number(path: Path, entries: dict[str, Any], key: str) -> float:
     """Return a finite number, or say what is there instead."""
     value = entries.get(key)
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) <= _LARGEST:
         came = repr(value) if key in entries else "nothing"
-        raise ValueError(f"{path}: {key}: expected a number, got {came}")
+        raise ValueError(f"{path}: {key}: expected a number, got {came:.40}")
     return float(value)
 
 
-def _whole(value: float) -> int:
+def _whole(path: Path, key: str, value: float) -> int:
     """Return a whole number as int."""
     if not value.is_integer():
-        raise ValueError(f"camera size: expected whole numbers of pixels, got {value:g}")
+        raise ValueError(f"{path}: {key}: expected a whole number of pixels, got {value:g}")
     return int(value)
 
 
@@ -150,8 +148,9 @@ def _load_npy(path: Path) -> np.ndarray:
     if not path.is_file():
         raise ValueError(f"{path}: expected a file, there is none")
     try:
-        return np.load(path, allow_pickle=False)
-    except (ValueError, OSError, EOFError) as error:
+        with path.open("rb") as file:
+            return np.lib.format.read_array(file, allow_pickle=False)
+    except Exception as error:  # a damaged header makes NumPy raise OSError, MemoryError, TokenError, ...
         raise ValueError(f"{path}: expected a NumPy array, got a damaged or foreign file ({error})") from error
 
 

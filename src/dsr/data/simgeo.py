@@ -10,7 +10,6 @@ from __future__ import annotations
 import contextlib
 import json
 import os
-import zipfile
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -18,7 +17,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from dsr.atomic import replacing
+from dsr.atomic import read_arrays, replacing
 from dsr.data.base import chosen
 from dsr.data.folder import Folder
 from dsr.data.simgeo_scenes import SCENES, SCENES_VERSION, Rendering, render_scene
@@ -74,7 +73,8 @@ class SimGeo:
 def _cached(scene: str, size: int) -> Rendering:
     """Return a rendering from the cache, or make it and try to keep it."""
     path = cache_directory() / f"simgeo-v{SCENES_VERSION}-{size}" / f"{scene}.npz"
-    with contextlib.suppress(OSError, KeyError, ValueError, zipfile.BadZipFile), np.load(path) as kept:
+    with contextlib.suppress(OSError, ValueError, KeyError, TypeError):  # missing, damaged, without a key, a wrong one
+        kept = read_arrays(path)
         return Rendering(kept["rgb"], kept["depth"], Camera(**json.loads(str(kept["camera"]))))
     rendering = render_scene(scene, size)
     with contextlib.suppress(OSError), replacing(path) as temporary:  # no room or no right to write: render again

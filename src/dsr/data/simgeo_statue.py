@@ -10,19 +10,9 @@ from functools import lru_cache
 
 import numpy as np
 
-from dsr.data.surfaces import Array, Field
+from dsr.data.surfaces import Array, Field, rotation
 
 Vector = tuple[float, float, float]
-
-
-def rotation(yaw: float, pitch: float, roll: float) -> Array:
-    """Return the rotation by ``roll`` about z, then ``pitch`` about x, then ``yaw`` about y, in degrees."""
-    out = np.eye(3)
-    for (i, j), angle in zip(((0, 1), (1, 2), (2, 0)), np.deg2rad((roll, pitch, yaw)), strict=True):
-        turn = np.eye(3)
-        turn[[i, i, j, j], [i, j, i, j]] = np.cos(angle), -np.sin(angle), np.sin(angle), np.cos(angle)
-        out = turn @ out
-    return out
 
 
 def statue_distance(p: Array) -> Array:

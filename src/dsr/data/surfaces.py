@@ -17,6 +17,16 @@ Array = NDArray[np.float64]
 Field = Callable[[Array], Array]
 
 
+def rotation(yaw: float, pitch: float, roll: float) -> Array:
+    """Return the rotation by ``roll`` about z, then ``pitch`` about x, then ``yaw`` about y, in degrees."""
+    out = np.eye(3)
+    for (i, j), angle in zip(((0, 1), (1, 2), (2, 0)), np.deg2rad((roll, pitch, yaw)), strict=True):
+        turn = np.eye(3)
+        turn[[i, i, j, j], [i, j, i, j]] = np.cos(angle), -np.sin(angle), np.sin(angle), np.cos(angle)
+        out = turn @ out
+    return out
+
+
 class Surface(ABC):
     """An opaque surface seen from outside."""
 

@@ -49,7 +49,7 @@ class Camera:
         """Check every field and take the absolute value of ``fy``."""
         for name in ("width", "height"):
             value = getattr(self, name)
-            if int(value) != value or value < 1:
+            if not float(value).is_integer() or value < 1:
                 raise ValueError(f"camera {name}: expected a positive whole number, got {value!r}")
         for name in ("fx", "fy", "cx", "cy", "doffs"):
             if not math.isfinite(getattr(self, name)):
@@ -148,7 +148,7 @@ def from_range(values: Tensor, camera: Camera, range_type: RangeType) -> Tensor:
         return values / camera.ray_lengths(dtype=values.dtype, device=values.device)
     if range_type == "disparity":
         shifted = values + camera.doffs
-        return torch.where(shifted > 0, _stereo_constant(camera) / shifted, torch.nan)
+        return _stereo_constant(camera) / torch.where(shifted > 0, shifted, torch.nan)  # no 0 * inf in gradients
     raise ValueError(f"range_type: expected one of {', '.join(RANGE_TYPES)}, got {range_type!r}")
 
 

@@ -7,14 +7,15 @@ with torchmetrics. The trunk is torchvision's ImageNet AlexNet, found by :func:`
 from __future__ import annotations
 
 import contextlib
+import http.client
 import socket
-import urllib.error
 from collections.abc import Iterator
 from pathlib import Path
 
 import torch
 import torchmetrics.functional.image as heads_home
 from torch import Tensor, nn
+from torch.nn.utils import skip_init
 
 from dsr.quality.functional import SurfacePair
 
@@ -54,7 +55,7 @@ class LPIPS(nn.Module):
     def __init__(self, trunk: dict[str, Tensor]) -> None:
         super().__init__()
         self.convolutions = nn.ModuleDict(
-            {str(i): nn.Conv2d(a, b, k, stride=s, padding=p) for i, (a, b, k, s, p) in _CONVOLUTIONS.items()}
+            {str(i): skip_init(nn.Conv2d, a, b, k, stride=s, padding=p) for i, (a, b, k, s, p) in _CONVOLUTIONS.items()}
         )
         for index, layer in self.convolutions.items():
             for name, parameter in layer.named_parameters():
@@ -150,7 +151,7 @@ def find_trunk(configured: Path | None) -> Path:
         try:
             with _socket_timeout(_DOWNLOAD_TIMEOUT):
                 torch.hub.download_url_to_file(TRUNK_URL, str(cached), hash_prefix=TRUNK_HASH, progress=True)
-        except (urllib.error.URLError, RuntimeError, TimeoutError) as error:  # RuntimeError: another hash
+        except (OSError, http.client.HTTPException, RuntimeError) as error:  # RuntimeError: another hash
             raise OSError(f"could not be downloaded: {getattr(error, 'reason', error)}") from error
     return cached
 

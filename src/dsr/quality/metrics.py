@@ -65,6 +65,15 @@ def _named(name: str) -> Metric:
     return next(metric for metric in catalogue() if metric.name == name)
 
 
+def _with_threshold(name: str, threshold: int, unit: str = "") -> Metric:
+    """Return a metric that the catalogue holds at some thresholds."""
+    try:
+        return _named(f"{name}_{threshold}{unit}")
+    except StopIteration:
+        choices = ", ".join(metric.name for metric in catalogue() if metric.name.startswith(name))
+        raise ValueError(f"threshold: expected one that gives {choices}; got {threshold!r}") from None
+
+
 class RMSEd(PerImageMean):
     """RMSE_d in metres."""
 
@@ -76,14 +85,14 @@ class BadPixD(PerImageMean):
     """BadPix_d: threshold 1, 5 or 10, in cm or in percent of the target where ``relative``."""
 
     def __init__(self, threshold: int = 5, *, relative: bool = False, **settings: Any) -> None:
-        super().__init__(_named(f"BadPix_d_{threshold}{'pct' if relative else 'cm'}"), **settings)
+        super().__init__(_with_threshold("BadPix_d", threshold, "pct" if relative else "cm"), **settings)
 
 
 class BadPixV(PerImageMean):
     """BadPix_v: threshold 1, 5 or 10 of 255."""
 
     def __init__(self, threshold: int = 5, variant: str = WORST, **settings: Any) -> None:
-        super().__init__(_named(f"BadPix_v_{threshold}"), variant, **settings)
+        super().__init__(_with_threshold("BadPix_v", threshold), variant, **settings)
 
 
 class DSSIMv(PerImageMean):

@@ -12,7 +12,7 @@ from torch import Tensor
 from dsr.geometry.shading import LIGHT_NAMES
 from dsr.quality import functional
 from dsr.quality.functional import SurfacePair
-from dsr.quality.lpips import LPIPS, lpips_v
+from dsr.quality.lpips import LPIPS, MIN_SIZE, lpips_v
 
 WORST = "max"
 VARIANTS = (*LIGHT_NAMES, WORST, "avg")
@@ -27,6 +27,7 @@ class Metric:
         function: from a pair to (B,), or to (B, 4) where ``per_light``.
         mask: from a pair to the (B, 1, H', W') pixels that it rests on.
         per_light: whether there is a value for each of the lights e1..e4.
+        min_size: smallest height and width in pixels that it is defined for.
 
     """
 
@@ -34,10 +35,18 @@ class Metric:
     function: Callable[[SurfacePair], Tensor]
     mask: Callable[[SurfacePair], Tensor]
     per_light: bool = False
+    min_size: int = 2
 
     def variants(self, pair: SurfacePair) -> dict[str, Tensor]:
-        """Return the value per image, (B,), by variant: e1..e4, their maximum and average, or just ""."""
-        values = self.function(pair)
+        """Return the value per image, (B,), by variant: e1..e4, their maximum and average, or just "".
+
+        NaN for images below the metric's smallest size.
+        """
+        count, size = len(pair.target), min(pair.target.shape[-2:])
+        if size < self.min_size:
+            values = pair.target.new_full((count, len(LIGHT_NAMES)) if self.per_light else (count,), torch.nan)
+        else:
+            values = self.function(pair)
         if not self.per_light:
             return {"": values}
         by_light = dict(zip(LIGHT_NAMES, values.unbind(1), strict=True))
@@ -45,6 +54,8 @@ class Metric:
 
     def share(self, pair: SurfacePair) -> Tensor:
         """Return the share of the pixels that the metric would use in a complete map and that are known, (B,)."""
+        if min(pair.target.shape[-2:]) < self.min_size:
+            return torch.zeros(len(pair.target), dtype=torch.float64)
         if pair.complete:
             return torch.ones(len(pair.target), dtype=torch.float64)
         return self.mask(pair).double().mean(dim=(-3, -2, -1))
@@ -79,9 +90,11 @@ def catalogue(network: LPIPS | None = None) -> tuple[Metric, ...]:
         Metric(f"BadPix_v_{level}", partial(functional.bad_pix_v, threshold=level), _normal_mask, per_light=True)
         for level in (1, 5, 10)
     ]
-    by_look.append(Metric("DSSIM_v", functional.dssim_v, _ssim_mask, per_light=True))
+    by_look.append(Metric("DSSIM_v", functional.dssim_v, _ssim_mask, per_light=True, min_size=functional.SSIM_WINDOW))
     if network is not None:
-        by_look.append(Metric("LPIPS_v", partial(lpips_v, network=network), _normal_mask, per_light=True))
+        by_look.append(
+            Metric("LPIPS_v", partial(lpips_v, network=network), _normal_mask, per_light=True, min_size=MIN_SIZE)
+        )
     by_look.append(Metric("RMSE_v", functional.rmse_v, _normal_mask))
     by_look.append(Metric("RMSE_v1", functional.rmse_v1, _normal_mask, per_light=True))
     return (*by_depth, *by_look, Metric("Bumpiness_d", functional.bumpiness_d, _bumpiness_mask))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -67,14 +68,16 @@ def save_picture(path: Path, sample: DepthSample, depth: Tensor, scores: Mapping
     maps = (depth, sample.depth_lr) if truth is None else (depth, sample.depth_lr, truth)
     holes = "" if all(bool(values.isfinite().all()) for values in maps) else " (pink: holes)"
     heading = f"{sample.dataset} / {sample.scene}, {label} x{sample.scale}{holes}"
-    figure.suptitle(heading, fontsize=16, y=1 - 0.12 / figure_height)
-    with replacing(path) as temporary:
+    figure.suptitle(heading, fontsize=16, y=1 - 0.12 / figure_height, parse_math=False)
+    with replacing(path) as temporary, warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "Glyph .* missing from font")  # a name that the font lacks letters for
         figure.savefig(temporary, dpi=_DPI)
 
 
 def _limits(depth: Tensor) -> tuple[float, float]:
     """Return the 1st and 99th percentile of the known depths: one outlier does not take all the colours."""
-    low, high = np.nanpercentile(depth.numpy(), [1, 99])
+    known = depth[depth.isfinite()].numpy()
+    low, high = np.percentile(known, [1, 99]) if known.size else (0, 1)
     return float(low), float(max(high, low + 1e-6))
 
 
@@ -87,7 +90,7 @@ def _show_depth(axis: Axes, depth: Tensor, limits: tuple[float, float], title: s
     """Draw depth in metres, (1, H, W)."""
     low, high = limits
     image = axis.imshow(depth[0].numpy(), cmap=_colours("viridis"), vmin=low, vmax=high, interpolation="nearest")
-    axis.set_title(title)
+    axis.set_title(title, parse_math=False)
     _colour_bar(axis, image, "depth, m")
 
 
@@ -106,7 +109,7 @@ def _show_renderings(axes: np.ndarray, sample: DepthSample, depth: Tensor, title
     normals = _normals(sample, depth)
     for axis, name, shades in zip(axes, LIGHT_NAMES, render(normals)[0], strict=False):
         axis.imshow(shades.numpy(), cmap=_colours("gray"), vmin=0, vmax=1, interpolation="nearest")
-        axis.set_title(f"{title} under {name}")
+        axis.set_title(f"{title} under {name}", parse_math=False)
 
 
 def _show_angles(axis: Axes, sample: DepthSample, depth: Tensor, truth: Tensor) -> None:

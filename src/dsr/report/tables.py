@@ -7,6 +7,7 @@ from importlib import resources
 
 import pandas as pd
 from rich import box
+from rich.markup import escape
 from rich.table import Table
 
 METRICS: dict[str, tuple[str, str, float, int]] = {
@@ -69,7 +70,7 @@ def score_table(scores: pd.DataFrame, label: str) -> Table:
     ours = in_paper_units(scores)
     scale, downsampling = int(scores["scale"].iloc[0]), str(scores["downsampling"].iloc[0])
     title = f"{label} on {scores['dataset'].iloc[0]}, x{scale}, {downsampling} downsampling - lower is better"
-    table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
+    table = Table(title=escape(title), title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
     table.add_column("scene", overflow="fold")
     table.add_column("from")
     for name in ours:
@@ -77,7 +78,7 @@ def score_table(scores: pd.DataFrame, label: str) -> Table:
         table.add_column(f"{heading}\n{unit}", justify="right", no_wrap=True)
     starred = False
     for scene, values in ours.iterrows():
-        table.add_row(str(scene), "dsr", *_cells(values))
+        table.add_row(escape(str(scene)), "dsr", *_cells(values))
         paper = published_row(str(scene), label, scale) if downsampling == _PUBLISHED_DOWNSAMPLING else None
         if paper is not None:
             recreated = scene in RECREATED

@@ -1,0 +1,482 @@
+"""The real ``python eval.py``: what it writes, re-uses, refuses and keeps."""
+
+import csv
+import json
+import math
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from dsr.app.entry import run_command
+from dsr.app.evaluate import evaluate
+
+REPOSITORY = Path(__file__).resolve().parents[2]
+COLUMNS = "dataset,scene,scale,downsampling,method,seed,metric,variant,value,valid_share"
+SIMGEO = [
+    "cube_high_freq",
+    "cube_no_texture",
+    "sphere_cylinder_high_freq",
+    "sphere_cylinder_low_freq",
+    "sphere_cylinder_no_texture",
+    "statue",
+]
+PLAIN = ["RMSE_d", *(f"BadPix_d_{t}" for t in ("1cm", "5cm", "10cm", "1pct", "5pct", "10pct")), "RMSE_v", "Bumpiness_d"]
+PER_LIGHT = ["BadPix_v_1", "BadPix_v_5", "BadPix_v_10", "DSSIM_v", "RMSE_v1"]
+VARIANTS = ["e1", "e2", "e3", "e4", "max", "avg"]
+
+
+@pytest.fixture(scope="session")
+def offline(tmp_path_factory, dsr_cache):
+    """Return an environment without an LPIPS trunk and without a way to download one."""
+    home = tmp_path_factory.mktemp("home")
+    nowhere = dict.fromkeys(("http_proxy", "https_proxy", "HTTP_PROXY", "HTTPS_PROXY"), "http://127.0.0.1:9")
+    dropped = ("DSR_LPIPS_TRUNK", "XDG_CACHE_HOME", "HYDRA_FULL_ERROR", "no_proxy", "NO_PROXY")
+    kept = {key: value for key, value in os.environ.items() if key not in dropped}
+    places = {"HOME": str(home), "TORCH_HOME": str(home / "torch"), "DSR_CACHE": str(dsr_cache)}
+    return {**kept, **nowhere, **places, "OMP_NUM_THREADS": "2"}
+
+
+def command(*arguments):
+    return [sys.executable, str(REPOSITORY / "eval.py"), *arguments]
+
+
+def run(folder, environment, *arguments):
+    """Run the command in a process of its own."""
+    return subprocess.run(
+        command(*arguments), cwd=folder, env=environment, capture_output=True, text=True, timeout=120, check=False
+    )
+
+
+@pytest.fixture
+def within(monkeypatch, tmp_path, capfd):
+    """Return a runner of the command within this process: the exit code, the output and the error lines."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("DSR_LPIPS_TRUNK", raising=False)
+    monkeypatch.setenv("HYDRA_FULL_ERROR", "1")
+
+    def call(*arguments, lpips=False):
+        switch = [] if lpips else ["metrics.lpips=false"]
+        monkeypatch.setattr(sys, "argv", ["eval.py", *arguments, *switch])
+        code = 0
+        try:
+            run_command(REPOSITORY / "conf", "eval", evaluate)
+        except SystemExit as ended:
+            code = ended.code
+        captured = capfd.readouterr()
+        return code, captured.out, captured.err.splitlines()
+
+    return call
+
+
+def write_scene(folder, *, height=40, width=48, seed=0, **camera):
+    """Write a scene of random photo and gentle depth in metres."""
+    folder.mkdir(parents=True)
+    photo = np.random.default_rng(seed).integers(0, 256, (height, width, 3), dtype=np.uint8)
+    cv2.imwrite(str(folder / "rgb.png"), photo)
+    rows, columns = np.mgrid[:height, :width]
+    np.save(folder / "depth.npy", 2 + 0.01 * columns + 0.1 * np.sin(rows / 5))
+    centre = {"cx": (width - 1) / 2, "cy": (height - 1) / 2}
+    entries = {"width": width, "height": height, "fx": 60.0, "fy": 60.0, **centre, **camera}
+    (folder / "camera.json").write_text(json.dumps(entries))
+    return folder
+
+
+def rows(folder):
+    with (folder / "scores.csv").open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def tree(folder):
+    return sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file())
+
+
+def written(scenes):
+    each = [
+        f"{kind}/{scene}.{suffix}" for kind, suffix in (("pictures", "png"), ("predictions", "npz")) for scene in scenes
+    ]
+    return sorted([*each, "config.yaml", "scores.csv", "summary.json", "versions.json"])
+
+
+@pytest.fixture(scope="module")
+def default_run(tmp_path_factory, offline):
+    """The working directory, the run's directory and the finished process of ``python eval.py dataset.size=64``."""
+    folder = tmp_path_factory.mktemp("default_run")
+    done = run(folder, offline, "dataset.size=64")
+    [home] = (folder / "outputs" / "eval").iterdir()
+    return folder, home, done
+
+
+def test_the_default_run_ends_well_and_says_where_the_results_are(default_run):
+    _, home, done = default_run
+    assert done.returncode == 0, done.stderr
+    assert home.name.startswith("simgeo_box_x4_bicubic_")
+    assert done.stdout.splitlines()[-1] == f"results: outputs/eval/{home.name}"
+    assert "statue" in done.stdout
+    assert "mean" in done.stdout
+
+
+def test_the_default_run_writes_everything_that_is_promised_and_nothing_else(default_run):
+    folder, home, _ = default_run
+    assert tree(home) == written(SIMGEO)
+    assert [path.name for path in folder.iterdir()] == ["outputs"]
+
+
+def test_without_an_lpips_trunk_one_line_says_what_to_do(default_run):
+    _, _, done = default_run
+    assert done.stderr.count("LPIPS_v is left out") == 1
+    [line] = done.stderr.splitlines()
+    assert "alexnet-owt-7be5be79.pth" in line
+    assert "metrics.lpips_trunk=FILE" in line
+    assert done.stdout.count("LPIPS") == 0
+
+
+def test_scores_csv_has_the_promised_columns_and_rows_with_finite_values(default_run):
+    _, home, _ = default_run
+    assert (home / "scores.csv").read_text().splitlines()[0] == COLUMNS
+    table = rows(home)
+    expected = [(scene, name, "") for scene in SIMGEO for name in PLAIN]
+    expected += [(scene, name, variant) for scene in SIMGEO for name in PER_LIGHT for variant in VARIANTS]
+    assert sorted((row["scene"], row["metric"], row["variant"]) for row in table) == sorted(expected)
+    assert all(math.isfinite(float(row["value"])) and float(row["value"]) >= 0 for row in table)
+    assert {row["valid_share"] for row in table} == {"1.0"}
+    same = {(row["dataset"], row["scale"], row["downsampling"], row["method"], row["seed"]) for row in table}
+    assert same == {("simgeo", "4", "box", "bicubic", "0")}
+
+
+def test_raw_units_are_metres_and_shares(default_run):
+    table = rows(default_run[1])
+    assert all(float(row["value"]) <= 1 for row in table if row["metric"].startswith("BadPix"))
+    assert all(0.001 < float(row["value"]) < 1 for row in table if row["metric"] == "RMSE_d")
+
+
+def test_the_summary_has_the_mean_over_the_scenes(default_run):
+    _, home, _ = default_run
+    content = json.loads((home / "summary.json").read_text())
+    values = [float(row["value"]) for row in rows(home) if row["metric"] == "DSSIM_v" and row["variant"] == "max"]
+    assert len(values) == 6
+    assert content["mean"]["DSSIM_v"] == pytest.approx(sum(values) / 6)
+    assert content["failures"] == {}
+    assert content["predicted"] == SIMGEO
+
+
+def test_config_yaml_is_the_resolved_configuration(default_run):
+    text = (default_run[1] / "config.yaml").read_text()
+    assert "${" not in text
+    assert "hydra" not in text
+    for line in ("scale: 4", "  size: 64", "  name: bicubic", "seed: 0", "  lpips_trunk: null"):
+        assert line in text.splitlines()
+
+
+def test_versions_json_has_packages_commit_and_device(default_run):
+    record = json.loads((default_run[1] / "versions.json").read_text())
+    assert record["packages"]["torch"] == torch.__version__
+    assert {"numpy", "hydra-core", "dsr"} <= record["packages"].keys()
+    assert {"git_commit", "git_dirty", "accelerator", "python"} <= record.keys()
+    assert record["identity"]["device"] in ("cpu", "cuda")
+
+
+def test_a_prediction_is_metres_of_the_scenes_size(default_run):
+    with np.load(default_run[1] / "predictions" / "statue.npz") as kept:
+        depth = kept["depth"]
+    assert depth.shape == (64, 64)
+    assert 2 < depth.min() < depth.max() < 4.5
+
+
+def test_a_second_run_reuses_the_predictions_and_says_so(default_run, within, monkeypatch):
+    folder, home, _ = default_run
+    monkeypatch.chdir(folder)
+    before = {path.name: path.stat().st_mtime_ns for path in (home / "predictions").iterdir()}
+    table = rows(home)
+    code, output, errors = within("dataset.size=64")
+    assert (code, errors) == (0, [])
+    assert "predictions re-used: 6 (overwrite=true makes them anew)" in output.splitlines()
+    assert [path.name for path in (folder / "outputs" / "eval").iterdir()] == [home.name]
+    assert {path.name: path.stat().st_mtime_ns for path in (home / "predictions").iterdir()} == before
+    assert rows(home) == table
+
+
+def test_a_multirun_puts_every_combination_into_a_directory_of_its_own(tmp_path, offline):
+    write_scene(tmp_path / "my data" / "lucy")
+    done = run(
+        tmp_path, offline, "-m", "dataset=simgeo,folder", "dataset.root='my data'", "dataset.scenes=[lucy]",
+        "scale=4,8", "method=bicubic,nearest",
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert done.stderr.count("LPIPS_v is left out") == 1
+    folders = sorted((tmp_path / "outputs" / "eval").iterdir())
+    stems = [folder.name.rpartition("_")[0] for folder in folders]
+    assert stems == sorted(
+        f"{data}_box_x{scale}_{method}"
+        for data in ("simgeo", "folder")
+        for scale in (4, 8)
+        for method in ("bicubic", "nearest")
+    )
+    assert all(tree(folder) == written(["lucy"]) for folder in folders)
+
+
+def test_one_bad_scene_keeps_the_others_results_and_the_exit_code_says_so(tmp_path, within):
+    for number, name in enumerate(("first", "bad one", "last")):
+        write_scene(tmp_path / "data" / name, seed=number)
+    (tmp_path / "data" / "bad one" / "rgb.png").write_bytes(b"\x89PNG\r\n\x1a\nbroken")
+    code, output, errors = within("dataset=folder", "dataset.root=data", "output_dir=out")
+    assert code == 2
+    assert errors == [
+        "error: data/bad one/rgb.png: expected a picture, got a damaged or foreign file of 14 bytes",
+        "error: 1 of 3 scenes failed: bad one; the others are in out",
+    ]
+    assert tree(tmp_path / "out") == written(["first", "last"])
+    assert {row["scene"] for row in rows(tmp_path / "out")} == {"first", "last"}
+    assert list(json.loads((tmp_path / "out" / "summary.json").read_text())["failures"]) == ["bad one"]
+    assert "first" in output
+    assert "last" in output
+
+
+def test_a_repaired_scene_is_added_by_the_same_command(tmp_path, within):
+    write_scene(tmp_path / "data" / "a")
+    camera = write_scene(tmp_path / "data" / "b") / "camera.json"
+    content = camera.read_text()
+    camera.write_text("{}")
+    arguments = ("dataset=folder", "dataset.root=data", "output_dir=out")
+    code, _, errors = within(*arguments)
+    assert (code, errors[0]) == (2, "error: data/b/camera.json: width: expected a number, got nothing")
+    camera.write_text(content)
+    code, output, errors = within(*arguments)
+    assert (code, errors) == (0, [])
+    assert "predictions re-used: 1" in output
+    assert tree(tmp_path / "out") == written(["a", "b"])
+
+
+def test_where_every_scene_fails_nothing_is_said_of_others(tmp_path, within):
+    write_scene(tmp_path / "data" / "a")
+    code, _, errors = within("dataset=folder", "dataset.root=data", "downsampling=measured")
+    assert code == 2
+    assert errors == [
+        "error: a: downsampling=measured expects a coarse map at x4, the scene has none",
+        "error: 1 of 1 scenes failed: a",
+    ]
+
+
+def test_a_changed_scene_is_not_taken_for_the_old_one(tmp_path, within):
+    folder = write_scene(tmp_path / "data" / "a")
+    arguments = ("dataset=folder", "dataset.root=data", "output_dir=out")
+    assert within(*arguments)[0] == 0
+    np.save(folder / "depth.npy", np.load(folder / "depth.npy") + 1)
+    code, _, errors = within(*arguments)
+    assert code == 2
+    assert errors == [
+        "error: out/predictions/a.npz: made with another scene_content; overwrite=true replaces it, "
+        "another output_dir keeps it"
+    ]
+    before = (tmp_path / "out" / "predictions" / "a.npz").read_bytes()
+    code, output, errors = within(*arguments, "overwrite=true")
+    assert (code, errors) == (0, [])
+    assert "re-used" not in output
+    assert (tmp_path / "out" / "predictions" / "a.npz").read_bytes() != before
+
+
+def test_a_directory_of_another_run_is_kept(tmp_path, within):
+    write_scene(tmp_path / "data" / "a")
+    arguments = ("dataset=folder", "dataset.root=data", "output_dir=out")
+    assert within(*arguments)[0] == 0
+    before = (tmp_path / "out" / "scores.csv").read_bytes()
+    code, _, errors = within(*arguments, "scale=8")
+    assert code == 2
+    assert errors == [
+        "error: output_dir: out holds a run with another scale; another output_dir keeps it, overwrite=true replaces it"
+    ]
+    assert (tmp_path / "out" / "scores.csv").read_bytes() == before
+
+
+USAGE_ERRORS = {
+    "a mistyped group": (["datset=folder"], "datset: unknown key; expected dataset, "),
+    "a mistyped choice": (["method=bicubik"], "method=bicubik: unknown; expected one of bicubic, "),
+    "a mistyped key": (["scal=8"], "scal: unknown key; expected dataset, "),
+    "an added key": (["+scal=8"], "scal: unknown key; expected dataset, "),
+    "an added key of a group": (["+method.sharp=1"], "method.sharp: unknown key; method=bicubic takes order, "),
+    "a group taken away": (["~method"], "method: missing; give it as method=..."),
+    "a scale that is none": (["scale=3"], "scale: expected one of 2, 4, 8, 16, got 3"),
+    "a number that is none": (["scale=big"], "scale: "),
+    "a type in a group": (["dataset.size=big"], "dataset.size: expected a whole number, got 'big'"),
+    "a choice in a group": (["method.order=cubic"], "method.order: expected one of nearest, bilinear, bicubic, got"),
+    "a range": (["dataset.size=8"], "dataset.size: expected at least 32 pixels, got 8"),
+    "sigma": (["downsampling=gaussian", "downsampling.sigma=-1"], "downsampling.sigma: expected a positive"),
+    "a device that is not here": (["device=gpu"], "device: expected auto, cpu or a device of this machine"),
+    "a device without numbers": (["device=meta"], "device: expected auto, cpu or a device of this machine"),
+    "a precision": (["precision=half"], "precision: expected one of float32, bfloat16, got half"),
+    "a seed": (["seed=-1"], "seed: expected 0 or a positive number"),
+    "no root": (["dataset=folder"], "dataset.root: dataset=folder needs it: dataset.root=..."),
+    "a missing root": (["dataset=folder", "dataset.root=no where"], "dataset.root: expected a directory of scenes"),
+    "an empty root": (["dataset=folder", "dataset.root=empty"], "dataset.root: expected a folder per scene in empty"),
+    "an unknown scene": (["dataset.scenes=[mars]"], "dataset.scenes: 'mars' is not there; expected some of cube"),
+    "no scene at all": (["dataset.scenes=[]"], "dataset.scenes: expected names, each once, or null for all"),
+    "a scene twice": (["dataset.scenes=[statue,statue]"], "dataset.scenes: expected names, each once"),
+    "a scene without a list": (["dataset.scenes=statue"], "dataset.scenes: expected a list of text or null, got"),
+    "no weights": (["method=msg_v"], "weights: method=msg_v needs weights=FILE, or a directory with msg_v_x4_clean"),
+    "missing weights": (["method=msg_v", "weights=no.pth"], "weights: expected a file of weights for method=msg_v"),
+    "a directory without": (["method=msg", "weights=empty"], "weights: expected a file of weights for method=msg, got"),
+    "foreign weights": (["method=msg_v", "weights=file"], "file: expected "),
+    "a missing trunk": (["metrics.lpips_trunk=no"], "metrics.lpips_trunk: expected a file, got no"),
+    "a foreign trunk": (["metrics.lpips_trunk=file"], "metrics.lpips_trunk: file: expected the weights"),
+    "a file as directory": (["output_dir=file"], "output_dir: expected a directory, file is a file"),
+    "a file on the way": (["output_dir=file/run"], "output_dir: expected a directory to write to, got file/run"),
+    "a foreign directory": (["output_dir=foreign"], "output_dir: foreign holds files of something else"),
+    "a text": (["scale"], "scale: expected KEY=VALUE"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", USAGE_ERRORS)
+def test_a_usage_error_is_one_line_with_exit_code_2_and_writes_nothing(tmp_path, within, case):
+    arguments, start = USAGE_ERRORS[case]
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "file").write_text("no weights")
+    (tmp_path / "foreign").mkdir()
+    (tmp_path / "foreign" / "thesis.txt").write_text("precious")
+    code, output, errors = within(*arguments, lpips="trunk" in case)
+    assert code == 2
+    assert output == ""
+    assert len(errors) == 1, errors
+    assert errors[0].startswith(f"error: {start}")
+    assert tree(tmp_path) == ["file", "foreign/thesis.txt"]
+    assert not (tmp_path / "outputs").exists()
+
+
+def test_a_usage_error_of_the_real_command_is_one_line_too(tmp_path, offline):
+    done = run(tmp_path, offline, "dataset=folder", "dataset.root=nowhere")
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr == "error: dataset.root: expected a directory of scenes, got nowhere (no such directory)\n"
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_help_lists_the_choices(within):
+    code, output, errors = within("--help")
+    assert (code, errors) == (0, [])
+    for line in ("dataset: folder, simgeo", "method: bicubic, bilinear, msg, msg_v, nearest"):
+        assert line in output
+
+
+def test_weights_that_a_method_has_no_use_for_are_noted(tmp_path, within):
+    write_scene(tmp_path / "data" / "a")
+    code, _, errors = within("dataset=folder", "dataset.root=data", "weights=x y")
+    assert (code, errors) == (0, ["note: method=bicubic has no weights; weights=x y is not used"])
+
+
+@pytest.mark.parametrize("name", ["a b", "ünï [red]", "$x$"])
+def test_a_scene_may_have_any_name(tmp_path, within, name):
+    write_scene(tmp_path / "data" / name)
+    code, output, errors = within("dataset=folder", "dataset.root=data", "output_dir='o [bold]'")
+    assert (code, errors) == (0, [])
+    assert tree(tmp_path / "o [bold]") == written([name])
+    assert f" {name} " in output
+    assert "results: o [bold]" in output
+
+
+def test_a_size_that_the_scale_does_not_divide_is_cropped_and_said_so(tmp_path, within):
+    write_scene(tmp_path / "data" / "a", height=42, width=51)
+    code, output, errors = within("dataset=folder", "dataset.root=data", "output_dir=out")
+    assert (code, errors) == (0, [])
+    assert "note: a: cropped from 42 x 51 to 40 x 48, which 4 divides" in output.splitlines()
+    with np.load(tmp_path / "out" / "predictions" / "a.npz") as kept:
+        assert kept["depth"].shape == (40, 48)
+
+
+@pytest.mark.parametrize("size", [4, 12])
+def test_a_picture_too_small_for_the_scale_is_refused_by_name(tmp_path, within, size):
+    write_scene(tmp_path / "data" / "dwarf", height=size, width=size)
+    code, _, errors = within("dataset=folder", "dataset.root=data", "scale=16")
+    assert code == 2
+    assert errors[0] == f"error: dwarf: expected at least 16 x 16 pixels, got {size} x {size}"
+
+
+def test_an_interruption_keeps_what_is_finished_and_the_same_command_goes_on(tmp_path, offline):
+    arguments = ("dataset=simgeo", "dataset.size=256", "output_dir=out", "metrics.lpips=false")
+    with subprocess.Popen(
+        command(*arguments), cwd=tmp_path, env=offline, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as process:
+        deadline = time.monotonic() + 60
+        while not list((tmp_path / "out" / "predictions").glob("[!.]*.npz")) and time.monotonic() < deadline:
+            time.sleep(0.02)
+        process.send_signal(signal.SIGINT)
+        _, errors = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert errors == "interrupted; what is finished is kept, the same command goes on from there\n"
+    finished = sorted(path.name for path in (tmp_path / "out" / "predictions").iterdir())
+    assert finished
+    assert len(finished) < 6
+    assert all(not name.startswith(".") for name in finished)
+
+
+def test_two_runs_at_the_same_time_do_not_hurt_each_other(tmp_path, offline):
+    for name in ("a", "b"):
+        write_scene(tmp_path / "data" / name)
+    arguments = command("dataset=folder", "dataset.root=data", "metrics.lpips=false", "output_dir=out")
+    pair = [
+        subprocess.Popen(
+            arguments, cwd=tmp_path, env=offline, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
+        )
+        for _ in range(2)
+    ]
+    errors = [process.communicate(timeout=100)[1] for process in pair]
+    assert [process.returncode for process in pair] == [0, 0], errors
+    assert tree(tmp_path / "out") == written(["a", "b"])
+
+
+def test_msg_v_reproduces_the_protocol_on_the_released_scenes(shared, tmp_path, within):
+    code, output, errors = within(
+        "dataset=folder", f"dataset.root='{shared / 'scenes'}'", "dataset.scenes=[lucy,plant]", "scale=4",
+        "method=msg_v", f"weights='{shared / 'weights'}'", "output_dir=out", "device=cpu",
+    )  # fmt: skip
+    assert (code, errors) == (0, [])
+    worst = {
+        (row["scene"], row["metric"]): float(row["value"])
+        for row in rows(tmp_path / "out")
+        if row["variant"] in ("", "max")
+    }
+    metrics = ("RMSE_d", "BadPix_d_5cm", "BadPix_v_5", "DSSIM_v", "Bumpiness_d", "RMSE_v")
+    expected = {  # the protocol's table, in its units
+        "lucy": dict(zip(metrics, (23.6, 1.62, 38.8, 206, 0.82, 156), strict=True)),
+        "plant": dict(zip(metrics, (26.6, 1.84, 74.3, 525, 1.31, 194), strict=True)),
+    }
+    factors = dict(zip(metrics, (1e3, 1e2, 1e2, 1e3, 1, 1e3), strict=True))
+    half_a_digit = dict(zip(metrics, (0.06, 0.006, 0.06, 0.6, 0.006, 0.6), strict=True))
+    for scene, values in expected.items():
+        for metric, value in values.items():
+            assert worst[scene, metric] * factors[metric] == pytest.approx(value, abs=half_a_digit[metric]), (
+                scene,
+                metric,
+            )
+    assert "paper" in output
+
+
+@pytest.mark.parametrize(
+    ("arguments", "file", "message"),
+    [
+        (["method=msg_v"], "msg_v_x8_clean.pth", "weights are for scale 8, the run is at scale 4"),
+        (["method=msg_v"], "MSGNet_x4.caffemodel", "expected weights of variant voynov, got those of variant hui"),
+        (["method=msg"], "msg_v_x4_clean.pth", "expected weights of variant hui, got those of variant voynov"),
+        (["method=msg", "scale=8"], "MSGNet_x16.caffemodel", "weights are for scale 16, the run is at scale 8"),
+    ],
+)
+def test_weights_of_another_scale_or_architecture_are_refused(shared, tmp_path, within, arguments, file, message):
+    path = shared / "weights" / file
+    code, output, errors = within(*arguments, f"weights='{path}'")
+    assert (code, output) == (2, "")
+    assert errors == [f"error: {path}: {message}"]
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_method_scores_a_measured_input_at_the_pixels_it_knows(shared, tmp_path, within):
+    code, _, errors = within(
+        "dataset=folder", f"dataset.root='{shared / 'scenes'}'", "dataset.scenes=[books]",
+        "downsampling=measured", "output_dir=out",
+    )  # fmt: skip
+    assert (code, errors) == (0, [])
+    shares = {float(row["valid_share"]) for row in rows(tmp_path / "out")}
+    assert all(0 < share < 1 for share in shares)

@@ -1,0 +1,184 @@
+"""From a configuration group to its object: the target's signature is the schema, and what does not fit is refused."""
+
+import sys
+import types
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Literal
+
+import pytest
+import torch
+
+from dsr.app.build import build, pick_device, takes
+from dsr.app.schema import ConfigError, EvalConfig
+
+Order = Literal["near", "far"]
+
+
+class Toy:
+    """Takes one argument of each annotated kind."""
+
+    def __init__(
+        self,
+        root: str,
+        names: Sequence[str] | None = None,
+        share: float = 0.5,
+        count: int = 1,
+        order: Order = "near",
+        scale: int = 0,
+        *,
+        flag: bool = False,
+        file: Path | None = None,
+    ) -> None:
+        self.values = (root, names, share, count, order, flag, file)
+        self.scale = scale
+        if root == "missing":
+            raise ValueError("dataset.root: no such directory")
+        if root == "unreadable":
+            raise OSError(13, "Permission denied", "unreadable")
+
+
+def no_arguments():
+    return "built"
+
+
+@pytest.fixture(autouse=True)
+def module(monkeypatch):
+    home = types.ModuleType("toy_home")
+    home.Toy, home.no_arguments = Toy, no_arguments
+    monkeypatch.setitem(sys.modules, "toy_home", home)
+
+
+def node(**keys):
+    return {"name": "toy", "target": "toy_home.Toy", **keys}
+
+
+def refusal(keys, group="dataset", given=None):
+    with pytest.raises(ConfigError) as caught:
+        build(group, keys, given)
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
+
+
+def test_the_keys_of_a_group_are_the_arguments_of_its_target():
+    toy = build("dataset", node(root="r", names=["a"], share=0.25, count=3, order="far", flag=True, file="f"))
+    assert toy.values == ("r", ["a"], 0.25, 3, "far", True, "f")
+
+
+def test_what_describes_a_group_does_not_reach_the_target():
+    build("method", node(root="r", label="Toy", weights_file="x", weights_source="y"))
+
+
+def test_a_function_without_arguments_may_be_a_target():
+    assert build("method", {"name": "f", "target": "toy_home.no_arguments"}) == "built"
+
+
+def test_the_target_gets_those_values_of_the_run_that_it_names():
+    assert build("method", node(root="r"), {"scale": 8, "device": "cpu"}).scale == 8
+    assert takes("method", node(), "scale")
+    assert not takes("method", node(), "device")
+
+
+def test_an_unknown_key_is_refused_with_the_keys_there_are():
+    message = refusal(node(root="r", rot="x"))
+    assert message == (
+        "dataset.rot: unknown key; dataset=toy takes root, names, share, count, order, scale, flag, file"
+    )
+
+
+def test_a_value_of_the_run_cannot_be_given_in_the_group():
+    message = refusal(node(root="r", scale=2), given={"scale": 4})
+    assert message.startswith("dataset.scale: unknown key")
+    assert "scale" not in message.split("takes")[1]
+
+
+def test_a_target_without_arguments_says_that_it_takes_none():
+    message = refusal({"name": "f", "target": "toy_home.no_arguments", "x": 1}, "method")
+    assert message == "method.x: unknown key; method=f takes none"
+
+
+def test_a_missing_key_is_refused_with_how_to_give_it():
+    assert refusal(node(root="???")) == "dataset.root: dataset=toy needs it: dataset.root=..."
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "expected"),
+    [
+        ("root", 3, "text, got 3"),
+        ("root", None, "text, got None"),
+        ("names", "a", "a list of text or null, got 'a'"),
+        ("names", [1], "a list of text or null, got [1]"),
+        ("share", "x", "a number, got 'x'"),
+        ("share", True, "a number, got True"),
+        ("count", 1.5, "a whole number, got 1.5"),
+        ("count", True, "a whole number, got True"),
+        ("order", "mid", "one of near, far, got 'mid'"),
+        ("flag", "yes", "true or false, got 'yes'"),
+        ("flag", 1, "true or false, got 1"),
+        ("file", 1, "Path or null, got 1"),
+    ],
+)
+def test_a_value_of_another_type_is_refused_with_the_type_expected(key, value, expected):
+    assert refusal(node(**{"root": "r", key: value})) == f"dataset.{key}: expected {expected}"
+
+
+@pytest.mark.parametrize(("key", "value"), [("share", 1), ("names", None), ("names", []), ("file", None)])
+def test_a_value_that_fits_the_type_is_taken(key, value):
+    build("dataset", node(**{"root": "r", key: value}))
+
+
+@pytest.mark.parametrize("root", ["missing", "unreadable"])
+def test_what_the_target_refuses_is_a_configuration_error(root):
+    expected = {
+        "missing": "dataset.root: no such directory",
+        "unreadable": "[Errno 13] Permission denied: 'unreadable'",
+    }
+    assert refusal(node(root=root)) == expected[root]
+
+
+@pytest.mark.parametrize(
+    "target", [None, 3, "toy", "no_such_module.Toy", "toy_home.Tay", "", "..x", "toy_home.__name__"]
+)
+def test_a_target_that_is_not_there_is_refused(target):
+    assert refusal({"name": "toy", "target": target}, "method").startswith("method.target: ")
+
+
+def test_auto_is_the_gpu_where_there_is_one():
+    assert pick_device("auto").type == ("cuda" if torch.cuda.is_available() else "cpu")
+    assert pick_device("cpu") == torch.device("cpu")
+
+
+@pytest.mark.parametrize("name", ["gpu", "cuda:99", "meta", "", "cpu:x"])
+def test_a_device_that_this_machine_has_not_is_refused(name):
+    with pytest.raises(ConfigError, match=r"^device: expected auto, cpu or a device of this machine, got "):
+        pick_device(name)
+
+
+def settings(**changes):
+    groups = {"dataset": {}, "downsampling": {}, "method": {}, "metrics": {"lpips": True, "lpips_trunk": None}}
+    return {**groups, "scale": 4, "precision": "float32", "seed": 0, **changes}
+
+
+def test_the_settings_of_a_run_are_checked():
+    assert EvalConfig.of(settings(scale=8)).scale == 8
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"scale": 3}, "scale: expected one of 2, 4, 8, 16, got 3"),
+        ({"precision": "float16"}, "precision: expected one of float32, bfloat16, got float16"),
+        ({"seed": -1}, "seed: expected 0 or a positive number, got -1"),
+        ({"method": "???"}, "method: missing; give it as method=..."),
+        ({"dataset": None}, "dataset: missing; give it as dataset=..."),
+    ],
+)
+def test_a_value_that_is_none_of_its_choices_is_refused(changes, message):
+    with pytest.raises(ConfigError) as caught:
+        EvalConfig.of(settings(**changes))
+    assert str(caught.value) == message
+
+
+def test_an_unknown_setting_is_refused_with_those_there_are():
+    with pytest.raises(ConfigError, match=r"^scal: unknown key; expected dataset, .*scale, "):
+        EvalConfig.of(settings(scal=4))

@@ -1,0 +1,158 @@
+"""The command line: whatever is wrong ends as one clear line on stderr and exit code 2, before anything is written."""
+
+import sys
+from pathlib import Path
+
+import pytest
+
+from dsr.app.entry import run_command
+from dsr.app.schema import ConfigError
+
+CONF = Path(__file__).resolve().parents[2] / "conf"
+
+
+@pytest.fixture
+def command(monkeypatch, tmp_path, capfd):
+    """Return a runner of a command line: the exit code, standard error, and the configurations that the job got."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("HYDRA_FULL_ERROR", "1")
+
+    def run(*arguments, job=None):
+        monkeypatch.setattr(sys, "argv", ["eval.py", *arguments])
+        seen = []
+
+        def remember(config):
+            seen.append(config)
+            if job is not None:
+                job(config)
+
+        code = 0
+        try:
+            run_command(CONF, "eval", remember)
+        except SystemExit as ended:
+            code = ended.code
+        return code, capfd.readouterr().err, seen
+
+    return run
+
+
+SETTINGS = "dataset, downsampling, method, metrics, scale, weights, device, precision, seed, output_dir, overwrite"
+USAGE_ERRORS = {
+    "dataset=fodler": "dataset=fodler: unknown; expected one of folder, simgeo",
+    "method=msgv": "method=msgv: unknown; expected one of bicubic, bilinear, msg, msg_v, nearest",
+    "downsampling=boxx": (
+        "downsampling=boxx: unknown; expected one of bicubic, bilinear, box, gaussian, measured, nearest"
+    ),
+    "metrics=none": "metrics=none: unknown; expected one of paper",
+    "datset=folder": f"datset: unknown key; expected {SETTINGS}",
+    "scal=8": f"scal: unknown key; expected {SETTINGS}",
+    "lpips=false": f"lpips: unknown key; expected {SETTINGS}",
+    "dataset.rot=x": "dataset.rot: unknown key; expected dataset.name, dataset.root, dataset.scenes, dataset.size",
+    "metrics.lpip=false": "metrics.lpip: unknown key; expected metrics.lpips, metrics.lpips_trunk",
+    "scale=four": "scale: Value 'four' of type 'str' could not be converted to Integer",
+    "seed=1.5": "seed: Value '1.5' of type 'float' could not be converted to Integer",
+    "overwrite=maybe": "overwrite: Value 'maybe' is not a valid bool (type str)",
+    "metrics.lpips=perhaps": "metrics.lpips: Value 'perhaps' is not a valid bool (type str)",
+    "method=null": "method=null: expected one of bicubic, bilinear, msg, msg_v, nearest",
+    "method=": "method=: expected one of bicubic, bilinear, msg, msg_v, nearest",
+    "scale": "scale: expected KEY=VALUE",
+    "output_dir=a=b": (
+        "output_dir: cannot read the value a=b; special characters need quotes within quotes: 'output_dir=\"a=b\"'"
+    ),
+    "dataset.scenes=[ünï,b]": (
+        "dataset.scenes: cannot read the value [ünï,b]; special characters need quotes within quotes: "
+        '\'dataset.scenes=["ünï","b"]\''
+    ),
+    "method=msg,msg_v": (
+        "method: got several values; -m runs each of them, method=[msg,msg_v] is a list, 'method=\"msg,msg_v\"' a text"
+    ),
+    "--config-name=other": "--config-name other: unknown; expected eval",
+}
+
+
+@pytest.mark.parametrize("argument", USAGE_ERRORS)
+def test_a_usage_error_is_one_line_that_names_the_key_and_the_choices(command, tmp_path, argument):
+    code, error, seen = command(argument)
+    assert (code, error) == (2, f"error: {USAGE_ERRORS[argument]}\n")
+    assert seen == []
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_key_of_the_chosen_group_is_mistyped_among_that_group_s_keys(command):
+    code, error, _ = command("dataset=folder", "dataset.rot=x")
+    assert (code, error) == (
+        2,
+        "error: dataset.rot: unknown key; expected dataset.name, dataset.root, dataset.scenes\n",
+    )
+
+
+@pytest.mark.parametrize("quoted", ['output_dir="a=b"', "output_dir='a=b'"])
+def test_a_quoted_value_is_taken_as_the_message_says(command, quoted):
+    code, error, [config] = command(quoted)
+    assert (code, error, config.output_dir) == (0, "", "a=b")
+
+
+def test_the_job_gets_the_composed_configuration_and_no_directory_is_made(command, tmp_path):
+    code, error, [config] = command("scale=8", "dataset=folder", "dataset.root=here")
+    assert (code, error) == (0, "")
+    assert (config.scale, config.dataset.root, config.method.name) == (8, "here", "bicubic")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_configuration_error_of_the_job_is_one_line_and_exit_code_2(command):
+    def job(config):
+        raise ConfigError("dataset.root: first\n   second")
+
+    assert command(job=job)[:2] == (2, "error: dataset.root: first second\n")
+
+
+def test_an_interruption_is_one_line_and_exit_code_130(command):
+    def job(config):
+        raise KeyboardInterrupt
+
+    code, error, _ = command(job=job)
+    assert code == 130
+    assert error.count("\n") == 1
+    assert error.startswith("interrupted; ")
+
+
+def test_a_defect_of_the_program_is_not_taken_for_a_usage_error(command):
+    def job(config):
+        raise ZeroDivisionError("our fault")
+
+    with pytest.raises(ZeroDivisionError, match="our fault"):
+        command(job=job)
+
+
+def test_a_multirun_calls_the_job_for_every_combination(command):
+    code, error, seen = command("-m", "scale=4,8", "method=nearest,bicubic")
+    assert (code, error) == (0, "")
+    assert [(config.scale, config.method.name) for config in seen] == [
+        (4, "nearest"), (4, "bicubic"), (8, "nearest"), (8, "bicubic"),
+    ]  # fmt: skip
+
+
+def test_a_failing_job_of_a_multirun_keeps_the_others_and_the_exit_code_says_so(command):
+    def job(config):
+        if config.scale == 4:
+            raise ConfigError("scale: not this one")
+
+    code, error, seen = command("-m", "scale=2,4,8", job=job)
+    assert (code, error) == (2, "error: scale: not this one\n")
+    assert [config.scale for config in seen] == [2, 4, 8]
+
+
+def test_a_multirun_with_an_unknown_choice_starts_no_job(command):
+    code, error, seen = command("-m", "method=bicubic,neerest")
+    assert (code, seen) == (2, [])
+    assert error == "error: method=neerest: unknown; expected one of bicubic, bilinear, msg, msg_v, nearest\n"
+
+
+def test_a_missing_configuration_directory_says_where_to_run(monkeypatch, tmp_path, capsys):
+    monkeypatch.setattr(sys, "argv", ["eval.py"])
+    with pytest.raises(SystemExit) as ended:
+        run_command(tmp_path / "conf", "eval", lambda config: None)
+    assert ended.value.code == 2
+    error = capsys.readouterr().err
+    assert error.startswith(f"error: {tmp_path / 'conf'}: expected the directory of the configuration files")
+    assert error.count("\n") == 1

@@ -1,0 +1,282 @@
+"""Reading files: every format gives the numbers that the test wrote byte by byte, every refusal names its file."""
+
+import json
+import os
+import struct
+import zlib
+
+import cv2
+import numpy as np
+import pytest
+
+from dsr.data.files import read_camera, read_map, read_mask, read_rgb
+
+VALUES = np.array([[1.0, 2.5, 3.25], [4.5, 5.0, 60000.0]])
+"""Not symmetric under any flip, exact in float32."""
+WHOLE = np.array([[1, 256, 3], [40000, 5, 65535]])
+INTRINSICS = {"width": 3, "height": 2, "fx": 3.0, "fy": 3.0, "cx": 1.0, "cy": 0.5}
+
+
+def png(values, depth, colour):
+    """Return a PNG file by its specification: values is (H, W) or (H, W, channels), big-endian samples."""
+
+    def chunk(kind, content):
+        return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", zlib.crc32(kind + content))
+
+    samples = np.asarray(values).astype(">u2" if depth == 16 else "u1")
+    lines = b"".join(b"\0" + row.tobytes() for row in samples)
+    header = struct.pack(">IIBBBBB", samples.shape[1], samples.shape[0], depth, colour, 0, 0, 0)
+    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(lines)) + chunk(b"IEND", b"")
+
+
+def pfm(values, order):
+    """Return a PFM file: text header, rows from the bottom up, a negative scale for little-endian floats."""
+    height, width = values.shape
+    header = f"Pf\n{width} {height}\n{'-1.0' if order == '<' else '1.0'}\n".encode()
+    return header + b"".join(struct.pack(f"{order}{width}f", *row) for row in values[::-1])
+
+
+def tiff(values):
+    """Return an uncompressed little-endian TIFF of 32-bit floats in one strip."""
+    pixels = values.astype("<f4").tobytes()
+    height, width = values.shape
+    long, short = 4, 3
+    entries = [
+        (256, long, width), (257, long, height), (258, short, 32), (259, short, 1), (262, short, 1), (273, long, 8),
+        (277, short, 1), (278, long, height), (279, long, len(pixels)), (339, short, 3),
+    ]  # fmt: skip
+    directory = struct.pack("<H", len(entries)) + b"".join(
+        struct.pack("<HHI", tag, kind, 1) + struct.pack("<I" if kind == long else "<Hxx", value)
+        for tag, kind, value in entries
+    )
+    return b"II*\0" + struct.pack("<I", 8 + len(pixels)) + pixels + directory + b"\0\0\0\0"
+
+
+def npy(values, descr):
+    """Return a version 1.0 .npy file."""
+    header = f"{{'descr': '{descr}', 'fortran_order': False, 'shape': {values.shape}, }}".ljust(117) + "\n"
+    return b"\x93NUMPY\x01\0" + struct.pack("<H", len(header)) + header.encode() + values.astype(descr).tobytes()
+
+
+def written(folder, name, content):
+    path = folder / name
+    path.write_bytes(content)
+    return path
+
+
+def refusal(reader, path, capfd):
+    """Return the message of the refusal: one line that names the file, and nothing printed."""
+    with pytest.raises(ValueError) as caught:  # noqa: PT011 - the callers look at the message
+        reader(path)
+    assert capfd.readouterr() == ("", "")
+    message = str(caught.value)
+    assert message.startswith(f"{path}: ")
+    assert message.count(str(path)) == 1
+    assert "\n" not in message
+    return message.removeprefix(f"{path}: ")
+
+
+FORMATS = {
+    "npy float32": ("d.npy", npy(VALUES, "<f4"), VALUES),
+    "npy float64": ("d.npy", npy(VALUES, "<f8"), VALUES),
+    "npy big-endian": ("d.npy", npy(VALUES, ">f4"), VALUES),
+    "npy 16-bit": ("d.npy", npy(WHOLE, "<u2"), WHOLE),
+    "npy 32-bit": ("d.npy", npy(WHOLE, "<i4"), WHOLE),
+    "png 16-bit": ("d.png", png(WHOLE, 16, 0), WHOLE),
+    "tiff float": ("d.tiff", tiff(VALUES), VALUES),
+    "tif float": ("d.tif", tiff(VALUES), VALUES),
+    "pfm little-endian": ("d.pfm", pfm(VALUES, "<"), VALUES),
+    "pfm big-endian": ("d.pfm", pfm(VALUES, ">"), VALUES),
+}
+
+
+@pytest.mark.parametrize("case", FORMATS)
+def test_a_map_of_every_format_is_read_exactly_top_row_first(tmp_path, case):
+    name, content, expected = FORMATS[case]
+    values = read_map(written(tmp_path, name, content))
+    assert values.dtype == np.float64
+    np.testing.assert_array_equal(values, expected)
+
+
+@pytest.mark.parametrize("order", ["<", ">"])
+def test_infinities_and_nan_of_a_pfm_come_through(tmp_path, order):
+    marked = np.array([[np.inf, 1.0], [np.nan, -2.0]])
+    np.testing.assert_array_equal(read_map(written(tmp_path, "d.pfm", pfm(marked, order))), marked)
+
+
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [("d.png", png(WHOLE % 256, 8, 0)), ("d.npy", npy(WHOLE % 256, "|u1")), ("d.npy", npy(WHOLE % 100, "|i1"))],
+)
+def test_8_bit_depth_is_refused(tmp_path, capfd, name, content):
+    assert "expected 16-bit or floating point" in refusal(read_map, written(tmp_path, name, content), capfd)
+
+
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        ("d.png", png(np.dstack([WHOLE] * 3), 16, 2)),
+        ("d.npy", npy(np.ones((1, 2, 3)), "<f4")),
+        ("d.npy", npy(np.ones(3), "<f4")),
+    ],
+)
+def test_a_map_of_several_channels_is_refused_with_its_shape(tmp_path, capfd, name, content):
+    assert "expected one channel" in refusal(read_map, written(tmp_path, name, content), capfd)
+
+
+@pytest.mark.parametrize("descr", ["<c16", "|b1"])
+def test_an_array_that_is_no_map_of_numbers_is_refused(tmp_path, capfd, descr):
+    refusal(read_map, written(tmp_path, "d.npy", npy(np.ones((2, 3)), descr)), capfd)
+
+
+@pytest.mark.parametrize("case", FORMATS)
+@pytest.mark.parametrize("share", [0, 0.3, 0.9])
+def test_a_truncated_map_is_refused(tmp_path, capfd, case, share):
+    name, content, _ = FORMATS[case]
+    refusal(read_map, written(tmp_path, name, content[: int(len(content) * share)]), capfd)
+
+
+@pytest.mark.parametrize("name", ["d.npy", "d.png", "d.tiff", "d.pfm"])
+@pytest.mark.parametrize(
+    "content", [b"", b"no picture, no array", bytes(200), b"\x93NUMPY\x01\0\x10\0{'descr': ((((", b"\x93NUMPY\x09\0ab"]
+)
+def test_a_foreign_file_is_refused(tmp_path, capfd, name, content):
+    refusal(read_map, written(tmp_path, name, content), capfd)
+
+
+def test_an_archive_of_arrays_named_npy_is_refused(tmp_path, capfd):
+    np.savez(tmp_path / "d.npz", depth=np.ones((2, 3)))
+    assert "expected a NumPy array" in refusal(read_map, (tmp_path / "d.npz").rename(tmp_path / "d.npy"), capfd)
+
+
+def test_an_array_that_would_run_code_is_refused(tmp_path, capfd):
+    np.save(tmp_path / "d.npy", np.array([[{}]], dtype=object))
+    refusal(read_map, tmp_path / "d.npy", capfd)
+
+
+def test_an_array_larger_than_any_memory_is_refused(tmp_path, capfd):
+    header = "{'descr': '<f8', 'fortran_order': False, 'shape': (99999999, 99999999), }".ljust(117) + "\n"
+    content = b"\x93NUMPY\x01\0" + struct.pack("<H", len(header)) + header.encode()
+    refusal(read_map, written(tmp_path, "d.npy", content), capfd)
+
+
+@pytest.mark.parametrize(
+    ("reader", "name"),
+    [(read_map, "d.npy"), (read_map, "d.png"), (read_rgb, "rgb.png"), (read_mask, "mask.png"), (read_camera, "c.json")],
+)
+def test_a_missing_file_and_a_directory_in_its_place_are_refused(tmp_path, capfd, reader, name):
+    assert "there is none" in refusal(reader, tmp_path / name, capfd)
+    (tmp_path / name).mkdir()
+    assert "there is none" in refusal(reader, tmp_path / name, capfd)
+
+
+def test_a_photo_is_read_as_red_green_blue(tmp_path):
+    colours = np.array([[[255, 0, 0], [0, 255, 0]], [[0, 0, 255], [10, 20, 30]]])
+    picture = read_rgb(written(tmp_path, "rgb.png", png(colours, 8, 2)))
+    assert picture.dtype == np.uint8
+    np.testing.assert_array_equal(picture, colours)
+
+
+def test_a_jpg_photo_is_read_as_red_green_blue(tmp_path):
+    orange = np.full((16, 24, 3), (0, 128, 255), np.uint8)  # blue, green, red
+    assert cv2.imwrite(str(tmp_path / "rgb.jpg"), orange)
+    picture = read_rgb(tmp_path / "rgb.jpg")
+    assert picture.shape == (16, 24, 3)
+    np.testing.assert_allclose(picture, np.full((16, 24, 3), (255, 128, 0)), atol=3)
+
+
+def test_a_grey_photo_becomes_three_equal_channels(tmp_path):
+    grey = WHOLE % 256
+    picture = read_rgb(written(tmp_path, "rgb.png", png(grey, 8, 0)))
+    np.testing.assert_array_equal(picture, np.dstack([grey] * 3))
+
+
+@pytest.mark.parametrize("share", [0, 0.3, 0.7, 0.97])
+def test_a_broken_png_photo_is_refused(tmp_path, capfd, share):
+    noise = np.random.default_rng(0).integers(0, 256, (32, 32, 3))
+    content = png(noise, 8, 2)
+    refusal(read_rgb, written(tmp_path, "rgb.png", content[: int(len(content) * share)]), capfd)
+
+
+def test_a_png_photo_with_a_flipped_bit_is_refused(tmp_path, capfd):
+    content = bytearray(png(np.random.default_rng(0).integers(0, 256, (32, 32, 3)), 8, 2))
+    content[len(content) // 2] ^= 1
+    refusal(read_rgb, written(tmp_path, "rgb.png", bytes(content)), capfd)
+
+
+def test_a_refused_picture_leaves_the_standard_error_open(tmp_path, capfd):
+    refusal(read_rgb, written(tmp_path, "rgb.png", b"no"), capfd)
+    os.write(2, b"heard")
+    assert capfd.readouterr().err == "heard"
+
+
+def test_a_mask_is_true_where_its_picture_is_not_0(tmp_path):
+    mask = read_mask(written(tmp_path, "mask.png", png([[0, 1, 255], [128, 0, 0]], 8, 0)))
+    assert mask.dtype == bool
+    np.testing.assert_array_equal(mask, [[False, True, True], [True, False, False]])
+
+
+def camera_file(folder, **changes):
+    entries = {key: value for key, value in {**INTRINSICS, **changes}.items() if value != "absent"}
+    path = folder / "camera.json"
+    path.write_text(json.dumps(entries))
+    return path
+
+
+def test_a_camera_file_is_read_in_pixels_and_metres(tmp_path):
+    path = camera_file(
+        tmp_path, range_type="disparity", baseline=160, baseline_unit="mm", doffs=2.5, depth_unit="mm", hole_value=0
+    )
+    described = read_camera(path)
+    camera = described.camera
+    assert (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy) == (3, 2, 3, 3, 1, 0.5)
+    assert camera.baseline == pytest.approx(0.16, rel=1e-15)
+    assert camera.doffs == 2.5
+    assert (described.range_type, described.depth_unit, described.hole_value) == ("disparity", 0.001, 0.0)
+
+
+def test_a_camera_file_of_intrinsics_alone_has_no_baseline_and_says_nothing_of_the_maps(tmp_path):
+    described = read_camera(camera_file(tmp_path))
+    assert (described.camera.baseline, described.camera.doffs) == (None, 0)
+    assert (described.range_type, described.depth_unit, described.hole_value) == (None, None, None)
+
+
+@pytest.mark.parametrize(("unit", "metres"), [("m", 1.0), ("mm", 0.001), (0.0002, 0.0002), (5, 5.0)])
+def test_the_depth_unit_is_m_mm_or_a_number(tmp_path, unit, metres):
+    assert read_camera(camera_file(tmp_path, depth_unit=unit)).depth_unit == metres
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("width", "absent"), ("fx", "absent"), ("cy", "absent"), ("width", 3.5), ("width", 0), ("height", -2),
+        ("fx", 0), ("fx", "3"), ("fy", 0), ("cx", None), ("cx", True), ("fx", 10**400), ("width", 1e300),
+        ("range_type", "z"), ("range_type", ["depth"]), ("baseline", "0.2"), ("baseline", 0), ("baseline", -1),
+        ("baseline", float("inf")), ("doffs", None), ("doffs", float("nan")), ("hole_value", "0"),
+        ("depth_unit", "cm"), ("depth_unit", 0), ("depth_unit", -1), ("depth_unit", None), ("depth_unit", True),
+        ("depth_unit", float("nan")),
+    ],
+)  # fmt: skip
+def test_a_bad_value_in_a_camera_file_is_refused_by_its_key(tmp_path, capfd, key, value):
+    assert key in refusal(read_camera, camera_file(tmp_path, **{key: value}), capfd).split(":")[0].split()[-1]
+
+
+@pytest.mark.parametrize("unit", ["cm", "", None, 0.001])
+def test_an_unknown_unit_of_the_baseline_is_refused_by_its_key(tmp_path, capfd, unit):
+    message = refusal(read_camera, camera_file(tmp_path, baseline=0.2, baseline_unit=unit), capfd)
+    assert message.startswith("baseline_unit: expected m, mm, got")
+
+
+def test_an_unknown_key_in_a_camera_file_is_refused_with_the_known_ones(tmp_path, capfd):
+    message = refusal(read_camera, camera_file(tmp_path, basline=0.2), capfd)
+    assert message.startswith("basline: unknown key; expected ")
+    assert "baseline" in message
+
+
+@pytest.mark.parametrize("text", ["", "{", "[1, 2]", "3", "null", "[" * 100_000, '{"width": 3,}'])
+def test_a_camera_file_that_is_no_json_object_is_refused(tmp_path, capfd, text):
+    assert "expected" in refusal(read_camera, written(tmp_path, "camera.json", text.encode()), capfd)
+
+
+def test_a_camera_file_that_is_no_text_is_refused(tmp_path, capfd):
+    refusal(read_camera, written(tmp_path, "camera.json", b"\xff\xfe{}"), capfd)

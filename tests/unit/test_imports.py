@@ -1,0 +1,148 @@
+"""Imports run downward only; see the house's layers in the README."""
+
+import ast
+from pathlib import Path
+
+import pytest
+
+SOURCE = Path(__file__).resolve().parents[2] / "src"
+LAYERS = (
+    ("dsr.atomic",),
+    ("dsr.geometry.camera",),
+    ("dsr.sample", "dsr.geometry.surface", "dsr.geometry.shading"),
+    ("dsr.degrade",),
+    ("dsr.quality.functional",),
+    ("dsr.quality.lpips",),
+    ("dsr.quality.scores",),
+    ("dsr.quality.metrics", "dsr.quality.losses"),
+    ("dsr.data", "dsr.methods"),
+    ("dsr.evaluation", "dsr.training"),
+    ("dsr.report",),
+    ("dsr.app", "dsr.cli"),
+)
+"""From the lowest up. A package stands for all its modules; those in one line do not import each other."""
+MORE_FORBIDDEN = {
+    "dsr.data": ("dsr.quality",),
+    "dsr.methods": ("dsr.quality",),
+    "dsr.report": ("dsr.data", "dsr.methods", "dsr.evaluation", "dsr.training", "dsr.quality", "dsr.degrade"),
+}
+ONLY_APP = ("hydra", "omegaconf")
+
+
+def name_of(path):
+    return ".".join(path.relative_to(SOURCE).with_suffix("").parts).removesuffix(".__init__")
+
+
+MODULES = {name_of(path): path for path in sorted((SOURCE / "dsr").rglob("*.py"))}
+
+
+def within(name, package):
+    return name == package or name.startswith(f"{package}.")
+
+
+def imports_of(text, module, *, package=False, known=()):
+    """Return the dotted names that a module's text imports, wherever in it: modules rather than what is in them."""
+    found = set()
+    for node in ast.walk(ast.parse(text)):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            base = node.module or ""
+            if node.level:
+                home = module.split(".")
+                home = home[: len(home) - node.level + package]
+                base = ".".join([*home, base] if base else home)
+            deeper = {f"{base}.{alias.name}" for alias in node.names}
+            modules = {name for name in deeper if name in known}
+            found |= modules
+            if modules != deeper:
+                found.add(base)
+    return found
+
+
+IMPORTS = {
+    name: imports_of(path.read_text(encoding="utf-8"), name, package=path.name == "__init__.py", known=MODULES)
+    for name, path in MODULES.items()
+}
+
+
+def place_of(name):
+    """Return the rank and the group of a module, None where it has none."""
+    for rank, layer in enumerate(LAYERS):
+        for group in layer:
+            if within(name, group):
+                return rank, group
+    return None
+
+
+def offences(name, imported):
+    """Return what is wrong with a module's imports, one line each."""
+    rank, group = place_of(name)
+    wrong = []
+    for other in sorted(imported):
+        place = place_of(other)
+        forbidden = any(
+            within(name, mine) and any(within(other, bad) for bad in bads) for mine, bads in MORE_FORBIDDEN.items()
+        )
+        if place is not None and (forbidden or place[0] > rank or (place[0] == rank and place[1] != group)):
+            wrong.append(f"{name} imports {other}")
+        if group != "dsr.app" and any(within(other, library) for library in ONLY_APP):
+            wrong.append(f"{name} imports {other}, which only dsr.app may")
+    return wrong
+
+
+def has_no_place(name):
+    """Return whether a module needs a layer and has none; an ``__init__`` that imports nothing needs none."""
+    return place_of(name) is None and not (MODULES[name].name == "__init__.py" and not IMPORTS[name])
+
+
+def test_every_module_has_a_layer():
+    homeless = [name for name in MODULES if has_no_place(name)]
+    assert not homeless, f"assign {', '.join(homeless)} to a layer in LAYERS of {Path(__file__).name}"
+
+
+@pytest.mark.parametrize("name", [name for name in MODULES if place_of(name) is not None])
+def test_a_module_imports_from_layers_below_and_its_own_group_alone(name):
+    assert offences(name, IMPORTS[name]) == []
+
+
+def test_modules_do_not_import_each_other_in_a_circle():
+    done, path = set(), []
+
+    def visit(name):
+        assert name not in path, f"circle: {' -> '.join([*path[path.index(name) :], name])}"
+        if name in done:
+            return
+        path.append(name)
+        for other in sorted(IMPORTS[name] & MODULES.keys()):
+            if other != name:
+                visit(other)
+        path.pop()
+        done.add(name)
+
+    for name in MODULES:
+        visit(name)
+
+
+@pytest.mark.parametrize(
+    ("module", "text", "offence"),
+    [
+        ("dsr.degrade", "import dsr.data.files", "dsr.data.files"),
+        ("dsr.data.files", "from dsr.methods import msg", "dsr.methods.msg"),
+        ("dsr.data.files", "def f():\n    from ..quality import lpips", "dsr.quality.lpips"),
+        ("dsr.quality.metrics", "from dsr.quality import losses", "dsr.quality"),
+        ("dsr.report.tables", "from dsr.evaluation import score", "dsr.evaluation"),
+        ("dsr.evaluation", "from omegaconf.errors import X", "omegaconf.errors"),
+        ("dsr.methods.msg", "import hydra", "hydra"),
+    ],
+)
+def test_the_test_itself_sees_a_forbidden_import(module, text, offence):
+    known = {*MODULES, "dsr.quality.losses"}
+    imported = imports_of(text, module, known=known)
+    assert any(within(name, offence) for name in imported)
+    assert len(offences(module, imported)) == 1
+
+
+def test_the_modules_were_found():
+    assert {"dsr.sample", "dsr.app.entry", "dsr.data.folder"} <= MODULES.keys()
+    assert "dsr.data.base" in IMPORTS["dsr.data.folder"]

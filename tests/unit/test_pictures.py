@@ -1,0 +1,111 @@
+"""A picture comes out of every scene, whatever its shape and whatever is unknown of it."""
+
+import struct
+
+import pytest
+import torch
+
+from dsr.geometry.camera import Camera
+from dsr.report.pictures import save_picture
+from dsr.sample import DepthSample
+
+SCORES = {"RMSE_d": 0.07, "DSSIM_v": 0.3}
+WIDTH = 2656
+"""Pixels: five panels of 3.2 inches and 0.6 inches of margin at 160 dpi."""
+
+
+def toy_sample(height=32, width=32, *, truth=True, name="toy", scale=4):
+    camera = Camera(width, height, 1.2 * width, 1.2 * width, (width - 1) / 2, (height - 1) / 2)
+    depth = 2 + 0.01 * torch.arange(height * width, dtype=torch.float64).view(1, height, width)
+    coarse = torch.nn.functional.avg_pool2d(depth[None], scale)[0]
+    coarse_camera = camera.rescale(width // scale, height // scale)
+    rgb = torch.full((3, height, width), 0.5)
+    return DepthSample("set", name, rgb, coarse, camera, coarse_camera, scale, depth if truth else None)
+
+
+def drawn(folder, sample, depth, scores=SCORES, label="Toy"):
+    """Draw and return the picture's width and height from the PNG's header."""
+    path = folder / "pictures" / "scene.png"
+    save_picture(path, sample, depth, scores, label)
+    assert [file.name for file in path.parent.iterdir()] == ["scene.png"]
+    content = path.read_bytes()
+    assert content.startswith(b"\x89PNG")
+    assert content.endswith(b"IEND\xaeB`\x82")
+    return struct.unpack(">II", content[16:24])
+
+
+def inches(rows, panel):
+    return 160 * (0.8 + rows * (panel + 0.95))
+
+
+def test_a_square_scene_has_three_rows_of_five_panels(tmp_path):
+    sample = toy_sample()
+    width, height = drawn(tmp_path, sample, sample.depth + 0.01)
+    assert width == WIDTH
+    assert height == pytest.approx(inches(3, 3.2), abs=1)
+
+
+def test_without_truth_there_are_two_rows(tmp_path):
+    sample = toy_sample(truth=False)
+    width, height = drawn(tmp_path, sample, torch.full((1, 32, 32), 2.0), {})
+    assert width == WIDTH
+    assert height == pytest.approx(inches(2, 3.2), abs=1)
+
+
+@pytest.mark.parametrize(
+    ("height", "width", "panel"), [(32, 64, 1.6), (64, 48, 3.2 * 4 / 3), (4, 64, 1.28), (64, 4, 8.0)]
+)
+def test_panels_follow_the_scene_s_shape_within_reason(tmp_path, height, width, panel):
+    sample = toy_sample(height, width)
+    assert drawn(tmp_path, sample, sample.depth)[1] == pytest.approx(inches(3, panel), abs=1)
+
+
+@pytest.mark.parametrize(("height", "width"), [(2, 2), (4, 8)])
+def test_a_tiny_scene_is_drawn(tmp_path, height, width):
+    sample = toy_sample(height, width, scale=2)
+    assert drawn(tmp_path, sample, sample.depth)[0] == WIDTH
+
+
+@pytest.mark.parametrize("where", ["prediction", "all"])
+def test_holes_are_drawn(tmp_path, where):
+    sample = toy_sample()
+    depth = sample.depth.clone()
+    if where in ("prediction", "all"):
+        depth[0, :10] = torch.nan
+    if where in ("truth", "all"):
+        sample.depth[0, 5:20, :9] = torch.nan
+    if where in ("input", "all"):
+        sample.depth_lr[0, 0] = torch.nan
+    drawn(tmp_path, sample, depth)
+
+
+@pytest.mark.parametrize("truth", [True, False])
+def test_a_prediction_of_holes_alone_is_drawn(tmp_path, truth):
+    sample = toy_sample(truth=truth)
+    drawn(tmp_path, sample, torch.full((1, 32, 32), torch.nan), {"RMSE_d": float("nan")})
+
+
+def test_a_flat_wall_is_drawn(tmp_path):
+    sample = toy_sample()
+    sample.depth.fill_(3.0)
+    sample.depth_lr.fill_(3.0)
+    drawn(tmp_path, sample, sample.depth.clone())
+
+
+@pytest.mark.parametrize("name", ["$\\foo$", "日本 a_b^c", "{} %d ünï $"])
+def test_any_name_is_drawn_as_it_is(tmp_path, name):
+    sample = toy_sample(name=name)
+    drawn(tmp_path, sample, sample.depth, label=name)
+
+
+def test_a_picture_that_is_there_is_replaced_and_a_failure_leaves_it(tmp_path):
+    sample = toy_sample()
+    drawn(tmp_path, sample, sample.depth)
+    before = (tmp_path / "pictures" / "scene.png").read_bytes()
+    drawn(tmp_path, sample, sample.depth + 0.5)
+    after = (tmp_path / "pictures" / "scene.png").read_bytes()
+    assert before != after
+    with pytest.raises((ValueError, RuntimeError, TypeError)):
+        save_picture(tmp_path / "pictures" / "scene.png", sample, torch.ones(1, 7, 9), SCORES, "Toy")
+    assert (tmp_path / "pictures" / "scene.png").read_bytes() == after
+    assert len(list((tmp_path / "pictures").iterdir())) == 1

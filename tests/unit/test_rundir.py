@@ -1,0 +1,189 @@
+"""The directory of a run never collides, is never silently overwritten, and says what the run was."""
+
+import importlib.metadata
+import json
+
+import pytest
+import torch
+from omegaconf import OmegaConf
+
+import dsr
+from dsr.app import rundir
+from dsr.app.rundir import claim, code_hash, default_directory, file_hash, identity_of, versions
+from dsr.app.schema import ConfigError
+
+CPU = torch.device("cpu")
+
+
+def config(**changes):
+    return {
+        "dataset": {"name": "folder", "root": "data", "scenes": None},
+        "downsampling": {"name": "box", "kernel": "box"},
+        "method": {"name": "msg_v"},
+        "metrics": {"lpips": True},
+        "scale": 4,
+        "weights": "w.pth",
+        "precision": "float32",
+        "seed": 0,
+        "output_dir": None,
+        "overwrite": False,
+        **changes,
+    }
+
+
+def directory(plain, weights="abc", device=CPU):
+    return default_directory("eval", plain, identity_of(plain, weights, device))
+
+
+def claimed(folder, plain, weights="abc"):
+    claim(folder, plain, identity_of(plain, weights, CPU))
+
+
+def test_the_same_configuration_leads_to_the_same_directory():
+    assert directory(config()) == directory(config())
+    folder = directory(config())
+    assert folder.parts[:2] == ("outputs", "eval")
+    assert folder.name.startswith("folder_box_x4_msg_v_")
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"scale": 8}, {"seed": 1}, {"precision": "bfloat16"}, {"dataset": {"name": "folder", "root": "other"}},
+        {"downsampling": {"name": "box", "kernel": "gaussian"}}, {"method": {"name": "msg_v", "variant": "x"}},
+    ],
+)  # fmt: skip
+def test_another_configuration_leads_to_another_directory(changes):
+    assert directory(config(**changes)) != directory(config())
+
+
+def test_other_weights_or_another_kind_of_device_lead_to_another_directory():
+    folders = {directory(config(), *rest) for rest in (("abc", CPU), ("abd", CPU), (None, CPU))}
+    folders.add(directory(config(), "abc", torch.device("cuda")))
+    assert len(folders) == 4
+    assert directory(config(), "abc", torch.device("cuda", 1)) in folders
+
+
+@pytest.mark.parametrize(
+    "changes", [{"weights": "elsewhere.pth"}, {"output_dir": "x"}, {"overwrite": True}, {"metrics": {"lpips": False}}]
+)
+def test_what_predictions_do_not_depend_on_does_not_move_the_directory(changes):
+    assert directory(config(**changes)) == directory(config())
+
+
+def test_other_code_leads_to_another_directory(monkeypatch):
+    before = directory(config())
+    monkeypatch.setattr(rundir, "code_hash", lambda: "other")
+    assert directory(config()) != before
+
+
+def test_the_hash_of_the_code_follows_what_makes_predictions_and_nothing_else(monkeypatch, tmp_path):
+    for name in ("methods/a.py", "data/b.py", "geometry/c.py", "sample.py", "degrade.py", "report/d.py"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text("x = 1\n")
+    monkeypatch.setattr(dsr, "__file__", str(tmp_path / "__init__.py"))
+
+    def fresh():
+        code_hash.cache_clear()
+        return code_hash()
+
+    try:
+        hashes = [fresh()]
+        for name in ("methods/a.py", "data/b.py", "geometry/c.py", "sample.py", "degrade.py"):
+            (tmp_path / name).write_text("x = 2\n")
+            hashes.append(fresh())
+        assert len(set(hashes)) == 6
+        (tmp_path / "report/d.py").write_text("x = 2\n")
+        assert fresh() == hashes[-1]
+    finally:
+        code_hash.cache_clear()
+
+
+def test_a_file_s_hash_is_its_sha_256(tmp_path):
+    (tmp_path / "abc").write_bytes(b"abc")
+    assert file_hash(tmp_path / "abc") == "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"
+
+
+def test_a_claimed_directory_has_the_config_and_the_versions(tmp_path):
+    claimed(tmp_path / "new" / "run", config())
+    assert sorted(path.name for path in (tmp_path / "new" / "run").iterdir()) == ["config.yaml", "versions.json"]
+    assert OmegaConf.to_container(OmegaConf.load(tmp_path / "new" / "run" / "config.yaml")) == config()
+    record = json.loads((tmp_path / "new" / "run" / "versions.json").read_text())
+    assert record["packages"]["torch"] == importlib.metadata.version("torch")
+    assert record["packages"]["numpy"] == importlib.metadata.version("numpy")
+    assert record["identity"]["weights_sha256"] == "abc"
+    assert record["identity"]["device"] == "cpu"
+
+
+def test_an_empty_directory_and_the_same_run_may_be_claimed(tmp_path):
+    claimed(tmp_path, config())
+    claimed(tmp_path, config(metrics={"lpips": False}, weights="elsewhere.pth"))
+
+
+def test_a_directory_of_another_run_is_refused_by_the_changed_keys(tmp_path):
+    claimed(tmp_path, config())
+    before = (tmp_path / "config.yaml").read_bytes()
+    other = config(scale=8, dataset={"name": "folder", "root": "other", "scenes": None})
+    with pytest.raises(ConfigError) as caught:
+        claimed(tmp_path, other, "abd")
+    message = str(caught.value)
+    assert message.startswith(f"output_dir: {tmp_path} holds a run with another dataset.root, scale, weights_sha256; ")
+    assert "overwrite=true" in message
+    assert (tmp_path / "config.yaml").read_bytes() == before
+
+
+@pytest.mark.parametrize("content", [None, "", "[]", "{}", '{"identity": 3}', '{"identity": null}'])
+def test_a_directory_with_files_of_something_else_is_refused_and_left_alone(tmp_path, content):
+    (tmp_path / "thesis.txt").write_text("precious")
+    if content is not None:
+        (tmp_path / "versions.json").write_text(content)
+    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    with pytest.raises(ConfigError, match=r"^output_dir: .* holds files of something else"):
+        claimed(tmp_path, config())
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
+
+
+def test_overwrite_takes_the_directory_of_another_run(tmp_path):
+    claimed(tmp_path, config())
+    claimed(tmp_path, config(scale=8, overwrite=True))
+    assert OmegaConf.load(tmp_path / "config.yaml").scale == 8
+    assert json.loads((tmp_path / "versions.json").read_text())["identity"]["scale"] == 8
+
+
+def test_a_file_in_the_directory_s_place_is_refused(tmp_path):
+    (tmp_path / "file").write_text("x")
+    with pytest.raises(ConfigError, match=r"^output_dir: expected a directory, .*file is a file"):
+        claimed(tmp_path / "file", config())
+
+
+def test_a_directory_that_cannot_be_made_is_refused_on_one_line(tmp_path):
+    (tmp_path / "file").write_text("x")
+    with pytest.raises(ConfigError, match=r"^output_dir: expected a directory to write to, got .*run \(Not a dir"):
+        claimed(tmp_path / "file" / "run", config())
+
+
+def test_a_directory_that_cannot_be_written_is_refused_on_one_line(tmp_path, monkeypatch):
+    def refuse(path, text):
+        raise PermissionError(13, "Permission denied", str(path))
+
+    monkeypatch.setattr(rundir, "write_text", refuse)
+    with pytest.raises(ConfigError, match=r"^output_dir: .*Permission denied"):
+        claimed(tmp_path / "run", config())
+
+
+def test_the_versions_have_packages_commit_and_accelerator():
+    record = json.loads(json.dumps(versions()))
+    assert {"dsr", "torch", "numpy", "hydra-core"} <= record["packages"].keys()
+    assert record["accelerator"] == (torch.cuda.get_device_name() if torch.cuda.is_available() else None)
+    assert record["git_commit"] is None or len(record["git_commit"]) == 40
+    assert isinstance(record["git_dirty"], bool)
+
+
+def test_the_versions_outside_of_a_checkout_have_no_commit(monkeypatch, tmp_path):
+    monkeypatch.setattr(dsr, "__file__", str(tmp_path / "dsr" / "__init__.py"))
+    assert versions()["git_commit"] is None
+
+
+def test_a_package_that_is_not_installed_is_said_to_be_so(monkeypatch):
+    monkeypatch.setattr(rundir, "_PACKAGES", ("dsr", "no-such-package-here"))
+    assert versions()["packages"]["no-such-package-here"] == "not installed"

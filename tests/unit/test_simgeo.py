@@ -1,0 +1,173 @@
+"""dataset=simgeo: six embedded scenes behind a cache, the paper's Lucy where it is to be had."""
+
+import json
+
+import cv2
+import numpy as np
+import pytest
+
+from dsr.data import simgeo
+from dsr.data.simgeo import SimGeo, cache_directory
+from dsr.data.simgeo_scenes import SCENES, render_scene
+
+SIZE = 64
+NAME = "cube_no_texture"
+
+
+@pytest.fixture
+def cache(tmp_path, monkeypatch):
+    """A cache of the test's own."""
+    monkeypatch.setenv("DSR_CACHE", str(tmp_path / "cache"))
+    return tmp_path / "cache"
+
+
+@pytest.fixture
+def calls(monkeypatch):
+    """Return the list of renderings made from here on."""
+    made = []
+
+    def counted(name, size):
+        made.append((name, size))
+        return render_scene(name, size)
+
+    monkeypatch.setattr(simgeo, "render_scene", counted)
+    return made
+
+
+def assert_rendered(scene, name=NAME):
+    expected = render_scene(name, SIZE)
+    np.testing.assert_array_equal((scene.rgb * 255).round().byte().permute(1, 2, 0).numpy(), expected.rgb)
+    assert scene.depth is not None
+    np.testing.assert_array_equal(scene.depth[0].numpy(), expected.depth)
+    assert scene.camera == expected.camera
+
+
+def test_there_are_five_scenes_like_the_papers_and_a_statue():
+    assert SimGeo(size=SIZE).scenes() == list(SCENES)
+    assert len(SCENES) == 6
+    assert "statue" in SCENES
+
+
+def test_a_scene_is_its_rendering_with_depth_in_metres(cache, calls):
+    scene = SimGeo(size=SIZE).load(NAME)
+    assert (scene.dataset, scene.name) == ("simgeo", NAME)
+    assert scene.rgb.shape == (3, SIZE, SIZE)
+    assert_rendered(scene)
+    assert calls == [(NAME, SIZE)]
+
+
+def test_a_rendering_is_made_once_and_then_read_from_the_cache(cache, calls):
+    SimGeo(size=SIZE).load(NAME)
+    again = SimGeo(size=SIZE).load(NAME)
+    assert calls == [(NAME, SIZE)]
+    assert_rendered(again)
+
+
+def test_the_cache_is_really_what_a_second_load_shows(cache):
+    SimGeo(size=SIZE).load(NAME)
+    [file] = cache.rglob("*.npz")
+    with np.load(file) as kept:
+        content = dict(kept)
+    content["depth"] = content["depth"] + 1
+    np.savez(file, **content)
+    np.testing.assert_array_equal(SimGeo(size=SIZE).load(NAME).depth[0].numpy(), render_scene(NAME, SIZE).depth + 1)
+
+
+def test_sizes_do_not_share_a_rendering(cache, calls):
+    SimGeo(size=SIZE).load(NAME)
+    assert SimGeo(size=32).load(NAME).rgb.shape == (3, 32, 32)
+    assert calls == [(NAME, SIZE), (NAME, 32)]
+
+
+@pytest.mark.parametrize("damage", ["empty", "truncated", "foreign", "without a camera", "a wrong camera"])
+def test_a_damaged_cache_file_is_replaced(cache, calls, damage):
+    SimGeo(size=SIZE).load(NAME)
+    [file] = cache.rglob("*.npz")
+    with np.load(file) as kept:
+        content = dict(kept)
+    if damage == "empty":
+        file.write_bytes(b"")
+    elif damage == "truncated":
+        file.write_bytes(file.read_bytes()[:-100])
+    elif damage == "foreign":
+        file.write_bytes(b"something else")
+    elif damage == "without a camera":
+        np.savez(file, rgb=content["rgb"], depth=content["depth"])
+    else:
+        np.savez(file, **{**content, "camera": json.dumps({"wide": 3})})
+    assert_rendered(SimGeo(size=SIZE).load(NAME))
+    assert len(calls) == 2
+    SimGeo(size=SIZE).load(NAME)
+    assert len(calls) == 2
+    assert [path.name for path in file.parent.iterdir()] == [f"{NAME}.npz"]
+
+
+def test_a_cache_that_cannot_be_written_is_done_without(tmp_path, monkeypatch, calls):
+    (tmp_path / "file").write_text("in the way")
+    monkeypatch.setenv("DSR_CACHE", str(tmp_path / "file"))
+    source = SimGeo(size=SIZE)
+    assert_rendered(source.load(NAME))
+    assert_rendered(source.load(NAME))
+    assert len(calls) == 2
+    assert (tmp_path / "file").read_text() == "in the way"
+
+
+def test_the_cache_is_dsr_cache_else_the_users(monkeypatch, tmp_path):
+    monkeypatch.setenv("DSR_CACHE", str(tmp_path / "mine"))
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "xdg"))
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    assert cache_directory() == tmp_path / "mine"
+    monkeypatch.delenv("DSR_CACHE")
+    assert cache_directory() == tmp_path / "xdg" / "dsr"
+    monkeypatch.delenv("XDG_CACHE_HOME")
+    assert cache_directory() == tmp_path / "home" / ".cache" / "dsr"
+
+
+def test_the_tests_do_not_touch_the_users_cache(dsr_cache):
+    assert cache_directory() == dsr_cache
+
+
+@pytest.fixture
+def lucy(tmp_path):
+    """A folder with a small Lucy."""
+    folder = tmp_path / "data" / "lucy"
+    folder.mkdir(parents=True)
+    cv2.imwrite(str(folder / "rgb.png"), np.full((4, 8, 3), 9, np.uint8))
+    np.save(folder / "depth.npy", np.full((4, 8), 2.5))
+    camera = {"width": 8, "height": 4, "fx": 8, "fy": 8, "cx": 3.5, "cy": 1.5}
+    (folder / "camera.json").write_text(json.dumps(camera))
+    return folder
+
+
+def test_lucy_takes_the_statues_place_where_there_is_one(lucy):
+    source = SimGeo(str(lucy.parent), size=SIZE)
+    assert source.scenes() == [*(name for name in SCENES if name != "statue"), "lucy"]
+    scene = source.load("lucy")
+    assert (scene.dataset, scene.name) == ("simgeo", "lucy")
+    assert scene.depth is not None
+    assert bool((scene.depth == 2.5).all())
+
+
+def test_lucys_fingerprint_follows_her_files_and_the_renderings_their_size(lucy):
+    source = SimGeo(str(lucy.parent), size=SIZE)
+    before, cube = source.fingerprint("lucy"), source.fingerprint(NAME)
+    np.save(lucy / "depth.npy", np.full((4, 8), 2.0))
+    assert source.fingerprint("lucy") != before
+    assert source.fingerprint(NAME) == cube != SimGeo(size=32).fingerprint(NAME)
+
+
+@pytest.mark.parametrize("root", [None, "nowhere"])
+def test_without_a_lucy_there_is_the_statue(tmp_path, root):
+    source = SimGeo(None if root is None else str(tmp_path / root), size=SIZE)
+    assert source.scenes()[-1] == "statue"
+
+
+def test_only_chosen_scenes_are_there_and_an_unknown_one_is_refused(lucy):
+    assert SimGeo(None, ["statue"], SIZE).scenes() == ["statue"]
+    with pytest.raises(ValueError, match=r"dataset\.scenes: 'lucy' is not there; expected some of .*statue"):
+        SimGeo(None, ["lucy"], SIZE)
+
+
+def test_a_size_below_32_is_refused():
+    with pytest.raises(ValueError, match=r"dataset\.size: expected at least 32 pixels, got 31"):
+        SimGeo(size=31)

@@ -1,0 +1,162 @@
+"""Scores in the units of the paper's tables, beside what the paper says."""
+
+import io
+import math
+
+import pandas as pd
+import pytest
+from rich.console import Console
+
+from dsr.report.tables import METRICS, RECREATED, in_paper_units, published, published_row, score_table
+
+RAW = {
+    "RMSE_d": 0.0704,
+    "BadPix_d_5cm": 0.0670,
+    "BadPix_v_5": 0.495,
+    "DSSIM_v": 0.354,
+    "LPIPS_v": 0.424,
+    "Bumpiness_d": 1.39,
+    "RMSE_v": 0.274,
+}
+"""Lucy x4 Bicubic as the protocol measures it, in raw units."""
+UNITS = {
+    "RMSE_d": 70.4,
+    "BadPix_d_5cm": 6.70,
+    "BadPix_v_5": 49.5,
+    "DSSIM_v": 354,
+    "LPIPS_v": 424,
+    "Bumpiness_d": 1.39,
+    "RMSE_v": 274,
+}
+PER_LIGHT = ("BadPix_v_5", "DSSIM_v", "LPIPS_v")
+
+
+def scores(*scenes, raw=RAW, downsampling="box", scale=4):
+    rows = []
+    for number, scene in enumerate(scenes):
+        for metric, value in {**raw, "BadPix_d_1cm": 0.9, "RMSE_v1": 0.8}.items():
+            variants = {"e1": 7.0, "max": value, "avg": 3.0} if metric in PER_LIGHT else {"": value}
+            rows += [
+                {
+                    "dataset": "simgeo",
+                    "scene": scene,
+                    "scale": scale,
+                    "downsampling": downsampling,
+                    "metric": metric,
+                    "variant": variant,
+                    "value": number_value + number * 0.1,
+                }
+                for variant, number_value in variants.items()
+            ]
+    return pd.DataFrame(rows)
+
+
+def text(table, label="Bicubic"):
+    console = Console(width=120, file=io.StringIO())
+    console.print(score_table(table, label))
+    return console.file.getvalue()
+
+
+def row(printed, first, second):
+    """Return the numbers of the printed row that starts with the two words."""
+    [line] = [line for line in printed.splitlines() if line.split()[: len(first) + 1] == [*first, second]]
+    return line.split()[len(first) + 1 :]
+
+
+def test_raw_scores_become_millimetres_percents_and_thousandths():
+    table = in_paper_units(scores("lucy"))
+    assert list(table.columns) == list(METRICS)
+    assert table.loc["lucy"].to_dict() == pytest.approx(UNITS)
+
+
+def test_the_table_shows_the_worst_of_the_four_lights():
+    assert in_paper_units(scores("lucy")).loc["lucy", "DSSIM_v"] == pytest.approx(354)
+
+
+def test_empty_variants_are_recognised_after_a_file_was_read_back(tmp_path):
+    scores("lucy").to_csv(tmp_path / "scores.csv", index=False)
+    again = pd.read_csv(tmp_path / "scores.csv")
+    pd.testing.assert_frame_equal(in_paper_units(again), in_paper_units(scores("lucy")))
+
+
+def test_a_metric_that_was_not_computed_has_no_column():
+    without = {name: value for name, value in RAW.items() if name != "LPIPS_v"}
+    assert "LPIPS_v" not in in_paper_units(scores("lucy", raw=without))
+    assert "LPIPS_v" not in text(scores("lucy", raw=without))
+
+
+def test_the_paper_has_an_rmse_d_of_72_mm_for_lucy_x4_bicubic():
+    found = published_row("lucy", "Bicubic", 4)
+    assert found is not None
+    assert (found["RMSE_d"], found["BadPix_d_5cm"], found["DSSIM_v"], found["LPIPS_v"]) == (72, 6.8, 355, 398)
+
+
+@pytest.mark.parametrize(("scene", "method", "scale"), [("lucy", "Bicubic", 2), ("lucy", "Mine", 4), ("a", "MSG", 4)])
+def test_what_the_paper_has_not_is_not_found(scene, method, scale):
+    assert published_row(scene, method, scale) is None
+
+
+@pytest.mark.parametrize("scene", RECREATED)
+@pytest.mark.parametrize("method", ["Bicubic", "MSG", "MSG-V"])
+@pytest.mark.parametrize("scale", [4, 8])
+def test_every_recreated_scene_is_found_in_the_paper(scene, method, scale):
+    found = published_row(scene, method, scale)
+    assert found is not None
+    assert math.isfinite(found["RMSE_d"])
+
+
+def test_the_published_figures_have_no_row_twice():
+    assert not published().duplicated(["scene", "method", "scale"]).any()
+
+
+def test_the_published_figures_are_those_of_the_shared_transcription(shared):
+    long = pd.read_csv(shared / "paper" / "tables.csv").set_index(["scene", "method", "scale", "metric"])["value"]
+    ours = published().melt(["scene", "method", "scale"], list(METRICS), "metric").dropna()
+    assert len(ours) > 500
+    theirs = long.loc[pd.MultiIndex.from_frame(ours[["scene", "method", "scale", "metric"]])]
+    pd.testing.assert_series_equal(ours["value"], theirs, check_index=False)
+
+
+def test_the_papers_values_stand_below_ours_in_the_same_units():
+    printed = text(scores("lucy"))
+    assert row(printed, ["lucy"], "dsr") == ["70.4", "6.70", "49.5", "354", "424", "1.39", "274"]
+    assert row(printed, [], "paper") == ["72.0", "6.80", "48.8", "355", "398", "1.37", "267"]
+    assert "*" not in printed
+
+
+def test_the_papers_values_of_a_recreated_scene_are_starred_and_explained():
+    printed = text(scores("cube_no_texture"))
+    assert row(printed, [], "paper*")
+    assert "* of the paper's own file" in printed
+
+
+@pytest.mark.parametrize("downsampling", ["nearest", "measured", "gaussian"])
+def test_under_another_downsampling_no_value_of_the_paper_is_shown(downsampling):
+    printed = text(scores("lucy", "cube_no_texture", downsampling=downsampling))
+    assert "paper" not in printed
+    assert f"{downsampling} downsampling" in printed
+
+
+def test_several_scenes_have_a_mean_and_one_has_none():
+    printed = text(scores("lucy", "other"))
+    assert row(printed, ["mean"], "dsr")[0] == "120.4"  # of 70.4 and 170.4 mm
+    assert row(printed, ["mean"], "dsr")[3] == "404"
+    assert "mean" not in text(scores("lucy"))
+
+
+def test_a_value_that_could_not_be_computed_is_a_dash_and_left_out_of_the_mean():
+    table = scores("lucy", "other")
+    table.loc[(table["scene"] == "other") & (table["metric"] == "RMSE_d"), "value"] = math.nan
+    printed = text(table)
+    assert row(printed, ["other"], "dsr")[0] == "-"
+    assert row(printed, ["mean"], "dsr")[0] == "70.4"
+
+
+@pytest.mark.parametrize("scene", ["[bold]", "a[red]b", "ünï", "[/]"])
+def test_a_scene_s_name_is_printed_as_it_is(scene):
+    assert scene in text(scores(scene))
+
+
+def test_the_title_names_method_data_scale_and_downsampling():
+    title = text(scores("lucy", scale=8), "MSG-V").splitlines()[0]
+    assert title.strip() == "MSG-V on simgeo, x8, box downsampling - lower is better"
