@@ -1,0 +1,84 @@
+"""All metrics of bicubic interpolation and of the published networks' maps, against independently computed values.
+
+``expected/metrics.json`` was computed by other code than ours, from the same protocol.
+"""
+
+from __future__ import annotations
+
+import json
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from torch import Tensor
+
+from dsr.degrade import Downsampling, make_sample
+from dsr.geometry.camera import Camera, from_range
+from dsr.methods.interpolation import Interpolation
+from dsr.quality.lpips import LPIPS, load_lpips
+from dsr.quality.scores import Score, catalogue, score_image
+from dsr.sample import Scene
+
+METHODS = {"Bicubic": None, "MSG-V": "msg_v", "MSG": "msg"}
+COVERED = {"Bicubic": 512, "MSG-V": 512, "MSG": 511}
+LIGHTS = ("e1", "e2", "e3", "e4")
+
+
+@pytest.fixture(scope="module")
+def network(shared: Path) -> LPIPS:
+    return load_lpips(shared / "weights" / "alexnet_imagenet_features.pth")
+
+
+@cache
+def _scene(shared: Path, name: str) -> Scene:
+    folder = shared / "scenes" / name
+    stored = json.loads((folder / "camera.json").read_text())
+    camera = Camera(**{key: stored[key] for key in ("width", "height", "fx", "fy", "cx", "cy", "baseline", "doffs")})
+    with Image.open(folder / "rgb.png") as image:
+        rgb = torch.from_numpy(np.array(image.convert("RGB"))).permute(2, 0, 1) / 255
+    disparity = torch.from_numpy(np.load(folder / "disparity.npy").astype(np.float64))[None]
+    return Scene("golden", name, rgb, camera, from_range(disparity, camera, "disparity"))
+
+
+def _prediction(shared: Path, scene: Scene, method: str, scale: int) -> Tensor:
+    """Return the method's fine depth; MSG's published networks leave out the last row and column."""
+    stem = METHODS[method]
+    if stem is None:
+        return Interpolation("bicubic")(make_sample(scene, scale, Downsampling("box"), Interpolation.range_type))
+    stored = torch.from_numpy(np.load(shared / "expected" / f"{stem}_{scene.name}_x{scale}.npy").astype(np.float64))
+    disparity = torch.full((1, 512, 512), torch.nan, dtype=torch.float64)
+    disparity[0, : stored.shape[0], : stored.shape[1]] = stored
+    return from_range(disparity, scene.camera, "disparity")
+
+
+def _check(expected: dict[str, Any], rows: dict[tuple[str, str], Score]) -> None:
+    """Compare all the metrics; each of the lights where there are some, their maximum and their average."""
+    assert set(expected) == {metric for metric, _ in rows}
+    for name, value in expected.items():
+        tolerance = 1e-3 if name == "LPIPS_v" else 1e-4
+        if not isinstance(value, list):
+            assert rows[name, ""].value == pytest.approx(value, rel=tolerance), name
+            continue
+        variants = dict(zip(LIGHTS, value, strict=True)) | {"max": max(value), "avg": sum(value) / 4}
+        for variant, number in variants.items():
+            assert rows[name, variant].value == pytest.approx(number, rel=tolerance), (name, variant)
+
+
+@pytest.mark.parametrize("scale", [4, 8])
+@pytest.mark.parametrize("scene", ["lucy", "plant"])
+@pytest.mark.parametrize("method", METHODS)
+def test_every_metric_is_that_of_the_golden_file(
+    shared: Path, network: LPIPS, method: str, scene: str, scale: int
+) -> None:
+    expected = json.loads((shared / "expected" / "metrics.json").read_text())[scene][f"x{scale}"][method]
+    loaded = _scene(shared, scene)
+    assert loaded.depth is not None
+    prediction = _prediction(shared, loaded, method, scale)
+    scores = score_image(prediction, loaded.depth, loaded.camera.rays(), catalogue(network))
+    rows = {(score.metric, score.variant): score for score in scores}
+    _check(expected, rows)
+    assert {round(row.valid_share, 9) for row in rows.values()} == {round((COVERED[method] / 512) ** 2, 9)}

@@ -1,0 +1,188 @@
+"""Cameras and range types, against the pinhole model written out in numpy."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from dsr.geometry.camera import RANGE_TYPES, VIRTUAL_BASELINE, Camera, RangeType, from_range, to_range
+
+CAMERA = Camera(width=16, height=8, fx=20.0, fy=25.0, cx=6.25, cy=4.5)
+STEREO = Camera(width=16, height=8, fx=20.0, fy=25.0, cx=6.25, cy=4.5, baseline=0.16, doffs=3.5)
+CAMERAS = [CAMERA, STEREO, Camera(16, 8, 20.0, 25.0, -3.0, 40.0, baseline=1e-3, doffs=-0.01)]
+
+
+def _depth(camera: Camera, seed: int = 0) -> torch.Tensor:
+    return torch.from_numpy(np.random.default_rng(seed).uniform(0.3, 9.0, (1, camera.height, camera.width)))
+
+
+def _numpy_range(z: np.ndarray, camera: Camera, range_type: str) -> np.ndarray:
+    v, u = np.mgrid[: camera.height, : camera.width]
+    if range_type == "perspective":
+        points = np.stack(((u - camera.cx) / camera.fx * z, (v - camera.cy) / camera.fy * z, z))
+        return np.linalg.norm(points, axis=0)
+    if range_type == "disparity":
+        baseline = 0.2 if camera.baseline is None else camera.baseline
+        return baseline * camera.fx / z - camera.doffs
+    return z
+
+
+def test_ray_of_a_pixel_has_z_one_and_pixel_centres_at_integers() -> None:
+    rays = CAMERA.rays()
+    assert rays.shape == (3, 8, 16)
+    assert rays.dtype == torch.float64
+    for v, u in ((0, 0), (3, 5), (7, 15)):
+        expected = [(u - 6.25) / 20.0, (v - 4.5) / 25.0, 1.0]
+        assert rays[:, v, u].tolist() == pytest.approx(expected, abs=1e-15)
+
+
+def test_ray_lengths_are_norms_of_the_rays() -> None:
+    expected = np.linalg.norm(CAMERA.rays().numpy(), axis=0)
+    np.testing.assert_allclose(CAMERA.ray_lengths().numpy(), expected, rtol=1e-15)
+
+
+def test_rays_come_in_the_wanted_precision() -> None:
+    assert CAMERA.rays(dtype=torch.float32).dtype == torch.float32
+    assert CAMERA.ray_lengths(dtype=torch.float32).dtype == torch.float32
+
+
+def test_cropped_camera_sees_the_window_of_rays_and_ranges() -> None:
+    window = (..., slice(2, 7), slice(3, 13))
+    cropped = STEREO.crop(2, 3, 5, 10)
+    assert (cropped.height, cropped.width) == (5, 10)
+    torch.testing.assert_close(cropped.rays(), STEREO.rays()[window], rtol=0, atol=1e-15)
+    depth = _depth(STEREO)
+    for range_type in RANGE_TYPES:
+        expected = to_range(depth, STEREO, range_type)[window]
+        torch.testing.assert_close(to_range(depth[window], cropped, range_type), expected, rtol=1e-14, atol=0)
+
+
+@pytest.mark.parametrize(("fy", "fx"), [(2, 2), (4, 4), (8, 8), (2, 4), (1, 16)])
+def test_rescaled_camera_sees_through_the_middle_of_each_block(fy: int, fx: int) -> None:
+    coarse = STEREO.rescale(16 // fx, 8 // fy)
+    blocks = STEREO.rays().numpy().reshape(3, 8 // fy, fy, 16 // fx, fx)
+    np.testing.assert_allclose(coarse.rays().numpy(), blocks.mean(axis=(2, 4)), rtol=0, atol=1e-14)
+
+
+@pytest.mark.parametrize("factor", [2, 4, 8])
+def test_rescaled_camera_has_the_parameters_of_the_protocol(factor: int) -> None:
+    coarse = STEREO.rescale(16 // factor, 8 // factor)
+    assert coarse.fx == pytest.approx(20.0 / factor, rel=1e-15)
+    assert coarse.fy == pytest.approx(25.0 / factor, rel=1e-15)
+    assert coarse.cx == pytest.approx((6.25 + 0.5) / factor - 0.5, abs=1e-14)
+    assert coarse.cy == pytest.approx((4.5 + 0.5) / factor - 0.5, abs=1e-14)
+    assert coarse.doffs == pytest.approx(3.5 / factor, rel=1e-15)
+    assert coarse.baseline == 0.16
+
+
+def test_rescaling_up_again_restores_the_camera() -> None:
+    again = STEREO.rescale(4, 2).rescale(16, 8)
+    for name in ("width", "height", "fx", "fy", "cx", "cy", "baseline", "doffs"):
+        assert getattr(again, name) == pytest.approx(getattr(STEREO, name), abs=1e-13)
+
+
+@pytest.mark.parametrize("factor", [2, 4, 8])
+@pytest.mark.parametrize("offset", ["middle", "first"])
+def test_decimated_camera_sees_the_rays_of_the_pixels_it_keeps(factor: int, offset: str) -> None:
+    start = factor // 2 if offset == "middle" else 0
+    coarse = STEREO.decimate(factor, start)
+    kept = (..., slice(start, None, factor), slice(start, None, factor))
+    torch.testing.assert_close(coarse.rays(), STEREO.rays()[kept], rtol=0, atol=1e-14)
+    depth = _depth(STEREO)
+    expected = to_range(depth, STEREO, "disparity")[kept] / factor  # disparity is in pixels of its own map
+    torch.testing.assert_close(to_range(depth[kept], coarse, "disparity"), expected, rtol=1e-13, atol=1e-13)
+
+
+@pytest.mark.parametrize("camera", CAMERAS)
+@pytest.mark.parametrize("range_type", RANGE_TYPES)
+def test_each_range_type_has_the_value_of_its_definition(camera: Camera, range_type: RangeType) -> None:
+    depth = _depth(camera)
+    expected = _numpy_range(depth[0].numpy(), camera, range_type)
+    np.testing.assert_allclose(to_range(depth, camera, range_type)[0].numpy(), expected, rtol=1e-14, atol=1e-14)
+
+
+@pytest.mark.parametrize("camera", CAMERAS)
+@pytest.mark.parametrize("range_type", RANGE_TYPES)
+def test_range_conversion_round_trips(camera: Camera, range_type: RangeType) -> None:
+    depth = _depth(camera)
+    again = from_range(to_range(depth, camera, range_type), camera, range_type)
+    torch.testing.assert_close(again, depth, rtol=1e-12, atol=0)
+
+
+def test_a_camera_without_baseline_has_the_virtual_one_of_twenty_centimetres() -> None:
+    assert VIRTUAL_BASELINE == 0.2
+    disparity = to_range(torch.full((1, 8, 16), 2.0, dtype=torch.float64), CAMERA, "disparity")
+    assert disparity.unique().item() == pytest.approx(0.2 * 20.0 / 2.0, rel=1e-15)
+
+
+@pytest.mark.parametrize("range_type", RANGE_TYPES)
+def test_holes_stay_holes_and_nothing_else_becomes_one(range_type: RangeType) -> None:
+    depth = _depth(STEREO)
+    depth[0, 2, 3] = torch.nan
+    for values in (to_range(depth, STEREO, range_type), from_range(depth, STEREO, range_type)):
+        assert torch.equal(values.isnan(), depth.isnan())
+
+
+def test_disparity_at_or_beyond_infinity_becomes_a_hole() -> None:
+    disparity = torch.full((8, 16), 1.0, dtype=torch.float64)
+    disparity[0, :3] = torch.tensor([-3.5, -3.6, -100.0])  # doffs = 3.5 px
+    disparity[1, 0] = -3.4  # still in front of infinity
+    depth = from_range(disparity, STEREO, "disparity")
+    assert depth.isnan().nonzero().tolist() == [[0, 0], [0, 1], [0, 2]]
+    assert depth[1, 0].item() == pytest.approx(0.16 * 20.0 / 0.1, rel=1e-12)
+
+
+def test_disparity_at_infinity_has_a_zero_gradient() -> None:
+    disparity = torch.tensor([[-3.5, -4.0, 1.0]], dtype=torch.float64, requires_grad=True)
+    depth = from_range(disparity, Camera(3, 1, 20.0, 20.0, 1.0, 0.0, baseline=0.16, doffs=3.5), "disparity")
+    torch.where(depth.isfinite(), depth, 0).sum().backward()
+    assert disparity.grad is not None
+    assert disparity.grad.flatten().tolist() == pytest.approx([0, 0, -0.16 * 20 / 4.5**2], rel=1e-12)
+
+
+@pytest.mark.parametrize("range_type", RANGE_TYPES)
+def test_ranges_take_any_leading_axes_and_keep_the_precision(range_type: RangeType) -> None:
+    depth = _depth(STEREO).float().expand(2, 3, 1, 8, 16)
+    values = to_range(depth, STEREO, range_type)
+    assert values.dtype == torch.float32
+    assert values.shape == depth.shape
+    torch.testing.assert_close(values[1, 2], to_range(depth[0, 0], STEREO, range_type), rtol=0, atol=0)
+
+
+def test_an_upward_y_axis_is_the_same_camera() -> None:
+    assert Camera(640, 480, 481.2, -480.0, 319.5, 239.5) == Camera(640, 480, 481.2, 480.0, 319.5, 239.5)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        *((name, value) for name in ("width", "height") for value in (0, -3, 2.5, math.nan, math.inf)),
+        *((name, value) for name in ("fx", "fy", "cx", "cy", "doffs", "baseline") for value in (math.nan, -math.inf)),
+        ("fx", 0.0),
+        ("fx", -20.0),
+        ("fy", 0.0),
+        ("baseline", 0.0),
+        ("baseline", -0.1),
+    ],
+)
+def test_a_wrong_field_is_named(name: str, value: float) -> None:
+    fields = {"width": 4, "height": 3, "fx": 5.0, "fy": 5.0, "cx": 1.5, "cy": 1.0}
+    with pytest.raises(ValueError, match=f"^camera {name}: expected "):
+        Camera(**(fields | {name: value}))  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    "window", [(-1, 0, 2, 2), (0, -1, 2, 2), (7, 0, 2, 2), (0, 15, 2, 2), (0, 0, 0, 2), (0, 0, 2, 0)]
+)
+def test_a_window_beyond_the_image_is_refused(window: tuple[int, int, int, int]) -> None:
+    with pytest.raises(ValueError, match=r"^crop: expected a window within 8 x 16"):
+        CAMERA.crop(*window)
+
+
+def test_an_unknown_range_type_is_refused() -> None:
+    for convert in (to_range, from_range):
+        with pytest.raises(ValueError, match="range_type: expected one of orthogonal, perspective, disparity"):
+            convert(_depth(CAMERA), CAMERA, "inverse")  # type: ignore[arg-type]

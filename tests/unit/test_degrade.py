@@ -1,0 +1,343 @@
+"""Downsampling models, against numpy, Pillow and weights written out in the test; samples, against closed forms."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from typing import Any, get_args
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from torch import Tensor
+
+from dsr.degrade import SCALES, Downsampling, Kernel, Measured, make_sample
+from dsr.geometry.camera import RANGE_TYPES, Camera, RangeType, to_range
+from dsr.sample import DepthSample, Scene
+
+KERNELS: tuple[Kernel, ...] = get_args(Kernel)
+CENTRED = tuple(kernel for kernel in KERNELS if kernel != "nearest")
+CAMERA = Camera(width=48, height=32, fx=60.0, fy=55.0, cx=21.3, cy=17.9)
+STEREO = Camera(width=48, height=32, fx=60.0, fy=55.0, cx=21.3, cy=17.9, baseline=0.12, doffs=1.7)
+
+
+def _values(height: int, width: int, seed: int = 0) -> Tensor:
+    return torch.from_numpy(np.random.default_rng(seed).uniform(1.0, 3.0, (1, height, width)))
+
+
+def _scene(depth: Tensor | None, camera: Camera = CAMERA, measured: dict[int, Tensor] | None = None) -> Scene:
+    rgb = torch.linspace(0, 1, 3 * camera.height * camera.width).view(3, camera.height, camera.width)
+    return Scene("set", "hall", rgb, camera, depth, measured or {})
+
+
+def _profile(kernel: str, x: float, sigma: float = 0.5) -> float:
+    """Return the weight at a distance of x coarse pixels: textbook formulas, one number at a time."""
+    x = abs(x)
+    if kernel == "box":
+        return float(x < 0.5)
+    if kernel == "bilinear":
+        return max(0.0, 1 - x)
+    if kernel == "gaussian":
+        return math.exp(-(x**2) / (2 * sigma**2)) if x <= 3 * sigma else 0.0
+    if x < 1:  # Keys with a = -1/2
+        return 1.5 * x**3 - 2.5 * x**2 + 1
+    return -0.5 * x**3 + 2.5 * x**2 - 4 * x + 2 if x < 2 else 0.0
+
+
+def _slow(values: np.ndarray, kernel: str, scale: int, sigma: float = 0.5) -> np.ndarray:
+    """Downsample one (H, W) map with holes, weight by weight, as the docstring of Downsampling says."""
+    height, width = values.shape
+    known = np.isfinite(values)
+    coarse = np.full((height // scale, width // scale), np.nan)
+    for i, j in np.ndindex(*coarse.shape):
+        block = values[i * scale : (i + 1) * scale, j * scale : (j + 1) * scale]
+        if np.isnan(block).all():
+            continue
+        rows = np.array([_profile(kernel, (v - (i + 0.5) * scale + 0.5) / scale, sigma) for v in range(height)])
+        columns = np.array([_profile(kernel, (u - (j + 0.5) * scale + 0.5) / scale, sigma) for u in range(width)])
+        weights = np.outer(rows / rows.sum(), columns / columns.sum())
+        share = weights[known].sum()
+        coarse[i, j] = (weights[known] @ values[known]) / share if share >= 0.5 else np.nanmean(block)
+    return coarse
+
+
+@pytest.mark.parametrize("scale", SCALES)
+def test_box_is_the_mean_of_the_block(scale: int) -> None:
+    values = _values(32, 48)
+    expected = values.numpy().reshape(1, 32 // scale, scale, 48 // scale, scale).mean(axis=(2, 4))
+    np.testing.assert_allclose(Downsampling("box")(values, scale).numpy(), expected, rtol=1e-13)
+
+
+@pytest.mark.parametrize("scale", SCALES)
+def test_nearest_is_the_pixel_at_half_a_block_and_keeps_its_hole(scale: int) -> None:
+    values = _values(32, 48)
+    values[0, scale // 2, scale // 2] = torch.nan
+    coarse = Downsampling("nearest")(values, scale).numpy()
+    np.testing.assert_array_equal(coarse, values.numpy()[:, scale // 2 :: scale, scale // 2 :: scale])
+    assert np.isnan(coarse[0, 0, 0])
+
+
+@pytest.mark.parametrize("scale", SCALES)
+@pytest.mark.parametrize(
+    ("kernel", "filter_"), [("bilinear", Image.Resampling.BILINEAR), ("bicubic", Image.Resampling.BICUBIC)]
+)
+def test_bilinear_and_bicubic_are_pillows(kernel: Kernel, filter_: Image.Resampling, scale: int) -> None:
+    values = _values(32, 48)
+    image = Image.fromarray(values[0].numpy().astype(np.float32))
+    expected = np.asarray(image.resize((48 // scale, 32 // scale), filter_))
+    np.testing.assert_allclose(Downsampling(kernel)(values, scale)[0].numpy(), expected, rtol=0, atol=2e-6)
+
+
+@pytest.mark.parametrize("sigma", [0.3, 0.5, 0.7])
+def test_gaussian_is_its_formula(sigma: float) -> None:
+    values = _values(12, 20)
+    expected = _slow(values[0].numpy(), "gaussian", 4, sigma)
+    np.testing.assert_allclose(Downsampling("gaussian", sigma)(values, 4)[0].numpy(), expected, rtol=1e-12)
+
+
+@pytest.mark.parametrize("scale", SCALES)
+@pytest.mark.parametrize("kernel", KERNELS)
+def test_a_constant_stays_one_up_to_the_border(kernel: Kernel, scale: int) -> None:
+    coarse = Downsampling(kernel)(torch.full((2, 1, 32, 48), 1.7, dtype=torch.float64), scale)
+    assert coarse.shape == (2, 1, 32 // scale, 48 // scale)
+    torch.testing.assert_close(coarse, torch.full_like(coarse, 1.7), rtol=1e-13, atol=0)
+
+
+@pytest.mark.parametrize("scale", [2, 4])
+@pytest.mark.parametrize("kernel", KERNELS)
+def test_a_ramp_stays_one_where_the_kernel_fits_inside(kernel: Kernel, scale: int) -> None:
+    v, u = torch.meshgrid(torch.arange(32.0).double(), torch.arange(48.0).double(), indexing="ij")
+    coarse = Downsampling(kernel)(3 + 0.2 * u - 0.1 * v, scale)
+    i, j = torch.meshgrid(torch.arange(32 // scale).double(), torch.arange(48 // scale).double(), indexing="ij")
+    first = scale // 2 if kernel == "nearest" else (scale - 1) / 2
+    expected = 3 + 0.2 * (j * scale + first) - 0.1 * (i * scale + first)
+    inner = (slice(2, -2), slice(2, -2))
+    torch.testing.assert_close(coarse[inner], expected[inner], rtol=1e-13, atol=0)
+
+
+@pytest.mark.parametrize("kernel", CENTRED)
+@pytest.mark.parametrize("share", [0.05, 0.4, 0.8])
+def test_holes_are_left_out_of_the_average(kernel: Kernel, share: float) -> None:
+    values = _values(12, 20)
+    values[torch.from_numpy(np.random.default_rng(1).random((1, 12, 20)) < share)] = torch.nan
+    values[0, :4, 4:8] = torch.nan  # a block without a known pixel
+    coarse = Downsampling(kernel)(values, 4)[0].numpy()
+    assert np.isnan(coarse[0, 1])
+    np.testing.assert_allclose(coarse, _slow(values[0].numpy(), kernel, 4), rtol=1e-12)
+
+
+@pytest.mark.parametrize("kernel", CENTRED)
+def test_where_less_than_half_the_weight_is_known_the_block_mean_stands_in(kernel: Kernel) -> None:
+    values = torch.full((1, 12, 12), torch.nan, dtype=torch.float64)
+    values[0, 4, 4], values[0, 7, 5] = 2.0, 3.0  # in the middle block alone
+    coarse = Downsampling(kernel)(values, 4)[0]
+    assert coarse.isfinite().nonzero().tolist() == [[1, 1]]
+    assert coarse[1, 1].item() == pytest.approx(2.5, rel=1e-14)
+
+
+@pytest.mark.parametrize("kernel", KERNELS)
+def test_every_map_of_a_batch_is_downsampled_by_itself(kernel: Kernel) -> None:
+    values = torch.stack((_values(8, 12, 0), _values(8, 12, 1)))
+    values[1, 0, 2, 3] = torch.nan
+    together = Downsampling(kernel)(values, 2)
+    for i in range(2):
+        torch.testing.assert_close(together[i], Downsampling(kernel)(values[i], 2), rtol=1e-14, atol=0, equal_nan=True)
+
+
+@pytest.mark.parametrize("kernel", KERNELS)
+@pytest.mark.parametrize("holes", [False, True])
+def test_downsampling_has_the_gradient_of_its_value(kernel: Kernel, holes: bool) -> None:
+    values = _values(4, 6)
+    mask = torch.ones_like(values, dtype=torch.bool)
+    if holes:
+        mask[0, :2, :2] = False
+        mask[0, 3, 4] = False
+
+    def known_part(values: Tensor) -> Tensor:
+        coarse = Downsampling(kernel)(torch.where(mask, values, torch.nan), 2)
+        return coarse[coarse.isfinite()]
+
+    assert torch.autograd.gradcheck(known_part, values.requires_grad_())
+
+
+@pytest.mark.parametrize("kernel", KERNELS)
+def test_downsampling_keeps_the_precision(kernel: Kernel) -> None:
+    assert Downsampling(kernel)(_values(8, 8).float(), 4).dtype == torch.float32
+
+
+def test_a_size_that_the_scale_does_not_divide_is_refused() -> None:
+    with pytest.raises(ValueError, match="downsampling: expected a size divisible by 4, got 8 x 10"):
+        Downsampling("box")(_values(8, 10), 4)
+
+
+def test_a_wrong_model_is_refused() -> None:
+    with pytest.raises(
+        ValueError, match="downsampling: expected one of box, nearest, bilinear, bicubic, gaussian, got"
+    ):
+        Downsampling("lanczos")  # type: ignore[arg-type]
+    for sigma in (0.0, -1.0, math.nan):
+        with pytest.raises(ValueError, match=r"downsampling.sigma: expected a positive fraction"):
+            Downsampling("gaussian", sigma)
+
+
+def _points(depth: Tensor, camera: Camera) -> Tensor:
+    return depth * camera.rays()
+
+
+COMBINATIONS = list(itertools.product(KERNELS, SCALES))
+
+
+@pytest.mark.parametrize(("kernel", "scale"), COMBINATIONS)
+@pytest.mark.parametrize("range_type", ["orthogonal", "disparity"])
+def test_a_fronto_parallel_plane_stays_where_it_is(kernel: Kernel, scale: int, range_type: RangeType) -> None:
+    plane = torch.full((1, 32, 48), 2.5, dtype=torch.float64)
+    sample = make_sample(_scene(plane, STEREO), scale, Downsampling(kernel), range_type)
+    torch.testing.assert_close(sample.depth_lr, torch.full_like(sample.depth_lr, 2.5), rtol=1e-12, atol=0)
+
+
+@pytest.mark.parametrize(("kernel", "scale"), COMBINATIONS)
+def test_a_sphere_around_the_camera_stays_one_in_perspective_depth(kernel: Kernel, scale: int) -> None:
+    sphere = (2.0 / CAMERA.ray_lengths())[None]
+    sample = make_sample(_scene(sphere), scale, Downsampling(kernel), "perspective")
+    radii = _points(sample.depth_lr, sample.camera_lr).norm(dim=0)
+    torch.testing.assert_close(radii, torch.full_like(radii, 2.0), rtol=1e-12, atol=0)
+
+
+@pytest.mark.parametrize("camera", [CAMERA, STEREO])
+@pytest.mark.parametrize(("kernel", "scale"), [(k, s) for k, s in COMBINATIONS if s <= 4 or k in ("box", "nearest")])
+def test_the_coarse_camera_sees_the_points_of_a_tilted_plane(kernel: Kernel, scale: int, camera: Camera) -> None:
+    normal = torch.tensor([0.3, -0.4, -1.0], dtype=torch.float64)[:, None, None]
+    tilted = -2.0 / (normal * camera.rays()).sum(dim=0, keepdim=True)  # its disparity is linear in u and v
+    sample = make_sample(_scene(tilted, camera), scale, Downsampling(kernel), "disparity")
+    offset = (normal * _points(sample.depth_lr, sample.camera_lr)).sum(dim=0)
+    inside = (slice(None), slice(None)) if kernel in ("box", "nearest") else (slice(2, -2), slice(2, -2))
+    torch.testing.assert_close(offset[inside], torch.full_like(offset[inside], -2.0), rtol=1e-12, atol=0)
+
+
+def test_nearest_keeps_points_of_the_fine_map() -> None:
+    depth = _values(32, 48)
+    sample = make_sample(_scene(depth), 4, Downsampling("nearest"), "perspective")
+    fine = _points(depth, CAMERA)[:, 2::4, 2::4]
+    torch.testing.assert_close(_points(sample.depth_lr, sample.camera_lr), fine, rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize("camera", [CAMERA, STEREO])
+@pytest.mark.parametrize("asked", [None, *RANGE_TYPES])
+@pytest.mark.parametrize("method", RANGE_TYPES)
+def test_the_average_is_that_of_the_range_type(camera: Camera, asked: RangeType | None, method: RangeType) -> None:
+    depth = _values(32, 48)
+    sample = make_sample(_scene(depth, camera), 4, Downsampling("box", range_type=asked), method)
+    z = depth.numpy()[0]
+    v, u = np.mgrid[:32, :48]
+    lengths = np.sqrt(((u - 21.3) / 60) ** 2 + ((v - 17.9) / 55) ** 2 + 1)
+    i, j = np.mgrid[:8, :12]
+    coarse_lengths = np.sqrt(((4 * j + 1.5 - 21.3) / 60) ** 2 + ((4 * i + 1.5 - 17.9) / 55) ** 2 + 1)
+
+    def mean(x: np.ndarray) -> np.ndarray:
+        return x.reshape(8, 4, 12, 4).mean(axis=(1, 3))
+
+    expected = {
+        "orthogonal": mean(z),
+        "perspective": mean(z * lengths) / coarse_lengths,
+        "disparity": 1 / mean(1 / z),
+    }[asked or method]
+    np.testing.assert_allclose(sample.depth_lr[0].numpy(), expected, rtol=1e-12)
+
+
+def test_coarse_disparity_counts_in_coarse_pixels() -> None:
+    disparity = to_range(_values(32, 48), STEREO, "disparity")
+    depth = STEREO.baseline * 60.0 / (disparity + 1.7)  # type: ignore[operator]
+    sample = make_sample(_scene(depth, STEREO), 4, Downsampling("box"), "disparity")
+    coarse = to_range(sample.depth_lr, sample.camera_lr, "disparity")
+    expected = disparity.numpy().reshape(1, 8, 4, 12, 4).mean(axis=(2, 4)) / 4
+    np.testing.assert_allclose(coarse.numpy(), expected, rtol=1e-12)
+
+
+def test_the_sample_carries_the_scene() -> None:
+    scene = _scene(_values(32, 48))
+    sample = make_sample(scene, 4, Downsampling("box"), "perspective")
+    assert (sample.dataset, sample.scene, sample.scale, sample.notes) == ("set", "hall", 4, ())
+    assert sample.camera == CAMERA
+    assert sample.camera_lr == CAMERA.rescale(12, 8)
+    assert torch.equal(sample.rgb, scene.rgb)
+    assert sample.depth is scene.depth
+
+
+@pytest.mark.parametrize("kernel", KERNELS)
+def test_a_size_that_the_scale_does_not_divide_is_cropped_and_the_notes_say_so(kernel: Kernel) -> None:
+    camera = Camera(width=50, height=35, fx=60.0, fy=55.0, cx=21.3, cy=17.9)
+    scene = _scene(_values(35, 50), camera)
+    assert scene.depth is not None
+    sample = make_sample(scene, 4, Downsampling(kernel), "perspective")
+    assert sample.notes == ("cropped from 35 x 50 to 32 x 48, which 4 divides",)
+    assert sample.camera == CAMERA
+    assert torch.equal(sample.rgb, scene.rgb[:, :32, :48])
+    assert sample.depth is not None
+    assert torch.equal(sample.depth, scene.depth[:, :32, :48])
+    whole = make_sample(_scene(scene.depth[:, :32, :48]), 4, Downsampling(kernel), "perspective")
+    torch.testing.assert_close(sample.depth_lr, whole.depth_lr, rtol=0, atol=0)
+    assert sample.camera_lr == whole.camera_lr
+
+
+@pytest.mark.parametrize("range_type", RANGE_TYPES)
+def test_holes_of_the_scene_are_left_out_of_its_sample(range_type: RangeType) -> None:
+    depth = torch.full((1, 32, 48), 2.0, dtype=torch.float64)
+    depth[0, :4, 4:8] = torch.nan
+    depth[0, 10, 13] = torch.nan
+    sample = make_sample(_scene(depth, STEREO), 4, Downsampling("box"), range_type)
+    assert (~sample.mask_lr).nonzero().tolist() == [[0, 0, 1]]
+    assert sample.mask is not None
+    assert int((~sample.mask).sum()) == 17
+    if range_type != "perspective":
+        torch.testing.assert_close(sample.depth_lr[sample.mask_lr].unique(), torch.tensor([2.0]).double())
+
+
+@pytest.mark.parametrize("range_type", RANGE_TYPES)
+def test_a_bicubic_undershoot_below_zero_is_a_hole(range_type: RangeType) -> None:
+    depth = torch.full((1, 32, 48), 40.0, dtype=torch.float64)
+    depth[..., :22] = 0.1
+    sample = make_sample(_scene(depth), 4, Downsampling("bicubic"), range_type)
+    assert 0 < int((~sample.mask_lr).sum()) <= 16
+    assert bool((sample.depth_lr[sample.mask_lr] > 0).all())
+
+
+def test_a_measured_map_is_taken_as_it_is() -> None:
+    measured = _values(8, 12)
+    measured[0, 1, 1] = torch.nan
+    sample = make_sample(_scene(None, measured={4: measured}), 4, Measured(), "disparity")
+    assert sample.depth_lr is measured
+    assert sample.depth is None
+    assert sample.camera_lr == CAMERA.rescale(12, 8)
+
+
+def test_a_scene_that_lacks_what_the_problem_needs_is_refused() -> None:
+    measured = _scene(None, measured={4: _values(8, 12)})
+    with pytest.raises(ValueError, match="hall: expected a fine depth map to downsample, there is none"):
+        make_sample(measured, 4, Downsampling("box"), "disparity")
+    with pytest.raises(ValueError, match=r"hall: downsampling=measured expects a coarse map at x8, the scene has x4"):
+        make_sample(measured, 8, Measured(), "disparity")
+    with pytest.raises(ValueError, match=r"a coarse map at x4, the scene has none"):
+        make_sample(_scene(_values(32, 48)), 4, Measured(), "disparity")
+
+
+@pytest.mark.parametrize("scale", [0, 1, 3, 32])
+def test_another_scale_is_refused(scale: int) -> None:
+    with pytest.raises(ValueError, match=f"scale: expected one of 2, 4, 8, 16, got {scale}"):
+        make_sample(_scene(_values(32, 48)), scale, Downsampling("box"), "disparity")
+
+
+def test_a_scene_smaller_than_one_block_is_refused() -> None:
+    camera = Camera(48, 7, 60.0, 55.0, 21.3, 3.0)
+    with pytest.raises(ValueError, match="hall: expected at least 8 x 8 pixels, got 7 x 48"):
+        make_sample(_scene(_values(7, 48), camera), 8, Downsampling("box"), "disparity")
+
+
+def test_an_unknown_range_type_is_refused() -> None:
+    arguments: Any = (_scene(_values(32, 48)), 4, Downsampling("box"), "inverse")
+    with pytest.raises(ValueError, match="range_type: expected one of"):
+        make_sample(*arguments)
+
+
+def test_samples_are_depth_samples() -> None:
+    assert isinstance(make_sample(_scene(_values(32, 48)), 2, Downsampling("gaussian"), "disparity"), DepthSample)

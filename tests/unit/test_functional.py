@@ -1,0 +1,303 @@
+"""Every metric, against plain numpy and scikit-image code written here from the protocol's table."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+import torch
+from scipy import ndimage
+from skimage.filters import scharr_h, scharr_v
+from skimage.metrics import structural_similarity
+from torch import Tensor
+
+from dsr.geometry.camera import Camera
+from dsr.quality.functional import (
+    SurfacePair,
+    bad_pix_d,
+    bad_pix_v,
+    bumpiness_d,
+    dssim_v,
+    mse_v,
+    rmse_d,
+    rmse_v,
+    rmse_v1,
+)
+
+SIZES = [(32, 48), (41, 29), (24, 24)]
+LIGHTS = -np.array(
+    [
+        [0, np.sqrt(2 / 3), 1 / np.sqrt(3)],
+        [1 / np.sqrt(2), -1 / np.sqrt(6), 1 / np.sqrt(3)],
+        [-1 / np.sqrt(2), -1 / np.sqrt(6), 1 / np.sqrt(3)],
+        [0, 0, 1],
+    ]
+)
+
+
+class Maps(NamedTuple):
+    """A predicted and a true depth map, (H, W), and their camera."""
+
+    prediction: np.ndarray
+    target: np.ndarray
+    camera: Camera
+
+
+def _maps(size: tuple[int, int] = (32, 48), seed: int = 0, *, holes: bool = False) -> Maps:
+    """Return two smooth surfaces with a depth step, that differ by a few centimetres."""
+    height, width = size
+    random = np.random.default_rng(seed)
+    smooth = [ndimage.gaussian_filter(random.normal(size=size), 3, mode="nearest") for _ in range(2)]
+    target = 2 + 0.5 * smooth[0] + 0.4 * (np.arange(width) > 0.6 * width)
+    prediction = target + 0.4 * smooth[1] + 0.0005 * random.normal(size=size)
+    if holes:
+        target[random.random(size) < 0.01] = np.nan
+        target[5:13, 7:15] = np.nan
+        target[-1, -4:] = np.nan
+        prediction[random.random(size) < 0.01] = np.nan
+        prediction[0, :3] = np.nan
+    return Maps(prediction, target, Camera(width, height, 60.0, 63.0, 0.45 * width, 0.55 * height))
+
+
+def _pair(maps: Maps, mask: np.ndarray | None = None, dtype: torch.dtype = torch.float64) -> SurfacePair:
+    prediction, target = (torch.from_numpy(values)[None, None].to(dtype) for values in maps[:2])
+    torch_mask = None if mask is None else torch.from_numpy(mask)[None, None]
+    return SurfacePair(prediction, target, maps.camera.rays()[None], torch_mask)
+
+
+class Reference:
+    """The protocol, step by step; what is unknown is NaN."""
+
+    def __init__(self, maps: Maps, mask: np.ndarray | None = None) -> None:
+        camera = maps.camera
+        known = np.isfinite(maps.prediction) & np.isfinite(maps.target) & (True if mask is None else mask)
+        self.depths = [np.where(known, z, np.nan) for z in maps[:2]]
+        v, u = np.mgrid[: camera.height, : camera.width]
+        rays = np.stack(((u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(u.shape)), axis=-1)
+        self.points = [z[..., None] * rays for z in self.depths]
+        self.perspective = [np.linalg.norm(points, axis=-1) for points in self.points]
+        self.normals = [self._normals(points) for points in self.points]
+        self.shadings = [np.einsum("lc,hwc->lhw", LIGHTS, normals) for normals in self.normals]
+        self.renderings = [np.clip(shading, 0, 1) for shading in self.shadings]
+
+    @staticmethod
+    def _normals(points: np.ndarray) -> np.ndarray:
+        along_u = np.diff(points, axis=1)
+        along_u = np.concatenate((along_u, along_u[:, -1:]), axis=1)
+        along_v = np.diff(points, axis=0)
+        along_v = np.concatenate((along_v, along_v[-1:]), axis=0)
+        normals = np.cross(along_v, along_u)
+        return normals / np.linalg.norm(normals, axis=-1, keepdims=True)
+
+    def rmse_d(self) -> float:
+        first, second = self.perspective
+        return np.sqrt(np.nanmean((first - second) ** 2))
+
+    def bad_pix_d(self, threshold: float, relative: bool) -> float:
+        first, second = self.perspective
+        error = np.abs(first - second)[np.isfinite(first)]
+        limit = threshold * second[np.isfinite(first)] if relative else threshold
+        return np.mean(error > limit)
+
+    def rmse_v(self) -> float:
+        first, second = (np.einsum("lc,hwc->lhw", LIGHTS[:3], normals) for normals in self.normals)
+        return np.sqrt(np.nanmean((first - second) ** 2))
+
+    def rmse_v1(self) -> list[float]:
+        first, second = self.shadings
+        return [np.sqrt(np.nanmean((first[i] - second[i]) ** 2)) for i in range(4)]
+
+    def bad_pix_v(self, threshold: float) -> list[float]:
+        first, second = self.renderings
+        known = np.isfinite(first[0])
+        return [np.mean(np.abs(first[i] - second[i])[known] > threshold / 255) for i in range(4)]
+
+    def dssim_v(self) -> list[float]:
+        first, second = self.renderings
+        centres = np.isfinite(first[0])[3:-3, 3:-3]
+        values = []
+        for x, y in zip(np.nan_to_num(first), np.nan_to_num(second), strict=True):
+            ssim_map = structural_similarity(x, y, data_range=2, full=True)[1][3:-3, 3:-3]
+            values.append(1 - ssim_map[centres].mean())
+        return values
+
+    def bumpiness_d(self) -> float:
+        first, second = self.depths
+        known = np.isfinite(first)
+        difference = 20.48 / np.where(known, first, 1.0) - 20.48 / np.where(known, second, 1.7)
+        squares = 0.0
+        for outer in (scharr_v, scharr_h):
+            derivative = _zero_border(outer(difference))
+            squares = squares + sum(_zero_border(inner(derivative)) ** 2 for inner in (scharr_v, scharr_h))
+        needed = ndimage.minimum_filter(known.astype(int), 5, mode="constant", cval=1) == 1
+        return 100 * np.minimum(0.05, np.sqrt(squares))[needed].mean()
+
+
+def _zero_border(values: np.ndarray) -> np.ndarray:
+    return np.pad(values[1:-1, 1:-1], 1)
+
+
+METRICS: dict[str, tuple[Callable[[SurfacePair], Tensor], Callable[[Reference], float | list[float]]]] = {
+    "RMSE_d": (rmse_d, Reference.rmse_d),
+    "BadPix_d_1cm": (lambda pair: bad_pix_d(pair, 0.01), lambda reference: reference.bad_pix_d(0.01, relative=False)),
+    "BadPix_d_5cm": (lambda pair: bad_pix_d(pair, 0.05), lambda reference: reference.bad_pix_d(0.05, relative=False)),
+    "BadPix_d_1pct": (
+        lambda pair: bad_pix_d(pair, 0.01, relative=True),
+        lambda reference: reference.bad_pix_d(0.01, relative=True),
+    ),
+    "MSE_v": (mse_v, lambda reference: reference.rmse_v() ** 2),
+    "RMSE_v": (rmse_v, Reference.rmse_v),
+    "RMSE_v1": (rmse_v1, Reference.rmse_v1),
+    "BadPix_v_1": (lambda pair: bad_pix_v(pair, 1), lambda reference: reference.bad_pix_v(1)),
+    "BadPix_v_10": (lambda pair: bad_pix_v(pair, 10), lambda reference: reference.bad_pix_v(10)),
+    "DSSIM_v": (dssim_v, Reference.dssim_v),
+    "Bumpiness_d": (bumpiness_d, Reference.bumpiness_d),
+}
+PER_LIGHT = {"RMSE_v1", "BadPix_v_1", "BadPix_v_10", "DSSIM_v"}
+every_metric = pytest.mark.parametrize("name", METRICS)
+
+
+@every_metric
+@pytest.mark.parametrize("size", SIZES)
+def test_metric_is_that_of_the_protocol(name: str, size: tuple[int, int]) -> None:
+    maps = _maps(size)
+    metric, reference = METRICS[name]
+    value = metric(_pair(maps))[0].numpy()
+    assert value.shape == ((4,) if name in PER_LIGHT else ())
+    assert (value > 0.001).all()  # the maps do differ in the metric's eyes
+    np.testing.assert_allclose(value, reference(Reference(maps)), rtol=1e-6)
+
+
+@every_metric
+@pytest.mark.parametrize("size", SIZES)
+@pytest.mark.parametrize("masked", [False, True])
+def test_with_holes_metric_is_that_of_the_known_pixels(name: str, size: tuple[int, int], masked: bool) -> None:
+    maps = _maps(size, holes=True)
+    mask = np.random.default_rng(5).random(size) < 0.98 if masked else None
+    metric, reference = METRICS[name]
+    np.testing.assert_allclose(metric(_pair(maps, mask))[0].numpy(), reference(Reference(maps, mask)), rtol=1e-6)
+
+
+@every_metric
+def test_depth_under_a_mask_does_not_count(name: str) -> None:
+    maps, mask = _maps(), np.ones((32, 48), dtype=bool)
+    mask[10:14, 20:25] = False
+    other = maps.prediction.copy()
+    other[~mask] = 77.0
+    metric = METRICS[name][0]
+    torch.testing.assert_close(metric(_pair(maps, mask)), metric(_pair(maps._replace(prediction=other), mask)))
+
+
+@every_metric
+def test_a_batch_of_two_is_two_single_images(name: str) -> None:
+    metric = METRICS[name][0]
+    several = [_maps(seed=1), _maps(seed=2, holes=True)]
+    singles = torch.cat([metric(_pair(maps)) for maps in several])
+    prediction, target = (torch.from_numpy(np.stack([maps[i] for maps in several]))[:, None] for i in range(2))
+    together = metric(SurfacePair(prediction, target, several[0].camera.rays()[None]))
+    torch.testing.assert_close(together, singles, rtol=1e-12, atol=1e-14)
+
+
+@every_metric
+def test_identical_maps_score_zero(name: str) -> None:
+    maps = _maps()
+    value = METRICS[name][0](_pair(maps._replace(prediction=maps.target)))
+    torch.testing.assert_close(value, torch.zeros_like(value), rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", [name for name in METRICS if not name.endswith("pct")])
+def test_metric_is_symmetric(name: str) -> None:
+    maps = _maps(holes=True)
+    metric = METRICS[name][0]
+    swapped = Maps(maps.target, maps.prediction, maps.camera)
+    torch.testing.assert_close(metric(_pair(maps)), metric(_pair(swapped)), rtol=1e-12, atol=1e-14)
+
+
+def test_relative_thresholds_are_fractions_of_the_target() -> None:
+    camera = Camera(4, 4, 5.0, 5.0, 1.5, 1.5)
+    target = np.full((4, 4), 2.0)
+    for prediction, bad in ((2.09, 0.0), (2.11, 1.0), (1.91, 0.0), (1.89, 1.0)):
+        pair = _pair(Maps(np.full((4, 4), prediction), target, camera))
+        assert bad_pix_d(pair, 0.05, relative=True).item() == bad
+
+
+def test_an_offset_of_a_wall_is_measured_along_the_rays() -> None:
+    camera = Camera(5, 4, 5.0, 5.0, 1.5, 1.5)
+    pair = _pair(Maps(np.full((4, 5), 2.1), np.full((4, 5), 2.0), camera))
+    expected = 0.1 * np.sqrt((np.linalg.norm(camera.rays().numpy(), axis=0) ** 2).mean())
+    assert rmse_d(pair).item() == pytest.approx(expected, rel=1e-12)
+    assert rmse_v(pair).item() == pytest.approx(0, abs=1e-12)
+
+
+@every_metric
+@pytest.mark.parametrize("unknown", ["prediction", "target"])
+def test_maps_without_a_common_pixel_score_nan(name: str, unknown: str) -> None:
+    maps = _maps()
+    value = METRICS[name][0](_pair(maps._replace(**{unknown: np.full((32, 48), np.nan)})))
+    assert value.shape == ((1, 4) if name in PER_LIGHT else (1,))
+    assert bool(value.isnan().all())
+
+
+@every_metric
+@pytest.mark.parametrize("holes", [False, True])
+def test_metric_works_in_float32(name: str, holes: bool) -> None:
+    maps = _maps(holes=holes)
+    metric = METRICS[name][0]
+    exact, single = metric(_pair(maps)), metric(_pair(maps, dtype=torch.float32))
+    tolerance = 2.1 / (32 * 48) if name.startswith("BadPix") else 1e-4  # one pixel may cross a threshold
+    torch.testing.assert_close(single.double(), exact, rtol=2e-3, atol=tolerance)
+
+
+@every_metric
+def test_narrow_images_of_wide_depths_cost_a_ten_thousandth(name: str) -> None:
+    maps = _maps(holes=True)
+    wide = _pair(maps)
+    narrow = SurfacePair(wide.prediction, wide.target, wide.rays, wide.depth_mask, image_dtype=torch.float32)
+    assert narrow.normals[0].dtype == torch.float32
+    metric = METRICS[name][0]
+    torch.testing.assert_close(metric(narrow).double(), metric(wide), rtol=1e-4, atol=1e-7)
+
+
+@pytest.mark.parametrize("name", [name for name in METRICS if not name.startswith("BadPix")])
+@pytest.mark.parametrize("holes", [False, True])
+def test_gradients_are_finite_and_zero_at_holes(name: str, holes: bool) -> None:
+    maps = _maps(holes=holes)
+    depth = torch.from_numpy(maps.prediction)[None, None].requires_grad_()
+    pair = SurfacePair(depth, torch.from_numpy(maps.target)[None, None], maps.camera.rays()[None])
+    METRICS[name][0](pair).sum().backward()
+    assert depth.grad is not None
+    assert bool(depth.grad.isfinite().all())
+    assert bool(depth.grad.any())
+    if holes:
+        assert not bool(depth.grad[~pair.depth_mask].any())
+
+
+@every_metric
+def test_metric_takes_a_prediction_that_requires_its_gradient(name: str) -> None:
+    maps = _maps()
+    depth = torch.from_numpy(maps.prediction)[None, None].requires_grad_()
+    pair = SurfacePair(depth, torch.from_numpy(maps.target)[None, None], maps.camera.rays()[None])
+    torch.testing.assert_close(METRICS[name][0](pair).detach(), METRICS[name][0](_pair(maps)), rtol=1e-12, atol=0)
+
+
+@pytest.mark.parametrize("size", [(6, 20), (20, 6)])
+def test_a_map_smaller_than_the_window_has_no_dssim(size: tuple[int, int]) -> None:
+    maps = _maps((20, 20))
+    small = Maps(*(z[: size[0], : size[1]] for z in maps[:2]), maps.camera.crop(0, 0, *size))
+    with pytest.raises(ValueError, match=f"DSSIM_v: expected a map of at least 7 x 7 pixels, got \\({size[0]}, "):
+        dssim_v(_pair(small))
+
+
+def test_inputs_that_do_not_fit_together_are_refused() -> None:
+    depth, rays = torch.ones(2, 1, 4, 5), torch.ones(1, 3, 4, 5)
+    for first, second in ((depth[0], depth[0]), (depth, depth[:1]), (depth.expand(2, 3, 4, 5),) * 2):
+        with pytest.raises(ValueError, match=r"^prediction, target: expected two depth maps of shape"):
+            SurfacePair(first, second, rays)
+    for wrong in (rays[0], rays[:, :2], rays[..., :4]):
+        with pytest.raises(ValueError, match=r"^rays: expected shape \(B or 1, 3, 4, 5\), got"):
+            SurfacePair(depth, depth, wrong)
+    for mask in (depth, depth[:1] > 0):
+        with pytest.raises(ValueError, match=r"^mask: expected bool of shape \(2, 1, 4, 5\), got"):
+            SurfacePair(depth, depth, rays, mask)

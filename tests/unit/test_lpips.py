@@ -1,0 +1,374 @@
+"""LPIPS, against its own example pair and against AlexNet written out here, with random weights."""
+
+from __future__ import annotations
+
+import hashlib
+import http.client
+import io
+import pickle
+import socket
+import urllib.error
+from email.message import Message
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+import torchmetrics.functional.image as heads_home
+from PIL import Image
+from torch import Tensor, nn
+
+from dsr.geometry.camera import Camera
+from dsr.geometry.shading import render
+from dsr.geometry.surface import normals_of
+from dsr.quality import lpips
+from dsr.quality.functional import SurfacePair
+from dsr.quality.lpips import LPIPS, TRUNK_FILE, TRUNK_HASH, TRUNK_URL, find_trunk, load_lpips, lpips_v
+
+SHAPES = {0: (64, 3, 11, 11), 3: (192, 64, 5, 5), 6: (384, 192, 3, 3), 8: (256, 384, 3, 3), 10: (256, 256, 3, 3)}
+
+
+def _trunk(seed: int = 0) -> dict[str, Tensor]:
+    random = torch.Generator().manual_seed(seed)
+    trunk = {}
+    for index, shape in SHAPES.items():
+        fan_in = shape[1] * shape[2] * shape[3]
+        trunk[f"features.{index}.weight"] = torch.randn(shape, generator=random) * (2 / fan_in) ** 0.5
+        trunk[f"features.{index}.bias"] = 0.1 * torch.randn(shape[0], generator=random)
+    return trunk
+
+
+@pytest.fixture(scope="module")
+def network() -> LPIPS:
+    return LPIPS(_trunk())
+
+
+def _images(seed: int, size: tuple[int, int] = (40, 47), batch: int = 1) -> Tensor:
+    return 2 * torch.rand(batch, 3, *size, generator=torch.Generator().manual_seed(seed)) - 1
+
+
+def _reference(trunk: dict[str, Tensor], first: Tensor, second: Tensor, mask: Tensor | None = None) -> Tensor:
+    """Return LPIPS v0.1, from torchvision's AlexNet as a stack of layers, in float64."""
+    layers = [
+        nn.Conv2d(3, 64, 11, stride=4, padding=2),
+        nn.ReLU(),
+        nn.MaxPool2d(3, 2),
+        nn.Conv2d(64, 192, 5, padding=2),
+        nn.ReLU(),
+        nn.MaxPool2d(3, 2),
+        nn.Conv2d(192, 384, 3, padding=1),
+        nn.ReLU(),
+        nn.Conv2d(384, 256, 3, padding=1),
+        nn.ReLU(),
+        nn.Conv2d(256, 256, 3, padding=1),
+        nn.ReLU(),
+    ]
+    features = nn.Sequential(*layers).double()
+    features.load_state_dict({name.removeprefix("features."): value for name, value in trunk.items()})
+    heads = torch.load(Path(heads_home.__file__).parent / "lpips_models" / "alex.pth", "cpu", weights_only=True)
+    shift, scale = (
+        torch.tensor(v).double().view(1, 3, 1, 1) for v in ((-0.030, -0.088, -0.188), (0.458, 0.448, 0.450))
+    )
+    x, y = ((image.double() - shift) / scale for image in (first, second))
+    total = torch.zeros(len(x), dtype=torch.float64)
+    level = 0
+    for i, layer in enumerate(features):
+        x, y = layer(x), layer(y)
+        if i in (1, 4, 7, 9, 11):  # relu1 ... relu5
+            difference = (nn.functional.normalize(x, dim=1) - nn.functional.normalize(y, dim=1)) ** 2
+            maps = nn.functional.conv2d(difference, heads[f"lin{level}.model.1.weight"].double())[:, 0]
+            weight = torch.ones_like(maps)
+            if mask is not None:
+                weight = torch.stack([_shares(m[0], maps.shape[-2:]) for m in mask])
+            total += (maps * weight).sum(dim=(1, 2)) / weight.sum(dim=(1, 2))
+            level += 1
+    return total.detach()
+
+
+def _shares(mask: Tensor, size: tuple[int, ...]) -> Tensor:
+    """Return the share of known pixels of each feature's part of the picture."""
+    height, width = mask.shape
+    shares = torch.empty(size, dtype=torch.float64)
+    for i, j in np.ndindex(*size):
+        top, bottom = i * height // size[0], -(-(i + 1) * height // size[0])
+        left, right = j * width // size[1], -(-(j + 1) * width // size[1])
+        shares[i, j] = mask[top:bottom, left:right].double().mean()
+    return shares
+
+
+def _pair(*, seed: int = 0, holes: bool = False, size: tuple[int, int] = (36, 40)) -> SurfacePair:
+    random = np.random.default_rng(seed)
+    prediction, target = (torch.from_numpy(2 + 0.05 * random.random((1, 1, *size))) for _ in range(2))
+    if holes:
+        target[..., 4:20, 6:16] = torch.nan
+    return SurfacePair(prediction, target, Camera(size[1], size[0], 40.0, 40.0, 20.0, 18.0).rays()[None])
+
+
+@pytest.mark.parametrize(("name", "expected"), [("ex_p0", 0.7219), ("ex_p1", 0.1376)])
+def test_the_authors_example_pairs_have_the_published_distance(shared: Path, name: str, expected: float) -> None:
+    def picture(stem: str) -> Tensor:
+        with Image.open(shared / "lpips_example" / f"{stem}.png") as image:
+            return torch.from_numpy(np.array(image.convert("RGB"))).permute(2, 0, 1)[None].float() / 127.5 - 1
+
+    with torch.no_grad():
+        network = load_lpips(shared / "weights" / "alexnet_imagenet_features.pth")
+        assert network(picture("ex_ref"), picture(name)).item() == pytest.approx(expected, abs=1e-4)
+
+
+@pytest.mark.parametrize("size", [(31, 31), (40, 47), (64, 33)])
+def test_distance_is_that_of_alexnets_normalised_features(network: LPIPS, size: tuple[int, int]) -> None:
+    first, second = _images(1, size, 2), _images(2, size, 2)
+    torch.testing.assert_close(network(first, second).double(), _reference(_trunk(), first, second), rtol=1e-4, atol=0)
+
+
+def test_masked_features_weigh_as_much_as_the_known_share_of_their_pixels(network: LPIPS) -> None:
+    first, second = _images(1, batch=2), _images(2, batch=2)
+    mask = torch.rand(2, 1, 40, 47, generator=torch.Generator().manual_seed(3)) > 0.3
+    mask[0, :, :20] = False
+    expected = _reference(_trunk(), first, second, mask)
+    torch.testing.assert_close(network(first, second, mask).double(), expected, rtol=1e-4, atol=0)
+
+
+def test_a_fully_known_mask_is_no_mask(network: LPIPS) -> None:
+    first, second = _images(1), _images(2)
+    mask = torch.ones(1, 1, 40, 47, dtype=torch.bool)
+    torch.testing.assert_close(network(first, second, mask), network(first, second), rtol=1e-6, atol=0)
+
+
+def test_a_mask_without_a_known_pixel_gives_nan(network: LPIPS) -> None:
+    assert bool(network(_images(1), _images(2), torch.zeros(1, 1, 40, 47, dtype=torch.bool)).isnan().all())
+
+
+def test_identical_images_have_distance_zero_and_a_finite_gradient(network: LPIPS) -> None:
+    first = _images(1).requires_grad_()
+    distance = network(first, first.detach().clone())
+    assert distance.item() == 0
+    distance.sum().backward()
+    assert first.grad is not None
+    assert bool(first.grad.isfinite().all())
+
+
+def test_features_that_are_all_zero_have_a_finite_gradient() -> None:
+    trunk = _trunk()
+    for index in SHAPES:
+        trunk[f"features.{index}.bias"] = torch.full((SHAPES[index][0],), -100.0)
+    first = _images(1).requires_grad_()
+    distance = LPIPS(trunk)(first, _images(2))
+    assert distance.item() == 0
+    distance.sum().backward()
+    assert first.grad is not None
+    assert bool(first.grad.isfinite().all())
+
+
+def test_gradient_points_away_from_the_other_image(network: LPIPS) -> None:
+    first, second = _images(1).requires_grad_(), _images(2)
+    before = network(first, second)
+    before.sum().backward()
+    assert first.grad is not None
+    step = 0.5 * first.grad / first.grad.norm()
+    assert network(first.detach() - step, second).item() < before.item()
+
+
+def test_distance_is_symmetric_and_does_not_depend_on_the_batch(network: LPIPS) -> None:
+    first, second = _images(1, batch=2), _images(2, batch=2)
+    together = network(first, second)
+    torch.testing.assert_close(network(second, first), together, rtol=1e-5, atol=0)
+    torch.testing.assert_close(torch.cat([network(first[i : i + 1], second[i : i + 1]) for i in range(2)]), together)
+
+
+def test_network_is_frozen(network: LPIPS) -> None:
+    assert not any(parameter.requires_grad for parameter in network.parameters())
+    assert not network.training
+
+
+@pytest.mark.parametrize("size", [(30, 64), (64, 30)])
+def test_too_small_images_are_refused(network: LPIPS, size: tuple[int, int]) -> None:
+    with pytest.raises(ValueError, match=rf"LPIPS: expected images of at least 31 x 31 pixels, got \({size[0]}, "):
+        network(_images(1, size), _images(2, size))
+
+
+@pytest.mark.parametrize("holes", [False, True])
+def test_lpips_v_is_the_distance_of_each_lights_rendering_in_three_channels(network: LPIPS, holes: bool) -> None:
+    pair = _pair(holes=holes)
+    depths = (torch.where(pair.depth_mask, depth, torch.nan) for depth in (pair.prediction, pair.target))
+    renderings = [render(normals_of(depth, pair.rays)).nan_to_num(nan=0) for depth in depths]
+    values = lpips_v(pair, network)
+    assert values.shape == (1, 4)
+    for light in range(4):
+        first, second = (2 * maps[:, light : light + 1].expand(-1, 3, -1, -1) - 1 for maps in renderings)
+        expected = _reference(_trunk(), first, second, pair.normal_mask)
+        torch.testing.assert_close(values[:, light].double(), expected, rtol=1e-4, atol=0)
+
+
+def test_depth_in_a_hole_does_not_matter(network: LPIPS) -> None:
+    pair = _pair(holes=True)
+    target = torch.where(pair.depth_mask, pair.target, torch.nan)
+    noise = torch.where(pair.depth_mask, pair.prediction, 9.0)
+    assert torch.equal(lpips_v(SurfacePair(noise, target, pair.rays), network), lpips_v(pair, network))
+
+
+def test_a_batch_of_complete_and_incomplete_pairs_is_each_by_itself(network: LPIPS) -> None:
+    pairs = [_pair(seed=1), _pair(seed=2, holes=True)]
+    joined = SurfacePair(
+        torch.cat([pair.prediction for pair in pairs]),
+        torch.cat([torch.where(pair.depth_mask, pair.target, torch.nan) for pair in pairs]),
+        pairs[0].rays,
+    )
+    expected = torch.cat([lpips_v(pair, network) for pair in pairs])
+    torch.testing.assert_close(lpips_v(joined, network), expected, rtol=1e-5, atol=0)
+
+
+def test_a_missing_or_misshapen_tensor_is_named() -> None:
+    trunk = _trunk()
+    del trunk["features.8.bias"]
+    with pytest.raises(ValueError, match=r"features.8.bias: expected a tensor of shape \(256,\), got nothing"):
+        LPIPS(trunk)
+    with pytest.raises(ValueError, match=r"features.0.weight: expected a tensor of shape \(64, 3, 11, 11\), got \(64,"):
+        LPIPS(_trunk() | {"features.0.weight": torch.zeros(64, 3, 7, 7)})
+
+
+def test_a_file_may_hold_more_than_the_features(tmp_path: Path, network: LPIPS) -> None:
+    torch.save(_trunk() | {"classifier.1.weight": torch.zeros(3)}, tmp_path / "alexnet.pth")
+    first, second = _images(1), _images(2)
+    assert torch.equal(load_lpips(tmp_path / "alexnet.pth")(first, second), network(first, second))
+
+
+def test_building_the_network_draws_no_random_number() -> None:
+    trunk = _trunk()
+    before = torch.get_rng_state()
+    LPIPS(trunk)
+    assert torch.equal(torch.get_rng_state(), before)
+
+
+class _Trap:
+    """Writes a file where somebody unpickles it."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return (Path.touch, (self.path,))
+
+
+def _damaged(kind: str, folder: Path) -> bytes:
+    buffer = io.BytesIO()
+    torch.save([1] if kind == "list" else _trunk() if kind == "cut" else {"state": torch.ones(2)}, buffer)
+    return {
+        "empty": b"",
+        "text": b"<html>404 not found</html>\nsecond line\n",
+        "cut": buffer.getvalue()[:-5000],
+        "list": buffer.getvalue(),
+        "other": buffer.getvalue(),
+        "trap": pickle.dumps(_Trap(folder / "sprung")),
+    }[kind]
+
+
+@pytest.mark.parametrize("kind", ["empty", "text", "cut", "list", "other", "trap"])
+def test_a_damaged_or_other_file_is_one_line_that_names_it(tmp_path: Path, kind: str) -> None:
+    path = tmp_path / "alexnet.pth"
+    path.write_bytes(_damaged(kind, tmp_path))
+    with pytest.raises(ValueError, match="expected the weights of torchvision's AlexNet: ") as caught:
+        load_lpips(path)
+    assert str(caught.value).startswith(f"{path}: ")
+    assert "\n" not in str(caught.value)
+    assert not (tmp_path / "sprung").exists()
+
+
+@pytest.fixture
+def hub(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Return torch's hub cache, empty, in a place of its own; any download fails the test."""
+    monkeypatch.setattr(torch.hub, "_hub_dir", str(tmp_path / "hub"))
+    monkeypatch.setattr(torch.hub, "urlopen", _unexpected)
+    return tmp_path / "hub" / "checkpoints"
+
+
+def _unexpected(*_: Any, **__: Any) -> Any:
+    raise AssertionError("nothing should be downloaded")
+
+
+def test_the_configured_file_comes_first(hub: Path, tmp_path: Path) -> None:
+    hub.mkdir(parents=True)
+    (hub / TRUNK_FILE).touch()
+    (tmp_path / "mine.pth").touch()
+    assert find_trunk(tmp_path / "mine.pth") == tmp_path / "mine.pth"
+
+
+def test_a_configured_file_that_is_missing_is_not_replaced_by_another(hub: Path, tmp_path: Path) -> None:
+    hub.mkdir(parents=True)
+    (hub / TRUNK_FILE).touch()
+    with pytest.raises(FileNotFoundError, match=r"metrics.lpips_trunk: expected a file, got .*mine.pth"):
+        find_trunk(tmp_path / "mine.pth")
+
+
+def test_the_cached_file_comes_before_a_download(hub: Path) -> None:
+    hub.mkdir(parents=True)
+    (hub / TRUNK_FILE).touch()
+    assert find_trunk(None) == hub / TRUNK_FILE
+
+
+class _Response(io.BytesIO):
+    """A download: its bytes, and then an error or the end."""
+
+    def __init__(self, content: bytes, error: Exception | None = None) -> None:
+        super().__init__(content)
+        self.error = error
+        self.headers = Message()
+        self.headers["Content-Length"] = str(len(content))
+
+    def info(self) -> Message:
+        return self.headers
+
+    def read(self, size: int | None = -1) -> bytes:
+        part = super().read(size)
+        if not part and self.error is not None:
+            raise self.error
+        return part
+
+
+def test_a_download_goes_into_the_cache(hub: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    content, asked = b"weights", []
+    monkeypatch.setattr(lpips, "TRUNK_HASH", hashlib.sha256(content).hexdigest()[:8])
+
+    def respond(request: Any, *_: Any, **__: Any) -> _Response:
+        asked.append(request.full_url)
+        return _Response(content)
+
+    monkeypatch.setattr(torch.hub, "urlopen", respond)
+    assert find_trunk(None).read_bytes() == content
+    assert find_trunk(None) == hub / TRUNK_FILE
+    assert asked == [TRUNK_URL]
+
+
+FAILURES: dict[str, Exception | _Response] = {
+    "offline": urllib.error.URLError("no route to host"),
+    "missing": urllib.error.HTTPError(TRUNK_URL, 404, "not found", Message(), None),
+    "unreachable": OSError("network is unreachable"),
+    "timeout": _Response(b"half of it", TimeoutError("timed out")),
+    "reset": _Response(b"half of it", ConnectionResetError("reset")),
+    "incomplete": _Response(b"half of it", http.client.IncompleteRead(b"", 7)),
+    "hash": _Response(b"another file altogether"),
+}
+
+
+@pytest.mark.parametrize("kind", FAILURES)
+def test_a_failed_download_is_an_os_error_and_leaves_nothing(
+    hub: Path, monkeypatch: pytest.MonkeyPatch, kind: str
+) -> None:
+    def respond(*_: Any, **__: Any) -> _Response:
+        failure = FAILURES[kind]
+        if isinstance(failure, Exception):
+            raise failure
+        return failure
+
+    before = socket.getdefaulttimeout()
+    monkeypatch.setattr(torch.hub, "urlopen", respond)
+    with pytest.raises(OSError, match="could not be downloaded"):
+        find_trunk(None)
+    assert list(hub.iterdir()) == []
+    assert socket.getdefaulttimeout() == before
+
+
+def test_the_trunk_is_the_official_file() -> None:
+    assert f"alexnet-owt-{TRUNK_HASH}.pth" == TRUNK_FILE
+    assert f"https://download.pytorch.org/models/{TRUNK_FILE}" == TRUNK_URL

@@ -1,0 +1,246 @@
+"""The torchmetrics classes: means over images of the pure functions' values, and nothing of LPIPS in checkpoints."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+
+import lightning
+import numpy as np
+import pytest
+import torch
+import torchmetrics
+from torch import Tensor, nn
+
+from dsr.geometry.camera import Camera
+from dsr.quality import functional
+from dsr.quality.functional import SurfacePair
+from dsr.quality.lpips import LPIPS, lpips_v
+from dsr.quality.metrics import (
+    BadPixD,
+    BadPixV,
+    BumpinessD,
+    DSSIMv,
+    LPIPSv,
+    PerImageMean,
+    RMSEd,
+    RMSEv,
+    RMSEv1,
+    visual_metrics,
+)
+
+CAMERA = Camera(width=40, height=36, fx=40.0, fy=40.0, cx=20.0, cy=18.0)
+NAMES = [
+    "RMSE_d",
+    *(f"BadPix_d_{percent}cm" for percent in (1, 5, 10)),
+    *(f"BadPix_d_{percent}pct" for percent in (1, 5, 10)),
+    *(f"BadPix_v_{level}" for level in (1, 5, 10)),
+    *("DSSIM_v", "LPIPS_v", "RMSE_v", "RMSE_v1", "Bumpiness_d"),
+]
+
+
+@pytest.fixture(scope="module")
+def network() -> LPIPS:
+    random = torch.Generator().manual_seed(0)
+    shapes = {0: (64, 3, 11, 11), 3: (192, 64, 5, 5), 6: (384, 192, 3, 3), 8: (256, 384, 3, 3), 10: (256, 256, 3, 3)}
+    trunk = {f"features.{i}.weight": 0.1 * torch.randn(shape, generator=random) for i, shape in shapes.items()}
+    return LPIPS(trunk | {f"features.{i}.bias": torch.zeros(shape[0]) for i, shape in shapes.items()})
+
+
+def _pair(seed: int, batch: int = 1) -> SurfacePair:
+    """Return maps whose error is 0.002 ... 0.5 m, so that every threshold splits their pixels."""
+    random = np.random.default_rng(seed)
+    ramp = np.linspace(0.002, 0.5, 40)[None, None, None]
+    target = 2 + 0.004 * random.random((batch, 1, 36, 40))
+    prediction = target + ramp * (1 + 0.02 * random.random((batch, 1, 36, 40)))
+    return SurfacePair(torch.from_numpy(prediction), torch.from_numpy(target), CAMERA.rays()[None])
+
+
+def _unknown() -> SurfacePair:
+    hole = torch.full((1, 1, 36, 40), torch.nan, dtype=torch.float64)
+    return SurfacePair(hole, hole, CAMERA.rays()[None])
+
+
+SINGLE: dict[str, tuple[Callable[[], PerImageMean], Callable[[SurfacePair], Tensor]]] = {
+    "RMSE_d": (RMSEd, functional.rmse_d),
+    "BadPix_d_5cm": (BadPixD, lambda pair: functional.bad_pix_d(pair, 0.05)),
+    "BadPix_d_10cm": (lambda: BadPixD(10), lambda pair: functional.bad_pix_d(pair, 0.1)),
+    "BadPix_d_1pct": (lambda: BadPixD(1, relative=True), lambda pair: functional.bad_pix_d(pair, 0.01, relative=True)),
+    "RMSE_v": (RMSEv, functional.rmse_v),
+    "Bumpiness_d": (BumpinessD, functional.bumpiness_d),
+}
+PER_LIGHT: dict[str, tuple[Callable[..., PerImageMean], Callable[[SurfacePair], Tensor]]] = {
+    "BadPix_v_5": (BadPixV, lambda pair: functional.bad_pix_v(pair, 5)),
+    "DSSIM_v": (DSSIMv, functional.dssim_v),
+    "RMSE_v1": (RMSEv1, functional.rmse_v1),
+}
+VARIANTS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
+    **{f"e{i + 1}": lambda values, i=i: values[:, i] for i in range(4)},  # type: ignore[misc]
+    "max": lambda values: values.max(axis=1),
+    "avg": lambda values: values.mean(axis=1),
+}
+
+
+@pytest.mark.parametrize("name", SINGLE)
+def test_metric_is_the_mean_over_images_not_over_batches(name: str) -> None:
+    make, function = SINGLE[name]
+    metric, pairs = make(), [_pair(0, batch=3), _pair(1)]
+    for pair in pairs:
+        metric.update(pair)
+    expected = np.concatenate([function(pair).numpy() for pair in pairs])
+    assert expected.shape == (4,)
+    assert expected.min() > 0
+    assert metric.compute().item() == pytest.approx(expected.mean(), rel=1e-12)
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+@pytest.mark.parametrize("name", PER_LIGHT)
+def test_variants_choose_among_the_lights_image_by_image(name: str, variant: str) -> None:
+    make, function = PER_LIGHT[name]
+    metric, pairs = make(variant=variant), [_pair(0, batch=2), _pair(1)]
+    for pair in pairs:
+        metric.update(pair)
+    values = np.concatenate([function(pair).numpy() for pair in pairs])
+    assert metric.compute().item() == pytest.approx(VARIANTS[variant](values).mean(), rel=1e-12)
+
+
+@pytest.mark.parametrize("name", PER_LIGHT)
+def test_the_worst_light_is_the_default(name: str) -> None:
+    make, function = PER_LIGHT[name]
+    metric = make()
+    metric.update(_pair(0))
+    assert metric.compute().item() == pytest.approx(function(_pair(0)).max().item(), rel=1e-12)
+
+
+def test_lpips_is_the_mean_of_its_function(network: LPIPS) -> None:
+    metric = LPIPSv(network)
+    metric.update(_pair(0))
+    assert metric.compute().item() == pytest.approx(lpips_v(_pair(0), network).max().item(), rel=1e-6)
+
+
+def test_images_that_cannot_be_scored_are_left_out() -> None:
+    for make in (RMSEd, DSSIMv, BumpinessD):
+        metric, alone = make(), make()
+        alone.update(_pair(0))
+        metric.update(_unknown())
+        metric.update(_pair(0))
+        assert metric.compute().item() == pytest.approx(alone.compute().item(), rel=1e-12)
+
+
+def test_without_an_image_to_score_the_mean_is_nan() -> None:
+    metric = RMSEd()
+    metric.update(_unknown())
+    assert math.isnan(metric.compute())
+
+
+def test_reset_forgets_everything() -> None:
+    metric, fresh = DSSIMv(), DSSIMv()
+    metric.update(_pair(0))
+    metric.reset()
+    metric.update(_pair(1))
+    fresh.update(_pair(1))
+    assert torch.equal(metric.compute(), fresh.compute())
+
+
+def test_state_of_two_processes_adds_up() -> None:
+    metric = RMSEd()
+    assert {name: reduce.__name__ for name, reduce in metric._reductions.items()} == {  # type: ignore[union-attr]
+        "total": "dim_zero_sum",
+        "count": "dim_zero_sum",
+    }
+
+
+def test_an_update_keeps_no_graph() -> None:
+    pair = _pair(0)
+    depth = pair.prediction.requires_grad_()
+    metric = RMSEv()
+    metric.update(SurfacePair(depth, pair.target, pair.rays))
+    assert not metric.compute().requires_grad
+
+
+def test_collection_gives_each_metric_its_own_value(network: LPIPS) -> None:
+    metrics = visual_metrics(network)
+    for pair in (_pair(0, batch=2), _pair(1)):
+        metrics.update(pair)
+    values = metrics.compute()
+    assert sorted(values) == sorted(NAMES)
+    pairs = [_pair(0, batch=2), _pair(1)]
+
+    def mean(function: Callable[[SurfacePair], Tensor]) -> float:
+        images = torch.cat([function(pair) for pair in pairs])
+        return (images if images.dim() == 1 else images.amax(dim=1)).mean().item()
+
+    for percent in (1, 5, 10):
+        assert values[f"BadPix_d_{percent}cm"].item() == mean(lambda p: functional.bad_pix_d(p, percent / 100))  # noqa: B023
+        relative = mean(lambda p: functional.bad_pix_d(p, percent / 100, relative=True))  # noqa: B023
+        assert values[f"BadPix_d_{percent}pct"].item() == relative
+        assert values[f"BadPix_v_{percent}"].item() == mean(lambda p: functional.bad_pix_v(p, percent))  # noqa: B023
+    for name, (_, function) in {**SINGLE, **PER_LIGHT}.items():
+        assert values[name].item() == pytest.approx(mean(function), rel=1e-12)
+    assert values["LPIPS_v"].item() == pytest.approx(mean(lambda p: lpips_v(p, network)), rel=1e-6)
+    assert len({round(value.item(), 12) for value in values.values()}) == len(NAMES)  # all differ on these maps
+
+
+def test_metrics_that_agree_on_the_first_image_may_differ_on_the_next() -> None:
+    metrics, pair = visual_metrics(), _pair(0)
+    metrics.update(SurfacePair(pair.target, pair.target, pair.rays))  # all of them 0
+    metrics.update(pair)
+    values = metrics.compute()
+    for percent in (1, 5, 10):
+        assert values[f"BadPix_d_{percent}cm"].item() == functional.bad_pix_d(pair, percent / 100).item() / 2
+        assert values[f"BadPix_v_{percent}"].item() == functional.bad_pix_v(pair, percent).max().item() / 2
+    for name, (_, function) in {**SINGLE, **PER_LIGHT}.items():
+        assert values[name].item() == pytest.approx(function(pair).max().item() / 2, rel=1e-9, abs=1e-9)
+
+
+def test_collection_without_a_network_leaves_lpips_out() -> None:
+    assert sorted(visual_metrics().keys()) == sorted(set(NAMES) - {"LPIPS_v"})
+
+
+class _Model(lightning.LightningModule):
+    """A model that validates itself."""
+
+    def __init__(self, metrics: torchmetrics.MetricCollection) -> None:
+        super().__init__()
+        self.layer = nn.Linear(2, 1)
+        self.metrics = metrics
+        self.single = metrics["LPIPS_v"]
+
+
+def test_checkpoints_hold_nothing_of_the_perceptual_network(network: LPIPS, tmp_path: Path) -> None:
+    model = _Model(visual_metrics(network))
+    model.metrics.update(_pair(0))
+    assert set(model.state_dict()) == {"layer.weight", "layer.bias"}
+    assert {name for name, _ in model.named_parameters()} == {"layer.weight", "layer.bias"}
+    assert not any(isinstance(module, LPIPS) for module in model.modules())
+    trainer = lightning.Trainer(
+        accelerator="cpu",
+        logger=False,
+        enable_checkpointing=False,
+        enable_progress_bar=False,
+        enable_model_summary=False,
+    )
+    trainer.strategy.connect(model)
+    trainer.save_checkpoint(tmp_path / "last.ckpt")
+    assert (tmp_path / "last.ckpt").stat().st_size < 20_000
+    assert set(torch.load(tmp_path / "last.ckpt", weights_only=True)["state_dict"]) == {"layer.weight", "layer.bias"}
+
+
+def test_an_unknown_variant_is_refused() -> None:
+    for make in (BadPixV, DSSIMv, RMSEv1):
+        with pytest.raises(ValueError, match=r"variant: expected one of e1, e2, e3, e4, max, avg, got 'e5'"):
+            make(variant="e5")
+
+
+def test_an_unknown_threshold_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"threshold: .*BadPix_d_1cm, BadPix_d_5cm, .*got 7"):
+        BadPixD(threshold=7)
+    with pytest.raises(ValueError, match=r"threshold: .*BadPix_d_10pct; got 7"):
+        BadPixD(threshold=7, relative=True)
+    with pytest.raises(ValueError, match=r"threshold: .*BadPix_v_1, BadPix_v_5, BadPix_v_10; got 2"):
+        BadPixV(threshold=2)
+
+
+def test_lower_is_better() -> None:
+    assert all(metric.higher_is_better is False for metric in visual_metrics().values())

@@ -1,0 +1,134 @@
+"""The records' checks: each says whose value is wrong, what was expected and what came."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import torch
+
+from dsr.geometry.camera import Camera
+from dsr.sample import DepthSample, Scene
+
+CAMERA = Camera(width=8, height=4, fx=9.0, fy=9.0, cx=3.5, cy=1.5)
+
+
+def _scene(**changes: Any) -> Scene:
+    fields = {"dataset": "set", "name": "hall", "rgb": torch.rand(3, 4, 8), "camera": CAMERA}
+    return Scene(**(fields | {"depth": torch.full((1, 4, 8), 2.0)} | changes))
+
+
+def _sample(**changes: Any) -> DepthSample:
+    fields = {
+        "dataset": "set",
+        "scene": "hall",
+        "rgb": torch.rand(3, 4, 8),
+        "depth_lr": torch.full((1, 2, 4), 2.0),
+        "camera": CAMERA,
+        "camera_lr": CAMERA.rescale(4, 2),
+        "scale": 2,
+        "depth": torch.full((1, 4, 8), 2.0),
+    }
+    return DepthSample(**(fields | changes))
+
+
+def _with(shape: tuple[int, ...], value: float) -> torch.Tensor:
+    depth = torch.full(shape, 2.0)
+    depth[0, 1, 2] = value
+    return depth
+
+
+def test_good_records_are_accepted_with_holes_and_without_truth() -> None:
+    _scene(depth=_with((1, 4, 8), torch.nan))
+    _scene(depth=None, measured={2: torch.ones(1, 2, 4), 4: torch.ones(1, 1, 2).double()})
+    sample = _sample(depth=None, depth_lr=_with((1, 2, 4), torch.nan))
+    assert sample.notes == ()
+
+
+def test_masks_tell_where_depth_is_known() -> None:
+    sample = _sample(depth_lr=_with((1, 2, 4), torch.nan), depth=_with((1, 4, 8), torch.nan))
+    assert sample.mask_lr.dtype == torch.bool
+    assert (~sample.mask_lr).nonzero().tolist() == [[0, 1, 2]]
+    assert sample.mask is not None
+    assert (~sample.mask).nonzero().tolist() == [[0, 1, 2]]
+    assert _sample(depth=None).mask is None
+
+
+@pytest.mark.parametrize("make", [_scene, _sample])
+@pytest.mark.parametrize("shape", [(4, 8), (1, 4, 8), (3, 8, 4), (1, 3, 4, 8), (3, 4, 7)])
+def test_a_photo_of_another_shape_is_refused(make: Any, shape: tuple[int, ...]) -> None:
+    with pytest.raises(ValueError, match=r"^hall: rgb: expected shape \(3, 4, 8\), got "):
+        make(rgb=torch.zeros(shape))
+
+
+@pytest.mark.parametrize("make", [_scene, _sample])
+@pytest.mark.parametrize(
+    "rgb",
+    [
+        torch.zeros(3, 4, 8, dtype=torch.uint8),
+        torch.full((3, 4, 8), 1.01),
+        torch.full((3, 4, 8), -0.01),
+        torch.full((3, 4, 8), torch.nan),
+        torch.full((3, 4, 8), 255.0),
+    ],
+)
+def test_a_photo_of_other_values_is_refused(make: Any, rgb: torch.Tensor) -> None:
+    with pytest.raises(ValueError, match=r"^hall: rgb: expected floating point values in \[0, 1\]"):
+        make(rgb=rgb)
+
+
+BAD_DEPTHS = [
+    (lambda shape: torch.ones(shape[1:]), "expected shape"),
+    (lambda shape: torch.ones(1, shape[2], shape[1]), "expected shape"),
+    (lambda shape: torch.ones(shape, dtype=torch.int32), "expected floating point metres, got torch.int32"),
+    (lambda shape: _with(shape, 0.0), "expected positive depth, and NaN where a pixel is a hole; got 0$"),
+    (lambda shape: _with(shape, -1.5), "expected positive depth, and NaN where a pixel is a hole; got -1.5$"),
+    (lambda shape: _with(shape, torch.inf), "expected positive depth, and NaN where a pixel is a hole; got inf$"),
+    (lambda shape: _with(shape, -torch.inf), "expected positive depth, and NaN where a pixel is a hole; got "),
+    (lambda shape: torch.full(shape, torch.nan), "expected at least one known pixel, all are holes$"),
+]
+
+
+@pytest.mark.parametrize(("bad", "message"), BAD_DEPTHS)
+def test_a_wrong_depth_map_is_named(bad: Any, message: str) -> None:
+    with pytest.raises(ValueError, match=f"^hall: depth: {message}"):
+        _scene(depth=bad((1, 4, 8)))
+    with pytest.raises(ValueError, match=f"^hall: measured depth at x2: {message}"):
+        _scene(measured={2: bad((1, 2, 4))})
+    with pytest.raises(ValueError, match=f"^hall: depth: {message}"):
+        _sample(depth=bad((1, 4, 8)))
+    with pytest.raises(ValueError, match=f"^hall: depth_lr: {message}"):
+        _sample(depth_lr=bad((1, 2, 4)))
+
+
+def test_a_scene_without_any_depth_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"^hall: expected a depth map, fine or measured, got none"):
+        _scene(depth=None)
+
+
+@pytest.mark.parametrize("factor", [0, -2])
+def test_a_measured_map_at_no_factor_is_refused(factor: int) -> None:
+    with pytest.raises(ValueError, match=f"^hall: measured: expected a positive factor, got {factor}"):
+        _scene(measured={factor: torch.ones(1, 2, 4)})
+
+
+def test_coarse_and_fine_sizes_must_differ_by_the_scale() -> None:
+    with pytest.raises(
+        ValueError, match=r"^hall: depth_lr: expected 1 x 2 \(the photo's 4 x 8 at scale 4\), got 2 x 4"
+    ):
+        _sample(scale=4)
+    with pytest.raises(ValueError, match=r"^hall: depth_lr: expected 2 x 4 .* got 2 x 3"):
+        _sample(camera_lr=CAMERA.rescale(3, 2), depth_lr=torch.ones(1, 2, 3))
+
+
+@pytest.mark.parametrize("scale", [0, -2])
+def test_a_scale_that_is_not_positive_is_refused(scale: int) -> None:
+    with pytest.raises(ValueError, match=f"^hall: scale: expected a positive whole number, got {scale}"):
+        _sample(scale=scale)
+
+
+def test_records_do_not_change() -> None:
+    with pytest.raises(AttributeError):
+        _scene().name = "other"  # type: ignore[misc]
+    with pytest.raises(AttributeError):
+        _sample().scale = 4  # type: ignore[misc]

@@ -1,0 +1,173 @@
+"""All scores of one image: their names, their values, and the share of pixels that each rests on."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from dsr.geometry.camera import Camera
+from dsr.quality import functional
+from dsr.quality.functional import SurfacePair
+from dsr.quality.lpips import LPIPS, lpips_v
+from dsr.quality.scores import Score, catalogue, score_image
+
+CAMERA = Camera(width=48, height=40, fx=50.0, fy=50.0, cx=24.0, cy=20.0)
+WITHOUT_LIGHTS = {
+    "RMSE_d",
+    *(f"BadPix_d_{percent}cm" for percent in (1, 5, 10)),
+    *(f"BadPix_d_{percent}pct" for percent in (1, 5, 10)),
+    *("RMSE_v", "Bumpiness_d"),
+}
+WITH_LIGHTS = {*(f"BadPix_v_{level}" for level in (1, 5, 10)), "DSSIM_v", "LPIPS_v", "RMSE_v1"}
+Row = tuple[str, str]
+
+
+@pytest.fixture(scope="module")
+def network() -> LPIPS:
+    random = torch.Generator().manual_seed(0)
+    shapes = {0: (64, 3, 11, 11), 3: (192, 64, 5, 5), 6: (384, 192, 3, 3), 8: (256, 384, 3, 3), 10: (256, 256, 3, 3)}
+    trunk = {f"features.{i}.weight": 0.1 * torch.randn(shape, generator=random) for i, shape in shapes.items()}
+    return LPIPS(trunk | {f"features.{i}.bias": torch.zeros(shape[0]) for i, shape in shapes.items()})
+
+
+def _maps(seed: int = 0) -> tuple[Tensor, Tensor]:
+    random = np.random.default_rng(seed)
+    target = 2 + 0.01 * random.random((1, 40, 48))
+    prediction = target + np.linspace(0.002, 0.5, 48) * (1 + 0.02 * random.random((1, 40, 48)))
+    return torch.from_numpy(prediction), torch.from_numpy(target)
+
+
+def _scores(prediction: Tensor, target: Tensor, network: LPIPS | None = None) -> dict[Row, Score]:
+    scores = list(score_image(prediction, target, CAMERA.rays(), catalogue(network)))
+    rows = {(score.metric, score.variant): score for score in scores}
+    assert len(rows) == len(scores)
+    return rows
+
+
+def test_the_metrics_and_their_variants_are_those_of_the_paper(network: LPIPS) -> None:
+    variants = {"e1", "e2", "e3", "e4", "max", "avg"}
+    expected = {(name, "") for name in WITHOUT_LIGHTS} | {(name, v) for name in WITH_LIGHTS for v in variants}
+    assert set(_scores(*_maps(), network)) == expected
+    assert {metric.name for metric in catalogue()} == WITHOUT_LIGHTS | WITH_LIGHTS - {"LPIPS_v"}
+
+
+def test_values_are_those_of_the_functions(network: LPIPS) -> None:
+    prediction, target = _maps()
+    rows = _scores(prediction, target, network)
+    pair = SurfacePair(prediction[None], target[None], CAMERA.rays()[None])
+    for percent in (1, 5, 10):
+        absolute = functional.bad_pix_d(pair, percent / 100).item()
+        relative = functional.bad_pix_d(pair, percent / 100, relative=True).item()
+        assert rows[f"BadPix_d_{percent}cm", ""].value == pytest.approx(absolute, rel=1e-12)
+        assert rows[f"BadPix_d_{percent}pct", ""].value == pytest.approx(relative, rel=1e-12)
+    for name, function in (("RMSE_d", "rmse_d"), ("RMSE_v", "rmse_v"), ("Bumpiness_d", "bumpiness_d")):
+        assert rows[name, ""].value == pytest.approx(getattr(functional, function)(pair).item(), rel=1e-5)
+    by_light = {
+        **{f"BadPix_v_{level}": functional.bad_pix_v(pair, level) for level in (1, 5, 10)},
+        "DSSIM_v": functional.dssim_v(pair),
+        "RMSE_v1": functional.rmse_v1(pair),
+        "LPIPS_v": lpips_v(pair, network),
+    }
+    for name, values in by_light.items():
+        lights = [rows[name, f"e{i}"].value for i in (1, 2, 3, 4)]
+        assert lights == pytest.approx(values[0].tolist(), rel=1e-3)
+        assert len(set(lights)) == 4
+        assert rows[name, "max"].value == max(lights)
+        assert rows[name, "avg"].value == pytest.approx(sum(lights) / 4, rel=1e-5)
+
+
+def test_complete_maps_are_scored_on_all_their_pixels(network: LPIPS) -> None:
+    assert {score.valid_share for score in _scores(*_maps(), network).values()} == {1.0}
+
+
+@pytest.mark.parametrize(
+    "cut", [(slice(0, 39), slice(0, 47)), (slice(2, 40), slice(0, 48)), (slice(1, 38), slice(5, 44))]
+)
+def test_what_the_method_does_not_cover_is_cut_off_first(cut: tuple[slice, slice]) -> None:
+    prediction, target = _maps()
+    partial = torch.full_like(prediction, torch.nan)
+    partial[(..., *cut)] = prediction[(..., *cut)]
+    rows = _scores(partial, target)
+    window = CAMERA.crop(cut[0].start, cut[1].start, cut[0].stop - cut[0].start, cut[1].stop - cut[1].start)
+    metrics = catalogue()
+    expected = list(score_image(prediction[(..., *cut)], target[(..., *cut)], window.rays(), metrics))
+    assert len(rows) == len(expected)
+    for score in expected:
+        row = rows[score.metric, score.variant]
+        assert row.value == pytest.approx(score.value, rel=1e-5)
+        assert row.valid_share == pytest.approx(window.height * window.width / (40 * 48), rel=1e-12)
+
+
+def test_a_hole_inside_is_left_out_and_each_metric_tells_its_share() -> None:
+    prediction, target = _maps()
+    prediction[0, 10, 20] = torch.nan
+    target[0, 30, 40] = torch.nan
+    rows = _scores(prediction, target)
+    pixels = 40 * 48
+    assert rows["RMSE_d", ""].valid_share == pytest.approx(1 - 2 / pixels, rel=1e-12)
+    assert rows["BadPix_d_5pct", ""].valid_share == pytest.approx(1 - 2 / pixels, rel=1e-12)
+    for name in ("BadPix_v_5", "RMSE_v1"):  # a normal needs its right and its lower neighbour
+        assert rows[name, "max"].valid_share == pytest.approx(1 - 6 / pixels, rel=1e-12)
+    assert rows["RMSE_v", ""].valid_share == pytest.approx(1 - 6 / pixels, rel=1e-12)
+    assert rows["DSSIM_v", "e1"].valid_share == pytest.approx(1 - 6 / (34 * 42), rel=1e-12)
+    assert rows["Bumpiness_d", ""].valid_share == pytest.approx(1 - 2 * 25 / pixels, rel=1e-12)
+    pair = SurfacePair(prediction[None], target[None], CAMERA.rays()[None])
+    assert rows["RMSE_d", ""].value == pytest.approx(functional.rmse_d(pair).item(), rel=1e-12)
+    assert rows["DSSIM_v", "e1"].value == pytest.approx(functional.dssim_v(pair)[0, 0].item(), rel=1e-4)
+
+
+def test_holes_of_the_truth_do_not_shrink_the_window() -> None:
+    prediction, target = _maps()
+    target[:, :4] = torch.nan
+    rows = _scores(prediction, target)
+    assert rows["RMSE_d", ""].valid_share == pytest.approx(36 / 40, rel=1e-12)
+    assert rows["RMSE_v", ""].valid_share == pytest.approx(36 / 40, rel=1e-12)
+    assert rows["DSSIM_v", "max"].valid_share == pytest.approx(33 / 34, rel=1e-12)  # of the rows 3 ... 36, but row 3
+
+
+def test_a_prediction_without_a_pixel_scores_nan_on_none(network: LPIPS) -> None:
+    prediction, target = _maps()
+    rows = _scores(torch.full_like(prediction, torch.nan), target, network)
+    assert all(math.isnan(score.value) and score.valid_share == 0 for score in rows.values())
+
+
+@pytest.mark.parametrize(
+    ("size", "scored"),
+    [
+        ((24, 30), {"RMSE_d", "BadPix_d_5cm", "BadPix_v_5", "RMSE_v", "RMSE_v1", "Bumpiness_d", "DSSIM_v"}),
+        ((6, 30), {"RMSE_d", "BadPix_d_5cm", "BadPix_v_5", "RMSE_v", "RMSE_v1", "Bumpiness_d"}),
+    ],
+)
+def test_a_window_too_small_for_a_metric_is_scored_by_the_others(
+    network: LPIPS, size: tuple[int, int], scored: set[str]
+) -> None:
+    prediction, target = _maps()
+    patch = torch.full_like(prediction, torch.nan)
+    window = (..., slice(5, 5 + size[0]), slice(8, 8 + size[1]))
+    patch[window] = prediction[window]
+    for score in _scores(patch, target, network).values():
+        if score.metric in scored:
+            assert math.isfinite(score.value)
+            assert score.valid_share == pytest.approx(size[0] * size[1] / (40 * 48), rel=1e-12)
+        if score.metric == "LPIPS_v" or (score.metric == "DSSIM_v" and "DSSIM_v" not in scored):
+            assert math.isnan(score.value)
+            assert score.valid_share == 0
+
+
+def test_a_prediction_of_one_pixel_has_no_score_by_its_look(network: LPIPS) -> None:
+    prediction, target = _maps()
+    spot = torch.full_like(prediction, torch.nan)
+    spot[0, 20, 30] = prediction[0, 20, 30]
+    rows = _scores(spot, target, network)
+    for name in WITH_LIGHTS:
+        assert math.isnan(rows[name, "max"].value)
+        assert rows[name, "max"].valid_share == 0
+
+
+def test_scoring_keeps_no_graph() -> None:
+    prediction, target = _maps()
+    assert all(isinstance(score.value, float) for score in _scores(prediction.requires_grad_(), target).values())

@@ -1,0 +1,155 @@
+"""Normals, against closed forms and against cross products of differences of points."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from dsr.geometry.camera import Camera
+from dsr.geometry.surface import length, normal_mask, normals_of, points_of
+from dsr.quality.functional import SurfacePair, mse_v
+
+CAMERA = Camera(width=11, height=7, fx=9.0, fy=12.0, cx=4.3, cy=3.9)
+PLANES = [(0.0, 0.0, -1.0), (0.3, -0.2, -1.0), (-0.5, 0.1, -0.8), (0.2, 0.6, -1.0)]
+
+
+def _plane(camera: Camera, normal: tuple[float, float, float], offset: float = -2.0) -> Tensor:
+    """Return the depth of the plane n . P = offset, (1, 1, H, W)."""
+    facing = torch.einsum("c,chw->hw", torch.tensor(normal, dtype=torch.float64), camera.rays())
+    return (offset / facing)[None, None]
+
+
+def _random(camera: Camera, seed: int = 0) -> Tensor:
+    shape = (1, 1, camera.height, camera.width)
+    return torch.from_numpy(np.random.default_rng(seed).uniform(1.0, 1.3, shape))
+
+
+def _cross_product_normals(z: np.ndarray, camera: Camera) -> np.ndarray:
+    """Return the protocol's normals, (H, W, 3), straight from its words; NaN where a point that they need is."""
+    v, u = np.mgrid[: camera.height, : camera.width].astype(float)
+    points = np.stack((z * (u - camera.cx) / camera.fx, z * (v - camera.cy) / camera.fy, z), axis=-1)
+    along_u = np.diff(points, axis=1)
+    along_u = np.concatenate((along_u, along_u[:, -1:]), axis=1)
+    along_v = np.diff(points, axis=0)
+    along_v = np.concatenate((along_v, along_v[-1:]), axis=0)
+    normals = np.cross(along_v, along_u)
+    return normals / np.linalg.norm(normals, axis=-1, keepdims=True)
+
+
+def _sphere_error(camera: Camera) -> float:
+    """Return the largest error of the normals of a sphere that fills the picture."""
+    centre, radius = torch.tensor([0.1, -0.05, 3.0], dtype=torch.float64)[:, None, None], 1.0
+    rays = camera.rays()
+    a, b, c = (rays * rays).sum(0), (rays * centre).sum(0), (centre * centre).sum() - radius**2
+    depth = ((b - (b * b - a * c).sqrt()) / a)[None]
+    truth = (points_of(depth[None], rays[None])[0] - centre) / radius
+    return float((normals_of(depth[None], rays[None])[0] - truth).abs().max())
+
+
+def test_points_lie_on_their_rays_at_their_depth() -> None:
+    depth = _random(CAMERA)
+    points = points_of(depth, CAMERA.rays()[None])
+    v, u = 5, 8
+    z = depth[0, 0, v, u].item()
+    assert points[0, :, v, u].tolist() == pytest.approx([(u - 4.3) / 9.0 * z, (v - 3.9) / 12.0 * z, z], rel=1e-14)
+
+
+@pytest.mark.parametrize("normal", PLANES)
+def test_a_plane_has_its_normal_at_every_pixel_to_the_last(normal: tuple[float, float, float]) -> None:
+    normals = normals_of(_plane(CAMERA, normal), CAMERA.rays()[None])
+    expected = torch.tensor(normal, dtype=torch.float64)
+    expected = (expected / expected.norm())[None, :, None, None].expand_as(normals)
+    torch.testing.assert_close(normals, expected, rtol=0, atol=1e-9)
+
+
+def test_normals_of_a_sphere_converge_with_first_order() -> None:
+    errors = [_sphere_error(Camera(32, 32, 160.0, 160.0, 15.5, 15.5).rescale(n, n)) for n in (32, 64, 128)]
+    assert errors[0] < 0.05
+    assert errors[0] / errors[1] == pytest.approx(2, abs=0.15)
+    assert errors[1] / errors[2] == pytest.approx(2, abs=0.15)
+
+
+@pytest.mark.parametrize("size", [(7, 11), (2, 2), (2, 5), (6, 2)])
+def test_normals_are_the_normalised_cross_product_of_forward_differences(size: tuple[int, int]) -> None:
+    camera = CAMERA.crop(0, 0, *size)
+    depth = _random(camera)
+    expected = torch.from_numpy(_cross_product_normals(depth[0, 0].numpy(), camera)).permute(2, 0, 1)[None]
+    torch.testing.assert_close(normals_of(depth, camera.rays()[None]), expected, rtol=0, atol=1e-10)
+
+
+def test_normals_have_unit_length_and_face_the_camera() -> None:
+    rays = CAMERA.rays()[None]
+    normals = normals_of(_random(CAMERA), rays)
+    torch.testing.assert_close(normals.norm(dim=1), torch.ones(1, 7, 11, dtype=torch.float64), rtol=0, atol=1e-14)
+    assert bool(((normals * rays).sum(dim=1) < 0).all())
+    for plane in PLANES:
+        assert bool((normals_of(_plane(CAMERA, plane), rays)[:, 2] < 0).all())
+
+
+@pytest.mark.parametrize("hole", [(3, 4), (0, 0), (6, 10), (6, 0), (0, 10), (5, 10), (6, 9)])
+def test_a_normal_is_unknown_exactly_where_a_pixel_that_it_needs_is(hole: tuple[int, int]) -> None:
+    depth = _random(CAMERA)
+    depth[0, 0, hole[0], hole[1]] = torch.nan
+    known = np.isfinite(_cross_product_normals(depth[0, 0].numpy(), CAMERA)).all(axis=-1)
+    assert not known.all()
+    assert np.array_equal(normal_mask(depth.isfinite())[0, 0].numpy(), known)
+    normals = normals_of(depth, CAMERA.rays()[None])
+    assert np.array_equal(normals.isfinite().all(dim=1)[0].numpy(), known)
+
+
+def test_normals_do_not_depend_on_the_batch() -> None:
+    depths = torch.cat((_random(CAMERA, 1), _random(CAMERA, 2)))
+    other = Camera(11, 7, 30.0, 31.0, 2.0, 3.0)
+    rays = torch.stack((CAMERA.rays(), other.rays()))
+    together = normals_of(depths, rays)
+    for i in range(2):
+        assert torch.equal(together[i : i + 1], normals_of(depths[i : i + 1], rays[i : i + 1]))
+
+
+def test_a_narrower_result_keeps_the_digits_of_tiny_differences() -> None:
+    camera = Camera(11, 7, 1e5, 1e5, 5.0, 3.0)
+    depth = 1 + 1e-6 * (_random(camera) - 1)  # float32 depths would differ by 0 or 1.2e-7
+    exact = normals_of(depth, camera.rays()[None])
+    narrow = normals_of(depth, camera.rays()[None], torch.float32)
+    assert narrow.dtype == torch.float32
+    torch.testing.assert_close(narrow.double(), exact, rtol=0, atol=5e-7)
+
+
+def test_length_is_the_euclidean_one() -> None:
+    vectors = torch.tensor([2.0, -3.0, 6.0])[:, None, None].expand(3, 2, 2)
+    assert length(vectors).unique().item() == 7.0
+
+
+@pytest.mark.parametrize("size", [(1, 5), (5, 1)])
+def test_a_map_of_one_row_or_column_is_refused(size: tuple[int, int]) -> None:
+    with pytest.raises(ValueError, match=f"at least 2 x 2 pixels, got \\({size[0]}, {size[1]}\\)"):
+        normals_of(torch.ones(1, 1, *size), torch.ones(1, 3, *size))
+
+
+@pytest.mark.parametrize("masked", [False, True])
+def test_the_visual_loss_has_the_gradient_of_its_value(masked: bool) -> None:
+    camera = Camera(4, 3, 5.0, 6.0, 1.2, 0.9)
+    target, depth = _random(camera, 3), _random(camera, 4).requires_grad_()
+    mask = torch.ones(1, 1, 3, 4, dtype=torch.bool)
+    if masked:
+        mask[0, 0, 1, 2] = False
+    assert torch.autograd.gradcheck(lambda z: mse_v(SurfacePair(z, target, camera.rays()[None], mask)), depth)
+
+
+@pytest.mark.parametrize("where", ["mask", "target", "prediction"])
+def test_the_gradient_at_a_hole_is_zero_and_finite_everywhere(where: str) -> None:
+    camera = Camera(6, 5, 5.0, 6.0, 1.2, 0.9)
+    target, depth = _random(camera, 3), _random(camera, 4)
+    mask = torch.ones(1, 1, 5, 6, dtype=torch.bool)
+    if where == "mask":
+        mask[0, 0, 2, 3] = False
+    else:
+        (target if where == "target" else depth)[0, 0, 2, 3] = torch.nan
+    depth.requires_grad_()
+    mse_v(SurfacePair(depth, target, camera.rays()[None], mask)).sum().backward()
+    assert depth.grad is not None
+    assert bool(depth.grad.isfinite().all())
+    assert depth.grad[0, 0, 2, 3] == 0
+    assert depth.grad[0, 0, 1, 1] != 0
