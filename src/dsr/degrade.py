@@ -26,6 +26,8 @@ from dsr.sample import DepthSample, Scene
 Kernel = Literal["box", "nearest", "bilinear", "bicubic", "gaussian"]
 SCALES = (2, 4, 8, 16)
 _LEAST_WEIGHT = 0.5
+_LEAST_SIGMA = 0.1
+"""Of a gaussian, as a fraction of the scale: at x2 the nearest pixel centre is 0.25 away, and three sigmas reach it."""
 
 
 @dataclass(frozen=True)
@@ -50,14 +52,14 @@ class Downsampling:
         """Check the values."""
         if self.kernel not in get_args(Kernel):
             raise ValueError(f"downsampling: expected one of {', '.join(get_args(Kernel))}, got {self.kernel!r}")
-        if not self.sigma > 0:
-            raise ValueError(f"downsampling.sigma: expected a positive fraction of the scale, got {self.sigma}")
+        if not self.sigma >= _LEAST_SIGMA:
+            raise ValueError(f"downsampling.sigma: expected at least {_LEAST_SIGMA} (of the scale), got {self.sigma}")
 
     def camera(self, camera: Camera, scale: int) -> Camera:
         """Return the camera of the coarse map; ``nearest`` looks along other rays than the centred kernels do."""
         if self.kernel == "nearest":
             return camera.decimate(scale, scale // 2)
-        return camera.rescale(camera.width // scale, camera.height // scale)
+        return camera.coarser(scale)
 
     def __call__(self, values: Tensor, scale: int) -> Tensor:
         """Downsample maps.
@@ -156,35 +158,49 @@ def make_sample(scene: Scene, scale: int, downsampling: Downsampling | Measured,
     """
     if scale not in SCALES:
         raise ValueError(f"scale: expected one of {', '.join(map(str, SCALES))}, got {scale}")
+    scene, notes = _divisible(scene, scale)
     if isinstance(downsampling, Measured):
-        return _measured_sample(scene, scale)
+        coarse, coarse_camera = _measured(scene, scale), scene.camera.coarser(scale)
+    else:
+        coarse, coarse_camera = _downsampled(scene, scale, downsampling, downsampling.range_type or range_type)
+    return DepthSample(
+        scene.dataset, scene.name, scene.rgb, coarse, scene.camera, coarse_camera, scale, scene.depth, notes
+    )
+
+
+def _divisible(scene: Scene, scale: int) -> tuple[Scene, tuple[str, ...]]:
+    """Return the scene, cropped to a size that the scale divides, and what to say of it."""
+    camera = scene.camera
+    height, width = (size // scale * scale for size in (camera.height, camera.width))
+    before = f"{camera.height} x {camera.width}"
+    if not height or not width:
+        raise ValueError(f"{scene.name}: expected at least {scale} x {scale} pixels, got {before}")
+    if (height, width) == (camera.height, camera.width):
+        return scene, ()
+    depth = None if scene.depth is None else scene.depth[:, :height, :width]
+    measured = {scale: scene.measured[scale]} if scale in scene.measured else {}
+    if depth is None and not measured:
+        raise ValueError(f"{scene.name}: expected a measured map at x{scale}, there is none")
+    camera = camera.crop(0, 0, height, width)
+    cropped = Scene(scene.dataset, scene.name, scene.rgb[:, :height, :width], camera, depth, measured)
+    return cropped, (f"cropped from {before} to {height} x {width}, which {scale} divides",)
+
+
+def _downsampled(scene: Scene, scale: int, downsampling: Downsampling, range_type: RangeType) -> tuple[Tensor, Camera]:
+    """Return the coarse depth that the model makes of the fine one, and its camera."""
     if scene.depth is None:
         raise ValueError(f"{scene.name}: expected a fine depth map to downsample, there is none")
-    rgb, depth, camera = scene.rgb, scene.depth, scene.camera
-    notes: tuple[str, ...] = ()
-    height, width = (size // scale * scale for size in (camera.height, camera.width))
-    if not height or not width:
-        size = f"{camera.height} x {camera.width}"
-        raise ValueError(f"{scene.name}: expected at least {scale} x {scale} pixels, got {size}")
-    if (height, width) != (camera.height, camera.width):
-        notes = (f"cropped from {camera.height} x {camera.width} to {height} x {width}, which {scale} divides",)
-        rgb, depth, camera = rgb[:, :height, :width], depth[:, :height, :width], camera.crop(0, 0, height, width)
-    coarse_camera = downsampling.camera(camera, scale)
-    range_type = downsampling.range_type or range_type
-    fine = to_range(depth, camera, range_type)
+    camera = downsampling.camera(scene.camera, scale)
+    fine = to_range(scene.depth, scene.camera, range_type)
     if range_type == "disparity":  # in the coarse camera's pixels
         fine = fine / scale
-    coarse = from_range(downsampling(fine, scale), coarse_camera, range_type)
-    coarse = torch.where(coarse > 0, coarse, torch.nan)  # bicubic may undershoot beside a depth step
-    return DepthSample(scene.dataset, scene.name, rgb, coarse, camera, coarse_camera, scale, depth, notes)
+    coarse = from_range(downsampling(fine, scale), camera, range_type)
+    return torch.where(coarse > 0, coarse, torch.nan), camera  # bicubic may undershoot beside a depth step
 
 
-def _measured_sample(scene: Scene, scale: int) -> DepthSample:
-    """Return the sample of a scene with a measured coarse map."""
+def _measured(scene: Scene, scale: int) -> Tensor:
+    """Return the coarse depth that the scene brings."""
     if scale not in scene.measured:
         have = ", ".join(f"x{factor}" for factor in scene.measured) or "none"
         raise ValueError(f"{scene.name}: downsampling=measured expects a coarse map at x{scale}, the scene has {have}")
-    camera = scene.camera
-    coarse_camera = camera.rescale(camera.width // scale, camera.height // scale)
-    coarse = scene.measured[scale]
-    return DepthSample(scene.dataset, scene.name, scene.rgb, coarse, camera, coarse_camera, scale, scene.depth)
+    return scene.measured[scale]

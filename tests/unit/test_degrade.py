@@ -176,8 +176,8 @@ def test_a_wrong_model_is_refused() -> None:
         ValueError, match="downsampling: expected one of box, nearest, bilinear, bicubic, gaussian, got"
     ):
         Downsampling("lanczos")  # type: ignore[arg-type]
-    for sigma in (0.0, -1.0, math.nan):
-        with pytest.raises(ValueError, match=r"downsampling.sigma: expected a positive fraction"):
+    for sigma in (0.0, 0.09, -1.0, math.nan):
+        with pytest.raises(ValueError, match=r"downsampling.sigma: expected at least 0\.1"):
             Downsampling("gaussian", sigma)
 
 
@@ -341,3 +341,19 @@ def test_an_unknown_range_type_is_refused() -> None:
 
 def test_samples_are_depth_samples() -> None:
     assert isinstance(make_sample(_scene(_values(32, 48)), 2, Downsampling("gaussian"), "disparity"), DepthSample)
+
+
+def test_the_smallest_sigma_still_reaches_a_pixel_at_every_scale() -> None:
+    for scale in SCALES:
+        assert bool(Downsampling("gaussian", sigma=0.1)(torch.ones(1, 32, 32), scale).isfinite().all())
+
+
+def test_a_measured_map_of_a_size_that_the_scale_does_not_divide_is_that_of_the_cropped_photo() -> None:
+    camera = Camera(width=23, height=21, fx=30.0, fy=30.0, cx=11.0, cy=10.0)
+    measured = torch.full((1, 5, 5), 2.0, dtype=torch.float64)
+    scene = Scene("test", "odd", torch.rand(3, 21, 23), camera, measured={4: measured})
+    sample = make_sample(scene, 4, Measured(), "disparity")
+    assert tuple(sample.rgb.shape) == (3, 20, 20)
+    assert sample.camera == camera.crop(0, 0, 20, 20)
+    assert sample.camera_lr == camera.crop(0, 0, 20, 20).rescale(5, 5)
+    assert sample.notes == ("cropped from 21 x 23 to 20 x 20, which 4 divides",)

@@ -301,3 +301,13 @@ def test_inputs_that_do_not_fit_together_are_refused() -> None:
     for mask in (depth, depth[:1] > 0):
         with pytest.raises(ValueError, match=r"^mask: expected bool of shape \(2, 1, 4, 5\), got"):
             SurfacePair(depth, depth, rays, mask)
+
+
+@pytest.mark.parametrize("name", METRICS)
+@pytest.mark.parametrize("wrong", [0.0, -3.0])
+def test_a_depth_that_is_not_positive_is_a_hole(name: str, wrong: float) -> None:
+    maps = _maps()
+    holed, negative = maps.prediction.copy(), maps.prediction.copy()
+    holed[..., 3:9, 4:20], negative[..., 3:9, 4:20] = np.nan, wrong
+    values = [METRICS[name][0](_pair(maps._replace(prediction=prediction))) for prediction in (holed, negative)]
+    assert torch.equal(*values)

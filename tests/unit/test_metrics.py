@@ -244,3 +244,11 @@ def test_an_unknown_threshold_is_refused() -> None:
 
 def test_lower_is_better() -> None:
     assert all(metric.higher_is_better is False for metric in visual_metrics().values())
+
+
+def test_an_image_whose_prediction_leaves_nothing_to_score_makes_the_mean_nan() -> None:
+    metric = RMSEd()
+    metric.update(_pair(0))
+    target = torch.full((1, 1, 36, 40), 2.0, dtype=torch.float64)
+    metric.update(SurfacePair(-target, target, CAMERA.rays()[None]))
+    assert math.isnan(metric.compute())

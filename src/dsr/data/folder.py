@@ -89,7 +89,7 @@ def load_scene(folder: Path, dataset: str) -> Scene:
             size = (camera.width // max(factor, 1), camera.height // max(factor, 1))
             if factor < 1 or not all(size):
                 raise ValueError(f"{path}: expected a factor that the {camera.height} x {camera.width} photo allows")
-            measured[factor] = _read_depth(path, match[1], description, camera.rescale(*size))
+            measured[factor] = _read_depth(path, match[1], description, camera.coarser(factor))
     fine = _find_fine(folder)
     depth = None if fine is None else _read_depth(fine, fine.stem, description, camera, folder / "mask.png")
     if depth is None and not measured:

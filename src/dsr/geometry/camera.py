@@ -90,6 +90,11 @@ class Camera:
             doffs=self.doffs * sx,
         )
 
+    def coarser(self, factor: int) -> Camera:
+        """Return the camera of a map ``factor`` times coarser, of the part of the image that the factor divides."""
+        width, height = self.width // factor, self.height // factor
+        return self.crop(0, 0, height * factor, width * factor).rescale(width, height)
+
     def decimate(self, factor: int, offset: float) -> Camera:
         """Return the camera whose pixel (i, j) is this one's (i * factor + offset, j * factor + offset)."""
         return replace(

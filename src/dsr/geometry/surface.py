@@ -21,7 +21,7 @@ def points_of(depth: Tensor, rays: Tensor) -> Tensor:
 
 
 def normals_of(depth: Tensor, rays: Tensor, dtype: torch.dtype | None = None) -> Tensor:
-    """Return the unit normals of the surface, facing the camera (n_z < 0).
+    """Return the unit normals of the surface, facing the camera (n . r < 0).
 
     First-order forward differences along u and v, the last column's and row's differences repeated:
     n = dP/dv x dP/du, normalised (Voynov et al. 2019, section 3, with the border as its authors evaluate it).
@@ -71,7 +71,7 @@ def length(vectors: Tensor) -> Tensor:
 
 
 def normal_mask(mask: Tensor) -> Tensor:
-    """Return where a normal is known: where all the three or four pixels that its differences need are.
+    """Return where a normal is known: where the three pixels that its differences need are.
 
     Args:
         mask: (B, 1, H, W) bool, where depth is known.

@@ -33,7 +33,8 @@ class SurfacePair:
     """Two depth maps of the same pixels, and what metrics derive from them.
 
     Args:
-        prediction, target: (B, 1, H, W) orthogonal depth in metres; NaN is a hole.
+        prediction, target: (B, 1, H, W) orthogonal depth in metres; NaN is a hole, and so is a depth that is not
+            positive, which no camera sees.
         rays: (B or 1, 3, H, W) rays with z = 1, see :meth:`dsr.geometry.camera.Camera.rays`.
         mask: (B, 1, H, W) bool, the pixels to look at; None for all.
         image_dtype: of normals and renderings, None for the depth's. float32 halves the time that they take and moves
@@ -65,8 +66,10 @@ class SurfacePair:
         if mask is not None and (mask.dtype != torch.bool or mask.shape != target.shape):
             came = f"{mask.dtype} {tuple(mask.shape)}"
             raise ValueError(f"mask: expected bool of shape {tuple(target.shape)}, got {came}")
-        known = prediction.isfinite() & target.isfinite()
-        self.depth_mask = known if mask is None else known & mask
+        self.target_mask = target.isfinite() & (target > 0)
+        if mask is not None:
+            self.target_mask = self.target_mask & mask
+        self.depth_mask = self.target_mask & prediction.isfinite() & (prediction > 0)
         self.complete = bool(self.depth_mask.all())
         self.rays = rays.to(target.dtype)
         self.image_dtype = image_dtype or target.dtype

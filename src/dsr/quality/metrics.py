@@ -21,7 +21,10 @@ from dsr.quality.scores import VARIANTS, WORST, Metric, catalogue
 
 
 class PerImageMean(torchmetrics.Metric):
-    """Mean over images of one metric; an image with nothing to score is left out.
+    """Mean over images of one metric.
+
+    An image whose target has no known pixel is left out. One whose prediction leaves nothing to score is not: the mean
+    is NaN then, lest a method that fails looked better than one that does not.
 
     Args:
         metric: from :func:`dsr.quality.scores.catalogue`.
@@ -52,7 +55,7 @@ class PerImageMean(torchmetrics.Metric):
     def update(self, pair: SurfacePair) -> None:
         """Add a batch of pairs."""
         values = self._metric.variants(pair)[self._variant]
-        known = values.isfinite()
+        known = pair.target_mask.flatten(1).any(dim=1)
         self.total += torch.where(known, values, 0).sum().to(self.total)
         self.count += known.sum().to(self.count)
 

@@ -79,13 +79,13 @@ def _bumpiness_mask(pair: SurfacePair) -> Tensor:
 
 def catalogue(network: LPIPS | None = None) -> tuple[Metric, ...]:
     """Return the paper's metrics in the order of its tables; LPIPS_v only where there is a network for it."""
-    by_depth = [Metric("RMSE_d", functional.rmse_d, _depth_mask)]
+    by_depth = [Metric("RMSE_d", functional.rmse_d, _depth_mask, min_size=1)]
     for percent in (1, 5, 10):
         bad = partial(functional.bad_pix_d, threshold=percent / 100)
-        by_depth.append(Metric(f"BadPix_d_{percent}cm", bad, _depth_mask))
+        by_depth.append(Metric(f"BadPix_d_{percent}cm", bad, _depth_mask, min_size=1))
     for percent in (1, 5, 10):
         bad = partial(functional.bad_pix_d, threshold=percent / 100, relative=True)
-        by_depth.append(Metric(f"BadPix_d_{percent}pct", bad, _depth_mask))
+        by_depth.append(Metric(f"BadPix_d_{percent}pct", bad, _depth_mask, min_size=1))
     by_look = [
         Metric(f"BadPix_v_{level}", partial(functional.bad_pix_v, threshold=level), _normal_mask, per_light=True)
         for level in (1, 5, 10)
@@ -97,7 +97,7 @@ def catalogue(network: LPIPS | None = None) -> tuple[Metric, ...]:
         )
     by_look.append(Metric("RMSE_v", functional.rmse_v, _normal_mask))
     by_look.append(Metric("RMSE_v1", functional.rmse_v1, _normal_mask, per_light=True))
-    return (*by_depth, *by_look, Metric("Bumpiness_d", functional.bumpiness_d, _bumpiness_mask))
+    return (*by_depth, *by_look, Metric("Bumpiness_d", functional.bumpiness_d, _bumpiness_mask, min_size=3))
 
 
 @dataclass(frozen=True)
