@@ -307,7 +307,7 @@ USAGE_ERRORS = {
     "a type in a group": (["dataset.size=big"], "dataset.size: expected a whole number, got 'big'"),
     "a choice in a group": (["method.order=cubic"], "method.order: expected one of nearest, bilinear, bicubic, got"),
     "a range": (["dataset.size=8"], "dataset.size: expected at least 32 pixels, got 8"),
-    "sigma": (["downsampling=gaussian", "downsampling.sigma=-1"], "downsampling.sigma: expected a positive"),
+    "sigma": (["downsampling=gaussian", "downsampling.sigma=-1"], "downsampling.sigma: expected at least 0.1"),
     "a device that is not here": (["device=gpu"], "device: expected auto, cpu or a device of this machine"),
     "a device without numbers": (["device=meta"], "device: expected auto, cpu or a device of this machine"),
     "a precision": (["precision=half"], "precision: expected one of float32, bfloat16, got half"),
