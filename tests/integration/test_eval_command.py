@@ -358,7 +358,7 @@ def test_a_usage_error_of_the_real_command_is_one_line_too(tmp_path, offline):
 def test_the_help_lists_the_choices(within):
     code, output, errors = within("--help")
     assert (code, errors) == (0, [])
-    for line in ("dataset: folder, simgeo", "method: bicubic, bilinear, msg, msg_v, nearest"):
+    for line in ("dataset: folder, procedural, simgeo", "method: bicubic, bilinear, msg, msg_v, nearest"):
         assert line in output
 
 

@@ -38,7 +38,7 @@ def command(monkeypatch, tmp_path, capfd):
 
 SETTINGS = "dataset, downsampling, method, metrics, scale, weights, device, precision, seed, output_dir, overwrite"
 USAGE_ERRORS = {
-    "dataset=fodler": "dataset=fodler: unknown; expected one of folder, simgeo",
+    "dataset=fodler": "dataset=fodler: unknown; expected one of folder, procedural, simgeo",
     "method=msgv": "method=msgv: unknown; expected one of bicubic, bilinear, msg, msg_v, nearest",
     "downsampling=boxx": (
         "downsampling=boxx: unknown; expected one of bicubic, bilinear, box, gaussian, measured, nearest"

@@ -81,7 +81,7 @@ def test_a_guidance_of_another_size_is_refused() -> None:
 def test_an_unknown_scale_or_variant_is_refused() -> None:
     with pytest.raises(ValueError, match="scale: expected one of"):
         MSGNet(3)
-    with pytest.raises(ValueError, match="variant: expected one of hui, voynov, got 'caffe'"):
+    with pytest.raises(ValueError, match="variant: expected one of hui, voynov, dsr, got 'caffe'"):
         MSGNet(4, "caffe")  # type: ignore[arg-type]
 
 

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from dsr.data import simgeo
-from dsr.data.simgeo import SimGeo, cache_directory
+from dsr.data.rendering import cache_directory
+from dsr.data.simgeo import SimGeo
 from dsr.data.simgeo_scenes import SCENES, render_scene
 
 SIZE = 64

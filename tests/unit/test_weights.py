@@ -10,10 +10,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from safetensors.torch import save_file
 from torch import Tensor
 
-from dsr.methods.msg_net import MSGNet
-from dsr.methods.weights import load_msg_weights
+from dsr.methods.msg_net import MSGNet, VariantName
+from dsr.methods.weights import load_msg_weights, save_msg_weights
 
 Layer = tuple[str, str, list[Tensor]]
 
@@ -239,3 +240,85 @@ def test_missing_and_additional_caffe_layers_are_named(tmp_path: Path) -> None:
     assert "guidance.1.activation.weight is missing" in _refusal(_write(path, _caffemodel(layers[:3] + layers[4:])))
     extra: Layer = ("conv9", "Convolution", [torch.ones(1, 1, 5, 5), torch.ones(1)])
     assert "'conv9.conv.weight' is unexpected" in _refusal(_write(path, _caffemodel([*layers, extra])))
+
+
+# Ours
+
+
+@pytest.mark.parametrize(("scale", "variant"), [(2, "dsr"), (4, "dsr"), (8, "dsr"), (4, "voynov")])
+def test_our_own_file_gives_back_the_very_parameters_that_were_saved(
+    tmp_path: Path, scale: int, variant: VariantName
+) -> None:
+    net = MSGNet(scale, variant)
+    net.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # as training has it
+    save_msg_weights(tmp_path / "w.safetensors", net, "msg_v")
+    loaded = load_msg_weights(tmp_path / "w.safetensors", scale, "voynov", "msg_v")
+    assert (loaded.variant.name, loaded.scale) == (variant, scale)
+    assert list(loaded.state_dict()) == list(net.state_dict())
+    torch.testing.assert_close(dict(loaded.state_dict()), dict(net.state_dict()), rtol=0, atol=0)
+
+
+def test_the_name_of_our_own_file_does_not_matter(tmp_path: Path) -> None:
+    save_msg_weights(tmp_path / "w.pth", MSGNet(4, "dsr"), "msg_v")
+    assert load_msg_weights(tmp_path / "w.pth", 4).variant.name == "dsr"
+
+
+def _ours(path: Path, facts: dict[str, str] | None = None, tensors: dict[str, Tensor] | None = None) -> Path:
+    """Write a file like our own, with some facts other and perhaps other tensors."""
+    ours = {"format": "dsr-msg-1", "variant": "dsr", "scale": "4", "trained_as": "msg_v", **(facts or {})}
+    state = MSGNet(4, "dsr").state_dict() if tensors is None else tensors
+    save_file(dict(state), path, {key: value for key, value in ours.items() if value})
+    return path
+
+
+def test_our_weights_of_another_model_or_scale_are_refused(tmp_path: Path) -> None:
+    path = _ours(tmp_path / "w.safetensors")
+    with pytest.raises(ValueError, match=r"w.safetensors: expected weights of model msg, got those of msg_v$"):
+        load_msg_weights(path, 4, "hui", "msg")
+    with pytest.raises(ValueError, match=r"w.safetensors: weights are for scale 4, the run is at scale 8$"):
+        load_msg_weights(path, 8, "voynov", "msg_v")
+    assert "weights are for scale 4, the run is at scale 2" in _refusal(path, 2)
+
+
+def test_the_authors_weights_are_taken_whatever_the_model_of_ours_would_be(tmp_path: Path) -> None:
+    path = _save(tmp_path / "net.pth", {"model_state_dict": _author_state(MSGNet(4))})
+    assert load_msg_weights(path, 4, "voynov", "msg_v").variant.name == "voynov"
+
+
+def test_our_file_cut_off_or_changed_anywhere_is_refused(tmp_path: Path) -> None:
+    path = _ours(tmp_path / "w.safetensors")
+    whole = path.read_bytes()
+    header = 8 + int.from_bytes(whole[:8], "little")
+    for length in (9, 100, header - 1, header, header + 1000, len(whole) - 1):
+        assert "expected a safetensors file, got a damaged one" in _refusal(_write(path, whole[:length]))
+    for first in (b"\xff" * 8, (2**40).to_bytes(8, "little"), (header - 20).to_bytes(8, "little")):
+        assert "expected a safetensors file, got a damaged one" in _refusal(_write(path, first + whole[8:]))
+
+
+@pytest.mark.parametrize(
+    "facts", [{"format": "other"}, {"format": ""}, {"variant": "unet"}, {"scale": "four"}, {"scale": ""}]
+)
+def test_foreign_safetensors_are_refused(tmp_path: Path, facts: dict[str, str]) -> None:
+    message = _refusal(_ours(tmp_path / "w.safetensors", facts))
+    assert "expected weights that train.py wrote, got safetensors with the facts" in message
+
+
+def test_safetensors_without_any_facts_are_refused(tmp_path: Path) -> None:
+    save_file({"a": torch.ones(2)}, tmp_path / "w.safetensors")
+    assert "expected weights that train.py wrote" in _refusal(tmp_path / "w.safetensors")
+
+
+def test_our_file_with_a_scale_that_there_is_not_is_refused(tmp_path: Path) -> None:
+    path = _ours(tmp_path / "w.safetensors", {"scale": "3"})
+    assert "weights are for scale 3, the run is at scale 4" in _refusal(path)
+
+
+def test_our_file_with_other_tensors_is_refused(tmp_path: Path) -> None:
+    state = {**MSGNet(4, "dsr").state_dict()}
+    bias = state.pop("smooth.conv.bias")
+    assert "but smooth.conv.bias is missing" in _refusal(_ours(tmp_path / "w", tensors=state))
+    assert "but 'extra' is unexpected" in _refusal(
+        _ours(tmp_path / "w", tensors={**state, "smooth.conv.bias": bias, "extra": bias.clone()})
+    )
+    state["smooth.conv.bias"] = torch.full_like(bias, torch.nan)
+    assert "smooth.conv.bias holds values other than finite" in _refusal(_ours(tmp_path / "w", tensors=state))

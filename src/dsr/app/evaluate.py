@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import random
 import sys
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -14,13 +14,13 @@ import pandas as pd
 import torch
 from omegaconf import DictConfig
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from dsr.app import rundir
 from dsr.app.build import build, pick_device, takes
+from dsr.app.perceptual import perceptual_network
+from dsr.app.progress import over
 from dsr.app.schema import ConfigError, EvalConfig, plain_config
-from dsr.evaluation import Outcome, StalePredictionError, Study, one_line, predict, score
-from dsr.quality.lpips import LPIPS, TRUNK_URL, load_lpips
+from dsr.evaluation import Outcome, StalePredictionError, Study, predict, score
 from dsr.quality.scores import catalogue
 from dsr.report.pictures import save_picture
 from dsr.report.tables import score_table
@@ -51,19 +51,19 @@ def evaluate(config: DictConfig) -> pd.DataFrame:
     device = pick_device(settings.device)
     study, identity = _study(settings, plain, device)
     if settings.metrics.lpips and settings.metrics.lpips_trunk is not None:
-        _lpips(settings.metrics.lpips_trunk)  # a wrong one is refused before anything is written
+        perceptual_network(settings.metrics.lpips_trunk)  # a wrong one is refused before anything is written
     folder = Path(settings.output_dir or rundir.default_directory("eval", plain, identity)).expanduser()
     rundir.claim(folder, plain, identity)
     _seed(settings.seed)
     try:
-        outcome = predict(study, folder, functools.partial(_progress, console), overwrite=settings.overwrite)
+        outcome = predict(study, folder, functools.partial(over, console), overwrite=settings.overwrite)
     except StalePredictionError as error:
         raise ConfigError(str(error)) from error
-    network = _lpips(settings.metrics.lpips_trunk) if settings.metrics.lpips else None
+    network = perceptual_network(settings.metrics.lpips_trunk) if settings.metrics.lpips else None
     metrics = catalogue(None if network is None else network.to(device))
     label = str(settings.method.get("label", study.method_name))
     illustrate = functools.partial(_illustrate, folder, label)
-    scores = score(study, folder, metrics, outcome, functools.partial(_progress, console), illustrate)
+    scores = score(study, folder, metrics, outcome, functools.partial(over, console), illustrate)
     _report(console, folder, scores, label, outcome)
     if outcome.failures:
         total = len(study.source.scenes())
@@ -115,44 +115,6 @@ def _seed(seed: int) -> None:
     random.seed(seed)
     np.random.seed(seed % 2**32)  # noqa: NPY002 - the legacy generator, for libraries that use it
     torch.manual_seed(seed)
-
-
-@functools.cache
-def _lpips(trunk: str | None) -> LPIPS | None:
-    """Return the LPIPS network; without a trunk, None and one line that says what to do."""
-    try:
-        return load_lpips(None if trunk is None else Path(trunk).expanduser())
-    except OSError as error:
-        if trunk is not None:
-            raise ConfigError(str(error)) from error
-        print(  # noqa: T201
-            f"LPIPS_v is left out: AlexNet's weights {one_line(error)}; "
-            f"get {TRUNK_URL} and set metrics.lpips_trunk=FILE or $DSR_LPIPS_TRUNK",
-            file=sys.stderr,
-        )
-        return None
-    except ValueError as error:
-        raise ConfigError(f"metrics.lpips_trunk: {error}") from error
-
-
-def _progress(console: Console, items: Sequence[str], description: str) -> Iterable[str]:
-    """Show a bar with the time left while the items are worked on."""
-    columns = (
-        TextColumn("{task.description:<8}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        TextColumn("left"),
-        TimeRemainingColumn(),
-        TextColumn("{task.fields[item]}"),
-    )
-    with Progress(*columns, console=console, disable=not console.is_terminal) as progress:
-        task = progress.add_task(description, total=len(items), item="")
-        for item in items:
-            progress.update(task, item=item)
-            yield item
-            progress.advance(task)
-        progress.update(task, item="")
 
 
 def _illustrate(

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
-from typing import Any
+from dataclasses import dataclass, field, fields, is_dataclass
+from typing import Any, Self
 
 from hydra.core.config_store import ConfigStore
 from omegaconf import MISSING, DictConfig, OmegaConf
@@ -12,7 +13,7 @@ from omegaconf import MISSING, DictConfig, OmegaConf
 from dsr.degrade import SCALES
 
 PRECISIONS = ("float32", "bfloat16")
-_GROUPS = ("dataset", "downsampling", "method", "metrics")
+_GROUPS = ("dataset", "downsampling", "method", "metrics", "model", "trainer", "loss")
 
 
 class ConfigError(ValueError):
@@ -27,8 +28,40 @@ class MetricsConfig:
     lpips_trunk: str | None = None
 
 
+class Checked:
+    """A dataclass of settings that checks what it is made from."""
+
+    @classmethod
+    def of(cls, plain: Mapping[str, Any]) -> Self:
+        """Return the checked settings of a composed configuration.
+
+        Raises:
+            ConfigError: a key is unknown or missing, or a value is not one of its choices.
+
+        """
+        entries = fields(cls)  # type: ignore[arg-type]  # every subclass is a dataclass
+        names = [entry.name for entry in entries]
+        for key, value in plain.items():
+            if key not in names:
+                raise ConfigError(f"{key}: unknown key; expected {', '.join(names)}")
+            if value == MISSING or (value is None and key in _GROUPS):
+                raise ConfigError(f"{key}: missing; give it as {key}=...")
+        parts: dict[str, Any] = {entry.name: entry.default_factory for entry in entries}
+        settings = cls(**{k: parts[k](**v) if is_dataclass(parts[k]) else v for k, v in plain.items()})
+        settings.check()
+        return settings
+
+    def check(self) -> None:
+        """Check the values that a type cannot.
+
+        Raises:
+            ConfigError: a value is not one of its choices.
+
+        """
+
+
 @dataclass
-class EvalConfig:
+class EvalConfig(Checked):
     """The configuration of ``eval.py``.
 
     The groups dataset, downsampling and method are made by :func:`dsr.app.build.build`, which checks their keys
@@ -47,23 +80,58 @@ class EvalConfig:
     output_dir: str | None = None
     overwrite: bool = False
 
-    @classmethod
-    def of(cls, plain: Mapping[str, Any]) -> EvalConfig:
-        """Return the checked settings of a composed configuration.
+    def check(self) -> None:
+        """Check the values that a type cannot.
 
         Raises:
-            ConfigError: a key is unknown or missing, or a value is not one of its choices.
+            ConfigError: a value is not one of its choices.
 
         """
-        names = [entry.name for entry in fields(cls)]
-        for key, value in plain.items():
-            if key not in names:
-                raise ConfigError(f"{key}: unknown key; expected {', '.join(names)}")
-            if value == MISSING or (value is None and key in _GROUPS):
-                raise ConfigError(f"{key}: missing; give it as {key}=...")
-        settings = cls(**{**plain, "metrics": MetricsConfig(**plain["metrics"])})
-        settings.check()
-        return settings
+        _check_run(self.scale, self.precision, self.seed)
+
+
+@dataclass
+class TrainerConfig:
+    """How long and with what to train; see ``conf/trainer/``."""
+
+    name: str = "default"
+    steps: int = 4000
+    validate_every: int = 500
+    learning_rate: float = 1e-3
+    warmup: int = 100
+    weight_decay: float = 1e-4
+    clip: float = 1.0
+    patch: int = 128
+    batch: int = 16
+    validation_scenes: int = 4
+    flip: bool = True
+    colour: float = 0.1
+    workers: int = 0
+
+
+@dataclass
+class LossConfig:
+    """Weight of MSE_v beside the depth loss, for a model with a visual loss."""
+
+    w: Any = "auto"
+
+
+@dataclass
+class TrainConfig(Checked):
+    """The configuration of ``train.py``; groups as in :class:`EvalConfig`."""
+
+    dataset: dict[str, Any] = MISSING
+    downsampling: dict[str, Any] = MISSING
+    model: dict[str, Any] = MISSING
+    trainer: TrainerConfig = field(default_factory=TrainerConfig)
+    metrics: MetricsConfig = field(default_factory=MetricsConfig)
+    loss: LossConfig = field(default_factory=LossConfig)
+    scale: int = 4
+    device: str = "auto"
+    precision: str = "float32"
+    seed: int = 0
+    output_dir: str | None = None
+    overwrite: bool = False
 
     def check(self) -> None:
         """Check the values that a type cannot.
@@ -72,12 +140,23 @@ class EvalConfig:
             ConfigError: a value is not one of its choices.
 
         """
-        if self.scale not in SCALES:
-            raise ConfigError(f"scale: expected one of {', '.join(map(str, SCALES))}, got {self.scale}")
-        if self.precision not in PRECISIONS:
-            raise ConfigError(f"precision: expected one of {', '.join(PRECISIONS)}, got {self.precision}")
-        if self.seed < 0:
-            raise ConfigError(f"seed: expected 0 or a positive number, got {self.seed}")
+        _check_run(self.scale, self.precision, self.seed)
+        w = self.loss.w
+        if w != "auto" and (isinstance(w, bool) or not isinstance(w, (int, float)) or not 0 <= w < math.inf):
+            raise ConfigError(f"loss.w: expected auto or a number, 0 or more, got {w!r}")
+        for name in ("steps", "validate_every", "learning_rate", "clip"):
+            if not getattr(self.trainer, name) > 0:
+                raise ConfigError(f"trainer.{name}: expected a positive number, got {getattr(self.trainer, name)}")
+
+
+def _check_run(scale: int, precision: str, seed: int) -> None:
+    """Check what all commands have."""
+    if scale not in SCALES:
+        raise ConfigError(f"scale: expected one of {', '.join(map(str, SCALES))}, got {scale}")
+    if precision not in PRECISIONS:
+        raise ConfigError(f"precision: expected one of {', '.join(PRECISIONS)}, got {precision}")
+    if seed < 0:
+        raise ConfigError(f"seed: expected 0 or a positive number, got {seed}")
 
 
 def plain_config(config: DictConfig) -> dict[str, Any]:
@@ -88,3 +167,4 @@ def plain_config(config: DictConfig) -> dict[str, Any]:
 def register() -> None:
     """Tell Hydra of the schemas."""
     ConfigStore.instance().store(name="eval_schema", node=EvalConfig)
+    ConfigStore.instance().store(name="train_schema", node=TrainConfig)

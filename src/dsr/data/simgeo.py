@@ -7,21 +7,13 @@ the layout of :mod:`dsr.data.folder`. Renderings are kept in a cache: $DSR_CACHE
 
 from __future__ import annotations
 
-import contextlib
-import json
-import os
 from collections.abc import Sequence
-from dataclasses import asdict
 from pathlib import Path
 
-import numpy as np
-import torch
-
-from dsr.atomic import read_arrays, replacing
 from dsr.data.base import chosen
 from dsr.data.folder import Folder
-from dsr.data.simgeo_scenes import SCENES, SCENES_VERSION, Rendering, render_scene
-from dsr.geometry.camera import Camera
+from dsr.data.rendering import cached
+from dsr.data.simgeo_scenes import SCENES, SCENES_VERSION, render_scene
 from dsr.sample import Scene
 
 
@@ -59,32 +51,11 @@ class SimGeo:
         """Return one scene; see :class:`dsr.data.base.SceneSource`."""
         if scene == "lucy" and self._lucy is not None:
             return self._lucy.load(scene)
-        rendering = _cached(scene, self._size)
-        rgb = torch.from_numpy(rendering.rgb).permute(2, 0, 1).float() / 255
-        return Scene(self.name, scene, rgb, rendering.camera, torch.from_numpy(rendering.depth)[None])
+        path = Path(f"simgeo-v{SCENES_VERSION}-{self._size}", f"{scene}.npz")
+        return cached(path, lambda: render_scene(scene, self._size)).scene(self.name, scene)
 
     def fingerprint(self, scene: str) -> str:
         """Return the version of the renderings, or the SHA-256 of Lucy's files."""
         if scene == "lucy" and self._lucy is not None:
             return self._lucy.fingerprint(scene)
         return f"simgeo-v{SCENES_VERSION}-{self._size}"
-
-
-def _cached(scene: str, size: int) -> Rendering:
-    """Return a rendering from the cache, or make it and try to keep it."""
-    path = cache_directory() / f"simgeo-v{SCENES_VERSION}-{size}" / f"{scene}.npz"
-    with contextlib.suppress(OSError, ValueError, KeyError, TypeError):  # missing, damaged, without a key, a wrong one
-        kept = read_arrays(path)
-        return Rendering(kept["rgb"], kept["depth"], Camera(**json.loads(str(kept["camera"]))))
-    rendering = render_scene(scene, size)
-    with contextlib.suppress(OSError), replacing(path) as temporary:  # no room or no right to write: render again
-        camera = json.dumps(asdict(rendering.camera))
-        np.savez_compressed(temporary, rgb=rendering.rgb, depth=rendering.depth, camera=camera)
-    return rendering
-
-
-def cache_directory() -> Path:
-    """Return where things that can be made again are kept."""
-    if "DSR_CACHE" in os.environ:
-        return Path(os.environ["DSR_CACHE"]).expanduser()
-    return Path(os.environ.get("XDG_CACHE_HOME", "~/.cache")).expanduser() / "dsr"

@@ -6,14 +6,13 @@ with different textures tells whether a method mistakes texture for shape. The s
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dsr.data.implicit import Implicit
 from dsr.data.raycast import Body, World, area_light, render
+from dsr.data.rendering import Rendering
 from dsr.data.simgeo_statue import statue_distance
 from dsr.data.surfaces import Array, Box, Cylinder, Field, Plane, Sphere, rotation
 from dsr.data.textures import CLOUD, DUSK, blobs, marble, mosaic, noise, plain, unrolled, weave
@@ -34,22 +33,6 @@ FOCAL = 618.0386 / 512
 WALL_Z = 3.95
 STATUE_BASE = (0.0, 1.09, 3.02)
 """Camera coordinates of the point of the floor, in metres, that the statue stands on."""
-
-
-@dataclass(frozen=True)
-class Rendering:
-    """A photo with its exact depth.
-
-    Args:
-        rgb: (H, W, 3) uint8.
-        depth: (H, W) float64 distance to the image plane in metres.
-        camera: the camera of both.
-
-    """
-
-    rgb: NDArray[np.uint8]
-    depth: NDArray[np.float64]
-    camera: Camera
 
 
 def render_scene(name: str, size: int = 512) -> Rendering:

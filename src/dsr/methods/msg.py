@@ -63,6 +63,7 @@ def build_msg(
     variant: VariantName,
     precision: Precision = "float32",
     device: torch.device | str = "cpu",
+    trained_as: str | None = None,
 ) -> MSG:
     """Return the method with the weights of a file; see :func:`~dsr.methods.weights.load_msg_weights`."""
-    return MSG(load_msg_weights(weights, scale, variant), precision, device)
+    return MSG(load_msg_weights(weights, scale, variant, trained_as), precision, device)

@@ -1,7 +1,8 @@
 """MSG-Net, the multi-scale guided depth super-resolution network, and what goes in and comes out of it.
 
 Hui, Loy, Tang, *Depth Map Super-Resolution by Deep Multi-Scale Guidance*, ECCV 2016 (variant ``hui``), and the version
-that Voynov et al., *Perceptual Deep Depth Super-Resolution*, ICCV 2019, trained for renderings (variant ``voynov``).
+that Voynov et al., *Perceptual Deep Depth Super-Resolution*, ICCV 2019, trained for renderings (variant ``voynov``);
+``dsr`` is the latter as this project trains it.
 
 The network refines what is left of the normalised low-resolution disparity once its 3 x 3 mean is taken away, guided by
 a normalised intensity image; the mean itself is upsampled bicubically and added back. Everything here is plain torch:
@@ -18,14 +19,14 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-VariantName = Literal["hui", "voynov"]
+VariantName = Literal["hui", "voynov", "dsr"]
 SCALES = (2, 4, 8, 16)
 FEATURES = 32
 
 
 @dataclass(frozen=True)
 class MSGVariant:
-    """What tells the two published networks and their inputs apart.
+    """What tells the published networks and ours, and their inputs, apart.
 
     Args:
         name: the variant's name.
@@ -53,6 +54,8 @@ VARIANTS = MappingProxyType(
         "hui": MSGVariant("hui", False, False, False, (65.481 / 255, 128.553 / 255, 24.966 / 255), 16.0, False),
         # The released code takes YCbCr's inverse for its forward transform; the weights were trained on this image.
         "voynov": MSGVariant("voynov", True, True, True, (1.0, -0.34414, -0.71414), 128 * (0.34414 + 0.71414), True),
+        # What dsr trains: the graph of voynov, guided by real luma, without a constant to take off afterwards.
+        "dsr": MSGVariant("dsr", True, True, True, (0.299, 0.587, 0.114), 0.0, False),
     }
 )
 
@@ -93,7 +96,7 @@ class MSGNet(nn.Module):
 
     Args:
         scale: upsampling factor, 2, 4, 8 or 16; log2(scale) levels.
-        variant: ``hui`` or ``voynov``.
+        variant: ``hui``, ``voynov`` or ``dsr``.
 
     """
 

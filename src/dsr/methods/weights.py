@@ -1,4 +1,4 @@
-"""Readers of the published MSG-Net weights, straight from their authors' files.
+"""Readers of MSG-Net weights: the published ones, straight from their authors' files, and our own.
 
 ``.pth`` (Voynov et al. 2019) is read by torch's own unpickler for plain tensors, ``.caffemodel`` (Hui et al. 2016) by a
 reader of the protobuf wire format (protobuf.dev/programming-guides/encoding). Neither ever runs code that a file holds,
@@ -14,11 +14,14 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+import safetensors
+import safetensors.torch
 import torch
 from torch import Tensor
 
-from dsr.methods.msg_net import SCALES, MSGNet, VariantName
+from dsr.methods.msg_net import SCALES, VARIANTS, MSGNet, VariantName
 
+OUR_FORMAT = "dsr-msg-1"
 TORCH_MAGIC = (b"PK\x03\x04", b"\x80")
 PARTS = ("conv.weight", "conv.bias", "activation.weight")
 VARINT, BYTES = 0, 2
@@ -32,15 +35,20 @@ class MSGWeights(NamedTuple):
     variant: VariantName
     scale: int
     tensors: dict[str, Tensor]
+    trained_as: str | None = None
+    """The model that our own training made, ``msg`` or ``msg_v``; None for the authors' files."""
 
 
-def load_msg_weights(path: Path, scale: int, variant: VariantName | None = None) -> MSGNet:
-    """Return the network with the weights of one of the authors' files, float32, on the CPU.
+def load_msg_weights(
+    path: Path, scale: int, variant: VariantName | None = None, trained_as: str | None = None
+) -> MSGNet:
+    """Return the network with the weights of one of the authors' files or of our training, float32, on the CPU.
 
     Args:
-        path: a ``.pth`` of Voynov et al. or a ``.caffemodel`` of Hui et al.; the content tells which.
+        path: a ``.pth`` of Voynov et al., a ``.caffemodel`` of Hui et al. or our ``.safetensors``; the content tells.
         scale: the scale that the run needs.
-        variant: the variant that the run needs, None for the file's.
+        variant: the variant that the run needs of the authors' files, None for any.
+        trained_as: the model that the run needs of our own files, None for any.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -49,7 +57,10 @@ def load_msg_weights(path: Path, scale: int, variant: VariantName | None = None)
     """
     path = Path(path)
     weights = read_msg_weights(path)
-    if variant is not None and weights.variant != variant:
+    if weights.trained_as is not None:
+        if trained_as is not None and weights.trained_as != trained_as:
+            raise ValueError(f"{path}: expected weights of model {trained_as}, got those of {weights.trained_as}")
+    elif variant is not None and weights.variant != variant:
         raise ValueError(f"{path}: expected weights of variant {variant}, got those of variant {weights.variant}")
     if weights.scale != scale:
         raise ValueError(f"{path}: weights are for scale {weights.scale}, the run is at scale {scale}")
@@ -68,7 +79,22 @@ def read_msg_weights(path: Path) -> MSGWeights:
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such weights file")
     data = path.read_bytes()
+    if data[8:9] == b"{":
+        return _from_ours(path, data)
     return _from_torch(path) if data.startswith(TORCH_MAGIC) else _from_caffe(path, data)
+
+
+def save_msg_weights(path: Path, net: MSGNet, trained_as: str) -> None:
+    """Write a network's weights as ``.safetensors``, with the few facts that rebuild it.
+
+    Args:
+        path: the file; written as it is, wrap it for atomicity.
+        net: the network.
+        trained_as: the model's name, ``msg`` or ``msg_v``.
+
+    """
+    facts = {"format": OUR_FORMAT, "variant": net.variant.name, "scale": str(net.scale), "trained_as": trained_as}
+    safetensors.torch.save_file({k: v.detach().cpu().contiguous() for k, v in net.state_dict().items()}, path, facts)
 
 
 def _misfits(tensors: dict[str, Tensor], shapes: dict[str, tuple[int, ...]]) -> list[str]:
@@ -81,6 +107,27 @@ def _misfits(tensors: dict[str, Tensor], shapes: dict[str, tuple[int, ...]]) -> 
         elif not value.is_floating_point() or not bool(value.isfinite().all()):
             problems.append(f"{name} holds values other than finite real numbers")
     return problems
+
+
+# Ours: safetensors with a few facts
+
+
+def _from_ours(path: Path, data: bytes) -> MSGWeights:
+    """Read a file of :func:`save_msg_weights`."""
+    try:
+        with safetensors.safe_open(path, framework="pt") as file:
+            facts = file.metadata() or {}
+        tensors = safetensors.torch.load(data)
+    except Exception as error:  # the library names no set of errors for damaged files
+        raise ValueError(f"{path}: expected a safetensors file, got a damaged one ({type(error).__name__})") from error
+    if (
+        facts.get("format") != OUR_FORMAT
+        or facts.get("variant") not in VARIANTS
+        or not facts.get("scale", "").isdigit()
+    ):
+        raise ValueError(f"{path}: expected weights that train.py wrote, got safetensors with the facts {facts}")
+    variant: VariantName = facts["variant"]
+    return MSGWeights(variant, int(facts["scale"]), tensors, facts.get("trained_as", ""))
 
 
 # Voynov et al.: a torch file

@@ -1,0 +1,78 @@
+"""Progress bars with the time left, on a terminal; nothing elsewhere."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+import lightning
+from lightning.pytorch.callbacks import ProgressBar
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+
+def bar(console: Console) -> Progress:
+    """Return a bar of a name, how much of how much, the time passed and left, and a remark."""
+    columns = (
+        TextColumn("{task.description:<8}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TextColumn("left"),
+        TimeRemainingColumn(elapsed_when_finished=False),
+        TextColumn("{task.fields[remark]}", markup=False),
+    )
+    return Progress(*columns, console=console, disable=not console.is_terminal)
+
+
+def over(console: Console, items: Iterable[str], description: str, total: int | None = None) -> Iterable[str]:
+    """Yield the items, ``total`` of them; the bar names the one at hand."""
+    if total is None:
+        items = list(items)
+        total = len(items)
+    with bar(console) as progress:
+        task = progress.add_task(description, total=total, remark="")
+        for item in items:
+            progress.update(task, remark=item)
+            yield item
+            progress.advance(task)
+        progress.update(task, remark="")
+
+
+class TrainingBar(ProgressBar):
+    """Steps of a whole training with the latest loss; off a terminal, a line per validation pass."""
+
+    def __init__(self, console: Console) -> None:
+        super().__init__()
+        self._console, self._bar = console, bar(console)
+        self._task: Any = None
+
+    def on_train_start(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
+        """Begin at the step that the training begins with."""
+        self._task = self._bar.add_task("train", total=trainer.max_steps, completed=trainer.global_step, remark="")
+        self._bar.start()
+
+    def on_train_batch_end(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule, *_: Any) -> None:
+        """Move on by a step."""
+        loss = trainer.callback_metrics.get("train/loss")
+        remark = "" if loss is None else f"loss {float(loss):.4f}"
+        self._bar.update(self._task, completed=trainer.global_step, remark=remark)
+
+    def on_validation_end(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
+        """Print the scores of the pass."""
+        names = ("RMSE_d", "RMSE_v", "DSSIM_v", "LPIPS_v")
+        scores = {name: trainer.callback_metrics.get(f"val/{name}") for name in names}
+        text = "  ".join(f"{name} {float(value):.4f}" for name, value in scores.items() if value is not None)
+        self._bar.console.print(f"step {trainer.global_step:>6}  validation: {text}", highlight=False)
+
+    def on_train_end(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
+        """Leave the bar as it is."""
+        self._bar.stop()
+
+    def on_exception(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule, _: BaseException) -> None:
+        """Give the terminal back."""
+        self._bar.stop()
+
+    def disable(self) -> None:
+        """Show nothing."""
+        self._bar.disable = True

@@ -1,0 +1,177 @@
+"""From a scene to a photo: visibility, shading, antialiasing, and what a camera adds."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter, maximum_filter, minimum_filter
+
+from dsr.data.procedural.lighting import SETS, Lighting, arriving, visibility
+from dsr.data.procedural.paints import Paint
+from dsr.data.procedural.shape import Shape
+from dsr.data.procedural.tracer import Hits, Tracer
+from dsr.data.surfaces import Array
+
+_CHUNK = 1 << 15
+_SUBPIXELS = ((-0.375, -0.125), (0.125, -0.375), (0.375, 0.125), (-0.125, 0.375))
+_MOST_ROUGH = 0.45  # share of the pixels that are cast again at most
+
+
+@dataclass(frozen=True, eq=False)
+class Body:
+    """A shape with its paint, and the strength and sharpness of its highlights."""
+
+    shape: Shape
+    paint: Paint
+    gloss: float = 0.0
+    shine: float = 20.0
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """Where rays start, (3,), and the rays (3, H, W), of length 1 along the view, with their steps (3,) per pixel."""
+
+    eye: Array
+    rays: Array
+    right: Array
+    down: Array
+
+
+def radiance(tracer: Tracer, bodies: Sequence[Body], view: View, lighting: Lighting) -> tuple[Array, Array]:
+    """Return the linear RGB (3, H, W) and the depth (H, W) of a view."""
+    shape = view.rays.shape[1:]
+    rays = view.rays.reshape(3, -1)
+    parts = [tracer.hits(view.eye, rays[:, i : i + _CHUNK]) for i in range(0, rays.shape[1], _CHUNK)]
+    hits = _joined(parts)
+    extent = float(np.median(hits.depth))
+    which = _pattern(shape)
+    pieces = [
+        visibility(tracer, lighting, part, which[i * _CHUNK :][: len(part.depth)], extent)
+        for i, part in enumerate(parts)
+    ]
+    seen = _smoothed(np.stack([np.concatenate(p) for p in zip(*pieces, strict=True)]), hits, shape)
+    colour = shade(bodies, hits, lighting, view.eye, seen)
+    display = np.clip(colour / (2.5 * np.median(colour) + 1e-9), 0, 1) ** (1 / 2.2)
+    contrast = _contrast(display.reshape(3, *shape))
+    limit = max(0.04, float(np.quantile(contrast, 1 - _MOST_ROUGH)))
+    rough = np.flatnonzero(contrast > limit)
+    for start in range(0, rough.size, _CHUNK):
+        pixels = rough[start : start + _CHUNK]
+        colour[:, pixels] = _refined(tracer, bodies, view, lighting, hits, seen, pixels)
+    return colour.reshape(3, *shape), hits.depth.reshape(shape)
+
+
+def _joined(parts: Sequence[Hits]) -> Hits:
+    """Return several parts as one."""
+    names = Hits.__dataclass_fields__
+    return Hits(**{name: np.concatenate([getattr(part, name) for part in parts], axis=-1) for name in names})
+
+
+def _pattern(shape: tuple[int, ...]) -> NDArray[np.intp]:
+    """Return the set of light samples (H * W,) of each pixel: all of them in each 4 x 4 window."""
+    v, u = np.indices(shape)
+    return np.asarray((u % 4 + 4 * (v % 4)) * 7 % SETS).ravel()
+
+
+def _smoothed(seen: Array, hits: Hits, shape: tuple[int, ...]) -> Array:
+    """Return what is seen (2, N) averaged over 4 x 4 pixels of the same surface."""
+    height, width = shape
+    values = seen.reshape(2, height, width).astype(np.float32)
+    normals = hits.normals.reshape(3, height, width).astype(np.float32)
+    inverse = (1 / hits.depth).reshape(height, width).astype(np.float32)
+    slopes = [np.abs(np.gradient(inverse, axis=axis)) for axis in (0, 1)]
+    slack = 1e-3 * inverse + 1.5 * np.maximum(*[np.minimum(s, np.roll(s, 1, a)) for a, s in enumerate(slopes)])
+    total, weight = np.zeros_like(values), np.zeros((height, width), np.float32)
+    for dv in range(-2, 2):
+        for du in range(-2, 2):
+            a, b = _overlap(height, dv), _overlap(width, du)
+            here, there = (a[0], b[0]), (a[1], b[1])
+            alike = np.einsum("ihw,ihw->hw", normals[:, *here], normals[:, *there]) > 0.9
+            near = np.abs(inverse[here] - inverse[there]) < (abs(du) + abs(dv) + 0.5) * slack[here]
+            w = (alike & near).astype(np.float32)
+            total[:, *here] += w * values[:, *there]
+            weight[here] += w
+    return np.asarray(total / weight, dtype=np.float64).reshape(2, -1)
+
+
+def _overlap(count: int, step: int) -> tuple[slice, slice]:
+    """Return the slices of those that have a neighbour ``step`` further, and of the neighbours."""
+    here = slice(max(0, -step), count - max(0, step))
+    return here, slice(here.start + step, here.stop + step)
+
+
+def shade(bodies: Sequence[Body], hits: Hits, lighting: Lighting, eye: Array, seen: Array) -> Array:
+    """Return the linear RGB (3, N) that comes from the hits, given the visibilities (2, N)."""
+    light, direct = arriving(lighting, hits.points, hits.normals, (seen[0], seen[1]))
+    half = _unit(_unit(lighting.lamp.mean((0, 1))[:, None] - hits.points) + _unit(eye[:, None] - hits.points))
+    mirror = np.maximum((half * hits.normals).sum(0), 0.0)
+    out = np.empty_like(light)
+    order = np.argsort(hits.body, kind="stable")
+    ends = np.searchsorted(hits.body[order], np.arange(len(bodies) + 1))
+    for number, body in enumerate(bodies):
+        mine = order[ends[number] : ends[number + 1]]
+        if mine.size:
+            out[:, mine] = light[:, mine] * body.paint(hits.rest[:, mine], hits.chart[:, mine])
+            if body.gloss:
+                shine = body.gloss * direct[mine] * mirror[mine] ** body.shine
+                out[:, mine] += shine * lighting.colour[:, None]
+    return out
+
+
+def _unit(vectors: Array) -> Array:
+    return vectors / np.sqrt((vectors**2).sum(0))
+
+
+def _refined(
+    tracer: Tracer,
+    bodies: Sequence[Body],
+    view: View,
+    lighting: Lighting,
+    hits: Hits,
+    seen: Array,
+    pixels: NDArray[np.intp],
+) -> Array:
+    """Return the mean linear RGB (3, N) of four rays within each of ``pixels``, with the visibility of a neighbour."""
+    total = np.zeros((3, pixels.size))
+    height, width = view.rays.shape[1:]
+    row, column = np.divmod(pixels, width)
+    rays = view.rays.reshape(3, -1)[:, pixels]
+    for du, dv in _SUBPIXELS:
+        fine = tracer.hits(view.eye, rays + du * view.right[:, None] + dv * view.down[:, None])
+        best, nearest = pixels, np.full(pixels.size, np.inf)
+        for i, j in ((0, 0), (0, 1), (1, 0), (1, 1)):
+            v = np.clip(row + i * int(np.sign(dv)), 0, height - 1)
+            u = np.clip(column + j * int(np.sign(du)), 0, width - 1)
+            other = v * width + u
+            away = np.abs(hits.depth[other] - fine.depth) + 1e3 * (hits.body[other] != fine.body)
+            best, nearest = np.where(away < nearest, other, best), np.minimum(away, nearest)
+        total += shade(bodies, fine, lighting, view.eye, seen[:, best])
+    return total / len(_SUBPIXELS)
+
+
+def _contrast(image: Array) -> Array:
+    """Return the largest difference within 3 x 3 pixels over the channels of (3, H, W), shape (H * W,)."""
+    size = (1, 3, 3)
+    grey = image.astype(np.float32)
+    difference = maximum_filter(grey, size, mode="nearest") - minimum_filter(grey, size, mode="nearest")
+    return np.asarray(difference.max(0).ravel(), dtype=np.float64)
+
+
+def developed(linear: Array, rng: np.random.Generator) -> NDArray[np.uint8]:
+    """Return the photo (H, W, 3) of linear RGB (3, H, W): exposure, white balance, lens, noise, tone curve."""
+    height, width = linear.shape[1:]
+    light, gamma = np.quantile(linear.max(0), rng.uniform(0.85, 0.98)), rng.uniform(1.9, 2.4)
+    image = linear * (rng.uniform(0.5, 1.0) / max(float(light), 1e-9))
+    image = image * np.exp(rng.normal(0, 0.06, (3, 1, 1)))
+    blur = rng.uniform(0.2, 0.6)
+    image = gaussian_filter(image, (0, blur, blur))
+    v, u = np.indices((height, width), dtype=np.float32) / max(height, width) - 0.5
+    image = image * (1 - rng.uniform(0, 0.7) * (u * u + v * v))
+    noise = rng.uniform(0.0, 0.012) ** 1.2
+    image = image + noise * np.sqrt(np.maximum(image, 0) + 0.01) * rng.standard_normal(image.shape, dtype=np.float32)
+    image = np.where(image > 0.8, 0.8 + 0.2 * np.tanh((image - 0.8) / 0.2), image)  # a shoulder
+    encoded = np.clip(image, 0, 1) ** (1 / gamma)
+    return np.ascontiguousarray(np.rint(255 * encoded).astype(np.uint8).transpose(1, 2, 0))

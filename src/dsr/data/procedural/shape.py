@@ -1,0 +1,225 @@
+"""Triangle meshes with what the renderer needs at every vertex, and the general ways to make them.
+
+A shape stands for the curved surface that its vertex normals suggest (see :mod:`dsr.data.procedural.tracer`), so edges
+that are to stay sharp have their vertices twice. Local frames have z up; lengths are in metres.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import mapbox_earcut
+import numpy as np
+from numpy.typing import NDArray
+
+from dsr.data.surfaces import Array
+
+Index = NDArray[np.intp]
+
+
+@dataclass(frozen=True, eq=False)
+class Shape:
+    """A mesh of V vertices and F triangles.
+
+    Args:
+        vertices: (V, 3) in metres.
+        faces: (F, 3) numbers of vertices; the sense does not matter.
+        normals: (V, 3) unit normals; either side.
+        chart: (V, 3) surface coordinates for paint: two in metres, and a tone in [0, 1] such as the relief's height.
+        rest: (V, 3) where the vertex was in the shape's own frame, for solid paint.
+
+    """
+
+    vertices: Array
+    faces: Index
+    normals: Array
+    chart: Array
+    rest: Array
+
+    def moved(self, shift: Sequence[float] | Array) -> Shape:
+        """Return the shape moved by ``shift`` (3,)."""
+        return replace(self, vertices=self.vertices + np.asarray(shift, dtype=np.float64))
+
+    def turned(self, turn: Array) -> Shape:
+        """Return the shape turned about the origin by the rotation ``turn`` (3, 3)."""
+        return replace(self, vertices=self.vertices @ turn.T, normals=self.normals @ turn.T)
+
+    def stretched(self, factors: Sequence[float] | float) -> Shape:
+        """Return the shape stretched along its axes, paint and all staying metric."""
+        by = np.broadcast_to(np.asarray(factors, dtype=np.float64), (3,))
+        chart = self.chart * [by.prod() ** (1 / 3), by.prod() ** (1 / 3), 1.0]
+        return Shape(self.vertices * by, self.faces, unit(self.normals / by), chart, self.rest * by)
+
+
+def unit(vectors: Array) -> Array:
+    """Return ``vectors`` (..., 3) at length 1; zero becomes (0, 0, 1)."""
+    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    return np.where(length > 1e-300, vectors / np.maximum(length, 1e-300), [0.0, 0.0, 1.0])
+
+
+def about(axis: int, degrees: float) -> Array:
+    """Return the rotation (3, 3) about the coordinate axis ``axis``."""
+    i, j = ((1, 2), (2, 0), (0, 1))[axis]
+    turn, angle = np.eye(3), np.deg2rad(degrees)
+    turn[[i, i, j, j], [i, j, i, j]] = np.cos(angle), -np.sin(angle), np.sin(angle), np.cos(angle)
+    return turn
+
+
+def any_turn(rng: np.random.Generator) -> Array:
+    """Return a random rotation (3, 3), uniform over all."""
+    q = unit(rng.normal(size=(1, 3)))[0]
+    spin = about(2, rng.uniform(0, 360))
+    other = unit(np.cross(q, [0.3, 0.5, 0.81])[None])[0]
+    return np.asarray(np.stack((other, np.cross(q, other), q), axis=1) @ spin)
+
+
+def merged(shapes: Sequence[Shape]) -> Shape:
+    """Return several shapes as one."""
+    starts = np.cumsum([0, *(len(s.vertices) for s in shapes[:-1])])
+    faces = np.concatenate([s.faces + start for s, start in zip(shapes, starts, strict=True)])
+    rest = [np.concatenate([getattr(s, name) for s in shapes]) for name in ("vertices", "normals", "chart", "rest")]
+    return Shape(rest[0], faces, *rest[1:])
+
+
+def surface(points: Array, normals: Array | None = None, tone: Array | None = None) -> Shape:
+    """Return the surface through a grid of points.
+
+    Args:
+        points: (R, C, 3); the last column may repeat the first, which makes it closed.
+        normals: (R, C, 3); None to take them from the grid.
+        tone: (R, C) the chart's third coordinate; None for 0.
+
+    """
+    rows, columns = points.shape[:2]
+    if normals is None:
+        normals = _grid_normals(points)
+    corner = np.arange(rows * columns).reshape(rows, columns)
+    a, b, c, d = (corner[i].ravel() for i in _QUADS)
+    shorter = _square(points, a, d) < _square(points, b, c)
+    first = np.where(shorter[:, None], np.stack((a, b, d), 1), np.stack((a, b, c), 1))
+    second = np.where(shorter[:, None], np.stack((a, d, c), 1), np.stack((b, d, c), 1))
+    chart = np.zeros(points.shape)
+    chart[:, 1:, 0] = np.cumsum(np.linalg.norm(np.diff(points, axis=1), axis=2).mean(0))
+    chart[1:, :, 1] = np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=2).mean(1))[:, None]
+    if tone is not None:
+        chart[..., 2] = tone
+    flat = points.reshape(-1, 3)
+    return Shape(flat, np.concatenate((first, second)), unit(normals.reshape(-1, 3)), chart.reshape(-1, 3), flat)
+
+
+_QUADS = (np.s_[:-1, :-1], np.s_[:-1, 1:], np.s_[1:, :-1], np.s_[1:, 1:])
+
+
+def _square(points: Array, i: Index, j: Index) -> Array:
+    """Return the squared lengths of the edges from vertices ``i`` to ``j``."""
+    flat = points.reshape(-1, 3)
+    return np.asarray(((flat[i] - flat[j]) ** 2).sum(1))
+
+
+def _grid_normals(points: Array) -> Array:
+    """Return the normals (R, C, 3) by central differences, across the seam where the grid is closed."""
+    along = np.gradient(points, axis=0)
+    around = np.gradient(points, axis=1)
+    if np.allclose(points[:, 0], points[:, -1], atol=1e-9):
+        around[:, 0] = around[:, -1] = (points[:, 1] - points[:, -2]) / 2
+    return np.cross(around, along)
+
+
+def lathe(sections: Sequence[Array], segments: int = 80) -> Shape:
+    """Return the profile ``sections`` turned about the z axis.
+
+    Args:
+        sections: each (K, 2): radius and height along a smooth piece; the profile is sharp between two pieces.
+        segments: steps around.
+
+    """
+    angle = np.linspace(0, 2 * np.pi, segments + 1)
+    circle = np.stack((np.cos(angle), np.sin(angle)), axis=1)
+    parts = []
+    for section in sections:
+        tangent = np.gradient(section, axis=0) if len(section) > 2 else np.repeat(np.diff(section, axis=0), 2, axis=0)
+        points = np.concatenate((section[:, :1, None] * circle, np.zeros((len(section), len(angle), 1))), axis=2)
+        points[..., 2] = section[:, 1:]
+        normals = np.concatenate((tangent[:, 1:, None] * circle, np.zeros((len(section), len(angle), 1))), axis=2)
+        normals[..., 2] = -tangent[:, :1]
+        parts.append(surface(points, normals))
+    return merged(parts)
+
+
+def extrusion(outlines: Sequence[Array], height: float, crease: float = 32.0) -> Shape:
+    """Return a prism from z = 0 to ``height``.
+
+    Args:
+        outlines: (K, 2) closed polygons: the outer one, then holes.
+        height: in metres.
+        crease: degrees; flatter corners of the outline are rounded off in the normals.
+
+    """
+    sides = [_side(outline, height, crease) for outline in outlines]
+    flat = np.concatenate(outlines)
+    ends = np.cumsum([len(o) for o in outlines]).astype(np.uint32)
+    faces = mapbox_earcut.triangulate_float64(np.ascontiguousarray(flat), ends).reshape(-1, 3).astype(np.intp)
+    caps = []
+    for z in (0.0, height):
+        points = np.column_stack((flat, np.full(len(flat), z)))
+        normals = np.broadcast_to([0.0, 0.0, 1.0], points.shape)
+        caps.append(Shape(points, faces, normals, np.column_stack((flat, 0 * flat[:, 0])), points))
+    return merged([*sides, *caps])
+
+
+def _side(outline: Array, height: float, crease: float) -> Shape:
+    """Return the wall over a closed outline (K, 2)."""
+    after = np.roll(outline, -1, axis=0)
+    edge = after - outline
+    normal = unit(np.column_stack((edge[:, 1], -edge[:, 0], 0 * edge[:, 0])))
+    smooth = (normal * np.roll(normal, 1, axis=0)).sum(1) > np.cos(np.deg2rad(crease))
+    start = np.where(smooth[:, None], unit(normal + np.roll(normal, 1, axis=0)), normal)
+    end = np.where(np.roll(smooth, -1)[:, None], unit(normal + np.roll(normal, -1, axis=0)), normal)
+    arc = np.concatenate(([0.0], np.cumsum(np.linalg.norm(edge, axis=1))))
+    corners = [(outline, 0.0, start, arc[:-1]), (after, 0.0, end, arc[1:])]
+    corners += [(outline, height, start, arc[:-1]), (after, height, end, arc[1:])]
+    points = np.concatenate([np.column_stack((p, np.full(len(p), z))) for p, z, _, _ in corners])
+    chart = np.concatenate([np.column_stack((u, np.full(len(u), z), 0 * u)) for _, z, _, u in corners])
+    k = np.arange(len(outline))
+    a, b, c, d = k, k + len(k), k + 2 * len(k), k + 3 * len(k)
+    faces = np.concatenate((np.stack((a, b, c), 1), np.stack((b, d, c), 1)))
+    return Shape(points, faces, np.concatenate([n for _, _, n, _ in corners]), chart, points)
+
+
+def tube(path: Array, radius: Array | float, segments: int = 20) -> Shape:
+    """Return a round tube along ``path`` (K, 3), with one ``radius`` or one for every point, closed by flat ends."""
+    tangent = unit(np.gradient(path, axis=0))
+    helper = np.eye(3)[np.argmin(np.abs(tangent[0]))]
+    frames = []
+    for t in tangent:  # carry the frame along without twist
+        helper = unit(helper - (helper @ t) * t)
+        frames.append((helper, np.cross(t, helper)))
+    angle = np.linspace(0, 2 * np.pi, segments + 1)
+    frame = np.array(frames)  # (K, 2, 3)
+    out = np.cos(angle)[:, None] * frame[:, None, 0] + np.sin(angle)[:, None] * frame[:, None, 1]  # (K, S, 3)
+    reach = np.broadcast_to(radius, (len(path),))[:, None, None]
+    ring = path[:, None] + reach * out
+    caps = [_disc(path[i], ring[i], tangent[i]) for i in (0, -1)]
+    return merged([surface(ring, out), *caps])
+
+
+def _disc(centre: Array, ring: Array, normal: Array) -> Shape:
+    """Return the flat fan between ``centre`` (3,) and ``ring`` (S, 3)."""
+    return surface(np.stack((np.broadcast_to(centre, ring.shape), ring)), np.broadcast_to(normal, (2, *ring.shape)))
+
+
+def quad(corner: Sequence[float] | Array, side: Sequence[float] | Array, up: Sequence[float] | Array) -> Shape:
+    """Return the flat parallelogram from ``corner`` along ``side`` and ``up``, all (3,)."""
+    origin, a, b = (np.asarray(x, dtype=np.float64) for x in (corner, side, up))
+    points = np.array([[origin, origin + a], [origin + b, origin + a + b]])
+    return surface(points, np.broadcast_to(unit(np.cross(a, b)[None])[0], points.shape))
+
+
+def box(size: Sequence[float] | Array) -> Shape:
+    """Return the box of edges ``size`` (3,) that stands on z = 0 over the origin."""
+    x, y, z = size
+    e = np.diag(np.asarray(size, dtype=np.float64))
+    low, high = np.array([-x / 2, -y / 2, 0.0]), np.array([x / 2, y / 2, float(z)])
+    pairs = ((0, 1), (0, 2), (1, 2))
+    return merged([quad(low, e[i], e[j]) for i, j in pairs] + [quad(high, -e[i], -e[j]) for i, j in pairs])

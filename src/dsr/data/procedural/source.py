@@ -1,0 +1,73 @@
+"""The data set class of the procedural scenes."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from multiprocessing import get_context
+from pathlib import Path
+
+from dsr.data.procedural.scenes import PROCEDURAL_VERSION, render_random_scene
+from dsr.data.rendering import cache_directory, cached
+from dsr.sample import Scene
+
+
+class Procedural:
+    """Random scenes number 0 .. ``count`` - 1 of a seed, rendered once and kept in the cache.
+
+    Args:
+        count: how many.
+        size: height and width in pixels.
+        seed: of the scenes; each is a pure function of seed, number and size.
+
+    Raises:
+        ValueError: a value is out of range.
+
+    """
+
+    name = "procedural"
+
+    def __init__(self, count: int = 200, size: int = 512, seed: int = 0) -> None:
+        if count < 1 or size < 32 or seed < 0:
+            raise ValueError(
+                f"dataset: expected count at least 1, size at least 32, seed at least 0; got {count}, {size}, {seed}"
+            )
+        self._count, self._size, self._seed = count, size, seed
+
+    def scenes(self) -> list[str]:
+        """Return the scenes' numbers as names."""
+        return [f"{index:05d}" for index in range(self._count)]
+
+    def load(self, scene: str) -> Scene:
+        """Return one scene; see :class:`dsr.data.base.SceneSource`."""
+        rendering = cached(self._path(scene), lambda: render_random_scene(self._seed, int(scene), self._size))
+        return rendering.scene(self.name, scene)
+
+    def fingerprint(self, scene: str) -> str:
+        """Return what the scene is a function of."""
+        return f"procedural-v{PROCEDURAL_VERSION}-{self._seed}-{self._size}-{scene}"
+
+    def prepare(self) -> Iterable[str]:
+        """Render what the cache lacks, on every processor, and yield the names as they are done."""
+        missing = [scene for scene in self.scenes() if not (cache_directory() / self._path(scene)).is_file()]
+        yield from (scene for scene in self.scenes() if scene not in set(missing))
+        if not missing:
+            return
+        workers = min(len(missing), os.cpu_count() or 1)
+        with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
+            jobs = {pool.submit(self._render, scene): scene for scene in missing}
+            try:
+                for job in as_completed(jobs):
+                    job.result()
+                    yield jobs[job]
+            except BaseException:
+                pool.shutdown(cancel_futures=True)
+                raise
+
+    def _render(self, scene: str) -> None:
+        """Make sure that the cache has a scene."""
+        cached(self._path(scene), lambda: render_random_scene(self._seed, int(scene), self._size))
+
+    def _path(self, scene: str) -> Path:
+        return Path(f"procedural-v{PROCEDURAL_VERSION}-{self._seed}-{self._size}", f"{scene}.npz")

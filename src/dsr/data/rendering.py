@@ -1,0 +1,62 @@
+"""Rendered scenes, and the cache that keeps them: $DSR_CACHE, else $XDG_CACHE_HOME/dsr or ~/.cache/dsr."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from dsr.atomic import read_arrays, replacing
+from dsr.geometry.camera import Camera
+from dsr.sample import Scene
+
+
+@dataclass(frozen=True)
+class Rendering:
+    """A photo with its exact depth.
+
+    Args:
+        rgb: (H, W, 3) uint8.
+        depth: (H, W) float64 distance to the image plane in metres.
+        camera: the camera of both.
+
+    """
+
+    rgb: NDArray[np.uint8]
+    depth: NDArray[np.float64]
+    camera: Camera
+
+    def scene(self, dataset: str, name: str) -> Scene:
+        """Return it as a scene of a data set."""
+        rgb = torch.from_numpy(self.rgb).permute(2, 0, 1).float() / 255
+        return Scene(dataset, name, rgb, self.camera, torch.from_numpy(self.depth)[None])
+
+
+def cached(path: Path, make: Callable[[], Rendering]) -> Rendering:
+    """Return the rendering kept at ``path`` below the cache directory, or make it and try to keep it there.
+
+    A damaged file is replaced; where nothing can be written the rendering is made each time.
+    """
+    path = cache_directory() / path
+    with contextlib.suppress(OSError, ValueError, KeyError, TypeError):  # missing, damaged, without a key, a wrong one
+        kept = read_arrays(path)
+        return Rendering(kept["rgb"], kept["depth"], Camera(**json.loads(str(kept["camera"]))))
+    rendering = make()
+    with contextlib.suppress(OSError), replacing(path) as temporary:
+        camera = json.dumps(asdict(rendering.camera))
+        np.savez_compressed(temporary, rgb=rendering.rgb, depth=rendering.depth, camera=camera)
+    return rendering
+
+
+def cache_directory() -> Path:
+    """Return where things that can be made again are kept."""
+    if "DSR_CACHE" in os.environ:
+        return Path(os.environ["DSR_CACHE"]).expanduser()
+    return Path(os.environ.get("XDG_CACHE_HOME", "~/.cache")).expanduser() / "dsr"

@@ -1,0 +1,422 @@
+"""The real ``python train.py``: what it writes, logs and refuses, and how it goes on after an interruption."""
+
+import csv
+import json
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import torch
+import yaml
+from safetensors.torch import load_file
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+import dsr.app.train as command
+from dsr.app.entry import run_command
+from dsr.app.evaluate import evaluate
+
+REPOSITORY = Path(__file__).resolve().parents[2]
+SMOKE = ("trainer=smoke", "dataset=simgeo", "dataset.size=64", "metrics.lpips=false", "device=cpu")
+FOUR = (*SMOKE, "trainer.steps=4", "trainer.validate_every=2", "output_dir=out")
+INTERRUPTED = "interrupted; what is finished is kept, the same command goes on from there"
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _one_thread():
+    """Small maps gain nothing from threads, and wait for each other's where other processes want the cores, too."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.fixture(scope="module")
+def environment(dsr_cache):
+    kept = {key: value for key, value in os.environ.items() if key not in ("DSR_LPIPS_TRUNK", "HYDRA_FULL_ERROR")}
+    return {**kept, "DSR_CACHE": str(dsr_cache), "OMP_NUM_THREADS": "1"}
+
+
+@pytest.fixture(scope="module")
+def smoke(tmp_path_factory, environment):
+    """The working directory, the run's directory and the finished process of a smoke training."""
+    folder = tmp_path_factory.mktemp("smoke")
+    done = subprocess.run(
+        [sys.executable, str(REPOSITORY / "train.py"), *SMOKE],
+        cwd=folder, env=environment, capture_output=True, text=True, timeout=120, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    [home] = (folder / "outputs" / "train").iterdir()
+    return folder, home, done
+
+
+@pytest.fixture
+def within(monkeypatch, tmp_path, capfd):
+    """Return a runner of the commands within this process: the exit code, the output and the error lines."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("DSR_LPIPS_TRUNK", raising=False)
+    for name, value in (("HYDRA_FULL_ERROR", "1"), ("PL_GLOBAL_SEED", "0"), ("PL_SEED_WORKERS", "1")):
+        monkeypatch.setenv(name, value)  # and so put back afterwards
+
+    def call(*arguments, name="train"):
+        monkeypatch.setattr(sys, "argv", [f"{name}.py", *arguments])
+        code = 0
+        try:
+            run_command(REPOSITORY / "conf", name, {"train": command.train, "eval": evaluate}[name])
+        except SystemExit as ended:
+            code = ended.code
+        captured = capfd.readouterr()
+        return code, captured.out, captured.err.splitlines()
+
+    return call
+
+
+@pytest.fixture
+def interrupt(monkeypatch):
+    """Return a function after which trainings are interrupted when they are about to do a step; None: not."""
+    bar = command.TrainingBar
+
+    def at(step):
+        class Interrupting(bar):
+            def on_train_batch_start(self, trainer, *_):
+                if trainer.global_step == step:
+                    raise KeyboardInterrupt
+
+        monkeypatch.setattr(command, "TrainingBar", Interrupting)
+
+    return at
+
+
+def tree(folder):
+    return sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file())
+
+
+def same_weights(first, second):
+    one, other = (load_file(folder / "weights.safetensors") for folder in (first, second))
+    return one.keys() == other.keys() and all(torch.equal(one[name], other[name]) for name in one)
+
+
+def events_of(home):
+    events = EventAccumulator(str(home / "tensorboard"), size_guidance={"tensors": 0, "scalars": 0, "images": 0})
+    return events.Reload()
+
+
+def scalars_of(home, tag):
+    return {event.step: event.value for event in events_of(home).Scalars(tag)}
+
+
+def last_step(home):
+    return torch.load(home / "checkpoints" / "last.ckpt", weights_only=True)["global_step"]
+
+
+def validated(output):
+    return [int(line.split()[1]) for line in output.splitlines() if "validation:" in line]
+
+
+def test_a_training_says_what_it_does_and_where_the_weights_are(smoke):
+    _, home, done = smoke
+    lines = done.stdout.splitlines()
+    assert lines[0] == "model  msg_v x4, 326,015 parameters"
+    assert lines[1] == "data   5 scenes of simgeo to train on, 1 to validate with"
+    assert re.fullmatch(r"loss   lap1 \+ 0\.\d+ MSE_v", lines[2])
+    assert lines[3] == "steps  2 of 2 patches of 32 x 32"
+    assert lines[4] == f"log    tensorboard --logdir outputs/train/{home.name}"
+    assert validated(done.stdout) == [1, 2]
+    assert "RMSE_v 0." in lines[5]
+    assert lines[7:] == [f"weights: outputs/train/{home.name}/weights.safetensors"]
+
+
+def test_a_training_warns_of_nothing(smoke):
+    assert smoke[2].stderr == ""
+
+
+def test_a_training_writes_everything_that_is_promised_and_nothing_else(smoke):
+    folder, home, _ = smoke
+    assert home.name.startswith("simgeo_box_x4_msg_v_")
+    [events] = (home / "tensorboard").glob("events.*")
+    assert tree(home) == [
+        "checkpoints/best.ckpt", "checkpoints/last.ckpt", "config.yaml",
+        f"tensorboard/{events.name}", "tensorboard/hparams.yaml", "versions.json", "weights.safetensors",
+    ]  # fmt: skip
+    assert [path.name for path in folder.iterdir()] == ["outputs"]
+
+
+def test_config_yaml_is_the_resolved_configuration(smoke):
+    text = (smoke[1] / "config.yaml").read_text()
+    assert "${" not in text
+    assert "???" not in text
+    config = yaml.safe_load(text)
+    assert config["trainer"]["patch"] == 32
+    assert config["trainer"]["name"] == "smoke"
+    assert config["dataset"]["size"] == 64
+    assert config["model"]["name"] == "msg_v"
+    assert config["loss"] == {"w": "auto"}
+
+
+def test_versions_json_says_what_made_the_weights(smoke):
+    record = json.loads((smoke[1] / "versions.json").read_text())
+    assert record["packages"]["torch"] == torch.__version__
+    assert record["identity"]["device"] == "cpu"
+    assert record["identity"]["trainer"]["steps"] == 2
+    assert "method" not in record["identity"]
+
+
+def test_the_log_has_losses_scores_rates_renderings_and_the_configuration(smoke):
+    home = smoke[1]
+    events = events_of(home)
+    tags = events.Tags()
+    scores = {f"val/{name}" for name in ("RMSE_d", "RMSE_v", "DSSIM_v", "Bumpiness_d", "BadPix_v_5", "RMSE_v1")}
+    assert scores | {"train/loss", "train/lap1", "train/mse_v", "lr-AdamW"} <= set(tags["scalars"])
+    assert not any("LPIPS" in tag for tag in tags["scalars"])
+    assert sorted(scalars_of(home, "val/DSSIM_v")) == sorted(scalars_of(home, "val/RMSE_v"))
+    assert len(scalars_of(home, "val/RMSE_v")) == 2
+    for tag in ("val/RMSE_v", "val/DSSIM_v", "train/loss"):
+        assert all(0 < value < 5 for value in scalars_of(home, tag).values())
+    assert list(scalars_of(home, "lr-AdamW").values()) == pytest.approx([1e-3, 1e-3])
+    assert tags["images"] == ["renderings/0"]
+    image = events.Images("renderings/0")[0]
+    assert (image.height, image.width) == (128, 256)
+    [text] = events.Tensors("config/text_summary")
+    assert "validation_scenes: 1" in text.tensor_proto.string_val[0].decode()
+
+
+def test_the_training_loss_is_the_sum_of_its_terms(smoke):
+    loss, depth, visual = (scalars_of(smoke[1], f"train/{name}") for name in ("loss", "lap1", "mse_v"))
+    w = float(smoke[2].stdout.split("lap1 + ")[1].split()[0])
+    for step, value in loss.items():
+        assert value == pytest.approx(depth[step] + w * visual[step], rel=2e-3)
+
+
+def test_the_same_command_again_is_refused_and_changes_nothing(smoke, within, monkeypatch):
+    folder, home, _ = smoke
+    monkeypatch.chdir(folder)
+    before = {name: (home / name).read_bytes() for name in tree(home)}
+    code, output, errors = within(*SMOKE)
+    assert (code, output) == (2, "")
+    file = f"outputs/train/{home.name}/weights.safetensors"
+    assert errors == [f"error: output_dir: {file} is trained already; overwrite=true trains it anew"]
+    assert {name: (home / name).read_bytes() for name in tree(home)} == before
+
+
+def test_overwrite_trains_anew(smoke, tmp_path, within):
+    shutil.copytree(smoke[1], tmp_path / "out")
+    (tmp_path / "out" / "weights.safetensors").write_bytes(b"old")
+    code, output, errors = within(*SMOKE, "output_dir=out", "overwrite=true")
+    assert (code, errors) == (0, [])
+    assert "resumed" not in output
+    assert validated(output) == [1, 2]
+    assert same_weights(tmp_path / "out", smoke[1])
+    assert len(list((tmp_path / "out" / "tensorboard").glob("events.*"))) == 1
+
+
+def test_an_interrupted_overwrite_leaves_no_weights_of_the_run_before(smoke, tmp_path, within, interrupt):
+    shutil.copytree(smoke[1], tmp_path / "out")
+    arguments = (*SMOKE, "output_dir=out", "seed=1")
+    interrupt(1)
+    assert within(*arguments, "overwrite=true")[0] == 130
+    assert not (tmp_path / "out" / "weights.safetensors").exists()
+    interrupt(None)
+    code, output, errors = within(*arguments)
+    assert (code, errors) == (0, [])
+    assert "resumed" in output
+    assert not same_weights(tmp_path / "out", smoke[1])
+
+
+def test_a_directory_of_another_training_is_kept(tmp_path, within, interrupt):
+    interrupt(1)
+    assert within(*SMOKE, "output_dir=out")[0] == 130
+    before = tree(tmp_path)
+    code, _, errors = within(*SMOKE, "output_dir=out", "seed=1", "trainer.batch=1")
+    assert code == 2
+    assert errors == [
+        "error: output_dir: out holds a run with another seed, trainer.batch; another output_dir keeps it, "
+        "overwrite=true replaces it"
+    ]
+    assert tree(tmp_path) == before
+
+
+def test_evaluation_takes_the_weights_and_scores_as_the_best_validation_did(smoke, tmp_path, within):
+    home = smoke[1]
+    code, _, errors = within(
+        "method=msg_v", f"weights='{home / 'weights.safetensors'}'", "dataset.size=64", "dataset.scenes=[statue]",
+        "metrics.lpips=false", "device=cpu", "output_dir=out", name="eval",
+    )  # fmt: skip
+    assert (code, errors) == (0, [])
+    with (tmp_path / "out" / "scores.csv").open(newline="") as file:
+        worst = {row["metric"]: float(row["value"]) for row in csv.DictReader(file) if row["variant"] in ("", "max")}
+    validations = scalars_of(home, "val/RMSE_v")
+    best = min(validations, key=validations.get)
+    for name in ("RMSE_v", "RMSE_d", "DSSIM_v", "Bumpiness_d"):
+        assert worst[name] == pytest.approx(scalars_of(home, f"val/{name}")[best], rel=1e-4), name
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["method=msg"], "expected weights of model msg, got those of msg_v"),
+        (["method=msg_v", "scale=8"], "weights are for scale 4, the run is at scale 8"),
+    ],
+)
+def test_evaluation_refuses_weights_of_another_model_or_scale(smoke, tmp_path, within, arguments, message):
+    path = smoke[1] / "weights.safetensors"
+    code, output, errors = within(
+        *arguments, f"weights='{path}'", "dataset.size=64", "metrics.lpips=false", name="eval"
+    )
+    assert (code, output) == (2, "")
+    assert errors == [f"error: {path}: {message}"]
+    assert tree(tmp_path) == []
+
+
+def test_msg_is_trained_on_depth_alone_and_its_weights_are_those_of_method_msg(tmp_path, within):
+    code, output, errors = within(*SMOKE, "model=msg", "output_dir=out", "scale=2")
+    assert (code, errors) == (0, [])
+    assert "loss   mse" in output.splitlines()
+    assert "train/mse_v" not in events_of(tmp_path / "out").Tags()["scalars"]
+    code, _, errors = within(
+        "method=msg", "weights=out/weights.safetensors", "scale=2", "dataset.size=64", "dataset.scenes=[statue]",
+        "metrics.lpips=false", "output_dir=scores", name="eval",
+    )  # fmt: skip
+    assert (code, errors) == (0, [])
+
+
+def test_the_last_steps_are_validated_where_the_interval_does_not_divide_them(tmp_path, within):
+    code, output, errors = within(*SMOKE, "trainer.steps=3", "trainer.validate_every=2", "output_dir=out")
+    assert (code, errors) == (0, [])
+    assert validated(output) == [2, 3]
+    assert last_step(tmp_path / "out") == 3
+
+
+def test_mixed_precision_trains_with_losses_as_in_full_precision(smoke, tmp_path, within):
+    code, _, errors = within(*SMOKE, "precision=bfloat16", "output_dir=out")
+    assert (code, errors) == (0, [])
+    full, mixed = (scalars_of(home, "train/loss") for home in (smoke[1], tmp_path / "out"))
+    first = min(full)
+    assert mixed[first] == pytest.approx(full[first], rel=0.02)
+    weights = load_file(tmp_path / "out" / "weights.safetensors").values()
+    assert {value.dtype for value in weights} == {torch.float32}
+
+
+USAGE_ERRORS = {
+    "a weight that is none": (["loss.w=abc"], "loss.w: expected auto or a number, 0 or more, got 'abc'"),
+    "a negative weight": (["loss.w=-1"], "loss.w: expected auto or a number, 0 or more, got -1"),
+    "a mistyped model": (["model=foo"], "model=foo: unknown; expected one of msg, msg_v"),
+    "a model taken away": (["~model"], "model: missing; give it as model=..."),
+    "a mistyped loss": (["model.depth_loss=l3"], "model.depth_loss: expected one of lap1, l1, mse, got 'l3'"),
+    "a network that leaves out pixels": (["model.variant=hui"], "model.variant: expected one that covers the whole"),
+    "a patch the scale does not divide": (["trainer.patch=30"], "trainer.patch: expected a size that scale=4 divides"),
+    "a patch larger than a scene": (["trainer.patch=128"], "trainer.patch: expected at most cube_high_freq's 64 x 64"),
+    "a patch too small": (["trainer.patch=8"], "trainer.patch: expected at least 16 pixels, got 8"),
+    "no step": (["trainer.steps=0"], "trainer.steps: expected a positive number, got 0"),
+    "no batch": (["trainer.batch=0"], "trainer.batch: expected a positive number, got 0"),
+    "a negative warm-up": (["trainer.warmup=-1"], "trainer.warmup: expected 0 or more, got -1"),
+    "a negative decay": (["trainer.weight_decay=-1"], "trainer.weight_decay: expected 0 or more, got -1"),
+    "a learning rate of nan": (["trainer.learning_rate=nan"], "trainer.learning_rate: expected a positive number"),
+    "a mistyped key": (["trainer.step=3"], "trainer.step: unknown key; expected trainer.name, trainer.steps"),
+    "too few scenes": (["dataset.scenes=[statue]"], "trainer.validation_scenes: expected fewer than the 1 scenes"),
+    "a measured map": (["downsampling=measured"], "downsampling: training needs a model such as box, measured is none"),
+    "a scale": (["scale=3"], "scale: expected one of 2, 4, 8, 16, got 3"),
+    "a seed": (["seed=99999999999"], "seed: expected at most 4294967295, got 99999999999"),
+    "a precision": (["precision=half"], "precision: expected one of float32, bfloat16, got half"),
+    "a foreign directory": (["output_dir=foreign"], "output_dir: foreign holds files of something else"),
+    "a file as directory": (["output_dir=file"], "output_dir: expected a directory, file is a file"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", USAGE_ERRORS)
+def test_a_usage_error_is_one_line_with_exit_code_2_and_writes_nothing(tmp_path, within, case):
+    arguments, start = USAGE_ERRORS[case]
+    (tmp_path / "file").write_text("no directory")
+    (tmp_path / "foreign").mkdir()
+    (tmp_path / "foreign" / "thesis.txt").write_text("precious")
+    code, output, errors = within(*SMOKE, *arguments)
+    assert (code, output) == (2, "")
+    assert len(errors) == 1, errors
+    assert errors[0].startswith(f"error: {start}")
+    assert tree(tmp_path) == ["file", "foreign/thesis.txt"]
+    assert not (tmp_path / "outputs").exists()
+
+
+def test_the_help_lists_the_choices(within):
+    code, output, errors = within("--help")
+    assert (code, errors) == (0, [])
+    for line in ("model: msg, msg_v", "trainer: default, smoke"):
+        assert line in output
+
+
+def test_an_interrupted_training_goes_on_to_the_very_weights_of_an_uninterrupted_one(tmp_path, within, interrupt):
+    code, output, errors = within(*FOUR[:-1], "output_dir=whole")
+    assert (code, errors) == (0, [])
+    assert validated(output) == [2, 4]
+    handler = signal.getsignal(signal.SIGINT)
+    for step, reached in ((3, 2), (2, 2)):  # within an epoch, then right where it went on
+        interrupt(step)
+        code, output, errors = within(*FOUR)
+        assert (code, errors) == (130, [INTERRUPTED])
+        assert not (tmp_path / "out" / "weights.safetensors").exists()
+        assert last_step(tmp_path / "out") == reached
+    assert signal.getsignal(signal.SIGINT) is handler
+    interrupt(None)
+    code, output, errors = within(*FOUR)
+    assert (code, errors) == (0, [])
+    assert "steps  4 of 2 patches of 32 x 32, resumed" in output
+    assert validated(output) == [4]
+    assert same_weights(tmp_path / "out", tmp_path / "whole")
+    for tag in ("val/RMSE_v", "train/loss", "lr-AdamW"):
+        assert scalars_of(tmp_path / "out", tag) == scalars_of(tmp_path / "whole", tag), tag
+
+
+def test_a_training_goes_on_from_its_last_validation_even_if_that_was_not_its_best(
+    tmp_path, within, interrupt, monkeypatch
+):
+    scores = iter([0.1, 0.2, 0.3])
+    end = command.SuperResolution.on_validation_epoch_end
+
+    def worse(self):
+        end(self)
+        self.log("val/RMSE_v", next(scores))
+
+    monkeypatch.setattr(command.SuperResolution, "on_validation_epoch_end", worse)
+    interrupt(2)
+    arguments = (*SMOKE, "trainer.steps=3", "output_dir=out")
+    assert within(*arguments)[0] == 130
+    assert last_step(tmp_path / "out") == 2
+    interrupt(None)
+    code, output, _ = within(*arguments)
+    assert (code, validated(output)) == (0, [3])
+    best = torch.load(tmp_path / "out" / "checkpoints" / "best.ckpt", weights_only=True)
+    assert best["global_step"] == 1
+    weights = load_file(tmp_path / "out" / "weights.safetensors")
+    assert all(torch.equal(value, best["state_dict"][f"net.{name}"]) for name, value in weights.items())
+
+
+def test_a_training_that_lacks_only_its_weights_file_gets_it(smoke, tmp_path, within):
+    code, _, _ = within(*SMOKE, "output_dir=out")
+    assert code == 0
+    (tmp_path / "out" / "weights.safetensors").unlink()
+    code, output, errors = within(*SMOKE, "output_dir=out")
+    assert (code, errors) == (0, [])
+    assert validated(output) == []
+    assert same_weights(tmp_path / "out", smoke[1])
+
+
+def test_ctrl_c_exits_with_130_and_one_line_that_says_how_to_go_on(tmp_path, environment):
+    arguments = (*SMOKE, "trainer.steps=500", "output_dir=out")
+    with subprocess.Popen(
+        [sys.executable, str(REPOSITORY / "train.py"), *arguments],
+        cwd=tmp_path, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    ) as process:  # fmt: skip
+        deadline = time.monotonic() + 60
+        last = tmp_path / "out" / "checkpoints" / "last.ckpt"
+        while not last.exists() and process.poll() is None and time.monotonic() < deadline:
+            time.sleep(0.02)
+        process.send_signal(signal.SIGINT)
+        _, errors = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert errors == f"{INTERRUPTED}\n"
+    assert not (tmp_path / "out" / "weights.safetensors").exists()
+    assert 1 <= last_step(tmp_path / "out") < 500

@@ -1,0 +1,263 @@
+"""Training losses, against a pyramid written in plain numpy, closed forms and finite differences."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from dsr.data.patches import Batch
+from dsr.geometry.camera import Camera
+from dsr.quality.losses import l1, lap1, mse
+from dsr.training import DepthLoss, Objective
+
+Loss = Callable[..., Tensor]
+LOSSES: dict[str, Loss] = {"l1": l1, "mse": mse, "lap1": lap1}
+TAPS = (1 / 16, 4 / 16, 6 / 16, 4 / 16, 1 / 16)
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _one_thread() -> Iterator[None]:
+    """Small maps gain nothing from threads, and wait for each other's where other processes want the cores, too."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+def _map(seed: int, height: int = 13, width: int = 18, batch: int = 1) -> Tensor:
+    return torch.from_numpy(np.random.default_rng(seed).normal(size=(batch, 1, height, width)))
+
+
+def _with_holes(values: Tensor, seed: int, share: float = 0.2) -> Tensor:
+    holes = torch.from_numpy(np.random.default_rng(seed).random(tuple(values.shape)) < share)
+    return values.masked_fill(holes, torch.nan)
+
+
+def _slow_reduce(x: np.ndarray) -> np.ndarray:
+    """Blur and keep every second pixel; beyond the border the edge pixel repeats."""
+    height, width = x.shape
+    coarse = np.zeros((math.ceil(height / 2), math.ceil(width / 2)))
+    for i, j in np.ndindex(*coarse.shape):
+        for p, q in np.ndindex(5, 5):
+            row, column = min(max(2 * i + p - 2, 0), height - 1), min(max(2 * j + q - 2, 0), width - 1)
+            coarse[i, j] += TAPS[p] * TAPS[q] * x[row, column]
+    return coarse
+
+
+def _slow_expand(coarse: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
+    """Interpolate: coarse pixel (i, j) sits at fine pixel (2 i, 2 j); weights are normalised."""
+    fine = np.zeros(shape)
+    for row, column in np.ndindex(*shape):
+        total = 0.0
+        for i, j in np.ndindex(*coarse.shape):
+            if abs(row - 2 * i) <= 2 and abs(column - 2 * j) <= 2:
+                weight = TAPS[row - 2 * i + 2] * TAPS[column - 2 * j + 2]
+                fine[row, column] += weight * coarse[i, j]
+                total += weight
+        fine[row, column] /= total
+    return fine
+
+
+def _slow_lap1(x: np.ndarray, y: np.ndarray, levels: int) -> float:
+    """Bojanowski et al. 2018, eq. 2, of two pyramids, over the number of pixels; a level's norm is a weighted mean."""
+    known = np.isfinite(x) & np.isfinite(y)
+    x, y, weight = np.where(known, x, 0), np.where(known, y, 0), known.astype(float)
+    total = 0.0
+    for _ in range(levels - 1):
+        coarse_x, coarse_y = _slow_reduce(x), _slow_reduce(y)
+        detail = (x - _slow_expand(coarse_x, x.shape)) - (y - _slow_expand(coarse_y, y.shape))
+        total += (weight * np.abs(detail)).sum() / weight.sum()
+        x, y, weight = coarse_x, coarse_y, _slow_reduce(weight)
+    return total + (weight * np.abs(x - y)).sum() / weight.sum()
+
+
+@pytest.mark.parametrize("levels", [1, 2, 3])
+@pytest.mark.parametrize("size", [(12, 12), (13, 18), (16, 15)])
+def test_lap1_is_the_slow_pyramid(size: tuple[int, int], levels: int) -> None:
+    x, y = _map(0, *size), _map(1, *size)
+    expected = _slow_lap1(x[0, 0].numpy(), y[0, 0].numpy(), levels)
+    assert lap1(x, y, levels=levels).item() == pytest.approx(expected, rel=1e-12)
+
+
+def test_lap1_with_holes_weighs_pixels_by_the_share_that_is_known() -> None:
+    x, y = _with_holes(_map(0), 2), _with_holes(_map(1), 3)
+    expected = _slow_lap1(x[0, 0].numpy(), y[0, 0].numpy(), 3)
+    assert lap1(x, y).item() == pytest.approx(expected, rel=1e-12)
+
+
+def test_lap1_has_three_levels_unless_told_otherwise() -> None:
+    x, y = _map(0), _map(1)
+    assert lap1(x, y).item() == lap1(x, y, levels=3).item() != lap1(x, y, levels=2).item()
+
+
+def test_where_sizes_are_even_a_level_s_mean_times_the_pixels_is_its_weighted_sum() -> None:
+    """The sum over levels of 4^j |L^j|_1, as the paper writes it, divided by the pixels."""
+    difference = (_map(0, 16, 24) - _map(1, 16, 24))[0, 0].numpy()
+    total = 0.0
+    for j in range(2):
+        coarse = _slow_reduce(difference)
+        total += 4**j * np.abs(difference - _slow_expand(coarse, difference.shape)).sum()
+        difference = coarse
+    total += 4**2 * np.abs(difference).sum()
+    assert lap1(_map(0, 16, 24), _map(1, 16, 24)).item() == pytest.approx(total / (16 * 24), rel=1e-12)
+
+
+@pytest.mark.parametrize("holes", [0.0, 0.3])
+def test_l1_and_mse_are_plain_means_over_what_is_known(holes: float) -> None:
+    x, y = _with_holes(_map(0), 2, holes), _map(1)
+    difference = (x - y).numpy()
+    assert l1(x, y).item() == pytest.approx(np.nanmean(np.abs(difference)), rel=1e-13)
+    assert mse(x, y).item() == pytest.approx(np.nanmean(difference**2), rel=1e-13)
+
+
+@pytest.mark.parametrize("c", [-2.5, 0.1, 3.0])
+@pytest.mark.parametrize("size", [(12, 12), (17, 14)])
+def test_a_constant_offset_gives_its_absolute_value(size: tuple[int, int], c: float) -> None:
+    x = _map(0, *size)
+    assert lap1(x + c, x).item() == pytest.approx(abs(c), rel=1e-13)
+    assert l1(x + c, x).item() == pytest.approx(abs(c), rel=1e-13)
+    assert mse(x + c, x).item() == pytest.approx(c**2, rel=1e-13)
+
+
+def test_lap1_with_one_level_is_l1() -> None:
+    x, y = _with_holes(_map(0), 2), _map(1)
+    assert lap1(x, y, levels=1).item() == pytest.approx(l1(x, y).item(), rel=1e-14)
+
+
+def test_a_ripple_weighs_more_in_lap1_than_in_l1_by_its_detail_alone() -> None:
+    """The finest level has nearly all of a checkerboard, the coarser ones next to nothing."""
+    rows, columns = np.indices((32, 32))
+    ripple = torch.from_numpy((-1.0) ** (rows + columns))[None, None]
+    assert lap1(ripple, torch.zeros_like(ripple), levels=2).item() == pytest.approx(1, abs=0.05)
+
+
+@pytest.mark.parametrize("name", LOSSES)
+def test_a_loss_is_symmetric_zero_at_the_target_and_positive_elsewhere(name: str) -> None:
+    x, y = _with_holes(_map(0), 2), _with_holes(_map(1), 3)
+    loss = LOSSES[name]
+    assert loss(x, y).item() == pytest.approx(loss(y, x).item(), rel=1e-14)
+    assert loss(x, x).item() == 0
+    assert loss(x, y).item() > 0
+
+
+@pytest.mark.parametrize("name", LOSSES)
+@pytest.mark.parametrize("garbage", [1e30, -7.0, math.inf, math.nan])
+def test_what_lies_under_the_mask_or_in_a_hole_never_matters(name: str, garbage: float) -> None:
+    x, y = _map(0), _map(1)
+    mask = torch.from_numpy(np.random.default_rng(4).random((1, 1, 13, 18)) < 0.7)
+    expected = LOSSES[name](x, y, mask).item()
+    assert expected != LOSSES[name](x, y).item()
+    assert LOSSES[name](x.masked_fill(~mask, garbage), y, mask).item() == expected
+    assert LOSSES[name](x, y.masked_fill(~mask, garbage), mask).item() == expected
+    assert LOSSES[name](x.masked_fill(~mask, garbage), y.masked_fill(~mask, torch.nan)).item() == expected
+
+
+@pytest.mark.parametrize("name", LOSSES)
+def test_an_image_without_a_known_pixel_gets_nan_and_leaves_the_others_alone(name: str) -> None:
+    x, y = _map(0, batch=2), _map(1, batch=2)
+    y[0] = torch.nan
+    values = LOSSES[name](x, y)
+    assert values.shape == (2,)
+    assert values[0].isnan()
+    assert values[1].item() == pytest.approx(LOSSES[name](x[1:], y[1:]).item(), rel=1e-14)
+
+
+@pytest.mark.parametrize("name", LOSSES)
+def test_gradients_are_free_of_nan_and_zero_in_holes_even_where_nothing_is_known(name: str) -> None:
+    x, y = _map(0, batch=2).requires_grad_(), _with_holes(_map(1, batch=2), 3)
+    y[0] = torch.nan
+    LOSSES[name](x, y).nanmean().backward()
+    assert x.grad is not None
+    assert bool(x.grad.isfinite().all())
+    assert bool((x.grad[y.isnan()] == 0).all())
+    assert bool(x.grad[1].any())
+
+
+@pytest.mark.parametrize("name", LOSSES)
+def test_a_batch_of_two_is_two_singles(name: str) -> None:
+    x, y = _with_holes(_map(0, batch=2), 2), _map(1, batch=2)
+    mask = torch.from_numpy(np.random.default_rng(4).random((2, 1, 13, 18)) < 0.7)
+    singles = [LOSSES[name](x[i : i + 1], y[i : i + 1], mask[i : i + 1]) for i in range(2)]
+    torch.testing.assert_close(LOSSES[name](x, y, mask), torch.cat(singles), rtol=1e-14, atol=0)
+
+
+@pytest.mark.parametrize("name", LOSSES)
+@pytest.mark.parametrize("holes", [0.0, 0.25])
+def test_a_loss_has_the_gradient_of_its_value(name: str, holes: float) -> None:
+    size = (12, 13) if name == "lap1" else (3, 4)
+    x, y = _map(0, *size), _with_holes(_map(1, *size), 3, holes)
+    assert torch.autograd.gradcheck(lambda x: LOSSES[name](x, y), x.requires_grad_())
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("name", LOSSES)
+def test_a_loss_keeps_the_precision(name: str, dtype: torch.dtype) -> None:
+    assert LOSSES[name](_map(0).to(dtype), _with_holes(_map(1), 2).to(dtype)).dtype == dtype
+
+
+def test_a_map_too_small_for_the_levels_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"lap1: expected at least 12 pixels a side for 3 levels, got \(11, 18\)"):
+        lap1(_map(0, 11), _map(1, 11))
+    with pytest.raises(ValueError, match=r"lap1: expected at least 3 pixels a side for 0 levels"):
+        lap1(_map(0), _map(1), levels=0)
+    assert lap1(_map(0, 12, 12), _map(1, 12, 12)).isfinite().all()
+
+
+# The objective, with a camera per sample
+
+CAMERAS = (
+    Camera(width=14, height=12, fx=15.0, fy=14.0, cx=6.1, cy=5.8, baseline=0.12, doffs=0.7),
+    Camera(width=14, height=12, fx=22.0, fy=23.0, cx=3.0, cy=9.2, baseline=0.3, doffs=-0.4),
+)
+
+
+def _batch(*, holes: float = 0.0) -> Batch:
+    depth = 2 + 0.3 * torch.tanh(_map(5, 12, 14, batch=2))
+    depth = _with_holes(depth, 6, holes)
+    stereo = torch.tensor([[c.fx * (c.baseline or 0)] for c in CAMERAS], dtype=torch.float64)[:, :, None, None]
+    doffs = torch.tensor([[c.doffs] for c in CAMERAS], dtype=torch.float64)[:, :, None, None]
+    fine = stereo / depth - doffs
+    coarse = fine.reshape(2, 1, 6, 2, 7, 2).nanmean(dim=(3, 5))
+    rays = torch.stack([camera.rays() for camera in CAMERAS])
+    return {"depth": depth, "rays": rays, "stereo": stereo, "doffs": doffs, "disparity_lr": coarse}
+
+
+def _guess(batch: Batch) -> Tensor:
+    """Return disparities near the true ones, and finite."""
+    truth = (batch["stereo"] / batch["depth"] - batch["doffs"]).nan_to_num(1.0)
+    return truth + 0.05 * _map(7, 12, 14, batch=2)
+
+
+@pytest.mark.parametrize("holes", [0.0, 0.15])
+@pytest.mark.parametrize("depth_loss", LOSSES)
+def test_the_objective_has_the_gradient_of_its_value(depth_loss: DepthLoss, holes: float) -> None:
+    batch, objective = _batch(holes=holes), Objective(depth_loss, 0.7)
+    assert torch.autograd.gradcheck(lambda guess: objective(guess, batch)["loss"], _guess(batch).requires_grad_())
+
+
+@pytest.mark.parametrize("holes", [0.0, 0.15])
+def test_the_objective_of_a_batch_is_the_mean_of_its_samples(holes: float) -> None:
+    batch, objective = _batch(holes=holes), Objective("lap1", 0.7)
+    guess = _guess(batch)
+    singles = [
+        objective(guess[i : i + 1], {name: value[i : i + 1] for name, value in batch.items()})["loss"] for i in range(2)
+    ]
+    assert singles[0].item() != pytest.approx(singles[1].item(), rel=0.01)
+    assert objective(guess, batch)["loss"].item() == pytest.approx(sum(singles).item() / 2, rel=1e-13)
+
+
+def test_the_objective_gives_finite_gradients_at_the_truth_and_beyond_infinity() -> None:
+    batch = _batch(holes=0.15)
+    truth = (batch["stereo"] / batch["depth"] - batch["doffs"]).nan_to_num(1.0)
+    behind = truth.clone()
+    behind[1] = -5  # nothing of that surface can be seen
+    for start in (truth, behind, torch.full_like(truth, -5)):
+        guess = start.clone().requires_grad_()
+        Objective("lap1", 0.7)(guess, batch)["loss"].backward()
+        assert guess.grad is not None
+        assert bool(guess.grad.isfinite().all())

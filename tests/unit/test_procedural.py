@@ -1,0 +1,234 @@
+"""Random scenes: exact depth of what the ray tracer says it traces, reproducible from two numbers, varied."""
+
+import functools
+
+import numpy as np
+import pytest
+
+from dsr.data.procedural import render_random_scene
+from dsr.data.procedural.layouts import LAYOUTS
+from dsr.data.procedural.paints import PAINTS
+from dsr.data.procedural.pictures import PICTURES, palette, picture_paint
+from dsr.data.procedural.reliefs import RELIEFS, relief
+from dsr.data.procedural.scenes import camera_of, random_scene, render
+from dsr.data.procedural.shape import about, box, extrusion, merged, quad, surface
+from dsr.data.procedural.solids import SOLIDS, any_solid, ellipsoid, frustum, rounded_box
+from dsr.data.procedural.stage import Viewpoint
+from dsr.data.procedural.tracer import Tracer
+
+SIZE = 96
+ORIGIN = np.zeros(3)
+FORWARD = Viewpoint(ORIGIN, np.array([0.0, 1.0, 0.0]), 1.0, 0.0, np.array([0.5, 0.5]))
+
+
+@functools.cache
+def scenes(count=10):
+    """The first scenes of a series, small."""
+    return [render_random_scene(3, index, 48) for index in range(count)]
+
+
+@functools.cache
+def rays(size=SIZE):
+    """Rays (3, size * size) of a camera at the origin that looks along z."""
+    return camera_of(FORWARD, size).rays().numpy().reshape(3, -1)
+
+
+def test_a_scene_is_the_same_every_time_and_whatever_was_rendered_before():
+    first = render_random_scene(5, 2, 24)
+    render_random_scene(5, 1, 24)
+    second = render_random_scene(5, 2, 24)
+    np.testing.assert_array_equal(first.rgb, second.rgb)
+    np.testing.assert_array_equal(first.depth, second.depth)
+    assert first.camera == second.camera
+
+
+def test_seed_and_index_each_make_another_scene():
+    views = [scenes()[0], scenes()[1], render_random_scene(4, 0, 48)]
+    assert len({view.camera.fx for view in views}) == 3
+    assert len({view.rgb.tobytes() for view in views}) == 3
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_every_layout_closes_the_view_and_keeps_the_promised_types_and_ranges(layout):
+    scene = random_scene(np.random.default_rng(8), layout)
+    picture = render(scene, SIZE)
+    assert scene.layout == layout
+    assert picture.rgb.dtype == np.uint8
+    assert picture.depth.dtype == np.float64
+    assert picture.rgb.shape == (SIZE, SIZE, 3)
+    assert picture.depth.shape == (SIZE, SIZE)
+    assert np.isfinite(picture.depth).all()
+    assert picture.depth.min() > 0.2
+    assert np.median(picture.depth) < 25
+    assert 10 < picture.rgb.mean() < 245
+    assert picture.rgb.std() > 4
+
+
+def test_another_size_is_another_sampling_of_the_same_scene():
+    large, small = (render_random_scene(0, 7, size) for size in (96, 32))
+    for name in ("fx", "fy"):
+        assert getattr(large.camera, name) == pytest.approx(3 * getattr(small.camera, name), abs=1e-12)
+    same = np.isclose(large.depth[1::3, 1::3], small.depth, rtol=1e-9)  # rays 1, 4, 7... are those of the small picture
+    assert same.mean() > 0.998
+    close = np.abs(large.rgb.reshape(32, 3, 32, 3, 3).mean((1, 3)) - small.rgb)
+    assert np.median(close) < 8
+
+
+def test_scenes_vary_in_depth_focal_length_and_brightness():
+    ratios = np.array([np.quantile(s.depth, 0.98) / np.quantile(s.depth, 0.02) for s in scenes()])
+    focal = np.array([s.camera.fx / s.camera.width for s in scenes()])
+    middle = np.array([np.median(s.depth) for s in scenes()])
+    light = np.array([s.rgb.mean() for s in scenes()])
+    assert ratios.min() < 1.7
+    assert ratios.max() > 3
+    assert ratios.max() < 7
+    assert focal.min() >= 0.6
+    assert focal.max() <= 1.8
+    assert np.ptp(focal) > 0.7
+    assert middle.max() > 2.5 * middle.min()
+    assert light.std() > 8
+    assert len({s.camera.cx for s in scenes()}) == len(scenes())
+
+
+def test_photos_show_texture_without_geometry_and_geometry_without_texture():
+    counts = np.zeros(2)
+    for scene in scenes():
+        grey = scene.rgb.mean(2)
+        contrast = np.abs(np.diff(grey, axis=1))[1:] > 15
+        inverse = 1 / scene.depth
+        bend = np.abs(np.diff(inverse, 2, axis=1))[1:, :] / inverse.mean()
+        edge = np.pad(bend > 0.02, ((0, 0), (0, 1)))
+        counts += (contrast & ~edge).sum(), (edge & ~contrast).sum()
+    assert (counts > 200).all()
+
+
+def test_a_plane_has_the_depth_of_its_closed_form_without_a_staircase():
+    normal, distance = np.array([0.3, -0.5, -0.81]), 2.7
+    normal /= np.linalg.norm(normal)
+    side = np.cross(normal, [0.0, 1.0, 0.0])
+    up = np.cross(normal, side)
+    tracer = Tracer([quad(-distance * normal - 20 * side - 20 * up, 40 * side, 40 * up)])
+    depth = tracer.hits(ORIGIN, rays()).depth
+    np.testing.assert_allclose(depth, -distance / (normal @ rays()), rtol=1e-12)
+    points = (depth * rays()).reshape(3, SIZE, SIZE)
+    du, dv = np.diff(points, axis=2)[:, :-1], np.diff(points, axis=1)[:, :, :-1]
+    seen = np.cross(dv, du, axis=0)
+    seen /= np.linalg.norm(seen, axis=0)
+    np.testing.assert_allclose(seen, np.broadcast_to(normal[:, None, None], seen.shape), atol=1e-6)
+
+
+def test_a_wall_far_from_the_origin_of_the_scene_is_as_flat():
+    tracer = Tracer([quad([-60.0, 37.0, -60.0], [120, 0, 0], [0, 0, 120])])
+    eye = np.array([3.3, 30.1, -7.7])
+    axes = FORWARD.axes()
+    depth = tracer.hits(eye, axes.T @ rays()).depth
+    np.testing.assert_allclose(depth, 6.9, rtol=1e-12)
+
+
+def test_a_ball_is_round_beyond_what_its_triangles_are():
+    radius, centre = 0.8, np.array([0.1, -0.2, 3.0])
+    shape = ellipsoid(np.full(3, radius), np.ones(2)).turned(about(0, 71.0)).moved(centre)
+    tracer = Tracer([shape])
+    hits = tracer.hits(ORIGIN, rays())
+    slope, square = centre @ rays(), (rays() ** 2).sum(0)
+    root = slope**2 - square * (centre @ centre - radius**2)
+    inner = root > 0.1 * slope**2 * radius**2 / (centre @ centre)  # away from the outline
+    exact = (slope - np.sqrt(np.maximum(root, 0))) / square
+    assert inner.sum() > 1000
+    away = np.abs(hits.depth - exact)[inner]
+    corners = tracer.triangles(hits.face[inner])  # (3, 3, N)
+    flat = (np.linalg.norm(corners - centre[:, None], axis=1).mean(0) - radius).max()
+    sag = radius - np.linalg.norm(corners.mean(0) - centre[:, None], axis=0)
+    assert abs(flat) < 1e-12
+    assert sag.max() > 2e-4  # the triangles cut the ball
+    assert away.max() < 2e-5
+    n = (hits.points[:, inner] - centre[:, None]) / radius
+    assert (n * hits.normals[:, inner]).sum(0).min() > 1 - 4e-6  # 0.16 degrees
+
+
+def test_hits_of_flat_things_lie_on_their_triangles():
+    rng = np.random.default_rng(4)
+    things = [box([0.5, 0.7, 0.4]), extrusion([np.array([[0, 0], [0.5, 0.1], [0.3, 0.6]])], 0.4)]
+    shapes = [s.turned(about(0, rng.uniform(0, 90))).moved([k - 0.5, 0.0, 3.0]) for k, s in enumerate(things)]
+    tracer = Tracer(shapes)
+    hits = tracer.hits(ORIGIN, rays())
+    on = hits.face >= 0
+    assert on.sum() > 500
+    assert set(np.unique(hits.body[on])) == {0, 1}
+    a, b, c = tracer.triangles(hits.face[on])
+    normal = np.cross(b - a, c - a, axis=0)
+    normal /= np.linalg.norm(normal, axis=0)
+    assert np.abs((normal * (hits.points[:, on] - a)).sum(0)).max() < 1e-9
+    assert np.isinf(hits.depth[~on]).all()
+
+
+def test_depth_goes_on_without_steps_from_triangle_to_triangle_of_a_relief():
+    u, v = np.meshgrid(np.linspace(-2, 2, 60), np.linspace(-2, 2, 60))
+    tracer = Tracer([surface(np.stack((u, v, 3 + 0.1 * np.sin(3 * u) * np.cos(2 * v)), axis=-1))])
+    depth = tracer.hits(ORIGIN, rays(192)).depth.reshape(192, 192)
+    points = depth * rays(192).reshape(3, 192, 192)
+    exact = 3 + 0.1 * np.sin(3 * points[0]) * np.cos(2 * points[1])
+    assert np.abs(points[2] - exact)[8:-8, 8:-8].max() < 4e-4  # triangles alone: 0.1 * 9 * 0.068**2 / 4 = 1e-3
+    kink = np.abs(np.diff(depth, 2, axis=1))
+    assert kink.max() < 6 * np.median(kink) + 1e-4
+
+
+def test_what_lies_between_is_found():
+    tracer = Tracer([quad([-1.0, -1.0, 1.0], [2, 0, 0], [0, 2, 0])])
+    origin = np.zeros((3, 4))
+    toward = np.array([[0.0, 0, 0, 3], [0, 0, 0, 0], [2, 0.9, -2, 2]])
+    assert tracer.blocked(origin, toward).tolist() == [True, False, False, False]
+
+
+@pytest.mark.parametrize("maker", SOLIDS, ids=lambda maker: maker.__name__)
+def test_solids_are_about_1_in_size_and_stand_on_the_ground(maker):
+    for seed in range(4):
+        shape = maker(np.random.default_rng(seed))
+        size = np.ptp(shape.vertices, axis=0)
+        assert 0.1 < size.max() < 1.7
+        assert abs(shape.vertices[:, 2].min()) < 0.16
+        np.testing.assert_allclose(np.linalg.norm(shape.normals, axis=1), 1, atol=1e-9)
+        assert shape.faces.max() < len(shape.vertices)
+
+
+def test_vertex_normals_agree_with_the_triangles():
+    parts = [any_solid(np.random.default_rng(seed)) for seed in range(12)] + [frustum(0.3, 0.1, 0.5)]
+    shape = merged([*parts, rounded_box(np.array([1.0, 0.5, 0.4]), 0.1)])
+    corners = shape.vertices[shape.faces]
+    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    area = np.linalg.norm(cross, axis=1)
+    keep = area > 1e-8
+    cosine = np.abs((cross[keep, None] / area[keep, None, None] * shape.normals[shape.faces[keep]]).sum(2))
+    assert np.average(cosine.min(1), weights=area[keep]) > 0.99
+
+
+@pytest.mark.parametrize("maker", RELIEFS, ids=lambda maker: maker.__name__)
+def test_reliefs_are_finite_and_shallow(maker):
+    shape = relief(np.random.default_rng(1), maker, 2.0, 64)
+    assert np.isfinite(shape.vertices).all()
+    assert 0.005 < np.ptp(shape.vertices[:, 2]) < 1.2
+    assert np.ptp(shape.chart[:, 2]) > 0.1
+
+
+@pytest.mark.parametrize("make", [*PAINTS, picture_paint], ids=lambda make: make.__name__)
+def test_paints_are_colours_that_do_not_depend_on_how_they_are_asked(make):
+    points, chart = np.random.default_rng(0).uniform(-1, 1, (2, 3, 500))
+    for seed in range(3):
+        paint = make(np.random.default_rng(seed), "any", 0.5)
+        colour = paint(points, chart)
+        assert colour.shape == (3, 500)
+        assert colour.min() >= 0
+        assert colour.max() < 1.4
+        np.testing.assert_allclose(paint(points[:, 100:200], chart[:, 100:200]), colour[:, 100:200], atol=1e-12)
+
+
+@pytest.mark.parametrize("draw", PICTURES, ids=lambda draw: draw.__name__)
+def test_pictures_are_not_blank(draw):
+    rng = np.random.default_rng(2)
+    assert draw(rng, palette(rng, "any", 6)).std() > 3
+
+
+@pytest.mark.parametrize(("argument", "value"), [("seed", -1), ("index", -1), ("size", 0)])
+def test_impossible_numbers_are_refused_by_name(argument, value):
+    with pytest.raises(ValueError, match=rf"{argument}: expected at least .*, got {value}"):
+        render_random_scene(**{"seed": 0, "index": 0, "size": 32} | {argument: value})

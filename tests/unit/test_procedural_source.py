@@ -1,0 +1,61 @@
+"""The procedural data set: numbered scenes, rendered once, kept in the cache."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dsr.data.procedural import render_random_scene
+from dsr.data.procedural import source as module
+from dsr.data.procedural.source import Procedural
+
+SIZE = 48
+
+
+@pytest.fixture
+def cache(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
+    monkeypatch.setenv("DSR_CACHE", str(tmp_path))
+    return tmp_path
+
+
+def test_a_scene_is_the_rendering_of_its_number(cache: Path) -> None:
+    scene = Procedural(count=3, size=SIZE, seed=5).load("00002")
+    expected = render_random_scene(5, 2, SIZE)
+    assert scene.depth is not None
+    assert np.array_equal(scene.depth[0].numpy(), expected.depth)
+    assert np.array_equal((255 * scene.rgb).round().permute(1, 2, 0).numpy(), expected.rgb)
+    assert scene.camera == expected.camera
+    assert (scene.dataset, scene.name) == ("procedural", "00002")
+
+
+def test_a_scene_is_rendered_once(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    first = Procedural(count=1, size=SIZE).load("00000")
+    monkeypatch.setattr(module, "render_random_scene", lambda *_: pytest.fail("rendered again"))
+    second = Procedural(count=1, size=SIZE).load("00000")
+    assert first.depth is not None
+    assert second.depth is not None
+    assert first.depth.equal(second.depth)
+
+
+def test_preparing_renders_what_is_missing_and_names_every_scene(cache: Path) -> None:
+    source = Procedural(count=3, size=SIZE)
+    source.load("00001")
+    assert sorted(source.prepare()) == ["00000", "00001", "00002"]
+    assert len(list(cache.rglob("*.npz"))) == 3
+    assert list(source.prepare()) == source.scenes()
+
+
+def test_seeds_and_sizes_do_not_share_scenes(cache: Path) -> None:
+    sources = [Procedural(count=1, size=SIZE), Procedural(count=1, size=SIZE, seed=1), Procedural(count=1, size=64)]
+    for source in sources:
+        source.load("00000")
+    assert len(list(cache.rglob("*.npz"))) == 3
+    assert len({source.fingerprint("00000") for source in sources}) == 3
+
+
+@pytest.mark.parametrize("wrong", [{"count": 0}, {"size": 16}, {"seed": -1}])
+def test_values_out_of_range_are_refused(wrong: dict[str, int]) -> None:
+    with pytest.raises(ValueError, match="dataset: expected count at least 1, size at least 32, seed at least 0"):
+        Procedural(**wrong)

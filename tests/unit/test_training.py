@@ -1,0 +1,335 @@
+"""The objective, the schedule and the Lightning module, against numbers worked out by hand."""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import lightning
+import numpy as np
+import pytest
+import torch
+from lightning.pytorch.callbacks import Callback
+from torch import Tensor
+from torch.utils.data import DataLoader
+
+from dsr.data.patches import Batch, Patches, PatchSettings, WholeScenes, tensors_of
+from dsr.degrade import Downsampling, make_sample
+from dsr.geometry.camera import Camera
+from dsr.methods.msg_net import MSGNet, upsample_disparity
+from dsr.quality import functional
+from dsr.quality.functional import SurfacePair
+from dsr.quality.lpips import LPIPS
+from dsr.quality.metrics import visual_metrics
+from dsr.sample import Scene
+from dsr.training import Objective, Schedule, SuperResolution, balanced_weight, depth_of
+
+BOX = Downsampling("box")
+CAMERA = Camera(width=40, height=36, fx=40.0, fy=40.0, cx=20.0, cy=18.0)
+
+pytestmark = [
+    pytest.mark.filterwarnings("ignore:.*does not have many workers.*"),
+    pytest.mark.filterwarnings("ignore:.*LeafSpec.*"),
+    pytest.mark.filterwarnings("ignore:.*smaller than the logging interval.*"),
+    pytest.mark.filterwarnings("ignore:.*have no `val_dataloader`.*"),
+]
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _one_thread() -> Iterator[None]:
+    """Small maps gain nothing from threads, and wait for each other's where other processes want the cores, too."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+def _four(value: float) -> Tensor:
+    return torch.full((1, 1, 1, 1), value, dtype=torch.float64)
+
+
+def _batch(depth: Tensor, camera: Camera, coarse: tuple[float, float]) -> Batch:
+    """Return a batch of one map whose coarse disparities span ``coarse``."""
+    return {
+        "depth": depth[None],
+        "rays": camera.rays()[None],
+        "stereo": _four((camera.baseline or 0.2) * camera.fx),
+        "doffs": _four(camera.doffs),
+        "disparity_lr": torch.tensor(coarse, dtype=torch.float64).view(1, 1, 1, 2),
+    }
+
+
+STEREO = Camera(width=13, height=12, fx=20.0, fy=25.0, cx=4.0, cy=7.0, baseline=0.5, doffs=1.0)
+
+
+def _wall() -> Batch:
+    """Return a wall at 2 m whose disparity is 0.5 * 20 / 2 - 1 = 4 pixels, of coarse ones from 3 to 5."""
+    return _batch(torch.full((1, 12, 13), 2.0, dtype=torch.float64), STEREO, (3.0, 5.0))
+
+
+def _ramp(slope: float, height: float = 4.0) -> Tensor:
+    """Return a disparity that grows by ``slope`` per column."""
+    return (height + slope * torch.arange(13, dtype=torch.float64)).expand(1, 1, 12, 13)
+
+
+@pytest.mark.parametrize("depth_loss", ["lap1", "l1", "mse"])
+def test_the_loss_is_zero_at_the_truth(depth_loss: Any) -> None:
+    depth = torch.from_numpy(np.random.default_rng(0).uniform(1, 3, (1, 12, 13)))
+    batch = _batch(depth, STEREO, (3.0, 5.0))
+    terms = Objective(depth_loss, 2.0)(0.5 * 20 / depth[None] - 1, batch)
+    assert terms.keys() == {"loss", depth_loss, "mse_v"}
+    assert all(abs(float(value)) < 1e-25 or float(value) < 1e-14 for value in terms.values())
+
+
+@pytest.mark.parametrize(("depth_loss", "expected"), [("l1", 0.25), ("lap1", 0.25), ("mse", 0.0625)])
+def test_an_offset_counts_as_its_share_of_the_coarse_range(depth_loss: Any, expected: float) -> None:
+    terms = Objective(depth_loss, 3.0)(torch.full((1, 1, 12, 13), 4.5, dtype=torch.float64), _wall())
+    assert float(terms[depth_loss]) == pytest.approx(expected, rel=1e-13)
+    assert float(terms["mse_v"]) == pytest.approx(0, abs=1e-25)  # a wall elsewhere looks the same
+    assert float(terms["loss"]) == pytest.approx(expected, rel=1e-13)
+
+
+def test_the_visual_term_is_that_of_the_angle_between_two_planes() -> None:
+    """d + doffs = a u + b is the plane a fx X + (a cx + b) Z = baseline fx; the wall's normal is the optical axis."""
+    slope = 0.3
+    along, axis = slope * 20, slope * 4 + 5
+    expected = (2 - 2 * axis / math.hypot(along, axis)) / 3
+    terms = Objective("l1", 0.5)(_ramp(slope), _wall())
+    assert float(terms["mse_v"]) == pytest.approx(expected, rel=1e-12)
+    assert float(terms["l1"]) == pytest.approx(slope * 6 / 2, rel=1e-12)
+    assert float(terms["loss"]) == pytest.approx(slope * 3 + 0.5 * expected, rel=1e-12)
+
+
+def test_without_a_weight_the_visual_term_is_left_out() -> None:
+    assert Objective("l1").w == 0
+    terms = Objective("l1")(_ramp(0.3), _wall())
+    assert terms.keys() == {"loss", "l1"}
+    assert float(terms["loss"]) == pytest.approx(0.9, rel=1e-12)
+
+
+def test_a_flat_coarse_map_has_a_span_that_is_not_zero() -> None:
+    batch = {**_wall(), "disparity_lr": torch.full((1, 1, 1, 2), 4.0, dtype=torch.float64)}
+    terms = Objective("l1")(_ramp(0, 4.001), batch)
+    assert float(terms["loss"]) == pytest.approx(0.001 / 0.004, rel=1e-9)
+
+
+def test_holes_of_the_coarse_map_do_not_widen_its_range() -> None:
+    batch = _wall()
+    batch["disparity_lr"] = torch.tensor([3.0, torch.nan, 5.0], dtype=torch.float64).view(1, 1, 1, 3)
+    assert float(Objective("l1")(_ramp(0, 4.5), batch)["loss"]) == pytest.approx(0.25, rel=1e-13)
+
+
+def test_an_unknown_depth_loss_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"model.depth_loss: expected one of lap1, l1, mse, got 'ssim'"):
+        Objective("ssim")  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("doffs", [0.0, 1.0, -2.5])
+def test_disparity_goes_back_to_the_depth_that_it_came_from(doffs: float) -> None:
+    depth = torch.from_numpy(np.random.default_rng(0).uniform(1, 3, (1, 12, 13)))
+    batch = {**_batch(depth, STEREO, (3.0, 5.0)), "doffs": _four(doffs)}
+    torch.testing.assert_close(depth_of(0.5 * 20 / depth[None] - doffs, batch), depth[None], rtol=1e-13, atol=0)
+
+
+def test_at_or_beyond_infinity_there_is_no_depth() -> None:
+    disparity = torch.tensor([[[[-1.5, -1.0, -0.5]]]], dtype=torch.float64)
+    assert depth_of(disparity, _wall())[0, 0, 0].isnan().tolist() == [True, True, False]
+    assert depth_of(disparity, _wall())[0, 0, 0, 2] == pytest.approx(20)
+
+
+# The balanced weight
+
+
+def _plane(baseline: float | None = None, doffs: float = 0.0, slope: float = 0.02, fx: float = 80.0) -> Batch:
+    """Return the tensors of the plane with d + doffs = slope u + 3, 100 columns wide."""
+    camera = Camera(width=100, height=4, fx=fx, fy=70.0, cx=40.0, cy=2.0, baseline=baseline, doffs=doffs)
+    depth = (baseline or 0.2) * fx / (3 + slope * torch.arange(100, dtype=torch.float64)).expand(1, 4, 100)
+    return tensors_of(
+        make_sample(Scene("set", "plane", torch.rand(3, 4, 100), camera, depth.clone()), 4, BOX, "disparity")
+    )
+
+
+@pytest.mark.parametrize(("baseline", "doffs", "fx"), [(None, 0.0, 80.0), (0.12, 0.0, 80.0), (0.12, 1.5, 123.0)])
+def test_the_balanced_weight_of_a_plane_is_its_closed_form(baseline: float | None, doffs: float, fx: float) -> None:
+    stereo = (baseline or 0.2) * fx
+    middle, spread = stereo / (3 + 0.02 * 50), 0.02 * 96  # the median's column; coarse centres from 1.5 to 97.5
+    tilt = math.radians(10)
+    as_disparity = (stereo / middle - stereo / (middle * (1 + 1e-6 * math.tan(tilt) / fx))) / 1e-6 / spread
+    expected = as_disparity / ((2 - 2 * math.cos(tilt)) / 3)
+    assert balanced_weight([_plane(baseline, doffs, fx=fx)]) == pytest.approx(expected, rel=2e-6)
+
+
+def test_the_balanced_weight_balances_a_tilt_between_neighbours() -> None:
+    """On a wall whose every second column stands out by tan(10 degrees) of a pixel's width, both terms weigh alike."""
+    camera = Camera(width=100, height=16, fx=80.0, fy=80.0, cx=49.5, cy=7.5)
+    wall = torch.full((1, 16, 100), 2.0, dtype=torch.float64)
+    wall[..., :4] = 2.5  # so that the coarse map has a range
+    batch = tensors_of(make_sample(Scene("set", "wall", torch.rand(3, 16, 100), camera, wall), 4, BOX, "disparity"))
+    w = balanced_weight([batch])
+    batch = {name: value[None].double() for name, value in batch.items()}
+    bumps = torch.zeros_like(batch["depth"])
+    bumps[..., 5::2] = math.tan(math.radians(10)) * 2 / 80
+    terms = Objective("l1", w)(batch["stereo"] / (batch["depth"] + bumps), batch)
+    # l1 sees every second column; MSE_v sees a tilt at every column
+    assert float(2 * terms["l1"]) == pytest.approx(float(w * terms["mse_v"]), rel=0.05)
+
+
+def test_the_balanced_weight_is_the_median_over_the_patches() -> None:
+    patches = [_plane(slope=slope) for slope in (0.01, 0.05, 0.03)]
+    assert balanced_weight(patches) == balanced_weight(patches[2:])
+
+
+def test_holes_hardly_touch_the_balanced_weight() -> None:
+    patch = _plane()
+    patch["depth"][0, :, 50] = torch.nan
+    patch["disparity_lr"][0, 0, 12] = torch.nan
+    assert balanced_weight([patch]) == pytest.approx(balanced_weight([_plane()]), rel=0.02)
+
+
+def test_the_balanced_weight_of_a_wall_is_finite() -> None:
+    assert 0 < balanced_weight([_plane(slope=0.0)]) < math.inf
+
+
+def test_a_balanced_weight_of_nothing_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"loss.w=auto: expected patches to compute it from, there is none"):
+        balanced_weight([])
+
+
+# The schedule
+
+
+def test_the_learning_rate_warms_up_evenly_and_falls_as_a_cosine_to_zero() -> None:
+    schedule = Schedule(steps=20, warmup=4)
+    assert [schedule.factor(step) for step in range(5)] == pytest.approx([0.25, 0.5, 0.75, 1, 1])
+    assert schedule.factor(12) == pytest.approx(0.5)  # halfway down
+    assert schedule.factor(8) == pytest.approx((1 + math.sqrt(0.5)) / 2)
+    assert schedule.factor(20) == schedule.factor(25) == pytest.approx(0, abs=1e-15)
+
+
+def test_there_may_be_no_warm_up_and_a_training_shorter_than_it() -> None:
+    assert Schedule(steps=10, warmup=0).factor(0) == 1
+    assert [Schedule(steps=2, warmup=4).factor(step) for step in range(2)] == [0.25, 0.5]
+
+
+@pytest.mark.parametrize("changes", [{"warmup": -1}, {"weight_decay": -0.1}, {"weight_decay": math.nan}])
+def test_a_schedule_that_cannot_be_is_refused(changes: dict[str, Any]) -> None:
+    with pytest.raises(ValueError, match=rf"trainer.{next(iter(changes))}: expected 0 or more, got"):
+        Schedule(10, **changes)
+
+
+# The module
+
+
+def _scene(seed: int, holes: float = 0.0) -> Scene:
+    """Return a wavy surface with a photo that shows its waves."""
+    random = np.random.default_rng(seed)
+    v, u = np.mgrid[:36, :40]
+    waves = np.sin(u / random.uniform(2, 4) + random.uniform(0, 6)) * np.cos(v / random.uniform(2, 4))
+    depth = torch.from_numpy(2 + 0.01 * u + 0.1 * waves)[None]
+    depth[torch.from_numpy(random.random((1, 36, 40)) < holes)] = torch.nan
+    rgb = torch.from_numpy(0.5 + 0.4 * waves).float().expand(3, 36, 40)
+    return Scene("set", f"s{seed}", rgb, CAMERA, depth)
+
+
+def _module(network: LPIPS | None = None, *, scale: int = 2, **schedule: Any) -> SuperResolution:
+    torch.manual_seed(0)
+    settings = {"steps": 30, "warmup": 1, **schedule}
+    return SuperResolution(MSGNet(scale, "dsr"), Objective("lap1", 0.1), Schedule(**settings), visual_metrics(network))
+
+
+def _trainer(folder: Path, **settings: Any) -> lightning.Trainer:
+    quiet: dict[str, Any] = dict.fromkeys(("logger", "enable_progress_bar", "enable_model_summary"), False)
+    return lightning.Trainer(
+        accelerator="cpu", default_root_dir=folder, enable_checkpointing=False, **{**quiet, **settings}
+    )
+
+
+class _Losses(Callback):
+    """What every training step returned."""
+
+    def __init__(self) -> None:
+        self.values: list[float] = []
+
+    def on_train_batch_end(self, trainer: Any, pl_module: Any, outputs: Any, *_: Any) -> None:
+        self.values.append(float(outputs["loss"]))
+
+
+def _one_batch() -> DataLoader[Batch]:
+    settings = PatchSettings(size=32, batch=2, steps=1, validation_scenes=1)
+    patches = Patches([_scene(0), _scene(1)], settings, 2, BOX, count=2)
+    return DataLoader(patches, batch_size=2)
+
+
+def test_thirty_steps_on_one_batch_bring_the_loss_down(tmp_path: Path) -> None:
+    losses, module = _Losses(), _module()
+    before = copy.deepcopy(module.net.state_dict())
+    _trainer(tmp_path, max_epochs=30, callbacks=[losses], gradient_clip_val=1.0).fit(module, _one_batch())
+    assert len(losses.values) == 30
+    assert np.mean(losses.values[-5:]) < 0.6 * losses.values[0]
+    assert all(not torch.equal(before[name], value) for name, value in module.net.state_dict().items())
+
+
+@pytest.mark.parametrize("precision", ["32-true", "bf16-mixed"])
+def test_the_training_loss_is_the_objective_of_the_networks_output_in_full_precision(
+    tmp_path: Path, precision: Any
+) -> None:
+    losses, module = _Losses(), _module()
+    [batch] = _one_batch()
+    with torch.no_grad(), torch.autocast("cpu", torch.bfloat16, enabled=precision != "32-true"):
+        disparity = upsample_disparity(module.net, batch["rgb"], batch["disparity_lr"])
+    expected = float(module.objective(disparity, batch)["loss"])
+    _trainer(tmp_path, max_steps=1, callbacks=[losses], precision=precision).fit(module, _one_batch())
+    assert losses.values == pytest.approx([expected], rel=2e-5)
+
+
+@pytest.mark.parametrize("precision", ["32-true", "bf16-mixed"])
+def test_validation_logs_the_mean_over_the_scenes_of_the_metrics_worst_light(tmp_path: Path, precision: Any) -> None:
+    module, scenes = _module(), WholeScenes([_scene(3), _scene(4, holes=0.05), _scene(5)], 2, BOX)
+    [logged] = _trainer(tmp_path, precision=precision).validate(module, DataLoader(scenes), verbose=False)
+    values: dict[str, list[float]] = {"RMSE_d": [], "RMSE_v": [], "DSSIM_v": [], "BadPix_v_5": [], "Bumpiness_d": []}
+    for i in range(3):
+        batch = {name: value[None] for name, value in scenes[i].items()}
+        with torch.no_grad(), torch.autocast("cpu", torch.bfloat16, enabled=precision != "32-true"):
+            disparity = upsample_disparity(module.net.eval(), batch["rgb"], batch["disparity_lr"]).double()
+        assert bool((disparity > 0).all())
+        pair = SurfacePair(40 * 0.2 / disparity, batch["depth"], CAMERA.rays()[None])
+        values["RMSE_d"].append(float(functional.rmse_d(pair)))
+        values["RMSE_v"].append(float(functional.rmse_v(pair)))
+        values["DSSIM_v"].append(float(functional.dssim_v(pair).amax()))
+        values["BadPix_v_5"].append(float(functional.bad_pix_v(pair, 5).amax()))
+        values["Bumpiness_d"].append(float(functional.bumpiness_d(pair)))
+    for name, each in values.items():
+        assert logged[f"val/{name}"] == pytest.approx(np.mean(each), rel=1e-4), name
+
+
+def test_a_validation_forgets_the_one_before(tmp_path: Path) -> None:
+    module, trainer = _module(), _trainer(tmp_path)
+    first, other = (DataLoader(WholeScenes([_scene(seed)], 2, BOX)) for seed in (3, 4))
+    [before] = trainer.validate(module, first, verbose=False)
+    [between] = trainer.validate(module, other, verbose=False)
+    [after] = trainer.validate(module, first, verbose=False)
+    assert before == after != between
+
+
+def test_a_checkpoint_holds_the_networks_tensors_alone_and_loads_as_plain_data(tmp_path: Path) -> None:
+    shapes = {0: (64, 3, 11, 11), 3: (192, 64, 5, 5), 6: (384, 192, 3, 3), 8: (256, 384, 3, 3), 10: (256, 256, 3, 3)}
+    trunk = {f"features.{i}.weight": 0.05 * torch.randn(shape) for i, shape in shapes.items()}
+    network = LPIPS(trunk | {f"features.{i}.bias": torch.zeros(shape[0]) for i, shape in shapes.items()})
+    module, trainer = _module(network), _trainer(tmp_path, max_steps=1)
+    loader = DataLoader(WholeScenes([_scene(3)], 2, BOX))
+    trainer.fit(module, _one_batch(), loader)
+    assert math.isfinite(trainer.callback_metrics["val/LPIPS_v"])
+    trainer.save_checkpoint(tmp_path / "a.ckpt")
+    content = torch.load(tmp_path / "a.ckpt", weights_only=True)
+    assert content["state_dict"].keys() == {f"net.{name}" for name in module.net.state_dict()}
+    assert content["global_step"] == 1
+    size = sum(value.numel() for value in module.net.parameters())
+    assert (tmp_path / "a.ckpt").stat().st_size < 4 * 3 * size + 200_000  # weights and AdamW's two moments
+
+
+def test_a_network_that_leaves_out_pixels_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"model.variant: expected one that covers the whole image, got hui"):
+        SuperResolution(MSGNet(4, "hui"), Objective(), Schedule(10), visual_metrics())
