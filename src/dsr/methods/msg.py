@@ -43,8 +43,8 @@ class MSG:
     def __call__(self, sample: DepthSample) -> Tensor:
         """Return the fine orthogonal depth, (1, H, W) in metres on the sample's device.
 
-        NaN where the network's disparity is not positive; for the ``hui`` variant also in the last row and column,
-        which it does not cover.
+        NaN where the network's disparity lies at or beyond infinity; for the ``hui`` variant also in the last row and
+        column, which it does not cover.
         """
         if sample.scale != self.net.scale:
             raise ValueError(f"{sample.scene}: expected scale {self.net.scale}, the network's, got {sample.scale}")
@@ -53,7 +53,6 @@ class MSG:
         fine = upsample_disparity(self.net, rgb, coarse)[0]
         missing = (sample.camera.width - fine.shape[-1], sample.camera.height - fine.shape[-2])
         fine = functional.pad(fine, (0, missing[0], 0, missing[1]), value=torch.nan)
-        fine = torch.where(fine > 0, fine, torch.nan)
         return from_range(fine, sample.camera, "disparity").to(sample.depth_lr.device)
 
 
