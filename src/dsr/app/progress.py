@@ -44,7 +44,7 @@ class TrainingBar(ProgressBar):
 
     def __init__(self, console: Console) -> None:
         super().__init__()
-        self._console, self._bar = console, bar(console)
+        self._bar = bar(console)
         self._task: Any = None
 
     def on_train_start(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
