@@ -19,9 +19,9 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from dsr.methods.msg import MSG
 from dsr.methods.msg_net import MSGNet, upsample_disparity
-from dsr.methods.weights import load_msg_weights
+from dsr.methods.network import NetworkUpsampler
+from dsr.methods.published import load_msg_weights
 
 SCALE = 4
 TARGETS = {"float32": 3.0, "bfloat16": 8.0}
@@ -41,7 +41,7 @@ def scene(size: int) -> tuple[Tensor, Tensor]:
 def ways(net: MSGNet, size: int) -> dict[str, Callable[[], Tensor]]:
     """Return the plain way first, then the measures one by one, each on top of those before."""
     rgb, disparity = scene(size)
-    float32, bfloat16 = MSG(net).net, MSG(net, "bfloat16").net
+    float32, bfloat16 = NetworkUpsampler(net).net, NetworkUpsampler(net, "bfloat16").net
     plain = copy.deepcopy(net).eval()
 
     def run(net: MSGNet, *, crop: bool, inference: bool) -> Callable[[], Tensor]:

@@ -13,6 +13,8 @@ Where a kernel would reach over the border it is cut and normalised.
 
 from __future__ import annotations
 
+import functools
+import hashlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal, get_args
@@ -141,7 +143,53 @@ class Measured:
     """The stand-in for a downsampling model where the scene brings a coarse map that a sensor measured."""
 
 
-def make_sample(scene: Scene, scale: int, downsampling: Downsampling | Measured, range_type: RangeType) -> DepthSample:
+@dataclass(frozen=True)
+class GaussianMultiplicative:
+    """Noise of the coarse map: values times 1 + std N(0, 1), in the range type that is averaged (Voynov et al. 2019).
+
+    Args:
+        std: of the factor.
+
+    Raises:
+        ValueError: it is not between 0 and 1.
+
+    """
+
+    std: float
+
+    def __post_init__(self) -> None:
+        """Check the value."""
+        if not 0 < self.std < 1:
+            raise ValueError(f"noise.std: expected a number above 0 and below 1, got {self.std}")
+
+    def __call__(self, values: Tensor, generator: torch.Generator) -> Tensor:
+        """Return noisy values; drawn on the CPU in float64, so the same on every device. NaN stays NaN."""
+        draws = torch.randn(values.shape, generator=generator, dtype=torch.float64)
+        return values * (1 + self.std * draws).to(values)
+
+
+Noise = GaussianMultiplicative | None
+
+
+def no_noise() -> None:
+    """Return no noise; what ``noise=none`` names."""
+    return
+
+
+def scene_generator(seed: int, *names: str | int) -> torch.Generator:
+    """Return a generator that is a pure function of a seed and of names."""
+    digest = hashlib.sha256(repr((seed, *names)).encode()).digest()
+    return torch.Generator().manual_seed(int.from_bytes(digest[:8], "little") >> 1)
+
+
+def make_sample(
+    scene: Scene,
+    scale: int,
+    downsampling: Downsampling | Measured,
+    range_type: RangeType,
+    noise: Noise = None,
+    generator: torch.Generator | int = 0,
+) -> DepthSample:
     """Return the super-resolution problem that a scene poses.
 
     A size that the scale does not divide is cropped at the bottom and the right, and the sample's notes say so.
@@ -151,6 +199,8 @@ def make_sample(scene: Scene, scale: int, downsampling: Downsampling | Measured,
         scale: the upsampling factor, one of 2, 4, 8, 16.
         downsampling: the model, or :class:`Measured` for the scene's own coarse map.
         range_type: the type that the method works on.
+        noise: of the coarse map, unless it is measured.
+        generator: of the noise, or a seed that gives each scene its own.
 
     Raises:
         ValueError: the scene lacks what the problem needs, or a value is out of range.
@@ -162,7 +212,10 @@ def make_sample(scene: Scene, scale: int, downsampling: Downsampling | Measured,
     if isinstance(downsampling, Measured):
         coarse, coarse_camera = _measured(scene, scale), scene.camera.coarser(scale)
     else:
-        coarse, coarse_camera = _downsampled(scene, scale, downsampling, downsampling.range_type or range_type)
+        if isinstance(generator, int):
+            generator = scene_generator(generator, scene.dataset, scene.name, scale)
+        noisy = None if noise is None else functools.partial(noise, generator=generator)
+        coarse, coarse_camera = _downsampled(scene, scale, downsampling, downsampling.range_type or range_type, noisy)
     return DepthSample(
         scene.dataset, scene.name, scene.rgb, coarse, scene.camera, coarse_camera, scale, scene.depth, notes
     )
@@ -186,15 +239,22 @@ def _divisible(scene: Scene, scale: int) -> tuple[Scene, tuple[str, ...]]:
     return cropped, (f"cropped from {before} to {height} x {width}, which {scale} divides",)
 
 
-def _downsampled(scene: Scene, scale: int, downsampling: Downsampling, range_type: RangeType) -> tuple[Tensor, Camera]:
-    """Return the coarse depth that the model makes of the fine one, and its camera."""
+def _downsampled(
+    scene: Scene,
+    scale: int,
+    downsampling: Downsampling,
+    range_type: RangeType,
+    noise: Callable[[Tensor], Tensor] | None,
+) -> tuple[Tensor, Camera]:
+    """Return the coarse depth that the model and the noise make of the fine one, and its camera."""
     if scene.depth is None:
         raise ValueError(f"{scene.name}: expected a fine depth map to downsample, there is none")
     camera = downsampling.camera(scene.camera, scale)
     fine = to_range(scene.depth, scene.camera, range_type)
     if range_type == "disparity":  # in the coarse camera's pixels
         fine = fine / scale
-    coarse = from_range(downsampling(fine, scale), camera, range_type)
+    values = downsampling(fine, scale)
+    coarse = from_range(values if noise is None else noise(values), camera, range_type)
     return torch.where(coarse > 0, coarse, torch.nan), camera  # bicubic may undershoot beside a depth step
 
 

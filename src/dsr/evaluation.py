@@ -22,7 +22,7 @@ from torch import Tensor
 
 from dsr.atomic import read_arrays, replacing, write_text
 from dsr.data.base import SceneSource
-from dsr.degrade import Downsampling, Measured, make_sample
+from dsr.degrade import Downsampling, Measured, Noise, make_sample
 from dsr.methods.base import Upsampler
 from dsr.quality.scores import WORST, Metric, score_image
 from dsr.sample import DepthSample
@@ -63,6 +63,7 @@ class Study:
         seed: of whatever is random.
         config: all that the predictions depend on besides the scene, as plain values; stored with each.
         device: where predictions and scores are computed.
+        noise: of the coarse maps.
 
     """
 
@@ -75,6 +76,7 @@ class Study:
     seed: int
     config: Mapping[str, Any]
     device: torch.device = field(default=torch.device("cpu"))
+    noise: Noise = None
 
     def sample(self, scene: str) -> DepthSample:
         """Return the problem that a scene poses.
@@ -83,7 +85,8 @@ class Study:
             ValueError: the scene's files are not as they should be.
 
         """
-        return make_sample(self.source.load(scene), self.scale, self.downsampling, self.method.range_type)
+        loaded = self.source.load(scene)
+        return make_sample(loaded, self.scale, self.downsampling, self.method.range_type, self.noise, self.seed)
 
     def stored_config(self, scene: str) -> dict[str, Any]:
         """Return what a prediction of this scene depends on."""

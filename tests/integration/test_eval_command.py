@@ -319,7 +319,9 @@ USAGE_ERRORS = {
     "no scene at all": (["dataset.scenes=[]"], "dataset.scenes: expected names, each once, or null for all"),
     "a scene twice": (["dataset.scenes=[statue,statue]"], "dataset.scenes: expected names, each once"),
     "a scene without a list": (["dataset.scenes=statue"], "dataset.scenes: expected a list of text or null, got"),
-    "no weights": (["method=msg_v"], "weights: method=msg_v needs weights=FILE, or a directory with msg_v_x4_clean"),
+    "no weights": (["method=msg_v", "scale=16"], "weights: dsr comes with "),
+    "a mixture": (["dataset=mixture"], "dataset=mixture: several data sets are for training; name one of them"),
+    "a noise that cannot be": (["noise=gaussian_multiplicative", "noise.std=2"], "noise.std: expected a number above"),
     "missing weights": (["method=msg_v", "weights=no.pth"], "weights: expected a file of weights for method=msg_v"),
     "a directory without": (["method=msg", "weights=empty"], "weights: expected a file of weights for method=msg, got"),
     "foreign weights": (["method=msg_v", "weights=file"], "file: expected "),
@@ -358,7 +360,7 @@ def test_a_usage_error_of_the_real_command_is_one_line_too(tmp_path, offline):
 def test_the_help_lists_the_choices(within):
     code, output, errors = within("--help")
     assert (code, errors) == (0, [])
-    for line in ("dataset: folder, procedural, simgeo", "method: bicubic, bilinear, msg, msg_v, nearest"):
+    for line in ("dataset: folder, mixture, procedural, simgeo", "method: bicubic, bilinear, facets, msg, msg_v"):
         assert line in output
 
 

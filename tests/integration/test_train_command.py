@@ -1,5 +1,6 @@
 """The real ``python train.py``: what it writes, logs and refuses, and how it goes on after an interruption."""
 
+import contextlib
 import csv
 import json
 import os
@@ -18,13 +19,18 @@ from safetensors.torch import load_file
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 import dsr.app.train as command
+import dsr.app.trainer as trainer_module
 from dsr.app.entry import run_command
 from dsr.app.evaluate import evaluate
+from dsr.training import SuperResolution
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 SMOKE = ("trainer=smoke", "dataset=simgeo", "dataset.size=64", "metrics.lpips=false", "device=cpu")
 FOUR = (*SMOKE, "trainer.steps=4", "trainer.validate_every=2", "output_dir=out")
-INTERRUPTED = "interrupted; what is finished is kept, the same command goes on from there"
+
+
+def interrupted(step, home="out"):
+    return f"interrupted at step {step}; python train.py resume={home} goes on from there"
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -79,7 +85,7 @@ def within(monkeypatch, tmp_path, capfd):
 @pytest.fixture
 def interrupt(monkeypatch):
     """Return a function after which trainings are interrupted when they are about to do a step; None: not."""
-    bar = command.TrainingBar
+    bar = trainer_module.TrainingBar
 
     def at(step):
         class Interrupting(bar):
@@ -87,7 +93,7 @@ def interrupt(monkeypatch):
                 if trainer.global_step == step:
                     raise KeyboardInterrupt
 
-        monkeypatch.setattr(command, "TrainingBar", Interrupting)
+        monkeypatch.setattr(trainer_module, "TrainingBar", Interrupting if step is not None else bar)
 
     return at
 
@@ -121,14 +127,15 @@ def validated(output):
 def test_a_training_says_what_it_does_and_where_the_weights_are(smoke):
     _, home, done = smoke
     lines = done.stdout.splitlines()
-    assert lines[0] == "model  msg_v x4, 326,015 parameters"
-    assert lines[1] == "data   5 scenes of simgeo to train on, 1 to validate with"
-    assert re.fullmatch(r"loss   lap1 \+ 0\.\d+ MSE_v", lines[2])
+    assert re.fullmatch(r"model  msg_v x4, 326,015 parameters, (float32|bfloat16)", lines[0])
+    assert lines[1] == "data   5 scenes of simgeo to train on, 1 of simgeo to validate with"
+    assert re.fullmatch(r"loss   lap1 \+ \d\.\d+ MSE_v", lines[2])
     assert lines[3] == "steps  2 of 2 patches of 32 x 32"
-    assert lines[4] == f"log    tensorboard --logdir outputs/train/{home.name}"
+    assert re.fullmatch(r"time   about \d+ s \(\S+ s a step as measured now\), and the validations", lines[4])
+    assert lines[5] == f"log    tensorboard --logdir outputs/train/{home.name}"
     assert validated(done.stdout) == [1, 2]
-    assert "RMSE_v 0." in lines[5]
-    assert lines[7:] == [f"weights: outputs/train/{home.name}/weights.safetensors"]
+    assert "RMSE_v 0." in lines[6]
+    assert lines[8:] == [f"weights: outputs/train/{home.name}/weights.safetensors"]
 
 
 def test_a_training_warns_of_nothing(smoke):
@@ -141,7 +148,8 @@ def test_a_training_writes_everything_that_is_promised_and_nothing_else(smoke):
     [events] = (home / "tensorboard").glob("events.*")
     assert tree(home) == [
         "checkpoints/best.ckpt", "checkpoints/last.ckpt", "config.yaml",
-        f"tensorboard/{events.name}", "tensorboard/hparams.yaml", "versions.json", "weights.safetensors",
+        f"tensorboard/{events.name}", "tensorboard/hparams.yaml", "validation.csv", "versions.json",
+        "weights.safetensors",
     ]  # fmt: skip
     assert [path.name for path in folder.iterdir()] == ["outputs"]
 
@@ -178,9 +186,9 @@ def test_the_log_has_losses_scores_rates_renderings_and_the_configuration(smoke)
     for tag in ("val/RMSE_v", "val/DSSIM_v", "train/loss"):
         assert all(0 < value < 5 for value in scalars_of(home, tag).values())
     assert list(scalars_of(home, "lr-AdamW").values()) == pytest.approx([1e-3, 1e-3])
-    assert tags["images"] == ["renderings/0"]
-    image = events.Images("renderings/0")[0]
-    assert (image.height, image.width) == (128, 256)
+    assert tags["images"] == ["renderings/simgeo_0"]
+    image = events.Images("renderings/simgeo_0")[0]
+    assert (image.height, image.width) == (192, 256)
     [text] = events.Tensors("config/text_summary")
     assert "validation_scenes: 1" in text.tensor_proto.string_val[0].decode()
 
@@ -304,10 +312,10 @@ def test_mixed_precision_trains_with_losses_as_in_full_precision(smoke, tmp_path
 USAGE_ERRORS = {
     "a weight that is none": (["loss.w=abc"], "loss.w: expected auto or a number, 0 or more, got 'abc'"),
     "a negative weight": (["loss.w=-1"], "loss.w: expected auto or a number, 0 or more, got -1"),
-    "a mistyped model": (["model=foo"], "model=foo: unknown; expected one of msg, msg_v"),
+    "a mistyped model": (["model=foo"], "model=foo: unknown; expected one of facets, msg, msg_v"),
     "a model taken away": (["~model"], "model: missing; give it as model=..."),
     "a mistyped loss": (["model.depth_loss=l3"], "model.depth_loss: expected one of lap1, l1, mse, got 'l3'"),
-    "a network that leaves out pixels": (["model.variant=hui"], "model.variant: expected one that covers the whole"),
+    "a network that leaves out pixels": (["model.variant=hui"], "model: expected a network that covers the whole"),
     "a patch the scale does not divide": (["trainer.patch=30"], "trainer.patch: expected a size that scale=4 divides"),
     "a patch larger than a scene": (["trainer.patch=128"], "trainer.patch: expected at most cube_high_freq's 64 x 64"),
     "a patch too small": (["trainer.patch=8"], "trainer.patch: expected at least 16 pixels, got 8"),
@@ -321,7 +329,7 @@ USAGE_ERRORS = {
     "a measured map": (["downsampling=measured"], "downsampling: training needs a model such as box, measured is none"),
     "a scale": (["scale=3"], "scale: expected one of 2, 4, 8, 16, got 3"),
     "a seed": (["seed=99999999999"], "seed: expected at most 4294967295, got 99999999999"),
-    "a precision": (["precision=half"], "precision: expected one of float32, bfloat16, got half"),
+    "a precision": (["precision=half"], "precision: expected one of float32, bfloat16, auto, got half"),
     "a foreign directory": (["output_dir=foreign"], "output_dir: foreign holds files of something else"),
     "a file as directory": (["output_dir=file"], "output_dir: expected a directory, file is a file"),
 }  # fmt: skip
@@ -344,7 +352,7 @@ def test_a_usage_error_is_one_line_with_exit_code_2_and_writes_nothing(tmp_path,
 def test_the_help_lists_the_choices(within):
     code, output, errors = within("--help")
     assert (code, errors) == (0, [])
-    for line in ("model: msg, msg_v", "trainer: default, smoke"):
+    for line in ("model: facets, msg, msg_v", "trainer: default, full, smoke", "noise: gaussian_multiplicative, none"):
         assert line in output
 
 
@@ -356,7 +364,7 @@ def test_an_interrupted_training_goes_on_to_the_very_weights_of_an_uninterrupted
     for step, reached in ((3, 2), (2, 2)):  # within an epoch, then right where it went on
         interrupt(step)
         code, output, errors = within(*FOUR)
-        assert (code, errors) == (130, [INTERRUPTED])
+        assert (code, errors) == (130, [interrupted(step)])
         assert not (tmp_path / "out" / "weights.safetensors").exists()
         assert last_step(tmp_path / "out") == reached
     assert signal.getsignal(signal.SIGINT) is handler
@@ -374,13 +382,13 @@ def test_a_training_goes_on_from_its_last_validation_even_if_that_was_not_its_be
     tmp_path, within, interrupt, monkeypatch
 ):
     scores = iter([0.1, 0.2, 0.3])
-    end = command.SuperResolution.on_validation_epoch_end
+    end = SuperResolution.on_validation_epoch_end
 
     def worse(self):
         end(self)
         self.log("val/RMSE_v", next(scores))
 
-    monkeypatch.setattr(command.SuperResolution, "on_validation_epoch_end", worse)
+    monkeypatch.setattr(SuperResolution, "on_validation_epoch_end", worse)
     interrupt(2)
     arguments = (*SMOKE, "trainer.steps=3", "output_dir=out")
     assert within(*arguments)[0] == 130
@@ -391,7 +399,7 @@ def test_a_training_goes_on_from_its_last_validation_even_if_that_was_not_its_be
     best = torch.load(tmp_path / "out" / "checkpoints" / "best.ckpt", weights_only=True)
     assert best["global_step"] == 1
     weights = load_file(tmp_path / "out" / "weights.safetensors")
-    assert all(torch.equal(value, best["state_dict"][f"net.{name}"]) for name, value in weights.items())
+    assert all(torch.equal(value, best["state_dict"][f"average.{name}"]) for name, value in weights.items())
 
 
 def test_a_training_that_lacks_only_its_weights_file_gets_it(smoke, tmp_path, within):
@@ -404,19 +412,207 @@ def test_a_training_that_lacks_only_its_weights_file_gets_it(smoke, tmp_path, wi
     assert same_weights(tmp_path / "out", smoke[1])
 
 
-def test_ctrl_c_exits_with_130_and_one_line_that_says_how_to_go_on(tmp_path, environment):
-    arguments = (*SMOKE, "trainer.steps=500", "output_dir=out")
+@contextlib.contextmanager
+def running(tmp_path, environment, *arguments):
+    """Run a training of many steps in a process of its own; yield it once there is something to go on from."""
     with subprocess.Popen(
-        [sys.executable, str(REPOSITORY / "train.py"), *arguments],
+        [sys.executable, str(REPOSITORY / "train.py"), *SMOKE, "output_dir=out", *arguments],
         cwd=tmp_path, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
     ) as process:  # fmt: skip
         deadline = time.monotonic() + 60
         last = tmp_path / "out" / "checkpoints" / "last.ckpt"
         while not last.exists() and process.poll() is None and time.monotonic() < deadline:
             time.sleep(0.02)
-        process.send_signal(signal.SIGINT)
+        yield process
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_an_interruption_exits_with_130_saves_the_very_step_and_says_how_to_go_on(tmp_path, environment, number):
+    with running(tmp_path, environment, "trainer.steps=500", "trainer.validate_every=3") as process:
+        process.send_signal(number)
         _, errors = process.communicate(timeout=60)
     assert process.returncode == 130
-    assert errors == f"{INTERRUPTED}\n"
     assert not (tmp_path / "out" / "weights.safetensors").exists()
-    assert 1 <= last_step(tmp_path / "out") < 500
+    step = last_step(tmp_path / "out")
+    assert 3 <= step < 500
+    assert errors == f"{interrupted(step)}\n"
+
+
+def test_resume_goes_on_from_any_step_to_the_very_weights_of_an_uninterrupted_run(
+    tmp_path, within, monkeypatch, interrupt
+):
+    arguments = (*SMOKE, "trainer.steps=6", "trainer.validate_every=2", "trainer.accumulate=2")
+    assert within(*arguments, "output_dir=whole")[0] == 0
+    end = trainer_module.Interruption.on_train_batch_end
+
+    def stop(self, trainer, *rest):
+        self._wanted = trainer.global_step == 3
+        end(self, trainer, *rest)
+
+    monkeypatch.setattr(trainer_module.Interruption, "on_train_batch_end", stop)
+    code, _, errors = within(*arguments, "output_dir=out")
+    assert (code, errors) == (130, [interrupted(3)])
+    assert last_step(tmp_path / "out") == 3
+    monkeypatch.setattr(trainer_module.Interruption, "on_train_batch_end", end)
+    code, output, errors = within("resume=out")
+    assert (code, errors) == (0, [])
+    assert "resumed" in output
+    assert validated(output) == [4, 6]
+    assert same_weights(tmp_path / "out", tmp_path / "whole")
+    assert (tmp_path / "out" / "validation.csv").read_text() == (tmp_path / "whole" / "validation.csv").read_text()
+    for tag in ("val/RMSE_v", "lr-AdamW"):
+        assert scalars_of(tmp_path / "out", tag) == scalars_of(tmp_path / "whole", tag), tag
+
+
+def test_a_killed_run_goes_on_to_the_very_weights_of_an_uninterrupted_one(tmp_path, within, environment):
+    many = ("trainer.steps=24", "trainer.validate_every=4")
+    with running(tmp_path, environment, *many) as process:
+        process.kill()
+    assert process.returncode == -signal.SIGKILL
+    assert not (tmp_path / "out" / "weights.safetensors").exists()
+    code, output, errors = within("resume=out")
+    assert (code, errors) == (0, [])
+    assert "resumed" in output
+    assert within(*SMOKE, *many, "output_dir=whole")[0] == 0
+    assert same_weights(tmp_path / "out", tmp_path / "whole")
+    assert (tmp_path / "out" / "validation.csv").read_text() == (tmp_path / "whole" / "validation.csv").read_text()
+
+
+def test_resume_takes_the_runs_own_configuration_alone(smoke, tmp_path, within):
+    code, _, errors = within("resume=nowhere")
+    assert (code, errors) == (
+        2, ["error: nowhere: expected the directory of a training, it has no readable config.yaml"],
+    )  # fmt: skip
+    code, _, errors = within(f"resume='{smoke[1]}'", "trainer.steps=5", "scale=2")
+    assert (code, errors) == (
+        2, ["error: resume: goes on under the run's own configuration; trainer.steps, scale cannot be changed"],
+    )  # fmt: skip
+    code, _, errors = within(f"resume='{smoke[1]}'")
+    assert code == 2
+    assert errors[0].endswith("is trained already; overwrite=true trains it anew")
+
+
+def validation_of(home):
+    """Return the scores of the last validation, by set and metric, to the last digit."""
+    with (home / "validation.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    return {(row["set"], row["metric"]): float(row["value"]) for row in rows if row["step"] == rows[-1]["step"]}
+
+
+def means_of(folder):
+    return json.loads((folder / "summary.json").read_text())["mean"]
+
+
+def test_evaluating_a_run_gives_the_very_scores_that_training_logged(tmp_path, within):
+    code, _, errors = within(
+        *SMOKE, "trainer.validate_every=2", "trainer.validation_scenes=2", "output_dir=out",
+        "noise=gaussian_multiplicative", "noise.std=0.01", "seed=3",
+    )  # fmt: skip
+    assert (code, errors) == (0, [])
+    code, output, errors = within("run=out", "metrics.lpips=false", "output_dir=scores", name="eval")
+    assert (code, errors) == (0, [])
+    assert "cube_high_freq" not in output  # trained on
+    logged = {metric: value for (kind, metric), value in validation_of(tmp_path / "out").items() if kind == "val"}
+    means = means_of(tmp_path / "scores")
+    assert len(means) > 10
+    assert means == pytest.approx(logged, rel=1e-14)
+    with (tmp_path / "scores" / "scores.csv").open(newline="") as file:
+        assert {row["downsampling"] for row in csv.DictReader(file)} == {"box+gaussian_multiplicative-0.01"}
+
+
+def test_evaluating_a_run_on_another_data_set_keeps_its_problem(smoke, tmp_path, within):
+    code, _, errors = within(
+        f"run='{smoke[1]}'", "dataset=procedural", "dataset.count=1", "dataset.size=64", "metrics.lpips=false",
+        "output_dir=scores", name="eval",
+    )  # fmt: skip
+    assert (code, errors) == (0, [])
+    assert json.loads((tmp_path / "scores" / "summary.json").read_text())["dataset"] == "procedural"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["run=nowhere"], "nowhere: expected the directory of a training, it has no readable config.yaml"),
+        (["run={run}", "method=bicubic"], "method: run={run} says it itself; leave one of them out"),
+        (["run={run}", "scale=8"], "scale: run={run} says it itself; leave one of them out"),
+    ],
+)
+def test_a_run_that_cannot_be_evaluated_is_refused(smoke, tmp_path, within, arguments, message):
+    run = tmp_path / "run"
+    shutil.copytree(smoke[1], run)
+    code, output, errors = within(*(each.format(run=run) for each in arguments), "metrics.lpips=false", name="eval")
+    assert (code, output, errors) == (2, "", [f"error: {message.format(run=run)}"])
+
+
+def test_an_unfinished_run_cannot_be_evaluated(tmp_path, within, interrupt):
+    interrupt(1)
+    assert within(*SMOKE, "output_dir=out")[0] == 130
+    code, _, errors = within("run=out", "metrics.lpips=false", name="eval")
+    assert (code, errors) == (2, ["error: run: out has no weights.safetensors; the training is not finished"])
+
+
+def test_mixtures_train_on_all_parts_and_validate_with_each(tmp_path, within):
+    code, output, errors = within(
+        "trainer=smoke", "trainer.validate_every=2", "metrics.lpips=false", "device=cpu", "output_dir=out",
+        "dataset=mixture",
+        "dataset.parts.procedural.count=2", "dataset.parts.procedural.size=64",
+        "~dataset.parts.folder", "~dataset.shares.folder",
+        "+dataset@dataset.parts.geo=simgeo", "dataset.parts.geo.size=64", "+dataset.shares.geo=0.5",
+    )  # fmt: skip
+    assert (code, errors) == (0, [])
+    assert "data   6 scenes of mixture to train on, 1 of procedural, 1 of simgeo to validate with" in output
+    scores = validation_of(tmp_path / "out")
+    assert {kind for kind, _ in scores} == {"val", "val_procedural", "val_simgeo"}
+    mean = (scores["val_procedural", "RMSE_v"] + scores["val_simgeo", "RMSE_v"]) / 2
+    assert scores["val", "RMSE_v"] == pytest.approx(mean, rel=1e-12)
+    tags = events_of(tmp_path / "out").Tags()
+    assert {"val/RMSE_v", "val_procedural/RMSE_v", "val_simgeo/DSSIM_v"} <= set(tags["scalars"])
+    assert {"renderings/procedural_0", "renderings/simgeo_0"} <= set(tags["images"])
+    code, _, errors = within("run=out", "metrics.lpips=false", "output_dir=scores", name="eval")
+    assert (code, errors) == (0, [])
+    for kind in ("procedural", "simgeo"):
+        assert means_of(tmp_path / "scores" / kind)["RMSE_v"] == pytest.approx(scores[f"val_{kind}", "RMSE_v"], 1e-14)
+
+
+def test_another_data_set_validates_beside_the_held_out_scenes(tmp_path, within):
+    code, output, errors = within(
+        *SMOKE, "output_dir=out", "+dataset@validation.mine=procedural", "validation.mine.count=1",
+        "validation.mine.size=64",
+    )  # fmt: skip
+    assert (code, errors) == (0, [])
+    assert "1 of simgeo, 1 of mine to validate with" in output
+    assert ("val_mine", "DSSIM_v") in validation_of(tmp_path / "out")
+
+
+def test_a_training_starts_from_given_weights(smoke, tmp_path, within):
+    weights = smoke[1] / "weights.safetensors"
+    rate = "trainer.learning_rate=1e-12"
+    code, _, errors = within(*SMOKE, f"trainer.init='{weights}'", rate, "output_dir=out")
+    assert (code, errors) == (0, [])
+    one, other = (load_file(folder / "weights.safetensors") for folder in (smoke[1], tmp_path / "out"))
+    assert all(torch.allclose(one[name], other[name], atol=1e-6) for name in one)
+    code, _, errors = within(*SMOKE, f"trainer.init='{weights}'", "model=facets", "output_dir=other")
+    assert code == 2
+    assert "expected weights of Facets" in errors[0]
+    code, _, errors = within(*SMOKE, "trainer.init=nowhere", "output_dir=other")
+    assert (code, errors) == (2, ["error: trainer.init: nowhere: no such weights file"])
+
+
+def test_facets_train_and_their_weights_are_those_of_method_facets(tmp_path, within):
+    code, output, errors = within(*SMOKE, "model=facets", "model.width=8", "model.blocks=1", "output_dir=out")
+    assert (code, errors) == (0, [])
+    assert output.startswith("model  facets x4")
+    code, _, errors = within(
+        "method=facets", "weights=out/weights.safetensors", "dataset.size=64", "dataset.scenes=[statue]",
+        "metrics.lpips=false", "output_dir=scores", name="eval",
+    )  # fmt: skip
+    assert (code, errors) == (0, [])
+
+
+def test_the_table_of_runs_has_the_settings_and_the_scores(smoke):
+    hparams = yaml.safe_load((smoke[1] / "tensorboard" / "hparams.yaml").read_text())
+    assert (hparams["model"], hparams["scale"], hparams["steps"], hparams["loss"]) == ("msg_v", 4, 2, "lap1")
+    assert hparams["w"] > 0
+    scalars = events_of(smoke[1]).Tags()["scalars"]
+    assert {"last/RMSE_v", "train/gradient_norm", "train/patches_per_second"} <= set(scalars)
+    assert min(scalars_of(smoke[1], "train/patches_per_second").values()) > 0

@@ -186,3 +186,17 @@ def test_an_unknown_range_type_is_refused() -> None:
     for convert in (to_range, from_range):
         with pytest.raises(ValueError, match="range_type: expected one of orthogonal, perspective, disparity"):
             convert(_depth(CAMERA), CAMERA, "inverse")  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("turns", [-1, 0, 1, 2, 3, 5])
+def test_a_turned_cameras_rays_are_the_turned_rays(turns: int) -> None:
+    camera = Camera(width=7, height=5, fx=6.0, fy=8.0, cx=2.3, cy=1.9, baseline=0.1, doffs=0.5)
+    rays = camera.rays().rot90(turns, (-2, -1))
+    x, y = rays[0], rays[1]
+    for _ in range(turns % 4):
+        x, y = y, -x  # counterclockwise: what pointed down points right, what pointed right points up
+    expected = torch.stack((x, y, rays[2]))
+    turned = camera.rotate90(turns)
+    assert (turned.height, turned.width) == tuple(expected.shape[-2:])
+    torch.testing.assert_close(turned.rays(), expected, rtol=0, atol=1e-12)
+    assert (turned.baseline, turned.doffs) == (0.1, 0.5)

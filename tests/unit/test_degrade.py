@@ -12,7 +12,7 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from dsr.degrade import SCALES, Downsampling, Kernel, Measured, make_sample
+from dsr.degrade import SCALES, Downsampling, GaussianMultiplicative, Kernel, Measured, make_sample, no_noise
 from dsr.geometry.camera import RANGE_TYPES, Camera, RangeType, to_range
 from dsr.sample import DepthSample, Scene
 
@@ -357,3 +357,78 @@ def test_a_measured_map_of_a_size_that_the_scale_does_not_divide_is_that_of_the_
     assert sample.camera == camera.crop(0, 0, 20, 20)
     assert sample.camera_lr == camera.crop(0, 0, 20, 20).rescale(5, 5)
     assert sample.notes == ("cropped from 21 x 23 to 20 x 20, which 4 divides",)
+
+
+# Noise
+
+
+def _wall(name: str = "hall", dataset: str = "set") -> Scene:
+    depth = torch.full((1, 320, 480), 2.0, dtype=torch.float64)
+    return Scene(dataset, name, torch.rand(3, 320, 480), Camera(480, 320, 60.0, 55.0, 240.0, 160.0), depth)
+
+
+BOX4: dict[str, Any] = {"scale": 4, "downsampling": Downsampling("box")}
+
+
+@pytest.mark.parametrize("range_type", RANGE_TYPES)
+def test_noise_multiplies_the_coarse_values_of_the_methods_range_type(range_type: RangeType) -> None:
+    noise = GaussianMultiplicative(0.02)
+    noisy, clean = (make_sample(_wall(), **BOX4, range_type=range_type, noise=each) for each in (noise, None))
+    one, other = (to_range(each.depth_lr, each.camera_lr, range_type) for each in (noisy, clean))
+    factors = (one / other).flatten()
+    assert float(factors.mean()) == pytest.approx(1, abs=1e-3)
+    assert float(factors.std()) == pytest.approx(0.02, rel=0.03)
+    spread = ((factors - 1) / 0.02).sort().values
+    assert [float(spread[int(len(spread) * share)]) for share in (0.159, 0.5, 0.841)] == pytest.approx(
+        [-1, 0, 1], abs=0.05
+    )
+    assert noisy.depth is not None
+    assert torch.equal(noisy.depth, clean.depth)  # type: ignore[arg-type]
+
+
+def test_noise_is_the_scenes_own_and_a_function_of_seed_names_and_scale() -> None:
+    def coarse(scene: Scene, seed: int = 0, scale: int = 4) -> Tensor:
+        noise = GaussianMultiplicative(0.01)
+        return make_sample(scene, scale, Downsampling("box"), "disparity", noise, seed).depth_lr.flatten()[:300]
+
+    first = coarse(_wall())
+    assert torch.equal(first, coarse(_wall()))
+    for other in (coarse(_wall("attic")), coarse(_wall(dataset="b")), coarse(_wall(), 1), coarse(_wall(), 0, 8)):
+        assert abs(float(torch.corrcoef(torch.stack((first, other)))[0, 1])) < 0.25
+
+
+def test_a_generator_of_ones_own_goes_on_from_sample_to_sample() -> None:
+    generator, noise = torch.Generator().manual_seed(5), GaussianMultiplicative(0.01)
+    first, second = (
+        make_sample(_wall(), **BOX4, range_type="disparity", noise=noise, generator=generator) for _ in "ab"
+    )
+    assert not torch.equal(first.depth_lr, second.depth_lr)
+    again = make_sample(
+        _wall(), **BOX4, range_type="disparity", noise=noise, generator=torch.Generator().manual_seed(5)
+    )
+    assert torch.equal(first.depth_lr, again.depth_lr)
+
+
+def test_holes_stay_holes_under_noise_and_dtype_and_device_stay() -> None:
+    values = torch.tensor([[1.0, torch.nan, 3.0]])
+    noisy = GaussianMultiplicative(0.1)(values, torch.Generator().manual_seed(0))
+    assert noisy.isnan().tolist() == [[False, True, False]]
+    assert noisy.dtype == torch.float32
+    exact = GaussianMultiplicative(0.1)(values.double(), torch.Generator().manual_seed(0))
+    torch.testing.assert_close(noisy.double(), exact, equal_nan=True, rtol=1e-6, atol=0)
+
+
+def test_noise_leaves_a_measured_map_alone() -> None:
+    measured = {4: 1 + torch.rand(1, 8, 12, dtype=torch.float64)}
+    sample = make_sample(_scene(None, measured=measured), 4, Measured(), "disparity", GaussianMultiplicative(0.1))
+    assert torch.equal(sample.depth_lr, measured[4])
+
+
+@pytest.mark.parametrize("std", [0.0, 1.0, -0.1, math.nan])
+def test_a_noise_that_cannot_be_is_refused(std: float) -> None:
+    with pytest.raises(ValueError, match=r"noise.std: expected a number above 0 and below 1"):
+        GaussianMultiplicative(std)
+
+
+def test_no_noise_is_none() -> None:
+    assert no_noise() is None  # type: ignore[func-returns-value]

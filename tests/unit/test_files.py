@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import struct
 import zlib
 
@@ -29,10 +30,10 @@ def png(values, depth, colour):
     return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(lines)) + chunk(b"IEND", b"")
 
 
-def pfm(values, order):
+def pfm(values, order, scale="1.0"):
     """Return a PFM file: text header, rows from the bottom up, a negative scale for little-endian floats."""
     height, width = values.shape
-    header = f"Pf\n{width} {height}\n{'-1.0' if order == '<' else '1.0'}\n".encode()
+    header = f"Pf\n{width} {height}\n{'-' if order == '<' else ''}{scale}\n".encode()
     return header + b"".join(struct.pack(f"{order}{width}f", *row) for row in values[::-1])
 
 
@@ -86,6 +87,8 @@ FORMATS = {
     "tiff float": ("d.tiff", tiff(VALUES), VALUES),
     "tif float": ("d.tif", tiff(VALUES), VALUES),
     "pfm little-endian": ("d.pfm", pfm(VALUES, "<"), VALUES),
+    "pfm of Middlebury": ("d.pfm", pfm(VALUES, "<", "0.003922"), VALUES),
+    "pfm big-endian, scaled": ("d.pfm", pfm(VALUES, ">", "2.5e+1"), VALUES),
     "pfm big-endian": ("d.pfm", pfm(VALUES, ">"), VALUES),
 }
 
@@ -102,6 +105,19 @@ def test_a_map_of_every_format_is_read_exactly_top_row_first(tmp_path, case):
 def test_infinities_and_nan_of_a_pfm_come_through(tmp_path, order):
     marked = np.array([[np.inf, 1.0], [np.nan, -2.0]])
     np.testing.assert_array_equal(read_map(written(tmp_path, "d.pfm", pfm(marked, order))), marked)
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"PF\n2 1\n-1.0\n" + bytes(24), b"Pf\n2 1\n0.0\n" + bytes(8), b"Pf\n2 1\n-1.0\n" + bytes(9),
+        b"Pf\n2 1\n-.\n" + bytes(8), b"Pf\n2\n-1.0\n" + bytes(8), b"Pf\n0 1\n-1.0\n",
+    ],
+)  # fmt: skip
+def test_a_pfm_that_is_no_single_channel_of_its_size_is_refused(tmp_path, capfd, content):
+    assert re.search(
+        r"expected (one channel|a PFM file)", refusal(read_map, written(tmp_path, "d.pfm", content), capfd)
+    )
 
 
 @pytest.mark.parametrize(

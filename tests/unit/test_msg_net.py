@@ -12,7 +12,6 @@ from scipy import ndimage
 from torch import Tensor
 
 from dsr.geometry.camera import Camera, from_range, to_range
-from dsr.methods.msg import MSG
 from dsr.methods.msg_net import (
     SCALES,
     VARIANTS,
@@ -25,6 +24,7 @@ from dsr.methods.msg_net import (
     upsample_bicubic,
     upsample_disparity,
 )
+from dsr.methods.network import NetworkUpsampler
 from dsr.sample import DepthSample
 
 
@@ -227,8 +227,8 @@ def test_channels_last_and_inference_mode_change_nothing(variant: VariantName) -
 @pytest.mark.parametrize("variant", ["hui", "voynov"])
 def test_bfloat16_stays_within_a_thousandth_of_the_range(variant: VariantName) -> None:
     sample, net = _sample(4, 32, 40), _net(4, variant)
-    exact = to_range(MSG(net)(sample), sample.camera, "disparity")
-    rounded = to_range(MSG(net, "bfloat16")(sample), sample.camera, "disparity")
+    exact = to_range(NetworkUpsampler(net)(sample), sample.camera, "disparity")
+    rounded = to_range(NetworkUpsampler(net, "bfloat16")(sample), sample.camera, "disparity")
     assert bool((exact.isnan() == rounded.isnan()).all())
     difference = (exact - rounded).nan_to_num().abs() / 5
     assert 0 < float(difference.max()) < 0.001  # 0.0002 measured
@@ -238,13 +238,13 @@ def test_bfloat16_stays_within_a_thousandth_of_the_range(variant: VariantName) -
 def test_the_method_keeps_a_plane_at_its_depth_with_and_without_a_disparity_offset(doffs: float) -> None:
     sample = _sample(4, 8, 8, doffs)
     flat = DepthSample("test", "flat", sample.rgb, torch.full((1, 8, 8), 2.5), sample.camera, sample.camera_lr, 4)
-    depth = MSG(_net(4))(flat)
+    depth = NetworkUpsampler(_net(4))(flat)
     assert depth.shape == (1, 32, 32)
     torch.testing.assert_close(depth, torch.full_like(depth, 2.5))
 
 
 def test_the_hui_method_leaves_its_last_row_and_column_as_holes() -> None:
-    depth = MSG(_net(4, "hui"))(_sample(4, 8, 9))
+    depth = NetworkUpsampler(_net(4, "hui"))(_sample(4, 8, 9))
     assert depth.shape == (1, 32, 36)
     assert bool(depth[0, -1].isnan().all())
     assert bool(depth[0, :, -1].isnan().all())
@@ -254,18 +254,62 @@ def test_the_hui_method_leaves_its_last_row_and_column_as_holes() -> None:
 def test_disparity_that_is_not_positive_becomes_a_hole() -> None:
     net = _net(4, "hui")
     torch.nn.init.constant_(net.get_parameter("reconstruct.conv.bias"), -100.0)
-    assert bool(MSG(net)(_sample(4, 8, 8)).isnan().all())
+    assert bool(NetworkUpsampler(net)(_sample(4, 8, 8)).isnan().all())
 
 
 def test_the_method_leaves_the_network_that_it_was_given_alone() -> None:
     net = MSGNet(4).train()
-    MSG(net, "bfloat16")
+    NetworkUpsampler(net, "bfloat16")
     assert net.training
     assert all(value.dtype == torch.float32 and value.requires_grad for value in net.parameters())
 
 
 def test_a_sample_of_another_scale_or_an_unknown_precision_is_refused() -> None:
     with pytest.raises(ValueError, match="scene: expected scale 4, the network's, got 2"):
-        MSG(_net(4))(_sample(2, 8, 8))
+        NetworkUpsampler(_net(4))(_sample(2, 8, 8))
     with pytest.raises(ValueError, match="precision: expected one of float32, bfloat16, got 'float16'"):
-        MSG(_net(4), "float16")  # type: ignore[arg-type]
+        NetworkUpsampler(_net(4), "float16")  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
+def test_the_shared_slopes_gradients_are_the_librarys(dtype: torch.dtype) -> None:
+    net = MSGNet(4, "dsr")
+    layer = net.smooth.to(dtype)
+    x = torch.randn(2, 32, 9, 8, generator=torch.Generator().manual_seed(0)).to(dtype).requires_grad_()
+    plain = x.detach().clone().requires_grad_()
+    slope = layer.activation.weight.detach().clone().requires_grad_()
+    weights = torch.randn(2, 32, 9, 8, generator=torch.Generator().manual_seed(1)).to(dtype)
+    (layer(x) * weights).sum().backward()
+    (torch.nn.functional.prelu(layer.conv(plain), slope) * weights).sum().backward()
+    tolerance = {"rtol": 1e-5, "atol": 1e-5} if dtype == torch.float32 else {"rtol": 2e-2, "atol": 2e-2}
+    torch.testing.assert_close(x.grad, plain.grad, **tolerance)
+    torch.testing.assert_close(layer.activation.weight.grad, slope.grad, rtol=max(tolerance["rtol"], 1e-4), atol=0)
+
+
+@pytest.mark.parametrize("scale", [2, 4, 8])
+def test_before_training_our_variant_is_nearly_the_interpolation_without_a_checkerboard(scale: int) -> None:
+    torch.manual_seed(0)
+    rgb, disparity = torch.rand(1, 3, 8 * scale, 9 * scale), torch.rand(1, 1, 8, 9, dtype=torch.float64)
+    with torch.no_grad():
+        fine = MSGNet(scale, "dsr").upsample(rgb, disparity)
+    base = upsample_bicubic(mean3x3(disparity), scale)
+    assert float((fine - base).abs().max()) < 0.02
+
+
+def test_bounds_take_the_place_of_the_maps_own_range() -> None:
+    net, rgb, disparity = MSGNet(4, "dsr"), torch.rand(1, 3, 32, 32), 5 + torch.rand(1, 1, 8, 8)
+    own = torch.stack((disparity.min(), disparity.max())).view(1, 2, 1, 1)
+    with torch.no_grad():
+        torch.testing.assert_close(net.upsample(rgb, disparity, own), net.upsample(rgb, disparity))
+        wide = net.upsample(rgb, disparity, torch.tensor([0.0, 20.0]).view(1, 2, 1, 1))
+    assert not torch.allclose(wide, net.upsample(rgb, disparity).detach(), atol=1e-6)
+
+
+def test_our_variant_fills_holes_from_around() -> None:
+    net, rgb = MSGNet(4, "dsr"), torch.rand(1, 3, 64, 64)
+    disparity = torch.full((1, 1, 16, 16), 7.0)
+    disparity[..., :3] = 9.0
+    pierced = disparity.clone()
+    pierced[..., 8, 9] = torch.nan
+    with torch.no_grad():
+        torch.testing.assert_close(net.upsample(rgb, pierced), net.upsample(rgb, disparity))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
@@ -11,13 +12,15 @@ import pytest
 import torch
 from torch import Tensor
 
-from dsr.data.patches import Batch, PatchData, Patches, PatchSettings, WholeScenes, tensors_of
-from dsr.degrade import Downsampling, Measured, make_sample
+from dsr.data.base import SceneSource
+from dsr.data.patches import Batch, Part, PatchData, Patches, PatchSettings, Problem, WholeScenes, tensors_of
+from dsr.degrade import Downsampling, GaussianMultiplicative, Measured, make_sample
 from dsr.geometry.camera import Camera
 from dsr.methods.msg_net import normalised
 from dsr.sample import Scene
 
 BOX = Downsampling("box")
+X4 = Problem(4, BOX)
 CAMERA = Camera(width=60, height=44, fx=50.0, fy=47.0, cx=33.3, cy=17.9)
 STEREO = replace(CAMERA, baseline=0.12, doffs=1.7)
 NORMAL = torch.tensor([0.3, -0.4, -1.0], dtype=torch.float64)[:, None, None]
@@ -36,11 +39,12 @@ def _scene(number: int = 0, camera: Camera = CAMERA, depth: Tensor | None = None
 
 
 def _settings(**changes: Any) -> PatchSettings:
-    return PatchSettings(**{"size": SIZE, "batch": 2, "steps": 3, "validation_scenes": 2, "colour": 0.0, **changes})
+    plain: dict[str, Any] = {"size": SIZE, "batch": 2, "validation_scenes": 2}
+    return PatchSettings(**{**plain, "rotate": False, "depth_scale": 0.0, "colour": 0.0, **changes})
 
 
 def _patches(scenes: list[Scene] | None = None, count: int = 40, **changes: Any) -> Patches:
-    return Patches(scenes or [_scene()], _settings(**changes), 4, BOX, count=count)
+    return Patches([scenes or [_scene()]], _settings(**changes), X4, count=count)
 
 
 def _places(patch: Batch) -> tuple[np.ndarray, np.ndarray, int]:
@@ -71,25 +75,35 @@ class _Source:
         return scene
 
 
-def _data(scenes: list[Scene] | None = None, scale: int = 4, **changes: Any) -> PatchData:
-    return PatchData(_Source(scenes or [_scene(i) for i in range(6)]), _settings(**changes), scale, BOX, seed=7)
+def _data(scenes: list[Scene] | None = None, problem: Problem = X4, **changes: Any) -> PatchData:
+    return PatchData([Part(_Source(scenes or [_scene(i) for i in range(6)]))], _settings(**changes), problem, seed=7)
 
 
-def _epoch(data: PatchData, epoch: int, max_steps: int = -1) -> list[Batch]:
-    data.trainer = SimpleNamespace(current_epoch=epoch, max_steps=max_steps)  # type: ignore[assignment]
+def _batches(
+    data: PatchData, count: int, step: int = 0, *, accumulate: int = 1, rank: int = 0, world: int = 1
+) -> list[Batch]:
+    """Return the first batches that a trainer at some step gets."""
+    data.trainer = SimpleNamespace(  # type: ignore[assignment]
+        global_step=step, accumulate_grad_batches=accumulate, global_rank=rank, world_size=world
+    )
     data.setup()
-    return list(data.train_dataloader())
+    return list(itertools.islice(data.train_dataloader(), count))
+
+
+def _equal(first: list[Batch], second: list[Batch]) -> bool:
+    return len(first) == len(second) and all(map(_same, first, second))
 
 
 def test_a_patch_is_a_pure_function_of_the_seed_and_its_number() -> None:
     scenes, settings = [_scene(i) for i in range(3)], _settings(colour=0.1)
-    whole = Patches(scenes, settings, 4, BOX, seed=5, count=12)
-    later = Patches(scenes, settings, 4, BOX, seed=5, first=7, count=3)
+    whole = Patches([scenes], settings, X4, seed=5, count=12)
+    later = Patches([scenes], settings, X4, seed=5, first=7, count=3)
+    assert all(_same(whole.starting(7, 3)[i], later[i]) for i in range(3))
     assert (len(whole), len(later)) == (12, 3)
     assert all(_same(later[i], whole[7 + i]) for i in (2, 0, 1))  # whatever was asked for before
     assert _same(whole[7], whole[7])
     assert not any(_same(whole[i], whole[7]) for i in range(12) if i != 7)
-    assert not _same(Patches(scenes, settings, 4, BOX, seed=6, count=12)[7], whole[7])
+    assert not _same(Patches([scenes], settings, X4, seed=6, count=12)[7], whole[7])
 
 
 def test_the_global_random_states_neither_matter_nor_change() -> None:
@@ -103,44 +117,92 @@ def test_the_global_random_states_neither_matter_nor_change() -> None:
 
 
 def test_workers_cut_the_patches_that_the_trainer_would() -> None:
-    alone, helped = (_epoch(_data(colour=0.1, workers=workers), 1) for workers in (0, 2))
-    assert len(alone) == len(helped) == 3
-    assert all(_same(first, second) for first, second in zip(alone, helped, strict=True))
+    alone, helped = (_batches(_data(colour=0.1, workers=workers), 3, 1) for workers in (0, 2))
+    assert _equal(alone, helped)
 
 
-def test_epochs_go_on_where_the_one_before_ended() -> None:
-    data = _data()
-    batches = [batch for epoch in range(3) for batch in _epoch(data, epoch)]
-    patches = Patches([_scene(i) for i in range(4)], _settings(), 4, BOX, seed=7, count=18)
-    for i, batch in enumerate(batches):
-        for j in range(2):
-            single = patches[2 * i + j]
-            assert all(torch.allclose(batch[name][j], single[name], rtol=1e-6) for name in single)  # depth was float32
+def test_a_loader_begins_at_the_trainers_step_and_has_no_length() -> None:
+    data = _data(colour=0.1)
+    whole = _batches(data, 6)
+    assert _equal(_batches(data, 2, 4), whole[4:])
+    assert _equal(_batches(data, 2, 2, accumulate=2), whole[4:])
+    with pytest.raises(TypeError):
+        len(data.train_dataloader())
+
+
+def test_devices_share_the_batches_of_a_step() -> None:
+    data = _data(colour=0.1)
+    whole = _batches(data, 6)
+    assert _equal(_batches(data, 2, 1, rank=0, world=2), [whole[2], whole[4]])
+    assert _equal(_batches(data, 2, 1, rank=1, world=2), [whole[3], whole[5]])
 
 
 def test_some_patches_are_the_first_of_the_run() -> None:
     data = _data()
-    data.setup()
-    first = _epoch(data, 0)
+    first = _batches(data, 2)
     for i, patch in enumerate(data.some_patches(4)):
         assert all(torch.equal(patch[name], first[i // 2][name][i % 2]) for name in patch)
 
 
-def test_the_last_epoch_ends_with_the_training() -> None:
-    data = _data()
-    assert [len(_epoch(data, epoch, max_steps=8)) for epoch in range(3)] == [3, 3, 2]
-
-
 def test_held_out_scenes_are_validated_with_whole_and_never_trained_on() -> None:
-    data = _data(steps=60)
-    assert (data.training_names, data.validation_names) == ([f"scene{i}" for i in range(4)], ["scene4", "scene5"])
-    seen = {int((255 * rgb[2, 0, 0]).round()) for batch in _epoch(data, 0) for rgb in batch["rgb"]}
+    data = _data()
+    assert data.training_count == 4
+    assert {kind: names for kind, (_, names) in data.validation_scenes().items()} == {"set": ["scene4", "scene5"]}
+    seen = {int((255 * rgb[2, 0, 0]).round()) for batch in _batches(data, 60) for rgb in batch["rgb"]}
     assert seen == {0, 1, 2, 3}
-    whole = list(data.val_dataloader())
+    [loader] = data.val_dataloader()
+    whole = list(loader)
     assert [int((255 * batch["rgb"][0, 2, 0, 0]).round()) for batch in whole] == [4, 5]
     assert all(batch["rgb"].shape == (1, 3, 44, 60) for batch in whole)
     assert {batch["depth"].dtype for batch in whole} == {torch.float64}
     torch.testing.assert_close(whole[0]["depth"][0], _tilted(CAMERA), rtol=0, atol=0)
+
+
+def test_parts_give_patches_by_their_shares() -> None:
+    parts = [_scene(0)], [_scene(1), _scene(2)], [_scene(3)]
+    patches = Patches(parts, _settings(), X4, shares=[1, 3, 0], count=400)
+    seen = np.array([_places(patches[i])[2] for i in range(400)])
+    assert np.bincount(seen, minlength=4) / 400 == pytest.approx([0.25, 0.375, 0.375, 0], abs=0.07)
+
+
+def test_each_part_holds_its_last_scenes_out_under_a_name_of_its_own() -> None:
+    sources = [_Source([_scene(i) for i in numbers]) for numbers in ((0, 1, 2), (3, 4))]
+    data = PatchData([Part(source) for source in sources], _settings(validation_scenes=1), X4)
+    assert data.validation_sets == ["set", "set_2"]
+    assert data.training_count == 3
+    assert data.sources[:2] == sources
+    data.setup()
+    assert [next(iter(loader))["rgb"][0, 2, 0, 0] * 255 for loader in data.val_dataloader()] == pytest.approx([2, 4])
+
+
+def test_other_data_sets_validate_whole_and_alone_where_nothing_is_held_out() -> None:
+    bare = Scene("set", "bare", _scene().rgb, CAMERA, None, {4: torch.ones(1, 11, 15)})
+    more: dict[str, SceneSource] = {"mine": _Source([_scene(8), bare, _scene(9)])}
+    data = PatchData([Part(_Source([_scene(0)]))], _settings(validation_scenes=0), X4, validation=more)
+    data.setup()
+    assert data.validation_sets == ["mine"]
+    assert data.validation_scenes()["mine"][1] == ["scene8", "scene9"]
+    with pytest.raises(ValueError, match=r"trainer.validation_scenes: expected a positive number where there is no"):
+        _data(validation_scenes=0)
+
+
+def test_a_scene_that_is_trained_on_cannot_validate() -> None:
+    more: dict[str, SceneSource] = {"mine": _Source([_scene(8), _scene(1)])}
+    with pytest.raises(ValueError, match=r"validation.mine: expected scenes that are not trained on, got scene1"):
+        PatchData([Part(_Source([_scene(i) for i in range(6)]))], _settings(), X4, validation=more)
+
+
+def test_a_validation_set_without_any_truth_is_refused() -> None:
+    bare = Scene("set", "bare", _scene().rgb, CAMERA, None, {4: torch.ones(1, 11, 15)})
+    more: dict[str, SceneSource] = {"mine": _Source([bare])}
+    with pytest.raises(ValueError, match=r"validation.mine: expected scenes with a true depth, there is none"):
+        PatchData([Part(_Source([_scene(0)]))], _settings(validation_scenes=0), X4, validation=more).setup()
+
+
+@pytest.mark.parametrize("share", [-1.0, float("nan"), float("inf")])
+def test_a_share_that_is_none_is_refused(share: float) -> None:
+    with pytest.raises(ValueError, match=r"dataset.shares: expected 0 or a positive number"):
+        Part(_Source([_scene()]), share)
 
 
 def test_patches_reach_every_row_and_column_of_a_scene() -> None:
@@ -212,6 +274,77 @@ def test_the_networks_input_depends_on_the_coarse_map_alone() -> None:
         torch.testing.assert_close(one, other, rtol=1e-5, atol=1e-6)
 
 
+@pytest.mark.parametrize("camera", [CAMERA, STEREO])
+def test_points_of_a_turned_patch_are_those_of_its_pixels_turned_about_the_axis(camera: Camera) -> None:
+    bumps = torch.from_numpy(np.random.default_rng(0).uniform(1, 3, (1, 44, 60)))
+    full = (bumps * camera.rays()).numpy()
+    patches, turns = _patches([_scene(camera=camera, depth=bumps)], count=80, flip=False, rotate=True), set()
+    for i in range(80):
+        patch = patches[i]
+        rows, columns, _ = _places(patch)
+        along = columns[0, 1] - columns[0, 0], rows[0, 1] - rows[0, 0]  # where the picture's u axis points in the scene
+        x, y, z = full[:, rows, columns]
+        down = -along[1], along[0]
+        expected = np.stack((along[0] * x + along[1] * y, down[0] * x + down[1] * y, z))
+        np.testing.assert_allclose((patch["depth"] * patch["rays"]).numpy(), expected, rtol=0, atol=2e-6)
+        turns.add(along)
+    assert turns == {(1, 0), (-1, 0), (0, 1), (0, -1)}
+
+
+def test_depth_is_scaled_within_its_range_and_with_it_the_bounds() -> None:
+    plain, scaled = (_patches(count=60, depth_scale=s) for s in (0.0, 0.5))
+    factors = []
+    for i in range(60):
+        one, other = plain[i], scaled[i]
+        rows, columns, _ = _places(other)
+        ratio = other["depth"][0].numpy() / _tilted(CAMERA).numpy()[0, rows, columns]
+        assert np.ptp(ratio) < 1e-5
+        factors.append(float(ratio.mean()))
+        assert one["rgb"].shape == other["rgb"].shape
+    logs = np.log(factors)
+    assert -0.5 <= logs.min() < -0.4
+    assert 0.4 < logs.max() <= 0.5
+
+
+def test_bounds_lie_between_the_patchs_own_and_the_scenes_and_often_are_the_scenes() -> None:
+    patches, shares = _patches(count=200), []
+    scene = 10 / make_sample(_scene(), 4, BOX, "disparity").depth_lr
+    for i in range(200):
+        patch = patches[i]
+        low, high = patch["bounds"].flatten().tolist()
+        own = patch["disparity_lr"]
+        assert float(scene.min()) - 1e-5 <= low <= float(own.min()) + 1e-5
+        assert float(own.max()) - 1e-5 <= high <= float(scene.max()) + 1e-5
+        shares.append((high - low) / float(scene.max() - scene.min()))
+    assert 0.4 < np.mean(np.array(shares) > 0.9999) < 0.65
+    assert min(shares) < 0.5
+
+
+def test_bounds_of_a_whole_scene_are_its_coarse_maps_own_and_those_of_a_wall_some_way_apart() -> None:
+    whole = WholeScenes([_scene()], X4)[0]
+    assert whole["bounds"].flatten().tolist() == pytest.approx(
+        [float(whole["disparity_lr"].min()), float(whole["disparity_lr"].max())]
+    )
+    wall = WholeScenes([_scene(depth=torch.full((1, 44, 60), 2.0, dtype=torch.float64))], X4)[0]
+    low, high = wall["bounds"].flatten().tolist()
+    assert low == pytest.approx(5)
+    assert high == pytest.approx(5.005)
+
+
+def test_noise_is_new_in_every_patch_and_the_same_in_every_run() -> None:
+    noisy = Problem(4, BOX, GaussianMultiplicative(0.01))
+    wall = _scene(depth=torch.full((1, 44, 60), 2.0, dtype=torch.float64))
+    first, again = (Patches([[wall]], _settings(), noisy, count=50) for _ in range(2))
+    assert _same(first[7], again[7])
+    values = np.stack([first[i]["disparity_lr"].numpy() / 5 - 1 for i in range(50)])
+    assert values.std() == pytest.approx(0.01, rel=0.1)
+    assert np.abs(np.corrcoef(values.reshape(50, -1))[np.triu_indices(50, 1)]).max() < 0.95
+    torch.testing.assert_close(first[7]["depth"], torch.full((1, 16, 16), 2.0))
+    whole, other = (WholeScenes([wall], noisy, seed)[0]["disparity_lr"] for seed in (0, 1))
+    assert torch.equal(whole, WholeScenes([wall], noisy, 0)[0]["disparity_lr"])
+    assert not torch.equal(whole, other)
+
+
 def test_colour_is_a_gain_per_channel_of_the_asked_spread() -> None:
     grey = replace(_scene(), rgb=torch.full((3, 44, 60), 0.4))
     patches = _patches([grey], count=300, colour=0.1)
@@ -259,17 +392,18 @@ def test_shapes_and_types_are_those_promised() -> None:
         "rays": (3, 16, 16),
         "stereo": (1, 1, 1),
         "doffs": (1, 1, 1),
+        "bounds": (2, 1, 1),
     }
     patch = _patches()[0]
     assert {name: tuple(value.shape) for name, value in patch.items()} == shapes
     assert {value.dtype for value in patch.values()} == {torch.float32}
-    whole = WholeScenes([_scene()], 4, BOX)[0]
-    assert whole["depth"].dtype == whole["rays"].dtype == whole["stereo"].dtype == torch.float64
-    assert whole["rgb"].dtype == whole["disparity_lr"].dtype == torch.float32
+    whole = WholeScenes([_scene()], X4)[0]
+    single = {"rgb", "bounds"}
+    assert all(value.dtype == (torch.float32 if name in single else torch.float64) for name, value in whole.items())
 
 
 def test_a_data_set_with_too_few_scenes_is_refused() -> None:
-    with pytest.raises(ValueError, match=r"trainer.validation_scenes: expected fewer than the 6 scenes, got 6"):
+    with pytest.raises(ValueError, match=r"trainer.validation_scenes: expected fewer than the 6 scenes of set, got 6"):
         _data(validation_scenes=6)
 
 
@@ -284,27 +418,28 @@ def test_a_scene_too_small_for_a_patch_is_refused_by_name_before_training() -> N
 
 def test_a_scene_without_true_depth_is_refused_by_name() -> None:
     measured = Scene("set", "bare", _scene().rgb, CAMERA, None, {4: torch.ones(1, 11, 15)})
-    for scenes in ([measured, *(_scene(i) for i in range(2))], [*(_scene(i) for i in range(2)), measured]):
-        with pytest.raises(ValueError, match="bare: expected a true depth to train with, there is none"):
-            _data(scenes, validation_scenes=1).setup()
+    with pytest.raises(ValueError, match="bare: expected a true depth to train with, there is none"):
+        _data([measured, *(_scene(i) for i in range(2))], validation_scenes=1).setup()
 
 
 def test_a_patch_that_the_scale_does_not_divide_is_refused() -> None:
     with pytest.raises(ValueError, match=r"trainer.patch: expected a size that scale=4 divides, got 30"):
         _data(size=30)
     with pytest.raises(ValueError, match=r"trainer.patch: expected a size that scale=16 divides, got 24"):
-        _data(scale=16, size=24)
+        _data(problem=Problem(16, BOX), size=24)
 
 
 def test_a_measured_map_cannot_be_cut() -> None:
-    patches = Patches([_scene()], _settings(), 4, Measured())  # type: ignore[arg-type]
+    patches = Patches([[_scene()]], _settings(), Problem(4, Measured()))  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="downsampling=measured expects a coarse map at x4"):
         patches[0]
 
 
 def test_no_scene_at_all_is_refused() -> None:
     with pytest.raises(ValueError, match="expected a scene or more"):
-        Patches([], _settings(), 4, BOX)
+        Patches([], _settings(), X4)
+    with pytest.raises(ValueError, match="expected a scene or more"):
+        Patches([[_scene()], []], _settings(), X4)
 
 
 @pytest.mark.parametrize(
@@ -312,8 +447,8 @@ def test_no_scene_at_all_is_refused() -> None:
     [
         ({"size": 15}, "trainer.patch: expected at least 16 pixels, got 15"),
         ({"batch": 0}, "trainer.batch: expected a positive number, got 0"),
-        ({"steps": 0}, "trainer.validate_every: expected a positive number, got 0"),
-        ({"validation_scenes": 0}, "trainer.validation_scenes: expected a positive number, got 0"),
+        ({"validation_scenes": -1}, "trainer.validation_scenes: expected 0 or more, got -1"),
+        ({"depth_scale": -0.1}, "trainer.depth_scale: expected 0 or more, got -0.1"),
         ({"workers": -1}, "trainer.workers: expected 0 or more, got -1"),
         ({"colour": -0.1}, "trainer.colour: expected 0 or more, got -0.1"),
         ({"colour": float("nan")}, "trainer.colour: expected 0 or more, got nan"),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import functools
 import math
 from collections.abc import Iterator
 from pathlib import Path
@@ -16,18 +17,20 @@ from lightning.pytorch.callbacks import Callback
 from torch import Tensor
 from torch.utils.data import DataLoader
 
-from dsr.data.patches import Batch, Patches, PatchSettings, WholeScenes, tensors_of
+from dsr.data.patches import Batch, Patches, PatchSettings, Problem, WholeScenes, tensors_of
 from dsr.degrade import Downsampling, make_sample
 from dsr.geometry.camera import Camera
 from dsr.methods.msg_net import MSGNet, upsample_disparity
-from dsr.quality import functional
+from dsr.objective import Objective, balanced_weight, depth_of
+from dsr.quality import functional as scores
 from dsr.quality.functional import SurfacePair
 from dsr.quality.lpips import LPIPS
 from dsr.quality.metrics import visual_metrics
 from dsr.sample import Scene
-from dsr.training import Objective, Schedule, SuperResolution, balanced_weight, depth_of
+from dsr.training import Schedule, SuperResolution
 
 BOX = Downsampling("box")
+X2 = Problem(2, BOX)
 CAMERA = Camera(width=40, height=36, fx=40.0, fy=40.0, cx=20.0, cy=18.0)
 
 pytestmark = [
@@ -156,14 +159,14 @@ def _plane(baseline: float | None = None, doffs: float = 0.0, slope: float = 0.0
 def test_the_balanced_weight_of_a_plane_is_its_closed_form(baseline: float | None, doffs: float, fx: float) -> None:
     stereo = (baseline or 0.2) * fx
     middle, spread = stereo / (3 + 0.02 * 50), 0.02 * 96  # the median's column; coarse centres from 1.5 to 97.5
-    tilt = math.radians(10)
+    tilt = math.radians(2.5)
     as_disparity = (stereo / middle - stereo / (middle * (1 + 1e-6 * math.tan(tilt) / fx))) / 1e-6 / spread
     expected = as_disparity / ((2 - 2 * math.cos(tilt)) / 3)
     assert balanced_weight([_plane(baseline, doffs, fx=fx)]) == pytest.approx(expected, rel=2e-6)
 
 
 def test_the_balanced_weight_balances_a_tilt_between_neighbours() -> None:
-    """On a wall whose every second column stands out by tan(10 degrees) of a pixel's width, both terms weigh alike."""
+    """On a wall whose every second column stands out by tan(2.5 degrees) of a pixel's width, both terms weigh alike."""
     camera = Camera(width=100, height=16, fx=80.0, fy=80.0, cx=49.5, cy=7.5)
     wall = torch.full((1, 16, 100), 2.0, dtype=torch.float64)
     wall[..., :4] = 2.5  # so that the coarse map has a range
@@ -171,7 +174,7 @@ def test_the_balanced_weight_balances_a_tilt_between_neighbours() -> None:
     w = balanced_weight([batch])
     batch = {name: value[None].double() for name, value in batch.items()}
     bumps = torch.zeros_like(batch["depth"])
-    bumps[..., 5::2] = math.tan(math.radians(10)) * 2 / 80
+    bumps[..., 5::2] = math.tan(math.radians(2.5)) * 2 / 80
     terms = Objective("l1", w)(batch["stereo"] / (batch["depth"] + bumps), batch)
     # l1 sees every second column; MSE_v sees a tilt at every column
     assert float(2 * terms["l1"]) == pytest.approx(float(w * terms["mse_v"]), rel=0.05)
@@ -237,7 +240,8 @@ def _scene(seed: int, holes: float = 0.0) -> Scene:
 def _module(network: LPIPS | None = None, *, scale: int = 2, **schedule: Any) -> SuperResolution:
     torch.manual_seed(0)
     settings = {"steps": 30, "warmup": 1, **schedule}
-    return SuperResolution(MSGNet(scale, "dsr"), Objective("lap1", 0.1), Schedule(**settings), visual_metrics(network))
+    metrics = functools.partial(visual_metrics, network)
+    return SuperResolution(MSGNet(scale, "dsr"), Objective("lap1", 0.1), Schedule(**settings), metrics)
 
 
 def _trainer(folder: Path, **settings: Any) -> lightning.Trainer:
@@ -258,8 +262,7 @@ class _Losses(Callback):
 
 
 def _one_batch() -> DataLoader[Batch]:
-    settings = PatchSettings(size=32, batch=2, steps=1, validation_scenes=1)
-    patches = Patches([_scene(0), _scene(1)], settings, 2, BOX, count=2)
+    patches = Patches([[_scene(0), _scene(1)]], PatchSettings(size=32, batch=2), X2, count=2)
     return DataLoader(patches, batch_size=2)
 
 
@@ -272,42 +275,113 @@ def test_thirty_steps_on_one_batch_bring_the_loss_down(tmp_path: Path) -> None:
     assert all(not torch.equal(before[name], value) for name, value in module.net.state_dict().items())
 
 
-@pytest.mark.parametrize("precision", ["32-true", "bf16-mixed"])
+@pytest.mark.parametrize("mixed", [False, True])
 def test_the_training_loss_is_the_objective_of_the_networks_output_in_full_precision(
-    tmp_path: Path, precision: Any
+    tmp_path: Path, mixed: bool
 ) -> None:
-    losses, module = _Losses(), _module()
+    losses, module = _Losses(), _module(mixed=mixed, finish=0.0)
     [batch] = _one_batch()
-    with torch.no_grad(), torch.autocast("cpu", torch.bfloat16, enabled=precision != "32-true"):
-        disparity = upsample_disparity(module.net, batch["rgb"], batch["disparity_lr"])
+    with torch.no_grad(), torch.autocast("cpu", torch.bfloat16, enabled=mixed):
+        disparity = upsample_disparity(module.net, batch["rgb"], batch["disparity_lr"], batch["bounds"])
     expected = float(module.objective(disparity, batch)["loss"])
-    _trainer(tmp_path, max_steps=1, callbacks=[losses], precision=precision).fit(module, _one_batch())
+    _trainer(tmp_path, max_steps=1, callbacks=[losses]).fit(module, _one_batch())
     assert losses.values == pytest.approx([expected], rel=2e-5)
 
 
-@pytest.mark.parametrize("precision", ["32-true", "bf16-mixed"])
-def test_validation_logs_the_mean_over_the_scenes_of_the_metrics_worst_light(tmp_path: Path, precision: Any) -> None:
-    module, scenes = _module(), WholeScenes([_scene(3), _scene(4, holes=0.05), _scene(5)], 2, BOX)
-    [logged] = _trainer(tmp_path, precision=precision).validate(module, DataLoader(scenes), verbose=False)
+def test_the_last_share_of_the_steps_runs_in_float32() -> None:
+    schedule = Schedule(steps=20, mixed=True, finish=0.25)
+    assert [schedule.is_mixed(step) for step in range(20)] == [True] * 15 + [False] * 5
+    assert not any(Schedule(steps=20, finish=0.25).is_mixed(step) for step in range(20))
+    assert all(Schedule(steps=20, mixed=True, finish=0.0).is_mixed(step) for step in range(20))
+
+
+def test_the_average_follows_the_weights_with_its_decay(tmp_path: Path) -> None:
+    seen: list[Tensor] = []
+
+    class _Watch(Callback):
+        def on_train_batch_end(self, trainer: Any, pl_module: Any, *_: Any) -> None:
+            seen.append(pl_module.net.stem.conv.weight.detach().clone())
+
+    module = _module(average=0.3)
+    expected = module.net.stem.conv.weight.detach().clone()
+    assert all(map(torch.equal, module.net.parameters(), module.average.parameters()))
+    _trainer(tmp_path, max_epochs=9, callbacks=[_Watch()]).fit(module, _one_batch())
+    for step, weight in enumerate(seen, start=1):
+        decay = min(0.3, step / (step + 9))
+        expected = decay * expected + (1 - decay) * weight
+    torch.testing.assert_close(module.average.stem.conv.weight, expected)
+    assert not torch.equal(module.net.stem.conv.weight, expected)
+    assert not any(parameter.requires_grad for parameter in module.average.parameters())
+
+
+def test_without_an_average_the_weights_themselves_are_kept(tmp_path: Path) -> None:
+    module = _module(average=0.0)
+    _trainer(tmp_path, max_epochs=2).fit(module, _one_batch())
+    assert all(map(torch.equal, module.net.parameters(), module.average.parameters()))
+
+
+def test_gradients_add_up_over_accumulated_batches(tmp_path: Path) -> None:
+    module = _module()
+    before = module.average.stem.conv.weight.clone()
+    trainer = _trainer(tmp_path, max_epochs=3, accumulate_grad_batches=3)  # one batch an epoch: a step per epoch's end
+    trainer.fit(module, _one_batch())
+    assert trainer.global_step == 3
+    assert not torch.equal(before, module.average.stem.conv.weight)
+
+
+def test_a_long_gradient_is_shortened_and_its_norm_logged(tmp_path: Path) -> None:
+    module, norms = _module(clip=1e-3), []
+
+    class _Norm(Callback):
+        def on_before_zero_grad(self, trainer: Any, pl_module: Any, *_: Any) -> None:
+            grads = [p.grad for p in pl_module.net.parameters() if p.grad is not None]
+            if grads:
+                norms.append(float(torch.cat([grad.flatten() for grad in grads]).norm()))
+
+    trainer = _trainer(tmp_path, max_epochs=2, callbacks=[_Norm()])
+    trainer.fit(module, _one_batch())
+    assert norms[-1] == pytest.approx(1e-3, rel=1e-3)
+    assert trainer.callback_metrics["train/gradient_norm"] > 1e-2
+
+
+def test_a_gradient_that_is_not_finite_changes_nothing(tmp_path: Path) -> None:
+    module = _module()
+    before = copy.deepcopy(module.net.state_dict())
+    [batch] = _one_batch()
+    batch["depth"] = batch["depth"].clone()
+    bad = {**batch, "stereo": torch.full_like(batch["stereo"], torch.inf)}
+    _trainer(tmp_path, max_epochs=1).fit(module, DataLoader([bad], batch_size=None))
+    assert all(torch.equal(before[name], value) for name, value in module.net.state_dict().items())
+
+
+@pytest.mark.parametrize("changes", [{"average": 1.0}, {"average": -0.1}, {"finish": 1.1}, {"finish": math.nan}])
+def test_an_average_or_a_finish_that_cannot_be_is_refused(changes: dict[str, Any]) -> None:
+    with pytest.raises(ValueError, match=rf"trainer.{next(iter(changes))}: expected "):
+        Schedule(10, **changes)
+
+
+def test_validation_logs_the_mean_over_the_scenes_of_the_metrics_worst_light(tmp_path: Path) -> None:
+    module, scenes = _module(mixed=True), WholeScenes([_scene(3), _scene(4, holes=0.05), _scene(5)], X2)
+    [logged] = _trainer(tmp_path).validate(module, DataLoader(scenes), verbose=False)
     values: dict[str, list[float]] = {"RMSE_d": [], "RMSE_v": [], "DSSIM_v": [], "BadPix_v_5": [], "Bumpiness_d": []}
     for i in range(3):
         batch = {name: value[None] for name, value in scenes[i].items()}
-        with torch.no_grad(), torch.autocast("cpu", torch.bfloat16, enabled=precision != "32-true"):
-            disparity = upsample_disparity(module.net.eval(), batch["rgb"], batch["disparity_lr"]).double()
+        with torch.no_grad():
+            disparity = upsample_disparity(module.average, batch["rgb"], batch["disparity_lr"])
         assert bool((disparity > 0).all())
         pair = SurfacePair(40 * 0.2 / disparity, batch["depth"], CAMERA.rays()[None])
-        values["RMSE_d"].append(float(functional.rmse_d(pair)))
-        values["RMSE_v"].append(float(functional.rmse_v(pair)))
-        values["DSSIM_v"].append(float(functional.dssim_v(pair).amax()))
-        values["BadPix_v_5"].append(float(functional.bad_pix_v(pair, 5).amax()))
-        values["Bumpiness_d"].append(float(functional.bumpiness_d(pair)))
+        values["RMSE_d"].append(float(scores.rmse_d(pair)))
+        values["RMSE_v"].append(float(scores.rmse_v(pair)))
+        values["DSSIM_v"].append(float(scores.dssim_v(pair).amax()))
+        values["BadPix_v_5"].append(float(scores.bad_pix_v(pair, 5).amax()))
+        values["Bumpiness_d"].append(float(scores.bumpiness_d(pair)))
     for name, each in values.items():
         assert logged[f"val/{name}"] == pytest.approx(np.mean(each), rel=1e-4), name
 
 
 def test_a_validation_forgets_the_one_before(tmp_path: Path) -> None:
     module, trainer = _module(), _trainer(tmp_path)
-    first, other = (DataLoader(WholeScenes([_scene(seed)], 2, BOX)) for seed in (3, 4))
+    first, other = (DataLoader(WholeScenes([_scene(seed)], X2)) for seed in (3, 4))
     [before] = trainer.validate(module, first, verbose=False)
     [between] = trainer.validate(module, other, verbose=False)
     [after] = trainer.validate(module, first, verbose=False)
@@ -319,17 +393,18 @@ def test_a_checkpoint_holds_the_networks_tensors_alone_and_loads_as_plain_data(t
     trunk = {f"features.{i}.weight": 0.05 * torch.randn(shape) for i, shape in shapes.items()}
     network = LPIPS(trunk | {f"features.{i}.bias": torch.zeros(shape[0]) for i, shape in shapes.items()})
     module, trainer = _module(network), _trainer(tmp_path, max_steps=1)
-    loader = DataLoader(WholeScenes([_scene(3)], 2, BOX))
+    loader = DataLoader(WholeScenes([_scene(3)], X2))
     trainer.fit(module, _one_batch(), loader)
     assert math.isfinite(trainer.callback_metrics["val/LPIPS_v"])
     trainer.save_checkpoint(tmp_path / "a.ckpt")
     content = torch.load(tmp_path / "a.ckpt", weights_only=True)
-    assert content["state_dict"].keys() == {f"net.{name}" for name in module.net.state_dict()}
+    names = {f"{part}.{name}" for part in ("net", "average") for name in module.net.state_dict()}
+    assert content["state_dict"].keys() == names
     assert content["global_step"] == 1
     size = sum(value.numel() for value in module.net.parameters())
-    assert (tmp_path / "a.ckpt").stat().st_size < 4 * 3 * size + 200_000  # weights and AdamW's two moments
+    assert (tmp_path / "a.ckpt").stat().st_size < 4 * 4 * size + 200_000  # weights, their average, AdamW's two moments
 
 
 def test_a_network_that_leaves_out_pixels_is_refused() -> None:
-    with pytest.raises(ValueError, match=r"model.variant: expected one that covers the whole image, got hui"):
-        SuperResolution(MSGNet(4, "hui"), Objective(), Schedule(10), visual_metrics())
+    with pytest.raises(ValueError, match=r"model: expected a network that covers the whole image"):
+        SuperResolution(MSGNet(4, "hui"), Objective(), Schedule(10), visual_metrics)

@@ -1,324 +1,155 @@
-"""The readers of the authors' weight files: what they take, and what they refuse without running it."""
+"""Files of our own networks' weights: what they give back, and what is refused."""
 
 from __future__ import annotations
 
-import pickle
-import struct
-from collections.abc import Iterable
+import json
 from pathlib import Path
+from typing import Any
 
-import numpy as np
 import pytest
 import torch
 from safetensors.torch import save_file
 from torch import Tensor
 
-from dsr.methods.msg_net import MSGNet, VariantName
-from dsr.methods.weights import load_msg_weights, save_msg_weights
+from dsr.methods.facets import Facets
+from dsr.methods.msg_net import MSGNet
+from dsr.methods.network import DisparityNetwork
+from dsr.methods.trained import NETWORKS, build_trained, packaged_names, packaged_weights
+from dsr.methods.weights import is_ours, load_network, read_head, save_network
 
-Layer = tuple[str, str, list[Tensor]]
-
-
-def _varint(value: int) -> bytes:
-    head = b""
-    while value > 0x7F:
-        head += bytes([value & 0x7F | 0x80])
-        value >>= 7
-    return head + bytes([value])
-
-
-def _field(number: int, content: bytes) -> bytes:
-    return _varint(number << 3 | 2) + _varint(len(content)) + content
+NETS = {
+    "msg": lambda: MSGNet(2, "dsr"),
+    "msg_v": lambda: MSGNet(8, "dsr"),
+    "as published": lambda: MSGNet(4, "voynov"),
+    "facets": lambda: Facets(4, width=8, blocks=1, facets=1),
+}
 
 
-def _blob(values: Tensor, *, packed: bool) -> bytes:
-    """Return a BlobProto; numbers one after the other, or each with its own key as proto2 writes them by default."""
-    floats, sizes = values.numpy().astype("<f4").tobytes(), values.shape
-    if packed:
-        return _field(7, _field(1, b"".join(map(_varint, sizes)))) + _field(5, floats)
-    singly = b"".join(_varint(5 << 3 | 5) + floats[i : i + 4] for i in range(0, len(floats), 4))
-    return singly + _field(7, b"".join(_varint(1 << 3) + _varint(size) for size in sizes))
-
-
-def _caffe_layers(net: MSGNet) -> list[Layer]:
-    """Return the network's layers as Caffe keeps them: a convolution with two blobs, then a PReLU with one."""
-    layers: list[Layer] = []
-    for name, value in net.state_dict().items():
-        layer, part = name.rsplit(".", 1)
-        kind = "PReLU" if "activation" in name else "Deconvolution" if ".up." in name else "Convolution"
-        if part == "bias":
-            layers[-1][2].append(value)
-        else:
-            layers.append((layer, kind, [value]))
-    return layers
-
-
-def _caffemodel(layers: Iterable[Layer], *, packed: bool = True) -> bytes:
-    """Return a NetParameter: its name, an input layer without parameters, a number field, the layers."""
-    content = _field(1, b"a test") + _varint(5 << 3) + b"\x01"
-    content += _field(100, _field(1, b"data") + _field(2, b"HDF5Data"))
-    for name, kind, blobs in layers:
-        parts = b"".join(_field(7, _blob(blob, packed=packed)) for blob in blobs)
-        content += _field(100, _field(1, name.encode()) + _field(2, kind.encode()) + parts)
-    return content
-
-
-def _author_state(net: MSGNet) -> dict[str, Tensor]:
-    """Return the parameters under Voynov et al.'s names at x4, which the network's description lists."""
-    names = {
-        "guidance.0": "feature_extraction_Y.0",
-        "guidance.1": "feature_extraction_Y.1",
-        "guidance.2": "feature_extraction_Y.2",
-        "stem": "feature_extraction_X",
-        "levels.0.up": "upsampling_X.0",
-        "levels.0.fuse": "upsampling_X.1",
-        "levels.0.refine": "upsampling_X.2",
-        "levels.1.up": "upsampling_X.3",
-        "levels.1.fuse": "upsampling_X.4",
-        "levels.1.refine": "upsampling_X.5",
-        "smooth": "upsampling_X.6",
-        "reconstruct": "upsampling_X.7",
-    }
-    state = {}
-    for name, value in net.state_dict().items():
-        layer, conv, part = name.rsplit(".", 2)
-        state[f"{names[layer]}.{conv}.{part}"] = value
-    return state
-
-
-def _write(path: Path, content: bytes) -> Path:
-    path.write_bytes(content)
-    return path
-
-
-def _save(path: Path, content: object) -> Path:
-    torch.save(content, path)
-    return path
-
-
-@pytest.mark.parametrize("packed", [True, False])
-@pytest.mark.parametrize("scale", [2, 8])
-def test_a_caffe_model_gives_back_the_parameters_that_were_written(tmp_path: Path, scale: int, packed: bool) -> None:
-    net = MSGNet(scale, "hui")
-    path = _write(tmp_path / "net.caffemodel", _caffemodel(_caffe_layers(net), packed=packed))
-    loaded = load_msg_weights(path, scale)
-    assert loaded.variant.name == "hui"
+@pytest.mark.parametrize("case", NETS)
+def test_a_file_gives_back_the_very_network_that_was_saved(tmp_path: Path, case: str) -> None:
+    net = NETS[case]()
+    net.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # as training has it
+    save_network(tmp_path / "w.safetensors", net, "mine")
+    loaded = load_network(tmp_path / "w.safetensors", NETWORKS, net.scale, "mine")
+    assert (type(loaded), loaded.arguments()) == (type(net), net.arguments())
+    assert list(loaded.state_dict()) == list(net.state_dict())
     torch.testing.assert_close(dict(loaded.state_dict()), dict(net.state_dict()), rtol=0, atol=0)
+    rgb, disparity = torch.rand(1, 3, 8 * net.scale, 8 * net.scale), torch.rand(1, 1, 8, 8)
+    with torch.no_grad():
+        torch.testing.assert_close(loaded.upsample(rgb, disparity), net.upsample(rgb, disparity), rtol=1e-4, atol=1e-5)
 
 
-def test_a_torch_file_gives_back_the_parameters_that_were_written(tmp_path: Path) -> None:
-    net = MSGNet(4)
-    loaded = load_msg_weights(_save(tmp_path / "net.pth", {"model_state_dict": _author_state(net)}), 4, "voynov")
-    assert loaded.variant.name == "voynov"
-    torch.testing.assert_close(dict(loaded.state_dict()), dict(net.state_dict()), rtol=0, atol=0)
+def test_equal_networks_give_equal_bytes_and_the_facts_come_back(tmp_path: Path) -> None:
+    net, facts = MSGNet(4, "dsr"), {"steps": 12, "loss": "lap1", "nested": {"b": 1, "a": [2]}}
+    for name in ("a", "b"):
+        save_network(tmp_path / name, net, "msg_v", facts)
+    assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
+    head = read_head(tmp_path / "a")
+    assert head["facts"] == facts
+    assert (head["network"], head["model"], head["arguments"]) == ("MSGNet", "msg_v", {"scale": 4, "variant": "dsr"})
 
 
 def test_loading_draws_nothing_from_the_random_generator(tmp_path: Path) -> None:
-    path = _save(tmp_path / "net.pth", {"model_state_dict": _author_state(MSGNet(4))})
+    save_network(tmp_path / "w", Facets(4, width=8, blocks=1), "facets")
     before = torch.get_rng_state()
-    load_msg_weights(path, 4)
+    load_network(tmp_path / "w", NETWORKS)
     assert torch.equal(torch.get_rng_state(), before)
 
 
-def _refusal(path: Path, scale: int = 4, variant: str | None = None) -> str:
-    """Return the message with which the file is refused: one line that names it."""
-    with pytest.raises(ValueError, match=r"expected|weights are for") as caught:
-        load_msg_weights(path, scale, variant)  # type: ignore[arg-type]
-    message = str(caught.value)
-    assert message.startswith(f"{path}: ")
-    assert "\n" not in message
-    return message
+def test_a_file_is_told_from_a_published_one_by_its_content(tmp_path: Path) -> None:
+    save_network(tmp_path / "w.pth", MSGNet(4, "dsr"), "msg_v")
+    torch.save({"model_state_dict": {}}, tmp_path / "w.caffemodel")
+    assert is_ours(tmp_path / "w.pth")
+    assert not is_ours(tmp_path / "w.caffemodel")
+    assert build_trained(tmp_path / "w.pth", 4, "msg_v", "voynov").net.scale == 4
+    with pytest.raises(ValueError, match=r"w.caffemodel: expected MSG-Net for a scale"):
+        build_trained(tmp_path / "w.caffemodel", 4, "msg_v", "voynov")
 
 
-def test_a_missing_file_is_reported_as_missing(tmp_path: Path) -> None:
-    with pytest.raises(FileNotFoundError, match=r"nowhere\.pth: no such weights file"):
-        load_msg_weights(tmp_path / "nowhere.pth", 4)
-
-
-def test_weights_of_another_scale_are_refused(tmp_path: Path) -> None:
-    caffe = _write(tmp_path / "net.caffemodel", _caffemodel(_caffe_layers(MSGNet(8, "hui"))))
-    assert "weights are for scale 8, the run is at scale 4" in _refusal(caffe, 4)
-    assert "weights are for scale 4, the run is at scale 2" in _refusal(
-        _save(tmp_path / "net.pth", {"model_state_dict": _author_state(MSGNet(4))}), 2
-    )
-
-
-def test_weights_of_the_other_variant_are_refused(tmp_path: Path) -> None:
-    caffe = _write(tmp_path / "net.caffemodel", _caffemodel(_caffe_layers(MSGNet(4, "hui"))))
-    assert "expected weights of variant voynov, got those of variant hui" in _refusal(caffe, 4, "voynov")
-
-
-class _Trap:
-    """Unpickled, it leaves a file behind."""
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-
-    def __reduce__(self) -> tuple[object, tuple[str, str]]:
-        return open, (str(self.path), "w")
-
-
-@pytest.mark.parametrize("protocol", [0, 2, 4])
-def test_code_in_a_pickle_is_not_run(tmp_path: Path, protocol: int) -> None:
-    mark = tmp_path / "trapped"
-    path = _write(tmp_path / "net.pth", pickle.dumps({"model_state_dict": _Trap(mark)}, protocol))
-    _refusal(path)
-    assert not mark.exists()
-
-
-def test_code_in_a_torch_file_is_not_run(tmp_path: Path) -> None:
-    mark = tmp_path / "trapped"
-    message = _refusal(_save(tmp_path / "net.pth", {"model_state_dict": _author_state(MSGNet(4)), "x": _Trap(mark)}))
-    assert "which are never loaded" in message
-    assert not mark.exists()
-
-
-def test_damaged_and_foreign_files_are_refused(tmp_path: Path) -> None:
-    whole = _save(tmp_path / "whole.pth", {"model_state_dict": _author_state(MSGNet(4))}).read_bytes()
-    noise = np.random.default_rng(0).bytes(10_000)
-    foreign = (b"", noise, b"\x80" + noise, b"PK\x03\x04" + noise, b"\x89PNG\r\n\x1a\n")
-    for content in (whole[:5000], whole[:-30], *foreign):
-        assert "expected a torch" in _refusal(_write(tmp_path / "net.pth", content))
-
-
-def test_a_caffe_model_cut_off_anywhere_is_refused(tmp_path: Path) -> None:
-    whole = _caffemodel(_caffe_layers(MSGNet(2, "hui")))
-    for length in np.random.default_rng(0).integers(1, len(whole), 40).tolist():
-        message = _refusal(_write(tmp_path / "net.caffemodel", whole[:length]), 2)
-        assert "expected" in message
-
-
-def test_a_caffe_blob_whose_shape_does_not_fit_its_values_is_refused(tmp_path: Path) -> None:
-    shape = _field(7, _field(1, _varint(2**62) + _varint(4)))
-    blob = shape + _field(5, struct.pack("<2f", 1, 2))
-    layer = _field(100, _field(1, b"conv") + _field(2, b"Convolution") + _field(7, blob))
-    assert f"a blob of shape ({2**62}, 4) holds 8 bytes" in _refusal(_write(tmp_path / "net.caffemodel", layer))
-
-
-@pytest.mark.parametrize(
-    ("content", "problem"),
-    [
-        (b"\x80\x80", "a number is cut off"),
-        (b"\xff" * 11, "a number is longer than 64 bits"),
-        (b"\xa2\x06\xff\xff\xff\xff\x0f\x00", "field 100 is cut off"),
-        (b"\x0b", "field 1 has the unknown wire type 3"),
-        (b"\x02\x00", "a field has number 0"),
-        (b"\xa0\x06\x01", "field 100 is a number instead of bytes"),
-        (_field(1, b"name"), "6 bytes without a Caffe layer"),
-    ],
-)
-def test_what_is_wrong_with_a_protobuf_is_said(tmp_path: Path, content: bytes, problem: str) -> None:
-    if content[0] == 0x80:  # a torch file's first byte, too
-        content = _field(1, b"name") + content
-    assert problem in _refusal(_write(tmp_path / "net.caffemodel", content))
-
-
-def test_a_torch_file_of_another_network_is_refused(tmp_path: Path) -> None:
-    path = tmp_path / "net.pth"
-    expected = "expected tensors under the key model_state_dict, got"
-    assert f"{expected} weight" in _refusal(_save(path, {"weight": torch.ones(1)}))
-    assert f"{expected} Tensor" in _refusal(_save(path, torch.ones(1)))
-    other = {"model_state_dict": {"conv.weight": torch.ones(1)}}
-    assert "expected MSG-Net for a scale of (2, 4, 8, 16), got 0 upsampling levels" in _refusal(_save(path, other))
-
-
-def test_missing_unexpected_and_misshapen_tensors_are_named(tmp_path: Path) -> None:
-    path, state = tmp_path / "net.pth", _author_state(MSGNet(4))
-    bias = state.pop("upsampling_X.5.conv.bias")
-    assert "levels.1.refine.conv.bias is missing" in _refusal(_save(path, {"model_state_dict": state}))
-    state |= {"upsampling_X.5.conv.bias": bias, "extra": bias}
-    assert "'extra' is unexpected" in _refusal(_save(path, {"model_state_dict": state}))
-    del state["extra"]
-    state["feature_extraction_X.conv.bias"] = bias
-    assert "stem.conv.bias has shape (32,) instead of (64,)" in _refusal(_save(path, {"model_state_dict": state}))
-    state["feature_extraction_X.conv.bias"] = torch.full((64,), torch.nan)
-    assert "stem.conv.bias holds values other than finite" in _refusal(_save(path, {"model_state_dict": state}))
-
-
-def test_missing_and_additional_caffe_layers_are_named(tmp_path: Path) -> None:
-    path, layers = tmp_path / "net.caffemodel", _caffe_layers(MSGNet(4, "hui"))
-    assert "guidance.1.activation.weight is missing" in _refusal(_write(path, _caffemodel(layers[:3] + layers[4:])))
-    extra: Layer = ("conv9", "Convolution", [torch.ones(1, 1, 5, 5), torch.ones(1)])
-    assert "'conv9.conv.weight' is unexpected" in _refusal(_write(path, _caffemodel([*layers, extra])))
-
-
-# Ours
-
-
-@pytest.mark.parametrize(("scale", "variant"), [(2, "dsr"), (4, "dsr"), (8, "dsr"), (4, "voynov")])
-def test_our_own_file_gives_back_the_very_parameters_that_were_saved(
-    tmp_path: Path, scale: int, variant: VariantName
-) -> None:
-    net = MSGNet(scale, variant)
-    net.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # as training has it
-    save_msg_weights(tmp_path / "w.safetensors", net, "msg_v")
-    loaded = load_msg_weights(tmp_path / "w.safetensors", scale, "voynov", "msg_v")
-    assert (loaded.variant.name, loaded.scale) == (variant, scale)
-    assert list(loaded.state_dict()) == list(net.state_dict())
-    torch.testing.assert_close(dict(loaded.state_dict()), dict(net.state_dict()), rtol=0, atol=0)
-
-
-def test_the_name_of_our_own_file_does_not_matter(tmp_path: Path) -> None:
-    save_msg_weights(tmp_path / "w.pth", MSGNet(4, "dsr"), "msg_v")
-    assert load_msg_weights(tmp_path / "w.pth", 4).variant.name == "dsr"
-
-
-def _ours(path: Path, facts: dict[str, str] | None = None, tensors: dict[str, Tensor] | None = None) -> Path:
-    """Write a file like our own, with some facts other and perhaps other tensors."""
-    ours = {"format": "dsr-msg-1", "variant": "dsr", "scale": "4", "trained_as": "msg_v", **(facts or {})}
+def _file(path: Path, changes: dict[str, Any] | None = None, tensors: dict[str, Tensor] | None = None) -> Path:
+    """Write a file like ours with some facts other, and perhaps other tensors."""
+    head = {"format": "dsr-network-1", "network": "MSGNet", "arguments": {"scale": 4, "variant": "dsr"}}
+    head |= {"model": "msg_v", "facts": {}, **(changes or {})}
     state = MSGNet(4, "dsr").state_dict() if tensors is None else tensors
-    save_file(dict(state), path, {key: value for key, value in ours.items() if value})
+    save_file(dict(state), path, {"dsr": json.dumps(head)})
     return path
 
 
-def test_our_weights_of_another_model_or_scale_are_refused(tmp_path: Path) -> None:
-    path = _ours(tmp_path / "w.safetensors")
-    with pytest.raises(ValueError, match=r"w.safetensors: expected weights of model msg, got those of msg_v$"):
-        load_msg_weights(path, 4, "hui", "msg")
-    with pytest.raises(ValueError, match=r"w.safetensors: weights are for scale 4, the run is at scale 8$"):
-        load_msg_weights(path, 8, "voynov", "msg_v")
-    assert "weights are for scale 4, the run is at scale 2" in _refusal(path, 2)
+def _refusal(path: Path, scale: int | None = 4, model: str | None = None) -> str:
+    """Return the message with which the file is refused: one line that names it."""
+    with pytest.raises(ValueError, match=r"expected|weights are for") as caught:
+        load_network(path, NETWORKS, scale, model)
+    message = str(caught.value)
+    assert message.startswith(f"{path}: ")
+    assert "\n" not in message
+    return message.removeprefix(f"{path}: ")
 
 
-def test_the_authors_weights_are_taken_whatever_the_model_of_ours_would_be(tmp_path: Path) -> None:
-    path = _save(tmp_path / "net.pth", {"model_state_dict": _author_state(MSGNet(4))})
-    assert load_msg_weights(path, 4, "voynov", "msg_v").variant.name == "voynov"
+def test_a_missing_file_is_reported_as_missing(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError, match=r"nowhere: no such weights file"):
+        load_network(tmp_path / "nowhere", NETWORKS)
 
 
-def test_our_file_cut_off_or_changed_anywhere_is_refused(tmp_path: Path) -> None:
-    path = _ours(tmp_path / "w.safetensors")
+def test_weights_of_another_model_or_scale_are_refused(tmp_path: Path) -> None:
+    path = _file(tmp_path / "w")
+    assert _refusal(path, model="msg") == "expected weights of model msg, got those of msg_v"
+    assert _refusal(path, 8) == "weights are for scale 4, the run is at scale 8"
+    with pytest.raises(ValueError, match=r"expected weights of model facets, got those of msg_v"):
+        build_trained(path, 4, "facets")
+
+
+def test_a_file_cut_off_or_changed_anywhere_is_refused(tmp_path: Path) -> None:
+    path = _file(tmp_path / "w")
     whole = path.read_bytes()
     header = 8 + int.from_bytes(whole[:8], "little")
-    for length in (9, 100, header - 1, header, header + 1000, len(whole) - 1):
-        assert "expected a safetensors file, got a damaged one" in _refusal(_write(path, whole[:length]))
-    for first in (b"\xff" * 8, (2**40).to_bytes(8, "little"), (header - 20).to_bytes(8, "little")):
-        assert "expected a safetensors file, got a damaged one" in _refusal(_write(path, first + whole[8:]))
+    damaged = [whole[:length] for length in (9, 100, header - 1, header, header + 1000, len(whole) - 1)]
+    damaged += [
+        first + whole[8:] for first in (b"\xff" * 8, (2**40).to_bytes(8, "little"), (header - 20).to_bytes(8, "little"))
+    ]
+    for content in damaged:
+        path.write_bytes(content)
+        assert "expected a safetensors file, got a damaged one" in _refusal(path)
 
 
-@pytest.mark.parametrize(
-    "facts", [{"format": "other"}, {"format": ""}, {"variant": "unet"}, {"scale": "four"}, {"scale": ""}]
-)
-def test_foreign_safetensors_are_refused(tmp_path: Path, facts: dict[str, str]) -> None:
-    message = _refusal(_ours(tmp_path / "w.safetensors", facts))
-    assert "expected weights that train.py wrote, got safetensors with the facts" in message
+@pytest.mark.parametrize("changes", [{"format": "other"}, {"format": None}])
+def test_a_foreign_format_is_refused(tmp_path: Path, changes: dict[str, Any]) -> None:
+    assert "expected weights that train.py wrote" in _refusal(_file(tmp_path / "w", changes))
 
 
 def test_safetensors_without_any_facts_are_refused(tmp_path: Path) -> None:
-    save_file({"a": torch.ones(2)}, tmp_path / "w.safetensors")
-    assert "expected weights that train.py wrote" in _refusal(tmp_path / "w.safetensors")
+    save_file({"a": torch.ones(2)}, tmp_path / "w")
+    assert _refusal(tmp_path / "w") == "expected weights that train.py wrote, got safetensors with no facts"
 
 
-def test_our_file_with_a_scale_that_there_is_not_is_refused(tmp_path: Path) -> None:
-    path = _ours(tmp_path / "w.safetensors", {"scale": "3"})
-    assert "weights are for scale 3, the run is at scale 4" in _refusal(path)
+@pytest.mark.parametrize(
+    "changes",
+    [{"network": "UNet"}, {"arguments": {"scale": 3}}, {"arguments": {"scale": 4, "depth": 9}}, {"arguments": [4]}],
+)
+def test_an_unknown_network_or_arguments_that_it_does_not_take_are_refused(
+    tmp_path: Path, changes: dict[str, Any]
+) -> None:
+    assert _refusal(_file(tmp_path / "w", changes)).startswith("expected one of the networks MSGNet, Facets, got ")
 
 
-def test_our_file_with_other_tensors_is_refused(tmp_path: Path) -> None:
+def test_other_tensors_are_refused(tmp_path: Path) -> None:
     state = {**MSGNet(4, "dsr").state_dict()}
     bias = state.pop("smooth.conv.bias")
-    assert "but smooth.conv.bias is missing" in _refusal(_ours(tmp_path / "w", tensors=state))
-    assert "but 'extra' is unexpected" in _refusal(
-        _ours(tmp_path / "w", tensors={**state, "smooth.conv.bias": bias, "extra": bias.clone()})
-    )
+    assert "but smooth.conv.bias is missing" in _refusal(_file(tmp_path / "w", tensors=state))
+    extra = {**state, "smooth.conv.bias": bias, "extra": bias.clone()}
+    assert "but 'extra' is unexpected" in _refusal(_file(tmp_path / "w", tensors=extra))
     state["smooth.conv.bias"] = torch.full_like(bias, torch.nan)
-    assert "smooth.conv.bias holds values other than finite" in _refusal(_ours(tmp_path / "w", tensors=state))
+    assert "smooth.conv.bias holds values other than finite" in _refusal(_file(tmp_path / "w", tensors=state))
+
+
+def test_every_file_that_comes_with_the_package_loads_as_the_model_and_scale_of_its_name() -> None:
+    for name in packaged_names():
+        path = packaged_weights(name)
+        assert path is not None
+        model, _, rest = name.partition("_x")
+        net: DisparityNetwork = load_network(path, NETWORKS, int(rest.split("_")[0]), model)
+        assert net.covers
+        assert read_head(path)["facts"]["steps"] > 0
+
+
+def test_a_name_that_does_not_come_with_the_package_is_none() -> None:
+    assert packaged_weights("msg_v_x3") is None

@@ -18,7 +18,7 @@ import torch
 from dsr.app.schema import ConfigError
 
 _MISSING = "???"
-_ABOUT = ("name", "label", "target", "weights_file", "weights_source", "depth_loss", "visual")
+_ABOUT = ("name", "label", "target", "weights_packaged", "weights_file", "weights_source", "depth_loss", "visual")
 
 
 def build(group: str, node: Mapping[str, Any], given: Mapping[str, Any] | None = None) -> Any:

@@ -47,8 +47,9 @@ def run_command(conf: Path, name: str, command: Callable[[DictConfig], Any]) -> 
 
     try:
         hydra.main(version_base="1.3", config_path=str(conf.resolve()), config_name=name)(job)()
-    except KeyboardInterrupt:
-        print("interrupted; what is finished is kept, the same command goes on from there", file=sys.stderr)  # noqa: T201
+    except KeyboardInterrupt as interruption:
+        message = str(interruption) or "interrupted; what is finished is kept, the same command goes on from there"
+        print(message, file=sys.stderr)  # noqa: T201
         sys.exit(INTERRUPTED)
     except (HydraException, OmegaConfBaseException) as error:
         fail(explain(error, conf, name))

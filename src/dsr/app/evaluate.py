@@ -19,8 +19,11 @@ from dsr.app import rundir
 from dsr.app.build import build, pick_device, takes
 from dsr.app.perceptual import perceptual_network
 from dsr.app.progress import over
-from dsr.app.schema import ConfigError, EvalConfig, plain_config
+from dsr.app.runs import studies_of_run
+from dsr.app.schema import ConfigError, EvalConfig, given_keys, plain_config
+from dsr.data.base import SceneSource
 from dsr.evaluation import Outcome, StalePredictionError, Study, predict, score
+from dsr.methods.trained import packaged_names, packaged_weights
 from dsr.quality.scores import catalogue
 from dsr.report.pictures import save_picture
 from dsr.report.tables import score_table
@@ -33,23 +36,33 @@ _LOG_WIDTH = 110
 def evaluate(config: DictConfig) -> pd.DataFrame:
     """Evaluate one method on one data set: write predictions, scores and pictures, print a table.
 
+    ``run=RUN_DIR`` evaluates the network of a training, on its own validation scenes unless a data set is given.
+
     Args:
         config: composed from ``conf/eval.yaml``.
 
     Returns:
-        The content of ``scores.csv``.
+        The content of ``scores.csv``, one after the other where a run was validated with several data sets.
 
     Raises:
         ConfigError: the configuration cannot be run, or a scene failed (the others' results are written).
 
     """
     plain = plain_config(config)
+    if plain["run"] is None:
+        return _evaluate(plain, None)
+    scores = [_evaluate(each, source) for each, source in studies_of_run(plain, given_keys())]
+    return pd.concat(scores, ignore_index=True)
+
+
+def _evaluate(plain: dict[str, Any], source: SceneSource | None) -> pd.DataFrame:
+    """Evaluate on ``source``, or on the data set that the configuration describes."""
     settings = EvalConfig.of(plain)
     console = Console()
     if not console.is_terminal:
         console = Console(width=_LOG_WIDTH)
     device = pick_device(settings.device)
-    study, identity = _study(settings, plain, device)
+    study, identity = _study(settings, plain, device, source)
     if settings.metrics.lpips and settings.metrics.lpips_trunk is not None:
         perceptual_network(settings.metrics.lpips_trunk)  # a wrong one is refused before anything is written
     folder = Path(settings.output_dir or rundir.default_directory("eval", plain, identity)).expanduser()
@@ -72,9 +85,15 @@ def evaluate(config: DictConfig) -> pd.DataFrame:
     return scores
 
 
-def _study(settings: EvalConfig, plain: Mapping[str, Any], device: torch.device) -> tuple[Study, dict[str, Any]]:
+def _study(
+    settings: EvalConfig, plain: Mapping[str, Any], device: torch.device, source: SceneSource | None
+) -> tuple[Study, dict[str, Any]]:
     """Build what the configuration describes, and what identifies its predictions."""
-    source = build("dataset", settings.dataset)
+    if source is None:
+        if "parts" in settings.dataset:
+            name = settings.dataset["name"]
+            raise ConfigError(f"dataset={name}: several data sets are for training; name one of them")
+        source = build("dataset", settings.dataset)
     downsampling = build("downsampling", settings.downsampling)
     weights = _weights(settings)
     given = {
@@ -86,9 +105,27 @@ def _study(settings: EvalConfig, plain: Mapping[str, Any], device: torch.device)
     }
     method = build("method", settings.method, given)
     identity = rundir.identity_of(plain, None if weights is None else rundir.file_hash(weights), device)
-    names = (str(settings.downsampling["name"]), str(settings.method["name"]))
-    study = Study(source, downsampling, names[0], settings.scale, method, names[1], settings.seed, identity, device)
+    study = Study(
+        source,
+        downsampling,
+        _problem_name(settings),
+        settings.scale,
+        method,
+        str(settings.method["name"]),
+        settings.seed,
+        identity,
+        device,
+        noise=build("noise", settings.noise),
+    )
     return study, identity
+
+
+def _problem_name(settings: EvalConfig) -> str:
+    """Return the name of the degradation, as in ``scores.csv``: box, or box+gaussian_multiplicative-0.003."""
+    noise = settings.noise
+    parameters = [f"{value:g}" for key, value in noise.items() if key not in ("name", "target")]
+    name = str(settings.downsampling["name"])
+    return name if noise["name"] == "none" else "+".join((name, "-".join((str(noise["name"]), *parameters))))
 
 
 def _weights(settings: EvalConfig) -> Path | None:
@@ -100,14 +137,27 @@ def _weights(settings: EvalConfig) -> Path | None:
             print(f"note: method={name} has no weights; weights={given} is not used", file=sys.stderr)  # noqa: T201
         return None
     file = settings.method.get("weights_file")
-    if given is None:
-        source = settings.method.get("weights_source")
-        raise ConfigError(f"weights: method={name} needs weights=FILE, or a directory with {file} (from {source})")
-    if given.is_dir() and file is not None:
+    if given is None or (given.is_dir() and file is None):
+        return _packaged(settings)
+    if given.is_dir():
         given = given / str(file)
     if not given.is_file():
         raise ConfigError(f"weights: expected a file of weights for method={name}, got {given} (no such file)")
     return given
+
+
+def _packaged(settings: EvalConfig) -> Path:
+    """Return the file of the weights that come with dsr."""
+    wanted = settings.method.get("weights_packaged")
+    found = None if wanted is None else packaged_weights(str(wanted))
+    if found is not None:
+        return found
+    file, source = settings.method.get("weights_file"), settings.method.get("weights_source")
+    published = f", or a directory with {file} (from {source})" if file else ""
+    raise ConfigError(
+        f"weights: dsr comes with {', '.join(packaged_names())}; method={settings.method['name']} at scale "
+        f"{settings.scale} needs weights=FILE{published}"
+    )
 
 
 def _seed(seed: int) -> None:

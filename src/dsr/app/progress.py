@@ -63,7 +63,7 @@ class TrainingBar(ProgressBar):
         names = ("RMSE_d", "RMSE_v", "DSSIM_v", "LPIPS_v")
         scores = {name: trainer.callback_metrics.get(f"val/{name}") for name in names}
         text = "  ".join(f"{name} {float(value):.4f}" for name, value in scores.items() if value is not None)
-        self._bar.console.print(f"step {trainer.global_step:>6}  validation: {text}", highlight=False)
+        self._bar.console.print(f"step {trainer.global_step:>6}  validation: {text}", highlight=False, soft_wrap=True)
 
     def on_train_end(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
         """Leave the bar as it is."""
@@ -76,3 +76,11 @@ class TrainingBar(ProgressBar):
     def disable(self) -> None:
         """Show nothing."""
         self._bar.disable = True
+
+
+def duration(seconds: float) -> str:
+    """Return a time for a reader: 40 s, 12 min, 3.5 h."""
+    if seconds < 100:
+        return f"{seconds:.0f} s"
+    minutes = seconds / 60
+    return f"{minutes:.0f} min" if minutes < 100 else f"{minutes / 60:.1f} h"

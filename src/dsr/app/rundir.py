@@ -8,7 +8,7 @@ import importlib.metadata
 import json
 import platform
 import subprocess
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -23,8 +23,8 @@ _PACKAGES = (
     "dsr", "hydra-core", "lightning", "numpy", "omegaconf", "opencv-python-headless",
     "pandas", "scikit-image", "scipy", "torch", "torchmetrics",
 )  # fmt: skip
-_NOT_IDENTITY = ("output_dir", "overwrite", "metrics", "weights")  # of the weights, the content counts
-_PREDICTING_CODE = ("sample.py", "degrade.py", "geometry", "methods", "data")
+_NOT_IDENTITY = ("output_dir", "overwrite", "metrics", "weights", "resume", "run")  # of the weights, the content counts
+_PREDICTING_CODE = ("sample.py", "degrade.py", "geometry", "methods", "data", "objective.py", "training.py")
 
 
 def identity_of(config: Mapping[str, Any], weights_hash: str | None, device: torch.device) -> dict[str, Any]:
@@ -36,18 +36,31 @@ def identity_of(config: Mapping[str, Any], weights_hash: str | None, device: tor
 def default_directory(kind: str, config: Mapping[str, Any], identity: Mapping[str, Any]) -> Path:
     """Return outputs/KIND/DATASET_DOWNSAMPLING_xSCALE_METHOD_HASH; the same configuration leads to the same one."""
     digest = hashlib.sha256(json.dumps(identity, sort_keys=True).encode()).hexdigest()[:8]
-    names = (config["dataset"]["name"], config["downsampling"]["name"], f"x{config['scale']}", config["method"]["name"])
+    what = config["method"] if "method" in config else config["model"]
+    names = (config["dataset"]["name"], config["downsampling"]["name"], f"x{config['scale']}", what["name"])
     return Path("outputs") / kind / "_".join((*names, digest))
 
 
-def claim(folder: Path, config: Mapping[str, Any], identity: Mapping[str, Any]) -> None:
+def claim(
+    folder: Path, config: Mapping[str, Any], identity: Mapping[str, Any], tolerated: Sequence[str] = ()
+) -> list[str]:
     """Make ``folder`` the directory of this run, with its ``config.yaml`` and ``versions.json``.
+
+    Args:
+        folder: the directory.
+        config: of the run.
+        identity: see :func:`identity_of`.
+        tolerated: keys of the identity in which what is there already may differ.
+
+    Returns:
+        Those tolerated keys in which it does.
 
     Raises:
         ConfigError: something else is there already and ``overwrite`` is not set, or the directory cannot be written.
 
     """
     record = folder / "versions.json"
+    excused: list[str] = []
     if folder.exists() and not folder.is_dir():
         raise ConfigError(f"output_dir: expected a directory, {folder} is a file")
     if folder.is_dir() and any(folder.iterdir()) and not config["overwrite"]:
@@ -57,7 +70,9 @@ def claim(folder: Path, config: Mapping[str, Any], identity: Mapping[str, Any]) 
             raise ConfigError(
                 f"output_dir: {folder} holds files of something else; another output_dir keeps them"
             ) from None
-        changed = _changes(before, json.loads(json.dumps(identity)))
+        different = _changes(before, json.loads(json.dumps(identity)))
+        excused = [key for key in different if key in tolerated]
+        changed = [key for key in different if key not in tolerated]
         if changed:
             raise ConfigError(
                 f"output_dir: {folder} holds a run with another {', '.join(changed)}; "
@@ -68,6 +83,7 @@ def claim(folder: Path, config: Mapping[str, Any], identity: Mapping[str, Any]) 
         write_text(folder / "config.yaml", OmegaConf.to_yaml(OmegaConf.create(dict(config))))
     except OSError as error:
         raise ConfigError(f"output_dir: expected a directory to write to, got {folder} ({error.strerror})") from error
+    return excused
 
 
 def versions() -> dict[str, Any]:

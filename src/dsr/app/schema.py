@@ -8,12 +8,13 @@ from dataclasses import dataclass, field, fields, is_dataclass
 from typing import Any, Self
 
 from hydra.core.config_store import ConfigStore
+from hydra.core.hydra_config import HydraConfig
 from omegaconf import MISSING, DictConfig, OmegaConf
 
 from dsr.degrade import SCALES
 
 PRECISIONS = ("float32", "bfloat16")
-_GROUPS = ("dataset", "downsampling", "method", "metrics", "model", "trainer", "loss")
+_GROUPS = ("dataset", "downsampling", "noise", "method", "metrics", "model", "trainer", "loss")
 
 
 class ConfigError(ValueError):
@@ -70,10 +71,12 @@ class EvalConfig(Checked):
 
     dataset: dict[str, Any] = MISSING
     downsampling: dict[str, Any] = MISSING
+    noise: dict[str, Any] = MISSING
     method: dict[str, Any] = MISSING
     metrics: MetricsConfig = field(default_factory=MetricsConfig)
     scale: int = 4
     weights: str | None = None
+    run: str | None = None
     device: str = "auto"
     precision: str = "float32"
     seed: int = 0
@@ -92,21 +95,28 @@ class EvalConfig(Checked):
 
 @dataclass
 class TrainerConfig:
-    """How long and with what to train; see ``conf/trainer/``."""
+    """How long and with what to train; see ``conf/trainer/default.yaml``."""
 
     name: str = "default"
-    steps: int = 4000
-    validate_every: int = 500
+    steps: int = 6000
+    validate_every: int = 1000
     learning_rate: float = 1e-3
     warmup: int = 100
     weight_decay: float = 1e-4
     clip: float = 1.0
-    patch: int = 128
+    average: float = 0.999
+    finish: float = 0.2
+    patch: int = 96
     batch: int = 16
+    accumulate: int = 1
     validation_scenes: int = 4
     flip: bool = True
+    rotate: bool = True
+    depth_scale: float = 0.3
     colour: float = 0.1
     workers: int = 0
+    devices: Any = 1
+    init: str | None = None
 
 
 @dataclass
@@ -122,13 +132,16 @@ class TrainConfig(Checked):
 
     dataset: dict[str, Any] = MISSING
     downsampling: dict[str, Any] = MISSING
+    noise: dict[str, Any] = MISSING
     model: dict[str, Any] = MISSING
     trainer: TrainerConfig = field(default_factory=TrainerConfig)
     metrics: MetricsConfig = field(default_factory=MetricsConfig)
     loss: LossConfig = field(default_factory=LossConfig)
+    validation: dict[str, Any] = field(default_factory=dict)
     scale: int = 4
+    resume: str | None = None
     device: str = "auto"
-    precision: str = "float32"
+    precision: str = "auto"
     seed: int = 0
     output_dir: str | None = None
     overwrite: bool = False
@@ -140,23 +153,33 @@ class TrainConfig(Checked):
             ConfigError: a value is not one of its choices.
 
         """
-        _check_run(self.scale, self.precision, self.seed)
+        _check_run(self.scale, self.precision, self.seed, (*PRECISIONS, "auto"))
         w = self.loss.w
         if w != "auto" and (isinstance(w, bool) or not isinstance(w, (int, float)) or not 0 <= w < math.inf):
             raise ConfigError(f"loss.w: expected auto or a number, 0 or more, got {w!r}")
-        for name in ("steps", "validate_every", "learning_rate", "clip"):
+        for name in ("validate_every", "accumulate"):
             if not getattr(self.trainer, name) > 0:
                 raise ConfigError(f"trainer.{name}: expected a positive number, got {getattr(self.trainer, name)}")
+        devices = self.trainer.devices
+        if devices != "auto" and (isinstance(devices, bool) or not isinstance(devices, int) or devices < 1):
+            raise ConfigError(f"trainer.devices: expected auto or a positive number, got {devices!r}")
 
 
-def _check_run(scale: int, precision: str, seed: int) -> None:
+def _check_run(scale: int, precision: str, seed: int, precisions: tuple[str, ...] = PRECISIONS) -> None:
     """Check what all commands have."""
     if scale not in SCALES:
         raise ConfigError(f"scale: expected one of {', '.join(map(str, SCALES))}, got {scale}")
-    if precision not in PRECISIONS:
-        raise ConfigError(f"precision: expected one of {', '.join(PRECISIONS)}, got {precision}")
+    if precision not in precisions:
+        raise ConfigError(f"precision: expected one of {', '.join(precisions)}, got {precision}")
     if seed < 0:
         raise ConfigError(f"seed: expected 0 or a positive number, got {seed}")
+
+
+def given_keys() -> list[str]:
+    """Return the keys that the command line sets, without + or ~; none outside of a Hydra command."""
+    if not HydraConfig.initialized():
+        return []
+    return [override.partition("=")[0].lstrip("+~") for override in HydraConfig.get().overrides.task]
 
 
 def plain_config(config: DictConfig) -> dict[str, Any]:

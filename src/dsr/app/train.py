@@ -2,48 +2,45 @@
 
 from __future__ import annotations
 
-import contextlib
-import logging
+import functools
 import shutil
-import signal
-import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import lightning
 import torch
-import torchmetrics
-from lightning.pytorch.callbacks import Callback, LearningRateMonitor, ModelCheckpoint
-from lightning.pytorch.loggers import TensorBoardLogger
-from omegaconf import DictConfig, OmegaConf
+import yaml
+from omegaconf import DictConfig
 from rich.console import Console
 
 from dsr.app import rundir
 from dsr.app.build import build, pick_device
 from dsr.app.perceptual import perceptual_network
-from dsr.app.progress import TrainingBar, over
-from dsr.app.schema import ConfigError, TrainConfig, plain_config
+from dsr.app.progress import duration, over
+from dsr.app.runs import WEIGHTS, common, read_config, training_data
+from dsr.app.schema import ConfigError, TrainConfig, given_keys, plain_config
+from dsr.app.trainer import fit, make_trainer, seconds_per_step
 from dsr.atomic import replacing
-from dsr.data.base import SceneSource
-from dsr.data.patches import PatchData, PatchSettings
+from dsr.data.patches import PatchData
 from dsr.data.procedural.source import Procedural
-from dsr.degrade import Downsampling
-from dsr.methods.msg_net import MSGNet
-from dsr.methods.weights import save_msg_weights
+from dsr.methods.network import DisparityNetwork
+from dsr.methods.trained import NETWORKS
+from dsr.methods.weights import load_network, save_network
+from dsr.objective import Objective, balanced_weight
 from dsr.quality.metrics import visual_metrics
-from dsr.training import Objective, Schedule, SuperResolution, balanced_weight
+from dsr.training import Schedule, SuperResolution
 
-WEIGHTS = "weights.safetensors"
-_MONITOR = "val/RMSE_v"
 _PATCHES_FOR_W = 64
 _LARGEST_SEED = 2**32 - 1
+_RESUMABLE = ("resume", "device")
 
 
 def train(config: DictConfig) -> Path:
     """Train a network: checkpoints, a TensorBoard log, and the weights of the best validation RMSE_v.
 
-    A run that was interrupted goes on from its last checkpoint when the same command is given again.
+    A run that was interrupted goes on from its last checkpoint when the same command is given again, or
+    ``resume=RUN_DIR``.
 
     Args:
         config: composed from ``conf/train.yaml``.
@@ -53,176 +50,176 @@ def train(config: DictConfig) -> Path:
 
     Raises:
         ConfigError: the configuration cannot be run, or is trained already.
+        KeyboardInterrupt: somebody stopped it; the message says how to go on.
 
     """
-    plain = plain_config(config)
+    plain = _resumed(plain_config(config))
     settings = TrainConfig.of(plain)
     device = pick_device(settings.device)
+    plain["precision"] = settings.precision = _precision(settings.precision, device)
     console = Console()
     if settings.seed > _LARGEST_SEED:
         raise ConfigError(f"seed: expected at most {_LARGEST_SEED}, got {settings.seed}")
     lightning.seed_everything(settings.seed, workers=True, verbose=False)
-    net = build("model", settings.model, {"scale": settings.scale})
-    data = _data(settings)
-    network = perceptual_network(settings.metrics.lpips_trunk) if settings.metrics.lpips else None
+    net = _network(settings)
+    data = training_data(settings)
+    perceptual = perceptual_network(settings.metrics.lpips_trunk) if settings.metrics.lpips else None
     identity = rundir.identity_of(plain, None, device)
-    names = {**plain, "method": settings.model}
-    folder = Path(settings.output_dir or rundir.default_directory("train", names, identity)).expanduser()
+    folder = Path(settings.output_dir or rundir.default_directory("train", plain, identity)).expanduser()
     weights, last = folder / WEIGHTS, folder / "checkpoints" / "last.ckpt"
     if weights.exists() and not settings.overwrite:
         raise ConfigError(f"output_dir: {weights} is trained already; overwrite=true trains it anew")
-    _prepare(console, data.source)
-    module = _module(settings, net, data, visual_metrics(None if network is None else network.to(device)))
-    rundir.claim(folder, plain, identity)
+    _prepare(console, data)
+    metrics = functools.partial(visual_metrics, None if perceptual is None else perceptual.to(device))
+    module = _module(settings, net, data, metrics)
+    tolerated = ("code", "device") if "resume" in given_keys() else ()
+    for key in rundir.claim(folder, plain, identity, tolerated):
+        console.print(f"note: the run began with another {key}", markup=False, highlight=False)
     if settings.overwrite:
-        weights.unlink(missing_ok=True)  # or they would pass for this run's, should it be interrupted
-        for made in ("checkpoints", "tensorboard"):
-            shutil.rmtree(folder / made, ignore_errors=True)
+        _clear(folder)
     resume = last if last.is_file() else None
-    _announce(console, settings, net, data, module.objective, folder, resume)
-    best = ModelCheckpoint(last.parent, "best", monitor=_MONITOR, mode="min", save_on_train_epoch_end=False)
-    latest = ModelCheckpoint(
-        last.parent, last.stem, enable_version_counter=False, save_on_train_epoch_end=False
-    )  # save_last=True keeps the best's
-    with _without_chatter():
-        callbacks = [best, latest, LearningRateMonitor("step"), TrainingBar(console)]
-        trainer = _trainer(settings, folder, device, callbacks)
-    trainer.logger.experiment.add_text("config", f"```yaml\n{OmegaConf.to_yaml(config, resolve=True)}```")  # type: ignore[union-attr]
-    _fit(trainer, module, data, resume)
-    _export(module, Path(best.best_model_path), weights, str(settings.model["name"]))
-    console.print(f"weights: {weights}", markup=False, highlight=False, soft_wrap=True)
+    _announce(console, settings, module, data, folder, resume)
+    facts = _facts(plain, module)
+    trainer, best = make_trainer(settings.trainer, folder, device, console, facts)
+    _describe(trainer, plain, module)
+    try:
+        fit(trainer, module, data, resume)
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt(
+            f"interrupted at step {trainer.global_step}; python train.py resume={folder} goes on from there"
+        ) from None
+    if trainer.is_global_zero:
+        _export(module, Path(best.best_model_path), weights, facts)
+        console.print(f"weights: {weights}", markup=False, highlight=False, soft_wrap=True)
     return weights
 
 
-def _data(settings: TrainConfig) -> PatchData:
-    """Return the patches that the configuration describes."""
-    trainer = settings.trainer
-    downsampling = build("downsampling", settings.downsampling)
-    if not isinstance(downsampling, Downsampling):
-        raise ConfigError("downsampling: training needs a model such as box, measured is none")
-    source = build("dataset", settings.dataset)
+def _resumed(plain: dict[str, Any]) -> dict[str, Any]:
+    """Return the configuration, or that of the run which is to be gone on with."""
+    if plain.get("resume") is None:
+        return plain
+    folder = Path(plain["resume"]).expanduser()
+    others = [key for key in given_keys() if key not in _RESUMABLE]
+    if others:
+        raise ConfigError(f"resume: goes on under the run's own configuration; {', '.join(others)} cannot be changed")
+    before = read_config(folder)
+    device = {"device": plain["device"]} if "device" in given_keys() else {}
+    return {**before, **device, "resume": None, "output_dir": str(folder), "overwrite": False}
+
+
+def _precision(name: str, device: torch.device) -> str:
+    """Return float32 or bfloat16: what is fast on the device where ``auto`` asks for it."""
+    if name != "auto":
+        return name
+    if device.type == "cuda":
+        return "bfloat16" if torch.cuda.is_bf16_supported(including_emulation=False) else "float32"
+    fast = getattr(torch.cpu, "_is_amx_tile_supported", None)
+    return "bfloat16" if device.type == "cpu" and fast is not None and fast() else "float32"
+
+
+def _network(settings: TrainConfig) -> DisparityNetwork:
+    """Return the network, with weights to start from where they are given."""
+    net: DisparityNetwork = build("model", settings.model, {"scale": settings.scale})
+    if settings.trainer.init is None:
+        return net
     try:
-        patches = PatchSettings(
-            trainer.patch,
-            trainer.batch,
-            min(trainer.validate_every, trainer.steps),
-            trainer.validation_scenes,
-            trainer.flip,
-            trainer.colour,
-            trainer.workers,
+        first = load_network(Path(settings.trainer.init).expanduser(), NETWORKS, settings.scale)
+    except (ValueError, OSError) as error:
+        raise ConfigError(f"trainer.init: {error}") from error
+    if type(first) is not type(net) or first.arguments() != net.arguments():
+        raise ConfigError(
+            f"trainer.init: {settings.trainer.init}: expected weights of {type(net).__name__} {net.arguments()}, "
+            f"got those of {type(first).__name__} {first.arguments()}"
         )
-        return PatchData(source, patches, settings.scale, downsampling, settings.seed)
-    except ValueError as error:
-        raise ConfigError(str(error)) from error
+    return first
 
 
-def _module(
-    settings: TrainConfig, net: MSGNet, data: PatchData, metrics: torchmetrics.MetricCollection
-) -> SuperResolution:
+def _prepare(console: Console, data: PatchData) -> None:
+    """Let the data sets that render their scenes do so, with a bar."""
+    for source in data.sources:
+        if isinstance(source, Procedural):
+            for _ in over(console, source.prepare(), "render", len(source.scenes())):
+                pass
+
+
+def _module(settings: TrainConfig, net: DisparityNetwork, data: PatchData, metrics: Any) -> SuperResolution:
     """Return the network under training; loads the scenes, which its loss may depend on."""
-    trainer = settings.trainer
     try:
         data.setup()
-        schedule = Schedule(trainer.steps, trainer.learning_rate, trainer.warmup, trainer.weight_decay)
-        return SuperResolution(net, _objective(settings, data), schedule, metrics)
+        mixed = settings.precision == "bfloat16"
+        schedule = Schedule(mixed=mixed, **common(Schedule, settings.trainer))
+        return SuperResolution(net, _objective(settings, data), schedule, metrics, data.validation_sets)
     except (ValueError, OSError) as error:
         raise ConfigError(str(error)) from error
 
 
-def _prepare(console: Console, source: SceneSource) -> None:
-    """Let a data set that renders its scenes do so, with a bar."""
-    if isinstance(source, Procedural):
-        count = len(source.scenes())
-        for _ in over(console, source.prepare(), "render", count):
-            pass
-
-
 def _objective(settings: TrainConfig, data: PatchData) -> Objective:
     """Return the loss; w is computed from training patches unless it is a number."""
-    if not settings.model["visual"]:
-        return Objective(settings.model["depth_loss"])
+    depth_loss: Any = settings.model.get("depth_loss")
+    visual = settings.model.get("visual")
+    if not isinstance(visual, bool):
+        raise ConfigError(f"model.visual: expected true or false, got {visual!r}")
+    if not visual:
+        return Objective(depth_loss)
     w = balanced_weight(data.some_patches(_PATCHES_FOR_W)) if settings.loss.w == "auto" else float(settings.loss.w)
-    return Objective(settings.model["depth_loss"], w)
+    return Objective(depth_loss, w)
 
 
-def _fit(trainer: lightning.Trainer, module: SuperResolution, data: PatchData, resume: Path | None) -> None:
-    """Train; an interruption, which Lightning turns into an exit with code 1, comes out as the KeyboardInterrupt."""
-    handler = signal.getsignal(signal.SIGINT)
-    try:
-        with _without_chatter():
-            trainer.fit(module, data, ckpt_path=resume, weights_only=True)
-    except SystemExit:
-        if not trainer.interrupted:
-            raise
-    if trainer.interrupted:
-        signal.signal(signal.SIGINT, handler)  # Lightning has it ignored
-        raise KeyboardInterrupt
-
-
-def _trainer(settings: TrainConfig, folder: Path, device: torch.device, callbacks: list[Callback]) -> lightning.Trainer:
-    """Return Lightning's trainer."""
-    return lightning.Trainer(
-        accelerator="gpu" if device.type == "cuda" else device.type,
-        devices=1 if device.type == "cpu" or device.index is None else [device.index],
-        precision="bf16-mixed" if settings.precision == "bfloat16" else "32-true",
-        max_steps=settings.trainer.steps,
-        gradient_clip_val=settings.trainer.clip,
-        reload_dataloaders_every_n_epochs=1,
-        log_every_n_steps=min(10, settings.trainer.validate_every),
-        logger=TensorBoardLogger(folder, name="", version="tensorboard"),
-        callbacks=callbacks,
-        enable_model_summary=False,
-        num_sanity_val_steps=0,
-    )
+def _clear(folder: Path) -> None:
+    """Take away what a former training left, lest it pass for this one's should it be interrupted."""
+    (folder / WEIGHTS).unlink(missing_ok=True)
+    for name in ("checkpoints", "tensorboard"):
+        shutil.rmtree(folder / name, ignore_errors=True)
 
 
 def _announce(
-    console: Console,
-    settings: TrainConfig,
-    net: MSGNet,
-    data: PatchData,
-    objective: Objective,
-    folder: Path,
-    resume: Path | None,
+    console: Console, settings: TrainConfig, module: SuperResolution, data: PatchData, folder: Path, resume: Path | None
 ) -> None:
-    """Say what the run will do."""
+    """Say what the run will do, and how long it will take."""
+    trainer, objective = settings.trainer, module.objective
     visual = f" + {objective.w:.3g} MSE_v" if objective.w else ""
-    trainer = settings.trainer
+    batch = torch.utils.data.default_collate(data.some_patches(trainer.batch))
+    step = seconds_per_step(module, batch) * trainer.accumulate
+    held_out = ", ".join(f"{len(names)} of {kind}" for kind, (_, names) in data.validation_scenes().items())
+    parameters = sum(each.numel() for each in module.net.parameters())
+    accumulate = f" x {trainer.accumulate} batches" if trainer.accumulate > 1 else ""
     lines: Mapping[str, Any] = {
-        "model": f"{settings.model['name']} x{settings.scale}, {sum(p.numel() for p in net.parameters()):,} parameters",
-        "data": f"{len(data.training_names)} scenes of {settings.dataset['name']} to train on, "
-        f"{len(data.validation_names)} to validate with",
+        "model": f"{settings.model['name']} x{settings.scale}, {parameters:,} parameters, {settings.precision}",
+        "data": f"{data.training_count} scenes of {settings.dataset['name']} to train on, {held_out} to validate with",
         "loss": f"{objective.depth_loss}{visual}",
-        "steps": f"{trainer.steps} of {trainer.batch} patches of {trainer.patch} x {trainer.patch}"
+        "steps": f"{trainer.steps} of {trainer.batch} patches of {trainer.patch} x {trainer.patch}{accumulate}"
         + (", resumed" if resume else ""),
+        "time": f"about {duration(step * trainer.steps)} ({step:.2g} s a step as measured now), and the validations",
         "log": f"tensorboard --logdir {folder}",
     }
     for name, line in lines.items():
         console.print(f"{name:<6} {line}", markup=False, highlight=False, soft_wrap=True)
 
 
-@contextlib.contextmanager
-def _without_chatter() -> Iterator[None]:
-    """Keep Lightning's tips, and its warnings of what is meant to be so, off the terminal."""
-    logger = logging.getLogger("lightning.pytorch")
-    level = logger.level
-    logger.setLevel(logging.ERROR)
-    try:
-        with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", ".*does not have many workers.*")
-            warnings.filterwarnings("ignore", ".*smaller than the logging interval.*")
-            for resumed in ("exists and is not empty", "that ended before the epoch ended"):
-                warnings.filterwarnings("ignore", f".*{resumed}.*")
-            warnings.filterwarnings("ignore", ".*LeafSpec.*", FutureWarning)
-            warnings.filterwarnings("ignore", ".*LeafSpec.*", DeprecationWarning)
-            yield
-    finally:
-        logger.setLevel(level)
+def _describe(trainer: lightning.Trainer, plain: Mapping[str, Any], module: SuperResolution) -> None:
+    """Write the configuration, and the w that came of it, where the dashboard shows them."""
+    writer: Any = trainer.logger.experiment  # type: ignore[union-attr]
+    text = yaml.safe_dump({**plain, "loss": {"w": module.objective.w}}, sort_keys=False)
+    writer.add_text("config", f"```yaml\n{text}```")
 
 
-def _export(module: SuperResolution, best: Path, weights: Path, name: str) -> None:
-    """Write the weights of the best checkpoint."""
-    state = torch.load(best, map_location="cpu", weights_only=True)["state_dict"]
-    module.load_state_dict(state)
+def _facts(plain: Mapping[str, Any], module: SuperResolution) -> dict[str, Any]:
+    """Return what a reader of the weights or of the log should know of the training."""
+    groups = ("model", "dataset", "downsampling", "noise", "trainer")
+    return {
+        **{group: plain[group]["name"] for group in groups},
+        **{key: plain[key] for key in ("scale", "seed", "precision")},
+        **{key: plain["trainer"][key] for key in ("steps", "learning_rate", "batch", "patch")},
+        "loss": module.objective.depth_loss,
+        "w": module.objective.w,
+    }
+
+
+def _export(module: SuperResolution, best: Path, weights: Path, facts: Mapping[str, Any]) -> None:
+    """Write the averaged weights of the best checkpoint, and what led to them."""
+    checkpoint = torch.load(best, map_location="cpu", weights_only=True)
+    state = checkpoint["state_dict"]
+    prefix = "average."
+    module.average.load_state_dict({k.removeprefix(prefix): v for k, v in state.items() if k.startswith(prefix)})
     with replacing(weights) as temporary:
-        save_msg_weights(temporary, module.net, name)
+        save_network(temporary, module.average, facts["model"], {**facts, "steps": int(checkpoint["global_step"])})

@@ -36,6 +36,32 @@ class SceneSource(Protocol):
         ...
 
 
+class Some:
+    """Some scenes of a data set.
+
+    Args:
+        source: the data set.
+        names: of the scenes.
+
+    """
+
+    def __init__(self, source: SceneSource, names: Sequence[str]) -> None:
+        self.name = source.name
+        self._source, self._names = source, list(names)
+
+    def scenes(self) -> list[str]:
+        """Return the names of the scenes, in order."""
+        return list(self._names)
+
+    def load(self, scene: str) -> Scene:
+        """Return one scene; see :class:`SceneSource`."""
+        return self._source.load(scene)
+
+    def fingerprint(self, scene: str) -> str:
+        """Return a text that changes when the scene's content does."""
+        return self._source.fingerprint(scene)
+
+
 def chosen(available: Sequence[str], wanted: Sequence[str] | None) -> list[str]:
     """Return the scenes to use: those wanted, or all.
 

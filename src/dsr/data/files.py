@@ -6,6 +6,7 @@ import contextlib
 import json
 import math
 import os
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -42,7 +43,9 @@ def read_map(path: Path) -> np.ndarray:
         ValueError: it is missing, damaged, of another shape, or has 8-bit values (too coarse for a surface).
 
     """
-    values = _load_npy(path) if path.suffix.lower() == ".npy" else _decode(path, cv2.IMREAD_UNCHANGED)
+    readers = {".npy": _load_npy, ".pfm": _load_pfm}
+    reader = readers.get(path.suffix.lower())
+    values = _decode(path, cv2.IMREAD_UNCHANGED) if reader is None else reader(path)
     if values.ndim != 2:
         raise ValueError(f"{path}: expected one channel (height x width), got shape {values.shape}")
     if values.dtype.kind not in "fiu" or (values.dtype.kind in "iu" and values.dtype.itemsize == 1):
@@ -142,6 +145,31 @@ def _unit(path: Path, entries: dict[str, Any], key: str, *, numeric: bool) -> fl
         return float(value)
     choices = "m, mm" + (" or a positive number of metres per value" if numeric else "")
     raise ValueError(f"{path}: {key}: expected {choices}, got {value!r}")
+
+
+def _load_pfm(path: Path) -> np.ndarray:
+    """Return a PFM file's values as they are, (H, W).
+
+    The header's scale says the byte order by its sign; its magnitude, which OpenCV multiplies by, is left alone, as the
+    stereo benchmarks do.
+    """
+    if not path.is_file():
+        raise ValueError(f"{path}: expected a picture, there is none")
+    data = path.read_bytes()
+    header = re.match(rb"(P[Ff])\s+(\d+)\s+(\d+)\s+([-+.\deE]+)\s", data)
+    if header is None:
+        raise ValueError(f"{path}: expected a PFM file, got something else")
+    if header[1] != b"Pf":
+        raise ValueError(f"{path}: expected one channel, got a PFM file with three")
+    width, height = int(header[2]), int(header[3])
+    try:
+        scale = float(header[4])
+    except ValueError:
+        scale = 0.0
+    pixels = data[header.end() :]
+    if scale == 0 or not width or not height or len(pixels) != 4 * width * height:
+        raise ValueError(f"{path}: expected a PFM file of {width} x {height} floats, got a damaged one")
+    return np.frombuffer(pixels, "<f4" if scale < 0 else ">f4").reshape(height, width)[::-1]
 
 
 def _load_npy(path: Path) -> np.ndarray:

@@ -108,6 +108,25 @@ class Camera:
             doffs=self.doffs / factor,
         )
 
+    def rotate90(self, turns: int = 1) -> Camera:
+        """Return the camera of the image turned by ``turns`` quarter turns counterclockwise, as ``torch.rot90`` does.
+
+        The focal lengths change places and the principal point turns along. A baseline stays what it is, the constant
+        of an encoding of depth, though the cameras that it lies between turn too.
+        """
+        camera = self
+        for _ in range(turns % 4):
+            camera = replace(
+                camera,
+                width=camera.height,
+                height=camera.width,
+                fx=camera.fy,
+                fy=camera.fx,
+                cx=camera.cy,
+                cy=camera.width - 1 - camera.cx,
+            )
+        return camera
+
     def rays(self, *, dtype: torch.dtype = torch.float64, device: torch.device | str = "cpu") -> Tensor:
         """Return the rays r(u, v) with z = 1, shape (3, H, W)."""
         x = (torch.arange(self.width, dtype=dtype, device=device) - self.cx) / self.fx

@@ -11,13 +11,17 @@ batched, differentiable, on any device, for any image size.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
+
+from dsr.methods.holes import filled
+from dsr.methods.network import DisparityNetwork
 
 VariantName = Literal["hui", "voynov", "dsr"]
 SCALES = (2, 4, 8, 16)
@@ -34,7 +38,12 @@ class MSGVariant:
         activate_output: a PReLU follows the reconstruction too.
         same_size: the output has scale * h rows, else scale * h - 1 (Caffe's transposed convolutions, which know no
             output padding), and likewise columns; the guidance has the output's size.
-        rgb_weights, rgb_offset: guidance = weights . (R, G, B in 0..255) + offset, clipped to 0..255.
+        rgb_weights, rgb_offset: intensity = weights . (R, G, B in 0..255) + offset, clipped to 0..255.
+        plain_guidance: the guidance is the intensity, -1..1, whatever the rest of the photo holds, so that a patch and
+            the whole photo look alike to the network; else see :func:`guidance_map`.
+        depth_gain, residual_gain: factors of the depth that goes in and of the residual that comes out. Small residuals
+            of large activations: a step of the optimiser moves smooth surfaces less.
+        fill_holes: holes of the coarse map are filled from around; else they are the least disparity.
         drift_compensation: the output's mean over a flat probe is taken off the output, see :func:`output_drift`.
 
     """
@@ -46,6 +55,10 @@ class MSGVariant:
     rgb_weights: tuple[float, float, float]
     rgb_offset: float
     drift_compensation: bool
+    plain_guidance: bool = False
+    depth_gain: float = 1.0
+    residual_gain: float = 1.0
+    fill_holes: bool = False
 
 
 VARIANTS = MappingProxyType(
@@ -55,7 +68,7 @@ VARIANTS = MappingProxyType(
         # The released code takes YCbCr's inverse for its forward transform; the weights were trained on this image.
         "voynov": MSGVariant("voynov", True, True, True, (1.0, -0.34414, -0.71414), 128 * (0.34414 + 0.71414), True),
         # What dsr trains: the graph of voynov, guided by real luma, without a constant to take off afterwards.
-        "dsr": MSGVariant("dsr", True, True, True, (0.299, 0.587, 0.114), 0.0, False),
+        "dsr": MSGVariant("dsr", True, True, True, (0.299, 0.587, 0.114), 0.0, False, True, 10.0, 0.05, True),
     }
 )
 
@@ -72,10 +85,32 @@ class ConvLayer(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         """Map (B, C_in, H, W) to (B, C_out, H', W')."""
         x = self.conv(x)
-        # In place, without a second map of this size, but only where no gradient can ever be asked for.
-        if isinstance(self.activation, nn.PReLU) and self.activation.num_parameters == 1 and torch.is_inference(x):
-            return functional.leaky_relu_(x, float(self.activation.weight))
+        if isinstance(self.activation, nn.PReLU) and self.activation.num_parameters == 1:
+            # In place, without a second map of this size, but only where no gradient can ever be asked for.
+            if torch.is_inference(x):
+                return functional.leaky_relu_(x, float(self.activation.weight))
+            if x.device.type == "cpu":
+                return _SharedPReLU.apply(x, self.activation.weight)
         return self.activation(x)
+
+
+class _SharedPReLU(torch.autograd.Function):
+    """A PReLU with one slope; its gradient on the CPU takes a fraction of the library's time."""
+
+    @staticmethod
+    def forward(ctx: Any, x: Tensor, slope: Tensor) -> Tensor:
+        """Return x where it is positive, else slope * x."""
+        ctx.save_for_backward(x)
+        ctx.slope = float(slope)
+        return functional.leaky_relu(x, ctx.slope)
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the gradients of x and of the slope, (1,)."""
+        (x,) = ctx.saved_tensors
+        sum_type = torch.promote_types(x.dtype, torch.float32)
+        of_slope = (gradient * x.clamp(max=0)).sum(dtype=sum_type).reshape(1)
+        return torch.where(x > 0, gradient, ctx.slope * gradient), of_slope
 
 
 class Level(nn.Module):
@@ -91,7 +126,7 @@ class Level(nn.Module):
         return self.refine(self.fuse(torch.cat((guide, self.up(depth)), dim=1)))
 
 
-class MSGNet(nn.Module):
+class MSGNet(DisparityNetwork):
     """The network of both variants; modules are registered in the order in which data passes them.
 
     Args:
@@ -108,6 +143,7 @@ class MSGNet(nn.Module):
             raise ValueError(f"variant: expected one of {', '.join(VARIANTS)}, got {variant!r}")
         self.scale = scale
         self.variant = VARIANTS[variant]
+        self.covers = self.variant.same_size
         levels = scale.bit_length() - 1
         self.guidance = nn.ModuleList([self._conv(1, 49, kernel=7), self._conv(49, FEATURES)])
         self.guidance.extend(self._conv(FEATURES, FEATURES) for _ in range(levels - 1))
@@ -120,6 +156,8 @@ class MSGNet(nn.Module):
         )
         self.smooth = self._conv(FEATURES, FEATURES)
         self.reconstruct = self._conv(FEATURES, 1, active=self.variant.activate_output)
+        if variant == "dsr":
+            self._start_smooth()
 
     def forward(self, guidance: Tensor, depth: Tensor) -> Tensor:
         """Map normalised inputs to the high-resolution residual.
@@ -141,6 +179,14 @@ class MSGNet(nn.Module):
         for level, guide in zip(self.levels, reversed(self._pyramid(guidance)), strict=True):
             x = level(x, guide)  # (B, 32, 2 h, 2 w), (B, 32, 4 h, 4 w), ...
         return self.reconstruct(self.smooth(x))
+
+    def arguments(self) -> dict[str, Any]:
+        """Return the constructor's arguments."""
+        return {"scale": self.scale, "variant": self.variant.name}
+
+    def upsample(self, rgb: Tensor, disparity: Tensor, bounds: Tensor | None = None) -> Tensor:
+        """Return fine disparity; see :func:`upsample_disparity`."""
+        return upsample_disparity(self, rgb, disparity, bounds)
 
     def output_size(self, depth: Tensor) -> torch.Size:
         """Return (H, W) for depth of (..., h, w)."""
@@ -166,6 +212,26 @@ class MSGNet(nn.Module):
             pyramid.append(self.pool(layer(pyramid[-1])))
         return pyramid
 
+    @torch.no_grad()
+    def _start_smooth(self) -> None:
+        """Initialise for a smooth start: interpolating kernels, no biases, next to no residual.
+
+        A random transposed convolution treats even and odd pixels differently; the checkerboard that this leaves on
+        smooth surfaces is slow to unlearn. A bilinear kernel treats them alike.
+        """
+        line = torch.tensor([0.0, 0.5, 1.0, 0.5, 0.0])
+        slope = 0.25  # of a new PReLU
+        for layer in self.modules():
+            if isinstance(layer, nn.ConvTranspose2d):
+                inputs, outputs = layer.weight.shape[:2]
+                gains = torch.randn(inputs, outputs) * math.sqrt(2 / ((1 + slope**2) * inputs))
+                layer.weight.copy_(gains[:, :, None, None] * torch.outer(line, line))
+            elif isinstance(layer, nn.Conv2d):
+                nn.init.kaiming_normal_(layer.weight, a=slope)
+            if isinstance(layer, nn.Conv2d | nn.ConvTranspose2d) and layer.bias is not None:
+                nn.init.zeros_(layer.bias)
+        self.reconstruct.conv.weight.mul_(0.05)
+
     def _slopes(self, channels: int) -> int:
         return 1 if self.variant.shared_slopes else channels
 
@@ -189,14 +255,23 @@ class Normalised(NamedTuple):
     span: Tensor
 
 
-def normalised(x: Tensor) -> Normalised:
+def normalised(x: Tensor, bounds: Tensor | None = None) -> Normalised:
     """Return (x - min) / (max - min) per sample of (B, 1, H, W), over the finite values; the others become 0.
 
     A constant map becomes 0 with a span of 0. Where nothing is finite the minimum is NaN.
+
+    Args:
+        x: the map.
+        bounds: (B, 2, 1, 1) minimum and maximum to use instead of the map's own.
+
     """
     known, dims = x.isfinite(), (-3, -2, -1)
-    least = x.masked_fill(~known, torch.inf).amin(dims, keepdim=True)
-    span = x.masked_fill(~known, -torch.inf).amax(dims, keepdim=True) - least  # -inf where nothing is finite
+    if bounds is None:
+        least = x.masked_fill(~known, torch.inf).amin(dims, keepdim=True)
+        span = x.masked_fill(~known, -torch.inf).amax(dims, keepdim=True) - least  # -inf where nothing is finite
+    else:
+        least = bounds[:, :1].to(x)
+        span = bounds[:, 1:].to(x) - least
     values = torch.where(known, x - least, 0) / torch.where(span > 0, span, 1)
     return Normalised(values, torch.where(span >= 0, least, torch.nan), span)
 
@@ -216,12 +291,15 @@ def upsample_bicubic(x: Tensor, scale: int) -> Tensor:
 
 
 def guidance_map(rgb: Tensor, variant: MSGVariant) -> Tensor:
-    """Return the guidance (B, 1, H, W), in 0..1, of a photo (B, 3, H, W) in 0..1.
+    """Return the guidance (B, 1, H, W) of a photo (B, 3, H, W) in 0..1.
 
-    An intensity (see :class:`MSGVariant`), normalised, less its 3 x 3 mean, normalised again.
+    An intensity (see :class:`MSGVariant`), normalised, less its 3 x 3 mean, normalised again, 0..1; or the intensity
+    itself, -1..1, where the variant has plain guidance.
     """
     weights = torch.tensor(variant.rgb_weights, dtype=rgb.dtype, device=rgb.device)[:, None, None]
     intensity = ((255 * rgb * weights).sum(-3, keepdim=True) + variant.rgb_offset).clip(0, 255)
+    if variant.plain_guidance:
+        return intensity / 127.5 - 1
     intensity = normalised(intensity).values
     return normalised(intensity - mean3x3(intensity)).values
 
@@ -257,16 +335,20 @@ def output_drift(net: MSGNet, guidance: Tensor, disparity: Tensor, *, crop: bool
 def residual(net: MSGNet, guidance: Tensor, depth: Tensor) -> Tensor:
     """Run the network in its own precision; the output has the dtype of ``depth``, at least float32."""
     dtype = net.stem.conv.weight.dtype
-    return net(guidance.to(dtype), depth.to(dtype)).to(torch.promote_types(depth.dtype, torch.float32))
+    output = net(guidance.to(dtype), (net.variant.depth_gain * depth).to(dtype))
+    return net.variant.residual_gain * output.to(torch.promote_types(depth.dtype, torch.float32))
 
 
-def upsample_disparity(net: MSGNet, rgb: Tensor, disparity: Tensor, *, crop_drift: bool = True) -> Tensor:
+def upsample_disparity(
+    net: MSGNet, rgb: Tensor, disparity: Tensor, bounds: Tensor | None = None, *, crop_drift: bool = True
+) -> Tensor:
     """Upsample disparity with a photo's guidance.
 
     Args:
         net: the network.
         rgb: (B, 3, H, W) in 0..1, with H = scale * h and W = scale * w.
         disparity: (B, 1, h, w); non-finite values are holes.
+        bounds: see :meth:`dsr.methods.network.DisparityNetwork.upsample`.
         crop_drift: see :func:`output_drift`.
 
     Returns:
@@ -274,7 +356,9 @@ def upsample_disparity(net: MSGNet, rgb: Tensor, disparity: Tensor, *, crop_drif
         is NaN for a sample without a finite value.
 
     """
-    values, minimum, span = normalised(disparity)
+    values, minimum, span = normalised(disparity, bounds)
+    if net.variant.fill_holes:
+        values = filled(torch.where(disparity.isfinite(), values, torch.nan))
     low_pass = mean3x3(values)
     height, width = net.output_size(values)
     guidance = guidance_map(rgb, net.variant)[..., :height, :width]

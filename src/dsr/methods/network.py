@@ -1,26 +1,56 @@
-"""Depth super-resolution with a trained MSG-Net: ``msg`` (Hui et al. 2016) and ``msg_v`` (Voynov et al. 2019)."""
+"""What the project's networks have in common: they map coarse disparity and a photo to fine disparity."""
 
 from __future__ import annotations
 
+import abc
 import copy
-from pathlib import Path
 from types import MappingProxyType
-from typing import Literal
+from typing import Any, Literal
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 from torch.nn import functional
 
 from dsr.geometry.camera import RangeType, from_range, to_range
-from dsr.methods.msg_net import MSGNet, VariantName, upsample_disparity
-from dsr.methods.weights import load_msg_weights
 from dsr.sample import DepthSample
 
 Precision = Literal["float32", "bfloat16"]
 DTYPES = MappingProxyType({"float32": torch.float32, "bfloat16": torch.bfloat16})
 
 
-class MSG:
+class DisparityNetwork(nn.Module, abc.ABC):
+    """A network that upsamples disparity under a photo's guidance.
+
+    Attributes:
+        scale: the upsampling factor.
+        covers: whether the output has all of the photo's pixels; some published networks leave out a row and a column.
+
+    """
+
+    scale: int
+    covers: bool = True
+
+    @abc.abstractmethod
+    def arguments(self) -> dict[str, Any]:
+        """Return what the constructor was given, as plain values; a file of weights keeps it."""
+
+    @abc.abstractmethod
+    def upsample(self, rgb: Tensor, disparity: Tensor, bounds: Tensor | None = None) -> Tensor:
+        """Return fine disparity.
+
+        Args:
+            rgb: (B, 3, H, W) in [0, 1], H = scale * h and W = scale * w.
+            disparity: (B, 1, h, w) in pixels of the photo's camera; non-finite values are holes.
+            bounds: (B, 2, 1, 1) lowest and highest coarse disparity of the image that this is a window of, which
+                normalise it; None for those of ``disparity`` itself.
+
+        Returns:
+            (B, 1, H, W) in the dtype of ``disparity``; NaN for an image without a known pixel.
+
+        """
+
+
+class NetworkUpsampler:
     """An :class:`~dsr.methods.base.Upsampler` around a trained network.
 
     Args:
@@ -32,7 +62,9 @@ class MSG:
 
     range_type: RangeType = "disparity"
 
-    def __init__(self, net: MSGNet, precision: Precision = "float32", device: torch.device | str = "cpu") -> None:
+    def __init__(
+        self, net: DisparityNetwork, precision: Precision = "float32", device: torch.device | str = "cpu"
+    ) -> None:
         if precision not in DTYPES:
             raise ValueError(f"precision: expected one of {', '.join(DTYPES)}, got {precision!r}")
         self.device = torch.device(device)
@@ -43,26 +75,13 @@ class MSG:
     def __call__(self, sample: DepthSample) -> Tensor:
         """Return the fine orthogonal depth, (1, H, W) in metres on the sample's device.
 
-        NaN where the network's disparity lies at or beyond infinity; for the ``hui`` variant also in the last row and
-        column, which it does not cover.
+        NaN where the network's disparity lies at or beyond infinity, and in the last row and column where the network
+        does not cover them.
         """
         if sample.scale != self.net.scale:
             raise ValueError(f"{sample.scene}: expected scale {self.net.scale}, the network's, got {sample.scale}")
         coarse = to_range(sample.depth_lr, sample.camera_lr, "disparity") * sample.scale  # in pixels of sample.camera
-        rgb, coarse = sample.rgb.to(self.device)[None], coarse.to(self.device)[None]
-        fine = upsample_disparity(self.net, rgb, coarse)[0]
+        fine = self.net.upsample(sample.rgb.to(self.device)[None], coarse.to(self.device)[None])[0]
         missing = (sample.camera.width - fine.shape[-1], sample.camera.height - fine.shape[-2])
         fine = functional.pad(fine, (0, missing[0], 0, missing[1]), value=torch.nan)
         return from_range(fine, sample.camera, "disparity").to(sample.depth_lr.device)
-
-
-def build_msg(
-    weights: Path,
-    scale: int,
-    variant: VariantName,
-    precision: Precision = "float32",
-    device: torch.device | str = "cpu",
-    trained_as: str | None = None,
-) -> MSG:
-    """Return the method with the weights of a file; see :func:`~dsr.methods.weights.load_msg_weights`."""
-    return MSG(load_msg_weights(weights, scale, variant, trained_as), precision, device)

@@ -1,0 +1,109 @@
+"""The directory of a training, seen from outside: its configuration, its data, and how to evaluate its network."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from dsr.app.build import build
+from dsr.app.schema import ConfigError, TrainConfig, TrainerConfig
+from dsr.data.base import SceneSource, Some
+from dsr.data.patches import Part, PatchData, PatchSettings, Problem
+from dsr.degrade import Downsampling
+
+WEIGHTS = "weights.safetensors"
+_FROM_RUN = ("scale", "downsampling", "noise", "seed", "dataset")
+_NOT_WITH_RUN = ("method", "scale", "weights")
+
+
+def read_config(folder: Path) -> dict[str, Any]:
+    """Return the configuration of a training.
+
+    Raises:
+        ConfigError: the directory is no training's.
+
+    """
+    try:
+        config = yaml.safe_load((folder / "config.yaml").read_text(encoding="utf-8"))
+    except (OSError, ValueError, yaml.YAMLError) as error:
+        raise ConfigError(f"{folder}: expected the directory of a training, it has no readable config.yaml") from error
+    if not isinstance(config, dict) or "model" not in config:
+        raise ConfigError(f"{folder}: expected the directory of a training, its config.yaml names no model")
+    return config
+
+
+def studies_of_run(
+    plain: Mapping[str, Any], given: Sequence[str]
+) -> Iterator[tuple[dict[str, Any], SceneSource | None]]:
+    """Yield what ``eval.py run=RUN_DIR`` evaluates: configurations, and the data set unless it is the configuration's.
+
+    Args:
+        plain: the composed configuration of ``eval.py``.
+        given: the keys that the command line sets.
+
+    Raises:
+        ConfigError: the directory holds no finished training, or a key contradicts it.
+
+    """
+    folder = Path(plain["run"]).expanduser()
+    run = read_config(folder)
+    weights = folder / WEIGHTS
+    if not weights.is_file():
+        raise ConfigError(f"run: {folder} has no {WEIGHTS}; the training is not finished")
+    for key in given:
+        if key.partition(".")[0] in _NOT_WITH_RUN:
+            raise ConfigError(f"{key}: run={folder} says it itself; leave one of them out")
+    chosen = {key.partition(".")[0] for key in given}
+    own = {key: run[key] for key in _FROM_RUN if key not in chosen}
+    name = run["model"]["name"]
+    method = {"name": name, "label": name, "target": "dsr.methods.trained.build_trained", "model": name}
+    base = {**plain, **own, "method": method, "weights": str(weights)}
+    if "dataset" in chosen:
+        yield base, None
+        return
+    data = training_data(TrainConfig.of(run))
+    for kind, (source, names) in data.validation_scenes().items():
+        several = len(data.validation_sets) > 1 and base["output_dir"] is not None
+        place = {"output_dir": str(Path(base["output_dir"]) / kind)} if several else {}
+        yield {**base, **place, "dataset": {"name": kind, "validation_of": str(folder)}}, Some(source, names)
+
+
+def training_data(settings: TrainConfig) -> PatchData:
+    """Return the patches that the configuration describes."""
+    trainer = settings.trainer
+    downsampling = build("downsampling", settings.downsampling)
+    if not isinstance(downsampling, Downsampling):
+        raise ConfigError("downsampling: training needs a model such as box, measured is none")
+    problem = Problem(settings.scale, downsampling, build("noise", settings.noise))
+    validation = {name: build(f"validation.{name}", node) for name, node in settings.validation.items()}
+    try:
+        patches = PatchSettings(size=trainer.patch, **common(PatchSettings, trainer))
+        return PatchData(_parts(settings.dataset), patches, problem, seed=settings.seed, validation=validation)
+    except ValueError as error:
+        raise ConfigError(str(error)) from error
+
+
+def common(target: type, settings: TrainerConfig) -> dict[str, Any]:
+    """Return the trainer's settings that a dataclass has, too, by name."""
+    theirs = {field.name for field in dataclasses.fields(target)}
+    return {name: value for name, value in dataclasses.asdict(settings).items() if name in theirs}
+
+
+def _parts(node: Mapping[str, Any]) -> list[Part]:
+    """Return the data sets to train on, with their shares."""
+    if "parts" not in node:
+        return [Part(build("dataset", node))]
+    parts, shares = node["parts"], node.get("shares")
+    if not isinstance(parts, Mapping) or not isinstance(shares, Mapping) or parts.keys() != shares.keys():
+        raise ConfigError(f"dataset.shares: expected a number for each of {', '.join(parts)}, got {shares}")
+    for name, share in shares.items():
+        if isinstance(share, bool) or not isinstance(share, (int, float)) or not share >= 0:
+            raise ConfigError(f"dataset.shares.{name}: expected 0 or a positive number, got {share!r}")
+    used = {name: share for name, share in shares.items() if share > 0}
+    if not used:
+        raise ConfigError("dataset.shares: expected a positive number among them, all are 0")
+    return [Part(build(f"dataset.parts.{name}", parts[name]), share) for name, share in used.items()]

@@ -1,0 +1,82 @@
+"""Random windows of scenes, and their variation: mirrored, turned, nearer or farther, recoloured."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+
+from dsr.sample import Scene
+
+
+@dataclass(frozen=True)
+class Variation:
+    """How windows are varied at random.
+
+    Args:
+        flip: whether they are mirrored, both ways.
+        rotate: whether they are turned by quarter turns, the camera along with them.
+        depth_scale: s, where depth is multiplied by exp(U(-s, s)).
+        colour: standard deviation of the gain of each colour channel.
+
+    Raises:
+        ValueError: a value is out of range.
+
+    """
+
+    flip: bool = True
+    rotate: bool = True
+    depth_scale: float = 0.3
+    colour: float = 0.1
+
+    def __post_init__(self) -> None:
+        """Check the values."""
+        for name in ("depth_scale", "colour"):
+            if not 0 <= getattr(self, name) < math.inf:
+                raise ValueError(f"trainer.{name}: expected 0 or more, got {getattr(self, name)}")
+
+    def __call__(self, scene: Scene, random: np.random.Generator) -> tuple[Scene, float]:
+        """Return the scene varied, and what its depth was multiplied by."""
+        if self.colour:
+            gain = torch.from_numpy(1 + self.colour * random.standard_normal((3, 1, 1))).float()
+            scene = replace(scene, rgb=(scene.rgb * gain).clamp(0, 1))
+        if self.flip:
+            for vertical in (False, True):
+                if random.random() < 0.5:
+                    scene = mirrored(scene, vertical=vertical)
+        if self.rotate:
+            scene = turned(scene, int(random.integers(4)))
+        factor = math.exp(random.uniform(-self.depth_scale, self.depth_scale)) if self.depth_scale else 1.0
+        depth = None if scene.depth is None else scene.depth * factor
+        return replace(scene, depth=depth), factor
+
+
+def window(scene: Scene, top: int, left: int, size: int) -> Scene:
+    """Return a square window of a scene, its depth in float64."""
+    rows, columns = slice(top, top + size), slice(left, left + size)
+    depth = None if scene.depth is None else scene.depth[:, rows, columns].double()
+    camera = scene.camera.crop(top, left, size, size)
+    return Scene(scene.dataset, scene.name, scene.rgb[:, rows, columns], camera, depth)
+
+
+def mirrored(scene: Scene, *, vertical: bool = False) -> Scene:
+    """Return the mirror image: left and right change places, or top and bottom; the world is mirrored with it."""
+    camera = scene.camera
+    if vertical:
+        camera = replace(camera, cy=camera.height - 1 - camera.cy)
+    else:
+        camera = replace(camera, cx=camera.width - 1 - camera.cx)
+    axis = -2 if vertical else -1
+    depth = None if scene.depth is None else scene.depth.flip(axis)
+    return replace(scene, rgb=scene.rgb.flip(axis), depth=depth, camera=camera, measured={})
+
+
+def turned(scene: Scene, turns: int) -> Scene:
+    """Return the scene as a camera sees it that is turned about its axis; the image turns counterclockwise."""
+    if turns % 4 == 0:
+        return scene
+    depth = None if scene.depth is None else scene.depth.rot90(turns, (-2, -1))
+    rgb = scene.rgb.rot90(turns, (-2, -1))
+    return replace(scene, rgb=rgb, depth=depth, camera=scene.camera.rotate90(turns), measured={})

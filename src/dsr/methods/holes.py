@@ -1,0 +1,26 @@
+"""Holes of coarse maps, for networks that need a value everywhere."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+
+def filled(x: Tensor) -> Tensor:
+    """Return (B, 1, h, w) with its non-finite values replaced by the mean of the known in their 3 x 3, from outside in.
+
+    An image without a known value stays as it is.
+    """
+    known = x.isfinite()
+    if bool(known.all()):
+        return x
+    values, weight = torch.where(known, x, 0), known.to(x.dtype)
+    for _ in range(max(x.shape[-2:])):
+        total, share = (functional.avg_pool2d(each, 3, stride=1, padding=1) for each in (values, weight))
+        new = (weight == 0) & (share > 0)
+        if not bool(new.any()):
+            break
+        values = torch.where(new, total / torch.where(share > 0, share, 1), values)
+        weight = torch.where(new, 1, weight)
+    return torch.where(weight > 0, values, torch.nan)

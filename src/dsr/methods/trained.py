@@ -1,0 +1,57 @@
+"""Methods that are trained networks: ours, whose weights come with the package, and the published ones."""
+
+from __future__ import annotations
+
+from importlib import resources
+from pathlib import Path
+from types import MappingProxyType
+
+import torch
+
+from dsr.methods.facets import Facets
+from dsr.methods.msg_net import MSGNet, VariantName
+from dsr.methods.network import DisparityNetwork, NetworkUpsampler, Precision
+from dsr.methods.published import load_msg_weights
+from dsr.methods.weights import is_ours, load_network
+
+NETWORKS: MappingProxyType[str, type[DisparityNetwork]] = MappingProxyType({"MSGNet": MSGNet, "Facets": Facets})
+
+
+def build_trained(
+    weights: Path,
+    scale: int,
+    model: str,
+    variant: VariantName | None = None,
+    precision: Precision = "float32",
+    device: torch.device | str = "cpu",
+) -> NetworkUpsampler:
+    """Return the method with the weights of a file.
+
+    Args:
+        weights: a file of ours, or one of the published ones where there is a ``variant``.
+        scale: the scale of the run.
+        model: the model that our files must be of.
+        variant: the variant of MSG-Net that published files must be of.
+        precision: of the convolutions.
+        device: where to compute.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: the file is damaged, or of another model, variant or scale.
+
+    """
+    weights = Path(weights)
+    if variant is None or (weights.is_file() and is_ours(weights)):
+        return NetworkUpsampler(load_network(weights, NETWORKS, scale, model), precision, device)
+    return NetworkUpsampler(load_msg_weights(weights, scale, variant), precision, device)
+
+
+def packaged_weights(name: str) -> Path | None:
+    """Return the file ``name.safetensors`` of the weights that come with the package; None if there is none."""
+    path = Path(str(resources.files("dsr.weights"))) / f"{name}.safetensors"
+    return path if path.is_file() else None
+
+
+def packaged_names() -> list[str]:
+    """Return the names of the weights that come with the package."""
+    return sorted(path.stem for path in Path(str(resources.files("dsr.weights"))).glob("*.safetensors"))

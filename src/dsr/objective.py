@@ -1,0 +1,103 @@
+"""What trainings minimise: a loss on disparity plus w MSE_v, and the w that balances the two."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from dsr.data.patches import Batch
+from dsr.quality import losses
+from dsr.quality.functional import SurfacePair, mse_v
+
+DepthLoss = Literal["lap1", "l1", "mse"]
+_TILT = math.radians(2.5)
+_DEPTH_LOSSES = {"lap1": losses.lap1, "l1": losses.l1, "mse": losses.mse}
+
+
+@dataclass(frozen=True)
+class Objective:
+    """The loss: depth_loss + w MSE_v (Voynov et al. 2019, eq. 4: Lap_1 + w MSE_v).
+
+    The depth loss is taken of disparities over the range of the coarse ones, so that it does not depend on the scene's
+    size.
+
+    Args:
+        depth_loss: ``lap1``, ``l1`` or ``mse``.
+        w: weight of MSE_v; 0 for the depth loss alone.
+
+    Raises:
+        ValueError: there is no such depth loss.
+
+    """
+
+    depth_loss: DepthLoss = "lap1"
+    w: float = 0.0
+
+    def __post_init__(self) -> None:
+        """Check the name."""
+        if self.depth_loss not in _DEPTH_LOSSES:
+            raise ValueError(f"model.depth_loss: expected one of {', '.join(_DEPTH_LOSSES)}, got {self.depth_loss!r}")
+
+    def __call__(self, disparity: Tensor, batch: Batch) -> dict[str, Tensor]:
+        """Return ``loss`` and its terms, means over the batch's images with anything to compare.
+
+        Args:
+            disparity: (B, 1, H, W) the network's, in pixels.
+            batch: see :func:`dsr.data.patches.tensors_of`.
+
+        """
+        target = batch["stereo"] / batch["depth"] - batch["doffs"]
+        span = _span(batch["disparity_lr"])
+        loss = _DEPTH_LOSSES[self.depth_loss](disparity / span, target / span).nanmean()
+        terms: dict[str, Tensor] = {self.depth_loss: loss}
+        if self.w:
+            pair = SurfacePair(depth_of(disparity, batch), batch["depth"], batch["rays"])
+            terms["mse_v"] = mse_v(pair).nanmean()
+            loss = loss + self.w * terms["mse_v"]
+        return {"loss": loss, **terms}
+
+
+def depth_of(disparity: Tensor, batch: Batch) -> Tensor:
+    """Return orthogonal depth in metres, (B, 1, H, W); NaN where the disparity lies at or beyond infinity."""
+    shifted = disparity + batch["doffs"]
+    return torch.where(shifted > 0, batch["stereo"] / torch.where(shifted > 0, shifted, 1), torch.nan)
+
+
+def balanced_weight(patches: Iterable[Batch]) -> float:
+    """Return the w that gives both terms of the loss the same size for one and the same error.
+
+    A depth error of tan(a) z / f metres between two neighbouring pixels, z / f metres apart, tilts the normal by a. As
+    a share of the coarse disparities' range the depth term sees stereo tan(a) / (f z range), and MSE_v sees
+    (2 - 2 cos a) / 3. w is their ratio for a tilt of 2.5 degrees, which a rendering begins to show, at the median over
+    the patches.
+
+    Args:
+        patches: single training patches, without a batch axis; see :func:`dsr.data.patches.tensors_of`.
+
+    Raises:
+        ValueError: there is no patch.
+
+    """
+    ratios = []
+    for patch in patches:
+        x = patch["rays"][0, 0].double()
+        focal = (x.numel() - 1) / float(x[-1] - x[0])
+        depth = float(patch["depth"][patch["depth"].isfinite()].median())
+        span = float(_span(patch["disparity_lr"][None]))
+        ratios.append(float(patch["stereo"]) * math.tan(_TILT) / (focal * depth * span))
+    if not ratios:
+        raise ValueError("loss.w=auto: expected patches to compute it from, there is none")
+    return float(torch.tensor(ratios, dtype=torch.float64).median()) / ((2 - 2 * math.cos(_TILT)) / 3)
+
+
+def _span(disparity: Tensor) -> Tensor:
+    """Return the range of known disparities per image, (B, 1, 1, 1); a thousandth of the largest where it is less."""
+    known, dims = disparity.isfinite(), (-3, -2, -1)
+    low = disparity.masked_fill(~known, torch.inf).amin(dim=dims, keepdim=True)
+    high = disparity.masked_fill(~known, -torch.inf).amax(dim=dims, keepdim=True)
+    return (high - low).clamp(min=1e-3 * high.abs().clamp(min=1e-3))

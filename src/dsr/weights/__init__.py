@@ -1,0 +1,1 @@
+"""Weights of our own networks; README.md beside them is their card."""

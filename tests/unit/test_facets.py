@@ -1,0 +1,207 @@
+"""Facets: what holds whatever its weights are, and that it can learn."""
+
+from __future__ import annotations
+
+import copy
+
+import pytest
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from dsr.methods.facets import Facets, stencil
+from dsr.methods.holes import filled
+
+SCALES = (2, 4, 8, 16)
+
+
+def _net(scale: int = 4, *, noise: float = 0.1, facets: int = 2) -> Facets:
+    """Return a small network with weights far from those that it starts with."""
+    torch.manual_seed(scale)
+    net = Facets(scale, width=12, blocks=1, facets=facets).requires_grad_(False)
+    for parameter in net.parameters():
+        parameter.add_(noise * torch.randn_like(parameter))
+    return net
+
+
+def _photo(height: int, width: int, count: int = 1) -> Tensor:
+    return torch.rand((count, 3, height, width), generator=torch.Generator().manual_seed(1))
+
+
+def _map(height: int, width: int, count: int = 1) -> Tensor:
+    return 20 + 9 * torch.rand((count, 1, height, width), generator=torch.Generator().manual_seed(2)).double()
+
+
+def _plane(height: int, width: int, along_u: float = 0.3, along_v: float = -0.2) -> Tensor:
+    v, u = torch.meshgrid(torch.arange(height).double(), torch.arange(width).double(), indexing="ij")
+    return (30 + along_u * u + along_v * v)[None, None]
+
+
+@pytest.mark.parametrize("scale", SCALES)
+def test_a_plane_is_reproduced_exactly_whatever_weights_and_photo_are(scale: int) -> None:
+    fine = _plane(6 * scale, 7 * scale)
+    coarse = functional.avg_pool2d(fine, scale)
+    result = _net(scale).upsample(_photo(6 * scale, 7 * scale), coarse)
+    torch.testing.assert_close(result, fine, rtol=0, atol=1e-11)
+
+
+def test_a_factor_and_a_constant_on_the_disparity_come_out_again() -> None:
+    net, rgb, coarse = _net(), _photo(24, 28), _map(6, 7)
+    torch.testing.assert_close(net.upsample(rgb, 3 * coarse + 7), 3 * net.upsample(rgb, coarse) + 7, rtol=1e-6, atol=0)
+
+
+def test_bounds_normalise_as_those_of_the_image_that_the_window_is_cut_from() -> None:
+    net, rgb, coarse = _net(), _photo(24, 28), _map(6, 7)
+    own = torch.tensor([coarse.min(), coarse.max()]).view(1, 2, 1, 1)
+    torch.testing.assert_close(net.upsample(rgb, coarse, own), net.upsample(rgb, coarse), rtol=1e-7, atol=0)
+    wide = torch.tensor([0.0, 100.0]).view(1, 2, 1, 1)
+    assert not torch.allclose(net.upsample(rgb, coarse, wide), net.upsample(rgb, coarse), rtol=1e-4)
+
+
+def test_a_constant_map_stays_constant() -> None:
+    result = _net().upsample(_photo(24, 28), torch.full((1, 1, 6, 7), 5.0))
+    torch.testing.assert_close(result, torch.full((1, 1, 24, 28), 5.0), rtol=1e-6, atol=0)
+
+
+def test_before_training_the_mixture_is_the_splines_blend_of_central_differences_planes() -> None:
+    """A plain loop over fine pixels, with every output of the network's three heads at 0."""
+    net, coarse = _net(noise=0), _map(4, 5)
+    for head in (net.planes, net.choice):
+        torch.nn.init.zeros_(head.weight)
+        torch.nn.init.zeros_(head.bias)
+    result = net.upsample(_photo(16, 20), coarse)[0, 0]
+    values = coarse[0, 0]
+    first = torch.tensor([0.0, 2.0, 0.0]).softmax(0).double()
+
+    def at(i: int, j: int) -> float:
+        """Return the map, continued linearly by one pixel."""
+        for axis, k, size in ((0, i, 4), (1, j, 5)):
+            if k in (-1, size):
+                inner, outer = (0, 1) if k == -1 else (size - 1, size - 2)
+                near, far = ((inner, j), (outer, j)) if axis == 0 else ((i, inner), (i, outer))
+                return 2 * at(*near) - at(*far)
+        return float(values[i, j])
+
+    def slope(before: float, here: float, after: float) -> float:
+        return float(first @ torch.tensor([here - before, (after - before) / 2, after - here]).double())
+
+    def spline(t: float, step: int) -> float:
+        return {-1: 0.5 * (0.5 - t) ** 2, 0: 0.75 - t * t, 1: 0.5 * (0.5 + t) ** 2}[step]
+
+    for y, x in ((0, 0), (5, 9), (9, 6), (15, 19), (7, 0)):
+        i, j = y // 4, x // 4
+        ty, tx = (y % 4 + 0.5) / 4 - 0.5, (x % 4 + 0.5) / 4 - 0.5
+        total = weights = 0.0
+        for dy in (-1, 0, 1):
+            for dx in (-1, 0, 1):
+                weight = spline(ty, dy) * spline(tx, dx) + 1e-4
+                inside = (i + dy in range(4), j + dx in range(5))
+                k, m = i + dy * inside[0], j + dx * inside[1]  # a neighbour outside is the pixel itself
+                along_u = slope(at(k, m - 1), at(k, m), at(k, m + 1))
+                along_v = slope(at(k - 1, m), at(k, m), at(k + 1, m))
+                total += weight * (at(k, m) + (tx + j - m) * along_u + (ty + i - k) * along_v)
+                weights += weight
+        assert float(result[y, x]) == pytest.approx(total / weights, rel=1e-6)
+
+
+def test_each_image_of_a_batch_is_treated_alone() -> None:
+    net, rgb, coarse = _net(), _photo(24, 28, 3), _map(6, 7, 3)
+    together = net.upsample(rgb, coarse)
+    alone = torch.cat([net.upsample(rgb[i : i + 1], coarse[i : i + 1]) for i in range(3)])
+    torch.testing.assert_close(together, alone, rtol=0, atol=1e-3)
+
+
+def test_the_photo_has_a_say() -> None:
+    net, coarse = _net(), _map(6, 7)
+    assert not torch.allclose(net.upsample(_photo(24, 28), coarse), net.upsample(1 - _photo(24, 28), coarse), rtol=1e-4)
+
+
+def test_a_photo_of_another_size_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"rgb: expected \(24, 28\) pixels for a coarse map of \(6, 7\) at scale 4"):
+        _net().upsample(_photo(24, 24), _map(6, 7))
+
+
+@pytest.mark.parametrize("arguments", [{"scale": 3}, {"scale": 4, "width": 0}, {"scale": 4, "facets": 0}])
+def test_arguments_out_of_range_are_refused(arguments: dict[str, int]) -> None:
+    with pytest.raises(ValueError, match=r"(scale|model): expected"):
+        Facets(**arguments)
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 5), (2, 2)])
+def test_the_smallest_maps_pass(size: tuple[int, int]) -> None:
+    result = _net().upsample(_photo(4 * size[0], 4 * size[1]), _map(*size))
+    assert bool(result.isfinite().all())
+
+
+def test_a_hole_is_filled_from_around_and_does_not_reach_far() -> None:
+    net, rgb, coarse = _net(), _photo(64, 64), _map(16, 16)
+    pierced = coarse.clone()
+    pierced[..., 3, 4] = torch.nan
+    result, whole = net.upsample(rgb, pierced), net.upsample(rgb, coarse)
+    assert bool(result.isfinite().all())
+    torch.testing.assert_close(result[..., 48:, 48:], whole[..., 48:, 48:], rtol=1e-6, atol=0)
+
+
+def test_an_image_without_a_known_pixel_becomes_nan() -> None:
+    assert bool(_net().upsample(_photo(24, 28), torch.full((1, 1, 6, 7), torch.nan)).isnan().all())
+
+
+def test_holes_are_filled_from_outside_in_by_the_mean_of_the_known_around() -> None:
+    x = torch.arange(49.0, dtype=torch.float64).view(1, 1, 7, 7)
+    pierced = x.clone()
+    pierced[..., 2:5, 2:5] = torch.nan
+    result = filled(pierced)
+    assert float(result[0, 0, 2, 2]) == pytest.approx((8 + 9 + 10 + 15 + 22) / 5)
+    assert float(result[0, 0, 3, 3]) == pytest.approx(24)  # the mean of the ring, which is symmetric about it
+    torch.testing.assert_close(result[..., 5:, :], x[..., 5:, :], rtol=0, atol=0)
+    assert filled(x) is x
+    assert bool(filled(torch.full_like(x, torch.nan)).isnan().all())
+
+
+def test_the_bend_is_zero_on_planes_and_the_step_beside_an_edge() -> None:
+    assert float(stencil(_plane(8, 9)).bend.max()) < 1e-12
+    step = torch.zeros(1, 1, 9, 12)
+    step[..., 6:] = 2.0
+    bend = stencil(step).bend[0, 0, 4]
+    assert bend.tolist() == [0, 0, 0, 0, 2, 2, 2, 2, 0, 0, 0, 0]
+
+
+def test_gradients_reach_every_parameter_and_agree_with_differences() -> None:
+    net = _net(2, facets=1).double().requires_grad_()
+    rgb, coarse = _photo(8, 6).double(), _map(4, 3)
+    net.upsample(rgb, coarse).square().mean().backward()
+    assert all(parameter.grad is not None and bool((parameter.grad != 0).any()) for parameter in net.parameters())
+    bias = net.choice.bias
+    assert bias is not None
+    other = copy.deepcopy(net)
+
+    def loss(value: Tensor) -> Tensor:
+        return torch.func.functional_call(other, {"choice.bias": value}, (rgb, coarse / 30)).square().mean()
+
+    assert torch.autograd.gradcheck(loss, bias.detach().clone().requires_grad_())
+
+
+def test_it_learns_an_edge_that_the_photo_shows() -> None:
+    """A wall behind a wall: after a few steps on one patch the edge is several times sharper than a spline's."""
+    torch.manual_seed(0)
+    fine = torch.full((1, 1, 32, 32), 20.0)
+    fine[..., 13:] = 26.0
+    rgb = (fine / 40).expand(1, 3, 32, 32)
+    coarse, net = functional.avg_pool2d(fine, 4), Facets(4, width=16, blocks=1)
+    optimiser = torch.optim.Adam(net.parameters(), 3e-3)
+    errors = []
+    for _ in range(80):
+        loss = (net.upsample(rgb, coarse) - fine).abs().mean()
+        optimiser.zero_grad()
+        loss.backward()
+        optimiser.step()
+        errors.append(float(loss.detach()))
+    assert errors[-1] < 0.2 * errors[0]
+
+
+@pytest.mark.parametrize("precision", [torch.float32, torch.bfloat16])
+def test_weights_of_half_precision_keep_planes_exact(precision: torch.dtype) -> None:
+    net = _net().to(precision)
+    fine = _plane(24, 28)
+    result = net.upsample(_photo(24, 28), functional.avg_pool2d(fine, 4))
+    torch.testing.assert_close(result, fine, rtol=0, atol=1e-11)

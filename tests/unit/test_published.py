@@ -1,0 +1,241 @@
+"""The readers of the authors' weight files: what they take, and what they refuse without running it."""
+
+from __future__ import annotations
+
+import pickle
+import struct
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from dsr.methods.msg_net import MSGNet
+from dsr.methods.published import load_msg_weights
+
+Layer = tuple[str, str, list[Tensor]]
+
+
+def _varint(value: int) -> bytes:
+    head = b""
+    while value > 0x7F:
+        head += bytes([value & 0x7F | 0x80])
+        value >>= 7
+    return head + bytes([value])
+
+
+def _field(number: int, content: bytes) -> bytes:
+    return _varint(number << 3 | 2) + _varint(len(content)) + content
+
+
+def _blob(values: Tensor, *, packed: bool) -> bytes:
+    """Return a BlobProto; numbers one after the other, or each with its own key as proto2 writes them by default."""
+    floats, sizes = values.numpy().astype("<f4").tobytes(), values.shape
+    if packed:
+        return _field(7, _field(1, b"".join(map(_varint, sizes)))) + _field(5, floats)
+    singly = b"".join(_varint(5 << 3 | 5) + floats[i : i + 4] for i in range(0, len(floats), 4))
+    return singly + _field(7, b"".join(_varint(1 << 3) + _varint(size) for size in sizes))
+
+
+def _caffe_layers(net: MSGNet) -> list[Layer]:
+    """Return the network's layers as Caffe keeps them: a convolution with two blobs, then a PReLU with one."""
+    layers: list[Layer] = []
+    for name, value in net.state_dict().items():
+        layer, part = name.rsplit(".", 1)
+        kind = "PReLU" if "activation" in name else "Deconvolution" if ".up." in name else "Convolution"
+        if part == "bias":
+            layers[-1][2].append(value)
+        else:
+            layers.append((layer, kind, [value]))
+    return layers
+
+
+def _caffemodel(layers: Iterable[Layer], *, packed: bool = True) -> bytes:
+    """Return a NetParameter: its name, an input layer without parameters, a number field, the layers."""
+    content = _field(1, b"a test") + _varint(5 << 3) + b"\x01"
+    content += _field(100, _field(1, b"data") + _field(2, b"HDF5Data"))
+    for name, kind, blobs in layers:
+        parts = b"".join(_field(7, _blob(blob, packed=packed)) for blob in blobs)
+        content += _field(100, _field(1, name.encode()) + _field(2, kind.encode()) + parts)
+    return content
+
+
+def _author_state(net: MSGNet) -> dict[str, Tensor]:
+    """Return the parameters under Voynov et al.'s names at x4, which the network's description lists."""
+    names = {
+        "guidance.0": "feature_extraction_Y.0",
+        "guidance.1": "feature_extraction_Y.1",
+        "guidance.2": "feature_extraction_Y.2",
+        "stem": "feature_extraction_X",
+        "levels.0.up": "upsampling_X.0",
+        "levels.0.fuse": "upsampling_X.1",
+        "levels.0.refine": "upsampling_X.2",
+        "levels.1.up": "upsampling_X.3",
+        "levels.1.fuse": "upsampling_X.4",
+        "levels.1.refine": "upsampling_X.5",
+        "smooth": "upsampling_X.6",
+        "reconstruct": "upsampling_X.7",
+    }
+    state = {}
+    for name, value in net.state_dict().items():
+        layer, conv, part = name.rsplit(".", 2)
+        state[f"{names[layer]}.{conv}.{part}"] = value
+    return state
+
+
+def _write(path: Path, content: bytes) -> Path:
+    path.write_bytes(content)
+    return path
+
+
+def _save(path: Path, content: object) -> Path:
+    torch.save(content, path)
+    return path
+
+
+@pytest.mark.parametrize("packed", [True, False])
+@pytest.mark.parametrize("scale", [2, 8])
+def test_a_caffe_model_gives_back_the_parameters_that_were_written(tmp_path: Path, scale: int, packed: bool) -> None:
+    net = MSGNet(scale, "hui")
+    path = _write(tmp_path / "net.caffemodel", _caffemodel(_caffe_layers(net), packed=packed))
+    loaded = load_msg_weights(path, scale)
+    assert loaded.variant.name == "hui"
+    torch.testing.assert_close(dict(loaded.state_dict()), dict(net.state_dict()), rtol=0, atol=0)
+
+
+def test_a_torch_file_gives_back_the_parameters_that_were_written(tmp_path: Path) -> None:
+    net = MSGNet(4)
+    loaded = load_msg_weights(_save(tmp_path / "net.pth", {"model_state_dict": _author_state(net)}), 4, "voynov")
+    assert loaded.variant.name == "voynov"
+    torch.testing.assert_close(dict(loaded.state_dict()), dict(net.state_dict()), rtol=0, atol=0)
+
+
+def test_loading_draws_nothing_from_the_random_generator(tmp_path: Path) -> None:
+    path = _save(tmp_path / "net.pth", {"model_state_dict": _author_state(MSGNet(4))})
+    before = torch.get_rng_state()
+    load_msg_weights(path, 4)
+    assert torch.equal(torch.get_rng_state(), before)
+
+
+def _refusal(path: Path, scale: int = 4, variant: str | None = None) -> str:
+    """Return the message with which the file is refused: one line that names it."""
+    with pytest.raises(ValueError, match=r"expected|weights are for") as caught:
+        load_msg_weights(path, scale, variant)  # type: ignore[arg-type]
+    message = str(caught.value)
+    assert message.startswith(f"{path}: ")
+    assert "\n" not in message
+    return message
+
+
+def test_a_missing_file_is_reported_as_missing(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError, match=r"nowhere\.pth: no such weights file"):
+        load_msg_weights(tmp_path / "nowhere.pth", 4)
+
+
+def test_weights_of_another_scale_are_refused(tmp_path: Path) -> None:
+    caffe = _write(tmp_path / "net.caffemodel", _caffemodel(_caffe_layers(MSGNet(8, "hui"))))
+    assert "weights are for scale 8, the run is at scale 4" in _refusal(caffe, 4)
+    assert "weights are for scale 4, the run is at scale 2" in _refusal(
+        _save(tmp_path / "net.pth", {"model_state_dict": _author_state(MSGNet(4))}), 2
+    )
+
+
+def test_weights_of_the_other_variant_are_refused(tmp_path: Path) -> None:
+    caffe = _write(tmp_path / "net.caffemodel", _caffemodel(_caffe_layers(MSGNet(4, "hui"))))
+    assert "expected weights of variant voynov, got those of variant hui" in _refusal(caffe, 4, "voynov")
+
+
+class _Trap:
+    """Unpickled, it leaves a file behind."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def __reduce__(self) -> tuple[object, tuple[str, str]]:
+        return open, (str(self.path), "w")
+
+
+@pytest.mark.parametrize("protocol", [0, 2, 4])
+def test_code_in_a_pickle_is_not_run(tmp_path: Path, protocol: int) -> None:
+    mark = tmp_path / "trapped"
+    path = _write(tmp_path / "net.pth", pickle.dumps({"model_state_dict": _Trap(mark)}, protocol))
+    _refusal(path)
+    assert not mark.exists()
+
+
+def test_code_in_a_torch_file_is_not_run(tmp_path: Path) -> None:
+    mark = tmp_path / "trapped"
+    message = _refusal(_save(tmp_path / "net.pth", {"model_state_dict": _author_state(MSGNet(4)), "x": _Trap(mark)}))
+    assert "which are never loaded" in message
+    assert not mark.exists()
+
+
+def test_damaged_and_foreign_files_are_refused(tmp_path: Path) -> None:
+    whole = _save(tmp_path / "whole.pth", {"model_state_dict": _author_state(MSGNet(4))}).read_bytes()
+    noise = np.random.default_rng(0).bytes(10_000)
+    foreign = (b"", noise, b"\x80" + noise, b"PK\x03\x04" + noise, b"\x89PNG\r\n\x1a\n")
+    for content in (whole[:5000], whole[:-30], *foreign):
+        assert "expected a torch" in _refusal(_write(tmp_path / "net.pth", content))
+
+
+def test_a_caffe_model_cut_off_anywhere_is_refused(tmp_path: Path) -> None:
+    whole = _caffemodel(_caffe_layers(MSGNet(2, "hui")))
+    for length in np.random.default_rng(0).integers(1, len(whole), 40).tolist():
+        message = _refusal(_write(tmp_path / "net.caffemodel", whole[:length]), 2)
+        assert "expected" in message
+
+
+def test_a_caffe_blob_whose_shape_does_not_fit_its_values_is_refused(tmp_path: Path) -> None:
+    shape = _field(7, _field(1, _varint(2**62) + _varint(4)))
+    blob = shape + _field(5, struct.pack("<2f", 1, 2))
+    layer = _field(100, _field(1, b"conv") + _field(2, b"Convolution") + _field(7, blob))
+    assert f"a blob of shape ({2**62}, 4) holds 8 bytes" in _refusal(_write(tmp_path / "net.caffemodel", layer))
+
+
+@pytest.mark.parametrize(
+    ("content", "problem"),
+    [
+        (b"\x80\x80", "a number is cut off"),
+        (b"\xff" * 11, "a number is longer than 64 bits"),
+        (b"\xa2\x06\xff\xff\xff\xff\x0f\x00", "field 100 is cut off"),
+        (b"\x0b", "field 1 has the unknown wire type 3"),
+        (b"\x02\x00", "a field has number 0"),
+        (b"\xa0\x06\x01", "field 100 is a number instead of bytes"),
+        (_field(1, b"name"), "6 bytes without a Caffe layer"),
+    ],
+)
+def test_what_is_wrong_with_a_protobuf_is_said(tmp_path: Path, content: bytes, problem: str) -> None:
+    if content[0] == 0x80:  # a torch file's first byte, too
+        content = _field(1, b"name") + content
+    assert problem in _refusal(_write(tmp_path / "net.caffemodel", content))
+
+
+def test_a_torch_file_of_another_network_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "net.pth"
+    expected = "expected tensors under the key model_state_dict, got"
+    assert f"{expected} weight" in _refusal(_save(path, {"weight": torch.ones(1)}))
+    assert f"{expected} Tensor" in _refusal(_save(path, torch.ones(1)))
+    other = {"model_state_dict": {"conv.weight": torch.ones(1)}}
+    assert "expected MSG-Net for a scale of (2, 4, 8, 16), got 0 upsampling levels" in _refusal(_save(path, other))
+
+
+def test_missing_unexpected_and_misshapen_tensors_are_named(tmp_path: Path) -> None:
+    path, state = tmp_path / "net.pth", _author_state(MSGNet(4))
+    bias = state.pop("upsampling_X.5.conv.bias")
+    assert "levels.1.refine.conv.bias is missing" in _refusal(_save(path, {"model_state_dict": state}))
+    state |= {"upsampling_X.5.conv.bias": bias, "extra": bias}
+    assert "'extra' is unexpected" in _refusal(_save(path, {"model_state_dict": state}))
+    del state["extra"]
+    state["feature_extraction_X.conv.bias"] = bias
+    assert "stem.conv.bias has shape (32,) instead of (64,)" in _refusal(_save(path, {"model_state_dict": state}))
+    state["feature_extraction_X.conv.bias"] = torch.full((64,), torch.nan)
+    assert "stem.conv.bias holds values other than finite" in _refusal(_save(path, {"model_state_dict": state}))
+
+
+def test_missing_and_additional_caffe_layers_are_named(tmp_path: Path) -> None:
+    path, layers = tmp_path / "net.caffemodel", _caffe_layers(MSGNet(4, "hui"))
+    assert "guidance.1.activation.weight is missing" in _refusal(_write(path, _caffemodel(layers[:3] + layers[4:])))
+    extra: Layer = ("conv9", "Convolution", [torch.ones(1, 1, 5, 5), torch.ones(1)])
+    assert "'conv9.conv.weight' is unexpected" in _refusal(_write(path, _caffemodel([*layers, extra])))
