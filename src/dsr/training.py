@@ -21,8 +21,6 @@ from dsr.objective import Objective, depth_of
 from dsr.quality.functional import SurfacePair
 
 _DRAWN = 4
-_ERROR_SHOWN = 0.5
-"""Length of a normals' difference that the error map shows as white."""
 
 
 @dataclass(frozen=True)
@@ -173,19 +171,19 @@ class SuperResolution(lightning.LightningModule):
             self.net.parameters(), lr=schedule.learning_rate, weight_decay=schedule.weight_decay
         )
         rates = torch.optim.lr_scheduler.LambdaLR(optimiser, schedule.factor)
-        return {"optimizer": optimiser, "lr_scheduler": {"scheduler": rates, "interval": "step"}}
+        named = {"scheduler": rates, "interval": "step", "name": "train/learning_rate"}
+        return {"optimizer": optimiser, "lr_scheduler": named}
 
 
 def comparison(depth: Tensor, batch: Batch) -> Tensor:
     """Return a picture of a result beside the truth, holes black.
 
     Returns:
-        (1, 3 H, 4 W) in [0, 1]: a column per light; the result's rendering, the truth's, and in the third row, repeated
-        under every light, how far the normals are apart.
+        (1, 2 H, 3 W) in [0, 1]: the renderings of the result and of the truth, and twice their difference; under the
+        first light, and below under the last.
 
     """
-    normals = [normals_of(each, batch["rays"]) for each in (depth, batch["depth"])]
-    rows = [torch.cat(list(render(each)[0]), dim=-1) for each in normals]  # 2 x (H, 4 W)
-    error = (normals[0] - normals[1]).square().sum(dim=1).sqrt()[0] / _ERROR_SHOWN  # (H, W)
-    rows.append(error.clamp(max=1).repeat(1, 4))
+    result, truth = (render(normals_of(each, batch["rays"]))[0] for each in (depth, batch["depth"]))  # (4, H, W)
+    error = (2 * (result - truth).abs()).clamp(max=1)
+    rows = [torch.cat((result[light], truth[light], error[light]), dim=-1) for light in (0, -1)]
     return torch.cat(rows, dim=-2)[None].nan_to_num(0).float().cpu()

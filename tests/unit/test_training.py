@@ -20,6 +20,8 @@ from torch.utils.data import DataLoader
 from dsr.data.patches import Batch, Patches, PatchSettings, Problem, WholeScenes, tensors_of
 from dsr.degrade import Downsampling, make_sample
 from dsr.geometry.camera import Camera
+from dsr.geometry.shading import render
+from dsr.geometry.surface import normals_of
 from dsr.methods.msg_net import MSGNet, upsample_disparity
 from dsr.objective import Objective, balanced_weight, depth_of
 from dsr.quality import functional as scores
@@ -27,7 +29,7 @@ from dsr.quality.functional import SurfacePair
 from dsr.quality.lpips import LPIPS
 from dsr.quality.metrics import visual_metrics
 from dsr.sample import Scene
-from dsr.training import Schedule, SuperResolution
+from dsr.training import Schedule, SuperResolution, comparison
 
 BOX = Downsampling("box")
 X2 = Problem(2, BOX)
@@ -377,6 +379,19 @@ def test_validation_logs_the_mean_over_the_scenes_of_the_metrics_worst_light(tmp
         values["Bumpiness_d"].append(float(scores.bumpiness_d(pair)))
     for name, each in values.items():
         assert logged[f"val/{name}"] == pytest.approx(np.mean(each), rel=1e-4), name
+
+
+def test_a_comparison_shows_result_truth_and_difference_under_two_lights() -> None:
+    batch = {name: value[None] for name, value in WholeScenes([_scene(3)], X2)[0].items()}
+    picture = comparison(batch["depth"], batch)[0]
+    assert picture.shape == (72, 120)
+    torch.testing.assert_close(picture[:, :40], picture[:, 40:80])
+    assert float(picture[:, 80:].abs().max()) == 0
+    lit = render(normals_of(batch["depth"], batch["rays"]))[0]
+    torch.testing.assert_close(picture[:36, 40:80], lit[0].float())
+    torch.testing.assert_close(picture[36:, 40:80], lit[3].float())
+    other = comparison(1.1 * batch["depth"] + 0.05 * torch.rand(1, 1, 36, 40), batch)[0]
+    torch.testing.assert_close(other[:, 80:], (2 * (other[:, :40] - other[:, 40:80]).abs()).clamp(max=1))
 
 
 def test_a_validation_forgets_the_one_before(tmp_path: Path) -> None:

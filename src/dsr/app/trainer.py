@@ -155,6 +155,14 @@ class Summary(Callback):
             trainer.logger.log_hyperparams(self._settings, {f"last/{name}": value for name, value in scores.items()})
 
 
+class Log(TensorBoardLogger):
+    """TensorBoard's log without the number of the epoch, of which there is one."""
+
+    def log_metrics(self, metrics: Mapping[str, float], step: int | None = None) -> None:
+        """Log all but that."""
+        super().log_metrics({name: value for name, value in metrics.items() if name != "epoch"}, step)
+
+
 def make_trainer(
     settings: TrainerConfig, folder: Path, device: torch.device, console: Console, table: Mapping[str, Any]
 ) -> tuple[lightning.Trainer, ModelCheckpoint]:
@@ -185,7 +193,7 @@ def make_trainer(
             val_check_interval=interval * settings.accumulate,
             check_val_every_n_epoch=None,
             log_every_n_steps=min(10, interval),
-            logger=TensorBoardLogger(folder, name="", version="tensorboard", default_hp_metric=False),
+            logger=Log(folder, name="", version="tensorboard", default_hp_metric=False),
             callbacks=callbacks,
             enable_model_summary=False,
             num_sanity_val_steps=0,
