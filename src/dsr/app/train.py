@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import os
 import shutil
 from collections.abc import Mapping
 from pathlib import Path
@@ -57,7 +58,8 @@ def train(config: DictConfig) -> Path:
     settings = TrainConfig.of(plain)
     device = pick_device(settings.device)
     plain["precision"] = settings.precision = _precision(settings.precision, device)
-    console = Console()
+    first = os.environ.get("LOCAL_RANK", "0") == "0"  # Lightning runs this command once per device
+    console = Console(quiet=not first)
     if settings.seed > _LARGEST_SEED:
         raise ConfigError(f"seed: expected at most {_LARGEST_SEED}, got {settings.seed}")
     lightning.seed_everything(settings.seed, workers=True, verbose=False)
@@ -75,7 +77,7 @@ def train(config: DictConfig) -> Path:
     tolerated = ("code", "device") if "resume" in given_keys() else ()
     for key in rundir.claim(folder, plain, identity, tolerated):
         console.print(f"note: the run began with another {key}", markup=False, highlight=False)
-    if settings.overwrite:
+    if settings.overwrite and first:
         _clear(folder)
     resume = last if last.is_file() else None
     _announce(console, settings, module, data, folder, resume)
@@ -90,7 +92,7 @@ def train(config: DictConfig) -> Path:
         ) from None
     if trainer.is_global_zero:
         _export(module, Path(best.best_model_path), weights, facts)
-        console.print(f"weights: {weights}", markup=False, highlight=False, soft_wrap=True)
+    console.print(f"weights: {weights}", markup=False, highlight=False, soft_wrap=True)
     return weights
 
 

@@ -143,13 +143,8 @@ class Summary(Callback):
     def __init__(self, settings: Mapping[str, Any]) -> None:
         self._settings = dict(settings)
 
-    def on_train_start(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
-        """Write the settings."""
-        if isinstance(trainer.logger, TensorBoardLogger):
-            trainer.logger.log_hyperparams(self._settings)
-
     def on_train_end(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
-        """Add the scores while the log is open."""
+        """Write them while the log is open."""
         if isinstance(trainer.logger, TensorBoardLogger) and isinstance(pl_module, SuperResolution):
             scores = pl_module.validation_scores.get("val", {})
             trainer.logger.log_hyperparams(self._settings, {f"last/{name}": value for name, value in scores.items()})
@@ -184,6 +179,8 @@ def make_trainer(
         TrainingBar(console),
         Interruption(checkpoints / "last.ckpt"),
     ]
+    logger = Log(folder, name="", version="tensorboard", default_hp_metric=False)
+    logger.log_hyperparams(dict(table))
     with without_chatter():
         trainer = lightning.Trainer(
             accelerator="gpu" if device.type == "cuda" else device.type,
@@ -193,7 +190,7 @@ def make_trainer(
             val_check_interval=interval * settings.accumulate,
             check_val_every_n_epoch=None,
             log_every_n_steps=min(10, interval),
-            logger=Log(folder, name="", version="tensorboard", default_hp_metric=False),
+            logger=logger,
             callbacks=callbacks,
             enable_model_summary=False,
             num_sanity_val_steps=0,
@@ -240,6 +237,7 @@ def without_chatter() -> Iterator[None]:
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", ".*does not have many workers.*")
             warnings.filterwarnings("ignore", ".*smaller than the logging interval.*")
+            warnings.filterwarnings("ignore", ".*sync_dist=True.*")  # metrics are the same on every device
             for resumed in ("exists and is not empty", "that ended before the epoch ended"):
                 warnings.filterwarnings("ignore", f".*{resumed}.*")
             warnings.filterwarnings("ignore", ".*LeafSpec.*", FutureWarning)
