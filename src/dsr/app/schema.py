@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, is_dataclass
-from typing import Any, Self
+from typing import Any, ClassVar, Self
 
 from hydra.core.config_store import ConfigStore
 from hydra.core.hydra_config import HydraConfig
@@ -62,26 +62,25 @@ class Checked:
 
 
 @dataclass
-class EvalConfig(Checked):
-    """The configuration of ``eval.py``.
+class RunConfig(Checked):
+    """What all commands have.
 
-    The groups dataset, downsampling and method are made by :func:`dsr.app.build.build`, which checks their keys
-    against what the class or function that they name takes.
+    The groups (dataset, downsampling, noise, method, model) are made by :func:`dsr.app.build.build`, which checks their
+    keys against what the class or function that they name takes.
     """
 
     dataset: dict[str, Any] = MISSING
     downsampling: dict[str, Any] = MISSING
     noise: dict[str, Any] = MISSING
-    method: dict[str, Any] = MISSING
     metrics: MetricsConfig = field(default_factory=MetricsConfig)
     scale: int = 4
-    weights: str | None = None
-    run: str | None = None
     device: str = "auto"
     precision: str = "float32"
     seed: int = 0
     output_dir: str | None = None
     overwrite: bool = False
+
+    precisions: ClassVar[tuple[str, ...]] = PRECISIONS
 
     def check(self) -> None:
         """Check the values that a type cannot.
@@ -90,7 +89,21 @@ class EvalConfig(Checked):
             ConfigError: a value is not one of its choices.
 
         """
-        _check_run(self.scale, self.precision, self.seed)
+        if self.scale not in SCALES:
+            raise ConfigError(f"scale: expected one of {', '.join(map(str, SCALES))}, got {self.scale}")
+        if self.precision not in self.precisions:
+            raise ConfigError(f"precision: expected one of {', '.join(self.precisions)}, got {self.precision}")
+        if self.seed < 0:
+            raise ConfigError(f"seed: expected 0 or a positive number, got {self.seed}")
+
+
+@dataclass
+class EvalConfig(RunConfig):
+    """The configuration of ``eval.py``."""
+
+    method: dict[str, Any] = MISSING
+    weights: str | None = None
+    run: str | None = None
 
 
 @dataclass
@@ -127,24 +140,17 @@ class LossConfig:
 
 
 @dataclass
-class TrainConfig(Checked):
-    """The configuration of ``train.py``; groups as in :class:`EvalConfig`."""
+class TrainConfig(RunConfig):
+    """The configuration of ``train.py``."""
 
-    dataset: dict[str, Any] = MISSING
-    downsampling: dict[str, Any] = MISSING
-    noise: dict[str, Any] = MISSING
     model: dict[str, Any] = MISSING
     trainer: TrainerConfig = field(default_factory=TrainerConfig)
-    metrics: MetricsConfig = field(default_factory=MetricsConfig)
     loss: LossConfig = field(default_factory=LossConfig)
     validation: dict[str, Any] = field(default_factory=dict)
-    scale: int = 4
     resume: str | None = None
-    device: str = "auto"
     precision: str = "auto"
-    seed: int = 0
-    output_dir: str | None = None
-    overwrite: bool = False
+
+    precisions: ClassVar[tuple[str, ...]] = (*PRECISIONS, "auto")
 
     def check(self) -> None:
         """Check the values that a type cannot.
@@ -153,7 +159,7 @@ class TrainConfig(Checked):
             ConfigError: a value is not one of its choices.
 
         """
-        _check_run(self.scale, self.precision, self.seed, (*PRECISIONS, "auto"))
+        super().check()
         w = self.loss.w
         if w != "auto" and (isinstance(w, bool) or not isinstance(w, (int, float)) or not 0 <= w < math.inf):
             raise ConfigError(f"loss.w: expected auto or a number, 0 or more, got {w!r}")
@@ -163,16 +169,6 @@ class TrainConfig(Checked):
         devices = self.trainer.devices
         if devices != "auto" and (isinstance(devices, bool) or not isinstance(devices, int) or devices < 1):
             raise ConfigError(f"trainer.devices: expected auto or a positive number, got {devices!r}")
-
-
-def _check_run(scale: int, precision: str, seed: int, precisions: tuple[str, ...] = PRECISIONS) -> None:
-    """Check what all commands have."""
-    if scale not in SCALES:
-        raise ConfigError(f"scale: expected one of {', '.join(map(str, SCALES))}, got {scale}")
-    if precision not in precisions:
-        raise ConfigError(f"precision: expected one of {', '.join(precisions)}, got {precision}")
-    if seed < 0:
-        raise ConfigError(f"seed: expected 0 or a positive number, got {seed}")
 
 
 def given_keys() -> list[str]:
