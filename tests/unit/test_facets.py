@@ -104,6 +104,18 @@ def test_before_training_the_mixture_is_the_splines_blend_of_central_differences
         assert float(result[y, x]) == pytest.approx(total / weights, rel=1e-6)
 
 
+def test_without_slopes_values_stay_within_those_around() -> None:
+    net = Facets(4, width=12, blocks=1, slopes=False)
+    coarse = torch.zeros(1, 1, 6, 6, dtype=torch.float64)
+    coarse[..., 3:] = 1.0
+    with torch.no_grad():
+        for parameter in (net.planes.weight, net.planes.bias):
+            parameter.zero_()
+        fine = net.upsample(_photo(24, 24), coarse)
+    assert 0 <= float(fine.min()) < 1e-12
+    assert 1 - 1e-12 < float(fine.max()) <= 1 + 1e-12
+
+
 def test_each_image_of_a_batch_is_treated_alone() -> None:
     net, rgb, coarse = _net(), _photo(24, 28, 3), _map(6, 7, 3)
     together = net.upsample(rgb, coarse)

@@ -69,6 +69,8 @@ class Facets(DisparityNetwork):
         width: channels at the coarse resolution.
         blocks: residual blocks there.
         facets: planes that each coarse pixel proposes.
+        slopes: whether planes have slopes; without them each is a constant, and the network predicts an interpolation
+            kernel for each pixel. For comparison: renderings show why it needs them.
 
     Raises:
         ValueError: a value is out of range.
@@ -78,7 +80,7 @@ class Facets(DisparityNetwork):
     prior: Tensor
     offsets: Tensor
 
-    def __init__(self, scale: int, width: int = 96, blocks: int = 6, facets: int = 2) -> None:
+    def __init__(self, scale: int, width: int = 96, blocks: int = 6, facets: int = 2, *, slopes: bool = True) -> None:
         super().__init__()
         if scale not in _SCALES:
             raise ValueError(f"scale: expected one of {', '.join(map(str, _SCALES))}, got {scale}")
@@ -86,7 +88,7 @@ class Facets(DisparityNetwork):
             raise ValueError(
                 f"model: expected width and facets of at least 1, blocks of at least 0; got {width}, {facets}, {blocks}"
             )
-        self.scale, self.width, self.blocks, self.facets = scale, width, blocks, facets
+        self.scale, self.width, self.blocks, self.facets, self.slopes = scale, width, blocks, facets, slopes
         levels = scale.bit_length() - 1
         channels = [*[_FINE, _HALF, width, width][:levels], width]
         self.photo = nn.Conv2d(4, channels[0], 5, padding=2)
@@ -108,7 +110,8 @@ class Facets(DisparityNetwork):
 
     def arguments(self) -> dict[str, Any]:
         """Return the constructor's arguments."""
-        return {"scale": self.scale, "width": self.width, "blocks": self.blocks, "facets": self.facets}
+        sizes = {"scale": self.scale, "width": self.width, "blocks": self.blocks, "facets": self.facets}
+        return {**sizes, "slopes": self.slopes}
 
     def upsample(self, rgb: Tensor, disparity: Tensor, bounds: Tensor | None = None) -> Tensor:
         """Return fine disparity; see :meth:`dsr.methods.network.DisparityNetwork.upsample`."""
@@ -146,7 +149,8 @@ class Facets(DisparityNetwork):
         differences = torch.stack((around.along_u, around.along_v), dim=1)  # (B, 2, 3, h, w)
         slopes = (picks * differences).sum(dim=2)  # (B, 2, h, w)
         base = torch.cat((around.value, slopes), dim=1)[:, None]
-        return base + moves.view(batch, self.facets, 3, height, width) * around.bend[:, None]
+        planes = base + moves.view(batch, self.facets, 3, height, width) * around.bend[:, None]
+        return planes if self.slopes else torch.cat((planes[:, :, :1], torch.zeros_like(planes[:, :, 1:])), dim=2)
 
     def _mixed(self, planes: Tensor, choice: Tensor) -> Tensor:
         """Return the mixture of the planes around each fine pixel, (B, 1, H, W).

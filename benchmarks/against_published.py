@@ -1,0 +1,84 @@
+"""The weights that come with dsr against the published MSG-V: the paper's Lucy and Plant, x4 and x8, box downsampling.
+
+    python benchmarks/against_published.py --shared DIR [--methods msg_v,facets] [--weights FILE] [--csv FILE]
+
+``DIR`` has ``scenes/lucy``, ``scenes/plant``, ``expected/metrics.json`` with the published network's scores, and
+``weights/alexnet_imagenet_features.pth`` for LPIPS_v. Each figure is ours / published, lower is better; none of these
+scenes was trained on or chosen with.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+from pathlib import Path
+
+import pandas as pd
+import torch
+
+from dsr.data.folder import Folder
+from dsr.degrade import Downsampling, make_sample
+from dsr.methods.network import NetworkUpsampler
+from dsr.methods.trained import NETWORKS, packaged_weights
+from dsr.methods.weights import load_network, read_head
+from dsr.quality.lpips import load_lpips
+from dsr.quality.scores import WORST, catalogue, score_image
+
+SCENES, SCALES = ("lucy", "plant"), (4, 8)
+METRICS = ("RMSE_v", "DSSIM_v", "BadPix_v_5", "Bumpiness_d", "LPIPS_v", "RMSE_d")
+
+
+def scores(shared: Path, weights: Path, scene: str) -> dict[str, float]:
+    """Return the worst-of-four scores of a network on one scene."""
+    net = load_network(weights, NETWORKS)
+    sample = make_sample(
+        Folder(str(shared / "scenes"), [scene]).load(scene), net.scale, Downsampling("box"), "disparity"
+    )
+    metrics = catalogue(load_lpips(shared / "weights" / "alexnet_imagenet_features.pth"))
+    depth = NetworkUpsampler(net)(sample)
+    with torch.inference_mode():
+        rows = score_image(depth, sample.depth, sample.camera.rays(), metrics)
+        return {row.metric: row.value for row in rows if row.variant in ("", WORST)}
+
+
+def table(shared: Path, methods: list[str], files: dict[str, Path]) -> pd.DataFrame:
+    """Return the ratios: a row per method, scale and scene, a column per metric."""
+    expected = json.loads((shared / "expected" / "metrics.json").read_text())
+    rows = []
+    for method in methods:
+        for scale in SCALES:
+            name = f"{method}_x{scale}"
+            weights = files.get(name) or packaged_weights(name)
+            for scene in SCENES if weights is not None else ():
+                ours, theirs = scores(shared, weights, scene), expected[scene][f"x{scale}"]["MSG-V"]
+                worst = {metric: max(value) if isinstance(value, list) else value for metric, value in theirs.items()}
+                ratios = {metric: ours[metric] / worst[metric] for metric in METRICS}
+                rows.append({"method": method, "scale": scale, "scene": scene, **ratios})
+    return pd.DataFrame(rows)
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--shared", type=Path, default=Path(os.environ.get("DSR_SHARED", "../shared")))
+    parser.add_argument("--methods", default="msg_v,facets,msg")
+    parser.add_argument("--weights", type=Path, nargs="*", default=[], help="files to take instead of packaged ones")
+    parser.add_argument("--csv", type=Path, help="where to write the table to")
+    arguments = parser.parse_args()
+    if not (arguments.shared / "expected" / "metrics.json").is_file():
+        print(f"skipped: needs the published network's scores, there are none in {arguments.shared}")
+        return
+    heads = {path: read_head(path) for path in arguments.weights}
+    files = {f"{head['model']}_x{head['arguments']['scale']}": path for path, head in heads.items()}
+    ratios = table(arguments.shared, arguments.methods.split(","), files)
+    if arguments.csv:
+        ratios.to_csv(arguments.csv, index=False)
+    for method, group in ratios.groupby("method", sort=False):
+        print(f"\n{method}: ours / published MSG-V")
+        print(group.drop(columns="method").to_string(index=False, float_format="%.3f"))
+        print("average ", "  ".join(f"{metric} {group[metric].mean():.3f}" for metric in METRICS))
+
+
+if __name__ == "__main__":
+    main()
