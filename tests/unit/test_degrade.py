@@ -12,7 +12,16 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from dsr.degrade import SCALES, Downsampling, GaussianMultiplicative, Kernel, Measured, make_sample, no_noise
+from dsr.degrade import (
+    SCALES,
+    Downsampling,
+    GaussianMultiplicative,
+    Kernel,
+    Measured,
+    make_sample,
+    no_noise,
+    scene_generator,
+)
 from dsr.geometry.camera import RANGE_TYPES, Camera, RangeType, to_range
 from dsr.sample import DepthSample, Scene
 
@@ -384,6 +393,30 @@ def test_noise_multiplies_the_coarse_values_of_the_methods_range_type(range_type
     )
     assert noisy.depth is not None
     assert torch.equal(noisy.depth, clean.depth)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("camera", [CAMERA, STEREO])
+@pytest.mark.parametrize("asked", [None, *RANGE_TYPES])
+@pytest.mark.parametrize("method", RANGE_TYPES)
+def test_noise_is_one_plus_std_times_the_draws_in_the_range_type_that_is_averaged(
+    camera: Camera, asked: RangeType | None, method: RangeType
+) -> None:
+    noisy, clean = (
+        make_sample(_scene(_values(32, 48), camera), 4, Downsampling("box", range_type=asked), method, noise, generator)
+        for noise, generator in ((GaussianMultiplicative(0.03), torch.Generator().manual_seed(3)), (None, 0))
+    )
+    one, other = (to_range(each.depth_lr, each.camera_lr, asked or method) for each in (noisy, clean))
+    draws = torch.randn(1, 8, 12, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
+    torch.testing.assert_close(one, other * (1 + 0.03 * draws), rtol=1e-10, atol=1e-10)
+
+
+def test_noise_that_leads_behind_the_camera_makes_a_hole() -> None:
+    scene = _scene(torch.full((1, 32, 48), 2.0, dtype=torch.float64))
+    for range_type in RANGE_TYPES:
+        sample = make_sample(scene, 2, Downsampling("box"), range_type, GaussianMultiplicative(0.9))
+        draws = torch.randn(1, 16, 24, generator=scene_generator(0, "set", "hall", 2), dtype=torch.float64)
+        assert 20 < int((1 + 0.9 * draws <= 0).sum()) < 100
+        assert torch.equal(sample.mask_lr, 1 + 0.9 * draws > 0)
 
 
 def test_noise_is_the_scenes_own_and_a_function_of_seed_names_and_scale() -> None:

@@ -1,6 +1,7 @@
 """Two passes: predictions to files, then scores from files; what is there already and what fails keep their places."""
 
 import csv
+import dataclasses
 import json
 import math
 
@@ -8,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from dsr.degrade import Downsampling, Measured
+from dsr.degrade import Downsampling, GaussianMultiplicative, Measured, make_sample
 from dsr.evaluation import SCORE_COLUMNS, Outcome, StalePredictionError, Study, load_prediction, predict, score
 from dsr.geometry.camera import Camera
 from dsr.quality.scores import catalogue, score_image
@@ -401,3 +402,14 @@ def test_a_prediction_is_replaced_whole_and_a_reader_of_the_former_one_is_not_di
         assert reader.read() == before
     assert path.read_bytes() != before
     assert path.stat().st_mode & 0o777 == 0o644
+
+
+def test_a_studys_samples_have_its_noise_under_its_seed():
+    clean, noise = toy_study(), GaussianMultiplicative(0.02)
+    noisy = dataclasses.replace(clean, noise=noise)
+    expected = make_sample(toy_scene("a"), SCALE, Downsampling("box"), "orthogonal", noise, 7)
+    torch.testing.assert_close(noisy.sample("a").depth_lr, expected.depth_lr, rtol=0, atol=0)
+    assert not torch.equal(noisy.sample("a").depth_lr, clean.sample("a").depth_lr)
+    reseeded = dataclasses.replace(noisy, seed=8).sample("a")
+    assert not torch.equal(reseeded.depth_lr, expected.depth_lr)
+    assert torch.equal(reseeded.depth, clean.sample("a").depth)

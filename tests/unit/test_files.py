@@ -112,6 +112,8 @@ def test_infinities_and_nan_of_a_pfm_come_through(tmp_path, order):
     [
         b"PF\n2 1\n-1.0\n" + bytes(24), b"Pf\n2 1\n0.0\n" + bytes(8), b"Pf\n2 1\n-1.0\n" + bytes(9),
         b"Pf\n2 1\n-.\n" + bytes(8), b"Pf\n2\n-1.0\n" + bytes(8), b"Pf\n0 1\n-1.0\n",
+        b"Pf\n2 1\n-1.0\n" + bytes(7), b"Pf\n2 1\n1e999\n" + bytes(8), b"Pf\n2 1\nnan\n" + bytes(8),
+        b"Pf\n" + b"1" * 5000 + b" 1\n-1.0\n" + bytes(8), b"Pf\n# made by hand\n2 1\n-1.0\n" + bytes(8),
     ],
 )  # fmt: skip
 def test_a_pfm_that_is_no_single_channel_of_its_size_is_refused(tmp_path, capfd, content):

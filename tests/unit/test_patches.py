@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import pickle
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
@@ -165,6 +166,26 @@ def test_parts_give_patches_by_their_shares() -> None:
     assert np.bincount(seen, minlength=4) / 400 == pytest.approx([0.25, 0.375, 0.375, 0], abs=0.07)
 
 
+def test_a_part_gets_its_share_and_a_scene_its_turn_though_their_depth_is_sparse() -> None:
+    sparse = torch.full((1, 44, 60), torch.nan, dtype=torch.float64)
+    sparse[0, ::3, ::3] = 2.0
+    patches = Patches([[_scene(0)], [_scene(1), _scene(2, depth=sparse)]], _settings(), X4, shares=[2, 2], count=400)
+    seen = np.array([_places(patches[i])[2] for i in range(400)])
+    assert np.bincount(seen) / 400 == pytest.approx([0.5, 0.25, 0.25], abs=0.07)
+
+
+def test_shares_that_are_all_zero_are_refused() -> None:
+    with pytest.raises(ValueError, match=r"dataset.shares: expected a positive number among them, all are 0"):
+        Patches([[_scene(0)], [_scene(1)]], _settings(), X4, shares=[0, 0])
+
+
+def test_patches_that_travel_to_another_process_stay_the_same() -> None:
+    patches = _patches([_scene(i) for i in range(3)], count=12)
+    before = [patches[i] for i in range(6)]
+    travelled = pickle.loads(pickle.dumps(patches))
+    assert _equal([travelled[i] for i in range(6)], before)
+
+
 def test_each_part_holds_its_last_scenes_out_under_a_name_of_its_own() -> None:
     sources = [_Source([_scene(i) for i in numbers]) for numbers in ((0, 1, 2), (3, 4))]
     data = PatchData([Part(source) for source in sources], _settings(validation_scenes=1), X4)
@@ -190,6 +211,19 @@ def test_a_scene_that_is_trained_on_cannot_validate() -> None:
     more: dict[str, SceneSource] = {"mine": _Source([_scene(8), _scene(1)])}
     with pytest.raises(ValueError, match=r"validation.mine: expected scenes that are not trained on, got scene1"):
         PatchData([Part(_Source([_scene(i) for i in range(6)]))], _settings(), X4, validation=more)
+
+
+def test_a_scene_that_is_trained_on_cannot_validate_under_another_name() -> None:
+    class _Copies(_Source):
+        def fingerprint(self, scene: str) -> str:
+            return "the same" if scene in ("scene1", "scene8") else scene
+
+    parts = [Part(_Copies([_scene(i) for i in range(6)]))]
+    with pytest.raises(ValueError, match=r"validation.mine: expected scenes that are not trained on, got scene8"):
+        PatchData(parts, _settings(), X4, validation={"mine": _Copies([_scene(8)])})
+    assert PatchData(parts, _settings(), X4, validation={"mine": _Copies([_scene(9)])}).validation_sets == [
+        "set", "mine",
+    ]  # fmt: skip
 
 
 def test_a_validation_set_without_any_truth_is_refused() -> None:
@@ -291,7 +325,7 @@ def test_points_of_a_turned_patch_are_those_of_its_pixels_turned_about_the_axis(
     assert turns == {(1, 0), (-1, 0), (0, 1), (0, -1)}
 
 
-def test_depth_is_scaled_within_its_range_and_with_it_the_bounds() -> None:
+def test_depth_is_scaled_evenly_and_within_its_range() -> None:
     plain, scaled = (_patches(count=60, depth_scale=s) for s in (0.0, 0.5))
     factors = []
     for i in range(60):
@@ -306,18 +340,49 @@ def test_depth_is_scaled_within_its_range_and_with_it_the_bounds() -> None:
     assert 0.4 < logs.max() <= 0.5
 
 
-def test_bounds_lie_between_the_patchs_own_and_the_scenes_and_often_are_the_scenes() -> None:
-    patches, shares = _patches(count=200), []
-    scene = 10 / make_sample(_scene(), 4, BOX, "disparity").depth_lr
+@pytest.mark.parametrize("camera", [CAMERA, STEREO])
+def test_bounds_lie_between_the_patchs_own_and_the_scenes_and_half_are_the_scenes(camera: Camera) -> None:
+    """The scene's, as the patch's camera counts it: turned, and nearer or farther."""
+    patches = _patches([_scene(camera=camera)], count=200, rotate=True, depth_scale=0.5)
+    coarse = 1 / (1 / _tilted(camera)).reshape(11, 4, 15, 4).mean(dim=(1, 3)).numpy()
+    shares = []
     for i in range(200):
         patch = patches[i]
+        rows, columns, _ = _places(patch)
+        factor = patch["depth"][0, 0, 0] / _tilted(camera)[0, rows[0, 0], columns[0, 0]]
+        focal = camera.fx if rows[0, 0] == rows[0, 1] else camera.fy
+        stereo = (camera.baseline or 0.2) * focal
+        scene = [float(stereo / (factor * z) - camera.doffs) for z in (coarse.max(), coarse.min())]
+        own = [float(patch["disparity_lr"].min()), float(patch["disparity_lr"].max())]
         low, high = patch["bounds"].flatten().tolist()
-        own = patch["disparity_lr"]
-        assert float(scene.min()) - 1e-5 <= low <= float(own.min()) + 1e-5
-        assert float(own.max()) - 1e-5 <= high <= float(scene.max()) + 1e-5
-        shares.append((high - low) / float(scene.max() - scene.min()))
-    assert 0.4 < np.mean(np.array(shares) > 0.9999) < 0.65
-    assert min(shares) < 0.5
+        assert scene[0] - 1e-5 <= low <= own[0] + 1e-5
+        assert own[1] - 1e-5 <= high <= scene[1] + 1e-5
+        shares.append(1 - (high - low - (own[1] - own[0])) / (scene[1] - scene[0] - (own[1] - own[0])))
+    assert np.mean(np.abs(shares) < 1e-4) == pytest.approx(0.5, abs=0.1)
+    between = np.array(shares)[np.abs(shares) >= 1e-4]
+    assert between.mean() == pytest.approx(0.5, abs=0.1)
+    assert between.std() == pytest.approx(12**-0.5, abs=0.05)  # of a uniform distribution
+
+
+def test_bounds_of_a_noisy_patch_contain_its_coarse_map_or_are_the_clean_scenes() -> None:
+    patches = Patches([[_scene()]], _settings(), Problem(4, BOX, GaussianMultiplicative(0.005)), count=60)
+    coarse = 10 * (1 / _tilted(CAMERA)).reshape(11, 4, 15, 4).mean(dim=(1, 3))
+    clean = 0
+    for i in range(60):
+        patch = patches[i]
+        (low, high), own = patch["bounds"].flatten().tolist(), patch["disparity_lr"]
+        assert low <= float(own.min()) + 1e-5
+        assert high >= float(own.max()) - 1e-5
+        clean += [low, high] == pytest.approx([float(coarse.min()), float(coarse.max())], rel=1e-5)
+    assert clean > 15
+
+
+def test_bounds_come_of_the_coarse_map_and_know_nothing_of_the_fine_one() -> None:
+    depth = torch.full((1, 44, 60), 2.0, dtype=torch.float64)
+    depth[0, ::4, ::4] = 1.0  # one pixel of disparity 10 among fifteen of 5 in each block, wherever a patch begins
+    patches = _patches([_scene(depth=depth)], count=20)
+    for i in range(20):
+        assert patches[i]["bounds"].flatten().tolist() == pytest.approx([5.3125, 1.001 * 5.3125], rel=1e-6)
 
 
 def test_bounds_of_a_whole_scene_are_its_coarse_maps_own_and_those_of_a_wall_some_way_apart() -> None:

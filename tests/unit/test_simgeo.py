@@ -155,6 +155,7 @@ def test_lucys_fingerprint_follows_her_files_and_the_renderings_their_size(lucy)
     np.save(lucy / "depth.npy", np.full((4, 8), 2.0))
     assert source.fingerprint("lucy") != before
     assert source.fingerprint(NAME) == cube != SimGeo(size=32).fingerprint(NAME)
+    assert len({SimGeo().fingerprint(scene) for scene in SimGeo().scenes()}) == len(SimGeo().scenes())
 
 
 @pytest.mark.parametrize("root", [None, "nowhere"])

@@ -156,7 +156,7 @@ def _load_pfm(path: Path) -> np.ndarray:
     if not path.is_file():
         raise ValueError(f"{path}: expected a picture, there is none")
     data = path.read_bytes()
-    header = re.match(rb"(P[Ff])\s+(\d+)\s+(\d+)\s+([-+.\deE]+)\s", data)
+    header = re.match(rb"(P[Ff])\s+(\d{1,9})\s+(\d{1,9})\s+([-+.\deE]{1,40})\s", data)
     if header is None:
         raise ValueError(f"{path}: expected a PFM file, got something else")
     if header[1] != b"Pf":
@@ -167,7 +167,7 @@ def _load_pfm(path: Path) -> np.ndarray:
     except ValueError:
         scale = 0.0
     pixels = data[header.end() :]
-    if scale == 0 or not width or not height or len(pixels) != 4 * width * height:
+    if not 0 < abs(scale) < math.inf or not width or not height or len(pixels) != 4 * width * height:
         raise ValueError(f"{path}: expected a PFM file of {width} x {height} floats, got a damaged one")
     return np.frombuffer(pixels, "<f4" if scale < 0 else ">f4").reshape(height, width)[::-1]
 

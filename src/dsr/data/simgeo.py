@@ -58,4 +58,4 @@ class SimGeo:
         """Return the version of the renderings, or the SHA-256 of Lucy's files."""
         if scene == "lucy" and self._lucy is not None:
             return self._lucy.fingerprint(scene)
-        return f"simgeo-v{SCENES_VERSION}-{self._size}"
+        return f"simgeo-v{SCENES_VERSION}-{self._size}-{scene}"

@@ -1,0 +1,76 @@
+"""What a network is trained on: the problem that a scene poses, and its tensors."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from dsr.degrade import Downsampling, Noise, make_sample
+from dsr.geometry.camera import VIRTUAL_BASELINE, Camera, to_range
+from dsr.sample import DepthSample, Scene
+
+Batch = dict[str, Tensor]
+_LEAST_SPAN = 1e-3
+"""Of the bounds of a flat map, as a share of its disparity."""
+
+
+@dataclass(frozen=True)
+class Problem:
+    """What is to be undone: how coarse maps come from fine ones.
+
+    Args:
+        scale, downsampling, noise: as for :func:`dsr.degrade.make_sample`.
+
+    """
+
+    scale: int
+    downsampling: Downsampling
+    noise: Noise = None
+
+    def sample(self, scene: Scene, generator: torch.Generator | int = 0, *, clean: bool = False) -> DepthSample:
+        """Return the problem that a scene poses, its coarse map made of disparity."""
+        noise = None if clean else self.noise
+        return make_sample(scene, self.scale, self.downsampling, "disparity", noise, generator)
+
+
+def tensors_of(sample: DepthSample, dtype: torch.dtype = torch.float32, bounds: Tensor | None = None) -> Batch:
+    """Return a sample as the tensors that a network on disparities trains on.
+
+    Args:
+        sample: with a true depth.
+        dtype: of all but the photo and the bounds.
+        bounds: (2, 1, 1) lowest and highest disparity to normalise with; None for those of the coarse map.
+
+    Returns:
+        ``rgb`` (3, H, W), ``bounds`` (2, 1, 1), float32; in ``dtype`` ``disparity_lr`` (1, h, w) in pixels of the
+        photo's camera, ``depth`` (1, H, W) metres, ``rays`` (3, H, W), ``stereo`` (1, 1, 1) baseline times fx
+        and ``doffs`` (1, 1, 1).
+
+    """
+    if sample.depth is None:
+        raise ValueError(f"{sample.scene}: expected a true depth to train with, there is none")
+    camera = sample.camera
+    disparity = sample.scale * to_range(sample.depth_lr, sample.camera_lr, "disparity")
+    return {
+        "rgb": sample.rgb.float(),
+        "disparity_lr": disparity.to(dtype),
+        "depth": sample.depth.to(dtype),
+        "rays": camera.rays(dtype=dtype),
+        "stereo": torch.full((1, 1, 1), stereo_of(camera), dtype=dtype),
+        "doffs": torch.full((1, 1, 1), camera.doffs, dtype=dtype),
+        "bounds": (bounds_of(disparity) if bounds is None else bounds).float(),
+    }
+
+
+def bounds_of(disparity: Tensor) -> Tensor:
+    """Return the lowest and the highest known value, (2, 1, 1), some way apart."""
+    known = disparity[disparity.isfinite()]
+    low, high = known.min(), known.max()
+    return torch.stack((low, torch.maximum(high, low + _LEAST_SPAN * high.abs().clamp(min=_LEAST_SPAN)))).view(2, 1, 1)
+
+
+def stereo_of(camera: Camera) -> float:
+    """Return baseline times fx, in metre pixels."""
+    return (VIRTUAL_BASELINE if camera.baseline is None else camera.baseline) * camera.fx
