@@ -111,16 +111,16 @@ class TrainerConfig:
     """How long and with what to train; see ``conf/trainer/default.yaml``."""
 
     name: str = "default"
-    steps: int = 6000
+    steps: int = 12000
     validate_every: int = 1000
     learning_rate: float = 1e-3
-    warmup: int = 100
+    warmup: int = 300
     weight_decay: float = 1e-4
     clip: float = 1.0
     average: float = 0.999
-    finish: float = 0.2
+    finish: float = 0.1
     patch: int = 96
-    batch: int = 16
+    batch: int = 6
     accumulate: int = 1
     validation_scenes: int = 4
     flip: bool = True
