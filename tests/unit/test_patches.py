@@ -159,6 +159,15 @@ def test_held_out_scenes_are_validated_with_whole_and_never_trained_on() -> None
     torch.testing.assert_close(whole[0]["depth"][0], _tilted(CAMERA), rtol=0, atol=0)
 
 
+def test_of_each_data_set_the_first_scenes_alone_can_be_used() -> None:
+    sources = [Part(_Source([_scene(i) for i in range(6)]))]
+    data = PatchData(sources, _settings(scenes=3, validation_scenes=1), X4)
+    assert data.used[0][1] == ["scene0", "scene1"]
+    assert data.validation_scenes()["set"][1] == ["scene2"]
+    with pytest.raises(ValueError, match=r"trainer.scenes: expected a positive number, or null for all, got 0"):
+        _settings(scenes=0)
+
+
 def test_parts_give_patches_by_their_shares() -> None:
     parts = [_scene(0)], [_scene(1), _scene(2)], [_scene(3)]
     patches = Patches(parts, _settings(), X4, shares=[1, 3, 0], count=400)
@@ -191,7 +200,8 @@ def test_each_part_holds_its_last_scenes_out_under_a_name_of_its_own() -> None:
     data = PatchData([Part(source) for source in sources], _settings(validation_scenes=1), X4)
     assert data.validation_sets == ["set", "set_2"]
     assert data.training_count == 3
-    assert data.sources[:2] == sources
+    assert [source for source, _ in data.used] == [*sources, *sources]
+    assert [names for _, names in data.used] == [["scene0", "scene1"], ["scene3"], ["scene2"], ["scene4"]]
     data.setup()
     assert [next(iter(loader))["rgb"][0, 2, 0, 0] * 255 for loader in data.val_dataloader()] == pytest.approx([2, 4])
 

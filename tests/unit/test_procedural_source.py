@@ -42,9 +42,9 @@ def test_a_scene_is_rendered_once(cache: Path, monkeypatch: pytest.MonkeyPatch) 
 def test_preparing_renders_what_is_missing_and_names_every_scene(cache: Path) -> None:
     source = Procedural(count=3, size=SIZE)
     source.load("00001")
-    assert sorted(source.prepare()) == ["00000", "00001", "00002"]
+    assert sorted(source.prepare(source.scenes())) == ["00000", "00001", "00002"]
     assert len(list(cache.rglob("*.npz"))) == 3
-    assert list(source.prepare()) == source.scenes()
+    assert list(source.prepare(["00002", "00000"])) == ["00002", "00000"]
 
 
 def test_seeds_and_sizes_do_not_share_scenes(cache: Path) -> None:

@@ -123,6 +123,7 @@ class TrainerConfig:
     batch: int = 6
     accumulate: int = 1
     validation_scenes: int = 4
+    scenes: int | None = None
     flip: bool = True
     rotate: bool = True
     depth_scale: float = 0.3

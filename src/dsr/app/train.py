@@ -138,9 +138,9 @@ def _network(settings: TrainConfig) -> DisparityNetwork:
 
 def _prepare(console: Console, data: PatchData) -> None:
     """Let the data sets that render their scenes do so, with a bar."""
-    for source in data.sources:
+    for source, names in data.used:
         if isinstance(source, Procedural):
-            for _ in over(console, source.prepare(), "render", len(source.scenes())):
+            for _ in over(console, source.prepare(names), "render", len(names)):
                 pass
 
 

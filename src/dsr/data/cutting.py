@@ -33,6 +33,7 @@ class PatchSettings:
         size: height and width in pixels; the scale divides it.
         batch: patches per step and device.
         validation_scenes: how many of each data set's last scenes are never trained on, but validated with.
+        scenes: how many of each data set's scenes to use, the first ones; None for all.
         workers: processes that cut patches; 0 for none beside the trainer's.
         flip, rotate, depth_scale, colour: see :class:`dsr.data.augment.Variation`.
 
@@ -44,6 +45,7 @@ class PatchSettings:
     size: int = 96
     batch: int = 16
     validation_scenes: int = 4
+    scenes: int | None = None
     workers: int = 0
     flip: bool = True
     rotate: bool = True
@@ -56,6 +58,8 @@ class PatchSettings:
             raise ValueError(f"trainer.patch: expected at least {_LEAST_SIZE} pixels, got {self.size}")
         if self.batch < 1:
             raise ValueError(f"trainer.batch: expected a positive number, got {self.batch}")
+        if self.scenes is not None and self.scenes < 1:
+            raise ValueError(f"trainer.scenes: expected a positive number, or null for all, got {self.scenes}")
         for name in ("workers", "validation_scenes"):
             if getattr(self, name) < 0:
                 raise ValueError(f"trainer.{name}: expected 0 or more, got {getattr(self, name)}")

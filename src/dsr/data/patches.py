@@ -98,9 +98,10 @@ class PatchData(lightning.LightningDataModule):
         self._validation: list[list[Scene]] = []
 
     @property
-    def sources(self) -> list[SceneSource]:
-        """All data sets, those of the parts first."""
-        return [*(part.source for part in self._parts), *(source for source, _ in self._held_out.values())]
+    def used(self) -> list[tuple[SceneSource, list[str]]]:
+        """The scenes that are trained on or validated with, by data set; those of the parts first."""
+        trained = [(part.source, names) for part, names in zip(self._parts, self._training_names, strict=True)]
+        return [*trained, *self._held_out.values()]
 
     @property
     def validation_sets(self) -> list[str]:
@@ -170,7 +171,7 @@ class PatchData(lightning.LightningDataModule):
 
     def _split(self, source: SceneSource) -> None:
         """Hold the last scenes of a data set out."""
-        names, count = source.scenes(), self._settings.validation_scenes
+        names, count = source.scenes()[: self._settings.scenes], self._settings.validation_scenes
         if len(names) <= count:
             raise ValueError(
                 f"trainer.validation_scenes: expected fewer than the {len(names)} scenes of {source.name}, got {count}"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from multiprocessing import get_context
 from pathlib import Path
@@ -48,10 +48,10 @@ class Procedural:
         """Return what the scene is a function of."""
         return f"procedural-v{PROCEDURAL_VERSION}-{self._seed}-{self._size}-{scene}"
 
-    def prepare(self) -> Iterable[str]:
-        """Render what the cache lacks, on every processor, and yield the names as they are done."""
-        missing = [scene for scene in self.scenes() if not (cache_directory() / self._path(scene)).is_file()]
-        yield from (scene for scene in self.scenes() if scene not in set(missing))
+    def prepare(self, scenes: Sequence[str]) -> Iterable[str]:
+        """Render what the cache lacks of some scenes, on every processor, and yield the names as they are done."""
+        missing = [scene for scene in scenes if not (cache_directory() / self._path(scene)).is_file()]
+        yield from (scene for scene in scenes if scene not in set(missing))
         if not missing:
             return
         workers = min(len(missing), os.cpu_count() or 1)
