@@ -36,8 +36,7 @@ class Schedule:
         average: decay of the exponential moving average of the weights, which is what is validated and kept; 0 for
             the weights themselves. In its first steps the average is shorter.
         mixed: whether the network's convolutions run in bfloat16; losses and weights never do.
-        finish: share of the steps, the last ones, that run in float32 all the same: bfloat16 leaves a faint pattern on
-            smooth surfaces, which renderings show.
+        finish: share of the steps, the last ones, that run in float32 all the same.
 
     Raises:
         ValueError: a value is out of range.
@@ -51,7 +50,7 @@ class Schedule:
     clip: float = 1.0
     average: float = 0.999
     mixed: bool = False
-    finish: float = 0.2
+    finish: float = 0.0
 
     def __post_init__(self) -> None:
         """Check the values."""
