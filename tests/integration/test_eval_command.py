@@ -4,6 +4,7 @@ import csv
 import json
 import math
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -44,8 +45,14 @@ def offline(tmp_path_factory, dsr_cache):
     return {**kept, **nowhere, **places, "OMP_NUM_THREADS": "2"}
 
 
+def quick(arguments):
+    """Return the arguments with the quickest method, unless they name or take away one themselves."""
+    named = any(re.match(r"~?method(=|$)|--help", argument) for argument in arguments)
+    return arguments if named else (*arguments, "method=bicubic")
+
+
 def command(*arguments):
-    return [sys.executable, str(REPOSITORY / "eval.py"), *arguments]
+    return [sys.executable, str(REPOSITORY / "eval.py"), *quick(arguments)]
 
 
 def run(folder, environment, *arguments):
@@ -64,7 +71,7 @@ def within(monkeypatch, tmp_path, capfd):
 
     def call(*arguments, lpips=False):
         switch = [] if lpips else ["metrics.lpips=false"]
-        monkeypatch.setattr(sys, "argv", ["eval.py", *arguments, *switch])
+        monkeypatch.setattr(sys, "argv", ["eval.py", *quick(arguments), *switch])
         code = 0
         try:
             run_command(REPOSITORY / "conf", "eval", evaluate)
@@ -362,6 +369,23 @@ def test_the_help_lists_the_choices(within):
     assert (code, errors) == (0, [])
     for line in ("dataset: folder, mixture, procedural, simgeo", "method: bicubic, bilinear, facets, msg, msg_v"):
         assert line in output
+
+
+def test_without_further_words_msg_v_is_evaluated_with_the_weights_that_come_with_dsr(tmp_path, offline):
+    arguments = ("dataset.size=64", "dataset.scenes=[statue,cube_no_texture]", "metrics.lpips=false")
+    done = subprocess.run(
+        [sys.executable, str(REPOSITORY / "eval.py"), *arguments],
+        cwd=tmp_path, env=offline, capture_output=True, text=True, timeout=120, check=False,
+    )  # fmt: skip
+    assert (done.returncode, done.stderr) == (0, "")
+    [home] = (tmp_path / "outputs" / "eval").iterdir()
+    assert home.name.startswith("simgeo_box_x4_msg_v_")
+    assert run(tmp_path, offline, *arguments, "output_dir=bicubic").returncode == 0
+    ours, theirs = (
+        json.loads((folder / "summary.json").read_text())["mean"] for folder in (home, tmp_path / "bicubic")
+    )
+    for name in ("RMSE_v", "DSSIM_v", "BadPix_v_5", "Bumpiness_d"):
+        assert ours[name] < 0.9 * theirs[name], name
 
 
 def test_weights_that_a_method_has_no_use_for_are_noted(tmp_path, within):
