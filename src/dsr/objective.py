@@ -15,7 +15,8 @@ from dsr.quality import losses
 from dsr.quality.functional import SurfacePair, mse_v
 
 DepthLoss = Literal["lap1", "l1", "mse"]
-_TILT = math.radians(2.5)
+_TILT = math.asin(5 / 255)
+"""Turns a surface seen side-on by 5 of 255 grey levels, what BadPix_v(5) begins to count: 1.1 degrees."""
 _DEPTH_LOSSES = {"lap1": losses.lap1, "l1": losses.l1, "mse": losses.mse}
 
 
@@ -73,8 +74,8 @@ def balanced_weight(patches: Iterable[Batch]) -> float:
 
     A depth error of tan(a) z / f metres between two neighbouring pixels, z / f metres apart, tilts the normal by a. As
     a share of the coarse disparities' range the depth term sees stereo tan(a) / (f z range), and MSE_v sees
-    (2 - 2 cos a) / 3. w is their ratio for a tilt of 2.5 degrees, which a rendering begins to show, at the median over
-    the patches.
+    (2 - 2 cos a) / 3. w is their ratio for a tilt of 1.1 degrees, which changes a rendering by 5 of 255, at
+    the median over the patches.
 
     Args:
         patches: single training patches, without a batch axis; see :func:`dsr.data.patches.tensors_of`.

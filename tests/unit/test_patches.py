@@ -41,7 +41,7 @@ def _scene(number: int = 0, camera: Camera = CAMERA, depth: Tensor | None = None
 
 def _settings(**changes: Any) -> PatchSettings:
     plain: dict[str, Any] = {"size": SIZE, "batch": 2, "validation_scenes": 2}
-    return PatchSettings(**{**plain, "rotate": False, "depth_scale": 0.0, "colour": 0.0, **changes})
+    return PatchSettings(**{**plain, "rotate": False, "depth_scale": 0.0, "colour": 0.0, "photo": 0.0, **changes})
 
 
 def _patches(scenes: list[Scene] | None = None, count: int = 40, **changes: Any) -> Patches:
@@ -438,6 +438,20 @@ def test_colour_stays_within_its_range_and_off_leaves_the_photo_as_it_is() -> No
     assert all(torch.equal(off[i]["rgb"], torch.full((3, SIZE, SIZE), 0.97)) for i in range(5))
 
 
+def test_a_share_of_the_photos_gets_another_gamma_blur_and_noise() -> None:
+    step = replace(_scene(), rgb=(0.2 + 0.6 * (torch.arange(60.0) >= 30)).expand(3, 44, 60).contiguous())
+    patches = _patches([step], count=400, photo=0.5, flip=False)
+    changed = [patch["rgb"] for patch in (patches[i] for i in range(400)) if len(patch["rgb"].unique()) > 2]
+    assert len(changed) / 400 == pytest.approx(0.5, abs=0.08)
+    left = torch.stack([photo[..., :3].mean() for photo in changed if photo[..., :8].max() < 0.55])
+    assert 0.05 < float(left.min()) < 0.12  # 0.2 to the power of exp(0.5)
+    assert 0.3 < float(left.max()) < 0.42  # and of exp(-0.5)
+    noise = torch.stack([photo[..., :3].std() for photo in changed if photo[..., :8].max() < 0.55])
+    assert float(noise.max()) < 0.035
+    assert float(noise.min()) < 0.006
+    assert all(photo.min() >= 0 and photo.max() <= 1 for photo in changed)
+
+
 def test_holes_stay_holes_and_half_of_a_patch_is_known_where_that_can_be_had() -> None:
     depth = _tilted(CAMERA)
     depth[:, :, :30] = torch.nan
@@ -523,6 +537,7 @@ def test_no_scene_at_all_is_refused() -> None:
         ({"size": 15}, "trainer.patch: expected at least 16 pixels, got 15"),
         ({"batch": 0}, "trainer.batch: expected a positive number, got 0"),
         ({"validation_scenes": -1}, "trainer.validation_scenes: expected 0 or more, got -1"),
+        ({"photo": 1.1}, "trainer.photo: expected a share from 0 to 1, got 1.1"),
         ({"depth_scale": -0.1}, "trainer.depth_scale: expected 0 or more, got -0.1"),
         ({"workers": -1}, "trainer.workers: expected 0 or more, got -1"),
         ({"colour": -0.1}, "trainer.colour: expected 0 or more, got -0.1"),

@@ -161,14 +161,14 @@ def _plane(baseline: float | None = None, doffs: float = 0.0, slope: float = 0.0
 def test_the_balanced_weight_of_a_plane_is_its_closed_form(baseline: float | None, doffs: float, fx: float) -> None:
     stereo = (baseline or 0.2) * fx
     middle, spread = stereo / (3 + 0.02 * 50), 0.02 * 96  # the median's column; coarse centres from 1.5 to 97.5
-    tilt = math.radians(2.5)
+    tilt = math.asin(5 / 255)
     as_disparity = (stereo / middle - stereo / (middle * (1 + 1e-6 * math.tan(tilt) / fx))) / 1e-6 / spread
     expected = as_disparity / ((2 - 2 * math.cos(tilt)) / 3)
     assert balanced_weight([_plane(baseline, doffs, fx=fx)]) == pytest.approx(expected, rel=2e-6)
 
 
 def test_the_balanced_weight_balances_a_tilt_between_neighbours() -> None:
-    """On a wall whose every second column stands out by tan(2.5 degrees) of a pixel's width, both terms weigh alike."""
+    """On a wall whose every second column stands out by tan(1.1 degrees) of a pixel's width, both terms weigh alike."""
     camera = Camera(width=100, height=16, fx=80.0, fy=80.0, cx=49.5, cy=7.5)
     wall = torch.full((1, 16, 100), 2.0, dtype=torch.float64)
     wall[..., :4] = 2.5  # so that the coarse map has a range
@@ -176,7 +176,7 @@ def test_the_balanced_weight_balances_a_tilt_between_neighbours() -> None:
     w = balanced_weight([batch])
     batch = {name: value[None].double() for name, value in batch.items()}
     bumps = torch.zeros_like(batch["depth"])
-    bumps[..., 5::2] = math.tan(math.radians(2.5)) * 2 / 80
+    bumps[..., 5::2] = math.tan(math.asin(5 / 255)) * 2 / 80
     terms = Objective("l1", w)(batch["stereo"] / (batch["depth"] + bumps), batch)
     # l1 sees every second column; MSE_v sees a tilt at every column
     assert float(2 * terms["l1"]) == pytest.approx(float(w * terms["mse_v"]), rel=0.05)

@@ -128,6 +128,7 @@ class TrainerConfig:
     rotate: bool = True
     depth_scale: float = 0.3
     colour: float = 0.1
+    photo: float = 0.5
     workers: int = 0
     devices: Any = 1
     init: str | None = None

@@ -1,4 +1,4 @@
-"""Random windows of scenes, and their variation: mirrored, turned, nearer or farther, recoloured."""
+"""Random windows of scenes, and their variation: mirrored, turned, nearer or farther, photographed otherwise."""
 
 from __future__ import annotations
 
@@ -7,8 +7,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
+from scipy import ndimage
+from torch import Tensor
 
 from dsr.sample import Scene
+
+_BLUR, _NOISE = 1.0, 0.03
 
 
 @dataclass(frozen=True)
@@ -20,6 +24,8 @@ class Variation:
         rotate: whether they are turned by quarter turns, the camera along with them.
         depth_scale: s, where depth is multiplied by exp(U(-s, s)).
         colour: standard deviation of the gain of each colour channel.
+        photo: share of the windows whose photo is as cameras take them rather than as they are rendered: of another
+            gamma, blurred and noisy.
 
     Raises:
         ValueError: a value is out of range.
@@ -30,18 +36,23 @@ class Variation:
     rotate: bool = True
     depth_scale: float = 0.3
     colour: float = 0.1
+    photo: float = 0.5
 
     def __post_init__(self) -> None:
         """Check the values."""
         for name in ("depth_scale", "colour"):
             if not 0 <= getattr(self, name) < math.inf:
                 raise ValueError(f"trainer.{name}: expected 0 or more, got {getattr(self, name)}")
+        if not 0 <= self.photo <= 1:
+            raise ValueError(f"trainer.photo: expected a share from 0 to 1, got {self.photo}")
 
     def __call__(self, scene: Scene, random: np.random.Generator) -> tuple[Scene, float]:
         """Return the scene varied, and what its depth was multiplied by."""
         if self.colour:
             gain = torch.from_numpy(1 + self.colour * random.standard_normal((3, 1, 1))).float()
             scene = replace(scene, rgb=(scene.rgb * gain).clamp(0, 1))
+        if random.random() < self.photo:
+            scene = replace(scene, rgb=photographed(scene.rgb, random))
         if self.flip:
             for vertical in (False, True):
                 if random.random() < 0.5:
@@ -51,6 +62,18 @@ class Variation:
         factor = math.exp(random.uniform(-self.depth_scale, self.depth_scale)) if self.depth_scale else 1.0
         depth = None if scene.depth is None else scene.depth * factor
         return replace(scene, depth=depth), factor
+
+
+def photographed(rgb: Tensor, random: np.random.Generator) -> Tensor:
+    """Return a photo (3, H, W) as some camera might have taken it.
+
+    Its gamma times exp(U(-0.5, 0.5)), a Gaussian blur of up to a pixel, and Gaussian noise of up to 0.03.
+    """
+    pixels = rgb.clamp(min=0).numpy() ** math.exp(random.uniform(-0.5, 0.5))
+    sigma = random.uniform(0, _BLUR)
+    pixels = ndimage.gaussian_filter(pixels, (0, sigma, sigma), mode="nearest")
+    pixels = pixels + random.uniform(0, _NOISE) * random.standard_normal(pixels.shape)
+    return torch.from_numpy(pixels.astype(np.float32)).clamp(0, 1)
 
 
 def window(scene: Scene, top: int, left: int, size: int) -> Scene:

@@ -35,7 +35,7 @@ class PatchSettings:
         validation_scenes: how many of each data set's last scenes are never trained on, but validated with.
         scenes: how many of each data set's scenes to use, the first ones; None for all.
         workers: processes that cut patches; 0 for none beside the trainer's.
-        flip, rotate, depth_scale, colour: see :class:`dsr.data.augment.Variation`.
+        flip, rotate, depth_scale, colour, photo: see :class:`dsr.data.augment.Variation`.
 
     Raises:
         ValueError: a value is out of range.
@@ -51,6 +51,7 @@ class PatchSettings:
     rotate: bool = True
     depth_scale: float = 0.3
     colour: float = 0.1
+    photo: float = 0.5
 
     def __post_init__(self) -> None:
         """Check the values."""
@@ -67,7 +68,7 @@ class PatchSettings:
 
     def variation(self) -> Variation:
         """Return how patches are varied."""
-        return Variation(self.flip, self.rotate, self.depth_scale, self.colour)
+        return Variation(self.flip, self.rotate, self.depth_scale, self.colour, self.photo)
 
 
 class Patches(Dataset[Batch]):
