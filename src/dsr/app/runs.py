@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import yaml
+from omegaconf import OmegaConf
 
 from dsr.app.build import build
 from dsr.app.schema import ConfigError, TrainConfig, TrainerConfig
@@ -28,12 +28,12 @@ def read_config(folder: Path) -> dict[str, Any]:
 
     """
     try:
-        config = yaml.safe_load((folder / "config.yaml").read_text(encoding="utf-8"))
-    except (OSError, ValueError, yaml.YAMLError) as error:
+        config = OmegaConf.to_container(OmegaConf.load(folder / "config.yaml"))
+    except Exception as error:  # a file that is missing, no text, no YAML: each library has its own
         raise ConfigError(f"{folder}: expected the directory of a training, it has no readable config.yaml") from error
     if not isinstance(config, dict) or "model" not in config:
         raise ConfigError(f"{folder}: expected the directory of a training, its config.yaml names no model")
-    return config
+    return {str(key): value for key, value in config.items()}
 
 
 def studies_of_run(

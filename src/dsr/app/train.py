@@ -11,8 +11,7 @@ from typing import Any
 
 import lightning
 import torch
-import yaml
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 
 from dsr.app import rundir
@@ -201,7 +200,7 @@ def _announce(
 def _describe(trainer: lightning.Trainer, plain: Mapping[str, Any], module: SuperResolution) -> None:
     """Write the configuration, and the w that came of it, where the dashboard shows them."""
     writer: Any = trainer.logger.experiment  # type: ignore[union-attr]
-    text = yaml.safe_dump({**plain, "loss": {"w": module.objective.w}}, sort_keys=False)
+    text = OmegaConf.to_yaml(OmegaConf.create({**plain, "loss": {"w": module.objective.w}}))
     writer.add_text("config", f"```yaml\n{text}```")
 
 
