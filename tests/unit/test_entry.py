@@ -36,10 +36,12 @@ def command(monkeypatch, tmp_path, capfd):
     return run
 
 
-SETTINGS = "dataset, downsampling, method, metrics, scale, weights, device, precision, seed, output_dir, overwrite"
+SETTINGS = (
+    "dataset, downsampling, noise, metrics, scale, device, precision, seed, output_dir, overwrite, method, weights, run"
+)
 USAGE_ERRORS = {
-    "dataset=fodler": "dataset=fodler: unknown; expected one of folder, procedural, simgeo",
-    "method=msgv": "method=msgv: unknown; expected one of bicubic, bilinear, msg, msg_v, nearest",
+    "dataset=fodler": "dataset=fodler: unknown; expected one of folder, mixture, procedural, simgeo",
+    "method=msgv": "method=msgv: unknown; expected one of bicubic, bilinear, facets, msg, msg_v, msg_v_noisy, nearest",
     "downsampling=boxx": (
         "downsampling=boxx: unknown; expected one of bicubic, bilinear, box, gaussian, measured, nearest"
     ),
@@ -53,8 +55,8 @@ USAGE_ERRORS = {
     "seed=1.5": "seed: Value '1.5' of type 'float' could not be converted to Integer",
     "overwrite=maybe": "overwrite: Value 'maybe' is not a valid bool (type str)",
     "metrics.lpips=perhaps": "metrics.lpips: Value 'perhaps' is not a valid bool (type str)",
-    "method=null": "method=null: expected one of bicubic, bilinear, msg, msg_v, nearest",
-    "method=": "method=: expected one of bicubic, bilinear, msg, msg_v, nearest",
+    "method=null": "method=null: expected one of bicubic, bilinear, facets, msg, msg_v, msg_v_noisy, nearest",
+    "method=": "method=: expected one of bicubic, bilinear, facets, msg, msg_v, msg_v_noisy, nearest",
     "scale": "scale: expected KEY=VALUE",
     "output_dir=a=b": (
         "output_dir: cannot read the value a=b; special characters need quotes within quotes: 'output_dir=\"a=b\"'"
@@ -95,7 +97,7 @@ def test_a_quoted_value_is_taken_as_the_message_says(command, quoted):
 def test_the_job_gets_the_composed_configuration_and_no_directory_is_made(command, tmp_path):
     code, error, [config] = command("scale=8", "dataset=folder", "dataset.root=here")
     assert (code, error) == (0, "")
-    assert (config.scale, config.dataset.root, config.method.name) == (8, "here", "bicubic")
+    assert (config.scale, config.dataset.root, config.method.name) == (8, "here", "msg_v")
     assert list(tmp_path.iterdir()) == []
 
 
@@ -145,7 +147,8 @@ def test_a_failing_job_of_a_multirun_keeps_the_others_and_the_exit_code_says_so(
 def test_a_multirun_with_an_unknown_choice_starts_no_job(command):
     code, error, seen = command("-m", "method=bicubic,neerest")
     assert (code, seen) == (2, [])
-    assert error == "error: method=neerest: unknown; expected one of bicubic, bilinear, msg, msg_v, nearest\n"
+    choices = "bicubic, bilinear, facets, msg, msg_v, msg_v_noisy, nearest"
+    assert error == f"error: method=neerest: unknown; expected one of {choices}\n"
 
 
 def test_a_missing_configuration_directory_says_where_to_run(monkeypatch, tmp_path, capsys):
