@@ -116,12 +116,15 @@ class SuperResolution(lightning.LightningModule):
 
     def training_step(self, batch: Batch, _: int) -> Tensor:
         """Return the loss of a batch of patches."""
-        mixed = self.schedule.is_mixed(self.global_step)
-        with torch.autocast(self.device.type, torch.bfloat16, enabled=mixed):
-            disparity = self.net.upsample(batch["rgb"], batch["disparity_lr"], batch["bounds"])
-        terms = self.objective(disparity.float(), batch)
+        terms = self.loss_terms(batch, mixed=self.schedule.is_mixed(self.global_step))
         self.log_dict({f"train/{name}": value.detach() for name, value in terms.items()})
         return terms["loss"]
+
+    def loss_terms(self, batch: Batch, *, mixed: bool) -> dict[str, Tensor]:
+        """Return ``loss`` and its terms; ``mixed``: with the network's convolutions in bfloat16."""
+        with torch.autocast(self.device.type, torch.bfloat16, enabled=mixed):
+            disparity = self.net.upsample(batch["rgb"], batch["disparity_lr"], batch["bounds"])
+        return self.objective(disparity.float(), batch)
 
     def configure_gradient_clipping(self, optimizer: Any, *_: Any, **__: Any) -> None:
         """Shorten a long gradient, log its norm; a step whose gradient is not finite changes nothing."""

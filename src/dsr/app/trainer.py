@@ -218,9 +218,7 @@ def seconds_per_step(module: SuperResolution, batch: Batch) -> float:
     for mixed in {module.schedule.mixed, module.schedule.mixed and module.schedule.finish == 0}:
         for _ in range(2):  # the first one warms up
             start = time.perf_counter()
-            with torch.autocast(module.device.type, torch.bfloat16, enabled=mixed):
-                disparity = module.net.upsample(batch["rgb"], batch["disparity_lr"], batch["bounds"])
-            module.objective(disparity.float(), batch)["loss"].backward()
+            module.loss_terms(batch, mixed=mixed)["loss"].backward()
             times[mixed] = time.perf_counter() - start
     module.net.zero_grad(set_to_none=True)
     finish = module.schedule.finish
@@ -249,6 +247,8 @@ def without_chatter() -> Iterator[None]:
 
 def _devices(settings: TrainerConfig, device: torch.device) -> Any:
     """Return what Lightning is to be told of the devices."""
-    if settings.devices != 1 or device.type == "cpu" or device.index is None:
-        return 1 if settings.devices == "auto" and device.type == "cpu" else settings.devices
-    return [device.index]
+    if device.type == "cpu" and settings.devices == "auto":
+        return 1
+    if device.type != "cpu" and settings.devices == 1 and device.index is not None:
+        return [device.index]
+    return settings.devices

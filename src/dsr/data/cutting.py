@@ -15,8 +15,8 @@ from torch import Tensor
 from torch.utils.data import Dataset
 
 from dsr.data.augment import Variation, window
-from dsr.data.problem import Batch, Problem, bounds_of, stereo_of, tensors_of
-from dsr.geometry.camera import to_range
+from dsr.data.problem import Batch, Problem, tensors_of
+from dsr.geometry.camera import stereo_constant
 from dsr.sample import DepthSample, Scene
 
 _TRIES, _MOST_TRIES = 10, 100
@@ -26,7 +26,7 @@ _LEAST_SIZE = 16
 
 
 @dataclass(frozen=True)
-class PatchSettings:
+class PatchSettings(Variation):
     """How patches are cut and varied.
 
     Args:
@@ -47,14 +47,10 @@ class PatchSettings:
     validation_scenes: int = 4
     scenes: int | None = None
     workers: int = 0
-    flip: bool = True
-    rotate: bool = True
-    depth_scale: float = 0.3
-    colour: float = 0.1
-    photo: float = 0.5
 
     def __post_init__(self) -> None:
         """Check the values."""
+        super().__post_init__()
         if self.size < _LEAST_SIZE:
             raise ValueError(f"trainer.patch: expected at least {_LEAST_SIZE} pixels, got {self.size}")
         if self.batch < 1:
@@ -64,11 +60,6 @@ class PatchSettings:
         for name in ("workers", "validation_scenes"):
             if getattr(self, name) < 0:
                 raise ValueError(f"trainer.{name}: expected 0 or more, got {getattr(self, name)}")
-        self.variation()
-
-    def variation(self) -> Variation:
-        """Return how patches are varied."""
-        return Variation(self.flip, self.rotate, self.depth_scale, self.colour, self.photo)
 
 
 class Patches(Dataset[Batch]):
@@ -108,7 +99,6 @@ class Patches(Dataset[Batch]):
             raise ValueError("dataset.shares: expected a positive number among them, all are 0")
         self._groups, self._settings, self._problem = groups, settings, problem
         self._limits = np.cumsum(weights / weights.sum())
-        self._variation = settings.variation()
         self._seed, self._first, self._count = seed, first, count
         self._extents: dict[tuple[int, int], tuple[float, float]] = {}  # by group and number: workers have other ids
 
@@ -127,10 +117,12 @@ class Patches(Dataset[Batch]):
         group = min(int(np.searchsorted(self._limits, random.random(), "right")), len(self._groups) - 1)
         number, top, left = self._window(group, random)
         source = self._groups[group][number]
-        scene, factor = self._variation(window(source, top, left, self._settings.size), random)
+        scene, factor = self._settings(window(source, top, left, self._settings.size), random)
         generator = torch.Generator().manual_seed(int(random.integers(2**63)))
         sample = self._problem.sample(scene, generator)
-        return tensors_of(sample, bounds=self._blend(self._extent(group, number), sample, factor, random))
+        patch = tensors_of(sample)
+        patch["bounds"] = self._blend(patch["bounds"], self._extent(group, number), sample, factor, random)
+        return patch
 
     def _window(self, group: int, random: np.random.Generator) -> tuple[int, int, int]:
         """Return a random window of a group, the number of its scene, its top and its left.
@@ -153,15 +145,16 @@ class Patches(Dataset[Batch]):
         raise ValueError("patches: expected scenes with more known depth than a few pixels")
 
     @staticmethod
-    def _blend(extent: tuple[float, float], sample: DepthSample, factor: float, random: np.random.Generator) -> Tensor:
+    def _blend(
+        own: Tensor, extent: tuple[float, float], sample: DepthSample, factor: float, random: np.random.Generator
+    ) -> Tensor:
         """Return the bounds to normalise a patch with, (2, 1, 1).
 
         In use a network sees whole images, whose disparities span more than a patch's. So half of the patches get the
         bounds of the scene that they are cut from (of its coarse map), the others something in between.
         """
-        own = bounds_of(sample.scale * to_range(sample.depth_lr, sample.camera_lr, "disparity"))
         near, far = extent
-        stereo, doffs = stereo_of(sample.camera), sample.camera.doffs
+        stereo, doffs = stereo_constant(sample.camera), sample.camera.doffs
         whole = torch.tensor([stereo / (factor * far) - doffs, stereo / (factor * near) - doffs]).view(2, 1, 1)
         whole = torch.stack((torch.minimum(whole[0], own[0]), torch.maximum(whole[1], own[1])))
         share = random.random() if random.random() < 0.5 else 1.0

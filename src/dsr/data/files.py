@@ -147,15 +147,20 @@ def _unit(path: Path, entries: dict[str, Any], key: str, *, numeric: bool) -> fl
     raise ValueError(f"{path}: {key}: expected {choices}, got {value!r}")
 
 
+def _content(path: Path) -> bytes:
+    """Return what is in a picture file."""
+    if not path.is_file():
+        raise ValueError(f"{path}: expected a picture, there is none")
+    return path.read_bytes()
+
+
 def _load_pfm(path: Path) -> np.ndarray:
     """Return a PFM file's values as they are, (H, W).
 
     The header's scale says the byte order by its sign; its magnitude, which OpenCV multiplies by, is left alone, as the
     stereo benchmarks do.
     """
-    if not path.is_file():
-        raise ValueError(f"{path}: expected a picture, there is none")
-    data = path.read_bytes()
+    data = _content(path)
     header = re.match(rb"(P[Ff])\s+(\d{1,9})\s+(\d{1,9})\s+([-+.\deE]{1,40})\s", data)
     if header is None:
         raise ValueError(f"{path}: expected a PFM file, got something else")
@@ -184,9 +189,7 @@ def _load_npy(path: Path) -> np.ndarray:
 
 def _decode(path: Path, flags: int) -> np.ndarray:
     """Return the pixels of a picture file."""
-    if not path.is_file():
-        raise ValueError(f"{path}: expected a picture, there is none")
-    content = path.read_bytes()
+    content = _content(path)
     try:
         with _quiet_stderr():
             pixels = cv2.imdecode(np.frombuffer(content, np.uint8), flags) if content else None

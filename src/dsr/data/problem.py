@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from dsr.degrade import Downsampling, Noise, make_sample
-from dsr.geometry.camera import VIRTUAL_BASELINE, Camera, to_range
+from dsr.geometry.camera import stereo_constant, to_range
 from dsr.sample import DepthSample, Scene
 
 Batch = dict[str, Tensor]
@@ -35,18 +35,17 @@ class Problem:
         return make_sample(scene, self.scale, self.downsampling, "disparity", noise, generator)
 
 
-def tensors_of(sample: DepthSample, dtype: torch.dtype = torch.float32, bounds: Tensor | None = None) -> Batch:
+def tensors_of(sample: DepthSample, dtype: torch.dtype = torch.float32) -> Batch:
     """Return a sample as the tensors that a network on disparities trains on.
 
     Args:
         sample: with a true depth.
         dtype: of all but the photo and the bounds.
-        bounds: (2, 1, 1) lowest and highest disparity to normalise with; None for those of the coarse map.
 
     Returns:
-        ``rgb`` (3, H, W), ``bounds`` (2, 1, 1), float32; in ``dtype`` ``disparity_lr`` (1, h, w) in pixels of the
-        photo's camera, ``depth`` (1, H, W) metres, ``rays`` (3, H, W), ``stereo`` (1, 1, 1) baseline times fx
-        and ``doffs`` (1, 1, 1).
+        ``rgb`` (3, H, W) and ``bounds`` (2, 1, 1), lowest and highest coarse disparity, in float32; in ``dtype``
+        ``disparity_lr`` (1, h, w) in pixels of the photo's camera, ``depth`` (1, H, W) metres, ``rays`` (3, H, W),
+        ``stereo`` (1, 1, 1) baseline times fx and ``doffs`` (1, 1, 1).
 
     """
     if sample.depth is None:
@@ -58,19 +57,14 @@ def tensors_of(sample: DepthSample, dtype: torch.dtype = torch.float32, bounds: 
         "disparity_lr": disparity.to(dtype),
         "depth": sample.depth.to(dtype),
         "rays": camera.rays(dtype=dtype),
-        "stereo": torch.full((1, 1, 1), stereo_of(camera), dtype=dtype),
+        "stereo": torch.full((1, 1, 1), stereo_constant(camera), dtype=dtype),
         "doffs": torch.full((1, 1, 1), camera.doffs, dtype=dtype),
-        "bounds": (bounds_of(disparity) if bounds is None else bounds).float(),
+        "bounds": _bounds(disparity).float(),
     }
 
 
-def bounds_of(disparity: Tensor) -> Tensor:
+def _bounds(disparity: Tensor) -> Tensor:
     """Return the lowest and the highest known value, (2, 1, 1), some way apart."""
     known = disparity[disparity.isfinite()]
     low, high = known.min(), known.max()
     return torch.stack((low, torch.maximum(high, low + _LEAST_SPAN * high.abs().clamp(min=_LEAST_SPAN)))).view(2, 1, 1)
-
-
-def stereo_of(camera: Camera) -> float:
-    """Return baseline times fx, in metre pixels."""
-    return (VIRTUAL_BASELINE if camera.baseline is None else camera.baseline) * camera.fx

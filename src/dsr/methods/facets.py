@@ -22,10 +22,9 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from dsr.methods.holes import filled
-from dsr.methods.msg_net import normalised
+from dsr.methods.msg_net import SCALES, normalised
 from dsr.methods.network import DisparityNetwork
 
-_SCALES = (2, 4, 8, 16)
 _NEIGHBOURS = 9
 _FINE, _HALF = 16, 32
 """Channels of the photo's features at the full and at half the resolution."""
@@ -82,8 +81,8 @@ class Facets(DisparityNetwork):
 
     def __init__(self, scale: int, width: int = 96, blocks: int = 6, facets: int = 2, *, slopes: bool = True) -> None:
         super().__init__()
-        if scale not in _SCALES:
-            raise ValueError(f"scale: expected one of {', '.join(map(str, _SCALES))}, got {scale}")
+        if scale not in SCALES:
+            raise ValueError(f"scale: expected one of {', '.join(map(str, SCALES))}, got {scale}")
         if min(width, facets) < 1 or blocks < 0:
             raise ValueError(
                 f"model: expected width and facets of at least 1, blocks of at least 0; got {width}, {facets}, {blocks}"
