@@ -1,6 +1,7 @@
 """The weights that come with dsr against the published MSG-V: the paper's Lucy and Plant, x4 and x8, box downsampling.
 
-    python benchmarks/against_published.py --shared DIR [--methods msg_v,facets] [--weights FILE] [--csv FILE]
+    python benchmarks/against_published.py --shared DIR [--methods msg_v,facets] [--weights FILE ...]
+        [--ensemble N] [--csv FILE]
 
 ``DIR`` has ``scenes/lucy``, ``scenes/plant``, ``expected/metrics.json`` with the published network's scores, and
 ``weights/alexnet_imagenet_features.pth`` for LPIPS_v. Each figure is ours / published, lower is better; none of these
@@ -19,9 +20,8 @@ import torch
 
 from dsr.data.folder import Folder
 from dsr.degrade import Downsampling, make_sample
-from dsr.methods.network import NetworkUpsampler
-from dsr.methods.trained import NETWORKS, packaged_weights
-from dsr.methods.weights import load_network, read_head
+from dsr.methods.trained import build_trained, packaged_weights
+from dsr.methods.weights import read_head
 from dsr.quality.lpips import load_lpips
 from dsr.quality.scores import WORST, catalogue, score_image
 
@@ -29,20 +29,22 @@ SCENES, SCALES = ("lucy", "plant"), (4, 8)
 METRICS = ("RMSE_v", "DSSIM_v", "BadPix_v_5", "Bumpiness_d", "LPIPS_v", "RMSE_d")
 
 
-def scores(shared: Path, weights: Path, scene: str) -> dict[str, float]:
+def scores(shared: Path, weights: Path, scene: str, ensemble: int | None = None) -> dict[str, float]:
     """Return the worst-of-four scores of a network on one scene."""
-    net = load_network(weights, NETWORKS)
+    head = read_head(weights)
+    scale = head["arguments"]["scale"]
+    method = build_trained(weights, scale, head["model"], ensemble=ensemble)
     sample = make_sample(
-        Folder(str(shared / "scenes"), [scene]).load(scene), net.scale, Downsampling("box"), "disparity"
+        Folder(str(shared / "scenes"), [scene]).load(scene), scale, Downsampling("box"), method.range_type
     )
     metrics = catalogue(load_lpips(shared / "weights" / "alexnet_imagenet_features.pth"))
-    depth = NetworkUpsampler(net)(sample)
+    depth = method(sample)
     with torch.inference_mode():
         rows = score_image(depth, sample.depth, sample.camera.rays(), metrics)
         return {row.metric: row.value for row in rows if row.variant in ("", WORST)}
 
 
-def table(shared: Path, methods: list[str], files: dict[str, Path]) -> pd.DataFrame:
+def table(shared: Path, methods: list[str], files: dict[str, Path], ensemble: int | None = None) -> pd.DataFrame:
     """Return the ratios: a row per method, scale and scene, a column per metric."""
     expected = json.loads((shared / "expected" / "metrics.json").read_text())
     rows = []
@@ -51,7 +53,7 @@ def table(shared: Path, methods: list[str], files: dict[str, Path]) -> pd.DataFr
             name = f"{method}_x{scale}"
             weights = files.get(name) or packaged_weights(name)
             for scene in SCENES if weights is not None else ():
-                ours, theirs = scores(shared, weights, scene), expected[scene][f"x{scale}"]["MSG-V"]
+                ours, theirs = scores(shared, weights, scene, ensemble), expected[scene][f"x{scale}"]["MSG-V"]
                 worst = {metric: max(value) if isinstance(value, list) else value for metric, value in theirs.items()}
                 ratios = {metric: ours[metric] / worst[metric] for metric in METRICS}
                 rows.append({"method": method, "scale": scale, "scene": scene, **ratios})
@@ -64,6 +66,7 @@ def main() -> None:
     parser.add_argument("--shared", type=Path, default=Path(os.environ.get("DSR_SHARED", "../shared")))
     parser.add_argument("--methods", default="msg_v,facets,msg")
     parser.add_argument("--weights", type=Path, nargs="*", default=[], help="files to take instead of packaged ones")
+    parser.add_argument("--ensemble", type=int, help="passes to average; that of eval.py unless given")
     parser.add_argument("--csv", type=Path, help="where to write the table to")
     arguments = parser.parse_args()
     if not (arguments.shared / "expected" / "metrics.json").is_file():
@@ -71,7 +74,7 @@ def main() -> None:
         return
     heads = {path: read_head(path) for path in arguments.weights}
     files = {f"{head['model']}_x{head['arguments']['scale']}": path for path, head in heads.items()}
-    ratios = table(arguments.shared, arguments.methods.split(","), files)
+    ratios = table(arguments.shared, arguments.methods.split(","), files, arguments.ensemble)
     if arguments.csv:
         ratios.to_csv(arguments.csv, index=False)
     for method, group in ratios.groupby("method", sort=False):

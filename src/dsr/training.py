@@ -36,7 +36,6 @@ class Schedule:
         average: decay of the exponential moving average of the weights, which is what is validated and kept; 0 for
             the weights themselves. In its first steps the average is shorter.
         mixed: whether the network's convolutions run in bfloat16; losses and weights never do.
-        finish: share of the steps, the last ones, that run in float32 all the same.
 
     Raises:
         ValueError: a value is out of range.
@@ -50,7 +49,6 @@ class Schedule:
     clip: float = 1.0
     average: float = 0.999
     mixed: bool = False
-    finish: float = 0.0
 
     def __post_init__(self) -> None:
         """Check the values."""
@@ -62,8 +60,6 @@ class Schedule:
                 raise ValueError(f"trainer.{name}: expected 0 or more, got {getattr(self, name)}")
         if not 0 <= self.average < 1:
             raise ValueError(f"trainer.average: expected 0 or more and less than 1, got {self.average}")
-        if not 0 <= self.finish <= 1:
-            raise ValueError(f"trainer.finish: expected a share from 0 to 1, got {self.finish}")
 
     def factor(self, step: int) -> float:
         """Return the learning rate at a step as a fraction of the highest."""
@@ -71,10 +67,6 @@ class Schedule:
             return (step + 1) / self.warmup
         done = min((step - self.warmup) / max(self.steps - self.warmup, 1), 1.0)
         return 0.5 * (1 + math.cos(math.pi * done))
-
-    def is_mixed(self, step: int) -> bool:
-        """Return whether the convolutions of a step run in bfloat16."""
-        return self.mixed and step < (1 - self.finish) * self.steps
 
     def decay(self, step: int) -> float:
         """Return the moving average's decay after a step, counted from 1."""
@@ -116,13 +108,13 @@ class SuperResolution(lightning.LightningModule):
 
     def training_step(self, batch: Batch, _: int) -> Tensor:
         """Return the loss of a batch of patches."""
-        terms = self.loss_terms(batch, mixed=self.schedule.is_mixed(self.global_step))
+        terms = self.loss_terms(batch)
         self.log_dict({f"train/{name}": value.detach() for name, value in terms.items()})
         return terms["loss"]
 
-    def loss_terms(self, batch: Batch, *, mixed: bool) -> dict[str, Tensor]:
-        """Return ``loss`` and its terms; ``mixed``: with the network's convolutions in bfloat16."""
-        with torch.autocast(self.device.type, torch.bfloat16, enabled=mixed):
+    def loss_terms(self, batch: Batch) -> dict[str, Tensor]:
+        """Return ``loss`` and its terms."""
+        with torch.autocast(self.device.type, torch.bfloat16, enabled=self.schedule.mixed):
             disparity = self.net.upsample(batch["rgb"], batch["disparity_lr"], batch["bounds"])
         return self.objective(disparity.float(), batch)
 

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from dsr.methods.msg_net import MSGNet
 from dsr.methods.published import load_msg_weights
+from dsr.methods.trained import build_trained
 
 Layer = tuple[str, str, list[Tensor]]
 
@@ -110,6 +111,12 @@ def test_a_torch_file_gives_back_the_parameters_that_were_written(tmp_path: Path
     loaded = load_msg_weights(_save(tmp_path / "net.pth", {"model_state_dict": _author_state(net)}), 4, "voynov")
     assert loaded.variant.name == "voynov"
     torch.testing.assert_close(dict(loaded.state_dict()), dict(net.state_dict()), rtol=0, atol=0)
+
+
+def test_published_networks_run_as_they_were_published_unless_told_otherwise(tmp_path: Path) -> None:
+    path = _save(tmp_path / "net.pth", {"model_state_dict": _author_state(MSGNet(4))})
+    assert build_trained(path, 4, "msg_v", "voynov").ensemble == 1
+    assert build_trained(path, 4, "msg_v", "voynov", ensemble=8).ensemble == 8
 
 
 def test_loading_draws_nothing_from_the_random_generator(tmp_path: Path) -> None:

@@ -281,20 +281,13 @@ def test_thirty_steps_on_one_batch_bring_the_loss_down(tmp_path: Path) -> None:
 def test_the_training_loss_is_the_objective_of_the_networks_output_in_full_precision(
     tmp_path: Path, mixed: bool
 ) -> None:
-    losses, module = _Losses(), _module(mixed=mixed, finish=0.0)
+    losses, module = _Losses(), _module(mixed=mixed)
     [batch] = _one_batch()
     with torch.no_grad(), torch.autocast("cpu", torch.bfloat16, enabled=mixed):
         disparity = upsample_disparity(module.net, batch["rgb"], batch["disparity_lr"], batch["bounds"])
     expected = float(module.objective(disparity, batch)["loss"])
     _trainer(tmp_path, max_steps=1, callbacks=[losses]).fit(module, _one_batch())
     assert losses.values == pytest.approx([expected], rel=2e-5)
-
-
-def test_the_last_share_of_the_steps_runs_in_float32() -> None:
-    schedule = Schedule(steps=20, mixed=True, finish=0.25)
-    assert [schedule.is_mixed(step) for step in range(20)] == [True] * 15 + [False] * 5
-    assert not any(Schedule(steps=20, finish=0.25).is_mixed(step) for step in range(20))
-    assert all(Schedule(steps=20, mixed=True, finish=0.0).is_mixed(step) for step in range(20))
 
 
 def test_the_average_follows_the_weights_with_its_decay(tmp_path: Path) -> None:
@@ -356,8 +349,8 @@ def test_a_gradient_that_is_not_finite_changes_nothing(tmp_path: Path) -> None:
     assert all(torch.equal(before[name], value) for name, value in module.net.state_dict().items())
 
 
-@pytest.mark.parametrize("changes", [{"average": 1.0}, {"average": -0.1}, {"finish": 1.1}, {"finish": math.nan}])
-def test_an_average_or_a_finish_that_cannot_be_is_refused(changes: dict[str, Any]) -> None:
+@pytest.mark.parametrize("changes", [{"average": 1.0}, {"average": -0.1}, {"average": math.nan}])
+def test_an_average_that_cannot_be_is_refused(changes: dict[str, Any]) -> None:
     with pytest.raises(ValueError, match=rf"trainer.{next(iter(changes))}: expected "):
         Schedule(10, **changes)
 

@@ -66,6 +66,12 @@ def test_a_file_is_told_from_a_published_one_by_its_content(tmp_path: Path) -> N
         build_trained(tmp_path / "w.caffemodel", 4, "msg_v", "voynov")
 
 
+def test_our_files_are_averaged_over_quarter_turns_unless_told_otherwise(tmp_path: Path) -> None:
+    save_network(tmp_path / "w", MSGNet(2, "dsr"), "msg_v")
+    assert build_trained(tmp_path / "w", 2, "msg_v", "voynov").ensemble == 4
+    assert build_trained(tmp_path / "w", 2, "msg_v", "voynov", ensemble=1).ensemble == 1
+
+
 def _file(path: Path, changes: dict[str, Any] | None = None, tensors: dict[str, Tensor] | None = None) -> Path:
     """Write a file like ours with some facts other, and perhaps other tensors."""
     head = {"format": "dsr-network-1", "network": "MSGNet", "arguments": {"scale": 4, "variant": "dsr"}}

@@ -61,6 +61,7 @@ def studies_of_run(
     own = {key: run[key] for key in _FROM_RUN if key not in chosen}
     name = run["model"]["name"]
     method = {"name": name, "label": name, "target": "dsr.methods.trained.build_trained", "model": name}
+    method["ensemble"] = 1  # as validations were scored
     base = {**plain, **own, "method": method, "weights": str(weights)}
     if "dataset" in chosen:
         yield base, None

@@ -118,7 +118,6 @@ class TrainerConfig:
     weight_decay: float = 1e-4
     clip: float = 1.0
     average: float = 0.999
-    finish: float = 0.0
     patch: int = 96
     batch: int = 6
     accumulate: int = 1

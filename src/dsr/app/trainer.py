@@ -214,15 +214,13 @@ def fit(trainer: lightning.Trainer, module: SuperResolution, data: Any, resume: 
 def seconds_per_step(module: SuperResolution, batch: Batch) -> float:
     """Return how long a step takes, measured; the module is left as it was."""
     batch = {name: value.to(module.device) for name, value in batch.items()}
-    times = {}
-    for mixed in {module.schedule.mixed, module.schedule.mixed and module.schedule.finish == 0}:
-        for _ in range(2):  # the first one warms up
-            start = time.perf_counter()
-            module.loss_terms(batch, mixed=mixed)["loss"].backward()
-            times[mixed] = time.perf_counter() - start
+    taken = 0.0
+    for _ in range(2):  # the first one warms up
+        start = time.perf_counter()
+        module.loss_terms(batch)["loss"].backward()
+        taken = time.perf_counter() - start
     module.net.zero_grad(set_to_none=True)
-    finish = module.schedule.finish
-    return times[False] if True not in times else (1 - finish) * times[True] + finish * times.get(False, times[True])
+    return taken
 
 
 @contextlib.contextmanager

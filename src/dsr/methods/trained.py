@@ -16,6 +16,8 @@ from dsr.methods.weights import is_ours, load_network
 
 NETWORKS: MappingProxyType[str, type[DisparityNetwork]] = MappingProxyType({"MSGNet": MSGNet, "Facets": Facets})
 
+_OUR_ENSEMBLE = 4
+
 
 def build_trained(
     weights: Path,
@@ -24,6 +26,7 @@ def build_trained(
     variant: VariantName | None = None,
     precision: Precision = "float32",
     device: torch.device | str = "cpu",
+    ensemble: int | None = None,
 ) -> NetworkUpsampler:
     """Return the method with the weights of a file.
 
@@ -34,16 +37,21 @@ def build_trained(
         variant: the variant of MSG-Net that published files must be of.
         precision: of the convolutions.
         device: where to compute.
+        ensemble: see :class:`~dsr.methods.network.NetworkUpsampler`; None for 4 with a file of ours and 1 with a
+            published one, as it was published.
 
     Raises:
         FileNotFoundError: there is no such file.
-        ValueError: the file is damaged, or of another model, variant or scale.
+        ValueError: the file is damaged, or of another model, variant or scale; the ensemble is impossible.
 
     """
     weights = Path(weights)
+    net: DisparityNetwork
     if variant is None or (weights.is_file() and is_ours(weights)):
-        return NetworkUpsampler(load_network(weights, NETWORKS, scale, model), precision, device)
-    return NetworkUpsampler(load_msg_weights(weights, scale, variant), precision, device)
+        net = load_network(weights, NETWORKS, scale, model)
+        return NetworkUpsampler(net, precision, device, _OUR_ENSEMBLE if ensemble is None else ensemble)
+    net = load_msg_weights(weights, scale, variant)
+    return NetworkUpsampler(net, precision, device, 1 if ensemble is None else ensemble)
 
 
 def packaged_weights(name: str) -> Path | None:
