@@ -182,3 +182,16 @@ def test_a_value_that_is_none_of_its_choices_is_refused(changes, message):
 def test_an_unknown_setting_is_refused_with_those_there_are():
     with pytest.raises(ConfigError, match=r"^scal: unknown key; expected dataset, .*scale, "):
         EvalConfig.of(settings(scal=4))
+
+
+@pytest.mark.parametrize(
+    ("metrics", "message"),
+    [
+        ({"lpips": False, "lpip": 1}, "metrics.lpip: unknown key; expected lpips, lpips_trunk"),
+        (3, "metrics: expected the keys lpips, lpips_trunk, got 3"),
+    ],
+)
+def test_a_group_of_settings_that_was_edited_into_something_else_is_refused(metrics, message):
+    with pytest.raises(ConfigError) as caught:
+        EvalConfig.of(settings(metrics=metrics))
+    assert str(caught.value) == message

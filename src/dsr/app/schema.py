@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, fields, is_dataclass
 from typing import Any, ClassVar, Self
 
@@ -40,14 +40,13 @@ class Checked:
             ConfigError: a key is unknown or missing, or a value is not one of its choices.
 
         """
-        entries = fields(cls)  # type: ignore[arg-type]  # every subclass is a dataclass
-        names = [entry.name for entry in entries]
+        parts: dict[str, Any] = {entry.name: entry.default_factory for entry in fields(cls)}  # type: ignore[arg-type]
+        _refuse_unknown(plain, parts)
         for key, value in plain.items():
-            if key not in names:
-                raise ConfigError(f"{key}: unknown key; expected {', '.join(names)}")
             if value == MISSING or (value is None and key in _GROUPS):
                 raise ConfigError(f"{key}: missing; give it as {key}=...")
-        parts: dict[str, Any] = {entry.name: entry.default_factory for entry in entries}
+            if is_dataclass(parts[key]):
+                _refuse_unknown(value, [entry.name for entry in fields(parts[key])], f"{key}.")
         settings = cls(**{k: parts[k](**v) if is_dataclass(parts[k]) else v for k, v in plain.items()})
         settings.check()
         return settings
@@ -59,6 +58,15 @@ class Checked:
             ConfigError: a value is not one of its choices.
 
         """
+
+
+def _refuse_unknown(plain: Any, names: Collection[str], place: str = "") -> None:
+    """Raise a ConfigError for the first key that is none of ``names``, and for what has no keys."""
+    if not isinstance(plain, Mapping):
+        raise ConfigError(f"{place.rstrip('.')}: expected the keys {', '.join(names)}, got {plain!r}")
+    for key in plain:
+        if key not in names:
+            raise ConfigError(f"{place}{key}: unknown key; expected {', '.join(names)}")
 
 
 @dataclass
