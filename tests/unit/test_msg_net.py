@@ -11,19 +11,10 @@ from PIL import Image
 from scipy import ndimage
 from torch import Tensor
 
+from dsr.degrade import SCALES
 from dsr.geometry.camera import Camera, from_range, to_range
-from dsr.methods.msg_net import (
-    SCALES,
-    VARIANTS,
-    MSGNet,
-    VariantName,
-    guidance_map,
-    mean3x3,
-    normalised,
-    output_drift,
-    upsample_bicubic,
-    upsample_disparity,
-)
+from dsr.methods.maps import mean3x3, normalised, upsample_bicubic
+from dsr.methods.msg_net import VARIANTS, MSGNet, VariantName, guidance_map, output_drift, upsample_disparity
 from dsr.methods.network import NetworkUpsampler
 from dsr.sample import DepthSample
 

@@ -17,7 +17,7 @@ from dsr.data.base import SceneSource
 from dsr.data.patches import Batch, Part, PatchData, Patches, PatchSettings, Problem, WholeScenes, tensors_of
 from dsr.degrade import Downsampling, GaussianMultiplicative, Measured, make_sample
 from dsr.geometry.camera import Camera
-from dsr.methods.msg_net import normalised
+from dsr.methods.maps import normalised
 from dsr.sample import Scene
 
 BOX = Downsampling("box")

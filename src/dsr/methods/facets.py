@@ -21,8 +21,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from dsr.degrade import SCALES
 from dsr.methods.holes import filled
-from dsr.methods.msg_net import SCALES, normalised
+from dsr.methods.maps import normalised
 from dsr.methods.network import DisparityNetwork
 
 _NEIGHBOURS = 9

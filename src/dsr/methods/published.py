@@ -17,7 +17,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dsr.methods.msg_net import SCALES, MSGNet, VariantName
+from dsr.degrade import SCALES
+from dsr.methods.msg_net import MSGNet, VariantName
 from dsr.methods.weights import fill
 
 TORCH_MAGIC = (b"PK\x03\x04", b"\x80")

@@ -1,0 +1,52 @@
+"""What several networks do with a map before and after: normalise, smooth, interpolate."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+
+class Normalised(NamedTuple):
+    """A map brought to 0..1 per sample, (B, 1, H, W), and the minimum and span (B, 1, 1, 1) to undo it with."""
+
+    values: Tensor
+    minimum: Tensor
+    span: Tensor
+
+
+def normalised(x: Tensor, bounds: Tensor | None = None) -> Normalised:
+    """Return (x - min) / (max - min) per sample of (B, 1, H, W), over the finite values; the others become 0.
+
+    A constant map becomes 0 with a span of 0. Where nothing is finite the minimum is NaN.
+
+    Args:
+        x: the map.
+        bounds: (B, 2, 1, 1) minimum and maximum to use instead of the map's own.
+
+    """
+    known, dims = x.isfinite(), (-3, -2, -1)
+    if bounds is None:
+        least = x.masked_fill(~known, torch.inf).amin(dims, keepdim=True)
+        span = x.masked_fill(~known, -torch.inf).amax(dims, keepdim=True) - least  # -inf where nothing is finite
+    else:
+        least = bounds[:, :1].to(x)
+        span = bounds[:, 1:].to(x) - least
+    values = torch.where(known, x - least, 0) / torch.where(span > 0, span, 1)
+    return Normalised(values, torch.where(span >= 0, least, torch.nan), span)
+
+
+def mean3x3(x: Tensor) -> Tensor:
+    """Return the 3 x 3 mean of (B, 1, H, W); borders are mirrored, edge pixels repeated."""
+    return functional.avg_pool2d(functional.pad(x, (1, 1, 1, 1), mode="replicate"), 3, stride=1)
+
+
+def upsample_bicubic(x: Tensor, scale: int) -> Tensor:
+    """Upsample (B, 1, h, w) to (B, 1, scale h, scale w): Keys' cubic kernel with a = -0.5, as Pillow resizes.
+
+    Beyond the border the kernel is cut off and renormalised.
+    """
+    size = [scale * n for n in x.shape[-2:]]
+    return functional.interpolate(x, size=size, mode="bicubic", align_corners=False, antialias=True)
