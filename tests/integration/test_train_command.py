@@ -632,5 +632,8 @@ def test_the_table_of_runs_has_the_settings_and_the_scores(smoke):
     assert (hparams["model"], hparams["scale"], hparams["steps"], hparams["loss"]) == ("msg_v", 4, 2, "lap1")
     assert hparams["w"] > 0
     scalars = events_of(smoke[1]).Tags()["scalars"]
-    assert {"last/RMSE_v", "train/gradient_norm", "train/patches_per_second"} <= set(scalars)
+    assert {"val/RMSE_v", "train/gradient_norm", "train/patches_per_second"} <= set(scalars)
+    assert {tag.partition("/")[0] for tag in scalars} == {"train", "val"}
+    table = events_of(smoke[1]).summary_metadata["_hparams_/experiment"].plugin_data.content
+    assert all(name in table for name in (b"val/RMSE_v", b"val/DSSIM_v", b"learning_rate"))
     assert min(scalars_of(smoke[1], "train/patches_per_second").values()) > 0

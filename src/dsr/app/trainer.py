@@ -17,6 +17,7 @@ import torch
 from lightning.pytorch.callbacks import Callback, LearningRateMonitor, ModelCheckpoint
 from lightning.pytorch.loggers import TensorBoardLogger
 from rich.console import Console
+from torch.utils.tensorboard.summary import hparams
 
 from dsr.app.progress import TrainingBar
 from dsr.app.schema import TrainerConfig
@@ -26,6 +27,7 @@ from dsr.training import SuperResolution
 
 MONITOR = "val/RMSE_v"
 VALIDATION = "validation.csv"
+_IN_TABLE = ("RMSE_v", "DSSIM_v", "LPIPS_v", "BadPix_v_5", "Bumpiness_d", "RMSE_d")
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
@@ -132,30 +134,19 @@ class LastValidation(Callback):
             trainer.should_stop = True
 
 
-class Summary(Callback):
-    """Writes the settings and the last scores for TensorBoard's table of runs.
-
-    Args:
-        settings: plain values by name.
-
-    """
-
-    def __init__(self, settings: Mapping[str, Any]) -> None:
-        self._settings = dict(settings)
-
-    def on_train_end(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
-        """Write them while the log is open."""
-        if isinstance(trainer.logger, TensorBoardLogger) and isinstance(pl_module, SuperResolution):
-            scores = pl_module.validation_scores.get("val", {})
-            trainer.logger.log_hyperparams(self._settings, {f"last/{name}": value for name, value in scores.items()})
-
-
 class Log(TensorBoardLogger):
     """TensorBoard's log without the number of the epoch, of which there is one."""
 
     def log_metrics(self, metrics: Mapping[str, float], step: int | None = None) -> None:
         """Log all but that."""
         super().log_metrics({name: value for name, value in metrics.items() if name != "epoch"}, step)
+
+    def list_run(self, settings: Mapping[str, Any]) -> None:
+        """Put the run into TensorBoard's table of runs, with its settings and the latest scores of its validations."""
+        self.log_hyperparams(dict(settings))
+        scores = dict.fromkeys((f"val/{name}" for name in _IN_TABLE), 0.0)  # the names count, values come from the log
+        for part in hparams(dict(settings), scores):
+            self.experiment.file_writer.add_summary(part)
 
 
 def make_trainer(
@@ -171,7 +162,6 @@ def make_trainer(
     callbacks = [
         Throughput(),
         LastValidation(interval),
-        Summary(table),
         ValidationTable(folder / VALIDATION),
         best,
         latest,
@@ -180,7 +170,7 @@ def make_trainer(
         Interruption(checkpoints / "last.ckpt"),
     ]
     logger = Log(folder, name="", version="tensorboard", default_hp_metric=False)
-    logger.log_hyperparams(dict(table))
+    logger.list_run(table)
     with without_chatter():
         trainer = lightning.Trainer(
             accelerator="gpu" if device.type == "cuda" else device.type,
