@@ -118,7 +118,7 @@ def test_without_any_variation_a_scene_stays_as_it_is() -> None:
     torch.testing.assert_close(_points(scene), _points(_scene()), rtol=0, atol=0, equal_nan=True)
 
 
-@pytest.mark.parametrize("changes", [{"depth_scale": -0.1}, {"depth_scale": float("inf")}, {"colour": float("nan")}])
+@pytest.mark.parametrize("changes", [{"depth_scale": -0.1}, {"depth_scale": 3.1}, {"colour": float("nan")}])
 def test_a_variation_that_cannot_be_is_refused(changes: dict[str, Any]) -> None:
-    with pytest.raises(ValueError, match=rf"trainer.{next(iter(changes))}: expected 0 or more, got"):
+    with pytest.raises(ValueError, match=rf"trainer.{next(iter(changes))}: expected 0 (or more|to 3), got"):
         Variation(**changes)

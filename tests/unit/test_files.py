@@ -90,6 +90,7 @@ FORMATS = {
     "pfm of Middlebury": ("d.pfm", pfm(VALUES, "<", "0.003922"), VALUES),
     "pfm big-endian, scaled": ("d.pfm", pfm(VALUES, ">", "2.5e+1"), VALUES),
     "pfm big-endian": ("d.pfm", pfm(VALUES, ">"), VALUES),
+    "pfm of Windows": ("d.pfm", pfm(VALUES, "<").replace(b"\n", b"\r\n", 3), VALUES),
 }
 
 

@@ -538,7 +538,7 @@ def test_no_scene_at_all_is_refused() -> None:
         ({"batch": 0}, "trainer.batch: expected a positive number, got 0"),
         ({"validation_scenes": -1}, "trainer.validation_scenes: expected 0 or more, got -1"),
         ({"photo": 1.1}, "trainer.photo: expected a share from 0 to 1, got 1.1"),
-        ({"depth_scale": -0.1}, "trainer.depth_scale: expected 0 or more, got -0.1"),
+        ({"depth_scale": -0.1}, "trainer.depth_scale: expected 0 to 3, got -0.1"),
         ({"workers": -1}, "trainer.workers: expected 0 or more, got -1"),
         ({"colour": -0.1}, "trainer.colour: expected 0 or more, got -0.1"),
         ({"colour": float("nan")}, "trainer.colour: expected 0 or more, got nan"),

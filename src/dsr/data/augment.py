@@ -13,6 +13,8 @@ from torch import Tensor
 from dsr.sample import Scene
 
 _BLUR, _NOISE = 1.0, 0.03
+_LARGEST_SCALE = 3.0
+"""exp(3) = 20 times nearer or farther; beyond that no scene is."""
 
 
 @dataclass(frozen=True)
@@ -40,9 +42,10 @@ class Variation:
 
     def __post_init__(self) -> None:
         """Check the values."""
-        for name in ("depth_scale", "colour"):
-            if not 0 <= getattr(self, name) < math.inf:
-                raise ValueError(f"trainer.{name}: expected 0 or more, got {getattr(self, name)}")
+        if not 0 <= self.depth_scale <= _LARGEST_SCALE:
+            raise ValueError(f"trainer.depth_scale: expected 0 to {_LARGEST_SCALE:g}, got {self.depth_scale}")
+        if not 0 <= self.colour < math.inf:
+            raise ValueError(f"trainer.colour: expected 0 or more, got {self.colour}")
         if not 0 <= self.photo <= 1:
             raise ValueError(f"trainer.photo: expected a share from 0 to 1, got {self.photo}")
 

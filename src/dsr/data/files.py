@@ -161,7 +161,7 @@ def _load_pfm(path: Path) -> np.ndarray:
     stereo benchmarks do.
     """
     data = _content(path)
-    header = re.match(rb"(P[Ff])\s+(\d{1,9})\s+(\d{1,9})\s+([-+.\deE]{1,40})\s", data)
+    header = re.match(rb"(P[Ff])\s+(\d{1,9})\s+(\d{1,9})\s+([-+.\deE]{1,40})(?:\r\n|\s)", data)
     if header is None:
         raise ValueError(f"{path}: expected a PFM file, got something else")
     if header[1] != b"Pf":
