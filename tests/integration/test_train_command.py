@@ -252,7 +252,7 @@ def test_evaluation_takes_the_weights_and_scores_as_the_best_validation_did(smok
     home = smoke[1]
     code, _, errors = within(
         "method=msg_v", f"weights='{home / 'weights.safetensors'}'", "dataset.size=64", "dataset.scenes=[statue]",
-        "metrics.lpips=false", "device=cpu", "output_dir=out", name="eval",
+        "metrics.lpips=false", "device=cpu", "method.ensemble=1", "output_dir=out", name="eval",
     )  # fmt: skip
     assert (code, errors) == (0, [])
     with (tmp_path / "out" / "scores.csv").open(newline="") as file:

@@ -16,6 +16,7 @@ import lightning
 import torch
 from lightning.pytorch.callbacks import Callback, LearningRateMonitor, ModelCheckpoint
 from lightning.pytorch.loggers import TensorBoardLogger
+from lightning.pytorch.utilities import rank_zero_only
 from rich.console import Console
 from torch.utils.tensorboard.summary import hparams
 
@@ -141,6 +142,7 @@ class Log(TensorBoardLogger):
         """Log all but that."""
         super().log_metrics({name: value for name, value in metrics.items() if name != "epoch"}, step)
 
+    @rank_zero_only
     def list_run(self, settings: Mapping[str, Any]) -> None:
         """Put the run into TensorBoard's table of runs, with its settings and the latest scores of its validations."""
         self.log_hyperparams(dict(settings))
