@@ -1,6 +1,6 @@
 """How much faster a training step of MSG-V is than in a plain float32 loop, data included.
 
-    python benchmarks/train_speed.py [--patch 96] [--batch 16] [--steps 5]
+    python benchmarks/train_speed.py [--patch 96] [--batch 5] [--steps 9]
 
 The plain way is what a tutorial would write: float32, PyTorch's default memory layout, its own PReLU. Both take turns
 within the run on the same patches; the ratio of the medians is the result.
@@ -16,7 +16,7 @@ import time
 import torch
 from torch import nn
 
-from dsr.data.patches import Batch, Patches, PatchSettings
+from dsr.data.patches import Batch, Patches, PatchSettings, Problem
 from dsr.data.simgeo import SimGeo
 from dsr.degrade import Downsampling
 from dsr.methods.msg_net import MSGNet
@@ -56,13 +56,13 @@ def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--patch", type=int, default=96)
-    parser.add_argument("--batch", type=int, default=16)
-    parser.add_argument("--steps", type=int, default=5)
+    parser.add_argument("--batch", type=int, default=5)
+    parser.add_argument("--steps", type=int, default=9)
     arguments = parser.parse_args()
     source = SimGeo(size=256)
     scenes = [source.load(name) for name in source.scenes()]
     settings = PatchSettings(size=arguments.patch, batch=arguments.batch)
-    patches = Patches(scenes, settings, SCALE, Downsampling("box"), count=arguments.batch)
+    patches = Patches([scenes], settings, Problem(SCALE, Downsampling("box")), count=arguments.batch)
     start = time.perf_counter()
     batch = torch.utils.data.default_collate([patches[i] for i in range(arguments.batch)])
     loading = time.perf_counter() - start

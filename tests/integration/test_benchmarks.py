@@ -1,0 +1,22 @@
+"""The benchmarks run: small, for what they print, not for how fast."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+BENCHMARKS = Path(__file__).resolve().parents[2] / "benchmarks"
+SMALL = {"train_speed.py": ("--patch", "32", "--batch", "2", "--steps", "1")}
+
+
+@pytest.mark.parametrize("name", SMALL)
+def test_a_benchmark_prints_ratios(name: str) -> None:
+    done = subprocess.run(
+        [sys.executable, str(BENCHMARKS / name), *SMALL[name]], capture_output=True, text=True, timeout=120, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert len(re.findall(r"\d\.\d+ times as fast", done.stdout)) == 3
