@@ -23,13 +23,15 @@ from dsr.degrade import Downsampling, make_sample
 from dsr.methods.trained import build_trained, packaged_weights
 from dsr.methods.weights import read_head
 from dsr.quality.lpips import load_lpips
-from dsr.quality.scores import WORST, catalogue, score_image
+from dsr.quality.scores import WORST, Metric, catalogue, score_image
 
 SCENES, SCALES = ("lucy", "plant"), (4, 8)
 METRICS = ("RMSE_v", "DSSIM_v", "BadPix_v_5", "Bumpiness_d", "LPIPS_v", "RMSE_d")
 
 
-def scores(shared: Path, weights: Path, scene: str, ensemble: int | None = None) -> dict[str, float]:
+def scores(
+    shared: Path, weights: Path, scene: str, metrics: tuple[Metric, ...], ensemble: int | None = None
+) -> dict[str, float]:
     """Return the worst-of-four scores of a network on one scene."""
     head = read_head(weights)
     scale = head["arguments"]["scale"]
@@ -37,7 +39,6 @@ def scores(shared: Path, weights: Path, scene: str, ensemble: int | None = None)
     sample = make_sample(
         Folder(str(shared / "scenes"), [scene]).load(scene), scale, Downsampling("box"), method.range_type
     )
-    metrics = catalogue(load_lpips(shared / "weights" / "alexnet_imagenet_features.pth"))
     depth = method(sample)
     with torch.inference_mode():
         rows = score_image(depth, sample.depth, sample.camera.rays(), metrics)
@@ -47,13 +48,14 @@ def scores(shared: Path, weights: Path, scene: str, ensemble: int | None = None)
 def table(shared: Path, methods: list[str], files: dict[str, Path], ensemble: int | None = None) -> pd.DataFrame:
     """Return the ratios: a row per method, scale and scene, a column per metric."""
     expected = json.loads((shared / "expected" / "metrics.json").read_text())
+    metrics = catalogue(load_lpips(shared / "weights" / "alexnet_imagenet_features.pth"))
     rows = []
     for method in methods:
         for scale in SCALES:
             name = f"{method}_x{scale}"
             weights = files.get(name) or packaged_weights(name)
             for scene in SCENES if weights is not None else ():
-                ours, theirs = scores(shared, weights, scene, ensemble), expected[scene][f"x{scale}"]["MSG-V"]
+                ours, theirs = scores(shared, weights, scene, metrics, ensemble), expected[scene][f"x{scale}"]["MSG-V"]
                 worst = {metric: max(value) if isinstance(value, list) else value for metric, value in theirs.items()}
                 ratios = {metric: ours[metric] / worst[metric] for metric in METRICS}
                 rows.append({"method": method, "scale": scale, "scene": scene, **ratios})

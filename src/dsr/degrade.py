@@ -206,8 +206,7 @@ def make_sample(
         ValueError: the scene lacks what the problem needs, or a value is out of range.
 
     """
-    if scale not in SCALES:
-        raise ValueError(f"scale: expected one of {', '.join(map(str, SCALES))}, got {scale}")
+    check_scale(scale)
     scene, notes = _divisible(scene, scale)
     if isinstance(downsampling, Measured):
         coarse, coarse_camera = _measured(scene, scale), scene.camera.coarser(scale)
@@ -219,6 +218,12 @@ def make_sample(
     return DepthSample(
         scene.dataset, scene.name, scene.rgb, coarse, scene.camera, coarse_camera, scale, scene.depth, notes
     )
+
+
+def check_scale(scale: int) -> None:
+    """Raise a ValueError for a factor that is none of ``SCALES``."""
+    if scale not in SCALES:
+        raise ValueError(f"scale: expected one of {', '.join(map(str, SCALES))}, got {scale}")
 
 
 def _divisible(scene: Scene, scale: int) -> tuple[Scene, tuple[str, ...]]:

@@ -60,8 +60,8 @@ def studies_of_run(
     chosen = {key.partition(".")[0] for key in given}
     own = {key: run[key] for key in _FROM_RUN if key not in chosen}
     name = run["model"]["name"]
-    method = {"name": name, "label": name, "target": "dsr.methods.trained.build_trained", "model": name}
-    method["ensemble"] = 1  # as validations were scored
+    target = "dsr.methods.trained.build_trained"
+    method = {"name": name, "label": name, "target": target, "model": name, "ensemble": 1}  # as validations scored it
     base = {**plain, **own, "method": method, "weights": str(weights)}
     if "dataset" in chosen:
         yield base, None

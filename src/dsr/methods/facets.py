@@ -21,7 +21,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from dsr.degrade import SCALES
+from dsr.degrade import check_scale
 from dsr.methods.holes import filled
 from dsr.methods.maps import normalised
 from dsr.methods.network import DisparityNetwork
@@ -82,8 +82,7 @@ class Facets(DisparityNetwork):
 
     def __init__(self, scale: int, width: int = 96, blocks: int = 6, facets: int = 2, *, slopes: bool = True) -> None:
         super().__init__()
-        if scale not in SCALES:
-            raise ValueError(f"scale: expected one of {', '.join(map(str, SCALES))}, got {scale}")
+        check_scale(scale)
         if min(width, facets) < 1 or blocks < 0:
             raise ValueError(
                 f"model: expected width and facets of at least 1, blocks of at least 0; got {width}, {facets}, {blocks}"

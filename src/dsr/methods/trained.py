@@ -46,12 +46,11 @@ def build_trained(
 
     """
     weights = Path(weights)
-    net: DisparityNetwork
-    if variant is None or (weights.is_file() and is_ours(weights)):
-        net = load_network(weights, NETWORKS, scale, model)
-        return NetworkUpsampler(net, precision, device, _OUR_ENSEMBLE if ensemble is None else ensemble)
-    net = load_msg_weights(weights, scale, variant)
-    return NetworkUpsampler(net, precision, device, 1 if ensemble is None else ensemble)
+    ours = variant is None or (weights.is_file() and is_ours(weights))
+    net = load_network(weights, NETWORKS, scale, model) if ours else load_msg_weights(weights, scale, variant)
+    if ensemble is None:
+        ensemble = _OUR_ENSEMBLE if ours else 1
+    return NetworkUpsampler(net, precision, device, ensemble)
 
 
 def packaged_weights(name: str) -> Path | None:

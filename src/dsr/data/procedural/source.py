@@ -50,8 +50,9 @@ class Procedural:
 
     def prepare(self, scenes: Sequence[str]) -> Iterable[str]:
         """Render what the cache lacks of some scenes, on every processor, and yield the names as they are done."""
-        missing = [scene for scene in scenes if not (cache_directory() / self._path(scene)).is_file()]
-        yield from (scene for scene in scenes if scene not in set(missing))
+        there = {scene: (cache_directory() / self._path(scene)).is_file() for scene in scenes}
+        missing = [scene for scene in scenes if not there[scene]]
+        yield from (scene for scene in scenes if there[scene])
         if not missing:
             return
         workers = min(len(missing), os.cpu_count() or 1)
