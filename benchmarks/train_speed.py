@@ -16,7 +16,8 @@ import time
 import torch
 from torch import nn
 
-from dsr.data.patches import Batch, Patches, PatchSettings, Problem
+from dsr.data.cutting import Patches, PatchSettings
+from dsr.data.problem import Batch, Problem
 from dsr.data.simgeo import SimGeo
 from dsr.degrade import Downsampling
 from dsr.methods.msg_net import MSGNet

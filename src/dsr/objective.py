@@ -10,7 +10,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from dsr.data.patches import Batch
+from dsr.data.problem import Batch
 from dsr.quality import losses
 from dsr.quality.functional import SurfacePair, mse_v
 
@@ -49,7 +49,7 @@ class Objective:
 
         Args:
             disparity: (B, 1, H, W) the network's, in pixels.
-            batch: see :func:`dsr.data.patches.tensors_of`.
+            batch: see :func:`dsr.data.problem.tensors_of`.
 
         """
         target = batch["stereo"] / batch["depth"] - batch["doffs"]
@@ -78,7 +78,7 @@ def balanced_weight(patches: Iterable[Batch]) -> float:
     the median over the patches.
 
     Args:
-        patches: single training patches, without a batch axis; see :func:`dsr.data.patches.tensors_of`.
+        patches: single training patches, without a batch axis; see :func:`dsr.data.problem.tensors_of`.
 
     Raises:
         ValueError: there is no patch.

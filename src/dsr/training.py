@@ -13,7 +13,7 @@ import torch
 import torchmetrics
 from torch import Tensor, nn
 
-from dsr.data.patches import Batch
+from dsr.data.problem import Batch
 from dsr.geometry.shading import render
 from dsr.geometry.surface import normals_of
 from dsr.methods.network import DisparityNetwork

@@ -10,7 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from dsr.data.patches import Batch
+from dsr.data.problem import Batch
 from dsr.geometry.camera import Camera
 from dsr.objective import DepthLoss, Objective
 from dsr.quality.losses import l1, lap1, mse

@@ -14,7 +14,9 @@ import torch
 from torch import Tensor
 
 from dsr.data.base import SceneSource
-from dsr.data.patches import Batch, Part, PatchData, Patches, PatchSettings, Problem, WholeScenes, tensors_of
+from dsr.data.cutting import Patches, PatchSettings
+from dsr.data.patches import Part, PatchData, WholeScenes
+from dsr.data.problem import Batch, Problem, tensors_of
 from dsr.degrade import Downsampling, GaussianMultiplicative, Measured, make_sample
 from dsr.geometry.camera import Camera
 from dsr.methods.maps import normalised

@@ -17,7 +17,9 @@ from lightning.pytorch.callbacks import Callback
 from torch import Tensor
 from torch.utils.data import DataLoader
 
-from dsr.data.patches import Batch, Patches, PatchSettings, Problem, WholeScenes, tensors_of
+from dsr.data.cutting import Patches, PatchSettings
+from dsr.data.patches import WholeScenes
+from dsr.data.problem import Batch, Problem, tensors_of
 from dsr.degrade import Downsampling, make_sample
 from dsr.geometry.camera import Camera
 from dsr.geometry.shading import render

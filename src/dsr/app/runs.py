@@ -12,7 +12,9 @@ from omegaconf import OmegaConf
 from dsr.app.build import build
 from dsr.app.schema import ConfigError, TrainConfig, TrainerConfig
 from dsr.data.base import SceneSource, Some
-from dsr.data.patches import Part, PatchData, PatchSettings, Problem
+from dsr.data.cutting import PatchSettings
+from dsr.data.patches import Part, PatchData
+from dsr.data.problem import Problem
 from dsr.degrade import Downsampling
 
 WEIGHTS = "weights.safetensors"

@@ -23,7 +23,7 @@ from torch.utils.tensorboard.summary import hparams
 from dsr.app.progress import TrainingBar
 from dsr.app.schema import TrainerConfig
 from dsr.atomic import replacing
-from dsr.data.patches import Batch
+from dsr.data.problem import Batch
 from dsr.training import SuperResolution
 
 MONITOR = "val/RMSE_v"

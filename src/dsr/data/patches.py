@@ -18,8 +18,6 @@ from dsr.data.cutting import Patches, PatchSettings, check_patches
 from dsr.data.problem import Batch, Problem, tensors_of
 from dsr.sample import Scene
 
-__all__ = ["Batch", "Part", "PatchData", "PatchSettings", "Patches", "Problem", "WholeScenes", "tensors_of"]
-
 
 @dataclass(frozen=True)
 class Part:

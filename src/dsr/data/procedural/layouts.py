@@ -6,13 +6,14 @@ from collections.abc import Callable
 
 import numpy as np
 
+from dsr.data.procedural.architecture import arched_wall, column
 from dsr.data.procedural.furniture import blinds, shelf, table
 from dsr.data.procedural.organic import branches, creature, figure, pebble, plant
 from dsr.data.procedural.photo import Body
 from dsr.data.procedural.props import backdrop, fill_room, heap, oddment, shell, tableware
 from dsr.data.procedural.reliefs import RELIEFS, blanket, crumple, curtain, folds, ground, relief
-from dsr.data.procedural.shape import Shape, about, any_turn, box, extrusion, merged
-from dsr.data.procedural.solids import any_solid, frustum, grounded, hollow, prism
+from dsr.data.procedural.shape import about, any_turn, box, merged
+from dsr.data.procedural.solids import any_solid, frustum, grounded, prism
 from dsr.data.procedural.stage import Stage, Viewpoint, Wardrobe, looking
 from dsr.data.surfaces import Array
 
@@ -140,15 +141,15 @@ def portico(rng: np.random.Generator, wear: Wardrobe) -> Stage:
     """Return a portico or a facade: columns, steps, arches, railings, blocks; several metres away."""
     stone, count = wear.paint("stone", 1.5), int(rng.integers(2, 6))
     pitch, high = rng.uniform(1.2, 2.4), rng.uniform(2.6, 4.0)
-    column = _column(rng, high)
+    shaft = column(rng, high)
     spots = (np.arange(count) - (count - 1) / 2) * pitch
     span = pitch * (count + 1)
-    shapes = [column.moved([x, 0, 0]) for x in spots]
+    shapes = [shaft.moved([x, 0, 0]) for x in spots]
     shapes.append(box([span, 0.7, 0.5]).moved([0, 0, high]))
     shapes += [box([span + 0.6 * k, 1.2 + 0.6 * k, 0.17]).moved([0, 0, -0.17 * (k + 1) - 0.001]) for k in range(4)]
     bodies = [Body(merged(shapes), stone)]
     back = rng.uniform(0.8, 3.0)
-    bodies += [wear.dress(s, "wall", 1.5) for s in _arched_wall(rng, span + 4, high + 1.5, back)]
+    bodies += [wear.dress(s, "wall", 1.5) for s in arched_wall(rng, span + 4, high + 1.5, back)]
     if rng.random() < 0.5:
         for x in spots[:-1]:
             rail = blinds(rng, pitch - 0.5, 0.9)[0]
@@ -165,43 +166,6 @@ def portico(rng: np.random.Generator, wear: Wardrobe) -> Stage:
         return looking(draw, eye, draw.uniform([-1, 0, 0.6], [1, 0.5, 1.9]), 0.8, 1.5)
 
     return Stage(bodies, views, _vector(-8, -12, 2), _vector(8, -2, 9))
-
-
-def _column(rng: np.random.Generator, high: float) -> Shape:
-    """Return a column: round, fluted or square, with base and capital."""
-    radius = rng.uniform(0.16, 0.32)
-    kind = rng.integers(3)
-    angle = np.arange(192) * 2 * np.pi / 192
-    flutes = radius * (1 - 0.07 * np.abs(np.sin(angle * 10)))
-    if kind == 0:
-        shaft = hollow(radius * _vector(1.0, 1.03, 0.98, 0.85), high - 0.4, 0.02)
-    elif kind == 1:
-        shaft = extrusion([np.column_stack((flutes * np.cos(angle), flutes * np.sin(angle)))], high - 0.4)
-    else:
-        shaft = box([1.7 * radius, 1.7 * radius, high - 0.4])
-    plates = [
-        box([2.8 * radius, 2.8 * radius, 0.12]),
-        box([2.8 * radius, 2.8 * radius, 0.12]).moved([0, 0, high - 0.121]),
-    ]
-    rings = [frustum(1.3 * radius, 1.05 * radius, 0.1).moved([0, 0, 0.12])]
-    rings.append(frustum(radius, 1.35 * radius, 0.15).moved([0, 0, high - 0.27]))
-    return merged([shaft.moved([0, 0, 0.2]), *plates, *rings])
-
-
-def _arched_wall(rng: np.random.Generator, wide: float, high: float, back: float) -> list[Shape]:
-    """Return a wall with a row of arched openings at y = ``back``, and what closes them."""
-    count, thick = int(rng.integers(1, 6)), rng.uniform(0.15, 0.6)
-    pitch = wide / count
-    half, rise = pitch * rng.uniform(0.15, 0.36), rng.uniform(1.2, 2.4)
-    bow = np.linspace(0, np.pi, 25)
-    holes = []
-    for k in range(count):
-        x, sill = (k + 0.5) * pitch - wide / 2, 0.001 if rng.random() < 0.5 else 0.8
-        arc = np.column_stack((x + half * np.cos(bow), rise + half * np.sin(bow) * rng.choice([1.0, 0.3])))
-        holes.append(np.concatenate((arc, [[x - half, sill], [x + half, sill]]))[::-1])
-    outline = np.array([[-wide, -1], [wide, -1], [wide, high], [-wide, high]], dtype=np.float64)
-    wall = extrusion([outline, *holes], thick).turned(about(0, 90)).moved([0, back, 0])
-    return [wall, box([2 * wide, 0.05, high + 1]).moved([0, back + 0.05, -1])]
 
 
 def shapes(rng: np.random.Generator, wear: Wardrobe) -> Stage:
