@@ -16,13 +16,14 @@ from __future__ import annotations
 import functools
 import hashlib
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
 import torch
 from torch import Tensor
 
 from dsr.geometry.camera import Camera, RangeType, from_range, to_range
+from dsr.holes import Holes
 from dsr.sample import DepthSample, Scene
 
 Kernel = Literal["box", "nearest", "bilinear", "bicubic", "gaussian"]
@@ -40,6 +41,7 @@ class Downsampling:
         kernel: see the module.
         sigma: standard deviation of the gaussian as a fraction of the scale factor.
         range_type: the range type that is averaged; None for the one that the method works on, as in the paper.
+        assumed: the kernel that a method which needs a model takes this one for; None for the true one.
 
     Raises:
         ValueError: an unknown kernel or a sigma that is not positive.
@@ -49,13 +51,19 @@ class Downsampling:
     kernel: Kernel
     sigma: float = 0.5
     range_type: RangeType | None = None
+    assumed: Kernel | None = None
 
     def __post_init__(self) -> None:
         """Check the values."""
-        if self.kernel not in get_args(Kernel):
-            raise ValueError(f"downsampling: expected one of {', '.join(get_args(Kernel))}, got {self.kernel!r}")
+        for name, kernel in (("downsampling", self.kernel), ("downsampling.assumed", self.assumed or self.kernel)):
+            if kernel not in get_args(Kernel):
+                raise ValueError(f"{name}: expected one of {', '.join(get_args(Kernel))}, got {kernel!r}")
         if not self.sigma >= _LEAST_SIGMA:
             raise ValueError(f"downsampling.sigma: expected at least {_LEAST_SIGMA} (of the scale), got {self.sigma}")
+
+    def believed(self) -> Downsampling:
+        """Return the model that a method takes this one for."""
+        return replace(self, kernel=self.assumed or self.kernel, assumed=None)
 
     def camera(self, camera: Camera, scale: int) -> Camera:
         """Return the camera of the coarse map; ``nearest`` looks along other rays than the centred kernels do."""
@@ -140,7 +148,18 @@ _PROFILES: dict[str, Callable[[Tensor, float], Tensor]] = {
 
 @dataclass(frozen=True)
 class Measured:
-    """The stand-in for a downsampling model where the scene brings a coarse map that a sensor measured."""
+    """The stand-in for a downsampling model where the scene brings a coarse map that a sensor measured.
+
+    Args:
+        assumed: the kernel of the model that a method which needs one takes the sensor for.
+
+    """
+
+    assumed: Kernel = "box"
+
+    def believed(self) -> Downsampling:
+        """Return the model that a method takes the sensor for."""
+        return Downsampling(self.assumed)
 
 
 @dataclass(frozen=True)
@@ -189,6 +208,7 @@ def make_sample(
     range_type: RangeType,
     noise: Noise = None,
     generator: torch.Generator | int = 0,
+    holes: Holes | None = None,
 ) -> DepthSample:
     """Return the super-resolution problem that a scene poses.
 
@@ -200,7 +220,8 @@ def make_sample(
         downsampling: the model, or :class:`Measured` for the scene's own coarse map.
         range_type: the type that the method works on.
         noise: of the coarse map, unless it is measured.
-        generator: of the noise, or a seed that gives each scene its own.
+        generator: of noise and holes, or a seed that gives each of them, in each scene, its own.
+        holes: where the coarse map loses its values.
 
     Raises:
         ValueError: the scene lacks what the problem needs, or a value is out of range.
@@ -208,13 +229,19 @@ def make_sample(
     """
     check_scale(scale)
     scene, notes = _divisible(scene, scale)
+    of_holes = generator
+    if isinstance(generator, int):
+        of_holes = scene_generator(generator, scene.dataset, scene.name, scale, "holes")
+        generator = scene_generator(generator, scene.dataset, scene.name, scale)
     if isinstance(downsampling, Measured):
         coarse, coarse_camera = _measured(scene, scale), scene.camera.coarser(scale)
     else:
-        if isinstance(generator, int):
-            generator = scene_generator(generator, scene.dataset, scene.name, scale)
+        if scene.depth is None:
+            raise ValueError(f"{scene.name}: expected a fine depth map to downsample, there is none")
         noisy = None if noise is None else functools.partial(noise, generator=generator)
-        coarse, coarse_camera = _downsampled(scene, scale, downsampling, downsampling.range_type or range_type, noisy)
+        coarse, coarse_camera = downsampled(scene.depth, scene.camera, scale, downsampling, range_type, noisy)
+    if holes is not None:
+        coarse = coarse.masked_fill(holes(coarse, coarse_camera, of_holes), torch.nan)
     return DepthSample(
         scene.dataset, scene.name, scene.rgb, coarse, scene.camera, coarse_camera, scale, scene.depth, notes
     )
@@ -244,23 +271,33 @@ def _divisible(scene: Scene, scale: int) -> tuple[Scene, tuple[str, ...]]:
     return cropped, (f"cropped from {before} to {height} x {width}, which {scale} divides",)
 
 
-def _downsampled(
-    scene: Scene,
+def downsampled(
+    depth: Tensor,
+    camera: Camera,
     scale: int,
     downsampling: Downsampling,
     range_type: RangeType,
-    noise: Callable[[Tensor], Tensor] | None,
+    noise: Callable[[Tensor], Tensor] | None = None,
 ) -> tuple[Tensor, Camera]:
-    """Return the coarse depth that the model and the noise make of the fine one, and its camera."""
-    if scene.depth is None:
-        raise ValueError(f"{scene.name}: expected a fine depth map to downsample, there is none")
-    camera = downsampling.camera(scene.camera, scale)
-    fine = to_range(scene.depth, scene.camera, range_type)
+    """Return the coarse depth that a model and noise make of a fine one, and its camera; differentiable.
+
+    Args:
+        depth: (..., H, W) orthogonal depth in metres.
+        camera: of these pixels.
+        scale: the factor.
+        downsampling: the model.
+        range_type: the type that is averaged, unless the model says one.
+        noise: of the averages, in that type; values to values.
+
+    """
+    range_type = downsampling.range_type or range_type
+    coarse_camera = downsampling.camera(camera, scale)
+    fine = to_range(depth, camera, range_type)
     if range_type == "disparity":  # in the coarse camera's pixels
         fine = fine / scale
     values = downsampling(fine, scale)
-    coarse = from_range(values if noise is None else noise(values), camera, range_type)
-    return torch.where(coarse > 0, coarse, torch.nan), camera  # bicubic may undershoot beside a depth step
+    coarse = from_range(values if noise is None else noise(values), coarse_camera, range_type)
+    return torch.where(coarse > 0, coarse, torch.nan), coarse_camera  # bicubic may undershoot beside a depth step
 
 
 def _measured(scene: Scene, scale: int) -> Tensor:

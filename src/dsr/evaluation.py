@@ -23,6 +23,7 @@ from torch import Tensor
 from dsr.atomic import read_arrays, replacing, write_text
 from dsr.data.base import SceneSource
 from dsr.degrade import Downsampling, Measured, Noise, make_sample
+from dsr.holes import Holes
 from dsr.methods.base import Upsampler
 from dsr.quality.scores import WORST, Metric, score_image
 from dsr.sample import DepthSample
@@ -64,6 +65,7 @@ class Study:
         config: all that the predictions depend on besides the scene, as plain values; stored with each.
         device: where predictions and scores are computed.
         noise: of the coarse maps.
+        holes: where the coarse maps lose their values.
 
     """
 
@@ -77,6 +79,7 @@ class Study:
     config: Mapping[str, Any]
     device: torch.device = field(default=torch.device("cpu"))
     noise: Noise = None
+    holes: Holes | None = None
 
     def sample(self, scene: str) -> DepthSample:
         """Return the problem that a scene poses.
@@ -86,7 +89,8 @@ class Study:
 
         """
         loaded = self.source.load(scene)
-        return make_sample(loaded, self.scale, self.downsampling, self.method.range_type, self.noise, self.seed)
+        kind = self.method.range_type
+        return make_sample(loaded, self.scale, self.downsampling, kind, self.noise, self.seed, self.holes)
 
     def stored_config(self, scene: str) -> dict[str, Any]:
         """Return what a prediction of this scene depends on."""

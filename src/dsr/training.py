@@ -14,8 +14,7 @@ import torchmetrics
 from torch import Tensor, nn
 
 from dsr.data.problem import Batch
-from dsr.geometry.shading import render
-from dsr.geometry.surface import normals_of
+from dsr.geometry.comparison import comparison
 from dsr.methods.network import DisparityNetwork
 from dsr.objective import Objective, depth_of
 from dsr.quality.functional import SurfacePair
@@ -142,7 +141,7 @@ class SuperResolution(lightning.LightningModule):
         writer: Any = getattr(self.logger, "experiment", None)
         if hasattr(writer, "add_image") and index < _DRAWN:
             name = f"renderings/{self.sets[dataloader_idx]}_{index}"
-            writer.add_image(name, comparison(depth, batch), self.global_step)
+            writer.add_image(name, comparison(depth, batch["depth"], batch["rays"]), self.global_step)
 
     def on_validation_epoch_end(self) -> None:
         """Log the means over the scenes, worst of four lights: of each set where there are several, and of them all."""
@@ -167,17 +166,3 @@ class SuperResolution(lightning.LightningModule):
         rates = torch.optim.lr_scheduler.LambdaLR(optimiser, schedule.factor)
         named = {"scheduler": rates, "interval": "step", "name": "train/learning_rate"}
         return {"optimizer": optimiser, "lr_scheduler": named}
-
-
-def comparison(depth: Tensor, batch: Batch) -> Tensor:
-    """Return a picture of a result beside the truth, holes black.
-
-    Returns:
-        (1, 2 H, 3 W) in [0, 1]: the renderings of the result and of the truth, and twice their difference; under the
-        first light, and below under the last.
-
-    """
-    result, truth = (render(normals_of(each, batch["rays"]))[0] for each in (depth, batch["depth"]))  # (4, H, W)
-    error = (2 * (result - truth).abs()).clamp(max=1)
-    rows = [torch.cat((result[light], truth[light], error[light]), dim=-1) for light in (0, -1)]
-    return torch.cat(rows, dim=-2)[None].nan_to_num(0).float().cpu()

@@ -31,7 +31,7 @@ from dsr.quality.functional import SurfacePair
 from dsr.quality.lpips import LPIPS
 from dsr.quality.metrics import visual_metrics
 from dsr.sample import Scene
-from dsr.training import Schedule, SuperResolution, comparison
+from dsr.training import Schedule, SuperResolution
 
 BOX = Downsampling("box")
 X2 = Problem(2, BOX)
@@ -374,19 +374,6 @@ def test_validation_logs_the_mean_over_the_scenes_of_the_metrics_worst_light(tmp
         values["Bumpiness_d"].append(float(scores.bumpiness_d(pair)))
     for name, each in values.items():
         assert logged[f"val/{name}"] == pytest.approx(np.mean(each), rel=1e-4), name
-
-
-def test_a_comparison_shows_result_truth_and_difference_under_two_lights() -> None:
-    batch = {name: value[None] for name, value in WholeScenes([_scene(3)], X2)[0].items()}
-    picture = comparison(batch["depth"], batch)[0]
-    assert picture.shape == (72, 120)
-    torch.testing.assert_close(picture[:, :40], picture[:, 40:80])
-    assert float(picture[:, 80:].abs().max()) == 0
-    lit = render(normals_of(batch["depth"], batch["rays"]))[0]
-    torch.testing.assert_close(picture[:36, 40:80], lit[0].float())
-    torch.testing.assert_close(picture[36:, 40:80], lit[3].float())
-    other = comparison(1.1 * batch["depth"] + 0.05 * torch.rand(1, 1, 36, 40), batch)[0]
-    torch.testing.assert_close(other[:, 80:], (2 * (other[:, :40] - other[:, 40:80]).abs()).clamp(max=1))
 
 
 def test_a_validation_forgets_the_one_before(tmp_path: Path) -> None:

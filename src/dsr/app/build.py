@@ -58,6 +58,19 @@ def takes(group: str, node: Mapping[str, Any], key: str) -> bool:
     return key in inspect.signature(_load(group, node)).parameters
 
 
+def trait(group: str, node: Mapping[str, Any], name: str) -> Any:
+    """Return an attribute of a group's target, such as ``optimises``; None where it has none."""
+    return getattr(_load(group, node), name, None)
+
+
+def fast_precision(device: torch.device) -> str:
+    """Return the precision that convolutions are fast in: bfloat16 on a GPU that has it and on a CPU with AMX."""
+    if device.type == "cuda":
+        return "bfloat16" if torch.cuda.is_bf16_supported(including_emulation=False) else "float32"
+    amx = getattr(torch.cpu, "_is_amx_tile_supported", None)
+    return "bfloat16" if device.type == "cpu" and amx is not None and amx() else "float32"
+
+
 def pick_device(name: str) -> torch.device:
     """Return the device of that name; ``auto`` is the first GPU where there is one, else the CPU.
 

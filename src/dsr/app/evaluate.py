@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import random
+import shutil
 import sys
 from collections.abc import Mapping
 from pathlib import Path
@@ -12,18 +13,22 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import torch
+import torchmetrics
 from omegaconf import DictConfig
 from rich.console import Console
 
 from dsr.app import rundir
-from dsr.app.build import build, pick_device, takes
+from dsr.app.build import build, fast_precision, pick_device, takes, trait
 from dsr.app.perceptual import perceptual_network
-from dsr.app.progress import over
+from dsr.app.progress import Display
 from dsr.app.runs import studies_of_run
 from dsr.app.schema import ConfigError, EvalConfig, given_keys, plain_config
 from dsr.data.base import SceneSource
 from dsr.evaluation import Outcome, StalePredictionError, Study, predict, score
 from dsr.methods.trained import packaged_names, packaged_weights
+from dsr.prior.method import WORKSPACE
+from dsr.quality.lpips import LPIPS
+from dsr.quality.metrics import visual_metrics
 from dsr.quality.scores import catalogue
 from dsr.report.pictures import save_picture
 from dsr.report.tables import score_table
@@ -62,21 +67,27 @@ def _evaluate(plain: dict[str, Any], source: SceneSource | None) -> pd.DataFrame
     if not console.is_terminal:
         console = Console(width=_LOG_WIDTH)
     device = pick_device(settings.device)
-    study, identity = _study(settings, plain, device, source)
+    plain = {**plain, "precision": _precision(settings, device)}
+    settings.precision = plain["precision"]
+    weights = _weights(settings)
+    identity = rundir.identity_of(plain, None if weights is None else rundir.file_hash(weights), device)
+    folder = Path(settings.output_dir or rundir.default_directory("eval", plain, identity)).expanduser()
+    display = Display(console)
+    given = {"device": device, "weights": weights, "workspace": folder, "display": display}
+    study = _study(settings, identity, given, source)
     if settings.metrics.lpips and settings.metrics.lpips_trunk is not None:
         perceptual_network(settings.metrics.lpips_trunk)  # a wrong one is refused before anything is written
-    folder = Path(settings.output_dir or rundir.default_directory("eval", plain, identity)).expanduser()
     rundir.claim(folder, plain, identity)
+    if settings.overwrite:
+        shutil.rmtree(folder / WORKSPACE, ignore_errors=True)
     _seed(settings.seed)
     try:
-        outcome = predict(study, folder, functools.partial(over, console), overwrite=settings.overwrite)
+        outcome = predict(study, folder, display, overwrite=settings.overwrite)
     except StalePredictionError as error:
         raise ConfigError(str(error)) from error
-    network = perceptual_network(settings.metrics.lpips_trunk) if settings.metrics.lpips else None
-    metrics = catalogue(None if network is None else network.to(device))
-    label = str(settings.method.get("label", study.method_name))
+    label = _flagged(str(settings.method.get("label", settings.method["name"])), study.method, " ({})")
     illustrate = functools.partial(_illustrate, folder, label)
-    scores = score(study, folder, metrics, outcome, functools.partial(over, console), illustrate)
+    scores = score(study, folder, catalogue(_perceptual(settings, device)), outcome, display, illustrate)
     _report(console, folder, scores, label, outcome)
     if outcome.failures:
         total = len(study.source.scenes())
@@ -86,46 +97,89 @@ def _evaluate(plain: dict[str, Any], source: SceneSource | None) -> pd.DataFrame
 
 
 def _study(
-    settings: EvalConfig, plain: Mapping[str, Any], device: torch.device, source: SceneSource | None
-) -> tuple[Study, dict[str, Any]]:
-    """Build what the configuration describes, and what identifies its predictions."""
+    settings: EvalConfig, identity: Mapping[str, Any], given: Mapping[str, Any], source: SceneSource | None
+) -> Study:
+    """Build what the configuration describes.
+
+    Args:
+        settings: the configuration.
+        identity: what identifies its predictions.
+        given: what a method may ask for beside the configuration's own values: device, weights, workspace, display.
+        source: the data set; None for the one that the configuration describes.
+
+    """
     if source is None:
         if "parts" in settings.dataset:
             name = settings.dataset["name"]
             raise ConfigError(f"dataset={name}: several data sets are for training; name one of them")
         source = build("dataset", settings.dataset)
     downsampling = build("downsampling", settings.downsampling)
-    weights = _weights(settings)
-    given = {
-        "scale": settings.scale,
-        "weights": weights,
-        "precision": settings.precision,
-        "device": device,
-        "seed": settings.seed,
-    }
-    method = build("method", settings.method, given)
-    identity = rundir.identity_of(plain, None if weights is None else rundir.file_hash(weights), device)
-    study = Study(
+    name = str(settings.method["name"])
+    if settings.downsampling.get("assumed") is not None and not takes("method", settings.method, "downsampling"):
+        if "downsampling.assumed" in given_keys():
+            raise ConfigError(f"downsampling.assumed: method={name} assumes no downsampling model; leave it out")
+    method = build(
+        "method",
+        settings.method,
+        {
+            **given,
+            "scale": settings.scale,
+            "precision": settings.precision,
+            "seed": settings.seed,
+            "downsampling": downsampling.believed(),
+            "metrics": functools.partial(_metrics, settings, given["device"]),
+        },
+    )
+    return Study(
         source,
         downsampling,
         _problem_name(settings),
         settings.scale,
         method,
-        str(settings.method["name"]),
+        _flagged(name, method, "_{}"),
         settings.seed,
         identity,
-        device,
+        given["device"],
         noise=build("noise", settings.noise),
+        holes=build("holes", settings.holes),
     )
-    return study, identity
+
+
+def _flagged(name: str, method: Any, form: str) -> str:
+    """Return the name of a method, with what has to stand beside its scores."""
+    flag = getattr(method, "flag", "")
+    return name + form.format(flag) if flag else name
+
+
+def _precision(settings: EvalConfig, device: torch.device) -> str:
+    """Return float32, or for an optimisation what is fast on the device, where ``auto`` leaves the choice."""
+    if settings.precision != "auto":
+        return settings.precision
+    return fast_precision(device) if trait("method", settings.method, "optimises") else "float32"
+
+
+def _perceptual(settings: EvalConfig, device: torch.device) -> LPIPS | None:
+    """Return the LPIPS network; None where it is not wanted, or not to be had."""
+    network = perceptual_network(settings.metrics.lpips_trunk) if settings.metrics.lpips else None
+    return None if network is None else network.to(device)
+
+
+def _metrics(settings: EvalConfig, device: torch.device) -> torchmetrics.MetricCollection:
+    """Return the metrics of a validation pass."""
+    return visual_metrics(_perceptual(settings, device))
 
 
 def _problem_name(settings: EvalConfig) -> str:
     """Return the name of the degradation, as in ``scores.csv``: box, or box+gaussian_multiplicative-0.003."""
-    noise = settings.noise
-    parameters = [f"{value:g}" for key, value in noise.items() if key not in ("name", "target")]
-    name = str(settings.downsampling["name"])
-    return name if noise["name"] == "none" else "+".join((name, "-".join((str(noise["name"]), *parameters))))
+    parts = [str(settings.downsampling["name"])]
+    assumed = settings.downsampling.get("assumed")
+    if assumed not in (None, parts[0]) and takes("method", settings.method, "downsampling"):
+        parts.append(f"assumed-{assumed}")
+    for group in (settings.noise, settings.holes):
+        if group["name"] != "none":
+            values = [f"{value:g}" for key, value in group.items() if key not in ("name", "target")]
+            parts.append("-".join((str(group["name"]), *values)))
+    return "+".join(parts)
 
 
 def _weights(settings: EvalConfig) -> Path | None:

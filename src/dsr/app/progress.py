@@ -1,8 +1,9 @@
-"""Progress bars with the time left, on a terminal; nothing elsewhere."""
+"""Progress bars with the time left, on a terminal; elsewhere the lines alone that somebody says."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import contextlib
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any
 
 import lightning
@@ -37,6 +38,48 @@ def over(console: Console, items: Iterable[str], description: str, total: int | 
             yield item
             progress.advance(task)
         progress.update(task, remark="")
+
+
+class Display:
+    """Bars for passes over scenes, and below them bars for the steps of the scene at hand.
+
+    Args:
+        console: where they are shown.
+
+    """
+
+    def __init__(self, console: Console) -> None:
+        self._console = console
+        self._passes: Progress | None = None
+
+    def __call__(self, items: Sequence[str], description: str) -> Iterator[str]:
+        """Yield the items; the bar names the one at hand."""
+        with bar(self._console) as progress:
+            self._passes = progress
+            task = progress.add_task(description, total=len(items), remark="")
+            try:
+                for item in items:
+                    progress.update(task, remark=item)
+                    yield item
+                    progress.advance(task)
+                progress.update(task, remark="")
+            finally:
+                self._passes = None
+
+    def say(self, line: str) -> None:
+        """Show a line, above the bars if there are any."""
+        self._console.print(line, markup=False, highlight=False, soft_wrap=True)
+
+    @contextlib.contextmanager
+    def steps(self, name: str, total: int, done: int) -> Iterator[Callable[[int, str], None]]:
+        """Show the steps of one thing; the context's value takes how many are done, and a remark."""
+        own = bar(self._console) if self._passes is None else contextlib.nullcontext(self._passes)
+        with own as progress:
+            task = progress.add_task("steps", total=total, completed=done, remark=name)
+            try:
+                yield lambda now, remark: progress.update(task, completed=now, remark=remark)
+            finally:
+                progress.remove_task(task)
 
 
 class TrainingBar(ProgressBar):

@@ -24,7 +24,10 @@ _PACKAGES = (
     "pandas", "scikit-image", "scipy", "torch", "torchmetrics",
 )  # fmt: skip
 _NOT_IDENTITY = ("output_dir", "overwrite", "metrics", "weights", "resume", "run")  # of the weights, the content counts
-_PREDICTING_CODE = ("sample.py", "degrade.py", "geometry", "methods", "data", "objective.py", "training.py")
+_PREDICTING_CODE = (
+    "sample.py", "holes.py", "degrade.py", "geometry", "quality/functional.py", "quality/losses.py",
+    "methods", "data", "objective.py", "training.py", "prior",
+)  # fmt: skip
 
 
 def identity_of(config: Mapping[str, Any], weights_hash: str | None, device: torch.device) -> dict[str, Any]:

@@ -14,7 +14,7 @@ from omegaconf import MISSING, DictConfig, OmegaConf
 from dsr.degrade import SCALES
 
 PRECISIONS = ("float32", "bfloat16")
-_GROUPS = ("dataset", "downsampling", "noise", "method", "metrics", "model", "trainer", "loss")
+_GROUPS = ("dataset", "downsampling", "noise", "holes", "method", "metrics", "model", "trainer", "loss")
 
 
 class ConfigError(ValueError):
@@ -109,9 +109,13 @@ class RunConfig(Checked):
 class EvalConfig(RunConfig):
     """The configuration of ``eval.py``."""
 
+    holes: dict[str, Any] = MISSING
     method: dict[str, Any] = MISSING
+    precision: str = "auto"
     weights: str | None = None
     run: str | None = None
+
+    precisions: ClassVar[tuple[str, ...]] = (*PRECISIONS, "auto")
 
 
 @dataclass

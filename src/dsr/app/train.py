@@ -15,15 +15,16 @@ from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 
 from dsr.app import rundir
-from dsr.app.build import build, pick_device
+from dsr.app.build import build, fast_precision, pick_device
 from dsr.app.perceptual import perceptual_network
 from dsr.app.progress import duration, over
 from dsr.app.runs import WEIGHTS, common, read_config, training_data
 from dsr.app.schema import ConfigError, TrainConfig, given_keys, plain_config
-from dsr.app.trainer import fit, make_trainer, seconds_per_step
+from dsr.app.trainer import make_trainer, seconds_per_step
 from dsr.atomic import replacing
 from dsr.data.patches import PatchData
 from dsr.data.procedural.source import Procedural
+from dsr.fitting import fit
 from dsr.methods.network import DisparityNetwork
 from dsr.methods.trained import NETWORKS
 from dsr.methods.weights import load_network, save_network
@@ -56,7 +57,8 @@ def train(config: DictConfig) -> Path:
     plain = _resumed(plain_config(config))
     settings = TrainConfig.of(plain)
     device = pick_device(settings.device)
-    plain["precision"] = settings.precision = _precision(settings.precision, device)
+    if settings.precision == "auto":
+        plain["precision"] = settings.precision = fast_precision(device)
     first = os.environ.get("LOCAL_RANK", "0") == "0"  # Lightning runs this command once per device
     console = Console(quiet=not first)
     if settings.seed > _LARGEST_SEED:
@@ -106,16 +108,6 @@ def _resumed(plain: dict[str, Any]) -> dict[str, Any]:
     before = read_config(folder)
     device = {"device": plain["device"]} if "device" in given_keys() else {}
     return {**before, **device, "resume": None, "output_dir": str(folder), "overwrite": False}
-
-
-def _precision(name: str, device: torch.device) -> str:
-    """Return float32 or bfloat16: what is fast on the device where ``auto`` asks for it."""
-    if name != "auto":
-        return name
-    if device.type == "cuda":
-        return "bfloat16" if torch.cuda.is_bf16_supported(including_emulation=False) else "float32"
-    fast = getattr(torch.cpu, "_is_amx_tile_supported", None)
-    return "bfloat16" if device.type == "cpu" and fast is not None and fast() else "float32"
 
 
 def _network(settings: TrainConfig) -> DisparityNetwork:

@@ -1,0 +1,168 @@
+"""What trainings and per-image optimisations with Lightning share: interruption, logs, quiet."""
+
+from __future__ import annotations
+
+import contextlib
+import csv
+import logging
+import signal
+import warnings
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any, Protocol
+
+import lightning
+from lightning.pytorch.callbacks import Callback
+from lightning.pytorch.loggers import TensorBoardLogger
+from lightning.pytorch.utilities import rank_zero_only
+from torch.utils.tensorboard.summary import hparams
+
+from dsr.atomic import replacing
+
+IN_TABLE = ("RMSE_v", "DSSIM_v", "LPIPS_v", "BadPix_v_5", "Bumpiness_d", "RMSE_d")
+_SIGNALS = (signal.SIGINT, signal.SIGTERM)
+
+
+class Scored(Protocol):
+    """A module that keeps the scores of its last validation: by set, by metric."""
+
+    validation_scores: dict[str, dict[str, float]]
+
+
+class Interruption(Callback):
+    """Ends a training between two steps at Ctrl-C or SIGTERM, with a checkpoint of that very step.
+
+    Args:
+        path: of the checkpoint.
+
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path, self._wanted = path, False
+        self._before: dict[int, Any] = {}
+
+    def on_train_start(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
+        """Listen."""
+        with contextlib.suppress(ValueError):  # not in the main thread
+            self._before = {number: signal.signal(number, self._want) for number in _SIGNALS}
+
+    def on_train_batch_end(self, trainer: lightning.Trainer, *_: Any) -> None:
+        """Save and stop, if that is wanted and no gradient is being accumulated."""
+        if self._wanted and trainer.fit_loop.batch_idx % trainer.accumulate_grad_batches == (
+            trainer.accumulate_grad_batches - 1
+        ):
+            save_checkpoint(trainer, self._path)
+            raise KeyboardInterrupt
+
+    def teardown(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule, stage: str) -> None:
+        """Listen no more."""
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
+        self._before = {}
+
+    def _want(self, number: int, _: Any) -> None:
+        """Remember the first time; the second time the default applies."""
+        self._wanted = True
+        signal.signal(number, signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL)
+
+
+class ValidationTable(Callback):
+    """Keeps the scores of all validations of a :class:`Scored` module in a file, to the last digit.
+
+    Its columns are step, set, metric and value.
+
+    Args:
+        path: of the file.
+
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+
+    def on_validation_end(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
+        """Add a pass; rows of later steps, of before an interruption, are dropped."""
+        if trainer.sanity_checking or not trainer.is_global_zero:
+            return
+        scored: Any = pl_module
+        step, before = trainer.global_step, []
+        if self._path.is_file():
+            with self._path.open(newline="", encoding="utf-8") as file:
+                before = list(csv.reader(file))[1:]
+        rows = [[str(step), kind, name, repr(value)]
+                for kind, each in scored.validation_scores.items() for name, value in each.items()]  # fmt: skip
+        with replacing(self._path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
+            kept = (row for row in before if int(row[0]) < step)
+            csv.writer(file, lineterminator="\n").writerows([("step", "set", "metric", "value"), *kept, *rows])
+
+
+class LastValidation(Callback):
+    """Has the last step validated where the interval does not divide the steps.
+
+    Args:
+        interval: between validations, in steps.
+
+    """
+
+    def __init__(self, interval: int) -> None:
+        self._interval = interval
+
+    def on_train_batch_end(self, trainer: lightning.Trainer, *_: Any) -> None:
+        """Let Lightning stop by itself, which it does with a validation."""
+        if trainer.global_step == trainer.max_steps and trainer.global_step % self._interval:
+            trainer.should_stop = True
+
+
+class Log(TensorBoardLogger):
+    """TensorBoard's log without the number of the epoch, of which there is one."""
+
+    def log_metrics(self, metrics: Mapping[str, float], step: int | None = None) -> None:
+        """Log all but that."""
+        super().log_metrics({name: value for name, value in metrics.items() if name != "epoch"}, step)
+
+    @rank_zero_only
+    def list_run(self, settings: Mapping[str, Any]) -> None:
+        """Put the run into TensorBoard's table of runs, with its settings and the latest scores of its validations."""
+        self.log_hyperparams(dict(settings))
+        scores = dict.fromkeys((f"val/{name}" for name in IN_TABLE), 0.0)  # the names count, values come from the log
+        for part in hparams(dict(settings), scores):
+            self.experiment.file_writer.add_summary(part)
+
+
+def save_checkpoint(trainer: lightning.Trainer, path: Path) -> None:
+    """Write a checkpoint, whole or not at all."""
+    with replacing(path) as temporary:
+        trainer.save_checkpoint(temporary)
+
+
+def fit(
+    trainer: lightning.Trainer, module: lightning.LightningModule, data: Any = None, resume: Path | None = None, **named: Any
+) -> None:
+    """Train; an interruption comes out as the KeyboardInterrupt that it is."""
+    try:
+        with without_chatter():
+            trainer.fit(module, data, ckpt_path=resume, weights_only=True, **named)
+    except SystemExit:  # Lightning turns an interruption into an exit with code 1
+        if not trainer.interrupted:
+            raise
+    if trainer.interrupted:
+        raise KeyboardInterrupt
+
+
+@contextlib.contextmanager
+def without_chatter() -> Iterator[None]:
+    """Keep Lightning's tips, and its warnings of what is meant to be so, off the terminal."""
+    logger = logging.getLogger("lightning.pytorch")
+    level = logger.level
+    logger.setLevel(logging.ERROR)
+    try:
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", ".*does not have many workers.*")
+            warnings.filterwarnings("ignore", ".*smaller than the logging interval.*")
+            warnings.filterwarnings("ignore", ".*sync_dist=True.*")  # metrics are the same on every device
+            for resumed in ("exists and is not empty", "that ended before the epoch ended"):
+                warnings.filterwarnings("ignore", f".*{resumed}.*")
+            warnings.filterwarnings("ignore", ".*LeafSpec.*", FutureWarning)
+            warnings.filterwarnings("ignore", ".*LeafSpec.*", DeprecationWarning)
+            yield
+    finally:
+        logger.setLevel(level)

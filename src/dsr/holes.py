@@ -1,0 +1,99 @@
+"""Holes of coarse depth maps, as sensors leave them: blobs of any shape, and the strips that a second camera misses.
+
+A kind of holes is a callable from a coarse map, its camera and a generator to a mask; see
+:func:`dsr.degrade.make_sample`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from dsr.geometry.camera import Camera
+
+Holes = Callable[[Tensor, Camera, torch.Generator], Tensor]
+"""From (1, h, w) depth in metres, NaN where unknown, to (1, h, w) bool: where it is to be unknown."""
+
+
+@dataclass(frozen=True)
+class Blobs:
+    """Blobs of random shape and place, where smooth random values are highest.
+
+    Args:
+        share: of the pixels.
+        size: typical diameter in coarse pixels.
+
+    Raises:
+        ValueError: the share is not between 0 and 1, or the size is below 1.
+
+    """
+
+    share: float = 0.1
+    size: float = 12.0
+
+    def __post_init__(self) -> None:
+        """Check the values."""
+        if not 0 < self.share < 1:
+            raise ValueError(f"holes.share: expected a number above 0 and below 1, got {self.share}")
+        if not self.size >= 1:
+            raise ValueError(f"holes.size: expected 1 or more coarse pixels, got {self.size}")
+
+    def __call__(self, depth: Tensor, camera: Camera, generator: torch.Generator) -> Tensor:
+        """Return where the holes are, (1, h, w); the share is met to the pixel."""
+        draws = torch.randn(1, *depth.shape, generator=generator, dtype=torch.float64)
+        for axis in (-2, -1):
+            draws = _blurred(draws, self.size / 4, axis)
+        values = draws[0].flatten()
+        holes = torch.zeros_like(values, dtype=torch.bool)
+        holes[values.argsort(descending=True)[: round(self.share * values.numel())]] = True
+        return holes.view_as(depth).to(depth.device)
+
+
+@dataclass(frozen=True)
+class Shadows:
+    """What a second camera or a projector ``baseline`` metres beside the first does not see: strips beside depth steps.
+
+    Args:
+        baseline: in metres; positive for one to the right, whose shadows lie to the left of what is near.
+
+    Raises:
+        ValueError: it is 0 or no number.
+
+    """
+
+    baseline: float = 0.1
+
+    def __post_init__(self) -> None:
+        """Check the value."""
+        if not 0 < abs(self.baseline) < float("inf"):
+            raise ValueError(f"holes.baseline: expected metres other than 0, got {self.baseline}")
+
+    def __call__(self, depth: Tensor, camera: Camera, generator: torch.Generator) -> Tensor:
+        """Return where the shadows are, (1, h, w): points whose place in the second image something nearer takes."""
+        columns = torch.arange(depth.shape[-1], dtype=torch.float64, device=depth.device)
+        seen_at = columns - self.baseline * camera.fx / depth.double()  # the column in the second image
+        unknown = seen_at.isnan()
+        if self.baseline > 0:  # what lies to the right comes before it there
+            nearest = seen_at.masked_fill(unknown, torch.inf).flip(-1).cummin(dim=-1).values.flip(-1)
+            return seen_at > nearest
+        nearest = seen_at.masked_fill(unknown, -torch.inf).cummax(dim=-1).values
+        return seen_at < nearest
+
+
+def no_holes() -> None:
+    """Return no holes; what ``holes=none`` names."""
+    return
+
+
+def _blurred(values: Tensor, sigma: float, axis: int) -> Tensor:
+    """Return (1, 1, h, w) convolved with a Gaussian along an axis; edge pixels repeated."""
+    radius = max(round(3 * sigma), 1)
+    taps = torch.exp(-0.5 * (torch.arange(-radius, radius + 1, dtype=values.dtype) / sigma).square())
+    vertical = axis == -2
+    kernel = (taps / taps.sum()).view(1, 1, *((-1, 1) if vertical else (1, -1)))
+    padding = (0, 0, radius, radius) if vertical else (radius, radius, 0, 0)
+    return functional.conv2d(functional.pad(values, padding, mode="replicate"), kernel)

@@ -1,0 +1,398 @@
+"""DIP and DIP-V: depth super-resolution by an untrained network that is optimised for each image.
+
+Ulyanov, Vedaldi, Lempitsky, *Deep Image Prior*, CVPR 2018, guided by the photo and with the visual loss of Voynov et
+al., *Perceptual Deep Depth Super-Resolution*, ICCV 2019, section 4.2. The network's answers are a depth map, whose
+coarse version is compared with the input, and the photo's intensities. As holes of the input are compared with nothing,
+they are filled with what the network finds natural.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import time
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar, Literal, Protocol
+
+import lightning
+import torch
+import torchmetrics
+from lightning.pytorch.callbacks import Callback
+from torch import Tensor
+from torch.utils.data import DataLoader
+
+from dsr.degrade import Downsampling, scene_generator
+from dsr.fitting import Interruption, LastValidation, Log, ValidationTable, fit, save_checkpoint, without_chatter
+from dsr.geometry.camera import RangeType
+from dsr.methods.network import DTYPES, Precision
+from dsr.methods.trained import build_trained
+from dsr.prior.optimisation import PriorOptimisation, PriorSettings
+from dsr.prior.problem import DataLoss, ImageProblem, PriorObjective
+from dsr.prior.stopping import Fixed, Oracle, Residual, Stopping, StoppingName, Variance, noise_level
+from dsr.sample import DepthSample
+
+WORKSPACE = "optimisation"
+_SECONDS_BETWEEN_CHECKPOINTS = 60.0
+_SECONDS_BETWEEN_LOOKS = 0.2
+_LOG_EVERY = 10
+
+
+class Display(Protocol):
+    """Where an optimisation says what it is about to do and how far it is."""
+
+    def say(self, line: str) -> None:
+        """Show a line."""
+        ...
+
+    def steps(self, name: str, total: int, done: int) -> AbstractContextManager[Callable[[int, str], None]]:
+        """Return a context whose value takes the number of steps done and a remark."""
+        ...
+
+
+class Silent:
+    """Shows nothing."""
+
+    def say(self, line: str) -> None:
+        """Show nothing."""
+
+    def steps(self, name: str, total: int, done: int) -> AbstractContextManager[Callable[[int, str], None]]:
+        """Show nothing."""
+        return contextlib.nullcontext(lambda _, __: None)
+
+
+@dataclass(kw_only=True)
+class DeepImagePrior:
+    """An :class:`~dsr.methods.base.Upsampler` that optimises a network for each image.
+
+    Each image has its own network and its own random numbers, which follow from the seed, the data set, the scene and
+    the scale: whatever else is optimised before it makes no difference.
+
+    Args:
+        scale: the upsampling factor.
+        downsampling: the model that is assumed to have led to the coarse map.
+        steps, learning_rate, widths, skips, padding, guide, input_noise, perturbation, guide_perturbation, average,
+            margin: see :class:`~dsr.prior.optimisation.PriorSettings`.
+        data_loss, data_weight, w, w_intensity: see :class:`~dsr.prior.problem.PriorObjective`.
+        stopping: ``fixed``: after ``steps``; ``variance``: at the minimum of the iterates' variance; ``residual``: as
+            soon as the coarse map is explained up to its estimated noise; ``oracle``: at the validation pass with the
+            lowest RMSE_v, for which the truth is looked at.
+        patience: steps without a new minimum until ``variance`` stops.
+        validate_every: steps between validation passes, which log scores and renderings; 0 for none.
+        precision: of the convolutions.
+        seed: of all that is random.
+        device: where to compute.
+        metrics: makes the metrics of a validation pass; None for none.
+        workspace: a directory for logs, and for checkpoints to go on from; None for neither.
+        display: shows how far an optimisation is.
+
+    Raises:
+        ValueError: a value is out of range.
+
+    """
+
+    range_type: ClassVar[RangeType] = "orthogonal"
+    optimises: ClassVar[bool] = True
+
+    scale: int
+    downsampling: Downsampling
+    steps: int = 1000
+    learning_rate: float = 0.01
+    widths: Sequence[int] = (32, 64, 128, 128, 128)
+    skips: Sequence[int] = (4, 4, 4, 4, 4)
+    padding: Literal["zeros", "reflect"] = "zeros"
+    guide: bool = True
+    input_noise: float = 0.1
+    perturbation: float = 0.1
+    guide_perturbation: float = 0.03
+    average: float = 0.99
+    margin: float = 0.1
+    data_loss: DataLoss = "lap1"
+    data_weight: float = 1.0
+    w: float = 1.0
+    w_intensity: float = 0.1
+    stopping: StoppingName = "fixed"
+    patience: int = 200
+    validate_every: int = 100
+    precision: Precision = "float32"
+    seed: int = 0
+    device: torch.device | str = "cpu"
+    metrics: Callable[[], torchmetrics.MetricCollection] | None = None
+    workspace: Path | None = None
+    display: Display | None = None
+
+    def __post_init__(self) -> None:
+        """Check the values."""
+        self.device = torch.device(self.device)
+        if self.precision not in DTYPES:
+            raise ValueError(f"precision: expected one of {', '.join(DTYPES)}, got {self.precision!r}")
+        for name, least in (("patience", 1), ("validate_every", 0)):
+            if getattr(self, name) < least:
+                raise ValueError(f"method.{name}: expected {least} or more, got {getattr(self, name)}")
+        if self.stopping == "oracle" and not self.validate_every:
+            raise ValueError("method.validate_every: expected a positive number, as method.stopping=oracle needs it")
+        self._settings = PriorSettings(
+            steps=self.steps,
+            learning_rate=self.learning_rate,
+            widths=tuple(self.widths),
+            skips=tuple(self.skips),
+            padding=self.padding,
+            guide=self.guide,
+            input_noise=self.input_noise,
+            perturbation=self.perturbation,
+            guide_perturbation=self.guide_perturbation,
+            average=self.average,
+            margin=self.margin,
+            mixed=self.precision == "bfloat16",
+        )
+        self._objective = PriorObjective(self.data_loss, self.data_weight, self.w, self.w_intensity)
+
+    @property
+    def flag(self) -> str:
+        """What has to stand beside every score: ``oracle`` where the truth was looked at."""
+        return "oracle" if self.stopping == "oracle" else ""
+
+    def base(self, sample: DepthSample) -> Tensor | None:
+        """Return the depth that the optimisation starts from, (1, H, W) in metres; None for none."""
+        return None
+
+    def __call__(self, sample: DepthSample) -> Tensor:
+        """Return the fine orthogonal depth, (1, H, W) in metres on the sample's device; known everywhere.
+
+        Raises:
+            ValueError: the coarse map has no known pixel, or the optimisation diverged.
+            KeyboardInterrupt: somebody stopped it; with a workspace, a second call goes on from there.
+
+        """
+        with torch.inference_mode(mode=False), torch.enable_grad():
+            module, origin = self.module(sample)
+            display = self.display or Silent()
+            folder = None if self.workspace is None else self.workspace / WORKSPACE / sample.scene
+            resume = None if folder is None else _checkpoint_of(folder / "last.ckpt", origin)
+            display.say(self._announcement(module, sample.scene, resume is not None))
+            trainer = self._trainer(module, folder, origin, display, sample.scene)
+            try:
+                steps: Any = DataLoader(range(self.steps), batch_size=None)  # type: ignore[arg-type]
+                once: Any = DataLoader([0], batch_size=None)  # type: ignore[arg-type]
+                with without_chatter():
+                    fit(trainer, module, steps, resume, val_dataloaders=once)
+            except KeyboardInterrupt:
+                where = f"interrupted at step {trainer.global_step} of {sample.scene}"
+                on = "; the same command goes on from there" if folder is not None else ""
+                raise KeyboardInterrupt(where + on) from None
+            depth = module.result()
+        if not bool(depth.isfinite().all()):
+            raise ValueError(f"{sample.scene}: the optimisation diverged; a lower method.learning_rate may help")
+        if folder is not None:
+            (folder / "last.ckpt").unlink(missing_ok=True)
+        if trainer.global_step < self.steps:
+            display.say(f"{sample.scene}: stopped at step {trainer.global_step} ({self.stopping})")
+        return depth[0].detach().to(sample.depth_lr)
+
+    def module(self, sample: DepthSample) -> tuple[PriorOptimisation, str]:
+        """Return an image's LightningModule, and a digest of all that it works on."""
+        device = torch.device(self.device)
+        problem = ImageProblem.of(sample, self.downsampling, self.range_type, device)
+        base = self.base(sample)
+        truth = None if sample.depth is None else sample.depth[None].to(device, torch.float32)
+        seed = scene_generator(self.seed, sample.dataset, sample.scene, sample.scale, "prior").initial_seed()
+        digest = hashlib.sha256(repr((self._settings, self._objective, self.stopping, self.patience, seed)).encode())
+        for values in (sample.rgb, sample.depth_lr, base):
+            if values is not None:
+                digest.update(values.detach().cpu().contiguous().numpy().tobytes())
+        module = PriorOptimisation(
+            problem,
+            self._objective,
+            self._settings,
+            self._rule(problem),
+            seed,
+            None if self.metrics is None or truth is None else self.metrics().to(device),
+            truth,
+            None if base is None else base[None].to(device, torch.float32),
+        )
+        return module, digest.hexdigest()
+
+    def _rule(self, problem: ImageProblem) -> Stopping:
+        """Return the stopping rule."""
+        if self.stopping == "variance":
+            return Variance(problem.grey, self.patience)
+        if self.stopping == "residual":
+            return Residual(problem.coarse, problem.residual)
+        return Oracle() if self.stopping == "oracle" else Fixed()
+
+    def _announcement(self, module: PriorOptimisation, scene: str, resumed: bool) -> str:
+        """Return what is about to happen: how many steps, how long, in how much memory."""
+        seconds, memory = cost_of_step(module)
+        most = "" if self.stopping in ("fixed", "oracle") else "up to "
+        height, width = module.problem.grey.shape[-2:]
+        noise = f", noise estimated as {noise_level(module.problem.coarse):.2%}" if self.stopping == "residual" else ""
+        return (
+            f"{scene}: {most}{self.steps} steps at {height} x {width} in {self.precision}"
+            f"{', resumed' if resumed else ''}; {most}about {_duration(seconds * self.steps)} "
+            f"({seconds:.2g} s a step as measured now), about {memory / 2**30:.1f} GiB of memory{noise}"
+        )
+
+    def _trainer(
+        self, module: PriorOptimisation, folder: Path | None, origin: str, display: Display, scene: str
+    ) -> lightning.Trainer:
+        """Return Lightning's trainer for one image."""
+        interval = min(self.validate_every or self.steps, self.steps)
+        callbacks: list[Callback] = [LastValidation(interval), Advance(display, scene, self.steps)]
+        logger: Any = False
+        if folder is not None:
+            callbacks += [Origin(origin), Keep(folder / "last.ckpt"), Interruption(folder / "last.ckpt")]
+            if module.metrics is not None and self.validate_every:
+                callbacks.append(ValidationTable(folder / "validation.csv"))
+            logger = Log(folder.parent, name="", version=scene, default_hp_metric=False)
+            logger.list_run({"scene": scene, "scale": self.scale, "stopping": self.stopping, "w": self.w,
+                             "data_loss": self.data_loss, "steps": self.steps, "seed": self.seed})  # fmt: skip
+        device = torch.device(self.device)
+        with without_chatter():
+            return lightning.Trainer(
+                accelerator="gpu" if device.type == "cuda" else device.type,
+                devices=[device.index or 0] if device.type == "cuda" else 1,
+                max_steps=self.steps,
+                val_check_interval=interval,
+                check_val_every_n_epoch=None,
+                limit_val_batches=1 if self.validate_every else 0,
+                log_every_n_steps=min(_LOG_EVERY, interval),
+                logger=logger,
+                callbacks=callbacks,
+                enable_checkpointing=False,
+                enable_model_summary=False,
+                enable_progress_bar=False,
+                num_sanity_val_steps=0,
+                use_distributed_sampler=False,
+            )
+
+
+@dataclass(kw_only=True)
+class WarmStarted(DeepImagePrior):
+    """A deep image prior that starts from a trained network's answer, and adds to it.
+
+    Args:
+        weights: of the network.
+        model: the network's name.
+        **settings: as for :class:`DeepImagePrior`; ``margin`` is the depth that an answer of 1 adds, as a share of the
+            coarse map's range.
+
+    Raises:
+        ValueError: a value is out of range, or the weights are of another network.
+
+    """
+
+    weights: Path
+    model: str
+
+    def __post_init__(self) -> None:
+        """Load the network."""
+        super().__post_init__()
+        self._trained = build_trained(Path(self.weights), self.scale, self.model, device=self.device)
+
+    def base(self, sample: DepthSample) -> Tensor:
+        """Return the trained network's answer; its holes are filled with the coarse map's mean."""
+        depth = self._trained(sample).clone()
+        return torch.where(depth.isfinite(), depth, sample.depth_lr.nanmean())
+
+
+class Origin(Callback):
+    """Keeps in each checkpoint what it came from."""
+
+    def __init__(self, origin: str) -> None:
+        self._origin = origin
+
+    def on_save_checkpoint(
+        self, trainer: lightning.Trainer, pl_module: lightning.LightningModule, checkpoint: dict[str, Any]
+    ) -> None:
+        """Write it down."""
+        checkpoint["origin"] = self._origin
+
+
+class Keep(Callback):
+    """Saves a checkpoint once a minute."""
+
+    def __init__(self, path: Path) -> None:
+        self._path, self._last = path, time.monotonic()
+
+    def on_train_batch_end(self, trainer: lightning.Trainer, *_: Any) -> None:
+        """Save if it is time."""
+        now = time.monotonic()
+        if now - self._last > _SECONDS_BETWEEN_CHECKPOINTS:
+            self._last = now
+            save_checkpoint(trainer, self._path)
+
+
+class Advance(Callback):
+    """Shows the steps with their loss."""
+
+    def __init__(self, display: Display, scene: str, total: int) -> None:
+        self._display, self._scene, self._total = display, scene, total
+        self._shown, self._stack = 0.0, contextlib.ExitStack()
+        self._update: Callable[[int, str], None] = lambda _, __: None
+
+    def on_train_start(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
+        """Begin at the step that the optimisation begins with."""
+        self._update = self._stack.enter_context(
+            self._display.steps(self._scene, self._total, trainer.global_step)
+        )
+
+    def on_train_batch_end(self, trainer: lightning.Trainer, *_: Any) -> None:
+        """Move on; the loss is fetched from the device a few times a second."""
+        now = time.monotonic()
+        if now - self._shown > _SECONDS_BETWEEN_LOOKS:
+            self._shown = now
+            loss = trainer.callback_metrics.get("train/loss")
+            self._update(trainer.global_step, "" if loss is None else f"{self._scene}, loss {float(loss):.4f}")
+
+    def on_validation_end(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
+        """Say the scores of the pass."""
+        names = ("RMSE_d", "RMSE_v", "DSSIM_v", "LPIPS_v")
+        scores = {name: trainer.callback_metrics.get(f"val/{name}") for name in names}
+        text = "  ".join(f"{name} {float(value):.4f}" for name, value in scores.items() if value is not None)
+        if text:
+            self._display.say(f"{self._scene}: step {trainer.global_step:>6}  {text}")
+
+    def teardown(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule, stage: str) -> None:
+        """Take the bar away."""
+        self._stack.close()
+
+
+def cost_of_step(module: PriorOptimisation) -> tuple[float, float]:
+    """Return the seconds of a step, and the bytes that it and the optimiser keep; the module is left as it was."""
+    state, taken = module.generator.get_state(), 0.0
+    kept: dict[int, int] = {}
+
+    def pack(x: Tensor) -> Tensor:
+        kept[x.untyped_storage().data_ptr()] = x.untyped_storage().nbytes()
+        return x
+
+    for _ in range(2):  # the first one warms up
+        kept.clear()
+        start = time.perf_counter()
+        with torch.autograd.graph.saved_tensors_hooks(pack, lambda x: x):
+            loss = module.objective(*module.answer(), module.problem)["loss"]
+        loss.backward()
+        loss.item()
+        taken = time.perf_counter() - start
+    module.zero_grad(set_to_none=True)
+    module.generator.set_state(state)
+    parameters = sum(each.numel() * each.element_size() for each in module.parameters())
+    return taken, sum(kept.values()) + 3 * parameters
+
+
+def _checkpoint_of(path: Path, origin: str) -> Path | None:
+    """Return the checkpoint if there is one that came from the same problem and settings."""
+    if not path.is_file():
+        return None
+    try:
+        stored = torch.load(path, map_location="cpu", weights_only=True).get("origin")
+    except Exception:  # noqa: BLE001 - torch raises whatever a damaged file makes it stumble over
+        return None
+    return path if stored == origin else None
+
+
+def _duration(seconds: float) -> str:
+    """Return a time for a reader."""
+    return f"{seconds:.0f} s" if seconds < 100 else f"{seconds / 60:.0f} min"
