@@ -229,16 +229,17 @@ def make_sample(
     """
     check_scale(scale)
     scene, notes = _divisible(scene, scale)
-    of_holes = generator
     if isinstance(generator, int):
+        of_noise = scene_generator(generator, scene.dataset, scene.name, scale)
         of_holes = scene_generator(generator, scene.dataset, scene.name, scale, "holes")
-        generator = scene_generator(generator, scene.dataset, scene.name, scale)
+    else:
+        of_noise = of_holes = generator
     if isinstance(downsampling, Measured):
         coarse, coarse_camera = _measured(scene, scale), scene.camera.coarser(scale)
     else:
         if scene.depth is None:
             raise ValueError(f"{scene.name}: expected a fine depth map to downsample, there is none")
-        noisy = None if noise is None else functools.partial(noise, generator=generator)
+        noisy = None if noise is None else functools.partial(noise, generator=of_noise)
         coarse, coarse_camera = downsampled(scene.depth, scene.camera, scale, downsampling, range_type, noisy)
     if holes is not None:
         coarse = coarse.masked_fill(holes(coarse, coarse_camera, of_holes), torch.nan)

@@ -135,7 +135,11 @@ def save_checkpoint(trainer: lightning.Trainer, path: Path) -> None:
 
 
 def fit(
-    trainer: lightning.Trainer, module: lightning.LightningModule, data: Any = None, resume: Path | None = None, **named: Any
+    trainer: lightning.Trainer,
+    module: lightning.LightningModule,
+    data: Any,
+    resume: Path | None = None,
+    **named: Any,
 ) -> None:
     """Train; an interruption comes out as the KeyboardInterrupt that it is."""
     try:

@@ -22,8 +22,6 @@ from dsr.data.patches import WholeScenes
 from dsr.data.problem import Batch, Problem, tensors_of
 from dsr.degrade import Downsampling, make_sample
 from dsr.geometry.camera import Camera
-from dsr.geometry.shading import render
-from dsr.geometry.surface import normals_of
 from dsr.methods.msg_net import MSGNet, upsample_disparity
 from dsr.objective import Objective, balanced_weight, depth_of
 from dsr.quality import functional as scores

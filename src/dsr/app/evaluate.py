@@ -115,9 +115,8 @@ def _study(
         source = build("dataset", settings.dataset)
     downsampling = build("downsampling", settings.downsampling)
     name = str(settings.method["name"])
-    if settings.downsampling.get("assumed") is not None and not takes("method", settings.method, "downsampling"):
-        if "downsampling.assumed" in given_keys():
-            raise ConfigError(f"downsampling.assumed: method={name} assumes no downsampling model; leave it out")
+    if "downsampling.assumed" in given_keys() and not takes("method", settings.method, "downsampling"):
+        raise ConfigError(f"downsampling.assumed: method={name} assumes no downsampling model; leave it out")
     method = build(
         "method",
         settings.method,

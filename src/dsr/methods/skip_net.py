@@ -12,12 +12,12 @@ the others do, and the widths may differ by level.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from torch import Tensor, nn
-from torch.nn import functional
 
+Padding = Literal["zeros", "reflect"]
 _SLOPE = 0.2
 _LEAST = 2
 """Pixels of the deepest level's shorter side: batch normalisation needs several."""
@@ -39,7 +39,7 @@ class SkipNet(nn.Module):
     """
 
     def __init__(
-        self, inputs: int, outputs: int, widths: Sequence[int], skips: Sequence[int], padding: str = "zeros"
+        self, inputs: int, outputs: int, widths: Sequence[int], skips: Sequence[int], padding: Padding = "zeros"
     ) -> None:
         super().__init__()
         if not widths or len(widths) != len(skips):
@@ -81,7 +81,7 @@ def levels_for(height: int, width: int, most: int) -> int:
 
 def doubled(x: Tensor) -> Tensor:
     """Return (B, C, h, w) bilinearly upsampled to (B, C, 2 h, 2 w): pixels as areas, edges repeated."""
-    result: Tensor = _Doubled.apply(x)  # type: ignore[no-untyped-call]
+    result: Tensor = _Doubled.apply(x)
     return result
 
 
@@ -94,7 +94,7 @@ class _Doubled(torch.autograd.Function):
         return _double(_double(x, 2), 3)
 
     @staticmethod
-    def backward(ctx: Any, gradient: Tensor) -> Tensor:  # type: ignore[override]
+    def backward(ctx: Any, gradient: Tensor) -> Tensor:
         """Apply the transpose."""
         return _halve(_halve(gradient, 3), 2)
 
@@ -130,9 +130,10 @@ def _memory_format(x: Tensor) -> torch.memory_format:
     return torch.channels_last if x.is_contiguous(memory_format=torch.channels_last) else torch.contiguous_format
 
 
-def _block(inputs: int, outputs: int, kernel: int, stride: int = 1, padding: str = "zeros") -> nn.Sequential:
+def _block(inputs: int, outputs: int, kernel: int, stride: int = 1, padding: Padding = "zeros") -> nn.Sequential:
     """Return a convolution, normalisation and activation."""
-    convolution = nn.Conv2d(inputs, outputs, kernel, stride, kernel // 2, padding_mode=padding if kernel > 1 else "zeros")
+    mode: Padding = padding if kernel > 1 else "zeros"
+    convolution = nn.Conv2d(inputs, outputs, kernel, stride, kernel // 2, padding_mode=mode)
     return nn.Sequential(convolution, _norm(outputs), nn.LeakyReLU(_SLOPE, inplace=True))
 
 

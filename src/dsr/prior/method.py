@@ -15,7 +15,7 @@ from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar, Literal, Protocol
+from typing import Any, ClassVar, Protocol
 
 import lightning
 import torch
@@ -28,6 +28,7 @@ from dsr.degrade import Downsampling, scene_generator
 from dsr.fitting import Interruption, LastValidation, Log, ValidationTable, fit, save_checkpoint, without_chatter
 from dsr.geometry.camera import RangeType
 from dsr.methods.network import DTYPES, Precision
+from dsr.methods.skip_net import Padding
 from dsr.methods.trained import build_trained
 from dsr.prior.optimisation import PriorOptimisation, PriorSettings
 from dsr.prior.problem import DataLoss, ImageProblem, PriorObjective
@@ -102,7 +103,7 @@ class DeepImagePrior:
     learning_rate: float = 0.01
     widths: Sequence[int] = (32, 64, 128, 128, 128)
     skips: Sequence[int] = (4, 4, 4, 4, 4)
-    padding: Literal["zeros", "reflect"] = "zeros"
+    padding: Padding = "zeros"
     guide: bool = True
     input_noise: float = 0.1
     perturbation: float = 0.1
@@ -334,9 +335,7 @@ class Advance(Callback):
 
     def on_train_start(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
         """Begin at the step that the optimisation begins with."""
-        self._update = self._stack.enter_context(
-            self._display.steps(self._scene, self._total, trainer.global_step)
-        )
+        self._update = self._stack.enter_context(self._display.steps(self._scene, self._total, trainer.global_step))
 
     def on_train_batch_end(self, trainer: lightning.Trainer, *_: Any) -> None:
         """Move on; the loss is fetched from the device a few times a second."""
@@ -388,7 +387,7 @@ def _checkpoint_of(path: Path, origin: str) -> Path | None:
         return None
     try:
         stored = torch.load(path, map_location="cpu", weights_only=True).get("origin")
-    except Exception:  # noqa: BLE001 - torch raises whatever a damaged file makes it stumble over
+    except Exception:
         return None
     return path if stored == origin else None
 

@@ -13,7 +13,7 @@ import torchmetrics
 from torch import Tensor, nn
 
 from dsr.geometry.comparison import comparison
-from dsr.methods.skip_net import SkipNet, levels_for
+from dsr.methods.skip_net import Padding, SkipNet, levels_for
 from dsr.prior.problem import ImageProblem, PriorObjective
 from dsr.prior.stopping import Stopping
 from dsr.quality.functional import SurfacePair, rmse_v
@@ -46,7 +46,7 @@ class PriorSettings:
     learning_rate: float
     widths: Sequence[int]
     skips: Sequence[int]
-    padding: str
+    padding: Padding
     guide: bool
     input_noise: float
     perturbation: float
@@ -88,6 +88,7 @@ class PriorOptimisation(lightning.LightningModule):
     """
 
     start: Tensor
+    spread: Tensor
     average: Tensor
 
     def __init__(
@@ -174,7 +175,8 @@ class PriorOptimisation(lightning.LightningModule):
     def _network(self) -> SkipNet:
         """Return the network; with a base it starts by answering nothing."""
         settings = self.settings
-        levels = levels_for(*self.problem.rgb.shape[-2:], most=len(settings.widths))
+        height, width = self.problem.rgb.shape[-2:]
+        levels = levels_for(height, width, len(settings.widths))
         channels = _NOISE_CHANNELS + (3 if settings.guide else 0)
         net = SkipNet(channels, 2, settings.widths[:levels], settings.skips[:levels], settings.padding)
         if self.base is not None:
