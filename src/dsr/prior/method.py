@@ -163,7 +163,7 @@ class DeepImagePrior:
         """Return the fine orthogonal depth, (1, H, W) in metres on the sample's device; known everywhere.
 
         Raises:
-            ValueError: the coarse map has no known pixel, or the optimisation diverged.
+            ValueError: the optimisation diverged.
             KeyboardInterrupt: somebody stopped it; with a workspace, a second call goes on from there.
 
         """
@@ -175,10 +175,8 @@ class DeepImagePrior:
             display.say(self._announcement(module, sample.scene, resume is not None))
             trainer = self._trainer(module, folder, origin, display, sample.scene)
             try:
-                steps: Any = DataLoader(range(self.steps), batch_size=None)  # type: ignore[arg-type]
-                once: Any = DataLoader([0], batch_size=None)  # type: ignore[arg-type]
                 with without_chatter():
-                    fit(trainer, module, steps, resume, val_dataloaders=once)
+                    fit(trainer, module, _numbers(self.steps), resume, val_dataloaders=_numbers(1))
             except KeyboardInterrupt:
                 where = f"interrupted at step {trainer.global_step} of {sample.scene}"
                 on = "; the same command goes on from there" if folder is not None else ""
@@ -379,6 +377,12 @@ def cost_of_step(module: PriorOptimisation) -> tuple[float, float]:
     module.generator.set_state(state)
     parameters = sum(each.numel() * each.element_size() for each in module.parameters())
     return taken, sum(kept.values()) + 3 * parameters
+
+
+def _numbers(count: int) -> Any:
+    """Return a loader of numbers, one for each step; it leaves the global random numbers alone."""
+    numbers: Any = range(count)
+    return DataLoader(numbers, batch_size=None, generator=torch.Generator())
 
 
 def _checkpoint_of(path: Path, origin: str) -> Path | None:

@@ -51,15 +51,8 @@ class ImageProblem:
 
     @classmethod
     def of(cls, sample: DepthSample, downsampling: Downsampling, range_type: RangeType, device: torch.device) -> Self:
-        """Return the problem that a sample poses; its true depth is not looked at.
-
-        Raises:
-            ValueError: the coarse map has no known pixel.
-
-        """
+        """Return the problem that a sample poses; its true depth is not looked at."""
         known = sample.depth_lr[sample.mask_lr]
-        if not len(known):
-            raise ValueError(f"{sample.scene}: expected a coarse depth map with known pixels, all of it is a hole")
         low, high = float(known.min()), float(known.max())
         rgb = sample.rgb[None].to(device, torch.float32)
         weights = torch.tensor(_LUMINANCE, device=device).view(1, 3, 1, 1)

@@ -184,6 +184,8 @@ def noise_level(coarse: Tensor) -> float:
         0 where fewer than one 3 x 3 window is known.
 
     """
+    if min(coarse.shape[-2:]) < 3:
+        return 0.0
     row = torch.tensor([1.0, -2.0, 1.0], dtype=torch.float64, device=coarse.device)
     answers = functional.conv2d(coarse.double().log(), torch.outer(row, row)[None, None]).abs()
     known = answers[answers.isfinite()]
