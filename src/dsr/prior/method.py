@@ -107,13 +107,13 @@ class DeepImagePrior:
     guide: bool = True
     input_noise: float = 0.1
     perturbation: float = 0.1
-    guide_perturbation: float = 0.03
+    guide_perturbation: float = 0.05
     average: float = 0.99
     margin: float = 0.1
     data_loss: DataLoss = "lap1"
     data_weight: float = 1.0
     w: float = 1.0
-    w_intensity: float = 0.1
+    w_intensity: float = 0.01
     stopping: StoppingName = "fixed"
     patience: int = 200
     validate_every: int = 100

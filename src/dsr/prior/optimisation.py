@@ -154,7 +154,8 @@ class PriorOptimisation(lightning.LightningModule):
                 self.metrics.reset()
                 self.metrics.update(pair)
                 self.validation_scores = {"val": {name: float(v) for name, v in self.metrics.compute().items()}}
-                self.log_dict({f"val/{k}": value for k, value in self.validation_scores["val"].items()}, batch_size=1)
+                named = {f"val/{k}": value for k, value in self.validation_scores["val"].items()}
+                self.log_dict({"step": float(self.global_step), **named}, batch_size=1)  # else Lightning counts from 0
         writer: Any = getattr(self.logger, "experiment", None)
         if hasattr(writer, "add_image"):
             writer.add_image("renderings", comparison(depth, self.truth, self.problem.rays), self.global_step)

@@ -102,7 +102,7 @@ class PriorObjective:
     data_loss: DataLoss = "lap1"
     data_weight: float = 1.0
     w: float = 1.0
-    w_intensity: float = 0.1
+    w_intensity: float = 0.01
 
     def __post_init__(self) -> None:
         """Check the values."""

@@ -1,0 +1,184 @@
+"""``python eval.py method=dip_v``: what it says, writes, logs, and how it goes on."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+REPOSITORY = Path(__file__).resolve().parents[2]
+ENVIRONMENT = {**os.environ, "OMP_NUM_THREADS": "1"}
+QUICK = (
+    "dataset.size=48", "metrics.lpips=false", "method.steps=40", "method.widths=[8,16]", "method.skips=[2,2]",
+    "method.validate_every=20",
+)  # fmt: skip
+
+
+def _command(*arguments: str) -> list[str]:
+    return [sys.executable, str(REPOSITORY / "eval.py"), *QUICK, *arguments]
+
+
+def _run(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        _command(*arguments), cwd=folder, env=ENVIRONMENT, capture_output=True, text=True, timeout=120, check=False
+    )
+
+
+def _depth(home: Path, scene: str) -> Any:
+    with np.load(home / "predictions" / f"{scene}.npz") as arrays:
+        return arrays["depth"]
+
+
+def _rows(home: Path) -> list[dict[str, str]]:
+    with (home / "scores.csv").open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+@pytest.fixture(scope="module")
+def both(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, subprocess.CompletedProcess[str]]:
+    """The run's directory and the finished process of an evaluation of two scenes."""
+    folder = tmp_path_factory.mktemp("both")
+    done = _run(folder, "method=dip_v", "dataset.scenes=[statue,cube_no_texture]", "output_dir=out")
+    return folder / "out", done
+
+
+def test_it_says_what_each_scene_will_cost_and_ends_in_a_table(
+    both: tuple[Path, subprocess.CompletedProcess[str]],
+) -> None:
+    home, done = both
+    assert (done.returncode, done.stderr) == (0, "")
+    for scene in ("statue", "cube_no_texture"):
+        assert re.search(rf"^{scene}: 40 steps at 48 x 48 in (float32|bfloat16); about \d+ s \(", done.stdout, re.M)
+        assert re.search(rf"^{scene}: step +40  RMSE_d 0\.\d+  RMSE_v 0\.\d+  DSSIM_v 0\.\d+$", done.stdout, re.M)
+    assert "DIP-V on simgeo, x4, box downsampling" in done.stdout
+    assert {row["method"] for row in _rows(home)} == {"dip_v"}
+
+
+def test_the_log_has_the_losses_all_scores_and_renderings(
+    both: tuple[Path, subprocess.CompletedProcess[str]],
+) -> None:
+    home, _ = both
+    log = EventAccumulator(str(home / "optimisation" / "statue"))
+    log.Reload()
+    names = set(log.Tags()["scalars"])
+    assert {"train/loss", "train/data_lap1", "train/mse_v", "train/intensity", "val/DSSIM_v", "val/RMSE_v"} <= names
+    assert [event.step for event in log.Scalars("val/RMSE_v")] == [20, 40]
+    assert [event.step for event in log.Images("renderings")] == [20, 40]
+    logged = log.Scalars("val/RMSE_v")[-1].value
+    [scored] = [row for row in _rows(home) if (row["scene"], row["metric"]) == ("statue", "RMSE_v")]
+    assert logged == pytest.approx(float(scored["value"]), rel=1e-4)
+    table = (home / "optimisation" / "statue" / "validation.csv").read_text()
+    assert "40,val,DSSIM_v," in table
+
+
+def test_a_result_does_not_depend_on_the_other_scenes_nor_on_their_order(
+    both: tuple[Path, subprocess.CompletedProcess[str]], tmp_path: Path
+) -> None:
+    home, _ = both
+    assert _run(tmp_path, "method=dip_v", "dataset.scenes=[cube_no_texture]", "output_dir=one").returncode == 0
+    assert np.array_equal(_depth(home, "cube_no_texture"), _depth(tmp_path / "one", "cube_no_texture"))
+    order = "dataset.scenes=[cube_no_texture,statue]"
+    assert _run(tmp_path, "method=dip_v", order, "output_dir=turned", "method.validate_every=0").returncode == 0
+    for scene in ("statue", "cube_no_texture"):
+        assert np.array_equal(_depth(home, scene), _depth(tmp_path / "turned", scene))
+
+
+def test_a_second_run_reuses_what_is_there(both: tuple[Path, subprocess.CompletedProcess[str]]) -> None:
+    home, _ = both
+    again = _run(home.parent, "method=dip_v", "dataset.scenes=[statue,cube_no_texture]", "output_dir=out")
+    assert again.returncode == 0
+    assert "predictions re-used: 2" in again.stdout
+    assert "steps at" not in again.stdout
+
+
+def test_an_interrupted_run_goes_on_within_the_image(tmp_path: Path) -> None:
+    arguments = ("method=dip_v", "dataset.scenes=[statue]", "method.steps=400", "method.validate_every=10")
+    with subprocess.Popen(
+        _command(*arguments, "output_dir=out"), cwd=tmp_path, env=ENVIRONMENT, stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE, text=True,
+    ) as process:  # fmt: skip
+        table, deadline = tmp_path / "out" / "optimisation" / "statue" / "validation.csv", time.monotonic() + 60
+        while not table.is_file() and time.monotonic() < deadline:
+            time.sleep(0.02)
+        process.send_signal(signal.SIGTERM)
+        _, errors = process.communicate(timeout=60)
+    assert process.returncode == 130
+    step = re.fullmatch(r"interrupted at step (\d+) of statue; the same command goes on from there\n", errors)
+    assert step is not None, errors
+    assert 10 <= int(step[1]) < 400
+    assert (tmp_path / "out" / "optimisation" / "statue" / "last.ckpt").is_file()
+    done = _run(tmp_path, *arguments, "output_dir=out")
+    assert done.returncode == 0, done.stderr
+    assert "resumed" in done.stdout
+    assert _run(tmp_path, *arguments, "output_dir=whole").returncode == 0
+    assert np.array_equal(_depth(tmp_path / "out", "statue"), _depth(tmp_path / "whole", "statue"))
+    assert not (tmp_path / "out" / "optimisation" / "statue" / "last.ckpt").exists()
+
+
+def test_an_oracle_is_named_in_scores_and_table(tmp_path: Path) -> None:
+    done = _run(tmp_path, "method=dip", "dataset.scenes=[statue]", "method.stopping=oracle", "output_dir=out")
+    assert done.returncode == 0, done.stderr
+    assert "DIP (oracle) on simgeo" in done.stdout
+    assert {row["method"] for row in _rows(tmp_path / "out")} == {"dip_oracle"}
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert summary["method"] == "dip_oracle"
+
+
+def test_holes_and_a_mistaken_model_are_part_of_the_problems_name(tmp_path: Path) -> None:
+    given = ("method=dip", "dataset.scenes=[statue]", "method.validate_every=0", "output_dir=out")
+    done = _run(tmp_path, *given, "holes=blobs", "holes.size=3", "downsampling.assumed=nearest")
+    assert done.returncode == 0, done.stderr
+    table = _rows(tmp_path / "out")
+    assert {row["downsampling"] for row in table} == {"box+assumed-nearest+blobs-0.1-3"}
+    assert {row["valid_share"] for row in table} == {"1.0"}  # filled
+    assert np.isfinite(_depth(tmp_path / "out", "statue")).all()
+    right = _run(tmp_path, *given[:-1], "output_dir=right", "holes=blobs", "holes.size=3")
+    assert right.returncode == 0
+    assert not np.array_equal(_depth(tmp_path / "out", "statue"), _depth(tmp_path / "right", "statue"))
+
+
+def test_a_warm_start_needs_no_words(tmp_path: Path) -> None:
+    done = _run(tmp_path, "method=dip_v_warm", "dataset.scenes=[statue]", "method.steps=3", "output_dir=out")
+    assert done.returncode == 0, done.stderr
+    assert "DIP-V (warm)" in done.stdout
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("method=dip_v", "method.stopping=never"), "method.stopping: expected one of fixed, variance, residual, oracle"),
+        (("method=dip_v", "method.w=-1"), "method.w: expected 0 or a positive number, got -1"),
+        (("method=dip_v", "method.steps=0"), "method.steps: expected a positive number, got 0"),
+        (("method=dip", "method.widhts=[8]"), "method.widhts: unknown key; expected method.name, "),
+        (("method=dip", "holes=blob"), "holes=blob: unknown; expected one of blobs, none, shadows"),
+        (("method=dip", "holes=blobs", "holes.share=2"), "holes.share: expected a number above 0 and below 1, got 2"),
+        (("method=dip", "downsampling.assumed=cubic"), "downsampling.assumed: expected "),
+    ],
+)
+def test_a_usage_error_is_one_line_and_writes_nothing(
+    tmp_path: Path, arguments: tuple[str, ...], message: str
+) -> None:
+    done = _run(tmp_path, *arguments)
+    assert done.returncode == 2
+    [line] = done.stderr.splitlines()
+    assert line.startswith(f"error: {message}")
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_model_that_nothing_assumes_is_refused(tmp_path: Path) -> None:
+    command = [sys.executable, str(REPOSITORY / "eval.py"), "method=bicubic", "downsampling.assumed=nearest"]
+    done = subprocess.run(command, cwd=tmp_path, env=ENVIRONMENT, capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == 2
+    assert done.stderr == "error: downsampling.assumed: method=bicubic assumes no downsampling model; leave it out\n"
+    assert not list(tmp_path.iterdir())
