@@ -3,7 +3,7 @@
     python benchmarks/inpainting.py --scenes DIR [--steps 400] [--scale 4] [--picture FILE] [--crop N]
 
 Two kinds of holes are cut into the coarse maps of Lucy and Plant: random blobs of 10 % of the pixels, and the shadows
-that a second camera 10 cm to the right would leave. Errors are those of the fine pixels under the holes alone.
+that a second camera 20 cm to the right would leave. Errors are those of the fine pixels under the holes alone.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from dsr.quality.functional import SurfacePair, rmse_d, rmse_v
 from dsr.sample import DepthSample, Scene
 
 BOX = Downsampling("box")
-KINDS: dict[str, Holes] = {"blobs": Blobs(0.1, 12.0), "shadows": Shadows(0.1)}
+KINDS: dict[str, Holes] = {"blobs": Blobs(0.1, 12.0), "shadows": Shadows(0.2)}
 
 
 def centre(scene: Scene, size: int) -> Scene:

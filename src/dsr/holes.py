@@ -65,7 +65,7 @@ class Shadows:
 
     """
 
-    baseline: float = 0.1
+    baseline: float = 0.2
 
     def __post_init__(self) -> None:
         """Check the value."""

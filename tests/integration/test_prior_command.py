@@ -157,7 +157,10 @@ def test_a_warm_start_needs_no_words(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("method=dip_v", "method.stopping=never"), "method.stopping: expected one of fixed, variance, residual, oracle"),
+        (
+            ("method=dip_v", "method.stopping=never"),
+            "method.stopping: expected one of fixed, variance, residual, oracle",
+        ),
         (("method=dip_v", "method.w=-1"), "method.w: expected 0 or a positive number, got -1"),
         (("method=dip_v", "method.steps=0"), "method.steps: expected a positive number, got 0"),
         (("method=dip", "method.widhts=[8]"), "method.widhts: unknown key; expected method.name, "),
@@ -166,9 +169,7 @@ def test_a_warm_start_needs_no_words(tmp_path: Path) -> None:
         (("method=dip", "downsampling.assumed=cubic"), "downsampling.assumed: expected "),
     ],
 )
-def test_a_usage_error_is_one_line_and_writes_nothing(
-    tmp_path: Path, arguments: tuple[str, ...], message: str
-) -> None:
+def test_a_usage_error_is_one_line_and_writes_nothing(tmp_path: Path, arguments: tuple[str, ...], message: str) -> None:
     done = _run(tmp_path, *arguments)
     assert done.returncode == 2
     [line] = done.stderr.splitlines()
@@ -178,7 +179,9 @@ def test_a_usage_error_is_one_line_and_writes_nothing(
 
 def test_a_model_that_nothing_assumes_is_refused(tmp_path: Path) -> None:
     command = [sys.executable, str(REPOSITORY / "eval.py"), "method=bicubic", "downsampling.assumed=nearest"]
-    done = subprocess.run(command, cwd=tmp_path, env=ENVIRONMENT, capture_output=True, text=True, timeout=60, check=False)
+    done = subprocess.run(
+        command, cwd=tmp_path, env=ENVIRONMENT, capture_output=True, text=True, timeout=60, check=False
+    )
     assert done.returncode == 2
     assert done.stderr == "error: downsampling.assumed: method=bicubic assumes no downsampling model; leave it out\n"
     assert not list(tmp_path.iterdir())

@@ -168,7 +168,9 @@ def test_the_variance_rule_goes_on_where_it_was_interrupted() -> None:
 def test_the_noise_of_a_depth_map_is_estimated_from_the_map_alone(std: float) -> None:
     v, u = torch.meshgrid(torch.linspace(0, 1, 90), torch.linspace(0, 1, 120), indexing="ij")
     depth = (2 + u + 0.5 * v + 1.5 * (u > 0.4))[None, None].double()
-    noisy = depth * (1 + std * torch.randn(depth.shape, generator=torch.Generator().manual_seed(3), dtype=torch.float64))
+    noisy = depth * (
+        1 + std * torch.randn(depth.shape, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
+    )
     noisy[..., 20:40, 30:60] = torch.nan
     assert noise_level(noisy) == pytest.approx(std, rel=0.06)
     assert noise_level(depth) < 1e-5

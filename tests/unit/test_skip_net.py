@@ -67,7 +67,8 @@ def test_the_answer_has_more_than_bfloat16s_steps_even_if_the_convolutions_have_
 
 
 @pytest.mark.parametrize(
-    ("height", "width", "most", "levels"), [(512, 512, 5, 5), (32, 512, 5, 4), (4, 4, 5, 1), (2, 2, 5, 1), (64, 64, 2, 2)]
+    ("height", "width", "most", "levels"),
+    [(512, 512, 5, 5), (32, 512, 5, 4), (4, 4, 5, 1), (2, 2, 5, 1), (64, 64, 2, 2)],
 )
 def test_a_small_image_has_fewer_levels(height: int, width: int, most: int, levels: int) -> None:
     assert levels_for(height, width, most) == levels
