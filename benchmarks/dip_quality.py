@@ -38,7 +38,7 @@ BOX = Downsampling("box")
 NAMES = ("RMSE_d", "DSSIM_v", "RMSE_v", "BadPix_v_5")
 DIP = {"data_loss": "mse", "data_weight": 10.0, "w": 0.0}
 ORIGINAL = {
-    "widths": (128,) * 5, "padding": "reflect", "guide": False, "perturbation": 0.03, "w_intensity": 0.1,
+    "widths": (128,) * 5, "padding": "reflect", "border": 0, "guide": False, "perturbation": 0.03, "w_intensity": 0.1,
 }  # fmt: skip
 """The reference experiment, but for the losses, which count as shares of the coarse map's range."""
 NARROW = {"widths": (32, 64, 128, 128, 128), "padding": "zeros"}
@@ -48,9 +48,10 @@ ABLATION: Mapping[str, Mapping[str, Any]] = {
     "dip_v: reference": ORIGINAL,
     "  narrow at full resolution, zeros at borders": {**ORIGINAL, **NARROW},
     "  and the photo as input": {**ORIGINAL, **NARROW, "guide": True, "guide_perturbation": 0.0},
-    "  and perturbation 0.1": {"w_intensity": 0.1, "guide_perturbation": 0.0},
-    "  and of the photo 0.05": {"w_intensity": 0.1},
-    "dip_v: and w_I 0.01": {},
+    "  and perturbation 0.1": {"border": 0, "w_intensity": 0.1, "guide_perturbation": 0.0},
+    "  and of the photo 0.05": {"border": 0, "w_intensity": 0.1},
+    "  and w_I 0.01": {"border": 0},
+    "dip_v: and a border of 8": {},
     "  w = 0": {"w": 0.0},
     "  w = 3": {"w": 3.0},
     "  w_I = 0": {"w_intensity": 0.0},

@@ -43,10 +43,11 @@ def library(x: Tensor) -> Tensor:
 
 def module_of(sample: DepthSample, *, plain: bool, widths: tuple[int, ...] | None = None) -> PriorOptimisation:
     """Return an optimisation, in the plain way or ours."""
-    given = {} if widths is None else {"widths": widths}
+    given: dict[str, object] = {} if widths is None else {"widths": widths}
     precision = "float32" if plain else fast_precision(torch.device("cpu"))
-    padding = "reflect" if plain else "zeros"
-    prior = DeepImagePrior(scale=4, downsampling=BOX, precision=precision, padding=padding, **given)  # type: ignore[arg-type]
+    if plain:
+        given |= {"padding": "reflect", "border": 0}
+    prior = DeepImagePrior(scale=4, downsampling=BOX, precision=precision, **given)  # type: ignore[arg-type]
     module, _ = prior.module(sample)
     if plain:
         module.net.to(memory_format=torch.contiguous_format)  # type: ignore[call-overload]

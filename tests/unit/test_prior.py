@@ -234,6 +234,21 @@ def test_measuring_a_step_changes_nothing() -> None:
         assert torch.equal(one, other)
 
 
+def test_the_network_sees_a_mirrored_border_that_the_answer_has_not() -> None:
+    sample = _sample()
+    module, _ = _prior(border=5).module(sample)
+    assert module.start.shape == (1, 35, 42, 58)
+    photo = module.start[0, 32:]
+    torch.testing.assert_close(photo[:, 5:-5, 5:-5], sample.rgb)
+    torch.testing.assert_close(photo[:, 4], photo[:, 6])
+    depth, intensity = module.answer()
+    assert depth.shape == intensity.shape == (1, 1, 32, 48)
+    plain, _ = _prior(border=0).module(sample)
+    assert plain.start.shape == (1, 35, 32, 48)
+    wide, _ = _prior(border=100).module(sample)  # as far as there is something to mirror
+    assert wide.start.shape == (1, 35, 32 + 62, 48 + 62)
+
+
 def test_an_oracle_is_flagged() -> None:
     assert _prior(stopping="oracle", validate_every=5).flag == "oracle"
     assert _prior(stopping="variance").flag == ""
@@ -266,6 +281,7 @@ def test_a_warm_start_begins_at_the_trained_networks_answer() -> None:
         {"validate_every": 0, "stopping": "oracle"},
         {"input_noise": 0.0, "guide": False},
         {"margin": -0.1},
+        {"border": -1},
     ],
 )
 def test_settings_out_of_range_are_refused(settings: dict[str, object]) -> None:

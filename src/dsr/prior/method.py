@@ -76,8 +76,8 @@ class DeepImagePrior:
     Args:
         scale: the upsampling factor.
         downsampling: the model that is assumed to have led to the coarse map.
-        steps, learning_rate, widths, skips, padding, guide, input_noise, perturbation, guide_perturbation, average,
-            margin: see :class:`~dsr.prior.optimisation.PriorSettings`.
+        steps, learning_rate, widths, skips, padding, border, guide, input_noise, perturbation, guide_perturbation,
+            average, margin: see :class:`~dsr.prior.optimisation.PriorSettings`.
         data_loss, data_weight, w, w_intensity: see :class:`~dsr.prior.problem.PriorObjective`.
         stopping: ``fixed``: after ``steps``; ``variance``: at the minimum of the iterates' variance; ``residual``: as
             soon as the coarse map is explained up to its estimated noise; ``oracle``: at the validation pass with the
@@ -101,11 +101,12 @@ class DeepImagePrior:
 
     scale: int
     downsampling: Downsampling
-    steps: int = 1000
+    steps: int = 600
     learning_rate: float = 0.01
     widths: Sequence[int] = (32, 64, 128, 128, 128)
     skips: Sequence[int] = (4, 4, 4, 4, 4)
     padding: Padding = "zeros"
+    border: int = 8
     guide: bool = True
     input_noise: float = 0.1
     perturbation: float = 0.1
@@ -142,6 +143,7 @@ class DeepImagePrior:
             widths=tuple(self.widths),
             skips=tuple(self.skips),
             padding=self.padding,
+            border=self.border,
             guide=self.guide,
             input_noise=self.input_noise,
             perturbation=self.perturbation,

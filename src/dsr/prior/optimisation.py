@@ -11,6 +11,7 @@ import lightning
 import torch
 import torchmetrics
 from torch import Tensor, nn
+from torch.nn import functional
 
 from dsr.geometry.comparison import comparison
 from dsr.methods.skip_net import Padding, SkipNet, levels_for
@@ -30,6 +31,8 @@ class PriorSettings:
         learning_rate: of Adam.
         widths, skips: of the network's levels, see :class:`~dsr.methods.skip_net.SkipNet`; a small image has fewer.
         padding: of its convolutions.
+        border: pixels by which the network's image is larger on each side, filled with the mirrored photo and cut off
+            again: no pixel of the answer lies at a border.
         guide: whether the photo is part of the network's input, beside 32 channels of noise.
         input_noise: the fixed noise is U[0, input_noise].
         perturbation, guide_perturbation: standard deviation of what is added to noise and photo, anew each step.
@@ -47,6 +50,7 @@ class PriorSettings:
     widths: Sequence[int]
     skips: Sequence[int]
     padding: Padding
+    border: int
     guide: bool
     input_noise: float
     perturbation: float
@@ -63,6 +67,8 @@ class PriorSettings:
         for name in ("input_noise", "perturbation", "guide_perturbation", "margin"):
             if not 0 <= getattr(self, name) < math.inf:
                 raise ValueError(f"method.{name}: expected 0 or a positive number, got {getattr(self, name)}")
+        if self.border < 0:
+            raise ValueError(f"method.border: expected 0 or a positive number, got {self.border}")
         if not self.guide and not self.input_noise:
             raise ValueError("method.input_noise: expected a positive number, or method.guide=true; got 0 and false")
         if not 0 <= self.average < 1:
@@ -106,13 +112,15 @@ class PriorOptimisation(lightning.LightningModule):
         self.problem, self.objective, self.settings, self.stopping = problem, objective, settings, stopping
         self.metrics, self.truth, self.base = metrics, truth, base
         self.validation_scores: dict[str, dict[str, float]] = {}
-        device = problem.rgb.device
+        device, size = problem.rgb.device, problem.rgb.shape[-2:]
+        self._border = min(settings.border, min(size) - 1)  # what mirroring has pixels for
         self.generator = torch.Generator(device).manual_seed(seed)
         with torch.random.fork_rng([]):
             torch.manual_seed(seed)
             self.net = self._network().to(device, memory_format=torch.channels_last)  # type: ignore[call-overload]
-            noise = settings.input_noise * torch.rand(1, _NOISE_CHANNELS, *problem.rgb.shape[-2:])
-        parts = [noise.to(device), problem.rgb] if settings.guide else [noise.to(device)]
+            photo = functional.pad(problem.rgb, (self._border,) * 4, mode="reflect")
+            noise = settings.input_noise * torch.rand(1, _NOISE_CHANNELS, *photo.shape[-2:])
+        parts = [noise.to(device), photo] if settings.guide else [noise.to(device)]
         spread = torch.full((sum(part.shape[1] for part in parts), 1, 1), settings.perturbation, device=device)
         spread[_NOISE_CHANNELS:] = settings.guide_perturbation
         self.register_buffer("start", torch.cat(parts, dim=1), persistent=False)
@@ -138,7 +146,9 @@ class PriorOptimisation(lightning.LightningModule):
         x = torch.addcmul(self.start, draws, self.spread).contiguous(memory_format=torch.channels_last)
         with torch.autocast(device.type, torch.bfloat16, enabled=self.settings.mixed):
             y = self.net(x)
-        return self._depth(y[:, :1].float()), y[:, 1:].float().sigmoid()
+        height, width = self.problem.grey.shape[-2:]
+        y = y[..., self._border :, self._border :][..., :height, :width].float()
+        return self._depth(y[:, :1]), y[:, 1:].sigmoid()
 
     def result(self) -> Tensor:
         """Return the depth map to answer with, (1, 1, H, W) in metres."""
