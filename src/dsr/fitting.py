@@ -152,6 +152,20 @@ def fit(
         raise KeyboardInterrupt
 
 
+def scores_line(trainer: lightning.Trainer) -> str:
+    """Return the main scores of the last validation for a reader; nothing where there are none."""
+    scores = {name: trainer.callback_metrics.get(f"val/{name}") for name in ("RMSE_d", "RMSE_v", "DSSIM_v", "LPIPS_v")}
+    return "  ".join(f"{name} {float(value):.4f}" for name, value in scores.items() if value is not None)
+
+
+def duration(seconds: float) -> str:
+    """Return a time for a reader: 40 s, 12 min, 3.5 h."""
+    if seconds < 100:
+        return f"{seconds:.0f} s"
+    minutes = seconds / 60
+    return f"{minutes:.0f} min" if minutes < 100 else f"{minutes / 60:.1f} h"
+
+
 @contextlib.contextmanager
 def without_chatter() -> Iterator[None]:
     """Keep Lightning's tips, and its warnings of what is meant to be so, off the terminal."""

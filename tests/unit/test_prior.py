@@ -18,7 +18,8 @@ from dsr.degrade import Downsampling, make_sample
 from dsr.geometry.camera import Camera
 from dsr.holes import Blobs
 from dsr.methods.trained import packaged_weights
-from dsr.prior.method import DeepImagePrior, WarmStarted, cost_of_step
+from dsr.prior.method import DeepImagePrior, WarmStarted
+from dsr.prior.watching import cost_of_step
 from dsr.quality.functional import SurfacePair, rmse_v
 from dsr.quality.metrics import visual_metrics
 from dsr.sample import DepthSample, Scene
@@ -64,7 +65,7 @@ class Stopper:
 @pytest.fixture
 def _every_step(monkeypatch: pytest.MonkeyPatch) -> None:
     """Have the display told of every step."""
-    monkeypatch.setattr("dsr.prior.method._SECONDS_BETWEEN_LOOKS", -1.0)
+    monkeypatch.setattr("dsr.prior.watching._SECONDS_BETWEEN_LOOKS", -1.0)
 
 
 def _error(depth: Tensor, sample: DepthSample, where: Tensor | None = None) -> float:
@@ -171,7 +172,7 @@ def test_an_interrupted_optimisation_ends_in_the_bits_of_an_uninterrupted_one(tm
 def test_what_is_killed_goes_on_from_the_last_minute(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     sample, settings = _sample(), {"steps": 30}
     whole = _prior(**settings)(sample)
-    monkeypatch.setattr("dsr.prior.method._SECONDS_BETWEEN_CHECKPOINTS", -1.0)  # each step is a minute
+    monkeypatch.setattr("dsr.prior.watching._SECONDS_BETWEEN_CHECKPOINTS", -1.0)  # each step is a minute
 
     def kill(*_: object) -> None:
         raise RuntimeError("killed")
@@ -221,7 +222,9 @@ def test_a_rule_that_stopped_says_when() -> None:
 
 
 def test_the_memory_that_a_step_keeps_grows_with_the_network() -> None:
-    bytes_kept = [cost_of_step(_prior(widths=widths).module(_sample())[0])[1] for widths in ((4, 6), (32, 48))]
+    bytes_kept = [
+        cost_of_step(_prior(widths=widths, border=0).module(_sample())[0])[1] for widths in ((4, 6), (32, 48))
+    ]
     pixels = 32 * 48
     assert 4 * 4 * pixels < bytes_kept[0]
     assert 4 * 32 * pixels * 4 < bytes_kept[1] < 4 * 32 * pixels * 40

@@ -11,6 +11,8 @@ from lightning.pytorch.callbacks import ProgressBar
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
+from dsr.fitting import scores_line
+
 
 def bar(console: Console) -> Progress:
     """Return a bar of a name, how much of how much, the time passed and left, and a remark."""
@@ -103,9 +105,7 @@ class TrainingBar(ProgressBar):
 
     def on_validation_end(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
         """Print the scores of the pass."""
-        names = ("RMSE_d", "RMSE_v", "DSSIM_v", "LPIPS_v")
-        scores = {name: trainer.callback_metrics.get(f"val/{name}") for name in names}
-        text = "  ".join(f"{name} {float(value):.4f}" for name, value in scores.items() if value is not None)
+        text = scores_line(trainer)
         self._bar.console.print(f"step {trainer.global_step:>6}  validation: {text}", highlight=False, soft_wrap=True)
 
     def on_train_end(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
@@ -119,11 +119,3 @@ class TrainingBar(ProgressBar):
     def disable(self) -> None:
         """Show nothing."""
         self._bar.disable = True
-
-
-def duration(seconds: float) -> str:
-    """Return a time for a reader: 40 s, 12 min, 3.5 h."""
-    if seconds < 100:
-        return f"{seconds:.0f} s"
-    minutes = seconds / 60
-    return f"{minutes:.0f} min" if minutes < 100 else f"{minutes / 60:.1f} h"

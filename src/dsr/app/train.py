@@ -17,14 +17,14 @@ from rich.console import Console
 from dsr.app import rundir
 from dsr.app.build import build, fast_precision, pick_device
 from dsr.app.perceptual import perceptual_network
-from dsr.app.progress import duration, over
+from dsr.app.progress import over
 from dsr.app.runs import WEIGHTS, common, read_config, training_data
 from dsr.app.schema import ConfigError, TrainConfig, given_keys, plain_config
 from dsr.app.trainer import make_trainer, seconds_per_step
 from dsr.atomic import replacing
 from dsr.data.patches import PatchData
 from dsr.data.procedural.source import Procedural
-from dsr.fitting import fit
+from dsr.fitting import duration, fit
 from dsr.methods.network import DisparityNetwork
 from dsr.methods.trained import NETWORKS
 from dsr.methods.weights import load_network, save_network

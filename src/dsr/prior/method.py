@@ -8,14 +8,11 @@ they are filled with what the network finds natural.
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
-import time
 from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar
 
 import lightning
 import torch
@@ -25,7 +22,7 @@ from torch import Tensor
 from torch.utils.data import DataLoader
 
 from dsr.degrade import Downsampling, scene_generator
-from dsr.fitting import Interruption, LastValidation, Log, ValidationTable, fit, save_checkpoint, without_chatter
+from dsr.fitting import Interruption, LastValidation, Log, ValidationTable, duration, fit, without_chatter
 from dsr.geometry.camera import RangeType
 from dsr.methods.network import DTYPES, Precision
 from dsr.methods.skip_net import Padding
@@ -33,37 +30,11 @@ from dsr.methods.trained import build_trained
 from dsr.prior.optimisation import PriorOptimisation, PriorSettings
 from dsr.prior.problem import DataLoss, ImageProblem, PriorObjective
 from dsr.prior.stopping import Fixed, Oracle, Residual, Stopping, StoppingName, Variance, noise_level
+from dsr.prior.watching import Advance, Display, Keep, Origin, Silent, checkpoint_of, cost_of_step
 from dsr.sample import DepthSample
 
 WORKSPACE = "optimisation"
-_SECONDS_BETWEEN_CHECKPOINTS = 60.0
-_SECONDS_BETWEEN_LOOKS = 0.2
 _LOG_EVERY = 10
-_TEMPORARY = 1.6
-"""What a step needs at its peak, relative to what the forward pass keeps for the backward pass; measured."""
-
-
-class Display(Protocol):
-    """Where an optimisation says what it is about to do and how far it is."""
-
-    def say(self, line: str) -> None:
-        """Show a line."""
-        ...
-
-    def steps(self, name: str, total: int, done: int) -> AbstractContextManager[Callable[[int, str], None]]:
-        """Return a context whose value takes the number of steps done and a remark."""
-        ...
-
-
-class Silent:
-    """Shows nothing."""
-
-    def say(self, line: str) -> None:
-        """Show nothing."""
-
-    def steps(self, name: str, total: int, done: int) -> AbstractContextManager[Callable[[int, str], None]]:
-        """Show nothing."""
-        return contextlib.nullcontext(lambda _, __: None)
 
 
 @dataclass(kw_only=True)
@@ -137,21 +108,9 @@ class DeepImagePrior:
                 raise ValueError(f"method.{name}: expected {least} or more, got {getattr(self, name)}")
         if self.stopping == "oracle" and not self.validate_every:
             raise ValueError("method.validate_every: expected a positive number, as method.stopping=oracle needs it")
-        self._settings = PriorSettings(
-            steps=self.steps,
-            learning_rate=self.learning_rate,
-            widths=tuple(self.widths),
-            skips=tuple(self.skips),
-            padding=self.padding,
-            border=self.border,
-            guide=self.guide,
-            input_noise=self.input_noise,
-            perturbation=self.perturbation,
-            guide_perturbation=self.guide_perturbation,
-            average=self.average,
-            margin=self.margin,
-            mixed=self.precision == "bfloat16",
-        )
+        given = {each.name: getattr(self, each.name) for each in fields(PriorSettings) if each.name != "mixed"}
+        given |= {"widths": tuple(self.widths), "skips": tuple(self.skips)}
+        self._settings = PriorSettings(**given, mixed=self.precision == "bfloat16")
         self._objective = PriorObjective(self.data_loss, self.data_weight, self.w, self.w_intensity)
 
     @property
@@ -175,7 +134,7 @@ class DeepImagePrior:
             module, origin = self.module(sample)
             display = self.display or Silent()
             folder = None if self.workspace is None else self.workspace / WORKSPACE / sample.scene
-            resume = None if folder is None else _checkpoint_of(folder / "last.ckpt", origin)
+            resume = None if folder is None else checkpoint_of(folder / "last.ckpt", origin)
             display.say(self._announcement(module, sample.scene, resume is not None))
             trainer = self._trainer(module, folder, origin, display, sample.scene)
             try:
@@ -201,7 +160,8 @@ class DeepImagePrior:
         base = self.base(sample)
         truth = None if sample.depth is None else sample.depth[None].to(device, torch.float32)
         seed = scene_generator(self.seed, sample.dataset, sample.scene, sample.scale, "prior").initial_seed()
-        digest = hashlib.sha256(repr((self._settings, self._objective, self.stopping, self.patience, seed)).encode())
+        facts = (self._settings, self._objective, self.downsampling, self.stopping, self.patience, seed)
+        digest = hashlib.sha256(repr((facts, sample.camera, sample.camera_lr)).encode())
         for values in (sample.rgb, sample.depth_lr, base):
             if values is not None:
                 digest.update(values.detach().cpu().contiguous().numpy().tobytes())
@@ -233,7 +193,7 @@ class DeepImagePrior:
         noise = f", noise estimated as {noise_level(module.problem.coarse):.2%}" if self.stopping == "residual" else ""
         return (
             f"{scene}: {most}{self.steps} steps at {height} x {width} in {self.precision}"
-            f"{', resumed' if resumed else ''}; {most}about {_duration(seconds * self.steps)} "
+            f"{', resumed' if resumed else ''}; {most}about {duration(seconds * self.steps)} "
             f"({seconds:.2g} s a step as measured now), about {memory / 2**30:.1f} GiB of memory of its own{noise}"
         )
 
@@ -300,106 +260,7 @@ class WarmStarted(DeepImagePrior):
         return torch.where(depth.isfinite(), depth, sample.depth_lr.nanmean())
 
 
-class Origin(Callback):
-    """Keeps in each checkpoint what it came from."""
-
-    def __init__(self, origin: str) -> None:
-        self._origin = origin
-
-    def on_save_checkpoint(
-        self, trainer: lightning.Trainer, pl_module: lightning.LightningModule, checkpoint: dict[str, Any]
-    ) -> None:
-        """Write it down."""
-        checkpoint["origin"] = self._origin
-
-
-class Keep(Callback):
-    """Saves a checkpoint once a minute."""
-
-    def __init__(self, path: Path) -> None:
-        self._path, self._last = path, time.monotonic()
-
-    def on_train_batch_end(self, trainer: lightning.Trainer, *_: Any) -> None:
-        """Save if it is time."""
-        now = time.monotonic()
-        if now - self._last > _SECONDS_BETWEEN_CHECKPOINTS:
-            self._last = now
-            save_checkpoint(trainer, self._path)
-
-
-class Advance(Callback):
-    """Shows the steps with their loss."""
-
-    def __init__(self, display: Display, scene: str, total: int) -> None:
-        self._display, self._scene, self._total = display, scene, total
-        self._shown, self._stack = 0.0, contextlib.ExitStack()
-        self._update: Callable[[int, str], None] = lambda _, __: None
-
-    def on_train_start(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
-        """Begin at the step that the optimisation begins with."""
-        self._update = self._stack.enter_context(self._display.steps(self._scene, self._total, trainer.global_step))
-
-    def on_train_batch_end(self, trainer: lightning.Trainer, *_: Any) -> None:
-        """Move on; the loss is fetched from the device a few times a second."""
-        now = time.monotonic()
-        if now - self._shown > _SECONDS_BETWEEN_LOOKS:
-            self._shown = now
-            loss = trainer.callback_metrics.get("train/loss")
-            self._update(trainer.global_step, "" if loss is None else f"{self._scene}, loss {float(loss):.4f}")
-
-    def on_validation_end(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
-        """Say the scores of the pass."""
-        names = ("RMSE_d", "RMSE_v", "DSSIM_v", "LPIPS_v")
-        scores = {name: trainer.callback_metrics.get(f"val/{name}") for name in names}
-        text = "  ".join(f"{name} {float(value):.4f}" for name, value in scores.items() if value is not None)
-        if text:
-            self._display.say(f"{self._scene}: step {trainer.global_step:>6}  {text}")
-
-    def teardown(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule, stage: str) -> None:
-        """Take the bar away."""
-        self._stack.close()
-
-
-def cost_of_step(module: PriorOptimisation) -> tuple[float, float]:
-    """Return the seconds of a step, and the bytes that it and the optimiser need; the module is left as it was."""
-    state, taken = module.generator.get_state(), 0.0
-    kept: dict[int, int] = {}
-
-    def pack(x: Tensor) -> Tensor:
-        kept[x.untyped_storage().data_ptr()] = x.untyped_storage().nbytes()
-        return x
-
-    for _ in range(2):  # the first one warms up
-        kept.clear()
-        start = time.perf_counter()
-        with torch.autograd.graph.saved_tensors_hooks(pack, lambda x: x):
-            loss = module.objective(*module.answer(), module.problem)["loss"]
-        loss.backward()
-        loss.item()
-        taken = time.perf_counter() - start
-    module.zero_grad(set_to_none=True)
-    module.generator.set_state(state)
-    parameters = sum(each.numel() * each.element_size() for each in module.parameters())
-    return taken, int(_TEMPORARY * sum(kept.values())) + 3 * parameters
-
-
 def _numbers(count: int) -> Any:
     """Return a loader of numbers, one for each step; it leaves the global random numbers alone."""
     numbers: Any = range(count)
     return DataLoader(numbers, batch_size=None, generator=torch.Generator())
-
-
-def _checkpoint_of(path: Path, origin: str) -> Path | None:
-    """Return the checkpoint if there is one that came from the same problem and settings."""
-    if not path.is_file():
-        return None
-    try:
-        stored = torch.load(path, map_location="cpu", weights_only=True).get("origin")
-    except Exception:
-        return None
-    return path if stored == origin else None
-
-
-def _duration(seconds: float) -> str:
-    """Return a time for a reader."""
-    return f"{seconds:.0f} s" if seconds < 100 else f"{seconds / 60:.0f} min"
