@@ -10,13 +10,18 @@ from pathlib import Path
 import pytest
 
 BENCHMARKS = Path(__file__).resolve().parents[2] / "benchmarks"
-SMALL = {"train_speed.py": ("--patch", "32", "--batch", "2", "--steps", "1")}
+SMALL = {
+    "train_speed.py": (("--patch", "32", "--batch", "2", "--steps", "1"), 3),
+    "dip_speed.py": (("--size", "64", "--steps", "1", "--quality-steps", "2"), 4),
+}
+"""Arguments, and how many ratios are printed."""
 
 
 @pytest.mark.parametrize("name", SMALL)
 def test_a_benchmark_prints_ratios(name: str) -> None:
+    arguments, ratios = SMALL[name]
     done = subprocess.run(
-        [sys.executable, str(BENCHMARKS / name), *SMALL[name]], capture_output=True, text=True, timeout=120, check=False
+        [sys.executable, str(BENCHMARKS / name), *arguments], capture_output=True, text=True, timeout=120, check=False
     )
     assert done.returncode == 0, done.stderr
-    assert len(re.findall(r"\d\.\d+ times as fast", done.stdout)) == 3
+    assert len(re.findall(r"\d\.\d+ times as fast", done.stdout)) == ratios
