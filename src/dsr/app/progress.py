@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
 import lightning
@@ -28,20 +28,6 @@ def bar(console: Console) -> Progress:
     return Progress(*columns, console=console, disable=not console.is_terminal)
 
 
-def over(console: Console, items: Iterable[str], description: str, total: int | None = None) -> Iterable[str]:
-    """Yield the items, ``total`` of them; the bar names the one at hand."""
-    if total is None:
-        items = list(items)
-        total = len(items)
-    with bar(console) as progress:
-        task = progress.add_task(description, total=total, remark="")
-        for item in items:
-            progress.update(task, remark=item)
-            yield item
-            progress.advance(task)
-        progress.update(task, remark="")
-
-
 class Display:
     """Bars for passes over scenes, and below them bars for the steps of the scene at hand.
 
@@ -54,11 +40,14 @@ class Display:
         self._console = console
         self._passes: Progress | None = None
 
-    def __call__(self, items: Sequence[str], description: str) -> Iterator[str]:
-        """Yield the items; the bar names the one at hand."""
+    def __call__(self, items: Iterable[str], description: str, total: int | None = None) -> Iterator[str]:
+        """Yield the items, ``total`` of them; the bar names the one at hand."""
+        if total is None:
+            items = list(items)
+            total = len(items)
         with bar(self._console) as progress:
             self._passes = progress
-            task = progress.add_task(description, total=len(items), remark="")
+            task = progress.add_task(description, total=total, remark="")
             try:
                 for item in items:
                     progress.update(task, remark=item)

@@ -17,7 +17,7 @@ from rich.console import Console
 from dsr.app import rundir
 from dsr.app.build import build, fast_precision, pick_device
 from dsr.app.perceptual import perceptual_network
-from dsr.app.progress import over
+from dsr.app.progress import Display
 from dsr.app.runs import WEIGHTS, common, read_config, training_data
 from dsr.app.schema import ConfigError, TrainConfig, given_keys, plain_config
 from dsr.app.trainer import make_trainer, seconds_per_step
@@ -131,7 +131,7 @@ def _prepare(console: Console, data: PatchData) -> None:
     """Let the data sets that render their scenes do so, with a bar."""
     for source, names in data.used:
         if isinstance(source, Procedural):
-            for _ in over(console, source.prepare(names), "render", len(names)):
+            for _ in Display(console)(source.prepare(names), "render", len(names)):
                 pass
 
 

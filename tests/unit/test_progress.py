@@ -1,0 +1,53 @@
+"""Bars and lines on the console."""
+
+from __future__ import annotations
+
+import io
+
+import pytest
+from rich.console import Console
+
+from dsr.app.progress import Display
+
+
+def _display(*, terminal: bool) -> tuple[Display, io.StringIO]:
+    text = io.StringIO()
+    return Display(Console(file=text, force_terminal=terminal, width=100)), text
+
+
+def test_off_a_terminal_there_are_lines_alone() -> None:
+    display, text = _display(terminal=False)
+    for item in display(["a", "b"], "predict"):
+        display.say(f"{item}: [about] 3 min")
+        with display.steps(item, 10, 0) as update:
+            update(5, "loss 0.1")
+    assert text.getvalue().strip() == "a: [about] 3 min\nb: [about] 3 min"
+
+
+def test_steps_are_shown_below_the_pass_that_they_belong_to() -> None:
+    display, text = _display(terminal=True)
+    for item in display(["statue"], "predict"):
+        with display.steps(item, 120, 40) as update:
+            update(60, "loss 0.25")
+            display._passes.refresh()  # type: ignore[union-attr]
+    shown = text.getvalue()
+    assert "predict" in shown
+    assert "60/120" in shown
+    assert "loss 0.25" in shown
+
+
+def test_steps_need_no_pass_around_them() -> None:
+    display, text = _display(terminal=True)
+    with display.steps("statue", 120, 40) as update:
+        update(120, "loss 0.25")
+    assert "statue" in text.getvalue()
+
+
+def test_after_an_error_the_terminal_is_free_again() -> None:
+    display, _ = _display(terminal=True)
+    for _ in range(2):
+        with pytest.raises(ValueError, match="broken"):
+            for item in display(["a", "b"], "predict"):
+                with display.steps(item, 10, 0):
+                    raise ValueError("broken")
+    assert list(display(["c"], "score")) == ["c"]
