@@ -45,9 +45,13 @@ def test_steps_need_no_pass_around_them() -> None:
 
 def test_after_an_error_the_terminal_is_free_again() -> None:
     display, _ = _display(terminal=True)
+
+    def fail() -> None:
+        for item in display(["a", "b"], "predict"):
+            with display.steps(item, 10, 0):
+                raise ValueError("broken")
+
     for _ in range(2):
         with pytest.raises(ValueError, match="broken"):
-            for item in display(["a", "b"], "predict"):
-                with display.steps(item, 10, 0):
-                    raise ValueError("broken")
+            fail()
     assert list(display(["c"], "score")) == ["c"]
