@@ -59,6 +59,8 @@ ABLATION: Mapping[str, Mapping[str, Any]] = {
     "  16, 32, 64, 128, 128 channels": {"widths": (16, 32, 64, 128, 128)},
     "  seed 1": {"seed": 1},
     "  seed 2": {"seed": 2},
+    "  border 16": {"border": 16},
+    "  perturbation 0.2": {"perturbation": 0.2},
 }
 
 

@@ -252,6 +252,19 @@ def test_the_network_sees_a_mirrored_border_that_the_answer_has_not() -> None:
     assert wide.start.shape == (1, 35, 32 + 62, 48 + 62)
 
 
+def test_normals_of_noise_do_not_count() -> None:
+    clean = _sample()
+    draws = torch.randn(clean.depth_lr.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    noisy = DepthSample(**{**vars(clean), "depth_lr": clean.depth_lr * (1 + 0.02 * draws)})
+    weights = [_prior(w=0.7).module(sample)[0].objective.w for sample in (clean, noisy)]
+    assert weights == [0.7, 0.0]
+    assert _prior(w=0.7, largest_tilt=None).module(noisy)[0].objective.w == 0.7
+    display = Stopper(-1)
+    _prior(steps=1, display=display)(noisy)
+    noise = r"noise of \d\.\d+% tilts the input's normals by \d+ degrees"
+    assert re.fullmatch(rf"step: without MSE_v; {noise}, more than method.largest_tilt", display.lines[1])
+
+
 def test_an_oracle_is_flagged() -> None:
     assert _prior(stopping="oracle", validate_every=5).flag == "oracle"
     assert _prior(stopping="variance").flag == ""
@@ -285,6 +298,7 @@ def test_a_warm_start_begins_at_the_trained_networks_answer() -> None:
         {"input_noise": 0.0, "guide": False},
         {"margin": -0.1},
         {"border": -1},
+        {"largest_tilt": -1.0},
     ],
 )
 def test_settings_out_of_range_are_refused(settings: dict[str, object]) -> None:

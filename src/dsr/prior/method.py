@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -27,9 +27,10 @@ from dsr.geometry.camera import RangeType
 from dsr.methods.network import DTYPES, Precision
 from dsr.methods.skip_net import Padding
 from dsr.methods.trained import build_trained
+from dsr.prior.noise import noise_level, tilt_of
 from dsr.prior.optimisation import PriorOptimisation, PriorSettings
 from dsr.prior.problem import DataLoss, ImageProblem, PriorObjective
-from dsr.prior.stopping import Fixed, Oracle, Residual, Stopping, StoppingName, Variance, noise_level
+from dsr.prior.stopping import Fixed, Oracle, Residual, Stopping, StoppingName, Variance
 from dsr.prior.watching import Advance, Display, Keep, Origin, Silent, checkpoint_of, cost_of_step
 from dsr.sample import DepthSample
 
@@ -50,6 +51,8 @@ class DeepImagePrior:
         steps, learning_rate, widths, skips, padding, border, guide, input_noise, perturbation, guide_perturbation,
             average, margin: see :class:`~dsr.prior.optimisation.PriorSettings`.
         data_loss, data_weight, w, w_intensity: see :class:`~dsr.prior.problem.PriorObjective`.
+        largest_tilt: degrees; where the noise that is estimated in the coarse map tilts its normals by more, they say
+            nothing of the surface, and MSE_v is left out. None for never.
         stopping: ``fixed``: after ``steps``; ``variance``: at the minimum of the iterates' variance; ``residual``: as
             soon as the coarse map is explained up to its estimated noise; ``oracle``: at the validation pass with the
             lowest RMSE_v, for which the truth is looked at.
@@ -88,6 +91,7 @@ class DeepImagePrior:
     data_weight: float = 1.0
     w: float = 1.0
     w_intensity: float = 0.01
+    largest_tilt: float | None = 10.0
     stopping: StoppingName = "fixed"
     patience: int = 200
     validate_every: int = 100
@@ -103,8 +107,8 @@ class DeepImagePrior:
         self.device = torch.device(self.device)
         if self.precision not in DTYPES:
             raise ValueError(f"precision: expected one of {', '.join(DTYPES)}, got {self.precision!r}")
-        for name, least in (("patience", 1), ("validate_every", 0)):
-            if getattr(self, name) < least:
+        for name, least in (("patience", 1), ("validate_every", 0), ("largest_tilt", 0)):
+            if (getattr(self, name) or 0) < least:
                 raise ValueError(f"method.{name}: expected {least} or more, got {getattr(self, name)}")
         if self.stopping == "oracle" and not self.validate_every:
             raise ValueError("method.validate_every: expected a positive number, as method.stopping=oracle needs it")
@@ -136,6 +140,8 @@ class DeepImagePrior:
             folder = None if self.workspace is None else self.workspace / WORKSPACE / sample.scene
             resume = None if folder is None else checkpoint_of(folder / "last.ckpt", origin)
             display.say(self._announcement(module, sample.scene, resume is not None))
+            if module.objective.w < self.w:
+                display.say(f"{sample.scene}: without MSE_v; {_noise_of(sample)}, more than method.largest_tilt")
             trainer = self._trainer(module, folder, origin, display, sample.scene)
             try:
                 with without_chatter():
@@ -160,14 +166,15 @@ class DeepImagePrior:
         base = self.base(sample)
         truth = None if sample.depth is None else sample.depth[None].to(device, torch.float32)
         seed = scene_generator(self.seed, sample.dataset, sample.scene, sample.scale, "prior").initial_seed()
-        facts = (self._settings, self._objective, self.downsampling, self.stopping, self.patience, seed)
+        objective = self._objective if self._normals_count(sample) else replace(self._objective, w=0.0)
+        facts = (self._settings, objective, self.downsampling, self.stopping, self.patience, seed)
         digest = hashlib.sha256(repr((facts, sample.camera, sample.camera_lr)).encode())
         for values in (sample.rgb, sample.depth_lr, base):
             if values is not None:
                 digest.update(values.detach().cpu().contiguous().numpy().tobytes())
         module = PriorOptimisation(
             problem,
-            self._objective,
+            objective,
             self._settings,
             self._rule(problem),
             seed,
@@ -176,6 +183,11 @@ class DeepImagePrior:
             None if base is None else base[None].to(device, torch.float32),
         )
         return module, digest.hexdigest()
+
+    def _normals_count(self, sample: DepthSample) -> bool:
+        """Return whether the coarse map's normals are more than noise."""
+        tilt = tilt_of(noise_level(sample.depth_lr[None]), sample.camera_lr)
+        return self.largest_tilt is None or tilt <= self.largest_tilt
 
     def _rule(self, problem: ImageProblem) -> Stopping:
         """Return the stopping rule."""
@@ -190,11 +202,10 @@ class DeepImagePrior:
         seconds, memory = cost_of_step(module)
         most = "" if self.stopping in ("fixed", "oracle") else "up to "
         height, width = module.problem.grey.shape[-2:]
-        noise = f", noise estimated as {noise_level(module.problem.coarse):.2%}" if self.stopping == "residual" else ""
         return (
             f"{scene}: {most}{self.steps} steps at {height} x {width} in {self.precision}"
             f"{', resumed' if resumed else ''}; {most}about {duration(seconds * self.steps)} "
-            f"({seconds:.2g} s a step as measured now), about {memory / 2**30:.1f} GiB of memory of its own{noise}"
+            f"({seconds:.2g} s a step as measured now), about {memory / 2**30:.1f} GiB of memory of its own"
         )
 
     def _trainer(
@@ -258,6 +269,12 @@ class WarmStarted(DeepImagePrior):
         """Return the trained network's answer; its holes are filled with the coarse map's mean."""
         depth = self._trained(sample).clone()
         return torch.where(depth.isfinite(), depth, sample.depth_lr.nanmean())
+
+
+def _noise_of(sample: DepthSample) -> str:
+    """Return the noise that is estimated in a coarse map, for a reader."""
+    noise = noise_level(sample.depth_lr[None])
+    return f"noise of {noise:.2%} tilts the input's normals by {tilt_of(noise, sample.camera_lr):.0f} degrees"
 
 
 def _numbers(count: int) -> Any:

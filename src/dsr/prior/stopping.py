@@ -11,7 +11,8 @@ from typing import Literal, Protocol
 
 import torch
 from torch import Tensor
-from torch.nn import functional
+
+from dsr.prior.noise import noise_level
 
 StoppingName = Literal["fixed", "variance", "residual", "oracle"]
 _EVERY = 20
@@ -169,24 +170,3 @@ class Oracle(Fixed):
     def restore(self, state: dict[str, Tensor]) -> None:
         """Go on from such a state."""
         self._lowest, self._best = float(state["lowest"]), state["best"].clone()
-
-
-def noise_level(coarse: Tensor) -> float:
-    """Return the standard deviation of a depth map's relative noise, estimated from the map alone.
-
-    Immerkaer, *Fast Noise Variance Estimation*, CVIU 1996: the difference of two Laplacians, which is 0 on planes and
-    on straight edges; here of the logarithm of depth, with the median instead of the mean, as depth has steps.
-
-    Args:
-        coarse: (1, 1, h, w) in metres, NaN in holes.
-
-    Returns:
-        0 where fewer than one 3 x 3 window is known.
-
-    """
-    if min(coarse.shape[-2:]) < 3:
-        return 0.0
-    row = torch.tensor([1.0, -2.0, 1.0], dtype=torch.float64, device=coarse.device)
-    answers = functional.conv2d(coarse.double().log(), torch.outer(row, row)[None, None]).abs()
-    known = answers[answers.isfinite()]
-    return float(known.median()) / 0.6745 / 6 if len(known) else 0.0

@@ -1,0 +1,46 @@
+"""How noisy a coarse depth map is, from the map alone, and what that does to its normals."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from dsr.geometry.camera import Camera
+
+
+def noise_level(coarse: Tensor) -> float:
+    """Return the standard deviation of a depth map's relative noise, estimated from the map alone.
+
+    Immerkaer, *Fast Noise Variance Estimation*, CVIU 1996: the difference of two Laplacians, which is 0 on planes and
+    on straight edges; here of the logarithm of depth, with the median instead of the mean, as depth has steps.
+
+    Args:
+        coarse: (1, 1, h, w) in metres, NaN in holes.
+
+    Returns:
+        0 where fewer than one 3 x 3 window is known.
+
+    """
+    if min(coarse.shape[-2:]) < 3:
+        return 0.0
+    row = torch.tensor([1.0, -2.0, 1.0], dtype=torch.float64, device=coarse.device)
+    answers = functional.conv2d(coarse.double().log(), torch.outer(row, row)[None, None]).abs()
+    known = answers[answers.isfinite()]
+    return float(known.median()) / 0.6745 / 6 if len(known) else 0.0
+
+
+def tilt_of(noise: float, camera: Camera) -> float:
+    """Return the standard deviation, in degrees, by which relative depth noise tilts the normals of a frontal surface.
+
+    Two neighbouring pixels at depth z are z / f metres apart; noise of standard deviation s z in each makes a slope of
+    standard deviation sqrt(2) s f.
+
+    Args:
+        noise: relative standard deviation of depth, s.
+        camera: of the coarse map.
+
+    """
+    return math.degrees(math.atan(math.sqrt(2) * noise * camera.fx))
