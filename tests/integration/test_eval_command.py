@@ -317,7 +317,7 @@ USAGE_ERRORS = {
     "sigma": (["downsampling=gaussian", "downsampling.sigma=-1"], "downsampling.sigma: expected at least 0.1"),
     "a device that is not here": (["device=gpu"], "device: expected auto, cpu or a device of this machine"),
     "a device without numbers": (["device=meta"], "device: expected auto, cpu or a device of this machine"),
-    "a precision": (["precision=half"], "precision: expected one of float32, bfloat16, got half"),
+    "a precision": (["precision=half"], "precision: expected one of float32, bfloat16, auto, got half"),
     "a seed": (["seed=-1"], "seed: expected 0 or a positive number"),
     "no root": (["dataset=folder"], "dataset.root: dataset=folder needs it: dataset.root=..."),
     "a missing root": (["dataset=folder", "dataset.root=no where"], "dataset.root: expected a directory of scenes"),
@@ -367,7 +367,10 @@ def test_a_usage_error_of_the_real_command_is_one_line_too(tmp_path, offline):
 def test_the_help_lists_the_choices(within):
     code, output, errors = within("--help")
     assert (code, errors) == (0, [])
-    for line in ("dataset: folder, mixture, procedural, simgeo", "method: bicubic, bilinear, facets, msg, msg_v"):
+    for line in (
+        "dataset: folder, mixture, procedural, simgeo",
+        "method: bicubic, bilinear, dip, dip_v, dip_v_warm, facets, msg, msg_v",
+    ):
         assert line in output
 
 

@@ -167,7 +167,7 @@ def test_the_settings_of_a_run_are_checked():
     ("changes", "message"),
     [
         ({"scale": 3}, "scale: expected one of 2, 4, 8, 16, got 3"),
-        ({"precision": "float16"}, "precision: expected one of float32, bfloat16, got float16"),
+        ({"precision": "float16"}, "precision: expected one of float32, bfloat16, auto, got float16"),
         ({"seed": -1}, "seed: expected 0 or a positive number, got -1"),
         ({"method": "???"}, "method: missing; give it as method=..."),
         ({"dataset": None}, "dataset: missing; give it as dataset=..."),

@@ -37,11 +37,13 @@ def command(monkeypatch, tmp_path, capfd):
 
 
 SETTINGS = (
-    "dataset, downsampling, noise, metrics, scale, device, precision, seed, output_dir, overwrite, method, weights, run"
+    "dataset, downsampling, noise, metrics, scale, device, precision, seed, output_dir, overwrite, holes, "
+    "method, weights, run"
 )
+METHODS = "bicubic, bilinear, dip, dip_v, dip_v_warm, facets, msg, msg_v, msg_v_noisy, nearest"
 USAGE_ERRORS = {
     "dataset=fodler": "dataset=fodler: unknown; expected one of folder, mixture, procedural, simgeo",
-    "method=msgv": "method=msgv: unknown; expected one of bicubic, bilinear, facets, msg, msg_v, msg_v_noisy, nearest",
+    "method=msgv": f"method=msgv: unknown; expected one of {METHODS}",
     "downsampling=boxx": (
         "downsampling=boxx: unknown; expected one of bicubic, bilinear, box, gaussian, measured, nearest"
     ),
@@ -55,8 +57,8 @@ USAGE_ERRORS = {
     "seed=1.5": "seed: Value '1.5' of type 'float' could not be converted to Integer",
     "overwrite=maybe": "overwrite: Value 'maybe' is not a valid bool (type str)",
     "metrics.lpips=perhaps": "metrics.lpips: Value 'perhaps' is not a valid bool (type str)",
-    "method=null": "method=null: expected one of bicubic, bilinear, facets, msg, msg_v, msg_v_noisy, nearest",
-    "method=": "method=: expected one of bicubic, bilinear, facets, msg, msg_v, msg_v_noisy, nearest",
+    "method=null": f"method=null: expected one of {METHODS}",
+    "method=": f"method=: expected one of {METHODS}",
     "scale": "scale: expected KEY=VALUE",
     "output_dir=a=b": (
         "output_dir: cannot read the value a=b; special characters need quotes within quotes: 'output_dir=\"a=b\"'"
@@ -147,8 +149,7 @@ def test_a_failing_job_of_a_multirun_keeps_the_others_and_the_exit_code_says_so(
 def test_a_multirun_with_an_unknown_choice_starts_no_job(command):
     code, error, seen = command("-m", "method=bicubic,neerest")
     assert (code, seen) == (2, [])
-    choices = "bicubic, bilinear, facets, msg, msg_v, msg_v_noisy, nearest"
-    assert error == f"error: method=neerest: unknown; expected one of {choices}\n"
+    assert error == f"error: method=neerest: unknown; expected one of {METHODS}\n"
 
 
 def test_a_missing_configuration_directory_says_where_to_run(monkeypatch, tmp_path, capsys):

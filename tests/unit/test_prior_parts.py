@@ -174,7 +174,7 @@ def test_the_noise_of_a_depth_map_is_estimated_from_the_map_alone(std: float) ->
         1 + std * torch.randn(depth.shape, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
     )
     noisy[..., 20:40, 30:60] = torch.nan
-    assert noise_level(noisy) == pytest.approx(std, rel=0.06)
+    assert noise_level(noisy) == pytest.approx(std, rel=0.1)
     assert noise_level(depth) < 1e-5
     assert noise_level(depth[..., :2, :2]) == 0
 
