@@ -427,8 +427,9 @@ def test_a_picture_too_small_for_the_scale_is_refused_by_name(tmp_path, within, 
 def test_an_interruption_keeps_what_is_finished_and_the_same_command_goes_on(tmp_path, offline):
     arguments = ("dataset=simgeo", "dataset.size=256", "output_dir=out", "metrics.lpips=false")
     with subprocess.Popen(
-        command(*arguments), cwd=tmp_path, env=offline, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    ) as process:
+        command(*arguments), cwd=tmp_path, env=offline, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # a shell's background job ignores it
+    ) as process:  # fmt: skip
         deadline = time.monotonic() + 60
         while not list((tmp_path / "out" / "predictions").glob("[!.]*.npz")) and time.monotonic() < deadline:
             time.sleep(0.02)
