@@ -428,7 +428,7 @@ def test_an_interruption_keeps_what_is_finished_and_the_same_command_goes_on(tmp
     arguments = ("dataset=simgeo", "dataset.size=256", "output_dir=out", "metrics.lpips=false")
     with subprocess.Popen(
         command(*arguments), cwd=tmp_path, env=offline, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # a shell's background job ignores it
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # noqa: PLW1509 - background jobs ignore it
     ) as process:  # fmt: skip
         deadline = time.monotonic() + 60
         while not list((tmp_path / "out" / "predictions").glob("[!.]*.npz")) and time.monotonic() < deadline:
