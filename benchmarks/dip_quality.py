@@ -16,6 +16,7 @@ import csv
 import os
 import tempfile
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,7 @@ import torch
 from torch import Tensor
 
 from dsr.app.build import fast_precision
+from dsr.data.augment import window
 from dsr.data.folder import Folder
 from dsr.degrade import Downsampling, GaussianMultiplicative, make_sample
 from dsr.methods.interpolation import Interpolation
@@ -65,12 +67,9 @@ ABLATION: Mapping[str, Mapping[str, Any]] = {
 
 
 def crop(scenes: Path, name: str, rows: tuple[int, int], columns: tuple[int, int]) -> Scene:
-    """Return a window of a scene."""
-    whole = Folder(str(scenes), [name]).load(name)
-    (top, bottom), (left, right) = rows, columns
-    camera = whole.camera.crop(top, left, bottom - top, right - left)
-    rgb, depth = whole.rgb[:, top:bottom, left:right], whole.depth
-    return Scene("crop", name, rgb, camera, None if depth is None else depth[:, top:bottom, left:right])
+    """Return a square window of a scene, as a data set of its own: random numbers follow from its name."""
+    (top, bottom), (left, _) = rows, columns
+    return replace(window(Folder(str(scenes), [name]).load(name), top, left, bottom - top), dataset="crop")
 
 
 def scores_of(depth: Tensor, sample: DepthSample) -> dict[str, float]:

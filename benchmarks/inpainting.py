@@ -19,6 +19,7 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from dsr.app.build import fast_precision
+from dsr.data.augment import window
 from dsr.data.folder import Folder
 from dsr.degrade import Downsampling, make_sample
 from dsr.geometry.shading import render
@@ -36,10 +37,7 @@ KINDS: dict[str, Holes] = {"blobs": Blobs(0.1, 12.0), "shadows": Shadows(0.2)}
 
 def centre(scene: Scene, size: int) -> Scene:
     """Return the window of ``size`` pixels in the middle of a scene."""
-    top, left = (scene.camera.height - size) // 2, (scene.camera.width - size) // 2
-    window = (slice(None), slice(top, top + size), slice(left, left + size))
-    depth = None if scene.depth is None else scene.depth[window]
-    return Scene(scene.dataset, scene.name, scene.rgb[window], scene.camera.crop(top, left, size, size), depth)
+    return window(scene, (scene.camera.height - size) // 2, (scene.camera.width - size) // 2, size)
 
 
 def results(sample: DepthSample, steps: int) -> dict[str, Tensor]:

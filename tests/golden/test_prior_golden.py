@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
 from torch import Tensor
 
+from dsr.data.augment import window
 from dsr.data.folder import Folder
 from dsr.degrade import Downsampling, make_sample
 from dsr.methods.interpolation import Interpolation
 from dsr.prior.method import DeepImagePrior
 from dsr.quality.functional import SurfacePair, dssim_v, rmse_d, rmse_v
-from dsr.sample import DepthSample, Scene
+from dsr.sample import DepthSample
 
 BOX = Downsampling("box")
 
@@ -22,10 +24,7 @@ BOX = Downsampling("box")
 def sample(shared: Path) -> DepthSample:
     """Rows 96:224, columns 160:288, at x4."""
     whole = Folder(str(shared / "scenes"), ["lucy"]).load("lucy")
-    assert whole.depth is not None
-    window = (slice(None), slice(96, 224), slice(160, 288))
-    scene = Scene("crop", "lucy", whole.rgb[window], whole.camera.crop(96, 160, 128, 128), whole.depth[window])
-    return make_sample(scene, 4, BOX, "orthogonal")
+    return make_sample(replace(window(whole, 96, 160, 128), dataset="crop"), 4, BOX, "orthogonal")
 
 
 def _scores(depth: Tensor, sample: DepthSample) -> dict[str, float]:

@@ -298,6 +298,7 @@ def test_a_warm_start_begins_at_the_trained_networks_answer() -> None:
         {"input_noise": 0.0, "guide": False},
         {"margin": -0.1},
         {"border": -1},
+        {"stopping": "never"},
         {"largest_tilt": -1.0},
     ],
 )

@@ -12,7 +12,7 @@ import hashlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, get_args
 
 import lightning
 import torch
@@ -110,6 +110,10 @@ class DeepImagePrior:
         for name, least in (("patience", 1), ("validate_every", 0), ("largest_tilt", 0)):
             if (getattr(self, name) or 0) < least:
                 raise ValueError(f"method.{name}: expected {least} or more, got {getattr(self, name)}")
+        if self.stopping not in get_args(StoppingName):
+            raise ValueError(
+                f"method.stopping: expected one of {', '.join(get_args(StoppingName))}, got {self.stopping!r}"
+            )
         if self.stopping == "oracle" and not self.validate_every:
             raise ValueError("method.validate_every: expected a positive number, as method.stopping=oracle needs it")
         given = {each.name: getattr(self, each.name) for each in fields(PriorSettings) if each.name != "mixed"}
@@ -144,8 +148,7 @@ class DeepImagePrior:
                 display.say(f"{sample.scene}: without MSE_v; {_noise_of(sample)}, more than method.largest_tilt")
             trainer = self._trainer(module, folder, origin, display, sample.scene)
             try:
-                with without_chatter():
-                    fit(trainer, module, _numbers(self.steps), resume, val_dataloaders=_numbers(1))
+                fit(trainer, module, _numbers(self.steps), resume, val_dataloaders=_numbers(1))
             except KeyboardInterrupt:
                 where = f"interrupted at step {trainer.global_step} of {sample.scene}"
                 on = "; the same command goes on from there" if folder is not None else ""
@@ -220,7 +223,7 @@ class DeepImagePrior:
             if module.metrics is not None and self.validate_every:
                 callbacks.append(ValidationTable(folder / "validation.csv"))
             logger = Log(folder.parent, name="", version=scene, default_hp_metric=False)
-            logger.list_run({"scene": scene, "scale": self.scale, "stopping": self.stopping, "w": self.w,
+            logger.list_run({"scene": scene, "scale": self.scale, "stopping": self.stopping, "w": module.objective.w,
                              "data_loss": self.data_loss, "steps": self.steps, "seed": self.seed})  # fmt: skip
         device = torch.device(self.device)
         with without_chatter():

@@ -7,6 +7,7 @@ the answer, and none but :class:`Oracle` ever sees the truth.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Literal, Protocol
 
 import torch
@@ -131,21 +132,13 @@ class Residual(Fixed):
 
     """
 
-    def __init__(self, coarse: Tensor, residual: Residue) -> None:
+    def __init__(self, coarse: Tensor, residual: Callable[[Tensor], Tensor]) -> None:
         self.noise = noise_level(coarse)
         self._residual = residual
 
     def observe(self, step: int, depth: Tensor, average: Tensor) -> bool:
         """Compare the residual with the noise."""
         return step % _EVERY == 0 and step > _SETTLED and float(self._residual(average)) <= self.noise
-
-
-class Residue(Protocol):
-    """How far a map is from explaining the coarse one."""
-
-    def __call__(self, depth: Tensor) -> Tensor:
-        """Return the root mean square of the coarse version's relative error, a scalar."""
-        ...
 
 
 class Oracle(Fixed):
