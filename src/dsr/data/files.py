@@ -53,6 +53,19 @@ def read_map(path: Path) -> np.ndarray:
     return values.astype(np.float64)
 
 
+def read_levels(path: Path) -> np.ndarray:
+    """Return an 8-bit one-channel picture as it is, (H, W) uint8: disparities of older benchmarks.
+
+    Raises:
+        ValueError: it is missing, damaged, or has other values.
+
+    """
+    levels = _decode(path, cv2.IMREAD_UNCHANGED)
+    if levels.ndim != 2 or levels.dtype != np.uint8:
+        raise ValueError(f"{path}: expected one channel of 8 bits, got {levels.dtype} of shape {levels.shape}")
+    return levels
+
+
 def read_mask(path: Path) -> np.ndarray:
     """Return a mask, (H, W) bool: True where the picture is not 0.
 

@@ -1,0 +1,221 @@
+"""Middlebury stereo data: 2014 (floating point disparity, full calibration) and 2001 to 2006 (8-bit disparity).
+
+Formats as on vision.middlebury.edu/stereo/data: disparity d in pixels of the left view, z = baseline f / (d + doffs).
+
+- 2014 (Scharstein et al., GCPR 2014): ``im0.png``, ``calib.txt``, ``disp0.pfm`` (``disp0GT.pfm`` in the smaller sizes of
+  the evaluation kit); inf = unknown.
+- 2005, 2006 (Scharstein and Pal, Hirschmueller and Scharstein, CVPR 2007): ``view1.png``, ``disp1.png``, 0 = unknown.
+  f = 3740 pixels at full size, baseline 160 mm. A level is a pixel of the full size, be the map full size, half or a
+  third; ``dmin.txt`` has the disparity, in such pixels, by which the views were shifted. Without it depths are too far,
+  though planes stay planes.
+- 2003 (Scharstein and Szeliski, CVPR 2003): ``im2.png``, ``disp2.png``, 4 levels a pixel, 0 = unknown. The camera is the
+  one that the evaluation kit has for Teddy.
+- 2001 (Scharstein and Szeliski, IJCV 2002): ``im2.ppm``, ``disp2.pgm``, 8 levels a pixel. No camera was published; it is
+  assumed to be the one of 2003.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from types import MappingProxyType
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from dsr.data.files import read_levels, read_map, read_rgb
+from dsr.data.terraces import smoothed_levels
+from dsr.geometry.camera import Camera, from_range
+from dsr.sample import Scene
+
+YEARS = (2001, 2003, 2005, 2006)
+_MATRIX = re.compile(r"\[\s*(\S+)\s+0\s+(\S+)\s*;\s*0\s+(\S+)\s+(\S+)\s*;\s*0\s+0\s+1\s*\]")
+_FULL_HEIGHT, _FULL_FOCAL, _BASELINE = 1110, 3740.0, 0.16
+_TEDDY = MappingProxyType({"fx": 1500.0, "fy": 1500.0, "baseline": 0.08, "doffs": 52.0, "cx": 199.0, "cy": 187.0})
+_NOISY = MappingProxyType({4: "_depth_2_n.png", 8: "_depth_3_n.png"})
+
+
+@dataclass(frozen=True)
+class Files:
+    """The files of a scene of 2001 to 2006.
+
+    Args:
+        photo, disparity: of the left view.
+        shift: ``dmin.txt``, None where there is none.
+        measured: noisy coarse disparities by factor.
+
+    """
+
+    photo: Path
+    disparity: Path
+    shift: Path | None
+    measured: Mapping[int, Path]
+
+
+def find_2014(root: Path) -> dict[str, Path]:
+    """Return the folders of the scenes of 2014 below ``root``, by name in small letters, without ``-perfect``."""
+    found: dict[str, Path] = {}
+    for folder in sorted(path.parent for path in root.glob("*/calib.txt")):
+        found.setdefault(re.sub(r"-(im)?perfect$", "", folder.name).casefold(), folder)  # imperfect sorts first
+        if folder.name.endswith("-perfect"):
+            found[folder.name.removesuffix("-perfect").casefold()] = folder
+    return found
+
+
+def find_levels(root: Path) -> dict[str, Files]:
+    """Return the files of the scenes of 2001 to 2006 below ``root``, by name in small letters.
+
+    ``NAME/view1.png``, ``NAME/im2.png`` or ``.ppm`` with their disparity, or ``NAME_color.png`` and ``NAME_big.png``.
+    """
+    pairs = (("view1.png", "disp1.png"), ("im2.png", "disp2.png"), ("im2.ppm", "disp2.pgm"))
+    found: dict[str, Files] = {}
+    for photo, disparity in pairs:
+        for path in sorted(root.glob(f"*/{photo}")):
+            shift = path.with_name("dmin.txt")
+            files = Files(path, path.with_name(disparity), shift if shift.is_file() else None, {})
+            found[path.parent.name.casefold()] = files
+    for path in sorted(root.glob("*_color.png")):
+        name = path.name.removesuffix("_color.png")
+        measured = {factor: root / (name + end) for factor, end in _NOISY.items() if (root / (name + end)).is_file()}
+        found[name.casefold()] = Files(path, root / f"{name}_big.png", None, measured)
+    return found
+
+
+def load_2014(folder: Path, dataset: str, name: str, *, offset: bool = True) -> Scene:
+    """Return a scene of 2014.
+
+    Args:
+        folder: with the files.
+        dataset, name: of the scene.
+        offset: whether doffs of ``calib.txt`` counts, as it has to geometrically, or is taken for 0.
+
+    Raises:
+        ValueError: a file is missing, damaged, or does not fit the others; the message names it.
+
+    """
+    camera = read_calibration(folder / "calib.txt")
+    path = folder / "disp0.pfm"
+    if not path.is_file() and (folder / "disp0GT.pfm").is_file():
+        path = folder / "disp0GT.pfm"
+    values = read_map(path)
+    _expect_size(path, values, camera)
+    values[~np.isfinite(values)] = np.nan
+    low = -camera.doffs if offset else 0.0
+    if np.nanmin(values, initial=np.inf) <= low:
+        raise ValueError(f"{path}: expected disparities above {low:g} pixels, got {np.nanmin(values):g}")
+    if not offset:
+        camera = replace(camera, doffs=0.0)
+    return Scene(dataset, name, _photo(folder / "im0.png", camera), camera, _depth(path, values, camera))
+
+
+def load_levels(files: Files, dataset: str, name: str, year: int, *, smooth: bool = True) -> Scene:
+    """Return a scene of 2001 to 2006.
+
+    Args:
+        files: of the scene.
+        dataset, name: of the scene.
+        year: that of the data set, which says how levels count.
+        smooth: whether terraces of the rounding become slopes; see :mod:`dsr.data.terraces`.
+
+    Raises:
+        ValueError: a file is missing, damaged, or does not fit the others; the message names it.
+
+    """
+    levels = read_levels(files.disparity).astype(np.float64)
+    height, width = levels.shape
+    camera, per_pixel = _CAMERAS[year](files, height, width)
+    levels[levels == 0] = np.nan
+    depth = _depth(files.disparity, (smoothed_levels(levels) if smooth else levels) / per_pixel, camera)
+    measured = {}
+    for factor, path in files.measured.items():
+        coarse = camera.coarser(factor)
+        values = read_levels(path).astype(np.float64)
+        _expect_size(path, values, coarse)
+        values[values == 0] = np.nan
+        measured[factor] = _depth(path, values / (per_pixel * factor), coarse)
+    return Scene(dataset, name, _photo(files.photo, camera), camera, depth, measured)
+
+
+def read_calibration(path: Path) -> Camera:
+    """Return the left camera of a ``calib.txt``.
+
+    Lines are ``key=value`` with blanks anywhere; ``cam0`` is a matrix as MATLAB writes it, ``baseline`` in millimetres,
+    the rest in pixels.
+
+    Raises:
+        ValueError: it is missing or damaged, or a key is missing or out of range.
+
+    """
+    if not path.is_file():
+        raise ValueError(f"{path}: expected a calibration, there is none")
+    lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
+    entries = {key.strip(): value.strip() for key, equals, value in (line.partition("=") for line in lines) if equals}
+    matrix = _MATRIX.fullmatch(entries.get("cam0", ""))
+    if matrix is None:
+        raise ValueError(f"{path}: cam0: expected [f 0 cx; 0 f cy; 0 0 1], got {entries.get('cam0', 'nothing'):.60}")
+    fx, cx, fy, cy = (_number(path, "cam0", text) for text in matrix.groups())
+    keys = ("doffs", "baseline", "width", "height")
+    doffs, baseline, width, height = (_number(path, key, entries.get(key, "nothing")) for key in keys)
+    try:
+        return Camera(int(width), int(height), fx, fy, cx, cy, baseline / 1000, doffs)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
+
+
+def _number(path: Path, key: str, text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = np.nan
+    if not np.isfinite(value) or (key in ("width", "height") and not value.is_integer()):
+        raise ValueError(f"{path}: {key}: expected a number, got {text:.40}")
+    return value
+
+
+def _photo(path: Path, camera: Camera) -> Tensor:
+    pixels = read_rgb(path)
+    _expect_size(path, pixels, camera)
+    return torch.from_numpy(pixels).permute(2, 0, 1).float() / 255
+
+
+def _depth(path: Path, disparity: np.ndarray, camera: Camera) -> Tensor:
+    """Return the depth of a disparity map, (1, H, W)."""
+    if np.isnan(disparity).all():
+        raise ValueError(f"{path}: expected at least one known disparity, all are unknown")
+    return from_range(torch.from_numpy(disparity)[None], camera, "disparity")
+
+
+def _expect_size(path: Path, values: np.ndarray, camera: Camera) -> None:
+    if values.shape[:2] != (camera.height, camera.width):
+        came = " x ".join(map(str, values.shape[:2]))
+        raise ValueError(f"{path}: expected {camera.height} x {camera.width} pixels (height x width), got {came}")
+
+
+def _camera_2006(files: Files, height: int, width: int) -> tuple[Camera, float]:
+    """Return the camera of 2005 and 2006 at a map's size, and levels per pixel."""
+    per_pixel = round(_FULL_HEIGHT / height)
+    if per_pixel not in (1, 2, 3):
+        raise ValueError(f"{files.disparity}: expected a height near {_FULL_HEIGHT}, a half or a third, got {height}")
+    shift = 0.0
+    if files.shift is not None:
+        text = files.shift.read_text(encoding="utf-8", errors="replace").strip()
+        shift = _number(files.shift, "dmin", text)
+    focal = _FULL_FOCAL / per_pixel
+    centre = ((width - 1) / 2, (height - 1) / 2)
+    return Camera(width, height, focal, focal, *centre, _BASELINE, shift / per_pixel), per_pixel
+
+
+def _camera_2003(files: Files, height: int, width: int) -> tuple[Camera, float]:
+    return Camera(width, height, **_TEDDY), 4
+
+
+def _camera_2001(files: Files, height: int, width: int) -> tuple[Camera, float]:
+    return Camera(width, height, **{**_TEDDY, "cx": (width - 1) / 2, "cy": (height - 1) / 2}), 8
+
+
+_CAMERAS: Mapping[int, Callable[[Files, int, int], tuple[Camera, float]]] = MappingProxyType(
+    {2001: _camera_2001, 2003: _camera_2003, 2005: _camera_2006, 2006: _camera_2006}
+)

@@ -1,0 +1,116 @@
+"""``dataset=middlebury``, ``middlebury2001`` .. ``middlebury2006``: stereo benchmarks to evaluate on.
+
+Of the 2014 data set the seven scenes of Voynov et al. 2019, of the others all. Scenes to train on: see
+:mod:`dsr.data.training_sets`.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Collection, Sequence
+from pathlib import Path
+
+from dsr.data.formats import middlebury
+from dsr.data.base import Wanted
+from dsr.data.native import Native, Place, Preparation, Record, data_folder
+
+EVALUATION_2014 = ("vintage", "recycle", "umbrella", "classroom1", "playroom", "backpack", "jadeplant")
+SCENES = {
+    2001: ("barn1", "barn2", "bull", "poster", "sawtooth", "venus"),
+    2003: ("cones", "teddy"),
+    2005: ("art", "books", "dolls", "laundry", "moebius", "reindeer"),
+    2006: (
+        "aloe", "baby1", "baby2", "baby3", "bowling1", "bowling2", "cloth1", "cloth2", "cloth3", "cloth4", "flowerpots",
+        "lampshade1", "lampshade2", "midd1", "midd2", "monopoly", "plastic", "rocks1", "rocks2", "wood1", "wood2",
+    ),
+}  # fmt: skip
+_FILES_2014 = ("im0.png", "calib.txt", "disp0.pfm", "disp0GT.pfm")
+
+
+class Middlebury(Native):
+    """Scenes of Middlebury 2014.
+
+    Args:
+        root: where folders such as ``Recycle-perfect`` or ``Recycle`` lie.
+        scenes: names of the ones to use; None for the paper's seven, ``found`` for all in ``root``.
+        size, crop: see :class:`dsr.data.native.Preparation`.
+        fill: names of the scenes whose holes are filled.
+        without_offset: names of the scenes whose disparity offset is taken for 0, so that their depth is not what it
+            was: the paper's figures of Vintage are of such depth, those of Recycle and Playroom are not.
+
+    Raises:
+        ValueError: a scene is not there, or a value is out of range.
+
+    """
+
+    def __init__(
+        self,
+        root: str,
+        scenes: Wanted = None,
+        size: int | None = 512,
+        crop: float = 0.5,
+        fill: Sequence[str] = ("vintage",),
+        without_offset: Sequence[str] = ("vintage",),
+    ) -> None:
+        folder = data_folder(root)
+        found = records_2014(folder, "middlebury", without_offset)
+        place = Place(folder, "middlebury")
+        super().__init__("middlebury", place, found, EVALUATION_2014, scenes, Preparation(size, crop, fill=tuple(fill)))
+
+
+class MiddleburyLevels(Native):
+    """Scenes of Middlebury 2001, 2003, 2005 or 2006, with disparities in 8 bits.
+
+    Args:
+        root: where the scenes lie.
+        year: of the data set.
+        scenes: names of the ones to use; None for all that there are, ``found`` for all in ``root``.
+        size, crop: see :class:`dsr.data.native.Preparation`.
+        fill: names of the scenes whose holes are filled.
+        smooth: whether terraces of the rounding to whole levels become slopes; see :mod:`dsr.data.terraces`.
+
+    Raises:
+        ValueError: a scene is not there, or a value is out of range.
+
+    """
+
+    def __init__(
+        self,
+        root: str,
+        year: int,
+        scenes: Wanted = None,
+        size: int | None = 512,
+        crop: float = 0.5,
+        fill: Sequence[str] = (),
+        smooth: bool = True,
+    ) -> None:
+        if year not in middlebury.YEARS:
+            raise ValueError(f"dataset.year: expected one of {', '.join(map(str, middlebury.YEARS))}, got {year}")
+        folder, name = data_folder(root), f"middlebury{year}"
+        found = records_levels(folder, name, year, smooth=smooth)
+        preparation = Preparation(size, crop, fill=tuple(fill))
+        super().__init__(name, Place(folder, name), found, SCENES[year], scenes, preparation)
+
+
+def records_2014(folder: Path, dataset: str, without_offset: Collection[str] = ()) -> dict[str, Record]:
+    """Return the scenes of 2014 on disk; the disparity offset of some may be taken for 0."""
+    return {
+        name: Record(
+            tuple(path for path in map(place.joinpath, _FILES_2014) if path.is_file()),
+            functools.partial(middlebury.load_2014, place, dataset, name, offset=name not in without_offset),
+            "without offset" if name in without_offset else "",
+        )
+        for name, place in middlebury.find_2014(folder).items()
+    }
+
+
+def records_levels(folder: Path, dataset: str, year: int, *, smooth: bool = True) -> dict[str, Record]:
+    """Return the scenes of 2001 to 2006 on disk."""
+    return {
+        name: Record(
+            tuple(path for path in (files.photo, files.disparity, files.shift, *files.measured.values()) if path),
+            functools.partial(middlebury.load_levels, files, dataset, name, year, smooth=smooth),
+            "" if smooth else "terraces",
+        )
+        for name, files in middlebury.find_levels(folder).items()
+    }

@@ -1,0 +1,240 @@
+"""Data sets in their owners' formats, prepared: resized and cropped once, and kept in the cache.
+
+What is kept is named by the content of the files, the settings, and the code that reads and resizes, so that whatever
+changes makes it anew.
+"""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import json
+import os
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import torch
+
+from dsr.data.base import Wanted, chosen
+from dsr.data.filling import filled_depth
+from dsr.data.rendering import Rendering, cache_directory, cached
+from dsr.data.resizing import fitted
+from dsr.sample import Scene
+
+_SMALLEST = 32
+_READING_CODE = ("resizing.py", "filling.py", "terraces.py", "native.py", "files.py", "formats")
+_HASHED_WHOLE = 1 << 28
+"""Bytes; of a larger file the name, the size and the time of its last change stand for the content."""
+
+
+@dataclass(frozen=True)
+class Record:
+    """A scene on disk.
+
+    Args:
+        files: all that it is read from.
+        load: reads it at its own size.
+        part: which part of the files it is, where they hold several scenes.
+
+    """
+
+    files: tuple[Path, ...]
+    load: Callable[[], Scene]
+    part: str = ""
+
+
+@dataclass(frozen=True)
+class Preparation:
+    """What is done to scenes after they are read.
+
+    Args:
+        size: of the shorter side in pixels; None for the scenes as they are.
+        crop: where along the longer side a square window lies: 0 at the top or left, 1 at the bottom or right; None for
+            no window.
+        enlarge: whether smaller scenes are enlarged.
+        fill: names of the scenes whose holes are filled; see :mod:`dsr.data.filling`.
+
+    Raises:
+        ValueError: a value is out of range.
+
+    """
+
+    size: int | None = 512
+    crop: float | None = 0.5
+    enlarge: bool = True
+    fill: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        """Check the values."""
+        if self.size is not None and self.size < _SMALLEST:
+            raise ValueError(f"dataset.size: expected at least {_SMALLEST} pixels, or null, got {self.size}")
+        if self.crop is not None and not 0 <= self.crop <= 1:
+            raise ValueError(f"dataset.crop: expected a number from 0 to 1, or null, got {self.crop}")
+
+    def __call__(self, scene: Scene) -> Scene:
+        """Return the scene prepared."""
+        if self.size is not None:
+            scene = fitted(scene, self.size, self.crop, enlarge=self.enlarge)
+        if scene.name in self.fill and scene.depth is not None:
+            scene = replace(scene, depth=filled_depth(scene.depth))
+        return scene
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where a data set was looked for, for messages.
+
+    Args:
+        root: the directory.
+        collection: what ``dsr data get`` calls it.
+
+    """
+
+    root: Path
+    collection: str
+
+    @property
+    def remedy(self) -> str:
+        """What to do where something is missing."""
+        return f"get it with: dsr data get {self.collection}; or say where it is: dataset.root=DIR"
+
+
+class Native:
+    """A data set in its own format; the base of those in this package.
+
+    Args:
+        name: as in ``scores.csv``.
+        place: where it was looked for.
+        found: the scenes on disk.
+        named: the scenes that belong to the data set.
+        wanted: the scenes to use.
+        preparation: what is done to them.
+
+    Raises:
+        ValueError: a scene is not on disk; the message says what to do.
+
+    """
+
+    evaluation = True
+
+    def __init__(
+        self,
+        name: str,
+        place: Place,
+        found: Mapping[str, Record],
+        named: Sequence[str],
+        wanted: Wanted,
+        preparation: Preparation,
+    ) -> None:
+        self.name = name
+        if not found:
+            there = "no scene of it" if place.root.is_dir() else "no such directory"
+            raise ValueError(f"dataset={name}: expected its files in {place.root}, got {there}; {place.remedy}")
+        if wanted is None:
+            missing = [scene for scene in named if scene not in found]
+            if missing:
+                raise ValueError(
+                    f"dataset={name}: expected {', '.join(missing)} in {place.root}, got {len(named) - len(missing)} "
+                    f"of {len(named)} scenes; {place.remedy}; or use what is there: dataset.scenes=found"
+                )
+            wanted = named
+        self._scenes = chosen(list(found), wanted)
+        unknown = [scene for scene in preparation.fill if scene not in (*named, *found)]
+        if unknown:
+            raise ValueError(f"dataset.fill: expected names of scenes, got {', '.join(unknown)}")
+        self._found, self._preparation = found, preparation
+
+    def scenes(self) -> list[str]:
+        """Return the names of the scenes, in order."""
+        return list(self._scenes)
+
+    def load(self, scene: str) -> Scene:
+        """Return one scene; see :class:`dsr.data.base.SceneSource`."""
+        record = self._found[scene]
+        if self._preparation.size is None and scene not in self._preparation.fill:
+            return record.load()
+        return cached(self._path(scene), lambda: _rendering(self._preparation(record.load()))).scene(self.name, scene)
+
+    def fingerprint(self, scene: str) -> str:
+        """Return the SHA-256 of the scene's files and of what is done to them."""
+        record = self._found[scene]
+        settings = json.dumps(
+            [record.part, scene in self._preparation.fill, asdict(replace(self._preparation, fill=()))]
+        )
+        digest = hashlib.sha256(settings.encode())
+        for path in record.files:
+            digest.update(content_hash(path).encode())
+        return digest.hexdigest()
+
+    def prepare(self, scenes: Sequence[str]) -> Iterator[str]:
+        """Prepare what the cache lacks of some scenes, several at a time, and yield the names as they are done.
+
+        A scene that fails is yielded, too; loading it says why.
+        """
+        with ThreadPoolExecutor(min(len(scenes), os.cpu_count() or 1) or 1) as pool:
+            jobs = {pool.submit(self.load, scene): scene for scene in scenes if not self._is_ready(scene)}
+            yield from (scene for scene in scenes if scene not in jobs.values())
+            try:
+                for job in as_completed(jobs):
+                    yield jobs[job]
+            except BaseException:
+                pool.shutdown(cancel_futures=True)
+                raise
+
+    def _is_ready(self, scene: str) -> bool:
+        try:
+            return self._preparation.size is None or (cache_directory() / self._path(scene)).is_file()
+        except (OSError, ValueError):  # loading it says why
+            return True
+
+    def _path(self, scene: str) -> Path:
+        key = hashlib.sha256((self.fingerprint(scene) + _rules_hash()).encode()).hexdigest()[:16]
+        return Path("prepared", self.name, f"{scene.replace('/', '_')}-{key}.npz")
+
+
+def data_folder(root: str) -> Path:
+    """Return a data set's directory as a path."""
+    return Path(root).expanduser()
+
+
+@functools.lru_cache(maxsize=4096)
+def _hash_of(path: Path, size: int, changed: int) -> str:
+    if size > _HASHED_WHOLE:
+        return f"{path.name} {size} {changed}"
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def content_hash(path: Path) -> str:
+    """Return the SHA-256 of a file; of a very large one, a text of its name, size and time of change.
+
+    Raises:
+        ValueError: there is no such file.
+
+    """
+    if not path.is_file():
+        raise ValueError(f"{path}: expected a file, there is none")
+    status = path.stat()
+    return _hash_of(path, status.st_size, status.st_mtime_ns)
+
+
+@functools.cache
+def _rules_hash() -> str:
+    """Return a hash of the code that reads and resizes."""
+    digest = hashlib.sha256()
+    folder = Path(__file__).parent
+    for name in _READING_CODE:
+        path = folder / name
+        for file in [path] if path.is_file() else sorted(path.rglob("*.py")):
+            digest.update(file.read_bytes())
+    return digest.hexdigest()
+
+
+def _rendering(scene: Scene) -> Rendering:
+    """Return a scene as it is kept: its photo in 8 bits."""
+    if scene.depth is None:
+        raise ValueError(f"{scene.name}: expected a fine depth map, there is none")
+    photo = (scene.rgb * 255).round().to(torch.uint8).permute(1, 2, 0).numpy()
+    return Rendering(photo, scene.depth[0].double().numpy(), scene.camera)

@@ -1,0 +1,149 @@
+"""Resizing scenes: photos antialiased, depth surface by surface.
+
+The rule for depth. A pixel of the new map belongs to the surface of the old pixel that its centre falls on; where that
+one is a hole, so is the new pixel. The new depth is that of the plane which fits the old pixels around best, by weighted
+least squares in inverse depth (a plane's is linear in the pixel), over the known pixels of that surface alone: those
+whose depth differs by less than ``JUMP`` from its own. Weights are a triangle as wide as in antialiased bilinear
+resizing, or a little wider where the map is enlarged. So nothing is mixed across a hole or a depth edge, holes neither grow nor shrink by more than half a
+pixel, and planes stay planes to rounding, at a border and beside a hole, too.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from dsr.geometry.camera import Camera
+from dsr.sample import Scene
+
+JUMP = 0.02
+"""Relative difference of depth beyond which neighbours are of different surfaces."""
+_LEAST_REACH = 1.5
+"""In old pixels: so that there are two on either side of a border, which a slope needs."""
+_RIDGE = 1e-9
+
+
+def resized(scene: Scene, height: int, width: int) -> Scene:
+    """Return a scene at another size, its camera along with it; measured coarse maps are left out.
+
+    Args:
+        scene: with a fine depth.
+        height, width: in pixels.
+
+    Raises:
+        ValueError: the scene has no fine depth.
+
+    """
+    if scene.depth is None:
+        raise ValueError(f"{scene.name}: expected a fine depth map to resize, there is none (dataset.size=null)")
+    if (height, width) == (scene.camera.height, scene.camera.width):
+        return replace(scene, measured={})
+    photo = functional.interpolate(scene.rgb[None], (height, width), mode="bicubic", antialias=True)[0].clamp(0, 1)
+    depth = resized_depth(scene.depth, height, width)
+    return replace(scene, rgb=photo, depth=depth, camera=scene.camera.rescale(width, height), measured={})
+
+
+def cropped(scene: Scene, top: int, left: int, height: int, width: int) -> Scene:
+    """Return a window of a scene; measured coarse maps are left out."""
+    rows, columns = slice(top, top + height), slice(left, left + width)
+    camera: Camera = scene.camera.crop(top, left, height, width)
+    depth = None if scene.depth is None else scene.depth[:, rows, columns]
+    return replace(scene, rgb=scene.rgb[:, rows, columns], depth=depth, camera=camera, measured={})
+
+
+def fitted(scene: Scene, size: int, place: float | None = 0.5, *, enlarge: bool = True) -> Scene:
+    """Return a scene whose shorter side is ``size`` pixels long.
+
+    Args:
+        scene: with a fine depth.
+        size: in pixels.
+        place: where along the longer side a square window is cut out: 0 at the top or left, 1 at the bottom or right;
+            None for no window.
+        enlarge: whether smaller scenes are enlarged, or left as they are.
+
+    """
+    height, width = scene.camera.height, scene.camera.width
+    shorter = min(height, width)
+    if size < shorter or enlarge:
+        height, width = (size if side == shorter else round(side * size / shorter) for side in (height, width))
+        scene = resized(scene, height, width)
+    if place is None:
+        return scene
+    side = min(height, width)
+    return cropped(scene, int((height - side) * place), int((width - side) * place), side, side)
+
+
+def resized_depth(depth: Tensor, height: int, width: int) -> Tensor:
+    """Return a depth map at another size, by the module's rule.
+
+    Args:
+        depth: (1, H, W) orthogonal depth in metres, NaN where unknown.
+        height, width: of the result in pixels.
+
+    Returns:
+        (1, height, width) float64.
+
+    """
+    inverse = depth[0].double().reciprocal()
+    rows, columns = _Axis(inverse.shape[0], height), _Axis(inverse.shape[1], width)
+    own = inverse[rows.nearest][:, columns.nearest]
+    shift_y, shift_x = (rows.nearest - rows.centre)[:, None], (columns.nearest - columns.centre)[None]
+    sums = [torch.zeros_like(own) for _ in range(9)]
+    for step_y, step_x in itertools.product(rows.steps(), columns.steps()):
+        row, weight_y = rows.neighbour(step_y)
+        column, weight_x = columns.neighbour(step_x)
+        values = inverse[row][:, column]
+        same = ((values - own).abs() <= JUMP * own) & values.isfinite()
+        weight = torch.where(same, weight_y[:, None] * weight_x[None], 0)
+        value, y, x = torch.where(same, values - own, 0), shift_y + step_y, shift_x + step_x
+        for total, factor in zip(sums, (1, y, x, y * y, y * x, x * x, value, value * y, value * x), strict=True):
+            total += weight * factor
+    fine = own + _plane_at_centre(sums, rows.reach * columns.reach)
+    return torch.where(fine > 0, fine, own).reciprocal()[None]
+
+
+class _Axis:
+    """New pixels along one axis and the old ones around them.
+
+    Args:
+        old, new: lengths in pixels.
+
+    """
+
+    def __init__(self, old: int, new: int) -> None:
+        self.reach = max(old / new, _LEAST_REACH)
+        self.centre = (torch.arange(new, dtype=torch.float64) + 0.5) * (old / new) - 0.5
+        self.nearest = self.centre.round().long().clamp(0, old - 1)
+        self._old = old
+
+    def steps(self) -> range:
+        """Return the distances of old pixels from the nearest one that may count."""
+        most = math.ceil(self.reach + 0.5) - 1
+        return range(-most, most + 1)
+
+    def neighbour(self, step: int) -> tuple[Tensor, Tensor]:
+        """Return the old pixels ``step`` from the nearest ones, and their weights; 0 beyond the border."""
+        index = self.nearest + step
+        weight = (1 - (index - self.centre).abs() / self.reach).clamp(min=0)
+        inside = (index >= 0) & (index < self._old)
+        return index.clamp(0, self._old - 1), torch.where(inside, weight, 0)
+
+
+def _plane_at_centre(sums: list[Tensor], area: float) -> Tensor:
+    """Return the value at 0 of the plane that fits best, from sums of w times 1, y, x, yy, yx, xx, v, vy, vx."""
+    total, y, x, yy, yx, xx, v, vy, vx = sums
+    weight = total.clamp(min=torch.finfo(total.dtype).tiny)
+    mean_y, mean_x, mean = y / weight, x / weight, v / weight
+    ridge = _RIDGE * area  # where all lie in a line, the slope across it is taken for 0
+    var_y, var_x = yy / weight - mean_y.square() + ridge, xx / weight - mean_x.square() + ridge
+    both = yx / weight - mean_y * mean_x
+    with_y, with_x = vy / weight - mean * mean_y, vx / weight - mean * mean_x
+    determinant = var_y * var_x - both.square()
+    slope_y = (with_y * var_x - with_x * both) / determinant
+    slope_x = (with_x * var_y - with_y * both) / determinant
+    return mean - slope_y * mean_y - slope_x * mean_x

@@ -1,0 +1,112 @@
+"""Resizing scenes: against planes in closed form, and by what must not happen."""
+
+import pytest
+import torch
+
+from dsr.data.resizing import cropped, fitted, resized, resized_depth
+from dsr.geometry.camera import Camera
+from dsr.geometry.surface import normals_of
+from dsr.sample import Scene
+
+CAMERA = Camera(90, 60, 80.0, 82.0, 44.0, 30.5, baseline=0.1, doffs=3.0)
+
+
+def plane_depth(camera, a=0.05, b=-0.3, c=0.4):
+    """Return the exact depth of the plane 1 / z = (a, b, c) . r."""
+    rays = camera.rays()
+    return 1 / (a * rays[0] + b * rays[1] + c * rays[2])[None]
+
+
+def scene(depth, camera=CAMERA):
+    rgb = torch.rand(3, camera.height, camera.width, generator=torch.Generator().manual_seed(0))
+    return Scene("set", "one", rgb, camera, depth)
+
+
+@pytest.mark.parametrize(("height", "width"), [(20, 30), (17, 25), (41, 61), (60, 90), (66, 99), (120, 180)])
+def test_a_plane_stays_the_plane_that_the_new_camera_sees_up_to_the_border_and_beside_a_hole(height, width):
+    depth = plane_depth(CAMERA)
+    depth[:, 20:33, 11:40] = torch.nan
+    fine = resized_depth(depth, height, width)
+    truth = plane_depth(CAMERA.rescale(width, height))
+    known = fine.isfinite()
+    torch.testing.assert_close(fine[known], truth[known], rtol=1e-7, atol=0)
+    assert 0.8 < known.double().mean() < 0.97
+
+
+def test_the_same_size_is_the_same_depth():
+    depth = 1 + torch.rand(1, 60, 90, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    assert torch.equal(resized(scene(depth), 60, 90).depth, depth)
+
+
+@pytest.mark.parametrize(("height", "width"), [(20, 30), (23, 31), (66, 99)])
+def test_nothing_is_mixed_across_a_depth_edge(height, width):
+    depth = torch.full((1, 60, 90), 2.0, dtype=torch.float64)
+    depth[:, 15:41, 22:67] = 1.0
+    fine = resized_depth(depth, height, width)
+    assert set(fine.unique().tolist()) == {1.0, 2.0}
+    share = (fine == 1).double().mean()
+    assert share == pytest.approx(26 * 45 / 5400, abs=0.02)
+
+
+def test_a_pixel_is_a_hole_just_where_its_centre_falls_on_one():
+    depth = torch.full((1, 60, 90), 2.0, dtype=torch.float64)
+    depth[:, 10:20, 30:33] = torch.nan
+    fine = resized_depth(depth, 20, 30)
+    expected = torch.zeros(1, 20, 30, dtype=torch.bool)
+    expected[:, 3:7, 10] = True  # centres at rows 10, 13, 16, 19 and column 31
+    assert torch.equal(fine.isnan(), expected)
+
+
+def test_averages_halve_the_noise_of_a_plane():
+    noise = 1e-3 * torch.randn(1, 120, 180, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
+    fine = resized_depth(2 + noise, 30, 45)
+    assert float((fine - 2).std()) < 0.35e-3
+
+
+def test_a_scene_keeps_its_normals_and_disparities_scale_with_the_size():
+    before = scene(plane_depth(CAMERA))
+    after = resized(before, 30, 45)
+    assert after.rgb.shape == (3, 30, 45)
+    assert after.camera == CAMERA.rescale(45, 30)
+    normal = normals_of(before.depth[None], before.camera.rays()[None])[0, :, 5, 5]
+    torch.testing.assert_close(
+        normals_of(after.depth[None], after.camera.rays()[None])[0],
+        normal[:, None, None].expand(3, 30, 45), rtol=0, atol=1e-6,
+    )  # fmt: skip
+
+
+def test_a_crop_sees_the_same_points():
+    whole = scene(plane_depth(CAMERA))
+    part = cropped(whole, 7, 11, 30, 40)
+    points, window = (each.depth * each.camera.rays() for each in (whole, part))
+    torch.testing.assert_close(window, points[:, 7:37, 11:51])
+
+
+@pytest.mark.parametrize(("place", "left"), [(0.0, 0), (0.5, 12), (1.0, 24)])
+def test_fitting_makes_the_shorter_side_so_long_and_cuts_a_square_along_the_longer(place, left):
+    fit = fitted(scene(plane_depth(CAMERA)), 48, place)
+    assert (fit.camera.height, fit.camera.width) == (48, 48)
+    assert fit.camera == CAMERA.rescale(72, 48).crop(0, left, 48, 48)
+
+
+def test_fitting_without_a_window_or_without_enlarging():
+    whole = scene(plane_depth(CAMERA))
+    assert fitted(whole, 48, None).rgb.shape == (3, 48, 72)
+    assert fitted(whole, 120, None, enlarge=False).rgb.shape == (3, 60, 90)
+    assert fitted(whole, 120, 0.5, enlarge=False).rgb.shape == (3, 60, 60)
+
+
+def test_the_paper_s_camera_of_plant_follows_from_that_of_icl_nuim():
+    native = Camera(640, 480, 480.6, 480.6, 319.5, 239.5)  # the authors take the mean of 481.2 and 480 for both
+    height, width = 480, 640
+    depth = torch.full((1, height, width), 2.0, dtype=torch.float64)
+    fit = fitted(Scene("icl", "plant", torch.zeros(3, height, width), native, depth), 512)
+    assert (fit.camera.width, fit.camera.height) == (512, 512)
+    assert (fit.camera.fx, fit.camera.fy) == (pytest.approx(512.64, rel=1e-3), pytest.approx(512.64))
+    assert (fit.camera.cx, fit.camera.cy) == (pytest.approx(255.8, abs=0.6), pytest.approx(255.4667, abs=0.04))
+
+
+def test_a_scene_without_fine_depth_cannot_be_resized():
+    only = Scene("set", "one", torch.zeros(3, 60, 90), CAMERA, None, {2: torch.ones(1, 30, 45)})
+    with pytest.raises(ValueError, match="one: expected a fine depth map to resize, there is none"):
+        resized(only, 30, 45)
