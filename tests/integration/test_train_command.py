@@ -25,7 +25,9 @@ from dsr.app.evaluate import evaluate
 from dsr.training import SuperResolution
 
 REPOSITORY = Path(__file__).resolve().parents[2]
-SMOKE = ("trainer=smoke", "dataset=simgeo", "dataset.size=64", "metrics.lpips=false", "device=cpu")
+SMOKE = (
+    "trainer=smoke", "dataset=procedural", "dataset.count=6", "dataset.size=64", "metrics.lpips=false", "device=cpu",
+)  # fmt: skip
 FOUR = (*SMOKE, "trainer.steps=4", "trainer.validate_every=2", "output_dir=out")
 
 
@@ -128,7 +130,7 @@ def test_a_training_says_what_it_does_and_where_the_weights_are(smoke):
     _, home, done = smoke
     lines = done.stdout.splitlines()
     assert re.fullmatch(r"model  msg_v x4, 326,015 parameters, (float32|bfloat16)", lines[0])
-    assert lines[1] == "data   5 scenes of simgeo to train on, 1 of simgeo to validate with"
+    assert lines[1] == "data   5 scenes of procedural to train on, 1 of procedural to validate with"
     assert re.fullmatch(r"loss   lap1 \+ \d\.\d+ MSE_v", lines[2])
     assert lines[3] == "steps  2 of 2 patches of 32 x 32"
     assert re.fullmatch(r"time   about \d+ s \(\S+ s a step as measured now\), and the validations", lines[4])
@@ -144,7 +146,7 @@ def test_a_training_warns_of_nothing(smoke):
 
 def test_a_training_writes_everything_that_is_promised_and_nothing_else(smoke):
     folder, home, _ = smoke
-    assert home.name.startswith("simgeo_box_x4_msg_v_")
+    assert home.name.startswith("procedural_box_x4_msg_v_")
     [events] = (home / "tensorboard").glob("events.*")
     assert tree(home) == [
         "checkpoints/best.ckpt", "checkpoints/last.ckpt", "config.yaml",
@@ -186,8 +188,8 @@ def test_the_log_has_losses_scores_rates_renderings_and_the_configuration(smoke)
     for tag in ("val/RMSE_v", "val/DSSIM_v", "train/loss"):
         assert all(0 < value < 5 for value in scalars_of(home, tag).values())
     assert list(scalars_of(home, "train/learning_rate").values()) == pytest.approx([1e-3, 1e-3])
-    assert tags["images"] == ["renderings/simgeo_0"]
-    image = events.Images("renderings/simgeo_0")[0]
+    assert tags["images"] == ["renderings/procedural_0"]
+    image = events.Images("renderings/procedural_0")[0]
     assert (image.height, image.width) == (128, 192)
     [text] = events.Tensors("config/text_summary")
     assert "validation_scenes: 1" in text.tensor_proto.string_val[0].decode()
@@ -352,7 +354,8 @@ def test_a_usage_error_is_one_line_with_exit_code_2_and_writes_nothing(tmp_path,
 def test_the_help_lists_the_choices(within):
     code, output, errors = within("--help")
     assert (code, errors) == (0, [])
-    for line in ("model: facets, msg, msg_v", "trainer: default, full, smoke", "noise: gaussian_multiplicative, none"):
+    noises = "noise: gaussian_multiplicative, kinect, none, tof"
+    for line in ("model: facets, msg, msg_v", "trainer: default, full, smoke", noises):
         assert line in output
 
 
@@ -557,20 +560,21 @@ def test_mixtures_train_on_all_parts_and_validate_with_each(tmp_path, within):
         "dataset=mixture",
         "dataset.parts.procedural.count=2", "dataset.parts.procedural.size=64",
         "~dataset.parts.folder", "~dataset.shares.folder",
-        "+dataset@dataset.parts.geo=simgeo", "dataset.parts.geo.size=64", "+dataset.shares.geo=0.5",
+        "+dataset@dataset.parts.other=procedural", "dataset.parts.other.count=6", "dataset.parts.other.size=64",
+        "dataset.parts.other.seed=1", "+dataset.shares.other=0.5",
     )  # fmt: skip
     assert (code, errors) == (0, [])
-    assert "data   6 scenes of mixture to train on, 1 of procedural, 1 of simgeo to validate with" in output
+    assert "data   6 scenes of mixture to train on, 1 of procedural, 1 of procedural_2 to validate with" in output
     scores = validation_of(tmp_path / "out")
-    assert {kind for kind, _ in scores} == {"val", "val_procedural", "val_simgeo"}
-    mean = (scores["val_procedural", "RMSE_v"] + scores["val_simgeo", "RMSE_v"]) / 2
+    assert {kind for kind, _ in scores} == {"val", "val_procedural", "val_procedural_2"}
+    mean = (scores["val_procedural", "RMSE_v"] + scores["val_procedural_2", "RMSE_v"]) / 2
     assert scores["val", "RMSE_v"] == pytest.approx(mean, rel=1e-12)
     tags = events_of(tmp_path / "out").Tags()
-    assert {"val/RMSE_v", "val_procedural/RMSE_v", "val_simgeo/DSSIM_v"} <= set(tags["scalars"])
-    assert {"renderings/procedural_0", "renderings/simgeo_0"} <= set(tags["images"])
+    assert {"val/RMSE_v", "val_procedural/RMSE_v", "val_procedural_2/DSSIM_v"} <= set(tags["scalars"])
+    assert {"renderings/procedural_0", "renderings/procedural_2_0"} <= set(tags["images"])
     code, _, errors = within("run=out", "metrics.lpips=false", "output_dir=scores", name="eval")
     assert (code, errors) == (0, [])
-    for kind in ("procedural", "simgeo"):
+    for kind in ("procedural", "procedural_2"):
         assert means_of(tmp_path / "scores" / kind)["RMSE_v"] == pytest.approx(scores[f"val_{kind}", "RMSE_v"], 1e-14)
 
 
@@ -580,8 +584,17 @@ def test_another_data_set_validates_beside_the_held_out_scenes(tmp_path, within)
         "validation.mine.size=64",
     )  # fmt: skip
     assert (code, errors) == (0, [])
-    assert "1 of simgeo, 1 of mine to validate with" in output
+    assert "1 of procedural, 1 of mine to validate with" in output
     assert ("val_mine", "DSSIM_v") in validation_of(tmp_path / "out")
+
+
+def test_data_sets_to_evaluate_on_are_not_trained_on(within, tmp_path):
+    code, _, errors = within("trainer=smoke", "dataset=simgeo", "metrics.lpips=false", "output_dir=out")
+    assert (code, errors) == (2, [
+        "error: dataset=simgeo: its scenes are to evaluate on, not to train on; "
+        "+dataset@validation.simgeo=simgeo validates with them"
+    ])  # fmt: skip
+    assert not (tmp_path / "out").exists()
 
 
 def test_a_training_starts_from_given_weights(smoke, tmp_path, within):

@@ -40,9 +40,13 @@ SETTINGS = (
     "dataset, downsampling, noise, metrics, scale, device, precision, seed, output_dir, overwrite, holes, "
     "method, weights, run"
 )
+DATASETS = (
+    "folder, icl, middlebury, middlebury2001, middlebury2003, middlebury2005, middlebury2006, middlebury_train, "
+    "mixture, nyu, paper_train, procedural, simgeo, sintel, sunrgbd, tartanair, tofmark"
+)
 METHODS = "bicubic, bilinear, dip, dip_v, dip_v_warm, facets, msg, msg_v, msg_v_noisy, nearest"
 USAGE_ERRORS = {
-    "dataset=fodler": "dataset=fodler: unknown; expected one of folder, mixture, procedural, simgeo",
+    "dataset=fodler": f"dataset=fodler: unknown; expected one of {DATASETS}",
     "method=msgv": f"method=msgv: unknown; expected one of {METHODS}",
     "downsampling=boxx": (
         "downsampling=boxx: unknown; expected one of bicubic, bilinear, box, gaussian, measured, nearest"

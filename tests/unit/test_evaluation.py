@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 import torch
 
-from dsr.degrade import Downsampling, GaussianMultiplicative, Measured, make_sample
+from dsr.degrade import Downsampling, Measured, make_sample
 from dsr.evaluation import SCORE_COLUMNS, Outcome, StalePredictionError, Study, load_prediction, predict, score
 from dsr.geometry.camera import Camera
+from dsr.noise import GaussianMultiplicative
 from dsr.quality.scores import catalogue, score_image
 from dsr.sample import Scene
 
@@ -24,6 +25,7 @@ class ToySource:
     """Scenes in memory; one whose content is an exception cannot be loaded."""
 
     name = "toy"
+    evaluation = True
 
     def __init__(self, **content):
         self.content = content

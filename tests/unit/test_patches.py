@@ -17,9 +17,10 @@ from dsr.data.base import SceneSource
 from dsr.data.cutting import Patches, PatchSettings
 from dsr.data.patches import Part, PatchData, WholeScenes
 from dsr.data.problem import Batch, Problem, tensors_of
-from dsr.degrade import Downsampling, GaussianMultiplicative, Measured, make_sample
+from dsr.degrade import Downsampling, Measured, make_sample
 from dsr.geometry.camera import Camera
 from dsr.methods.maps import normalised
+from dsr.noise import GaussianMultiplicative
 from dsr.sample import Scene
 
 BOX = Downsampling("box")
@@ -64,6 +65,7 @@ class _Source:
     """A data set of six scenes."""
 
     name = "set"
+    evaluation = False
 
     def __init__(self, scenes: list[Scene]) -> None:
         self._scenes = {scene.name: scene for scene in scenes}

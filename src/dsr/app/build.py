@@ -112,6 +112,8 @@ def _fits(value: Any, hint: Any) -> bool:
         return value in get_args(hint)
     if origin is not None and issubclass(origin, Sequence):
         return isinstance(value, list) and all(_fits(item, get_args(hint)[0]) for item in value)
+    if origin is not None and issubclass(origin, Mapping):
+        return isinstance(value, Mapping) and all(_fits(item, get_args(hint)[1]) for item in value.values())
     accepted: Any = {float: (int, float), Path: str}.get(hint, hint)
     return isinstance(value, accepted) and (hint is bool or not isinstance(value, bool))
 
@@ -125,5 +127,7 @@ def _describe(hint: Any) -> str:
         return "one of " + ", ".join(map(str, get_args(hint)))
     if origin is not None and issubclass(origin, Sequence):
         return f"a list of {_describe(get_args(hint)[0])}"
+    if origin is not None and issubclass(origin, Mapping):
+        return f"keys, each with {_describe(get_args(hint)[1])}"
     names = {float: "a number", int: "a whole number", str: "text", bool: "true or false", type(None): "null"}
     return names.get(hint, getattr(hint, "__name__", str(hint)))

@@ -20,7 +20,7 @@ from rich.console import Console
 from dsr.app import rundir
 from dsr.app.build import build, fast_precision, pick_device, takes, trait
 from dsr.app.perceptual import perceptual_network
-from dsr.app.progress import Display
+from dsr.app.progress import Display, prepare
 from dsr.app.runs import studies_of_run
 from dsr.app.schema import ConfigError, EvalConfig, given_keys, plain_config
 from dsr.data.base import SceneSource
@@ -81,6 +81,7 @@ def _evaluate(plain: dict[str, Any], source: SceneSource | None) -> pd.DataFrame
     if settings.overwrite:
         shutil.rmtree(folder / WORKSPACE, ignore_errors=True)
     _seed(settings.seed)
+    prepare(display, study.source, study.source.scenes())
     try:
         outcome = predict(study, folder, display, overwrite=settings.overwrite)
     except StalePredictionError as error:

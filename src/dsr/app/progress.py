@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any
 
 import lightning
@@ -11,6 +11,7 @@ from lightning.pytorch.callbacks import ProgressBar
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
+from dsr.data.base import Prepared, SceneSource
 from dsr.fitting import scores_line
 
 
@@ -71,6 +72,13 @@ class Display:
                 yield lambda now, remark: progress.update(task, completed=now, remark=remark)
             finally:
                 progress.remove_task(task)
+
+
+def prepare(display: Display, source: SceneSource, names: Sequence[str]) -> None:
+    """Let a data set that renders or resizes its scenes do so for some of them, with a bar."""
+    if isinstance(source, Prepared):
+        for _ in display(source.prepare(names), "prepare", len(names)):
+            pass
 
 
 class TrainingBar(ProgressBar):

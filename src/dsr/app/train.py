@@ -17,13 +17,12 @@ from rich.console import Console
 from dsr.app import rundir
 from dsr.app.build import build, fast_precision, pick_device
 from dsr.app.perceptual import perceptual_network
-from dsr.app.progress import Display
+from dsr.app.progress import Display, prepare
 from dsr.app.runs import WEIGHTS, common, read_config, training_data
 from dsr.app.schema import ConfigError, TrainConfig, given_keys, plain_config
 from dsr.app.trainer import make_trainer, seconds_per_step
 from dsr.atomic import replacing
 from dsr.data.patches import PatchData
-from dsr.data.procedural.source import Procedural
 from dsr.fitting import duration, fit
 from dsr.methods.network import DisparityNetwork
 from dsr.methods.trained import NETWORKS
@@ -128,11 +127,9 @@ def _network(settings: TrainConfig) -> DisparityNetwork:
 
 
 def _prepare(console: Console, data: PatchData) -> None:
-    """Let the data sets that render their scenes do so, with a bar."""
+    """Let the data sets that render or resize their scenes do so, with a bar."""
     for source, names in data.used:
-        if isinstance(source, Procedural):
-            for _ in Display(console)(source.prepare(names), "render", len(names)):
-                pass
+        prepare(Display(console), source, names)
 
 
 def _module(settings: TrainConfig, net: DisparityNetwork, data: PatchData, metrics: Any) -> SuperResolution:

@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Protocol
+from collections.abc import Iterable, Sequence
+from typing import Literal, Protocol, runtime_checkable
 
 from dsr.sample import Scene
+
+Wanted = Sequence[str] | Literal["found"] | None
+"""Names of scenes; ``found`` for all that are on disk, None for those that the data set names."""
+
+_MOST_LISTED = 60
 
 
 class SceneSource(Protocol):
@@ -13,10 +18,12 @@ class SceneSource(Protocol):
 
     Attributes:
         name: as in ``scores.csv``.
+        evaluation: whether its scenes are those that methods are compared on, which none may be trained on.
 
     """
 
     name: str
+    evaluation: bool
 
     def scenes(self) -> list[str]:
         """Return the names of the scenes, in order."""
@@ -36,6 +43,15 @@ class SceneSource(Protocol):
         ...
 
 
+@runtime_checkable
+class Prepared(Protocol):
+    """A data set that makes its scenes ready once."""
+
+    def prepare(self, scenes: Sequence[str]) -> Iterable[str]:
+        """Make some scenes ready, several at a time, and yield the names as they are done."""
+        ...
+
+
 class Some:
     """Some scenes of a data set.
 
@@ -46,7 +62,7 @@ class Some:
     """
 
     def __init__(self, source: SceneSource, names: Sequence[str]) -> None:
-        self.name = source.name
+        self.name, self.evaluation = source.name, source.evaluation
         self._source, self._names = source, list(names)
 
     def scenes(self) -> list[str]:
@@ -62,17 +78,21 @@ class Some:
         return self._source.fingerprint(scene)
 
 
-def chosen(available: Sequence[str], wanted: Sequence[str] | None) -> list[str]:
+def chosen(available: Sequence[str], wanted: Wanted) -> list[str]:
     """Return the scenes to use: those wanted, or all.
 
     Raises:
         ValueError: a wanted scene is not available or is named twice, or none is wanted.
 
     """
+    if wanted == "found":
+        wanted = None
     if wanted is not None and (not wanted or len(set(wanted)) < len(wanted)):
         came = ", ".join(wanted) or "an empty list"
         raise ValueError(f"dataset.scenes: expected names, each once, or null for all; got {came}")
     for name in wanted or ():
         if name not in available:
-            raise ValueError(f"dataset.scenes: {name!r} is not there; expected some of {', '.join(available)}")
+            rest = f", ... ({len(available)} in all)" if len(available) > _MOST_LISTED else ""
+            some = ", ".join(available[:_MOST_LISTED])
+            raise ValueError(f"dataset.scenes: {name!r} is not there; expected some of {some}{rest}")
     return list(available) if wanted is None else list(wanted)

@@ -32,7 +32,7 @@ def read_rgb(path: Path) -> np.ndarray:
         ValueError: it is missing, damaged or no picture.
 
     """
-    picture = _decode(path, cv2.IMREAD_COLOR)
+    picture = read_pixels(path, cv2.IMREAD_COLOR)
     return cv2.cvtColor(picture, cv2.COLOR_BGR2RGB)
 
 
@@ -45,12 +45,13 @@ def read_map(path: Path) -> np.ndarray:
     """
     readers = {".npy": _load_npy, ".pfm": _load_pfm}
     reader = readers.get(path.suffix.lower())
-    values = _decode(path, cv2.IMREAD_UNCHANGED) if reader is None else reader(path)
+    values = read_pixels(path, cv2.IMREAD_UNCHANGED) if reader is None else reader(path)
     if values.ndim != 2:
         raise ValueError(f"{path}: expected one channel (height x width), got shape {values.shape}")
     if values.dtype.kind not in "fiu" or (values.dtype.kind in "iu" and values.dtype.itemsize == 1):
         raise ValueError(f"{path}: expected 16-bit or floating point values, got {values.dtype} (too coarse for depth)")
-    return values.astype(np.float64)
+    with np.errstate(invalid="ignore"):  # a damaged file may hold signalling NaNs
+        return values.astype(np.float64)
 
 
 def read_levels(path: Path) -> np.ndarray:
@@ -60,7 +61,7 @@ def read_levels(path: Path) -> np.ndarray:
         ValueError: it is missing, damaged, or has other values.
 
     """
-    levels = _decode(path, cv2.IMREAD_UNCHANGED)
+    levels = read_pixels(path, cv2.IMREAD_UNCHANGED)
     if levels.ndim != 2 or levels.dtype != np.uint8:
         raise ValueError(f"{path}: expected one channel of 8 bits, got {levels.dtype} of shape {levels.shape}")
     return levels
@@ -73,7 +74,7 @@ def read_mask(path: Path) -> np.ndarray:
         ValueError: it is missing or damaged.
 
     """
-    return _decode(path, cv2.IMREAD_GRAYSCALE) > 0
+    return read_pixels(path, cv2.IMREAD_GRAYSCALE) > 0
 
 
 @dataclass(frozen=True)
@@ -200,8 +201,17 @@ def _load_npy(path: Path) -> np.ndarray:
         raise ValueError(f"{path}: expected a NumPy array, got a damaged or foreign file ({error})") from error
 
 
-def _decode(path: Path, flags: int) -> np.ndarray:
-    """Return the pixels of a picture file."""
+def read_pixels(path: Path, flags: int) -> np.ndarray:
+    """Return the pixels of a picture file as OpenCV decodes them.
+
+    Args:
+        path: the file.
+        flags: OpenCV's.
+
+    Raises:
+        ValueError: it is missing, damaged or no picture.
+
+    """
     content = _content(path)
     try:
         with _quiet_stderr():

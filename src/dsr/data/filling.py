@@ -1,4 +1,4 @@
-"""Filling holes of a data set's depth, where its evaluation is to have none: the background goes on behind what is near.
+"""Filling holes of a data set's depth where its evaluation is to have none: the background goes on behind what is near.
 
 Inside a hole inverse depth solves Laplace's equation with the hole's rim as its boundary. Where the rim spans a depth
 step (an occlusion, as stereo leaves them), only its farther part counts, as what is hidden from the second camera is

@@ -20,7 +20,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dsr.data.base import chosen
+from dsr.data.base import Wanted, chosen
 from dsr.data.files import MAP_SUFFIXES, CameraFile, read_camera, read_map, read_mask, read_rgb
 from dsr.geometry.camera import Camera, RangeType, from_range
 from dsr.sample import Scene
@@ -43,7 +43,9 @@ class Folder:
 
     """
 
-    def __init__(self, root: str, scenes: Sequence[str] | None = None, name: str = "folder") -> None:
+    evaluation = False
+
+    def __init__(self, root: str, scenes: Wanted = None, name: str = "folder") -> None:
         self.name = name
         self._root = Path(root).expanduser()
         if not self._root.is_dir():

@@ -10,8 +10,8 @@ import functools
 from collections.abc import Collection, Sequence
 from pathlib import Path
 
-from dsr.data.formats import middlebury
 from dsr.data.base import Wanted
+from dsr.data.formats import middlebury
 from dsr.data.native import Native, Place, Preparation, Record, data_folder
 
 EVALUATION_2014 = ("vintage", "recycle", "umbrella", "classroom1", "playroom", "backpack", "jadeplant")

@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -43,6 +44,51 @@ class Record:
     files: tuple[Path, ...]
     load: Callable[[], Scene]
     part: str = ""
+
+
+def records_of(
+    frames: Mapping[str, tuple[Any, ...]], load: Callable[..., Scene], dataset: str, **settings: Any
+) -> dict[str, Record]:
+    """Return frames on disk as records, by their names with _ for /.
+
+    Args:
+        frames: the first arguments of ``load`` by name, as the readers in :mod:`dsr.data.formats` list them.
+        load: reads a frame; called with these, the data set's and the scene's name, and ``settings``.
+        dataset: name of the data set.
+        settings: further arguments of ``load``.
+
+    """
+    records = {}
+    for frame, arguments in frames.items():
+        name = frame.replace("/", "_")
+        files = tuple(file for path in arguments if isinstance(path, Path) for file in _files_of(path))
+        part = json.dumps([[each for each in arguments if not isinstance(each, Path)], settings])
+        records[name] = Record(files, functools.partial(load, *arguments, dataset, name, **settings), part)
+    return records
+
+
+def _files_of(path: Path) -> list[Path]:
+    """Return a file, or the files of a folder and those below it."""
+    return [path] if not path.is_dir() else sorted(file for file in path.rglob("*") if file.is_file())
+
+
+def renamed(records: Mapping[str, Record], names: Mapping[str, str]) -> dict[str, Record]:
+    """Return records, some under other names.
+
+    Args:
+        records: by name.
+        names: the frame on disk that each new name stands for, with / or _; those that are not there are left out.
+
+    """
+    frames = {name: frame.replace("/", "_") for name, frame in names.items()}
+    chosen = {name: _named(records[frame], name) for name, frame in frames.items() if frame in records}
+    taken = set(frames.values())
+    return {**chosen, **{name: record for name, record in records.items() if name not in taken | chosen.keys()}}
+
+
+def _named(record: Record, name: str) -> Record:
+    """Return a record whose scene has another name."""
+    return replace(record, load=lambda: replace(record.load(), name=name))
 
 
 @dataclass(frozen=True)
@@ -197,6 +243,11 @@ class Native:
 def data_folder(root: str) -> Path:
     """Return a data set's directory as a path."""
     return Path(root).expanduser()
+
+
+def listed(find: Callable[..., Mapping[str, tuple[Any, ...]]], folder: Path, *arguments: Any) -> Mapping[str, Any]:
+    """Return what a reader finds in a directory; nothing where there is none."""
+    return find(folder, *arguments) if folder.is_dir() else {}
 
 
 @functools.lru_cache(maxsize=4096)

@@ -66,7 +66,7 @@ class PatchData(lightning.LightningDataModule):
         validation: more data sets to validate with, by name; scenes without a true depth are left out.
 
     Raises:
-        ValueError: a data set has too few scenes, a scene is to be trained on and validated with, or the scale does not
+        ValueError: a data set is one to evaluate on or has too few scenes, a scene is to be trained on and validated with, or the scale does not
             divide a patch.
 
     """
@@ -169,6 +169,11 @@ class PatchData(lightning.LightningDataModule):
 
     def _split(self, source: SceneSource) -> None:
         """Hold the last scenes of a data set out."""
+        if source.evaluation:
+            raise ValueError(
+                f"dataset={source.name}: its scenes are to evaluate on, not to train on; "
+                f"+dataset@validation.{source.name}={source.name} validates with them"
+            )
         names, count = source.scenes()[: self._settings.scenes], self._settings.validation_scenes
         if len(names) <= count:
             raise ValueError(

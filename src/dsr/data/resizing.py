@@ -1,11 +1,11 @@
 """Resizing scenes: photos antialiased, depth surface by surface.
 
 The rule for depth. A pixel of the new map belongs to the surface of the old pixel that its centre falls on; where that
-one is a hole, so is the new pixel. The new depth is that of the plane which fits the old pixels around best, by weighted
+is a hole, so is the new pixel. The new depth is that of the plane which fits the old pixels around best, by weighted
 least squares in inverse depth (a plane's is linear in the pixel), over the known pixels of that surface alone: those
 whose depth differs by less than ``JUMP`` from its own. Weights are a triangle as wide as in antialiased bilinear
-resizing, or a little wider where the map is enlarged. So nothing is mixed across a hole or a depth edge, holes neither grow nor shrink by more than half a
-pixel, and planes stay planes to rounding, at a border and beside a hole, too.
+resizing, or a little wider where the map is enlarged. So nothing is mixed across a hole or a depth edge, holes neither
+grow nor shrink by more than half a pixel, and planes stay planes to rounding, at a border and beside a hole, too.
 """
 
 from __future__ import annotations
@@ -33,7 +33,8 @@ def resized(scene: Scene, height: int, width: int) -> Scene:
 
     Args:
         scene: with a fine depth.
-        height, width: in pixels.
+        height: of the result in pixels.
+        width: the same.
 
     Raises:
         ValueError: the scene has no fine depth.
@@ -83,7 +84,8 @@ def resized_depth(depth: Tensor, height: int, width: int) -> Tensor:
 
     Args:
         depth: (1, H, W) orthogonal depth in metres, NaN where unknown.
-        height, width: of the result in pixels.
+        height: of the result in pixels.
+        width: the same.
 
     Returns:
         (1, height, width) float64.
@@ -101,8 +103,8 @@ def resized_depth(depth: Tensor, height: int, width: int) -> Tensor:
         same = ((values - own).abs() <= JUMP * own) & values.isfinite()
         weight = torch.where(same, weight_y[:, None] * weight_x[None], 0)
         value, y, x = torch.where(same, values - own, 0), shift_y + step_y, shift_x + step_x
-        for total, factor in zip(sums, (1, y, x, y * y, y * x, x * x, value, value * y, value * x), strict=True):
-            total += weight * factor
+        terms = (torch.ones_like(y), y, x, y * y, y * x, x * x, value, value * y, value * x)
+        sums = [total + weight * term for total, term in zip(sums, terms, strict=True)]
     fine = own + _plane_at_centre(sums, rows.reach * columns.reach)
     return torch.where(fine > 0, fine, own).reciprocal()[None]
 

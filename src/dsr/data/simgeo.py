@@ -7,10 +7,9 @@ the layout of :mod:`dsr.data.folder`. Renderings are kept in a cache: $DSR_CACHE
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 
-from dsr.data.base import chosen
+from dsr.data.base import Wanted, chosen
 from dsr.data.folder import Folder
 from dsr.data.rendering import cached
 from dsr.data.simgeo_scenes import SCENES, SCENES_VERSION, render_scene
@@ -31,8 +30,9 @@ class SimGeo:
     """
 
     name = "simgeo"
+    evaluation = True
 
-    def __init__(self, root: str | None = None, scenes: Sequence[str] | None = None, size: int = 512) -> None:
+    def __init__(self, root: str | None = None, scenes: Wanted = None, size: int = 512) -> None:
         if size < 32:
             raise ValueError(f"dataset.size: expected at least 32 pixels, got {size}")
         self._size = size

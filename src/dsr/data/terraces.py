@@ -1,7 +1,7 @@
 """Undoing the rounding of maps that hold whole levels, so that slopes are slopes and not terraces.
 
-A level L says that the value lay between L - 1/2 and L + 1/2. Between pixels of levels L and L + 1 it passed L + 1/2, so
-the lines between levels are known as the contour lines of a map are. Between them the result is harmonic: it solves
+A level L says that the value lay between L - 1/2 and L + 1/2. Between pixels of levels L and L + 1 it passed L + 1/2,
+so the lines between levels are known as the contour lines of a map are. Between them the result is harmonic: it solves
 Laplace's equation given the contours, with holes and the edges of surfaces, where levels jump, as free boundaries.
 """
 

@@ -28,6 +28,14 @@ RECREATED = {
     "sphere_cylinder_no_texture": "Sphere and cylinder, no texture",
 }
 """Embedded SimGeo scenes and the scene of the paper that each re-creates."""
+OTHER_FRAMES = ("icl",)
+"""Data sets of which the paper does not say which frames its scenes are."""
+AVERAGES = {
+    "simgeo": ("Average performance on SimGeo dataset", 6),
+    "icl": ("Average performance on ICL-NUIM dataset", 6),
+    "middlebury": ("Average performance on Middlebury dataset", 7),
+}
+"""The paper's averages over its scenes of a data set, and how many these are."""
 _PUBLISHED_DOWNSAMPLING = "box"
 
 
@@ -41,7 +49,7 @@ def published() -> pd.DataFrame:
 def published_row(scene: str, method: str, scale: int) -> pd.Series | None:
     """Return the paper's figures for a scene (by our name or its own) and a method (by its name in the paper)."""
     table = published()
-    name = RECREATED.get(scene, scene).casefold()
+    name = RECREATED.get(scene, scene.replace("_", " ")).casefold()
     rows = table[(table["scene"].str.casefold() == name) & (table["method"] == method) & (table["scale"] == scale)]
     return None if rows.empty else rows.iloc[0]
 
@@ -69,7 +77,8 @@ def score_table(scores: pd.DataFrame, label: str) -> Table:
     """
     ours = in_paper_units(scores)
     scale, downsampling = int(scores["scale"].iloc[0]), str(scores["downsampling"].iloc[0])
-    title = f"{label} on {scores['dataset'].iloc[0]}, x{scale}, {downsampling} downsampling - lower is better"
+    dataset = str(scores["dataset"].iloc[0])
+    title = f"{label} on {dataset}, x{scale}, {downsampling} downsampling - lower is better"
     table = Table(title=escape(title), title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
     table.add_column("scene", overflow="fold")
     table.add_column("from")
@@ -81,14 +90,18 @@ def score_table(scores: pd.DataFrame, label: str) -> Table:
         table.add_row(escape(str(scene)), "dsr", *_cells(values))
         paper = published_row(str(scene), label, scale) if downsampling == _PUBLISHED_DOWNSAMPLING else None
         if paper is not None:
-            recreated = scene in RECREATED
+            recreated = scene in RECREATED or dataset in OTHER_FRAMES
             starred |= recreated
             table.add_row("", "paper*" if recreated else "paper", *_cells(paper[list(ours)]), style="dim")
     if len(ours) > 1:
         table.add_section()
         table.add_row("mean", "dsr", *_cells(ours.mean()), style="bold")
+        name, count = AVERAGES.get(dataset, ("", 0))
+        paper = published_row(name, label, scale) if downsampling == _PUBLISHED_DOWNSAMPLING else None
+        if paper is not None and len(ours) == count:
+            table.add_row("", "paper*" if starred else "paper", *_cells(paper[list(ours)]), style="dim")
     if starred:
-        table.caption = "* of the paper's own file; the embedded scene re-creates its description"
+        table.caption = "* of the paper's own files; the scenes here are others of the same description"
         table.caption_justify = "left"
     return table
 

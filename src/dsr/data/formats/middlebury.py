@@ -2,16 +2,16 @@
 
 Formats as on vision.middlebury.edu/stereo/data: disparity d in pixels of the left view, z = baseline f / (d + doffs).
 
-- 2014 (Scharstein et al., GCPR 2014): ``im0.png``, ``calib.txt``, ``disp0.pfm`` (``disp0GT.pfm`` in the smaller sizes of
-  the evaluation kit); inf = unknown.
+- 2014 (Scharstein et al., GCPR 2014): ``im0.png``, ``calib.txt``, ``disp0.pfm`` (``disp0GT.pfm`` in the smaller sizes
+  of the evaluation kit); inf = unknown.
 - 2005, 2006 (Scharstein and Pal, Hirschmueller and Scharstein, CVPR 2007): ``view1.png``, ``disp1.png``, 0 = unknown.
   f = 3740 pixels at full size, baseline 160 mm. A level is a pixel of the full size, be the map full size, half or a
   third; ``dmin.txt`` has the disparity, in such pixels, by which the views were shifted. Without it depths are too far,
   though planes stay planes.
-- 2003 (Scharstein and Szeliski, CVPR 2003): ``im2.png``, ``disp2.png``, 4 levels a pixel, 0 = unknown. The camera is the
-  one that the evaluation kit has for Teddy.
-- 2001 (Scharstein and Szeliski, IJCV 2002): ``im2.ppm``, ``disp2.pgm``, 8 levels a pixel. No camera was published; it is
-  assumed to be the one of 2003.
+- 2003 (Scharstein and Szeliski, CVPR 2003): ``im2.png``, ``disp2.png``, 4 levels a pixel, 0 = unknown. The camera is
+  the one that the evaluation kit has for Teddy.
+- 2001 (Scharstein and Szeliski, IJCV 2002): ``im2.ppm``, ``disp2.pgm``, 8 levels a pixel. No camera was published; it
+  is assumed to be the one of 2003.
 """
 
 from __future__ import annotations
@@ -89,7 +89,8 @@ def load_2014(folder: Path, dataset: str, name: str, *, offset: bool = True) -> 
 
     Args:
         folder: with the files.
-        dataset, name: of the scene.
+        dataset: of the scene returned.
+        name: the same.
         offset: whether doffs of ``calib.txt`` counts, as it has to geometrically, or is taken for 0.
 
     Raises:
@@ -116,7 +117,8 @@ def load_levels(files: Files, dataset: str, name: str, year: int, *, smooth: boo
 
     Args:
         files: of the scene.
-        dataset, name: of the scene.
+        dataset: of the scene returned.
+        name: the same.
         year: that of the data set, which says how levels count.
         smooth: whether terraces of the rounding become slopes; see :mod:`dsr.data.terraces`.
 

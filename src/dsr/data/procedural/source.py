@@ -27,6 +27,7 @@ class Procedural:
     """
 
     name = "procedural"
+    evaluation = False
 
     def __init__(self, count: int = 200, size: int = 512, seed: int = 0) -> None:
         if count < 1 or size < 32 or seed < 0:

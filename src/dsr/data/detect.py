@@ -1,0 +1,83 @@
+"""What lies in a directory: the scenes of any layout that dsr reads."""
+
+from __future__ import annotations
+
+import functools
+import itertools
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from dsr.data.folder import load_scene
+from dsr.data.formats import icl_nuim, middlebury, nyu, sintel, sunrgbd, tartanair, tofmark
+from dsr.sample import Scene
+
+Loader = Callable[[], Scene]
+_YEARS = {"view1.png": 2006, "im2.png": 2003, "im2.ppm": 2001}
+_FRAMES: tuple[tuple[Callable[[Path], Mapping[str, tuple[Any, ...]]], Callable[..., Scene], str], ...] = (
+    (icl_nuim.find_frames, icl_nuim.load_frame, "icl"),
+    (sunrgbd.find_frames, sunrgbd.load_frame, "sunrgbd"),
+    (tartanair.find_frames, tartanair.load_frame, "tartanair"),
+    (sintel.find_frames, sintel.load_frame, "sintel"),
+    (tofmark.find_frames, tofmark.load_frame, "tofmark"),
+)
+
+
+def scenes_in(folder: Path) -> Iterator[tuple[str, Loader]]:
+    """Yield the name of each scene in a directory, or of the one that it is, and what loads it.
+
+    Raises:
+        ValueError: there is no such directory.
+
+    """
+    if not folder.is_dir():
+        raise ValueError(f"{folder}: expected a directory, there is none")
+    for place in (folder, *_folders(folder)):
+        yield from _own_layout(place)
+        yield from _stereo(place, itself=place == folder)
+        yield from _labelled(place)
+    yield from _frames(folder)
+
+
+def _folders(folder: Path) -> list[Path]:
+    return sorted(path for path in folder.iterdir() if path.is_dir() and not path.name.startswith("."))
+
+
+def _own_layout(place: Path) -> Iterator[tuple[str, Loader]]:
+    """Yield the scene of a folder with a camera file."""
+    if (place / "camera.json").is_file():
+        yield place.name, functools.partial(load_scene, place, "folder")
+
+
+def _stereo(place: Path, *, itself: bool) -> Iterator[tuple[str, Loader]]:
+    """Yield the scenes of Middlebury directly below a folder, and the one that it is."""
+    for name, scene in middlebury.find_2014(place).items():
+        yield name, functools.partial(middlebury.load_2014, scene, "middlebury", name)
+    for name, files in middlebury.find_levels(place).items():
+        yield name, _levels(name, files)
+    if itself and (place / "calib.txt").is_file():
+        yield place.name, functools.partial(middlebury.load_2014, place, "middlebury", place.name)
+    if itself and any((place / photo).is_file() for photo in _YEARS):
+        name = place.resolve().name.casefold()
+        yield name, _levels(name, middlebury.find_levels(place.resolve().parent)[name])
+
+
+def _levels(name: str, files: middlebury.Files) -> Loader:
+    year = _YEARS.get(files.photo.name, 2005)
+    return functools.partial(middlebury.load_levels, files, f"middlebury{year}", name, year)
+
+
+def _labelled(place: Path) -> Iterator[tuple[str, Loader]]:
+    """Yield the frames of NYU's labelled file, some of them: one in a hundred."""
+    path = place / "nyu_depth_v2_labeled.mat"
+    if path.is_file():
+        for name, arguments in itertools.islice(nyu.find_frames(path).items(), 0, None, 100):
+            yield name, functools.partial(nyu.load_frame, *arguments, "nyu", name)
+
+
+def _frames(folder: Path) -> Iterator[tuple[str, Loader]]:
+    """Yield frames at any depth below a folder."""
+    for find, load, dataset in _FRAMES:
+        for name, arguments in find(folder).items():
+            if not any((path.parent / "camera.json").is_file() for path in arguments if isinstance(path, Path)):
+                yield name, functools.partial(load, *arguments, dataset, name)

@@ -1,0 +1,117 @@
+"""Matrices from MATLAB files: version 5 by its published description, 7.3 as the HDF5 that it is.
+
+SciPy reads version 5, too, but a damaged file can end the whole process there.
+"""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+
+_LARGEST = 1 << 26
+"""Numbers in a matrix that is read."""
+_MATRIX, _COMPRESSED, _STRUCTURE = 14, 15, 2
+_STORED = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}
+_CLASSES = {6: "f8", 7: "f4", 8: "i1", 9: "u1", 10: "i2", 11: "u2", 12: "i4", 13: "u4", 14: "i8", 15: "u8"}
+
+
+def read_variables(path: Path) -> dict[str, np.ndarray]:
+    """Return the matrices of numbers in a MATLAB file, of versions 5 to 7.3, by name.
+
+    A field of a structure is named "structure.field"; cells, text and sparse matrices are left out. Version 5 is read
+    by its published description ("MAT-File Format", MathWorks), 7.3 as the HDF5 that it is.
+
+    Raises:
+        ValueError: it is missing, damaged, or another kind of file, or a matrix is too large to be one.
+
+    """
+    if not path.is_file():
+        raise ValueError(f"{path}: expected a MATLAB file, there is none")
+    size = path.stat().st_size
+    most = min(_LARGEST, 1032 * size)  # deflate makes nothing smaller than that
+    try:
+        if h5py.is_hdf5(path):
+            with h5py.File(path, "r") as file:
+                return dict(_matrices("", file, most))
+        _expect_at_most(8 * _LARGEST, "the file", size)
+        return dict(_matrices("", _old_variables(path.read_bytes()), most))
+    except Exception as error:  # a damaged file makes h5py raise RuntimeError, OSError, KeyError, ..., zlib its own
+        reason = " ".join(str(error).split())
+        raise ValueError(f"{path}: expected a MATLAB file, got a damaged or foreign one ({reason:.80})") from error
+
+
+def _old_variables(content: bytes) -> dict[str, Any]:
+    """Return what a file of version 5 holds: matrices, structures as dictionaries, None for the rest."""
+    order = {b"IM": "<", b"MI": ">"}.get(content[126:128])
+    if order is None:
+        raise ValueError("no header of MATLAB 5")
+    found = {}
+    for kind, part in _elements(content[128:], order):
+        if kind == _COMPRESSED:
+            unpacking = zlib.decompressobj()
+            part = unpacking.decompress(part, 8 * _LARGEST)  # noqa: PLW2901 - one of two kinds of the same
+            if not unpacking.eof:
+                raise ValueError("a compressed variable without end")
+            ((kind, part),) = _elements(part, order)  # noqa: PLW2901
+        if kind == _MATRIX:
+            name, value = _old_variable(part, order)
+            found[name] = value
+    return found
+
+
+def _old_variable(content: bytes, order: str) -> tuple[str, Any]:
+    """Return the name and the value of a variable of version 5."""
+    if not content:
+        return "", None
+    (_, flags), (_, sizes), (_, name), *parts = _elements(content, order)
+    kind = struct.unpack_from(order + "I", flags)[0] & 0xFF
+    shape = tuple(np.frombuffer(sizes, order + "i4").tolist())
+    value: Any = None
+    if kind in _CLASSES and min(shape) >= 0:
+        stored, numbers = parts[0]
+        value = np.frombuffer(numbers, order + _STORED[stored]).reshape(shape, order="F").astype(_CLASSES[kind])
+    elif kind == _STRUCTURE and shape == (1, 1):
+        (_, length), (_, names), *fields = parts
+        step = struct.unpack(order + "i", length)[0]
+        keys = [names[at : at + step].split(b"\0")[0].decode("ascii") for at in range(0, len(names), step)]
+        value = {key: _old_variable(part, order)[1] for key, (_, part) in zip(keys, fields, strict=True)}
+    return name.decode("ascii"), value
+
+
+def _elements(content: bytes, order: str) -> Iterator[tuple[int, bytes]]:
+    """Yield kind and content of the elements that stand one behind the other in a file of version 5."""
+    at = 0
+    while at < len(content):
+        kind, length = struct.unpack_from(order + "II", content, at)
+        start = at + 8
+        if kind >> 16:  # at most four bytes, within the element's head
+            kind, length, start = kind & 0xFFFF, kind >> 16, at + 4
+            at += 8
+        else:
+            at = start + length + (0 if kind == _COMPRESSED else -length % 8)
+        if start + length > len(content):
+            raise ValueError("an element that ends beyond the file")
+        yield kind, content[start : start + length]
+
+
+def _expect_at_most(most: int, name: str, size: int) -> None:
+    if size > most:
+        raise ValueError(f"{name} has {size}, expected at most {most}")
+
+
+def _matrices(prefix: str, entries: Mapping[str, Any], most: int) -> Iterator[tuple[str, np.ndarray]]:
+    """Yield the matrices of numbers in a file or structure, axes as in MATLAB."""
+    for key, entry in entries.items():
+        if key.startswith("#"):  # MATLAB's own tables
+            continue
+        if isinstance(entry, Mapping):
+            yield from _matrices(f"{prefix}{key}.", entry, most)
+        elif isinstance(entry, np.ndarray | h5py.Dataset) and entry.dtype.kind in "biuf" and entry.ndim in (2, 3):
+            _expect_at_most(most, prefix + key, entry.size)
+            yield prefix + key, entry if isinstance(entry, np.ndarray) else entry[()].T

@@ -1,0 +1,114 @@
+"""NYU Depth v2, the 1449 labelled frames.
+
+Silberman et al., "Indoor Segmentation and Support Inference from RGBD Images", ECCV 2012.
+
+``nyu_depth_v2_labeled.mat`` is a MATLAB 7.3 file, that is HDF5, which turns axes around: images (N, 3, 640, 480) uint8,
+depths and rawDepths (N, 640, 480) float32, orthogonal metres in the colour camera. rawDepths is the Kinect's depth, 0
+for a hole; depths was filled by the authors (colourisation after Levin et al.). One frame is read at a time.
+
+The camera is camera_params.m of the official toolbox, which counts pixels from 1. The toolbox cuts off the white border
+(get_projection_mask.m): rows 45 to 471, columns 41 to 601, counted from 1, which leaves 427 x 561.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from types import MappingProxyType
+
+import h5py
+import numpy as np
+import torch
+
+from dsr.data.formats.shared import to_depth
+from dsr.geometry.camera import Camera
+from dsr.sample import Scene
+
+CAMERA = Camera(640, 480, 518.85790117450188, 519.46961112127485, 325.58244941119034 - 1, 253.73616633400465 - 1)
+BORDER = (44, 40, 427, 561)
+"""First row, first column, height and width, from 0, of what the projected depth covers."""
+_FRAME = MappingProxyType({
+    "images": ((3, 640, 480), np.dtype(np.uint8)),
+    "depths": ((640, 480), np.dtype(np.float32)),
+    "rawDepths": ((640, 480), np.dtype(np.float32)),
+})  # fmt: skip
+
+
+def find_frames(path: Path) -> dict[str, tuple[Path, int]]:
+    """Return the file and the frame's number, the first two arguments of :func:`load_frame`, by name "0001" to "1449".
+
+    Numbers count from 1, as in the official split of the frames.
+
+    Raises:
+        ValueError: the file is missing, damaged or another one.
+
+    """
+    with _opened(path) as arrays:
+        return {f"{number:04d}": (path, number) for number in range(1, len(arrays["images"]) + 1)}
+
+
+def load_frame(path: Path, number: int, dataset: str, name: str, *, filled: bool = False, crop: bool = True) -> Scene:
+    """Return one frame.
+
+    Args:
+        path: the labelled ``.mat`` file.
+        number: of the frame, from 1.
+        dataset: of the scene returned.
+        name: the same.
+        filled: take the authors' filled depth instead of the Kinect's with its holes.
+        crop: cut off the border, which leaves 427 x 561 pixels.
+
+    Raises:
+        ValueError: the file is missing, damaged or another one, or has no such frame.
+
+    """
+    key = "depths" if filled else "rawDepths"
+    with _opened(path) as arrays:
+        count = len(arrays["images"])
+        if not 1 <= number <= count:
+            raise ValueError(f"{path}: expected a frame from 1 to {count}, got {number}")
+        try:
+            pixels, metres = arrays["images"][number - 1], arrays[key][number - 1]
+        except OSError as error:  # a damaged block
+            raise ValueError(f"{path}: expected frame {number} of {key} and images, got a damaged file") from error
+    rgb = torch.from_numpy(pixels).permute(0, 2, 1).contiguous().float() / 255  # (3, 480, 640)
+    depth, camera = to_depth(path, metres.T), CAMERA
+    if crop:
+        top, left, height, width = BORDER
+        rgb, depth = (image[:, top : top + height, left : left + width] for image in (rgb, depth))
+        camera = camera.crop(*BORDER)
+    if not depth.isfinite().any():
+        raise ValueError(f"{path}: expected at least one known pixel in frame {number}, all are holes")
+    return Scene(dataset, name, rgb, camera, depth)
+
+
+@contextlib.contextmanager
+def _opened(path: Path) -> Iterator[Mapping[str, h5py.Dataset]]:
+    """Open the file and yield its arrays, checked to be as the module says."""
+    if not path.is_file():
+        raise ValueError(f"{path}: expected a MATLAB 7.3 file, there is none")
+    try:
+        file = h5py.File(path, "r")
+    except OSError as error:
+        size = path.stat().st_size
+        raise ValueError(f"{path}: expected a MATLAB 7.3 (HDF5) file, got {size} bytes damaged or foreign") from error
+    with file:
+        yield {key: _checked(path, file, key) for key in _FRAME}
+
+
+def _checked(path: Path, file: h5py.File, key: str) -> h5py.Dataset:
+    """Return one of the arrays, if it has the shape and type of its frames and as many as the others."""
+    shape, dtype = _FRAME[key]
+    try:
+        array = file.get(key)
+        came = (array.dtype, array.shape) if isinstance(array, h5py.Dataset) else None
+        count = file["images"].shape[:1]
+    except Exception as error:  # damaged inside: h5py raises KeyError, RuntimeError, OSError, ...
+        raise ValueError(f"{path}: expected the array {key}, got a damaged or foreign file") from error
+    if came is None:
+        raise ValueError(f"{path}: expected the array {key}, got none of that name")
+    if came != (dtype, (*count, *shape)):
+        sizes = ", ".join(map(str, shape))
+        raise ValueError(f"{path}: {key}: expected {dtype} (frames, {sizes}), got {came[0]} {came[1]}")
+    return array

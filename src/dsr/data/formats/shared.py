@@ -1,0 +1,160 @@
+"""What the readers of native formats share: numbers and pictures from files, checks that name the file."""
+
+from __future__ import annotations
+
+import math
+import os
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor
+
+from dsr.data.files import read_pixels
+from dsr.geometry.camera import Camera
+
+_LONGEST = 40
+"""Bytes that one number and the blank behind it may take."""
+_TEXT = re.compile(rb"[-+.\deEnaifNAIF\s]*")
+
+
+def read_numbers(path: Path, count: int) -> np.ndarray:
+    """Return the numbers of a text file, separated by blanks or line ends, as float64 (count,).
+
+    Raises:
+        ValueError: it is missing, holds something else, or another number of them.
+
+    """
+    if not path.is_file():
+        raise ValueError(f"{path}: expected a text file of {count} numbers, there is none")
+    size = path.stat().st_size
+    if size > _LONGEST * count:
+        raise ValueError(f"{path}: expected {count} numbers, got {size} bytes, too many for that")
+    content = path.read_bytes()
+    try:
+        values = np.array(content.split() if _TEXT.fullmatch(content) else "", dtype=np.float64)
+    except ValueError as error:
+        raise ValueError(f"{path}: expected {count} numbers, got text or bytes that are none") from error
+    if values.size != count:
+        raise ValueError(f"{path}: expected {count} numbers, got {values.size}")
+    return values
+
+
+def read_bytes(path: Path, what: str) -> bytes:
+    """Return what is in a file.
+
+    Raises:
+        ValueError: there is none; ``what`` says what was expected.
+
+    """
+    if not path.is_file():
+        raise ValueError(f"{path}: expected {what}, there is none")
+    return path.read_bytes()
+
+
+def read_picture(path: Path) -> Tensor:
+    """Return a picture of 8 or 16 bits a channel, (3, H, W) float32 in [0, 1].
+
+    Raises:
+        ValueError: it is missing, damaged, or no such picture.
+
+    """
+    pixels = read_pixels(path, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH)
+    if pixels.dtype not in (np.uint8, np.uint16):
+        raise ValueError(f"{path}: expected a picture of 8 or 16 bits a channel, got {pixels.dtype}")
+    scaled = pixels[..., ::-1].astype(np.float32) / np.iinfo(pixels.dtype).max
+    return torch.from_numpy(np.ascontiguousarray(scaled.transpose(2, 0, 1)))
+
+
+def read_16bit(path: Path) -> np.ndarray:
+    """Return the values of a grey picture of 16 bits, (H, W) uint16.
+
+    Raises:
+        ValueError: it is missing, damaged, or no such picture.
+
+    """
+    pixels = read_pixels(path, cv2.IMREAD_UNCHANGED)
+    if pixels.ndim != 2 or pixels.dtype != np.uint16:
+        channels = 1 if pixels.ndim == 2 else pixels.shape[2]
+        raise ValueError(f"{path}: expected one channel of 16 bits, got {channels} of {pixels.dtype}")
+    return pixels
+
+
+def to_depth(path: Path, values: np.ndarray, farthest: float = math.inf) -> Tensor:
+    """Return depth with its holes marked, (1, H, W) float64 in metres.
+
+    Args:
+        path: the file that the values come from, for the message.
+        values: (H, W) metres; 0 is a hole.
+        farthest: metres; what lies beyond, the sky, becomes a hole.
+
+    Raises:
+        ValueError: a value is negative or NaN, or all are holes.
+
+    """
+    with np.errstate(invalid="ignore"):  # damaged bytes may be signalling NaN, which a cast warns of
+        values = values.astype(np.float64)
+    if not (values >= 0).all():
+        came = "NaN" if np.isnan(values).any() else f"{values.min():g}"
+        raise ValueError(f"{path}: expected positive depth, and 0 where a pixel is a hole; got {came}")
+    known = (values > 0) & (values <= farthest) & np.isfinite(values)
+    if not known.any():
+        limit = "" if math.isinf(farthest) else f" within {farthest:g} m"
+        raise ValueError(f"{path}: expected at least one known pixel{limit}, all are holes")
+    return torch.from_numpy(np.where(known, values, np.nan))[None]
+
+
+def expect_size(path: Path, size: tuple[int, ...], expected: tuple[int, ...]) -> None:
+    """Refuse a map that is not ``expected`` = (height, width)."""
+    if tuple(size) != tuple(expected):
+        raise ValueError(
+            f"{path}: expected {expected[0]} x {expected[1]} pixels (height x width), got {' x '.join(map(str, size))}"
+        )
+
+
+def to_camera(source: Path | str, matrix: np.ndarray, size: tuple[int, int]) -> Camera:
+    """Return the camera of an intrinsic matrix [fx 0 cx; 0 fy cy; 0 0 1], pixel centres at integers.
+
+    Args:
+        source: the file or argument that the matrix comes from, for the message.
+        matrix: (3, 3), in pixels.
+        size: (height, width) of the pictures.
+
+    Raises:
+        ValueError: it is no such matrix, a focal length is beyond 0.1 to 100 picture widths, or the principal point
+            lies outside of the picture.
+
+    """
+    height, width = size
+    (fx, skew, cx), (lower, fy, cy), last = matrix.tolist()
+    shape = (skew, lower, *last) == (0, 0, 0, 0, 1)
+    focal = all(0.1 * width <= value <= 100 * width for value in (fx, fy))
+    if not (shape and focal and 0 <= cx < width and 0 <= cy < height):
+        came = " ".join(f"{value:g}" for value in matrix.ravel())
+        raise ValueError(f"{source}: expected fx 0 cx 0 fy cy 0 0 1 of a {height} x {width} picture, got {came}")
+    return Camera(width, height, fx, fy, cx, cy)
+
+
+def walk(root: Path) -> Iterator[tuple[Path, list[str], list[str]]]:
+    """Yield every folder of a directory in order, with the names of its folders and of its files.
+
+    A name that the caller takes off the list of folders is not entered; hidden folders are not either.
+
+    Raises:
+        ValueError: there is no such directory.
+
+    """
+    if not root.is_dir():
+        raise ValueError(f"{root}: expected a directory, there is none")
+    for folder, below, files in os.walk(root):
+        below[:] = sorted(name for name in below if not name.startswith("."))
+        yield Path(folder), below, sorted(files)
+
+
+def name_of(root: Path, folder: Path, frame: str = "") -> str:
+    """Return the name of a frame of a folder, "a/b/0001", from ``root`` on; of ``root`` itself the directory's name."""
+    path = folder.relative_to(root) / frame
+    return path.as_posix() if path.parts else root.resolve().name

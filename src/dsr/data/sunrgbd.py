@@ -1,0 +1,78 @@
+"""``dataset=sunrgbd``: real rooms by four sensors (Song et al., CVPR 2015).
+
+Voynov et al. 2019 evaluate on twelve images and do not say which. Here: three of each sensor.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
+
+from dsr.data.base import Wanted
+from dsr.data.formats import sunrgbd
+from dsr.data.native import Native, Place, Preparation, Record, data_folder, listed, records_of, renamed
+
+FRAMES = MappingProxyType(
+    {
+        "kinect1_1": "kv1/NYUdata/NYU0001",
+        "kinect1_2": "kv1/NYUdata/NYU0428",
+        "kinect1_3": "kv1/b3dodata/img_0063",
+        "kinect2_1": "kv2/kinect2data/000002_2014-05-26_14-23-37_260595134347_rgbf000103-resize",
+        "kinect2_2": "kv2/align_kv2/2014-12-18_11-31-54_260595134347",
+        "kinect2_3": "kv2/align_kv2/2014-12-18_13-59-40_260595134347",
+        "realsense_1": "realsense/lg/2014_10_24-09_14_34-1311000073",
+        "realsense_2": "realsense/sa/2014_10_21-15_21_11-1311000073",
+        "realsense_3": "realsense/sh/2014_10_21-11_35_34-1311000041",
+        "xtion_1": "xtion/xtion_align_data/2014_12_18_12_3_40",
+        "xtion_2": "xtion/sun3ddata/mit_76_studyroom/76-1studyroom1/0000003-000000067032",
+        "xtion_3": "xtion/sun3ddata/brown_bm_2/brown_bm_2",
+    }
+)
+"""Folders; where several scenes lie below one, its first."""
+
+
+class SunRGBD(Native):
+    """Scenes of SUN RGB-D; what the sensor measured is taken for the truth, holes and all.
+
+    Args:
+        root: where the scenes' folders lie, at any depth.
+        scenes: names of the ones to use; None for twelve, ``found`` for all in ``root``.
+        size: height and width in pixels; None for scenes as they are.
+        crop: see :class:`dsr.data.native.Preparation`.
+        refined: whether the authors' refined depth, without holes, is taken for the truth.
+        frames: which folder each of the twelve names stands for.
+        intrinsics: fx, fy, cx, cy in pixels for folders without ``intrinsics.txt``.
+
+    Raises:
+        ValueError: a scene is not there, or a value is out of range.
+
+    """
+
+    def __init__(
+        self,
+        root: str,
+        scenes: Wanted = None,
+        size: int | None = 512,
+        crop: float = 0.5,
+        refined: bool = False,
+        frames: Mapping[str, str] = FRAMES,
+        intrinsics: Sequence[float] | None = None,
+    ) -> None:
+        if intrinsics is not None and len(intrinsics) != 4:
+            raise ValueError(f"dataset.intrinsics: expected fx, fy, cx, cy, got {len(intrinsics)} numbers")
+        folder = data_folder(root)
+        settings = {"refined": refined, "intrinsics": intrinsics and tuple(intrinsics)}
+        records = records_of(listed(sunrgbd.find_frames, folder), sunrgbd.load_frame, "sunrgbd", **settings)
+        found = renamed(records, {name: _first_below(records, path) for name, path in frames.items()})
+        super().__init__("sunrgbd", Place(folder, "sunrgbd"), found, tuple(FRAMES), scenes, Preparation(size, crop))
+
+
+def _first_below(records: Mapping[str, Record], path: str) -> str:
+    """Return the first scene whose name is or begins with a path, below ``SUNRGBD`` or not; the path where none is."""
+    wanted = path.replace("/", "_")
+    beginnings = (wanted, f"SUNRGBD_{wanted}")
+    return next((name for name in sorted(records) if name in beginnings or name.startswith(_under(beginnings))), path)
+
+
+def _under(beginnings: Sequence[str]) -> tuple[str, ...]:
+    return tuple(f"{beginning}_" for beginning in beginnings)

@@ -1,0 +1,51 @@
+"""``dataset=tofmark``: a time-of-flight sensor's samples beside a photo (Ferstl et al., ICCV 2013).
+
+The benchmark's files hold no camera. Voynov et al. 2019 use Books, Devil and Shark with the real sensor's maps as the
+input: ``downsampling=measured``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+from dsr.data.base import Wanted
+from dsr.data.formats import tofmark
+from dsr.data.native import Native, Place, Preparation, data_folder, listed, records_of
+
+SCENES = ("books", "devil", "shark")
+
+
+class ToFMark(Native):
+    """Scenes of ToFMark at their own size, the samples as measured maps at x4 and x8.
+
+    Args:
+        root: where the ``.mat`` files or the pictures lie.
+        scenes: names of the ones to use; None for the three, ``found`` for all in ``root``.
+        intrinsics: fx, fy, cx, cy in pixels; the files have none.
+        depth_range: metres that levels 1 and 255 of pictures stand for; they hold no scale.
+        variables: names in the ``.mat`` files of ``intensity``, ``depth`` and ``samples``, where they are not found.
+
+    Raises:
+        ValueError: a scene is not there, or a value is out of range.
+
+    """
+
+    def __init__(
+        self,
+        root: str,
+        scenes: Wanted = None,
+        intrinsics: Sequence[float] | None = None,
+        depth_range: Sequence[float] | None = None,
+        variables: Mapping[str, str] | None = None,
+    ) -> None:
+        for name, values, count in (("intrinsics", intrinsics, 4), ("depth_range", depth_range, 2)):
+            if values is not None and len(values) != count:
+                raise ValueError(f"dataset.{name}: expected {count} numbers, got {len(values)}")
+        folder = data_folder(root)
+        settings = {
+            "intrinsics": intrinsics and tuple(intrinsics),
+            "depth_range": depth_range and tuple(depth_range),
+            "variables": variables and dict(variables),
+        }
+        found = records_of(listed(tofmark.find_frames, folder), tofmark.load_frame, "tofmark", **settings)
+        super().__init__("tofmark", Place(folder, "tofmark"), found, SCENES, scenes, Preparation(None))

@@ -1,0 +1,164 @@
+"""The paper's scenes by name, and that none of them is trained on."""
+
+from pathlib import Path
+
+import pytest
+import yaml
+
+from dsr.app.build import build
+from dsr.app.schema import ConfigError
+from dsr.data.folder import Folder
+from dsr.data.formats.sintel import SEQUENCES
+from dsr.data.icl import FRAMES as ICL_FRAMES
+from dsr.data.icl import ICL
+from dsr.data.middlebury import EVALUATION_2014, Middlebury, MiddleburyLevels
+from dsr.data.simgeo import SimGeo
+from dsr.data.simgeo_scenes import SCENES as SIMGEO_SCENES
+from dsr.data.sunrgbd import FRAMES as SUN_FRAMES
+from dsr.data.sunrgbd import SunRGBD
+from dsr.data.tofmark import SCENES as TOFMARK_SCENES
+from dsr.data.tofmark import ToFMark
+from dsr.data.training_sets import MIDDLEBURY, MiddleburyTrain, Sintel, sintel_frames
+from dsr.report.tables import published_row
+
+CONF = Path(__file__).resolve().parents[2] / "conf" / "dataset"
+
+
+def touch(root, *paths):
+    """Make empty files."""
+    for path in paths:
+        (root / path).parent.mkdir(parents=True, exist_ok=True)
+        (root / path).touch()
+    return str(root)
+
+
+def stereo_2014(root, names):
+    return touch(root, *(f"{name.title()}-perfect/calib.txt" for name in names))
+
+
+def node(name):
+    """Return a data set's configuration, with environment variables left alone."""
+    return yaml.safe_load((CONF / f"{name}.yaml").read_text())
+
+
+def test_the_evaluation_set_has_34_images():
+    counts = {
+        "simgeo": len(SIMGEO_SCENES), "icl": len(ICL_FRAMES), "middlebury": len(EVALUATION_2014),
+        "sunrgbd": len(SUN_FRAMES), "tofmark": len(TOFMARK_SCENES),
+    }  # fmt: skip
+    assert counts == {"simgeo": 6, "icl": 6, "middlebury": 7, "sunrgbd": 12, "tofmark": 3}
+    assert sum(counts.values()) == 34
+
+
+@pytest.mark.parametrize("scene", [*ICL_FRAMES, *EVALUATION_2014])
+def test_a_scene_of_icl_nuim_and_middlebury_has_rows_in_the_paper_s_tables(scene):
+    for scale in (4, 8):
+        assert published_row(scene, "Bicubic", scale) is not None
+
+
+@pytest.mark.parametrize(("name", "frames"), [("icl", ICL_FRAMES), ("sunrgbd", SUN_FRAMES)])
+def test_the_configuration_names_the_frames_that_the_code_does(name, frames):
+    assert node(name)["frames"] == dict(frames)
+
+
+@pytest.mark.parametrize(
+    "name", [path.stem for path in CONF.glob("*.yaml") if path.stem not in ("mixture", "paper_train")]
+)
+def test_every_data_set_s_configuration_is_one_that_its_class_takes(name, tmp_path, monkeypatch):
+    entries = {**node(name), "root": str(tmp_path / "nowhere")} if "root" in node(name) else node(name)
+    if name in ("simgeo", "procedural"):
+        assert build("dataset", entries).scenes()
+        return
+    with pytest.raises(ConfigError, match="nowhere") as refusal:
+        build("dataset", entries)
+    message = str(refusal.value)
+    assert "\n" not in message
+    assert name == "folder" or f"get it with: dsr data get {name}; or say where it is: dataset.root=DIR" in message
+
+
+def test_frames_are_named_in_the_configuration(tmp_path):
+    root = touch(tmp_path, *(f"{where}/{what}/{number}.png" for where in ("x", "y") for what in ("rgb", "depth")
+                             for number in (0, 7)))  # fmt: skip
+    entries = {**node("icl"), "root": root, "frames": {**ICL_FRAMES, "sofa": "y/0007"}, "scenes": ["sofa", "x_0000"]}
+    assert build("dataset", entries).scenes() == ["sofa", "x_0000"]
+    with pytest.raises(ConfigError, match=r"dataset\.frames: expected keys, each with text, got \['a'\]"):
+        build("dataset", {**entries, "frames": ["a"]})
+
+
+def test_middlebury_is_the_paper_s_seven_scenes_unless_told_otherwise(tmp_path):
+    root = stereo_2014(tmp_path, (*EVALUATION_2014, "piano"))
+    assert Middlebury(root).scenes() == list(EVALUATION_2014)
+    assert sorted(Middlebury(root, "found").scenes()) == sorted((*EVALUATION_2014, "piano"))
+
+
+def test_scenes_of_sun_rgbd_are_found_below_any_folder_by_their_path_or_its_beginning(tmp_path):
+    paths = [*list(SUN_FRAMES.values())[:-1], "xtion/sun3ddata/brown_bm_2/brown_bm_2/b", "kv1/NYUdata/NYU00011"]
+    root = touch(tmp_path, *(f"SUNRGBD/{path}/{part}/x" for path in paths for part in ("image", "depth")),
+                 "SUNRGBD/xtion/sun3ddata/brown_bm_2/brown_bm_2/a/image/x",
+                 "SUNRGBD/xtion/sun3ddata/brown_bm_2/brown_bm_2/a/depth/x")  # fmt: skip
+    data = SunRGBD(root)
+    assert data.scenes() == list(SUN_FRAMES)
+    assert "brown_bm_2_a" in data._found["xtion_3"].files[0].as_posix().replace("/", "_")
+    assert len(SunRGBD(root, "found").scenes()) == 14
+
+
+def test_nothing_that_is_evaluated_on_is_trained_on_by_name(tmp_path):
+    training = {scene for scenes in MIDDLEBURY.values() for scene in scenes}
+    assert not training & set(EVALUATION_2014)
+    assert not set(MIDDLEBURY[2014]) & (set(ICL_FRAMES) | set(SIMGEO_SCENES) | set(SUN_FRAMES) | set(TOFMARK_SCENES))
+    stereo_2014(tmp_path / "middlebury2014", (*EVALUATION_2014, *MIDDLEBURY[2014]))
+    root = str(tmp_path)
+    found = MiddleburyTrain(root, "found").scenes()
+    assert sorted(found) == sorted(MIDDLEBURY[2014])
+    for scene in EVALUATION_2014:
+        with pytest.raises(ValueError, match=f"'{scene}' is not there"):
+            MiddleburyTrain(root, [scene])
+
+
+def test_data_sets_know_whether_they_are_to_evaluate_on():
+    evaluated = (Middlebury, MiddleburyLevels, ICL, SunRGBD, ToFMark, SimGeo)
+    assert all(kind.evaluation for kind in evaluated)
+    assert not any(kind.evaluation for kind in (MiddleburyTrain, Sintel, Folder))
+
+
+def test_sintel_has_58_frames_that_exist():
+    frames = sintel_frames()
+    assert len(frames) == len(set(frames)) == 58
+    for frame in frames:
+        sequence, number = frame.rsplit("_frame_", 1)
+        assert 1 <= int(number) <= SEQUENCES[sequence]
+    assert {frame.rsplit("_frame_", 1)[0] for frame in frames} == set(SEQUENCES)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda root: MiddleburyLevels(root, 2007), "dataset.year: expected one of 2001, 2003, 2005, 2006, got 2007"),
+        (
+            lambda root: MiddleburyTrain(root, years=[2005]),
+            "dataset.years: expected some of 2001, 2006, 2014, got 2005",
+        ),
+        (lambda root: SunRGBD(root, intrinsics=[1.0]), "dataset.intrinsics: expected fx, fy, cx, cy, got 1 numbers"),
+        (lambda root: ToFMark(root, depth_range=[1.0]), "dataset.depth_range: expected 2 numbers, got 1"),
+    ],
+)
+def test_values_out_of_range_are_refused(tmp_path, make, message):
+    with pytest.raises(ValueError, match=message):
+        make(str(tmp_path))
+
+
+def test_real_scenes_of_every_data_set_are_prepared(shared, dsr_cache):
+    real = shared / "real"
+    sources = [
+        Middlebury(str(real / "middlebury2014"), ["recycle"], 64),
+        MiddleburyLevels(str(real / "middlebury2006"), 2006, ["aloe"], 64),
+        ICL(str(real / "icl_nuim"), ["office_0000"], 64),
+        SunRGBD(str(real / "sunrgbd"), ["img_0063"], 64),
+    ]
+    for data in sources:
+        [name] = data.scenes()
+        scene = data.load(name)
+        assert (scene.name, tuple(scene.depth.shape), tuple(scene.rgb.shape)) == (name, (1, 64, 64), (3, 64, 64))
+        assert 0.5 < scene.depth.nanmedian() < 12
+    tofmark = ToFMark(str(real / "tofmark"), None, [600.0, 600.0, 404.5, 304.5], [1.0, 2.5])
+    assert tuple(tofmark.load("devil").measured[8].shape) == (1, 76, 101)

@@ -1,0 +1,150 @@
+"""NYU Depth v2: a file of two frames in the official layout, MATLAB's axes, crop and camera, every damage named."""
+
+import h5py
+import numpy as np
+import pytest
+
+from dsr.data.formats.nyu import CAMERA, find_frames, load_frame
+
+ROWS, COLUMNS = np.mgrid[0:480, 0:640]
+RAW = np.stack([1.0 + ROWS / 512 + COLUMNS / 8192, 4.0 + ROWS / 512]).astype(np.float32)
+"""(frames, rows, columns) in metres; not symmetric under any flip."""
+FILLED = RAW + np.float32(0.25)
+IMAGES = np.stack([ROWS % 256, COLUMNS % 256, ROWS * 0 + 51])[None].repeat(2, axis=0).astype(np.uint8)
+
+
+def official(path, **changes):
+    """Write a MATLAB 7.3 file: 512 bytes of text, then HDF5 with the axes turned around."""
+    raw = RAW.copy()
+    raw[0, 100, 200] = 0
+    arrays = {"images": IMAGES.swapaxes(2, 3), "rawDepths": raw.swapaxes(1, 2), "depths": FILLED.swapaxes(1, 2)}
+    with h5py.File(path, "w", userblock_size=512) as file:
+        for key, array in {**arrays, **changes}.items():
+            if array is not None:
+                file.create_dataset(key, data=array, chunks=(1, *array.shape[1:]) if array.ndim > 1 else None)
+        file.create_group("#refs#")
+    content = path.read_bytes()
+    path.write_bytes(b"MATLAB 7.3 MAT-file".ljust(512) + content[512:])
+    return path
+
+
+@pytest.fixture(scope="module")
+def labelled(tmp_path_factory):
+    return official(tmp_path_factory.mktemp("nyu") / "nyu_depth_v2_labeled.mat")
+
+
+def refusal(act, path, capfd):
+    """Return the message of the refusal: one line that names the file, and nothing printed."""
+    with pytest.raises(ValueError) as caught:  # noqa: PT011 - the callers look at the message
+        act(path)
+    assert capfd.readouterr() == ("", "")
+    message = str(caught.value)
+    assert message.startswith(f"{path}: ")
+    assert "\n" not in message
+    return message
+
+
+def load(path):
+    return load_frame(path, 1, "nyu", "0001")
+
+
+def test_a_frame_is_turned_upright_with_the_kinect_s_holes(labelled):
+    scene = load_frame(labelled, 1, "nyu", "0001", crop=False)
+    assert scene.camera == CAMERA
+    np.testing.assert_array_equal((scene.rgb * 255).round(), IMAGES[0])
+    assert scene.depth.isnan().nonzero().tolist() == [[0, 100, 200]]
+    np.testing.assert_array_equal(scene.depth[0, 101:], RAW[0, 101:])
+
+
+def test_the_filled_depth_is_read_on_request(labelled):
+    scene = load_frame(labelled, 2, "nyu", "0002", filled=True, crop=False)
+    np.testing.assert_array_equal(scene.depth[0], FILLED[1])
+
+
+def test_the_border_is_cut_off_and_the_camera_moves_along(labelled):
+    scene = load_frame(labelled, 2, "nyu", "0002")
+    np.testing.assert_array_equal(scene.depth[0], RAW[1, 44:471, 40:601])
+    np.testing.assert_array_equal((scene.rgb * 255).round(), IMAGES[1, :, 44:471, 40:601])
+    camera = scene.camera
+    assert (camera.height, camera.width, camera.fx) == (427, 561, CAMERA.fx)
+    assert (camera.cx, camera.cy) == pytest.approx((325.582449 - 41, 253.736166 - 45), abs=1e-6)
+
+
+def test_frames_are_counted_from_1(labelled):
+    assert find_frames(labelled) == {"0001": (labelled, 1), "0002": (labelled, 2)}
+
+
+@pytest.mark.parametrize("number", [0, -1, 3, 1449])
+def test_a_frame_that_is_not_there_is_refused(labelled, capfd, number):
+    message = refusal(lambda path: load_frame(path, number, "nyu", "a"), labelled, capfd)
+    assert message.endswith(f"expected a frame from 1 to 2, got {number}")
+
+
+@pytest.mark.parametrize("act", [load, find_frames])
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda whole: b"",
+        lambda whole: b"<html>not found</html>",
+        lambda whole: whole[:512],
+        lambda whole: whole[:1000],
+        lambda whole: whole[: len(whole) // 2],
+        lambda whole: whole[:600] + b"\xff" * 400 + whole[1000:],
+        lambda whole: b"MATLAB 5.0 MAT-file".ljust(4096),
+    ],
+)
+def test_a_damaged_or_foreign_file_is_refused_in_one_line(labelled, tmp_path, capfd, act, damage):
+    path = tmp_path / "nyu.mat"
+    path.write_bytes(damage(labelled.read_bytes()))
+    assert "expected" in refusal(act, path, capfd)
+
+
+def test_a_missing_file_is_refused(tmp_path, capfd):
+    assert "there is none" in refusal(load, tmp_path / "nyu.mat", capfd)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"images": None},
+        {"rawDepths": None},
+        {"images": IMAGES},
+        {"images": IMAGES.swapaxes(2, 3).astype(np.uint16)},
+        {"rawDepths": RAW},
+        {"rawDepths": RAW.swapaxes(1, 2)[:1]},
+        {"rawDepths": RAW.swapaxes(1, 2).astype(np.float64)},
+        {"depths": np.ones(5, np.float32)},
+    ],
+)
+def test_a_file_of_other_arrays_is_refused_in_one_line(tmp_path, capfd, changes):
+    (key,) = changes
+    path = official(tmp_path / "nyu.mat", **changes)
+    assert key in refusal(load, path, capfd)
+
+
+@pytest.mark.parametrize("value", [np.nan, -1.0])
+def test_depth_that_is_no_number_or_negative_is_refused(tmp_path, capfd, value):
+    raw = RAW.swapaxes(1, 2).copy()
+    raw[0, 3, 4] = value
+    assert "expected positive depth" in refusal(load, official(tmp_path / "nyu.mat", rawDepths=raw), capfd)
+
+
+def test_a_frame_of_holes_is_refused(tmp_path, capfd):
+    path = official(tmp_path / "nyu.mat", rawDepths=np.zeros((2, 640, 480), np.float32))
+    assert "all are holes" in refusal(load, path, capfd)
+
+
+def test_a_damaged_block_is_refused_and_the_other_frames_are_not(tmp_path, capfd):
+    path = tmp_path / "nyu.mat"
+    official(path, depths=None)
+    with h5py.File(path, "a") as file:
+        depths = file.create_dataset("depths", data=FILLED.swapaxes(1, 2), chunks=(1, 640, 480), compression="gzip")
+        file.flush()
+        block = depths.id.get_chunk_info(0)
+    content = bytearray(path.read_bytes())
+    start = content.index(b"\x89HDF") + block.byte_offset
+    content[start : start + 1000] = bytes(1000)
+    path.write_bytes(content)
+    refusal(lambda path: load_frame(path, 1, "nyu", "a", filled=True), path, capfd)
+    assert load_frame(path, 2, "nyu", "a", filled=True).depth.isfinite().all()
+    assert load(path).depth.isfinite().any()

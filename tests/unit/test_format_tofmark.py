@@ -1,0 +1,308 @@
+"""ToFMark: pictures whose scale the caller gives, .mat files whose variables are told, samples gathered in blocks."""
+
+import struct
+
+import h5py
+import numpy as np
+import pytest
+import scipy.io
+import scipy.sparse
+import torch
+
+from dsr.data.formats.matlab import read_variables
+from dsr.data.formats.tofmark import block_means, find_frames, load_frame, read_matrices, read_samples
+
+INTRINSICS = (40.0, 40.0, 19.5, 9.5)
+SIZE = (22, 40)
+ROWS, COLUMNS = np.mgrid[0 : SIZE[0], 0 : SIZE[1]]
+TRUTH = 0.75 + ROWS / 64 + COLUMNS / 1024
+"""Metres; not symmetric under any flip."""
+SPARSE = np.where((ROWS % 6 == 1) & (COLUMNS % 6 == 2), TRUTH, 0)
+GREY = ((ROWS * 7 + COLUMNS) % 256).astype(np.uint8)
+
+
+def bmp(levels):
+    """Return a Windows bitmap of 256 greys: rows from the bottom up, each padded to four bytes."""
+    height, width = levels.shape
+    padding = bytes(-width % 4)
+    pixels = b"".join(row.astype(np.uint8).tobytes() + padding for row in levels[::-1])
+    palette = b"".join(bytes((level, level, level, 0)) for level in range(256))
+    header = struct.pack("<2sIII", b"BM", 1078 + len(pixels), 0, 1078)
+    info = struct.pack("<IiiHHIIiiII", 40, width, height, 1, 8, 0, len(pixels), 0, 0, 256, 0)
+    return header + info + palette + pixels
+
+
+def written(path, content):
+    path.write_bytes(content)
+    return path
+
+
+def old(path, variables, *, compress=False):
+    scipy.io.savemat(path, variables, do_compression=compress)
+    return path
+
+
+def new(path, variables):
+    """Write a MATLAB 7.3 file: 512 bytes of text, then HDF5 with the axes turned around."""
+    with h5py.File(path, "w", userblock_size=512) as file:
+        for name, values in variables.items():
+            file[name.replace(".", "/")] = np.asarray(values).T
+        file["#refs#/a"] = TRUTH.T
+    path.write_bytes(b"MATLAB 7.3 MAT-file".ljust(512) + path.read_bytes()[512:])
+    return path
+
+
+def refusal(act, named, capfd):
+    """Return the message of the refusal: one line that starts with a name, and nothing printed."""
+    with pytest.raises(ValueError) as caught:  # noqa: PT011 - the callers look at the message
+        act()
+    assert capfd.readouterr() == ("", "")
+    message = str(caught.value)
+    assert message.startswith(f"{named}: ")
+    assert "\n" not in message
+    return message.removeprefix(f"{named}: ")
+
+
+@pytest.fixture
+def pictures(tmp_path):
+    levels = np.zeros(SIZE)
+    levels[1::6, 2::6] = np.arange(4)[:, None] * 60 + np.arange(7) + 1
+    levels[1, 2], levels[1, 8] = 1, 255
+    return written(tmp_path / "books.bmp", bmp(GREY)), written(tmp_path / "books_depth.bmp", bmp(levels))
+
+
+def test_samples_are_levels_over_255_and_0_is_none(pictures):
+    values, known = read_samples(pictures[1])
+    assert known.sum().item() == 28
+    assert values.shape == (1, *SIZE)
+    assert values[0, 1, 8].item() == 1.0
+    assert values[0, 7, 2].item() == 61 / 255
+
+
+def test_the_caller_s_range_makes_metres_of_levels(pictures):
+    scene = load_frame(*pictures, "tofmark", "books", intrinsics=INTRINSICS, depth_range=(0.5, 3.04), factors=(1, 4))
+    assert scene.depth is None
+    assert scene.measured[1][0, 1, 2].item() == pytest.approx(0.5)
+    assert scene.measured[1][0, 1, 8].item() == pytest.approx(3.04)
+    assert scene.measured[1][0, 7, 2].item() == pytest.approx(0.5 + 60 * 0.01)
+    assert scene.measured[1].isfinite().sum().item() == 28
+    assert scene.measured[4].shape == (1, 5, 10)
+    assert (scene.camera.height, scene.camera.width, scene.camera.cy) == (*SIZE, 9.5)
+    np.testing.assert_array_equal((scene.rgb * 255).round()[2], GREY)
+
+
+def test_pictures_without_a_range_or_a_camera_are_refused_with_the_reason(pictures, capfd):
+    rgb, samples = pictures
+    message = refusal(lambda: load_frame(rgb, samples, "t", "b", intrinsics=INTRINSICS), samples, capfd)
+    assert "lost the metric scale" in message
+    assert "no camera" in refusal(lambda: load_frame(rgb, samples, "t", "b", depth_range=(0.5, 1)), rgb, capfd)
+
+
+@pytest.mark.parametrize("depth_range", [(1.0, 0.5), (0.0, 1.0), (1.0, 1.0), (0.5, np.inf), (np.nan, 1.0)])
+def test_a_range_that_is_none_is_refused(pictures, capfd, depth_range):
+    act = lambda: load_frame(*pictures, "t", "b", intrinsics=INTRINSICS, depth_range=depth_range)  # noqa: E731
+    refusal(act, "depth_range", capfd)
+
+
+@pytest.mark.parametrize("factor", [0, -4, 23])
+def test_a_factor_that_the_size_does_not_allow_is_refused(capfd, factor):
+    refusal(lambda: block_means(torch.ones(1, *SIZE), factor), "factors", capfd)
+
+
+@pytest.mark.parametrize(
+    "content", [b"", b"BM", bmp(GREY)[:1078], bmp(GREY)[:-400], b"text", bmp(GREY * 0), bmp(GREY[:21])]
+)
+def test_a_damaged_picture_of_samples_is_refused(pictures, capfd, content):
+    rgb, samples = pictures
+    written(samples, content)
+    act = lambda: load_frame(rgb, samples, "t", "b", intrinsics=INTRINSICS, depth_range=(0.5, 1.0))  # noqa: E731
+    assert "expected" in refusal(act, samples, capfd)
+
+
+def test_a_block_s_depth_is_the_mean_of_its_samples_inverse_depths():
+    depth = torch.full((1, 5, 9), torch.nan, dtype=torch.float64)
+    depth[0, 0, 0], depth[0, 3, 3], depth[0, 1, 5], depth[0, 4, 8] = 1.0, 2.0, 3.0, 9.0
+    means = block_means(depth, 4)
+    torch.testing.assert_close(means, torch.tensor([[[4 / 3, 3.0]]], dtype=torch.float64))
+    assert block_means(depth, 2).isfinite().sum().item() == 3
+
+
+NAMINGS = {
+    "plain": ("intensity", "depth_gt", "tof"),
+    "capitals": ("I", "GT", "D_LR"),
+    "one depth": ("gray", "ground_truth", "depth"),
+    "no help": ("Image", "a", "b"),
+    "structure": ("scene.img", "scene.depthHR", "scene.depth_sparse"),
+}
+
+
+@pytest.mark.parametrize("scale", [1.0, 1000.0])
+@pytest.mark.parametrize("kind", ["5", "5 compressed", "7.3"])
+@pytest.mark.parametrize("naming", NAMINGS)
+def test_variables_are_told_by_name_and_content_in_metres_or_millimetres(tmp_path, naming, kind, scale):
+    arrays = dict(zip(NAMINGS[naming], (GREY, TRUTH * scale, SPARSE * scale), strict=True))
+    arrays |= {"weights": (SPARSE > 0) * 0.5, "tof_lowres": np.ones((6, 7)), "version": "1"}
+    if "." in NAMINGS[naming][0] and kind != "7.3":
+        arrays = {"scene": {name.rpartition(".")[2]: array for name, array in arrays.items()}}
+    path = tmp_path / "benchmarking_dataset_books.mat"
+    if kind == "7.3":
+        del arrays["version"]
+        new(path, arrays)
+    else:
+        old(path, arrays, compress="compressed" in kind)
+    scene = load_frame(path, None, "tofmark", "books", intrinsics=INTRINSICS)
+    np.testing.assert_allclose(scene.depth[0], TRUTH)
+    np.testing.assert_array_equal((scene.rgb * 255).round()[0], GREY)
+    samples = torch.from_numpy(np.where(SPARSE, SPARSE, np.nan))[None]
+    torch.testing.assert_close(scene.measured[4], block_means(samples, 4), equal_nan=True)
+    assert set(scene.measured) == {4, 8}
+
+
+TYPES = ("i1", "u1", "i2", "u2", "i4", "u4", "i8", "u8", "f4", "f8")
+
+
+@pytest.mark.parametrize("compress", [False, True])
+def test_matrices_of_every_type_come_through_and_whatever_else_is_left_out(tmp_path, compress):
+    arrays = {kind: (GREY % 100).astype(kind) for kind in TYPES}
+    arrays |= {"logical": GREY > 9, "cube": np.arange(24.0).reshape(2, 3, 4), "empty": np.zeros((0, 3))}
+    others = {"text": "abc", "cell": np.array([1, "a"], object), "sparse": scipy.sparse.csc_matrix(SPARSE)}
+    structure = {"s": {"deep": {"m": TRUTH}, "word": "a"}}
+    path = old(tmp_path / "a.mat", {**arrays, **others, **structure}, compress=compress)
+    found = read_variables(path)
+    assert set(found) == {*arrays, "s.deep.m"}
+    np.testing.assert_array_equal(found["s.deep.m"], TRUTH)
+    for name, array in arrays.items():
+        np.testing.assert_array_equal(found[name], array)
+        assert found[name].dtype == array.dtype or name == "logical"
+
+
+def test_a_file_of_a_machine_of_the_other_byte_order_is_read(tmp_path):
+    def element(kind, content):
+        return struct.pack(">II", kind, len(content)) + content + bytes(-len(content) % 8)
+
+    numbers = struct.pack(">6h", *range(6))
+    parts = [(6, struct.pack(">II", 6, 0)), (5, struct.pack(">ii", 2, 3)), (1, b"gt"), (3, numbers)]
+    header = b"MATLAB 5.0 MAT-file".ljust(124) + struct.pack(">H", 0x0100) + b"MI"
+    path = written(tmp_path / "a.mat", header + element(14, b"".join(element(*part) for part in parts)))
+    np.testing.assert_array_equal(read_variables(path)["gt"], [[0.0, 2.0, 4.0], [1.0, 3.0, 5.0]])
+
+
+def test_the_caller_may_name_the_variables(tmp_path):
+    path = old(tmp_path / "a.mat", {"x": GREY / 255, "y": TRUTH, "z": TRUTH + 1, "w": SPARSE})
+    rgb, depth, samples = read_matrices(path, {"intensity": "x", "depth": "z"})
+    np.testing.assert_allclose(rgb[1], GREY / 255, rtol=1e-6)
+    np.testing.assert_array_equal(depth[0], TRUTH + 1)
+    assert samples.isfinite().sum().item() == (SPARSE > 0).sum()
+
+
+def test_true_depth_may_be_missing_and_holes_may_be_nan(tmp_path):
+    path = old(tmp_path / "a.mat", {"intensity": GREY, "tof": np.where(SPARSE, SPARSE, np.nan)})
+    _, depth, samples = read_matrices(path)
+    assert depth is None
+    assert samples.isfinite().sum().item() == (SPARSE > 0).sum()
+
+
+@pytest.mark.parametrize(
+    ("variables", "reason"),
+    [
+        ({"a": TRUTH, "b": SPARSE}, "a 22 x 40, b 22 x 40"),
+        ({"intensity": GREY}, "intensity 22 x 40"),
+        ({"intensity": GREY, "tof": SPARSE[:20]}, "tof 20 x 40"),
+        ({"intensity": GREY, "u": TRUTH, "v": TRUTH, "tof": SPARSE}, "not told among u, v"),
+        ({"intensity": GREY, "tof": -SPARSE, "gt": -TRUTH}, "expected positive depth"),
+        ({"intensity": GREY * np.nan, "gt": TRUTH}, "expected an image"),
+        ({"intensity": GREY * 1e9, "gt": TRUTH}, "expected an image"),
+        ({"intensity": GREY, "gt": TRUTH * 0}, "all are holes"),
+        ({"text": "nothing else"}, "no matrix"),
+    ],
+)
+def test_a_file_of_other_variables_is_refused_with_what_it_has(tmp_path, capfd, variables, reason):
+    path = old(tmp_path / "a.mat", variables)
+    assert reason in refusal(lambda: read_matrices(path), path, capfd)
+
+
+@pytest.mark.parametrize(
+    ("mapping", "reason"),
+    [
+        ({"intensity": "none"}, "expected the variable none, got intensity 22 x 40, depth_gt 22 x 40"),
+        ({"depth": "small"}, "small: expected shape (22, 40)"),
+    ],
+)
+def test_names_of_the_caller_that_do_not_fit_are_refused(tmp_path, capfd, mapping, reason):
+    path = old(tmp_path / "a.mat", {"intensity": GREY, "depth_gt": TRUTH, "small": TRUTH[:9]})
+    assert reason in refusal(lambda: read_matrices(path, mapping), path, capfd)
+    refusal(lambda: read_matrices(path, {"weights": "depth_gt"}), "variables", capfd)
+
+
+@pytest.mark.parametrize("make", [old, new])
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda whole: b"",
+        lambda whole: b"text, no matrix",
+        lambda whole: whole[:128],
+        lambda whole: whole[:600],
+        lambda whole: whole[: len(whole) // 2],
+        lambda whole: whole[:132] + b"\xff" * 800 + whole[932:],
+        lambda whole: bytes(5000),
+    ],
+)
+def test_a_damaged_mat_file_is_refused_in_one_line(tmp_path, capfd, make, damage):
+    path = make(tmp_path / "a.mat", {"intensity": GREY, "depth_gt": TRUTH, "tof": SPARSE})
+    written(path, damage(path.read_bytes()))
+    assert "expected" in refusal(lambda: read_matrices(path), path, capfd)
+
+
+def test_a_matrix_larger_than_its_file_can_hold_is_refused_before_it_is_read(tmp_path, capfd):
+    path = tmp_path / "a.mat"
+    with h5py.File(path, "w") as file:
+        file.create_dataset("intensity", shape=(10**6, 10**6), dtype="f8", chunks=(100, 100))
+    assert "intensity has 1000000000000, expected at most" in refusal(lambda: read_matrices(path), path, capfd)
+    old(path, {"intensity": GREY})
+    content = path.read_bytes()
+    size = struct.pack("<ii", *SIZE)
+    assert content.count(size) == 1
+    written(path, content.replace(size, struct.pack("<ii", 10**6, 10**3)))
+    assert "cannot reshape" in refusal(lambda: read_matrices(path), path, capfd)
+
+
+def test_missing_files_are_refused(tmp_path, capfd):
+    path = tmp_path / "a.mat"
+    assert "there is none" in refusal(lambda: read_matrices(path), path, capfd)
+    assert "there is none" in refusal(lambda: read_samples(path), path, capfd)
+
+
+def test_scenes_are_listed_once_the_metric_file_first(tmp_path):
+    for name in ("books.bmp", "books_depth.bmp", "benchmarking_dataset_books.mat", "shark.bmp", "shark_depth.bmp",
+                 "devil_depth.bmp", "other.mat"):  # fmt: skip
+        written(tmp_path / name, b"")
+    assert find_frames(tmp_path) == {
+        "books": (tmp_path / "benchmarking_dataset_books.mat", None),
+        "shark": (tmp_path / "shark.bmp", tmp_path / "shark_depth.bmp"),
+    }
+    with pytest.raises(ValueError, match="expected a directory"):
+        find_frames(tmp_path / "nowhere")
+
+
+def test_the_real_pictures_have_samples_in_a_fortieth_of_their_pixels(shared):
+    frames = find_frames(shared / "real/tofmark")
+    assert list(frames) == ["books", "devil", "shark"]
+    for name, files in frames.items():
+        assert read_samples(files[1])[1].double().mean().item() == pytest.approx(0.025, abs=0.001)
+        arguments = {"intrinsics": (550.0, 550.0, 404.5, 304.5), "depth_range": (0.38, 0.93)}
+        scene = load_frame(*files, "tofmark", name, **arguments)
+        assert scene.measured[4].shape == (1, 152, 202)
+        assert scene.measured[8].isfinite().double().mean() > 0.98
+
+
+def test_255_is_far_as_the_wall_of_books_is_brighter_than_the_cup_before_it(shared):
+    levels, known = read_samples(shared / "real/tofmark/books_depth.bmp")
+
+    def middle(rows, columns):
+        return levels[0, rows, columns][known[0, rows, columns]].median()
+
+    wall, book, cup = (middle(slice(a, a + 60), slice(b, b + 40)) for a, b in ((60, 280), (300, 530), (440, 600)))
+    assert cup < book < wall
+    truth = np.load(shared / "scenes/books/disparity.npy")  # the same scene at 0.645 of the size, cropped
+    wall, book, cup = (np.nanmedian(truth[a : a + 30, b : b + 20]) for a, b in ((30, 180), (182, 341), (272, 386)))
+    assert cup > book > wall

@@ -1,0 +1,193 @@
+"""Data sets in their owners' formats: which scenes, prepared how, kept where."""
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+import dsr.data.native as module
+from dsr.data.native import Native, Place, Preparation, Record, records_of, renamed
+from dsr.data.rendering import cache_directory
+from dsr.geometry.camera import Camera
+from dsr.sample import Scene
+
+
+@pytest.fixture(autouse=True)
+def _own_cache(tmp_path, monkeypatch):
+    monkeypatch.setenv("DSR_CACHE", str(tmp_path / "cache"))
+
+
+def frame(path, dataset, name, near=1.0):
+    """Load a scene from a file with a depth in it; what a reader does."""
+    if path.read_text() == "damaged":
+        raise ValueError(f"{path}: expected a number, got damaged")
+    depth = torch.full((1, 60, 90), near * float(path.read_text()), dtype=torch.float64)
+    depth[:, 20:30, 40:50] = torch.nan
+    return Scene(dataset, name, torch.full((3, 60, 90), 0.5), Camera(90, 60, 80.0, 80.0, 44.5, 29.5), depth)
+
+
+@pytest.fixture
+def files(tmp_path):
+    """Three scenes on disk, a, b and deep/c, of 1, 2 and 3 metres."""
+    (tmp_path / "set" / "deep").mkdir(parents=True)
+    paths = {name: tmp_path / "set" / f"{name}.txt" for name in ("a", "b", "deep/c")}
+    for depth, path in enumerate(paths.values(), 1):
+        path.write_text(str(depth))
+    return {name: (path,) for name, path in paths.items()}
+
+
+def source(files, named=("a", "b"), wanted=None, preparation=None, **settings):
+    place = Place(Path("data/things"), "things")
+    records = records_of(files, frame, "things", **settings)
+    return Native("things", place, records, named, wanted, preparation or Preparation(48))
+
+
+def kept():
+    return sorted(path.name for path in (cache_directory() / "prepared" / "things").glob("*"))
+
+
+def test_the_scenes_are_those_named_or_chosen_or_all_that_are_there(files):
+    assert source(files).scenes() == ["a", "b"]
+    assert source(files, wanted="found").scenes() == ["a", "b", "deep_c"]
+    assert source(files, wanted=["deep_c", "a"]).scenes() == ["deep_c", "a"]
+
+
+def test_what_is_missing_is_named_with_the_command_that_gets_it(files):
+    with pytest.raises(ValueError, match="things") as refusal:
+        source(files, named=("a", "z", "y"))
+    assert str(refusal.value) == (
+        "dataset=things: expected z, y in data/things, got 1 of 3 scenes; get it with: dsr data get things; or say "
+        "where it is: dataset.root=DIR; or use what is there: dataset.scenes=found"
+    )
+    with pytest.raises(ValueError, match="things") as refusal:
+        source({})
+    assert str(refusal.value) == (
+        "dataset=things: expected its files in data/things, got no such directory; get it with: dsr data get things; "
+        "or say where it is: dataset.root=DIR"
+    )
+    with pytest.raises(ValueError, match=r"dataset\.scenes: 'z' is not there; expected some of a, b, deep_c"):
+        source(files, wanted=["z"])
+    with pytest.raises(ValueError, match=r"dataset\.fill: expected names of scenes, got z"):
+        source(files, preparation=Preparation(48, fill=("z",)))
+
+
+def test_scenes_are_resized_cropped_and_named(files):
+    scene = source(files).load("b")
+    assert (scene.dataset, scene.name, tuple(scene.depth.shape)) == ("things", "b", (1, 48, 48))
+    assert scene.camera == Camera(90, 60, 80.0, 80.0, 44.5, 29.5).rescale(72, 48).crop(0, 12, 48, 48)
+    torch.testing.assert_close(scene.depth.nanmean(), torch.tensor(2.0, dtype=torch.float64))
+    assert scene.depth.isnan().any()
+    assert not source(files, preparation=Preparation(48, fill=("b",))).load("b").depth.isnan().any()
+
+
+def test_without_a_size_scenes_are_as_they_are_and_nothing_is_kept(files):
+    scene = source(files, preparation=Preparation(None)).load("a")
+    assert tuple(scene.depth.shape) == (1, 60, 90)
+    assert kept() == []
+
+
+def test_a_prepared_scene_is_read_again_not_made_again(files, monkeypatch):
+    first = source(files).load("a")
+    assert len(kept()) == 1
+    monkeypatch.setattr(module, "fitted", None)
+    again = source(files).load("a")
+    assert np.array_equal(first.depth, again.depth, equal_nan=True)
+    assert torch.equal(first.rgb, again.rgb)
+    assert first.camera == again.camera
+
+
+def test_other_content_settings_or_code_make_it_anew(files, monkeypatch):
+    plain = source(files)
+    plain.load("a")
+    assert plain.fingerprint("a") == source(files).fingerprint("a")
+    others = [
+        source(files, preparation=Preparation(32)), source(files, preparation=Preparation(48, 0.0)),
+        source(files, preparation=Preparation(48, fill=("a",))), source(files, near=2.0),
+    ]  # fmt: skip
+    assert len({each.fingerprint("a") for each in (plain, *others)}) == 5
+    for count, each in enumerate(others, 2):
+        each.load("a")
+        assert len(kept()) == count
+    monkeypatch.setattr(module, "_rules_hash", lambda: "other code")
+    source(files).load("a")
+    assert len(kept()) == 6
+    files["a"][0].write_text("7")
+    assert source(files).load("a").depth.nanmean() == pytest.approx(7)
+
+
+def test_filling_one_scene_does_not_make_the_others_anew(files):
+    assert source(files).fingerprint("a") == source(files, preparation=Preparation(48, fill=("b",))).fingerprint("a")
+
+
+def test_a_damaged_copy_in_the_cache_is_made_anew(files):
+    first = source(files).load("a")
+    [name] = kept()
+    (cache_directory() / "prepared" / "things" / name).write_bytes(b"half a file")
+    assert np.array_equal(source(files).load("a").depth, first.depth, equal_nan=True)
+
+
+def test_preparing_makes_what_is_missing_and_yields_every_scene(files):
+    data = source(files, wanted="found")
+    data.load("b")
+    assert sorted(data.prepare(data.scenes())) == ["a", "b", "deep_c"]
+    assert len(kept()) == 3
+    assert sorted(data.prepare(data.scenes())) == ["a", "b", "deep_c"]
+
+
+def test_a_scene_that_cannot_be_prepared_does_not_keep_the_others_from_it(files):
+    files["a"][0].write_text("damaged")
+    files["b"][0].unlink()
+    data = source(files, wanted=["a", "b", "deep_c"])
+    assert sorted(data.prepare(data.scenes())) == ["a", "b", "deep_c"]
+    assert len(kept()) == 1
+    with pytest.raises(ValueError, match=r"a\.txt: expected a number, got damaged"):
+        data.load("a")
+    with pytest.raises(ValueError, match=r"b\.txt: expected a file, there is none"):
+        data.load("b")
+
+
+def test_where_nothing_can_be_kept_scenes_are_made_each_time(files, monkeypatch):
+    monkeypatch.setenv("DSR_CACHE", os.devnull)
+    assert source(files).load("a").depth.nanmean() == pytest.approx(1)
+
+
+def test_frames_get_other_names(files):
+    records = renamed(records_of(files, frame, "things"), {"first": "deep/c", "second": "z"})
+    assert sorted(records) == ["a", "b", "first"]
+    assert records["first"].load().name == "first"
+
+
+def test_files_of_folders_count_and_very_large_ones_by_size_and_time(files, monkeypatch, tmp_path):
+    folder = tmp_path / "set"
+    [record] = records_of({"all": (folder, 3)}, frame, "things").values()
+    assert [path.name for path in record.files] == ["a.txt", "b.txt", "c.txt"]
+    monkeypatch.setattr(module, "_HASHED_WHOLE", 0)
+    path = files["a"][0]
+    path.write_text("12345")
+    assert module.content_hash(path) == f"a.txt 5 {path.stat().st_mtime_ns}"
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"size": 31}, r"dataset\.size: expected at least 32 pixels, or null, got 31"),
+        ({"crop": 1.5}, r"dataset\.crop: expected a number from 0 to 1, or null, got 1\.5"),
+    ],
+)
+def test_values_out_of_range_are_refused(settings, message):
+    with pytest.raises(ValueError, match=message):
+        Preparation(**settings)
+
+
+def test_a_record_without_fine_depth_cannot_be_resized(files):
+    def measured_only():
+        return Scene("things", "a", torch.zeros(3, 60, 90), Camera(90, 60, 80.0, 80.0, 44.5, 29.5), None,
+                     {2: torch.ones(1, 30, 45)})  # fmt: skip
+
+    data = Native("things", Place(Path("x"), "things"), {"a": Record((), measured_only)}, ["a"], None, Preparation(48))
+    with pytest.raises(
+        ValueError, match=r"a: expected a fine depth map to resize, there is none \(dataset\.size=null\)"
+    ):
+        data.load("a")
