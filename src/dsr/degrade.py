@@ -13,7 +13,6 @@ Where a kernel would reach over the border it is cut and normalised.
 
 from __future__ import annotations
 
-import functools
 import hashlib
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -24,6 +23,7 @@ from torch import Tensor
 
 from dsr.geometry.camera import Camera, RangeType, from_range, to_range
 from dsr.holes import Holes
+from dsr.noise import Noise
 from dsr.sample import DepthSample, Scene
 
 Kernel = Literal["box", "nearest", "bilinear", "bicubic", "gaussian"]
@@ -162,39 +162,6 @@ class Measured:
         return Downsampling(self.assumed)
 
 
-@dataclass(frozen=True)
-class GaussianMultiplicative:
-    """Noise of the coarse map: values times 1 + std N(0, 1), in the range type that is averaged (Voynov et al. 2019).
-
-    Args:
-        std: of the factor.
-
-    Raises:
-        ValueError: it is not between 0 and 1.
-
-    """
-
-    std: float
-
-    def __post_init__(self) -> None:
-        """Check the value."""
-        if not 0 < self.std < 1:
-            raise ValueError(f"noise.std: expected a number above 0 and below 1, got {self.std}")
-
-    def __call__(self, values: Tensor, generator: torch.Generator) -> Tensor:
-        """Return noisy values; drawn on the CPU in float64, so the same on every device. NaN stays NaN."""
-        draws = torch.randn(values.shape, generator=generator, dtype=torch.float64)
-        return values * (1 + self.std * draws).to(values)
-
-
-Noise = GaussianMultiplicative | None
-
-
-def no_noise() -> None:
-    """Return no noise; what ``noise=none`` names."""
-    return
-
-
 def scene_generator(seed: int, *names: str | int) -> torch.Generator:
     """Return a generator that is a pure function of a seed and of names."""
     digest = hashlib.sha256(repr((seed, *names)).encode()).digest()
@@ -206,7 +173,7 @@ def make_sample(
     scale: int,
     downsampling: Downsampling | Measured,
     range_type: RangeType,
-    noise: Noise = None,
+    noise: Noise | None = None,
     generator: torch.Generator | int = 0,
     holes: Holes | None = None,
 ) -> DepthSample:
@@ -239,7 +206,7 @@ def make_sample(
     else:
         if scene.depth is None:
             raise ValueError(f"{scene.name}: expected a fine depth map to downsample, there is none")
-        noisy = None if noise is None else functools.partial(noise, generator=of_noise)
+        noisy = None if noise is None else (noise, of_noise)
         coarse, coarse_camera = downsampled(scene.depth, scene.camera, scale, downsampling, range_type, noisy)
     if holes is not None:
         coarse = coarse.masked_fill(holes(coarse, coarse_camera, of_holes), torch.nan)
@@ -278,7 +245,7 @@ def downsampled(
     scale: int,
     downsampling: Downsampling,
     range_type: RangeType,
-    noise: Callable[[Tensor], Tensor] | None = None,
+    noise: tuple[Noise, torch.Generator] | None = None,
 ) -> tuple[Tensor, Camera]:
     """Return the coarse depth that a model and noise make of a fine one, and its camera; differentiable.
 
@@ -288,7 +255,7 @@ def downsampled(
         scale: the factor.
         downsampling: the model.
         range_type: the type that is averaged, unless the model says one.
-        noise: of the averages, in that type; values to values.
+        noise: of the averages, and its generator; in that type, unless the noise says one.
 
     """
     range_type = downsampling.range_type or range_type
@@ -297,7 +264,13 @@ def downsampled(
     if range_type == "disparity":  # in the coarse camera's pixels
         fine = fine / scale
     values = downsampling(fine, scale)
-    coarse = from_range(values if noise is None else noise(values), coarse_camera, range_type)
+    if noise is not None:
+        kind, generator = noise
+        if kind.range_type is not None:
+            averages = from_range(values, coarse_camera, range_type)
+            range_type, values = kind.range_type, to_range(averages, coarse_camera, kind.range_type)
+        values = kind(values, generator)
+    coarse = from_range(values, coarse_camera, range_type)
     return torch.where(coarse > 0, coarse, torch.nan), coarse_camera  # bicubic may undershoot beside a depth step
 
 

@@ -22,9 +22,10 @@ from torch import Tensor
 
 from dsr.atomic import read_arrays, replacing, write_text
 from dsr.data.base import SceneSource
-from dsr.degrade import Downsampling, Measured, Noise, make_sample
+from dsr.degrade import Downsampling, Measured, make_sample
 from dsr.holes import Holes
 from dsr.methods.base import Upsampler
+from dsr.noise import Noise
 from dsr.quality.scores import WORST, Metric, score_image
 from dsr.sample import DepthSample
 
@@ -78,7 +79,7 @@ class Study:
     seed: int
     config: Mapping[str, Any]
     device: torch.device = field(default=torch.device("cpu"))
-    noise: Noise = None
+    noise: Noise | None = None
     holes: Holes | None = None
 
     def sample(self, scene: str) -> DepthSample:

@@ -14,6 +14,10 @@ from torch import Tensor
 from dsr.geometry.camera import Camera
 
 
+class AllHolesError(ValueError):
+    """A depth map without a known pixel."""
+
+
 @dataclass(frozen=True)
 class Scene:
     """A photo and its fine depth, before any downsampling.
@@ -125,4 +129,4 @@ def _expect_depth(scene: str, name: str, depth: Tensor, size: tuple[int, int]) -
         came = "inf" if bool(depth.isinf().any()) else f"{depth.nan_to_num(nan=torch.inf).min().item():g}"
         raise ValueError(f"{scene}: {name}: expected positive depth, and NaN where a pixel is a hole; got {came}")
     if not bool(depth.isfinite().any()):
-        raise ValueError(f"{scene}: {name}: expected at least one known pixel, all are holes")
+        raise AllHolesError(f"{scene}: {name}: expected at least one known pixel, all are holes")

@@ -15,14 +15,13 @@ from torch import Tensor
 from dsr.degrade import (
     SCALES,
     Downsampling,
-    GaussianMultiplicative,
     Kernel,
     Measured,
     make_sample,
-    no_noise,
     scene_generator,
 )
 from dsr.geometry.camera import RANGE_TYPES, Camera, RangeType, to_range
+from dsr.noise import GaussianMultiplicative, no_noise
 from dsr.sample import DepthSample, Scene
 
 KERNELS: tuple[Kernel, ...] = get_args(Kernel)

@@ -9,7 +9,7 @@ SOURCE = Path(__file__).resolve().parents[2] / "src"
 LAYERS = (
     ("dsr.atomic",),
     ("dsr.geometry.camera",),
-    ("dsr.sample", "dsr.holes", "dsr.geometry.surface", "dsr.geometry.shading"),
+    ("dsr.sample", "dsr.holes", "dsr.noise", "dsr.geometry.surface", "dsr.geometry.shading"),
     ("dsr.degrade", "dsr.geometry.comparison"),
     ("dsr.quality.functional",),
     ("dsr.quality.lpips",),
@@ -18,7 +18,7 @@ LAYERS = (
     ("dsr.data", "dsr.methods"),
     ("dsr.objective",),
     ("dsr.fitting",),
-    ("dsr.evaluation", "dsr.training", "dsr.prior"),
+    ("dsr.evaluation", "dsr.training", "dsr.prior", "dsr.doctor"),
     ("dsr.report",),
     ("dsr.app", "dsr.cli"),
 )

@@ -20,7 +20,7 @@ from dsr.data.problem import Batch, Problem, tensors_of
 from dsr.degrade import Downsampling, Measured, make_sample
 from dsr.geometry.camera import Camera
 from dsr.methods.maps import normalised
-from dsr.noise import GaussianMultiplicative
+from dsr.noise import GaussianMultiplicative, Kinect
 from dsr.sample import Scene
 
 BOX = Downsampling("box")
@@ -551,3 +551,13 @@ def test_no_scene_at_all_is_refused() -> None:
 def test_a_setting_out_of_range_is_refused_by_its_key(changes: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         _settings(**changes)
+
+
+def test_where_noise_leaves_nothing_of_a_window_another_one_is_taken() -> None:
+    far = _scene(1, depth=torch.full((1, CAMERA.height, CAMERA.width), 50.0, dtype=torch.float64))
+    problem = Problem(4, BOX, Kinect(nearest=None, farthest=20.0))
+    patches = Patches([[far, _scene()]], _settings(), problem)
+    for index in range(8):
+        assert patches.starting(index, 1)[0]["depth"].nanmean() < 20
+    with pytest.raises(ValueError, match="patches: expected coarse maps with a known pixel or more; noise makes all"):
+        Patches([[far]], _settings(), problem)[0]

@@ -177,7 +177,8 @@ def _problem_name(settings: EvalConfig) -> str:
         parts.append(f"assumed-{assumed}")
     for group in (settings.noise, settings.holes):
         if group["name"] != "none":
-            values = [f"{value:g}" for key, value in group.items() if key not in ("name", "target")]
+            settings_of = [value for key, value in group.items() if key not in ("name", "target")]
+            values = ["none" if value is None else f"{value:g}" for value in settings_of]
             parts.append("-".join((str(group["name"]), *values)))
     return "+".join(parts)
 

@@ -25,7 +25,7 @@ _PACKAGES = (
 )  # fmt: skip
 _NOT_IDENTITY = ("output_dir", "overwrite", "metrics", "weights", "resume", "run")  # of the weights, the content counts
 _PREDICTING_CODE = (
-    "sample.py", "holes.py", "degrade.py", "geometry", "quality/functional.py", "quality/losses.py",
+    "sample.py", "holes.py", "noise.py", "degrade.py", "geometry", "quality/functional.py", "quality/losses.py",
     "methods", "data", "objective.py", "training.py", "prior",
 )  # fmt: skip
 

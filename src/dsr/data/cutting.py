@@ -6,6 +6,7 @@ it would have seen, whatever the number of workers.
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -17,7 +18,7 @@ from torch.utils.data import Dataset
 from dsr.data.augment import Variation, window
 from dsr.data.problem import Batch, Problem, tensors_of
 from dsr.geometry.camera import stereo_constant
-from dsr.sample import DepthSample, Scene
+from dsr.sample import AllHolesError, DepthSample, Scene
 
 _TRIES, _MOST_TRIES = 10, 100
 """Of windows in a scene, and of scenes."""
@@ -112,8 +113,18 @@ class Patches(Dataset[Batch]):
         return other
 
     def __getitem__(self, index: int) -> Batch:
-        """Return patch number ``first + index``; one with at least half of its depth known, if ten tries find one."""
+        """Return patch number ``first + index``; one with at least half of its depth known, if ten tries find one.
+
+        Where noise leaves nothing of a window, as a sensor's limits of range may, another one is taken.
+        """
         random = np.random.default_rng([self._seed, self._first + index])
+        for _ in range(_MOST_TRIES):
+            with contextlib.suppress(AllHolesError):
+                return self._patch(random)
+        raise ValueError("patches: expected coarse maps with a known pixel or more; noise makes all of them holes")
+
+    def _patch(self, random: np.random.Generator) -> Batch:
+        """Return a random patch."""
         group = min(int(np.searchsorted(self._limits, random.random(), "right")), len(self._groups) - 1)
         number, top, left = self._window(group, random)
         source = self._groups[group][number]

@@ -7,8 +7,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from dsr.degrade import Downsampling, Noise, make_sample
+from dsr.degrade import Downsampling, make_sample
 from dsr.geometry.camera import stereo_constant, to_range
+from dsr.noise import Noise
 from dsr.sample import DepthSample, Scene
 
 Batch = dict[str, Tensor]
@@ -27,7 +28,7 @@ class Problem:
 
     scale: int
     downsampling: Downsampling
-    noise: Noise = None
+    noise: Noise | None = None
 
     def sample(self, scene: Scene, generator: torch.Generator | int = 0, *, clean: bool = False) -> DepthSample:
         """Return the problem that a scene poses, its coarse map made of disparity."""

@@ -16,12 +16,13 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from dsr.atomic import replacing
+from dsr.geometry.camera import Camera
 from dsr.geometry.shading import LIGHT_NAMES, render
 from dsr.geometry.surface import normals_of
 from dsr.report.tables import METRICS
 from dsr.sample import DepthSample
 
-_HOLE_COLOUR = "#d684b4"
+HOLE_COLOUR = "#d684b4"
 _PANEL = 3.2
 _ABOVE = 0.8
 _BETWEEN = 0.95
@@ -53,7 +54,7 @@ def save_picture(path: Path, sample: DepthSample, depth: Tensor, scores: Mapping
     figure.subplots_adjust(left=0.01, right=0.99, bottom=bottom, top=top, wspace=0.04, hspace=_BETWEEN / panel)
     for axis in axes.flat:
         axis.set_axis_off()
-    limits = _limits(depth if truth is None else truth)
+    limits = limits_of(depth if truth is None else truth)
     axes[0, 0].imshow(sample.rgb.permute(1, 2, 0).numpy())
     axes[0, 0].set_title(f"photo, {width} x {height}")
     _show_depth(axes[0, 1], sample.depth_lr, limits, f"input, {sample.camera_lr.width} x {sample.camera_lr.height}")
@@ -69,27 +70,32 @@ def save_picture(path: Path, sample: DepthSample, depth: Tensor, scores: Mapping
     holes = "" if all(bool(values.isfinite().all()) for values in maps) else " (pink: holes)"
     heading = f"{sample.dataset} / {sample.scene}, {label} x{sample.scale}{holes}"
     figure.suptitle(heading, fontsize=16, y=1 - 0.12 / figure_height, parse_math=False)
+    write_figure(path, figure, _DPI)
+
+
+def write_figure(path: Path, figure: Figure, dpi: int) -> None:
+    """Write a figure atomically."""
     with replacing(path) as temporary, warnings.catch_warnings():
         warnings.filterwarnings("ignore", "Glyph .* missing from font")  # a name that the font lacks letters for
-        figure.savefig(temporary, dpi=_DPI)
+        figure.savefig(temporary, dpi=dpi)
 
 
-def _limits(depth: Tensor) -> tuple[float, float]:
+def limits_of(depth: Tensor) -> tuple[float, float]:
     """Return the 1st and 99th percentile of the known depths: one outlier does not take all the colours."""
     known = depth[depth.isfinite()].numpy()
     low, high = np.percentile(known, [1, 99]) if known.size else (0, 1)
     return float(low), float(max(high, low + 1e-6))
 
 
-def _colours(name: str) -> Any:
-    """Return a colour map that shows holes in grey."""
-    return mpl.colormaps[name].with_extremes(bad=_HOLE_COLOUR)
+def colours(name: str) -> Any:
+    """Return a colour map that shows holes in their colour."""
+    return mpl.colormaps[name].with_extremes(bad=HOLE_COLOUR)
 
 
 def _show_depth(axis: Axes, depth: Tensor, limits: tuple[float, float], title: str) -> None:
     """Draw depth in metres, (1, H, W)."""
     low, high = limits
-    image = axis.imshow(depth[0].numpy(), cmap=_colours("viridis"), vmin=low, vmax=high, interpolation="nearest")
+    image = axis.imshow(depth[0].numpy(), cmap=colours("viridis"), vmin=low, vmax=high, interpolation="nearest")
     axis.set_title(title, parse_math=False)
     _colour_bar(axis, image, "depth, m")
 
@@ -99,24 +105,24 @@ def _show_error(axis: Axes, difference: Tensor) -> None:
     centimetres = 100 * difference[0].numpy()
     known = centimetres[np.isfinite(centimetres)]
     limit = max(float(np.percentile(np.abs(known), 98)), 0.1) if known.size else 1.0
-    image = axis.imshow(centimetres, cmap=_colours("RdBu_r"), vmin=-limit, vmax=limit, interpolation="nearest")
+    image = axis.imshow(centimetres, cmap=colours("RdBu_r"), vmin=-limit, vmax=limit, interpolation="nearest")
     axis.set_title("error")
     _colour_bar(axis, image, "result - truth, cm", extend="both")
 
 
 def _show_renderings(axes: np.ndarray, sample: DepthSample, depth: Tensor, title: str) -> None:
     """Draw the renderings of a depth map, (1, H, W), under the four lights."""
-    normals = _normals(sample, depth)
+    normals = normals_seen_by(sample.camera, depth)
     for axis, name, shades in zip(axes, LIGHT_NAMES, render(normals)[0], strict=False):
-        axis.imshow(shades.numpy(), cmap=_colours("gray"), vmin=0, vmax=1, interpolation="nearest")
+        axis.imshow(shades.numpy(), cmap=colours("gray"), vmin=0, vmax=1, interpolation="nearest")
         axis.set_title(f"{title} under {name}", parse_math=False)
 
 
 def _show_angles(axis: Axes, sample: DepthSample, depth: Tensor, truth: Tensor) -> None:
     """Draw the angle between the two normals in degrees."""
-    cosine = (_normals(sample, depth) * _normals(sample, truth)).sum(dim=1)[0]
+    cosine = (normals_seen_by(sample.camera, depth) * normals_seen_by(sample.camera, truth)).sum(dim=1)[0]
     degrees = torch.rad2deg(torch.arccos(cosine.clamp(-1, 1))).numpy()
-    image = axis.imshow(degrees, cmap=_colours("magma"), vmin=0, vmax=60, interpolation="nearest")
+    image = axis.imshow(degrees, cmap=colours("magma"), vmin=0, vmax=60, interpolation="nearest")
     axis.set_title("error of the normals")
     _colour_bar(axis, image, "degrees", extend="max")
 
@@ -129,9 +135,9 @@ def _colour_bar(axis: Axes, image: Any, label: str, extend: str = "neither") -> 
     bar.set_label(label, labelpad=1)
 
 
-def _normals(sample: DepthSample, depth: Tensor) -> Tensor:
-    """Return the normals of a depth map, (1, 3, H, W), NaN where unknown."""
-    return normals_of(depth.double()[None], sample.camera.rays()[None])
+def normals_seen_by(camera: Camera, depth: Tensor) -> Tensor:
+    """Return the normals of a depth map, (1, H, W) in metres, as (1, 3, H, W), NaN where unknown."""
+    return normals_of(depth.double()[None], camera.rays()[None])
 
 
 def _write_scores(axis: Axes, scores: Mapping[str, float]) -> None:

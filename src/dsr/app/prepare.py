@@ -1,0 +1,79 @@
+"""The command behind ``dsr data prepare``: a data set made ready, and pictures of what that led to."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import hydra
+from hydra.errors import HydraException
+from omegaconf.errors import OmegaConfBaseException
+from rich.console import Console
+
+import dsr
+from dsr.app.build import build
+from dsr.app.entry import explain
+from dsr.app.progress import Display, prepare
+from dsr.app.schema import ConfigError, plain_config, register
+from dsr.data.base import SceneSource
+from dsr.report.sheets import save_contact_sheet
+from dsr.sample import Scene
+
+
+def prepare_dataset(name: str, overrides: Sequence[str], console: Console) -> None:
+    """Prepare every scene of a data set and draw the contact sheet, ``outputs/data/NAME/sheet.png`` or its pages.
+
+    Args:
+        name: of a file in ``conf/dataset``.
+        overrides: as on the command line of ``eval.py``, such as ``dataset.size=256``.
+        console: where progress is shown.
+
+    Raises:
+        ConfigError: there is no such data set, it is not there, or a scene of it cannot be read (the others are drawn).
+
+    """
+    source = _source(name, overrides)
+    display = Display(console)
+    prepare(display, source, source.scenes())
+    failures: dict[str, str] = {}
+    scenes = _loaded(source, display(source.scenes(), "draw"), failures)
+    folder = Path("outputs", "data", name)
+    before = set(folder.glob("sheet*.png"))
+    pages = save_contact_sheet(folder / "sheet.png", scenes, f"{name}, as prepared")
+    for path in before - set(pages):
+        path.unlink()
+    for path in pages:
+        console.print(f"contact sheet: {path}", markup=False, highlight=False, soft_wrap=True)
+    if failures:
+        lines = "; ".join(failures.values())
+        raise ConfigError(f"{len(failures)} of {len(source.scenes())} scenes cannot be read: {lines}")
+
+
+def _source(name: str, overrides: Sequence[str]) -> SceneSource:
+    """Return the data set that a configuration describes."""
+    register()
+    conf = next((path for path in (Path("conf").resolve(), _beside_package()) if (path / "dataset").is_dir()), None)
+    if conf is None:
+        raise ConfigError("conf: expected the directory of the configuration files; run the command in a checkout")
+    try:
+        with hydra.initialize_config_dir(str(conf), version_base="1.3"):
+            node = plain_config(hydra.compose("eval", [f"dataset={name}", *overrides]))["dataset"]
+    except (HydraException, OmegaConfBaseException) as error:
+        raise ConfigError(explain(error, conf, "eval")) from error
+    if "parts" in node:
+        raise ConfigError(f"dataset={name}: expected one data set, it has the parts {', '.join(node['parts'])}")
+    source: SceneSource = build("dataset", node)
+    return source
+
+
+def _beside_package() -> Path:
+    return Path(dsr.__file__).resolve().parents[2] / "conf"
+
+
+def _loaded(source: SceneSource, names: Iterator[str], failures: dict[str, str]) -> Iterator[Scene]:
+    """Yield the scenes that can be read; say of the others why not."""
+    for name in names:
+        try:
+            yield source.load(name)
+        except (ValueError, OSError) as error:
+            failures[name] = " ".join(str(error).split())

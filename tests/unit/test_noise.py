@@ -1,0 +1,312 @@
+"""Noise, against its laws: exact numbers where the draws are known, statistics of large maps where they are not."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from omegaconf import OmegaConf
+from torch import Tensor
+
+from dsr.app.build import build
+from dsr.degrade import Downsampling, Measured, make_sample, scene_generator
+from dsr.geometry.camera import RANGE_TYPES, Camera, RangeType, from_range, to_range
+from dsr.noise import GaussianMultiplicative, Kinect, Noise, TimeOfFlight
+from dsr.sample import Scene
+
+REPOSITORY = Path(__file__).resolve().parents[2]
+CAMERA = Camera(8, 4, 10.0, 10.0, 3.5, 1.5, baseline=0.1, doffs=0.5)
+STEPS = torch.arange(32, dtype=torch.float64).view(1, 4, 8) / 16 + 1
+KINDS: tuple[Noise, ...] = (GaussianMultiplicative(0.02), TimeOfFlight(), Kinect())
+SENSORS = KINDS[1:]
+QUIET: dict[str, Any] = {"std": 0.0, "dropout": 0.0}
+BOX = Downsampling("box")
+
+
+def _generator(seed: int = 0) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+def _wall(depth: float, size: int = 400) -> Tensor:
+    return torch.full((1, size, size), depth, dtype=torch.float64)
+
+
+def _scene(depth: Tensor | None = STEPS, measured: dict[int, Tensor] | None = None) -> Scene:
+    return Scene("set", "hall", torch.zeros(3, 4, 8), CAMERA, depth, measured or {})
+
+
+# Multiplicative
+
+
+@pytest.mark.parametrize(
+    ("range_type", "expected"),
+    [
+        ("orthogonal", [1.3006548458092884, 1.4461722713779719, 1.4532395017945559, 1.6804173814385563]),
+        ("perspective", [1.301891072383432, 1.4482635565802489, 1.4557471019488886, 1.6833404663756506]),
+        ("disparity", [1.2244615478680083, 1.3487868435516208, 1.5093446627187703, 1.6133715164190385]),
+    ],
+)
+def test_multiplicative_noise_has_the_very_numbers_of_results_that_are_stored(
+    range_type: RangeType, expected: list[float]
+) -> None:
+    sample = make_sample(_scene(), 2, BOX, range_type, GaussianMultiplicative(0.05), 7)
+    assert sample.depth_lr[0, 0].tolist() == expected
+
+
+# What all kinds have in common
+
+
+@pytest.mark.parametrize("noise", KINDS)
+def test_a_generator_gives_the_same_noise_again_and_another_one_another(noise: Noise) -> None:
+    depth = _wall(2.0, 20)
+    first, again, other = (noise(depth, _generator(seed)) for seed in (1, 1, 2))
+    assert torch.equal(first, again)
+    assert not torch.equal(first, other)
+
+
+@pytest.mark.parametrize("noise", KINDS)
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_a_hole_stays_one_and_shape_and_dtype_stay(noise: Noise, dtype: torch.dtype) -> None:
+    depth = torch.full((2, 1, 5, 7), 2.0, dtype=dtype)
+    depth[1, 0, 2, 3] = torch.nan
+    noisy = noise(depth, _generator())
+    assert (noisy.shape, noisy.dtype) == (depth.shape, dtype)
+    assert torch.equal(noisy.isnan(), depth.isnan())
+
+
+@pytest.mark.parametrize("noise", KINDS)
+def test_float32_gets_the_noise_of_float64(noise: Noise) -> None:
+    depth = (1 + torch.rand(1, 30, 40, generator=_generator(3))).float()
+    single, double = noise(depth, _generator()), noise(depth.double(), _generator())
+    torch.testing.assert_close(single.double(), double, rtol=1e-6, atol=0, equal_nan=True)
+
+
+@pytest.mark.parametrize("noise", KINDS)
+def test_the_depth_that_goes_in_is_left_alone(noise: Noise) -> None:
+    depth = STEPS.clone()
+    noise(depth, _generator())
+    assert torch.equal(depth, STEPS)
+
+
+@pytest.mark.parametrize("method", RANGE_TYPES)
+@pytest.mark.parametrize("noise", SENSORS)
+def test_a_sensor_s_noise_is_one_of_metric_depth_whatever_is_averaged(noise: Noise, method: RangeType) -> None:
+    clean = make_sample(_scene(), 2, BOX, method).depth_lr
+    noisy = make_sample(_scene(), 2, BOX, method, noise, _generator(5)).depth_lr
+    torch.testing.assert_close(noisy, noise(clean, _generator(5)), rtol=1e-12, atol=0, equal_nan=True)
+
+
+@pytest.mark.parametrize("method", RANGE_TYPES)
+def test_a_noise_gets_the_range_type_that_it_says(method: RangeType) -> None:
+    class Offset:
+        range_type = "perspective"
+
+        def __call__(self, values: Tensor, generator: torch.Generator) -> Tensor:
+            return values + 1
+
+    clean, noisy = (make_sample(_scene(), 2, BOX, method, noise) for noise in (None, Offset()))  # type: ignore[arg-type]
+    camera = clean.camera_lr
+    expected = from_range(to_range(clean.depth_lr, camera, "perspective") + 1, camera, "perspective")
+    torch.testing.assert_close(noisy.depth_lr, expected, rtol=1e-13, atol=0)
+
+
+@pytest.mark.parametrize("noise", KINDS)
+def test_noise_in_a_sample_is_the_scene_s_own_and_depends_on_the_seed(noise: Noise) -> None:
+    first, again, other = (make_sample(_scene(), 2, BOX, "orthogonal", noise, seed).depth_lr for seed in (0, 0, 1))
+    assert torch.equal(first.nan_to_num(), again.nan_to_num())
+    assert not torch.equal(first.nan_to_num(), other.nan_to_num())
+    own = noise(BOX(STEPS, 2), scene_generator(0, "set", "hall", 2))
+    torch.testing.assert_close(first, own, rtol=1e-13, atol=0, equal_nan=True)
+
+
+@pytest.mark.parametrize("noise", KINDS)
+def test_a_sample_that_is_refused_or_measured_draws_nothing(noise: Noise) -> None:
+    generator = _generator(4)
+    before = generator.get_state()
+    measured = _scene(None, {2: BOX(STEPS, 2)})
+    assert torch.equal(make_sample(measured, 2, Measured(), "disparity", noise, generator).depth_lr, BOX(STEPS, 2))
+    for scene, scale in ((measured, 2), (_scene(), 3), (_scene(), 8)):
+        with pytest.raises(ValueError, match="expected"):
+            make_sample(scene, scale, BOX, "disparity", noise, generator)
+    assert torch.equal(generator.get_state(), before)
+
+
+def test_a_sensor_draws_as_much_whatever_its_settings() -> None:
+    states = []
+    for noise in (Kinect(), Kinect(**QUIET, nearest=None, farthest=None), Kinect(reach=3, dropout=1.0)):
+        generator = _generator(2)
+        noise(STEPS, generator)
+        states.append(generator.get_state())
+    assert all(torch.equal(state, states[0]) for state in states)
+
+
+@pytest.mark.parametrize(("name", "expected"), [("tof", TimeOfFlight()), ("kinect", Kinect())])
+def test_the_files_of_the_configuration_hold_the_defaults(name: str, expected: Noise) -> None:
+    node = OmegaConf.to_container(OmegaConf.load(REPOSITORY / "conf" / "noise" / f"{name}.yaml"))
+    assert isinstance(node, dict)
+    assert node["name"] == name
+    assert build("noise", node) == expected  # type: ignore[arg-type]
+    assert set(node) == {"name", "target", *vars(expected)}
+
+
+@pytest.mark.parametrize(
+    ("kind", "values", "message"),
+    [
+        (GaussianMultiplicative, {"std": 1.0}, "noise.std: expected a number above 0 and below 1, got 1.0"),
+        (TimeOfFlight, {"strength": 0.0}, "noise.strength: expected a positive number, got 0.0"),
+        (TimeOfFlight, {"strength": math.nan}, "noise.strength: expected a positive number, got nan"),
+        (TimeOfFlight, {"stereo_constant": -1.0}, "noise.stereo_constant: expected a positive number, got -1.0"),
+        (TimeOfFlight, {"doffs": -1.0}, "noise.doffs: expected 0 or a positive number, got -1.0"),
+        (TimeOfFlight, {"doffs": math.inf}, "noise.doffs: expected 0 or a positive number, got inf"),
+        (Kinect, {"std": -0.1}, "noise.std: expected 0 or a positive number of pixels, got -0.1"),
+        (Kinect, {"std": math.nan}, "noise.std: expected 0 or a positive number of pixels, got nan"),
+        (Kinect, {"step": 0.0}, "noise.step: expected a positive number, got 0.0"),
+        (Kinect, {"stereo_constant": math.inf}, "noise.stereo_constant: expected a positive number, got inf"),
+        (Kinect, {"dropout": 1.1}, "noise.dropout: expected a number from 0 to 1, got 1.1"),
+        (Kinect, {"jump": 0.0}, "noise.jump: expected a positive number, got 0.0"),
+        (Kinect, {"reach": 0}, "noise.reach: expected a positive whole number of coarse pixels, got 0"),
+        (Kinect, {"reach": 1.5}, "noise.reach: expected a positive whole number of coarse pixels, got 1.5"),
+        (Kinect, {"nearest": 0.0}, "noise.nearest: expected a positive number, got 0.0"),
+        (Kinect, {"farthest": -8.0}, "noise.farthest: expected a positive number, got -8.0"),
+        (Kinect, {"farthest": 0.3}, "noise.farthest: expected more than noise.nearest, 0.4, got 0.3"),
+    ],
+)
+def test_a_value_that_cannot_be_is_refused_by_its_key(kind: Any, values: dict[str, float], message: str) -> None:
+    with pytest.raises(ValueError, match="expected") as caught:
+        kind(**values)
+    assert str(caught.value) == message
+
+
+# Time of flight
+
+
+@pytest.mark.parametrize("depth", [1.0, 1.5, 2.0, 3.0])
+def test_time_of_flight_noise_grows_with_the_third_power_of_depth(depth: float) -> None:
+    noisy = TimeOfFlight()(_wall(depth), _generator())
+    assert float(noisy.std()) == pytest.approx(651 * depth**3 / 598.4**2, rel=0.02)
+    assert float(noisy.mean()) == pytest.approx(depth, rel=2e-3)
+
+
+def test_its_disparity_is_normal_with_a_standard_deviation_of_strength_by_disparity() -> None:
+    depth = 1 + 2 * torch.rand(1, 40, 50, generator=_generator(1), dtype=torch.float64)
+    noise = TimeOfFlight(strength=300.0, stereo_constant=500.0, doffs=20.0)
+    clean = 500 / depth - 20
+    draws = torch.randn(depth.shape, generator=_generator(), dtype=torch.float64)
+    torch.testing.assert_close(500 / noise(depth, _generator()) - 20, clean + 300 / clean * draws, rtol=1e-12, atol=0)
+
+
+def test_where_its_disparity_is_not_positive_there_is_a_hole() -> None:
+    noisy = TimeOfFlight()(_wall(30.0, 100), _generator())
+    draws = torch.randn(1, 100, 100, generator=_generator(), dtype=torch.float64)
+    v = 598.4 / 30
+    assert torch.equal(noisy.isnan(), v + 651 / v * draws <= 0)
+    assert bool((noisy[noisy.isfinite()] > 0).all())
+    assert bool(TimeOfFlight(doffs=200.0)(_wall(3.0, 10), _generator()).isnan().all())
+
+
+@pytest.mark.parametrize(("name", "scale"), [("art_depth_2_n.png", 4), ("art_depth_3_n.png", 8)])
+def test_the_noisy_middlebury_inputs_that_circulate_have_five_levels_of_noise_at_every_disparity(
+    shared: Path, name: str, scale: int
+) -> None:
+    folder = shared / "real" / "middlebury2005"
+    fine, noisy = (cv2.imread(str(folder / each), cv2.IMREAD_UNCHANGED).astype(float) for each in ("art_big.png", name))
+    height, width = noisy.shape
+    blocks = fine.reshape(height, scale, width, scale).transpose(0, 2, 1, 3).reshape(height, width, -1)
+    calm = cv2.erode(((blocks.max(-1) - blocks.min(-1)) <= 2).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    levels, errors = blocks.mean(-1)[calm], (noisy - blocks.mean(-1))[calm]
+    far, near = errors[levels < 100], errors[levels > 170]
+    assert min(far.size, near.size) > 3000
+    assert far.std() == pytest.approx(5, rel=0.02)  # 651 / v: 8 and 3.5; its root: 2.8 and 1.9
+    assert near.std() == pytest.approx(5, rel=0.02)
+
+
+# Structured light
+
+
+@pytest.mark.parametrize("depth", [1.0, 2.0, 3.0, 5.0])
+def test_kinect_noise_is_that_of_khoshelham_and_grows_with_the_square_of_depth(depth: float) -> None:
+    span = 1 + 0.02 * torch.linspace(-1, 1, 400, dtype=torch.float64)  # several steps: one depth lies well or badly
+    wall = _wall(depth) * span
+    errors = (Kinect()(wall, _generator()) - wall) / wall**2
+    assert float(errors.std()) == pytest.approx(1.425e-3, rel=0.02)
+    assert float(errors.mean()) == pytest.approx(0, abs=2e-5)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_disparity_comes_in_eighths_of_the_sensor_s_pixels(dtype: torch.dtype) -> None:
+    depth = 0.5 + 7 * torch.rand(1, 60, 80, generator=_generator(1), dtype=torch.float64).to(dtype)
+    reading = Kinect()(depth, _generator())
+    eighths = (8 * 0.075 * 580 / reading[reading.isfinite()]).double()
+    assert eighths.numel() > 1000
+    torch.testing.assert_close(eighths, eighths.round(), rtol=0, atol=1e-9 if dtype == torch.float64 else 2e-4)
+
+
+def test_without_noise_the_nearest_step_is_read() -> None:
+    noise = Kinect(**QUIET, step=0.5, stereo_constant=10.0, nearest=None, farthest=None)
+    disparity = torch.tensor([[[9.8, 10.2, 10.3, 0.3, 0.2]]], dtype=torch.float64)
+    expected = torch.tensor([[[1.0, 1.0, 10 / 10.5, 20.0, torch.nan]]], dtype=torch.float64)
+    torch.testing.assert_close(noise(10 / disparity, _generator()), expected, rtol=1e-12, atol=0, equal_nan=True)
+
+
+def _step() -> Tensor:
+    """Return a wall at 3 m with a box at 2 m before it, in rows 10 to 19 and columns 15 to 24."""
+    depth = _wall(3.0, 40)
+    depth[0, 10:20, 15:25] = 2.0
+    return depth
+
+
+@pytest.mark.parametrize("reach", [1, 2, 4])
+def test_dropouts_lie_within_reach_of_depth_edges_and_nowhere_else(reach: int) -> None:
+    lost = Kinect(dropout=1.0, reach=reach)(_step(), _generator()).isnan()
+    inside = {(row, column) for row in range(10, 20) for column in range(15, 25)}
+    outside = {(row, column) for row in range(40) for column in range(40)} - inside
+    around = ((0, 1), (1, 0), (0, -1), (-1, 0))
+    edge = [
+        (row, column)
+        for own, other in ((inside, outside), (outside, inside))
+        for row, column in own
+        if any((row + down, column + right) in other for down, right in around)
+    ]
+    expected = torch.zeros(1, 40, 40, dtype=torch.bool)
+    for row, column in edge:
+        expected[0, row - reach + 1 : row + reach, column - reach + 1 : column + reach] = True
+    assert torch.equal(lost, expected)
+
+
+def test_dropouts_have_their_probability() -> None:
+    depth = _wall(2.0, 300)
+    depth[..., ::2] = 3.0
+    for dropout in (0.2, 0.7):
+        assert float(Kinect(dropout=dropout)(depth, _generator()).isnan().double().mean()) == pytest.approx(
+            dropout, abs=0.01
+        )
+
+
+@pytest.mark.parametrize(("jump", "expected"), [(0.49, True), (0.51, False)])
+def test_an_edge_is_a_jump_by_more_than_a_share_of_the_nearer_depth(jump: float, expected: bool) -> None:
+    assert bool(Kinect(dropout=1.0, jump=jump)(_step(), _generator()).isnan().any()) is expected
+
+
+def test_a_hole_makes_no_edge() -> None:
+    depth = _wall(2.0, 20)
+    depth[0, 5:9, 5:9] = torch.nan
+    assert torch.equal(Kinect(dropout=1.0)(depth, _generator()).isnan(), depth.isnan())
+
+
+def test_readings_out_of_range_are_holes_unless_the_limits_are_off() -> None:
+    depth = torch.tensor([[[0.2, 0.39, 0.41, 2.0, 7.8, 8.3, 20.0]]], dtype=torch.float64)
+    quiet = Kinect(**QUIET)(depth, _generator())
+    assert quiet.isnan()[0, 0].tolist() == [True, True, False, False, False, True, True]
+    open_ended = Kinect(**QUIET, nearest=None, farthest=None)(depth, _generator())
+    torch.testing.assert_close(open_ended, depth, rtol=0.03, atol=0)
+
+
+def test_a_reading_without_disparity_or_behind_the_sensor_is_a_hole() -> None:
+    depth = torch.tensor([[[1e6, -1.0]]], dtype=torch.float64)
+    assert bool(Kinect(**QUIET, nearest=None, farthest=None)(depth, _generator()).isnan().all())
+    assert TimeOfFlight()(depth, _generator())[0, 0, 1].isnan()

@@ -1,0 +1,196 @@
+"""Contact sheets: every scene gets a row with its own colours, numbers and holes; pages are whole or not there."""
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from matplotlib.figure import Figure
+
+from dsr.geometry.camera import Camera
+from dsr.report.sheets import save_contact_sheet
+from dsr.sample import Scene
+
+PHOTO = (0.2, 0.4, 0.6)
+PINK = (214, 132, 180)
+KNOWN = (228, 228, 228)
+WIDTH = 1330
+"""Pixels: 0.15 inches of margin, 2.35 of text, four panels of 2.56 and 0.14 between them, at 100 dpi."""
+PAGE = 6
+
+
+def toy_scene(height=32, width=32, name="toy", **changes):
+    camera = Camera(width, height, width / 2, height / 2, (width - 1) / 2, (height - 1) / 2)
+    rgb = torch.tensor(PHOTO).view(3, 1, 1).expand(3, height, width).clone()
+    depth = torch.full((1, height, width), 2.0)
+    return Scene(**{"dataset": "set", "name": name, "rgb": rgb, "camera": camera, "depth": depth, **changes})
+
+
+def drawn(folder, *scenes, title="Toys"):
+    """Draw one page and return its pixels, (H, W, 3) red, green, blue."""
+    path = folder / "sheets" / "toys.png"
+    assert save_contact_sheet(path, scenes, title) == [path]
+    assert [file.name for file in path.parent.iterdir()] == ["toys.png"]
+    return cv2.imread(str(path))[..., ::-1]
+
+
+def panel(page, column, row=0):
+    """Return the pixels of a square panel of a page of square scenes, a few from its border left out."""
+    top, left = 80 + row * 306, 250 + column * 270
+    return page[top + 4 : top + 252, left + 4 : left + 252]
+
+
+@pytest.fixture
+def written(monkeypatch):
+    """All that is written on pages, but for what belongs to a panel."""
+    texts, original = [], Figure.text
+
+    def text(self, x, y, content, **settings):
+        texts.append(content)
+        return original(self, x, y, content, **settings)
+
+    monkeypatch.setattr(Figure, "text", text)
+    return texts
+
+
+def test_a_row_shows_photo_depth_holes_and_renderings(tmp_path):
+    scene = toy_scene()
+    scene.depth[0, :16, 16:] = torch.nan
+    page = drawn(tmp_path, scene)
+    assert page.shape == (80 + 306, WIDTH, 3)
+    assert (panel(page, 0) == (51, 102, 153)).all()
+    depth, holes, lights = (panel(page, column) for column in (1, 2, 3))
+    assert (depth[:116, 132:] == PINK).all()
+    assert (depth[132:] == (68, 1, 84)).all()  # the nearest in viridis
+    assert (holes[:116, 132:] == PINK).all()
+    assert (holes[132:] == KNOWN).all()
+    frontal = lights[-40:, -100:]  # e4, right below; the wall faces it
+    assert (frontal == 255).all()
+    slanted = lights[80:100, 40:60]  # e1: e . n is 1 / sqrt 3
+    assert np.abs(slanted.astype(int) - round(255 / 3**0.5)).max() <= 1
+
+
+def test_rows_keep_the_order_of_the_scenes(tmp_path):
+    shades = (0.0, 0.4, 0.8)
+    page = drawn(tmp_path, *(toy_scene(rgb=torch.full((3, 32, 32), shade)) for shade in shades))
+    for row, shade in enumerate(shades):
+        assert (panel(page, 0, row) == round(255 * shade)).all()
+
+
+def test_beside_it_stand_name_size_field_of_view_range_and_share_of_holes(tmp_path, written):
+    scene = toy_scene(30, 40)
+    scene.depth[0, 0, 0] = 1.25
+    scene.depth[0, 5:8, :] = torch.nan
+    drawn(tmp_path, scene)
+    assert "toy" in written
+    expected = "set\n40 x 30 pixels\nfield of view 90 x 90 degrees\ndepth 1.25 to 2 m\nholes: 10 %"
+    assert expected in written
+
+
+def test_the_field_of_view_of_a_crop_is_that_of_the_crop(tmp_path, written):
+    left_half = toy_scene().camera.crop(0, 0, 32, 16)
+    drawn(tmp_path, toy_scene(32, 16, camera=left_half))
+    assert any("field of view 45 x 90 degrees" in text for text in written)
+
+
+def test_a_scene_with_little_unknown_does_not_count_as_complete(tmp_path, written):
+    scene = toy_scene(200, 200)
+    scene.depth[0, 7, 7] = torch.nan
+    drawn(tmp_path, scene)
+    assert any(text.endswith("holes: 0.0025 %") for text in written)
+
+
+def test_a_scene_without_fine_depth_shows_its_coarsest_measured_map(tmp_path, written):
+    coarse = torch.full((1, 4, 4), 3.0)
+    coarse[0, :2] = torch.nan
+    page = drawn(tmp_path, toy_scene(depth=None, measured={2: torch.ones(1, 16, 16), 8: coarse}))
+    assert (panel(page, 2)[:116] == PINK).all()
+    assert (panel(page, 2)[132:] == KNOWN).all()
+    assert any("measured: x2, x8; no fine depth\nshown: x8, 4 x 4\ndepth 3 to 3 m\nholes: 50 %" in t for t in written)
+
+
+def test_a_measured_map_beside_the_fine_one_is_told_of(tmp_path, written):
+    drawn(tmp_path, toy_scene(measured={4: torch.full((1, 8, 8), 2.0)}))
+    assert any("measured, too: x4\ndepth 2 to 2 m" in text for text in written)
+
+
+@pytest.mark.parametrize(("count", "pages"), [(3, 2), (4, 2), (5, 3)])
+def test_many_scenes_make_numbered_pages(tmp_path, written, monkeypatch, count, pages):
+    monkeypatch.setattr("dsr.report.sheets._ROWS", 2)
+    path = tmp_path / "toys.png"
+    made = save_contact_sheet(path, (toy_scene(8, 8, f"scene {number}") for number in range(count)), "Toys")
+    assert made == [tmp_path / f"toys-{number + 1}.png" for number in range(pages)]
+    assert sorted(file.name for file in tmp_path.iterdir()) == sorted(file.name for file in made)
+    assert [text for text in written if text.startswith("scene ")] == [f"scene {number}" for number in range(count)]
+
+
+def test_scenes_are_taken_as_they_are_needed(tmp_path, monkeypatch):
+    monkeypatch.setattr("dsr.report.sheets._ROWS", 2)
+
+    def scenes():
+        for number in range(4):
+            if number == 3:
+                assert (tmp_path / "toys-1.png").is_file()
+            yield toy_scene(8, 8)
+
+    save_contact_sheet(tmp_path / "toys.png", scenes(), "Toys")
+
+
+def test_a_full_page_needs_no_number(tmp_path):
+    assert drawn(tmp_path, *(toy_scene(8, 8) for _ in range(PAGE))).shape == (80 + PAGE * 306, WIDTH, 3)
+
+
+def test_no_scene_is_refused_and_writes_nothing(tmp_path):
+    with pytest.raises(ValueError, match=r"toys.png: expected a scene or more for a contact sheet, got none"):
+        save_contact_sheet(tmp_path / "toys.png", [], "Toys")
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(("height", "width"), [(2, 2), (1, 9), (9, 1), (4, 90), (90, 4), (700, 900)])
+def test_any_size_is_drawn(tmp_path, height, width):
+    tallest = max(256 * height / max(height, width), 30)
+    page = drawn(tmp_path, toy_scene(height, width))
+    assert page.shape[1] == WIDTH
+    assert page.shape[0] == pytest.approx(
+        80 + max(tallest + 50, 8 * 16.5), abs=1
+    )  # seven lines of text and a blank one
+
+
+def test_a_large_photo_is_averaged(tmp_path):
+    stripes = torch.zeros(3, 1200, 1200)
+    stripes[:, :, ::2] = 1
+    page = drawn(tmp_path, toy_scene(1200, 1200, rgb=stripes))
+    assert np.abs(panel(page, 0).astype(int) - 127).max() <= 20
+
+
+@pytest.mark.parametrize("name", ["$\\foo$", "日本 a_b^c", "{} %d ünï $", "n" * 100, "a-b " * 20, " "])
+def test_any_name_and_title_are_written_as_they_are(tmp_path, name):
+    drawn(tmp_path, toy_scene(8, 8, name), title=name)
+
+
+def test_a_page_that_is_there_is_replaced_and_a_failure_leaves_it(tmp_path):
+    path = tmp_path / "sheets" / "toys.png"
+    drawn(tmp_path, toy_scene(8, 8))
+    before = path.read_bytes()
+    drawn(tmp_path, toy_scene(8, 8, "other"))
+    after = path.read_bytes()
+    assert before != after
+
+    def broken():
+        yield toy_scene(8, 8)
+        raise ValueError("damaged")
+
+    with pytest.raises(ValueError, match="damaged"):
+        save_contact_sheet(path, broken(), "Toys")
+    assert path.read_bytes() == after
+    assert len(list(path.parent.iterdir())) == 1
+
+
+def test_a_page_of_detailed_scenes_stays_below_two_megabytes(tmp_path, shared):
+    scenes = []
+    for folder in sorted((shared / "real" / "middlebury2014").iterdir()):
+        photo = torch.from_numpy(cv2.imread(str(folder / "im0.png")) / 255).permute(2, 0, 1).float()
+        disparity = torch.from_numpy(cv2.imread(str(folder / "disp0GT.pfm"), cv2.IMREAD_UNCHANGED))[None]
+        depth = torch.where(disparity.isfinite(), 100 / (disparity + 30), torch.nan)
+        scenes.append(toy_scene(*photo.shape[1:], rgb=photo, depth=depth))
+    drawn(tmp_path, *scenes[:PAGE])
+    assert (tmp_path / "sheets" / "toys.png").stat().st_size < 2e6
