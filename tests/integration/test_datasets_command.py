@@ -1,12 +1,16 @@
 """``python eval.py`` and ``python train.py`` on data sets in their owners' formats."""
 
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
 
+import cv2
 import pandas as pd
 import pytest
+
+from dsr.cli import main
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 QUICK = ("metrics.lpips=false", "device=cpu")
@@ -62,3 +66,44 @@ def test_a_training_on_real_scenes_with_holes_runs(run, tmp_path, shared):
     assert (done.returncode, done.stderr) == (0, "")
     assert "data   3 scenes of middlebury_train to train on, 1 of middlebury_train to validate with" in done.stdout
     assert (tmp_path / "out" / "weights.safetensors").is_file()
+
+
+def test_preparing_draws_a_contact_sheet_and_what_is_wrong_is_one_line(
+    tmp_path, monkeypatch, capsys, shared, dsr_cache
+):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("DSR_DATA", str(shared / "real"))
+    assert main(["data", "prepare", "icl", "dataset.scenes=found", "dataset.size=64"]) == 0
+    assert capsys.readouterr().out.splitlines()[-1] == "contact sheet: outputs/data/icl/sheet.png"
+    assert cv2.imread("outputs/data/icl/sheet.png").shape[1] > 1000
+    monkeypatch.setenv("DSR_DATA", "nowhere")
+    wrong = {
+        ("icl",): "dataset=icl: expected its files in nowhere/icl_nuim, got no such directory; get it with",
+        ("icll",): "dataset=icll: unknown; expected one of folder, icl, ",
+        ("icl", "dataset.sizes=3"): "dataset.sizes: unknown key; expected dataset.name, dataset.root, dataset.scenes, "
+        "dataset.size, dataset.crop, dataset.frames",
+        ("paper_train",): "dataset=paper_train: expected one data set, it has the parts middlebury_train, sintel, pro",
+    }
+    for arguments, message in wrong.items():
+        assert main(["data", "prepare", *arguments]) == 2
+        errors = capsys.readouterr().err.splitlines()
+        assert len(errors) == 1
+        assert errors[0].startswith(f"error: {message}")
+    assert [path.name for path in tmp_path.iterdir()] == ["outputs"]
+
+
+def test_a_scene_that_cannot_be_read_is_named_and_the_others_are_drawn(
+    tmp_path, monkeypatch, capsys, shared, dsr_cache
+):
+    (tmp_path / "icl_nuim").mkdir()
+    for name in ("good", "bad"):
+        shutil.copytree(shared / "real" / "icl_nuim" / "living", tmp_path / "icl_nuim" / name)
+    (tmp_path / "icl_nuim" / "bad" / "depth.png").write_bytes(b"no picture")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("DSR_DATA", str(tmp_path))
+    assert main(["data", "prepare", "icl", "dataset.scenes=found", "dataset.size=64"]) == 2
+    captured = capsys.readouterr()
+    assert "contact sheet: outputs/data/icl/sheet.png" in captured.out
+    assert captured.err.startswith(
+        f"error: 1 of 2 scenes cannot be read: {tmp_path}/icl_nuim/bad/depth.png: expected a "
+    )

@@ -15,12 +15,13 @@ LAYERS = (
     ("dsr.quality.lpips",),
     ("dsr.quality.scores",),
     ("dsr.quality.metrics", "dsr.quality.losses"),
-    ("dsr.data", "dsr.methods"),
+    ("dsr.data", "dsr.methods", "dsr.fetching"),
     ("dsr.objective",),
     ("dsr.fitting",),
     ("dsr.evaluation", "dsr.training", "dsr.prior", "dsr.doctor"),
     ("dsr.report",),
-    ("dsr.app", "dsr.cli"),
+    ("dsr.app",),
+    ("dsr.cli",),
 )
 """From the lowest up. A package stands for all its modules; those in one line do not import each other."""
 MORE_FORBIDDEN = {

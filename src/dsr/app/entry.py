@@ -68,8 +68,16 @@ def fail(message: str) -> None:
     sys.exit(USAGE_ERROR)
 
 
-def explain(error: Exception, conf: Path, name: str) -> str:
-    """Return what is wrong with a configuration, on one line, with the choices where a name is mistyped."""
+def explain(error: Exception, conf: Path, name: str, arguments: Sequence[str] | None = None) -> str:
+    """Return what is wrong with a configuration, on one line, with the choices where a name is mistyped.
+
+    Args:
+        error: Hydra's or OmegaConf's.
+        conf: Hydra's configuration directory.
+        name: of the configuration.
+        arguments: that it was composed from; None for the command line's.
+
+    """
     if isinstance(error, MissingConfigException) and error.missing_cfg_file is not None:
         return _explain_missing(str(error.missing_cfg_file), conf, name)
     if isinstance(error, OverrideParseException):
@@ -81,17 +89,17 @@ def explain(error: Exception, conf: Path, name: str) -> str:
         return (
             f"{key}: got several values; -m runs each of them, {key}=[{values}] is a list, '{key}=\"{values}\"' a text"
         )
-    return _explain_value(error, text, conf, name)
+    return _explain_value(error, text, conf, name, sys.argv[1:] if arguments is None else arguments)
 
 
-def _explain_value(error: Exception, text: str, conf: Path, name: str) -> str:
+def _explain_value(error: Exception, text: str, conf: Path, name: str, arguments: Sequence[str]) -> str:
     """Return which key of an override is unknown, or does not take its value."""
     cause = error.__cause__
     key = re.search(r"Could not override '([^']+)'", text)
     if key:
         if cause is not None and "not in struct" not in str(cause) and "not in '" not in str(cause):
             return f"{key[1]}: {_first_line(cause)}"
-        return f"{key[1]}: unknown key; expected {', '.join(_siblings(key[1], conf, name))}"
+        return f"{key[1]}: unknown key; expected {', '.join(_siblings(key[1], conf, name, arguments))}"
     value = re.match(r"Error merging override (\S+?)=", text)
     return f"{value[1]}: {_first_line(cause)}" if value and cause is not None else text
 
@@ -129,9 +137,9 @@ def _first_line(error: BaseException) -> str:
     return str(error).splitlines()[0] if str(error) else type(error).__name__
 
 
-def _siblings(key: str, conf: Path, name: str) -> Sequence[str]:
+def _siblings(key: str, conf: Path, name: str, arguments: Sequence[str]) -> Sequence[str]:
     """Return the keys that stand where ``key`` was looked for."""
-    overrides = [argument for argument in sys.argv[1:] if re.match(rf"({'|'.join(_groups(conf))})=[\w-]+$", argument)]
+    overrides = [argument for argument in arguments if re.match(rf"({'|'.join(_groups(conf))})=[\w-]+$", argument)]
     with hydra.initialize_config_dir(str(conf.resolve()), version_base="1.3"):
         node: Any = hydra.compose(name, overrides)
     for part in key.split(".")[:-1]:

@@ -55,11 +55,12 @@ def _source(name: str, overrides: Sequence[str]) -> SceneSource:
     conf = next((path for path in (Path("conf").resolve(), _beside_package()) if (path / "dataset").is_dir()), None)
     if conf is None:
         raise ConfigError("conf: expected the directory of the configuration files; run the command in a checkout")
+    arguments = [f"dataset={name}", *overrides]
     try:
         with hydra.initialize_config_dir(str(conf), version_base="1.3"):
-            node = plain_config(hydra.compose("eval", [f"dataset={name}", *overrides]))["dataset"]
+            node = plain_config(hydra.compose("eval", arguments))["dataset"]
     except (HydraException, OmegaConfBaseException) as error:
-        raise ConfigError(explain(error, conf, "eval")) from error
+        raise ConfigError(explain(error, conf, "eval", arguments)) from error
     if "parts" in node:
         raise ConfigError(f"dataset={name}: expected one data set, it has the parts {', '.join(node['parts'])}")
     source: SceneSource = build("dataset", node)

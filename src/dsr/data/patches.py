@@ -66,8 +66,8 @@ class PatchData(lightning.LightningDataModule):
         validation: more data sets to validate with, by name; scenes without a true depth are left out.
 
     Raises:
-        ValueError: a data set is one to evaluate on or has too few scenes, a scene is to be trained on and validated with, or the scale does not
-            divide a patch.
+        ValueError: a data set is one to evaluate on or has too few scenes, a scene is to be trained on and validated
+            with, or the scale does not divide a patch.
 
     """
 

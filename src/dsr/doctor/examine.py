@@ -1,0 +1,126 @@
+"""Examining scenes and telling what was found."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+
+from rich.console import Console
+from rich.progress import Progress
+from rich.table import Table
+from rich.text import Text
+
+from dsr.data.detect import scenes_in
+from dsr.doctor.finding import LEVELS, Finding, Level, with_depth, worst
+from dsr.doctor.holes import check_holes
+from dsr.doctor.intrinsics import check_intrinsics, check_size
+from dsr.doctor.planes import check_planes
+from dsr.doctor.precision import check_precision
+from dsr.doctor.registration import check_registration
+from dsr.doctor.units import check_units
+from dsr.sample import Scene
+
+FINE, FAULTY, UNUSABLE = 0, 1, 2
+CHECKS: tuple[Callable[[Scene], list[Finding]], ...] = (
+    check_units,
+    check_intrinsics,
+    check_registration,
+    check_holes,
+    check_precision,
+    check_planes,
+    check_size,
+)
+_COLOURS: dict[Level, str] = {"ok": "green", "note": "cyan", "warning": "yellow", "problem": "bold red"}
+_MANY = 8
+"""Scenes beyond which what is in order is left out."""
+_LOG_WIDTH = 110
+"""Columns where the output is not a terminal."""
+
+
+def examine_directory(folder: Path) -> int:
+    """Print what looks wrong with the scenes of a directory, or with the one scene that it is.
+
+    Args:
+        folder: of any layout that :func:`dsr.data.detect.scenes_in` knows.
+
+    Returns:
+        0 where nothing looks wrong (there may be notes), 1 where there are warnings or problems, 2, with one line on
+        stderr, where there is no scene to examine.
+
+    """
+    try:
+        scenes = list(scenes_in(folder)) if folder.is_dir() else []
+        if not scenes:
+            came = "no scene in it" if folder.is_dir() else "no such directory"
+            raise ValueError(f"{folder}: expected a scene or a directory of scenes, got {came}")
+    except (ValueError, OSError) as error:
+        Console(stderr=True).print(
+            f"error: {' '.join(str(error).split())}", markup=False, highlight=False, soft_wrap=True
+        )
+        return UNUSABLE
+    console = Console()
+    if not console.is_terminal:
+        console = Console(width=_LOG_WIDTH)
+    verdicts: Counter[Level] = Counter()
+    with Progress(console=console, transient=True, disable=not console.is_terminal or len(scenes) <= _MANY) as bar:
+        for name, load in bar.track(scenes, description="examining"):
+            title, findings = _examine(name, load)
+            _show(console, title, findings, brief=len(scenes) > _MANY)
+            verdicts[worst(findings)] += 1
+    console.print(_summary(verdicts), style="bold", highlight=False)
+    return FAULTY if verdicts["warning"] or verdicts["problem"] else FINE
+
+
+def examine(scene: Scene) -> list[Finding]:
+    """Return what all checks find in a scene, in the order of :data:`CHECKS`."""
+    scene = with_depth(scene)
+    return [finding for check in CHECKS for finding in check(scene)]
+
+
+def _examine(name: str, load: Callable[[], Scene]) -> tuple[str, list[Finding]]:
+    """Return a title and the findings of a scene that may be impossible to load."""
+    try:
+        scene = load()
+    except (ValueError, OSError) as error:
+        message = f"cannot be read: {' '.join(str(error).split())}"
+        return name, [Finding("files", "problem", message, "repair the file, or describe it as the message says")]
+    if scene.depth is None:
+        return f"{name} (the map measured at x{min(scene.measured)})", examine(scene)
+    return name, examine(scene)
+
+
+def _show(console: Console, title: str, findings: list[Finding], *, brief: bool) -> None:
+    """Print a scene's findings, if ``brief`` those alone that are not in order, and its verdict."""
+    grid = Table.grid(padding=(0, 2))
+    grid.add_column(no_wrap=True)
+    grid.add_column(no_wrap=True)
+    grid.add_column(overflow="fold")
+    for finding in findings:
+        if finding.level != "ok" or not brief:
+            grid.add_row(Text(f"  {finding.level}", _COLOURS[finding.level]), finding.check, Text(finding.message))
+            if finding.advice:
+                grid.add_row("", "", Text(f"-> {finding.advice}", "dim"))
+    level = worst(findings)
+    console.print(Text.assemble((title, "bold"), ": ", (_verdict(findings), _COLOURS[level])), soft_wrap=True)
+    if grid.row_count:
+        console.print(grid)
+    if not brief:
+        console.print()
+
+
+def _verdict(findings: list[Finding]) -> str:
+    """Return how a scene is, in a few words."""
+    counts = Counter(finding.level for finding in findings)
+    parts = [f"{counts[level]} {level}{'s' if counts[level] > 1 else ''}" for level in LEVELS[:0:-1] if counts[level]]
+    if worst(findings) in ("warning", "problem"):
+        return ", ".join(parts)
+    return ", ".join(["fine", *parts])
+
+
+def _summary(verdicts: Counter[Level]) -> str:
+    """Return how many scenes are how."""
+    total, fine = sum(verdicts.values()), verdicts["ok"] + verdicts["note"]
+    parts = [f"{fine} fine"] if fine else []
+    parts += [f"{verdicts[level]} with {level}s" for level in ("warning", "problem") if verdicts[level]]
+    return f"{total} scene{'s' if total > 1 else ''}: {', '.join(parts)}"

@@ -1,0 +1,198 @@
+"""Whether stored depth is orthogonal: walls are bowls where distance along the ray was taken for it.
+
+A plane is linear in 1 / z over the image. If the values s follow z = s / |r|**k, with k = 0 for orthogonal depth, 1 for
+distance along the ray, and -1 for orthogonal depth that was taken for distance along the ray and divided by |r|, then
+1 / s = (a u + b v + c) / |r|**k, which is linear in a, b, c and, as |r| changes little within a window, in k:
+1 / s = a u + b v + c - k log|r| / s. A robust fit to windows of many sizes and places estimates k; those that this
+explains are planar and vote.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from dsr.doctor.finding import Array, Finding, metres
+from dsr.doctor.precision import find_rounding
+from dsr.geometry.camera import Camera
+from dsr.sample import Scene
+
+_SIZES = (1.0, 2 / 3, 1 / 2, 1 / 3, 1 / 4, 1 / 6)
+"""Of windows, as shares of the image's shorter side."""
+_CELLS = 16
+"""Across a window: values are averaged within cells, which quiets noise."""
+_ITERATIONS = 12
+_KNOWN, _INLIERS = 0.6, 0.55
+"""Shares of a window's cells that have to be known, and on the plane."""
+_NOISE = 0.5
+"""Of the bend that k = 1 makes: what a planar window may deviate from its fit."""
+_NEAR = 0.3
+"""From a vote's k to what it votes for."""
+_WHOLE = 0.95
+"""Of a cell's pixels that have to be known."""
+_LARGEST = 1e3
+"""Inverse depth, as a multiple of the median's, beyond which it is cut."""
+_EXACT = 1e-12
+_LEAST, _LEAD = 4, 3
+"""Votes for orthogonal depth, and how many times as many as for the others."""
+_LEAST_BENT, _MAJORITY_BENT = 6, 0.7
+"""Votes for another type, and their share of the planar windows."""
+
+
+@dataclass(frozen=True)
+class Windows:
+    """Square windows of a map of inverse depth, as averages within cells.
+
+    Args:
+        inverse: (N, cells) of 1 / s, as a multiple of the window's median; 0 where not known.
+        known: (N, cells) bool.
+        u, v: (N, cells) position within the window, about -1 to 1.
+        bend: (N, cells) logarithm of |r|, less its mean over the window.
+
+    """
+
+    inverse: Array
+    known: np.ndarray
+    u: Array
+    v: Array
+    bend: Array
+
+
+def check_planes(scene: Scene) -> list[Finding]:
+    """Return whether flat surfaces are flat when the depth is taken as orthogonal.
+
+    Args:
+        scene: with fine depth.
+
+    """
+    depth = metres(scene)
+    rounding = find_rounding(scene)
+    votes = plane_votes(depth, scene.camera, 0.0 if rounding is None else rounding.relative)
+    flat, ray, reverse = (int((np.abs(votes - k) < _NEAR).sum()) for k in (0, 1, -1))
+    bent = f"{{}} of {votes.size} planar windows are flat then, {flat} are as it was read"
+    if ray >= _LEAST_BENT and ray > _MAJORITY_BENT * votes.size:
+        message = f"depth looks like distance along the ray: {bent.format(ray)}"
+        return [Finding("planes", "problem", message, 'set "range_type": "perspective" in camera.json')]
+    if reverse >= _LEAST_BENT and reverse > _MAJORITY_BENT * votes.size:
+        message = f"depth was taken for distance along the ray but looks orthogonal in the file: {bent.format(reverse)}"
+        return [Finding("planes", "problem", message, 'set "range_type": "orthogonal" in camera.json')]
+    if flat >= _LEAST and flat > _LEAD * (ray + reverse):
+        return [Finding("planes", "ok", f"{flat} of {votes.size} planar windows are flat in orthogonal depth")]
+    counts = f"planar windows: {flat} and {ray}"
+    message = f"too few planes for this view to tell orthogonal depth from distance along the ray ({counts})"
+    return [Finding("planes", "note", message)]
+
+
+def plane_votes(values: Array, camera: Camera, step: float = 0.0) -> Array:
+    """Return the exponent k that each planar window speaks for: near 0 orthogonal, 1 along the ray, -1 the reverse.
+
+    Args:
+        values: (H, W) positive, in any unit, NaN in holes.
+        camera: of these pixels.
+        step: that the values were rounded to, as a share of them.
+
+    """
+    windows = _windows(values, camera)
+    if not windows.inverse.size:
+        return np.empty(0)
+    columns = np.stack((np.ones_like(windows.u), windows.u, windows.v, -windows.bend * windows.inverse), axis=-1)
+    scale = np.sqrt(np.square(columns).mean(axis=1, keepdims=True))
+    columns = columns / scale
+    fit, weight = _robust_fit(columns, windows)
+    residual = windows.inverse - _product(columns, fit)
+    bent = columns[..., 3] * scale[..., 3]
+    bent = bent - _product(columns[..., :3], _solve(columns[..., :3], weight, bent))
+    signal, noise = (_spread(values, weight) for values in (bent, residual))
+    noise = np.hypot(noise, step / np.sqrt(12))
+    planar = (weight.mean(axis=1) > _INLIERS) & (noise < _NOISE * signal)
+    exponents: Array = (fit[:, 3] / scale[:, 0, 3])[planar]
+    return exponents
+
+
+def _windows(values: Array, camera: Camera) -> Windows:
+    """Return the windows of a map of which enough is known."""
+    known = np.isfinite(values)
+    inverse = np.where(known, np.nanmedian(values) / values, 0).clip(max=_LARGEST)
+    tops, lefts, sizes = _places(*values.shape)
+    ends = np.round(np.arange(_CELLS + 1) * sizes[:, None] / _CELLS).astype(int)
+    rows, columns = tops[:, None] + ends, lefts[:, None] + ends
+    area = np.diff(rows)[:, :, None] * np.diff(columns)[:, None, :]
+    count = _totals(known.astype(np.float64), rows, columns)
+    whole = count > _WHOLE * area
+    enough = whole.mean(axis=(1, 2)) > _KNOWN
+    rows, columns, whole, count = rows[enough], columns[enough], whole[enough], count[enough]
+    means = np.where(whole, _totals(inverse, rows, columns) / np.maximum(count, 1), 0)
+    v, u = (((part[:, 1:] + part[:, :-1]) - 1) / 2 for part in (rows, columns))
+    slopes = np.square((u - camera.cx) / camera.fx)[:, None, :] + np.square((v - camera.cy) / camera.fy)[:, :, None]
+    bend = np.log1p(slopes) / 2
+    bend -= bend.mean(axis=(1, 2), keepdims=True)
+    u, v = (2 * (part - part.mean(axis=1, keepdims=True)) / sizes[enough, None] for part in (u, v))
+    u, v = np.broadcast_to(u[:, None, :], bend.shape), np.broadcast_to(v[:, :, None], bend.shape)
+    shape = (len(means), _CELLS**2)
+    means, whole, u, v, bend = (field.reshape(shape) for field in (means, whole, u, v, bend))
+    scale = np.array([np.median(mean[own]) for mean, own in zip(means, whole, strict=True)])[:, None]
+    return Windows(means / scale, whole, u, v, bend)
+
+
+def _places(height: int, width: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return first rows, first columns and sizes of windows that overlap by half."""
+    found = []
+    for share in _SIZES:
+        size = int(min(height, width) * share)
+        if size >= _CELLS:
+            tops, lefts = (
+                np.linspace(0, n - size, round(2 * (n - size) / size) + 1).astype(int) for n in (height, width)
+            )
+            found += [(top, left, size) for top in tops for left in lefts]
+    tops, lefts, sizes = np.array(found, dtype=int).reshape(-1, 3).T
+    return tops, lefts, sizes
+
+
+def _totals(values: Array, rows: np.ndarray, columns: np.ndarray) -> Array:
+    """Return the sums over the cells between rows (N, n + 1) and columns (N, n + 1), shape (N, n, n)."""
+    sums = np.pad(values.cumsum(axis=0).cumsum(axis=1), ((1, 0), (1, 0)))
+    totals: Array = np.diff(np.diff(sums[rows[:, :, None], columns[:, None, :]], axis=1), axis=2)
+    return totals
+
+
+def _robust_fit(columns: Array, windows: Windows) -> tuple[Array, Array]:
+    """Return coefficients (N, 4), and weights (N, cells) of 1 for the cells that they explain and 0 for others.
+
+    Least absolute deviations first, which up to half of the cells may contradict, then Tukey's biweight.
+    """
+    known = windows.known.astype(np.float64)
+    weight = known
+    for iteration in range(_ITERATIONS):
+        size = np.abs(windows.inverse - _product(columns, _solve(columns, weight, windows.inverse)))
+        ratio = size / _deviation(size, windows.known)
+        absolute = iteration < _ITERATIONS // 2
+        weight = known * (
+            1 / np.maximum(ratio, 0.05) if absolute else np.square((1 - np.square(ratio / 4)).clip(min=0))
+        )
+    fit = _solve(columns, weight, windows.inverse)
+    size = np.abs(windows.inverse - _product(columns, fit))
+    return fit, known * (size < 3 * _deviation(size, windows.known))
+
+
+def _deviation(size: Array, known: np.ndarray) -> Array:
+    """Return the standard deviation that the median of absolute residuals implies, (N, 1)."""
+    return 1.4826 * np.nanmedian(np.where(known, size, np.nan), axis=1, keepdims=True) + _EXACT
+
+
+def _solve(columns: Array, weight: Array, target: Array) -> Array:
+    """Return the weighted least-squares coefficients (N, k) of columns (N, cells, k)."""
+    weighted = columns.swapaxes(1, 2) * weight[:, None, :]
+    ridge = _EXACT * np.eye(columns.shape[-1]) * (1 + weight.sum(axis=1))[:, None, None]
+    solution: Array = np.linalg.solve(weighted @ columns + ridge, weighted @ target[..., None])[..., 0]
+    return solution
+
+
+def _product(columns: Array, fit: Array) -> Array:
+    product: Array = (columns @ fit[..., None])[..., 0]
+    return product
+
+
+def _spread(values: Array, weight: Array) -> Array:
+    """Return the weighted root mean square, (N,)."""
+    return np.sqrt((np.square(values) * weight).sum(axis=1) / np.maximum(weight.sum(axis=1), 1))

@@ -1,0 +1,98 @@
+"""Whether depth is in metres: distances that no room or table has come from another unit, and often tell which."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from dsr.doctor.finding import Array, Finding, Level, length, metres
+from dsr.sample import Scene
+
+_NEAREST, _FARTHEST = 0.05, 200.0
+"""Metres: depth that lies below or beyond as a whole is in another unit."""
+_NEAR, _FAR = 0.1, 30.0
+"""Metres: a median below is macro photography, one beyond is outdoors; or both are in another unit."""
+_TYPICAL = (0.4, 8.0)
+"""Metres: where the median of a room or a table lies."""
+_FACTORS: tuple[tuple[float, str], ...] = (
+    (1e-3, "millimetres read as metres"),
+    (1e3, "metres read as millimetres"),
+    (1e-2, "centimetres read as metres"),
+    (1e2, "metres read as centimetres"),
+    (1 / 5000, "values of 1/5000 m, as ICL-NUIM and TUM store them, read as metres"),
+    (1 / 5, "values of 1/5000 m read as millimetres"),
+    (1 / 8, "SUN RGB-D's values read without turning them by three bits"),
+    (1 / 256, "values of 1/256 m, as KITTI stores them, read as metres"),
+)
+"""From the likeliest down."""
+_BASELINES = (1e-3, 5.0)
+"""Metres between two cameras."""
+_AGREEMENT = 1.25
+"""Ratio of measured and fine depth beyond which they disagree."""
+
+
+def check_units(scene: Scene) -> list[Finding]:
+    """Return whether depth, baseline and measured maps are as far and as wide as metres are.
+
+    Args:
+        scene: with fine depth.
+
+    """
+    depth = metres(scene)
+    low, middle, high = np.nanpercentile(depth, (1, 50, 99))
+    text = f"depth {length(low)} to {length(high)} (1st to 99th percentile), median {length(middle)}"
+    level: Level
+    level, remark = "ok", ""
+    if high < _NEAREST or low > _FARTHEST:
+        level, remark = "problem", f": {'nearer' if high < _NEAREST else 'farther'} than any room or table"
+    elif middle < _NEAR or middle > _FARTHEST:
+        level, remark = "warning", f": {'nearer' if middle < _NEAR else 'farther'} than most rooms and tables"
+    elif middle > _FAR:
+        level, remark = "note", ": too far for a room, right for outdoors"
+    findings = [Finding("units", level, text + remark, "" if level == "ok" else _cure(scene, middle))]
+    return findings + _baseline(scene) + _measured(scene, depth)
+
+
+def _cure(scene: Scene, middle: float) -> str:
+    """Return which factors make a median depth plausible."""
+    fitting = [(factor, why) for factor, why in _FACTORS if _TYPICAL[0] <= middle * factor <= _TYPICAL[1]]
+    if not fitting:
+        return "check the unit"
+    texts = [f"x {factor:g} would make the median {length(middle * factor)} ({why})" for factor, why in fitting[:2]]
+    where = 'set "depth_unit" in camera.json'
+    baseline = scene.camera.baseline
+    if baseline is not None and not _plausible_baseline(baseline) and _plausible_baseline(baseline * fitting[0][0]):
+        where = f'set "baseline_unit" in camera.json: the baseline of {length(baseline)} is off by the same factor'
+    return f"{', or '.join(texts)}; {where}"
+
+
+def _plausible_baseline(baseline: float) -> bool:
+    return _BASELINES[0] <= baseline <= _BASELINES[1]
+
+
+def _baseline(scene: Scene) -> list[Finding]:
+    """Return what is odd about the distance between the cameras."""
+    baseline = scene.camera.baseline
+    if baseline is None or _plausible_baseline(baseline):
+        return []
+    low, high = (length(limit) for limit in _BASELINES)
+    message = f"baseline {length(baseline)}, usual are {low} to {high}"
+    advice = 'check "baseline_unit" in camera.json; leave it where depth, if computed from it, is plausible'
+    return [Finding("units", "note", message, advice)]
+
+
+def _measured(scene: Scene, depth: Array) -> list[Finding]:
+    """Return where a measured coarse map disagrees with the fine one."""
+    findings = []
+    for factor, coarse in sorted(scene.measured.items()):
+        values = coarse[0].double().numpy()
+        fine = depth[factor // 2 :: factor, factor // 2 :: factor][: values.shape[0], : values.shape[1]]
+        values = values[: fine.shape[0], : fine.shape[1]]
+        both = np.isfinite(fine) & np.isfinite(values)
+        if not both.any():
+            continue
+        ratio = float(np.median(values[both] / fine[both]))
+        if not 1 / _AGREEMENT <= ratio <= _AGREEMENT:
+            message = f"the measured map at x{factor} is {ratio:.3g} times as far as the fine depth"
+            advice = "give both in one unit; the disparity of a coarse map is in pixels of its own"
+            findings.append(Finding("units", "problem", message, advice))
+    return findings

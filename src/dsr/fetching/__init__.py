@@ -1,0 +1,1 @@
+"""Getting data sets: what there is, downloads that go on where they stopped, checksums, archives."""

@@ -1,0 +1,123 @@
+"""What was fetched, and its SHA-256: ``checksums.json`` in the directory of the data sets."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from dsr.atomic import write_text
+
+try:
+    import fcntl
+except ImportError:  # there is none on Windows
+    fcntl = None  # type: ignore[assignment]
+
+Moved = Callable[[int, int | None], None]
+"""Takes how many bytes are done, and of how many, None where that is not known."""
+_CHUNK = 1 << 20
+
+
+@dataclass(frozen=True)
+class Entry:
+    """What is known of a file.
+
+    Args:
+        sha256: its checksum; None for an archive that the user unpacked.
+        size: in bytes.
+        files: of an archive, the sizes of the files that it unpacked to, by their path in its directory.
+
+    """
+
+    sha256: str | None
+    size: int
+    files: Mapping[str, int] | None = None
+
+
+class Checksums(Mapping[str, Entry]):
+    """The entries of ``checksums.json``, by path below the directory of the data sets.
+
+    Args:
+        root: that directory.
+
+    Raises:
+        ValueError: the file is damaged.
+
+    """
+
+    def __init__(self, root: Path) -> None:
+        self.path = root / "checksums.json"
+        self._entries: dict[str, Entry] = {}
+        if self.path.is_file():
+            try:
+                entries = json.loads(self.path.read_text(encoding="utf-8"))
+                self._entries = {str(name): _entry(fields) for name, fields in entries.items()}
+            except (ValueError, TypeError, AttributeError, RecursionError) as error:
+                raise ValueError(
+                    f"{self.path}: expected the checksums of the data sets, got a damaged file ({error}); delete it to "
+                    "record them anew"
+                ) from error
+
+    def __getitem__(self, name: str) -> Entry:
+        return self._entries[name]
+
+    def __len__(self) -> int:
+        return len(self._entries)
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._entries)
+
+    def update(self, entries: Mapping[str, Entry]) -> None:
+        """Add entries, or change them, and write the file."""
+        self._entries.update(entries)
+        fields = {
+            name: {key: value for key, value in asdict(entry).items() if value is not None}
+            for name, entry in sorted(self._entries.items())
+        }
+        write_text(self.path, json.dumps(fields, indent=1) + "\n")
+
+
+def _entry(fields: Any) -> Entry:
+    """Return an entry from its JSON."""
+    sha256, size, files = fields.get("sha256"), fields.get("size"), fields.get("files")
+    digest = sha256 is None or (isinstance(sha256, str) and len(sha256) == 64)
+    sizes = files is None or all(isinstance(value, int) for value in files.values())
+    if not (isinstance(size, int) and digest and sizes):
+        raise ValueError(f"{fields!s:.60} is no entry")
+    return Entry(sha256, size, files)
+
+
+def sha256_of(path: Path, moved: Moved | None = None) -> str:
+    """Return the SHA-256 of a file, 64 hexadecimal digits."""
+    digest, done, total = hashlib.sha256(), 0, path.stat().st_size
+    with path.open("rb") as file:
+        while chunk := file.read(_CHUNK):
+            digest.update(chunk)
+            done += len(chunk)
+            if moved is not None:
+                moved(done, total)
+    return digest.hexdigest()
+
+
+@contextlib.contextmanager
+def alone(root: Path) -> Iterator[None]:
+    """Keep other commands from writing into the directory of the data sets meanwhile.
+
+    Raises:
+        ValueError: another one is at it.
+
+    """
+    with contextlib.ExitStack() as stack:
+        try:
+            file = stack.enter_context((root / ".dsr-data.lock").open("w"))
+            if fcntl is not None:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise ValueError(f"{root}: another `dsr data` command is writing there; wait for it to end") from error
+        except OSError:  # there is no such directory, it is read-only, or its file system has no locks
+            pass
+        yield

@@ -1,0 +1,179 @@
+"""``dsr data get``: fetching the data sets of the catalogue.
+
+A file that comes for the first time is checked for what it claims to be, and its SHA-256 is written into
+``checksums.json``; ever after it has to have that one. Files are on disk under their names whole or not at all.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from urllib.parse import urlsplit
+
+import pooch  # type: ignore[import-untyped]
+
+from dsr.fetching.catalogue import Item
+from dsr.fetching.checksums import Checksums, Entry, alone, sha256_of
+from dsr.fetching.download import FetchError, NoSpaceError, UnreachableError, download, megabytes
+from dsr.fetching.inventory import Watcher, compare, expect_kind, lack, record
+from dsr.fetching.unpack import take_member, unpack
+
+_UNPACKED = 1.25
+"""Size of what an archive of pictures unpacks to, as a multiple of its own: for a first check of the disk."""
+
+
+@dataclass(frozen=True)
+class Options:
+    """How to fetch.
+
+    Args:
+        mirror: address of a server to try first; it has each file under its path below the directory of the data sets.
+        accept_changed: whether a file may have another checksum than recorded.
+        keep_archives: whether archives stay after they were unpacked.
+
+    """
+
+    mirror: str | None = None
+    accept_changed: bool = False
+    keep_archives: bool = False
+
+
+def get(items: Iterable[Item], root: Path, watcher: Watcher, options: Options | None = None) -> list[str]:
+    """Fetch what is not there, or not as recorded.
+
+    An interruption keeps what has come of a file beside it, ``.part``, and the next call goes on from there.
+
+    Args:
+        items: what to fetch; a path that occurs twice is fetched once.
+        root: the directory of the data sets.
+        watcher: is told how it goes.
+        options: see :class:`Options`.
+
+    Returns:
+        What could not be had and why, a line each; the others are there. A full disk ends it.
+
+    Raises:
+        ValueError: ``checksums.json`` is damaged, or another command is writing into ``root``.
+
+    """
+    problems: list[str] = []
+    root.mkdir(parents=True, exist_ok=True)
+    with alone(root):
+        job = _Job(root, Checksums(root), watcher, options or Options())
+        for item in {item.path: item for item in items}.values():
+            try:
+                job.get(item)
+            except NoSpaceError as error:
+                return [*problems, f"{item.path}: {error}"]
+            except (ValueError, OSError) as error:
+                problems.append(f"{item.path}: {' '.join(str(error).split())}")
+    return problems
+
+
+@dataclass(frozen=True)
+class _Job:
+    """Fetching; ``gone`` has the servers that could not be reached."""
+
+    root: Path
+    checksums: Checksums
+    watcher: Watcher
+    options: Options
+    gone: set[str] = field(default_factory=set)
+
+    def get(self, item: Item) -> None:
+        """Fetch an item unless it is there and good."""
+        target, entry = self.root / item.path, self.checksums.get(item.path)
+        if item.unpack_to is None:
+            if not self._is_good(item):
+                digest = self._fetch(item)
+                self.checksums.update({item.path: Entry(digest, target.stat().st_size)})
+                self.watcher.say(f"{item.path}: {megabytes(target.stat().st_size)}")
+            return
+        if lack(item, self.root, entry) is None:
+            return
+        digest = self._digest(item, target, str(target)) if target.is_file() else self._fetch(item)
+        with self.watcher.transfer(f"unpacking {item.path}") as moved:
+            files = unpack(target, self.root / item.unpack_to, moved, item.contains)
+        self.checksums.update({item.path: Entry(digest, target.stat().st_size, files)})
+        self.watcher.say(f"{item.path}: {megabytes(target.stat().st_size)}, unpacked to {len(files)} files")
+        if not self.options.keep_archives:
+            target.unlink()
+
+    def _is_good(self, item: Item) -> bool:
+        """Return whether a file is there and as recorded; the user's own is recorded."""
+        if not (self.root / item.path).is_file():
+            return False
+        new: dict[str, Entry] = {}
+        problem = compare(item.path, self.root, self.checksums, new, self.watcher, item.sha256)
+        if problem is not None:
+            self.watcher.say(f"{problem}: fetching it again")
+            return False
+        record(self.checksums, new, self.watcher)
+        return True
+
+    def _fetch(self, item: Item) -> str:
+        """Download a file from the first address that has it, and return its checksum."""
+        mirror = () if self.options.mirror is None else (f"{self.options.mirror.rstrip('/')}/{item.path}",)
+        problems = []
+        for url in (*mirror, *item.urls):
+            host = urlsplit(url).netloc
+            try:
+                return self._fetch_from(url, item, () if host in self.gone else None)
+            except NoSpaceError:
+                raise
+            except UnreachableError as error:
+                self.gone.add(host)
+                problems.append(str(error))
+            except ValueError as error:
+                problems.append(str(error))
+        raise FetchError("; ".join(dict.fromkeys(problems)))
+
+    def _fetch_from(self, url: str, item: Item, pauses: Sequence[float] | None) -> str:
+        """Download a file, check it, put it in place, and return its checksum."""
+        target = self.root / item.path
+        address, _, member = url.partition("#")
+        name = f"{target.name}.zip" if member else target.name
+        part = target.with_name(f"{name}.part")
+        room = 0.0 if item.unpack_to is None else _UNPACKED
+        with self.watcher.transfer(item.path) as moved:
+
+            def downloader(address: str, output: str, _: object) -> None:
+                download(address, part, moved, room=room, pauses=pauses)
+                part.replace(output)
+
+            pooch.get_logger().setLevel("WARNING")
+            new = Path(pooch.retrieve(address, None, f"{name}.new", target.parent, downloader=downloader))
+        try:
+            if member:
+                new = _member_of(new, member)
+            expect_kind(new, target.suffix, url)
+            digest = self._digest(item, new, url)
+        except ValueError:
+            new.unlink(missing_ok=True)
+            raise
+        new.replace(target)
+        return digest
+
+    def _digest(self, item: Item, path: Path, source: str) -> str:
+        """Return a file's checksum, which must be the recorded one if there is one."""
+        entry = None if self.options.accept_changed else self.checksums.get(item.path)
+        expected, digest = item.sha256 or (None if entry is None else entry.sha256), sha256_of(path)
+        if expected not in (None, digest):
+            raise FetchError(
+                f"{source}: expected sha256 {expected} as recorded in {self.checksums.path}, got {digest}; "
+                "if the new one is right, --accept-changed takes it"
+            )
+        return digest
+
+
+def _member_of(archive: Path, member: str) -> Path:
+    """Return a member of a zip archive as a file, in place of the archive."""
+    path = archive.with_name(f"{archive.name}.member")
+    try:
+        take_member(archive, member, path)
+    except ValueError:
+        path.unlink(missing_ok=True)
+        raise
+    archive.unlink()
+    return path

@@ -1,0 +1,82 @@
+"""The real ``dsr doctor DIR``: what it prints, and its exit codes."""
+
+import json
+import os
+import subprocess
+import sys
+
+import cv2
+import numpy as np
+import pytest
+
+from dsr.data.simgeo_scenes import render_scene
+
+
+def doctor(folder):
+    """Run the command in a process of its own."""
+    return subprocess.run(
+        [sys.executable, "-m", "dsr.cli", "doctor", str(folder)],
+        capture_output=True,
+        text=True,
+        timeout=300,
+        check=False,
+        env={**os.environ, "OMP_NUM_THREADS": "1", "PYTHONWARNINGS": "error::RuntimeWarning"},
+    )
+
+
+@pytest.fixture(scope="module")
+def cube():
+    return render_scene("cube_no_texture", 192)
+
+
+def write(folder, rendering, depth, **entries):
+    """Write a scene in the folder layout, of a rendering with another depth."""
+    folder.mkdir(parents=True)
+    camera = rendering.camera
+    numbers = {name: getattr(camera, name) for name in ("width", "height", "fx", "fy", "cx", "cy")}
+    (folder / "camera.json").write_text(json.dumps({**numbers, **entries}))
+    cv2.imwrite(str(folder / "rgb.png"), rendering.rgb[:, :, ::-1])
+    np.save(folder / "depth.npy", depth)
+
+
+def test_a_sound_scene_is_fine(tmp_path, cube):
+    write(tmp_path / "cube", cube, cube.depth)
+    for folder in (tmp_path, tmp_path / "cube"):
+        done = doctor(folder)
+        assert (done.returncode, done.stderr) == (0, "")
+        assert done.stdout.startswith("cube: fine")
+        assert done.stdout.endswith("1 scene: 1 fine\n")
+
+
+def test_what_is_wrong_is_told_with_what_to_do(tmp_path, cube):
+    rays = cube.camera.ray_lengths().numpy()
+    write(tmp_path / "ray", cube, cube.depth * rays)
+    write(tmp_path / "ray_described", cube, cube.depth * rays, range_type="perspective")
+    write(tmp_path / "unit", cube, cube.depth * 1000)
+    write(tmp_path / "unit_described", cube, cube.depth * 1000, depth_unit="mm")
+    done = doctor(tmp_path)
+    assert (done.returncode, done.stderr) == (1, "")
+    text = " ".join(done.stdout.split())
+    assert "ray: 1 problem" in text
+    assert "depth looks like distance along the ray" in text
+    assert '-> set "range_type": "perspective" in camera.json' in text
+    assert "ray_described: fine" in text
+    assert "unit: 1 problem" in text
+    assert "-> x 0.001 would make the median" in text
+    assert "unit_described: fine" in text
+    assert done.stdout.endswith("4 scenes: 2 fine, 2 with problems\n")
+
+
+def test_a_place_without_scenes_is_one_line_on_stderr(tmp_path):
+    done = doctor(tmp_path / "none")
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr.startswith(f"error: {tmp_path / 'none'}: expected a scene or a directory of scenes")
+    assert done.stderr.count("\n") == 1
+
+
+def test_the_published_scenes_are_fine(shared):
+    done = doctor(shared / "scenes")
+    assert (done.returncode, done.stderr) == (0, "")
+    for name in ("books", "lucy", "plant"):
+        assert f"{name}: fine" in done.stdout
+    assert done.stdout.endswith("3 scenes: 3 fine\n")

@@ -1,0 +1,99 @@
+"""The catalogue of data sets: every entry can be fetched or says how to get it, and lies where its reader looks."""
+
+from pathlib import Path, PurePosixPath
+from urllib.parse import urlsplit
+
+import pytest
+
+from dsr.data.middlebury import EVALUATION_2014 as EVALUATED
+from dsr.data.middlebury import SCENES
+from dsr.fetching.catalogue import CATALOGUE, EVALUATION_2014, SCENES_2006, TRAINING_2014, find
+
+ITEMS = [item for collection in CATALOGUE.values() for item in collection.items]
+
+
+@pytest.mark.parametrize("name", CATALOGUE)
+def test_a_collection_says_what_it_is_and_on_which_terms(name):
+    collection = CATALOGUE[name]
+    assert collection.name == name
+    assert urlsplit(collection.homepage).scheme in ("http", "https")
+    assert collection.title
+    assert collection.licence.endswith(".")
+    assert collection.citation.endswith(".")
+    assert any(str(year) in collection.citation for year in range(2001, 2027))
+    assert collection.size is None or collection.size > 0
+    assert bool(collection.items) != bool(collection.manual and collection.patterns)
+
+
+@pytest.mark.parametrize("name", CATALOGUE)
+def test_the_files_of_a_collection_lie_in_its_folders(name):
+    collection = CATALOGUE[name]
+    assert {item.path.split("/")[0] for item in collection.items} == (
+        set(collection.folders) if collection.items else set()
+    )
+    paths = [item.path for item in collection.items]
+    assert len(set(paths)) == len(paths)
+
+
+@pytest.mark.parametrize("item", ITEMS, ids=lambda item: item.path)
+def test_an_item_has_addresses_of_its_name_and_a_path_below_the_root(item):
+    assert not PurePosixPath(item.path).is_absolute()
+    assert ".." not in item.path
+    assert item.urls
+    for url in item.urls:
+        address = urlsplit(url)
+        assert address.scheme in ("http", "https")
+        assert " " not in url
+        name = (address.fragment or address.path).rpartition("/")[2]
+        assert name == PurePosixPath(item.path).name or item.unpack_to is not None
+    assert (item.unpack_to is None) == (not item.path.endswith((".zip", ".tar.gz")))
+    assert bool(item.contains) == (item.unpack_to is not None)
+
+
+def test_an_item_is_the_same_wherever_it_occurs():
+    by_path = {item.path: item for item in ITEMS}
+    assert all(by_path[item.path] == item for item in ITEMS)
+
+
+def test_middlebury_2014_has_its_23_public_scenes_once():
+    assert len({*EVALUATION_2014, *TRAINING_2014}) == 7 + 16 == len(EVALUATION_2014) + len(TRAINING_2014)
+    paths = [item.path for item in CATALOGUE["middlebury"].items]
+    assert len(paths) == 3 * 7
+    assert "middlebury2014/Vintage-perfect/disp0.pfm" in paths
+    assert not set(CATALOGUE["middlebury"].items) & set(CATALOGUE["middlebury_train"].items)
+
+
+def test_the_training_scenes_are_those_of_2014_2006_and_2001():
+    items = CATALOGUE["middlebury_train"].items
+    assert len(items) == 3 * 16 + 3 * 21 + 2 * 6
+    assert {*CATALOGUE["middlebury2006"].items, *CATALOGUE["middlebury2001"].items} < set(items)
+    assert len(SCENES_2006) == 21
+
+
+def test_the_scenes_are_those_that_are_read():
+    assert {name.lower() for name in EVALUATION_2014} == set(EVALUATED)
+    for year, scenes in SCENES.items():
+        folders = {item.path.split("/")[1].lower() for item in CATALOGUE[f"middlebury{year}"].items}
+        assert folders == set(scenes)
+
+
+def test_icl_has_a_directory_per_trajectory():
+    items = {item.unpack_to: item.urls[0] for item in CATALOGUE["icl"].items}
+    assert len(items) == 8
+    assert items["icl_nuim/living_room_traj2"].endswith("/~ahanda/living_room_traj2_frei_png.tar.gz")
+    assert items["icl_nuim/office_room_traj2"].endswith("/~ahanda/traj2_frei_png.tar.gz")
+
+
+def test_names_are_found_once_each_in_the_order_asked_for():
+    found = find(["nyu", "icl", "nyu"], CATALOGUE)
+    assert [collection.name for collection in found] == ["nyu", "icl"]
+
+
+def test_an_unknown_name_is_refused_with_the_known_ones():
+    with pytest.raises(ValueError, match=r"^middelbury: unknown data set; expected some of middlebury, ") as caught:
+        find(["nyu", "middelbury"], CATALOGUE)
+    assert "\n" not in str(caught.value)
+
+
+def test_an_instruction_names_the_directory():
+    assert str(Path("/data/tofmark")) in CATALOGUE["tofmark"].instruction(Path("/data"))

@@ -1,0 +1,641 @@
+"""The doctor: a check finds the one fault that the test put in, with its number, and none finds any in sound scenes."""
+
+import json
+import math
+import re
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from dsr.data.files import read_map, read_rgb
+from dsr.data.folder import load_scene
+from dsr.data.procedural import render_random_scene
+from dsr.data.simgeo_scenes import render_scene
+from dsr.data.surfaces import rotation
+from dsr.doctor import examine_directory
+from dsr.doctor.examine import CHECKS, examine
+from dsr.doctor.finding import length, with_depth
+from dsr.doctor.planes import plane_votes
+from dsr.doctor.precision import find_rounding
+from dsr.doctor.registration import check_registration
+from dsr.geometry.camera import Camera, from_range, to_range
+from dsr.sample import Scene
+
+SIZE = 256
+CAMERA = Camera(SIZE, SIZE, 240.0, 240.0, 127.5, 127.5, baseline=0.2)
+BALLS = [(-0.7, -0.4, 2.6, 0.4), (0.6, 0.3, 2.2, 0.35), (0.1, -0.7, 3.0, 0.3), (-0.5, 0.6, 2.4, 0.3)]
+
+
+def room(camera, turn=0.0):
+    """Return depth, and which surface is where: a room of 4 x 3 x 4 m with four balls, turned by some degrees."""
+    rays = camera.rays().numpy().reshape(3, -1)
+    turned = rotation(turn, turn / 2, turn / 3) @ rays
+    with np.errstate(divide="ignore"):
+        walls = np.stack([limit / turned[axis] for axis, limit in ((0, 2), (0, -2), (1, 1.5), (1, -1.5), (2, 4))])
+    hits = [np.where(walls > 0, walls, np.inf)]
+    for *place, radius in BALLS:
+        centre = np.array(place)
+        square, half = (rays**2).sum(axis=0), centre @ rays
+        root = half**2 - square * (centre @ centre - radius**2)
+        hits.append(np.where(root > 0, (half - np.sqrt(np.maximum(root, 0))) / square, np.inf)[None])
+    hits = np.concatenate(hits)
+    shape = (camera.height, camera.width)
+    return hits.min(axis=0).reshape(shape), hits.argmin(axis=0).reshape(shape)
+
+
+def room_scene(camera=CAMERA, turn=0.0):
+    """Return the room as a scene: every surface of its own colour, with noise."""
+    depth, surface = room(camera, turn)
+    rng = np.random.default_rng(3)
+    colours = rng.uniform(0.1, 0.9, (12, 3))
+    photo = colours[surface].transpose(2, 0, 1) + 0.02 * rng.standard_normal((3, *surface.shape))
+    return Scene("made", "room", torch.from_numpy(photo.clip(0, 1)).float(), camera, torch.from_numpy(depth)[None])
+
+
+@pytest.fixture(scope="module")
+def straight():
+    """Return a room seen along its floor and walls: exactly equal depth along lines and all over the wall opposite."""
+    return room_scene()
+
+
+@pytest.fixture(scope="module")
+def sound():
+    """Return a room in which no surface faces the camera."""
+    return room_scene(turn=17.0)
+
+
+def changed(scene, depth):
+    """Return the scene with a depth that is made of its own, (H, W) array to (H, W) array."""
+    return replace(scene, depth=torch.from_numpy(np.asarray(depth(scene.depth[0].numpy())))[None])
+
+
+def with_camera(scene, **values):
+    return replace(scene, camera=replace(scene.camera, **values))
+
+
+def wrong(scene):
+    """Return level, message and advice by check of what is worse than a note."""
+    found = {}
+    for finding in examine(scene):
+        assert "\n" not in finding.message + finding.advice
+        if finding.level in ("warning", "problem"):
+            assert finding.check not in found
+            assert finding.advice
+            found[finding.check] = (finding.level, finding.message, finding.advice)
+    return found
+
+
+def only(scene, check):
+    """Return what is wrong with a scene, which is one thing."""
+    found = wrong(scene)
+    assert list(found) == [check]
+    return found[check]
+
+
+def level_of(scene, check):
+    """Return the level of the first finding of one check."""
+    return of(scene, check)[0].level
+
+
+def of(scene, check):
+    """Return the findings of one check."""
+    return next(function for function in CHECKS if function.__name__ == f"check_{check}")(scene)
+
+
+def test_sound_rooms_are_in_order_in_every_respect(straight, sound):
+    for scene in (straight, sound):
+        assert [(finding.check, finding.level) for finding in examine(scene)] == [
+            (check.__name__.removeprefix("check_"), "ok") for check in CHECKS
+        ]
+
+
+def test_single_precision_is_fine_enough(straight, sound):
+    for scene in (straight, sound):
+        assert wrong(replace(scene, depth=scene.depth.float())) == {}
+
+
+@pytest.mark.parametrize("name", ["cube_no_texture", "sphere_cylinder_high_freq"])
+def test_embedded_scenes_are_sound(name):
+    assert wrong(render_scene(name, 160).scene("simgeo", name)) == {}
+
+
+@pytest.mark.parametrize("index", range(3))
+def test_random_scenes_are_sound(index):
+    assert wrong(render_random_scene(11, index, 128).scene("procedural", str(index))) == {}
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 9), (2, 3), (5, 4), (16, 16), (40, 33)])
+def test_pictures_of_any_size_are_examined(size):
+    height, width = size
+    camera = Camera(width, height, 30.0, 30.0, (width - 1) / 2, (height - 1) / 2)
+    depth = 1 + torch.rand(1, height, width, dtype=torch.float64)
+    depth[:, 0, 0] = torch.nan if height * width > 1 else 1.0
+    examine(Scene("made", "small", torch.rand(3, height, width), camera, depth))
+
+
+# units
+
+
+@pytest.mark.parametrize(("factor", "cure"), [(1000, "x 0.001"), (0.001, "x 1000"), (5000, "x 0.0002")])
+def test_another_unit_is_found_with_its_factor(sound, factor, cure):
+    level, message, advice = only(changed(sound, lambda z: z * factor), "units")
+    assert level == "problem"
+    assert cure in advice
+    assert '"depth_unit"' in advice
+    assert ("farther" if factor > 1 else "nearer") in message
+
+
+def test_the_factor_s_meaning_and_result_are_told(sound):
+    _, message, advice = only(changed(sound, lambda z: z * 1000), "units")
+    low, middle, high = np.percentile(sound.depth.numpy(), (1, 50, 99))
+    assert message.startswith(f"depth {low:.3g} km to {high:.3g} km (1st to 99th percentile), median {middle:.3g} km")
+    assert advice.startswith(f"x 0.001 would make the median {middle:.3g} m (millimetres read as metres)")
+
+
+@pytest.mark.parametrize(("factor", "text"), [(1000, "200 m"), (0.001, "0.2 mm")])
+def test_a_baseline_in_another_unit_is_named_where_depth_is_off_by_the_same_factor(sound, factor, text):
+    scene = with_camera(changed(sound, lambda z: z * factor), baseline=0.2 * factor)
+    advice = [finding.advice for finding in examine(scene) if finding.level == "problem"]
+    assert len(advice) == 1
+    assert f'set "baseline_unit" in camera.json: the baseline of {text} is off by the same factor' in advice[0]
+
+
+def test_an_odd_baseline_is_noted_where_depth_is_plausible(sound):
+    notes = [finding for finding in examine(with_camera(sound, baseline=160.0)) if finding.level != "ok"]
+    assert [(note.check, note.level) for note in notes] == [("units", "note")]
+    assert notes[0].message.startswith("baseline 160 m")
+
+
+@pytest.mark.parametrize(("factor", "level"), [(20, "note"), (100, "warning"), (0.02, "warning")])
+def test_distances_between_a_room_s_and_another_unit_s_are_doubtful(sound, factor, level):
+    assert level_of(changed(sound, lambda z: z * factor), "units") == level
+
+
+def test_a_measured_map_in_another_unit_than_the_fine_one_is_found(sound):
+    coarse = sound.depth[:, 2::4, 2::4]
+    assert wrong(replace(sound, measured={4: coarse})) == {}
+    _, message, _ = only(replace(sound, measured={4: coarse * 4}), "units")
+    assert message == "the measured map at x4 is 4 times as far as the fine depth"
+
+
+@pytest.mark.parametrize(
+    ("metres", "text"), [(0.00123, "1.23 mm"), (0.05, "50 mm"), (0.2, "0.2 m"), (3.456, "3.46 m"), (5e3, "5 km")]
+)
+def test_lengths_are_told_in_fitting_units(metres, text):
+    assert length(metres) == text
+
+
+# intrinsics and size
+
+
+@pytest.mark.parametrize("scale", [2, 0.5, 4, 0.25, 3])
+def test_intrinsics_of_another_resolution_are_found_with_the_factor(sound, scale):
+    other = sound.camera.rescale(round(SIZE * scale), round(SIZE * scale))
+    scene = with_camera(sound, fx=other.fx, fy=other.fy, cx=other.cx, cy=other.cy)
+    level, message, advice = only(scene, "intrinsics")
+    assert level == "problem"
+    assert f"{scale:g} times as large ({SIZE * scale:.0f} x {SIZE * scale:.0f})" in message
+    assert advice.startswith(f"divide them by {scale:g}")
+
+
+def test_swapped_intrinsics_are_put_in_order():
+    camera = Camera(320, 240, 300.0, 301.0, 159.5, 119.5)
+    sound = room_scene(camera, 17.0)
+    assert wrong(sound) == {}
+    _, message, advice = only(with_camera(sound, fy=159.5, cx=301.0), "intrinsics")
+    assert "fx 300, fy 159.5, cx 301, cy 119.5 px" in message
+    assert advice == "put them in order: fy is the number given as cx, cx is the number given as fy"
+    _, _, advice = only(with_camera(sound, cx=119.5, cy=159.5), "intrinsics")
+    assert advice == "put them in order: cx is the number given as cy, cy is the number given as cx"
+
+
+def test_a_principal_point_far_off_the_centre_is_told_with_its_side(sound):
+    _, message, advice = only(with_camera(sound, cx=127.5 - 0.3 * SIZE), "intrinsics")
+    assert "lies 30% of the width left of the centre and 0% of the height above it" in message
+    assert advice.startswith("check cx and cy")
+    assert level_of(with_camera(sound, cy=127.5 + 0.12 * SIZE), "intrinsics") == "note"
+    assert level_of(with_camera(sound, cy=127.5 + 0.08 * SIZE), "intrinsics") == "ok"
+
+
+def test_unequal_focal_lengths_are_told(sound):
+    level, message, _ = only(with_camera(sound, fy=300.0), "intrinsics")
+    assert (level, message) == ("warning", "fx 240 and fy 300 px differ by 25%")
+
+
+@pytest.mark.parametrize(("fx", "level"), [(35.0, "warning"), (60.0, "note"), (800.0, "note"), (2000.0, "warning")])
+def test_a_view_that_no_usual_lens_has_is_told_in_degrees(sound, fx, level):
+    scene = with_camera(sound, fx=fx, fy=fx)
+    [finding] = of(scene, "intrinsics")
+    degrees = 2 * math.degrees(math.atan(SIZE / 2 / fx))
+    assert finding.level == level
+    assert f"fx {fx:g} px makes a view of {degrees:.3g} degrees across" in finding.message
+
+
+def test_a_size_that_8_does_not_divide_is_noted():
+    scene = room_scene(Camera(250, 244, 240.0, 240.0, 124.5, 121.5), 17.0)
+    [finding] = of(scene, "size")
+    assert finding.level == "note"
+    assert "244 x 250 pixels (height x width), not divisible by 8: at x8 the top left 240 x 248" in finding.message
+
+
+# registration
+
+
+@pytest.mark.parametrize(
+    ("right", "down", "text"),
+    [(6, 0, "6 px right, 0 px below"), (-4, 0, "4 px left, 0 px below"), (3, -5, "3 px right, 5 px above")],
+)
+def test_a_shifted_photo_is_found_with_its_shift(sound, right, down, text):
+    shifted = replace(sound, rgb=sound.rgb.roll((down, right), (1, 2)))
+    level, message, _ = only(shifted, "registration")
+    assert (level, message) == ("warning", f"the photo's edges lie {text} of the depth's")
+
+
+def test_a_shift_in_a_large_picture_is_found_in_its_own_pixels():
+    camera = Camera(820, 700, 700.0, 700.0, 409.5, 349.5)
+    scene = room_scene(camera, 17.0)
+    [finding] = check_registration(replace(scene, rgb=scene.rgb.roll((0, 14), (1, 2))))
+    assert finding.message == "the photo's edges lie 14 px right, 0 px below of the depth's"
+
+
+def test_a_shift_within_the_blur_of_edges_is_in_order(sound):
+    assert level_of(replace(sound, rgb=sound.rgb.roll(2, 2)), "registration") == "ok"
+
+
+@pytest.mark.parametrize(
+    ("axes", "text"),
+    [((2,), "mirrored left to right"), ((1,), "mirrored top to bottom"), ((1, 2), "turned by 180 degrees")],
+)
+def test_a_mirrored_photo_is_recognised(sound, axes, text):
+    level, message, _ = only(replace(sound, rgb=sound.rgb.flip(axes)), "registration")
+    assert (level, message) == ("problem", f"the photo is {text} against the depth")
+
+
+def test_a_photo_of_something_else_is_noted(sound):
+    other = room_scene(turn=-50.0)
+    other = replace(other, rgb=other.rgb.roll((100, 70), (1, 2)))
+    [finding] = [finding for finding in examine(replace(sound, rgb=other.rgb)) if finding.level != "ok"]
+    assert (finding.check, finding.level) == ("registration", "note")
+    assert finding.message.startswith("at no shift within 8 px")
+
+
+def test_too_few_depth_edges_are_no_reason_to_complain(sound):
+    depth = np.broadcast_to(2 + 0.001 * np.arange(SIZE) + 1e-6 * np.arange(SIZE)[:, None], (SIZE, SIZE)).copy()
+    scene = replace(sound, depth=torch.from_numpy(depth)[None])
+    assert wrong(scene) == {}
+    assert level_of(scene, "registration") == "note"
+
+
+def test_edges_beside_holes_are_not_counted(sound):
+    depth = sound.depth.clone()
+    depth[:, ::8] = torch.nan
+    depth[:, :, ::8] = torch.nan
+    [finding] = check_registration(replace(sound, depth=depth))
+    assert finding.message.startswith("not enough depth edges")
+
+
+# holes
+
+
+@pytest.mark.parametrize(("rows", "level"), [(10, "ok"), (64, "note"), (128, "warning")])
+def test_the_share_of_holes_is_judged(sound, rows, level):
+    depth = sound.depth.clone()
+    depth[:, :rows] = torch.nan
+    [finding] = of(replace(sound, depth=depth), "holes")
+    assert finding.level == level
+    assert finding.message == f"{1 - rows / SIZE:.1%} of the pixels known"
+
+
+def scattered(share=0.05):
+    """Return pixels in many places."""
+    return np.random.default_rng(5).random((SIZE, SIZE)) < share
+
+
+@pytest.mark.parametrize("value", [65.535, 10.0, 655.35, 0.001, 0.0001, 7.77])
+def test_a_value_that_stands_for_holes_is_found(sound, value):
+    where = scattered()
+    _, message, advice = only(changed(sound, lambda z: np.where(where, value, z)), "holes")
+    share = f"{where.mean():.1%}"
+    side = "largest" if value > 4 else "smallest"
+    assert message.startswith(f"{share} of the known pixels have exactly the {side} value, {value:g} m")
+    assert '"hole_value"' in advice
+
+
+def test_a_value_that_stands_for_holes_is_found_through_a_conversion_from_distance_along_the_ray(sound):
+    rays = CAMERA.ray_lengths().numpy()
+    _, message, _ = only(changed(sound, lambda z: np.where(scattered(), 50.0, z * rays) / rays), "holes")
+    assert "exactly the largest value, 50 m" in message
+
+
+def test_a_value_that_lies_apart_in_one_piece_may_be_a_wall(sound):
+    wall = np.zeros((SIZE, SIZE), bool)
+    wall[:40] = True
+    scene = changed(sound, lambda z: np.where(wall, 9.0, z))
+    [finding] = [finding for finding in of(scene, "holes") if finding.level != "ok"]
+    assert finding.level == "note"
+    assert "apart from the next" in finding.message
+
+
+def test_a_map_of_one_value_is_doubtful(sound):
+    level, message, _ = only(changed(sound, lambda z: np.full_like(z, 2.0)), "holes")
+    assert (level, message) == ("warning", "every known pixel has the same value, 2 m")
+
+
+# precision
+
+
+def degrees(relative_step, camera=CAMERA):
+    return math.degrees(math.atan(relative_step * camera.fx))
+
+
+@pytest.mark.parametrize("step", [0.001, 0.002])
+def test_whole_millimetres_make_terraces(sound, step):
+    scene = changed(sound, lambda z: np.round(z / step) * step)
+    level, message, advice = only(scene, "precision")
+    tilt = degrees(step / np.median(scene.depth))
+    assert level == "warning"
+    assert message.startswith(f"depth comes in steps of {step * 1e3:.3g} mm, ")
+    assert f"one step tilts a surface by {tilt:.2g} degrees" in message
+    assert advice
+
+
+def test_a_straight_room_in_whole_millimetres_is_found_too(straight):
+    assert "steps of 1 mm" in only(changed(straight, lambda z: np.round(z, 3)), "precision")[1]
+
+
+def test_tenths_of_millimetres_are_fine_enough(sound):
+    scene = changed(sound, lambda z: np.round(z, 4))
+    assert wrong(scene) == {}
+    rounding = find_rounding(scene)
+    assert rounding is not None
+    assert rounding.step == pytest.approx(1e-4)
+    assert rounding.tilt == pytest.approx(degrees(1e-4 / np.median(scene.depth)), rel=1e-3)
+
+
+def test_8_bit_depth_is_a_problem(sound):
+    low, high = sound.depth.min().item(), sound.depth.max().item()
+    step = (high - low) / 255
+    level, message, _ = only(changed(sound, lambda z: low + np.round((z - low) / step) * step), "precision")
+    assert level == "problem"
+    assert message.startswith(f"depth comes in steps of {step * 1e3:.3g} mm, ")
+    assert "distinct values (8 bits hold 256)" in message
+
+
+def test_whole_disparities_are_told_in_pixels(sound):
+    disparity = to_range(sound.depth, CAMERA, "disparity").round()
+    scene = replace(sound, depth=from_range(disparity, CAMERA, "disparity"))
+    level, message, _ = only(scene, "precision")
+    assert level == "problem"
+    assert message.startswith("disparity comes in steps of 1 px, ")
+    tilt = degrees(np.median(scene.depth) / (0.2 * CAMERA.fx))
+    assert f"one step tilts a surface by {tilt:.2g} degrees" in message
+
+
+def test_half_precision_is_recognised(sound):
+    _, message, _ = only(changed(sound, lambda z: z.astype(np.float16).astype(np.float64)), "precision")
+    assert message.startswith("values of half precision (float16), ")
+
+
+@pytest.mark.parametrize("factor", [2, 3, 4, 8])
+def test_a_map_enlarged_by_repeating_its_pixels_is_recognised(sound, factor):
+    def enlarge(depth):
+        return depth[::factor, ::factor].repeat(factor, 0).repeat(factor, 1)[:SIZE, :SIZE]
+
+    level, message, _ = only(changed(sound, enlarge), "precision")
+    assert level == "problem"
+    assert message == f"every value is repeated {factor} times across and down: a smaller map, enlarged"
+
+
+def test_flat_walls_and_level_floors_are_not_taken_for_terraces(straight):
+    depth = straight.depth[0].numpy()
+    assert (np.diff(depth) == 0).mean() > 0.2
+    assert find_rounding(straight) is None
+
+
+def test_cards_that_face_the_camera_are_not_taken_for_an_enlarged_map(sound):
+    depth = np.full((SIZE, SIZE), 3.0)
+    depth[40:100, 32:96], depth[120:200, 160:240] = 2.0, 2.5
+    assert level_of(changed(sound, lambda _: depth), "precision") == "ok"
+
+
+# planes
+
+
+def test_distance_along_the_ray_is_recognised_and_the_reverse(straight, sound):
+    rays = CAMERA.ray_lengths().numpy()
+    for scene in (straight, sound):
+        level, message, advice = only(changed(scene, lambda z: z * rays), "planes")
+        assert level == "problem"
+        assert message.startswith("depth looks like distance along the ray: ")
+        assert advice == 'set "range_type": "perspective" in camera.json'
+        _, message, advice = only(changed(scene, lambda z: z / rays), "planes")
+        assert message.startswith("depth was taken for distance along the ray but looks orthogonal in the file: ")
+        assert advice == 'set "range_type": "orthogonal" in camera.json'
+
+
+@pytest.mark.parametrize("exponent", [0, 1, -1])
+def test_the_exponent_of_planes_is_measured(sound, exponent):
+    votes = plane_votes(sound.depth[0].numpy() * CAMERA.ray_lengths().numpy() ** exponent, CAMERA)
+    assert votes.size > 50
+    assert np.median(votes) == pytest.approx(exponent, abs=0.1)
+
+
+def test_planes_are_recognised_through_noise_and_holes(sound):
+    noise = 1 + 0.002 * np.random.default_rng(6).standard_normal((SIZE, SIZE))
+    holes = np.where(scattered(0.002), np.nan, 1)
+    rays = CAMERA.ray_lengths().numpy()
+    assert level_of(changed(sound, lambda z: z * noise * holes), "planes") == "ok"
+    assert level_of(changed(sound, lambda z: z * rays * noise * holes), "planes") == "problem"
+
+
+def test_a_narrow_view_leaves_the_planes_undecided(sound):
+    camera = replace(CAMERA, fx=6000.0, fy=6000.0)
+    noise = 1 + 0.002 * np.random.default_rng(6).standard_normal((SIZE, SIZE))
+    depth = torch.from_numpy(room(camera, 17.0)[0] * noise)[None]
+    assert level_of(replace(sound, camera=camera, depth=depth), "planes") == "note"
+
+
+def test_balls_alone_leave_the_planes_undecided(sound):
+    rays = CAMERA.rays().numpy()
+    square, half = (rays**2).sum(axis=0), 3 * rays[2]
+    root = half**2 - square * (9 - 0.9**2)
+    depth = np.where(root > 0, (half - np.sqrt(np.maximum(root, 0))) / square, np.nan)
+    for bend in (1, rays[2], np.sqrt(square), 1 / np.sqrt(square)):
+        assert level_of(changed(sound, lambda _, bend=bend: depth * bend), "planes") == "note"
+
+
+def test_terraces_are_not_taken_for_planes():
+    camera = replace(CAMERA, fx=800.0, fy=800.0)
+    scene = room_scene(camera, 17.0)
+    constant = 0.2 * 800
+    rays = camera.ray_lengths().numpy()
+    rounded = changed(scene, lambda z: constant / np.round(constant / (z * rays)))
+    assert level_of(rounded, "precision") == "problem"
+    assert level_of(rounded, "planes") == "note"
+
+
+def test_rounded_distance_along_the_ray_is_found_in_its_own_unit(sound):
+    rays = CAMERA.ray_lengths().numpy()
+    _, message, _ = only(changed(sound, lambda z: np.round(z * rays, 3) / rays), "precision")
+    assert message.startswith("distance along the ray comes in steps of 1 mm, ")
+
+
+def test_rounding_below_the_noise_does_no_harm(sound):
+    noise = 1 + 0.005 * np.random.default_rng(6).standard_normal((SIZE, SIZE))
+    assert level_of(changed(sound, lambda z: np.round(z * noise, 3)), "precision") == "ok"
+
+
+# scenes of which only a measured coarse map is known
+
+
+def test_a_measured_map_is_examined_at_its_own_resolution(sound):
+    coarse = replace(sound, depth=None, measured={4: sound.depth[:, 2::4, 2::4], 2: sound.depth[:, 1::2, 1::2]})
+    scene = with_depth(coarse)
+    assert scene.rgb.shape == (3, SIZE // 2, SIZE // 2)
+    assert (scene.camera.fx, scene.camera.width) == (120, SIZE // 2)
+    assert torch.equal(scene.depth, sound.depth[:, 1::2, 1::2])
+    assert wrong(coarse) == {}
+    assert list(wrong(replace(coarse, measured={2: sound.depth[:, 1::2, 1::2] * 1000}))) == ["units"]
+
+
+# real scenes
+
+
+@pytest.mark.parametrize("name", ["lucy", "plant"])
+def test_published_scenes_are_sound(shared, name):
+    assert wrong(load_scene(shared / "scenes" / name, "folder")) == {}
+
+
+ICL = Camera(640, 480, 481.2, -480.0, 319.5, 239.5)
+
+
+def real_scene(rgb, depth, camera):
+    """Return a scene of a photo (H, W, 3) and depth (H, W) in metres, not positive in holes."""
+    photo = torch.from_numpy(rgb).permute(2, 0, 1).float() / 255
+    known = np.where(depth > 0, depth, np.nan)
+    return Scene("real", "real", photo, camera, torch.from_numpy(known)[None])
+
+
+def office(shared):
+    """Return ICL-NUIM's office, its distances along the ray taken as depth."""
+    folder = shared / "real" / "icl_nuim" / "office"
+    values = np.array((folder / "scene_00_0000.depth").read_text().split(), float).reshape(480, 640) / 100
+    return real_scene(read_rgb(folder / "scene_00_0000.png"), values, ICL)
+
+
+def test_a_real_office_s_distances_along_the_ray_are_recognised(shared):
+    scene = office(shared)
+    only(scene, "planes")
+    assert wrong(replace(scene, depth=from_range(scene.depth, ICL, "perspective"))) == {}
+
+
+def test_a_real_living_room_is_orthogonal_and_in_whole_millimetres(shared):
+    folder = shared / "real" / "icl_nuim" / "living"
+    scene = real_scene(read_rgb(folder / "rgb.png"), read_map(folder / "depth.png") / 5000, ICL)
+    level, message, _ = only(scene, "precision")
+    assert level == "warning"
+    assert re.match(r"depth comes in steps of 1 mm, .* tilts a surface by 9 degrees", message)
+    assert level_of(scene, "planes") == "ok"
+    assert "planes" in wrong(changed(scene, lambda z: z * ICL.ray_lengths().numpy()))
+
+
+def test_tartanair_is_in_half_precision(shared):
+    folder = shared / "real" / "tartanair"
+    depth = np.load(folder / "000000_left_depth.npy").astype(np.float64)
+    camera = Camera(640, 480, 320.0, 320.0, 320.0, 240.0)
+    scene = real_scene(read_rgb(folder / "000000_left.png"), depth, camera)
+    assert only(scene, "precision")[1].startswith("values of half precision (float16), 934 distinct values")
+
+
+@pytest.mark.parametrize("name", ["Aloe", "Midd1"])
+def test_middlebury_2006_has_terraces_of_a_third_of_a_pixel(shared, name):
+    folder = shared / "real" / "middlebury2006" / name
+    disparity = cv2.imread(str(folder / "disp1.png"), cv2.IMREAD_UNCHANGED) / 3
+    height, width = disparity.shape
+    camera = Camera(width, height, 3740 / 3, 3740 / 3, (width - 1) / 2, (height - 1) / 2, baseline=0.16)
+    with np.errstate(divide="ignore"):
+        depth = np.where(disparity > 0, camera.baseline * camera.fx / disparity, np.nan)
+    level, message, _ = only(real_scene(read_rgb(folder / "view1.png"), depth, camera), "precision")
+    assert level == "problem"
+    assert message.startswith("disparity comes in steps of 0.33 px, ")
+
+
+# the report
+
+
+def write(folder, scene, **entries):
+    """Write a scene in the folder layout."""
+    folder.mkdir(parents=True)
+    camera = scene.camera
+    names = ("width", "height", "fx", "fy", "cx", "cy")
+    (folder / "camera.json").write_text(json.dumps({name: getattr(camera, name) for name in names} | entries))
+    photo = scene.rgb.permute(1, 2, 0).numpy()[:, :, ::-1] * 255
+    cv2.imwrite(str(folder / "rgb.png"), photo.round().astype(np.uint8))
+    np.save(folder / "depth.npy", scene.depth[0].numpy())
+
+
+def test_a_sound_scene_s_report_is_one_table_and_exit_code_0(tmp_path, capsys, sound):
+    write(tmp_path / "room", sound)
+    assert examine_directory(tmp_path / "room") == 0
+    out, err = capsys.readouterr()
+    assert err == ""
+    lines = out.splitlines()
+    assert lines[0] == "room: fine"
+    assert [line.split()[:2] for line in lines[1:8]] == [["ok", check.__name__[6:]] for check in CHECKS]
+    assert lines[-1] == "1 scene: 1 fine"
+
+
+def test_a_directory_of_scenes_is_summed_up(tmp_path, capsys, sound):
+    write(tmp_path / "a_sound", sound)
+    write(tmp_path / "b_unit", changed(sound, lambda z: z * 1000))
+    write(tmp_path / "c_rounded", changed(sound, lambda z: np.round(z, 3)))
+    write(tmp_path / "d_[broken]", sound)
+    (tmp_path / "d_[broken]" / "depth.npy").write_bytes(b"none")
+    assert examine_directory(tmp_path) == 1
+    out, err = capsys.readouterr()
+    assert err == ""
+    assert "a_sound: fine\n" in out
+    assert "b_unit: 1 problem\n" in out
+    assert "c_rounded: 1 warning\n" in out
+    assert "d_[broken]: 1 problem\n" in out
+    assert re.search(r"problem +files +cannot be read: ", out)
+    assert re.search(r"-> +x 0\.001", out)
+    assert out.splitlines()[-1] == "4 scenes: 1 fine, 1 with warnings, 2 with problems"
+
+
+def test_of_many_scenes_only_what_is_not_in_order_is_shown(tmp_path, capsys, sound):
+    small = replace(sound, depth=sound.depth[:, :64, :64], rgb=sound.rgb[:, :64, :64], camera=CAMERA.crop(0, 0, 64, 64))
+    centred = with_camera(small, cx=31.5, cy=31.5, fx=60.0, fy=60.0)
+    for number in range(8):
+        write(tmp_path / f"scene{number}", centred)
+    write(tmp_path / "unit", changed(centred, lambda z: z * 1000))
+    assert examine_directory(tmp_path) == 1
+    out, _ = capsys.readouterr()
+    assert not re.search(r"^ +ok ", out, flags=re.MULTILINE)
+    assert len(re.findall(r"^scene\d: fine", out, flags=re.MULTILINE)) == 8
+    assert "unit: 1 problem" in out
+    assert out.splitlines()[-1] == "9 scenes: 8 fine, 1 with problems"
+
+
+def test_a_scene_with_a_measured_map_alone_says_what_was_examined(tmp_path, capsys, sound):
+    write(tmp_path / "sensor", sound)
+    (tmp_path / "sensor" / "depth.npy").unlink()
+    np.save(tmp_path / "sensor" / "depth_lr2.npy", sound.depth[0, ::2, ::2].numpy())
+    assert examine_directory(tmp_path / "sensor") == 0
+    assert capsys.readouterr().out.startswith("sensor (the map measured at x2): fine")
+
+
+@pytest.mark.parametrize("kind", ["missing", "file", "empty"])
+def test_a_place_without_scenes_is_one_line_on_stderr_and_exit_code_2(tmp_path, capsys, kind):
+    place = tmp_path / kind
+    if kind == "file":
+        place.write_text("x")
+    elif kind == "empty":
+        place.mkdir()
+    assert examine_directory(place) == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert re.fullmatch(rf"error: {re.escape(str(place))}: expected a scene or a directory of scenes, got .*\n", err)

@@ -1,0 +1,773 @@
+"""Fetching data sets: from a server of its own that breaks off, lies, has changed or is not there at all."""
+
+import contextlib
+import errno
+import hashlib
+import io
+import json
+import os
+import shutil
+import socket
+import tarfile
+import threading
+import zipfile
+from collections import namedtuple
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+
+import pytest
+
+from dsr.fetching import download, unpack
+from dsr.fetching.catalogue import Collection, Item
+from dsr.fetching.checksums import Checksums, alone
+from dsr.fetching.fetch import Options, get
+from dsr.fetching.inventory import state, verify
+
+PNG = b"\x89PNG\r\n\x1a\n" + bytes(range(256)) * 1600
+OTHER = b"\x89PNG\r\n\x1a\n" + bytes(range(255, -1, -1)) * 1600
+PAGE = b"\n<!DOCTYPE html><html><body>Not here any more</body></html>"
+
+
+class Handler(BaseHTTPRequestHandler):
+    """Sends ``server.files``; one number of ``server.cuts`` per answer is where the connection breaks off."""
+
+    protocol_version = "HTTP/1.1"
+
+    def do_GET(self):
+        server, wanted = self.server, self.headers.get("Range")
+        content = server.files.get(self.path)
+        status = server.states.pop(0) if server.states else 200
+        if content is None or status != 200:
+            server.log.append((self.path, wanted, 0))
+            self.send_error(404 if content is None else status)
+            return
+        start = 0
+        mark = self.headers.get("If-Range")
+        if wanted and server.ranges and mark in (None, *server.marks.values()):
+            start, status = int(wanted.removeprefix("bytes=").removesuffix("-")), 206
+        if start and start >= len(content):
+            server.log.append((self.path, wanted, 0))
+            self.answer(416, {"Content-Range": f"bytes */{len(content)}"}, b"", None)
+            return
+        headers = {"Content-Range": f"bytes {start}-{len(content) - 1}/{len(content)}"} if start else {}
+        cut = server.cuts.pop(0) if server.cuts else None
+        server.log.append((self.path, wanted, len(content) - start if cut is None else cut))
+        self.answer(status, {**headers, **server.marks, **server.headers}, content[start:], cut)
+
+    def answer(self, status, headers, content, cut):
+        self.send_response(status)
+        for key, value in {**headers, "Content-Length": len(content)}.items():
+            self.send_header(key, str(value))
+        self.end_headers()
+        self.wfile.write(content[:cut])
+        if cut is not None:
+            self.close_connection = True
+
+    def log_message(self, *_):
+        pass
+
+
+@pytest.fixture
+def server(monkeypatch):
+    monkeypatch.setenv("NO_PROXY", "127.0.0.1")
+    monkeypatch.setattr(download, "PAUSES", (0.0, 0.0))
+    with ThreadingHTTPServer(("127.0.0.1", 0), Handler) as running:
+        running.files, running.states, running.cuts, running.log = {"/a.png": PNG}, [], [], []
+        running.ranges, running.marks, running.headers = True, {"ETag": '"1"'}, {}
+        running.url = f"http://127.0.0.1:{running.server_address[1]}"
+        thread = threading.Thread(target=running.serve_forever, kwargs={"poll_interval": 0.01})
+        thread.start()
+        yield running
+        running.shutdown()
+        thread.join()
+
+
+class Watcher:
+    """Keeps what it is told; ``stop_at`` bytes of a transfer are an interruption."""
+
+    def __init__(self, stop_at=None):
+        self.lines, self.names, self.stop_at = [], [], stop_at
+
+    def say(self, line):
+        self.lines.append(line)
+
+    @contextlib.contextmanager
+    def transfer(self, name):
+        self.names.append(name)
+        yield self.moved
+
+    def moved(self, done, total):
+        assert total is None or 0 <= done <= total
+        if self.stop_at is not None and done >= self.stop_at:
+            raise KeyboardInterrupt
+
+
+def picture(server, *paths, name="a.png"):
+    return Item(f"set/{name}", tuple(f"{server.url}{path}" for path in paths or ("/a.png",)))
+
+
+def fetched(items, root, **options):
+    items = [items] if isinstance(items, Item) else items
+    return get(items, root, Watcher(), Options(**options))
+
+
+def one_line(problems, *parts):
+    assert len(problems) == 1
+    assert "\n" not in problems[0]
+    for part in parts:
+        assert str(part) in problems[0], (part, problems[0])
+
+
+def left_in(root):
+    """Return the files in ``root``, without those for the command's own use."""
+    own = ("checksums.json", ".dsr-data.lock")
+    return sorted(str(path.relative_to(root)) for path in root.rglob("*") if path.is_file() and path.name not in own)
+
+
+def sha256(content):
+    return hashlib.sha256(content).hexdigest()
+
+
+def test_a_file_comes_whole_is_recorded_and_is_not_asked_for_again(server, tmp_path):
+    item = picture(server)
+    assert fetched(item, tmp_path) == []
+    assert (tmp_path / "set/a.png").read_bytes() == PNG
+    entries = json.loads((tmp_path / "checksums.json").read_text())
+    assert entries == {"set/a.png": {"sha256": sha256(PNG), "size": len(PNG)}}
+    assert left_in(tmp_path) == ["set/a.png"]
+    assert fetched([item, item], tmp_path) == []
+    assert len(server.log) == 1
+
+
+def test_a_connection_that_breaks_off_goes_on_where_it_stopped(server, tmp_path):
+    server.cuts = [200_000, 100_000]
+    assert fetched(picture(server), tmp_path) == []
+    assert (tmp_path / "set/a.png").read_bytes() == PNG
+    first, second, third = (None if wanted is None else int(wanted[6:-1]) for _, wanted, _ in server.log)
+    assert first is None
+    assert 100_000 < second <= 200_000 < third <= second + 100_000  # at most a piece that was under way is lost
+    assert server.log[-1][2] == len(PNG) - third
+
+
+def test_a_connection_that_gets_on_may_break_off_more_often_than_one_that_does_not(server, tmp_path):
+    server.cuts = [100_000] * 3
+    assert fetched(picture(server), tmp_path) == []
+    server.cuts, server.ranges = [100_000] * 3, False
+    one_line(fetched(picture(server, name="b.png"), tmp_path), "broke off")
+
+
+def test_a_later_command_goes_on_where_the_last_one_stopped(server, tmp_path, monkeypatch):
+    monkeypatch.setattr(download, "PAUSES", ())
+    server.cuts = [200_000]
+    one_line(fetched(picture(server), tmp_path), "set/a.png: ", f"{server.url}/a.png: ", "broke off")
+    had = (tmp_path / "set/a.png.part").read_bytes()
+    assert PNG.startswith(had)
+    assert len(had) > 100_000
+    assert not (tmp_path / "set/a.png").exists()
+    assert fetched(picture(server), tmp_path) == []
+    assert server.log[-1] == ("/a.png", f"bytes={len(had)}-", len(PNG) - len(had))
+    assert (tmp_path / "set/a.png").read_bytes() == PNG
+    assert left_in(tmp_path) == ["set/a.png"]
+
+
+def test_an_interruption_keeps_what_has_come(server, tmp_path):
+    with pytest.raises(KeyboardInterrupt):
+        get([picture(server)], tmp_path, Watcher(stop_at=200_000))
+    assert left_in(tmp_path) == ["set/a.png.part", "set/a.png.part.json"]
+    had = (tmp_path / "set/a.png.part").stat().st_size
+    assert had >= 200_000
+    assert fetched(picture(server), tmp_path) == []
+    assert server.log[-1][1:] == (f"bytes={had}-", len(PNG) - had)
+
+
+def test_what_came_whole_before_an_interruption_is_not_asked_for_again(server, tmp_path, monkeypatch):
+    with monkeypatch.context() as patch:
+        patch.setattr("dsr.fetching.fetch.expect_kind", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+        with pytest.raises(KeyboardInterrupt):
+            fetched(picture(server), tmp_path)
+    assert not (tmp_path / "set/a.png").exists()
+    assert fetched(picture(server), tmp_path) == []
+    assert len(server.log) == 1
+    assert left_in(tmp_path) == ["set/a.png"]
+
+
+@pytest.mark.parametrize("marks", [{"ETag": '"1"'}, {"Last-Modified": "Mon, 01 Jan 2024 00:00:00 GMT"}])
+def test_a_file_that_changed_in_between_starts_anew(server, tmp_path, marks):
+    server.marks = marks
+    with pytest.raises(KeyboardInterrupt):
+        get([picture(server)], tmp_path, Watcher(stop_at=200_000))
+    server.files["/a.png"], server.marks = OTHER, {key: value.replace("1", "2") for key, value in marks.items()}
+    assert fetched(picture(server), tmp_path) == []
+    assert server.log[-1][2] == len(OTHER)
+    assert (tmp_path / "set/a.png").read_bytes() == OTHER
+
+
+@pytest.mark.parametrize(("length", "sent"), [(len(PNG), "rest"), (len(PNG) - 256, "whole")])
+def test_without_a_mark_of_the_version_the_size_decides(server, tmp_path, length, sent):
+    server.marks = {"ETag": 'W/"weak"'}
+    with pytest.raises(KeyboardInterrupt):
+        get([picture(server)], tmp_path, Watcher(stop_at=200_000))
+    had = (tmp_path / "set/a.png.part").stat().st_size
+    server.files["/a.png"] = PNG[:length]
+    assert fetched(picture(server), tmp_path) == []
+    assert server.log[-1][2] == (length - had if sent == "rest" else length)
+    assert (tmp_path / "set/a.png").read_bytes() == PNG[:length]
+
+
+def test_without_a_mark_another_server_starts_anew(server, tmp_path):
+    server.marks = {}
+    server.files["/b.png"] = OTHER
+    with pytest.raises(KeyboardInterrupt):
+        get([picture(server)], tmp_path, Watcher(stop_at=200_000))
+    assert fetched(picture(server, "/b.png"), tmp_path) == []
+    assert server.log[-1] == ("/b.png", None, len(OTHER))
+    assert (tmp_path / "set/a.png").read_bytes() == OTHER
+
+
+def test_a_server_without_ranges_sends_the_file_anew(server, tmp_path):
+    server.ranges, server.cuts = False, [200_000]
+    assert fetched(picture(server), tmp_path) == []
+    assert [sent for _, _, sent in server.log] == [200_000, len(PNG)]
+    assert (tmp_path / "set/a.png").read_bytes() == PNG
+
+
+def test_a_beginning_longer_than_the_file_is_thrown_away(server, tmp_path):
+    part = tmp_path / "set/a.png.part"
+    part.parent.mkdir()
+    part.write_bytes(PNG + b"more")
+    note = {"url": f"{server.url}/a.png", "mark": '"1"', "total": len(PNG)}
+    part.with_name("a.png.part.json").write_text(json.dumps(note))
+    assert fetched(picture(server), tmp_path) == []
+    assert [wanted for _, wanted, _ in server.log] == [f"bytes={len(PNG) + 4}-", None]
+    assert (tmp_path / "set/a.png").read_bytes() == PNG
+
+
+def test_a_beginning_that_is_the_whole_file_needs_no_more_bytes(server, tmp_path):
+    with pytest.raises(KeyboardInterrupt):
+        get([picture(server)], tmp_path, Watcher(stop_at=len(PNG)))
+    assert fetched(picture(server), tmp_path) == []
+    assert server.log[-1][2] == 0
+    assert (tmp_path / "set/a.png").read_bytes() == PNG
+
+
+def test_a_server_that_is_busy_is_asked_again(server, tmp_path):
+    server.states = [503, 429]
+    assert fetched(picture(server), tmp_path) == []
+    assert len(server.log) == 3
+
+
+def test_a_server_that_stays_busy_is_one_line(server, tmp_path):
+    server.states = [503] * 9
+    one_line(fetched(picture(server), tmp_path), f"set/a.png: {server.url}/a.png: HTTP 503")
+    assert len(server.log) == 3
+
+
+def test_another_address_is_taken_where_the_first_has_no_such_file(server, tmp_path):
+    assert fetched(picture(server, "/gone.png", "/a.png"), tmp_path) == []
+    assert [path for path, _, _ in server.log] == ["/gone.png", "/a.png"]
+    assert (tmp_path / "set/a.png").read_bytes() == PNG
+
+
+def test_a_file_that_is_nowhere_is_one_line_and_the_others_come(server, tmp_path):
+    items = [picture(server, "/gone.png", "/lost.png", name="x.png"), picture(server)]
+    one_line(
+        fetched(items, tmp_path),
+        f"set/x.png: {server.url}/gone.png: HTTP 404 Not Found; {server.url}/lost.png: HTTP 404 Not Found",
+    )
+    assert left_in(tmp_path) == ["set/a.png"]
+
+
+def test_a_server_that_is_not_there_is_one_line_a_file_and_retried_once(server, tmp_path, monkeypatch):
+    slept = []
+    monkeypatch.setattr(download.time, "sleep", slept.append)
+    with socket.socket() as closed:
+        closed.bind(("127.0.0.1", 0))
+        gone = f"http://127.0.0.1:{closed.getsockname()[1]}"
+        items = [Item(f"set/{name}", (f"{gone}/{name}",)) for name in ("x.png", "y.png")]
+        problems = fetched([*items, picture(server)], tmp_path)
+    assert [problem.split(": ", 1)[0] for problem in problems] == ["set/x.png", "set/y.png"]
+    for problem in problems:
+        one_line([problem], f"{gone}/", f"no connection to {gone.removeprefix('http://')}")
+    assert len(slept) == 2
+    assert left_in(tmp_path) == ["set/a.png"]
+
+
+@pytest.mark.parametrize("url", ["nonsense", "http://", "ftp://127.0.0.1/a.png", "http://127.0.0.1:99999/a.png"])
+def test_an_address_that_is_none_is_one_line(tmp_path, url):
+    one_line(fetched(Item("set/a.png", (url,)), tmp_path), f"set/a.png: {url}: ")
+
+
+def test_a_web_page_instead_of_the_file_is_refused(server, tmp_path):
+    server.files["/a.png"] = PAGE
+    one_line(fetched(picture(server), tmp_path), f"{server.url}/a.png: expected a file, got a web page")
+    assert left_in(tmp_path) == []
+
+
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        ("a.png", b"GIF89a nothing"), ("a.zip", PNG), ("a.tar.gz", PNG), ("a.pfm", PNG), ("a.txt", b"\0\1"),
+        ("a.mat", PNG), ("a.ppm", PNG), ("a.pgm", PNG), ("a.npy", PNG),
+    ],
+)  # fmt: skip
+def test_a_file_of_another_kind_is_refused(server, tmp_path, name, content):
+    server.files["/a.png"] = content
+    problems = fetched(picture(server, name=name), tmp_path)
+    one_line(problems, f"set/{name}: {server.url}/a.png: expected a {Path(name).suffix} file, got one that begins with")
+    assert left_in(tmp_path) == []
+
+
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        ("a.pfm", b"Pf\n1 1\n-1.0\n"), ("a.txt", b"270\n"), ("a.mat", b"MATLAB 7.3 MAT-file"), ("a.ppm", b"P6 1 1"),
+        ("a.pgm", b"P5 1 1"), ("a.npy", b"\x93NUMPY\1\0"), ("a.zip", b"PK\3\4"), ("a.tar.gz", b"\x1f\x8b\x08"),
+    ],
+)  # fmt: skip
+def test_a_file_of_its_kind_is_taken(server, tmp_path, name, content):
+    server.files["/a.png"] = content
+    assert fetched(picture(server, name=name), tmp_path) == []
+    assert (tmp_path / "set" / name).read_bytes() == content
+
+
+def test_an_empty_answer_and_a_compressed_one_are_refused(server, tmp_path):
+    server.files["/a.png"] = b""
+    server.files["/b.png"] = PNG
+    one_line(fetched(picture(server), tmp_path), "got an empty one")
+    server.headers = {"Content-Encoding": "gzip"}
+    one_line(fetched(picture(server, "/b.png"), tmp_path), "expected the file as it is, got it compressed (gzip)")
+    assert left_in(tmp_path) == []
+
+
+def test_another_checksum_than_recorded_is_refused_with_both(server, tmp_path):
+    fetched(picture(server), tmp_path)
+    (tmp_path / "set/a.png").unlink()
+    server.files["/a.png"] = OTHER
+    one_line(
+        fetched(picture(server), tmp_path),
+        f"{server.url}/a.png", f"expected sha256 {sha256(PNG)}", f"got {sha256(OTHER)}", "--accept-changed",
+    )  # fmt: skip
+    assert left_in(tmp_path) == []
+    assert Checksums(tmp_path)["set/a.png"].sha256 == sha256(PNG)
+
+
+def test_another_checksum_is_taken_when_that_is_asked_for(server, tmp_path):
+    fetched(picture(server), tmp_path)
+    (tmp_path / "set/a.png").unlink()
+    server.files["/a.png"] = OTHER
+    assert fetched(picture(server), tmp_path, accept_changed=True) == []
+    assert (tmp_path / "set/a.png").read_bytes() == OTHER
+    assert Checksums(tmp_path)["set/a.png"].sha256 == sha256(OTHER)
+
+
+def test_a_checksum_that_is_known_beforehand_holds_even_then(server, tmp_path):
+    item = Item("set/a.png", (f"{server.url}/a.png",), sha256=sha256(OTHER))
+    one_line(fetched(item, tmp_path, accept_changed=True), sha256(OTHER), sha256(PNG))
+    server.files["/a.png"] = OTHER
+    assert fetched(item, tmp_path) == []
+
+
+def test_a_mirror_is_asked_first_under_the_same_path(server, tmp_path):
+    server.files["/mirror/set/a.png"] = PNG
+    assert fetched(picture(server), tmp_path, mirror=f"{server.url}/mirror/") == []
+    assert [path for path, _, _ in server.log] == ["/mirror/set/a.png"]
+    assert fetched(picture(server, name="b.png"), tmp_path, mirror=f"{server.url}/mirror") == []
+    assert [path for path, _, _ in server.log[1:]] == ["/mirror/set/b.png", "/a.png"]
+
+
+def test_a_mirror_with_another_file_is_passed_over(server, tmp_path):
+    fetched(picture(server), tmp_path)
+    (tmp_path / "set/a.png").unlink()
+    server.files["/mirror/set/a.png"] = OTHER
+    assert fetched(picture(server), tmp_path, mirror=f"{server.url}/mirror") == []
+    assert (tmp_path / "set/a.png").read_bytes() == PNG
+
+
+def test_a_member_of_an_archive_stands_for_a_file(server, tmp_path):
+    server.files["/two.zip"] = zipped({"Art/view1.png": PNG, "Art/view5.png": OTHER})
+    assert fetched(picture(server, "/gone.png", "/two.zip#Art/view1.png"), tmp_path) == []
+    assert (tmp_path / "set/a.png").read_bytes() == PNG
+    assert left_in(tmp_path) == ["set/a.png"]
+    problems = fetched(picture(server, "/two.zip#Art/view7.png", name="b.png"), tmp_path)
+    one_line(problems, "set/b.png: ", "view7.png")
+    server.files["/two.zip"] = b"PK no archive"
+    one_line(fetched(picture(server, "/two.zip#Art/view1.png", name="c.png"), tmp_path), "expected an archive")
+
+
+def test_a_disk_too_small_for_the_file_ends_it_before_a_byte_is_written(server, tmp_path, monkeypatch):
+    usage = namedtuple("usage", "total used free")
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: usage(10**9, 10**9, 100_000))
+    problems = fetched([picture(server), picture(server, name="b.png")], tmp_path)
+    one_line(problems, "set/a.png: ", f"{tmp_path / 'set'}: expected 0.4 MB of free disk space, there are 0.1 MB")
+    assert left_in(tmp_path) == []
+
+
+def test_an_archive_needs_space_for_what_it_unpacks_to(server, tmp_path, monkeypatch):
+    usage = namedtuple("usage", "total used free")
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: usage(10**9, 0, 500_000))
+    server.files["/big.zip"] = b"PK" + bytes(300_000)
+    item = Item("set/big.zip", (f"{server.url}/big.zip",), unpack_to="set/big")
+    one_line(fetched(item, tmp_path), "expected 0.7 MB of free disk space, there are 0.5 MB")
+
+
+def test_a_disk_that_fills_up_is_one_line_and_keeps_what_has_come(server, tmp_path, monkeypatch):
+    original = Path.open
+
+    class Full:
+        def __init__(self, file):
+            self.file = file
+
+        def __enter__(self):
+            return self
+
+        def __exit__(self, *_):
+            self.file.close()
+
+        def write(self, content):
+            if self.file.tell() > 150_000:
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+            self.file.write(content)
+
+        def flush(self):
+            self.file.flush()
+
+    def opened(path, mode="r", *rest, **options):
+        file = original(path, mode, *rest, **options)
+        return Full(file) if path.suffix == ".part" else file
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "open", opened)
+        problems = fetched([picture(server), picture(server, name="b.png")], tmp_path)
+    one_line(problems, "set/a.png: ", f"{tmp_path / 'set/a.png.part'}: the disk is full", "goes on")
+    had = (tmp_path / "set/a.png.part").stat().st_size
+    assert had > 150_000
+    assert fetched(picture(server), tmp_path) == []
+    assert server.log[-1][1] == f"bytes={had}-"
+    assert (tmp_path / "set/a.png").read_bytes() == PNG
+
+
+def test_a_directory_that_cannot_be_written_is_one_line_a_file(server, tmp_path):
+    (tmp_path / "set").write_text("a file in its place")
+    one_line(fetched(picture(server), tmp_path), "set/a.png: ", str(tmp_path / "set"))
+
+
+def zipped(files):
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w") as packed:
+        for name, content in files.items():
+            packed.writestr(name, content)
+    return buffer.getvalue()
+
+
+def tarred(files, *members):
+    """Return a tar.gz of files, and of members with a type of their own, (name, type, target)."""
+    buffer = io.BytesIO()
+    with tarfile.open(fileobj=buffer, mode="w:gz") as packed:
+        for name, content in files.items():
+            member = tarfile.TarInfo(name)
+            member.size = len(content)
+            packed.addfile(member, io.BytesIO(content))
+        for name, kind, target in members:
+            member = tarfile.TarInfo(name)
+            member.type, member.linkname = kind, target
+            packed.addfile(member)
+    return buffer.getvalue()
+
+
+def archive(server, name, content, contains=("rgb",)):
+    server.files[f"/{name}"] = content
+    return Item(f"set/{name}", (f"{server.url}/{name}",), unpack_to="set/room", contains=contains)
+
+
+FILES = {"rgb/1.png": PNG, "rgb/2.png": OTHER, "list.txt": b"1\n2\n"}
+PACKED = {"s.zip": zipped(FILES), "s.tar.gz": tarred({f"./{name}": content for name, content in FILES.items()})}
+
+
+@pytest.mark.parametrize("name", PACKED)
+def test_an_archive_is_unpacked_recorded_and_removed(server, tmp_path, name):
+    item = archive(server, name, PACKED[name])
+    assert fetched(item, tmp_path) == []
+    assert left_in(tmp_path) == ["set/room/list.txt", "set/room/rgb/1.png", "set/room/rgb/2.png"]
+    for path, content in FILES.items():
+        assert (tmp_path / "set/room" / path).read_bytes() == content
+    entry = json.loads((tmp_path / "checksums.json").read_text())[f"set/{name}"]
+    assert entry == {
+        "sha256": sha256(PACKED[name]),
+        "size": len(PACKED[name]),
+        "files": {path: len(content) for path, content in FILES.items()},
+    }
+    assert fetched(item, tmp_path) == []
+    assert len(server.log) == 1
+
+
+def test_an_archive_is_kept_when_that_is_asked_for(server, tmp_path):
+    assert fetched(archive(server, "s.zip", PACKED["s.zip"]), tmp_path, keep_archives=True) == []
+    assert (tmp_path / "set/s.zip").read_bytes() == PACKED["s.zip"]
+
+
+def test_an_archive_that_lies_there_is_used(server, tmp_path):
+    item = archive(server, "s.zip", PACKED["s.zip"])
+    (tmp_path / "set").mkdir()
+    (tmp_path / "set/s.zip").write_bytes(PACKED["s.zip"])
+    assert fetched(item, tmp_path) == []
+    assert server.log == []
+    assert (tmp_path / "set/room/rgb/1.png").read_bytes() == PNG
+
+
+def test_what_was_unpacked_and_lost_is_fetched_again(server, tmp_path):
+    item = archive(server, "s.zip", PACKED["s.zip"])
+    fetched(item, tmp_path)
+    (tmp_path / "set/room/rgb/2.png").unlink()
+    (tmp_path / "set/room/mine.txt").write_text("stays")
+    assert fetched(item, tmp_path) == []
+    assert (tmp_path / "set/room/rgb/2.png").read_bytes() == OTHER
+    assert (tmp_path / "set/room/mine.txt").read_text() == "stays"
+    assert len(server.log) == 2
+
+
+def test_two_archives_share_a_directory(server, tmp_path):
+    first = archive(server, "s.zip", zipped({"training/final/1.png": PNG}), ("training/final",))
+    second = archive(server, "t.zip", zipped({"training/depth/1.png": OTHER}), ("training/depth",))
+    assert fetched([first, second], tmp_path) == []
+    assert left_in(tmp_path) == ["set/room/training/depth/1.png", "set/room/training/final/1.png"]
+
+
+OUTSIDE = {
+    "up in a zip": ("s.zip", zipped({"rgb/1.png": PNG, "../evil.txt": b"evil"})),
+    "up inside": ("s.zip", zipped({"rgb/../../../evil.txt": b"evil"})),
+    "backslashes": ("s.zip", zipped({"rgb\\..\\..\\evil.txt": b"evil"})),
+    "a drive": ("s.zip", zipped({"C:/evil.txt": b"evil"})),
+    "absolute": ("s.tar.gz", tarred({"rgb/1.png": PNG, "/tmp/dsr_evil.txt": b"evil"})),
+    "up in a tar": ("s.tar.gz", tarred({"../evil.txt": b"evil"})),
+    "a link up": ("s.tar.gz", tarred({"rgb/1.png": PNG}, ("rgb/evil", tarfile.SYMTYPE, "../../evil.txt"))),
+    "an absolute link": ("s.tar.gz", tarred({}, ("evil", tarfile.SYMTYPE, "/etc/passwd"))),
+    "a hard link up": ("s.tar.gz", tarred({}, ("rgb/evil", tarfile.LNKTYPE, "../evil.txt"))),
+    "a device": ("s.tar.gz", tarred({}, ("evil", tarfile.CHRTYPE, ""))),
+    "a pipe": ("s.tar.gz", tarred({}, ("evil", tarfile.FIFOTYPE, ""))),
+}
+
+
+@pytest.mark.parametrize("case", OUTSIDE)
+def test_an_archive_that_leads_outside_is_refused_before_anything_is_unpacked(server, tmp_path, case):
+    root = tmp_path / "a" / "b"
+    (tmp_path / "a" / "evil.txt").parent.mkdir()
+    name, content = OUTSIDE[case]
+    one_line(fetched(archive(server, name, content), root), f"{root / 'set' / name}: refused: ", "evil")
+    assert left_in(tmp_path / "a") == [f"b/set/{name}"]
+    assert not Path("/tmp/dsr_evil.txt").exists()
+
+
+def test_a_link_in_a_zip_is_refused(server, tmp_path):
+    member = zipfile.ZipInfo("rgb/evil")
+    member.external_attr = 0o120777 << 16
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w") as packed:
+        packed.writestr(member, "../../evil.txt")
+    one_line(fetched(archive(server, "s.zip", buffer.getvalue()), tmp_path), "'rgb/evil' in it is neither a file nor")
+
+
+def test_links_within_an_archive_become_copies(server, tmp_path):
+    links = (("rgb/same.png", tarfile.SYMTYPE, "1.png"), ("rgb/too.png", tarfile.LNKTYPE, "rgb/1.png"))
+    content = tarred({"rgb/1.png": PNG}, *links, ("rgb", tarfile.DIRTYPE, ""), ("color", tarfile.SYMTYPE, "rgb"))
+    assert fetched(archive(server, "s.tar.gz", content), tmp_path) == []
+    for name in ("same.png", "too.png"):
+        path = tmp_path / "set/room/rgb" / name
+        assert path.read_bytes() == PNG
+        assert not path.is_symlink()
+    assert not (tmp_path / "set/room/color").exists()
+
+
+@pytest.mark.parametrize("name", PACKED)
+@pytest.mark.parametrize("share", [0.2, 0.7])
+def test_a_truncated_archive_is_refused_and_nothing_of_it_left(server, tmp_path, name, share):
+    content = PACKED[name][: int(len(PACKED[name]) * share)]
+    one_line(
+        fetched(archive(server, name, content), tmp_path), f"{tmp_path / 'set' / name}: expected an archive, got a"
+    )
+    assert left_in(tmp_path) == [f"set/{name}"]
+
+
+def test_an_archive_with_a_flipped_bit_is_refused(server, tmp_path):
+    content = bytearray(PACKED["s.zip"])
+    content[5000] ^= 1
+    one_line(
+        fetched(archive(server, "s.zip", bytes(content)), tmp_path), "expected an archive, got a damaged one: Bad CRC"
+    )
+    assert left_in(tmp_path) == ["set/s.zip"]
+
+
+def test_an_archive_of_something_else_is_refused(server, tmp_path):
+    problems = fetched(archive(server, "s.zip", PACKED["s.zip"], ("rgb", "depth")), tmp_path)
+    one_line(problems, "expected depth in it, there is none")
+    assert left_in(tmp_path) == ["set/s.zip"]
+
+
+def test_an_interrupted_unpacking_leaves_nothing_and_needs_no_second_download(server, tmp_path, monkeypatch):
+    item = archive(server, "s.zip", PACKED["s.zip"])
+
+    def interrupted(source, sink, _):
+        sink.write(source.read(1000))
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(unpack.shutil, "copyfileobj", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            fetched(item, tmp_path)
+    assert left_in(tmp_path) == ["set/s.zip"]
+    assert fetched(item, tmp_path) == []
+    assert len(server.log) == 1
+
+
+def test_the_rest_of_a_killed_unpacking_is_swept_away(server, tmp_path):
+    rest = tmp_path / "set/.s.zip.unpacking/rgb/old.png"
+    rest.parent.mkdir(parents=True)
+    rest.write_bytes(PNG)
+    assert fetched(archive(server, "s.zip", PACKED["s.zip"]), tmp_path) == []
+    assert left_in(tmp_path) == ["set/room/list.txt", "set/room/rgb/1.png", "set/room/rgb/2.png"]
+
+
+def collection(*items, **fields):
+    return Collection("mine", "Mine", "https://page", "free", "Me.", ("set",), None, items, **fields)
+
+
+def verified(of, root, **options):
+    watcher = Watcher()
+    return verify(of, root, watcher, **options), watcher.lines
+
+
+def test_files_as_recorded_are_found_right(server, tmp_path):
+    items = picture(server), archive(server, "s.zip", PACKED["s.zip"])
+    fetched(items, tmp_path)
+    assert verified(collection(*items), tmp_path) == ([], [])
+
+
+def test_a_damaged_file_is_named_with_both_checksums_and_fetched_again(server, tmp_path):
+    item = picture(server)
+    fetched(item, tmp_path)
+    (tmp_path / "set/a.png").write_bytes(OTHER)
+    problems, _ = verified(collection(item), tmp_path)
+    one_line(problems, f"{tmp_path / 'set/a.png'}: expected sha256 {sha256(PNG)} as recorded, got {sha256(OTHER)}")
+    assert fetched(item, tmp_path) == []
+    assert (tmp_path / "set/a.png").read_bytes() == PNG
+
+
+def test_a_file_of_another_size_and_a_missing_one_are_named(server, tmp_path):
+    items = picture(server), picture(server, name="b.png"), archive(server, "s.zip", PACKED["s.zip"])
+    fetched(items, tmp_path)
+    (tmp_path / "set/a.png").write_bytes(PNG[:-1])
+    (tmp_path / "set/b.png").unlink()
+    (tmp_path / "set/room/rgb/2.png").write_bytes(b"")
+    problems, _ = verified(collection(*items), tmp_path)
+    assert problems == [
+        f"{tmp_path / 'set/a.png'}: expected {len(PNG)} bytes as recorded, got {len(PNG) - 1}",
+        f"{tmp_path / 'set/b.png'}: expected a file, there is none",
+        f"{tmp_path / 'set/room/rgb/2.png'}: expected {len(OTHER)} bytes as recorded, got 0",
+    ]
+
+
+def test_nothing_is_made_where_nothing_is(server, tmp_path):
+    problems, _ = verified(collection(picture(server)), tmp_path / "nowhere")
+    one_line(problems, "expected a file, there is none")
+    assert not (tmp_path / "nowhere").exists()
+
+
+def test_files_from_elsewhere_are_recorded_as_they_are(server, tmp_path):
+    item = picture(server)
+    (tmp_path / "set").mkdir()
+    (tmp_path / "set/a.png").write_bytes(PNG)
+    assert verified(collection(item), tmp_path) == ([], [f"{tmp_path}/checksums.json: recorded as found: set/a.png"])
+    (tmp_path / "set/b.png").write_bytes(PNG)
+    assert fetched(picture(server, name="b.png"), tmp_path) == []
+    assert server.log == []
+    assert Checksums(tmp_path)["set/b.png"].sha256 == sha256(PNG)
+
+
+def test_an_archive_unpacked_by_hand_is_recorded_as_it_is(server, tmp_path):
+    item = archive(server, "s.zip", PACKED["s.zip"])
+    (tmp_path / "set/room").mkdir(parents=True)
+    one_line(verified(collection(item), tmp_path)[0], f"{tmp_path / 'set/room'}: expected what s.zip unpacks to")
+    (tmp_path / "set/room/rgb").mkdir()
+    (tmp_path / "set/room/rgb/1.png").write_bytes(PNG)
+    assert verified(collection(item), tmp_path)[0] == []
+    assert Checksums(tmp_path)["set/s.zip"].files == {"rgb/1.png": len(PNG)}
+    assert fetched(item, tmp_path) == []
+    assert server.log == []
+
+
+MANUAL = collection(manual="put *.mat into {folder}", patterns=("*.mat", "*/P*/*.png"))
+
+
+def test_the_manual_route_says_what_is_missing_and_where_it_belongs(tmp_path):
+    problems, _ = verified(MANUAL, tmp_path)
+    assert [problem.split(": ")[1] for problem in problems] == [
+        "expected *.mat, there is none",
+        "expected */P*/*.png, there is none",
+    ]
+    for problem in problems:
+        assert problem.startswith(f"{tmp_path / 'set'}: ")
+        assert f"put *.mat into {tmp_path / 'set'}, then `dsr data verify mine`" in problem
+
+
+def test_the_manual_route_records_once_and_checks_ever_after(tmp_path):
+    for name, content in {"set/a.mat": b"MATLAB 5.0", "set/sea/P000/1.png": PNG}.items():
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_bytes(content)
+    recorded = f"{tmp_path}/checksums.json: recorded as found: set/a.mat, set/sea/P000/1.png"
+    assert verified(MANUAL, tmp_path) == ([], [recorded])
+    assert verified(MANUAL, tmp_path) == ([], [])
+    (tmp_path / "set/a.mat").write_bytes(b"MATLAB 7.3")
+    (tmp_path / "set/sea/P000/1.png").rename(tmp_path / "set/sea/P000/2.png")
+    problems, _ = verified(MANUAL, tmp_path)
+    assert len(problems) == 2
+    assert "set/sea/P000/1.png: expected a file as recorded, there is none" in problems[0]
+    assert f"got {sha256(b'MATLAB 7.3')}" in problems[1]
+    assert len(verified(MANUAL, tmp_path, accept_changed=True)[0]) == 1  # what is not there cannot be accepted
+    assert Checksums(tmp_path)["set/a.mat"].sha256 == sha256(b"MATLAB 7.3")
+
+
+def test_the_manual_route_leaves_other_data_sets_alone(server, tmp_path):
+    fetched(Item("others/a.png", (f"{server.url}/a.png",)), tmp_path)
+    (tmp_path / "others/a.png").unlink()
+    (tmp_path / "set/sea/P000").mkdir(parents=True)
+    (tmp_path / "set/sea/P000/1.png").write_bytes(PNG)
+    (tmp_path / "set/a.mat").write_bytes(b"MATLAB")
+    assert verified(MANUAL, tmp_path)[0] == []
+
+
+def test_a_web_page_put_there_by_hand_is_seen(tmp_path):
+    (tmp_path / "set/sea/P000").mkdir(parents=True)
+    (tmp_path / "set/sea/P000/1.png").write_bytes(PNG)
+    (tmp_path / "set/a.mat").write_bytes(PAGE)
+    one_line(verified(MANUAL, tmp_path)[0], f"{tmp_path / 'set/a.mat'}: expected a .mat file, got a web page")
+
+
+def test_the_state_of_a_collection(server, tmp_path):
+    items = picture(server), picture(server, name="b.png"), archive(server, "s.zip", PACKED["s.zip"])
+    assert state(collection(*items), tmp_path) == "absent"
+    fetched(items[0], tmp_path)
+    assert state(collection(*items), tmp_path) == "partial 1 of 3"
+    fetched(items, tmp_path)
+    assert state(collection(*items), tmp_path) == "complete"
+    (tmp_path / "set/room/rgb/2.png").unlink()
+    assert state(collection(*items), tmp_path) == "partial 2 of 3"
+    assert state(MANUAL, tmp_path) == "manual"
+    (tmp_path / "set/sea/P000").mkdir(parents=True)
+    (tmp_path / "set/sea/P000/1.png").write_bytes(PNG)
+    (tmp_path / "set/a.mat").write_bytes(b"MATLAB")
+    assert state(MANUAL, tmp_path) == "complete"
+
+
+@pytest.mark.parametrize(
+    "text", ["", "{", "[]", "3", '{"a": 3}', '{"a": {"size": "3"}}', '{"a": {"size": 3, "sha256": 5}}']
+)
+def test_damaged_records_are_one_line(server, tmp_path, text):
+    (tmp_path / "checksums.json").write_text(text)
+    with pytest.raises(ValueError, match="expected the checksums of the data sets") as caught:
+        fetched(picture(server), tmp_path)
+    one_line([str(caught.value)], tmp_path / "checksums.json")
+
+
+def test_two_commands_do_not_write_at_the_same_time(server, tmp_path):
+    with alone(tmp_path), pytest.raises(ValueError, match="another `dsr data` command"):
+        fetched(picture(server), tmp_path)
+    assert fetched(picture(server), tmp_path) == []
