@@ -136,6 +136,13 @@ def test_levels_of_2006_count_in_pixels_of_the_full_size(tmp_path):
     assert scene.depth.isnan().sum() == 1
 
 
+def test_without_its_shift_a_scene_of_2006_has_that_of_art(tmp_path):
+    levels(tmp_path / "Aloe" / "disp1.png", np.full((370, 40), 90))
+    picture(tmp_path / "Aloe" / "view1.png", 370, 40)
+    scene = load_levels(find_levels(tmp_path)["aloe"], "middlebury2006", "aloe", 2006)
+    assert scene.depth[0, 5, 5] == pytest.approx(3740 * 0.16 / (90 + 200))
+
+
 def test_levels_of_2003_and_2001_are_quarters_and_eighths_of_pixels(tmp_path):
     levels(tmp_path / "cones" / "disp2.png", np.full((375, 450), 100))
     picture(tmp_path / "cones" / "im2.png", 375, 450)
@@ -202,5 +209,7 @@ def test_real_scenes_of_2005_and_2006_are_read(shared):
     assert {factor: tuple(coarse.shape) for factor, coarse in scene.measured.items()} == {
         4: (1, 272, 344), 8: (1, 136, 172),
     }  # fmt: skip
+    kit = load_2014(find_2014(shared / "real" / "middlebury2014")["artl"], "middlebury", "artl")
+    torch.testing.assert_close(scene.depth.nanmedian(), kit.depth.nanmedian(), rtol=0.01, atol=0)
     coarse, fine = scene.measured[4], scene.depth
     torch.testing.assert_close(coarse.nanmedian(), fine.nanmedian(), rtol=0.02, atol=0)

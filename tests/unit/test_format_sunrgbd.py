@@ -174,3 +174,13 @@ def test_a_pair_of_loose_files_is_read_with_intrinsics(shared):
     folder = shared / "real/sunrgbd/open3d_sample"
     scene = load_pair(folder / "SUN_color.jpg", folder / "SUN_depth.png", "sunrgbd", "sample", (570, 570, 320, 240))
     assert scene.depth.nan_to_num(0).max().item() == 9.870  # beyond 8 m, not cut
+
+
+def test_scenes_behind_links_are_found_and_links_that_lead_back_do_no_harm(tmp_path):
+    for part in ("image", "depth"):
+        (tmp_path / "elsewhere" / "one" / part).mkdir(parents=True)
+    root = tmp_path / "root"
+    root.mkdir()
+    (root / "linked").symlink_to(tmp_path / "elsewhere")
+    (tmp_path / "elsewhere" / "back").symlink_to(root)
+    assert list(find_frames(root)) == ["linked/one"]

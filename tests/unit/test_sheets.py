@@ -13,8 +13,8 @@ from dsr.sample import Scene
 PHOTO = (0.2, 0.4, 0.6)
 PINK = (214, 132, 180)
 KNOWN = (228, 228, 228)
-WIDTH = 1330
-"""Pixels: 0.15 inches of margin, 2.35 of text, four panels of 2.56 and 0.14 between them, at 100 dpi."""
+WIDTH = 1355
+"""Pixels: 0.15 inches of margin, 2.6 of text, four panels of 2.56 and 0.14 between them, at 100 dpi."""
 PAGE = 6
 
 
@@ -35,7 +35,7 @@ def drawn(folder, *scenes, title="Toys"):
 
 def panel(page, column, row=0):
     """Return the pixels of a square panel of a page of square scenes, a few from its border left out."""
-    top, left = 80 + row * 306, 250 + column * 270
+    top, left = 80 + row * 306, 275 + column * 270
     return page[top + 4 : top + 252, left + 4 : left + 252]
 
 

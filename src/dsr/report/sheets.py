@@ -30,13 +30,13 @@ _PANEL = 2.56
 """Inches of a panel's longer side: 256 pixels."""
 _LEAST_PANEL = 0.3
 """Inches of its shorter side."""
-_TEXT, _MARGIN, _GAP, _ABOVE, _BELOW = 2.35, 0.15, 0.14, 0.8, 0.5
+_TEXT, _MARGIN, _GAP, _ABOVE, _BELOW = 2.6, 0.15, 0.14, 0.8, 0.5
 """Inches of the text's column, the margin, and the room between panels, above the first row and below each."""
 _SEAM, _LEAST_LABELLED = 0.04, 0.35
 """Inches between the renderings, and of the shorter side of one that has room for a label."""
 _LABEL = {"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 1.2}
 _KNOWN_COLOUR = "#e4e4e4"
-_LETTERS = 24
+_LETTERS = 27
 _LINE = 0.165
 """Of a line of text, and its height in inches."""
 

@@ -6,8 +6,8 @@ Formats as on vision.middlebury.edu/stereo/data: disparity d in pixels of the le
   of the evaluation kit); inf = unknown.
 - 2005, 2006 (Scharstein and Pal, Hirschmueller and Scharstein, CVPR 2007): ``view1.png``, ``disp1.png``, 0 = unknown.
   f = 3740 pixels at full size, baseline 160 mm. A level is a pixel of the full size, be the map full size, half or a
-  third; ``dmin.txt`` has the disparity, in such pixels, by which the views were shifted. Without it depths are too far,
-  though planes stay planes.
+  third; ``dmin.txt`` has the disparity, in such pixels, by which the views were shifted. Where it is missing 200 are
+  assumed: those of Art, by the evaluation kit's calibration of it. Depth is not metric then, though planes stay planes.
 - 2003 (Scharstein and Szeliski, CVPR 2003): ``im2.png``, ``disp2.png``, 4 levels a pixel, 0 = unknown. The camera is
   the one that the evaluation kit has for Teddy.
 - 2001 (Scharstein and Szeliski, IJCV 2002): ``im2.ppm``, ``disp2.pgm``, 8 levels a pixel. No camera was published; it
@@ -34,6 +34,7 @@ from dsr.sample import Scene
 YEARS = (2001, 2003, 2005, 2006)
 _MATRIX = re.compile(r"\[\s*(\S+)\s+0\s+(\S+)\s*;\s*0\s+(\S+)\s+(\S+)\s*;\s*0\s+0\s+1\s*\]")
 _FULL_HEIGHT, _FULL_FOCAL, _BASELINE = 1110, 3740.0, 0.16
+_ASSUMED_SHIFT = 200.0
 _TEDDY = MappingProxyType({"fx": 1500.0, "fy": 1500.0, "baseline": 0.08, "doffs": 52.0, "cx": 199.0, "cy": 187.0})
 _NOISY = MappingProxyType({4: "_depth_2_n.png", 8: "_depth_3_n.png"})
 
@@ -201,7 +202,7 @@ def _camera_2006(files: Files, height: int, width: int) -> tuple[Camera, float]:
     per_pixel = round(_FULL_HEIGHT / height)
     if per_pixel not in (1, 2, 3):
         raise ValueError(f"{files.disparity}: expected a height near {_FULL_HEIGHT}, a half or a third, got {height}")
-    shift = 0.0
+    shift = _ASSUMED_SHIFT
     if files.shift is not None:
         text = files.shift.read_text(encoding="utf-8", errors="replace").strip()
         shift = _number(files.shift, "dmin", text)

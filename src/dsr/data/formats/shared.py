@@ -141,7 +141,8 @@ def to_camera(source: Path | str, matrix: np.ndarray, size: tuple[int, int]) -> 
 def walk(root: Path) -> Iterator[tuple[Path, list[str], list[str]]]:
     """Yield every folder of a directory in order, with the names of its folders and of its files.
 
-    A name that the caller takes off the list of folders is not entered; hidden folders are not either.
+    A name that the caller takes off the list of folders is not entered; hidden folders are not either. Links are,
+    unless they lead back.
 
     Raises:
         ValueError: there is no such directory.
@@ -149,8 +150,11 @@ def walk(root: Path) -> Iterator[tuple[Path, list[str], list[str]]]:
     """
     if not root.is_dir():
         raise ValueError(f"{root}: expected a directory, there is none")
-    for folder, below, files in os.walk(root):
-        below[:] = sorted(name for name in below if not name.startswith("."))
+    entered = set()
+    for folder, below, files in os.walk(root, followlinks=True):
+        entered.add(os.path.realpath(folder))
+        fresh = [name for name in below if os.path.realpath(os.path.join(folder, name)) not in entered]  # noqa: PTH118
+        below[:] = sorted(name for name in fresh if not name.startswith("."))
         yield Path(folder), below, sorted(files)
 
 
