@@ -229,14 +229,17 @@ def _divisible(scene: Scene, scale: int) -> tuple[Scene, tuple[str, ...]]:
     if not height or not width:
         raise ValueError(f"{scene.name}: expected at least {scale} x {scale} pixels, got {before}")
     if (height, width) == (camera.height, camera.width):
-        return scene, ()
+        return scene, scene.notes
     depth = None if scene.depth is None else scene.depth[:, :height, :width]
     measured = {scale: scene.measured[scale]} if scale in scene.measured else {}
     if depth is None and not measured:
         raise ValueError(f"{scene.name}: expected a measured map at x{scale}, there is none")
     camera = camera.crop(0, 0, height, width)
     cropped = Scene(scene.dataset, scene.name, scene.rgb[:, :height, :width], camera, depth, measured)
-    return cropped, (f"cropped from {before} to {height} x {width}, which {scale} divides",)
+    return cropped, (
+        *scene.notes,
+        f"cropped from {before} to {height} x {width}, which {scale} divides",
+    )
 
 
 def downsampled(

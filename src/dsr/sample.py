@@ -28,6 +28,7 @@ class Scene:
         camera: the camera of both.
         depth: (1, H, W) true depth, or None where it is not known.
         measured: coarse depth maps that a sensor measured, (1, H / factor, W / factor) by factor.
+        notes: what somebody who reads the scores should know, such as "depth is not metric".
 
     Raises:
         ValueError: a shape, range or unit is not as above.
@@ -40,6 +41,7 @@ class Scene:
     camera: Camera
     depth: Tensor | None = None
     measured: Mapping[int, Tensor] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         """Check shapes and value ranges."""

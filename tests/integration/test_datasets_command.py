@@ -58,13 +58,15 @@ def test_real_scenes_of_several_data_sets_are_evaluated_by_one_command(run, tmp_
     assert pictures == ["living", "office_0000"]
 
 
-def test_a_training_on_real_scenes_with_holes_runs(run, tmp_path, shared):
+def test_a_training_on_real_scenes_with_holes_and_procedural_ones_runs(run, tmp_path, shared):
     done = run(
-        "train.py", "dataset=middlebury_train", "dataset.scenes=found", "trainer=smoke", "output_dir=out",
-        "trainer.scenes=4", DSR_DATA=str(shared / "real"),
+        "train.py", "dataset=paper_train", "trainer=smoke", "output_dir=out", "trainer.scenes=4",
+        "dataset.parts.middlebury_train.scenes=found", "dataset.shares.sintel=0",
+        "dataset.parts.procedural.count=2", "dataset.parts.procedural.size=64", DSR_DATA=str(shared / "real"),
     )  # fmt: skip
     assert (done.returncode, done.stderr) == (0, "")
-    assert "data   3 scenes of middlebury_train to train on, 1 of middlebury_train to validate with" in done.stdout
+    split = "data   4 scenes of paper_train to train on, 1 of middlebury_train, 1 of procedural to validate with"
+    assert split in done.stdout
     assert (tmp_path / "out" / "weights.safetensors").is_file()
 
 

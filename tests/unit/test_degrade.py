@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from dataclasses import replace
 from typing import Any, get_args
 
 import numpy as np
@@ -464,3 +465,12 @@ def test_a_noise_that_cannot_be_is_refused(std: float) -> None:
 
 def test_no_noise_is_none() -> None:
     assert no_noise() is None  # type: ignore[func-returns-value]
+
+
+def test_what_is_to_be_known_of_a_scene_is_known_of_its_samples() -> None:
+    known = replace(_scene(_values(32, 48)), notes=("not metric",))
+    assert make_sample(known, 2, Downsampling("box"), "orthogonal").notes == ("not metric",)
+    odd = replace(CAMERA, width=50)
+    known = replace(_scene(_values(32, 50), odd), notes=("not metric",))
+    notes = make_sample(known, 4, Downsampling("box"), "orthogonal").notes
+    assert notes == ("not metric", "cropped from 32 x 50 to 32 x 48, which 4 divides")

@@ -1,6 +1,7 @@
 """Data sets in their owners' formats: which scenes, prepared how, kept where."""
 
 import os
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -146,6 +147,14 @@ def test_a_scene_that_cannot_be_prepared_does_not_keep_the_others_from_it(files)
         data.load("a")
     with pytest.raises(ValueError, match=r"b\.txt: expected a file, there is none"):
         data.load("b")
+
+
+def test_what_is_to_be_known_of_a_scene_goes_with_it_prepared_or_not(files):
+    records = {name: replace(record, note="not metric") for name, record in records_of(files, frame, "things").items()}
+    for preparation in (Preparation(48), Preparation(48), Preparation(None)):
+        data = Native("things", Place(Path("x"), "things"), records, ["a"], None, preparation)
+        assert data.load("a").notes == ("not metric",)
+    assert source(files).load("a").notes == ()
 
 
 def test_where_nothing_can_be_kept_scenes_are_made_each_time(files, monkeypatch):

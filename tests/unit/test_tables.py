@@ -144,6 +144,26 @@ def test_several_scenes_have_a_mean_and_one_has_none():
     assert "mean" not in text(scores("lucy"))
 
 
+def test_below_the_mean_of_all_scenes_stands_the_paper_s_average_over_them():
+    seven = scores("vintage", "recycle", "umbrella", "classroom1", "playroom", "backpack", "jadeplant")
+    seven["dataset"] = "middlebury"
+    average = published()[
+        (published()["scene"] == "Average performance on Middlebury dataset")
+        & (published()["method"] == "Bicubic") & (published()["scale"] == 4)
+    ]  # fmt: skip
+    lines = text(seven).splitlines()
+    place = next(number for number, line in enumerate(lines) if line.split()[:1] == ["mean"])
+    assert lines[place + 1].split()[:2] == ["paper", f"{average['RMSE_d'].item():.1f}"]
+    six = seven[seven["scene"] != "vintage"]
+    assert text(six).split("mean")[1].count("paper") == 0
+
+
+def test_of_frames_that_may_be_others_than_the_paper_s_the_row_is_starred():
+    table = scores("coat_rack")
+    table["dataset"] = "icl"
+    assert row(text(table), [], "paper*")
+
+
 def test_a_value_that_could_not_be_computed_is_a_dash_and_left_out_of_the_mean():
     table = scores("lucy", "other")
     table.loc[(table["scene"] == "other") & (table["metric"] == "RMSE_d"), "value"] = math.nan

@@ -99,6 +99,7 @@ def records_2014(folder: Path, dataset: str, without_offset: Collection[str] = (
             tuple(path for path in map(place.joinpath, _FILES_2014) if path.is_file()),
             functools.partial(middlebury.load_2014, place, dataset, name, offset=name not in without_offset),
             "without offset" if name in without_offset else "",
+            "depth is not metric: the disparity offset is left out, as in the paper" if name in without_offset else "",
         )
         for name, place in middlebury.find_2014(folder).items()
     }
@@ -111,6 +112,7 @@ def records_levels(folder: Path, dataset: str, year: int, *, smooth: bool = True
             tuple(path for path in (files.photo, files.disparity, files.shift, *files.measured.values()) if path),
             functools.partial(middlebury.load_levels, files, dataset, name, year, smooth=smooth),
             "" if smooth else "terraces",
+            middlebury.shortcoming(files, year),
         )
         for name, files in middlebury.find_levels(folder).items()
     }

@@ -37,13 +37,15 @@ class Record:
     Args:
         files: all that it is read from.
         load: reads it at its own size.
-        part: which part of the files it is, where they hold several scenes.
+        part: which part of the files it is, where they hold several scenes, and how it is read.
+        note: what somebody who reads its scores should know; empty for nothing.
 
     """
 
     files: tuple[Path, ...]
     load: Callable[[], Scene]
     part: str = ""
+    note: str = ""
 
 
 def records_of(
@@ -199,9 +201,11 @@ class Native:
     def load(self, scene: str) -> Scene:
         """Return one scene; see :class:`dsr.data.base.SceneSource`."""
         record = self._found[scene]
+        notes = (record.note,) if record.note else ()
         if self._preparation.size is None and scene not in self._preparation.fill:
-            return record.load()
-        return cached(self._path(scene), lambda: _rendering(self._preparation(record.load()))).scene(self.name, scene)
+            return replace(record.load(), notes=notes)
+        prepared = cached(self._path(scene), lambda: _rendering(self._preparation(record.load())))
+        return replace(prepared.scene(self.name, scene), notes=notes)
 
     def fingerprint(self, scene: str) -> str:
         """Return the SHA-256 of the scene's files and of what is done to them."""

@@ -142,6 +142,13 @@ def load_levels(files: Files, dataset: str, name: str, year: int, *, smooth: boo
     return Scene(dataset, name, _photo(files.photo, camera), camera, depth, measured)
 
 
+def shortcoming(files: Files, year: int) -> str:
+    """Return why the depth of a scene of 2001 to 2006 is not metric; empty where it is."""
+    if year in (2001, 2003):
+        return "depth is not metric: no camera was published, that of Teddy in the evaluation kit is assumed"
+    return "" if files.shift else "depth is not metric: there is no dmin.txt, the shift of Art is assumed"
+
+
 def read_calibration(path: Path) -> Camera:
     """Return the left camera of a ``calib.txt``.
 
