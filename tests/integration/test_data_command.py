@@ -54,11 +54,16 @@ class Mirror(BaseHTTPRequestHandler):
         pass
 
 
+class QuietServer(ThreadingHTTPServer):
+    def handle_error(self, request, client_address):
+        """Say nothing of clients that hang up, as interrupted ones do."""
+
+
 @pytest.fixture
 def mirror(monkeypatch):
     monkeypatch.setenv("NO_PROXY", "127.0.0.1")
     monkeypatch.setattr(download, "PAUSES", (0.0,))
-    with ThreadingHTTPServer(("127.0.0.1", 0), Mirror) as server:
+    with QuietServer(("127.0.0.1", 0), Mirror) as server:
         server.files, server.log, server.go_on = (
             {f"/{name}": PNG + name.encode() for name in NAMES},
             [],

@@ -160,5 +160,8 @@ def test_real_scenes_of_every_data_set_are_prepared(shared, dsr_cache):
         scene = data.load(name)
         assert (scene.name, tuple(scene.depth.shape), tuple(scene.rgb.shape)) == (name, (1, 64, 64), (3, 64, 64))
         assert 0.5 < scene.depth.nanmedian() < 12
-    tofmark = ToFMark(str(real / "tofmark"), None, [600.0, 600.0, 404.5, 304.5], [1.0, 2.5])
-    assert tuple(tofmark.load("devil").measured[8].shape) == (1, 76, 101)
+    devil = ToFMark(str(real / "tofmark"), depth_range=[0.4, 0.9]).load("devil")
+    assert tuple(devil.measured[8].shape) == (1, 76, 101)
+    assert (devil.camera.fx, devil.notes) == (549.2, ("the benchmark has no camera: it is an estimate",))
+    given = ToFMark(str(real / "tofmark"), None, [600.0, 600.0, 404.5, 304.5], [0.4, 0.9]).load("devil")
+    assert (given.camera.fx, given.notes) == (600.0, ())

@@ -67,11 +67,16 @@ class Handler(BaseHTTPRequestHandler):
         pass
 
 
+class QuietServer(ThreadingHTTPServer):
+    def handle_error(self, request, client_address):
+        """Say nothing of clients that hang up, as interrupted ones do."""
+
+
 @pytest.fixture
 def server(monkeypatch):
     monkeypatch.setenv("NO_PROXY", "127.0.0.1")
     monkeypatch.setattr(download, "PAUSES", (0.0, 0.0))
-    with ThreadingHTTPServer(("127.0.0.1", 0), Handler) as running:
+    with QuietServer(("127.0.0.1", 0), Handler) as running:
         running.files, running.states, running.cuts, running.log = {"/a.png": PNG}, [], [], []
         running.ranges, running.marks, running.headers = True, {"ETag": '"1"'}, {}
         running.url = f"http://127.0.0.1:{running.server_address[1]}"

@@ -1,18 +1,24 @@
 """``dataset=tofmark``: a time-of-flight sensor's samples beside a photo (Ferstl et al., ICCV 2013).
 
-The benchmark's files hold no camera. Voynov et al. 2019 use Books, Devil and Shark with the real sensor's maps as the
-input: ``downsampling=measured``.
+Voynov et al. 2019 use Books, Devil and Shark with the real sensor's maps as the input: ``downsampling=measured``.
+
+The benchmark's files hold no camera. It is estimated here from the Books that the paper's authors published with a
+camera and metric depth: of 100 correspondences between the two photos 72 fit one pose and one camera of square pixels,
+without distortion, with a root mean square of 0.95 pixels.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 from dsr.data.base import Wanted
 from dsr.data.formats import tofmark
 from dsr.data.native import Native, Place, Preparation, data_folder, listed, records_of
 
 SCENES = ("books", "devil", "shark")
+ESTIMATED = (549.2, 549.2, 375.2, 334.3)
+"""fx, fy, cx, cy in pixels of the 610 x 810 photos."""
 
 
 class ToFMark(Native):
@@ -21,7 +27,7 @@ class ToFMark(Native):
     Args:
         root: where the ``.mat`` files or the pictures lie.
         scenes: names of the ones to use; None for the three, ``found`` for all in ``root``.
-        intrinsics: fx, fy, cx, cy in pixels; the files have none.
+        intrinsics: fx, fy, cx, cy in pixels; None for the estimated ones.
         depth_range: metres that levels 1 and 255 of pictures stand for; they hold no scale.
         variables: names in the ``.mat`` files of ``intensity``, ``depth`` and ``samples``, where they are not found.
 
@@ -43,9 +49,12 @@ class ToFMark(Native):
                 raise ValueError(f"dataset.{name}: expected {count} numbers, got {len(values)}")
         folder = data_folder(root)
         settings = {
-            "intrinsics": intrinsics and tuple(intrinsics),
+            "intrinsics": tuple(intrinsics or ESTIMATED),
             "depth_range": depth_range and tuple(depth_range),
             "variables": variables and dict(variables),
         }
         found = records_of(listed(tofmark.find_frames, folder), tofmark.load_frame, "tofmark", **settings)
+        if intrinsics is None:
+            note = "the benchmark has no camera: it is an estimate"
+            found = {name: replace(record, note=note) for name, record in found.items()}
         super().__init__("tofmark", Place(folder, "tofmark"), found, SCENES, scenes, Preparation(None))
