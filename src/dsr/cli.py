@@ -178,7 +178,7 @@ def _doctor(options: argparse.Namespace, *_: object) -> int:
     """Examine a directory of scenes."""
     from dsr.doctor import examine_directory  # noqa: PLC0415 - it takes seconds to import
 
-    return examine_directory(options.directory)
+    return examine_directory(options.directory, options.most)
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -191,6 +191,7 @@ def _parser() -> argparse.ArgumentParser:
 
     doctor = commands.add_parser("doctor", help="check a directory of your own scenes")
     doctor.add_argument("directory", type=Path, metavar="DIR", help="a scene, or a directory of scenes")
+    doctor.add_argument("--most", type=int, metavar="N", help="examine N scenes at most, spread over all")
     doctor.set_defaults(run=_doctor)
 
     data = commands.add_parser(

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
+from dsr.cli import main
 from dsr.data.simgeo_scenes import render_scene
 
 
@@ -80,3 +81,15 @@ def test_the_published_scenes_are_fine(shared):
     for name in ("books", "lucy", "plant"):
         assert f"{name}: fine" in done.stdout
     assert done.stdout.endswith("3 scenes: 3 fine\n")
+
+
+def test_of_many_scenes_some_are_examined_on_request(tmp_path, cube, capsys):
+    for number in range(5):
+        write(tmp_path / f"cube{number}", cube, cube.depth)
+    assert main(["doctor", str(tmp_path), "--most", "2"]) == 0
+    output = capsys.readouterr().out
+    assert output.startswith("2 of 5 scenes, spread over all\ncube0: fine")
+    assert "cube2: fine" in output
+    assert output.endswith("2 scenes: 2 fine\n")
+    assert main(["doctor", str(tmp_path), "--most", "0"]) == 2
+    assert capsys.readouterr().err == "error: --most: expected a positive number, got 0\n"

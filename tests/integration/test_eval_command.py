@@ -325,7 +325,7 @@ USAGE_ERRORS = {
     "an unknown scene": (["dataset.scenes=[mars]"], "dataset.scenes: 'mars' is not there; expected some of cube"),
     "no scene at all": (["dataset.scenes=[]"], "dataset.scenes: expected names, each once, or null for all"),
     "a scene twice": (["dataset.scenes=[statue,statue]"], "dataset.scenes: expected names, each once"),
-    "a scene without a list": (["dataset.scenes=statue"], "dataset.scenes: expected a list of text or one of found or null, got"),
+    "a scene without a list": (["dataset.scenes=statue"], "dataset.scenes: expected a list of text or one of found"),
     "no weights": (["method=msg_v", "scale=16"], "weights: dsr comes with "),
     "a mixture": (["dataset=mixture"], "dataset=mixture: several data sets are for training; name one of them"),
     "a noise that cannot be": (["noise=gaussian_multiplicative", "noise.std=2"], "noise.std: expected a number above"),

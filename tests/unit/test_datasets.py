@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from dsr.app.build import build
+from dsr.app.build import build, trait
 from dsr.app.schema import ConfigError
 from dsr.data.folder import Folder
 from dsr.data.formats.sintel import SEQUENCES
@@ -19,6 +19,7 @@ from dsr.data.sunrgbd import SunRGBD
 from dsr.data.tofmark import SCENES as TOFMARK_SCENES
 from dsr.data.tofmark import ToFMark
 from dsr.data.training_sets import MIDDLEBURY, MiddleburyTrain, Sintel, sintel_frames
+from dsr.methods.trained import packaged_weights
 from dsr.report.tables import published_row
 
 CONF = Path(__file__).resolve().parents[2] / "conf" / "dataset"
@@ -119,6 +120,19 @@ def test_data_sets_know_whether_they_are_to_evaluate_on():
     evaluated = (Middlebury, MiddleburyLevels, ICL, SunRGBD, ToFMark, SimGeo)
     assert all(kind.evaluation for kind in evaluated)
     assert not any(kind.evaluation for kind in (MiddleburyTrain, Sintel, Folder))
+
+
+@pytest.mark.parametrize(
+    ("method", "range_type"),
+    [("bicubic", "perspective"), ("msg_v", "disparity"), ("facets", "disparity"), ("dip", "orthogonal")],
+)
+def test_a_method_gets_the_range_type_that_it_was_made_for(method, range_type):
+    entries = yaml.safe_load((CONF.parent / "method" / f"{method}.yaml").read_text())
+    if trait("method", entries, "range_type") is not None:
+        assert trait("method", entries, "range_type") == range_type
+    else:
+        made = build("method", entries, {"weights": packaged_weights(f"{method}_x4"), "scale": 4})
+        assert made.range_type == range_type
 
 
 def test_sintel_has_58_frames_that_exist():

@@ -38,11 +38,12 @@ _LOG_WIDTH = 110
 """Columns where the output is not a terminal."""
 
 
-def examine_directory(folder: Path) -> int:
+def examine_directory(folder: Path, most: int | None = None) -> int:
     """Print what looks wrong with the scenes of a directory, or with the one scene that it is.
 
     Args:
         folder: of any layout that :func:`dsr.data.detect.scenes_in` knows.
+        most: examine so many scenes at most, spread over all; None for all.
 
     Returns:
         0 where nothing looks wrong (there may be notes), 1 where there are warnings or problems, 2, with one line on
@@ -51,6 +52,8 @@ def examine_directory(folder: Path) -> int:
     """
     try:
         scenes = list(scenes_in(folder)) if folder.is_dir() else []
+        if most is not None and most < 1:
+            raise ValueError(f"--most: expected a positive number, got {most}")
         if not scenes:
             came = "no scene in it" if folder.is_dir() else "no such directory"
             raise ValueError(f"{folder}: expected a scene or a directory of scenes, got {came}")
@@ -62,6 +65,9 @@ def examine_directory(folder: Path) -> int:
     console = Console()
     if not console.is_terminal:
         console = Console(width=_LOG_WIDTH)
+    if most is not None and len(scenes) > most:
+        console.print(f"{most} of {len(scenes)} scenes, spread over all", highlight=False)
+        scenes = [scenes[index * len(scenes) // most] for index in range(most)]
     verdicts: Counter[Level] = Counter()
     with Progress(console=console, transient=True, disable=not console.is_terminal or len(scenes) <= _MANY) as bar:
         for name, load in bar.track(scenes, description="examining"):
