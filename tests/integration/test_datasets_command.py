@@ -10,6 +10,9 @@ import cv2
 import pandas as pd
 import pytest
 
+from dsr.app.entry import run_command
+from dsr.app.evaluate import evaluate
+from dsr.app.train import train
 from dsr.cli import main
 
 REPOSITORY = Path(__file__).resolve().parents[2]
@@ -31,16 +34,28 @@ def run(tmp_path, dsr_cache):
     return call
 
 
-def test_an_absent_data_set_names_the_command_that_gets_it_and_nothing_is_written(run, tmp_path):
-    done = run("eval.py", "dataset=icl", "method=bicubic")
-    assert (done.returncode, done.stderr) == (
-        2,
-        "error: dataset=icl: expected its files in data/icl_nuim, got no such directory; "
-        "get it with: dsr data get icl; or say where it is: dataset.root=DIR\n",
+@pytest.mark.parametrize(
+    ("name", "command", "arguments", "message"),
+    [
+        ("eval", evaluate, ("dataset=icl", "method=bicubic"), "icl: expected its files in data/icl_nuim, "),
+        ("train", train, ("dataset=paper_train", "trainer=smoke"), "middlebury_train: expected its files in data, "),
+    ],
+)
+def test_an_absent_data_set_names_the_command_that_gets_it_and_nothing_is_written(
+    tmp_path, monkeypatch, capfd, name, command, arguments, message
+):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("DSR_DATA", raising=False)
+    monkeypatch.setenv("HYDRA_FULL_ERROR", "1")
+    monkeypatch.setattr(sys, "argv", [f"{name}.py", *arguments, *QUICK])
+    with pytest.raises(SystemExit) as ended:
+        run_command(REPOSITORY / "conf", name, command)
+    assert ended.value.code == 2
+    which = message.partition(":")[0]
+    assert capfd.readouterr().err == (
+        f"error: dataset={message}got no such directory; get it with: dsr data get {which}; "
+        "or say where it is: dataset.root=DIR\n"
     )
-    done = run("train.py", "dataset=paper_train", "trainer=smoke")
-    assert done.returncode == 2
-    assert done.stderr.startswith("error: dataset=middlebury_train: expected its files in data, got no such directory")
     assert list(tmp_path.iterdir()) == []
 
 

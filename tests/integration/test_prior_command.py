@@ -17,6 +17,9 @@ import numpy as np
 import pytest
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+from dsr.app.entry import run_command
+from dsr.app.evaluate import evaluate
+
 REPOSITORY = Path(__file__).resolve().parents[2]
 ENVIRONMENT = {**os.environ, "OMP_NUM_THREADS": "1"}
 QUICK = (
@@ -164,21 +167,26 @@ def test_a_warm_start_needs_no_words(tmp_path: Path) -> None:
         (("method=dip", "holes=blob"), "holes=blob: unknown; expected one of blobs, none, shadows"),
         (("method=dip", "holes=blobs", "holes.share=2"), "holes.share: expected a number above 0 and below 1, got 2"),
         (("method=dip", "downsampling.assumed=cubic"), "downsampling.assumed: expected "),
+        (
+            ("method=bicubic", "downsampling.assumed=nearest"),
+            "downsampling.assumed: method=bicubic assumes no downsampling model; leave it out",
+        ),
     ],
 )
-def test_a_usage_error_is_one_line_and_writes_nothing(tmp_path: Path, arguments: tuple[str, ...], message: str) -> None:
-    done = _run(tmp_path, *arguments)
-    assert done.returncode == 2
-    [line] = done.stderr.splitlines()
+def test_a_usage_error_is_one_line_and_writes_nothing(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+    arguments: tuple[str, ...],
+    message: str,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("HYDRA_FULL_ERROR", "1")
+    quick = QUICK if arguments[0].startswith("method=dip") else QUICK[:2]
+    monkeypatch.setattr(sys, "argv", ["eval.py", *quick, *arguments])
+    with pytest.raises(SystemExit) as ended:
+        run_command(REPOSITORY / "conf", "eval", evaluate)
+    assert ended.value.code == 2
+    [line] = capfd.readouterr().err.splitlines()
     assert line.startswith(f"error: {message}")
-    assert not list(tmp_path.iterdir())
-
-
-def test_a_model_that_nothing_assumes_is_refused(tmp_path: Path) -> None:
-    command = [sys.executable, str(REPOSITORY / "eval.py"), "method=bicubic", "downsampling.assumed=nearest"]
-    done = subprocess.run(
-        command, cwd=tmp_path, env=ENVIRONMENT, capture_output=True, text=True, timeout=60, check=False
-    )
-    assert done.returncode == 2
-    assert done.stderr == "error: downsampling.assumed: method=bicubic assumes no downsampling model; leave it out\n"
     assert not list(tmp_path.iterdir())
