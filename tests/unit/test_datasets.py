@@ -7,11 +7,14 @@ import yaml
 
 from dsr.app.build import build, trait
 from dsr.app.schema import ConfigError
+from dsr.data.cutting import PatchSettings
 from dsr.data.folder import Folder
 from dsr.data.formats.sintel import SEQUENCES
 from dsr.data.icl import FRAMES as ICL_FRAMES
 from dsr.data.icl import ICL
 from dsr.data.middlebury import EVALUATION_2014, Middlebury, MiddleburyLevels
+from dsr.data.patches import Part, PatchData
+from dsr.data.problem import Problem
 from dsr.data.simgeo import SimGeo
 from dsr.data.simgeo_scenes import SCENES as SIMGEO_SCENES
 from dsr.data.sunrgbd import FRAMES as SUN_FRAMES
@@ -19,6 +22,7 @@ from dsr.data.sunrgbd import SunRGBD
 from dsr.data.tofmark import SCENES as TOFMARK_SCENES
 from dsr.data.tofmark import ToFMark
 from dsr.data.training_sets import MIDDLEBURY, MiddleburyTrain, Sintel, sintel_frames
+from dsr.degrade import Downsampling
 from dsr.methods.trained import packaged_weights
 from dsr.report.tables import published_row
 
@@ -114,6 +118,16 @@ def test_nothing_that_is_evaluated_on_is_trained_on_by_name(tmp_path):
     for scene in EVALUATION_2014:
         with pytest.raises(ValueError, match=f"'{scene}' is not there"):
             MiddleburyTrain(root, [scene])
+
+
+def test_a_scene_that_is_trained_on_does_not_validate_as_one_of_another_data_set(shared):
+    real = shared / "real"
+    train = Part(MiddleburyTrain(str(real), ["piano", "pipes", "adirondack"]))
+    settings, problem = PatchSettings(size=32, batch=1, validation_scenes=1), Problem(4, Downsampling("box"))
+    piano, recycle = (Middlebury(str(real / "middlebury2014"), [name]) for name in ("piano", "recycle"))
+    with pytest.raises(ValueError, match=r"validation\.others: expected scenes that are not trained on, got piano"):
+        PatchData([train], settings, problem, validation={"others": piano})
+    assert PatchData([train], settings, problem, validation={"others": recycle}).training_count == 2
 
 
 def test_data_sets_know_whether_they_are_to_evaluate_on():

@@ -149,6 +149,12 @@ def test_a_scene_that_cannot_be_prepared_does_not_keep_the_others_from_it(files)
         data.load("b")
 
 
+def test_the_content_of_a_scene_does_not_depend_on_what_is_done_to_it(files):
+    one, other = source(files), source(files, preparation=Preparation(32), near=2.0)
+    assert one.content("a") == other.content("a") != one.content("b")
+    assert one.fingerprint("a") != other.fingerprint("a")
+
+
 def test_what_is_to_be_known_of_a_scene_goes_with_it_prepared_or_not(files):
     records = {name: replace(record, note="not metric") for name, record in records_of(files, frame, "things").items()}
     for preparation in (Preparation(48), Preparation(48), Preparation(None)):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Literal, Protocol, runtime_checkable
 
 from dsr.sample import Scene
@@ -41,6 +41,12 @@ class SceneSource(Protocol):
     def fingerprint(self, scene: str) -> str:
         """Return a text that changes when the scene's content does."""
         ...
+
+
+def content_of(source: SceneSource, scene: str) -> str:
+    """Return a text that is the same for the same scene of two data sets, however each prepares it, if they know."""
+    content: Callable[[str], str] = getattr(source, "content", source.fingerprint)
+    return content(scene)
 
 
 @runtime_checkable

@@ -37,8 +37,9 @@ class Record:
     Args:
         files: all that it is read from.
         load: reads it at its own size.
-        part: which part of the files it is, where they hold several scenes, and how it is read.
+        part: how the files are read.
         note: what somebody who reads its scores should know; empty for nothing.
+        frame: which part of the files it is, where they hold several scenes.
 
     """
 
@@ -46,6 +47,7 @@ class Record:
     load: Callable[[], Scene]
     part: str = ""
     note: str = ""
+    frame: str = ""
 
 
 def records_of(
@@ -64,8 +66,9 @@ def records_of(
     for frame, arguments in frames.items():
         name = frame.replace("/", "_")
         files = tuple(file for path in arguments if isinstance(path, Path) for file in _files_of(path))
-        part = json.dumps([[each for each in arguments if not isinstance(each, Path)], settings])
-        records[name] = Record(files, functools.partial(load, *arguments, dataset, name, **settings), part)
+        which = json.dumps([each for each in arguments if not isinstance(each, Path)])
+        read = functools.partial(load, *arguments, dataset, name, **settings)
+        records[name] = Record(files, read, json.dumps(settings), frame=which)
     return records
 
 
@@ -209,11 +212,14 @@ class Native:
 
     def fingerprint(self, scene: str) -> str:
         """Return the SHA-256 of the scene's files and of what is done to them."""
+        plain = asdict(replace(self._preparation, fill=()))
+        settings = json.dumps([self._found[scene].part, scene in self._preparation.fill, plain])
+        return hashlib.sha256(f"{settings}{self.content(scene)}".encode()).hexdigest()
+
+    def content(self, scene: str) -> str:
+        """Return the SHA-256 of the scene's files, whatever is done to them."""
         record = self._found[scene]
-        settings = json.dumps(
-            [record.part, scene in self._preparation.fill, asdict(replace(self._preparation, fill=()))]
-        )
-        digest = hashlib.sha256(settings.encode())
+        digest = hashlib.sha256(record.frame.encode())
         for path in record.files:
             digest.update(content_hash(path).encode())
         return digest.hexdigest()

@@ -13,7 +13,7 @@ import lightning
 import torch
 from torch.utils.data import DataLoader, Dataset
 
-from dsr.data.base import SceneSource
+from dsr.data.base import SceneSource, content_of
 from dsr.data.cutting import Patches, PatchSettings, check_patches
 from dsr.data.problem import Batch, Problem, tensors_of
 from dsr.sample import Scene
@@ -186,13 +186,13 @@ class PatchData(lightning.LightningDataModule):
     def _refuse_leaks(self) -> None:
         """Raise where a scene is to be trained on and validated with, be it under another name."""
         trained = {
-            part.source.fingerprint(name)
+            content_of(part.source, name)
             for part, names in zip(self._parts, self._training_names, strict=True)
             for name in names
         }
         for kind, (source, names) in self._held_out.items():
             for name in names:
-                if source.fingerprint(name) in trained:
+                if content_of(source, name) in trained:
                     raise ValueError(f"validation.{kind}: expected scenes that are not trained on, got {name}")
 
 
