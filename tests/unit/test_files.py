@@ -1,10 +1,12 @@
 """Reading files: every format gives the numbers that the test wrote byte by byte, every refusal names its file."""
 
+import contextlib
 import json
 import os
 import re
 import struct
 import zlib
+from concurrent.futures import ThreadPoolExecutor
 
 import cv2
 import numpy as np
@@ -299,3 +301,19 @@ def test_a_camera_file_that_is_no_json_object_is_refused(tmp_path, capfd, text):
 
 def test_a_camera_file_that_is_no_text_is_refused(tmp_path, capfd):
     refusal(read_camera, written(tmp_path, "camera.json", b"\xff\xfe{}"), capfd)
+
+
+def test_threads_that_decode_at_the_same_time_leave_stderr_as_it_was(tmp_path, capfd):
+    picture = tmp_path / "a.png"
+    cv2.imwrite(str(picture), np.zeros((300, 300, 3), np.uint8))
+    damaged = tmp_path / "b.png"
+    damaged.write_bytes(picture.read_bytes()[:200])
+
+    def read(number):
+        with contextlib.suppress(ValueError):
+            read_rgb(damaged if number % 3 else picture)
+
+    with ThreadPoolExecutor(8) as pool:
+        list(pool.map(read, range(200)))
+    os.write(2, b"still here\n")
+    assert capfd.readouterr().err == "still here\n"

@@ -232,11 +232,14 @@ def _report(console: Console, folder: Path, scores: pd.DataFrame, label: str, ou
     """Print the table, and what a reader should know."""
     if not scores.empty:
         console.print(score_table(scores, label))
+    told: dict[str, list[str]] = {}
     for scene, notes in outcome.notes.items():
-        console.print(f"note: {scene}: {'; '.join(notes)}", markup=False, highlight=False, soft_wrap=True)
+        told.setdefault("; ".join(notes), []).append(scene)
+    for note, scenes in told.items():
+        console.print(f"note: {', '.join(scenes)}: {note}", markup=False, highlight=False, soft_wrap=True)
     if outcome.unscored:
-        scenes = ", ".join(outcome.unscored)
-        console.print(f"note: no truth to score against: {scenes}", markup=False, highlight=False, soft_wrap=True)
+        unscored = ", ".join(outcome.unscored)
+        console.print(f"note: no truth to score against: {unscored}", markup=False, highlight=False, soft_wrap=True)
     if outcome.reused:
         console.print(f"predictions re-used: {len(outcome.reused)} (overwrite=true makes them anew)", highlight=False)
     console.print(f"results: {folder}", markup=False, highlight=False, soft_wrap=True)

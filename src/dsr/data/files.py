@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
 import math
 import os
 import re
-from collections.abc import Iterator
+import threading
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -214,7 +213,7 @@ def read_pixels(path: Path, flags: int) -> np.ndarray:
     """
     content = _content(path)
     try:
-        with _quiet_stderr():
+        with _QUIET_STDERR:
             pixels = cv2.imdecode(np.frombuffer(content, np.uint8), flags) if content else None
     except cv2.error:
         pixels = None
@@ -223,14 +222,29 @@ def read_pixels(path: Path, flags: int) -> np.ndarray:
     return pixels
 
 
-@contextlib.contextmanager
-def _quiet_stderr() -> Iterator[None]:
-    """Keep the decoders' own messages (libpng, OpenCV) off the terminal: our one line says it all."""
-    kept = os.dup(2)
-    with open(os.devnull, "wb") as nowhere:  # noqa: PTH123 - a device
-        os.dup2(nowhere.fileno(), 2)
-    try:
-        yield
-    finally:
-        os.dup2(kept, 2)
-        os.close(kept)
+class _QuietStderr:
+    """Keeps the decoders' own messages (libpng, OpenCV) off the terminal: our one line says it all.
+
+    Threads that decode at the same time share one silence: the first begins it and the last ends it.
+    """
+
+    def __init__(self) -> None:
+        self._lock, self._within, self._kept = threading.Lock(), 0, -1
+
+    def __enter__(self) -> None:
+        with self._lock:
+            if not self._within:
+                self._kept = os.dup(2)
+                with open(os.devnull, "wb") as nowhere:  # noqa: PTH123 - a device
+                    os.dup2(nowhere.fileno(), 2)
+            self._within += 1
+
+    def __exit__(self, *_: object) -> None:
+        with self._lock:
+            self._within -= 1
+            if not self._within:
+                os.dup2(self._kept, 2)
+                os.close(self._kept)
+
+
+_QUIET_STDERR = _QuietStderr()
