@@ -12,6 +12,7 @@ import pytest
 BENCHMARKS = Path(__file__).resolve().parents[2] / "benchmarks"
 SMALL = {
     "train_speed.py": (("--patch", "32", "--batch", "2", "--steps", "1"), 3),
+    "prepare_speed.py": (("--scenes", "2", "--height", "160", "--width", "240"), 2),
     "dip_speed.py": (("--size", "64", "--steps", "1", "--quality-steps", "2"), 4),
 }
 """Arguments, and how many ratios are printed."""
