@@ -307,7 +307,7 @@ def test_help_has_examples(arguments, capsys):
 def test_the_doctor_s_exit_code_is_the_command_s(tmp_path, monkeypatch):
     doctor = types.ModuleType("dsr.doctor")
     seen = []
-    doctor.examine_directory = lambda path: seen.append(path) or 3
+    doctor.examine_directory = lambda *given: seen.append(given) or 3
     monkeypatch.setitem(sys.modules, "dsr.doctor", doctor)
     assert cli.main(["doctor", str(tmp_path)]) == 3
-    assert seen == [tmp_path]
+    assert seen == [(tmp_path, None)]
