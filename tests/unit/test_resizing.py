@@ -75,6 +75,27 @@ def test_a_scene_keeps_its_normals_and_disparities_scale_with_the_size():
     )  # fmt: skip
 
 
+def sphere_depth(camera):
+    """Return the exact depth of a sphere of 0.4 m around (0, 0, 2), and of a wall 2.5 m away beside it."""
+    rays = camera.rays()
+    square, along = rays.square().sum(dim=0), 2 * rays[2]
+    root = along.square() - square * (4 - 0.16)
+    return torch.where(root > 0, (along - root.clamp(min=0).sqrt()) / square, 2.5)[None]
+
+
+@pytest.mark.parametrize("size", [(120, 180), (200, 300), (480, 720), (520, 780)])
+def test_a_curved_surface_is_where_it_was(size):
+    camera = Camera(720, 480, 640.0, 640.0, 350.0, 244.0)
+    small = resized(scene(sphere_depth(camera), camera), *size)
+    truth = sphere_depth(small.camera)
+    inner = (truth < 1.7) & (small.depth < 1.7)  # the sphere but for its rim
+    assert inner.double().mean() > 0.05
+    torch.testing.assert_close(small.depth[inner], truth[inner], rtol=2e-4, atol=0)
+    normals, exact = (normals_of(depth[None], small.camera.rays()[None]) for depth in (small.depth, truth))
+    angle = (normals * exact).sum(dim=1).clamp(-1, 1).arccos().rad2deg()
+    assert float(angle[0][inner[0]].quantile(0.95)) < 1.0
+
+
 def test_a_crop_sees_the_same_points():
     whole = scene(plane_depth(CAMERA))
     part = cropped(whole, 7, 11, 30, 40)

@@ -181,7 +181,8 @@ def _number(path: Path, key: str, text: str) -> float:
     except ValueError:
         value = np.nan
     if not np.isfinite(value) or (key in ("width", "height") and not value.is_integer()):
-        raise ValueError(f"{path}: {key}: expected a number, got {text:.40}")
+        came = "".join(letter for letter in text if letter.isprintable())
+        raise ValueError(f"{path}: {key}: expected a number, got {came:.40}")
     return value
 
 
