@@ -174,14 +174,22 @@ def test_frames_get_other_names(files):
     assert records["first"].load().name == "first"
 
 
-def test_files_of_folders_count_and_very_large_ones_by_size_and_time(files, monkeypatch, tmp_path):
+def test_all_files_of_a_folder_count_and_very_large_ones_by_size_and_time(files, monkeypatch, tmp_path):
     folder = tmp_path / "set"
-    [record] = records_of({"all": (folder, 3)}, frame, "things").values()
-    assert [path.name for path in record.files] == ["a.txt", "b.txt", "c.txt"]
+    place = Place(folder, "things")
+    data = Native("things", place, records_of({"all": (folder, 3)}, frame, "things"), ["all"], None, Preparation(48))
+    before = data.content("all")
+    files["deep/c"][0].write_text("4")
+    assert data.content("all") != before
     monkeypatch.setattr(module, "_HASHED_WHOLE", 0)
     path = files["a"][0]
     path.write_text("12345")
     assert module.content_hash(path) == f"a.txt 5 {path.stat().st_mtime_ns}"
+
+
+def test_the_code_that_reads_and_resizes_is_there_to_be_hashed():
+    package = Path(module.__file__).parents[1]
+    assert all((package / name).exists() for name in module._READING_CODE)
 
 
 @pytest.mark.parametrize(

@@ -25,7 +25,10 @@ from dsr.data.resizing import fitted
 from dsr.sample import Scene
 
 _SMALLEST = 32
-_READING_CODE = ("resizing.py", "filling.py", "terraces.py", "native.py", "files.py", "formats")
+_READING_CODE = (
+    "geometry/camera.py", "data/resizing.py", "data/filling.py", "data/terraces.py", "data/native.py", "data/files.py",
+    "data/formats",
+)  # fmt: skip
 _HASHED_WHOLE = 1 << 28
 """Bytes; of a larger file the name, the size and the time of its last change stand for the content."""
 
@@ -35,7 +38,7 @@ class Record:
     """A scene on disk.
 
     Args:
-        files: all that it is read from.
+        files: all that it is read from; a folder for all that is in it.
         load: reads it at its own size.
         part: how the files are read.
         note: what somebody who reads its scores should know; empty for nothing.
@@ -65,7 +68,7 @@ def records_of(
     records = {}
     for frame, arguments in frames.items():
         name = frame.replace("/", "_")
-        files = tuple(file for path in arguments if isinstance(path, Path) for file in _files_of(path))
+        files = tuple(path for path in arguments if isinstance(path, Path))
         which = json.dumps([each for each in arguments if not isinstance(each, Path)])
         read = functools.partial(load, *arguments, dataset, name, **settings)
         records[name] = Record(files, read, json.dumps(settings), frame=which)
@@ -221,7 +224,8 @@ class Native:
         record = self._found[scene]
         digest = hashlib.sha256(record.frame.encode())
         for path in record.files:
-            digest.update(content_hash(path).encode())
+            for file in _files_of(path):
+                digest.update(content_hash(file).encode())
         return digest.hexdigest()
 
     def prepare(self, scenes: Sequence[str]) -> Iterator[str]:
@@ -285,9 +289,9 @@ def content_hash(path: Path) -> str:
 def _rules_hash() -> str:
     """Return a hash of the code that reads and resizes."""
     digest = hashlib.sha256()
-    folder = Path(__file__).parent
+    package = Path(__file__).parents[1]
     for name in _READING_CODE:
-        path = folder / name
+        path = package / name
         for file in [path] if path.is_file() else sorted(path.rglob("*.py")):
             digest.update(file.read_bytes())
     return digest.hexdigest()
