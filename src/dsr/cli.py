@@ -54,8 +54,7 @@ folder of its data set:
   URL/middlebury2014/Vintage-perfect/im0.png
   URL/sunrgbd/SUNRGBD.zip
   URL/icl_nuim/office_room_traj0_frei_png.tar.gz
-An archive that you put there by hand is used instead of being fetched. Either way it is removed once it is unpacked,
-unless --keep-archives says otherwise.
+An archive that you put there by hand is used instead of being fetched, and kept.
 """
 
 

@@ -510,13 +510,14 @@ def test_an_archive_is_kept_when_that_is_asked_for(server, tmp_path):
     assert (tmp_path / "set/s.zip").read_bytes() == PACKED["s.zip"]
 
 
-def test_an_archive_that_lies_there_is_used(server, tmp_path):
+def test_an_archive_that_lies_there_is_used_and_kept(server, tmp_path):
     item = archive(server, "s.zip", PACKED["s.zip"])
     (tmp_path / "set").mkdir()
     (tmp_path / "set/s.zip").write_bytes(PACKED["s.zip"])
     assert fetched(item, tmp_path) == []
     assert server.log == []
     assert (tmp_path / "set/room/rgb/1.png").read_bytes() == PNG
+    assert (tmp_path / "set/s.zip").read_bytes() == PACKED["s.zip"]
 
 
 def test_what_was_unpacked_and_lost_is_fetched_again(server, tmp_path):

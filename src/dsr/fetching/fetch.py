@@ -30,7 +30,7 @@ class Options:
     Args:
         mirror: address of a server to try first; it has each file under its path below the directory of the data sets.
         accept_changed: whether a file may have another checksum than recorded.
-        keep_archives: whether archives stay after they were unpacked.
+        keep_archives: whether archives stay after they were unpacked; those that were there before do anyway.
 
     """
 
@@ -92,12 +92,15 @@ class _Job:
             return
         if lack(item, self.root, entry) is None:
             return
-        digest = self._digest(item, target, str(target)) if target.is_file() else self._fetch(item)
+        given = target.is_file()
+        digest = self._digest(item, target, str(target)) if given else self._fetch(item)
         with self.watcher.transfer(f"unpacking {item.path}") as moved:
             files = unpack(target, self.root / item.unpack_to, moved, item.contains)
         self.checksums.update({item.path: Entry(digest, target.stat().st_size, files)})
         self.watcher.say(f"{item.path}: {megabytes(target.stat().st_size)}, unpacked to {len(files)} files")
-        if not self.options.keep_archives:
+        if given:
+            self.watcher.say(f"{item.path}: was there before and is kept; it is not needed any more")
+        elif not self.options.keep_archives:
             target.unlink()
 
     def _is_good(self, item: Item) -> bool:
