@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+import threading
+from collections.abc import Callable, Iterator
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -36,3 +39,35 @@ def shared() -> Path:
             pytest.fail(message)
         pytest.skip(message)
     return folder
+
+
+class QuietServer(ThreadingHTTPServer):
+    """A server that says nothing of clients that hang up, as interrupted ones do; ``url`` is its address."""
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """Say nothing."""
+
+    @property
+    def url(self) -> str:
+        """The address to ask."""
+        return f"http://127.0.0.1:{self.server_address[1]}"
+
+
+@pytest.fixture
+def serve(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[type[BaseHTTPRequestHandler]], QuietServer]]:
+    """Return what starts a server of this machine with a handler; it ends with the test."""
+    monkeypatch.setenv("NO_PROXY", "127.0.0.1")
+    running: list[tuple[QuietServer, threading.Thread]] = []
+
+    def start(handler: type[BaseHTTPRequestHandler]) -> QuietServer:
+        server = QuietServer(("127.0.0.1", 0), handler)
+        thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01})
+        thread.start()
+        running.append((server, thread))
+        return server
+
+    yield start
+    for server, thread in running:
+        server.shutdown()
+        thread.join()
+        server.server_close()

@@ -12,16 +12,12 @@ from rich.console import Console
 from rich.table import Table
 
 from dsr.fetching.catalogue import CATALOGUE, Collection, find
-from dsr.fetching.display import Display, show
+from dsr.fetching.display import Display
 from dsr.fetching.download import megabytes
 from dsr.fetching.fetch import Options, get
 from dsr.fetching.inventory import absent, state, verify
 from dsr.fetching.place import data_root
-
-USAGE_ERROR = 2
-INTERRUPTED = 130
-_LOG_WIDTH = 110
-"""Columns of a table where the output is not a terminal."""
+from dsr.terminal import INTERRUPTED, USAGE_ERROR, one_line, open_console, print_error, show
 
 _EXAMPLES = """\
 examples:
@@ -67,20 +63,18 @@ def main(arguments: Sequence[str] | None = None, catalogue: Mapping[str, Collect
 
     """
     options = _parser().parse_args(arguments)
-    console, errors = Console(), Console(stderr=True)
-    if not console.is_terminal:
-        console = Console(width=_LOG_WIDTH)
+    console = open_console()
     try:
         problems = options.run(options, console, CATALOGUE if catalogue is None else catalogue)
     except KeyboardInterrupt:
-        show(errors, "interrupted; what has come so far is kept, the same command goes on from there")
+        show(Console(stderr=True), "interrupted; what has come so far is kept, the same command goes on from there")
         return INTERRUPTED
     except (ValueError, OSError) as error:
-        problems = [" ".join(str(error).split())]
+        problems = [one_line(error)]
     if isinstance(problems, int):
         return problems
     for problem in problems:
-        show(errors, f"error: {problem}")
+        print_error(problem)
     return USAGE_ERROR if problems else 0
 
 

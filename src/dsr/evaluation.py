@@ -28,6 +28,7 @@ from dsr.methods.base import Upsampler
 from dsr.noise import Noise
 from dsr.quality.scores import WORST, Metric, score_image
 from dsr.sample import DepthSample
+from dsr.terminal import one_line
 
 SCORE_COLUMNS = (
     "dataset",
@@ -235,11 +236,6 @@ def load_prediction(path: Path) -> Tensor:
         return torch.from_numpy(read_arrays(path)["depth"])[None]
     except (OSError, KeyError, ValueError, TypeError) as error:
         raise ValueError(f"{path}: expected a prediction, got a missing or damaged file") from error
-
-
-def one_line(error: BaseException) -> str:
-    """Return an error's message on one line."""
-    return " ".join(str(error).split()) or type(error).__name__
 
 
 def _failure(scene: str, error: BaseException) -> str:

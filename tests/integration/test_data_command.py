@@ -10,7 +10,7 @@ import sys
 import threading
 import time
 import types
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from http.server import BaseHTTPRequestHandler
 
 import pytest
 
@@ -54,29 +54,15 @@ class Mirror(BaseHTTPRequestHandler):
         pass
 
 
-class QuietServer(ThreadingHTTPServer):
-    def handle_error(self, request, client_address):
-        """Say nothing of clients that hang up, as interrupted ones do."""
-
-
 @pytest.fixture
-def mirror(monkeypatch):
-    monkeypatch.setenv("NO_PROXY", "127.0.0.1")
+def mirror(monkeypatch, serve):
     monkeypatch.setattr(download, "PAUSES", (0.0,))
-    with QuietServer(("127.0.0.1", 0), Mirror) as server:
-        server.files, server.log, server.go_on = (
-            {f"/{name}": PNG + name.encode() for name in NAMES},
-            [],
-            threading.Event(),
-        )
-        server.go_on.set()
-        server.url = f"http://127.0.0.1:{server.server_address[1]}"
-        thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01})
-        thread.start()
-        yield server
-        server.go_on.set()
-        server.shutdown()
-        thread.join()
+    server = serve(Mirror)
+    server.files = {f"/{name}": PNG + name.encode() for name in NAMES}
+    server.log, server.go_on = [], threading.Event()
+    server.go_on.set()
+    yield server
+    server.go_on.set()
 
 
 @pytest.fixture

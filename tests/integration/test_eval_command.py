@@ -325,7 +325,10 @@ USAGE_ERRORS = {
     "an unknown scene": (["dataset.scenes=[mars]"], "dataset.scenes: 'mars' is not there; expected some of cube"),
     "no scene at all": (["dataset.scenes=[]"], "dataset.scenes: expected names, each once, or null for all"),
     "a scene twice": (["dataset.scenes=[statue,statue]"], "dataset.scenes: expected names, each once"),
-    "a scene without a list": (["dataset.scenes=statue"], "dataset.scenes: expected a list of text or one of found"),
+    "a scene without a list": (
+        ["dataset.scenes=statue"],
+        "dataset.scenes: expected a list of text or one of found or null, got",
+    ),
     "no weights": (["method=msg_v", "scale=16"], "weights: dsr comes with "),
     "a mixture": (["dataset=mixture"], "dataset=mixture: several data sets are for training; name one of them"),
     "a noise that cannot be": (["noise=gaussian_multiplicative", "noise.std=2"], "noise.std: expected a number above"),
@@ -368,7 +371,8 @@ def test_the_help_lists_the_choices(within):
     code, output, errors = within("--help")
     assert (code, errors) == (0, [])
     for line in (
-        "dataset: folder, icl, middlebury, middlebury2001",
+        "dataset: folder, icl, middlebury, middlebury2001, middlebury2003, middlebury2005, middlebury2006, "
+        "middlebury_train, mixture, nyu, paper_train, procedural, simgeo, sintel, sunrgbd, tartanair, tofmark",
         "method: bicubic, bilinear, dip, dip_v, dip_v_warm, facets, msg, msg_v",
     ):
         assert line in output

@@ -9,10 +9,9 @@ import os
 import shutil
 import socket
 import tarfile
-import threading
 import zipfile
 from collections import namedtuple
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from http.server import BaseHTTPRequestHandler
 from pathlib import Path
 
 import pytest
@@ -67,24 +66,13 @@ class Handler(BaseHTTPRequestHandler):
         pass
 
 
-class QuietServer(ThreadingHTTPServer):
-    def handle_error(self, request, client_address):
-        """Say nothing of clients that hang up, as interrupted ones do."""
-
-
 @pytest.fixture
-def server(monkeypatch):
-    monkeypatch.setenv("NO_PROXY", "127.0.0.1")
+def server(monkeypatch, serve):
     monkeypatch.setattr(download, "PAUSES", (0.0, 0.0))
-    with QuietServer(("127.0.0.1", 0), Handler) as running:
-        running.files, running.states, running.cuts, running.log = {"/a.png": PNG}, [], [], []
-        running.ranges, running.marks, running.headers = True, {"ETag": '"1"'}, {}
-        running.url = f"http://127.0.0.1:{running.server_address[1]}"
-        thread = threading.Thread(target=running.serve_forever, kwargs={"poll_interval": 0.01})
-        thread.start()
-        yield running
-        running.shutdown()
-        thread.join()
+    running = serve(Handler)
+    running.files, running.states, running.cuts, running.log = {"/a.png": PNG}, [], [], []
+    running.ranges, running.marks, running.headers = True, {"ETag": '"1"'}, {}
+    return running
 
 
 class Watcher:

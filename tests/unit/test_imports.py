@@ -7,7 +7,8 @@ import pytest
 
 SOURCE = Path(__file__).resolve().parents[2] / "src"
 LAYERS = (
-    ("dsr.atomic",),
+    ("dsr.atomic", "dsr.hashing", "dsr.terminal"),
+    ("dsr.fetching",),
     ("dsr.geometry.camera",),
     ("dsr.sample", "dsr.holes", "dsr.noise", "dsr.geometry.surface", "dsr.geometry.shading"),
     ("dsr.degrade", "dsr.geometry.comparison"),
@@ -15,7 +16,7 @@ LAYERS = (
     ("dsr.quality.lpips",),
     ("dsr.quality.scores",),
     ("dsr.quality.metrics", "dsr.quality.losses"),
-    ("dsr.data", "dsr.methods", "dsr.fetching"),
+    ("dsr.data", "dsr.methods"),
     ("dsr.objective",),
     ("dsr.fitting",),
     ("dsr.evaluation", "dsr.training", "dsr.prior", "dsr.doctor"),

@@ -9,8 +9,9 @@ from omegaconf import OmegaConf
 
 import dsr
 from dsr.app import rundir
-from dsr.app.rundir import claim, code_hash, default_directory, file_hash, identity_of, versions
+from dsr.app.rundir import claim, code_hash, default_directory, identity_of, versions
 from dsr.app.schema import ConfigError
+from dsr.hashing import file_hash
 
 CPU = torch.device("cpu")
 

@@ -15,9 +15,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from dsr.app.schema import ConfigError, register
-
-USAGE_ERROR = 2
-INTERRUPTED = 130
+from dsr.terminal import INTERRUPTED, USAGE_ERROR, print_error
 
 
 def run_command(conf: Path, name: str, command: Callable[[DictConfig], Any]) -> None:
@@ -55,11 +53,6 @@ def run_command(conf: Path, name: str, command: Callable[[DictConfig], Any]) -> 
         fail(explain(error, conf, name))
     if failures:
         sys.exit(USAGE_ERROR)
-
-
-def print_error(message: str) -> None:
-    """Print one line on stderr."""
-    print(f"error: {' '.join(message.split())}", file=sys.stderr, flush=True)  # noqa: T201
 
 
 def fail(message: str) -> None:

@@ -25,6 +25,7 @@ from dsr.app.runs import studies_of_run
 from dsr.app.schema import ConfigError, EvalConfig, given_keys, plain_config
 from dsr.data.base import SceneSource
 from dsr.evaluation import Outcome, StalePredictionError, Study, predict, score
+from dsr.hashing import file_hash
 from dsr.methods.trained import packaged_names, packaged_weights
 from dsr.prior.method import WORKSPACE
 from dsr.quality.lpips import LPIPS
@@ -33,9 +34,7 @@ from dsr.quality.scores import catalogue
 from dsr.report.pictures import save_picture
 from dsr.report.tables import score_table
 from dsr.sample import DepthSample
-
-_LOG_WIDTH = 110
-"""Columns of the table where the output is not a terminal."""
+from dsr.terminal import open_console, print_error, show
 
 
 def evaluate(config: DictConfig) -> pd.DataFrame:
@@ -63,14 +62,12 @@ def evaluate(config: DictConfig) -> pd.DataFrame:
 def _evaluate(plain: dict[str, Any], source: SceneSource | None) -> pd.DataFrame:
     """Evaluate on ``source``, or on the data set that the configuration describes."""
     settings = EvalConfig.of(plain)
-    console = Console()
-    if not console.is_terminal:
-        console = Console(width=_LOG_WIDTH)
+    console = open_console()
     device = pick_device(settings.device)
     plain = {**plain, "precision": _precision(settings, device)}
     settings.precision = plain["precision"]
     weights = _weights(settings)
-    identity = rundir.identity_of(plain, None if weights is None else rundir.file_hash(weights), device)
+    identity = rundir.identity_of(plain, None if weights is None else file_hash(weights), device)
     folder = Path(settings.output_dir or rundir.default_directory("eval", plain, identity)).expanduser()
     display = Display(console)
     given = {"device": device, "weights": weights, "workspace": folder, "display": display}
@@ -236,12 +233,12 @@ def _report(console: Console, folder: Path, scores: pd.DataFrame, label: str, ou
     for scene, notes in outcome.notes.items():
         told.setdefault("; ".join(notes), []).append(scene)
     for note, scenes in told.items():
-        console.print(f"note: {', '.join(scenes)}: {note}", markup=False, highlight=False, soft_wrap=True)
+        show(console, f"note: {', '.join(scenes)}: {note}")
     if outcome.unscored:
         unscored = ", ".join(outcome.unscored)
-        console.print(f"note: no truth to score against: {unscored}", markup=False, highlight=False, soft_wrap=True)
+        show(console, f"note: no truth to score against: {unscored}")
     if outcome.reused:
         console.print(f"predictions re-used: {len(outcome.reused)} (overwrite=true makes them anew)", highlight=False)
-    console.print(f"results: {folder}", markup=False, highlight=False, soft_wrap=True)
+    show(console, f"results: {folder}")
     for message in outcome.failures.values():
-        print(f"error: {message}", file=sys.stderr)  # noqa: T201
+        print_error(message)

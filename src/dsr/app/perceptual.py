@@ -7,8 +7,8 @@ import sys
 from pathlib import Path
 
 from dsr.app.schema import ConfigError
-from dsr.evaluation import one_line
 from dsr.quality.lpips import LPIPS, TRUNK_URL, load_lpips
+from dsr.terminal import one_line
 
 
 @functools.cache

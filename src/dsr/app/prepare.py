@@ -18,6 +18,7 @@ from dsr.app.schema import ConfigError, plain_config, register
 from dsr.data.base import SceneSource
 from dsr.report.sheets import save_contact_sheet
 from dsr.sample import Scene
+from dsr.terminal import one_line, show
 
 
 def prepare_dataset(name: str, overrides: Sequence[str], console: Console) -> None:
@@ -43,7 +44,7 @@ def prepare_dataset(name: str, overrides: Sequence[str], console: Console) -> No
     for path in before - set(pages):
         path.unlink()
     for path in pages:
-        console.print(f"contact sheet: {path}", markup=False, highlight=False, soft_wrap=True)
+        show(console, f"contact sheet: {path}")
     if failures:
         lines = "; ".join(failures.values())
         raise ConfigError(f"{len(failures)} of {len(source.scenes())} scenes cannot be read: {lines}")
@@ -77,4 +78,4 @@ def _loaded(source: SceneSource, names: Iterator[str], failures: dict[str, str])
         try:
             yield source.load(name)
         except (ValueError, OSError) as error:
-            failures[name] = " ".join(str(error).split())
+            failures[name] = one_line(error)

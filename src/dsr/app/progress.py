@@ -13,6 +13,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from dsr.data.base import Prepared, SceneSource
 from dsr.fitting import scores_line
+from dsr.terminal import show
 
 
 def bar(console: Console) -> Progress:
@@ -60,7 +61,7 @@ class Display:
 
     def say(self, line: str) -> None:
         """Show a line, above the bars if there are any."""
-        self._console.print(line, markup=False, highlight=False, soft_wrap=True)
+        show(self._console, line)
 
     @contextlib.contextmanager
     def steps(self, name: str, total: int, done: int) -> Iterator[Callable[[int, str], None]]:

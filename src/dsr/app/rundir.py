@@ -18,6 +18,7 @@ from omegaconf import OmegaConf
 import dsr
 from dsr.app.schema import ConfigError
 from dsr.atomic import write_text
+from dsr.hashing import hash_of_code
 
 _PACKAGES = (
     "dsr", "hydra-core", "lightning", "numpy", "omegaconf", "opencv-python-headless",
@@ -112,19 +113,7 @@ def versions() -> dict[str, Any]:
 @functools.cache
 def code_hash() -> str:
     """Return a hash of the code that makes predictions, so that those of older code are not taken for new ones."""
-    package = Path(dsr.__file__).parent
-    digest = hashlib.sha256()
-    for name in _PREDICTING_CODE:
-        path = package / name
-        for file in [path] if path.is_file() else sorted(path.rglob("*.py")):
-            digest.update(file.relative_to(package).as_posix().encode() + b"\0" + file.read_bytes())
-    return digest.hexdigest()[:16]
-
-
-def file_hash(path: Path) -> str:
-    """Return the SHA-256 of a file."""
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
+    return hash_of_code(_PREDICTING_CODE)[:16]
 
 
 def _changes(before: Mapping[str, Any], now: Mapping[str, Any], prefix: str = "") -> list[str]:

@@ -29,6 +29,7 @@ from dsr.methods.trained import NETWORKS
 from dsr.methods.weights import load_network, save_network
 from dsr.objective import Objective, balanced_weight
 from dsr.quality.metrics import visual_metrics
+from dsr.terminal import show
 from dsr.training import Schedule, SuperResolution
 
 _PATCHES_FOR_W = 64
@@ -92,7 +93,7 @@ def train(config: DictConfig) -> Path:
         ) from None
     if trainer.is_global_zero:
         _export(module, Path(best.best_model_path), weights, facts)
-    console.print(f"weights: {weights}", markup=False, highlight=False, soft_wrap=True)
+    show(console, f"weights: {weights}")
     return weights
 
 
@@ -183,7 +184,7 @@ def _announce(
         "log": f"tensorboard --logdir {folder}",
     }
     for name, line in lines.items():
-        console.print(f"{name:<6} {line}", markup=False, highlight=False, soft_wrap=True)
+        show(console, f"{name:<6} {line}")
 
 
 def _describe(trainer: lightning.Trainer, plain: Mapping[str, Any], module: SuperResolution) -> None:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 from dsr.data.base import Wanted
 from dsr.data.formats import nyu, tartanair
-from dsr.data.native import Native, Place, Preparation, data_folder, listed, records_of
+from dsr.data.native import Native, Preparation, listed, records_of
 
 
 class TartanAir(Native):
@@ -30,11 +32,10 @@ class TartanAir(Native):
         crop: float = 0.5,
         farthest: float = tartanair.FARTHEST,
     ) -> None:
-        folder = data_folder(root)
+        folder = Path(root).expanduser()
         frames = listed(tartanair.find_frames, folder)
         found = records_of(frames, tartanair.load_frame, "tartanair", farthest=farthest)
-        place = Place(folder, "tartanair")
-        super().__init__("tartanair", place, found, tuple(found), scenes, Preparation(size, crop))
+        super().__init__("tartanair", folder, found, tuple(found), scenes, Preparation(size, crop))
 
 
 class NYU(Native):
@@ -60,8 +61,8 @@ class NYU(Native):
         crop: float = 0.5,
         filled: bool = False,
     ) -> None:
-        folder = data_folder(root)
+        folder = Path(root).expanduser()
         path = folder / "nyu_depth_v2_labeled.mat"
         frames = nyu.find_frames(path) if path.is_file() else {}
         found = records_of(frames, nyu.load_frame, "nyu", filled=filled)
-        super().__init__("nyu", Place(folder, "nyu"), found, tuple(found), scenes, Preparation(size, crop))
+        super().__init__("nyu", folder, found, tuple(found), scenes, Preparation(size, crop))

@@ -8,11 +8,12 @@ theirs are is not; those below are spread over the trajectories, and ``dataset.f
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 from types import MappingProxyType
 
 from dsr.data.base import Wanted
 from dsr.data.formats import icl_nuim
-from dsr.data.native import Native, Place, Preparation, data_folder, listed, records_of, renamed
+from dsr.data.native import Native, Preparation, listed, records_of, renamed
 
 FRAMES = MappingProxyType(
     {
@@ -49,6 +50,6 @@ class ICL(Native):
         crop: float = 0.5,
         frames: Mapping[str, str] = FRAMES,
     ) -> None:
-        folder = data_folder(root)
+        folder = Path(root).expanduser()
         found = renamed(records_of(listed(icl_nuim.find_frames, folder), icl_nuim.load_frame, "icl"), frames)
-        super().__init__("icl", Place(folder, "icl"), found, tuple(FRAMES), scenes, Preparation(size, crop))
+        super().__init__("icl", folder, found, tuple(FRAMES), scenes, Preparation(size, crop))

@@ -12,18 +12,24 @@ from pathlib import Path
 
 from dsr.data.base import Wanted
 from dsr.data.formats import middlebury
-from dsr.data.native import Native, Place, Preparation, Record, data_folder
+from dsr.data.native import Native, Preparation, Record
+from dsr.fetching import catalogue
 
-EVALUATION_2014 = ("vintage", "recycle", "umbrella", "classroom1", "playroom", "backpack", "jadeplant")
+
+def _names(folders: Sequence[str]) -> tuple[str, ...]:
+    """Return the names of scenes, small letters, by their folders' names."""
+    return tuple(name.casefold() for name in folders)
+
+
+EVALUATION_2014 = _names(catalogue.EVALUATION_2014)
 SCENES = {
-    2001: ("barn1", "barn2", "bull", "poster", "sawtooth", "venus"),
-    2003: ("cones", "teddy"),
-    2005: ("art", "books", "dolls", "laundry", "moebius", "reindeer"),
-    2006: (
-        "aloe", "baby1", "baby2", "baby3", "bowling1", "bowling2", "cloth1", "cloth2", "cloth3", "cloth4", "flowerpots",
-        "lampshade1", "lampshade2", "midd1", "midd2", "monopoly", "plastic", "rocks1", "rocks2", "wood1", "wood2",
-    ),
-}  # fmt: skip
+    2001: _names(catalogue.SCENES_2001),
+    2003: _names(catalogue.SCENES_2003),
+    2005: _names(catalogue.SCENES_2005),
+    2006: _names(catalogue.SCENES_2006),
+}
+TRAINING_2014 = _names(catalogue.TRAINING_2014)
+_WITHOUT_OFFSET = "depth is not metric: the disparity offset is left out, as in the paper"
 _FILES_2014 = ("im0.png", "calib.txt", "disp0.pfm", "disp0GT.pfm")
 
 
@@ -52,10 +58,11 @@ class Middlebury(Native):
         fill: Sequence[str] = ("vintage",),
         without_offset: Sequence[str] = ("vintage",),
     ) -> None:
-        folder = data_folder(root)
+        folder = Path(root).expanduser()
         found = records_2014(folder, "middlebury", without_offset)
-        place = Place(folder, "middlebury")
-        super().__init__("middlebury", place, found, EVALUATION_2014, scenes, Preparation(size, crop, fill=tuple(fill)))
+        super().__init__(
+            "middlebury", folder, found, EVALUATION_2014, scenes, Preparation(size, crop, fill=tuple(fill))
+        )
 
 
 class MiddleburyLevels(Native):
@@ -86,10 +93,10 @@ class MiddleburyLevels(Native):
     ) -> None:
         if year not in middlebury.YEARS:
             raise ValueError(f"dataset.year: expected one of {', '.join(map(str, middlebury.YEARS))}, got {year}")
-        folder, name = data_folder(root), f"middlebury{year}"
+        folder, name = Path(root).expanduser(), f"middlebury{year}"
         found = records_levels(folder, name, year, smooth=smooth)
         preparation = Preparation(size, crop, fill=tuple(fill))
-        super().__init__(name, Place(folder, name), found, SCENES[year], scenes, preparation)
+        super().__init__(name, folder, found, SCENES[year], scenes, preparation)
 
 
 def records_2014(folder: Path, dataset: str, without_offset: Collection[str] = ()) -> dict[str, Record]:
@@ -98,8 +105,8 @@ def records_2014(folder: Path, dataset: str, without_offset: Collection[str] = (
         name: Record(
             tuple(path for path in map(place.joinpath, _FILES_2014) if path.is_file()),
             functools.partial(middlebury.load_2014, place, dataset, name, offset=name not in without_offset),
-            "without offset" if name in without_offset else "",
-            "depth is not metric: the disparity offset is left out, as in the paper" if name in without_offset else "",
+            settings="without offset" if name in without_offset else "",
+            note=_WITHOUT_OFFSET if name in without_offset else "",
         )
         for name, place in middlebury.find_2014(folder).items()
     }
@@ -111,8 +118,8 @@ def records_levels(folder: Path, dataset: str, year: int, *, smooth: bool = True
         name: Record(
             tuple(path for path in (files.photo, files.disparity, files.shift, *files.measured.values()) if path),
             functools.partial(middlebury.load_levels, files, dataset, name, year, smooth=smooth),
-            "" if smooth else "terraces",
-            middlebury.shortcoming(files, year),
+            settings="" if smooth else "terraces",
+            note=middlebury.shortcoming(files, year),
         )
         for name, files in middlebury.find_levels(folder).items()
     }

@@ -22,6 +22,7 @@ from dsr.data.base import Wanted, chosen
 from dsr.data.filling import filled_depth
 from dsr.data.rendering import Rendering, cache_directory, cached
 from dsr.data.resizing import fitted
+from dsr.hashing import file_hash, hash_of_code
 from dsr.sample import Scene
 
 _SMALLEST = 32
@@ -40,17 +41,17 @@ class Record:
     Args:
         files: all that it is read from; a folder for all that is in it.
         load: reads it at its own size.
-        part: how the files are read.
-        note: what somebody who reads its scores should know; empty for nothing.
         frame: which part of the files it is, where they hold several scenes.
+        settings: how the files are read.
+        note: what somebody who reads its scores should know; empty for nothing.
 
     """
 
     files: tuple[Path, ...]
     load: Callable[[], Scene]
-    part: str = ""
-    note: str = ""
     frame: str = ""
+    settings: str = ""
+    note: str = ""
 
 
 def records_of(
@@ -71,7 +72,7 @@ def records_of(
         files = tuple(path for path in arguments if isinstance(path, Path))
         which = json.dumps([each for each in arguments if not isinstance(each, Path)])
         read = functools.partial(load, *arguments, dataset, name, **settings)
-        records[name] = Record(files, read, json.dumps(settings), frame=which)
+        records[name] = Record(files, read, which, json.dumps(settings))
     return records
 
 
@@ -136,31 +137,12 @@ class Preparation:
         return scene
 
 
-@dataclass(frozen=True)
-class Place:
-    """Where a data set was looked for, for messages.
-
-    Args:
-        root: the directory.
-        collection: what ``dsr data get`` calls it.
-
-    """
-
-    root: Path
-    collection: str
-
-    @property
-    def remedy(self) -> str:
-        """What to do where something is missing."""
-        return f"get it with: dsr data get {self.collection}; or say where it is: dataset.root=DIR"
-
-
 class Native:
     """A data set in its own format; the base of those in this package.
 
     Args:
-        name: as in ``scores.csv``.
-        place: where it was looked for.
+        name: as in ``scores.csv``, and what ``dsr data get`` calls it.
+        folder: where it was looked for.
         found: the scenes on disk.
         named: the scenes that belong to the data set.
         wanted: the scenes to use.
@@ -176,22 +158,23 @@ class Native:
     def __init__(
         self,
         name: str,
-        place: Place,
+        folder: Path,
         found: Mapping[str, Record],
         named: Sequence[str],
         wanted: Wanted,
         preparation: Preparation,
     ) -> None:
         self.name = name
+        remedy = f"get it with: dsr data get {name}; or say where it is: dataset.root=DIR"
         if not found:
-            there = "no scene of it" if place.root.is_dir() else "no such directory"
-            raise ValueError(f"dataset={name}: expected its files in {place.root}, got {there}; {place.remedy}")
+            there = "no scene of it" if folder.is_dir() else "no such directory"
+            raise ValueError(f"dataset={name}: expected its files in {folder}, got {there}; {remedy}")
         if wanted is None:
             missing = [scene for scene in named if scene not in found]
             if missing:
                 raise ValueError(
-                    f"dataset={name}: expected {', '.join(missing)} in {place.root}, got {len(named) - len(missing)} "
-                    f"of {len(named)} scenes; {place.remedy}; or use what is there: dataset.scenes=found"
+                    f"dataset={name}: expected {', '.join(missing)} in {folder}, got {len(named) - len(missing)} "
+                    f"of {len(named)} scenes; {remedy}; or use what is there: dataset.scenes=found"
                 )
             wanted = named
         self._scenes = chosen(list(found), wanted)
@@ -216,7 +199,7 @@ class Native:
     def fingerprint(self, scene: str) -> str:
         """Return the SHA-256 of the scene's files and of what is done to them."""
         plain = asdict(replace(self._preparation, fill=()))
-        settings = json.dumps([self._found[scene].part, scene in self._preparation.fill, plain])
+        settings = json.dumps([self._found[scene].settings, scene in self._preparation.fill, plain])
         return hashlib.sha256(f"{settings}{self.content(scene)}".encode()).hexdigest()
 
     def content(self, scene: str) -> str:
@@ -234,8 +217,9 @@ class Native:
         A scene that fails is yielded, too; loading it says why.
         """
         with ThreadPoolExecutor(min(len(scenes), os.cpu_count() or 1) or 1) as pool:
-            jobs = {pool.submit(self.load, scene): scene for scene in scenes if not self._is_ready(scene)}
-            yield from (scene for scene in scenes if scene not in jobs.values())
+            ready = {scene: self._is_ready(scene) for scene in scenes}
+            jobs = {pool.submit(self.load, scene): scene for scene in scenes if not ready[scene]}
+            yield from (scene for scene in scenes if ready[scene])
             try:
                 for job in as_completed(jobs):
                     yield jobs[job]
@@ -254,11 +238,6 @@ class Native:
         return Path("prepared", self.name, f"{scene.replace('/', '_')}-{key}.npz")
 
 
-def data_folder(root: str) -> Path:
-    """Return a data set's directory as a path."""
-    return Path(root).expanduser()
-
-
 def listed(find: Callable[..., Mapping[str, tuple[Any, ...]]], folder: Path, *arguments: Any) -> Mapping[str, Any]:
     """Return what a reader finds in a directory; nothing where there is none."""
     return find(folder, *arguments) if folder.is_dir() else {}
@@ -268,8 +247,7 @@ def listed(find: Callable[..., Mapping[str, tuple[Any, ...]]], folder: Path, *ar
 def _hash_of(path: Path, size: int, changed: int) -> str:
     if size > _HASHED_WHOLE:
         return f"{path.name} {size} {changed}"
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
+    return file_hash(path)
 
 
 def content_hash(path: Path) -> str:
@@ -288,13 +266,7 @@ def content_hash(path: Path) -> str:
 @functools.cache
 def _rules_hash() -> str:
     """Return a hash of the code that reads and resizes."""
-    digest = hashlib.sha256()
-    package = Path(__file__).parents[1]
-    for name in _READING_CODE:
-        path = package / name
-        for file in [path] if path.is_file() else sorted(path.rglob("*.py")):
-            digest.update(file.read_bytes())
-    return digest.hexdigest()
+    return hash_of_code(_READING_CODE)
 
 
 def _rendering(scene: Scene) -> Rendering:

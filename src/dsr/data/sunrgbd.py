@@ -6,11 +6,12 @@ Voynov et al. 2019 evaluate on twelve images and do not say which. Here: three o
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from types import MappingProxyType
 
 from dsr.data.base import Wanted
 from dsr.data.formats import sunrgbd
-from dsr.data.native import Native, Place, Preparation, Record, data_folder, listed, records_of, renamed
+from dsr.data.native import Native, Preparation, Record, listed, records_of, renamed
 
 FRAMES = MappingProxyType(
     {
@@ -60,19 +61,14 @@ class SunRGBD(Native):
     ) -> None:
         if intrinsics is not None and len(intrinsics) != 4:
             raise ValueError(f"dataset.intrinsics: expected fx, fy, cx, cy, got {len(intrinsics)} numbers")
-        folder = data_folder(root)
+        folder = Path(root).expanduser()
         settings = {"refined": refined, "intrinsics": intrinsics and tuple(intrinsics)}
         records = records_of(listed(sunrgbd.find_frames, folder), sunrgbd.load_frame, "sunrgbd", **settings)
         found = renamed(records, {name: _first_below(records, path) for name, path in frames.items()})
-        super().__init__("sunrgbd", Place(folder, "sunrgbd"), found, tuple(FRAMES), scenes, Preparation(size, crop))
+        super().__init__("sunrgbd", folder, found, tuple(FRAMES), scenes, Preparation(size, crop))
 
 
 def _first_below(records: Mapping[str, Record], path: str) -> str:
     """Return the first scene whose name is or begins with a path, below ``SUNRGBD`` or not; the path where none is."""
-    wanted = path.replace("/", "_")
-    beginnings = (wanted, f"SUNRGBD_{wanted}")
-    return next((name for name in sorted(records) if name in beginnings or name.startswith(_under(beginnings))), path)
-
-
-def _under(beginnings: Sequence[str]) -> tuple[str, ...]:
-    return tuple(f"{beginning}_" for beginning in beginnings)
+    beginnings = tuple(f"{above}{path.replace('/', '_')}_" for above in ("", "SUNRGBD_"))
+    return next((name for name in records if f"{name}_".startswith(beginnings)), path)

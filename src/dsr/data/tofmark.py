@@ -11,10 +11,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from pathlib import Path
 
 from dsr.data.base import Wanted
 from dsr.data.formats import tofmark
-from dsr.data.native import Native, Place, Preparation, data_folder, listed, records_of
+from dsr.data.native import Native, Preparation, listed, records_of
 
 SCENES = ("books", "devil", "shark")
 ESTIMATED = (549.2, 549.2, 375.2, 334.3)
@@ -47,7 +48,7 @@ class ToFMark(Native):
         for name, values, count in (("intrinsics", intrinsics, 4), ("depth_range", depth_range, 2)):
             if values is not None and len(values) != count:
                 raise ValueError(f"dataset.{name}: expected {count} numbers, got {len(values)}")
-        folder = data_folder(root)
+        folder = Path(root).expanduser()
         settings = {
             "intrinsics": tuple(intrinsics or ESTIMATED),
             "depth_range": depth_range and tuple(depth_range),
@@ -57,4 +58,4 @@ class ToFMark(Native):
         if intrinsics is None:
             note = "the benchmark has no camera: it is an estimate"
             found = {name: replace(record, note=note) for name, record in found.items()}
-        super().__init__("tofmark", Place(folder, "tofmark"), found, SCENES, scenes, Preparation(None))
+        super().__init__("tofmark", folder, found, SCENES, scenes, Preparation(None))

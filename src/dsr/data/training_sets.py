@@ -8,21 +8,15 @@ the seven that are evaluated on, and 58 frames of Sintel, two or three of each s
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Literal
 
 from dsr.data.base import Wanted
 from dsr.data.formats import sintel
-from dsr.data.middlebury import EVALUATION_2014, SCENES, records_2014, records_levels
-from dsr.data.native import Native, Place, Preparation, Record, data_folder, listed, records_of
+from dsr.data.middlebury import EVALUATION_2014, SCENES, TRAINING_2014, records_2014, records_levels
+from dsr.data.native import Native, Preparation, Record, listed, records_of
 
-MIDDLEBURY = {
-    2001: SCENES[2001],
-    2006: SCENES[2006],
-    2014: (
-        "adirondack", "bicycle1", "cable", "couch", "flowers", "mask", "motorcycle", "piano", "pipes", "playtable",
-        "shelves", "shopvac", "sticks", "storage", "sword1", "sword2",
-    ),
-}  # fmt: skip
+MIDDLEBURY = {2001: SCENES[2001], 2006: SCENES[2006], 2014: TRAINING_2014}
 """Scenes by year."""
 _SINTEL_THIRDS = 12
 """Of so many sequences a third frame is used: 2 x 23 + 12 = 58."""
@@ -56,7 +50,7 @@ class MiddleburyTrain(Native):
     def __init__(
         self, root: str, scenes: Wanted = None, size: int | None = 720, years: Sequence[int] = tuple(MIDDLEBURY)
     ) -> None:
-        name, folder = "middlebury_train", data_folder(root)
+        name, folder = "middlebury_train", Path(root).expanduser()
         found: dict[str, Record] = {}
         for year in years:
             if year not in MIDDLEBURY:
@@ -67,7 +61,7 @@ class MiddleburyTrain(Native):
             found.pop(scene, None)
         named = [scene for year in years for scene in MIDDLEBURY[year]]
         preparation = Preparation(size, crop=None, enlarge=False)
-        super().__init__(name, Place(folder, name), found, named, scenes, preparation)
+        super().__init__(name, folder, found, named, scenes, preparation)
 
 
 class Sintel(Native):
@@ -95,8 +89,8 @@ class Sintel(Native):
         rendering: Literal["clean", "final"] = "clean",
         farthest: float = sintel.FARTHEST,
     ) -> None:
-        folder = data_folder(root)
+        folder = Path(root).expanduser()
         frames = listed(sintel.find_frames, folder, rendering)
         found = records_of(frames, sintel.load_frame, "sintel", farthest=farthest)
         preparation = Preparation(size, crop=None, enlarge=False)
-        super().__init__("sintel", Place(folder, "sintel"), found, sintel_frames(), scenes, preparation)
+        super().__init__("sintel", folder, found, sintel_frames(), scenes, preparation)

@@ -20,8 +20,9 @@ from dsr.doctor.precision import check_precision
 from dsr.doctor.registration import check_registration
 from dsr.doctor.units import check_units
 from dsr.sample import Scene
+from dsr.terminal import USAGE_ERROR, one_line, open_console, print_error
 
-FINE, FAULTY, UNUSABLE = 0, 1, 2
+FINE, FAULTY = 0, 1
 CHECKS: tuple[Callable[[Scene], list[Finding]], ...] = (
     check_units,
     check_intrinsics,
@@ -34,8 +35,6 @@ CHECKS: tuple[Callable[[Scene], list[Finding]], ...] = (
 _COLOURS: dict[Level, str] = {"ok": "green", "note": "cyan", "warning": "yellow", "problem": "bold red"}
 _MANY = 8
 """Scenes beyond which what is in order is left out."""
-_LOG_WIDTH = 110
-"""Columns where the output is not a terminal."""
 
 
 def examine_directory(folder: Path, most: int | None = None) -> int:
@@ -58,13 +57,9 @@ def examine_directory(folder: Path, most: int | None = None) -> int:
             came = "no scene in it" if folder.is_dir() else "no such directory"
             raise ValueError(f"{folder}: expected a scene or a directory of scenes, got {came}")
     except (ValueError, OSError) as error:
-        Console(stderr=True).print(
-            f"error: {' '.join(str(error).split())}", markup=False, highlight=False, soft_wrap=True
-        )
-        return UNUSABLE
-    console = Console()
-    if not console.is_terminal:
-        console = Console(width=_LOG_WIDTH)
+        print_error(str(error))
+        return USAGE_ERROR
+    console = open_console()
     if most is not None and len(scenes) > most:
         console.print(f"{most} of {len(scenes)} scenes, spread over all", highlight=False)
         scenes = [scenes[index * len(scenes) // most] for index in range(most)]
@@ -89,7 +84,7 @@ def _examine(name: str, load: Callable[[], Scene]) -> tuple[str, list[Finding]]:
     try:
         scene = load()
     except (ValueError, OSError) as error:
-        message = f"cannot be read: {' '.join(str(error).split())}"
+        message = f"cannot be read: {one_line(error)}"
         return name, [Finding("files", "problem", message, "repair the file, or describe it as the message says")]
     if scene.depth is None:
         return f"{name} (the map measured at x{min(scene.measured)})", examine(scene)

@@ -11,6 +11,7 @@ from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeR
 
 from dsr.fetching.checksums import Moved
 from dsr.fetching.download import megabytes
+from dsr.terminal import show
 
 _LOG_SECONDS = 30.0
 """Between two lines about one download where the output is not a terminal."""
@@ -80,8 +81,3 @@ class Display:
                 self.say(f"{name}: {megabytes(done)}{whole}, {megabytes(speed)}/s{left}")
 
         yield moved
-
-
-def show(console: Console, line: str) -> None:
-    """Show a line as it is."""
-    console.print(line, markup=False, highlight=False, soft_wrap=True)

@@ -18,6 +18,7 @@ import urllib3
 
 from dsr.atomic import write_text
 from dsr.fetching.checksums import Moved
+from dsr.terminal import one_line
 
 PAUSES = (1.0, 3.0, 9.0)
 """Seconds before each further try where a connection fails."""
@@ -138,7 +139,7 @@ def _transfer(url: str, part: Path, moved: Moved, room: float) -> None:
     except (requests.ConnectionError, requests.Timeout) as error:
         raise _TryAgainError(f"no connection to {urlsplit(url).netloc}", reached=False) from error
     except requests.RequestException as error:
-        raise FetchError(f"{url}: {' '.join(str(error).split())}") from error
+        raise FetchError(f"{url}: {one_line(error)}") from error
     except urllib3.exceptions.HTTPError as error:
         raise _TryAgainError("the connection broke off") from error
 

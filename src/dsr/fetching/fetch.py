@@ -18,6 +18,7 @@ from dsr.fetching.checksums import Checksums, Entry, alone, sha256_of
 from dsr.fetching.download import FetchError, NoSpaceError, UnreachableError, download, megabytes
 from dsr.fetching.inventory import Watcher, compare, expect_kind, lack, record
 from dsr.fetching.unpack import take_member, unpack
+from dsr.terminal import one_line
 
 _UNPACKED = 1.25
 """Size of what an archive of pictures unpacks to, as a multiple of its own: for a first check of the disk."""
@@ -67,7 +68,7 @@ def get(items: Iterable[Item], root: Path, watcher: Watcher, options: Options | 
             except NoSpaceError as error:
                 return [*problems, f"{item.path}: {error}"]
             except (ValueError, OSError) as error:
-                problems.append(f"{item.path}: {' '.join(str(error).split())}")
+                problems.append(f"{item.path}: {one_line(error)}")
     return problems
 
 

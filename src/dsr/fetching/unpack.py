@@ -17,6 +17,7 @@ from typing import IO
 
 from dsr.fetching.checksums import Moved
 from dsr.fetching.download import disk_errors, expect_room
+from dsr.terminal import one_line
 
 _CHUNK = 1 << 20
 _DAMAGE = (zipfile.BadZipFile, tarfile.TarError, EOFError, zlib.error, KeyError, RuntimeError, OSError)
@@ -97,9 +98,7 @@ def _damage(archive: Path) -> Iterator[None]:
     except _DAMAGE as error:
         if isinstance(error, OSError) and error.errno is not None:
             raise
-        raise ValueError(
-            f"{archive}: expected an archive, got a damaged one: {' '.join(str(error).split())}"
-        ) from error
+        raise ValueError(f"{archive}: expected an archive, got a damaged one: {one_line(error)}") from error
 
 
 @contextlib.contextmanager

@@ -88,7 +88,7 @@ def score_table(scores: pd.DataFrame, label: str) -> Table:
     starred = False
     for scene, values in ours.iterrows():
         table.add_row(escape(str(scene)), "dsr", *_cells(values))
-        paper = published_row(str(scene), label, scale) if downsampling == _PUBLISHED_DOWNSAMPLING else None
+        paper = _paper_row(str(scene), label, scale, downsampling)
         if paper is not None:
             recreated = scene in RECREATED or dataset in OTHER_FRAMES
             starred |= recreated
@@ -97,13 +97,18 @@ def score_table(scores: pd.DataFrame, label: str) -> Table:
         table.add_section()
         table.add_row("mean", "dsr", *_cells(ours.mean()), style="bold")
         name, count = AVERAGES.get(dataset, ("", 0))
-        paper = published_row(name, label, scale) if downsampling == _PUBLISHED_DOWNSAMPLING else None
+        paper = _paper_row(name, label, scale, downsampling)
         if paper is not None and len(ours) == count:
             table.add_row("", "paper*" if starred else "paper", *_cells(paper[list(ours)]), style="dim")
     if starred:
         table.caption = "* of the paper's own files; the scenes here are others of the same description"
         table.caption_justify = "left"
     return table
+
+
+def _paper_row(scene: str, method: str, scale: int, downsampling: str) -> pd.Series | None:
+    """Return the paper's figures where they are of the same downsampling."""
+    return published_row(scene, method, scale) if downsampling == _PUBLISHED_DOWNSAMPLING else None
 
 
 def _cells(values: pd.Series) -> list[str]:

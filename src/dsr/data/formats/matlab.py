@@ -14,6 +14,8 @@ from typing import Any
 import h5py
 import numpy as np
 
+from dsr.terminal import one_line
+
 _LARGEST = 1 << 26
 """Numbers in a matrix that is read."""
 _MATRIX, _COMPRESSED, _STRUCTURE = 14, 15, 2
@@ -42,8 +44,9 @@ def read_variables(path: Path) -> dict[str, np.ndarray]:
         _expect_at_most(8 * _LARGEST, "the file", size)
         return dict(_matrices("", _old_variables(path.read_bytes()), most))
     except Exception as error:  # a damaged file makes h5py raise RuntimeError, OSError, KeyError, ..., zlib its own
-        reason = " ".join(str(error).split())
-        raise ValueError(f"{path}: expected a MATLAB file, got a damaged or foreign one ({reason:.80})") from error
+        raise ValueError(
+            f"{path}: expected a MATLAB file, got a damaged or foreign one ({one_line(error):.80})"
+        ) from error
 
 
 def _old_variables(content: bytes) -> dict[str, Any]:

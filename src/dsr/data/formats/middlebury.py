@@ -26,7 +26,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dsr.data.files import read_levels, read_map, read_rgb
+from dsr.data.files import read_levels, read_map
+from dsr.data.formats.shared import expect_size, read_picture
 from dsr.data.terraces import smoothed_levels
 from dsr.geometry.camera import Camera, from_range
 from dsr.sample import Scene
@@ -103,7 +104,7 @@ def load_2014(folder: Path, dataset: str, name: str, *, offset: bool = True) -> 
     if not path.is_file() and (folder / "disp0GT.pfm").is_file():
         path = folder / "disp0GT.pfm"
     values = read_map(path)
-    _expect_size(path, values, camera)
+    expect_size(path, values.shape, (camera.height, camera.width))
     values[~np.isfinite(values)] = np.nan
     low = -camera.doffs if offset else 0.0
     if np.nanmin(values, initial=np.inf) <= low:
@@ -136,7 +137,7 @@ def load_levels(files: Files, dataset: str, name: str, year: int, *, smooth: boo
     for factor, path in files.measured.items():
         coarse = camera.coarser(factor)
         values = read_levels(path).astype(np.float64)
-        _expect_size(path, values, coarse)
+        expect_size(path, values.shape, (coarse.height, coarse.width))
         values[values == 0] = np.nan
         measured[factor] = _depth(path, values / (per_pixel * factor), coarse)
     return Scene(dataset, name, _photo(files.photo, camera), camera, depth, measured)
@@ -187,9 +188,9 @@ def _number(path: Path, key: str, text: str) -> float:
 
 
 def _photo(path: Path, camera: Camera) -> Tensor:
-    pixels = read_rgb(path)
-    _expect_size(path, pixels, camera)
-    return torch.from_numpy(pixels).permute(2, 0, 1).float() / 255
+    rgb = read_picture(path)
+    expect_size(path, tuple(rgb.shape[1:]), (camera.height, camera.width))
+    return rgb
 
 
 def _depth(path: Path, disparity: np.ndarray, camera: Camera) -> Tensor:
@@ -197,12 +198,6 @@ def _depth(path: Path, disparity: np.ndarray, camera: Camera) -> Tensor:
     if np.isnan(disparity).all():
         raise ValueError(f"{path}: expected at least one known disparity, all are unknown")
     return from_range(torch.from_numpy(disparity)[None], camera, "disparity")
-
-
-def _expect_size(path: Path, values: np.ndarray, camera: Camera) -> None:
-    if values.shape[:2] != (camera.height, camera.width):
-        came = " x ".join(map(str, values.shape[:2]))
-        raise ValueError(f"{path}: expected {camera.height} x {camera.width} pixels (height x width), got {came}")
 
 
 def _camera_2006(files: Files, height: int, width: int) -> tuple[Camera, float]:

@@ -138,6 +138,17 @@ def to_camera(source: Path | str, matrix: np.ndarray, size: tuple[int, int]) -> 
     return Camera(width, height, fx, fy, cx, cy)
 
 
+def given_camera(intrinsics: tuple[float, float, float, float], size: tuple[int, int]) -> Camera:
+    """Return the camera of a caller's (fx, fy, cx, cy) for pictures of ``size`` = (height, width).
+
+    Raises:
+        ValueError: they are those of no such camera, see :func:`to_camera`.
+
+    """
+    fx, fy, cx, cy = intrinsics
+    return to_camera("intrinsics", np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]), size)
+
+
 def walk(root: Path) -> Iterator[tuple[Path, list[str], list[str]]]:
     """Yield every folder of a directory in order, with the names of its folders and of its files.
 

@@ -20,11 +20,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import numpy as np
 from torch import Tensor
 
 from dsr.data.formats.shared import (
     expect_size,
+    given_camera,
     name_of,
     read_16bit,
     read_numbers,
@@ -112,9 +112,7 @@ def load_pair(rgb_path: Path, depth_path: Path, dataset: str, name: str, intrins
     expect_size(depth_path, tuple(depth.shape[1:]), size)
     if isinstance(intrinsics, Path):
         return Scene(dataset, name, rgb, read_intrinsics(intrinsics, size), depth)
-    fx, fy, cx, cy = intrinsics
-    matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
-    return Scene(dataset, name, rgb, to_camera("intrinsics", matrix, size), depth)
+    return Scene(dataset, name, rgb, given_camera(intrinsics, size), depth)
 
 
 def frame_files(folder: Path, *, refined: bool = False) -> tuple[Path, ...]:

@@ -25,7 +25,7 @@ from torch import Tensor
 
 from dsr.data.files import read_levels
 from dsr.data.formats.matlab import read_variables
-from dsr.data.formats.shared import expect_size, name_of, read_picture, to_camera, to_depth, walk
+from dsr.data.formats.shared import expect_size, given_camera, name_of, read_picture, to_depth, walk
 from dsr.sample import Scene
 
 FACTORS = (4, 8)
@@ -102,9 +102,7 @@ def load_frame(
         rgb = read_picture(path)
         samples = _metres(samples_path, *read_samples(samples_path), depth_range)
         expect_size(samples_path, tuple(samples.shape[1:]), tuple(rgb.shape[1:]))
-    fx, fy, cx, cy = intrinsics
-    matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
-    camera = to_camera("intrinsics", matrix, (rgb.shape[1], rgb.shape[2]))
+    camera = given_camera(intrinsics, (rgb.shape[1], rgb.shape[2]))
     measured = {} if samples is None else {factor: block_means(samples, factor) for factor in factors}
     return Scene(dataset, name, rgb, camera, depth, measured)
 
