@@ -2,17 +2,38 @@
 
 from __future__ import annotations
 
+import json
 import os
+import shutil
 import threading
 from collections.abc import Callable, Iterator
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import pandas as pd
 import pytest
 import torch
 
+from dsr.degrade import Downsampling, make_sample
+from dsr.evaluation import SCORE_COLUMNS
+from dsr.geometry.camera import Camera
+from dsr.quality.scores import catalogue, score_image
+from dsr.sample import Scene
+from dsr.store import prediction_path, save_scene, scene_path
+
 REPOSITORY = Path(__file__).resolve().parents[1]
+CHROMIUMS = ("chromium", "chromium-browser", "google-chrome")
+CHROMIUM_ARGUMENTS = (
+    "--no-sandbox",
+    "--disable-gpu",
+    "--disable-quic",
+    "--no-first-run",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+)
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -71,3 +92,68 @@ def serve(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[type[BaseHTTPRe
         server.shutdown()
         thread.join()
         server.server_close()
+
+
+@pytest.fixture(scope="session")
+def browser() -> Iterator[Any]:
+    """A headless Chromium, driven by playwright; $DSR_CHROMIUM names another than the one on the path."""
+    path = os.environ.get("DSR_CHROMIUM") or next(filter(None, map(shutil.which, CHROMIUMS)), None)
+    sync_api = pytest.importorskip("playwright.sync_api")
+    if path is None:
+        message = f"needs a browser ({', '.join(CHROMIUMS)} on the path, or DSR_CHROMIUM)"
+        if os.environ.get("DSR_REQUIRE_BROWSER"):
+            pytest.fail(message)
+        pytest.skip(message)
+    with sync_api.sync_playwright() as driver:
+        started = driver.chromium.launch(executable_path=path, args=list(CHROMIUM_ARGUMENTS))
+        yield started
+        started.close()
+
+
+@pytest.fixture
+def make_run() -> Callable[..., Path]:
+    """Return what writes the directory of a run, whole and with real depth maps, without running a method."""
+    return write_run
+
+
+def write_run(
+    folder,
+    *,
+    method="bicubic",
+    label="Bicubic",
+    dataset="simgeo",
+    scale=4,
+    downsampling="box",
+    seed=0,
+    scenes=("cube_no_texture",),
+    size=32,
+):
+    """Write a run whose method repeats coarse pixels with a little noise of its own; truths are waves, one a scene."""
+    camera = Camera(size, size, 1.2 * size, 1.2 * size, (size - 1) / 2, (size - 1) / 2)
+    kind = Downsampling("box")
+    rows, seconds = [], {}
+    for scene in scenes:
+        generator = torch.Generator().manual_seed(sum(scene.encode()))
+        x, y = torch.meshgrid(*2 * [torch.arange(size, dtype=torch.float64) / size], indexing="xy")
+        phase = float(torch.rand(1, generator=generator))
+        truth = (2 + 0.3 * torch.sin(6 * (x + phase)) + 0.2 * torch.cos(5 * y))[None]
+        rgb = torch.rand(3, size, size, generator=generator)
+        sample = make_sample(Scene(dataset, scene, rgb, camera, truth), scale, kind, "orthogonal")
+        noise = torch.Generator().manual_seed(seed + sum((method + label + scene).encode()))
+        depth = sample.depth_lr.repeat_interleave(scale, 1).repeat_interleave(scale, 2)
+        depth = depth + 0.002 * torch.randn(depth.shape, generator=noise, dtype=depth.dtype)
+        save_scene(scene_path(folder, scene), sample)
+        seconds[scene] = 0.25
+        path = prediction_path(folder, scene)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        np.savez_compressed(path, depth=depth[0].numpy(), config="{}", seconds=seconds[scene])
+        about = (dataset, scene, scale, downsampling, method, seed)
+        results = score_image(depth, sample.depth, camera.rays(), catalogue())
+        rows += [(*about, each.metric, each.variant, each.value, each.valid_share) for each in results]
+    pd.DataFrame(rows, columns=list(SCORE_COLUMNS)).to_csv(folder / "scores.csv", index=False)
+    named = {"dataset": dataset, "scale": scale, "downsampling": downsampling, "method": method, "label": label}
+    (folder / "summary.json").write_text(json.dumps({**named, "seed": seed, "seconds": seconds}))
+    identity = {"method": {"name": method, "label": label}, "dataset": {"name": dataset}, "seed": seed, "scale": scale}
+    versions = {"packages": {"dsr": "0.1.0"}, "python": "3.11.7", "platform": "Linux", "cpu_threads": 2}
+    (folder / "versions.json").write_text(json.dumps({**versions, "identity": identity}))
+    return folder

@@ -1,7 +1,8 @@
 """Evaluation in two passes: predictions to files, then scores from files.
 
 A prediction is ``predictions/SCENE.npz``: ``depth`` (H, W) in metres, NaN in holes; ``config``, a JSON text of all that
-it came from; and the ``seconds`` that it took. A prediction whose stored config is the wanted one is not made again, so
+it came from; and the ``seconds`` that it took. Beside it lies the problem that it answers, see :mod:`dsr.store`. A
+prediction whose stored config is the wanted one is not made again, so
 an interrupted run goes on where it stopped. One scene that fails does not keep the others from their results.
 """
 
@@ -28,6 +29,7 @@ from dsr.methods.base import Upsampler
 from dsr.noise import Noise
 from dsr.quality.scores import WORST, Metric, score_image
 from dsr.sample import DepthSample
+from dsr.store import load_prediction, prediction_path, save_scene, scene_path
 from dsr.terminal import one_line
 
 SCORE_COLUMNS = (
@@ -68,6 +70,7 @@ class Study:
         device: where predictions and scores are computed.
         noise: of the coarse maps.
         holes: where the coarse maps lose their values.
+        label: the method's name for readers; empty where that is ``method_name``.
 
     """
 
@@ -82,6 +85,7 @@ class Study:
     device: torch.device = field(default=torch.device("cpu"))
     noise: Noise | None = None
     holes: Holes | None = None
+    label: str = ""
 
     def sample(self, scene: str) -> DepthSample:
         """Return the problem that a scene poses.
@@ -184,6 +188,7 @@ def score(
             sample = study.sample(scene)
             depth = load_prediction(prediction_path(folder, scene))
             new = list(_score_scene(study, sample, depth, metrics))
+            save_scene(scene_path(folder, scene), sample)
             rows += new
             if sample.depth is None:
                 outcome.unscored.append(scene)
@@ -208,6 +213,7 @@ def summary(study: Study, scores: pd.DataFrame, outcome: Outcome) -> dict[str, A
         "scale": study.scale,
         "downsampling": study.downsampling_name,
         "method": study.method_name,
+        "label": study.label or study.method_name,
         "seed": study.seed,
         "scenes": scores["scene"].nunique(),
         "mean": {str(name): float(value) for name, value in means.items()},
@@ -218,24 +224,6 @@ def summary(study: Study, scores: pd.DataFrame, outcome: Outcome) -> dict[str, A
         "notes": outcome.notes,
         "failures": outcome.failures,
     }
-
-
-def prediction_path(folder: Path, scene: str) -> Path:
-    """Return where a scene's prediction is kept."""
-    return folder / "predictions" / f"{scene}.npz"
-
-
-def load_prediction(path: Path) -> Tensor:
-    """Return a predicted depth map, (1, H, W) in metres.
-
-    Raises:
-        ValueError: the file is missing or damaged.
-
-    """
-    try:
-        return torch.from_numpy(read_arrays(path)["depth"])[None]
-    except (OSError, KeyError, ValueError, TypeError) as error:
-        raise ValueError(f"{path}: expected a prediction, got a missing or damaged file") from error
 
 
 def _failure(scene: str, error: BaseException) -> str:

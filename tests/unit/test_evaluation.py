@@ -97,7 +97,10 @@ def rows(folder):
 
 def test_a_run_leaves_predictions_scores_and_a_summary_and_nothing_else(tmp_path):
     outcome, *_ = run(toy_study(), tmp_path)
-    assert files(tmp_path) == ["predictions/a.npz", "predictions/b.npz", "scores.csv", "summary.json"]
+    assert files(tmp_path) == [
+        *("predictions/a.npz", "predictions/b.npz"),
+        *("scenes/a.npz", "scenes/b.npz", "scores.csv", "summary.json"),
+    ]
     assert (outcome.made, outcome.reused, outcome.failures, outcome.unscored) == (["a", "b"], [], {}, [])
 
 
@@ -201,7 +204,7 @@ def test_the_picture_gets_the_prediction_and_its_worst_scores(tmp_path):
 
 def test_a_second_run_reuses_predictions_without_calling_the_method(tmp_path):
     _, first, _ = run(toy_study(), tmp_path)
-    before = {name: (tmp_path / name).stat().st_mtime_ns for name in files(tmp_path) if name.endswith("npz")}
+    before = {name: (tmp_path / name).stat().st_mtime_ns for name in files(tmp_path) if name.startswith("pred")}
     method = ToyMethod()
     outcome, second, pictures = run(toy_study(method=method), tmp_path)
     assert method.calls == []
@@ -275,7 +278,10 @@ def test_one_bad_scene_does_not_lose_the_others_results(tmp_path, failure, messa
     assert scores["scene"].unique().tolist() == ["a", "c"]
     assert [sample.scene for sample, *_ in pictures] == ["a", "c"]
     assert json.loads((tmp_path / "summary.json").read_text())["failures"] == outcome.failures
-    assert files(tmp_path) == ["predictions/a.npz", "predictions/c.npz", "scores.csv", "summary.json"]
+    assert files(tmp_path) == [
+        *("predictions/a.npz", "predictions/c.npz"),
+        *("scenes/a.npz", "scenes/c.npz", "scores.csv", "summary.json"),
+    ]
 
 
 def test_a_scene_that_the_method_refuses_does_not_lose_the_others_results(tmp_path):

@@ -11,6 +11,7 @@ LAYERS = (
     ("dsr.fetching",),
     ("dsr.geometry.camera",),
     ("dsr.sample", "dsr.holes", "dsr.noise", "dsr.geometry.surface", "dsr.geometry.shading"),
+    ("dsr.store", "dsr.geometry.mesh"),
     ("dsr.degrade", "dsr.geometry.comparison"),
     ("dsr.quality.functional",),
     ("dsr.quality.lpips",),
@@ -20,7 +21,9 @@ LAYERS = (
     ("dsr.objective",),
     ("dsr.fitting",),
     ("dsr.evaluation", "dsr.training", "dsr.prior", "dsr.doctor"),
+    ("dsr.upsampling",),
     ("dsr.report",),
+    ("dsr.study", "dsr.rgbd"),
     ("dsr.app",),
     ("dsr.cli",),
 )

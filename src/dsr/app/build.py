@@ -37,7 +37,7 @@ def build(group: str, node: Mapping[str, Any], given: Mapping[str, Any] | None =
     parameters = inspect.signature(target).parameters
     hints = get_type_hints(target.__init__ if inspect.isclass(target) else target)
     given = {key: value for key, value in (given or {}).items() if key in parameters}
-    arguments = {key: value for key, value in node.items() if key not in _ABOUT}
+    arguments = {key: value for key, value in node.items() if key not in _ABOUT or key in parameters}
     own = [key for key in parameters if key not in given]
     for key, value in arguments.items():
         if key not in own:

@@ -31,6 +31,7 @@ from dsr.prior.method import WORKSPACE
 from dsr.quality.lpips import LPIPS
 from dsr.quality.metrics import visual_metrics
 from dsr.quality.scores import catalogue
+from dsr.report.dashboard import save_dashboard
 from dsr.report.pictures import save_picture
 from dsr.report.tables import score_table
 from dsr.sample import DepthSample
@@ -83,10 +84,10 @@ def _evaluate(plain: dict[str, Any], source: SceneSource | None) -> pd.DataFrame
         outcome = predict(study, folder, display, overwrite=settings.overwrite)
     except StalePredictionError as error:
         raise ConfigError(str(error)) from error
-    label = _flagged(str(settings.method.get("label", settings.method["name"])), study.method, " ({})")
-    illustrate = functools.partial(_illustrate, folder, label)
+    illustrate = functools.partial(_illustrate, folder, study.label)
     scores = score(study, folder, catalogue(_perceptual(settings, device)), outcome, display, illustrate)
-    _report(console, folder, scores, label, outcome)
+    save_dashboard(folder)
+    _report(console, folder, scores, study.label, outcome)
     if outcome.failures:
         total = len(study.source.scenes())
         rest = f"; the others are in {folder}" if len(outcome.failures) < total else ""
@@ -139,6 +140,7 @@ def _study(
         given["device"],
         noise=build("noise", settings.noise),
         holes=build("holes", settings.holes),
+        label=_flagged(str(settings.method.get("label", name)), method, " ({})"),
     )
 
 

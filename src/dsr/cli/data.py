@@ -1,35 +1,25 @@
-"""The ``dsr`` command."""
+"""``dsr data``: list, fetch, check and prepare data sets."""
 
 from __future__ import annotations
 
 import argparse
 import sys
 import textwrap
-from collections.abc import Mapping, Sequence
-from pathlib import Path
+from collections.abc import Mapping
+from typing import Any
 
 from rich.console import Console
 from rich.table import Table
 
-from dsr.fetching.catalogue import CATALOGUE, Collection, find
+from dsr.fetching.catalogue import Collection, find
 from dsr.fetching.display import Display
 from dsr.fetching.download import megabytes
 from dsr.fetching.fetch import Options, get
 from dsr.fetching.inventory import absent, state, verify
 from dsr.fetching.place import data_root
-from dsr.terminal import INTERRUPTED, USAGE_ERROR, one_line, open_console, print_error, show
+from dsr.terminal import show
 
 _EXAMPLES = """\
-examples:
-  dsr data list                         what there is, and what of it is here
-  dsr data get middlebury               fetch the seven scenes of the paper's tables
-  dsr data verify middlebury            check every file against its checksum
-  dsr data prepare middlebury           resize, crop and keep them, and draw a contact sheet
-  dsr doctor my_scenes                  check a directory of your own scenes
-
-Training and evaluation have commands of their own, train.py and eval.py in a checkout of the project.
-"""
-_DATA_EXAMPLES = """\
 examples:
   dsr data list
   dsr data get middlebury middlebury2003 --yes
@@ -54,28 +44,41 @@ An archive that you put there by hand is used instead of being fetched, and kept
 """
 
 
-def main(arguments: Sequence[str] | None = None, catalogue: Mapping[str, Collection] | None = None) -> int:
-    """Run the command, and return its exit code: 0, 2 where something is wrong, 130 when interrupted.
+def add(commands: Any) -> None:
+    """Add the command to the parser's commands."""
+    style = argparse.RawDescriptionHelpFormatter
+    data = commands.add_parser(
+        "data",
+        help="list, fetch and check data sets",
+        description="Data sets.",
+        epilog=_EXAMPLES,
+        formatter_class=style,
+    )
+    tasks = data.add_subparsers(title="commands", metavar="COMMAND", required=True)
+    tasks.add_parser("list", help="what there is, and what of it is here").set_defaults(run=_list)
 
-    Args:
-        arguments: of the command line; those of the process where None.
-        catalogue: the data sets to offer; :data:`dsr.fetching.catalogue.CATALOGUE` where None.
+    where = tasks.add_parser("where", help="the directory of the data sets, or the folders of some")
+    where.add_argument("names", nargs="*", metavar="NAME", help="a data set, as in `dsr data list`")
+    where.set_defaults(run=_where)
 
-    """
-    options = _parser().parse_args(arguments)
-    console = open_console()
-    try:
-        problems = options.run(options, console, CATALOGUE if catalogue is None else catalogue)
-    except KeyboardInterrupt:
-        show(Console(stderr=True), "interrupted; what has come so far is kept, the same command goes on from there")
-        return INTERRUPTED
-    except (ValueError, OSError) as error:
-        problems = [one_line(error)]
-    if isinstance(problems, int):
-        return problems
-    for problem in problems:
-        print_error(problem)
-    return USAGE_ERROR if problems else 0
+    fetch = tasks.add_parser("get", help="fetch what is missing", epilog=_GET_NOTES, formatter_class=style)
+    fetch.add_argument("names", nargs="+", metavar="NAME", help="a data set, as in `dsr data list`")
+    fetch.add_argument("--mirror", metavar="URL", help="a server to try first, see below")
+    fetch.add_argument("--yes", "-y", action="store_true", help="do not ask")
+    fetch.add_argument("--keep-archives", action="store_true", help="keep archives after they were unpacked")
+    fetch.set_defaults(run=_get)
+
+    check = tasks.add_parser("verify", help="check every file against its recorded size and checksum")
+    check.add_argument("names", nargs="+", metavar="NAME", help="a data set, as in `dsr data list`")
+    check.set_defaults(run=_verify)
+    ready = tasks.add_parser("prepare", help="resize and keep the scenes of a data set, and draw a contact sheet")
+    ready.add_argument("name", metavar="NAME", help="a data set, as in `eval.py dataset=NAME`")
+    ready.add_argument("settings", nargs="*", metavar="KEY=VALUE", help="as for eval.py, such as dataset.size=256")
+    ready.set_defaults(run=_prepare)
+    for task in (fetch, check):
+        task.add_argument(
+            "--accept-changed", action="store_true", help="take files whose checksum differs from the recorded one"
+        )
 
 
 def _list(_: argparse.Namespace, console: Console, catalogue: Mapping[str, Collection]) -> list[str]:
@@ -165,62 +168,3 @@ def _prepare(options: argparse.Namespace, console: Console, _: object) -> list[s
 
     prepare_dataset(options.name, options.settings, console)
     return []
-
-
-def _doctor(options: argparse.Namespace, *_: object) -> int:
-    """Examine a directory of scenes."""
-    from dsr.doctor import examine_directory  # noqa: PLC0415 - it takes seconds to import
-
-    return examine_directory(options.directory, options.most)
-
-
-def _parser() -> argparse.ArgumentParser:
-    """Return the command line."""
-    style = argparse.RawDescriptionHelpFormatter
-    parser = argparse.ArgumentParser(
-        "dsr", description="Guided depth super-resolution.", epilog=_EXAMPLES, formatter_class=style
-    )
-    commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
-
-    doctor = commands.add_parser("doctor", help="check a directory of your own scenes")
-    doctor.add_argument("directory", type=Path, metavar="DIR", help="a scene, or a directory of scenes")
-    doctor.add_argument("--most", type=int, metavar="N", help="examine N scenes at most, spread over all")
-    doctor.set_defaults(run=_doctor)
-
-    data = commands.add_parser(
-        "data",
-        help="list, fetch and check data sets",
-        description="Data sets.",
-        epilog=_DATA_EXAMPLES,
-        formatter_class=style,
-    )
-    tasks = data.add_subparsers(title="commands", metavar="COMMAND", required=True)
-    tasks.add_parser("list", help="what there is, and what of it is here").set_defaults(run=_list)
-
-    where = tasks.add_parser("where", help="the directory of the data sets, or the folders of some")
-    where.add_argument("names", nargs="*", metavar="NAME", help="a data set, as in `dsr data list`")
-    where.set_defaults(run=_where)
-
-    fetch = tasks.add_parser("get", help="fetch what is missing", epilog=_GET_NOTES, formatter_class=style)
-    fetch.add_argument("names", nargs="+", metavar="NAME", help="a data set, as in `dsr data list`")
-    fetch.add_argument("--mirror", metavar="URL", help="a server to try first, see below")
-    fetch.add_argument("--yes", "-y", action="store_true", help="do not ask")
-    fetch.add_argument("--keep-archives", action="store_true", help="keep archives after they were unpacked")
-    fetch.set_defaults(run=_get)
-
-    check = tasks.add_parser("verify", help="check every file against its recorded size and checksum")
-    check.add_argument("names", nargs="+", metavar="NAME", help="a data set, as in `dsr data list`")
-    check.set_defaults(run=_verify)
-    ready = tasks.add_parser("prepare", help="resize and keep the scenes of a data set, and draw a contact sheet")
-    ready.add_argument("name", metavar="NAME", help="a data set, as in `eval.py dataset=NAME`")
-    ready.add_argument("settings", nargs="*", metavar="KEY=VALUE", help="as for eval.py, such as dataset.size=256")
-    ready.set_defaults(run=_prepare)
-    for task in (fetch, check):
-        task.add_argument(
-            "--accept-changed", action="store_true", help="take files whose checksum differs from the recorded one"
-        )
-    return parser
-
-
-if __name__ == "__main__":
-    sys.exit(main())

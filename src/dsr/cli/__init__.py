@@ -1,0 +1,62 @@
+"""The ``dsr`` command."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Mapping, Sequence
+
+from rich.console import Console
+
+from dsr.cli import data, doctor
+from dsr.fetching.catalogue import CATALOGUE, Collection
+from dsr.terminal import INTERRUPTED, USAGE_ERROR, one_line, open_console, print_error, show
+
+_EXAMPLES = """\
+examples:
+  dsr data list                         what there is, and what of it is here
+  dsr data get middlebury               fetch the seven scenes of the paper's tables
+  dsr data verify middlebury            check every file against its checksum
+  dsr data prepare middlebury           resize, crop and keep them, and draw a contact sheet
+  dsr doctor my_scenes                  check a directory of your own scenes
+
+Training and evaluation have commands of their own, train.py and eval.py in a checkout of the project.
+"""
+_COMMANDS = (doctor, data)
+
+
+def main(arguments: Sequence[str] | None = None, catalogue: Mapping[str, Collection] | None = None) -> int:
+    """Run the command, and return its exit code: 0, 2 where something is wrong, 130 when interrupted.
+
+    Args:
+        arguments: of the command line; those of the process where None.
+        catalogue: the data sets to offer; :data:`dsr.fetching.catalogue.CATALOGUE` where None.
+
+    """
+    options = _parser().parse_args(arguments)
+    console = open_console()
+    try:
+        problems = options.run(options, console, CATALOGUE if catalogue is None else catalogue)
+    except KeyboardInterrupt:
+        show(Console(stderr=True), "interrupted; what has come so far is kept, the same command goes on from there")
+        return INTERRUPTED
+    except (ValueError, OSError) as error:
+        problems = [one_line(error)]
+    if isinstance(problems, int):
+        return problems
+    for problem in problems:
+        print_error(problem)
+    return USAGE_ERROR if problems else 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    """Return the command line."""
+    parser = argparse.ArgumentParser(
+        "dsr",
+        description="Guided depth super-resolution.",
+        epilog=_EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
+    for command in _COMMANDS:
+        command.add(commands)
+    return parser

@@ -1,0 +1,142 @@
+"""The TensorBoard log of an evaluation, so that many can be compared in one dashboard.
+
+A scalar's step is what it is plotted over: the number of the scene, or of the light. A run's text ``scenes`` says which
+number is which scene.
+"""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import matplotlib as mpl
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn import functional
+from torch.utils.tensorboard import SummaryWriter
+from torch.utils.tensorboard.summary import hparams
+
+from dsr.geometry.shading import LIGHT_NAMES, render
+from dsr.report.pictures import colours, normals_seen_by
+from dsr.report.results import Run, read_run
+from dsr.report.tables import METRICS
+from dsr.store import StoredScene
+
+FOLDER = "tensorboard"
+WORST = "worst of four lights"
+_PANEL = 320
+"""Pixels of the longer side of a rendering in a picture, at most."""
+
+
+def save_dashboard(folder: Path) -> None:
+    """Write the TensorBoard log of a run into its directory, in place of an earlier one.
+
+    Scalars, in the units of the paper's tables: ``mean/METRIC``; ``scene/METRIC`` over the scenes; ``METRIC/SCENE``;
+    ``light/METRIC/SCENE`` over the lights e1..e4. Pictures of each scene: renderings of the result above those of the
+    truth, and errors. A custom layout has a chart per metric; the table of runs (hparams) has settings and means.
+
+    Args:
+        folder: a run's directory; nothing but its files is looked at.
+
+    Raises:
+        ValueError: it is no run's directory.
+
+    """
+    run = read_run(folder)
+    temporary = Path(tempfile.mkdtemp(prefix=".tensorboard-", dir=folder))
+    try:
+        with SummaryWriter(temporary) as writer:
+            _write_scores(writer, run)
+            for number, scene in enumerate(run.scenes):
+                if run.has_scene(scene):
+                    _write_pictures(writer, number, run.scene(scene), run.prediction(scene))
+        shutil.rmtree(folder / FOLDER, ignore_errors=True)
+        temporary.chmod(0o755)
+        temporary.replace(folder / FOLDER)
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+
+
+def _write_scores(writer: SummaryWriter, run: Run) -> None:
+    """Write scalars, their layout, and the run's row in the table of runs."""
+    scored = list(run.scores["scene"].unique())
+    means: dict[str, float] = {}
+    scenes: dict[str, list[str]] = {"Depth and normals": [], f"Looks, {WORST}": []}
+    for name, (*_, factor, _digits) in METRICS.items():
+        rows = run.scores[run.scores["metric"] == name]
+        if rows.empty:
+            continue
+        by_light = bool((rows["variant"] != "").any())
+        scenes[f"Looks, {WORST}" if by_light else "Depth and normals"].append(name)
+        headline = rows[rows["variant"].isin(["", "max"])].set_index("scene")["value"] * factor
+        means[name] = float(headline.mean())
+        for number, scene in enumerate(scored):
+            writer.add_scalar(f"scene/{name}", headline[scene], number)
+            writer.add_scalar(f"{name}/{scene}", headline[scene], 0)
+        for row in rows[rows["variant"].isin(LIGHT_NAMES)].itertuples():
+            light = LIGHT_NAMES.index(row.variant) + 1
+            writer.add_scalar(f"light/{name}/{row.scene}", row.value * factor, light)
+    for name, value in means.items():
+        writer.add_scalar(f"mean/{name}", value, 0)
+    layout = {
+        title: {name: ["Multiline", [f"scene/{name}"]] for name in names} for title, names in scenes.items() if names
+    }
+    layout["By light, e1 to e4"] = {name: ["Multiline", [f"light/{name}/.*"]] for name in scenes[f"Looks, {WORST}"]}
+    writer.add_custom_scalars({title: charts for title, charts in layout.items() if charts})
+    writer.add_text("scenes", "\n".join(f"{number}. {scene}" for number, scene in enumerate(scored)))
+    for part in hparams(_hyperparameters(run), {f"mean/{name}": value for name, value in means.items()}):
+        writer.file_writer.add_summary(part)  # type: ignore[attr-defined]  # torch's stubs say None
+
+
+def _hyperparameters(run: Run) -> dict[str, Any]:
+    """Return what the table of runs says of one: the problem, the method and its settings."""
+    method = run.settings.get("method", {})
+    shown = {key: value for key, value in method.items() if isinstance(value, (bool, int, float, str))}
+    hidden = ("name", "label", "target", "weights_packaged", "weights_file", "weights_source")
+    settings = {f"method.{key}": value for key, value in shown.items() if key not in hidden}
+    return {
+        "method": run.label,
+        "dataset": run.dataset,
+        "scale": run.scale,
+        "downsampling": run.downsampling,
+        "seed": run.seed,
+        **settings,
+    }
+
+
+def _write_pictures(writer: SummaryWriter, number: int, scene: StoredScene, depth: Tensor) -> None:
+    """Write a scene's renderings, result above truth, and the errors of depth and normals."""
+    shades = [render(normals_seen_by(scene.camera, depth))[0]]
+    if scene.depth is not None:
+        shades.append(render(normals_seen_by(scene.camera, scene.depth))[0])
+    rows = [torch.cat(list(_panel(each)), dim=-1) for each in shades]
+    writer.add_image(f"renderings/{scene.name}", _grey(torch.cat(rows, dim=-2)), number, dataformats="HWC")
+    if scene.depth is not None:
+        writer.add_image(f"depth_error_cm/{scene.name}", _error(depth, scene.depth), number, dataformats="HWC")
+
+
+def _panel(values: Tensor) -> Tensor:
+    """Return (C, H, W) no larger than a panel; the mean of the known pixels that fall together."""
+    factor = -(-max(values.shape[-2:]) // _PANEL)
+    if factor == 1:
+        return values
+    known = values.isfinite().to(values.dtype)
+    share = functional.avg_pool2d(known, factor)
+    return functional.avg_pool2d(values.nan_to_num(), factor) / torch.where(share > 0, share, torch.nan)
+
+
+def _grey(values: Tensor) -> np.ndarray:
+    """Return (H, W) in [0, 1] as grey levels, holes in their colour, (H, W, 3) uint8."""
+    return (colours("gray")(np.ma.masked_invalid(values.numpy()))[..., :3] * 255).round().astype(np.uint8)
+
+
+def _error(depth: Tensor, truth: Tensor) -> np.ndarray:
+    """Return the signed error, blue where the result is nearer, (H, W, 3) uint8; its scale is symmetric, 98 %."""
+    difference = _panel(100 * (depth - truth))[0].numpy()
+    known = np.abs(difference[np.isfinite(difference)])
+    limit = max(float(np.percentile(known, 98)), 0.1) if known.size else 1.0
+    scaled = mpl.colors.Normalize(-limit, limit)(np.ma.masked_invalid(difference))
+    return (colours("RdBu_r")(scaled)[..., :3] * 255).round().astype(np.uint8)

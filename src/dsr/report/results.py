@@ -1,0 +1,277 @@
+"""What evaluations left in their directories, read for tables, figures and pages.
+
+Nothing but files is looked at: ``scores.csv``, ``summary.json``, ``versions.json``, predictions and stored scenes.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import pandas as pd
+from torch import Tensor
+
+from dsr.store import StoredScene, load_prediction, load_scene, prediction_path, scene_path
+
+METHOD_ORDER = (
+    "Nearest", "Bilinear", "Bicubic", "SRfS", "EG", "PDN", "DG", "DIP", "MSG", "DIP-V", "MSG-V",
+)  # fmt: skip
+"""The paper's methods in the order of its tables, between what is simpler and what it did not have."""
+_DATASET_ORDER = ("simgeo", "icl", "middlebury", "sunrgbd", "tofmark")
+_SCORES, _SUMMARY, _VERSIONS = "scores.csv", "summary.json", "versions.json"
+_TEXT_COLUMNS = ("dataset", "scene", "downsampling", "method", "metric", "variant")
+_NUMBER_COLUMNS = ("scale", "seed", "value", "valid_share")
+_ABOUT_METHOD = ("method", "weights_sha256", "precision")
+_DIGEST = 8
+"""Of a hash, as many digits are shown."""
+
+
+class Problem(NamedTuple):
+    """What methods are compared on: a data set, a scale, a degradation."""
+
+    dataset: str
+    scale: int
+    downsampling: str
+
+
+@dataclass(frozen=True)
+class Run:
+    """One run of ``eval.py``: one method on one data set, at one scale, under one degradation, with one seed.
+
+    Args:
+        folder: its directory.
+        dataset, scale, downsampling, seed, method: as in ``scores.csv``; ``downsampling`` has noise and holes in it.
+        label: the method's name for readers. Runs of one method with other settings have labels that differ; runs
+            that differ in the seed alone have the same.
+        scores: its ``scores.csv``, raw units; rows of the scenes in ``scenes`` alone.
+        seconds: computing time by scene.
+        settings: the resolved configuration.
+        versions: of packages, Python and the project.
+        scenes: those that have a prediction.
+
+    """
+
+    folder: Path
+    dataset: str
+    scale: int
+    downsampling: str
+    seed: int
+    method: str
+    label: str
+    scores: pd.DataFrame
+    seconds: Mapping[str, float]
+    settings: Mapping[str, Any]
+    versions: Mapping[str, Any]
+    scenes: tuple[str, ...]
+
+    @property
+    def problem(self) -> Problem:
+        """What it answers."""
+        return Problem(self.dataset, self.scale, self.downsampling)
+
+    def prediction(self, scene: str) -> Tensor:
+        """Return the predicted depth, (1, H, W) in metres, NaN in holes.
+
+        Raises:
+            ValueError: the file is missing or damaged.
+
+        """
+        return load_prediction(prediction_path(self.folder, scene))
+
+    def scene(self, scene: str) -> StoredScene:
+        """Return the problem that a scene posed.
+
+        Raises:
+            ValueError: the file is damaged, or missing as in a run of an older dsr.
+
+        """
+        return load_scene(scene_path(self.folder, scene))
+
+    def has_scene(self, scene: str) -> bool:
+        """Return whether the problem that a scene posed is kept."""
+        return scene_path(self.folder, scene).is_file()
+
+
+@dataclass(frozen=True)
+class Results:
+    """Any number of runs.
+
+    Args:
+        runs: ordered by data set, scale, degradation, and then by method as in the paper's tables, and seed.
+        notes: what was left out and why.
+
+    """
+
+    runs: tuple[Run, ...]
+    notes: tuple[str, ...] = ()
+
+    @property
+    def scores(self) -> pd.DataFrame:
+        """All scores in one table, with the columns ``label`` and ``run`` besides those of ``scores.csv``."""
+        parts = [run.scores.assign(label=run.label, run=str(run.folder)) for run in self.runs]
+        return pd.concat(parts, ignore_index=True)
+
+    def methods(self) -> list[str]:
+        """Return the labels of the methods, in order."""
+        return sorted({run.label for run in self.runs}, key=_method_key)
+
+    def problems(self) -> list[Problem]:
+        """Return what was evaluated, in order."""
+        return list(dict.fromkeys(run.problem for run in self.runs))
+
+
+def load_results(paths: Sequence[Path]) -> Results:
+    """Read all runs in and below some directories.
+
+    A run that is damaged is left out, and of two predictions for the same scene by the same method the older; the notes
+    say so.
+
+    Raises:
+        ValueError: a path is no directory, or there is no run that can be read.
+
+    """
+    runs: list[Run] = []
+    notes: list[str] = []
+    for folder in _folders(paths):
+        try:
+            runs.append(read_run(folder))
+        except ValueError as error:
+            notes.append(f"left out: {error}")
+    if not runs:
+        where = ", ".join(map(str, paths))
+        detail = f"; {notes[0]}" if notes else ""
+        raise ValueError(f"{where}: expected runs of eval.py (directories with {_SCORES}), found none{detail}")
+    runs = _distinguished(runs)
+    runs, older = _newest(runs)
+    runs.sort(key=lambda run: (_problem_key(run.problem), _method_key(run.label), run.seed))
+    return Results(tuple(runs), (*notes, *older))
+
+
+def _folders(paths: Sequence[Path]) -> Iterator[Path]:
+    """Yield the directories of runs in and below the paths, each once."""
+    seen = set()
+    for path in paths:
+        if not path.is_dir():
+            raise ValueError(f"{path}: expected a directory with runs of eval.py, there is none")
+        for file in sorted(path.rglob(_SUMMARY)):
+            if file.resolve() not in seen and (file.parent / _SCORES).is_file():
+                seen.add(file.resolve())
+                yield file.parent
+
+
+def read_run(folder: Path) -> Run:
+    """Return one run, with the label that it has by itself.
+
+    Raises:
+        ValueError: a file of the directory is missing or damaged.
+
+    """
+    summary, versions = _read_json(folder / _SUMMARY), _read_json(folder / _VERSIONS)
+    settings = dict(versions.pop("identity", {}))
+    scores = _read_scores(folder / _SCORES)
+    try:
+        method = str(summary["method"])
+        label = str(summary.get("label") or settings.get("method", {}).get("label") or method)
+        dataset = str(scores["dataset"].iloc[0]) if len(scores) else str(summary["dataset"])
+        seconds = {str(scene): float(value) for scene, value in summary["seconds"].items()}
+        scale, seed, downsampling = int(summary["scale"]), int(summary["seed"]), str(summary["downsampling"])
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise ValueError(f"{folder / _SUMMARY}: expected the summary of a run, {error!r} is missing or wrong") from None
+    scenes = tuple(scene for scene in seconds if prediction_path(folder, scene).is_file())
+    scores = scores[scores["scene"].isin(scenes)]
+    return Run(folder, dataset, scale, downsampling, seed, method, label, scores, seconds, settings, versions, scenes)
+
+
+def _read_json(path: Path) -> dict[str, Any]:
+    """Return a JSON object."""
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError) as error:
+        raise ValueError(f"{path}: expected a run's JSON, got {type(error).__name__}") from error
+    if not isinstance(content, dict):
+        raise ValueError(f"{path}: expected a JSON object, got {type(content).__name__}")
+    return content
+
+
+def _read_scores(path: Path) -> pd.DataFrame:
+    """Return a run's ``scores.csv``; an empty variant is ""."""
+    try:
+        missing = {name: [""] for name in _NUMBER_COLUMNS}
+        scores = pd.read_csv(path, dtype=dict.fromkeys(_TEXT_COLUMNS, str), keep_default_na=False, na_values=missing)
+        scores = scores[[*_TEXT_COLUMNS, *_NUMBER_COLUMNS]].astype({"scale": int, "seed": int, "value": float})
+    except (OSError, ValueError, KeyError, pd.errors.ParserError) as error:
+        raise ValueError(f"{path}: expected a run's scores, got a damaged or foreign file") from error
+    return scores
+
+
+def _distinguished(runs: Sequence[Run]) -> list[Run]:
+    """Return the runs with labels and data sets' names that differ where settings do.
+
+    What differs is said: "MSG-V (ensemble=1)", "middlebury (size=256)".
+    """
+    methods = [_method_settings(run.settings) for run in runs]
+    datasets = [{**run.settings.get("dataset", {}), "root": None, "scenes": None} for run in runs]
+    labels = _told_apart([(run.label, run.scale) for run in runs], methods)
+    names = _told_apart([(run.dataset, 0) for run in runs], datasets)
+    return [
+        replace(run, label=run.label + label, dataset=run.dataset + name)
+        for run, label, name in zip(runs, labels, names, strict=True)
+    ]
+
+
+def _method_settings(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what a run's method depends on, flat, by dotted key."""
+    found: dict[str, Any] = {}
+    for key in _ABOUT_METHOD:
+        value = settings.get(key)
+        if isinstance(value, Mapping):
+            found |= {name: entry for name, entry in value.items() if name not in ("name", "label", "target")}
+        elif value is not None:
+            found["weights" if key == "weights_sha256" else key] = str(value)[:_DIGEST]
+    return {key: value for key, value in found.items() if not key.startswith("weights_")}
+
+
+def _told_apart(names: Sequence[Any], settings: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Return what to add to each name, such as " (ensemble=1)": the settings in which those of one name differ."""
+    added = []
+    for name, own in zip(names, settings, strict=True):
+        others = [other for theirs, other in zip(names, settings, strict=True) if theirs == name]
+        keys = [key for key in own if any(other.get(key) != own[key] for other in others)]
+        text = ", ".join(f"{key}={own[key]}" for key in keys if own[key] is not None)
+        added.append(f" ({text})" if text else "")
+    return added
+
+
+def _newest(runs: Sequence[Run]) -> tuple[list[Run], list[str]]:
+    """Return the runs without what a newer run of the same method has, too, and notes on what was left out."""
+    kept: list[Run] = []
+    notes = []
+    taken: dict[tuple[Any, ...], Path] = {}
+    for run in sorted(runs, key=lambda each: (each.folder / _SCORES).stat().st_mtime, reverse=True):
+        keys = {scene: (run.problem, run.label, run.seed, scene) for scene in run.scenes}
+        again = [scene for scene, key in keys.items() if key in taken]
+        if again:
+            newer = taken[keys[again[0]]]
+            notes.append(f"left out: {run.folder}: {', '.join(again)}; {newer} is newer and of the same settings")
+        scenes = tuple(scene for scene in run.scenes if scene not in again)
+        taken |= {keys[scene]: run.folder for scene in scenes}
+        if scenes:
+            kept.append(replace(run, scenes=scenes, scores=run.scores[run.scores["scene"].isin(scenes)]))
+    return kept, notes
+
+
+def _problem_key(problem: Problem) -> tuple[Any, ...]:
+    """Order data sets as the paper does, others after them."""
+    return (*_rank(problem.dataset.partition(" (")[0], _DATASET_ORDER), problem)
+
+
+def _method_key(label: str) -> tuple[Any, ...]:
+    """Order methods as the paper's tables do, others after them."""
+    return (*_rank(label.partition(" (")[0], METHOD_ORDER), label)
+
+
+def _rank(name: str, order: Sequence[str]) -> tuple[int, str]:
+    return (order.index(name), "") if name in order else (len(order), name)

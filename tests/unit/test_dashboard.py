@@ -1,0 +1,108 @@
+"""The TensorBoard log of an evaluation: what it holds, read back by TensorBoard's own reader."""
+
+import json
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from tensorboard.plugins.custom_scalar import layout_pb2
+from tensorboard.plugins.hparams import plugin_data_pb2
+
+from dsr.geometry.shading import render
+from dsr.report.dashboard import save_dashboard
+from dsr.report.pictures import normals_seen_by
+from dsr.report.results import load_results
+from dsr.store import scene_path
+
+SCENES = ("b", "a")
+
+
+@pytest.fixture
+def log(make_run, tmp_path):
+    save_dashboard(make_run(tmp_path, scenes=SCENES))
+    return read(tmp_path)
+
+
+def read(folder):
+    accumulator = EventAccumulator(str(folder / "tensorboard"), size_guidance={"images": 0, "tensors": 0})
+    return accumulator.Reload()
+
+
+def scalars(log, tag):
+    return {event.step: event.value for event in log.Scalars(tag)}
+
+
+def test_scalars_are_the_scores_in_the_units_of_the_tables(log, tmp_path):
+    scores = load_results([tmp_path]).scores.set_index(["metric", "variant", "scene"])["value"]
+    assert scalars(log, "RMSE_d/a") == {0: pytest.approx(1000 * scores["RMSE_d", "", "a"])}
+    assert scalars(log, "DSSIM_v/b") == {0: pytest.approx(1000 * scores["DSSIM_v", "max", "b"])}
+    assert scalars(log, "scene/BadPix_v_5") == {
+        number: pytest.approx(100 * scores["BadPix_v_5", "max", scene]) for number, scene in enumerate(SCENES)
+    }
+    assert scalars(log, "light/DSSIM_v/a") == {
+        number: pytest.approx(1000 * scores["DSSIM_v", f"e{number}", "a"]) for number in (1, 2, 3, 4)
+    }
+    mean = 1000 * (scores["RMSE_v", "", "a"] + scores["RMSE_v", "", "b"]) / 2
+    assert scalars(log, "mean/RMSE_v") == {0: pytest.approx(mean)}
+
+
+def test_the_layout_groups_the_metrics_that_are_the_worst_of_four_lights(log):
+    content = log.Tensors("custom_scalars__config__")[0].tensor_proto.string_val[0]
+    layout = layout_pb2.Layout.FromString(content)
+    charts = {category.title: [chart.title for chart in category.chart] for category in layout.category}
+    assert charts["Looks, worst of four lights"] == ["BadPix_v_5", "DSSIM_v"]
+    assert charts["Depth and normals"] == ["RMSE_d", "BadPix_d_5cm", "Bumpiness_d", "RMSE_v"]
+    tags = set(log.Tags()["scalars"])
+    for category in layout.category[:2]:
+        assert {tag for chart in category.chart for tag in chart.multiline.tag} <= tags
+
+
+def test_the_table_of_runs_has_the_method_and_its_settings(make_run, tmp_path):
+    folder = make_run(tmp_path, scenes=("s",), scale=2)
+    versions = json.loads((folder / "versions.json").read_text())
+    versions["identity"]["method"] |= {"steps": 600, "w": 1.0, "widths": [1, 2], "target": "dsr.x"}
+    (folder / "versions.json").write_text(json.dumps(versions))
+    save_dashboard(folder)
+    content = read(folder).SummaryMetadata("_hparams_/session_start_info").plugin_data.content
+    start = plugin_data_pb2.HParamsPluginData.FromString(content).session_start_info
+    values = {key: value.string_value or value.number_value for key, value in start.hparams.items()}
+    assert values["method"] == "Bicubic"
+    assert values["scale"] == 2
+    assert values["method.steps"] == 600
+    assert values["method.w"] == 1
+    assert "method.target" not in values
+
+
+def test_a_picture_has_the_renderings_of_the_result_above_those_of_the_truth(log, tmp_path):
+    (run,) = load_results([tmp_path]).runs
+    encoded = np.frombuffer(log.Images("renderings/a")[0].encoded_image_string, np.uint8)
+    picture = cv2.imdecode(encoded, cv2.IMREAD_COLOR)
+    scene = run.scene("a")
+    result, truth = (render(normals_seen_by(scene.camera, depth))[0] for depth in (run.prediction("a"), scene.depth))
+    expected = torch.cat([torch.cat(list(result), dim=-1), torch.cat(list(truth), dim=-1)])
+    np.testing.assert_allclose(picture[..., 0], 255 * expected.numpy(), atol=1.01)
+
+
+def test_a_second_log_replaces_the_first(make_run, tmp_path):
+    make_run(tmp_path, scenes=("s",))
+    save_dashboard(tmp_path)
+    save_dashboard(tmp_path)
+    assert len(list((tmp_path / "tensorboard").iterdir())) == 1
+    assert not list(tmp_path.glob(".tensorboard*"))
+    assert len(read(tmp_path).Scalars("mean/RMSE_v")) == 1
+
+
+def test_a_scene_that_is_not_kept_has_scores_and_no_picture(make_run, tmp_path):
+    make_run(tmp_path, scenes=("s", "t"))
+    scene_path(tmp_path, "t").unlink()
+    save_dashboard(tmp_path)
+    log = read(tmp_path)
+    assert "RMSE_d/t" in log.Tags()["scalars"]
+    assert set(log.Tags()["images"]) == {"renderings/s", "depth_error_cm/s"}
+
+
+def test_a_directory_that_is_no_run_s_is_refused(tmp_path):
+    with pytest.raises(ValueError, match=r"summary\.json"):
+        save_dashboard(tmp_path)

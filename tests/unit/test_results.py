@@ -1,0 +1,149 @@
+"""Runs are read from their directories alone: ordered, told apart, and what cannot be read is left out and said."""
+
+import json
+import os
+
+import pytest
+import torch
+
+from dsr.report.results import Problem, load_results
+from dsr.store import load_scene, scene_path
+
+
+def change(folder, name, **entries):
+    path = folder / name
+    content = json.loads(path.read_text())
+    path.write_text(json.dumps({**content, **entries}))
+
+
+def change_method(folder, **entries):
+    identity = json.loads((folder / "versions.json").read_text())["identity"]
+    change(folder, "versions.json", identity={**identity, "method": {**identity["method"], **entries}})
+
+
+def test_a_run_is_read_with_its_scenes_predictions_and_scores(make_run, tmp_path):
+    make_run(tmp_path / "a", scenes=("b", "c"))
+    (run,) = load_results([tmp_path]).runs
+    assert (run.problem, run.label, run.scenes) == (Problem("simgeo", 4, "box"), "Bicubic", ("b", "c"))
+    assert run.prediction("b").shape == (1, 32, 32)
+    assert set(run.scores["scene"]) == {"b", "c"}
+    assert run.seconds == {"b": 0.25, "c": 0.25}
+    assert run.versions["python"] == "3.11.7"
+    assert "identity" not in run.versions
+    assert run.settings["method"]["name"] == "bicubic"
+
+
+def test_a_stored_scene_is_the_sample_that_the_method_was_given(make_run, tmp_path):
+    make_run(tmp_path / "a", scenes=("b",))
+    (run,) = load_results([tmp_path]).runs
+    scene = run.scene("b")
+    assert (scene.dataset, scene.name, scene.scale) == ("simgeo", "b", 4)
+    assert scene.coarse.shape == (1, 8, 8)
+    blocks = scene.depth[0].unfold(0, 4, 4).unfold(1, 4, 4).mean(dim=(-1, -2))
+    assert torch.allclose(blocks, scene.coarse[0], atol=1e-6)
+    assert scene.camera_lr == scene.camera.coarser(4)
+    assert float(scene.rgb.max()) <= 1
+
+
+def test_methods_and_problems_come_in_the_order_of_the_paper(make_run, tmp_path):
+    for number, (label, dataset) in enumerate(
+        [("Facets", "icl"), ("MSG-V", "icl"), ("DIP", "icl"), ("Bicubic", "simgeo")]
+    ):
+        make_run(tmp_path / str(number), label=label, method=label, dataset=dataset, scenes=("a",))
+    results = load_results([tmp_path])
+    assert results.methods() == ["Bicubic", "DIP", "MSG-V", "Facets"]
+    assert [problem.dataset for problem in results.problems()] == ["simgeo", "icl"]
+    assert [run.label for run in results.runs] == ["Bicubic", "DIP", "MSG-V", "Facets"]
+
+
+def test_runs_of_one_method_with_other_settings_are_told_apart_by_them(make_run, tmp_path):
+    for name, ensemble in (("a", 1), ("b", 4)):
+        make_run(tmp_path / name, scenes=("s",))
+        change_method(tmp_path / name, ensemble=ensemble, order="cubic")
+    assert load_results([tmp_path]).methods() == ["Bicubic (ensemble=1)", "Bicubic (ensemble=4)"]
+
+
+def test_runs_that_differ_in_the_seed_have_one_label(make_run, tmp_path):
+    for seed in (0, 1):
+        make_run(tmp_path / str(seed), seed=seed, scenes=("s",))
+    results = load_results([tmp_path])
+    assert results.methods() == ["Bicubic"]
+    assert [run.seed for run in results.runs] == [0, 1]
+    assert not results.notes
+
+
+def test_of_two_predictions_for_a_scene_the_newer_counts_and_a_note_says_so(make_run, tmp_path):
+    for age, (name, scenes) in enumerate([("new", ("s",)), ("old", ("s", "t"))]):
+        make_run(tmp_path / name, scenes=scenes)
+        os.utime(tmp_path / name / "scores.csv", (1e9 - age, 1e9 - age))
+    results = load_results([tmp_path])
+    assert {run.folder.name: run.scenes for run in results.runs} == {"new": ("s",), "old": ("t",)}
+    assert set(results.runs[1].scores["scene"] if results.runs[1].folder.name == "old" else []) <= {"t"}
+    (note,) = results.notes
+    assert "old" in note
+    assert ": s; " in note
+
+
+def test_a_directory_that_is_named_twice_is_read_once(make_run, tmp_path):
+    make_run(tmp_path / "a", scenes=("s",))
+    assert len(load_results([tmp_path, tmp_path / "a"]).runs) == 1
+
+
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        ("summary.json", "{"),
+        ("summary.json", "[]"),
+        ("summary.json", "{}"),
+        ("versions.json", "x"),
+        ("scores.csv", "a,b\n1,2\n"),
+        ("scores.csv", ""),
+        ("scores.csv", "dataset,scene,scale,downsampling,method,seed,metric,variant,value,valid_share\na,b,x,,,,,,,\n"),
+    ],
+)
+def test_a_damaged_run_is_left_out_and_the_others_are_read(make_run, tmp_path, name, content):
+    make_run(tmp_path / "fine", scenes=("s",))
+    make_run(tmp_path / "damaged", scenes=("s",), label="MSG")
+    (tmp_path / "damaged" / name).write_text(content)
+    results = load_results([tmp_path])
+    assert results.methods() == ["Bicubic"]
+    (note,) = results.notes
+    assert str(tmp_path / "damaged" / name) in note
+
+
+def test_a_directory_without_runs_is_refused(tmp_path):
+    with pytest.raises(ValueError, match=r"expected runs of eval.py .*found none"):
+        load_results([tmp_path])
+    with pytest.raises(ValueError, match="there is none"):
+        load_results([tmp_path / "absent"])
+
+
+def test_a_scene_that_is_missing_or_damaged_is_refused_in_one_line(make_run, tmp_path):
+    make_run(tmp_path, scenes=("s",))
+    path = scene_path(tmp_path, "s")
+    path.write_bytes(path.read_bytes()[:100])
+    with pytest.raises(ValueError, match="got a damaged"):
+        load_scene(path)
+    path.unlink()
+    (run,) = load_results([tmp_path]).runs
+    assert not run.has_scene("s")
+    with pytest.raises(ValueError, match="there is none"):
+        run.scene("s")
+
+
+def test_a_scene_without_prediction_is_none_of_the_run_s(make_run, tmp_path):
+    make_run(tmp_path, scenes=("s", "t"))
+    (tmp_path / "predictions" / "t.npz").unlink()
+    (run,) = load_results([tmp_path]).runs
+    assert run.scenes == ("s",)
+    assert set(run.scores["scene"]) == {"s"}
+
+
+def test_scores_of_all_runs_name_their_method_and_run(make_run, tmp_path):
+    for label in ("Bicubic", "MSG"):
+        make_run(tmp_path / label, label=label, method=label, scenes=("s",))
+    scores = load_results([tmp_path]).scores
+    assert set(scores["label"]) == {"Bicubic", "MSG"}
+    assert set(scores["run"]) == {str(tmp_path / "Bicubic"), str(tmp_path / "MSG")}
+    assert (scores[scores["metric"] == "DSSIM_v"]["variant"].unique() == ["e1", "e2", "e3", "e4", "max", "avg"]).all()
+    assert (scores[scores["metric"] == "RMSE_d"]["variant"] == "").all()
