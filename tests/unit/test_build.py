@@ -65,6 +65,12 @@ def test_the_keys_of_a_group_are_the_arguments_of_its_target():
     assert toy.values == ("r", ["a"], 0.25, 3, "far", True, "f")
 
 
+def test_a_name_reaches_a_target_that_takes_one(tmp_path):
+    (tmp_path / "scene").mkdir()
+    node = {"name": "mine", "target": "dsr.data.folder.Folder", "root": str(tmp_path)}
+    assert build("dataset", node).name == "mine"
+
+
 def test_what_describes_a_group_does_not_reach_the_target():
     build("method", node(root="r", label="Toy", weights_file="x", weights_source="y"))
 
