@@ -26,7 +26,7 @@ def log(make_run, tmp_path):
 
 
 def read(folder):
-    accumulator = EventAccumulator(str(folder / "tensorboard"), size_guidance={"images": 0, "tensors": 0})
+    accumulator = EventAccumulator(str(folder), size_guidance={"images": 0, "tensors": 0})
     return accumulator.Reload()
 
 
@@ -85,11 +85,28 @@ def test_a_picture_has_the_renderings_of_the_result_above_those_of_the_truth(log
     np.testing.assert_allclose(picture[..., 0], 255 * expected.numpy(), atol=1.01)
 
 
+def test_errors_have_the_same_colours_whatever_the_method(make_run, tmp_path):
+    folder = make_run(tmp_path, scenes=("s",))
+    truth = load_results([folder]).runs[0].scene("s").depth
+    step = 0.005 * truth.nanmedian()
+    shown = []
+    for outlier in (0, 1):
+        depth = truth + step
+        depth[0, 0, 0] += outlier
+        np.savez_compressed(folder / "predictions" / "s.npz", depth=depth[0].numpy(), config="{}", seconds=1)
+        save_dashboard(folder)
+        encoded = np.frombuffer(read(folder).Images("depth_error/s")[0].encoded_image_string, np.uint8)
+        shown.append(cv2.imdecode(encoded, cv2.IMREAD_COLOR)[4:])
+    assert (shown[0] == shown[1]).all()
+    blue, _, red = shown[0][0, 0].astype(int)
+    assert red > blue
+
+
 def test_a_second_log_replaces_the_first(make_run, tmp_path):
     make_run(tmp_path, scenes=("s",))
     save_dashboard(tmp_path)
     save_dashboard(tmp_path)
-    assert len(list((tmp_path / "tensorboard").iterdir())) == 1
+    assert len(list(tmp_path.glob("events*"))) == 1
     assert not list(tmp_path.glob(".tensorboard*"))
     assert len(read(tmp_path).Scalars("mean/RMSE_v")) == 1
 
@@ -100,7 +117,7 @@ def test_a_scene_that_is_not_kept_has_scores_and_no_picture(make_run, tmp_path):
     save_dashboard(tmp_path)
     log = read(tmp_path)
     assert "RMSE_d/t" in log.Tags()["scalars"]
-    assert set(log.Tags()["images"]) == {"renderings/s", "depth_error_cm/s"}
+    assert set(log.Tags()["images"]) == {"renderings/s", "depth_error/s"}
 
 
 def test_a_directory_that_is_no_run_s_is_refused(tmp_path):

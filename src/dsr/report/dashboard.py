@@ -11,9 +11,9 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-import matplotlib as mpl
 import numpy as np
 import torch
+from matplotlib.colors import Normalize
 from torch import Tensor
 from torch.nn import functional
 from torch.utils.tensorboard import SummaryWriter
@@ -25,8 +25,8 @@ from dsr.report.results import Run, read_run
 from dsr.report.tables import METRICS
 from dsr.store import StoredScene
 
-FOLDER = "tensorboard"
 WORST = "worst of four lights"
+_EVENTS = "events.out.tfevents.*"
 _PANEL = 320
 """Pixels of the longer side of a rendering in a picture, at most."""
 
@@ -53,9 +53,10 @@ def save_dashboard(folder: Path) -> None:
             for number, scene in enumerate(run.scenes):
                 if run.has_scene(scene):
                     _write_pictures(writer, number, run.scene(scene), run.prediction(scene))
-        shutil.rmtree(folder / FOLDER, ignore_errors=True)
-        temporary.chmod(0o755)
-        temporary.replace(folder / FOLDER)
+        for old in folder.glob(_EVENTS):
+            old.unlink()
+        for new in temporary.glob(_EVENTS):
+            new.replace(folder / new.name)
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
 
@@ -115,7 +116,7 @@ def _write_pictures(writer: SummaryWriter, number: int, scene: StoredScene, dept
     rows = [torch.cat(list(_panel(each)), dim=-1) for each in shades]
     writer.add_image(f"renderings/{scene.name}", _grey(torch.cat(rows, dim=-2)), number, dataformats="HWC")
     if scene.depth is not None:
-        writer.add_image(f"depth_error_cm/{scene.name}", _error(depth, scene.depth), number, dataformats="HWC")
+        writer.add_image(f"depth_error/{scene.name}", _error(depth, scene.depth), number, dataformats="HWC")
 
 
 def _panel(values: Tensor) -> Tensor:
@@ -134,9 +135,10 @@ def _grey(values: Tensor) -> np.ndarray:
 
 
 def _error(depth: Tensor, truth: Tensor) -> np.ndarray:
-    """Return the signed error, blue where the result is nearer, (H, W, 3) uint8; its scale is symmetric, 98 %."""
-    difference = _panel(100 * (depth - truth))[0].numpy()
-    known = np.abs(difference[np.isfinite(difference)])
-    limit = max(float(np.percentile(known, 98)), 0.1) if known.size else 1.0
-    scaled = mpl.colors.Normalize(-limit, limit)(np.ma.masked_invalid(difference))
+    """Return the signed error, blue where the result is nearer, (H, W, 3) uint8.
+
+    The strongest colours are 1 % of the scene's median depth, whatever the method, so that runs can be compared.
+    """
+    limit = 0.01 * float(truth.nanmedian())
+    scaled = Normalize(-limit, limit)(np.ma.masked_invalid(_panel(depth - truth)[0].numpy()))
     return (colours("RdBu_r")(scaled)[..., :3] * 255).round().astype(np.uint8)
