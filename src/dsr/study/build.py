@@ -1,0 +1,283 @@
+"""Make the page of a study from runs, and the key that says whose the pictures are."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import json
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from torch import Tensor
+
+from dsr.atomic import write_text
+from dsr.report.results import Problem, Results, Run
+from dsr.study.key import KEY_NAME, PAGE_VERSION, Candidate, Key, Trial, read_key, write_key
+from dsr.study.page import page_of
+from dsr.study.pictures import grey_png, shading_of
+
+PAGE_NAME = "index.html"
+_DIGITS = 12
+"""Of a hash, so many digits are an id."""
+_FEWEST = 2
+"""Methods that there is something to choose between."""
+
+Watch = Callable[[Sequence["Question"]], Iterable["Question"]]
+
+
+@dataclass(frozen=True)
+class Choice:
+    """What of the runs to ask about, and how.
+
+    Args:
+        light: e1..e4, that of the renderings.
+        scales, downsamplings, methods, scenes: those to take; all where empty. Methods by label or by name.
+        scenes_per_person: how many scenes each person sees, drawn at random; all where None.
+        repeat: how many of a person's scenes come a second time, to see how consistent the answers are.
+        title: of the page.
+        send_to: what the last page says to do with the file of answers.
+
+    """
+
+    light: str = "e4"
+    scales: Sequence[int] = ()
+    downsamplings: Sequence[str] = ()
+    methods: Sequence[str] = ()
+    scenes: Sequence[str] = ()
+    scenes_per_person: int | None = None
+    repeat: int = 0
+    title: str = "Which picture is most similar?"
+    send_to: str = "Send the file to the person who gave you this page."
+
+
+@dataclass(frozen=True)
+class Question:
+    """A scene and the runs to show of it, in the order of the results."""
+
+    problem: Problem
+    scene: str
+    runs: tuple[Run, ...]
+
+
+@dataclass(frozen=True)
+class _Drawn:
+    """The pictures of a question: PNGs of the truth and of the runs in their order, and their width and height."""
+
+    question: Question
+    truth: bytes = b""
+    pictures: tuple[bytes, ...] = ()
+    size: tuple[int, int] = (0, 0)
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Built:
+    """What was written.
+
+    Args:
+        page: the page.
+        key: what is in the key beside it.
+        notes: what was left out and what to know, one line each.
+
+    """
+
+    page: Path
+    key: Key
+    notes: tuple[str, ...] = field(default=())
+
+
+def build_study(
+    results: Results, folder: Path, choice: Choice | None = None, *, overwrite: bool = False, watch: Watch = iter
+) -> Built:
+    """Write ``index.html``, the page, and ``key.json`` into a directory.
+
+    Args:
+        results: the runs.
+        folder: where to; made if need be.
+        choice: what of the runs to show.
+        overwrite: whether to replace another study there, whose answers can then no longer be collected.
+        watch: is handed the scenes and yields them one by one, such as a progress bar.
+
+    Raises:
+        ValueError: nothing is left to compare, a choice names what the runs have not, a file is damaged, the title
+            has a method's name in it, or the directory holds another study.
+
+    """
+    choice = choice or Choice()
+    questions, notes = _questions(results, choice)
+    labels = {run.label for question in questions for run in question.runs}
+    _expect_blind(choice, labels)
+    drawn = [_draw(question, choice.light) for question in watch(questions)]
+    notes += [note for each in drawn for note in each.notes]
+    scenes, trials = _with_ids([each for each in drawn if each.pictures])
+    if not scenes:
+        raise ValueError(f"study: expected a scene with its truth, found none; {notes[-1]}")
+    per_person = _within("scenes per person", choice.scenes_per_person, 1, len(scenes), len(scenes))
+    repeat = _within("repeat", choice.repeat, 0, per_person, 0)
+    asked: dict[str, Any] = {"perPerson": per_person, "repeat": repeat, "scenes": scenes}
+    study = hashlib.sha256(json.dumps(asked, sort_keys=True).encode()).hexdigest()[:_DIGITS]
+    key = Key(study, choice.light, per_person, repeat, trials)
+    _expect_free(folder / KEY_NAME, study, overwrite=overwrite)
+    content = {"study": study, "page": PAGE_VERSION, **asked}
+    write_key(folder / KEY_NAME, key)
+    write_text(folder / PAGE_NAME, page_of(content, title=choice.title, send_to=choice.send_to))
+    return Built(folder / PAGE_NAME, key, tuple(notes))
+
+
+def _questions(results: Results, choice: Choice) -> tuple[list[Question], list[str]]:
+    """Return what to ask, and notes on what cannot be."""
+    runs = [run for run in results.runs if _wanted(run, choice)]
+    _expect_known(results, choice)
+    notes = list(results.notes)
+    questions = []
+    for problem in dict.fromkeys(run.problem for run in runs):
+        of_problem = [run for run in runs if run.problem == problem]
+        scenes = dict.fromkeys(scene for run in of_problem for scene in run.scenes)
+        everyone = {run.label for run in of_problem}
+        for scene in scenes:
+            if choice.scenes and scene not in choice.scenes:
+                continue
+            place = f"{problem.dataset}/{scene} x{problem.scale} {problem.downsampling}"
+            shown = _one_per_label([run for run in of_problem if scene in run.scenes])
+            reason = _why_not(shown, scene)
+            if reason:
+                notes.append(f"left out: {place}: {reason}")
+                continue
+            missing = sorted(everyone - {run.label for run in shown})
+            notes += [f"{place}: without {', '.join(missing)}, which has no prediction of it"] if missing else []
+            questions.append(Question(problem, scene, shown))
+    if not questions:
+        detail = f"; {notes[-1]}" if notes else ""
+        raise ValueError(f"study: expected a scene with its truth and {_FEWEST} methods, found none{detail}")
+    return questions, notes
+
+
+def _wanted(run: Run, choice: Choice) -> bool:
+    """Return whether a run is among those to show."""
+    return (
+        (not choice.scales or run.scale in choice.scales)
+        and (not choice.downsamplings or run.downsampling in choice.downsamplings)
+        and (not choice.methods or run.label in choice.methods or run.method in choice.methods)
+    )
+
+
+def _expect_known(results: Results, choice: Choice) -> None:
+    """Refuse the name of what no run has."""
+    there: dict[str, tuple[Sequence[Any], set[Any]]] = {
+        "scale": (choice.scales, {run.scale for run in results.runs}),
+        "downsampling": (choice.downsamplings, {run.downsampling for run in results.runs}),
+        "method": (choice.methods, {name for run in results.runs for name in (run.label, run.method)}),
+        "scene": (choice.scenes, {scene for run in results.runs for scene in run.scenes}),
+    }
+    for what, (asked, known) in there.items():
+        for name in asked:
+            if name not in known:
+                raise ValueError(f"{what}: expected one of {', '.join(map(str, sorted(known)))}, got {name!r}")
+
+
+def _one_per_label(runs: Sequence[Run]) -> tuple[Run, ...]:
+    """Return the run of each label with the lowest seed, in the order of the labels."""
+    first: dict[str, Run] = {}
+    for run in sorted(runs, key=lambda run: run.seed):
+        first.setdefault(run.label, run)
+    return tuple(first[label] for label in dict.fromkeys(run.label for run in runs))
+
+
+def _why_not(runs: Sequence[Run], scene: str) -> str | None:
+    """Return why a scene cannot be asked about, None where it can."""
+    if len(runs) < _FEWEST:
+        return f"only {', '.join(run.label for run in runs)} has a prediction of it"
+    if not any(run.has_scene(scene) for run in runs):
+        return "no run has kept the scene itself; the run's command writes it anew"
+    return None
+
+
+def _expect_blind(choice: Choice, labels: Iterable[str]) -> None:
+    """Refuse words of the page that would tell a method's name."""
+    for name, text in (("title", choice.title), ("send-to", choice.send_to)):
+        for label in labels:
+            if label.casefold() in text.casefold():
+                raise ValueError(f"{name}: expected words without the methods' names, got {label!r} in {text!r}")
+
+
+def _draw(question: Question, light: str) -> _Drawn:
+    """Return a scene's pictures; none where its truth is not known."""
+    problem = question.problem
+    place = f"{problem.dataset}/{question.scene} x{problem.scale} {problem.downsampling}"
+    scene = next(run for run in question.runs if run.has_scene(question.scene)).scene(question.scene)
+    if scene.depth is None:
+        return _Drawn(question, notes=(f"left out: {place}: its truth is not known",))
+    truth = shading_of(scene.depth, scene.camera, light)
+    known = truth.isfinite()
+    pictures: dict[bytes, str] = {}
+    notes = []
+    shown = []
+    for run in question.runs:
+        depth = run.prediction(question.scene)
+        _expect_size(run, question.scene, depth, scene.depth)
+        picture = grey_png(shading_of(depth, scene.camera, light), known)
+        if pictures.setdefault(picture, run.label) != run.label:
+            notes.append(f"{place}: {pictures[picture]} and {run.label} look exactly the same")
+        shown.append(picture)
+    return _Drawn(question, grey_png(truth, known), tuple(shown), (known.shape[1], known.shape[0]), tuple(notes))
+
+
+def _expect_size(run: Run, scene: str, depth: Tensor, truth: Tensor) -> None:
+    """Refuse a prediction of another size than the truth's."""
+    if depth.shape != truth.shape:
+        sizes = [" x ".join(map(str, reversed(each.shape[-2:]))) for each in (truth, depth)]
+        raise ValueError(f"{run.folder}: prediction of {scene}: expected {sizes[0]} pixels, got {sizes[1]}")
+
+
+def _with_ids(drawn: Sequence[_Drawn]) -> tuple[list[dict[str, Any]], dict[str, Trial]]:
+    """Return the page's scenes, ordered by id, and the key's trials; ids are hashes of pictures.
+
+    Neither an id nor the order on the page tells anything of a name.
+    """
+    scenes, trials = [], {}
+    for number, each in enumerate(drawn):
+        scene_id = _hash(str(number).encode(), each.truth, *sorted(each.pictures))
+        ids = [_hash(scene_id.encode(), picture, str(i).encode()) for i, picture in enumerate(each.pictures)]
+        images = {name: _text(picture) for name, picture in zip(ids, each.pictures, strict=True)}
+        width, height = each.size
+        truth = _text(each.truth)
+        scenes.append(
+            {"id": scene_id, "width": width, "height": height, "truth": truth, "images": dict(sorted(images.items()))}
+        )
+        named = {
+            name: Candidate(run.label, run.method, str(run.folder))
+            for name, run in zip(ids, each.question.runs, strict=True)
+        }
+        problem = each.question.problem
+        trials[scene_id] = Trial(problem.dataset, each.question.scene, problem.scale, problem.downsampling, named)
+    return sorted(scenes, key=lambda scene: str(scene["id"])), trials
+
+
+def _hash(*parts: bytes) -> str:
+    """Return an id of some bytes."""
+    digest = hashlib.sha256()
+    for part in parts:
+        digest.update(len(part).to_bytes(8, "big") + part)
+    return digest.hexdigest()[:_DIGITS]
+
+
+def _text(png: bytes) -> str:
+    return base64.b64encode(png).decode()
+
+
+def _within(what: str, value: int | None, low: int, high: int, default: int) -> int:
+    """Return a number that is in a range, or the default."""
+    if value is None:
+        return default
+    if not low <= value <= high:
+        raise ValueError(f"{what}: expected {low} to {high}, got {value}")
+    return value
+
+
+def _expect_free(path: Path, study: str, *, overwrite: bool) -> None:
+    """Refuse to lose the key of another study, without which its answers mean nothing."""
+    if not overwrite and path.exists() and read_key(path).study != study:
+        where = "take another directory or --overwrite"
+        raise ValueError(f"{path}: expected no other study, whose answers need this key, got one; {where}")

@@ -1,0 +1,315 @@
+"""The study as people do it: the page in a browser, by mouse, keys and fingers, and the command that collects."""
+
+import argparse
+import itertools
+import json
+import math
+from collections import Counter
+
+import pandas as pd
+import pytest
+
+from dsr.cli import study as command
+from dsr.report.results import load_results
+from dsr.study.build import Choice, build_study
+from dsr.study.key import read_key
+from dsr.terminal import open_console
+
+LABELS = {"msg_v": "MSG-V", "bicubic": "Bicubic", "dip": "DIP"}
+SCENES = ("cube", "statue", "<img src=x onerror=alert(1)>")
+QUESTIONS = len(SCENES) + 1
+PHONE = {"viewport": {"width": 390, "height": 844}, "has_touch": True, "is_mobile": True, "device_scale_factor": 2}
+LANDSCAPE = PHONE | {"viewport": {"width": 844, "height": 390}}
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return tmp_path_factory.mktemp("study")
+
+
+@pytest.fixture
+def study(folder, make_run):
+    """A study of three methods on three scenes, one of which comes twice."""
+    if not (folder / "index.html").exists():
+        for method, label in LABELS.items():
+            make_run(folder / "runs" / method, method=method, label=label, scenes=SCENES)
+        build_study(load_results([folder / "runs"]), folder, Choice(repeat=1))
+    return folder
+
+
+@pytest.fixture
+def visit(browser, study):
+    """Return what opens the page as somebody new; in the end nothing may have gone wrong on any page."""
+    visits = []
+
+    def open_page(**options):
+        visits.append(Visit(browser, study, options))
+        return visits[-1]
+
+    yield open_page
+    for each in visits:
+        each.context.close()
+        assert each.wrong == []
+        assert {url for url in each.asked if not url.startswith(("data:", "blob:"))} == {each.url}
+
+
+class Visit:
+    """Somebody's visit of the page, with what went wrong there and what it asked for."""
+
+    def __init__(self, browser, folder, options):
+        self.context = browser.new_context(**({"viewport": {"width": 1280, "height": 900}} | options))
+        self.page = self.context.new_page()
+        self.wrong, self.asked = [], []
+        self.page.on("console", lambda message: self.wrong.append(message.text))
+        self.page.on("pageerror", lambda error: self.wrong.append(str(error)))
+        self.page.on("request", lambda request: self.asked.append(request.url))
+        self.url = (folder / "index.html").as_uri()
+        self.page.goto(self.url)
+
+    def begin(self):
+        self.page.locator("#begin").click()
+        return self
+
+    def tile(self, number):
+        return self.page.locator(f".tile[data-number='{number}']")
+
+    def press(self, *keys):
+        for key in keys:
+            self.page.keyboard.press(key)
+
+    def ranks(self):
+        """Return the numbers of the pictures chosen first and second."""
+        script = "names => names.map(name => document.querySelector(`.tile.${name}`)?.dataset.number ?? null)"
+        return self.page.evaluate(script, ["first", "second"])
+
+    def text(self, where):
+        return self.page.locator(where).inner_text()
+
+    def pictures(self):
+        script = "() => [...document.querySelectorAll('#grid img')].map(each => each.src)"
+        return self.page.evaluate(script)
+
+    def answer_rest(self):
+        while self.page.locator("#trial").is_visible():
+            if self.page.locator("#next").is_disabled():
+                self.press("1", "2")
+            self.press("Enter")
+
+    def save(self, path):
+        with self.page.expect_download() as download:
+            self.page.locator("#save").click()
+        download.value.save_as(path)
+        return json.loads(path.read_text(encoding="utf-8"))
+
+
+def run(*arguments):
+    parser = argparse.ArgumentParser()
+    command.add(parser.add_subparsers())
+    options = parser.parse_args(["study", *map(str, arguments)])
+    return options.run(options, open_console(), None)
+
+
+def label_of(key, trial, rank):
+    return key.trials[trial["scene"]].candidates[trial[rank]].label
+
+
+def test_from_the_first_choice_to_the_table(visit, study, tmp_path, capsys):
+    mouse = visit().begin()
+    mouse.tile(2).click()
+    mouse.tile(3).click()
+    assert mouse.ranks() == ["2", "3"]
+    mouse.page.locator("#next").click()
+    mouse.page.reload()
+    assert mouse.text("#where") == f"Scene 2 of {QUESTIONS}"
+    mouse.answer_rest()
+    first = mouse.save(tmp_path / "mouse.json")
+
+    finger = visit(**PHONE)
+    finger.page.locator("#begin").tap()
+    for _ in range(QUESTIONS):
+        finger.tile(3).tap()
+        finger.tile(1).tap()
+        finger.page.locator("#next").tap()
+    second = finger.save(tmp_path / "finger.json")
+    (tmp_path / "pasted.json").write_text(finger.page.locator("#answers").input_value())
+
+    assert [trial["first"] for trial in first["trials"]][:1] == [first["trials"][0]["order"][1]]
+    assert all(trial["first"] == trial["order"][2] for trial in second["trials"])
+    assert (first["touch"], second["touch"]) == (False, True)
+    assert run("collect", study, tmp_path, "-o", tmp_path / "table.csv") == []
+    said = capsys.readouterr()
+    assert "2 of 3 files count" in said.out
+    assert "the same person" in said.err
+    key = read_key(study / "key.json")
+    chosen = Counter()
+    for trial in [trial for content in (first, second) for trial in content["trials"] if not trial["again"]]:
+        scene = key.trials[trial["scene"]].scene
+        chosen[scene, label_of(key, trial, "first"), "user_first"] += 50
+        chosen[scene, label_of(key, trial, "second"), "user_second"] += 50
+    table = pd.read_csv(tmp_path / "table.csv").set_index(["dataset", "scene", "label"]).sort_index()
+    for scene in SCENES:
+        for label in LABELS.values():
+            for column in ("user_first", "user_second"):
+                assert table.loc[("simgeo", scene, label), column] == chosen[scene, label, column]
+    assert set(table["n"]) == {2}
+
+
+def test_keys_choose_undo_and_go_on_and_back(visit):
+    somebody = visit().begin()
+    somebody.press("3", "1")
+    assert somebody.ranks() == ["3", "1"]
+    somebody.press("2")
+    assert somebody.ranks() == ["3", "1"]
+    assert "Two are chosen" in somebody.text("#hint")
+    somebody.press("Backspace")
+    assert somebody.ranks() == ["3", None]
+    somebody.press("Enter")
+    assert somebody.text("#where") == f"Scene 1 of {QUESTIONS}"
+    somebody.press("2", "Enter")
+    assert somebody.text("#where") == f"Scene 2 of {QUESTIONS}"
+    assert somebody.ranks() == [None, None]
+    somebody.press("ArrowLeft")
+    assert somebody.ranks() == ["3", "2"]
+    somebody.press("3")
+    assert somebody.ranks() == [None, "2"]
+
+
+def test_the_tab_key_reaches_pictures_and_enter_chooses_them(visit):
+    somebody = visit().begin()
+    for number in (1, 2):
+        somebody.press("Tab", "Enter")
+        assert somebody.tile(number).get_attribute("aria-pressed") == "true"
+    assert somebody.tile(1).get_attribute("aria-label") == "Picture 1, chosen as most similar"
+    somebody.press("Enter")
+    assert somebody.text("#where") == f"Scene 2 of {QUESTIONS}"
+
+
+def test_clicking_a_choice_again_undoes_it(visit):
+    somebody = visit().begin()
+    somebody.tile(1).click()
+    somebody.tile(2).click()
+    somebody.tile(2).click()
+    assert somebody.ranks() == ["1", None]
+    somebody.tile(1).click()
+    assert somebody.ranks() == [None, None]
+    assert somebody.page.locator("#undo").is_disabled()
+
+
+def test_the_space_bar_held_shows_the_original_everywhere_and_a_long_press_in_one_place(visit):
+    somebody = visit().begin()
+    original, *others = somebody.pictures()
+    assert original not in others
+    somebody.page.keyboard.down("Space")
+    assert somebody.pictures() == [original] * 4
+    somebody.page.keyboard.up("Space")
+    assert somebody.pictures() == [original, *others]
+    somebody.tile(2).hover()
+    somebody.page.mouse.down()
+    somebody.page.locator(".tile.flip").wait_for()
+    assert somebody.pictures() == [original, others[0], original, others[2]]
+    somebody.page.mouse.up()
+    assert somebody.pictures() == [original, *others]
+    assert somebody.ranks() == [None, None]
+
+
+def test_all_pictures_are_of_one_size_and_zoom_and_move_together(visit):
+    somebody = visit().begin()
+    script = """() => [...document.querySelectorAll('#grid .view')].map(view => {
+        const [box, image] = [view, view.firstElementChild].map(each => each.getBoundingClientRect());
+        return [box.width, box.height, image.width, image.x - box.x, image.y - box.y].map(Math.round);
+    })"""
+    boxes = somebody.page.evaluate(script)
+    assert boxes == [boxes[0]] * 4
+    assert boxes[0][0] == boxes[0][1] == boxes[0][2] > 300
+    somebody.tile(1).hover()
+    somebody.page.mouse.wheel(0, -400)
+    somebody.page.locator("#grid.zoomed").wait_for()
+    zoomed = somebody.page.evaluate(script)
+    assert zoomed == [zoomed[0]] * 4
+    assert zoomed[0][2] > 1.5 * boxes[0][0]
+    somebody.page.mouse.down()
+    somebody.page.mouse.move(0, 0, steps=4)
+    somebody.page.mouse.up()
+    moved = somebody.page.evaluate(script)
+    assert moved == [moved[0]] * 4
+    assert moved[0][3:] == [boxes[0][0] - moved[0][2]] * 2
+    assert somebody.ranks() == [None, None]
+    somebody.press("0")
+    assert somebody.page.evaluate(script) == boxes
+
+
+@pytest.mark.parametrize("options", [PHONE, LANDSCAPE], ids=["phone", "landscape"])
+def test_nothing_is_wider_than_the_window_and_no_picture_covers_another(visit, options):
+    somebody = visit(**options)
+    for step in (lambda: None, somebody.begin, somebody.answer_rest):
+        step()
+        assert somebody.page.evaluate("document.documentElement.scrollWidth <= innerWidth")
+        boxes = [each.bounding_box() for each in somebody.page.locator(".tile:visible, #original:visible").all()]
+        for one, other in itertools.combinations(boxes, 2):
+            beside = one["x"] + one["width"] <= other["x"] or other["x"] + other["width"] <= one["x"]
+            assert beside or one["y"] + one["height"] <= other["y"]
+
+
+def test_a_window_without_storage_is_told_once_and_works(visit, tmp_path):
+    somebody = visit()
+    script = "Object.defineProperty(window, 'localStorage', {get() { throw new DOMException('no'); }})"
+    somebody.context.add_init_script(script)
+    somebody.page.reload()
+    assert "keeps nothing" in somebody.text("#notice")
+    somebody.page.locator("#dismiss").click()
+    somebody.begin().answer_rest()
+    assert not somebody.page.locator("#notice").is_visible()
+    assert len(somebody.save(tmp_path / "answers.json")["trials"]) == QUESTIONS
+
+
+DAMAGES = ("'{'", "'null'", *(f"JSON.stringify({{...person, started: 'x', {part}}})" for part in (
+    "trials: 3", "index: 99", "participant: 'p'", "trials: person.trials.slice(1)",
+)))  # fmt: skip
+
+
+def test_what_somebody_damaged_in_the_storage_does_not_stop_the_page(visit):
+    somebody = visit()
+    for damage in DAMAGES:
+        somebody.page.evaluate(f"localStorage.setItem(STORE, {damage})")
+        somebody.page.reload()
+        assert somebody.page.locator("#welcome").is_visible(), damage
+
+
+def test_another_person_starts_anew_and_answers_are_not_dropped_unasked(visit, tmp_path):
+    somebody = visit().begin()
+    somebody.answer_rest()
+    said = []
+    somebody.page.once("dialog", lambda dialog: (said.append(dialog.message), dialog.dismiss()))
+    somebody.page.locator("#again").click()
+    assert "not been saved" in said[0]
+    first = somebody.save(tmp_path / "first.json")
+    somebody.page.locator("#again").click()
+    assert somebody.page.locator("#welcome").is_visible()
+    somebody.begin().answer_rest()
+    second = somebody.save(tmp_path / "second.json")
+    assert first["participant"] != second["participant"]
+    assert first["study"] == second["study"]
+
+
+def test_a_change_of_mind_after_the_last_scene_is_in_the_file(visit, tmp_path):
+    somebody = visit().begin()
+    somebody.answer_rest()
+    before = somebody.save(tmp_path / "before.json")
+    somebody.page.locator("#revise").click()
+    somebody.press("Backspace", "Backspace", "3", "1", "Enter")
+    after = somebody.save(tmp_path / "after.json")
+    assert after["finished"] > before["finished"]
+    assert after["trials"][-1]["first"] == after["trials"][-1]["order"][2]
+    assert after["trials"][:-1] == before["trials"][:-1]
+
+
+def test_one_person_is_always_shown_the_same_order_and_of_many_each_is_as_frequent_as_chance_has_it(visit):
+    page = visit().page
+    plans = page.evaluate("['p1', 'p2', 'p3', 'p1'].map(person => JSON.stringify(planFor(person)))")
+    assert plans[0] == plans[3]
+    assert len(set(plans)) == 3
+    people = "[...Array(4800).keys()]"
+    counts = Counter(page.evaluate(f"{people}.map(i => shuffled(['a', 'b', 'c', 'd'], `${{i}}/s/false`).join(''))"))
+    assert len(counts) == math.factorial(4)
+    chi_square = sum((count - 200) ** 2 / 200 for count in counts.values())
+    assert 5 < chi_square < 50  # 23 degrees of freedom: outside with a chance of 1e-4 if orders are fair

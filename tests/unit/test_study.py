@@ -1,0 +1,543 @@
+"""The perceptual study: its page, what is taken of the answers, and the percentages."""
+
+import argparse
+import base64
+import copy
+import io
+import itertools
+import json
+import math
+import re
+import shutil
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+from PIL import Image
+from scipy.stats import binomtest
+
+from dsr.cli import study as command
+from dsr.geometry.camera import Camera
+from dsr.report.results import load_results
+from dsr.study.answers import files_of, read_all, read_answers
+from dsr.study.build import Choice, build_study
+from dsr.study.collect import ALL, AVERAGE, COLUMNS, collect, remarks
+from dsr.study.display import tables_of
+from dsr.study.intervals import agreement, average_share, bootstrap_of_average, wilson
+from dsr.study.key import Candidate, Key, Trial, read_key, write_key
+from dsr.study.pictures import grey_png, shading_of
+from dsr.terminal import open_console
+
+CANDIDATES = {
+    "aa": Candidate("MSG-V", "msg_v", "runs/1"),
+    "bb": Candidate("Bicubic", "bicubic", "runs/2"),
+    "cc": Candidate("DIP", "dip", "runs/3"),
+}
+METHODS = {"V": "aa", "B": "bb", "D": "cc"}
+SCENES = {"s1": "cube", "s2": "statue"}
+KEY = Key(
+    "0123456789ab",
+    "e4",
+    2,
+    0,
+    {name: Trial("simgeo", scene, 4, "box", CANDIDATES) for name, scene in SCENES.items()},
+)
+
+
+def answers(person, *choices, minute=0, **changes):
+    """Return a file's content; a choice such as "VB" is MSG-V first and Bicubic second, one for each scene."""
+    trials = [
+        {
+            "scene": scene,
+            "again": False,
+            "order": ["cc", "aa", "bb"],
+            "first": METHODS[a],
+            "second": METHODS[b],
+            "ms": 5e3,
+        }
+        for scene, (a, b) in zip(SCENES, choices, strict=True)
+    ]
+    for trial in trials:
+        trial["ms"] += 100 * sum(person.encode())  # people differ in how long they take
+    finished = f"2024-05-01T12:{minute:02}:00.000Z"
+    return {"study": KEY.study, "page": 1, "participant": person, "finished": finished, "trials": trials} | changes
+
+
+def written(folder, *contents):
+    files = [folder / f"{number}.json" for number in range(len(contents))]
+    for file, content in zip(files, contents, strict=True):
+        file.write_text(content if isinstance(content, str) else json.dumps(content))
+    return files
+
+
+def collected(folder, *contents, key=KEY):
+    given, left_out = read_all(written(folder, *contents), key)
+    assert left_out == []
+    return collect(given, key)
+
+
+def row(table, dataset, scene, label):
+    [found] = table[(table["dataset"] == dataset) & (table["scene"] == scene) & (table["label"] == label)].to_dict(
+        "records"
+    )
+    return found
+
+
+FOUR = (
+    answers("p1", "VB", "VD"),
+    answers("p2", "VB", "BV"),
+    answers("p3", "VD", "BV"),
+    answers("p4", "BV", "VB"),
+)
+
+
+@pytest.mark.parametrize(("count", "n"), [(0, 1), (1, 1), (0, 136), (3, 136), (130, 136), (5, 10), (136, 136)])
+def test_wilsons_interval_is_that_of_scipy(count, n):
+    theirs = binomtest(count, n).proportion_ci(0.95, method="wilson")
+    assert wilson(count, n) == pytest.approx((theirs.low, theirs.high), abs=1e-12)
+
+
+def test_without_answers_there_is_no_interval():
+    assert all(math.isnan(bound) for bound in wilson(0, 0))
+
+
+def test_the_interval_of_an_average_over_one_scene_is_that_of_the_binomial():
+    asked = np.ones((400, 1), int)
+    chosen = (np.arange(400) < 120).astype(int)[:, None]
+    half = 1.96 * math.sqrt(0.3 * 0.7 / 400)
+    assert bootstrap_of_average(chosen, asked) == pytest.approx((0.3 - half, 0.3 + half), abs=0.005)
+
+
+def test_people_who_answer_alike_everywhere_count_as_one_answer_each():
+    chosen = np.repeat((np.arange(400) < 120).astype(int)[:, None], 9, axis=1)
+    one = bootstrap_of_average(chosen[:, :1], np.ones((400, 1), int))
+    assert bootstrap_of_average(chosen, np.ones((400, 9), int)) == pytest.approx(one)
+
+
+def test_where_everybody_agrees_the_interval_of_an_average_is_wilsons_with_one_answer_a_person():
+    ones = np.ones((12, 5), int)
+    assert bootstrap_of_average(ones, ones) == pytest.approx(wilson(12, 12))
+    assert bootstrap_of_average(0 * ones, ones) == pytest.approx(wilson(0, 12))
+
+
+def test_an_average_counts_each_scene_alike_and_scenes_without_answers_not_at_all():
+    assert average_share(np.array([1, 9, 0]), np.array([2, 9, 0])) == pytest.approx(0.75)
+
+
+def test_agreement_is_that_of_fleiss_own_example():
+    """Ten subjects, fourteen raters, five categories: 0.378 and kappa 0.210."""
+    counts = [
+        [0, 0, 0, 0, 14], [0, 2, 6, 4, 2], [0, 0, 3, 5, 6], [0, 3, 9, 2, 0], [2, 2, 8, 1, 1],
+        [7, 7, 0, 0, 0], [3, 2, 6, 3, 0], [2, 5, 3, 2, 2], [6, 5, 2, 1, 0], [0, 2, 2, 3, 7],
+    ]  # fmt: skip
+    assert agreement(np.array(counts)) == pytest.approx((0.378, 0.210), abs=5e-4)
+
+
+def test_agreement_of_one_person_is_unknown():
+    assert all(math.isnan(value) for value in agreement(np.array([[1, 0], [0, 1]])))
+
+
+def test_percentages_of_a_scene_are_those_counted_by_hand(tmp_path):
+    table = collected(tmp_path, *FOUR)
+    assert tuple(table.columns) == COLUMNS
+    found = row(table, "simgeo", "cube", "MSG-V")
+    assert (found["user_first"], found["user_second"], found["user_top2"], found["n"]) == (75, 25, 100, 4)
+    found = row(table, "simgeo", "cube", "Bicubic")
+    assert (found["user_first"], found["user_second"], found["user_top2"]) == (25, 50, 75)
+    found = row(table, "simgeo", "statue", "DIP")
+    assert (found["user_first"], found["user_second"], found["user_top2"]) == (0, 25, 25)
+    assert (found["method"], found["scale"], found["downsampling"]) == ("dip", 4, "box")
+    bounds = binomtest(1, 4).proportion_ci(0.95, method="wilson")
+    assert (found["user_top2_low"], found["user_top2_high"]) == pytest.approx((100 * bounds.low, 100 * bounds.high))
+
+
+def test_averages_are_means_over_scenes_with_an_interval_around_them(tmp_path):
+    table = collected(tmp_path, *FOUR)
+    found = row(table, "simgeo", AVERAGE, "MSG-V")
+    assert (found["user_first"], found["user_second"], found["user_top2"], found["n"]) == (62.5, 37.5, 100, 4)
+    assert found["user_first_low"] < 62.5 < found["user_first_high"]
+    assert row(table, ALL, AVERAGE, "MSG-V") | {"dataset": "simgeo"} == found
+
+
+def test_first_choices_of_all_methods_add_up_to_100_percent(tmp_path):
+    shares = collected(tmp_path, *FOUR).groupby(["dataset", "scene"])[["user_first", "user_second", "user_top2"]].sum()
+    assert shares.to_numpy() == pytest.approx(np.array([[100, 100, 200]] * len(shares)))
+
+
+def test_the_average_over_data_sets_counts_their_scenes_alike(tmp_path):
+    other = Trial("paper", "lucy", 4, "box", CANDIDATES)
+    key = Key(KEY.study, "e4", 2, 0, {**KEY.trials, "s2": other})
+    table = collected(tmp_path, *FOUR, key=key)
+    assert row(table, "paper", AVERAGE, "Bicubic")["user_first"] == 50
+    assert row(table, ALL, AVERAGE, "Bicubic")["user_first"] == 37.5
+
+
+def test_a_scene_counts_only_those_who_were_shown_it(tmp_path):
+    key = Key(KEY.study, "e4", 1, 0, KEY.trials)
+    parts = copy.deepcopy(FOUR)
+    for number, part in enumerate(parts):
+        part["trials"] = part["trials"][:1] if number else part["trials"][1:]
+    table = collected(tmp_path, *parts, key=key)
+    assert [row(table, "simgeo", scene, "MSG-V")["n"] for scene in ("cube", "statue", AVERAGE)] == [3, 1, 4]
+    shares = [row(table, "simgeo", scene, "MSG-V")["user_first"] for scene in ("cube", "statue", AVERAGE)]
+    assert shares == pytest.approx([200 / 3, 100, 250 / 3])
+
+
+def test_repeated_scenes_tell_how_sure_people_are_and_do_not_count_twice(tmp_path):
+    key = Key(KEY.study, "e4", 2, 2, KEY.trials)
+    asked_again = copy.deepcopy(FOUR)
+    for number, content in enumerate(asked_again):
+        more = [{**trial, "again": True} for trial in content["trials"]]
+        content["trials"] += [trial | ({"first": "cc", "second": "aa"} if number == 3 else {}) for trial in more]
+    given, _ = read_all(written(tmp_path, *asked_again), key)
+    pd.testing.assert_frame_equal(collect(given, key), collected(tmp_path, *FOUR))
+    lines = remarks(given, key)
+    assert "asked again, people chose the same picture first 6 of 8 times" in lines
+    assert any(line.startswith(f"{tmp_path / '3.json'}: another first choice") for line in lines)
+
+
+def test_how_far_people_agree_is_counted_over_pairs(tmp_path):
+    given, _ = read_all(written(tmp_path, *FOUR), KEY)
+    [line] = [line for line in remarks(given, KEY) if "two people" in line]
+    assert "in 42 % of the cases (33 % by guessing)" in line  # cube: 3 of 6 pairs, statue: 2 of 6
+    expected = (5 / 8) ** 2 + (3 / 8) ** 2
+    assert f"kappa {(5 / 12 - expected) / (1 - expected):.2f}" in line
+
+
+def changed(trial=None, **changes):
+    """Return answers with other values in them, or in their first trial."""
+    content = answers("p9", "VB", "VD")
+    content["trials"][0] |= trial or {}
+    return content | changes
+
+
+DAMAGE = {
+    "damaged JSON": '{"study": "0123',
+    "got damaged JSON": "[" * 100_000,
+    "got a JSON list": "[]",
+    "got those to 'ffff'": changed(study="ffff"),
+    "got those to None": "{}",
+    "answers of version 1, got 7": changed(page=7),
+    "participant: expected an id, got 7": changed(participant=7),
+    "incomplete, it was saved before": changed(finished=None),
+    "finished: expected a time": changed(finished="yesterday"),
+    "finished: expected a time such": changed(finished="2024-05-01T12:00:00"),
+    "trials: expected a list, got dict": changed(trials={}),
+    "incomplete, 1 of 2 scenes": changed(trials=answers("p9", "VB", "VD")["trials"][:1]),
+    "trial 1: expected an object": changed(trials=[3]),
+    "scene: expected one of the study's, got 's7'": changed({"scene": "s7"}),
+    "scene: expected one of the study's, got ['s1']": changed({"scene": ["s1"]}),
+    "different scenes, got one of them twice": changed({"scene": "s2"}),
+    "order: expected each picture of the scene once": changed({"order": ["aa", "bb"]}),
+    "order: expected a list of pictures": changed({"order": None}),
+    "second: expected a picture that was shown, got 'zz'": changed({"second": "zz"}),
+    "first: expected a picture that was shown, got 1": changed({"first": 1}),
+    "incomplete, no second choice": changed({"second": None}),
+    "the same as first and second": changed({"second": "aa"}),
+    "ms: expected milliseconds, got -1": changed({"ms": -1}),
+    "ms: expected milliseconds, got nan": changed({"ms": math.nan}),
+    "ms: expected milliseconds, got None": changed({"ms": None}),
+    "again: expected true or false": changed({"again": 0}),
+}
+
+
+@pytest.mark.parametrize("message", DAMAGE)
+def test_a_file_that_cannot_be_right_is_left_out_with_one_line_that_names_it(tmp_path, message):
+    good, bad = written(tmp_path, FOUR[0], DAMAGE[message])
+    given, left_out = read_all([good, bad], KEY)
+    assert [each.file for each in given] == [good]
+    [line] = left_out
+    assert line.startswith(f"{bad}: ")
+    assert message in line
+    assert "\n" not in line
+
+
+def test_a_missing_file_a_picture_and_one_of_many_megabytes_are_left_out(tmp_path):
+    picture, large = tmp_path / "picture.json", tmp_path / "large.json"
+    picture.write_bytes(b"\x89PNG\r\n\xff\xfe")
+    with large.open("wb") as file:
+        file.truncate(20_000_000)
+    given, left_out = read_all([tmp_path / "none.json", picture, large], KEY)
+    assert given == []
+    assert [line.partition(": ")[0] for line in left_out] == [str(tmp_path / "none.json"), str(picture), str(large)]
+    assert "20 MB" in left_out[2]
+
+
+def test_answers_survive_a_byte_order_mark_of_an_editor(tmp_path):
+    file = tmp_path / "mailed.json"
+    file.write_text(json.dumps(FOUR[0]) + "\r\n", encoding="utf-8-sig")
+    assert read_answers(file, KEY).participant == "p1"
+
+
+def test_of_one_persons_files_the_one_finished_first_counts(tmp_path):
+    later, first, other = answers("p1", "VB", "VB", minute=9), answers("p1", "BV", "BV", minute=3), FOUR[1]
+    files = written(tmp_path, later, first, other)
+    given, left_out = read_all(files, KEY)
+    assert [each.file for each in given] == files[1:]
+    assert left_out == [f"{files[0]}: a double of {files[1]} (the same person), which was finished first and counts"]
+
+
+def test_an_incomplete_file_does_not_keep_the_persons_complete_one_out(tmp_path):
+    half = answers("p1", "BV", "BV", minute=1)
+    half["trials"][1]["second"] = None
+    given, left_out = read_all(written(tmp_path, half, answers("p1", "VB", "VB", minute=9)), KEY)
+    assert [each.file.name for each in given] == ["1.json"]
+    assert len(left_out) == 1
+
+
+def test_the_very_same_answers_under_another_name_count_once(tmp_path):
+    given, left_out = read_all(written(tmp_path, FOUR[0], FOUR[0] | {"participant": "p7"}), KEY)
+    assert len(given) == 1
+    assert "the very same answers" in left_out[0]
+
+
+def test_two_people_of_one_mind_both_count(tmp_path):
+    given, left_out = read_all(written(tmp_path, answers("p1", "VB", "VB"), answers("p2", "VB", "VB")), KEY)
+    assert (len(given), left_out) == (2, [])
+
+
+def test_a_directory_stands_for_the_json_files_below_it_and_a_file_named_twice_counts_once(tmp_path):
+    (tmp_path / "deep").mkdir()
+    files = [*written(tmp_path, FOUR[0]), *written(tmp_path / "deep", FOUR[1])]
+    (tmp_path / "notes.txt").write_text("no answers")
+    assert files_of([tmp_path, files[0]]) == files
+    with pytest.raises(ValueError, match="found none"):
+        files_of([])
+
+
+def test_the_key_is_read_as_it_was_written_and_refused_when_damaged(tmp_path):
+    path = tmp_path / "key.json"
+    write_key(path, KEY)
+    assert read_key(path) == KEY
+    path.write_text(path.read_text()[:-30])
+    with pytest.raises(ValueError, match="damaged or foreign"):
+        read_key(path)
+    with pytest.raises(ValueError, match="there is none"):
+        read_key(tmp_path / "none.json")
+
+
+def test_the_tables_of_the_terminal_show_shares_with_intervals(tmp_path, capsys):
+    tables = list(tables_of(collected(tmp_path, *FOUR)))
+    assert len(tables) == 1
+    open_console().print(tables[0])
+    [line] = [line for line in capsys.readouterr().out.splitlines() if "cube" in line]
+    assert line.split() == ["cube", "MSG-V", "75.0", "(30-95)", "25.0", "(5-70)", "100.0", "(51-100)", "4"]
+
+
+# The page
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    return tmp_path_factory.mktemp("made")
+
+
+@pytest.fixture
+def runs(tmp_path, made, make_run):
+    """Three methods on two scenes; the third has only one of them."""
+    scenes = ("cube_no_texture", "<_script><b>statue")
+    for method, label, count in (("bicubic", "Bicubic", 2), ("msg_v", "MSG-V", 2), ("dip", "DIP", 1)):
+        if not (made / f"folder_of_{method}").exists():
+            make_run(made / f"folder_of_{method}", method=method, label=label, scenes=scenes[:count])
+    return shutil.copytree(made, tmp_path / "runs")
+
+
+def content_of(page):
+    text = page.read_text(encoding="utf-8")
+    [data] = re.findall(r'<script type="application/json" id="study">(.*?)</script>', text, re.DOTALL)
+    return json.loads(data), text.replace(data, re.sub(r"[A-Za-z0-9+/=]{100,}", "", data))
+
+
+def decoded(text):
+    """Return (H, W, 2): grey and opacity."""
+    return np.asarray(Image.open(io.BytesIO(base64.b64decode(text))).convert("LA"))
+
+
+def test_the_page_shows_what_the_key_says(tmp_path, runs):
+    built = build_study(load_results([runs]), tmp_path / "study")
+    content, _ = content_of(built.page)
+    assert read_key(tmp_path / "study" / "key.json") == built.key
+    assert content["study"] == built.key.study
+    assert {scene["id"]: set(scene["images"]) for scene in content["scenes"]} == {
+        name: set(trial.candidates) for name, trial in built.key.trials.items()
+    }
+    [cube] = [(name, trial) for name, trial in built.key.trials.items() if trial.scene == "cube_no_texture"]
+    [shown] = [scene for scene in content["scenes"] if scene["id"] == cube[0]]
+    for name, candidate in cube[1].candidates.items():
+        [run] = [run for run in load_results([runs]).runs if run.label == candidate.label]
+        scene = run.scene("cube_no_texture")
+        expected = shading_of(run.prediction("cube_no_texture"), scene.camera, "e4").numpy()
+        image = decoded(shown["images"][name])
+        assert np.abs((image[..., 0] - 1.0) / 254 - expected).max() <= 0.51 / 254
+
+
+def test_nothing_on_the_page_tells_a_method_a_scene_or_a_directory(tmp_path, runs):
+    built = build_study(load_results([runs]), tmp_path / "study")
+    _, words = content_of(built.page)
+    for name in ("bicubic", "msg", "dip", "folder_of", "simgeo", "cube", "statue"):
+        assert name not in words.casefold()
+    assert str(tmp_path) not in words
+    sizes = {
+        decoded(png).shape
+        for scene in content_of(built.page)[0]["scenes"]
+        for png in (scene["truth"], *scene["images"].values())
+    }
+    assert len(sizes) == 1
+
+
+def test_the_order_on_the_page_is_that_of_hashes(tmp_path, runs):
+    content, _ = content_of(build_study(load_results([runs]), tmp_path / "study").page)
+    assert content["scenes"] == sorted(content["scenes"], key=lambda scene: scene["id"])
+    for scene in content["scenes"]:
+        assert list(scene["images"]) == sorted(scene["images"])
+
+
+def test_the_same_runs_make_the_same_study_and_others_another(tmp_path, runs):
+    results = load_results([runs])
+    first = build_study(results, tmp_path / "one")
+    second = build_study(results, tmp_path / "two", Choice(title="Other words"))
+    third = build_study(results, tmp_path / "three", Choice(light="e1"))
+    assert first.key == second.key
+    assert third.key.study != first.key.study
+
+
+def test_the_key_has_the_methods_in_the_order_of_the_results(tmp_path, runs):
+    results = load_results([runs])
+    for trial in build_study(results, tmp_path / "study").key.trials.values():
+        labels = [candidate.label for candidate in trial.candidates.values()]
+        assert labels == [label for label in results.methods() if label in labels]
+
+
+def test_a_scene_that_one_method_alone_has_is_left_out_and_one_without_some_is_noted(tmp_path, runs, make_run):
+    make_run(runs / "more", scenes=["alone"])
+    built = build_study(load_results([runs]), tmp_path / "study")
+    assert {trial.scene for trial in built.key.trials.values()} == {"cube_no_texture", "<_script><b>statue"}
+    assert any("alone x4 box: only Bicubic has a prediction" in note for note in built.notes)
+    assert any("without DIP" in note for note in built.notes)
+
+
+def test_of_several_seeds_the_lowest_is_shown(tmp_path, runs, make_run):
+    make_run(runs / "again", method="msg_v", label="MSG-V", seed=1)
+    built = build_study(load_results([runs]), tmp_path / "study", Choice(scenes=["cube_no_texture"]))
+    [trial] = built.key.trials.values()
+    assert sorted(each.run for each in trial.candidates.values()) == sorted(
+        str(path) for path in runs.glob("folder_of_*")
+    )
+
+
+@pytest.mark.parametrize(
+    ("choice", "message"),
+    [
+        (Choice(methods=["Bicubic", "EG"]), "method: expected one of .*, got 'EG'"),
+        (Choice(scales=[16]), "scale: expected one of 4, got 16"),
+        (Choice(scenes=["none"]), "scene: expected one of"),
+        (Choice(downsamplings=["nearest"]), "downsampling: expected one of box, got 'nearest'"),
+        (Choice(methods=["Bicubic"]), "2 methods, found none; left out: "),
+        (Choice(light="e5"), "light: expected one of e1, e2, e3, e4, got 'e5'"),
+        (Choice(scenes_per_person=3), "scenes per person: expected 1 to 2, got 3"),
+        (Choice(repeat=-1), "repeat: expected 0 to 2, got -1"),
+        (Choice(title="Is bicubic best?"), "title: expected words without the methods' names, got 'Bicubic'"),
+    ],
+)
+def test_a_study_that_cannot_be_made_is_refused_and_leaves_nothing(tmp_path, runs, choice, message):
+    with pytest.raises(ValueError, match=message):
+        build_study(load_results([runs]), tmp_path / "study", choice)
+    assert not (tmp_path / "study").exists()
+
+
+def test_the_key_of_another_study_is_not_overwritten_unasked(tmp_path, runs):
+    results = load_results([runs])
+    first = build_study(results, tmp_path)
+    assert build_study(results, tmp_path).key == first.key
+    with pytest.raises(ValueError, match="expected no other study"):
+        build_study(results, tmp_path, Choice(light="e1"))
+    assert read_key(tmp_path / "key.json") == first.key
+    assert build_study(results, tmp_path, Choice(light="e1"), overwrite=True).key == read_key(tmp_path / "key.json")
+
+
+def test_words_of_the_page_are_shown_as_they_are(tmp_path, runs):
+    title = "</title><script>alert(1)</script> {{DATA}}"
+    page = build_study(load_results([runs]), tmp_path / "study", Choice(title=title)).page.read_text()
+    assert "alert(1)</script>" not in page
+    assert page.count("&lt;/title&gt;&lt;script&gt;alert(1)&lt;/script&gt; {{DATA}}") == 2
+
+
+def test_what_the_truth_does_not_have_is_hidden_in_every_picture_alike():
+    camera = Camera(8, 6, 8.0, 8.0, 3.5, 2.5)
+    depth = torch.full((1, 6, 8), 2.0)
+    truth = depth.clone()
+    truth[0, 2, 3] = math.nan
+    known = shading_of(truth, camera, "e4").isfinite()
+    picture = decoded(base64.b64encode(grey_png(shading_of(depth, camera, "e4"), known)))
+    assert picture.shape == (6, 8, 2)
+    assert np.array_equal(picture[..., 1] == 0, ~known.numpy())
+    assert (~known).nonzero().tolist() == [[1, 3], [2, 2], [2, 3]]
+
+
+def test_of_a_wall_seen_head_on_the_fourth_lights_rendering_is_white():
+    camera = Camera(8, 6, 8.0, 8.0, 3.5, 2.5)
+    shades = shading_of(torch.full((1, 6, 8), 2.0), camera, "e4")
+    picture = decoded(base64.b64encode(grey_png(shades, shades.isfinite())))
+    assert (picture == 255).all()
+
+
+def test_methods_that_look_exactly_the_same_are_told_and_keep_ids_of_their_own(tmp_path, make_run):
+    for method in ("msg", "copy"):
+        make_run(tmp_path / method, method=method, label=method)
+    file = "predictions/cube_no_texture.npz"
+    (tmp_path / "copy" / file).write_bytes((tmp_path / "msg" / file).read_bytes())
+    built = build_study(load_results([tmp_path]), tmp_path / "study")
+    [trial] = built.key.trials.values()
+    assert len(trial.candidates) == 2
+    assert any("copy and msg look exactly the same" in note for note in built.notes)
+
+
+class Commands:
+    """What the command line adds its commands to."""
+
+    def __init__(self):
+        self.parser = argparse.ArgumentParser()
+        command.add(self.parser.add_subparsers())
+
+    def __call__(self, *arguments):
+        options = self.parser.parse_args(["study", *map(str, arguments)])
+        return options.run(options, open_console(), None)
+
+
+def test_the_command_collects_what_is_good_and_says_what_is_not(tmp_path, capsys):
+    write_key(tmp_path / "key.json", KEY)
+    folder = tmp_path / "answers"
+    folder.mkdir()
+    written(folder, *FOUR, "{")
+    assert Commands()("collect", tmp_path, folder, "-o", tmp_path / "table.csv") == []
+    said = capsys.readouterr()
+    assert said.err.startswith(f"left out: {folder / '4.json'}: ")
+    assert "4 of 5 files count, see above" in said.out
+    table = pd.read_csv(tmp_path / "table.csv")
+    assert tuple(table.columns) == COLUMNS
+    assert row(table, "simgeo", "cube", "MSG-V")["user_first"] == 75
+
+
+def test_the_command_refuses_a_study_without_an_answer_that_counts(tmp_path):
+    write_key(tmp_path / "key.json", KEY)
+    files = written(tmp_path, "{", "[]")
+    with pytest.raises(ValueError, match="answers that count, got none in 2 files"):
+        Commands()("collect", tmp_path, *files)
+    assert not (tmp_path / "study.csv").exists()
+
+
+def test_the_command_builds_with_the_options_given(tmp_path, runs, capsys):
+    words = ("--scale", 4, "--methods", "bicubic", "msg_v", "--repeat", 1, "--send-to", "Post it.")
+    assert Commands()("build", runs, *words, "-o", tmp_path / "study") == []
+    content, text = content_of(tmp_path / "study" / "index.html")
+    assert (content["perPerson"], content["repeat"]) == (2, 1)
+    assert "Post it." in text
+    assert "3 questions for each person" in capsys.readouterr().out
+
+
+def test_permutations_that_the_page_may_draw_are_all_accepted(tmp_path):
+    for number, order in enumerate(itertools.permutations(CANDIDATES)):
+        content = answers(f"p{number}", "VB", "VD")
+        content["trials"][0]["order"] = list(order)
+        assert read_answers(written(tmp_path, content)[0], KEY).given[0].first == "aa"
