@@ -147,3 +147,14 @@ def test_scores_of_all_runs_name_their_method_and_run(make_run, tmp_path):
     assert set(scores["run"]) == {str(tmp_path / "Bicubic"), str(tmp_path / "MSG")}
     assert (scores[scores["metric"] == "DSSIM_v"]["variant"].unique() == ["e1", "e2", "e3", "e4", "max", "avg"]).all()
     assert (scores[scores["metric"] == "RMSE_d"]["variant"] == "").all()
+
+
+def test_some_runs_can_be_chosen_and_what_is_not_there_is_refused(make_run, tmp_path):
+    for label, scale in (("Bicubic", 4), ("MSG", 4), ("MSG", 2)):
+        make_run(tmp_path / f"{label}{scale}", label=label, method=label, scale=scale, scenes=("s",))
+    results = load_results([tmp_path])
+    assert [(run.label, run.scale) for run in results.only(label=["MSG"], scale=[]).runs] == [("MSG", 2), ("MSG", 4)]
+    with pytest.raises(ValueError, match="label: expected one of MSG, Bicubic, got DIP"):
+        results.only(label=["DIP"])
+    with pytest.raises(ValueError, match="there is none"):
+        results.only(label=["Bicubic"], scale=[2])

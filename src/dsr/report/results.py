@@ -122,6 +122,26 @@ class Results:
         """Return what was evaluated, in order."""
         return list(dict.fromkeys(run.problem for run in self.runs))
 
+    def only(self, **wanted: Sequence[Any]) -> Results:
+        """Return the runs of some labels, data sets or scales: ``only(label=["MSG-V"], scale=[4, 8])``.
+
+        An empty choice is no choice.
+
+        Raises:
+            ValueError: there is none of a wanted value, or none of all together.
+
+        """
+        runs = self.runs
+        for name, values in wanted.items():
+            there = list(dict.fromkeys(getattr(run, name) for run in self.runs))
+            for value in values:
+                if value not in there:
+                    raise ValueError(f"{name}: expected one of {', '.join(map(str, there))}, got {value}")
+            runs = tuple(run for run in runs if not values or getattr(run, name) in values)
+        if not runs:
+            raise ValueError(f"expected a run with {', '.join(map(str, wanted))} as wanted, there is none")
+        return Results(runs, self.notes)
+
 
 def load_results(paths: Sequence[Path]) -> Results:
     """Read all runs in and below some directories.

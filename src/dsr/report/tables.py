@@ -48,10 +48,22 @@ def published() -> pd.DataFrame:
 
 def published_row(scene: str, method: str, scale: int) -> pd.Series | None:
     """Return the paper's figures for a scene (by our name or its own) and a method (by its name in the paper)."""
+    name = RECREATED.get(scene, scene.replace("_", " "))
+    number = _published_places().get((name.casefold(), method, scale))
+    return None if number is None else published().iloc[number]
+
+
+@functools.cache
+def _published_places() -> dict[tuple[str, str, int], int]:
+    """Return in which row of :func:`published` the figures of a scene, method and scale are."""
     table = published()
-    name = RECREATED.get(scene, scene.replace("_", " ")).casefold()
-    rows = table[(table["scene"].str.casefold() == name) & (table["method"] == method) & (table["scale"] == scale)]
-    return None if rows.empty else rows.iloc[0]
+    keys = zip(table["scene"].str.casefold(), table["method"], table["scale"], strict=True)
+    return {(scene, method, int(scale)): number for number, (scene, method, scale) in enumerate(keys)}
+
+
+def paper_row(scene: str, method: str, scale: int, downsampling: str) -> pd.Series | None:
+    """Return the paper's figures as :func:`published_row` does, where they are of the same downsampling."""
+    return published_row(scene, method, scale) if downsampling == _PUBLISHED_DOWNSAMPLING else None
 
 
 def in_paper_units(scores: pd.DataFrame) -> pd.DataFrame:
@@ -88,7 +100,7 @@ def score_table(scores: pd.DataFrame, label: str) -> Table:
     starred = False
     for scene, values in ours.iterrows():
         table.add_row(escape(str(scene)), "dsr", *_cells(values))
-        paper = _paper_row(str(scene), label, scale, downsampling)
+        paper = paper_row(str(scene), label, scale, downsampling)
         if paper is not None:
             recreated = scene in RECREATED or dataset in OTHER_FRAMES
             starred |= recreated
@@ -97,18 +109,13 @@ def score_table(scores: pd.DataFrame, label: str) -> Table:
         table.add_section()
         table.add_row("mean", "dsr", *_cells(ours.mean()), style="bold")
         name, count = AVERAGES.get(dataset, ("", 0))
-        paper = _paper_row(name, label, scale, downsampling)
+        paper = paper_row(name, label, scale, downsampling)
         if paper is not None and len(ours) == count:
             table.add_row("", "paper*" if starred else "paper", *_cells(paper[list(ours)]), style="dim")
     if starred:
         table.caption = "* of the paper's own files; the scenes here are others of the same description"
         table.caption_justify = "left"
     return table
-
-
-def _paper_row(scene: str, method: str, scale: int, downsampling: str) -> pd.Series | None:
-    """Return the paper's figures where they are of the same downsampling."""
-    return published_row(scene, method, scale) if downsampling == _PUBLISHED_DOWNSAMPLING else None
 
 
 def _cells(values: pd.Series) -> list[str]:

@@ -1,0 +1,240 @@
+"""The metric study as figures: a scatter matrix like the paper's, and each metric's correlation with LPIPS_v.
+
+Voynov et al., *Perceptual Deep Depth Super-Resolution* (ICCV 2019): pairs of metrics below the diagonal, correlations
+above, densities per method on it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import matplotlib as mpl
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from scipy.stats import gaussian_kde
+
+from dsr.report.correlations import DEPTH_LIMIT, REFERENCE, correlate, metric_matrix, pairs, with_reference
+from dsr.report.palette import method_colours
+from dsr.report.pictures import write_figure
+from dsr.report.results import Results
+from dsr.report.tables import METRICS
+
+_STYLE: dict[Any, Any] = {
+    "pdf.fonttype": 42,
+    "ps.fonttype": 42,
+    "font.size": 8,
+    "axes.linewidth": 0.6,
+    "axes.unicode_minus": False,
+}
+_DPI = 200
+_PANEL = 1.35
+_ABOVE = 0.95
+"""Inches of a panel, and of the room for the title and the legend."""
+_HIGHLIGHT, _FRAME = "#fff4d6", "#c98a00"
+_STRENGTH = "RdBu_r"
+_MANY = 3000
+"""From so many points on they are an image in the PDF, which would take minutes to open."""
+
+
+def save_scatter_matrix(folder: Path, results: Results) -> list[Path]:
+    """Draw the scatter matrix of the paper's metrics, and the correlations of all versions with LPIPS_v.
+
+    Args:
+        folder: gets ``scatter_matrix.pdf`` and ``.png``, and ``with_lpips.pdf`` and ``.png`` where there is an LPIPS_v.
+        results: the runs.
+
+    Returns:
+        The files.
+
+    """
+    matrix = metric_matrix(results)
+    labels = [label for label in results.methods() if label in matrix.index.get_level_values("label")]
+    ranking = with_reference(matrix)
+    with mpl.rc_context(_STYLE):
+        figures = {"scatter_matrix": scatter_matrix(matrix, labels)}
+        if len(ranking):
+            figures["with_lpips"] = _ranking(ranking, len(matrix))
+        paths = []
+        for name, figure in figures.items():
+            for suffix in ("pdf", "png"):
+                paths.append(folder / f"{name}.{suffix}")
+                write_figure(paths[-1], figure, _DPI)
+    return paths
+
+
+def scatter_matrix(matrix: pd.DataFrame, labels: list[str]) -> Figure:
+    """Return the figure.
+
+    Args:
+        matrix: of :func:`dsr.report.correlations.metric_matrix`.
+        labels: the methods, in the legend's order.
+
+    """
+    names = [name for name in METRICS if name in matrix and name != REFERENCE]
+    names += [REFERENCE] if REFERENCE in matrix else []
+    values = matrix[names] * [METRICS[name][2] for name in names]
+    method = matrix.index.get_level_values("label").to_numpy()
+    colours = method_colours(labels)
+    size = max(len(names), 2) * _PANEL
+    height = size + _ABOVE + 0.5
+    figure = Figure(figsize=(size + 0.7, height))
+    FigureCanvasAgg(figure)
+    axes = figure.subplots(len(names), len(names), squeeze=False)
+    figure.subplots_adjust(0.6 / (size + 0.7), 0.45 / height, 1 - 0.1 / (size + 0.7), 1 - _ABOVE / height, 0.09, 0.09)
+    limits = {name: _limits(values[name]) for name in names}
+    tables = (correlate(matrix[names], "pearson"), correlate(matrix[names], "spearman"), pairs(matrix[names]))
+    for row, vertical in enumerate(names):
+        for column, across in enumerate(names):
+            axis = axes[row, column]
+            if row == column:
+                _densities(axis, values[across].to_numpy(), method, colours, limits[across])
+            elif row > column:
+                _scatter(axis, values[across].to_numpy(), values[vertical].to_numpy(), method, colours)
+                axis.set(xlim=limits[across], ylim=limits[vertical])
+            else:
+                pearson, spearman, count = (float(table.loc[vertical, across]) for table in tables)
+                _coefficients(axis, pearson, spearman, "" if count == len(matrix) else f"n = {count:.0f}")
+            if REFERENCE in (vertical, across):
+                _highlight(axis, lit=row >= column)
+            _label(axis, row, column, vertical, across, len(names))
+    _head(figure, len(matrix), colours, has_reference=REFERENCE in names)
+    return figure
+
+
+def _limits(values: pd.Series) -> tuple[float, float]:
+    """Return the range of an axis with a margin."""
+    known = values.dropna()
+    low, high = (float(known.min()), float(known.max())) if len(known) else (0.0, 1.0)
+    margin = 0.06 * (high - low) or 0.06 * abs(high) or 0.5
+    return low - margin, high + margin
+
+
+def _scatter(
+    axis: Axes, across: np.ndarray, vertical: np.ndarray, method: np.ndarray, colours: Mapping[str, str]
+) -> None:
+    """Draw the results of a pair of metrics; the order of drawing is shuffled, so that no method covers another."""
+    order = np.random.default_rng(0).permutation(len(across))
+    points = [colours[label] for label in method[order]]
+    many = len(across) > _MANY
+    axis.scatter(across[order], vertical[order], s=7, c=points, alpha=0.75, linewidths=0, rasterized=many)
+
+
+def _densities(
+    axis: Axes, values: np.ndarray, method: np.ndarray, colours: Mapping[str, str], limits: tuple[float, float]
+) -> None:
+    """Draw a kernel density estimate per method, each to its own height; ticks below where there is none."""
+    grid = np.linspace(*limits, 200)
+    for label, colour in colours.items():
+        own = values[(method == label) & np.isfinite(values)]
+        density = density_of(own, grid)
+        if density is None:
+            axis.plot(own, np.full(len(own), 0.05), "|", color=colour, markersize=7, markeredgewidth=1)
+        else:
+            axis.plot(grid, density / density.max(), color=colour, linewidth=1.1)
+            axis.fill_between(grid, density / density.max(), color=colour, alpha=0.08, linewidth=0)
+    axis.set(xlim=limits, ylim=(0, 1.12))
+
+
+def density_of(values: np.ndarray, grid: np.ndarray) -> np.ndarray | None:
+    """Return the Gaussian kernel density of values on a grid (Scott's bandwidth); None for fewer than three different.
+
+    Args:
+        values: (N,) finite.
+        grid: (M,) where it is wanted.
+
+    """
+    if len(np.unique(values)) < 3:
+        return None
+    density = gaussian_kde(values)(grid)
+    return density if density.max() > 0 and np.isfinite(density).all() else None
+
+
+def _highlight(axis: Axes, *, lit: bool) -> None:
+    """Mark a panel of the reference's row or column."""
+    if lit:
+        axis.set_facecolor(_HIGHLIGHT)
+    for spine in axis.spines.values():
+        spine.set(color=_FRAME, linewidth=1.2)
+
+
+def _coefficients(axis: Axes, pearson: float, spearman: float, count: str) -> None:
+    """Write Pearson's and Spearman's coefficient, the larger and the more colourful the stronger."""
+    if np.isfinite(pearson):
+        axis.set_facecolor(mpl.colormaps[_STRENGTH](0.5 + 0.27 * (pearson + spearman) / 2))
+    for value, letter, height in ((pearson, "r", 0.66), (spearman, "\N{GREEK SMALL LETTER RHO}", 0.34)):
+        known = bool(np.isfinite(value))
+        text = f"{letter} = {value:.2f}" if known else f"{letter} \N{EN DASH}"
+        size = 7 + 6 * abs(value) if known else 7
+        axis.text(0.5, height, text, ha="center", va="center", fontsize=size, transform=axis.transAxes)
+    axis.text(0.5, 0.09, count, ha="center", va="center", fontsize=6, transform=axis.transAxes)
+
+
+def _label(axis: Axes, row: int, column: int, vertical: str, across: str, count: int) -> None:
+    """Write the metrics' names and numbers at the outer panels alone."""
+    axis.tick_params(length=2, width=0.5, labelsize=6, pad=1.5)
+    axis.locator_params(nbins=4)
+    if row < count - 1:
+        axis.set_xticklabels([])
+    else:
+        axis.set_xlabel(_name(across), fontweight="bold" if across == REFERENCE else "normal", parse_math=False)
+    if column > 0 or row == 0:
+        axis.set_yticklabels([])
+    if column == 0:
+        axis.set_ylabel(_name(vertical), fontweight="bold" if vertical == REFERENCE else "normal", parse_math=False)
+    if row == column:
+        axis.set_yticks([])
+    if row < column:
+        axis.set(xticks=[], yticks=[])
+    axis.xaxis.set_label_coords(0.5, -0.17)
+    axis.yaxis.set_label_coords(-0.24, 0.5)
+
+
+def _name(metric: str) -> str:
+    heading, unit, *_ = METRICS[metric]
+    return f"{heading} ({unit})" if unit else heading
+
+
+def _head(figure: Figure, count: int, colours: Mapping[str, str], *, has_reference: bool) -> None:
+    """Write what the figure shows, and the methods."""
+    width, height = figure.get_size_inches()
+    reference = f"{REFERENCE} is highlighted" if has_reference else f"no {REFERENCE} in these results"
+    text = (
+        f"{count} results; worst of four lights; RMSE_d clipped at {1000 * DEPTH_LIMIT:g} mm; {reference}\n"
+        "r: Pearson, \N{GREEK SMALL LETTER RHO}: Spearman; on the diagonal kernel densities, each to its own height"
+    )
+    figure.text(0.6 / width, 1 - 0.12 / height, text, va="top", fontsize=8, parse_math=False)
+    handles: list[Any] = [
+        Line2D([], [], marker="o", linestyle="", markersize=4, color=each) for each in colours.values()
+    ]
+    columns = max(1, int(width / (0.45 + 0.075 * max(map(len, colours), default=0))))
+    figure.legend(handles, list(colours), loc="upper left", bbox_to_anchor=(0.6 / width - 0.01, 1 - 0.42 / height),
+                  ncols=min(columns, len(handles)), frameon=False, handletextpad=0.1, columnspacing=1.2)  # fmt: skip
+
+
+def _ranking(ranking: pd.DataFrame, count: int) -> Figure:
+    """Return the figure of all metrics' correlations with LPIPS_v, the strongest on top."""
+    rows = len(ranking)
+    height = 0.19 * rows + 0.85
+    figure = Figure(figsize=(5.6, height))
+    FigureCanvasAgg(figure)
+    axis = figure.add_axes((0.3, 0.5 / height, 0.66, 1 - 0.85 / height))
+    places = np.arange(rows)[::-1]
+    axis.hlines(places, 0, 1, color="#e6e6e6", linewidth=0.6, zorder=0)
+    axis.barh(places, ranking["spearman"], height=0.62, color="#0f165b", alpha=0.85, label="Spearman")
+    axis.plot(ranking["pearson"], places, "D", color="#d52554", markersize=4, markeredgecolor="white",
+              markeredgewidth=0.5, label="Pearson")  # fmt: skip
+    axis.set_yticks(places, [str(name) for name in ranking["metric"]], parse_math=False)
+    low = min(0.0, float(np.nanmin(ranking[["pearson", "spearman"]].to_numpy(), initial=0)))
+    axis.set(xlim=(low - 0.05 * (low < 0), 1.0), ylim=(-0.7, rows - 0.3))
+    axis.set_xlabel(f"correlation with {REFERENCE} over {count} results", parse_math=False)
+    axis.tick_params(length=0, axis="y")
+    axis.spines[["top", "right", "left"]].set_visible(False)
+    axis.axvline(0, color="black", linewidth=0.6)
+    axis.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=2, frameon=False, borderaxespad=0.2)
+    return figure

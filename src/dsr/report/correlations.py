@@ -1,0 +1,140 @@
+"""How metrics agree with each other, and with LPIPS_v, over all results.
+
+The study of metrics of Voynov et al., *Perceptual Deep Depth Super-Resolution* (ICCV 2019): every result, whatever its
+method, scene and scale, is a point; correlations are Pearson's and Spearman's.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import pandas as pd
+
+from dsr.atomic import replacing, write_text
+from dsr.report.markup import MISSING, aligned, escaped
+from dsr.report.results import Results
+
+Kind = Literal["pearson", "spearman"]
+KINDS: tuple[Kind, ...] = ("pearson", "spearman")
+REFERENCE = "LPIPS_v"
+DEPTH_LIMIT = 0.5
+"""Metres that RMSE_d is clipped at, as in the paper: a few results are far off."""
+_ABOUT = ["dataset", "scene", "scale", "downsampling", "label", "seed"]
+_LEAST = 3
+"""Points that a correlation needs."""
+
+
+def metric_matrix(results: Results) -> pd.DataFrame:
+    """Return one row per result and one column per version of a metric, in raw units.
+
+    Args:
+        results: the runs.
+
+    Returns:
+        Rows: ``dataset, scene, scale, downsampling, label, seed``. Columns: ``DSSIM_v`` for the worst of the four
+        lights, ``DSSIM_v[e1]`` to ``[e4]`` and ``[avg]``, metrics without lights by their name. RMSE_d is clipped at
+        0.5 m. What is unknown is NaN.
+
+    """
+    scores = pd.concat([run.scores.assign(dataset=run.dataset, label=run.label) for run in results.runs])
+    variant = scores["variant"].fillna("")
+    name = scores["metric"].where(variant.isin(["", "max"]), scores["metric"] + "[" + variant + "]")
+    scores = scores.assign(name=name, value=scores["value"].where(np.isfinite(scores["value"])))
+    scores = scores.drop_duplicates([*_ABOUT, "name"], keep="last")
+    matrix = scores.pivot(index=_ABOUT, columns="name", values="value")
+    matrix = matrix.reindex(columns=list(dict.fromkeys(name))).rename_axis(columns=None)
+    if "RMSE_d" in matrix:
+        matrix["RMSE_d"] = matrix["RMSE_d"].clip(upper=DEPTH_LIMIT)
+    return matrix
+
+
+def correlate(matrix: pd.DataFrame, kind: Kind) -> pd.DataFrame:
+    """Return the correlation of every pair of columns, over the rows in which both are known.
+
+    It is NaN where these are fewer than three or where a column is constant in them.
+
+    Args:
+        matrix: of :func:`metric_matrix`.
+        kind: ``pearson``, or ``spearman``: that of the ranks among these rows, equal values sharing theirs.
+
+    Raises:
+        ValueError: another kind.
+
+    """
+    if kind not in KINDS:
+        raise ValueError(f"kind: expected pearson or spearman, got {kind}")
+    return matrix.astype(float).corr(method=kind, min_periods=_LEAST)
+
+
+def pairs(matrix: pd.DataFrame) -> pd.DataFrame:
+    """Return for every pair of columns in how many rows both are known."""
+    known = matrix.notna().astype(int)
+    return known.T @ known
+
+
+def with_reference(matrix: pd.DataFrame) -> pd.DataFrame:
+    """Return how every version of a metric but LPIPS_v's own correlates with LPIPS_v.
+
+    Returns:
+        Columns ``metric, pearson, spearman, n``, the largest of ``spearman`` first, unknown ones last; no row without
+        LPIPS_v.
+
+    """
+    names = [name for name in matrix if not str(name).startswith(REFERENCE)] if REFERENCE in matrix else []
+    frame = pd.DataFrame({"metric": pd.Series(names, dtype=str)})
+    for kind in KINDS:
+        found = correlate(matrix, kind)
+        frame[kind] = [float(found.loc[name, REFERENCE]) for name in names]
+    counts = pairs(matrix)
+    frame["n"] = [int(counts.loc[name, REFERENCE]) for name in names]
+    return frame.sort_values("spearman", ascending=False, kind="stable", ignore_index=True)
+
+
+def write_correlations(folder: Path, results: Results) -> list[Path]:
+    """Write the correlations of all versions of all metrics.
+
+    Args:
+        folder: gets ``pearson.csv``, ``spearman.csv``, ``pairs.csv`` (how many results each rests on),
+            ``with_lpips.csv`` and ``with_lpips.md``.
+        results: the runs.
+
+    Returns:
+        The files.
+
+    """
+    matrix = metric_matrix(results)
+    ranking = with_reference(matrix)
+    tables = {kind: correlate(matrix, kind) for kind in KINDS} | {"pairs": pairs(matrix)}
+    paths = []
+    for name, table in tables.items():
+        paths.append(folder / f"{name}.csv")
+        with replacing(paths[-1]) as temporary:
+            table.to_csv(temporary, index_label="metric")
+    paths.append(folder / "with_lpips.csv")
+    with replacing(paths[-1]) as temporary:
+        ranking.to_csv(temporary, index=False)
+    paths.append(folder / "with_lpips.md")
+    write_text(paths[-1], _ranking_text(ranking, len(matrix)))
+    return paths
+
+
+def _ranking_text(ranking: pd.DataFrame, count: int) -> str:
+    """Return the table of correlations with LPIPS_v as Markdown."""
+    title = f"## Correlation with {REFERENCE}\n\n"
+    if ranking.empty:
+        return f"{title}There is no {REFERENCE} in these {count} results (metrics.lpips=true computes it).\n"
+    rows = [
+        [escaped(str(row["metric"])), *(_coefficient(row[kind]) for kind in KINDS), str(row["n"])]
+        for _, row in ranking.iterrows()
+    ]
+    text = (
+        f"Over {count} results of all methods, scenes and scales. A name by itself is the worst of four lights; "
+        f"RMSE_d is clipped at {DEPTH_LIMIT:g} m. n: results in which both metrics are known."
+    )
+    return f"{title}{text}\n\n{aligned(['metric', 'Pearson', 'Spearman', 'n'], rows, 1)}\n"
+
+
+def _coefficient(value: float) -> str:
+    return MISSING if np.isnan(value) else f"{value:.3f}"

@@ -1,0 +1,191 @@
+"""Tables as LaTeX with the rules of booktabs: to be read by a paper, or a document that compiles by itself."""
+
+from __future__ import annotations
+
+import unicodedata
+from collections.abc import Iterator, Sequence
+
+from dsr.report.table_parts import STAR_NOTE, Cell, Column, Group, PaperTable, Row
+
+MISSING = "--"
+_END = "\\end{table}\n"
+_ROWS, _ROWS_TURNED = 42, 26
+"""More do not fit on a page, upright or turned."""
+_WIDE = 135
+"""Characters of a row that do not fit on an upright page in a legible size."""
+_MARKS = {0: ("", ""), 1: ("\\textbf{", "}"), 2: ("\\underline{", "}")}
+_SPECIAL = {
+    "\\": "\\textbackslash{}", "{": "\\{", "}": "\\}", "$": "\\$", "&": "\\&", "#": "\\#", "%": "\\%", "_": "\\_",
+    "~": "\\textasciitilde{}", "^": "\\textasciicircum{}", "<": "\\textless{}", ">": "\\textgreater{}",
+    "|": "\\textbar{}", '"': "\\textquotedbl{}", "`": "\\textasciigrave{}",
+    "\N{PLUS-MINUS SIGN}": "$\\pm$", "\N{EN DASH}": "--", "\N{MULTIPLICATION SIGN}": "$\\times$",
+}  # fmt: skip
+_LAST_LETTER = 0x17F
+"""The last of Latin Extended-A: the font encoding T1 has no letters beyond."""
+_HEAD = r"""\documentclass{article}
+\usepackage[T1]{fontenc}
+\usepackage[utf8]{inputenc}
+\IfFileExists{lmodern.sty}{\usepackage{lmodern}}{}
+\usepackage{textcomp}
+\usepackage[a4paper,margin=18mm]{geometry}
+\usepackage{booktabs,graphicx,pdflscape}
+\setlength{\parindent}{0pt}
+\begin{document}
+"""
+
+
+def to_document(tables: Sequence[PaperTable]) -> str:
+    """Return a document with all tables, each with its variant beside the paper's values, that compiles by itself."""
+    parts = [_HEAD]
+    for table in tables:
+        for published in (False, True)[: 1 + table.has_published]:
+            text = to_latex(table, published=published)
+            text = text.replace(_END, f"{_END}\\clearpage\n")  # landscape does not turn pages of floats alone
+            turned = _width(table, published=published) > _WIDE
+            parts.append(f"\\begin{{landscape}}\n{text}\\end{{landscape}}\n" if turned else text)
+    return "\n".join([*parts, "\\end{document}\n"])
+
+
+def to_latex(table: PaperTable, *, published: bool = False) -> str:
+    r"""Return a table as LaTeX for ``\input``; it needs the packages booktabs and graphicx, and the encoding T1.
+
+    It is as wide as the line at most. What is too long for a page becomes several tables.
+
+    Args:
+        table: what to write.
+        published: whether the paper's values stand in parentheses after ours; then without spreads and intervals.
+
+    """
+    columns = table.published_columns() if published else table.columns
+    groups = [list(_rows(table, group, columns, published=published)) for group in table.groups]
+    most = _ROWS_TURNED if _width(table, published=published) > _WIDE else _ROWS
+    pages = list(_pages([rows for rows in groups if rows], most))
+    return "\n".join(_page(table, columns, page, number, published) for number, page in enumerate(pages))
+
+
+def latex_text(text: str) -> str:
+    r"""Return a text that LaTeX prints as it is, on one line; letters that its fonts lack are named, as U+65E5."""
+    composed = unicodedata.normalize("NFC", " ".join(text.split()))
+    return "".join(map(_letter, composed))
+
+
+def _heading(column: Column) -> str:
+    """Return a metric's name, what follows its underscore as an index."""
+    name, _, index = column.heading.partition("_")
+    return latex_text(name) + (f"$_{{{latex_text(index)}}}$" if index else "")
+
+
+def _letter(letter: str) -> str:
+    if letter in _SPECIAL:
+        return _SPECIAL[letter]
+    plain = letter.isascii() and letter.isprintable()
+    return letter if plain or (letter.isalpha() and ord(letter) <= _LAST_LETTER) else f"[U+{ord(letter):04X}]"
+
+
+def _pages(groups: Sequence[list[str]], most: int) -> Iterator[list[list[str]]]:
+    """Yield the rows of each page by group, ``most`` of them; a group that fits on a page is not torn."""
+    page: list[list[str]] = []
+    for rows in groups:
+        for start in range(0, len(rows), most):
+            part = rows[start : start + most]
+            if page and sum(map(len, page)) + len(part) > most:
+                yield page
+                page = []
+            page.append(part)
+    if page:
+        yield page
+
+
+def _page(
+    table: PaperTable, columns: Sequence[Column], groups: Sequence[Sequence[str]], number: int, published: bool
+) -> str:
+    """Return one table environment."""
+    title = table.title + (", beside the paper's values (in parentheses)" if published else "")
+    notes = [*table.notes, *([STAR_NOTE] if published and table.starred else [])]
+    caption = f"{title}. {' '.join(notes)}" if number == 0 else f"{title}, continued."
+    seeds = table.seeded and not published
+    kinds = "ll" + "r" * seeds + "r" * len(columns)
+    head = ["Scene", "Method", *(["Seeds"] if seeds else []), *(_heading(column) for column in columns)]
+    units = ["", "", *([""] if seeds else []), *(latex_text(column.unit) for column in columns)]
+    body = "\n\\midrule\n".join("\n".join(rows) for rows in groups)
+    return rf"""\begin{{table}}[htbp]
+\centering
+\caption{{{latex_text(caption)}}}
+\smallskip
+\resizebox{{\ifdim\width>\linewidth \linewidth\else\width\fi}}{{!}}{{%
+\begin{{tabular}}{{@{{}}{kinds}@{{}}}}
+\toprule
+{" & ".join(head)} \\
+{" & ".join(units)} \\
+\midrule
+{body}
+\bottomrule
+\end{{tabular}}%
+}}
+{_END}"""
+
+
+def _rows(table: PaperTable, group: Group, columns: Sequence[Column], *, published: bool) -> Iterator[str]:
+    """Yield the lines of a scene, its name in the first; that of an average has a line to itself."""
+    title = latex_text(group.about.title) + ("*" if published and group.about.recreated else "")
+    compared = any(row.published for row in group.rows)  # all of ours, for the best of them is marked
+    shown = [row for row in group.rows if not published or (compared and row.cells)]
+    if group.about.average and shown:
+        seeds_too = table.seeded and not published
+        yield f"\\multicolumn{{{2 + seeds_too + len(columns)}}}{{@{{}}l}}{{{title}}} \\\\"
+        title = ""
+    for row in shown:
+        cells = [_beside(c, row) if published else _text(c, row.cells.get(c.key), row.seeds) for c in columns]
+        seeds = [str(row.seeds)] if table.seeded and not published else []
+        yield " & ".join([title, latex_text(row.label), *seeds, *cells]) + " \\\\"
+        title = ""
+    for name, values in group.paper_only.items() if published and compared else ():
+        cells = [f"({values[c.key]:g})" if c.key in values else MISSING for c in columns]
+        yield " & ".join([title, f"{latex_text(name)} (paper)", *cells]) + " \\\\"
+        title = ""
+
+
+def _beside(column: Column, row: Row) -> str:
+    """Return our value and the paper's."""
+    cell, paper = row.cells.get(column.key), row.published.get(column.key)
+    ours = MISSING if cell is None else _text(column, _bare(cell), 1)
+    return f"{ours} ({MISSING if paper is None else f'{paper:g}'})"
+
+
+def _bare(cell: Cell) -> Cell:
+    """Return a cell without its spread and interval."""
+    return Cell(cell.mean, scenes=cell.scenes, of=cell.of, rank=cell.rank)
+
+
+def _text(column: Column, cell: Cell | None, seeds: int) -> str:
+    """Return a value with all that belongs to it; a number of seeds that is not the row's is said."""
+    if cell is None:
+        return MISSING
+    text = _number(column.text(cell.mean)).join(_MARKS[cell.rank])
+    if cell.spread is not None:
+        text += f" $\\pm$ {_number(column.text(cell.spread))}"
+    if cell.interval is not None:
+        text += " [{}, {}]".format(*map(column.text, cell.interval))
+    if cell.seeds not in (0, seeds):
+        text += f" ($n = {cell.seeds}$)"
+    return text if cell.complete else f"{text} ({cell.scenes} of {cell.of})"
+
+
+def _number(text: str) -> str:
+    """Return a number with a true minus sign."""
+    return f"${text}$" if text.startswith("-") else text
+
+
+def _width(table: PaperTable, *, published: bool) -> int:
+    """Return the characters of the longest row, without its markup."""
+    columns = table.published_columns() if published else table.columns
+    wide = 0
+    for group in table.groups:
+        labels = [*(row.label for row in group.rows), *group.paper_only]
+        for row in group.rows:
+            cells = [_beside(c, row) if published else _text(c, row.cells.get(c.key), row.seeds) for c in columns]
+            plain = [text.replace("\\textbf", "").replace("\\underline", "").replace("$\\pm$", "+") for text in cells]
+            shown = [max(len(text), len(c.heading)) + 2 for text, c in zip(plain, columns, strict=True)]
+            title = "" if group.about.average else group.about.title
+            wide = max(wide, len(title) + max(map(len, labels)) + sum(shown))
+    return wide

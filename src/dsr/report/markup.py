@@ -1,0 +1,201 @@
+"""Tables as Markdown, LaTeX and CSV files."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+
+import pandas as pd
+
+from dsr.atomic import write_text
+from dsr.report.latex import to_document, to_latex
+from dsr.report.paper_tables import build_tables
+from dsr.report.results import Results
+from dsr.report.table_parts import STAR_NOTE, Cell, Column, Group, PaperTable, Row
+
+__all__ = ["aligned", "to_csv", "to_latex", "to_markdown", "write_tables"]
+
+MISSING = "\N{EN DASH}"
+_MARKS = {0: ("", ""), 1: ("**", "**"), 2: ("<ins>", "</ins>")}
+_SPECIAL = re.compile(r"[\\`*\[\]<>|~&#]|(?<![A-Za-z0-9])_|_(?![A-Za-z0-9])")
+_FACTS_FROM = 7
+"""In a CSV the columns before tell what a row is about."""
+
+
+def write_tables(folder: Path, results: Results, study: pd.DataFrame | None = None) -> list[Path]:
+    """Write all tables of some runs.
+
+    Args:
+        folder: gets ``NAME.md``, ``NAME.tex``, ``NAME_published.tex`` (where the paper has values) and ``NAME.csv`` of
+            each table, and ``all.md`` and ``all.tex`` with all of them.
+        results: the runs.
+        study: see :func:`dsr.report.paper_tables.build_tables`.
+
+    Returns:
+        The files.
+
+    Raises:
+        ValueError: the study's table is something else.
+
+    """
+    tables = build_tables(results, study)
+    texts = {"all.md": "\n".join(map(to_markdown, tables)), "all.tex": to_document(tables)}
+    for table in tables:
+        texts |= {f"{table.name}.md": to_markdown(table), f"{table.name}.tex": to_latex(table)}
+        if table.has_published:
+            texts[f"{table.name}_published.tex"] = to_latex(table, published=True)
+        texts[f"{table.name}.csv"] = to_csv(table)
+    for name, text in texts.items():
+        write_text(folder / name, text)
+    return [folder / name for name in texts]
+
+
+def to_markdown(table: PaperTable) -> str:
+    """Return a table as Markdown; below it, where the paper has values, ours beside them with difference and ratio."""
+    head = ["scene", "method", *(["seeds"] if table.seeded else []), *map(_heading, table.columns)]
+    rows = [row for group in table.groups for row in _rows(table, group)]
+    parts = [f"## {escaped(table.title)}", aligned(head, rows, 2), "\n".join(f"- {note}" for note in table.notes)]
+    if table.has_published:
+        columns = table.published_columns()
+        rows = [row for group in table.groups for row in _compared(columns, group)]
+        notes = ["- Difference: ours - paper. Ratio: ours / paper.", f"- {STAR_NOTE}".replace("*", "\\*")]
+        parts += [f"### {escaped(table.title)}, beside the paper"]
+        parts += [aligned(["scene", "method", "", *map(_heading, columns)], rows, 3)]
+        parts += ["\n".join(notes if table.starred else notes[:1])]
+    return "\n\n".join(parts) + "\n"
+
+
+def to_csv(table: PaperTable) -> str:
+    """Return a table as CSV at full precision, in the paper's units: one row per method and scene or average.
+
+    What is missing is empty; a kind of value that no row has (spread, interval, the paper's) has no column.
+    """
+    rows = [
+        {
+            "kind": "average" if group.about.average else "scene",
+            "scene": group.about.title,
+            "dataset": " ".join(dict.fromkeys(place.dataset for place in group.about.places)),
+            "scale": table.scale,
+            "downsampling": table.downsampling,
+            "method": row.label,
+            "seeds": row.seeds or None,
+            **{key: value for column in table.columns for key, value in _facts(column, row)},
+        }
+        for group in table.groups
+        for row in (*group.rows, *(Row(f"{name} (paper)", {}, paper, 0) for name, paper in group.paper_only.items()))
+    ]
+    frame = pd.DataFrame(rows)
+    empty = [name for name in frame.columns[_FACTS_FROM:] if frame[name].isna().all()]
+    counts = [name for name in frame.columns if name.endswith(("seeds", " scenes")) and name not in empty]
+    return frame.drop(columns=empty).astype(dict.fromkeys(counts, "Int64")).to_csv(index=False, lineterminator="\n")
+
+
+def aligned(head: Sequence[str], rows: Sequence[Sequence[str]], texts: int) -> str:
+    """Return a Markdown table whose columns are aligned in the file, too.
+
+    Args:
+        head: its headings, escaped.
+        rows: its cells, escaped.
+        texts: how many columns from the left are text; those after them are numbers, and stand to the right.
+
+    """
+    widths = [max(3, *map(len, column)) for column in zip(head, *rows, strict=True)]
+    rule = ["-" * width if number < texts else "-" * (width - 1) + ":" for number, width in enumerate(widths)]
+    lines = []
+    for row in (head, rule, *rows):
+        cells = (
+            text.ljust(width) if number < texts else text.rjust(width)
+            for number, (text, width) in enumerate(zip(row, widths, strict=True))
+        )
+        lines.append(f"| {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+def escaped(text: str) -> str:
+    """Return a text that Markdown shows as it is, on one line."""
+    return _SPECIAL.sub(r"\\\g<0>", " ".join(text.split()))
+
+
+def _facts(column: Column, row: Row) -> Iterator[tuple[str, float | int | None]]:
+    """Yield the columns of a CSV that tell of one metric."""
+    cell, paper = row.cells.get(column.key), row.published.get(column.key)
+    unit = f" [{column.unit.split(', ')[-1]}]" if column.unit else ""  # the key says of which threshold
+    low, high = (None, None) if cell is None or cell.interval is None else cell.interval
+    difference, ratio = (None if cell is None else cell.against(paper)) or (None, None)
+    yield f"{column.key}{unit}", None if cell is None else cell.mean
+    yield f"{column.key} spread{unit}", None if cell is None else cell.spread
+    yield f"{column.key} seeds", None if cell is None or cell.spread is None else cell.seeds
+    yield f"{column.key} scenes", None if cell is None else cell.scenes
+    yield f"{column.key} low{unit}", low
+    yield f"{column.key} high{unit}", high
+    yield f"{column.key} paper{unit}", paper
+    yield f"{column.key} difference{unit}", difference
+    yield f"{column.key} ratio", ratio
+
+
+def _heading(column: Column) -> str:
+    return f"{column.heading} ({column.unit})" if column.unit else column.heading
+
+
+def _rows(table: PaperTable, group: Group) -> Iterator[list[str]]:
+    """Yield our rows of a scene, its name in the first."""
+    title = escaped(group.about.title)
+    for row in group.rows:
+        seeds = [str(row.seeds)] if table.seeded else []
+        yield [title, escaped(row.label), *seeds, *(_text(c, row.cells.get(c.key), row.seeds) for c in table.columns)]
+        title = ""
+
+
+def _text(column: Column, cell: Cell | None, seeds: int) -> str:
+    """Return a value with all that belongs to it; a number of seeds that is not the row's is said."""
+    if cell is None:
+        return MISSING
+    text = column.text(cell.mean).join(_MARKS[cell.rank])
+    if cell.spread is not None:
+        text += f" ± {column.text(cell.spread)}"
+    if cell.interval is not None:
+        text += " [{}, {}]".format(*map(column.text, cell.interval))
+    if cell.seeds not in (0, seeds):
+        text += f" (n = {cell.seeds})"
+    return text if cell.complete else f"{text} ({cell.scenes} of {cell.of})"
+
+
+def _compared(columns: Sequence[Column], group: Group) -> Iterator[list[str]]:
+    """Yield ours, the paper's, difference and ratio of the methods that the paper has, then its other methods."""
+    title = escaped(group.about.title) + ("\\*" if group.about.recreated else "")
+    for row in (row for row in group.rows if row.published):
+        both = [_against(column, row) for column in columns]
+        yield [title, escaped(row.label), "ours", *(_plain(column, row) for column in columns)]
+        yield ["", "", "paper", *_paper(columns, row.published)]
+        yield ["", "", "difference", *(difference for difference, _ in both)]
+        yield ["", "", "ratio", *(ratio for _, ratio in both)]
+        title = ""
+    for name, values in group.paper_only.items():
+        yield [title, name, "paper", *_paper(columns, values)]
+        title = ""
+
+
+def _plain(column: Column, row: Row) -> str:
+    """Return a mean, and of how many scenes where these are not all."""
+    cell = row.cells.get(column.key)
+    if cell is None:
+        return MISSING
+    return column.text(cell.mean) + ("" if cell.complete else f" ({cell.scenes} of {cell.of})")
+
+
+def _paper(columns: Sequence[Column], values: Mapping[str, float]) -> list[str]:
+    """Return the paper's values with the digits that it gives."""
+    return [f"{values[column.key]:g}" if column.key in values else MISSING for column in columns]
+
+
+def _against(column: Column, row: Row) -> tuple[str, str]:
+    """Return the difference from the paper's value and the ratio to it, as shown."""
+    cell, paper = row.cells.get(column.key), row.published.get(column.key)
+    both = None if cell is None else cell.against(paper)
+    if both is None:
+        return MISSING, MISSING
+    difference = column.text(both[0])
+    return difference if difference.startswith("-") else f"+{difference}", MISSING if both[
+        1
+    ] is None else f"{both[1]:.2f}"

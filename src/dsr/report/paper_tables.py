@@ -1,0 +1,244 @@
+"""The paper's tables of any number of runs: methods x metrics for each scene and for averages over scenes.
+
+Voynov et al., *Perceptual Deep Depth Super-Resolution* (ICCV 2019), its summary table and those of its supplement. A
+table has no layout; :mod:`dsr.report.markup` writes it.
+
+Seeds are averaged first, within each scene, then scenes. A spread is the sample standard deviation over seeds: of an
+average over scenes, that of the averages of each seed that has all of its scenes.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+import statistics
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import pandas as pd
+
+from dsr.report.results import Results, Run
+from dsr.report.scene_sets import PAPER_SCENES, TITLES, Place, SceneSet, sets_of_dataset, sets_of_summary
+from dsr.report.table_parts import Cell, Column, Group, PaperTable, Row
+from dsr.report.tables import METRICS, paper_row, published
+from dsr.report.user_study import USER_COLUMNS, check_study, user_cells
+
+PAPER_METHODS = {"bicubic": "Bicubic", "dip": "DIP", "dip_v": "DIP-V", "msg": "MSG", "msg_v": "MSG-V"}
+"""The paper's name of a method by that in ``scores.csv``."""
+_PAPER_SIZE = 512
+"""Pixels of the paper's pictures; of other sizes its figures say nothing."""
+_FOLDER = "dsr.data.folder.Folder"
+"""What reads people's own folders, in which the paper's own scenes may be."""
+
+
+COLUMNS = (
+    *(Column(key, heading, unit, digits) for key, (heading, unit, _, digits) in METRICS.items()),
+    *(Column(key, heading, "%", 1, higher_is_better=True) for key, heading in USER_COLUMNS.items()),
+)
+
+
+def build_tables(results: Results, study: pd.DataFrame | None = None) -> list[PaperTable]:
+    """Return the tables of all runs: for each scale and degradation the summary, then one for each data set.
+
+    Args:
+        results: the runs.
+        study: what ``dsr study collect`` wrote: columns ``dataset, scene, scale, downsampling, label``, and
+            ``user_first, user_second, user_top2`` in percent with ``_low`` and ``_high`` of each.
+
+    Raises:
+        ValueError: the study lacks a column.
+
+    """
+    if study is not None:
+        check_study(study)
+    complete = _truth_is_complete(results)
+    tables: list[PaperTable] = []
+    for scale, downsampling in dict.fromkeys((run.scale, run.downsampling) for run in results.runs):
+        runs = [run for run in results.runs if (run.scale, run.downsampling) == (scale, downsampling)]
+        make = _Maker(
+            scale, downsampling, results.methods(), _values(runs), _comparable(runs), _paper_names(runs), study
+        )
+        places = list(dict.fromkeys(place for scenes in make.values.values() for place in scenes))
+        if not places:
+            continue
+        tables.append(make.table("summary", "Averages", sets_of_summary(places, complete)))
+        for dataset in dict.fromkeys(place.dataset for place in places):
+            sets = sets_of_dataset([place for place in places if place.dataset == dataset])
+            tables.append(make.table(dataset, TITLES.get(dataset, dataset), sets))
+    return _named_apart(tables)
+
+
+Values = Mapping[str, Mapping[Place, Mapping[str, Mapping[int, float]]]]
+"""By label, scene, metric and seed: worst of four lights, in the paper's units; what is not finite is not in it."""
+
+
+@dataclass(frozen=True)
+class _Maker:
+    """Makes the tables of one scale and degradation.
+
+    Args:
+        scale, downsampling: which.
+        methods: all labels, in order.
+        values: the scores.
+        comparable: data sets whose scenes may be the paper's.
+        names: the paper's name of a method by label.
+        study: what people said.
+
+    """
+
+    scale: int
+    downsampling: str
+    methods: Sequence[str]
+    values: Values
+    comparable: frozenset[str]
+    names: Mapping[str, str]
+    study: pd.DataFrame | None
+
+    def table(self, name: str, title: str, sets: Sequence[SceneSet]) -> PaperTable:
+        """Return a table of some sets of scenes."""
+        places = {place for each in sets for place in each.places}
+        labels = [label for label in self.methods if not places.isdisjoint(self.values.get(label, ()))]
+        groups = tuple(_ranked(self._group(each, labels)) for each in sets)
+        used = {key for group in groups for row in group.rows for key in row.cells}
+        columns = tuple(column for column in COLUMNS if column.key in used)
+        slug = re.sub(r"[^A-Za-z0-9.-]+", "_", f"{name}_x{self.scale}_{self.downsampling}").strip("._-")
+        title = f"{title}, x{self.scale}, {self.downsampling} downsampling"
+        return PaperTable(slug, title, tuple(_notes(groups, columns)), self.scale, self.downsampling, columns, groups)
+
+    def _group(self, about: SceneSet, labels: Sequence[str]) -> Group:
+        """Return the rows of some methods, empty where a method has no value."""
+        comparable = about.published != "" and self.comparable.issuperset(place.dataset for place in about.places)
+        rows = []
+        for label in labels:
+            scenes = [self.values[label].get(place, {}) for place in about.places]
+            cells = {key: _cell([scene.get(key, {}) for scene in scenes]) for key in METRICS}
+            known = {key: cell for key, cell in cells.items() if cell is not None} | self._user_cells(about, label)
+            paper = self._published(about, self.names[label]) if comparable and known else {}
+            rows.append(Row(label, known, paper, max([1, *(cell.seeds for cell in known.values())])))
+        ran = {self.names[row.label] for row in rows if row.cells}
+        others = [str(name) for name in published()["method"].unique() if name not in ran]
+        only = {name: self._published(about, name) for name in others} if comparable and not about.recreated else {}
+        return Group(about, tuple(rows), {name: values for name, values in only.items() if values})
+
+    def _published(self, about: SceneSet, method: str) -> dict[str, float]:
+        """Return the paper's values by column."""
+        row = paper_row(about.published, method, self.scale, self.downsampling)
+        keys = [column.key for column in COLUMNS]
+        return {} if row is None else {key: float(row[key]) for key in keys if pd.notna(row[key])}
+
+    def _user_cells(self, about: SceneSet, label: str) -> dict[str, Cell]:
+        """Return what a study's participants said of a method."""
+        found = user_cells(self.study, about.places, self.scale, self.downsampling, label)
+        return {key: Cell(mean, None, 0, count, len(about.places), ci) for key, (mean, count, ci) in found.items()}
+
+
+def _values(runs: Sequence[Run]) -> Values:
+    """Return what the tables are made of."""
+    found: dict[str, dict[Place, dict[str, dict[int, float]]]] = {}
+    for run in runs:
+        scores = run.scores
+        shown = scores[scores["variant"].fillna("").isin(["", "max"]) & scores["metric"].isin(list(METRICS))]
+        for scene, metric, value in zip(shown["scene"], shown["metric"], shown["value"], strict=True):
+            by_metric = found.setdefault(run.label, {}).setdefault(Place(run.dataset, scene), {})
+            if math.isfinite(value):
+                by_metric.setdefault(metric, {})[run.seed] = METRICS[metric][2] * value
+    return found
+
+
+def _comparable(runs: Sequence[Run]) -> frozenset[str]:
+    """Return the data sets whose scenes may be those that the paper has figures of."""
+    others = set()
+    for run in runs:
+        dataset = run.settings.get("dataset", {})
+        known = run.dataset in PAPER_SCENES or dataset.get("target") == _FOLDER
+        if not known or dataset.get("size", _PAPER_SIZE) != _PAPER_SIZE:
+            others.add(run.dataset)
+    return frozenset({run.dataset for run in runs} - others)
+
+
+def _paper_names(runs: Sequence[Run]) -> dict[str, str]:
+    """Return the paper's name of each method by label."""
+    return {run.label: PAPER_METHODS.get(run.method, run.label) for run in runs}
+
+
+def _truth_is_complete(results: Results) -> Callable[[Place], bool]:
+    """Return what tells whether a scene's truth has no hole.
+
+    Where some method's scores rest on every pixel it has none. Otherwise the stored scene decides; without it the holes
+    are taken for the truth's.
+    """
+    scores = pd.concat([run.scores.assign(dataset=run.dataset) for run in results.runs])
+    depth = scores[scores["metric"] == "RMSE_d"]
+    shares = depth.groupby(["dataset", "scene"])["valid_share"].max()
+
+    def complete(place: Place) -> bool:
+        if shares.get(tuple(place), 0.0) == 1:
+            return True
+        kept = [run for run in results.runs if run.dataset == place.dataset and run.has_scene(place.scene)]
+        truth = kept[0].scene(place.scene).depth if kept else None
+        return truth is not None and bool(truth.isfinite().all())
+
+    return complete
+
+
+def _cell(scenes: Sequence[Mapping[int, float]]) -> Cell | None:
+    """Return the mean over seeds, then scenes, of one method's and metric's values by seed; None without any."""
+    known = [by_seed for by_seed in scenes if by_seed]
+    if not known:
+        return None
+    mean = statistics.fmean(statistics.fmean(by_seed.values()) for by_seed in known)
+    seeds = set.intersection(*map(set, known))  # those that have all of these scenes
+    averages = [statistics.fmean(by_seed[seed] for by_seed in known) for seed in sorted(seeds)]
+    spread = statistics.stdev(averages) if len(averages) > 1 else None
+    return Cell(mean, spread, max(len(averages), 1), len(known), len(scenes))
+
+
+def _ranked(group: Group) -> Group:
+    """Return the group with the best and second best marked.
+
+    What is shown is compared, not what is behind it: equal texts share a rank. Averages over fewer scenes than there
+    are take no part, nor does a value without another to compare it with.
+    """
+    ranks: dict[tuple[str, str], int] = {}
+    for column in COLUMNS:
+        cells = {row.label: row.cells[column.key] for row in group.rows if column.key in row.cells}
+        shown = {label: float(column.text(cell.mean)) for label, cell in cells.items() if cell.complete}
+        order = sorted(set(shown.values()), reverse=column.higher_is_better)[:2] if len(shown) > 1 else []
+        ranks |= {(label, column.key): order.index(value) + 1 for label, value in shown.items() if value in order}
+    rows = [
+        replace(row, cells={key: replace(cell, rank=ranks.get((row.label, key), 0)) for key, cell in row.cells.items()})
+        for row in group.rows
+    ]
+    return replace(group, rows=tuple(rows))
+
+
+def _notes(groups: Sequence[Group], columns: Sequence[Column]) -> Iterator[str]:
+    """Yield what a reader of the table should know."""
+    rows = [row for group in groups for row in group.rows]
+    cells = [cell for row in rows for cell in row.cells.values()]
+    user = any(column.key in USER_COLUMNS for column in columns)
+    yield "Lower is better" + (", of User columns higher." if user else ".")
+    yield "Metrics of renderings are the worst of four lights."
+    yield "Of our values as shown the best of each group is bold, the second underlined; equal ones share the mark."
+    missing = [name for name in METRICS if name not in {column.key for column in columns}]
+    if missing:
+        yield f"Not computed: {', '.join(missing)}."
+    if any(cell.spread is not None for cell in cells):
+        yield "Mean ± sample standard deviation over seeds; seeds are averaged within each scene, then scenes."
+    if any(not cell.complete for cell in cells):
+        yield "(k of n): an average over k of the n scenes; it is not compared with the others."
+    if user:
+        yield "User: share of answers that chose the method as most similar (1st), as second most (2nd), or as either."
+
+
+def _named_apart(tables: Sequence[PaperTable]) -> list[PaperTable]:
+    """Return the tables with names that differ on any file system."""
+    taken: set[str] = set()
+    named = []
+    for table in tables:
+        name, number = table.name, 2
+        while name.casefold() in taken:
+            name, number = f"{table.name}_{number}", number + 1
+        taken.add(name.casefold())
+        named.append(replace(table, name=name))
+    return named

@@ -1,0 +1,193 @@
+"""The metric study: what is a point, what is correlated, and that the figures show it."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from scipy import stats
+
+from dsr.report import correlation_figure
+from dsr.report.correlation_figure import density_of, save_scatter_matrix, scatter_matrix
+from dsr.report.correlations import correlate, metric_matrix, pairs, with_reference, write_correlations
+from dsr.report.palette import KNOWN, method_colours
+from dsr.report.results import Results, Run
+
+VARIANTS = ("e1", "e2", "e3", "e4", "max", "avg")
+
+
+def run(label, count=12, *, seed=0, scale=4, lpips=True, dataset="simgeo"):
+    """Return a run on scenes whose metrics go with each other more or less."""
+    rng = np.random.default_rng([seed, scale, *label.encode()])
+    rows = []
+    for number in range(count):
+        about = {"dataset": dataset, "scene": f"s{number}", "scale": scale, "downsampling": "box", "seed": seed}
+        about |= {"method": label, "valid_share": 1.0}
+        base = rng.random()
+        rows.append({**about, "metric": "RMSE_d", "variant": "", "value": base**2})
+        for metric in ("DSSIM_v", *(["LPIPS_v"] if lpips else [])):
+            values = base + 0.2 * rng.random(6)
+            rows += [
+                {**about, "metric": metric, "variant": v, "value": x} for v, x in zip(VARIANTS, values, strict=True)
+            ]
+    scores = pd.DataFrame(rows)
+    scenes = tuple(scores["scene"].unique())
+    return Run(Path(label), dataset, scale, "box", seed, label, label, scores, {}, {}, {}, scenes)
+
+
+RESULTS = Results((run("Bicubic"), run("MSG"), run("MSG", seed=1), run("MSG", scale=8), run("Mine", 2)))
+
+
+def test_every_result_is_a_row_and_every_version_of_a_metric_a_column():
+    matrix = metric_matrix(RESULTS)
+    assert len(matrix) == 4 * 12 + 2
+    lights = [f"[{name}]" for name in VARIANTS if name != "max"]
+    expected = {"RMSE_d", *(name + light for name in ("DSSIM_v", "LPIPS_v") for light in ["", *lights])}
+    assert set(matrix.columns) == expected
+    scores = RESULTS.runs[3].scores
+    [value] = scores[(scores["scene"] == "s3") & (scores["metric"] == "DSSIM_v") & (scores["variant"] == "max")][
+        "value"
+    ]
+    assert matrix.loc[("simgeo", "s3", 8, "box", "MSG", 0), "DSSIM_v"] == value
+
+
+def test_rmse_d_is_clipped_at_half_a_metre():
+    raw = np.concatenate([each.scores[each.scores["metric"] == "RMSE_d"]["value"] for each in RESULTS.runs])
+    clipped = metric_matrix(RESULTS)["RMSE_d"]
+    assert (raw > 0.5).any()
+    assert clipped.max() == 0.5
+    assert sorted(clipped) == pytest.approx(sorted(np.minimum(raw, 0.5)))
+
+
+@pytest.mark.parametrize(("kind", "reference"), [("pearson", stats.pearsonr), ("spearman", stats.spearmanr)])
+def test_correlations_are_scipy_s_over_the_rows_where_both_are_known(kind, reference):
+    rng = np.random.default_rng(1)
+    matrix = pd.DataFrame(rng.integers(0, 9, (30, 3)).astype(float), columns=list("abc"))  # with ties
+    matrix.loc[:6, "a"] = math.nan
+    matrix.loc[20:, "b"] = math.nan
+    table = correlate(matrix, kind)
+    for one, two in ("ab", "ac", "bc"):
+        known = matrix[[one, two]].dropna()
+        assert table.loc[one, two] == pytest.approx(reference(known[one], known[two]).statistic, abs=1e-12)
+        assert table.loc[two, one] == table.loc[one, two]
+        assert pairs(matrix).loc[one, two] == len(known)
+
+
+def test_a_monotone_curve_has_a_spearman_of_one_and_a_smaller_pearson():
+    x = np.arange(10.0)
+    matrix = pd.DataFrame({"x": x, "exp": np.exp(x), "falling": -x})
+    assert correlate(matrix, "spearman").loc["x", "exp"] == pytest.approx(1)
+    assert correlate(matrix, "pearson").loc["x", "exp"] < 0.8
+    assert correlate(matrix, "pearson").loc["x", "falling"] == pytest.approx(-1)
+
+
+@pytest.mark.parametrize("kind", ["pearson", "spearman"])
+@pytest.mark.parametrize("other", [[1.0, 2.0, math.nan, math.nan], [0.1, 0.1, 0.1, 0.1], [0.1, 0.1, 0.1, math.nan]])
+def test_of_too_few_points_or_a_constant_there_is_no_correlation(kind, other):
+    table = correlate(pd.DataFrame({"x": [1.0, 2.0, 4.0, 3.0], "y": other}), kind)
+    assert math.isnan(table.loc["x", "y"])
+
+
+def test_another_kind_is_refused():
+    with pytest.raises(ValueError, match="kind: expected pearson or spearman, got kendall"):
+        correlate(pd.DataFrame({"x": [1.0]}), "kendall")
+
+
+def test_metrics_are_ordered_by_their_rank_correlation_with_lpips_and_its_own_versions_left_out():
+    ranking = with_reference(metric_matrix(RESULTS))
+    assert list(ranking["spearman"]) == sorted(ranking["spearman"], reverse=True)
+    assert not ranking["metric"].str.startswith("LPIPS").any()
+    assert set(ranking["n"]) == {50}
+    matrix = metric_matrix(RESULTS)
+    row = ranking[ranking["metric"] == "DSSIM_v[e2]"].iloc[0]
+    assert row["pearson"] == pytest.approx(stats.pearsonr(matrix["DSSIM_v[e2]"], matrix["LPIPS_v"]).statistic)
+
+
+def test_the_files_hold_the_tables(tmp_path):
+    paths = write_correlations(tmp_path, RESULTS)
+    assert [path.name for path in paths] == [
+        "pearson.csv", "spearman.csv", "pairs.csv", "with_lpips.csv", "with_lpips.md"]  # fmt: skip
+    again = pd.read_csv(paths[1], index_col="metric")
+    pd.testing.assert_frame_equal(again, correlate(metric_matrix(RESULTS), "spearman"), check_names=False)
+    assert "| metric" in paths[-1].read_text(encoding="utf-8")
+
+
+def test_without_lpips_everything_else_is_there_and_a_line_says_so(tmp_path, monkeypatch):
+    results = Results((run("A", 5, lpips=False),))
+    text = write_correlations(tmp_path, results)[-1].read_text(encoding="utf-8")
+    assert "There is no LPIPS_v in these 5 results" in text
+    drawn = {}
+    monkeypatch.setattr(correlation_figure, "write_figure", lambda path, figure, _: drawn.update({path.name: figure}))
+    save_scatter_matrix(tmp_path, results)
+    assert list(drawn) == ["scatter_matrix.pdf", "scatter_matrix.png"]
+    assert "no LPIPS_v in these results" in drawn["scatter_matrix.pdf"].texts[0].get_text()
+
+
+def test_the_figure_has_points_below_the_diagonal_coefficients_above_and_densities_on_it():
+    matrix = metric_matrix(RESULTS)
+    figure = scatter_matrix(matrix, ["Bicubic", "MSG", "Mine"])
+    axes = np.array(figure.axes).reshape(3, 3)
+    drawn = axes[2, 0].collections[0].get_offsets()
+    assert sorted(drawn[:, 0]) == pytest.approx(sorted(1000 * matrix["RMSE_d"]))
+    expected = stats.spearmanr(matrix["RMSE_d"], matrix["LPIPS_v"]).statistic
+    assert f"{expected:.2f}" in axes[0, 2].texts[1].get_text()
+    curves = [line for line in axes[1, 1].lines if len(line.get_xdata()) == 200]
+    assert [line.get_color() for line in curves] == [
+        KNOWN["Bicubic"],
+        KNOWN["MSG"],
+    ]  # of two results there is no density
+    assert all(max(line.get_ydata()) == pytest.approx(1) for line in curves)
+    assert axes[2, 2].get_xlabel() == "LPIPS_v (1/1000)"
+
+
+def test_points_have_the_colours_of_their_methods():
+    matrix = metric_matrix(RESULTS)
+    figure = scatter_matrix(matrix, ["Bicubic", "MSG", "Mine"])
+    points = figure.axes[3].collections[0]
+    colours = method_colours(["Bicubic", "MSG", "Mine"])
+    by_place = {
+        tuple(place): tuple(colour[:3])
+        for place, colour in zip(points.get_offsets(), points.get_facecolors(), strict=True)
+    }
+    for label, colour in colours.items():
+        rows = matrix.xs(label, level="label")
+        for x, y in zip(1000 * rows["RMSE_d"], 1000 * rows["DSSIM_v"], strict=True):
+            assert by_place[x, y] == pytest.approx(tuple(int(colour[at : at + 2], 16) / 255 for at in (1, 3, 5)))
+
+
+def test_densities_are_scipy_s_and_integrate_to_one():
+    values = np.random.default_rng(2).normal(3, 1, 50)
+    grid = np.linspace(-5, 11, 4001)
+    density = density_of(values, grid)
+    assert np.trapezoid(density, grid) == pytest.approx(1, abs=1e-4)
+    width = values.std(ddof=1) * 50 ** (-1 / 5)  # Scott's rule in one dimension
+    at = np.exp(-0.5 * ((grid[2000] - values) / width) ** 2).sum() / (50 * width * math.sqrt(2 * math.pi))
+    assert density[2000] == pytest.approx(at)
+
+
+@pytest.mark.parametrize("values", [[], [1.0], [2.0, 2.0, 2.0, 2.0], [1.0, 2.0]])
+def test_of_too_few_different_values_there_is_no_density(values):
+    assert density_of(np.array(values), np.linspace(0, 3, 10)) is None
+
+
+def test_the_figures_are_vector_text_and_pictures(tmp_path, monkeypatch):
+    monkeypatch.setitem(correlation_figure._STYLE, "pdf.compression", 0)
+    paths = save_scatter_matrix(tmp_path, Results((run("Bicubic", 5), run("Odd $_ name", 5))))
+    assert [path.name for path in paths] == [
+        "scatter_matrix.pdf", "scatter_matrix.png", "with_lpips.pdf", "with_lpips.png"]  # fmt: skip
+    content = paths[0].read_bytes()
+    assert b"/Subtype /Type0" in content  # TrueType outlines, not bitmaps
+    assert b"/Subtype /Type3" not in content
+    assert paths[1].read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_known_method_s_colour_does_not_depend_on_the_others():
+    alone, many = method_colours(["MSG-V"]), method_colours(["Mine", "Yours", "MSG-V", "Bicubic"])
+    assert alone["MSG-V"] == many["MSG-V"]
+    assert len(set(many.values())) == 4
+
+
+def test_any_number_of_methods_have_colours_that_differ():
+    colours = method_colours([*KNOWN, *(f"method {number}" for number in range(40))])
+    assert len({colour.lower() for colour in colours.values()}) == 50

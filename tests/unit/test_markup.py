@@ -1,0 +1,200 @@
+"""The three formats of a table: what stands in them, that it stands there unharmed, and that LaTeX takes it."""
+
+import io
+import shutil
+import subprocess
+from pathlib import Path
+
+import pandas as pd
+import pytest
+
+from dsr.report.latex import latex_text, to_document
+from dsr.report.markup import MISSING, aligned, escaped, to_csv, to_latex, to_markdown, write_tables
+from dsr.report.paper_tables import build_tables
+from dsr.report.results import Results, Run
+
+ODD = "a|b_*x* 50% & $1 {c} \\d #e ~f ^g <u> `h` \"i\" 'j'"
+FOLDER = "dsr.data.folder.Folder"
+
+
+def run(label, values, *, dataset="mine", seed=0, method="other", target=FOLDER):
+    """Return a run on a folder of scenes whose RMSE_d is the value in mm, and whose DSSIM_v, too, in thousandths."""
+    about = {"dataset": dataset, "scale": 4, "downsampling": "box", "seed": seed, "method": method}
+    rows = [
+        {**about, "scene": scene, "metric": metric, "variant": variant, "value": value / 1e3, "valid_share": 1.0}
+        for scene, value in values.items()
+        for metric, variant in (("RMSE_d", ""), ("DSSIM_v", "max"))
+    ]
+    settings = {"dataset": {"target": target}}
+    return Run(folder=Path("runs", label), label=label, scores=pd.DataFrame(rows), seconds={}, settings=settings,
+               versions={}, scenes=tuple(values), **about)  # fmt: skip
+
+
+def study_of(label):
+    shares = {
+        "user_first": 61.5,
+        "user_first_low": 50.25,
+        "user_first_high": 71.0,
+        "user_second": 20.0,
+        "user_top2": 81.5,
+    }
+    about = {"dataset": "mine", "scene": "lucy", "scale": 4, "downsampling": "box", "label": label}
+    return pd.DataFrame([{**about, **shares}])
+
+
+def results():
+    """Return three seeds of one method, one seed of others, and a scene that one of them lacks."""
+    seeds = [run("DIP", {"lucy": 20.0 + 2 * seed, "b": 50.0}, seed=seed) for seed in range(3)]
+    whole = run("MSG-V", {"lucy": 23.6, "b": 40.0}, method="msg_v")
+    return Results((run("Bicubic", {"lucy": 70.4}, method="bicubic"), *seeds, whole))
+
+
+def the_table(given=None, study=None):
+    return build_tables(given or results(), study)[1]
+
+
+def lines_of(text, start):
+    """Return the cells of the table that follows a heading."""
+    lines = text[text.index(start) :].splitlines()
+    return [[cell.strip() for cell in line.strip("|").split(" | ")] for line in lines if line.startswith("|")]
+
+
+def test_markdown_has_means_spreads_ranks_missing_values_and_counts_of_scenes():
+    head, _, *rows = lines_of(to_markdown(the_table()).split("###")[0], "##")
+    assert head == ["scene", "method", "seeds", "RMSE_d (mm)", "DSSIM_v (1/1000)"]
+    assert rows == [
+        ["lucy", "Bicubic", "1", "70.4", "70"],
+        ["", "DIP", "3", "**22.0** ± 2.0", "**22** ± 2"],
+        ["", "MSG-V", "1", "<ins>23.6</ins>", "<ins>24</ins>"],
+        ["b", "Bicubic", "1", MISSING, MISSING],
+        ["", "DIP", "3", "<ins>50.0</ins> ± 0.0", "<ins>50</ins> ± 0"],
+        ["", "MSG-V", "1", "**40.0**", "**40**"],
+        ["mine, average of 2 scenes", "Bicubic", "1", "70.4 (1 of 2)", "70 (1 of 2)"],
+        ["", "DIP", "3", "<ins>36.0</ins> ± 1.0", "<ins>36</ins> ± 1"],
+        ["", "MSG-V", "1", "**31.8**", "**32**"],
+    ]
+
+
+def test_markdown_has_the_paper_s_values_the_difference_and_the_ratio():
+    text = to_markdown(the_table())
+    head, _, *rows = lines_of(text, "### ")
+    assert head == ["scene", "method", "", "RMSE_d (mm)", "DSSIM_v (1/1000)"]
+    assert rows[:4] == [
+        ["lucy", "Bicubic", "ours", "70.4", "70"],
+        ["", "", "paper", "72", "355"],
+        ["", "", "difference", "-1.6", "-285"],
+        ["", "", "ratio", "0.98", "0.20"],
+    ]
+    assert ["", "PDN", "paper"] in [row[:3] for row in rows]
+    assert "nan" not in text.casefold()
+
+
+def test_the_lines_of_a_markdown_table_are_equally_long():
+    for part in to_markdown(the_table()).split("\n\n"):
+        assert len({len(line) for line in part.splitlines() if line.startswith("|")}) <= 1
+    assert aligned(["a", "b"], [["long text", "1"]], 1).splitlines() == [
+        "| a         |   b |", "| --------- | --: |", "| long text |   1 |"]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("text", "shown"),
+    [
+        ("cube_no_texture", "cube_no_texture"),
+        ("_a_", "\\_a\\_"),
+        ("a|b*", "a\\|b\\*"),
+        ("a\nb", "a b"),
+        ("<b>", "\\<b\\>"),
+    ],
+)
+def test_markdown_shows_names_as_they_are(text, shown):
+    assert escaped(text) == shown
+
+
+def test_csv_has_full_precision_the_paper_s_units_and_no_column_that_nobody_needs():
+    frame = pd.read_csv(io.StringIO(to_csv(the_table())))
+    row = frame[(frame["scene"] == "lucy") & (frame["method"] == "DIP")].iloc[0]
+    assert row["RMSE_d [mm]"] == 22
+    assert row["RMSE_d spread [mm]"] == 2
+    assert row["seeds"] == 3
+    average = frame[(frame["kind"] == "average") & (frame["method"] == "Bicubic")].iloc[0]
+    assert (average["RMSE_d scenes"], average["RMSE_d [mm]"]) == (1, pytest.approx(70.4, abs=1e-12))
+    ours = frame[(frame["scene"] == "lucy") & (frame["method"] == "MSG-V")].iloc[0]
+    assert ours["RMSE_d paper [mm]"] == 74
+    assert ours["RMSE_d difference [mm]"] == pytest.approx(23.6 - 74)
+    assert ours["RMSE_d ratio"] == pytest.approx(23.6 / 74)
+    other = frame[frame["method"] == "PDN (paper)"].iloc[0]
+    assert pd.isna(other["RMSE_d [mm]"])
+    assert other["RMSE_d paper [mm]"] > 0
+    assert "DSSIM_v [1/1000]" in frame
+    assert not [name for name in frame if "low" in name or frame[name].isna().all()]
+    alone = pd.read_csv(io.StringIO(to_csv(the_table(Results((run("A", {"x": 1.25}),))))))
+    assert not [name for name in alone if "spread" in name or "paper" in name]
+
+
+def test_the_answers_of_a_study_have_their_intervals_in_every_format():
+    table = the_table(Results((run("A", {"lucy": 1.0}),)), study_of("A"))
+    assert "61.5 [50.2, 71.0]" in to_markdown(table)
+    assert "61.5 [50.2, 71.0]" in to_latex(table)
+    row = pd.read_csv(io.StringIO(to_csv(table))).iloc[0]
+    assert tuple(row[["user_first [%]", "user_first low [%]", "user_first high [%]"]]) == (61.5, 50.25, 71)
+
+
+def test_latex_has_rules_units_marks_and_dashes():
+    text = to_latex(the_table())
+    lines = [line.rstrip("\\ ").split(" & ") for line in text.splitlines() if " & " in line]
+    assert lines[0] == ["Scene", "Method", "Seeds", "RMSE$_{d}$", "DSSIM$_{v}$"]
+    assert lines[1] == ["", "", "", "mm", "1/1000"]
+    assert ["", "DIP", "3", "\\textbf{22.0} $\\pm$ 2.0", "\\textbf{22} $\\pm$ 2"] in lines
+    assert ["b", "Bicubic", "1", "--", "--"] in lines
+    assert ["", "Bicubic", "1", "70.4 (1 of 2)", "70 (1 of 2)"] in lines
+    assert "\\underline{23.6}" in text
+    assert [text.count(f"\\{rule}rule") for rule in ("top", "mid", "bottom")] == [1, 3, 1]
+
+
+def test_the_other_latex_table_has_the_paper_s_values_in_parentheses():
+    mine = run("Mine", {"lucy": 2.0})
+    text = to_latex(the_table(Results((*results().runs, mine))), published=True)
+    lines = [line.rstrip("\\ ").split(" & ") for line in text.splitlines() if " & " in line]
+    assert ["lucy", "Bicubic", "70.4 (72)", "70 (355)"] in lines
+    assert ["", "Mine", "\\textbf{2.0} (--)", "\\textbf{2} (--)"] in lines
+    assert ["", "PDN (paper)"] in [line[:2] for line in lines]
+    assert not [line for line in lines if line[1] == "MSG (paper)" and "--" in line]
+    assert "b &" not in text  # the paper has no such scene
+
+
+def test_a_long_table_becomes_several_that_fit_on_a_page():
+    scenes = {f"scene{number:02}": 1.0 for number in range(50)}
+    text = to_latex(the_table(Results((run("A", scenes), run("B", scenes)))))
+    parts = text.split("\\end{table}")[:-1]
+    assert len(parts) == 3
+    assert max(part.count("\\\\\n") for part in parts) == 2 + 42  # of the heading, and rows
+    assert all(text.count(f"{name} &") == 1 for name in scenes)
+
+
+@pytest.mark.parametrize(("text", "shown"), [("50%_&", "50\\%\\_\\&"), ("é", "é"), ("日本", "[U+65E5][U+672C]")])
+def test_latex_text_is_printed_as_it_is_or_named(text, shown):
+    assert latex_text(text) == shown
+
+
+def test_all_files_are_written_under_names_of_their_own(tmp_path):
+    paths = write_tables(tmp_path, results())
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted(path.name for path in paths)
+    assert {"all.md", "all.tex", "mine_x4_box.csv", "mine_x4_box_published.tex"} <= {path.name for path in paths}
+    assert (tmp_path / "all.md").read_text(encoding="utf-8").count("\n## ") == 1
+
+
+def test_latex_compiles_and_nothing_runs_off_the_page(tmp_path):
+    if shutil.which("pdflatex") is None:
+        pytest.skip("needs pdflatex")
+    odd = [
+        run(label, {ODD: 1.0, "ünï日本": 2.0, "lucy": 3.0}, seed=seed) for seed in (0, 1) for label in (ODD, "B" * 60)
+    ]
+    study = pd.concat([study_of("Bicubic"), study_of("DIP")])
+    tables = build_tables(Results((*results().runs, *odd)), study)
+    (tmp_path / "all.tex").write_text(to_document(tables), encoding="utf-8")
+    command = ["pdflatex", "-interaction=nonstopmode", "-halt-on-error", "all.tex"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, errors="replace", check=False)
+    assert done.returncode == 0, done.stdout[-2000:]
+    assert "Overfull" not in done.stdout
+    assert "Float too large" not in done.stdout
+    assert "Missing character" not in (tmp_path / "all.log").read_text(encoding="latin-1")

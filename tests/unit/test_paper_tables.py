@@ -1,0 +1,302 @@
+"""The paper's tables: which scenes an average is over, seeds, ranks, and the paper's values beside ours."""
+
+import math
+import statistics
+from pathlib import Path
+
+import pandas as pd
+import pytest
+
+from dsr.report.paper_tables import COLUMNS, build_tables
+from dsr.report.results import Results, Run
+from dsr.report.scene_sets import PAPER_SCENES, Place, sets_of_dataset, sets_of_summary
+from dsr.report.tables import published
+from dsr.report.user_study import read_study
+
+SIMGEO = (*PAPER_SCENES["simgeo"][:5], "statue")
+METRICS = ("RMSE_d", "DSSIM_v")
+
+
+def run(label, values, *, dataset="simgeo", seed=0, scale=4, downsampling="box", method=None, share=1.0, **settings):
+    """Return a run whose RMSE_d is the scenes' value in mm, and whose DSSIM_v, in thousandths, is ten times that."""
+    rows = []
+    for scene, value in values.items():
+        about = {"dataset": dataset, "scene": scene, "scale": scale, "downsampling": downsampling, "seed": seed}
+        about |= {"method": method or label.lower().replace("-", "_"), "valid_share": share}
+        rows.append({**about, "metric": "RMSE_d", "variant": "", "value": value / 1e3})
+        rows += [
+            {**about, "metric": "DSSIM_v", "variant": variant, "value": value / 1e2 * factor}
+            for variant, factor in (("e1", 0.5), ("max", 1.0), ("avg", 0.7))
+        ]
+    scores = pd.DataFrame(rows)
+    name = method or label.lower().replace("-", "_")
+    about = {"dataset": dataset, "scale": scale, "downsampling": downsampling, "seed": seed}
+    settings = {"dataset": settings}
+    return Run(
+        folder=Path("runs", f"{label}{seed}"), method=name, label=label, scores=scores, seconds={}, settings=settings,
+        versions={}, scenes=tuple(values), **about,
+    )  # fmt: skip
+
+
+def tables(*runs, study=None):
+    return {table.name: table for table in build_tables(Results(runs), study)}
+
+
+def group_of(table, start):
+    [group] = [group for group in table.groups if group.about.title.startswith(start)]
+    return group
+
+
+def cell_of(table, start, label, key="RMSE_d"):
+    [row] = [row for row in group_of(table, start).rows if row.label == label]
+    return row.cells.get(key)
+
+
+def all_of(names, value=10.0):
+    return {name: value + number for number, name in enumerate(names)}
+
+
+def test_there_is_a_summary_and_a_table_per_data_set_for_each_scale_and_degradation():
+    found = tables(
+        run("Bicubic", {"lucy": 1.0}),
+        run("Bicubic", {"sofa": 1.0}, dataset="icl"),
+        run("Bicubic", {"lucy": 1.0}, scale=8),
+        run("Bicubic", {"lucy": 1.0}, downsampling="box+noise 0.01/blobs"),
+    )
+    assert list(found) == [
+        "summary_x4_box", "simgeo_x4_box", "icl_x4_box", "summary_x8_box", "simgeo_x8_box",
+        "summary_x4_box_noise_0.01_blobs", "simgeo_x4_box_noise_0.01_blobs",
+    ]  # fmt: skip
+
+
+def test_names_of_files_differ_on_any_file_system_and_hold_no_odd_letters():
+    found = tables(*(run("MSG", {"a": 1.0}, dataset=name) for name in ("a/b", "A b", "a:b")))
+    assert len({name.casefold() for name in found}) == 4
+    assert all(name.replace("_", "").replace("-", "").replace(".", "").isalnum() for name in found)
+
+
+def test_values_are_in_the_paper_s_units_and_the_worst_of_four_lights():
+    table = tables(run("Bicubic", {"lucy": 70.4}))["simgeo_x4_box"]
+    assert cell_of(table, "lucy", "Bicubic").mean == pytest.approx(70.4)
+    assert cell_of(table, "lucy", "Bicubic", "DSSIM_v").mean == pytest.approx(704)
+    assert [column.key for column in table.columns] == ["RMSE_d", "DSSIM_v"]
+    assert any(note.startswith("Not computed: BadPix_d_5cm") for note in table.notes)
+
+
+def test_seeds_are_averaged_first_and_the_spread_of_an_average_is_that_of_the_seeds_averages():
+    values = {0: {"a": 10.0, "b": 40.0}, 1: {"a": 12.0, "b": 50.0}, 2: {"a": 17.0, "b": 30.0}}
+    table = tables(*(run("DIP", each, seed=seed, dataset="mine") for seed, each in values.items()))["mine_x4_box"]
+    single = cell_of(table, "a", "DIP")
+    assert (single.mean, single.seeds) == (pytest.approx(13), 3)
+    assert single.spread == pytest.approx(math.sqrt((9 + 1 + 16) / 2))
+    average = cell_of(table, "mine", "DIP")
+    assert average.mean == pytest.approx((13 + 40) / 2)
+    assert average.spread == pytest.approx(statistics.stdev([25, 31, 23.5]))
+
+
+def test_scenes_of_uneven_seeds_weigh_the_same_and_only_whole_seeds_spread():
+    runs = [run("DIP", {"a": 10.0, "b": 40.0}, dataset="m"), run("DIP", {"a": 20.0, "b": 60.0}, dataset="m", seed=1)]
+    average = cell_of(tables(*runs, run("DIP", {"a": 90.0}, dataset="m", seed=2))["m_x4_box"], "m,", "DIP")
+    assert average.mean == pytest.approx((40 + 50) / 2)
+    assert (average.seeds, average.spread) == (2, pytest.approx(statistics.stdev([25, 40])))
+
+
+def test_one_seed_has_no_spread():
+    table = tables(run("DIP", {"a": 10.0, "b": 1.0}, dataset="mine"))["mine_x4_box"]
+    assert all(cell.spread is None for group in table.groups for row in group.rows for cell in row.cells.values())
+
+
+def test_the_best_and_second_best_shown_values_are_marked_and_equal_ones_share():
+    runs = [run(label, {"a": value}) for label, value in (("A", 10.01), ("B", 9.99), ("C", 12.0), ("D", 13.0))]
+    table = tables(*runs)["simgeo_x4_box"]
+    assert [row.cells["RMSE_d"].rank for row in table.groups[0].rows] == [1, 1, 2, 0]  # both read 10.0
+    texts = [COLUMNS[0].text(row.cells["RMSE_d"].mean) for row in table.groups[0].rows]
+    assert texts == ["10.0", "10.0", "12.0", "13.0"]
+
+
+def test_a_method_alone_is_not_the_best():
+    assert cell_of(tables(run("A", {"a": 1.0}))["simgeo_x4_box"], "a", "A").rank == 0
+
+
+def test_an_average_over_fewer_scenes_says_so_and_is_not_compared():
+    runs = [run("A", {"a": 1.0, "b": 9.0}, dataset="m"), run("B", {"a": 2.0, "b": 10.0}, dataset="m")]
+    table = tables(*runs, run("C", {"a": 0.5}, dataset="m"))["m_x4_box"]
+    partial = cell_of(table, "m,", "C")
+    assert (partial.mean, partial.scenes, partial.of, partial.rank) == (pytest.approx(0.5), 1, 2, 0)
+    assert [cell_of(table, "m,", label).rank for label in "AB"] == [1, 2]
+    assert any(note.startswith("(k of n)") for note in table.notes)
+
+
+def test_a_method_without_a_value_keeps_its_row():
+    table = tables(run("A", {"a": 1.0, "b": 9.0}), run("B", {"a": 2.0}))["simgeo_x4_box"]
+    assert [row.label for row in group_of(table, "b").rows] == ["A", "B"]
+    assert cell_of(table, "b", "B") is None
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf])
+def test_what_is_no_number_is_missing(value):
+    table = tables(run("A", {"a": value, "b": 1.0}))["simgeo_x4_box"]
+    assert cell_of(table, "a", "A") is None
+    assert cell_of(table, "b", "A") is not None
+
+
+def test_the_summary_has_the_paper_s_six_averages_with_its_values():
+    runs = [run("MSG-V", all_of(names), dataset=name) for name, names in PAPER_SCENES.items()]
+    table = tables(*runs)["summary_x4_box"]
+    titles = [group.about.published for group in table.groups]
+    assert titles == [name for name in published()["scene"].unique() if name.startswith("Average")]
+    assert [len(group.about.places) for group in table.groups] == [6, 6, 7, 13, 6, 19]
+    without = cell_of(table, "Without", "MSG-V")
+    assert without.mean == pytest.approx(sum([*range(10, 16), *range(10, 16), 10]) / 13)
+    assert cell_of(table, "With missing", "MSG-V").mean == pytest.approx(sum(range(11, 17)) / 6)
+    assert group_of(table, "Without").rows[0].published["RMSE_d"] == 38
+    assert group_of(table, "With missing").rows[0].published["RMSE_d"] == 107
+
+
+def test_the_published_averages_are_means_over_the_very_scenes_that_ours_are():
+    places = [Place(name, scene) for name, scenes in PAPER_SCENES.items() for scene in scenes]
+    rows = published()[published()["method"] == "Bicubic"].set_index(["scene", "scale"])["BadPix_v_5"]
+    singles = {place: each.published for place in places for each in sets_of_dataset([place])}
+    known = {name.casefold(): name for name, _ in rows.index}
+    averages = sets_of_summary(places, lambda _: True)
+    assert len(averages) == 6
+    for each in averages:
+        own = [rows[known[singles[place].casefold()], 4] for place in each.places]
+        assert statistics.mean(own) == pytest.approx(rows[each.published, 4], abs=0.051)
+
+
+def test_with_scenes_lacking_an_average_says_so_and_has_no_published_value():
+    table = tables(run("MSG-V", all_of(SIMGEO[:2])))["summary_x4_box"]
+    assert [group.about.title for group in table.groups] == ["SimGeo, average of 2 of the paper's 6 scenes"]
+    assert not table.has_published
+
+
+def test_sets_of_the_same_scenes_are_averaged_once_in_the_place_of_the_first():
+    places = [Place("icl", "sofa"), Place("middlebury", "recycle"), Place("simgeo", "lucy")]
+    titles = [each.title.partition(",")[0] for each in sets_of_summary(places, lambda _: True)]
+    assert titles == ["ICL-NUIM", "Middlebury", "SimGeo", "Without missing measurements (SimGeo", "SimGeo"]
+
+
+def test_further_scenes_do_not_enter_the_paper_s_averages():
+    scenes = [*PAPER_SCENES["middlebury"], "adirondack"]
+    table = tables(run("MSG-V", all_of(scenes), dataset="middlebury"))["middlebury_x4_box"]
+    assert cell_of(table, "Middlebury, average of 7", "MSG-V").mean == pytest.approx(13)
+    assert cell_of(table, "Middlebury, average of 8", "MSG-V").mean == pytest.approx(13.5)
+    assert group_of(table, "Middlebury, average of 7").rows[0].published["RMSE_d"] == 96
+    assert not group_of(table, "Middlebury, average of 8").rows[0].published
+
+
+def test_the_statue_takes_lucy_s_place_only_where_lucy_is_not():
+    both = sets_of_dataset([Place("simgeo", name) for name in (*SIMGEO, "lucy")])
+    assert Place("simgeo", "statue") not in both[-2].places
+    assert Place("simgeo", "lucy") in both[-2].places
+    [average] = [each for each in sets_of_dataset([Place("simgeo", name) for name in SIMGEO]) if each.average]
+    assert average.published
+    assert average.recreated
+
+
+@pytest.mark.parametrize(("shares", "title"), [((0.9, 1.0), "without"), ((0.9, 0.95), "with")])
+def test_scenes_of_other_data_sets_are_sorted_by_holes_in_their_truth(shares, title):
+    holes = ["b"] if title == "with" else []
+    runs = [run(label, {"b": 1.0}, dataset="m", share=share) for label, share in zip("AB", shares, strict=True)]
+    others = [run(label, {"a": 1.0, "c": 1.0}, dataset="m") for label in "AB"]
+    found = tables(*runs, *others)["summary_x4_box"].groups
+    sets = {group.about.title.split(",")[0]: [place.scene for place in group.about.places] for group in found}
+    assert sets.get("Other scenes with missing measurements", []) == holes
+    assert sets.get("Other scenes without missing measurements", ["a", "b", "c"]) == sorted({"a", "b", "c"} - {*holes})
+
+
+def test_a_stored_scene_tells_holes_of_the_truth_from_those_of_a_prediction(make_run, tmp_path):
+    folder = make_run(tmp_path, dataset="m", scenes=("a", "b"))
+    runs = [run("A", {"a": 1.0, "b": 2.0}, dataset="m", share=0.9)]
+    runs = [Run(**{**vars(each), "folder": folder}) for each in runs]
+    [group] = tables(*runs)["summary_x4_box"].groups
+    assert len(group.about.places) == 2
+    titles = [each.title for each in sets_of_summary(group.about.places, lambda _: False)]
+    assert titles == ["m, average of 2 scenes"]  # the same scenes are not averaged twice
+
+
+def test_the_paper_s_values_of_methods_that_were_not_run_stand_only_beside_its_own_scenes():
+    folder = "dsr.data.folder.Folder"
+    table = tables(run("MSG-V", {"lucy": 23.6}, dataset="mine", target=folder))["mine_x4_box"]
+    [group] = table.groups
+    assert group.rows[0].published["RMSE_d"] == 74
+    assert group.paper_only["PDN"]["RMSE_d"] == published_value("Lucy", "PDN")
+    assert "MSG-V" not in group.paper_only
+    recreated = tables(run("MSG-V", {"cube_no_texture": 9.0}))["simgeo_x4_box"].groups[0]
+    assert recreated.rows[0].published["RMSE_d"] == 9
+    assert recreated.about.recreated
+    assert not recreated.paper_only
+
+
+def published_value(scene, method, scale=4, key="RMSE_d"):
+    table = published()
+    return table[(table["scene"] == scene) & (table["method"] == method) & (table["scale"] == scale)][key].item()
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [{"downsampling": "nearest"}, {"dataset": "sunrgbd"}, {"size": 256}, {"scale": 2}, {"method": "mine"}],
+    ids=str,
+)
+def test_the_paper_has_nothing_to_say_of_other_data_degradations_sizes_scales_and_methods(settings):
+    [single, *_] = [tables(run("Mine", {"lucy": 1.0}, **{"method": "msg_v", **settings}))]
+    assert not any(table.has_published for table in single.values())
+
+
+def test_a_method_is_compared_with_the_paper_s_whatever_its_label_is():
+    table = tables(run("MSG-V (ensemble=1)", {"lucy": 1.0}, method="msg_v"))["simgeo_x4_box"]
+    assert table.groups[0].rows[0].published["RMSE_d"] == 74
+
+
+def study_of(*rows):
+    columns = ("dataset", "scene", "label", "user_first", "user_first_low", "user_first_high")
+    frame = pd.DataFrame([dict(zip(columns, row, strict=True)) for row in rows])
+    return frame.assign(scale=4, downsampling="box", user_second=5.0, user_top2=frame["user_first"] + 5)
+
+
+def test_the_columns_of_a_study_join_with_its_intervals_and_higher_is_better():
+    study = study_of(
+        ("m", "a", "A", 80.0, 70, 90), ("m", "b", "A", 60.0, 50, 70), ("m", "average", "A", 70.0, 65, 75),
+        ("m", "a", "B", 20.0, 10, 30), ("m", "b", "B", 40.0, 30, 50),
+    )  # fmt: skip
+    values = {"a": 1.0, "b": 2.0}
+    table = tables(run("A", values, dataset="m"), run("B", values, dataset="m"), study=study)["m_x4_box"]
+    single = cell_of(table, "a", "A", "user_first")
+    assert (single.mean, single.interval, single.rank) == (80, (70, 90), 1)
+    assert cell_of(table, "m,", "A", "user_first").interval == (65, 75)
+    other = cell_of(table, "m,", "B", "user_first")
+    assert (other.mean, other.interval, other.rank) == (30, None, 2)
+
+
+def test_a_study_of_some_scenes_is_not_taken_for_one_of_all():
+    study = study_of(("m", "a", "A", 80.0, 70, 90), ("m", "average", "A", 80.0, 65, 75))
+    table = tables(run("A", {"a": 1.0, "b": 2.0}, dataset="m"), study=study)["m_x4_box"]
+    average = cell_of(table, "m,", "A", "user_first")
+    assert (average.scenes, average.of, average.interval) == (1, 2, None)
+    assert cell_of(table, "b", "A", "user_first") is None
+
+
+def test_a_table_that_is_no_study_is_refused():
+    with pytest.raises(ValueError, match="study: expected the table of dsr study collect, got one without dataset"):
+        tables(run("A", {"a": 1.0}), study=pd.DataFrame({"x": [1]}))
+
+
+def test_a_study_s_file_is_read_as_it_was_written(tmp_path):
+    study = study_of(("m", "01", "None", 80.0, 70, 90), ("m", "a", "A", 20.0, math.nan, math.nan))
+    study.to_csv(tmp_path / "study.csv", index=False)
+    pd.testing.assert_frame_equal(read_study(tmp_path / "study.csv"), study, check_dtype=False)
+
+
+@pytest.mark.parametrize("content", [b"", b"\xff\xfe\x00", b'"a\nb,c\n1,2,3', b"dataset,scene\nm,a\n", None])
+def test_a_file_that_is_no_study_is_refused_in_one_line(tmp_path, content):
+    if content is not None:
+        (tmp_path / "study.csv").write_bytes(content)
+    with pytest.raises(ValueError, match=r"study.csv: expected the table of dsr study collect, got [^\n]+$"):
+        read_study(tmp_path / "study.csv")
+
+
+def test_shares_that_are_no_numbers_are_refused(tmp_path):
+    study_of(("m", "a", "A", 80.0, 70, 90)).assign(user_first="most").to_csv(tmp_path / "study.csv", index=False)
+    with pytest.raises(ValueError, match=r"study.csv: expected numbers in user_first, got text"):
+        read_study(tmp_path / "study.csv")
