@@ -38,7 +38,8 @@ CHROMIUM_ARGUMENTS = (
 
 @pytest.fixture(scope="session", autouse=True)
 def _two_threads() -> None:
-    torch.set_num_threads(int(os.environ.get("DSR_TEST_THREADS", "2")))
+    several = "PYTEST_XDIST_WORKER" in os.environ
+    torch.set_num_threads(int(os.environ.get("DSR_TEST_THREADS", "1" if several else "2")))
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -106,7 +106,7 @@ def test_a_second_run_reuses_what_is_there(both: tuple[Path, subprocess.Complete
 
 
 def test_an_interrupted_run_goes_on_within_the_image(tmp_path: Path) -> None:
-    arguments = ("method=dip_v", "dataset.scenes=[statue]", "method.steps=400", "method.validate_every=10")
+    arguments = ("method=dip_v", "dataset.scenes=[statue]", "method.steps=200", "method.validate_every=10")
     with subprocess.Popen(
         _command(*arguments, "output_dir=out"), cwd=tmp_path, env=ENVIRONMENT, stdout=subprocess.PIPE,
         stderr=subprocess.PIPE, text=True,
@@ -119,7 +119,7 @@ def test_an_interrupted_run_goes_on_within_the_image(tmp_path: Path) -> None:
     assert process.returncode == 130
     step = re.fullmatch(r"interrupted at step (\d+) of statue; the same command goes on from there\n", errors)
     assert step is not None, errors
-    assert 10 <= int(step[1]) < 400
+    assert 10 <= int(step[1]) < 200
     assert (tmp_path / "out" / "optimisation" / "statue" / "last.ckpt").is_file()
     done = _run(tmp_path, *arguments, "output_dir=out")
     assert done.returncode == 0, done.stderr

@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+import math
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import matplotlib as mpl
 import numpy as np
 import torch
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import Colormap
 from matplotlib.figure import Figure
 from torch import Tensor
+from torch.nn import functional
 
 from dsr.atomic import replacing
 from dsr.geometry.camera import Camera
@@ -73,11 +76,11 @@ def save_picture(path: Path, sample: DepthSample, depth: Tensor, scores: Mapping
     write_figure(path, figure, _DPI)
 
 
-def write_figure(path: Path, figure: Figure, dpi: int) -> None:
-    """Write a figure atomically."""
+def write_figure(path: Path, figure: Figure, dpi: int, metadata: Mapping[str, Any] | None = None) -> None:
+    """Write a figure atomically, in the format that the suffix says."""
     with replacing(path) as temporary, warnings.catch_warnings():
         warnings.filterwarnings("ignore", "Glyph .* missing from font")  # a name that the font lacks letters for
-        figure.savefig(temporary, dpi=dpi)
+        figure.savefig(temporary, dpi=dpi, metadata=metadata)
 
 
 def limits_of(depth: Tensor) -> tuple[float, float]:
@@ -87,9 +90,61 @@ def limits_of(depth: Tensor) -> tuple[float, float]:
     return float(low), float(max(high, low + 1e-6))
 
 
-def colours(name: str) -> Any:
+def colours(name: str | Colormap) -> Any:
     """Return a colour map that shows holes in their colour."""
-    return mpl.colormaps[name].with_extremes(bad=HOLE_COLOUR)
+    return mpl.colormaps.get_cmap(name).with_extremes(bad=HOLE_COLOUR)
+
+
+class Window(NamedTuple):
+    """A part of a picture: ``height x width`` pixels, the first of them at (``top``, ``left``)."""
+
+    top: int
+    left: int
+    height: int
+    width: int
+
+    @property
+    def slices(self) -> tuple[slice, slice]:
+        """Its rows and columns."""
+        return slice(self.top, self.top + self.height), slice(self.left, self.left + self.width)
+
+
+def strongest_window(values: np.ndarray, height: int, width: int, taken: Sequence[Window] = ()) -> Window | None:
+    """Return the window with the largest mean, clear of others.
+
+    Args:
+        values: (H, W), at least 0; NaN counts as 0.
+        height: of the window in pixels.
+        width: the same.
+        taken: windows that it must not overlap.
+
+    Returns:
+        The first of the best in reading order; None where there is no room.
+
+    """
+    if height > values.shape[0] or width > values.shape[1]:
+        return None
+    sums = np.pad(np.nan_to_num(values).astype(np.float64).cumsum(axis=0).cumsum(axis=1), ((1, 0), (1, 0)))
+    totals = sums[height:, width:] - sums[:-height, width:] - sums[height:, :-width] + sums[:-height, :-width]
+    totals = totals.round(9)  # so that rounding does not choose among equals
+    for other in taken:
+        rows = slice(max(0, other.top - height + 1), other.top + other.height)
+        totals[rows, max(0, other.left - width + 1) : other.left + other.width] = -1
+    top, left = np.unravel_index(int(totals.argmax()), totals.shape)
+    return None if totals[top, left] < 0 else Window(int(top), int(left), height, width)
+
+
+def reduced(values: Tensor, longest: int) -> Tensor:
+    """Return (C, H, W) averaged over whole pixels to at most ``longest`` of them; NaN where most of them are."""
+    factor = math.ceil(max(values.shape[-2:]) / longest)
+    if factor == 1:
+        return values
+    known = values.isfinite()
+    total, weight = (
+        functional.avg_pool2d(each.to(values.dtype), factor, ceil_mode=True, count_include_pad=False)
+        for each in (torch.where(known, values, 0), known)
+    )
+    return torch.where(weight >= 0.5, total / weight.clamp(min=0.5), torch.nan)
 
 
 def _show_depth(axis: Axes, depth: Tensor, limits: tuple[float, float], title: str) -> None:

@@ -1,0 +1,151 @@
+"""The command behind ``dsr report``."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import shutil
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import pandas as pd
+from rich.console import Console
+
+from dsr.app.progress import Display
+from dsr.atomic import write_text
+from dsr.geometry.shading import LIGHT_NAMES
+from dsr.report.correlation_figure import save_scatter_matrix
+from dsr.report.correlations import write_correlations
+from dsr.report.figures import save_figures
+from dsr.report.markup import write_tables
+from dsr.report.page import save_page
+from dsr.report.results import Results, load_results
+from dsr.report.user_study import read_study
+from dsr.terminal import show
+
+_MARK = "report.json"
+"""What makes a directory one that a report may replace."""
+PARTS = ("tables", "metrics", "figures", "page")
+_MAIN = {
+    "page": "index.html",
+    "tables": "tables/all.md",
+    "LaTeX": "tables/all.tex",
+    "figures": "figures",
+    "metrics": "metrics",
+}
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """What of the results goes into the report.
+
+    Args:
+        methods, datasets, scales: these alone; empty for all.
+        parts: of tables, metrics, figures, page.
+        light: of the figures.
+        title: of the page.
+        page_mb: the most that the page may weigh.
+
+    """
+
+    methods: tuple[str, ...]
+    datasets: tuple[str, ...]
+    scales: tuple[int, ...]
+    parts: tuple[str, ...]
+    light: str
+    title: str
+    page_mb: float
+
+
+def make_report(runs: Sequence[Path], output: Path, study: Path | None, wanted: Wanted, console: Console) -> None:
+    """Write the tables, figures, correlations and page of some runs into a directory, whole or not at all.
+
+    Args:
+        runs: directories of runs, or with runs below them.
+        output: the report's directory; an earlier report there is replaced.
+        study: what ``dsr study collect`` wrote.
+        wanted: what goes in.
+        console: where progress is shown.
+
+    Raises:
+        ValueError: there is no run, a choice is none of those there are, or the directory holds something else.
+
+    """
+    _check(output, wanted)
+    results = load_results(runs)
+    results = results.only(label=wanted.methods, dataset=wanted.datasets, scale=wanted.scales)
+    answers = None if study is None else read_study(study)
+    output.parent.mkdir(parents=True, exist_ok=True)
+    temporary = Path(tempfile.mkdtemp(prefix=f".{output.name}-", dir=output.parent))
+    try:
+        notes = _write(temporary, results, answers, wanted, Display(console))
+        write_text(temporary / _MARK, json.dumps({"runs": [str(run.folder) for run in results.runs]}, indent=1) + "\n")
+        temporary.chmod(0o755)
+        if output.exists():
+            shutil.rmtree(output)
+        temporary.replace(output)
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+    for note in (*results.notes, *notes):
+        show(console, f"note: {note}")
+    for what, file in _MAIN.items():
+        if (output / file).exists():
+            show(console, f"{what:<8} {output / file}")
+
+
+def _check(output: Path, wanted: Wanted) -> None:
+    """Refuse what cannot be made, before anything is read."""
+    for part in wanted.parts:
+        if part not in PARTS:
+            raise ValueError(f"--only: expected some of {', '.join(PARTS)}, got {part}")
+    if wanted.light not in LIGHT_NAMES:
+        raise ValueError(f"--light: expected one of {', '.join(LIGHT_NAMES)}, got {wanted.light}")
+    if not wanted.page_mb > 0:
+        raise ValueError(f"--page-mb: expected a positive number, got {wanted.page_mb:g}")
+    if output.exists() and not (output.is_dir() and ((output / _MARK).is_file() or not any(output.iterdir()))):
+        raise ValueError(f"{output}: expected a new directory or an earlier report, it holds something else")
+
+
+def _write(folder: Path, results: Results, study: pd.DataFrame | None, wanted: Wanted, display: Display) -> list[str]:
+    """Write the parts, and return what a reader should know."""
+    notes: list[str] = []
+
+    def tables() -> None:
+        write_tables(folder / "tables", results, study)
+
+    def metrics() -> None:
+        write_correlations(folder / "metrics", results)
+        save_scatter_matrix(folder / "metrics", results)
+
+    def figures() -> None:
+        with _steps(display) as progress:
+            save_figures(folder / "figures", results, progress, light=wanted.light, notes=notes)
+
+    def page() -> None:  # the last, as it links to the others' files
+        with _steps(display) as progress:
+            notes.extend(
+                save_page(
+                    folder / "index.html", results, title=wanted.title, budget_mb=wanted.page_mb, progress=progress
+                )
+            )
+
+    parts = {"tables": tables, "metrics": metrics, "figures": figures, "page": page}
+    for part in display([part for part in parts if part in wanted.parts], "report"):
+        parts[part]()
+    return notes
+
+
+@contextlib.contextmanager
+def _steps(display: Display) -> Iterator[Callable[..., None]]:
+    """Yield what takes how much is done, of how much, and perhaps what is at hand; a bar shows it."""
+    with contextlib.ExitStack() as stack:
+        shown: list[Callable[[int, str], None]] = []
+
+        def progress(done: int, total: int, name: str = "") -> None:
+            if not shown:
+                shown.append(stack.enter_context(display.steps(name, total, done)))
+            shown[0](done, name)
+
+        yield progress

@@ -1,0 +1,154 @@
+"""Triangle meshes of depth maps, cut at depth steps.
+
+A plane's inverse depth is linear in the pixel, however grazing the view. So a pair of neighbours lies across a step
+where inverse depth changes by more than the slopes on both sides of the pair predict; the mere difference of the two
+depths would cut floors before the horizon. Steps that interpolation has spread over a few pixels are found by the
+change over a window of up to five pairs.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from torch import Tensor
+
+from dsr.geometry.camera import Camera
+
+LARGEST_STEP = 0.02
+"""Of depth, by which neighbours on one surface may deviate from its slope."""
+MOST_VERTICES = 2_000_000
+_REACHES = (1, 2, 3)
+"""Half widths of the windows in pixels: the step is between two of them, or spread over up to five."""
+_OWN_SHARE = 0.25
+"""Of ``largest_step``, that a pair within a wider window must itself change by to be cut."""
+
+
+class Mesh(NamedTuple):
+    """Triangles in the camera frame.
+
+    Args:
+        vertices: (N, 3) float32 in metres; x right, y down, z forward.
+        faces: (M, 3) int32 indices of vertices, counterclockwise as the camera sees them.
+        pixels: (N,) int64 index of each vertex in the flattened depth map.
+
+    """
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    pixels: np.ndarray
+
+
+def triangulate(
+    depth: Tensor,
+    camera: Camera,
+    *,
+    largest_step: float = LARGEST_STEP,
+    most: int = MOST_VERTICES,
+    isolated: bool = False,
+) -> Mesh:
+    """Join neighbouring known pixels by triangles, two per square of four, but for those that span a step in depth.
+
+    The diagonal of a square is the one with the smaller change of depth; of a square with one hole the other three
+    pixels make a triangle. Takes about 120 bytes per vertex at most, and 240 for :func:`vertex_normals`.
+
+    Args:
+        depth: (1, H, W) orthogonal depth in metres, NaN in holes.
+        camera: of these pixels.
+        largest_step: what is cut: a change of depth, as a share of it, beyond what the slopes beside it predict.
+        most: vertices; of a map with more pixels every second, third, ... row and column is taken.
+        isolated: whether vertices without a triangle are kept.
+
+    Raises:
+        ValueError: ``depth`` is no map of the camera's size, or a number is not positive.
+
+    """
+    if tuple(depth.shape) != (1, camera.height, camera.width):
+        raise ValueError(f"depth: expected shape {(1, camera.height, camera.width)}, got {tuple(depth.shape)}")
+    if not largest_step > 0 or most < 1:
+        raise ValueError(f"mesh: expected a positive step and number of vertices, got {largest_step} and {most}")
+    stride = stride_for(depth, most)
+    thinned = depth[0, ::stride, ::stride].detach().cpu().double().numpy()
+    known = np.isfinite(thinned)
+    faces = _faces(1 / thinned, largest_step)
+    kept = known.ravel().copy()
+    if not isolated:
+        kept[:] = False
+        kept[faces.ravel()] = True
+    place = np.cumsum(kept, dtype=np.int32) - 1
+    rows, columns = np.divmod(np.flatnonzero(kept), thinned.shape[1])
+    rows, columns = rows * stride, columns * stride
+    z = thinned.ravel()[kept]
+    vertices = np.stack(((columns - camera.cx) / camera.fx * z, (rows - camera.cy) / camera.fy * z, z), axis=1)
+    return Mesh(vertices.astype(np.float32), place[faces], rows * camera.width + columns)
+
+
+def stride_for(depth: Tensor, most: int) -> int:
+    """Return the smallest stride at which a map, (1, H, W), has at most that many known pixels."""
+    known = depth[0].isfinite()
+    stride = max(1, math.isqrt(int(known.sum()) // most))
+    while int(known[::stride, ::stride].sum()) > most:
+        stride += 1
+    return stride
+
+
+def vertex_normals(mesh: Mesh) -> np.ndarray:
+    """Return the unit normals of the vertices, (N, 3) float32: the mean of their triangles', weighted by area.
+
+    A vertex without a triangle looks at the camera.
+    """
+    corners = mesh.vertices[mesh.faces]  # (M, 3, 3)
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    at = mesh.faces.ravel()
+    sums = [np.bincount(at, np.repeat(normals[:, axis], 3), len(mesh.vertices)) for axis in range(3)]
+    total = np.stack(sums, axis=1)
+    lengths = np.linalg.norm(total, axis=1, keepdims=True)
+    towards = -mesh.vertices / np.linalg.norm(mesh.vertices, axis=1, keepdims=True)
+    return np.where(lengths > 0, total / np.where(lengths > 0, lengths, 1), towards).astype(np.float32)
+
+
+def _faces(inverse: np.ndarray, largest_step: float) -> np.ndarray:
+    """Return the triangles of a map of inverse depth, (H, W), as (M, 3) indices into the flattened map."""
+    height, width = inverse.shape
+    across, down = _joined(inverse, largest_step), _joined(inverse.T, largest_step).T
+    top, bottom, left, right = across[:-1], across[1:], down[:, :-1], down[:, 1:]
+    falling = np.abs(inverse[:-1, :-1] - inverse[1:, 1:])  # from the upper left pixel to the lower right one
+    rising = np.abs(inverse[1:, :-1] - inverse[:-1, 1:])
+    first = ~(np.nan_to_num(falling, nan=np.inf) > np.nan_to_num(rising, nan=np.inf))
+    index = np.arange(height * width, dtype=np.int32).reshape(height, width)
+    upper_left, upper_right = index[:-1, :-1], index[:-1, 1:]
+    lower_left, lower_right = index[1:, :-1], index[1:, 1:]
+    choices = (
+        (first & left & bottom, (upper_left, lower_left, lower_right)),
+        (first & top & right, (upper_left, lower_right, upper_right)),
+        (~first & left & top, (upper_left, lower_left, upper_right)),
+        (~first & bottom & right, (lower_left, lower_right, upper_right)),
+    )
+    return np.concatenate([np.stack([corner[where] for corner in corners], axis=1) for where, corners in choices])
+
+
+def _joined(inverse: np.ndarray, largest_step: float) -> np.ndarray:
+    """Return whether each pixel and its right neighbour are of one surface, (H, W - 1) bool; False beside holes."""
+    change = np.diff(inverse, axis=1)  # (H, W - 1)
+    scale = largest_step * np.minimum(inverse[:, :-1], inverse[:, 1:])
+    step = np.zeros(change.shape, dtype=bool)
+    for reach in _REACHES:
+        far, near = _shifted(inverse, reach)[:, :-1], _shifted(inverse, 1 - reach)[:, :-1]
+        beyond, before = _shifted(inverse, 2 * reach)[:, :-1], _shifted(inverse, 1 - 2 * reach)[:, :-1]
+        total, pairs = far - near, 2 * reach - 1
+        excess, own = np.abs(total), np.abs(change)
+        for slope in ((beyond - far) / reach, (near - before) / reach):
+            excess = np.fmin(excess, np.abs(total - pairs * slope))
+            own = np.fmin(own, np.abs(change - slope))
+        step |= (excess > scale) & (own > (1.0 if reach == 1 else _OWN_SHARE) * scale)
+    return np.isfinite(change) & ~step
+
+
+def _shifted(values: np.ndarray, by: int) -> np.ndarray:
+    """Return what is ``by`` columns further along, (H, W), NaN beyond the border."""
+    shifted = np.full_like(values, np.nan)
+    width = values.shape[1]
+    if abs(by) < width:
+        shifted[:, max(-by, 0) : width - max(by, 0)] = values[:, max(by, 0) : width + min(by, 0)]
+    return shifted

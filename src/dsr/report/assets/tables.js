@@ -1,0 +1,193 @@
+// Tables that sort, by mouse and by keyboard; what is missing stands at the end whichever way.
+
+const DASH = "\u2013";
+
+/**
+ * Return a sortable table.
+ * columns: {title, unit, word, value(row), cell(row)}; rows: anything. `visible(row)` filters; `foot` stays below.
+ */
+function sortable(columns, rows, { caption, visible = () => true, foot } = {}) {
+  const state = { column: null, down: false };
+  const body = make("tbody");
+  const headers = columns.map((column) => {
+    const header = make("th", { scope: "col", tabIndex: 0, "aria-sort": "none", className: column.word ? "word" : "" }, make("span", { className: "heading", textContent: column.title }));
+    if (column.unit) header.append(make("small", { textContent: column.unit }));
+    const act = () => sortBy(column);
+    header.addEventListener("click", act);
+    header.addEventListener("keydown", (event) => {
+      if (event.key !== "Enter" && event.key !== " ") return;
+      event.preventDefault();
+      act();
+    });
+    return header;
+  });
+
+  function sortBy(column) {
+    if (state.column === column && state.down) state.column = null;
+    else {
+      state.down = state.column === column;
+      state.column = column;
+    }
+    columns.forEach((each, k) => {
+      const sorted = each === state.column ? (state.down ? "descending" : "ascending") : "none";
+      headers[k].setAttribute("aria-sort", sorted);
+    });
+    refresh();
+  }
+
+  function refresh() {
+    const shown = rows.filter(visible);
+    if (state.column !== null) {
+      const keys = new Map(shown.map((row) => [row, state.column.value(row)]));
+      shown.sort((a, b) => compare(keys.get(a), keys.get(b), state.down));
+    }
+    body.replaceChildren(...shown.map((row) => make("tr", {}, ...columns.map((column) => {
+      const content = column.cell ? column.cell(row) : column.value(row);
+      return make("td", { className: column.word ? "word" : "" }, content ?? missing());
+    }))));
+  }
+
+  const last = foot ? make("tfoot", {}, make("tr", {}, ...columns.map((column, k) => make("td", { className: column.word ? "word" : "" }, foot[k] ?? missing())))) : null;
+  const table = make("table", {}, caption ? make("caption", { textContent: caption, className: "skip" }) : null, make("thead", {}, make("tr", {}, ...headers)), body, last);
+  refresh();
+  return { element: make("div", { className: "box", tabIndex: -1 }, table), refresh };
+}
+
+const isMissing = (value) => value === null || value === undefined || Number.isNaN(value);
+const missing = () => make("span", { className: "missing", textContent: DASH, title: "missing" });
+
+/** Order two values, numbers by size and words by the alphabet; what is missing comes last whichever way. */
+function compare(a, b, down) {
+  if (isMissing(a) || isMissing(b)) return Number(isMissing(a)) - Number(isMissing(b));
+  const order = typeof a === "string" ? a.localeCompare(b, "en", { numeric: true }) : a - b;
+  return down ? -order : order;
+}
+
+/** Return the two smallest shown values of a column: what is shown alike shares its place. */
+function ranked(rows, metric) {
+  const shown = rows
+    .filter((row) => row.values[metric.id] && !(row.counts && metric.id in row.counts))
+    .map((row) => Number(row.values[metric.id][0].toFixed(metric.digits)));
+  const places = [...new Set(shown)].sort((a, b) => a - b);
+  return shown.length > 1 ? places.slice(0, 2) : [];
+}
+
+/** Return a score's cell: the mean, its spread, how it ranks, how many scenes it lacks, and the published value. */
+function scoreCell(row, metric, places, total, published) {
+  const values = row.values[metric.id];
+  const paper = row.paper[metric.id];
+  const cell = make("span");
+  if (values) {
+    const text = number(values[0], metric.digits);
+    const place = row.counts && metric.id in row.counts ? -1 : places.indexOf(Number(values[0].toFixed(metric.digits)));
+    cell.append(make("span", { textContent: text, className: ["best", "second"][place] ?? "" }));
+    if (values.length > 1) cell.append(make("small", { textContent: ` \u00b1 ${number(values[1], metric.digits)}` }));
+    if (row.counts && metric.id in row.counts) {
+      cell.append(make("small", { textContent: ` (${row.counts[metric.id]} of ${total})`, title: "over the scenes that it has" }));
+    }
+  } else cell.append(missing());
+  if (published) {
+    const text = paper === undefined ? DASH : number(paper, paperDigits(paper, metric)) + (row.starred ? "*" : "");
+    cell.append(make("span", { className: "paper", textContent: text }));
+  }
+  return cell;
+}
+
+/** Return with how many digits the paper's value is shown: those that it has. */
+const paperDigits = (value, metric) => Math.min(metric.digits, (String(value).split(".")[1] ?? "").length);
+
+/** Return the columns of the metrics. */
+function metricColumns(metrics, places, total, options) {
+  return metrics.map((metric) => ({
+    title: metric.name,
+    unit: metric.unit || "\u00a0",
+    value: (row) => row.values[metric.id]?.[0],
+    cell: (row) => scoreCell(row, metric, places(row, metric), total, options.published),
+  }));
+}
+
+/** Fill the section of tables; `open(problem, scene)` shows a scene, where it has pictures. */
+function showTables(data, entries, open) {
+  const options = { published: false, scene: "", method: "" };
+  const matches = (text, part) => text.toLowerCase().includes(part.toLowerCase());
+  const all = [];
+  const home = find("#tables .tables");
+  data.problems.forEach((problem, index) => {
+    const seeds = Math.max(...problem.means.map((row) => row.seeds));
+    const meanPlaces = new Map(data.metrics.map((metric) => [metric.id, ranked(problem.means, metric)]));
+    const means = sortable(
+      [
+        { title: "Method", unit: "\u00a0", word: true, value: (row) => row.method },
+        ...metricColumns(data.metrics, (_, metric) => meanPlaces.get(metric.id), problem.scenes.length, options),
+      ],
+      problem.means,
+      { caption: `${problemName(problem)}: means`, visible: (row) => matches(row.method, options.method) },
+    );
+    const places = new Map();
+    for (const scene of problem.scenes) {
+      const own = problem.rows.filter((row) => row.scene === scene);
+      places.set(scene, new Map(data.metrics.map((metric) => [metric.id, ranked(own, metric)])));
+    }
+    const has = new Set(entries.filter((entry) => entry.problem === index).map((entry) => entry.name));
+    const scenes = sortable(
+      [
+        {
+          title: "Scene", unit: "\u00a0", word: true, value: (row) => row.scene,
+          cell: (row) => has.has(row.scene)
+            ? make("button", { type: "button", className: "go", textContent: row.scene, title: "show its pictures", onclick: () => open(index, row.scene, row.method) })
+            : row.scene,
+        },
+        { title: "Method", unit: "\u00a0", word: true, value: (row) => row.method },
+        ...metricColumns(data.metrics, (row, metric) => places.get(row.scene).get(metric.id), 0, options),
+      ],
+      problem.rows,
+      { caption: `${problemName(problem)}: scenes`, visible: (row) => matches(row.method, options.method) && matches(row.scene, options.scene) },
+    );
+    all.push(means, scenes);
+    const details = make("details", { open: data.problems.length === 1 },
+      make("summary", {}, "Scene by scene ", make("small", { textContent: `${plural(problem.scenes.length, "scene")}, ${plural(problem.methods.length, "method")}` })),
+      scenes.element);
+    home.append(make("div", { className: "block" },
+      make("h3", {}, problemName(problem), make("small", { textContent: ` \u00b7 mean over ${plural(problem.scenes.length, "scene")}${seeds > 1 ? `, mean \u00b1 standard deviation over up to ${seeds} seeds` : ""}` })),
+      means.element, details));
+  });
+  const foot = make("p", { className: "foot", hidden: true, textContent: "Below ours, the published values. * of the paper's own files; the scenes here are others of the same description." });
+  home.append(foot);
+  const refresh = () => all.forEach((table) => table.refresh());
+  find(".filter-scene").addEventListener("input", (event) => {
+    options.scene = event.target.value;
+    if (options.scene) home.querySelectorAll("details").forEach((details) => { details.open = true; });
+    refresh();
+  });
+  find(".filter-method").addEventListener("input", (event) => { options.method = event.target.value; refresh(); });
+  const any = data.problems.some((problem) => [...problem.rows, ...problem.means].some((row) => Object.keys(row.paper).length));
+  find(".show-published").parentElement.hidden = !any;
+  find(".show-published").addEventListener("change", (event) => {
+    options.published = event.target.checked;
+    foot.hidden = !options.published;
+    refresh();
+  });
+}
+
+/** Fill the section of times. */
+function showTimes(data) {
+  const home = find("#times .times");
+  for (const problem of data.problems) {
+    const timed = problem.methods.filter((method) => Object.keys(problem.seconds[method]).length);
+    if (!timed.length) continue;
+    const show = (seconds) => (isMissing(seconds) ? null : number(seconds, seconds < 0.0995 ? 3 : seconds < 9.95 ? 2 : 1));
+    const scenes = [...new Set(timed.flatMap((method) => Object.keys(problem.seconds[method])))];
+    const of = (method, scene) => problem.seconds[method][scene];
+    const mean = (method) => {
+      const values = Object.values(problem.seconds[method]);
+      return values.reduce((sum, value) => sum + value, 0) / values.length;
+    };
+    const columns = [
+      { title: "Scene", word: true, value: (row) => row.scene },
+      ...timed.map((method) => ({ title: method, value: (row) => of(method, row.scene), cell: (row) => show(of(method, row.scene)) })),
+    ];
+    const foot = ["mean", ...timed.map((method) => show(mean(method)))];
+    const table = sortable(columns, scenes.map((scene) => ({ scene })), { caption: `${problemName(problem)}: seconds`, foot });
+    home.append(make("div", { className: "block" }, make("h3", { textContent: problemName(problem) }), table.element));
+  }
+}

@@ -1,0 +1,51 @@
+"""Figures for papers and pages, as PDF and PNG: grids of scenes by methods, and the four lights."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+from dsr.report.figures.grids import LIGHT, figure_count, save_depth_grids, save_error_grids, save_rendering_grids
+from dsr.report.figures.lights import save_lights_figure
+from dsr.report.results import Results
+
+__all__ = ["save_depth_grids", "save_error_grids", "save_figures", "save_lights_figure", "save_rendering_grids"]
+
+
+def save_figures(
+    folder: Path,
+    results: Results,
+    progress: Callable[[int, int, str], None] | None = None,
+    *,
+    light: str = LIGHT,
+    notes: list[str] | None = None,
+) -> list[Path]:
+    """Draw all figures.
+
+    Args:
+        folder: for the files, which are replaced where they are there.
+        results: to draw.
+        progress: is told, before each figure, how many are done, how many there are at most, and its name.
+        light: of the renderings, ``e1`` to ``e4``.
+        notes: is extended by a line for each scene or result that could not be drawn.
+
+    Returns:
+        The files: a PDF and a PNG of each figure.
+
+    Raises:
+        ValueError: there is no such light.
+
+    """
+    total, done = figure_count(results) + 1, 0
+
+    def tell(name: str) -> None:
+        nonlocal done
+        if progress is not None:
+            progress(done, total, name)
+        done += 1
+
+    paths = save_rendering_grids(folder, results, light, progress=tell, notes=notes)
+    paths += save_depth_grids(folder, results, progress=tell, notes=notes)
+    paths += save_error_grids(folder, results, progress=tell, notes=notes)
+    tell("lights")
+    return paths + save_lights_figure(folder, results)

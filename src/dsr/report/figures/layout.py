@@ -1,0 +1,220 @@
+"""The common look of the grids: rows of panels of one width, details below them, and one colour bar per row."""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import Colormap
+from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
+from matplotlib.ticker import MaxNLocator, ScalarFormatter
+
+from dsr.report.pictures import Window, colours, write_figure
+
+DPI = 300
+FRAMES = ("#ff8c00", "#00a5e3")
+"""Colours of the first and second detail."""
+_WIDTH, _LEAST_PANEL, _MOST_PANEL = 7.0, 0.95, 1.6
+"""Inches of a page's width as long as panels are within bounds."""
+_TALLEST = 1.5
+"""A panel's greatest height by its width; pictures that are taller become narrower."""
+_GAP, _SEAM, _MARGIN, _LINE = 0.05, 0.04, 0.06, 0.125
+"""Inches between panels, between details, around the page, and of a line of text."""
+_BAR, _BAR_TEXT = 0.09, 0.42
+_FONT = 7.0
+_LETTER = 0.062
+"""Inches that a letter takes, generously."""
+_EMPTY = "#f2f2f2"
+
+
+@dataclass(frozen=True)
+class Cell:
+    """A panel.
+
+    Args:
+        picture: (H, W), NaN in holes, or (H, W, 3) in [0, 1]; None for an empty panel.
+        caption: a line below; of a panel without picture, what is written into it.
+        bold: whether the caption is.
+        colour_map, limits: for (H, W).
+
+    """
+
+    picture: np.ndarray | None
+    caption: str = ""
+    bold: bool = False
+    colour_map: str | Colormap = "gray"
+    limits: tuple[float, float] = (0.0, 1.0)
+
+
+@dataclass(frozen=True)
+class Row:
+    """A scene.
+
+    Args:
+        label: its name.
+        aspect: height by width of its pictures.
+        cells: one per column.
+        details: windows that are shown enlarged, square, in pixels of a picture of ``size``.
+        size: height and width.
+        bar: what the colour bar counts; empty for none. It is that of the last cell with limits.
+        extend: see Matplotlib's colour bars.
+
+    """
+
+    label: str
+    aspect: float
+    cells: Sequence[Cell]
+    details: Sequence[Window] = ()
+    size: tuple[int, int] = (1, 1)
+    bar: str = ""
+    extend: str = "neither"
+
+
+def save_both(folder: Path, name: str, figure: Figure) -> list[Path]:
+    """Write a figure as PDF and PNG atomically, and return the files.
+
+    In the PDF text is text, and pictures keep their own pixels.
+    """
+    paths = []
+    for suffix, interpolation, metadata in ((".pdf", "none", {"CreationDate": None}), (".png", "auto", {})):
+        for axes in figure.axes:
+            for image in axes.images:
+                image.set_interpolation(interpolation)
+        paths.append(folder / f"{name}{suffix}")
+        with mpl.rc_context({"pdf.fonttype": 42}):
+            write_figure(paths[-1], figure, DPI, metadata)
+    return paths
+
+
+def draw_grid(columns: Sequence[str], rows: Sequence[Row], texts: tuple[str, str]) -> Figure:
+    """Return a page.
+
+    Args:
+        columns: the headings.
+        rows: from top to bottom, each with a cell per column.
+        texts: above and below.
+
+    """
+    right = _MARGIN + (_BAR + _BAR_TEXT if any(row.bar for row in rows) else 0)
+    panel = min(max((_WIDTH - 0.3 - right) / len(columns) - _GAP, _LEAST_PANEL), _MOST_PANEL)
+    boxes = [_boxes(row, panel) for row in rows]
+    labels = [_wrapped(row.label, sum(heights)) for row, (_, *heights) in zip(rows, boxes, strict=True)]
+    left = _MARGIN + _LINE * max(label.count("\n") + 1 for label in labels) + 0.03
+    heads = [_wrapped(column, panel) for column in columns]
+    head = _LINE * max(text.count("\n") + 1 for text in heads)
+    top = _MARGIN + _LINE * 1.5 + head
+    total = top + sum(sum(heights) + _GAP for _, *heights in boxes) + _LINE * 1.3 + _MARGIN
+    page = _Page(left + len(columns) * (panel + _GAP) + right, total)
+    page.text(_MARGIN, total - _MARGIN, texts[0], va="top", weight="bold")
+    page.text(_MARGIN, _MARGIN, texts[1], va="bottom")
+    for column, text in enumerate(heads):
+        page.text(left + column * (panel + _GAP) + panel / 2, total - top + 0.06, text, ha="center", va="baseline")
+    level = total - top
+    for row, label, box in zip(rows, labels, boxes, strict=True):
+        middle = level - sum(box[1:]) / 2
+        page.text(left - 0.04, middle, label, ha="right", va="center", rotation=90, multialignment="center")
+        for column, cell in enumerate(row.cells):
+            page.cell(row, cell, left + column * (panel + _GAP), level, panel, box)
+        if row.bar:
+            page.bar(row, left + len(columns) * (panel + _GAP), level, box[1])
+        level -= sum(box[1:]) + _GAP
+    return page.figure
+
+
+def _boxes(row: Row, panel: float) -> tuple[float, float, float, float]:
+    """Return a row's sizes in inches: a picture's width and height, and the heights of details and caption."""
+    width = panel * min(1.0, _TALLEST / row.aspect)
+    details = (panel - _SEAM * (len(row.details) - 1)) / len(row.details) + _SEAM if row.details else 0.0
+    caption = _LINE if any(cell.caption and cell.picture is not None for cell in row.cells) else 0.0
+    return width, max(width * row.aspect, 0.15), details, caption
+
+
+def _wrapped(text: str, length: float) -> str:
+    """Return a text as lines that are at most so many inches long."""
+    return "\n".join(textwrap.wrap(text, max(int(length / _LETTER), 4), break_on_hyphens=False)) or text
+
+
+class _Page:
+    """A figure whose places are in inches from the lower left corner."""
+
+    def __init__(self, width: float, height: float) -> None:
+        self.figure = Figure(figsize=(width, height))
+        FigureCanvasAgg(self.figure)
+
+    def text(self, x: float, y: float, text: str, **style: Any) -> None:
+        """Write a text."""
+        width, height = self.figure.get_size_inches()
+        self.figure.text(x / width, y / height, text, fontsize=_FONT, parse_math=False, linespacing=1.1, **style)
+
+    def axes(self, left: float, bottom: float, width: float, height: float, label: str = "") -> Axes:
+        """Return axes without ticks."""
+        whole, total = self.figure.get_size_inches()
+        axes = self.figure.add_axes((left / whole, bottom / total, width / whole, height / total), label=label)
+        axes.set(xticks=[], yticks=[])
+        for spine in axes.spines.values():
+            spine.set_visible(False)
+        return axes
+
+    def cell(
+        self, row: Row, cell: Cell, left: float, top: float, panel: float, box: tuple[float, float, float, float]
+    ) -> None:
+        """Draw a panel, its details and its caption, the picture's upper edge at ``top``."""
+        width, height, below, _ = box
+        axes = self.axes(left + (panel - width) / 2, top - height, width, height, label=f"{row.label}: panel")
+        if cell.picture is None:
+            axes.set_facecolor(_EMPTY)
+            axes.text(0.5, 0.5, cell.caption, ha="center", va="center", fontsize=_FONT, color="0.45")
+            return
+        _show(axes, cell, cell.picture)
+        size = below - _SEAM
+        for number, (window, colour) in enumerate(zip(row.details, FRAMES, strict=False)):
+            part = _scaled(window, row.size, cell.picture.shape[:2])
+            axes.add_patch(_frame(part, colour))
+            inset = self.axes(left + number * (size + _SEAM), top - height - below, size, size, f"{row.label}: detail")
+            _show(inset, cell, cell.picture[part.slices])
+            for spine in inset.spines.values():
+                spine.set(visible=True, color=colour, linewidth=1.0)
+        self.text(left + panel / 2, top - height - below - 0.02, cell.caption, ha="center", va="top",
+                  weight="bold" if cell.bold else "normal")  # fmt: skip
+
+    def bar(self, row: Row, left: float, top: float, height: float) -> None:
+        """Draw a row's colour bar, beside its panels."""
+        panels = [axes for axes in self.figure.axes if axes.get_label() == f"{row.label}: panel" and axes.images]
+        shown = [cell.picture for cell in row.cells if cell.picture is not None]
+        mapped = [axes for axes, picture in zip(panels, shown, strict=True) if picture.ndim == 2]
+        if not mapped:
+            return
+        place = self.axes(left, top - height, _BAR, height, f"{row.label}: bar")
+        bar = self.figure.colorbar(mapped[-1].images[0], cax=place, extend=row.extend, ticks=MaxNLocator(5),
+                                   format=ScalarFormatter(useOffset=False))  # fmt: skip
+        bar.outline.set_linewidth(0.4)
+        bar.ax.tick_params(labelsize=_FONT - 1, length=2, width=0.4, pad=1.5)
+        bar.set_label(row.bar, fontsize=_FONT, labelpad=1.5)
+
+
+def _show(axes: Axes, cell: Cell, picture: np.ndarray) -> None:
+    """Draw a picture."""
+    low, high = cell.limits
+    axes.imshow(picture, cmap=colours(cell.colour_map), vmin=low, vmax=high, aspect="auto")
+
+
+def _frame(window: Window, colour: str) -> Rectangle:
+    """Return the frame around a window."""
+    corner = (window.left - 0.5, window.top - 0.5)
+    return Rectangle(corner, window.width, window.height, fill=False, edgecolor=colour, linewidth=0.9)
+
+
+def _scaled(window: Window, size: tuple[int, int], shape: tuple[int, ...]) -> Window:
+    """Return a window of a picture of one size in one of another, to whole pixels, at least one."""
+    down, across = shape[0] / size[0], shape[1] / size[1]
+    top, left = int(window.top * down), int(window.left * across)
+    bottom, right = round((window.top + window.height) * down), round((window.left + window.width) * across)
+    return Window(top, left, max(bottom - top, 1), max(right - left, 1))

@@ -1,0 +1,142 @@
+"""The four lights, explained: a sphere and a surface under each."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import torch
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.patches import Circle
+from torch import Tensor
+
+from dsr.geometry.shading import LIGHT_NAMES, lights, render
+from dsr.report.figures.layout import save_both
+from dsr.report.figures.scenes import rendering
+from dsr.report.pictures import colours
+from dsr.report.results import Results
+from dsr.store import StoredScene
+
+_SPHERE = 401
+"""Pixels across."""
+_FORMULAS = {
+    "e1": r"$-(0,\,\sqrt{2/3},\,1/\sqrt{3})$",
+    "e2": r"$-(1/\sqrt{2},\,-1/\sqrt{6},\,1/\sqrt{3})$",
+    "e3": r"$-(-1/\sqrt{2},\,-1/\sqrt{6},\,1/\sqrt{3})$",
+    "e4": r"$-(0,\,0,\,1)$",
+}
+_FONT = 8
+_PANEL, _GAP, _AXES, _ABOVE, _MARGIN = 1.42, 0.08, 0.95, 0.4, 0.06
+_ARROW = "#d1495b"
+_REACH = 1.32
+"""Of the half width of a sphere's panel, in radii."""
+_PREFERRED = ("statue", "lucy")
+_CANDIDATES = 8
+
+
+def save_lights_figure(folder: Path, results: Results | None = None) -> list[Path]:
+    """Draw a sphere, and the truth of a scene, under the four lights; arrows show the way that the light takes.
+
+    Args:
+        folder: for ``lights.pdf`` and ``lights.png``.
+        results: the truth of their most varied scene is shown; None for the sphere alone.
+
+    Returns:
+        The files.
+
+    """
+    scene = None if results is None else _most_varied(results)
+    rows = 1 if scene is None else 2
+    aspect = 1.0 if scene is None else min(scene.camera.height / scene.camera.width, 1.5)
+    width = _MARGIN + _AXES + len(LIGHT_NAMES) * (_PANEL + _GAP)
+    height = _ABOVE + _PANEL + (rows - 1) * (_PANEL * aspect + _GAP) + _MARGIN
+    figure = Figure(figsize=(width, height))
+    FigureCanvasAgg(figure)
+
+    def axes(left: float, bottom: float, across: float, down: float, label: str) -> Axes:
+        place = figure.add_axes((left / width, bottom / height, across / width, down / height), label=label)
+        place.set_axis_off()
+        return place
+
+    upper = height - _ABOVE - _PANEL
+    _draw_frame(axes(_MARGIN, upper + (_PANEL - _AXES) / 2, _AXES, _AXES, "camera frame"))
+    sphere = render(sphere_normals(_SPHERE)[None])[0].numpy()
+    for number, name in enumerate(LIGHT_NAMES):
+        left = _MARGIN + _AXES + number * (_PANEL + _GAP) + _GAP
+        panel = axes(left, upper, _PANEL, _PANEL, f"sphere under {name}")
+        _draw_sphere(panel, sphere[number], lights()[number])
+        for line, text in enumerate((_FORMULAS[name], name)):
+            place = ((left + _PANEL / 2) / width, (upper + _PANEL + 0.08 + 0.16 * line) / height)
+            figure.text(*place, text, ha="center", va="baseline", fontsize=_FONT - 0.5)
+        if scene is not None and scene.depth is not None:
+            surface = axes(left, _MARGIN, _PANEL, _PANEL * aspect, f"{scene.name} under {name}")
+            shades = rendering(scene.depth, scene.camera, name)
+            surface.imshow(shades, cmap=colours("gray"), vmin=0, vmax=1, aspect="auto")
+    return save_both(folder, "lights", figure)
+
+
+def sphere_normals(size: int) -> Tensor:
+    """Return the normals of a sphere seen from afar, (3, size, size), NaN beside it.
+
+    n = (x, y, -sqrt(1 - x^2 - y^2)) with x and y from -1 to 1.
+    """
+    ramp = torch.linspace(-1, 1, size, dtype=torch.float64)
+    y, x = torch.meshgrid(ramp, ramp, indexing="ij")
+    square = 1 - x.square() - y.square()
+    return torch.where(square >= 0, torch.stack((x, y, -square.clamp(min=0).sqrt())), torch.nan)
+
+
+def _draw_sphere(axes: Axes, shades: np.ndarray, direction: Tensor) -> None:
+    """Draw a sphere on white and an arrow along which the light comes."""
+    axes.imshow(np.ma.masked_invalid(shades), cmap="gray", vmin=0, vmax=1, extent=(-1, 1, 1, -1))
+    axes.add_patch(Circle((0, 0), 1, facecolor="none", edgecolor="0.6", linewidth=0.5))
+    axes.set(xlim=(-_REACH, _REACH), ylim=(_REACH, -_REACH))
+    x, y, _ = direction.tolist()
+    if abs(x) + abs(y) > 0:
+        style = {"arrowstyle": "-|>", "color": _ARROW, "linewidth": 1.8, "shrinkA": 0, "shrinkB": 0}
+        axes.annotate("", (0.55 * x, 0.55 * y), (1.58 * x, 1.58 * y), arrowprops=style)
+    else:
+        _draw_away(axes, 0, 0, 0.13, _ARROW)
+
+
+def _draw_frame(axes: Axes) -> None:
+    """Draw the axes of the camera frame as the viewer sees them."""
+    axes.set(xlim=(-0.5, 1.35), ylim=(1.35, -0.5))
+    style = {"arrowstyle": "-|>", "color": "0.15", "linewidth": 1.2, "shrinkA": 5, "shrinkB": 0}
+    for name, end in (("x", (0.8, 0.0)), ("y", (0.0, 0.8))):
+        axes.annotate("", end, (0, 0), arrowprops=style)
+        axes.text(1.22 * end[0], 1.22 * end[1], name, ha="center", va="center", fontsize=_FONT, style="italic")
+    _draw_away(axes, 0, 0, 0.1, "0.15")
+    axes.text(-0.24, -0.24, "z", ha="center", va="center", fontsize=_FONT, style="italic")
+
+
+def _draw_away(axes: Axes, x: float, y: float, radius: float, colour: str) -> None:
+    """Draw the sign of a vector that points away from the viewer: a crossed circle."""
+    axes.add_patch(Circle((x, y), radius, facecolor="white", edgecolor=colour, linewidth=1.2, zorder=3))
+    reach = radius / 2**0.5
+    for sign in (1, -1):
+        axes.plot((x - reach, x + reach), (y - sign * reach, y + sign * reach), color=colour, linewidth=1.2, zorder=4)
+
+
+def _most_varied(results: Results) -> StoredScene | None:
+    """Return a scene with a truth: of those by known names the first, else the one whose normals vary most."""
+    found: dict[str, StoredScene] = {}
+    for run in results.runs:
+        for name in run.scenes:
+            if name not in found and len(found) < _CANDIDATES and run.has_scene(name):
+                try:
+                    scene = run.scene(name)
+                except ValueError:
+                    continue
+                if scene.depth is not None and min(scene.depth.shape[-2:]) > 1:
+                    found[name] = scene
+    named = [found[name] for name in _PREFERRED if name in found]
+    return next(iter(named), max(found.values(), key=_variety, default=None))
+
+
+def _variety(scene: StoredScene) -> float:
+    """Return the standard deviation of the brightness under the first light."""
+    values = rendering(scene.depth, scene.camera, LIGHT_NAMES[0]) if scene.depth is not None else np.zeros(1)
+    return float(np.nan_to_num(np.nanstd(values)))

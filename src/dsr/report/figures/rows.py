@@ -1,0 +1,133 @@
+"""The rows of the grids: what each kind of figure shows of one scene."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.colors import Colormap, ListedColormap
+from torch import Tensor
+
+from dsr.report.figures.layout import Cell, Row
+from dsr.report.figures.scenes import Shown, details_of, rendering
+from dsr.report.pictures import limits_of
+from dsr.report.tables import METRICS
+
+_COARSE_ERROR = 0.02
+"""Metres of a row's limit from which on errors are told in centimetres."""
+_LEAST_ERROR = 1e-5
+
+
+def rendering_row(shown: Shown, light: str) -> Row:
+    """Return a scene's renderings."""
+    scene = shown.scene
+    results = {
+        label: None if depth is None else rendering(depth, scene.camera, light) for label, depth in shown.depths.items()
+    }
+    truth = None if scene.depth is None else rendering(scene.depth, scene.camera, light)
+    scores = _captions(shown, "DSSIM_v", "RMSE_v")
+    cells = [
+        _photo(shown),
+        Cell(_enlarged(rendering(scene.coarse, scene.camera_lr, light), scene.scale)),
+        *(_panel(picture, scores[label]) for label, picture in results.items()),
+        _panel(truth, missing="no truth"),
+    ]
+    size = (scene.camera.height, scene.camera.width)
+    details = details_of([picture for picture in results.values() if picture is not None], truth, scene.scale)
+    return Row(_label(shown), size[0] / size[1], cells, details, size)
+
+
+def depth_row(shown: Shown) -> Row:
+    """Return a scene's depth maps."""
+    scene = shown.scene
+    style = _Style("viridis", limits_of(scene.coarse if scene.depth is None else scene.depth))
+    scores = _captions(shown, "RMSE_d")
+    cells = [
+        _photo(shown),
+        _panel(_enlarged(scene.coarse[0].numpy(), scene.scale), style=style),
+        *(_panel(_pixels(depth), scores[label], style=style) for label, depth in shown.depths.items()),
+        _panel(_pixels(scene.depth), missing="no truth", style=style),
+    ]
+    return Row(_label(shown), scene.camera.height / scene.camera.width, cells, bar="depth, m", extend="both")
+
+
+def error_row(shown: Shown) -> Row | None:
+    """Return a scene's errors, None where there is no truth or no result."""
+    truth = shown.scene.depth
+    if truth is None or not shown.known():
+        return None
+    errors = {name: None if depth is None else depth.double() - truth for name, depth in shown.depths.items()}
+    known = [error[error.isfinite()].abs().numpy() for error in errors.values() if error is not None]
+    pooled = np.concatenate(known)
+    limit = max(float(np.percentile(pooled, 98)) if pooled.size else 0.0, _LEAST_ERROR)
+    factor, unit = (100, "cm") if limit >= _COARSE_ERROR else (1000, "mm")
+    style, scores = _Style(_diverging(), (-factor * limit, factor * limit)), _captions(shown, "RMSE_d")
+    cells = [_photo(shown)]
+    for label, error in errors.items():
+        cells.append(_panel(None if error is None else factor * error[0].numpy(), scores[label], style=style))
+    aspect = shown.scene.camera.height / shown.scene.camera.width
+    return Row(_label(shown), aspect, cells, bar=f"result - truth, {unit}", extend="both")
+
+
+def _photo(shown: Shown) -> Cell:
+    return Cell(shown.scene.rgb.permute(1, 2, 0).clamp(0, 1).numpy())
+
+
+class _Style(NamedTuple):
+    """Colours of a panel."""
+
+    colour_map: str | Colormap
+    limits: tuple[float, float]
+
+
+_GREY = _Style("gray", (0, 1))
+
+
+def _panel(
+    picture: np.ndarray | None,
+    caption: tuple[str, bool] = ("", False),
+    *,
+    missing: str = "no result",
+    style: _Style = _GREY,
+) -> Cell:
+    """Return a panel of (H, W) values, or one that says what is missing."""
+    return Cell(None, missing) if picture is None else Cell(picture, *caption, *style)
+
+
+def _pixels(values: Tensor | None) -> np.ndarray | None:
+    """Return (1, H, W) as an array, (H, W)."""
+    return None if values is None else values[0].numpy()
+
+
+def _enlarged(picture: np.ndarray, scale: int) -> np.ndarray:
+    """Return a picture with each pixel repeated, so that no viewer smooths what is coarse."""
+    return picture.repeat(scale, axis=0).repeat(scale, axis=1)
+
+
+def _diverging() -> Colormap:
+    """Return blue to white to red, without the ends that are nearly black."""
+    return ListedColormap(mpl.colormaps["RdBu_r"](np.linspace(0.1, 0.9, 255)), "errors")
+
+
+def _label(shown: Shown) -> str:
+    """Return a scene's name with spaces, where lines may end."""
+    return shown.name.replace("_", " ")
+
+
+def _captions(shown: Shown, *metrics: str) -> dict[str, tuple[str, bool]]:
+    """Return the scores of each method in the paper's units, and whether the first of them is the best."""
+    first = {label: scores[metrics[0]] for label, scores in shown.scores.items() if metrics[0] in scores}
+    known = [value for value in first.values() if np.isfinite(value)]
+    best = min(known) if len(known) > 1 else None
+    return {label: (_figures(scores, metrics), first.get(label) == best) for label, scores in shown.scores.items()}
+
+
+def _figures(scores: dict[str, float], metrics: tuple[str, ...]) -> str:
+    """Return scores for a reader, a dash for what is missing, nothing where all are."""
+    texts = []
+    for name in metrics:
+        _, _, factor, digits = METRICS[name]
+        value = scores.get(name, np.nan)
+        texts.append(f"{factor * value:.{digits}f}" if np.isfinite(value) else "-")
+    return "" if all(text == "-" for text in texts) else " / ".join(texts)

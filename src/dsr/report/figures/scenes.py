@@ -1,0 +1,155 @@
+"""What the figures show: the scenes of a problem, with the result of every method that has one."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from torch import Tensor
+
+from dsr.geometry.camera import Camera
+from dsr.geometry.shading import LIGHT_NAMES, lights, shade
+from dsr.report.pictures import Window, normals_seen_by, strongest_window
+from dsr.report.results import Problem, Results, Run
+from dsr.store import StoredScene
+
+_DETAIL = 5
+"""A detail's side is this part of the picture's shorter one."""
+
+
+@dataclass(frozen=True)
+class Shown:
+    """A scene and its results.
+
+    Args:
+        name: the scene's.
+        scene: what was asked.
+        depths: (1, H, W) in metres by method, None where there is no result.
+        scores: worst of four lights, raw units, by method and metric.
+
+    """
+
+    name: str
+    scene: StoredScene
+    depths: dict[str, Tensor | None]
+    scores: dict[str, dict[str, float]]
+
+    def known(self) -> list[Tensor]:
+        """Return the results that there are."""
+        return [depth for depth in self.depths.values() if depth is not None]
+
+
+def first_runs(results: Results, problem: Problem) -> dict[str, list[Run]]:
+    """Return the runs of a problem by method; the first is of the lowest seed."""
+    runs: dict[str, list[Run]] = {}
+    for run in results.runs:
+        if (run.dataset, run.scale, run.downsampling) == problem:
+            runs.setdefault(run.label, []).append(run)
+    return {label: sorted(each, key=lambda run: run.seed) for label, each in runs.items()}
+
+
+def scene_names(runs: dict[str, list[Run]]) -> list[str]:
+    """Return the scenes that a method or more has a result of, in the order of the runs."""
+    return list(dict.fromkeys(scene for each in runs.values() for run in each for scene in run.scenes))
+
+
+def shown_scenes(results: Results, problem: Problem, notes: list[str]) -> Iterator[Shown]:
+    """Yield the scenes of a problem one by one.
+
+    Args:
+        results: all.
+        problem: which of them.
+        notes: is extended by a line for each scene or result that is left out.
+
+    """
+    runs = first_runs(results, problem)
+    for name in scene_names(runs):
+        scene = _stored(name, [run for each in runs.values() for run in each], notes)
+        if scene is None:
+            continue
+        depths: dict[str, Tensor | None] = {}
+        scores: dict[str, dict[str, float]] = {}
+        for label, each in runs.items():
+            run = next((run for run in each if name in run.scenes), None)
+            depths[label] = None if run is None else _prediction(run, name, scene.camera, notes)
+            scores[label] = {} if run is None else _scores(run, name)
+        yield Shown(name, scene, depths, scores)
+
+
+def _stored(name: str, runs: Sequence[Run], notes: list[str]) -> StoredScene | None:
+    """Return the scene from the first run that keeps it whole."""
+    reason = "no run keeps its photo and input"
+    for run in runs:
+        if run.has_scene(name):
+            try:
+                return run.scene(name)
+            except ValueError as error:
+                reason = str(error)
+    _note(notes, f"no figures of {name}: {reason}")
+    return None
+
+
+def _prediction(run: Run, name: str, camera: Camera, notes: list[str]) -> Tensor | None:
+    """Return a result that can be drawn."""
+    try:
+        depth = run.prediction(name)
+    except ValueError as error:
+        _note(notes, str(error))
+        return None
+    if tuple(depth.shape) == (1, camera.height, camera.width):
+        return depth
+    expected, came = (f"{height} x {width}" for height, width in ((camera.height, camera.width), depth.shape[-2:]))
+    _note(notes, f"{run.folder}: {name}: expected a result of the photo's {expected} pixels, got {came}; not drawn")
+    return None
+
+
+def _note(notes: list[str], line: str) -> None:
+    if line not in notes:
+        notes.append(line)
+
+
+def _scores(run: Run, name: str) -> dict[str, float]:
+    """Return a scene's scores by metric, worst of four lights where there are lights."""
+    rows = run.scores[(run.scores["scene"] == name) & run.scores["variant"].fillna("").isin(["", "max"])]
+    return {str(metric): float(value) for metric, value in zip(rows["metric"], rows["value"], strict=True)}
+
+
+def rendering(depth: Tensor, camera: Camera, light: str) -> np.ndarray:
+    """Return the rendering of a map, (1, H, W), under one light, (H, W) in [0, 1], NaN where unknown.
+
+    Raises:
+        ValueError: there is no such light.
+
+    """
+    if light not in LIGHT_NAMES:
+        raise ValueError(f"light: expected one of {', '.join(LIGHT_NAMES)}, got {light!r}")
+    if min(depth.shape[-2:]) < 2:
+        return np.full(tuple(depth.shape[-2:]), np.nan)
+    direction = lights()[LIGHT_NAMES.index(light)][None]
+    return shade(normals_seen_by(camera, depth), direction)[0, 0].clamp(0, 1).numpy()
+
+
+def details_of(pictures: Sequence[np.ndarray], truth: np.ndarray | None, grain: int, count: int = 2) -> list[Window]:
+    """Return square windows where results differ most, on average, from the truth, or without one from their mean.
+
+    Args:
+        pictures: renderings of the results, (H, W), NaN where unknown.
+        truth: likewise.
+        grain: pixels of the result by those of the input; windows lie on whole pixels of the input.
+        count: how many at most; they do not overlap.
+
+    """
+    if not pictures:
+        return []
+    stack = np.nan_to_num(np.stack(pictures))
+    difference = np.abs(stack - (stack.mean(axis=0) if truth is None else truth)).mean(axis=0)
+    height, width = (side // grain for side in difference.shape)
+    blocks = np.nan_to_num(difference)[: height * grain, : width * grain].reshape(height, grain, width, grain)
+    side = max(round(min(height, width) / _DETAIL), 1)
+    windows: list[Window] = []
+    for _ in range(count):
+        window = strongest_window(blocks.mean(axis=(1, 3)), side, side, windows)
+        if window is not None:
+            windows.append(window)
+    return [Window(*(grain * value for value in window)) for window in windows]

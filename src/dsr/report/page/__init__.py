@@ -1,0 +1,186 @@
+"""``index.html``: one page of a whole evaluation that needs nothing but itself."""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import html
+import json
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import matplotlib as mpl
+import numpy as np
+
+from dsr.atomic import write_text
+from dsr.geometry.shading import LIGHT_NAMES, lights
+from dsr.report.page.content import links, metrics_data, problem_data, run_data
+from dsr.report.page.encoding import LEVELS, Level, Pool, megabytes
+from dsr.report.page.scenes import View, scene_data, views_of
+from dsr.report.pictures import HOLE_COLOUR
+from dsr.report.results import Results
+
+Progress = Callable[[int, int], None]
+_COLOUR_MAPS = {"depth": "viridis", "error": "RdBu_r", "angle": "magma"}
+_SCRIPTS = ("dom.js", "pictures.js", "tables.js", "viewer.js", "page.js")
+_SAMPLE = 6
+"""Scenes by which the size of all is estimated."""
+
+
+class _TooLargeError(Exception):
+    """Pictures that do not fit the budget."""
+
+
+@dataclass(frozen=True)
+class _Stored:
+    """The pictures of all scenes, the scenes' data (None for one without pictures), and what to say."""
+
+    pool: Pool
+    scenes: list[dict[str, Any] | None]
+    notes: list[str]
+
+
+def save_page(
+    path: Path,
+    results: Results,
+    *,
+    tables: Sequence[Path] | None = None,
+    title: str = "dsr report",
+    budget_mb: float = 60,
+    progress: Progress | None = None,
+) -> list[str]:
+    """Write a page with the scores, renderings, errors, times and settings of runs, atomically.
+
+    It works from a file, asks no server for anything, and computes the renderings itself from normals in 8 bits: they
+    are those of :func:`dsr.geometry.shading.render` but for their last grey levels.
+
+    Args:
+        path: an HTML file.
+        results: the runs.
+        tables: files to link to, below the page's folder; None for those in ``tables`` beside the page.
+        title: the page's.
+        budget_mb: megabytes that its pictures may have. They are stored without loss where that fits, else with more
+            and more compression, then smaller; the page says which.
+        progress: is told how many scenes of how many are done; begins anew where pictures need more compression.
+
+    Returns:
+        What could not be shown, and how pictures were stored.
+
+    Raises:
+        ValueError: the budget is not positive.
+
+    """
+    if not budget_mb > 0:
+        raise ValueError(f"budget_mb: expected a positive number of megabytes, got {budget_mb!r}")
+    views = views_of(results)
+    stored = _pictures(views, 1e6 * budget_mb, progress or (lambda done, total: None))
+    shown = [(view, scene) for view, scene in zip(views, stored.scenes, strict=True) if scene is not None]
+    notes = stored.notes
+    if shown:
+        notes = [f"pictures: {stored.pool.level.text(stored.pool.reduced)}; {megabytes(stored.pool.size)}", *notes]
+    problems = results.problems()
+    data = {
+        **_data(path, results, tables, title),
+        "notes": [*results.notes, *notes],
+        "scenes": [
+            {"problem": problems.index(view.problem), "name": view.scene, "data": f"s{number}"}
+            for number, (view, _) in enumerate(shown)
+        ],
+    }
+    blocks = [_block("data", _json(data))]
+    blocks += [_block(f"s{number}", _json(scene)) for number, (_, scene) in enumerate(shown)]
+    blocks += [_block(name, content, "text/plain") for name, content in stored.pool.pictures.items()]
+    write_text(path, _filled(title, blocks))
+    return notes
+
+
+def _pictures(views: Sequence[View], budget: float, progress: Progress) -> _Stored:
+    """Return the pictures of all scenes at the best level that the budget allows, else at the last."""
+    for level in LEVELS[:-1]:
+        with contextlib.suppress(_TooLargeError):
+            return _at_level(views, level, budget, progress)
+    return _at_level(views, LEVELS[-1], math.inf, progress)
+
+
+def _at_level(views: Sequence[View], level: Level, budget: float, progress: Progress) -> _Stored:
+    """Return the pictures of all scenes.
+
+    Raises:
+        _TooLargeError: they are larger than the budget, or a sample says that they will be.
+
+    """
+    pool = Pool(level)
+    notes: dict[int, list[str]] = {}
+    scenes: dict[int, dict[str, Any] | None] = {}
+    for done, number in enumerate(_spread(len(views)), start=1):
+        notes[number] = []
+        scenes[number] = scene_data(views[number], pool, notes[number])
+        expected = pool.size * len(views) / done if done == _SAMPLE else pool.size
+        if expected > budget:
+            raise _TooLargeError
+        progress(done, len(views))
+    ordered = range(len(views))
+    said = dict.fromkeys(note for number in ordered for note in notes[number])
+    return _Stored(pool, [scenes[number] for number in ordered], list(said))
+
+
+def _spread(count: int) -> Iterator[int]:
+    """Yield the numbers below ``count``, first some that are spread over all."""
+    first = dict.fromkeys(int(number) for number in np.linspace(0, count - 1, min(count, _SAMPLE)).round())
+    yield from first
+    yield from (number for number in range(count) if number not in first)
+
+
+def _data(path: Path, results: Results, tables: Sequence[Path] | None, title: str) -> dict[str, Any]:
+    """Return everything but the pictures."""
+    problems = results.problems()
+    return {
+        "title": title,
+        "metrics": metrics_data(results),
+        "problems": [problem_data(results, problem) for problem in problems],
+        "methods": results.methods(),
+        "seeds": sorted({run.seed for run in results.runs}),
+        "runs": [run_data(run) for run in results.runs],
+        "links": links(path.parent, tables),
+        "lights": dict(zip(LIGHT_NAMES, lights().tolist(), strict=True)),
+        "hole": HOLE_COLOUR,
+        "colours": {use: _colours(name) for use, name in _COLOUR_MAPS.items()},
+    }
+
+
+@functools.cache
+def _colours(name: str) -> str:
+    """Return a colour map's 256 colours, six hexadecimal digits each."""
+    return mpl.colormaps[name](np.arange(256), bytes=True)[:, :3].tobytes().hex()
+
+
+def _json(value: Any) -> str:
+    """Return JSON in which no tag can begin or end."""
+    text = json.dumps(value, ensure_ascii=False, separators=(",", ":"), allow_nan=False)
+    return text.replace("&", "\\u0026").replace("<", "\\u003c").replace(">", "\\u003e")
+
+
+def _block(name: str, content: str, kind: str = "application/json") -> str:
+    return f'<script type="{kind}" id="{name}">{content}</script>'
+
+
+def _asset(name: str) -> str:
+    return resources.files("dsr.report").joinpath("assets", name).read_text(encoding="utf-8")
+
+
+def _filled(title: str, blocks: Sequence[str]) -> str:
+    """Return the page."""
+    parts = {
+        "TITLE": html.escape(title),
+        "STYLE": _asset("page.css"),
+        "DATA": "\n".join(blocks),
+        "SCRIPT": "\n".join(_asset(name) for name in _SCRIPTS),
+    }
+    page = _asset("page.html")
+    for name, content in parts.items():
+        page = page.replace(f"<!-- {name} -->", content, 1)
+    return page

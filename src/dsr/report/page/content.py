@@ -1,0 +1,154 @@
+"""What a report's page says in words and numbers: scores, published values, times, settings, links."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote
+
+import pandas as pd
+
+from dsr.report.page.scenes import runs_of
+from dsr.report.results import Problem, Results, Run
+from dsr.report.tables import AVERAGES, METRICS, OTHER_FRAMES, RECREATED, in_paper_units, paper_row
+
+_FOLDERS = {"tables": (".csv", ".md", ".tex"), "metrics": (".csv",), "figures": (".pdf",)}
+"""Folders beside the page whose files it links to."""
+_BESIDES = " ("
+"""Begins what tells data sets of one name apart: settings that are not the paper's."""
+
+
+def metrics_data(results: Results) -> list[dict[str, Any]]:
+    """Return the metrics that any run has: heading, unit and digits."""
+    present = {name for run in results.runs for name in run.scores["metric"]}
+    return [
+        {"id": name, "name": heading, "unit": unit, "digits": digits}
+        for name, (heading, unit, _, digits) in METRICS.items()
+        if name in present
+    ]
+
+
+def problem_data(results: Results, problem: Problem) -> dict[str, Any]:
+    """Return a problem's scores in the paper's units, by scene and on average, with the published ones beside them."""
+    runs = runs_of(results, problem)
+    methods = list(dict.fromkeys(run.label for run in runs))
+    wide = {id(run): _by_scene(run) for run in runs}
+    scenes = list(dict.fromkeys(scene for run in runs for scene in wide[id(run)].index))
+    rows: list[dict[str, Any]] = []
+    means: list[dict[str, Any]] = []
+    for method in methods:
+        tables = [wide[id(run)] for run in runs if run.label == method]
+        for scene in scenes:
+            own = [table.loc[scene] for table in tables if scene in table.index]
+            if own:
+                paper = _published(problem, scene, method)
+                starred = scene in RECREATED or problem.dataset in OTHER_FRAMES or _BESIDES in problem.dataset
+                rows.append({"scene": scene, "method": method, "seeds": len(own), "values": _over_seeds(own),
+                             "paper": paper, "starred": starred and bool(paper)})  # fmt: skip
+        means.append(_mean_row(problem, method, scenes, tables))
+    return {
+        "dataset": problem.dataset,
+        "scale": problem.scale,
+        "downsampling": problem.downsampling,
+        "methods": methods,
+        "scenes": scenes,
+        "means": means,
+        "rows": sorted(rows, key=lambda row: scenes.index(row["scene"])),
+        "seconds": _seconds(runs, methods),
+    }
+
+
+def _by_scene(run: Run) -> pd.DataFrame:
+    """Return a run's scores, scene x metric, in the paper's units."""
+    table = in_paper_units(run.scores)
+    table.index = table.index.map(str)
+    return table
+
+
+def _over_seeds(series: Sequence[pd.Series]) -> dict[str, list[float]]:
+    """Return by metric the mean over seeds, and where there are several their sample standard deviation."""
+    values: dict[str, list[float]] = {}
+    together = pd.DataFrame(list(series)).astype(float)
+    for name in together:
+        known = together[name].dropna()
+        if len(known):
+            mean = float(known.mean())
+            values[str(name)] = [mean] if len(known) < 2 else [mean, float(known.std(ddof=1))]
+    return {name: numbers for name, numbers in values.items() if all(map(math.isfinite, numbers))}
+
+
+def _mean_row(problem: Problem, method: str, scenes: list[str], tables: list[pd.DataFrame]) -> dict[str, Any]:
+    """Return a method's averages over the scenes; ``counts``: by metric, over how many, where some are missing."""
+    values = _over_seeds([table.mean() for table in tables])
+    seen: dict[str, set[str]] = {name: set() for name in values}
+    for table in tables:
+        for name in values:
+            if name in table:
+                seen[name] |= set(table.index[table[name].notna()])
+    counts = {name: len(found) for name, found in seen.items() if len(found) < len(scenes)}
+    name, count = AVERAGES.get(problem.dataset, ("", 0))
+    paper = _published(problem, name, method) if len(scenes) == count and not counts else {}
+    starred = problem.dataset in OTHER_FRAMES or any(scene in RECREATED for scene in scenes)
+    return {"method": method, "seeds": len(tables), "values": values, "counts": counts, "paper": paper,
+            "starred": starred and bool(paper)}  # fmt: skip
+
+
+def _published(problem: Problem, scene: str, method: str) -> dict[str, float]:
+    """Return the paper's figures by metric; it has some where the downsampling is its own."""
+    row = paper_row(scene, method, problem.scale, problem.downsampling)
+    return {} if row is None else {name: float(row[name]) for name in METRICS if pd.notna(row[name])}
+
+
+def _seconds(runs: Iterable[Run], methods: Iterable[str]) -> dict[str, dict[str, float]]:
+    """Return by method and scene the seconds of computing, the mean over seeds."""
+    found: dict[str, dict[str, list[float]]] = {method: {} for method in methods}
+    for run in runs:
+        for scene, seconds in run.seconds.items():
+            if math.isfinite(seconds):
+                found[run.label].setdefault(str(scene), []).append(float(seconds))
+    return {
+        method: {scene: sum(values) / len(values) for scene, values in scenes.items()}
+        for method, scenes in found.items()
+    }
+
+
+def run_data(run: Run) -> dict[str, Any]:
+    """Return a run's settings and environment as text by key."""
+    return {
+        "folder": run.folder.name,
+        "label": run.label,
+        "dataset": run.dataset,
+        "scale": run.scale,
+        "downsampling": run.downsampling,
+        "seed": run.seed,
+        "settings": flat(run.settings),
+        "versions": flat(run.versions),
+    }
+
+
+def flat(values: Mapping[str, Any], above: str = "") -> dict[str, str]:
+    """Return nested values as text by dotted key."""
+    found: dict[str, str] = {}
+    for key, value in values.items():
+        name = f"{above}{key}"
+        if isinstance(value, Mapping) and value:
+            found |= flat(value, f"{name}.")
+        else:
+            found[name] = "none" if value is None else str(value)
+    return found
+
+
+def links(folder: Path, tables: Sequence[Path] | None) -> list[dict[str, str]]:
+    """Return the files beside the page that there are: a name, and an address relative to it."""
+    paths = [
+        path
+        for name, suffixes in _FOLDERS.items()
+        if name != "tables" or tables is None
+        for path in sorted((folder / name).glob("*"))
+        if path.suffix in suffixes and path.is_file()
+    ]
+    named = [path for path in tables or () if path.is_file() and path.resolve().is_relative_to(folder.resolve())]
+    relative = [path.resolve().relative_to(folder.resolve()).as_posix() for path in [*named, *paths]]
+    return [{"name": name, "address": quote(name)} for name in dict.fromkeys(relative)]

@@ -1,0 +1,181 @@
+"""What a report's page holds of each scene: photo, input, results and truth as pictures of values."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from torch import Tensor
+
+from dsr.geometry.camera import Camera
+from dsr.geometry.shading import lights, shade
+from dsr.report.page.encoding import Pool, depth_picture, error_picture, mask_picture, shading_picture
+from dsr.report.pictures import limits_of, normals_seen_by
+from dsr.report.results import Problem, Results, Run
+from dsr.store import StoredScene
+
+_LEAST_ERROR = 1e-4
+"""Metres; the colours of smaller errors do not go over the whole bar."""
+
+
+@dataclass(frozen=True)
+class View:
+    """A scene of a problem, and the runs that answered it, one of each method."""
+
+    problem: Problem
+    scene: str
+    runs: tuple[Run, ...]
+
+
+@dataclass(frozen=True)
+class _Result:
+    """A method's answer, (1, H, W) in metres."""
+
+    label: str
+    seed: int | None
+    depth: Tensor
+
+
+def views_of(results: Results) -> list[View]:
+    """Return every scene that has pictures, by problem; of several seeds of a method the lowest counts."""
+    views = []
+    for problem in results.problems():
+        runs = runs_of(results, problem)
+        scenes = dict.fromkeys(scene for run in runs for scene in run.scenes)
+        for scene in scenes:
+            chosen: dict[str, Run] = {}
+            for run in sorted(runs, key=lambda run: run.seed):
+                if scene in run.scenes:
+                    chosen.setdefault(run.label, run)
+            ordered = [chosen[label] for label in dict.fromkeys(run.label for run in runs) if label in chosen]
+            views.append(View(problem, scene, tuple(ordered)))
+    return views
+
+
+def runs_of(results: Results, problem: Problem) -> list[Run]:
+    """Return a problem's runs in order."""
+    wanted = tuple(problem)
+    return [run for run in results.runs if (run.dataset, run.scale, run.downsampling) == wanted]
+
+
+def scene_data(view: View, pool: Pool, notes: list[str]) -> dict[str, Any] | None:
+    """Return what the page needs to show a scene; its pictures go to the pool.
+
+    Args:
+        view: the scene and its runs.
+        pool: takes the pictures.
+        notes: takes what could not be shown, and why.
+
+    Returns:
+        Plain values; None where no run keeps the scene.
+
+    """
+    stored = _stored(view, notes)
+    if stored is None:
+        return None
+    answers = _results(view, stored, notes)
+    reference = stored.depth if stored.depth is not None else (answers[0].depth if answers else stored.coarse)
+    low, high = limits_of(reference)
+    data: dict[str, Any] = {
+        "scene": view.scene,
+        "size": [stored.camera.width, stored.camera.height],
+        "notes": list(stored.notes),
+        "depth": [low, high],
+        "photo": _photo(stored.rgb, pool),
+    }
+    largest = None
+    if stored.depth is not None:
+        largest, data["error"] = _error_limits([each.depth - stored.depth for each in answers])
+    coarse = f"{stored.camera_lr.width} x {stored.camera_lr.height}"
+    surfaces = [
+        {"label": "input", "kind": "input", "text": coarse, **_surface(stored.coarse, stored.camera_lr, data, pool)}
+    ]
+    for each in answers:
+        surface = _surface(each.depth, stored.camera, data, pool)
+        if stored.depth is not None and largest is not None:
+            surface["error"] = _error(each.depth - stored.depth, largest, pool)
+        text = "" if each.seed is None else f"seed {each.seed}"
+        surfaces.append({"label": each.label, "kind": "method", "text": text, **surface})
+    if stored.depth is not None:
+        surfaces.append({"label": "truth", "kind": "truth", **_surface(stored.depth, stored.camera, data, pool)})
+    return {**data, "surfaces": surfaces}
+
+
+def _stored(view: View, notes: list[str]) -> StoredScene | None:
+    """Return the scene as the first run that has it keeps it."""
+    for run in view.runs:
+        if run.has_scene(view.scene):
+            try:
+                return run.scene(view.scene)
+            except ValueError as error:
+                notes.append(str(error))
+    dataset, scale, downsampling = view.problem
+    notes.append(
+        f"{dataset} x{scale} {downsampling}, {view.scene}: no pictures, for no run keeps the photo and the input"
+    )
+    return None
+
+
+def _results(view: View, stored: StoredScene, notes: list[str]) -> list[_Result]:
+    """Return the predictions that fit the scene."""
+    found = []
+    for run in view.runs:
+        try:
+            depth = run.prediction(view.scene)
+        except (ValueError, OSError) as error:
+            notes.append(str(error))
+            continue
+        size = (1, stored.camera.height, stored.camera.width)
+        if tuple(depth.shape) != size:
+            notes.append(f"{run.folder.name}: {view.scene}: expected a prediction of {size}, got {tuple(depth.shape)}")
+            continue
+        found.append(_Result(run.label, run.seed, depth.double()))
+    return found
+
+
+def _photo(rgb: Tensor, pool: Pool) -> str:
+    """Store a photo, (3, H, W) in [0, 1]."""
+    values, _ = pool.fitted(rgb.permute(1, 2, 0).double().numpy())
+    return pool.add(np.rint(255 * np.clip(values, 0, 1)).astype(np.uint8))
+
+
+def _surface(depth: Tensor, camera: Camera, data: dict[str, Any], pool: Pool) -> dict[str, Any]:
+    """Store the normals and depth of a map, (1, H, W) in metres."""
+    basis = lights()[:3]
+    if min(depth.shape[-2:]) < 2:
+        shadings = np.full((*depth.shape[-2:], 3), np.nan)
+    else:
+        shadings = shade(normals_seen_by(camera, depth), basis)[0].permute(1, 2, 0).numpy()
+    fitted, normal_known = pool.fitted(shadings)
+    metres, depth_known = pool.fitted(depth[0].double().numpy())
+    surface = {
+        "size": [fitted.shape[1], fitted.shape[0]],
+        "normals": pool.add(shading_picture(fitted)),
+        "depth": pool.add(depth_picture(metres, *data["depth"])),
+    }
+    mask = mask_picture(depth_known, normal_known)
+    return surface if mask is None else {**surface, "mask": pool.add(mask, exact=True)}
+
+
+def _error(difference: Tensor, largest: float, pool: Pool) -> dict[str, str]:
+    """Store a signed error, (1, H, W) in metres."""
+    values, known = pool.fitted(difference[0].numpy())
+    stored = {"values": pool.add(error_picture(values, largest))}
+    mask = mask_picture(known, known)
+    return stored if mask is None else {**stored, "mask": pool.add(mask, exact=True)}
+
+
+def _error_limits(differences: Sequence[Tensor]) -> tuple[float, dict[str, float]]:
+    """Return the largest error that is stored, and that and the limit of the colours: the same for all methods.
+
+    The largest is the 99.9th percentile of the worst method, the limit of the colours the 98th of the median method.
+    """
+    sizes = [difference[difference.isfinite()].abs().numpy() for difference in differences]
+    sizes = [values for values in sizes if values.size]
+    largest = max((float(np.percentile(values, 99.9)) for values in sizes), default=0.0)
+    limit = float(np.median([np.percentile(values, 98) for values in sizes])) if sizes else 0.0
+    limit = max(limit, _LEAST_ERROR)
+    largest = max(largest, limit)
+    return largest, {"largest": largest, "limit": limit}

@@ -1,0 +1,360 @@
+"""The page of a report in a browser: it sorts, lights, compares and reads out what it should, and asks nobody."""
+
+import base64
+import dataclasses
+import functools
+
+import cv2
+import numpy as np
+import pytest
+
+from dsr.geometry.shading import lights, render, shade
+from dsr.report.page import save_page
+from dsr.report.pictures import normals_seen_by
+from dsr.report.results import Results, load_results
+
+SPITEFUL = "<img src=x onerror=alert(1)>\"'&</script><script>alert(2)</script>"
+SIZE = 64
+DESKTOP = {"width": 1280, "height": 900}
+SCENES = ("cube_no_texture", "statue")
+
+
+@functools.cache
+def made(make_run, folder):
+    """Return runs of two methods on two scenes and one at another scale, and the address of the page about them."""
+    for label in ("Bicubic", "MSG-V"):
+        make_run(folder / label, method=label.lower(), label=label, scenes=SCENES, size=SIZE)
+    make_run(folder / "x8", scale=8, scenes=SCENES[:1], size=SIZE)
+    found = load_results([folder])
+    save_page(folder / "index.html", found, title="A report")
+    return found, (folder / "index.html").as_uri()
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return tmp_path_factory.mktemp("runs")
+
+
+@pytest.fixture
+def results(make_run, folder):
+    return made(make_run, folder)[0]
+
+
+@pytest.fixture
+def address(make_run, folder):
+    return made(make_run, folder)[1]
+
+
+@pytest.fixture(scope="module")
+def window(browser):
+    """A page in a window with mouse and touch, and what it said or asked for that it should not have."""
+    context = browser.new_context(viewport=DESKTOP, has_touch=True, reduced_motion="reduce")
+    page, wrong = context.new_page(), []
+    page.on("console", lambda message: wrong.append(message.text))
+    page.on("pageerror", lambda error: wrong.append(str(error)))
+    page.on("dialog", lambda dialog: (wrong.append(dialog.message), dialog.dismiss()))
+    page.on("request", lambda request: None if harmless(request.url) else wrong.append(request.url))
+    yield page, wrong
+    context.close()
+
+
+@pytest.fixture
+def opened(window, address):
+    """Return what opens the page anew; errors and requests that it makes fail the test at its end."""
+    page, wrong = window
+    wrong.clear()
+
+    def open_page(url=address, *, pictures=True):
+        page.set_viewport_size(DESKTOP)
+        page.goto("about:blank")
+        page.goto(url)
+        if pictures:
+            page.wait_for_selector(".stage[data-shown]")
+            page.evaluate("document.querySelector('#scenes').scrollIntoView()")
+            settle(page)
+        return page
+
+    yield open_page
+    assert wrong == []
+
+
+def harmless(url):
+    return url.startswith(("data:", "blob:", "about:")) or (url.startswith("file:") and ".html" in url)
+
+
+def settle(page):
+    """Wait until what was asked for is drawn."""
+    page.evaluate("new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")
+
+
+def pixels(page, selector):
+    """Return a canvas's pixels, (H, W, 3)."""
+    url = page.evaluate("(selector) => document.querySelector(selector).toDataURL()", selector)
+    content = np.frombuffer(base64.b64decode(url.split(",")[1]), np.uint8)
+    return cv2.imdecode(content, cv2.IMREAD_COLOR)[..., ::-1]
+
+
+def seen(page, selector=".stage"):
+    """Return an element as it is on the screen, (h, w, 3)."""
+    content = page.locator(selector).screenshot()
+    return cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_COLOR)[..., ::-1].astype(int)
+
+
+def run_of(results, label):
+    return next(run for run in results.runs if run.label == label and run.scale == 4)
+
+
+def depth_of(results, label, scene=SCENES[0]):
+    run = run_of(results, "Bicubic" if label == "truth" else label)
+    return run.scene(scene).depth if label == "truth" else run.prediction(scene)
+
+
+def normals(results, label, scene=SCENES[0]):
+    return normals_seen_by(run_of(results, "Bicubic").scene(scene).camera, depth_of(results, label, scene))
+
+
+def rendering(results, label, light):
+    """Return a rendering as grey levels, (H, W)."""
+    return 255 * render(normals(results, label))[0, light].numpy()
+
+
+def choose(page, side, label):
+    page.locator(f"#scenes select.{side}").select_option(label=label)
+    settle(page)
+
+
+def column(page, table, number):
+    """Return a column of a table of the section of tables, as text."""
+    return page.evaluate(
+        "([table, number]) => [...document.querySelectorAll('#tables table')[table].querySelectorAll('tbody tr')]"
+        ".map((row) => row.cells[number].innerText)",
+        [table, number],
+    )
+
+
+def test_both_sides_show_the_renderings_of_the_protocol_under_every_light(opened, results):
+    page = opened()
+    choose(page, "left", "MSG-V")
+    page.locator(".stage").focus()
+    for light in (1, 0, 3, 2):
+        page.keyboard.press(str(light + 1)) if light % 2 else page.click(f"[data-light=e{light + 1}]")
+        settle(page)
+        for side, label in (("left", "MSG-V"), ("right", "truth")):
+            drawn = pixels(page, f".pane-{side} canvas").astype(float)
+            assert drawn.shape == (SIZE, SIZE, 3)
+            assert np.abs(drawn[..., 0] - rendering(results, label, light)).max() <= (1.51 if light < 3 else 2.3)
+            assert (drawn == drawn[..., :1]).all()
+
+
+def test_left_and_right_of_the_divider_on_the_screen_are_the_two_pictures(opened, results):
+    page = opened()
+    choose(page, "left", "Bicubic")
+    for share in (0.25, 0.75):
+        box = page.locator(".stage").bounding_box()
+        page.mouse.click(box["x"] + share * box["width"], box["y"] + 0.3 * box["height"])
+        page.mouse.move(5, 5)
+        image = seen(page)
+        height, width = image.shape[:2]
+        rows, columns = np.mgrid[8 : SIZE - 20, 2 : SIZE - 2]
+        far = np.abs((columns + 0.5) / SIZE - share) > 0.06
+        rows, columns = rows[far], columns[far]
+        found = image[((rows + 0.5) * height / SIZE).astype(int), ((columns + 0.5) * width / SIZE).astype(int), 0]
+        left, right = rendering(results, "Bicubic", 0), rendering(results, "truth", 0)
+        expected = np.where((columns + 0.5) / SIZE < share, left[rows, columns], right[rows, columns])
+        assert np.abs(found - expected).max() <= 2
+        assert np.abs(left - right).max() > 50
+        assert page.get_attribute(".divider", "aria-valuenow") == str(round(100 * share))
+
+
+def test_the_divider_moves_by_keys_mouse_and_touch(opened):
+    page = opened()
+    divider = page.locator(".divider")
+    divider.focus()
+
+    def now():
+        return int(divider.get_attribute("aria-valuenow"))
+
+    for key, expected in (("ArrowLeft", 49), ("Shift+ArrowRight", 59), ("Home", 0), ("ArrowLeft", 0), ("End", 100)):
+        page.keyboard.press(key)
+        assert now() == expected
+    page.keyboard.press("Home")
+    box = page.locator(".stage").bounding_box()
+    x, y = box["x"], box["y"] + 0.5 * box["height"]
+    page.mouse.move(x + 3, y)
+    page.mouse.down()
+    page.mouse.move(x + 0.3 * box["width"], y, steps=3)
+    page.mouse.up()
+    page.mouse.move(x + 0.9 * box["width"], y)
+    assert now() == 30
+    session = page.context.new_cdp_session(page)
+    for kind, share in (("touchStart", 0.3), ("touchMove", 0.5), ("touchMove", 0.6), ("touchEnd", None)):
+        points = [] if share is None else [{"x": x + share * box["width"], "y": y}]
+        session.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": points})
+    assert now() == 60
+
+
+def test_both_pictures_zoom_and_move_together(opened):
+    page = opened()
+
+    def transforms():
+        return page.eval_on_selector_all(".stage .pane canvas", "all => all.map(each => each.style.transform)")
+
+    page.click(".zoom-in")
+    left, right = transforms()
+    assert left == right
+    assert "scale(1.5)" in left
+    box = page.locator(".stage").bounding_box()
+    middle = box["x"] + box["width"] * 0.3, box["y"] + box["height"] * 0.3
+    page.mouse.move(*middle)
+    page.mouse.down()
+    page.mouse.move(middle[0] - 40, middle[1] - 30)
+    page.mouse.up()
+    moved, other = transforms()
+    assert moved == other != left
+    assert page.get_attribute(".divider", "aria-valuenow") == "50"
+    page.click(".zoom-reset")
+    assert transforms()[0] == "translate(0px, 0px) scale(1)"
+
+
+def test_the_free_light_follows_the_pointer_and_shades_as_a_light_of_that_direction_does(opened, results):
+    page = opened()
+    page.click("[data-light=free]")
+    box = page.locator(".stage").bounding_box()
+    page.mouse.move(box["x"] + 0.75 * box["width"], box["y"] + 0.3 * box["height"])
+    settle(page)
+    x, y = 0.5, -0.4
+    light = lights()[:1].clone()
+    light[0] = light.new_tensor([x, y, -np.sqrt(1 - x * x - y * y)])
+    expected = 255 * shade(normals(results, "truth"), light)[0, 0].clamp(0, 1).numpy()
+    assert np.abs(pixels(page, ".pane-right canvas")[..., 0] - expected).max() <= 4
+
+
+def test_pointing_at_a_method_shows_its_errors_and_reads_them_out(opened, results):
+    page = opened()
+    page.hover(".strip button:has-text('MSG-V')")
+    assert page.inner_text(".errors-heading") == "Errors of MSG-V"
+    canvas = page.locator(".depth-error > canvas")
+    canvas.scroll_into_view_if_needed()
+    box = canvas.bounding_box()
+    error = (depth_of(results, "MSG-V") - depth_of(results, "truth"))[0].numpy()
+    for row, across in ((20, 33), (50, 10)):
+        page.mouse.move(box["x"] + (across + 0.5) * box["width"] / SIZE, box["y"] + (row + 0.5) * box["height"] / SIZE)
+        text = page.inner_text(".error-readout").replace("\N{MINUS SIGN}", "-")
+        value, unit = text.split("error ")[1].split(",")[0].split()
+        metres = float(value) / {"cm": 100, "mm": 1000}[unit]
+        assert metres == pytest.approx(error[row, across], abs=0.02 * np.abs(error).max())
+        mine, truth = (normals(results, label)[0, :, row, across] for label in ("MSG-V", "truth"))
+        degrees = np.degrees(np.arccos(float((mine * truth).sum())))
+        assert float(text.split("off by ")[1].split("°")[0]) == pytest.approx(degrees, abs=0.6)
+
+
+def test_the_error_map_is_red_where_the_result_is_farther_and_blue_where_it_is_nearer(opened, results):
+    page = opened()
+    choose(page, "left", "Bicubic")
+    page.click("[data-view=error]")
+    settle(page)
+    drawn = pixels(page, ".pane-left canvas").astype(int)
+    error = (depth_of(results, "Bicubic") - depth_of(results, "truth"))[0].numpy()
+    large = np.percentile(np.abs(error), 90)
+    assert (drawn[..., 0] > drawn[..., 2])[error > large].all()
+    assert (drawn[..., 0] < drawn[..., 2])[error < -large].all()
+    assert "cm" in page.inner_text(".stage-scale") or "mm" in page.inner_text(".stage-scale")
+
+
+def test_depth_is_in_the_colours_of_the_other_pictures_and_the_photo_is_the_photo(opened, results):
+    page = opened()
+    choose(page, "left", "photo")
+    photo = run_of(results, "Bicubic").scene(SCENES[0]).rgb.permute(1, 2, 0).numpy() * 255
+    assert np.abs(pixels(page, ".pane-left canvas") - photo).max() <= 1
+    page.click("[data-view=depth]")
+    settle(page)
+    depth = depth_of(results, "truth")[0].numpy()
+    drawn = pixels(page, ".pane-right canvas")
+    assert drawn[np.unravel_index(depth.argmin(), depth.shape)].tolist() == [68, 1, 84]  # both ends of viridis
+    assert drawn[np.unravel_index(depth.argmax(), depth.shape)].tolist() == [253, 231, 36]
+
+
+def test_headings_sort_by_click_and_by_key_and_say_so(opened):
+    page = opened()
+    headers = page.locator("#tables table").first.locator("th")
+    order = column(page, 0, 0)
+    assert order == ["Bicubic", "MSG-V"]
+    headers.nth(1).click()
+    rising = [float(text) for text in column(page, 0, 1)]
+    assert rising == sorted(rising)
+    assert headers.nth(1).get_attribute("aria-sort") == "ascending"
+    page.keyboard.press("Enter")
+    assert [float(text) for text in column(page, 0, 1)] == rising[::-1]
+    assert headers.nth(1).get_attribute("aria-sort") == "descending"
+    page.keyboard.press(" ")
+    assert column(page, 0, 0) == order
+    assert headers.nth(1).get_attribute("aria-sort") == "none"
+
+
+def test_rows_are_filtered_by_scene_and_method(opened):
+    page = opened()
+    page.fill(".filter-scene", "STAT")
+    page.fill(".filter-method", "msg")
+    assert (column(page, 1, 0), column(page, 1, 1)) == (["statue"], ["MSG-V"])
+
+
+def test_published_values_come_and_go(opened):
+    page = opened()
+    assert "*" not in page.inner_text("#tables .tables")
+    page.check(".show-published")
+    assert page.locator("#tables .paper:has-text('*')").count() > 0
+    page.uncheck(".show-published")
+    assert "*" not in page.inner_text("#tables .tables")
+
+
+def test_a_scene_of_a_table_opens_in_the_viewer_and_the_address_keeps_it(opened):
+    page = opened()
+    page.evaluate("document.querySelectorAll('#tables details').forEach((each) => { each.open = true; })")
+    page.locator("#tables .go:has-text('statue')").last.click()
+    page.wait_for_selector(".stage[data-shown=s1]")
+    assert page.inner_text(".name-left") == "MSG-V"
+    assert page.locator("#scene-choice").evaluate("each => each.selectedOptions[0].text") == "statue"
+    again = opened(page.url)
+    again.wait_for_selector(".stage[data-shown=s1]")
+    assert again.inner_text(".name-left") == "MSG-V"
+
+
+def test_another_problem_has_its_own_methods_and_the_same_scene(opened):
+    page = opened()
+    page.locator("#scenes select.problem").select_option(index=1)
+    page.wait_for_selector(".stage[data-shown=s2]")
+    assert page.eval_on_selector_all("#scenes select.left option", "all => all.map(each => each.text)") == [
+        "photo", "input", "Bicubic", "truth",
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize(("width", "scheme"), [(360, "light"), (390, "dark")])
+def test_on_a_phone_nothing_is_wider_than_the_screen(opened, width, scheme):
+    page = opened()
+    page.set_viewport_size({"width": width, "height": 780})
+    page.emulate_media(color_scheme=scheme)
+    page.evaluate("document.querySelectorAll('details').forEach((each) => { each.open = true; })")
+    page.check(".show-published")
+    assert page.evaluate("document.documentElement.scrollWidth") == width
+    assert page.locator(".stage").bounding_box()["width"] <= width
+
+
+def test_names_that_are_code_are_shown_and_not_run(opened, results, tmp_path):
+    runs = [dataclasses.replace(run, label=SPITEFUL, dataset=SPITEFUL) for run in results.runs[:1]]
+    path = tmp_path / "index.html"
+    save_page(path, Results(tuple(runs), (SPITEFUL,)), title=SPITEFUL)
+    page = opened(path.as_uri())
+    assert page.title() == SPITEFUL
+    assert page.inner_text("h1") == SPITEFUL
+    assert page.inner_text(".name-left") == SPITEFUL
+    assert page.locator("img").count() == 0
+
+
+def test_a_page_without_pictures_has_its_tables(opened, make_run, tmp_path):
+    run = make_run(tmp_path / "run")
+    (run / "scenes" / "cube_no_texture.npz").unlink()
+    save_page(tmp_path / "index.html", load_results([run]))
+    page = opened((tmp_path / "index.html").as_uri(), pictures=False)
+    assert page.locator("#tables td").count() > 0
+    assert page.locator("#scenes").is_hidden()
+    assert "no pictures" in page.inner_text(".notes")

@@ -1,0 +1,288 @@
+"""Figures: every scene and method has its panel, colours are comparable, and the PDF's text is text."""
+
+import itertools
+import re
+import shutil
+import subprocess
+
+import numpy as np
+import pytest
+import torch
+
+from dsr.geometry.shading import lights
+from dsr.report.figures import (
+    grids,
+    layout,
+    save_depth_grids,
+    save_error_grids,
+    save_figures,
+    save_lights_figure,
+    save_rendering_grids,
+)
+from dsr.report.figures import lights as lights_figure
+from dsr.report.figures.layout import Cell, Row, draw_grid
+from dsr.report.figures.lights import sphere_normals
+from dsr.report.figures.scenes import details_of
+from dsr.report.pictures import HOLE_COLOUR, Window, colours, strongest_window
+from dsr.report.results import load_results
+
+TOGETHER = (save_rendering_grids, save_depth_grids, save_error_grids)
+
+
+@pytest.fixture
+def results(tmp_path, make_run):
+    """Two methods on two scenes, and one that has the first scene alone."""
+    make_run(tmp_path / "runs" / "a", scenes=("one", "two"), size=24)
+    make_run(tmp_path / "runs" / "b", method="msg_v", label="MSG-V", scenes=("one", "two"), size=24)
+    make_run(tmp_path / "runs" / "c", method="dip", label="DIP", scenes=("one",), size=24)
+    return load_results([tmp_path / "runs"])
+
+
+@pytest.fixture
+def drawn(monkeypatch):
+    """What would have been written, by name."""
+    figures = {}
+    for module in (grids, lights_figure):
+        monkeypatch.setattr(module, "save_both", lambda _, name, figure: [figures.setdefault(name, figure)])
+    return figures
+
+
+def panels(figure, row):
+    return [axes for axes in figure.axes if axes.get_label() == f"{row}: panel"]
+
+
+def texts(figure):
+    return [text.get_text() for text in figure.texts] + [text.get_text() for axes in figure.axes for text in axes.texts]
+
+
+def change(path, **arrays):
+    """Replace arrays of an archive."""
+    with np.load(path) as file:
+        content = dict(file)
+    np.savez(path, **{**content, **arrays})
+
+
+def test_every_figure_is_a_pdf_and_a_png(tmp_path, results, monkeypatch):
+    monkeypatch.setattr(layout, "DPI", 60)  # for speed
+    told = []
+    paths = save_figures(tmp_path / "new", results, lambda *progress: told.append(progress))
+    names = ["renderings_simgeo_x4_box_1", "depth_simgeo_x4_box_1", "errors_simgeo_x4_box_1", "lights"]
+    assert [path.name for path in paths] == [f"{name}.{kind}" for name in names for kind in ("pdf", "png")]
+    assert sorted(tmp_path.joinpath("new").iterdir()) == sorted(paths)
+    assert told == [(number, 4, name) for number, name in enumerate(names)]
+    pdf = paths[0].read_bytes()
+    assert b"/CIDFontType2" in pdf  # TrueType, which keeps text selectable, and not outlines
+    assert b"/Type3" not in pdf
+    widths = {int(width) for width in re.findall(rb"/Width (\d+)", pdf)}
+    assert 24 in widths  # pictures with their own pixels
+    assert max(widths) == 24
+    if shutil.which("pdftotext"):
+        text = subprocess.run(["pdftotext", str(paths[0]), "-"], capture_output=True, text=True, check=True).stdout
+        assert {"Bicubic", "MSG-V", "DIP", "photo", "input", "truth", "one", "two"} <= set(text.split())
+
+
+def test_columns_are_photo_input_methods_in_the_paper_s_order_and_truth(results, drawn, tmp_path):
+    save_rendering_grids(tmp_path, results)
+    [figure] = drawn.values()
+    headings = ["photo", "input", "Bicubic", "DIP", "MSG-V", "truth"]
+    assert [text for text in texts(figure) if text in headings] == headings
+    assert len(panels(figure, "one")) == len(panels(figure, "two")) == 6
+
+
+def test_a_method_without_a_result_has_an_empty_panel_that_says_so(results, drawn, tmp_path):
+    save_rendering_grids(tmp_path, results)
+    figure = drawn["renderings_simgeo_x4_box_1"]
+    empty = [axes for axes in panels(figure, "two") if not axes.images]
+    assert [axes.texts[0].get_text() for axes in empty] == ["no result"]
+    assert all(axes.images for axes in panels(figure, "one"))
+
+
+def test_depth_has_the_same_limits_across_a_row_and_a_bar_with_them(results, drawn, tmp_path):
+    save_depth_grids(tmp_path, results)
+    [figure] = drawn.values()
+    for row in ("one", "two"):
+        images = [axes.images[0] for axes in panels(figure, row) if axes.images]
+        assert len({image.get_clim() for image in images if image.get_array().ndim == 2}) == 1
+        [bar] = [axes for axes in figure.axes if axes.get_label() == f"{row}: bar"]
+        assert bar.get_ylabel() == "depth, m"
+        assert bar.get_ylim() == images[-1].get_clim()
+    assert panels(figure, "one")[-1].images[0].get_clim() != panels(figure, "two")[-1].images[0].get_clim()
+
+
+@pytest.mark.parametrize(("error", "unit", "factor"), [(0.003, "mm", 1e3), (0.3, "cm", 1e2)])
+def test_errors_are_centred_at_zero_and_signed(tmp_path, make_run, drawn, error, unit, factor):
+    for name, sign in (("a", 1), ("b", -1)):
+        run = make_run(tmp_path / name, method=name, label=name, size=16, scenes=("one",))
+        scene = load_results([run]).runs[0].scene("one")
+        change(run / "predictions" / "one.npz", depth=(scene.depth + sign * error)[0].numpy())
+    save_error_grids(tmp_path, load_results([tmp_path]))
+    [figure] = drawn.values()
+    photo, *both = panels(figure, "one")
+    assert photo.images[0].get_array().ndim == 3
+    for axes, sign in zip(both, (1, -1), strict=True):
+        low, high = axes.images[0].get_clim()
+        assert -low == high == pytest.approx(factor * error, rel=1e-3)
+        np.testing.assert_allclose(axes.images[0].get_array(), sign * factor * error, rtol=1e-3)
+    red, _, blue = both[0].images[0].cmap(1.0)[:3]
+    assert red > 2 * blue
+    [bar] = [axes for axes in figure.axes if axes.get_label() == "one: bar"]
+    assert bar.get_ylabel() == f"result - truth, {unit}"
+
+
+def test_details_are_where_the_results_differ_most_from_the_truth():
+    truth = np.full((40, 60), 0.5)
+    results = [truth.copy(), truth.copy()]
+    results[0][8:16, 40:48] = 1.0
+    results[1][8:16, 40:48] = 0.1
+    results[0][24:32, 4:12] = 0.8  # the second most
+    results[1][0, 0] = np.nan
+    first, second = details_of(results, truth, 4)
+    assert first == Window(8, 40, 8, 8)
+    assert second == Window(24, 4, 8, 8)
+
+
+def test_without_a_truth_details_are_where_results_differ_from_each_other():
+    results = [np.full((40, 40), 0.5), np.full((40, 40), 0.5)]
+    results[0][16:24, 24:32] = 0.9
+    assert details_of(results, None, 1)[0] == Window(16, 24, 8, 8)
+    assert details_of([], None, 1) == []
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_strongest_window_is_the_one_that_a_search_of_all_finds(seed):
+    values = np.random.default_rng(seed).random((9, 11))
+    means = {(top, left): values[top : top + 3, left : left + 4].mean() for top in range(7) for left in range(8)}
+    first = strongest_window(values, 3, 4)
+    assert first[:2] == max(means, key=means.get)
+    clear = {at: mean for at, mean in means.items() if abs(at[0] - first.top) >= 3 or abs(at[1] - first.left) >= 4}
+    assert strongest_window(values, 3, 4, [first])[:2] == max(clear, key=clear.get)
+
+
+def test_there_may_be_no_room_for_a_window():
+    assert strongest_window(np.ones((3, 9)), 4, 2) is None
+    assert strongest_window(np.ones((5, 5)), 3, 3, [Window(1, 1, 3, 3)]) is None
+
+
+def test_details_and_their_frames_are_the_same_for_all_methods(results, drawn, tmp_path):
+    save_rendering_grids(tmp_path, results)
+    [figure] = drawn.values()
+    frames = [[patch.get_bbox().bounds for patch in axes.patches] for axes in panels(figure, "one")]
+    assert len(frames[0]) == 2
+    assert all(each == frames[0] for each in frames)
+    insets = [axes.images[0].get_array() for axes in figure.axes if axes.get_label() == "one: detail"]
+    assert len(insets) == 12
+    left, top, width, height = (round(value + 0.5) if at < 2 else int(value) for at, value in enumerate(frames[0][0]))
+    whole = panels(figure, "one")[-1].images[0].get_array()
+    np.testing.assert_array_equal(insets[-2], whole[top : top + height, left : left + width])
+
+
+def test_scores_are_in_thousandths_and_the_best_is_bold(results, drawn, tmp_path):
+    save_rendering_grids(tmp_path, results)
+    [figure] = drawn.values()
+    captions = [text for text in figure.texts if re.fullmatch(r"\d+ / \d+", text.get_text())]
+    assert len(captions) == 5
+    table = results.scores.query("scene == 'one' and metric == 'DSSIM_v' and variant == 'max'")
+    shown = [int(text.get_text().split(" / ")[0]) for text in captions[:3]]
+    assert shown == [round(1000 * value) for value in table["value"]]
+    assert [text.get_weight() == "bold" for text in captions[:3]] == [value == min(shown) for value in shown]
+
+
+def test_a_scene_that_no_run_keeps_is_left_out_with_a_note(results, drawn, tmp_path):
+    for path in (tmp_path / "runs").glob("*/scenes/two.npz"):
+        path.unlink()
+    notes = []
+    for save in TOGETHER:
+        save(tmp_path, results, notes=notes)
+    assert notes == ["no figures of two: no run keeps its photo and input"]
+    assert all(not panels(figure, "two") and panels(figure, "one") for figure in drawn.values())
+
+
+def test_results_that_cannot_be_drawn_are_left_out_with_a_note(results, drawn, tmp_path):
+    change(tmp_path / "runs" / "a" / "predictions" / "one.npz", depth=np.ones((7, 24)))
+    (tmp_path / "runs" / "b" / "predictions" / "one.npz").write_bytes(b"damaged")
+    notes = []
+    save_depth_grids(tmp_path, results, notes=notes)
+    assert len(notes) == 2
+    assert any("expected a result of the photo's 24 x 24 pixels, got 7 x 24" in note for note in notes)
+    assert any(str(tmp_path / "runs" / "b" / "predictions" / "one.npz") in note for note in notes)
+    assert sum(not axes.images for axes in panels(drawn["depth_simgeo_x4_box_1"], "one")) == 2
+
+
+def test_holes_have_their_colour_and_are_explained(results, drawn, tmp_path):
+    change(tmp_path / "runs" / "a" / "predictions" / "one.npz", depth=np.full((24, 24), np.nan))
+    for save in TOGETHER:
+        save(tmp_path, results)
+    assert len(drawn) == 3
+    for figure in drawn.values():
+        assert any(text.endswith("pink: holes") for text in texts(figure))
+    assert colours("gray")(np.ma.masked_invalid([np.nan]))[0][:3] == pytest.approx(
+        tuple(int(HOLE_COLOUR[at : at + 2], 16) / 255 for at in (1, 3, 5))
+    )
+
+
+def test_pages_have_five_scenes_and_problems_their_own_files(tmp_path, make_run, drawn):
+    make_run(tmp_path / "a", scenes=tuple(f"s{number}" for number in range(6)), size=8)
+    make_run(tmp_path / "b", dataset="other", scale=2, downsampling="box, noise 1 %", scenes=("s0",), size=8)
+    save_depth_grids(tmp_path, load_results([tmp_path]))
+    assert list(drawn) == ["depth_simgeo_x4_box_1", "depth_simgeo_x4_box_2", "depth_other_x2_box_noise_1_1"]
+    assert len(panels(drawn["depth_simgeo_x4_box_1"], "s4")) == 4
+    assert len(panels(drawn["depth_simgeo_x4_box_2"], "s5")) == 4
+
+
+def test_long_names_do_not_overlap_and_aspects_may_differ():
+    rng = np.random.default_rng(0)
+    labels = ["photo", *[f"A method with a long name, variant {number} (published)" for number in range(7)]]
+    rows = [
+        Row(
+            f"a rather long name of scene {number} in a set", h / w, [Cell(rng.random((h, w)), "123 / 45")] * 8, bar="m"
+        )
+        for number, (h, w) in enumerate([(10, 40), (30, 30), (60, 20)])
+    ]
+    figure = draw_grid(labels, rows, ("heading", "below"))
+    figure.canvas.draw()
+    boxes = [text.get_window_extent() for text in figure.texts]
+    for first, second in itertools.combinations(boxes, 2):
+        assert first.shrunk(0.98, 0.98).count_overlaps([second.shrunk(0.98, 0.98)]) == 0
+    assert all(box.x0 >= 0 and box.y0 >= 0 for box in boxes)
+    assert all(box.x1 <= figure.bbox.x1 and box.y1 <= figure.bbox.y1 for box in boxes)
+    for row, (h, w) in zip(rows, [(10, 40), (30, 30), (60, 20)], strict=True):
+        place = panels(figure, row.label)[0].get_window_extent()
+        assert place.height / place.width == pytest.approx(h / w, rel=1e-6)
+
+
+def test_an_unknown_light_is_refused(results, tmp_path):
+    with pytest.raises(ValueError, match="light: expected one of e1, e2, e3, e4, got 'e5'"):
+        save_rendering_grids(tmp_path, results, "e5")
+
+
+def test_the_sphere_s_normals_are_unit_vectors_that_face_the_camera():
+    x, y, z = sphere_normals(101)
+    known = z.isfinite()
+    assert known.double().mean() == pytest.approx(torch.pi / 4, rel=0.03)
+    torch.testing.assert_close((x**2 + y**2 + z**2)[known], torch.ones(int(known.sum()), dtype=torch.float64))
+    assert (z[known] <= 0).all()
+    assert x[50, 75] == pytest.approx(0.5)
+    assert y[75, 50] == pytest.approx(0.5)
+
+
+def test_the_figure_of_lights_shows_their_closed_form(drawn, tmp_path):
+    save_lights_figure(tmp_path)
+    [figure] = drawn.values()
+    size = 401
+    ramp = np.linspace(-1, 1, size)
+    y, x = np.meshgrid(ramp, ramp, indexing="ij")
+    inside = np.hypot(x, y) < 0.999
+    for number, light in enumerate(lights().numpy(), start=1):
+        [axes] = [axes for axes in figure.axes if axes.get_label() == f"sphere under e{number}"]
+        image = axes.images[0].get_array()
+        brightness = np.clip(light[0] * x - light[2] * np.sqrt(np.clip(1 - x**2 - y**2, 0, 1)) + light[1] * y, 0, 1)
+        np.testing.assert_allclose(image[inside], brightness[inside], atol=1e-9)
+        if number < 4:  # the arrow comes from where the light is
+            [arrow] = [text for text in axes.texts if text.arrow_patch is not None]
+            assert np.dot(arrow.xyann, light[:2]) > np.dot(arrow.xy, light[:2]) > 0
+
+
+def test_the_figure_of_lights_shows_a_truth_of_the_results(results, drawn, tmp_path):
+    save_lights_figure(tmp_path, results)
+    [figure] = drawn.values()
+    assert sum(axes.get_label().split(" ")[0] in ("one", "two") for axes in figure.axes) == 4

@@ -1,0 +1,210 @@
+"""Meshes of depth maps: planes stay whole however they slant, steps are cut, faces look at the camera."""
+
+import numpy as np
+import pytest
+import torch
+
+from dsr.geometry.camera import Camera
+from dsr.geometry.mesh import stride_for, triangulate, vertex_normals
+
+CAMERA = Camera(40, 30, 50, 50, 19.5, 14.5)
+
+
+def wall(z=2.0, camera=CAMERA):
+    return torch.full((1, camera.height, camera.width), float(z))
+
+
+def floor(camera, below=1.5):
+    """Return the depth of the plane y = below, of which the camera sees rows under its horizon alone."""
+    rows = torch.arange(camera.height, dtype=torch.float64) - camera.cy
+    return (below * camera.fy / torch.where(rows > 0, rows, torch.nan))[None, :, None].expand(1, -1, camera.width)
+
+
+def sphere(camera, distance=3.0, radius=1.0):
+    """Return the depth of a sphere on the optical axis, NaN around it."""
+    rays = camera.rays()
+    a, b = rays.square().sum(dim=0), distance
+    root = b * b - a * (distance**2 - radius**2)
+    return ((b - torch.where(root >= 0, root, torch.nan).sqrt()) / a)[None]
+
+
+def squares(camera=CAMERA):
+    return (camera.width - 1) * (camera.height - 1)
+
+
+def face_normals(mesh):
+    corners = mesh.vertices[mesh.faces].astype(np.float64)
+    return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), corners.mean(axis=1)
+
+
+def spans(mesh, depth):
+    """Return the largest relative range of depth within a face."""
+    z = mesh.vertices[mesh.faces][..., 2]
+    return (z.max(axis=1) / z.min(axis=1)).max() - 1
+
+
+def test_a_wall_is_two_triangles_per_square_and_its_area_that_of_the_wall():
+    mesh = triangulate(wall(), CAMERA)
+    assert len(mesh.vertices) == 40 * 30
+    assert len(mesh.faces) == 2 * squares()
+    assert mesh.faces.dtype == np.int32
+    areas = np.linalg.norm(face_normals(mesh)[0], axis=1) / 2
+    assert areas.sum() == pytest.approx(39 * 29 * (2 / 50) ** 2)
+
+
+def test_vertices_are_the_back_projected_pixels():
+    depth = wall() + 0.01 * torch.arange(1200).view(1, 30, 40)
+    mesh = triangulate(depth, CAMERA, largest_step=9)
+    points = (CAMERA.rays() * depth).flatten(1).T.numpy()
+    np.testing.assert_allclose(mesh.vertices, points[mesh.pixels], rtol=1e-6)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_faces_and_vertex_normals_look_at_the_camera(seed):
+    depth = 2 + 0.02 * torch.rand(1, 30, 40, generator=torch.Generator().manual_seed(seed))
+    depth[0, 5:8, 5:8] = torch.nan
+    mesh = triangulate(depth, CAMERA, largest_step=0.5)
+    normals, centres = face_normals(mesh)
+    assert ((normals * centres).sum(axis=1) < 0).all()
+    assert ((vertex_normals(mesh) * mesh.vertices).sum(axis=1) < 0).all()
+
+
+def test_a_floor_stays_whole_up_to_the_row_below_the_horizon():
+    camera = Camera(20, 120, 400, 400, 9.5, 14.5)
+    depth = floor(camera)
+    assert float(depth[0, 15, 0] / depth[0, 16, 0]) == pytest.approx(3)  # the change that must not be cut
+    mesh = triangulate(depth, camera)
+    assert len(mesh.faces) == 2 * 19 * (120 - 15 - 1)
+
+
+@pytest.mark.parametrize("slope", [(0.9, 0.0), (0.0, -0.9), (0.6, 0.6)])
+def test_a_slanted_plane_stays_whole(slope):
+    x, y, _ = CAMERA.rays()
+    mesh = triangulate((1 / (1 + slope[0] * x + slope[1] * y))[None], CAMERA, largest_step=1e-6)
+    assert len(mesh.faces) == 2 * squares()
+
+
+def test_a_fold_between_two_planes_stays_whole():
+    x = CAMERA.rays()[:1]
+    mesh = triangulate(1 / (0.5 + 1.5 * x.abs()), CAMERA)
+    assert len(mesh.faces) == 2 * squares()
+
+
+def test_a_sphere_loses_nothing_but_the_last_two_pixels_of_its_rim():
+    camera = Camera(200, 200, 250, 250, 99.5, 99.5)
+    depth = sphere(camera)
+    mesh = triangulate(depth, camera)
+    rim = 250 / 8**0.5  # pixels from the centre: the tangent has the sine 1 / 3
+    radius = np.hypot(mesh.pixels % 200 - 99.5, mesh.pixels // 200 - 99.5)
+    within = (radius[mesh.faces] < rim - 2).all(axis=1).sum()
+    rows, columns = np.mgrid[:200, :200] - 99.5
+    square = np.hypot(rows, columns) < rim - 2
+    corners = [square[:-1, :-1], square[:-1, 1:], square[1:, :-1], square[1:, 1:]]
+    assert within >= 2 * np.logical_and.reduce(corners).sum()
+    normals = mesh.vertices - np.array([0, 0, 3])  # of a unit sphere
+    inside = np.linalg.norm(mesh.vertices[:, :2], axis=1) < 0.8
+    assert ((vertex_normals(mesh) * normals).sum(axis=1)[inside] > 0.999).all()
+
+
+@pytest.mark.parametrize("transposed", [False, True])
+@pytest.mark.parametrize(("step", "cut"), [(1.03, True), (1.01, False)])
+def test_a_step_of_three_percent_between_planes_is_cut_and_one_of_one_percent_is_not(step, cut, transposed):
+    camera = Camera(30, 30, 50, 50, 14.5, 14.5)
+    depth = wall(camera=camera)
+    depth[0, :, 15:] *= step
+    mesh = triangulate(depth.mT if transposed else depth, camera)
+    assert len(mesh.faces) == 2 * 29 * (28 if cut else 29)
+    assert (spans(mesh, depth) < 1e-6) == cut
+
+
+def test_a_step_on_a_floor_is_cut():
+    camera = Camera(20, 120, 400, 400, 9.5, 14.5)
+    depth = floor(camera).clone()
+    depth[0, 60:, 10:] /= 1.2  # a box on the floor
+    mesh = triangulate(depth, camera)
+    columns = mesh.pixels[mesh.faces] % 20
+    rows = mesh.pixels[mesh.faces] // 20
+    across = (columns.min(axis=1) == 9) & (columns.max(axis=1) == 10)
+    assert not (across & (rows.min(axis=1) >= 60)).any()
+    assert across.sum() == 2 * (60 - 15) - 1  # one more is cut at the box's corner
+
+
+def test_a_step_smeared_over_three_pixels_leaves_no_rubber_sheet():
+    depth = wall()
+    depth[0, :, 18:20] = torch.tensor([2.35, 2.7])
+    depth[0, :, 20:] = 3
+    mesh = triangulate(depth, CAMERA)
+    assert spans(mesh, depth) < 1e-6
+    assert set(np.unique(mesh.vertices[:, 2])) == {2.0, 3.0}
+
+
+def test_a_pole_of_one_pixel_is_cut_free_and_dropped():
+    depth = wall()
+    depth[0, :, 20] = 1.5
+    mesh = triangulate(depth, CAMERA)
+    assert (mesh.vertices[:, 2] == 2).all()
+    assert len(mesh.faces) == 2 * 29 * 37
+
+
+def test_isolated_pixels_are_dropped_unless_wanted():
+    depth = torch.full((1, 30, 40), torch.nan)
+    depth[0, 3, 4] = 2
+    depth[0, 10:12, 10:12] = 2
+    assert len(triangulate(depth, CAMERA).vertices) == 4
+    mesh = triangulate(depth, CAMERA, isolated=True)
+    assert mesh.pixels.tolist() == [3 * 40 + 4, 410, 411, 450, 451]
+    towards = -mesh.vertices[0] / np.linalg.norm(mesh.vertices[0])
+    np.testing.assert_allclose(vertex_normals(mesh)[0], towards, rtol=1e-6)
+
+
+def test_three_known_pixels_of_a_square_make_a_triangle():
+    for hole in ((0, 0), (0, 1), (1, 0), (1, 1)):
+        depth = torch.full((1, 2, 2), 2.0)
+        depth[0, *hole] = torch.nan
+        mesh = triangulate(depth, Camera(2, 2, 5, 5, 0.5, 0.5))
+        assert mesh.faces.tolist() in ([[0, 1, 2]], [[1, 2, 0]], [[2, 0, 1]], [[0, 2, 1]], [[1, 0, 2]], [[2, 1, 0]])
+        assert face_normals(mesh)[0][0, 2] < 0
+
+
+def test_the_diagonal_follows_the_smaller_change_of_depth():
+    depth = torch.tensor([[[2.0, 2.5], [2.2, 2.0]]])
+    mesh = triangulate(depth, Camera(2, 2, 5, 5, 0.5, 0.5), largest_step=9)
+    assert all({0, 3} <= set(face) for face in mesh.faces.tolist())
+    mesh = triangulate(depth.flip(-1), Camera(2, 2, 5, 5, 0.5, 0.5), largest_step=9)
+    assert all({1, 2} <= set(face) for face in mesh.faces.tolist())
+
+
+@pytest.mark.parametrize("most", [1200, 1199, 300, 100, 7, 1])
+def test_a_large_map_is_thinned_to_the_most_that_is_wanted(most):
+    mesh = triangulate(wall(), CAMERA, most=most, isolated=True)
+    stride = stride_for(wall(), most)
+    assert len(mesh.vertices) <= most
+    assert len(mesh.vertices) == len(range(0, 30, stride)) * len(range(0, 40, stride))
+    finer = len(range(0, 30, stride - 1)) * len(range(0, 40, stride - 1)) if stride > 1 else most + 1
+    assert finer > most
+    points = (CAMERA.rays() * 2).flatten(1).T.numpy()
+    np.testing.assert_allclose(mesh.vertices, points[mesh.pixels], rtol=1e-6, atol=1e-7)
+
+
+def test_only_holes_give_an_empty_mesh():
+    mesh = triangulate(wall(torch.nan), CAMERA)
+    assert mesh.vertices.shape == (0, 3)
+    assert mesh.faces.shape == (0, 3)
+
+
+@pytest.mark.parametrize("size", [(1, 5), (5, 1), (1, 1), (2, 3)])
+def test_a_tiny_map_is_no_error(size):
+    height, width = size
+    camera = Camera(width, height, 5, 5, 0, 0)
+    assert len(triangulate(wall(camera=camera), camera).faces) == 2 * (height - 1) * (width - 1)
+
+
+@pytest.mark.parametrize("values", [{"largest_step": 0}, {"largest_step": float("nan")}, {"most": 0}])
+def test_a_number_that_is_not_positive_is_refused(values):
+    with pytest.raises(ValueError, match="expected a positive step and number of vertices"):
+        triangulate(wall(), CAMERA, **values)
+
+
+def test_a_map_of_another_size_is_refused():
+    with pytest.raises(ValueError, match=r"depth: expected shape \(1, 30, 40\), got \(1, 3, 4\)"):
+        triangulate(torch.ones(1, 3, 4), CAMERA)

@@ -1,0 +1,280 @@
+"""The page of a report: what it holds of scores and pictures, and that it holds nothing else."""
+
+import base64
+import dataclasses
+import json
+import math
+import re
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from dsr.geometry.shading import render
+from dsr.report.page import save_page
+from dsr.report.page.encoding import LEVELS, Pool, depth_picture, error_picture, mask_picture, shading_picture
+from dsr.report.pictures import normals_seen_by
+from dsr.report.results import Results, load_results
+
+SPITEFUL = "<img src=x onerror=alert(1)>\"'&</script><script>alert(2)</script>"
+
+
+def blocks(path):
+    """Return the page's blocks of data by name."""
+    text = path.read_text(encoding="utf-8")
+    return dict(re.findall(r'<script type="[a-z/]+" id="(\w+)">(.*?)</script>', text, flags=re.DOTALL))
+
+
+def picture(content, name):
+    """Return a stored picture; grey ones as (H, W)."""
+    image = cv2.imdecode(np.frombuffer(base64.b64decode(content[name]), np.uint8), cv2.IMREAD_COLOR)
+    return image[..., 0]
+
+
+def shadings(content, surface):
+    """Return e1, e2, e3 as the page holds them, (3, H, W) in [-1, 1]."""
+    width, height = surface["size"]
+    tiles = picture(content, surface["normals"]).astype(float) / 127.5 - 1
+    return tiles.reshape(height, 3, width).transpose(1, 0, 2)
+
+
+def saved(folder, results, **options):
+    """Write the page and return its blocks, the data and the first scene."""
+    path = folder / "report" / "index.html"
+    save_page(path, results, **options)
+    content = blocks(path)
+    return content, json.loads(content["data"]), json.loads(content["s0"]) if "s0" in content else None
+
+
+def changed(run, **predictions):
+    """Return a run with other predictions or scenes, which lie in no file."""
+    run = dataclasses.replace(run)
+    for name, value in predictions.items():
+        object.__setattr__(run, name, value)
+    return run
+
+
+def test_the_renderings_that_the_page_computes_are_those_of_the_protocol_to_a_grey_level(make_run, tmp_path):
+    results = load_results([make_run(tmp_path / "run")])
+    content, _, scene = saved(tmp_path, results)
+    run = results.runs[0]
+    stored = run.scene("cube_no_texture")
+    depths = {"Bicubic": run.prediction("cube_no_texture"), "truth": stored.depth}
+    for surface in scene["surfaces"][1:]:
+        expected = render(normals_seen_by(stored.camera, depths[surface["label"]]))[0].numpy()
+        e1, e2, e3 = shadings(content, surface)
+        found = np.stack([e1, e2, e3, (e1 + e2 + e3) / math.sqrt(3)]).clip(0, 1)
+        assert np.abs(found[:3] - expected[:3]).max() <= 1.001 / 255
+        assert np.abs(found[3] - expected[3]).max() <= math.sqrt(3) * 1.001 / 255
+
+
+def test_the_input_is_shown_at_its_own_size_seen_by_its_own_camera(make_run, tmp_path):
+    results = load_results([make_run(tmp_path / "run")])
+    content, _, scene = saved(tmp_path, results)
+    stored = results.runs[0].scene("cube_no_texture")
+    surface = scene["surfaces"][0]
+    assert (surface["kind"], surface["size"]) == ("input", [8, 8])
+    expected = render(normals_seen_by(stored.camera_lr, stored.coarse))[0, 0].numpy()
+    assert np.abs(shadings(content, surface)[0].clip(0, 1) - expected).max() <= 1.001 / 255
+
+
+def test_stored_errors_are_result_minus_truth_within_a_hundredth_of_the_largest(make_run, tmp_path):
+    results = load_results([make_run(tmp_path / "run")])
+    content, _, scene = saved(tmp_path, results)
+    run = results.runs[0]
+    expected = (run.prediction("cube_no_texture") - run.scene("cube_no_texture").depth)[0].numpy()
+    largest = scene["error"]["largest"]
+    levels = picture(content, scene["surfaces"][1]["error"]["values"]).astype(float) - 128
+    found = np.sign(levels) * levels**2 / 127**2 * largest
+    assert np.abs(found - expected.clip(-largest, largest)).max() <= 0.01 * largest
+    assert largest == pytest.approx(np.percentile(np.abs(expected), 99.9))
+
+
+@pytest.mark.parametrize(("error", "level"), [(0, 128), (2, 255), (-2, 1), (9, 255), (0.5, 192), (-0.5, 64)])
+def test_an_error_is_stored_by_the_root_of_its_share_of_the_largest(error, level):
+    assert error_picture(np.array([[float(error)]]), 2.0)[0, 0] == pytest.approx(level, abs=1)
+
+
+def test_depth_is_stored_between_its_limits():
+    assert depth_picture(np.array([[0.5, 1, 2, 3, 9.0]]), 1, 3).tolist() == [[0, 0, 128, 255, 255]]
+
+
+def test_shadings_of_minus_one_nought_and_one_are_stored_side_by_side():
+    assert shading_picture(np.array([[[-1.0, 0.0, 1.0]]])).tolist() == [[0, 128, 255]]
+
+
+def test_a_mask_tells_a_hole_from_a_depth_without_a_normal():
+    depth, normal = np.array([[False, True, True]]), np.array([[False, False, True]])
+    assert mask_picture(depth, normal).tolist() == [[0, 128, 255]]
+    assert mask_picture(normal | True, normal | True) is None
+
+
+def test_holes_of_a_result_are_masked_and_those_around_them_have_no_normal(make_run, tmp_path):
+    [run] = load_results([make_run(tmp_path / "run")]).runs
+    depth = run.prediction("cube_no_texture").clone()
+    depth[0, 10, 20] = torch.nan
+    content, _, scene = saved(tmp_path, Results((changed(run, prediction=lambda _: depth),)))
+    mask = picture(content, scene["surfaces"][1]["mask"])
+    assert {tuple(place) for place in np.argwhere(mask != 255)} == {(10, 20), (10, 19), (9, 20)}
+    assert mask[10, 20] == 0
+    assert mask[9, 20] == mask[10, 19] == 128
+    assert picture(content, scene["surfaces"][1]["error"]["mask"])[10, 20] == 0
+    assert "mask" not in scene["surfaces"][2]
+
+
+def test_the_limits_of_errors_and_depth_are_the_same_for_all_methods(make_run, tmp_path):
+    runs = [make_run(tmp_path / "runs" / name, method=name, label=name) for name in ("a", "b")]
+    _, _, scene = saved(tmp_path, load_results(runs))
+    assert [surface["label"] for surface in scene["surfaces"]] == ["input", "a", "b", "truth"]
+    assert scene["error"]["limit"] <= scene["error"]["largest"]
+    assert not any("limit" in surface["error"] for surface in scene["surfaces"][1:3])
+
+
+def test_a_photo_and_a_truth_of_several_methods_and_seeds_are_stored_once(make_run, tmp_path):
+    one = saved(tmp_path / "one", load_results([make_run(tmp_path / "runs" / "a", scale=2)]))[0]
+    make_run(tmp_path / "runs" / "b", scale=4)
+    two = saved(tmp_path / "two", load_results([tmp_path / "runs"]))[0]
+    shared = {name for name in one if name.startswith("p")} & set(two)
+    assert len(shared) == len([name for name in one if name.startswith("p")])
+    scenes = [json.loads(two[name]) for name in ("s0", "s1")]
+    assert scenes[0]["photo"] == scenes[1]["photo"]
+    assert scenes[0]["surfaces"][-1]["normals"] == scenes[1]["surfaces"][-1]["normals"]
+
+
+def test_pictures_above_the_budget_are_compressed_and_reduced_and_the_page_says_so(make_run, tmp_path):
+    results = load_results([make_run(tmp_path / "run", size=208)])
+    notes = save_page(tmp_path / "small.html", results, budget_mb=0.02)
+    assert notes[0].startswith("pictures: compressed with losses (WebP, quality 75), reduced to 192 pixels at most")
+    assert notes[0] in json.loads(blocks(tmp_path / "small.html")["data"])["notes"]
+    assert save_page(tmp_path / "large.html", results)[0].startswith("pictures: lossless, 8 bits;")
+    assert (tmp_path / "small.html").stat().st_size < (tmp_path / "large.html").stat().st_size
+
+
+def test_reduced_values_are_averages_of_what_is_known():
+    pool = Pool(dataclasses.replace(LEVELS[0], longest=2))
+    values = np.array([[1.0, 3, 5, np.nan], [1, 3, 7, 9], [np.nan, np.nan, 2, 2], [np.nan, 4, 2, 2]])
+    reduced, known = pool.fitted(values)
+    assert pool.reduced
+    assert reduced[known].tolist() == [2, 7, 2]
+    assert known.tolist() == [[True, True], [False, True]]
+
+
+@pytest.mark.parametrize("budget", [0, -1, math.nan])
+def test_a_budget_that_is_not_positive_is_refused(make_run, tmp_path, budget):
+    with pytest.raises(ValueError, match="budget_mb: expected a positive number"):
+        save_page(tmp_path / "index.html", load_results([make_run(tmp_path / "run")]), budget_mb=budget)
+
+
+def test_of_several_seeds_the_page_has_mean_and_standard_deviation(make_run, tmp_path):
+    scenes = ("cube_no_texture", "statue")
+    for seed in range(3):
+        make_run(tmp_path / "runs" / str(seed), seed=seed, scenes=scenes)
+    results = load_results([tmp_path / "runs"])
+    _, data, scene = saved(tmp_path, results)
+    [problem] = data["problems"]
+    table = results.scores[results.scores["metric"] == "RMSE_d"]
+    own = table[table["scene"] == "statue"]["value"] * 1000
+    [row] = [row for row in problem["rows"] if row["scene"] == "statue"]
+    assert row["values"]["RMSE_d"] == pytest.approx([own.mean(), own.std()])
+    averages = table.groupby("seed")["value"].mean() * 1000
+    assert problem["means"][0]["values"]["RMSE_d"] == pytest.approx([averages.mean(), averages.std()])
+    assert problem["means"][0]["seeds"] == 3
+    assert [surface["text"] for surface in scene["surfaces"] if surface["kind"] == "method"] == ["seed 0"]
+
+
+def test_a_mean_over_fewer_scenes_than_others_have_says_over_how_many(make_run, tmp_path):
+    make_run(tmp_path / "runs" / "all", scenes=("a", "b"))
+    make_run(tmp_path / "runs" / "part", method="mine", label="Mine", scenes=("a",))
+    _, data, _ = saved(tmp_path, load_results([tmp_path / "runs"]))
+    counts = {row["method"]: row["counts"] for row in data["problems"][0]["means"]}
+    assert counts["Bicubic"] == {}
+    assert counts["Mine"]["RMSE_d"] == 1
+
+
+def test_published_values_stand_with_scenes_of_the_paper_and_those_re_created_are_starred(make_run, tmp_path):
+    make_run(tmp_path / "runs" / "a", scenes=("cube_no_texture",))
+    make_run(tmp_path / "runs" / "b", scenes=("lucy", "mine"), dataset="folder")
+    _, data, _ = saved(tmp_path, load_results([tmp_path / "runs"]))
+    rows = {row["scene"]: row for problem in data["problems"] for row in problem["rows"]}
+    assert rows["lucy"]["paper"]["RMSE_d"] == 72
+    assert not rows["lucy"]["starred"]
+    assert rows["cube_no_texture"]["starred"]
+    assert rows["mine"]["paper"] == {}
+
+
+def test_a_run_without_stored_scenes_shows_its_tables_and_says_why_no_pictures(make_run, tmp_path):
+    folder = make_run(tmp_path / "run")
+    (folder / "scenes" / "cube_no_texture.npz").unlink()
+    content, data, scene = saved(tmp_path, load_results([folder]))
+    assert scene is None
+    assert data["scenes"] == []
+    assert data["problems"][0]["rows"]
+    assert any("cube_no_texture: no pictures" in note for note in data["notes"])
+    assert not any(name.startswith("p") for name in content)
+
+
+def test_a_damaged_prediction_is_left_out_and_named(make_run, tmp_path):
+    runs = [make_run(tmp_path / name, method=name, label=name) for name in ("a", "b")]
+    results = load_results(runs)
+    (runs[1] / "predictions" / "cube_no_texture.npz").write_bytes(b"PK")
+    _, data, scene = saved(tmp_path, results)
+    assert [surface["label"] for surface in scene["surfaces"]] == ["input", "a", "truth"]
+    assert any("expected a prediction" in note for note in data["notes"])
+
+
+def test_without_a_truth_there_are_renderings_and_no_errors(make_run, tmp_path):
+    [run] = load_results([make_run(tmp_path / "run")]).runs
+    stored = dataclasses.replace(run.scene("cube_no_texture"), depth=None)
+    _, _, scene = saved(tmp_path, Results((changed(run, scene=lambda _: stored),)))
+    assert [surface["kind"] for surface in scene["surfaces"]] == ["input", "method"]
+    assert "error" not in scene
+    assert "error" not in scene["surfaces"][1]
+
+
+def test_names_with_tags_in_them_end_no_block_and_begin_no_element(make_run, tmp_path):
+    [run] = load_results([make_run(tmp_path / "run")]).runs
+    spiteful = dataclasses.replace(run, label=SPITEFUL, dataset=SPITEFUL)
+    path = tmp_path / "index.html"
+    save_page(path, Results((spiteful,), (SPITEFUL,)), title=SPITEFUL)
+    text = path.read_text(encoding="utf-8")
+    assert "<img" not in text
+    assert "alert(2)</script>" not in text
+    assert json.loads(blocks(path)["data"])["methods"] == [SPITEFUL]
+
+
+def test_links_lead_to_the_files_that_lie_beside_the_page(make_run, tmp_path):
+    report = tmp_path / "report"
+    for name in ("tables/all 1.csv", "tables/all.tex", "figures/x.pdf", "figures/x.log", "other/y.csv"):
+        (report / name).parent.mkdir(parents=True, exist_ok=True)
+        (report / name).touch()
+    results = load_results([make_run(tmp_path / "run")])
+    _, data, _ = saved(tmp_path, results)
+    assert [link["address"] for link in data["links"]] == ["tables/all%201.csv", "tables/all.tex", "figures/x.pdf"]
+    _, data, _ = saved(tmp_path, results, tables=[report / "other" / "y.csv", report / "absent.csv"])
+    assert [link["name"] for link in data["links"]] == ["other/y.csv", "figures/x.pdf"]
+
+
+def test_progress_is_told_and_an_interrupted_page_leaves_the_old_one_as_it_was(make_run, tmp_path):
+    results = load_results([make_run(tmp_path / "run", scenes=("a", "b", "c"))])
+    seen = []
+    path = tmp_path / "report" / "index.html"
+    save_page(path, results, progress=lambda done, total: seen.append((done, total)))
+    assert seen == [(1, 3), (2, 3), (3, 3)]
+    before = path.read_bytes()
+
+    def interrupt(_done, _total):
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        save_page(path, results, progress=interrupt)
+    assert path.read_bytes() == before
+    assert [file.name for file in path.parent.iterdir()] == ["index.html"]
+
+
+def test_settings_times_and_environment_are_there_by_dotted_key(make_run, tmp_path):
+    _, data, _ = saved(tmp_path, load_results([make_run(tmp_path / "run")]))
+    [run] = data["runs"]
+    assert run["settings"]["method.name"] == "bicubic"
+    assert run["versions"]["packages.dsr"] == "0.1.0"
+    assert data["problems"][0]["seconds"] == {"Bicubic": {"cube_no_texture": 0.25}}
