@@ -153,8 +153,8 @@ def test_some_runs_can_be_chosen_and_what_is_not_there_is_refused(make_run, tmp_
     for label, scale in (("Bicubic", 4), ("MSG", 4), ("MSG", 2)):
         make_run(tmp_path / f"{label}{scale}", label=label, method=label, scale=scale, scenes=("s",))
     results = load_results([tmp_path])
-    assert [(run.label, run.scale) for run in results.only(label=["MSG"], scale=[]).runs] == [("MSG", 2), ("MSG", 4)]
-    with pytest.raises(ValueError, match="label: expected one of MSG, Bicubic, got DIP"):
-        results.only(label=["DIP"])
+    assert [(run.label, run.scale) for run in results.only(["MSG"], scales=[]).runs] == [("MSG", 2), ("MSG", 4)]
+    with pytest.raises(ValueError, match="methods: expected some of MSG, Bicubic, got DIP"):
+        results.only(["DIP"])
     with pytest.raises(ValueError, match="there is none"):
-        results.only(label=["Bicubic"], scale=[2])
+        results.only(["Bicubic"], scales=[2])

@@ -75,7 +75,7 @@ def make_report(runs: Sequence[Path], output: Path, study: Path | None, wanted: 
     """
     _check(output, wanted)
     results = load_results(runs)
-    results = results.only(label=wanted.methods, dataset=wanted.datasets, scale=wanted.scales)
+    results = results.only(wanted.methods, wanted.datasets, wanted.scales)
     answers = None if study is None else read_study(study)
     output.parent.mkdir(parents=True, exist_ok=True)
     temporary = Path(tempfile.mkdtemp(prefix=f".{output.name}-", dir=output.parent))

@@ -122,24 +122,23 @@ class Results:
         """Return what was evaluated, in order."""
         return list(dict.fromkeys(run.problem for run in self.runs))
 
-    def only(self, **wanted: Sequence[Any]) -> Results:
-        """Return the runs of some labels, data sets or scales: ``only(label=["MSG-V"], scale=[4, 8])``.
-
-        An empty choice is no choice.
+    def only(self, methods: Sequence[str] = (), datasets: Sequence[str] = (), scales: Sequence[int] = ()) -> Results:
+        """Return the runs of some methods (by label), data sets and scales; an empty choice is no choice.
 
         Raises:
             ValueError: there is none of a wanted value, or none of all together.
 
         """
         runs = self.runs
-        for name, values in wanted.items():
-            there = list(dict.fromkeys(getattr(run, name) for run in self.runs))
-            for value in values:
+        for name, field, wanted in (("methods", "label", methods), ("datasets", "dataset", datasets),
+                                    ("scales", "scale", scales)):  # fmt: skip
+            there = list(dict.fromkeys(getattr(run, field) for run in self.runs))
+            for value in wanted:
                 if value not in there:
-                    raise ValueError(f"{name}: expected one of {', '.join(map(str, there))}, got {value}")
-            runs = tuple(run for run in runs if not values or getattr(run, name) in values)
+                    raise ValueError(f"{name}: expected some of {', '.join(map(str, there))}, got {value}")
+            runs = tuple(run for run in runs if not wanted or getattr(run, field) in wanted)
         if not runs:
-            raise ValueError(f"expected a run with {', '.join(map(str, wanted))} as wanted, there is none")
+            raise ValueError("methods, datasets, scales: expected a run that fits all of them, there is none")
         return Results(runs, self.notes)
 
 

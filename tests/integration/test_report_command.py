@@ -1,0 +1,127 @@
+"""``dsr report``: what it writes, what it replaces, and what it refuses."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pandas as pd
+import pytest
+
+from dsr.app import report
+from dsr.cli import main
+
+SCENES = ("cube_high_freq", "statue")
+
+
+@pytest.fixture
+def runs(make_run: Callable[..., Path], tmp_path: Path) -> Path:
+    """Two methods on two scenes."""
+    for label in ("Bicubic", "MSG-V"):
+        make_run(tmp_path / "runs" / label, label=label, method=label.lower(), scenes=SCENES)
+    return tmp_path / "runs"
+
+
+def refused(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
+    """Return the one line of a command that is refused."""
+    assert main([str(argument) for argument in arguments]) == 2
+    [line] = capsys.readouterr().err.splitlines()
+    assert line.startswith("error: ")
+    return line.removeprefix("error: ")
+
+
+def test_a_report_has_tables_figures_the_metric_study_and_a_page(runs: Path, tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "dsr.cli", "report", str(runs), "-o", "report", "--title", "Ours"]
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
+    folder = tmp_path / "report"
+    for name in (
+        *("tables/all.md", "tables/all.tex", "tables/simgeo_x4_box.csv", "figures/lights.pdf"),
+        *("figures/renderings_simgeo_x4_box_1.pdf", "figures/errors_simgeo_x4_box_1.png"),
+        *("metrics/pearson.csv", "metrics/scatter_matrix.pdf"),
+    ):
+        assert (folder / name).stat().st_size > 100, name
+    page = (folder / "index.html").read_text(encoding="utf-8")
+    assert "<title>Ours</title>" in page
+    assert "tables/simgeo_x4_box.csv" in page
+    assert "figures/lights.pdf" in page
+    assert "Bicubic" in (folder / "tables" / "all.md").read_text(encoding="utf-8")
+    assert json.loads((folder / "report.json").read_text())["runs"] == [str(runs / "Bicubic"), str(runs / "MSG-V")]
+    assert "report/index.html" in done.stdout
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["report", "runs"]
+
+
+def test_a_report_replaces_an_earlier_one_whole(runs: Path, tmp_path: Path) -> None:
+    output = tmp_path / "report"
+    arguments = ["report", str(runs), "-o", str(output), "--only", "tables"]
+    assert main(arguments) == 0
+    assert "Bicubic" in (output / "tables" / "all.md").read_text(encoding="utf-8")
+    assert main([*arguments, "--methods", "MSG-V"]) == 0
+    assert "Bicubic |" not in (output / "tables" / "all.md").read_text(encoding="utf-8")
+    assert not (output / "index.html").exists()
+
+
+def test_an_interrupted_report_leaves_the_earlier_one_as_it_was(
+    runs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    output = tmp_path / "report"
+    assert main(["report", str(runs), "-o", str(output), "--only", "tables"]) == 0
+    before = {path: path.read_bytes() for path in output.rglob("*") if path.is_file()}
+
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(report, "write_correlations", interrupt)
+    assert main(["report", str(runs), "-o", str(output), "--only", "tables,metrics"]) == 130
+    assert {path: path.read_bytes() for path in output.rglob("*") if path.is_file()} == before
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["report", "runs"]
+
+
+def test_a_directory_of_something_else_is_refused_and_kept(
+    runs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "thesis.tex").write_text("years of work")
+    assert "it holds something else" in refused(capsys, "report", runs, "-o", tmp_path / "mine")
+    assert (tmp_path / "mine" / "thesis.tex").read_text() == "years of work"
+
+
+def test_a_user_study_joins_the_tables(runs: Path, tmp_path: Path) -> None:
+    shares = {"user_first": 75.0, "user_second": 25.0, "user_top2": 100.0}
+    ends = {f"{name}_{end}": value for name in shares for end, value in (("low", 40.0), ("high", 99.0))}
+    place = {"dataset": "simgeo", "scene": "statue", "scale": 4, "downsampling": "box"}
+    row = {**place, "method": "msg-v", "label": "MSG-V", **shares, "n": 20, **ends}
+    pd.DataFrame([row]).to_csv(tmp_path / "study.csv", index=False)
+    arguments = ["report", str(runs), "-o", str(tmp_path / "report"), "--only", "tables"]
+    assert main([*arguments, "--study", str(tmp_path / "study.csv")]) == 0
+    text = (tmp_path / "report" / "tables" / "simgeo_x4_box.md").read_text(encoding="utf-8")
+    assert "User 1st" in text
+    assert "75" in text
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--methods", "DIP"], "methods: expected some of Bicubic, MSG-V, got DIP"),
+        (["--scales", "x4"], "--scales: expected whole numbers such as 4,8, got 'x4'"),
+        (["--scales", "8"], "scales: expected some of 4, got 8"),
+        (["--only", "tables,graphs"], "--only: expected some of tables, metrics, figures, page, got graphs"),
+        (["--light", "e5"], "--light: expected one of e1, e2, e3, e4, got e5"),
+        (["--page-mb", "0"], "--page-mb: expected a positive number, got 0"),
+        (["--study", "absent.csv"], "absent.csv: "),
+    ],
+)
+def test_a_wrong_choice_is_one_line_and_nothing_is_written(
+    runs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], arguments: list[str], message: str
+) -> None:
+    assert refused(capsys, "report", runs, "-o", tmp_path / "report", *arguments).startswith(message)
+    assert not (tmp_path / "report").exists()
+
+
+def test_a_directory_without_runs_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert "expected runs of eval.py" in refused(capsys, "report", tmp_path, "-o", tmp_path / "report")
