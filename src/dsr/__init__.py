@@ -1,3 +1,33 @@
-"""Guided depth super-resolution, trained, run and judged by how the surface looks."""
+"""Guided depth super-resolution, trained, run and judged by how the surface looks.
+
+>>> import dsr
+>>> camera = dsr.Camera(width=640, height=480, fx=525.0, fy=525.0, cx=319.5, cy=239.5)
+
+and ``dsr.upsample(photo, depth, camera)``, see :func:`dsr.upsampling.people.upsample`.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from dsr.geometry.camera import Camera
+    from dsr.upsampling.people import upsample
 
 __version__ = "0.1.0"
+__all__ = ["Camera", "__version__", "upsample"]
+
+_HOMES = {"Camera": "dsr.geometry.camera", "upsample": "dsr.upsampling.people"}
+
+
+def __getattr__(name: str) -> Any:
+    """Import what is asked for: ``import dsr`` alone loads nothing heavy."""
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(importlib.import_module(_HOMES[name]), name)
+
+
+def __dir__() -> list[str]:
+    """List the names that are imported when asked for, too."""
+    return sorted({*globals(), *__all__})

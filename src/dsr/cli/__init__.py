@@ -7,21 +7,23 @@ from collections.abc import Mapping, Sequence
 
 from rich.console import Console
 
-from dsr.cli import data, doctor
+from dsr.cli import data, doctor, report, study, upsample
 from dsr.fetching.catalogue import CATALOGUE, Collection
 from dsr.terminal import INTERRUPTED, USAGE_ERROR, one_line, open_console, print_error, show
 
 _EXAMPLES = """\
 examples:
-  dsr data list                         what there is, and what of it is here
-  dsr data get middlebury               fetch the seven scenes of the paper's tables
-  dsr data verify middlebury            check every file against its checksum
-  dsr data prepare middlebury           resize, crop and keep them, and draw a contact sheet
-  dsr doctor my_scenes                  check a directory of your own scenes
+  dsr upsample --rgb photo.jpg --depth depth.png -o out    finer depth, mesh and pictures from your own camera
+  dsr report outputs/eval -o report                        tables, figures and a page of all evaluations
+  dsr study build outputs/eval --scale 4 -o study          a page that asks people which result looks best
+  dsr study collect study answers/*.json                   what they answered, with intervals
+  dsr data list                                            which data sets there are, and what of them is here
+  dsr data get middlebury                                  fetch the seven scenes of the paper's tables
+  dsr doctor my_scenes                                     check a directory of your own scenes
 
 Training and evaluation have commands of their own, train.py and eval.py in a checkout of the project.
 """
-_COMMANDS = (doctor, data)
+_COMMANDS = (upsample, report, study, data, doctor)
 
 
 def main(arguments: Sequence[str] | None = None, catalogue: Mapping[str, Collection] | None = None) -> int:

@@ -42,15 +42,35 @@ def read_map(path: Path) -> np.ndarray:
         ValueError: it is missing, damaged, of another shape, or has 8-bit values (too coarse for a surface).
 
     """
+    with np.errstate(invalid="ignore"):  # a damaged file may hold signalling NaNs
+        return read_values(path).astype(np.float64)
+
+
+def read_values(path: Path) -> np.ndarray:
+    """Return a one-channel map in the type that it is stored in, (H, W); see :func:`read_map`.
+
+    Raises:
+        ValueError: as for :func:`read_map`.
+
+    """
     readers = {".npy": _load_npy, ".pfm": _load_pfm}
     reader = readers.get(path.suffix.lower())
     values = read_pixels(path, cv2.IMREAD_UNCHANGED) if reader is None else reader(path)
+    return expect_depth_values(path, values)
+
+
+def expect_depth_values(path: Path, values: np.ndarray) -> np.ndarray:
+    """Return the values of a depth file.
+
+    Raises:
+        ValueError: they are not (H, W), or no floats or whole numbers of 16 bits or more.
+
+    """
     if values.ndim != 2:
         raise ValueError(f"{path}: expected one channel (height x width), got shape {values.shape}")
     if values.dtype.kind not in "fiu" or (values.dtype.kind in "iu" and values.dtype.itemsize == 1):
         raise ValueError(f"{path}: expected 16-bit or floating point values, got {values.dtype} (too coarse for depth)")
-    with np.errstate(invalid="ignore"):  # a damaged file may hold signalling NaNs
-        return values.astype(np.float64)
+    return values
 
 
 def read_levels(path: Path) -> np.ndarray:
@@ -248,3 +268,8 @@ class _QuietStderr:
 
 
 _QUIET_STDERR = _QuietStderr()
+
+
+def quiet_decoders() -> _QuietStderr:
+    """Return a context in which nothing reaches stderr: what decoders say of damaged files is left to our own line."""
+    return _QUIET_STDERR

@@ -23,8 +23,8 @@ from torch.nn import functional
 
 from dsr.degrade import check_scale
 from dsr.methods.holes import filled
-from dsr.methods.maps import normalised
-from dsr.methods.network import DisparityNetwork
+from dsr.methods.maps import bounds_of, normalised
+from dsr.methods.network import DisparityNetwork, Whole
 
 _NEIGHBOURS = 9
 _FINE, _HALF = 16, 32
@@ -114,21 +114,48 @@ class Facets(DisparityNetwork):
 
     def upsample(self, rgb: Tensor, disparity: Tensor, bounds: Tensor | None = None) -> Tensor:
         """Return fine disparity; see :meth:`dsr.methods.network.DisparityNetwork.upsample`."""
+        return self._upsampled(rgb, disparity, bounds, None)
+
+    @property
+    def reach(self) -> int:  # type: ignore[override]
+        """How many coarse pixels around its own an output depends on.
+
+        One for its planes' neighbours and what follows the trunk, two for each residual block, one each for the planes'
+        and the coarse map's convolutions, two for the differences; the photo's features look less far.
+        """
+        return 2 * self.blocks + 6
+
+    def whole(self, rgb: Tensor, disparity: Tensor) -> Whole:
+        """Return what answers windows: the disparity's range and the photo's mean are the whole image's."""
+        bounds, mean = bounds_of(disparity), _mean(rgb)
+        return Whole(filled(disparity), lambda photo, window: self._upsampled(photo, window, bounds, mean))
+
+    def _upsampled(self, rgb: Tensor, disparity: Tensor, bounds: Tensor | None, mean: Tensor | None) -> Tensor:
         known = normalised(disparity, bounds)
         span = torch.where(known.span > 0, known.span, 1)
         values = (filled(disparity) - known.minimum) / span
-        fine = self(rgb, values)
+        fine = self(rgb, values, mean)
         return fine * span + known.minimum
 
-    def forward(self, rgb: Tensor, values: Tensor) -> Tensor:
-        """Map a photo (B, 3, H, W) and normalised coarse disparity (B, 1, h, w) to fine disparity (B, 1, H, W)."""
+    def forward(self, rgb: Tensor, values: Tensor, mean: Tensor | None = None) -> Tensor:
+        """Map a photo and normalised coarse disparity to fine disparity.
+
+        Args:
+            rgb: (B, 3, H, W).
+            values: (B, 1, h, w).
+            mean: (B, 3, 1, 1) colour of the photo that this is a window of; None for that of ``rgb`` itself.
+
+        Returns:
+            (B, 1, H, W).
+
+        """
         if rgb.shape[-2:] != torch.Size(self.scale * n for n in values.shape[-2:]):
             expected = tuple(self.scale * n for n in values.shape[-2:])
             raise ValueError(f"rgb: expected {expected} pixels for a coarse map of {tuple(values.shape[-2:])} "
                              f"at scale {self.scale}, got {tuple(rgb.shape[-2:])}")  # fmt: skip
         around = stencil(values)
         dtype = self.photo.weight.dtype
-        pyramid = [functional.relu(self.photo(_photo_input(rgb).to(dtype)))]
+        pyramid = [functional.relu(self.photo(_photo_input(rgb, mean).to(dtype)))]
         for layer in self.down:
             pyramid.append(functional.relu(layer(pyramid[-1])))
         x = self.trunk(functional.relu(pyramid[-1] + self.coarse(_coarse_input(around).to(dtype))))
@@ -203,9 +230,14 @@ def _extended(values: Tensor, dim: int) -> Tensor:
     return torch.cat((2 * first - second, values, 2 * last - before), dim)
 
 
-def _photo_input(rgb: Tensor) -> Tensor:
+def _mean(rgb: Tensor) -> Tensor:
+    """Return the mean colour of photos, (B, 3, 1, 1)."""
+    return rgb.mean(dim=(-2, -1), keepdim=True)
+
+
+def _photo_input(rgb: Tensor, mean: Tensor | None = None) -> Tensor:
     """Return (B, 4, H, W): the colours, and how much brighter than the picture's mean a pixel is."""
-    brightness = (rgb - rgb.mean(dim=(-2, -1), keepdim=True)).mean(dim=1, keepdim=True)
+    brightness = (rgb - (_mean(rgb) if mean is None else mean)).mean(dim=1, keepdim=True)
     return torch.cat((rgb - 0.5, 2 * brightness), dim=1)
 
 

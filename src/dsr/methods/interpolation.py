@@ -41,18 +41,22 @@ class Interpolation:
 
     def __call__(self, sample: DepthSample) -> Tensor:
         """Return the fine depth, (1, H, W) in metres."""
-        coarse = to_range(sample.depth_lr, sample.camera_lr, "perspective")[0]
-        known = sample.mask_lr[0].cpu().numpy()
+        return self.interpolated(sample.depth_lr, sample.camera_lr, sample.camera)
+
+    def interpolated(self, depth: Tensor, camera: Camera, fine_camera: Camera) -> Tensor:
+        """Return depth, (1, h, w) in metres, at the pixels of another camera, whatever the ratio of their sizes."""
+        coarse = to_range(depth, camera, "perspective")[0]
+        known = depth.isfinite()[0].cpu().numpy()
         values = coarse.cpu().numpy()
         if not known.all():
             nearest = ndimage.distance_transform_edt(~known, return_distances=False, return_indices=True)
             values = values[tuple(nearest)]
-        where = _coarse_coordinates(sample.camera, sample.camera_lr)
+        where = _coarse_coordinates(fine_camera, camera)
         fine = ndimage.map_coordinates(values, where, order=self._degree, mode="nearest")
         if not (known.all() or self._fill_holes):
             fine[ndimage.map_coordinates(known.astype(np.uint8), where, order=0, mode="nearest") == 0] = np.nan
         fine[fine <= 0] = np.nan  # a spline may overshoot beside a depth step
-        return from_range(torch.from_numpy(fine).to(coarse)[None], sample.camera, "perspective")
+        return from_range(torch.from_numpy(fine).to(coarse)[None], fine_camera, "perspective")
 
 
 def _coarse_coordinates(fine: Camera, coarse: Camera) -> np.ndarray:

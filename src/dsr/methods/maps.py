@@ -27,15 +27,22 @@ def normalised(x: Tensor, bounds: Tensor | None = None) -> Normalised:
         bounds: (B, 2, 1, 1) minimum and maximum to use instead of the map's own.
 
     """
-    known, dims = x.isfinite(), (-3, -2, -1)
-    if bounds is None:
-        least = x.masked_fill(~known, torch.inf).amin(dims, keepdim=True)
-        span = x.masked_fill(~known, -torch.inf).amax(dims, keepdim=True) - least  # -inf where nothing is finite
-    else:
-        least = bounds[:, :1].to(x)
-        span = bounds[:, 1:].to(x) - least
+    known = x.isfinite()
+    bounds = bounds_of(x) if bounds is None else bounds.to(x)
+    least = bounds[:, :1]
+    span = bounds[:, 1:] - least  # -inf where nothing is finite
     values = torch.where(known, x - least, 0) / torch.where(span > 0, span, 1)
     return Normalised(values, torch.where(span >= 0, least, torch.nan), span)
+
+
+def bounds_of(x: Tensor) -> Tensor:
+    """Return the lowest and the highest finite value of each map of (B, 1, H, W), (B, 2, 1, 1).
+
+    Infinity and minus infinity where nothing is finite.
+    """
+    known, dims = x.isfinite(), (-3, -2, -1)
+    least = x.masked_fill(~known, torch.inf).amin(dims, keepdim=True)
+    return torch.cat((least, x.masked_fill(~known, -torch.inf).amax(dims, keepdim=True)), dim=1)
 
 
 def mean3x3(x: Tensor) -> Tensor:

@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -22,8 +22,8 @@ from torch import Tensor, nn
 from dsr.degrade import check_scale
 from dsr.methods.holes import filled
 from dsr.methods.layers import ConvLayer, Level
-from dsr.methods.maps import mean3x3, normalised, upsample_bicubic
-from dsr.methods.network import DisparityNetwork
+from dsr.methods.maps import bounds_of, mean3x3, normalised, upsample_bicubic
+from dsr.methods.network import DisparityNetwork, Whole
 
 VariantName = Literal["hui", "voynov", "dsr"]
 FEATURES = 32
@@ -135,6 +135,18 @@ class MSGNet(DisparityNetwork):
         """Return fine disparity; see :func:`upsample_disparity`."""
         return upsample_disparity(self, rgb, disparity, bounds)
 
+    @property
+    def reach(self) -> int:  # type: ignore[override]
+        """How many coarse pixels around its own an output depends on, two of them for ``hui``'s uneven padding."""
+        return self.rows_seen(0) + 2
+
+    def whole(self, rgb: Tensor, disparity: Tensor) -> Whole:
+        """Return what answers windows: ranges, drift and filled holes are the whole image's."""
+        bounds = bounds_of(disparity)
+        traits = traits_of(self, rgb, disparity)
+        known = filled(disparity) if self.variant.fill_holes else disparity
+        return Whole(known, lambda photo, window: upsample_disparity(self, photo, window, bounds, traits))
+
     def output_size(self, depth: Tensor) -> torch.Size:
         """Return (H, W) for depth of (..., h, w)."""
         lost = 0 if self.variant.same_size else 1
@@ -194,18 +206,48 @@ class MSGNet(DisparityNetwork):
         return ConvLayer(conv, self._slopes(FEATURES))
 
 
-def guidance_map(rgb: Tensor, variant: MSGVariant) -> Tensor:
+class Traits(NamedTuple):
+    """What MSG-Net's answer takes from the whole image, beside the range of its disparity.
+
+    ``intensity`` and ``detail`` (B, 2, 1, 1): bounds of the photo's intensity and of its difference to its 3 x 3 mean,
+    None for plain guidance; ``drift`` (B, 1, 1, 1): see :func:`output_drift`, None without its compensation.
+    """
+
+    intensity: Tensor | None
+    detail: Tensor | None
+    drift: Tensor | None
+
+
+def traits_of(net: MSGNet, rgb: Tensor, disparity: Tensor) -> Traits:
+    """Return the traits of an image; see :func:`upsample_disparity`."""
+    variant = net.variant
+    intensity = detail = drift = None
+    if not variant.plain_guidance:
+        grey = _intensity(rgb, variant)
+        intensity, grey = bounds_of(grey), normalised(grey).values
+        detail = bounds_of(grey - mean3x3(grey))
+    if variant.drift_compensation:
+        drift = output_drift(net, guidance_map(rgb, variant), normalised(disparity).values)
+    return Traits(intensity, detail, drift)
+
+
+def guidance_map(rgb: Tensor, variant: MSGVariant, traits: Traits | None = None) -> Tensor:
     """Return the guidance (B, 1, H, W) of a photo (B, 3, H, W) in 0..1.
 
     An intensity (see :class:`MSGVariant`), normalised, less its 3 x 3 mean, normalised again, 0..1; or the intensity
-    itself, -1..1, where the variant has plain guidance.
+    itself, -1..1, where the variant has plain guidance. With traits, the photo is a window of the one that has them.
     """
-    weights = torch.tensor(variant.rgb_weights, dtype=rgb.dtype, device=rgb.device)[:, None, None]
-    intensity = ((255 * rgb * weights).sum(-3, keepdim=True) + variant.rgb_offset).clip(0, 255)
+    intensity = _intensity(rgb, variant)
     if variant.plain_guidance:
         return intensity / 127.5 - 1
-    intensity = normalised(intensity).values
-    return normalised(intensity - mean3x3(intensity)).values
+    intensity = normalised(intensity, traits and traits.intensity).values
+    return normalised(intensity - mean3x3(intensity), traits and traits.detail).values
+
+
+def _intensity(rgb: Tensor, variant: MSGVariant) -> Tensor:
+    """Return the photo's intensity, (B, 1, H, W) in 0..255."""
+    weights = torch.tensor(variant.rgb_weights, dtype=rgb.dtype, device=rgb.device)[:, None, None]
+    return ((255 * rgb * weights).sum(-3, keepdim=True) + variant.rgb_offset).clip(0, 255)
 
 
 def output_drift(net: MSGNet, guidance: Tensor, disparity: Tensor, *, crop: bool = True) -> Tensor:
@@ -244,7 +286,13 @@ def residual(net: MSGNet, guidance: Tensor, depth: Tensor) -> Tensor:
 
 
 def upsample_disparity(
-    net: MSGNet, rgb: Tensor, disparity: Tensor, bounds: Tensor | None = None, *, crop_drift: bool = True
+    net: MSGNet,
+    rgb: Tensor,
+    disparity: Tensor,
+    bounds: Tensor | None = None,
+    traits: Traits | None = None,
+    *,
+    crop_drift: bool = True,
 ) -> Tensor:
     """Upsample disparity with a photo's guidance.
 
@@ -253,6 +301,7 @@ def upsample_disparity(
         rgb: (B, 3, H, W) in 0..1, with H = scale * h and W = scale * w.
         disparity: (B, 1, h, w); non-finite values are holes.
         bounds: see :meth:`dsr.methods.network.DisparityNetwork.upsample`.
+        traits: of the image that this is a window of; None for its own.
         crop_drift: see :func:`output_drift`.
 
     Returns:
@@ -265,9 +314,11 @@ def upsample_disparity(
         values = filled(torch.where(disparity.isfinite(), values, torch.nan))
     low_pass = mean3x3(values)
     height, width = net.output_size(values)
-    guidance = guidance_map(rgb, net.variant)[..., :height, :width]
+    guidance = guidance_map(rgb, net.variant, traits)[..., :height, :width]
     output = residual(net, guidance, values - low_pass)
-    if net.variant.drift_compensation:
+    if traits is not None and traits.drift is not None:
+        output = output - traits.drift
+    elif net.variant.drift_compensation:
         output = output - output_drift(net, guidance, values, crop=crop_drift)
     output = output + upsample_bicubic(low_pass, net.scale)[..., :height, :width]
     return output * span + minimum

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import abc
 import copy
+from collections.abc import Callable
+from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any, Literal
 
@@ -12,11 +14,33 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from dsr.geometry.camera import RangeType, from_range, to_range
+from dsr.methods.tiling import Progress, Span, blended, spans
 from dsr.sample import DepthSample
 
 Precision = Literal["float32", "bfloat16"]
 ENSEMBLES = (1, 4, 8)
 DTYPES = MappingProxyType({"float32": torch.float32, "bfloat16": torch.bfloat16})
+TILE = 1024
+"""Side of a tile in pixels of the photo."""
+UNTILED = 2**21
+"""Photos of up to so many pixels are answered in one piece."""
+_OVERLAP = 4
+
+
+@dataclass(frozen=True)
+class Whole:
+    """What a network found in a whole image, with which it answers windows as it would have answered the image.
+
+    Args:
+        disparity: (B, 1, h, w) the coarse disparity, its holes filled if the network fills them.
+        answer: from a window of the photo, (B, 3, scale * n, scale * m), and one of ``disparity``, (B, 1, n, m), to
+            fine disparity, right for pixels at least the network's reach away from the window's borders within the
+            image.
+
+    """
+
+    disparity: Tensor
+    answer: Callable[[Tensor, Tensor], Tensor]
 
 
 class DisparityNetwork(nn.Module, abc.ABC):
@@ -25,11 +49,13 @@ class DisparityNetwork(nn.Module, abc.ABC):
     Attributes:
         scale: the upsampling factor.
         covers: whether the output has all of the photo's pixels; some published networks leave out a row and a column.
+        reach: how many coarse pixels around its own an output depends on; None for all, so that there are no windows.
 
     """
 
     scale: int
     covers: bool = True
+    reach: int | None = None
 
     @abc.abstractmethod
     def arguments(self) -> dict[str, Any]:
@@ -50,9 +76,18 @@ class DisparityNetwork(nn.Module, abc.ABC):
 
         """
 
+    def whole(self, rgb: Tensor, disparity: Tensor) -> Whole:
+        """Return what answers windows of an image; for a network that has a reach. See :meth:`upsample`."""
+        raise NotImplementedError
+
 
 class NetworkUpsampler:
     """An :class:`~dsr.methods.base.Upsampler` around a trained network.
+
+    A photo of more than ``UNTILED`` pixels is answered in tiles, see :mod:`dsr.methods.tiling`, which bounds the
+    memory: about 40 bytes for each pixel of the photo, and for each pixel of a window (a tile, and the network's reach
+    on each side) 700 bytes where the depth is float32, 900 where it is float64. Whatever a network takes from the whole
+    image, such as the range of the disparity, it takes from the whole image, so the answer is the same to rounding.
 
     Args:
         net: the network; a copy is taken.
@@ -62,9 +97,11 @@ class NetworkUpsampler:
             these and their mirror images, each turned back, in as many times the time: the geometric self-ensemble of
             Timofte, Rothe, Van Gool, *Seven Ways to Improve Example-Based Single Image Super Resolution*, CVPR 2016,
             section 3.6. What is right agrees in all of them, and much of what is wrong doesn't.
+        tile: side of a tile in pixels of the photo; None for ``TILE``, and no tiles up to ``UNTILED`` pixels.
 
     Raises:
-        ValueError: there is no such precision or ensemble, or the network leaves out pixels and can't be averaged.
+        ValueError: there is no such precision or ensemble, the network leaves out pixels and can't be averaged, or a
+            tile is smaller than a coarse pixel.
 
     """
 
@@ -76,6 +113,7 @@ class NetworkUpsampler:
         precision: Precision = "float32",
         device: torch.device | str = "cpu",
         ensemble: int = 1,
+        tile: int | None = None,
     ) -> None:
         if precision not in DTYPES:
             raise ValueError(f"precision: expected one of {', '.join(DTYPES)}, got {precision!r}")
@@ -83,13 +121,16 @@ class NetworkUpsampler:
             raise ValueError(f"ensemble: expected one of {', '.join(map(str, ENSEMBLES))}, got {ensemble!r}")
         if ensemble > 1 and not net.covers:
             raise ValueError(f"ensemble: expected 1 for a network that leaves out pixels, got {ensemble}")
+        if tile is not None and tile < net.scale:
+            raise ValueError(f"tile: expected at least {net.scale} pixels, the scale, got {tile}")
         self.ensemble = ensemble
+        self.tile = tile
         self.device = torch.device(device)
         net = copy.deepcopy(net).eval().requires_grad_(False).to(self.device, DTYPES[precision])
         self.net = net.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # torch's stubs lack it
 
     @torch.inference_mode()
-    def __call__(self, sample: DepthSample) -> Tensor:
+    def __call__(self, sample: DepthSample, progress: Progress | None = None) -> Tensor:
         """Return the fine orthogonal depth, (1, H, W) in metres on the sample's device.
 
         NaN where the network's disparity lies at or beyond infinity, and in the last row and column where the network
@@ -98,23 +139,64 @@ class NetworkUpsampler:
         if sample.scale != self.net.scale:
             raise ValueError(f"{sample.scene}: expected scale {self.net.scale}, the network's, got {sample.scale}")
         coarse = to_range(sample.depth_lr, sample.camera_lr, "disparity") * sample.scale  # in pixels of sample.camera
-        fine = self.fine_disparity(sample.rgb.to(self.device)[None], coarse.to(self.device)[None])[0]
+        fine = self.fine_disparity(sample.rgb.to(self.device)[None], coarse.to(self.device)[None], progress)[0]
         missing = (sample.camera.width - fine.shape[-1], sample.camera.height - fine.shape[-2])
-        fine = functional.pad(fine, (0, missing[0], 0, missing[1]), value=torch.nan)
+        if any(missing):
+            fine = functional.pad(fine, (0, missing[0], 0, missing[1]), value=torch.nan)
         return from_range(fine, sample.camera, "disparity").to(sample.depth_lr.device)
 
-    def fine_disparity(self, rgb: Tensor, coarse: Tensor) -> Tensor:
+    def fine_disparity(self, rgb: Tensor, coarse: Tensor, progress: Progress | None = None) -> Tensor:
         """Return the mean of the ensemble's fine disparities, (B, 1, H, W).
 
         Args:
             rgb: (B, 3, H, W) in [0, 1].
             coarse: (B, 1, h, w) disparity in pixels of the photo's camera; non-finite values are holes.
+            progress: is told after each of the ensemble's answers, and each tile of it.
 
         """
-        total = self.net.upsample(rgb, coarse)
+        if not self._tiled(rgb.shape[-2], rgb.shape[-1]):
+            return self._mean_of_poses(lambda pose: self.net.upsample(posed(rgb, pose), posed(coarse, pose)), progress)
+        rows, columns = (self._spans(n) for n in coarse.shape[-2:])
+        wholes = [self.net.whole(posed(rgb, pose), posed(coarse, pose)) for pose in range(self.ensemble)]
+        tiles, done, scale = len(rows) * len(columns), 0, self.net.scale
+
+        def told(part: int, parts: int) -> None:
+            nonlocal done
+            done += 1
+            if progress is not None:
+                progress(done, tiles * self.ensemble)
+
+        def answer(high: slice, wide: slice) -> Tensor:
+            photo = rgb[..., scale * high.start : scale * high.stop, scale * wide.start : scale * wide.stop]
+            known = wholes[0].disparity[..., high, wide]
+            return self._mean_of_poses(lambda pose: wholes[pose].answer(posed(photo, pose), posed(known, pose)), told)
+
+        return blended(answer, rows, columns, scale)
+
+    def parts(self, height: int, width: int) -> int:
+        """Return how many parts ``progress`` counts for a photo of that size."""
+        if not self._tiled(height, width):
+            return self.ensemble
+        tiles = [len(self._spans(n // self.net.scale)) for n in (height, width)]
+        return tiles[0] * tiles[1] * self.ensemble
+
+    def _tiled(self, height: int, width: int) -> bool:
+        return self.net.reach is not None and (self.tile is not None or height * width > UNTILED)
+
+    def _spans(self, size: int) -> list[Span]:
+        """Return the tiles along an axis of so many coarse pixels."""
+        tile = (self.tile or TILE) // self.net.scale
+        return spans(size, tile, self.net.reach or 0, _OVERLAP)
+
+    def _mean_of_poses(self, answer: Callable[[int], Tensor], progress: Progress | None) -> Tensor:
+        """Return the mean of what ``answer`` says for each pose, turned back."""
+        total = answer(0)
         for pose in range(1, self.ensemble):
-            fine = self.net.upsample(posed(rgb, pose), posed(coarse, pose))
-            total += unposed(fine, pose)
+            if progress is not None:
+                progress(pose, self.ensemble)
+            total += unposed(answer(pose), pose)
+        if progress is not None:
+            progress(self.ensemble, self.ensemble)
         return total / self.ensemble
 
 

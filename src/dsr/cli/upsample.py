@@ -1,0 +1,131 @@
+"""``dsr upsample``: finer depth for people's own pairs of photo and depth map."""
+
+from __future__ import annotations
+
+import argparse
+import math
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+
+_DESCRIPTION = """\
+Make the depth maps of your own photos as fine as the photos, and their surfaces as they look.
+
+Give --rgb and --depth, or folders that hold both. The depth map has to be registered to the photo: the same view, the
+same field of view, any size up to the photo's. What is not given is told from the files or assumed, and said."""
+_EXAMPLES = """\
+examples:
+  dsr upsample --rgb photo.jpg --depth depth.png -o out
+  dsr upsample --rgb photo.jpg --depth depth.png --camera camera.json -o out
+  dsr upsample --rgb photo.jpg --depth depth.exr --fov 70 --format exr --only depth,mesh -o out
+  dsr upsample --rgb a.jpg b.jpg --depth a.png b.png --intrinsics 615 615 319.5 239.5 -o out
+  dsr upsample --rgb rgb/ --depth depth/ --depth-unit 1/5000 -o out
+  dsr upsample rgbd_dataset_freiburg1_xyz -o out
+  dsr upsample recordings --dry-run -o out       what would be done, and what would be assumed
+
+A single pair's results lie in OUT itself, those of several in OUT/NAME: depth.* as the input counts, depth_metres.npy,
+renderings/, normals.png, cloud.ply, mesh.ply, mesh.glb, before_after.png, and info.json with all settings and
+assumptions. The same command goes on where it was interrupted. More in docs/upsample.md.
+"""
+
+
+def add(commands: Any) -> None:
+    """Add the command to the parser's commands."""
+    parser = commands.add_parser(
+        "upsample",
+        help="make the depth of your own photos finer",
+        description=_DESCRIPTION,
+        epilog=_EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    what = parser.add_argument_group("what to work on")
+    what.add_argument("folders", nargs="*", type=Path, metavar="FOLDER", help="folders of photos and depth maps")
+    what.add_argument("--rgb", nargs="+", type=Path, default=[], metavar="PHOTO", help="photos, or a folder of them")
+    what.add_argument("--depth", nargs="+", type=Path, default=[], metavar="MAP", help="depth maps, one for each photo")
+    what.add_argument("--mask", nargs="+", type=Path, default=[], metavar="MASK", help="pictures, 0 at unknown depth")
+    _add_reading(parser)
+    _add_method(parser)
+    _add_results(parser)
+    parser.set_defaults(run=_run)
+
+
+def _add_reading(parser: argparse.ArgumentParser) -> None:
+    """Add how the files are to be read."""
+    reading = parser.add_argument_group("how the files count (told from the files, or assumed and said)")
+    camera = reading.add_mutually_exclusive_group()
+    camera.add_argument("--camera", type=Path, metavar="FILE", help="camera.json, Open3D's JSON, or a 3 x 3 matrix")
+    camera.add_argument("--fov", type=float, metavar="DEGREES", help="horizontal field of view of the photo")
+    camera.add_argument("--intrinsics", nargs=4, type=float, metavar=("FX", "FY", "CX", "CY"), help="photo pixels")
+    reading.add_argument("--depth-unit", metavar="UNIT", help="m, cm, mm, or metres per value: 0.0002, 1/5000")
+    types = ("orthogonal", "perspective", "disparity")
+    reading.add_argument(
+        "--range-type", choices=types, help="depth along the axis (default), along the ray, or disparity"
+    )
+    reading.add_argument("--baseline", type=float, metavar="METRES", help="between the cameras, for disparity")
+    reading.add_argument("--hole-value", type=float, metavar="VALUE", help="one more value that means unknown")
+
+
+def _add_method(parser: argparse.ArgumentParser) -> None:
+    """Add how it is computed."""
+    method = parser.add_argument_group("how it is done")
+    method.add_argument(
+        "--method", default="facets", metavar="NAME", help="facets (default), msg_v, bicubic, dip_v, ..."
+    )
+    method.add_argument("--scale", type=int, metavar="N", help="upsampling factor (default: from the sizes)")
+    method.add_argument("--device", default="auto", metavar="DEVICE", help="auto (default), cpu, cuda, cuda:1, ...")
+    method.add_argument("--keep-holes", action="store_true", help="leave holes of the input holes")
+
+
+def _add_results(parser: argparse.ArgumentParser) -> None:
+    """Add what is written."""
+    results = parser.add_argument_group("what is written")
+    results.add_argument("-o", "--output", type=Path, required=True, metavar="OUT", help="folder of the results")
+    results.add_argument("--format", metavar="FORMAT", help="of the depth: png, tiff, npy, npz, pfm, exr (the input's)")
+    parts = "depth,renderings,normals,cloud,mesh,before_after"
+    chosen = results.add_mutually_exclusive_group()
+    chosen.add_argument("--only", type=_words, metavar="PARTS", help=f"some of {parts}")
+    chosen.add_argument("--without", type=_words, default=(), metavar="PARTS", help="all but these")
+    results.add_argument("--overwrite", action="store_true", help="redo what is there, replace other results")
+    results.add_argument("--dry-run", action="store_true", help="read the files and say what would be done")
+
+
+def _words(text: str) -> tuple[str, ...]:
+    """Return the words between commas."""
+    return tuple(word.strip() for word in text.split(",") if word.strip())
+
+
+def _run(options: argparse.Namespace, console: Console, _: object) -> list[str]:
+    """Upsample, and return what went wrong."""
+    from dsr.rgbd.cameras import CameraChoice  # noqa: PLC0415 - they take seconds to import
+    from dsr.rgbd.command import Wanted, run  # noqa: PLC0415
+    from dsr.rgbd.encoding import parse_unit  # noqa: PLC0415
+    from dsr.rgbd.inputs import Reading  # noqa: PLC0415
+    from dsr.rgbd.outputs import PARTS  # noqa: PLC0415
+
+    intrinsics = None if options.intrinsics is None else tuple(options.intrinsics)
+    unit = None if options.depth_unit is None else parse_unit(options.depth_unit)
+    if options.baseline is not None and not 0 < options.baseline < float("inf"):
+        raise ValueError(f"--baseline: expected a positive number of metres, got {options.baseline:g}")
+    if options.hole_value is not None and math.isnan(options.hole_value):  # NaN is one anyway
+        options.hole_value = None
+    choice = CameraChoice(options.camera, options.fov, intrinsics)
+    unknown = [part for part in options.without if part not in PARTS]
+    parts = options.only if options.only is not None else tuple(part for part in PARTS if part not in options.without)
+    wanted = Wanted(
+        output=options.output,
+        folders=tuple(options.folders),
+        rgb=tuple(options.rgb),
+        depth=tuple(options.depth),
+        mask=tuple(options.mask),
+        reading=Reading(choice, unit, options.range_type, options.baseline, options.hole_value),
+        method=options.method,
+        scale=options.scale,
+        device=options.device,
+        keep_holes=options.keep_holes,
+        depth_format=options.format,
+        parts=(*parts, *unknown),
+        overwrite=options.overwrite,
+        dry_run=options.dry_run,
+    )
+    return run(wanted, console)

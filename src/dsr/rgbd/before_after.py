@@ -1,0 +1,193 @@
+"""One picture that shows what upsampling did to somebody's depth: the surface before and after, lit from above."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
+from matplotlib.ticker import MaxNLocator, ScalarFormatter
+from torch import Tensor
+from torch.nn import functional
+
+from dsr.geometry.camera import Camera
+from dsr.geometry.shading import lights
+from dsr.report.pictures import colours, limits_of, reduced, strongest_window, write_figure
+from dsr.rgbd.exports import normal_strips
+
+_DPI = 200
+_PANEL, _TALLEST, _NARROWEST = 3.78, 4.6, 2.2
+"""Inches of a panel's width, its greatest height, and the least room across."""
+_LEFT, _GAP, _HEADING, _BETWEEN, _BELOW = 0.3, 0.1, 0.92, 0.1, 0.62
+"""Inches left of the panels, between them, above the first row, between rows, and below the last."""
+_LONGEST = 1536
+"""Pixels of a whole picture's longer side as it is drawn: twice a panel's."""
+_DETAIL = 4
+"""The detail is this part of the picture's sides."""
+_FRAME = "#ff8c00"
+_LIGHT = 0
+_ROWS = ("lit from above", "detail", "normals | depth")
+
+
+class _Part(NamedTuple):
+    """A part of the view; 0 is the left or upper edge and 1 the right or lower."""
+
+    left: float
+    right: float
+    top: float
+    bottom: float
+
+
+_WHOLE = _Part(0, 1, 0, 1)
+
+
+def write_before_after(path: Path, rgb: Tensor, coarse: Tensor, depth: Tensor, camera: Camera, title: str) -> None:
+    """Draw the photo, the input and the result, both as a surface under light e1 and as depth.
+
+    The input is rendered from its own pixels, not from interpolated ones. The detail is where the two renderings differ
+    most. At most 2400 pixels wide, whatever the photo's size.
+
+    Args:
+        path: a PNG, written atomically.
+        rgb: (3, H, W) in [0, 1].
+        coarse: (1, h, w) the input, of any size and of the same view; orthogonal depth in metres, NaN in holes.
+        depth: (1, H, W) the result, likewise.
+        camera: of the photo and the result.
+        title: the heading.
+
+    Raises:
+        ValueError: a map is less than 2 pixels high or wide.
+
+    """
+    normals = _normals(depth, camera)
+    before = _lit(_normals(coarse, camera.rescale(coarse.shape[-1], coarse.shape[-2])))
+    after = _lit(normals)
+    part = _detail(before, after)
+    size, size_lr = (f"{each.shape[-1]} x {each.shape[-2]}" for each in (depth, coarse))
+    sheet = _Sheet(camera.height / camera.width, title)
+    pictures = ((rgb.float(), f"photo, {size}"), (before, f"before, {size_lr}"), (after, f"after, {size}"))
+    for column, (picture, heading) in enumerate(pictures):
+        axes = sheet.panel(0, column, reduced(picture, _LONGEST), heading=heading)
+        frame = (part.right - part.left, part.bottom - part.top)
+        axes.add_patch(Rectangle((part.left, part.top), *frame, fill=False, color=_FRAME, linewidth=1.8))
+        sheet.panel(1, column, picture, part, frame=_FRAME)
+    sheet.panel(2, 0, (1 + torch.tensor([1, -1, -1])[:, None, None] * reduced(normals, _LONGEST)) / 2)
+    limits = limits_of(coarse)
+    for column, values in ((1, coarse), (2, depth)):
+        axes = sheet.panel(2, column, reduced(values.float(), _LONGEST), depth=limits)
+    sheet.colour_bar(axes)
+    if not (coarse.isfinite().all() and depth.isfinite().all()):
+        sheet.figure.text(0.99, sheet.line, "pink: holes", ha="right", va="center", fontsize=11)
+    write_figure(path, sheet.figure, _DPI)
+
+
+def _normals(depth: Tensor, camera: Camera) -> Tensor:
+    """Return the normals of a map, (3, H, W) float32."""
+    normals = torch.empty((3, camera.height, camera.width))
+    for rows, part in normal_strips(depth, camera):
+        normals[:, rows] = part
+    return normals
+
+
+def _lit(normals: Tensor) -> Tensor:
+    """Return the rendering under the light, (1, H, W)."""
+    x, y, z = lights()[_LIGHT].tolist()
+    return (x * normals[:1] + y * normals[1:2] + z * normals[2:]).clamp(0, 1)
+
+
+def _detail(before: Tensor, after: Tensor) -> _Part:
+    """Return where two renderings, of any sizes, differ most."""
+    enlarged = functional.interpolate(before[None], tuple(after.shape[-2:]), mode="nearest-exact")[0]
+    difference = reduced((enlarged - after).abs(), _LONGEST)[0].numpy()
+    height, width = difference.shape
+    window = strongest_window(difference, math.ceil(height / _DETAIL), math.ceil(width / _DETAIL))
+    if window is None:  # the window is never larger than the picture
+        return _WHOLE
+    right, bottom = window.left + window.width, window.top + window.height
+    return _Part(window.left / width, right / width, window.top / height, bottom / height)
+
+
+class _Sheet:
+    """Three by three panels under a heading.
+
+    Args:
+        aspect: height of the view by its width.
+        title: the heading.
+
+    """
+
+    def __init__(self, aspect: float, title: str) -> None:
+        width = min(_PANEL, _TALLEST / aspect)
+        self._size = (width, width * aspect)
+        self._pitch = max(width, _NARROWEST) + _GAP
+        whole = (_LEFT + 3 * self._pitch, _HEADING + 3 * (self._size[1] + _BETWEEN) + _BELOW)
+        self.figure = Figure(figsize=whole)
+        FigureCanvasAgg(self.figure)
+        self.line = 0.3 / whole[1]
+        self.figure.text(_LEFT / whole[0], 1 - 0.3 / whole[1], title, fontsize=16, va="center", weight="bold",
+                         parse_math=False)  # fmt: skip
+
+    def _axes(self, left: float, bottom: float, width: float, height: float) -> Axes:
+        """Return axes at a place in inches."""
+        whole, total = self.figure.get_size_inches()
+        return self.figure.add_axes((left / whole, bottom / total, width / whole, height / total))
+
+    def panel(
+        self,
+        row: int,
+        column: int,
+        values: Tensor,
+        part: _Part = _WHOLE,
+        *,
+        heading: str = "",
+        frame: str = "none",
+        depth: tuple[float, float] | None = None,
+    ) -> Axes:
+        """Draw a picture, (3, H, W), a rendering or depth between two limits, (1, H, W), or a part of it."""
+        width, height = self._size
+        total = float(self.figure.get_size_inches()[1])
+        left = _LEFT + column * self._pitch + (self._pitch - _GAP - width) / 2
+        axes = self._axes(left, total - _HEADING - (row + 1) * (height + _BETWEEN) + _BETWEEN, width, height)
+        axes.set(xticks=[], yticks=[])
+        for spine in axes.spines.values():
+            spine.set(color=frame, linewidth=2.5)
+        shown, extent = _cut(values, part)
+        low, high = depth or (0.0, 1.0)
+        colour_map = colours("gray" if depth is None else "viridis")
+        picture = _with_holes(shown) if len(shown) == 3 else shown[0].numpy()
+        axes.imshow(picture, cmap=colour_map, vmin=low, vmax=high, extent=extent, aspect="auto")
+        axes.set(xlim=(part.left, part.right), ylim=(part.bottom, part.top))
+        axes.set_title(heading, fontsize=13)
+        if column == 0:
+            label = _ROWS[row] if height > 1 else ""
+            self.figure.text(0.5 * _LEFT / self.figure.get_figwidth(), sum(axes.get_position().intervaly) / 2, label,
+                             rotation=90, ha="center", va="center", fontsize=12)  # fmt: skip
+        return axes
+
+    def colour_bar(self, axes: Axes) -> None:
+        """Draw the colour bar of the depth in the last row."""
+        place = self._axes(_LEFT + 1.25 * self._pitch, 0.42, 1.5 * self._pitch - _GAP, 0.1)
+        bar = self.figure.colorbar(axes.images[0], cax=place, orientation="horizontal", ticks=MaxNLocator(6),
+                                   format=ScalarFormatter(useOffset=False))  # fmt: skip
+        bar.set_label("depth, m", fontsize=11, labelpad=1)
+
+
+def _cut(values: Tensor, part: _Part) -> tuple[Tensor, tuple[float, float, float, float]]:
+    """Return the pixels of a (C, H, W) picture that a part of it touches, and their extent for Matplotlib."""
+    height, width = values.shape[-2:]
+    top, bottom = math.floor(part.top * height), math.ceil(part.bottom * height)
+    left, right = math.floor(part.left * width), math.ceil(part.right * width)
+    return values[:, top:bottom, left:right], (left / width, right / width, bottom / height, top / height)
+
+
+def _with_holes(picture: Tensor) -> np.ndarray:
+    """Return a (3, H, W) picture as (H, W, 3) with holes in their colour."""
+    known = picture.isfinite().all(dim=0)
+    hole = torch.tensor(colours("gray").get_bad()[:3], dtype=picture.dtype)
+    return torch.where(known[..., None], picture.permute(1, 2, 0), hole).clamp(0, 1).numpy()

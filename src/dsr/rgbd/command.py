@@ -1,0 +1,221 @@
+"""``dsr upsample``: from somebody's files to folders of results, one picture after another."""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from rich.console import Console
+from rich.progress import Progress
+from torch import Tensor
+
+from dsr.rgbd.encoding import Fact
+from dsr.rgbd.inputs import Picture, UnitMemory, read_picture
+from dsr.rgbd.layouts import pairs_of_folder
+from dsr.rgbd.outputs import (
+    Earlier,
+    begin,
+    described,
+    expect_free,
+    finish,
+    kept_depth,
+    output_encoding,
+    read_earlier,
+    versions,
+    write_parts,
+)
+from dsr.rgbd.pairs import Found, Pair, pairs_of_lists
+from dsr.rgbd.telling import Reporter, bars, listed, problem_line, steps
+from dsr.rgbd.wanted import Wanted, files_of, inputs_of, settings_of
+from dsr.terminal import show
+from dsr.upsampling import Plan, enlarged_by, plan, upsample_depth
+
+
+def run(wanted: Wanted, console: Console) -> list[str]:
+    """Upsample all that is asked for.
+
+    Args:
+        wanted: what.
+        console: where progress and assumptions are shown.
+
+    Returns:
+        What went wrong, one line for each; empty where nothing did.
+
+    Raises:
+        ValueError: nothing can be done at all.
+
+    """
+    found = _find(wanted)
+    single = len(found.pairs) == 1 and not wanted.folders and not wanted.rgb[0].is_dir()
+    _tell_found(console, found)
+    reporter, units = Reporter(console), UnitMemory()
+    problems: dict[str, list[str]] = {}
+    outcomes: Counter[str] = Counter()
+    with bars(console) as progress:
+        total = progress.add_task("pictures", total=len(found.pairs), remark="", visible=not single)
+        for pair in found.pairs:
+            progress.update(total, remark=pair.name)
+            target = wanted.output if single else wanted.output / pair.name
+            try:
+                outcomes[_one(wanted, pair, target, units, reporter, progress)] += 1
+            except (ValueError, OSError, MemoryError, torch.OutOfMemoryError) as error:
+                problems.setdefault(problem_line(error), []).append(pair.name)
+            progress.advance(total)
+    if not single:
+        reporter.summary(outcomes["done"] + outcomes["to do"])
+        counts = [f"{count} {outcome}" for outcome, count in outcomes.items()]
+        counts += [f"{sum(map(len, problems.values()))} failed"] if problems else []
+        show(console, f"{len(found.pairs)} pictures: {', '.join(counts)} -> {wanted.output}")
+    return [f"{listed(names)}: {message}" if len(found.pairs) > 1 else message for message, names in problems.items()]
+
+
+def _find(wanted: Wanted) -> Found:
+    """Return the pairs."""
+    if not wanted.folders:
+        return pairs_of_lists(wanted.rgb, wanted.depth, wanted.mask)
+    parts = [pairs_of_folder(folder, wanted.output) for folder in wanted.folders]
+    if len(parts) == 1:
+        return parts[0]
+    pairs = [
+        replace(pair, name=f"{folder.resolve().name}/{pair.name}")
+        for folder, part in zip(wanted.folders, parts, strict=True)
+        for pair in part.pairs
+    ]
+    if len({pair.name for pair in pairs}) < len(pairs):
+        raise ValueError("expected folders of different names; give those of one name in commands of their own")
+    facts = tuple(dict.fromkeys(fact for part in parts for fact in part.facts))
+    return Found(tuple(pairs), facts, tuple(path for part in parts for path in part.alone))
+
+
+def _tell_found(console: Console, found: Found) -> None:
+    """Show how many pairs there are, and what has no partner."""
+    count = len(found.pairs)
+    lines = [
+        f"{count} pairs of photo and depth map" if count > 1 else f"{found.pairs[0].rgb} and {found.pairs[0].depth}"
+    ]
+    lines += [f"  {fact}" for fact in found.facts]
+    if found.alone:
+        lines.append(f"  {len(found.alone)} without a partner, left out: {listed([path.name for path in found.alone])}")
+    for line in lines:
+        show(console, line)
+
+
+@dataclass(frozen=True)
+class _Job:
+    """One picture, and what an earlier run left in its folder."""
+
+    wanted: Wanted
+    pair: Pair
+    target: Path
+    settings: Mapping[str, Any]
+    inputs: Mapping[str, Any]
+    earlier: Earlier | None
+
+    @property
+    def reusable(self) -> bool:
+        """Whether the earlier run came to its end with the same inputs and settings, and may stay."""
+        return self.earlier is not None and self.earlier.complete and self.same and not self.wanted.overwrite
+
+    @property
+    def same(self) -> bool:
+        """Whether the earlier run had the same inputs and settings."""
+        return self.earlier is not None and (self.earlier.settings, self.earlier.inputs) == (self.settings, self.inputs)
+
+    def expect_agreement(self) -> None:
+        """Raise ValueError where the folder holds a complete result of something else."""
+        earlier = self.earlier
+        if earlier is None or not earlier.complete or self.same or self.wanted.overwrite:
+            return
+        if earlier.inputs != self.inputs:
+            what = "other inputs: " + ", ".join(str(entry.get("file")) for entry in earlier.inputs.values())
+        else:
+            changed = [name for name, value in self.settings.items() if earlier.settings.get(name) != value]
+            what = "other settings: " + ", ".join(f"{name} {earlier.settings.get(name)}" for name in changed)
+        raise ValueError(f"{self.target}: holds a result of {what}; take another -o, or --overwrite")
+
+    def is_done(self) -> bool:
+        """Return whether everything that is wanted is there."""
+        if not self.reusable or self.earlier is None:
+            return False
+        there = {name.split("/")[0].split(".")[0] for name in self.earlier.files if (self.target / name).is_file()}
+        return there >= set(self.wanted.parts)
+
+
+def _one(wanted: Wanted, pair: Pair, target: Path, units: UnitMemory, reporter: Reporter, progress: Progress) -> str:
+    """Do one picture, and return how it went."""
+    job = _Job(wanted, pair, target, settings_of(wanted), inputs_of(pair, wanted.reading), read_earlier(target))
+    job.expect_agreement()
+    if job.is_done():
+        reporter.say(f"{pair.name}: complete already, in {target}")
+        return "complete already"
+    picture = _without_repeats(read_picture(pair, wanted.reading, units))
+    coarse_size = (picture.coarse.shape[-2], picture.coarse.shape[-1])
+    planned = plan((picture.camera.height, picture.camera.width), coarse_size, wanted.scale, wanted.method)
+    reporter.facts(picture.facts)
+    if wanted.dry_run:
+        reporter.say(f"{pair.name}: {planned.text} -> {target}")
+        return "to do"
+    inputs = files_of(pair, wanted.reading).values()
+    expect_free(target, inputs, ours=wanted.overwrite or job.earlier is not None)
+    depth = kept_depth(target, picture.camera) if job.reusable else None
+    begin(target, job.settings, job.inputs, () if job.earlier is None else job.earlier.files)
+    started = time.perf_counter()
+    if depth is None:
+        depth = _upsampled(job, picture, progress)
+    seconds = time.perf_counter() - started
+    facts = _write(job, picture, depth, planned, seconds)
+    reporter.facts(facts)
+    reporter.say(f"{pair.name}: {planned.text}, {seconds:.1f} s -> {target}")
+    return "done"
+
+
+def _without_repeats(picture: Picture) -> Picture:
+    """Return the picture with a depth map that was enlarged by repeating pixels as it was before."""
+    height, width = picture.coarse.shape[-2:]
+    block = enlarged_by(picture.coarse) if (height, width) == (picture.camera.height, picture.camera.width) else 1
+    if block == 1 or height % block or width % block:
+        return picture
+    fact = Fact(f"the depth map was enlarged x{block} by repeating pixels, which are dropped")
+    return replace(picture, coarse=picture.coarse[:, ::block, ::block], facts=(*picture.facts, fact))
+
+
+def _upsampled(job: _Job, picture: Picture, progress: Progress) -> Tensor:
+    """Return the fine depth, (1, H, W) in metres."""
+    wanted = job.wanted
+    with steps(progress, job.pair.name) as step:
+        return upsample_depth(
+            picture.rgb,
+            picture.coarse,
+            picture.camera,
+            wanted.scale,
+            method=wanted.method,
+            device=wanted.device,
+            keep_holes=wanted.keep_holes,
+            progress=step,
+        ).cpu()
+
+
+def _write(job: _Job, picture: Picture, depth: Tensor, planned: Plan, seconds: float) -> list[Fact]:
+    """Write all parts and ``info.json``, and return what should be said of them."""
+    started = time.perf_counter()
+    encoding = output_encoding(picture.encoding, job.wanted.depth_format)
+    title = f"{job.pair.name}, {job.wanted.method} x{planned.scale}"
+    files, facts = write_parts(job.target, picture, depth, job.wanted.parts, encoding, title)
+    entries = {
+        "inputs": job.inputs,
+        "settings": job.settings,
+        "scale": planned.scale,
+        "plan": planned.text,
+        **described(picture, encoding),
+        "assumptions": [str(fact) for fact in (*picture.facts, *facts)],
+        "seconds": {"upsampling": round(seconds, 3), "writing": round(time.perf_counter() - started, 3)},
+        "versions": versions(),
+    }
+    kept = job.earlier.files if job.earlier is not None and job.same else ()
+    finish(job.target, job.earlier, entries, [*files, *(name for name in kept if name not in files)])
+    return facts

@@ -1,0 +1,216 @@
+"""The folder of one result: what is written into it, what an earlier run left there, and ``info.json``."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import math
+import platform
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from dsr.atomic import replacing, write_text
+from dsr.geometry.camera import Camera
+from dsr.geometry.shading import LIGHT_NAMES
+from dsr.rgbd.before_after import write_before_after
+from dsr.rgbd.depth_files import DEPTH_SUFFIXES, write_depth_file
+from dsr.rgbd.encoding import Encoding, Fact, encode
+from dsr.rgbd.exports import write_cloud, write_mesh, write_normals, write_renderings
+from dsr.rgbd.inputs import Picture
+
+PARTS = ("depth", "renderings", "normals", "cloud", "mesh", "before_after")
+FORMATS = ("png", "tiff", "npy", "npz", "pfm", "exr")
+INFO = "info.json"
+METRES = "depth_metres.npy"
+_FILES: Mapping[str, tuple[str, ...]] = {
+    "depth": (*(f"depth{suffix}" for suffix in DEPTH_SUFFIXES), METRES),
+    "renderings": tuple(f"renderings/{name}.png" for name in LIGHT_NAMES),
+    "normals": ("normals.png",),
+    "cloud": ("cloud.ply",),
+    "mesh": ("mesh.ply", "mesh.glb"),
+    "before_after": ("before_after.png",),
+}
+_PACKAGES = ("torch", "numpy", "opencv-python-headless")
+
+
+@dataclass(frozen=True)
+class Earlier:
+    """What ``info.json`` says of an earlier run.
+
+    Args:
+        complete: whether it came to its end.
+        settings, inputs: as this module wrote them.
+        files: names of what it wrote.
+
+    """
+
+    complete: bool
+    settings: Mapping[str, Any]
+    inputs: Mapping[str, Any]
+    files: tuple[str, ...]
+
+
+def output_encoding(encoding: Encoding, wanted: str | None) -> Encoding:
+    """Return how the result is stored: as the input in the input's format, else in metres, or in whole millimetres.
+
+    Args:
+        encoding: of the input.
+        wanted: one of :data:`FORMATS`; None for the input's.
+
+    """
+    own = "tiff" if encoding.suffix == ".tif" else encoding.suffix[1:]
+    if wanted in (None, own):
+        return encoding
+    if wanted == "png":
+        return Encoding(".png", "uint16", 1e-3, 0.0, "orthogonal")
+    return Encoding(f".{wanted}", "float32", 1.0, math.nan, "orthogonal")
+
+
+def read_earlier(folder: Path) -> Earlier | None:
+    """Return what an earlier run left in a folder, None where there was none.
+
+    Raises:
+        ValueError: there is an ``info.json`` of something else.
+
+    """
+    path = folder / INFO
+    if not path.is_file():
+        return None
+    try:
+        entries = json.loads(path.read_text(encoding="utf-8"))
+        return Earlier(
+            entries["complete"] is True, dict(entries["settings"]), dict(entries["inputs"]), tuple(entries["files"])
+        )
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
+        raise ValueError(f"{path}: expected a file of `dsr upsample`, got something else; take another -o") from error
+
+
+def expect_free(folder: Path, inputs: Iterable[Path], *, ours: bool) -> None:
+    """Say where a result would overwrite its input, or files that no earlier run wrote.
+
+    Args:
+        folder: of the result.
+        inputs: files that must stay.
+        ours: whether what lies there may be replaced.
+
+    Raises:
+        ValueError: it would.
+
+    """
+    names = [name for names in _FILES.values() for name in names] + [INFO]
+    there = [folder / name for name in names if (folder / name).exists()]
+    for path in there:
+        if any(path.samefile(other) for other in inputs):
+            raise ValueError(f"{path}: the result would overwrite its input; take another -o")
+    if there and not ours:
+        raise ValueError(f"{there[0]}: is there already and not of an earlier run; take another -o, or --overwrite")
+
+
+def write_parts(
+    folder: Path, picture: Picture, depth: Tensor, parts: Sequence[str], encoding: Encoding, title: str
+) -> tuple[list[str], list[Fact]]:
+    """Write the parts of a result.
+
+    Args:
+        folder: is made if need be.
+        picture: the input.
+        depth: (1, H, W) the result, orthogonal depth in metres, NaN in holes.
+        parts: some of :data:`PARTS`.
+        encoding: of the depth file.
+        title: of the picture of before and after.
+
+    Returns:
+        The names of the files, and what should be said of them.
+
+    """
+    rgb, camera = picture.rgb, picture.camera
+    facts: list[Fact] = []
+    files: list[str] = []
+    if "depth" in parts:
+        files, facts = _write_depth(folder, depth, camera, encoding)
+    if "renderings" in parts:
+        write_renderings(folder / "renderings", depth, camera)
+    if "normals" in parts:
+        write_normals(folder / "normals.png", depth, camera)
+    if "cloud" in parts:
+        write_cloud(folder / "cloud.ply", rgb, depth, camera)
+    if "mesh" in parts:
+        try:
+            write_mesh([folder / name for name in _FILES["mesh"]], rgb, depth, camera)
+        except ValueError as error:
+            facts.append(Fact("no mesh", str(error)))
+            parts = [part for part in parts if part != "mesh"]
+    if "before_after" in parts:
+        write_before_after(folder / "before_after.png", rgb, picture.coarse, depth, camera, title)
+    return [*files, *(name for part in parts if part != "depth" for name in _FILES[part])], facts
+
+
+def _write_depth(folder: Path, depth: Tensor, camera: Camera, encoding: Encoding) -> tuple[list[str], list[Fact]]:
+    """Write the depth as the input counts, and in metres where that is something else."""
+    values, lost = encode(depth, encoding, camera)
+    name = f"depth{encoding.suffix}"
+    facts = []
+    if lost:
+        text = f"{name}: what {encoding.dtype} values of this unit cannot hold is written as a hole; {METRES} has all"
+        facts.append(Fact(text, f"{lost} pixels"))
+    write_depth_file(folder / name, values)
+    if replace(encoding, hole=0.0) == Encoding(".npy", "float32", 1.0, 0.0, "orthogonal") and math.isnan(encoding.hole):
+        return [name], facts
+    with replacing(folder / METRES) as temporary:
+        np.save(temporary, depth[0].float().cpu().numpy())
+    if np.dtype(encoding.dtype).kind in "iu":
+        facts.append(Fact(f"{name} is in whole numbers like the input; {METRES} is not rounded"))
+    return [name, METRES], facts
+
+
+def kept_depth(folder: Path, camera: Camera) -> Tensor | None:
+    """Return the depth in metres of an earlier complete run, (1, H, W); None where it is not there."""
+    with contextlib.suppress(OSError, ValueError, EOFError):
+        values = np.load(folder / METRES)
+        if values.shape == (camera.height, camera.width) and values.dtype == np.float32:
+            return torch.from_numpy(values)[None]
+    return None
+
+
+def begin(folder: Path, settings: Mapping[str, Any], inputs: Mapping[str, Any], files: Sequence[str]) -> None:
+    """Mark a folder as one of an unfinished run."""
+    entries = {"complete": False, "inputs": inputs, "settings": settings, "files": files}
+    write_text(folder / INFO, json.dumps(entries, indent=2) + "\n")
+
+
+def finish(folder: Path, earlier: Earlier | None, entries: Mapping[str, Any], files: Sequence[str]) -> None:
+    """Write ``info.json`` of a finished run; files of an earlier one that are no part of it are removed."""
+    for name in () if earlier is None else earlier.files:
+        if name not in files and any(name in names for names in _FILES.values()):
+            (folder / name).unlink(missing_ok=True)
+    write_text(folder / INFO, json.dumps({"complete": True, **entries, "files": list(files)}, indent=2) + "\n")
+
+
+def described(picture: Picture, encoding: Encoding) -> dict[str, Any]:
+    """Return sizes, camera and files' conventions for ``info.json``."""
+    return {
+        "photo_size": [picture.camera.width, picture.camera.height],
+        "input_size": [picture.coarse.shape[-1], picture.coarse.shape[-2]],
+        "input_holes": round(1 - float(picture.coarse.isfinite().float().mean()), 6),
+        "camera": asdict(picture.camera),
+        "input_depth": _plain(picture.encoding),
+        "depth_file": _plain(encoding),
+    }
+
+
+def versions() -> dict[str, str]:
+    """Return the versions of what computed the result."""
+    return {"dsr": version("dsr"), "python": platform.python_version(), **{name: version(name) for name in _PACKAGES}}
+
+
+def _plain(encoding: Encoding) -> dict[str, Any]:
+    """Return an encoding as JSON has it, which knows no NaN."""
+    entries = asdict(encoding)
+    return entries if math.isfinite(encoding.hole) else {**entries, "hole": str(encoding.hole)}

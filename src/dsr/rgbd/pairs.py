@@ -1,0 +1,146 @@
+"""Pairs of photo and depth map: from lists of files, and from two folders by the names in them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from dsr.rgbd.depth_files import DEPTH_SUFFIXES
+from dsr.rgbd.encoding import Fact
+from dsr.rgbd.names import PHOTO_SUFFIXES, match_names
+
+CAMERA_NAMES = (
+    "camera.json", "intrinsics.json", "intrinsic.json", "camera_intrinsic.json",
+    "intrinsic_color.txt", "intrinsics.txt", "intrinsic.txt",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Pair:
+    """Two files of one view.
+
+    Args:
+        name: of the result; unique among the pairs found together.
+        rgb, depth: the files.
+        camera: a camera file that lies beside them; None for none.
+        mask: a picture that is 0 where depth is unknown; None for none.
+        unit: metres per value where the layout tells it.
+        factor: how many times coarser the depth is where its name tells it, as in ``depth_lr4.npy``.
+
+    """
+
+    name: str
+    rgb: Path
+    depth: Path
+    camera: Path | None = None
+    mask: Path | None = None
+    unit: float | None = None
+    factor: int | None = None
+
+
+@dataclass(frozen=True)
+class Found:
+    """What was found.
+
+    Args:
+        pairs: in order.
+        facts: how they were recognised.
+        alone: pictures without a partner.
+
+    """
+
+    pairs: tuple[Pair, ...]
+    facts: tuple[Fact, ...] = ()
+    alone: tuple[Path, ...] = ()
+
+
+def pairs_of_lists(photos: Sequence[Path], depths: Sequence[Path], masks: Sequence[Path] = ()) -> Found:
+    """Return the pairs of files in the order given, or of two folders by the names in them.
+
+    Raises:
+        ValueError: the lists differ in length, mix files and folders, or nothing in the folders is a pair.
+
+    """
+    for name, paths in (("--rgb", photos), ("--depth", depths), ("--mask", masks)):
+        for path in paths:
+            if not path.exists():
+                raise ValueError(f"{name}: {path}: no such file or folder")
+    if len(photos) == len(depths) == 1 and photos[0].is_dir() and depths[0].is_dir():
+        if photos[0].samefile(depths[0]):
+            raise ValueError(
+                f"{photos[0]}: expected two folders; one that holds both is given without --rgb and --depth"
+            )
+        return pairs_of_two_folders(photos[0], depths[0], masks)
+    for path in (*photos, *depths, *masks):
+        if path.is_dir():
+            raise ValueError(f"{path}: expected files, or one folder each for --rgb and --depth")
+    if len(photos) != len(depths) or len(masks) not in (0, len(photos)):
+        counts = f"{len(photos)} for --rgb, {len(depths)} for --depth" + (f", {len(masks)} for --mask" if masks else "")
+        raise ValueError(f"expected as many depth maps (and masks, if any) as photos, got {counts}")
+    pairs = [
+        Pair(rgb.stem, rgb, depth, camera_beside(rgb.parent, rgb.parent))
+        for rgb, depth in zip(photos, depths, strict=True)
+    ]
+    if masks:
+        pairs = [replace(pair, mask=mask) for pair, mask in zip(pairs, masks, strict=True)]
+    return Found(named_apart(pairs))
+
+
+def pairs_of_two_folders(photos: Path, depths: Path, masks: Sequence[Path]) -> Found:
+    """Return the pairs of two folders by name."""
+    if masks:
+        raise ValueError("--mask: expected photos and depth maps as files, one for each mask; got folders")
+    left = [path for path in pictures_in(photos) if path.suffix.lower() in PHOTO_SUFFIXES]
+    right = [path for path in pictures_in(depths) if path.suffix.lower() in DEPTH_SUFFIXES]
+    found = matched(left, right)
+    if not found.pairs:
+        raise ValueError(
+            f"{photos} and {depths}: expected photos and depth maps of the same names, numbers or times (within 20 "
+            f"ms); of {len(left)} and {len(right)} none belong together"
+        )
+    camera = camera_beside(photos, photos.parent)
+    return replace(found, pairs=tuple(replace(pair, camera=camera) for pair in found.pairs))
+
+
+def camera_beside(folder: Path, root: Path) -> Path | None:
+    """Return a camera file in the folder, in its folders of intrinsics, or above it up to the root."""
+    places = [folder, folder / "intrinsic", folder / "intrinsics"]
+    while folder != root:
+        folder = folder.parent
+        places.append(folder)
+    return next((place / name for place in places for name in CAMERA_NAMES if (place / name).is_file()), None)
+
+
+def matched(photos: Iterable[Path], depths: Iterable[Path]) -> Found:
+    """Return the pairs among photos and depth maps by name; see :func:`dsr.rgbd.names.match_names`."""
+    photos, depths = list(photos), list(depths)
+    matches = match_names(photos, depths)
+    used = {path for match in matches for path in match}
+    alone = tuple(path for path in (*photos, *depths) if path not in used)
+    return Found(tuple(Pair(rgb.stem, rgb, depth) for rgb, depth in matches), (), alone)
+
+
+def pictures_in(folder: Path) -> list[Path]:
+    """Return the pictures and maps in a folder."""
+    suffixes = (*PHOTO_SUFFIXES, *DEPTH_SUFFIXES)
+    return sorted(
+        path for path in folder.iterdir()
+        if path.is_file() and path.suffix.lower() in suffixes and not path.name.startswith(".")
+    )  # fmt: skip
+
+
+def named_apart(pairs: Iterable[Pair]) -> tuple[Pair, ...]:
+    """Return the pairs under names of their own: that of the folder in front where two are the same, else a number."""
+    pairs = list(pairs)
+    names = [pair.name for pair in pairs]
+    if len(set(names)) < len(names):
+        names = [f"{pair.rgb.parent.name}_{name}" if names.count(name) > 1 else name
+                 for pair, name in zip(pairs, names, strict=True)]  # fmt: skip
+    unique: dict[str, Pair] = {}
+    for pair, name in zip(pairs, names, strict=True):
+        number, own = 2, name
+        while own.casefold() in unique:
+            number, own = number + 1, f"{name}_{number}"
+        unique[own.casefold()] = replace(pair, name=own)
+    return tuple(unique.values())

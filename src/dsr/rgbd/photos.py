@@ -1,0 +1,72 @@
+"""Photos as they lie in their files, and what their EXIF data tell (CIPA DC-008, JEITA CP-3451)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from dsr.data.files import read_pixels
+from dsr.rgbd.encoding import Fact
+
+_ORIENTATION, _EXIF_IFD, _EXIF_FOCAL_35 = 0x0112, 0x8769, 0xA405
+_ASPECT_TOLERANCE = 0.02
+_TURNS: dict[int, Callable[[np.ndarray], np.ndarray]] = {
+    2: lambda pixels: pixels[:, ::-1],
+    3: lambda pixels: pixels[::-1, ::-1],
+    4: lambda pixels: pixels[::-1],
+    5: lambda pixels: pixels.transpose(1, 0, 2),
+    6: lambda pixels: pixels.transpose(1, 0, 2)[:, ::-1],
+    7: lambda pixels: pixels[::-1, ::-1].transpose(1, 0, 2),
+    8: lambda pixels: pixels.transpose(1, 0, 2)[::-1],
+}
+"""What shows a photo upright, by EXIF orientation."""
+
+Size = tuple[int, int]
+"""Height and width in pixels."""
+
+
+def read_photo(path: Path, coarse: Size) -> tuple[np.ndarray, list[Fact]]:
+    """Return the photo, (H, W, 3) uint8 RGB, as it lies in its file; turned upright where depth fits that alone."""
+    if path.suffix.lower() in (".heic", ".heif"):
+        raise ValueError(f"{path}: expected a JPEG or PNG photo, got HEIC; export it as JPEG")
+    pixels = cv2.cvtColor(read_pixels(path, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION), cv2.COLOR_BGR2RGB)
+    orientation = orientation_of(path)
+    if orientation == 1:
+        return pixels, []
+    size: Size = (pixels.shape[0], pixels.shape[1])
+    if orientation >= 5 and not same_aspect(size, coarse) and same_aspect(size[::-1], coarse):
+        return _TURNS[orientation](pixels), [Fact("the photo is turned as its EXIF data say: so the depth map fits")]
+    return pixels, [Fact("the photo's EXIF orientation is left out: the depth map is taken to lie as the file does")]
+
+
+def same_aspect(first: Size, second: Size) -> bool:
+    """Return whether two sizes have one aspect, but for 2 %."""
+    return abs(first[0] * second[1] / (first[1] * second[0]) - 1) <= _ASPECT_TOLERANCE
+
+
+def focal_in_exif(photo: Path) -> float | None:
+    """Return the focal length in millimetres for 35 mm film that the photo's EXIF data tell; None where they do not."""
+    value = _exif(photo).get(_EXIF_FOCAL_35)
+    return float(value) if isinstance(value, (int, float)) and 1 < value < 10_000 else None
+
+
+def _exif(photo: Path) -> dict[int, Any]:
+    """Return the EXIF data of the photo, empty where there are none."""
+    from PIL import Image  # noqa: PLC0415 - it takes its time to import
+
+    try:
+        with Image.open(photo) as image:
+            exif = image.getexif()
+            return {**dict(exif), **exif.get_ifd(_EXIF_IFD)}
+    except Exception:  # damaged data of whatever camera are as good as none
+        return {}
+
+
+def orientation_of(photo: Path) -> int:
+    """Return the EXIF orientation of the photo, 1 (as it is) to 8; 1 where there is none."""
+    value = _exif(photo).get(_ORIENTATION, 1)
+    return value if isinstance(value, int) and 1 <= value <= 8 else 1

@@ -1,0 +1,79 @@
+"""What ``dsr upsample`` shows: facts, each once, and bars with the time left."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+
+import torch
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+from dsr.rgbd.encoding import Fact
+from dsr.terminal import one_line, show
+
+_SHOWN = 5
+"""Names that a line lists before it only counts."""
+
+
+class Reporter:
+    """Says every fact once, and counts for how many pictures it held."""
+
+    def __init__(self, console: Console) -> None:
+        self._console = console
+        self._counts: Counter[str] = Counter()
+
+    def say(self, line: str) -> None:
+        """Show a line."""
+        show(self._console, line)
+
+    def facts(self, facts: Sequence[Fact]) -> None:
+        """Show those facts that no picture before had."""
+        for fact in facts:
+            if not self._counts[fact.text]:
+                self.say(f"  {fact}")
+            self._counts[fact.text] += 1
+
+    def summary(self, pictures: int) -> None:
+        """Show which facts held for some pictures only."""
+        for text, count in self._counts.items():
+            if count < pictures:
+                self.say(f"  {count} of {pictures} pictures: {text}")
+
+
+def problem_line(error: BaseException) -> str:
+    """Return an error as one line."""
+    if isinstance(error, (MemoryError, torch.OutOfMemoryError)):
+        return "not enough memory; a smaller --scale, --device cpu or a smaller photo needs less"
+    return one_line(error)
+
+
+def listed(names: Sequence[str]) -> str:
+    """Return some of the names, and how many more there are."""
+    more = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
+    return ", ".join(names[:_SHOWN]) + more
+
+
+def bars(console: Console) -> Progress:
+    """Return bars with the time left, on a terminal only."""
+    columns = (
+        TextColumn("{task.description:<8}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TextColumn("left"),
+        TimeRemainingColumn(elapsed_when_finished=False),
+        TextColumn("{task.fields[remark]}", markup=False),
+    )
+    return Progress(*columns, console=console, transient=True, disable=not console.is_terminal)
+
+
+@contextmanager
+def steps(progress: Progress, name: str) -> Iterator[Callable[[int, int], None]]:
+    """Show the parts of one picture as they come."""
+    task = progress.add_task("parts", total=None, remark=name)
+    try:
+        yield lambda done, total: progress.update(task, completed=done, total=total)
+    finally:
+        progress.remove_task(task)

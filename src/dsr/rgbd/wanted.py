@@ -1,0 +1,94 @@
+"""What a user of ``dsr upsample`` asks for, and what of it a result depends on."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+from dsr.hashing import file_hash
+from dsr.rgbd.inputs import Reading
+from dsr.rgbd.outputs import FORMATS, PARTS
+from dsr.rgbd.pairs import Pair
+from dsr.upsampling import METHODS
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """What the user asks for.
+
+    Args:
+        output: the folder of the results.
+        folders: to look for pairs in.
+        rgb, depth, mask: files, or one folder each of the first two.
+        reading: how the files are to be read.
+        method, scale, device, keep_holes: see :func:`dsr.upsampling.upsample_depth`.
+        depth_format: of the result; None for the input's.
+        parts: what to write, some of :data:`dsr.rgbd.outputs.PARTS`.
+        overwrite: whether to redo what is there.
+        dry_run: whether only to say what would be done.
+
+    """
+
+    output: Path
+    folders: tuple[Path, ...] = ()
+    rgb: tuple[Path, ...] = ()
+    depth: tuple[Path, ...] = ()
+    mask: tuple[Path, ...] = ()
+    reading: Reading = field(default_factory=Reading)
+    method: str = "facets"
+    scale: int | None = None
+    device: str = "auto"
+    keep_holes: bool = False
+    depth_format: str | None = None
+    parts: tuple[str, ...] = PARTS
+    overwrite: bool = False
+    dry_run: bool = False
+
+    def __post_init__(self) -> None:
+        """Check what does not need the files."""
+        for name, value, known in (("--method", self.method, METHODS), ("--format", self.depth_format, FORMATS)):
+            if value is not None and value not in known:
+                raise ValueError(f"{name}: expected one of {', '.join(known)}, got {value!r}")
+        for part in self.parts:
+            if part not in PARTS:
+                raise ValueError(f"--only, --without: expected some of {', '.join(PARTS)}, got {part!r}")
+        if not self.parts:
+            raise ValueError("--only, --without: expected something to be left to write, got nothing")
+        if bool(self.folders) == bool(self.rgb or self.depth) or bool(self.rgb) != bool(self.depth):
+            raise ValueError("expected --rgb and --depth, or folders that hold both")
+        if self.folders and self.mask:
+            raise ValueError("--mask: expected --rgb and --depth with it, got folders")
+
+
+def settings_of(wanted: Wanted) -> dict[str, Any]:
+    """Return what a result depends on beside its inputs, as JSON has it."""
+    reading = asdict(wanted.reading)
+    choice = reading.pop("camera")
+    return {
+        "method": wanted.method,
+        "scale": wanted.scale,
+        "keep_holes": wanted.keep_holes,
+        "format": wanted.depth_format,
+        **reading,
+        "fov": choice["fov"],
+        "intrinsics": None if choice["intrinsics"] is None else list(choice["intrinsics"]),
+    }
+
+
+def files_of(pair: Pair, reading: Reading) -> dict[str, Path]:
+    """Return the files that a result depends on."""
+    given = reading.camera.fov is not None or reading.camera.intrinsics is not None
+    camera = reading.camera.file or (None if given else pair.camera)
+    found = {"rgb": pair.rgb, "depth": pair.depth, "camera": camera, "mask": pair.mask}
+    return {name: path for name, path in found.items() if path is not None}
+
+
+def inputs_of(pair: Pair, reading: Reading) -> dict[str, dict[str, str]]:
+    """Return the inputs and their hashes, as JSON has them."""
+    inputs = {}
+    for name, path in files_of(pair, reading).items():
+        if not path.is_file():
+            raise ValueError(f"{path}: there is no such file")
+        inputs[name] = {"file": path.name, "sha256": file_hash(path)}
+    return inputs

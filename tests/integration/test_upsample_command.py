@@ -1,0 +1,328 @@
+"""``dsr upsample`` on people's own pictures: results, what was assumed, resuming, and every refusal."""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+
+from dsr.cli import main
+from dsr.data.simgeo_scenes import render_scene
+from dsr.geometry.camera import Camera
+from dsr.rgbd.depth_files import read_depth_file, write_depth_file
+
+PARTS = {
+    "depth": ("depth.png", "depth_metres.npy"),
+    "renderings": tuple(f"renderings/e{number}.png" for number in range(1, 5)),
+    "normals": ("normals.png",),
+    "cloud": ("cloud.ply",),
+    "mesh": ("mesh.ply", "mesh.glb"),
+    "before_after": ("before_after.png",),
+}
+BICUBIC = ("--method", "bicubic")
+DEPTH_ONLY = (*BICUBIC, "--only", "depth")
+
+
+@pytest.fixture(scope="module")
+def cube():
+    return render_scene("cube_no_texture", 64)
+
+
+@pytest.fixture
+def pair(tmp_path, cube):
+    """A photo of 64 x 64 and its depth, a quarter as large, in whole millimetres with a hole of 2 x 3."""
+    coarse = cube.depth.reshape(16, 4, 16, 4).mean((1, 3))
+    values = np.round(coarse * 1000).astype(np.uint16)
+    values[5:7, 3:6] = 0
+    Image.fromarray(cube.rgb).save(tmp_path / "photo.png")
+    Image.fromarray(values).save(tmp_path / "depth.png")
+    return tmp_path / "photo.png", tmp_path / "depth.png", values
+
+
+def upsample(*arguments):
+    return main(["upsample", *map(str, arguments)])
+
+
+def of(pair, folder, *arguments):
+    return upsample("--rgb", pair[0], "--depth", pair[1], "-o", folder, *arguments)
+
+
+def info(folder):
+    return json.loads((folder / "info.json").read_text())
+
+
+def refused(capsys, code):
+    """Return the one line on stderr of a command that ended with 2."""
+    error = capsys.readouterr().err
+    assert (code, error.count("\n"), error[:7]) == (2, 1, "error: ")
+    return error[7:-1]
+
+
+def files_in(folder):
+    return {str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file()}
+
+
+def test_two_files_are_enough_and_everything_assumed_is_said(pair, cube, tmp_path, capsys):
+    out = tmp_path / "out"
+    assert of(pair, out) == 0
+    said = capsys.readouterr().out
+    for text in (
+        "60 degrees of horizontal view assumed",
+        "whole numbers are taken for millimetres (median ",
+        "zeros count as holes (2.3%)",
+        "depth_metres.npy is not rounded",
+    ):
+        assert text in said
+    assert files_in(out) == {*sum(PARTS.values(), ()), "info.json"}
+    metres = np.load(out / "depth_metres.npy")
+    assert (metres.shape, metres.dtype) == ((64, 64), np.float32)
+    assert np.abs(metres - cube.depth).mean() < 0.05
+    stored = np.asarray(Image.open(out / "depth.png"))
+    assert stored.dtype == np.uint16
+    np.testing.assert_array_equal(stored, np.round(metres.astype(float) * 1000))
+    told = info(out)
+    assert (told["complete"], told["scale"], told["settings"]["method"]) == (True, 4, "facets")
+    assert told["depth_file"] == {
+        "suffix": ".png",
+        "dtype": "uint16",
+        "unit": 0.001,
+        "hole": 0,
+        "range_type": "orthogonal",
+    }
+    assert told["photo_size"] == [64, 64]
+    assert Camera(**told["camera"]).fx == pytest.approx(32 / np.tan(np.pi / 6))
+    assert len(told["assumptions"]) == 4
+    assert told["files"] == [name for names in PARTS.values() for name in names]
+
+
+@pytest.mark.parametrize(
+    ("suffix", "factor", "dtype"),
+    [("tiff", 1, "f4"), ("npy", 1000, "f4"), ("pfm", 1, "f4"), ("exr", 1, "f4"), ("npz", 1, "f8")],
+)
+def test_the_result_is_in_the_input_s_format_type_unit_and_holes(pair, tmp_path, suffix, factor, dtype):
+    photo, _, values = pair
+    metres = np.where(values == 0, np.nan, values / 1000)
+    depth = tmp_path / f"d.{suffix}"
+    write_depth_file(depth, (metres * factor).astype(dtype))
+    out = tmp_path / "out"
+    assert of((photo, depth), out, *DEPTH_ONLY, "--keep-holes") == 0
+    stored = read_depth_file(out / f"depth.{suffix}")
+    plain = "depth.npy" if not (out / "depth_metres.npy").exists() else "depth_metres.npy"
+    result = np.load(out / plain)
+    assert (stored.dtype, stored.shape) == (np.dtype(dtype), (64, 64))
+    np.testing.assert_allclose(stored / factor, result, rtol=1e-6)
+    assert np.isnan(stored[22:26, 14:22]).all()
+    assert 0 < np.isnan(stored).mean() < 0.1
+
+
+def test_another_format_is_in_metres_or_in_whole_millimetres(pair, tmp_path):
+    out = tmp_path / "out"
+    assert of(pair, out, *DEPTH_ONLY, "--format", "pfm", "--depth-unit", "cm") == 0
+    assert files_in(out) == {"depth.pfm", "depth_metres.npy", "info.json"}
+    np.testing.assert_array_equal(read_depth_file(out / "depth.pfm"), np.load(out / "depth_metres.npy"))
+    assert np.median(np.load(out / "depth_metres.npy")) > 10
+
+
+def test_holes_are_filled_unless_they_are_to_be_kept(pair, tmp_path):
+    assert of(pair, tmp_path / "filled", *DEPTH_ONLY) == 0
+    assert of(pair, tmp_path / "kept", *DEPTH_ONLY, "--keep-holes") == 0
+    filled, kept = (np.asarray(Image.open(tmp_path / name / "depth.png")) for name in ("filled", "kept"))
+    assert filled.min() > 0
+    assert (kept[22:26, 14:22] == 0).all()
+
+
+def test_a_mask_makes_holes(pair, tmp_path):
+    mask = np.full((16, 16), 255, np.uint8)
+    mask[:, 10:] = 0
+    Image.fromarray(mask).save(tmp_path / "mask.png")
+    assert of(pair, tmp_path / "out", *DEPTH_ONLY, "--keep-holes", "--mask", tmp_path / "mask.png") == 0
+    assert (np.asarray(Image.open(tmp_path / "out" / "depth.png"))[:, 44:] == 0).all()
+    assert set(info(tmp_path / "out")["inputs"]) == {"rgb", "depth", "mask"}
+
+
+def test_a_disparity_becomes_a_finer_disparity_of_the_finer_pixels(pair, cube, tmp_path):
+    coarse = cube.depth.reshape(16, 4, 16, 4).mean((1, 3))
+    depth = tmp_path / "disparity.npy"
+    np.save(depth, (0.1 * cube.camera.fx / 4 / coarse).astype(np.float32))
+    numbers = [getattr(cube.camera, name) for name in ("fx", "fy", "cx", "cy")]
+    out = tmp_path / "out"
+    assert of((pair[0], depth), out, *DEPTH_ONLY, "--baseline", 0.1, "--intrinsics", *numbers) == 0
+    metres = np.load(out / "depth_metres.npy")
+    assert np.abs(metres - cube.depth).mean() < 0.05
+    np.testing.assert_allclose(np.load(out / "depth.npy"), 0.1 * cube.camera.fx / metres, rtol=1e-5)
+
+
+def test_the_same_command_again_does_nothing_and_another_part_needs_no_new_depth(pair, tmp_path, capsys, monkeypatch):
+    out = tmp_path / "out"
+    assert of(pair, out, *DEPTH_ONLY) == 0
+    times = {name: (out / name).stat().st_mtime_ns for name in files_in(out)}
+    assert of(pair, out, *DEPTH_ONLY) == 0
+    assert "photo: complete already" in capsys.readouterr().out
+    assert times == {name: (out / name).stat().st_mtime_ns for name in files_in(out)}
+    monkeypatch.setattr("dsr.rgbd.command.upsample_depth", None)
+    assert of(pair, out, *BICUBIC, "--only", "normals") == 0
+    assert (
+        files_in(out)
+        == {"depth.png", "depth_metres.npy", "normals.png", "info.json"}
+        == {*info(out)["files"], "info.json"}
+    )
+    assert of(pair, out, *BICUBIC, "--only", "normals,depth") == 0
+    assert "photo: complete already" in capsys.readouterr().out
+
+
+def test_a_result_of_other_settings_or_inputs_is_kept_unless_told_otherwise(pair, tmp_path, capsys):
+    out = tmp_path / "out"
+    assert of(pair, out, *DEPTH_ONLY) == 0
+    before = (out / "depth.png").read_bytes()
+    message = refused(capsys, of(pair, out, *DEPTH_ONLY, "--fov", 70))
+    assert message == f"{out}: holds a result of other settings: fov None; take another -o, or --overwrite"
+    Image.fromarray(pair[2] + np.uint16(100)).save(pair[1])
+    message = refused(capsys, of(pair, out, *DEPTH_ONLY))
+    assert message == f"{out}: holds a result of other inputs: photo.png, depth.png; take another -o, or --overwrite"
+    assert (out / "depth.png").read_bytes() == before
+    assert of(pair, out, *DEPTH_ONLY, "--overwrite", "--format", "npy") == 0
+    assert files_in(out) == {"depth.npy", "depth_metres.npy", "info.json"} - {"depth_metres.npy"}
+
+
+def test_an_interrupted_run_goes_on(pair, tmp_path, capsys, monkeypatch):
+    out = tmp_path / "out"
+
+    def interrupt(*_):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr("dsr.rgbd.outputs.write_normals", interrupt)
+        assert of(pair, out, *BICUBIC, "--only", "depth,normals") == 130
+    assert "the same command goes on from there" in capsys.readouterr().err
+    assert info(out)["complete"] is False
+    assert of(pair, out, *BICUBIC, "--only", "depth,normals") == 0
+    assert info(out)["complete"] is True
+
+
+def test_a_result_overwrites_neither_its_input_nor_files_of_others(pair, tmp_path, capsys):
+    assert "depth.png: the result would overwrite its input" in refused(capsys, of(pair, tmp_path, *DEPTH_ONLY))
+    assert "the result would overwrite its input" in refused(capsys, of(pair, tmp_path, *DEPTH_ONLY, "--overwrite"))
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / "mesh.ply").write_text("mine")
+    assert "mesh.ply: is there already and not of an earlier run" in refused(capsys, of(pair, out, *DEPTH_ONLY))
+    (out / "info.json").write_text("{}")
+    assert "info.json: expected a file of `dsr upsample`" in refused(capsys, of(pair, out, *DEPTH_ONLY))
+    assert files_in(out) == {"mesh.ply", "info.json"}
+
+
+def test_of_three_pictures_a_broken_one_does_not_stop_the_others(pair, tmp_path, capsys):
+    frames = tmp_path / "frames"
+    for number in range(3):
+        for kind, path in (("rgb", pair[0]), ("depth", pair[1])):
+            (frames / kind).mkdir(parents=True, exist_ok=True)
+            shutil.copy(path, frames / kind / f"{number:06}.png")
+    (frames / "depth" / "000001.png").write_bytes(pair[1].read_bytes()[:60])
+    (frames / "rgb" / "000007.png").touch()
+    out = tmp_path / "out"
+    code = upsample(frames, "-o", out, *DEPTH_ONLY)
+    told = capsys.readouterr()
+    assert code == 2
+    assert told.err == (
+        f"error: 000001: {frames}/depth/000001.png: expected a picture, got a damaged or foreign file of 60 bytes\n"
+    )
+    assert (
+        "3 pairs of photo and depth map\n  folders rgb and depth\n  1 without a partner, left out: 000007.png"
+        in told.out
+    )
+    assert told.out.count("degrees of horizontal view assumed") == 1
+    assert f"3 pictures: 2 done, 1 failed -> {out}" in told.out
+    assert files_in(out) == {
+        f"{name}/{file}" for name in ("000000", "000002") for file in ("depth.png", "depth_metres.npy", "info.json")
+    }
+    shutil.copy(pair[1], frames / "depth" / "000001.png")
+    assert upsample(frames, "-o", out, *DEPTH_ONLY) == 0
+    assert f"3 pictures: 2 complete already, 1 done -> {out}" in capsys.readouterr().out
+
+
+def test_the_published_scenes_are_read_with_their_cameras(shared, tmp_path, capsys):
+    assert upsample(shared / "scenes", "-o", tmp_path / "out", "--dry-run") == 0
+    said = capsys.readouterr().out
+    assert "3 pairs of photo and depth map\n  camera: camera.json beside the pictures\n" in said
+    assert "taken for disparities, by the file's name" in said
+    assert said.endswith(f"3 pictures: 3 to do -> {tmp_path / 'out'}\n")
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("--method", "magic"), "--method: expected one of"),
+        (("--format", "jpg"), "--format: expected one of png, tiff, npy, npz, pfm, exr, got 'jpg'"),
+        (("--only", "depth,film"), "--only, --without: expected some of depth, renderings"),
+        (("--without", "film"), "--only, --without: expected some of depth, renderings"),
+        (("--only", ","), "expected something to be left to write"),
+        (("--depth-unit", "inch"), "--depth-unit: expected m, cm, mm or metres per value"),
+        (("--baseline", "0"), "--baseline: expected a positive number of metres, got 0"),
+        (("--fov", "200"), "--fov: expected degrees from 1 to below 180, got 200"),
+        (("--range-type", "disparity"), "depth.png: disparities need the distance between the two cameras"),
+        (("some_folder",), "expected --rgb and --depth, or folders that hold both"),
+    ],
+)
+def test_arguments_that_cannot_be_are_refused_in_one_line(pair, tmp_path, capsys, arguments, message):
+    assert message in refused(capsys, of(pair, tmp_path / "out", *BICUBIC, *arguments))
+    assert not (tmp_path / "out").exists()
+
+
+def test_pictures_that_do_not_fit_each_other_are_refused_in_one_line(pair, tmp_path, capsys):
+    photo, depth, _ = pair
+    for name, array, message in (
+        (
+            "large.png",
+            np.ones((128, 128), np.uint16),
+            "expected no more pixels than the photo, got 128 x 128; the photo photo.png has 64 x 64",
+        ),
+        ("wide.png", np.full((9, 16), 1000, np.uint16), "expected the photo's aspect and field of view, got 16 x 9"),
+        ("eight.png", np.full((16, 16), 7, np.uint8), "too coarse for depth"),
+        ("holes.png", np.zeros((16, 16), np.uint16), "expected at least one known pixel, all are holes"),
+        ("one.png", np.full((1, 1), 1000, np.uint16), "expected at least 2 x 2 pixels, got 1 x 1"),
+    ):
+        Image.fromarray(array).save(tmp_path / name)
+        assert message in refused(capsys, of((photo, tmp_path / name), tmp_path / "out", *DEPTH_ONLY))
+    cv2.imwrite(str(tmp_path / "mask.png"), np.ones((64, 64), np.uint8))
+    message = refused(capsys, of(pair, tmp_path / "out", *DEPTH_ONLY, "--mask", tmp_path / "mask.png"))
+    assert "mask.png: expected a mask of the depth map's 16 x 16 pixels (width x height), got 64 x 64" in message
+    (tmp_path / "photo.heic").touch()
+    assert "got HEIC; export it as JPEG" in refused(
+        capsys, of((tmp_path / "photo.heic", depth), tmp_path / "out", *DEPTH_ONLY)
+    )
+    assert "--rgb: " in refused(capsys, of((tmp_path / "none.jpg", depth), tmp_path / "out", *DEPTH_ONLY))
+    assert not (tmp_path / "out").exists()
+
+
+def test_the_help_comes_without_loading_what_computes():
+    code = "import sys, dsr.cli; sys.argv[1:] = ['upsample', '-h']\ntry: dsr.cli.main()\nexcept SystemExit: pass\n"
+    code += "print(sorted({'torch', 'cv2', 'matplotlib', 'scipy', 'PIL'} & sys.modules.keys()))"
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=True,
+        env={**os.environ, "COLUMNS": "100"},
+    )
+    assert "dsr upsample --rgb photo.jpg --depth depth.png -o out" in done.stdout
+    assert done.stdout.endswith("[]\n")
+
+
+def test_depth_that_was_enlarged_by_repeating_pixels_is_as_good_as_before(pair, tmp_path, capsys):
+    photo, _, values = pair
+    Image.fromarray(values.repeat(4, axis=0).repeat(4, axis=1)).save(tmp_path / "enlarged.png")
+    assert of(pair, tmp_path / "small", *DEPTH_ONLY) == 0
+    capsys.readouterr()
+    assert of((photo, tmp_path / "enlarged.png"), tmp_path / "large", *DEPTH_ONLY) == 0
+    said = capsys.readouterr().out
+    assert "the depth map was enlarged x4 by repeating pixels, which are dropped" in said
+    assert "16 x 16 depth to 64 x 64 by bicubic x4" in said
+    small, large = (np.load(tmp_path / name / "depth_metres.npy") for name in ("small", "large"))
+    np.testing.assert_array_equal(small, large)

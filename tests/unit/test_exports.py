@@ -1,0 +1,219 @@
+"""What is written beside an upsampled depth map, read back by other programs' code."""
+
+import struct
+
+import cv2
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from dsr.geometry.camera import Camera
+from dsr.geometry.mesh import triangulate
+from dsr.geometry.shading import render
+from dsr.geometry.surface import normals_of
+from dsr.rgbd import before_after, exports
+from dsr.rgbd.before_after import write_before_after
+from dsr.rgbd.exports import write_cloud, write_mesh, write_normals, write_renderings
+from dsr.rgbd.modelfiles import write_glb
+
+CAMERA = Camera(24, 18, 30, 30, 11.5, 8.5)
+NORMAL_OF_A_WALL = [128, 128, 255]
+
+
+def wall(camera=CAMERA):
+    return torch.full((1, camera.height, camera.width), 2.0)
+
+
+def bumpy(camera=CAMERA, seed=0):
+    noise = torch.rand(1, camera.height, camera.width, generator=torch.Generator().manual_seed(seed))
+    return 2 + 0.02 * noise
+
+
+def photo(camera=CAMERA):
+    """Return a picture with red growing to the right, green downward."""
+    rows, columns = torch.meshgrid(torch.arange(camera.height), torch.arange(camera.width), indexing="ij")
+    return torch.stack((columns / camera.width, rows / camera.height, torch.full(rows.shape, 0.5)))
+
+
+def leaning(axis, camera=CAMERA):
+    """Return a plane whose normal leans by 45 degrees along an axis, towards its positive end."""
+    return (2 / (1 - camera.rays()[axis]))[None]
+
+
+def read(path):
+    picture = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    return picture if picture.ndim == 2 else picture[..., [2, 1, 0, *range(3, picture.shape[2])]]
+
+
+def test_renderings_are_the_protocol_s_in_eight_bits(tmp_path):
+    paths = write_renderings(tmp_path / "new", bumpy(), CAMERA)
+    assert [path.name for path in paths] == ["e1.png", "e2.png", "e3.png", "e4.png"]
+    expected = render(normals_of(bumpy().double()[None], CAMERA.rays()[None]))[0]
+    for path, shades in zip(paths, expected, strict=True):
+        assert read(path).shape == (18, 24)
+        np.testing.assert_allclose(read(path), 255 * shades.numpy(), atol=0.51)
+
+
+@pytest.mark.parametrize("strip", [1, 24 * 5, 24 * 17])
+def test_strips_leave_no_seam(tmp_path, monkeypatch, strip):
+    write_renderings(tmp_path / "whole", bumpy(), CAMERA)
+    write_normals(tmp_path / "whole" / "normals.png", bumpy(), CAMERA)
+    monkeypatch.setattr(exports, "_STRIP", strip)
+    write_renderings(tmp_path / "strips", bumpy(), CAMERA)
+    write_normals(tmp_path / "strips" / "normals.png", bumpy(), CAMERA)
+    for path in (tmp_path / "whole").iterdir():
+        np.testing.assert_array_equal(read(path), read(tmp_path / "strips" / path.name))
+
+
+def test_holes_are_transparent(tmp_path):
+    depth = bumpy()
+    depth[0, 4:7, 5:9] = torch.nan
+    write_renderings(tmp_path, depth, CAMERA)
+    write_normals(tmp_path / "normals.png", depth, CAMERA)
+    transparent = np.zeros((18, 24), bool)
+    transparent[3:7, 4:9] = True
+    transparent[3, 4] = False  # its normal needs the pixels to the right and below alone
+    for name in ("e1.png", "e4.png", "normals.png"):
+        picture = read(tmp_path / name)
+        assert picture.shape == (18, 24, 4)
+        np.testing.assert_array_equal(picture[..., 3] == 0, transparent)
+
+
+def test_a_wall_s_normal_map_is_the_usual_light_blue(tmp_path):
+    write_normals(tmp_path / "n.png", wall(), CAMERA)
+    assert (read(tmp_path / "n.png") == NORMAL_OF_A_WALL).all()
+
+
+@pytest.mark.parametrize(("axis", "colour"), [(0, [218, 128, 218]), (1, [128, 37, 218])])
+def test_normals_to_the_right_are_red_and_downward_lack_green(tmp_path, axis, colour):
+    write_normals(tmp_path / "n.png", leaning(axis), CAMERA)
+    np.testing.assert_allclose(read(tmp_path / "n.png").reshape(-1, 3), [colour] * (18 * 24), atol=1)
+
+
+def test_a_cloud_has_every_known_pixel_with_its_colour(tmp_path):
+    depth = bumpy()
+    depth[0, 3] = torch.nan
+    assert write_cloud(tmp_path / "c.ply", photo(), depth, CAMERA) == 17 * 24
+    cloud = trimesh.load(tmp_path / "c.ply")
+    points = (CAMERA.rays() * depth).flatten(1).T
+    kept = points.isfinite().all(dim=1)
+    np.testing.assert_allclose(cloud.vertices, points[kept], rtol=1e-6, atol=1e-6)
+    np.testing.assert_allclose(cloud.colors[:, :3], 255 * photo().flatten(1).T[kept], atol=0.51)
+
+
+def test_the_ply_header_says_what_the_axes_are_and_the_normals_face_the_camera(tmp_path):
+    write_cloud(tmp_path / "c.ply", photo(), wall(), CAMERA)
+    header, _, content = (tmp_path / "c.ply").read_bytes().partition(b"end_header\n")
+    assert b"comment camera frame: x right, y down, z forward; metres" in header
+    assert len(content) == 24 * 18 * 28
+    assert struct.unpack("<6f4B", content[:28]) == pytest.approx(
+        (-2 * 11.5 / 30, -2 * 8.5 / 30, 2, 0, 0, -1, 0, 0, 128, 255), abs=1e-6
+    )
+
+
+def test_a_ply_mesh_is_read_back_with_its_faces(tmp_path):
+    mesh = write_mesh(tmp_path / "m.ply", photo(), bumpy(), CAMERA)
+    again = trimesh.load(tmp_path / "m.ply", process=False)
+    np.testing.assert_array_equal(again.vertices, mesh.vertices)
+    np.testing.assert_array_equal(again.faces, mesh.faces)
+    np.testing.assert_allclose(again.visual.vertex_colors[:, :3], 255 * photo().flatten(1).T, atol=0.51)
+
+
+def test_a_glb_mesh_is_y_up_looks_along_minus_z_and_wears_the_photo(tmp_path):
+    mesh = write_mesh([tmp_path / "m.glb"], photo(), bumpy(), CAMERA)
+    [again] = trimesh.load(tmp_path / "m.glb", process=False).geometry.values()
+    np.testing.assert_allclose(again.vertices, mesh.vertices * np.array([1, -1, -1]), rtol=1e-6)
+    np.testing.assert_array_equal(again.faces, mesh.faces)
+    assert (again.face_normals[:, 2] > 0).all()  # towards a viewer on the positive z axis
+    assert (again.vertex_normals[:, 2] > 0).all()
+    colours = again.visual.to_color().vertex_colors[:, :3]
+    np.testing.assert_allclose(colours, 255 * photo().flatten(1).T, atol=0.51)
+    material = again.visual.material
+    assert (material.metallicFactor, material.roughnessFactor, material.doubleSided) == (0, 1, True)
+
+
+def test_a_large_photo_becomes_a_texture_that_viewers_take(tmp_path):
+    picture = np.zeros((1, 5000, 3), np.uint8)
+    picture[:, 2500:] = 200
+    points = np.array([[0, 0, 1], [1, 0, 1], [0, 1, 1.0]])
+    normals, corners = np.tile([0.0, 0, -1], (3, 1)), np.array([[0, 2, 1]])
+    write_glb(tmp_path / "m.glb", points, normals, corners, np.array([[0, 0], [4999, 0], [2600, 0]]), picture)
+    [again] = trimesh.load(tmp_path / "m.glb", process=False).geometry.values()
+    assert again.visual.material.baseColorTexture.size == (4096, 1)
+    assert again.visual.to_color().vertex_colors[:, 0].tolist() == [0, 200, 200]
+
+
+def test_meshes_are_cut_at_steps_and_thinned(tmp_path):
+    depth = wall()
+    depth[0, :, 12:] = 3
+    assert len(write_mesh(tmp_path / "m.ply", photo(), depth, CAMERA).faces) == 2 * 17 * 22
+    assert len(write_mesh(tmp_path / "m.ply", photo(), depth, CAMERA, largest_step=0.6).faces) == 2 * 17 * 23
+    assert len(write_mesh(tmp_path / "m.ply", photo(), depth, CAMERA, most=150).vertices) == 9 * 12
+    assert write_cloud(tmp_path / "c.ply", photo(), depth, CAMERA, most=150) == 9 * 12
+
+
+@pytest.mark.parametrize("name", ["m.obj", "m"])
+def test_an_unknown_kind_of_mesh_is_refused_before_anything_is_written(tmp_path, name):
+    with pytest.raises(ValueError, match=r"m.*: expected a mesh file, .ply or .glb, got"):
+        write_mesh([tmp_path / "a.ply", tmp_path / name], photo(), wall(), CAMERA)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_map_without_two_neighbours_is_refused_and_an_older_file_is_kept(tmp_path):
+    depth = torch.full_like(wall(), torch.nan)
+    depth[0, 3, 3] = 2
+    (tmp_path / "m.glb").write_text("old")
+    with pytest.raises(ValueError, match=r"m.glb: expected neighbours of known depth"):
+        write_mesh(tmp_path / "m.glb", photo(), depth, CAMERA)
+    assert (tmp_path / "m.glb").read_text() == "old"
+    triangulate(depth, CAMERA, isolated=True)
+    assert write_cloud(tmp_path / "c.ply", photo(), depth, CAMERA) == 1
+
+
+@pytest.fixture
+def drawn(monkeypatch):
+    """What would have been written, with its dots per inch."""
+    figures = []
+    monkeypatch.setattr(before_after, "write_figure", lambda _, figure, dpi: figures.append((figure, dpi)))
+    return figures
+
+
+@pytest.mark.parametrize(
+    ("size", "coarse"), [((18, 24), (5, 6)), ((18, 24), (18, 24)), ((9, 60), (3, 20)), ((60, 9), (15, 2))]
+)
+def test_a_before_after_picture_is_at_most_2400_pixels_wide(tmp_path, drawn, size, coarse):
+    camera = Camera(size[1], size[0], 30, 30, size[1] / 2, size[0] / 2)
+    write_before_after(tmp_path, photo(camera), bumpy(camera.rescale(*coarse[::-1])), bumpy(camera), camera, "t")
+    [(figure, dpi)] = drawn
+    assert 1200 < figure.get_figwidth() * dpi <= 2400
+    assert figure.get_figheight() * dpi < 3300
+    width, height = figure.axes[0].get_position().size * figure.get_size_inches()
+    assert height / width == pytest.approx(size[0] / size[1])
+
+
+def test_a_before_after_picture_is_written_with_any_title_and_holes(tmp_path):
+    depth = bumpy()
+    depth[0, 1, 2] = torch.nan
+    write_before_after(tmp_path / "b.png", photo(), bumpy(CAMERA.rescale(6, 5)), depth, CAMERA, "a_b $c$ {} \u65e5")
+    assert [path.name for path in tmp_path.iterdir()] == ["b.png"]
+    assert read(tmp_path / "b.png").shape[1] == 2388
+
+
+def test_the_detail_of_a_before_after_picture_is_where_the_surface_changed(tmp_path, drawn):
+    depth = wall()
+    depth[0, 10:13, 15:19] += 0.05 * torch.rand(3, 4, generator=torch.Generator().manual_seed(1))
+    write_before_after(tmp_path / "b.png", photo(), wall(), depth, CAMERA, "t")
+    [(figure, _)] = drawn
+    frames = [axes.patches[0] for axes in figure.axes if axes.patches]
+    assert len(frames) == 3
+    for frame in frames:
+        left, top = frame.get_x() * 24, frame.get_y() * 18
+        assert left <= 14
+        assert top <= 9
+        assert left + frame.get_width() * 24 >= 19
+        assert top + frame.get_height() * 18 >= 13
+    limits = {
+        axes.images[0].get_clim() for axes in figure.axes if axes.images and axes.images[0].cmap.name == "viridis"
+    }
+    assert len(limits) == 1

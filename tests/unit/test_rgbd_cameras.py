@@ -1,0 +1,153 @@
+"""Cameras of people's photos: files of several programs, numbers, EXIF data, and what is assumed without."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from dsr.geometry.camera import Camera
+from dsr.rgbd.cameras import CameraChoice, camera_of
+from dsr.rgbd.photos import read_photo
+
+SIZE, COARSE = (48, 64), (12, 16)
+OWN = {"width": 64, "height": 48, "fx": 60.0, "fy": 61.0, "cx": 31.0, "cy": 24.0}
+MATRIX = [[60.0, 0, 31], [0, 61, 24], [0, 0, 1]]
+
+
+def written(folder, name, content):
+    path = folder / name
+    path.write_text(content if isinstance(content, str) else json.dumps(content))
+    return path
+
+
+def photo(folder, exif=None, size=SIZE):
+    """Return a JPEG file with EXIF entries: main ones, and the focal length of the Exif part."""
+    path, entries = folder / "photo.jpg", Image.Exif()
+    for tag, value in (exif or {}).items():
+        (entries.get_ifd(0x8769) if tag == 0xA405 else entries)[tag] = value
+    pixels = np.linspace(0, 255, size[0] * size[1] * 3).reshape(*size, 3).astype("u1")
+    Image.fromarray(pixels).save(path, exif=entries, quality=95)
+    return path
+
+
+def found(folder, **choice):
+    description, facts = camera_of(CameraChoice(**choice), photo(folder), SIZE, COARSE)
+    return description.camera, [str(fact) for fact in facts]
+
+
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        ("camera.json", OWN),
+        ("open3d.json", {"width": 64, "height": 48, "intrinsic_matrix": [60.0, 0, 0, 0, 61, 0, 31, 24, 1]}),
+    ],
+)
+def test_a_camera_file_of_the_photo_is_taken_as_it_is_without_a_word(tmp_path, name, content):
+    assert found(tmp_path, file=written(tmp_path, name, content)) == (Camera(**OWN), [])
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "60 0 31\n0 61 24\n0 0 1\n", "60 0 31 0 61 24 0 0 1", "60,0,31\n0,61,24\n0,0,1",
+        "6e1 0 31 0\n0 61 24 0\n0 0 1 0\n0 0 0 1\n",
+    ],
+)  # fmt: skip
+def test_a_matrix_of_sun_rgbd_or_scannet_is_of_the_photo_s_pixels(tmp_path, text):
+    camera, facts = found(tmp_path, file=written(tmp_path, "intrinsics.txt", text))
+    assert camera == Camera(**OWN)
+    assert facts == ["camera: the matrix is taken for one of the photo's pixels"]
+
+
+def test_a_matrix_of_the_depth_map_s_pixels_is_recognised_and_scaled(tmp_path):
+    camera, facts = found(tmp_path, file=written(tmp_path, "k.txt", "15 0 7.5 0 15 5.5 0 0 1"))
+    assert camera == Camera(64, 48, 60, 60, 31.5, 23.5)
+    assert "depth map's pixels" in facts[0]
+    assert "16 x 12 pixels is scaled to the photo's 64 x 48" in facts[1]
+
+
+def test_a_camera_of_another_resolution_is_scaled_about_the_outer_edge(tmp_path):
+    camera, facts = found(tmp_path, file=written(tmp_path, "c.json", {**OWN, "width": 128, "height": 96}))
+    assert camera == Camera(64, 48, 30, 30.5, 31.5 / 2 - 0.5, 24.5 / 2 - 0.5)
+    assert facts == ["camera: that of 128 x 96 pixels is scaled to the photo's 64 x 48"]
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("c.json", {**OWN, "width": 80}, "another aspect"),
+        ("c.json", {**OWN, "fx": "wide"}, "fx: expected a number"),
+        ("c.json", {"intrinsic_matrix": [1, 2]}, "intrinsic_matrix: expected nine numbers"),
+        ("c.json", {"intrinsic_matrix": np.transpose(MATRIX).ravel().tolist()}, '"width" and "height"'),
+        ("c.json", {"width": 64, "height": 48, "intrinsic_matrix": np.ravel(MATRIX).tolist()}, "expected a matrix"),
+        ("c.json", "{", "expected JSON"),
+        ("k.txt", "a matrix", "expected JSON or a matrix"),
+        ("k.txt", "1 2 3", "expected JSON or a matrix"),
+        ("k.txt", "60 0 310 0 61 240 0 0 1", "expected a principal point near the middle"),
+        ("k.txt", "-60 0 31 0 61 24 0 0 1", r"expected a matrix \(fx 0 cx"),
+        ("missing.txt", None, "expected a camera file, there is none"),
+    ],
+)
+def test_a_camera_file_that_does_not_fit_is_refused_by_name(tmp_path, name, content, message):
+    path = tmp_path / name if content is None else written(tmp_path, name, content)
+    with pytest.raises(ValueError, match=message) as caught:
+        found(tmp_path, file=path)
+    assert str(caught.value).startswith(f"{path}: ")
+
+
+def test_numbers_of_the_command_line_are_pixels_of_the_photo(tmp_path):
+    assert found(tmp_path, intrinsics=(60.0, 61.0, 31.0, 24.0)) == (Camera(**OWN), [])
+
+
+def test_the_field_of_view_is_the_angle_between_the_outer_edges(tmp_path):
+    camera, facts = found(tmp_path, fov=90.0)
+    assert (camera.fx, camera.fy, camera.cx, camera.cy) == pytest.approx((32, 32, 31.5, 23.5))
+    assert facts == []
+
+
+def test_without_a_word_about_the_camera_60_degrees_are_assumed_and_said(tmp_path):
+    camera, facts = found(tmp_path)
+    assert math.degrees(2 * math.atan(32 / camera.fx)) == pytest.approx(60)
+    assert facts == [
+        "camera: none given, 60 degrees of horizontal view assumed (--camera, --fov or --intrinsics) (55.426 pixels)"
+    ]
+
+
+def test_the_focal_length_of_the_exif_data_is_along_the_diagonal_of_35_mm_film(tmp_path):
+    description, facts = camera_of(CameraChoice(), photo(tmp_path, {0xA405: 26}), SIZE, COARSE)
+    assert description.camera.fx == pytest.approx(26 / math.sqrt(36**2 + 24**2) * 80)
+    assert "EXIF" in facts[0].text
+    assert facts[0].detail.startswith("26 mm")
+
+
+@pytest.mark.parametrize("value", [0, 1, 65535])
+def test_an_exif_focal_length_that_is_none_is_left_out(tmp_path, value):
+    facts = camera_of(CameraChoice(), photo(tmp_path, {0xA405: value}), SIZE, COARSE)[1]
+    assert facts[0].text.startswith("camera: none given")
+
+
+@pytest.mark.parametrize("choice", [{"fov": 0.0}, {"fov": 180.0}, {"fov": math.nan}, {"intrinsics": (1, 0, 1, 1)}])
+def test_impossible_numbers_are_refused(choice):
+    with pytest.raises(ValueError, match=f"--{next(iter(choice))}: expected"):
+        CameraChoice(**choice)
+
+
+@pytest.mark.parametrize("orientation", range(2, 9))
+def test_a_photo_is_turned_by_its_exif_data_only_where_depth_fits_that_alone(tmp_path, orientation):
+    path = photo(tmp_path, {0x0112: orientation})
+    plain = np.asarray(Image.open(path).convert("RGB")).astype(int)
+    as_stored, facts = read_photo(path, COARSE)
+    assert np.abs(as_stored - plain).max() <= 2
+    assert "left out" in facts[0].text
+    upright, facts = read_photo(path, COARSE[::-1])
+    if orientation < 5:
+        assert upright.shape == (48, 64, 3)
+        return
+    from PIL import ImageOps  # noqa: PLC0415
+
+    expected = np.asarray(ImageOps.exif_transpose(Image.open(path)).convert("RGB")).astype(int)
+    assert upright.shape == expected.shape
+    assert np.abs(upright - expected).max() <= 2
+    assert "turned" in facts[0].text

@@ -1,0 +1,142 @@
+"""People's depth files: each format against an independent reader or writer, each refusal on one line."""
+
+import zipfile
+
+import cv2
+import numpy as np
+import OpenEXR
+import pytest
+from PIL import Image
+
+from dsr.rgbd.depth_files import can_hold, read_depth_file, write_depth_file
+
+FLOATS = np.array([[0.5, 1.25, np.nan], [3.0, 60000.0, np.inf]])
+"""Not symmetric under any flip, exact in half precision but for the largest."""
+WHOLE = np.array([[0, 256, 3], [40000, 5, 65535]])
+
+
+def exr(path, channels):
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    with OpenEXR.File(header, dict(channels)) as file:
+        file.write(str(path))
+    return path
+
+
+def read_pfm(path):
+    """Return a PFM's values by its specification."""
+    lines = path.read_bytes().split(b"\n", 3)
+    width, height = map(int, lines[1].split())
+    order = "<" if float(lines[2]) < 0 else ">"
+    return np.frombuffer(lines[3], f"{order}f4").reshape(height, width)[::-1]
+
+
+def read_exr(path):
+    with OpenEXR.File(str(path)) as file:
+        assert list(file.channels()) == ["Z"]
+        return file.channels()["Z"].pixels
+
+
+INDEPENDENT = {
+    "png": lambda path: np.asarray(Image.open(path)),
+    "tiff": lambda path: np.asarray(Image.open(path)),
+    "npy": np.load,
+    "npz": lambda path: np.load(path)["depth"],
+    "pfm": read_pfm,
+    "exr": read_exr,
+}
+
+
+@pytest.mark.parametrize(
+    ("suffix", "dtype"),
+    [
+        ("png", "u2"), ("tiff", "u2"), ("tif", "f4"), ("npy", "u2"), ("npy", "f4"), ("npy", "f8"), ("npy", "f2"),
+        ("npz", "i4"), ("npz", "f4"), ("pfm", "f4"), ("exr", "f4"), ("exr", "f2"),
+    ],
+)  # fmt: skip
+def test_what_is_written_reads_the_same_here_and_in_another_program(tmp_path, suffix, dtype):
+    values = (WHOLE if dtype[0] in "iu" else FLOATS).astype(dtype)
+    path = tmp_path / f"d.{suffix}"
+    write_depth_file(path, values)
+    again = read_depth_file(path)
+    assert again.dtype == values.dtype
+    np.testing.assert_array_equal(again, values)
+    np.testing.assert_array_equal(INDEPENDENT["tiff" if suffix == "tif" else suffix](path), values)
+    assert [entry.name for entry in tmp_path.iterdir()] == [path.name]
+
+
+def test_files_of_other_programs_are_read_exactly(tmp_path):
+    Image.fromarray(WHOLE.astype("u2")).save(tmp_path / "a.png")
+    Image.fromarray(FLOATS.astype("f4")).save(tmp_path / "a.tif")
+    np.savez(tmp_path / "a.npz", anything=FLOATS)
+    np.save(tmp_path / "a.npy", FLOATS.astype(">f4"))
+    np.testing.assert_array_equal(read_depth_file(tmp_path / "a.png"), WHOLE)
+    for name in ("a.tif", "a.npz", "a.npy"):
+        values = read_depth_file(tmp_path / name)
+        assert values.dtype.isnative
+        np.testing.assert_array_equal(values, FLOATS)
+
+
+@pytest.mark.parametrize(
+    ("names", "taken"),
+    [
+        (("Y", "Z"), "Z"), (("A", "Y"), "Y"), (("distance",), "distance"), (("B", "G", "R"), "R"),
+        (("R", "G", "B", "scene.Z"), "scene.Z"), (("R", "depth.V", "left.depth"), "left.depth"),
+    ],
+)  # fmt: skip
+def test_of_an_openexr_file_the_depth_channel_is_taken(tmp_path, names, taken):
+    channels = {name: np.full((2, 3), float(number), np.float32) for number, name in enumerate(names, 1)}
+    values = read_depth_file(exr(tmp_path / "d.exr", channels))
+    np.testing.assert_array_equal(values, channels[taken])
+
+
+def test_an_openexr_file_without_a_depth_channel_is_refused_with_its_channels(tmp_path):
+    path = exr(tmp_path / "d.exr", {name: np.ones((2, 3), np.float32) for name in ("U", "V")})
+    with pytest.raises(ValueError, match=r"d.exr: expected a channel named Z, Y or R, got U, V$"):
+        read_depth_file(path)
+
+
+@pytest.mark.parametrize("suffix", ["png", "tiff", "npy", "npz", "pfm", "exr"])
+@pytest.mark.parametrize("share", [0.0, 0.5, 0.95])
+def test_a_truncated_file_is_refused_in_one_line_and_nothing_is_printed(tmp_path, suffix, share, capfd):
+    path = tmp_path / f"d.{suffix}"
+    write_depth_file(
+        path, np.random.default_rng(0).integers(1, 60000, (40, 50)).astype("u2" if suffix == "png" else "f4")
+    )
+    content = path.read_bytes()
+    path.write_bytes(content[: int(len(content) * share)])
+    with pytest.raises(ValueError, match=r"d\..*: expected") as caught:
+        read_depth_file(path)
+    assert "\n" not in str(caught.value)
+    assert capfd.readouterr() == ("", "")
+
+
+def test_what_is_no_depth_map_is_refused(tmp_path):
+    cv2.imwrite(str(tmp_path / "eight.png"), np.ones((4, 4), np.uint8))
+    cv2.imwrite(str(tmp_path / "colour.png"), np.ones((4, 4, 3), np.uint16))
+    np.savez(tmp_path / "two.npz", a=FLOATS, b=FLOATS)
+    np.savez(tmp_path / "cube.npz", a=np.ones((2, 2, 2)))
+    np.save(tmp_path / "empty.npy", np.ones((0, 3)))
+    with zipfile.ZipFile(tmp_path / "none.npz", "w"):
+        pass
+    (tmp_path / "photo.jpg").write_bytes(b"")
+    for name, message in {
+        "eight.png": "too coarse for depth",
+        "colour.png": "expected one channel",
+        "two.npz": "expected one array, or one named depth; got a, b",
+        "cube.npz": "expected one channel",
+        "empty.npy": "0 x 3 pixels",
+        "none.npz": "got none",
+        "photo.jpg": "expected a depth map as .png",
+        "missing.exr": "there is no such file",
+    }.items():
+        with pytest.raises(ValueError, match=message) as caught:
+            read_depth_file(tmp_path / name)
+        assert str(tmp_path / name) in str(caught.value)
+
+
+def test_a_format_that_cannot_hold_the_values_is_refused(tmp_path):
+    assert can_hold(".tif", np.dtype("float32"))
+    assert not can_hold(".png", np.dtype("float32"))
+    with pytest.raises(ValueError, match=r"d.png: expected uint16 values, got float32"):
+        write_depth_file(tmp_path / "d.png", np.ones((2, 2), np.float32))
+    assert not any(tmp_path.iterdir())

@@ -1,0 +1,111 @@
+"""A pair of files as it is read: unit, range type and holes by who tells them first, and the part that counts."""
+
+import json
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from dsr.geometry.camera import Camera
+from dsr.rgbd.cameras import CameraChoice
+from dsr.rgbd.inputs import Reading, read_picture
+from dsr.rgbd.pairs import Pair
+
+OWN = {"width": 16, "height": 12, "fx": 15.0, "fy": 15.0, "cx": 7.5, "cy": 5.5}
+
+
+@pytest.fixture
+def make(tmp_path):
+    """Write a pair: a grey photo, a depth file, and camera.json where it has entries."""
+
+    def write(depth, name="depth.npy", size=(12, 16), camera=None, **entries):
+        Image.fromarray(np.full((*size, 3), 51, np.uint8)).save(tmp_path / "photo.png")
+        if name.endswith(".npy"):
+            np.save(tmp_path / name, depth)
+        else:
+            Image.fromarray(depth).save(tmp_path / name)
+        path = tmp_path / "camera.json" if entries or camera else None
+        if path is not None:
+            path.write_text(json.dumps({**(camera or OWN), **entries}))
+        return Pair("x", tmp_path / "photo.png", tmp_path / name, path)
+
+    return write
+
+
+def read(pair, units=None, **reading):
+    return read_picture(pair, Reading(**reading), {} if units is None else units)
+
+
+def texts(picture):
+    return [fact.text for fact in picture.facts]
+
+
+def test_the_photo_is_in_0_to_1_and_depth_in_metres_with_nan_in_holes(make):
+    picture = read(make(np.array([[0, 1000], [2500, 65535]] * 3, np.uint16).repeat(4, 1), "depth.png"))
+    assert torch.equal(picture.rgb, torch.full((3, 12, 16), 0.2))
+    expected = torch.tensor([[torch.nan, 1.0], [2.5, torch.nan]] * 3).repeat_interleave(4, 1)[None]
+    assert torch.allclose(picture.coarse, expected, equal_nan=True)
+
+
+@pytest.mark.parametrize(
+    ("given", "entries", "layout", "metres"),
+    [
+        (0.01, {"depth_unit": "m"}, 2e-4, 20.0), (None, {"depth_unit": 5e-4}, 2e-4, 1.0), (None, {}, 2e-4, 0.4),
+        (None, {}, None, 2.0),
+    ],
+)  # fmt: skip
+def test_the_user_s_unit_goes_before_the_camera_file_s_and_that_before_the_layout_s(
+    make, given, entries, layout, metres
+):
+    pair = make(np.full((3, 4), 2000, np.uint16), **entries)
+    picture = read(Pair(pair.name, pair.rgb, pair.depth, pair.camera, unit=layout), unit=given)
+    assert float(picture.coarse[0, 0, 0]) == pytest.approx(metres)
+
+
+def test_maps_beside_each_other_have_the_unit_of_the_first(make):
+    units = {}
+    assert float(read(make(np.full((3, 4), 2.0)), units).coarse[0, 0, 0]) == 2
+    assert float(read(make(np.full((3, 4), 300.0)), units).coarse[0, 0, 0]) == 300
+    assert float(read(make(np.full((3, 4), 300.0))).coarse[0, 0, 0]) == pytest.approx(0.3)
+
+
+def test_the_camera_file_tells_range_type_and_hole_value(make):
+    pair = make(np.array([[2.0, 9.0], [2.0, 2.0]] * 3).repeat(4, 1), range_type="perspective", hole_value=9)
+    picture = read(pair)
+    corner = Camera(**OWN).rescale(8, 6).ray_lengths()[0, 0]
+    assert float(picture.coarse[0, 0, 0]) == pytest.approx(float(2 / corner))
+    assert bool(picture.coarse[0, 0, 4].isnan())
+    assert picture.encoding.hole == 9
+    assert any("perspective, says the camera file" in text for text in texts(picture))
+    assert float(read(pair, range_type="orthogonal").coarse[0, 0, 0]) == 2
+
+
+def test_a_camera_that_the_user_gives_goes_before_the_one_beside_the_pictures(make):
+    pair = make(np.full((3, 4), 2.0))
+    assert read(pair).camera.fx != 20
+    pair = make(np.full((3, 4), 2.0), baseline=0.3)
+    assert read(pair).camera == Camera(**OWN, baseline=0.3)
+    assert texts(read(pair))[0] == "camera: camera.json beside the pictures"
+    assert read(pair, camera=CameraChoice(intrinsics=(20, 20, 7, 5)), baseline=0.1).camera == Camera(
+        16, 12, 20, 20, 7, 5, 0.1
+    )
+
+
+def test_of_a_photo_that_is_no_multiple_the_part_that_a_coarse_map_covers_is_taken(make):
+    pair = make(np.full((3, 4), 2.0), "depth_lr4.npy", (14, 17), {**OWN, "width": 17, "height": 14})
+    picture = read(Pair(pair.name, pair.rgb, pair.depth, pair.camera, factor=4))
+    assert tuple(picture.rgb.shape) == (3, 12, 16)
+    assert picture.camera == Camera(**OWN)
+    assert "the photo is cut to the part that the depth map covers" in texts(picture)
+
+
+def test_disparity_without_a_baseline_or_above_0_is_refused(make):
+    pair = make(np.full((3, 4), 2.0), "disparity.npy")
+    with pytest.raises(
+        ValueError, match=r"disparity.npy: disparities need the distance between the two cameras: --baseline"
+    ):
+        read(pair)
+    pair = make(np.full((3, 4), 2.0), "disparity.npy", baseline=0.1, doffs=-20)
+    with pytest.raises(ValueError, match=r"disparity.npy: expected at least one disparity above 0, got none"):
+        read(pair)

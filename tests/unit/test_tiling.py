@@ -1,0 +1,135 @@
+"""Tiles, and that networks answer in them as they answer the whole image."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+import torch
+from torch import Tensor
+
+from dsr.geometry.camera import Camera, from_range
+from dsr.methods.facets import Facets
+from dsr.methods.msg_net import MSGNet
+from dsr.methods.network import DisparityNetwork, NetworkUpsampler
+from dsr.methods.tiling import blended, spans
+from dsr.sample import DepthSample
+
+NETS: dict[str, Callable[[], DisparityNetwork]] = {
+    "facets": lambda: Facets(4, width=8, blocks=2),
+    "facets x8": lambda: Facets(8, width=8, blocks=1),
+    "dsr": lambda: MSGNet(4, "dsr"),
+    "voynov": lambda: MSGNet(4, "voynov"),
+    "hui": lambda: MSGNet(2, "hui"),
+}
+
+
+def _method(name: str, *, ensemble: int = 1, tile: int | None = None) -> NetworkUpsampler:
+    """Return a network whose answer is far from smooth, so that whatever a window misses shows."""
+    torch.manual_seed(0)
+    net = NETS[name]()
+    with torch.no_grad():
+        for parameter in net.parameters():
+            if parameter.dim() > 1:
+                parameter.mul_(1.5)
+    return NetworkUpsampler(net.double(), ensemble=ensemble, tile=tile)
+
+
+def _pair(scale: int, height: int, width: int) -> tuple[Tensor, Tensor]:
+    generator = torch.Generator().manual_seed(3)
+    rgb = torch.rand((1, 3, scale * height, scale * width), generator=generator)
+    coarse = 20 + 5 * torch.rand((1, 1, height, width), generator=generator)
+    return rgb, coarse
+
+
+@pytest.mark.parametrize(("size", "tile", "overlap"), [(100, 30, 4), (31, 30, 4), (30, 30, 4), (7, 1, 2), (1, 5, 0)])
+def test_weights_of_tiles_add_up_to_one_everywhere(size: int, tile: int, overlap: int) -> None:
+    total = torch.zeros(2 * size)
+    for span in spans(size, tile, 3, overlap):
+        assert span.read.start <= span.kept.start < span.kept.stop <= span.read.stop
+        assert span.kept.stop - span.kept.start <= max(tile, overlap + 1) + overlap
+        total[2 * span.kept.start : 2 * span.kept.stop] += span.weights(2)
+    torch.testing.assert_close(total, torch.ones(2 * size))
+
+
+def test_a_window_holds_the_reach_within_the_image() -> None:
+    first, second, last = spans(90, 30, 7, 4)
+    assert (first.read, second.read, last.read) == (slice(0, 39), slice(21, 69), slice(51, 90))
+    assert (first.ramps, second.ramps, last.ramps) == ((0, 4), (4, 4), (4, 0))
+
+
+def test_answers_that_differ_by_a_constant_are_joined_by_a_ramp() -> None:
+    values = iter((1.0, 2.0))
+    rows, columns = spans(4, 4, 0, 0), spans(20, 10, 0, 4)
+    line = blended(lambda r, c: torch.full((1, 1, 4, c.stop - c.start), next(values)), rows, columns, 1)[0, 0, 0]
+    expected = torch.cat((torch.ones(8), torch.tensor([1.125, 1.375, 1.625, 1.875]), torch.full((8,), 2.0)))
+    torch.testing.assert_close(line, expected)
+
+
+@pytest.mark.parametrize("name", NETS)
+def test_an_answer_in_tiles_is_the_answer_in_one_piece(name: str) -> None:
+    method = _method(name)
+    scale = method.net.scale
+    rgb, coarse = _pair(scale, 14, 48)
+    coarse[..., 3:9, 4:20] = torch.nan  # a hole that is larger than a tile
+    if method.net.arguments().get("variant") in ("voynov", "hui"):
+        coarse = coarse.nan_to_num(nan=20.5)  # random networks turn the step at a hole into anything
+    with torch.inference_mode():
+        whole = method.fine_disparity(rgb, coarse)
+        method.tile = 12 * scale
+        tiled = method.fine_disparity(rgb, coarse)
+    assert tiled.shape == whole.shape
+    assert method.parts(*rgb.shape[-2:]) == 8
+    assert float((tiled - whole).abs().max() / (whole.max() - whole.min())) < 1e-5
+
+
+def test_an_ensemble_in_tiles_is_the_ensemble_in_one_piece() -> None:
+    method = _method("facets", ensemble=8)
+    rgb, coarse = _pair(4, 12, 36)
+    parts: list[tuple[int, int]] = []
+    with torch.inference_mode():
+        whole = method.fine_disparity(rgb, coarse)
+        method.tile = 24
+        tiled = method.fine_disparity(rgb, coarse, lambda done, total: parts.append((done, total)))
+    assert float((tiled - whole).abs().max() / (whole.max() - whole.min())) < 1e-5
+    assert parts == [(i + 1, method.parts(48, 144)) for i in range(8 * 2 * 6)]
+
+
+@pytest.mark.parametrize("name", NETS)
+def test_nothing_beyond_the_reach_counts(name: str) -> None:
+    net = _method(name).net
+    assert net.reach is not None
+    size, at = 2 * net.reach + 9, net.reach + 4
+    rgb, coarse = _pair(net.scale, size, size)
+    coarse[..., at, at], rgb[..., net.scale * at + 1, net.scale * at + 1] = 22.0, 0.5
+    other, photo = coarse.clone(), rgb.clone()
+    other[..., at, at], photo[..., net.scale * at + 1, net.scale * at + 1] = 23.0, 0.6
+    with torch.inference_mode():
+        whole = net.whole(rgb, coarse)
+        change = (whole.answer(photo, other) - whole.answer(rgb, coarse)).abs()[0, 0]
+    rows, columns = (change > 1e-6).nonzero().T
+    for index in (rows, columns):
+        distance = (index // net.scale - at).abs()
+        assert 0 < int(distance.max()) <= net.reach
+
+
+def test_a_large_photo_is_tiled_by_itself(monkeypatch: pytest.MonkeyPatch) -> None:
+    method = _method("facets")
+    rgb, coarse = _pair(4, 12, 12)
+    camera = Camera(48, 48, 50.0, 50.0, 24.0, 24.0)
+    low = camera.rescale(12, 12)
+    sample = DepthSample("test", "scene", rgb[0], from_range(coarse[0] / 4, low, "disparity"), camera, low, 4)
+    parts: list[int] = []
+    whole = method(sample, lambda done, total: parts.append(total))
+    monkeypatch.setattr("dsr.methods.network.UNTILED", 1000)
+    monkeypatch.setattr("dsr.methods.network.TILE", 24)
+    tiled = method(sample, lambda done, total: parts.append(total))
+    assert parts == [1, *[4] * 4]
+    torch.testing.assert_close(tiled, whole, rtol=1e-5, atol=0)
+
+
+def test_a_tile_below_a_coarse_pixel_is_refused() -> None:
+    with pytest.raises(ValueError, match="tile: expected at least 4 pixels, the scale, got 3"):
+        _method("facets", tile=3)
+    with pytest.raises(ValueError, match="tiles: expected a positive size and tile"):
+        spans(10, 0, 1, 2)

@@ -1,0 +1,253 @@
+"""Upsampling anybody's picture: any size, any ratio, holes; arrays and tensors."""
+
+from __future__ import annotations
+
+import doctest
+import math
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+import dsr
+from dsr.geometry.camera import Camera
+from dsr.upsampling import METHODS, people, plan, upsample_depth
+from dsr.upsampling.engine import enlarged_by
+from dsr.upsampling.planning import OWN_SIZE
+from dsr.upsampling.resampling import resized_inverse
+
+
+def _camera(height: int, width: int) -> Camera:
+    return Camera(width, height, 60.0, 60.0, (width - 1) / 2, (height - 1) / 2)
+
+
+def _plane(height: int, width: int, camera: Camera) -> Tensor:
+    """Return the depth of a slanted plane at the pixels of a map that covers the camera's view, (1, H, W) float64."""
+    own = camera.rescale(width, height)
+    x, y, _ = own.rays()
+    return (0.5 + 0.2 * x - 0.1 * y).reciprocal()[None]
+
+
+def _photo(height: int, width: int) -> Tensor:
+    return torch.rand((3, height, width), generator=torch.Generator().manual_seed(0))
+
+
+@pytest.mark.parametrize(
+    ("size", "coarse_size"),
+    [((48, 64), (12, 16)), ((48, 64), (24, 32)), ((45, 60), (15, 20)), ((45, 61), (11, 15)), ((60, 75), (8, 10)),
+     ((64, 96), (4, 6)), ((41, 46), (41, 46))],
+    ids=lambda size: "x".join(map(str, size)),
+)  # fmt: skip
+@pytest.mark.parametrize("method", ["facets", "bicubic"])
+def test_a_slanted_plane_comes_back_as_it_is_at_any_size_and_ratio(
+    method: str, size: tuple[int, int], coarse_size: tuple[int, int]
+) -> None:
+    camera = _camera(*size)
+    fine = upsample_depth(_photo(*size), _plane(*coarse_size, camera), camera, method=method)
+    truth = _plane(*size, camera)
+    assert fine.shape == truth.shape
+    assert fine.dtype == torch.float32
+    off = (fine.reciprocal() - truth.reciprocal()).abs()
+    # a spline's depth is not straight where inverse depth is, and flat at the border: off by less than a coarse pixel
+    assert float(off.max()) < (3e-6 if method == "facets" else 0.3 / 60 * max(size[1] / coarse_size[1], 4))
+
+
+def test_holes_are_filled_or_kept() -> None:
+    camera = _camera(32, 48)
+    depth = _plane(8, 12, camera)
+    depth[:, 2, 3] = torch.nan
+    rgb = _photo(32, 48)
+    for method in ("facets", "bicubic", "nearest"):
+        filled, kept = (upsample_depth(rgb, depth, camera, method=method, keep_holes=keep) for keep in (False, True))
+        assert bool(filled.isfinite().all())
+        assert kept.isnan().nonzero()[:, 1:].amin(0).tolist() == [8, 12]
+        assert kept.isnan().nonzero()[:, 1:].amax(0).tolist() == [11, 15]
+        assert int(kept.isnan().sum()) == 16
+        torch.testing.assert_close(kept[kept.isfinite()], filled[kept.isfinite()])
+
+
+def test_depth_of_the_photos_size_keeps_its_own_holes() -> None:
+    camera = _camera(33, 46)
+    depth = _plane(33, 46, camera)
+    holes = torch.rand(depth.shape, generator=torch.Generator().manual_seed(1)) < 0.3
+    depth = depth.masked_fill(holes, torch.nan)
+    rgb = _photo(33, 46)
+    kept = upsample_depth(rgb, depth, camera, keep_holes=True)
+    torch.testing.assert_close(kept.isnan(), holes)
+    filled = upsample_depth(rgb, depth, camera)
+    assert bool(filled.isfinite().all())
+    assert float((filled / _plane(33, 46, camera) - 1).abs().max()) < 0.05
+
+
+def test_depth_that_was_enlarged_by_repeating_pixels_is_taken_for_the_coarse_map() -> None:
+    camera = _camera(48, 64)
+    coarse, rgb = _plane(6, 8, camera), _photo(48, 64)
+    coarse[:, 1, 2] = torch.nan
+    enlarged = coarse.repeat_interleave(8, -1).repeat_interleave(8, -2)
+    assert enlarged_by(enlarged) == 8
+    assert enlarged_by(enlarged[:, :-3, :-5]) == 8
+    assert enlarged_by(enlarged[:, 1:]) == 1
+    assert enlarged_by(coarse) == enlarged_by(torch.ones(1, 8, 8)) == 1
+    torch.testing.assert_close(upsample_depth(rgb, enlarged, camera), upsample_depth(rgb, coarse, camera))
+
+
+def test_nearest_repeats_the_pixels_and_a_sharp_step_stays_sharp_when_an_answer_is_reduced() -> None:
+    camera = Camera(15, 12, 1e5, 1e5, 7.0, 5.5)  # of so narrow a view that all range types agree
+    coarse = torch.full((1, 8, 10), 1.0)
+    coarse[..., 4:] = 2.0
+    fine = upsample_depth(_photo(12, 15), coarse, camera, method="nearest")
+    torch.testing.assert_close(fine[0], torch.tensor([1.0] * 6 + [2.0] * 9).expand(12, 15))
+    step = resized_inverse(torch.cat((torch.ones(1, 30, 13), torch.full((1, 30, 17), 0.5)), -1), (20, 20))
+    assert set(step.unique().tolist()) == {0.5, 1.0}
+
+
+@pytest.mark.parametrize("size", [(61, 50), (97, 33), (20, 80), (110, 85), (300, 81)])
+def test_resizing_keeps_planes_to_rounding_up_to_the_border(size: tuple[int, int]) -> None:
+    def plane(height: int, width: int) -> Tensor:
+        y, x = ((torch.arange(n, dtype=torch.float64) + 0.5) / n for n in (height, width))
+        return (0.3 + 0.5 * x + y[:, None])[None]
+
+    torch.testing.assert_close(resized_inverse(plane(97, 80), size), plane(*size), rtol=0, atol=1e-12)
+
+
+def test_a_plan_says_what_is_done() -> None:
+    assert plan((480, 640), (120, 160)).scale == 4
+    assert plan((1440, 1920), (192, 256)).scale == 8  # 7.5
+    assert plan((720, 1280), (240, 426)).steps == (4,)
+    assert plan((3024, 4032), (192, 256)).steps == (8, 4)  # 15.75
+    assert plan((480, 640), (480, 640)).coarsened == 4
+    assert plan((480, 640), (480, 640), 8).coarsened == 8
+    assert plan((480, 640), (120, 160), 8).steps == (8,)
+    assert plan((480, 640), (160, 213), method="bicubic").scale == 4
+    assert plan((480, 640), (160, 214), method="bicubic").steps == ()
+    text = plan((3000, 4000), (750, 1000)).text
+    assert "750 x 1000 depth to 3000 x 4000 by facets x4" in text
+    assert text.count("\n") == 0
+    gigabytes = float(text.split("about ")[1].split(" GB")[0])
+    assert 1 < gigabytes < 4
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (((48, 64), (12, 16), 4, "fcets"), "method: expected one of facets, msg_v, .*, got 'fcets'"),
+        (((48, 64), (12, 16), 2, "facets"), "scale: expected one of 4, 8, 16, 32 for facets, got 2"),
+        (((48, 64), (12, 16), 8, "msg_v_noisy"), "scale: expected one of 4, 16 for msg_v_noisy, got 8"),
+        (((48, 64), (12, 16), 0, "bicubic"), "scale: expected a positive whole number, got 0"),
+        (((480, 640), (120, 150), None, "facets"), "aspect within 2%, got 120 x 150 for a photo of 480 x 640"),
+        (((480, 640), (960, 1280), None, "facets"), "expected no more pixels than the photo, got 960 x 1280"),
+        (((4800, 6400), (96, 128), None, "facets"), "at least 1/32 of the photo's size for facets, got 1/50"),
+        (((2000, 2000), (500, 500), None, "dip_v"), "method=dip_v: expected a photo of up to 1048576 pixels"),
+    ],
+)
+def test_what_can_not_be_done_is_refused_in_one_line(arguments: tuple, message: str) -> None:
+    with pytest.raises(ValueError, match=message) as caught:
+        plan(*arguments)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (0.0, "depth: expected metres above 0, and NaN .* to mark holes, got 0 in 1 of 192 pixels"),
+        (-1.0, "to mark holes, got -1 in 1"),
+        (math.inf, "to mark holes, got inf in 1"),
+    ],
+)
+def test_a_depth_that_is_none_is_refused_with_how_to_mark_holes(change: float, message: str) -> None:
+    depth = torch.ones(1, 12, 16)
+    depth[0, 3, 4] = change
+    with pytest.raises(ValueError, match=message):
+        upsample_depth(_photo(48, 64), depth, _camera(48, 64))
+
+
+def test_what_is_no_picture_is_refused() -> None:
+    depth, camera = torch.ones(1, 12, 16), _camera(48, 64)
+    with pytest.raises(ValueError, match=r"rgb: expected shape \(3, 48, 64\), the camera's, got \(3, 48, 60\)"):
+        upsample_depth(_photo(48, 60), depth, camera)
+    with pytest.raises(ValueError, match=r"rgb: expected floating point values in \[0, 1\]"):
+        upsample_depth(255 * _photo(48, 64), depth, camera)
+    with pytest.raises(ValueError, match="at least one known pixel, all are holes"):
+        upsample_depth(_photo(48, 64), depth * torch.nan, camera)
+    with pytest.raises(ValueError, match="depth: expected floating point of shape"):
+        upsample_depth(_photo(48, 64), depth.int(), camera)
+    with pytest.raises(ValueError, match="device: expected auto, cpu, cuda or cuda:N of this machine, got 'gpu'"):
+        upsample_depth(_photo(48, 64), depth, camera, device="gpu")
+    with pytest.raises(ValueError, match="two NumPy arrays or two tensors, got Tensor and ndarray"):
+        dsr.upsample(_photo(48, 64), np.ones((12, 16)), camera)  # type: ignore[type-var]
+    with pytest.raises(ValueError, match=r"rgb: expected shape \(H, W, 3\), got \(3, 48, 64\)"):
+        dsr.upsample(_photo(48, 64).numpy(), np.ones((12, 16)), camera)
+    with pytest.raises(ValueError, match=r"mask: expected the depth's shape \(12, 16\), got \(48, 64\)"):
+        dsr.upsample(_photo(48, 64), depth, camera, mask=torch.ones(48, 64))
+
+
+def test_arrays_and_tensors_give_the_same() -> None:
+    camera, depth = _camera(48, 64), _plane(12, 16, _camera(48, 64)).float()
+    depth[0, 5, 5] = 1.0
+    bytes_ = (255 * _photo(48, 64)).round().to(torch.uint8)
+    of_tensors = dsr.upsample(bytes_, depth, camera)
+    known = depth[0].numpy() < 100
+    of_arrays = dsr.upsample(bytes_.permute(1, 2, 0).numpy(), depth[0].numpy(), camera, scale=4, mask=known)
+    assert isinstance(of_arrays, np.ndarray)
+    assert of_arrays.dtype == np.float32
+    np.testing.assert_array_equal(of_arrays, of_tensors[0].numpy())
+    floats = dsr.upsample(bytes_.permute(1, 2, 0).numpy() / 255, depth[0].numpy(), camera)
+    np.testing.assert_allclose(floats, of_arrays, rtol=1e-4)
+
+
+def test_a_mask_makes_holes() -> None:
+    camera, depth = _camera(48, 64), _plane(12, 16, _camera(48, 64))
+    mask = torch.ones(12, 16)
+    mask[4, 4] = 0
+    depth[0, 4, 4] = 0.01
+    fine = dsr.upsample(_photo(48, 64), depth.masked_fill(mask == 0, 5.0), camera, mask=mask, method="bicubic")
+    pierced = dsr.upsample(_photo(48, 64), depth.masked_fill(mask == 0, torch.nan), camera, method="bicubic")
+    torch.testing.assert_close(fine, pierced)
+
+
+def test_progress_runs_to_the_end_over_all_steps() -> None:
+    camera, parts = _camera(64, 96), []
+    upsample_depth(_photo(64, 96), _plane(4, 6, camera), camera, progress=lambda *part: parts.append(part))
+    assert parts == [(i + 1, 8) for i in range(8)]  # x8, then x4, each an ensemble of four
+
+
+def test_every_method_that_needs_no_optimisation_answers() -> None:
+    camera = _camera(32, 32)
+    for method in METHODS:
+        if not method.startswith("dip"):
+            fine = upsample_depth(_photo(32, 32), _plane(8, 8, camera), camera, method=method)
+            assert fine.shape == (1, 32, 32), method
+            assert float((fine / _plane(32, 32, camera) - 1).abs().max()) < 0.1, method
+
+
+def test_a_prior_answers_at_any_size(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("dsr.upsampling.engine._PRIOR_SETTINGS", {"dip": {"steps": 2, "widths": (4,), "skips": (2,)}})
+    camera = _camera(31, 42)
+    fine = upsample_depth(_photo(31, 42), _plane(15, 21, camera), camera, method="dip")
+    assert fine.shape == (1, 31, 42)
+    assert bool(fine.isfinite().all())
+
+
+def test_depth_almost_of_the_photos_size_counts_as_such() -> None:
+    assert plan((480, 640), (int(480 / OWN_SIZE), int(640 / OWN_SIZE))).coarsened == 4
+    camera = _camera(40, 60)
+    fine = upsample_depth(_photo(40, 60), _plane(38, 57, camera), camera)
+    assert float((fine / _plane(40, 60, camera) - 1).abs().max()) < 0.02
+
+
+def test_the_example_of_the_documentation_runs() -> None:
+    for module in (people, dsr):
+        result = doctest.testmod(module)
+        assert result.attempted > 1
+        assert result.failed == 0
+
+
+def test_importing_the_package_loads_nothing_heavy() -> None:
+    code = "import sys, dsr; assert 'upsample' in dir(dsr); print(sorted({'torch', 'numpy'} & set(sys.modules)))"
+    answer = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert answer.stdout.strip() == "[]"
+    with pytest.raises(AttributeError, match="module 'dsr' has no attribute 'upsampled'"):
+        dsr.upsampled  # noqa: B018
