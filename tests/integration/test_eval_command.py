@@ -102,14 +102,18 @@ def rows(folder):
 
 
 def tree(folder):
-    return sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file())
+    """Return the files in a folder; that of the log ends with a time and the name of the machine."""
+    files = [path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()]
+    return sorted(name.partition(".tfevents.")[0] for name in files)
 
 
 def written(scenes):
     each = [
-        f"{kind}/{scene}.{suffix}" for kind, suffix in (("pictures", "png"), ("predictions", "npz")) for scene in scenes
+        f"{kind}/{scene}.{suffix}"
+        for kind, suffix in (("pictures", "png"), ("predictions", "npz"), ("scenes", "npz"))
+        for scene in scenes
     ]
-    return sorted([*each, "config.yaml", "scores.csv", "summary.json", "versions.json"])
+    return sorted([*each, "config.yaml", "events.out", "scores.csv", "summary.json", "versions.json"])
 
 
 @pytest.fixture(scope="module")
