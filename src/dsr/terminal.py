@@ -1,10 +1,11 @@
-"""What all commands have in common: exit codes, a console, and lines on it."""
+"""What all commands have in common: exit codes, a console, lines and bars on it."""
 
 from __future__ import annotations
 
 import sys
 
 from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 USAGE_ERROR = 2
 INTERRUPTED = 130
@@ -21,6 +22,26 @@ def open_console() -> Console:
 def show(console: Console, line: str) -> None:
     """Show a line as it is."""
     console.print(line, markup=False, highlight=False, soft_wrap=True)
+
+
+def bar(console: Console, *, transient: bool = False) -> Progress:
+    """Return a bar of a name, how much of how much, the time passed and left, and a remark; on a terminal only.
+
+    Args:
+        console: where it is shown.
+        transient: whether it goes away at the end.
+
+    """
+    columns = (
+        TextColumn("{task.description:<8}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TextColumn("left"),
+        TimeRemainingColumn(elapsed_when_finished=False),
+        TextColumn("{task.fields[remark]}", markup=False),
+    )
+    return Progress(*columns, console=console, transient=transient, disable=not console.is_terminal)
 
 
 def print_error(message: str) -> None:

@@ -9,25 +9,11 @@ from typing import Any
 import lightning
 from lightning.pytorch.callbacks import ProgressBar
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import Progress
 
 from dsr.data.base import Prepared, SceneSource
 from dsr.fitting import scores_line
-from dsr.terminal import show
-
-
-def bar(console: Console) -> Progress:
-    """Return a bar of a name, how much of how much, the time passed and left, and a remark."""
-    columns = (
-        TextColumn("{task.description:<8}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        TextColumn("left"),
-        TimeRemainingColumn(elapsed_when_finished=False),
-        TextColumn("{task.fields[remark]}", markup=False),
-    )
-    return Progress(*columns, console=console, disable=not console.is_terminal)
+from dsr.terminal import bar, show
 
 
 class Display:

@@ -30,9 +30,9 @@ from dsr.rgbd.outputs import (
     write_parts,
 )
 from dsr.rgbd.pairs import Found, Pair, pairs_of_lists
-from dsr.rgbd.telling import Reporter, bars, listed, problem_line, steps
+from dsr.rgbd.telling import Reporter, listed, problem_line, steps
 from dsr.rgbd.wanted import Wanted, files_of, inputs_of, settings_of
-from dsr.terminal import show
+from dsr.terminal import bar, show
 from dsr.upsampling import Plan, enlarged_by, plan, upsample_depth
 
 
@@ -56,7 +56,7 @@ def run(wanted: Wanted, console: Console) -> list[str]:
     reporter, units = Reporter(console), UnitMemory()
     problems: dict[str, list[str]] = {}
     outcomes: Counter[str] = Counter()
-    with bars(console) as progress:
+    with bar(console, transient=True) as progress:
         total = progress.add_task("pictures", total=len(found.pairs), remark="", visible=not single)
         for pair in found.pairs:
             progress.update(total, remark=pair.name)
