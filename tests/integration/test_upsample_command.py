@@ -86,7 +86,7 @@ def test_two_files_are_enough_and_everything_assumed_is_said(pair, cube, tmp_pat
     assert stored.dtype == np.uint16
     np.testing.assert_array_equal(stored, np.round(metres.astype(float) * 1000))
     told = info(out)
-    assert (told["complete"], told["scale"], told["settings"]["method"]) == (True, 4, "facets")
+    assert (told["complete"], told["scale"], told["method"], told["settings"]["method"]) == (True, 4, "facets", "auto")
     assert told["depth_file"] == {
         "suffix": ".png",
         "dtype": "uint16",
@@ -326,3 +326,15 @@ def test_depth_that_was_enlarged_by_repeating_pixels_is_as_good_as_before(pair, 
     assert "16 x 16 depth to 64 x 64 by bicubic x4" in said
     small, large = (np.load(tmp_path / name / "depth_metres.npy") for name in ("small", "large"))
     np.testing.assert_array_equal(small, large)
+
+
+def test_noisy_depth_gets_the_network_that_was_trained_on_it(cube, tmp_path, capsys):
+    coarse = cube.depth.reshape(16, 4, 16, 4).mean((1, 3))
+    noise = np.random.default_rng(0).normal(size=coarse.shape)
+    np.save(tmp_path / "noisy.npy", coarse * (1 + 0.01 * noise))
+    Image.fromarray(cube.rgb).save(tmp_path / "photo.png")
+    assert of((tmp_path / "photo.png", tmp_path / "noisy.npy"), tmp_path / "out", "--only", "depth") == 0
+    said = capsys.readouterr().out
+    assert "the depth map is noisy: msg_v_noisy, which was trained for that (--method facets keeps more)" in said
+    assert "by msg_v_noisy x4" in said
+    assert info(tmp_path / "out")["method"] == "msg_v_noisy"

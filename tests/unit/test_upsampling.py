@@ -16,6 +16,7 @@ import dsr
 from dsr.geometry.camera import Camera
 from dsr.upsampling import METHODS, people, plan, upsample_depth
 from dsr.upsampling.engine import enlarged_by
+from dsr.upsampling.inspection import suited_method
 from dsr.upsampling.planning import OWN_SIZE
 from dsr.upsampling.resampling import resized_inverse
 
@@ -251,3 +252,26 @@ def test_importing_the_package_loads_nothing_heavy() -> None:
     assert answer.stdout.strip() == "[]"
     with pytest.raises(AttributeError, match="module 'dsr' has no attribute 'upsampled'"):
         dsr.upsampled  # noqa: B018
+
+
+@pytest.mark.parametrize("repeats", [1, 4])
+@pytest.mark.parametrize(("noise", "method"), [(0.0005, "facets"), (0.004, "msg_v_noisy")])
+def test_the_suited_method_depends_on_how_noise_tilts_the_normals(noise, method, repeats):
+    camera = Camera(128, 128, 128.0, 128.0, 63.5, 63.5)  # noise of 0.002 tilts by 5.2 degrees at 32 x 32
+    coarse = 2 * (1 + noise * torch.randn(1, 32, 32, generator=torch.Generator().manual_seed(0)))
+    given = coarse.repeat_interleave(repeats, 1).repeat_interleave(repeats, 2)
+    assert suited_method(given, camera) == method
+
+
+def test_depth_of_the_photo_s_size_is_judged_after_it_was_averaged():
+    camera = Camera(128, 128, 128.0, 128.0, 63.5, 63.5)
+    fine = 2 * (1 + 0.008 * torch.randn(1, 128, 128, generator=torch.Generator().manual_seed(0)))
+    assert suited_method(fine, camera) == "facets"  # averages of 16 have a quarter of the noise
+    assert suited_method(2 + 2 * (fine - 2), camera) == "msg_v_noisy"
+
+
+def test_where_the_noisy_network_has_no_weights_the_other_is_taken():
+    camera = Camera(256, 256, 256.0, 256.0, 127.5, 127.5)
+    noisy = 2 + 0.05 * torch.rand(1, 32, 32, generator=torch.Generator().manual_seed(0))
+    assert suited_method(noisy, camera) == "facets"
+    assert suited_method(noisy, Camera(128, 128, 128.0, 128.0, 63.5, 63.5), scale=8) == "facets"

@@ -70,7 +70,10 @@ def _add_method(parser: argparse.ArgumentParser) -> None:
     """Add how it is computed."""
     method = parser.add_argument_group("how it is done")
     method.add_argument(
-        "--method", default="facets", metavar="NAME", help="facets (default), msg_v, bicubic, dip_v, ..."
+        "--method",
+        default="auto",
+        metavar="NAME",
+        help="auto (default): msg_v_noisy for noisy depth, else facets; bicubic, ...",
     )
     method.add_argument("--scale", type=int, metavar="N", help="upsampling factor (default: from the sizes)")
     method.add_argument("--device", default="auto", metavar="DEVICE", help="auto (default), cpu, cuda, cuda:1, ...")

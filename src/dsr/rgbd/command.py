@@ -33,7 +33,7 @@ from dsr.rgbd.pairs import Found, Pair, pairs_of_lists
 from dsr.rgbd.telling import Reporter, listed, problem_line, steps
 from dsr.rgbd.wanted import Wanted, files_of, inputs_of, settings_of
 from dsr.terminal import bar, show
-from dsr.upsampling import Plan, enlarged_by, plan, upsample_depth
+from dsr.upsampling import AUTO, NOISY, Plan, enlarged_by, plan, suited_method, upsample_depth
 
 
 def run(wanted: Wanted, console: Console) -> list[str]:
@@ -155,7 +155,9 @@ def _one(wanted: Wanted, pair: Pair, target: Path, units: UnitMemory, reporter: 
         return "complete already"
     picture = _without_repeats(read_picture(pair, wanted.reading, units))
     coarse_size = (picture.coarse.shape[-2], picture.coarse.shape[-1])
-    planned = plan((picture.camera.height, picture.camera.width), coarse_size, wanted.scale, wanted.method)
+    method, suits = _method(picture, wanted)
+    picture = replace(picture, facts=(*picture.facts, *suits))
+    planned = plan((picture.camera.height, picture.camera.width), coarse_size, wanted.scale, method)
     reporter.facts(picture.facts)
     if wanted.dry_run:
         reporter.say(f"{pair.name}: {planned.text} -> {target}")
@@ -166,12 +168,24 @@ def _one(wanted: Wanted, pair: Pair, target: Path, units: UnitMemory, reporter: 
     begin(target, job.settings, job.inputs, () if job.earlier is None else job.earlier.files)
     started = time.perf_counter()
     if depth is None:
-        depth = _upsampled(job, picture, progress)
+        depth = _upsampled(job, picture, planned.method, progress)
     seconds = time.perf_counter() - started
     facts = _write(job, picture, depth, planned, seconds)
     reporter.facts(facts)
     reporter.say(f"{pair.name}: {planned.text}, {seconds:.1f} s -> {target}")
     return "done"
+
+
+def _method(picture: Picture, wanted: Wanted) -> tuple[str, list[Fact]]:
+    """Return the method to use, and what there is to say of it."""
+    if wanted.method != AUTO:
+        return wanted.method, []
+    method = suited_method(picture.coarse, picture.camera, wanted.scale)
+    if method == NOISY:
+        return method, [
+            Fact(f"the depth map is noisy: {NOISY}, which was trained for that (--method facets keeps more)")
+        ]
+    return method, []
 
 
 def _without_repeats(picture: Picture) -> Picture:
@@ -184,7 +198,7 @@ def _without_repeats(picture: Picture) -> Picture:
     return replace(picture, coarse=picture.coarse[:, ::block, ::block], facts=(*picture.facts, fact))
 
 
-def _upsampled(job: _Job, picture: Picture, progress: Progress) -> Tensor:
+def _upsampled(job: _Job, picture: Picture, method: str, progress: Progress) -> Tensor:
     """Return the fine depth, (1, H, W) in metres."""
     wanted = job.wanted
     with steps(progress, job.pair.name) as step:
@@ -193,7 +207,7 @@ def _upsampled(job: _Job, picture: Picture, progress: Progress) -> Tensor:
             picture.coarse,
             picture.camera,
             wanted.scale,
-            method=wanted.method,
+            method=method,
             device=wanted.device,
             keep_holes=wanted.keep_holes,
             progress=step,
@@ -204,11 +218,12 @@ def _write(job: _Job, picture: Picture, depth: Tensor, planned: Plan, seconds: f
     """Write all parts and ``info.json``, and return what should be said of them."""
     started = time.perf_counter()
     encoding = output_encoding(picture.encoding, job.wanted.depth_format)
-    title = f"{job.pair.name}, {job.wanted.method} x{planned.scale}"
+    title = f"{job.pair.name}, {planned.method} x{planned.scale}"
     files, facts = write_parts(job.target, picture, depth, job.wanted.parts, encoding, title)
     entries = {
         "inputs": job.inputs,
         "settings": job.settings,
+        "method": planned.method,
         "scale": planned.scale,
         "plan": planned.text,
         **described(picture, encoding),

@@ -10,7 +10,7 @@ from dsr.hashing import file_hash
 from dsr.rgbd.inputs import Reading
 from dsr.rgbd.outputs import FORMATS, PARTS
 from dsr.rgbd.pairs import Pair
-from dsr.upsampling import METHODS
+from dsr.upsampling import AUTO, METHODS
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ class Wanted:
     depth: tuple[Path, ...] = ()
     mask: tuple[Path, ...] = ()
     reading: Reading = field(default_factory=Reading)
-    method: str = "facets"
+    method: str = AUTO
     scale: int | None = None
     device: str = "auto"
     keep_holes: bool = False
@@ -47,7 +47,10 @@ class Wanted:
 
     def __post_init__(self) -> None:
         """Check what does not need the files."""
-        for name, value, known in (("--method", self.method, METHODS), ("--format", self.depth_format, FORMATS)):
+        for name, value, known in (
+            ("--method", self.method, (AUTO, *METHODS)),
+            ("--format", self.depth_format, FORMATS),
+        ):
             if value is not None and value not in known:
                 raise ValueError(f"{name}: expected one of {', '.join(known)}, got {value!r}")
         for part in self.parts:

@@ -1,7 +1,8 @@
 """Finer depth for anybody's photo and depth map: any size, any ratio of the sizes, holes, bounded memory."""
 
-from dsr.upsampling.engine import enlarged_by, upsample_depth
+from dsr.upsampling.engine import upsample_depth
+from dsr.upsampling.inspection import NOISY, enlarged_by, suited_method
 from dsr.upsampling.people import upsample
-from dsr.upsampling.planning import METHODS, Plan, plan
+from dsr.upsampling.planning import AUTO, METHODS, Plan, plan
 
-__all__ = ["METHODS", "Plan", "enlarged_by", "plan", "upsample", "upsample_depth"]
+__all__ = ["AUTO", "METHODS", "NOISY", "Plan", "enlarged_by", "plan", "suited_method", "upsample", "upsample_depth"]

@@ -17,11 +17,11 @@ from dsr.methods.tiling import Progress
 from dsr.methods.trained import build_trained, packaged_weights
 from dsr.prior.method import DeepImagePrior
 from dsr.sample import DepthSample
-from dsr.upsampling.planning import INTERPOLATIONS, NETWORKS, OWN_SIZE, PRIORS, plan
+from dsr.upsampling.inspection import enlarged_by, suited_method
+from dsr.upsampling.planning import AUTO, INTERPOLATIONS, NETWORKS, OWN_SIZE, PRIORS, plan
 from dsr.upsampling.resampling import resized_inverse
 
 _PRIOR_SETTINGS: dict[str, dict[str, Any]] = {"dip": {"data_loss": "mse", "data_weight": 10.0, "w": 0.0}, "dip_v": {}}
-_LARGEST_BLOCK = 16
 
 
 def upsample_depth(
@@ -30,7 +30,7 @@ def upsample_depth(
     camera: Camera,
     scale: int | None = None,
     *,
-    method: str = "facets",
+    method: str = AUTO,
     device: str = "auto",
     keep_holes: bool = False,
     progress: Progress | None = None,
@@ -48,7 +48,7 @@ def upsample_depth(
         depth: (1, h, w) orthogonal depth in metres, NaN in holes.
         camera: the photo's; interpolation alone depends on it, and priors.
         scale: see :func:`dsr.upsampling.plan`.
-        method: one of ``METHODS``.
+        method: one of ``METHODS``, or ``auto``, see :func:`dsr.upsampling.inspection.suited_method`.
         device: ``auto`` for a GPU where there is one, else as torch names it.
         keep_holes: whether pixels whose own depth, or nearest coarse pixel, is unknown stay NaN; else they are filled.
         progress: is told how many parts are done, and of how many.
@@ -62,6 +62,7 @@ def upsample_depth(
     """
     _check(rgb, depth, camera)
     size = (camera.height, camera.width)
+    method = suited_method(depth, camera, scale) if method == AUTO else method
     plan(size, _size(depth), scale, method)  # refuses what can't be
     inverse = depth.float().reciprocal()
     known = inverse.isfinite()
@@ -84,29 +85,6 @@ def upsample_depth(
     if keep_holes and not bool(known.all()):
         result = result.masked_fill(~_nearest(known, size).to(result.device), torch.nan)
     return result.to(depth.device)
-
-
-def enlarged_by(values: Tensor) -> int:
-    """Return the factor by which a map, (..., H, W), was enlarged by repeating pixels; 1 for none."""
-    known = values.nan_to_num(nan=-1.0)
-    if bool((known == known.flatten()[0]).all()):
-        return 1
-    for block in range(_LARGEST_BLOCK, 1, -1):
-        one = known[..., ::block, ::block]
-        if all(
-            torch.equal(
-                known[..., i::block, j::block], one[..., : _count(known, -2, i, block), : _count(known, -1, j, block)]
-            )
-            for i in range(block)
-            for j in range(block)
-        ):
-            return block
-    return 1
-
-
-def _count(values: Tensor, dim: int, start: int, step: int) -> int:
-    """Return the length of ``values[start::step]`` along ``dim``."""
-    return len(range(start, values.shape[dim], step))
 
 
 def _answer(

@@ -11,6 +11,7 @@ from torch import Tensor
 from dsr.geometry.camera import Camera
 from dsr.methods.tiling import Progress
 from dsr.upsampling.engine import upsample_depth
+from dsr.upsampling.planning import AUTO
 
 Array = TypeVar("Array", np.ndarray, Tensor)
 
@@ -21,7 +22,7 @@ def upsample(
     camera: Camera,
     scale: int | None = None,
     *,
-    method: str = "facets",
+    method: str = AUTO,
     mask: Array | None = None,
     device: str = "auto",
     keep_holes: bool = False,
@@ -38,8 +39,8 @@ def upsample(
         camera: of the photo, ``dsr.Camera(width, height, fx, fy, cx, cy)``, all in the photo's pixels.
         scale: how much finer the result is, 4 or 8 for networks; None for what suits the sizes. Where the depth map has
             the photo's size already it is first averaged over so many pixels, 4 for None.
-        method: ``facets`` looks best; also ``msg_v``, ``msg_v_noisy`` for noisy sensors, ``msg``, ``bicubic``,
-            ``bilinear``, ``nearest``, and ``dip``, ``dip_v``, which take minutes.
+        method: ``auto`` for ``msg_v_noisy`` where the depth is noisy, else ``facets``; also ``msg_v``, ``msg``,
+            ``bicubic``, ``bilinear``, ``nearest``, and ``dip``, ``dip_v``, which take minutes.
         mask: where the depth is known, of the depth's shape; for maps that mark holes by a mask.
         device: ``auto`` for a GPU where there is one, else ``cpu``, ``cuda`` or ``cuda:1``.
         keep_holes: whether holes stay NaN; otherwise they are filled.

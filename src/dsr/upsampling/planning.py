@@ -29,6 +29,7 @@ PRIORS = ("dip", "dip_v")
 NETWORKS = MappingProxyType(
     {"facets": "facets_x{}", "msg_v": "msg_v_x{}", "msg": "msg_x{}", "msg_v_noisy": "msg_v_x{}_noisy"}
 )
+AUTO = "auto"
 METHODS = (*NETWORKS, *INTERPOLATIONS, *PRIORS)
 LARGEST_FOR_PRIORS = 2**20
 """Pixels; an optimisation beyond takes hours."""
@@ -37,7 +38,7 @@ OWN_SIZE = 1.25
 _STEPS = MappingProxyType({4: (4,), 8: (8,), 16: (8, 4), 32: (8, 4)})
 _STEPS_OF_X4 = MappingProxyType({4: (4,), 16: (4, 4)})
 _STEPS_OF_PRIORS = MappingProxyType({scale: (scale,) for scale in (2, 4, 8, 16)})
-_USUAL_SCALE = 4
+USUAL_SCALE = 4
 _ASPECT = 0.02
 _SLACK = 1.05
 
@@ -47,6 +48,7 @@ class Plan:
     """What is going to be done.
 
     Args:
+        method: the method.
         scale: by how much finer depth becomes, about.
         steps: the networks' factors, one after the other; empty for interpolation.
         coarsened: by how much depth of the photo's own size is made coarser first; 1 for coarse depth.
@@ -54,6 +56,7 @@ class Plan:
 
     """
 
+    method: str
     scale: int
     steps: tuple[int, ...]
     coarsened: int
@@ -82,7 +85,7 @@ def plan(
         raise ValueError(f"method: expected one of {', '.join(METHODS)}, got {method!r}")
     ratio = _ratio(photo_size, depth_size)
     own = ratio <= OWN_SIZE
-    chosen = _scale(scale, _USUAL_SCALE if own else ratio, method)
+    chosen = _scale(scale, USUAL_SCALE if own else ratio, method)
     steps = () if method in INTERPOLATIONS else _steps_of(method)[chosen]
     pixels = math.prod(photo_size)
     if method in PRIORS and pixels > LARGEST_FOR_PRIORS:
@@ -100,7 +103,7 @@ def plan(
         f"{depth_size[0]} x {depth_size[1]} depth {before}to {photo_size[0]} x {photo_size[1]} by {what}, "
         f"in about {_memory(pixels, worked_on, method) / 2**30:.1f} GB of memory"
     )
-    return Plan(chosen, steps, coarsened, text)
+    return Plan(method, chosen, steps, coarsened, text)
 
 
 def _ratio(photo_size: tuple[int, int], depth_size: tuple[int, int]) -> float:
