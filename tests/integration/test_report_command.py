@@ -108,8 +108,7 @@ def test_a_user_study_joins_the_tables(runs: Path, tmp_path: Path) -> None:
     ("arguments", "message"),
     [
         (["--methods", "DIP"], "methods: expected some of Bicubic, MSG-V, got DIP"),
-        (["--scales", "x4"], "--scales: expected whole numbers such as 4,8, got 'x4'"),
-        (["--scales", "8"], "scales: expected some of 4, got 8"),
+        (["--scale", "8"], "scales: expected some of 4, got 8"),
         (["--only", "tables,graphs"], "--only: expected some of tables, metrics, figures, page, got graphs"),
         (["--light", "e5"], "--light: expected one of e1, e2, e3, e4, got e5"),
         (["--page-mb", "0"], "--page-mb: expected a positive number, got 0"),
