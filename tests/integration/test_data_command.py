@@ -136,7 +136,7 @@ def test_an_interrupted_command_goes_on_where_it_stopped(mirror, root):
     _, errors = process.communicate(timeout=30)
     assert (process.returncode, errors) == (
         130,
-        "interrupted; what has come so far is kept, the same command goes on from there\n",
+        "interrupted; what was finished is kept, run the same command again to go on\n",
     )
     had = part.stat().st_size
     assert not (root / NAMES[0]).exists()

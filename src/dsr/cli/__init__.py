@@ -39,7 +39,7 @@ def main(arguments: Sequence[str] | None = None, catalogue: Mapping[str, Collect
     try:
         problems = options.run(options, console, CATALOGUE if catalogue is None else catalogue)
     except KeyboardInterrupt:
-        show(Console(stderr=True), "interrupted; what has come so far is kept, the same command goes on from there")
+        show(Console(stderr=True), "interrupted; what was finished is kept, run the same command again to go on")
         return INTERRUPTED
     except (ValueError, OSError) as error:
         problems = [one_line(error)]

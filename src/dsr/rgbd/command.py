@@ -70,7 +70,8 @@ def run(wanted: Wanted, console: Console) -> list[str]:
         reporter.summary(outcomes["done"] + outcomes["to do"])
         counts = [f"{count} {outcome}" for outcome, count in outcomes.items()]
         counts += [f"{sum(map(len, problems.values()))} failed"] if problems else []
-        show(console, f"{len(found.pairs)} pictures: {', '.join(counts)} -> {wanted.output}")
+        pictures = "1 picture" if len(found.pairs) == 1 else f"{len(found.pairs)} pictures"
+        show(console, f"{pictures}: {', '.join(counts)} -> {wanted.output}")
     return [f"{listed(names)}: {message}" if len(found.pairs) > 1 else message for message, names in problems.items()]
 
 
