@@ -198,7 +198,7 @@ def test_an_interrupted_run_goes_on(pair, tmp_path, capsys, monkeypatch):
     with monkeypatch.context() as patch:
         patch.setattr("dsr.rgbd.outputs.write_normals", interrupt)
         assert of(pair, out, *BICUBIC, "--only", "depth,normals") == 130
-    assert "the same command goes on from there" in capsys.readouterr().err
+    assert "run the same command again to go on" in capsys.readouterr().err
     assert info(out)["complete"] is False
     assert of(pair, out, *BICUBIC, "--only", "depth,normals") == 0
     assert info(out)["complete"] is True
