@@ -9,6 +9,7 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pandas as pd
 import pytest
 
@@ -89,6 +90,22 @@ def test_a_directory_of_something_else_is_refused_and_kept(
     (tmp_path / "mine" / "thesis.tex").write_text("years of work")
     assert "it holds something else" in refused(capsys, "report", runs, "-o", tmp_path / "mine")
     assert (tmp_path / "mine" / "thesis.tex").read_text() == "years of work"
+
+
+def test_without_a_truth_there_are_pictures_and_no_tables(
+    runs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for folder in runs.iterdir():
+        header = (folder / "scores.csv").read_text().splitlines()[0]
+        (folder / "scores.csv").write_text(header + "\n")
+        for file in (folder / "scenes").iterdir():
+            with np.load(file) as arrays:
+                rest = {name: values for name, values in arrays.items() if name != "depth"}
+            np.savez_compressed(file, **rest)
+    assert main(["report", str(runs), "-o", str(tmp_path / "report"), "--only", "tables,metrics,page"]) == 0
+    assert "no scene has a truth to score against" in capsys.readouterr().out
+    assert sorted(path.name for path in (tmp_path / "report").iterdir()) == ["index.html", "report.json"]
+    assert "Bicubic" in (tmp_path / "report" / "index.html").read_text(encoding="utf-8")
 
 
 def test_a_user_study_joins_the_tables(runs: Path, tmp_path: Path) -> None:

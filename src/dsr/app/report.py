@@ -132,7 +132,11 @@ def _write(folder: Path, results: Results, study: pd.DataFrame | None, wanted: W
             )
 
     parts = {"tables": tables, "metrics": metrics, "figures": figures, "page": page}
-    for part in display([part for part in parts if part in wanted.parts], "report"):
+    todo = [part for part in parts if part in wanted.parts]
+    if all(run.scores.empty for run in results.runs):
+        notes.append("no scene has a truth to score against, so there are no tables and no metric study")
+        todo = [part for part in todo if part not in ("tables", "metrics")]
+    for part in display(todo, "report"):
         parts[part]()
     return notes
 
