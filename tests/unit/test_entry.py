@@ -44,7 +44,10 @@ DATASETS = (
     "folder, icl, middlebury, middlebury2001, middlebury2003, middlebury2005, middlebury2006, middlebury_train, "
     "mixture, nyu, paper_train, procedural, simgeo, sintel, sunrgbd, tartanair, tofmark"
 )
-METHODS = "bicubic, bilinear, dip, dip_v, dip_v_warm, facets, msg, msg_v, msg_v_noisy, nearest"
+METHODS = (
+    "anisotropic_diffusion, bicubic, bilinear, dip, dip_v, dip_v_warm, facets, fast_global_smoother, guided_filter, "
+    "joint_bilateral, msg, msg_v, msg_v_noisy, nearest, tgv"
+)
 USAGE_ERRORS = {
     "dataset=fodler": f"dataset=fodler: unknown; expected one of {DATASETS}",
     "method=msgv": f"method=msgv: unknown; expected one of {METHODS}",

@@ -17,9 +17,10 @@ from torch import Tensor
 from dsr.store import StoredScene, load_prediction, load_scene, prediction_path, scene_path
 
 METHOD_ORDER = (
-    "Nearest", "Bilinear", "Bicubic", "SRfS", "EG", "PDN", "DG", "DIP", "MSG", "DIP-V", "MSG-V",
+    "Nearest", "Bilinear", "Bicubic", "GF", "JBU", "FGS", "Diffusion", "TGV",
+    "SRfS", "EG", "PDN", "DG", "DIP", "MSG", "DIP-V", "MSG-V",
 )  # fmt: skip
-"""The paper's methods in the order of its tables, between what is simpler and what it did not have."""
+"""The paper's methods in the order of its tables, after simpler ones; what it did not have and is no simpler follows."""
 _DATASET_ORDER = ("simgeo", "icl", "middlebury", "sunrgbd", "tofmark")
 _SCORES, _SUMMARY, _VERSIONS = "scores.csv", "summary.json", "versions.json"
 _TEXT_COLUMNS = ("dataset", "scene", "downsampling", "method", "metric", "variant")

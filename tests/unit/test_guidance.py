@@ -1,0 +1,171 @@
+"""What holds for every photo-guided filter: planes, offsets, holes, sizes, cameras."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from dsr.degrade import SCALES, Downsampling, Kernel, make_sample
+from dsr.geometry.camera import Camera, from_range, to_range
+from dsr.methods.fast_global_smoother import FastGlobalSmoother
+from dsr.methods.guidance import GuidedMethod, slopes_along
+from dsr.methods.guided_filter import GuidedFilter
+from dsr.methods.joint_bilateral import JointBilateral
+from dsr.sample import DepthSample, Scene
+
+METHODS = (GuidedFilter, JointBilateral, FastGlobalSmoother)
+every_method = pytest.mark.parametrize("method", METHODS, ids=lambda method: method.__name__)
+Build = Callable[..., GuidedMethod]
+
+
+def _photo(height: int, width: int) -> Tensor:
+    return torch.from_numpy(np.random.default_rng(1).uniform(size=(3, height, width)))
+
+
+def _sample(disparity: Tensor, kernel: Kernel = "box", scale: int = 4, photo: Tensor | None = None) -> DepthSample:
+    """Return the problem of a scene with these disparities, (H, W)."""
+    height, width = disparity.shape
+    camera = Camera(width, height, 60.0, 55.0, 21.3, 17.9)
+    depth = from_range(disparity[None], camera, "disparity")
+    scene = Scene("set", "hall", _photo(height, width) if photo is None else photo, camera, depth)
+    return make_sample(scene, scale, Downsampling(kernel), "disparity")
+
+
+def _result(method: GuidedMethod, sample: DepthSample) -> Tensor:
+    """Return the fine disparity, (H, W)."""
+    fine = method(sample)
+    assert fine.shape == (1, sample.camera.height, sample.camera.width)
+    return to_range(fine, sample.camera, "disparity")[0]
+
+
+def _plane(height: int = 32, width: int = 48) -> Tensor:
+    v, u = torch.meshgrid(torch.arange(height).double(), torch.arange(width).double(), indexing="ij")
+    return 8 + 0.05 * u - 0.03 * v
+
+
+def _random(height: int = 32, width: int = 48) -> Tensor:
+    return torch.from_numpy(np.random.default_rng(2).uniform(5, 9, (height, width)))
+
+
+@every_method
+@pytest.mark.parametrize("scale", SCALES)
+@pytest.mark.parametrize("kernel", ["box", "nearest"])
+def test_a_plane_is_reproduced_exactly_under_a_photo_of_noise(method: Build, scale: int, kernel: Kernel) -> None:
+    plane = _plane()
+    torch.testing.assert_close(_result(method(), _sample(plane, kernel, scale)), plane, rtol=0, atol=1e-10)
+
+
+@every_method
+def test_without_slopes_a_plane_is_reproduced_to_a_coarse_pixels_rise_away_from_the_border(method: Build) -> None:
+    plane = _plane(64, 64)
+    error = (_result(method(slopes=False), _sample(plane)) - plane).abs()[16:-16, 16:-16]
+    assert 1e-3 < float(error.max()) < 4 * (0.05 + 0.03)
+
+
+@every_method
+def test_a_hole_in_a_plane_is_filled_with_the_plane(method: Build) -> None:
+    holed = _plane()
+    holed[8:24, 12:32] = torch.nan
+    torch.testing.assert_close(_result(method(fill_holes=True), _sample(holed)), _plane(), rtol=0, atol=1e-10)
+
+
+@every_method
+@pytest.mark.parametrize("slopes", [True, False])
+def test_a_factor_and_a_constant_on_the_disparity_come_out_again(method: Build, slopes: bool) -> None:
+    fine = _result(method(slopes=slopes), _sample(_random()))
+    moved = _result(method(slopes=slopes), _sample(2 * _random() + 7))
+    torch.testing.assert_close(moved, 2 * fine + 7, rtol=0, atol=1e-10)
+
+
+@every_method
+@pytest.mark.parametrize("fill", [True, False])
+def test_a_fine_pixel_is_a_hole_where_its_nearest_coarse_pixel_is_unless_holes_are_filled(
+    method: Build, fill: bool
+) -> None:
+    holed = _random()
+    holed[4:12, 8:16] = torch.nan
+    holed[28:, :4] = torch.nan
+    sample = _sample(holed)
+    expected = np.kron(sample.mask_lr[0].numpy(), np.ones((4, 4), dtype=bool))
+    assert (~expected).sum() == 80
+    np.testing.assert_array_equal(_result(method(fill_holes=fill), sample).isfinite().numpy(), expected | fill)
+
+
+@every_method
+def test_without_slopes_an_answer_lies_between_the_known_values_and_holes_count_nowhere(method: Build) -> None:
+    """A hole that counted as 0 would pull its surroundings below 5."""
+    flat = torch.full((32, 48), 5.0).double()
+    flat[8:20, 12:32] = torch.nan
+    for slopes in (True, False):
+        fine = _result(method(fill_holes=True, slopes=slopes), _sample(flat))
+        torch.testing.assert_close(fine, torch.full_like(fine, 5.0), rtol=0, atol=1e-10)
+
+
+@every_method
+def test_one_known_coarse_pixel_is_enough(method: Build) -> None:
+    lonely = torch.full((32, 48), torch.nan).double()
+    lonely[8:12, 8:12] = 5.0
+    fine = _result(method(fill_holes=True), _sample(lonely))
+    torch.testing.assert_close(fine, torch.full_like(fine, 5.0), rtol=0, atol=1e-10)
+
+
+@every_method
+@pytest.mark.parametrize(("height", "width"), [(4, 4), (4, 40), (36, 4), (20, 52)])
+def test_any_size_has_an_answer_everywhere(method: Build, height: int, width: int) -> None:
+    assert bool(_result(method(), _sample(_random(height, width))).isfinite().all())
+
+
+@every_method
+def test_turning_everything_by_a_half_turns_the_answer(method: Build) -> None:
+    """Rows and columns are solved in order, but their own direction is none."""
+    camera = Camera(48, 32, 60.0, 60.0, 23.5, 15.5)
+    photo, depth = _photo(32, 48), 1 + _random()[None] / 9
+    sample, turned = (
+        make_sample(Scene("", "", p, camera, d), 4, Downsampling("box"), "disparity")
+        for p, d in ((photo, depth), (photo.rot90(2, (1, 2)), depth.rot90(2, (1, 2))))
+    )
+    torch.testing.assert_close(method()(turned).rot90(2, (1, 2)), method()(sample), rtol=1e-9, atol=0)
+
+
+@every_method
+def test_the_answer_is_positive_depth_even_where_far_and_near_meet(method: Build) -> None:
+    disparity = torch.where(torch.arange(48) % 16 < 8, 0.01, 40.0).double().expand(32, 48)
+    sample = _sample(disparity)
+    fine = method()(sample)
+    assert bool((fine > 0).all())
+    assert float(fine.max()) <= 4 * float(sample.depth_lr.max()) + 1e-9
+
+
+@every_method
+def test_the_truth_is_not_looked_at_and_the_answer_is_the_same_each_time(method: Build) -> None:
+    sample = _sample(_random())
+    blind = DepthSample("", "", sample.rgb, sample.depth_lr, sample.camera, sample.camera_lr, sample.scale)
+    assert torch.equal(method()(sample), method()(blind))
+
+
+@every_method
+def test_the_result_has_the_precision_of_the_coarse_depth(method: Build) -> None:
+    single = _sample(_random().float(), photo=_photo(32, 48).float())
+    assert method()(single).dtype == torch.float32
+    torch.testing.assert_close(method()(single), method()(_sample(_random())).float(), rtol=1e-3, atol=0)
+
+
+@every_method
+def test_the_method_works_on_disparity(method: Build) -> None:
+    assert method().range_type == "disparity"
+
+
+def test_a_slope_is_the_smaller_difference_without_the_pixel_that_mixes_a_step() -> None:
+    values = torch.tensor([[0.0, 1.0, 2.0, 6.0, 10.0, 11.0, 12.0, 11.0, 10.0]]).double()
+    expected = torch.tensor([[1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 0.0, -1.0, -1.0]]).double()
+    torch.testing.assert_close(slopes_along(values, 1), expected)
+    torch.testing.assert_close(slopes_along(values.T, 0), expected.T)
+
+
+def test_beside_a_hole_the_slope_is_the_one_difference_that_there_is() -> None:
+    values = torch.tensor([0.0, 2.0, 4.0, torch.nan, 9.0, 12.0, 15.0]).double()
+    torch.testing.assert_close(slopes_along(values, 0), torch.tensor([2.0, 2.0, 2.0, 2.0, 3.0, 3.0, 3.0]).double())

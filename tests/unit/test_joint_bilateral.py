@@ -1,0 +1,107 @@
+"""Joint bilateral upsampling, against a plain loop over pixels."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from dsr.degrade import Downsampling, make_sample
+from dsr.geometry.camera import Camera, from_range, to_range
+from dsr.methods.interpolation import Interpolation
+from dsr.methods.joint_bilateral import JointBilateral
+from dsr.sample import DepthSample, Scene
+
+
+def _sample(disparity: Tensor, photo: Tensor, scale: int = 4) -> DepthSample:
+    height, width = disparity.shape
+    camera = Camera(width, height, 60.0, 60.0, width / 2, height / 2)
+    scene = Scene("set", "hall", photo, camera, from_range(disparity[None], camera, "disparity"))
+    return make_sample(scene, scale, Downsampling("box"), "disparity")
+
+
+def _disparity(sample: DepthSample, depth: Tensor) -> np.ndarray:
+    return to_range(depth, sample.camera, "disparity")[0].numpy()
+
+
+def _by_loops(sample: DepthSample, radius: int, sigma_space: float, sigma_colour: float) -> np.ndarray:
+    """Sum over the neighbours of each fine pixel, coarse pixel (i, j) lying at its block's centre."""
+    coarse = to_range(sample.depth_lr, sample.camera_lr, "disparity")[0].numpy() * 4
+    photo = sample.rgb.numpy()
+    height, width = photo.shape[1:]
+    means = photo.reshape(3, height // 4, 4, width // 4, 4).mean(axis=(2, 4))
+    result = np.full((height, width), np.nan)
+    for v in range(height):
+        for u in range(width):
+            total = weights = 0.0
+            for i in range(max(v // 4 - radius, 0), min(v // 4 + radius + 1, height // 4)):
+                for j in range(max(u // 4 - radius, 0), min(u // 4 + radius + 1, width // 4)):
+                    if math.isnan(coarse[i, j]):
+                        continue
+                    distance = math.hypot((v - 1.5) / 4 - i, (u - 1.5) / 4 - j)
+                    unlike = np.linalg.norm(photo[:, v, u] - means[:, i, j])
+                    weight = math.exp(-0.5 * (distance / sigma_space) ** 2 - 0.5 * (unlike / sigma_colour) ** 2)
+                    total, weights = total + weight * coarse[i, j], weights + weight
+            result[v, u] = total / weights if weights else np.nan
+    return result
+
+
+@pytest.mark.parametrize(("radius", "sigma_space", "sigma_colour"), [(1, 0.5, 0.1), (2, 1.0, 0.3)])
+@pytest.mark.parametrize("holes", [False, True])
+def test_it_is_the_mean_over_neighbours_weighed_by_distance_and_colour(
+    radius: int, sigma_space: float, sigma_colour: float, holes: bool
+) -> None:
+    random = np.random.default_rng(0)
+    disparity = torch.from_numpy(random.uniform(5, 9, (16, 16)))
+    if holes:
+        disparity[4:8, 8:12] = torch.nan
+        disparity[:4, :4] = torch.nan
+    sample = _sample(disparity, torch.from_numpy(random.uniform(size=(3, 16, 16))))
+    method = JointBilateral(radius, sigma_space, sigma_colour, fill_holes=True, slopes=False)
+    expected = _by_loops(sample, radius, sigma_space, sigma_colour)
+    np.testing.assert_allclose(_disparity(sample, method(sample)), expected, rtol=1e-10)
+
+
+def test_under_a_photo_of_one_colour_it_is_a_gaussian_mean() -> None:
+    """Of an impulse at the coarse pixel (4, 4), the answer at a fine pixel is that pixel's weight."""
+    disparity = torch.full((36, 36), 5.0).double()
+    disparity[16:20, 16:20] = 6.0
+    sample = _sample(disparity, torch.full((3, 36, 36), 0.5).double())
+    fine = _disparity(sample, JointBilateral(2, 0.7, slopes=False)(sample)) - 5
+    along = []
+    for u in range(16, 20):
+        weights = {j: math.exp(-0.5 * (((u - 1.5) / 4 - j) / 0.7) ** 2) for j in range(2, 7)}
+        along.append(weights[4] / sum(weights.values()))
+    np.testing.assert_allclose(fine[16:20, 16:20], np.outer(along, along), rtol=1e-10)
+
+
+@pytest.mark.parametrize("slopes", [True, False])
+def test_a_step_along_an_edge_of_the_photo_stays_sharp_within_a_coarse_pixel(slopes: bool) -> None:
+    columns = torch.arange(64).expand(48, 64)
+    photo = torch.where(columns < 32, 0.2, 0.8).double().expand(3, 48, 64).contiguous()
+    truth = torch.where(columns < 32, 5.0, 9.0).double()
+    sample = _sample(truth, photo)
+    ours = np.abs(_disparity(sample, JointBilateral(slopes=slopes)(sample)) - truth.numpy())
+    bilinear = np.abs(_disparity(sample, Interpolation("bilinear")(sample)) - truth.numpy())
+    assert ours.max() < 1e-6
+    assert bilinear.max() > 1
+
+
+def test_a_colour_unlike_all_around_takes_the_most_similar_neighbour() -> None:
+    photo = torch.zeros(3, 16, 16).double()
+    photo[:, :, 8:] = 0.3
+    photo[:, 8, 5] = 1.0
+    disparity = torch.where(torch.arange(16) < 8, 5.0, 9.0).double().expand(16, 16)
+    sample = _sample(disparity, photo)
+    fine = _disparity(sample, JointBilateral(sigma_colour=1e-3, slopes=False)(sample))
+    assert np.isfinite(fine).all()
+    assert fine[8, 5] == pytest.approx(9.0)
+
+
+@pytest.mark.parametrize("name", ["radius", "sigma_space", "sigma_colour"])
+def test_a_parameter_that_is_not_positive_is_refused(name: str) -> None:
+    with pytest.raises(ValueError, match=rf"method.{name}: expected a positive number for joint bilateral upsampling"):
+        JointBilateral(**{name: -1})

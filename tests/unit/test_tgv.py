@@ -1,0 +1,270 @@
+"""TGV upsampling, against another algorithm for the same minimum, and closed forms."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from scipy import sparse
+from scipy.sparse.linalg import splu
+from torch import Tensor
+
+from dsr.degrade import Downsampling, make_sample
+from dsr.geometry.camera import Camera, from_range, to_range
+from dsr.methods.differences import divergence, extended, gradient, touching, upsampled
+from dsr.methods.tgv import Tensors, TotalGeneralisedVariation
+from dsr.sample import DepthSample, Scene
+
+
+def _sample(disparity: Tensor, rgb: Tensor | None = None, scale: int = 4) -> DepthSample:
+    """Return the problem of a scene with these disparities, (H, W)."""
+    height, width = disparity.shape
+    camera = Camera(width, height, 60.0, 55.0, 0.45 * width, 0.55 * height)
+    rgb = torch.zeros(3, height, width) if rgb is None else rgb
+    scene = Scene("set", "hall", rgb, camera, from_range(disparity[None], camera, "disparity"))
+    return make_sample(scene, scale, Downsampling("box"), "disparity")
+
+
+def _plane(height: int = 32, width: int = 48) -> Tensor:
+    v, u = torch.meshgrid(torch.arange(height).double(), torch.arange(width).double(), indexing="ij")
+    return 6 + 0.05 * u - 0.03 * v
+
+
+def _step(size: int = 32, column: int = 14) -> tuple[Tensor, Tensor]:
+    """Return disparities with a step in the midst of a block, and a photo with an edge there."""
+    near = torch.arange(size) >= column
+    return torch.where(near, 8.0, 4.0).double().expand(size, size), near.float().expand(3, size, size)
+
+
+def _random(height: int, width: int, seed: int = 0) -> tuple[Tensor, Tensor]:
+    rng = np.random.default_rng(seed)
+    rgb = torch.from_numpy(rng.uniform(0, 1, (3, height, width))).float()
+    return torch.from_numpy(rng.uniform(3, 9, (height, width))), rgb
+
+
+def _normals(*shape: int, seed: int = 0) -> Tensor:
+    return torch.from_numpy(np.random.default_rng(seed).normal(size=shape))
+
+
+def _disparity(depth: Tensor, sample: DepthSample) -> Tensor:
+    return to_range(depth, sample.camera, "disparity")[0]
+
+
+def _means(x: Tensor, scale: int) -> np.ndarray:
+    height, width = x.shape
+    return x.numpy().reshape(height // scale, scale, width // scale, scale).mean(axis=(1, 3))
+
+
+@pytest.mark.parametrize("shape", [(1, 1, 5, 7), (2, 2, 4, 3), (1, 1, 1, 6), (1, 2, 3, 1)])
+def test_divergence_is_minus_the_adjoint_of_the_gradient(shape: tuple[int, int, int, int]) -> None:
+    batch, channels, height, width = shape
+    x, p = _normals(*shape), _normals(batch, 2, channels, height, width, seed=1)
+    assert float((gradient(x) * p).sum()) == pytest.approx(-float((x * divergence(p)).sum()), rel=1e-12)
+
+
+def test_the_gradient_is_numpys_forward_difference() -> None:
+    x = _normals(1, 1, 5, 7)
+    expected = np.zeros((2, 5, 7))
+    expected[0, :, :-1], expected[1, :-1] = np.diff(x[0, 0].numpy(), axis=1), np.diff(x[0, 0].numpy(), axis=0)
+    np.testing.assert_array_equal(gradient(x)[0, :, 0].numpy(), expected)
+
+
+def test_what_touches_a_pixel_is_the_sum_of_the_gradients_absolute_column() -> None:
+    sizes = _normals(1, 2, 1, 4, 5).abs()
+    eye = torch.eye(20).double().reshape(20, 1, 4, 5)
+    expected = (gradient(eye).abs() * sizes).sum(dim=(1, 2, 3, 4)).reshape(4, 5)
+    torch.testing.assert_close(touching(sizes)[0, 0], expected)
+
+
+@pytest.mark.parametrize("scale", [2, 4, 8])
+def test_upsampling_and_extending_reproduce_a_plane_up_to_the_border(scale: int) -> None:
+    plane = _plane()
+    coarse = torch.from_numpy(_means(plane, scale))[None, None]
+    torch.testing.assert_close(upsampled(coarse, scale)[0, 0], plane)
+    torch.testing.assert_close(extended(plane[None, None, 3:-3, 3:-3], 3)[0, 0], plane)
+
+
+def test_the_tensor_shrinks_across_an_edge_and_leaves_what_runs_along_it() -> None:
+    _, rgb = _step(16, 8)
+    g = TotalGeneralisedVariation(sharpness=9.0, exponent=0.85).tensors(rgb[None].double())
+    assert float(g.uu[0, 0, 5, 7]) == pytest.approx(np.exp(-9.0), abs=1e-6)
+    assert torch.equal(g.vv, torch.ones_like(g.vv))
+    assert torch.equal(g.uv, torch.zeros_like(g.uv))
+    assert float(g.uu.sum()) == pytest.approx(16 * 15 + 16 * np.exp(-9.0), abs=1e-4)
+
+
+def test_the_tensors_root_has_the_eigenvalues_of_the_paper() -> None:
+    _, rgb = _random(6, 7)
+    g = TotalGeneralisedVariation(sharpness=3.0, exponent=0.5).tensors(rgb[None].double())
+    matrices = torch.stack((g.uu, g.uv, g.uv, g.vv), dim=-1).reshape(-1, 2, 2)
+    grey = (rgb.double() * torch.tensor([0.299, 0.587, 0.114]).double()[:, None, None]).sum(dim=0)
+    slope = torch.zeros(2, 6, 7).double()
+    slope[0, :, :-1], slope[1, :-1] = grey.diff(dim=1), grey.diff(dim=0)
+    size = slope.norm(dim=0).flatten()
+    torch.testing.assert_close(torch.linalg.eigvalsh(matrices)[:, 0], torch.exp(-3.0 * size.sqrt()))
+    torch.testing.assert_close(torch.linalg.eigvalsh(matrices)[:, 1], torch.ones(42).double())
+
+
+@pytest.mark.parametrize("data_weight", [None, 20.0])
+@pytest.mark.parametrize("holes", [False, True])
+def test_the_objective_reaches_that_of_another_algorithm(data_weight: float | None, holes: bool) -> None:
+    """Within 1e-3, on 16 x 16 pixels with depth steps, slopes and noise: ADMM with exact solves."""
+    rng = np.random.default_rng(3)
+    truth = np.where(np.arange(16) > 6, 0.8, 0.2) + 0.02 * np.arange(16)[:, None] + rng.normal(0, 0.03, (16, 16))
+    coarse = torch.from_numpy(_means(torch.from_numpy(truth), 2))[None, None]
+    if holes:
+        coarse[0, 0, 2:4, 3:5] = torch.nan
+    rgb = torch.from_numpy(rng.uniform(0, 1, (1, 3, 16, 16)))
+    method = TotalGeneralisedVariation(iterations=3000, tolerance=0.0, data_weight=data_weight, second=2.0)
+    tensors = method.tensors(rgb)
+    found = method.minimised(rgb, coarse, 2)
+    ours = float(method.objective(found.values, found.slopes, coarse, tensors))
+    reference = _reference(coarse[0, 0].numpy(), tensors, method.first, method.second, data_weight)
+    assert ours == pytest.approx(reference, rel=1e-3)
+    early = TotalGeneralisedVariation(iterations=20, tolerance=0.0, data_weight=data_weight, second=2.0)
+    start = early.minimised(rgb, coarse, 2)
+    assert float(method.objective(start.values, start.slopes, coarse, tensors)) > 1.01 * ours
+
+
+def _reference(coarse: np.ndarray, g: Tensors, first: float, second: float, weight: float | None) -> float:
+    """Return the least E for 2 x 2 blocks, by the alternating direction method of multipliers with sparse matrices."""
+    height, width = (2 * n for n in coarse.shape)
+    size = height * width
+    du = sparse.csr_matrix(sparse.kron(sparse.eye(height), _difference(width)))
+    dv = sparse.csr_matrix(sparse.kron(_difference(height), sparse.eye(width)))
+    inside_u, inside_v = (sparse.diags((np.asarray(abs(d).sum(axis=1))[:, 0] > 0).astype(float)) for d in (du, dv))
+    uu, uv, vv = (sparse.diags(each[0, 0].numpy().ravel()) for each in g)
+    bent = sparse.bmat([[uu, uv], [uv, vv]]) @ sparse.bmat([[du, -inside_u, None], [dv, None, -inside_v]])
+    none = sparse.csr_matrix((size, size))
+    k = sparse.vstack((bent, sparse.bmat([[none, d, None] for d in (du, dv)] + [[none, None, d] for d in (du, dv)])))
+    known = np.isfinite(coarse).ravel()
+    pair = sparse.csr_matrix(np.ones((1, 2)))
+    means = sparse.kron(sparse.kron(sparse.eye(height // 2), pair), sparse.kron(sparse.eye(width // 2), pair))
+    means = sparse.csr_matrix(means)[known] / 4
+    means = sparse.hstack((means, sparse.csr_matrix((means.shape[0], 2 * size))))
+    d, heavy, rho = coarse.ravel()[known], 1e7 if weight is None else weight, 20.0
+    solve = splu((rho * k.T @ k + 4 * heavy * means.T @ means).tocsc()).solve
+    z = w = np.zeros(k.shape[0])
+    x = np.zeros(3 * size)
+    for _ in range(1500):
+        x = solve(rho * k.T @ (z - w) + 4 * heavy * means.T @ d)
+        y = k @ x + w
+        z = np.concatenate(
+            (_shrunk(y[: 2 * size].reshape(2, -1), first / rho), _shrunk(y[2 * size :].reshape(4, -1), second / rho))
+        )
+        w = y - z
+    y = k @ x
+    lengths = [
+        np.linalg.norm(part.reshape(n, -1), axis=0).sum() for part, n in ((y[: 2 * size], 2), (y[2 * size :], 4))
+    ]
+    return float(first * lengths[0] + second * lengths[1] + heavy / 2 * 4 * np.square(means @ x - d).sum())
+
+
+def _difference(count: int) -> sparse.spmatrix:
+    matrix = sparse.diags([-np.ones(count), np.ones(count - 1)], [0, 1]).tolil()
+    matrix[-1] = 0
+    return matrix.tocsr()
+
+
+def _shrunk(y: np.ndarray, by: float) -> np.ndarray:
+    lengths = np.linalg.norm(y, axis=0)
+    return (y * np.maximum(1 - by / np.maximum(lengths, 1e-300), 0)).ravel()
+
+
+@pytest.mark.parametrize("scale", [2, 4, 8])
+def test_a_plane_is_reproduced_exactly(scale: int) -> None:
+    disparity = _plane()
+    sample = _sample(disparity, _random(32, 48)[1], scale)
+    fine = TotalGeneralisedVariation(iterations=300)(sample)
+    assert fine.shape == (1, 32, 48)
+    torch.testing.assert_close(_disparity(fine, sample), disparity, rtol=0, atol=1e-9)
+
+
+def test_a_hole_in_a_plane_is_filled_with_the_plane() -> None:
+    disparity = _plane()
+    sample = _sample(disparity)
+    sample.depth_lr[:, 2:5, 4:7] = torch.nan
+    fine = _disparity(TotalGeneralisedVariation(iterations=2000, tolerance=1e-8)(sample), sample)
+    assert (fine - disparity).abs().max() < 1e-3 * (disparity.max() - disparity.min())
+
+
+def test_a_step_stays_sharp_along_an_edge_of_the_photo_and_is_smoother_without_one() -> None:
+    disparity, rgb = _step()
+    sharp, smooth = (
+        _disparity(TotalGeneralisedVariation(iterations=600)(sample), sample)
+        for sample in (_sample(disparity, rgb), _sample(disparity))
+    )
+    assert (sharp - disparity).abs().max() < 0.05
+    assert (smooth - disparity).abs().max() > 0.5
+
+
+@pytest.mark.parametrize(("scale", "size"), [(2, (10, 6)), (8, (8, 24)), (16, (16, 16))])
+def test_without_a_data_weight_block_means_are_the_input(scale: int, size: tuple[int, int]) -> None:
+    sample = _sample(*_random(*size), scale=scale)
+    fine = _disparity(TotalGeneralisedVariation(iterations=60)(sample), sample)
+    coarse = to_range(sample.depth_lr, sample.camera_lr, "disparity")[0].numpy() * scale
+    np.testing.assert_allclose(_means(fine, scale), coarse, rtol=1e-9)
+
+
+def test_a_small_data_weight_smooths_a_noisy_plane() -> None:
+    noisy = _plane() + 0.1 * _normals(32, 48)
+    sample = _sample(noisy, scale=2)
+    errors = [
+        float((_disparity(TotalGeneralisedVariation(data_weight=weight)(sample), sample) - _plane()).square().mean())
+        for weight in (None, 2.0)
+    ]
+    assert errors[1] < 0.5 * errors[0]
+
+
+def test_twice_the_same_is_the_same_and_the_truth_is_not_looked_at() -> None:
+    sample = _sample(*_random(16, 24))
+    first = TotalGeneralisedVariation(iterations=100)(sample)
+    assert sample.depth is not None
+    sample.depth.fill_(torch.nan)
+    assert torch.equal(first, TotalGeneralisedVariation(iterations=100)(sample))
+
+
+def test_a_batch_is_what_its_samples_are_one_at_a_time() -> None:
+    coarse, photos = _normals(2, 1, 4, 6).sigmoid(), _normals(2, 3, 16, 24, seed=1).sigmoid()
+    method = TotalGeneralisedVariation(iterations=100, tolerance=0.0)
+    together = method.minimised(photos, coarse, 4).values
+    for number in range(2):
+        alone = method.minimised(photos[number : number + 1], coarse[number : number + 1], 4).values[0]
+        torch.testing.assert_close(together[number], alone)
+
+
+def test_a_flat_map_with_a_single_known_pixel_is_filled() -> None:
+    sample = _sample(torch.full((8, 8), 5.0).double())
+    sample.depth_lr[:, 1:] = torch.nan
+    sample.depth_lr[:, :, 1:] = torch.nan
+    fine = _disparity(TotalGeneralisedVariation(iterations=60)(sample), sample)
+    np.testing.assert_allclose(fine.numpy(), 5.0, rtol=1e-9)
+
+
+def test_it_stops_where_the_map_moves_no_longer_and_tells_its_progress() -> None:
+    told: list[tuple[int, int]] = []
+    plane = _sample(_plane())
+    TotalGeneralisedVariation(iterations=5000)(plane, lambda done, most: told.append((done, most)))
+    assert told == [(50, 5000), (5000, 5000)]
+    coarse, photo = _normals(1, 1, 4, 6).sigmoid(), _normals(1, 3, 16, 24, seed=1).sigmoid()
+    found = TotalGeneralisedVariation(iterations=5000, tolerance=2e-3).minimised(photo, coarse, 4)
+    assert 50 * len(found.moved) == found.iterations < 5000
+    assert found.moved[-1] < 2e-3 <= min(found.moved[:-1])
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("iterations", 0),
+        ("tolerance", -1.0),
+        ("first", 0.0),
+        ("second", 0.0),
+        ("data_weight", 0.0),
+        ("sharpness", -1.0),
+        ("exponent", 0.0),
+        ("step_ratio", 0.0),
+    ],
+)
+def test_a_value_out_of_range_is_refused_by_name(key: str, value: float) -> None:
+    with pytest.raises(ValueError, match=rf"method\.{key}: expected .*, got {value}"):
+        TotalGeneralisedVariation(**{key: value})  # type: ignore[arg-type]
