@@ -20,7 +20,7 @@ METHOD_ORDER = (
     "Nearest", "Bilinear", "Bicubic", "GF", "JBU", "FGS", "Diffusion", "TGV",
     "SRfS", "EG", "PDN", "DG", "DIP", "MSG", "DIP-V", "MSG-V",
 )  # fmt: skip
-"""The paper's methods in the order of its tables, after simpler ones; what it did not have and is no simpler follows."""
+"""The paper's methods in the order of its tables, after simpler ones; what it did not have follows."""
 _DATASET_ORDER = ("simgeo", "icl", "middlebury", "sunrgbd", "tofmark")
 _SCORES, _SUMMARY, _VERSIONS = "scores.csv", "summary.json", "versions.json"
 _TEXT_COLUMNS = ("dataset", "scene", "downsampling", "method", "metric", "variant")
