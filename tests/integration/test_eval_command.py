@@ -308,7 +308,7 @@ def test_a_directory_of_another_run_is_kept(tmp_path, within):
 
 USAGE_ERRORS = {
     "a mistyped group": (["datset=folder"], "datset: unknown key; expected dataset, "),
-    "a mistyped choice": (["method=bicubik"], "method=bicubik: unknown; expected one of anisotropic_diffusion, bicubic, "),
+    "a mistyped choice": (["method=bicubik"], "method=bicubik: unknown; expected one of anisotropic_diffusion, "),
     "a mistyped key": (["scal=8"], "scal: unknown key; expected dataset, "),
     "an added key": (["+scal=8"], "scal: unknown key; expected dataset, "),
     "an added key of a group": (["+method.sharp=1"], "method.sharp: unknown key; method=bicubic takes order, "),
