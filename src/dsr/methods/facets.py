@@ -24,7 +24,7 @@ from torch.nn import functional
 from dsr.degrade import check_scale
 from dsr.methods.holes import filled
 from dsr.methods.maps import bounds_of, normalised
-from dsr.methods.network import DisparityNetwork, Whole
+from dsr.methods.network import Whole, WindowedNetwork
 
 _NEIGHBOURS = 9
 _FINE, _HALF = 16, 32
@@ -61,7 +61,7 @@ def stencil(values: Tensor) -> Stencil:
     return Stencil(here, along_u, along_v, bend, functional.avg_pool2d(padded, 3, stride=1))
 
 
-class Facets(DisparityNetwork):
+class Facets(WindowedNetwork):
     """The network.
 
     Args:
@@ -117,7 +117,7 @@ class Facets(DisparityNetwork):
         return self._upsampled(rgb, disparity, bounds, None)
 
     @property
-    def reach(self) -> int:  # type: ignore[override]
+    def reach(self) -> int:
         """How many coarse pixels around its own an output depends on.
 
         One for its planes' neighbours and what follows the trunk, two for each residual block, one each for the planes'

@@ -18,8 +18,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from dsr.geometry.camera import Camera, RangeType, from_range, to_range
+from dsr.geometry.camera import RangeType, from_range, to_range
 from dsr.methods.holes import filled
+from dsr.methods.maps import coarse_coordinates
 from dsr.sample import DepthSample
 
 _BEYOND = 4.0
@@ -108,16 +109,6 @@ class GuidedMethod(ABC):
             i, j = guided.nearest()
             fine = fine.masked_fill(~known[i[:, None], j], torch.nan)
         return from_range(fine[None], sample.camera, "disparity").to(sample.depth_lr)
-
-
-def coarse_coordinates(fine: Camera, coarse: Camera, device: torch.device | str = "cpu") -> tuple[Tensor, Tensor]:
-    """Return the coarse row of each fine row, (H,), and the coarse column of each fine column, (W,), in float64."""
-    rows = torch.arange(fine.height, dtype=torch.float64, device=device)
-    columns = torch.arange(fine.width, dtype=torch.float64, device=device)
-    return (
-        (rows - fine.cy) / fine.fy * coarse.fy + coarse.cy,
-        (columns - fine.cx) / fine.fx * coarse.fx + coarse.cx,
-    )
 
 
 def slopes_along(values: Tensor, axis: int) -> Tensor:

@@ -10,6 +10,7 @@ from scipy import ndimage
 from torch import Tensor
 
 from dsr.geometry.camera import Camera, RangeType, from_range, to_range
+from dsr.methods.maps import coarse_coordinates
 from dsr.sample import DepthSample
 
 Order = Literal["nearest", "bilinear", "bicubic"]
@@ -51,16 +52,10 @@ class Interpolation:
         if not known.all():
             nearest = ndimage.distance_transform_edt(~known, return_distances=False, return_indices=True)
             values = values[tuple(nearest)]
-        where = _coarse_coordinates(fine_camera, camera)
+        places = coarse_coordinates(fine_camera, camera)
+        where = torch.stack(torch.meshgrid(*places, indexing="ij")).numpy()
         fine = ndimage.map_coordinates(values, where, order=self._degree, mode="nearest")
         if not (known.all() or self._fill_holes):
             fine[ndimage.map_coordinates(known.astype(np.uint8), where, order=0, mode="nearest") == 0] = np.nan
         fine[fine <= 0] = np.nan  # a spline may overshoot beside a depth step
         return from_range(torch.from_numpy(fine).to(coarse)[None], fine_camera, "perspective")
-
-
-def _coarse_coordinates(fine: Camera, coarse: Camera) -> np.ndarray:
-    """Return the (row, column) in the coarse map that each fine pixel's ray meets, (2, H, W)."""
-    rows = (np.arange(fine.height) - fine.cy) / fine.fy * coarse.fy + coarse.cy
-    columns = (np.arange(fine.width) - fine.cx) / fine.fx * coarse.fx + coarse.cx
-    return np.stack(np.meshgrid(rows, columns, indexing="ij"))

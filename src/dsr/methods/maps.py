@@ -8,6 +8,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from dsr.geometry.camera import Camera
+
 
 class Normalised(NamedTuple):
     """A map brought to 0..1 per sample, (B, 1, H, W), and the minimum and span (B, 1, 1, 1) to undo it with."""
@@ -57,3 +59,13 @@ def upsample_bicubic(x: Tensor, scale: int) -> Tensor:
     """
     size = [scale * n for n in x.shape[-2:]]
     return functional.interpolate(x, size=size, mode="bicubic", align_corners=False, antialias=True)
+
+
+def coarse_coordinates(fine: Camera, coarse: Camera, device: torch.device | str = "cpu") -> tuple[Tensor, Tensor]:
+    """Return the coarse row of each fine row, (H,), and the coarse column of each fine column, (W,), in float64."""
+    rows = torch.arange(fine.height, dtype=torch.float64, device=device)
+    columns = torch.arange(fine.width, dtype=torch.float64, device=device)
+    return (
+        (rows - fine.cy) / fine.fy * coarse.fy + coarse.cy,
+        (columns - fine.cx) / fine.fx * coarse.fx + coarse.cx,
+    )

@@ -23,7 +23,7 @@ from dsr.degrade import check_scale
 from dsr.methods.holes import filled
 from dsr.methods.layers import ConvLayer, Level
 from dsr.methods.maps import bounds_of, mean3x3, normalised, upsample_bicubic
-from dsr.methods.network import DisparityNetwork, Whole
+from dsr.methods.network import Whole, WindowedNetwork
 
 VariantName = Literal["hui", "voynov", "dsr"]
 FEATURES = 32
@@ -74,7 +74,7 @@ VARIANTS = MappingProxyType(
 )
 
 
-class MSGNet(DisparityNetwork):
+class MSGNet(WindowedNetwork):
     """The network of both variants; modules are registered in the order in which data passes them.
 
     Args:
@@ -136,7 +136,7 @@ class MSGNet(DisparityNetwork):
         return upsample_disparity(self, rgb, disparity, bounds)
 
     @property
-    def reach(self) -> int:  # type: ignore[override]
+    def reach(self) -> int:
         """How many coarse pixels around its own an output depends on, two of them for ``hui``'s uneven padding."""
         return self.rows_seen(0) + 2
 

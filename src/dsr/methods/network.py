@@ -49,13 +49,11 @@ class DisparityNetwork(nn.Module, abc.ABC):
     Attributes:
         scale: the upsampling factor.
         covers: whether the output has all of the photo's pixels; some published networks leave out a row and a column.
-        reach: how many coarse pixels around its own an output depends on; None for all, so that there are no windows.
 
     """
 
     scale: int
     covers: bool = True
-    reach: int | None = None
 
     @abc.abstractmethod
     def arguments(self) -> dict[str, Any]:
@@ -76,9 +74,21 @@ class DisparityNetwork(nn.Module, abc.ABC):
 
         """
 
+
+class WindowedNetwork(DisparityNetwork):
+    """A network whose outputs depend on what is near them alone, beside a few values of the whole image.
+
+    So it answers large images window by window; another :class:`DisparityNetwork` answers them in one piece.
+    """
+
+    @property
+    @abc.abstractmethod
+    def reach(self) -> int:
+        """How many coarse pixels around its own an output depends on."""
+
+    @abc.abstractmethod
     def whole(self, rgb: Tensor, disparity: Tensor) -> Whole:
-        """Return what answers windows of an image; for a network that has a reach. See :meth:`upsample`."""
-        raise NotImplementedError
+        """Return what answers windows of an image; see :meth:`upsample` for the arguments."""
 
 
 class NetworkUpsampler:
@@ -154,10 +164,11 @@ class NetworkUpsampler:
             progress: is told after each of the ensemble's answers, and each tile of it.
 
         """
-        if not self._tiled(rgb.shape[-2], rgb.shape[-1]):
+        net = self._windowed(rgb.shape[-2], rgb.shape[-1])
+        if net is None:
             return self._mean_of_poses(lambda pose: self.net.upsample(posed(rgb, pose), posed(coarse, pose)), progress)
-        rows, columns = (self._spans(n) for n in coarse.shape[-2:])
-        wholes = [self.net.whole(posed(rgb, pose), posed(coarse, pose)) for pose in range(self.ensemble)]
+        rows, columns = (self._spans(n, net) for n in coarse.shape[-2:])
+        wholes = [net.whole(posed(rgb, pose), posed(coarse, pose)) for pose in range(self.ensemble)]
         tiles, done, scale = len(rows) * len(columns), 0, self.net.scale
 
         def told(part: int, parts: int) -> None:
@@ -175,18 +186,20 @@ class NetworkUpsampler:
 
     def parts(self, height: int, width: int) -> int:
         """Return how many parts ``progress`` counts for a photo of that size."""
-        if not self._tiled(height, width):
+        net = self._windowed(height, width)
+        if net is None:
             return self.ensemble
-        tiles = [len(self._spans(n // self.net.scale)) for n in (height, width)]
+        tiles = [len(self._spans(n // net.scale, net)) for n in (height, width)]
         return tiles[0] * tiles[1] * self.ensemble
 
-    def _tiled(self, height: int, width: int) -> bool:
-        return self.net.reach is not None and (self.tile is not None or height * width > UNTILED)
+    def _windowed(self, height: int, width: int) -> WindowedNetwork | None:
+        """Return the network if a photo of that size is to be answered in tiles, and can be."""
+        large = self.tile is not None or height * width > UNTILED
+        return self.net if large and isinstance(self.net, WindowedNetwork) else None
 
-    def _spans(self, size: int) -> list[Span]:
+    def _spans(self, size: int, net: WindowedNetwork) -> list[Span]:
         """Return the tiles along an axis of so many coarse pixels."""
-        tile = (self.tile or TILE) // self.net.scale
-        return spans(size, tile, self.net.reach or 0, _OVERLAP)
+        return spans(size, (self.tile or TILE) // net.scale, net.reach, _OVERLAP)
 
     def _mean_of_poses(self, answer: Callable[[int], Tensor], progress: Progress | None) -> Tensor:
         """Return the mean of what ``answer`` says for each pose, turned back."""

@@ -15,13 +15,12 @@ import numpy as np
 import torch
 from matplotlib.colors import Normalize
 from torch import Tensor
-from torch.nn import functional
 from torch.utils.tensorboard import SummaryWriter
 from torch.utils.tensorboard.summary import hparams
 
 from dsr.geometry.shading import LIGHT_NAMES, render
-from dsr.report.pictures import colours, normals_seen_by
-from dsr.report.results import Run, read_run
+from dsr.report.pictures import colours, normals_seen_by, reduced
+from dsr.report.results import Run, method_settings, read_run
 from dsr.report.tables import METRICS
 from dsr.store import StoredScene
 
@@ -94,10 +93,11 @@ def _write_scores(writer: SummaryWriter, run: Run) -> None:
 
 def _hyperparameters(run: Run) -> dict[str, Any]:
     """Return what the table of runs says of one: the problem, the method and its settings."""
-    method = run.settings.get("method", {})
-    shown = {key: value for key, value in method.items() if isinstance(value, (bool, int, float, str))}
-    hidden = ("name", "label", "target", "weights_packaged", "weights_file", "weights_source")
-    settings = {f"method.{key}": value for key, value in shown.items() if key not in hidden}
+    settings = {
+        f"method.{key}": value
+        for key, value in method_settings(run.settings).items()
+        if isinstance(value, (bool, int, float, str))
+    }
     return {
         "method": run.label,
         "dataset": run.dataset,
@@ -113,20 +113,10 @@ def _write_pictures(writer: SummaryWriter, number: int, scene: StoredScene, dept
     shades = [render(normals_seen_by(scene.camera, depth))[0]]
     if scene.depth is not None:
         shades.append(render(normals_seen_by(scene.camera, scene.depth))[0])
-    rows = [torch.cat(list(_panel(each)), dim=-1) for each in shades]
+    rows = [torch.cat(list(reduced(each, _PANEL)), dim=-1) for each in shades]
     writer.add_image(f"renderings/{scene.name}", _grey(torch.cat(rows, dim=-2)), number, dataformats="HWC")
     if scene.depth is not None:
         writer.add_image(f"depth_error/{scene.name}", _error(depth, scene.depth), number, dataformats="HWC")
-
-
-def _panel(values: Tensor) -> Tensor:
-    """Return (C, H, W) no larger than a panel; the mean of the known pixels that fall together."""
-    factor = -(-max(values.shape[-2:]) // _PANEL)
-    if factor == 1:
-        return values
-    known = values.isfinite().to(values.dtype)
-    share = functional.avg_pool2d(known, factor)
-    return functional.avg_pool2d(values.nan_to_num(), factor) / torch.where(share > 0, share, torch.nan)
 
 
 def _grey(values: Tensor) -> np.ndarray:
@@ -140,5 +130,5 @@ def _error(depth: Tensor, truth: Tensor) -> np.ndarray:
     The strongest colours are 1 % of the scene's median depth, whatever the method, so that runs can be compared.
     """
     limit = 0.01 * float(truth.nanmedian())
-    scaled = Normalize(-limit, limit)(np.ma.masked_invalid(_panel(depth - truth)[0].numpy()))
+    scaled = Normalize(-limit, limit)(np.ma.masked_invalid(reduced(depth - truth, _PANEL)[0].numpy()))
     return (colours("RdBu_r")(scaled)[..., :3] * 255).round().astype(np.uint8)

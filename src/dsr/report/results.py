@@ -25,7 +25,7 @@ _DATASET_ORDER = ("simgeo", "icl", "middlebury", "sunrgbd", "tofmark")
 _SCORES, _SUMMARY, _VERSIONS = "scores.csv", "summary.json", "versions.json"
 _TEXT_COLUMNS = ("dataset", "scene", "downsampling", "method", "metric", "variant")
 _NUMBER_COLUMNS = ("scale", "seed", "value", "valid_share")
-_ABOUT_METHOD = ("method", "weights_sha256", "precision")
+_NAMES = ("name", "label", "target")
 _DIGEST = 8
 """Of a hash, as many digits are shown."""
 
@@ -123,6 +123,10 @@ class Results:
         """Return what was evaluated, in order."""
         return list(dict.fromkeys(run.problem for run in self.runs))
 
+    def of(self, problem: Problem) -> list[Run]:
+        """Return the runs that answer a problem, in order."""
+        return [run for run in self.runs if run.problem == problem]
+
     def only(self, methods: Sequence[str] = (), datasets: Sequence[str] = (), scales: Sequence[int] = ()) -> Results:
         """Return the runs of some methods (by label), data sets and scales; an empty choice is no choice.
 
@@ -141,6 +145,14 @@ class Results:
         if not runs:
             raise ValueError("methods, datasets, scales: expected a run that fits all of them, there is none")
         return Results(runs, self.notes)
+
+
+def one_per_method(runs: Sequence[Run]) -> tuple[Run, ...]:
+    """Return the run of each label with the lowest seed, in the order of the labels."""
+    lowest: dict[str, Run] = {}
+    for run in sorted(runs, key=lambda run: run.seed):
+        lowest.setdefault(run.label, run)
+    return tuple(lowest[label] for label in dict.fromkeys(run.label for run in runs))
 
 
 def load_results(paths: Sequence[Path]) -> Results:
@@ -232,7 +244,7 @@ def _distinguished(runs: Sequence[Run]) -> list[Run]:
 
     What differs is said: "MSG-V (ensemble=1)", "middlebury (size=256)".
     """
-    methods = [_method_settings(run.settings) for run in runs]
+    methods = [_identity_of_method(run.settings) for run in runs]
     datasets = [{**run.settings.get("dataset", {}), "root": None, "scenes": None} for run in runs]
     labels = _told_apart([(run.label, run.scale) for run in runs], methods)
     names = _told_apart([(run.dataset, 0) for run in runs], datasets)
@@ -242,16 +254,20 @@ def _distinguished(runs: Sequence[Run]) -> list[Run]:
     ]
 
 
-def _method_settings(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Return what a run's method depends on, flat, by dotted key."""
-    found: dict[str, Any] = {}
-    for key in _ABOUT_METHOD:
-        value = settings.get(key)
-        if isinstance(value, Mapping):
-            found |= {name: entry for name, entry in value.items() if name not in ("name", "label", "target")}
-        elif value is not None:
-            found["weights" if key == "weights_sha256" else key] = str(value)[:_DIGEST]
-    return {key: value for key, value in found.items() if not key.startswith("weights_")}
+def method_settings(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the parameters of a run's method: its configuration without names and where weights come from."""
+    method = settings.get("method")
+    known = method if isinstance(method, Mapping) else {}
+    return {key: value for key, value in known.items() if key not in _NAMES and not key.startswith("weights_")}
+
+
+def _identity_of_method(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what tells methods of one label apart: parameters, weights, precision."""
+    found = method_settings(settings)
+    for key, name in (("weights_sha256", "weights"), ("precision", "precision")):
+        if settings.get(key) is not None:
+            found[name] = str(settings[key])[:_DIGEST]
+    return found
 
 
 def _told_apart(names: Sequence[Any], settings: Sequence[Mapping[str, Any]]) -> list[str]:

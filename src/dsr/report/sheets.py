@@ -17,17 +17,18 @@ from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator, ScalarFormatter
 from torch import Tensor
-from torch.nn import functional
 
 from dsr.geometry.camera import Camera
 from dsr.geometry.shading import LIGHT_NAMES, render
-from dsr.report.pictures import HOLE_COLOUR, colours, limits_of, normals_seen_by, write_figure
+from dsr.report.pictures import HOLE_COLOUR, colours, limits_of, normals_seen_by, reduced, write_figure
 from dsr.sample import Scene
 
 _ROWS = 6
 _DPI = 100
 _PANEL = 2.56
 """Inches of a panel's longer side: 256 pixels."""
+_LONGEST = 512
+"""Pixels of a picture's longer side, at most."""
 _LEAST_PANEL = 0.3
 """Inches of its shorter side."""
 _TEXT, _MARGIN, _GAP, _ABOVE, _BELOW = 2.6, 0.15, 0.14, 0.8, 0.5
@@ -143,14 +144,8 @@ def _percent(share: float) -> str:
 
 
 def _reduced(values: Tensor) -> Tensor:
-    """Return (C, H, W) averaged over whole pixels to at most twice a panel's; NaN where most of them are."""
-    factor = math.ceil(max(values.shape[-2:]) / (2 * _PANEL * _DPI))
-    known = values.isfinite()
-    total, weight = (
-        functional.avg_pool2d(each.double(), factor, ceil_mode=True, count_include_pad=False)
-        for each in (torch.where(known, values, 0), known)
-    )
-    return torch.where(weight >= 0.5, total / weight.clamp(min=0.5), torch.nan)
+    """Return (C, H, W) in float64, reduced to at most twice a panel's pixels."""
+    return reduced(values.double(), _LONGEST)
 
 
 def _save_page(path: Path, rows: list[_Row], title: str) -> None:

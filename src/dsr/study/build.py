@@ -13,7 +13,7 @@ from typing import Any
 from torch import Tensor
 
 from dsr.atomic import write_text
-from dsr.report.results import Problem, Results, Run
+from dsr.report.results import Problem, Results, Run, one_per_method
 from dsr.study.key import KEY_NAME, PAGE_VERSION, Candidate, Key, Trial, read_key, write_key
 from dsr.study.page import page_of
 from dsr.study.pictures import grey_png, shading_of
@@ -140,7 +140,7 @@ def _questions(results: Results, choice: Choice) -> tuple[list[Question], list[s
             if choice.scenes and scene not in choice.scenes:
                 continue
             place = f"{problem.dataset}/{scene} x{problem.scale} {problem.downsampling}"
-            shown = _one_per_label([run for run in of_problem if scene in run.scenes])
+            shown = one_per_method([run for run in of_problem if scene in run.scenes])
             reason = _why_not(shown, scene)
             if reason:
                 notes.append(f"left out: {place}: {reason}")
@@ -175,14 +175,6 @@ def _expect_known(results: Results, choice: Choice) -> None:
         for name in asked:
             if name not in known:
                 raise ValueError(f"{what}: expected one of {', '.join(map(str, sorted(known)))}, got {name!r}")
-
-
-def _one_per_label(runs: Sequence[Run]) -> tuple[Run, ...]:
-    """Return the run of each label with the lowest seed, in the order of the labels."""
-    first: dict[str, Run] = {}
-    for run in sorted(runs, key=lambda run: run.seed):
-        first.setdefault(run.label, run)
-    return tuple(first[label] for label in dict.fromkeys(run.label for run in runs))
 
 
 def _why_not(runs: Sequence[Run], scene: str) -> str | None:

@@ -43,9 +43,8 @@ class Shown:
 def first_runs(results: Results, problem: Problem) -> dict[str, list[Run]]:
     """Return the runs of a problem by method; the first is of the lowest seed."""
     runs: dict[str, list[Run]] = {}
-    for run in results.runs:
-        if (run.dataset, run.scale, run.downsampling) == problem:
-            runs.setdefault(run.label, []).append(run)
+    for run in results.of(problem):
+        runs.setdefault(run.label, []).append(run)
     return {label: sorted(each, key=lambda run: run.seed) for label, each in runs.items()}
 
 

@@ -10,7 +10,6 @@ from urllib.parse import quote
 
 import pandas as pd
 
-from dsr.report.page.scenes import runs_of
 from dsr.report.results import Problem, Results, Run
 from dsr.report.tables import AVERAGES, METRICS, OTHER_FRAMES, RECREATED, in_paper_units, paper_row
 
@@ -32,7 +31,7 @@ def metrics_data(results: Results) -> list[dict[str, Any]]:
 
 def problem_data(results: Results, problem: Problem) -> dict[str, Any]:
     """Return a problem's scores in the paper's units, by scene and on average, with the published ones beside them."""
-    runs = runs_of(results, problem)
+    runs = results.of(problem)
     methods = list(dict.fromkeys(run.label for run in runs))
     wide = {id(run): _by_scene(run) for run in runs}
     scenes = list(dict.fromkeys(scene for run in runs for scene in wide[id(run)].index))

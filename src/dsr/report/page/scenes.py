@@ -13,7 +13,7 @@ from dsr.geometry.camera import Camera
 from dsr.geometry.shading import lights, shade
 from dsr.report.page.encoding import Pool, depth_picture, error_picture, mask_picture, shading_picture
 from dsr.report.pictures import limits_of, normals_seen_by
-from dsr.report.results import Problem, Results, Run
+from dsr.report.results import Problem, Results, Run, one_per_method
 from dsr.store import StoredScene
 
 _LEAST_ERROR = 1e-4
@@ -40,24 +40,14 @@ class _Result:
 
 def views_of(results: Results) -> list[View]:
     """Return every scene that has pictures, by problem; of several seeds of a method the lowest counts."""
-    views = []
+    views: list[View] = []
     for problem in results.problems():
-        runs = runs_of(results, problem)
+        runs = results.of(problem)
         scenes = dict.fromkeys(scene for run in runs for scene in run.scenes)
-        for scene in scenes:
-            chosen: dict[str, Run] = {}
-            for run in sorted(runs, key=lambda run: run.seed):
-                if scene in run.scenes:
-                    chosen.setdefault(run.label, run)
-            ordered = [chosen[label] for label in dict.fromkeys(run.label for run in runs) if label in chosen]
-            views.append(View(problem, scene, tuple(ordered)))
+        views += [
+            View(problem, scene, one_per_method([run for run in runs if scene in run.scenes])) for scene in scenes
+        ]
     return views
-
-
-def runs_of(results: Results, problem: Problem) -> list[Run]:
-    """Return a problem's runs in order."""
-    wanted = tuple(problem)
-    return [run for run in results.runs if (run.dataset, run.scale, run.downsampling) == wanted]
 
 
 def scene_data(view: View, pool: Pool, notes: list[str]) -> dict[str, Any] | None:
