@@ -5,7 +5,7 @@ from __future__ import annotations
 import unicodedata
 from collections.abc import Iterator, Sequence
 
-from dsr.report.table_parts import STAR_NOTE, Cell, Column, Group, PaperTable, Row
+from dsr.report.table_parts import STAR_NOTE, Cell, Column, Group, PaperTable, Row, Style
 
 MISSING = "--"
 _END = "\\end{table}\n"
@@ -13,7 +13,6 @@ _ROWS, _ROWS_TURNED = 42, 26
 """More do not fit on a page, upright or turned."""
 _WIDE = 135
 """Characters of a row that do not fit on an upright page in a legible size."""
-_MARKS = {0: ("", ""), 1: ("\\textbf{", "}"), 2: ("\\underline{", "}")}
 _SPECIAL = {
     "\\": "\\textbackslash{}", "{": "\\{", "}": "\\}", "$": "\\$", "&": "\\&", "#": "\\#", "%": "\\%", "_": "\\_",
     "~": "\\textasciitilde{}", "^": "\\textasciicircum{}", "<": "\\textless{}", ">": "\\textgreater{}",
@@ -135,7 +134,7 @@ def _rows(table: PaperTable, group: Group, columns: Sequence[Column], *, publish
         yield f"\\multicolumn{{{2 + seeds_too + len(columns)}}}{{@{{}}l}}{{{title}}} \\\\"
         title = ""
     for row in shown:
-        cells = [_beside(c, row) if published else _text(c, row.cells.get(c.key), row.seeds) for c in columns]
+        cells = [_beside(c, row) if published else _STYLE.text(c, row.cells.get(c.key), row.seeds) for c in columns]
         seeds = [str(row.seeds)] if table.seeded and not published else []
         yield " & ".join([title, latex_text(row.label), *seeds, *cells]) + " \\\\"
         title = ""
@@ -148,27 +147,13 @@ def _rows(table: PaperTable, group: Group, columns: Sequence[Column], *, publish
 def _beside(column: Column, row: Row) -> str:
     """Return our value and the paper's."""
     cell, paper = row.cells.get(column.key), row.published.get(column.key)
-    ours = MISSING if cell is None else _text(column, _bare(cell), 1)
+    ours = MISSING if cell is None else _STYLE.text(column, _bare(cell), 1)
     return f"{ours} ({MISSING if paper is None else f'{paper:g}'})"
 
 
 def _bare(cell: Cell) -> Cell:
     """Return a cell without its spread and interval."""
     return Cell(cell.mean, scenes=cell.scenes, of=cell.of, rank=cell.rank)
-
-
-def _text(column: Column, cell: Cell | None, seeds: int) -> str:
-    """Return a value with all that belongs to it; a number of seeds that is not the row's is said."""
-    if cell is None:
-        return MISSING
-    text = _number(column.text(cell.mean)).join(_MARKS[cell.rank])
-    if cell.spread is not None:
-        text += f" $\\pm$ {_number(column.text(cell.spread))}"
-    if cell.interval is not None:
-        text += " [{}, {}]".format(*map(column.text, cell.interval))
-    if cell.seeds not in (0, seeds):
-        text += f" ($n = {cell.seeds}$)"
-    return text if cell.complete else f"{text} ({cell.scenes} of {cell.of})"
 
 
 def _number(text: str) -> str:
@@ -183,9 +168,12 @@ def _width(table: PaperTable, *, published: bool) -> int:
     for group in table.groups:
         labels = [*(row.label for row in group.rows), *group.paper_only]
         for row in group.rows:
-            cells = [_beside(c, row) if published else _text(c, row.cells.get(c.key), row.seeds) for c in columns]
+            cells = [_beside(c, row) if published else _STYLE.text(c, row.cells.get(c.key), row.seeds) for c in columns]
             plain = [text.replace("\\textbf", "").replace("\\underline", "").replace("$\\pm$", "+") for text in cells]
             shown = [max(len(text), len(c.heading)) + 2 for text, c in zip(plain, columns, strict=True)]
             title = "" if group.about.average else group.about.title
             wide = max(wide, len(title) + max(map(len, labels)) + sum(shown))
     return wide
+
+
+_STYLE = Style(MISSING, {0: ("", ""), 1: ("\\textbf{", "}"), 2: ("\\underline{", "}")}, "$\\pm$", "$n = {}$", _number)

@@ -12,12 +12,12 @@ from dsr.atomic import write_text
 from dsr.report.latex import to_document, to_latex
 from dsr.report.paper_tables import build_tables
 from dsr.report.results import Results
-from dsr.report.table_parts import STAR_NOTE, Cell, Column, Group, PaperTable, Row
+from dsr.report.table_parts import STAR_NOTE, Column, Group, PaperTable, Row, Style
 
 __all__ = ["aligned", "to_csv", "to_latex", "to_markdown", "write_tables"]
 
 MISSING = "\N{EN DASH}"
-_MARKS = {0: ("", ""), 1: ("**", "**"), 2: ("<ins>", "</ins>")}
+_STYLE = Style(MISSING, {0: ("", ""), 1: ("**", "**"), 2: ("<ins>", "</ins>")}, "\N{PLUS-MINUS SIGN}", "n = {}")
 _SPECIAL = re.compile(r"[\\`*\[\]<>|~&#]|(?<![A-Za-z0-9])_|_(?![A-Za-z0-9])")
 _FACTS_FROM = 7
 """In a CSV the columns before tell what a row is about."""
@@ -143,22 +143,13 @@ def _rows(table: PaperTable, group: Group) -> Iterator[list[str]]:
     title = escaped(group.about.title)
     for row in group.rows:
         seeds = [str(row.seeds)] if table.seeded else []
-        yield [title, escaped(row.label), *seeds, *(_text(c, row.cells.get(c.key), row.seeds) for c in table.columns)]
+        yield [
+            title,
+            escaped(row.label),
+            *seeds,
+            *(_STYLE.text(c, row.cells.get(c.key), row.seeds) for c in table.columns),
+        ]
         title = ""
-
-
-def _text(column: Column, cell: Cell | None, seeds: int) -> str:
-    """Return a value with all that belongs to it; a number of seeds that is not the row's is said."""
-    if cell is None:
-        return MISSING
-    text = column.text(cell.mean).join(_MARKS[cell.rank])
-    if cell.spread is not None:
-        text += f" ± {column.text(cell.spread)}"
-    if cell.interval is not None:
-        text += " [{}, {}]".format(*map(column.text, cell.interval))
-    if cell.seeds not in (0, seeds):
-        text += f" (n = {cell.seeds})"
-    return text if cell.complete else f"{text} ({cell.scenes} of {cell.of})"
 
 
 def _compared(columns: Sequence[Column], group: Group) -> Iterator[list[str]]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 from dsr.report.scene_sets import SceneSet
@@ -143,3 +143,37 @@ class PaperTable:
         """Return the columns in which the paper's values stand beside ours."""
         rows = [row for group in self.groups for row in group.rows]
         return tuple(column for column in self.columns if any(column.key in row.published for row in rows))
+
+
+@dataclass(frozen=True)
+class Style:
+    """How a layout writes a cell.
+
+    Args:
+        missing: for a value that there is not.
+        marks: what stands before and after a value, by rank.
+        number: writes a number.
+        plus_minus: between a value and its spread.
+        seeds: says how many seeds there were, ``{}``.
+
+    """
+
+    missing: str
+    marks: Mapping[int, tuple[str, str]]
+    plus_minus: str
+    seeds: str
+    number: Callable[[str], str] = str
+
+    def text(self, column: Column, cell: Cell | None, seeds: int) -> str:
+        """Return a value with all that belongs to it; a number of seeds that is not the row's is said."""
+        if cell is None:
+            return self.missing
+        before, after = self.marks[cell.rank]
+        text = f"{before}{self.number(column.text(cell.mean))}{after}"
+        if cell.spread is not None:
+            text += f" {self.plus_minus} {self.number(column.text(cell.spread))}"
+        if cell.interval is not None:
+            text += " [{}, {}]".format(*map(column.text, cell.interval))
+        if cell.seeds not in (0, seeds):
+            text += f" ({self.seeds.format(cell.seeds)})"
+        return text if cell.complete else f"{text} ({cell.scenes} of {cell.of})"
