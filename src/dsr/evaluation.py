@@ -1,9 +1,10 @@
 """Evaluation in two passes: predictions to files, then scores from files.
 
 A prediction is ``predictions/SCENE.npz``: ``depth`` (H, W) in metres, NaN in holes; ``config``, a JSON text of all that
-it came from; and the ``seconds`` that it took. Beside it lies the problem that it answers, see :mod:`dsr.store`. A
-prediction whose stored config is the wanted one is not made again, so
-an interrupted run goes on where it stopped. One scene that fails does not keep the others from their results.
+it came from; and the ``seconds`` that it took. Beside it lies the problem that it answers, see :mod:`dsr.store`, and
+``iterations/SCENE.csv``, how the iteration went, of a method that iterates. A prediction whose stored config is the
+wanted one is not made again, so an interrupted run goes on where it stopped. One scene that fails, or that the method
+has no answer for, does not keep the others from their results.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ import json
 import re
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
@@ -25,11 +27,11 @@ from dsr.atomic import read_arrays, replacing, write_text
 from dsr.data.base import SceneSource
 from dsr.degrade import Downsampling, Measured, make_sample
 from dsr.holes import Holes
-from dsr.methods.base import Upsampler
+from dsr.methods.base import Iterative, NoAnswerError, Upsampler
 from dsr.noise import Noise
 from dsr.quality.scores import WORST, Metric, score_image
 from dsr.sample import DepthSample
-from dsr.store import load_prediction, prediction_path, save_scene, scene_path
+from dsr.store import iterations_path, load_prediction, prediction_path, save_scene, scene_path
 from dsr.terminal import one_line
 
 SCORE_COLUMNS = (
@@ -52,6 +54,10 @@ class Progress(Protocol):
     def __call__(self, items: Sequence[str], description: str) -> Iterable[str]:
         """Return the items, one at a time."""
         ...
+
+
+Steps = Callable[[str], AbstractContextManager[Callable[[int, int], object]]]
+"""Shows how far a method is within the scene of that name: ``with steps(scene) as step: step(done, total)``."""
 
 
 @dataclass(frozen=True)
@@ -110,6 +116,7 @@ class Outcome:
     Args:
         made, reused: scenes whose prediction was computed, or found on disk.
         failures: scene and what was wrong, one line each.
+        unanswered: scene and why the method has no answer for it, one line each.
         notes: scene and what a reader of the scores should know.
         seconds: computing time per scene.
         unscored: scenes without a fine depth map to compare with.
@@ -119,6 +126,7 @@ class Outcome:
     made: list[str] = field(default_factory=list)
     reused: list[str] = field(default_factory=list)
     failures: dict[str, str] = field(default_factory=dict)
+    unanswered: dict[str, str] = field(default_factory=dict)
     notes: dict[str, list[str]] = field(default_factory=dict)
     seconds: dict[str, float] = field(default_factory=dict)
     unscored: list[str] = field(default_factory=list)
@@ -128,13 +136,16 @@ class StalePredictionError(ValueError):
     """A prediction on disk was made from something else, and nobody allowed to overwrite it."""
 
 
-def predict(study: Study, folder: Path, progress: Progress, *, overwrite: bool = False) -> Outcome:
+def predict(
+    study: Study, folder: Path, progress: Progress, *, steps: Steps | None = None, overwrite: bool = False
+) -> Outcome:
     """Write the prediction of every scene that has none yet to ``folder / "predictions"``.
 
     Args:
         study: what to evaluate.
         folder: the run's directory.
         progress: shows how far it is.
+        steps: shows how far a method that iterates is within a scene.
         overwrite: whether predictions on disk are made anew, whatever they came from.
 
     Raises:
@@ -148,13 +159,16 @@ def predict(study: Study, folder: Path, progress: Progress, *, overwrite: bool =
             config = study.stored_config(scene)
             seconds = None if overwrite else _seconds_of_current(path, config)
             if seconds is None:
-                outcome.seconds[scene] = _predict_scene(study, scene, path, config)
+                outcome.seconds[scene] = _predict_scene(study, scene, folder, config, steps)
                 outcome.made.append(scene)
             else:
                 outcome.seconds[scene] = seconds
                 outcome.reused.append(scene)
         except StalePredictionError:
             raise
+        except NoAnswerError as error:
+            outcome.unanswered[scene] = _failure(scene, error)
+            path.unlink(missing_ok=True)
         except (ValueError, OSError) as error:
             outcome.failures[scene] = _failure(scene, error)
     return outcome
@@ -183,7 +197,8 @@ def score(
 
     """
     rows: list[dict[str, Any]] = []
-    for scene in progress([name for name in study.source.scenes() if name not in outcome.failures], "score"):
+    without = outcome.failures.keys() | outcome.unanswered.keys()
+    for scene in progress([name for name in study.source.scenes() if name not in without], "score"):
         try:
             sample = study.sample(scene)
             depth = load_prediction(prediction_path(folder, scene))
@@ -223,6 +238,7 @@ def summary(study: Study, scores: pd.DataFrame, outcome: Outcome) -> dict[str, A
         "without_truth": outcome.unscored,
         "notes": outcome.notes,
         "failures": outcome.failures,
+        "unanswered": outcome.unanswered,
     }
 
 
@@ -251,20 +267,31 @@ def _seconds_of_current(path: Path, config: Mapping[str, Any]) -> float | None:
     )
 
 
-def _predict_scene(study: Study, scene: str, path: Path, config: Mapping[str, Any]) -> float:
-    """Compute and write one prediction; return the seconds that the method took."""
+def _predict_scene(study: Study, scene: str, folder: Path, config: Mapping[str, Any], steps: Steps | None) -> float:
+    """Compute and write one prediction, and how the iteration went; return the seconds that the method took."""
     sample = study.sample(scene)
     start = time.perf_counter()
-    depth = study.method(sample)
+    depth = _answer(study.method, sample, steps)
     seconds = time.perf_counter() - start
     expected = (1, sample.camera.height, sample.camera.width)
     if tuple(depth.shape) != expected:
         raise ValueError(f"{scene}: {study.method_name} gave depth of shape {tuple(depth.shape)}, expected {expected}")
-    with replacing(path) as temporary:
+    if isinstance(study.method, Iterative):
+        with replacing(iterations_path(folder, scene)) as temporary:
+            pd.DataFrame(study.method.history).to_csv(temporary, index=False)
+    with replacing(prediction_path(folder, scene)) as temporary:
         np.savez_compressed(
             temporary, depth=depth[0].cpu().numpy(), config=json.dumps(dict(config), sort_keys=True), seconds=seconds
         )
     return seconds
+
+
+def _answer(method: Upsampler, sample: DepthSample, steps: Steps | None) -> Tensor:
+    """Return a method's depth; show how far it is if it tells."""
+    if not isinstance(method, Iterative) or steps is None:
+        return method(sample)
+    with steps(sample.scene) as step:
+        return method(sample, step)
 
 
 def _score_scene(

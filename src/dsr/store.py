@@ -2,7 +2,7 @@
 
 ``predictions/SCENE.npz`` has ``depth`` (H, W) in metres, NaN in holes, and where it came from. ``scenes/SCENE.npz`` has
 the photo, the coarse input, the truth and their cameras, so that whatever is drawn from a run later, on any machine,
-needs nothing but its directory.
+needs nothing but its directory. ``iterations/SCENE.csv`` says how the iteration went, of a method that iterates.
 """
 
 from __future__ import annotations
@@ -56,6 +56,11 @@ def prediction_path(folder: Path, scene: str) -> Path:
 def scene_path(folder: Path, scene: str) -> Path:
     """Return where a run keeps the problem that a scene posed."""
     return folder / "scenes" / f"{scene}.npz"
+
+
+def iterations_path(folder: Path, scene: str) -> Path:
+    """Return where a run keeps how a scene's iteration went."""
+    return folder / "iterations" / f"{scene}.csv"
 
 
 def load_prediction(path: Path) -> Tensor:

@@ -26,3 +26,12 @@ def test_a_benchmark_prints_ratios(name: str) -> None:
     )
     assert done.returncode == 0, done.stderr
     assert len(re.findall(r"\d\.\d+ times as fast", done.stdout)) == ratios
+
+
+def test_what_a_method_costs_is_measured(shared: Path) -> None:
+    command = [sys.executable, str(BENCHMARKS / "methods_cost.py"), "--scenes", str(shared / "scenes")]
+    done = subprocess.run(
+        [*command, "--methods", "nearest", "--scale", "4"], capture_output=True, text=True, timeout=120, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert re.fullmatch(r"\| `nearest` \| \d+\.\d \| \d+ \|", done.stdout.splitlines()[-1])

@@ -1,5 +1,6 @@
 """Two passes: predictions to files, then scores from files; what is there already and what fails keep their places."""
 
+import contextlib
 import csv
 import dataclasses
 import json
@@ -12,6 +13,7 @@ import torch
 from dsr.degrade import Downsampling, Measured, make_sample
 from dsr.evaluation import SCORE_COLUMNS, Outcome, StalePredictionError, Study, load_prediction, predict, score
 from dsr.geometry.camera import Camera
+from dsr.methods.base import NoAnswerError
 from dsr.noise import GaussianMultiplicative
 from dsr.quality.scores import catalogue, score_image
 from dsr.sample import Scene
@@ -421,3 +423,46 @@ def test_a_studys_samples_have_its_noise_under_its_seed():
     reseeded = dataclasses.replace(noisy, seed=8).sample("a")
     assert not torch.equal(reseeded.depth_lr, expected.depth_lr)
     assert torch.equal(reseeded.depth, clean.sample("a").depth)
+
+
+class Iterating(ToyMethod):
+    """Tells its steps, and how they went."""
+
+    history: list[dict[str, float]] = []  # noqa: RUF012 - of the last call, as the protocol has it
+
+    def __call__(self, sample, progress=None):
+        for step in range(3):
+            if progress is not None:
+                progress(step + 1, 3)
+        self.history = [{"iteration": 1.0, "objective": 0.5}, {"iteration": 3.0, "objective": 0.25}]
+        return super().__call__(sample)
+
+
+def test_how_an_iteration_went_is_shown_while_it_goes_and_kept(tmp_path):
+    shown = []
+
+    @contextlib.contextmanager
+    def steps(scene):
+        yield lambda done, total: shown.append((scene, done, total))
+
+    predict(toy_study(method=Iterating()), tmp_path, plainly, steps=steps)
+    assert shown == [(scene, done, 3) for scene in "ab" for done in (1, 2, 3)]
+    assert (tmp_path / "iterations" / "a.csv").read_text() == "iteration,objective\n1.0,0.5\n3.0,0.25\n"
+
+
+def test_a_scene_without_an_answer_is_a_result_and_no_failure(tmp_path):
+    method = ToyMethod(b=NoAnswerError("a map of 2 x 2 is smaller than a patch"))
+    outcome, scores, _ = run(toy_study(method=method), tmp_path)
+    reason = "b: a map of 2 x 2 is smaller than a patch"
+    assert outcome.unanswered == {"b": reason}
+    assert outcome.failures == {}
+    assert set(scores["scene"]) == {"a"}
+    assert json.loads((tmp_path / "summary.json").read_text())["unanswered"] == {"b": reason}
+    assert not (tmp_path / "predictions" / "b.npz").exists()
+
+
+def test_what_a_scene_had_before_is_not_scored_where_there_is_no_answer_now(tmp_path):
+    run(toy_study(), tmp_path)
+    _, scores, _ = run(toy_study(method=ToyMethod(b=NoAnswerError("none"))), tmp_path, overwrite=True)
+    assert set(scores["scene"]) == {"a"}
+    assert not (tmp_path / "predictions" / "b.npz").exists()

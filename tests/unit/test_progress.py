@@ -43,6 +43,17 @@ def test_steps_need_no_pass_around_them() -> None:
     assert "statue" in text.getvalue()
 
 
+def test_parts_are_shown_once_it_is_known_how_many_there_are() -> None:
+    display, text = _display(terminal=True)
+    for item in display(["statue"], "predict"):
+        with display.parts(item) as update:
+            before = text.getvalue()
+            update(50, 1000)
+            display._passes.refresh()  # type: ignore[union-attr]
+    assert "50/1000" in text.getvalue()
+    assert "1000" not in before
+
+
 def test_after_an_error_the_terminal_is_free_again() -> None:
     display, _ = _display(terminal=True)
 

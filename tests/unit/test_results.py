@@ -158,3 +158,9 @@ def test_some_runs_can_be_chosen_and_what_is_not_there_is_refused(make_run, tmp_
         results.only(["DIP"])
     with pytest.raises(ValueError, match="there is none"):
         results.only(["Bicubic"], scales=[2])
+
+
+def test_scenes_that_a_method_has_no_answer_for_are_noted(make_run, tmp_path):
+    make_run(tmp_path / "a", label="EG", method="eg", scenes=("s",))
+    change(tmp_path / "a", "summary.json", unanswered={"t": "t: no edge is closed"})
+    assert load_results([tmp_path]).notes == ("EG at x4 has no answer for t: no edge is closed",)

@@ -81,7 +81,7 @@ def _evaluate(plain: dict[str, Any], source: SceneSource | None) -> pd.DataFrame
     _seed(settings.seed)
     prepare(display, study.source, study.source.scenes())
     try:
-        outcome = predict(study, folder, display, overwrite=settings.overwrite)
+        outcome = predict(study, folder, display, steps=display.parts, overwrite=settings.overwrite)
     except StalePredictionError as error:
         raise ConfigError(str(error)) from error
     illustrate = functools.partial(_illustrate, folder, study.label)
@@ -239,6 +239,8 @@ def _report(console: Console, folder: Path, scores: pd.DataFrame, label: str, ou
     if outcome.unscored:
         unscored = ", ".join(outcome.unscored)
         show(console, f"note: no truth to score against: {unscored}")
+    for message in outcome.unanswered.values():
+        show(console, f"no answer: {message}")
     if outcome.reused:
         console.print(f"predictions re-used: {len(outcome.reused)} (overwrite=true makes them anew)", highlight=False)
     show(console, f"results: {folder}")

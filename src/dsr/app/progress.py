@@ -60,6 +60,19 @@ class Display:
             finally:
                 progress.remove_task(task)
 
+    @contextlib.contextmanager
+    def parts(self, name: str = "") -> Iterator[Callable[..., None]]:
+        """Show the parts of one thing that says itself how many it has: how many are done, of how many, a remark."""
+        with contextlib.ExitStack() as stack:
+            shown: list[Callable[[int, str], None]] = []
+
+            def progress(done: int, total: int, remark: str = name) -> None:
+                if not shown:
+                    shown.append(stack.enter_context(self.steps(remark, total, done)))
+                shown[0](done, remark)
+
+            yield progress
+
 
 def prepare(display: Display, source: SceneSource, names: Sequence[str]) -> None:
     """Let a data set that renders or resizes its scenes do so for some of them, with a bar."""

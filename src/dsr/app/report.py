@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
 import shutil
 import tempfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -120,11 +119,11 @@ def _write(folder: Path, results: Results, study: pd.DataFrame | None, wanted: W
         save_scatter_matrix(folder / "metrics", results)
 
     def figures() -> None:
-        with _steps(display) as progress:
+        with display.parts() as progress:
             save_figures(folder / "figures", results, progress, light=wanted.light, notes=notes)
 
     def page() -> None:  # the last, as it links to the others' files
-        with _steps(display) as progress:
+        with display.parts() as progress:
             notes.extend(
                 save_page(
                     folder / "index.html", results, title=wanted.title, budget_mb=wanted.page_mb, progress=progress
@@ -139,17 +138,3 @@ def _write(folder: Path, results: Results, study: pd.DataFrame | None, wanted: W
     for part in display(todo, "report"):
         parts[part]()
     return notes
-
-
-@contextlib.contextmanager
-def _steps(display: Display) -> Iterator[Callable[..., None]]:
-    """Yield what takes how much is done, of how much, and perhaps what is at hand; a bar shows it."""
-    with contextlib.ExitStack() as stack:
-        shown: list[Callable[[int, str], None]] = []
-
-        def progress(done: int, total: int, name: str = "") -> None:
-            if not shown:
-                shown.append(stack.enter_context(display.steps(name, total, done)))
-            shown[0](done, name)
-
-        yield progress

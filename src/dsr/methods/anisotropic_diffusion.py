@@ -30,6 +30,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from dsr.geometry.camera import RangeType, from_range, to_range
+from dsr.methods.base import history_of
 from dsr.methods.differences import box_mean, extended, upsampled
 from dsr.methods.holes import filled
 from dsr.methods.maps import bounds_of, normalised
@@ -94,6 +95,7 @@ class AnisotropicDiffusion:
             raise ValueError(f"method.border: expected 0 or more coarse pixels, got {border}")
         self.steps, self.tolerance, self.step = steps, tolerance, step
         self.edge, self.depth_weight, self.border = edge, depth_weight, border
+        self.history: list[dict[str, float]] = []
 
     @torch.inference_mode()
     def __call__(self, sample: DepthSample, progress: Progress | None = None) -> Tensor:
@@ -106,7 +108,9 @@ class AnisotropicDiffusion:
         """
         coarse = to_range(sample.depth_lr.double(), sample.camera_lr, "disparity") + sample.camera_lr.doffs
         inverse = (coarse * sample.scale)[None]  # in pixels of the fine camera
-        fine = self.diffused(sample.rgb[None], inverse, sample.scale, progress).values[0]
+        found = self.diffused(sample.rgb[None], inverse, sample.scale, progress)
+        self.history = history_of(found.moved, CHECK_EVERY)
+        fine = found.values[0]
         return from_range(fine - sample.camera.doffs, sample.camera, "disparity").to(sample.depth_lr.dtype)
 
     def diffused(self, rgb: Tensor, coarse: Tensor, scale: int, progress: Progress | None = None) -> Diffused:

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from torch import Tensor
 
 from dsr.geometry.camera import RangeType
+from dsr.methods.tiling import Progress
 from dsr.sample import DepthSample
+
+
+class NoAnswerError(ValueError):
+    """A method has no answer for an image, through no fault of the image's: a result to report, as papers do."""
 
 
 class Upsampler(Protocol):
@@ -25,5 +30,40 @@ class Upsampler(Protocol):
         """Return the fine orthogonal depth, (1, H, W) in metres on the sample's device, NaN where there is none.
 
         A method never reads ``sample.depth``.
+
+        Raises:
+            NoAnswerError: it has none for this image.
+
         """
         ...
+
+
+@runtime_checkable
+class Iterative(Protocol):
+    """An :class:`Upsampler` that iterates, and tells how it went.
+
+    Attributes:
+        history: of the last call, one entry for each look at the iterates: ``iteration`` first, then what the method
+            watches, such as ``objective`` and ``moved``, in an order of its own.
+
+    """
+
+    history: list[dict[str, float]]
+
+    def __call__(self, sample: DepthSample, progress: Progress | None = None) -> Tensor:
+        """Return what :class:`Upsampler` does.
+
+        Args:
+            sample: the problem.
+            progress: is told the iterations done and the most that it may take.
+
+        """
+        ...
+
+
+def history_of(moved: list[float], every: int) -> list[dict[str, float]]:
+    """Return the history of an iteration that looks, every so many iterations, at how far its map has moved.
+
+    ``moved`` is the RMS since the last look, as a share of the map's range.
+    """
+    return [{"iteration": float(every * (look + 1)), "moved": value} for look, value in enumerate(moved)]

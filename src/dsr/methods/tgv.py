@@ -33,6 +33,7 @@ import torch
 from torch import Tensor
 
 from dsr.geometry.camera import RangeType, from_range, to_range
+from dsr.methods.base import history_of
 from dsr.methods.differences import box_mean, divergence, gradient, grey, repeated, touching, upsampled
 from dsr.methods.holes import filled
 from dsr.methods.maps import normalised
@@ -125,6 +126,7 @@ class TotalGeneralisedVariation:
         self.iterations, self.tolerance = iterations, tolerance
         self.first, self.second, self.data_weight = first, second, data_weight
         self.sharpness, self.exponent, self.step_ratio = sharpness, exponent, step_ratio
+        self.history: list[dict[str, float]] = []
 
     @torch.inference_mode()
     def __call__(self, sample: DepthSample, progress: Progress | None = None) -> Tensor:
@@ -142,6 +144,7 @@ class TotalGeneralisedVariation:
         known = coarse.isfinite()
         values = torch.where(known, scaled.values, torch.nan)
         found = self.minimised(sample.rgb[None].double(), values, sample.scale, progress)
+        self.history = history_of(found.moved, CHECK_EVERY)
         fine = found.values * scaled.span + scaled.minimum
         return from_range(fine[0], sample.camera, "disparity").to(sample.depth_lr.dtype)
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -52,6 +52,7 @@ class Run:
         settings: the resolved configuration.
         versions: of packages, Python and the project.
         scenes: those that have a prediction.
+        unanswered: scenes that the method has no answer for, and why.
 
     """
 
@@ -67,6 +68,7 @@ class Run:
     settings: Mapping[str, Any]
     versions: Mapping[str, Any]
     scenes: tuple[str, ...]
+    unanswered: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def problem(self) -> Problem:
@@ -135,13 +137,13 @@ class Results:
 
         """
         runs = self.runs
-        for name, field, wanted in (("methods", "label", methods), ("datasets", "dataset", datasets),
+        for name, key, wanted in (("methods", "label", methods), ("datasets", "dataset", datasets),
                                     ("scales", "scale", scales)):  # fmt: skip
-            there = list(dict.fromkeys(getattr(run, field) for run in self.runs))
+            there = list(dict.fromkeys(getattr(run, key) for run in self.runs))
             for value in wanted:
                 if value not in there:
                     raise ValueError(f"{name}: expected some of {', '.join(map(str, there))}, got {value}")
-            runs = tuple(run for run in runs if not wanted or getattr(run, field) in wanted)
+            runs = tuple(run for run in runs if not wanted or getattr(run, key) in wanted)
         if not runs:
             raise ValueError("methods, datasets, scales: expected a run that fits all of them, there is none")
         return Results(runs, self.notes)
@@ -177,9 +179,14 @@ def load_results(paths: Sequence[Path]) -> Results:
         detail = f"; {notes[0]}" if notes else ""
         raise ValueError(f"{where}: expected runs of eval.py (directories with {_SCORES}), found none{detail}")
     runs = _distinguished(runs)
+    unanswered = [
+        f"{run.label} at x{run.scale} has no answer for {message}"
+        for run in runs
+        for message in run.unanswered.values()
+    ]
     runs, older = _newest(runs)
     runs.sort(key=lambda run: (_problem_key(run.problem), _method_key(run.label), run.seed))
-    return Results(tuple(runs), (*notes, *older))
+    return Results(tuple(runs), (*notes, *older, *unanswered))
 
 
 def _folders(paths: Sequence[Path]) -> Iterator[Path]:
@@ -209,12 +216,14 @@ def read_run(folder: Path) -> Run:
         label = str(summary.get("label") or settings.get("method", {}).get("label") or method)
         dataset = str(scores["dataset"].iloc[0]) if len(scores) else str(summary["dataset"])
         seconds = {str(scene): float(value) for scene, value in summary["seconds"].items()}
+        unanswered = {str(scene): str(why) for scene, why in summary.get("unanswered", {}).items()}
         scale, seed, downsampling = int(summary["scale"]), int(summary["seed"]), str(summary["downsampling"])
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise ValueError(f"{folder / _SUMMARY}: expected the summary of a run, {error!r} is missing or wrong") from None
     scenes = tuple(scene for scene in seconds if prediction_path(folder, scene).is_file())
     scores = scores[scores["scene"].isin(scenes)]
-    return Run(folder, dataset, scale, downsampling, seed, method, label, scores, seconds, settings, versions, scenes)
+    about = (folder, dataset, scale, downsampling, seed, method, label)
+    return Run(*about, scores, seconds, settings, versions, scenes, unanswered)
 
 
 def _read_json(path: Path) -> dict[str, Any]:
