@@ -612,6 +612,27 @@ def test_a_training_starts_from_given_weights(smoke, tmp_path, within):
     assert (code, errors) == (2, ["error: trainer.init: nowhere: no such weights file"])
 
 
+def test_a_network_that_fits_any_scale_starts_from_weights_of_another(tmp_path, within):
+    small = ("model=dg", "model.stages=1", "model.filters=4", "model.size=3")
+    assert within(*SMOKE, *small, "output_dir=four")[0] == 0
+    weights = "trainer.init=four/weights.safetensors"
+    code, _, errors = within(
+        *SMOKE, *small, "scale=8", weights, "trainer.learning_rate=1e-12", "trainer.weight_decay=0", "output_dir=eight"
+    )
+    assert (code, errors) == (0, [])
+    one, other = (load_file(tmp_path / name / "weights.safetensors") for name in ("four", "eight"))
+    assert all(torch.allclose(one[name], other[name], atol=1e-6) for name in one)
+    code, _, errors = within(*SMOKE, *small, "model.filters=5", weights, "output_dir=other")
+    assert code == 2
+    assert "expected weights of DynamicGuidance" in errors[0]
+
+
+def test_a_network_that_depends_on_the_scale_refuses_weights_of_another(smoke, within):
+    code, _, errors = within(*SMOKE, "scale=8", f"trainer.init='{smoke[1]}/weights.safetensors'", "output_dir=other")
+    assert code == 2
+    assert errors[0].endswith("weights are for scale 4, the run is at scale 8, where MSGNet has other parameters")
+
+
 def test_facets_train_and_their_weights_are_those_of_method_facets(tmp_path, within):
     code, output, errors = within(*SMOKE, "model=facets", "model.width=8", "model.blocks=1", "output_dir=out")
     assert (code, errors) == (0, [])

@@ -116,15 +116,27 @@ def _network(settings: TrainConfig) -> DisparityNetwork:
     if settings.trainer.init is None:
         return net
     try:
-        first = load_network(Path(settings.trainer.init).expanduser(), NETWORKS, settings.scale)
+        first = load_network(Path(settings.trainer.init).expanduser(), NETWORKS)
     except (ValueError, OSError) as error:
         raise ConfigError(f"trainer.init: {error}") from error
-    if type(first) is not type(net) or first.arguments() != net.arguments():
+    of_another_scale = {**first.arguments(), "scale": settings.scale}
+    if type(first) is not type(net) or of_another_scale != net.arguments():
         raise ConfigError(
             f"trainer.init: {settings.trainer.init}: expected weights of {type(net).__name__} {net.arguments()}, "
             f"got those of {type(first).__name__} {first.arguments()}"
         )
-    return first
+    if _shapes(first) != _shapes(net):
+        raise ConfigError(
+            f"trainer.init: {settings.trainer.init}: weights are for scale {first.scale}, the run is at scale "
+            f"{net.scale}, where {type(net).__name__} has other parameters"
+        )
+    net.load_state_dict(first.state_dict())
+    return net
+
+
+def _shapes(net: DisparityNetwork) -> dict[str, torch.Size]:
+    """Return the shapes of a network's parameters."""
+    return {name: value.shape for name, value in net.state_dict().items()}
 
 
 def _prepare(console: Console, data: PatchData) -> None:

@@ -8,13 +8,17 @@ from types import MappingProxyType
 
 import torch
 
+from dsr.methods.dynamic_guidance import DynamicGuidance
 from dsr.methods.facets import Facets
 from dsr.methods.msg_net import MSGNet, VariantName
 from dsr.methods.network import DisparityNetwork, NetworkUpsampler, Precision
+from dsr.methods.pdn import PrimalDualNetwork
 from dsr.methods.published import load_msg_weights
 from dsr.methods.weights import is_ours, load_network
 
-NETWORKS: MappingProxyType[str, type[DisparityNetwork]] = MappingProxyType({"MSGNet": MSGNet, "Facets": Facets})
+NETWORKS: MappingProxyType[str, type[DisparityNetwork]] = MappingProxyType(
+    {"MSGNet": MSGNet, "Facets": Facets, "PrimalDualNetwork": PrimalDualNetwork, "DynamicGuidance": DynamicGuidance}
+)
 
 _OUR_ENSEMBLE = 4
 

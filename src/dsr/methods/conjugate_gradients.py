@@ -1,0 +1,60 @@
+"""Linear systems with symmetric positive definite operators that are given as functions: conjugate gradients.
+
+Hestenes and Stiefel, *Methods of Conjugate Gradients for Solving Linear Systems*, 1952. Each step lowers the quadratic
+1/2 <x, A x> - <b, x>, so an early stop is still nearer to the solution than the start.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+
+class Solved(NamedTuple):
+    """What was found: ``values`` (B, ...), the steps taken, and the largest |b - A x| / |b| in the batch."""
+
+    values: Tensor
+    iterations: int
+    residual: float
+
+
+def conjugate_gradients(
+    operator: Callable[[Tensor], Tensor], right: Tensor, start: Tensor, *, iterations: int, tolerance: float
+) -> Solved:
+    """Solve A x = b for each of a batch.
+
+    Args:
+        operator: x -> A x, (B, ...) -> (B, ...), symmetric positive definite for each element of the batch, on the
+            subspace that b - A start lies in; elements do not mix.
+        right: b, (B, ...).
+        start: the first x, (B, ...).
+        iterations: at most so many steps.
+        tolerance: it stops where |b - A x| is at most this share of |b|, in all elements.
+
+    """
+    x, residual = start, right - operator(start)
+    direction = residual
+    size, goal = _dot(residual, residual), tolerance**2 * _dot(right, right)
+    done = 0
+    while done < iterations and bool((size > goal).any()):
+        image = operator(direction)
+        step = _ratio(size, _dot(direction, image))
+        x = x + step * direction
+        residual = residual - step * image
+        before, size = size, _dot(residual, residual)
+        direction = residual + _ratio(size, before) * direction
+        done += 1
+    return Solved(x, done, float(_ratio(size, _dot(right, right)).max().sqrt()))
+
+
+def _dot(a: Tensor, b: Tensor) -> Tensor:
+    """Return the inner products, (B, 1, ...)."""
+    return (a * b).sum(dim=tuple(range(1, a.ndim)), keepdim=True)
+
+
+def _ratio(above: Tensor, below: Tensor) -> Tensor:
+    """Return above / below, 0 where that is 0: an element that is solved stands still."""
+    return torch.where(below > 0, above / torch.where(below > 0, below, 1), 0)

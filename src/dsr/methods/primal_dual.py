@@ -1,0 +1,244 @@
+"""The non-local Huber model and the primal-dual iteration, unrolled: the second stage of the deep primal-dual network.
+
+Riegler, Ferstl, Rüther and Bischof, *A Deep Primal-Dual Network for Guided Depth Super-Resolution*, BMVC 2016, section
+on the non-local variational model. Given a map f and weights w, the map u with the least
+
+    E(u) = sum over pairs (i, i + d) of h(u[i + d] - u[i], w[i, d]) + data / 2 * sum (u - f)^2,
+
+d being half of the offsets of a square window, so that every pair counts once, and h the Huber function in the form
+that the authors' code has, max over |p| <= w of p x - huber / 2 p^2:
+
+    h(x, w) = x^2 / (2 huber) where |x| <= huber w, else w |x| - huber / 2 w^2.
+
+So what is alike is smoothed in the same way whatever the weights are, and across a step a pair pulls no harder than its
+weight says. The iteration is that of Chambolle and Pock (2011, algorithm 3: both terms are strongly convex),
+
+    p = clip((p + sigma K(u + theta (u - u_before))) / (1 + sigma huber), -w, w),
+    u = (u - tau K' p + tau data f) / (1 + tau data),
+
+K being the pairs' differences and K' its adjoint; a fixed number of steps makes it a network.
+
+What differs: the original leaves out pairs that reach beyond the border, which bends planes there. Here f goes on
+beyond it, where it stays as it is. The iteration starts from p = clip(K f / huber, -w, w) instead of K f, and works on
+u - f. A step's sizes are its own, data and huber are every step's, so that there is an energy; the original multiplies
+them out and learns the factors of each step's sums apart.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor, nn
+from torch.autograd.function import once_differentiable
+from torch.nn import functional
+
+Offset = tuple[int, int]
+
+
+class Step(NamedTuple):
+    """Sizes of an iteration's dual and primal step, and of the extrapolation after it; numbers or 0-d tensors."""
+
+    sigma: Tensor | float
+    tau: Tensor | float
+    theta: Tensor | float
+
+
+def half_window(window: int) -> list[Offset]:
+    """Return the (rows, columns) of one of each two opposite offsets in a square window of an odd size from 3 on.
+
+    Raises:
+        ValueError: it has no such size.
+
+    """
+    if window < 3 or window % 2 == 0:
+        raise ValueError(f"model.window: expected an odd number of at least 3, got {window}")
+    radius = window // 2
+    side = range(-radius, radius + 1)
+    return [(v, u) for v in range(-radius, 1) for u in side if (v, u) < (0, 0)]
+
+
+def pair_differences(x: Tensor, offsets: Sequence[Offset]) -> Tensor:
+    """Return x[i + d] - x[i] for each pixel i whose pair may touch the image, and each offset d.
+
+    Args:
+        x: (B, 1, H + 2 r, W + 4 r), the image, r rows above and below, 2 r columns on the left and the right; r is the
+            largest offset.
+        offsets: of :func:`half_window`.
+
+    Returns:
+        (B, len(offsets), H + r, W + 2 r): of the image, r rows below, r columns on either side.
+
+    """
+    r = _radius(offsets)
+    height, width = x.shape[-2] - r, x.shape[-1] - 2 * r
+    here = x[..., r:, r : r + width]
+    return torch.cat([x[..., r + v : r + v + height, r + u : r + u + width] - here for v, u in offsets], dim=1)
+
+
+def pair_sums(p: Tensor, offsets: Sequence[Offset]) -> Tensor:
+    """Return the adjoint of :func:`pair_differences` on the image: the sum of p[i - d] - p[i], (B, 1, H, W)."""
+    r = _radius(offsets)
+    height, width = p.shape[-2] - r, p.shape[-1] - 2 * r
+    total = -p[..., :height, r : r + width].sum(dim=1)
+    for k, (v, u) in enumerate(offsets):
+        total += p[:, k, -v : height - v, r - u : r - u + width]
+    return total[:, None]
+
+
+class _Differences(torch.autograd.Function):
+    """:func:`pair_differences` of an image with zeros beyond its border; the derivative is the adjoint, in one go."""
+
+    @staticmethod
+    def forward(ctx: Any, x: Tensor, offsets: Sequence[Offset]) -> Tensor:
+        """Return the differences of (B, 1, H, W)."""
+        ctx.offsets = offsets
+        r = _radius(offsets)
+        return pair_differences(functional.pad(x, (2 * r, 2 * r, r, r)), offsets)
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, None]:
+        """Return the adjoint of a gradient."""
+        return _Sums.apply(gradients[0], ctx.offsets), None
+
+
+class _DualStep(torch.autograd.Function):
+    """clip((p + sigma x) / (1 + sigma huber), -w, w); written out, its derivative takes a part of the time."""
+
+    @staticmethod
+    def forward(ctx: Any, p: Tensor, x: Tensor, sigma: Tensor, huber: Tensor, w: Tensor) -> Tensor:
+        """Return the dual variable after the step."""
+        shares = torch.addcmul(p, x, sigma).div_(1 + sigma * huber).div_(w).clamp_(-1, 1)
+        ctx.save_for_backward(p, x, sigma, huber, shares)
+        return shares * w
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, ...]:
+        """Let the gradient pass to p and x where nothing is clipped, to w elsewhere."""
+        p, x, sigma, huber, shares = ctx.saved_tensors
+        keep = 1 / (1 + sigma * huber)
+        within = torch.ops.aten.hardtanh_backward(gradients[0], shares, -1.0, 1.0)
+        of_w = (gradients[0] - within).mul_(shares)
+        of_p, of_x = (torch.dot(within.flatten(), each.flatten()) for each in (p, x))
+        numerator = of_p + sigma * of_x
+        of_sigma = keep * of_x - keep.square() * huber * numerator
+        within *= keep
+        return within, within * sigma, of_sigma, -keep.square() * sigma * numerator, of_w
+
+
+class _Sums(torch.autograd.Function):
+    """:func:`pair_sums`, likewise."""
+
+    @staticmethod
+    def forward(ctx: Any, p: Tensor, offsets: Sequence[Offset]) -> Tensor:
+        """Return the sums of (B, N, H + r, W + 2 r)."""
+        ctx.offsets = offsets
+        return pair_sums(p, offsets)
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, None]:
+        """Return the adjoint of a gradient."""
+        return _Differences.apply(gradients[0], ctx.offsets), None
+
+
+def unrolled(
+    slopes: Tensor, weights: Tensor, steps: Sequence[Step], data: Tensor | float, huber: Tensor | float, window: int
+) -> Tensor:
+    """Return u - f after a number of steps.
+
+    Args:
+        slopes: the :func:`pair_differences` of f, continued beyond the border, (B, N, H + r, W + 2 r).
+        weights: (B, N, H, W), more than 0; those of the border count beyond it, too.
+        steps: of the iteration.
+        data: weight of the distance from f (lambda), more than 0.
+        huber: where the Huber function's square ends is this times the weight (epsilon), more than 0.
+        window: its size.
+
+    Returns:
+        (B, 1, H, W).
+
+    """
+    offsets = half_window(window)
+    r = _radius(offsets)
+    most = functional.pad(weights, (r, r, 0, r), mode="replicate")
+    huber = torch.as_tensor(huber, dtype=slopes.dtype, device=slopes.device)
+    p = (slopes / (huber * most)).clamp(-1, 1) * most
+    moved = ahead = slopes.new_zeros(weights.shape[0], 1, *weights.shape[-2:])
+    for k, step in enumerate(steps):
+        now = slopes if k == 0 else slopes + _Differences.apply(ahead, offsets)
+        p = _DualStep.apply(p, now, torch.as_tensor(step.sigma).to(huber), huber, most)
+        before, moved = moved, (moved - step.tau * _Sums.apply(p, offsets)) / (1 + step.tau * data)
+        ahead = moved + step.theta * (moved - before)
+    return moved
+
+
+def safe_step(data: float, huber: float, window: int) -> Step:
+    """Return the step sizes with which the iteration converges (Chambolle and Pock 2011, algorithm 3).
+
+    K has a norm of at most 2 sqrt(N): each of the N offsets' differences has one of at most 2.
+    """
+    norm = 2 * math.sqrt(len(half_window(window)))
+    mu = 2 * math.sqrt(data * huber) / norm
+    return Step(mu / (2 * huber), mu / (2 * data), 1 / (1 + mu))
+
+
+class UnrolledHuber(nn.Module):
+    """So many steps of the iteration with parameters that are learned, and positive as they are kept as logarithms.
+
+    They begin as :func:`safe_step`: with them, more steps come closer to the least E. Of data = 10 and 100 the former
+    left a lower RMSE_v on procedural scenes (0.194, 0.206), and without the iteration it was 0.210, after a short
+    training which moved neither by much.
+
+    Args:
+        window: size of the window that a pixel is compared within.
+        iterations: steps.
+        data: weight of the distance from f before training.
+        huber: epsilon before training.
+
+    Raises:
+        ValueError: a value is out of range.
+
+    """
+
+    def __init__(self, window: int = 5, iterations: int = 10, data: float = 10.0, huber: float = 1.0) -> None:
+        super().__init__()
+        self.offsets = half_window(window)
+        if iterations < 1:
+            raise ValueError(f"model.iterations: expected at least 1, got {iterations}")
+        self.window, self.iterations = window, iterations
+        self.log_data = nn.Parameter(torch.tensor(math.log(data)))
+        self.log_huber = nn.Parameter(torch.tensor(math.log(huber)))
+        first = torch.tensor(safe_step(data, huber, window)).log()
+        self.log_steps = nn.Parameter(first.repeat(iterations, 1))  # (iterations, 3): sigma, tau, theta
+
+    @property
+    def reach(self) -> int:
+        """How many pixels around its own an output depends on."""
+        return self.iterations * (self.window // 2)
+
+    def steps(self, dtype: torch.dtype = torch.float32) -> list[Step]:
+        """Return the sizes of each step."""
+        return [Step(*row.unbind()) for row in self.log_steps.to(dtype).exp().unbind()]
+
+    def forward(self, first: Tensor, weights: Tensor) -> Tensor:
+        """Map f and weights to u - f.
+
+        Args:
+            first: f, (B, 1, H + 2 r, W + 4 r), continued beyond the border as :func:`pair_differences` takes it.
+            weights: (B, N, H, W), more than 0, in the dtype of the computation.
+
+        Returns:
+            (B, 1, H, W) in the dtype of the weights.
+
+        """
+        dtype = weights.dtype
+        slopes = pair_differences(first, self.offsets).to(dtype)
+        data, huber = self.log_data.to(dtype).exp(), self.log_huber.to(dtype).exp()
+        return unrolled(slopes, weights, self.steps(dtype), data, huber, self.window)
+
+
+def _radius(offsets: Sequence[Offset]) -> int:
+    return -offsets[0][0]

@@ -1,0 +1,60 @@
+"""Conjugate gradients, against a direct solver."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from dsr.methods.conjugate_gradients import conjugate_gradients
+
+
+def _systems(batch: int, size: int) -> tuple[Tensor, Tensor]:
+    rng = np.random.default_rng(0)
+    root = torch.from_numpy(rng.normal(size=(batch, size, size)))
+    return root @ root.mT + torch.eye(size).double(), torch.from_numpy(rng.normal(size=(batch, size)))
+
+
+def _times(matrices: Tensor, x: Tensor) -> Tensor:
+    return (matrices @ x[..., None])[..., 0]
+
+
+def test_it_equals_a_direct_solver_for_each_of_a_batch() -> None:
+    matrices, right = _systems(3, 12)
+    found = conjugate_gradients(
+        lambda x: _times(matrices, x), right, torch.zeros_like(right), iterations=100, tolerance=1e-12
+    )
+    torch.testing.assert_close(found.values, torch.linalg.solve(matrices, right))
+    assert found.residual <= 1e-12
+
+
+def test_it_takes_no_more_steps_than_there_are_different_eigenvalues() -> None:
+    diagonal = torch.tensor([1.0, 1, 4, 4, 9, 9]).double()
+    right = torch.arange(1.0, 7.0).double()[None]
+    found = conjugate_gradients(lambda x: diagonal * x, right, torch.zeros_like(right), iterations=100, tolerance=1e-10)
+    assert found.iterations == 3
+    torch.testing.assert_close(found.values, right / diagonal)
+
+
+@pytest.mark.parametrize("steps", [1, 2, 5])
+def test_each_step_lowers_the_quadratic_even_from_a_good_start(steps: int) -> None:
+    matrices, right = _systems(2, 12)
+    start = torch.linalg.solve(matrices, right) + 0.01
+
+    def quadratic(x: Tensor) -> Tensor:
+        return (0.5 * x * _times(matrices, x) - right * x).sum(dim=1)
+
+    before = conjugate_gradients(lambda x: _times(matrices, x), right, start, iterations=steps - 1, tolerance=0.0)
+    after = conjugate_gradients(lambda x: _times(matrices, x), right, start, iterations=steps, tolerance=0.0)
+    assert bool((quadratic(after.values) < quadratic(before.values)).all())
+
+
+def test_a_solved_element_stands_still_while_another_goes_on() -> None:
+    matrices, right = _systems(2, 8)
+    right[0] = 0
+    found = conjugate_gradients(
+        lambda x: _times(matrices, x), right, torch.zeros_like(right), iterations=50, tolerance=1e-12
+    )
+    assert torch.equal(found.values[0], torch.zeros(8).double())
+    torch.testing.assert_close(found.values[1], torch.linalg.solve(matrices[1], right[1]))

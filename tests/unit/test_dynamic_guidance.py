@@ -1,0 +1,262 @@
+"""Dynamic guidance: its stages against plain loops and the energy's gradient, and what holds whatever its weights."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from dsr.methods.analysis_filters import WIDTHS, influence, penalty, plane_free_basis, zero_mean_basis
+from dsr.methods.differences import box_mean, repeated, upsampled
+from dsr.methods.dynamic_guidance import DynamicGuidance, Stage
+from dsr.methods.network import NetworkUpsampler
+
+SCALES = (2, 4, 8, 16)
+
+
+def _net(scale: int = 4, *, stages: int = 2, filters: int = 5, size: int = 5, noise: float = 0.2) -> DynamicGuidance:
+    """Return a small network with weights far from those that it starts with."""
+    torch.manual_seed(scale)
+    net = DynamicGuidance(scale, stages, filters, size).requires_grad_(False)
+    for parameter in net.parameters():
+        parameter.add_(noise * torch.randn_like(parameter))
+    return net
+
+
+def _stage(*, filters: int = 5, size: int = 5) -> Stage:
+    net = _net(stages=1, filters=filters, size=size).double()
+    stage = net.stages[0]
+    if not isinstance(stage, Stage):
+        raise TypeError
+    return stage
+
+
+def _photo(height: int, width: int, count: int = 1) -> Tensor:
+    return torch.rand((count, 3, height, width), generator=torch.Generator().manual_seed(1))
+
+
+def _map(height: int, width: int, count: int = 1) -> Tensor:
+    return 20 + 9 * torch.rand((count, 1, height, width), generator=torch.Generator().manual_seed(2)).double()
+
+
+def _plane(height: int, width: int, along_u: float = 0.3, along_v: float = -0.2) -> Tensor:
+    v, u = torch.meshgrid(torch.arange(height).double(), torch.arange(width).double(), indexing="ij")
+    return (30 + along_u * u + along_v * v)[None, None]
+
+
+@pytest.mark.parametrize("size", [3, 4, 7])
+def test_the_bases_are_orthonormal_and_blind_to_planes_or_constants(size: int) -> None:
+    v, u = torch.meshgrid(torch.arange(size).double(), torch.arange(size).double(), indexing="ij")
+    for basis, blind in ((plane_free_basis(size), (u, v, v - v + 1)), (zero_mean_basis(size), (v - v + 1,))):
+        flat = basis.flatten(1)
+        assert len(flat) == size**2 - len(blind)
+        torch.testing.assert_close(flat @ flat.T, torch.eye(len(flat)).double(), rtol=0, atol=1e-12)
+        for each in blind:
+            assert float((basis * each).sum(dim=(1, 2)).abs().max()) < 1e-11
+
+
+def test_the_influence_is_the_derivative_of_the_penalty() -> None:
+    z = torch.tensor([-2.0, -0.3, -4e-3, 0.0, 1e-3, 0.02, 0.7], dtype=torch.float64).view(1, 1, 1, 7)
+    heights = torch.tensor([[1.0, -0.5, 0.3, 2.0, -1.0, 0.1]], dtype=torch.float64)
+    z.requires_grad_()
+    (expected,) = torch.autograd.grad(penalty(z, heights).sum(), z)
+    torch.testing.assert_close(influence(z, heights), expected, rtol=1e-12, atol=1e-15)
+    one = sum(float(a) / (1 + (0.02 / width) ** 2) for a, width in zip(heights[0], WIDTHS, strict=True))
+    assert float(influence(z, heights)[0, 0, 0, 5].detach()) == pytest.approx(0.02 * one, rel=1e-12)
+
+
+def test_the_influences_gradients_agree_with_differences() -> None:
+    generator = torch.Generator().manual_seed(3)
+    z = torch.randn((2, 3, 2, 3), generator=generator, dtype=torch.float64).requires_grad_()
+    heights = torch.randn((3, len(WIDTHS)), generator=generator, dtype=torch.float64).requires_grad_()
+    assert torch.autograd.gradcheck(influence, (z, heights), eps=1e-7, atol=1e-4)
+
+
+def test_a_stage_is_a_step_towards_the_coarse_map_and_one_down_the_gradient_of_its_energy() -> None:
+    stage, rgb = _stage(), _photo(16, 20, 2).double()
+    coarse = _map(4, 5, 2) / 30
+    x = repeated(coarse, 4) + 0.1 * _map(16, 20, 2)
+    y = (x - stage.fidelity * upsampled(box_mean(x, 4) - coarse, 4)).requires_grad_()
+    (gradient,) = torch.autograd.grad(stage.energy(y, rgb).sum(), y)
+    assert float(gradient.abs().max()) > 1e-2
+    torch.testing.assert_close(stage(x, coarse, rgb), y.detach() - gradient, rtol=0, atol=1e-13)
+
+
+def test_a_stage_is_what_plain_loops_give() -> None:
+    stage, rgb = _stage(filters=3), _photo(16, 16).double()
+    coarse = _map(4, 4) / 30
+    x = repeated(coarse, 4) + 0.1 * _map(16, 16)
+    with torch.no_grad():
+        result = stage(x, coarse, rgb)[0, 0].numpy()
+        misfit = upsampled(box_mean(x, 4) - coarse, 4)[0, 0].numpy()
+    y = x[0, 0].numpy() - float(stage.fidelity) * misfit
+    photo = rgb[0].numpy()
+    combined = stage.analysis.numpy() / np.linalg.norm(stage.analysis.numpy(), axis=1, keepdims=True)
+    filters = np.tensordot(combined, plane_free_basis(5).numpy(), 1)
+    seeing = np.tensordot(stage.guidance.numpy(), zero_mean_basis(5).numpy(), 1)  # (L, 3, 5, 5)
+    expected = y.copy()
+    for i in range(12):
+        for j in range(12):
+            squares = [float((b * photo[:, i : i + 5, j : j + 5]).sum()) ** 2 for b in seeing]
+            for k, c, heights in zip(filters, np.abs(stage.mixing.numpy()), stage.heights.numpy() / 3, strict=True):
+                z = float((k * y[i : i + 5, j : j + 5]).sum())
+                slope = sum(a * z / (1 + z * z / t**2) for a, t in zip(heights, WIDTHS, strict=True))
+                expected[i : i + 5, j : j + 5] -= np.exp(-float(c @ squares)) * slope * k
+    np.testing.assert_allclose(result, expected, rtol=0, atol=1e-12)
+
+
+def test_gradients_reach_every_parameter_and_agree_with_differences() -> None:
+    net = _net(2, filters=2, size=3).double().requires_grad_()
+    rgb, coarse = _photo(8, 6).double(), _map(4, 3) / 30
+    names, parameters = zip(*net.named_parameters(), strict=True)
+
+    def answer(*values: Tensor) -> Tensor:
+        result = torch.func.functional_call(net, dict(zip(names, values, strict=True)), (rgb, coarse))
+        return result if isinstance(result, Tensor) else torch.empty(0)
+
+    answer(*parameters).square().mean().backward()
+    assert all(parameter.grad is not None and bool((parameter.grad != 0).any()) for parameter in parameters)
+    assert torch.autograd.gradcheck(answer, parameters, eps=1e-7, atol=1e-4, fast_mode=True)
+
+
+@pytest.mark.parametrize("scale", SCALES)
+def test_a_plane_is_reproduced_whatever_weights_and_photo_are(scale: int) -> None:
+    fine = _plane(5 * scale, 6 * scale)
+    net, rgb, coarse = _net(scale), _photo(5 * scale, 6 * scale), functional.avg_pool2d(fine, scale)
+    torch.testing.assert_close(net.upsample(rgb, coarse), fine, rtol=0, atol=1e-5 * float(fine.max() - fine.min()))
+    torch.testing.assert_close(net.double().upsample(rgb, coarse), fine, rtol=0, atol=1e-12 * 30 * scale)
+
+
+def test_weights_of_half_precision_keep_planes() -> None:
+    fine = _plane(24, 28)
+    result = _net().bfloat16().upsample(_photo(24, 28), functional.avg_pool2d(fine, 4))
+    torch.testing.assert_close(result, fine, rtol=0, atol=1e-4)
+
+
+def test_training_in_mixed_precision_computes_in_float32() -> None:
+    net, rgb, coarse = _net(), _photo(24, 28), _map(6, 7)
+    with torch.autocast("cpu", torch.bfloat16):
+        mixed = net.upsample(rgb, coarse)
+    torch.testing.assert_close(mixed, net.upsample(rgb, coarse), rtol=0, atol=0)
+
+
+def test_a_factor_and_a_constant_on_the_disparity_come_out_again() -> None:
+    net, rgb, coarse = _net().double(), _photo(24, 28), _map(6, 7)
+    expected = 3 * net.upsample(rgb, coarse) + 7
+    torch.testing.assert_close(net.upsample(rgb, 3 * coarse + 7), expected, rtol=1e-9, atol=0)
+
+
+def test_windows_answer_as_the_whole_image_does() -> None:
+    net = _net(8, stages=1, size=3).double()
+    rgb, coarse = _photo(136, 128).double(), _map(17, 16)
+    expected = NetworkUpsampler(net).fine_disparity(rgb, coarse)
+    result = NetworkUpsampler(net, tile=32).fine_disparity(rgb, coarse)
+    torch.testing.assert_close(result, expected, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("scale", SCALES)
+def test_an_output_depends_on_no_coarse_pixel_beyond_the_reach_and_on_one_within_half_of_it(scale: int) -> None:
+    net = _net(scale, stages=1)
+    count = 2 * net.reach + 3
+    values = torch.rand(1, 1, 1, count, generator=torch.Generator().manual_seed(4)).expand(-1, -1, 8, -1).clone()
+    rgb, middle = _photo(8 * scale, count * scale), count // 2
+
+    def answer(at: int) -> Tensor:
+        changed = values.clone()
+        changed[..., at] += 0.3
+        return net(rgb, changed)[..., middle * scale : (middle + 1) * scale]
+
+    same = net(rgb, values)[..., middle * scale : (middle + 1) * scale]
+    for beyond in (middle - net.reach - 1, middle + net.reach + 1):
+        torch.testing.assert_close(answer(beyond), same, rtol=0, atol=0)
+    assert not torch.allclose(answer(middle - net.reach // 2), same, rtol=0, atol=1e-7)
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 5), (2, 2), (3, 7)])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_maps_of_any_size_pass_in_their_dtype(size: tuple[int, int], dtype: torch.dtype) -> None:
+    result = _net(2).upsample(_photo(2 * size[0], 2 * size[1]), _map(*size).to(dtype))
+    assert result.shape == (1, 1, 2 * size[0], 2 * size[1])
+    assert result.dtype == dtype
+    assert bool(result.isfinite().all())
+
+
+def test_a_hole_is_filled_from_around_and_does_not_reach_far() -> None:
+    net, rgb, coarse = _net(stages=1), _photo(64, 64), _map(16, 16)
+    coarse[..., 0, 0], coarse[..., 0, 1] = 20, 29  # the range, which normalises
+    pierced = coarse.clone()
+    pierced[..., 3, 4] = torch.nan
+    result, whole = net.upsample(rgb, pierced), net.upsample(rgb, coarse)
+    assert bool(result.isfinite().all())
+    far = 4 * (4 + net.reach + 1)
+    torch.testing.assert_close(result[..., far:], whole[..., far:], rtol=1e-6, atol=0)
+    assert not torch.allclose(result[..., 12:16, 16:20], whole[..., 12:16, 16:20])
+
+
+def test_an_image_without_a_known_pixel_becomes_nan() -> None:
+    assert bool(_net().upsample(_photo(24, 28), torch.full((1, 1, 6, 7), torch.nan)).isnan().all())
+
+
+def test_each_image_of_a_batch_is_treated_alone_and_every_time_alike() -> None:
+    net, rgb, coarse = _net(), _photo(24, 28, 3), _map(6, 7, 3)
+    together = net.upsample(rgb, coarse)
+    alone = torch.cat([net.upsample(rgb[i : i + 1], coarse[i : i + 1]) for i in range(3)])
+    torch.testing.assert_close(together, alone, rtol=0, atol=1e-4)
+    assert torch.equal(net.upsample(rgb, coarse), together)
+
+
+def test_bounds_normalise_as_those_of_the_image_that_the_window_is_cut_from() -> None:
+    net, rgb, coarse = _net(), _photo(24, 28), _map(6, 7)
+    own = torch.tensor([coarse.min(), coarse.max()]).view(1, 2, 1, 1)
+    torch.testing.assert_close(net.upsample(rgb, coarse, own), net.upsample(rgb, coarse), rtol=1e-6, atol=0)
+    wide = torch.tensor([0.0, 100.0]).view(1, 2, 1, 1)
+    assert not torch.allclose(net.upsample(rgb, coarse, wide), net.upsample(rgb, coarse), rtol=1e-4)
+
+
+def test_an_edge_of_the_photo_lets_the_map_break_there_and_a_flat_photo_has_no_say() -> None:
+    stage = _stage()
+    edge = torch.zeros(1, 3, 16, 16, dtype=torch.float64)
+    edge[..., 8:] = 1.0
+    weights = stage.weights(edge)[0]
+    assert float(weights[..., 5:7].max()) < 0.5  # filters over the edge's middle
+    torch.testing.assert_close(weights[..., 8:], torch.ones(5, 12, 4).double(), rtol=0, atol=1e-12)
+    torch.testing.assert_close(weights[..., :4], torch.ones(5, 12, 4).double(), rtol=0, atol=1e-12)
+
+
+def test_it_learns_an_edge_that_the_photo_shows() -> None:
+    torch.manual_seed(0)
+    fine = torch.full((1, 1, 32, 32), 20.0)
+    fine[..., 13:] = 26.0
+    rgb = (fine / 40).expand(1, 3, 32, 32)
+    coarse, net = functional.avg_pool2d(fine, 4), DynamicGuidance(4, stages=2, filters=8, size=5)
+    optimiser = torch.optim.Adam(net.parameters(), 3e-2)
+    errors = []
+    for _ in range(40):
+        loss = (net.upsample(rgb, coarse) - fine).square().mean()
+        optimiser.zero_grad()
+        loss.backward()
+        optimiser.step()
+        errors.append(float(loss.detach()))
+    assert errors[-1] < 0.3 * errors[0]
+
+
+def test_a_photo_of_another_size_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"^rgb: expected \(24, 28\) pixels for a coarse map of \(6, 7\) at scale 4"):
+        _net().upsample(_photo(24, 24), _map(6, 7))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"scale": 3}, "scale: expected"),
+        ({"scale": 4, "stages": 0}, "model: expected stages of at least 1 and a size of at least 3, got 0 and 7"),
+        ({"scale": 4, "size": 2}, "model: expected stages of at least 1 and a size of at least 3, got 5 and 2"),
+        ({"scale": 4, "filters": 0}, "model.filters: expected 1 to 46 of size 7, got 0"),
+        ({"scale": 4, "filters": 7, "size": 3}, "model.filters: expected 1 to 6 of size 3, got 7"),
+    ],
+)
+def test_arguments_out_of_range_are_refused(arguments: dict[str, int], message: str) -> None:
+    with pytest.raises(ValueError, match=f"^{message}"):
+        DynamicGuidance(**arguments)

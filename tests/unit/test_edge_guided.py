@@ -1,0 +1,174 @@
+"""Edge-guided upsampling: planes, straight steps, holes, and the filter against a plain loop."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from dsr.degrade import Downsampling, make_sample
+from dsr.geometry.camera import Camera, from_range, to_range
+from dsr.methods.base import Iterative, NoAnswerError
+from dsr.methods.edge_guided import EdgeGuided, filtered, prime_factors, reachable
+from dsr.methods.guidance import slopes_along
+from dsr.methods.interpolation import Interpolation
+from dsr.sample import DepthSample, Scene
+
+
+def _sample(disparity: Tensor, scale: int = 4) -> DepthSample:
+    height, width = disparity.shape
+    camera = Camera(width, height, 60.0, 60.0, width / 2, height / 2)
+    photo = torch.full((3, height, width), 0.5).to(disparity)
+    return make_sample(
+        Scene("set", "hall", photo, camera, from_range(disparity[None], camera, "disparity")),
+        scale,
+        Downsampling("box"),
+        "disparity",
+    )
+
+
+def _disparity(sample: DepthSample, depth: Tensor) -> Tensor:
+    return to_range(depth, sample.camera, "disparity")[0]
+
+
+def _grid(height: int, width: int) -> tuple[Tensor, Tensor]:
+    v, u = torch.meshgrid(torch.arange(height).double(), torch.arange(width).double(), indexing="ij")
+    return v, u
+
+
+def _step(size: int, degrees: float) -> tuple[Tensor, Tensor]:
+    """Return a map that is 5 left of a line and 9 right of it, and how many columns are left of it in each row."""
+    v, u = _grid(size, size)
+    slant = math.tan(math.radians(degrees))
+    where = size / 2 + 0.37 - (v[:, 0] - size / 2) * slant
+    return torch.where(u < where[:, None], 5.0, 9.0).double(), where + 0.5
+
+
+@pytest.mark.parametrize(("scale", "size"), [(2, (22, 34)), (4, (36, 28)), (8, (64, 40))])
+def test_a_plane_is_reproduced_exactly_at_any_size(scale: int, size: tuple[int, int]) -> None:
+    v, u = _grid(*size)
+    plane = 6 + 0.02 * u - 0.03 * v
+    sample = _sample(plane, scale)
+    torch.testing.assert_close(_disparity(sample, EdgeGuided()(sample)), plane, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("scale", [2, 4])
+@pytest.mark.parametrize("degrees", [0.0, 10.0, 30.0])
+@pytest.mark.parametrize("turned", [False, True])
+def test_a_straight_step_stays_straight_and_sharp(scale: int, degrees: float, turned: bool) -> None:
+    """Each row's edge is nearer than half a coarse pixel to the line; bicubic smears it over more pixels."""
+    truth, line = _step(96, degrees)
+    sample = _sample(truth.T.contiguous() if turned else truth, scale)
+    ours, bicubic = (_disparity(sample, method(sample)) for method in (EdgeGuided(), Interpolation("bicubic")))
+    ours, bicubic = (each.T if turned else each for each in (ours, bicubic))
+    apart = (((9 - ours) / 4).sum(dim=1) - line)[8:-8]
+    assert float(apart.abs().max()) < scale / 2
+    assert float(apart.std()) < 0.65
+    smeared = [((each > 5.4) & (each < 8.6)).sum() for each in (ours, bicubic)]
+    assert smeared[0] < 0.25 * smeared[1]
+
+
+def _by_loops(coarse: np.ndarray, barrier: np.ndarray, radius: int, sigma: float, mixed: float) -> np.ndarray:
+    """The filter at scale 4, NaN on edges and where nothing is to be seen; ways are found by breadth-first search."""
+    h, w = coarse.shape
+    down, across = (slopes_along(torch.from_numpy(coarse), axis).numpy() for axis in (0, 1))
+    total, weights = (np.zeros(barrier.shape) for _ in range(2))
+    for i in range(h):
+        for j in range(w):
+            top, bottom = 4 * max(i - radius, 0), 4 * min(i + radius + 1, h)
+            left, right = 4 * max(j - radius, 0), 4 * min(j + radius + 1, w)
+            starts = [(v, u) for v in (4 * i + 1, 4 * i + 2) for u in (4 * j + 1, 4 * j + 2) if not barrier[v, u]]
+            seen, queue = set(starts), deque(starts)
+            while queue:
+                v, u = queue.popleft()
+                for to in ((v - 1, u), (v + 1, u), (v, u - 1), (v, u + 1)):
+                    inside = top <= to[0] < bottom and left <= to[1] < right
+                    if inside and to not in seen and not barrier[to]:
+                        seen.add(to)
+                        queue.append(to)
+            trust = mixed if barrier[4 * i : 4 * i + 4, 4 * j : 4 * j + 4].any() else 1.0
+            for v, u in seen:
+                y, x = (v - 1.5) / 4 - i, (u - 1.5) / 4 - j
+                weight = trust * math.exp(-0.5 * (math.hypot(y, x) / sigma) ** 2)
+                total[v, u] += weight * (coarse[i, j] + y * down[i, j] + x * across[i, j])
+                weights[v, u] += weight
+    return np.where(barrier | (weights == 0), np.nan, total / np.where(weights > 0, weights, 1))
+
+
+@pytest.mark.parametrize("radius", [1, 2])
+def test_the_filter_is_a_mean_over_the_pixels_that_a_way_leads_to(radius: int) -> None:
+    random = np.random.default_rng(0)
+    coarse = random.uniform(5, 9, (4, 4))
+    barrier = random.random((16, 16)) < 0.2
+    barrier[:12, 7] = True
+    expected = _by_loops(coarse, barrier, radius, 0.6, 0.1)
+    answer = filtered(torch.from_numpy(coarse), torch.from_numpy(barrier), 4, radius, 0.6, 0.1).numpy()
+    seen = np.isfinite(expected)
+    assert seen.sum() > 150
+    np.testing.assert_allclose(answer[seen], expected[seen], rtol=1e-10)
+    reach = reachable(torch.from_numpy(barrier), 4, radius).any(dim=0).any(dim=0).numpy()
+    np.testing.assert_array_equal(seen, reach & ~barrier)
+
+
+def test_an_edge_keeps_the_sides_apart() -> None:
+    coarse = torch.where(torch.arange(8) < 4, 5.0, 9.0).double().expand(8, 8)
+    barrier = torch.zeros(16, 16, dtype=torch.bool)
+    barrier[:, 8] = True
+    fine = filtered(coarse, barrier, 2, 1, 0.5, 0.01)
+    torch.testing.assert_close(fine, torch.where(torch.arange(16) < 8, 5.0, 9.0).double().expand(16, 16))
+
+
+@pytest.mark.parametrize("fill", [False, True])
+def test_holes_stay_or_are_filled_and_what_is_around_stays_a_plane(fill: bool) -> None:
+    v, u = _grid(48, 48)
+    plane = 6 + 0.02 * u - 0.03 * v
+    sample = _sample(plane.masked_fill((v >= 16) & (v < 24) & (u >= 20) & (u < 32), torch.nan))
+    fine = _disparity(sample, EdgeGuided(fill_holes=fill)(sample))
+    hole = ~sample.mask_lr[0].repeat_interleave(4, 0).repeat_interleave(4, 1)
+    assert bool((fine.isfinite() == (~hole | fill)).all())
+    assert float((fine - plane)[~hole].abs().max()) < (0.2 if fill else 1e-9)
+
+
+def test_twice_the_same_is_the_same_and_it_tells_how_it_went() -> None:
+    sample = _sample(_step(96, 10.0)[0])
+    method = EdgeGuided(iterations=30)
+    told: list[tuple[int, int]] = []
+    first = method(sample, lambda done, most: told.append((done, most)))
+    assert isinstance(method, Iterative)
+    assert told[-1] == (60, 60)
+    assert [entry["iteration"] for entry in method.history] == sorted({e["iteration"] for e in method.history})
+    assert torch.equal(first, method(sample))
+
+
+def test_single_precision_in_gives_single_precision_out() -> None:
+    v, u = _grid(32, 32)
+    sample = _sample((6 + 0.02 * u - 0.03 * v).float())
+    fine = EdgeGuided()(sample)
+    assert fine.dtype == torch.float32
+    torch.testing.assert_close(fine, sample.depth, rtol=1e-5, atol=0)
+
+
+def test_a_map_too_small_for_patches_has_no_answer() -> None:
+    sample = _sample(_step(32, 0.0)[0])
+    with pytest.raises(NoAnswerError, match="edge-guided upsampling: the edges of a map of 8 x 8 pixels do not recur"):
+        EdgeGuided()(sample)
+
+
+def test_a_scale_is_taken_in_its_prime_factors() -> None:
+    assert [prime_factors(n) for n in (1, 2, 7, 8, 12)] == [[], [2], [7], [2, 2, 2], [2, 2, 3]]
+
+
+@pytest.mark.parametrize("name", ["step", "sharp_weight", "smoothness", "sigma_space", "mixed"])
+def test_a_parameter_that_is_not_positive_is_refused(name: str) -> None:
+    with pytest.raises(ValueError, match=rf"method.{name}: expected a positive number for edge-guided upsampling"):
+        EdgeGuided(**{name: 0.0})
+
+
+@pytest.mark.parametrize("name", ["candidates", "iterations", "radius"])
+def test_a_number_below_one_is_refused(name: str) -> None:
+    with pytest.raises(ValueError, match=rf"method.{name}: expected at least 1 for edge-guided upsampling, got 0"):
+        EdgeGuided(**{name: 0})

@@ -1,0 +1,122 @@
+"""The edge map and its Markov random field, against enumeration, dynamic programming and plain loops."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+import torch
+from scipy import ndimage
+from torch import Tensor
+
+from dsr.methods.base import NoAnswerError
+from dsr.methods.belief_propagation import energy, labelled
+from dsr.methods.edge_map import edge_map, edges, thinned
+from dsr.methods.edge_patches import PATCH, Patches, averaged, distances, distinct, nearest, overlaps, turned
+
+
+def _field(nodes: int, pairs: list[tuple[int, int]], labels: int = 3, seed: int = 0) -> tuple[Tensor, Tensor, Tensor]:
+    random = torch.Generator().manual_seed(seed)
+    unary = torch.rand(nodes, labels, generator=random, dtype=torch.float64)
+    costs = torch.rand(len(pairs), labels, labels, generator=random, dtype=torch.float64)
+    return unary, torch.tensor(pairs, dtype=torch.long).view(-1, 2), costs
+
+
+def _least(unary: Tensor, pairs: Tensor, costs: Tensor) -> float:
+    nodes, labels = unary.shape
+    every = itertools.product(range(labels), repeat=nodes)
+    return min(energy(torch.tensor(each), unary, pairs, costs) for each in every)
+
+
+def _patches(count: int, seed: int = 0) -> Tensor:
+    random = np.random.default_rng(seed)
+    return torch.from_numpy(random.random((count, PATCH, PATCH)) < 0.1)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_on_a_tree_belief_propagation_finds_the_least_energy_of_all(seed: int) -> None:
+    field = _field(6, [(0, 1), (1, 2), (3, 1), (3, 4), (5, 3)], seed=seed)
+    found = labelled(*field)
+    assert found.converged
+    assert found.energy == pytest.approx(_least(*field), abs=1e-12)
+    assert energy(found.labels, *field) == pytest.approx(found.energy)
+
+
+def test_on_a_chain_it_is_viterbis_answer() -> None:
+    unary, pairs, costs = _field(40, [(i, i + 1) for i in range(39)], labels=5)
+    best = unary[0]
+    for i in range(39):
+        best = (best[:, None] + costs[i]).amin(dim=0) + unary[i + 1]
+    assert labelled(unary, pairs, costs, 300, 1e-9).energy == pytest.approx(float(best.min()), abs=1e-9)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_on_a_small_grid_with_loops_it_finds_what_enumeration_finds(seed: int) -> None:
+    pairs = [(0, 1), (1, 2), (3, 4), (4, 5), (0, 3), (1, 4), (2, 5)]
+    unary, ends, costs = _field(6, pairs, seed=seed)
+    found = labelled(unary, ends, 0.5 * costs)
+    assert found.energy == pytest.approx(_least(unary, ends, 0.5 * costs), abs=1e-12)
+
+
+def test_without_pairs_each_node_takes_its_cheapest_label() -> None:
+    unary, pairs, costs = _field(4, [])
+    assert torch.equal(labelled(unary, pairs, costs).labels, unary.argmin(dim=1))
+
+
+def test_distances_are_scipys_and_overlaps_are_those_of_a_loop() -> None:
+    masks = _patches(5)
+    expected = [ndimage.distance_transform_edt(~each) for each in masks.numpy()]
+    np.testing.assert_allclose(distances(masks), np.stack(expected), rtol=1e-6)
+    places = torch.tensor([[5, 7], [8, 5], [8, 17], [30, 30]])
+    patches = _patches(8, seed=1).flatten(1).float().view(4, 2, -1)
+    pairs, costs = overlaps(places, patches)
+    assert sorted(sorted(pair) for pair in pairs.tolist()) == [[0, 1], [0, 2]]
+    for (a, b), cost in zip(pairs.tolist(), costs, strict=True):
+        for x, y in itertools.product(range(2), repeat=2):
+            first, second = (np.full((50, 50), np.nan) for _ in range(2))
+            for canvas, node, label in ((first, a, x), (second, b, y)):
+                v, u = (places[node] - PATCH // 2).tolist()
+                canvas[v : v + PATCH, u : u + PATCH] = patches[node, label].view(PATCH, PATCH)
+            assert float(cost[x, y]) == pytest.approx(np.nansum((first - second) ** 2))
+
+
+def test_pairs_are_told_apart_kept_once_and_found_again() -> None:
+    low, high = _patches(6), _patches(6, seed=1)
+    known = distinct(Patches(torch.cat((low, low)), torch.cat((high, high))))
+    assert len(known.low) == 6
+    far, which = nearest(high, Patches(high, high), 3, 3.0)
+    assert torch.equal(which[:, 0], torch.arange(6))
+    assert float(far[:, 0].max()) < 1e-3
+    assert len(distinct(Patches(turned(low), turned(high))).low) == 48
+
+
+def test_the_mean_of_one_patch_is_the_patch() -> None:
+    patch = _patches(1)
+    mean = averaged(patch.flatten(1).float(), torch.tensor([[7, 9]]), (20, 20))
+    assert torch.equal(mean[2:13, 4:15].bool(), patch[0])
+    assert int(mean.count_nonzero()) == int(patch.sum())
+
+
+def test_a_thick_bar_becomes_a_line_and_a_line_stays() -> None:
+    bar = torch.zeros(20, 30, dtype=torch.bool)
+    bar[8:11, 5:25] = True
+    line = thinned(bar)
+    assert int(line.sum(dim=0).max()) == 1
+    assert int(line.any(dim=0).sum()) >= 16
+    assert torch.equal(thinned(line), line)
+
+
+def test_a_plane_has_no_edge_however_steep_and_a_step_has_one_where_it_is() -> None:
+    v, u = torch.meshgrid(torch.arange(16.0).double(), torch.arange(20.0).double(), indexing="ij")
+    assert not bool(edges(3 * u - 2 * v, 2, 0.1).any())
+    assert edge_map(3 * u - 2 * v, 2, 0.1)[1] is None
+    found = edges(torch.where(u < 10, 0.0, 1.0).double(), 2, 0.1)
+    assert bool(found[:, 18:22].any(dim=1).all())
+    assert not bool(found[:, :18].any() | found[:, 22:].any())
+
+
+def test_a_map_too_small_for_patches_has_no_answer_if_it_has_edges() -> None:
+    step = torch.where(torch.arange(8) < 4, 0.0, 1.0).double().expand(8, 8)
+    with pytest.raises(NoAnswerError, match="the edges of a map of 8 x 8 pixels do not recur at 1/2 of its size"):
+        edge_map(step, 2, 0.1)

@@ -1,0 +1,298 @@
+"""PDN: its unrolled stage against a plain loop and another optimiser, and what holds for the whole network."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from dsr.methods.network import NetworkUpsampler
+from dsr.methods.pdn import PrimalDualNetwork
+from dsr.methods.primal_dual import Step, UnrolledHuber, half_window, pair_differences, pair_sums, safe_step, unrolled
+
+
+def _random(*shape: int, seed: int = 0) -> Tensor:
+    return torch.rand(shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+def _problem(size: int, window: int, count: int = 1) -> tuple[Tensor, Tensor]:
+    """Return a map with steps, continued beyond the border, and weights whose pairs are partly across the steps."""
+    r, n = window // 2, len(half_window(window))
+    first = _random(count, 1, size + 2 * r, size + 4 * r, seed=1) * 0.02
+    first[..., size // 2 :] += 0.5
+    return first, (_random(count, n, size, size, seed=2) + 0.01) / n
+
+
+def _plane(height: int, width: int, along_u: float = 0.3, along_v: float = -0.2) -> Tensor:
+    v, u = torch.meshgrid(torch.arange(height).double(), torch.arange(width).double(), indexing="ij")
+    return (30 + along_u * u + along_v * v)[None, None]
+
+
+def _net(scale: int = 4, *, noise: float = 0.05, window: int = 3, **arguments: int) -> PrimalDualNetwork:
+    """Return a small network with weights far from those that it starts with."""
+    torch.manual_seed(scale)
+    sizes = {"width": 6, "layers": 3, "iterations": 3, **arguments}
+    net = PrimalDualNetwork(scale, window=window, **sizes).requires_grad_(False)
+    for parameter in net.parameters():
+        parameter.add_(noise * torch.randn_like(parameter))
+    return net
+
+
+def _photo(height: int, width: int, count: int = 1) -> Tensor:
+    return _random(count, 3, height, width, seed=3).float()
+
+
+def _map(height: int, width: int, count: int = 1) -> Tensor:
+    return 20 + 9 * _random(count, 1, height, width, seed=4)
+
+
+def test_half_a_window_has_one_of_each_two_opposite_offsets() -> None:
+    for window in (3, 5, 7):
+        half = half_window(window)
+        both = {*half, *((-v, -u) for v, u in half)}
+        assert len(half) == (window**2 - 1) // 2
+        assert len(both) == window**2 - 1
+
+
+@pytest.mark.parametrize("window", [1, 4, -3])
+def test_a_window_of_an_even_size_is_refused_in_one_line(window: int) -> None:
+    with pytest.raises(ValueError, match=rf"^model\.window: expected an odd number of at least 3, got {window}$"):
+        UnrolledHuber(window)
+
+
+def test_the_sums_are_the_adjoint_of_the_differences_of_an_image_in_zeros() -> None:
+    offsets = half_window(5)
+    x, p = _random(2, 1, 6, 7), _random(2, 12, 8, 11, seed=1)
+    padded = functional.pad(x, (4, 4, 2, 2))
+    left = (pair_differences(padded, offsets) * p).sum()
+    torch.testing.assert_close(left, (x * pair_sums(p, offsets)).sum())
+
+
+def test_the_unrolled_stage_equals_a_plain_loop() -> None:
+    window, size, data, huber = 5, 16, 7.0, 0.4
+    first, weights = _problem(size, window)
+    stage = UnrolledHuber(window, 4, data, huber).double().requires_grad_(False)
+    stage.log_steps.add_(0.3 * torch.randn(4, 3, generator=torch.Generator().manual_seed(5)))
+    result = stage(first, weights)
+    steps = [[float(value) for value in step] for step in stage.steps(torch.float64)]
+    expected = _loop(first[0, 0].numpy(), weights[0].numpy(), steps, data, huber, window)
+    np.testing.assert_allclose(result[0, 0].numpy(), expected, rtol=0, atol=1e-7)  # the parameters are float32's
+
+
+def _loop(f: np.ndarray, w: np.ndarray, steps: list[list[float]], data: float, huber: float, window: int) -> np.ndarray:
+    """Return u - f, pair by pair and pixel by pixel, on a map with r rows and 2 r columns around the image."""
+    r, (height, width) = window // 2, w.shape[1:]
+    inside = [(y, x) for y in range(height) for x in range(width)]
+    pairs = {}
+    for k, (dy, dx) in enumerate(half_window(window)):
+        for y in range(height + r):
+            for x in range(-r, width + r):
+                weight = w[k, min(max(y, 0), height - 1), min(max(x, 0), width - 1)]
+                pairs[k, y, x] = ((y + r, x + 2 * r), (y + dy + r, x + dx + 2 * r), weight)
+    u, ahead = f.copy(), f.copy()
+    p = {key: float(np.clip((f[j] - f[i]) / huber, -most, most)) for key, (i, j, most) in pairs.items()}
+    for sigma, tau, theta in steps:
+        for key, (i, j, most) in pairs.items():
+            p[key] = float(np.clip((p[key] + sigma * (ahead[j] - ahead[i])) / (1 + sigma * huber), -most, most))
+        sums = np.zeros_like(f)
+        for key, (i, j, _) in pairs.items():
+            sums[j] += p[key]
+            sums[i] -= p[key]
+        for y, x in inside:
+            at = (y + r, x + 2 * r)
+            new = (u[at] - tau * sums[at] + tau * data * f[at]) / (1 + tau * data)
+            ahead[at] = new + theta * (new - u[at])
+            u[at] = new
+    return (u - f)[r : r + height, 2 * r : 2 * r + width]
+
+
+def _energy(moved: Tensor, first: Tensor, weights: Tensor, data: float, huber: float, window: int) -> Tensor:
+    """Return E by its definition: the Huber function of each pair, with the image's pixels alone free to move."""
+    r = window // 2
+    x = pair_differences(first + functional.pad(moved, (2 * r, 2 * r, r, r)), half_window(window))
+    w = functional.pad(weights, (r, r, 0, r), mode="replicate")
+    size = x.abs()
+    pairs = torch.where(size <= huber * w, x.square() / (2 * huber), w * size - huber / 2 * w.square())
+    return pairs.sum() + data / 2 * moved.square().sum()
+
+
+def test_many_steps_reach_the_least_energy_that_another_optimiser_finds() -> None:
+    window, data, huber = 3, 2.0, 0.3
+    first, weights = _problem(8, window)
+    steps = [safe_step(data, huber, window)] * 200
+    slopes = pair_differences(first, half_window(window))
+    found = unrolled(slopes, weights, steps, data, huber, window)
+    other = torch.zeros_like(found).requires_grad_()
+    optimiser = torch.optim.LBFGS(
+        [other], max_iter=500, tolerance_grad=1e-12, tolerance_change=0, line_search_fn="strong_wolfe"
+    )
+
+    def closure() -> Tensor:
+        optimiser.zero_grad()
+        energy = _energy(other, first, weights, data, huber, window)
+        energy.backward()
+        return energy
+
+    optimiser.step(closure)
+    other = other.detach()
+    least, start = (float(_energy(at, first, weights, data, huber, window)) for at in (other, torch.zeros_like(other)))
+    assert start - least > 0.05 * start  # there is something to gain
+    assert float(_energy(found, first, weights, data, huber, window)) == pytest.approx(least, rel=1e-9)
+    torch.testing.assert_close(found, other, rtol=0, atol=1e-6)
+
+
+def test_gradients_with_respect_to_maps_weights_and_parameters_are_right() -> None:
+    window = 3
+    first, weights = _problem(4, window)
+    numbers = [torch.tensor(value, dtype=torch.float64) for value in (3.0, 0.5, 0.2, 0.6, 0.7)]
+
+    def answer(slopes: Tensor, weights: Tensor, data: Tensor, huber: Tensor, *step: Tensor) -> Tensor:
+        s, t, theta = step
+        return unrolled(slopes, weights, [Step(s, t, theta), Step(1.2 * s, t, theta)], data, huber, window)
+
+    inputs = [each.requires_grad_() for each in (pair_differences(first, half_window(window)), weights, *numbers)]
+    assert torch.autograd.gradcheck(answer, inputs)
+
+
+@pytest.mark.parametrize("scale", [2, 4, 8, 16])
+def test_before_training_a_plane_is_reproduced_up_to_the_border(scale: int) -> None:
+    torch.manual_seed(0)
+    net = PrimalDualNetwork(scale, width=6, layers=3).requires_grad_(False)
+    fine = _plane(6 * scale, 7 * scale, 0.1, -0.07)
+    scene = torch.tensor([20.0, 60.0]).view(1, 2, 1, 1)  # the plane is part of it
+    result = net.upsample(_photo(6 * scale, 7 * scale), functional.avg_pool2d(fine, scale), scene)
+    torch.testing.assert_close(result, fine, rtol=0, atol=1e-6)
+
+
+def test_a_plane_stays_one_whatever_the_weights_are_where_it_is_not_too_steep_for_epsilon() -> None:
+    net, fine = _net(noise=0.3), _plane(80, 84)
+    with torch.no_grad():
+        net.stage.log_huber.fill_(3.0)  # e^3 times weights of about 1/4 is far above the slopes
+        net.head.weight[1:] *= 0.1
+    result = net.upsample(_photo(80, 84), functional.avg_pool2d(fine, 4))
+    torch.testing.assert_close(result, fine, rtol=0, atol=1e-6)
+
+
+def test_a_factor_and_a_constant_on_the_disparity_come_out_again() -> None:
+    net, rgb, coarse = _net(), _photo(24, 28), _map(6, 7)
+    torch.testing.assert_close(net.upsample(rgb, 3 * coarse + 7), 3 * net.upsample(rgb, coarse) + 7, rtol=1e-6, atol=0)
+
+
+def test_bounds_normalise_as_those_of_the_image_that_the_window_is_cut_from() -> None:
+    net, rgb, coarse = _net(), _photo(24, 28), _map(6, 7)
+    own = torch.tensor([coarse.min(), coarse.max()]).view(1, 2, 1, 1)
+    torch.testing.assert_close(net.upsample(rgb, coarse, own), net.upsample(rgb, coarse), rtol=1e-6, atol=0)
+    wide = torch.tensor([0.0, 100.0]).view(1, 2, 1, 1)
+    assert not torch.allclose(net.upsample(rgb, coarse, wide), net.upsample(rgb, coarse), rtol=1e-4)
+
+
+def test_a_constant_map_stays_constant() -> None:
+    result = _net().upsample(_photo(24, 28), torch.full((1, 1, 6, 7), 5.0))
+    torch.testing.assert_close(result, torch.full((1, 1, 24, 28), 5.0), rtol=1e-6, atol=0)
+
+
+def test_windows_answer_as_the_whole_does() -> None:
+    net = _net(2, iterations=2)
+    rgb, coarse = _photo(80, 84), _map(40, 42)
+    whole = net.upsample(rgb, coarse)
+    answers = net.whole(rgb, coarse)
+    reach, start, stop = net.reach, 12, 40
+    part = answers.answer(rgb[..., 2 * start : 2 * stop, 20:], answers.disparity[..., start:stop, 10:])
+    top, left = 2 * (start + reach), 20 + 2 * reach
+    kept = part[..., 2 * reach :, 2 * reach :]
+    torch.testing.assert_close(kept, whole[..., top:, left:], rtol=1e-6, atol=0)
+    outside = part[..., : 2 * reach, :] - whole[..., 2 * start : top, 20:]
+    assert float(outside.abs().max()) > 1e-3  # nearer to the cut it differs
+
+
+def test_tiles_agree_with_the_answer_in_one_piece() -> None:
+    net = _net(4, layers=2, iterations=1)
+    rgb, coarse = _photo(96, 128), _map(24, 32)
+    tiled = NetworkUpsampler(net, tile=64).fine_disparity(rgb, coarse)
+    torch.testing.assert_close(tiled, NetworkUpsampler(net).fine_disparity(rgb, coarse), rtol=1e-6, atol=0)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize(("height", "width"), [(1, 1), (1, 5), (3, 2)])
+def test_any_size_is_answered_in_the_dtype_of_the_map(height: int, width: int, dtype: torch.dtype) -> None:
+    coarse = _map(height, width).to(dtype)
+    result = _net(window=7).upsample(_photo(4 * height, 4 * width), coarse)
+    assert result.shape == (1, 1, 4 * height, 4 * width)
+    assert result.dtype == dtype
+    assert bool(result.isfinite().all())
+
+
+def test_holes_are_filled_and_an_image_without_a_known_pixel_has_no_answer() -> None:
+    coarse = torch.full((2, 1, 6, 7), 5.0)
+    coarse[0, 0, 2:4, 1:3] = torch.nan
+    coarse[1] = torch.nan
+    result = _net().upsample(_photo(24, 28, 2), coarse)
+    torch.testing.assert_close(result[:1], torch.full((1, 1, 24, 28), 5.0), rtol=1e-6, atol=0)
+    assert bool(result[1].isnan().all())
+
+
+def test_each_image_of_a_batch_is_treated_alone_and_the_same_each_time() -> None:
+    net, rgb, coarse = _net(), _photo(24, 28, 3), _map(6, 7, 3)
+    together = net.upsample(rgb, coarse)
+    alone = torch.cat([net.upsample(rgb[i : i + 1], coarse[i : i + 1]) for i in range(3)])
+    torch.testing.assert_close(together, alone, rtol=1e-6, atol=0)
+    assert torch.equal(together, net.upsample(rgb, coarse))
+
+
+def test_the_photo_has_a_say() -> None:
+    net, coarse = _net(), _map(6, 7)
+    assert not torch.allclose(net.upsample(_photo(24, 28), coarse), net.upsample(1 - _photo(24, 28), coarse), rtol=1e-4)
+
+
+def test_parameters_of_the_iteration_stay_positive_whatever_a_training_does_to_them() -> None:
+    stage = UnrolledHuber(3, 2).requires_grad_(False)
+    with torch.no_grad():
+        for parameter in stage.parameters():
+            parameter.sub_(20.0)
+    assert all(float(value) > 0 for step in stage.steps() for value in step)
+
+
+def test_a_training_reaches_every_parameter() -> None:
+    net = PrimalDualNetwork(2, width=4, layers=2, window=3, iterations=2)
+    torch.nn.init.normal_(net.head.weight, std=0.3)
+    coarse = _map(6, 6)
+    coarse[..., 3:] += 20  # a step, across which the weights count
+    net.upsample(_photo(12, 12), coarse).square().mean().backward()
+    for name, parameter in net.named_parameters():
+        assert parameter.grad is not None, name
+        assert bool((parameter.grad != 0).any()), name
+
+
+def test_the_convolutions_may_run_in_bfloat16() -> None:
+    net, rgb, coarse = _net(), _photo(24, 28), _map(6, 7)
+    exact = net.upsample(rgb, coarse)
+    with torch.autocast("cpu", torch.bfloat16):
+        mixed = net.upsample(rgb, coarse)
+    assert mixed.dtype == torch.float64
+    assert 0 < float((mixed - exact).abs().max()) < 0.05 * 9
+    halved = NetworkUpsampler(net, "bfloat16").fine_disparity(rgb, coarse)
+    assert float((halved - exact).abs().max()) < 0.05 * 9
+
+
+def test_a_photo_of_another_size_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"rgb: expected \(24, 28\) pixels for a coarse map of \(6, 7\) at scale 4"):
+        _net().upsample(_photo(24, 24), _map(6, 7))
+
+
+@pytest.mark.parametrize(
+    "arguments", [{"scale": 3}, {"scale": 4, "width": 0}, {"scale": 4, "layers": 1}, {"scale": 4, "window": 4},
+                  {"scale": 4, "iterations": 0}],
+)  # fmt: skip
+def test_arguments_out_of_range_are_refused(arguments: dict[str, int]) -> None:
+    with pytest.raises(ValueError, match=r"^(scale|model[.a-z]*): expected [^\n]*$"):
+        PrimalDualNetwork(**arguments)
+
+
+def test_arguments_rebuild_the_network() -> None:
+    net = _net(8, window=5)
+    again = PrimalDualNetwork(**net.arguments())
+    again.load_state_dict(net.state_dict())
+    rgb, coarse = _photo(32, 24), _map(4, 3)
+    assert torch.equal(again.upsample(rgb, coarse), net.upsample(rgb, coarse))

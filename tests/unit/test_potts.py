@@ -1,0 +1,113 @@
+"""The Potts problem: closed forms, and all partitions of small pictures tried."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from dsr.methods.potts import BRIGHTEST, Regions, boundary_length, fitted, fused
+
+
+def _energy(photo: Tensor, shading: Tensor, regions: Regions, weight: float) -> float:
+    missed = fitted(photo, shading, regions) * shading - photo
+    return 0.5 * float(missed.square().sum()) + weight * boundary_length(regions)
+
+
+def _two(size: int = 24, noise: float = 0.03) -> tuple[Tensor, Tensor, Tensor]:
+    """Return a photo of a disc before a wall under uneven light, its shading, and the disc."""
+    rng = np.random.default_rng(0)
+    v, u = np.mgrid[:size, :size]
+    disc = torch.from_numpy((u - 11) ** 2 + (v - 13) ** 2 < 50)
+    albedo = torch.where(
+        disc, torch.tensor([0.8, 0.3, 0.5])[:, None, None], torch.tensor([0.4, 0.6, 0.5])[:, None, None]
+    )
+    shading = torch.from_numpy(0.5 + 0.4 * u / size + 0.1 * np.sin(v)).expand(1, 3, size, size)
+    photo = albedo[None] * shading + noise * torch.from_numpy(rng.normal(size=(1, 3, size, size)))
+    return photo, shading, disc
+
+
+def test_two_regions_under_noise_are_found_exactly() -> None:
+    photo, shading, disc = _two()
+    regions = fused(photo, shading, 0.05)
+    assert regions.number == 2
+    assert torch.equal(regions.labels[0] == regions.labels[0, 13, 11], disc)
+
+
+def test_a_regions_albedo_is_the_least_squares_one() -> None:
+    photo, shading, disc = _two()
+    albedo = fitted(photo, shading, fused(photo, shading, 0.05))
+    for channel in range(3):
+        for where in (disc, ~disc):
+            expected = np.linalg.lstsq(
+                shading[0, channel][where].numpy()[:, None], photo[0, channel][where].numpy(), rcond=None
+            )[0]
+            torch.testing.assert_close(albedo[0, channel][where], torch.full((int(where.sum()),), expected[0]).double())
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("weight", [0.001, 0.02, 0.5])
+def test_no_partition_of_a_small_picture_that_fuses_two_regions_has_less_energy(seed: int, weight: float) -> None:
+    rng = np.random.default_rng(seed)
+    photo, shading = (torch.from_numpy(rng.uniform(0.2, 1, (1, 2, 4, 5))) for _ in range(2))
+    regions = fused(photo, shading, weight)
+    least = _energy(photo, shading, regions, weight)
+    for one, other in itertools.combinations(range(regions.number), 2):
+        labels = torch.where(regions.labels == other, one, regions.labels)
+        assert _energy(photo, shading, Regions(labels, regions.number), weight) >= least - 1e-12
+
+
+def test_a_row_of_pixels_is_cut_as_trying_all_cuts_says() -> None:
+    values = torch.tensor([0.2, 0.22, 0.21, 0.6, 0.62, 0.9, 0.88, 0.91]).double()
+    photo = values.reshape(1, 1, 1, 8)
+    shading = torch.ones_like(photo)
+    best = min(
+        (torch.tensor([0, *np.cumsum(cuts)]) for cuts in itertools.product((0, 1), repeat=7)),
+        key=lambda labels: _energy(photo, shading, Regions(labels.reshape(1, 1, 8), 8), 0.02),
+    )
+    assert torch.equal(fused(photo, shading, 0.02).labels.reshape(-1), best)
+
+
+@pytest.mark.parametrize("shape", [(1, 1, 1, 1), (1, 1, 1, 6), (2, 3, 5, 1), (1, 2, 7, 5)])
+def test_little_weight_leaves_each_pixel_and_much_makes_each_picture_one(shape: tuple[int, ...]) -> None:
+    photo = torch.from_numpy(np.random.default_rng(1).uniform(0.2, 1, shape))
+    shading = torch.ones_like(photo)
+    alone = fused(photo, shading, 1e-12)
+    torch.testing.assert_close(fitted(photo, shading, alone), photo)
+    together = fused(photo, shading, 1e6)
+    assert together.number == shape[0]
+    assert boundary_length(together) == 0
+    mean = photo.mean(dim=(-2, -1), keepdim=True).expand(shape)
+    torch.testing.assert_close(fitted(photo, shading, together), mean)
+
+
+def test_a_batch_is_what_its_pictures_are_one_at_a_time_and_twice_the_same_is_the_same() -> None:
+    photo, shading, _ = _two()
+    both = torch.cat((photo, photo.flip(-1))), torch.cat((shading, shading.flip(-1)))
+    together = fitted(*both, fused(*both, 0.01))
+    again = fitted(*both, fused(*both, 0.01))
+    assert torch.equal(together, again)
+    for number in range(2):
+        one = both[0][number : number + 1], both[1][number : number + 1]
+        assert _energy(*one, fused(*one, 0.05), 0.05) == pytest.approx(
+            _energy(photo, shading, fused(photo, shading, 0.05), 0.05)
+        )
+
+
+def test_pixels_outside_stay_alone_and_part_what_is_inside() -> None:
+    photo = torch.full((1, 1, 3, 5), 0.5).double()
+    inside = torch.ones(1, 1, 3, 5, dtype=torch.bool)
+    inside[..., 2] = False
+    regions = fused(photo, torch.ones_like(photo), 0.1, inside)
+    assert regions.number == 2 + 3
+    assert boundary_length(regions, inside) == 0
+
+
+def test_albedos_stay_within_bounds_where_there_is_little_light() -> None:
+    photo = torch.full((1, 1, 2, 2), 0.5).double()
+    shading = torch.tensor([[1e-6, -1.0], [0.0, 1.0]]).double().reshape(1, 1, 2, 2)
+    albedo = fitted(photo, shading, Regions(torch.arange(4).reshape(1, 2, 2), 4))
+    assert albedo.flatten().tolist() == [BRIGHTEST, 0.0, 0.0, 0.5]

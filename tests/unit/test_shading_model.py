@@ -1,0 +1,114 @@
+"""The rendering equation: against the geometry's normals, derivatives, lighting."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from dsr.geometry.camera import Camera
+from dsr.geometry.surface import normals_of, points_of
+from dsr.methods.shading_model import area_of, best_lighting, by_theta, photometry, shading_of, surface_of
+
+LIGHT = torch.tensor([[[0.3, -0.4, -0.6, 0.2], [0.2, -0.5, -0.5, 0.1], [0.4, -0.2, -0.4, 0.3]]]).double()
+
+
+def _camera(size: int) -> Camera:
+    return Camera(size, size, 1.1 * size, 1.2 * size, 0.4 * size - 0.5, 0.6 * size - 0.5)
+
+
+def _theta(camera: Camera) -> tuple[Tensor, Tensor]:
+    """Return a smooth surface's slopes and depth, (1, 3, H, W), from forward differences, and its depth."""
+    rays = camera.rays()
+    depth = 2 + 0.3 * torch.sin(3 * rays[0]) * torch.cos(2 * rays[1]) + 0.2 * rays[0]
+    slopes = [
+        focal * torch.cat((depth.diff(dim=dim), depth.diff(dim=dim).narrow(dim, -1, 1)), dim)
+        for dim, focal in ((1, camera.fx), (0, camera.fy))
+    ]
+    return torch.stack((*slopes, depth))[None], depth[None, None]
+
+
+def _random(*shape: int, seed: int = 0) -> Tensor:
+    return torch.from_numpy(np.random.default_rng(seed).normal(size=shape))
+
+
+def _mixed_theta() -> tuple[Tensor, Tensor]:
+    theta = _random(1, 3, 3, 4)
+    theta[:, 2] = 2 + 0.2 * theta[:, 2]
+    return theta, Camera(4, 3, 5.0, 6.0, 1.2, 0.9).rays()[None]
+
+
+def test_the_rendering_is_the_geometrys_normals_times_the_light_the_nearer_the_finer_the_map() -> None:
+    errors = []
+    for size in (64, 128):
+        camera = _camera(size)
+        theta, depth = _theta(camera)
+        rays = camera.rays()[None]
+        normals = normals_of(depth, rays)
+        expected = torch.einsum("bck,bkhw->bchw", LIGHT, torch.cat((normals, torch.ones_like(normals[:, :1])), dim=1))
+        errors.append(float((shading_of(surface_of(theta, rays).normals, LIGHT) - expected).abs().max()))
+    assert errors[0] < 0.01
+    assert errors[1] == pytest.approx(errors[0] / 2, rel=0.1)  # of differences taken to one side
+
+
+def test_a_map_without_slopes_has_the_geometrys_normals_exactly() -> None:
+    camera = _camera(8)
+    rays, depth = camera.rays()[None], torch.full((1, 1, 8, 8), 3.0).double()
+    theta = torch.cat((torch.zeros(1, 2, 8, 8).double(), depth), dim=1)
+    torch.testing.assert_close(surface_of(theta, rays).normals, normals_of(depth, rays))
+
+
+def test_the_area_is_that_of_the_back_projected_pixels() -> None:
+    camera = _camera(256)
+    theta, depth = _theta(camera)
+    rays = camera.rays()[None]
+    points = points_of(depth, rays)[0]
+    along_u, along_v = points.diff(dim=2)[:, :-1], points.diff(dim=1)[:, :, :-1]
+    expected = torch.linalg.cross(along_u, along_v, dim=0).norm(dim=0)
+    ours = area_of(theta, surface_of(theta, rays))[0, 0, :-1, :-1] / (camera.fx * camera.fy)
+    torch.testing.assert_close(ours, expected, rtol=0.02, atol=0)
+    assert float(ours.sum()) == pytest.approx(float(expected.sum()), rel=2e-3)
+
+
+def test_what_the_photo_says_has_the_derivatives_that_are_given() -> None:
+    theta, rays = _mixed_theta()
+    albedo, photo = _random(1, 3, 3, 4, seed=1).abs(), _random(1, 3, 3, 4, seed=2)
+
+    def residual(theta: Tensor) -> Tensor:
+        return albedo * shading_of(surface_of(theta, rays).normals, LIGHT) - photo
+
+    theta.requires_grad_()
+    assert torch.autograd.gradcheck(residual, (theta,))
+    seen = photometry(photo, albedo, LIGHT, surface_of(theta, rays), rays)
+    torch.testing.assert_close(seen.residual, residual(theta))
+    for channel in range(3):
+        (slope,) = torch.autograd.grad(residual(theta)[:, channel].sum(), theta)
+        torch.testing.assert_close(seen.slopes[:, channel], slope)
+
+
+def test_the_length_of_m_has_the_normal_for_a_derivative() -> None:
+    theta, rays = _mixed_theta()
+    theta.requires_grad_()
+    surface = surface_of(theta, rays)
+    (slope,) = torch.autograd.grad(surface.length.sum(), theta)
+    torch.testing.assert_close(by_theta(surface.normals, rays), slope)
+
+
+def test_the_light_is_recovered_exactly_from_a_photo_without_noise() -> None:
+    theta, rays = _mixed_theta()
+    normals = surface_of(theta, rays).normals
+    albedo = _random(1, 3, 3, 4, seed=1).abs()
+    photo = albedo * shading_of(normals, LIGHT)
+    inside = torch.ones(1, 1, 3, 4).double()
+    torch.testing.assert_close(best_lighting(photo, albedo, normals, inside), LIGHT)
+    photo[..., 1:3, 2] = 0.7
+    inside[..., 1:3, 2] = 0
+    torch.testing.assert_close(best_lighting(photo, albedo, normals, inside), LIGHT)
+
+
+def test_the_light_on_a_flat_wall_is_the_least_that_explains_it() -> None:
+    normals = torch.tensor([0.0, 0.0, -1.0]).double()[:, None, None].expand(1, 3, 4, 5)
+    albedo = torch.ones(1, 1, 4, 5).double()
+    light = best_lighting(0.6 * albedo, albedo, normals, torch.ones_like(albedo))
+    torch.testing.assert_close(light, torch.tensor([[[0.0, 0.0, -0.3, 0.3]]]).double())

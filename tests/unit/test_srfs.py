@@ -1,0 +1,336 @@
+"""Super-resolution from shading: closed forms, a dense reference, and steps that lower the energy."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from dsr.degrade import Downsampling, make_sample
+from dsr.geometry.camera import Camera, from_range
+from dsr.geometry.surface import normals_of
+from dsr.methods.base import Iterative
+from dsr.methods.interpolation import Interpolation
+from dsr.methods.shading_admm import Problem, ShadingSolver, Slopes
+from dsr.methods.shading_model import shading_of, surface_of
+from dsr.methods.srfs import ShapeFromShading
+from dsr.sample import DepthSample, Scene
+
+LIGHT = ((0.35, -0.3, -0.55, 0.15), (0.3, -0.25, -0.5, 0.2), (0.25, -0.3, -0.5, 0.2))
+
+
+def _camera(height: int, width: int, focal: float | None = None) -> Camera:
+    focal = 1.2 * width if focal is None else focal
+    return Camera(width, height, focal, 1.1 * focal, 0.45 * width, 0.55 * height)
+
+
+def _grid(height: int, width: int) -> tuple[Tensor, Tensor]:
+    v, u = torch.meshgrid(torch.arange(height).double(), torch.arange(width).double(), indexing="ij")
+    return v, u
+
+
+def _sample(
+    depth: Tensor, rgb: Tensor | None = None, scale: int = 4, name: str = "hall", focal: float | None = None
+) -> DepthSample:
+    """Return the problem of a scene with this depth, (H, W)."""
+    camera = _camera(*depth.shape, focal)
+    rgb = torch.full((3, *depth.shape), 0.5) if rgb is None else rgb
+    return make_sample(Scene("set", name, rgb, camera, depth[None]), scale, Downsampling("box"), "orthogonal")
+
+
+def _lit(depth: Tensor) -> Tensor:
+    """Return the photo of a surface of one colour under LIGHT, (3, H, W)."""
+    normals = normals_of(depth[None, None], _camera(*depth.shape).rays()[None])
+    colour = torch.tensor([0.8, 0.7, 0.6]).double()[:, None, None]
+    return (colour * shading_of(normals, torch.tensor(LIGHT).double()[None])[0]).clamp(0, 1)
+
+
+def _sphere(size: int) -> Tensor:
+    """Return a sphere of radius 0.6 m, 2 m away, before a wall that it is half sunk into, (H, W)."""
+    rays = _camera(size, size).rays()
+    middle = torch.tensor([0.0, -0.05, 2.0]).double()[:, None, None]
+    along, square = (rays * middle).sum(dim=0), rays.square().sum(dim=0)
+    root = along.square() - square * (middle.square().sum() - 0.6**2)
+    return torch.where(root > 0, (along - root.clamp(min=0).sqrt()) / square, torch.inf).clamp(max=1.8)
+
+
+def _bumps(size: int) -> Tensor:
+    v, u = _grid(size, size)
+    hill = torch.exp(-((u - size / 2) ** 2 + (v - size / 2) ** 2) / (2 * (size / 5) ** 2))
+    return 2 - 0.25 * hill + 0.02 * torch.sin(2 * math.pi * u / 9) * torch.sin(2 * math.pi * v / 11)
+
+
+def _angle(depth: Tensor, truth: Tensor) -> float:
+    """Return the mean angle between normals in degrees."""
+    rays = _camera(*truth.shape).rays()[None]
+    a, b = (normals_of(each[None, None].double(), rays) for each in (depth, truth))
+    return float(torch.rad2deg(torch.acos((a * b).sum(dim=1).clamp(-1, 1))).mean())
+
+
+def _random(height: int, width: int, seed: int = 0) -> tuple[Tensor, Tensor]:
+    rng = np.random.default_rng(seed)
+    rgb = torch.from_numpy(rng.uniform(0, 1, (3, height, width))).float()
+    return torch.from_numpy(rng.uniform(1.8, 2.2, (height, width))), rgb
+
+
+def _solver(*, holes: bool = False, mask: bool = False) -> ShadingSolver:
+    """Return a solver in the midst of a random problem of 16 x 16 pixels."""
+    depth, rgb = _random(16, 16)
+    sample = _sample(depth, rgb)
+    if holes:
+        sample.depth_lr[:, 1:3, 2] = torch.nan
+    solver, _ = ShapeFromShading().prepared(sample)
+    if mask:
+        v, u = _grid(16, 16)
+        inside = ((u - 7) ** 2 + (v - 8) ** 2 < 40)[None, None]
+        solver = ShadingSolver(solver.problem._replace(inside=inside), solver.weights, solver.z, solver.penalty)
+    rng = np.random.default_rng(1)
+    solver.theta = solver.theta + 0.2 * torch.from_numpy(rng.normal(size=(1, 3, 16, 16))) * solver.problem.inside
+    solver.missed = 0.1 * torch.from_numpy(rng.normal(size=(1, 3, 16, 16))) * solver.problem.inside
+    solver.update_albedo()
+    solver.update_lighting()
+    return solver
+
+
+def _dense(operator: Callable[[Tensor], Tensor], count: int, shape: tuple[int, ...]) -> np.ndarray:
+    """Return an operator's matrix, a column an input."""
+    eye = torch.eye(count).double().reshape(count, 1, *shape)
+    return torch.stack([operator(each[None]).flatten() for each in eye], dim=1).numpy()
+
+
+@pytest.mark.parametrize("build", [_sphere, _bumps], ids=["sphere", "bumps"])
+def test_normals_of_a_shaded_surface_are_better_than_bicubics(build: Callable[[int], Tensor]) -> None:
+    truth = build(48)
+    sample = _sample(truth, _lit(truth))
+    bicubic = _angle(Interpolation("bicubic")(sample)[0], truth)
+    assert _angle(ShapeFromShading()(sample)[0], truth) < 0.85 * bicubic
+    assert _angle(ShapeFromShading(area_weight=0.02)(sample)[0], truth) < 0.5 * bicubic
+
+
+@pytest.mark.parametrize("mask", [False, True])
+def test_slopes_and_their_adjoint_have_transposed_matrices(mask: bool) -> None:
+    problem = _solver(mask=mask).problem
+    slopes = Slopes(problem)
+    forth = _dense(slopes, 256, (16, 16))
+    back = _adjoint(slopes)
+    np.testing.assert_allclose(back, forth.T, atol=1e-14)
+
+
+def _adjoint(slopes: Slopes) -> np.ndarray:
+    eye = torch.eye(768).double().reshape(768, 1, 3, 16, 16)
+    return torch.stack([slopes.adjoint(each).flatten() for each in eye], dim=1).numpy()
+
+
+def test_slopes_of_a_map_make_the_geometrys_normals_to_first_order() -> None:
+    truth = _sphere(64)
+    solver, metres = ShapeFromShading().prepared(_sample(truth))
+    found = surface_of(solver.slopes(truth[None, None] / metres), solver.problem.rays).normals
+    expected = normals_of(truth[None, None], solver.problem.rays)
+    assert float((found - expected).abs().mean()) < 5e-3
+
+
+@pytest.mark.parametrize(("holes", "mask"), [(False, False), (True, False), (False, True)])
+def test_the_step_of_depth_is_the_least_squares_solution(holes: bool, mask: bool) -> None:
+    """Of sqrt(data) (K z - coarse) and sqrt(penalty) (G z - theta + u), as dense matrices by numpy."""
+    solver = _solver(holes=holes, mask=mask)
+    problem, before = solver.problem, solver.z.flatten().numpy().copy()
+    means = np.kron(np.kron(np.eye(4), np.full((1, 4), 0.25)), np.kron(np.eye(4), np.full((1, 4), 0.25)))
+    coarse = problem.coarse.flatten().numpy()
+    known = np.isfinite(coarse)
+    weights = np.array([1.0, 1.0, (problem.unit / 4) ** 2]).repeat(256) * np.tile(problem.inside.flatten().numpy(), 3)
+    root = np.sqrt(solver.penalty * weights)[:, None]
+    matrix = np.concatenate((np.sqrt(solver.weights.data) * means[known], root * _dense(solver.slopes, 256, (16, 16))))
+    right = np.concatenate(
+        (
+            np.sqrt(solver.weights.data) * coarse[known],
+            root[:, 0] * (solver.theta - solver.missed).flatten().numpy(),
+        )
+    )
+    free = problem.inside.flatten().numpy()
+    expected = before.copy()
+    expected[free] = np.linalg.lstsq(matrix[:, free], right - matrix[:, ~free] @ before[~free], rcond=None)[0]
+    solver.update_depth()
+    np.testing.assert_allclose(solver.z.flatten().numpy(), expected, rtol=0, atol=1e-4 * expected.std())
+
+
+@pytest.mark.parametrize(("holes", "mask"), [(False, False), (True, False), (False, True)])
+def test_no_step_raises_the_augmented_lagrangian_in_its_own_variable(holes: bool, mask: bool) -> None:
+    solver = _solver(holes=holes, mask=mask)
+    lowered = {}
+    for turn in range(6):
+        steps = {
+            "albedo": lambda turn=turn: solver.update_albedo(anew=turn % 2 == 0),
+            "lighting": solver.update_lighting,
+            "theta": solver.update_theta,
+            "depth": solver.update_depth,
+        }
+        for name, step in steps.items():
+            before = solver.lagrangian()
+            step()
+            after = solver.lagrangian()
+            assert after <= before + 1e-9 * abs(before), (turn, name)
+            lowered[name] = lowered.get(name, 0.0) + before - after
+        solver.update_missed(1.3)
+    assert min(lowered.values()) > 0
+
+
+def test_the_step_of_theta_ends_where_the_gradient_is_small() -> None:
+    solver = _solver()
+    for _ in range(20):
+        solver.update_theta()
+    target = solver.slopes(solver.z) + solver.missed
+    theta = solver.theta.clone().requires_grad_()
+    (slope,) = torch.autograd.grad(solver._pixel_energy(theta, target).sum(), theta)
+    start = target.clone().requires_grad_()
+    (first,) = torch.autograd.grad(solver._pixel_energy(start, target).sum(), start)
+    assert float(slope.square().mean()) < 1e-3 * float(first.square().mean())
+
+
+def test_a_level_plane_of_one_colour_comes_out_to_a_thousandth_of_its_depth() -> None:
+    """Not exactly: the area that a pixel sees is least on a sphere around the camera."""
+    sample = _sample(torch.full((16, 24), 3.0).double(), focal=400.0)
+    assert float((ShapeFromShading()(sample) / 3 - 1).abs().max()) < 1e-3
+
+
+@pytest.mark.parametrize("scale", [2, 4, 8])
+def test_a_slanted_plane_of_one_colour_comes_out_to_a_hundredth_of_its_depth(scale: int) -> None:
+    v, u = _grid(32, 48)
+    camera = _camera(32, 48, 400.0)
+    truth = from_range((40 + 0.05 * u - 0.03 * v)[None], camera, "disparity")[0]
+    sample = _sample(truth, None, scale, focal=400.0)
+    fine = ShapeFromShading()(sample)[0]
+    assert float((fine / truth - 1).abs().max()) < 1e-2
+    assert float((fine / truth - 1).square().mean().sqrt()) < 1e-3
+
+
+def test_holes_are_filled_and_have_no_say() -> None:
+    depth, rgb = _random(16, 24)
+    sample = _sample(depth, rgb)
+    sample.depth_lr[:, 1:3, 2:4] = torch.nan
+    fine = ShapeFromShading(iterations=5)(sample)
+    assert fine.shape == (1, 16, 24)
+    assert bool(fine.isfinite().all())
+    assert float(fine.min()) > 1.0
+
+
+@pytest.mark.parametrize(("scale", "size"), [(2, (10, 6)), (8, (8, 24)), (16, (16, 16)), (2, (2, 2))])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_any_size_is_taken_in_single_and_double_precision(
+    scale: int, size: tuple[int, int], dtype: torch.dtype
+) -> None:
+    depth, rgb = _random(*size)
+    fine = ShapeFromShading(iterations=2)(_sample(depth.to(dtype), rgb, scale))
+    assert fine.shape == (1, *size)
+    assert fine.dtype == dtype
+    assert bool(fine.isfinite().all())
+
+
+def test_an_object_of_millimetres_comes_out_as_one_of_metres() -> None:
+    truth = _bumps(32)
+    large, small = (ShapeFromShading(iterations=3)(_sample(k * truth, _lit(truth))) for k in (1.0, 1e-3))
+    torch.testing.assert_close(1e3 * small, large, rtol=1e-6, atol=0)
+
+
+def test_twice_the_same_is_the_same_and_the_truth_is_not_looked_at() -> None:
+    sample = _sample(*_random(16, 24))
+    method = ShapeFromShading(iterations=4)
+    first = method(sample)
+    assert sample.depth is not None
+    sample.depth.fill_(torch.nan)
+    assert torch.equal(first, method(sample))
+
+
+def test_a_batch_is_what_its_problems_are_one_at_a_time() -> None:
+    solvers = [ShapeFromShading().prepared(_sample(*_random(16, 16, seed)))[0] for seed in (0, 1)]
+    one, other = (solver.problem for solver in solvers)
+    both = Problem(
+        torch.cat((one.photo, other.photo)),
+        torch.cat((one.coarse, other.coarse)),
+        one.rays,
+        one.focal,
+        one.unit,
+        torch.cat((one.inside, other.inside)),
+    )
+    together = ShadingSolver(both, solvers[0].weights, torch.cat([solver.z for solver in solvers]), 0.02)
+    for solver in (together, *solvers):
+        for _ in range(2):
+            solver.update_lighting()
+            solver.update_theta()
+            solver.update_depth()
+            solver.update_missed(1.3)
+    torch.testing.assert_close(together.z, torch.cat([solver.z for solver in solvers]), rtol=1e-5, atol=0)
+
+
+def test_it_stops_where_it_has_converged_and_tells_its_progress() -> None:
+    told: list[tuple[int, int]] = []
+    truth = _sphere(32)
+    method = ShapeFromShading(iterations=60, tolerance=1e-3)
+    assert isinstance(method, Iterative)
+    method(_sample(truth, _lit(truth)), lambda done, most: told.append((done, most)))
+    steps = len(method.history)
+    assert 2 < steps < 60
+    assert told == [*((done, 60) for done in range(1, steps + 1)), (60, 60)]
+    assert [entry["iteration"] for entry in method.history] == list(range(1, steps + 1))
+    last, before = method.history[-1], method.history[-2]
+    assert last["residual"] < 1e-3
+    assert abs(last["objective"] - before["objective"]) < 1e-3 * before["objective"]
+    terms = ("shading", "data", "area", "boundaries")
+    assert last["objective"] == pytest.approx(sum(last[name] for name in terms))
+    assert last["objective"] < method.history[0]["objective"]
+
+
+def test_outside_the_foreground_the_first_map_stays(tmp_path: Path) -> None:
+    truth = _bumps(32)
+    sample = _sample(truth, _lit(truth), name="bumps")
+    v, u = _grid(32, 32)
+    inside = (u - 15) ** 2 + (v - 17) ** 2 < 90
+    cv2.imwrite(str(tmp_path / "bumps.png"), 255 * inside.numpy().astype(np.uint8))
+    method = ShapeFromShading(foreground=str(tmp_path))
+    solver, metres = method.prepared(sample)
+    first = solver.z[0, 0] * metres
+    fine = method(sample)[0]
+    torch.testing.assert_close(fine[~inside], first[~inside])
+    assert float((fine - first)[inside].abs().mean()) > 1e-4
+    assert float((fine - truth)[inside].square().mean()) < float((first - truth)[inside].square().mean())
+
+
+def test_a_mask_that_is_missing_damaged_black_or_of_another_size_is_refused_by_name(tmp_path: Path) -> None:
+    sample = _sample(_bumps(16))
+    path = tmp_path / "hall.png"
+    method = ShapeFromShading(iterations=1, foreground=str(tmp_path))
+    with pytest.raises(ValueError, match=r"hall\.png: expected a mask of the foreground, there is no such file"):
+        method(sample)
+    for content in (b"", b"no picture"):
+        path.write_bytes(content)
+        with pytest.raises(ValueError, match=r"hall\.png: .* no picture or damaged"):
+            method(sample)
+    cv2.imwrite(str(path), np.full((16, 20), 255, np.uint8))
+    with pytest.raises(ValueError, match=r"hall\.png: expected 16 x 16, as the photo is, got 16 x 20"):
+        method(sample)
+    cv2.imwrite(str(path), np.zeros((16, 16), np.uint8))
+    with pytest.raises(ValueError, match=r"hall\.png: expected a foreground in white, got a black mask"):
+        method(sample)
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("iterations", 0),
+        ("tolerance", -1.0),
+        ("data_weight", 0.0),
+        ("area_weight", -1.0),
+        ("boundary_weight", 0.0),
+        ("penalty", 0.0),
+        ("growth", 0.9),
+        ("foreground", "/nowhere"),
+    ],
+)
+def test_a_value_out_of_range_is_refused_by_name(key: str, value: object) -> None:
+    with pytest.raises(ValueError, match=rf"method\.{key}: expected .* {value}"):
+        ShapeFromShading(**{key: value})  # type: ignore[arg-type]
