@@ -377,8 +377,8 @@ def test_the_help_lists_the_choices(within):
     for line in (
         "dataset: folder, icl, middlebury, middlebury2001, middlebury2003, middlebury2005, middlebury2006, "
         "middlebury_train, mixture, nyu, paper_train, procedural, simgeo, sintel, sunrgbd, tartanair, tofmark",
-        "method: anisotropic_diffusion, bicubic, bilinear, dip, dip_v, dip_v_warm, facets, fast_global_smoother, "
-        "guided_filter, joint_bilateral, msg, msg_v",
+        "method: anisotropic_diffusion, bicubic, bilinear, dg, dip, dip_v, dip_v_warm, eg, facets, "
+        "fast_global_smoother, guided_filter, joint_bilateral, msg, msg_v",
     ):
         assert line in output
 

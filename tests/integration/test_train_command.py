@@ -315,7 +315,7 @@ def test_mixed_precision_trains_with_losses_as_in_full_precision(smoke, tmp_path
 USAGE_ERRORS = {
     "a weight that is none": (["loss.w=abc"], "loss.w: expected auto or a number, 0 or more, got 'abc'"),
     "a negative weight": (["loss.w=-1"], "loss.w: expected auto or a number, 0 or more, got -1"),
-    "a mistyped model": (["model=foo"], "model=foo: unknown; expected one of facets, msg, msg_v"),
+    "a mistyped model": (["model=foo"], "model=foo: unknown; expected one of dg, facets, msg, msg_v, pdn"),
     "a model taken away": (["~model"], "model: missing; give it as model=..."),
     "a mistyped loss": (["model.depth_loss=l3"], "model.depth_loss: expected one of lap1, l1, mse, got 'l3'"),
     "a network that leaves out pixels": (["model.variant=hui"], "model: expected a network that covers the whole"),
@@ -356,7 +356,7 @@ def test_the_help_lists_the_choices(within):
     code, output, errors = within("--help")
     assert (code, errors) == (0, [])
     noises = "noise: gaussian_multiplicative, kinect, none, tof"
-    for line in ("model: facets, msg, msg_v", "trainer: default, full, smoke", noises):
+    for line in ("model: dg, facets, msg, msg_v, pdn", "trainer: default, full, smoke", noises):
         assert line in output
 
 

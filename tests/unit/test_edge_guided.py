@@ -13,7 +13,8 @@ from torch import Tensor
 from dsr.degrade import Downsampling, make_sample
 from dsr.geometry.camera import Camera, from_range, to_range
 from dsr.methods.base import Iterative, NoAnswerError
-from dsr.methods.edge_guided import EdgeGuided, filtered, prime_factors, reachable
+from dsr.methods.edge_filter import filtered, reachable
+from dsr.methods.edge_guided import EdgeGuided, prime_factors
 from dsr.methods.guidance import slopes_along
 from dsr.methods.interpolation import Interpolation
 from dsr.sample import DepthSample, Scene

@@ -45,8 +45,8 @@ DATASETS = (
     "mixture, nyu, paper_train, procedural, simgeo, sintel, sunrgbd, tartanair, tofmark"
 )
 METHODS = (
-    "anisotropic_diffusion, bicubic, bilinear, dip, dip_v, dip_v_warm, facets, fast_global_smoother, guided_filter, "
-    "joint_bilateral, msg, msg_v, msg_v_noisy, nearest, tgv"
+    "anisotropic_diffusion, bicubic, bilinear, dg, dip, dip_v, dip_v_warm, eg, facets, fast_global_smoother, "
+    "guided_filter, joint_bilateral, msg, msg_v, msg_v_noisy, nearest, pdn, srfs, tgv"
 )
 USAGE_ERRORS = {
     "dataset=fodler": f"dataset=fodler: unknown; expected one of {DATASETS}",

@@ -96,7 +96,7 @@ class NetworkUpsampler:
 
     A photo of more than ``UNTILED`` pixels is answered in tiles, see :mod:`dsr.methods.tiling`, which bounds the
     memory: about 40 bytes for each pixel of the photo, and for each pixel of a window (a tile, and the network's reach
-    on each side) 700 bytes where the depth is float32, 900 where it is float64. Whatever a network takes from the whole
+    on each side) 700 to 1000 bytes, by network and by the depth's precision. Whatever a network takes from the whole
     image, such as the range of the disparity, it takes from the whole image, so the answer is the same to rounding.
 
     Args:
