@@ -11,7 +11,6 @@ from torch.nn import functional
 from dsr.methods.analysis_filters import WIDTHS, influence, penalty, plane_free_basis, zero_mean_basis
 from dsr.methods.differences import box_mean, repeated, upsampled
 from dsr.methods.dynamic_guidance import DynamicGuidance, Stage
-from dsr.methods.network import NetworkUpsampler
 
 SCALES = (2, 4, 8, 16)
 
@@ -142,20 +141,6 @@ def test_training_in_mixed_precision_computes_in_float32() -> None:
     torch.testing.assert_close(mixed, net.upsample(rgb, coarse), rtol=0, atol=0)
 
 
-def test_a_factor_and_a_constant_on_the_disparity_come_out_again() -> None:
-    net, rgb, coarse = _net().double(), _photo(24, 28), _map(6, 7)
-    expected = 3 * net.upsample(rgb, coarse) + 7
-    torch.testing.assert_close(net.upsample(rgb, 3 * coarse + 7), expected, rtol=1e-9, atol=0)
-
-
-def test_windows_answer_as_the_whole_image_does() -> None:
-    net = _net(8, stages=1, size=3).double()
-    rgb, coarse = _photo(136, 128).double(), _map(17, 16)
-    expected = NetworkUpsampler(net).fine_disparity(rgb, coarse)
-    result = NetworkUpsampler(net, tile=32).fine_disparity(rgb, coarse)
-    torch.testing.assert_close(result, expected, rtol=0, atol=1e-9)
-
-
 @pytest.mark.parametrize("scale", SCALES)
 def test_an_output_depends_on_no_coarse_pixel_beyond_the_reach_and_on_one_within_half_of_it(scale: int) -> None:
     net = _net(scale, stages=1)
@@ -172,47 +157,6 @@ def test_an_output_depends_on_no_coarse_pixel_beyond_the_reach_and_on_one_within
     for beyond in (middle - net.reach - 1, middle + net.reach + 1):
         torch.testing.assert_close(answer(beyond), same, rtol=0, atol=0)
     assert not torch.allclose(answer(middle - net.reach // 2), same, rtol=0, atol=1e-7)
-
-
-@pytest.mark.parametrize("size", [(1, 1), (1, 5), (2, 2), (3, 7)])
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_maps_of_any_size_pass_in_their_dtype(size: tuple[int, int], dtype: torch.dtype) -> None:
-    result = _net(2).upsample(_photo(2 * size[0], 2 * size[1]), _map(*size).to(dtype))
-    assert result.shape == (1, 1, 2 * size[0], 2 * size[1])
-    assert result.dtype == dtype
-    assert bool(result.isfinite().all())
-
-
-def test_a_hole_is_filled_from_around_and_does_not_reach_far() -> None:
-    net, rgb, coarse = _net(stages=1), _photo(64, 64), _map(16, 16)
-    coarse[..., 0, 0], coarse[..., 0, 1] = 20, 29  # the range, which normalises
-    pierced = coarse.clone()
-    pierced[..., 3, 4] = torch.nan
-    result, whole = net.upsample(rgb, pierced), net.upsample(rgb, coarse)
-    assert bool(result.isfinite().all())
-    far = 4 * (4 + net.reach + 1)
-    torch.testing.assert_close(result[..., far:], whole[..., far:], rtol=1e-6, atol=0)
-    assert not torch.allclose(result[..., 12:16, 16:20], whole[..., 12:16, 16:20])
-
-
-def test_an_image_without_a_known_pixel_becomes_nan() -> None:
-    assert bool(_net().upsample(_photo(24, 28), torch.full((1, 1, 6, 7), torch.nan)).isnan().all())
-
-
-def test_each_image_of_a_batch_is_treated_alone_and_every_time_alike() -> None:
-    net, rgb, coarse = _net(), _photo(24, 28, 3), _map(6, 7, 3)
-    together = net.upsample(rgb, coarse)
-    alone = torch.cat([net.upsample(rgb[i : i + 1], coarse[i : i + 1]) for i in range(3)])
-    torch.testing.assert_close(together, alone, rtol=0, atol=1e-4)
-    assert torch.equal(net.upsample(rgb, coarse), together)
-
-
-def test_bounds_normalise_as_those_of_the_image_that_the_window_is_cut_from() -> None:
-    net, rgb, coarse = _net(), _photo(24, 28), _map(6, 7)
-    own = torch.tensor([coarse.min(), coarse.max()]).view(1, 2, 1, 1)
-    torch.testing.assert_close(net.upsample(rgb, coarse, own), net.upsample(rgb, coarse), rtol=1e-6, atol=0)
-    wide = torch.tensor([0.0, 100.0]).view(1, 2, 1, 1)
-    assert not torch.allclose(net.upsample(rgb, coarse, wide), net.upsample(rgb, coarse), rtol=1e-4)
 
 
 def test_an_edge_of_the_photo_lets_the_map_break_there_and_a_flat_photo_has_no_say() -> None:
@@ -240,11 +184,6 @@ def test_it_learns_an_edge_that_the_photo_shows() -> None:
         optimiser.step()
         errors.append(float(loss.detach()))
     assert errors[-1] < 0.3 * errors[0]
-
-
-def test_a_photo_of_another_size_is_refused() -> None:
-    with pytest.raises(ValueError, match=r"^rgb: expected \(24, 28\) pixels for a coarse map of \(6, 7\) at scale 4"):
-        _net().upsample(_photo(24, 24), _map(6, 7))
 
 
 @pytest.mark.parametrize(

@@ -45,24 +45,6 @@ def test_a_plane_is_reproduced_exactly_whatever_weights_and_photo_are(scale: int
     torch.testing.assert_close(result, fine, rtol=0, atol=1e-11)
 
 
-def test_a_factor_and_a_constant_on_the_disparity_come_out_again() -> None:
-    net, rgb, coarse = _net(), _photo(24, 28), _map(6, 7)
-    torch.testing.assert_close(net.upsample(rgb, 3 * coarse + 7), 3 * net.upsample(rgb, coarse) + 7, rtol=1e-6, atol=0)
-
-
-def test_bounds_normalise_as_those_of_the_image_that_the_window_is_cut_from() -> None:
-    net, rgb, coarse = _net(), _photo(24, 28), _map(6, 7)
-    own = torch.tensor([coarse.min(), coarse.max()]).view(1, 2, 1, 1)
-    torch.testing.assert_close(net.upsample(rgb, coarse, own), net.upsample(rgb, coarse), rtol=1e-7, atol=0)
-    wide = torch.tensor([0.0, 100.0]).view(1, 2, 1, 1)
-    assert not torch.allclose(net.upsample(rgb, coarse, wide), net.upsample(rgb, coarse), rtol=1e-4)
-
-
-def test_a_constant_map_stays_constant() -> None:
-    result = _net().upsample(_photo(24, 28), torch.full((1, 1, 6, 7), 5.0))
-    torch.testing.assert_close(result, torch.full((1, 1, 24, 28), 5.0), rtol=1e-6, atol=0)
-
-
 def test_before_training_the_mixture_is_the_splines_blend_of_central_differences_planes() -> None:
     """A plain loop over fine pixels, with every output of the network's three heads at 0."""
     net, coarse = _net(noise=0), _map(4, 5)
@@ -116,46 +98,10 @@ def test_without_slopes_values_stay_within_those_around() -> None:
     assert 1 - 1e-12 < float(fine.max()) <= 1 + 1e-12
 
 
-def test_each_image_of_a_batch_is_treated_alone() -> None:
-    net, rgb, coarse = _net(), _photo(24, 28, 3), _map(6, 7, 3)
-    together = net.upsample(rgb, coarse)
-    alone = torch.cat([net.upsample(rgb[i : i + 1], coarse[i : i + 1]) for i in range(3)])
-    torch.testing.assert_close(together, alone, rtol=0, atol=1e-3)
-
-
-def test_the_photo_has_a_say() -> None:
-    net, coarse = _net(), _map(6, 7)
-    assert not torch.allclose(net.upsample(_photo(24, 28), coarse), net.upsample(1 - _photo(24, 28), coarse), rtol=1e-4)
-
-
-def test_a_photo_of_another_size_is_refused() -> None:
-    with pytest.raises(ValueError, match=r"rgb: expected \(24, 28\) pixels for a coarse map of \(6, 7\) at scale 4"):
-        _net().upsample(_photo(24, 24), _map(6, 7))
-
-
 @pytest.mark.parametrize("arguments", [{"scale": 3}, {"scale": 4, "width": 0}, {"scale": 4, "facets": 0}])
 def test_arguments_out_of_range_are_refused(arguments: dict[str, int]) -> None:
     with pytest.raises(ValueError, match=r"(scale|model): expected"):
         Facets(**arguments)
-
-
-@pytest.mark.parametrize("size", [(1, 1), (1, 5), (2, 2)])
-def test_the_smallest_maps_pass(size: tuple[int, int]) -> None:
-    result = _net().upsample(_photo(4 * size[0], 4 * size[1]), _map(*size))
-    assert bool(result.isfinite().all())
-
-
-def test_a_hole_is_filled_from_around_and_does_not_reach_far() -> None:
-    net, rgb, coarse = _net(), _photo(64, 64), _map(16, 16)
-    pierced = coarse.clone()
-    pierced[..., 3, 4] = torch.nan
-    result, whole = net.upsample(rgb, pierced), net.upsample(rgb, coarse)
-    assert bool(result.isfinite().all())
-    torch.testing.assert_close(result[..., 48:, 48:], whole[..., 48:, 48:], rtol=1e-6, atol=0)
-
-
-def test_an_image_without_a_known_pixel_becomes_nan() -> None:
-    assert bool(_net().upsample(_photo(24, 28), torch.full((1, 1, 6, 7), torch.nan)).isnan().all())
 
 
 def test_holes_are_filled_from_outside_in_by_the_mean_of_the_known_around() -> None:

@@ -175,24 +175,6 @@ def test_a_plane_stays_one_whatever_the_weights_are_where_it_is_not_too_steep_fo
     torch.testing.assert_close(result, fine, rtol=0, atol=1e-6)
 
 
-def test_a_factor_and_a_constant_on_the_disparity_come_out_again() -> None:
-    net, rgb, coarse = _net(), _photo(24, 28), _map(6, 7)
-    torch.testing.assert_close(net.upsample(rgb, 3 * coarse + 7), 3 * net.upsample(rgb, coarse) + 7, rtol=1e-6, atol=0)
-
-
-def test_bounds_normalise_as_those_of_the_image_that_the_window_is_cut_from() -> None:
-    net, rgb, coarse = _net(), _photo(24, 28), _map(6, 7)
-    own = torch.tensor([coarse.min(), coarse.max()]).view(1, 2, 1, 1)
-    torch.testing.assert_close(net.upsample(rgb, coarse, own), net.upsample(rgb, coarse), rtol=1e-6, atol=0)
-    wide = torch.tensor([0.0, 100.0]).view(1, 2, 1, 1)
-    assert not torch.allclose(net.upsample(rgb, coarse, wide), net.upsample(rgb, coarse), rtol=1e-4)
-
-
-def test_a_constant_map_stays_constant() -> None:
-    result = _net().upsample(_photo(24, 28), torch.full((1, 1, 6, 7), 5.0))
-    torch.testing.assert_close(result, torch.full((1, 1, 24, 28), 5.0), rtol=1e-6, atol=0)
-
-
 def test_windows_answer_as_the_whole_does() -> None:
     net = _net(2, iterations=2)
     rgb, coarse = _photo(80, 84), _map(40, 42)
@@ -205,45 +187,6 @@ def test_windows_answer_as_the_whole_does() -> None:
     torch.testing.assert_close(kept, whole[..., top:, left:], rtol=1e-6, atol=0)
     outside = part[..., : 2 * reach, :] - whole[..., 2 * start : top, 20:]
     assert float(outside.abs().max()) > 1e-3  # nearer to the cut it differs
-
-
-def test_tiles_agree_with_the_answer_in_one_piece() -> None:
-    net = _net(4, layers=2, iterations=1)
-    rgb, coarse = _photo(96, 128), _map(24, 32)
-    tiled = NetworkUpsampler(net, tile=64).fine_disparity(rgb, coarse)
-    torch.testing.assert_close(tiled, NetworkUpsampler(net).fine_disparity(rgb, coarse), rtol=1e-6, atol=0)
-
-
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-@pytest.mark.parametrize(("height", "width"), [(1, 1), (1, 5), (3, 2)])
-def test_any_size_is_answered_in_the_dtype_of_the_map(height: int, width: int, dtype: torch.dtype) -> None:
-    coarse = _map(height, width).to(dtype)
-    result = _net(window=7).upsample(_photo(4 * height, 4 * width), coarse)
-    assert result.shape == (1, 1, 4 * height, 4 * width)
-    assert result.dtype == dtype
-    assert bool(result.isfinite().all())
-
-
-def test_holes_are_filled_and_an_image_without_a_known_pixel_has_no_answer() -> None:
-    coarse = torch.full((2, 1, 6, 7), 5.0)
-    coarse[0, 0, 2:4, 1:3] = torch.nan
-    coarse[1] = torch.nan
-    result = _net().upsample(_photo(24, 28, 2), coarse)
-    torch.testing.assert_close(result[:1], torch.full((1, 1, 24, 28), 5.0), rtol=1e-6, atol=0)
-    assert bool(result[1].isnan().all())
-
-
-def test_each_image_of_a_batch_is_treated_alone_and_the_same_each_time() -> None:
-    net, rgb, coarse = _net(), _photo(24, 28, 3), _map(6, 7, 3)
-    together = net.upsample(rgb, coarse)
-    alone = torch.cat([net.upsample(rgb[i : i + 1], coarse[i : i + 1]) for i in range(3)])
-    torch.testing.assert_close(together, alone, rtol=1e-6, atol=0)
-    assert torch.equal(together, net.upsample(rgb, coarse))
-
-
-def test_the_photo_has_a_say() -> None:
-    net, coarse = _net(), _map(6, 7)
-    assert not torch.allclose(net.upsample(_photo(24, 28), coarse), net.upsample(1 - _photo(24, 28), coarse), rtol=1e-4)
 
 
 def test_parameters_of_the_iteration_stay_positive_whatever_a_training_does_to_them() -> None:
@@ -276,11 +219,6 @@ def test_the_convolutions_may_run_in_bfloat16() -> None:
     assert float((halved - exact).abs().max()) < 0.05 * 9
 
 
-def test_a_photo_of_another_size_is_refused() -> None:
-    with pytest.raises(ValueError, match=r"rgb: expected \(24, 28\) pixels for a coarse map of \(6, 7\) at scale 4"):
-        _net().upsample(_photo(24, 24), _map(6, 7))
-
-
 @pytest.mark.parametrize(
     "arguments", [{"scale": 3}, {"scale": 4, "width": 0}, {"scale": 4, "layers": 1}, {"scale": 4, "window": 4},
                   {"scale": 4, "iterations": 0}],
@@ -288,11 +226,3 @@ def test_a_photo_of_another_size_is_refused() -> None:
 def test_arguments_out_of_range_are_refused(arguments: dict[str, int]) -> None:
     with pytest.raises(ValueError, match=r"^(scale|model[.a-z]*): expected [^\n]*$"):
         PrimalDualNetwork(**arguments)
-
-
-def test_arguments_rebuild_the_network() -> None:
-    net = _net(8, window=5)
-    again = PrimalDualNetwork(**net.arguments())
-    again.load_state_dict(net.state_dict())
-    rgb, coarse = _photo(32, 24), _map(4, 3)
-    assert torch.equal(again.upsample(rgb, coarse), net.upsample(rgb, coarse))

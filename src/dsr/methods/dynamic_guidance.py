@@ -43,9 +43,7 @@ from torch.nn import functional
 from dsr.degrade import check_scale
 from dsr.methods.analysis_filters import WIDTHS, influence, penalty, plane_free_basis, zero_mean_basis
 from dsr.methods.differences import box_mean, upsampled
-from dsr.methods.holes import filled
-from dsr.methods.maps import bounds_of, normalised
-from dsr.methods.network import Whole, WindowedNetwork
+from dsr.methods.network import NormalisedNetwork, expect_photo
 
 _HEIGHT, _CONTRAST, _SHARED, _FIDELITY = 0.05, 2.0, 0.02, 0.5
 """Before training: of penalties; of the b_m; the c_lm of other filters than the l-th; of the data step."""
@@ -118,7 +116,7 @@ class Stage(nn.Module):
         return self.heights.to(like) / len(self.heights)
 
 
-class DynamicGuidance(WindowedNetwork):
+class DynamicGuidance(NormalisedNetwork):
     """The network.
 
     Holes of the input are filled. Everything is computed in float32, or float64 where the weights are; weights of half
@@ -157,18 +155,6 @@ class DynamicGuidance(WindowedNetwork):
         """
         return _BICUBIC + len(self.stages) * (_BICUBIC + math.ceil((self.size - 1) / self.scale))
 
-    def whole(self, rgb: Tensor, disparity: Tensor) -> Whole:
-        """Return what answers windows: the disparity's range is the whole image's."""
-        bounds = bounds_of(disparity)
-        return Whole(filled(disparity), lambda photo, window: self.upsample(photo, window, bounds))
-
-    def upsample(self, rgb: Tensor, disparity: Tensor, bounds: Tensor | None = None) -> Tensor:
-        """Return fine disparity; see :meth:`dsr.methods.network.DisparityNetwork.upsample`."""
-        known = normalised(disparity, bounds)
-        span = torch.where(known.span > 0, known.span, 1)
-        values = (filled(disparity) - known.minimum) / span
-        return self(rgb, values) * span + known.minimum
-
     def forward(self, rgb: Tensor, values: Tensor) -> Tensor:
         """Map a photo and normalised coarse disparity to fine disparity.
 
@@ -183,10 +169,7 @@ class DynamicGuidance(WindowedNetwork):
             ValueError: the photo's size is not scale times the map's.
 
         """
-        expected = tuple(self.scale * n for n in values.shape[-2:])
-        if tuple(rgb.shape[-2:]) != expected:
-            raise ValueError(f"rgb: expected {expected} pixels for a coarse map of {tuple(values.shape[-2:])} "
-                             f"at scale {self.scale}, got {tuple(rgb.shape[-2:])}")  # fmt: skip
+        expect_photo(rgb, values, self.scale)
         weight = next(self.parameters())
         with torch.autocast(rgb.device.type, enabled=False):
             photo, coarse = (x.to(torch.promote_types(weight.dtype, torch.float32)) for x in (rgb, values))

@@ -24,7 +24,7 @@ from torch.nn import functional
 from dsr.degrade import check_scale
 from dsr.methods.holes import filled
 from dsr.methods.maps import bounds_of, normalised
-from dsr.methods.network import Whole, WindowedNetwork
+from dsr.methods.network import Whole, WindowedNetwork, expect_photo
 
 _NEIGHBOURS = 9
 _FINE, _HALF = 16, 32
@@ -149,10 +149,7 @@ class Facets(WindowedNetwork):
             (B, 1, H, W).
 
         """
-        if rgb.shape[-2:] != torch.Size(self.scale * n for n in values.shape[-2:]):
-            expected = tuple(self.scale * n for n in values.shape[-2:])
-            raise ValueError(f"rgb: expected {expected} pixels for a coarse map of {tuple(values.shape[-2:])} "
-                             f"at scale {self.scale}, got {tuple(rgb.shape[-2:])}")  # fmt: skip
+        expect_photo(rgb, values, self.scale)
         around = stencil(values)
         dtype = self.photo.weight.dtype
         pyramid = [functional.relu(self.photo(_photo_input(rgb, mean).to(dtype)))]

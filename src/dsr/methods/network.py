@@ -14,6 +14,8 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from dsr.geometry.camera import RangeType, from_range, to_range
+from dsr.methods.holes import filled
+from dsr.methods.maps import bounds_of, normalised
 from dsr.methods.tiling import Progress, Span, blended, spans
 from dsr.sample import DepthSample
 
@@ -89,6 +91,39 @@ class WindowedNetwork(DisparityNetwork):
     @abc.abstractmethod
     def whole(self, rgb: Tensor, disparity: Tensor) -> Whole:
         """Return what answers windows of an image; see :meth:`upsample` for the arguments."""
+
+
+class NormalisedNetwork(WindowedNetwork):
+    """A network on a photo and coarse disparity that is brought to 0..1 and has its holes filled.
+
+    So the disparity's unit and offset come out as they went in. Called with (B, 3, H, W) and (B, 1, h, w), it returns
+    (B, 1, H, W).
+    """
+
+    def upsample(self, rgb: Tensor, disparity: Tensor, bounds: Tensor | None = None) -> Tensor:
+        """Return fine disparity; see :meth:`DisparityNetwork.upsample`."""
+        known = normalised(disparity, bounds)
+        span = torch.where(known.span > 0, known.span, 1)
+        values = (filled(disparity) - known.minimum) / span
+        return self(rgb, values) * span + known.minimum
+
+    def whole(self, rgb: Tensor, disparity: Tensor) -> Whole:
+        """Return what answers windows: the disparity's range is the whole image's."""
+        bounds = bounds_of(disparity)
+        return Whole(filled(disparity), lambda photo, window: self.upsample(photo, window, bounds))
+
+
+def expect_photo(rgb: Tensor, coarse: Tensor, scale: int) -> None:
+    """Check a photo's size, (..., H, W), against a coarse map's, (..., h, w).
+
+    Raises:
+        ValueError: it is not scale times the map's.
+
+    """
+    expected, came = tuple(scale * n for n in coarse.shape[-2:]), tuple(rgb.shape[-2:])
+    if came != expected:
+        size = tuple(coarse.shape[-2:])
+        raise ValueError(f"rgb: expected {expected} pixels for a coarse map of {size} at scale {scale}, got {came}")
 
 
 class NetworkUpsampler:

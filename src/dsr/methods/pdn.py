@@ -35,9 +35,7 @@ from torch.nn import functional
 from dsr.degrade import check_scale
 from dsr.methods.differences import extended, upsampled
 from dsr.methods.facets import stencil
-from dsr.methods.holes import filled
-from dsr.methods.maps import bounds_of, normalised
-from dsr.methods.network import Whole, WindowedNetwork
+from dsr.methods.network import NormalisedNetwork, expect_photo
 from dsr.methods.primal_dual import UnrolledHuber
 
 _FAINT = 1e-3
@@ -46,7 +44,7 @@ _INPUTS = 9
 _TINY = 1e-12
 
 
-class PrimalDualNetwork(WindowedNetwork):
+class PrimalDualNetwork(NormalisedNetwork):
     """The network.
 
     Memory: about 900 bytes for each pixel of the photo, or of a window.
@@ -89,13 +87,6 @@ class PrimalDualNetwork(WindowedNetwork):
         sizes = {"scale": self.scale, "width": self.width, "layers": self.layers}
         return {**sizes, "window": self.window, "iterations": self.iterations}
 
-    def upsample(self, rgb: Tensor, disparity: Tensor, bounds: Tensor | None = None) -> Tensor:
-        """Return fine disparity; see :meth:`dsr.methods.network.DisparityNetwork.upsample`."""
-        known = normalised(disparity, bounds)
-        span = torch.where(known.span > 0, known.span, 1)
-        values = (filled(disparity) - known.minimum) / span
-        return self(rgb, values) * span + known.minimum
-
     @property
     def reach(self) -> int:
         """How many coarse pixels around its own an output depends on.
@@ -105,11 +96,6 @@ class PrimalDualNetwork(WindowedNetwork):
         """
         fine = self.layers + self.stage.reach
         return -(-fine // self.scale) + 4
-
-    def whole(self, rgb: Tensor, disparity: Tensor) -> Whole:
-        """Return what answers windows: the disparity's range is the whole image's."""
-        bounds = bounds_of(disparity)
-        return Whole(filled(disparity), lambda photo, window: self.upsample(photo, window, bounds))
 
     def forward(self, rgb: Tensor, values: Tensor) -> Tensor:
         """Map a photo and normalised coarse disparity to fine disparity.
@@ -122,10 +108,7 @@ class PrimalDualNetwork(WindowedNetwork):
             (B, 1, H, W).
 
         """
-        if rgb.shape[-2:] != torch.Size(self.scale * n for n in values.shape[-2:]):
-            expected = tuple(self.scale * n for n in values.shape[-2:])
-            raise ValueError(f"rgb: expected {expected} pixels for a coarse map of {tuple(values.shape[-2:])} "
-                             f"at scale {self.scale}, got {tuple(rgb.shape[-2:])}")  # fmt: skip
+        expect_photo(rgb, values, self.scale)
         fine = upsampled(values, self.scale)
         seen, bend = self._seen(rgb, values, fine)
         output = self.head(self.trunk(seen.to(self.head.weight.dtype)))
