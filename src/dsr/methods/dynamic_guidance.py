@@ -24,9 +24,10 @@ What differs from the original:
 - A penalty is a mixture of Lorentzians whose widths grow by factors; there, its derivative is a sum of Gaussian radial
   basis functions. Disparity has faint bends and large steps, so widths from 1/1000 to 1 of its range are needed.
 - The data step comes first, is smooth, and knows that coarse values are block means (iterative back-projection: Irani
-  and Peleg, *Improving Resolution by Image Registration*, 1991). In short trainings on procedural scenes it has a
-  lower RMSE_d and RMSE_v than the gradient of |A x - d|^2, whose blocks remain visible in renderings.
-- The form of w_l is ours. One squared filter of the grey photo for each k_l had a higher RMSE_d.
+  and Peleg, *Improving Resolution by Image Registration*, 1991). After 160 steps of training for MSE its RMSE_d
+  and RMSE_v on procedural scenes were 43 mm and .224, with the gradient of |A x - d|^2 in its place 45 mm and .240.
+- The form of w_l is ours. With one squared filter of the grey photo for each k_l RMSE_d was higher, 49 against 47 mm,
+  and RMSE_v, for which that training was not, lower, .234 against .251.
 - All stages are trained at once, from polynomial filters and weak penalties, without training one after another before.
 - It works on disparity over its range in the coarse map.
 """
