@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from dsr.report.results import Problem, load_results
-from dsr.store import load_scene, scene_path
+from dsr.store import load_scene, prediction_path, scene_path
 
 
 def change(folder, name, **entries):
@@ -164,3 +164,13 @@ def test_scenes_that_a_method_has_no_answer_for_are_noted(make_run, tmp_path):
     make_run(tmp_path / "a", label="EG", method="eg", scenes=("s",))
     change(tmp_path / "a", "summary.json", unanswered={"t": "t: no edge is closed"})
     assert load_results([tmp_path]).notes == ("EG at x4 has no answer for t: no edge is closed",)
+
+
+def test_runs_without_any_answer_are_refused_with_the_reason(make_run, tmp_path):
+    make_run(tmp_path / "a", label="EG", method="eg", scenes=("s",))
+    prediction_path(tmp_path / "a", "s").unlink()
+    with pytest.raises(ValueError, match=r"expected runs with a prediction, found none$"):
+        load_results([tmp_path])
+    change(tmp_path / "a", "summary.json", unanswered={"s": "s: no edge is closed"})
+    with pytest.raises(ValueError, match=r"found none; EG at x4 has no answer for s: no edge is closed$"):
+        load_results([tmp_path])

@@ -29,6 +29,8 @@ It has no answer for a map with edges that do not recur at half its size, such a
 ``downsampling=nearest`` it is half a pixel off.
 
 Everything that is a depth is computed in float64. Time grows with the pixels, and with edge patches times those known.
+Memory: about 27 float64 maps of the photo's size, at most 2^24 distances of 4 bytes, and what grows with the edge
+pixels; for a statue before a wall at 512 x 512 165 maps in all.
 """
 
 from __future__ import annotations

@@ -185,6 +185,9 @@ def load_results(paths: Sequence[Path]) -> Results:
         for message in run.unanswered.values()
     ]
     runs, older = _newest(runs)
+    if not runs:
+        reason = f"; {unanswered[0]}" if unanswered else ""
+        raise ValueError(f"{', '.join(map(str, paths))}: expected runs with a prediction, found none{reason}")
     runs.sort(key=lambda run: (_problem_key(run.problem), _method_key(run.label), run.seed))
     return Results(tuple(runs), (*notes, *older, *unanswered))
 
