@@ -14,7 +14,7 @@ from torch.nn import functional
 
 from dsr.geometry.camera import Camera, from_range, to_range
 from dsr.methods.maps import upsample_bicubic
-from dsr.methods.msg_net import VariantName
+from dsr.methods.msg_guidance import VariantName
 from dsr.methods.network import Precision
 from dsr.methods.trained import build_trained
 from dsr.sample import DepthSample

@@ -18,7 +18,8 @@ import torch
 from torch import Tensor
 
 from dsr.degrade import SCALES
-from dsr.methods.msg_net import MSGNet, VariantName
+from dsr.methods.msg_guidance import VariantName
+from dsr.methods.msg_net import MSGNet
 from dsr.methods.weights import fill
 
 TORCH_MAGIC = (b"PK\x03\x04", b"\x80")

@@ -10,7 +10,8 @@ import torch
 
 from dsr.methods.dynamic_guidance import DynamicGuidance
 from dsr.methods.facets import Facets
-from dsr.methods.msg_net import MSGNet, VariantName
+from dsr.methods.msg_guidance import VariantName
+from dsr.methods.msg_net import MSGNet
 from dsr.methods.network import DisparityNetwork, NetworkUpsampler, Precision
 from dsr.methods.pdn import PrimalDualNetwork
 from dsr.methods.published import load_msg_weights
