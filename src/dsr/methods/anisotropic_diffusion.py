@@ -30,7 +30,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from dsr.geometry.camera import RangeType, from_range, to_range
-from dsr.methods.base import history_of
+from dsr.methods.base import expect_limits, history_of
 from dsr.methods.differences import box_mean, extended, upsampled
 from dsr.methods.holes import filled
 from dsr.methods.maps import bounds_of, normalised
@@ -81,10 +81,7 @@ class AnisotropicDiffusion:
         depth_weight: float = 1.0,
         border: int = 4,
     ) -> None:
-        if steps < 1:
-            raise ValueError(f"method.steps: expected at least 1, got {steps}")
-        if not tolerance >= 0:
-            raise ValueError(f"method.tolerance: expected 0 or more, got {tolerance}")
+        expect_limits(tolerance, steps=steps)
         if not 0 < step <= 0.25:
             raise ValueError(f"method.step: expected more than 0 and at most 0.25, got {step}")
         if not edge > 0:

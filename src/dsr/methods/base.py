@@ -67,3 +67,21 @@ def history_of(moved: list[float], every: int) -> list[dict[str, float]]:
     ``moved`` is the RMS since the last look, as a share of the map's range.
     """
     return [{"iteration": float(every * (look + 1)), "moved": value} for look, value in enumerate(moved)]
+
+
+def expect_limits(tolerance: float, **counts: int) -> None:
+    """Check when an iteration ends.
+
+    Args:
+        tolerance: how little has to change.
+        **counts: the most steps that it may take, by the parameter's name.
+
+    Raises:
+        ValueError: the tolerance is negative, or a count less than 1.
+
+    """
+    for name, count in counts.items():
+        if count < 1:
+            raise ValueError(f"method.{name}: expected at least 1, got {count}")
+    if not tolerance >= 0:
+        raise ValueError(f"method.tolerance: expected 0 or more, got {tolerance}")

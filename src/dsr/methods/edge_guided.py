@@ -43,7 +43,7 @@ from dsr.methods.edge_filter import filtered
 from dsr.methods.edge_map import edge_map
 from dsr.methods.guidance import positive
 from dsr.methods.holes import filled
-from dsr.methods.tiling import Progress
+from dsr.methods.tiling import Progress, part_of
 from dsr.sample import DepthSample
 
 _BEYOND = 4.0
@@ -113,7 +113,7 @@ class EdgeGuided:
         stages = prime_factors(sample.scale)
         barrier: Tensor | None = None
         for number, scale in enumerate(stages):
-            told = _part(progress, number, len(stages), self._iterations)
+            told = part_of(progress, number * self._iterations, len(stages) * self._iterations)
             doubtful = barrier
             barrier = self._edges(fine, scale, self._step * (most - least), told)
             fine = filtered(
@@ -132,12 +132,13 @@ class EdgeGuided:
             fine = filled(fine[None, None])[0, 0]
         return from_range(fine[None], sample.camera, "disparity").to(sample.depth_lr)
 
-    def _edges(self, coarse: Tensor, scale: int, step: float, told: Progress) -> Tensor:
+    def _edges(self, coarse: Tensor, scale: int, step: float, told: Progress | None) -> Tensor:
         """Return the fine edge map of a map (h, w), and add to the history how it was found."""
         barrier, answer = edge_map(
             coarse, scale, step, self._candidates, self._sharp_weight, self._smoothness, self._iterations, told
         )
-        told(self._iterations, self._iterations)
+        if told is not None:
+            told(self._iterations, self._iterations)
         done = self.history[-1]["iteration"] if self.history else 0.0
         if answer is not None:
             self.history += [{**entry, "iteration": entry["iteration"] + done} for entry in answer.history]
@@ -151,13 +152,3 @@ def prime_factors(scale: int) -> list[int]:
         factors.append(next(n for n in range(2, scale + 1) if scale % n == 0))
         scale //= factors[-1]
     return factors
-
-
-def _part(progress: Progress | None, number: int, stages: int, iterations: int) -> Progress:
-    """Return what a stage's progress is told, as a part of the whole."""
-
-    def told(done: int, _: int) -> None:
-        if progress is not None:
-            progress(number * iterations + done, stages * iterations)
-
-    return told

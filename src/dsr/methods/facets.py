@@ -22,9 +22,8 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from dsr.degrade import check_scale
-from dsr.methods.holes import filled
-from dsr.methods.maps import bounds_of, normalised
-from dsr.methods.network import Whole, WindowedNetwork, expect_photo
+from dsr.methods.differences import extended
+from dsr.methods.network import NormalisedNetwork, expect_photo
 
 _NEIGHBOURS = 9
 _FINE, _HALF = 16, 32
@@ -50,7 +49,7 @@ class Stencil(NamedTuple):
 
 def stencil(values: Tensor) -> Stencil:
     """Return the differences of (B, 1, h, w) maps; beyond the border a map goes on linearly."""
-    padded = _extended(_extended(values, -1), -2)  # (B, 1, h + 2, w + 2)
+    padded = extended(values, 1)  # (B, 1, h + 2, w + 2)
     left, here, right = padded[..., 1:-1, :-2], padded[..., 1:-1, 1:-1], padded[..., 1:-1, 2:]
     above, below = padded[..., :-2, 1:-1], padded[..., 2:, 1:-1]
     along_u = torch.cat((here - left, (right - left) / 2, right - here), dim=1)
@@ -61,7 +60,7 @@ def stencil(values: Tensor) -> Stencil:
     return Stencil(here, along_u, along_v, bend, functional.avg_pool2d(padded, 3, stride=1))
 
 
-class Facets(WindowedNetwork):
+class Facets(NormalisedNetwork):
     """The network.
 
     Args:
@@ -112,10 +111,6 @@ class Facets(WindowedNetwork):
         sizes = {"scale": self.scale, "width": self.width, "blocks": self.blocks, "facets": self.facets}
         return {**sizes, "slopes": self.slopes}
 
-    def upsample(self, rgb: Tensor, disparity: Tensor, bounds: Tensor | None = None) -> Tensor:
-        """Return fine disparity; see :meth:`dsr.methods.network.DisparityNetwork.upsample`."""
-        return self._upsampled(rgb, disparity, bounds, None)
-
     @property
     def reach(self) -> int:
         """How many coarse pixels around its own an output depends on.
@@ -125,17 +120,9 @@ class Facets(WindowedNetwork):
         """
         return 2 * self.blocks + 6
 
-    def whole(self, rgb: Tensor, disparity: Tensor) -> Whole:
-        """Return what answers windows: the disparity's range and the photo's mean are the whole image's."""
-        bounds, mean = bounds_of(disparity), _mean(rgb)
-        return Whole(filled(disparity), lambda photo, window: self._upsampled(photo, window, bounds, mean))
-
-    def _upsampled(self, rgb: Tensor, disparity: Tensor, bounds: Tensor | None, mean: Tensor | None) -> Tensor:
-        known = normalised(disparity, bounds)
-        span = torch.where(known.span > 0, known.span, 1)
-        values = (filled(disparity) - known.minimum) / span
-        fine = self(rgb, values, mean)
-        return fine * span + known.minimum
+    def context(self, rgb: Tensor) -> tuple[Tensor, ...]:
+        """Return the photo's mean colour, (B, 3, 1, 1)."""
+        return (_mean(rgb),)
 
     def forward(self, rgb: Tensor, values: Tensor, mean: Tensor | None = None) -> Tensor:
         """Map a photo and normalised coarse disparity to fine disparity.
@@ -217,14 +204,6 @@ def _quiet(conv: nn.Conv2d) -> nn.Conv2d:
     if conv.bias is not None:
         nn.init.zeros_(conv.bias)
     return conv
-
-
-def _extended(values: Tensor, dim: int) -> Tensor:
-    """Return maps with a slice more on either side along ``dim``, extrapolated; repeated where there is just one."""
-    size = values.shape[dim]
-    first, last = values.narrow(dim, 0, 1), values.narrow(dim, size - 1, 1)
-    second, before = values.narrow(dim, min(1, size - 1), 1), values.narrow(dim, max(size - 2, 0), 1)
-    return torch.cat((2 * first - second, values, 2 * last - before), dim)
 
 
 def _mean(rgb: Tensor) -> Tensor:

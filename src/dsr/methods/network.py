@@ -96,21 +96,28 @@ class WindowedNetwork(DisparityNetwork):
 class NormalisedNetwork(WindowedNetwork):
     """A network on a photo and coarse disparity that is brought to 0..1 and has its holes filled.
 
-    So the disparity's unit and offset come out as they went in. Called with (B, 3, H, W) and (B, 1, h, w), it returns
-    (B, 1, H, W).
+    So the disparity's unit and offset come out as they went in. Called with (B, 3, H, W) and (B, 1, h, w), and the
+    whole photo's :meth:`context` where these are a window, it returns (B, 1, H, W).
     """
 
     def upsample(self, rgb: Tensor, disparity: Tensor, bounds: Tensor | None = None) -> Tensor:
         """Return fine disparity; see :meth:`DisparityNetwork.upsample`."""
+        return self._over_range(rgb, disparity, bounds, ())
+
+    def whole(self, rgb: Tensor, disparity: Tensor) -> Whole:
+        """Return what answers windows: the disparity's range and the context are the whole image's."""
+        bounds, context = bounds_of(disparity), self.context(rgb)
+        return Whole(filled(disparity), lambda photo, window: self._over_range(photo, window, bounds, context))
+
+    def context(self, rgb: Tensor) -> tuple[Tensor, ...]:
+        """Return what the network takes from the whole photo, (B, 3, H, W)."""
+        return ()
+
+    def _over_range(self, rgb: Tensor, disparity: Tensor, bounds: Tensor | None, context: tuple[Tensor, ...]) -> Tensor:
         known = normalised(disparity, bounds)
         span = torch.where(known.span > 0, known.span, 1)
         values = (filled(disparity) - known.minimum) / span
-        return self(rgb, values) * span + known.minimum
-
-    def whole(self, rgb: Tensor, disparity: Tensor) -> Whole:
-        """Return what answers windows: the disparity's range is the whole image's."""
-        bounds = bounds_of(disparity)
-        return Whole(filled(disparity), lambda photo, window: self.upsample(photo, window, bounds))
+        return self(rgb, values, *context) * span + known.minimum
 
 
 def expect_photo(rgb: Tensor, coarse: Tensor, scale: int) -> None:

@@ -39,6 +39,7 @@ import torch
 from torch import Tensor
 
 from dsr.geometry.camera import RangeType
+from dsr.methods.base import expect_limits
 from dsr.methods.differences import upsampled
 from dsr.methods.holes import filled
 from dsr.methods.shading_admm import Problem, ShadingSolver, Weights
@@ -93,10 +94,7 @@ class ShapeFromShading:
         growth: float = 1.3,
         foreground: str | None = None,
     ) -> None:
-        if iterations < 1:
-            raise ValueError(f"method.iterations: expected at least 1, got {iterations}")
-        if not tolerance >= 0:
-            raise ValueError(f"method.tolerance: expected 0 or more, got {tolerance}")
+        expect_limits(tolerance, iterations=iterations)
         if not area_weight >= 0:
             raise ValueError(f"method.area_weight: expected 0 or more, got {area_weight}")
         if not 1 <= growth < float("inf"):

@@ -33,7 +33,7 @@ import torch
 from torch import Tensor
 
 from dsr.geometry.camera import RangeType, from_range, to_range
-from dsr.methods.base import history_of
+from dsr.methods.base import expect_limits, history_of
 from dsr.methods.differences import box_mean, divergence, gradient, grey, repeated, touching, upsampled
 from dsr.methods.holes import filled
 from dsr.methods.maps import normalised
@@ -107,10 +107,7 @@ class TotalGeneralisedVariation:
         exponent: float = 0.85,
         step_ratio: float = 1e4,
     ) -> None:
-        if iterations < 1:
-            raise ValueError(f"method.iterations: expected at least 1, got {iterations}")
-        if not tolerance >= 0:
-            raise ValueError(f"method.tolerance: expected 0 or more, got {tolerance}")
+        expect_limits(tolerance, iterations=iterations)
         positive = {
             "first": first,
             "second": second,

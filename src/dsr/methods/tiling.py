@@ -18,6 +18,11 @@ Progress = Callable[[int, int], object]
 """Is told how many parts of the work are done, and of how many."""
 
 
+def part_of(progress: Progress | None, before: int, total: int) -> Progress | None:
+    """Return what one of several steps tells of its parts, ``before`` parts being those of the steps before it."""
+    return None if progress is None else lambda done, _: progress(before + done, total)
+
+
 @dataclass(frozen=True)
 class Span:
     """A tile along one axis, in coarse pixels.

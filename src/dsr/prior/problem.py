@@ -10,12 +10,12 @@ from torch import Tensor
 
 from dsr.degrade import Downsampling, downsampled
 from dsr.geometry.camera import Camera, RangeType
+from dsr.methods.differences import grey
 from dsr.quality import losses
 from dsr.quality.functional import SurfacePair, mse_v
 from dsr.sample import DepthSample
 
 DataLoss = Literal["lap1", "mse"]
-_LUMINANCE = (0.299, 0.587, 0.114)
 _LEAST_SPAN = 1e-3
 _MOST_LEVELS = 3
 
@@ -55,10 +55,9 @@ class ImageProblem:
         known = sample.depth_lr[sample.mask_lr]
         low, high = float(known.min()), float(known.max())
         rgb = sample.rgb[None].to(device, torch.float32)
-        weights = torch.tensor(_LUMINANCE, device=device).view(1, 3, 1, 1)
         return cls(
             rgb=rgb,
-            grey=(weights * rgb).sum(dim=1, keepdim=True),
+            grey=grey(rgb),
             coarse=sample.depth_lr[None].to(device, torch.float32),
             rays=sample.camera.rays(dtype=torch.float32, device=device)[None],
             rays_lr=sample.camera_lr.rays(dtype=torch.float32, device=device)[None],

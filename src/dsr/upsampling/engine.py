@@ -13,7 +13,7 @@ from dsr.degrade import Downsampling
 from dsr.geometry.camera import Camera
 from dsr.methods.interpolation import Interpolation, Order
 from dsr.methods.network import NetworkUpsampler
-from dsr.methods.tiling import Progress
+from dsr.methods.tiling import Progress, part_of
 from dsr.methods.trained import build_trained, packaged_weights
 from dsr.prior.method import DeepImagePrior
 from dsr.sample import DepthSample
@@ -107,7 +107,7 @@ def _answer(
     for i, (net, coarse_size) in enumerate(zip(networks, sizes, strict=True)):
         inverse = resized_inverse(inverse, coarse_size, math.inf)
         before, total = sum(parts[:i]), sum(parts)
-        report = None if progress is None else _later(progress, before, total)
+        report = part_of(progress, before, total)
         photo = resized_photo(rgb, (net.net.scale * coarse_size[0], net.net.scale * coarse_size[1]))
         inverse = net.fine_disparity(photo[None].to(on), inverse[None].to(on), report)[0]
         del photo
@@ -119,11 +119,6 @@ def resized_photo(rgb: Tensor, size: tuple[int, int]) -> Tensor:
     if _size(rgb) == size:
         return rgb
     return functional.interpolate(rgb[None], size, mode="bicubic", antialias=True)[0].clamp_(0, 1)
-
-
-def _later(progress: Progress, before: int, total: int) -> Progress:
-    """Return a progress of one of several steps."""
-    return lambda done, _: progress(before + done, total)
 
 
 def _network(method: str, scale: int, device: torch.device) -> NetworkUpsampler:
