@@ -7,43 +7,13 @@ import itertools
 import numpy as np
 import pytest
 import torch
+from small_scenes import disparity_of, plane, random_scene, sample_of, step
 from torch import Tensor
 
-from dsr.degrade import Downsampling, make_sample
-from dsr.geometry.camera import Camera, from_range, to_range
+from dsr.geometry.camera import to_range
 from dsr.methods.anisotropic_diffusion import AnisotropicDiffusion
 from dsr.methods.differences import upsampled
-from dsr.sample import DepthSample, Scene
-
-
-def _sample(disparity: Tensor, rgb: Tensor | None = None, scale: int = 4, doffs: float = 0.0) -> DepthSample:
-    """Return the problem of a scene with these disparities, (H, W)."""
-    height, width = disparity.shape
-    camera = Camera(width, height, 60.0, 55.0, 0.45 * width, 0.55 * height, doffs=doffs)
-    rgb = torch.zeros(3, height, width) if rgb is None else rgb
-    scene = Scene("set", "hall", rgb, camera, from_range(disparity[None], camera, "disparity"))
-    return make_sample(scene, scale, Downsampling("box"), "disparity")
-
-
-def _plane(height: int = 32, width: int = 48) -> Tensor:
-    v, u = torch.meshgrid(torch.arange(height).double(), torch.arange(width).double(), indexing="ij")
-    return 6 + 0.05 * u - 0.03 * v
-
-
-def _step(size: int = 32, column: int = 14) -> tuple[Tensor, Tensor]:
-    """Return disparities with a step in the midst of a block, and a photo with an edge there."""
-    near = torch.arange(size) >= column
-    return torch.where(near, 8.0, 4.0).double().expand(size, size), near.float().expand(3, size, size)
-
-
-def _random(height: int, width: int, seed: int = 0) -> tuple[Tensor, Tensor]:
-    rng = np.random.default_rng(seed)
-    rgb = torch.from_numpy(rng.uniform(0, 1, (3, height, width))).float()
-    return torch.from_numpy(rng.uniform(3, 9, (height, width))), rgb
-
-
-def _disparity(depth: Tensor, sample: DepthSample) -> Tensor:
-    return to_range(depth, sample.camera, "disparity")[0]
+from dsr.sample import DepthSample
 
 
 def _coarse(sample: DepthSample) -> np.ndarray:
@@ -58,15 +28,15 @@ def _means(x: Tensor, scale: int) -> np.ndarray:
 @pytest.mark.parametrize(("scale", "size"), [(2, (10, 6)), (4, (32, 48)), (8, (8, 24)), (16, (16, 16))])
 @pytest.mark.parametrize("doffs", [0.0, 2.5])
 def test_block_means_of_disparity_are_the_input(scale: int, size: tuple[int, int], doffs: float) -> None:
-    sample = _sample(*_random(*size), scale=scale, doffs=doffs)
+    sample = sample_of(*random_scene(*size), scale=scale, doffs=doffs)
     fine = AnisotropicDiffusion(steps=60)(sample)
     assert fine.shape == (1, *size)
-    np.testing.assert_allclose(_means(_disparity(fine, sample), scale), _coarse(sample), rtol=1e-9)
+    np.testing.assert_allclose(_means(disparity_of(fine, sample), scale), _coarse(sample), rtol=1e-9)
 
 
 def test_a_map_is_what_a_plain_loop_over_pixels_makes_of_it() -> None:
-    disparity, rgb = _random(16, 16)
-    sample = _sample(disparity, rgb)
+    disparity, rgb = random_scene(16, 16)
+    sample = sample_of(disparity, rgb)
     method = AnisotropicDiffusion(steps=20, edge=0.2, depth_weight=0.0, border=0)
     coarse = torch.from_numpy(_coarse(sample))[None, None]
     start = upsampled(coarse, 4)[0, 0].numpy()
@@ -97,49 +67,49 @@ def _plain(x: np.ndarray, rgb: np.ndarray, coarse: np.ndarray, *, steps: int, ed
 
 @pytest.mark.parametrize("scale", [2, 4, 8])
 def test_a_plane_is_reproduced_within_three_ten_thousandths_of_its_range(scale: int) -> None:
-    disparity = _plane()
-    sample = _sample(disparity, scale=scale)
-    error = (_disparity(AnisotropicDiffusion()(sample), sample) - disparity).abs().max()
+    disparity = plane()
+    sample = sample_of(disparity, scale=scale)
+    error = (disparity_of(AnisotropicDiffusion()(sample), sample) - disparity).abs().max()
     assert error < 3e-4 * (disparity.max() - disparity.min())
 
 
 def test_without_a_border_a_plane_is_bent_along_the_images_edge() -> None:
-    disparity = _plane()
-    sample = _sample(disparity)
-    error = (_disparity(AnisotropicDiffusion(border=0)(sample), sample) - disparity).abs()
+    disparity = plane()
+    sample = sample_of(disparity)
+    error = (disparity_of(AnisotropicDiffusion(border=0)(sample), sample) - disparity).abs()
     assert error[:, :2].max() > 10 * error[12:20, 20:28].max()
 
 
 def test_a_step_stays_sharp_along_an_edge_of_the_photo_and_is_smooth_without_one() -> None:
-    disparity, rgb = _step()
+    disparity, rgb = step()
     sharp, smooth = (
-        _disparity(AnisotropicDiffusion(depth_weight=0.0, edge=0.01)(sample), sample)
-        for sample in (_sample(disparity, rgb), _sample(disparity))
+        disparity_of(AnisotropicDiffusion(depth_weight=0.0, edge=0.01)(sample), sample)
+        for sample in (sample_of(disparity, rgb), sample_of(disparity))
     )
     assert (sharp - disparity).abs().max() < 0.05
     assert (smooth - disparity).abs().max() > 0.5
 
 
 def test_a_hole_is_filled_from_the_side_that_the_photo_shows_it_on() -> None:
-    disparity, rgb = _step(64, 32)
-    sample = _sample(disparity, rgb)
+    disparity, rgb = step(64, 32)
+    sample = sample_of(disparity, rgb)
     sample.depth_lr[:, 4:10, 5:8] = torch.nan
-    fine = _disparity(AnisotropicDiffusion(edge=0.01, depth_weight=0.0)(sample), sample)
+    fine = disparity_of(AnisotropicDiffusion(edge=0.01, depth_weight=0.0)(sample), sample)
     assert (fine - disparity).abs().max() < 0.1
     known = sample.mask_lr[0].numpy()
     np.testing.assert_allclose(_means(fine, 4)[known], _coarse(sample)[known], rtol=1e-9)
 
 
 def test_a_single_known_pixel_fills_the_map() -> None:
-    sample = _sample(torch.full((8, 8), 5.0).double())
+    sample = sample_of(torch.full((8, 8), 5.0).double())
     sample.depth_lr[:, 1:] = torch.nan
     sample.depth_lr[:, :, 1:] = torch.nan
-    fine = _disparity(AnisotropicDiffusion()(sample), sample)
+    fine = disparity_of(AnisotropicDiffusion()(sample), sample)
     np.testing.assert_allclose(fine.numpy(), 5.0, rtol=1e-6)
 
 
 def test_it_stops_where_the_map_moves_no_longer_and_more_steps_change_little() -> None:
-    sample = _sample(*_random(32, 48))
+    sample = sample_of(*random_scene(32, 48))
     coarse, rgb = torch.from_numpy(_coarse(sample))[None, None], sample.rgb[None]
     early = AnisotropicDiffusion(edge=0.3, depth_weight=0.0).diffused(rgb, coarse, 4)
     late = AnisotropicDiffusion(edge=0.3, depth_weight=0.0, tolerance=0.0, steps=3000).diffused(rgb, coarse, 4)
@@ -150,7 +120,7 @@ def test_it_stops_where_the_map_moves_no_longer_and_more_steps_change_little() -
 
 
 def test_a_batch_is_what_its_samples_are_one_at_a_time() -> None:
-    maps, photos = zip(*(_random(16, 24, seed) for seed in (1, 2)), strict=True)
+    maps, photos = zip(*(random_scene(16, 24, seed) for seed in (1, 2)), strict=True)
     coarse = torch.stack([torch.from_numpy(_means(each, 4)) for each in maps])[:, None]
     method = AnisotropicDiffusion(steps=100, tolerance=0.0)
     together = method.diffused(torch.stack(photos), coarse, 4).values
@@ -160,7 +130,7 @@ def test_a_batch_is_what_its_samples_are_one_at_a_time() -> None:
 
 
 def test_twice_the_same_is_the_same_and_the_truth_is_not_looked_at() -> None:
-    sample = _sample(*_random(16, 24))
+    sample = sample_of(*random_scene(16, 24))
     first = AnisotropicDiffusion(steps=100)(sample)
     assert sample.depth is not None
     sample.depth.fill_(torch.nan)
@@ -170,7 +140,7 @@ def test_twice_the_same_is_the_same_and_the_truth_is_not_looked_at() -> None:
 def test_progress_ends_at_the_most_steps_that_it_may_take() -> None:
     told: list[tuple[int, int]] = []
     AnisotropicDiffusion(steps=120, tolerance=0.0)(
-        _sample(*_random(8, 8)), lambda done, most: told.append((done, most))
+        sample_of(*random_scene(8, 8)), lambda done, most: told.append((done, most))
     )
     assert told == [(50, 120), (100, 120), (120, 120)]
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from small_scenes import maps, photos, plane_map
 from torch import Tensor
 from torch.nn import functional
 
@@ -30,19 +31,6 @@ def _stage(*, filters: int = 5, size: int = 5) -> Stage:
     if not isinstance(stage, Stage):
         raise TypeError
     return stage
-
-
-def _photo(height: int, width: int, count: int = 1) -> Tensor:
-    return torch.rand((count, 3, height, width), generator=torch.Generator().manual_seed(1))
-
-
-def _map(height: int, width: int, count: int = 1) -> Tensor:
-    return 20 + 9 * torch.rand((count, 1, height, width), generator=torch.Generator().manual_seed(2)).double()
-
-
-def _plane(height: int, width: int, along_u: float = 0.3, along_v: float = -0.2) -> Tensor:
-    v, u = torch.meshgrid(torch.arange(height).double(), torch.arange(width).double(), indexing="ij")
-    return (30 + along_u * u + along_v * v)[None, None]
 
 
 @pytest.mark.parametrize("size", [3, 4, 7])
@@ -74,9 +62,9 @@ def test_the_influences_gradients_agree_with_differences() -> None:
 
 
 def test_a_stage_is_a_step_towards_the_coarse_map_and_one_down_the_gradient_of_its_energy() -> None:
-    stage, rgb = _stage(), _photo(16, 20, 2).double()
-    coarse = _map(4, 5, 2) / 30
-    x = repeated(coarse, 4) + 0.1 * _map(16, 20, 2)
+    stage, rgb = _stage(), photos(16, 20, 2).double()
+    coarse = maps(4, 5, 2) / 30
+    x = repeated(coarse, 4) + 0.1 * maps(16, 20, 2)
     y = (x - stage.fidelity * upsampled(box_mean(x, 4) - coarse, 4)).requires_grad_()
     (gradient,) = torch.autograd.grad(stage.energy(y, rgb).sum(), y)
     assert float(gradient.abs().max()) > 1e-2
@@ -84,9 +72,9 @@ def test_a_stage_is_a_step_towards_the_coarse_map_and_one_down_the_gradient_of_i
 
 
 def test_a_stage_is_what_plain_loops_give() -> None:
-    stage, rgb = _stage(filters=3), _photo(16, 16).double()
-    coarse = _map(4, 4) / 30
-    x = repeated(coarse, 4) + 0.1 * _map(16, 16)
+    stage, rgb = _stage(filters=3), photos(16, 16).double()
+    coarse = maps(4, 4) / 30
+    x = repeated(coarse, 4) + 0.1 * maps(16, 16)
     with torch.no_grad():
         result = stage(x, coarse, rgb)[0, 0].numpy()
         misfit = upsampled(box_mean(x, 4) - coarse, 4)[0, 0].numpy()
@@ -108,7 +96,7 @@ def test_a_stage_is_what_plain_loops_give() -> None:
 
 def test_gradients_reach_every_parameter_and_agree_with_differences() -> None:
     net = _net(2, filters=2, size=3).double().requires_grad_()
-    rgb, coarse = _photo(8, 6).double(), _map(4, 3) / 30
+    rgb, coarse = photos(8, 6).double(), maps(4, 3) / 30
     names, parameters = zip(*net.named_parameters(), strict=True)
 
     def answer(*values: Tensor) -> Tensor:
@@ -122,20 +110,20 @@ def test_gradients_reach_every_parameter_and_agree_with_differences() -> None:
 
 @pytest.mark.parametrize("scale", SCALES)
 def test_a_plane_is_reproduced_whatever_weights_and_photo_are(scale: int) -> None:
-    fine = _plane(5 * scale, 6 * scale)
-    net, rgb, coarse = _net(scale), _photo(5 * scale, 6 * scale), functional.avg_pool2d(fine, scale)
+    fine = plane_map(5 * scale, 6 * scale)
+    net, rgb, coarse = _net(scale), photos(5 * scale, 6 * scale), functional.avg_pool2d(fine, scale)
     torch.testing.assert_close(net.upsample(rgb, coarse), fine, rtol=0, atol=1e-5 * float(fine.max() - fine.min()))
     torch.testing.assert_close(net.double().upsample(rgb, coarse), fine, rtol=0, atol=1e-12 * 30 * scale)
 
 
 def test_weights_of_half_precision_keep_planes() -> None:
-    fine = _plane(24, 28)
-    result = _net().bfloat16().upsample(_photo(24, 28), functional.avg_pool2d(fine, 4))
+    fine = plane_map(24, 28)
+    result = _net().bfloat16().upsample(photos(24, 28), functional.avg_pool2d(fine, 4))
     torch.testing.assert_close(result, fine, rtol=0, atol=1e-4)
 
 
 def test_training_in_mixed_precision_computes_in_float32() -> None:
-    net, rgb, coarse = _net(), _photo(24, 28), _map(6, 7)
+    net, rgb, coarse = _net(), photos(24, 28), maps(6, 7)
     with torch.autocast("cpu", torch.bfloat16):
         mixed = net.upsample(rgb, coarse)
     torch.testing.assert_close(mixed, net.upsample(rgb, coarse), rtol=0, atol=0)
@@ -146,7 +134,7 @@ def test_an_output_depends_on_no_coarse_pixel_beyond_the_reach_and_on_one_within
     net = _net(scale, stages=1)
     count = 2 * net.reach + 3
     values = torch.rand(1, 1, 1, count, generator=torch.Generator().manual_seed(4)).expand(-1, -1, 8, -1).clone()
-    rgb, middle = _photo(8 * scale, count * scale), count // 2
+    rgb, middle = photos(8 * scale, count * scale), count // 2
 
     def answer(at: int) -> Tensor:
         changed = values.clone()

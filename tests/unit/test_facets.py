@@ -6,6 +6,7 @@ import copy
 
 import pytest
 import torch
+from small_scenes import maps, photos, plane_map
 from torch import Tensor
 from torch.nn import functional
 
@@ -24,34 +25,21 @@ def _net(scale: int = 4, *, noise: float = 0.1, facets: int = 2) -> Facets:
     return net
 
 
-def _photo(height: int, width: int, count: int = 1) -> Tensor:
-    return torch.rand((count, 3, height, width), generator=torch.Generator().manual_seed(1))
-
-
-def _map(height: int, width: int, count: int = 1) -> Tensor:
-    return 20 + 9 * torch.rand((count, 1, height, width), generator=torch.Generator().manual_seed(2)).double()
-
-
-def _plane(height: int, width: int, along_u: float = 0.3, along_v: float = -0.2) -> Tensor:
-    v, u = torch.meshgrid(torch.arange(height).double(), torch.arange(width).double(), indexing="ij")
-    return (30 + along_u * u + along_v * v)[None, None]
-
-
 @pytest.mark.parametrize("scale", SCALES)
 def test_a_plane_is_reproduced_exactly_whatever_weights_and_photo_are(scale: int) -> None:
-    fine = _plane(6 * scale, 7 * scale)
+    fine = plane_map(6 * scale, 7 * scale)
     coarse = functional.avg_pool2d(fine, scale)
-    result = _net(scale).upsample(_photo(6 * scale, 7 * scale), coarse)
+    result = _net(scale).upsample(photos(6 * scale, 7 * scale), coarse)
     torch.testing.assert_close(result, fine, rtol=0, atol=1e-11)
 
 
 def test_before_training_the_mixture_is_the_splines_blend_of_central_differences_planes() -> None:
     """A plain loop over fine pixels, with every output of the network's three heads at 0."""
-    net, coarse = _net(noise=0), _map(4, 5)
+    net, coarse = _net(noise=0), maps(4, 5)
     for head in (net.planes, net.choice):
         torch.nn.init.zeros_(head.weight)
         torch.nn.init.zeros_(head.bias)
-    result = net.upsample(_photo(16, 20), coarse)[0, 0]
+    result = net.upsample(photos(16, 20), coarse)[0, 0]
     values = coarse[0, 0]
     first = torch.tensor([0.0, 2.0, 0.0]).softmax(0).double()
 
@@ -93,7 +81,7 @@ def test_without_slopes_values_stay_within_those_around() -> None:
     with torch.no_grad():
         for parameter in (net.planes.weight, net.planes.bias):
             parameter.zero_()
-        fine = net.upsample(_photo(24, 24), coarse)
+        fine = net.upsample(photos(24, 24), coarse)
     assert 0 <= float(fine.min()) < 1e-12
     assert 1 - 1e-12 < float(fine.max()) <= 1 + 1e-12
 
@@ -117,7 +105,7 @@ def test_holes_are_filled_from_outside_in_by_the_mean_of_the_known_around() -> N
 
 
 def test_the_bend_is_zero_on_planes_and_the_step_beside_an_edge() -> None:
-    assert float(stencil(_plane(8, 9)).bend.max()) < 1e-12
+    assert float(stencil(plane_map(8, 9)).bend.max()) < 1e-12
     step = torch.zeros(1, 1, 9, 12)
     step[..., 6:] = 2.0
     bend = stencil(step).bend[0, 0, 4]
@@ -126,7 +114,7 @@ def test_the_bend_is_zero_on_planes_and_the_step_beside_an_edge() -> None:
 
 def test_gradients_reach_every_parameter_and_agree_with_differences() -> None:
     net = _net(2, facets=1).double().requires_grad_()
-    rgb, coarse = _photo(8, 6).double(), _map(4, 3)
+    rgb, coarse = photos(8, 6).double(), maps(4, 3)
     net.upsample(rgb, coarse).square().mean().backward()
     assert all(parameter.grad is not None and bool((parameter.grad != 0).any()) for parameter in net.parameters())
     bias = net.choice.bias
@@ -160,6 +148,6 @@ def test_it_learns_an_edge_that_the_photo_shows() -> None:
 @pytest.mark.parametrize("precision", [torch.float32, torch.bfloat16])
 def test_weights_of_half_precision_keep_planes_exact(precision: torch.dtype) -> None:
     net = _net().to(precision)
-    fine = _plane(24, 28)
-    result = net.upsample(_photo(24, 28), functional.avg_pool2d(fine, 4))
+    fine = plane_map(24, 28)
+    result = net.upsample(photos(24, 28), functional.avg_pool2d(fine, 4))
     torch.testing.assert_close(result, fine, rtol=0, atol=1e-11)

@@ -7,7 +7,7 @@ from types import MappingProxyType
 
 import pytest
 import torch
-from torch import Tensor
+from small_scenes import maps, photos
 
 from dsr.methods.dynamic_guidance import DynamicGuidance
 from dsr.methods.facets import Facets
@@ -42,21 +42,13 @@ def net(build: Callable[..., WindowedNetwork]) -> WindowedNetwork:
     return build()
 
 
-def _photo(height: int, width: int, count: int = 1) -> Tensor:
-    return torch.rand((count, 3, height, width), generator=torch.Generator().manual_seed(1))
-
-
-def _map(height: int, width: int, count: int = 1) -> Tensor:
-    return 20 + 9 * torch.rand((count, 1, height, width), generator=torch.Generator().manual_seed(2)).double()
-
-
 def test_a_factor_and_a_constant_on_the_disparity_come_out_again(net: WindowedNetwork) -> None:
-    rgb, coarse = _photo(24, 28), _map(6, 7)
+    rgb, coarse = photos(24, 28), maps(6, 7)
     torch.testing.assert_close(net.upsample(rgb, 3 * coarse + 7), 3 * net.upsample(rgb, coarse) + 7, rtol=1e-6, atol=0)
 
 
 def test_bounds_normalise_as_those_of_the_image_that_the_window_is_cut_from(net: WindowedNetwork) -> None:
-    rgb, coarse = _photo(24, 28), _map(6, 7)
+    rgb, coarse = photos(24, 28), maps(6, 7)
     own = torch.tensor([coarse.min(), coarse.max()]).view(1, 2, 1, 1)
     torch.testing.assert_close(net.upsample(rgb, coarse, own), net.upsample(rgb, coarse), rtol=1e-6, atol=0)
     wide = torch.tensor([0.0, 100.0]).view(1, 2, 1, 1)
@@ -64,18 +56,18 @@ def test_bounds_normalise_as_those_of_the_image_that_the_window_is_cut_from(net:
 
 
 def test_a_constant_map_stays_constant(net: WindowedNetwork) -> None:
-    result = net.upsample(_photo(24, 28), torch.full((1, 1, 6, 7), 5.0))
+    result = net.upsample(photos(24, 28), torch.full((1, 1, 6, 7), 5.0))
     torch.testing.assert_close(result, torch.full((1, 1, 24, 28), 5.0), rtol=1e-6, atol=0)
 
 
 def test_the_photo_has_a_say(net: WindowedNetwork) -> None:
-    coarse = _map(6, 7)
-    one, other = (net.upsample(photo, coarse) for photo in (_photo(24, 28), 1 - _photo(24, 28).square()))
+    coarse = maps(6, 7)
+    one, other = (net.upsample(photo, coarse) for photo in (photos(24, 28), 1 - photos(24, 28).square()))
     assert not torch.allclose(one, other, rtol=1e-4)
 
 
 def test_each_image_of_a_batch_is_treated_alone_and_every_time_alike(net: WindowedNetwork) -> None:
-    rgb, coarse = _photo(24, 28, 3), _map(6, 7, 3)
+    rgb, coarse = photos(24, 28, 3), maps(6, 7, 3)
     together = net.upsample(rgb, coarse)
     alone = torch.cat([net.upsample(rgb[i : i + 1], coarse[i : i + 1]) for i in range(3)])
     torch.testing.assert_close(together, alone, rtol=0, atol=1e-3)
@@ -85,7 +77,7 @@ def test_each_image_of_a_batch_is_treated_alone_and_every_time_alike(net: Window
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("size", [(1, 1), (1, 5), (2, 2), (3, 7)])
 def test_maps_of_any_size_pass_in_their_dtype(net: WindowedNetwork, size: tuple[int, int], dtype: torch.dtype) -> None:
-    result = net.upsample(_photo(4 * size[0], 4 * size[1]), _map(*size).to(dtype))
+    result = net.upsample(photos(4 * size[0], 4 * size[1]), maps(*size).to(dtype))
     assert result.shape == (1, 1, 4 * size[0], 4 * size[1])
     assert result.dtype == dtype
     assert bool(result.isfinite().all())
@@ -93,7 +85,7 @@ def test_maps_of_any_size_pass_in_their_dtype(net: WindowedNetwork, size: tuple[
 
 def test_a_hole_is_filled_from_around_and_reaches_no_farther_than_the_network(net: WindowedNetwork) -> None:
     columns = 2 * net.reach + 6
-    rgb, coarse = _photo(32, 4 * columns), _map(8, columns)
+    rgb, coarse = photos(32, 4 * columns), maps(8, columns)
     coarse[..., 0, 0], coarse[..., 0, 1] = 20, 29  # the range, which normalises
     pierced = coarse.clone()
     pierced[..., 3, 2] = torch.nan
@@ -105,25 +97,25 @@ def test_a_hole_is_filled_from_around_and_reaches_no_farther_than_the_network(ne
 
 
 def test_an_image_without_a_known_pixel_becomes_nan(net: WindowedNetwork) -> None:
-    assert bool(net.upsample(_photo(24, 28), torch.full((1, 1, 6, 7), torch.nan)).isnan().all())
+    assert bool(net.upsample(photos(24, 28), torch.full((1, 1, 6, 7), torch.nan)).isnan().all())
 
 
 @pytest.mark.parametrize("scale", [2, 8])
 def test_tiles_agree_with_the_answer_in_one_piece(build: Callable[..., WindowedNetwork], scale: int) -> None:
     net = build(scale)
     rows, columns = net.reach + 9, 2 * net.reach + 10
-    rgb, coarse = _photo(scale * rows, scale * columns), _map(rows, columns)
+    rgb, coarse = photos(scale * rows, scale * columns), maps(rows, columns)
     tiled = NetworkUpsampler(net, tile=4 * scale).fine_disparity(rgb, coarse)
     torch.testing.assert_close(tiled, NetworkUpsampler(net).fine_disparity(rgb, coarse), rtol=1e-6, atol=0)
 
 
 def test_a_photo_of_another_size_is_refused(net: WindowedNetwork) -> None:
     with pytest.raises(ValueError, match=r"^rgb: expected \(24, 28\) pixels for a coarse map of \(6, 7\) at scale 4"):
-        net.upsample(_photo(24, 24), _map(6, 7))
+        net.upsample(photos(24, 24), maps(6, 7))
 
 
 def test_arguments_rebuild_the_network(net: WindowedNetwork) -> None:
     again = type(net)(**net.arguments())
     again.load_state_dict(net.state_dict())
-    rgb, coarse = _photo(16, 12), _map(4, 3)
+    rgb, coarse = photos(16, 12), maps(4, 3)
     assert torch.equal(again.upsample(rgb, coarse), net.upsample(rgb, coarse))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from small_scenes import plane_map
 from torch import Tensor
 from torch.nn import functional
 
@@ -23,11 +24,6 @@ def _problem(size: int, window: int, count: int = 1) -> tuple[Tensor, Tensor]:
     first = _random(count, 1, size + 2 * r, size + 4 * r, seed=1) * 0.02
     first[..., size // 2 :] += 0.5
     return first, (_random(count, n, size, size, seed=2) + 0.01) / n
-
-
-def _plane(height: int, width: int, along_u: float = 0.3, along_v: float = -0.2) -> Tensor:
-    v, u = torch.meshgrid(torch.arange(height).double(), torch.arange(width).double(), indexing="ij")
-    return (30 + along_u * u + along_v * v)[None, None]
 
 
 def _net(scale: int = 4, *, noise: float = 0.05, window: int = 3, **arguments: int) -> PrimalDualNetwork:
@@ -160,14 +156,14 @@ def test_gradients_with_respect_to_maps_weights_and_parameters_are_right() -> No
 def test_before_training_a_plane_is_reproduced_up_to_the_border(scale: int) -> None:
     torch.manual_seed(0)
     net = PrimalDualNetwork(scale, width=6, layers=3).requires_grad_(False)
-    fine = _plane(6 * scale, 7 * scale, 0.1, -0.07)
+    fine = plane_map(6 * scale, 7 * scale, 0.1, -0.07)
     scene = torch.tensor([20.0, 60.0]).view(1, 2, 1, 1)  # the plane is part of it
     result = net.upsample(_photo(6 * scale, 7 * scale), functional.avg_pool2d(fine, scale), scene)
     torch.testing.assert_close(result, fine, rtol=0, atol=1e-6)
 
 
 def test_a_plane_stays_one_whatever_the_weights_are_where_it_is_not_too_steep_for_epsilon() -> None:
-    net, fine = _net(noise=0.3), _plane(80, 84)
+    net, fine = _net(noise=0.3), plane_map(80, 84)
     with torch.no_grad():
         net.stage.log_huber.fill_(3.0)  # e^3 times weights of about 1/4 is far above the slopes
         net.head.weight[1:] *= 0.1

@@ -7,47 +7,16 @@ import pytest
 import torch
 from scipy import sparse
 from scipy.sparse.linalg import splu
+from small_scenes import disparity_of, plane, random_scene, sample_of, step
 from torch import Tensor
 
-from dsr.degrade import Downsampling, make_sample
-from dsr.geometry.camera import Camera, from_range, to_range
+from dsr.geometry.camera import to_range
 from dsr.methods.differences import divergence, extended, gradient, touching, upsampled
 from dsr.methods.tgv import Tensors, TotalGeneralisedVariation
-from dsr.sample import DepthSample, Scene
-
-
-def _sample(disparity: Tensor, rgb: Tensor | None = None, scale: int = 4) -> DepthSample:
-    """Return the problem of a scene with these disparities, (H, W)."""
-    height, width = disparity.shape
-    camera = Camera(width, height, 60.0, 55.0, 0.45 * width, 0.55 * height)
-    rgb = torch.zeros(3, height, width) if rgb is None else rgb
-    scene = Scene("set", "hall", rgb, camera, from_range(disparity[None], camera, "disparity"))
-    return make_sample(scene, scale, Downsampling("box"), "disparity")
-
-
-def _plane(height: int = 32, width: int = 48) -> Tensor:
-    v, u = torch.meshgrid(torch.arange(height).double(), torch.arange(width).double(), indexing="ij")
-    return 6 + 0.05 * u - 0.03 * v
-
-
-def _step(size: int = 32, column: int = 14) -> tuple[Tensor, Tensor]:
-    """Return disparities with a step in the midst of a block, and a photo with an edge there."""
-    near = torch.arange(size) >= column
-    return torch.where(near, 8.0, 4.0).double().expand(size, size), near.float().expand(3, size, size)
-
-
-def _random(height: int, width: int, seed: int = 0) -> tuple[Tensor, Tensor]:
-    rng = np.random.default_rng(seed)
-    rgb = torch.from_numpy(rng.uniform(0, 1, (3, height, width))).float()
-    return torch.from_numpy(rng.uniform(3, 9, (height, width))), rgb
 
 
 def _normals(*shape: int, seed: int = 0) -> Tensor:
     return torch.from_numpy(np.random.default_rng(seed).normal(size=shape))
-
-
-def _disparity(depth: Tensor, sample: DepthSample) -> Tensor:
-    return to_range(depth, sample.camera, "disparity")[0]
 
 
 def _means(x: Tensor, scale: int) -> np.ndarray:
@@ -78,14 +47,14 @@ def test_what_touches_a_pixel_is_the_sum_of_the_gradients_absolute_column() -> N
 
 @pytest.mark.parametrize("scale", [2, 4, 8])
 def test_upsampling_and_extending_reproduce_a_plane_up_to_the_border(scale: int) -> None:
-    plane = _plane()
-    coarse = torch.from_numpy(_means(plane, scale))[None, None]
-    torch.testing.assert_close(upsampled(coarse, scale)[0, 0], plane)
-    torch.testing.assert_close(extended(plane[None, None, 3:-3, 3:-3], 3)[0, 0], plane)
+    flat = plane()
+    coarse = torch.from_numpy(_means(flat, scale))[None, None]
+    torch.testing.assert_close(upsampled(coarse, scale)[0, 0], flat)
+    torch.testing.assert_close(extended(flat[None, None, 3:-3, 3:-3], 3)[0, 0], flat)
 
 
 def test_the_tensor_shrinks_across_an_edge_and_leaves_what_runs_along_it() -> None:
-    _, rgb = _step(16, 8)
+    _, rgb = step(16, 8)
     g = TotalGeneralisedVariation(sharpness=9.0, exponent=0.85).tensors(rgb[None].double())
     assert float(g.uu[0, 0, 5, 7]) == pytest.approx(np.exp(-9.0), abs=1e-6)
     assert torch.equal(g.vv, torch.ones_like(g.vv))
@@ -94,7 +63,7 @@ def test_the_tensor_shrinks_across_an_edge_and_leaves_what_runs_along_it() -> No
 
 
 def test_the_tensors_root_has_the_eigenvalues_of_the_paper() -> None:
-    _, rgb = _random(6, 7)
+    _, rgb = random_scene(6, 7)
     g = TotalGeneralisedVariation(sharpness=3.0, exponent=0.5).tensors(rgb[None].double())
     matrices = torch.stack((g.uu, g.uv, g.uv, g.vv), dim=-1).reshape(-1, 2, 2)
     grey = (rgb.double() * torch.tensor([0.299, 0.587, 0.114]).double()[:, None, None]).sum(dim=0)
@@ -173,26 +142,26 @@ def _shrunk(y: np.ndarray, by: float) -> np.ndarray:
 
 @pytest.mark.parametrize("scale", [2, 4, 8])
 def test_a_plane_is_reproduced_exactly(scale: int) -> None:
-    disparity = _plane()
-    sample = _sample(disparity, _random(32, 48)[1], scale)
+    disparity = plane()
+    sample = sample_of(disparity, random_scene(32, 48)[1], scale)
     fine = TotalGeneralisedVariation(iterations=300)(sample)
     assert fine.shape == (1, 32, 48)
-    torch.testing.assert_close(_disparity(fine, sample), disparity, rtol=0, atol=1e-9)
+    torch.testing.assert_close(disparity_of(fine, sample), disparity, rtol=0, atol=1e-9)
 
 
 def test_a_hole_in_a_plane_is_filled_with_the_plane() -> None:
-    disparity = _plane()
-    sample = _sample(disparity)
+    disparity = plane()
+    sample = sample_of(disparity)
     sample.depth_lr[:, 2:5, 4:7] = torch.nan
-    fine = _disparity(TotalGeneralisedVariation(iterations=2000, tolerance=1e-8)(sample), sample)
+    fine = disparity_of(TotalGeneralisedVariation(iterations=2000, tolerance=1e-8)(sample), sample)
     assert (fine - disparity).abs().max() < 1e-3 * (disparity.max() - disparity.min())
 
 
 def test_a_step_stays_sharp_along_an_edge_of_the_photo_and_is_smoother_without_one() -> None:
-    disparity, rgb = _step()
+    disparity, rgb = step()
     sharp, smooth = (
-        _disparity(TotalGeneralisedVariation(iterations=600)(sample), sample)
-        for sample in (_sample(disparity, rgb), _sample(disparity))
+        disparity_of(TotalGeneralisedVariation(iterations=600)(sample), sample)
+        for sample in (sample_of(disparity, rgb), sample_of(disparity))
     )
     assert (sharp - disparity).abs().max() < 0.05
     assert (smooth - disparity).abs().max() > 0.5
@@ -200,24 +169,24 @@ def test_a_step_stays_sharp_along_an_edge_of_the_photo_and_is_smoother_without_o
 
 @pytest.mark.parametrize(("scale", "size"), [(2, (10, 6)), (8, (8, 24)), (16, (16, 16))])
 def test_without_a_data_weight_block_means_are_the_input(scale: int, size: tuple[int, int]) -> None:
-    sample = _sample(*_random(*size), scale=scale)
-    fine = _disparity(TotalGeneralisedVariation(iterations=60)(sample), sample)
+    sample = sample_of(*random_scene(*size), scale=scale)
+    fine = disparity_of(TotalGeneralisedVariation(iterations=60)(sample), sample)
     coarse = to_range(sample.depth_lr, sample.camera_lr, "disparity")[0].numpy() * scale
     np.testing.assert_allclose(_means(fine, scale), coarse, rtol=1e-9)
 
 
 def test_a_small_data_weight_smooths_a_noisy_plane() -> None:
-    noisy = _plane() + 0.1 * _normals(32, 48)
-    sample = _sample(noisy, scale=2)
+    noisy = plane() + 0.1 * _normals(32, 48)
+    sample = sample_of(noisy, scale=2)
     errors = [
-        float((_disparity(TotalGeneralisedVariation(data_weight=weight)(sample), sample) - _plane()).square().mean())
+        float((disparity_of(TotalGeneralisedVariation(data_weight=weight)(sample), sample) - plane()).square().mean())
         for weight in (None, 2.0)
     ]
     assert errors[1] < 0.5 * errors[0]
 
 
 def test_twice_the_same_is_the_same_and_the_truth_is_not_looked_at() -> None:
-    sample = _sample(*_random(16, 24))
+    sample = sample_of(*random_scene(16, 24))
     first = TotalGeneralisedVariation(iterations=100)(sample)
     assert sample.depth is not None
     sample.depth.fill_(torch.nan)
@@ -234,17 +203,17 @@ def test_a_batch_is_what_its_samples_are_one_at_a_time() -> None:
 
 
 def test_a_flat_map_with_a_single_known_pixel_is_filled() -> None:
-    sample = _sample(torch.full((8, 8), 5.0).double())
+    sample = sample_of(torch.full((8, 8), 5.0).double())
     sample.depth_lr[:, 1:] = torch.nan
     sample.depth_lr[:, :, 1:] = torch.nan
-    fine = _disparity(TotalGeneralisedVariation(iterations=60)(sample), sample)
+    fine = disparity_of(TotalGeneralisedVariation(iterations=60)(sample), sample)
     np.testing.assert_allclose(fine.numpy(), 5.0, rtol=1e-9)
 
 
 def test_it_stops_where_the_map_moves_no_longer_and_tells_its_progress() -> None:
     told: list[tuple[int, int]] = []
-    plane = _sample(_plane())
-    TotalGeneralisedVariation(iterations=5000)(plane, lambda done, most: told.append((done, most)))
+    sample = sample_of(plane())
+    TotalGeneralisedVariation(iterations=5000)(sample, lambda done, most: told.append((done, most)))
     assert told == [(50, 5000), (5000, 5000)]
     coarse, photo = _normals(1, 1, 4, 6).sigmoid(), _normals(1, 3, 16, 24, seed=1).sigmoid()
     found = TotalGeneralisedVariation(iterations=5000, tolerance=2e-3).minimised(photo, coarse, 4)

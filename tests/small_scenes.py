@@ -1,0 +1,60 @@
+"""Small scenes and maps of closed form, for the tests of many methods."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from dsr.degrade import Downsampling, make_sample
+from dsr.geometry.camera import Camera, from_range, to_range
+from dsr.sample import DepthSample, Scene
+
+
+def sample_of(disparity: Tensor, rgb: Tensor | None = None, scale: int = 4, doffs: float = 0.0) -> DepthSample:
+    """Return the problem of a scene with these disparities, (H, W)."""
+    height, width = disparity.shape
+    camera = Camera(width, height, 60.0, 55.0, 0.45 * width, 0.55 * height, doffs=doffs)
+    rgb = torch.zeros(3, height, width) if rgb is None else rgb
+    scene = Scene("set", "hall", rgb, camera, from_range(disparity[None], camera, "disparity"))
+    return make_sample(scene, scale, Downsampling("box"), "disparity")
+
+
+def plane(height: int = 32, width: int = 48) -> Tensor:
+    """Return disparities of a plane, (H, W)."""
+    v, u = torch.meshgrid(torch.arange(height).double(), torch.arange(width).double(), indexing="ij")
+    return 6 + 0.05 * u - 0.03 * v
+
+
+def step(size: int = 32, column: int = 14) -> tuple[Tensor, Tensor]:
+    """Return disparities with a step in the midst of a block, and a photo with an edge there."""
+    near = torch.arange(size) >= column
+    return torch.where(near, 8.0, 4.0).double().expand(size, size), near.float().expand(3, size, size)
+
+
+def random_scene(height: int, width: int, seed: int = 0) -> tuple[Tensor, Tensor]:
+    """Return random disparities, (H, W), and a random photo."""
+    rng = np.random.default_rng(seed)
+    rgb = torch.from_numpy(rng.uniform(0, 1, (3, height, width))).float()
+    return torch.from_numpy(rng.uniform(3, 9, (height, width))), rgb
+
+
+def disparity_of(depth: Tensor, sample: DepthSample) -> Tensor:
+    """Return the disparities, (H, W), of a depth map, (1, H, W)."""
+    return to_range(depth, sample.camera, "disparity")[0]
+
+
+def photos(height: int, width: int, count: int = 1) -> Tensor:
+    """Return random photos, (B, 3, H, W)."""
+    return torch.rand((count, 3, height, width), generator=torch.Generator().manual_seed(1))
+
+
+def maps(height: int, width: int, count: int = 1) -> Tensor:
+    """Return random disparities, (B, 1, H, W)."""
+    return 20 + 9 * torch.rand((count, 1, height, width), generator=torch.Generator().manual_seed(2)).double()
+
+
+def plane_map(height: int, width: int, along_u: float = 0.3, along_v: float = -0.2) -> Tensor:
+    """Return disparities of a plane, (1, 1, H, W)."""
+    v, u = torch.meshgrid(torch.arange(height).double(), torch.arange(width).double(), indexing="ij")
+    return (30 + along_u * u + along_v * v)[None, None]
