@@ -16,11 +16,18 @@ def file_hash(path: Path) -> str:
 
 
 def hash_of_code(names: Iterable[str]) -> str:
-    """Return a hash of modules and packages, by their paths below the package."""
+    """Return a hash of modules and packages, by their paths below the package.
+
+    Raises:
+        FileNotFoundError: there is no such module or package.
+
+    """
     package = Path(dsr.__file__).parent
     digest = hashlib.sha256()
     for name in names:
         path = package / name
+        if not path.exists():
+            raise FileNotFoundError(f"{path}: no such module or package")
         for file in [path] if path.is_file() else sorted(path.rglob("*.py")):
             digest.update(file.relative_to(package).as_posix().encode() + b"\0" + file.read_bytes())
     return digest.hexdigest()

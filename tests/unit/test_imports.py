@@ -1,11 +1,10 @@
 """Imports run downward only; see the house's layers in the README."""
 
-import ast
 from pathlib import Path
 
 import pytest
+from module_graph import IMPORTS, MODULES, imports_of, within
 
-SOURCE = Path(__file__).resolve().parents[2] / "src"
 LAYERS = (
     ("dsr.atomic", "dsr.hashing", "dsr.terminal"),
     ("dsr.fetching",),
@@ -42,43 +41,6 @@ MORE_FORBIDDEN = {
     ),
 }
 ONLY_APP = ("hydra", "omegaconf")
-
-
-def name_of(path):
-    return ".".join(path.relative_to(SOURCE).with_suffix("").parts).removesuffix(".__init__")
-
-
-MODULES = {name_of(path): path for path in sorted((SOURCE / "dsr").rglob("*.py"))}
-
-
-def within(name, package):
-    return name == package or name.startswith(f"{package}.")
-
-
-def imports_of(text, module, *, package=False, known=()):
-    """Return the dotted names that a module's text imports, wherever in it: modules rather than what is in them."""
-    found = set()
-    for node in ast.walk(ast.parse(text)):
-        if isinstance(node, ast.Import):
-            found |= {alias.name for alias in node.names}
-        elif isinstance(node, ast.ImportFrom):
-            base = node.module or ""
-            if node.level:
-                home = module.split(".")
-                home = home[: len(home) - node.level + package]
-                base = ".".join([*home, base] if base else home)
-            deeper = {f"{base}.{alias.name}" for alias in node.names}
-            modules = {name for name in deeper if name in known}
-            found |= modules
-            if modules != deeper:
-                found.add(base)
-    return found
-
-
-IMPORTS = {
-    name: imports_of(path.read_text(encoding="utf-8"), name, package=path.name == "__init__.py", known=MODULES)
-    for name, path in MODULES.items()
-}
 
 
 def place_of(name):

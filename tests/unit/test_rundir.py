@@ -5,13 +5,14 @@ import json
 
 import pytest
 import torch
+from module_graph import IMPORTS, SOURCE, closure_of, modules_in, path_below_package
 from omegaconf import OmegaConf
 
 import dsr
 from dsr.app import rundir
-from dsr.app.rundir import claim, code_hash, default_directory, identity_of, versions
+from dsr.app.rundir import PREDICTING_CODE, claim, code_hash, default_directory, identity_of, versions
 from dsr.app.schema import ConfigError
-from dsr.hashing import file_hash
+from dsr.hashing import file_hash, hash_of_code
 
 CPU = torch.device("cpu")
 
@@ -78,11 +79,44 @@ def test_other_code_leads_to_another_directory(monkeypatch):
     assert directory(config()) != before
 
 
+PREDICTING_PACKAGES = ("dsr.methods", "dsr.prior", "dsr.data", "dsr.degrade", "dsr.noise", "dsr.holes", "dsr.training")
+"""Where what makes predictions lies: all that these import determines a prediction, too."""
+NOT_PREDICTING = ("__init__.py", "atomic.py", "hashing.py", "terminal.py", "store.py", "upsampling", "fetching")
+"""What they import and what does not determine one: files, texts, downloads; ``dsr.upsample`` is imported by name."""
+
+
+def lacking(modules, code=PREDICTING_CODE):
+    """Return the modules' paths that neither list names."""
+    paths = {path_below_package(name) for name in modules}
+    named = (*code, *NOT_PREDICTING)
+    return sorted(path for path in paths if not any(path == each or path.startswith(f"{each}/") for each in named))
+
+
+def test_every_module_that_determines_a_prediction_is_in_the_list_of_its_code():
+    assert lacking(closure_of(modules_in(*PREDICTING_PACKAGES))) == []
+
+
+def test_a_module_that_a_method_imports_and_the_list_lacks_is_found():
+    imports = {**IMPORTS, "dsr.methods.facets": IMPORTS["dsr.methods.facets"] | {"dsr.report.palette"}}
+    assert lacking(closure_of(["dsr.methods.facets"], imports)) == ["report/palette.py"]
+    without = [name for name in PREDICTING_CODE if name != "fitting.py"]
+    assert lacking(closure_of(["dsr.prior.method"]), without) == ["fitting.py"]
+
+
+def test_the_lists_of_code_name_nothing_that_is_not_there():
+    for name in (*PREDICTING_CODE, *NOT_PREDICTING):
+        assert (SOURCE / "dsr" / name).exists(), name
+    with pytest.raises(FileNotFoundError, match=r"nowhere\.py"):
+        hash_of_code(["nowhere.py"])
+
+
 def test_the_hash_of_the_code_follows_what_makes_predictions_and_nothing_else(monkeypatch, tmp_path):
-    for name in ("methods/a.py", "data/b.py", "geometry/c.py", "sample.py", "degrade.py", "report/d.py"):
+    names = ("methods/a.py", "data/b.py", "geometry/c.py", "sample.py", "degrade.py", "report/d.py")
+    for name in names:
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).write_text("x = 1\n")
     monkeypatch.setattr(dsr, "__file__", str(tmp_path / "__init__.py"))
+    monkeypatch.setattr(rundir, "PREDICTING_CODE", ("methods", "data", "geometry", "sample.py", "degrade.py"))
 
     def fresh():
         code_hash.cache_clear()

@@ -25,10 +25,11 @@ _PACKAGES = (
     "pandas", "scikit-image", "scipy", "torch", "torchmetrics",
 )  # fmt: skip
 _NOT_IDENTITY = ("output_dir", "overwrite", "metrics", "weights", "resume", "run")  # of the weights, the content counts
-_PREDICTING_CODE = (
-    "sample.py", "holes.py", "noise.py", "degrade.py", "geometry", "quality/functional.py", "quality/losses.py",
-    "methods", "data", "objective.py", "training.py", "prior",
+PREDICTING_CODE = (
+    "sample.py", "holes.py", "noise.py", "degrade.py", "geometry", "quality", "methods", "data", "objective.py",
+    "training.py", "fitting.py", "prior", "evaluation.py",
 )  # fmt: skip
+"""Modules and packages that determine a prediction, by their paths below the package."""
 
 
 def identity_of(config: Mapping[str, Any], weights_hash: str | None, device: torch.device) -> dict[str, Any]:
@@ -113,7 +114,7 @@ def versions() -> dict[str, Any]:
 @functools.cache
 def code_hash() -> str:
     """Return a hash of the code that makes predictions, so that those of older code are not taken for new ones."""
-    return hash_of_code(_PREDICTING_CODE)[:16]
+    return hash_of_code(PREDICTING_CODE)[:16]
 
 
 def _changes(before: Mapping[str, Any], now: Mapping[str, Any], prefix: str = "") -> list[str]:
