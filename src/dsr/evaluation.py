@@ -23,7 +23,6 @@ import pandas as pd
 import torch
 from torch import Tensor
 
-from dsr.atomic import read_arrays, replacing, write_text
 from dsr.data.base import SceneSource
 from dsr.degrade import Downsampling, Measured, make_sample
 from dsr.holes import Holes
@@ -32,7 +31,8 @@ from dsr.noise import Noise
 from dsr.quality.scores import WORST, Metric, score_image
 from dsr.sample import DepthSample
 from dsr.store import iterations_path, load_prediction, prediction_path, save_scene, scene_path
-from dsr.terminal import one_line
+from dsr.utils.console import one_line
+from dsr.utils.files import read_arrays, replacing, write_text
 
 SCORE_COLUMNS = (
     "dataset",

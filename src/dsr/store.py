@@ -16,9 +16,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dsr.atomic import read_arrays, replacing
 from dsr.geometry.camera import Camera
 from dsr.sample import DepthSample
+from dsr.utils.files import read_arrays, replacing
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from dsr.cli import study as command
 from dsr.report.results import load_results
 from dsr.study.build import Choice, build_study
 from dsr.study.key import read_key
-from dsr.terminal import open_console
+from dsr.utils.console import open_console
 
 LABELS = {"msg_v": "MSG-V", "bicubic": "Bicubic", "dip": "DIP"}
 SCENES = ("cube", "statue", "<img src=x onerror=alert(1)>")

@@ -6,7 +6,7 @@ import pytest
 from module_graph import IMPORTS, MODULES, imports_of, within
 
 LAYERS = (
-    ("dsr.atomic", "dsr.hashing", "dsr.terminal"),
+    ("dsr.utils.files", "dsr.utils.hashing", "dsr.utils.console"),
     ("dsr.fetching",),
     ("dsr.geometry.camera",),
     ("dsr.sample", "dsr.holes", "dsr.noise", "dsr.geometry.surface", "dsr.geometry.shading"),
@@ -18,7 +18,7 @@ LAYERS = (
     ("dsr.quality.metrics", "dsr.quality.losses"),
     ("dsr.data", "dsr.methods"),
     ("dsr.objective",),
-    ("dsr.fitting",),
+    ("dsr.utils.lightning",),
     ("dsr.evaluation", "dsr.training", "dsr.prior", "dsr.doctor"),
     ("dsr.upsampling",),
     ("dsr.report",),

@@ -12,7 +12,7 @@ import dsr
 from dsr.app import rundir
 from dsr.app.rundir import PREDICTING_CODE, claim, code_hash, default_directory, identity_of, versions
 from dsr.app.schema import ConfigError
-from dsr.hashing import file_hash, hash_of_code
+from dsr.utils.hashing import file_hash, hash_of_code
 
 CPU = torch.device("cpu")
 
@@ -81,7 +81,16 @@ def test_other_code_leads_to_another_directory(monkeypatch):
 
 PREDICTING_PACKAGES = ("dsr.methods", "dsr.prior", "dsr.data", "dsr.degrade", "dsr.noise", "dsr.holes", "dsr.training")
 """Where what makes predictions lies: all that these import determines a prediction, too."""
-NOT_PREDICTING = ("__init__.py", "atomic.py", "hashing.py", "terminal.py", "store.py", "upsampling", "fetching")
+NOT_PREDICTING = (
+    "__init__.py",
+    "utils/__init__.py",
+    "utils/files.py",
+    "utils/hashing.py",
+    "utils/console.py",
+    "store.py",
+    "upsampling",
+    "fetching",
+)
 """What they import and what does not determine one: files, texts, downloads; ``dsr.upsample`` is imported by name."""
 
 
@@ -99,8 +108,8 @@ def test_every_module_that_determines_a_prediction_is_in_the_list_of_its_code():
 def test_a_module_that_a_method_imports_and_the_list_lacks_is_found():
     imports = {**IMPORTS, "dsr.methods.facets": IMPORTS["dsr.methods.facets"] | {"dsr.report.palette"}}
     assert lacking(closure_of(["dsr.methods.facets"], imports)) == ["report/palette.py"]
-    without = [name for name in PREDICTING_CODE if name != "fitting.py"]
-    assert lacking(closure_of(["dsr.prior.method"]), without) == ["fitting.py"]
+    without = [name for name in PREDICTING_CODE if name != "utils/lightning.py"]
+    assert lacking(closure_of(["dsr.prior.method"]), without) == ["utils/lightning.py"]
 
 
 def test_the_lists_of_code_name_nothing_that_is_not_there():

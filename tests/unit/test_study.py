@@ -27,7 +27,7 @@ from dsr.study.display import tables_of
 from dsr.study.intervals import agreement, average_share, bootstrap_of_average, wilson
 from dsr.study.key import Candidate, Key, Trial, read_key, write_key
 from dsr.study.pictures import grey_png, shading_of
-from dsr.terminal import open_console
+from dsr.utils.console import open_console
 
 CANDIDATES = {
     "aa": Candidate("MSG-V", "msg_v", "runs/1"),

@@ -15,7 +15,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from dsr.app.schema import ConfigError, register
-from dsr.terminal import INTERRUPTED, USAGE_ERROR, print_error
+from dsr.utils.console import INTERRUPTED, USAGE_ERROR, print_error
 
 
 def run_command(conf: Path, name: str, command: Callable[[DictConfig], Any]) -> None:

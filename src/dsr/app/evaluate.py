@@ -25,7 +25,6 @@ from dsr.app.runs import studies_of_run
 from dsr.app.schema import ConfigError, EvalConfig, given_keys, plain_config
 from dsr.data.base import SceneSource
 from dsr.evaluation import Outcome, StalePredictionError, Study, predict, score
-from dsr.hashing import file_hash
 from dsr.methods.trained import packaged_names, packaged_weights
 from dsr.prior.method import WORKSPACE
 from dsr.quality.lpips import LPIPS
@@ -35,7 +34,8 @@ from dsr.report.dashboard import save_dashboard
 from dsr.report.pictures import save_picture
 from dsr.report.tables import score_table
 from dsr.sample import DepthSample
-from dsr.terminal import open_console, print_error, show
+from dsr.utils.console import open_console, print_error, show
+from dsr.utils.hashing import file_hash
 
 
 def evaluate(config: DictConfig) -> pd.DataFrame:

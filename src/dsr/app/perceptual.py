@@ -8,7 +8,7 @@ from pathlib import Path
 
 from dsr.app.schema import ConfigError
 from dsr.quality.lpips import LPIPS, TRUNK_URL, load_lpips
-from dsr.terminal import one_line
+from dsr.utils.console import one_line
 
 
 @functools.cache

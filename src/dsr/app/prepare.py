@@ -18,7 +18,7 @@ from dsr.app.schema import ConfigError, plain_config, register
 from dsr.data.base import SceneSource
 from dsr.report.sheets import save_contact_sheet
 from dsr.sample import Scene
-from dsr.terminal import one_line, show
+from dsr.utils.console import one_line, show
 
 
 def prepare_dataset(name: str, overrides: Sequence[str], console: Console) -> None:

@@ -12,8 +12,8 @@ from rich.console import Console
 from rich.progress import Progress
 
 from dsr.data.base import Prepared, SceneSource
-from dsr.fitting import scores_line
-from dsr.terminal import bar, show
+from dsr.utils.console import bar, show
+from dsr.utils.lightning import scores_line
 
 
 class Display:

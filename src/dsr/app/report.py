@@ -13,7 +13,6 @@ import pandas as pd
 from rich.console import Console
 
 from dsr.app.progress import Display
-from dsr.atomic import write_text
 from dsr.geometry.shading import LIGHT_NAMES
 from dsr.report.correlation_figure import save_scatter_matrix
 from dsr.report.correlations import write_correlations
@@ -22,7 +21,8 @@ from dsr.report.markup import write_tables
 from dsr.report.page import save_page
 from dsr.report.results import Results, load_results
 from dsr.report.user_study import read_study
-from dsr.terminal import show
+from dsr.utils.console import show
+from dsr.utils.files import write_text
 
 _MARK = "report.json"
 """What makes a directory one that a report may replace."""

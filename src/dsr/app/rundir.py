@@ -17,8 +17,8 @@ from omegaconf import OmegaConf
 
 import dsr
 from dsr.app.schema import ConfigError
-from dsr.atomic import write_text
-from dsr.hashing import hash_of_code
+from dsr.utils.files import write_text
+from dsr.utils.hashing import hash_of_code
 
 _PACKAGES = (
     "dsr", "hydra-core", "lightning", "numpy", "omegaconf", "opencv-python-headless",
@@ -27,7 +27,7 @@ _PACKAGES = (
 _NOT_IDENTITY = ("output_dir", "overwrite", "metrics", "weights", "resume", "run")  # of the weights, the content counts
 PREDICTING_CODE = (
     "sample.py", "holes.py", "noise.py", "degrade.py", "geometry", "quality", "methods", "data", "objective.py",
-    "training.py", "fitting.py", "prior", "evaluation.py",
+    "training.py", "utils/lightning.py", "prior", "evaluation.py",
 )  # fmt: skip
 """Modules and packages that determine a prediction, by their paths below the package."""
 

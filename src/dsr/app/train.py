@@ -21,16 +21,16 @@ from dsr.app.progress import Display, prepare
 from dsr.app.runs import WEIGHTS, common, read_config, training_data
 from dsr.app.schema import ConfigError, TrainConfig, given_keys, plain_config
 from dsr.app.trainer import make_trainer, seconds_per_step
-from dsr.atomic import replacing
 from dsr.data.patches import PatchData
-from dsr.fitting import duration, fit
 from dsr.methods.network import DisparityNetwork
 from dsr.methods.trained import NETWORKS
 from dsr.methods.weights import load_network, save_network
 from dsr.objective import Objective, balanced_weight
 from dsr.quality.metrics import visual_metrics
-from dsr.terminal import show
 from dsr.training import Schedule, SuperResolution
+from dsr.utils.console import show
+from dsr.utils.files import replacing
+from dsr.utils.lightning import duration, fit
 
 _PATCHES_FOR_W = 64
 _LARGEST_SEED = 2**32 - 1

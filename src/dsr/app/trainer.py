@@ -15,8 +15,8 @@ from rich.console import Console
 from dsr.app.progress import TrainingBar
 from dsr.app.schema import TrainerConfig
 from dsr.data.problem import Batch
-from dsr.fitting import Interruption, LastValidation, Log, ValidationTable, without_chatter
 from dsr.training import SuperResolution
+from dsr.utils.lightning import Interruption, LastValidation, Log, ValidationTable, without_chatter
 
 MONITOR = "val/RMSE_v"
 VALIDATION = "validation.csv"

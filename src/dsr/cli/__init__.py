@@ -9,7 +9,7 @@ from rich.console import Console
 
 from dsr.cli import data, doctor, report, study, upsample
 from dsr.fetching.catalogue import CATALOGUE, Collection
-from dsr.terminal import INTERRUPTED, USAGE_ERROR, one_line, open_console, print_error, show
+from dsr.utils.console import INTERRUPTED, USAGE_ERROR, one_line, open_console, print_error, show
 
 _EXAMPLES = """\
 examples:

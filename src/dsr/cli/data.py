@@ -17,7 +17,7 @@ from dsr.fetching.download import megabytes
 from dsr.fetching.fetch import Options, get
 from dsr.fetching.inventory import absent, state, verify
 from dsr.fetching.place import data_root
-from dsr.terminal import show
+from dsr.utils.console import show
 
 _EXAMPLES = """\
 examples:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 
-from dsr.terminal import show
+from dsr.utils.console import show
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -110,10 +110,10 @@ def _watched(questions: Sequence[Question], console: Console) -> Iterator[Questi
 
 def _collect(options: argparse.Namespace, console: Console, _: object) -> list[str]:
     """Read answers, print and write the table."""
-    from dsr.atomic import write_text  # noqa: PLC0415 - pandas takes a second to import
     from dsr.study.answers import files_of, read_all  # noqa: PLC0415
     from dsr.study.collect import collect, remarks  # noqa: PLC0415
     from dsr.study.key import KEY_NAME, read_key  # noqa: PLC0415
+    from dsr.utils.files import write_text  # noqa: PLC0415 - pandas takes a second to import
 
     key = read_key(options.study / KEY_NAME)
     files = files_of(options.answers)

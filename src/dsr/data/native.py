@@ -22,8 +22,8 @@ from dsr.data.base import Wanted, chosen
 from dsr.data.filling import filled_depth
 from dsr.data.rendering import Rendering, cache_directory, cached
 from dsr.data.resizing import fitted
-from dsr.hashing import file_hash, hash_of_code
 from dsr.sample import Scene
+from dsr.utils.hashing import file_hash, hash_of_code
 
 _SMALLEST = 32
 _READING_CODE = (

@@ -13,9 +13,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from dsr.atomic import read_arrays, replacing
 from dsr.geometry.camera import Camera
 from dsr.sample import Scene
+from dsr.utils.files import read_arrays, replacing
 
 
 @dataclass(frozen=True)

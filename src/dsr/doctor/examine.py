@@ -20,7 +20,7 @@ from dsr.doctor.precision import check_precision
 from dsr.doctor.registration import check_registration
 from dsr.doctor.units import check_units
 from dsr.sample import Scene
-from dsr.terminal import USAGE_ERROR, one_line, open_console, print_error
+from dsr.utils.console import USAGE_ERROR, one_line, open_console, print_error
 
 FINE, FAULTY = 0, 1
 CHECKS: tuple[Callable[[Scene], list[Finding]], ...] = (

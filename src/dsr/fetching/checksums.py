@@ -10,7 +10,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from dsr.atomic import write_text
+from dsr.utils.files import write_text
 
 try:
     import fcntl

@@ -11,7 +11,7 @@ from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeR
 
 from dsr.fetching.checksums import Moved
 from dsr.fetching.download import megabytes
-from dsr.terminal import show
+from dsr.utils.console import show
 
 _LOG_SECONDS = 30.0
 """Between two lines about one download where the output is not a terminal."""

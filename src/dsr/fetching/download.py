@@ -16,9 +16,9 @@ from urllib.parse import urlsplit
 import requests
 import urllib3
 
-from dsr.atomic import write_text
 from dsr.fetching.checksums import Moved
-from dsr.terminal import one_line
+from dsr.utils.console import one_line
+from dsr.utils.files import write_text
 
 PAUSES = (1.0, 3.0, 9.0)
 """Seconds before each further try where a connection fails."""

@@ -18,7 +18,7 @@ from dsr.fetching.checksums import Checksums, Entry, alone, sha256_of
 from dsr.fetching.download import FetchError, NoSpaceError, UnreachableError, download, megabytes
 from dsr.fetching.inventory import Watcher, compare, expect_kind, lack, record
 from dsr.fetching.unpack import take_member, unpack
-from dsr.terminal import one_line
+from dsr.utils.console import one_line
 
 _UNPACKED = 1.25
 """Size of what an archive of pictures unpacks to, as a multiple of its own: for a first check of the disk."""

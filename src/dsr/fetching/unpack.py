@@ -17,7 +17,7 @@ from typing import IO
 
 from dsr.fetching.checksums import Moved
 from dsr.fetching.download import disk_errors, expect_room
-from dsr.terminal import one_line
+from dsr.utils.console import one_line
 
 _CHUNK = 1 << 20
 _DAMAGE = (zipfile.BadZipFile, tarfile.TarError, EOFError, zlib.error, KeyError, RuntimeError, OSError)

@@ -22,7 +22,6 @@ from torch import Tensor
 from torch.utils.data import DataLoader
 
 from dsr.degrade import Downsampling, scene_generator
-from dsr.fitting import Interruption, LastValidation, Log, ValidationTable, duration, fit, without_chatter
 from dsr.geometry.camera import RangeType
 from dsr.methods.network import DTYPES, Precision
 from dsr.methods.skip_net import Padding
@@ -33,6 +32,7 @@ from dsr.prior.problem import DataLoss, ImageProblem, PriorObjective
 from dsr.prior.stopping import Fixed, Oracle, Residual, Stopping, StoppingName, Variance
 from dsr.prior.watching import Advance, Display, Keep, Origin, Silent, checkpoint_of, cost_of_step
 from dsr.sample import DepthSample
+from dsr.utils.lightning import Interruption, LastValidation, Log, ValidationTable, duration, fit, without_chatter
 
 WORKSPACE = "optimisation"
 _LOG_EVERY = 10

@@ -14,8 +14,8 @@ import torch
 from lightning.pytorch.callbacks import Callback
 from torch import Tensor
 
-from dsr.fitting import save_checkpoint, scores_line
 from dsr.prior.optimisation import PriorOptimisation
+from dsr.utils.lightning import save_checkpoint, scores_line
 
 _SECONDS_BETWEEN_CHECKPOINTS = 60.0
 _SECONDS_BETWEEN_LOOKS = 0.2

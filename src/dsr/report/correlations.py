@@ -12,9 +12,9 @@ from typing import Literal
 import numpy as np
 import pandas as pd
 
-from dsr.atomic import replacing, write_text
 from dsr.report.markup import MISSING, aligned, escaped
 from dsr.report.results import Results
+from dsr.utils.files import replacing, write_text
 
 Kind = Literal["pearson", "spearman"]
 KINDS: tuple[Kind, ...] = ("pearson", "spearman")

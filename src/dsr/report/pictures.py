@@ -18,12 +18,12 @@ from matplotlib.figure import Figure
 from torch import Tensor
 from torch.nn import functional
 
-from dsr.atomic import replacing
 from dsr.geometry.camera import Camera
 from dsr.geometry.shading import LIGHT_NAMES, render
 from dsr.geometry.surface import normals_of
 from dsr.report.tables import METRICS
 from dsr.sample import DepthSample
+from dsr.utils.files import replacing
 
 HOLE_COLOUR = "#d684b4"
 _PANEL = 3.2

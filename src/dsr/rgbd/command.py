@@ -32,8 +32,8 @@ from dsr.rgbd.outputs import (
 from dsr.rgbd.pairs import Found, Pair, pairs_of_lists
 from dsr.rgbd.telling import Reporter, listed, problem_line, steps
 from dsr.rgbd.wanted import Wanted, files_of, inputs_of, settings_of
-from dsr.terminal import bar, show
 from dsr.upsampling import AUTO, NOISY, Plan, enlarged_by, plan, suited_method, upsample_depth
+from dsr.utils.console import bar, show
 
 
 def run(wanted: Wanted, console: Console) -> list[str]:

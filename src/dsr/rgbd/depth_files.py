@@ -13,8 +13,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from dsr.atomic import read_arrays, replacing
 from dsr.data.files import expect_depth_values, quiet_decoders, read_values
+from dsr.utils.files import read_arrays, replacing
 
 DEPTH_SUFFIXES = (".png", ".tiff", ".tif", ".npy", ".npz", ".pfm", ".exr")
 _STORABLE = {

@@ -19,7 +19,7 @@ from trimesh.exchange.ply import export_ply
 from trimesh.visual.material import PBRMaterial
 from trimesh.visual.texture import TextureVisuals
 
-from dsr.atomic import replacing
+from dsr.utils.files import replacing
 
 _TO_GLTF = np.array([1, -1, -1])
 _LARGEST_TEXTURE = 4096

@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.progress import Progress
 
 from dsr.rgbd.encoding import Fact
-from dsr.terminal import one_line, show
+from dsr.utils.console import one_line, show
 
 _SHOWN = 5
 """Names that a line lists before it only counts."""

@@ -6,11 +6,11 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from dsr.hashing import file_hash
 from dsr.rgbd.inputs import Reading
 from dsr.rgbd.outputs import FORMATS, PARTS
 from dsr.rgbd.pairs import Pair
 from dsr.upsampling import AUTO, METHODS
+from dsr.utils.hashing import file_hash
 
 
 @dataclass(frozen=True)

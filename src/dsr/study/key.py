@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from dsr.atomic import write_text
+from dsr.utils.files import write_text
 
 PAGE_VERSION = 1
 """Of the page and of the answers that it writes."""

@@ -14,7 +14,7 @@ from typing import Any
 import h5py
 import numpy as np
 
-from dsr.terminal import one_line
+from dsr.utils.console import one_line
 
 _LARGEST = 1 << 26
 """Numbers in a matrix that is read."""
