@@ -19,7 +19,7 @@ import pandas as pd
 import torch
 
 from dsr.data.folder import Folder
-from dsr.degrade import Downsampling, make_sample
+from dsr.degradation.downsampling import Downsampling, make_sample
 from dsr.methods.trained import build_trained, packaged_weights
 from dsr.methods.weights import read_head
 from dsr.quality.lpips import load_lpips

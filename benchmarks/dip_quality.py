@@ -26,10 +26,10 @@ from torch import Tensor
 from dsr.app.build import fast_precision
 from dsr.data.augment import window
 from dsr.data.folder import Folder
-from dsr.degrade import Downsampling, make_sample
+from dsr.degradation.downsampling import Downsampling, make_sample
+from dsr.degradation.noise import GaussianMultiplicative
 from dsr.methods.interpolation import Interpolation
 from dsr.methods.trained import packaged_weights
-from dsr.noise import GaussianMultiplicative
 from dsr.prior.method import DeepImagePrior, WarmStarted
 from dsr.prior.problem import ImageProblem
 from dsr.prior.stopping import Fixed, Residual, Stopping, Variance

@@ -24,7 +24,7 @@ from torch.nn import functional
 
 from dsr.app.build import fast_precision
 from dsr.data.simgeo import SimGeo
-from dsr.degrade import Downsampling, make_sample
+from dsr.degradation.downsampling import Downsampling, make_sample
 from dsr.methods import skip_net
 from dsr.prior.method import DeepImagePrior
 from dsr.prior.optimisation import PriorOptimisation

@@ -21,10 +21,10 @@ from torch import Tensor
 from dsr.app.build import fast_precision
 from dsr.data.augment import window
 from dsr.data.folder import Folder
-from dsr.degrade import Downsampling, make_sample
+from dsr.degradation.downsampling import Downsampling, make_sample
+from dsr.degradation.holes import Blobs, Holes, Shadows
 from dsr.geometry.shading import render
 from dsr.geometry.surface import normals_of
-from dsr.holes import Blobs, Holes, Shadows
 from dsr.methods.interpolation import Interpolation
 from dsr.methods.trained import build_trained, packaged_weights
 from dsr.prior.method import DeepImagePrior

@@ -22,7 +22,7 @@ from hydra import compose, initialize_config_dir
 from dsr.app.build import build
 from dsr.app.schema import plain_config, register
 from dsr.data.folder import Folder
-from dsr.degrade import Downsampling, make_sample
+from dsr.degradation.downsampling import Downsampling, make_sample
 from dsr.methods.trained import packaged_weights
 
 CONF = Path(__file__).resolve().parents[1] / "conf"

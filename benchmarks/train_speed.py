@@ -19,7 +19,7 @@ from torch import nn
 from dsr.data.cutting import Patches, PatchSettings
 from dsr.data.problem import Batch, Problem
 from dsr.data.simgeo import SimGeo
-from dsr.degrade import Downsampling
+from dsr.degradation.downsampling import Downsampling
 from dsr.methods.msg_net import MSGNet
 from dsr.objective import Objective
 

@@ -16,7 +16,7 @@ import pandas as pd
 import pytest
 import torch
 
-from dsr.degrade import Downsampling, make_sample
+from dsr.degradation.downsampling import Downsampling, make_sample
 from dsr.evaluation import SCORE_COLUMNS
 from dsr.geometry.camera import Camera
 from dsr.quality.scores import catalogue, score_image

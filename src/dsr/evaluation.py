@@ -24,10 +24,10 @@ import torch
 from torch import Tensor
 
 from dsr.data.base import SceneSource
-from dsr.degrade import Downsampling, Measured, make_sample
-from dsr.holes import Holes
+from dsr.degradation.downsampling import Downsampling, Measured, make_sample
+from dsr.degradation.holes import Holes
+from dsr.degradation.noise import Noise
 from dsr.methods.base import Iterative, NoAnswerError, Upsampler
-from dsr.noise import Noise
 from dsr.quality.scores import WORST, Metric, score_image
 from dsr.sample import DepthSample
 from dsr.store import iterations_path, load_prediction, prediction_path, save_scene, scene_path

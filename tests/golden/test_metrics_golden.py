@@ -16,7 +16,7 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from dsr.degrade import Downsampling, make_sample
+from dsr.degradation.downsampling import Downsampling, make_sample
 from dsr.geometry.camera import Camera, from_range
 from dsr.methods.interpolation import Interpolation
 from dsr.quality.lpips import LPIPS, load_lpips

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from dsr.data.augment import window
 from dsr.data.folder import Folder
-from dsr.degrade import Downsampling, make_sample
+from dsr.degradation.downsampling import Downsampling, make_sample
 from dsr.methods.interpolation import Interpolation
 from dsr.prior.method import DeepImagePrior
 from dsr.quality.functional import SurfacePair, dssim_v, rmse_d, rmse_v

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from dsr.data.simgeo import SimGeo
-from dsr.degrade import Downsampling, make_sample
+from dsr.degradation.downsampling import Downsampling, make_sample
 from dsr.methods.network import NetworkUpsampler
 from dsr.methods.trained import build_trained, packaged_weights
 from dsr.quality.lpips import load_lpips

@@ -22,7 +22,7 @@ from dsr.data.sunrgbd import SunRGBD
 from dsr.data.tofmark import SCENES as TOFMARK_SCENES
 from dsr.data.tofmark import ToFMark
 from dsr.data.training_sets import MIDDLEBURY, MiddleburyTrain, Sintel, sintel_frames
-from dsr.degrade import Downsampling
+from dsr.degradation.downsampling import Downsampling
 from dsr.methods.trained import packaged_weights
 from dsr.report.tables import published_row
 

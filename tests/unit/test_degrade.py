@@ -13,7 +13,7 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from dsr.degrade import (
+from dsr.degradation.downsampling import (
     SCALES,
     Downsampling,
     Kernel,
@@ -21,8 +21,8 @@ from dsr.degrade import (
     make_sample,
     scene_generator,
 )
+from dsr.degradation.noise import GaussianMultiplicative, no_noise
 from dsr.geometry.camera import RANGE_TYPES, Camera, RangeType, to_range
-from dsr.noise import GaussianMultiplicative, no_noise
 from dsr.sample import DepthSample, Scene
 
 KERNELS: tuple[Kernel, ...] = get_args(Kernel)

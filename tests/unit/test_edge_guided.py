@@ -10,7 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from dsr.degrade import Downsampling, make_sample
+from dsr.degradation.downsampling import Downsampling, make_sample
 from dsr.geometry.camera import Camera, from_range, to_range
 from dsr.methods.base import Iterative, NoAnswerError
 from dsr.methods.edge_filter import filtered, reachable

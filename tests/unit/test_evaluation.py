@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 import torch
 
-from dsr.degrade import Downsampling, Measured, make_sample
+from dsr.degradation.downsampling import Downsampling, Measured, make_sample
+from dsr.degradation.noise import GaussianMultiplicative
 from dsr.evaluation import SCORE_COLUMNS, Outcome, StalePredictionError, Study, load_prediction, predict, score
 from dsr.geometry.camera import Camera
 from dsr.methods.base import NoAnswerError
-from dsr.noise import GaussianMultiplicative
 from dsr.quality.scores import catalogue, score_image
 from dsr.sample import Scene
 

@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from dsr.degrade import Downsampling, Kernel, make_sample
+from dsr.degradation.downsampling import Downsampling, Kernel, make_sample
 from dsr.geometry.camera import Camera, from_range, to_range
 from dsr.methods.fast_global_smoother import FastGlobalSmoother, smoothed, solved_lines
 from dsr.methods.interpolation import Interpolation

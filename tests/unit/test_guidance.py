@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from dsr.degrade import SCALES, Downsampling, Kernel, make_sample
+from dsr.degradation.downsampling import SCALES, Downsampling, Kernel, make_sample
 from dsr.geometry.camera import Camera, from_range, to_range
 from dsr.methods.fast_global_smoother import FastGlobalSmoother
 from dsr.methods.guidance import GuidedMethod, slopes_along

@@ -5,10 +5,10 @@ from __future__ import annotations
 import pytest
 import torch
 
-from dsr.degrade import Downsampling, Measured, make_sample
+from dsr.degradation.downsampling import Downsampling, Measured, make_sample
+from dsr.degradation.holes import Blobs, Shadows
+from dsr.degradation.noise import GaussianMultiplicative
 from dsr.geometry.camera import Camera
-from dsr.holes import Blobs, Shadows
-from dsr.noise import GaussianMultiplicative
 from dsr.sample import Scene
 
 CAMERA = Camera(width=40, height=30, fx=50.0, fy=50.0, cx=19.5, cy=14.5)

@@ -9,9 +9,9 @@ LAYERS = (
     ("dsr.utils.files", "dsr.utils.hashing", "dsr.utils.console"),
     ("dsr.fetching",),
     ("dsr.geometry.camera",),
-    ("dsr.sample", "dsr.holes", "dsr.noise", "dsr.geometry.surface", "dsr.geometry.shading"),
+    ("dsr.sample", "dsr.degradation.holes", "dsr.degradation.noise", "dsr.geometry.surface", "dsr.geometry.shading"),
     ("dsr.store", "dsr.geometry.mesh"),
-    ("dsr.degrade", "dsr.geometry.comparison"),
+    ("dsr.degradation.downsampling", "dsr.geometry.comparison"),
     ("dsr.quality.functional",),
     ("dsr.quality.lpips",),
     ("dsr.quality.scores",),
@@ -37,7 +37,7 @@ MORE_FORBIDDEN = {
         "dsr.objective",
         "dsr.training",
         "dsr.quality",
-        "dsr.degrade",
+        "dsr.degradation.downsampling",
     ),
 }
 ONLY_APP = ("hydra", "omegaconf")
@@ -107,7 +107,7 @@ def test_modules_do_not_import_each_other_in_a_circle():
 @pytest.mark.parametrize(
     ("module", "text", "offence"),
     [
-        ("dsr.degrade", "import dsr.data.files", "dsr.data.files"),
+        ("dsr.degradation.downsampling", "import dsr.data.files", "dsr.data.files"),
         ("dsr.data.files", "from dsr.methods import msg_net", "dsr.methods.msg_net"),
         ("dsr.data.files", "def f():\n    from ..quality import lpips", "dsr.quality.lpips"),
         ("dsr.quality.metrics", "from dsr.quality import losses", "dsr.quality"),

@@ -8,7 +8,7 @@ import torch
 from scipy import ndimage
 from torch import Tensor
 
-from dsr.degrade import SCALES, Downsampling, Kernel, make_sample
+from dsr.degradation.downsampling import SCALES, Downsampling, Kernel, make_sample
 from dsr.geometry.camera import Camera, from_range, to_range
 from dsr.methods.interpolation import Interpolation, Order
 from dsr.sample import DepthSample, Scene

@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from dsr.degrade import Downsampling, make_sample
+from dsr.degradation.downsampling import Downsampling, make_sample
 from dsr.geometry.camera import Camera, from_range, to_range
 from dsr.methods.interpolation import Interpolation
 from dsr.methods.joint_bilateral import JointBilateral

@@ -11,7 +11,7 @@ from PIL import Image
 from scipy import ndimage
 from torch import Tensor
 
-from dsr.degrade import SCALES
+from dsr.degradation.downsampling import SCALES
 from dsr.geometry.camera import Camera, from_range, to_range
 from dsr.methods.maps import mean3x3, normalised, upsample_bicubic
 from dsr.methods.msg_guidance import VARIANTS, VariantName, guidance_map

@@ -14,9 +14,9 @@ from omegaconf import OmegaConf
 from torch import Tensor
 
 from dsr.app.build import build
-from dsr.degrade import Downsampling, Measured, make_sample, scene_generator
+from dsr.degradation.downsampling import Downsampling, Measured, make_sample, scene_generator
+from dsr.degradation.noise import GaussianMultiplicative, Kinect, Noise, TimeOfFlight
 from dsr.geometry.camera import RANGE_TYPES, Camera, RangeType, from_range, to_range
-from dsr.noise import GaussianMultiplicative, Kinect, Noise, TimeOfFlight
 from dsr.sample import Scene
 
 REPOSITORY = Path(__file__).resolve().parents[2]

@@ -17,10 +17,10 @@ from dsr.data.base import SceneSource
 from dsr.data.cutting import Patches, PatchSettings
 from dsr.data.patches import Part, PatchData, WholeScenes
 from dsr.data.problem import Batch, Problem, tensors_of
-from dsr.degrade import Downsampling, Measured, make_sample
+from dsr.degradation.downsampling import Downsampling, Measured, make_sample
+from dsr.degradation.noise import GaussianMultiplicative, Kinect
 from dsr.geometry.camera import Camera
 from dsr.methods.maps import normalised
-from dsr.noise import GaussianMultiplicative, Kinect
 from dsr.sample import Scene
 
 BOX = Downsampling("box")

@@ -14,9 +14,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from dsr.degrade import Downsampling, make_sample
+from dsr.degradation.downsampling import Downsampling, make_sample
+from dsr.degradation.holes import Blobs
 from dsr.geometry.camera import Camera
-from dsr.holes import Blobs
 from dsr.methods.trained import packaged_weights
 from dsr.prior.method import DeepImagePrior, WarmStarted
 from dsr.prior.watching import cost_of_step

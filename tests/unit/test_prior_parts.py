@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from dsr.degrade import Downsampling, make_sample
+from dsr.degradation.downsampling import Downsampling, make_sample
 from dsr.geometry.camera import Camera
 from dsr.geometry.surface import normals_of
 from dsr.prior.noise import noise_level, tilt_of

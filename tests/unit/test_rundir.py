@@ -79,7 +79,13 @@ def test_other_code_leads_to_another_directory(monkeypatch):
     assert directory(config()) != before
 
 
-PREDICTING_PACKAGES = ("dsr.methods", "dsr.prior", "dsr.data", "dsr.degrade", "dsr.noise", "dsr.holes", "dsr.training")
+PREDICTING_PACKAGES = (
+    "dsr.methods",
+    "dsr.prior",
+    "dsr.data",
+    "dsr.degradation",
+    "dsr.training",
+)
 """Where what makes predictions lies: all that these import determines a prediction, too."""
 NOT_PREDICTING = (
     "__init__.py",

@@ -12,7 +12,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from dsr.degrade import Downsampling, make_sample
+from dsr.degradation.downsampling import Downsampling, make_sample
 from dsr.geometry.camera import Camera, from_range
 from dsr.geometry.surface import normals_of
 from dsr.methods.base import Iterative

@@ -20,7 +20,7 @@ from torch.utils.data import DataLoader
 from dsr.data.cutting import Patches, PatchSettings
 from dsr.data.patches import WholeScenes
 from dsr.data.problem import Batch, Problem, tensors_of
-from dsr.degrade import Downsampling, make_sample
+from dsr.degradation.downsampling import Downsampling, make_sample
 from dsr.geometry.camera import Camera
 from dsr.methods.msg_net import MSGNet, upsample_disparity
 from dsr.objective import Objective, balanced_weight, depth_of

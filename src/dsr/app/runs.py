@@ -15,7 +15,7 @@ from dsr.data.base import SceneSource, Some
 from dsr.data.cutting import PatchSettings
 from dsr.data.patches import Part, PatchData
 from dsr.data.problem import Problem
-from dsr.degrade import Downsampling
+from dsr.degradation.downsampling import Downsampling
 
 WEIGHTS = "weights.safetensors"
 _FROM_RUN = ("scale", "downsampling", "noise", "seed", "dataset")

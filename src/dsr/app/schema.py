@@ -11,7 +11,7 @@ from hydra.core.config_store import ConfigStore
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import MISSING, DictConfig, OmegaConf
 
-from dsr.degrade import SCALES
+from dsr.degradation.downsampling import SCALES
 
 PRECISIONS = ("float32", "bfloat16")
 _GROUPS = ("dataset", "downsampling", "noise", "holes", "method", "metrics", "model", "trainer", "loss")

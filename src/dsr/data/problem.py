@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from dsr.degrade import Downsampling, make_sample
+from dsr.degradation.downsampling import Downsampling, make_sample
+from dsr.degradation.noise import Noise
 from dsr.geometry.camera import stereo_constant, to_range
-from dsr.noise import Noise
 from dsr.sample import DepthSample, Scene
 
 Batch = dict[str, Tensor]
@@ -22,7 +22,7 @@ class Problem:
     """What is to be undone: how coarse maps come from fine ones.
 
     Args:
-        scale, downsampling, noise: as for :func:`dsr.degrade.make_sample`.
+        scale, downsampling, noise: as for :func:`dsr.degradation.downsampling.make_sample`.
 
     """
 

@@ -41,7 +41,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from dsr.degrade import check_scale
+from dsr.degradation.downsampling import check_scale
 from dsr.methods.analysis_filters import WIDTHS, influence, penalty, plane_free_basis, zero_mean_basis
 from dsr.methods.differences import box_mean, upsampled
 from dsr.methods.network import NormalisedNetwork, expect_photo

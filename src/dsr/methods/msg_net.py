@@ -17,7 +17,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from dsr.degrade import check_scale
+from dsr.degradation.downsampling import check_scale
 from dsr.methods.holes import filled
 from dsr.methods.layers import ConvLayer, Level
 from dsr.methods.maps import bounds_of, mean3x3, normalised, upsample_bicubic

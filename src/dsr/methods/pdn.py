@@ -32,7 +32,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from dsr.degrade import check_scale
+from dsr.degradation.downsampling import check_scale
 from dsr.methods.differences import extended, upsampled
 from dsr.methods.facets import stencil
 from dsr.methods.network import NormalisedNetwork, expect_photo

@@ -17,7 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dsr.degrade import SCALES
+from dsr.degradation.downsampling import SCALES
 from dsr.methods.msg_guidance import VariantName
 from dsr.methods.msg_net import MSGNet
 from dsr.methods.weights import fill

@@ -21,7 +21,7 @@ from lightning.pytorch.callbacks import Callback
 from torch import Tensor
 from torch.utils.data import DataLoader
 
-from dsr.degrade import Downsampling, scene_generator
+from dsr.degradation.downsampling import Downsampling, scene_generator
 from dsr.geometry.camera import RangeType
 from dsr.methods.network import DTYPES, Precision
 from dsr.methods.skip_net import Padding

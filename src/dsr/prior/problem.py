@@ -8,7 +8,7 @@ from typing import Literal, Self
 import torch
 from torch import Tensor
 
-from dsr.degrade import Downsampling, downsampled
+from dsr.degradation.downsampling import Downsampling, downsampled
 from dsr.geometry.camera import Camera, RangeType
 from dsr.methods.differences import grey
 from dsr.quality import losses

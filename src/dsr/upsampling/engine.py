@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from dsr.degrade import Downsampling
+from dsr.degradation.downsampling import Downsampling
 from dsr.geometry.camera import Camera
 from dsr.methods.interpolation import Interpolation, Order
 from dsr.methods.network import NetworkUpsampler

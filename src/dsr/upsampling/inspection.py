@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from dsr.degrade import Downsampling
+from dsr.degradation.downsampling import Downsampling
 from dsr.geometry.camera import Camera
 from dsr.prior.noise import noise_level, tilt_of
 from dsr.upsampling.planning import OWN_SIZE, USUAL_SCALE

@@ -1,7 +1,7 @@
 """Noise of coarse depth maps: multiplicative, and that of two kinds of sensors.
 
 A kind of noise says which range type it acts on and maps a coarse map in that type, with a generator, to a noisy one;
-see :func:`dsr.degrade.make_sample`.
+see :func:`dsr.degradation.downsampling.make_sample`.
 """
 
 from __future__ import annotations

@@ -21,9 +21,9 @@ from typing import Literal, get_args
 import torch
 from torch import Tensor
 
+from dsr.degradation.holes import Holes
+from dsr.degradation.noise import Noise
 from dsr.geometry.camera import Camera, RangeType, from_range, to_range
-from dsr.holes import Holes
-from dsr.noise import Noise
 from dsr.sample import DepthSample, Scene
 
 Kernel = Literal["box", "nearest", "bilinear", "bicubic", "gaussian"]

@@ -1,7 +1,7 @@
 """Holes of coarse depth maps, as sensors leave them: blobs of any shape, and the strips that a second camera misses.
 
 A kind of holes is a callable from a coarse map, its camera and a generator to a mask; see
-:func:`dsr.degrade.make_sample`.
+:func:`dsr.degradation.downsampling.make_sample`.
 """
 
 from __future__ import annotations
