@@ -22,8 +22,8 @@ from dsr.data.folder import Folder
 from dsr.degradation.downsampling import Downsampling, make_sample
 from dsr.methods.trained import build_trained, packaged_weights
 from dsr.methods.weights import read_head
-from dsr.quality.lpips import load_lpips
-from dsr.quality.scores import WORST, Metric, catalogue, score_image
+from dsr.metrics.catalogue import WORST, Metric, catalogue, score_image
+from dsr.metrics.lpips import load_lpips
 
 SCENES, SCALES = ("lucy", "plant"), (4, 8)
 METRICS = ("RMSE_v", "DSSIM_v", "BadPix_v_5", "Bumpiness_d", "LPIPS_v", "RMSE_d")

@@ -30,11 +30,11 @@ from dsr.degradation.downsampling import Downsampling, make_sample
 from dsr.degradation.noise import GaussianMultiplicative
 from dsr.methods.interpolation import Interpolation
 from dsr.methods.trained import packaged_weights
+from dsr.metrics.classes import visual_metrics
+from dsr.metrics.functional import SurfacePair
 from dsr.prior.method import DeepImagePrior, WarmStarted
 from dsr.prior.problem import ImageProblem
 from dsr.prior.stopping import Fixed, Residual, Stopping, Variance
-from dsr.quality.functional import SurfacePair
-from dsr.quality.metrics import visual_metrics
 from dsr.sample import DepthSample, Scene
 
 BOX = Downsampling("box")

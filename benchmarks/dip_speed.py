@@ -26,10 +26,10 @@ from dsr.app.build import fast_precision
 from dsr.data.simgeo import SimGeo
 from dsr.degradation.downsampling import Downsampling, make_sample
 from dsr.methods import skip_net
+from dsr.metrics.classes import visual_metrics
+from dsr.metrics.functional import SurfacePair
 from dsr.prior.method import DeepImagePrior
 from dsr.prior.optimisation import PriorOptimisation
-from dsr.quality.functional import SurfacePair
-from dsr.quality.metrics import visual_metrics
 from dsr.sample import DepthSample
 
 BOX = Downsampling("box")

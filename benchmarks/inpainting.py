@@ -27,8 +27,8 @@ from dsr.geometry.shading import render
 from dsr.geometry.surface import normals_of
 from dsr.methods.interpolation import Interpolation
 from dsr.methods.trained import build_trained, packaged_weights
+from dsr.metrics.functional import SurfacePair, rmse_d, rmse_v
 from dsr.prior.method import DeepImagePrior
-from dsr.quality.functional import SurfacePair, rmse_d, rmse_v
 from dsr.sample import DepthSample, Scene
 
 BOX = Downsampling("box")

@@ -19,8 +19,8 @@ from skimage.metrics import structural_similarity
 
 from dsr.geometry.camera import Camera
 from dsr.geometry.shading import lights
-from dsr.quality.functional import BUMPINESS_DISPARITY
-from dsr.quality.scores import catalogue, score_image
+from dsr.metrics.catalogue import catalogue, score_image
+from dsr.metrics.functional import BUMPINESS_DISPARITY
 
 CAMERA = Camera(width=512, height=512, fx=618.0, fy=618.0, cx=255.5, cy=255.5)
 THRESHOLDS = (1, 5, 10)

@@ -19,7 +19,7 @@ import torch
 from dsr.degradation.downsampling import Downsampling, make_sample
 from dsr.evaluation import SCORE_COLUMNS
 from dsr.geometry.camera import Camera
-from dsr.quality.scores import catalogue, score_image
+from dsr.metrics.catalogue import catalogue, score_image
 from dsr.sample import Scene
 from dsr.store import prediction_path, save_scene, scene_path
 

@@ -28,7 +28,7 @@ from dsr.degradation.downsampling import Downsampling, Measured, make_sample
 from dsr.degradation.holes import Holes
 from dsr.degradation.noise import Noise
 from dsr.methods.base import Iterative, NoAnswerError, Upsampler
-from dsr.quality.scores import WORST, Metric, score_image
+from dsr.metrics.catalogue import WORST, Metric, score_image
 from dsr.sample import DepthSample
 from dsr.store import iterations_path, load_prediction, prediction_path, save_scene, scene_path
 from dsr.utils.console import one_line
@@ -187,7 +187,7 @@ def score(
     Args:
         study: what was evaluated.
         folder: the run's directory.
-        metrics: from :func:`dsr.quality.scores.catalogue`.
+        metrics: from :func:`dsr.metrics.catalogue.catalogue`.
         outcome: of :func:`predict`; failures and scenes without truth are added to it.
         progress: shows how far it is.
         illustrate: draws a picture from a sample, the predicted depth and its worst-of-four scores.

@@ -11,8 +11,8 @@ import torch
 from torch import Tensor
 
 from dsr.data.problem import Batch
-from dsr.quality import losses
-from dsr.quality.functional import SurfacePair, mse_v
+from dsr.metrics import losses
+from dsr.metrics.functional import SurfacePair, mse_v
 
 DepthLoss = Literal["lap1", "l1", "mse"]
 _TILT = math.asin(5 / 255)

@@ -16,8 +16,8 @@ from torch import Tensor, nn
 from dsr.data.problem import Batch
 from dsr.geometry.comparison import comparison
 from dsr.methods.network import DisparityNetwork
+from dsr.metrics.functional import SurfacePair
 from dsr.objective import Objective, depth_of
-from dsr.quality.functional import SurfacePair
 
 _DRAWN = 4
 
@@ -79,7 +79,7 @@ class SuperResolution(lightning.LightningModule):
         net: the network.
         objective: the loss.
         schedule: of the training.
-        metrics: makes the metrics of a validation set, such as :func:`dsr.quality.metrics.visual_metrics`.
+        metrics: makes the metrics of a validation set, such as :func:`dsr.metrics.classes.visual_metrics`.
         validation_sets: their names, in the order of the validation loaders.
 
     Raises:

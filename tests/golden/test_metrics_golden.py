@@ -19,8 +19,8 @@ from torch import Tensor
 from dsr.degradation.downsampling import Downsampling, make_sample
 from dsr.geometry.camera import Camera, from_range
 from dsr.methods.interpolation import Interpolation
-from dsr.quality.lpips import LPIPS, load_lpips
-from dsr.quality.scores import Score, catalogue, score_image
+from dsr.metrics.catalogue import Score, catalogue, score_image
+from dsr.metrics.lpips import LPIPS, load_lpips
 from dsr.sample import Scene
 
 METHODS = {"Bicubic": None, "MSG-V": "msg_v", "MSG": "msg"}

@@ -13,8 +13,8 @@ from dsr.data.augment import window
 from dsr.data.folder import Folder
 from dsr.degradation.downsampling import Downsampling, make_sample
 from dsr.methods.interpolation import Interpolation
+from dsr.metrics.functional import SurfacePair, dssim_v, rmse_d, rmse_v
 from dsr.prior.method import DeepImagePrior
-from dsr.quality.functional import SurfacePair, dssim_v, rmse_d, rmse_v
 from dsr.sample import DepthSample
 
 BOX = Downsampling("box")

@@ -15,8 +15,8 @@ from dsr.data.simgeo import SimGeo
 from dsr.degradation.downsampling import Downsampling, make_sample
 from dsr.methods.network import NetworkUpsampler
 from dsr.methods.trained import build_trained, packaged_weights
-from dsr.quality.lpips import load_lpips
-from dsr.quality.scores import WORST, Metric, catalogue, score_image
+from dsr.metrics.catalogue import WORST, Metric, catalogue, score_image
+from dsr.metrics.lpips import load_lpips
 from dsr.sample import DepthSample
 
 REPOSITORY = Path(__file__).resolve().parents[2]

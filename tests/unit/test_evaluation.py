@@ -15,7 +15,7 @@ from dsr.degradation.noise import GaussianMultiplicative
 from dsr.evaluation import SCORE_COLUMNS, Outcome, StalePredictionError, Study, load_prediction, predict, score
 from dsr.geometry.camera import Camera
 from dsr.methods.base import NoAnswerError
-from dsr.quality.scores import catalogue, score_image
+from dsr.metrics.catalogue import catalogue, score_image
 from dsr.sample import Scene
 
 SIZE, SCALE = 16, 2

@@ -14,7 +14,7 @@ from skimage.metrics import structural_similarity
 from torch import Tensor
 
 from dsr.geometry.camera import Camera
-from dsr.quality.functional import (
+from dsr.metrics.functional import (
     SurfacePair,
     bad_pix_d,
     bad_pix_v,

@@ -12,10 +12,10 @@ LAYERS = (
     ("dsr.sample", "dsr.degradation.holes", "dsr.degradation.noise", "dsr.geometry.surface", "dsr.geometry.shading"),
     ("dsr.store", "dsr.geometry.mesh"),
     ("dsr.degradation.downsampling", "dsr.geometry.comparison"),
-    ("dsr.quality.functional",),
-    ("dsr.quality.lpips",),
-    ("dsr.quality.scores",),
-    ("dsr.quality.metrics", "dsr.quality.losses"),
+    ("dsr.metrics.functional",),
+    ("dsr.metrics.lpips",),
+    ("dsr.metrics.catalogue",),
+    ("dsr.metrics.classes", "dsr.metrics.losses"),
     ("dsr.data", "dsr.methods"),
     ("dsr.objective",),
     ("dsr.utils.lightning",),
@@ -28,15 +28,15 @@ LAYERS = (
 )
 """From the lowest up. A package stands for all its modules; those in one line do not import each other."""
 MORE_FORBIDDEN = {
-    "dsr.data": ("dsr.quality",),
-    "dsr.methods": ("dsr.quality",),
+    "dsr.data": ("dsr.metrics",),
+    "dsr.methods": ("dsr.metrics",),
     "dsr.report": (
         "dsr.data",
         "dsr.methods",
         "dsr.evaluation",
         "dsr.objective",
         "dsr.training",
-        "dsr.quality",
+        "dsr.metrics",
         "dsr.degradation.downsampling",
     ),
 }
@@ -109,15 +109,15 @@ def test_modules_do_not_import_each_other_in_a_circle():
     [
         ("dsr.degradation.downsampling", "import dsr.data.files", "dsr.data.files"),
         ("dsr.data.files", "from dsr.methods import msg_net", "dsr.methods.msg_net"),
-        ("dsr.data.files", "def f():\n    from ..quality import lpips", "dsr.quality.lpips"),
-        ("dsr.quality.metrics", "from dsr.quality import losses", "dsr.quality"),
+        ("dsr.data.files", "def f():\n    from ..quality import lpips", "dsr.metrics.lpips"),
+        ("dsr.metrics.classes", "from dsr.metrics import losses", "dsr.metrics"),
         ("dsr.report.tables", "from dsr.evaluation import score", "dsr.evaluation"),
         ("dsr.evaluation", "from omegaconf.errors import X", "omegaconf.errors"),
         ("dsr.methods.facets", "import hydra", "hydra"),
     ],
 )
 def test_the_test_itself_sees_a_forbidden_import(module, text, offence):
-    known = {*MODULES, "dsr.quality.losses"}
+    known = {*MODULES, "dsr.metrics.losses"}
     imported = imports_of(text, module, known=known)
     assert any(within(name, offence) for name in imported)
     assert len(offences(module, imported)) == 1

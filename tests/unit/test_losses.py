@@ -12,8 +12,8 @@ from torch import Tensor
 
 from dsr.data.problem import Batch
 from dsr.geometry.camera import Camera
+from dsr.metrics.losses import l1, lap1, mse
 from dsr.objective import DepthLoss, Objective
-from dsr.quality.losses import l1, lap1, mse
 
 Loss = Callable[..., Tensor]
 LOSSES: dict[str, Loss] = {"l1": l1, "mse": mse, "lap1": lap1}

@@ -22,9 +22,9 @@ from torch import Tensor, nn
 from dsr.geometry.camera import Camera
 from dsr.geometry.shading import render
 from dsr.geometry.surface import normals_of
-from dsr.quality import lpips
-from dsr.quality.functional import SurfacePair
-from dsr.quality.lpips import LPIPS, TRUNK_FILE, TRUNK_HASH, TRUNK_URL, find_trunk, load_lpips, lpips_v
+from dsr.metrics import lpips
+from dsr.metrics.functional import SurfacePair
+from dsr.metrics.lpips import LPIPS, TRUNK_FILE, TRUNK_HASH, TRUNK_URL, find_trunk, load_lpips, lpips_v
 
 SHAPES = {0: (64, 3, 11, 11), 3: (192, 64, 5, 5), 6: (384, 192, 3, 3), 8: (256, 384, 3, 3), 10: (256, 256, 3, 3)}
 

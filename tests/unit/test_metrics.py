@@ -14,10 +14,8 @@ import torchmetrics
 from torch import Tensor, nn
 
 from dsr.geometry.camera import Camera
-from dsr.quality import functional
-from dsr.quality.functional import SurfacePair
-from dsr.quality.lpips import LPIPS, lpips_v
-from dsr.quality.metrics import (
+from dsr.metrics import functional
+from dsr.metrics.classes import (
     BadPixD,
     BadPixV,
     BumpinessD,
@@ -29,6 +27,8 @@ from dsr.quality.metrics import (
     RMSEv1,
     visual_metrics,
 )
+from dsr.metrics.functional import SurfacePair
+from dsr.metrics.lpips import LPIPS, lpips_v
 
 CAMERA = Camera(width=40, height=36, fx=40.0, fy=40.0, cx=20.0, cy=18.0)
 NAMES = [

@@ -18,10 +18,10 @@ from dsr.degradation.downsampling import Downsampling, make_sample
 from dsr.degradation.holes import Blobs
 from dsr.geometry.camera import Camera
 from dsr.methods.trained import packaged_weights
+from dsr.metrics.classes import visual_metrics
+from dsr.metrics.functional import SurfacePair, rmse_v
 from dsr.prior.method import DeepImagePrior, WarmStarted
 from dsr.prior.watching import cost_of_step
-from dsr.quality.functional import SurfacePair, rmse_v
-from dsr.quality.metrics import visual_metrics
 from dsr.sample import DepthSample, Scene
 
 BOX = Downsampling("box")

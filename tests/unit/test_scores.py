@@ -10,10 +10,10 @@ import torch
 from torch import Tensor
 
 from dsr.geometry.camera import Camera
-from dsr.quality import functional
-from dsr.quality.functional import SurfacePair
-from dsr.quality.lpips import LPIPS, lpips_v
-from dsr.quality.scores import Score, catalogue, score_image
+from dsr.metrics import functional
+from dsr.metrics.catalogue import Score, catalogue, score_image
+from dsr.metrics.functional import SurfacePair
+from dsr.metrics.lpips import LPIPS, lpips_v
 
 CAMERA = Camera(width=48, height=40, fx=50.0, fy=50.0, cx=24.0, cy=20.0)
 WITHOUT_LIGHTS = {

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from dsr.geometry.camera import Camera
 from dsr.geometry.surface import length, normal_mask, normals_of, points_of
-from dsr.quality.functional import SurfacePair, mse_v
+from dsr.metrics.functional import SurfacePair, mse_v
 
 CAMERA = Camera(width=11, height=7, fx=9.0, fy=12.0, cx=4.3, cy=3.9)
 PLANES = [(0.0, 0.0, -1.0), (0.3, -0.2, -1.0), (-0.5, 0.1, -0.8), (0.2, 0.6, -1.0)]

@@ -23,11 +23,11 @@ from dsr.data.problem import Batch, Problem, tensors_of
 from dsr.degradation.downsampling import Downsampling, make_sample
 from dsr.geometry.camera import Camera
 from dsr.methods.msg_net import MSGNet, upsample_disparity
+from dsr.metrics import functional as scores
+from dsr.metrics.classes import visual_metrics
+from dsr.metrics.functional import SurfacePair
+from dsr.metrics.lpips import LPIPS
 from dsr.objective import Objective, balanced_weight, depth_of
-from dsr.quality import functional as scores
-from dsr.quality.functional import SurfacePair
-from dsr.quality.lpips import LPIPS
-from dsr.quality.metrics import visual_metrics
 from dsr.sample import Scene
 from dsr.training import Schedule, SuperResolution
 

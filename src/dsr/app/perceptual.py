@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 
 from dsr.app.schema import ConfigError
-from dsr.quality.lpips import LPIPS, TRUNK_URL, load_lpips
+from dsr.metrics.lpips import LPIPS, TRUNK_URL, load_lpips
 from dsr.utils.console import one_line
 
 

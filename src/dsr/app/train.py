@@ -25,8 +25,8 @@ from dsr.data.patches import PatchData
 from dsr.methods.network import DisparityNetwork
 from dsr.methods.trained import NETWORKS
 from dsr.methods.weights import load_network, save_network
+from dsr.metrics.classes import visual_metrics
 from dsr.objective import Objective, balanced_weight
-from dsr.quality.metrics import visual_metrics
 from dsr.training import Schedule, SuperResolution
 from dsr.utils.console import show
 from dsr.utils.files import replacing

@@ -15,9 +15,9 @@ from torch.nn import functional
 
 from dsr.geometry.comparison import comparison
 from dsr.methods.skip_net import Padding, SkipNet, levels_for
+from dsr.metrics.functional import SurfacePair, rmse_v
 from dsr.prior.problem import ImageProblem, PriorObjective
 from dsr.prior.stopping import Stopping
-from dsr.quality.functional import SurfacePair, rmse_v
 
 _NOISE_CHANNELS = 32
 

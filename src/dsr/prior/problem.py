@@ -11,8 +11,8 @@ from torch import Tensor
 from dsr.degradation.downsampling import Downsampling, downsampled
 from dsr.geometry.camera import Camera, RangeType
 from dsr.methods.differences import grey
-from dsr.quality import losses
-from dsr.quality.functional import SurfacePair, mse_v
+from dsr.metrics import losses
+from dsr.metrics.functional import SurfacePair, mse_v
 from dsr.sample import DepthSample
 
 DataLoss = Literal["lap1", "mse"]

@@ -10,9 +10,9 @@ import torch
 from torch import Tensor
 
 from dsr.geometry.shading import LIGHT_NAMES
-from dsr.quality import functional
-from dsr.quality.functional import SurfacePair
-from dsr.quality.lpips import LPIPS, MIN_SIZE, lpips_v
+from dsr.metrics import functional
+from dsr.metrics.functional import SurfacePair
+from dsr.metrics.lpips import LPIPS, MIN_SIZE, lpips_v
 
 WORST = "max"
 VARIANTS = (*LIGHT_NAMES, WORST, "avg")

@@ -1,6 +1,6 @@
 """Training losses: the paper's Lap_1 + w MSE_v, and plain ones on depth. One value per image, masked, differentiable.
 
-MSE_v is the metric's own kernel, :func:`dsr.quality.functional.mse_v`.
+MSE_v is the metric's own kernel, :func:`dsr.metrics.functional.mse_v`.
 """
 
 from __future__ import annotations

@@ -15,9 +15,9 @@ import torch
 import torchmetrics
 from torch import Tensor
 
-from dsr.quality.functional import SurfacePair
-from dsr.quality.lpips import LPIPS
-from dsr.quality.scores import VARIANTS, WORST, Metric, catalogue
+from dsr.metrics.catalogue import VARIANTS, WORST, Metric, catalogue
+from dsr.metrics.functional import SurfacePair
+from dsr.metrics.lpips import LPIPS
 
 
 class PerImageMean(torchmetrics.Metric):
@@ -27,7 +27,7 @@ class PerImageMean(torchmetrics.Metric):
     is NaN then, lest a method that fails looked better than one that does not.
 
     Args:
-        metric: from :func:`dsr.quality.scores.catalogue`.
+        metric: from :func:`dsr.metrics.catalogue.catalogue`.
         variant: ``max`` (worst of four lights), ``avg`` or one of e1..e4; without effect on metrics without lights.
         **settings: as for every torchmetrics class.
 

@@ -17,7 +17,7 @@ import torchmetrics.functional.image as heads_home
 from torch import Tensor, nn
 from torch.nn.utils import skip_init
 
-from dsr.quality.functional import SurfacePair
+from dsr.metrics.functional import SurfacePair
 
 TRUNK_FILE = "alexnet-owt-7be5be79.pth"
 TRUNK_URL = f"https://download.pytorch.org/models/{TRUNK_FILE}"
