@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from dsr.cli import main
-from dsr.data.simgeo_scenes import render_scene
+from dsr.synthetic.simgeo.scenes import render_scene
 
 
 def doctor(folder):

@@ -12,9 +12,9 @@ import pytest
 from PIL import Image
 
 from dsr.cli import main
-from dsr.data.simgeo_scenes import render_scene
 from dsr.geometry.camera import Camera
 from dsr.rgbd.depth_files import read_depth_file, write_depth_file
+from dsr.synthetic.simgeo.scenes import render_scene
 
 PARTS = {
     "depth": ("depth.png", "depth_metres.npy"),

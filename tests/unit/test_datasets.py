@@ -16,7 +16,6 @@ from dsr.data.middlebury import EVALUATION_2014, Middlebury, MiddleburyLevels
 from dsr.data.patches import Part, PatchData
 from dsr.data.problem import Problem
 from dsr.data.simgeo import SimGeo
-from dsr.data.simgeo_scenes import SCENES as SIMGEO_SCENES
 from dsr.data.sunrgbd import FRAMES as SUN_FRAMES
 from dsr.data.sunrgbd import SunRGBD
 from dsr.data.tofmark import SCENES as TOFMARK_SCENES
@@ -25,6 +24,7 @@ from dsr.data.training_sets import MIDDLEBURY, MiddleburyTrain, Sintel, sintel_f
 from dsr.degradation.downsampling import Downsampling
 from dsr.methods.trained import packaged_weights
 from dsr.report.tables import published_row
+from dsr.synthetic.simgeo.scenes import SCENES as SIMGEO_SCENES
 
 CONF = Path(__file__).resolve().parents[2] / "conf" / "dataset"
 

@@ -12,9 +12,6 @@ import torch
 
 from dsr.data.files import read_map, read_rgb
 from dsr.data.folder import load_scene
-from dsr.data.procedural import render_random_scene
-from dsr.data.simgeo_scenes import render_scene
-from dsr.data.surfaces import rotation
 from dsr.doctor import examine_directory
 from dsr.doctor.examine import CHECKS, examine
 from dsr.doctor.finding import length, with_depth
@@ -23,6 +20,9 @@ from dsr.doctor.precision import find_rounding
 from dsr.doctor.registration import check_registration
 from dsr.geometry.camera import Camera, from_range, to_range
 from dsr.sample import Scene
+from dsr.synthetic.procedural.scenes import render_random_scene
+from dsr.synthetic.simgeo.scenes import render_scene
+from dsr.synthetic.surfaces import rotation
 
 SIZE = 256
 CAMERA = Camera(SIZE, SIZE, 240.0, 240.0, 127.5, 127.5, baseline=0.2)

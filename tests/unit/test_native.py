@@ -10,9 +10,9 @@ import torch
 
 import dsr.data.native as module
 from dsr.data.native import Native, Preparation, Record, records_of, renamed
-from dsr.data.rendering import cache_directory
 from dsr.geometry.camera import Camera
 from dsr.sample import Scene
+from dsr.synthetic.rendering import cache_directory
 
 
 @pytest.fixture(autouse=True)

@@ -5,16 +5,15 @@ import functools
 import numpy as np
 import pytest
 
-from dsr.data.procedural import render_random_scene
-from dsr.data.procedural.layouts import LAYOUTS
-from dsr.data.procedural.paints import PAINTS
-from dsr.data.procedural.pictures import PICTURES, palette, picture_paint
-from dsr.data.procedural.reliefs import RELIEFS, relief
-from dsr.data.procedural.scenes import camera_of, random_scene, render
-from dsr.data.procedural.shape import about, box, extrusion, merged, quad, surface
-from dsr.data.procedural.solids import SOLIDS, any_solid, ellipsoid, frustum, rounded_box
-from dsr.data.procedural.stage import Viewpoint
-from dsr.data.procedural.tracer import Tracer
+from dsr.synthetic.procedural.layouts import LAYOUTS
+from dsr.synthetic.procedural.paints import PAINTS
+from dsr.synthetic.procedural.pictures import PICTURES, palette, picture_paint
+from dsr.synthetic.procedural.reliefs import RELIEFS, relief
+from dsr.synthetic.procedural.scenes import camera_of, random_scene, render, render_random_scene
+from dsr.synthetic.procedural.shape import about, box, extrusion, merged, quad, surface
+from dsr.synthetic.procedural.solids import SOLIDS, any_solid, ellipsoid, frustum, rounded_box
+from dsr.synthetic.procedural.stage import Viewpoint
+from dsr.synthetic.procedural.tracer import Tracer
 
 SIZE = 96
 ORIGIN = np.zeros(3)

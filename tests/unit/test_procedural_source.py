@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dsr.data.procedural import render_random_scene
-from dsr.data.procedural import source as module
-from dsr.data.procedural.source import Procedural
+from dsr.data import procedural as module
+from dsr.data.procedural import Procedural
+from dsr.synthetic.procedural.scenes import render_random_scene
 
 SIZE = 48
 

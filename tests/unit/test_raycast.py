@@ -5,10 +5,10 @@ import math
 import numpy as np
 import pytest
 
-from dsr.data.implicit import Implicit
-from dsr.data.raycast import Body, World, area_light, cast, render
-from dsr.data.surfaces import Box, Cylinder, Plane, Sphere
 from dsr.geometry.camera import Camera
+from dsr.synthetic.implicit import Implicit
+from dsr.synthetic.raycast import Body, World, area_light, cast, render
+from dsr.synthetic.surfaces import Box, Cylinder, Plane, Sphere
 
 BACK = Plane(np.array([0.0, 0.0, 4.0]), np.array([0.0, 0.0, -1.0]))
 AHEAD = np.array([[0.0], [0.0], [1.0]])

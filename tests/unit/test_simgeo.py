@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from dsr.data import simgeo
-from dsr.data.rendering import cache_directory
 from dsr.data.simgeo import SimGeo
-from dsr.data.simgeo_scenes import SCENES, render_scene
+from dsr.synthetic.rendering import cache_directory
+from dsr.synthetic.simgeo.scenes import SCENES, render_scene
 
 SIZE = 64
 NAME = "cube_no_texture"

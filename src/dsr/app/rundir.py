@@ -26,7 +26,7 @@ _PACKAGES = (
 )  # fmt: skip
 _NOT_IDENTITY = ("output_dir", "overwrite", "metrics", "weights", "resume", "run")  # of the weights, the content counts
 PREDICTING_CODE = (
-    "sample.py", "degradation", "geometry", "metrics", "methods", "data", "objective.py",
+    "sample.py", "degradation", "geometry", "metrics", "synthetic", "methods", "data", "objective.py",
     "training.py", "utils/lightning.py", "prior", "evaluation.py",
 )  # fmt: skip
 """Modules and packages that determine a prediction, by their paths below the package."""

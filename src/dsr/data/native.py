@@ -20,9 +20,9 @@ import torch
 
 from dsr.data.base import Wanted, chosen
 from dsr.data.filling import filled_depth
-from dsr.data.rendering import Rendering, cache_directory, cached
 from dsr.data.resizing import fitted
 from dsr.sample import Scene
+from dsr.synthetic.rendering import Rendering, cache_directory, cached
 from dsr.utils.hashing import file_hash, hash_of_code
 
 _SMALLEST = 32

@@ -11,9 +11,9 @@ from pathlib import Path
 
 from dsr.data.base import Wanted, chosen
 from dsr.data.folder import Folder
-from dsr.data.rendering import cached
-from dsr.data.simgeo_scenes import SCENES, SCENES_VERSION, render_scene
 from dsr.sample import Scene
+from dsr.synthetic.rendering import cached
+from dsr.synthetic.simgeo.scenes import SCENES, SCENES_VERSION, render_scene
 
 
 class SimGeo:

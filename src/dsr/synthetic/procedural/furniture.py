@@ -7,11 +7,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from dsr.data.procedural.organic import plant
-from dsr.data.procedural.reliefs import blanket
-from dsr.data.procedural.shape import Shape, about, box, extrusion, lathe, merged, tube
-from dsr.data.procedural.solids import any_solid, frustum, hollow, rounded_box
-from dsr.data.surfaces import Array
+from dsr.synthetic.procedural.organic import plant
+from dsr.synthetic.procedural.reliefs import blanket
+from dsr.synthetic.procedural.shape import Shape, about, box, extrusion, lathe, merged, tube
+from dsr.synthetic.procedural.solids import any_solid, frustum, hollow, rounded_box
+from dsr.synthetic.surfaces import Array
 
 Parts = list[Shape]
 

@@ -6,16 +6,16 @@ from collections.abc import Callable
 
 import numpy as np
 
-from dsr.data.procedural.architecture import arched_wall, column
-from dsr.data.procedural.furniture import blinds, shelf, table
-from dsr.data.procedural.organic import branches, creature, figure, pebble, plant
-from dsr.data.procedural.photo import Body
-from dsr.data.procedural.props import backdrop, fill_room, heap, oddment, shell, tableware
-from dsr.data.procedural.reliefs import RELIEFS, blanket, crumple, curtain, folds, ground, relief
-from dsr.data.procedural.shape import about, any_turn, box, merged
-from dsr.data.procedural.solids import any_solid, frustum, grounded, prism
-from dsr.data.procedural.stage import Stage, Viewpoint, Wardrobe, looking
-from dsr.data.surfaces import Array
+from dsr.synthetic.procedural.architecture import arched_wall, column
+from dsr.synthetic.procedural.furniture import blinds, shelf, table
+from dsr.synthetic.procedural.organic import branches, creature, figure, pebble, plant
+from dsr.synthetic.procedural.photo import Body
+from dsr.synthetic.procedural.props import backdrop, fill_room, heap, oddment, shell, tableware
+from dsr.synthetic.procedural.reliefs import RELIEFS, blanket, crumple, curtain, folds, ground, relief
+from dsr.synthetic.procedural.shape import about, any_turn, box, merged
+from dsr.synthetic.procedural.solids import any_solid, frustum, grounded, prism
+from dsr.synthetic.procedural.stage import Stage, Viewpoint, Wardrobe, looking
+from dsr.synthetic.surfaces import Array
 
 Layout = Callable[[np.random.Generator, Wardrobe], Stage]
 

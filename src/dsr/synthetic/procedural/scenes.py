@@ -6,13 +6,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dsr.data.procedural.layouts import LAYOUTS
-from dsr.data.procedural.lighting import Lighting, random_lighting
-from dsr.data.procedural.photo import View, developed, radiance
-from dsr.data.procedural.stage import Stage, Viewpoint, Wardrobe
-from dsr.data.procedural.tracer import Hits, Tracer
-from dsr.data.rendering import Rendering
 from dsr.geometry.camera import Camera
+from dsr.synthetic.procedural.layouts import LAYOUTS
+from dsr.synthetic.procedural.lighting import Lighting, random_lighting
+from dsr.synthetic.procedural.photo import View, developed, radiance
+from dsr.synthetic.procedural.stage import Stage, Viewpoint, Wardrobe
+from dsr.synthetic.procedural.tracer import Hits, Tracer
+from dsr.synthetic.rendering import Rendering
 
 PROCEDURAL_VERSION = 1
 """Raised whenever an image would change."""
@@ -52,7 +52,7 @@ def render_random_scene(seed: int, index: int, size: int = 512) -> Rendering:
 
     Returns:
         The photo and its depth in metres, more than 0.2 everywhere and exact for the surfaces that
-        :mod:`dsr.data.procedural.tracer` describes.
+        :mod:`dsr.synthetic.procedural.tracer` describes.
 
     Raises:
         ValueError: a number is negative, or the size is not positive.

@@ -6,14 +6,14 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from dsr.data.procedural import furniture as f
-from dsr.data.procedural.organic import branches, creature, figure, pebble, plant
-from dsr.data.procedural.photo import Body
-from dsr.data.procedural.reliefs import RELIEFS, blanket, curtain, relief
-from dsr.data.procedural.shape import Shape, about, box, merged, quad, surface
-from dsr.data.procedural.solids import any_solid, bowl, letter, vase
-from dsr.data.procedural.stage import Wardrobe
-from dsr.data.surfaces import Array
+from dsr.synthetic.procedural import furniture as f
+from dsr.synthetic.procedural.organic import branches, creature, figure, pebble, plant
+from dsr.synthetic.procedural.photo import Body
+from dsr.synthetic.procedural.reliefs import RELIEFS, blanket, curtain, relief
+from dsr.synthetic.procedural.shape import Shape, about, box, merged, quad, surface
+from dsr.synthetic.procedural.solids import any_solid, bowl, letter, vase
+from dsr.synthetic.procedural.stage import Wardrobe
+from dsr.synthetic.surfaces import Array
 
 
 def shell(rng: np.random.Generator, wear: Wardrobe, size: Array) -> list[Body]:

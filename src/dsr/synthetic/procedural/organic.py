@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from skimage.measure import marching_cubes
 
-from dsr.data.procedural.shape import Shape, about, merged, surface, tube, unit
-from dsr.data.procedural.solids import grounded
-from dsr.data.surfaces import Array
+from dsr.synthetic.procedural.shape import Shape, about, merged, surface, tube, unit
+from dsr.synthetic.procedural.solids import grounded
+from dsr.synthetic.surfaces import Array
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,7 +9,7 @@ from matplotlib.font_manager import FontProperties
 from matplotlib.textpath import TextPath
 from scipy.interpolate import CubicSpline, PchipInterpolator
 
-from dsr.data.procedural.shape import (
+from dsr.synthetic.procedural.shape import (
     Shape,
     about,
     any_turn,
@@ -22,7 +22,7 @@ from dsr.data.procedural.shape import (
     tube,
     unit,
 )
-from dsr.data.surfaces import Array
+from dsr.synthetic.surfaces import Array
 
 Maker = Callable[[np.random.Generator], Shape]
 _GLYPHS = "ABCDEFGHJKLMNPRSTUVXYZ23456789&QO"

@@ -8,9 +8,9 @@ from concurrent.futures import ProcessPoolExecutor, as_completed
 from multiprocessing import get_context
 from pathlib import Path
 
-from dsr.data.procedural.scenes import PROCEDURAL_VERSION, render_random_scene
-from dsr.data.rendering import cache_directory, cached
 from dsr.sample import Scene
+from dsr.synthetic.procedural.scenes import PROCEDURAL_VERSION, render_random_scene
+from dsr.synthetic.rendering import cache_directory, cached
 
 
 class Procedural:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
-from dsr.data.surfaces import Array, Box, Field, Surface
+from dsr.synthetic.surfaces import Array, Box, Field, Surface
 
 _CELL = 0.0125  # metres between the samples of an implicit surface's lattice
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from dsr.data.procedural.shape import Shape, about, box, extrusion, merged
-from dsr.data.procedural.solids import frustum, hollow
+from dsr.synthetic.procedural.shape import Shape, about, box, extrusion, merged
+from dsr.synthetic.procedural.solids import frustum, hollow
 
 
 def column(rng: np.random.Generator, high: float) -> Shape:

@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, maximum_filter, minimum_filter
 
-from dsr.data.procedural.lighting import SETS, Lighting, arriving, visibility
-from dsr.data.procedural.paints import Paint
-from dsr.data.procedural.shape import Shape
-from dsr.data.procedural.tracer import Hits, Tracer
-from dsr.data.surfaces import Array
+from dsr.synthetic.procedural.lighting import SETS, Lighting, arriving, visibility
+from dsr.synthetic.procedural.paints import Paint
+from dsr.synthetic.procedural.shape import Shape
+from dsr.synthetic.procedural.tracer import Hits, Tracer
+from dsr.synthetic.surfaces import Array
 
 _CHUNK = 1 << 15
 _SUBPIXELS = ((-0.375, -0.125), (0.125, -0.375), (0.375, 0.125), (-0.125, 0.375))

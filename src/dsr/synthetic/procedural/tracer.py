@@ -15,8 +15,8 @@ from embreex.mesh_construction import TriangleMesh  # type: ignore[import-untype
 from embreex.rtcore_scene import EmbreeScene  # type: ignore[import-untyped]
 from numpy.typing import NDArray
 
-from dsr.data.procedural.shape import Index, Shape, merged
-from dsr.data.surfaces import Array
+from dsr.synthetic.procedural.shape import Index, Shape, merged
+from dsr.synthetic.surfaces import Array
 
 _GRAZING = 0.12  # smallest cosine between ray and normal by which a displacement is divided
 
@@ -30,7 +30,7 @@ class Hits:
         face: (N,) the number of the triangle, -1 where there is nothing.
         body: (N,) the number of the shape.
         points, normals: (3, N) in the frame of the shapes; normals face the camera.
-        rest, chart: (3, N) the paint's coordinates, as in :class:`dsr.data.procedural.shape.Shape`.
+        rest, chart: (3, N) the paint's coordinates, as in :class:`dsr.synthetic.procedural.shape.Shape`.
         bulge: (N,) metres from the triangle to the point along the normal.
 
     """

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter, minimum_filter
 
-from dsr.data.surfaces import Array, Field, Plane, Surface
 from dsr.geometry.camera import Camera
+from dsr.synthetic.surfaces import Array, Field, Plane, Surface
 
 _CHUNK = 1 << 16  # rays at a time: temporaries stay in the cache
 _LIFT = 1e-4  # metres that a shadow ray starts above its surface

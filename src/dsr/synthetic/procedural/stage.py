@@ -7,12 +7,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dsr.data.procedural import paints as p
-from dsr.data.procedural.paints import PAINTS, Paint
-from dsr.data.procedural.photo import Body
-from dsr.data.procedural.pictures import picture_paint
-from dsr.data.procedural.shape import Shape, any_turn, unit
-from dsr.data.surfaces import Array
+from dsr.synthetic.procedural import paints as p
+from dsr.synthetic.procedural.paints import PAINTS, Paint
+from dsr.synthetic.procedural.photo import Body
+from dsr.synthetic.procedural.pictures import picture_paint
+from dsr.synthetic.procedural.shape import Shape, any_turn, unit
+from dsr.synthetic.surfaces import Array
 
 _USUAL: dict[str, tuple[Callable[[np.random.Generator, str, float], Paint], ...]] = {
     "wood": (p.grain, p.grain, p.grain, p.solid_colour),

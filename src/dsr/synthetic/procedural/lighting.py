@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dsr.data.procedural.paints import fractal
-from dsr.data.procedural.shape import Index, unit
-from dsr.data.procedural.tracer import Hits, Tracer
-from dsr.data.surfaces import Array
+from dsr.synthetic.procedural.paints import fractal
+from dsr.synthetic.procedural.shape import Index, unit
+from dsr.synthetic.procedural.tracer import Hits, Tracer
+from dsr.synthetic.surfaces import Array
 
 Cookie = Callable[[Array], Array]
 SETS = 16

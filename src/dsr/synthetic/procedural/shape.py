@@ -1,7 +1,7 @@
 """Triangle meshes with what the renderer needs at every vertex, and the general ways to make them.
 
-A shape stands for the curved surface that its vertex normals suggest (see :mod:`dsr.data.procedural.tracer`), so edges
-that are to stay sharp have their vertices twice. Local frames have z up; lengths are in metres.
+A shape stands for the curved surface that its vertex normals suggest (see :mod:`dsr.synthetic.procedural.tracer`), so
+edges that are to stay sharp have their vertices twice. Local frames have z up; lengths are in metres.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import mapbox_earcut
 import numpy as np
 from numpy.typing import NDArray
 
-from dsr.data.surfaces import Array
+from dsr.synthetic.surfaces import Array
 
 Index = NDArray[np.intp]
 

@@ -10,7 +10,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from dsr.data.surfaces import Array, Field, rotation
+from dsr.synthetic.surfaces import Array, Field, rotation
 
 Vector = tuple[float, float, float]
 

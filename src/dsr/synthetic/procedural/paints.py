@@ -11,9 +11,9 @@ from collections.abc import Callable
 
 import numpy as np
 
-from dsr.data.procedural.shape import any_turn
-from dsr.data.surfaces import Array, rotation
-from dsr.data.textures import noise
+from dsr.synthetic.procedural.shape import any_turn
+from dsr.synthetic.surfaces import Array, rotation
+from dsr.synthetic.textures import noise
 
 Paint = Callable[[Array, Array], Array]
 Palette = Array

@@ -10,13 +10,13 @@ from functools import lru_cache
 
 import numpy as np
 
-from dsr.data.implicit import Implicit
-from dsr.data.raycast import Body, World, area_light, render
-from dsr.data.rendering import Rendering
-from dsr.data.simgeo_statue import statue_distance
-from dsr.data.surfaces import Array, Box, Cylinder, Field, Plane, Sphere, rotation
-from dsr.data.textures import CLOUD, DUSK, blobs, marble, mosaic, noise, plain, unrolled, weave
 from dsr.geometry.camera import VIRTUAL_BASELINE, Camera
+from dsr.synthetic.implicit import Implicit
+from dsr.synthetic.raycast import Body, World, area_light, render
+from dsr.synthetic.rendering import Rendering
+from dsr.synthetic.simgeo.statue import statue_distance
+from dsr.synthetic.surfaces import Array, Box, Cylinder, Field, Plane, Sphere, rotation
+from dsr.synthetic.textures import CLOUD, DUSK, blobs, marble, mosaic, noise, plain, unrolled, weave
 
 SCENES: tuple[str, ...] = (
     "cube_high_freq",

@@ -12,8 +12,8 @@ import numpy as np
 from scipy.ndimage import gaussian_filter
 from scipy.spatial import cKDTree
 
-from dsr.data.procedural.shape import Shape, surface
-from dsr.data.surfaces import Array
+from dsr.synthetic.procedural.shape import Shape, surface
+from dsr.synthetic.surfaces import Array
 
 Heights = tuple[Array, Array, float]
 _FACE = cv2.FONT_HERSHEY_TRIPLEX

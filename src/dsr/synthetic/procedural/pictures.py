@@ -6,9 +6,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from dsr.data.procedural.paints import Paint, Palette, palette
-from dsr.data.procedural.reliefs import spectrum
-from dsr.data.surfaces import Array
+from dsr.synthetic.procedural.paints import Paint, Palette, palette
+from dsr.synthetic.procedural.reliefs import spectrum
+from dsr.synthetic.surfaces import Array
 
 Image = NDArray[np.uint8]
 """(S, S, 3); a value stands for the linear light (value / 255)**2."""

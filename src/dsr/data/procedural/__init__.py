@@ -1,9 +1,0 @@
-"""``dataset=procedural``: endless random scenes with exact depth, to train on.
-
-Read :mod:`~dsr.data.procedural.scenes` first; below it come the layouts, their props and furniture, the shapes and
-paints, the ray tracer and the photo.
-"""
-
-from dsr.data.procedural.scenes import PROCEDURAL_VERSION, render_random_scene
-
-__all__ = ["PROCEDURAL_VERSION", "render_random_scene"]

@@ -1,1 +1,0 @@
-"""Metrics of depth maps and of their renderings."""

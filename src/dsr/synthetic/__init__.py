@@ -1,0 +1,1 @@
+"""Everything that renders: ray casters, SimGeo's scenes, random scenes to train on."""

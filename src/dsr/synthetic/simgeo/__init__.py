@@ -1,0 +1,1 @@
+"""SimGeo: the paper's geometric scenes, and a statue."""
