@@ -5,9 +5,9 @@ from urllib.parse import urlsplit
 
 import pytest
 
+from dsr.data.download.catalogue import CATALOGUE, EVALUATION_2014, SCENES_2006, TRAINING_2014, find
 from dsr.data.middlebury import EVALUATION_2014 as EVALUATED
 from dsr.data.middlebury import SCENES
-from dsr.fetching.catalogue import CATALOGUE, EVALUATION_2014, SCENES_2006, TRAINING_2014, find
 
 ITEMS = [item for collection in CATALOGUE.values() for item in collection.items]
 

@@ -13,14 +13,15 @@ from dsr.data.formats.sintel import SEQUENCES
 from dsr.data.icl import FRAMES as ICL_FRAMES
 from dsr.data.icl import ICL
 from dsr.data.middlebury import EVALUATION_2014, Middlebury, MiddleburyLevels
+from dsr.data.middlebury_train import MIDDLEBURY, MiddleburyTrain
 from dsr.data.patches import Part, PatchData
 from dsr.data.problem import Problem
 from dsr.data.simgeo import SimGeo
+from dsr.data.sintel import Sintel, sintel_frames
 from dsr.data.sunrgbd import FRAMES as SUN_FRAMES
 from dsr.data.sunrgbd import SunRGBD
 from dsr.data.tofmark import SCENES as TOFMARK_SCENES
 from dsr.data.tofmark import ToFMark
-from dsr.data.training_sets import MIDDLEBURY, MiddleburyTrain, Sintel, sintel_frames
 from dsr.degradation.downsampling import Downsampling
 from dsr.methods.trained import packaged_weights
 from dsr.report.tables import published_row

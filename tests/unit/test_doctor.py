@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 import torch
 
-from dsr.data.files import read_map, read_rgb
 from dsr.data.folder import load_scene
+from dsr.data.formats.files import read_map, read_rgb
 from dsr.doctor import examine_directory
 from dsr.doctor.examine import CHECKS, examine
 from dsr.doctor.finding import length, with_depth

@@ -16,11 +16,12 @@ from pathlib import Path
 
 import pytest
 
-from dsr.fetching import download, unpack
-from dsr.fetching.catalogue import Collection, Item
-from dsr.fetching.checksums import Checksums, alone
-from dsr.fetching.fetch import Options, get
-from dsr.fetching.inventory import state, verify
+from dsr.data.download import transfer as download
+from dsr.data.download import unpack
+from dsr.data.download.catalogue import Collection, Item
+from dsr.data.download.checksums import Checksums, alone
+from dsr.data.download.get import Options, get
+from dsr.data.download.inventory import state, verify
 
 PNG = b"\x89PNG\r\n\x1a\n" + bytes(range(256)) * 1600
 OTHER = b"\x89PNG\r\n\x1a\n" + bytes(range(255, -1, -1)) * 1600
@@ -175,7 +176,7 @@ def test_an_interruption_keeps_what_has_come(server, tmp_path):
 
 def test_what_came_whole_before_an_interruption_is_not_asked_for_again(server, tmp_path, monkeypatch):
     with monkeypatch.context() as patch:
-        patch.setattr("dsr.fetching.fetch.expect_kind", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+        patch.setattr("dsr.data.download.get.expect_kind", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
         with pytest.raises(KeyboardInterrupt):
             fetched(picture(server), tmp_path)
     assert not (tmp_path / "set/a.png").exists()

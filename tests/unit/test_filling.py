@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from dsr.data.filling import filled_depth
+from dsr.data.preparation.inpainting import filled_depth
 
 
 def inverse_plane(height=40, width=60):

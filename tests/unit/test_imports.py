@@ -7,7 +7,6 @@ from module_graph import IMPORTS, MODULES, imports_of, within
 
 LAYERS = (
     ("dsr.utils.files", "dsr.utils.hashing", "dsr.utils.console"),
-    ("dsr.fetching",),
     ("dsr.geometry.camera",),
     ("dsr.sample", "dsr.degradation.holes", "dsr.degradation.noise", "dsr.geometry.surface", "dsr.geometry.shading"),
     ("dsr.store", "dsr.geometry.mesh"),
@@ -108,9 +107,9 @@ def test_modules_do_not_import_each_other_in_a_circle():
 @pytest.mark.parametrize(
     ("module", "text", "offence"),
     [
-        ("dsr.degradation.downsampling", "import dsr.data.files", "dsr.data.files"),
-        ("dsr.data.files", "from dsr.methods import msg_net", "dsr.methods.msg_net"),
-        ("dsr.data.files", "def f():\n    from ..metrics import lpips", "dsr.metrics.lpips"),
+        ("dsr.degradation.downsampling", "import dsr.data.formats.files", "dsr.data.formats.files"),
+        ("dsr.data.formats.files", "from dsr.methods import msg_net", "dsr.methods.msg_net"),
+        ("dsr.data.formats.files", "def f():\n    from ...metrics import lpips", "dsr.metrics.lpips"),
         ("dsr.metrics.classes", "from dsr.metrics import losses", "dsr.metrics"),
         ("dsr.report.tables", "from dsr.evaluation import score", "dsr.evaluation"),
         ("dsr.evaluation", "from omegaconf.errors import X", "omegaconf.errors"),

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-import dsr.data.native as module
-from dsr.data.native import Native, Preparation, Record, records_of, renamed
+import dsr.data.preparation.records as module
+from dsr.data.preparation.records import Native, Preparation, Record, records_of, renamed
 from dsr.geometry.camera import Camera
 from dsr.sample import Scene
 from dsr.synthetic.rendering import cache_directory

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from dsr.data.resizing import cropped, fitted, resized, resized_depth
+from dsr.data.preparation.resizing import cropped, fitted, resized, resized_depth
 from dsr.geometry.camera import Camera
 from dsr.geometry.surface import normals_of
 from dsr.sample import Scene

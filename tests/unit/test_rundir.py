@@ -95,7 +95,7 @@ NOT_PREDICTING = (
     "utils/console.py",
     "store.py",
     "upsampling",
-    "fetching",
+    "data/download",
 )
 """What they import and what does not determine one: files, texts, downloads; ``dsr.upsample`` is imported by name."""
 

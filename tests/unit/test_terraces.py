@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from dsr.data.terraces import smoothed_levels
+from dsr.data.preparation.dequantization import smoothed_levels
 
 Y, X = np.mgrid[:120, :160].astype(float)
 

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from rich.console import Console
 
 from dsr.cli import data, doctor, report, study, upsample
-from dsr.fetching.catalogue import CATALOGUE, Collection
+from dsr.data.download.catalogue import CATALOGUE, Collection
 from dsr.utils.console import INTERRUPTED, USAGE_ERROR, one_line, open_console, print_error, show
 
 _EXAMPLES = """\
@@ -31,7 +31,7 @@ def main(arguments: Sequence[str] | None = None, catalogue: Mapping[str, Collect
 
     Args:
         arguments: of the command line; those of the process where None.
-        catalogue: the data sets to offer; :data:`dsr.fetching.catalogue.CATALOGUE` where None.
+        catalogue: the data sets to offer; :data:`dsr.data.download.catalogue.CATALOGUE` where None.
 
     """
     options = _parser().parse_args(arguments)

@@ -11,12 +11,12 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from dsr.fetching.catalogue import Collection, find
-from dsr.fetching.display import Display
-from dsr.fetching.download import megabytes
-from dsr.fetching.fetch import Options, get
-from dsr.fetching.inventory import absent, state, verify
-from dsr.fetching.place import data_root
+from dsr.data.download.catalogue import Collection, find
+from dsr.data.download.display import Display
+from dsr.data.download.get import Options, get
+from dsr.data.download.inventory import absent, state, verify
+from dsr.data.download.location import data_root
+from dsr.data.download.transfer import megabytes
 from dsr.utils.console import show
 
 _EXAMPLES = """\

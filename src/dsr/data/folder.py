@@ -6,7 +6,7 @@
               mask.png                       optional; 0 where the fine depth is unknown
               depth_lr4.*, disparity_lr4.*   optional; a measured coarse map, here at x4, disparity in its own pixels
 
-Depth and disparity follow ``camera.json``; see :func:`dsr.data.files.read_camera` for its keys.
+Depth and disparity follow ``camera.json``; see :func:`dsr.data.formats.files.read_camera` for its keys.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ import torch
 from torch import Tensor
 
 from dsr.data.base import Wanted, chosen
-from dsr.data.files import MAP_SUFFIXES, CameraFile, read_camera, read_map, read_mask, read_rgb
+from dsr.data.formats.files import MAP_SUFFIXES, CameraFile, read_camera, read_map, read_mask, read_rgb
 from dsr.geometry.camera import Camera, RangeType, from_range
 from dsr.sample import Scene
 

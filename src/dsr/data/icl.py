@@ -13,7 +13,7 @@ from types import MappingProxyType
 
 from dsr.data.base import Wanted
 from dsr.data.formats import icl_nuim
-from dsr.data.native import Native, Preparation, listed, records_of, renamed
+from dsr.data.preparation.records import Native, Preparation, listed, records_of, renamed
 
 FRAMES = MappingProxyType(
     {
@@ -34,7 +34,7 @@ class ICL(Native):
         root: where the trajectories' folders lie.
         scenes: names of the ones to use; None for the paper's six, ``found`` for every frame in ``root``.
         size: height and width in pixels; None for frames as they are.
-        crop: see :class:`dsr.data.native.Preparation`.
+        crop: see :class:`dsr.data.preparation.records.Preparation`.
         frames: which frame each of the paper's names stands for.
 
     Raises:

@@ -1,7 +1,7 @@
 """``dataset=middlebury``, ``middlebury2001`` .. ``middlebury2006``: stereo benchmarks to evaluate on.
 
 Of the 2014 data set the seven scenes of Voynov et al. 2019, of the others all. Scenes to train on: see
-:mod:`dsr.data.training_sets`.
+:mod:`dsr.data.middlebury_train`.
 """
 
 from __future__ import annotations
@@ -11,9 +11,9 @@ from collections.abc import Collection, Sequence
 from pathlib import Path
 
 from dsr.data.base import Wanted
+from dsr.data.download import catalogue
 from dsr.data.formats import middlebury
-from dsr.data.native import Native, Preparation, Record
-from dsr.fetching import catalogue
+from dsr.data.preparation.records import Native, Preparation, Record
 
 
 def _names(folders: Sequence[str]) -> tuple[str, ...]:
@@ -39,7 +39,7 @@ class Middlebury(Native):
     Args:
         root: where folders such as ``Recycle-perfect`` or ``Recycle`` lie.
         scenes: names of the ones to use; None for the paper's seven, ``found`` for all in ``root``.
-        size, crop: see :class:`dsr.data.native.Preparation`.
+        size, crop: see :class:`dsr.data.preparation.records.Preparation`.
         fill: names of the scenes whose holes are filled.
         without_offset: names of the scenes whose disparity offset is taken for 0, so that their depth is not what it
             was: the paper's figures of Vintage are of such depth, those of Recycle and Playroom are not.
@@ -72,9 +72,10 @@ class MiddleburyLevels(Native):
         root: where the scenes lie.
         year: of the data set.
         scenes: names of the ones to use; None for all that there are, ``found`` for all in ``root``.
-        size, crop: see :class:`dsr.data.native.Preparation`.
+        size, crop: see :class:`dsr.data.preparation.records.Preparation`.
         fill: names of the scenes whose holes are filled.
-        smooth: whether terraces of the rounding to whole levels become slopes; see :mod:`dsr.data.terraces`.
+        smooth: whether terraces of the rounding to whole levels become slopes; see
+            :mod:`dsr.data.preparation.dequantization`.
 
     Raises:
         ValueError: a scene is not there, or a value is out of range.

@@ -11,7 +11,7 @@ from types import MappingProxyType
 
 from dsr.data.base import Wanted
 from dsr.data.formats import sunrgbd
-from dsr.data.native import Native, Preparation, Record, listed, records_of, renamed
+from dsr.data.preparation.records import Native, Preparation, Record, listed, records_of, renamed
 
 FRAMES = MappingProxyType(
     {
@@ -39,7 +39,7 @@ class SunRGBD(Native):
         root: where the scenes' folders lie, at any depth.
         scenes: names of the ones to use; None for twelve, ``found`` for all in ``root``.
         size: height and width in pixels; None for scenes as they are.
-        crop: see :class:`dsr.data.native.Preparation`.
+        crop: see :class:`dsr.data.preparation.records.Preparation`.
         refined: whether the authors' refined depth, without holes, is taken for the truth.
         frames: which folder each of the twelve names stands for.
         intrinsics: fx, fy, cx, cy in pixels for folders without ``intrinsics.txt``.

@@ -15,7 +15,7 @@ from pathlib import Path
 
 from dsr.data.base import Wanted
 from dsr.data.formats import tofmark
-from dsr.data.native import Native, Preparation, listed, records_of
+from dsr.data.preparation.records import Native, Preparation, listed, records_of
 
 SCENES = ("books", "devil", "shark")
 ESTIMATED = (549.2, 549.2, 375.2, 334.3)

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from dsr.data.files import CameraFile, read_camera
+from dsr.data.formats.files import CameraFile, read_camera
 from dsr.geometry.camera import Camera
 from dsr.rgbd.encoding import Fact
 from dsr.rgbd.photos import Size, focal_in_exif, same_aspect

@@ -13,7 +13,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from dsr.data.files import expect_depth_values, quiet_decoders, read_values
+from dsr.data.formats.files import expect_depth_values, quiet_decoders, read_values
 from dsr.utils.files import read_arrays, replacing
 
 DEPTH_SUFFIXES = (".png", ".tiff", ".tif", ".npy", ".npz", ".pfm", ".exr")

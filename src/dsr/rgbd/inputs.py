@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dsr.data.files import CameraFile, read_mask
+from dsr.data.formats.files import CameraFile, read_mask
 from dsr.geometry.camera import Camera, RangeType
 from dsr.rgbd.cameras import CameraChoice, camera_of
 from dsr.rgbd.depth_files import read_depth_file

@@ -9,7 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from dsr.data.files import read_pixels
+from dsr.data.formats.files import read_pixels
 from dsr.rgbd.depth_files import DEPTH_SUFFIXES
 from dsr.rgbd.encoding import Fact
 from dsr.rgbd.names import match_times, role_of, role_of_words, words_of

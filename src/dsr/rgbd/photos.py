@@ -9,7 +9,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from dsr.data.files import read_pixels
+from dsr.data.formats.files import read_pixels
 from dsr.rgbd.encoding import Fact
 
 _ORIENTATION, _EXIF_IFD, _EXIF_FOCAL_35 = 0x0112, 0x8769, 0xA405

@@ -26,9 +26,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dsr.data.files import read_levels, read_map
+from dsr.data.formats.files import read_levels, read_map
 from dsr.data.formats.shared import expect_size, read_picture
-from dsr.data.terraces import smoothed_levels
+from dsr.data.preparation.dequantization import smoothed_levels
 from dsr.geometry.camera import Camera, from_range
 from dsr.sample import Scene
 
@@ -122,7 +122,7 @@ def load_levels(files: Files, dataset: str, name: str, year: int, *, smooth: boo
         dataset: of the scene returned.
         name: the same.
         year: that of the data set, which says how levels count.
-        smooth: whether terraces of the rounding become slopes; see :mod:`dsr.data.terraces`.
+        smooth: whether terraces of the rounding become slopes; see :mod:`dsr.data.preparation.dequantization`.
 
     Raises:
         ValueError: a file is missing, damaged, or does not fit the others; the message names it.

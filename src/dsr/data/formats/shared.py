@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dsr.data.files import read_pixels
+from dsr.data.formats.files import read_pixels
 from dsr.geometry.camera import Camera
 
 _LONGEST = 40

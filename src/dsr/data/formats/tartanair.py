@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from torch import Tensor
 
-from dsr.data.files import read_map
+from dsr.data.formats.files import read_map
 from dsr.data.formats.shared import expect_size, name_of, read_picture, to_depth, walk
 from dsr.geometry.camera import Camera
 from dsr.sample import Scene

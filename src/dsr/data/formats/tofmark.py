@@ -23,7 +23,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dsr.data.files import read_levels
+from dsr.data.formats.files import read_levels
 from dsr.data.formats.matlab import read_variables
 from dsr.data.formats.shared import expect_size, given_camera, name_of, read_picture, to_depth, walk
 from dsr.sample import Scene

@@ -9,8 +9,8 @@ from collections.abc import Iterator
 from rich.console import Console
 from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeRemainingColumn, TransferSpeedColumn
 
-from dsr.fetching.checksums import Moved
-from dsr.fetching.download import megabytes
+from dsr.data.download.checksums import Moved
+from dsr.data.download.transfer import megabytes
 from dsr.utils.console import show
 
 _LOG_SECONDS = 30.0
@@ -18,7 +18,7 @@ _LOG_SECONDS = 30.0
 
 
 class Display:
-    """Bars with speed and time left on a terminal, lines elsewhere; see :class:`dsr.fetching.inventory.Watcher`.
+    """Bars with speed and time left on a terminal, lines elsewhere; see :class:`dsr.data.download.inventory.Watcher`.
 
     Args:
         console: where they are shown.

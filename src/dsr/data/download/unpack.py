@@ -15,8 +15,8 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import IO
 
-from dsr.fetching.checksums import Moved
-from dsr.fetching.download import disk_errors, expect_room
+from dsr.data.download.checksums import Moved
+from dsr.data.download.transfer import disk_errors, expect_room
 from dsr.utils.console import one_line
 
 _CHUNK = 1 << 20

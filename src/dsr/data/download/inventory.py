@@ -7,9 +7,9 @@ from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Protocol
 
-from dsr.fetching.catalogue import Collection, Item
-from dsr.fetching.checksums import Checksums, Entry, Moved, alone, sha256_of
-from dsr.fetching.download import is_page
+from dsr.data.download.catalogue import Collection, Item
+from dsr.data.download.checksums import Checksums, Entry, Moved, alone, sha256_of
+from dsr.data.download.transfer import is_page
 
 _BEGINNINGS: Mapping[str, tuple[bytes, ...]] = {
     ".gz": (b"\x1f\x8b",),

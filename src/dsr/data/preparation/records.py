@@ -19,17 +19,14 @@ from typing import Any
 import torch
 
 from dsr.data.base import Wanted, chosen
-from dsr.data.filling import filled_depth
-from dsr.data.resizing import fitted
+from dsr.data.preparation.inpainting import filled_depth
+from dsr.data.preparation.resizing import fitted
 from dsr.sample import Scene
 from dsr.synthetic.rendering import Rendering, cache_directory, cached
 from dsr.utils.hashing import file_hash, hash_of_code
 
 _SMALLEST = 32
-_READING_CODE = (
-    "geometry/camera.py", "data/resizing.py", "data/filling.py", "data/terraces.py", "data/native.py", "data/files.py",
-    "data/formats",
-)  # fmt: skip
+_READING_CODE = ("geometry/camera.py", "data/preparation", "data/formats")
 _HASHED_WHOLE = 1 << 28
 """Bytes; of a larger file the name, the size and the time of its last change stand for the content."""
 
@@ -109,7 +106,7 @@ class Preparation:
         crop: where along the longer side a square window lies: 0 at the top or left, 1 at the bottom or right; None for
             no window.
         enlarge: whether smaller scenes are enlarged.
-        fill: names of the scenes whose holes are filled; see :mod:`dsr.data.filling`.
+        fill: names of the scenes whose holes are filled; see :mod:`dsr.data.preparation.inpainting`.
 
     Raises:
         ValueError: a value is out of range.

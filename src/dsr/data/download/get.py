@@ -13,11 +13,11 @@ from urllib.parse import urlsplit
 
 import pooch  # type: ignore[import-untyped]
 
-from dsr.fetching.catalogue import Item
-from dsr.fetching.checksums import Checksums, Entry, alone, sha256_of
-from dsr.fetching.download import FetchError, NoSpaceError, UnreachableError, download, megabytes
-from dsr.fetching.inventory import Watcher, compare, expect_kind, lack, record
-from dsr.fetching.unpack import take_member, unpack
+from dsr.data.download.catalogue import Item
+from dsr.data.download.checksums import Checksums, Entry, alone, sha256_of
+from dsr.data.download.inventory import Watcher, compare, expect_kind, lack, record
+from dsr.data.download.transfer import FetchError, NoSpaceError, UnreachableError, download, megabytes
+from dsr.data.download.unpack import take_member, unpack
 from dsr.utils.console import one_line
 
 _UNPACKED = 1.25

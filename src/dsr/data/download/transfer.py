@@ -16,7 +16,7 @@ from urllib.parse import urlsplit
 import requests
 import urllib3
 
-from dsr.fetching.checksums import Moved
+from dsr.data.download.checksums import Moved
 from dsr.utils.console import one_line
 from dsr.utils.files import write_text
 

@@ -1,0 +1,1 @@
+"""Getting data sets: what there is, resumable downloads, checksums, archives."""

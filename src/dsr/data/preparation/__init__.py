@@ -1,0 +1,1 @@
+"""Scenes made ready: resized, cropped, inpainted, freed of quantization."""

@@ -1,1 +1,0 @@
-"""Getting data sets: what there is, downloads that go on where they stopped, checksums, archives."""
