@@ -20,8 +20,8 @@ import torch
 
 from dsr.data.folder import Folder
 from dsr.degradation.downsampling import Downsampling, make_sample
-from dsr.methods.trained import build_trained, packaged_weights
-from dsr.methods.weights import read_head
+from dsr.methods.networks.trained import build_trained, packaged_weights
+from dsr.methods.networks.weight_files import read_head
 from dsr.metrics.catalogue import WORST, Metric, catalogue, score_image
 from dsr.metrics.lpips import load_lpips
 

@@ -28,13 +28,13 @@ from dsr.data.augment import window
 from dsr.data.folder import Folder
 from dsr.degradation.downsampling import Downsampling, make_sample
 from dsr.degradation.noise import GaussianMultiplicative
-from dsr.methods.interpolation import Interpolation
-from dsr.methods.trained import packaged_weights
+from dsr.methods.classical.interpolation import Interpolation
+from dsr.methods.dip.problem import ImageProblem
+from dsr.methods.dip.stopping import Fixed, Residual, Stopping, Variance
+from dsr.methods.dip.upsampler import DeepImagePrior, WarmStarted
+from dsr.methods.networks.trained import packaged_weights
 from dsr.metrics.classes import visual_metrics
 from dsr.metrics.functional import SurfacePair
-from dsr.prior.method import DeepImagePrior, WarmStarted
-from dsr.prior.problem import ImageProblem
-from dsr.prior.stopping import Fixed, Residual, Stopping, Variance
 from dsr.sample import DepthSample, Scene
 
 BOX = Downsampling("box")

@@ -25,11 +25,11 @@ from torch.nn import functional
 from dsr.app.build import fast_precision
 from dsr.data.simgeo import SimGeo
 from dsr.degradation.downsampling import Downsampling, make_sample
-from dsr.methods import skip_net
+from dsr.methods.dip import skip_net
+from dsr.methods.dip.optimisation import PriorOptimisation
+from dsr.methods.dip.upsampler import DeepImagePrior
 from dsr.metrics.classes import visual_metrics
 from dsr.metrics.functional import SurfacePair
-from dsr.prior.method import DeepImagePrior
-from dsr.prior.optimisation import PriorOptimisation
 from dsr.sample import DepthSample
 
 BOX = Downsampling("box")

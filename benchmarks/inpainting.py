@@ -25,10 +25,10 @@ from dsr.degradation.downsampling import Downsampling, make_sample
 from dsr.degradation.holes import Blobs, Holes, Shadows
 from dsr.geometry.shading import render
 from dsr.geometry.surface import normals_of
-from dsr.methods.interpolation import Interpolation
-from dsr.methods.trained import build_trained, packaged_weights
+from dsr.methods.classical.interpolation import Interpolation
+from dsr.methods.dip.upsampler import DeepImagePrior
+from dsr.methods.networks.trained import build_trained, packaged_weights
 from dsr.metrics.functional import SurfacePair, rmse_d, rmse_v
-from dsr.prior.method import DeepImagePrior
 from dsr.sample import DepthSample, Scene
 
 BOX = Downsampling("box")

@@ -23,7 +23,7 @@ from dsr.app.build import build
 from dsr.app.schema import plain_config, register
 from dsr.data.folder import Folder
 from dsr.degradation.downsampling import Downsampling, make_sample
-from dsr.methods.trained import packaged_weights
+from dsr.methods.networks.trained import packaged_weights
 
 CONF = Path(__file__).resolve().parents[1] / "conf"
 METHODS = (

@@ -19,8 +19,8 @@ from torch import Tensor
 
 from dsr.data.folder import Folder
 from dsr.geometry.camera import Camera
-from dsr.methods import network
-from dsr.methods.trained import build_trained, packaged_weights
+from dsr.methods.networks import base as network
+from dsr.methods.networks.trained import build_trained, packaged_weights
 from dsr.upsampling import upsample_depth
 from dsr.upsampling.planning import NETWORKS
 

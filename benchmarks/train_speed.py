@@ -20,7 +20,7 @@ from dsr.data.cutting import Patches, PatchSettings
 from dsr.data.problem import Batch, Problem
 from dsr.data.simgeo import SimGeo
 from dsr.degradation.downsampling import Downsampling
-from dsr.methods.msg_net import MSGNet
+from dsr.methods.networks.msg_net import MSGNet
 from dsr.objective import Objective
 
 SCALE = 4

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 from dsr.data.problem import Batch
 from dsr.geometry.comparison import comparison
-from dsr.methods.network import DisparityNetwork
+from dsr.methods.networks.base import DisparityNetwork
 from dsr.metrics.functional import SurfacePair
 from dsr.objective import Objective, depth_of
 

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from dsr.degradation.downsampling import Downsampling, make_sample
 from dsr.geometry.camera import Camera, from_range
-from dsr.methods.interpolation import Interpolation
+from dsr.methods.classical.interpolation import Interpolation
 from dsr.metrics.catalogue import Score, catalogue, score_image
 from dsr.metrics.lpips import LPIPS, load_lpips
 from dsr.sample import Scene

@@ -13,10 +13,10 @@ from torch import Tensor
 from torch.nn import functional
 
 from dsr.geometry.camera import Camera, from_range, to_range
-from dsr.methods.maps import upsample_bicubic
-from dsr.methods.msg_guidance import VariantName
-from dsr.methods.network import Precision
-from dsr.methods.trained import build_trained
+from dsr.methods.networks.base import Precision
+from dsr.methods.networks.maps import upsample_bicubic
+from dsr.methods.networks.msg_guidance import VariantName
+from dsr.methods.networks.trained import build_trained
 from dsr.sample import DepthSample
 
 FILES: dict[str, tuple[VariantName, str]] = {

@@ -13,8 +13,8 @@ from torch import Tensor
 
 from dsr.data.simgeo import SimGeo
 from dsr.degradation.downsampling import Downsampling, make_sample
-from dsr.methods.network import NetworkUpsampler
-from dsr.methods.trained import build_trained, packaged_weights
+from dsr.methods.networks.base import NetworkUpsampler
+from dsr.methods.networks.trained import build_trained, packaged_weights
 from dsr.metrics.catalogue import WORST, Metric, catalogue, score_image
 from dsr.metrics.lpips import load_lpips
 from dsr.sample import DepthSample

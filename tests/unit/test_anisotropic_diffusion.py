@@ -11,8 +11,8 @@ from small_scenes import disparity_of, plane, random_scene, sample_of, step
 from torch import Tensor
 
 from dsr.geometry.camera import to_range
-from dsr.methods.anisotropic_diffusion import AnisotropicDiffusion
-from dsr.methods.differences import upsampled
+from dsr.methods.classical.anisotropic_diffusion import AnisotropicDiffusion
+from dsr.methods.classical.finite_differences import upsampled
 from dsr.sample import DepthSample
 
 

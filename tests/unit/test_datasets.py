@@ -23,7 +23,7 @@ from dsr.data.sunrgbd import SunRGBD
 from dsr.data.tofmark import SCENES as TOFMARK_SCENES
 from dsr.data.tofmark import ToFMark
 from dsr.degradation.downsampling import Downsampling
-from dsr.methods.trained import packaged_weights
+from dsr.methods.networks.trained import packaged_weights
 from dsr.report.tables import published_row
 from dsr.synthetic.simgeo.scenes import SCENES as SIMGEO_SCENES
 

@@ -9,9 +9,9 @@ from small_scenes import maps, photos, plane_map
 from torch import Tensor
 from torch.nn import functional
 
-from dsr.methods.analysis_filters import WIDTHS, influence, penalty, plane_free_basis, zero_mean_basis
-from dsr.methods.differences import box_mean, repeated, upsampled
-from dsr.methods.dynamic_guidance import DynamicGuidance, Stage
+from dsr.methods.classical.finite_differences import box_mean, repeated, upsampled
+from dsr.methods.networks.analysis_filters import WIDTHS, influence, penalty, plane_free_basis, zero_mean_basis
+from dsr.methods.networks.dg import DynamicGuidance, Stage
 
 SCALES = (2, 4, 8, 16)
 

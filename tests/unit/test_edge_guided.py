@@ -13,10 +13,10 @@ from torch import Tensor
 from dsr.degradation.downsampling import Downsampling, make_sample
 from dsr.geometry.camera import Camera, from_range, to_range
 from dsr.methods.base import Iterative, NoAnswerError
-from dsr.methods.edge_filter import filtered, reachable
-from dsr.methods.edge_guided import EdgeGuided, prime_factors
-from dsr.methods.guidance import slopes_along
-from dsr.methods.interpolation import Interpolation
+from dsr.methods.classical.eg.bilateral import filtered, reachable
+from dsr.methods.classical.eg.upsampler import EdgeGuided, prime_factors
+from dsr.methods.classical.interpolation import Interpolation
+from dsr.methods.classical.photo_guided import slopes_along
 from dsr.sample import DepthSample, Scene
 
 

@@ -11,9 +11,9 @@ from scipy import ndimage
 from torch import Tensor
 
 from dsr.methods.base import NoAnswerError
-from dsr.methods.belief_propagation import energy, labelled
-from dsr.methods.edge_map import edge_map, edges, thinned
-from dsr.methods.edge_patches import PATCH, Patches, averaged, distances, distinct, nearest, overlaps, turned
+from dsr.methods.classical.eg.belief_propagation import energy, labelled
+from dsr.methods.classical.eg.edge_map import edge_map, edges, thinned
+from dsr.methods.classical.eg.patches import PATCH, Patches, averaged, distances, distinct, nearest, overlaps, turned
 
 
 def _field(nodes: int, pairs: list[tuple[int, int]], labels: int = 3, seed: int = 0) -> tuple[Tensor, Tensor, Tensor]:

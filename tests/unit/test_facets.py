@@ -10,8 +10,8 @@ from small_scenes import maps, photos, plane_map
 from torch import Tensor
 from torch.nn import functional
 
-from dsr.methods.facets import Facets, stencil
-from dsr.methods.holes import filled
+from dsr.methods.networks.facets import Facets, stencil
+from dsr.methods.networks.inpainting import filled
 
 SCALES = (2, 4, 8, 16)
 

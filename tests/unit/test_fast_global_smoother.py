@@ -9,8 +9,8 @@ from torch import Tensor
 
 from dsr.degradation.downsampling import Downsampling, Kernel, make_sample
 from dsr.geometry.camera import Camera, from_range, to_range
-from dsr.methods.fast_global_smoother import FastGlobalSmoother, smoothed, solved_lines
-from dsr.methods.interpolation import Interpolation
+from dsr.methods.classical.fast_global_smoother import FastGlobalSmoother, smoothed, solved_lines
+from dsr.methods.classical.interpolation import Interpolation
 from dsr.sample import DepthSample, Scene
 
 

@@ -11,10 +11,10 @@ from torch import Tensor
 
 from dsr.degradation.downsampling import SCALES, Downsampling, Kernel, make_sample
 from dsr.geometry.camera import Camera, from_range, to_range
-from dsr.methods.fast_global_smoother import FastGlobalSmoother
-from dsr.methods.guidance import GuidedMethod, slopes_along
-from dsr.methods.guided_filter import GuidedFilter
-from dsr.methods.joint_bilateral import JointBilateral
+from dsr.methods.classical.fast_global_smoother import FastGlobalSmoother
+from dsr.methods.classical.guided_filter import GuidedFilter
+from dsr.methods.classical.joint_bilateral import JointBilateral
+from dsr.methods.classical.photo_guided import GuidedMethod, slopes_along
 from dsr.sample import DepthSample, Scene
 
 METHODS = (GuidedFilter, JointBilateral, FastGlobalSmoother)

@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from dsr.methods.guided_filter import GuidedFilter, guided_filter
+from dsr.methods.classical.guided_filter import GuidedFilter, guided_filter
 
 
 def _noise(*shape: int, seed: int = 0) -> Tensor:

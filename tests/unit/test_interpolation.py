@@ -10,7 +10,7 @@ from torch import Tensor
 
 from dsr.degradation.downsampling import SCALES, Downsampling, Kernel, make_sample
 from dsr.geometry.camera import Camera, from_range, to_range
-from dsr.methods.interpolation import Interpolation, Order
+from dsr.methods.classical.interpolation import Interpolation, Order
 from dsr.sample import DepthSample, Scene
 
 CAMERA = Camera(width=48, height=32, fx=60.0, fy=55.0, cx=21.3, cy=17.9)

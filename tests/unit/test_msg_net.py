@@ -13,10 +13,10 @@ from torch import Tensor
 
 from dsr.degradation.downsampling import SCALES
 from dsr.geometry.camera import Camera, from_range, to_range
-from dsr.methods.maps import mean3x3, normalised, upsample_bicubic
-from dsr.methods.msg_guidance import VARIANTS, VariantName, guidance_map
-from dsr.methods.msg_net import MSGNet, output_drift, upsample_disparity
-from dsr.methods.network import NetworkUpsampler
+from dsr.methods.networks.base import NetworkUpsampler
+from dsr.methods.networks.maps import mean3x3, normalised, upsample_bicubic
+from dsr.methods.networks.msg_guidance import VARIANTS, VariantName, guidance_map
+from dsr.methods.networks.msg_net import MSGNet, output_drift, upsample_disparity
 from dsr.sample import DepthSample
 
 

@@ -10,8 +10,8 @@ from torch import Tensor
 from torch.nn import functional
 
 from dsr.geometry.camera import Camera, from_range, to_range
-from dsr.methods.msg_net import MSGNet
-from dsr.methods.network import ENSEMBLES, DisparityNetwork, NetworkUpsampler, posed, unposed
+from dsr.methods.networks.base import ENSEMBLES, DisparityNetwork, NetworkUpsampler, posed, unposed
+from dsr.methods.networks.msg_net import MSGNet
 from dsr.sample import DepthSample
 
 

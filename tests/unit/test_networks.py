@@ -9,10 +9,10 @@ import pytest
 import torch
 from small_scenes import maps, photos
 
-from dsr.methods.dynamic_guidance import DynamicGuidance
-from dsr.methods.facets import Facets
-from dsr.methods.network import NetworkUpsampler, WindowedNetwork
-from dsr.methods.pdn import PrimalDualNetwork
+from dsr.methods.networks.base import NetworkUpsampler, WindowedNetwork
+from dsr.methods.networks.dg import DynamicGuidance
+from dsr.methods.networks.facets import Facets
+from dsr.methods.networks.pdn import PrimalDualNetwork
 
 BUILDERS: MappingProxyType[str, Callable[[int], WindowedNetwork]] = MappingProxyType(
     {

@@ -20,7 +20,7 @@ from dsr.data.problem import Batch, Problem, tensors_of
 from dsr.degradation.downsampling import Downsampling, Measured, make_sample
 from dsr.degradation.noise import GaussianMultiplicative, Kinect
 from dsr.geometry.camera import Camera
-from dsr.methods.maps import normalised
+from dsr.methods.networks.maps import normalised
 from dsr.sample import Scene
 
 BOX = Downsampling("box")

@@ -9,9 +9,17 @@ from small_scenes import plane_map
 from torch import Tensor
 from torch.nn import functional
 
-from dsr.methods.network import NetworkUpsampler
-from dsr.methods.pdn import PrimalDualNetwork
-from dsr.methods.primal_dual import Step, UnrolledHuber, half_window, pair_differences, pair_sums, safe_step, unrolled
+from dsr.methods.networks.base import NetworkUpsampler
+from dsr.methods.networks.pdn import PrimalDualNetwork
+from dsr.methods.networks.primal_dual import (
+    Step,
+    UnrolledHuber,
+    half_window,
+    pair_differences,
+    pair_sums,
+    safe_step,
+    unrolled,
+)
 
 
 def _random(*shape: int, seed: int = 0) -> Tensor:

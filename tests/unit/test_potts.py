@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from dsr.methods.potts import BRIGHTEST, Regions, boundary_length, fitted, fused
+from dsr.methods.classical.srfs.potts import BRIGHTEST, Regions, boundary_length, fitted, fused
 
 
 def _energy(photo: Tensor, shading: Tensor, regions: Regions, weight: float) -> float:

@@ -17,11 +17,11 @@ from torch import Tensor
 from dsr.degradation.downsampling import Downsampling, make_sample
 from dsr.degradation.holes import Blobs
 from dsr.geometry.camera import Camera
-from dsr.methods.trained import packaged_weights
+from dsr.methods.dip.callbacks import cost_of_step
+from dsr.methods.dip.upsampler import DeepImagePrior, WarmStarted
+from dsr.methods.networks.trained import packaged_weights
 from dsr.metrics.classes import visual_metrics
 from dsr.metrics.functional import SurfacePair, rmse_v
-from dsr.prior.method import DeepImagePrior, WarmStarted
-from dsr.prior.watching import cost_of_step
 from dsr.sample import DepthSample, Scene
 
 BOX = Downsampling("box")
@@ -65,7 +65,7 @@ class Stopper:
 @pytest.fixture
 def _every_step(monkeypatch: pytest.MonkeyPatch) -> None:
     """Have the display told of every step."""
-    monkeypatch.setattr("dsr.prior.watching._SECONDS_BETWEEN_LOOKS", -1.0)
+    monkeypatch.setattr("dsr.methods.dip.callbacks._SECONDS_BETWEEN_LOOKS", -1.0)
 
 
 def _error(depth: Tensor, sample: DepthSample, where: Tensor | None = None) -> float:
@@ -143,7 +143,7 @@ def test_holes_are_filled_better_than_with_what_lies_nearest() -> None:
 
 def test_an_optimisation_that_diverges_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(
-        "dsr.prior.optimisation.PriorOptimisation.result", lambda _: torch.full((1, 1, 32, 48), torch.nan)
+        "dsr.methods.dip.optimisation.PriorOptimisation.result", lambda _: torch.full((1, 1, 32, 48), torch.nan)
     )
     with pytest.raises(ValueError, match=r"step: the optimisation diverged; a lower method.learning_rate"):
         _prior(steps=1)(_sample())
@@ -172,13 +172,13 @@ def test_an_interrupted_optimisation_ends_in_the_bits_of_an_uninterrupted_one(tm
 def test_what_is_killed_goes_on_from_the_last_minute(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     sample, settings = _sample(), {"steps": 30}
     whole = _prior(**settings)(sample)
-    monkeypatch.setattr("dsr.prior.watching._SECONDS_BETWEEN_CHECKPOINTS", -1.0)  # each step is a minute
+    monkeypatch.setattr("dsr.methods.dip.callbacks._SECONDS_BETWEEN_CHECKPOINTS", -1.0)  # each step is a minute
 
     def kill(*_: object) -> None:
         raise RuntimeError("killed")
 
     with monkeypatch.context() as patch:
-        patch.setattr("dsr.prior.optimisation.PriorOptimisation.validation_step", kill)
+        patch.setattr("dsr.methods.dip.optimisation.PriorOptimisation.validation_step", kill)
         with pytest.raises(RuntimeError, match="killed"):
             _prior(workspace=tmp_path, **{**settings, "validate_every": 17})(sample)
     display = Stopper(-1)

@@ -11,11 +11,11 @@ from torch import Tensor
 from dsr.degradation.downsampling import Downsampling, make_sample
 from dsr.geometry.camera import Camera
 from dsr.geometry.surface import normals_of
+from dsr.methods.dip.noise import noise_level, tilt_of
+from dsr.methods.dip.problem import ImageProblem, PriorObjective
+from dsr.methods.dip.stopping import Fixed, Oracle, Residual, Variance
 from dsr.metrics.functional import SurfacePair, rmse_v
 from dsr.metrics.losses import lap1
-from dsr.prior.noise import noise_level, tilt_of
-from dsr.prior.problem import ImageProblem, PriorObjective
-from dsr.prior.stopping import Fixed, Oracle, Residual, Variance
 from dsr.sample import DepthSample, Scene
 
 CAMERA = Camera(width=48, height=32, fx=60.0, fy=60.0, cx=23.5, cy=15.5)

@@ -12,9 +12,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from dsr.methods.msg_net import MSGNet
-from dsr.methods.published import load_msg_weights
-from dsr.methods.trained import build_trained
+from dsr.methods.networks.msg_net import MSGNet
+from dsr.methods.networks.published import load_msg_weights
+from dsr.methods.networks.trained import build_trained
 
 Layer = tuple[str, str, list[Tensor]]
 

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from dsr.geometry.camera import Camera
 from dsr.geometry.surface import normals_of, points_of
-from dsr.methods.shading_model import area_of, best_lighting, by_theta, photometry, shading_of, surface_of
+from dsr.methods.classical.srfs.shading import area_of, best_lighting, by_theta, photometry, shading_of, surface_of
 
 LIGHT = torch.tensor([[[0.3, -0.4, -0.6, 0.2], [0.2, -0.5, -0.5, 0.1], [0.4, -0.2, -0.4, 0.3]]]).double()
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch.nn import functional
 
-from dsr.methods.skip_net import SkipNet, doubled, levels_for
+from dsr.methods.dip.skip_net import SkipNet, doubled, levels_for
 
 
 @pytest.mark.parametrize("shape", [(1, 3, 1, 1), (2, 3, 4, 5), (1, 1, 7, 1)])

@@ -16,10 +16,10 @@ from dsr.degradation.downsampling import Downsampling, make_sample
 from dsr.geometry.camera import Camera, from_range
 from dsr.geometry.surface import normals_of
 from dsr.methods.base import Iterative
-from dsr.methods.interpolation import Interpolation
-from dsr.methods.shading_admm import Problem, ShadingSolver, Slopes
-from dsr.methods.shading_model import shading_of, surface_of
-from dsr.methods.srfs import ShapeFromShading
+from dsr.methods.classical.interpolation import Interpolation
+from dsr.methods.classical.srfs.admm import Problem, ShadingSolver, Slopes
+from dsr.methods.classical.srfs.shading import shading_of, surface_of
+from dsr.methods.classical.srfs.upsampler import ShapeFromShading
 from dsr.sample import DepthSample, Scene
 
 LIGHT = ((0.35, -0.3, -0.55, 0.15), (0.3, -0.25, -0.5, 0.2), (0.25, -0.3, -0.5, 0.2))

@@ -11,8 +11,8 @@ from small_scenes import disparity_of, plane, random_scene, sample_of, step
 from torch import Tensor
 
 from dsr.geometry.camera import to_range
-from dsr.methods.differences import divergence, extended, gradient, touching, upsampled
-from dsr.methods.tgv import Tensors, TotalGeneralisedVariation
+from dsr.methods.classical.finite_differences import divergence, extended, gradient, touching, upsampled
+from dsr.methods.classical.tgv import Tensors, TotalGeneralisedVariation
 
 
 def _normals(*shape: int, seed: int = 0) -> Tensor:

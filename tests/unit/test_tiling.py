@@ -9,9 +9,9 @@ import torch
 from torch import Tensor
 
 from dsr.geometry.camera import Camera, from_range
-from dsr.methods.facets import Facets
-from dsr.methods.msg_net import MSGNet
-from dsr.methods.network import DisparityNetwork, NetworkUpsampler
+from dsr.methods.networks.base import DisparityNetwork, NetworkUpsampler
+from dsr.methods.networks.facets import Facets
+from dsr.methods.networks.msg_net import MSGNet
 from dsr.methods.tiling import blended, spans
 from dsr.sample import DepthSample
 
@@ -121,8 +121,8 @@ def test_a_large_photo_is_tiled_by_itself(monkeypatch: pytest.MonkeyPatch) -> No
     sample = DepthSample("test", "scene", rgb[0], from_range(coarse[0] / 4, low, "disparity"), camera, low, 4)
     parts: list[int] = []
     whole = method(sample, lambda done, total: parts.append(total))
-    monkeypatch.setattr("dsr.methods.network.UNTILED", 1000)
-    monkeypatch.setattr("dsr.methods.network.TILE", 24)
+    monkeypatch.setattr("dsr.methods.networks.base.UNTILED", 1000)
+    monkeypatch.setattr("dsr.methods.networks.base.TILE", 24)
     tiled = method(sample, lambda done, total: parts.append(total))
     assert parts == [1, *[4] * 4]
     torch.testing.assert_close(tiled, whole, rtol=1e-5, atol=0)

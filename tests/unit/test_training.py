@@ -22,7 +22,7 @@ from dsr.data.patches import WholeScenes
 from dsr.data.problem import Batch, Problem, tensors_of
 from dsr.degradation.downsampling import Downsampling, make_sample
 from dsr.geometry.camera import Camera
-from dsr.methods.msg_net import MSGNet, upsample_disparity
+from dsr.methods.networks.msg_net import MSGNet, upsample_disparity
 from dsr.metrics import functional as scores
 from dsr.metrics.classes import visual_metrics
 from dsr.metrics.functional import SurfacePair

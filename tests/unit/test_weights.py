@@ -11,11 +11,11 @@ import torch
 from safetensors.torch import save_file
 from torch import Tensor
 
-from dsr.methods.facets import Facets
-from dsr.methods.msg_net import MSGNet
-from dsr.methods.network import DisparityNetwork
-from dsr.methods.trained import NETWORKS, build_trained, packaged_names, packaged_weights
-from dsr.methods.weights import is_ours, load_network, read_head, save_network
+from dsr.methods.networks.base import DisparityNetwork
+from dsr.methods.networks.facets import Facets
+from dsr.methods.networks.msg_net import MSGNet
+from dsr.methods.networks.trained import NETWORKS, build_trained, packaged_names, packaged_weights
+from dsr.methods.networks.weight_files import is_ours, load_network, read_head, save_network
 
 NETS = {
     "msg": lambda: MSGNet(2, "dsr"),

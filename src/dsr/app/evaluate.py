@@ -25,11 +25,11 @@ from dsr.app.runs import studies_of_run
 from dsr.app.schema import ConfigError, EvalConfig, given_keys, plain_config
 from dsr.data.base import SceneSource
 from dsr.evaluation import Outcome, StalePredictionError, Study, predict, score
-from dsr.methods.trained import packaged_names, packaged_weights
+from dsr.methods.dip.upsampler import WORKSPACE
+from dsr.methods.networks.trained import packaged_names, packaged_weights
 from dsr.metrics.catalogue import catalogue
 from dsr.metrics.classes import visual_metrics
 from dsr.metrics.lpips import LPIPS
-from dsr.prior.method import WORKSPACE
 from dsr.report.dashboard import save_dashboard
 from dsr.report.pictures import save_picture
 from dsr.report.tables import score_table

@@ -27,7 +27,7 @@ _PACKAGES = (
 _NOT_IDENTITY = ("output_dir", "overwrite", "metrics", "weights", "resume", "run")  # of the weights, the content counts
 PREDICTING_CODE = (
     "sample.py", "degradation", "geometry", "metrics", "synthetic", "methods", "data", "objective.py",
-    "training.py", "utils/lightning.py", "prior", "evaluation.py",
+    "training.py", "utils/lightning.py", "evaluation.py",
 )  # fmt: skip
 """Modules and packages that determine a prediction, by their paths below the package."""
 

@@ -62,7 +62,7 @@ def studies_of_run(
     chosen = {key.partition(".")[0] for key in given}
     own = {key: run[key] for key in _FROM_RUN if key not in chosen}
     name = run["model"]["name"]
-    target = "dsr.methods.trained.build_trained"
+    target = "dsr.methods.networks.trained.build_trained"
     method = {"name": name, "label": name, "target": target, "model": name, "ensemble": 1}  # as validations scored it
     base = {**plain, **own, "method": method, "weights": str(weights)}
     if "dataset" in chosen:

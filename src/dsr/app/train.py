@@ -22,9 +22,9 @@ from dsr.app.runs import WEIGHTS, common, read_config, training_data
 from dsr.app.schema import ConfigError, TrainConfig, given_keys, plain_config
 from dsr.app.trainer import make_trainer, seconds_per_step
 from dsr.data.patches import PatchData
-from dsr.methods.network import DisparityNetwork
-from dsr.methods.trained import NETWORKS
-from dsr.methods.weights import load_network, save_network
+from dsr.methods.networks.base import DisparityNetwork
+from dsr.methods.networks.trained import NETWORKS
+from dsr.methods.networks.weight_files import load_network, save_network
 from dsr.metrics.classes import visual_metrics
 from dsr.objective import Objective, balanced_weight
 from dsr.training import Schedule, SuperResolution

@@ -11,11 +11,11 @@ from torch.nn import functional
 
 from dsr.degradation.downsampling import Downsampling
 from dsr.geometry.camera import Camera
-from dsr.methods.interpolation import Interpolation, Order
-from dsr.methods.network import NetworkUpsampler
+from dsr.methods.classical.interpolation import Interpolation, Order
+from dsr.methods.dip.upsampler import DeepImagePrior
+from dsr.methods.networks.base import NetworkUpsampler
+from dsr.methods.networks.trained import build_trained, packaged_weights
 from dsr.methods.tiling import Progress, part_of
-from dsr.methods.trained import build_trained, packaged_weights
-from dsr.prior.method import DeepImagePrior
 from dsr.sample import DepthSample
 from dsr.upsampling.inspection import enlarged_by, suited_method
 from dsr.upsampling.planning import AUTO, INTERPOLATIONS, NETWORKS, OWN_SIZE, PRIORS, plan

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from dsr.degradation.downsampling import Downsampling
 from dsr.geometry.camera import Camera
-from dsr.prior.noise import noise_level, tilt_of
+from dsr.methods.dip.noise import noise_level, tilt_of
 from dsr.upsampling.planning import OWN_SIZE, USUAL_SCALE
 
 CLEAN, NOISY = "facets", "msg_v_noisy"
@@ -21,8 +21,8 @@ _LARGEST_RATIO = 4.2
 def suited_method(depth: Tensor, camera: Camera, scale: int | None = None) -> str:
     """Return the network for a depth map: one that was trained on noisy depth where the map is noisy.
 
-    With noise that tilts the coarse map's normals (:func:`dsr.prior.noise.tilt_of`) by so many degrees RMSE_v on Lucy
-    and Plant at x4 is
+    With noise that tilts the coarse map's normals (:func:`dsr.methods.dip.noise.tilt_of`) by so many degrees RMSE_v on
+    Lucy and Plant at x4 is
 
     | tilt | 2, 2 | 7, 5 | 12, 9 | 22, 17 | 37, 30 |
     | --- | --- | --- | --- | --- | --- |

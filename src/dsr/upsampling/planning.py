@@ -22,7 +22,7 @@ import math
 from dataclasses import dataclass
 from types import MappingProxyType
 
-from dsr.methods.network import TILE, UNTILED
+from dsr.methods.networks.base import TILE, UNTILED
 
 INTERPOLATIONS = ("nearest", "bilinear", "bicubic")
 PRIORS = ("dip", "dip_v")

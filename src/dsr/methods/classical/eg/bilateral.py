@@ -1,0 +1,182 @@
+"""The modified joint bilateral filter of edge-guided upsampling: means that do not cross edges.
+
+Xie, Feris, Sun, *Edge-Guided Single Depth Image Super Resolution*, IEEE TIP 25(1), 2016; what is taken over and what
+differs is said in :mod:`dsr.methods.classical.eg.upsampler`.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from dsr.methods.classical.finite_differences import box_mean, repeated, upsampled
+from dsr.methods.classical.photo_guided import slopes_along
+from dsr.methods.networks.inpainting import filled
+
+_CHUNK = 4096
+"""Coarse pixels whose ways are looked for at once."""
+_BESIDE = ((-1, 0), (0, -1), (0, 1), (1, 0), (-1, -1), (-1, 1), (1, -1), (1, 1))
+"""Rows and columns to a pixel's neighbours, the nearest first."""
+
+
+class _Planes(NamedTuple):
+    """Coarse pixels (h, w): value, slopes per row and per column, and how much each counts."""
+
+    values: Tensor
+    down: Tensor
+    across: Tensor
+    trust: Tensor
+
+
+def filtered(
+    coarse: Tensor,
+    barrier: Tensor,
+    scale: int,
+    radius: int,
+    sigma_space: float,
+    mixed: float,
+    *,
+    doubtful: Tensor | None = None,
+    sharp: bool = True,
+) -> Tensor:
+    """Return a map (h, w) upsampled by the modified joint bilateral filter, (H, W), NaN where it is.
+
+    Args:
+        coarse: the map, NaN where it is not known; some of it must be.
+        barrier: (H, W) bool, the edges.
+        scale: fine pixels per coarse one.
+        radius: of the neighbourhood, in coarse pixels.
+        sigma_space: standard deviation of the distance's Gaussian, in coarse pixels.
+        mixed: what a coarse pixel with an edge through it counts.
+        doubtful: (h, w) bool, more coarse pixels that mix two sides; None for none.
+        sharp: whether pixels on edges take a side; otherwise they keep what leaves block means as they are.
+
+    """
+    known = coarse.isfinite()
+    doubtful = torch.zeros_like(known) if doubtful is None else doubtful
+    whole = filled(coarse[None, None])
+    cut = functional.max_pool2d(barrier[None, None].float(), scale)[0, 0] > 0
+    clean = coarse.masked_fill(doubtful, torch.nan)
+    trust = torch.where(cut | doubtful, mixed, 1.0).to(coarse) * known
+    planes = _Planes(whole[0, 0], slopes_along(clean, 0), slopes_along(clean, 1), trust)
+    smooth = upsampled(whole, scale)[0, 0]
+    reach = reachable(barrier, scale, radius)
+    fine = _between(_means(planes, reach, scale, sigma_space, smooth), barrier, whole, smooth, scale)
+    if sharp:
+        _take_sides(reach, barrier, fine, scale)
+        fine = torch.where(barrier, _means(planes, reach, scale, sigma_space, smooth), fine)
+    return fine.masked_fill(~repeated(known[None, None], scale)[0, 0], torch.nan)
+
+
+def reachable(barrier: Tensor, scale: int, radius: int) -> Tensor:
+    """Return which coarse pixels each fine pixel has a way to that crosses no edge.
+
+    A way starts in the middle of the coarse pixel, goes over 4-connected fine pixels that are no edge, and stays within
+    the coarse pixels at most ``radius`` rows and columns off.
+
+    Args:
+        barrier: (H, W) bool, the edge map.
+        scale: fine pixels per coarse one.
+        radius: of the neighbourhood, in coarse pixels.
+
+    Returns:
+        (2 radius + 1, 2 radius + 1, H, W) bool: [radius + a, radius + b] says it of the coarse pixel a rows below and
+        b columns right of the one that the fine pixel lies in.
+
+    """
+    height, width = barrier.shape[0] // scale, barrier.shape[1] // scale
+    side, edge = 2 * radius + 1, radius * scale
+    padded = functional.pad(barrier, (edge, edge, edge, edge), value=True)
+    windows = padded.unfold(0, side * scale, scale).unfold(1, side * scale, scale).flatten(0, 1)
+    ways = torch.ones_like(windows)
+    for some in windows.flatten(1).any(dim=1).nonzero()[:, 0].split(_CHUNK):
+        ways[some] = _flooded(~windows[some])
+    ways = ways.view(height, width, side, scale, side, scale)
+    result = barrier.new_zeros(side, side, height, scale, width, scale)
+    for a in range(-radius, radius + 1):
+        rows, from_rows = _shifted(a, height)
+        for b in range(-radius, radius + 1):
+            columns, from_columns = _shifted(b, width)
+            there = ways[from_rows, from_columns, radius - a, :, radius - b]
+            result[radius + a, radius + b, rows, :, columns] = there.transpose(1, 2)
+    return result.view(side, side, *barrier.shape)
+
+
+def _means(planes: _Planes, reach: Tensor, scale: int, sigma_space: float, smooth: Tensor) -> Tensor:
+    """Return the weighted means of the planes, (H, W); where no weight is, the smooth map."""
+    height, width = planes.values.shape
+    rows, columns = (torch.arange(n, device=smooth.device) for n in smooth.shape)
+    y, x = ((n.to(smooth) + 0.5) / scale - 0.5 for n in (rows, columns))
+    total, weights = torch.zeros_like(smooth), torch.zeros_like(smooth)
+    radius = reach.shape[0] // 2
+    for a in range(-radius, radius + 1):
+        for b in range(-radius, radius + 1):
+            i, j = rows // scale + a, columns // scale + b
+            at = i.clamp(0, height - 1)[:, None], j.clamp(0, width - 1)  # beyond the border nothing is reachable
+            down, across = (y - i)[:, None], x - j
+            weight = torch.exp((down.square() + across.square()) / (-2 * sigma_space**2))
+            weight = weight * planes.trust[at] * reach[radius + a, radius + b]
+            total += weight * (planes.values[at] + planes.down[at] * down + planes.across[at] * across)
+            weights += weight
+    return torch.where(weights > 0, total / torch.where(weights > 0, weights, 1), smooth)
+
+
+def _between(fine: Tensor, barrier: Tensor, coarse: Tensor, smooth: Tensor, scale: int) -> Tensor:
+    """Return the fine map with new values on edges: the smooth map, moved as the means of blocks need.
+
+    They stay between the least and the most of the neighbours off the edge.
+    """
+    start = torch.where(barrier, smooth, fine)[None, None]
+    share = box_mean(barrier[None, None].to(fine), scale)
+    missing = repeated((coarse - box_mean(start, scale)) / torch.where(share > 0, share, 1), scale)
+    beside = torch.cat((start, -start)).masked_fill(barrier, -torch.inf)
+    most, least = functional.max_pool2d(beside, 3, stride=1, padding=1).unbind(0)
+    value = (start + missing)[0].clamp(-least, most)
+    return torch.where(barrier & most.isfinite(), value, start[0])[0]
+
+
+def _take_sides(reach: Tensor, barrier: Tensor, fine: Tensor, scale: int) -> None:
+    """Let each edge pixel reach, in place, what its neighbour off the edge does that is the most like its own value.
+
+    An edge pixel without such a neighbour reaches nothing.
+    """
+    places = barrier.nonzero()
+    beside = places[:, None] + places.new_tensor(_BESIDE)  # (N, 8, 2)
+    inside = ((beside >= 0) & (beside < places.new_tensor(barrier.shape))).all(dim=2)
+    beside = torch.where(inside[:, :, None], beside, places[:, None])
+    off = ~barrier[beside[..., 0], beside[..., 1]]
+    apart = (fine[beside[..., 0], beside[..., 1]] - fine[places[:, 0], places[:, 1]][:, None]).abs()
+    best = apart.masked_fill(~off, torch.inf).argmin(dim=1)
+    chosen = beside[torch.arange(len(places), device=places.device), best]  # an edge where there is no neighbour
+    side = len(reach)
+    there = places // scale - chosen // scale + torch.arange(side, device=places.device)[:, None, None]  # (side, N, 2)
+    within = (there >= 0) & (there < side)
+    rows, columns = there.clamp(0, side - 1).unbind(2)
+    seen = reach[rows[:, None], columns[None], chosen[:, 0], chosen[:, 1]]  # (side, side, N)
+    reach[:, :, places[:, 0], places[:, 1]] = seen & within[:, None, :, 0] & within[None, :, :, 1]
+
+
+def _flooded(free: Tensor) -> Tensor:
+    """Return the pixels of windows (N, K, K) that 4-connected ways over free pixels lead to from the middle."""
+    size = free.shape[-1]
+    middle = slice((size - 1) // 2, size // 2 + 1)
+    reached = torch.zeros_like(free)
+    reached[:, middle, middle] = free[:, middle, middle]
+    while True:
+        new = reached.clone()
+        new[:, 1:] |= reached[:, :-1]
+        new[:, :-1] |= reached[:, 1:]
+        new[:, :, 1:] |= reached[:, :, :-1]
+        new[:, :, :-1] |= reached[:, :, 1:]
+        new &= free
+        if bool((new == reached).all()):
+            return reached
+        reached = new
+
+
+def _shifted(by: int, size: int) -> tuple[slice, slice]:
+    """Return the places of a line whose neighbour so far on there is, and these neighbours."""
+    return slice(max(-by, 0), size - max(by, 0)), slice(max(by, 0), size - max(-by, 0))

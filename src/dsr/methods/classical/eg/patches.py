@@ -1,0 +1,130 @@
+"""Patches of edge maps: pairs of one as it comes and as it is, their distances, and how neighbours disagree.
+
+The parts of :mod:`dsr.methods.classical.eg.edge_map` that know of patches alone. Patches are (N, PATCH, PATCH) bool.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+PATCH = 11
+"""Rows and columns of a patch, in fine pixels."""
+_ENTRIES = 2**24
+"""Distances between patches that are held at once."""
+_BITS = 62
+"""Pixels that a 64-bit word holds, its sign left out."""
+
+
+class Patches(NamedTuple):
+    """Edges as upsampling shows them, and the true edges at the same places."""
+
+    low: Tensor
+    high: Tensor
+
+
+def no_patches(device: torch.device) -> Patches:
+    """Return none."""
+    none = torch.zeros(0, PATCH, PATCH, dtype=torch.bool, device=device)
+    return Patches(none, none)
+
+
+def taken(mask: Tensor, places: Tensor) -> Tensor:
+    """Return the patches of a mask (H, W) around places (N, 2), rows and columns that far inside."""
+    reach = torch.arange(PATCH, device=mask.device) - PATCH // 2
+    return mask[places[:, 0, None, None] + reach[:, None], places[:, 1, None, None] + reach]
+
+
+def turned(patches: Tensor) -> Tensor:
+    """Return patches in their 8 orientations, (8 N, PATCH, PATCH): turned by right angles and mirrored."""
+    quarters = [patches.rot90(k, (1, 2)) for k in range(4)]
+    return torch.cat(quarters + [each.mT for each in quarters])
+
+
+def distinct(patches: Patches) -> Patches:
+    """Return the pairs without repetitions, in an order of their own."""
+    pixels = 2 * PATCH**2
+    bits = torch.cat((patches.low.flatten(1), patches.high.flatten(1)), dim=1).long()
+    place = torch.arange(_BITS, device=bits.device)
+    words = (functional.pad(bits, (0, -pixels % _BITS)).unflatten(1, (-1, _BITS)) << place).sum(dim=2)
+    words = torch.unique(words, dim=0)
+    bits = ((words[:, :, None] >> place) & 1).flatten(1)[:, :pixels]
+    return Patches(*bits.bool().unflatten(1, (2, PATCH, PATCH)).unbind(1))
+
+
+def distances(patches: Tensor) -> Tensor:
+    """Return each pixel's Euclidean distance from the edges of its patch, (N, PATCH, PATCH) float32.
+
+    Infinite in a patch without an edge.
+    """
+    place = torch.arange(PATCH, device=patches.device)
+    square = (place[:, None] - place).square().float()
+    along = torch.where(patches[:, :, None], square, torch.inf).amin(dim=3)  # (N, row, column), within the row
+    return (along[:, None] + square[:, :, None]).amin(dim=2).sqrt()
+
+
+def nearest(query: Tensor, known: Patches, count: int, weight: float) -> tuple[Tensor, Tensor]:
+    """Return the known pairs most like patches, as squared distances and as numbers, (N, count) each; the best first.
+
+    |D(query) - D(low)|^2 + weight^2 |query - high|^2, D being :func:`distances`.
+    """
+    there = _features(known.low, known.high, weight)
+    length = there.square().sum(dim=1)
+    far, which = [], []
+    for some in query.split(max(_ENTRIES // len(there), 1)):
+        here = _features(some, some, weight)
+        square = here.square().sum(dim=1, keepdim=True) + length - 2 * here @ there.T
+        least = square.clamp_(min=0).topk(min(count, len(there)), dim=1, largest=False)
+        far.append(least.values)
+        which.append(least.indices)
+    return torch.cat(far), torch.cat(which)
+
+
+def overlaps(places: Tensor, patches: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the pairs of patches that overlap, (E, 2), and how their candidates disagree there, (E, K, K).
+
+    A disagreement is the sum of squared differences over the pixels that both cover.
+
+    Args:
+        places: (N, 2) rows and columns of the patches' centres, no two alike.
+        patches: (N, K, PATCH^2) float, the candidates of each.
+
+    """
+    index = places.new_full(tuple((places.amax(dim=0) + PATCH).tolist()), -1)
+    index[places[:, 0], places[:, 1]] = torch.arange(len(places), device=places.device)
+    images = patches.unflatten(2, (PATCH, PATCH))
+    pairs, costs = [places.new_zeros(0, 2)], [patches.new_zeros(0, patches.shape[1], patches.shape[1])]
+    for down in range(PATCH):
+        for across in range(-PATCH + 1 if down else 1, PATCH):
+            first = (places[:, 1] + across >= 0).nonzero()[:, 0]
+            second = index[places[first, 0] + down, places[first, 1] + across]
+            first, second = first[second >= 0], second[second >= 0]
+            if len(first):
+                pairs.append(torch.stack((first, second), dim=1))
+                costs.append(_disagreement(images[first], images[second], down, across))
+    return torch.cat(pairs), torch.cat(costs)
+
+
+def averaged(patches: Tensor, places: Tensor, shape: tuple[int, int]) -> Tensor:
+    """Return the mean of the patches (N, PATCH^2) that cover each pixel, (H, W); 0 where none does."""
+    total, number = patches.new_zeros(shape), patches.new_zeros(shape)
+    for k in range(PATCH**2):  # of one k no two fall on the same pixel
+        rows, columns = places[:, 0] + k // PATCH - PATCH // 2, places[:, 1] + k % PATCH - PATCH // 2
+        total[rows, columns] += patches[:, k]
+        number[rows, columns] += 1
+    return total / number.clamp(min=1)
+
+
+def _features(low: Tensor, high: Tensor, weight: float) -> Tensor:
+    return torch.cat((distances(low).flatten(1), weight * high.flatten(1).float()), dim=1)
+
+
+def _disagreement(first: Tensor, second: Tensor, down: int, across: int) -> Tensor:
+    """Return the squared differences of (E, K, PATCH, PATCH) patches, the second so many rows and columns further."""
+    left, right = max(across, 0), max(-across, 0)
+    a = first[:, :, down:, left : PATCH - right].flatten(2)
+    b = second[:, :, : PATCH - down, right : PATCH - left].flatten(2)
+    return a.square().sum(dim=2)[:, :, None] + b.square().sum(dim=2)[:, None] - 2 * a @ b.mT

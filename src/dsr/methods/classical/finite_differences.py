@@ -1,0 +1,91 @@
+"""Differences of maps and their adjoints, block means, where an iteration starts: what variational methods share."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from dsr.methods.networks.maps import upsample_bicubic
+
+LUMA = (0.299, 0.587, 0.114)
+"""Weights of red, green and blue in a grey photo (ITU-R BT.601)."""
+_REACH = 2
+"""Coarse pixels that Keys' kernel reaches beyond the border."""
+
+
+def gradient(x: Tensor) -> Tensor:
+    """Return forward differences along u and v, (B, C, H, W) -> (B, 2, C, H, W); 0 in the last column and row."""
+    return torch.stack((_forward(x, -1), _forward(x, -2)), dim=1)
+
+
+def divergence(p: Tensor) -> Tensor:
+    """Return minus the adjoint of :func:`gradient`, (B, 2, C, H, W) -> (B, C, H, W).
+
+    <gradient(x), p> = -<x, divergence(p)> for all x and p; what p says in the last column along u, and in the last row
+    along v, does not count.
+    """
+    total = torch.zeros_like(p[:, 0])
+    along_u, along_v = p[:, 0, ..., :-1], p[:, 1, ..., :-1, :]
+    total[..., :-1] += along_u
+    total[..., 1:] -= along_u
+    total[..., :-1, :] += along_v
+    total[..., 1:, :] -= along_v
+    return total
+
+
+def touching(p: Tensor) -> Tensor:
+    """Return the sum of what belongs to each pixel's differences, (B, 2, C, H, W) -> (B, C, H, W).
+
+    The adjoint of :func:`gradient` with a plus for every minus: its columns' absolute sums, weighted.
+    """
+    total = torch.zeros_like(p[:, 0])
+    along_u, along_v = p[:, 0, ..., :-1], p[:, 1, ..., :-1, :]
+    total[..., :-1] += along_u
+    total[..., 1:] += along_u
+    total[..., :-1, :] += along_v
+    total[..., 1:, :] += along_v
+    return total
+
+
+def box_mean(x: Tensor, scale: int) -> Tensor:
+    """Return the mean of each scale x scale block, (B, C, H, W) -> (B, C, H / scale, W / scale)."""
+    return functional.avg_pool2d(x, scale)
+
+
+def repeated(x: Tensor, scale: int) -> Tensor:
+    """Return each pixel as a scale x scale block, (B, C, h, w) -> (B, C, scale h, scale w)."""
+    return x.repeat_interleave(scale, -2).repeat_interleave(scale, -1)
+
+
+def grey(rgb: Tensor) -> Tensor:
+    """Return the luma of (B, 3, H, W) photos, (B, 1, H, W)."""
+    return (rgb * rgb.new_tensor(LUMA)[:, None, None]).sum(dim=1, keepdim=True)
+
+
+def extended(x: Tensor, border: int) -> Tensor:
+    """Return (B, C, h, w) with ``border`` pixels more on each side, where it goes on linearly; a plane stays one."""
+    return _extended(_extended(x, border, -1), border, -2)
+
+
+def upsampled(coarse: Tensor, scale: int) -> Tensor:
+    """Return (B, 1, h, w) upsampled bicubically to (B, 1, scale h, scale w), exact on planes up to the border."""
+    if scale == 1:
+        return coarse.clone()
+    edge = _REACH * scale
+    return upsample_bicubic(extended(coarse, _REACH), scale)[..., edge:-edge, edge:-edge].contiguous()
+
+
+def _forward(x: Tensor, dim: int) -> Tensor:
+    ends = (0, 1) if dim == -1 else (0, 0, 0, 1)
+    return functional.pad(x.diff(dim=dim), ends)
+
+
+def _extended(x: Tensor, border: int, dim: int) -> Tensor:
+    count = x.shape[dim]
+    first, last = x.narrow(dim, 0, 1), x.narrow(dim, count - 1, 1)
+    before = first - x.narrow(dim, min(1, count - 1), 1)  # 0 where there is a single pixel
+    after = last - x.narrow(dim, max(count - 2, 0), 1)
+    steps = range(border, 0, -1)
+    pieces = [first + k * before for k in steps] + [x] + [last + k * after for k in reversed(steps)]
+    return torch.cat(pieces, dim=dim)

@@ -1,0 +1,115 @@
+"""Guided filter upsampling: in each window, depth is a linear function of the photo's colours.
+
+He, Sun, Tang, *Guided Image Filtering*, TPAMI 2013, with the colour guide of its section on colour images. In every
+window w_k of the fine image, q_i = a_k . I_i + b_k with
+
+    a_k = (S_k + eps U)^-1 (mean(I p) - m_k mean(p)),    b_k = mean(p) - a_k . m_k,
+
+m_k and S_k being mean and 3 x 3 covariance of the photo I in the window, p the input and U the identity; the answer is
+q_i = mean(a_k) . I_i + mean(b_k) over the windows that hold pixel i. For upsampling, p is the bilinear interpolation of
+the coarse map, as in the paper's joint upsampling.
+
+What differs: every mean over a window counts pixels by their confidence (see
+:mod:`dsr.methods.classical.photo_guided`), so holes do not spread, and each window counts by its pixels' mean
+confidence; without holes that is the paper's filter. Windows are cut at the border. The radius is in coarse pixels.
+
+Time grows as H * W * radius * scale; memory peaks at about 50 maps of H * W float64 values, whatever the radius.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from dsr.methods.classical.photo_guided import Guided, GuidedMethod, positive
+
+_PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
+"""The entries of a symmetric 3 x 3 matrix, in the order in which they are kept."""
+_ROWS = ([0, 1, 2], [1, 3, 4], [2, 4, 5])
+"""Where the matrix's rows are among these."""
+_TINY = 1e-30
+
+
+class GuidedFilter(GuidedMethod):
+    """The guided filter of the interpolated coarse disparity.
+
+    Args:
+        radius: of the windows, in coarse pixels.
+        epsilon: added to the photo's variances, colours being in [0, 1]: colours that vary less do not count.
+        fill_holes, slopes: see :class:`dsr.methods.classical.photo_guided.GuidedMethod`.
+
+    Raises:
+        ValueError: the radius or epsilon is not positive.
+
+    """
+
+    def __init__(
+        self, radius: float = 0.5, epsilon: float = 1e-3, *, fill_holes: bool = False, slopes: bool = True
+    ) -> None:
+        super().__init__(fill_holes=fill_holes, slopes=slopes)
+        positive("the guided filter", radius=radius, epsilon=epsilon)
+        self._radius, self._epsilon = radius, epsilon
+
+    def filtered(self, guided: Guided) -> Tensor:
+        """Return the filtered interpolations, (N, H, W)."""
+        maps, confidence = guided.interpolated()
+        radius = max(round(self._radius * guided.scale), 1)
+        return guided_filter(guided.photo, maps, radius, self._epsilon, confidence)
+
+
+def guided_filter(guide: Tensor, maps: Tensor, radius: int, epsilon: float, confidence: Tensor | None = None) -> Tensor:
+    """Return maps filtered with a colour guide.
+
+    Args:
+        guide: (3, H, W).
+        maps: (N, H, W), finite.
+        radius: windows are of 2 * radius + 1 pixels on each side, cut at the border.
+        epsilon: added to the guide's variances.
+        confidence: (H, W) in [0, 1], how much each value counts; None for 1.
+
+    Returns:
+        (N, H, W); a pixel that no window with a confident value holds keeps its value.
+
+    """
+    weight = torch.ones_like(guide[0]) if confidence is None else confidence
+    share = _box(weight, radius)
+    counted = torch.where(share > 0, share, 1)
+    mean = _box(weight * guide, radius) / counted
+    products = torch.stack([guide[i] * guide[j] for i, j in _PAIRS])
+    variances = _box(weight * products, radius) / counted - torch.stack([mean[i] * mean[j] for i, j in _PAIRS])
+    del products
+    for k in (0, 3, 5):
+        variances[k] += epsilon
+    inverse = _inverse(variances)
+    of_image = share / _box(torch.ones_like(weight), radius)  # the mean confidence of a window's pixels
+    total = _box(of_image, radius)
+
+    def one(values: Tensor) -> Tensor:
+        mean_value = _box(weight * values, radius) / counted
+        cross = _box(weight * guide * values, radius) / counted - mean * mean_value
+        slopes = torch.stack([(inverse[row] * cross).sum(dim=0) for row in _ROWS])
+        constant = mean_value - (slopes * mean).sum(dim=0)
+        slopes, constant = _box(of_image * slopes, radius), _box(of_image * constant, radius)
+        return torch.where(total > 0, ((slopes * guide).sum(dim=0) + constant) / total.clamp(min=_TINY), values)
+
+    return torch.stack([one(values) for values in maps])
+
+
+def _box(x: Tensor, radius: int) -> Tensor:
+    """Return the means over windows of (..., H, W), what lies beyond the border being 0; where all are 0, exactly 0."""
+    maps, side = x.reshape(-1, 1, *x.shape[-2:]), 2 * radius + 1
+    maps = functional.avg_pool2d(functional.pad(maps, (0, 0, radius, radius)), (side, 1), stride=1)
+    maps = functional.avg_pool2d(functional.pad(maps, (radius, radius)), (1, side), stride=1)
+    return maps.reshape(x.shape)
+
+
+def _inverse(matrix: Tensor) -> Tensor:
+    """Return the inverses of symmetric 3 x 3 matrices, (6, H, W) both, by cofactors.
+
+    Covariances plus epsilon have determinants of at least epsilon cubed.
+    """
+    a, b, c, d, e, f = matrix
+    aa, bb, cc = d * f - e * e, c * e - b * f, b * e - c * d
+    dd, ee, ff = a * f - c * c, b * c - a * e, a * d - b * b
+    return torch.stack((aa, bb, cc, dd, ee, ff)) / (a * aa + b * bb + c * cc)

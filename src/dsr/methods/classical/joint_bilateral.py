@@ -1,0 +1,102 @@
+"""Joint bilateral upsampling: means of coarse values, weighed by distance and by likeness in the photo.
+
+Kopf, Cohen, Lischinski, Uyttendaele, *Joint Bilateral Upsampling*, SIGGRAPH 2007. The fine value at pixel p is
+
+    S_p = 1 / k_p * sum over coarse pixels q of S_q f(|p - q|) g(|I_p - I_q|),
+
+f and g being Gaussians, of the distance in coarse pixels and of the difference of colours, and k_p the weights' sum;
+q runs over the (2 * radius + 1)^2 coarse pixels around p.
+
+What differs: I_q is the mean of the photo over the coarse pixel, which is what a coarse depth stands for, where the
+paper takes a single pixel of the photo. Coarse pixels that are holes do not count. The largest weight of each pixel is
+scaled to 1, so that a colour unlike all those around gets its most similar neighbours, and no 0 / 0.
+
+Time grows as H * W * (2 * radius + 1)^2; memory peaks at about 20 maps of H * W float64 values, whatever the radius.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import torch
+from torch import Tensor
+
+from dsr.methods.classical.photo_guided import Guided, GuidedMethod, positive
+
+
+class JointBilateral(GuidedMethod):
+    """Joint bilateral upsampling of the coarse disparity.
+
+    Args:
+        radius: of the neighbourhood, in coarse pixels.
+        sigma_space: standard deviation of the distance's Gaussian, in coarse pixels.
+        sigma_colour: standard deviation of the Gaussian of the colours' Euclidean distance, colours being in [0, 1].
+        fill_holes, slopes: see :class:`dsr.methods.classical.photo_guided.GuidedMethod`; a hole is filled by this
+            filter within the radius, and from around farther inside.
+
+    Raises:
+        ValueError: a value is not positive.
+
+    """
+
+    def __init__(
+        self,
+        radius: int = 2,
+        sigma_space: float = 0.5,
+        sigma_colour: float = 0.1,
+        *,
+        fill_holes: bool = False,
+        slopes: bool = True,
+    ) -> None:
+        super().__init__(fill_holes=fill_holes, slopes=slopes)
+        positive("joint bilateral upsampling", radius=radius, sigma_space=sigma_space, sigma_colour=sigma_colour)
+        self._radius, self._sigma_space, self._sigma_colour = radius, sigma_space, sigma_colour
+
+    def filtered(self, guided: Guided) -> Tensor:
+        """Return the weighted means of the coarse maps, (N, H, W)."""
+        height, width = guided.known.shape
+        coarse_photo = _block_means(guided)
+        nearest = guided.nearest()
+        largest = torch.full_like(guided.photo[0], -torch.inf)
+        for exponent, _, _ in self._neighbours(guided, coarse_photo):
+            torch.maximum(largest, exponent, out=largest)
+        found = largest.isfinite()
+        largest = torch.where(found, largest, 0)
+        weights = torch.zeros_like(largest)
+        totals = largest.new_zeros((len(guided.maps), *largest.shape))
+        for exponent, i, j in self._neighbours(guided, coarse_photo):
+            weight = exponent.sub_(largest).exp_()
+            weights += weight
+            rows, columns = i.clamp(0, height - 1)[:, None], j.clamp(0, width - 1)
+            for total, values in zip(totals, guided.maps, strict=True):
+                total.addcmul_(weight, values[rows, columns])
+        around = guided.maps[:, nearest[0][:, None], nearest[1]]
+        return torch.where(found, totals / torch.where(found, weights, 1), around)
+
+    def _neighbours(self, guided: Guided, coarse_photo: Tensor) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
+        """Yield, neighbour by neighbour, its weights' exponents (H, W), its rows (H,) and its columns (W,).
+
+        Where the neighbour is a hole or lies outside, the exponent is minus infinity.
+        """
+        height, width = guided.known.shape
+        i, j = guided.nearest()
+        for down in range(-self._radius, self._radius + 1):
+            for across in range(-self._radius, self._radius + 1):
+                rows, columns = i + down, j + across
+                kept_rows, kept_columns = rows.clamp(0, height - 1)[:, None], columns.clamp(0, width - 1)
+                squares = (guided.rows - rows).square()[:, None] + (guided.columns - columns).square()
+                exponent = squares / (-2 * self._sigma_space**2)
+                for photo, coarse in zip(guided.photo, coarse_photo, strict=True):
+                    exponent -= (photo - coarse[kept_rows, kept_columns]).square() / (2 * self._sigma_colour**2)
+                inside = (rows == rows.clamp(0, height - 1))[:, None] & (columns == columns.clamp(0, width - 1))
+                counts = inside & (guided.known[kept_rows, kept_columns] > 0)
+                yield exponent.masked_fill_(~counts, -torch.inf), rows, columns
+
+
+def _block_means(guided: Guided) -> Tensor:
+    """Return the photo's mean over the fine pixels that are nearest to each coarse one, (3, h, w)."""
+    matrices = []
+    for nearest, size in zip(guided.nearest(), guided.known.shape, strict=True):
+        belongs = (nearest == torch.arange(size, device=nearest.device)[:, None]).double()
+        matrices.append(belongs / belongs.sum(dim=1, keepdim=True).clamp(min=1))
+    return matrices[0] @ guided.photo @ matrices[1].T

@@ -1,0 +1,154 @@
+"""What photo-guided filters share: pixels matched through the cameras, holes, and slopes.
+
+A filter of this kind is a weighted mean of coarse values, u_p = sum of W_pq d_q with weights that add up to 1. Such
+means flatten slopes at borders, and where the photo makes the weights uneven they copy its texture into the surface.
+With ``slopes`` each coarse pixel stands for a plane instead, u_p = sum of W_pq (d_q + s_q . (p - q)), s_q being the
+local slope of the coarse disparity, and the weights stay what they are. A plane in space has a disparity linear in the
+pixel, so planes come out exactly, whatever the photo; a constant added to the disparity and a factor applied to it come
+out again, as without. No filter's paper does this: ``slopes=False`` is the filter as published.
+
+Everything is computed in float64, without randomness, on the sample's device.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from dsr.geometry.camera import RangeType, from_range, to_range
+from dsr.methods.networks.inpainting import filled
+from dsr.methods.networks.maps import coarse_coordinates
+from dsr.sample import DepthSample
+
+_BEYOND = 4.0
+"""How many times farther than the farthest known coarse pixel an answer may be, and how many times nearer."""
+
+
+@dataclass(frozen=True)
+class Guided:
+    """Coarse maps and the photo that guides their upsampling.
+
+    Args:
+        photo: (3, H, W) float64 in [0, 1].
+        maps: (N, h, w) float64, to be upsampled alike; finite everywhere, in holes what stands around them.
+        known: (h, w) float64, 1 where the maps are known and 0 in holes.
+        rows, columns: (H,), (W,) float64, where each fine pixel lies in the coarse maps, in coarse pixels.
+
+    """
+
+    photo: Tensor
+    maps: Tensor
+    known: Tensor
+    rows: Tensor
+    columns: Tensor
+
+    @property
+    def scale(self) -> float:
+        """Fine pixels per coarse one."""
+        return self.photo.shape[-1] / self.maps.shape[-1]
+
+    def nearest(self) -> tuple[Tensor, Tensor]:
+        """Return the row (H,) and the column (W,) of the coarse pixel that each fine pixel is nearest to."""
+        height, width = self.known.shape
+        return _nearest(self.rows, height), _nearest(self.columns, width)
+
+    def interpolated(self) -> tuple[Tensor, Tensor]:
+        """Return the maps, (N, H, W), and their confidence, (H, W), at the fine pixels.
+
+        A value is the bilinear mean of the known among the four coarse pixels around, its confidence the bilinear
+        weight of these: 1 away from holes, 0 within, where the filled value stands in.
+        """
+        height, width = self.known.shape
+        down, across = _linear(self.rows, height), _linear(self.columns, width)
+        if bool(self.known.all()):
+            return down @ self.maps @ across.T, torch.ones_like(self.photo[0])
+        confidence = (down @ self.known @ across.T).clamp(0, 1)
+        mean = down @ (self.maps * self.known) @ across.T / torch.where(confidence > 0, confidence, 1)
+        return torch.where(confidence > 0, mean, down @ self.maps @ across.T), confidence
+
+
+class GuidedMethod(ABC):
+    """A filter of the coarse disparity that a photo guides: what comes before and after :meth:`filtered`.
+
+    Args:
+        fill_holes: whether holes of the coarse map are filled; otherwise a fine pixel whose nearest coarse pixel is a
+            hole stays one. No answer depends on a value in a hole.
+        slopes: whether each coarse pixel stands for a plane, see the module.
+
+    """
+
+    range_type: RangeType = "disparity"
+
+    def __init__(self, *, fill_holes: bool = False, slopes: bool = True) -> None:
+        self._fill_holes = fill_holes
+        self._slopes = slopes
+
+    @abstractmethod
+    def filtered(self, guided: Guided) -> Tensor:
+        """Return the fine maps, (N, H, W) float64, finite everywhere: the same weighted means of each."""
+
+    def __call__(self, sample: DepthSample) -> Tensor:
+        """Return the fine depth, (1, H, W) in metres in the precision of the coarse depth."""
+        device = sample.depth_lr.device
+        rows, columns = coarse_coordinates(sample.camera, sample.camera_lr, device)
+        coarse = to_range(sample.depth_lr.double(), sample.camera_lr, "disparity")[0] * sample.scale
+        known = coarse.isfinite()
+        maps = _planes(coarse) if self._slopes else coarse[None]
+        guided = Guided(sample.rgb.to(device).double(), filled(maps[:, None])[:, 0], known.double(), rows, columns)
+        answers = self.filtered(guided)
+        fine = answers[0]
+        if self._slopes:
+            fine = fine + answers[1] * rows[:, None] + answers[2] * columns
+        doffs = sample.camera.doffs  # disparity + doffs is inverse depth
+        least, most = (float(bound) + doffs for bound in coarse[known].aminmax())
+        fine = fine.clamp(least / _BEYOND - doffs, most * _BEYOND - doffs)
+        if not (self._fill_holes or bool(known.all())):
+            i, j = guided.nearest()
+            fine = fine.masked_fill(~known[i[:, None], j], torch.nan)
+        return from_range(fine[None], sample.camera, "disparity").to(sample.depth_lr)
+
+
+def slopes_along(values: Tensor, axis: int) -> Tensor:
+    """Return the local slope of a map along an axis, of its shape; unknown values (NaN) have slope 0.
+
+    Of backward and forward difference the one nearer to 0, or 0 where their signs differ; at a border or a hole the one
+    that there is. The median of that along three pixels then leaves out the pixel in a depth step that mixes both
+    sides.
+    """
+    values = values.movedim(axis, 0)
+    difference = torch.full_like(values[:1], torch.nan)
+    difference = torch.cat((difference, values[1:] - values[:-1], difference))
+    before, after = difference[:-1], difference[1:]
+    nearer = torch.where(before.abs() <= after.abs(), before, after)
+    slope = torch.where(before * after < 0, 0, nearer)
+    slope = torch.where(before.isnan(), after, torch.where(after.isnan(), before, slope)).nan_to_num(nan=0.0)
+    padded = torch.cat((slope[:1], slope, slope[-1:]))
+    return torch.stack((padded[:-2], slope, padded[2:])).median(dim=0).values.movedim(0, axis)
+
+
+def positive(method: str, **values: float) -> None:
+    """Raise a ValueError for the first of a method's parameters that is not a positive finite number."""
+    for name, value in values.items():
+        if not 0 < value < float("inf"):
+            raise ValueError(f"method.{name}: expected a positive number for {method}, got {value}")
+
+
+def _planes(coarse: Tensor) -> Tensor:
+    """Return each coarse pixel's plane: its value at row and column 0, per row, per column, (3, h, w); NaN in holes."""
+    height, width = coarse.shape
+    down, across = slopes_along(coarse, 0), slopes_along(coarse, 1)
+    constant = coarse - down * torch.arange(height).to(coarse)[:, None] - across * torch.arange(width).to(coarse)
+    return torch.stack((constant, down, across)).masked_fill(coarse.isnan(), torch.nan)
+
+
+def _nearest(where: Tensor, size: int) -> Tensor:
+    return (where + 0.5).floor().long().clamp(0, size - 1)
+
+
+def _linear(where: Tensor, size: int) -> Tensor:
+    """Return the weights of linear interpolation, (len(where), size); edge pixels are repeated beyond the border."""
+    places = torch.arange(size).to(where)
+    return (1 - (where.clamp(0, size - 1)[:, None] - places).abs()).clamp(min=0)

@@ -1,0 +1,280 @@
+"""Depth, albedo and lighting that explain a photo and a coarse depth map: the energy and the steps that lower it.
+
+Haefner et al., CVPR 2018 (see :mod:`dsr.methods.classical.srfs.upsampler`) minimise
+
+    E = 1/2 sum |albedo * shading(z, grad z) - photo|^2 + data / 2 * sum |mean z - coarse|^2
+        + area * sum z |m| + boundary * (length of the albedo's boundaries),
+
+z in pixels here (times the focal length, by the typical depth), so slopes are numbers without a unit. With a copy
+theta of (grad z, z) for the terms that are not linear, and u for what the copy has missed so far, the augmented
+Lagrangian is E with theta in the place of (grad z, z) but in the data term, plus
+
+    penalty / 2 * (|(grad z, z) + u - theta|^2 - |u|^2).
+
+Each ``update_`` lowers it, or leaves it, in its own variable: the albedo by region fusion, the lighting by least
+squares, theta pixel by pixel by Levenberg and Marquardt's method, z by conjugate gradients.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from dsr.methods.classical.conjugate_gradients import conjugate_gradients
+from dsr.methods.classical.finite_differences import box_mean, repeated
+from dsr.methods.classical.srfs.potts import Regions, boundary_length, fitted, fused
+from dsr.methods.classical.srfs.shading import area_of, best_lighting, by_theta, photometry, shading_of, surface_of
+
+_CG_ITERATIONS, _CG_TOLERANCE = 60, 1e-6
+_INNER = 3
+"""Steps of Levenberg and Marquardt's method in an update of theta."""
+_LESS, _MORE = 0.2, 5.0
+"""What its damping is multiplied with after a step that lowers the energy, and after one that would not."""
+
+
+class Weights(NamedTuple):
+    """The weights of E's terms: of the coarse map, of the area and of the albedo's boundaries."""
+
+    data: float
+    area: float
+    boundary: float
+
+
+class Problem(NamedTuple):
+    """What does not change.
+
+    ``photo`` (B, C, H, W); ``coarse`` (B, 1, h, w) in the unit of z, NaN in holes; ``rays`` (1, 3, H, W) and
+    ``focal`` (fx, fy) of the photo's camera, ``unit`` by which z is more than depth of about 1; ``inside``
+    (B, 1, H, W) bool, the pixels that may change.
+    """
+
+    photo: Tensor
+    coarse: Tensor
+    rays: Tensor
+    focal: tuple[float, float]
+    unit: float
+    inside: Tensor
+
+    @property
+    def scale(self) -> int:
+        """The upsampling factor."""
+        return self.photo.shape[-1] // self.coarse.shape[-1]
+
+
+class Slopes:
+    """(fx dz/du, fy dz/dv, z) / unit of maps, as a linear operator, and its adjoint.
+
+    Forward differences between pixels that are inside; where there is no next one, backward; where neither, 0. Without
+    a mask, the differences that :func:`dsr.geometry.surface.normals_of` takes.
+    """
+
+    def __init__(self, problem: Problem) -> None:
+        inside = problem.inside
+        self._factors = [focal / problem.unit for focal in problem.focal]
+        self._unit = problem.unit
+        self._forward, self._backward = [], []
+        for dim in (-1, -2):
+            size = inside.shape[dim]
+            both = inside.narrow(dim, 0, size - 1) & inside.narrow(dim, 1, size - 1)
+            none = torch.zeros_like(inside.narrow(dim, 0, 1))
+            ahead, behind = torch.cat((both, none), dim), torch.cat((none, both), dim)
+            self._forward.append(ahead.to(problem.photo))
+            self._backward.append((behind & ~ahead).to(problem.photo))
+
+    def __call__(self, z: Tensor) -> Tensor:
+        """Return theta of z, (B, 1, H, W) -> (B, 3, H, W)."""
+        found = []
+        for dim, factor, forward, backward in zip((-1, -2), self._factors, self._forward, self._backward, strict=True):
+            step = z.diff(dim=dim)
+            none = torch.zeros_like(z.narrow(dim, 0, 1))
+            found.append(factor * (forward * torch.cat((step, none), dim) + backward * torch.cat((none, step), dim)))
+        return torch.cat((*found, z / self._unit), dim=1)
+
+    def adjoint(self, theta: Tensor) -> Tensor:
+        """Apply the adjoint, (B, 3, H, W) -> (B, 1, H, W): <theta of z, theta> = <z, what is returned>."""
+        total = theta[:, 2:] / self._unit
+        pairs = zip((-1, -2), self._factors, self._forward, self._backward, theta[:, :2].split(1, dim=1), strict=True)
+        for dim, factor, forward, backward, slope in pairs:
+            size = slope.shape[dim]
+            ahead, behind = forward * slope, backward * slope
+            step = factor * (ahead.narrow(dim, 0, size - 1) + behind.narrow(dim, 1, size - 1))
+            none = torch.zeros_like(total.narrow(dim, 0, 1))
+            total = total + torch.cat((none, step), dim) - torch.cat((step, none), dim)
+        return total
+
+
+class ShadingSolver:
+    """The variables of a problem, and their updates.
+
+    Args:
+        problem: what is given.
+        weights: of E's terms.
+        first: (B, 1, H, W), the first z; outside it stays.
+        penalty: the first one.
+
+    Attributes:
+        z, theta, missed, albedo, lighting, regions: the variables; ``missed`` is u.
+
+    """
+
+    def __init__(self, problem: Problem, weights: Weights, first: Tensor, penalty: float) -> None:
+        self.problem, self.weights, self.penalty = problem, weights, penalty
+        self.slopes = Slopes(problem)
+        self._weight = problem.inside.to(problem.photo)
+        self._known = problem.coarse.isfinite()
+        self._coarse = torch.where(self._known, problem.coarse, 0)
+        coupling = problem.photo.new_tensor((1.0, 1.0, (problem.unit / problem.scale) ** 2))
+        self._coupling = coupling[:, None, None] * self._weight
+        self.z, self.theta = first, self.slopes(first)
+        self.missed = torch.zeros_like(self.theta)
+        self.albedo = problem.photo
+        self.lighting = problem.photo.new_tensor((0.0, 0.0, -1.0, 0.0)).expand(*problem.photo.shape[:2], 4)
+        self.regions: Regions | None = None
+        self._damping = torch.full_like(first, 1e-3)
+
+    def update_albedo(self, *, anew: bool = True) -> None:
+        """Take the best albedo that is constant in regions: in new ones, if they are better than the old.
+
+        The first call replaces the photo, which stands for the albedo before it.
+        """
+        photo, inside = self.problem.photo, self.problem.inside
+        shading = shading_of(surface_of(self.theta, self.problem.rays).normals, self.lighting)
+        found = []
+        if self.regions is not None:
+            found.append(self.regions)
+        if anew or not found:
+            found.append(fused(photo, shading, self.weights.boundary, inside))
+        tried = [(fitted(photo, shading, regions), regions) for regions in found]
+        energies = [self._shading_energy(albedo, shading) + self._boundaries(regions) for albedo, regions in tried]
+        self.albedo, self.regions = tried[energies.index(min(energies))]
+
+    def update_lighting(self) -> None:
+        """Take the best lighting."""
+        normals = surface_of(self.theta, self.problem.rays).normals
+        lighting = best_lighting(self.problem.photo, self.albedo, normals, self._weight)
+        self.lighting = lighting.to(self.problem.photo)
+
+    def update_theta(self) -> None:
+        """Lower the Lagrangian in theta, pixel by pixel."""
+        target = self.slopes(self.z) + self.missed
+        theta, damping = self.theta, self._damping
+        energy = self._pixel_energy(theta, target)
+        for _ in range(_INNER):
+            near = theta - _solved(*self._quadratic(theta, target), damping)
+            lower = self._pixel_energy(near, target)
+            better = lower < energy
+            theta, energy = torch.where(better, near, theta), torch.where(better, lower, energy)
+            damping = (damping * torch.where(better, _LESS, _MORE)).clamp(1e-6, 1e6)
+        self.theta, self._damping = theta, damping
+
+    def update_depth(self) -> None:
+        """Lower the Lagrangian, quadratic in z, by conjugate gradients, from z as it is."""
+        weight = self._weight
+        wanted = self.theta - self.missed
+        rest = self._coarse - self._means(self.z)
+        right = weight * (
+            self.weights.data * self._spread(rest)
+            + self.penalty * self.slopes.adjoint(self._coupling * (wanted - self.slopes(self.z)))
+        )
+        found = conjugate_gradients(
+            self.normal_operator, right, torch.zeros_like(right), iterations=_CG_ITERATIONS, tolerance=_CG_TOLERANCE
+        )
+        self.z = self.z + found.values
+
+    def update_missed(self, growth: float) -> None:
+        """Add to u what theta misses of (grad z, z), and multiply the penalty."""
+        self.missed = (self.missed + self.slopes(self.z) - self.theta) / growth
+        self.penalty *= growth
+
+    def normal_operator(self, z: Tensor) -> Tensor:
+        """Return the Lagrangian's second derivative in z, times z; 0 outside."""
+        inside = self._weight * z
+        own = self.penalty * self.slopes.adjoint(self._coupling * self.slopes(inside))
+        return self._weight * (own + self.weights.data * self._spread(self._means(inside)))
+
+    def lagrangian(self) -> float:
+        """Return the augmented Lagrangian."""
+        miss = self.slopes(self.z) + self.missed - self.theta
+        bound = 0.5 * self.penalty * float((self._coupling * (miss.square() - self.missed.square())).sum())
+        return sum(self.terms(self.theta).values()) + bound
+
+    def terms(self, theta: Tensor | None = None) -> dict[str, float]:
+        """Return E's ``shading``, ``data``, ``area`` and ``boundaries``; without theta, of z alone."""
+        theta = self.slopes(self.z) if theta is None else theta
+        surface = surface_of(theta, self.problem.rays)
+        return {
+            "shading": self._shading_energy(self.albedo, shading_of(surface.normals, self.lighting)),
+            "data": 0.5 * self.weights.data * float((self._coarse - self._means(self.z)).square().sum()),
+            "area": self.weights.area * float((self._weight * area_of(theta, surface)).sum()),
+            "boundaries": 0.0 if self.regions is None else self._boundaries(self.regions),
+        }
+
+    def _means(self, z: Tensor) -> Tensor:
+        return torch.where(self._known, box_mean(z, self.problem.scale), 0)
+
+    def _spread(self, coarse: Tensor) -> Tensor:
+        """Return the adjoint of the means."""
+        return repeated(coarse, self.problem.scale) / self.problem.scale**2
+
+    def _shading_energy(self, albedo: Tensor, shading: Tensor) -> float:
+        return 0.5 * float((self._weight * (albedo * shading - self.problem.photo).square()).sum())
+
+    def _boundaries(self, regions: Regions) -> float:
+        return self.weights.boundary * boundary_length(regions, self.problem.inside)
+
+    def _pixel_energy(self, theta: Tensor, target: Tensor) -> Tensor:
+        """Return what a theta costs in each pixel, (B, 1, H, W)."""
+        surface = surface_of(theta, self.problem.rays)
+        missed = self.albedo * shading_of(surface.normals, self.lighting) - self.problem.photo
+        own = 0.5 * missed.square().sum(dim=1, keepdim=True) + self.weights.area * area_of(theta, surface)
+        bound = 0.5 * self.penalty * (self._coupling * (theta - target).square()).sum(dim=1, keepdim=True)
+        return self._weight * own + bound
+
+    def _quadratic(self, theta: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
+        """Return gradient (B, 3, H, W) and an approximate Hessian (B, 6, H, W): its upper triangle, row by row."""
+        problem, weights = self.problem, self.weights
+        surface = surface_of(theta, problem.rays)
+        n = surface.normals
+        seen = photometry(problem.photo, self.albedo, self.lighting, surface, problem.rays)
+        gradient = (seen.residual[:, :, None] * seen.slopes).sum(dim=1)
+        depth = theta[:, 2:]
+        size = by_theta(n, problem.rays)  # the derivative of |m|
+        gradient = gradient + weights.area * depth.abs() * size
+        gradient[:, 2:] += weights.area * depth.sign() * surface.length
+        curved = weights.area * depth.abs() / surface.length
+        x, y = problem.rays[:, :1], problem.rays[:, 1:2]
+        products: dict[tuple[int, int], Tensor | float] = {
+            (0, 0): 1 + x * x,
+            (0, 1): x * y,
+            (0, 2): x,
+            (1, 1): 1 + y * y,
+            (1, 2): y,
+            (2, 2): 1.0,
+        }
+        triangle = []
+        for (i, j), product in products.items():
+            shaded = (seen.slopes[:, :, i] * seen.slopes[:, :, j]).sum(dim=1, keepdim=True)
+            triangle.append(shaded + curved * (product - size[:, i : i + 1] * size[:, j : j + 1]))
+        hessian = torch.cat(triangle, dim=1) * self._weight
+        hessian[:, [0, 3, 5]] += self.penalty * self._coupling
+        return gradient * self._weight + self.penalty * self._coupling * (theta - target), hessian
+
+
+def _solved(gradient: Tensor, hessian: Tensor, damping: Tensor) -> Tensor:
+    """Return the inverse of the Hessian, its diagonal raised by ``damping`` of it, times the gradient."""
+    a, b, c, d, e, f = hessian.unbind(dim=1)
+    more = 1 + damping[:, 0]
+    a, d, f = (torch.where(each > 0, each * more, 1) for each in (a, d, f))
+    x, y, z = gradient.unbind(dim=1)
+    l21, l31 = b / a, c / a
+    middle = d - l21 * b
+    low = e - l21 * c
+    l32 = low / middle
+    last = f - l31 * c - l32 * low
+    y = y - l21 * x
+    z = (z - l31 * x - l32 * y) / last
+    y = (y - low * z) / middle
+    x = (x - b * y - c * z) / a
+    return torch.stack((x, y, z), dim=1)

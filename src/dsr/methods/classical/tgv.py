@@ -1,0 +1,284 @@
+"""Upsampling by anisotropic total generalised variation, without training.
+
+Ferstl, Reinbacher, Ranftl, Rüther and Bischof, *Image Guided Depth Upsampling using Anisotropic Total Generalized
+Variation*, ICCV 2013: of all fine maps u and vector fields v, the pair with the least
+
+    E(u, v) = first * sum |G (grad u - v)| + second * sum |grad v| + data_weight / 2 * sum w (mean u - d)^2,
+
+their eq. 6 with first = alpha_1 and second = alpha_0. v is the map's slope where it is smooth, so planes cost nothing.
+G = exp(-sharpness |grad I|^exponent) n n^T + t t^T, with n = grad I / |grad I| and t across it, is their tensor from
+the grey photo I (eq. 5): across its edges the map may jump. Solved by the primal-dual method of Chambolle and Pock
+(2011), with the diagonal step sizes of Pock and Chambolle (ICCV 2011, eq. 10 with alpha = 1), over-relaxed (Condat
+2013, algorithm 3.1).
+
+What differs from the original:
+
+- A coarse pixel d says what the *mean* of u over its block is, w = the block's pixels; there, it is the value of a
+  single fine pixel. Such a data term's proximal map has a closed form as well, and without a finite ``data_weight`` it
+  is a projection: block means are the input's exactly.
+- It works on disparity, linear on planes, over its range in the image.
+- A difference that would need a pixel beyond the border is left out, whereas the original takes it for 0, which bends
+  planes there.
+- It starts from the bicubic map and its gradient, and stops where the map no longer moves. Holes have no data term, as
+  there; with them, it starts from its own solution on the coarse map, for a hole is filled pixel by pixel.
+- ``second`` is 2.4 instead of 17: on procedural scenes, renderings are better by a quarter, and it converges sooner.
+  The iteration is slow at the end: 1000 iterations come close to the least E, and ripples of walls may remain.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from dsr.geometry.camera import RangeType, from_range, to_range
+from dsr.methods.base import expect_limits, history_of
+from dsr.methods.classical.finite_differences import box_mean, divergence, gradient, grey, repeated, touching, upsampled
+from dsr.methods.networks.inpainting import filled
+from dsr.methods.networks.maps import normalised
+from dsr.methods.tiling import Progress
+from dsr.sample import DepthSample
+
+CHECK_EVERY = 50
+"""Iterations between two looks at how far the map has moved."""
+_RELAXATION = 1.9
+"""By how much of a step the iterates move; converges below 2."""
+_SLOPE = 0.3
+"""Unit of slopes, in that of the map a pixel, for step sizes."""
+
+
+class Tensors(NamedTuple):
+    """Symmetric 2 x 2 matrices, one a pixel: [[uu, uv], [uv, vv]], each (B, 1, H, W)."""
+
+    uu: Tensor
+    uv: Tensor
+    vv: Tensor
+
+    def times(self, p: Tensor) -> Tensor:
+        """Return the products with vectors, (B, 2, 1, H, W)."""
+        return torch.stack((self.uu * p[:, 0] + self.uv * p[:, 1], self.uv * p[:, 0] + self.vv * p[:, 1]), dim=1)
+
+
+class Minimised(NamedTuple):
+    """What the minimisation found.
+
+    ``values`` (B, 1, H, W) is u, ``slopes`` (B, 2, H, W) is v, each the mean of the iterates since the last look, for
+    they oscillate; the iterations taken, and the RMS by which u moved between two looks.
+    """
+
+    values: Tensor
+    slopes: Tensor
+    iterations: int
+    moved: list[float]
+
+
+class TotalGeneralisedVariation:
+    """TGV-guided upsampling.
+
+    Holes of the input are filled. Memory: about 90 float64 maps of the photo's size, 180 MB for 512 x 512. It takes the
+    coarse map for block means of disparity, whatever the downsampling model was.
+
+    Args:
+        iterations: at most so many.
+        tolerance: it stops after moving, within 50 iterations, by less than this share of the map's range (RMS).
+        first: weight of the map's distance from its slopes (alpha_1).
+        second: weight of the slopes' variation (alpha_0).
+        data_weight: weight of the input (lambda); null: its block means are met exactly.
+        sharpness: how much an edge of the photo lets the map jump (beta).
+        exponent: of the photo's gradient (gamma).
+        step_ratio: of the dual to the primal steps; moves the time that it takes, not the minimum.
+
+    Raises:
+        ValueError: a value is out of range.
+
+    """
+
+    range_type: RangeType = "disparity"
+
+    def __init__(
+        self,
+        iterations: int = 1000,
+        tolerance: float = 1e-4,
+        first: float = 1.2,
+        second: float = 2.4,
+        data_weight: float | None = None,
+        sharpness: float = 9.0,
+        exponent: float = 0.85,
+        step_ratio: float = 1e4,
+    ) -> None:
+        expect_limits(tolerance, iterations=iterations)
+        positive = {
+            "first": first,
+            "second": second,
+            "data_weight": 1.0 if data_weight is None else data_weight,
+            "exponent": exponent,
+            "step_ratio": step_ratio,
+        }
+        for name, value in positive.items():
+            if not value > 0:
+                raise ValueError(f"method.{name}: expected more than 0, got {value}")
+        if not sharpness >= 0:
+            raise ValueError(f"method.sharpness: expected 0 or more, got {sharpness}")
+        self.iterations, self.tolerance = iterations, tolerance
+        self.first, self.second, self.data_weight = first, second, data_weight
+        self.sharpness, self.exponent, self.step_ratio = sharpness, exponent, step_ratio
+        self.history: list[dict[str, float]] = []
+
+    @torch.inference_mode()
+    def __call__(self, sample: DepthSample, progress: Progress | None = None) -> Tensor:
+        """Return the fine depth, (1, H, W) in metres, on the sample's device and without holes.
+
+        A disparity at or beyond infinity becomes NaN.
+
+        Args:
+            sample: the problem.
+            progress: is told the iterations done and the most that it may take.
+
+        """
+        coarse = to_range(sample.depth_lr.double(), sample.camera_lr, "disparity")[None] * sample.scale
+        scaled = normalised(coarse)
+        known = coarse.isfinite()
+        values = torch.where(known, scaled.values, torch.nan)
+        found = self.minimised(sample.rgb[None].double(), values, sample.scale, progress)
+        self.history = history_of(found.moved, CHECK_EVERY)
+        fine = found.values * scaled.span + scaled.minimum
+        return from_range(fine[0], sample.camera, "disparity").to(sample.depth_lr.dtype)
+
+    def minimised(self, rgb: Tensor, coarse: Tensor, scale: int, progress: Progress | None = None) -> Minimised:
+        """Return the minimum of E for normalised maps.
+
+        Args:
+            rgb: (B, 3, H, W) in [0, 1].
+            coarse: (B, 1, H / scale, W / scale) of the same type, in [0, 1], NaN where it is not known.
+            scale: the factor; at 1, holes are filled.
+            progress: as above.
+
+        """
+        start = filled(coarse)
+        if scale > 1 and not bool(coarse.isfinite().all()):
+            start = self.minimised(box_mean(rgb, scale), coarse, 1).values
+        first = upsampled(start, scale)
+        return self._iterated(first, coarse, self.tensors(rgb), progress)
+
+    def tensors(self, rgb: Tensor) -> Tensors:
+        """Return G for (B, 3, H, W) photos; the identity where a photo is constant."""
+        slope = gradient(grey(rgb))
+        size = slope.square().sum(dim=1).sqrt()
+        normal = slope / torch.where(size > 0, size, 1)[:, None]  # 0 where there is none
+        less = 1 - torch.exp(-self.sharpness * size.pow(self.exponent))
+        x, y = normal[:, 0], normal[:, 1]
+        return Tensors(1 - less * x * x, -less * x * y, 1 - less * y * y)
+
+    def objective(self, values: Tensor, slopes: Tensor, coarse: Tensor, tensors: Tensors) -> Tensor:
+        """Return E(u, v), (B,); of the data term, 0 where ``data_weight`` is None."""
+        bent = tensors.times(_within(gradient(values) - slopes[:, :, None]))
+        total = self.first * _lengths(bent).sum(dim=(1, 2, 3))
+        total = total + self.second * _lengths(gradient(slopes)).sum(dim=(1, 2, 3))
+        if self.data_weight is None:
+            return total
+        scale = values.shape[-1] // coarse.shape[-1]
+        miss = torch.where(coarse.isfinite(), box_mean(values, scale) - coarse, 0)
+        return total + self.data_weight / 2 * scale**2 * miss.square().sum(dim=(1, 2, 3))
+
+    def _iterated(self, first: Tensor, coarse: Tensor, g: Tensors, progress: Progress | None) -> Minimised:
+        """Return what the primal-dual iteration makes of a first map."""
+        steps = _Steps.of(g, self.step_ratio)
+        data = _DataTerm(coarse, steps.u, self.data_weight)
+        u = first
+        v = slopes(u)
+        p, q = torch.zeros_like(v)[:, :, None], torch.zeros_like(gradient(v))
+        mean_u, mean_v = torch.zeros_like(u), torch.zeros_like(v)
+        before, moved, done = u, [], 0
+        for done in range(1, self.iterations + 1):
+            gp = _within(g.times(p))
+            near_u = data.nearest(u + steps.u * divergence(gp))
+            near_v = v + steps.v * (gp[:, :, 0] + divergence(q))
+            ahead_u, ahead_v = 2 * near_u - u, 2 * near_v - v
+            near_p = _ball(p + steps.p * g.times(_within(gradient(ahead_u) - ahead_v[:, :, None])), self.first)
+            near_q = _ball(q + steps.q * gradient(ahead_v), self.second)
+            u, v, p, q = (
+                old.lerp(near, _RELAXATION) for old, near in ((u, near_u), (v, near_v), (p, near_p), (q, near_q))
+            )
+            since = (done - 1) % CHECK_EVERY + 1
+            mean_u, mean_v = mean_u.lerp(near_u, 1 / since), mean_v.lerp(near_v, 1 / since)
+            if since == CHECK_EVERY:
+                if progress is not None:
+                    progress(done, self.iterations)
+                moved.append(float((mean_u - before).square().mean(dim=(-2, -1)).max().sqrt()))
+                if moved[-1] < self.tolerance:
+                    break
+                before = mean_u
+        if progress is not None:
+            progress(self.iterations, self.iterations)
+        return Minimised(mean_u, mean_v, done, moved)
+
+
+class _Steps(NamedTuple):
+    """Step sizes: of u (B, 1, H, W), v (B, 2, H, W), p (B, 1, 1, H, W) and q."""
+
+    u: Tensor
+    v: Tensor
+    p: Tensor
+    q: float
+
+    @classmethod
+    def of(cls, g: Tensors, ratio: float) -> _Steps:
+        """Return the inverse sums of the operator's absolute rows and columns, times and by the ratio's root.
+
+        Those are of the operator on (u, v / _SLOPE), for slopes are smaller than what they lead to.
+        """
+        root = ratio**0.5
+        along_u, along_v = g.uu + g.uv.abs(), g.vv + g.uv.abs()
+        inside = _within(torch.stack((along_u, along_v), dim=1))
+        columns = touching(inside)
+        v = _SLOPE / (inside[:, :, 0] + 4)
+        p = 1 / ((2 + _SLOPE) * torch.maximum(along_u, along_v))[:, None]
+        return cls(1 / (root * columns.clamp(min=1e-6)), v / root, p * root, root / (2 * _SLOPE))
+
+
+class _DataTerm:
+    """The proximal map of data_weight / 2 * sum over blocks of size^2 (mean - coarse)^2, for step sizes one a pixel.
+
+    With steps t, the pixels of a block move by -t * data_weight * (mean - coarse): the mean of that is an equation for
+    the mean. As data_weight grows, it becomes the projection onto mean = coarse.
+    """
+
+    def __init__(self, coarse: Tensor, steps: Tensor, weight: float | None) -> None:
+        self.scale = steps.shape[-1] // coarse.shape[-1]
+        known = coarse.isfinite()
+        self.coarse = torch.where(known, coarse, 0)
+        mean = box_mean(steps, self.scale)
+        share = 1 / mean if weight is None else weight / (1 + weight * mean)
+        self.share = steps * repeated(torch.where(known, share, 0), self.scale)
+
+    def nearest(self, u: Tensor) -> Tensor:
+        """Return the proximal map of u, (B, 1, H, W)."""
+        return u - self.share * repeated(box_mean(u, self.scale) - self.coarse, self.scale)
+
+
+def slopes(u: Tensor) -> Tensor:
+    """Return the gradient of (B, 1, H, W) maps, (B, 2, H, W), with the last column and row that have one repeated."""
+    v = gradient(u)[:, :, 0]
+    if u.shape[-1] > 1:
+        v[:, 0, :, -1] = v[:, 0, :, -2]
+    if u.shape[-2] > 1:
+        v[:, 1, -1] = v[:, 1, -2]
+    return v
+
+
+def _within(p: Tensor) -> Tensor:
+    """Set to 0, in place, what (B, 2, C, H, W) says of differences beyond the border."""
+    p[:, 0, ..., -1] = 0
+    p[:, 1, ..., -1, :] = 0
+    return p
+
+
+def _lengths(p: Tensor) -> Tensor:
+    """Return the length of each pixel's vector or matrix, (B, 2, C, H, W) -> (B, 1, H, W)."""
+    return p.square().sum(dim=(1, 2), keepdim=True)[:, 0].sqrt()
+
+
+def _ball(p: Tensor, radius: float) -> Tensor:
+    """Return (B, 2, C, H, W) with each pixel's vector or matrix cut to a length."""
+    return p / (_lengths(p)[:, None] / radius).clamp(min=1)

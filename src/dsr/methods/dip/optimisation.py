@@ -1,0 +1,205 @@
+"""The optimisation of one image as a LightningModule."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import lightning
+import torch
+import torchmetrics
+from torch import Tensor, nn
+from torch.nn import functional
+
+from dsr.geometry.comparison import comparison
+from dsr.methods.dip.problem import ImageProblem, PriorObjective
+from dsr.methods.dip.skip_net import Padding, SkipNet, levels_for
+from dsr.methods.dip.stopping import Stopping
+from dsr.metrics.functional import SurfacePair, rmse_v
+
+_NOISE_CHANNELS = 32
+
+
+@dataclass(frozen=True)
+class PriorSettings:
+    """The network, its input and its optimiser.
+
+    Args:
+        steps: at most.
+        learning_rate: of Adam.
+        widths, skips: of the network's levels, see :class:`~dsr.methods.dip.skip_net.SkipNet`; a small image has fewer.
+        padding: of its convolutions.
+        border: pixels by which the network's image is larger on each side, filled with the mirrored photo and cut off
+            again: no pixel of the answer lies at a border.
+        guide: whether the photo is part of the network's input, beside 32 channels of noise.
+        input_noise: the fixed noise is U[0, input_noise].
+        perturbation, guide_perturbation: standard deviation of what is added to noise and photo, anew each step.
+        average: decay of the exponential moving average of the depth maps.
+        margin: by how much depth may leave the coarse map's range, as a share of it.
+        mixed: whether convolutions run in bfloat16.
+
+    Raises:
+        ValueError: a value is out of range.
+
+    """
+
+    steps: int
+    learning_rate: float
+    widths: Sequence[int]
+    skips: Sequence[int]
+    padding: Padding
+    border: int
+    guide: bool
+    input_noise: float
+    perturbation: float
+    guide_perturbation: float
+    average: float
+    margin: float
+    mixed: bool
+
+    def __post_init__(self) -> None:
+        """Check the values."""
+        for name in ("steps", "learning_rate"):
+            if not 0 < getattr(self, name) < math.inf:
+                raise ValueError(f"method.{name}: expected a positive number, got {getattr(self, name)}")
+        for name in ("input_noise", "perturbation", "guide_perturbation", "margin"):
+            if not 0 <= getattr(self, name) < math.inf:
+                raise ValueError(f"method.{name}: expected 0 or a positive number, got {getattr(self, name)}")
+        if self.border < 0:
+            raise ValueError(f"method.border: expected 0 or a positive number, got {self.border}")
+        if not self.guide and not self.input_noise:
+            raise ValueError("method.input_noise: expected a positive number, or method.guide=true; got 0 and false")
+        if not 0 <= self.average < 1:
+            raise ValueError(f"method.average: expected 0 or more and less than 1, got {self.average}")
+        for name, values in (("widths", self.widths), ("skips", self.skips)):
+            if not values or min(values) < 1 or len(values) != len(self.widths):
+                raise ValueError(f"method.{name}: expected a positive number for each level, got {list(values)}")
+
+
+class PriorOptimisation(lightning.LightningModule):
+    """One network for one image.
+
+    Args:
+        problem: the image.
+        objective: the loss.
+        settings: of the network and the optimiser.
+        stopping: the rule.
+        seed: of the weights, the input and its perturbations.
+        metrics: of a validation pass; None for none.
+        truth: (1, 1, H, W) true depth to validate with, never used by anything else but an oracle; None for none.
+        base: (1, 1, H, W) depth in metres that the network's answer is added to; None for an answer from scratch.
+
+    """
+
+    start: Tensor
+    spread: Tensor
+    average: Tensor
+
+    def __init__(
+        self,
+        problem: ImageProblem,
+        objective: PriorObjective,
+        settings: PriorSettings,
+        stopping: Stopping,
+        seed: int,
+        metrics: torchmetrics.MetricCollection | None = None,
+        truth: Tensor | None = None,
+        base: Tensor | None = None,
+    ) -> None:
+        super().__init__()
+        self.problem, self.objective, self.settings, self.stopping = problem, objective, settings, stopping
+        self.metrics, self.truth, self.base = metrics, truth, base
+        self.validation_scores: dict[str, dict[str, float]] = {}
+        device, size = problem.rgb.device, problem.rgb.shape[-2:]
+        self._border = min(settings.border, min(size) - 1)  # what mirroring has pixels for
+        self.generator = torch.Generator(device).manual_seed(seed)
+        with torch.random.fork_rng([]):
+            torch.manual_seed(seed)
+            self.net = self._network().to(device, memory_format=torch.channels_last)  # type: ignore[call-overload]
+            photo = functional.pad(problem.rgb, (self._border,) * 4, mode="reflect")
+            noise = settings.input_noise * torch.rand(1, _NOISE_CHANNELS, *photo.shape[-2:])
+        parts = [noise.to(device), photo] if settings.guide else [noise.to(device)]
+        spread = torch.full((sum(part.shape[1] for part in parts), 1, 1), settings.perturbation, device=device)
+        spread[_NOISE_CHANNELS:] = settings.guide_perturbation
+        self.register_buffer("start", torch.cat(parts, dim=1), persistent=False)
+        self.register_buffer("spread", spread, persistent=False)
+        self.register_buffer("average", torch.zeros_like(problem.grey))
+
+    def training_step(self, _: Any, __: int) -> Tensor:
+        """Return the loss of this step's depth map, which joins the average."""
+        depth, intensity = self.answer()
+        terms = self.objective(depth, intensity, self.problem)
+        self.log_dict({f"train/{name}": value.detach() for name, value in terms.items()}, batch_size=1)
+        step = self.global_step + 1
+        with torch.no_grad():
+            self.average.lerp_(depth, 1 - min(self.settings.average, (step - 1) / (step + 9)))
+            if self.stopping.observe(step, depth, self.average):
+                self.trainer.should_stop = True
+        return terms["loss"]
+
+    def answer(self) -> tuple[Tensor, Tensor]:
+        """Return depth in metres and intensity in [0, 1], both (1, 1, H, W), for an input perturbed anew."""
+        shape, device = self.start.shape, self.start.device
+        draws = torch.randn(shape, generator=self.generator, device=device)
+        x = torch.addcmul(self.start, draws, self.spread).contiguous(memory_format=torch.channels_last)
+        with torch.autocast(device.type, torch.bfloat16, enabled=self.settings.mixed):
+            y = self.net(x)
+        height, width = self.problem.grey.shape[-2:]
+        y = y[..., self._border :, self._border :][..., :height, :width].float()
+        return self._depth(y[:, :1]), y[:, 1:].sigmoid()
+
+    def result(self) -> Tensor:
+        """Return the depth map to answer with, (1, 1, H, W) in metres."""
+        return self.stopping.result(self.average)
+
+    def validation_step(self, _: Any, __: int) -> None:
+        """Score the average so far, where there is a truth, and draw it."""
+        depth = self.average
+        if self.truth is not None:
+            pair = SurfacePair(depth, self.truth, self.problem.rays)
+            self.stopping.judge(float(rmse_v(pair).nanmean()), depth)
+            if self.metrics is not None:
+                self.metrics.reset()
+                self.metrics.update(pair)
+                self.validation_scores = {"val": {name: float(v) for name, v in self.metrics.compute().items()}}
+                named = {f"val/{k}": value for k, value in self.validation_scores["val"].items()}
+                self.log_dict({"step": float(self.global_step), **named}, batch_size=1)  # else Lightning counts from 0
+        writer: Any = getattr(self.logger, "experiment", None)
+        if hasattr(writer, "add_image"):
+            writer.add_image("renderings", comparison(depth, self.truth, self.problem.rays), self.global_step)
+
+    def configure_optimizers(self) -> torch.optim.Optimizer:
+        """Return Adam."""
+        return torch.optim.Adam(self.net.parameters(), self.settings.learning_rate, fused=True)
+
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Keep what is not a parameter: where the random numbers are, and what the stopping rule knows."""
+        checkpoint["generator"], checkpoint["stopping"] = self.generator.get_state(), self.stopping.state()
+
+    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Go on from there."""
+        self.generator.set_state(checkpoint["generator"].cpu())
+        self.stopping.restore(checkpoint["stopping"])
+
+    def _network(self) -> SkipNet:
+        """Return the network; with a base it starts by answering nothing."""
+        settings = self.settings
+        height, width = self.problem.rgb.shape[-2:]
+        levels = levels_for(height, width, len(settings.widths))
+        channels = _NOISE_CHANNELS + (3 if settings.guide else 0)
+        net = SkipNet(channels, 2, settings.widths[:levels], settings.skips[:levels], settings.padding)
+        if self.base is not None:
+            nn.init.zeros_(net.last.weight[:1])
+            nn.init.zeros_(net.last.bias[:1])  # type: ignore[index]
+        return net
+
+    def _depth(self, y: Tensor) -> Tensor:
+        """Return depth in metres for the network's first channel."""
+        problem = self.problem
+        margin = self.settings.margin * problem.span
+        least = max(problem.low - margin, 0.5 * problem.low)
+        if self.base is not None:
+            return (self.base + margin * y).clamp(min=0.5 * problem.low)
+        return least + (problem.low + problem.span + margin - least) * y.sigmoid()

@@ -1,0 +1,286 @@
+"""DIP and DIP-V: depth super-resolution by an untrained network that is optimised for each image.
+
+Ulyanov, Vedaldi, Lempitsky, *Deep Image Prior*, CVPR 2018, guided by the photo and with the visual loss of Voynov et
+al., *Perceptual Deep Depth Super-Resolution*, ICCV 2019, section 4.2. The network's answers are a depth map, whose
+coarse version is compared with the input, and the photo's intensities. As holes of the input are compared with nothing,
+they are filled with what the network finds natural.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Any, ClassVar, get_args
+
+import lightning
+import torch
+import torchmetrics
+from lightning.pytorch.callbacks import Callback
+from torch import Tensor
+from torch.utils.data import DataLoader
+
+from dsr.degradation.downsampling import Downsampling, scene_generator
+from dsr.geometry.camera import RangeType
+from dsr.methods.dip.callbacks import Advance, Display, Keep, Origin, Silent, checkpoint_of, cost_of_step
+from dsr.methods.dip.noise import noise_level, tilt_of
+from dsr.methods.dip.optimisation import PriorOptimisation, PriorSettings
+from dsr.methods.dip.problem import DataLoss, ImageProblem, PriorObjective
+from dsr.methods.dip.skip_net import Padding
+from dsr.methods.dip.stopping import Fixed, Oracle, Residual, Stopping, StoppingName, Variance
+from dsr.methods.networks.base import DTYPES, Precision
+from dsr.methods.networks.trained import build_trained
+from dsr.sample import DepthSample
+from dsr.utils.lightning import Interruption, LastValidation, Log, ValidationTable, duration, fit, without_chatter
+
+WORKSPACE = "optimisation"
+_LOG_EVERY = 10
+
+
+@dataclass(kw_only=True)
+class DeepImagePrior:
+    """An :class:`~dsr.methods.base.Upsampler` that optimises a network for each image.
+
+    Each image has its own network and its own random numbers, which follow from the seed, the data set, the scene and
+    the scale: whatever else is optimised before it makes no difference.
+
+    Args:
+        scale: the upsampling factor.
+        downsampling: the model that is assumed to have led to the coarse map.
+        steps, learning_rate, widths, skips, padding, border, guide, input_noise, perturbation, guide_perturbation,
+            average, margin: see :class:`~dsr.methods.dip.optimisation.PriorSettings`.
+        data_loss, data_weight, w, w_intensity: see :class:`~dsr.methods.dip.problem.PriorObjective`.
+        largest_tilt: degrees; where the noise that is estimated in the coarse map tilts its normals by more, they say
+            nothing of the surface, and MSE_v is left out. None for never.
+        stopping: ``fixed``: after ``steps``; ``variance``: at the minimum of the iterates' variance; ``residual``: as
+            soon as the coarse map is explained up to its estimated noise; ``oracle``: at the validation pass with the
+            lowest RMSE_v, for which the truth is looked at.
+        patience: steps without a new minimum until ``variance`` stops.
+        validate_every: steps between validation passes, which log scores and renderings; 0 for none.
+        precision: of the convolutions.
+        seed: of all that is random.
+        device: where to compute.
+        metrics: makes the metrics of a validation pass; None for none.
+        workspace: a directory for logs, and for checkpoints to go on from; None for neither.
+        display: shows how far an optimisation is.
+
+    Raises:
+        ValueError: a value is out of range.
+
+    """
+
+    range_type: ClassVar[RangeType] = "orthogonal"
+    optimises: ClassVar[bool] = True
+
+    scale: int
+    downsampling: Downsampling
+    steps: int = 600
+    learning_rate: float = 0.01
+    widths: Sequence[int] = (32, 64, 128, 128, 128)
+    skips: Sequence[int] = (4, 4, 4, 4, 4)
+    padding: Padding = "zeros"
+    border: int = 8
+    guide: bool = True
+    input_noise: float = 0.1
+    perturbation: float = 0.1
+    guide_perturbation: float = 0.05
+    average: float = 0.99
+    margin: float = 0.1
+    data_loss: DataLoss = "lap1"
+    data_weight: float = 1.0
+    w: float = 1.0
+    w_intensity: float = 0.01
+    largest_tilt: float | None = 10.0
+    stopping: StoppingName = "fixed"
+    patience: int = 200
+    validate_every: int = 100
+    precision: Precision = "float32"
+    seed: int = 0
+    device: torch.device | str = "cpu"
+    metrics: Callable[[], torchmetrics.MetricCollection] | None = None
+    workspace: Path | None = None
+    display: Display | None = None
+
+    def __post_init__(self) -> None:
+        """Check the values."""
+        self.device = torch.device(self.device)
+        if self.precision not in DTYPES:
+            raise ValueError(f"precision: expected one of {', '.join(DTYPES)}, got {self.precision!r}")
+        for name, least in (("patience", 1), ("validate_every", 0), ("largest_tilt", 0)):
+            if (getattr(self, name) or 0) < least:
+                raise ValueError(f"method.{name}: expected {least} or more, got {getattr(self, name)}")
+        if self.stopping not in get_args(StoppingName):
+            raise ValueError(
+                f"method.stopping: expected one of {', '.join(get_args(StoppingName))}, got {self.stopping!r}"
+            )
+        if self.stopping == "oracle" and not self.validate_every:
+            raise ValueError("method.validate_every: expected a positive number, as method.stopping=oracle needs it")
+        given = {each.name: getattr(self, each.name) for each in fields(PriorSettings) if each.name != "mixed"}
+        given |= {"widths": tuple(self.widths), "skips": tuple(self.skips)}
+        self._settings = PriorSettings(**given, mixed=self.precision == "bfloat16")
+        self._objective = PriorObjective(self.data_loss, self.data_weight, self.w, self.w_intensity)
+
+    @property
+    def flag(self) -> str:
+        """What has to stand beside every score: ``oracle`` where the truth was looked at."""
+        return "oracle" if self.stopping == "oracle" else ""
+
+    def base(self, sample: DepthSample) -> Tensor | None:
+        """Return the depth that the optimisation starts from, (1, H, W) in metres; None for none."""
+        return None
+
+    def __call__(self, sample: DepthSample) -> Tensor:
+        """Return the fine orthogonal depth, (1, H, W) in metres on the sample's device; known everywhere.
+
+        Raises:
+            ValueError: the optimisation diverged.
+            KeyboardInterrupt: somebody stopped it; with a workspace, a second call goes on from there.
+
+        """
+        with torch.inference_mode(mode=False), torch.enable_grad():
+            module, origin = self.module(sample)
+            display = self.display or Silent()
+            folder = None if self.workspace is None else self.workspace / WORKSPACE / sample.scene
+            resume = None if folder is None else checkpoint_of(folder / "last.ckpt", origin)
+            display.say(self._announcement(module, sample.scene, resume is not None))
+            if module.objective.w < self.w:
+                display.say(f"{sample.scene}: without MSE_v; {_noise_of(sample)}, more than method.largest_tilt")
+            trainer = self._trainer(module, folder, origin, display, sample.scene)
+            try:
+                fit(trainer, module, _numbers(self.steps), resume, val_dataloaders=_numbers(1))
+            except KeyboardInterrupt:
+                where = f"interrupted at step {trainer.global_step} of {sample.scene}"
+                on = "; the same command goes on from there" if folder is not None else ""
+                raise KeyboardInterrupt(where + on) from None
+            depth = module.result()
+        if not bool(depth.isfinite().all()):
+            raise ValueError(f"{sample.scene}: the optimisation diverged; a lower method.learning_rate may help")
+        if folder is not None:
+            (folder / "last.ckpt").unlink(missing_ok=True)
+        if trainer.global_step < self.steps:
+            display.say(f"{sample.scene}: stopped at step {trainer.global_step} ({self.stopping})")
+        return depth[0].detach().to(sample.depth_lr)
+
+    def module(self, sample: DepthSample) -> tuple[PriorOptimisation, str]:
+        """Return an image's LightningModule, and a digest of all that it works on."""
+        device = torch.device(self.device)
+        problem = ImageProblem.of(sample, self.downsampling, self.range_type, device)
+        base = self.base(sample)
+        truth = None if sample.depth is None else sample.depth[None].to(device, torch.float32)
+        seed = scene_generator(self.seed, sample.dataset, sample.scene, sample.scale, "prior").initial_seed()
+        objective = self._objective if self._normals_count(sample) else replace(self._objective, w=0.0)
+        facts = (self._settings, objective, self.downsampling, self.stopping, self.patience, seed)
+        digest = hashlib.sha256(repr((facts, sample.camera, sample.camera_lr)).encode())
+        for values in (sample.rgb, sample.depth_lr, base):
+            if values is not None:
+                digest.update(values.detach().cpu().contiguous().numpy().tobytes())
+        module = PriorOptimisation(
+            problem,
+            objective,
+            self._settings,
+            self._rule(problem),
+            seed,
+            None if self.metrics is None or truth is None else self.metrics().to(device),
+            truth,
+            None if base is None else base[None].to(device, torch.float32),
+        )
+        return module, digest.hexdigest()
+
+    def _normals_count(self, sample: DepthSample) -> bool:
+        """Return whether the coarse map's normals are more than noise."""
+        tilt = tilt_of(noise_level(sample.depth_lr[None]), sample.camera_lr)
+        return self.largest_tilt is None or tilt <= self.largest_tilt
+
+    def _rule(self, problem: ImageProblem) -> Stopping:
+        """Return the stopping rule."""
+        if self.stopping == "variance":
+            return Variance(problem.grey, self.patience)
+        if self.stopping == "residual":
+            return Residual(problem.coarse, problem.residual)
+        return Oracle() if self.stopping == "oracle" else Fixed()
+
+    def _announcement(self, module: PriorOptimisation, scene: str, resumed: bool) -> str:
+        """Return what is about to happen: how many steps, how long, in how much memory."""
+        seconds, memory = cost_of_step(module)
+        most = "" if self.stopping in ("fixed", "oracle") else "up to "
+        height, width = module.problem.grey.shape[-2:]
+        return (
+            f"{scene}: {most}{self.steps} steps at {height} x {width} in {self.precision}"
+            f"{', resumed' if resumed else ''}; {most}about {duration(seconds * self.steps)} "
+            f"({seconds:.2g} s a step as measured now), about {memory / 2**30:.1f} GiB of memory of its own"
+        )
+
+    def _trainer(
+        self, module: PriorOptimisation, folder: Path | None, origin: str, display: Display, scene: str
+    ) -> lightning.Trainer:
+        """Return Lightning's trainer for one image."""
+        interval = min(self.validate_every or self.steps, self.steps)
+        callbacks: list[Callback] = [LastValidation(interval), Advance(display, scene, self.steps)]
+        logger: Any = False
+        if folder is not None:
+            callbacks += [Origin(origin), Keep(folder / "last.ckpt"), Interruption(folder / "last.ckpt")]
+            if module.metrics is not None and self.validate_every:
+                callbacks.append(ValidationTable(folder / "validation.csv"))
+            logger = Log(folder.parent, name="", version=scene, default_hp_metric=False)
+            logger.list_run({"scene": scene, "scale": self.scale, "stopping": self.stopping, "w": module.objective.w,
+                             "data_loss": self.data_loss, "steps": self.steps, "seed": self.seed})  # fmt: skip
+        device = torch.device(self.device)
+        with without_chatter():
+            return lightning.Trainer(
+                accelerator="gpu" if device.type == "cuda" else device.type,
+                devices=[device.index or 0] if device.type == "cuda" else 1,
+                max_steps=self.steps,
+                val_check_interval=interval,
+                check_val_every_n_epoch=None,
+                limit_val_batches=1 if self.validate_every else 0,
+                log_every_n_steps=min(_LOG_EVERY, interval),
+                logger=logger,
+                callbacks=callbacks,
+                enable_checkpointing=False,
+                enable_model_summary=False,
+                enable_progress_bar=False,
+                num_sanity_val_steps=0,
+                use_distributed_sampler=False,
+            )
+
+
+@dataclass(kw_only=True)
+class WarmStarted(DeepImagePrior):
+    """A deep image prior that starts from a trained network's answer, and adds to it.
+
+    Args:
+        weights: of the network.
+        model: the network's name.
+        **settings: as for :class:`DeepImagePrior`; ``margin`` is the depth that an answer of 1 adds, as a share of the
+            coarse map's range.
+
+    Raises:
+        ValueError: a value is out of range, or the weights are of another network.
+
+    """
+
+    weights: Path
+    model: str
+
+    def __post_init__(self) -> None:
+        """Load the network."""
+        super().__post_init__()
+        self._trained = build_trained(Path(self.weights), self.scale, self.model, device=self.device)
+
+    def base(self, sample: DepthSample) -> Tensor:
+        """Return the trained network's answer; its holes are filled with the coarse map's mean."""
+        depth = self._trained(sample).clone()
+        return torch.where(depth.isfinite(), depth, sample.depth_lr.nanmean())
+
+
+def _noise_of(sample: DepthSample) -> str:
+    """Return the noise that is estimated in a coarse map, for a reader."""
+    noise = noise_level(sample.depth_lr[None])
+    return f"noise of {noise:.2%} tilts the input's normals by {tilt_of(noise, sample.camera_lr):.0f} degrees"
+
+
+def _numbers(count: int) -> Any:
+    """Return a loader of numbers, one for each step; it leaves the global random numbers alone."""
+    numbers: Any = range(count)
+    return DataLoader(numbers, batch_size=None, generator=torch.Generator())

@@ -1,0 +1,180 @@
+"""Learned dynamic guidance: an energy with learned filters, minimised for a few steps, each with its own parameters.
+
+Gu, Zuo, Guo, Chen, Chen and Zhang, *Learning Dynamic Guidance for Depth Image Enhancement*, CVPR 2017; extended as
+*Learned Dynamic Guidance for Depth Image Reconstruction*, TPAMI 2020. Their weighted analysis representation model
+penalises what filters k_l say of the map x, where the photo g weighs the penalty at each pixel i,
+
+    E(x) = sum over l and i of w_l(g)_i rho_l((k_l * x)_i),
+
+beside a data term. Its minimisation by gradient descent is cut after a few steps, the *stages*, and each stage has
+filters, penalties and weights of its own: the guidance is dynamic, for it changes as the map gets better. They are
+learned from what the stages give (task-driven), by back-propagation. A stage here is
+
+    y = x - fidelity * U(A x - d),    A x the block means, d the coarse map, U bicubic upsampling,
+    x = y - sum over l of k_l' (w_l(g) rho_l'(k_l y)),    the gradient step of E, step size 1,
+
+with k_l y at the positions where the filter lies inside, and k_l' the adjoint. w_l(g) = exp(-sum over m of c_lm
+(b_m * g)^2) lies in 0..1, with filters b_m on the photo's three colours and c_lm >= 0: where the photo has an edge the
+map may break. For k_l and rho_l see :mod:`dsr.methods.networks.analysis_filters`.
+
+What differs from the original:
+
+- Filters answer a plane with 0, so that planes are reproduced under any photo. With filters of zero mean alone, which
+  answer a slope with a constant, the weights would copy the photo's texture into it.
+- A penalty is a mixture of Lorentzians whose widths grow by factors; there, its derivative is a sum of Gaussian radial
+  basis functions. Disparity has faint bends and large steps, so widths from 1/1000 to 1 of its range are needed.
+- The data step comes first, is smooth, and knows that coarse values are block means (iterative back-projection: Irani
+  and Peleg, *Improving Resolution by Image Registration*, 1991). After 160 steps of training for MSE its RMSE_d
+  and RMSE_v on procedural scenes were 43 mm and .224, with the gradient of |A x - d|^2 in its place 45 mm and .240.
+- The form of w_l is ours. With one squared filter of the grey photo for each k_l RMSE_d was higher, 49 against 47 mm,
+  and RMSE_v, for which that training was not, lower, .234 against .251.
+- All stages are trained at once, from polynomial filters and weak penalties, without training one after another before.
+- It works on disparity over its range in the coarse map.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from dsr.degradation.downsampling import check_scale
+from dsr.methods.classical.finite_differences import box_mean, upsampled
+from dsr.methods.networks.analysis_filters import WIDTHS, influence, penalty, plane_free_basis, zero_mean_basis
+from dsr.methods.networks.base import NormalisedNetwork, expect_photo
+
+_HEIGHT, _CONTRAST, _SHARED, _FIDELITY = 0.05, 2.0, 0.02, 0.5
+"""Before training: of penalties; of the b_m; the c_lm of other filters than the l-th; of the data step."""
+_BICUBIC = 2
+"""Coarse pixels that bicubic upsampling looks at on either side."""
+
+
+class Stage(nn.Module):
+    """One step from a map to a better one.
+
+    Args:
+        filters: number of filters k_l, and of b_m.
+        size: of a filter, pixels.
+
+    """
+
+    def __init__(self, filters: int, size: int) -> None:
+        super().__init__()
+        self.size = size
+        self.analysis = nn.Parameter(torch.eye(filters, size**2 - 3))
+        self.heights = nn.Parameter(torch.full((filters, len(WIDTHS)), _HEIGHT))
+        first = torch.eye(filters, size**2 - 1)[:, None].expand(-1, 3, -1)
+        self.guidance = nn.Parameter(_CONTRAST / 3 * first)
+        self.mixing = nn.Parameter(torch.eye(filters) + _SHARED)
+        self.fidelity = nn.Parameter(torch.tensor(_FIDELITY))
+
+    def filters(self, like: Tensor) -> Tensor:
+        """Return the k_l in the dtype of ``like``, (L, 1, size, size)."""
+        unit = functional.normalize(self.analysis.to(like), dim=1)
+        return torch.einsum("lb,bij->lij", unit, plane_free_basis(self.size).to(like))[:, None]
+
+    def weights(self, rgb: Tensor) -> Tensor:
+        """Return the w_l of photos (B, 3, H, W), (B, L, H - size + 1, W - size + 1)."""
+        filters = torch.einsum("lcb,bij->lcij", self.guidance.to(rgb), zero_mean_basis(self.size).to(rgb))
+        squares = functional.conv2d(rgb, filters).square()
+        return torch.exp(-functional.conv2d(squares, self.mixing.to(rgb).abs()[..., None, None]))
+
+    def energy(self, x: Tensor, rgb: Tensor) -> Tensor:
+        """Return E of maps (B, 1, H, W), (B,); a map smaller than a filter has none.
+
+        Args:
+            x: the maps, normalised.
+            rgb: (B, 3, H, W) the photos.
+
+        """
+        if min(x.shape[-2:]) < self.size:
+            return x.new_zeros(len(x))
+        responses = functional.conv2d(x, self.filters(x))
+        return (self.weights(rgb) * penalty(responses, self._heights(x))).sum(dim=(1, 2, 3))
+
+    def forward(self, x: Tensor, coarse: Tensor, rgb: Tensor) -> Tensor:
+        """Return the next map, (B, 1, H, W): a step towards the coarse map, then one down the gradient of E.
+
+        Args:
+            x: (B, 1, H, W) the map.
+            coarse: (B, 1, h, w) its block means as they should be.
+            rgb: (B, 3, H, W) the photos.
+
+        """
+        scale = x.shape[-1] // coarse.shape[-1]
+        x = x - self.fidelity.to(x) * upsampled(box_mean(x, scale) - coarse, scale)
+        if min(x.shape[-2:]) < self.size:
+            return x
+        filters = self.filters(x)
+        forces = self.weights(rgb) * influence(functional.conv2d(x, filters), self._heights(x))
+        return x - functional.conv_transpose2d(forces, filters)
+
+    def _heights(self, like: Tensor) -> Tensor:
+        """Return the a_j of each filter's penalty, (L, 6), for a step size of 1."""
+        return self.heights.to(like) / len(self.heights)
+
+
+class DynamicGuidance(NormalisedNetwork):
+    """The network.
+
+    Holes of the input are filled. Everything is computed in float32, or float64 where the weights are; weights of half
+    precision save memory and no time.
+
+    Args:
+        scale: upsampling factor, 2, 4, 8 or 16.
+        stages: unrolled steps.
+        filters: of each step, at most size^2 - 3.
+        size: of a filter, pixels, at least 3.
+
+    Raises:
+        ValueError: a value is out of range.
+
+    """
+
+    def __init__(self, scale: int, stages: int = 5, filters: int = 24, size: int = 7) -> None:
+        super().__init__()
+        check_scale(scale)
+        if stages < 1 or size < 3:
+            raise ValueError(f"model: expected stages of at least 1 and a size of at least 3, got {stages} and {size}")
+        if not 1 <= filters <= size**2 - 3:
+            raise ValueError(f"model.filters: expected 1 to {size**2 - 3} of size {size}, got {filters}")
+        self.scale, self.filters, self.size = scale, filters, size
+        self.stages = nn.ModuleList(Stage(filters, size) for _ in range(stages))
+
+    def arguments(self) -> dict[str, Any]:
+        """Return the constructor's arguments."""
+        return {"scale": self.scale, "stages": len(self.stages), "filters": self.filters, "size": self.size}
+
+    @property
+    def reach(self) -> int:
+        """How many coarse pixels around its own an output depends on.
+
+        Bicubic upsampling's at the start and in each stage, and in each stage a filter's and its adjoint's.
+        """
+        return _BICUBIC + len(self.stages) * (_BICUBIC + math.ceil((self.size - 1) / self.scale))
+
+    def forward(self, rgb: Tensor, values: Tensor) -> Tensor:
+        """Map a photo and normalised coarse disparity to fine disparity.
+
+        Args:
+            rgb: (B, 3, H, W).
+            values: (B, 1, h, w).
+
+        Returns:
+            (B, 1, H, W) in the dtype of ``values``.
+
+        Raises:
+            ValueError: the photo's size is not scale times the map's.
+
+        """
+        expect_photo(rgb, values, self.scale)
+        weight = next(self.parameters())
+        with torch.autocast(rgb.device.type, enabled=False):
+            photo, coarse = (x.to(torch.promote_types(weight.dtype, torch.float32)) for x in (rgb, values))
+            x = upsampled(coarse, self.scale)
+            for stage in self.stages:
+                x = stage(x, coarse, photo)
+        return x.to(values.dtype)

@@ -1,0 +1,246 @@
+"""MSG-Net, the multi-scale guided depth super-resolution network, and what goes in and comes out of it.
+
+Hui, Loy, Tang, *Depth Map Super-Resolution by Deep Multi-Scale Guidance*, ECCV 2016 (variant ``hui``), and the version
+that Voynov et al., *Perceptual Deep Depth Super-Resolution*, ICCV 2019, trained for renderings (variant ``voynov``);
+``dsr`` is the latter as this project trains it.
+
+The network refines what is left of the normalised low-resolution disparity once its 3 x 3 mean is taken away, guided by
+a normalised intensity image; the mean itself is upsampled bicubically and added back. Everything here is plain torch:
+batched, differentiable, on any device, for any image size.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from dsr.degradation.downsampling import check_scale
+from dsr.methods.networks.base import Whole, WindowedNetwork
+from dsr.methods.networks.inpainting import filled
+from dsr.methods.networks.layers import ConvLayer, Level
+from dsr.methods.networks.maps import bounds_of, mean3x3, normalised, upsample_bicubic
+from dsr.methods.networks.msg_guidance import VARIANTS, Traits, VariantName, guidance_map, intensity_of
+
+FEATURES = 32
+
+
+class MSGNet(WindowedNetwork):
+    """The network of both variants; modules are registered in the order in which data passes them.
+
+    Args:
+        scale: upsampling factor, 2, 4, 8 or 16; log2(scale) levels.
+        variant: ``hui``, ``voynov`` or ``dsr``.
+
+    """
+
+    def __init__(self, scale: int, variant: VariantName = "voynov") -> None:
+        super().__init__()
+        check_scale(scale)
+        if variant not in VARIANTS:
+            raise ValueError(f"variant: expected one of {', '.join(VARIANTS)}, got {variant!r}")
+        self.scale = scale
+        self.variant = VARIANTS[variant]
+        self.covers = self.variant.same_size
+        levels = scale.bit_length() - 1
+        self.guidance = nn.ModuleList([self._conv(1, 49, kernel=7), self._conv(49, FEATURES)])
+        self.guidance.extend(self._conv(FEATURES, FEATURES) for _ in range(levels - 1))
+        padding = 1 if self.variant.same_size else 0
+        self.pool = nn.MaxPool2d(3, stride=2, padding=padding, ceil_mode=not self.variant.same_size)
+        self.stem = self._conv(1, 2 * FEATURES)
+        self.levels = nn.ModuleList(
+            Level(self._up(first=i == 0), self._conv(2 * FEATURES, FEATURES), self._conv(FEATURES, FEATURES))
+            for i in range(levels)
+        )
+        self.smooth = self._conv(FEATURES, FEATURES)
+        self.reconstruct = self._conv(FEATURES, 1, active=self.variant.activate_output)
+        if variant == "dsr":
+            self._start_smooth()
+
+    def forward(self, guidance: Tensor, depth: Tensor) -> Tensor:
+        """Map normalised inputs to the high-resolution residual.
+
+        Args:
+            guidance: (B, 1, H, W) of :func:`guidance_map`, the size being ``output_size`` of the depth's.
+            depth: (B, 1, h, w) normalised disparity minus its mean, see :func:`normalised`.
+
+        Returns:
+            (B, 1, H, W) residual, in units of the disparity's range.
+
+        """
+        if guidance.shape[-2:] != self.output_size(depth):
+            raise ValueError(
+                f"guidance: expected {tuple(self.output_size(depth))} for depth of {tuple(depth.shape[-2:])} at scale "
+                f"{self.scale} ({self.variant.name}), got {tuple(guidance.shape[-2:])}"
+            )
+        x = self.stem(depth)
+        for level, guide in zip(self.levels, reversed(self._pyramid(guidance)), strict=True):
+            x = level(x, guide)  # (B, 32, 2 h, 2 w), (B, 32, 4 h, 4 w), ...
+        return self.reconstruct(self.smooth(x))
+
+    def arguments(self) -> dict[str, Any]:
+        """Return the constructor's arguments."""
+        return {"scale": self.scale, "variant": self.variant.name}
+
+    def upsample(self, rgb: Tensor, disparity: Tensor, bounds: Tensor | None = None) -> Tensor:
+        """Return fine disparity; see :func:`upsample_disparity`."""
+        return upsample_disparity(self, rgb, disparity, bounds)
+
+    @property
+    def reach(self) -> int:
+        """How many coarse pixels around its own an output depends on, two of them for ``hui``'s uneven padding."""
+        return self.rows_seen(0) + 2
+
+    def whole(self, rgb: Tensor, disparity: Tensor) -> Whole:
+        """Return what answers windows: ranges, drift and filled holes are the whole image's."""
+        bounds = bounds_of(disparity)
+        traits = traits_of(self, rgb, disparity)
+        known = filled(disparity) if self.variant.fill_holes else disparity
+        return Whole(known, lambda photo, window: upsample_disparity(self, photo, window, bounds, traits))
+
+    def output_size(self, depth: Tensor) -> torch.Size:
+        """Return (H, W) for depth of (..., h, w)."""
+        lost = 0 if self.variant.same_size else 1
+        return torch.Size(self.scale * n - lost for n in depth.shape[-2:])
+
+    def rows_seen(self, rows: int) -> int:
+        """Return how many low-resolution rows (times scale, guidance rows) the outputs 0 .. ``rows`` - 1 depend on.
+
+        Holds for columns as well, and for the ``voynov`` variant's padding. Followed backwards from the output along
+        the depth branch: a 5 x 5 convolution needs 2 rows more, and output o of a transposed convolution reads inputs
+        up to (o + 2) // 2. The guidance branch never needs more than that, at any scale.
+        """
+        seen = rows + 4  # reconstruction, smoothing
+        for _ in self.levels:
+            seen = (seen + 4 + 1) // 2 + 1  # refinement and fusion, then the transposed convolution
+        return seen + 2
+
+    def _pyramid(self, guidance: Tensor) -> list[Tensor]:
+        """Return the guidance features from the full resolution down, (B, 32, H, W), (B, 32, H / 2, W / 2), ..."""
+        pyramid = [self.guidance[1](self.guidance[0](guidance))]
+        for layer in self.guidance[2:]:
+            pyramid.append(self.pool(layer(pyramid[-1])))
+        return pyramid
+
+    @torch.no_grad()
+    def _start_smooth(self) -> None:
+        """Initialise for a smooth start: interpolating kernels, no biases, next to no residual.
+
+        A random transposed convolution treats even and odd pixels differently; the checkerboard that this leaves on
+        smooth surfaces is slow to unlearn. A bilinear kernel treats them alike.
+        """
+        line = torch.tensor([0.0, 0.5, 1.0, 0.5, 0.0])
+        slope = 0.25  # of a new PReLU
+        for layer in self.modules():
+            if isinstance(layer, nn.ConvTranspose2d):
+                inputs, outputs = layer.weight.shape[:2]
+                gains = torch.randn(inputs, outputs) * math.sqrt(2 / ((1 + slope**2) * inputs))
+                layer.weight.copy_(gains[:, :, None, None] * torch.outer(line, line))
+            elif isinstance(layer, nn.Conv2d):
+                nn.init.kaiming_normal_(layer.weight, a=slope)
+            if isinstance(layer, nn.Conv2d | nn.ConvTranspose2d) and layer.bias is not None:
+                nn.init.zeros_(layer.bias)
+        self.reconstruct.conv.weight.mul_(0.05)
+
+    def _slopes(self, channels: int) -> int:
+        return 1 if self.variant.shared_slopes else channels
+
+    def _conv(self, before: int, after: int, *, kernel: int = 5, active: bool = True) -> ConvLayer:
+        conv = nn.Conv2d(before, after, kernel, padding=kernel // 2)
+        return ConvLayer(conv, self._slopes(after) if active else 0)
+
+    def _up(self, *, first: bool) -> ConvLayer:
+        padding = 2 if first or self.variant.same_size else 1
+        extra = 1 if self.variant.same_size else 0
+        before = 2 * FEATURES if first else FEATURES
+        conv = nn.ConvTranspose2d(before, FEATURES, 5, stride=2, padding=padding, output_padding=extra)
+        return ConvLayer(conv, self._slopes(FEATURES))
+
+
+def traits_of(net: MSGNet, rgb: Tensor, disparity: Tensor) -> Traits:
+    """Return the traits of an image; see :func:`upsample_disparity`."""
+    variant = net.variant
+    intensity = detail = drift = None
+    if not variant.plain_guidance:
+        grey = intensity_of(rgb, variant)
+        intensity, grey = bounds_of(grey), normalised(grey).values
+        detail = bounds_of(grey - mean3x3(grey))
+    if variant.drift_compensation:
+        drift = output_drift(net, guidance_map(rgb, variant), normalised(disparity).values)
+    return Traits(intensity, detail, drift)
+
+
+def output_drift(net: MSGNet, guidance: Tensor, disparity: Tensor, *, crop: bool = True) -> Tensor:
+    """Return the constant that the network adds by itself, (B, 1, 1, 1).
+
+    The normalised disparity's first quarter of rows and columns is set to 0.5, and the network's output averaged over
+    rows h // 16 .. h // 4 - h // 16 and columns likewise, where h, w is the low-resolution size and the indices count
+    high-resolution pixels (so did the released code). 0 where that region is empty.
+
+    Args:
+        net: the network, of the ``voynov`` variant.
+        guidance: (B, 1, H, W) of :func:`guidance_map`.
+        disparity: (B, 1, h, w) of :func:`normalised`.
+        crop: run the network only on the inputs which those pixels see: the same value for far less work.
+
+    """
+    height, width = disparity.shape[-2:]
+    rows, columns = (slice(n // 16, n // 4 - n // 16) for n in (height, width))
+    if rows.stop <= rows.start or columns.stop <= columns.start:
+        return disparity.new_zeros((len(disparity), 1, 1, 1))
+    probe = disparity.clone()
+    probe[..., : height // 4, : width // 4] = 0.5
+    probe = probe - mean3x3(probe)
+    if crop:
+        height, width = (min(n, net.rows_seen(s.stop)) for n, s in ((height, rows), (width, columns)))
+    guidance = guidance[..., : net.scale * height, : net.scale * width]
+    output = residual(net, guidance, probe[..., :height, :width])
+    return output[..., rows, columns].mean((-2, -1), keepdim=True)
+
+
+def residual(net: MSGNet, guidance: Tensor, depth: Tensor) -> Tensor:
+    """Run the network in its own precision; the output has the dtype of ``depth``, at least float32."""
+    dtype = net.stem.conv.weight.dtype
+    output = net(guidance.to(dtype), (net.variant.depth_gain * depth).to(dtype))
+    return net.variant.residual_gain * output.to(torch.promote_types(depth.dtype, torch.float32))
+
+
+def upsample_disparity(
+    net: MSGNet,
+    rgb: Tensor,
+    disparity: Tensor,
+    bounds: Tensor | None = None,
+    traits: Traits | None = None,
+    *,
+    crop_drift: bool = True,
+) -> Tensor:
+    """Upsample disparity with a photo's guidance.
+
+    Args:
+        net: the network.
+        rgb: (B, 3, H, W) in 0..1, with H = scale * h and W = scale * w.
+        disparity: (B, 1, h, w); non-finite values are holes.
+        bounds: see :meth:`dsr.methods.networks.base.DisparityNetwork.upsample`.
+        traits: of the image that this is a window of; None for its own.
+        crop_drift: see :func:`output_drift`.
+
+    Returns:
+        (B, 1, H, W) in the unit of the input, (B, 1, H - 1, W - 1) for the ``hui`` variant. It can be negative, and
+        is NaN for a sample without a finite value.
+
+    """
+    values, minimum, span = normalised(disparity, bounds)
+    if net.variant.fill_holes:
+        values = filled(torch.where(disparity.isfinite(), values, torch.nan))
+    low_pass = mean3x3(values)
+    height, width = net.output_size(values)
+    guidance = guidance_map(rgb, net.variant, traits)[..., :height, :width]
+    output = residual(net, guidance, values - low_pass)
+    if traits is not None and traits.drift is not None:
+        output = output - traits.drift
+    elif net.variant.drift_compensation:
+        output = output - output_drift(net, guidance, values, crop=crop_drift)
+    output = output + upsample_bicubic(low_pass, net.scale)[..., :height, :width]
+    return output * span + minimum

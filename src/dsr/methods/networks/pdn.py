@@ -1,0 +1,140 @@
+"""PDN: the deep primal-dual network for guided depth super-resolution.
+
+Riegler, Ferstl, Rüther and Bischof, *A Deep Primal-Dual Network for Guided Depth Super-Resolution*, BMVC 2016: ten
+3 x 3 convolutions look at the upsampled depth and the photo, and say by how much the former is wrong, and how different
+each pixel is from half of those in the window around it. The softmax of minus these becomes the weights of a non-local
+Huber model, :mod:`dsr.methods.networks.primal_dual`, whose primal-dual iteration makes the answer. The sizes that the
+paper leaves open are those of the authors' code (github.com/griegler/primal-dual-networks, gdsr).
+
+What differs from the original:
+
+- It works on disparity, over its range in the coarse map. The upsampling is bicubic and exact on planes, the original's
+  is bilinear. The convolutions see its differences from local means and its slopes, faint ones enlarged, instead of
+  its values, so that bfloat16 is enough for them; and the photo's colours instead of its grey.
+- The residual is in multiples of the coarse map's *bend* (the largest second difference around, see
+  :mod:`dsr.methods.networks.facets`), so that it is 0 on a plane whatever the weights are. Without that, a short
+  training left a DSSIM_v of 0.30 instead of 0.22 on procedural scenes.
+- The window is 5 x 5, 12 offsets, the original's 7 x 7, 24 offsets, in twice the time; 10 steps, the code has 20.
+- Convolutions are padded with zeros, the original's answer is smaller than its input.
+- It is trained as one from the start, with the mean squared error of the answer. The original first trains the
+  convolutions alone, on the residual and the differences of the true depth, and starts the second stage from there.
+
+On a plane the weights do not count as long as its differences within the window stay below epsilon times the weights,
+and it is reproduced; a steeper one is bent where the weights vary.
+"""
+
+from __future__ import annotations
+
+import itertools
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from dsr.degradation.downsampling import check_scale
+from dsr.methods.classical.finite_differences import extended, upsampled
+from dsr.methods.networks.base import NormalisedNetwork, expect_photo
+from dsr.methods.networks.facets import stencil
+from dsr.methods.networks.primal_dual import UnrolledHuber
+
+_FAINT = 1e-3
+"""A difference of normalised disparity that becomes about 1 in the network's input."""
+_INPUTS = 9
+_TINY = 1e-12
+
+
+class PrimalDualNetwork(NormalisedNetwork):
+    """The network.
+
+    Memory: about 900 bytes for each pixel of the photo, or of a window.
+
+    Args:
+        scale: upsampling factor, 2, 4, 8 or 16.
+        width: channels of the convolutions.
+        layers: 3 x 3 convolutions.
+        window: size of the window that a pixel is compared within, odd.
+        iterations: steps of the unrolled iteration.
+
+    Raises:
+        ValueError: a value is out of range.
+
+    """
+
+    def __init__(self, scale: int, width: int = 64, layers: int = 10, window: int = 5, iterations: int = 10) -> None:
+        super().__init__()
+        check_scale(scale)
+        if width < 1 or layers < 2:
+            raise ValueError(f"model: expected a width of at least 1 and at least 2 layers, got {width} and {layers}")
+        self.scale, self.width, self.layers = scale, width, layers
+        self.window, self.iterations = window, iterations
+        self.stage = UnrolledHuber(window, iterations)
+        channels = [_INPUTS] + [width] * (layers - 1)
+        self.trunk = nn.Sequential()
+        for before, after in itertools.pairwise(channels):
+            self.trunk.extend([nn.Conv2d(before, after, 3, padding=1), nn.ReLU()])
+        for layer in self.trunk:
+            if isinstance(layer, nn.Conv2d):
+                nn.init.kaiming_normal_(layer.weight, nonlinearity="relu")
+                layer.bias.data.zero_()  # type: ignore[union-attr]
+        self.head = nn.Conv2d(width, 1 + len(self.stage.offsets), 3, padding=1)
+        self.head.weight.data[:1].zero_()  # no residual at first
+        self.head.bias.data.zero_()  # type: ignore[union-attr]
+        self.log_strength = nn.Parameter(torch.zeros(()))
+
+    def arguments(self) -> dict[str, Any]:
+        """Return the constructor's arguments."""
+        sizes = {"scale": self.scale, "width": self.width, "layers": self.layers}
+        return {**sizes, "window": self.window, "iterations": self.iterations}
+
+    @property
+    def reach(self) -> int:
+        """How many coarse pixels around its own an output depends on.
+
+        A fine pixel for each convolution, half a window for each step of the iteration; the upsampling and the
+        differences of the coarse map that go in look four coarse pixels far.
+        """
+        fine = self.layers + self.stage.reach
+        return -(-fine // self.scale) + 4
+
+    def forward(self, rgb: Tensor, values: Tensor) -> Tensor:
+        """Map a photo and normalised coarse disparity to fine disparity.
+
+        Args:
+            rgb: (B, 3, H, W).
+            values: (B, 1, h, w).
+
+        Returns:
+            (B, 1, H, W).
+
+        """
+        expect_photo(rgb, values, self.scale)
+        fine = upsampled(values, self.scale)
+        seen, bend = self._seen(rgb, values, fine)
+        output = self.head(self.trunk(seen.to(self.head.weight.dtype)))
+        with torch.autocast(rgb.device.type, enabled=False):
+            output = output.to(torch.float32 if output.dtype == torch.bfloat16 else output.dtype)
+            residual = (output[:, :1] * bend).to(fine.dtype)
+            strength = self.log_strength.to(output.dtype).exp()
+            weights = (-strength * output[:, 1:].abs()).softmax(dim=1) + _TINY
+            r = self.window // 2
+            first = extended(fine, 2 * r) + functional.pad(residual, (2 * r,) * 4, mode="replicate")
+            moved = self.stage(first[..., r:-r, :], weights)
+            return fine + residual + moved.to(fine.dtype)
+
+    def _seen(self, rgb: Tensor, values: Tensor, fine: Tensor) -> tuple[Tensor, Tensor]:
+        """Return what the convolutions take, (B, 9, H, W), and the bend that their residual is a multiple of.
+
+        These are the photo's 3 colours; the coarse map's slopes along u and v and its distance from the mean of 3 x 3
+        pixels, the fine map's distance from the same means, and the bend, compressed so that faint ones count; and the
+        latter distance over the bend.
+        """
+        around = stencil(values)
+        coarse = torch.cat((around.along_u[:, 1:2], around.along_v[:, 1:2], around.value - around.mean), dim=1)
+        size = tuple(fine.shape[-2:])
+        bend = functional.interpolate(around.bend.float(), size=size, mode="bilinear")
+        slopes = functional.interpolate(coarse.float(), size=size, mode="bilinear")
+        away = (fine - upsampled(around.mean, self.scale)).float()
+        turned = away / bend.clamp(min=torch.finfo(torch.float32).tiny)
+        depth = torch.asinh(torch.cat((slopes, away, bend), dim=1) / _FAINT) / 3
+        return torch.cat((rgb.float() - 0.5, depth, turned.clamp(-2, 2)), dim=1), bend

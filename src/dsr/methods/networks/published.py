@@ -1,0 +1,240 @@
+"""Readers of the published MSG-Net weights, straight from their authors' files.
+
+``.pth`` (Voynov et al. 2019) is read by torch's own unpickler for plain tensors, ``.caffemodel`` (Hui et al. 2016) by a
+reader of the protobuf wire format (protobuf.dev/programming-guides/encoding). Neither ever runs code that a file holds,
+and whatever does not fit raises a ``ValueError`` that names the file, what was expected and what came.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from dsr.degradation.downsampling import SCALES
+from dsr.methods.networks.msg_guidance import VariantName
+from dsr.methods.networks.msg_net import MSGNet
+from dsr.methods.networks.weight_files import fill
+
+TORCH_MAGIC = (b"PK\x03\x04", b"\x80")
+PARTS = ("conv.weight", "conv.bias", "activation.weight")
+VARINT, BYTES = 0, 2
+FIXED_SIZES = {1: 8, 5: 4}
+NET_LAYER, LAYER_NAME, LAYER_TYPE, LAYER_BLOBS, BLOB_DATA, BLOB_SHAPE, SHAPE_DIM = 100, 1, 2, 7, 5, 7, 1
+
+
+class MSGWeights(NamedTuple):
+    """What a file holds; tensors go by our parameter names, those that we don't know by the file's."""
+
+    variant: VariantName
+    scale: int
+    tensors: dict[str, Tensor]
+
+
+def load_msg_weights(path: Path, scale: int, variant: VariantName | None = None) -> MSGNet:
+    """Return the network with the weights of one of the authors' files, float32, on the CPU.
+
+    Args:
+        path: a ``.pth`` of Voynov et al. or a ``.caffemodel`` of Hui et al.; the content tells.
+        scale: the scale that the run needs.
+        variant: the variant that the run needs, None for any.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: the file is damaged, of another format, scale, variant or architecture.
+
+    """
+    path = Path(path)
+    weights = read_msg_weights(path)
+    if variant is not None and weights.variant != variant:
+        raise ValueError(f"{path}: expected weights of variant {variant}, got those of variant {weights.variant}")
+    if weights.scale != scale:
+        raise ValueError(f"{path}: weights are for scale {weights.scale}, the run is at scale {scale}")
+    with torch.device("meta"):  # without memory, and without a draw from the random generator
+        net = MSGNet(scale, weights.variant)
+    fill(net, weights.tensors, path, f"MSG-Net ({weights.variant}) at scale {scale}")
+    return net
+
+
+def read_msg_weights(path: Path) -> MSGWeights:
+    """Return what the file holds, with its variant and scale; shapes are not checked yet."""
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such weights file")
+    data = path.read_bytes()
+    return _from_torch(path) if data.startswith(TORCH_MAGIC) else _from_caffe(path, data)
+
+
+# Voynov et al.: a torch file
+
+
+def _from_torch(path: Path) -> MSGWeights:
+    """Read a torch file that holds tensors only, under ``model_state_dict``."""
+    try:
+        content = torch.load(path, map_location="cpu", weights_only=True)
+    except Exception as error:  # torch names no set of errors for damaged files
+        raise ValueError(
+            f"{path}: expected a torch file of plain tensors, got one that is damaged or holds other Python objects, "
+            f"which are never loaded ({type(error).__name__})"
+        ) from error
+    found = content.get("model_state_dict") if isinstance(content, dict) else None
+    if not isinstance(found, dict) or not all(isinstance(value, Tensor) for value in found.values()):
+        keys = ", ".join(map(str, list(content)[:4])) if isinstance(content, dict) else type(content).__name__
+        raise ValueError(f"{path}: expected tensors under the key model_state_dict, got {keys}")
+    indices = re.findall(r"^upsampling_X\.(\d{1,3})\.", "\n".join(map(str, found)), re.MULTILINE)
+    levels = _checked_levels(path, max(map(int, indices), default=0) // 3)  # 3 layers per level, then 2
+    layer_names = zip(_author_names(levels), _layer_names(levels), strict=True)
+    ours = {f"{theirs}.{part}": f"{name}.{part}" for theirs, name in layer_names for part in PARTS}
+    return MSGWeights("voynov", 2**levels, {ours.get(name, str(name)): value for name, value in found.items()})
+
+
+def _layer_names(levels: int) -> list[str]:
+    """Return the names of our layers in the order in which data passes them."""
+    guidance = [f"guidance.{i}" for i in range(levels + 1)]
+    depth = [f"levels.{level}.{part}" for level in range(levels) for part in ("up", "fuse", "refine")]
+    return [*guidance, "stem", *depth, "smooth", "reconstruct"]
+
+
+def _author_names(levels: int) -> list[str]:
+    """Return Voynov et al.'s names for the same layers; their guidance branch counts its poolings, too."""
+    guidance = [f"feature_extraction_Y.{max(i, 2 * i - 2)}" for i in range(levels + 1)]
+    return [*guidance, "feature_extraction_X", *(f"upsampling_X.{i}" for i in range(3 * levels + 2))]
+
+
+def _checked_levels(path: Path, levels: int) -> int:
+    if levels < 1 or 2**levels not in SCALES:
+        raise ValueError(f"{path}: expected MSG-Net for a scale of {SCALES}, got {levels} upsampling levels")
+    return levels
+
+
+# Hui et al.: a Caffe model
+
+
+class _Layer(NamedTuple):
+    """A layer of a Caffe network, with its parameters."""
+
+    name: str
+    kind: str
+    blobs: list[Tensor]
+
+
+def _from_caffe(path: Path, data: bytes) -> MSGWeights:
+    """Read a Caffe model: its layers lie in the order in which data passes them, whatever their names."""
+    try:
+        layers = [layer for layer in map(_layer, _messages(memoryview(data), NET_LAYER)) if layer.blobs]
+    except ValueError as error:
+        raise ValueError(f"{path}: expected a torch or Caffe model, got a damaged one or neither ({error})") from error
+    if not layers:
+        raise ValueError(f"{path}: expected a torch or Caffe model, got {len(data)} bytes without a Caffe layer")
+    levels = _checked_levels(path, sum(layer.kind == "Deconvolution" for layer in layers))
+    names = iter(_layer_names(levels))
+    tensors: dict[str, Tensor] = {}
+    name = ""
+    for layer in layers:
+        is_activation = layer.kind == "PReLU"  # it follows the layer that it belongs to
+        name = name if is_activation else next(names, layer.name)
+        keys = [f"{name}.{part}" for part in (PARTS[2:] if is_activation else PARTS[:2])]
+        for i, blob in enumerate(layer.blobs):
+            fits = i < len(keys) and keys[i] not in tensors
+            tensors[keys[i] if fits else f"{layer.name} blob {i}"] = blob
+    return MSGWeights("hui", 2**levels, tensors)
+
+
+def _layer(message: memoryview) -> _Layer:
+    texts = {LAYER_NAME: "", LAYER_TYPE: ""}
+    blobs = []
+    for number, value in _fields(message):
+        if number in texts:
+            texts[number] = bytes(_bytes_of(value, number)).decode("utf-8", "replace")
+        elif number == LAYER_BLOBS:
+            blobs.append(_blob(_bytes_of(value, number)))
+    return _Layer(texts[LAYER_NAME], texts[LAYER_TYPE], blobs)
+
+
+def _blob(message: memoryview) -> Tensor:
+    """Return a BlobProto's values, packed or one by one, in its shape."""
+    chunks, shape = [], None
+    for number, value in _fields(message):
+        if number == BLOB_DATA:
+            chunks.append(bytes(_bytes_of(value, number)))
+        elif number == BLOB_SHAPE:
+            shape = _shape(_bytes_of(value, number))
+    data = b"".join(chunks)
+    if shape is None or 4 * math.prod(shape) != len(data):
+        raise ValueError(f"a blob of shape {shape} holds {len(data)} bytes")
+    return torch.from_numpy(np.frombuffer(data, dtype="<f4").astype(np.float32)).reshape(shape)
+
+
+def _shape(message: memoryview) -> tuple[int, ...]:
+    """Return a BlobShape's sizes, packed or one by one."""
+    sizes: list[int] = []
+    for number, value in _fields(message):
+        if number != SHAPE_DIM:
+            continue
+        if isinstance(value, int):
+            sizes.append(value)
+            continue
+        position = 0
+        while position < len(value):
+            size, position = _varint(value, position)
+            sizes.append(size)
+    return tuple(sizes)
+
+
+# The protobuf wire format
+
+
+def _messages(message: memoryview, wanted: int) -> Iterator[memoryview]:
+    """Yield the sub-messages in field ``wanted``."""
+    for number, value in _fields(message):
+        if number == wanted:
+            yield _bytes_of(value, number)
+
+
+def _bytes_of(value: int | memoryview, number: int) -> memoryview:
+    if isinstance(value, int):
+        raise ValueError(f"field {number} is a number instead of bytes")
+    return value
+
+
+def _fields(message: memoryview) -> Iterator[tuple[int, int | memoryview]]:
+    """Yield (field number, value) of a message: an int for a varint, else the value's bytes."""
+    position = 0
+    while position < len(message):
+        key, position = _varint(message, position)
+        number, wire_type = key >> 3, key & 7
+        if number == 0:
+            raise ValueError("a field has number 0")
+        if wire_type == VARINT:
+            value, position = _varint(message, position)
+            yield number, value
+            continue
+        if wire_type == BYTES:
+            size, position = _varint(message, position)
+        elif wire_type in FIXED_SIZES:
+            size = FIXED_SIZES[wire_type]
+        else:
+            raise ValueError(f"field {number} has the unknown wire type {wire_type}")
+        if size > len(message) - position:
+            raise ValueError(f"field {number} is cut off: {size} bytes expected, {len(message) - position} left")
+        yield number, message[position : position + size]
+        position += size
+
+
+def _varint(message: memoryview, position: int) -> tuple[int, int]:
+    """Return the variable-length integer at ``position``, at most 64 bits, and the position after it."""
+    value = 0
+    for shift in range(0, 70, 7):
+        if position >= len(message):
+            raise ValueError("a number is cut off")
+        byte = message[position]
+        position += 1
+        value |= (byte & 0x7F) << shift
+        if byte < 0x80:
+            return value, position
+    raise ValueError("a number is longer than 64 bits")

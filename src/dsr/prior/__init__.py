@@ -1,1 +1,0 @@
-"""Deep image priors: depth maps as the output of a network that is optimised for the one image."""
