@@ -24,7 +24,6 @@ import torch
 from torch import Tensor
 
 from dsr.app.build import fast_precision
-from dsr.data.augment import window
 from dsr.data.folder import Folder
 from dsr.degradation.downsampling import Downsampling, make_sample
 from dsr.degradation.noise import GaussianMultiplicative
@@ -36,6 +35,7 @@ from dsr.methods.networks.trained import packaged_weights
 from dsr.metrics.classes import visual_metrics
 from dsr.metrics.functional import SurfacePair
 from dsr.sample import DepthSample, Scene
+from dsr.training.augmentation import window
 
 BOX = Downsampling("box")
 NAMES = ("RMSE_d", "DSSIM_v", "RMSE_v", "BadPix_v_5")

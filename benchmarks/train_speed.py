@@ -16,12 +16,12 @@ import time
 import torch
 from torch import nn
 
-from dsr.data.cutting import Patches, PatchSettings
-from dsr.data.problem import Batch, Problem
 from dsr.data.simgeo import SimGeo
 from dsr.degradation.downsampling import Downsampling
 from dsr.methods.networks.msg_net import MSGNet
-from dsr.objective import Objective
+from dsr.training.cropping import Patches, PatchSettings
+from dsr.training.objective import Objective
+from dsr.training.problem import Batch, Problem
 
 SCALE = 4
 

@@ -9,13 +9,13 @@ import pytest
 import torch
 from torch import Tensor
 
-from dsr.data.augment import window
 from dsr.data.folder import Folder
 from dsr.degradation.downsampling import Downsampling, make_sample
 from dsr.methods.classical.interpolation import Interpolation
 from dsr.methods.dip.upsampler import DeepImagePrior
 from dsr.metrics.functional import SurfacePair, dssim_v, rmse_d, rmse_v
 from dsr.sample import DepthSample
+from dsr.training.augmentation import window
 
 BOX = Downsampling("box")
 

@@ -22,7 +22,7 @@ import dsr.app.train as command
 import dsr.app.trainer as trainer_module
 from dsr.app.entry import run_command
 from dsr.app.evaluate import evaluate
-from dsr.training import SuperResolution
+from dsr.training.module import SuperResolution
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 SMOKE = (

@@ -9,11 +9,11 @@ import pytest
 import torch
 from torch import Tensor
 
-from dsr.data.augment import Variation, mirrored, turned, window
 from dsr.geometry.camera import Camera
 from dsr.geometry.shading import lights, render
 from dsr.geometry.surface import normals_of
 from dsr.sample import Scene
+from dsr.training.augmentation import Variation, mirrored, turned, window
 
 CAMERA = Camera(width=31, height=23, fx=30.0, fy=27.0, cx=13.3, cy=9.9, baseline=0.1, doffs=0.7)
 

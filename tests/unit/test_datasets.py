@@ -7,15 +7,12 @@ import yaml
 
 from dsr.app.build import build, trait
 from dsr.app.schema import ConfigError
-from dsr.data.cutting import PatchSettings
 from dsr.data.folder import Folder
 from dsr.data.formats.sintel import SEQUENCES
 from dsr.data.icl import FRAMES as ICL_FRAMES
 from dsr.data.icl import ICL
 from dsr.data.middlebury import EVALUATION_2014, Middlebury, MiddleburyLevels
 from dsr.data.middlebury_train import MIDDLEBURY, MiddleburyTrain
-from dsr.data.patches import Part, PatchData
-from dsr.data.problem import Problem
 from dsr.data.simgeo import SimGeo
 from dsr.data.sintel import Sintel, sintel_frames
 from dsr.data.sunrgbd import FRAMES as SUN_FRAMES
@@ -26,6 +23,9 @@ from dsr.degradation.downsampling import Downsampling
 from dsr.methods.networks.trained import packaged_weights
 from dsr.report.tables import published_row
 from dsr.synthetic.simgeo.scenes import SCENES as SIMGEO_SCENES
+from dsr.training.cropping import PatchSettings
+from dsr.training.patches import Part, PatchData
+from dsr.training.problem import Problem
 
 CONF = Path(__file__).resolve().parents[2] / "conf" / "dataset"
 

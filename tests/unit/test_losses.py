@@ -10,10 +10,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from dsr.data.problem import Batch
 from dsr.geometry.camera import Camera
 from dsr.metrics.losses import l1, lap1, mse
-from dsr.objective import DepthLoss, Objective
+from dsr.training.objective import DepthLoss, Objective
+from dsr.training.problem import Batch
 
 Loss = Callable[..., Tensor]
 LOSSES: dict[str, Loss] = {"l1": l1, "mse": mse, "lap1": lap1}

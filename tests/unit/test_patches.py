@@ -14,14 +14,14 @@ import torch
 from torch import Tensor
 
 from dsr.data.base import SceneSource
-from dsr.data.cutting import Patches, PatchSettings
-from dsr.data.patches import Part, PatchData, WholeScenes
-from dsr.data.problem import Batch, Problem, tensors_of
 from dsr.degradation.downsampling import Downsampling, Measured, make_sample
 from dsr.degradation.noise import GaussianMultiplicative, Kinect
 from dsr.geometry.camera import Camera
 from dsr.methods.networks.maps import normalised
 from dsr.sample import Scene
+from dsr.training.cropping import Patches, PatchSettings
+from dsr.training.patches import Part, PatchData, WholeScenes
+from dsr.training.problem import Batch, Problem, tensors_of
 
 BOX = Downsampling("box")
 X4 = Problem(4, BOX)

@@ -83,7 +83,7 @@ PREDICTING_PACKAGES = (
     "dsr.methods",
     "dsr.data",
     "dsr.degradation",
-    "dsr.training",
+    "dsr.training.module",
 )
 """Where what makes predictions lies: all that these import determines a prediction, too."""
 NOT_PREDICTING = (

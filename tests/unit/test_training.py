@@ -17,9 +17,6 @@ from lightning.pytorch.callbacks import Callback
 from torch import Tensor
 from torch.utils.data import DataLoader
 
-from dsr.data.cutting import Patches, PatchSettings
-from dsr.data.patches import WholeScenes
-from dsr.data.problem import Batch, Problem, tensors_of
 from dsr.degradation.downsampling import Downsampling, make_sample
 from dsr.geometry.camera import Camera
 from dsr.methods.networks.msg_net import MSGNet, upsample_disparity
@@ -27,9 +24,12 @@ from dsr.metrics import functional as scores
 from dsr.metrics.classes import visual_metrics
 from dsr.metrics.functional import SurfacePair
 from dsr.metrics.lpips import LPIPS
-from dsr.objective import Objective, balanced_weight, depth_of
 from dsr.sample import Scene
-from dsr.training import Schedule, SuperResolution
+from dsr.training.cropping import Patches, PatchSettings
+from dsr.training.module import Schedule, SuperResolution
+from dsr.training.objective import Objective, balanced_weight, depth_of
+from dsr.training.patches import WholeScenes
+from dsr.training.problem import Batch, Problem, tensors_of
 
 BOX = Downsampling("box")
 X2 = Problem(2, BOX)

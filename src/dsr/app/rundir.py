@@ -26,8 +26,8 @@ _PACKAGES = (
 )  # fmt: skip
 _NOT_IDENTITY = ("output_dir", "overwrite", "metrics", "weights", "resume", "run")  # of the weights, the content counts
 PREDICTING_CODE = (
-    "sample.py", "degradation", "geometry", "metrics", "synthetic", "methods", "data", "objective.py",
-    "training.py", "utils/lightning.py", "evaluation.py",
+    "sample.py", "degradation", "geometry", "metrics", "synthetic", "methods", "data", "training",
+    "utils/lightning.py", "evaluation.py",
 )  # fmt: skip
 """Modules and packages that determine a prediction, by their paths below the package."""
 

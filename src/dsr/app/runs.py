@@ -12,10 +12,10 @@ from omegaconf import OmegaConf
 from dsr.app.build import build
 from dsr.app.schema import ConfigError, TrainConfig, TrainerConfig
 from dsr.data.base import SceneSource, Some
-from dsr.data.cutting import PatchSettings
-from dsr.data.patches import Part, PatchData
-from dsr.data.problem import Problem
 from dsr.degradation.downsampling import Downsampling
+from dsr.training.cropping import PatchSettings
+from dsr.training.patches import Part, PatchData
+from dsr.training.problem import Problem
 
 WEIGHTS = "weights.safetensors"
 _FROM_RUN = ("scale", "downsampling", "noise", "seed", "dataset")

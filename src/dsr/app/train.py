@@ -21,13 +21,13 @@ from dsr.app.progress import Display, prepare
 from dsr.app.runs import WEIGHTS, common, read_config, training_data
 from dsr.app.schema import ConfigError, TrainConfig, given_keys, plain_config
 from dsr.app.trainer import make_trainer, seconds_per_step
-from dsr.data.patches import PatchData
 from dsr.methods.networks.base import DisparityNetwork
 from dsr.methods.networks.trained import NETWORKS
 from dsr.methods.networks.weight_files import load_network, save_network
 from dsr.metrics.classes import visual_metrics
-from dsr.objective import Objective, balanced_weight
-from dsr.training import Schedule, SuperResolution
+from dsr.training.module import Schedule, SuperResolution
+from dsr.training.objective import Objective, balanced_weight
+from dsr.training.patches import PatchData
 from dsr.utils.console import show
 from dsr.utils.files import replacing
 from dsr.utils.lightning import duration, fit

@@ -13,11 +13,11 @@ import torch
 import torchmetrics
 from torch import Tensor, nn
 
-from dsr.data.problem import Batch
 from dsr.geometry.comparison import comparison
 from dsr.methods.networks.base import DisparityNetwork
 from dsr.metrics.functional import SurfacePair
-from dsr.objective import Objective, depth_of
+from dsr.training.objective import Objective, depth_of
+from dsr.training.problem import Batch
 
 _DRAWN = 4
 

@@ -10,9 +10,9 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from dsr.data.problem import Batch
 from dsr.metrics import losses
 from dsr.metrics.functional import SurfacePair, mse_v
+from dsr.training.problem import Batch
 
 DepthLoss = Literal["lap1", "l1", "mse"]
 _TILT = math.asin(5 / 255)
@@ -49,7 +49,7 @@ class Objective:
 
         Args:
             disparity: (B, 1, H, W) the network's, in pixels.
-            batch: see :func:`dsr.data.problem.tensors_of`.
+            batch: see :func:`dsr.training.problem.tensors_of`.
 
         """
         target = batch["stereo"] / batch["depth"] - batch["doffs"]
@@ -78,7 +78,7 @@ def balanced_weight(patches: Iterable[Batch]) -> float:
     the median over the patches.
 
     Args:
-        patches: single training patches, without a batch axis; see :func:`dsr.data.problem.tensors_of`.
+        patches: single training patches, without a batch axis; see :func:`dsr.training.problem.tensors_of`.
 
     Raises:
         ValueError: there is no patch.

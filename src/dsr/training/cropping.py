@@ -15,10 +15,10 @@ import torch
 from torch import Tensor
 from torch.utils.data import Dataset
 
-from dsr.data.augment import Variation, window
-from dsr.data.problem import Batch, Problem, tensors_of
 from dsr.geometry.camera import stereo_constant
 from dsr.sample import AllHolesError, DepthSample, Scene
+from dsr.training.augmentation import Variation, window
+from dsr.training.problem import Batch, Problem, tensors_of
 
 _TRIES, _MOST_TRIES = 10, 100
 """Of windows in a scene, and of scenes."""
@@ -36,7 +36,7 @@ class PatchSettings(Variation):
         validation_scenes: how many of each data set's last scenes are never trained on, but validated with.
         scenes: how many of each data set's scenes to use, the first ones; None for all.
         workers: processes that cut patches; 0 for none beside the trainer's.
-        flip, rotate, depth_scale, colour, photo: see :class:`dsr.data.augment.Variation`.
+        flip, rotate, depth_scale, colour, photo: see :class:`dsr.training.augmentation.Variation`.
 
     Raises:
         ValueError: a value is out of range.

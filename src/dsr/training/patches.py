@@ -14,9 +14,9 @@ import torch
 from torch.utils.data import DataLoader, Dataset
 
 from dsr.data.base import SceneSource, content_of
-from dsr.data.cutting import Patches, PatchSettings, check_patches
-from dsr.data.problem import Batch, Problem, tensors_of
 from dsr.sample import Scene
+from dsr.training.cropping import Patches, PatchSettings, check_patches
+from dsr.training.problem import Batch, Problem, tensors_of
 
 
 @dataclass(frozen=True)

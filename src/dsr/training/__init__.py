@@ -1,0 +1,1 @@
+"""Training: patches of scenes, losses, the LightningModule."""
