@@ -17,11 +17,11 @@ import pytest
 import torch
 
 from dsr.degradation.downsampling import Downsampling, make_sample
-from dsr.evaluation import SCORE_COLUMNS
+from dsr.evaluation.predict import SCORE_COLUMNS
+from dsr.evaluation.store import prediction_path, save_scene, scene_path
 from dsr.geometry.camera import Camera
 from dsr.metrics.catalogue import catalogue, score_image
 from dsr.sample import Scene
-from dsr.store import prediction_path, save_scene, scene_path
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 CHROMIUMS = ("chromium", "chromium-browser", "google-chrome")

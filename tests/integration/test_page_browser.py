@@ -8,10 +8,10 @@ import cv2
 import numpy as np
 import pytest
 
+from dsr.evaluation.results import Results, load_results
 from dsr.geometry.shading import lights, render, shade
 from dsr.report.page import save_page
 from dsr.report.pictures import normals_seen_by
-from dsr.report.results import Results, load_results
 
 SPITEFUL = "<img src=x onerror=alert(1)>\"'&</script><script>alert(2)</script>"
 SIZE = 64

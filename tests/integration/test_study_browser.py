@@ -10,7 +10,7 @@ import pandas as pd
 import pytest
 
 from dsr.cli import study as command
-from dsr.report.results import load_results
+from dsr.evaluation.results import load_results
 from dsr.study.build import Choice, build_study
 from dsr.study.key import read_key
 from dsr.utils.console import open_console

@@ -8,11 +8,11 @@ import pandas as pd
 import pytest
 from scipy import stats
 
+from dsr.evaluation.results import Results, Run
 from dsr.report import correlation_figure
 from dsr.report.correlation_figure import density_of, save_scatter_matrix, scatter_matrix
 from dsr.report.correlations import correlate, metric_matrix, pairs, with_reference, write_correlations
 from dsr.report.palette import KNOWN, method_colours
-from dsr.report.results import Results, Run
 
 VARIANTS = ("e1", "e2", "e3", "e4", "max", "avg")
 

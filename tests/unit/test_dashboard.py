@@ -10,11 +10,11 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from tensorboard.plugins.custom_scalar import layout_pb2
 from tensorboard.plugins.hparams import plugin_data_pb2
 
+from dsr.evaluation.results import load_results
+from dsr.evaluation.store import scene_path
 from dsr.geometry.shading import render
 from dsr.report.dashboard import save_dashboard
 from dsr.report.pictures import normals_seen_by
-from dsr.report.results import load_results
-from dsr.store import scene_path
 
 SCENES = ("b", "a")
 

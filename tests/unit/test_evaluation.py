@@ -12,7 +12,7 @@ import torch
 
 from dsr.degradation.downsampling import Downsampling, Measured, make_sample
 from dsr.degradation.noise import GaussianMultiplicative
-from dsr.evaluation import SCORE_COLUMNS, Outcome, StalePredictionError, Study, load_prediction, predict, score
+from dsr.evaluation.predict import SCORE_COLUMNS, Outcome, StalePredictionError, Study, load_prediction, predict, score
 from dsr.geometry.camera import Camera
 from dsr.methods.base import NoAnswerError
 from dsr.metrics.catalogue import catalogue, score_image

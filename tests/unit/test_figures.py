@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 
+from dsr.evaluation.results import load_results
 from dsr.geometry.shading import lights
 from dsr.report.figures import (
     grids,
@@ -24,7 +25,6 @@ from dsr.report.figures.layout import Cell, Row, draw_grid
 from dsr.report.figures.lights import sphere_normals
 from dsr.report.figures.scenes import details_of
 from dsr.report.pictures import HOLE_COLOUR, Window, colours, strongest_window
-from dsr.report.results import load_results
 
 TOGETHER = (save_rendering_grids, save_depth_grids, save_error_grids)
 

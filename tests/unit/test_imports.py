@@ -10,7 +10,7 @@ LAYERS = (
     ("dsr.sample",),
     ("dsr.degradation", "dsr.metrics", "dsr.synthetic"),
     ("dsr.data", "dsr.methods"),
-    ("dsr.training", "dsr.evaluation", "dsr.inference", "dsr.io", "dsr.viz"),
+    ("dsr.training", "dsr.evaluation.predict", "dsr.inference", "dsr.io", "dsr.viz"),
     ("dsr.doctor", "dsr.report", "dsr.user_study"),
     ("dsr.app",),
     ("dsr.cli",),
@@ -23,7 +23,7 @@ MORE_FORBIDDEN = {
     "dsr.report": (
         "dsr.data",
         "dsr.methods",
-        "dsr.evaluation",
+        "dsr.evaluation.predict",
         "dsr.training.objective",
         "dsr.training.module",
         "dsr.metrics",
@@ -101,8 +101,8 @@ def test_modules_do_not_import_each_other_in_a_circle():
         ("dsr.data.formats.files", "from dsr.methods.networks import msg_net", "dsr.methods.networks.msg_net"),
         ("dsr.data.formats.files", "def f():\n    from ...metrics import lpips", "dsr.metrics.lpips"),
         ("dsr.metrics.classes", "from dsr.metrics import losses", "dsr.metrics"),
-        ("dsr.report.tables", "from dsr.evaluation import score", "dsr.evaluation"),
-        ("dsr.evaluation", "from omegaconf.errors import X", "omegaconf.errors"),
+        ("dsr.report.tables", "from dsr.evaluation.predict import score", "dsr.evaluation.predict"),
+        ("dsr.evaluation.predict", "from omegaconf.errors import X", "omegaconf.errors"),
         ("dsr.methods.networks.facets", "import hydra", "hydra"),
     ],
 )

@@ -8,10 +8,10 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
+from dsr.evaluation.results import Results, Run
 from dsr.report.latex import latex_text, to_document
 from dsr.report.markup import MISSING, aligned, escaped, to_csv, to_latex, to_markdown, write_tables
 from dsr.report.paper_tables import build_tables
-from dsr.report.results import Results, Run
 
 ODD = "a|b_*x* 50% & $1 {c} \\d #e ~f ^g <u> `h` \"i\" 'j'"
 FOLDER = "dsr.data.folder.Folder"

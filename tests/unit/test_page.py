@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 import torch
 
+from dsr.evaluation.results import Results, load_results
 from dsr.geometry.shading import render
 from dsr.report.page import save_page
 from dsr.report.page.encoding import LEVELS, Pool, depth_picture, error_picture, mask_picture, shading_picture
 from dsr.report.pictures import normals_seen_by
-from dsr.report.results import Results, load_results
 
 SPITEFUL = "<img src=x onerror=alert(1)>\"'&</script><script>alert(2)</script>"
 

@@ -7,8 +7,8 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
+from dsr.evaluation.results import Results, Run
 from dsr.report.paper_tables import COLUMNS, build_tables
-from dsr.report.results import Results, Run
 from dsr.report.scene_sets import PAPER_SCENES, Place, sets_of_dataset, sets_of_summary
 from dsr.report.tables import published
 from dsr.report.user_study import read_study

@@ -6,8 +6,8 @@ import os
 import pytest
 import torch
 
-from dsr.report.results import Problem, load_results
-from dsr.store import load_scene, prediction_path, scene_path
+from dsr.evaluation.results import Problem, load_results
+from dsr.evaluation.store import load_scene, prediction_path, scene_path
 
 
 def change(folder, name, **entries):

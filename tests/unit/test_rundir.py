@@ -92,7 +92,7 @@ NOT_PREDICTING = (
     "utils/files.py",
     "utils/hashing.py",
     "utils/console.py",
-    "store.py",
+    "evaluation/__init__.py", "evaluation/store.py",
     "upsampling",
     "data/download",
 )

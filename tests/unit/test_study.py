@@ -18,8 +18,8 @@ from PIL import Image
 from scipy.stats import binomtest
 
 from dsr.cli import study as command
+from dsr.evaluation.results import load_results
 from dsr.geometry.camera import Camera
-from dsr.report.results import load_results
 from dsr.study.answers import files_of, read_all, read_answers
 from dsr.study.build import Choice, build_study
 from dsr.study.collect import ALL, AVERAGE, COLUMNS, collect, remarks

@@ -24,7 +24,7 @@ from dsr.app.progress import Display, prepare
 from dsr.app.runs import studies_of_run
 from dsr.app.schema import ConfigError, EvalConfig, given_keys, plain_config
 from dsr.data.base import SceneSource
-from dsr.evaluation import Outcome, StalePredictionError, Study, predict, score
+from dsr.evaluation.predict import Outcome, StalePredictionError, Study, predict, score
 from dsr.methods.dip.upsampler import WORKSPACE
 from dsr.methods.networks.trained import packaged_names, packaged_weights
 from dsr.metrics.catalogue import catalogue

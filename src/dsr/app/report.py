@@ -13,13 +13,13 @@ import pandas as pd
 from rich.console import Console
 
 from dsr.app.progress import Display
+from dsr.evaluation.results import Results, load_results
 from dsr.geometry.shading import LIGHT_NAMES
 from dsr.report.correlation_figure import save_scatter_matrix
 from dsr.report.correlations import write_correlations
 from dsr.report.figures import save_figures
 from dsr.report.markup import write_tables
 from dsr.report.page import save_page
-from dsr.report.results import Results, load_results
 from dsr.report.user_study import read_study
 from dsr.utils.console import show
 from dsr.utils.files import write_text

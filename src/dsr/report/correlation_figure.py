@@ -19,10 +19,10 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from scipy.stats import gaussian_kde
 
+from dsr.evaluation.results import Results
 from dsr.report.correlations import DEPTH_LIMIT, REFERENCE, correlate, metric_matrix, pairs, with_reference
 from dsr.report.palette import method_colours
 from dsr.report.pictures import write_figure
-from dsr.report.results import Results
 from dsr.report.tables import METRICS
 
 _STYLE: dict[Any, Any] = {

@@ -12,8 +12,8 @@ from typing import Literal
 import numpy as np
 import pandas as pd
 
+from dsr.evaluation.results import Results
 from dsr.report.markup import MISSING, aligned, escaped
-from dsr.report.results import Results
 from dsr.utils.files import replacing, write_text
 
 Kind = Literal["pearson", "spearman"]

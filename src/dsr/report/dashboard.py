@@ -18,11 +18,11 @@ from torch import Tensor
 from torch.utils.tensorboard import SummaryWriter
 from torch.utils.tensorboard.summary import hparams
 
+from dsr.evaluation.results import Run, method_settings, read_run
+from dsr.evaluation.store import StoredScene
 from dsr.geometry.shading import LIGHT_NAMES, render
 from dsr.report.pictures import colours, normals_seen_by, reduced
-from dsr.report.results import Run, method_settings, read_run
 from dsr.report.tables import METRICS
-from dsr.store import StoredScene
 
 WORST = "worst of four lights"
 _EVENTS = "events.out.tfevents.*"

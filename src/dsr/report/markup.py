@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pandas as pd
 
+from dsr.evaluation.results import Results
 from dsr.report.latex import to_document, to_latex
 from dsr.report.paper_tables import build_tables
-from dsr.report.results import Results
 from dsr.report.table_parts import STAR_NOTE, Column, Group, PaperTable, Row, Style
 from dsr.utils.files import write_text
 

@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 
 import pandas as pd
 
-from dsr.report.results import Results, Run
+from dsr.evaluation.results import Results, Run
 from dsr.report.scene_sets import PAPER_SCENES, TITLES, Place, SceneSet, sets_of_dataset, sets_of_summary
 from dsr.report.table_parts import Cell, Column, Group, PaperTable, Row
 from dsr.report.tables import METRICS, paper_row, published

@@ -12,7 +12,7 @@ from typing import Any
 
 from torch import Tensor
 
-from dsr.report.results import Problem, Results, Run, one_per_method
+from dsr.evaluation.results import Problem, Results, Run, one_per_method
 from dsr.study.key import KEY_NAME, PAGE_VERSION, Candidate, Key, Trial, read_key, write_key
 from dsr.study.page import page_of
 from dsr.study.pictures import grey_png, shading_of

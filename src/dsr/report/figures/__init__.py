@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
+from dsr.evaluation.results import Results
 from dsr.report.figures.grids import LIGHT, figure_count, save_depth_grids, save_error_grids, save_rendering_grids
 from dsr.report.figures.lights import save_lights_figure
-from dsr.report.results import Results
 
 __all__ = ["save_depth_grids", "save_error_grids", "save_figures", "save_lights_figure", "save_rendering_grids"]
 

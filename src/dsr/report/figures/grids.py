@@ -9,10 +9,10 @@ from pathlib import Path
 
 import numpy as np
 
+from dsr.evaluation.results import Problem, Results
 from dsr.report.figures.layout import Row, draw_grid, save_both
 from dsr.report.figures.rows import depth_row, error_row, rendering_row
 from dsr.report.figures.scenes import Shown, first_runs, scene_names, shown_scenes
-from dsr.report.results import Problem, Results
 
 LIGHT = "e1"
 ROWS = 5

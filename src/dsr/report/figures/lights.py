@@ -12,12 +12,12 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 from torch import Tensor
 
+from dsr.evaluation.results import Results
+from dsr.evaluation.store import StoredScene
 from dsr.geometry.shading import LIGHT_NAMES, lights, render
 from dsr.report.figures.layout import save_both
 from dsr.report.figures.scenes import rendering
 from dsr.report.pictures import colours
-from dsr.report.results import Results
-from dsr.store import StoredScene
 
 _SPHERE = 401
 """Pixels across."""

@@ -8,11 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 from torch import Tensor
 
+from dsr.evaluation.results import Problem, Results, Run
+from dsr.evaluation.store import StoredScene
 from dsr.geometry.camera import Camera
 from dsr.geometry.shading import LIGHT_NAMES, lights, shade
 from dsr.report.pictures import Window, normals_seen_by, strongest_window
-from dsr.report.results import Problem, Results, Run
-from dsr.store import StoredScene
 
 _DETAIL = 5
 """A detail's side is this part of the picture's shorter one."""

@@ -16,12 +16,12 @@ from typing import Any
 import matplotlib as mpl
 import numpy as np
 
+from dsr.evaluation.results import Results
 from dsr.geometry.shading import LIGHT_NAMES, lights
 from dsr.report.page.content import links, metrics_data, problem_data, run_data
 from dsr.report.page.encoding import LEVELS, Level, Pool, megabytes
 from dsr.report.page.scenes import View, scene_data, views_of
 from dsr.report.pictures import HOLE_COLOUR
-from dsr.report.results import Results
 from dsr.utils.files import write_text
 
 Progress = Callable[[int, int], None]

@@ -10,7 +10,7 @@ from urllib.parse import quote
 
 import pandas as pd
 
-from dsr.report.results import Problem, Results, Run
+from dsr.evaluation.results import Problem, Results, Run
 from dsr.report.tables import AVERAGES, METRICS, OTHER_FRAMES, RECREATED, in_paper_units, paper_row
 
 _FOLDERS = {"tables": (".csv", ".md", ".tex"), "metrics": (".csv",), "figures": (".pdf",)}

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import pandas as pd
 from torch import Tensor
 
-from dsr.store import StoredScene, load_prediction, load_scene, prediction_path, scene_path
+from dsr.evaluation.store import StoredScene, load_prediction, load_scene, prediction_path, scene_path
 
 METHOD_ORDER = (
     "Nearest", "Bilinear", "Bicubic", "GF", "JBU", "FGS", "Diffusion", "TGV",

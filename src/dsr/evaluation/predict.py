@@ -1,10 +1,10 @@
 """Evaluation in two passes: predictions to files, then scores from files.
 
 A prediction is ``predictions/SCENE.npz``: ``depth`` (H, W) in metres, NaN in holes; ``config``, a JSON text of all that
-it came from; and the ``seconds`` that it took. Beside it lies the problem that it answers, see :mod:`dsr.store`, and
-``iterations/SCENE.csv``, how the iteration went, of a method that iterates. A prediction whose stored config is the
-wanted one is not made again, so an interrupted run goes on where it stopped. One scene that fails, or that the method
-has no answer for, does not keep the others from their results.
+it came from; and the ``seconds`` that it took. Beside it lies the problem that it answers, see
+:mod:`dsr.evaluation.store`, and ``iterations/SCENE.csv``, how the iteration went, of a method that iterates. A
+prediction whose stored config is the wanted one is not made again, so an interrupted run goes on where it stopped. One
+scene that fails, or that the method has no answer for, does not keep the others from their results.
 """
 
 from __future__ import annotations
@@ -27,10 +27,10 @@ from dsr.data.base import SceneSource
 from dsr.degradation.downsampling import Downsampling, Measured, make_sample
 from dsr.degradation.holes import Holes
 from dsr.degradation.noise import Noise
+from dsr.evaluation.store import iterations_path, load_prediction, prediction_path, save_scene, scene_path
 from dsr.methods.base import Iterative, NoAnswerError, Upsampler
 from dsr.metrics.catalogue import WORST, Metric, score_image
 from dsr.sample import DepthSample
-from dsr.store import iterations_path, load_prediction, prediction_path, save_scene, scene_path
 from dsr.utils.console import one_line
 from dsr.utils.files import read_arrays, replacing, write_text
 

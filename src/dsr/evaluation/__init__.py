@@ -1,0 +1,1 @@
+"""Predictions to files, scores from files, and what runs left in their directories."""
