@@ -19,10 +19,10 @@ from torch import Tensor
 
 from dsr.data.folder import Folder
 from dsr.geometry.camera import Camera
+from dsr.inference import upsample_depth
+from dsr.inference.planning import NETWORKS
 from dsr.methods.networks import base as network
 from dsr.methods.networks.trained import build_trained, packaged_weights
-from dsr.upsampling import upsample_depth
-from dsr.upsampling.planning import NETWORKS
 
 
 def mirrored(values: Tensor, height: int, width: int) -> Tensor:

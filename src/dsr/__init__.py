@@ -3,7 +3,7 @@
 >>> import dsr
 >>> camera = dsr.Camera(width=640, height=480, fx=525.0, fy=525.0, cx=319.5, cy=239.5)
 
-and ``dsr.upsample(photo, depth, camera)``, see :func:`dsr.upsampling.people.upsample`.
+and ``dsr.upsample(photo, depth, camera)``, see :func:`dsr.inference.api.upsample`.
 """
 
 from __future__ import annotations
@@ -13,12 +13,12 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from dsr.geometry.camera import Camera
-    from dsr.upsampling.people import upsample
+    from dsr.inference.api import upsample
 
 __version__ = "0.1.0"
 __all__ = ["Camera", "__version__", "upsample"]
 
-_HOMES = {"Camera": "dsr.geometry.camera", "upsample": "dsr.upsampling.people"}
+_HOMES = {"Camera": "dsr.geometry.camera", "upsample": "dsr.inference.api"}
 
 
 def __getattr__(name: str) -> Any:

@@ -92,8 +92,9 @@ NOT_PREDICTING = (
     "utils/files.py",
     "utils/hashing.py",
     "utils/console.py",
-    "evaluation/__init__.py", "evaluation/store.py",
-    "upsampling",
+    "evaluation/__init__.py",
+    "evaluation/store.py",
+    "inference",
     "data/download",
 )
 """What they import and what does not determine one: files, texts, downloads; ``dsr.upsample`` is imported by name."""

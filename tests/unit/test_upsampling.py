@@ -14,11 +14,12 @@ from torch import Tensor
 
 import dsr
 from dsr.geometry.camera import Camera
-from dsr.upsampling import METHODS, people, plan, upsample_depth
-from dsr.upsampling.engine import enlarged_by
-from dsr.upsampling.inspection import suited_method
-from dsr.upsampling.planning import OWN_SIZE
-from dsr.upsampling.resampling import resized_inverse
+from dsr.inference import METHODS, plan, upsample_depth
+from dsr.inference import api as people
+from dsr.inference.engine import enlarged_by
+from dsr.inference.inspection import suited_method
+from dsr.inference.planning import OWN_SIZE
+from dsr.inference.resampling import resized_inverse
 
 
 def _camera(height: int, width: int) -> Camera:
@@ -225,7 +226,7 @@ def test_every_method_that_needs_no_optimisation_answers() -> None:
 
 
 def test_a_prior_answers_at_any_size(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("dsr.upsampling.engine._PRIOR_SETTINGS", {"dip": {"steps": 2, "widths": (4,), "skips": (2,)}})
+    monkeypatch.setattr("dsr.inference.engine._PRIOR_SETTINGS", {"dip": {"steps": 2, "widths": (4,), "skips": (2,)}})
     camera = _camera(31, 42)
     fine = upsample_depth(_photo(31, 42), _plane(15, 21, camera), camera, method="dip")
     assert fine.shape == (1, 31, 42)

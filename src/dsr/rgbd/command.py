@@ -14,6 +14,7 @@ from rich.console import Console
 from rich.progress import Progress
 from torch import Tensor
 
+from dsr.inference import AUTO, NOISY, Plan, enlarged_by, plan, suited_method, upsample_depth
 from dsr.rgbd.encoding import Fact
 from dsr.rgbd.inputs import Picture, UnitMemory, read_picture
 from dsr.rgbd.layouts import pairs_of_folder
@@ -32,7 +33,6 @@ from dsr.rgbd.outputs import (
 from dsr.rgbd.pairs import Found, Pair, pairs_of_lists
 from dsr.rgbd.telling import Reporter, listed, problem_line, steps
 from dsr.rgbd.wanted import Wanted, files_of, inputs_of, settings_of
-from dsr.upsampling import AUTO, NOISY, Plan, enlarged_by, plan, suited_method, upsample_depth
 from dsr.utils.console import bar, show
 
 

@@ -6,10 +6,10 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
+from dsr.inference import AUTO, METHODS
 from dsr.rgbd.inputs import Reading
 from dsr.rgbd.outputs import FORMATS, PARTS
 from dsr.rgbd.pairs import Pair
-from dsr.upsampling import AUTO, METHODS
 from dsr.utils.hashing import file_hash
 
 
@@ -22,7 +22,7 @@ class Wanted:
         folders: to look for pairs in.
         rgb, depth, mask: files, or one folder each of the first two.
         reading: how the files are to be read.
-        method, scale, device, keep_holes: see :func:`dsr.upsampling.upsample_depth`.
+        method, scale, device, keep_holes: see :func:`dsr.inference.upsample_depth`.
         depth_format: of the result; None for the input's.
         parts: what to write, some of :data:`dsr.rgbd.outputs.PARTS`.
         overwrite: whether to redo what is there.

@@ -11,15 +11,15 @@ from torch.nn import functional
 
 from dsr.degradation.downsampling import Downsampling
 from dsr.geometry.camera import Camera
+from dsr.inference.inspection import enlarged_by, suited_method
+from dsr.inference.planning import AUTO, INTERPOLATIONS, NETWORKS, OWN_SIZE, PRIORS, plan
+from dsr.inference.resampling import resized_inverse
 from dsr.methods.classical.interpolation import Interpolation, Order
 from dsr.methods.dip.upsampler import DeepImagePrior
 from dsr.methods.networks.base import NetworkUpsampler
 from dsr.methods.networks.trained import build_trained, packaged_weights
 from dsr.methods.tiling import Progress, part_of
 from dsr.sample import DepthSample
-from dsr.upsampling.inspection import enlarged_by, suited_method
-from dsr.upsampling.planning import AUTO, INTERPOLATIONS, NETWORKS, OWN_SIZE, PRIORS, plan
-from dsr.upsampling.resampling import resized_inverse
 
 _PRIOR_SETTINGS: dict[str, dict[str, Any]] = {"dip": {"data_loss": "mse", "data_weight": 10.0, "w": 0.0}, "dip_v": {}}
 
@@ -38,7 +38,7 @@ def upsample_depth(
     """Return depth of the photo's size.
 
     The depth map is registered to the photo: the same view and field of view, outer edge on outer edge. Where it is
-    coarse, see :mod:`dsr.upsampling.planning` for what is done. Where it has the photo's size it is made coarser by
+    coarse, see :mod:`dsr.inference.planning` for what is done. Where it has the photo's size it is made coarser by
     ``scale`` first, its known pixels' inverse depth averaged; where it was enlarged by repeating pixels, these are
     dropped instead. Averages across a depth step do no harm: the networks were trained on them. (With a tenth of the
     map unknown, their RMSE_v on Lucy is 0.127, against 0.142 and more of means, medians and planes of one surface.)
@@ -47,8 +47,8 @@ def upsample_depth(
         rgb: (3, H, W) floating point, in [0, 1].
         depth: (1, h, w) orthogonal depth in metres, NaN in holes.
         camera: the photo's; interpolation alone depends on it, and priors.
-        scale: see :func:`dsr.upsampling.plan`.
-        method: one of ``METHODS``, or ``auto``, see :func:`dsr.upsampling.inspection.suited_method`.
+        scale: see :func:`dsr.inference.plan`.
+        method: one of ``METHODS``, or ``auto``, see :func:`dsr.inference.inspection.suited_method`.
         device: ``auto`` for a GPU where there is one, else as torch names it.
         keep_holes: whether pixels whose own depth, or nearest coarse pixel, is unknown stay NaN; else they are filled.
         progress: is told how many parts are done, and of how many.

@@ -1,7 +1,7 @@
 """What is going to be done with a photo and a depth map of given sizes, and what it costs.
 
 Networks are trained for fixed factors. A coarse depth map stays as it is: the photo is resized to a multiple of its
-size, the network answers at that size, and the answer is resized to the photo (:mod:`dsr.upsampling.resampling`).
+size, the network answers at that size, and the answer is resized to the photo (:mod:`dsr.inference.resampling`).
 RMSE_v and RMSE_d in mm of Facets on Lucy and Plant, box averages at the ratio given, means of both scenes:
 
 | ratio | so, x4 | so, x8 | depth resized instead, x4 | x8 | cubic spline |
@@ -66,7 +66,7 @@ class Plan:
 def plan(
     photo_size: tuple[int, int], depth_size: tuple[int, int], scale: int | None = None, method: str = "facets"
 ) -> Plan:
-    """Return what :func:`dsr.upsampling.upsample_depth` does.
+    """Return what :func:`dsr.inference.upsample_depth` does.
 
     A depth map of the photo's size that turns out to be enlarged by repeating pixels is taken for the coarse map that
     it was, whatever the plan says.

@@ -9,9 +9,9 @@ import torch
 from torch import Tensor
 
 from dsr.geometry.camera import Camera
+from dsr.inference.engine import upsample_depth
+from dsr.inference.planning import AUTO
 from dsr.methods.tiling import Progress
-from dsr.upsampling.engine import upsample_depth
-from dsr.upsampling.planning import AUTO
 
 Array = TypeVar("Array", np.ndarray, Tensor)
 

@@ -7,8 +7,8 @@ from torch import Tensor
 
 from dsr.degradation.downsampling import Downsampling
 from dsr.geometry.camera import Camera
+from dsr.inference.planning import OWN_SIZE, USUAL_SCALE
 from dsr.methods.dip.noise import noise_level, tilt_of
-from dsr.upsampling.planning import OWN_SIZE, USUAL_SCALE
 
 CLEAN, NOISY = "facets", "msg_v_noisy"
 LARGEST_TILT = 8.0

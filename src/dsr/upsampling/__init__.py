@@ -1,8 +1,0 @@
-"""Finer depth for anybody's photo and depth map: any size, any ratio of the sizes, holes, bounded memory."""
-
-from dsr.upsampling.engine import upsample_depth
-from dsr.upsampling.inspection import NOISY, enlarged_by, suited_method
-from dsr.upsampling.people import upsample
-from dsr.upsampling.planning import AUTO, METHODS, Plan, plan
-
-__all__ = ["AUTO", "METHODS", "NOISY", "Plan", "enlarged_by", "plan", "suited_method", "upsample", "upsample_depth"]
