@@ -11,7 +11,7 @@ import pytest
 from dsr.evaluation.results import Results, load_results
 from dsr.geometry.shading import lights, render, shade
 from dsr.report.page import save_page
-from dsr.report.pictures import normals_seen_by
+from dsr.viz.panels import normals_seen_by
 
 SPITEFUL = "<img src=x onerror=alert(1)>\"'&</script><script>alert(2)</script>"
 SIZE = 64

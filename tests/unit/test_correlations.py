@@ -12,7 +12,7 @@ from dsr.evaluation.results import Results, Run
 from dsr.report import correlation_figure
 from dsr.report.correlation_figure import density_of, save_scatter_matrix, scatter_matrix
 from dsr.report.correlations import correlate, metric_matrix, pairs, with_reference, write_correlations
-from dsr.report.palette import KNOWN, method_colours
+from dsr.viz.palette import KNOWN, method_colours
 
 VARIANTS = ("e1", "e2", "e3", "e4", "max", "avg")
 

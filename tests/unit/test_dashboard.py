@@ -14,7 +14,7 @@ from dsr.evaluation.results import load_results
 from dsr.evaluation.store import scene_path
 from dsr.geometry.shading import render
 from dsr.report.dashboard import save_dashboard
-from dsr.report.pictures import normals_seen_by
+from dsr.viz.panels import normals_seen_by
 
 SCENES = ("b", "a")
 

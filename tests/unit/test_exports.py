@@ -12,10 +12,11 @@ from dsr.geometry.camera import Camera
 from dsr.geometry.mesh import triangulate
 from dsr.geometry.shading import render
 from dsr.geometry.surface import normals_of
-from dsr.rgbd import before_after, exports
-from dsr.rgbd.before_after import write_before_after
+from dsr.rgbd import exports
 from dsr.rgbd.exports import write_cloud, write_mesh, write_normals, write_renderings
 from dsr.rgbd.modelfiles import write_glb
+from dsr.viz import before_after
+from dsr.viz.before_after import write_before_after
 
 CAMERA = Camera(24, 18, 30, 30, 11.5, 8.5)
 NORMAL_OF_A_WALL = [128, 128, 255]

@@ -24,7 +24,7 @@ from dsr.report.figures import lights as lights_figure
 from dsr.report.figures.layout import Cell, Row, draw_grid
 from dsr.report.figures.lights import sphere_normals
 from dsr.report.figures.scenes import details_of
-from dsr.report.pictures import HOLE_COLOUR, Window, colours, strongest_window
+from dsr.viz.panels import HOLE_COLOUR, Window, colours, strongest_window
 
 TOGETHER = (save_rendering_grids, save_depth_grids, save_error_grids)
 

@@ -15,7 +15,7 @@ from dsr.evaluation.results import Results, load_results
 from dsr.geometry.shading import render
 from dsr.report.page import save_page
 from dsr.report.page.encoding import LEVELS, Pool, depth_picture, error_picture, mask_picture, shading_picture
-from dsr.report.pictures import normals_seen_by
+from dsr.viz.panels import normals_seen_by
 
 SPITEFUL = "<img src=x onerror=alert(1)>\"'&</script><script>alert(2)</script>"
 

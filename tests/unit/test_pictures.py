@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from dsr.geometry.camera import Camera
-from dsr.report.pictures import save_picture
 from dsr.sample import DepthSample
+from dsr.viz.panels import save_picture
 
 SCORES = {"RMSE_d": 0.07, "DSSIM_v": 0.3}
 WIDTH = 2656

@@ -114,7 +114,7 @@ def test_every_module_that_determines_a_prediction_is_in_the_list_of_its_code():
 def test_a_module_that_a_method_imports_and_the_list_lacks_is_found():
     imports = {
         **IMPORTS,
-        "dsr.methods.networks.facets": IMPORTS["dsr.methods.networks.facets"] | {"dsr.report.palette"},
+        "dsr.methods.networks.facets": IMPORTS["dsr.methods.networks.facets"] | {"dsr.viz.palette"},
     }
     assert lacking(closure_of(["dsr.methods.networks.facets"], imports)) == ["report/palette.py"]
     without = [name for name in PREDICTING_CODE if name != "utils/lightning.py"]

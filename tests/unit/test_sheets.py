@@ -7,8 +7,8 @@ import torch
 from matplotlib.figure import Figure
 
 from dsr.geometry.camera import Camera
-from dsr.report.sheets import save_contact_sheet
 from dsr.sample import Scene
+from dsr.viz.sheets import save_contact_sheet
 
 PHOTO = (0.2, 0.4, 0.6)
 PINK = (214, 132, 180)
@@ -115,7 +115,7 @@ def test_a_measured_map_beside_the_fine_one_is_told_of(tmp_path, written):
 
 @pytest.mark.parametrize(("count", "pages"), [(3, 2), (4, 2), (5, 3)])
 def test_many_scenes_make_numbered_pages(tmp_path, written, monkeypatch, count, pages):
-    monkeypatch.setattr("dsr.report.sheets._ROWS", 2)
+    monkeypatch.setattr("dsr.viz.sheets._ROWS", 2)
     path = tmp_path / "toys.png"
     made = save_contact_sheet(path, (toy_scene(8, 8, f"scene {number}") for number in range(count)), "Toys")
     assert made == [tmp_path / f"toys-{number + 1}.png" for number in range(pages)]
@@ -124,7 +124,7 @@ def test_many_scenes_make_numbered_pages(tmp_path, written, monkeypatch, count, 
 
 
 def test_scenes_are_taken_as_they_are_needed(tmp_path, monkeypatch):
-    monkeypatch.setattr("dsr.report.sheets._ROWS", 2)
+    monkeypatch.setattr("dsr.viz.sheets._ROWS", 2)
 
     def scenes():
         for number in range(4):

@@ -31,11 +31,11 @@ from dsr.metrics.catalogue import catalogue
 from dsr.metrics.classes import visual_metrics
 from dsr.metrics.lpips import LPIPS
 from dsr.report.dashboard import save_dashboard
-from dsr.report.pictures import save_picture
 from dsr.report.tables import score_table
 from dsr.sample import DepthSample
 from dsr.utils.console import open_console, print_error, show
 from dsr.utils.hashing import file_hash
+from dsr.viz.panels import save_picture
 
 
 def evaluate(config: DictConfig) -> pd.DataFrame:

@@ -16,9 +16,9 @@ from dsr.app.entry import explain
 from dsr.app.progress import Display, prepare
 from dsr.app.schema import ConfigError, plain_config, register
 from dsr.data.base import SceneSource
-from dsr.report.sheets import save_contact_sheet
 from dsr.sample import Scene
 from dsr.utils.console import one_line, show
+from dsr.viz.sheets import save_contact_sheet
 
 
 def prepare_dataset(name: str, overrides: Sequence[str], console: Console) -> None:

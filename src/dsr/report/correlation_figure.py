@@ -21,9 +21,9 @@ from scipy.stats import gaussian_kde
 
 from dsr.evaluation.results import Results
 from dsr.report.correlations import DEPTH_LIMIT, REFERENCE, correlate, metric_matrix, pairs, with_reference
-from dsr.report.palette import method_colours
-from dsr.report.pictures import write_figure
 from dsr.report.tables import METRICS
+from dsr.viz.palette import method_colours
+from dsr.viz.panels import write_figure
 
 _STYLE: dict[Any, Any] = {
     "pdf.fonttype": 42,

@@ -21,8 +21,8 @@ from torch.utils.tensorboard.summary import hparams
 from dsr.evaluation.results import Run, method_settings, read_run
 from dsr.evaluation.store import StoredScene
 from dsr.geometry.shading import LIGHT_NAMES, render
-from dsr.report.pictures import colours, normals_seen_by, reduced
 from dsr.report.tables import METRICS
+from dsr.viz.panels import colours, normals_seen_by, reduced
 
 WORST = "worst of four lights"
 _EVENTS = "events.out.tfevents.*"

@@ -18,12 +18,12 @@ from torch import Tensor
 
 from dsr.geometry.camera import Camera
 from dsr.geometry.shading import LIGHT_NAMES
-from dsr.rgbd.before_after import write_before_after
 from dsr.rgbd.depth_files import DEPTH_SUFFIXES, write_depth_file
 from dsr.rgbd.encoding import Encoding, Fact, encode
 from dsr.rgbd.exports import write_cloud, write_mesh, write_normals, write_renderings
 from dsr.rgbd.inputs import Picture
 from dsr.utils.files import replacing, write_text
+from dsr.viz.before_after import write_before_after
 
 PARTS = ("depth", "renderings", "normals", "cloud", "mesh", "before_after")
 FORMATS = ("png", "tiff", "npy", "npz", "pfm", "exr")

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from dsr.geometry.camera import Camera
 from dsr.geometry.shading import LIGHT_NAMES, render
-from dsr.report.pictures import normals_seen_by
+from dsr.viz.panels import normals_seen_by
 
 _SIGNATURE_AND_HEADER = 8 + 25
 """Bytes of a PNG before its second chunk."""

@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from matplotlib.ticker import MaxNLocator, ScalarFormatter
 
-from dsr.report.pictures import Window, colours, write_figure
+from dsr.viz.panels import Window, colours, write_figure
 
 DPI = 300
 FRAMES = ("#ff8c00", "#00a5e3")

@@ -17,7 +17,7 @@ from dsr.evaluation.store import StoredScene
 from dsr.geometry.shading import LIGHT_NAMES, lights, render
 from dsr.report.figures.layout import save_both
 from dsr.report.figures.scenes import rendering
-from dsr.report.pictures import colours
+from dsr.viz.panels import colours
 
 _SPHERE = 401
 """Pixels across."""

@@ -11,8 +11,8 @@ from torch import Tensor
 
 from dsr.report.figures.layout import Cell, Row
 from dsr.report.figures.scenes import Shown, details_of, rendering
-from dsr.report.pictures import limits_of
 from dsr.report.tables import METRICS
+from dsr.viz.panels import limits_of
 
 _COARSE_ERROR = 0.02
 """Metres of a row's limit from which on errors are told in centimetres."""

@@ -12,7 +12,7 @@ from dsr.evaluation.results import Problem, Results, Run
 from dsr.evaluation.store import StoredScene
 from dsr.geometry.camera import Camera
 from dsr.geometry.shading import LIGHT_NAMES, lights, shade
-from dsr.report.pictures import Window, normals_seen_by, strongest_window
+from dsr.viz.panels import Window, normals_seen_by, strongest_window
 
 _DETAIL = 5
 """A detail's side is this part of the picture's shorter one."""

@@ -21,8 +21,8 @@ from dsr.geometry.shading import LIGHT_NAMES, lights
 from dsr.report.page.content import links, metrics_data, problem_data, run_data
 from dsr.report.page.encoding import LEVELS, Level, Pool, megabytes
 from dsr.report.page.scenes import View, scene_data, views_of
-from dsr.report.pictures import HOLE_COLOUR
 from dsr.utils.files import write_text
+from dsr.viz.panels import HOLE_COLOUR
 
 Progress = Callable[[int, int], None]
 _COLOUR_MAPS = {"depth": "viridis", "error": "RdBu_r", "angle": "magma"}

@@ -14,7 +14,7 @@ from dsr.evaluation.store import StoredScene
 from dsr.geometry.camera import Camera
 from dsr.geometry.shading import lights, shade
 from dsr.report.page.encoding import Pool, depth_picture, error_picture, mask_picture, shading_picture
-from dsr.report.pictures import limits_of, normals_seen_by
+from dsr.viz.panels import limits_of, normals_seen_by
 
 _LEAST_ERROR = 1e-4
 """Metres; the colours of smaller errors do not go over the whole bar."""

@@ -20,8 +20,8 @@ from torch import Tensor
 
 from dsr.geometry.camera import Camera
 from dsr.geometry.shading import LIGHT_NAMES, render
-from dsr.report.pictures import HOLE_COLOUR, colours, limits_of, normals_seen_by, reduced, write_figure
 from dsr.sample import Scene
+from dsr.viz.panels import HOLE_COLOUR, colours, limits_of, normals_seen_by, reduced, write_figure
 
 _ROWS = 6
 _DPI = 100

@@ -18,8 +18,8 @@ from torch.nn import functional
 
 from dsr.geometry.camera import Camera
 from dsr.geometry.shading import lights
-from dsr.report.pictures import colours, limits_of, reduced, strongest_window, write_figure
 from dsr.rgbd.exports import normal_strips
+from dsr.viz.panels import colours, limits_of, reduced, strongest_window, write_figure
 
 _DPI = 200
 _PANEL, _TALLEST, _NARROWEST = 3.78, 4.6, 2.2

@@ -1,0 +1,1 @@
+"""Plotting that several parts share: colour maps, panels, contact sheets, comparisons."""
