@@ -13,7 +13,7 @@ from PIL import Image
 
 from dsr.cli import main
 from dsr.geometry.camera import Camera
-from dsr.rgbd.depth_files import read_depth_file, write_depth_file
+from dsr.io.depth_files import read_depth_file, write_depth_file
 from dsr.synthetic.simgeo.scenes import render_scene
 
 PARTS = {
@@ -164,7 +164,7 @@ def test_the_same_command_again_does_nothing_and_another_part_needs_no_new_depth
     assert of(pair, out, *DEPTH_ONLY) == 0
     assert "photo: complete already" in capsys.readouterr().out
     assert times == {name: (out / name).stat().st_mtime_ns for name in files_in(out)}
-    monkeypatch.setattr("dsr.rgbd.command.upsample_depth", None)
+    monkeypatch.setattr("dsr.app.upsample.run.upsample_depth", None)
     assert of(pair, out, *BICUBIC, "--only", "normals") == 0
     assert (
         files_in(out)
@@ -196,7 +196,7 @@ def test_an_interrupted_run_goes_on(pair, tmp_path, capsys, monkeypatch):
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr("dsr.rgbd.outputs.write_normals", interrupt)
+        patch.setattr("dsr.app.upsample.outputs.write_normals", interrupt)
         assert of(pair, out, *BICUBIC, "--only", "depth,normals") == 130
     assert "run the same command again to go on" in capsys.readouterr().err
     assert info(out)["complete"] is False

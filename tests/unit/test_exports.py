@@ -12,9 +12,9 @@ from dsr.geometry.camera import Camera
 from dsr.geometry.mesh import triangulate
 from dsr.geometry.shading import render
 from dsr.geometry.surface import normals_of
-from dsr.rgbd import exports
-from dsr.rgbd.exports import write_cloud, write_mesh, write_normals, write_renderings
-from dsr.rgbd.modelfiles import write_glb
+from dsr.io import exports
+from dsr.io.exports import write_cloud, write_mesh, write_normals, write_renderings
+from dsr.io.model_files import write_glb
 from dsr.viz import before_after
 from dsr.viz.before_after import write_before_after
 

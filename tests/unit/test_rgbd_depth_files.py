@@ -8,7 +8,7 @@ import OpenEXR
 import pytest
 from PIL import Image
 
-from dsr.rgbd.depth_files import can_hold, read_depth_file, write_depth_file
+from dsr.io.depth_files import can_hold, read_depth_file, write_depth_file
 
 FLOATS = np.array([[0.5, 1.25, np.nan], [3.0, 60000.0, np.inf]])
 """Not symmetric under any flip, exact in half precision but for the largest."""

@@ -4,9 +4,9 @@ import cv2
 import numpy as np
 import pytest
 
-from dsr.rgbd.layouts import pairs_of_folder
-from dsr.rgbd.names import key_of, role_of, time_of, words_of
-from dsr.rgbd.pairs import pairs_of_lists
+from dsr.io.layouts import pairs_of_folder
+from dsr.io.names import key_of, role_of, time_of, words_of
+from dsr.io.pairs import pairs_of_lists
 
 
 def touch(folder, *names):

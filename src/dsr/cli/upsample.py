@@ -100,11 +100,11 @@ def _words(text: str) -> tuple[str, ...]:
 
 def _run(options: argparse.Namespace, console: Console, _: object) -> list[str]:
     """Upsample, and return what went wrong."""
-    from dsr.rgbd.cameras import CameraChoice  # noqa: PLC0415 - they take seconds to import
-    from dsr.rgbd.command import Wanted, run  # noqa: PLC0415
-    from dsr.rgbd.encoding import parse_unit  # noqa: PLC0415
-    from dsr.rgbd.inputs import Reading  # noqa: PLC0415
-    from dsr.rgbd.outputs import PARTS  # noqa: PLC0415
+    from dsr.app.upsample.outputs import PARTS  # noqa: PLC0415
+    from dsr.app.upsample.run import Wanted, run  # noqa: PLC0415
+    from dsr.io.cameras import CameraChoice  # noqa: PLC0415 - they take seconds to import
+    from dsr.io.encoding import parse_unit  # noqa: PLC0415
+    from dsr.io.inputs import Reading  # noqa: PLC0415
 
     intrinsics = None if options.intrinsics is None else tuple(options.intrinsics)
     unit = None if options.depth_unit is None else parse_unit(options.depth_unit)

@@ -18,7 +18,7 @@ from torch.nn import functional
 
 from dsr.geometry.camera import Camera
 from dsr.geometry.shading import lights
-from dsr.rgbd.exports import normal_strips
+from dsr.io.exports import normal_strips
 from dsr.viz.panels import colours, limits_of, reduced, strongest_window, write_figure
 
 _DPI = 200

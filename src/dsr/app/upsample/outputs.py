@@ -18,10 +18,10 @@ from torch import Tensor
 
 from dsr.geometry.camera import Camera
 from dsr.geometry.shading import LIGHT_NAMES
-from dsr.rgbd.depth_files import DEPTH_SUFFIXES, write_depth_file
-from dsr.rgbd.encoding import Encoding, Fact, encode
-from dsr.rgbd.exports import write_cloud, write_mesh, write_normals, write_renderings
-from dsr.rgbd.inputs import Picture
+from dsr.io.depth_files import DEPTH_SUFFIXES, write_depth_file
+from dsr.io.encoding import Encoding, Fact, encode
+from dsr.io.exports import write_cloud, write_mesh, write_normals, write_renderings
+from dsr.io.inputs import Picture
 from dsr.utils.files import replacing, write_text
 from dsr.viz.before_after import write_before_after
 

@@ -11,12 +11,12 @@ from torch import Tensor
 
 from dsr.data.formats.files import CameraFile, read_mask
 from dsr.geometry.camera import Camera, RangeType
-from dsr.rgbd.cameras import CameraChoice, camera_of
-from dsr.rgbd.depth_files import read_depth_file
-from dsr.rgbd.encoding import Encoding, Fact, decode, find_holes, guess_unit
-from dsr.rgbd.names import words_of
-from dsr.rgbd.pairs import Pair
-from dsr.rgbd.photos import Size, read_photo, same_aspect
+from dsr.io.cameras import CameraChoice, camera_of
+from dsr.io.depth_files import read_depth_file
+from dsr.io.encoding import Encoding, Fact, decode, find_holes, guess_unit
+from dsr.io.names import words_of
+from dsr.io.pairs import Pair
+from dsr.io.photos import Size, read_photo, same_aspect
 
 _DISPARITY_WORDS = frozenset({"disparity", "disp"})
 

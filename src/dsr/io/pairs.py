@@ -6,9 +6,9 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from dsr.rgbd.depth_files import DEPTH_SUFFIXES
-from dsr.rgbd.encoding import Fact
-from dsr.rgbd.names import PHOTO_SUFFIXES, match_names
+from dsr.io.depth_files import DEPTH_SUFFIXES
+from dsr.io.encoding import Fact
+from dsr.io.names import PHOTO_SUFFIXES, match_names
 
 CAMERA_NAMES = (
     "camera.json", "intrinsics.json", "intrinsic.json", "camera_intrinsic.json",
@@ -113,7 +113,7 @@ def camera_beside(folder: Path, root: Path) -> Path | None:
 
 
 def matched(photos: Iterable[Path], depths: Iterable[Path]) -> Found:
-    """Return the pairs among photos and depth maps by name; see :func:`dsr.rgbd.names.match_names`."""
+    """Return the pairs among photos and depth maps by name; see :func:`dsr.io.names.match_names`."""
     photos, depths = list(photos), list(depths)
     matches = match_names(photos, depths)
     used = {path for match in matches for path in match}

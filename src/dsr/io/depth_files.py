@@ -1,6 +1,6 @@
 """Depth maps in the files that people have, read and written value by value: PNG, TIFF, NPY, NPZ, PFM and OpenEXR.
 
-Units and holes are the business of :mod:`dsr.rgbd.encoding`; here a value is what the file holds.
+Units and holes are the business of :mod:`dsr.io.encoding`; here a value is what the file holds.
 """
 
 from __future__ import annotations

@@ -14,7 +14,7 @@ from dsr.geometry.camera import Camera
 from dsr.geometry.mesh import LARGEST_STEP, MOST_VERTICES, Mesh, triangulate, vertex_normals
 from dsr.geometry.shading import LIGHT_NAMES, render
 from dsr.geometry.surface import normals_of
-from dsr.rgbd.modelfiles import write_glb, write_ply
+from dsr.io.model_files import write_glb, write_ply
 from dsr.utils.files import replacing
 
 _STRIP = 1 << 20

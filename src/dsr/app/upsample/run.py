@@ -14,11 +14,7 @@ from rich.console import Console
 from rich.progress import Progress
 from torch import Tensor
 
-from dsr.inference import AUTO, NOISY, Plan, enlarged_by, plan, suited_method, upsample_depth
-from dsr.rgbd.encoding import Fact
-from dsr.rgbd.inputs import Picture, UnitMemory, read_picture
-from dsr.rgbd.layouts import pairs_of_folder
-from dsr.rgbd.outputs import (
+from dsr.app.upsample.outputs import (
     Earlier,
     begin,
     described,
@@ -30,9 +26,13 @@ from dsr.rgbd.outputs import (
     versions,
     write_parts,
 )
-from dsr.rgbd.pairs import Found, Pair, pairs_of_lists
-from dsr.rgbd.telling import Reporter, listed, problem_line, steps
-from dsr.rgbd.wanted import Wanted, files_of, inputs_of, settings_of
+from dsr.app.upsample.reporting import Reporter, listed, problem_line, steps
+from dsr.app.upsample.request import Wanted, files_of, inputs_of, settings_of
+from dsr.inference import AUTO, NOISY, Plan, enlarged_by, plan, suited_method, upsample_depth
+from dsr.io.encoding import Fact
+from dsr.io.inputs import Picture, UnitMemory, read_picture
+from dsr.io.layouts import pairs_of_folder
+from dsr.io.pairs import Found, Pair, pairs_of_lists
 from dsr.utils.console import bar, show
 
 

@@ -6,10 +6,10 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
+from dsr.app.upsample.outputs import FORMATS, PARTS
 from dsr.inference import AUTO, METHODS
-from dsr.rgbd.inputs import Reading
-from dsr.rgbd.outputs import FORMATS, PARTS
-from dsr.rgbd.pairs import Pair
+from dsr.io.inputs import Reading
+from dsr.io.pairs import Pair
 from dsr.utils.hashing import file_hash
 
 
@@ -24,7 +24,7 @@ class Wanted:
         reading: how the files are to be read.
         method, scale, device, keep_holes: see :func:`dsr.inference.upsample_depth`.
         depth_format: of the result; None for the input's.
-        parts: what to write, some of :data:`dsr.rgbd.outputs.PARTS`.
+        parts: what to write, some of :data:`dsr.app.upsample.outputs.PARTS`.
         overwrite: whether to redo what is there.
         dry_run: whether only to say what would be done.
 

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from dsr.data.formats.files import read_pixels
-from dsr.rgbd.encoding import Fact
+from dsr.io.encoding import Fact
 
 _ORIENTATION, _EXIF_IFD, _EXIF_FOCAL_35 = 0x0112, 0x8769, 0xA405
 _ASPECT_TOLERANCE = 0.02

@@ -13,8 +13,8 @@ import numpy as np
 
 from dsr.data.formats.files import CameraFile, read_camera
 from dsr.geometry.camera import Camera
-from dsr.rgbd.encoding import Fact
-from dsr.rgbd.photos import Size, focal_in_exif, same_aspect
+from dsr.io.encoding import Fact
+from dsr.io.photos import Size, focal_in_exif, same_aspect
 
 _ASSUMED_FOV = 60.0
 """Degrees, horizontally: about a phone's main camera in 4:3, and a depth camera's colour sensor."""

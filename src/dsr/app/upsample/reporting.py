@@ -10,7 +10,7 @@ import torch
 from rich.console import Console
 from rich.progress import Progress
 
-from dsr.rgbd.encoding import Fact
+from dsr.io.encoding import Fact
 from dsr.utils.console import one_line, show
 
 _SHOWN = 5

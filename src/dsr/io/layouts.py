@@ -10,10 +10,10 @@ import cv2
 import numpy as np
 
 from dsr.data.formats.files import read_pixels
-from dsr.rgbd.depth_files import DEPTH_SUFFIXES
-from dsr.rgbd.encoding import Fact
-from dsr.rgbd.names import match_times, role_of, role_of_words, words_of
-from dsr.rgbd.pairs import Found, Pair, camera_beside, matched, named_apart, pairs_of_two_folders, pictures_in
+from dsr.io.depth_files import DEPTH_SUFFIXES
+from dsr.io.encoding import Fact
+from dsr.io.names import match_times, role_of, role_of_words, words_of
+from dsr.io.pairs import Found, Pair, camera_beside, matched, named_apart, pairs_of_two_folders, pictures_in
 
 _COARSE = re.compile(r"(depth|disparity)_lr(\d+)")
 _TUM_UNIT = 1 / 5000

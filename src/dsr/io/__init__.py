@@ -1,0 +1,1 @@
+"""People's files: photos, depth maps, cameras, meshes, and how they belong together."""

@@ -1,1 +1,0 @@
-"""``dsr upsample``: finer depth for people's own pairs of photo and depth map."""
