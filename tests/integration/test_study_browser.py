@@ -11,8 +11,8 @@ import pytest
 
 from dsr.cli import study as command
 from dsr.evaluation.results import load_results
-from dsr.study.build import Choice, build_study
-from dsr.study.key import read_key
+from dsr.user_study.build import Choice, build_study
+from dsr.user_study.key import read_key
 from dsr.utils.console import open_console
 
 LABELS = {"msg_v": "MSG-V", "bicubic": "Bicubic", "dip": "DIP"}

@@ -20,13 +20,13 @@ from scipy.stats import binomtest
 from dsr.cli import study as command
 from dsr.evaluation.results import load_results
 from dsr.geometry.camera import Camera
-from dsr.study.answers import files_of, read_all, read_answers
-from dsr.study.build import Choice, build_study
-from dsr.study.collect import ALL, AVERAGE, COLUMNS, collect, remarks
-from dsr.study.display import tables_of
-from dsr.study.intervals import agreement, average_share, bootstrap_of_average, wilson
-from dsr.study.key import Candidate, Key, Trial, read_key, write_key
-from dsr.study.pictures import grey_png, shading_of
+from dsr.user_study.answers import files_of, read_all, read_answers
+from dsr.user_study.build import Choice, build_study
+from dsr.user_study.collect import ALL, AVERAGE, COLUMNS, collect, remarks
+from dsr.user_study.intervals import agreement, average_share, bootstrap_of_average, wilson
+from dsr.user_study.key import Candidate, Key, Trial, read_key, write_key
+from dsr.user_study.pictures import grey_png, shading_of
+from dsr.user_study.summary import tables_of
 from dsr.utils.console import open_console
 
 CANDIDATES = {

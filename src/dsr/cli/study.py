@@ -14,7 +14,7 @@ from dsr.utils.console import show
 if TYPE_CHECKING:
     import pandas as pd
 
-    from dsr.study.build import Question
+    from dsr.user_study.build import Question
 
 _EXAMPLES = """\
 examples:
@@ -71,7 +71,7 @@ def add(commands: Any) -> None:
 def _build(options: argparse.Namespace, console: Console, _: object) -> list[str]:
     """Make the page and its key."""
     from dsr.evaluation.results import load_results  # noqa: PLC0415 - torch and pandas take seconds to import
-    from dsr.study.build import Choice, build_study  # noqa: PLC0415
+    from dsr.user_study.build import Choice, build_study  # noqa: PLC0415
 
     words = {name: text for name, text in (("title", options.title), ("send_to", options.send_to)) if text is not None}
     choice = Choice(
@@ -110,9 +110,9 @@ def _watched(questions: Sequence[Question], console: Console) -> Iterator[Questi
 
 def _collect(options: argparse.Namespace, console: Console, _: object) -> list[str]:
     """Read answers, print and write the table."""
-    from dsr.study.answers import files_of, read_all  # noqa: PLC0415
-    from dsr.study.collect import collect, remarks  # noqa: PLC0415
-    from dsr.study.key import KEY_NAME, read_key  # noqa: PLC0415
+    from dsr.user_study.answers import files_of, read_all  # noqa: PLC0415
+    from dsr.user_study.collect import collect, remarks  # noqa: PLC0415
+    from dsr.user_study.key import KEY_NAME, read_key  # noqa: PLC0415
     from dsr.utils.files import write_text  # noqa: PLC0415 - pandas takes a second to import
 
     key = read_key(options.study / KEY_NAME)
@@ -135,7 +135,7 @@ def _collect(options: argparse.Namespace, console: Console, _: object) -> list[s
 
 def _print(console: Console, table: pd.DataFrame) -> None:
     """Print one table for each data set, scale and degradation."""
-    from dsr.study.display import tables_of  # noqa: PLC0415
+    from dsr.user_study.summary import tables_of  # noqa: PLC0415
 
     for each in tables_of(table):
         console.print(each)

@@ -9,7 +9,7 @@ from rich import box
 from rich.markup import escape
 from rich.table import Table
 
-from dsr.study.collect import ALL, AVERAGE, SHARES
+from dsr.user_study.collect import ALL, AVERAGE, SHARES
 
 _HEADINGS = ("User 1st", "User 2nd", "Top 2")
 
@@ -18,7 +18,7 @@ def tables_of(collected: pd.DataFrame) -> Iterator[Table]:
     """Yield a table for each data set, scale and degradation, and one over all data sets where there are several.
 
     Args:
-        collected: see :func:`dsr.study.collect.collect`.
+        collected: see :func:`dsr.user_study.collect.collect`.
 
     """
     for place, rows in collected.groupby(["dataset", "scale", "downsampling"], sort=False):

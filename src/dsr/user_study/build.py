@@ -13,9 +13,9 @@ from typing import Any
 from torch import Tensor
 
 from dsr.evaluation.results import Problem, Results, Run, one_per_method
-from dsr.study.key import KEY_NAME, PAGE_VERSION, Candidate, Key, Trial, read_key, write_key
-from dsr.study.page import page_of
-from dsr.study.pictures import grey_png, shading_of
+from dsr.user_study.key import KEY_NAME, PAGE_VERSION, Candidate, Key, Trial, read_key, write_key
+from dsr.user_study.page import page_of
+from dsr.user_study.pictures import grey_png, shading_of
 from dsr.utils.files import write_text
 
 PAGE_NAME = "index.html"

@@ -11,7 +11,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-from dsr.study.key import PAGE_VERSION, Key
+from dsr.user_study.key import PAGE_VERSION, Key
 
 _LARGEST = 10_000_000
 """Bytes; a file of answers has some thousands."""

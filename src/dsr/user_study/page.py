@@ -42,7 +42,7 @@ def page_of(content: Mapping[str, Any], *, title: str, send_to: str) -> str:
 
 def _asset(name: str) -> str:
     """Return a part of the page as it lies in the package."""
-    return resources.files("dsr.study").joinpath("assets", name).read_text(encoding="utf-8")
+    return resources.files("dsr.user_study").joinpath("assets", name).read_text(encoding="utf-8")
 
 
 def _digest(text: str) -> str:

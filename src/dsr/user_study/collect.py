@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from dsr.study.answers import Answer, Answers
-from dsr.study.intervals import agreement, average_share, bootstrap_of_average, wilson
-from dsr.study.key import Candidate, Key, Trial
+from dsr.user_study.answers import Answer, Answers
+from dsr.user_study.intervals import agreement, average_share, bootstrap_of_average, wilson
+from dsr.user_study.key import Candidate, Key, Trial
 
 SHARES = ("user_first", "user_second", "user_top2")
 PLACE = ("dataset", "scene", "scale", "downsampling", "method", "label")
