@@ -23,7 +23,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from dsr.app.build import fast_precision
+from dsr.app.builder import fast_precision
 from dsr.data.folder import Folder
 from dsr.degradation.downsampling import Downsampling, make_sample
 from dsr.degradation.noise import GaussianMultiplicative

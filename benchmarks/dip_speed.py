@@ -22,7 +22,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from dsr.app.build import fast_precision
+from dsr.app.builder import fast_precision
 from dsr.data.simgeo import SimGeo
 from dsr.degradation.downsampling import Downsampling, make_sample
 from dsr.methods.dip import skip_net

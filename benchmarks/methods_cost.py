@@ -19,7 +19,7 @@ from pathlib import Path
 import torch
 from hydra import compose, initialize_config_dir
 
-from dsr.app.build import build
+from dsr.app.builder import build
 from dsr.app.schema import plain_config, register
 from dsr.data.folder import Folder
 from dsr.degradation.downsampling import Downsampling, make_sample

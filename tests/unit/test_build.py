@@ -9,7 +9,7 @@ from typing import Literal
 import pytest
 import torch
 
-from dsr.app.build import build, pick_device, takes
+from dsr.app.builder import build, pick_device, takes
 from dsr.app.schema import ConfigError, EvalConfig
 
 Order = Literal["near", "far"]

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from dsr.app.build import build, trait
+from dsr.app.builder import build, trait
 from dsr.app.schema import ConfigError
 from dsr.data.folder import Folder
 from dsr.data.formats.sintel import SEQUENCES

@@ -13,7 +13,7 @@ import torch
 from omegaconf import OmegaConf
 from torch import Tensor
 
-from dsr.app.build import build
+from dsr.app.builder import build
 from dsr.degradation.downsampling import Downsampling, Measured, make_sample, scene_generator
 from dsr.degradation.noise import GaussianMultiplicative, Kinect, Noise, TimeOfFlight
 from dsr.geometry.camera import RANGE_TYPES, Camera, RangeType, from_range, to_range

@@ -9,8 +9,8 @@ from module_graph import IMPORTS, SOURCE, closure_of, modules_in, path_below_pac
 from omegaconf import OmegaConf
 
 import dsr
-from dsr.app import rundir
-from dsr.app.rundir import PREDICTING_CODE, claim, code_hash, default_directory, identity_of, versions
+from dsr.app import run_directory as rundir
+from dsr.app.run_directory import PREDICTING_CODE, claim, code_hash, default_directory, identity_of, versions
 from dsr.app.schema import ConfigError
 from dsr.utils.hashing import file_hash, hash_of_code
 

@@ -17,12 +17,12 @@ import torchmetrics
 from omegaconf import DictConfig
 from rich.console import Console
 
-from dsr.app import rundir
-from dsr.app.build import build, fast_precision, pick_device, takes, trait
+from dsr.app import run_directory as rundir
+from dsr.app.builder import build, fast_precision, pick_device, takes, trait
 from dsr.app.perceptual import perceptual_network
 from dsr.app.progress import Display, prepare
-from dsr.app.runs import studies_of_run
 from dsr.app.schema import ConfigError, EvalConfig, given_keys, plain_config
+from dsr.app.training_runs import studies_of_run
 from dsr.data.base import SceneSource
 from dsr.evaluation.predict import Outcome, StalePredictionError, Study, predict, score
 from dsr.methods.dip.upsampler import WORKSPACE

@@ -11,7 +11,7 @@ from omegaconf.errors import OmegaConfBaseException
 from rich.console import Console
 
 import dsr
-from dsr.app.build import build
+from dsr.app.builder import build
 from dsr.app.entry import explain
 from dsr.app.progress import Display, prepare
 from dsr.app.schema import ConfigError, plain_config, register

@@ -73,8 +73,8 @@ def _refuse_unknown(plain: Any, names: Collection[str], place: str = "") -> None
 class RunConfig(Checked):
     """What all commands have.
 
-    The groups (dataset, downsampling, noise, method, model) are made by :func:`dsr.app.build.build`, which checks their
-    keys against what the class or function that they name takes.
+    The groups (dataset, downsampling, noise, method, model) are made by :func:`dsr.app.builder.build`, which checks
+    their keys against what the class or function that they name takes.
     """
 
     dataset: dict[str, Any] = MISSING

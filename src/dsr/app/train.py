@@ -14,13 +14,13 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 
-from dsr.app import rundir
-from dsr.app.build import build, fast_precision, pick_device
+from dsr.app import run_directory as rundir
+from dsr.app.builder import build, fast_precision, pick_device
 from dsr.app.perceptual import perceptual_network
 from dsr.app.progress import Display, prepare
-from dsr.app.runs import WEIGHTS, common, read_config, training_data
 from dsr.app.schema import ConfigError, TrainConfig, given_keys, plain_config
 from dsr.app.trainer import make_trainer, seconds_per_step
+from dsr.app.training_runs import WEIGHTS, common, read_config, training_data
 from dsr.methods.networks.base import DisparityNetwork
 from dsr.methods.networks.trained import NETWORKS
 from dsr.methods.networks.weight_files import load_network, save_network

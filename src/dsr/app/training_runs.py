@@ -9,7 +9,7 @@ from typing import Any
 
 from omegaconf import OmegaConf
 
-from dsr.app.build import build
+from dsr.app.builder import build
 from dsr.app.schema import ConfigError, TrainConfig, TrainerConfig
 from dsr.data.base import SceneSource, Some
 from dsr.degradation.downsampling import Downsampling
