@@ -68,7 +68,7 @@ def jobs(scenes: Path, folder: Path) -> Iterator[tuple[str, list[str]]]:
             yield name, [*python, *plant, *more]
     for kind in ("noise=kinect", "noise=tof", "noise=gaussian_multiplicative", "holes=blobs", "holes=shadows"):
         for method in ("facets", "tgv", "bicubic"):
-            name = f"{method} {kind}"
+            name = f"{method} {kind.replace('=', ' ')}"
             yield name, [*python, *plant, kind, f"method={method}", f"output_dir={folder / name}"]
     for kind in ("nearest", "bilinear", "bicubic", "gaussian"):
         yield (

@@ -116,7 +116,7 @@ def test_a_module_that_a_method_imports_and_the_list_lacks_is_found():
         **IMPORTS,
         "dsr.methods.networks.facets": IMPORTS["dsr.methods.networks.facets"] | {"dsr.viz.palette"},
     }
-    assert lacking(closure_of(["dsr.methods.networks.facets"], imports)) == ["report/palette.py"]
+    assert lacking(closure_of(["dsr.methods.networks.facets"], imports)) == ["viz/palette.py"]
     without = [name for name in PREDICTING_CODE if name != "utils/lightning.py"]
     assert lacking(closure_of(["dsr.methods.dip.upsampler"]), without) == ["utils/lightning.py"]
 

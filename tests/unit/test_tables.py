@@ -7,7 +7,8 @@ import pandas as pd
 import pytest
 from rich.console import Console
 
-from dsr.report.tables import METRICS, RECREATED, in_paper_units, published, published_row, score_table
+from dsr.metrics.catalogue import METRICS
+from dsr.report.tables import RECREATED, in_paper_units, published, published_row, score_table
 
 RAW = {
     "RMSE_d": 0.0704,

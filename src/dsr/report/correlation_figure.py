@@ -20,8 +20,8 @@ from matplotlib.lines import Line2D
 from scipy.stats import gaussian_kde
 
 from dsr.evaluation.results import Results
+from dsr.metrics.catalogue import METRICS
 from dsr.report.correlations import DEPTH_LIMIT, REFERENCE, correlate, metric_matrix, pairs, with_reference
-from dsr.report.tables import METRICS
 from dsr.viz.palette import method_colours
 from dsr.viz.panels import write_figure
 

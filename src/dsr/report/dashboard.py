@@ -21,7 +21,7 @@ from torch.utils.tensorboard.summary import hparams
 from dsr.evaluation.results import Run, method_settings, read_run
 from dsr.evaluation.store import StoredScene
 from dsr.geometry.shading import LIGHT_NAMES, render
-from dsr.report.tables import METRICS
+from dsr.metrics.catalogue import METRICS
 from dsr.viz.panels import colours, normals_seen_by, reduced
 
 WORST = "worst of four lights"

@@ -18,9 +18,10 @@ from dataclasses import dataclass, replace
 import pandas as pd
 
 from dsr.evaluation.results import Results, Run
+from dsr.metrics.catalogue import METRICS
 from dsr.report.scene_sets import PAPER_SCENES, TITLES, Place, SceneSet, sets_of_dataset, sets_of_summary
 from dsr.report.table_parts import Cell, Column, Group, PaperTable, Row
-from dsr.report.tables import METRICS, paper_row, published
+from dsr.report.tables import paper_row, published
 from dsr.report.user_study import USER_COLUMNS, check_study, user_cells
 
 PAPER_METHODS = {"bicubic": "Bicubic", "dip": "DIP", "dip_v": "DIP-V", "msg": "MSG", "msg_v": "MSG-V"}

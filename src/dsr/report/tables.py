@@ -10,16 +10,8 @@ from rich import box
 from rich.markup import escape
 from rich.table import Table
 
-METRICS: dict[str, tuple[str, str, float, int]] = {
-    "RMSE_d": ("RMSE_d", "mm", 1e3, 1),
-    "BadPix_d_5cm": ("BadPix_d", "5 cm, %", 1e2, 2),
-    "BadPix_v_5": ("BadPix_v", "5, %", 1e2, 1),
-    "DSSIM_v": ("DSSIM_v", "1/1000", 1e3, 0),
-    "LPIPS_v": ("LPIPS_v", "1/1000", 1e3, 0),
-    "Bumpiness_d": ("Bump_d", "", 1.0, 2),
-    "RMSE_v": ("RMSE_v", "1/1000", 1e3, 0),
-}
-"""The columns of the paper's tables: heading, unit, factor from raw units, digits after the point."""
+from dsr.metrics.catalogue import METRICS
+
 RECREATED = {
     "cube_high_freq": "Cube, high-frequency texture",
     "cube_no_texture": "Cube, no texture",

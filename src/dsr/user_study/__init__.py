@@ -1,1 +1,1 @@
-"""TODO."""
+"""The perceptual study: a page that people answer, and the percentages of their answers."""

@@ -21,7 +21,7 @@ from torch.nn import functional
 from dsr.geometry.camera import Camera
 from dsr.geometry.shading import LIGHT_NAMES, render
 from dsr.geometry.surface import normals_of
-from dsr.report.tables import METRICS
+from dsr.metrics.catalogue import METRICS
 from dsr.sample import DepthSample
 from dsr.utils.files import replacing
 

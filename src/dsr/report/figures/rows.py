@@ -9,9 +9,9 @@ import numpy as np
 from matplotlib.colors import Colormap, ListedColormap
 from torch import Tensor
 
+from dsr.metrics.catalogue import METRICS
 from dsr.report.figures.layout import Cell, Row
 from dsr.report.figures.scenes import Shown, details_of, rendering
-from dsr.report.tables import METRICS
 from dsr.viz.panels import limits_of
 
 _COARSE_ERROR = 0.02

@@ -11,7 +11,8 @@ from urllib.parse import quote
 import pandas as pd
 
 from dsr.evaluation.results import Problem, Results, Run
-from dsr.report.tables import AVERAGES, METRICS, OTHER_FRAMES, RECREATED, in_paper_units, paper_row
+from dsr.metrics.catalogue import METRICS
+from dsr.report.tables import AVERAGES, OTHER_FRAMES, RECREATED, in_paper_units, paper_row
 
 _FOLDERS = {"tables": (".csv", ".md", ".tex"), "metrics": (".csv",), "figures": (".pdf",)}
 """Folders beside the page whose files it links to."""

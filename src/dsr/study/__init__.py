@@ -1,1 +1,0 @@
-"""The perceptual study: a page that people answer, and the percentages of their answers."""
