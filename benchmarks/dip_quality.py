@@ -43,7 +43,7 @@ DIP = {"data_loss": "mse", "data_weight": 10.0, "w": 0.0}
 ORIGINAL = {
     "widths": (128,) * 5, "padding": "reflect", "border": 0, "guide": False, "perturbation": 0.03, "w_intensity": 0.1,
 }  # fmt: skip
-"""The reference experiment, but for the losses, which count as shares of the coarse map's range."""
+"""The reference experiment, but for the losses, which count as shares of the low-resolution map's range."""
 NARROW = {"widths": (32, 64, 128, 128, 128), "padding": "zeros"}
 ABLATION: Mapping[str, Mapping[str, Any]] = {
     "dip: reference": {**ORIGINAL, **DIP},

@@ -2,8 +2,9 @@
 
     python benchmarks/inpainting.py --scenes DIR [--steps 400] [--scale 4] [--picture FILE] [--crop N]
 
-Two kinds of holes are cut into the coarse maps of Lucy and Plant: random blobs of 10 % of the pixels, and the shadows
-that a second camera 20 cm to the right would leave. Errors are those of the fine pixels under the holes alone.
+Two kinds of holes are cut into the low-resolution maps of Lucy and Plant: random blobs of 10 % of the pixels, and the
+shadows that a second camera 20 cm to the right would leave. Errors are those of the high-resolution pixels under the
+holes alone.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from dsr.data.folder import Folder
 from dsr.degradation.downsampling import Downsampling, make_sample
 from dsr.degradation.holes import Blobs, Holes, Shadows
 from dsr.geometry.shading import render
-from dsr.geometry.surface import normals_of
+from dsr.geometry.surface import depth_to_normals
 from dsr.methods.classical.interpolation import Interpolation
 from dsr.methods.dip.upsampler import DeepImagePrior
 from dsr.methods.networks.trained import build_trained, packaged_weights
@@ -82,7 +83,9 @@ def draw(rows: list[tuple[str, DepthSample, dict[str, Tensor]]], path: Path) -> 
         for axis, name in zip(line[2:], names, strict=True):
             depth = sample.depth if name == "truth" else found[name]
             if depth is not None:
-                axis.imshow(render(normals_of(depth.double()[None], rays))[0, 0].numpy(), cmap="gray", vmin=0, vmax=1)
+                axis.imshow(
+                    render(depth_to_normals(depth.double()[None], rays))[0, 0].numpy(), cmap="gray", vmin=0, vmax=1
+                )
             axis.set_title(name)
         for axis in line:
             axis.set_axis_off()

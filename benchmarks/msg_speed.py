@@ -28,7 +28,7 @@ TARGETS = {"float32": 3.0, "bfloat16": 8.0}
 
 
 def scene(size: int) -> tuple[Tensor, Tensor]:
-    """Return a photo (1, 3, size, size) and coarse disparity (1, 1, size / 4, size / 4): a disc before a wavy wall."""
+    """Return a photo (1, 3, size, size) and LR disparity (1, 1, size / 4, size / 4): a disc before a wavy wall."""
     axis = torch.linspace(-1, 1, size, dtype=torch.float64)
     y, x = axis[:, None], axis[None, :]
     disc = x**2 + y**2 < 0.4

@@ -21,7 +21,7 @@ from dsr.degradation.downsampling import Downsampling
 from dsr.methods.networks.msg_net import MSGNet
 from dsr.training.cropping import Patches, PatchSettings
 from dsr.training.objective import Objective
-from dsr.training.problem import Batch, Problem
+from dsr.training.problem import Batch, Degradation
 
 SCALE = 4
 
@@ -63,7 +63,7 @@ def main() -> None:
     source = SimGeo(size=256)
     scenes = [source.load(name) for name in source.scenes()]
     settings = PatchSettings(size=arguments.patch, batch=arguments.batch)
-    patches = Patches([scenes], settings, Problem(SCALE, Downsampling("box")), count=arguments.batch)
+    patches = Patches([scenes], settings, Degradation(SCALE, Downsampling("box")), count=arguments.batch)
     start = time.perf_counter()
     batch = torch.utils.data.default_collate([patches[i] for i in range(arguments.batch)])
     loading = time.perf_counter() - start

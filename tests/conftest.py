@@ -129,7 +129,7 @@ def write_run(
     scenes=("cube_no_texture",),
     size=32,
 ):
-    """Write a run whose method repeats coarse pixels with a little noise of its own; truths are waves, one a scene."""
+    """Write a run whose method repeats LR pixels with a little noise of its own; truths are waves, one a scene."""
     camera = Camera(size, size, 1.2 * size, 1.2 * size, (size - 1) / 2, (size - 1) / 2)
     kind = Downsampling("box")
     rows, seconds = [], {}

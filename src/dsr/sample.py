@@ -20,14 +20,14 @@ class AllHolesError(ValueError):
 
 @dataclass(frozen=True)
 class Scene:
-    """A photo and its fine depth, before any downsampling.
+    """A photo and its high-resolution depth, before any downsampling.
 
     Args:
         dataset, name: together they identify the scene.
         rgb: (3, H, W) floating point, in [0, 1].
         camera: the camera of both.
         depth: (1, H, W) true depth, or None where it is not known.
-        measured: coarse depth maps that a sensor measured, (1, H / factor, W / factor) by factor.
+        measured: low-resolution depth maps that a sensor measured, (1, H / factor, W / factor) by factor.
         notes: what somebody who reads the scores should know, such as "depth is not metric".
 
     Raises:
@@ -59,16 +59,16 @@ class Scene:
 
 @dataclass(frozen=True)
 class DepthSample:
-    """A photo, a coarse depth map, and the fine one where it is known.
+    """A photo, a low-resolution depth map, and the high-resolution one where it is known.
 
     Args:
         dataset, scene: names; together they identify the sample.
         rgb: (3, H, W) floating point, in [0, 1].
-        depth_lr: (1, h, w) coarse depth, H = h * scale and W = w * scale.
+        depth_lr: (1, h, w) low-resolution depth, H = h * scale and W = w * scale.
         camera: the camera of the photo and of ``depth``.
         camera_lr: the camera of ``depth_lr``.
         scale: the upsampling factor.
-        depth: (1, H, W) true fine depth, or None where it is not known.
+        depth: (1, H, W) true high-resolution depth, or None where it is not known.
         notes: what somebody who reads the scores should know, such as "cropped from 513 x 512".
 
     Raises:
@@ -103,7 +103,7 @@ class DepthSample:
 
     @property
     def mask_lr(self) -> Tensor:
-        """(1, h, w) bool: where the coarse depth is known."""
+        """(1, h, w) bool: where the low-resolution depth is known."""
         return self.depth_lr.isfinite()
 
     @property

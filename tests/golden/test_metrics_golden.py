@@ -45,7 +45,7 @@ def _scene(shared: Path, name: str) -> Scene:
 
 
 def _prediction(shared: Path, scene: Scene, method: str, scale: int) -> Tensor:
-    """Return the method's fine depth; MSG's published networks leave out the last row and column."""
+    """Return the method's high-resolution depth; MSG's published networks leave out the last row and column."""
     stem = METHODS[method]
     if stem is None:
         return Interpolation("bicubic")(make_sample(scene, scale, Downsampling("box"), Interpolation.range_type))

@@ -270,7 +270,7 @@ def test_where_every_scene_fails_nothing_is_said_of_others(tmp_path, within):
     code, _, errors = within("dataset=folder", "dataset.root=data", "downsampling=measured")
     assert code == 2
     assert errors == [
-        "error: a: downsampling=measured expects a coarse map at x4, the scene has none",
+        "error: a: downsampling=measured expects a low-resolution map at x4, the scene has none",
         "error: 1 of 1 scenes failed: a",
     ]
 

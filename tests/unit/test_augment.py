@@ -11,7 +11,7 @@ from torch import Tensor
 
 from dsr.geometry.camera import Camera
 from dsr.geometry.shading import lights, render
-from dsr.geometry.surface import normals_of
+from dsr.geometry.surface import depth_to_normals
 from dsr.sample import Scene
 from dsr.training.augmentation import Variation, mirrored, turned, window
 
@@ -29,7 +29,7 @@ def _scene() -> Scene:
 
 def _normals(scene: Scene) -> Tensor:
     assert scene.depth is not None
-    return normals_of(scene.depth[None], scene.camera.rays()[None])[0]
+    return depth_to_normals(scene.depth[None], scene.camera.rays()[None])[0]
 
 
 def _quarter(vectors: Tensor) -> Tensor:

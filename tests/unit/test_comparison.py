@@ -7,7 +7,7 @@ import torch
 from dsr.geometry.camera import Camera
 from dsr.geometry.comparison import comparison
 from dsr.geometry.shading import render
-from dsr.geometry.surface import normals_of
+from dsr.geometry.surface import depth_to_normals
 
 CAMERA = Camera(width=40, height=36, fx=50.0, fy=50.0, cx=19.5, cy=17.5)
 RAYS = CAMERA.rays()[None]
@@ -19,7 +19,7 @@ def test_a_comparison_shows_result_truth_and_difference_under_two_lights() -> No
     assert picture.shape == (72, 120)
     torch.testing.assert_close(picture[:, :40], picture[:, 40:80])
     assert float(picture[:, 80:].abs().max()) == 0
-    lit = render(normals_of(DEPTH, RAYS))[0]
+    lit = render(depth_to_normals(DEPTH, RAYS))[0]
     torch.testing.assert_close(picture[:36, 40:80], lit[0].float())
     torch.testing.assert_close(picture[36:, 40:80], lit[3].float())
     other = comparison(1.1 * DEPTH + 0.05 * torch.rand(1, 1, 36, 40), DEPTH, RAYS)[0]
@@ -32,5 +32,5 @@ def test_without_a_truth_the_result_stands_alone_and_holes_are_black() -> None:
     picture = comparison(depth, None, RAYS)[0]
     assert picture.shape == (72, 40)
     assert float(picture[5:8, 5:8].abs().max()) == 0
-    lit = render(normals_of(DEPTH, RAYS))[0, 3]
+    lit = render(depth_to_normals(DEPTH, RAYS))[0, 3]
     torch.testing.assert_close(picture[50:, 12:], lit[14:, 12:].float())

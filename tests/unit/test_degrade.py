@@ -41,7 +41,7 @@ def _scene(depth: Tensor | None, camera: Camera = CAMERA, measured: dict[int, Te
 
 
 def _profile(kernel: str, x: float, sigma: float = 0.5) -> float:
-    """Return the weight at a distance of x coarse pixels: textbook formulas, one number at a time."""
+    """Return the weight at a distance of x low-resolution pixels: textbook formulas, one number at a time."""
     x = abs(x)
     if kernel == "box":
         return float(x < 0.5)
@@ -322,11 +322,13 @@ def test_a_measured_map_is_taken_as_it_is() -> None:
 
 def test_a_scene_that_lacks_what_the_problem_needs_is_refused() -> None:
     measured = _scene(None, measured={4: _values(8, 12)})
-    with pytest.raises(ValueError, match="hall: expected a fine depth map to downsample, there is none"):
+    with pytest.raises(ValueError, match="hall: expected a high-resolution depth map to downsample, there is none"):
         make_sample(measured, 4, Downsampling("box"), "disparity")
-    with pytest.raises(ValueError, match=r"hall: downsampling=measured expects a coarse map at x8, the scene has x4"):
+    with pytest.raises(
+        ValueError, match=r"hall: downsampling=measured expects a low-resolution map at x8, the scene has x4"
+    ):
         make_sample(measured, 8, Measured(), "disparity")
-    with pytest.raises(ValueError, match=r"a coarse map at x4, the scene has none"):
+    with pytest.raises(ValueError, match=r"a low-resolution map at x4, the scene has none"):
         make_sample(_scene(_values(32, 48)), 4, Measured(), "disparity")
 
 

@@ -178,7 +178,7 @@ def test_a_measured_map_in_another_unit_than_the_fine_one_is_found(sound):
     coarse = sound.depth[:, 2::4, 2::4]
     assert wrong(replace(sound, measured={4: coarse})) == {}
     _, message, _ = only(replace(sound, measured={4: coarse * 4}), "units")
-    assert message == "the measured map at x4 is 4 times as far as the fine depth"
+    assert message == "the measured map at x4 is 4 times as far as the high-resolution depth"
 
 
 @pytest.mark.parametrize(
@@ -488,7 +488,7 @@ def test_rounding_below_the_noise_does_no_harm(sound):
     assert level_of(changed(sound, lambda z: np.round(z * noise, 3)), "precision") == "ok"
 
 
-# scenes of which only a measured coarse map is known
+# scenes of which only a measured low-resolution map is known
 
 
 def test_a_measured_map_is_examined_at_its_own_resolution(sound):

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from dsr.degradation.downsampling import Downsampling, make_sample
 from dsr.geometry.camera import Camera, from_range, to_range
-from dsr.methods.base import Iterative, NoAnswerError
+from dsr.methods.base import Iterative, NoSolutionError
 from dsr.methods.classical.eg.bilateral import filtered, reachable
 from dsr.methods.classical.eg.upsampler import EdgeGuided, prime_factors
 from dsr.methods.classical.interpolation import Interpolation
@@ -61,7 +61,7 @@ def test_a_plane_is_reproduced_exactly_at_any_size(scale: int, size: tuple[int, 
 @pytest.mark.parametrize("degrees", [0.0, 10.0, 30.0])
 @pytest.mark.parametrize("turned", [False, True])
 def test_a_straight_step_stays_straight_and_sharp(scale: int, degrees: float, turned: bool) -> None:
-    """Each row's edge is nearer than half a coarse pixel to the line; bicubic smears it over more pixels."""
+    """Each row's edge is nearer than half a low-resolution pixel to the line; bicubic smears it over more pixels."""
     truth, line = _step(96, degrees)
     sample = _sample(truth.T.contiguous() if turned else truth, scale)
     ours, bicubic = (_disparity(sample, method(sample)) for method in (EdgeGuided(), Interpolation("bicubic")))
@@ -155,7 +155,9 @@ def test_single_precision_in_gives_single_precision_out() -> None:
 
 def test_a_map_too_small_for_patches_has_no_answer() -> None:
     sample = _sample(_step(32, 0.0)[0])
-    with pytest.raises(NoAnswerError, match="edge-guided upsampling: the edges of a map of 8 x 8 pixels do not recur"):
+    with pytest.raises(
+        NoSolutionError, match="edge-guided upsampling: the edges of a map of 8 x 8 pixels do not recur"
+    ):
         EdgeGuided()(sample)
 
 

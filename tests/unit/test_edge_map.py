@@ -10,7 +10,7 @@ import torch
 from scipy import ndimage
 from torch import Tensor
 
-from dsr.methods.base import NoAnswerError
+from dsr.methods.base import NoSolutionError
 from dsr.methods.classical.eg.belief_propagation import energy, labelled
 from dsr.methods.classical.eg.edge_map import edge_map, edges, thinned
 from dsr.methods.classical.eg.patches import PATCH, Patches, averaged, distances, distinct, nearest, overlaps, turned
@@ -118,5 +118,5 @@ def test_a_plane_has_no_edge_however_steep_and_a_step_has_one_where_it_is() -> N
 
 def test_a_map_too_small_for_patches_has_no_answer_if_it_has_edges() -> None:
     step = torch.where(torch.arange(8) < 4, 0.0, 1.0).double().expand(8, 8)
-    with pytest.raises(NoAnswerError, match="the edges of a map of 8 x 8 pixels do not recur at 1/2 of its size"):
+    with pytest.raises(NoSolutionError, match="the edges of a map of 8 x 8 pixels do not recur at 1/2 of its size"):
         edge_map(step, 2, 0.1)

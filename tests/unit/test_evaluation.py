@@ -12,9 +12,17 @@ import torch
 
 from dsr.degradation.downsampling import Downsampling, Measured, make_sample
 from dsr.degradation.noise import GaussianMultiplicative
-from dsr.evaluation.predict import SCORE_COLUMNS, Outcome, StalePredictionError, Study, load_prediction, predict, score
+from dsr.evaluation.predict import (
+    SCORE_COLUMNS,
+    Evaluation,
+    Outcome,
+    StalePredictionError,
+    load_prediction,
+    predict,
+    score,
+)
 from dsr.geometry.camera import Camera
-from dsr.methods.base import NoAnswerError
+from dsr.methods.base import NoSolutionError
 from dsr.metrics.catalogue import catalogue, score_image
 from dsr.sample import Scene
 
@@ -47,7 +55,7 @@ class ToySource:
 
 
 class ToyMethod:
-    """Repeats coarse pixels, remembers its calls, and may do something else at a scene."""
+    """Repeats low-resolution pixels, remembers its calls, and may do something else at a scene."""
 
     range_type = "orthogonal"
 
@@ -73,7 +81,7 @@ def toy_study(source=None, method=None, config=None, downsampling=None):
     source = source or ToySource(a=toy_scene("a"), b=toy_scene("b", RAMP + 1))
     downsampling = downsampling or Downsampling("box")
     config = {"method": {"name": "toy"}, "scale": SCALE} if config is None else config
-    return Study(source, downsampling, "box", SCALE, method or ToyMethod(), "toy_method", 7, config)
+    return Evaluation(source, downsampling, "box", SCALE, method or ToyMethod(), "toy_method", 7, config)
 
 
 def plainly(items, description):
@@ -451,7 +459,7 @@ def test_how_an_iteration_went_is_shown_while_it_goes_and_kept(tmp_path):
 
 
 def test_a_scene_without_an_answer_is_a_result_and_no_failure(tmp_path):
-    method = ToyMethod(b=NoAnswerError("a map of 2 x 2 is smaller than a patch"))
+    method = ToyMethod(b=NoSolutionError("a map of 2 x 2 is smaller than a patch"))
     outcome, scores, _ = run(toy_study(method=method), tmp_path)
     reason = "b: a map of 2 x 2 is smaller than a patch"
     assert outcome.unanswered == {"b": reason}
@@ -463,6 +471,6 @@ def test_a_scene_without_an_answer_is_a_result_and_no_failure(tmp_path):
 
 def test_what_a_scene_had_before_is_not_scored_where_there_is_no_answer_now(tmp_path):
     run(toy_study(), tmp_path)
-    _, scores, _ = run(toy_study(method=ToyMethod(b=NoAnswerError("none"))), tmp_path, overwrite=True)
+    _, scores, _ = run(toy_study(method=ToyMethod(b=NoSolutionError("none"))), tmp_path, overwrite=True)
     assert set(scores["scene"]) == {"a"}
     assert not (tmp_path / "predictions" / "b.npz").exists()

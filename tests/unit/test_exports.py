@@ -11,7 +11,7 @@ import trimesh
 from dsr.geometry.camera import Camera
 from dsr.geometry.mesh import triangulate
 from dsr.geometry.shading import render
-from dsr.geometry.surface import normals_of
+from dsr.geometry.surface import depth_to_normals
 from dsr.io import exports
 from dsr.io.exports import write_cloud, write_mesh, write_normals, write_renderings
 from dsr.io.model_files import write_glb
@@ -50,7 +50,7 @@ def read(path):
 def test_renderings_are_the_protocol_s_in_eight_bits(tmp_path):
     paths = write_renderings(tmp_path / "new", bumpy(), CAMERA)
     assert [path.name for path in paths] == ["e1.png", "e2.png", "e3.png", "e4.png"]
-    expected = render(normals_of(bumpy().double()[None], CAMERA.rays()[None]))[0]
+    expected = render(depth_to_normals(bumpy().double()[None], CAMERA.rays()[None]))[0]
     for path, shades in zip(paths, expected, strict=True):
         assert read(path).shape == (18, 24)
         np.testing.assert_allclose(read(path), 255 * shades.numpy(), atol=0.51)

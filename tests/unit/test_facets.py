@@ -34,7 +34,7 @@ def test_a_plane_is_reproduced_exactly_whatever_weights_and_photo_are(scale: int
 
 
 def test_before_training_the_mixture_is_the_splines_blend_of_central_differences_planes() -> None:
-    """A plain loop over fine pixels, with every output of the network's three heads at 0."""
+    """A plain loop over high-resolution pixels, with every output of the network's three heads at 0."""
     net, coarse = _net(noise=0), maps(4, 5)
     for head in (net.planes, net.choice):
         torch.nn.init.zeros_(head.weight)

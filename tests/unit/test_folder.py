@@ -203,7 +203,9 @@ def test_mask_png_takes_pixels_out_where_it_is_0(scene):
 def test_a_measured_disparity_counts_in_its_own_pixels(scene):
     np.save(scene / "depth.npy", Z)
     coarse_z = np.array([[2.0, 4.0]])
-    np.save(scene / "disparity_lr4.npy", 0.5 * (F / 4) / coarse_z - 1.0 / 4)  # focal length and doffs in coarse pixels
+    np.save(
+        scene / "disparity_lr4.npy", 0.5 * (F / 4) / coarse_z - 1.0 / 4
+    )  # focal length and doffs in low-resolution pixels
     describe(scene, baseline=0.5, doffs=1.0)
     record = load_scene(scene, "folder")
     assert list(record.measured) == [4]
@@ -211,7 +213,7 @@ def test_a_measured_disparity_counts_in_its_own_pixels(scene):
 
 
 def test_measured_perspective_depth_is_divided_by_the_rays_of_the_coarse_camera(scene):
-    def length(u, v):  # coarse pixel (u, v) looks along the centre of its 2 x 2 block
+    def length(u, v):  # low-resolution pixel (u, v) looks along the centre of its 2 x 2 block
         return math.hypot((2 * u + 0.5 - CX) / F, (2 * v + 0.5 - CY) / F, 1.0)
 
     coarse = np.array([[3.0 * length(u, v) for u in range(W // 2)] for v in range(H // 2)])

@@ -36,7 +36,7 @@ def _sample(disparity: Tensor, kernel: Kernel = "box", scale: int = 4, photo: Te
 
 
 def _result(method: GuidedMethod, sample: DepthSample) -> Tensor:
-    """Return the fine disparity, (H, W)."""
+    """Return the high-resolution disparity, (H, W)."""
     fine = method(sample)
     assert fine.shape == (1, sample.camera.height, sample.camera.width)
     return to_range(fine, sample.camera, "disparity")[0]

@@ -1,4 +1,4 @@
-"""Holes of coarse maps."""
+"""Holes of low-resolution maps."""
 
 from __future__ import annotations
 

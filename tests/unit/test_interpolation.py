@@ -81,7 +81,7 @@ def test_a_sphere_around_the_camera_is_restored(order: Order, kernel: Kernel) ->
 def test_coarse_and_fine_pixels_are_matched_through_their_cameras(kernel: Kernel) -> None:
     perspective = _ramp()
     fine = _result(_sample(perspective, kernel), "bilinear")
-    inside = (slice(2, -2), slice(2, -2))  # between the outermost coarse pixel centres
+    inside = (slice(2, -2), slice(2, -2))  # between the outermost low-resolution pixel centres
     np.testing.assert_allclose(fine[inside], perspective.numpy()[inside], rtol=1e-12)
 
 
@@ -100,9 +100,9 @@ def test_a_nearest_downsampled_pixel_keeps_its_value(order: Order) -> None:
 
 def _with_holes() -> Tensor:
     perspective = _random()
-    perspective[4:12, 8:16] = torch.nan  # 2 x 2 coarse pixels
+    perspective[4:12, 8:16] = torch.nan  # 2 x 2 low-resolution pixels
     perspective[28:, :4] = torch.nan
-    perspective[20, 20] = torch.nan  # one fine pixel is no coarse hole
+    perspective[20, 20] = torch.nan  # one high-resolution pixel is no coarse hole
     return perspective
 
 

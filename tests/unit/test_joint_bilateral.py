@@ -28,7 +28,7 @@ def _disparity(sample: DepthSample, depth: Tensor) -> np.ndarray:
 
 
 def _by_loops(sample: DepthSample, radius: int, sigma_space: float, sigma_colour: float) -> np.ndarray:
-    """Sum over the neighbours of each fine pixel, coarse pixel (i, j) lying at its block's centre."""
+    """Sum over the neighbours of each HR pixel, LR pixel (i, j) lying at its block's centre."""
     coarse = to_range(sample.depth_lr, sample.camera_lr, "disparity")[0].numpy() * 4
     photo = sample.rgb.numpy()
     height, width = photo.shape[1:]
@@ -66,7 +66,7 @@ def test_it_is_the_mean_over_neighbours_weighed_by_distance_and_colour(
 
 
 def test_under_a_photo_of_one_colour_it_is_a_gaussian_mean() -> None:
-    """Of an impulse at the coarse pixel (4, 4), the answer at a fine pixel is that pixel's weight."""
+    """Of an impulse at the LR pixel (4, 4), the answer at a HR pixel is that pixel's weight."""
     disparity = torch.full((36, 36), 5.0).double()
     disparity[16:20, 16:20] = 6.0
     sample = _sample(disparity, torch.full((3, 36, 36), 0.5).double())

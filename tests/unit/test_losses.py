@@ -50,7 +50,7 @@ def _slow_reduce(x: np.ndarray) -> np.ndarray:
 
 
 def _slow_expand(coarse: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
-    """Interpolate: coarse pixel (i, j) sits at fine pixel (2 i, 2 j); weights are normalised."""
+    """Interpolate: low-resolution pixel (i, j) sits at high-resolution pixel (2 i, 2 j); weights are normalised."""
     fine = np.zeros(shape)
     for row, column in np.ndindex(*shape):
         total = 0.0

@@ -21,7 +21,7 @@ from torch import Tensor, nn
 
 from dsr.geometry.camera import Camera
 from dsr.geometry.shading import render
-from dsr.geometry.surface import normals_of
+from dsr.geometry.surface import depth_to_normals
 from dsr.metrics import lpips
 from dsr.metrics.functional import SurfacePair
 from dsr.metrics.lpips import LPIPS, TRUNK_FILE, TRUNK_HASH, TRUNK_URL, find_trunk, load_lpips, lpips_v
@@ -192,7 +192,7 @@ def test_too_small_images_are_refused(network: LPIPS, size: tuple[int, int]) -> 
 def test_lpips_v_is_the_distance_of_each_lights_rendering_in_three_channels(network: LPIPS, holes: bool) -> None:
     pair = _pair(holes=holes)
     depths = (torch.where(pair.depth_mask, depth, torch.nan) for depth in (pair.prediction, pair.target))
-    renderings = [render(normals_of(depth, pair.rays)).nan_to_num(nan=0) for depth in depths]
+    renderings = [render(depth_to_normals(depth, pair.rays)).nan_to_num(nan=0) for depth in depths]
     values = lpips_v(pair, network)
     assert values.shape == (1, 4)
     for light in range(4):

@@ -26,7 +26,7 @@ def _net(scale: int, variant: VariantName = "voynov") -> MSGNet:
 
 
 def _scene(scale: int, height: int, width: int, batch: int = 1) -> tuple[Tensor, Tensor]:
-    """Return a photo and a coarse disparity map, random but smooth enough to resemble one."""
+    """Return a photo and a low-resolution disparity map, random but smooth enough to resemble one."""
     generator = torch.Generator().manual_seed(height + width)
     rgb = torch.rand((batch, 3, scale * height, scale * width), generator=generator)
     disparity = 20 + 5 * torch.rand((batch, 1, height, width), generator=generator, dtype=torch.float64)

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 import dsr.data.preparation.records as module
-from dsr.data.preparation.records import Native, Preparation, Record, records_of, renamed
+from dsr.data.preparation.records import Preparation, PreparedDataset, Record, records_of, renamed
 from dsr.geometry.camera import Camera
 from dsr.sample import Scene
 from dsr.synthetic.rendering import cache_directory
@@ -41,7 +41,7 @@ def files(tmp_path):
 
 def source(files, named=("a", "b"), wanted=None, preparation=None, **settings):
     records = records_of(files, frame, "things", **settings)
-    return Native("things", Path("data/things"), records, named, wanted, preparation or Preparation(48))
+    return PreparedDataset("things", Path("data/things"), records, named, wanted, preparation or Preparation(48))
 
 
 def kept():
@@ -157,7 +157,7 @@ def test_the_content_of_a_scene_does_not_depend_on_what_is_done_to_it(files):
 def test_what_is_to_be_known_of_a_scene_goes_with_it_prepared_or_not(files):
     records = {name: replace(record, note="not metric") for name, record in records_of(files, frame, "things").items()}
     for preparation in (Preparation(48), Preparation(48), Preparation(None)):
-        data = Native("things", Path("x"), records, ["a"], None, preparation)
+        data = PreparedDataset("things", Path("x"), records, ["a"], None, preparation)
         assert data.load("a").notes == ("not metric",)
     assert source(files).load("a").notes == ()
 
@@ -175,7 +175,9 @@ def test_frames_get_other_names(files):
 
 def test_all_files_of_a_folder_count_and_very_large_ones_by_size_and_time(files, monkeypatch, tmp_path):
     folder = tmp_path / "set"
-    data = Native("things", folder, records_of({"all": (folder, 3)}, frame, "things"), ["all"], None, Preparation(48))
+    data = PreparedDataset(
+        "things", folder, records_of({"all": (folder, 3)}, frame, "things"), ["all"], None, Preparation(48)
+    )
     before = data.content("all")
     files["deep/c"][0].write_text("4")
     assert data.content("all") != before
@@ -207,8 +209,8 @@ def test_a_record_without_fine_depth_cannot_be_resized(files):
         return Scene("things", "a", torch.zeros(3, 60, 90), Camera(90, 60, 80.0, 80.0, 44.5, 29.5), None,
                      {2: torch.ones(1, 30, 45)})  # fmt: skip
 
-    data = Native("things", Path("x"), {"a": Record((), measured_only)}, ["a"], None, Preparation(48))
+    data = PreparedDataset("things", Path("x"), {"a": Record((), measured_only)}, ["a"], None, Preparation(48))
     with pytest.raises(
-        ValueError, match=r"a: expected a fine depth map to resize, there is none \(dataset\.size=null\)"
+        ValueError, match=r"a: expected a high-resolution depth map to resize, there is none \(dataset\.size=null\)"
     ):
         data.load("a")

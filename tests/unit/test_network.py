@@ -10,13 +10,13 @@ from torch import Tensor
 from torch.nn import functional
 
 from dsr.geometry.camera import Camera, from_range, to_range
-from dsr.methods.networks.base import ENSEMBLES, DisparityNetwork, NetworkUpsampler, posed, unposed
+from dsr.methods.networks.base import ENSEMBLES, DisparityNetwork, NetworkUpsampler, apply_dihedral, undo_dihedral
 from dsr.methods.networks.msg_net import MSGNet
 from dsr.sample import DepthSample
 
 
 class _Leaning(DisparityNetwork):
-    """Repeats the coarse pixels, and adds what depends on the pose: a ramp to the right, an arc from top to bottom."""
+    """Repeats the LR pixels, and adds what depends on the pose: a ramp to the right, an arc from top to bottom."""
 
     scale = 2
 
@@ -41,8 +41,10 @@ def _sample(height: int = 6, width: int = 8) -> DepthSample:
 @pytest.mark.parametrize("pose", range(8))
 def test_a_pose_is_undone_and_differs_from_the_others(pose: int) -> None:
     x = torch.rand(2, 3, 5, 5)
-    torch.testing.assert_close(unposed(posed(x, pose), pose), x, rtol=0, atol=0)
-    assert not any(torch.equal(posed(x, pose), posed(x, other)) for other in range(8) if other != pose)
+    torch.testing.assert_close(undo_dihedral(apply_dihedral(x, pose), pose), x, rtol=0, atol=0)
+    assert not any(
+        torch.equal(apply_dihedral(x, pose), apply_dihedral(x, other)) for other in range(8) if other != pose
+    )
 
 
 def test_an_ensemble_averages_what_depends_on_the_pose() -> None:
@@ -63,9 +65,14 @@ def test_an_ensemble_of_a_turned_scene_is_the_turned_ensemble() -> None:
     method = NetworkUpsampler(MSGNet(2, "dsr"), ensemble=4)
     sample = _sample()
     rgb, coarse = sample.rgb[None], to_range(sample.depth_lr, sample.camera_lr, "disparity")[None]
-    single = method.net.upsample(posed(rgb, 1), posed(coarse, 1)) - posed(method.net.upsample(rgb, coarse), 1)
+    single = method.net.upsample(apply_dihedral(rgb, 1), apply_dihedral(coarse, 1)) - apply_dihedral(
+        method.net.upsample(rgb, coarse), 1
+    )
     assert float(single.abs().max()) > 1e-3
-    both = [method.fine_disparity(posed(rgb, 1), posed(coarse, 1)), posed(method.fine_disparity(rgb, coarse), 1)]
+    both = [
+        method.fine_disparity(apply_dihedral(rgb, 1), apply_dihedral(coarse, 1)),
+        apply_dihedral(method.fine_disparity(rgb, coarse), 1),
+    ]
     torch.testing.assert_close(both[0], both[1], rtol=0, atol=1e-6)
 
 

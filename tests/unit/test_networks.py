@@ -110,7 +110,9 @@ def test_tiles_agree_with_the_answer_in_one_piece(build: Callable[..., WindowedN
 
 
 def test_a_photo_of_another_size_is_refused(net: WindowedNetwork) -> None:
-    with pytest.raises(ValueError, match=r"^rgb: expected \(24, 28\) pixels for a coarse map of \(6, 7\) at scale 4"):
+    with pytest.raises(
+        ValueError, match=r"^rgb: expected \(24, 28\) pixels for a low-resolution map of \(6, 7\) at scale 4"
+    ):
         net.upsample(photos(24, 24), maps(6, 7))
 
 

@@ -21,10 +21,10 @@ from dsr.methods.networks.maps import normalised
 from dsr.sample import Scene
 from dsr.training.cropping import Patches, PatchSettings
 from dsr.training.patches import Part, PatchData, WholeScenes
-from dsr.training.problem import Batch, Problem, tensors_of
+from dsr.training.problem import Batch, Degradation, tensors_of
 
 BOX = Downsampling("box")
-X4 = Problem(4, BOX)
+X4 = Degradation(4, BOX)
 CAMERA = Camera(width=60, height=44, fx=50.0, fy=47.0, cx=33.3, cy=17.9)
 STEREO = replace(CAMERA, baseline=0.12, doffs=1.7)
 NORMAL = torch.tensor([0.3, -0.4, -1.0], dtype=torch.float64)[:, None, None]
@@ -80,7 +80,7 @@ class _Source:
         return scene
 
 
-def _data(scenes: list[Scene] | None = None, problem: Problem = X4, **changes: Any) -> PatchData:
+def _data(scenes: list[Scene] | None = None, problem: Degradation = X4, **changes: Any) -> PatchData:
     return PatchData([Part(_Source(scenes or [_scene(i) for i in range(6)]))], _settings(**changes), problem, seed=7)
 
 
@@ -309,7 +309,7 @@ def test_the_coarse_disparity_is_the_box_mean_of_the_fine_one_in_fine_pixels(cam
 
 
 def test_the_networks_input_depends_on_the_coarse_map_alone() -> None:
-    """Fine depth that changes within its blocks, far beyond the coarse range, leaves no trace."""
+    """High-resolution depth that changes within its blocks, far beyond the low-resolution range, leaves no trace."""
     disparity = 50 * 0.2 / _tilted(CAMERA)
     checker = torch.tensor([[1.0, -1.0], [-1.0, 1.0]]).repeat(22, 30).double()
     plain, wild = (_scene(depth=50 * 0.2 / (disparity + swing * checker)) for swing in (0.0, 2.5))
@@ -379,7 +379,7 @@ def test_bounds_lie_between_the_patchs_own_and_the_scenes_and_half_are_the_scene
 
 
 def test_bounds_of_a_noisy_patch_contain_its_coarse_map_or_are_the_clean_scenes() -> None:
-    patches = Patches([[_scene()]], _settings(), Problem(4, BOX, GaussianMultiplicative(0.005)), count=60)
+    patches = Patches([[_scene()]], _settings(), Degradation(4, BOX, GaussianMultiplicative(0.005)), count=60)
     coarse = 10 * (1 / _tilted(CAMERA)).reshape(11, 4, 15, 4).mean(dim=(1, 3))
     clean = 0
     for i in range(60):
@@ -411,7 +411,7 @@ def test_bounds_of_a_whole_scene_are_its_coarse_maps_own_and_those_of_a_wall_som
 
 
 def test_noise_is_new_in_every_patch_and_the_same_in_every_run() -> None:
-    noisy = Problem(4, BOX, GaussianMultiplicative(0.01))
+    noisy = Degradation(4, BOX, GaussianMultiplicative(0.01))
     wall = _scene(depth=torch.full((1, 44, 60), 2.0, dtype=torch.float64))
     first, again = (Patches([[wall]], _settings(), noisy, count=50) for _ in range(2))
     assert _same(first[7], again[7])
@@ -519,12 +519,12 @@ def test_a_patch_that_the_scale_does_not_divide_is_refused() -> None:
     with pytest.raises(ValueError, match=r"trainer.patch: expected a size that scale=4 divides, got 30"):
         _data(size=30)
     with pytest.raises(ValueError, match=r"trainer.patch: expected a size that scale=16 divides, got 24"):
-        _data(problem=Problem(16, BOX), size=24)
+        _data(problem=Degradation(16, BOX), size=24)
 
 
 def test_a_measured_map_cannot_be_cut() -> None:
-    patches = Patches([[_scene()]], _settings(), Problem(4, Measured()))  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match="downsampling=measured expects a coarse map at x4"):
+    patches = Patches([[_scene()]], _settings(), Degradation(4, Measured()))  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="downsampling=measured expects a low-resolution map at x4"):
         patches[0]
 
 
@@ -555,9 +555,11 @@ def test_a_setting_out_of_range_is_refused_by_its_key(changes: dict[str, Any], m
 
 def test_where_noise_leaves_nothing_of_a_window_another_one_is_taken() -> None:
     far = _scene(1, depth=torch.full((1, CAMERA.height, CAMERA.width), 50.0, dtype=torch.float64))
-    problem = Problem(4, BOX, Kinect(nearest=None, farthest=20.0))
+    problem = Degradation(4, BOX, Kinect(nearest=None, farthest=20.0))
     patches = Patches([[far, _scene()]], _settings(), problem)
     for index in range(8):
         assert patches.starting(index, 1)[0]["depth"].nanmean() < 20
-    with pytest.raises(ValueError, match="patches: expected coarse maps with a known pixel or more; noise makes all"):
+    with pytest.raises(
+        ValueError, match="patches: expected low-resolution maps with a known pixel or more; noise makes all"
+    ):
         Patches([[far]], _settings(), problem)[0]

@@ -183,7 +183,7 @@ def test_windows_answer_as_the_whole_does() -> None:
     net = _net(2, iterations=2)
     rgb, coarse = _photo(80, 84), _map(40, 42)
     whole = net.upsample(rgb, coarse)
-    answers = net.whole(rgb, coarse)
+    answers = net.global_context(rgb, coarse)
     reach, start, stop = net.reach, 12, 40
     part = answers.answer(rgb[..., 2 * start : 2 * stop, 20:], answers.disparity[..., start:stop, 10:])
     top, left = 2 * (start + reach), 20 + 2 * reach

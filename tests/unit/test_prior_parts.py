@@ -10,8 +10,8 @@ from torch import Tensor
 
 from dsr.degradation.downsampling import Downsampling, make_sample
 from dsr.geometry.camera import Camera
-from dsr.geometry.surface import normals_of
-from dsr.methods.dip.noise import noise_level, tilt_of
+from dsr.geometry.surface import depth_to_normals
+from dsr.methods.dip.noise import noise_level, normal_noise_deg
 from dsr.methods.dip.problem import ImageProblem, PriorObjective
 from dsr.methods.dip.stopping import Fixed, Oracle, Residual, Variance
 from dsr.metrics.functional import SurfacePair, rmse_v
@@ -182,10 +182,10 @@ def test_the_noise_of_a_depth_map_is_estimated_from_the_map_alone(std: float) ->
 def test_noise_tilts_the_normals_of_a_frontal_surface_as_much_as_they_say() -> None:
     camera = Camera(width=200, height=150, fx=80.0, fy=80.0, cx=99.5, cy=74.5)
     draws = torch.randn(1, 1, 150, 200, generator=torch.Generator().manual_seed(4), dtype=torch.float64)
-    normals = normals_of(3 * (1 + 0.001 * draws), camera.rays()[None])
+    normals = depth_to_normals(3 * (1 + 0.001 * draws), camera.rays()[None])
     slopes = (normals[:, 0] / normals[:, 2])[..., 60:90, 80:120]
-    assert math.degrees(math.atan(float(slopes.std()))) == pytest.approx(tilt_of(0.001, camera), rel=0.1)
-    assert tilt_of(0.0, camera) == 0
+    assert math.degrees(math.atan(float(slopes.std()))) == pytest.approx(normal_noise_deg(0.001, camera), rel=0.1)
+    assert normal_noise_deg(0.0, camera) == 0
 
 
 def test_the_residual_rule_stops_when_the_map_is_explained_up_to_its_noise() -> None:

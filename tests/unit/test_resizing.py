@@ -5,7 +5,7 @@ import torch
 
 from dsr.data.preparation.resizing import cropped, fitted, resized, resized_depth
 from dsr.geometry.camera import Camera
-from dsr.geometry.surface import normals_of
+from dsr.geometry.surface import depth_to_normals
 from dsr.sample import Scene
 
 CAMERA = Camera(90, 60, 80.0, 82.0, 44.0, 30.5, baseline=0.1, doffs=3.0)
@@ -68,9 +68,9 @@ def test_a_scene_keeps_its_normals_and_disparities_scale_with_the_size():
     after = resized(before, 30, 45)
     assert after.rgb.shape == (3, 30, 45)
     assert after.camera == CAMERA.rescale(45, 30)
-    normal = normals_of(before.depth[None], before.camera.rays()[None])[0, :, 5, 5]
+    normal = depth_to_normals(before.depth[None], before.camera.rays()[None])[0, :, 5, 5]
     torch.testing.assert_close(
-        normals_of(after.depth[None], after.camera.rays()[None])[0],
+        depth_to_normals(after.depth[None], after.camera.rays()[None])[0],
         normal[:, None, None].expand(3, 30, 45), rtol=0, atol=1e-6,
     )  # fmt: skip
 
@@ -91,7 +91,7 @@ def test_a_curved_surface_is_where_it_was(size):
     inner = (truth < 1.7) & (small.depth < 1.7)  # the sphere but for its rim
     assert inner.double().mean() > 0.05
     torch.testing.assert_close(small.depth[inner], truth[inner], rtol=2e-4, atol=0)
-    normals, exact = (normals_of(depth[None], small.camera.rays()[None]) for depth in (small.depth, truth))
+    normals, exact = (depth_to_normals(depth[None], small.camera.rays()[None]) for depth in (small.depth, truth))
     angle = (normals * exact).sum(dim=1).clamp(-1, 1).arccos().rad2deg()
     assert float(angle[0][inner[0]].quantile(0.95)) < 1.0
 
@@ -129,5 +129,5 @@ def test_the_paper_s_camera_of_plant_follows_from_that_of_icl_nuim():
 
 def test_a_scene_without_fine_depth_cannot_be_resized():
     only = Scene("set", "one", torch.zeros(3, 60, 90), CAMERA, None, {2: torch.ones(1, 30, 45)})
-    with pytest.raises(ValueError, match="one: expected a fine depth map to resize, there is none"):
+    with pytest.raises(ValueError, match="one: expected a high-resolution depth map to resize, there is none"):
         resized(only, 30, 45)

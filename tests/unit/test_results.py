@@ -6,7 +6,7 @@ import os
 import pytest
 import torch
 
-from dsr.evaluation.results import Problem, load_results
+from dsr.evaluation.results import BenchmarkSetting, load_results
 from dsr.evaluation.store import load_scene, prediction_path, scene_path
 
 
@@ -24,7 +24,7 @@ def change_method(folder, **entries):
 def test_a_run_is_read_with_its_scenes_predictions_and_scores(make_run, tmp_path):
     make_run(tmp_path / "a", scenes=("b", "c"))
     (run,) = load_results([tmp_path]).runs
-    assert (run.problem, run.label, run.scenes) == (Problem("simgeo", 4, "box"), "Bicubic", ("b", "c"))
+    assert (run.problem, run.label, run.scenes) == (BenchmarkSetting("simgeo", 4, "box"), "Bicubic", ("b", "c"))
     assert run.prediction("b").shape == (1, 32, 32)
     assert set(run.scores["scene"]) == {"b", "c"}
     assert run.seconds == {"b": 0.25, "c": 0.25}

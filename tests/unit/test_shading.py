@@ -7,7 +7,7 @@ import torch
 
 from dsr.geometry.camera import Camera
 from dsr.geometry.shading import LIGHT_NAMES, lights, render, shade
-from dsr.geometry.surface import normals_of
+from dsr.geometry.surface import depth_to_normals
 
 PROTOCOL = -np.array(
     [
@@ -60,7 +60,7 @@ def test_rendering_clips_the_shading_to_zero_and_one() -> None:
 
 def test_a_fronto_parallel_wall_is_brightest_from_the_front_and_equal_from_the_sides() -> None:
     camera = Camera(5, 4, 10.0, 10.0, 2.0, 1.5)
-    normals = normals_of(torch.full((1, 1, 4, 5), 2.0, dtype=torch.float64), camera.rays()[None])
+    normals = depth_to_normals(torch.full((1, 1, 4, 5), 2.0, dtype=torch.float64), camera.rays()[None])
     brightness = render(normals).mean(dim=(0, 2, 3)).numpy()
     np.testing.assert_allclose(brightness, [3**-0.5, 3**-0.5, 3**-0.5, 1], rtol=1e-12)
 

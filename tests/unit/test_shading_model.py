@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from dsr.geometry.camera import Camera
-from dsr.geometry.surface import normals_of, points_of
+from dsr.geometry.surface import depth_to_normals, points_of
 from dsr.methods.classical.srfs.shading import area_of, best_lighting, by_theta, photometry, shading_of, surface_of
 
 LIGHT = torch.tensor([[[0.3, -0.4, -0.6, 0.2], [0.2, -0.5, -0.5, 0.1], [0.4, -0.2, -0.4, 0.3]]]).double()
@@ -45,7 +45,7 @@ def test_the_rendering_is_the_geometrys_normals_times_the_light_the_nearer_the_f
         camera = _camera(size)
         theta, depth = _theta(camera)
         rays = camera.rays()[None]
-        normals = normals_of(depth, rays)
+        normals = depth_to_normals(depth, rays)
         expected = torch.einsum("bck,bkhw->bchw", LIGHT, torch.cat((normals, torch.ones_like(normals[:, :1])), dim=1))
         errors.append(float((shading_of(surface_of(theta, rays).normals, LIGHT) - expected).abs().max()))
     assert errors[0] < 0.01
@@ -56,7 +56,7 @@ def test_a_map_without_slopes_has_the_geometrys_normals_exactly() -> None:
     camera = _camera(8)
     rays, depth = camera.rays()[None], torch.full((1, 1, 8, 8), 3.0).double()
     theta = torch.cat((torch.zeros(1, 2, 8, 8).double(), depth), dim=1)
-    torch.testing.assert_close(surface_of(theta, rays).normals, normals_of(depth, rays))
+    torch.testing.assert_close(surface_of(theta, rays).normals, depth_to_normals(depth, rays))
 
 
 def test_the_area_is_that_of_the_back_projected_pixels() -> None:

@@ -105,7 +105,10 @@ def test_a_scene_without_fine_depth_shows_its_coarsest_measured_map(tmp_path, wr
     page = drawn(tmp_path, toy_scene(depth=None, measured={2: torch.ones(1, 16, 16), 8: coarse}))
     assert (panel(page, 2)[:116] == PINK).all()
     assert (panel(page, 2)[132:] == KNOWN).all()
-    assert any("measured: x2, x8; no fine depth\nshown: x8, 4 x 4\ndepth 3 to 3 m\nholes: 50 %" in t for t in written)
+    assert any(
+        "measured: x2, x8; no high-resolution depth\nshown: x8, 4 x 4\ndepth 3 to 3 m\nholes: 50 %" in t
+        for t in written
+    )
 
 
 def test_a_measured_map_beside_the_fine_one_is_told_of(tmp_path, written):

@@ -26,7 +26,7 @@ def object_points(name, number):
     return (picture.depth * rays)[:, mine]
 
 
-def normals_of(picture):
+def depth_to_normals(picture):
     """Return forward-difference normals and where the 2 x 2 neighbourhood is on one plane."""
     points = picture.camera.rays().numpy() * picture.depth
     down, right = np.diff(points, axis=1)[:, :, :-1], np.diff(points, axis=2)[:, :-1]
@@ -78,7 +78,7 @@ def test_variants_of_a_scene_share_their_depth_but_not_their_photo():
 
 
 def test_the_cube_and_the_wall_show_exactly_four_normals_three_of_them_orthogonal():
-    normal, flat = normals_of(rendering("cube_no_texture"))
+    normal, flat = depth_to_normals(rendering("cube_no_texture"))
     found, count = np.unique(np.round(normal[:, flat].T, 6) + 0.0, axis=0, return_counts=True)
     assert len(found) == 4
     assert count.min() > 50

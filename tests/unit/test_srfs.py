@@ -14,10 +14,10 @@ from torch import Tensor
 
 from dsr.degradation.downsampling import Downsampling, make_sample
 from dsr.geometry.camera import Camera, from_range
-from dsr.geometry.surface import normals_of
+from dsr.geometry.surface import depth_to_normals
 from dsr.methods.base import Iterative
 from dsr.methods.classical.interpolation import Interpolation
-from dsr.methods.classical.srfs.admm import Problem, ShadingSolver, Slopes
+from dsr.methods.classical.srfs.admm import ShadingProblem, ShadingSolver, Slopes
 from dsr.methods.classical.srfs.shading import shading_of, surface_of
 from dsr.methods.classical.srfs.upsampler import ShapeFromShading
 from dsr.sample import DepthSample, Scene
@@ -46,7 +46,7 @@ def _sample(
 
 def _lit(depth: Tensor) -> Tensor:
     """Return the photo of a surface of one colour under LIGHT, (3, H, W)."""
-    normals = normals_of(depth[None, None], _camera(*depth.shape).rays()[None])
+    normals = depth_to_normals(depth[None, None], _camera(*depth.shape).rays()[None])
     colour = torch.tensor([0.8, 0.7, 0.6]).double()[:, None, None]
     return (colour * shading_of(normals, torch.tensor(LIGHT).double()[None])[0]).clamp(0, 1)
 
@@ -69,7 +69,7 @@ def _bumps(size: int) -> Tensor:
 def _angle(depth: Tensor, truth: Tensor) -> float:
     """Return the mean angle between normals in degrees."""
     rays = _camera(*truth.shape).rays()[None]
-    a, b = (normals_of(each[None, None].double(), rays) for each in (depth, truth))
+    a, b = (depth_to_normals(each[None, None].double(), rays) for each in (depth, truth))
     return float(torch.rad2deg(torch.acos((a * b).sum(dim=1).clamp(-1, 1))).mean())
 
 
@@ -134,7 +134,7 @@ def test_slopes_of_a_map_make_the_geometrys_normals_to_first_order() -> None:
     truth = _sphere(64)
     solver, metres = ShapeFromShading().prepared(_sample(truth))
     found = surface_of(solver.slopes(truth[None, None] / metres), solver.problem.rays).normals
-    expected = normals_of(truth[None, None], solver.problem.rays)
+    expected = depth_to_normals(truth[None, None], solver.problem.rays)
     assert float((found - expected).abs().mean()) < 5e-3
 
 
@@ -252,7 +252,7 @@ def test_twice_the_same_is_the_same_and_the_truth_is_not_looked_at() -> None:
 def test_a_batch_is_what_its_problems_are_one_at_a_time() -> None:
     solvers = [ShapeFromShading().prepared(_sample(*_random(16, 16, seed)))[0] for seed in (0, 1)]
     one, other = (solver.problem for solver in solvers)
-    both = Problem(
+    both = ShadingProblem(
         torch.cat((one.photo, other.photo)),
         torch.cat((one.coarse, other.coarse)),
         one.rays,

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from dsr.geometry.camera import Camera
-from dsr.geometry.surface import length, normal_mask, normals_of, points_of
+from dsr.geometry.surface import depth_to_normals, length, normal_mask, points_of
 from dsr.metrics.functional import SurfacePair, mse_v
 
 CAMERA = Camera(width=11, height=7, fx=9.0, fy=12.0, cx=4.3, cy=3.9)
@@ -45,7 +45,7 @@ def _sphere_error(camera: Camera) -> float:
     a, b, c = (rays * rays).sum(0), (rays * centre).sum(0), (centre * centre).sum() - radius**2
     depth = ((b - (b * b - a * c).sqrt()) / a)[None]
     truth = (points_of(depth[None], rays[None])[0] - centre) / radius
-    return float((normals_of(depth[None], rays[None])[0] - truth).abs().max())
+    return float((depth_to_normals(depth[None], rays[None])[0] - truth).abs().max())
 
 
 def test_points_lie_on_their_rays_at_their_depth() -> None:
@@ -58,7 +58,7 @@ def test_points_lie_on_their_rays_at_their_depth() -> None:
 
 @pytest.mark.parametrize("normal", PLANES)
 def test_a_plane_has_its_normal_at_every_pixel_to_the_last(normal: tuple[float, float, float]) -> None:
-    normals = normals_of(_plane(CAMERA, normal), CAMERA.rays()[None])
+    normals = depth_to_normals(_plane(CAMERA, normal), CAMERA.rays()[None])
     expected = torch.tensor(normal, dtype=torch.float64)
     expected = (expected / expected.norm())[None, :, None, None].expand_as(normals)
     torch.testing.assert_close(normals, expected, rtol=0, atol=1e-9)
@@ -76,16 +76,16 @@ def test_normals_are_the_normalised_cross_product_of_forward_differences(size: t
     camera = CAMERA.crop(0, 0, *size)
     depth = _random(camera)
     expected = torch.from_numpy(_cross_product_normals(depth[0, 0].numpy(), camera)).permute(2, 0, 1)[None]
-    torch.testing.assert_close(normals_of(depth, camera.rays()[None]), expected, rtol=0, atol=1e-10)
+    torch.testing.assert_close(depth_to_normals(depth, camera.rays()[None]), expected, rtol=0, atol=1e-10)
 
 
 def test_normals_have_unit_length_and_face_the_camera() -> None:
     rays = CAMERA.rays()[None]
-    normals = normals_of(_random(CAMERA), rays)
+    normals = depth_to_normals(_random(CAMERA), rays)
     torch.testing.assert_close(normals.norm(dim=1), torch.ones(1, 7, 11, dtype=torch.float64), rtol=0, atol=1e-14)
     assert bool(((normals * rays).sum(dim=1) < 0).all())
     for plane in PLANES:
-        assert bool((normals_of(_plane(CAMERA, plane), rays)[:, 2] < 0).all())
+        assert bool((depth_to_normals(_plane(CAMERA, plane), rays)[:, 2] < 0).all())
 
 
 @pytest.mark.parametrize("hole", [(3, 4), (0, 0), (6, 10), (6, 0), (0, 10), (5, 10), (6, 9)])
@@ -95,7 +95,7 @@ def test_a_normal_is_unknown_exactly_where_a_pixel_that_it_needs_is(hole: tuple[
     known = np.isfinite(_cross_product_normals(depth[0, 0].numpy(), CAMERA)).all(axis=-1)
     assert not known.all()
     assert np.array_equal(normal_mask(depth.isfinite())[0, 0].numpy(), known)
-    normals = normals_of(depth, CAMERA.rays()[None])
+    normals = depth_to_normals(depth, CAMERA.rays()[None])
     assert np.array_equal(normals.isfinite().all(dim=1)[0].numpy(), known)
 
 
@@ -103,16 +103,16 @@ def test_normals_do_not_depend_on_the_batch() -> None:
     depths = torch.cat((_random(CAMERA, 1), _random(CAMERA, 2)))
     other = Camera(11, 7, 30.0, 31.0, 2.0, 3.0)
     rays = torch.stack((CAMERA.rays(), other.rays()))
-    together = normals_of(depths, rays)
+    together = depth_to_normals(depths, rays)
     for i in range(2):
-        assert torch.equal(together[i : i + 1], normals_of(depths[i : i + 1], rays[i : i + 1]))
+        assert torch.equal(together[i : i + 1], depth_to_normals(depths[i : i + 1], rays[i : i + 1]))
 
 
 def test_a_narrower_result_keeps_the_digits_of_tiny_differences() -> None:
     camera = Camera(11, 7, 1e5, 1e5, 5.0, 3.0)
     depth = 1 + 1e-6 * (_random(camera) - 1)  # float32 depths would differ by 0 or 1.2e-7
-    exact = normals_of(depth, camera.rays()[None])
-    narrow = normals_of(depth, camera.rays()[None], torch.float32)
+    exact = depth_to_normals(depth, camera.rays()[None])
+    narrow = depth_to_normals(depth, camera.rays()[None], torch.float32)
     assert narrow.dtype == torch.float32
     torch.testing.assert_close(narrow.double(), exact, rtol=0, atol=5e-7)
 
@@ -125,7 +125,7 @@ def test_length_is_the_euclidean_one() -> None:
 @pytest.mark.parametrize("size", [(1, 5), (5, 1)])
 def test_a_map_of_one_row_or_column_is_refused(size: tuple[int, int]) -> None:
     with pytest.raises(ValueError, match=f"at least 2 x 2 pixels, got \\({size[0]}, {size[1]}\\)"):
-        normals_of(torch.ones(1, 1, *size), torch.ones(1, 3, *size))
+        depth_to_normals(torch.ones(1, 1, *size), torch.ones(1, 3, *size))
 
 
 @pytest.mark.parametrize("masked", [False, True])

@@ -105,7 +105,7 @@ def test_nothing_beyond_the_reach_counts(name: str) -> None:
     other, photo = coarse.clone(), rgb.clone()
     other[..., at, at], photo[..., net.scale * at + 1, net.scale * at + 1] = 23.0, 0.6
     with torch.inference_mode():
-        whole = net.whole(rgb, coarse)
+        whole = net.global_context(rgb, coarse)
         change = (whole.answer(photo, other) - whole.answer(rgb, coarse)).abs()[0, 0]
     rows, columns = (change > 1e-6).nonzero().T
     for index in (rows, columns):

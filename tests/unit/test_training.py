@@ -29,10 +29,10 @@ from dsr.training.cropping import Patches, PatchSettings
 from dsr.training.module import Schedule, SuperResolution
 from dsr.training.objective import Objective, balanced_weight, depth_of
 from dsr.training.patches import WholeScenes
-from dsr.training.problem import Batch, Problem, tensors_of
+from dsr.training.problem import Batch, Degradation, tensors_of
 
 BOX = Downsampling("box")
-X2 = Problem(2, BOX)
+X2 = Degradation(2, BOX)
 CAMERA = Camera(width=40, height=36, fx=40.0, fy=40.0, cx=20.0, cy=18.0)
 
 pytestmark = [
@@ -57,7 +57,7 @@ def _four(value: float) -> Tensor:
 
 
 def _batch(depth: Tensor, camera: Camera, coarse: tuple[float, float]) -> Batch:
-    """Return a batch of one map whose coarse disparities span ``coarse``."""
+    """Return a batch of one map whose low-resolution disparities span ``coarse``."""
     return {
         "depth": depth[None],
         "rays": camera.rays()[None],
@@ -71,7 +71,7 @@ STEREO = Camera(width=13, height=12, fx=20.0, fy=25.0, cx=4.0, cy=7.0, baseline=
 
 
 def _wall() -> Batch:
-    """Return a wall at 2 m whose disparity is 0.5 * 20 / 2 - 1 = 4 pixels, of coarse ones from 3 to 5."""
+    """Return a wall at 2 m whose disparity is 0.5 * 20 / 2 - 1 = 4 pixels, of low-resolution ones from 3 to 5."""
     return _batch(torch.full((1, 12, 13), 2.0, dtype=torch.float64), STEREO, (3.0, 5.0))
 
 
@@ -171,7 +171,7 @@ def test_the_balanced_weight_balances_a_tilt_between_neighbours() -> None:
     """On a wall whose every second column stands out by tan(1.1 degrees) of a pixel's width, both terms weigh alike."""
     camera = Camera(width=100, height=16, fx=80.0, fy=80.0, cx=49.5, cy=7.5)
     wall = torch.full((1, 16, 100), 2.0, dtype=torch.float64)
-    wall[..., :4] = 2.5  # so that the coarse map has a range
+    wall[..., :4] = 2.5  # so that the low-resolution map has a range
     batch = tensors_of(make_sample(Scene("set", "wall", torch.rand(3, 16, 100), camera, wall), 4, BOX, "disparity"))
     w = balanced_weight([batch])
     batch = {name: value[None].double() for name, value in batch.items()}

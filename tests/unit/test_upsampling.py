@@ -53,7 +53,8 @@ def test_a_slanted_plane_comes_back_as_it_is_at_any_size_and_ratio(
     assert fine.shape == truth.shape
     assert fine.dtype == torch.float32
     off = (fine.reciprocal() - truth.reciprocal()).abs()
-    # a spline's depth is not straight where inverse depth is, and flat at the border: off by less than a coarse pixel
+    # a spline's depth is not straight where inverse depth is, and flat at the border: off by less than a low-resolution
+    # pixel
     assert float(off.max()) < (3e-6 if method == "facets" else 0.3 / 60 * max(size[1] / coarse_size[1], 4))
 
 

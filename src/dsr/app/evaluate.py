@@ -24,7 +24,7 @@ from dsr.app.progress import Display, prepare
 from dsr.app.schema import ConfigError, EvalConfig, given_keys, plain_config
 from dsr.app.training_runs import studies_of_run
 from dsr.data.base import SceneSource
-from dsr.evaluation.predict import Outcome, StalePredictionError, Study, predict, score
+from dsr.evaluation.predict import Evaluation, Outcome, StalePredictionError, predict, score
 from dsr.methods.dip.upsampler import WORKSPACE
 from dsr.methods.networks.trained import packaged_names, packaged_weights
 from dsr.metrics.catalogue import catalogue
@@ -97,7 +97,7 @@ def _evaluate(plain: dict[str, Any], source: SceneSource | None) -> pd.DataFrame
 
 def _study(
     settings: EvalConfig, identity: Mapping[str, Any], given: Mapping[str, Any], source: SceneSource | None
-) -> Study:
+) -> Evaluation:
     """Build what the configuration describes.
 
     Args:
@@ -124,11 +124,11 @@ def _study(
             "scale": settings.scale,
             "precision": settings.precision,
             "seed": settings.seed,
-            "downsampling": downsampling.believed(),
+            "downsampling": downsampling.assumed_model(),
             "metrics": functools.partial(_metrics, settings, given["device"]),
         },
     )
-    return Study(
+    return Evaluation(
         source,
         downsampling,
         _problem_name(settings),

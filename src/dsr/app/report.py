@@ -37,7 +37,7 @@ _MAIN = {
 
 
 @dataclass(frozen=True)
-class Wanted:
+class ReportRequest:
     """What of the results goes into the report.
 
     Args:
@@ -58,7 +58,9 @@ class Wanted:
     page_mb: float
 
 
-def make_report(runs: Sequence[Path], output: Path, study: Path | None, wanted: Wanted, console: Console) -> None:
+def make_report(
+    runs: Sequence[Path], output: Path, study: Path | None, wanted: ReportRequest, console: Console
+) -> None:
     """Write the tables, figures, correlations and page of some runs into a directory, whole or not at all.
 
     Args:
@@ -94,7 +96,7 @@ def make_report(runs: Sequence[Path], output: Path, study: Path | None, wanted: 
             show(console, f"{what:<8} {output / file}")
 
 
-def _check(output: Path, wanted: Wanted) -> None:
+def _check(output: Path, wanted: ReportRequest) -> None:
     """Refuse what cannot be made, before anything is read."""
     for part in wanted.parts:
         if part not in PARTS:
@@ -107,7 +109,9 @@ def _check(output: Path, wanted: Wanted) -> None:
         raise ValueError(f"{output}: expected a new directory or an earlier report, it holds something else")
 
 
-def _write(folder: Path, results: Results, study: pd.DataFrame | None, wanted: Wanted, display: Display) -> list[str]:
+def _write(
+    folder: Path, results: Results, study: pd.DataFrame | None, wanted: ReportRequest, display: Display
+) -> list[str]:
     """Write the parts, and return what a reader should know."""
     notes: list[str] = []
 

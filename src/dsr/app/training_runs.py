@@ -15,7 +15,7 @@ from dsr.data.base import SceneSource, Some
 from dsr.degradation.downsampling import Downsampling
 from dsr.training.cropping import PatchSettings
 from dsr.training.patches import Part, PatchData
-from dsr.training.problem import Problem
+from dsr.training.problem import Degradation
 
 WEIGHTS = "weights.safetensors"
 _FROM_RUN = ("scale", "downsampling", "noise", "seed", "dataset")
@@ -81,7 +81,7 @@ def training_data(settings: TrainConfig) -> PatchData:
     downsampling = build("downsampling", settings.downsampling)
     if not isinstance(downsampling, Downsampling):
         raise ConfigError("downsampling: training needs a model such as box, measured is none")
-    problem = Problem(settings.scale, downsampling, build("noise", settings.noise))
+    problem = Degradation(settings.scale, downsampling, build("noise", settings.noise))
     validation = {name: build(f"validation.{name}", node) for name, node in settings.validation.items()}
     try:
         patches = PatchSettings(size=trainer.patch, **common(PatchSettings, trainer))

@@ -49,9 +49,9 @@ def add(commands: Any) -> None:
 
 def _run(options: argparse.Namespace, console: Console, _: object) -> list[str]:
     """Make the report."""
-    from dsr.app.report import PARTS, Wanted, make_report  # noqa: PLC0415 - it takes seconds to import
+    from dsr.app.report import PARTS, ReportRequest, make_report  # noqa: PLC0415 - it takes seconds to import
 
-    wanted = Wanted(
+    wanted = ReportRequest(
         tuple(options.methods),
         tuple(options.datasets),
         tuple(options.scale),

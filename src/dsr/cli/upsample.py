@@ -101,7 +101,7 @@ def _words(text: str) -> tuple[str, ...]:
 def _run(options: argparse.Namespace, console: Console, _: object) -> list[str]:
     """Upsample, and return what went wrong."""
     from dsr.app.upsample.outputs import PARTS  # noqa: PLC0415
-    from dsr.app.upsample.run import Wanted, run  # noqa: PLC0415
+    from dsr.app.upsample.run import UpsampleRequest, run  # noqa: PLC0415
     from dsr.io.cameras import CameraChoice  # noqa: PLC0415 - they take seconds to import
     from dsr.io.encoding import parse_unit  # noqa: PLC0415
     from dsr.io.inputs import Reading  # noqa: PLC0415
@@ -115,7 +115,7 @@ def _run(options: argparse.Namespace, console: Console, _: object) -> list[str]:
     choice = CameraChoice(options.camera, options.fov, intrinsics)
     unknown = [part for part in options.without if part not in PARTS]
     parts = options.only if options.only is not None else tuple(part for part in PARTS if part not in options.without)
-    wanted = Wanted(
+    wanted = UpsampleRequest(
         output=options.output,
         folders=tuple(options.folders),
         rgb=tuple(options.rgb),

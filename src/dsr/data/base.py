@@ -7,7 +7,7 @@ from typing import Literal, Protocol, runtime_checkable
 
 from dsr.sample import Scene
 
-Wanted = Sequence[str] | Literal["found"] | None
+SceneSelection = Sequence[str] | Literal["found"] | None
 """Names of scenes; ``found`` for all that are on disk, None for those that the data set names."""
 
 _MOST_LISTED = 60
@@ -84,7 +84,7 @@ class Some:
         return self._source.fingerprint(scene)
 
 
-def chosen(available: Sequence[str], wanted: Wanted) -> list[str]:
+def chosen(available: Sequence[str], wanted: SceneSelection) -> list[str]:
     """Return the scenes to use: those wanted, or all.
 
     Raises:

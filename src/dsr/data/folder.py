@@ -2,9 +2,10 @@
 
     DIR/SCENE/rgb.png (or .jpg, .jpeg)
               camera.json
-              depth.* or disparity.*         fine depth; .npy, .png (16 bit), .tiff, .pfm
-              mask.png                       optional; 0 where the fine depth is unknown
-              depth_lr4.*, disparity_lr4.*   optional; a measured coarse map, here at x4, disparity in its own pixels
+              depth.* or disparity.*         high-resolution depth; .npy, .png (16 bit), .tiff, .pfm
+              mask.png                       optional; 0 where the high-resolution depth is unknown
+              depth_lr4.*, disparity_lr4.*   optional; a measured low-resolution map, here at x4, disparity in its own
+              pixels
 
 Depth and disparity follow ``camera.json``; see :func:`dsr.data.formats.files.read_camera` for its keys.
 """
@@ -20,7 +21,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dsr.data.base import Wanted, chosen
+from dsr.data.base import SceneSelection, chosen
 from dsr.data.formats.files import MAP_SUFFIXES, CameraFile, read_camera, read_map, read_mask, read_rgb
 from dsr.geometry.camera import Camera, RangeType, from_range
 from dsr.sample import Scene
@@ -45,7 +46,7 @@ class Folder:
 
     evaluation = False
 
-    def __init__(self, root: str, scenes: Wanted = None, name: str = "folder") -> None:
+    def __init__(self, root: str, scenes: SceneSelection = None, name: str = "folder") -> None:
         self.name = name
         self._root = Path(root).expanduser()
         if not self._root.is_dir():
@@ -107,11 +108,13 @@ def _first(folder: Path, names: Sequence[str]) -> Path:
 
 
 def _find_fine(folder: Path) -> Path | None:
-    """Return the file of the fine depth, None where there is none."""
+    """Return the file of the high-resolution depth, None where there is none."""
     found = [folder / f"{name}{suffix}" for name in _QUANTITIES for suffix in MAP_SUFFIXES]
     found = [path for path in found if path.is_file()]
     if len(found) > 1:
-        raise ValueError(f"{folder}: expected one fine depth map, got {', '.join(path.name for path in found)}")
+        raise ValueError(
+            f"{folder}: expected one high-resolution depth map, got {', '.join(path.name for path in found)}"
+        )
     return found[0] if found else None
 
 

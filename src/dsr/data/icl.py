@@ -11,9 +11,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from types import MappingProxyType
 
-from dsr.data.base import Wanted
+from dsr.data.base import SceneSelection
 from dsr.data.formats import icl_nuim
-from dsr.data.preparation.records import Native, Preparation, listed, records_of, renamed
+from dsr.data.preparation.records import Preparation, PreparedDataset, listed, records_of, renamed
 
 FRAMES = MappingProxyType(
     {
@@ -27,7 +27,7 @@ FRAMES = MappingProxyType(
 )
 
 
-class ICL(Native):
+class ICL(PreparedDataset):
     """Frames of ICL-NUIM.
 
     Args:
@@ -45,7 +45,7 @@ class ICL(Native):
     def __init__(
         self,
         root: str,
-        scenes: Wanted = None,
+        scenes: SceneSelection = None,
         size: int | None = 512,
         crop: float = 0.5,
         frames: Mapping[str, str] = FRAMES,

@@ -10,10 +10,10 @@ import functools
 from collections.abc import Collection, Sequence
 from pathlib import Path
 
-from dsr.data.base import Wanted
+from dsr.data.base import SceneSelection
 from dsr.data.download import catalogue
 from dsr.data.formats import middlebury
-from dsr.data.preparation.records import Native, Preparation, Record
+from dsr.data.preparation.records import Preparation, PreparedDataset, Record
 
 
 def _names(folders: Sequence[str]) -> tuple[str, ...]:
@@ -33,7 +33,7 @@ _WITHOUT_OFFSET = "depth is not metric: the disparity offset is left out, as in 
 _FILES_2014 = ("im0.png", "calib.txt", "disp0.pfm", "disp0GT.pfm")
 
 
-class Middlebury(Native):
+class Middlebury(PreparedDataset):
     """Scenes of Middlebury 2014.
 
     Args:
@@ -52,7 +52,7 @@ class Middlebury(Native):
     def __init__(
         self,
         root: str,
-        scenes: Wanted = None,
+        scenes: SceneSelection = None,
         size: int | None = 512,
         crop: float = 0.5,
         fill: Sequence[str] = ("vintage",),
@@ -65,7 +65,7 @@ class Middlebury(Native):
         )
 
 
-class MiddleburyLevels(Native):
+class MiddleburyLevels(PreparedDataset):
     """Scenes of Middlebury 2001, 2003, 2005 or 2006, with disparities in 8 bits.
 
     Args:
@@ -86,7 +86,7 @@ class MiddleburyLevels(Native):
         self,
         root: str,
         year: int,
-        scenes: Wanted = None,
+        scenes: SceneSelection = None,
         size: int | None = 512,
         crop: float = 0.5,
         fill: Sequence[str] = (),

@@ -10,15 +10,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from dsr.data.base import Wanted
+from dsr.data.base import SceneSelection
 from dsr.data.middlebury import EVALUATION_2014, SCENES, TRAINING_2014, records_2014, records_levels
-from dsr.data.preparation.records import Native, Preparation, Record
+from dsr.data.preparation.records import Preparation, PreparedDataset, Record
 
 MIDDLEBURY = {2001: SCENES[2001], 2006: SCENES[2006], 2014: TRAINING_2014}
 """Scenes by year."""
 
 
-class MiddleburyTrain(Native):
+class MiddleburyTrain(PreparedDataset):
     """Scenes of Middlebury 2001, 2006 and 2014 that nothing is evaluated on.
 
     Args:
@@ -35,7 +35,7 @@ class MiddleburyTrain(Native):
     evaluation = False
 
     def __init__(
-        self, root: str, scenes: Wanted = None, size: int | None = 720, years: Sequence[int] = tuple(MIDDLEBURY)
+        self, root: str, scenes: SceneSelection = None, size: int | None = 720, years: Sequence[int] = tuple(MIDDLEBURY)
     ) -> None:
         name, folder = "middlebury_train", Path(root).expanduser()
         found: dict[str, Record] = {}

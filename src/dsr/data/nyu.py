@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from dsr.data.base import Wanted
+from dsr.data.base import SceneSelection
 from dsr.data.formats import nyu
-from dsr.data.preparation.records import Native, Preparation, records_of
+from dsr.data.preparation.records import Preparation, PreparedDataset, records_of
 
 
-class NYU(Native):
+class NYU(PreparedDataset):
     """Labelled frames of NYU Depth v2: rooms by a Kinect (Silberman et al., ECCV 2012).
 
     Args:
@@ -27,7 +27,7 @@ class NYU(Native):
     def __init__(
         self,
         root: str,
-        scenes: Wanted = None,
+        scenes: SceneSelection = None,
         size: int | None = 512,
         crop: float = 0.5,
         filled: bool = False,

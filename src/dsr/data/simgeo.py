@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from dsr.data.base import Wanted, chosen
+from dsr.data.base import SceneSelection, chosen
 from dsr.data.folder import Folder
 from dsr.sample import Scene
 from dsr.synthetic.rendering import cached
@@ -32,7 +32,7 @@ class SimGeo:
     name = "simgeo"
     evaluation = True
 
-    def __init__(self, root: str | None = None, scenes: Wanted = None, size: int = 512) -> None:
+    def __init__(self, root: str | None = None, scenes: SceneSelection = None, size: int = 512) -> None:
         if size < 32:
             raise ValueError(f"dataset.size: expected at least 32 pixels, got {size}")
         self._size = size

@@ -9,9 +9,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Literal
 
-from dsr.data.base import Wanted
+from dsr.data.base import SceneSelection
 from dsr.data.formats import sintel
-from dsr.data.preparation.records import Native, Preparation, listed, records_of
+from dsr.data.preparation.records import Preparation, PreparedDataset, listed, records_of
 
 _SINTEL_THIRDS = 12
 """Of so many sequences a third frame is used: 2 x 23 + 12 = 58."""
@@ -26,7 +26,7 @@ def sintel_frames() -> tuple[str, ...]:
     return tuple(frames)
 
 
-class Sintel(Native):
+class Sintel(PreparedDataset):
     """Frames of MPI Sintel (Butler et al., ECCV 2012).
 
     Args:
@@ -46,7 +46,7 @@ class Sintel(Native):
     def __init__(
         self,
         root: str,
-        scenes: Wanted = None,
+        scenes: SceneSelection = None,
         size: int | None = None,
         rendering: Literal["clean", "final"] = "clean",
         farthest: float = sintel.FARTHEST,

@@ -9,9 +9,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
 
-from dsr.data.base import Wanted
+from dsr.data.base import SceneSelection
 from dsr.data.formats import sunrgbd
-from dsr.data.preparation.records import Native, Preparation, Record, listed, records_of, renamed
+from dsr.data.preparation.records import Preparation, PreparedDataset, Record, listed, records_of, renamed
 
 FRAMES = MappingProxyType(
     {
@@ -32,7 +32,7 @@ FRAMES = MappingProxyType(
 """Folders; where several scenes lie below one, its first."""
 
 
-class SunRGBD(Native):
+class SunRGBD(PreparedDataset):
     """Scenes of SUN RGB-D; what the sensor measured is taken for the truth, holes and all.
 
     Args:
@@ -52,7 +52,7 @@ class SunRGBD(Native):
     def __init__(
         self,
         root: str,
-        scenes: Wanted = None,
+        scenes: SceneSelection = None,
         size: int | None = 512,
         crop: float = 0.5,
         refined: bool = False,

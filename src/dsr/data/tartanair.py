@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from dsr.data.base import Wanted
+from dsr.data.base import SceneSelection
 from dsr.data.formats import tartanair
-from dsr.data.preparation.records import Native, Preparation, listed, records_of
+from dsr.data.preparation.records import Preparation, PreparedDataset, listed, records_of
 
 
-class TartanAir(Native):
+class TartanAir(PreparedDataset):
     """Frames of TartanAir: rendered outdoor and indoor scenes (Wang et al., IROS 2020).
 
     Args:
@@ -27,7 +27,7 @@ class TartanAir(Native):
     def __init__(
         self,
         root: str,
-        scenes: Wanted = None,
+        scenes: SceneSelection = None,
         size: int | None = 512,
         crop: float = 0.5,
         farthest: float = tartanair.FARTHEST,

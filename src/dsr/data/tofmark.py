@@ -13,16 +13,16 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from dsr.data.base import Wanted
+from dsr.data.base import SceneSelection
 from dsr.data.formats import tofmark
-from dsr.data.preparation.records import Native, Preparation, listed, records_of
+from dsr.data.preparation.records import Preparation, PreparedDataset, listed, records_of
 
 SCENES = ("books", "devil", "shark")
 ESTIMATED = (549.2, 549.2, 375.2, 334.3)
 """fx, fy, cx, cy in pixels of the 610 x 810 photos."""
 
 
-class ToFMark(Native):
+class ToFMark(PreparedDataset):
     """Scenes of ToFMark at their own size, the samples as measured maps at x4 and x8.
 
     Args:
@@ -40,7 +40,7 @@ class ToFMark(Native):
     def __init__(
         self,
         root: str,
-        scenes: Wanted = None,
+        scenes: SceneSelection = None,
         intrinsics: Sequence[float] | None = None,
         depth_range: Sequence[float] | None = None,
         variables: Mapping[str, str] | None = None,

@@ -1,7 +1,8 @@
-"""Downsampling models: how a fine depth map becomes a coarse one.
+"""Downsampling models: how a high-resolution depth map becomes a low-resolution one.
 
 Every model is a separable kernel, applied as two small matrices, so it is exact, batched and differentiable, and knows
-holes: an average runs over the known pixels alone. Kernels for factor f, in fine pixels from the coarse pixel's centre:
+holes: an average runs over the known pixels alone. Kernels for factor f, in high-resolution pixels from the
+    low-resolution pixel's centre:
 
 - ``box``: the mean of the f x f block.
 - ``nearest``: the block's pixel [f // 2, f // 2], as in ``depth[f // 2 :: f, f // 2 :: f]``.
@@ -61,12 +62,12 @@ class Downsampling:
         if not self.sigma >= _LEAST_SIGMA:
             raise ValueError(f"downsampling.sigma: expected at least {_LEAST_SIGMA} (of the scale), got {self.sigma}")
 
-    def believed(self) -> Downsampling:
+    def assumed_model(self) -> Downsampling:
         """Return the model that a method takes this one for."""
         return replace(self, kernel=self.assumed or self.kernel, assumed=None)
 
     def camera(self, camera: Camera, scale: int) -> Camera:
-        """Return the camera of the coarse map; ``nearest`` looks along other rays than the centred kernels do."""
+        """Return the camera of the LR map; ``nearest`` looks along other rays than the centred kernels do."""
         if self.kernel == "nearest":
             return camera.decimate(scale, scale // 2)
         return camera.coarser(scale)
@@ -74,8 +75,8 @@ class Downsampling:
     def __call__(self, values: Tensor, scale: int) -> Tensor:
         """Downsample maps.
 
-        A coarse pixel whose block has no known pixel is a hole. Where less than half of a kernel's weight falls on
-        known pixels, the mean of the block's known pixels stands in.
+        A low-resolution pixel whose block has no known pixel is a hole. Where less than half of a kernel's weight falls
+        on known pixels, the mean of the block's known pixels stands in.
 
         Args:
             values: (..., H, W), NaN where unknown; H and W divisible by ``scale``.
@@ -148,7 +149,7 @@ _PROFILES: dict[str, Callable[[Tensor, float], Tensor]] = {
 
 @dataclass(frozen=True)
 class Measured:
-    """The stand-in for a downsampling model where the scene brings a coarse map that a sensor measured.
+    """The stand-in for a downsampling model where the scene brings a low-resolution map that a sensor measured.
 
     Args:
         assumed: the kernel of the model that a method which needs one takes the sensor for.
@@ -157,7 +158,7 @@ class Measured:
 
     assumed: Kernel = "box"
 
-    def believed(self) -> Downsampling:
+    def assumed_model(self) -> Downsampling:
         """Return the model that a method takes the sensor for."""
         return Downsampling(self.assumed)
 
@@ -182,13 +183,13 @@ def make_sample(
     A size that the scale does not divide is cropped at the bottom and the right, and the sample's notes say so.
 
     Args:
-        scene: the fine maps.
+        scene: the high-resolution maps.
         scale: the upsampling factor, one of 2, 4, 8, 16.
-        downsampling: the model, or :class:`Measured` for the scene's own coarse map.
+        downsampling: the model, or :class:`Measured` for the scene's own low-resolution map.
         range_type: the type that the method works on.
-        noise: of the coarse map, unless it is measured.
+        noise: of the low-resolution map, unless it is measured.
         generator: of noise and holes, or a seed that gives each of them, in each scene, its own.
-        holes: where the coarse map loses its values.
+        holes: where the low-resolution map loses its values.
 
     Raises:
         ValueError: the scene lacks what the problem needs, or a value is out of range.
@@ -205,7 +206,7 @@ def make_sample(
         coarse, coarse_camera = _measured(scene, scale), scene.camera.coarser(scale)
     else:
         if scene.depth is None:
-            raise ValueError(f"{scene.name}: expected a fine depth map to downsample, there is none")
+            raise ValueError(f"{scene.name}: expected a high-resolution depth map to downsample, there is none")
         noisy = None if noise is None else (noise, of_noise)
         coarse, coarse_camera = downsampled(scene.depth, scene.camera, scale, downsampling, range_type, noisy)
     if holes is not None:
@@ -250,7 +251,7 @@ def downsampled(
     range_type: RangeType,
     noise: tuple[Noise, torch.Generator] | None = None,
 ) -> tuple[Tensor, Camera]:
-    """Return the coarse depth that a model and noise make of a fine one, and its camera; differentiable.
+    """Return the LR depth that a model and noise make of a HR one, and its camera; differentiable.
 
     Args:
         depth: (..., H, W) orthogonal depth in metres.
@@ -264,7 +265,7 @@ def downsampled(
     range_type = downsampling.range_type or range_type
     coarse_camera = downsampling.camera(camera, scale)
     fine = to_range(depth, camera, range_type)
-    if range_type == "disparity":  # in the coarse camera's pixels
+    if range_type == "disparity":  # in the low-resolution camera's pixels
         fine = fine / scale
     values = downsampling(fine, scale)
     if noise is not None:
@@ -278,8 +279,10 @@ def downsampled(
 
 
 def _measured(scene: Scene, scale: int) -> Tensor:
-    """Return the coarse depth that the scene brings."""
+    """Return the low-resolution depth that the scene brings."""
     if scale not in scene.measured:
         have = ", ".join(f"x{factor}" for factor in scene.measured) or "none"
-        raise ValueError(f"{scene.name}: downsampling=measured expects a coarse map at x{scale}, the scene has {have}")
+        raise ValueError(
+            f"{scene.name}: downsampling=measured expects a low-resolution map at x{scale}, the scene has {have}"
+        )
     return scene.measured[scale]

@@ -1,6 +1,6 @@
-"""Holes of coarse depth maps, as sensors leave them: blobs of any shape, and the strips that a second camera misses.
+"""Holes of LR depth maps, as sensors leave them: blobs of any shape, and the strips that a second camera misses.
 
-A kind of holes is a callable from a coarse map, its camera and a generator to a mask; see
+A kind of holes is a callable from a low-resolution map, its camera and a generator to a mask; see
 :func:`dsr.degradation.downsampling.make_sample`.
 """
 
@@ -25,7 +25,7 @@ class Blobs:
 
     Args:
         share: of the pixels.
-        size: typical diameter in coarse pixels.
+        size: typical diameter in low-resolution pixels.
 
     Raises:
         ValueError: the share is not between 0 and 1, or the size is below 1.
@@ -40,7 +40,7 @@ class Blobs:
         if not 0 < self.share < 1:
             raise ValueError(f"holes.share: expected a number above 0 and below 1, got {self.share}")
         if not self.size >= 1:
-            raise ValueError(f"holes.size: expected 1 or more coarse pixels, got {self.size}")
+            raise ValueError(f"holes.size: expected 1 or more low-resolution pixels, got {self.size}")
 
     def __call__(self, depth: Tensor, camera: Camera, generator: torch.Generator) -> Tensor:
         """Return where the holes are, (1, h, w); the share is met to the pixel."""

@@ -1,4 +1,4 @@
-"""Noise of coarse depth maps: multiplicative, and that of two kinds of sensors.
+"""Noise of low-resolution depth maps: multiplicative, and that of two kinds of sensors.
 
 A kind of noise says which range type it acts on and maps a coarse map in that type, with a generator, to a noisy one;
 see :func:`dsr.degradation.downsampling.make_sample`.
@@ -33,7 +33,7 @@ class Noise(Protocol):
 
 @dataclass(frozen=True)
 class GaussianMultiplicative:
-    """Noise of the coarse map: values times 1 + std N(0, 1), in the range type that is averaged (Voynov et al. 2019).
+    """Noise of the LR map: values times 1 + std N(0, 1), in the range type that is averaged (Voynov et al. 2019).
 
     Args:
         std: of the factor.
@@ -146,7 +146,7 @@ class Kinect:
         stereo_constant: of the sensor, baseline times focal length in metre pixels; 0.075 m x 580 px for a Kinect.
         dropout: probability that a pixel beside a depth edge is a hole.
         jump: relative difference of two neighbours' depths beyond which an edge lies between them.
-        reach: how many coarse pixels wide the band of dropouts is on each side of an edge, diagonally, too.
+        reach: how many low-resolution pixels wide the band of dropouts is on each side of an edge, diagonally, too.
         nearest, farthest: readings in metres that still count; null for no such limit.
 
     Raises:
@@ -173,7 +173,9 @@ class Kinect:
         if not 0 <= self.dropout <= 1:
             raise ValueError(f"noise.dropout: expected a number from 0 to 1, got {self.dropout}")
         if self.reach < 1 or not float(self.reach).is_integer():
-            raise ValueError(f"noise.reach: expected a positive whole number of coarse pixels, got {self.reach}")
+            raise ValueError(
+                f"noise.reach: expected a positive whole number of low-resolution pixels, got {self.reach}"
+            )
         for name in ("nearest", "farthest"):
             if getattr(self, name) is not None:
                 _check_positive(name, getattr(self, name))

@@ -41,7 +41,7 @@ def worst(findings: list[Finding]) -> Level:
 
 
 def with_depth(scene: Scene) -> Scene:
-    """Return the scene at the resolution of the depth to examine: of the fine one, else of the finest measured one."""
+    """Return the scene at the resolution of the depth to examine: of the HR one, else of the finest measured one."""
     if scene.depth is not None:
         return scene
     factor = min(scene.measured)
@@ -51,14 +51,14 @@ def with_depth(scene: Scene) -> Scene:
 
 
 def metres(scene: Scene) -> Array:
-    """Return a scene's fine depth, (H, W) float64 in metres, NaN in holes.
+    """Return a scene's high-resolution depth, (H, W) float64 in metres, NaN in holes.
 
     Raises:
         ValueError: it has none.
 
     """
     if scene.depth is None:
-        raise ValueError(f"{scene.name}: expected fine depth, there is none; see with_depth")
+        raise ValueError(f"{scene.name}: expected high-resolution depth, there is none; see with_depth")
     depth: Array = scene.depth[0].double().numpy()
     return depth
 

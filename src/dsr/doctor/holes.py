@@ -25,7 +25,7 @@ def check_holes(scene: Scene) -> list[Finding]:
     """Return how many pixels are holes, and which value of depth looks as if it meant one.
 
     Args:
-        scene: with fine depth.
+        scene: with high-resolution depth.
 
     """
     depth = metres(scene)

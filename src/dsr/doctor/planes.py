@@ -63,7 +63,7 @@ def check_planes(scene: Scene) -> list[Finding]:
     """Return whether flat surfaces are flat when the depth is taken as orthogonal.
 
     Args:
-        scene: with fine depth.
+        scene: with high-resolution depth.
 
     """
     depth = metres(scene)

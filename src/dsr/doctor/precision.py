@@ -15,7 +15,7 @@ from typing import Literal
 import numpy as np
 
 from dsr.doctor.finding import Array, Finding, Level, length, metres
-from dsr.geometry.camera import stereo_constant
+from dsr.geometry.camera import baseline_times_focal
 from dsr.sample import Scene
 
 Quantity = Literal["depth", "inverse depth", "distance along the ray"]
@@ -61,14 +61,14 @@ def check_precision(scene: Scene) -> list[Finding]:
     """Return whether the depth was rounded so much that it shows.
 
     Args:
-        scene: with fine depth.
+        scene: with high-resolution depth.
 
     """
     depth = metres(scene)
     factor = repeated(depth)
     if factor > 1:
         message = f"every value is repeated {factor} times across and down: a smaller map, enlarged"
-        advice = f"give the smaller map itself, as depth_lr{factor}, or find the fine one"
+        advice = f"give the smaller map itself, as depth_lr{factor}, or find the high-resolution one"
         return [Finding("precision", "problem", message, advice)]
     rounding = find_rounding(scene)
     count = np.unique(depth[np.isfinite(depth)]).size
@@ -171,4 +171,4 @@ def _source(scene: Scene, depth: Array, rounding: Rounding) -> str:
         return f"{rounding.quantity} comes in steps of {length(rounding.step)}"
     if scene.camera.baseline is None:
         return f"inverse depth comes in steps of {rounding.step:.2g} / m"
-    return f"disparity comes in steps of {rounding.step * stereo_constant(scene.camera):.2g} px"
+    return f"disparity comes in steps of {rounding.step * baseline_times_focal(scene.camera):.2g} px"

@@ -84,7 +84,7 @@ def check_registration(scene: Scene) -> list[Finding]:
     """Return whether the photo's edges lie on the depth's.
 
     Args:
-        scene: with fine depth.
+        scene: with high-resolution depth.
 
     """
     every = math.ceil(max(scene.camera.height, scene.camera.width) / _WORKING_SIZE)

@@ -27,14 +27,14 @@ _FACTORS: tuple[tuple[float, str], ...] = (
 _BASELINES = (1e-3, 5.0)
 """Metres between two cameras."""
 _AGREEMENT = 1.25
-"""Ratio of measured and fine depth beyond which they disagree."""
+"""Ratio of measured and high-resolution depth beyond which they disagree."""
 
 
 def check_units(scene: Scene) -> list[Finding]:
     """Return whether depth, baseline and measured maps are as far and as wide as metres are.
 
     Args:
-        scene: with fine depth.
+        scene: with high-resolution depth.
 
     """
     depth = metres(scene)
@@ -81,7 +81,7 @@ def _baseline(scene: Scene) -> list[Finding]:
 
 
 def _measured(scene: Scene, depth: Array) -> list[Finding]:
-    """Return where a measured coarse map disagrees with the fine one."""
+    """Return where a measured low-resolution map disagrees with the high-resolution one."""
     findings = []
     for factor, coarse in sorted(scene.measured.items()):
         values = coarse[0].double().numpy()
@@ -92,7 +92,7 @@ def _measured(scene: Scene, depth: Array) -> list[Finding]:
             continue
         ratio = float(np.median(values[both] / fine[both]))
         if not 1 / _AGREEMENT <= ratio <= _AGREEMENT:
-            message = f"the measured map at x{factor} is {ratio:.3g} times as far as the fine depth"
-            advice = "give both in one unit; the disparity of a coarse map is in pixels of its own"
+            message = f"the measured map at x{factor} is {ratio:.3g} times as far as the high-resolution depth"
+            advice = "give both in one unit; the disparity of a low-resolution map is in pixels of its own"
             findings.append(Finding("units", "problem", message, advice))
     return findings

@@ -28,7 +28,7 @@ from dsr.degradation.downsampling import Downsampling, Measured, make_sample
 from dsr.degradation.holes import Holes
 from dsr.degradation.noise import Noise
 from dsr.evaluation.store import iterations_path, load_prediction, prediction_path, save_scene, scene_path
-from dsr.methods.base import Iterative, NoAnswerError, Upsampler
+from dsr.methods.base import Iterative, NoSolutionError, Upsampler
 from dsr.metrics.catalogue import WORST, Metric, score_image
 from dsr.sample import DepthSample
 from dsr.utils.console import one_line
@@ -61,7 +61,7 @@ Steps = Callable[[str], AbstractContextManager[Callable[[int, int], object]]]
 
 
 @dataclass(frozen=True)
-class Study:
+class Evaluation:
     """What is evaluated: one method on one data set under one downsampling model.
 
     Args:
@@ -74,8 +74,8 @@ class Study:
         seed: of whatever is random.
         config: all that the predictions depend on besides the scene, as plain values; stored with each.
         device: where predictions and scores are computed.
-        noise: of the coarse maps.
-        holes: where the coarse maps lose their values.
+        noise: of the low-resolution maps.
+        holes: where the low-resolution maps lose their values.
         label: the method's name for readers; empty where that is ``method_name``.
 
     """
@@ -119,7 +119,7 @@ class Outcome:
         unanswered: scene and why the method has no answer for it, one line each.
         notes: scene and what a reader of the scores should know.
         seconds: computing time per scene.
-        unscored: scenes without a fine depth map to compare with.
+        unscored: scenes without a high-resolution depth map to compare with.
 
     """
 
@@ -137,7 +137,7 @@ class StalePredictionError(ValueError):
 
 
 def predict(
-    study: Study, folder: Path, progress: Progress, *, steps: Steps | None = None, overwrite: bool = False
+    study: Evaluation, folder: Path, progress: Progress, *, steps: Steps | None = None, overwrite: bool = False
 ) -> Outcome:
     """Write the prediction of every scene that has none yet to ``folder / "predictions"``.
 
@@ -166,7 +166,7 @@ def predict(
                 outcome.reused.append(scene)
         except StalePredictionError:
             raise
-        except NoAnswerError as error:
+        except NoSolutionError as error:
             outcome.unanswered[scene] = _failure(scene, error)
             path.unlink(missing_ok=True)
         except (ValueError, OSError) as error:
@@ -175,7 +175,7 @@ def predict(
 
 
 def score(
-    study: Study,
+    study: Evaluation,
     folder: Path,
     metrics: tuple[Metric, ...],
     outcome: Outcome,
@@ -219,7 +219,7 @@ def score(
     return scores
 
 
-def summary(study: Study, scores: pd.DataFrame, outcome: Outcome) -> dict[str, Any]:
+def summary(study: Evaluation, scores: pd.DataFrame, outcome: Outcome) -> dict[str, Any]:
     """Return means over the scenes of each metric (worst of four lights where it has lights) and how the run went."""
     worst = scores[scores["variant"].isin(["", WORST])]
     means = worst.groupby("metric", sort=False)["value"].mean()
@@ -267,7 +267,9 @@ def _seconds_of_current(path: Path, config: Mapping[str, Any]) -> float | None:
     )
 
 
-def _predict_scene(study: Study, scene: str, folder: Path, config: Mapping[str, Any], steps: Steps | None) -> float:
+def _predict_scene(
+    study: Evaluation, scene: str, folder: Path, config: Mapping[str, Any], steps: Steps | None
+) -> float:
     """Compute and write one prediction, and how the iteration went; return the seconds that the method took."""
     sample = study.sample(scene)
     start = time.perf_counter()
@@ -295,7 +297,7 @@ def _answer(method: Upsampler, sample: DepthSample, steps: Steps | None) -> Tens
 
 
 def _score_scene(
-    study: Study, sample: DepthSample, depth: Tensor, metrics: tuple[Metric, ...]
+    study: Evaluation, sample: DepthSample, depth: Tensor, metrics: tuple[Metric, ...]
 ) -> Iterator[dict[str, Any]]:
     """Yield the rows of one scene; none where there is no truth."""
     if sample.depth is None:

@@ -30,7 +30,7 @@ _DIGEST = 8
 """Of a hash, as many digits are shown."""
 
 
-class Problem(NamedTuple):
+class BenchmarkSetting(NamedTuple):
     """What methods are compared on: a data set, a scale, a degradation."""
 
     dataset: str
@@ -71,9 +71,9 @@ class Run:
     unanswered: Mapping[str, str] = field(default_factory=dict)
 
     @property
-    def problem(self) -> Problem:
+    def problem(self) -> BenchmarkSetting:
         """What it answers."""
-        return Problem(self.dataset, self.scale, self.downsampling)
+        return BenchmarkSetting(self.dataset, self.scale, self.downsampling)
 
     def prediction(self, scene: str) -> Tensor:
         """Return the predicted depth, (1, H, W) in metres, NaN in holes.
@@ -85,7 +85,7 @@ class Run:
         return load_prediction(prediction_path(self.folder, scene))
 
     def scene(self, scene: str) -> StoredScene:
-        """Return the problem that a scene posed.
+        """Return the problem that a scene apply_dihedral.
 
         Raises:
             ValueError: the file is damaged, or missing as in a run of an older dsr.
@@ -94,7 +94,7 @@ class Run:
         return load_scene(scene_path(self.folder, scene))
 
     def has_scene(self, scene: str) -> bool:
-        """Return whether the problem that a scene posed is kept."""
+        """Return whether the problem that a scene apply_dihedral is kept."""
         return scene_path(self.folder, scene).is_file()
 
 
@@ -121,11 +121,11 @@ class Results:
         """Return the labels of the methods, in order."""
         return sorted({run.label for run in self.runs}, key=_method_key)
 
-    def problems(self) -> list[Problem]:
+    def problems(self) -> list[BenchmarkSetting]:
         """Return what was evaluated, in order."""
         return list(dict.fromkeys(run.problem for run in self.runs))
 
-    def of(self, problem: Problem) -> list[Run]:
+    def of(self, problem: BenchmarkSetting) -> list[Run]:
         """Return the runs that answer a problem, in order."""
         return [run for run in self.runs if run.problem == problem]
 
@@ -311,7 +311,7 @@ def _newest(runs: Sequence[Run]) -> tuple[list[Run], list[str]]:
     return kept, notes
 
 
-def _problem_key(problem: Problem) -> tuple[Any, ...]:
+def _problem_key(problem: BenchmarkSetting) -> tuple[Any, ...]:
     """Order data sets as the paper does, others after them."""
     return (*_rank(problem.dataset.partition(" (")[0], _DATASET_ORDER), problem)
 

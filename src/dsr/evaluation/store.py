@@ -1,8 +1,9 @@
 """What the directory of an evaluation holds of each scene: the prediction, and the problem that it answers.
 
 ``predictions/SCENE.npz`` has ``depth`` (H, W) in metres, NaN in holes, and where it came from. ``scenes/SCENE.npz`` has
-the photo, the coarse input, the truth and their cameras, so that whatever is drawn from a run later, on any machine,
-needs nothing but its directory. ``iterations/SCENE.csv`` says how the iteration went, of a method that iterates.
+the photo, the low-resolution input, the truth and their cameras, so that whatever is drawn from a run later, on any
+machine, needs nothing but its directory. ``iterations/SCENE.csv`` says how the iteration went, of a method that
+iterates.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ class StoredScene:
         dataset, name: together they identify the scene.
         scale: the upsampling factor.
         rgb: (3, H, W) float32 in [0, 1], to 8 bits.
-        camera: of the photo and the fine depth.
+        camera: of the photo and the high-resolution depth.
         coarse: (1, h, w) float32 the input, orthogonal depth in metres, NaN in holes.
         camera_lr: of the input.
         depth: (1, H, W) float32 the truth, likewise; None where it is not known.
@@ -54,7 +55,7 @@ def prediction_path(folder: Path, scene: str) -> Path:
 
 
 def scene_path(folder: Path, scene: str) -> Path:
-    """Return where a run keeps the problem that a scene posed."""
+    """Return where a run keeps the problem that a scene apply_dihedral."""
     return folder / "scenes" / f"{scene}.npz"
 
 

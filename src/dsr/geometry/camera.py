@@ -157,7 +157,7 @@ def to_range(depth: Tensor, camera: Camera, range_type: RangeType) -> Tensor:
     if range_type == "perspective":
         return depth * camera.ray_lengths(dtype=depth.dtype, device=depth.device)
     if range_type == "disparity":
-        return stereo_constant(camera) / depth - camera.doffs
+        return baseline_times_focal(camera) / depth - camera.doffs
     raise ValueError(f"range_type: expected one of {', '.join(RANGE_TYPES)}, got {range_type!r}")
 
 
@@ -172,10 +172,10 @@ def from_range(values: Tensor, camera: Camera, range_type: RangeType) -> Tensor:
         return values / camera.ray_lengths(dtype=values.dtype, device=values.device)
     if range_type == "disparity":
         shifted = values + camera.doffs
-        return stereo_constant(camera) / torch.where(shifted > 0, shifted, torch.nan)  # no 0 * inf in gradients
+        return baseline_times_focal(camera) / torch.where(shifted > 0, shifted, torch.nan)  # no 0 * inf in gradients
     raise ValueError(f"range_type: expected one of {', '.join(RANGE_TYPES)}, got {range_type!r}")
 
 
-def stereo_constant(camera: Camera) -> float:
+def baseline_times_focal(camera: Camera) -> float:
     """Return baseline * fx in metre pixels, with the virtual baseline where the camera has none."""
     return (VIRTUAL_BASELINE if camera.baseline is None else camera.baseline) * camera.fx

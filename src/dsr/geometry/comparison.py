@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from dsr.geometry.shading import render
-from dsr.geometry.surface import normals_of
+from dsr.geometry.surface import depth_to_normals
 
 
 def comparison(depth: Tensor, truth: Tensor | None, rays: Tensor) -> Tensor:
@@ -22,10 +22,10 @@ def comparison(depth: Tensor, truth: Tensor | None, rays: Tensor) -> Tensor:
         first light, and below under the last. Without a truth (1, 2 H, W), the result's alone.
 
     """
-    result = render(normals_of(depth, rays))[0]  # (4, H, W)
+    result = render(depth_to_normals(depth, rays))[0]  # (4, H, W)
     columns = [result]
     if truth is not None:
-        real = render(normals_of(truth, rays))[0]
+        real = render(depth_to_normals(truth, rays))[0]
         columns += [real, (2 * (result - real).abs()).clamp(max=1)]
     rows = [torch.cat([each[light] for each in columns], dim=-1) for light in (0, -1)]
     return torch.cat(rows, dim=-2)[None].nan_to_num(0).float().cpu()

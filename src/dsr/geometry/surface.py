@@ -20,7 +20,7 @@ def points_of(depth: Tensor, rays: Tensor) -> Tensor:
     return depth * rays
 
 
-def normals_of(depth: Tensor, rays: Tensor, dtype: torch.dtype | None = None) -> Tensor:
+def depth_to_normals(depth: Tensor, rays: Tensor, dtype: torch.dtype | None = None) -> Tensor:
     """Return the unit normals of the surface, facing the camera (n . r < 0).
 
     First-order forward differences along u and v, the last column's and row's differences repeated:

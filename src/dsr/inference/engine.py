@@ -1,4 +1,4 @@
-"""Upsampling of one photo's depth: coarse map in, fine map out."""
+"""Upsampling of one photo's depth: low-resolution map in, high-resolution map out."""
 
 from __future__ import annotations
 
@@ -50,7 +50,8 @@ def upsample_depth(
         scale: see :func:`dsr.inference.plan`.
         method: one of ``METHODS``, or ``auto``, see :func:`dsr.inference.inspection.suited_method`.
         device: ``auto`` for a GPU where there is one, else as torch names it.
-        keep_holes: whether pixels whose own depth, or nearest coarse pixel, is unknown stay NaN; else they are filled.
+        keep_holes: whether pixels whose own depth, or nearest low-resolution pixel, is unknown stay NaN; else they are
+            filled.
         progress: is told how many parts are done, and of how many.
 
     Returns:
@@ -90,7 +91,7 @@ def upsample_depth(
 def _answer(
     rgb: Tensor, inverse: Tensor, camera: Camera, scale: int | None, method: str, device: str, progress: Progress | None
 ) -> Tensor:
-    """Return fine inverse depth, (1, H, W), of coarse inverse depth, (1, h, w)."""
+    """Return high-resolution inverse depth, (1, H, W), of low-resolution inverse depth, (1, h, w)."""
     size = (camera.height, camera.width)
     if method in INTERPOLATIONS:
         interpolation = Interpolation(cast("Order", method), fill_holes=True)
@@ -101,7 +102,7 @@ def _answer(
     if method in PRIORS:
         return _optimised(rgb, inverse, camera, planned.steps[0], method, on)
     networks = [_network(method, step, on) for step in planned.steps]
-    sizes = [_size(inverse)]  # of the coarse map of each step
+    sizes = [_size(inverse)]  # of the low-resolution map of each step
     sizes += [(-(-size[0] // step), -(-size[1] // step)) for step in planned.steps[1:]]
     parts = [net.parts(step * s[0], step * s[1]) for net, step, s in zip(networks, planned.steps, sizes, strict=True)]
     for i, (net, coarse_size) in enumerate(zip(networks, sizes, strict=True)):

@@ -8,7 +8,7 @@ from torch import Tensor
 from dsr.degradation.downsampling import Downsampling
 from dsr.geometry.camera import Camera
 from dsr.inference.planning import OWN_SIZE, USUAL_SCALE
-from dsr.methods.dip.noise import noise_level, tilt_of
+from dsr.methods.dip.noise import noise_level, normal_noise_deg
 
 CLEAN, NOISY = "facets", "msg_v_noisy"
 LARGEST_TILT = 8.0
@@ -21,8 +21,8 @@ _LARGEST_RATIO = 4.2
 def suited_method(depth: Tensor, camera: Camera, scale: int | None = None) -> str:
     """Return the network for a depth map: one that was trained on noisy depth where the map is noisy.
 
-    With noise that tilts the coarse map's normals (:func:`dsr.methods.dip.noise.tilt_of`) by so many degrees RMSE_v on
-    Lucy and Plant at x4 is
+    With noise that tilts the low-resolution map's normals (:func:`dsr.methods.dip.noise.normal_noise_deg`) by so many
+    degrees RMSE_v on Lucy and Plant at x4 is
 
     | tilt | 2, 2 | 7, 5 | 12, 9 | 22, 17 | 37, 30 |
     | --- | --- | --- | --- | --- | --- |
@@ -39,12 +39,12 @@ def suited_method(depth: Tensor, camera: Camera, scale: int | None = None) -> st
     ratio = max(camera.height / coarse.shape[-2], camera.width / coarse.shape[-1])
     if scale not in _SCALES_OF_NOISY or ratio > _LARGEST_RATIO:
         return CLEAN
-    tilt = tilt_of(noise_level(coarse[None]), camera.rescale(coarse.shape[-1], coarse.shape[-2]))
+    tilt = normal_noise_deg(noise_level(coarse[None]), camera.rescale(coarse.shape[-1], coarse.shape[-2]))
     return NOISY if tilt > LARGEST_TILT else CLEAN
 
 
 def _coarse(depth: Tensor, camera: Camera, scale: int | None) -> Tensor:
-    """Return the coarse map that a network will be given, about."""
+    """Return the low-resolution map that a network will be given, about."""
     height, width = depth.shape[-2:]
     if camera.height > OWN_SIZE * height or camera.width > OWN_SIZE * width:
         return depth

@@ -1,7 +1,7 @@
 """What is going to be done with a photo and a depth map of given sizes, and what it costs.
 
-Networks are trained for fixed factors. A coarse depth map stays as it is: the photo is resized to a multiple of its
-size, the network answers at that size, and the answer is resized to the photo (:mod:`dsr.inference.resampling`).
+Networks are trained for fixed factors. A low-resolution depth map stays as it is: the photo is resized to a multiple of
+its size, the network answers at that size, and the answer is resized to the photo (:mod:`dsr.inference.resampling`).
 RMSE_v and RMSE_d in mm of Facets on Lucy and Plant, box averages at the ratio given, means of both scenes:
 
 | ratio | so, x4 | so, x8 | depth resized instead, x4 | x8 | cubic spline |
@@ -51,7 +51,7 @@ class Plan:
         method: the method.
         scale: by how much finer depth becomes, about.
         steps: the networks' factors, one after the other; empty for interpolation.
-        coarsened: by how much depth of the photo's own size is made coarser first; 1 for coarse depth.
+        coarsened: by how much depth of the photo's own size is made coarser first; 1 for low-resolution depth.
         text: this, and the memory that it takes, in one line.
 
     """
@@ -68,8 +68,8 @@ def plan(
 ) -> Plan:
     """Return what :func:`dsr.inference.upsample_depth` does.
 
-    A depth map of the photo's size that turns out to be enlarged by repeating pixels is taken for the coarse map that
-    it was, whatever the plan says.
+    A depth map of the photo's size that turns out to be enlarged by repeating pixels is taken for the low-resolution
+    map that it was, whatever the plan says.
 
     Args:
         photo_size: height and width.

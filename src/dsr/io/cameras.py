@@ -13,7 +13,7 @@ import numpy as np
 
 from dsr.data.formats.files import CameraFile, read_camera
 from dsr.geometry.camera import Camera
-from dsr.io.encoding import Fact
+from dsr.io.encoding import Assumption
 from dsr.io.photos import Size, focal_in_exif, same_aspect
 
 _ASSUMED_FOV = 60.0
@@ -50,7 +50,7 @@ class CameraChoice:
             raise ValueError(f"--intrinsics: expected FX FY CX CY in pixels, FX and FY above 0, got {came}")
 
 
-def camera_of(choice: CameraChoice, photo: Path, size: Size, coarse: Size) -> tuple[CameraFile, list[Fact]]:
+def camera_of(choice: CameraChoice, photo: Path, size: Size, coarse: Size) -> tuple[CameraFile, list[Assumption]]:
     """Return the camera of a photo's pixels, with what its file says of depth, and what was assumed.
 
     Args:
@@ -73,14 +73,14 @@ def camera_of(choice: CameraChoice, photo: Path, size: Size, coarse: Size) -> tu
     equivalent = focal_in_exif(photo)
     if equivalent is not None:
         focal = equivalent / _FILM_DIAGONAL * math.hypot(width, height)
-        fact = Fact(
+        fact = Assumption(
             "camera: focal length from the photo's EXIF data, principal point in the middle",
             f"{equivalent:g} mm for 35 mm film = {focal:.5g} pixels",
         )
         return _alone(_centred(size, focal)), [fact]
     focal = width / 2 / math.tan(math.radians(_ASSUMED_FOV) / 2)
     text = f"camera: none given, {_ASSUMED_FOV:g} degrees of horizontal view assumed (--camera, --fov or --intrinsics)"
-    return _alone(_centred(size, focal)), [Fact(text, f"{focal:.5g} pixels")]
+    return _alone(_centred(size, focal)), [Assumption(text, f"{focal:.5g} pixels")]
 
 
 def read_any_camera(path: Path) -> CameraFile | np.ndarray:
@@ -118,7 +118,9 @@ def _centred(size: Size, focal: float) -> Camera:
     return Camera(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
 
 
-def _fitted(path: Path, content: CameraFile | np.ndarray, size: Size, coarse: Size) -> tuple[CameraFile, list[Fact]]:
+def _fitted(
+    path: Path, content: CameraFile | np.ndarray, size: Size, coarse: Size
+) -> tuple[CameraFile, list[Assumption]]:
     """Return a file's camera for the pixels of the photo."""
     height, width = size
     if isinstance(content, np.ndarray):
@@ -134,16 +136,16 @@ def _fitted(path: Path, content: CameraFile | np.ndarray, size: Size, coarse: Si
             f"{width} x {height}, another aspect"
         )
     text = f"camera: that of {camera.width} x {camera.height} pixels is scaled to the photo's {width} x {height}"
-    return replace(content, camera=camera.rescale(width, height)), [*facts, Fact(text)]
+    return replace(content, camera=camera.rescale(width, height)), [*facts, Assumption(text)]
 
 
-def _sized(path: Path, matrix: np.ndarray, size: Size, coarse: Size) -> tuple[CameraFile, list[Fact]]:
+def _sized(path: Path, matrix: np.ndarray, size: Size, coarse: Size) -> tuple[CameraFile, list[Assumption]]:
     """Return the camera of a matrix: of the photo's pixels, or else of the depth map's, by its principal point."""
     for name, (height, width) in (("photo", size), ("depth map", coarse)):
         cx, cy = matrix[0, 2], matrix[1, 2]
         if max(abs((cx + 0.5) / width - 0.5), abs((cy + 0.5) / height - 0.5)) <= _OFF_CENTRE:
             camera = Camera(width, height, matrix[0, 0], matrix[1, 1], cx, cy)
-            return _alone(camera), [Fact(f"camera: the matrix is taken for one of the {name}'s pixels")]
+            return _alone(camera), [Assumption(f"camera: the matrix is taken for one of the {name}'s pixels")]
     raise ValueError(
         f"{path}: expected a principal point near the middle of the photo, {size[1]} x {size[0]} pixels (width x "
         f"height), or of the depth map, {coarse[1]} x {coarse[0]}; got {cx:g}, {cy:g}"

@@ -26,7 +26,7 @@ _UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
 _LARGEST_UNIT = 1e6
 
 
-class Fact(NamedTuple):
+class Assumption(NamedTuple):
     """Something that was assumed or found.
 
     Attributes:
@@ -81,11 +81,11 @@ def parse_unit(text: str) -> float:
     return unit
 
 
-def find_holes(values: np.ndarray, hole_value: float | None) -> tuple[np.ndarray, float, list[Fact]]:
+def find_holes(values: np.ndarray, hole_value: float | None) -> tuple[np.ndarray, float, list[Assumption]]:
     """Return where a stored map is unknown, the value that marks a hole in it, and what was assumed.
 
-    Whole numbers have holes at 0 and at the largest number of their type, floats at 0, below, at NaN and infinities;
-    both at ``hole_value`` too.
+    GlobalContext numbers have holes at 0 and at the largest number of their type, floats at 0, below, at NaN and
+    infinities; both at ``hole_value`` too.
 
     Args:
         values: (h, w) as stored.
@@ -107,7 +107,7 @@ def find_holes(values: np.ndarray, hole_value: float | None) -> tuple[np.ndarray
     holes = np.logical_or.reduce(list(kinds.values()))
     found = {name: float(mask.mean()) for name, mask in kinds.items() if mask.any()}
     facts = [
-        Fact(f"values that are {name} count as holes" if name != "0" else "zeros count as holes", f"{share:.1%}")
+        Assumption(f"values that are {name} count as holes" if name != "0" else "zeros count as holes", f"{share:.1%}")
         for name, share in found.items()
     ]
     return holes, _mark(values, found, hole_value), facts
@@ -123,7 +123,7 @@ def _mark(values: np.ndarray, found: dict[str, float], hole_value: float | None)
     return {"0": 0.0, "infinity": math.inf}.get(max(found, key=found.__getitem__, default=""), math.nan)
 
 
-def guess_unit(name: str, values: np.ndarray, holes: np.ndarray) -> tuple[float, list[Fact]]:
+def guess_unit(name: str, values: np.ndarray, holes: np.ndarray) -> tuple[float, list[Assumption]]:
     """Return metres per value of a stored map, told from its type and its median, and what was assumed.
 
     Args:
@@ -138,24 +138,26 @@ def guess_unit(name: str, values: np.ndarray, holes: np.ndarray) -> tuple[float,
     middle = float(np.median(values[~holes]))
     if values.dtype.kind == "f":
         if middle > _FLOAT_MILLIMETRES:
-            return 1e-3, [Fact("floats this large are taken for millimetres", f"median {middle:.4g}")]
-        facts = [Fact("floats are taken for metres", f"median {middle:.3g} m")]
+            return 1e-3, [Assumption("floats this large are taken for millimetres", f"median {middle:.4g}")]
+        facts = [Assumption("floats are taken for metres", f"median {middle:.3g} m")]
         if middle < _NEAREST:
-            facts.append(Fact("the depth is nearer than 5 cm: is it in metres? --depth-unit gives another unit"))
+            facts.append(Assumption("the depth is nearer than 5 cm: is it in metres? --depth-unit gives another unit"))
         return 1.0, facts
     if _NEAREST <= middle * 1e-3 <= _FARTHEST:
-        facts = [Fact("whole numbers are taken for millimetres", f"median {middle * 1e-3:.3g} m")]
+        facts = [Assumption("whole numbers are taken for millimetres", f"median {middle * 1e-3:.3g} m")]
         if middle * 1e-3 > _FAR_FOR_A_SENSOR:
             facts.append(
-                Fact("that is far for a sensor: TUM and ICL-NUIM store 1/5000 m, SUN RGB-D 1/8000 m (--depth-unit)")
+                Assumption(
+                    "that is far for a sensor: TUM and ICL-NUIM store 1/5000 m, SUN RGB-D 1/8000 m (--depth-unit)"
+                )
             )
         if holes.mean() > _SPARSE:
-            facts.append(Fact("that is sparse, as of a laser scanner: KITTI stores 1/256 m (--depth-unit 1/256)"))
+            facts.append(Assumption("that is sparse, as of a laser scanner: KITTI stores 1/256 m (--depth-unit 1/256)"))
         return 1e-3, facts
     for unit, label in _OTHER_UNITS:
         if _NEAREST <= middle * unit <= _FARTHEST:
             why = f"as millimetres the median would be {middle * 1e-3:.3g} m, now {middle * unit:.3g} m"
-            return unit, [Fact(f"whole numbers are taken for {label}", why)]
+            return unit, [Assumption(f"whole numbers are taken for {label}", why)]
     raise ValueError(f"{name}: no usual unit makes its median of {middle:g} a distance; give one with --depth-unit")
 
 
@@ -176,7 +178,7 @@ def decode(values: np.ndarray, holes: np.ndarray, encoding: Encoding, camera: Ca
 def encode(depth: Tensor, encoding: Encoding, camera: Camera) -> tuple[np.ndarray, int]:
     """Return depth as a file stores it, and how many known pixels it cannot hold: those become holes.
 
-    Whole numbers are rounded to the nearest.
+    GlobalContext numbers are rounded to the nearest.
 
     Args:
         depth: (1, H, W) orthogonal metres, NaN in holes.

@@ -13,7 +13,7 @@ from torch import Tensor
 from dsr.geometry.camera import Camera
 from dsr.geometry.mesh import LARGEST_STEP, MOST_VERTICES, Mesh, triangulate, vertex_normals
 from dsr.geometry.shading import LIGHT_NAMES, render
-from dsr.geometry.surface import normals_of
+from dsr.geometry.surface import depth_to_normals
 from dsr.io.model_files import write_glb, write_ply
 from dsr.utils.files import replacing
 
@@ -24,7 +24,7 @@ _STRIP = 1 << 20
 def normal_strips(depth: Tensor, camera: Camera) -> Iterator[tuple[slice, Tensor]]:
     """Yield the rows of one strip after another, and its normals, (3, rows, W) float32, NaN where unknown.
 
-    The strips together are what :func:`dsr.geometry.surface.normals_of` gives for the whole map, (1, H, W).
+    The strips together are what :func:`dsr.geometry.surface.depth_to_normals` gives for the whole map, (1, H, W).
     """
     height, width = camera.height, camera.width
     rows = max(1, _STRIP // width)
@@ -32,7 +32,7 @@ def normal_strips(depth: Tensor, camera: Camera) -> Iterator[tuple[slice, Tensor
         stop = min(start + rows, height)
         first, last = max(0, min(start, height - 2)), min(stop + 1, height)
         part = depth[None, :, first:last].double()
-        normals = normals_of(part, camera.crop(first, 0, last - first, width).rays()[None], torch.float32)[0]
+        normals = depth_to_normals(part, camera.crop(first, 0, last - first, width).rays()[None], torch.float32)[0]
         yield slice(start, stop), normals[:, start - first : stop - first]
 
 

@@ -13,7 +13,7 @@ from dsr.data.formats.files import CameraFile, read_mask
 from dsr.geometry.camera import Camera, RangeType
 from dsr.io.cameras import CameraChoice, camera_of
 from dsr.io.depth_files import read_depth_file
-from dsr.io.encoding import Encoding, Fact, decode, find_holes, guess_unit
+from dsr.io.encoding import Assumption, Encoding, decode, find_holes, guess_unit
 from dsr.io.names import words_of
 from dsr.io.pairs import Pair
 from dsr.io.photos import Size, read_photo, same_aspect
@@ -58,10 +58,10 @@ class Picture:
     coarse: Tensor
     camera: Camera
     encoding: Encoding
-    facts: tuple[Fact, ...]
+    facts: tuple[Assumption, ...]
 
 
-UnitMemory = dict[tuple[Path, str, str], tuple[float, list[Fact]]]
+UnitMemory = dict[tuple[Path, str, str], tuple[float, list[Assumption]]]
 """Units told from a first depth map, by folder, suffix and type of value: the maps beside it have the same."""
 
 
@@ -104,7 +104,7 @@ def read_picture(pair: Pair, reading: Reading, units: UnitMemory) -> Picture:
     return Picture(rgb, coarse, camera, encoding, all_facts)
 
 
-def _cut_to_multiple(pixels: np.ndarray, factor: int | None, coarse: Size) -> tuple[np.ndarray, list[Fact]]:
+def _cut_to_multiple(pixels: np.ndarray, factor: int | None, coarse: Size) -> tuple[np.ndarray, list[Assumption]]:
     """Return the part of a photo that a map ``factor`` times coarser covers."""
     if factor is None:
         return pixels, []
@@ -112,7 +112,7 @@ def _cut_to_multiple(pixels: np.ndarray, factor: int | None, coarse: Size) -> tu
     if covered.shape == pixels.shape or covered.shape[:2] != (coarse[0] * factor, coarse[1] * factor):
         return pixels, []
     return covered, [
-        Fact("the photo is cut to the part that the depth map covers", f"{pixels.shape[1]} x {pixels.shape[0]}")
+        Assumption("the photo is cut to the part that the depth map covers", f"{pixels.shape[1]} x {pixels.shape[0]}")
     ]
 
 
@@ -131,12 +131,12 @@ def _expect_coarser(pair: Pair, size: Size, coarse: Size) -> None:
         raise ValueError(f"{pair.depth}: expected at least 2 x 2 pixels, got {narrow} x {low}")
 
 
-def _camera(pair: Pair, reading: Reading, size: Size, coarse: Size) -> tuple[CameraFile, list[Fact]]:
+def _camera(pair: Pair, reading: Reading, size: Size, coarse: Size) -> tuple[CameraFile, list[Assumption]]:
     """Return the camera that the user gives, else the one beside the pictures, else one assumed."""
     if reading.camera != CameraChoice() or pair.camera is None:
         return camera_of(reading.camera, pair.rgb, size, coarse)
     described, facts = camera_of(CameraChoice(file=pair.camera), pair.rgb, size, coarse)
-    return described, [Fact(f"camera: {pair.camera.name} beside the pictures"), *facts]
+    return described, [Assumption(f"camera: {pair.camera.name} beside the pictures"), *facts]
 
 
 def _mask(path: Path, size: Size) -> np.ndarray:
@@ -150,18 +150,20 @@ def _mask(path: Path, size: Size) -> np.ndarray:
     return mask
 
 
-def _range_type(pair: Pair, reading: Reading, described: CameraFile, camera: Camera) -> tuple[RangeType, list[Fact]]:
+def _range_type(
+    pair: Pair, reading: Reading, described: CameraFile, camera: Camera
+) -> tuple[RangeType, list[Assumption]]:
     """Return what the values measure: as the user says, else by the file's name, else by the camera file."""
-    facts: list[Fact] = []
+    facts: list[Assumption] = []
     if reading.range_type is not None:
         range_type = reading.range_type
     elif _DISPARITY_WORDS & set(words_of(pair.depth.stem)):
         range_type = "disparity"
-        facts.append(Fact("values are taken for disparities, by the file's name"))
+        facts.append(Assumption("values are taken for disparities, by the file's name"))
     else:
         range_type = described.range_type or "orthogonal"
         if described.range_type not in (None, "orthogonal"):
-            facts.append(Fact(f"values are of range type {range_type}, says the camera file"))
+            facts.append(Assumption(f"values are of range type {range_type}, says the camera file"))
     if range_type == "disparity" and camera.baseline is None:
         raise ValueError(f"{pair.depth}: disparities need the distance between the two cameras: --baseline METRES")
     return range_type, facts
@@ -170,14 +172,14 @@ def _range_type(pair: Pair, reading: Reading, described: CameraFile, camera: Cam
 def _unit(
     pair: Pair, reading: Reading, described: CameraFile, range_type: RangeType,
     stored: np.ndarray, holes: np.ndarray, units: UnitMemory,
-) -> tuple[float, list[Fact]]:  # fmt: skip
+) -> tuple[float, list[Assumption]]:  # fmt: skip
     """Return metres per value (for disparities, pixels), and what was assumed."""
     if reading.unit is not None:
         return reading.unit, []
     if range_type == "disparity":
-        return 1.0, [Fact("disparities are taken for pixels of the depth map")]
+        return 1.0, [Assumption("disparities are taken for pixels of the depth map")]
     if described.depth_unit is not None:
-        return described.depth_unit, [Fact(f"unit: {described.depth_unit:g} m per value, says the camera file")]
+        return described.depth_unit, [Assumption(f"unit: {described.depth_unit:g} m per value, says the camera file")]
     if pair.unit is not None:
         return pair.unit, []
     kind = (pair.depth.parent, pair.depth.suffix.lower(), str(stored.dtype))

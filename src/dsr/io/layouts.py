@@ -11,9 +11,9 @@ import numpy as np
 
 from dsr.data.formats.files import read_pixels
 from dsr.io.depth_files import DEPTH_SUFFIXES
-from dsr.io.encoding import Fact
+from dsr.io.encoding import Assumption
 from dsr.io.names import match_times, role_of, role_of_words, words_of
-from dsr.io.pairs import Found, Pair, camera_beside, matched, named_apart, pairs_of_two_folders, pictures_in
+from dsr.io.pairs import Pair, PairingResult, camera_beside, matched, named_apart, pairs_of_two_folders, pictures_in
 
 _COARSE = re.compile(r"(depth|disparity)_lr(\d+)")
 _TUM_UNIT = 1 / 5000
@@ -21,7 +21,7 @@ _DEEPEST = 3
 """Folders below the one given that are looked through."""
 
 
-def pairs_of_folder(folder: Path, leave: Path | None = None) -> Found:
+def pairs_of_folder(folder: Path, leave: Path | None = None) -> PairingResult:
     """Return the pairs in a folder of any layout, or in the folders in it.
 
     Known are: a scene of dsr (``rgb.png``, ``camera.json`` and ``depth*`` or ``disparity*``); lists of TUM RGB-D
@@ -42,10 +42,10 @@ def pairs_of_folder(folder: Path, leave: Path | None = None) -> Found:
     if not found.pairs:
         alone = f"; {len(found.alone)} pictures have no partner" if found.alone else ""
         raise ValueError(f"{folder}: expected photos and depth maps that belong together, found no pair{alone}")
-    return Found(named_apart(found.pairs), found.facts, found.alone)
+    return PairingResult(named_apart(found.pairs), found.facts, found.alone)
 
 
-def _search(folder: Path, root: Path, leave: Path | None, depth: int) -> Found:
+def _search(folder: Path, root: Path, leave: Path | None, depth: int) -> PairingResult:
     """Return the pairs in a folder, else those of the folders in it together."""
     for layout in (_scene, _tum, _role_folders, _side_by_side):
         found = layout(folder)
@@ -64,36 +64,36 @@ def _search(folder: Path, root: Path, leave: Path | None, depth: int) -> Found:
     ]
     facts = tuple(dict.fromkeys(fact for _, below in deeper for fact in below.facts))
     alone = (*found.alone, *(path for _, below in deeper for path in below.alone))
-    return Found(tuple(pairs), facts, alone)
+    return PairingResult(tuple(pairs), facts, alone)
 
 
-def _scene(folder: Path) -> Found:
-    """Return the pair of dsr's own layout: its coarse map, the finest of several, else the fine one."""
+def _scene(folder: Path) -> PairingResult:
+    """Return the pair of dsr's own layout: its LR map, the finest of several, else the HR one."""
     photo = next((folder / name for name in ("rgb.png", "rgb.jpg", "rgb.jpeg") if (folder / name).is_file()), None)
     if photo is None or not (folder / "camera.json").is_file():
-        return Found(())
+        return PairingResult(())
     maps = sorted(path for path in folder.iterdir() if path.suffix.lower() in DEPTH_SUFFIXES)
     coarse = {path: int(match[2]) for path in maps if (match := _COARSE.fullmatch(path.stem)) and int(match[2]) > 0}
     camera = folder / "camera.json"
     if coarse:
         path = min(coarse, key=coarse.__getitem__)
-        return Found((Pair(folder.name, photo, path, camera, None, None, coarse[path]),))
+        return PairingResult((Pair(folder.name, photo, path, camera, None, None, coarse[path]),))
     fine = [path for path in maps if path.stem in ("depth", "disparity")]
     mask = folder / "mask.png"
     pairs = [Pair(folder.name, photo, path, camera, mask if mask.is_file() else None) for path in fine[:1]]
-    return Found(tuple(pairs))
+    return PairingResult(tuple(pairs))
 
 
-def _tum(folder: Path) -> Found:
+def _tum(folder: Path) -> PairingResult:
     """Return the pairs of TUM's lists of times and files."""
     lists = folder / "rgb.txt", folder / "depth.txt"
     if not all(path.is_file() for path in lists):
-        return Found(())
+        return PairingResult(())
     photos, depths = (_timed(path) for path in lists)
     partner = match_times(photos, depths)
     pairs = tuple(Pair(path.stem, path, partner[path], unit=_TUM_UNIT) for path in photos if path in partner)
     alone = [path for path in (*photos, *depths) if path not in partner and path not in partner.values()]
-    return Found(pairs, (Fact("rgb.txt and depth.txt of TUM RGB-D: depth in 1/5000 m"),), tuple(alone))
+    return PairingResult(pairs, (Assumption("rgb.txt and depth.txt of TUM RGB-D: depth in 1/5000 m"),), tuple(alone))
 
 
 def _timed(path: Path) -> dict[Path, float]:
@@ -110,7 +110,7 @@ def _timed(path: Path) -> dict[Path, float]:
     return times
 
 
-def _role_folders(folder: Path) -> Found:
+def _role_folders(folder: Path) -> PairingResult:
     """Return the pairs of two folders in a folder that are named for photos and for depth maps."""
     named: dict[str, list[Path]] = {"rgb": [], "depth": [], "other": []}
     for path in sorted(folder.iterdir(), key=lambda path: (len(path.name), path.name)):
@@ -118,15 +118,15 @@ def _role_folders(folder: Path) -> Found:
         if role is not None and pictures_in(path):
             named[role].append(path)
     if not named["rgb"] or not named["depth"]:
-        return Found(())
+        return PairingResult(())
     found = pairs_of_two_folders(named["rgb"][0], named["depth"][0], ())
     extra = [path.name for paths in (named["rgb"], named["depth"]) for path in paths[1:]]
     text = f"folders {named['rgb'][0].name} and {named['depth'][0].name}"
-    fact = Fact(text + (f"; not looked at: {', '.join(extra)}" if extra else ""))
+    fact = Assumption(text + (f"; not looked at: {', '.join(extra)}" if extra else ""))
     return replace(found, facts=(fact, *found.facts))
 
 
-def _side_by_side(folder: Path) -> Found:
+def _side_by_side(folder: Path) -> PairingResult:
     """Return the pairs among the files of a folder."""
     roles = {path: role_of(path) for path in pictures_in(folder)}
     photos = [path for path, role in roles.items() if role == "rgb"]

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from dsr.io.depth_files import DEPTH_SUFFIXES
-from dsr.io.encoding import Fact
+from dsr.io.encoding import Assumption
 from dsr.io.names import PHOTO_SUFFIXES, match_names
 
 CAMERA_NAMES = (
@@ -40,7 +40,7 @@ class Pair:
 
 
 @dataclass(frozen=True)
-class Found:
+class PairingResult:
     """What was found.
 
     Args:
@@ -51,11 +51,11 @@ class Found:
     """
 
     pairs: tuple[Pair, ...]
-    facts: tuple[Fact, ...] = ()
+    facts: tuple[Assumption, ...] = ()
     alone: tuple[Path, ...] = ()
 
 
-def pairs_of_lists(photos: Sequence[Path], depths: Sequence[Path], masks: Sequence[Path] = ()) -> Found:
+def pairs_of_lists(photos: Sequence[Path], depths: Sequence[Path], masks: Sequence[Path] = ()) -> PairingResult:
     """Return the pairs of files in the order given, or of two folders by the names in them.
 
     Raises:
@@ -84,10 +84,10 @@ def pairs_of_lists(photos: Sequence[Path], depths: Sequence[Path], masks: Sequen
     ]
     if masks:
         pairs = [replace(pair, mask=mask) for pair, mask in zip(pairs, masks, strict=True)]
-    return Found(named_apart(pairs))
+    return PairingResult(named_apart(pairs))
 
 
-def pairs_of_two_folders(photos: Path, depths: Path, masks: Sequence[Path]) -> Found:
+def pairs_of_two_folders(photos: Path, depths: Path, masks: Sequence[Path]) -> PairingResult:
     """Return the pairs of two folders by name."""
     if masks:
         raise ValueError("--mask: expected photos and depth maps as files, one for each mask; got folders")
@@ -112,13 +112,13 @@ def camera_beside(folder: Path, root: Path) -> Path | None:
     return next((place / name for place in places for name in CAMERA_NAMES if (place / name).is_file()), None)
 
 
-def matched(photos: Iterable[Path], depths: Iterable[Path]) -> Found:
+def matched(photos: Iterable[Path], depths: Iterable[Path]) -> PairingResult:
     """Return the pairs among photos and depth maps by name; see :func:`dsr.io.names.match_names`."""
     photos, depths = list(photos), list(depths)
     matches = match_names(photos, depths)
     used = {path for match in matches for path in match}
     alone = tuple(path for path in (*photos, *depths) if path not in used)
-    return Found(tuple(Pair(rgb.stem, rgb, depth) for rgb, depth in matches), (), alone)
+    return PairingResult(tuple(Pair(rgb.stem, rgb, depth) for rgb, depth in matches), (), alone)
 
 
 def pictures_in(folder: Path) -> list[Path]:

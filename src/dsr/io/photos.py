@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from dsr.data.formats.files import read_pixels
-from dsr.io.encoding import Fact
+from dsr.io.encoding import Assumption
 
 _ORIENTATION, _EXIF_IFD, _EXIF_FOCAL_35 = 0x0112, 0x8769, 0xA405
 _ASPECT_TOLERANCE = 0.02
@@ -29,7 +29,7 @@ Size = tuple[int, int]
 """Height and width in pixels."""
 
 
-def read_photo(path: Path, coarse: Size) -> tuple[np.ndarray, list[Fact]]:
+def read_photo(path: Path, coarse: Size) -> tuple[np.ndarray, list[Assumption]]:
     """Return the photo, (H, W, 3) uint8 RGB, as it lies in its file; turned upright where depth fits that alone."""
     if path.suffix.lower() in (".heic", ".heif"):
         raise ValueError(f"{path}: expected a JPEG or PNG photo, got HEIC; export it as JPEG")
@@ -39,8 +39,12 @@ def read_photo(path: Path, coarse: Size) -> tuple[np.ndarray, list[Fact]]:
         return pixels, []
     size: Size = (pixels.shape[0], pixels.shape[1])
     if orientation >= 5 and not same_aspect(size, coarse) and same_aspect(size[::-1], coarse):
-        return _TURNS[orientation](pixels), [Fact("the photo is turned as its EXIF data say: so the depth map fits")]
-    return pixels, [Fact("the photo's EXIF orientation is left out: the depth map is taken to lie as the file does")]
+        return _TURNS[orientation](pixels), [
+            Assumption("the photo is turned as its EXIF data say: so the depth map fits")
+        ]
+    return pixels, [
+        Assumption("the photo's EXIF orientation is left out: the depth map is taken to lie as the file does")
+    ]
 
 
 def same_aspect(first: Size, second: Size) -> bool:

@@ -1,4 +1,4 @@
-"""What every super-resolution method is: a callable from a sample to fine depth."""
+"""What every super-resolution method is: a callable from a sample to high-resolution depth."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from dsr.methods.tiling import Progress
 from dsr.sample import DepthSample
 
 
-class NoAnswerError(ValueError):
+class NoSolutionError(ValueError):
     """A method has no answer for an image, through no fault of the image's: a result to report, as papers do."""
 
 
@@ -27,12 +27,12 @@ class Upsampler(Protocol):
     range_type: RangeType
 
     def __call__(self, sample: DepthSample) -> Tensor:
-        """Return the fine orthogonal depth, (1, H, W) in metres on the sample's device, NaN where there is none.
+        """Return the HR orthogonal depth, (1, H, W) in metres on the sample's device, NaN where there is none.
 
         A method never reads ``sample.depth``.
 
         Raises:
-            NoAnswerError: it has none for this image.
+            NoSolutionError: it has none for this image.
 
         """
         ...

@@ -1,8 +1,8 @@
 """Answering an image window by window, so that memory is bounded whatever the image's size.
 
-An image is cut into tiles of coarse pixels. A tile's answer is computed from a window which holds the tile, half of the
-overlap with its neighbours, and as much around that as the answer depends on, so tiles answer alike where they overlap;
-there they are blended with linear ramps, whose weights add up to 1.
+An image is cut into tiles of low-resolution pixels. A tile's answer is computed from a window which holds the tile,
+half of the overlap with its neighbours, and as much around that as the answer depends on, so tiles answer alike where
+they overlap; there they are blended with linear ramps, whose weights add up to 1.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ def part_of(progress: Progress | None, before: int, total: int) -> Progress | No
 
 @dataclass(frozen=True)
 class Span:
-    """A tile along one axis, in coarse pixels.
+    """A tile along one axis, in low-resolution pixels.
 
     Args:
         read: what its window holds.
@@ -39,7 +39,7 @@ class Span:
     ramps: tuple[int, int]
 
     def weights(self, scale: int) -> Tensor:
-        """Return how much each kept fine pixel counts, (scale * kept,) float32: 1, and linear ramps at the ends."""
+        """Return how much each kept HR pixel counts, (scale * kept,) float32: 1, and linear ramps at the ends."""
         size = scale * (self.kept.stop - self.kept.start)
         weights = torch.ones(size)
         first, last = (scale * ramp for ramp in self.ramps)
@@ -52,10 +52,11 @@ def spans(size: int, tile: int, reach: int, overlap: int) -> list[Span]:
     """Return the tiles along an axis, as equal in size as whole pixels allow.
 
     Args:
-        size: of the image in coarse pixels.
+        size: of the image in low-resolution pixels.
         tile: the most of them that a tile has, without the overlap.
         reach: how far beyond a pixel its answer looks.
-        overlap: the width that neighbouring tiles share, an even number of coarse pixels; tiles are at least as wide.
+        overlap: the width that neighbouring tiles share, an even number of low-resolution pixels; tiles are at least as
+            wide.
 
     Raises:
         ValueError: a number is out of range.
@@ -88,11 +89,11 @@ def blended(
     """Return the image that the tiles' answers make up.
 
     Args:
-        answer: from rows and columns of coarse pixels to their fine pixels, (B, C, scale * rows, scale * columns); it
-            may leave out a fine row and column at the end, and so will the image.
+        answer: from rows and columns of low-resolution pixels to their high-resolution pixels, (B, C, scale * rows,
+            scale * columns); it may leave out a high-resolution row and column at the end, and so will the image.
         rows: the tiles along the rows, of :func:`spans`.
         columns: the same along the columns.
-        scale: fine pixels per coarse one.
+        scale: high-resolution pixels per low-resolution one.
         progress: is told after each tile.
 
     Returns:
@@ -125,7 +126,7 @@ def blended(
 
 
 def _places(span: Span, scale: int, size: int) -> tuple[slice, slice]:
-    """Return which fine pixels of the image a tile's kept ones are, and where they lie in its answer."""
+    """Return which high-resolution pixels of the image a tile's kept ones are, and where they lie in its answer."""
     first, last = scale * span.kept.start, min(scale * span.kept.stop, size)
     offset = scale * span.read.start
     return slice(first, last), slice(first - offset, last - offset)

@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from dsr.geometry.shading import lights, shade
-from dsr.geometry.surface import length, normal_mask, normals_of
+from dsr.geometry.surface import depth_to_normals, length, normal_mask
 
 SSIM_WINDOW = 7
 SSIM_DATA_RANGE = 2.0
@@ -81,7 +81,9 @@ class SurfacePair:
     @cached_property
     def normals(self) -> tuple[Tensor, Tensor]:
         """The two normal maps, (B, 3, H, W); meaningful where ``normal_mask`` is set."""
-        first, second = (normals_of(depth, self.rays, self.image_dtype) for depth in (self.prediction, self.target))
+        first, second = (
+            depth_to_normals(depth, self.rays, self.image_dtype) for depth in (self.prediction, self.target)
+        )
         return first, second
 
     @cached_property

@@ -15,10 +15,10 @@ import torch
 from torch import Tensor
 from torch.utils.data import Dataset
 
-from dsr.geometry.camera import stereo_constant
+from dsr.geometry.camera import baseline_times_focal
 from dsr.sample import AllHolesError, DepthSample, Scene
 from dsr.training.augmentation import Variation, window
-from dsr.training.problem import Batch, Problem, tensors_of
+from dsr.training.problem import Batch, Degradation, tensors_of
 
 _TRIES, _MOST_TRIES = 10, 100
 """Of windows in a scene, and of scenes."""
@@ -84,7 +84,7 @@ class Patches(Dataset[Batch]):
         self,
         groups: Sequence[Sequence[Scene]],
         settings: PatchSettings,
-        problem: Problem,
+        problem: Degradation,
         *,
         shares: Sequence[float] | None = None,
         seed: int = 0,
@@ -121,7 +121,9 @@ class Patches(Dataset[Batch]):
         for _ in range(_MOST_TRIES):
             with contextlib.suppress(AllHolesError):
                 return self._patch(random)
-        raise ValueError("patches: expected coarse maps with a known pixel or more; noise makes all of them holes")
+        raise ValueError(
+            "patches: expected low-resolution maps with a known pixel or more; noise makes all of them holes"
+        )
 
     def _patch(self, random: np.random.Generator) -> Batch:
         """Return a random patch."""
@@ -162,17 +164,17 @@ class Patches(Dataset[Batch]):
         """Return the bounds to normalise a patch with, (2, 1, 1).
 
         In use a network sees whole images, whose disparities span more than a patch's. So half of the patches get the
-        bounds of the scene that they are cut from (of its coarse map), the others something in between.
+        bounds of the scene that they are cut from (of its low-resolution map), the others something in between.
         """
         near, far = extent
-        stereo, doffs = stereo_constant(sample.camera), sample.camera.doffs
+        stereo, doffs = baseline_times_focal(sample.camera), sample.camera.doffs
         whole = torch.tensor([stereo / (factor * far) - doffs, stereo / (factor * near) - doffs]).view(2, 1, 1)
         whole = torch.stack((torch.minimum(whole[0], own[0]), torch.maximum(whole[1], own[1])))
         share = random.random() if random.random() < 0.5 else 1.0
         return own + share * (whole - own)
 
     def _extent(self, group: int, number: int) -> tuple[float, float]:
-        """Return the nearest and the farthest depth of a scene's coarse map, in metres."""
+        """Return the nearest and the farthest depth of a scene's low-resolution map, in metres."""
         key = group, number
         if key not in self._extents:
             depth = self._problem.sample(self._groups[group][number], clean=True).depth_lr

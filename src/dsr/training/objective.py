@@ -24,8 +24,8 @@ _DEPTH_LOSSES = {"lap1": losses.lap1, "l1": losses.l1, "mse": losses.mse}
 class Objective:
     """The loss: depth_loss + w MSE_v (Voynov et al. 2019, eq. 4: Lap_1 + w MSE_v).
 
-    The depth loss is taken of disparities over the range of the coarse ones, so that it does not depend on the scene's
-    size.
+    The depth loss is taken of disparities over the range of the low-resolution ones, so that it does not depend on the
+    scene's size.
 
     Args:
         depth_loss: ``lap1``, ``l1`` or ``mse``.
@@ -73,7 +73,7 @@ def balanced_weight(patches: Iterable[Batch]) -> float:
     """Return the w that gives both terms of the loss the same size for one and the same error.
 
     A depth error of tan(a) z / f metres between two neighbouring pixels, z / f metres apart, tilts the normal by a. As
-    a share of the coarse disparities' range the depth term sees stereo tan(a) / (f z range), and MSE_v sees
+    a share of the low-resolution disparities' range the depth term sees stereo tan(a) / (f z range), and MSE_v sees
     (2 - 2 cos a) / 3. w is their ratio for a tilt of 1.1 degrees, which changes a rendering by 5 of 255, at
     the median over the patches.
 

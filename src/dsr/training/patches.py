@@ -16,7 +16,7 @@ from torch.utils.data import DataLoader, Dataset
 from dsr.data.base import SceneSource, content_of
 from dsr.sample import Scene
 from dsr.training.cropping import Patches, PatchSettings, check_patches
-from dsr.training.problem import Batch, Problem, tensors_of
+from dsr.training.problem import Batch, Degradation, tensors_of
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class Part:
 class WholeScenes(Dataset[Batch]):
     """The samples of whole scenes, in float64 as evaluation scores them."""
 
-    def __init__(self, scenes: Sequence[Scene], problem: Problem, seed: int = 0) -> None:
+    def __init__(self, scenes: Sequence[Scene], problem: Degradation, seed: int = 0) -> None:
         self._samples = [problem.sample(scene, seed) for scene in scenes]
 
     def __len__(self) -> int:
@@ -75,7 +75,7 @@ class PatchData(lightning.LightningDataModule):
         self,
         parts: Sequence[Part],
         settings: PatchSettings,
-        problem: Problem,
+        problem: Degradation,
         *,
         seed: int = 0,
         validation: Mapping[str, SceneSource] | None = None,

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from dsr.degradation.downsampling import Downsampling, make_sample
 from dsr.degradation.noise import Noise
-from dsr.geometry.camera import stereo_constant, to_range
+from dsr.geometry.camera import baseline_times_focal, to_range
 from dsr.sample import DepthSample, Scene
 
 Batch = dict[str, Tensor]
@@ -18,8 +18,8 @@ _LEAST_SPAN = 1e-3
 
 
 @dataclass(frozen=True)
-class Problem:
-    """What is to be undone: how coarse maps come from fine ones.
+class Degradation:
+    """What is to be undone: how low-resolution maps come from high-resolution ones.
 
     Args:
         scale, downsampling, noise: as for :func:`dsr.degradation.downsampling.make_sample`.
@@ -31,7 +31,7 @@ class Problem:
     noise: Noise | None = None
 
     def sample(self, scene: Scene, generator: torch.Generator | int = 0, *, clean: bool = False) -> DepthSample:
-        """Return the problem that a scene poses, its coarse map made of disparity."""
+        """Return the problem that a scene poses, its low-resolution map made of disparity."""
         noise = None if clean else self.noise
         return make_sample(scene, self.scale, self.downsampling, "disparity", noise, generator)
 
@@ -44,9 +44,9 @@ def tensors_of(sample: DepthSample, dtype: torch.dtype = torch.float32) -> Batch
         dtype: of all but the photo and the bounds.
 
     Returns:
-        ``rgb`` (3, H, W) and ``bounds`` (2, 1, 1), lowest and highest coarse disparity, in float32; in ``dtype``
-        ``disparity_lr`` (1, h, w) in pixels of the photo's camera, ``depth`` (1, H, W) metres, ``rays`` (3, H, W),
-        ``stereo`` (1, 1, 1) baseline times fx and ``doffs`` (1, 1, 1).
+        ``rgb`` (3, H, W) and ``bounds`` (2, 1, 1), lowest and highest low-resolution disparity, in float32; in
+        ``dtype`` ``disparity_lr`` (1, h, w) in pixels of the photo's camera, ``depth`` (1, H, W) metres, ``rays`` (3,
+        H, W), ``stereo`` (1, 1, 1) baseline times fx and ``doffs`` (1, 1, 1).
 
     """
     if sample.depth is None:
@@ -58,7 +58,7 @@ def tensors_of(sample: DepthSample, dtype: torch.dtype = torch.float32) -> Batch
         "disparity_lr": disparity.to(dtype),
         "depth": sample.depth.to(dtype),
         "rays": camera.rays(dtype=dtype),
-        "stereo": torch.full((1, 1, 1), stereo_constant(camera), dtype=dtype),
+        "stereo": torch.full((1, 1, 1), baseline_times_focal(camera), dtype=dtype),
         "doffs": torch.full((1, 1, 1), camera.doffs, dtype=dtype),
         "bounds": _bounds(disparity).float(),
     }

@@ -12,7 +12,7 @@ from typing import Any
 
 from torch import Tensor
 
-from dsr.evaluation.results import Problem, Results, Run, one_per_method
+from dsr.evaluation.results import BenchmarkSetting, Results, Run, one_per_method
 from dsr.user_study.key import KEY_NAME, PAGE_VERSION, Candidate, Key, Trial, read_key, write_key
 from dsr.user_study.page import page_of
 from dsr.user_study.pictures import grey_png, shading_of
@@ -56,7 +56,7 @@ class Choice:
 class Question:
     """A scene and the runs to show of it, in the order of the results."""
 
-    problem: Problem
+    problem: BenchmarkSetting
     scene: str
     runs: tuple[Run, ...]
 

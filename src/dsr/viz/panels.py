@@ -20,7 +20,7 @@ from torch.nn import functional
 
 from dsr.geometry.camera import Camera
 from dsr.geometry.shading import LIGHT_NAMES, render
-from dsr.geometry.surface import normals_of
+from dsr.geometry.surface import depth_to_normals
 from dsr.metrics.catalogue import METRICS
 from dsr.sample import DepthSample
 from dsr.utils.files import replacing
@@ -192,7 +192,7 @@ def _colour_bar(axis: Axes, image: Any, label: str, extend: str = "neither") -> 
 
 def normals_seen_by(camera: Camera, depth: Tensor) -> Tensor:
     """Return the normals of a depth map, (1, H, W) in metres, as (1, 3, H, W), NaN where unknown."""
-    return normals_of(depth.double()[None], camera.rays()[None])
+    return depth_to_normals(depth.double()[None], camera.rays()[None])
 
 
 def _write_scores(axis: Axes, scores: Mapping[str, float]) -> None:

@@ -59,8 +59,8 @@ class _Row:
 def save_contact_sheet(path: Path, scenes: Iterable[Scene], title: str) -> list[Path]:
     """Draw the photo, depth, holes and renderings of scenes, a row each, and write the pages atomically.
 
-    Scenes are taken one by one, so there may be more of them than fit into memory. One without a fine depth shows its
-    coarsest measured map.
+    Scenes are taken one by one, so there may be more of them than fit into memory. One without a high-resolution depth
+    shows its coarsest measured map.
 
     Args:
         path: a PNG; where there are more than six scenes, of each page: ``NAME-1.png``, ``NAME-2.png``, ...
@@ -128,7 +128,11 @@ def _shown_map(scene: Scene) -> tuple[Tensor, Camera, list[str]]:
     factor = max(scene.measured)
     coarse = scene.measured[factor]
     size = f"{coarse.shape[-1]} x {coarse.shape[-2]}"
-    return coarse, scene.camera.coarser(factor), [f"measured: {measured}; no fine depth", f"shown: x{factor}, {size}"]
+    return (
+        coarse,
+        scene.camera.coarser(factor),
+        [f"measured: {measured}; no high-resolution depth", f"shown: x{factor}, {size}"],
+    )
 
 
 def _field_of_view(camera: Camera) -> tuple[float, float]:

@@ -19,7 +19,7 @@ from torch import Tensor
 from dsr.geometry.camera import Camera
 from dsr.geometry.shading import LIGHT_NAMES
 from dsr.io.depth_files import DEPTH_SUFFIXES, write_depth_file
-from dsr.io.encoding import Encoding, Fact, encode
+from dsr.io.encoding import Assumption, Encoding, encode
 from dsr.io.exports import write_cloud, write_mesh, write_normals, write_renderings
 from dsr.io.inputs import Picture
 from dsr.utils.files import replacing, write_text
@@ -41,7 +41,7 @@ _PACKAGES = ("torch", "numpy", "opencv-python-headless")
 
 
 @dataclass(frozen=True)
-class Earlier:
+class PreviousRun:
     """What ``info.json`` says of an earlier run.
 
     Args:
@@ -73,7 +73,7 @@ def output_encoding(encoding: Encoding, wanted: str | None) -> Encoding:
     return Encoding(f".{wanted}", "float32", 1.0, math.nan, "orthogonal")
 
 
-def read_earlier(folder: Path) -> Earlier | None:
+def read_previous_run(folder: Path) -> PreviousRun | None:
     """Return what an earlier run left in a folder, None where there was none.
 
     Raises:
@@ -85,7 +85,7 @@ def read_earlier(folder: Path) -> Earlier | None:
         return None
     try:
         entries = json.loads(path.read_text(encoding="utf-8"))
-        return Earlier(
+        return PreviousRun(
             entries["complete"] is True, dict(entries["settings"]), dict(entries["inputs"]), tuple(entries["files"])
         )
     except (ValueError, KeyError, TypeError, RecursionError) as error:
@@ -115,7 +115,7 @@ def expect_free(folder: Path, inputs: Iterable[Path], *, ours: bool) -> None:
 
 def write_parts(
     folder: Path, picture: Picture, depth: Tensor, parts: Sequence[str], encoding: Encoding, title: str
-) -> tuple[list[str], list[Fact]]:
+) -> tuple[list[str], list[Assumption]]:
     """Write the parts of a result.
 
     Args:
@@ -131,7 +131,7 @@ def write_parts(
 
     """
     rgb, camera = picture.rgb, picture.camera
-    facts: list[Fact] = []
+    facts: list[Assumption] = []
     files: list[str] = []
     if "depth" in parts:
         files, facts = _write_depth(folder, depth, camera, encoding)
@@ -145,28 +145,28 @@ def write_parts(
         try:
             write_mesh([folder / name for name in _FILES["mesh"]], rgb, depth, camera)
         except ValueError as error:
-            facts.append(Fact("no mesh", str(error)))
+            facts.append(Assumption("no mesh", str(error)))
             parts = [part for part in parts if part != "mesh"]
     if "before_after" in parts:
         write_before_after(folder / "before_after.png", rgb, picture.coarse, depth, camera, title)
     return [*files, *(name for part in parts if part != "depth" for name in _FILES[part])], facts
 
 
-def _write_depth(folder: Path, depth: Tensor, camera: Camera, encoding: Encoding) -> tuple[list[str], list[Fact]]:
+def _write_depth(folder: Path, depth: Tensor, camera: Camera, encoding: Encoding) -> tuple[list[str], list[Assumption]]:
     """Write the depth as the input counts, and in metres where that is something else."""
     values, lost = encode(depth, encoding, camera)
     name = f"depth{encoding.suffix}"
     facts = []
     if lost:
         text = f"{name}: what {encoding.dtype} values of this unit cannot hold is written as a hole; {METRES} has all"
-        facts.append(Fact(text, f"{lost} pixels"))
+        facts.append(Assumption(text, f"{lost} pixels"))
     write_depth_file(folder / name, values)
     if replace(encoding, hole=0.0) == Encoding(".npy", "float32", 1.0, 0.0, "orthogonal") and math.isnan(encoding.hole):
         return [name], facts
     with replacing(folder / METRES) as temporary:
         np.save(temporary, depth[0].float().cpu().numpy())
     if np.dtype(encoding.dtype).kind in "iu":
-        facts.append(Fact(f"{name} is in whole numbers like the input; {METRES} is not rounded"))
+        facts.append(Assumption(f"{name} is in whole numbers like the input; {METRES} is not rounded"))
     return [name, METRES], facts
 
 
@@ -185,7 +185,7 @@ def begin(folder: Path, settings: Mapping[str, Any], inputs: Mapping[str, Any], 
     write_text(folder / INFO, json.dumps(entries, indent=2) + "\n")
 
 
-def finish(folder: Path, earlier: Earlier | None, entries: Mapping[str, Any], files: Sequence[str]) -> None:
+def finish(folder: Path, earlier: PreviousRun | None, entries: Mapping[str, Any], files: Sequence[str]) -> None:
     """Write ``info.json`` of a finished run; files of an earlier one that are no part of it are removed."""
     for name in () if earlier is None else earlier.files:
         if name not in files and any(name in names for names in _FILES.values()):

@@ -10,7 +10,7 @@ import torch
 from rich.console import Console
 from rich.progress import Progress
 
-from dsr.io.encoding import Fact
+from dsr.io.encoding import Assumption
 from dsr.utils.console import one_line, show
 
 _SHOWN = 5
@@ -28,7 +28,7 @@ class Reporter:
         """Show a line."""
         show(self._console, line)
 
-    def facts(self, facts: Sequence[Fact]) -> None:
+    def facts(self, facts: Sequence[Assumption]) -> None:
         """Show those facts that no picture before had."""
         for fact in facts:
             if not self._counts[fact.text]:

@@ -14,7 +14,7 @@ from dsr.utils.hashing import file_hash
 
 
 @dataclass(frozen=True)
-class Wanted:
+class UpsampleRequest:
     """What the user asks for.
 
     Args:
@@ -64,7 +64,7 @@ class Wanted:
             raise ValueError("--mask: expected --rgb and --depth with it, got folders")
 
 
-def settings_of(wanted: Wanted) -> dict[str, Any]:
+def settings_of(wanted: UpsampleRequest) -> dict[str, Any]:
     """Return what a result depends on beside its inputs, as JSON has it."""
     reading = asdict(wanted.reading)
     choice = reading.pop("camera")

@@ -15,28 +15,28 @@ from rich.progress import Progress
 from torch import Tensor
 
 from dsr.app.upsample.outputs import (
-    Earlier,
+    PreviousRun,
     begin,
     described,
     expect_free,
     finish,
     kept_depth,
     output_encoding,
-    read_earlier,
+    read_previous_run,
     versions,
     write_parts,
 )
 from dsr.app.upsample.reporting import Reporter, listed, problem_line, steps
-from dsr.app.upsample.request import Wanted, files_of, inputs_of, settings_of
+from dsr.app.upsample.request import UpsampleRequest, files_of, inputs_of, settings_of
 from dsr.inference import AUTO, NOISY, Plan, enlarged_by, plan, suited_method, upsample_depth
-from dsr.io.encoding import Fact
+from dsr.io.encoding import Assumption
 from dsr.io.inputs import Picture, UnitMemory, read_picture
 from dsr.io.layouts import pairs_of_folder
-from dsr.io.pairs import Found, Pair, pairs_of_lists
+from dsr.io.pairs import Pair, PairingResult, pairs_of_lists
 from dsr.utils.console import bar, show
 
 
-def run(wanted: Wanted, console: Console) -> list[str]:
+def run(wanted: UpsampleRequest, console: Console) -> list[str]:
     """Upsample all that is asked for.
 
     Args:
@@ -75,7 +75,7 @@ def run(wanted: Wanted, console: Console) -> list[str]:
     return [f"{listed(names)}: {message}" if len(found.pairs) > 1 else message for message, names in problems.items()]
 
 
-def _find(wanted: Wanted) -> Found:
+def _find(wanted: UpsampleRequest) -> PairingResult:
     """Return the pairs."""
     if not wanted.folders:
         return pairs_of_lists(wanted.rgb, wanted.depth, wanted.mask)
@@ -90,10 +90,10 @@ def _find(wanted: Wanted) -> Found:
     if len({pair.name for pair in pairs}) < len(pairs):
         raise ValueError("expected folders of different names; give those of one name in commands of their own")
     facts = tuple(dict.fromkeys(fact for part in parts for fact in part.facts))
-    return Found(tuple(pairs), facts, tuple(path for part in parts for path in part.alone))
+    return PairingResult(tuple(pairs), facts, tuple(path for part in parts for path in part.alone))
 
 
-def _tell_found(console: Console, found: Found) -> None:
+def _tell_found(console: Console, found: PairingResult) -> None:
     """Show how many pairs there are, and what has no partner."""
     count = len(found.pairs)
     lines = [
@@ -110,12 +110,12 @@ def _tell_found(console: Console, found: Found) -> None:
 class _Job:
     """One picture, and what an earlier run left in its folder."""
 
-    wanted: Wanted
+    wanted: UpsampleRequest
     pair: Pair
     target: Path
     settings: Mapping[str, Any]
     inputs: Mapping[str, Any]
-    earlier: Earlier | None
+    earlier: PreviousRun | None
 
     @property
     def reusable(self) -> bool:
@@ -147,9 +147,11 @@ class _Job:
         return there >= set(self.wanted.parts)
 
 
-def _one(wanted: Wanted, pair: Pair, target: Path, units: UnitMemory, reporter: Reporter, progress: Progress) -> str:
+def _one(
+    wanted: UpsampleRequest, pair: Pair, target: Path, units: UnitMemory, reporter: Reporter, progress: Progress
+) -> str:
     """Do one picture, and return how it went."""
-    job = _Job(wanted, pair, target, settings_of(wanted), inputs_of(pair, wanted.reading), read_earlier(target))
+    job = _Job(wanted, pair, target, settings_of(wanted), inputs_of(pair, wanted.reading), read_previous_run(target))
     job.expect_agreement()
     if job.is_done():
         reporter.say(f"{pair.name}: complete already, in {target}")
@@ -177,14 +179,14 @@ def _one(wanted: Wanted, pair: Pair, target: Path, units: UnitMemory, reporter: 
     return "done"
 
 
-def _method(picture: Picture, wanted: Wanted) -> tuple[str, list[Fact]]:
+def _method(picture: Picture, wanted: UpsampleRequest) -> tuple[str, list[Assumption]]:
     """Return the method to use, and what there is to say of it."""
     if wanted.method != AUTO:
         return wanted.method, []
     method = suited_method(picture.coarse, picture.camera, wanted.scale)
     if method == NOISY:
         return method, [
-            Fact(f"the depth map is noisy: {NOISY}, which was trained for that (--method facets keeps more)")
+            Assumption(f"the depth map is noisy: {NOISY}, which was trained for that (--method facets keeps more)")
         ]
     return method, []
 
@@ -195,12 +197,12 @@ def _without_repeats(picture: Picture) -> Picture:
     block = enlarged_by(picture.coarse) if (height, width) == (picture.camera.height, picture.camera.width) else 1
     if block == 1 or height % block or width % block:
         return picture
-    fact = Fact(f"the depth map was enlarged x{block} by repeating pixels, which are dropped")
+    fact = Assumption(f"the depth map was enlarged x{block} by repeating pixels, which are dropped")
     return replace(picture, coarse=picture.coarse[:, ::block, ::block], facts=(*picture.facts, fact))
 
 
 def _upsampled(job: _Job, picture: Picture, method: str, progress: Progress) -> Tensor:
-    """Return the fine depth, (1, H, W) in metres."""
+    """Return the high-resolution depth, (1, H, W) in metres."""
     wanted = job.wanted
     with steps(progress, job.pair.name) as step:
         return upsample_depth(
@@ -215,7 +217,7 @@ def _upsampled(job: _Job, picture: Picture, method: str, progress: Progress) -> 
         ).cpu()
 
 
-def _write(job: _Job, picture: Picture, depth: Tensor, planned: Plan, seconds: float) -> list[Fact]:
+def _write(job: _Job, picture: Picture, depth: Tensor, planned: Plan, seconds: float) -> list[Assumption]:
     """Write all parts and ``info.json``, and return what should be said of them."""
     started = time.perf_counter()
     encoding = output_encoding(picture.encoding, job.wanted.depth_format)

@@ -47,7 +47,7 @@ class Files:
     Args:
         photo, disparity: of the left view.
         shift: ``dmin.txt``, None where there is none.
-        measured: noisy coarse disparities by factor.
+        measured: noisy low-resolution disparities by factor.
 
     """
 

@@ -75,7 +75,7 @@ def load_frame(
     variables: Mapping[str, str] | None = None,
     factors: Sequence[int] = FACTORS,
 ) -> Scene:
-    """Return one scene, with the samples as measured coarse maps; of pictures the true depth is not known.
+    """Return one scene, with the samples as measured low-resolution maps; of pictures the true depth is not known.
 
     Args:
         path: the ``.mat`` file, or the intensity picture.

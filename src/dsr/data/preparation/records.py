@@ -18,7 +18,7 @@ from typing import Any
 
 import torch
 
-from dsr.data.base import Wanted, chosen
+from dsr.data.base import SceneSelection, chosen
 from dsr.data.preparation.inpainting import filled_depth
 from dsr.data.preparation.resizing import fitted
 from dsr.sample import Scene
@@ -134,7 +134,7 @@ class Preparation:
         return scene
 
 
-class Native:
+class PreparedDataset:
     """A data set in its own format; the base of those in this package.
 
     Args:
@@ -158,7 +158,7 @@ class Native:
         folder: Path,
         found: Mapping[str, Record],
         named: Sequence[str],
-        wanted: Wanted,
+        wanted: SceneSelection,
         preparation: Preparation,
     ) -> None:
         self.name = name
@@ -269,6 +269,6 @@ def _rules_hash() -> str:
 def _rendering(scene: Scene) -> Rendering:
     """Return a scene as it is kept: its photo in 8 bits."""
     if scene.depth is None:
-        raise ValueError(f"{scene.name}: expected a fine depth map, there is none")
+        raise ValueError(f"{scene.name}: expected a high-resolution depth map, there is none")
     photo = (scene.rgb * 255).round().to(torch.uint8).permute(1, 2, 0).numpy()
     return Rendering(photo, scene.depth[0].double().numpy(), scene.camera)

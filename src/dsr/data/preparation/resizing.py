@@ -29,19 +29,21 @@ _RIDGE = 1e-9
 
 
 def resized(scene: Scene, height: int, width: int) -> Scene:
-    """Return a scene at another size, its camera along with it; measured coarse maps are left out.
+    """Return a scene at another size, its camera along with it; measured low-resolution maps are left out.
 
     Args:
-        scene: with a fine depth.
+        scene: with a high-resolution depth.
         height: of the result in pixels.
         width: the same.
 
     Raises:
-        ValueError: the scene has no fine depth.
+        ValueError: the scene has no high-resolution depth.
 
     """
     if scene.depth is None:
-        raise ValueError(f"{scene.name}: expected a fine depth map to resize, there is none (dataset.size=null)")
+        raise ValueError(
+            f"{scene.name}: expected a high-resolution depth map to resize, there is none (dataset.size=null)"
+        )
     if (height, width) == (scene.camera.height, scene.camera.width):
         return replace(scene, measured={})
     photo = functional.interpolate(scene.rgb[None], (height, width), mode="bicubic", antialias=True)[0].clamp(0, 1)
@@ -50,7 +52,7 @@ def resized(scene: Scene, height: int, width: int) -> Scene:
 
 
 def cropped(scene: Scene, top: int, left: int, height: int, width: int) -> Scene:
-    """Return a window of a scene; measured coarse maps are left out."""
+    """Return a window of a scene; measured low-resolution maps are left out."""
     rows, columns = slice(top, top + height), slice(left, left + width)
     camera: Camera = scene.camera.crop(top, left, height, width)
     depth = None if scene.depth is None else scene.depth[:, rows, columns]
@@ -61,7 +63,7 @@ def fitted(scene: Scene, size: int, place: float | None = 0.5, *, enlarge: bool 
     """Return a scene whose shorter side is ``size`` pixels long.
 
     Args:
-        scene: with a fine depth.
+        scene: with a high-resolution depth.
         size: in pixels.
         place: where along the longer side a square window is cut out: 0 at the top or left, 1 at the bottom or right;
             None for no window.

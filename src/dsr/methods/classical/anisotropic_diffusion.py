@@ -6,7 +6,7 @@ The untrained mode of Metzger, Daudt and Schindler, *Guided Depth Super-Resoluti
 - diffusion (their eq. 1, Perona and Malik 1990): u += step * sum over the four neighbours n of c_n (u_n - u), with
   c = 1 / (1 + (x / edge)^2), where x is the mean absolute difference between the two pixels over the channels of the
   guide, the photo and the interpolated map; c is computed once;
-- adjustment (their eq. 3): each block is multiplied by the ratio of the coarse pixel to the block's mean.
+- adjustment (their eq. 3): each block is multiplied by the ratio of the low-resolution pixel to the block's mean.
 
 What differs from the original:
 
@@ -14,10 +14,10 @@ What differs from the original:
   planes. The photo is in [0, 1] and the map, in the guide, in [0, 1] over its range times ``depth_weight``; there, both
   are standardised with constants of each data set.
 - The iteration stops where it no longer moves the map, instead of after 8000 steps in every case.
-- The map is continued linearly by ``border`` coarse pixels, for the diffusion flattens it along the image's edge: a
-  plane comes out within 3e-4 of its range, and exactly but for that.
-- Holes of the coarse map have no adjustment, as there. They are filled by the same iteration on the coarse map first,
-  for diffusion into a large hole takes as many steps as the square of its width.
+- The map is continued linearly by ``border`` low-resolution pixels, for the diffusion flattens it along the image's
+  edge: a plane comes out within 3e-4 of its range, and exactly but for that.
+- Holes of the low-resolution map have no adjustment, as there. They are filled by the same iteration on the
+  low-resolution map first, for diffusion into a large hole takes as many steps as the square of its width.
 - A map is iterated in float32, and adjusted in float64 at the end.
 """
 
@@ -33,7 +33,7 @@ from dsr.geometry.camera import RangeType, from_range, to_range
 from dsr.methods.base import expect_limits, history_of
 from dsr.methods.classical.finite_differences import box_mean, extended, upsampled
 from dsr.methods.networks.inpainting import filled
-from dsr.methods.networks.maps import bounds_of, normalised
+from dsr.methods.networks.maps import min_max, normalised
 from dsr.methods.tiling import Progress
 from dsr.sample import DepthSample
 
@@ -55,7 +55,7 @@ class AnisotropicDiffusion:
     """Guided anisotropic diffusion; the box means of its inverse depth are the input's.
 
     Holes of the input are filled. Memory: about 15 float64 maps of the photo's size, 30 MB for 512 x 512. It takes the
-    coarse map for block means of disparity, whatever the downsampling model was.
+    low-resolution map for block means of disparity, whatever the downsampling model was.
 
     Args:
         steps: at most so many.
@@ -63,7 +63,7 @@ class AnisotropicDiffusion:
         step: length of a step; above 0.25 diffusion is unstable.
         edge: difference of the guide at which diffusion is halved (K).
         depth_weight: weight of the interpolated map, over its range, in the guide; 0 leaves the photo alone.
-        border: coarse pixels by which the map is continued linearly.
+        border: low-resolution pixels by which the map is continued linearly.
 
     Raises:
         ValueError: a value is out of range.
@@ -89,14 +89,14 @@ class AnisotropicDiffusion:
         if not depth_weight >= 0:
             raise ValueError(f"method.depth_weight: expected 0 or more, got {depth_weight}")
         if border < 0:
-            raise ValueError(f"method.border: expected 0 or more coarse pixels, got {border}")
+            raise ValueError(f"method.border: expected 0 or more low-resolution pixels, got {border}")
         self.steps, self.tolerance, self.step = steps, tolerance, step
         self.edge, self.depth_weight, self.border = edge, depth_weight, border
         self.history: list[dict[str, float]] = []
 
     @torch.inference_mode()
     def __call__(self, sample: DepthSample, progress: Progress | None = None) -> Tensor:
-        """Return the fine depth, (1, H, W) in metres, on the sample's device and without holes.
+        """Return the high-resolution depth, (1, H, W) in metres, on the sample's device and without holes.
 
         Args:
             sample: the problem.
@@ -104,7 +104,7 @@ class AnisotropicDiffusion:
 
         """
         coarse = to_range(sample.depth_lr.double(), sample.camera_lr, "disparity") + sample.camera_lr.doffs
-        inverse = (coarse * sample.scale)[None]  # in pixels of the fine camera
+        inverse = (coarse * sample.scale)[None]  # in pixels of the high-resolution camera
         found = self.diffused(sample.rgb[None], inverse, sample.scale, progress)
         self.history = history_of(found.moved, CHECK_EVERY)
         fine = found.values[0]
@@ -123,7 +123,7 @@ class AnisotropicDiffusion:
         start = filled(coarse)
         if scale > 1 and not bool(coarse.isfinite().all()):
             start = self.diffused(box_mean(rgb, scale), coarse, 1).values
-        low, high = bounds_of(start).chunk(2, dim=1)
+        low, high = min_max(start).chunk(2, dim=1)
         wide = extended(start, self.border).clamp(min=_LEAST * low, max=high / _LEAST)
         known = functional.pad(coarse.isfinite(), [self.border] * 4, value=True)
         edge = self.border * scale
@@ -156,7 +156,7 @@ class AnisotropicDiffusion:
         """Return where the two steps, in turn, end."""
         mean = first.mean(dim=(-2, -1), keepdim=True)
         x, target = (first / mean).float(), (coarse / mean).float()
-        span = bounds_of(target).diff(dim=1).clamp(min=1e-12)
+        span = min_max(target).diff(dim=1).clamp(min=1e-12)
         along_u, along_v = torch.empty_like(conductances[0]), torch.empty_like(conductances[1])
         before, moved, done = x.clone(), [], 0
         for done in range(1, self.steps + 1):
@@ -180,7 +180,7 @@ class AnisotropicDiffusion:
 
 
 def _adjust(x: Tensor, coarse: Tensor, known: Tensor) -> None:
-    """Multiply each known block of x, (B, 1, H, W), so that its mean is the coarse pixel, in place."""
+    """Multiply each known block of x, (B, 1, H, W), so that its mean is the low-resolution pixel, in place."""
     scale = x.shape[-1] // coarse.shape[-1]
     ratio = torch.where(known, coarse / box_mean(x, scale), 1)
     blocks = x.view(*coarse.shape[:-1], scale, coarse.shape[-1], scale)

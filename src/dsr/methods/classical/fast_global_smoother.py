@@ -10,11 +10,12 @@ two. The image's is approximated by solving all rows, then all columns, T times 
     lambda_t = 3/2 * 4^(T - t) / (4^T - 1) * lambda.
 
 For sparse data the paper smooths the data and an index map of where they are alike, and divides: E(c f) / E(c), with E
-for the smoothing and c = 1 at data, 0 elsewhere. So it is here: f is the coarse map at its pixels' centres (the four
-fine pixels around a centre where it lies between them), and c is 0 elsewhere and in holes.
+for the smoothing and c = 1 at data, 0 elsewhere. So it is here: f is the low-resolution map at its pixels' centres (the
+four high-resolution pixels around a centre where it lies between them), and c is 0 elsewhere and in holes.
 
-What differs: lambda is in units of the squared coarse pixel, so that one value fits all scales. It is far smaller than
-the paper's, which renders as blur; and the paper's way without ``slopes`` renders as a tent at each coarse pixel.
+What differs: lambda is in units of the squared low-resolution pixel, so that one value fits all scales. It is far
+smaller than the paper's, which renders as blur; and the paper's way without ``slopes`` renders as a tent at each
+low-resolution pixel.
 
 Time grows as iterations * H * W; memory peaks at about 25 maps of H * W float64 values (19 without ``slopes``).
 """
@@ -27,16 +28,17 @@ from torch import Tensor
 from dsr.methods.classical.photo_guided import Guided, GuidedMethod, positive
 
 _LEAST = 1e-200
-"""Of smoothed confidence, a sum of positive terms: below it digits get lost, and the nearest coarse value stands in."""
+"""Of smoothed confidence, a sum of positive terms: below it digits get lost, and the nearest LR value stands in."""
 _HALF = 0.5 + 1e-6
-"""Fine pixels from a coarse pixel's centre within which a fine pixel is data."""
+"""High-resolution pixels from a low-resolution pixel's centre within which a high-resolution pixel is data."""
 
 
 class FastGlobalSmoother(GuidedMethod):
-    """The fast global smoother of the coarse disparity, as sparse data.
+    """The fast global smoother of the low-resolution disparity, as sparse data.
 
     Args:
-        smoothness: lambda, in squared coarse pixels; well below 1 the rows between those of the data show as stripes.
+        smoothness: lambda, in squared low-resolution pixels; well below 1 the rows between those of the data show as
+            stripes.
         sigma_colour: the difference of colours, Euclidean in [0, 1], that divides a neighbour's weight by e.
         iterations: pairs of passes.
         fill_holes, slopes: see :class:`dsr.methods.classical.photo_guided.GuidedMethod`.

@@ -11,7 +11,7 @@ from dsr.methods.networks.maps import upsample_bicubic
 LUMA = (0.299, 0.587, 0.114)
 """Weights of red, green and blue in a grey photo (ITU-R BT.601)."""
 _REACH = 2
-"""Coarse pixels that Keys' kernel reaches beyond the border."""
+"""Low-resolution pixels that Keys' kernel reaches beyond the border."""
 
 
 def gradient(x: Tensor) -> Tensor:

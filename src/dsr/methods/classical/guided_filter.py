@@ -7,11 +7,12 @@ window w_k of the fine image, q_i = a_k . I_i + b_k with
 
 m_k and S_k being mean and 3 x 3 covariance of the photo I in the window, p the input and U the identity; the answer is
 q_i = mean(a_k) . I_i + mean(b_k) over the windows that hold pixel i. For upsampling, p is the bilinear interpolation of
-the coarse map, as in the paper's joint upsampling.
+the low-resolution map, as in the paper's joint upsampling.
 
 What differs: every mean over a window counts pixels by their confidence (see
 :mod:`dsr.methods.classical.photo_guided`), so holes do not spread, and each window counts by its pixels' mean
-confidence; without holes that is the paper's filter. Windows are cut at the border. The radius is in coarse pixels.
+confidence; without holes that is the paper's filter. Windows are cut at the border. The radius is in low-resolution
+pixels.
 
 Time grows as H * W * radius * scale; memory peaks at about 50 maps of H * W float64 values, whatever the radius.
 """
@@ -32,10 +33,10 @@ _TINY = 1e-30
 
 
 class GuidedFilter(GuidedMethod):
-    """The guided filter of the interpolated coarse disparity.
+    """The guided filter of the interpolated low-resolution disparity.
 
     Args:
-        radius: of the windows, in coarse pixels.
+        radius: of the windows, in low-resolution pixels.
         epsilon: added to the photo's variances, colours being in [0, 1]: colours that vary less do not count.
         fill_holes, slopes: see :class:`dsr.methods.classical.photo_guided.GuidedMethod`.
 

@@ -1,4 +1,4 @@
-"""Interpolation of the coarse depth alone: nearest neighbour, bilinear, cubic spline (the paper's "Bicubic")."""
+"""Interpolation of the LR depth alone: nearest neighbour, bilinear, cubic spline (the paper's "Bicubic")."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ class Interpolation:
 
     Args:
         order: ``nearest``, ``bilinear`` or ``bicubic``.
-        fill_holes: whether holes of the coarse map are filled with their nearest known pixel; otherwise a fine pixel
-            whose nearest coarse pixel is a hole stays one.
+        fill_holes: whether holes of the low-resolution map are filled with their nearest known pixel; otherwise a
+            high-resolution pixel whose nearest low-resolution pixel is a hole stays one.
 
     Raises:
         ValueError: an unknown order.
@@ -41,7 +41,7 @@ class Interpolation:
         self._fill_holes = fill_holes
 
     def __call__(self, sample: DepthSample) -> Tensor:
-        """Return the fine depth, (1, H, W) in metres."""
+        """Return the high-resolution depth, (1, H, W) in metres."""
         return self.interpolated(sample.depth_lr, sample.camera_lr, sample.camera)
 
     def interpolated(self, depth: Tensor, camera: Camera, fine_camera: Camera) -> Tensor:

@@ -1,15 +1,17 @@
-"""Joint bilateral upsampling: means of coarse values, weighed by distance and by likeness in the photo.
+"""Joint bilateral upsampling: means of low-resolution values, weighed by distance and by likeness in the photo.
 
-Kopf, Cohen, Lischinski, Uyttendaele, *Joint Bilateral Upsampling*, SIGGRAPH 2007. The fine value at pixel p is
+Kopf, Cohen, Lischinski, Uyttendaele, *Joint Bilateral Upsampling*, SIGGRAPH 2007. The high-resolution value at pixel p
+is
 
-    S_p = 1 / k_p * sum over coarse pixels q of S_q f(|p - q|) g(|I_p - I_q|),
+    S_p = 1 / k_p * sum over low-resolution pixels q of S_q f(|p - q|) g(|I_p - I_q|),
 
-f and g being Gaussians, of the distance in coarse pixels and of the difference of colours, and k_p the weights' sum;
-q runs over the (2 * radius + 1)^2 coarse pixels around p.
+f and g being Gaussians, of the distance in low-resolution pixels and of the difference of colours, and k_p the weights'
+sum; q runs over the (2 * radius + 1)^2 low-resolution pixels around p.
 
-What differs: I_q is the mean of the photo over the coarse pixel, which is what a coarse depth stands for, where the
-paper takes a single pixel of the photo. Coarse pixels that are holes do not count. The largest weight of each pixel is
-scaled to 1, so that a colour unlike all those around gets its most similar neighbours, and no 0 / 0.
+What differs: I_q is the mean of the photo over the low-resolution pixel, which is what a low-resolution depth stands
+for, where the paper takes a single pixel of the photo. Low-resolution pixels that are holes do not count. The largest
+weight of each pixel is scaled to 1, so that a colour unlike all those around gets its most similar neighbours, and no 0
+/ 0.
 
 Time grows as H * W * (2 * radius + 1)^2; memory peaks at about 20 maps of H * W float64 values, whatever the radius.
 """
@@ -25,11 +27,11 @@ from dsr.methods.classical.photo_guided import Guided, GuidedMethod, positive
 
 
 class JointBilateral(GuidedMethod):
-    """Joint bilateral upsampling of the coarse disparity.
+    """Joint bilateral upsampling of the low-resolution disparity.
 
     Args:
-        radius: of the neighbourhood, in coarse pixels.
-        sigma_space: standard deviation of the distance's Gaussian, in coarse pixels.
+        radius: of the neighbourhood, in low-resolution pixels.
+        sigma_space: standard deviation of the distance's Gaussian, in low-resolution pixels.
         sigma_colour: standard deviation of the Gaussian of the colours' Euclidean distance, colours being in [0, 1].
         fill_holes, slopes: see :class:`dsr.methods.classical.photo_guided.GuidedMethod`; a hole is filled by this
             filter within the radius, and from around farther inside.
@@ -53,7 +55,7 @@ class JointBilateral(GuidedMethod):
         self._radius, self._sigma_space, self._sigma_colour = radius, sigma_space, sigma_colour
 
     def filtered(self, guided: Guided) -> Tensor:
-        """Return the weighted means of the coarse maps, (N, H, W)."""
+        """Return the weighted means of the low-resolution maps, (N, H, W)."""
         height, width = guided.known.shape
         coarse_photo = _block_means(guided)
         nearest = guided.nearest()
@@ -94,7 +96,7 @@ class JointBilateral(GuidedMethod):
 
 
 def _block_means(guided: Guided) -> Tensor:
-    """Return the photo's mean over the fine pixels that are nearest to each coarse one, (3, h, w)."""
+    """Return the photo's mean over the HR pixels that are nearest to each LR one, (3, h, w)."""
     matrices = []
     for nearest, size in zip(guided.nearest(), guided.known.shape, strict=True):
         belongs = (nearest == torch.arange(size, device=nearest.device)[:, None]).double()

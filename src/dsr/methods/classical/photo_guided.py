@@ -1,11 +1,12 @@
 """What photo-guided filters share: pixels matched through the cameras, holes, and slopes.
 
-A filter of this kind is a weighted mean of coarse values, u_p = sum of W_pq d_q with weights that add up to 1. Such
-means flatten slopes at borders, and where the photo makes the weights uneven they copy its texture into the surface.
-With ``slopes`` each coarse pixel stands for a plane instead, u_p = sum of W_pq (d_q + s_q . (p - q)), s_q being the
-local slope of the coarse disparity, and the weights stay what they are. A plane in space has a disparity linear in the
-pixel, so planes come out exactly, whatever the photo; a constant added to the disparity and a factor applied to it come
-out again, as without. No filter's paper does this: ``slopes=False`` is the filter as published.
+A filter of this kind is a weighted mean of low-resolution values, u_p = sum of W_pq d_q with weights that add up to 1.
+Such means flatten slopes at borders, and where the photo makes the weights uneven they copy its texture into the
+surface. With ``slopes`` each low-resolution pixel stands for a plane instead, u_p = sum of W_pq (d_q + s_q . (p - q)),
+s_q being the local slope of the low-resolution disparity, and the weights stay what they are. A plane in space has a
+disparity linear in the pixel, so planes come out exactly, whatever the photo; a constant added to the disparity and a
+factor applied to it come out again, as without. No filter's paper does this: ``slopes=False`` is the filter as
+published.
 
 Everything is computed in float64, without randomness, on the sample's device.
 """
@@ -24,18 +25,19 @@ from dsr.methods.networks.maps import coarse_coordinates
 from dsr.sample import DepthSample
 
 _BEYOND = 4.0
-"""How many times farther than the farthest known coarse pixel an answer may be, and how many times nearer."""
+"""How many times farther than the farthest known low-resolution pixel an answer may be, and how many times nearer."""
 
 
 @dataclass(frozen=True)
 class Guided:
-    """Coarse maps and the photo that guides their upsampling.
+    """Low-resolution maps and the photo that guides their upsampling.
 
     Args:
         photo: (3, H, W) float64 in [0, 1].
         maps: (N, h, w) float64, to be upsampled alike; finite everywhere, in holes what stands around them.
         known: (h, w) float64, 1 where the maps are known and 0 in holes.
-        rows, columns: (H,), (W,) float64, where each fine pixel lies in the coarse maps, in coarse pixels.
+        rows, columns: (H,), (W,) float64, where each high-resolution pixel lies in the low-resolution maps, in
+            low-resolution pixels.
 
     """
 
@@ -47,19 +49,19 @@ class Guided:
 
     @property
     def scale(self) -> float:
-        """Fine pixels per coarse one."""
+        """High-resolution pixels per low-resolution one."""
         return self.photo.shape[-1] / self.maps.shape[-1]
 
     def nearest(self) -> tuple[Tensor, Tensor]:
-        """Return the row (H,) and the column (W,) of the coarse pixel that each fine pixel is nearest to."""
+        """Return the row (H,) and the column (W,) of the LR pixel that each HR pixel is nearest to."""
         height, width = self.known.shape
         return _nearest(self.rows, height), _nearest(self.columns, width)
 
     def interpolated(self) -> tuple[Tensor, Tensor]:
-        """Return the maps, (N, H, W), and their confidence, (H, W), at the fine pixels.
+        """Return the maps, (N, H, W), and their confidence, (H, W), at the high-resolution pixels.
 
-        A value is the bilinear mean of the known among the four coarse pixels around, its confidence the bilinear
-        weight of these: 1 away from holes, 0 within, where the filled value stands in.
+        A value is the bilinear mean of the known among the four low-resolution pixels around, its confidence the
+        bilinear weight of these: 1 away from holes, 0 within, where the filled value stands in.
         """
         height, width = self.known.shape
         down, across = _linear(self.rows, height), _linear(self.columns, width)
@@ -71,12 +73,12 @@ class Guided:
 
 
 class GuidedMethod(ABC):
-    """A filter of the coarse disparity that a photo guides: what comes before and after :meth:`filtered`.
+    """A filter of the low-resolution disparity that a photo guides: what comes before and after :meth:`filtered`.
 
     Args:
-        fill_holes: whether holes of the coarse map are filled; otherwise a fine pixel whose nearest coarse pixel is a
-            hole stays one. No answer depends on a value in a hole.
-        slopes: whether each coarse pixel stands for a plane, see the module.
+        fill_holes: whether holes of the low-resolution map are filled; otherwise a high-resolution pixel whose nearest
+            low-resolution pixel is a hole stays one. No answer depends on a value in a hole.
+        slopes: whether each low-resolution pixel stands for a plane, see the module.
 
     """
 
@@ -88,10 +90,10 @@ class GuidedMethod(ABC):
 
     @abstractmethod
     def filtered(self, guided: Guided) -> Tensor:
-        """Return the fine maps, (N, H, W) float64, finite everywhere: the same weighted means of each."""
+        """Return the high-resolution maps, (N, H, W) float64, finite everywhere: the same weighted means of each."""
 
     def __call__(self, sample: DepthSample) -> Tensor:
-        """Return the fine depth, (1, H, W) in metres in the precision of the coarse depth."""
+        """Return the high-resolution depth, (1, H, W) in metres in the precision of the low-resolution depth."""
         device = sample.depth_lr.device
         rows, columns = coarse_coordinates(sample.camera, sample.camera_lr, device)
         coarse = to_range(sample.depth_lr.double(), sample.camera_lr, "disparity")[0] * sample.scale
@@ -137,7 +139,7 @@ def positive(method: str, **values: float) -> None:
 
 
 def _planes(coarse: Tensor) -> Tensor:
-    """Return each coarse pixel's plane: its value at row and column 0, per row, per column, (3, h, w); NaN in holes."""
+    """Return each LR pixel's plane: its value at row and column 0, per row, per column, (3, h, w); NaN in holes."""
     height, width = coarse.shape
     down, across = slopes_along(coarse, 0), slopes_along(coarse, 1)
     constant = coarse - down * torch.arange(height).to(coarse)[:, None] - across * torch.arange(width).to(coarse)

@@ -1,7 +1,7 @@
 """Upsampling by anisotropic total generalised variation, without training.
 
 Ferstl, Reinbacher, Ranftl, Rüther and Bischof, *Image Guided Depth Upsampling using Anisotropic Total Generalized
-Variation*, ICCV 2013: of all fine maps u and vector fields v, the pair with the least
+Variation*, ICCV 2013: of all high-resolution maps u and vector fields v, the pair with the least
 
     E(u, v) = first * sum |G (grad u - v)| + second * sum |grad v| + data_weight / 2 * sum w (mean u - d)^2,
 
@@ -13,14 +13,14 @@ the grey photo I (eq. 5): across its edges the map may jump. Solved by the prima
 
 What differs from the original:
 
-- A coarse pixel d says what the *mean* of u over its block is, w = the block's pixels; there, it is the value of a
-  single fine pixel. Such a data term's proximal map has a closed form as well, and without a finite ``data_weight`` it
-  is a projection: block means are the input's exactly.
+- A low-resolution pixel d says what the *mean* of u over its block is, w = the block's pixels; there, it is the value
+  of a single high-resolution pixel. Such a data term's proximal map has a closed form as well, and without a finite
+  ``data_weight`` it is a projection: block means are the input's exactly.
 - It works on disparity, linear on planes, over its range in the image.
 - A difference that would need a pixel beyond the border is left out, whereas the original takes it for 0, which bends
   planes there.
 - It starts from the bicubic map and its gradient, and stops where the map no longer moves. Holes have no data term, as
-  there; with them, it starts from its own solution on the coarse map, for a hole is filled pixel by pixel.
+  there; with them, it starts from its own solution on the low-resolution map, for a hole is filled pixel by pixel.
 - ``second`` is 2.4 instead of 17: on procedural scenes, renderings are better by a quarter, and it converges sooner.
   The iteration is slow at the end: 1000 iterations come close to the least E, and ripples of walls may remain.
 """
@@ -77,7 +77,7 @@ class TotalGeneralisedVariation:
     """TGV-guided upsampling.
 
     Holes of the input are filled. Memory: about 90 float64 maps of the photo's size, 180 MB for 512 x 512. It takes the
-    coarse map for block means of disparity, whatever the downsampling model was.
+    low-resolution map for block means of disparity, whatever the downsampling model was.
 
     Args:
         iterations: at most so many.
@@ -127,7 +127,7 @@ class TotalGeneralisedVariation:
 
     @torch.inference_mode()
     def __call__(self, sample: DepthSample, progress: Progress | None = None) -> Tensor:
-        """Return the fine depth, (1, H, W) in metres, on the sample's device and without holes.
+        """Return the high-resolution depth, (1, H, W) in metres, on the sample's device and without holes.
 
         A disparity at or beyond infinity becomes NaN.
 

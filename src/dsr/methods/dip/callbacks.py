@@ -46,7 +46,7 @@ class Silent:
         return contextlib.nullcontext(lambda _, __: None)
 
 
-class Origin(Callback):
+class Provenance(Callback):
     """Keeps in each checkpoint what it came from."""
 
     def __init__(self, origin: str) -> None:

@@ -1,4 +1,4 @@
-"""How noisy a coarse depth map is, from the map alone, and what that does to its normals."""
+"""How noisy a low-resolution depth map is, from the map alone, and what that does to its normals."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def noise_level(coarse: Tensor) -> float:
     return float(known.kthvalue(max(round(_SHARE * len(known)), 1)).values) / _QUANTILE / 6
 
 
-def tilt_of(noise: float, camera: Camera) -> float:
+def normal_noise_deg(noise: float, camera: Camera) -> float:
     """Return the standard deviation, in degrees, by which relative depth noise tilts the normals of a frontal surface.
 
     Two neighbouring pixels at depth z are z / f metres apart; noise of standard deviation s z in each makes a slope of
@@ -46,7 +46,7 @@ def tilt_of(noise: float, camera: Camera) -> float:
 
     Args:
         noise: relative standard deviation of depth, s.
-        camera: of the coarse map.
+        camera: of the low-resolution map.
 
     """
     return math.degrees(math.atan(math.sqrt(2) * noise * camera.fx))

@@ -37,7 +37,7 @@ class PriorSettings:
         input_noise: the fixed noise is U[0, input_noise].
         perturbation, guide_perturbation: standard deviation of what is added to noise and photo, anew each step.
         average: decay of the exponential moving average of the depth maps.
-        margin: by how much depth may leave the coarse map's range, as a share of it.
+        margin: by how much depth may leave the low-resolution map's range, as a share of it.
         mixed: whether convolutions run in bfloat16.
 
     Raises:

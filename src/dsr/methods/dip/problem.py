@@ -31,9 +31,9 @@ class ImageProblem:
         rays, rays_lr: (1, 3, H, W) and (1, 3, h, w), of the cameras.
         camera: of the photo.
         scale: the upsampling factor.
-        downsampling: the model that leads from fine to coarse depth, as far as one knows.
+        downsampling: the model that leads from fine to low-resolution depth, as far as one knows.
         range_type: the type that the model averages unless it says one itself.
-        low, span: the least known coarse depth, and how far the largest is from it; metres.
+        low, span: the least known low-resolution depth, and how far the largest is from it; metres.
 
     """
 
@@ -70,11 +70,11 @@ class ImageProblem:
         )
 
     def coarsened(self, depth: Tensor) -> Tensor:
-        """Return what the model makes of fine depth, (1, 1, H, W) to (1, 1, h, w), both in metres."""
+        """Return what the model makes of high-resolution depth, (1, 1, H, W) to (1, 1, h, w), both in metres."""
         return downsampled(depth, self.camera, self.scale, self.downsampling, self.range_type)[0]
 
     def residual(self, depth: Tensor) -> Tensor:
-        """Return the root mean square of D(depth) / coarse - 1 over the known coarse pixels, a scalar."""
+        """Return the root mean square of D(depth) / coarse - 1 over the known low-resolution pixels, a scalar."""
         share = self.coarsened(depth) / self.coarse - 1
         known = share.isfinite()
         return (torch.where(known, share, 0).square().sum() / known.sum()).sqrt()
@@ -82,15 +82,15 @@ class ImageProblem:
 
 @dataclass(frozen=True)
 class PriorObjective:
-    """The loss of Voynov et al. 2019 for image priors: a data term on coarse depth, and the photo's reconstruction.
+    """The loss of Voynov et al. 2019 for image priors: a data term on LR depth, and the photo's reconstruction.
 
     L = c * data(D d / r, d_LR / r) + w * MSE_v(D d, d_LR) + w_I * Lap_1(intensity, photo), where r is the range of the
-    coarse depth. In holes of the coarse map nothing is asked of the depth.
+    low-resolution depth. In holes of the low-resolution map nothing is asked of the depth.
 
     Args:
         data_loss: ``mse`` for DIP, ``lap1`` for DIP-V.
         data_weight: c.
-        w: weight of MSE_v, whose normals are taken with the coarse camera; 0 for DIP.
+        w: weight of MSE_v, whose normals are taken with the low-resolution camera; 0 for DIP.
         w_intensity: w_I.
 
     Raises:

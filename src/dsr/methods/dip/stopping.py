@@ -124,11 +124,12 @@ class Variance(Fixed):
 
 
 class Residual(Fixed):
-    """Stops when the average explains the coarse map as well as its noise allows: Morozov's discrepancy principle.
+    """Stops when the average explains the LR map as well as its noise allows: Morozov's discrepancy principle.
 
     Args:
         coarse: (1, 1, h, w) the coarse depth in metres, NaN in holes; its noise is estimated.
-        residual: from a map (1, 1, H, W) to the root mean square of its coarse version's relative error, a scalar.
+        residual: from a map (1, 1, H, W) to the root mean square of its low-resolution version's relative error, a
+            scalar.
 
     """
 

@@ -2,8 +2,8 @@
 
 Ulyanov, Vedaldi, Lempitsky, *Deep Image Prior*, CVPR 2018, guided by the photo and with the visual loss of Voynov et
 al., *Perceptual Deep Depth Super-Resolution*, ICCV 2019, section 4.2. The network's answers are a depth map, whose
-coarse version is compared with the input, and the photo's intensities. As holes of the input are compared with nothing,
-they are filled with what the network finds natural.
+low-resolution version is compared with the input, and the photo's intensities. As holes of the input are compared with
+nothing, they are filled with what the network finds natural.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from torch.utils.data import DataLoader
 
 from dsr.degradation.downsampling import Downsampling, scene_generator
 from dsr.geometry.camera import RangeType
-from dsr.methods.dip.callbacks import Advance, Display, Keep, Origin, Silent, checkpoint_of, cost_of_step
-from dsr.methods.dip.noise import noise_level, tilt_of
+from dsr.methods.dip.callbacks import Advance, Display, Keep, Provenance, Silent, checkpoint_of, cost_of_step
+from dsr.methods.dip.noise import noise_level, normal_noise_deg
 from dsr.methods.dip.optimisation import PriorOptimisation, PriorSettings
 from dsr.methods.dip.problem import DataLoss, ImageProblem, PriorObjective
 from dsr.methods.dip.skip_net import Padding
@@ -47,15 +47,15 @@ class DeepImagePrior:
 
     Args:
         scale: the upsampling factor.
-        downsampling: the model that is assumed to have led to the coarse map.
+        downsampling: the model that is assumed to have led to the low-resolution map.
         steps, learning_rate, widths, skips, padding, border, guide, input_noise, perturbation, guide_perturbation,
             average, margin: see :class:`~dsr.methods.dip.optimisation.PriorSettings`.
         data_loss, data_weight, w, w_intensity: see :class:`~dsr.methods.dip.problem.PriorObjective`.
-        largest_tilt: degrees; where the noise that is estimated in the coarse map tilts its normals by more, they say
-            nothing of the surface, and MSE_v is left out. None for never.
+        largest_tilt: degrees; where the noise that is estimated in the low-resolution map tilts its normals by more,
+            they say nothing of the surface, and MSE_v is left out. None for never.
         stopping: ``fixed``: after ``steps``; ``variance``: at the minimum of the iterates' variance; ``residual``: as
-            soon as the coarse map is explained up to its estimated noise; ``oracle``: at the validation pass with the
-            lowest RMSE_v, for which the truth is looked at.
+            soon as the low-resolution map is explained up to its estimated noise; ``oracle``: at the validation pass
+            with the lowest RMSE_v, for which the truth is looked at.
         patience: steps without a new minimum until ``variance`` stops.
         validate_every: steps between validation passes, which log scores and renderings; 0 for none.
         precision: of the convolutions.
@@ -131,7 +131,7 @@ class DeepImagePrior:
         return None
 
     def __call__(self, sample: DepthSample) -> Tensor:
-        """Return the fine orthogonal depth, (1, H, W) in metres on the sample's device; known everywhere.
+        """Return the high-resolution orthogonal depth, (1, H, W) in metres on the sample's device; known everywhere.
 
         Raises:
             ValueError: the optimisation diverged.
@@ -188,8 +188,8 @@ class DeepImagePrior:
         return module, digest.hexdigest()
 
     def _normals_count(self, sample: DepthSample) -> bool:
-        """Return whether the coarse map's normals are more than noise."""
-        tilt = tilt_of(noise_level(sample.depth_lr[None]), sample.camera_lr)
+        """Return whether the low-resolution map's normals are more than noise."""
+        tilt = normal_noise_deg(noise_level(sample.depth_lr[None]), sample.camera_lr)
         return self.largest_tilt is None or tilt <= self.largest_tilt
 
     def _rule(self, problem: ImageProblem) -> Stopping:
@@ -219,7 +219,7 @@ class DeepImagePrior:
         callbacks: list[Callback] = [LastValidation(interval), Advance(display, scene, self.steps)]
         logger: Any = False
         if folder is not None:
-            callbacks += [Origin(origin), Keep(folder / "last.ckpt"), Interruption(folder / "last.ckpt")]
+            callbacks += [Provenance(origin), Keep(folder / "last.ckpt"), Interruption(folder / "last.ckpt")]
             if module.metrics is not None and self.validate_every:
                 callbacks.append(ValidationTable(folder / "validation.csv"))
             logger = Log(folder.parent, name="", version=scene, default_hp_metric=False)
@@ -253,7 +253,7 @@ class WarmStarted(DeepImagePrior):
         weights: of the network.
         model: the network's name.
         **settings: as for :class:`DeepImagePrior`; ``margin`` is the depth that an answer of 1 adds, as a share of the
-            coarse map's range.
+            low-resolution map's range.
 
     Raises:
         ValueError: a value is out of range, or the weights are of another network.
@@ -269,15 +269,15 @@ class WarmStarted(DeepImagePrior):
         self._trained = build_trained(Path(self.weights), self.scale, self.model, device=self.device)
 
     def base(self, sample: DepthSample) -> Tensor:
-        """Return the trained network's answer; its holes are filled with the coarse map's mean."""
+        """Return the trained network's answer; its holes are filled with the low-resolution map's mean."""
         depth = self._trained(sample).clone()
         return torch.where(depth.isfinite(), depth, sample.depth_lr.nanmean())
 
 
 def _noise_of(sample: DepthSample) -> str:
-    """Return the noise that is estimated in a coarse map, for a reader."""
+    """Return the noise that is estimated in a low-resolution map, for a reader."""
     noise = noise_level(sample.depth_lr[None])
-    return f"noise of {noise:.2%} tilts the input's normals by {tilt_of(noise, sample.camera_lr):.0f} degrees"
+    return f"noise of {noise:.2%} tilts the input's normals by {normal_noise_deg(noise, sample.camera_lr):.0f} degrees"
 
 
 def _numbers(count: int) -> Any:

@@ -1,4 +1,4 @@
-"""What the project's networks have in common: they map coarse disparity and a photo to fine disparity."""
+"""What the project's networks have in common: they map LR disparity and a photo to HR disparity."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from torch.nn import functional
 
 from dsr.geometry.camera import RangeType, from_range, to_range
 from dsr.methods.networks.inpainting import filled
-from dsr.methods.networks.maps import bounds_of, normalised
+from dsr.methods.networks.maps import min_max, normalised
 from dsr.methods.tiling import Progress, Span, blended, spans
 from dsr.sample import DepthSample
 
@@ -30,14 +30,14 @@ _OVERLAP = 4
 
 
 @dataclass(frozen=True)
-class Whole:
+class GlobalContext:
     """What a network found in a whole image, with which it answers windows as it would have answered the image.
 
     Args:
-        disparity: (B, 1, h, w) the coarse disparity, its holes filled if the network fills them.
+        disparity: (B, 1, h, w) the low-resolution disparity, its holes filled if the network fills them.
         answer: from a window of the photo, (B, 3, scale * n, scale * m), and one of ``disparity``, (B, 1, n, m), to
-            fine disparity, right for pixels at least the network's reach away from the window's borders within the
-            image.
+            high-resolution disparity, right for pixels at least the network's reach away from the window's borders
+            within the image.
 
     """
 
@@ -63,13 +63,13 @@ class DisparityNetwork(nn.Module, abc.ABC):
 
     @abc.abstractmethod
     def upsample(self, rgb: Tensor, disparity: Tensor, bounds: Tensor | None = None) -> Tensor:
-        """Return fine disparity.
+        """Return high-resolution disparity.
 
         Args:
             rgb: (B, 3, H, W) in [0, 1], H = scale * h and W = scale * w.
             disparity: (B, 1, h, w) in pixels of the photo's camera; non-finite values are holes.
-            bounds: (B, 2, 1, 1) lowest and highest coarse disparity of the image that this is a window of, which
-                normalise it; None for those of ``disparity`` itself.
+            bounds: (B, 2, 1, 1) lowest and highest low-resolution disparity of the image that this is a window of,
+                which normalise it; None for those of ``disparity`` itself.
 
         Returns:
             (B, 1, H, W) in the dtype of ``disparity``; NaN for an image without a known pixel.
@@ -86,28 +86,28 @@ class WindowedNetwork(DisparityNetwork):
     @property
     @abc.abstractmethod
     def reach(self) -> int:
-        """How many coarse pixels around its own an output depends on."""
+        """How many low-resolution pixels around its own an output depends on."""
 
     @abc.abstractmethod
-    def whole(self, rgb: Tensor, disparity: Tensor) -> Whole:
+    def global_context(self, rgb: Tensor, disparity: Tensor) -> GlobalContext:
         """Return what answers windows of an image; see :meth:`upsample` for the arguments."""
 
 
 class NormalisedNetwork(WindowedNetwork):
-    """A network on a photo and coarse disparity that is brought to 0..1 and has its holes filled.
+    """A network on a photo and low-resolution disparity that is brought to 0..1 and has its holes filled.
 
     So the disparity's unit and offset come out as they went in. Called with (B, 3, H, W) and (B, 1, h, w), and the
     whole photo's :meth:`context` where these are a window, it returns (B, 1, H, W).
     """
 
     def upsample(self, rgb: Tensor, disparity: Tensor, bounds: Tensor | None = None) -> Tensor:
-        """Return fine disparity; see :meth:`DisparityNetwork.upsample`."""
+        """Return high-resolution disparity; see :meth:`DisparityNetwork.upsample`."""
         return self._over_range(rgb, disparity, bounds, ())
 
-    def whole(self, rgb: Tensor, disparity: Tensor) -> Whole:
+    def global_context(self, rgb: Tensor, disparity: Tensor) -> GlobalContext:
         """Return what answers windows: the disparity's range and the context are the whole image's."""
-        bounds, context = bounds_of(disparity), self.context(rgb)
-        return Whole(filled(disparity), lambda photo, window: self._over_range(photo, window, bounds, context))
+        bounds, context = min_max(disparity), self.context(rgb)
+        return GlobalContext(filled(disparity), lambda photo, window: self._over_range(photo, window, bounds, context))
 
     def context(self, rgb: Tensor) -> tuple[Tensor, ...]:
         """Return what the network takes from the whole photo, (B, 3, H, W)."""
@@ -121,7 +121,7 @@ class NormalisedNetwork(WindowedNetwork):
 
 
 def expect_photo(rgb: Tensor, coarse: Tensor, scale: int) -> None:
-    """Check a photo's size, (..., H, W), against a coarse map's, (..., h, w).
+    """Check a photo's size, (..., H, W), against a low-resolution map's, (..., h, w).
 
     Raises:
         ValueError: it is not scale times the map's.
@@ -130,7 +130,9 @@ def expect_photo(rgb: Tensor, coarse: Tensor, scale: int) -> None:
     expected, came = tuple(scale * n for n in coarse.shape[-2:]), tuple(rgb.shape[-2:])
     if came != expected:
         size = tuple(coarse.shape[-2:])
-        raise ValueError(f"rgb: expected {expected} pixels for a coarse map of {size} at scale {scale}, got {came}")
+        raise ValueError(
+            f"rgb: expected {expected} pixels for a low-resolution map of {size} at scale {scale}, got {came}"
+        )
 
 
 class NetworkUpsampler:
@@ -153,7 +155,7 @@ class NetworkUpsampler:
 
     Raises:
         ValueError: there is no such precision or ensemble, the network leaves out pixels and can't be averaged, or a
-            tile is smaller than a coarse pixel.
+            tile is smaller than a low-resolution pixel.
 
     """
 
@@ -183,7 +185,7 @@ class NetworkUpsampler:
 
     @torch.inference_mode()
     def __call__(self, sample: DepthSample, progress: Progress | None = None) -> Tensor:
-        """Return the fine orthogonal depth, (1, H, W) in metres on the sample's device.
+        """Return the high-resolution orthogonal depth, (1, H, W) in metres on the sample's device.
 
         NaN where the network's disparity lies at or beyond infinity, and in the last row and column where the network
         does not cover them.
@@ -198,7 +200,7 @@ class NetworkUpsampler:
         return from_range(fine, sample.camera, "disparity").to(sample.depth_lr.device)
 
     def fine_disparity(self, rgb: Tensor, coarse: Tensor, progress: Progress | None = None) -> Tensor:
-        """Return the mean of the ensemble's fine disparities, (B, 1, H, W).
+        """Return the mean of the ensemble's high-resolution disparities, (B, 1, H, W).
 
         Args:
             rgb: (B, 3, H, W) in [0, 1].
@@ -208,9 +210,13 @@ class NetworkUpsampler:
         """
         net = self._windowed(rgb.shape[-2], rgb.shape[-1])
         if net is None:
-            return self._mean_of_poses(lambda pose: self.net.upsample(posed(rgb, pose), posed(coarse, pose)), progress)
+            return self._mean_of_poses(
+                lambda pose: self.net.upsample(apply_dihedral(rgb, pose), apply_dihedral(coarse, pose)), progress
+            )
         rows, columns = (self._spans(n, net) for n in coarse.shape[-2:])
-        wholes = [net.whole(posed(rgb, pose), posed(coarse, pose)) for pose in range(self.ensemble)]
+        wholes = [
+            net.global_context(apply_dihedral(rgb, pose), apply_dihedral(coarse, pose)) for pose in range(self.ensemble)
+        ]
         tiles, done, scale = len(rows) * len(columns), 0, self.net.scale
 
         def told(part: int, parts: int) -> None:
@@ -222,7 +228,9 @@ class NetworkUpsampler:
         def answer(high: slice, wide: slice) -> Tensor:
             photo = rgb[..., scale * high.start : scale * high.stop, scale * wide.start : scale * wide.stop]
             known = wholes[0].disparity[..., high, wide]
-            return self._mean_of_poses(lambda pose: wholes[pose].answer(posed(photo, pose), posed(known, pose)), told)
+            return self._mean_of_poses(
+                lambda pose: wholes[pose].answer(apply_dihedral(photo, pose), apply_dihedral(known, pose)), told
+            )
 
         return blended(answer, rows, columns, scale)
 
@@ -240,7 +248,7 @@ class NetworkUpsampler:
         return self.net if large and isinstance(self.net, WindowedNetwork) else None
 
     def _spans(self, size: int, net: WindowedNetwork) -> list[Span]:
-        """Return the tiles along an axis of so many coarse pixels."""
+        """Return the tiles along an axis of so many low-resolution pixels."""
         return spans(size, (self.tile or TILE) // net.scale, net.reach, _OVERLAP)
 
     def _mean_of_poses(self, answer: Callable[[int], Tensor], progress: Progress | None) -> Tensor:
@@ -249,18 +257,18 @@ class NetworkUpsampler:
         for pose in range(1, self.ensemble):
             if progress is not None:
                 progress(pose, self.ensemble)
-            total += unposed(answer(pose), pose)
+            total += undo_dihedral(answer(pose), pose)
         if progress is not None:
             progress(self.ensemble, self.ensemble)
         return total / self.ensemble
 
 
-def posed(x: Tensor, pose: int) -> Tensor:
+def apply_dihedral(x: Tensor, pose: int) -> Tensor:
     """Return (B, C, H, W) after ``pose`` % 4 quarter turns, mirrored first if ``pose`` is 4 or more."""
     return torch.rot90(x.flip(-1) if pose >= 4 else x, pose % 4, (-2, -1)).contiguous()
 
 
-def unposed(x: Tensor, pose: int) -> Tensor:
-    """Undo :func:`posed`."""
+def undo_dihedral(x: Tensor, pose: int) -> Tensor:
+    """Undo :func:`apply_dihedral`."""
     x = torch.rot90(x, -(pose % 4), (-2, -1))
     return x.flip(-1) if pose >= 4 else x

@@ -10,7 +10,7 @@ beside a data term. Its minimisation by gradient descent is cut after a few step
 filters, penalties and weights of its own: the guidance is dynamic, for it changes as the map gets better. They are
 learned from what the stages give (task-driven), by back-propagation. A stage here is
 
-    y = x - fidelity * U(A x - d),    A x the block means, d the coarse map, U bicubic upsampling,
+    y = x - fidelity * U(A x - d),    A x the block means, d the low-resolution map, U bicubic upsampling,
     x = y - sum over l of k_l' (w_l(g) rho_l'(k_l y)),    the gradient step of E, step size 1,
 
 with k_l y at the positions where the filter lies inside, and k_l' the adjoint. w_l(g) = exp(-sum over m of c_lm
@@ -23,13 +23,13 @@ What differs from the original:
   answer a slope with a constant, the weights would copy the photo's texture into it.
 - A penalty is a mixture of Lorentzians whose widths grow by factors; there, its derivative is a sum of Gaussian radial
   basis functions. Disparity has faint bends and large steps, so widths from 1/1000 to 1 of its range are needed.
-- The data step comes first, is smooth, and knows that coarse values are block means (iterative back-projection: Irani
-  and Peleg, *Improving Resolution by Image Registration*, 1991). After 160 steps of training for MSE its RMSE_d
+- The data step comes first, is smooth, and knows that low-resolution values are block means (iterative back-projection:
+  Irani and Peleg, *Improving Resolution by Image Registration*, 1991). After 160 steps of training for MSE its RMSE_d
   and RMSE_v on procedural scenes were 43 mm and .224, with the gradient of |A x - d|^2 in its place 45 mm and .240.
 - The form of w_l is ours. With one squared filter of the grey photo for each k_l RMSE_d was higher, 49 against 47 mm,
   and RMSE_v, for which that training was not, lower, .234 against .251.
 - All stages are trained at once, from polynomial filters and weak penalties, without training one after another before.
-- It works on disparity over its range in the coarse map.
+- It works on disparity over its range in the low-resolution map.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ from dsr.methods.networks.base import NormalisedNetwork, expect_photo
 _HEIGHT, _CONTRAST, _SHARED, _FIDELITY = 0.05, 2.0, 0.02, 0.5
 """Before training: of penalties; of the b_m; the c_lm of other filters than the l-th; of the data step."""
 _BICUBIC = 2
-"""Coarse pixels that bicubic upsampling looks at on either side."""
+"""Low-resolution pixels that bicubic upsampling looks at on either side."""
 
 
 class Stage(nn.Module):
@@ -96,7 +96,7 @@ class Stage(nn.Module):
         return (self.weights(rgb) * penalty(responses, self._heights(x))).sum(dim=(1, 2, 3))
 
     def forward(self, x: Tensor, coarse: Tensor, rgb: Tensor) -> Tensor:
-        """Return the next map, (B, 1, H, W): a step towards the coarse map, then one down the gradient of E.
+        """Return the next map, (B, 1, H, W): a step towards the low-resolution map, then one down the gradient of E.
 
         Args:
             x: (B, 1, H, W) the map.
@@ -150,14 +150,14 @@ class DynamicGuidance(NormalisedNetwork):
 
     @property
     def reach(self) -> int:
-        """How many coarse pixels around its own an output depends on.
+        """How many low-resolution pixels around its own an output depends on.
 
         Bicubic upsampling's at the start and in each stage, and in each stage a filter's and its adjoint's.
         """
         return _BICUBIC + len(self.stages) * (_BICUBIC + math.ceil((self.size - 1) / self.scale))
 
     def forward(self, rgb: Tensor, values: Tensor) -> Tensor:
-        """Map a photo and normalised coarse disparity to fine disparity.
+        """Map a photo and normalised low-resolution disparity to high-resolution disparity.
 
         Args:
             rgb: (B, 3, H, W).

@@ -2,14 +2,15 @@
 
 What renderings show first is the error of normals on smooth surfaces: convolutions that write disparity pixel by pixel
 leave a faint texture there. A plane's disparity is linear in the pixel, so this network never writes disparity. Each
-coarse pixel proposes a few planes ("facets"), built from the differences to its neighbours; each fine pixel takes the
-planes of the 3 x 3 coarse pixels around it, extended to where it is, and the photo decides whose count how much. Three
-properties hold whatever the weights are: a planar surface is reproduced exactly, a constant added to the disparity or a
-factor applied to it comes out again, and nothing overshoots the extended planes.
+low-resolution pixel proposes a few planes ("facets"), built from the differences to its neighbours; each
+high-resolution pixel takes the planes of the 3 x 3 low-resolution pixels around it, extended to where it is, and the
+photo decides whose count how much. Three properties hold whatever the weights are: a planar surface is reproduced
+exactly, a constant added to the disparity or a factor applied to it comes out again, and nothing overshoots the
+extended planes.
 
-Each coarse pixel's planes may leave the differences that they come from by no more than a multiple of the local *bend*
-(the largest second difference around it), which is 0 where the surface is planar, and large beside a depth step, where
-the coarse value mixes both sides.
+Each low-resolution pixel's planes may leave the differences that they come from by no more than a multiple of the local
+*bend* (the largest second difference around it), which is 0 where the surface is planar, and large beside a depth step,
+where the low-resolution value mixes both sides.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ _FAINT, _STRONG = 1e-3, 0.25
 
 
 class Stencil(NamedTuple):
-    """Differences of a coarse map to its neighbours, per coarse pixel.
+    """Differences of a low-resolution map to its neighbours, per low-resolution pixel.
 
     ``value`` (B, 1, h, w); ``along_u`` and ``along_v`` (B, 3, h, w): backward, central and forward difference; ``bend``
     (B, 1, h, w): the largest absolute second difference within 3 x 3 pixels; ``mean`` (B, 1, h, w) of 3 x 3.
@@ -65,9 +66,9 @@ class Facets(NormalisedNetwork):
 
     Args:
         scale: upsampling factor, 2, 4, 8 or 16.
-        width: channels at the coarse resolution.
+        width: channels at the low resolution.
         blocks: residual blocks there.
-        facets: planes that each coarse pixel proposes.
+        facets: planes that each low-resolution pixel proposes.
         slopes: whether planes have slopes; without them each is a constant, and the network predicts an interpolation
             kernel for each pixel. For comparison: renderings show why it needs them.
 
@@ -102,7 +103,9 @@ class Facets(NormalisedNetwork):
             nn.Conv2d(outputs[i] + channels[i], outputs[i], 3, padding=1) for i in reversed(range(levels))
         )
         self.choice = _quiet(nn.Conv2d(_HEAD, _NEIGHBOURS * facets, 3, padding=1))
-        offsets = (torch.arange(scale) + 0.5) / scale - 0.5  # of fine pixels from their coarse one's centre
+        offsets = (
+            torch.arange(scale) + 0.5
+        ) / scale - 0.5  # of high-resolution pixels from their low-resolution one's centre
         self.register_buffer("offsets", offsets, persistent=False)
         self.register_buffer("prior", _spline_logits(offsets), persistent=False)
 
@@ -113,10 +116,10 @@ class Facets(NormalisedNetwork):
 
     @property
     def reach(self) -> int:
-        """How many coarse pixels around its own an output depends on.
+        """How many low-resolution pixels around its own an output depends on.
 
         One for its planes' neighbours and what follows the trunk, two for each residual block, one each for the planes'
-        and the coarse map's convolutions, two for the differences; the photo's features look less far.
+        and the low-resolution map's convolutions, two for the differences; the photo's features look less far.
         """
         return 2 * self.blocks + 6
 
@@ -125,7 +128,7 @@ class Facets(NormalisedNetwork):
         return (_mean(rgb),)
 
     def forward(self, rgb: Tensor, values: Tensor, mean: Tensor | None = None) -> Tensor:
-        """Map a photo and normalised coarse disparity to fine disparity.
+        """Map a photo and normalised low-resolution disparity to high-resolution disparity.
 
         Args:
             rgb: (B, 3, H, W).
@@ -149,7 +152,7 @@ class Facets(NormalisedNetwork):
         return self._mixed(planes, self.choice(x))
 
     def _proposed(self, output: Tensor, around: Stencil) -> Tensor:
-        """Return the planes of each coarse pixel, (B, facets, 3, h, w): value at its centre, slopes along u and v."""
+        """Return the planes of each LR pixel, (B, facets, 3, h, w): value at its centre, slopes along u and v."""
         output = output.to(torch.promote_types(around.value.dtype, torch.float32))
         batch, _, height, width = output.shape
         moves, picks = output.split((3 * self.facets, 6), dim=1)
@@ -163,7 +166,7 @@ class Facets(NormalisedNetwork):
         return planes if self.slopes else torch.cat((planes[:, :, :1], torch.zeros_like(planes[:, :, 1:])), dim=2)
 
     def _mixed(self, planes: Tensor, choice: Tensor) -> Tensor:
-        """Return the mixture of the planes around each fine pixel, (B, 1, H, W).
+        """Return the mixture of the planes around each high-resolution pixel, (B, 1, H, W).
 
         Args:
             planes: (B, facets, 3, h, w).
@@ -229,7 +232,7 @@ def _coarse_input(around: Stencil) -> Tensor:
 
 
 def _neighbours(planes: Tensor) -> Tensor:
-    """Return the planes of the 3 x 3 coarse pixels around each, extended to its centre.
+    """Return the planes of the 3 x 3 low-resolution pixels around each, extended to its centre.
 
     Args:
         planes: (B, facets, 3, h, w).

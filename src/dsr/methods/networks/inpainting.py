@@ -1,4 +1,4 @@
-"""Holes of coarse maps, for networks that need a value everywhere."""
+"""Holes of low-resolution maps, for networks that need a value everywhere."""
 
 from __future__ import annotations
 

@@ -30,14 +30,14 @@ def normalised(x: Tensor, bounds: Tensor | None = None) -> Normalised:
 
     """
     known = x.isfinite()
-    bounds = bounds_of(x) if bounds is None else bounds.to(x)
+    bounds = min_max(x) if bounds is None else bounds.to(x)
     least = bounds[:, :1]
     span = bounds[:, 1:] - least  # -inf where nothing is finite
     values = torch.where(known, x - least, 0) / torch.where(span > 0, span, 1)
     return Normalised(values, torch.where(span >= 0, least, torch.nan), span)
 
 
-def bounds_of(x: Tensor) -> Tensor:
+def min_max(x: Tensor) -> Tensor:
     """Return the lowest and the highest finite value of each map of (B, 1, H, W), (B, 2, 1, 1).
 
     Infinity and minus infinity where nothing is finite.
@@ -62,7 +62,7 @@ def upsample_bicubic(x: Tensor, scale: int) -> Tensor:
 
 
 def coarse_coordinates(fine: Camera, coarse: Camera, device: torch.device | str = "cpu") -> tuple[Tensor, Tensor]:
-    """Return the coarse row of each fine row, (H,), and the coarse column of each fine column, (W,), in float64."""
+    """Return the LR row of each HR row, (H,), and the LR column of each HR column, (W,), in float64."""
     rows = torch.arange(fine.height, dtype=torch.float64, device=device)
     columns = torch.arange(fine.width, dtype=torch.float64, device=device)
     return (

@@ -30,7 +30,7 @@ class MSGVariant:
             the whole photo look alike to the network; else see :func:`guidance_map`.
         depth_gain, residual_gain: factors of the depth that goes in and of the residual that comes out. Small residuals
             of large activations: a step of the optimiser moves smooth surfaces less.
-        fill_holes: holes of the coarse map are filled from around; else they are the least disparity.
+        fill_holes: holes of the low-resolution map are filled from around; else they are the least disparity.
         drift_compensation: the output's mean over a flat probe is taken off the output, see
             :func:`dsr.methods.networks.msg_net.output_drift`.
 

@@ -18,10 +18,10 @@ import torch
 from torch import Tensor, nn
 
 from dsr.degradation.downsampling import check_scale
-from dsr.methods.networks.base import Whole, WindowedNetwork
+from dsr.methods.networks.base import GlobalContext, WindowedNetwork
 from dsr.methods.networks.inpainting import filled
 from dsr.methods.networks.layers import ConvLayer, Level
-from dsr.methods.networks.maps import bounds_of, mean3x3, normalised, upsample_bicubic
+from dsr.methods.networks.maps import mean3x3, min_max, normalised, upsample_bicubic
 from dsr.methods.networks.msg_guidance import VARIANTS, Traits, VariantName, guidance_map, intensity_of
 
 FEATURES = 32
@@ -85,20 +85,20 @@ class MSGNet(WindowedNetwork):
         return {"scale": self.scale, "variant": self.variant.name}
 
     def upsample(self, rgb: Tensor, disparity: Tensor, bounds: Tensor | None = None) -> Tensor:
-        """Return fine disparity; see :func:`upsample_disparity`."""
+        """Return high-resolution disparity; see :func:`upsample_disparity`."""
         return upsample_disparity(self, rgb, disparity, bounds)
 
     @property
     def reach(self) -> int:
-        """How many coarse pixels around its own an output depends on, two of them for ``hui``'s uneven padding."""
+        """How many LR pixels around its own an output depends on, two of them for ``hui``'s uneven padding."""
         return self.rows_seen(0) + 2
 
-    def whole(self, rgb: Tensor, disparity: Tensor) -> Whole:
+    def global_context(self, rgb: Tensor, disparity: Tensor) -> GlobalContext:
         """Return what answers windows: ranges, drift and filled holes are the whole image's."""
-        bounds = bounds_of(disparity)
+        bounds = min_max(disparity)
         traits = traits_of(self, rgb, disparity)
         known = filled(disparity) if self.variant.fill_holes else disparity
-        return Whole(known, lambda photo, window: upsample_disparity(self, photo, window, bounds, traits))
+        return GlobalContext(known, lambda photo, window: upsample_disparity(self, photo, window, bounds, traits))
 
     def output_size(self, depth: Tensor) -> torch.Size:
         """Return (H, W) for depth of (..., h, w)."""
@@ -165,8 +165,8 @@ def traits_of(net: MSGNet, rgb: Tensor, disparity: Tensor) -> Traits:
     intensity = detail = drift = None
     if not variant.plain_guidance:
         grey = intensity_of(rgb, variant)
-        intensity, grey = bounds_of(grey), normalised(grey).values
-        detail = bounds_of(grey - mean3x3(grey))
+        intensity, grey = min_max(grey), normalised(grey).values
+        detail = min_max(grey - mean3x3(grey))
     if variant.drift_compensation:
         drift = output_drift(net, guidance_map(rgb, variant), normalised(disparity).values)
     return Traits(intensity, detail, drift)

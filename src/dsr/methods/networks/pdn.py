@@ -8,10 +8,10 @@ paper leaves open are those of the authors' code (github.com/griegler/primal-dua
 
 What differs from the original:
 
-- It works on disparity, over its range in the coarse map. The upsampling is bicubic and exact on planes, the original's
-  is bilinear. The convolutions see its differences from local means and its slopes, faint ones enlarged, instead of
-  its values, so that bfloat16 is enough for them; and the photo's colours instead of its grey.
-- The residual is in multiples of the coarse map's *bend* (the largest second difference around, see
+- It works on disparity, over its range in the low-resolution map. The upsampling is bicubic and exact on planes, the
+  original's is bilinear. The convolutions see its differences from local means and its slopes, faint ones enlarged,
+  instead of its values, so that bfloat16 is enough for them; and the photo's colours instead of its grey.
+- The residual is in multiples of the low-resolution map's *bend* (the largest second difference around, see
   :mod:`dsr.methods.networks.facets`), so that it is 0 on a plane whatever the weights are. Without that, a short
   training left a DSSIM_v of 0.30 instead of 0.22 on procedural scenes.
 - The window is 5 x 5, 12 offsets, the original's 7 x 7, 24 offsets, in twice the time; 10 steps, the code has 20.
@@ -89,16 +89,16 @@ class PrimalDualNetwork(NormalisedNetwork):
 
     @property
     def reach(self) -> int:
-        """How many coarse pixels around its own an output depends on.
+        """How many low-resolution pixels around its own an output depends on.
 
-        A fine pixel for each convolution, half a window for each step of the iteration; the upsampling and the
-        differences of the coarse map that go in look four coarse pixels far.
+        A high-resolution pixel for each convolution, half a window for each step of the iteration; the upsampling and
+        the differences of the low-resolution map that go in look four low-resolution pixels far.
         """
         fine = self.layers + self.stage.reach
         return -(-fine // self.scale) + 4
 
     def forward(self, rgb: Tensor, values: Tensor) -> Tensor:
-        """Map a photo and normalised coarse disparity to fine disparity.
+        """Map a photo and normalised low-resolution disparity to high-resolution disparity.
 
         Args:
             rgb: (B, 3, H, W).
@@ -125,9 +125,9 @@ class PrimalDualNetwork(NormalisedNetwork):
     def _seen(self, rgb: Tensor, values: Tensor, fine: Tensor) -> tuple[Tensor, Tensor]:
         """Return what the convolutions take, (B, 9, H, W), and the bend that their residual is a multiple of.
 
-        These are the photo's 3 colours; the coarse map's slopes along u and v and its distance from the mean of 3 x 3
-        pixels, the fine map's distance from the same means, and the bend, compressed so that faint ones count; and the
-        latter distance over the bend.
+        These are the photo's 3 colours; the low-resolution map's slopes along u and v and its distance from the mean of
+        3 x 3 pixels, the high-resolution map's distance from the same means, and the bend, compressed so that faint
+        ones count; and the latter distance over the bend.
         """
         around = stencil(values)
         coarse = torch.cat((around.along_u[:, 1:2], around.along_v[:, 1:2], around.value - around.mean), dim=1)

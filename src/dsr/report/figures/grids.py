@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from dsr.evaluation.results import Problem, Results
+from dsr.evaluation.results import BenchmarkSetting, Results
 from dsr.report.figures.layout import Row, draw_grid, save_both
 from dsr.report.figures.rows import depth_row, error_row, rendering_row
 from dsr.report.figures.scenes import Shown, first_runs, scene_names, shown_scenes
@@ -118,7 +118,7 @@ def _pages(rows: Iterator[Row]) -> Iterator[list[Row]]:
         yield page
 
 
-def _names(problems: list[Problem]) -> list[str]:
+def _names(problems: list[BenchmarkSetting]) -> list[str]:
     """Return a part of a file's name for each problem, no two the same."""
     names: list[str] = []
     for dataset, scale, downsampling in problems:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from torch import Tensor
 
-from dsr.evaluation.results import Problem, Results, Run
+from dsr.evaluation.results import BenchmarkSetting, Results, Run
 from dsr.evaluation.store import StoredScene
 from dsr.geometry.camera import Camera
 from dsr.geometry.shading import LIGHT_NAMES, lights, shade
@@ -40,7 +40,7 @@ class Shown:
         return [depth for depth in self.depths.values() if depth is not None]
 
 
-def first_runs(results: Results, problem: Problem) -> dict[str, list[Run]]:
+def first_runs(results: Results, problem: BenchmarkSetting) -> dict[str, list[Run]]:
     """Return the runs of a problem by method; the first is of the lowest seed."""
     runs: dict[str, list[Run]] = {}
     for run in results.of(problem):
@@ -53,7 +53,7 @@ def scene_names(runs: dict[str, list[Run]]) -> list[str]:
     return list(dict.fromkeys(scene for each in runs.values() for run in each for scene in run.scenes))
 
 
-def shown_scenes(results: Results, problem: Problem, notes: list[str]) -> Iterator[Shown]:
+def shown_scenes(results: Results, problem: BenchmarkSetting, notes: list[str]) -> Iterator[Shown]:
     """Yield the scenes of a problem one by one.
 
     Args:

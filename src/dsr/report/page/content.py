@@ -10,7 +10,7 @@ from urllib.parse import quote
 
 import pandas as pd
 
-from dsr.evaluation.results import Problem, Results, Run
+from dsr.evaluation.results import BenchmarkSetting, Results, Run
 from dsr.metrics.catalogue import METRICS
 from dsr.report.tables import AVERAGES, OTHER_FRAMES, RECREATED, in_paper_units, paper_row
 
@@ -30,7 +30,7 @@ def metrics_data(results: Results) -> list[dict[str, Any]]:
     ]
 
 
-def problem_data(results: Results, problem: Problem) -> dict[str, Any]:
+def problem_data(results: Results, problem: BenchmarkSetting) -> dict[str, Any]:
     """Return a problem's scores in the paper's units, by scene and on average, with the published ones beside them."""
     runs = results.of(problem)
     methods = list(dict.fromkeys(run.label for run in runs))
@@ -79,7 +79,7 @@ def _over_seeds(series: Sequence[pd.Series]) -> dict[str, list[float]]:
     return {name: numbers for name, numbers in values.items() if all(map(math.isfinite, numbers))}
 
 
-def _mean_row(problem: Problem, method: str, scenes: list[str], tables: list[pd.DataFrame]) -> dict[str, Any]:
+def _mean_row(problem: BenchmarkSetting, method: str, scenes: list[str], tables: list[pd.DataFrame]) -> dict[str, Any]:
     """Return a method's averages over the scenes; ``counts``: by metric, over how many, where some are missing."""
     values = _over_seeds([table.mean() for table in tables])
     seen: dict[str, set[str]] = {name: set() for name in values}
@@ -95,7 +95,7 @@ def _mean_row(problem: Problem, method: str, scenes: list[str], tables: list[pd.
             "starred": starred and bool(paper)}  # fmt: skip
 
 
-def _published(problem: Problem, scene: str, method: str) -> dict[str, float]:
+def _published(problem: BenchmarkSetting, scene: str, method: str) -> dict[str, float]:
     """Return the paper's figures by metric; it has some where the downsampling is its own."""
     row = paper_row(scene, method, problem.scale, problem.downsampling)
     return {} if row is None else {name: float(row[name]) for name in METRICS if pd.notna(row[name])}

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from torch import Tensor
 
-from dsr.evaluation.results import Problem, Results, Run, one_per_method
+from dsr.evaluation.results import BenchmarkSetting, Results, Run, one_per_method
 from dsr.evaluation.store import StoredScene
 from dsr.geometry.camera import Camera
 from dsr.geometry.shading import lights, shade
@@ -24,7 +24,7 @@ _LEAST_ERROR = 1e-4
 class View:
     """A scene of a problem, and the runs that answered it, one of each method."""
 
-    problem: Problem
+    problem: BenchmarkSetting
     scene: str
     runs: tuple[Run, ...]
 

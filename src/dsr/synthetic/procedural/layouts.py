@@ -14,17 +14,17 @@ from dsr.synthetic.procedural.props import backdrop, fill_room, heap, oddment, s
 from dsr.synthetic.procedural.reliefs import RELIEFS, blanket, crumple, curtain, folds, ground, relief
 from dsr.synthetic.procedural.shape import about, any_turn, box, merged
 from dsr.synthetic.procedural.solids import any_solid, frustum, grounded, prism
-from dsr.synthetic.procedural.stage import Stage, Viewpoint, Wardrobe, looking
+from dsr.synthetic.procedural.stage import MaterialSampler, SceneLayout, Viewpoint, looking
 from dsr.synthetic.surfaces import Array
 
-Layout = Callable[[np.random.Generator, Wardrobe], Stage]
+Layout = Callable[[np.random.Generator, MaterialSampler], SceneLayout]
 
 
 def _vector(*values: float) -> Array:
     return np.array(values, dtype=np.float64)
 
 
-def room(rng: np.random.Generator, wear: Wardrobe) -> Stage:
+def room(rng: np.random.Generator, wear: MaterialSampler) -> SceneLayout:
     """Return a furnished room, seen from eye height towards a corner or a wall."""
     size = rng.uniform([2.6, 2.8, 2.2], [5.5, 6.0, 3.2])
     bodies = [*shell(rng, wear, size), *fill_room(rng, wear, size)]
@@ -37,10 +37,10 @@ def room(rng: np.random.Generator, wear: Wardrobe) -> Stage:
         return looking(draw, eye, target, 0.6, 1.3)
 
     margin = _vector(0.3, 0.3, 0.2)
-    return Stage(bodies, views, _vector(-size[0] / 2, -size[1] / 2, 0.9) + margin, size * [0.5, 0.5, 1] - margin)
+    return SceneLayout(bodies, views, _vector(-size[0] / 2, -size[1] / 2, 0.9) + margin, size * [0.5, 0.5, 1] - margin)
 
 
-def tabletop(rng: np.random.Generator, wear: Wardrobe) -> Stage:
+def tabletop(rng: np.random.Generator, wear: MaterialSampler) -> SceneLayout:
     """Return many small things on a table before a wall or a backdrop."""
     wide, deep = rng.uniform([0.7, 0.5], [1.6, 0.9])
     bodies = tableware(rng, wear, _vector(wide, deep))
@@ -59,10 +59,10 @@ def tabletop(rng: np.random.Generator, wear: Wardrobe) -> Stage:
         way = _vector(np.sin(yaw) * np.cos(rise), -np.cos(yaw) * np.cos(rise), np.sin(rise))
         return looking(draw, target + far * way, target, 0.8, 1.8)
 
-    return Stage(bodies, views, _vector(-2, -2, 0.3), _vector(2, deep / 2, 2))
+    return SceneLayout(bodies, views, _vector(-2, -2, 0.3), _vector(2, deep / 2, 2))
 
 
-def statue(rng: np.random.Generator, wear: Wardrobe) -> Stage:
+def statue(rng: np.random.Generator, wear: MaterialSampler) -> SceneLayout:
     """Return one or two organic bodies, close, on a plinth."""
     count = 1 if rng.random() < 0.65 else 2
     bodies = []
@@ -83,10 +83,10 @@ def statue(rng: np.random.Generator, wear: Wardrobe) -> Stage:
         eye = target + far * _vector(np.sin(yaw), -np.cos(yaw), draw.uniform(-0.15, 0.5))
         return looking(draw, eye, target, 0.7, 1.6)
 
-    return Stage(bodies, views, _vector(-2, -2, 0.2), _vector(2, 0.3, 2.2))
+    return SceneLayout(bodies, views, _vector(-2, -2, 0.2), _vector(2, 0.3, 2.2))
 
 
-def relief_wall(rng: np.random.Generator, wear: Wardrobe) -> Stage:
+def relief_wall(rng: np.random.Generator, wear: MaterialSampler) -> SceneLayout:
     """Return a relief that fills the picture, straight or at a slant, flat or curved; things before it at times."""
     side = 3.0
     bend = rng.choice([0.0, 0.0, 0.12, -0.12, 0.3])
@@ -105,10 +105,10 @@ def relief_wall(rng: np.random.Generator, wear: Wardrobe) -> Stage:
         eye = target + far * _vector(np.sin(slant) * np.cos(lift), -np.cos(slant) * np.cos(lift), np.sin(lift))
         return looking(draw, eye, target, 1.0, 1.8)
 
-    return Stage(bodies, views, _vector(-3, -3, -2), _vector(3, -0.5, 3))
+    return SceneLayout(bodies, views, _vector(-3, -3, -2), _vector(3, -0.5, 3))
 
 
-def landscape(rng: np.random.Generator, wear: Wardrobe) -> Stage:
+def landscape(rng: np.random.Generator, wear: MaterialSampler) -> SceneLayout:
     """Return ground or rumpled cloth seen at a slant, with stones, plants or things on it, before a backdrop."""
     maker = (ground, ground, crumple, folds)[rng.integers(4)]
     side = 4.0
@@ -134,10 +134,10 @@ def landscape(rng: np.random.Generator, wear: Wardrobe) -> Stage:
         eye = _vector(draw.uniform(-0.4, 0.4), -0.5, rise)
         return looking(draw, eye, _vector(draw.uniform(-0.3, 0.3), draw.uniform(0.9, 1.8), 0), 0.7, 1.5)
 
-    return Stage(bodies, views, _vector(-3, -2, 0.8), _vector(3, 2.6, 3.5))
+    return SceneLayout(bodies, views, _vector(-3, -2, 0.8), _vector(3, 2.6, 3.5))
 
 
-def portico(rng: np.random.Generator, wear: Wardrobe) -> Stage:
+def portico(rng: np.random.Generator, wear: MaterialSampler) -> SceneLayout:
     """Return a portico or a facade: columns, steps, arches, railings, blocks; several metres away."""
     stone, count = wear.paint("stone", 1.5), int(rng.integers(2, 6))
     pitch, high = rng.uniform(1.2, 2.4), rng.uniform(2.6, 4.0)
@@ -165,10 +165,10 @@ def portico(rng: np.random.Generator, wear: Wardrobe) -> Stage:
         eye = draw.uniform([-3.0, -7.0, 0.3], [3.0, -3.6, 2.6])
         return looking(draw, eye, draw.uniform([-1, 0, 0.6], [1, 0.5, 1.9]), 0.8, 1.5)
 
-    return Stage(bodies, views, _vector(-8, -12, 2), _vector(8, -2, 9))
+    return SceneLayout(bodies, views, _vector(-8, -12, 2), _vector(8, -2, 9))
 
 
-def shapes(rng: np.random.Generator, wear: Wardrobe) -> Stage:
+def shapes(rng: np.random.Generator, wear: MaterialSampler) -> SceneLayout:
     """Return a few large simple or organic shapes that float before a plane or a curved backdrop."""
     bodies = []
     for place in heap(rng, int(rng.integers(1, 6))):
@@ -181,10 +181,10 @@ def shapes(rng: np.random.Generator, wear: Wardrobe) -> Stage:
         eye = draw.uniform([-0.8, -2.6, -0.3], [0.8, -1.7, 0.9])
         return looking(draw, eye, draw.uniform([-0.1, 0, -0.1], [0.1, 0, 0.1]), 0.9, 1.8)
 
-    return Stage(bodies, views, _vector(-2.5, -3, -0.5), _vector(2.5, -0.3, 2.5))
+    return SceneLayout(bodies, views, _vector(-2.5, -3, -0.5), _vector(2.5, -0.3, 2.5))
 
 
-def clutter(rng: np.random.Generator, wear: Wardrobe) -> Stage:
+def clutter(rng: np.random.Generator, wear: MaterialSampler) -> SceneLayout:
     """Return a crowd of things of all kinds at several depths that fills the picture: a lumber-room, a toy box."""
     bodies: list[Body] = []
     reach = rng.uniform(0.5, 1.0)
@@ -204,10 +204,10 @@ def clutter(rng: np.random.Generator, wear: Wardrobe) -> Stage:
         eye = draw.uniform([-0.7, -1.7, 0.3], [0.7, -0.9, 1.3])
         return looking(draw, eye, draw.uniform([-0.2, 0.2, 0.05], [0.2, 0.4, 0.3]), 1.0, 1.8)
 
-    return Stage(bodies, views, _vector(-2, -2, 0.4), _vector(2, 0.4, 2.2))
+    return SceneLayout(bodies, views, _vector(-2, -2, 0.4), _vector(2, 0.4, 2.2))
 
 
-def shelves(rng: np.random.Generator, wear: Wardrobe) -> Stage:
+def shelves(rng: np.random.Generator, wear: MaterialSampler) -> SceneLayout:
     """Return a close look at a full bookcase, through a curtain's gap or a grille at times."""
     parts = shelf(rng)
     families = ["wood", "print", "any", "cloth", "any"]
@@ -230,7 +230,7 @@ def shelves(rng: np.random.Generator, wear: Wardrobe) -> Stage:
         eye[2] = max(eye[2], 0.15)
         return looking(draw, eye, target, 0.8, 1.5)
 
-    return Stage(bodies, views, _vector(-2, -3, 0.4), _vector(2, -0.5, 2.6))
+    return SceneLayout(bodies, views, _vector(-2, -3, 0.4), _vector(2, -0.5, 2.6))
 
 
 LAYOUTS: dict[str, tuple[Layout, float]] = {

@@ -12,11 +12,11 @@ from dsr.synthetic.procedural.photo import Body
 from dsr.synthetic.procedural.reliefs import RELIEFS, blanket, curtain, relief
 from dsr.synthetic.procedural.shape import Shape, about, box, merged, quad, surface
 from dsr.synthetic.procedural.solids import any_solid, bowl, letter, vase
-from dsr.synthetic.procedural.stage import Wardrobe
+from dsr.synthetic.procedural.stage import MaterialSampler
 from dsr.synthetic.surfaces import Array
 
 
-def shell(rng: np.random.Generator, wear: Wardrobe, size: Array) -> list[Body]:
+def shell(rng: np.random.Generator, wear: MaterialSampler, size: Array) -> list[Body]:
     """Return floor, ceiling and walls of a room of ``size`` (3,) around the origin of its floor."""
     x, y, z = size
     low = [-x / 2, -y / 2, 0.0]
@@ -39,7 +39,7 @@ def shell(rng: np.random.Generator, wear: Wardrobe, size: Array) -> list[Body]:
     return bodies
 
 
-def fill_room(rng: np.random.Generator, wear: Wardrobe, size: Array) -> list[Body]:
+def fill_room(rng: np.random.Generator, wear: MaterialSampler, size: Array) -> list[Body]:
     """Return furniture along the back and side walls and on the floor, and what hangs on the walls."""
     bodies: list[Body] = []
     for wall, (turn, length) in enumerate(((0, size[0]), (90, size[1]), (-90, size[1]))):
@@ -64,7 +64,7 @@ def _extent(parts: Sequence[Shape]) -> tuple[Array, Array]:
 
 
 def _dressed(
-    wear: Wardrobe, parts: Sequence[Shape], families: Sequence[str], turn: Array, shift: Array | Sequence[float]
+    wear: MaterialSampler, parts: Sequence[Shape], families: Sequence[str], turn: Array, shift: Array | Sequence[float]
 ) -> list[Body]:
     """Return the parts, moved by ``shift`` and then turned, each in its material."""
     last = families[-1]
@@ -107,7 +107,7 @@ def _set_table(rng: np.random.Generator) -> list[Shape]:
 
 
 def _hangings(
-    rng: np.random.Generator, wear: Wardrobe, turn: Array, length: float, out: float, high: float
+    rng: np.random.Generator, wear: MaterialSampler, turn: Array, length: float, out: float, high: float
 ) -> list[Body]:
     """Return what hangs on a wall at y = ``out``, then turned: pictures, a window with a curtain or blinds, a rail."""
     bodies: list[Body] = []
@@ -138,7 +138,7 @@ def _hangings(
     return bodies
 
 
-def _middle(rng: np.random.Generator, wear: Wardrobe, size: Array) -> list[Body]:
+def _middle(rng: np.random.Generator, wear: MaterialSampler, size: Array) -> list[Body]:
     """Return a carpet, and a table with chairs or single things in the middle of the room."""
     bodies: list[Body] = []
     spot = rng.uniform([-0.2, -0.05], [0.2, 0.2]) * size[:2]
@@ -170,7 +170,7 @@ def scattered(rng: np.random.Generator, size: Array, count: int, apart: float) -
     return spots
 
 
-def tableware(rng: np.random.Generator, wear: Wardrobe, size: Array) -> list[Body]:
+def tableware(rng: np.random.Generator, wear: MaterialSampler, size: Array) -> list[Body]:
     """Return things on a table of ``size`` (2,) whose top is z = 0."""
     bodies: list[Body] = []
     pitch = rng.uniform(0.11, 0.3)
@@ -236,7 +236,7 @@ def heap(rng: np.random.Generator, count: int) -> list[Array]:
     ]
 
 
-def backdrop(rng: np.random.Generator, wear: Wardrobe, back: float, floor: float) -> list[Body]:
+def backdrop(rng: np.random.Generator, wear: MaterialSampler, back: float, floor: float) -> list[Body]:
     """Return what closes the view: a wall and a floor, a sweep, a curved wall, folds, or a relief."""
     kind = rng.integers(5)
     ground = wear.dress(box([30, 30, 0.1]).moved([0, 0, floor - 0.101]), "wood", 1.0)

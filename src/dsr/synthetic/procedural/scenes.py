@@ -10,7 +10,7 @@ from dsr.geometry.camera import Camera
 from dsr.synthetic.procedural.layouts import LAYOUTS
 from dsr.synthetic.procedural.lighting import Lighting, random_lighting
 from dsr.synthetic.procedural.photo import View, developed, radiance
-from dsr.synthetic.procedural.stage import Stage, Viewpoint, Wardrobe
+from dsr.synthetic.procedural.stage import MaterialSampler, SceneLayout, Viewpoint
 from dsr.synthetic.procedural.tracer import Hits, Tracer
 from dsr.synthetic.rendering import Rendering
 
@@ -34,7 +34,7 @@ class RandomScene:
     """
 
     layout: str
-    stage: Stage
+    stage: SceneLayout
     tracer: Tracer
     viewpoint: Viewpoint
     lighting: Lighting
@@ -70,7 +70,7 @@ def random_scene(rng: np.random.Generator, layout: str | None = None) -> RandomS
     weights = np.array([weight for _, weight in LAYOUTS.values()])
     for _ in range(_TRIES[0]):
         name = layout if layout is not None else names[rng.choice(len(names), p=weights / weights.sum())]
-        stage = LAYOUTS[name][0](rng, Wardrobe(rng))
+        stage = LAYOUTS[name][0](rng, MaterialSampler(rng))
         tracer = Tracer([body.shape for body in stage.bodies])
         for _ in range(_TRIES[1]):
             viewpoint = stage.views(rng)

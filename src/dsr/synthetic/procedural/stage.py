@@ -63,7 +63,7 @@ def looking(rng: np.random.Generator, eye: Array, target: Array, low: float = 0.
 
 
 @dataclass(frozen=True, eq=False)
-class Stage:
+class SceneLayout:
     """A layout.
 
     Args:
@@ -79,7 +79,7 @@ class Stage:
     high: Array
 
 
-class Wardrobe:
+class MaterialSampler:
     """The materials of one scene: from bare plaster to everything patterned; now and then one paint over all."""
 
     def __init__(self, rng: np.random.Generator) -> None:

@@ -17,13 +17,13 @@ from dsr.methods.classical.photo_guided import slopes_along
 from dsr.methods.networks.inpainting import filled
 
 _CHUNK = 4096
-"""Coarse pixels whose ways are looked for at once."""
+"""Low-resolution pixels whose ways are looked for at once."""
 _BESIDE = ((-1, 0), (0, -1), (0, 1), (1, 0), (-1, -1), (-1, 1), (1, -1), (1, 1))
 """Rows and columns to a pixel's neighbours, the nearest first."""
 
 
 class _Planes(NamedTuple):
-    """Coarse pixels (h, w): value, slopes per row and per column, and how much each counts."""
+    """Low-resolution pixels (h, w): value, slopes per row and per column, and how much each counts."""
 
     values: Tensor
     down: Tensor
@@ -47,11 +47,11 @@ def filtered(
     Args:
         coarse: the map, NaN where it is not known; some of it must be.
         barrier: (H, W) bool, the edges.
-        scale: fine pixels per coarse one.
-        radius: of the neighbourhood, in coarse pixels.
-        sigma_space: standard deviation of the distance's Gaussian, in coarse pixels.
-        mixed: what a coarse pixel with an edge through it counts.
-        doubtful: (h, w) bool, more coarse pixels that mix two sides; None for none.
+        scale: high-resolution pixels per low-resolution one.
+        radius: of the neighbourhood, in low-resolution pixels.
+        sigma_space: standard deviation of the distance's Gaussian, in low-resolution pixels.
+        mixed: what a low-resolution pixel with an edge through it counts.
+        doubtful: (h, w) bool, more low-resolution pixels that mix two sides; None for none.
         sharp: whether pixels on edges take a side; otherwise they keep what leaves block means as they are.
 
     """
@@ -72,19 +72,19 @@ def filtered(
 
 
 def reachable(barrier: Tensor, scale: int, radius: int) -> Tensor:
-    """Return which coarse pixels each fine pixel has a way to that crosses no edge.
+    """Return which low-resolution pixels each high-resolution pixel has a way to that crosses no edge.
 
-    A way starts in the middle of the coarse pixel, goes over 4-connected fine pixels that are no edge, and stays within
-    the coarse pixels at most ``radius`` rows and columns off.
+    A way starts in the middle of the low-resolution pixel, goes over 4-connected high-resolution pixels that are no
+    edge, and stays within the low-resolution pixels at most ``radius`` rows and columns off.
 
     Args:
         barrier: (H, W) bool, the edge map.
-        scale: fine pixels per coarse one.
-        radius: of the neighbourhood, in coarse pixels.
+        scale: high-resolution pixels per low-resolution one.
+        radius: of the neighbourhood, in low-resolution pixels.
 
     Returns:
-        (2 radius + 1, 2 radius + 1, H, W) bool: [radius + a, radius + b] says it of the coarse pixel a rows below and
-        b columns right of the one that the fine pixel lies in.
+        (2 radius + 1, 2 radius + 1, H, W) bool: [radius + a, radius + b] says it of the low-resolution pixel a rows
+        below and b columns right of the one that the high-resolution pixel lies in.
 
     """
     height, width = barrier.shape[0] // scale, barrier.shape[1] // scale
@@ -125,7 +125,7 @@ def _means(planes: _Planes, reach: Tensor, scale: int, sigma_space: float, smoot
 
 
 def _between(fine: Tensor, barrier: Tensor, coarse: Tensor, smooth: Tensor, scale: int) -> Tensor:
-    """Return the fine map with new values on edges: the smooth map, moved as the means of blocks need.
+    """Return the high-resolution map with new values on edges: the smooth map, moved as the means of blocks need.
 
     They stay between the least and the most of the neighbours off the edge.
     """

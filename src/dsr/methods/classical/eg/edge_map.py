@@ -1,4 +1,4 @@
-"""The fine edge map of a coarse map: patches of edges that recur across scales, chosen by a Markov random field.
+"""The HR edge map of a LR map: patches of edges that recur across scales, chosen by a Markov random field.
 
 Xie, Feris, Sun, *Edge-Guided Single Depth Image Super Resolution*, IEEE TIP 25(1), 2016, the self-similar mode, which
 needs no training data. The map itself at a coarser level, where the truth is known, gives pairs of patches: edges found
@@ -14,9 +14,9 @@ edges of less than 4 pixels dropped, pairs only where both have edge pixels enou
 
 What differs:
 
-- Edges are Canny's of the bicubic map, whose inflection lines say within a coarse pixel where a step of box means is.
-  There, maps are single samples, each repeated as a block, and a shock filter makes a second, sharper edge map for the
-  data term; as it leaves inflection lines where they are, one map serves for both here.
+- Edges are Canny's of the bicubic map, whose inflection lines say within a low-resolution pixel where a step of box
+  means is. There, maps are single samples, each repeated as a block, and a shock filter makes a second, sharper edge
+  map for the data term; as it leaves inflection lines where they are, one map serves for both here.
 - The surface's own slope does not count as a step.
 - Pairs come in the 8 orientations of the grid, exactly, rather than turned by multiples of 18 degrees.
 - One patch at most in each cell of 2 x 2 pixels, rather than a scan that skips the neighbours of what it took.
@@ -29,7 +29,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from dsr.methods.base import NoAnswerError
+from dsr.methods.base import NoSolutionError
 from dsr.methods.classical.eg.belief_propagation import Labelling, labelled
 from dsr.methods.classical.eg.patches import (
     PATCH,
@@ -69,11 +69,11 @@ def edge_map(
     iterations: int = 100,
     progress: Progress | None = None,
 ) -> tuple[Tensor, Labelling | None]:
-    """Return the fine edge map, (h * scale, w * scale) bool, and how its patches were chosen; None without an edge.
+    """Return the HR edge map, (h * scale, w * scale) bool, and how its patches were chosen; None without an edge.
 
     Args:
         coarse: (h, w) map, NaN where it is not known.
-        scale: fine pixels per coarse one, at least 2.
+        scale: high-resolution pixels per low-resolution one, at least 2.
         step: how high a step is an edge, in the map's unit.
         candidates: pairs that each patch chooses from.
         sharp_weight: weight of the sharp edges against the distances of the edges.
@@ -82,7 +82,7 @@ def edge_map(
         progress: is told the iterations done and the most that it may take.
 
     Raises:
-        NoAnswerError: the map has edges, but none at the coarser level.
+        NoSolutionError: the map has edges, but none at the coarser level.
 
     """
     border = -(-(PATCH // 2 + 1) // scale)
@@ -92,9 +92,9 @@ def edge_map(
         return torch.zeros_like(found[within]), None
     known = recurring(coarse, scale, step)
     if len(known.low) == 0:
-        raise NoAnswerError(
+        raise NoSolutionError(
             f"edge-guided upsampling: the edges of a map of {coarse.shape[0]} x {coarse.shape[1]} pixels do not recur "
-            f"at 1/{scale} of its size, so nothing tells how fine ones look"
+            f"at 1/{scale} of its size, so nothing tells how high-resolution ones look"
         )
     places = _places(found)
     far, which = nearest(taken(found, places), known, candidates, sharp_weight)
@@ -110,10 +110,10 @@ def edges(coarse: Tensor, scale: int, step: float) -> Tensor:
     """Return the steps of a map (h, w) upsampled by ``scale``, (h * scale, w * scale) bool, about a pixel wide.
 
     Canny, *A Computational Approach to Edge Detection*, PAMI 1986: pixels whose gradient is the largest along its
-    direction and large enough, or less large and connected with such. A step of height s between coarse pixels has a
-    gradient of s / 2 at least. Only as much of a gradient counts as exceeds the slope of the surface (see
-    :func:`dsr.methods.classical.photo_guided.slopes_along`) there or at a coarse pixel beside: planes have no edge,
-    however steep, and nor has what a hole (NaN) is filled with.
+    direction and large enough, or less large and connected with such. A step of height s between low-resolution pixels
+    has a gradient of s / 2 at least. Only as much of a gradient counts as exceeds the slope of the surface (see
+    :func:`dsr.methods.classical.photo_guided.slopes_along`) there or at a low-resolution pixel beside: planes have no
+    edge, however steep, and nor has what a hole (NaN) is filled with.
     """
     fine = upsampled(filled(coarse[None, None]), scale)[0, 0]
     down, across = (_central(fine, axis) * scale for axis in (0, 1))

@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.nn import functional
 
 PATCH = 11
-"""Rows and columns of a patch, in fine pixels."""
+"""Rows and columns of a patch, in high-resolution pixels."""
 _ENTRIES = 2**24
 """Distances between patches that are held at once."""
 _BITS = 62

@@ -1,22 +1,22 @@
 """Edge-guided upsampling of a depth map alone: a bilateral filter whose means do not cross predicted edges.
 
 Xie, Feris, Sun, *Edge-Guided Single Depth Image Super Resolution*, IEEE TIP 25(1), 2016 (first at ICIP 2014), in its
-self-similar mode. :mod:`dsr.methods.classical.eg.edge_map` predicts the fine edges; the modified joint bilateral filter
-then is
+self-similar mode. :mod:`dsr.methods.classical.eg.edge_map` predicts the high-resolution edges; the modified joint
+bilateral filter then is
 
-    S_p = 1 / k_p * sum over coarse pixels q of S_q f(|p - q|) r(p, q),
+    S_p = 1 / k_p * sum over low-resolution pixels q of S_q f(|p - q|) r(p, q),
 
-f being a Gaussian of the distance in coarse pixels, r = 1 where a way leads from p to q that crosses no edge and 0
-elsewhere, and k_p the weights' sum. The photo is not looked at.
+f being a Gaussian of the distance in low-resolution pixels, r = 1 where a way leads from p to q that crosses no edge
+and 0 elsewhere, and k_p the weights' sum. The photo is not looked at.
 
 What differs from the original, besides the edge map:
 
-- It works on disparity, and each coarse pixel stands for a plane, as in :mod:`dsr.methods.classical.photo_guided`:
-  planes come out exactly, where constants would make stairs of every slope.
-- A coarse pixel is a mean over its block, not a sample. One that an edge cuts through mixes both sides, so it counts
-  ``mixed`` times what others count: where there is another pixel on the side of p, next to nothing.
-- A way is 4-connected, within the neighbourhood of the coarse pixel, and does not tread on edges. There, it is the
-  shortest path with edges made costly, widened by a pixel.
+- It works on disparity, and each low-resolution pixel stands for a plane, as in
+  :mod:`dsr.methods.classical.photo_guided`: planes come out exactly, where constants would make stairs of every slope.
+- A low-resolution pixel is a mean over its block, not a sample. One that an edge cuts through mixes both sides, so it
+  counts ``mixed`` times what others count: where there is another pixel on the side of p, next to nothing.
+- A way is 4-connected, within the neighbourhood of the low-resolution pixel, and does not tread on edges. There, it is
+  the shortest path with edges made costly, widened by a pixel.
 - Pixels on edges get what is missing to the coarse value in their block's mean, starting from the bicubic map and
   staying between the sides: so an edge keeps its place to a part of a pixel. Then each sees what its neighbour off the
   edge sees whose answer is the most like that. There, they see both sides.
@@ -26,7 +26,7 @@ What differs from the original, besides the edge map:
   take sides; in the next after another they count as ``mixed`` and have no slope.
 
 It has no answer for a map with edges that do not recur at half its size, such as one too small for patches: see
-:class:`dsr.methods.base.NoAnswerError`. A map without an edge needs none. Box means are expected; with
+:class:`dsr.methods.base.NoSolutionError`. A map without an edge needs none. Box means are expected; with
 ``downsampling=nearest`` it is half a pixel off.
 
 Everything that is a depth is computed in float64. Time grows with the pixels, and with edge patches times those known.
@@ -48,11 +48,11 @@ from dsr.methods.tiling import Progress, part_of
 from dsr.sample import DepthSample
 
 _BEYOND = 4.0
-"""How many times farther than the farthest known coarse pixel an answer may be, and how many times nearer."""
+"""How many times farther than the farthest known low-resolution pixel an answer may be, and how many times nearer."""
 
 
 class EdgeGuided:
-    """Edge-guided upsampling of the coarse disparity.
+    """Edge-guided upsampling of the low-resolution disparity.
 
     Args:
         step: how high a step of disparity is an edge, as a share of the map's range.
@@ -60,10 +60,10 @@ class EdgeGuided:
         sharp_weight: weight of the sharp edges against the distances of the edges, in patches' likeness.
         smoothness: weight of neighbouring patches' disagreement.
         iterations: of belief propagation, at most so many in each stage.
-        radius: of the filter's neighbourhood, in coarse pixels of the stage.
-        sigma_space: standard deviation of the distance's Gaussian, in coarse pixels of the stage.
-        mixed: what a coarse pixel with an edge through it counts.
-        fill_holes: whether holes of the coarse map are filled, from around; otherwise they stay.
+        radius: of the filter's neighbourhood, in low-resolution pixels of the stage.
+        sigma_space: standard deviation of the distance's Gaussian, in low-resolution pixels of the stage.
+        mixed: what a low-resolution pixel with an edge through it counts.
+        fill_holes: whether holes of the low-resolution map are filled, from around; otherwise they stay.
 
     Attributes:
         history: of the last call: iterations (through all stages), the field's energy, the largest change of a message.
@@ -100,10 +100,10 @@ class EdgeGuided:
 
     @torch.inference_mode()
     def __call__(self, sample: DepthSample, progress: Progress | None = None) -> Tensor:
-        """Return the fine depth, (1, H, W) in metres in the precision of the coarse depth.
+        """Return the high-resolution depth, (1, H, W) in metres in the precision of the low-resolution depth.
 
         Raises:
-            NoAnswerError: edges do not recur across scales, see the module.
+            NoSolutionError: edges do not recur across scales, see the module.
 
         """
         coarse = to_range(sample.depth_lr.double(), sample.camera_lr, "disparity")[0] * sample.scale
@@ -134,7 +134,7 @@ class EdgeGuided:
         return from_range(fine[None], sample.camera, "disparity").to(sample.depth_lr)
 
     def _edges(self, coarse: Tensor, scale: int, step: float, told: Progress | None) -> Tensor:
-        """Return the fine edge map of a map (h, w), and add to the history how it was found."""
+        """Return the high-resolution edge map of a map (h, w), and add to the history how it was found."""
         barrier, answer = edge_map(
             coarse, scale, step, self._candidates, self._sharp_weight, self._smoothness, self._iterations, told
         )

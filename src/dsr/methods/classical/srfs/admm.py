@@ -1,4 +1,4 @@
-"""Depth, albedo and lighting that explain a photo and a coarse depth map: the energy and the steps that lower it.
+"""Depth, albedo and lighting that explain a photo and a LR depth map: the energy and the steps that lower it.
 
 Haefner et al., CVPR 2018 (see :mod:`dsr.methods.classical.srfs.upsampler`) minimise
 
@@ -35,14 +35,14 @@ _LESS, _MORE = 0.2, 5.0
 
 
 class Weights(NamedTuple):
-    """The weights of E's terms: of the coarse map, of the area and of the albedo's boundaries."""
+    """The weights of E's terms: of the low-resolution map, of the area and of the albedo's boundaries."""
 
     data: float
     area: float
     boundary: float
 
 
-class Problem(NamedTuple):
+class ShadingProblem(NamedTuple):
     """What does not change.
 
     ``photo`` (B, C, H, W); ``coarse`` (B, 1, h, w) in the unit of z, NaN in holes; ``rays`` (1, 3, H, W) and
@@ -67,10 +67,10 @@ class Slopes:
     """(fx dz/du, fy dz/dv, z) / unit of maps, as a linear operator, and its adjoint.
 
     Forward differences between pixels that are inside; where there is no next one, backward; where neither, 0. Without
-    a mask, the differences that :func:`dsr.geometry.surface.normals_of` takes.
+    a mask, the differences that :func:`dsr.geometry.surface.depth_to_normals` takes.
     """
 
-    def __init__(self, problem: Problem) -> None:
+    def __init__(self, problem: ShadingProblem) -> None:
         inside = problem.inside
         self._factors = [focal / problem.unit for focal in problem.focal]
         self._unit = problem.unit
@@ -119,7 +119,7 @@ class ShadingSolver:
 
     """
 
-    def __init__(self, problem: Problem, weights: Weights, first: Tensor, penalty: float) -> None:
+    def __init__(self, problem: ShadingProblem, weights: Weights, first: Tensor, penalty: float) -> None:
         self.problem, self.weights, self.penalty = problem, weights, penalty
         self.slopes = Slopes(problem)
         self._weight = problem.inside.to(problem.photo)

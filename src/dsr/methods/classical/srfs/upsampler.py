@@ -1,11 +1,11 @@
 """Super-resolution from shading, without training (SRfS).
 
 Haefner, Quéau, Möllenhoff and Cremers, *Fight Ill-Posedness with Ill-Posedness: Single-shot Variational Depth
-Super-Resolution from Shading*, CVPR 2018: the depth z whose block means are the coarse map, the piecewise constant
-albedo and the light that explain the photo, with the least area of the surface. Their section 3 has the rendering
-equation (:mod:`dsr.methods.classical.srfs.shading`) and the priors: minimal surface for the shape, Potts for the albedo
-(:mod:`dsr.methods.classical.srfs.potts`). Their section 4 minimises the energy by alternating directions, the penalty
-growing, over albedo, lighting, theta = (z, grad z), z and the multipliers, in this order
+Super-Resolution from Shading*, CVPR 2018: the depth z whose block means are the low-resolution map, the piecewise
+constant albedo and the light that explain the photo, with the least area of the surface. Their section 3 has the
+rendering equation (:mod:`dsr.methods.classical.srfs.shading`) and the priors: minimal surface for the shape, Potts for
+the albedo (:mod:`dsr.methods.classical.srfs.potts`). Their section 4 minimises the energy by alternating directions,
+the penalty growing, over albedo, lighting, theta = (z, grad z), z and the multipliers, in this order
 (:mod:`dsr.methods.classical.srfs.admm`).
 
 The energy per pixel, with intensities in [0, 1] and z in pixels (times the focal length f, by the median depth):
@@ -16,10 +16,10 @@ The energy per pixel, with intensities in [0, 1] and z in pixels (times the foca
 What differs from the original, besides what those modules name:
 
 - Weights. Its code (mu = 0.1, nu = 1e-4, lambda = 1, doubling the penalty 1e-4 each time) has, in these units at x4
-  with f = 500: data_weight 0.0015, area_weight 1e-7 and boundary_weight 0.5. So weak a data term follows the coarse map
-  from hundreds of pixels on, and every texture that the albedo leaves becomes relief. Ours were chosen on procedural
-  scenes and on a bumpy surface under known light. With area_weight = 0.02 such a surface has half the error that 0.2
-  leaves; with 1 rooms, where depth steps and texture rule, are a tenth better.
+  with f = 500: data_weight 0.0015, area_weight 1e-7 and boundary_weight 0.5. So weak a data term follows the
+  low-resolution map from hundreds of pixels on, and every texture that the albedo leaves becomes relief. Ours were
+  chosen on procedural scenes and on a bumpy surface under known light. With area_weight = 0.02 such a surface has half
+  the error that 0.2 leaves; with 1 rooms, where depth steps and texture rule, are a tenth better.
 - Each channel has a light of its own; in its code they share one. Albedos are between 0 and 2.
 - The penalty of the copy of z is weighted by 1 / scale^2: with 1 a step spreads over a pixel, and blocks have several.
 - theta by Levenberg and Marquardt's method, its 3 x 3 systems solved in closed form, instead of BFGS; z by plain
@@ -42,7 +42,7 @@ from torch import Tensor
 from dsr.geometry.camera import RangeType
 from dsr.methods.base import expect_limits
 from dsr.methods.classical.finite_differences import upsampled
-from dsr.methods.classical.srfs.admm import Problem, ShadingSolver, Weights
+from dsr.methods.classical.srfs.admm import ShadingProblem, ShadingSolver, Weights
 from dsr.methods.networks.inpainting import filled
 from dsr.methods.tiling import Progress
 from dsr.sample import DepthSample
@@ -50,7 +50,7 @@ from dsr.sample import DepthSample
 _RENEW = 10
 """Regions of the albedo are sought anew every so many iterations; in between, each takes its best albedo."""
 _NEARER = 4.0
-"""How many times nearer than the nearest known coarse pixel an answer may be."""
+"""How many times nearer than the nearest known low-resolution pixel an answer may be."""
 _WHITE = 127
 """Above it, a pixel of a mask is white."""
 
@@ -58,14 +58,14 @@ _WHITE = 127
 class ShapeFromShading:
     """Variational super-resolution from shading.
 
-    Holes of the input are filled. Memory: about 130 float64 maps of the photo's size. It takes the coarse map for block
-    means of depth.
+    Holes of the input are filled. Memory: about 130 float64 maps of the photo's size. It takes the low-resolution map
+    for block means of depth.
 
     Args:
         iterations: at most so many.
         tolerance: it stops where, in an iteration, the energy changes by less than this share and theta misses slopes
             by less than this (RMS).
-        data_weight: weight of the coarse map (mu).
+        data_weight: weight of the low-resolution map (mu).
         area_weight: weight of the surface's area (nu).
         boundary_weight: weight of the albedo's boundaries (lambda).
         penalty: the first one of what theta misses (kappa).
@@ -114,7 +114,7 @@ class ShapeFromShading:
 
     @torch.inference_mode()
     def __call__(self, sample: DepthSample, progress: Progress | None = None) -> Tensor:
-        """Return the fine depth, (1, H, W) in metres, on the sample's device and without holes.
+        """Return the high-resolution depth, (1, H, W) in metres, on the sample's device and without holes.
 
         Args:
             sample: the problem.
@@ -149,7 +149,7 @@ class ShapeFromShading:
         camera = sample.camera
         unit = (camera.fx * camera.fy) ** 0.5
         metres = float(coarse[coarse.isfinite()].median()) / unit
-        problem = Problem(
+        problem = ShadingProblem(
             photo=sample.rgb[None].to(coarse),
             coarse=coarse / metres,
             rays=camera.rays(device=coarse.device)[None],
