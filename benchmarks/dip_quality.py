@@ -23,7 +23,6 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from dsr.app.builder import fast_precision
 from dsr.data.folder import Folder
 from dsr.degradation.downsampling import Downsampling, make_sample
 from dsr.degradation.noise import GaussianMultiplicative
@@ -36,6 +35,7 @@ from dsr.metrics.classes import visual_metrics
 from dsr.metrics.functional import SurfacePair
 from dsr.sample import DepthSample, Scene
 from dsr.training.augmentation import window
+from dsr.utils.devices import fast_precision
 
 BOX = Downsampling("box")
 NAMES = ("RMSE_d", "DSSIM_v", "RMSE_v", "BadPix_v_5")

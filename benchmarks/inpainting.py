@@ -19,7 +19,6 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from dsr.app.builder import fast_precision
 from dsr.data.folder import Folder
 from dsr.degradation.downsampling import Downsampling, make_sample
 from dsr.degradation.holes import Blobs, Holes, Shadows
@@ -31,6 +30,7 @@ from dsr.methods.networks.trained import build_trained, packaged_weights
 from dsr.metrics.functional import SurfacePair, rmse_d, rmse_v
 from dsr.sample import DepthSample, Scene
 from dsr.training.augmentation import window
+from dsr.utils.devices import fast_precision
 
 BOX = Downsampling("box")
 KINDS: dict[str, Holes] = {"blobs": Blobs(0.1, 12.0), "shadows": Shadows(0.2)}

@@ -19,11 +19,11 @@ from pathlib import Path
 import torch
 from hydra import compose, initialize_config_dir
 
-from dsr.app.builder import build
 from dsr.app.schema import plain_config, register
 from dsr.data.folder import Folder
 from dsr.degradation.downsampling import Downsampling, make_sample
 from dsr.methods.networks.trained import packaged_weights
+from dsr.utils.builder import build
 
 CONF = Path(__file__).resolve().parents[1] / "conf"
 METHODS = (

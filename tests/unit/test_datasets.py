@@ -5,8 +5,6 @@ from pathlib import Path
 import pytest
 import yaml
 
-from dsr.app.builder import build, trait
-from dsr.app.schema import ConfigError
 from dsr.data.folder import Folder
 from dsr.data.formats.sintel import SEQUENCES
 from dsr.data.icl import FRAMES as ICL_FRAMES
@@ -26,6 +24,7 @@ from dsr.synthetic.simgeo.scenes import SCENES as SIMGEO_SCENES
 from dsr.training.cropping import PatchSettings
 from dsr.training.patches import Part, PatchData
 from dsr.training.problem import Degradation
+from dsr.utils.builder import ConfigError, build, trait
 
 CONF = Path(__file__).resolve().parents[2] / "conf" / "dataset"
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from dsr.app.entry import run_command
-from dsr.app.schema import ConfigError
+from dsr.utils.builder import ConfigError
 
 CONF = Path(__file__).resolve().parents[2] / "conf"
 

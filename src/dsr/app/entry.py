@@ -14,7 +14,8 @@ from hydra.errors import HydraException, MissingConfigException, OverrideParseEx
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from dsr.app.schema import ConfigError, register
+from dsr.app.schema import register
+from dsr.utils.builder import ConfigError
 from dsr.utils.console import INTERRUPTED, USAGE_ERROR, print_error
 
 

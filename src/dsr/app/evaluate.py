@@ -18,10 +18,9 @@ from omegaconf import DictConfig
 from rich.console import Console
 
 from dsr.app import run_directory as rundir
-from dsr.app.builder import build, fast_precision, pick_device, takes, trait
 from dsr.app.perceptual import perceptual_network
 from dsr.app.progress import Display, prepare
-from dsr.app.schema import ConfigError, EvalConfig, given_keys, plain_config
+from dsr.app.schema import EvalConfig, given_keys, plain_config
 from dsr.app.training_runs import studies_of_run
 from dsr.data.base import SceneSource
 from dsr.evaluation.predict import Evaluation, Outcome, StalePredictionError, predict, score
@@ -33,7 +32,9 @@ from dsr.metrics.lpips import LPIPS
 from dsr.report.dashboard import save_dashboard
 from dsr.report.tables import score_table
 from dsr.sample import DepthSample
+from dsr.utils.builder import ConfigError, build, takes, trait
 from dsr.utils.console import open_console, print_error, show
+from dsr.utils.devices import fast_precision, pick_device
 from dsr.utils.hashing import file_hash
 from dsr.viz.panels import save_picture
 

@@ -6,8 +6,8 @@ import functools
 import sys
 from pathlib import Path
 
-from dsr.app.schema import ConfigError
 from dsr.metrics.lpips import LPIPS, TRUNK_URL, load_lpips
+from dsr.utils.builder import ConfigError
 from dsr.utils.console import one_line
 
 

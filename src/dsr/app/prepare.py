@@ -11,12 +11,12 @@ from omegaconf.errors import OmegaConfBaseException
 from rich.console import Console
 
 import dsr
-from dsr.app.builder import build
 from dsr.app.entry import explain
 from dsr.app.progress import Display, prepare
-from dsr.app.schema import ConfigError, plain_config, register
+from dsr.app.schema import plain_config, register
 from dsr.data.base import SceneSource
 from dsr.sample import Scene
+from dsr.utils.builder import ConfigError, build
 from dsr.utils.console import one_line, show
 from dsr.viz.sheets import save_contact_sheet
 

@@ -16,7 +16,7 @@ import torch
 from omegaconf import OmegaConf
 
 import dsr
-from dsr.app.schema import ConfigError
+from dsr.utils.builder import ConfigError
 from dsr.utils.files import write_text
 from dsr.utils.hashing import hash_of_code
 

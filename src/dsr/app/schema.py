@@ -12,13 +12,10 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import MISSING, DictConfig, OmegaConf
 
 from dsr.degradation.downsampling import SCALES
+from dsr.utils.builder import ConfigError
 
 PRECISIONS = ("float32", "bfloat16")
 _GROUPS = ("dataset", "downsampling", "noise", "holes", "method", "metrics", "model", "trainer", "loss")
-
-
-class ConfigError(ValueError):
-    """A configuration that cannot be run: one line that names the key, what was expected and what came."""
 
 
 @dataclass
@@ -73,7 +70,7 @@ def _refuse_unknown(plain: Any, names: Collection[str], place: str = "") -> None
 class RunConfig(Checked):
     """What all commands have.
 
-    The groups (dataset, downsampling, noise, method, model) are made by :func:`dsr.app.builder.build`, which checks
+    The groups (dataset, downsampling, noise, method, model) are made by :func:`dsr.utils.builder.build`, which checks
     their keys against what the class or function that they name takes.
     """
 

@@ -15,10 +15,9 @@ from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 
 from dsr.app import run_directory as rundir
-from dsr.app.builder import build, fast_precision, pick_device
 from dsr.app.perceptual import perceptual_network
 from dsr.app.progress import Display, prepare
-from dsr.app.schema import ConfigError, TrainConfig, given_keys, plain_config
+from dsr.app.schema import TrainConfig, given_keys, plain_config
 from dsr.app.trainer import make_trainer, seconds_per_step
 from dsr.app.training_runs import WEIGHTS, common, read_config, training_data
 from dsr.methods.networks.base import DisparityNetwork
@@ -28,7 +27,9 @@ from dsr.metrics.classes import visual_metrics
 from dsr.training.module import Schedule, SuperResolution
 from dsr.training.objective import Objective, balanced_weight
 from dsr.training.patches import PatchData
+from dsr.utils.builder import ConfigError, build
 from dsr.utils.console import show
+from dsr.utils.devices import fast_precision, pick_device
 from dsr.utils.files import replacing
 from dsr.utils.lightning import duration, fit
 

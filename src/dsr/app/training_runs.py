@@ -9,13 +9,13 @@ from typing import Any
 
 from omegaconf import OmegaConf
 
-from dsr.app.builder import build
-from dsr.app.schema import ConfigError, TrainConfig, TrainerConfig
+from dsr.app.schema import TrainConfig, TrainerConfig
 from dsr.data.base import SceneSource, Some
 from dsr.degradation.downsampling import Downsampling
 from dsr.training.cropping import PatchSettings
 from dsr.training.patches import Part, PatchData
 from dsr.training.problem import Degradation
+from dsr.utils.builder import ConfigError, build
 
 WEIGHTS = "weights.safetensors"
 _FROM_RUN = ("scale", "downsampling", "noise", "seed", "dataset")

@@ -9,8 +9,9 @@ from typing import Literal
 import pytest
 import torch
 
-from dsr.app.builder import build, pick_device, takes
-from dsr.app.schema import ConfigError, EvalConfig
+from dsr.app.schema import EvalConfig
+from dsr.utils.builder import ConfigError, build, takes
+from dsr.utils.devices import pick_device
 
 Order = Literal["near", "far"]
 

@@ -1,7 +1,8 @@
-"""From a configuration group to the object that it describes.
+"""Build the object that a configuration group describes.
 
 A group's file names its class or function as ``target``; the other keys are the arguments. So the schema of a group is
-the signature of its target, and a new method needs a module and a file, nothing else.
+the signature of its target, and a new method needs one module and one file. An error of the target that begins with an
+argument's name (``sharpness: expected ...``) is shown with the key that sets it (``method.sharpness: expected ...``).
 """
 
 from __future__ import annotations
@@ -9,16 +10,16 @@ from __future__ import annotations
 import importlib
 import inspect
 import types
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
-import torch
-
-from dsr.app.schema import ConfigError
-
 _MISSING = "???"
 _ABOUT = ("name", "label", "target", "weights_packaged", "weights_file", "weights_source", "depth_loss", "visual")
+
+
+class ConfigError(ValueError):
+    """A configuration that cannot be run: one line that names the key, what was expected and what came."""
 
 
 def build(group: str, node: Mapping[str, Any], given: Mapping[str, Any] | None = None) -> Any:
@@ -50,7 +51,7 @@ def build(group: str, node: Mapping[str, Any], given: Mapping[str, Any] | None =
     try:
         return target(**arguments, **given)
     except (ValueError, OSError) as error:
-        raise ConfigError(str(error)) from error
+        raise ConfigError(_with_key(str(error), group, parameters)) from error
 
 
 def takes(group: str, node: Mapping[str, Any], key: str) -> bool:
@@ -63,29 +64,9 @@ def trait(group: str, node: Mapping[str, Any], name: str) -> Any:
     return getattr(_load(group, node), name, None)
 
 
-def fast_precision(device: torch.device) -> str:
-    """Return the precision that convolutions are fast in: bfloat16 on a GPU that has it and on a CPU with AMX."""
-    if device.type == "cuda":
-        return "bfloat16" if torch.cuda.is_bf16_supported(including_emulation=False) else "float32"
-    amx = getattr(torch.cpu, "_is_amx_tile_supported", None)
-    return "bfloat16" if device.type == "cpu" and amx is not None and amx() else "float32"
-
-
-def pick_device(name: str) -> torch.device:
-    """Return the device of that name; ``auto`` is the first GPU where there is one, else the CPU.
-
-    Raises:
-        ConfigError: there is no such device here.
-
-    """
-    if name == "auto":
-        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    try:
-        device = torch.device(name)
-        torch.zeros(1, device=device).item()
-    except (RuntimeError, AssertionError) as error:  # torch asserts that it was built for CUDA
-        raise ConfigError(f"device: expected auto, cpu or a device of this machine, got {name!r}") from error
-    return device
+def _with_key(message: str, group: str, parameters: Collection[str]) -> str:
+    """Return a message that begins with an argument's name with the group before it: the key that sets the argument."""
+    return f"{group}.{message}" if message.partition(":")[0] in parameters else message
 
 
 def _load(group: str, node: Mapping[str, Any]) -> Any:

@@ -11,7 +11,7 @@ from omegaconf import OmegaConf
 import dsr
 from dsr.app import run_directory as rundir
 from dsr.app.run_directory import PREDICTING_CODE, claim, code_hash, default_directory, identity_of, versions
-from dsr.app.schema import ConfigError
+from dsr.utils.builder import ConfigError
 from dsr.utils.hashing import file_hash, hash_of_code
 
 CPU = torch.device("cpu")

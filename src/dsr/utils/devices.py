@@ -1,0 +1,32 @@
+"""Devices to compute on."""
+
+from __future__ import annotations
+
+import torch
+
+from dsr.utils.builder import ConfigError
+
+
+def fast_precision(device: torch.device) -> str:
+    """Return the precision that convolutions are fast in: bfloat16 on a GPU that has it and on a CPU with AMX."""
+    if device.type == "cuda":
+        return "bfloat16" if torch.cuda.is_bf16_supported(including_emulation=False) else "float32"
+    amx = getattr(torch.cpu, "_is_amx_tile_supported", None)
+    return "bfloat16" if device.type == "cpu" and amx is not None and amx() else "float32"
+
+
+def pick_device(name: str) -> torch.device:
+    """Return the device of that name; ``auto`` is the first GPU where there is one, else the CPU.
+
+    Raises:
+        ConfigError: there is no such device here.
+
+    """
+    if name == "auto":
+        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    try:
+        device = torch.device(name)
+        torch.zeros(1, device=device).item()
+    except (RuntimeError, AssertionError) as error:  # torch asserts that it was built for CUDA
+        raise ConfigError(f"device: expected auto, cpu or a device of this machine, got {name!r}") from error
+    return device
