@@ -1,0 +1,45 @@
+"""Where the configuration files are found."""
+
+from pathlib import Path
+
+import pytest
+
+from dsr.utils import config_files
+from dsr.utils.config_files import config_directories, list_choices, list_groups
+
+CHECKOUT = Path(__file__).resolve().parents[2] / "conf"
+
+
+def test_a_checkout_has_them_in_conf():
+    assert config_directories() == (CHECKOUT,)
+
+
+def test_an_installed_package_brings_its_own(tmp_path, monkeypatch):
+    (tmp_path / "conf").mkdir()
+    (tmp_path / "conf" / "eval.yaml").touch()
+    monkeypatch.setattr(config_files, "_PLACES", (tmp_path / "conf", CHECKOUT))
+    assert config_directories() == (tmp_path / "conf",)
+
+
+def test_own_directories_come_after_the_project_s(tmp_path):
+    assert config_directories([tmp_path]) == (CHECKOUT, tmp_path)
+
+
+def test_own_directories_add_choices_and_groups(tmp_path):
+    (tmp_path / "method").mkdir()
+    (tmp_path / "method" / "mine.yaml").touch()
+    (tmp_path / "own").mkdir()
+    directories = config_directories([tmp_path])
+    assert {"bicubic", "mine"} <= set(list_choices("method", directories))
+    assert {"method", "own"} <= set(list_groups(directories))
+
+
+def test_a_missing_directory_is_named(tmp_path):
+    with pytest.raises(ValueError, match="--config-dir: expected a directory, got"):
+        config_directories([tmp_path / "nowhere"])
+
+
+def test_an_incomplete_installation_is_named(tmp_path, monkeypatch):
+    monkeypatch.setattr(config_files, "_PLACES", (tmp_path / "conf",))
+    with pytest.raises(ValueError, match="the installation is incomplete"):
+        config_directories()
