@@ -24,6 +24,7 @@ from dsr.metrics.catalogue import catalogue, score_image
 from dsr.sample import Scene
 
 REPOSITORY = Path(__file__).resolve().parents[1]
+UNIT_TESTS = REPOSITORY / "tests" / "unit"
 CHROMIUMS = ("chromium", "chromium-browser", "google-chrome")
 CHROMIUM_ARGUMENTS = (
     "--no-sandbox",
@@ -34,6 +35,24 @@ CHROMIUM_ARGUMENTS = (
     "--disable-component-update",
     "--disable-sync",
 )
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Give every test its tiers.
+
+    ``shared`` tests need the shared material, ``browser`` tests a browser, and ``slow`` tests run whole commands or are
+    marked so. All others are ``unit``.
+    """
+    for item in items:
+        fixtures = getattr(item, "fixturenames", ())
+        if "shared" in fixtures:
+            item.add_marker("shared")
+        if "browser" in fixtures:
+            item.add_marker("browser")
+        if UNIT_TESTS not in item.path.parents:
+            item.add_marker("slow")
+        if not any(item.get_closest_marker(tier) for tier in ("shared", "browser", "slow")):
+            item.add_marker("unit")
 
 
 @pytest.fixture(scope="session", autouse=True)

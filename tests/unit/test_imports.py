@@ -3,7 +3,7 @@
 from pathlib import Path
 
 import pytest
-from module_graph import IMPORTS, MODULES, imports_of, within
+from module_graph import IMPORTS, MODULES, SOURCE, imports_of, within
 
 LAYERS = (
     ("dsr.utils", "dsr.geometry"),
@@ -116,3 +116,7 @@ def test_the_test_itself_sees_a_forbidden_import(module, text, offence):
 def test_the_modules_were_found():
     assert {"dsr.sample", "dsr.app.entry", "dsr.data.folder"} <= MODULES.keys()
     assert "dsr.data.base" in IMPORTS["dsr.data.folder"]
+
+
+def test_the_root_of_the_package_holds_no_module_but_the_sample():
+    assert {path.name for path in (SOURCE / "dsr").glob("*.py")} == {"__init__.py", "sample.py"}

@@ -188,7 +188,7 @@ def test_all_files_of_a_folder_count_and_very_large_ones_by_size_and_time(files,
 
 
 def test_the_code_that_reads_and_resizes_is_there_to_be_hashed():
-    package = Path(module.__file__).parents[1]
+    package = Path(module.__file__).parents[2]
     assert all((package / name).exists() for name in module._READING_CODE)
 
 
