@@ -1,7 +1,8 @@
 """Break one line of the package at a time, and show which unit test catches it: ``python benchmarks/broken_lines.py``.
 
 Each break is a plausible mistake: a sign in the normals, a wrong light, a swapped mask, a lost seed, a camera half a
-pixel off. The unit tests of a copy of the checkout are run until the first failure. Exit code 1 if a break is not caught.
+pixel off. The unit tests of a copy of the checkout are run until the first failure. The exit code is 1 if a break is
+not caught.
 """
 
 from __future__ import annotations
