@@ -34,7 +34,6 @@ from dsr.methods.networks.trained import packaged_weights
 from dsr.metrics.classes import visual_metrics
 from dsr.metrics.functional import SurfacePair
 from dsr.sample import DepthSample, Scene
-from dsr.training.augmentation import window
 from dsr.utils.devices import fast_precision
 
 BOX = Downsampling("box")
@@ -69,8 +68,8 @@ ABLATION: Mapping[str, Mapping[str, Any]] = {
 
 def crop(scenes: Path, name: str, rows: tuple[int, int], columns: tuple[int, int]) -> Scene:
     """Return a square window of a scene, as a data set of its own: random numbers follow from its name."""
-    (top, bottom), (left, _) = rows, columns
-    return replace(window(Folder(str(scenes), [name]).load(name), top, left, bottom - top), dataset="crop")
+    (top, bottom), (left, right) = rows, columns
+    return replace(Folder(str(scenes), [name]).load(name).crop(top, left, bottom - top, right - left), dataset="crop")
 
 
 def scores_of(depth: Tensor, sample: DepthSample) -> dict[str, float]:

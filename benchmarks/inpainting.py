@@ -29,7 +29,6 @@ from dsr.methods.dip.upsampler import DeepImagePrior
 from dsr.methods.networks.trained import build_trained, packaged_weights
 from dsr.metrics.functional import SurfacePair, rmse_d, rmse_v
 from dsr.sample import DepthSample, Scene
-from dsr.training.augmentation import window
 from dsr.utils.devices import fast_precision
 
 BOX = Downsampling("box")
@@ -38,7 +37,7 @@ KINDS: dict[str, Holes] = {"blobs": Blobs(0.1, 12.0), "shadows": Shadows(0.2)}
 
 def centre(scene: Scene, size: int) -> Scene:
     """Return the window of ``size`` pixels in the middle of a scene."""
-    return window(scene, (scene.camera.height - size) // 2, (scene.camera.width - size) // 2, size)
+    return scene.crop((scene.camera.height - size) // 2, (scene.camera.width - size) // 2, size, size)
 
 
 def results(sample: DepthSample, steps: int) -> dict[str, Tensor]:

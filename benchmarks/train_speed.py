@@ -19,9 +19,9 @@ from torch import nn
 from dsr.data.simgeo import SimGeo
 from dsr.degradation.downsampling import Downsampling
 from dsr.methods.networks.msg_net import MSGNet
-from dsr.training.cropping import Patches, PatchSettings
+from dsr.training.degradation import Batch, Degradation
 from dsr.training.objective import Objective
-from dsr.training.problem import Batch, Degradation
+from dsr.training.patches import Patches, PatchSettings
 
 SCALE = 4
 
@@ -47,7 +47,7 @@ def step(net: MSGNet, objective: Objective, batch: Batch, *, mixed: bool) -> flo
     """Do forward, loss and backward; return the seconds."""
     start = time.perf_counter()
     with torch.autocast("cpu", torch.bfloat16, enabled=mixed):
-        disparity = net.upsample(batch["rgb"], batch["disparity_lr"], batch["bounds"])
+        disparity = net.upsample(batch["rgb"], batch["disparity_lr"], batch["min_max"])
     objective(disparity.float(), batch)["loss"].backward()
     net.zero_grad(set_to_none=True)
     return time.perf_counter() - start

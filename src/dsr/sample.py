@@ -6,7 +6,7 @@ Depth is orthogonal depth (distance to the image plane) in metres. A hole is NaN
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor
@@ -55,6 +55,21 @@ class Scene:
                 raise ValueError(f"{self.name}: measured: expected a positive factor, got {factor}")
             size = (self.camera.height // factor, self.camera.width // factor)
             _expect_depth(self.name, f"measured depth at x{factor}", coarse, size)
+
+    def crop(self, top: int, left: int, height: int, width: int) -> Scene:
+        """Return a window of the scene: ``height`` x ``width`` pixels from row ``top`` and column ``left`` on.
+
+        A measured map is cropped along with it where its factor divides all four numbers, and left out otherwise.
+        """
+        window = (slice(None), slice(top, top + height), slice(left, left + width))
+        measured = {
+            factor: depth[:, top // factor : (top + height) // factor, left // factor : (left + width) // factor]
+            for factor, depth in self.measured.items()
+            if not any(number % factor for number in (top, left, height, width))
+        }
+        depth = None if self.depth is None else self.depth[window]
+        camera = self.camera.crop(top, left, height, width)
+        return replace(self, rgb=self.rgb[window], depth=depth, camera=camera, measured=measured)
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,6 @@ from dsr.methods.classical.interpolation import Interpolation
 from dsr.methods.dip.upsampler import DeepImagePrior
 from dsr.metrics.functional import SurfacePair, dssim_v, rmse_d, rmse_v
 from dsr.sample import DepthSample
-from dsr.training.augmentation import window
 
 BOX = Downsampling("box")
 
@@ -24,7 +23,7 @@ BOX = Downsampling("box")
 def sample(shared: Path) -> DepthSample:
     """Rows 96:224, columns 160:288, at x4."""
     whole = Folder(str(shared / "scenes"), ["lucy"]).load("lucy")
-    return make_sample(replace(window(whole, 96, 160, 128), dataset="crop"), 4, BOX, "orthogonal")
+    return make_sample(replace(whole.crop(96, 160, 128, 128), dataset="crop"), 4, BOX, "orthogonal")
 
 
 def _scores(depth: Tensor, sample: DepthSample) -> dict[str, float]:

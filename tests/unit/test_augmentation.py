@@ -1,4 +1,4 @@
-"""Variation of scenes: what is turned or mirrored is another view of the same surface, or of its mirror image."""
+"""Augmentation of scenes: what is turned or mirrored is another view of the same surface, or of its mirror image."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from dsr.geometry.camera import Camera
 from dsr.geometry.shading import lights, render
 from dsr.geometry.surface import depth_to_normals
 from dsr.sample import Scene
-from dsr.training.augmentation import Variation, mirrored, turned, window
+from dsr.training.augmentation import Augmentation, mirror, rotate90
 
 CAMERA = Camera(width=31, height=23, fx=30.0, fy=27.0, cx=13.3, cy=9.9, baseline=0.1, doffs=0.7)
 
@@ -48,14 +48,14 @@ def test_points_of_a_turned_scene_are_the_turned_points(turns: int) -> None:
     expected = _points(_scene()).rot90(turns, (-2, -1))
     for _ in range(turns):
         expected = _quarter(expected)
-    torch.testing.assert_close(_points(turned(_scene(), turns)), expected, rtol=0, atol=1e-12, equal_nan=True)
+    torch.testing.assert_close(_points(rotate90(_scene(), turns)), expected, rtol=0, atol=1e-12, equal_nan=True)
 
 
 @pytest.mark.parametrize("turns", [0, 1, 2, 3])
 def test_a_turned_plane_has_the_turned_normal_and_is_lit_by_it(turns: int) -> None:
     normal = torch.tensor([0.3, -0.4, -1.0], dtype=torch.float64)[:, None, None]
     depth = -2.0 / (normal * CAMERA.rays()).sum(dim=0, keepdim=True)
-    shown = _normals(turned(Scene("set", "plane", torch.rand(3, 23, 31), CAMERA, depth), turns))
+    shown = _normals(rotate90(Scene("set", "plane", torch.rand(3, 23, 31), CAMERA, depth), turns))
     expected = normal / normal.norm()
     for _ in range(turns):
         expected = _quarter(expected)
@@ -68,15 +68,15 @@ def test_a_turned_plane_has_the_turned_normal_and_is_lit_by_it(turns: int) -> No
 
 def test_four_quarter_turns_and_two_mirrors_lead_back() -> None:
     scene = _scene()
-    there = turned(turned(turned(turned(scene, 1), 1), 1), 1)
-    twice = mirrored(mirrored(scene, vertical=True), vertical=True)
+    there = rotate90(rotate90(rotate90(rotate90(scene, 1), 1), 1), 1)
+    twice = mirror(mirror(scene, vertical=True), vertical=True)
     for other in (there, twice):
         assert torch.equal(other.rgb, scene.rgb)
         torch.testing.assert_close(_points(other), _points(scene), rtol=0, atol=1e-12, equal_nan=True)
         assert not other.measured  # which would have to be turned, too
-    assert turned(scene, 4) is scene
-    both = mirrored(mirrored(scene), vertical=True)
-    half = turned(scene, 2)
+    assert rotate90(scene, 4) is scene
+    both = mirror(mirror(scene), vertical=True)
+    half = rotate90(scene, 2)
     assert torch.equal(both.rgb, half.rgb)
     assert both.camera == half.camera
 
@@ -85,19 +85,19 @@ def test_four_quarter_turns_and_two_mirrors_lead_back() -> None:
 def test_points_of_a_mirrored_scene_are_the_mirrored_points(vertical: bool) -> None:
     sign = torch.tensor([1.0, -1.0, 1.0] if vertical else [-1.0, 1.0, 1.0], dtype=torch.float64)[:, None, None]
     expected = sign * _points(_scene()).flip(-2 if vertical else -1)
-    shown = _points(mirrored(_scene(), vertical=vertical))
+    shown = _points(mirror(_scene(), vertical=vertical))
     torch.testing.assert_close(shown, expected, rtol=0, atol=1e-12, equal_nan=True)
 
 
 def test_a_window_shows_the_points_of_its_pixels() -> None:
-    cut = window(_scene(), 4, 6, 16)
+    cut = _scene().crop(4, 6, 16, 16)
     torch.testing.assert_close(_points(cut), _points(_scene())[:, 4:20, 6:22], rtol=0, atol=1e-12, equal_nan=True)
     assert torch.equal(cut.rgb, _scene().rgb[:, 4:20, 6:22])
 
 
 def test_the_factor_that_comes_with_a_varied_scene_is_that_of_its_depth() -> None:
     vary, random, factors = (
-        Variation(flip=False, rotate=False, depth_scale=0.5, colour=0.0),
+        Augmentation(flip=False, rotate=False, depth_scale=0.5, colour=0.0),
         np.random.default_rng(0),
         [],
     )
@@ -112,7 +112,9 @@ def test_the_factor_that_comes_with_a_varied_scene_is_that_of_its_depth() -> Non
 
 
 def test_without_any_variation_a_scene_stays_as_it_is() -> None:
-    scene, factor = Variation(flip=False, rotate=False, depth_scale=0.0, colour=0.0)(_scene(), np.random.default_rng(0))
+    scene, factor = Augmentation(flip=False, rotate=False, depth_scale=0.0, colour=0.0)(
+        _scene(), np.random.default_rng(0)
+    )
     assert factor == 1
     assert torch.equal(scene.rgb, _scene().rgb)
     torch.testing.assert_close(_points(scene), _points(_scene()), rtol=0, atol=0, equal_nan=True)
@@ -121,4 +123,4 @@ def test_without_any_variation_a_scene_stays_as_it_is() -> None:
 @pytest.mark.parametrize("changes", [{"depth_scale": -0.1}, {"depth_scale": 3.1}, {"colour": float("nan")}])
 def test_a_variation_that_cannot_be_is_refused(changes: dict[str, Any]) -> None:
     with pytest.raises(ValueError, match=rf"trainer.{next(iter(changes))}: expected 0 (or more|to 3), got"):
-        Variation(**changes)
+        Augmentation(**changes)

@@ -21,9 +21,9 @@ from dsr.degradation.downsampling import Downsampling
 from dsr.methods.networks.trained import packaged_weights
 from dsr.report.tables import published_row
 from dsr.synthetic.simgeo.scenes import SCENES as SIMGEO_SCENES
-from dsr.training.cropping import PatchSettings
-from dsr.training.patches import Part, PatchData
-from dsr.training.problem import Degradation
+from dsr.training.data_module import Part, PatchData
+from dsr.training.degradation import Degradation
+from dsr.training.patches import PatchSettings
 from dsr.utils.builder import ConfigError, build, trait
 
 CONF = Path(__file__).resolve().parents[2] / "conf" / "dataset"
@@ -123,11 +123,11 @@ def test_nothing_that_is_evaluated_on_is_trained_on_by_name(tmp_path):
 def test_a_scene_that_is_trained_on_does_not_validate_as_one_of_another_data_set(shared):
     real = shared / "real"
     train = Part(MiddleburyTrain(str(real), ["piano", "pipes", "adirondack"]))
-    settings, problem = PatchSettings(size=32, batch=1, validation_scenes=1), Degradation(4, Downsampling("box"))
+    settings, degradation = PatchSettings(size=32, batch=1, validation_scenes=1), Degradation(4, Downsampling("box"))
     piano, recycle = (Middlebury(str(real / "middlebury2014"), [name]) for name in ("piano", "recycle"))
     with pytest.raises(ValueError, match=r"validation\.others: expected scenes that are not trained on, got piano"):
-        PatchData([train], settings, problem, validation={"others": piano})
-    assert PatchData([train], settings, problem, validation={"others": recycle}).training_count == 2
+        PatchData([train], settings, degradation, validation={"others": piano})
+    assert PatchData([train], settings, degradation, validation={"others": recycle}).training_count == 2
 
 
 def test_data_sets_know_whether_they_are_to_evaluate_on():

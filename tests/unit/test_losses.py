@@ -12,8 +12,8 @@ from torch import Tensor
 
 from dsr.geometry.camera import Camera
 from dsr.metrics.losses import l1, lap1, mse
+from dsr.training.degradation import Batch
 from dsr.training.objective import DepthLoss, Objective
-from dsr.training.problem import Batch
 
 Loss = Callable[..., Tensor]
 LOSSES: dict[str, Loss] = {"l1": l1, "mse": mse, "lap1": lap1}
@@ -224,12 +224,12 @@ def _batch(*, holes: float = 0.0) -> Batch:
     fine = stereo / depth - doffs
     coarse = fine.reshape(2, 1, 6, 2, 7, 2).nanmean(dim=(3, 5))
     rays = torch.stack([camera.rays() for camera in CAMERAS])
-    return {"depth": depth, "rays": rays, "stereo": stereo, "doffs": doffs, "disparity_lr": coarse}
+    return {"depth": depth, "rays": rays, "bf": stereo, "doffs": doffs, "disparity_lr": coarse}
 
 
 def _guess(batch: Batch) -> Tensor:
     """Return disparities near the true ones, and finite."""
-    truth = (batch["stereo"] / batch["depth"] - batch["doffs"]).nan_to_num(1.0)
+    truth = (batch["bf"] / batch["depth"] - batch["doffs"]).nan_to_num(1.0)
     return truth + 0.05 * _map(7, 12, 14, batch=2)
 
 
@@ -253,7 +253,7 @@ def test_the_objective_of_a_batch_is_the_mean_of_its_samples(holes: float) -> No
 
 def test_the_objective_gives_finite_gradients_at_the_truth_and_beyond_infinity() -> None:
     batch = _batch(holes=0.15)
-    truth = (batch["stereo"] / batch["depth"] - batch["doffs"]).nan_to_num(1.0)
+    truth = (batch["bf"] / batch["depth"] - batch["doffs"]).nan_to_num(1.0)
     behind = truth.clone()
     behind[1] = -5  # nothing of that surface can be seen
     for start in (truth, behind, torch.full_like(truth, -5)):

@@ -19,9 +19,9 @@ from dsr.degradation.noise import GaussianMultiplicative, Kinect
 from dsr.geometry.camera import Camera
 from dsr.methods.networks.maps import normalised
 from dsr.sample import Scene
-from dsr.training.cropping import Patches, PatchSettings
-from dsr.training.patches import Part, PatchData, WholeScenes
-from dsr.training.problem import Batch, Degradation, tensors_of
+from dsr.training.data_module import Part, PatchData, WholeScenes
+from dsr.training.degradation import Batch, Degradation, to_tensors
+from dsr.training.patches import Patches, PatchSettings
 
 BOX = Downsampling("box")
 X4 = Degradation(4, BOX)
@@ -80,8 +80,10 @@ class _Source:
         return scene
 
 
-def _data(scenes: list[Scene] | None = None, problem: Degradation = X4, **changes: Any) -> PatchData:
-    return PatchData([Part(_Source(scenes or [_scene(i) for i in range(6)]))], _settings(**changes), problem, seed=7)
+def _data(scenes: list[Scene] | None = None, degradation: Degradation = X4, **changes: Any) -> PatchData:
+    return PatchData(
+        [Part(_Source(scenes or [_scene(i) for i in range(6)]))], _settings(**changes), degradation, seed=7
+    )
 
 
 def _batches(
@@ -103,7 +105,7 @@ def test_a_patch_is_a_pure_function_of_the_seed_and_its_number() -> None:
     scenes, settings = [_scene(i) for i in range(3)], _settings(colour=0.1)
     whole = Patches([scenes], settings, X4, seed=5, count=12)
     later = Patches([scenes], settings, X4, seed=5, first=7, count=3)
-    assert all(_same(whole.starting(7, 3)[i], later[i]) for i in range(3))
+    assert all(_same(whole.select(7, 3)[i], later[i]) for i in range(3))
     assert (len(whole), len(later)) == (12, 3)
     assert all(_same(later[i], whole[7 + i]) for i in (2, 0, 1))  # whatever was asked for before
     assert _same(whole[7], whole[7])
@@ -145,7 +147,7 @@ def test_devices_share_the_batches_of_a_step() -> None:
 def test_some_patches_are_the_first_of_the_run() -> None:
     data = _data()
     first = _batches(data, 2)
-    for i, patch in enumerate(data.some_patches(4)):
+    for i, patch in enumerate(data.first_patches(4)):
         assert all(torch.equal(patch[name], first[i // 2][name][i % 2]) for name in patch)
 
 
@@ -166,7 +168,7 @@ def test_held_out_scenes_are_validated_with_whole_and_never_trained_on() -> None
 def test_of_each_data_set_the_first_scenes_alone_can_be_used() -> None:
     sources = [Part(_Source([_scene(i) for i in range(6)]))]
     data = PatchData(sources, _settings(scenes=3, validation_scenes=1), X4)
-    assert data.used[0][1] == ["scene0", "scene1"]
+    assert data.used_scenes[0][1] == ["scene0", "scene1"]
     assert data.validation_scenes()["set"][1] == ["scene2"]
     with pytest.raises(ValueError, match=r"trainer.scenes: expected a positive number, or null for all, got 0"):
         _settings(scenes=0)
@@ -204,8 +206,8 @@ def test_each_part_holds_its_last_scenes_out_under_a_name_of_its_own() -> None:
     data = PatchData([Part(source) for source in sources], _settings(validation_scenes=1), X4)
     assert data.validation_sets == ["set", "set_2"]
     assert data.training_count == 3
-    assert [source for source, _ in data.used] == [*sources, *sources]
-    assert [names for _, names in data.used] == [["scene0", "scene1"], ["scene3"], ["scene2"], ["scene4"]]
+    assert [source for source, _ in data.used_scenes] == [*sources, *sources]
+    assert [names for _, names in data.used_scenes] == [["scene0", "scene1"], ["scene3"], ["scene2"], ["scene4"]]
     data.setup()
     assert [next(iter(loader))["rgb"][0, 2, 0, 0] * 255 for loader in data.val_dataloader()] == pytest.approx([2, 4])
 
@@ -305,7 +307,7 @@ def test_the_coarse_disparity_is_the_box_mean_of_the_fine_one_in_fine_pixels(cam
         fine = (camera.baseline or 0.2) * 50.0 / shown - camera.doffs
         coarse = fine.reshape(4, 4, 4, 4).mean(axis=(1, 3))
         np.testing.assert_allclose(patch["disparity_lr"][0].numpy(), coarse, rtol=1e-6)
-        np.testing.assert_allclose((patch["stereo"] / patch["depth"] - patch["doffs"])[0].numpy(), fine, rtol=1e-5)
+        np.testing.assert_allclose((patch["bf"] / patch["depth"] - patch["doffs"])[0].numpy(), fine, rtol=1e-5)
 
 
 def test_the_networks_input_depends_on_the_coarse_map_alone() -> None:
@@ -313,7 +315,7 @@ def test_the_networks_input_depends_on_the_coarse_map_alone() -> None:
     disparity = 50 * 0.2 / _tilted(CAMERA)
     checker = torch.tensor([[1.0, -1.0], [-1.0, 1.0]]).repeat(22, 30).double()
     plain, wild = (_scene(depth=50 * 0.2 / (disparity + swing * checker)) for swing in (0.0, 2.5))
-    first, second = (tensors_of(make_sample(scene, 4, BOX, "disparity")) for scene in (plain, wild))
+    first, second = (to_tensors(make_sample(scene, 4, BOX, "disparity")) for scene in (plain, wild))
     assert (first["depth"] - second["depth"]).abs().min() > 0.1
     assert second["depth"].max() > 1.2 * first["depth"].max()
     assert torch.equal(first["rgb"], second["rgb"])
@@ -368,7 +370,7 @@ def test_bounds_lie_between_the_patchs_own_and_the_scenes_and_half_are_the_scene
         stereo = (camera.baseline or 0.2) * focal
         scene = [float(stereo / (factor * z) - camera.doffs) for z in (coarse.max(), coarse.min())]
         own = [float(patch["disparity_lr"].min()), float(patch["disparity_lr"].max())]
-        low, high = patch["bounds"].flatten().tolist()
+        low, high = patch["min_max"].flatten().tolist()
         assert scene[0] - 1e-5 <= low <= own[0] + 1e-5
         assert own[1] - 1e-5 <= high <= scene[1] + 1e-5
         shares.append(1 - (high - low - (own[1] - own[0])) / (scene[1] - scene[0] - (own[1] - own[0])))
@@ -384,7 +386,7 @@ def test_bounds_of_a_noisy_patch_contain_its_coarse_map_or_are_the_clean_scenes(
     clean = 0
     for i in range(60):
         patch = patches[i]
-        (low, high), own = patch["bounds"].flatten().tolist(), patch["disparity_lr"]
+        (low, high), own = patch["min_max"].flatten().tolist(), patch["disparity_lr"]
         assert low <= float(own.min()) + 1e-5
         assert high >= float(own.max()) - 1e-5
         clean += [low, high] == pytest.approx([float(coarse.min()), float(coarse.max())], rel=1e-5)
@@ -396,16 +398,16 @@ def test_bounds_come_of_the_coarse_map_and_know_nothing_of_the_fine_one() -> Non
     depth[0, ::4, ::4] = 1.0  # one pixel of disparity 10 among fifteen of 5 in each block, wherever a patch begins
     patches = _patches([_scene(depth=depth)], count=20)
     for i in range(20):
-        assert patches[i]["bounds"].flatten().tolist() == pytest.approx([5.3125, 1.001 * 5.3125], rel=1e-6)
+        assert patches[i]["min_max"].flatten().tolist() == pytest.approx([5.3125, 1.001 * 5.3125], rel=1e-6)
 
 
 def test_bounds_of_a_whole_scene_are_its_coarse_maps_own_and_those_of_a_wall_some_way_apart() -> None:
     whole = WholeScenes([_scene()], X4)[0]
-    assert whole["bounds"].flatten().tolist() == pytest.approx(
+    assert whole["min_max"].flatten().tolist() == pytest.approx(
         [float(whole["disparity_lr"].min()), float(whole["disparity_lr"].max())]
     )
     wall = WholeScenes([_scene(depth=torch.full((1, 44, 60), 2.0, dtype=torch.float64))], X4)[0]
-    low, high = wall["bounds"].flatten().tolist()
+    low, high = wall["min_max"].flatten().tolist()
     assert low == pytest.approx(5)
     assert high == pytest.approx(5.005)
 
@@ -483,15 +485,15 @@ def test_shapes_and_types_are_those_promised() -> None:
         "disparity_lr": (1, 4, 4),
         "depth": (1, 16, 16),
         "rays": (3, 16, 16),
-        "stereo": (1, 1, 1),
+        "bf": (1, 1, 1),
         "doffs": (1, 1, 1),
-        "bounds": (2, 1, 1),
+        "min_max": (2, 1, 1),
     }
     patch = _patches()[0]
     assert {name: tuple(value.shape) for name, value in patch.items()} == shapes
     assert {value.dtype for value in patch.values()} == {torch.float32}
     whole = WholeScenes([_scene()], X4)[0]
-    single = {"rgb", "bounds"}
+    single = {"rgb", "min_max"}
     assert all(value.dtype == (torch.float32 if name in single else torch.float64) for name, value in whole.items())
 
 
@@ -519,7 +521,7 @@ def test_a_patch_that_the_scale_does_not_divide_is_refused() -> None:
     with pytest.raises(ValueError, match=r"trainer.patch: expected a size that scale=4 divides, got 30"):
         _data(size=30)
     with pytest.raises(ValueError, match=r"trainer.patch: expected a size that scale=16 divides, got 24"):
-        _data(problem=Degradation(16, BOX), size=24)
+        _data(degradation=Degradation(16, BOX), size=24)
 
 
 def test_a_measured_map_cannot_be_cut() -> None:
@@ -555,11 +557,11 @@ def test_a_setting_out_of_range_is_refused_by_its_key(changes: dict[str, Any], m
 
 def test_where_noise_leaves_nothing_of_a_window_another_one_is_taken() -> None:
     far = _scene(1, depth=torch.full((1, CAMERA.height, CAMERA.width), 50.0, dtype=torch.float64))
-    problem = Degradation(4, BOX, Kinect(nearest=None, farthest=20.0))
-    patches = Patches([[far, _scene()]], _settings(), problem)
+    degradation = Degradation(4, BOX, Kinect(nearest=None, farthest=20.0))
+    patches = Patches([[far, _scene()]], _settings(), degradation)
     for index in range(8):
-        assert patches.starting(index, 1)[0]["depth"].nanmean() < 20
+        assert patches.select(index, 1)[0]["depth"].nanmean() < 20
     with pytest.raises(
         ValueError, match="patches: expected low-resolution maps with a known pixel or more; noise makes all"
     ):
-        Patches([[far]], _settings(), problem)[0]
+        Patches([[far]], _settings(), degradation)[0]

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from dsr.data.preparation.resizing import cropped, fitted, resized, resized_depth
+from dsr.data.preparation.resizing import fitted, resized, resized_depth
 from dsr.geometry.camera import Camera
 from dsr.geometry.surface import depth_to_normals
 from dsr.sample import Scene
@@ -98,7 +98,7 @@ def test_a_curved_surface_is_where_it_was(size):
 
 def test_a_crop_sees_the_same_points():
     whole = scene(plane_depth(CAMERA))
-    part = cropped(whole, 7, 11, 30, 40)
+    part = whole.crop(7, 11, 30, 40)
     points, window = (each.depth * each.camera.rays() for each in (whole, part))
     torch.testing.assert_close(window, points[:, 7:37, 11:51])
 

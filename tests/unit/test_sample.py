@@ -45,6 +45,19 @@ def test_good_records_are_accepted_with_holes_and_without_truth() -> None:
     assert sample.notes == ()
 
 
+def test_crop_takes_the_window_of_every_map_and_of_the_camera() -> None:
+    depth = torch.arange(1.0, 33.0).view(1, 4, 8)
+    measured = {2: torch.arange(1.0, 9.0).view(1, 2, 4), 4: torch.ones(1, 1, 2)}
+    scene = _scene(depth=depth, measured=measured, notes=("estimated",))
+    window = scene.crop(2, 4, 2, 4)
+    assert torch.equal(window.rgb, scene.rgb[:, 2:, 4:])
+    assert torch.equal(window.depth, depth[:, 2:, 4:])
+    assert window.camera == CAMERA.crop(2, 4, 2, 4)
+    assert window.notes == ("estimated",)
+    assert list(window.measured) == [2]  # 4 does not divide the window
+    assert torch.equal(window.measured[2], torch.tensor([[[7.0, 8.0]]]))
+
+
 def test_masks_tell_where_depth_is_known() -> None:
     sample = _sample(depth_lr=_with((1, 2, 4), torch.nan), depth=_with((1, 4, 8), torch.nan))
     assert sample.mask_lr.dtype == torch.bool

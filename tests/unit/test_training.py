@@ -25,11 +25,11 @@ from dsr.metrics.classes import visual_metrics
 from dsr.metrics.functional import SurfacePair
 from dsr.metrics.lpips import LPIPS
 from dsr.sample import Scene
-from dsr.training.cropping import Patches, PatchSettings
+from dsr.training.data_module import WholeScenes
+from dsr.training.degradation import Batch, Degradation, to_tensors
 from dsr.training.module import Schedule, SuperResolution
-from dsr.training.objective import Objective, balanced_weight, depth_of
-from dsr.training.patches import WholeScenes
-from dsr.training.problem import Batch, Degradation, tensors_of
+from dsr.training.objective import Objective, balance_weight, to_depth
+from dsr.training.patches import Patches, PatchSettings
 
 BOX = Downsampling("box")
 X2 = Degradation(2, BOX)
@@ -61,7 +61,7 @@ def _batch(depth: Tensor, camera: Camera, coarse: tuple[float, float]) -> Batch:
     return {
         "depth": depth[None],
         "rays": camera.rays()[None],
-        "stereo": _four((camera.baseline or 0.2) * camera.fx),
+        "bf": _four((camera.baseline or 0.2) * camera.fx),
         "doffs": _four(camera.doffs),
         "disparity_lr": torch.tensor(coarse, dtype=torch.float64).view(1, 1, 1, 2),
     }
@@ -136,13 +136,13 @@ def test_an_unknown_depth_loss_is_refused() -> None:
 def test_disparity_goes_back_to_the_depth_that_it_came_from(doffs: float) -> None:
     depth = torch.from_numpy(np.random.default_rng(0).uniform(1, 3, (1, 12, 13)))
     batch = {**_batch(depth, STEREO, (3.0, 5.0)), "doffs": _four(doffs)}
-    torch.testing.assert_close(depth_of(0.5 * 20 / depth[None] - doffs, batch), depth[None], rtol=1e-13, atol=0)
+    torch.testing.assert_close(to_depth(0.5 * 20 / depth[None] - doffs, batch), depth[None], rtol=1e-13, atol=0)
 
 
 def test_at_or_beyond_infinity_there_is_no_depth() -> None:
     disparity = torch.tensor([[[[-1.5, -1.0, -0.5]]]], dtype=torch.float64)
-    assert depth_of(disparity, _wall())[0, 0, 0].isnan().tolist() == [True, True, False]
-    assert depth_of(disparity, _wall())[0, 0, 0, 2] == pytest.approx(20)
+    assert to_depth(disparity, _wall())[0, 0, 0].isnan().tolist() == [True, True, False]
+    assert to_depth(disparity, _wall())[0, 0, 0, 2] == pytest.approx(20)
 
 
 # The balanced weight
@@ -152,7 +152,7 @@ def _plane(baseline: float | None = None, doffs: float = 0.0, slope: float = 0.0
     """Return the tensors of the plane with d + doffs = slope u + 3, 100 columns wide."""
     camera = Camera(width=100, height=4, fx=fx, fy=70.0, cx=40.0, cy=2.0, baseline=baseline, doffs=doffs)
     depth = (baseline or 0.2) * fx / (3 + slope * torch.arange(100, dtype=torch.float64)).expand(1, 4, 100)
-    return tensors_of(
+    return to_tensors(
         make_sample(Scene("set", "plane", torch.rand(3, 4, 100), camera, depth.clone()), 4, BOX, "disparity")
     )
 
@@ -164,7 +164,7 @@ def test_the_balanced_weight_of_a_plane_is_its_closed_form(baseline: float | Non
     tilt = math.asin(5 / 255)
     as_disparity = (stereo / middle - stereo / (middle * (1 + 1e-6 * math.tan(tilt) / fx))) / 1e-6 / spread
     expected = as_disparity / ((2 - 2 * math.cos(tilt)) / 3)
-    assert balanced_weight([_plane(baseline, doffs, fx=fx)]) == pytest.approx(expected, rel=2e-6)
+    assert balance_weight([_plane(baseline, doffs, fx=fx)]) == pytest.approx(expected, rel=2e-6)
 
 
 def test_the_balanced_weight_balances_a_tilt_between_neighbours() -> None:
@@ -172,35 +172,35 @@ def test_the_balanced_weight_balances_a_tilt_between_neighbours() -> None:
     camera = Camera(width=100, height=16, fx=80.0, fy=80.0, cx=49.5, cy=7.5)
     wall = torch.full((1, 16, 100), 2.0, dtype=torch.float64)
     wall[..., :4] = 2.5  # so that the low-resolution map has a range
-    batch = tensors_of(make_sample(Scene("set", "wall", torch.rand(3, 16, 100), camera, wall), 4, BOX, "disparity"))
-    w = balanced_weight([batch])
+    batch = to_tensors(make_sample(Scene("set", "wall", torch.rand(3, 16, 100), camera, wall), 4, BOX, "disparity"))
+    w = balance_weight([batch])
     batch = {name: value[None].double() for name, value in batch.items()}
     bumps = torch.zeros_like(batch["depth"])
     bumps[..., 5::2] = math.tan(math.asin(5 / 255)) * 2 / 80
-    terms = Objective("l1", w)(batch["stereo"] / (batch["depth"] + bumps), batch)
+    terms = Objective("l1", w)(batch["bf"] / (batch["depth"] + bumps), batch)
     # l1 sees every second column; MSE_v sees a tilt at every column
     assert float(2 * terms["l1"]) == pytest.approx(float(w * terms["mse_v"]), rel=0.05)
 
 
 def test_the_balanced_weight_is_the_median_over_the_patches() -> None:
     patches = [_plane(slope=slope) for slope in (0.01, 0.05, 0.03)]
-    assert balanced_weight(patches) == balanced_weight(patches[2:])
+    assert balance_weight(patches) == balance_weight(patches[2:])
 
 
 def test_holes_hardly_touch_the_balanced_weight() -> None:
     patch = _plane()
     patch["depth"][0, :, 50] = torch.nan
     patch["disparity_lr"][0, 0, 12] = torch.nan
-    assert balanced_weight([patch]) == pytest.approx(balanced_weight([_plane()]), rel=0.02)
+    assert balance_weight([patch]) == pytest.approx(balance_weight([_plane()]), rel=0.02)
 
 
 def test_the_balanced_weight_of_a_wall_is_finite() -> None:
-    assert 0 < balanced_weight([_plane(slope=0.0)]) < math.inf
+    assert 0 < balance_weight([_plane(slope=0.0)]) < math.inf
 
 
 def test_a_balanced_weight_of_nothing_is_refused() -> None:
     with pytest.raises(ValueError, match=r"loss.w=auto: expected patches to compute it from, there is none"):
-        balanced_weight([])
+        balance_weight([])
 
 
 # The schedule
@@ -284,7 +284,7 @@ def test_the_training_loss_is_the_objective_of_the_networks_output_in_full_preci
     losses, module = _Losses(), _module(mixed=mixed)
     [batch] = _one_batch()
     with torch.no_grad(), torch.autocast("cpu", torch.bfloat16, enabled=mixed):
-        disparity = upsample_disparity(module.net, batch["rgb"], batch["disparity_lr"], batch["bounds"])
+        disparity = upsample_disparity(module.net, batch["rgb"], batch["disparity_lr"], batch["min_max"])
     expected = float(module.objective(disparity, batch)["loss"])
     _trainer(tmp_path, max_steps=1, callbacks=[losses]).fit(module, _one_batch())
     assert losses.values == pytest.approx([expected], rel=2e-5)
@@ -344,7 +344,7 @@ def test_a_gradient_that_is_not_finite_changes_nothing(tmp_path: Path) -> None:
     before = copy.deepcopy(module.net.state_dict())
     [batch] = _one_batch()
     batch["depth"] = batch["depth"].clone()
-    bad = {**batch, "stereo": torch.full_like(batch["stereo"], torch.inf)}
+    bad = {**batch, "bf": torch.full_like(batch["bf"], torch.inf)}
     _trainer(tmp_path, max_epochs=1).fit(module, DataLoader([bad], batch_size=None))
     assert all(torch.equal(before[name], value) for name, value in module.net.state_dict().items())
 

@@ -24,9 +24,9 @@ from dsr.methods.networks.base import DisparityNetwork
 from dsr.methods.networks.trained import NETWORKS
 from dsr.methods.networks.weight_files import load_network, save_network
 from dsr.metrics.classes import visual_metrics
+from dsr.training.data_module import PatchData
 from dsr.training.module import Schedule, SuperResolution
-from dsr.training.objective import Objective, balanced_weight
-from dsr.training.patches import PatchData
+from dsr.training.objective import Objective, balance_weight
 from dsr.utils.builder import ConfigError, build
 from dsr.utils.console import show
 from dsr.utils.devices import fast_precision, pick_device
@@ -142,7 +142,7 @@ def _shapes(net: DisparityNetwork) -> dict[str, torch.Size]:
 
 def _prepare(console: Console, data: PatchData) -> None:
     """Let the data sets that render or resize their scenes do so, with a bar."""
-    for source, names in data.used:
+    for source, names in data.used_scenes:
         prepare(Display(console), source, names)
 
 
@@ -165,7 +165,7 @@ def _objective(settings: TrainConfig, data: PatchData) -> Objective:
         raise ConfigError(f"model.visual: expected true or false, got {visual!r}")
     if not visual:
         return Objective(depth_loss)
-    w = balanced_weight(data.some_patches(_PATCHES_FOR_W)) if settings.loss.w == "auto" else float(settings.loss.w)
+    w = balance_weight(data.first_patches(_PATCHES_FOR_W)) if settings.loss.w == "auto" else float(settings.loss.w)
     return Objective(depth_loss, w)
 
 
@@ -182,7 +182,7 @@ def _announce(
     """Say what the run will do, and how long it will take."""
     trainer, objective = settings.trainer, module.objective
     visual = f" + {objective.w:.3g} MSE_v" if objective.w else ""
-    batch = torch.utils.data.default_collate(data.some_patches(trainer.batch))
+    batch = torch.utils.data.default_collate(data.first_patches(trainer.batch))
     step = seconds_per_step(module, batch) * trainer.accumulate
     held_out = ", ".join(f"{len(names)} of {kind}" for kind, (_, names) in data.validation_scenes().items())
     parameters = sum(each.numel() for each in module.net.parameters())

@@ -14,8 +14,8 @@ from rich.console import Console
 
 from dsr.app.progress import TrainingBar
 from dsr.app.schema import TrainerConfig
+from dsr.training.degradation import Batch
 from dsr.training.module import SuperResolution
-from dsr.training.problem import Batch
 from dsr.utils.lightning import Interruption, LastValidation, Log, ValidationTable, without_chatter
 
 MONITOR = "val/RMSE_v"

@@ -12,9 +12,9 @@ from omegaconf import OmegaConf
 from dsr.app.schema import TrainConfig, TrainerConfig
 from dsr.data.base import SceneSource, Some
 from dsr.degradation.downsampling import Downsampling
-from dsr.training.cropping import PatchSettings
-from dsr.training.patches import Part, PatchData
-from dsr.training.problem import Degradation
+from dsr.training.data_module import Part, PatchData
+from dsr.training.degradation import Degradation
+from dsr.training.patches import PatchSettings
 from dsr.utils.builder import ConfigError, build
 
 WEIGHTS = "weights.safetensors"
@@ -81,11 +81,11 @@ def training_data(settings: TrainConfig) -> PatchData:
     downsampling = build("downsampling", settings.downsampling)
     if not isinstance(downsampling, Downsampling):
         raise ConfigError("downsampling: training needs a model such as box, measured is none")
-    problem = Degradation(settings.scale, downsampling, build("noise", settings.noise))
+    degradation = Degradation(settings.scale, downsampling, build("noise", settings.noise))
     validation = {name: build(f"validation.{name}", node) for name, node in settings.validation.items()}
     try:
         patches = PatchSettings(size=trainer.patch, **common(PatchSettings, trainer))
-        return PatchData(_parts(settings.dataset), patches, problem, seed=settings.seed, validation=validation)
+        return PatchData(_parts(settings.dataset), patches, degradation, seed=settings.seed, validation=validation)
     except ValueError as error:
         raise ConfigError(str(error)) from error
 

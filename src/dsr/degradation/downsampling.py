@@ -231,13 +231,9 @@ def _divisible(scene: Scene, scale: int) -> tuple[Scene, tuple[str, ...]]:
         raise ValueError(f"{scene.name}: expected at least {scale} x {scale} pixels, got {before}")
     if (height, width) == (camera.height, camera.width):
         return scene, scene.notes
-    depth = None if scene.depth is None else scene.depth[:, :height, :width]
-    measured = {scale: scene.measured[scale]} if scale in scene.measured else {}
-    if depth is None and not measured:
+    if scene.depth is None and scale not in scene.measured:
         raise ValueError(f"{scene.name}: expected a measured map at x{scale}, there is none")
-    camera = camera.crop(0, 0, height, width)
-    cropped = Scene(scene.dataset, scene.name, scene.rgb[:, :height, :width], camera, depth, measured)
-    return cropped, (
+    return scene.crop(0, 0, height, width), (
         *scene.notes,
         f"cropped from {before} to {height} x {width}, which {scale} divides",
     )

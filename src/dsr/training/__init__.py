@@ -1,1 +1,1 @@
-"""Training: patches of scenes, losses, the LightningModule."""
+"""Training of networks: augmentation, patches, the loss, the LightningDataModule and the LightningModule."""

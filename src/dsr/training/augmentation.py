@@ -1,4 +1,4 @@
-"""Random windows of scenes, and their variation: mirrored, turned, nearer or farther, photographed otherwise."""
+"""Random augmentation of scenes: mirroring, quarter turns, scaling of depth, and changes of the rgb image."""
 
 from __future__ import annotations
 
@@ -13,21 +13,20 @@ from torch import Tensor
 from dsr.sample import Scene
 
 _BLUR, _NOISE = 1.0, 0.03
-_LARGEST_SCALE = 3.0
-"""exp(3) = 20 times nearer or farther; beyond that no scene is."""
+_MAX_DEPTH_SCALE = 3.0
+"""Depth changes by a factor of exp(3) = 20 at most."""
 
 
 @dataclass(frozen=True)
-class Variation:
-    """How windows are varied at random.
+class Augmentation:
+    """Random changes of a scene that keep rgb, depth and camera consistent.
 
     Args:
-        flip: whether they are mirrored, both ways.
-        rotate: whether they are turned by quarter turns, the camera along with them.
+        flip: whether scenes are mirrored at random, horizontally and vertically.
+        rotate: whether scenes are rotated by random quarter turns, the camera included.
         depth_scale: s, where depth is multiplied by exp(U(-s, s)).
         colour: standard deviation of the gain of each colour channel.
-        photo: share of the windows whose photo is as cameras take them rather than as they are rendered: of another
-            gamma, blurred and noisy.
+        photo: fraction of the scenes whose rgb is changed by :func:`simulate_camera`.
 
     Raises:
         ValueError: a value is out of range.
@@ -42,35 +41,36 @@ class Variation:
 
     def __post_init__(self) -> None:
         """Check the values."""
-        if not 0 <= self.depth_scale <= _LARGEST_SCALE:
-            raise ValueError(f"trainer.depth_scale: expected 0 to {_LARGEST_SCALE:g}, got {self.depth_scale}")
+        if not 0 <= self.depth_scale <= _MAX_DEPTH_SCALE:
+            raise ValueError(f"trainer.depth_scale: expected 0 to {_MAX_DEPTH_SCALE:g}, got {self.depth_scale}")
         if not 0 <= self.colour < math.inf:
             raise ValueError(f"trainer.colour: expected 0 or more, got {self.colour}")
         if not 0 <= self.photo <= 1:
             raise ValueError(f"trainer.photo: expected a share from 0 to 1, got {self.photo}")
 
     def __call__(self, scene: Scene, random: np.random.Generator) -> tuple[Scene, float]:
-        """Return the scene varied, and what its depth was multiplied by."""
+        """Return the augmented scene and the factor by which its depth was multiplied."""
         if self.colour:
             gain = torch.from_numpy(1 + self.colour * random.standard_normal((3, 1, 1))).float()
             scene = replace(scene, rgb=(scene.rgb * gain).clamp(0, 1))
         if random.random() < self.photo:
-            scene = replace(scene, rgb=photographed(scene.rgb, random))
+            scene = replace(scene, rgb=simulate_camera(scene.rgb, random))
         if self.flip:
             for vertical in (False, True):
                 if random.random() < 0.5:
-                    scene = mirrored(scene, vertical=vertical)
+                    scene = mirror(scene, vertical=vertical)
         if self.rotate:
-            scene = turned(scene, int(random.integers(4)))
+            scene = rotate90(scene, int(random.integers(4)))
         factor = math.exp(random.uniform(-self.depth_scale, self.depth_scale)) if self.depth_scale else 1.0
         depth = None if scene.depth is None else scene.depth * factor
         return replace(scene, depth=depth), factor
 
 
-def photographed(rgb: Tensor, random: np.random.Generator) -> Tensor:
-    """Return a photo (3, H, W) as some camera might have taken it.
+def simulate_camera(rgb: Tensor, random: np.random.Generator) -> Tensor:
+    """Return an rgb image (3, H, W) with another gamma, blur and noise, as cameras differ.
 
-    Its gamma times exp(U(-0.5, 0.5)), a Gaussian blur of up to a pixel, and Gaussian noise of up to 0.03.
+    The values are raised to the power exp(U(-0.5, 0.5)). The Gaussian blur has a standard deviation of up to one pixel,
+    the Gaussian noise one of up to 0.03.
     """
     pixels = rgb.clamp(min=0).numpy() ** math.exp(random.uniform(-0.5, 0.5))
     sigma = random.uniform(0, _BLUR)
@@ -79,16 +79,8 @@ def photographed(rgb: Tensor, random: np.random.Generator) -> Tensor:
     return torch.from_numpy(pixels.astype(np.float32)).clamp(0, 1)
 
 
-def window(scene: Scene, top: int, left: int, size: int) -> Scene:
-    """Return a square window of a scene, its depth in float64."""
-    rows, columns = slice(top, top + size), slice(left, left + size)
-    depth = None if scene.depth is None else scene.depth[:, rows, columns].double()
-    camera = scene.camera.crop(top, left, size, size)
-    return Scene(scene.dataset, scene.name, scene.rgb[:, rows, columns], camera, depth)
-
-
-def mirrored(scene: Scene, *, vertical: bool = False) -> Scene:
-    """Return the mirror image: left and right change places, or top and bottom; the world is mirrored with it."""
+def mirror(scene: Scene, *, vertical: bool = False) -> Scene:
+    """Return the mirror image of a scene and its camera, left to right or, with ``vertical``, top to bottom."""
     camera = scene.camera
     if vertical:
         camera = replace(camera, cy=camera.height - 1 - camera.cy)
@@ -99,8 +91,8 @@ def mirrored(scene: Scene, *, vertical: bool = False) -> Scene:
     return replace(scene, rgb=scene.rgb.flip(axis), depth=depth, camera=camera, measured={})
 
 
-def turned(scene: Scene, turns: int) -> Scene:
-    """Return the scene as a camera sees it that is turned about its axis; the image turns counterclockwise."""
+def rotate90(scene: Scene, turns: int) -> Scene:
+    """Return the scene rotated counterclockwise by ``turns`` quarter turns, the camera included."""
     if turns % 4 == 0:
         return scene
     depth = None if scene.depth is None else scene.depth.rot90(turns, (-2, -1))

@@ -1,4 +1,4 @@
-"""Training of super-resolution networks with Lightning: the schedule and the module."""
+"""Training of super-resolution networks with Lightning: the schedule and the LightningModule."""
 
 from __future__ import annotations
 
@@ -12,29 +12,31 @@ import lightning
 import torch
 import torchmetrics
 from torch import Tensor, nn
+from torch.optim.swa_utils import get_ema_multi_avg_fn
 
 from dsr.geometry.comparison import comparison
 from dsr.methods.networks.base import DisparityNetwork
 from dsr.metrics.functional import SurfacePair
-from dsr.training.objective import Objective, depth_of
-from dsr.training.problem import Batch
+from dsr.training.degradation import Batch
+from dsr.training.objective import Objective, to_depth
 
-_DRAWN = 4
+_RENDERED_SCENES = 4
+"""Number of scenes of each validation set that are rendered for TensorBoard."""
 
 
 @dataclass(frozen=True)
 class Schedule:
-    """How a training goes: AdamW, linear warm-up, cosine to zero, an average of the weights.
+    """Optimisation settings: AdamW with linear warm-up and cosine decay to zero, and an average of the weights.
 
     Args:
-        steps: of the whole training.
-        learning_rate: at its highest.
-        warmup: steps until it gets there.
-        weight_decay: of AdamW.
-        clip: largest norm of a gradient; a longer one is shortened to it.
-        average: decay of the exponential moving average of the weights, which is what is validated and kept; 0 for
-            the weights themselves. In its first steps the average is shorter.
-        mixed: whether the network's convolutions run in bfloat16; losses and weights never do.
+        steps: number of steps of the whole training.
+        learning_rate: highest learning rate.
+        warmup: number of steps until the highest learning rate.
+        weight_decay: weight decay of AdamW.
+        clip: largest norm of the gradient; longer gradients are scaled down to it.
+        average: decay of the exponential moving average of the weights, which is validated and saved; 0 for the weights
+            themselves. The decay is smaller in the first steps.
+        mixed: whether the network's convolutions run in bfloat16; losses and weights stay in float32.
 
     Raises:
         ValueError: a value is out of range.
@@ -68,22 +70,23 @@ class Schedule:
         return 0.5 * (1 + math.cos(math.pi * done))
 
     def decay(self, step: int) -> float:
-        """Return the moving average's decay after a step, counted from 1."""
+        """Return the decay of the moving average after a step, counted from 1."""
         return min(self.average, step / (step + 9))
 
 
 class SuperResolution(lightning.LightningModule):
-    """A network on disparities under training.
+    """The training of a network of disparities.
 
     Args:
         net: the network.
         objective: the loss.
-        schedule: of the training.
-        metrics: makes the metrics of a validation set, such as :func:`dsr.metrics.classes.visual_metrics`.
-        validation_sets: their names, in the order of the validation loaders.
+        schedule: settings of the optimisation.
+        metrics: function that makes the metrics of a validation set, such as
+            :func:`dsr.metrics.classes.visual_metrics`.
+        validation_sets: names of the validation sets, in the order of the loaders.
 
     Raises:
-        ValueError: the network leaves out pixels.
+        ValueError: the network does not cover the whole image.
 
     """
 
@@ -114,37 +117,36 @@ class SuperResolution(lightning.LightningModule):
     def loss_terms(self, batch: Batch) -> dict[str, Tensor]:
         """Return ``loss`` and its terms."""
         with torch.autocast(self.device.type, torch.bfloat16, enabled=self.schedule.mixed):
-            disparity = self.net.upsample(batch["rgb"], batch["disparity_lr"], batch["bounds"])
+            disparity = self.net.upsample(batch["rgb"], batch["disparity_lr"], batch["min_max"])
         return self.objective(disparity.float(), batch)
 
     def configure_gradient_clipping(self, optimizer: Any, *_: Any, **__: Any) -> None:
-        """Shorten a long gradient, log its norm; a step whose gradient is not finite changes nothing."""
+        """Clip the gradient and log its norm; drop a gradient that is not finite, so that the step changes nothing."""
         norm = nn.utils.clip_grad_norm_(self.net.parameters(), self.schedule.clip)
         self.log("train/gradient_norm", norm.detach())
         if not bool(norm.isfinite()):
             optimizer.zero_grad(set_to_none=True)
 
     def optimizer_step(self, *arguments: Any, **named: Any) -> None:
-        """Do a step, then move the average of the weights on."""
+        """Do a step, then update the moving average of the weights."""
         super().optimizer_step(*arguments, **named)
-        with torch.no_grad():
-            decay = self.schedule.decay(self.global_step + 1)
-            torch._foreach_lerp_(list(self.average.parameters()), list(self.net.parameters()), 1 - decay)
+        update = get_ema_multi_avg_fn(self.schedule.decay(self.global_step + 1))
+        update(list(self.average.parameters()), list(self.net.parameters()), None)
 
     def validation_step(self, batch: Batch, index: int, dataloader_idx: int = 0) -> None:
-        """Score a whole scene, and draw the first few."""
+        """Score a whole scene; render the first few for TensorBoard."""
         disparity = self.average.upsample(batch["rgb"], batch["disparity_lr"])
-        depth = depth_of(disparity.to(batch["depth"].dtype), batch)
+        depth = to_depth(disparity.to(batch["depth"].dtype), batch)
         self.metrics[dataloader_idx].update(  # type: ignore[operator]
             SurfacePair(depth, batch["depth"], batch["rays"], image_dtype=torch.float32)
         )
         writer: Any = getattr(self.logger, "experiment", None)
-        if hasattr(writer, "add_image") and index < _DRAWN:
+        if hasattr(writer, "add_image") and index < _RENDERED_SCENES:
             name = f"renderings/{self.sets[dataloader_idx]}_{index}"
             writer.add_image(name, comparison(depth, batch["depth"], batch["rays"]), self.global_step)
 
     def on_validation_epoch_end(self) -> None:
-        """Log the means over the scenes, worst of four lights: of each set where there are several, and of them all."""
+        """Log the mean scores over the scenes, worst of four lights, of all sets and, if there are several, of each."""
         scores = [{name: value.double() for name, value in each.compute().items()} for each in self.metrics]  # type: ignore[operator]
         means = {name: torch.stack([each[name] for each in scores]).nanmean() for name in scores[0]}
         named = {"val": means}
@@ -158,7 +160,7 @@ class SuperResolution(lightning.LightningModule):
             each.reset()  # type: ignore[operator]
 
     def configure_optimizers(self) -> Any:
-        """Return AdamW and the schedule of its learning rate, step by step."""
+        """Return AdamW and its learning-rate schedule, which is updated after every step."""
         schedule = self.schedule
         optimiser = torch.optim.AdamW(
             self.net.parameters(), lr=schedule.learning_rate, weight_decay=schedule.weight_decay

@@ -1,4 +1,4 @@
-"""What trainings minimise: a loss on disparity plus w MSE_v, and the w that balances the two."""
+"""The training loss, a loss on disparity plus w MSE_v, and the weight w that balances the two."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from torch import Tensor
 
 from dsr.metrics import losses
 from dsr.metrics.functional import SurfacePair, mse_v
-from dsr.training.problem import Batch
+from dsr.training.degradation import Batch
 
 DepthLoss = Literal["lap1", "l1", "mse"]
 _TILT = math.asin(5 / 255)
-"""Turns a surface seen side-on by 5 of 255 grey levels, what BadPix_v(5) begins to count: 1.1 degrees."""
+"""1.1 degrees: it changes the rendering of a surface lit from the side by 5 of 255, the threshold of BadPix_v(5)."""
 _DEPTH_LOSSES = {"lap1": losses.lap1, "l1": losses.l1, "mse": losses.mse}
 
 
@@ -24,8 +24,8 @@ _DEPTH_LOSSES = {"lap1": losses.lap1, "l1": losses.l1, "mse": losses.mse}
 class Objective:
     """The loss: depth_loss + w MSE_v (Voynov et al. 2019, eq. 4: Lap_1 + w MSE_v).
 
-    The depth loss is taken of disparities over the range of the low-resolution ones, so that it does not depend on the
-    scene's size.
+    The depth loss compares disparities divided by the range of the low-resolution ones, so that it does not depend on
+    the scale of the scene.
 
     Args:
         depth_loss: ``lap1``, ``l1`` or ``mse``.
@@ -45,40 +45,40 @@ class Objective:
             raise ValueError(f"model.depth_loss: expected one of {', '.join(_DEPTH_LOSSES)}, got {self.depth_loss!r}")
 
     def __call__(self, disparity: Tensor, batch: Batch) -> dict[str, Tensor]:
-        """Return ``loss`` and its terms, means over the batch's images with anything to compare.
+        """Return ``loss`` and its terms, means over the images of the batch that have valid depth.
 
         Args:
-            disparity: (B, 1, H, W) the network's, in pixels.
-            batch: see :func:`dsr.training.problem.tensors_of`.
+            disparity: (B, 1, H, W) the network's disparity in pixels.
+            batch: tensors of :func:`dsr.training.degradation.to_tensors`.
 
         """
-        target = batch["stereo"] / batch["depth"] - batch["doffs"]
-        span = _span(batch["disparity_lr"])
-        loss = _DEPTH_LOSSES[self.depth_loss](disparity / span, target / span).nanmean()
+        target = batch["bf"] / batch["depth"] - batch["doffs"]
+        extent = _range(batch["disparity_lr"])
+        loss = _DEPTH_LOSSES[self.depth_loss](disparity / extent, target / extent).nanmean()
         terms: dict[str, Tensor] = {self.depth_loss: loss}
         if self.w:
-            pair = SurfacePair(depth_of(disparity, batch), batch["depth"], batch["rays"])
+            pair = SurfacePair(to_depth(disparity, batch), batch["depth"], batch["rays"])
             terms["mse_v"] = mse_v(pair).nanmean()
             loss = loss + self.w * terms["mse_v"]
         return {"loss": loss, **terms}
 
 
-def depth_of(disparity: Tensor, batch: Batch) -> Tensor:
+def to_depth(disparity: Tensor, batch: Batch) -> Tensor:
     """Return orthogonal depth in metres, (B, 1, H, W); NaN where the disparity lies at or beyond infinity."""
     shifted = disparity + batch["doffs"]
-    return torch.where(shifted > 0, batch["stereo"] / torch.where(shifted > 0, shifted, 1), torch.nan)
+    return torch.where(shifted > 0, batch["bf"] / torch.where(shifted > 0, shifted, 1), torch.nan)
 
 
-def balanced_weight(patches: Iterable[Batch]) -> float:
-    """Return the w that gives both terms of the loss the same size for one and the same error.
+def balance_weight(patches: Iterable[Batch]) -> float:
+    """Return the weight w for which one depth error gives both terms of the loss the same size.
 
-    A depth error of tan(a) z / f metres between two neighbouring pixels, z / f metres apart, tilts the normal by a. As
-    a share of the low-resolution disparities' range the depth term sees stereo tan(a) / (f z range), and MSE_v sees
-    (2 - 2 cos a) / 3. w is their ratio for a tilt of 1.1 degrees, which changes a rendering by 5 of 255, at
-    the median over the patches.
+    A depth error of tan(a) z / f metres between two neighbouring pixels, z / f metres apart, tilts the normal by a. The
+    depth term of this error is bf tan(a) / (f z range), where bf is the baseline times the focal length and range that
+    of the low-resolution disparities; MSE_v is (2 - 2 cos a) / 3. w is the median over the patches of their ratio for a
+    tilt of 1.1 degrees, which changes a rendering by 5 of 255.
 
     Args:
-        patches: single training patches, without a batch axis; see :func:`dsr.training.problem.tensors_of`.
+        patches: single training patches, without a batch axis, as from :func:`dsr.training.degradation.to_tensors`.
 
     Raises:
         ValueError: there is no patch.
@@ -89,16 +89,16 @@ def balanced_weight(patches: Iterable[Batch]) -> float:
         x = patch["rays"][0, 0].double()
         focal = (x.numel() - 1) / float(x[-1] - x[0])
         depth = float(patch["depth"][patch["depth"].isfinite()].median())
-        span = float(_span(patch["disparity_lr"][None]))
-        ratios.append(float(patch["stereo"]) * math.tan(_TILT) / (focal * depth * span))
+        extent = float(_range(patch["disparity_lr"][None]))
+        ratios.append(float(patch["bf"]) * math.tan(_TILT) / (focal * depth * extent))
     if not ratios:
         raise ValueError("loss.w=auto: expected patches to compute it from, there is none")
     return float(torch.tensor(ratios, dtype=torch.float64).median()) / ((2 - 2 * math.cos(_TILT)) / 3)
 
 
-def _span(disparity: Tensor) -> Tensor:
-    """Return the range of known disparities per image, (B, 1, 1, 1); a thousandth of the largest where it is less."""
-    known, dims = disparity.isfinite(), (-3, -2, -1)
-    low = disparity.masked_fill(~known, torch.inf).amin(dim=dims, keepdim=True)
-    high = disparity.masked_fill(~known, -torch.inf).amax(dim=dims, keepdim=True)
+def _range(disparity: Tensor) -> Tensor:
+    """Return the range of valid disparities per image, (B, 1, 1, 1), at least a thousandth of the largest."""
+    valid, dims = disparity.isfinite(), (-3, -2, -1)
+    low = disparity.masked_fill(~valid, torch.inf).amin(dim=dims, keepdim=True)
+    high = disparity.masked_fill(~valid, -torch.inf).amax(dim=dims, keepdim=True)
     return (high - low).clamp(min=1e-3 * high.abs().clamp(min=1e-3))

@@ -1,229 +1,220 @@
-"""Training data: random patches of data sets' scenes, and whole scenes for validation."""
+"""Training patches: random windows of scenes.
+
+Patch number i of a run is a pure function of (seed, i). So an interrupted run continues with the same patches, whatever
+the number of workers.
+"""
 
 from __future__ import annotations
 
-import itertools
-import math
-import sys
-from collections.abc import Iterator, Mapping, Sequence
+import contextlib
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
-import lightning
+import numpy as np
 import torch
-from torch.utils.data import DataLoader, Dataset
+from torch import Tensor
+from torch.utils.data import Dataset
 
-from dsr.data.base import SceneSource, content_of
-from dsr.sample import Scene
-from dsr.training.cropping import Patches, PatchSettings, check_patches
-from dsr.training.problem import Batch, Degradation, tensors_of
+from dsr.geometry.camera import baseline_times_focal
+from dsr.sample import AllHolesError, DepthSample, Scene
+from dsr.training.augmentation import Augmentation
+from dsr.training.degradation import Batch, Degradation, to_tensors
+
+_WINDOW_TRIES, _SCENE_TRIES = 10, 100
+_MIN_VALID_FRACTION = 0.5
+_MIN_SIZE = 16
 
 
 @dataclass(frozen=True)
-class Part:
-    """A data set to train on.
+class PatchSettings(Augmentation):
+    """How patches are cropped and augmented.
 
     Args:
-        source: the data set.
-        share: how often patches come from it, relative to the other parts' shares.
+        size: height and width in pixels, a multiple of the scale.
+        batch: number of patches per step and device.
+        validation_scenes: number of scenes at the end of each data set that are kept for validation.
+        scenes: number of scenes to use of each data set, from its first on; None for all.
+        workers: number of additional processes that crop patches.
+        flip, rotate, depth_scale, colour, photo: see :class:`dsr.training.augmentation.Augmentation`.
 
     Raises:
-        ValueError: the share is negative or no number.
+        ValueError: a value is out of range.
 
     """
 
-    source: SceneSource
-    share: float = 1.0
+    size: int = 96
+    batch: int = 16
+    validation_scenes: int = 4
+    scenes: int | None = None
+    workers: int = 0
 
     def __post_init__(self) -> None:
-        """Check the share."""
-        if not 0 <= self.share < math.inf:
-            raise ValueError(f"dataset.shares: expected 0 or a positive number, got {self.share}")
+        """Check the values."""
+        super().__post_init__()
+        if self.size < _MIN_SIZE:
+            raise ValueError(f"trainer.patch: expected at least {_MIN_SIZE} pixels, got {self.size}")
+        if self.batch < 1:
+            raise ValueError(f"trainer.batch: expected a positive number, got {self.batch}")
+        if self.scenes is not None and self.scenes < 1:
+            raise ValueError(f"trainer.scenes: expected a positive number, or null for all, got {self.scenes}")
+        for name in ("workers", "validation_scenes"):
+            if getattr(self, name) < 0:
+                raise ValueError(f"trainer.{name}: expected 0 or more, got {getattr(self, name)}")
 
 
-class WholeScenes(Dataset[Batch]):
-    """The samples of whole scenes, in float64 as evaluation scores them."""
-
-    def __init__(self, scenes: Sequence[Scene], problem: Degradation, seed: int = 0) -> None:
-        self._samples = [problem.sample(scene, seed) for scene in scenes]
-
-    def __len__(self) -> int:
-        return len(self._samples)
-
-    def __getitem__(self, index: int) -> Batch:
-        """Return one sample's tensors."""
-        return tensors_of(self._samples[index], torch.float64)
-
-
-class PatchData(lightning.LightningDataModule):
-    """Patches of data sets' scenes to train on; the last scenes of each, and other data sets, whole to validate with.
+class Patches(Dataset[Batch]):
+    """Random patches ``first`` .. ``first + count - 1`` of a run.
 
     Args:
-        parts: the data sets to train on.
-        settings: how patches are cut.
-        problem: what is to be undone.
-        seed: of the patches, and of the noise of validation scenes.
-        validation: more data sets to validate with, by name; scenes without a true depth are left out.
+        groups: groups of scenes, each with a true depth and at least as large as a patch.
+        settings: how patches are cropped and augmented.
+        degradation: how their low-resolution maps are made.
+        shares: relative frequency of each group; None for equal frequencies.
+        seed: seed of the run.
+        first: number of the first patch.
+        count: number of patches.
 
     Raises:
-        ValueError: a data set is one to evaluate on or has too few scenes, a scene is to be trained on and validated
-            with, or the scale does not divide a patch.
+        ValueError: a scene is too small or has no true depth, or there is no scene.
 
     """
 
     def __init__(
         self,
-        parts: Sequence[Part],
+        groups: Sequence[Sequence[Scene]],
         settings: PatchSettings,
-        problem: Degradation,
+        degradation: Degradation,
         *,
+        shares: Sequence[float] | None = None,
         seed: int = 0,
-        validation: Mapping[str, SceneSource] | None = None,
+        first: int = 0,
+        count: int = 1,
     ) -> None:
-        super().__init__()
-        check_patches((), settings, problem.scale)
-        self._parts, self._settings, self._problem, self._seed = list(parts), settings, problem, seed
-        self._training_names: list[list[str]] = []
-        self._held_out: dict[str, tuple[SceneSource, list[str]]] = {}
-        for part in parts:
-            self._split(part.source)
-        for name, source in (validation or {}).items():
-            self._held_out[_unused(name, self._held_out)] = (source, source.scenes())
-        if not self._held_out:
-            raise ValueError("trainer.validation_scenes: expected a positive number where there is no other validation")
-        self._refuse_leaks()
-        self._patches: Patches | None = None
-        self._validation: list[list[Scene]] = []
+        for group in groups:
+            check_patches(group, settings, degradation.scale)
+        weights = np.array([1.0] * len(groups) if shares is None else shares, dtype=np.float64)
+        if not groups or not all(groups):
+            raise ValueError("patches: expected a scene or more to train on")
+        if not weights.sum() > 0:
+            raise ValueError("dataset.shares: expected a positive number among them, all are 0")
+        self._groups, self._settings, self._degradation = groups, settings, degradation
+        self._limits = np.cumsum(weights / weights.sum())
+        self._seed, self._first, self._count = seed, first, count
+        self._depth_ranges: dict[tuple[int, int], tuple[float, float]] = {}  # by group and number of the scene
 
-    @property
-    def used(self) -> list[tuple[SceneSource, list[str]]]:
-        """The scenes that are trained on or validated with, by data set; those of the parts first."""
-        trained = [(part.source, names) for part, names in zip(self._parts, self._training_names, strict=True)]
-        return [*trained, *self._held_out.values()]
+    def __len__(self) -> int:
+        return self._count
 
-    @property
-    def validation_sets(self) -> list[str]:
-        """The names of the validation sets, in the order of the loaders."""
-        return list(self._held_out)
+    def select(self, first: int, count: int) -> Patches:
+        """Return the patches ``first`` .. ``first + count - 1`` of the same run."""
+        other = Patches.__new__(Patches)
+        other.__dict__ = {**self.__dict__, "_first": first, "_count": count}
+        return other
 
-    @property
-    def training_count(self) -> int:
-        """How many scenes are trained on."""
-        return sum(map(len, self._training_names))
+    def __getitem__(self, index: int) -> Batch:
+        """Return patch number ``first + index``, at least half of whose depth is valid if ten tries find such a window.
 
-    def validation_scenes(self) -> dict[str, tuple[SceneSource, list[str]]]:
-        """Return the scenes of each validation set: the data set that has them, and their names."""
-        return dict(self._held_out)
+        Another window is taken where noise makes all of its depth missing, as a sensor's limits of range may.
+        """
+        random = np.random.default_rng([self._seed, self._first + index])
+        for _ in range(_SCENE_TRIES):
+            with contextlib.suppress(AllHolesError):
+                return self._patch(random)
+        raise ValueError(
+            "patches: expected low-resolution maps with a known pixel or more; noise makes all of them holes"
+        )
 
-    def setup(self, stage: str = "fit") -> None:
-        """Load the scenes; ``stage`` is Lightning's and makes no difference.
+    def _patch(self, random: np.random.Generator) -> Batch:
+        """Return a random patch."""
+        group = min(int(np.searchsorted(self._limits, random.random(), "right")), len(self._groups) - 1)
+        number, top, left = self._window(group, random)
+        source = self._groups[group][number]
+        size = self._settings.size
+        cropped = source.crop(top, left, size, size)
+        depth = None if cropped.depth is None else cropped.depth.double()
+        scene, factor = self._settings(replace(cropped, depth=depth, measured={}), random)
+        generator = torch.Generator().manual_seed(int(random.integers(2**63)))
+        sample = self._degradation.sample(scene, generator)
+        patch = to_tensors(sample)
+        patch["min_max"] = self._blend_min_max(
+            patch["min_max"], self._depth_range(group, number), sample, factor, random
+        )
+        return patch
 
-        Raises:
-            ValueError: a scene is smaller than a patch, or lacks a true depth.
+    def _window(self, group: int, random: np.random.Generator) -> tuple[int, int, int]:
+        """Return a random window of a group: the number of the scene, the top and the left.
+
+        The first window of a random scene with enough valid depth is taken, else the best of ten. Another scene is
+        taken only where all ten have no valid depth, so that scenes with many holes are not trained on less often.
+        """
+        size, scenes = self._settings.size, self._groups[group]
+        for _ in range(_SCENE_TRIES):
+            number, best, highest = int(random.integers(len(scenes))), None, 0.0
+            for _ in range(_WINDOW_TRIES):
+                top, left = (int(random.integers(length - size + 1)) for length in scenes[number].rgb.shape[-2:])
+                fraction = _valid_fraction(scenes[number], top, left, size)
+                if fraction > highest:
+                    best, highest = (number, top, left), fraction
+                if highest >= _MIN_VALID_FRACTION:
+                    break
+            if best is not None:
+                return best
+        raise ValueError("patches: expected scenes with more known depth than a few pixels")
+
+    @staticmethod
+    def _blend_min_max(
+        own: Tensor, depth_range: tuple[float, float], sample: DepthSample, factor: float, random: np.random.Generator
+    ) -> Tensor:
+        """Return the disparities (2, 1, 1) that become 0 and 1 when a patch is normalised.
+
+        In use a network sees whole images, whose disparities have a larger range than a patch's. So half of the patches
+        are normalised with the range of the scene's low-resolution map, the others with a random range between it and
+        their own.
+
+        Args:
+            own: (2, 1, 1) lowest and highest disparity of the patch.
+            depth_range: nearest and farthest depth of the scene in metres.
+            sample: the patch.
+            factor: factor by which augmentation multiplied its depth.
+            random: source of random numbers.
 
         """
-        if self._patches is not None:
-            return
-        groups = [
-            [_light(part.source.load(name)) for name in names]
-            for part, names in zip(self._parts, self._training_names, strict=True)
-        ]
-        shares = [part.share for part in self._parts]
-        self._patches = Patches(groups, self._settings, self._problem, shares=shares, seed=self._seed)
-        for kind, (source, names) in self._held_out.items():
-            scenes = [scene for scene in map(source.load, names) if scene.depth is not None]
-            if not scenes:
-                raise ValueError(f"validation.{kind}: expected scenes with a true depth, there is none")
-            self._held_out[kind] = (source, [scene.name for scene in scenes])
-            self._validation.append(scenes)
+        near, far = depth_range
+        bf, doffs = baseline_times_focal(sample.camera), sample.camera.doffs
+        whole = torch.tensor([bf / (factor * far) - doffs, bf / (factor * near) - doffs]).view(2, 1, 1)
+        whole = torch.stack((torch.minimum(whole[0], own[0]), torch.maximum(whole[1], own[1])))
+        weight = random.random() if random.random() < 0.5 else 1.0
+        return own + weight * (whole - own)
 
-    def some_patches(self, count: int) -> list[Batch]:
-        """Return the first patches of the run, once the scenes are loaded."""
-        patches = self._loaded().starting(0, count)
-        return [patches[index] for index in range(count)]
-
-    def train_dataloader(self) -> DataLoader[Batch]:
-        """Return the patches of the run from the trainer's step on, without an end.
-
-        A loader without a length: of one with a length, Lightning would count off what was trained before it was made.
-        """
-        per_step, done, rank = self._settings.batch, 0, 0
-        if self.trainer is not None:
-            per_step *= self.trainer.accumulate_grad_batches * self.trainer.world_size
-            done, rank = self.trainer.global_step, self.trainer.global_rank
-        stride = 1 if self.trainer is None else self.trainer.world_size
-        numbers = _Numbers(done * per_step, self._settings.batch, rank, stride)
-        workers: dict[str, Any] = {"num_workers": self._settings.workers}
-        pin = torch.cuda.is_available()
-        return DataLoader(self._loaded().starting(0, sys.maxsize), batch_sampler=numbers, pin_memory=pin, **workers)
-
-    def val_dataloader(self) -> list[DataLoader[Batch]]:
-        """Return the whole validation scenes, one at a time, a loader per set."""
-        return [DataLoader(WholeScenes(scenes, self._problem, self._seed), batch_size=1) for scenes in self._validation]
-
-    def _loaded(self) -> Patches:
-        if self._patches is None:
-            self.setup()
-        assert self._patches is not None  # noqa: S101 - for the type checker
-        return self._patches
-
-    def _split(self, source: SceneSource) -> None:
-        """Hold the last scenes of a data set out."""
-        if source.evaluation:
-            raise ValueError(
-                f"dataset={source.name}: its scenes are to evaluate on, not to train on; "
-                f"+dataset@validation.{source.name}={source.name} validates with them"
-            )
-        names, count = source.scenes()[: self._settings.scenes], self._settings.validation_scenes
-        if len(names) <= count:
-            raise ValueError(
-                f"trainer.validation_scenes: expected fewer than the {len(names)} scenes of {source.name}, got {count}"
-            )
-        self._training_names.append(names[: len(names) - count])
-        if count:
-            self._held_out[_unused(source.name, self._held_out)] = (source, names[len(names) - count :])
-
-    def _refuse_leaks(self) -> None:
-        """Raise where a scene is to be trained on and validated with, be it under another name."""
-        trained = {
-            content_of(part.source, name)
-            for part, names in zip(self._parts, self._training_names, strict=True)
-            for name in names
-        }
-        for kind, (source, names) in self._held_out.items():
-            for name in names:
-                if content_of(source, name) in trained:
-                    raise ValueError(f"validation.{kind}: expected scenes that are not trained on, got {name}")
+    def _depth_range(self, group: int, number: int) -> tuple[float, float]:
+        """Return the nearest and the farthest depth of a scene's low-resolution map, in metres."""
+        key = group, number
+        if key not in self._depth_ranges:
+            depth = self._degradation.sample(self._groups[group][number], clean=True).depth_lr
+            valid = depth[depth.isfinite()]
+            self._depth_ranges[key] = (float(valid.min()), float(valid.max()))
+        return self._depth_ranges[key]
 
 
-class _Numbers:
-    """The numbers of the patches of one device's batches, endlessly; deliberately without a length.
+def check_patches(scenes: Sequence[Scene], settings: PatchSettings, scale: int) -> None:
+    """Check that patches of these settings can be cropped.
 
-    Args:
-        first: number of the first patch of all devices.
-        batch: patches per batch.
-        rank: of the device.
-        stride: how many devices there are.
+    Raises:
+        ValueError: the scale does not divide the patches, or a scene is smaller than a patch or has no true depth.
 
     """
-
-    def __init__(self, first: int, batch: int, rank: int, stride: int) -> None:
-        self._first, self._batch, self._rank, self._stride = first, batch, rank, stride
-
-    def __iter__(self) -> Iterator[list[int]]:
-        for start in itertools.count(self._first + self._rank * self._batch, self._stride * self._batch):
-            yield list(range(start, start + self._batch))
-
-
-def _unused(name: str, names: Mapping[str, Any]) -> str:
-    """Return the name, with a number where it is taken."""
-    candidate, number = name, 1
-    while candidate in names:
-        number += 1
-        candidate = f"{name}_{number}"
-    return candidate
+    if settings.size % scale:
+        raise ValueError(f"trainer.patch: expected a size that scale={scale} divides, got {settings.size}")
+    for scene in scenes:
+        if scene.depth is None:
+            raise ValueError(f"{scene.name}: expected a true depth to train with, there is none")
+        height, width = scene.rgb.shape[-2:]
+        if min(height, width) < settings.size:
+            raise ValueError(f"trainer.patch: expected at most {scene.name}'s {height} x {width}, got {settings.size}")
 
 
-def _light(scene: Scene) -> Scene:
-    """Return a scene whose depth takes half the memory."""
-    return scene if scene.depth is None else replace(scene, depth=scene.depth.float())
+def _valid_fraction(scene: Scene, top: int, left: int, size: int) -> float:
+    """Return the fraction of a window's pixels whose depth is valid."""
+    if scene.depth is None:
+        return 0.0
+    return float(scene.depth[:, top : top + size, left : left + size].isfinite().float().mean())

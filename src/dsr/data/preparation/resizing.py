@@ -18,7 +18,6 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from dsr.geometry.camera import Camera
 from dsr.sample import Scene
 
 JUMP = 0.02
@@ -51,14 +50,6 @@ def resized(scene: Scene, height: int, width: int) -> Scene:
     return replace(scene, rgb=photo, depth=depth, camera=scene.camera.rescale(width, height), measured={})
 
 
-def cropped(scene: Scene, top: int, left: int, height: int, width: int) -> Scene:
-    """Return a window of a scene; measured low-resolution maps are left out."""
-    rows, columns = slice(top, top + height), slice(left, left + width)
-    camera: Camera = scene.camera.crop(top, left, height, width)
-    depth = None if scene.depth is None else scene.depth[:, rows, columns]
-    return replace(scene, rgb=scene.rgb[:, rows, columns], depth=depth, camera=camera, measured={})
-
-
 def fitted(scene: Scene, size: int, place: float | None = 0.5, *, enlarge: bool = True) -> Scene:
     """Return a scene whose shorter side is ``size`` pixels long.
 
@@ -78,7 +69,8 @@ def fitted(scene: Scene, size: int, place: float | None = 0.5, *, enlarge: bool 
     if place is None:
         return scene
     side = min(height, width)
-    return cropped(scene, int((height - side) * place), int((width - side) * place), side, side)
+    window = scene.crop(int((height - side) * place), int((width - side) * place), side, side)
+    return replace(window, measured={})
 
 
 def resized_depth(depth: Tensor, height: int, width: int) -> Tensor:

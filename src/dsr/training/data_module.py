@@ -1,0 +1,238 @@
+"""Training data: random patches of the scenes of data sets, and whole scenes for validation."""
+
+from __future__ import annotations
+
+import itertools
+import math
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import lightning
+import torch
+from torch.utils.data import DataLoader, Dataset
+
+from dsr.data.base import SceneSource, content_of
+from dsr.sample import Scene
+from dsr.training.degradation import Batch, Degradation, to_tensors
+from dsr.training.patches import Patches, PatchSettings, check_patches
+
+
+@dataclass(frozen=True)
+class Part:
+    """A data set to train on.
+
+    Args:
+        source: the data set.
+        share: how often patches come from it, relative to the other parts.
+
+    Raises:
+        ValueError: the share is negative or no number.
+
+    """
+
+    source: SceneSource
+    share: float = 1.0
+
+    def __post_init__(self) -> None:
+        """Check the share."""
+        if not 0 <= self.share < math.inf:
+            raise ValueError(f"dataset.shares: expected 0 or a positive number, got {self.share}")
+
+
+class WholeScenes(Dataset[Batch]):
+    """The samples of whole scenes in float64, the type in which evaluation scores them.
+
+    Args:
+        scenes: scenes with a true depth.
+        degradation: how their low-resolution maps are made.
+        seed: seed of the noise.
+
+    """
+
+    def __init__(self, scenes: Sequence[Scene], degradation: Degradation, seed: int = 0) -> None:
+        self._samples = [degradation.sample(scene, seed) for scene in scenes]
+
+    def __len__(self) -> int:
+        return len(self._samples)
+
+    def __getitem__(self, index: int) -> Batch:
+        """Return one sample's tensors."""
+        return to_tensors(self._samples[index], torch.float64)
+
+
+class PatchData(lightning.LightningDataModule):
+    """Patches of data sets to train on, and whole scenes to validate with: the last ones of each, and other data sets.
+
+    Args:
+        parts: the data sets to train on.
+        settings: how patches are cropped and augmented.
+        degradation: how low-resolution maps are made.
+        seed: seed of the patches and of the noise of validation scenes.
+        validation: more data sets to validate with, by name; their scenes without a true depth are left out.
+
+    Raises:
+        ValueError: a data set is one to evaluate on or has too few scenes, a scene is to be trained on and validated
+            with, or the scale does not divide a patch.
+
+    """
+
+    def __init__(
+        self,
+        parts: Sequence[Part],
+        settings: PatchSettings,
+        degradation: Degradation,
+        *,
+        seed: int = 0,
+        validation: Mapping[str, SceneSource] | None = None,
+    ) -> None:
+        super().__init__()
+        check_patches((), settings, degradation.scale)
+        self._parts, self._settings, self._degradation, self._seed = list(parts), settings, degradation, seed
+        self._training_names: list[list[str]] = []
+        self._held_out: dict[str, tuple[SceneSource, list[str]]] = {}
+        for part in parts:
+            self._split(part.source)
+        for name, source in (validation or {}).items():
+            self._held_out[_make_unique(name, self._held_out)] = (source, source.scenes())
+        if not self._held_out:
+            raise ValueError("trainer.validation_scenes: expected a positive number where there is no other validation")
+        self._refuse_leaks()
+        self._patches: Patches | None = None
+        self._validation: list[list[Scene]] = []
+
+    @property
+    def used_scenes(self) -> list[tuple[SceneSource, list[str]]]:
+        """The scenes to train on and to validate with, by data set; those of the parts come first."""
+        trained = [(part.source, names) for part, names in zip(self._parts, self._training_names, strict=True)]
+        return [*trained, *self._held_out.values()]
+
+    @property
+    def validation_sets(self) -> list[str]:
+        """The names of the validation sets, in the order of the loaders."""
+        return list(self._held_out)
+
+    @property
+    def training_count(self) -> int:
+        """The number of scenes to train on."""
+        return sum(map(len, self._training_names))
+
+    def validation_scenes(self) -> dict[str, tuple[SceneSource, list[str]]]:
+        """Return the data set and the names of the scenes of each validation set."""
+        return dict(self._held_out)
+
+    def setup(self, stage: str = "fit") -> None:
+        """Load the scenes; Lightning's ``stage`` makes no difference.
+
+        Raises:
+            ValueError: a scene is smaller than a patch, or lacks a true depth.
+
+        """
+        if self._patches is not None:
+            return
+        groups = [
+            [_halve_precision(part.source.load(name)) for name in names]
+            for part, names in zip(self._parts, self._training_names, strict=True)
+        ]
+        shares = [part.share for part in self._parts]
+        self._patches = Patches(groups, self._settings, self._degradation, shares=shares, seed=self._seed)
+        for kind, (source, names) in self._held_out.items():
+            scenes = [scene for scene in map(source.load, names) if scene.depth is not None]
+            if not scenes:
+                raise ValueError(f"validation.{kind}: expected scenes with a true depth, there is none")
+            self._held_out[kind] = (source, [scene.name for scene in scenes])
+            self._validation.append(scenes)
+
+    def first_patches(self, count: int) -> list[Batch]:
+        """Return the first ``count`` patches of the run."""
+        patches = self._load_patches().select(0, count)
+        return [patches[index] for index in range(count)]
+
+    def train_dataloader(self) -> DataLoader[Batch]:
+        """Return an endless loader of the run's patches, from the trainer's current step on.
+
+        It has no length: Lightning would subtract the steps done before from the length of a loader.
+        """
+        per_step, done, rank = self._settings.batch, 0, 0
+        if self.trainer is not None:
+            per_step *= self.trainer.accumulate_grad_batches * self.trainer.world_size
+            done, rank = self.trainer.global_step, self.trainer.global_rank
+        stride = 1 if self.trainer is None else self.trainer.world_size
+        numbers = _PatchNumbers(done * per_step, self._settings.batch, rank, stride)
+        workers: dict[str, Any] = {"num_workers": self._settings.workers}
+        pin = torch.cuda.is_available()
+        return DataLoader(self._load_patches().select(0, sys.maxsize), batch_sampler=numbers, pin_memory=pin, **workers)
+
+    def val_dataloader(self) -> list[DataLoader[Batch]]:
+        """Return a loader for each validation set, of whole scenes, one at a time."""
+        return [
+            DataLoader(WholeScenes(scenes, self._degradation, self._seed), batch_size=1) for scenes in self._validation
+        ]
+
+    def _load_patches(self) -> Patches:
+        if self._patches is None:
+            self.setup()
+        assert self._patches is not None  # noqa: S101 - for the type checker
+        return self._patches
+
+    def _split(self, source: SceneSource) -> None:
+        """Divide the scenes of a data set into those to train on and those to validate with, the last ones."""
+        if source.evaluation:
+            raise ValueError(
+                f"dataset={source.name}: its scenes are to evaluate on, not to train on; "
+                f"+dataset@validation.{source.name}={source.name} validates with them"
+            )
+        names, count = source.scenes()[: self._settings.scenes], self._settings.validation_scenes
+        if len(names) <= count:
+            raise ValueError(
+                f"trainer.validation_scenes: expected fewer than the {len(names)} scenes of {source.name}, got {count}"
+            )
+        self._training_names.append(names[: len(names) - count])
+        if count:
+            self._held_out[_make_unique(source.name, self._held_out)] = (source, names[len(names) - count :])
+
+    def _refuse_leaks(self) -> None:
+        """Refuse a scene that is both trained on and validated with, under whatever name."""
+        trained = {
+            content_of(part.source, name)
+            for part, names in zip(self._parts, self._training_names, strict=True)
+            for name in names
+        }
+        for kind, (source, names) in self._held_out.items():
+            for name in names:
+                if content_of(source, name) in trained:
+                    raise ValueError(f"validation.{kind}: expected scenes that are not trained on, got {name}")
+
+
+class _PatchNumbers:
+    """The patch numbers of one device's batches, without an end and hence without a length.
+
+    Args:
+        first: number of the first patch of all devices.
+        batch: number of patches per batch.
+        rank: number of the device.
+        stride: number of devices.
+
+    """
+
+    def __init__(self, first: int, batch: int, rank: int, stride: int) -> None:
+        self._first, self._batch, self._rank, self._stride = first, batch, rank, stride
+
+    def __iter__(self) -> Iterator[list[int]]:
+        for start in itertools.count(self._first + self._rank * self._batch, self._stride * self._batch):
+            yield list(range(start, start + self._batch))
+
+
+def _make_unique(name: str, names: Mapping[str, Any]) -> str:
+    """Return the name, with a number behind it where ``names`` has it already."""
+    candidate, number = name, 1
+    while candidate in names:
+        number += 1
+        candidate = f"{name}_{number}"
+    return candidate
+
+
+def _halve_precision(scene: Scene) -> Scene:
+    """Return a scene whose depth is float32, which takes half the memory."""
+    return scene if scene.depth is None else replace(scene, depth=scene.depth.float())

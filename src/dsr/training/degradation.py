@@ -1,0 +1,75 @@
+"""The degradation that a network learns to undo, and the tensors of a sample that it trains on."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from dsr.degradation.downsampling import Downsampling, make_sample
+from dsr.degradation.noise import Noise
+from dsr.geometry.camera import baseline_times_focal, to_range
+from dsr.sample import DepthSample, Scene
+
+Batch = dict[str, Tensor]
+_MIN_RELATIVE_RANGE = 1e-3
+"""Smallest range of a map as a fraction of its disparity."""
+
+
+@dataclass(frozen=True)
+class Degradation:
+    """How low-resolution maps are made from high-resolution ones.
+
+    Args:
+        scale, downsampling, noise: as for :func:`dsr.degradation.downsampling.make_sample`.
+
+    """
+
+    scale: int
+    downsampling: Downsampling
+    noise: Noise | None = None
+
+    def sample(self, scene: Scene, generator: torch.Generator | int = 0, *, clean: bool = False) -> DepthSample:
+        """Return a scene with its low-resolution map, which is made from disparity; without noise if ``clean``."""
+        noise = None if clean else self.noise
+        return make_sample(scene, self.scale, self.downsampling, "disparity", noise, generator)
+
+
+def to_tensors(sample: DepthSample, dtype: torch.dtype = torch.float32) -> Batch:
+    """Return a sample as the tensors on which a network of disparities is trained.
+
+    Args:
+        sample: a sample with a true depth.
+        dtype: type of all tensors but ``rgb`` and ``min_max``.
+
+    Returns:
+        ``rgb`` (3, H, W) and ``min_max`` (2, 1, 1), the lowest and highest low-resolution disparity, in float32; in
+        ``dtype`` ``disparity_lr`` (1, h, w) in pixels of the high-resolution camera, ``depth`` (1, H, W) in metres,
+        ``rays`` (3, H, W), ``bf`` (1, 1, 1), the baseline times the focal length, and ``doffs`` (1, 1, 1).
+
+    Raises:
+        ValueError: the sample has no true depth.
+
+    """
+    if sample.depth is None:
+        raise ValueError(f"{sample.scene}: expected a true depth to train with, there is none")
+    camera = sample.camera
+    disparity = sample.scale * to_range(sample.depth_lr, sample.camera_lr, "disparity")
+    return {
+        "rgb": sample.rgb.float(),
+        "disparity_lr": disparity.to(dtype),
+        "depth": sample.depth.to(dtype),
+        "rays": camera.rays(dtype=dtype),
+        "bf": torch.full((1, 1, 1), baseline_times_focal(camera), dtype=dtype),
+        "doffs": torch.full((1, 1, 1), camera.doffs, dtype=dtype),
+        "min_max": _min_max(disparity).float(),
+    }
+
+
+def _min_max(disparity: Tensor) -> Tensor:
+    """Return the lowest and the highest valid value, (2, 1, 1), which differ by a thousandth at least."""
+    valid = disparity[disparity.isfinite()]
+    low, high = valid.min(), valid.max()
+    min_range = _MIN_RELATIVE_RANGE * high.abs().clamp(min=_MIN_RELATIVE_RANGE)
+    return torch.stack((low, torch.maximum(high, low + min_range))).view(2, 1, 1)
