@@ -63,7 +63,7 @@ class ToyMethod:
         self.calls = []
         self.instead = instead
 
-    def __call__(self, sample):
+    def __call__(self, sample, progress=None):
         self.calls.append(sample.scene)
         result = self.instead.get(sample.scene)
         if isinstance(result, BaseException):

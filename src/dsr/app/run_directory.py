@@ -27,7 +27,7 @@ _PACKAGES = (
 _NOT_IDENTITY = ("output_dir", "overwrite", "metrics", "weights", "resume", "run")  # of the weights, the content counts
 PREDICTING_CODE = (
     "sample.py", "degradation", "geometry", "metrics", "synthetic", "methods", "data", "training",
-    "utils/lightning.py", "evaluation/predict.py",
+    "utils/lightning.py", "utils/progress.py", "evaluation/predict.py",
 )  # fmt: skip
 """Modules and packages that determine a prediction, by their paths below the package."""
 

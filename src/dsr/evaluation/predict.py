@@ -145,7 +145,7 @@ def predict(
         study: what to evaluate.
         folder: the run's directory.
         progress: shows how far it is.
-        steps: shows how far a method that iterates is within a scene.
+        steps: shows how far a method is within a scene.
         overwrite: whether predictions on disk are made anew, whatever they came from.
 
     Raises:
@@ -289,8 +289,8 @@ def _predict_scene(
 
 
 def _answer(method: Upsampler, sample: DepthSample, steps: Steps | None) -> Tensor:
-    """Return a method's depth; show how far it is if it tells."""
-    if not isinstance(method, Iterative) or steps is None:
+    """Return a method's depth, and show how far it is."""
+    if steps is None:
         return method(sample)
     with steps(sample.scene) as step:
         return method(sample, step)

@@ -11,7 +11,7 @@ from torch import Tensor
 from dsr.geometry.camera import Camera
 from dsr.inference.engine import upsample_depth
 from dsr.inference.planning import AUTO
-from dsr.methods.tiling import Progress
+from dsr.utils.progress import Steps
 
 Array = TypeVar("Array", np.ndarray, Tensor)
 
@@ -26,7 +26,7 @@ def upsample(
     mask: Array | None = None,
     device: str = "auto",
     keep_holes: bool = False,
-    progress: Progress | None = None,
+    progress: Steps | None = None,
 ) -> Array:
     """Return depth as fine as the photo.
 

@@ -18,8 +18,8 @@ from dsr.methods.classical.interpolation import Interpolation, Order
 from dsr.methods.dip.upsampler import DeepImagePrior
 from dsr.methods.networks.base import NetworkUpsampler
 from dsr.methods.networks.trained import build_trained, packaged_weights
-from dsr.methods.tiling import Progress, part_of
 from dsr.sample import DepthSample
+from dsr.utils.progress import Steps, part_of
 
 _PRIOR_SETTINGS: dict[str, dict[str, Any]] = {"dip": {"data_loss": "mse", "data_weight": 10.0, "w": 0.0}, "dip_v": {}}
 
@@ -33,7 +33,7 @@ def upsample_depth(
     method: str = AUTO,
     device: str = "auto",
     keep_holes: bool = False,
-    progress: Progress | None = None,
+    progress: Steps | None = None,
 ) -> Tensor:
     """Return depth of the photo's size.
 
@@ -89,7 +89,7 @@ def upsample_depth(
 
 
 def _answer(
-    rgb: Tensor, inverse: Tensor, camera: Camera, scale: int | None, method: str, device: str, progress: Progress | None
+    rgb: Tensor, inverse: Tensor, camera: Camera, scale: int | None, method: str, device: str, progress: Steps | None
 ) -> Tensor:
     """Return high-resolution inverse depth, (1, H, W), of low-resolution inverse depth, (1, h, w)."""
     size = (camera.height, camera.width)

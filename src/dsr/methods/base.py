@@ -7,8 +7,8 @@ from typing import Protocol, runtime_checkable
 from torch import Tensor
 
 from dsr.geometry.camera import RangeType
-from dsr.methods.tiling import Progress
 from dsr.sample import DepthSample
+from dsr.utils.progress import Steps
 
 
 class NoSolutionError(ValueError):
@@ -26,10 +26,14 @@ class Upsampler(Protocol):
 
     range_type: RangeType
 
-    def __call__(self, sample: DepthSample) -> Tensor:
+    def __call__(self, sample: DepthSample, progress: Steps | None = None) -> Tensor:
         """Return the HR orthogonal depth, (1, H, W) in metres on the sample's device, NaN where there is none.
 
         A method never reads ``sample.depth``.
+
+        Args:
+            sample: the problem.
+            progress: is called with the steps done and their total, by methods that take more than one.
 
         Raises:
             NoSolutionError: it has none for this image.
@@ -40,7 +44,7 @@ class Upsampler(Protocol):
 
 @runtime_checkable
 class Iterative(Protocol):
-    """An :class:`Upsampler` that iterates, and tells how it went.
+    """An :class:`Upsampler` that iterates, and records how it went.
 
     Attributes:
         history: of the last call, one entry for each look at the iterates: ``iteration`` first, then what the method
@@ -49,16 +53,6 @@ class Iterative(Protocol):
     """
 
     history: list[dict[str, float]]
-
-    def __call__(self, sample: DepthSample, progress: Progress | None = None) -> Tensor:
-        """Return what :class:`Upsampler` does.
-
-        Args:
-            sample: the problem.
-            progress: is told the iterations done and the most that it may take.
-
-        """
-        ...
 
 
 def history_of(moved: list[float], every: int) -> list[dict[str, float]]:

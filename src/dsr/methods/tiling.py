@@ -14,13 +14,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-Progress = Callable[[int, int], object]
-"""Is told how many parts of the work are done, and of how many."""
-
-
-def part_of(progress: Progress | None, before: int, total: int) -> Progress | None:
-    """Return what one of several steps tells of its parts, ``before`` parts being those of the steps before it."""
-    return None if progress is None else lambda done, _: progress(before + done, total)
+from dsr.utils.progress import Steps
 
 
 @dataclass(frozen=True)
@@ -84,7 +78,7 @@ def blended(
     rows: list[Span],
     columns: list[Span],
     scale: int,
-    progress: Progress | None = None,
+    progress: Steps | None = None,
 ) -> Tensor:
     """Return the image that the tiles' answers make up.
 

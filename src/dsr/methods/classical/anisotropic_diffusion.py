@@ -34,8 +34,8 @@ from dsr.methods.base import expect_limits, history_of
 from dsr.methods.classical.finite_differences import box_mean, extended, upsampled
 from dsr.methods.networks.inpainting import filled
 from dsr.methods.networks.maps import min_max, normalised
-from dsr.methods.tiling import Progress
 from dsr.sample import DepthSample
+from dsr.utils.progress import Steps
 
 CHECK_EVERY = 50
 """Steps between two looks at how far the map has moved."""
@@ -95,7 +95,7 @@ class AnisotropicDiffusion:
         self.history: list[dict[str, float]] = []
 
     @torch.inference_mode()
-    def __call__(self, sample: DepthSample, progress: Progress | None = None) -> Tensor:
+    def __call__(self, sample: DepthSample, progress: Steps | None = None) -> Tensor:
         """Return the high-resolution depth, (1, H, W) in metres, on the sample's device and without holes.
 
         Args:
@@ -110,7 +110,7 @@ class AnisotropicDiffusion:
         fine = found.values[0]
         return from_range(fine - sample.camera.doffs, sample.camera, "disparity").to(sample.depth_lr.dtype)
 
-    def diffused(self, rgb: Tensor, coarse: Tensor, scale: int, progress: Progress | None = None) -> Diffused:
+    def diffused(self, rgb: Tensor, coarse: Tensor, scale: int, progress: Steps | None = None) -> Diffused:
         """Return positive maps upsampled.
 
         Args:
@@ -151,7 +151,7 @@ class AnisotropicDiffusion:
         coarse: Tensor,
         known: Tensor,
         conductances: tuple[Tensor, Tensor],
-        progress: Progress | None,
+        progress: Steps | None,
     ) -> Diffused:
         """Return where the two steps, in turn, end."""
         mean = first.mean(dim=(-2, -1), keepdim=True)

@@ -12,6 +12,7 @@ from torch import Tensor
 from dsr.geometry.camera import Camera, RangeType, from_range, to_range
 from dsr.methods.networks.maps import coarse_coordinates
 from dsr.sample import DepthSample
+from dsr.utils.progress import Steps
 
 Order = Literal["nearest", "bilinear", "bicubic"]
 
@@ -40,7 +41,7 @@ class Interpolation:
         self._degree = {"nearest": 0, "bilinear": 1, "bicubic": 3}[order]
         self._fill_holes = fill_holes
 
-    def __call__(self, sample: DepthSample) -> Tensor:
+    def __call__(self, sample: DepthSample, progress: Steps | None = None) -> Tensor:
         """Return the high-resolution depth, (1, H, W) in metres."""
         return self.interpolated(sample.depth_lr, sample.camera_lr, sample.camera)
 

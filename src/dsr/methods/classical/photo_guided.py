@@ -23,6 +23,7 @@ from dsr.geometry.camera import RangeType, from_range, to_range
 from dsr.methods.networks.inpainting import filled
 from dsr.methods.networks.maps import coarse_coordinates
 from dsr.sample import DepthSample
+from dsr.utils.progress import Steps
 
 _BEYOND = 4.0
 """How many times farther than the farthest known low-resolution pixel an answer may be, and how many times nearer."""
@@ -92,7 +93,7 @@ class GuidedMethod(ABC):
     def filtered(self, guided: Guided) -> Tensor:
         """Return the high-resolution maps, (N, H, W) float64, finite everywhere: the same weighted means of each."""
 
-    def __call__(self, sample: DepthSample) -> Tensor:
+    def __call__(self, sample: DepthSample, progress: Steps | None = None) -> Tensor:
         """Return the high-resolution depth, (1, H, W) in metres in the precision of the low-resolution depth."""
         device = sample.depth_lr.device
         rows, columns = coarse_coordinates(sample.camera, sample.camera_lr, device)

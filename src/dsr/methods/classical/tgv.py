@@ -37,8 +37,8 @@ from dsr.methods.base import expect_limits, history_of
 from dsr.methods.classical.finite_differences import box_mean, divergence, gradient, grey, repeated, touching, upsampled
 from dsr.methods.networks.inpainting import filled
 from dsr.methods.networks.maps import normalised
-from dsr.methods.tiling import Progress
 from dsr.sample import DepthSample
+from dsr.utils.progress import Steps
 
 CHECK_EVERY = 50
 """Iterations between two looks at how far the map has moved."""
@@ -126,7 +126,7 @@ class TotalGeneralisedVariation:
         self.history: list[dict[str, float]] = []
 
     @torch.inference_mode()
-    def __call__(self, sample: DepthSample, progress: Progress | None = None) -> Tensor:
+    def __call__(self, sample: DepthSample, progress: Steps | None = None) -> Tensor:
         """Return the high-resolution depth, (1, H, W) in metres, on the sample's device and without holes.
 
         A disparity at or beyond infinity becomes NaN.
@@ -145,7 +145,7 @@ class TotalGeneralisedVariation:
         fine = found.values * scaled.span + scaled.minimum
         return from_range(fine[0], sample.camera, "disparity").to(sample.depth_lr.dtype)
 
-    def minimised(self, rgb: Tensor, coarse: Tensor, scale: int, progress: Progress | None = None) -> Minimised:
+    def minimised(self, rgb: Tensor, coarse: Tensor, scale: int, progress: Steps | None = None) -> Minimised:
         """Return the minimum of E for normalised maps.
 
         Args:
@@ -181,7 +181,7 @@ class TotalGeneralisedVariation:
         miss = torch.where(coarse.isfinite(), box_mean(values, scale) - coarse, 0)
         return total + self.data_weight / 2 * scale**2 * miss.square().sum(dim=(1, 2, 3))
 
-    def _iterated(self, first: Tensor, coarse: Tensor, g: Tensors, progress: Progress | None) -> Minimised:
+    def _iterated(self, first: Tensor, coarse: Tensor, g: Tensors, progress: Steps | None) -> Minimised:
         """Return what the primal-dual iteration makes of a first map."""
         steps = _Steps.of(g, self.step_ratio)
         data = _DataTerm(coarse, steps.u, self.data_weight)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any, Protocol
@@ -16,6 +16,7 @@ from torch import Tensor
 
 from dsr.methods.dip.optimisation import PriorOptimisation
 from dsr.utils.lightning import save_checkpoint, scores_line
+from dsr.utils.progress import Steps
 
 _SECONDS_BETWEEN_CHECKPOINTS = 60.0
 _SECONDS_BETWEEN_LOOKS = 0.2
@@ -36,14 +37,24 @@ class Display(Protocol):
 
 
 class Silent:
-    """Shows nothing."""
+    """Shows nothing, and calls ``progress``, if given, with the steps done and their total."""
+
+    def __init__(self, progress: Steps | None = None) -> None:
+        self._progress = progress
 
     def say(self, line: str) -> None:
         """Show nothing."""
 
-    def steps(self, name: str, total: int, done: int) -> AbstractContextManager[Callable[[int, str], None]]:
-        """Show nothing."""
-        return contextlib.nullcontext(lambda _, __: None)
+    @contextlib.contextmanager
+    def steps(self, name: str, total: int, done: int) -> Iterator[Callable[[int, str], None]]:
+        """Report the steps; the last one, too, when all are done."""
+
+        def update(now: int, _: str) -> None:
+            if self._progress is not None:
+                self._progress(now, total)
+
+        yield update
+        update(total, "")
 
 
 class Provenance(Callback):

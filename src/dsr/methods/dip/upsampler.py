@@ -33,6 +33,7 @@ from dsr.methods.networks.base import DTYPES, Precision
 from dsr.methods.networks.trained import build_trained
 from dsr.sample import DepthSample
 from dsr.utils.lightning import Interruption, LastValidation, Log, ValidationTable, duration, fit, without_chatter
+from dsr.utils.progress import Steps
 
 WORKSPACE = "optimisation"
 _LOG_EVERY = 10
@@ -130,8 +131,12 @@ class DeepImagePrior:
         """Return the depth that the optimisation starts from, (1, H, W) in metres; None for none."""
         return None
 
-    def __call__(self, sample: DepthSample) -> Tensor:
+    def __call__(self, sample: DepthSample, progress: Steps | None = None) -> Tensor:
         """Return the high-resolution orthogonal depth, (1, H, W) in metres on the sample's device; known everywhere.
+
+        Args:
+            sample: the problem.
+            progress: is called with the steps done and their total, unless there is a display.
 
         Raises:
             ValueError: the optimisation diverged.
@@ -140,7 +145,7 @@ class DeepImagePrior:
         """
         with torch.inference_mode(mode=False), torch.enable_grad():
             module, origin = self.module(sample)
-            display = self.display or Silent()
+            display = self.display or Silent(progress)
             folder = None if self.workspace is None else self.workspace / WORKSPACE / sample.scene
             resume = None if folder is None else checkpoint_of(folder / "last.ckpt", origin)
             display.say(self._announcement(module, sample.scene, resume is not None))

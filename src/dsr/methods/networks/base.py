@@ -16,8 +16,9 @@ from torch.nn import functional
 from dsr.geometry.camera import RangeType, from_range, to_range
 from dsr.methods.networks.inpainting import filled
 from dsr.methods.networks.maps import min_max, normalised
-from dsr.methods.tiling import Progress, Span, blended, spans
+from dsr.methods.tiling import Span, blended, spans
 from dsr.sample import DepthSample
+from dsr.utils.progress import Steps
 
 Precision = Literal["float32", "bfloat16"]
 ENSEMBLES = (1, 4, 8)
@@ -184,7 +185,7 @@ class NetworkUpsampler:
         self.net = net.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # torch's stubs lack it
 
     @torch.inference_mode()
-    def __call__(self, sample: DepthSample, progress: Progress | None = None) -> Tensor:
+    def __call__(self, sample: DepthSample, progress: Steps | None = None) -> Tensor:
         """Return the high-resolution orthogonal depth, (1, H, W) in metres on the sample's device.
 
         NaN where the network's disparity lies at or beyond infinity, and in the last row and column where the network
@@ -199,7 +200,7 @@ class NetworkUpsampler:
             fine = functional.pad(fine, (0, missing[0], 0, missing[1]), value=torch.nan)
         return from_range(fine, sample.camera, "disparity").to(sample.depth_lr.device)
 
-    def fine_disparity(self, rgb: Tensor, coarse: Tensor, progress: Progress | None = None) -> Tensor:
+    def fine_disparity(self, rgb: Tensor, coarse: Tensor, progress: Steps | None = None) -> Tensor:
         """Return the mean of the ensemble's high-resolution disparities, (B, 1, H, W).
 
         Args:
@@ -251,7 +252,7 @@ class NetworkUpsampler:
         """Return the tiles along an axis of so many low-resolution pixels."""
         return spans(size, (self.tile or TILE) // net.scale, net.reach, _OVERLAP)
 
-    def _mean_of_poses(self, answer: Callable[[int], Tensor], progress: Progress | None) -> Tensor:
+    def _mean_of_poses(self, answer: Callable[[int], Tensor], progress: Steps | None) -> Tensor:
         """Return the mean of what ``answer`` says for each pose, turned back."""
         total = answer(0)
         for pose in range(1, self.ensemble):

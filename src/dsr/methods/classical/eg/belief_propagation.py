@@ -21,7 +21,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from dsr.methods.tiling import Progress
+from dsr.utils.progress import Steps
 
 _MOVE = 0.5
 """By how much of a step messages move; 1 would be undamped."""
@@ -48,7 +48,7 @@ def labelled(
     costs: Tensor,
     iterations: int = 100,
     tolerance: float = 1e-3,
-    progress: Progress | None = None,
+    progress: Steps | None = None,
 ) -> Labelling:
     """Return the labels that min-sum belief propagation finds.
 

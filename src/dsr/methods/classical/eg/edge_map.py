@@ -45,7 +45,7 @@ from dsr.methods.classical.eg.patches import (
 from dsr.methods.classical.finite_differences import box_mean, extended, upsampled
 from dsr.methods.classical.photo_guided import slopes_along
 from dsr.methods.networks.inpainting import filled
-from dsr.methods.tiling import Progress
+from dsr.utils.progress import Steps
 
 KEPT = 0.2
 """An edge is where more than this share of the chosen patches says so."""
@@ -67,7 +67,7 @@ def edge_map(
     sharp_weight: float = 3.0,
     smoothness: float = 1.0,
     iterations: int = 100,
-    progress: Progress | None = None,
+    progress: Steps | None = None,
 ) -> tuple[Tensor, Labelling | None]:
     """Return the HR edge map, (h * scale, w * scale) bool, and how its patches were chosen; None without an edge.
 

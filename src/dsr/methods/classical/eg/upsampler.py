@@ -44,8 +44,8 @@ from dsr.methods.classical.eg.bilateral import filtered
 from dsr.methods.classical.eg.edge_map import edge_map
 from dsr.methods.classical.photo_guided import positive
 from dsr.methods.networks.inpainting import filled
-from dsr.methods.tiling import Progress, part_of
 from dsr.sample import DepthSample
+from dsr.utils.progress import Steps, part_of
 
 _BEYOND = 4.0
 """How many times farther than the farthest known low-resolution pixel an answer may be, and how many times nearer."""
@@ -99,7 +99,7 @@ class EdgeGuided:
         self.history: list[dict[str, float]] = []
 
     @torch.inference_mode()
-    def __call__(self, sample: DepthSample, progress: Progress | None = None) -> Tensor:
+    def __call__(self, sample: DepthSample, progress: Steps | None = None) -> Tensor:
         """Return the high-resolution depth, (1, H, W) in metres in the precision of the low-resolution depth.
 
         Raises:
@@ -133,7 +133,7 @@ class EdgeGuided:
             fine = filled(fine[None, None])[0, 0]
         return from_range(fine[None], sample.camera, "disparity").to(sample.depth_lr)
 
-    def _edges(self, coarse: Tensor, scale: int, step: float, told: Progress | None) -> Tensor:
+    def _edges(self, coarse: Tensor, scale: int, step: float, told: Steps | None) -> Tensor:
         """Return the high-resolution edge map of a map (h, w), and add to the history how it was found."""
         barrier, answer = edge_map(
             coarse, scale, step, self._candidates, self._sharp_weight, self._smoothness, self._iterations, told

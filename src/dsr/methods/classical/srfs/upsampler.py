@@ -44,8 +44,8 @@ from dsr.methods.base import expect_limits
 from dsr.methods.classical.finite_differences import upsampled
 from dsr.methods.classical.srfs.admm import ShadingProblem, ShadingSolver, Weights
 from dsr.methods.networks.inpainting import filled
-from dsr.methods.tiling import Progress
 from dsr.sample import DepthSample
+from dsr.utils.progress import Steps
 
 _RENEW = 10
 """Regions of the albedo are sought anew every so many iterations; in between, each takes its best albedo."""
@@ -113,7 +113,7 @@ class ShapeFromShading:
         self.history: list[dict[str, float]] = []
 
     @torch.inference_mode()
-    def __call__(self, sample: DepthSample, progress: Progress | None = None) -> Tensor:
+    def __call__(self, sample: DepthSample, progress: Steps | None = None) -> Tensor:
         """Return the high-resolution depth, (1, H, W) in metres, on the sample's device and without holes.
 
         Args:
