@@ -62,7 +62,7 @@ def main() -> None:
     arguments = parser.parse_args()
     source = SimGeo(size=256)
     scenes = [source.load(name) for name in source.scenes()]
-    settings = PatchSettings(size=arguments.patch, batch=arguments.batch)
+    settings = PatchSettings(patch=arguments.patch, batch=arguments.batch)
     patches = Patches([scenes], settings, Degradation(SCALE, Downsampling("box")), count=arguments.batch)
     start = time.perf_counter()
     batch = torch.utils.data.default_collate([patches[i] for i in range(arguments.batch)])

@@ -150,5 +150,5 @@ def test_progress_ends_at_the_most_steps_that_it_may_take() -> None:
     [("steps", 0), ("tolerance", -1.0), ("step", 0.3), ("edge", 0.0), ("depth_weight", -1.0), ("border", -1)],
 )
 def test_a_value_out_of_range_is_refused_by_name(key: str, value: float) -> None:
-    with pytest.raises(ValueError, match=rf"method\.{key}: expected .*, got {value}"):
+    with pytest.raises(ValueError, match=rf"^{key}: expected .*, got {value}"):
         AnisotropicDiffusion(**{key: value})  # type: ignore[arg-type]

@@ -34,7 +34,7 @@ class Toy:
         self.values = (root, names, share, count, order, flag, file)
         self.scale = scale
         if root == "missing":
-            raise ValueError("dataset.root: no such directory")
+            raise ValueError("root: no such directory")
         if root == "unreadable":
             raise OSError(13, "Permission denied", "unreadable")
 

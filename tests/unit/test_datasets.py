@@ -123,7 +123,7 @@ def test_nothing_that_is_evaluated_on_is_trained_on_by_name(tmp_path):
 def test_a_scene_that_is_trained_on_does_not_validate_as_one_of_another_data_set(shared):
     real = shared / "real"
     train = Part(MiddleburyTrain(str(real), ["piano", "pipes", "adirondack"]))
-    settings, degradation = PatchSettings(size=32, batch=1, validation_scenes=1), Degradation(4, Downsampling("box"))
+    settings, degradation = PatchSettings(patch=32, batch=1, validation_scenes=1), Degradation(4, Downsampling("box"))
     piano, recycle = (Middlebury(str(real / "middlebury2014"), [name]) for name in ("piano", "recycle"))
     with pytest.raises(ValueError, match=r"validation\.others: expected scenes that are not trained on, got piano"):
         PatchData([train], settings, degradation, validation={"others": piano})
@@ -161,13 +161,13 @@ def test_sintel_has_58_frames_that_exist():
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda root: MiddleburyLevels(root, 2007), "dataset.year: expected one of 2001, 2003, 2005, 2006, got 2007"),
+        (lambda root: MiddleburyLevels(root, 2007), "year: expected one of 2001, 2003, 2005, 2006, got 2007"),
         (
             lambda root: MiddleburyTrain(root, years=[2005]),
-            "dataset.years: expected some of 2001, 2006, 2014, got 2005",
+            "years: expected some of 2001, 2006, 2014, got 2005",
         ),
-        (lambda root: SunRGBD(root, intrinsics=[1.0]), "dataset.intrinsics: expected fx, fy, cx, cy, got 1 numbers"),
-        (lambda root: ToFMark(root, depth_range=[1.0]), "dataset.depth_range: expected 2 numbers, got 1"),
+        (lambda root: SunRGBD(root, intrinsics=[1.0]), "intrinsics: expected fx, fy, cx, cy, got 1 numbers"),
+        (lambda root: ToFMark(root, depth_range=[1.0]), "depth_range: expected 2 numbers, got 1"),
     ],
 )
 def test_values_out_of_range_are_refused(tmp_path, make, message):

@@ -303,5 +303,5 @@ def test_a_warm_start_begins_at_the_trained_networks_answer() -> None:
     ],
 )
 def test_settings_out_of_range_are_refused(settings: dict[str, object]) -> None:
-    with pytest.raises(ValueError, match=f"method.{next(iter(settings))}: expected"):
+    with pytest.raises(ValueError, match=f"^{next(iter(settings))}: expected"):
         _prior(**settings)

@@ -180,8 +180,8 @@ def test_it_learns_an_edge_that_the_photo_shows() -> None:
         ({"scale": 3}, "scale: expected"),
         ({"scale": 4, "stages": 0}, "model: expected stages of at least 1 and a size of at least 3, got 0 and 7"),
         ({"scale": 4, "size": 2}, "model: expected stages of at least 1 and a size of at least 3, got 5 and 2"),
-        ({"scale": 4, "filters": 0}, "model.filters: expected 1 to 46 of size 7, got 0"),
-        ({"scale": 4, "filters": 7, "size": 3}, "model.filters: expected 1 to 6 of size 3, got 7"),
+        ({"scale": 4, "filters": 0}, "filters: expected 1 to 46 of size 7, got 0"),
+        ({"scale": 4, "filters": 7, "size": 3}, "filters: expected 1 to 6 of size 3, got 7"),
     ],
 )
 def test_arguments_out_of_range_are_refused(arguments: dict[str, int], message: str) -> None:

@@ -167,11 +167,11 @@ def test_a_scale_is_taken_in_its_prime_factors() -> None:
 
 @pytest.mark.parametrize("name", ["step", "sharp_weight", "smoothness", "sigma_space", "mixed"])
 def test_a_parameter_that_is_not_positive_is_refused(name: str) -> None:
-    with pytest.raises(ValueError, match=rf"method.{name}: expected a positive number for edge-guided upsampling"):
+    with pytest.raises(ValueError, match=rf"^{name}: expected a positive number for edge-guided upsampling"):
         EdgeGuided(**{name: 0.0})
 
 
 @pytest.mark.parametrize("name", ["candidates", "iterations", "radius"])
 def test_a_number_below_one_is_refused(name: str) -> None:
-    with pytest.raises(ValueError, match=rf"method.{name}: expected at least 1 for edge-guided upsampling, got 0"):
+    with pytest.raises(ValueError, match=rf"^{name}: expected at least 1 for edge-guided upsampling, got 0"):
         EdgeGuided(**{name: 0})

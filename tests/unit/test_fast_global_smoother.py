@@ -110,5 +110,5 @@ def test_it_is_the_smoothed_data_over_the_smoothed_index_map(kernel: Kernel) -> 
 
 @pytest.mark.parametrize("name", ["smoothness", "sigma_colour", "iterations"])
 def test_a_parameter_that_is_not_positive_is_refused(name: str) -> None:
-    with pytest.raises(ValueError, match=rf"method.{name}: expected a positive number for the fast global smoother"):
+    with pytest.raises(ValueError, match=rf"^{name}: expected a positive number for the fast global smoother"):
         FastGlobalSmoother(**{name: 0})

@@ -81,5 +81,5 @@ def test_a_blurred_step_along_an_edge_of_the_photo_becomes_sharp() -> None:
 
 @pytest.mark.parametrize("name", ["radius", "epsilon"])
 def test_a_parameter_that_is_not_positive_is_refused(name: str) -> None:
-    with pytest.raises(ValueError, match=rf"method.{name}: expected a positive number for the guided filter, got 0"):
+    with pytest.raises(ValueError, match=rf"^{name}: expected a positive number for the guided filter, got 0"):
         GuidedFilter(**{name: 0})

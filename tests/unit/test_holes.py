@@ -62,7 +62,7 @@ def test_a_plane_has_no_shadows_even_where_part_of_it_is_unknown() -> None:
 @pytest.mark.parametrize("make", [lambda: Blobs(0.0), lambda: Blobs(1.0), lambda: Blobs(0.1, 0.5), lambda: Shadows(0.0),
                                   lambda: Shadows(float("nan"))])  # fmt: skip
 def test_values_out_of_range_are_refused(make: object) -> None:
-    with pytest.raises(ValueError, match=r"holes\.(share|size|baseline): expected"):
+    with pytest.raises(ValueError, match=r"^(share|size|baseline): expected"):
         make()  # type: ignore[operator]
 
 

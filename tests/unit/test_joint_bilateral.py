@@ -103,5 +103,5 @@ def test_a_colour_unlike_all_around_takes_the_most_similar_neighbour() -> None:
 
 @pytest.mark.parametrize("name", ["radius", "sigma_space", "sigma_colour"])
 def test_a_parameter_that_is_not_positive_is_refused(name: str) -> None:
-    with pytest.raises(ValueError, match=rf"method.{name}: expected a positive number for joint bilateral upsampling"):
+    with pytest.raises(ValueError, match=rf"^{name}: expected a positive number for joint bilateral upsampling"):
         JointBilateral(**{name: -1})

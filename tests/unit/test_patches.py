@@ -43,7 +43,7 @@ def _scene(number: int = 0, camera: Camera = CAMERA, depth: Tensor | None = None
 
 
 def _settings(**changes: Any) -> PatchSettings:
-    plain: dict[str, Any] = {"size": SIZE, "batch": 2, "validation_scenes": 2}
+    plain: dict[str, Any] = {"patch": SIZE, "batch": 2, "validation_scenes": 2}
     return PatchSettings(**{**plain, "rotate": False, "depth_scale": 0.0, "colour": 0.0, "photo": 0.0, **changes})
 
 
@@ -170,7 +170,7 @@ def test_of_each_data_set_the_first_scenes_alone_can_be_used() -> None:
     data = PatchData(sources, _settings(scenes=3, validation_scenes=1), X4)
     assert data.used_scenes[0][1] == ["scene0", "scene1"]
     assert data.validation_scenes()["set"][1] == ["scene2"]
-    with pytest.raises(ValueError, match=r"trainer.scenes: expected a positive number, or null for all, got 0"):
+    with pytest.raises(ValueError, match=r"^scenes: expected a positive number, or null for all, got 0"):
         _settings(scenes=0)
 
 
@@ -190,7 +190,7 @@ def test_a_part_gets_its_share_and_a_scene_its_turn_though_their_depth_is_sparse
 
 
 def test_shares_that_are_all_zero_are_refused() -> None:
-    with pytest.raises(ValueError, match=r"dataset.shares: expected a positive number among them, all are 0"):
+    with pytest.raises(ValueError, match=r"^shares: expected a positive number among them, all are 0"):
         Patches([[_scene(0)], [_scene(1)]], _settings(), X4, shares=[0, 0])
 
 
@@ -219,7 +219,7 @@ def test_other_data_sets_validate_whole_and_alone_where_nothing_is_held_out() ->
     data.setup()
     assert data.validation_sets == ["mine"]
     assert data.validation_scenes()["mine"][1] == ["scene8", "scene9"]
-    with pytest.raises(ValueError, match=r"trainer.validation_scenes: expected a positive number where there is no"):
+    with pytest.raises(ValueError, match=r"^validation_scenes: expected a positive number where there is no"):
         _data(validation_scenes=0)
 
 
@@ -251,7 +251,7 @@ def test_a_validation_set_without_any_truth_is_refused() -> None:
 
 @pytest.mark.parametrize("share", [-1.0, float("nan"), float("inf")])
 def test_a_share_that_is_none_is_refused(share: float) -> None:
-    with pytest.raises(ValueError, match=r"dataset.shares: expected 0 or a positive number"):
+    with pytest.raises(ValueError, match=r"^share: expected 0 or a positive number"):
         Part(_Source([_scene()]), share)
 
 
@@ -498,17 +498,17 @@ def test_shapes_and_types_are_those_promised() -> None:
 
 
 def test_a_data_set_with_too_few_scenes_is_refused() -> None:
-    with pytest.raises(ValueError, match=r"trainer.validation_scenes: expected fewer than the 6 scenes of set, got 6"):
+    with pytest.raises(ValueError, match=r"^validation_scenes: expected fewer than the 6 scenes of set, got 6"):
         _data(validation_scenes=6)
 
 
 def test_a_scene_too_small_for_a_patch_is_refused_by_name_before_training() -> None:
     small = _scene(1, replace(CAMERA, width=60, height=30))
-    message = "trainer.patch: expected at most scene1's 30 x 60, got 32"
+    message = "patch: expected at most scene1's 30 x 60, got 32"
     with pytest.raises(ValueError, match=message):
-        _data([_scene(0), small, _scene(2), _scene(3)], size=32).setup()
+        _data([_scene(0), small, _scene(2), _scene(3)], patch=32).setup()
     with pytest.raises(ValueError, match=message):
-        _patches([_scene(0), small], size=32)
+        _patches([_scene(0), small], patch=32)
 
 
 def test_a_scene_without_true_depth_is_refused_by_name() -> None:
@@ -518,10 +518,10 @@ def test_a_scene_without_true_depth_is_refused_by_name() -> None:
 
 
 def test_a_patch_that_the_scale_does_not_divide_is_refused() -> None:
-    with pytest.raises(ValueError, match=r"trainer.patch: expected a size that scale=4 divides, got 30"):
-        _data(size=30)
-    with pytest.raises(ValueError, match=r"trainer.patch: expected a size that scale=16 divides, got 24"):
-        _data(degradation=Degradation(16, BOX), size=24)
+    with pytest.raises(ValueError, match=r"^patch: expected a size that scale=4 divides, got 30"):
+        _data(patch=30)
+    with pytest.raises(ValueError, match=r"^patch: expected a size that scale=16 divides, got 24"):
+        _data(degradation=Degradation(16, BOX), patch=24)
 
 
 def test_a_measured_map_cannot_be_cut() -> None:
@@ -540,14 +540,14 @@ def test_no_scene_at_all_is_refused() -> None:
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"size": 15}, "trainer.patch: expected at least 16 pixels, got 15"),
-        ({"batch": 0}, "trainer.batch: expected a positive number, got 0"),
-        ({"validation_scenes": -1}, "trainer.validation_scenes: expected 0 or more, got -1"),
-        ({"photo": 1.1}, "trainer.photo: expected a share from 0 to 1, got 1.1"),
-        ({"depth_scale": -0.1}, "trainer.depth_scale: expected 0 to 3, got -0.1"),
-        ({"workers": -1}, "trainer.workers: expected 0 or more, got -1"),
-        ({"colour": -0.1}, "trainer.colour: expected 0 or more, got -0.1"),
-        ({"colour": float("nan")}, "trainer.colour: expected 0 or more, got nan"),
+        ({"patch": 15}, "patch: expected at least 16 pixels, got 15"),
+        ({"batch": 0}, "batch: expected a positive number, got 0"),
+        ({"validation_scenes": -1}, "validation_scenes: expected 0 or more, got -1"),
+        ({"photo": 1.1}, "photo: expected a share from 0 to 1, got 1.1"),
+        ({"depth_scale": -0.1}, "depth_scale: expected 0 to 3, got -0.1"),
+        ({"workers": -1}, "workers: expected 0 or more, got -1"),
+        ({"colour": -0.1}, "colour: expected 0 or more, got -0.1"),
+        ({"colour": float("nan")}, "colour: expected 0 or more, got nan"),
     ],
 )
 def test_a_setting_out_of_range_is_refused_by_its_key(changes: dict[str, Any], message: str) -> None:

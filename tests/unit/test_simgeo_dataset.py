@@ -166,10 +166,10 @@ def test_without_a_lucy_there_is_the_statue(tmp_path, root):
 
 def test_only_chosen_scenes_are_there_and_an_unknown_one_is_refused(lucy):
     assert SimGeo(None, ["statue"], SIZE).scenes() == ["statue"]
-    with pytest.raises(ValueError, match=r"dataset\.scenes: 'lucy' is not there; expected some of .*statue"):
+    with pytest.raises(ValueError, match=r"^scenes: 'lucy' is not there; expected some of .*statue"):
         SimGeo(None, ["lucy"], SIZE)
 
 
 def test_a_size_below_32_is_refused():
-    with pytest.raises(ValueError, match=r"dataset\.size: expected at least 32 pixels, got 31"):
+    with pytest.raises(ValueError, match=r"^size: expected at least 32 pixels, got 31"):
         SimGeo(size=31)

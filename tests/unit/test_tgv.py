@@ -235,5 +235,5 @@ def test_it_stops_where_the_map_moves_no_longer_and_tells_its_progress() -> None
     ],
 )
 def test_a_value_out_of_range_is_refused_by_name(key: str, value: float) -> None:
-    with pytest.raises(ValueError, match=rf"method\.{key}: expected .*, got {value}"):
+    with pytest.raises(ValueError, match=rf"^{key}: expected .*, got {value}"):
         TotalGeneralisedVariation(**{key: value})  # type: ignore[arg-type]

@@ -18,7 +18,7 @@ def perceptual_network(trunk: str | None) -> LPIPS | None:
         return load_lpips(None if trunk is None else Path(trunk).expanduser())
     except OSError as error:
         if trunk is not None:
-            raise ConfigError(str(error)) from error
+            raise ConfigError(f"metrics.lpips_trunk: {error}") from error
         print(  # noqa: T201
             f"LPIPS_v is left out: AlexNet's weights {one_line(error)}; "
             f"get {TRUNK_URL} and set metrics.lpips_trunk=FILE or $DSR_LPIPS_TRUNK",

@@ -19,7 +19,7 @@ from dsr.app.perceptual import perceptual_network
 from dsr.app.progress import Display, prepare
 from dsr.app.schema import TrainConfig, given_keys, plain_config
 from dsr.app.trainer import make_trainer, seconds_per_step
-from dsr.app.training_runs import WEIGHTS, common, read_config, training_data
+from dsr.app.training_runs import WEIGHTS, common, keyed, read_config, training_data
 from dsr.methods.networks.base import DisparityNetwork
 from dsr.methods.networks.trained import NETWORKS
 from dsr.methods.networks.weight_files import load_network, save_network
@@ -154,7 +154,7 @@ def _module(settings: TrainConfig, net: DisparityNetwork, data: PatchData, metri
         schedule = Schedule(mixed=mixed, **common(Schedule, settings.trainer))
         return SuperResolution(net, _objective(settings, data), schedule, metrics, data.validation_sets)
     except (ValueError, OSError) as error:
-        raise ConfigError(str(error)) from error
+        raise keyed(error) from error
 
 
 def _objective(settings: TrainConfig, data: PatchData) -> Objective:

@@ -15,7 +15,7 @@ from dsr.degradation.downsampling import Downsampling
 from dsr.training.data_module import Part, PatchData
 from dsr.training.degradation import Degradation
 from dsr.training.patches import PatchSettings
-from dsr.utils.builder import ConfigError, build
+from dsr.utils.builder import ConfigError, build, with_key
 
 WEIGHTS = "weights.safetensors"
 _FROM_RUN = ("scale", "downsampling", "noise", "seed", "dataset")
@@ -84,10 +84,16 @@ def training_data(settings: TrainConfig) -> PatchData:
     degradation = Degradation(settings.scale, downsampling, build("noise", settings.noise))
     validation = {name: build(f"validation.{name}", node) for name, node in settings.validation.items()}
     try:
-        patches = PatchSettings(size=trainer.patch, **common(PatchSettings, trainer))
+        patches = PatchSettings(**common(PatchSettings, trainer))
         return PatchData(_parts(settings.dataset), patches, degradation, seed=settings.seed, validation=validation)
     except ValueError as error:
-        raise ConfigError(str(error)) from error
+        raise keyed(error) from error
+
+
+def keyed(error: Exception) -> ConfigError:
+    """Return an error of a training's parts, with the key that sets the argument which it names."""
+    names = [field.name for field in dataclasses.fields(TrainerConfig)]
+    return ConfigError(with_key(with_key(str(error), "trainer", names), "model", ["depth_loss"]))
 
 
 def common(target: type, settings: TrainerConfig) -> dict[str, Any]:

@@ -95,10 +95,10 @@ def chosen(available: Sequence[str], wanted: SceneSelection) -> list[str]:
         wanted = None
     if wanted is not None and (not wanted or len(set(wanted)) < len(wanted)):
         came = ", ".join(wanted) or "an empty list"
-        raise ValueError(f"dataset.scenes: expected names, each once, or null for all; got {came}")
+        raise ValueError(f"scenes: expected names, each once, or null for all; got {came}")
     for name in wanted or ():
         if name not in available:
             rest = f", ... ({len(available)} in all)" if len(available) > _MOST_LISTED else ""
             some = ", ".join(available[:_MOST_LISTED])
-            raise ValueError(f"dataset.scenes: {name!r} is not there; expected some of {some}{rest}")
+            raise ValueError(f"scenes: {name!r} is not there; expected some of {some}{rest}")
     return list(available) if wanted is None else list(wanted)

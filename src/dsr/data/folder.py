@@ -50,10 +50,10 @@ class Folder:
         self.name = name
         self._root = Path(root).expanduser()
         if not self._root.is_dir():
-            raise ValueError(f"dataset.root: expected a directory of scenes, got {root} (no such directory)")
+            raise ValueError(f"root: expected a directory of scenes, got {root} (no such directory)")
         found = sorted(path.name for path in self._root.iterdir() if path.is_dir() and not path.name.startswith("."))
         if not found:
-            raise ValueError(f"dataset.root: expected a folder per scene in {root}, there is none")
+            raise ValueError(f"root: expected a folder per scene in {root}, there is none")
         self._scenes = chosen(found, scenes)
 
     def scenes(self) -> list[str]:

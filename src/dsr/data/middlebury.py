@@ -93,7 +93,7 @@ class MiddleburyLevels(PreparedDataset):
         smooth: bool = True,
     ) -> None:
         if year not in middlebury.YEARS:
-            raise ValueError(f"dataset.year: expected one of {', '.join(map(str, middlebury.YEARS))}, got {year}")
+            raise ValueError(f"year: expected one of {', '.join(map(str, middlebury.YEARS))}, got {year}")
         folder, name = Path(root).expanduser(), f"middlebury{year}"
         found = records_levels(folder, name, year, smooth=smooth)
         preparation = Preparation(size, crop, fill=tuple(fill))

@@ -41,7 +41,7 @@ class MiddleburyTrain(PreparedDataset):
         found: dict[str, Record] = {}
         for year in years:
             if year not in MIDDLEBURY:
-                raise ValueError(f"dataset.years: expected some of {', '.join(map(str, MIDDLEBURY))}, got {year}")
+                raise ValueError(f"years: expected some of {', '.join(map(str, MIDDLEBURY))}, got {year}")
             place = folder / f"middlebury{year}"
             found |= records_2014(place, name) if year == 2014 else records_levels(place, name, year)
         for scene in EVALUATION_2014:

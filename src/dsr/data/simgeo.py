@@ -34,7 +34,7 @@ class SimGeo:
 
     def __init__(self, root: str | None = None, scenes: SceneSelection = None, size: int = 512) -> None:
         if size < 32:
-            raise ValueError(f"dataset.size: expected at least 32 pixels, got {size}")
+            raise ValueError(f"size: expected at least 32 pixels, got {size}")
         self._size = size
         self._lucy: Folder | None = None
         available = list(SCENES)

@@ -60,7 +60,7 @@ class SunRGBD(PreparedDataset):
         intrinsics: Sequence[float] | None = None,
     ) -> None:
         if intrinsics is not None and len(intrinsics) != 4:
-            raise ValueError(f"dataset.intrinsics: expected fx, fy, cx, cy, got {len(intrinsics)} numbers")
+            raise ValueError(f"intrinsics: expected fx, fy, cx, cy, got {len(intrinsics)} numbers")
         folder = Path(root).expanduser()
         settings = {"refined": refined, "intrinsics": intrinsics and tuple(intrinsics)}
         records = records_of(listed(sunrgbd.find_frames, folder), sunrgbd.load_frame, "sunrgbd", **settings)

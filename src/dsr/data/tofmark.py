@@ -47,7 +47,7 @@ class ToFMark(PreparedDataset):
     ) -> None:
         for name, values, count in (("intrinsics", intrinsics, 4), ("depth_range", depth_range, 2)):
             if values is not None and len(values) != count:
-                raise ValueError(f"dataset.{name}: expected {count} numbers, got {len(values)}")
+                raise ValueError(f"{name}: expected {count} numbers, got {len(values)}")
         folder = Path(root).expanduser()
         settings = {
             "intrinsics": tuple(intrinsics or ESTIMATED),

@@ -56,11 +56,11 @@ class Downsampling:
 
     def __post_init__(self) -> None:
         """Check the values."""
-        for name, kernel in (("downsampling", self.kernel), ("downsampling.assumed", self.assumed or self.kernel)):
+        for name, kernel in (("kernel", self.kernel), ("assumed", self.assumed or self.kernel)):
             if kernel not in get_args(Kernel):
                 raise ValueError(f"{name}: expected one of {', '.join(get_args(Kernel))}, got {kernel!r}")
         if not self.sigma >= _LEAST_SIGMA:
-            raise ValueError(f"downsampling.sigma: expected at least {_LEAST_SIGMA} (of the scale), got {self.sigma}")
+            raise ValueError(f"sigma: expected at least {_LEAST_SIGMA} (of the scale), got {self.sigma}")
 
     def assumed_model(self) -> Downsampling:
         """Return the model that a method takes this one for."""

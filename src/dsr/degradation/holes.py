@@ -38,9 +38,9 @@ class Blobs:
     def __post_init__(self) -> None:
         """Check the values."""
         if not 0 < self.share < 1:
-            raise ValueError(f"holes.share: expected a number above 0 and below 1, got {self.share}")
+            raise ValueError(f"share: expected a number above 0 and below 1, got {self.share}")
         if not self.size >= 1:
-            raise ValueError(f"holes.size: expected 1 or more low-resolution pixels, got {self.size}")
+            raise ValueError(f"size: expected 1 or more low-resolution pixels, got {self.size}")
 
     def __call__(self, depth: Tensor, camera: Camera, generator: torch.Generator) -> Tensor:
         """Return where the holes are, (1, h, w); the share is met to the pixel."""
@@ -70,7 +70,7 @@ class Shadows:
     def __post_init__(self) -> None:
         """Check the value."""
         if not 0 < abs(self.baseline) < float("inf"):
-            raise ValueError(f"holes.baseline: expected metres other than 0, got {self.baseline}")
+            raise ValueError(f"baseline: expected metres other than 0, got {self.baseline}")
 
     def __call__(self, depth: Tensor, camera: Camera, generator: torch.Generator) -> Tensor:
         """Return where the shadows are, (1, h, w): points whose place in the second image something nearer takes."""

@@ -49,7 +49,7 @@ class GaussianMultiplicative:
     def __post_init__(self) -> None:
         """Check the value."""
         if not 0 < self.std < 1:
-            raise ValueError(f"noise.std: expected a number above 0 and below 1, got {self.std}")
+            raise ValueError(f"std: expected a number above 0 and below 1, got {self.std}")
 
     def __call__(self, values: Tensor, generator: torch.Generator) -> Tensor:
         """Return noisy values; NaN stays NaN."""
@@ -110,7 +110,7 @@ class TimeOfFlight:
         _check_positive("strength", self.strength)
         _check_positive("stereo_constant", self.stereo_constant)
         if not 0 <= self.doffs < math.inf:
-            raise ValueError(f"noise.doffs: expected 0 or a positive number, got {self.doffs}")
+            raise ValueError(f"doffs: expected 0 or a positive number, got {self.doffs}")
 
     def __call__(self, values: Tensor, generator: torch.Generator) -> Tensor:
         """Return noisy depth in metres; NaN stays NaN, and where v, before or after the noise, is not positive is NaN.
@@ -167,20 +167,18 @@ class Kinect:
     def __post_init__(self) -> None:
         """Check the values."""
         if not 0 <= self.std < math.inf:
-            raise ValueError(f"noise.std: expected 0 or a positive number of pixels, got {self.std}")
+            raise ValueError(f"std: expected 0 or a positive number of pixels, got {self.std}")
         for name in ("step", "stereo_constant", "jump"):
             _check_positive(name, getattr(self, name))
         if not 0 <= self.dropout <= 1:
-            raise ValueError(f"noise.dropout: expected a number from 0 to 1, got {self.dropout}")
+            raise ValueError(f"dropout: expected a number from 0 to 1, got {self.dropout}")
         if self.reach < 1 or not float(self.reach).is_integer():
-            raise ValueError(
-                f"noise.reach: expected a positive whole number of low-resolution pixels, got {self.reach}"
-            )
+            raise ValueError(f"reach: expected a positive whole number of low-resolution pixels, got {self.reach}")
         for name in ("nearest", "farthest"):
             if getattr(self, name) is not None:
                 _check_positive(name, getattr(self, name))
         if self.nearest is not None and self.farthest is not None and self.farthest <= self.nearest:
-            raise ValueError(f"noise.farthest: expected more than noise.nearest, {self.nearest}, got {self.farthest}")
+            raise ValueError(f"farthest: expected more than nearest, {self.nearest}, got {self.farthest}")
 
     def __call__(self, values: Tensor, generator: torch.Generator) -> Tensor:
         """Return the sensor's reading in metres; NaN stays NaN, and dropouts and what is out of range are NaN.
@@ -209,7 +207,7 @@ def no_noise() -> None:
 
 def _check_positive(name: str, value: float) -> None:
     if not 0 < value < math.inf:
-        raise ValueError(f"noise.{name}: expected a positive number, got {value}")
+        raise ValueError(f"{name}: expected a positive number, got {value}")
 
 
 def _positive(values: Tensor) -> Tensor:

@@ -76,6 +76,6 @@ def expect_limits(tolerance: float, **counts: int) -> None:
     """
     for name, count in counts.items():
         if count < 1:
-            raise ValueError(f"method.{name}: expected at least 1, got {count}")
+            raise ValueError(f"{name}: expected at least 1, got {count}")
     if not tolerance >= 0:
-        raise ValueError(f"method.tolerance: expected 0 or more, got {tolerance}")
+        raise ValueError(f"tolerance: expected 0 or more, got {tolerance}")

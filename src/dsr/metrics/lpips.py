@@ -143,7 +143,7 @@ def find_trunk(configured: Path | None) -> Path:
     """
     if configured is not None:
         if not configured.is_file():
-            raise FileNotFoundError(f"metrics.lpips_trunk: expected a file, got {configured} (no such file)")
+            raise FileNotFoundError(f"expected a file, got {configured} (no such file)")
         return configured
     cached = Path(torch.hub.get_dir()) / "checkpoints" / TRUNK_FILE
     if not cached.is_file():

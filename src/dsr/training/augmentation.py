@@ -42,11 +42,11 @@ class Augmentation:
     def __post_init__(self) -> None:
         """Check the values."""
         if not 0 <= self.depth_scale <= _MAX_DEPTH_SCALE:
-            raise ValueError(f"trainer.depth_scale: expected 0 to {_MAX_DEPTH_SCALE:g}, got {self.depth_scale}")
+            raise ValueError(f"depth_scale: expected 0 to {_MAX_DEPTH_SCALE:g}, got {self.depth_scale}")
         if not 0 <= self.colour < math.inf:
-            raise ValueError(f"trainer.colour: expected 0 or more, got {self.colour}")
+            raise ValueError(f"colour: expected 0 or more, got {self.colour}")
         if not 0 <= self.photo <= 1:
-            raise ValueError(f"trainer.photo: expected a share from 0 to 1, got {self.photo}")
+            raise ValueError(f"photo: expected a share from 0 to 1, got {self.photo}")
 
     def __call__(self, scene: Scene, random: np.random.Generator) -> tuple[Scene, float]:
         """Return the augmented scene and the factor by which its depth was multiplied."""

@@ -38,7 +38,7 @@ class Part:
     def __post_init__(self) -> None:
         """Check the share."""
         if not 0 <= self.share < math.inf:
-            raise ValueError(f"dataset.shares: expected 0 or a positive number, got {self.share}")
+            raise ValueError(f"share: expected 0 or a positive number, got {self.share}")
 
 
 class WholeScenes(Dataset[Batch]):
@@ -97,7 +97,7 @@ class PatchData(lightning.LightningDataModule):
         for name, source in (validation or {}).items():
             self._held_out[_make_unique(name, self._held_out)] = (source, source.scenes())
         if not self._held_out:
-            raise ValueError("trainer.validation_scenes: expected a positive number where there is no other validation")
+            raise ValueError("validation_scenes: expected a positive number where there is no other validation")
         self._refuse_leaks()
         self._patches: Patches | None = None
         self._validation: list[list[Scene]] = []
@@ -186,7 +186,7 @@ class PatchData(lightning.LightningDataModule):
         names, count = source.scenes()[: self._settings.scenes], self._settings.validation_scenes
         if len(names) <= count:
             raise ValueError(
-                f"trainer.validation_scenes: expected fewer than the {len(names)} scenes of {source.name}, got {count}"
+                f"validation_scenes: expected fewer than the {len(names)} scenes of {source.name}, got {count}"
             )
         self._training_names.append(names[: len(names) - count])
         if count:

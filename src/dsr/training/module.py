@@ -55,12 +55,12 @@ class Schedule:
         """Check the values."""
         for name in ("steps", "learning_rate", "clip"):
             if not 0 < getattr(self, name) < math.inf:
-                raise ValueError(f"trainer.{name}: expected a positive number, got {getattr(self, name)}")
+                raise ValueError(f"{name}: expected a positive number, got {getattr(self, name)}")
         for name in ("warmup", "weight_decay"):
             if not 0 <= getattr(self, name) < math.inf:
-                raise ValueError(f"trainer.{name}: expected 0 or more, got {getattr(self, name)}")
+                raise ValueError(f"{name}: expected 0 or more, got {getattr(self, name)}")
         if not 0 <= self.average < 1:
-            raise ValueError(f"trainer.average: expected 0 or more and less than 1, got {self.average}")
+            raise ValueError(f"average: expected 0 or more and less than 1, got {self.average}")
 
     def factor(self, step: int) -> float:
         """Return the learning rate at a step as a fraction of the highest."""

@@ -42,7 +42,7 @@ class Objective:
     def __post_init__(self) -> None:
         """Check the name."""
         if self.depth_loss not in _DEPTH_LOSSES:
-            raise ValueError(f"model.depth_loss: expected one of {', '.join(_DEPTH_LOSSES)}, got {self.depth_loss!r}")
+            raise ValueError(f"depth_loss: expected one of {', '.join(_DEPTH_LOSSES)}, got {self.depth_loss!r}")
 
     def __call__(self, disparity: Tensor, batch: Batch) -> dict[str, Tensor]:
         """Return ``loss`` and its terms, means over the images of the batch that have valid depth.
@@ -92,7 +92,7 @@ def balance_weight(patches: Iterable[Batch]) -> float:
         extent = float(_range(patch["disparity_lr"][None]))
         ratios.append(float(patch["bf"]) * math.tan(_TILT) / (focal * depth * extent))
     if not ratios:
-        raise ValueError("loss.w=auto: expected patches to compute it from, there is none")
+        raise ValueError("patches: expected one or more to compute w from, got none")
     return float(torch.tensor(ratios, dtype=torch.float64).median()) / ((2 - 2 * math.cos(_TILT)) / 3)
 
 

@@ -30,7 +30,7 @@ class PatchSettings(Augmentation):
     """How patches are cropped and augmented.
 
     Args:
-        size: height and width in pixels, a multiple of the scale.
+        patch: height and width in pixels, a multiple of the scale.
         batch: number of patches per step and device.
         validation_scenes: number of scenes at the end of each data set that are kept for validation.
         scenes: number of scenes to use of each data set, from its first on; None for all.
@@ -42,7 +42,7 @@ class PatchSettings(Augmentation):
 
     """
 
-    size: int = 96
+    patch: int = 96
     batch: int = 16
     validation_scenes: int = 4
     scenes: int | None = None
@@ -51,15 +51,15 @@ class PatchSettings(Augmentation):
     def __post_init__(self) -> None:
         """Check the values."""
         super().__post_init__()
-        if self.size < _MIN_SIZE:
-            raise ValueError(f"trainer.patch: expected at least {_MIN_SIZE} pixels, got {self.size}")
+        if self.patch < _MIN_SIZE:
+            raise ValueError(f"patch: expected at least {_MIN_SIZE} pixels, got {self.patch}")
         if self.batch < 1:
-            raise ValueError(f"trainer.batch: expected a positive number, got {self.batch}")
+            raise ValueError(f"batch: expected a positive number, got {self.batch}")
         if self.scenes is not None and self.scenes < 1:
-            raise ValueError(f"trainer.scenes: expected a positive number, or null for all, got {self.scenes}")
+            raise ValueError(f"scenes: expected a positive number, or null for all, got {self.scenes}")
         for name in ("workers", "validation_scenes"):
             if getattr(self, name) < 0:
-                raise ValueError(f"trainer.{name}: expected 0 or more, got {getattr(self, name)}")
+                raise ValueError(f"{name}: expected 0 or more, got {getattr(self, name)}")
 
 
 class Patches(Dataset[Batch]):
@@ -96,7 +96,7 @@ class Patches(Dataset[Batch]):
         if not groups or not all(groups):
             raise ValueError("patches: expected a scene or more to train on")
         if not weights.sum() > 0:
-            raise ValueError("dataset.shares: expected a positive number among them, all are 0")
+            raise ValueError("shares: expected a positive number among them, all are 0")
         self._groups, self._settings, self._degradation = groups, settings, degradation
         self._limits = np.cumsum(weights / weights.sum())
         self._seed, self._first, self._count = seed, first, count
@@ -129,7 +129,7 @@ class Patches(Dataset[Batch]):
         group = min(int(np.searchsorted(self._limits, random.random(), "right")), len(self._groups) - 1)
         number, top, left = self._window(group, random)
         source = self._groups[group][number]
-        size = self._settings.size
+        size = self._settings.patch
         cropped = source.crop(top, left, size, size)
         depth = None if cropped.depth is None else cropped.depth.double()
         scene, factor = self._settings(replace(cropped, depth=depth, measured={}), random)
@@ -147,7 +147,7 @@ class Patches(Dataset[Batch]):
         The first window of a random scene with enough valid depth is taken, else the best of ten. Another scene is
         taken only where all ten have no valid depth, so that scenes with many holes are not trained on less often.
         """
-        size, scenes = self._settings.size, self._groups[group]
+        size, scenes = self._settings.patch, self._groups[group]
         for _ in range(_SCENE_TRIES):
             number, best, highest = int(random.integers(len(scenes))), None, 0.0
             for _ in range(_WINDOW_TRIES):
@@ -203,14 +203,14 @@ def check_patches(scenes: Sequence[Scene], settings: PatchSettings, scale: int) 
         ValueError: the scale does not divide the patches, or a scene is smaller than a patch or has no true depth.
 
     """
-    if settings.size % scale:
-        raise ValueError(f"trainer.patch: expected a size that scale={scale} divides, got {settings.size}")
+    if settings.patch % scale:
+        raise ValueError(f"patch: expected a size that scale={scale} divides, got {settings.patch}")
     for scene in scenes:
         if scene.depth is None:
             raise ValueError(f"{scene.name}: expected a true depth to train with, there is none")
         height, width = scene.rgb.shape[-2:]
-        if min(height, width) < settings.size:
-            raise ValueError(f"trainer.patch: expected at most {scene.name}'s {height} x {width}, got {settings.size}")
+        if min(height, width) < settings.patch:
+            raise ValueError(f"patch: expected at most {scene.name}'s {height} x {width}, got {settings.patch}")
 
 
 def _valid_fraction(scene: Scene, top: int, left: int, size: int) -> float:

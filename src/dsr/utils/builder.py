@@ -51,7 +51,7 @@ def build(group: str, node: Mapping[str, Any], given: Mapping[str, Any] | None =
     try:
         return target(**arguments, **given)
     except (ValueError, OSError) as error:
-        raise ConfigError(_with_key(str(error), group, parameters)) from error
+        raise ConfigError(with_key(str(error), group, parameters)) from error
 
 
 def takes(group: str, node: Mapping[str, Any], key: str) -> bool:
@@ -64,8 +64,15 @@ def trait(group: str, node: Mapping[str, Any], name: str) -> Any:
     return getattr(_load(group, node), name, None)
 
 
-def _with_key(message: str, group: str, parameters: Collection[str]) -> str:
-    """Return a message that begins with an argument's name with the group before it: the key that sets the argument."""
+def with_key(message: str, group: str, parameters: Collection[str]) -> str:
+    """Return an error message with the key that sets the argument which it begins with.
+
+    Args:
+        message: such as ``sharpness: expected ...``.
+        group: the configuration group whose keys set the arguments.
+        parameters: the arguments' names; a message that begins with another word stays as it is.
+
+    """
     return f"{group}.{message}" if message.partition(":")[0] in parameters else message
 
 

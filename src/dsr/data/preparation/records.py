@@ -121,9 +121,9 @@ class Preparation:
     def __post_init__(self) -> None:
         """Check the values."""
         if self.size is not None and self.size < _SMALLEST:
-            raise ValueError(f"dataset.size: expected at least {_SMALLEST} pixels, or null, got {self.size}")
+            raise ValueError(f"size: expected at least {_SMALLEST} pixels, or null, got {self.size}")
         if self.crop is not None and not 0 <= self.crop <= 1:
-            raise ValueError(f"dataset.crop: expected a number from 0 to 1, or null, got {self.crop}")
+            raise ValueError(f"crop: expected a number from 0 to 1, or null, got {self.crop}")
 
     def __call__(self, scene: Scene) -> Scene:
         """Return the scene prepared."""
@@ -177,7 +177,7 @@ class PreparedDataset:
         self._scenes = chosen(list(found), wanted)
         unknown = [scene for scene in preparation.fill if scene not in (*named, *found)]
         if unknown:
-            raise ValueError(f"dataset.fill: expected names of scenes, got {', '.join(unknown)}")
+            raise ValueError(f"fill: expected names of scenes, got {', '.join(unknown)}")
         self._found, self._preparation = found, preparation
 
     def scenes(self) -> list[str]:

@@ -83,13 +83,13 @@ class AnisotropicDiffusion:
     ) -> None:
         expect_limits(tolerance, steps=steps)
         if not 0 < step <= 0.25:
-            raise ValueError(f"method.step: expected more than 0 and at most 0.25, got {step}")
+            raise ValueError(f"step: expected more than 0 and at most 0.25, got {step}")
         if not edge > 0:
-            raise ValueError(f"method.edge: expected more than 0, got {edge}")
+            raise ValueError(f"edge: expected more than 0, got {edge}")
         if not depth_weight >= 0:
-            raise ValueError(f"method.depth_weight: expected 0 or more, got {depth_weight}")
+            raise ValueError(f"depth_weight: expected 0 or more, got {depth_weight}")
         if border < 0:
-            raise ValueError(f"method.border: expected 0 or more low-resolution pixels, got {border}")
+            raise ValueError(f"border: expected 0 or more low-resolution pixels, got {border}")
         self.steps, self.tolerance, self.step = steps, tolerance, step
         self.edge, self.depth_weight, self.border = edge, depth_weight, border
         self.history: list[dict[str, float]] = []

@@ -37,7 +37,7 @@ class Interpolation:
 
     def __init__(self, order: Order = "bicubic", *, fill_holes: bool = False) -> None:
         if order not in get_args(Order):
-            raise ValueError(f"method.order: expected one of {', '.join(get_args(Order))}, got {order!r}")
+            raise ValueError(f"order: expected one of {', '.join(get_args(Order))}, got {order!r}")
         self._degree = {"nearest": 0, "bilinear": 1, "bicubic": 3}[order]
         self._fill_holes = fill_holes
 

@@ -136,7 +136,7 @@ def positive(method: str, **values: float) -> None:
     """Raise a ValueError for the first of a method's parameters that is not a positive finite number."""
     for name, value in values.items():
         if not 0 < value < float("inf"):
-            raise ValueError(f"method.{name}: expected a positive number for {method}, got {value}")
+            raise ValueError(f"{name}: expected a positive number for {method}, got {value}")
 
 
 def _planes(coarse: Tensor) -> Tensor:

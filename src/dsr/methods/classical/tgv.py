@@ -117,9 +117,9 @@ class TotalGeneralisedVariation:
         }
         for name, value in positive.items():
             if not value > 0:
-                raise ValueError(f"method.{name}: expected more than 0, got {value}")
+                raise ValueError(f"{name}: expected more than 0, got {value}")
         if not sharpness >= 0:
-            raise ValueError(f"method.sharpness: expected 0 or more, got {sharpness}")
+            raise ValueError(f"sharpness: expected 0 or more, got {sharpness}")
         self.iterations, self.tolerance = iterations, tolerance
         self.first, self.second, self.data_weight = first, second, data_weight
         self.sharpness, self.exponent, self.step_ratio = sharpness, exponent, step_ratio

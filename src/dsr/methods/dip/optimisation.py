@@ -63,19 +63,19 @@ class PriorSettings:
         """Check the values."""
         for name in ("steps", "learning_rate"):
             if not 0 < getattr(self, name) < math.inf:
-                raise ValueError(f"method.{name}: expected a positive number, got {getattr(self, name)}")
+                raise ValueError(f"{name}: expected a positive number, got {getattr(self, name)}")
         for name in ("input_noise", "perturbation", "guide_perturbation", "margin"):
             if not 0 <= getattr(self, name) < math.inf:
-                raise ValueError(f"method.{name}: expected 0 or a positive number, got {getattr(self, name)}")
+                raise ValueError(f"{name}: expected 0 or a positive number, got {getattr(self, name)}")
         if self.border < 0:
-            raise ValueError(f"method.border: expected 0 or a positive number, got {self.border}")
+            raise ValueError(f"border: expected 0 or a positive number, got {self.border}")
         if not self.guide and not self.input_noise:
-            raise ValueError("method.input_noise: expected a positive number, or method.guide=true; got 0 and false")
+            raise ValueError("input_noise: expected a positive number, or guide=true; got 0 and false")
         if not 0 <= self.average < 1:
-            raise ValueError(f"method.average: expected 0 or more and less than 1, got {self.average}")
+            raise ValueError(f"average: expected 0 or more and less than 1, got {self.average}")
         for name, values in (("widths", self.widths), ("skips", self.skips)):
             if not values or min(values) < 1 or len(values) != len(self.widths):
-                raise ValueError(f"method.{name}: expected a positive number for each level, got {list(values)}")
+                raise ValueError(f"{name}: expected a positive number for each level, got {list(values)}")
 
 
 class PriorOptimisation(lightning.LightningModule):

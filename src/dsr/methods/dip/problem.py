@@ -106,10 +106,10 @@ class PriorObjective:
     def __post_init__(self) -> None:
         """Check the values."""
         if self.data_loss not in ("lap1", "mse"):
-            raise ValueError(f"method.data_loss: expected lap1 or mse, got {self.data_loss!r}")
+            raise ValueError(f"data_loss: expected lap1 or mse, got {self.data_loss!r}")
         for name in ("data_weight", "w", "w_intensity"):
             if not 0 <= getattr(self, name) < float("inf"):
-                raise ValueError(f"method.{name}: expected 0 or a positive number, got {getattr(self, name)}")
+                raise ValueError(f"{name}: expected 0 or a positive number, got {getattr(self, name)}")
 
     def __call__(self, depth: Tensor, intensity: Tensor, problem: ImageProblem) -> dict[str, Tensor]:
         """Return ``loss`` and its terms, scalars.

@@ -110,13 +110,11 @@ class DeepImagePrior:
             raise ValueError(f"precision: expected one of {', '.join(DTYPES)}, got {self.precision!r}")
         for name, least in (("patience", 1), ("validate_every", 0), ("largest_tilt", 0)):
             if (getattr(self, name) or 0) < least:
-                raise ValueError(f"method.{name}: expected {least} or more, got {getattr(self, name)}")
+                raise ValueError(f"{name}: expected {least} or more, got {getattr(self, name)}")
         if self.stopping not in get_args(StoppingName):
-            raise ValueError(
-                f"method.stopping: expected one of {', '.join(get_args(StoppingName))}, got {self.stopping!r}"
-            )
+            raise ValueError(f"stopping: expected one of {', '.join(get_args(StoppingName))}, got {self.stopping!r}")
         if self.stopping == "oracle" and not self.validate_every:
-            raise ValueError("method.validate_every: expected a positive number, as method.stopping=oracle needs it")
+            raise ValueError("validate_every: expected a positive number, as stopping=oracle needs it")
         given = {each.name: getattr(self, each.name) for each in fields(PriorSettings) if each.name != "mixed"}
         given |= {"widths": tuple(self.widths), "skips": tuple(self.skips)}
         self._settings = PriorSettings(**given, mixed=self.precision == "bfloat16")
@@ -150,7 +148,7 @@ class DeepImagePrior:
             resume = None if folder is None else checkpoint_of(folder / "last.ckpt", origin)
             display.say(self._announcement(module, sample.scene, resume is not None))
             if module.objective.w < self.w:
-                display.say(f"{sample.scene}: without MSE_v; {_noise_of(sample)}, more than method.largest_tilt")
+                display.say(f"{sample.scene}: without MSE_v; {_noise_of(sample)}, more than largest_tilt")
             trainer = self._trainer(module, folder, origin, display, sample.scene)
             try:
                 fit(trainer, module, _numbers(self.steps), resume, val_dataloaders=_numbers(1))

@@ -140,7 +140,7 @@ class DynamicGuidance(NormalisedNetwork):
         if stages < 1 or size < 3:
             raise ValueError(f"model: expected stages of at least 1 and a size of at least 3, got {stages} and {size}")
         if not 1 <= filters <= size**2 - 3:
-            raise ValueError(f"model.filters: expected 1 to {size**2 - 3} of size {size}, got {filters}")
+            raise ValueError(f"filters: expected 1 to {size**2 - 3} of size {size}, got {filters}")
         self.scale, self.filters, self.size = scale, filters, size
         self.stages = nn.ModuleList(Stage(filters, size) for _ in range(stages))
 

@@ -54,7 +54,7 @@ def half_window(window: int) -> list[Offset]:
 
     """
     if window < 3 or window % 2 == 0:
-        raise ValueError(f"model.window: expected an odd number of at least 3, got {window}")
+        raise ValueError(f"window: expected an odd number of at least 3, got {window}")
     radius = window // 2
     side = range(-radius, radius + 1)
     return [(v, u) for v in range(-radius, 1) for u in side if (v, u) < (0, 0)]
@@ -207,7 +207,7 @@ class UnrolledHuber(nn.Module):
         super().__init__()
         self.offsets = half_window(window)
         if iterations < 1:
-            raise ValueError(f"model.iterations: expected at least 1, got {iterations}")
+            raise ValueError(f"iterations: expected at least 1, got {iterations}")
         self.window, self.iterations = window, iterations
         self.log_data = nn.Parameter(torch.tensor(math.log(data)))
         self.log_huber = nn.Parameter(torch.tensor(math.log(huber)))

@@ -92,7 +92,7 @@ class EdgeGuided:
         positive("edge-guided upsampling", sigma_space=sigma_space, mixed=mixed)
         for name, value in (("candidates", candidates), ("iterations", iterations), ("radius", radius)):
             if value < 1:
-                raise ValueError(f"method.{name}: expected at least 1 for edge-guided upsampling, got {value}")
+                raise ValueError(f"{name}: expected at least 1 for edge-guided upsampling, got {value}")
         self._step, self._candidates, self._sharp_weight, self._smoothness = step, candidates, sharp_weight, smoothness
         self._iterations, self._radius, self._sigma_space, self._mixed = iterations, radius, sigma_space, mixed
         self._fill_holes = fill_holes

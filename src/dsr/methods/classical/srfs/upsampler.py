@@ -97,15 +97,15 @@ class ShapeFromShading:
     ) -> None:
         expect_limits(tolerance, iterations=iterations)
         if not area_weight >= 0:
-            raise ValueError(f"method.area_weight: expected 0 or more, got {area_weight}")
+            raise ValueError(f"area_weight: expected 0 or more, got {area_weight}")
         if not 1 <= growth < float("inf"):
-            raise ValueError(f"method.growth: expected at least 1, got {growth}")
+            raise ValueError(f"growth: expected at least 1, got {growth}")
         positive = {"data_weight": data_weight, "boundary_weight": boundary_weight, "penalty": penalty}
         for name, value in positive.items():
             if not 0 < value < float("inf"):
-                raise ValueError(f"method.{name}: expected more than 0, got {value}")
+                raise ValueError(f"{name}: expected more than 0, got {value}")
         if foreground is not None and not Path(foreground).is_dir():
-            raise ValueError(f"method.foreground: expected a folder of masks, there is none at {foreground}")
+            raise ValueError(f"foreground: expected a folder of masks, there is none at {foreground}")
         self.iterations, self.tolerance = iterations, tolerance
         self.weights = Weights(data_weight, area_weight, boundary_weight)
         self.penalty, self.growth = penalty, growth
