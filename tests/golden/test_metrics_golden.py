@@ -71,9 +71,7 @@ def _check(expected: dict[str, Any], rows: dict[tuple[str, str], Score]) -> None
 @pytest.mark.parametrize("scale", [4, 8])
 @pytest.mark.parametrize("scene", ["lucy", "plant"])
 @pytest.mark.parametrize("method", METHODS)
-def test_every_metric_is_that_of_the_golden_file(
-    shared: Path, network: LPIPS, method: str, scene: str, scale: int
-) -> None:
+def test_metrics_equal_the_golden_file(shared: Path, network: LPIPS, method: str, scene: str, scale: int) -> None:
     expected = json.loads((shared / "expected" / "metrics.json").read_text())[scene][f"x{scale}"][method]
     loaded = _scene(shared, scene)
     assert loaded.depth is not None

@@ -68,13 +68,13 @@ def test_output_is_that_of_the_published_network(shared: Path, method: str, scen
 
 
 @pytest.mark.parametrize("scale", [2, 16])
-def test_the_other_published_networks_are_better_than_bicubic_too(shared: Path, scale: int) -> None:
+def test_other_published_networks_are_better_than_bicubic_too(shared: Path, scale: int) -> None:
     sample, truth = _sample(shared, "lucy", scale)
     bicubic = upsample_bicubic(functional.avg_pool2d(truth, scale)[None], scale)[0, 0]
     assert _rmse_mm(sample, _upsampled(shared, "msg", sample), truth[0]) < 0.9 * _rmse_mm(sample, bicubic, truth[0])
 
 
-def test_the_network_trained_on_noise_loads_and_stays_near_the_truth(shared: Path) -> None:
+def test_network_trained_on_noise_loads_and_stays_near_the_truth(shared: Path) -> None:
     sample, truth = _sample(shared, "lucy", 4)
     upsampler = build_trained(shared / "weights" / "msg_v_x4_noise_std0.003.pth", 4, "msg_v", "voynov")
     assert _rmse_mm(sample, to_range(upsampler(sample), sample.camera, "disparity")[0], truth[0]) < 60
@@ -89,7 +89,7 @@ def test_bfloat16_changes_the_published_error_by_less_than_one_percent(shared: P
     assert float((exact - rounded).square().mean().sqrt()) / span < 5e-4  # 2.2e-4 measured
 
 
-def test_a_published_file_of_the_other_variant_or_scale_is_refused(shared: Path) -> None:
+def test_published_file_of_the_other_variant_or_scale_is_refused(shared: Path) -> None:
     with pytest.raises(ValueError, match="expected weights of variant voynov, got those of variant hui"):
         build_trained(shared / "weights" / "MSGNet_x4.caffemodel", 4, "msg_v", "voynov")
     with pytest.raises(ValueError, match="weights are for scale 8, the run is at scale 4"):

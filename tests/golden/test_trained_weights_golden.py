@@ -47,7 +47,7 @@ def test_our_networks_beat_the_published_one_in_every_visual_metric_of_every_cas
     assert float(ours[[*VISUAL]].mean().mean()) < all_metrics
 
 
-def test_the_visual_loss_shows_on_lucy_and_plant(ratios: pd.DataFrame) -> None:
+def test_visual_loss_shows_on_lucy_and_plant(ratios: pd.DataFrame) -> None:
     cases = ratios.set_index(["scale", "scene"])
     gain = cases[cases["method"] == "msg_v"][[*VISUAL]] / cases[cases["method"] == "msg"][[*VISUAL]]
     assert gain.shape == (4, len(VISUAL))
@@ -56,7 +56,7 @@ def test_the_visual_loss_shows_on_lucy_and_plant(ratios: pd.DataFrame) -> None:
 
 
 @pytest.mark.parametrize("scale", [4, 8])
-def test_the_visual_loss_shows_on_simgeo(shared: Path, scale: int) -> None:
+def test_visual_loss_shows_on_simgeo(shared: Path, scale: int) -> None:
     lpips = load_lpips(shared / "weights" / "alexnet_imagenet_features.pth")
     metrics = tuple(metric for metric in catalogue(lpips) if metric.name in VISUAL)
     source = SimGeo(size=512)

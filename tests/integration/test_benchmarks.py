@@ -19,7 +19,7 @@ SMALL = {
 
 
 @pytest.mark.parametrize("name", SMALL)
-def test_a_benchmark_prints_ratios(name: str) -> None:
+def test_benchmark_prints_ratios(name: str) -> None:
     arguments, ratios = SMALL[name]
     done = subprocess.run(
         [sys.executable, str(BENCHMARKS / name), *arguments], capture_output=True, text=True, timeout=120, check=False
@@ -28,7 +28,7 @@ def test_a_benchmark_prints_ratios(name: str) -> None:
     assert len(re.findall(r"\d\.\d+ times as fast", done.stdout)) == ratios
 
 
-def test_what_a_method_costs_is_measured(shared: Path) -> None:
+def test_method_cost_benchmark_measures(shared: Path) -> None:
     command = [sys.executable, str(BENCHMARKS / "methods_cost.py"), "--scenes", str(shared / "scenes")]
     done = subprocess.run(
         [*command, "--methods", "nearest", "--scale", "4"], capture_output=True, text=True, timeout=120, check=False

@@ -90,7 +90,7 @@ def mine(*items, **fields):
     return {"mine": Collection("mine", "Mine", "https://page", "Free.", "Me, 2020.", ("set",), 3e6, items, **fields)}
 
 
-def test_a_data_set_is_fetched_listed_checked_and_not_fetched_twice(mirror, root):
+def test_dataset_is_fetched_listed_verified_and_not_fetched_twice(mirror, root):
     done = run("data", "get", "middlebury2003", "--mirror", mirror.url)
     assert (done.returncode, done.stderr) == (0, "")
     lines = done.stdout.splitlines()
@@ -119,7 +119,7 @@ def test_a_data_set_is_fetched_listed_checked_and_not_fetched_twice(mirror, root
     assert len(mirror.log) == 4
 
 
-def test_an_interrupted_command_goes_on_where_it_stopped(mirror, root):
+def test_interrupted_command_resumes(mirror, root):
     mirror.go_on.clear()
     get = ("data", "get", "middlebury2003", "--mirror", mirror.url)
     process = subprocess.Popen(
@@ -147,7 +147,7 @@ def test_an_interrupted_command_goes_on_where_it_stopped(mirror, root):
     assert not part.exists()
 
 
-def test_on_a_terminal_it_asks_before_the_first_byte(mirror, root):
+def test_command_asks_before_the_first_byte_on_a_terminal(mirror, root):
     for answer, code, there in ((b"n\n", 0, False), (b"y\n", 0, True)):
         ours, theirs = pty.openpty()
         process = subprocess.Popen(
@@ -182,7 +182,7 @@ def drain(terminal):
         pass
 
 
-def test_a_file_that_is_nowhere_is_one_line_and_the_others_come(mirror, root, capsys):
+def test_file_found_nowhere_is_one_line_and_the_others_come(mirror, root, capsys):
     items = [Item(f"set/{number}.png", (f"{mirror.url}/{name}",)) for number, name in enumerate(("gone", NAMES[0]))]
     code, _, errors = in_process(capsys, "data", "get", "mine", catalogue=mine(*items))
     assert (code, errors) == (2, [f"error: set/0.png: {mirror.url}/gone: HTTP 404 Not Found"])
@@ -192,7 +192,7 @@ def test_a_file_that_is_nowhere_is_one_line_and_the_others_come(mirror, root, ca
     assert lines[-1].split() == ["mine", "Mine", "3.0", "MB", "partial", "1", "of", "2"]
 
 
-def test_without_a_network_each_file_is_one_line(root, capsys, monkeypatch):
+def test_files_without_a_network_are_one_line_each(root, capsys, monkeypatch):
     monkeypatch.setattr(download, "PAUSES", (0.0,))
     with socket.socket() as closed:
         closed.bind(("127.0.0.1", 0))
@@ -206,7 +206,7 @@ def test_without_a_network_each_file_is_one_line(root, capsys, monkeypatch):
     assert not list((root / "set").iterdir())
 
 
-def test_a_damaged_file_is_seen_and_fetched_again(mirror, root, capsys):
+def test_damaged_file_is_found_and_fetched_again(mirror, root, capsys):
     get = ("data", "get", "middlebury2003", "--mirror", mirror.url)
     assert in_process(capsys, *get)[0] == 0
     path = root / NAMES[1]
@@ -221,7 +221,7 @@ def test_a_damaged_file_is_seen_and_fetched_again(mirror, root, capsys):
     assert path.read_bytes() == PNG + NAMES[1].encode()
 
 
-def test_a_changed_file_is_refused_until_it_is_accepted(mirror, root, capsys):
+def test_changed_file_is_refused_until_it_is_accepted(mirror, root, capsys):
     catalogue = mine(Item("set/a.png", (f"{mirror.url}/{NAMES[0]}",)))
     assert in_process(capsys, "data", "get", "mine", catalogue=catalogue)[0] == 0
     (root / "set/a.png").unlink()
@@ -233,7 +233,7 @@ def test_a_changed_file_is_refused_until_it_is_accepted(mirror, root, capsys):
     assert in_process(capsys, "data", "verify", "mine", catalogue=catalogue)[0] == 0
 
 
-def test_the_manual_route_says_where_the_files_belong_and_checks_them(root, capsys):
+def test_manual_route_names_the_files_places_and_checks_them(root, capsys):
     for task in ("get", "verify"):
         code, lines, errors = in_process(capsys, "data", task, "tofmark")
         assert (code, len(errors)) == (2, 1)
@@ -248,7 +248,7 @@ def test_the_manual_route_says_where_the_files_belong_and_checks_them(root, caps
     assert in_process(capsys, "data", "verify", "tofmark")[0] == 2
 
 
-def test_it_says_where_the_data_sets_belong(root, capsys):
+def test_locations_of_the_datasets_are_printed(root, capsys):
     code, lines, _ = in_process(capsys, "data", "where")
     assert (code, lines[0]) == (0, str(root))
     assert ["icl", str(root / "icl_nuim")] in [line.split() for line in lines[1:]]
@@ -256,14 +256,14 @@ def test_it_says_where_the_data_sets_belong(root, capsys):
 
 
 @pytest.mark.parametrize("task", ["get", "verify", "where"])
-def test_an_unknown_name_is_one_line_with_the_known_ones(root, capsys, task):
+def test_unknown_name_is_one_line_with_the_known_ones(root, capsys, task):
     code, lines, errors = in_process(capsys, "data", task, "middelbury")
     assert (code, lines, len(errors)) == (2, [], 1)
     assert errors[0].startswith("error: middelbury: unknown data set; expected some of middlebury, middlebury_train, ")
     assert not root.exists()
 
 
-def test_a_mirror_that_is_no_address_is_one_line(root, capsys):
+def test_invalid_mirror_address_is_one_line(root, capsys):
     code, _, errors = in_process(capsys, "data", "get", "nyu", "--mirror", "/mnt/data")
     assert (code, errors) == (
         2,
@@ -290,7 +290,7 @@ def test_help_has_examples(arguments, capsys):
     assert all(len(line) <= 120 for line in said.splitlines())
 
 
-def test_the_doctor_s_exit_code_is_the_command_s(tmp_path, monkeypatch):
+def test_doctor_exit_code_is_that_of_the_command(tmp_path, monkeypatch):
     doctor = types.ModuleType("dsr.doctor")
     seen = []
     doctor.examine_directory = lambda *given: seen.append(given) or 3

@@ -41,7 +41,7 @@ def run(tmp_path, dsr_cache):
         ("train", train, ("dataset=paper_train", "trainer=smoke"), "middlebury_train: expected its files in data, "),
     ],
 )
-def test_an_absent_data_set_names_the_command_that_gets_it_and_nothing_is_written(
+def test_missing_dataset_names_the_command_that_fetches_it_and_nothing_is_written(
     tmp_path, monkeypatch, capfd, name, command, arguments, message
 ):
     monkeypatch.chdir(tmp_path)
@@ -59,7 +59,7 @@ def test_an_absent_data_set_names_the_command_that_gets_it_and_nothing_is_writte
     assert list(tmp_path.iterdir()) == []
 
 
-def test_real_scenes_of_several_data_sets_are_evaluated_by_one_command(run, tmp_path, shared):
+def test_real_scenes_of_several_datasets_are_evaluated_by_one_command(run, tmp_path, shared):
     done = run(
         "eval.py", "-m", "dataset=icl,sunrgbd", "dataset.scenes=found", "dataset.size=64", "method=bicubic",
         DSR_DATA=str(shared / "real"),
@@ -73,7 +73,7 @@ def test_real_scenes_of_several_data_sets_are_evaluated_by_one_command(run, tmp_
     assert pictures == ["living", "office_0000"]
 
 
-def test_a_training_on_real_scenes_with_holes_and_procedural_ones_runs(run, tmp_path, shared):
+def test_training_on_real_scenes_with_holes_and_procedural_ones_runs(run, tmp_path, shared):
     done = run(
         "train.py", "dataset=paper_train", "trainer=smoke", "output_dir=out", "trainer.scenes=4",
         "dataset.parts.middlebury_train.scenes=found", "dataset.shares.sintel=0",
@@ -85,9 +85,7 @@ def test_a_training_on_real_scenes_with_holes_and_procedural_ones_runs(run, tmp_
     assert (tmp_path / "out" / "weights.safetensors").is_file()
 
 
-def test_preparing_draws_a_contact_sheet_and_what_is_wrong_is_one_line(
-    tmp_path, monkeypatch, capsys, shared, dsr_cache
-):
+def test_prepare_draws_a_contact_sheet_and_errors_are_one_line(tmp_path, monkeypatch, capsys, shared, dsr_cache):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("DSR_DATA", str(shared / "real"))
     assert main(["data", "prepare", "icl", "dataset.scenes=found", "dataset.size=64"]) == 0
@@ -109,9 +107,7 @@ def test_preparing_draws_a_contact_sheet_and_what_is_wrong_is_one_line(
     assert [path.name for path in tmp_path.iterdir()] == ["outputs"]
 
 
-def test_a_scene_that_cannot_be_read_is_named_and_the_others_are_drawn(
-    tmp_path, monkeypatch, capsys, shared, dsr_cache
-):
+def test_unreadable_scene_is_named_and_the_others_are_drawn(tmp_path, monkeypatch, capsys, shared, dsr_cache):
     (tmp_path / "icl_nuim").mkdir()
     for name in ("good", "bad"):
         shutil.copytree(shared / "real" / "icl_nuim" / "living", tmp_path / "icl_nuim" / name)

@@ -56,7 +56,7 @@ def both(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, subprocess.Com
     return folder / "out", done
 
 
-def test_it_says_what_each_scene_will_cost_and_ends_in_a_table(
+def test_cost_of_each_scene_is_announced_and_the_run_ends_in_a_table(
     both: tuple[Path, subprocess.CompletedProcess[str]],
 ) -> None:
     home, done = both
@@ -68,7 +68,7 @@ def test_it_says_what_each_scene_will_cost_and_ends_in_a_table(
     assert {row["method"] for row in _rows(home)} == {"dip_v"}
 
 
-def test_the_log_has_the_losses_all_scores_and_renderings(
+def test_log_has_the_losses_all_scores_and_renderings(
     both: tuple[Path, subprocess.CompletedProcess[str]],
 ) -> None:
     home, _ = both
@@ -85,7 +85,7 @@ def test_the_log_has_the_losses_all_scores_and_renderings(
     assert "40,val,DSSIM_v," in table
 
 
-def test_a_result_does_not_depend_on_the_other_scenes_nor_on_their_order(
+def test_result_does_not_depend_on_the_other_scenes_nor_on_their_order(
     both: tuple[Path, subprocess.CompletedProcess[str]], tmp_path: Path
 ) -> None:
     home, _ = both
@@ -97,7 +97,7 @@ def test_a_result_does_not_depend_on_the_other_scenes_nor_on_their_order(
         assert np.array_equal(_depth(home, scene), _depth(tmp_path / "turned", scene))
 
 
-def test_a_second_run_reuses_what_is_there(both: tuple[Path, subprocess.CompletedProcess[str]]) -> None:
+def test_second_run_reuses_what_is_there(both: tuple[Path, subprocess.CompletedProcess[str]]) -> None:
     home, _ = both
     again = _run(home.parent, "method=dip_v", "dataset.scenes=[statue,cube_no_texture]", "output_dir=out")
     assert again.returncode == 0
@@ -105,7 +105,7 @@ def test_a_second_run_reuses_what_is_there(both: tuple[Path, subprocess.Complete
     assert "steps at" not in again.stdout
 
 
-def test_an_interrupted_run_goes_on_within_the_image(tmp_path: Path) -> None:
+def test_interrupted_run_resumes_within_the_image(tmp_path: Path) -> None:
     arguments = ("method=dip_v", "dataset.scenes=[statue]", "method.steps=200", "method.validate_every=10")
     with subprocess.Popen(
         _command(*arguments, "output_dir=out"), cwd=tmp_path, env=ENVIRONMENT, stdout=subprocess.PIPE,
@@ -129,7 +129,7 @@ def test_an_interrupted_run_goes_on_within_the_image(tmp_path: Path) -> None:
     assert not (tmp_path / "out" / "optimisation" / "statue" / "last.ckpt").exists()
 
 
-def test_an_oracle_is_named_in_scores_and_table(tmp_path: Path) -> None:
+def test_oracle_is_named_in_scores_and_table(tmp_path: Path) -> None:
     done = _run(tmp_path, "method=dip", "dataset.scenes=[statue]", "method.stopping=oracle", "output_dir=out")
     assert done.returncode == 0, done.stderr
     assert "DIP (oracle) on simgeo" in done.stdout
@@ -138,7 +138,7 @@ def test_an_oracle_is_named_in_scores_and_table(tmp_path: Path) -> None:
     assert summary["method"] == "dip_oracle"
 
 
-def test_holes_and_a_mistaken_model_are_part_of_the_problems_name(tmp_path: Path) -> None:
+def test_holes_and_a_wrong_model_are_part_of_the_setting_name(tmp_path: Path) -> None:
     given = ("method=dip", "dataset.scenes=[statue]", "method.validate_every=0", "output_dir=out")
     done = _run(tmp_path, *given, "holes=blobs", "holes.size=3", "downsampling.assumed=nearest")
     assert done.returncode == 0, done.stderr
@@ -151,7 +151,7 @@ def test_holes_and_a_mistaken_model_are_part_of_the_problems_name(tmp_path: Path
     assert not np.array_equal(_depth(tmp_path / "out", "statue"), _depth(tmp_path / "right", "statue"))
 
 
-def test_a_warm_start_needs_no_words(tmp_path: Path) -> None:
+def test_warm_start_works_by_default(tmp_path: Path) -> None:
     done = _run(tmp_path, "method=dip_v_warm", "dataset.scenes=[statue]", "method.steps=3", "output_dir=out")
     assert done.returncode == 0, done.stderr
     assert "DIP-V (warm)" in done.stdout
@@ -173,7 +173,7 @@ def test_a_warm_start_needs_no_words(tmp_path: Path) -> None:
         ),
     ],
 )
-def test_a_usage_error_is_one_line_and_writes_nothing(
+def test_usage_error_is_one_line_and_writes_nothing(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capfd: pytest.CaptureFixture[str],

@@ -40,7 +40,7 @@ def write(folder, rendering, depth, **entries):
     np.save(folder / "depth.npy", depth)
 
 
-def test_a_sound_scene_is_fine(tmp_path, cube):
+def test_sound_scene_passes(tmp_path, cube):
     write(tmp_path / "cube", cube, cube.depth)
     for folder in (tmp_path, tmp_path / "cube"):
         done = doctor(folder)
@@ -49,7 +49,7 @@ def test_a_sound_scene_is_fine(tmp_path, cube):
         assert done.stdout.endswith("1 scene: 1 fine\n")
 
 
-def test_what_is_wrong_is_told_with_what_to_do(tmp_path, cube):
+def test_findings_are_printed_with_advice(tmp_path, cube):
     rays = cube.camera.ray_lengths().numpy()
     write(tmp_path / "ray", cube, cube.depth * rays)
     write(tmp_path / "ray_described", cube, cube.depth * rays, range_type="perspective")
@@ -68,14 +68,14 @@ def test_what_is_wrong_is_told_with_what_to_do(tmp_path, cube):
     assert done.stdout.endswith("4 scenes: 2 fine, 2 with problems\n")
 
 
-def test_a_place_without_scenes_is_one_line_on_stderr(tmp_path):
+def test_directory_without_scenes_is_one_line_on_stderr(tmp_path):
     done = doctor(tmp_path / "none")
     assert (done.returncode, done.stdout) == (2, "")
     assert done.stderr.startswith(f"error: {tmp_path / 'none'}: expected a scene or a directory of scenes")
     assert done.stderr.count("\n") == 1
 
 
-def test_the_published_scenes_are_fine(shared):
+def test_published_scenes_pass(shared):
     done = doctor(shared / "scenes")
     assert (done.returncode, done.stderr) == (0, "")
     for name in ("books", "lucy", "plant"):
@@ -83,7 +83,7 @@ def test_the_published_scenes_are_fine(shared):
     assert done.stdout.endswith("3 scenes: 3 fine\n")
 
 
-def test_of_many_scenes_some_are_examined_on_request(tmp_path, cube, capsys):
+def test_limit_examines_some_of_many_scenes(tmp_path, cube, capsys):
     for number in range(5):
         write(tmp_path / f"cube{number}", cube, cube.depth)
     assert main(["doctor", str(tmp_path), "--most", "2"]) == 0

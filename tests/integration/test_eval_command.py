@@ -125,7 +125,7 @@ def default_run(tmp_path_factory, offline):
     return folder, home, done
 
 
-def test_the_default_run_ends_well_and_says_where_the_results_are(default_run):
+def test_default_run_succeeds_and_names_its_results(default_run):
     _, home, done = default_run
     assert done.returncode == 0, done.stderr
     assert home.name.startswith("simgeo_box_x4_bicubic_")
@@ -134,13 +134,13 @@ def test_the_default_run_ends_well_and_says_where_the_results_are(default_run):
     assert "mean" in done.stdout
 
 
-def test_the_default_run_writes_everything_that_is_promised_and_nothing_else(default_run):
+def test_default_run_writes_the_documented_files_and_nothing_else(default_run):
     folder, home, _ = default_run
     assert tree(home) == written(SIMGEO)
     assert [path.name for path in folder.iterdir()] == ["outputs"]
 
 
-def test_without_an_lpips_trunk_one_line_says_what_to_do(default_run):
+def test_missing_lpips_trunk_is_one_line_with_advice(default_run):
     _, _, done = default_run
     assert done.stderr.count("LPIPS_v is left out") == 1
     [line] = done.stderr.splitlines()
@@ -149,7 +149,7 @@ def test_without_an_lpips_trunk_one_line_says_what_to_do(default_run):
     assert done.stdout.count("LPIPS") == 0
 
 
-def test_scores_csv_has_the_promised_columns_and_rows_with_finite_values(default_run):
+def test_scores_csv_has_the_documented_columns_and_finite_rows(default_run):
     _, home, _ = default_run
     assert (home / "scores.csv").read_text().splitlines()[0] == COLUMNS
     table = rows(home)
@@ -162,13 +162,13 @@ def test_scores_csv_has_the_promised_columns_and_rows_with_finite_values(default
     assert same == {("simgeo", "4", "box", "bicubic", "0")}
 
 
-def test_raw_units_are_metres_and_shares(default_run):
+def test_raw_units_are_metres_and_fractions(default_run):
     table = rows(default_run[1])
     assert all(float(row["value"]) <= 1 for row in table if row["metric"].startswith("BadPix"))
     assert all(0.001 < float(row["value"]) < 1 for row in table if row["metric"] == "RMSE_d")
 
 
-def test_the_summary_has_the_mean_over_the_scenes(default_run):
+def test_summary_has_the_mean_over_the_scenes(default_run):
     _, home, _ = default_run
     content = json.loads((home / "summary.json").read_text())
     values = [float(row["value"]) for row in rows(home) if row["metric"] == "DSSIM_v" and row["variant"] == "max"]
@@ -194,14 +194,14 @@ def test_versions_json_has_packages_commit_and_device(default_run):
     assert record["identity"]["device"] in ("cpu", "cuda")
 
 
-def test_a_prediction_is_metres_of_the_scenes_size(default_run):
+def test_prediction_is_in_metres_of_the_scenes_size(default_run):
     with np.load(default_run[1] / "predictions" / "statue.npz") as kept:
         depth = kept["depth"]
     assert depth.shape == (64, 64)
     assert 2 < depth.min() < depth.max() < 4.5
 
 
-def test_a_second_run_reuses_the_predictions_and_says_so(default_run, within, monkeypatch):
+def test_second_run_reuses_the_predictions_and_says_so(default_run, within, monkeypatch):
     folder, home, _ = default_run
     monkeypatch.chdir(folder)
     before = {path.name: path.stat().st_mtime_ns for path in (home / "predictions").iterdir()}
@@ -214,7 +214,7 @@ def test_a_second_run_reuses_the_predictions_and_says_so(default_run, within, mo
     assert rows(home) == table
 
 
-def test_a_multirun_puts_every_combination_into_a_directory_of_its_own(tmp_path, offline):
+def test_multirun_writes_a_directory_per_combination(tmp_path, offline):
     write_scene(tmp_path / "my data" / "lucy")
     done = run(
         tmp_path, offline, "-m", "dataset=simgeo,folder", "dataset.root='my data'", "dataset.scenes=[lucy]",
@@ -233,7 +233,7 @@ def test_a_multirun_puts_every_combination_into_a_directory_of_its_own(tmp_path,
     assert all(tree(folder) == written(["lucy"]) for folder in folders)
 
 
-def test_one_bad_scene_keeps_the_others_results_and_the_exit_code_says_so(tmp_path, within):
+def test_bad_scene_keeps_the_others_results_and_sets_the_exit_code(tmp_path, within):
     for number, name in enumerate(("first", "bad one", "last")):
         write_scene(tmp_path / "data" / name, seed=number)
     (tmp_path / "data" / "bad one" / "rgb.png").write_bytes(b"\x89PNG\r\n\x1a\nbroken")
@@ -250,7 +250,7 @@ def test_one_bad_scene_keeps_the_others_results_and_the_exit_code_says_so(tmp_pa
     assert "last" in output
 
 
-def test_a_repaired_scene_is_added_by_the_same_command(tmp_path, within):
+def test_repaired_scene_is_added_by_the_same_command(tmp_path, within):
     write_scene(tmp_path / "data" / "a")
     camera = write_scene(tmp_path / "data" / "b") / "camera.json"
     content = camera.read_text()
@@ -265,7 +265,7 @@ def test_a_repaired_scene_is_added_by_the_same_command(tmp_path, within):
     assert tree(tmp_path / "out") == written(["a", "b"])
 
 
-def test_where_every_scene_fails_nothing_is_said_of_others(tmp_path, within):
+def test_message_mentions_no_other_scenes_where_all_fail(tmp_path, within):
     write_scene(tmp_path / "data" / "a")
     code, _, errors = within("dataset=folder", "dataset.root=data", "downsampling=measured")
     assert code == 2
@@ -275,7 +275,7 @@ def test_where_every_scene_fails_nothing_is_said_of_others(tmp_path, within):
     ]
 
 
-def test_a_changed_scene_is_not_taken_for_the_old_one(tmp_path, within):
+def test_changed_scene_is_predicted_anew(tmp_path, within):
     folder = write_scene(tmp_path / "data" / "a")
     arguments = ("dataset=folder", "dataset.root=data", "output_dir=out")
     assert within(*arguments)[0] == 0
@@ -293,7 +293,7 @@ def test_a_changed_scene_is_not_taken_for_the_old_one(tmp_path, within):
     assert (tmp_path / "out" / "predictions" / "a.npz").read_bytes() != before
 
 
-def test_a_directory_of_another_run_is_kept(tmp_path, within):
+def test_directory_of_another_run_is_kept(tmp_path, within):
     write_scene(tmp_path / "data" / "a")
     arguments = ("dataset=folder", "dataset.root=data", "output_dir=out")
     assert within(*arguments)[0] == 0
@@ -349,7 +349,7 @@ USAGE_ERRORS = {
 
 
 @pytest.mark.parametrize("case", USAGE_ERRORS)
-def test_a_usage_error_is_one_line_with_exit_code_2_and_writes_nothing(tmp_path, within, case):
+def test_usage_error_is_one_line_with_exit_code_2_and_writes_nothing(tmp_path, within, case):
     arguments, start = USAGE_ERRORS[case]
     (tmp_path / "empty").mkdir()
     (tmp_path / "file").write_text("no weights")
@@ -364,14 +364,14 @@ def test_a_usage_error_is_one_line_with_exit_code_2_and_writes_nothing(tmp_path,
     assert not (tmp_path / "outputs").exists()
 
 
-def test_a_usage_error_of_the_real_command_is_one_line_too(tmp_path, offline):
+def test_usage_error_of_the_real_command_is_one_line(tmp_path, offline):
     done = run(tmp_path, offline, "dataset=folder", "dataset.root=nowhere")
     assert (done.returncode, done.stdout) == (2, "")
     assert done.stderr == "error: dataset.root: expected a directory of scenes, got nowhere (no such directory)\n"
     assert list(tmp_path.iterdir()) == []
 
 
-def test_the_help_lists_the_choices(within):
+def test_help_lists_the_choices(within):
     code, output, errors = within("--help")
     assert (code, errors) == (0, [])
     for line in (
@@ -383,7 +383,7 @@ def test_the_help_lists_the_choices(within):
         assert line in output
 
 
-def test_without_further_words_msg_v_is_evaluated_with_the_weights_that_come_with_dsr(tmp_path, offline):
+def test_default_method_is_msg_v_with_packaged_weights(tmp_path, offline):
     arguments = ("dataset.size=64", "dataset.scenes=[statue,cube_no_texture]", "metrics.lpips=false")
     done = subprocess.run(
         [sys.executable, str(REPOSITORY / "eval.py"), *arguments],
@@ -400,14 +400,14 @@ def test_without_further_words_msg_v_is_evaluated_with_the_weights_that_come_wit
         assert ours[name] < 0.9 * theirs[name], name
 
 
-def test_weights_that_a_method_has_no_use_for_are_noted(tmp_path, within):
+def test_weights_that_a_method_does_not_use_are_noted(tmp_path, within):
     write_scene(tmp_path / "data" / "a")
     code, _, errors = within("dataset=folder", "dataset.root=data", "weights=x y")
     assert (code, errors) == (0, ["note: method=bicubic has no weights; weights=x y is not used"])
 
 
 @pytest.mark.parametrize("name", ["a b", "ünï [red]", "$x$"])
-def test_a_scene_may_have_any_name(tmp_path, within, name):
+def test_scene_may_have_any_name(tmp_path, within, name):
     write_scene(tmp_path / "data" / name)
     code, output, errors = within("dataset=folder", "dataset.root=data", "output_dir='o [bold]'")
     assert (code, errors) == (0, [])
@@ -416,7 +416,7 @@ def test_a_scene_may_have_any_name(tmp_path, within, name):
     assert "results: o [bold]" in output
 
 
-def test_a_size_that_the_scale_does_not_divide_is_cropped_and_said_so(tmp_path, within):
+def test_size_that_the_scale_does_not_divide_is_cropped_with_a_note(tmp_path, within):
     write_scene(tmp_path / "data" / "a", height=42, width=51)
     code, output, errors = within("dataset=folder", "dataset.root=data", "output_dir=out")
     assert (code, errors) == (0, [])
@@ -426,14 +426,14 @@ def test_a_size_that_the_scale_does_not_divide_is_cropped_and_said_so(tmp_path, 
 
 
 @pytest.mark.parametrize("size", [4, 12])
-def test_a_picture_too_small_for_the_scale_is_refused_by_name(tmp_path, within, size):
+def test_picture_too_small_for_the_scale_is_refused_by_name(tmp_path, within, size):
     write_scene(tmp_path / "data" / "dwarf", height=size, width=size)
     code, _, errors = within("dataset=folder", "dataset.root=data", "scale=16")
     assert code == 2
     assert errors[0] == f"error: dwarf: expected at least 16 x 16 pixels, got {size} x {size}"
 
 
-def test_an_interruption_keeps_what_is_finished_and_the_same_command_goes_on(tmp_path, offline):
+def test_interrupted_run_keeps_finished_scenes_and_resumes(tmp_path, offline):
     arguments = ("dataset=simgeo", "dataset.size=256", "output_dir=out", "metrics.lpips=false")
     with subprocess.Popen(
         command(*arguments), cwd=tmp_path, env=offline, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
@@ -452,7 +452,7 @@ def test_an_interruption_keeps_what_is_finished_and_the_same_command_goes_on(tmp
     assert all(not name.startswith(".") for name in finished)
 
 
-def test_two_runs_at_the_same_time_do_not_hurt_each_other(tmp_path, offline):
+def test_concurrent_runs_do_not_disturb_each_other(tmp_path, offline):
     for name in ("a", "b"):
         write_scene(tmp_path / "data" / name)
     arguments = command("dataset=folder", "dataset.root=data", "metrics.lpips=false", "output_dir=out")
@@ -511,7 +511,7 @@ def test_weights_of_another_scale_or_architecture_are_refused(shared, tmp_path, 
     assert list(tmp_path.iterdir()) == []
 
 
-def test_the_method_scores_a_measured_input_at_the_pixels_it_knows(shared, tmp_path, within):
+def test_measured_input_is_scored_at_its_valid_pixels(shared, tmp_path, within):
     code, _, errors = within(
         "dataset=folder", f"dataset.root='{shared / 'scenes'}'", "dataset.scenes=[books]",
         "downsampling=measured", "output_dir=out",

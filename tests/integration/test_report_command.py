@@ -35,7 +35,7 @@ def refused(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
     return line.removeprefix("error: ")
 
 
-def test_a_report_has_tables_figures_the_metric_study_and_a_page(runs: Path, tmp_path: Path) -> None:
+def test_report_has_tables_figures_the_metric_study_and_a_page(runs: Path, tmp_path: Path) -> None:
     command = [sys.executable, "-m", "dsr.cli", "report", str(runs), "-o", "report", "--title", "Ours"]
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
     done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
@@ -57,7 +57,7 @@ def test_a_report_has_tables_figures_the_metric_study_and_a_page(runs: Path, tmp
     assert sorted(path.name for path in tmp_path.iterdir()) == ["report", "runs"]
 
 
-def test_a_report_replaces_an_earlier_one_whole(runs: Path, tmp_path: Path) -> None:
+def test_report_replaces_an_earlier_one_whole(runs: Path, tmp_path: Path) -> None:
     output = tmp_path / "report"
     arguments = ["report", str(runs), "-o", str(output), "--only", "tables"]
     assert main(arguments) == 0
@@ -67,7 +67,7 @@ def test_a_report_replaces_an_earlier_one_whole(runs: Path, tmp_path: Path) -> N
     assert not (output / "index.html").exists()
 
 
-def test_an_interrupted_report_leaves_the_earlier_one_as_it_was(
+def test_interrupted_report_leaves_the_earlier_one_as_it_was(
     runs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     output = tmp_path / "report"
@@ -83,7 +83,7 @@ def test_an_interrupted_report_leaves_the_earlier_one_as_it_was(
     assert sorted(path.name for path in tmp_path.iterdir()) == ["report", "runs"]
 
 
-def test_a_directory_of_something_else_is_refused_and_kept(
+def test_directory_with_foreign_files_is_refused_and_kept(
     runs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "mine").mkdir()
@@ -92,7 +92,7 @@ def test_a_directory_of_something_else_is_refused_and_kept(
     assert (tmp_path / "mine" / "thesis.tex").read_text() == "years of work"
 
 
-def test_without_a_truth_there_are_pictures_and_no_tables(
+def test_report_without_truth_has_pictures_and_no_tables(
     runs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     for folder in runs.iterdir():
@@ -108,7 +108,7 @@ def test_without_a_truth_there_are_pictures_and_no_tables(
     assert "Bicubic" in (tmp_path / "report" / "index.html").read_text(encoding="utf-8")
 
 
-def test_a_user_study_joins_the_tables(runs: Path, tmp_path: Path) -> None:
+def test_user_study_joins_the_tables(runs: Path, tmp_path: Path) -> None:
     shares = {"user_first": 75.0, "user_second": 25.0, "user_top2": 100.0}
     ends = {f"{name}_{end}": value for name in shares for end, value in (("low", 40.0), ("high", 99.0))}
     place = {"dataset": "simgeo", "scene": "statue", "scale": 4, "downsampling": "box"}
@@ -132,12 +132,12 @@ def test_a_user_study_joins_the_tables(runs: Path, tmp_path: Path) -> None:
         (["--study", "absent.csv"], "absent.csv: "),
     ],
 )
-def test_a_wrong_choice_is_one_line_and_nothing_is_written(
+def test_invalid_choice_is_one_line_and_nothing_is_written(
     runs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], arguments: list[str], message: str
 ) -> None:
     assert refused(capsys, "report", runs, "-o", tmp_path / "report", *arguments).startswith(message)
     assert not (tmp_path / "report").exists()
 
 
-def test_a_directory_without_runs_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_directory_without_runs_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert "expected runs of eval.py" in refused(capsys, "report", tmp_path, "-o", tmp_path / "report")

@@ -146,7 +146,7 @@ def test_both_sides_show_the_renderings_of_the_protocol_under_every_light(opened
             assert (drawn == drawn[..., :1]).all()
 
 
-def test_left_and_right_of_the_divider_on_the_screen_are_the_two_pictures(opened, results):
+def test_divider_separates_the_two_pictures_on_the_screen(opened, results):
     page = opened()
     choose(page, "left", "Bicubic")
     for share in (0.25, 0.75):
@@ -166,7 +166,7 @@ def test_left_and_right_of_the_divider_on_the_screen_are_the_two_pictures(opened
         assert page.get_attribute(".divider", "aria-valuenow") == str(round(100 * share))
 
 
-def test_the_divider_moves_by_keys_mouse_and_touch(opened):
+def test_divider_moves_by_keys_mouse_and_touch(opened):
     page = opened()
     divider = page.locator(".divider")
     divider.focus()
@@ -216,7 +216,7 @@ def test_both_pictures_zoom_and_move_together(opened):
     assert transforms()[0] == "translate(0px, 0px) scale(1)"
 
 
-def test_the_free_light_follows_the_pointer_and_shades_as_a_light_of_that_direction_does(opened, results):
+def test_free_light_follows_the_pointer_and_shades_like_a_light_of_that_direction(opened, results):
     page = opened()
     page.click("[data-light=free]")
     box = page.locator(".stage").bounding_box()
@@ -229,7 +229,7 @@ def test_the_free_light_follows_the_pointer_and_shades_as_a_light_of_that_direct
     assert np.abs(pixels(page, ".pane-right canvas")[..., 0] - expected).max() <= 4
 
 
-def test_pointing_at_a_method_shows_its_errors_and_reads_them_out(opened, results):
+def test_hovering_a_method_shows_and_reads_out_its_errors(opened, results):
     page = opened()
     page.hover(".strip button:has-text('MSG-V')")
     assert page.inner_text(".errors-heading") == "Errors of MSG-V"
@@ -248,7 +248,7 @@ def test_pointing_at_a_method_shows_its_errors_and_reads_them_out(opened, result
         assert float(text.split("off by ")[1].split("°")[0]) == pytest.approx(degrees, abs=0.6)
 
 
-def test_the_error_map_is_red_where_the_result_is_farther_and_blue_where_it_is_nearer(opened, results):
+def test_error_map_is_red_where_the_result_is_farther_and_blue_where_it_is_nearer(opened, results):
     page = opened()
     choose(page, "left", "Bicubic")
     page.click("[data-view=error]")
@@ -261,7 +261,7 @@ def test_the_error_map_is_red_where_the_result_is_farther_and_blue_where_it_is_n
     assert "cm" in page.inner_text(".stage-scale") or "mm" in page.inner_text(".stage-scale")
 
 
-def test_depth_is_in_the_colours_of_the_other_pictures_and_the_photo_is_the_photo(opened, results):
+def test_depth_has_the_colours_of_the_other_pictures_and_the_photo_is_unchanged(opened, results):
     page = opened()
     choose(page, "left", "photo")
     photo = run_of(results, "Bicubic").scene(SCENES[0]).rgb.permute(1, 2, 0).numpy() * 255
@@ -298,7 +298,7 @@ def test_rows_are_filtered_by_scene_and_method(opened):
     assert (column(page, 1, 0), column(page, 1, 1)) == (["statue"], ["MSG-V"])
 
 
-def test_published_values_come_and_go(opened):
+def test_published_values_can_be_hidden(opened):
     page = opened()
     assert "*" not in page.inner_text("#tables .tables")
     page.check(".show-published")
@@ -307,7 +307,7 @@ def test_published_values_come_and_go(opened):
     assert "*" not in page.inner_text("#tables .tables")
 
 
-def test_a_scene_of_a_table_opens_in_the_viewer_and_the_address_keeps_it(opened):
+def test_scene_of_a_table_opens_in_the_viewer_and_the_address_keeps_it(opened):
     page = opened()
     page.evaluate("document.querySelectorAll('#tables details').forEach((each) => { each.open = true; })")
     page.locator("#tables .go:has-text('statue')").last.click()
@@ -319,7 +319,7 @@ def test_a_scene_of_a_table_opens_in_the_viewer_and_the_address_keeps_it(opened)
     assert again.inner_text(".name-left") == "MSG-V"
 
 
-def test_another_problem_has_its_own_methods_and_the_same_scene(opened):
+def test_other_setting_has_its_own_methods_and_the_same_scene(opened):
     page = opened()
     page.locator("#scenes select.problem").select_option(index=1)
     page.wait_for_selector(".stage[data-shown=s2]")
@@ -329,7 +329,7 @@ def test_another_problem_has_its_own_methods_and_the_same_scene(opened):
 
 
 @pytest.mark.parametrize(("width", "scheme"), [(360, "light"), (390, "dark")])
-def test_on_a_phone_nothing_is_wider_than_the_screen(opened, width, scheme):
+def test_layout_fits_a_phone(opened, width, scheme):
     page = opened()
     page.set_viewport_size({"width": width, "height": 780})
     page.emulate_media(color_scheme=scheme)
@@ -350,7 +350,7 @@ def test_names_that_are_code_are_shown_and_not_run(opened, results, tmp_path):
     assert page.locator("img").count() == 0
 
 
-def test_a_page_without_pictures_has_its_tables(opened, make_run, tmp_path):
+def test_page_without_pictures_has_its_tables(opened, make_run, tmp_path):
     run = make_run(tmp_path / "run")
     (run / "scenes" / "cube_no_texture.npz").unlink()
     save_page(tmp_path / "index.html", load_results([run]))

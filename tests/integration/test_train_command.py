@@ -126,7 +126,7 @@ def validated(output):
     return [int(line.split()[1]) for line in output.splitlines() if "validation:" in line]
 
 
-def test_a_training_says_what_it_does_and_where_the_weights_are(smoke):
+def test_training_reports_its_plan_and_where_the_weights_are(smoke):
     _, home, done = smoke
     lines = done.stdout.splitlines()
     assert re.fullmatch(r"model  msg_v x4, 326,015 parameters, (float32|bfloat16)", lines[0])
@@ -140,11 +140,11 @@ def test_a_training_says_what_it_does_and_where_the_weights_are(smoke):
     assert lines[8:] == [f"weights: outputs/train/{home.name}/weights.safetensors"]
 
 
-def test_a_training_warns_of_nothing(smoke):
+def test_training_emits_no_warning(smoke):
     assert smoke[2].stderr == ""
 
 
-def test_a_training_writes_everything_that_is_promised_and_nothing_else(smoke):
+def test_training_writes_the_documented_files_and_nothing_else(smoke):
     folder, home, _ = smoke
     assert home.name.startswith("procedural_box_x4_msg_v_")
     [events] = (home / "tensorboard").glob("events.*")
@@ -168,7 +168,7 @@ def test_config_yaml_is_the_resolved_configuration(smoke):
     assert config["loss"] == {"w": "auto"}
 
 
-def test_versions_json_says_what_made_the_weights(smoke):
+def test_versions_json_records_what_made_the_weights(smoke):
     record = json.loads((smoke[1] / "versions.json").read_text())
     assert record["packages"]["torch"] == torch.__version__
     assert record["identity"]["device"] == "cpu"
@@ -176,7 +176,7 @@ def test_versions_json_says_what_made_the_weights(smoke):
     assert "method" not in record["identity"]
 
 
-def test_the_log_has_losses_scores_rates_renderings_and_the_configuration(smoke):
+def test_log_has_losses_scores_rates_renderings_and_the_configuration(smoke):
     home = smoke[1]
     events = events_of(home)
     tags = events.Tags()
@@ -195,14 +195,14 @@ def test_the_log_has_losses_scores_rates_renderings_and_the_configuration(smoke)
     assert "validation_scenes: 1" in text.tensor_proto.string_val[0].decode()
 
 
-def test_the_training_loss_is_the_sum_of_its_terms(smoke):
+def test_training_loss_is_the_sum_of_its_terms(smoke):
     loss, depth, visual = (scalars_of(smoke[1], f"train/{name}") for name in ("loss", "lap1", "mse_v"))
     w = float(smoke[2].stdout.split("lap1 + ")[1].split()[0])
     for step, value in loss.items():
         assert value == pytest.approx(depth[step] + w * visual[step], rel=2e-3)
 
 
-def test_the_same_command_again_is_refused_and_changes_nothing(smoke, within, monkeypatch):
+def test_repeated_command_is_refused_and_changes_nothing(smoke, within, monkeypatch):
     folder, home, _ = smoke
     monkeypatch.chdir(folder)
     before = {name: (home / name).read_bytes() for name in tree(home)}
@@ -224,7 +224,7 @@ def test_overwrite_trains_anew(smoke, tmp_path, within):
     assert len(list((tmp_path / "out" / "tensorboard").glob("events.*"))) == 1
 
 
-def test_an_interrupted_overwrite_leaves_no_weights_of_the_run_before(smoke, tmp_path, within, interrupt):
+def test_interrupted_overwrite_leaves_no_weights_of_the_run_before(smoke, tmp_path, within, interrupt):
     shutil.copytree(smoke[1], tmp_path / "out")
     arguments = (*SMOKE, "output_dir=out", "seed=1")
     interrupt(1)
@@ -237,7 +237,7 @@ def test_an_interrupted_overwrite_leaves_no_weights_of_the_run_before(smoke, tmp
     assert not same_weights(tmp_path / "out", smoke[1])
 
 
-def test_a_directory_of_another_training_is_kept(tmp_path, within, interrupt):
+def test_directory_of_another_training_is_kept(tmp_path, within, interrupt):
     interrupt(1)
     assert within(*SMOKE, "output_dir=out")[0] == 130
     before = tree(tmp_path)
@@ -250,7 +250,7 @@ def test_a_directory_of_another_training_is_kept(tmp_path, within, interrupt):
     assert tree(tmp_path) == before
 
 
-def test_evaluation_takes_the_weights_and_scores_as_the_best_validation_did(smoke, tmp_path, within):
+def test_evaluation_with_the_weights_scores_like_the_best_validation(smoke, tmp_path, within):
     home = smoke[1]
     code, _, errors = within(
         "method=msg_v", f"weights='{home / 'weights.safetensors'}'", "dataset=procedural", "dataset.count=6",
@@ -295,14 +295,14 @@ def test_msg_is_trained_on_depth_alone_and_its_weights_are_those_of_method_msg(t
     assert (code, errors) == (0, [])
 
 
-def test_the_last_steps_are_validated_where_the_interval_does_not_divide_them(tmp_path, within):
+def test_last_steps_are_validated_where_the_interval_does_not_divide_them(tmp_path, within):
     code, output, errors = within(*SMOKE, "trainer.steps=3", "trainer.validate_every=2", "output_dir=out")
     assert (code, errors) == (0, [])
     assert validated(output) == [2, 3]
     assert last_step(tmp_path / "out") == 3
 
 
-def test_mixed_precision_trains_with_losses_as_in_full_precision(smoke, tmp_path, within):
+def test_mixed_precision_losses_are_close_to_full_precision(smoke, tmp_path, within):
     code, _, errors = within(*SMOKE, "precision=bfloat16", "output_dir=out")
     assert (code, errors) == (0, [])
     full, mixed = (scalars_of(home, "train/loss") for home in (smoke[1], tmp_path / "out"))
@@ -339,7 +339,7 @@ USAGE_ERRORS = {
 
 
 @pytest.mark.parametrize("case", USAGE_ERRORS)
-def test_a_usage_error_is_one_line_with_exit_code_2_and_writes_nothing(tmp_path, within, case):
+def test_usage_error_is_one_line_with_exit_code_2_and_writes_nothing(tmp_path, within, case):
     arguments, start = USAGE_ERRORS[case]
     (tmp_path / "file").write_text("no directory")
     (tmp_path / "foreign").mkdir()
@@ -352,7 +352,7 @@ def test_a_usage_error_is_one_line_with_exit_code_2_and_writes_nothing(tmp_path,
     assert not (tmp_path / "outputs").exists()
 
 
-def test_the_help_lists_the_choices(within):
+def test_help_lists_the_choices(within):
     code, output, errors = within("--help")
     assert (code, errors) == (0, [])
     noises = "noise: gaussian_multiplicative, kinect, none, tof"
@@ -360,7 +360,7 @@ def test_the_help_lists_the_choices(within):
         assert line in output
 
 
-def test_an_interrupted_training_goes_on_to_the_very_weights_of_an_uninterrupted_one(tmp_path, within, interrupt):
+def test_interrupted_training_gives_bit_identical_weights(tmp_path, within, interrupt):
     code, output, errors = within(*FOUR[:-1], "output_dir=whole")
     assert (code, errors) == (0, [])
     assert validated(output) == [2, 4]
@@ -382,7 +382,7 @@ def test_an_interrupted_training_goes_on_to_the_very_weights_of_an_uninterrupted
         assert scalars_of(tmp_path / "out", tag) == scalars_of(tmp_path / "whole", tag), tag
 
 
-def test_a_training_goes_on_from_its_last_validation_even_if_that_was_not_its_best(
+def test_training_resumes_from_its_last_validation_even_if_it_was_not_the_best(
     tmp_path, within, interrupt, monkeypatch
 ):
     scores = iter([0.1, 0.2, 0.3])
@@ -406,7 +406,7 @@ def test_a_training_goes_on_from_its_last_validation_even_if_that_was_not_its_be
     assert all(torch.equal(value, best["state_dict"][f"average.{name}"]) for name, value in weights.items())
 
 
-def test_a_training_that_lacks_only_its_weights_file_gets_it(smoke, tmp_path, within):
+def test_training_that_lacks_only_its_weights_file_gets_it(smoke, tmp_path, within):
     code, _, _ = within(*SMOKE, "output_dir=out")
     assert code == 0
     (tmp_path / "out" / "weights.safetensors").unlink()
@@ -431,7 +431,7 @@ def running(tmp_path, environment, *arguments):
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_an_interruption_exits_with_130_saves_the_very_step_and_says_how_to_go_on(tmp_path, environment, number):
+def test_interruption_exits_with_130_saves_its_step_and_says_how_to_resume(tmp_path, environment, number):
     with running(tmp_path, environment, "trainer.steps=500", "trainer.validate_every=3") as process:
         process.send_signal(number)
         _, errors = process.communicate(timeout=60)
@@ -442,9 +442,7 @@ def test_an_interruption_exits_with_130_saves_the_very_step_and_says_how_to_go_o
     assert errors == f"{interrupted(step)}\n"
 
 
-def test_resume_goes_on_from_any_step_to_the_very_weights_of_an_uninterrupted_run(
-    tmp_path, within, monkeypatch, interrupt
-):
+def test_resume_from_any_step_gives_bit_identical_weights(tmp_path, within, monkeypatch, interrupt):
     arguments = (*SMOKE, "trainer.steps=6", "trainer.validate_every=2", "trainer.accumulate=2")
     assert within(*arguments, "output_dir=whole")[0] == 0
     end = trainer_module.Interruption.on_train_batch_end
@@ -468,7 +466,7 @@ def test_resume_goes_on_from_any_step_to_the_very_weights_of_an_uninterrupted_ru
         assert scalars_of(tmp_path / "out", tag) == scalars_of(tmp_path / "whole", tag), tag
 
 
-def test_a_killed_run_goes_on_to_the_very_weights_of_an_uninterrupted_one(tmp_path, within, environment):
+def test_killed_run_resumes_to_bit_identical_weights(tmp_path, within, environment):
     many = ("trainer.steps=24", "trainer.validate_every=4")
     with running(tmp_path, environment, *many) as process:
         process.kill()
@@ -507,7 +505,7 @@ def means_of(folder):
     return json.loads((folder / "summary.json").read_text())["mean"]
 
 
-def test_evaluating_a_run_gives_the_very_scores_that_training_logged(tmp_path, within):
+def test_evaluation_of_a_run_gives_the_scores_that_training_logged(tmp_path, within):
     code, _, errors = within(
         *SMOKE, "trainer.validate_every=2", "trainer.validation_scenes=2", "output_dir=out",
         "noise=gaussian_multiplicative", "noise.std=0.01", "seed=3",
@@ -524,7 +522,7 @@ def test_evaluating_a_run_gives_the_very_scores_that_training_logged(tmp_path, w
         assert {row["downsampling"] for row in csv.DictReader(file)} == {"box+gaussian_multiplicative-0.01"}
 
 
-def test_evaluating_a_run_on_another_data_set_keeps_its_problem(smoke, tmp_path, within):
+def test_evaluation_of_a_run_on_another_dataset_keeps_its_setting(smoke, tmp_path, within):
     code, _, errors = within(
         f"run='{smoke[1]}'", "dataset=procedural", "dataset.count=1", "dataset.size=64", "metrics.lpips=false",
         "output_dir=scores", name="eval",
@@ -541,14 +539,14 @@ def test_evaluating_a_run_on_another_data_set_keeps_its_problem(smoke, tmp_path,
         (["run={run}", "scale=8"], "scale: run={run} says it itself; leave one of them out"),
     ],
 )
-def test_a_run_that_cannot_be_evaluated_is_refused(smoke, tmp_path, within, arguments, message):
+def test_run_that_cannot_be_evaluated_is_refused(smoke, tmp_path, within, arguments, message):
     run = tmp_path / "run"
     shutil.copytree(smoke[1], run)
     code, output, errors = within(*(each.format(run=run) for each in arguments), "metrics.lpips=false", name="eval")
     assert (code, output, errors) == (2, "", [f"error: {message.format(run=run)}"])
 
 
-def test_an_unfinished_run_cannot_be_evaluated(tmp_path, within, interrupt):
+def test_unfinished_run_cannot_be_evaluated(tmp_path, within, interrupt):
     interrupt(1)
     assert within(*SMOKE, "output_dir=out")[0] == 130
     code, _, errors = within("run=out", "metrics.lpips=false", name="eval")
@@ -579,7 +577,7 @@ def test_mixtures_train_on_all_parts_and_validate_with_each(tmp_path, within):
         assert means_of(tmp_path / "scores" / kind)["RMSE_v"] == pytest.approx(scores[f"val_{kind}", "RMSE_v"], 1e-14)
 
 
-def test_another_data_set_validates_beside_the_held_out_scenes(tmp_path, within):
+def test_other_dataset_validates_beside_the_held_out_scenes(tmp_path, within):
     code, output, errors = within(
         *SMOKE, "output_dir=out", "+dataset@validation.mine=procedural", "validation.mine.count=1",
         "validation.mine.size=64", "validation.mine.seed=9",
@@ -589,7 +587,7 @@ def test_another_data_set_validates_beside_the_held_out_scenes(tmp_path, within)
     assert ("val_mine", "DSSIM_v") in validation_of(tmp_path / "out")
 
 
-def test_data_sets_to_evaluate_on_are_not_trained_on(within, tmp_path):
+def test_evaluation_datasets_are_not_trained_on(within, tmp_path):
     code, _, errors = within("trainer=smoke", "dataset=simgeo", "metrics.lpips=false", "output_dir=out")
     assert (code, errors) == (2, [
         "error: dataset=simgeo: its scenes are to evaluate on, not to train on; "
@@ -598,7 +596,7 @@ def test_data_sets_to_evaluate_on_are_not_trained_on(within, tmp_path):
     assert not (tmp_path / "out").exists()
 
 
-def test_a_training_starts_from_given_weights(smoke, tmp_path, within):
+def test_training_starts_from_given_weights(smoke, tmp_path, within):
     weights = smoke[1] / "weights.safetensors"
     rate = "trainer.learning_rate=1e-12"
     code, _, errors = within(*SMOKE, f"trainer.init='{weights}'", rate, "output_dir=out")
@@ -612,7 +610,7 @@ def test_a_training_starts_from_given_weights(smoke, tmp_path, within):
     assert (code, errors) == (2, ["error: trainer.init: nowhere: no such weights file"])
 
 
-def test_a_network_that_fits_any_scale_starts_from_weights_of_another(tmp_path, within):
+def test_network_that_fits_any_scale_starts_from_weights_of_another(tmp_path, within):
     small = ("model=dg", "model.stages=1", "model.filters=4", "model.size=3")
     assert within(*SMOKE, *small, "output_dir=four")[0] == 0
     weights = "trainer.init=four/weights.safetensors"
@@ -627,7 +625,7 @@ def test_a_network_that_fits_any_scale_starts_from_weights_of_another(tmp_path, 
     assert "expected weights of DynamicGuidance" in errors[0]
 
 
-def test_a_network_that_depends_on_the_scale_refuses_weights_of_another(smoke, within):
+def test_network_that_depends_on_the_scale_refuses_weights_of_another(smoke, within):
     code, _, errors = within(*SMOKE, "scale=8", f"trainer.init='{smoke[1]}/weights.safetensors'", "output_dir=other")
     assert code == 2
     assert errors[0].endswith("weights are for scale 4, the run is at scale 8, where MSGNet has other parameters")
@@ -661,7 +659,7 @@ def test_two_devices_train_as_one_with_twice_the_batch(tmp_path, within, environ
     )
 
 
-def test_the_table_of_runs_has_the_settings_and_the_scores(smoke):
+def test_table_of_runs_has_the_settings_and_the_scores(smoke):
     assert not any("epoch" in tag for tag in events_of(smoke[1]).Tags()["scalars"])
     hparams = yaml.safe_load((smoke[1] / "tensorboard" / "hparams.yaml").read_text())
     assert (hparams["model"], hparams["scale"], hparams["steps"], hparams["loss"]) == ("msg_v", 4, 2, "lap1")

@@ -67,7 +67,7 @@ def files_in(folder):
     return {str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file()}
 
 
-def test_two_files_are_enough_and_everything_assumed_is_said(pair, cube, tmp_path, capsys):
+def test_two_files_are_enough_and_all_assumptions_are_printed(pair, cube, tmp_path, capsys):
     out = tmp_path / "out"
     assert of(pair, out) == 0
     said = capsys.readouterr().out
@@ -104,7 +104,7 @@ def test_two_files_are_enough_and_everything_assumed_is_said(pair, cube, tmp_pat
     ("suffix", "factor", "dtype"),
     [("tiff", 1, "f4"), ("npy", 1000, "f4"), ("pfm", 1, "f4"), ("exr", 1, "f4"), ("npz", 1, "f8")],
 )
-def test_the_result_is_in_the_input_s_format_type_unit_and_holes(pair, tmp_path, suffix, factor, dtype):
+def test_result_has_the_inputs_format_type_unit_and_holes(pair, tmp_path, suffix, factor, dtype):
     photo, _, values = pair
     metres = np.where(values == 0, np.nan, values / 1000)
     depth = tmp_path / f"d.{suffix}"
@@ -120,7 +120,7 @@ def test_the_result_is_in_the_input_s_format_type_unit_and_holes(pair, tmp_path,
     assert 0 < np.isnan(stored).mean() < 0.1
 
 
-def test_another_format_is_in_metres_or_in_whole_millimetres(pair, tmp_path):
+def test_other_format_is_in_metres_or_whole_millimetres(pair, tmp_path):
     out = tmp_path / "out"
     assert of(pair, out, *DEPTH_ONLY, "--format", "pfm", "--depth-unit", "cm") == 0
     assert files_in(out) == {"depth.pfm", "depth_metres.npy", "info.json"}
@@ -128,7 +128,7 @@ def test_another_format_is_in_metres_or_in_whole_millimetres(pair, tmp_path):
     assert np.median(np.load(out / "depth_metres.npy")) > 10
 
 
-def test_holes_are_filled_unless_they_are_to_be_kept(pair, tmp_path):
+def test_holes_are_filled_unless_kept_on_request(pair, tmp_path):
     assert of(pair, tmp_path / "filled", *DEPTH_ONLY) == 0
     assert of(pair, tmp_path / "kept", *DEPTH_ONLY, "--keep-holes") == 0
     filled, kept = (np.asarray(Image.open(tmp_path / name / "depth.png")) for name in ("filled", "kept"))
@@ -136,7 +136,7 @@ def test_holes_are_filled_unless_they_are_to_be_kept(pair, tmp_path):
     assert (kept[22:26, 14:22] == 0).all()
 
 
-def test_a_mask_makes_holes(pair, tmp_path):
+def test_mask_makes_holes(pair, tmp_path):
     mask = np.full((16, 16), 255, np.uint8)
     mask[:, 10:] = 0
     Image.fromarray(mask).save(tmp_path / "mask.png")
@@ -145,7 +145,7 @@ def test_a_mask_makes_holes(pair, tmp_path):
     assert set(info(tmp_path / "out")["inputs"]) == {"rgb", "depth", "mask"}
 
 
-def test_a_disparity_becomes_a_finer_disparity_of_the_finer_pixels(pair, cube, tmp_path):
+def test_disparity_becomes_disparity_of_the_high_resolution_pixels(pair, cube, tmp_path):
     coarse = cube.depth.reshape(16, 4, 16, 4).mean((1, 3))
     depth = tmp_path / "disparity.npy"
     np.save(depth, (0.1 * cube.camera.fx / 4 / coarse).astype(np.float32))
@@ -157,7 +157,7 @@ def test_a_disparity_becomes_a_finer_disparity_of_the_finer_pixels(pair, cube, t
     np.testing.assert_allclose(np.load(out / "depth.npy"), 0.1 * cube.camera.fx / metres, rtol=1e-5)
 
 
-def test_the_same_command_again_does_nothing_and_another_part_needs_no_new_depth(pair, tmp_path, capsys, monkeypatch):
+def test_repeated_command_does_nothing_and_new_outputs_need_no_new_depth(pair, tmp_path, capsys, monkeypatch):
     out = tmp_path / "out"
     assert of(pair, out, *DEPTH_ONLY) == 0
     times = {name: (out / name).stat().st_mtime_ns for name in files_in(out)}
@@ -175,7 +175,7 @@ def test_the_same_command_again_does_nothing_and_another_part_needs_no_new_depth
     assert "photo: complete already" in capsys.readouterr().out
 
 
-def test_a_result_of_other_settings_or_inputs_is_kept_unless_told_otherwise(pair, tmp_path, capsys):
+def test_result_of_other_settings_or_inputs_is_kept_unless_overwritten(pair, tmp_path, capsys):
     out = tmp_path / "out"
     assert of(pair, out, *DEPTH_ONLY) == 0
     before = (out / "depth.png").read_bytes()
@@ -189,7 +189,7 @@ def test_a_result_of_other_settings_or_inputs_is_kept_unless_told_otherwise(pair
     assert files_in(out) == {"depth.npy", "depth_metres.npy", "info.json"} - {"depth_metres.npy"}
 
 
-def test_an_interrupted_run_goes_on(pair, tmp_path, capsys, monkeypatch):
+def test_interrupted_run_resumes(pair, tmp_path, capsys, monkeypatch):
     out = tmp_path / "out"
 
     def interrupt(*_):
@@ -204,7 +204,7 @@ def test_an_interrupted_run_goes_on(pair, tmp_path, capsys, monkeypatch):
     assert info(out)["complete"] is True
 
 
-def test_a_result_overwrites_neither_its_input_nor_files_of_others(pair, tmp_path, capsys):
+def test_result_overwrites_neither_its_input_nor_foreign_files(pair, tmp_path, capsys):
     assert "depth.png: the result would overwrite its input" in refused(capsys, of(pair, tmp_path, *DEPTH_ONLY))
     assert "the result would overwrite its input" in refused(capsys, of(pair, tmp_path, *DEPTH_ONLY, "--overwrite"))
     out = tmp_path / "out"
@@ -216,7 +216,7 @@ def test_a_result_overwrites_neither_its_input_nor_files_of_others(pair, tmp_pat
     assert files_in(out) == {"mesh.ply", "info.json"}
 
 
-def test_of_three_pictures_a_broken_one_does_not_stop_the_others(pair, tmp_path, capsys):
+def test_broken_picture_does_not_stop_the_others(pair, tmp_path, capsys):
     frames = tmp_path / "frames"
     for number in range(3):
         for kind, path in (("rgb", pair[0]), ("depth", pair[1])):
@@ -245,7 +245,7 @@ def test_of_three_pictures_a_broken_one_does_not_stop_the_others(pair, tmp_path,
     assert f"3 pictures: 2 complete already, 1 done -> {out}" in capsys.readouterr().out
 
 
-def test_the_published_scenes_are_read_with_their_cameras(shared, tmp_path, capsys):
+def test_published_scenes_are_read_with_their_cameras(shared, tmp_path, capsys):
     assert upsample(shared / "scenes", "-o", tmp_path / "out", "--dry-run") == 0
     said = capsys.readouterr().out
     assert "3 pairs of photo and depth map\n  camera: camera.json beside the pictures\n" in said
@@ -269,7 +269,7 @@ def test_the_published_scenes_are_read_with_their_cameras(shared, tmp_path, caps
         (("some_folder",), "expected --rgb and --depth, or folders that hold both"),
     ],
 )
-def test_arguments_that_cannot_be_are_refused_in_one_line(pair, tmp_path, capsys, arguments, message):
+def test_invalid_arguments_are_refused_in_one_line(pair, tmp_path, capsys, arguments, message):
     assert message in refused(capsys, of(pair, tmp_path / "out", *BICUBIC, *arguments))
     assert not (tmp_path / "out").exists()
 
@@ -300,7 +300,7 @@ def test_pictures_that_do_not_fit_each_other_are_refused_in_one_line(pair, tmp_p
     assert not (tmp_path / "out").exists()
 
 
-def test_the_help_comes_without_loading_what_computes():
+def test_help_loads_nothing_heavy():
     code = "import sys, dsr.cli; sys.argv[1:] = ['upsample', '-h']\ntry: dsr.cli.main()\nexcept SystemExit: pass\n"
     code += "print(sorted({'torch', 'cv2', 'matplotlib', 'scipy', 'PIL'} & sys.modules.keys()))"
     done = subprocess.run(
@@ -315,7 +315,7 @@ def test_the_help_comes_without_loading_what_computes():
     assert done.stdout.endswith("[]\n")
 
 
-def test_depth_that_was_enlarged_by_repeating_pixels_is_as_good_as_before(pair, tmp_path, capsys):
+def test_enlarged_depth_gives_as_good_a_result(pair, tmp_path, capsys):
     photo, _, values = pair
     Image.fromarray(values.repeat(4, axis=0).repeat(4, axis=1)).save(tmp_path / "enlarged.png")
     assert of(pair, tmp_path / "small", *DEPTH_ONLY) == 0
@@ -328,7 +328,7 @@ def test_depth_that_was_enlarged_by_repeating_pixels_is_as_good_as_before(pair, 
     np.testing.assert_array_equal(small, large)
 
 
-def test_noisy_depth_gets_the_network_that_was_trained_on_it(cube, tmp_path, capsys):
+def test_noisy_depth_gets_the_network_trained_on_noise(cube, tmp_path, capsys):
     coarse = cube.depth.reshape(16, 4, 16, 4).mean((1, 3))
     noise = np.random.default_rng(0).normal(size=coarse.shape)
     np.save(tmp_path / "noisy.npy", coarse * (1 + 0.01 * noise))

@@ -113,7 +113,7 @@ def label_of(key, trial, rank):
     return key.trials[trial["scene"]].candidates[trial[rank]].label
 
 
-def test_from_the_first_choice_to_the_table(visit, study, tmp_path, capsys):
+def test_study_runs_from_the_first_choice_to_the_table(visit, study, tmp_path, capsys):
     mouse = visit().begin()
     mouse.tile(2).click()
     mouse.tile(3).click()
@@ -174,7 +174,7 @@ def test_keys_choose_undo_and_go_on_and_back(visit):
     assert somebody.ranks() == [None, "2"]
 
 
-def test_the_tab_key_reaches_pictures_and_enter_chooses_them(visit):
+def test_tab_key_reaches_pictures_and_enter_chooses_them(visit):
     somebody = visit().begin()
     for number in (1, 2):
         somebody.press("Tab", "Enter")
@@ -195,7 +195,7 @@ def test_clicking_a_choice_again_undoes_it(visit):
     assert somebody.page.locator("#undo").is_disabled()
 
 
-def test_the_space_bar_held_shows_the_original_everywhere_and_a_long_press_in_one_place(visit):
+def test_space_bar_held_shows_the_original_everywhere_and_a_long_press_in_one_place(visit):
     somebody = visit().begin()
     original, *others = somebody.pictures()
     assert original not in others
@@ -212,7 +212,7 @@ def test_the_space_bar_held_shows_the_original_everywhere_and_a_long_press_in_on
     assert somebody.ranks() == [None, None]
 
 
-def test_all_pictures_are_of_one_size_and_zoom_and_move_together(visit):
+def test_pictures_have_one_size_and_zoom_and_move_together(visit):
     somebody = visit().begin()
     script = """() => [...document.querySelectorAll('#grid .view')].map(view => {
         const [box, image] = [view, view.firstElementChild].map(each => each.getBoundingClientRect());
@@ -239,7 +239,7 @@ def test_all_pictures_are_of_one_size_and_zoom_and_move_together(visit):
 
 
 @pytest.mark.parametrize("options", [PHONE, LANDSCAPE], ids=["phone", "landscape"])
-def test_nothing_is_wider_than_the_window_and_no_picture_covers_another(visit, options):
+def test_layout_fits_the_window_without_overlaps(visit, options):
     somebody = visit(**options)
     for step in (lambda: None, somebody.begin, somebody.answer_rest):
         step()
@@ -250,7 +250,7 @@ def test_nothing_is_wider_than_the_window_and_no_picture_covers_another(visit, o
             assert beside or one["y"] + one["height"] <= other["y"]
 
 
-def test_a_window_without_storage_is_told_once_and_works(visit, tmp_path):
+def test_window_without_storage_is_reported_once_and_works(visit, tmp_path):
     somebody = visit()
     script = "Object.defineProperty(window, 'localStorage', {get() { throw new DOMException('no'); }})"
     somebody.context.add_init_script(script)
@@ -267,7 +267,7 @@ DAMAGES = ("'{'", "'null'", *(f"JSON.stringify({{...person, started: 'x', {part}
 )))  # fmt: skip
 
 
-def test_what_somebody_damaged_in_the_storage_does_not_stop_the_page(visit):
+def test_damaged_storage_does_not_stop_the_page(visit):
     somebody = visit()
     for damage in DAMAGES:
         somebody.page.evaluate(f"localStorage.setItem(STORE, {damage})")
@@ -275,7 +275,7 @@ def test_what_somebody_damaged_in_the_storage_does_not_stop_the_page(visit):
         assert somebody.page.locator("#welcome").is_visible(), damage
 
 
-def test_another_person_starts_anew_and_answers_are_not_dropped_unasked(visit, tmp_path):
+def test_next_person_starts_anew_and_answers_are_not_dropped_unasked(visit, tmp_path):
     somebody = visit().begin()
     somebody.answer_rest()
     said = []
@@ -291,7 +291,7 @@ def test_another_person_starts_anew_and_answers_are_not_dropped_unasked(visit, t
     assert first["study"] == second["study"]
 
 
-def test_a_change_of_mind_after_the_last_scene_is_in_the_file(visit, tmp_path):
+def test_changed_choice_after_the_last_scene_is_in_the_file(visit, tmp_path):
     somebody = visit().begin()
     somebody.answer_rest()
     before = somebody.save(tmp_path / "before.json")
@@ -303,7 +303,7 @@ def test_a_change_of_mind_after_the_last_scene_is_in_the_file(visit, tmp_path):
     assert after["trials"][:-1] == before["trials"][:-1]
 
 
-def test_one_person_is_always_shown_the_same_order_and_of_many_each_is_as_frequent_as_chance_has_it(visit):
+def test_order_is_fixed_for_a_person_and_uniform_over_many(visit):
     page = visit().page
     plans = page.evaluate("['p1', 'p2', 'p3', 'p1'].map(person => JSON.stringify(planFor(person)))")
     assert plans[0] == plans[3]

@@ -27,14 +27,14 @@ def _means(x: Tensor, scale: int) -> np.ndarray:
 
 @pytest.mark.parametrize(("scale", "size"), [(2, (10, 6)), (4, (32, 48)), (8, (8, 24)), (16, (16, 16))])
 @pytest.mark.parametrize("doffs", [0.0, 2.5])
-def test_block_means_of_disparity_are_the_input(scale: int, size: tuple[int, int], doffs: float) -> None:
+def test_diffusion_keeps_the_block_means_of_disparity(scale: int, size: tuple[int, int], doffs: float) -> None:
     sample = sample_of(*random_scene(*size), scale=scale, doffs=doffs)
     fine = AnisotropicDiffusion(steps=60)(sample)
     assert fine.shape == (1, *size)
     np.testing.assert_allclose(_means(disparity_of(fine, sample), scale), _coarse(sample), rtol=1e-9)
 
 
-def test_a_map_is_what_a_plain_loop_over_pixels_makes_of_it() -> None:
+def test_diffusion_equals_a_plain_loop_over_pixels() -> None:
     disparity, rgb = random_scene(16, 16)
     sample = sample_of(disparity, rgb)
     method = AnisotropicDiffusion(steps=20, edge=0.2, depth_weight=0.0, border=0)
@@ -66,21 +66,21 @@ def _plain(x: np.ndarray, rgb: np.ndarray, coarse: np.ndarray, *, steps: int, ed
 
 
 @pytest.mark.parametrize("scale", [2, 4, 8])
-def test_a_plane_is_reproduced_within_three_ten_thousandths_of_its_range(scale: int) -> None:
+def test_diffusion_reproduces_a_plane_within_three_ten_thousandths_of_its_range(scale: int) -> None:
     disparity = plane()
     sample = sample_of(disparity, scale=scale)
     error = (disparity_of(AnisotropicDiffusion()(sample), sample) - disparity).abs().max()
     assert error < 3e-4 * (disparity.max() - disparity.min())
 
 
-def test_without_a_border_a_plane_is_bent_along_the_images_edge() -> None:
+def test_plane_is_bent_along_the_image_border_without_padding() -> None:
     disparity = plane()
     sample = sample_of(disparity)
     error = (disparity_of(AnisotropicDiffusion(border=0)(sample), sample) - disparity).abs()
     assert error[:, :2].max() > 10 * error[12:20, 20:28].max()
 
 
-def test_a_step_stays_sharp_along_an_edge_of_the_photo_and_is_smooth_without_one() -> None:
+def test_step_stays_sharp_along_a_photo_edge_and_is_smooth_without_one() -> None:
     disparity, rgb = step()
     sharp, smooth = (
         disparity_of(AnisotropicDiffusion(depth_weight=0.0, edge=0.01)(sample), sample)
@@ -90,7 +90,7 @@ def test_a_step_stays_sharp_along_an_edge_of_the_photo_and_is_smooth_without_one
     assert (smooth - disparity).abs().max() > 0.5
 
 
-def test_a_hole_is_filled_from_the_side_that_the_photo_shows_it_on() -> None:
+def test_hole_is_filled_from_the_side_of_the_photo_edge_that_it_lies_on() -> None:
     disparity, rgb = step(64, 32)
     sample = sample_of(disparity, rgb)
     sample.depth_lr[:, 4:10, 5:8] = torch.nan
@@ -100,7 +100,7 @@ def test_a_hole_is_filled_from_the_side_that_the_photo_shows_it_on() -> None:
     np.testing.assert_allclose(_means(fine, 4)[known], _coarse(sample)[known], rtol=1e-9)
 
 
-def test_a_single_known_pixel_fills_the_map() -> None:
+def test_single_valid_pixel_fills_the_map() -> None:
     sample = sample_of(torch.full((8, 8), 5.0).double())
     sample.depth_lr[:, 1:] = torch.nan
     sample.depth_lr[:, :, 1:] = torch.nan
@@ -108,7 +108,7 @@ def test_a_single_known_pixel_fills_the_map() -> None:
     np.testing.assert_allclose(fine.numpy(), 5.0, rtol=1e-6)
 
 
-def test_it_stops_where_the_map_moves_no_longer_and_more_steps_change_little() -> None:
+def test_iteration_stops_at_convergence_and_more_steps_change_little() -> None:
     sample = sample_of(*random_scene(32, 48))
     coarse, rgb = torch.from_numpy(_coarse(sample))[None, None], sample.rgb[None]
     early = AnisotropicDiffusion(edge=0.3, depth_weight=0.0).diffused(rgb, coarse, 4)
@@ -119,7 +119,7 @@ def test_it_stops_where_the_map_moves_no_longer_and_more_steps_change_little() -
     assert (early.values - late.values).abs().max() < 1e-3 * 6
 
 
-def test_a_batch_is_what_its_samples_are_one_at_a_time() -> None:
+def test_batch_equals_its_samples_one_at_a_time() -> None:
     maps, photos = zip(*(random_scene(16, 24, seed) for seed in (1, 2)), strict=True)
     coarse = torch.stack([torch.from_numpy(_means(each, 4)) for each in maps])[:, None]
     method = AnisotropicDiffusion(steps=100, tolerance=0.0)
@@ -129,7 +129,7 @@ def test_a_batch_is_what_its_samples_are_one_at_a_time() -> None:
         torch.testing.assert_close(together[number], alone, rtol=1e-5, atol=0)
 
 
-def test_twice_the_same_is_the_same_and_the_truth_is_not_looked_at() -> None:
+def test_result_is_deterministic_and_independent_of_the_truth() -> None:
     sample = sample_of(*random_scene(16, 24))
     first = AnisotropicDiffusion(steps=100)(sample)
     assert sample.depth is not None
@@ -137,7 +137,7 @@ def test_twice_the_same_is_the_same_and_the_truth_is_not_looked_at() -> None:
     assert torch.equal(first, AnisotropicDiffusion(steps=100)(sample))
 
 
-def test_progress_ends_at_the_most_steps_that_it_may_take() -> None:
+def test_progress_ends_at_the_maximum_number_of_steps() -> None:
     told: list[tuple[int, int]] = []
     AnisotropicDiffusion(steps=120, tolerance=0.0)(
         sample_of(*random_scene(8, 8)), lambda done, most: told.append((done, most))
@@ -149,6 +149,6 @@ def test_progress_ends_at_the_most_steps_that_it_may_take() -> None:
     ("key", "value"),
     [("steps", 0), ("tolerance", -1.0), ("step", 0.3), ("edge", 0.0), ("depth_weight", -1.0), ("border", -1)],
 )
-def test_a_value_out_of_range_is_refused_by_name(key: str, value: float) -> None:
+def test_value_out_of_range_is_refused_by_name(key: str, value: float) -> None:
     with pytest.raises(ValueError, match=rf"^{key}: expected .*, got {value}"):
         AnisotropicDiffusion(**{key: value})  # type: ignore[arg-type]

@@ -44,7 +44,7 @@ def _points(scene: Scene) -> Tensor:
 
 
 @pytest.mark.parametrize("turns", [0, 1, 2, 3])
-def test_points_of_a_turned_scene_are_the_turned_points(turns: int) -> None:
+def test_turned_scene_has_the_turned_points(turns: int) -> None:
     expected = _points(_scene()).rot90(turns, (-2, -1))
     for _ in range(turns):
         expected = _quarter(expected)
@@ -52,7 +52,7 @@ def test_points_of_a_turned_scene_are_the_turned_points(turns: int) -> None:
 
 
 @pytest.mark.parametrize("turns", [0, 1, 2, 3])
-def test_a_turned_plane_has_the_turned_normal_and_is_lit_by_it(turns: int) -> None:
+def test_turned_plane_has_the_turned_normal_and_is_lit_by_it(turns: int) -> None:
     normal = torch.tensor([0.3, -0.4, -1.0], dtype=torch.float64)[:, None, None]
     depth = -2.0 / (normal * CAMERA.rays()).sum(dim=0, keepdim=True)
     shown = _normals(rotate90(Scene("set", "plane", torch.rand(3, 23, 31), CAMERA, depth), turns))
@@ -66,7 +66,7 @@ def test_a_turned_plane_has_the_turned_normal_and_is_lit_by_it(turns: int) -> No
     assert float((render(shown[None])[0] - lit).abs()[:, known].max()) < 1e-9
 
 
-def test_four_quarter_turns_and_two_mirrors_lead_back() -> None:
+def test_four_quarter_turns_and_two_mirrors_restore_the_scene() -> None:
     scene = _scene()
     there = rotate90(rotate90(rotate90(rotate90(scene, 1), 1), 1), 1)
     twice = mirror(mirror(scene, vertical=True), vertical=True)
@@ -82,20 +82,20 @@ def test_four_quarter_turns_and_two_mirrors_lead_back() -> None:
 
 
 @pytest.mark.parametrize("vertical", [False, True])
-def test_points_of_a_mirrored_scene_are_the_mirrored_points(vertical: bool) -> None:
+def test_mirrored_scene_has_the_mirrored_points(vertical: bool) -> None:
     sign = torch.tensor([1.0, -1.0, 1.0] if vertical else [-1.0, 1.0, 1.0], dtype=torch.float64)[:, None, None]
     expected = sign * _points(_scene()).flip(-2 if vertical else -1)
     shown = _points(mirror(_scene(), vertical=vertical))
     torch.testing.assert_close(shown, expected, rtol=0, atol=1e-12, equal_nan=True)
 
 
-def test_a_window_shows_the_points_of_its_pixels() -> None:
+def test_window_has_the_points_of_its_pixels() -> None:
     cut = _scene().crop(4, 6, 16, 16)
     torch.testing.assert_close(_points(cut), _points(_scene())[:, 4:20, 6:22], rtol=0, atol=1e-12, equal_nan=True)
     assert torch.equal(cut.rgb, _scene().rgb[:, 4:20, 6:22])
 
 
-def test_the_factor_that_comes_with_a_varied_scene_is_that_of_its_depth() -> None:
+def test_factor_of_a_varied_scene_is_that_of_its_depth() -> None:
     vary, random, factors = (
         Augmentation(flip=False, rotate=False, depth_scale=0.5, colour=0.0),
         np.random.default_rng(0),
@@ -111,7 +111,7 @@ def test_the_factor_that_comes_with_a_varied_scene_is_that_of_its_depth() -> Non
     assert np.mean(factors) == pytest.approx(0, abs=0.07)
 
 
-def test_without_any_variation_a_scene_stays_as_it_is() -> None:
+def test_scene_without_variation_is_unchanged() -> None:
     scene, factor = Augmentation(flip=False, rotate=False, depth_scale=0.0, colour=0.0)(
         _scene(), np.random.default_rng(0)
     )
@@ -121,6 +121,6 @@ def test_without_any_variation_a_scene_stays_as_it_is() -> None:
 
 
 @pytest.mark.parametrize("changes", [{"depth_scale": -0.1}, {"depth_scale": 3.1}, {"colour": float("nan")}])
-def test_a_variation_that_cannot_be_is_refused(changes: dict[str, Any]) -> None:
+def test_invalid_variation_is_refused(changes: dict[str, Any]) -> None:
     with pytest.raises(ValueError, match=rf"^{next(iter(changes))}: expected 0 (or more|to 3), got"):
         Augmentation(**changes)

@@ -61,50 +61,50 @@ def refusal(keys, group="dataset", given=None):
     return str(caught.value)
 
 
-def test_the_keys_of_a_group_are_the_arguments_of_its_target():
+def test_group_keys_are_the_arguments_of_the_target():
     toy = build("dataset", node(root="r", names=["a"], share=0.25, count=3, order="far", flag=True, file="f"))
     assert toy.values == ("r", ["a"], 0.25, 3, "far", True, "f")
 
 
-def test_a_name_reaches_a_target_that_takes_one(tmp_path):
+def test_name_is_passed_to_a_target_that_takes_one(tmp_path):
     (tmp_path / "scene").mkdir()
     node = {"name": "mine", "target": "dsr.data.folder.Folder", "root": str(tmp_path)}
     assert build("dataset", node).name == "mine"
 
 
-def test_what_describes_a_group_does_not_reach_the_target():
+def test_descriptive_keys_are_not_passed_to_the_target():
     build("method", node(root="r", label="Toy", weights_file="x", weights_source="y"))
 
 
-def test_a_function_without_arguments_may_be_a_target():
+def test_target_may_be_a_function_without_arguments():
     assert build("method", {"name": "f", "target": "toy_home.no_arguments"}) == "built"
 
 
-def test_the_target_gets_those_values_of_the_run_that_it_names():
+def test_target_gets_the_run_values_that_it_names():
     assert build("method", node(root="r"), {"scale": 8, "device": "cpu"}).scale == 8
     assert takes("method", node(), "scale")
     assert not takes("method", node(), "device")
 
 
-def test_an_unknown_key_is_refused_with_the_keys_there_are():
+def test_unknown_key_is_refused_with_the_known_keys():
     message = refusal(node(root="r", rot="x"))
     assert message == (
         "dataset.rot: unknown key; dataset=toy takes root, names, share, count, order, scale, flag, file"
     )
 
 
-def test_a_value_of_the_run_cannot_be_given_in_the_group():
+def test_group_may_not_set_a_value_of_the_run():
     message = refusal(node(root="r", scale=2), given={"scale": 4})
     assert message.startswith("dataset.scale: unknown key")
     assert "scale" not in message.split("takes")[1]
 
 
-def test_a_target_without_arguments_says_that_it_takes_none():
+def test_target_without_arguments_refuses_every_key():
     message = refusal({"name": "f", "target": "toy_home.no_arguments", "x": 1}, "method")
     assert message == "method.x: unknown key; method=f takes none"
 
 
-def test_a_missing_key_is_refused_with_how_to_give_it():
+def test_missing_key_is_refused_with_how_to_set_it():
     assert refusal(node(root="???")) == "dataset.root: dataset=toy needs it: dataset.root=..."
 
 
@@ -125,17 +125,17 @@ def test_a_missing_key_is_refused_with_how_to_give_it():
         ("file", 1, "Path or null, got 1"),
     ],
 )
-def test_a_value_of_another_type_is_refused_with_the_type_expected(key, value, expected):
+def test_value_of_the_wrong_type_is_refused_with_the_expected_type(key, value, expected):
     assert refusal(node(**{"root": "r", key: value})) == f"dataset.{key}: expected {expected}"
 
 
 @pytest.mark.parametrize(("key", "value"), [("share", 1), ("names", None), ("names", []), ("file", None)])
-def test_a_value_that_fits_the_type_is_taken(key, value):
+def test_value_of_a_compatible_type_is_accepted(key, value):
     build("dataset", node(**{"root": "r", key: value}))
 
 
 @pytest.mark.parametrize("root", ["missing", "unreadable"])
-def test_what_the_target_refuses_is_a_configuration_error(root):
+def test_value_error_of_the_target_becomes_a_configuration_error(root):
     expected = {
         "missing": "dataset.root: no such directory",
         "unreadable": "[Errno 13] Permission denied: 'unreadable'",
@@ -146,17 +146,17 @@ def test_what_the_target_refuses_is_a_configuration_error(root):
 @pytest.mark.parametrize(
     "target", [None, 3, "toy", "no_such_module.Toy", "toy_home.Tay", "", "..x", "toy_home.__name__"]
 )
-def test_a_target_that_is_not_there_is_refused(target):
+def test_missing_target_is_refused(target):
     assert refusal({"name": "toy", "target": target}, "method").startswith("method.target: ")
 
 
-def test_auto_is_the_gpu_where_there_is_one():
+def test_device_auto_is_the_gpu_where_there_is_one():
     assert pick_device("auto").type == ("cuda" if torch.cuda.is_available() else "cpu")
     assert pick_device("cpu") == torch.device("cpu")
 
 
 @pytest.mark.parametrize("name", ["gpu", "cuda:99", "meta", "", "cpu:x"])
-def test_a_device_that_this_machine_has_not_is_refused(name):
+def test_device_that_this_machine_lacks_is_refused(name):
     with pytest.raises(ConfigError, match=r"^device: expected auto, cpu or a device of this machine, got "):
         pick_device(name)
 
@@ -166,7 +166,7 @@ def settings(**changes):
     return {**groups, "scale": 4, "precision": "float32", "seed": 0, **changes}
 
 
-def test_the_settings_of_a_run_are_checked():
+def test_run_settings_are_checked():
     assert EvalConfig.of(settings(scale=8)).scale == 8
 
 
@@ -180,13 +180,13 @@ def test_the_settings_of_a_run_are_checked():
         ({"dataset": None}, "dataset: missing; give it as dataset=..."),
     ],
 )
-def test_a_value_that_is_none_of_its_choices_is_refused(changes, message):
+def test_value_outside_its_choices_is_refused(changes, message):
     with pytest.raises(ConfigError) as caught:
         EvalConfig.of(settings(**changes))
     assert str(caught.value) == message
 
 
-def test_an_unknown_setting_is_refused_with_those_there_are():
+def test_unknown_setting_is_refused_with_the_known_ones():
     with pytest.raises(ConfigError, match=r"^scal: unknown key; expected dataset, .*scale, "):
         EvalConfig.of(settings(scal=4))
 
@@ -198,7 +198,7 @@ def test_an_unknown_setting_is_refused_with_those_there_are():
         (3, "metrics: expected the keys lpips, lpips_trunk, got 3"),
     ],
 )
-def test_a_group_of_settings_that_was_edited_into_something_else_is_refused(metrics, message):
+def test_settings_group_that_is_no_mapping_is_refused(metrics, message):
     with pytest.raises(ConfigError) as caught:
         EvalConfig.of(settings(metrics=metrics))
     assert str(caught.value) == message

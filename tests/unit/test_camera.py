@@ -30,7 +30,7 @@ def _numpy_range(z: np.ndarray, camera: Camera, range_type: str) -> np.ndarray:
     return z
 
 
-def test_ray_of_a_pixel_has_z_one_and_pixel_centres_at_integers() -> None:
+def test_rays_have_z_one_and_pixel_centres_at_integers() -> None:
     rays = CAMERA.rays()
     assert rays.shape == (3, 8, 16)
     assert rays.dtype == torch.float64
@@ -44,12 +44,12 @@ def test_ray_lengths_are_norms_of_the_rays() -> None:
     np.testing.assert_allclose(CAMERA.ray_lengths().numpy(), expected, rtol=1e-15)
 
 
-def test_rays_come_in_the_wanted_precision() -> None:
+def test_rays_have_the_requested_precision() -> None:
     assert CAMERA.rays(dtype=torch.float32).dtype == torch.float32
     assert CAMERA.ray_lengths(dtype=torch.float32).dtype == torch.float32
 
 
-def test_cropped_camera_sees_the_window_of_rays_and_ranges() -> None:
+def test_cropped_camera_has_the_rays_and_ranges_of_the_window() -> None:
     window = (..., slice(2, 7), slice(3, 13))
     cropped = STEREO.crop(2, 3, 5, 10)
     assert (cropped.height, cropped.width) == (5, 10)
@@ -61,7 +61,7 @@ def test_cropped_camera_sees_the_window_of_rays_and_ranges() -> None:
 
 
 @pytest.mark.parametrize(("fy", "fx"), [(2, 2), (4, 4), (8, 8), (2, 4), (1, 16)])
-def test_rescaled_camera_sees_through_the_middle_of_each_block(fy: int, fx: int) -> None:
+def test_rescaled_camera_has_the_rays_of_block_centres(fy: int, fx: int) -> None:
     coarse = STEREO.rescale(16 // fx, 8 // fy)
     blocks = STEREO.rays().numpy().reshape(3, 8 // fy, fy, 16 // fx, fx)
     np.testing.assert_allclose(coarse.rays().numpy(), blocks.mean(axis=(2, 4)), rtol=0, atol=1e-14)
@@ -86,7 +86,7 @@ def test_rescaling_up_again_restores_the_camera() -> None:
 
 @pytest.mark.parametrize("factor", [2, 4, 8])
 @pytest.mark.parametrize("offset", ["middle", "first"])
-def test_decimated_camera_sees_the_rays_of_the_pixels_it_keeps(factor: int, offset: str) -> None:
+def test_decimated_camera_has_the_rays_of_the_kept_pixels(factor: int, offset: str) -> None:
     start = factor // 2 if offset == "middle" else 0
     coarse = STEREO.decimate(factor, start)
     kept = (..., slice(start, None, factor), slice(start, None, factor))
@@ -98,7 +98,7 @@ def test_decimated_camera_sees_the_rays_of_the_pixels_it_keeps(factor: int, offs
 
 @pytest.mark.parametrize("camera", CAMERAS)
 @pytest.mark.parametrize("range_type", RANGE_TYPES)
-def test_each_range_type_has_the_value_of_its_definition(camera: Camera, range_type: RangeType) -> None:
+def test_range_types_have_their_defined_values(camera: Camera, range_type: RangeType) -> None:
     depth = _depth(camera)
     expected = _numpy_range(depth[0].numpy(), camera, range_type)
     np.testing.assert_allclose(to_range(depth, camera, range_type)[0].numpy(), expected, rtol=1e-14, atol=1e-14)
@@ -112,14 +112,14 @@ def test_range_conversion_round_trips(camera: Camera, range_type: RangeType) -> 
     torch.testing.assert_close(again, depth, rtol=1e-12, atol=0)
 
 
-def test_a_camera_without_baseline_has_the_virtual_one_of_twenty_centimetres() -> None:
+def test_default_baseline_is_twenty_centimetres() -> None:
     assert VIRTUAL_BASELINE == 0.2
     disparity = to_range(torch.full((1, 8, 16), 2.0, dtype=torch.float64), CAMERA, "disparity")
     assert disparity.unique().item() == pytest.approx(0.2 * 20.0 / 2.0, rel=1e-15)
 
 
 @pytest.mark.parametrize("range_type", RANGE_TYPES)
-def test_holes_stay_holes_and_nothing_else_becomes_one(range_type: RangeType) -> None:
+def test_range_conversion_keeps_holes_and_adds_none(range_type: RangeType) -> None:
     depth = _depth(STEREO)
     depth[0, 2, 3] = torch.nan
     for values in (to_range(depth, STEREO, range_type), from_range(depth, STEREO, range_type)):
@@ -144,7 +144,7 @@ def test_disparity_at_infinity_has_a_zero_gradient() -> None:
 
 
 @pytest.mark.parametrize("range_type", RANGE_TYPES)
-def test_ranges_take_any_leading_axes_and_keep_the_precision(range_type: RangeType) -> None:
+def test_range_conversion_takes_any_leading_axes_and_keeps_the_precision(range_type: RangeType) -> None:
     depth = _depth(STEREO).float().expand(2, 3, 1, 8, 16)
     values = to_range(depth, STEREO, range_type)
     assert values.dtype == torch.float32
@@ -152,7 +152,7 @@ def test_ranges_take_any_leading_axes_and_keep_the_precision(range_type: RangeTy
     torch.testing.assert_close(values[1, 2], to_range(depth[0, 0], STEREO, range_type), rtol=0, atol=0)
 
 
-def test_an_upward_y_axis_is_the_same_camera() -> None:
+def test_camera_with_an_upward_y_axis_is_converted() -> None:
     assert Camera(640, 480, 481.2, -480.0, 319.5, 239.5) == Camera(640, 480, 481.2, 480.0, 319.5, 239.5)
 
 
@@ -168,7 +168,7 @@ def test_an_upward_y_axis_is_the_same_camera() -> None:
         ("baseline", -0.1),
     ],
 )
-def test_a_wrong_field_is_named(name: str, value: float) -> None:
+def test_invalid_field_is_refused_by_name(name: str, value: float) -> None:
     fields = {"width": 4, "height": 3, "fx": 5.0, "fy": 5.0, "cx": 1.5, "cy": 1.0}
     with pytest.raises(ValueError, match=f"^camera {name}: expected "):
         Camera(**(fields | {name: value}))  # type: ignore[arg-type]
@@ -177,19 +177,19 @@ def test_a_wrong_field_is_named(name: str, value: float) -> None:
 @pytest.mark.parametrize(
     "window", [(-1, 0, 2, 2), (0, -1, 2, 2), (7, 0, 2, 2), (0, 15, 2, 2), (0, 0, 0, 2), (0, 0, 2, 0)]
 )
-def test_a_window_beyond_the_image_is_refused(window: tuple[int, int, int, int]) -> None:
+def test_window_beyond_the_image_is_refused(window: tuple[int, int, int, int]) -> None:
     with pytest.raises(ValueError, match=r"^crop: expected a window within 8 x 16"):
         CAMERA.crop(*window)
 
 
-def test_an_unknown_range_type_is_refused() -> None:
+def test_unknown_range_type_is_refused() -> None:
     for convert in (to_range, from_range):
         with pytest.raises(ValueError, match="range_type: expected one of orthogonal, perspective, disparity"):
             convert(_depth(CAMERA), CAMERA, "inverse")  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("turns", [-1, 0, 1, 2, 3, 5])
-def test_a_turned_cameras_rays_are_the_turned_rays(turns: int) -> None:
+def test_turned_camera_has_the_turned_rays(turns: int) -> None:
     camera = Camera(width=7, height=5, fx=6.0, fy=8.0, cx=2.3, cy=1.9, baseline=0.1, doffs=0.5)
     rays = camera.rays().rot90(turns, (-2, -1))
     x, y = rays[0], rays[1]

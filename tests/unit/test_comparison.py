@@ -14,7 +14,7 @@ RAYS = CAMERA.rays()[None]
 DEPTH = 2 + torch.rand(1, 1, 36, 40, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
 
 
-def test_a_comparison_shows_result_truth_and_difference_under_two_lights() -> None:
+def test_comparison_shows_result_truth_and_difference_under_two_lights() -> None:
     picture = comparison(DEPTH, DEPTH, RAYS)[0]
     assert picture.shape == (72, 120)
     torch.testing.assert_close(picture[:, :40], picture[:, 40:80])
@@ -26,7 +26,7 @@ def test_a_comparison_shows_result_truth_and_difference_under_two_lights() -> No
     torch.testing.assert_close(other[:, 80:], (2 * (other[:, :40] - other[:, 40:80]).abs()).clamp(max=1))
 
 
-def test_without_a_truth_the_result_stands_alone_and_holes_are_black() -> None:
+def test_comparison_without_truth_shows_the_result_alone_and_holes_black() -> None:
     depth = DEPTH.clone()
     depth[..., 5:9, 5:9] = torch.nan
     picture = comparison(depth, None, RAYS)[0]

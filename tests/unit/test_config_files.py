@@ -10,18 +10,18 @@ from dsr.utils.config_files import config_directories, list_choices, list_groups
 CHECKOUT = Path(__file__).resolve().parents[2] / "conf"
 
 
-def test_a_checkout_has_them_in_conf():
+def test_configuration_of_a_checkout_is_conf():
     assert config_directories() == (CHECKOUT,)
 
 
-def test_an_installed_package_brings_its_own(tmp_path, monkeypatch):
+def test_configuration_of_an_installed_package_comes_with_it(tmp_path, monkeypatch):
     (tmp_path / "conf").mkdir()
     (tmp_path / "conf" / "eval.yaml").touch()
     monkeypatch.setattr(config_files, "_PLACES", (tmp_path / "conf", CHECKOUT))
     assert config_directories() == (tmp_path / "conf",)
 
 
-def test_own_directories_come_after_the_project_s(tmp_path):
+def test_own_directories_are_searched_after_the_project(tmp_path):
     assert config_directories([tmp_path]) == (CHECKOUT, tmp_path)
 
 
@@ -34,12 +34,12 @@ def test_own_directories_add_choices_and_groups(tmp_path):
     assert {"method", "own"} <= set(list_groups(directories))
 
 
-def test_a_missing_directory_is_named(tmp_path):
+def test_missing_directory_is_refused_by_name(tmp_path):
     with pytest.raises(ValueError, match="--config-dir: expected a directory, got"):
         config_directories([tmp_path / "nowhere"])
 
 
-def test_an_incomplete_installation_is_named(tmp_path, monkeypatch):
+def test_incomplete_installation_is_refused_by_name(tmp_path, monkeypatch):
     monkeypatch.setattr(config_files, "_PLACES", (tmp_path / "conf",))
     with pytest.raises(ValueError, match="the installation is incomplete"):
         config_directories()

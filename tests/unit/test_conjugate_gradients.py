@@ -20,7 +20,7 @@ def _times(matrices: Tensor, x: Tensor) -> Tensor:
     return (matrices @ x[..., None])[..., 0]
 
 
-def test_it_equals_a_direct_solver_for_each_of_a_batch() -> None:
+def test_conjugate_gradients_equal_a_direct_solver_for_each_element_of_a_batch() -> None:
     matrices, right = _systems(3, 12)
     found = conjugate_gradients(
         lambda x: _times(matrices, x), right, torch.zeros_like(right), iterations=100, tolerance=1e-12
@@ -29,7 +29,7 @@ def test_it_equals_a_direct_solver_for_each_of_a_batch() -> None:
     assert found.residual <= 1e-12
 
 
-def test_it_takes_no_more_steps_than_there_are_different_eigenvalues() -> None:
+def test_conjugate_gradients_need_at_most_one_step_per_distinct_eigenvalue() -> None:
     diagonal = torch.tensor([1.0, 1, 4, 4, 9, 9]).double()
     right = torch.arange(1.0, 7.0).double()[None]
     found = conjugate_gradients(lambda x: diagonal * x, right, torch.zeros_like(right), iterations=100, tolerance=1e-10)
@@ -38,7 +38,7 @@ def test_it_takes_no_more_steps_than_there_are_different_eigenvalues() -> None:
 
 
 @pytest.mark.parametrize("steps", [1, 2, 5])
-def test_each_step_lowers_the_quadratic_even_from_a_good_start(steps: int) -> None:
+def test_conjugate_gradients_lower_the_quadratic_in_each_step_from_a_good_start(steps: int) -> None:
     matrices, right = _systems(2, 12)
     start = torch.linalg.solve(matrices, right) + 0.01
 
@@ -50,7 +50,7 @@ def test_each_step_lowers_the_quadratic_even_from_a_good_start(steps: int) -> No
     assert bool((quadratic(after.values) < quadratic(before.values)).all())
 
 
-def test_a_solved_element_stands_still_while_another_goes_on() -> None:
+def test_solved_element_is_unchanged_while_another_goes_on() -> None:
     matrices, right = _systems(2, 8)
     right[0] = 0
     found = conjugate_gradients(

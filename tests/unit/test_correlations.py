@@ -39,7 +39,7 @@ def run(label, count=12, *, seed=0, scale=4, lpips=True, dataset="simgeo"):
 RESULTS = Results((run("Bicubic"), run("MSG"), run("MSG", seed=1), run("MSG", scale=8), run("Mine", 2)))
 
 
-def test_every_result_is_a_row_and_every_version_of_a_metric_a_column():
+def test_metric_matrix_has_a_row_per_result_and_a_column_per_metric_variant():
     matrix = metric_matrix(RESULTS)
     assert len(matrix) == 4 * 12 + 2
     lights = [f"[{name}]" for name in VARIANTS if name != "max"]
@@ -61,7 +61,7 @@ def test_rmse_d_is_clipped_at_half_a_metre():
 
 
 @pytest.mark.parametrize(("kind", "reference"), [("pearson", stats.pearsonr), ("spearman", stats.spearmanr)])
-def test_correlations_are_scipy_s_over_the_rows_where_both_are_known(kind, reference):
+def test_correlations_equal_scipy_over_the_rows_where_both_are_known(kind, reference):
     rng = np.random.default_rng(1)
     matrix = pd.DataFrame(rng.integers(0, 9, (30, 3)).astype(float), columns=list("abc"))  # with ties
     matrix.loc[:6, "a"] = math.nan
@@ -74,7 +74,7 @@ def test_correlations_are_scipy_s_over_the_rows_where_both_are_known(kind, refer
         assert pairs(matrix).loc[one, two] == len(known)
 
 
-def test_a_monotone_curve_has_a_spearman_of_one_and_a_smaller_pearson():
+def test_spearman_of_a_monotone_curve_is_one_and_pearson_is_smaller():
     x = np.arange(10.0)
     matrix = pd.DataFrame({"x": x, "exp": np.exp(x), "falling": -x})
     assert correlate(matrix, "spearman").loc["x", "exp"] == pytest.approx(1)
@@ -84,17 +84,17 @@ def test_a_monotone_curve_has_a_spearman_of_one_and_a_smaller_pearson():
 
 @pytest.mark.parametrize("kind", ["pearson", "spearman"])
 @pytest.mark.parametrize("other", [[1.0, 2.0, math.nan, math.nan], [0.1, 0.1, 0.1, 0.1], [0.1, 0.1, 0.1, math.nan]])
-def test_of_too_few_points_or_a_constant_there_is_no_correlation(kind, other):
+def test_correlation_of_too_few_points_or_a_constant_is_unknown(kind, other):
     table = correlate(pd.DataFrame({"x": [1.0, 2.0, 4.0, 3.0], "y": other}), kind)
     assert math.isnan(table.loc["x", "y"])
 
 
-def test_another_kind_is_refused():
+def test_unknown_kind_of_correlation_is_refused():
     with pytest.raises(ValueError, match="kind: expected pearson or spearman, got kendall"):
         correlate(pd.DataFrame({"x": [1.0]}), "kendall")
 
 
-def test_metrics_are_ordered_by_their_rank_correlation_with_lpips_and_its_own_versions_left_out():
+def test_metrics_are_ordered_by_rank_correlation_with_lpips_without_its_own_variants():
     ranking = with_reference(metric_matrix(RESULTS))
     assert list(ranking["spearman"]) == sorted(ranking["spearman"], reverse=True)
     assert not ranking["metric"].str.startswith("LPIPS").any()
@@ -104,7 +104,7 @@ def test_metrics_are_ordered_by_their_rank_correlation_with_lpips_and_its_own_ve
     assert row["pearson"] == pytest.approx(stats.pearsonr(matrix["DSSIM_v[e2]"], matrix["LPIPS_v"]).statistic)
 
 
-def test_the_files_hold_the_tables(tmp_path):
+def test_correlation_files_hold_the_tables(tmp_path):
     paths = write_correlations(tmp_path, RESULTS)
     assert [path.name for path in paths] == [
         "pearson.csv", "spearman.csv", "pairs.csv", "with_lpips.csv", "with_lpips.md"]  # fmt: skip
@@ -113,7 +113,7 @@ def test_the_files_hold_the_tables(tmp_path):
     assert "| metric" in paths[-1].read_text(encoding="utf-8")
 
 
-def test_without_lpips_everything_else_is_there_and_a_line_says_so(tmp_path, monkeypatch):
+def test_missing_lpips_leaves_the_rest_and_one_line_says_so(tmp_path, monkeypatch):
     results = Results((run("A", 5, lpips=False),))
     text = write_correlations(tmp_path, results)[-1].read_text(encoding="utf-8")
     assert "There is no LPIPS_v in these 5 results" in text
@@ -124,7 +124,7 @@ def test_without_lpips_everything_else_is_there_and_a_line_says_so(tmp_path, mon
     assert "no LPIPS_v in these results" in drawn["scatter_matrix.pdf"].texts[0].get_text()
 
 
-def test_the_figure_has_points_below_the_diagonal_coefficients_above_and_densities_on_it():
+def test_scatter_matrix_has_points_coefficients_and_densities():
     matrix = metric_matrix(RESULTS)
     figure = scatter_matrix(matrix, ["Bicubic", "MSG", "Mine"])
     axes = np.array(figure.axes).reshape(3, 3)
@@ -156,7 +156,7 @@ def test_points_have_the_colours_of_their_methods():
             assert by_place[x, y] == pytest.approx(tuple(int(colour[at : at + 2], 16) / 255 for at in (1, 3, 5)))
 
 
-def test_densities_are_scipy_s_and_integrate_to_one():
+def test_densities_equal_scipy_and_integrate_to_one():
     values = np.random.default_rng(2).normal(3, 1, 50)
     grid = np.linspace(-5, 11, 4001)
     density = density_of(values, grid)
@@ -167,11 +167,11 @@ def test_densities_are_scipy_s_and_integrate_to_one():
 
 
 @pytest.mark.parametrize("values", [[], [1.0], [2.0, 2.0, 2.0, 2.0], [1.0, 2.0]])
-def test_of_too_few_different_values_there_is_no_density(values):
+def test_density_of_too_few_distinct_values_is_empty(values):
     assert density_of(np.array(values), np.linspace(0, 3, 10)) is None
 
 
-def test_the_figures_are_vector_text_and_pictures(tmp_path, monkeypatch):
+def test_figures_are_vector_text_and_pictures(tmp_path, monkeypatch):
     monkeypatch.setitem(correlation_figure._STYLE, "pdf.compression", 0)
     paths = save_scatter_matrix(tmp_path, Results((run("Bicubic", 5), run("Odd $_ name", 5))))
     assert [path.name for path in paths] == [
@@ -182,12 +182,12 @@ def test_the_figures_are_vector_text_and_pictures(tmp_path, monkeypatch):
     assert paths[1].read_bytes().startswith(b"\x89PNG")
 
 
-def test_a_known_method_s_colour_does_not_depend_on_the_others():
+def test_colour_of_a_known_method_does_not_depend_on_the_others():
     alone, many = method_colours(["MSG-V"]), method_colours(["Mine", "Yours", "MSG-V", "Bicubic"])
     assert alone["MSG-V"] == many["MSG-V"]
     assert len(set(many.values())) == 4
 
 
-def test_any_number_of_methods_have_colours_that_differ():
+def test_colours_of_any_number_of_methods_differ():
     colours = method_colours([*KNOWN, *(f"method {number}" for number in range(40))])
     assert len({colour.lower() for colour in colours.values()}) == 50

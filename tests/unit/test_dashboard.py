@@ -34,7 +34,7 @@ def scalars(log, tag):
     return {event.step: event.value for event in log.Scalars(tag)}
 
 
-def test_scalars_are_the_scores_in_the_units_of_the_tables(log, tmp_path):
+def test_scalars_are_the_scores_in_table_units(log, tmp_path):
     scores = load_results([tmp_path]).scores.set_index(["metric", "variant", "scene"])["value"]
     assert scalars(log, "RMSE_d/a") == {0: pytest.approx(1000 * scores["RMSE_d", "", "a"])}
     assert scalars(log, "DSSIM_v/b") == {0: pytest.approx(1000 * scores["DSSIM_v", "max", "b"])}
@@ -48,7 +48,7 @@ def test_scalars_are_the_scores_in_the_units_of_the_tables(log, tmp_path):
     assert scalars(log, "mean/RMSE_v") == {0: pytest.approx(mean)}
 
 
-def test_the_layout_groups_the_metrics_that_are_the_worst_of_four_lights(log):
+def test_layout_groups_the_metrics_that_are_the_worst_of_four_lights(log):
     content = log.Tensors("custom_scalars__config__")[0].tensor_proto.string_val[0]
     layout = layout_pb2.Layout.FromString(content)
     charts = {category.title: [chart.title for chart in category.chart] for category in layout.category}
@@ -59,7 +59,7 @@ def test_the_layout_groups_the_metrics_that_are_the_worst_of_four_lights(log):
         assert {tag for chart in category.chart for tag in chart.multiline.tag} <= tags
 
 
-def test_the_table_of_runs_has_the_method_and_its_settings(make_run, tmp_path):
+def test_table_of_runs_has_the_method_and_its_settings(make_run, tmp_path):
     folder = make_run(tmp_path, scenes=("s",), scale=2)
     versions = json.loads((folder / "versions.json").read_text())
     versions["identity"]["method"] |= {"steps": 600, "w": 1.0, "widths": [1, 2], "target": "dsr.x"}
@@ -75,7 +75,7 @@ def test_the_table_of_runs_has_the_method_and_its_settings(make_run, tmp_path):
     assert "method.target" not in values
 
 
-def test_a_picture_has_the_renderings_of_the_result_above_those_of_the_truth(log, tmp_path):
+def test_picture_has_renderings_of_the_result_above_those_of_the_truth(log, tmp_path):
     (run,) = load_results([tmp_path]).runs
     encoded = np.frombuffer(log.Images("renderings/a")[0].encoded_image_string, np.uint8)
     picture = cv2.imdecode(encoded, cv2.IMREAD_COLOR)
@@ -85,7 +85,7 @@ def test_a_picture_has_the_renderings_of_the_result_above_those_of_the_truth(log
     np.testing.assert_allclose(picture[..., 0], 255 * expected.numpy(), atol=1.01)
 
 
-def test_errors_have_the_same_colours_whatever_the_method(make_run, tmp_path):
+def test_error_colours_are_the_same_for_all_methods(make_run, tmp_path):
     folder = make_run(tmp_path, scenes=("s",))
     truth = load_results([folder]).runs[0].scene("s").depth
     step = 0.005 * truth.nanmedian()
@@ -102,7 +102,7 @@ def test_errors_have_the_same_colours_whatever_the_method(make_run, tmp_path):
     assert red > blue
 
 
-def test_a_second_log_replaces_the_first(make_run, tmp_path):
+def test_second_log_replaces_the_first(make_run, tmp_path):
     make_run(tmp_path, scenes=("s",))
     save_dashboard(tmp_path)
     save_dashboard(tmp_path)
@@ -111,7 +111,7 @@ def test_a_second_log_replaces_the_first(make_run, tmp_path):
     assert len(read(tmp_path).Scalars("mean/RMSE_v")) == 1
 
 
-def test_a_scene_that_is_not_kept_has_scores_and_no_picture(make_run, tmp_path):
+def test_scene_that_is_not_stored_has_scores_and_no_picture(make_run, tmp_path):
     make_run(tmp_path, scenes=("s", "t"))
     scene_path(tmp_path, "t").unlink()
     save_dashboard(tmp_path)
@@ -120,6 +120,6 @@ def test_a_scene_that_is_not_kept_has_scores_and_no_picture(make_run, tmp_path):
     assert set(log.Tags()["images"]) == {"renderings/s", "depth_error/s"}
 
 
-def test_a_directory_that_is_no_run_s_is_refused(tmp_path):
+def test_directory_that_is_no_run_is_refused(tmp_path):
     with pytest.raises(ValueError, match=r"summary\.json"):
         save_dashboard(tmp_path)

@@ -46,7 +46,7 @@ def node(name):
     return yaml.safe_load((CONF / f"{name}.yaml").read_text())
 
 
-def test_the_evaluation_set_has_34_images():
+def test_evaluation_set_has_34_images():
     counts = {
         "simgeo": len(SIMGEO_SCENES), "icl": len(ICL_FRAMES), "middlebury": len(EVALUATION_2014),
         "sunrgbd": len(SUN_FRAMES), "tofmark": len(TOFMARK_SCENES),
@@ -56,20 +56,20 @@ def test_the_evaluation_set_has_34_images():
 
 
 @pytest.mark.parametrize("scene", [*ICL_FRAMES, *EVALUATION_2014])
-def test_a_scene_of_icl_nuim_and_middlebury_has_rows_in_the_paper_s_tables(scene):
+def test_icl_nuim_and_middlebury_scenes_have_rows_in_the_paper_tables(scene):
     for scale in (4, 8):
         assert published_row(scene, "Bicubic", scale) is not None
 
 
 @pytest.mark.parametrize(("name", "frames"), [("icl", ICL_FRAMES), ("sunrgbd", SUN_FRAMES)])
-def test_the_configuration_names_the_frames_that_the_code_does(name, frames):
+def test_configured_frames_are_those_of_the_code(name, frames):
     assert node(name)["frames"] == dict(frames)
 
 
 @pytest.mark.parametrize(
     "name", [path.stem for path in CONF.glob("*.yaml") if path.stem not in ("mixture", "paper_train")]
 )
-def test_every_data_set_s_configuration_is_one_that_its_class_takes(name, tmp_path, monkeypatch):
+def test_dataset_configurations_build_their_classes(name, tmp_path, monkeypatch):
     entries = {**node(name), "root": str(tmp_path / "nowhere")} if "root" in node(name) else node(name)
     if name in ("simgeo", "procedural"):
         assert build("dataset", entries).scenes()
@@ -81,7 +81,7 @@ def test_every_data_set_s_configuration_is_one_that_its_class_takes(name, tmp_pa
     assert name == "folder" or f"get it with: dsr data get {name}; or say where it is: dataset.root=DIR" in message
 
 
-def test_frames_are_named_in_the_configuration(tmp_path):
+def test_frames_can_be_chosen_in_the_configuration(tmp_path):
     root = touch(tmp_path, *(f"{where}/{what}/{number}.png" for where in ("x", "y") for what in ("rgb", "depth")
                              for number in (0, 7)))  # fmt: skip
     entries = {**node("icl"), "root": root, "frames": {**ICL_FRAMES, "sofa": "y/0007"}, "scenes": ["sofa", "x_0000"]}
@@ -90,13 +90,13 @@ def test_frames_are_named_in_the_configuration(tmp_path):
         build("dataset", {**entries, "frames": ["a"]})
 
 
-def test_middlebury_is_the_paper_s_seven_scenes_unless_told_otherwise(tmp_path):
+def test_middlebury_defaults_to_the_seven_scenes_of_the_paper(tmp_path):
     root = stereo_2014(tmp_path, (*EVALUATION_2014, "piano"))
     assert Middlebury(root).scenes() == list(EVALUATION_2014)
     assert sorted(Middlebury(root, "found").scenes()) == sorted((*EVALUATION_2014, "piano"))
 
 
-def test_scenes_of_sun_rgbd_are_found_below_any_folder_by_their_path_or_its_beginning(tmp_path):
+def test_sun_rgbd_scenes_are_found_below_any_folder_by_path_or_prefix(tmp_path):
     paths = [*list(SUN_FRAMES.values())[:-1], "xtion/sun3ddata/brown_bm_2/brown_bm_2/b", "kv1/NYUdata/NYU00011"]
     root = touch(tmp_path, *(f"SUNRGBD/{path}/{part}/x" for path in paths for part in ("image", "depth")),
                  "SUNRGBD/xtion/sun3ddata/brown_bm_2/brown_bm_2/a/image/x",
@@ -107,7 +107,7 @@ def test_scenes_of_sun_rgbd_are_found_below_any_folder_by_their_path_or_its_begi
     assert len(SunRGBD(root, "found").scenes()) == 14
 
 
-def test_nothing_that_is_evaluated_on_is_trained_on_by_name(tmp_path):
+def test_evaluation_scenes_are_not_trained_on_by_name(tmp_path):
     training = {scene for scenes in MIDDLEBURY.values() for scene in scenes}
     assert not training & set(EVALUATION_2014)
     assert not set(MIDDLEBURY[2014]) & (set(ICL_FRAMES) | set(SIMGEO_SCENES) | set(SUN_FRAMES) | set(TOFMARK_SCENES))
@@ -120,7 +120,7 @@ def test_nothing_that_is_evaluated_on_is_trained_on_by_name(tmp_path):
             MiddleburyTrain(root, [scene])
 
 
-def test_a_scene_that_is_trained_on_does_not_validate_as_one_of_another_data_set(shared):
+def test_training_scene_does_not_validate_as_one_of_another_dataset(shared):
     real = shared / "real"
     train = Part(MiddleburyTrain(str(real), ["piano", "pipes", "adirondack"]))
     settings, degradation = PatchSettings(patch=32, batch=1, validation_scenes=1), Degradation(4, Downsampling("box"))
@@ -130,7 +130,7 @@ def test_a_scene_that_is_trained_on_does_not_validate_as_one_of_another_data_set
     assert PatchData([train], settings, degradation, validation={"others": recycle}).training_count == 2
 
 
-def test_data_sets_know_whether_they_are_to_evaluate_on():
+def test_datasets_declare_whether_they_are_for_evaluation():
     evaluated = (Middlebury, MiddleburyLevels, ICL, SunRGBD, ToFMark, SimGeo)
     assert all(kind.evaluation for kind in evaluated)
     assert not any(kind.evaluation for kind in (MiddleburyTrain, Sintel, Folder))
@@ -140,7 +140,7 @@ def test_data_sets_know_whether_they_are_to_evaluate_on():
     ("method", "range_type"),
     [("bicubic", "perspective"), ("msg_v", "disparity"), ("facets", "disparity"), ("dip", "orthogonal")],
 )
-def test_a_method_gets_the_range_type_that_it_was_made_for(method, range_type):
+def test_method_gets_the_range_type_that_it_was_made_for(method, range_type):
     entries = yaml.safe_load((CONF.parent / "method" / f"{method}.yaml").read_text())
     if trait("method", entries, "range_type") is not None:
         assert trait("method", entries, "range_type") == range_type
@@ -175,7 +175,7 @@ def test_values_out_of_range_are_refused(tmp_path, make, message):
         make(str(tmp_path))
 
 
-def test_real_scenes_of_every_data_set_are_prepared(shared, dsr_cache):
+def test_real_scenes_of_every_dataset_are_prepared(shared, dsr_cache):
     real = shared / "real"
     sources = [
         Middlebury(str(real / "middlebury2014"), ["recycle"], 64),

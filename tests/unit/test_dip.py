@@ -74,7 +74,7 @@ def _error(depth: Tensor, sample: DepthSample, where: Tensor | None = None) -> f
     return float((difference if where is None else difference[where]).mean().sqrt())
 
 
-def test_the_same_seed_leads_to_the_same_bits_and_another_to_others() -> None:
+def test_same_seed_gives_the_same_bits_and_another_seed_others() -> None:
     sample = _sample()
     first, again, other = (_prior(seed=seed)(sample) for seed in (0, 0, 1))
     assert torch.equal(first, again)
@@ -83,7 +83,7 @@ def test_the_same_seed_leads_to_the_same_bits_and_another_to_others() -> None:
     assert first.dtype == sample.depth_lr.dtype
 
 
-def test_a_result_does_not_depend_on_what_was_optimised_before_nor_on_global_random_numbers() -> None:
+def test_result_does_not_depend_on_earlier_optimisations_or_global_random_state() -> None:
     a, b = _sample("a"), _sample("b")
     prior = _prior()
     alone = _prior()(b)
@@ -93,7 +93,7 @@ def test_a_result_does_not_depend_on_what_was_optimised_before_nor_on_global_ran
     assert not torch.equal(both["a"], both["b"])  # the same maps, but another scene
 
 
-def test_global_random_numbers_are_left_as_they_are() -> None:
+def test_global_random_state_is_unchanged() -> None:
     torch.manual_seed(5)
     expected = torch.rand(3)
     torch.manual_seed(5)
@@ -101,7 +101,7 @@ def test_global_random_numbers_are_left_as_they_are() -> None:
     assert torch.equal(torch.rand(3), expected)
 
 
-def test_it_does_not_look_at_the_truth() -> None:
+def test_result_does_not_depend_on_the_truth() -> None:
     sample = _sample()
     blind = DepthSample(**{**vars(sample), "depth": None})
     settings = {"validate_every": 4, "metrics": visual_metrics}
@@ -117,13 +117,13 @@ def _fitted(*, visual: bool) -> tuple[Tensor, DepthSample]:
 
 
 @pytest.mark.parametrize("visual", [False, True])
-def test_it_gets_close_to_two_planes(visual: bool) -> None:
+def test_dip_approximates_two_planes(visual: bool) -> None:
     depth, sample = _fitted(visual=visual)
     flat = torch.full_like(depth, float(sample.depth_lr.mean()))
     assert _error(depth, sample) < 0.25 * _error(flat, sample)
 
 
-def test_the_visual_loss_gives_better_normals() -> None:
+def test_visual_loss_gives_better_normals() -> None:
     errors = {}
     for visual in (True, False):
         depth, sample = _fitted(visual=visual)
@@ -132,7 +132,7 @@ def test_the_visual_loss_gives_better_normals() -> None:
     assert errors[True] < 0.8 * errors[False]
 
 
-def test_holes_are_filled_better_than_with_what_lies_nearest() -> None:
+def test_holes_are_filled_better_than_with_the_nearest_values() -> None:
     sample = _sample(holes=Blobs(0.15, 8))
     depth = _prior(**ENOUGH)(sample)
     assert bool(depth.isfinite().all())
@@ -141,7 +141,7 @@ def test_holes_are_filled_better_than_with_what_lies_nearest() -> None:
     assert _error(depth, sample, holes) < 0.3 * _error(flat, sample, holes)
 
 
-def test_an_optimisation_that_diverges_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_diverging_optimisation_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(
         "dsr.methods.dip.optimisation.PriorOptimisation.result", lambda _: torch.full((1, 1, 32, 48), torch.nan)
     )
@@ -151,7 +151,7 @@ def test_an_optimisation_that_diverges_says_so(monkeypatch: pytest.MonkeyPatch) 
 
 @pytest.mark.usefixtures("_every_step")
 @pytest.mark.parametrize("stopping", ["fixed", "variance", "oracle"])
-def test_an_interrupted_optimisation_ends_in_the_bits_of_an_uninterrupted_one(tmp_path: Path, stopping: str) -> None:
+def test_interrupted_optimisation_gives_bit_identical_results(tmp_path: Path, stopping: str) -> None:
     sample = _sample()
     settings = {"steps": 90, "stopping": stopping, "patience": 30, "validate_every": 20, "metrics": visual_metrics}
     whole = _prior(workspace=tmp_path / "whole", **settings)(sample)
@@ -169,7 +169,7 @@ def test_an_interrupted_optimisation_ends_in_the_bits_of_an_uninterrupted_one(tm
     assert "80,val,RMSE_v," in tables[0]
 
 
-def test_what_is_killed_goes_on_from_the_last_minute(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_killed_optimisation_resumes_from_the_last_minute(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     sample, settings = _sample(), {"steps": 30}
     whole = _prior(**settings)(sample)
     monkeypatch.setattr("dsr.methods.dip.callbacks._SECONDS_BETWEEN_CHECKPOINTS", -1.0)  # each step is a minute
@@ -188,7 +188,7 @@ def test_what_is_killed_goes_on_from_the_last_minute(tmp_path: Path, monkeypatch
 
 @pytest.mark.usefixtures("_every_step")
 @pytest.mark.parametrize("spoil", ["settings", "input", "bytes"])
-def test_a_checkpoint_of_something_else_is_not_gone_on_with(tmp_path: Path, spoil: str) -> None:
+def test_checkpoint_of_another_optimisation_is_not_resumed(tmp_path: Path, spoil: str) -> None:
     sample = _sample()
     with pytest.raises(KeyboardInterrupt):
         _prior(workspace=tmp_path, display=Stopper(5))(sample)
@@ -203,7 +203,7 @@ def test_a_checkpoint_of_something_else_is_not_gone_on_with(tmp_path: Path, spoi
     assert "resumed" not in display.lines[0]
 
 
-def test_before_it_starts_it_says_how_long_it_will_take() -> None:
+def test_expected_duration_is_announced_at_the_start() -> None:
     display = Stopper(-1)
     _prior(display=display)(_sample())
     pattern = (
@@ -213,7 +213,7 @@ def test_before_it_starts_it_says_how_long_it_will_take() -> None:
     assert re.fullmatch(pattern, display.lines[0])
 
 
-def test_a_rule_that_stopped_says_when() -> None:
+def test_stopping_rule_reports_its_step() -> None:
     display = Stopper(-1)
     noisy = _sample()
     _prior(display=display, steps=400, stopping="variance", patience=20, learning_rate=0.05)(noisy)
@@ -221,7 +221,7 @@ def test_a_rule_that_stopped_says_when() -> None:
     assert "up to 400 steps" in display.lines[0]
 
 
-def test_the_memory_that_a_step_keeps_grows_with_the_network() -> None:
+def test_memory_of_a_step_grows_with_the_network() -> None:
     bytes_kept = [
         cost_of_step(_prior(widths=widths, border=0).module(_sample())[0])[1] for widths in ((4, 6), (32, 48))
     ]
@@ -237,7 +237,7 @@ def test_measuring_a_step_changes_nothing() -> None:
         assert torch.equal(one, other)
 
 
-def test_the_network_sees_a_mirrored_border_that_the_answer_has_not() -> None:
+def test_network_sees_a_mirrored_border_that_the_result_lacks() -> None:
     sample = _sample()
     module, _ = _prior(border=5).module(sample)
     assert module.start.shape == (1, 35, 42, 58)
@@ -252,7 +252,7 @@ def test_the_network_sees_a_mirrored_border_that_the_answer_has_not() -> None:
     assert wide.start.shape == (1, 35, 32 + 62, 48 + 62)
 
 
-def test_normals_of_noise_do_not_count() -> None:
+def test_normals_of_noise_are_ignored() -> None:
     clean = _sample()
     draws = torch.randn(clean.depth_lr.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     noisy = DepthSample(**{**vars(clean), "depth_lr": clean.depth_lr * (1 + 0.02 * draws)})
@@ -265,12 +265,12 @@ def test_normals_of_noise_do_not_count() -> None:
     assert re.fullmatch(rf"step: without MSE_v; {noise}, more than method.largest_tilt", display.lines[1])
 
 
-def test_an_oracle_is_flagged() -> None:
+def test_oracle_is_flagged() -> None:
     assert _prior(stopping="oracle", validate_every=5).flag == "oracle"
     assert _prior(stopping="variance").flag == ""
 
 
-def test_a_warm_start_begins_at_the_trained_networks_answer() -> None:
+def test_warm_start_begins_at_the_result_of_the_trained_network() -> None:
     weights = packaged_weights("msg_v_x4")
     assert weights is not None
     settings = {"scale": 4, "downsampling": BOX, "weights": weights, "model": "msg_v", "widths": (16,), "skips": (4,)}

@@ -38,14 +38,14 @@ def _problem(**changes: object) -> ImageProblem:
     return ImageProblem.of(_sample(**changes), Downsampling("box"), "orthogonal", CPU)
 
 
-def test_a_problem_does_not_depend_on_the_truth() -> None:
+def test_image_problem_does_not_depend_on_the_truth() -> None:
     given, blind = _problem(), _problem(depth=None)
     for name, value in vars(given).items():
         other = getattr(blind, name)
         assert torch.equal(value, other) if isinstance(value, Tensor) else value == other
 
 
-def test_the_loss_is_its_terms_on_coarse_maps() -> None:
+def test_loss_is_the_sum_of_its_terms_on_low_resolution_maps() -> None:
     problem = _problem()
     depth, intensity = _depth(3).float()[None], torch.rand(1, 1, 32, 48)
     blocks = depth.view(1, 1, 16, 2, 24, 2).mean(dim=(3, 5))
@@ -63,14 +63,14 @@ def test_the_loss_is_its_terms_on_coarse_maps() -> None:
     assert plain.keys() == {"loss", "data_mse"}
 
 
-def test_the_photo_is_its_luminance() -> None:
+def test_photo_term_uses_luminance() -> None:
     rgb = torch.zeros(3, 32, 48)
     rgb[1] = 0.5
     torch.testing.assert_close(_problem(rgb=rgb).grey, torch.full((1, 1, 32, 48), 0.587 * 0.5))
 
 
 @pytest.mark.parametrize("objective", [PriorObjective("mse", 10.0, 0.0, 0.0), PriorObjective("lap1", 1.0, 1.0, 0.0)])
-def test_nothing_is_asked_of_depth_under_a_hole(objective: PriorObjective) -> None:
+def test_depth_under_a_hole_does_not_matter(objective: PriorObjective) -> None:
     coarse = _sample().depth_lr.clone()
     coarse[:, 4:9, 6:14] = torch.nan
     depth = _depth(3).float()[None].requires_grad_()
@@ -82,7 +82,7 @@ def test_nothing_is_asked_of_depth_under_a_hole(objective: PriorObjective) -> No
     assert float(gradient[..., 20:, :].abs().min()) > 0
 
 
-def test_a_loss_is_finite_where_no_two_neighbours_are_known() -> None:
+def test_loss_is_finite_where_no_two_neighbours_are_valid() -> None:
     coarse = torch.full((1, 16, 24), torch.nan, dtype=torch.float64)
     coarse[:, ::3, ::3] = 2.5
     depth = _depth().float()[None].requires_grad_()
@@ -92,7 +92,7 @@ def test_a_loss_is_finite_where_no_two_neighbours_are_known() -> None:
     assert bool(depth.grad.isfinite().all())  # type: ignore[union-attr]
 
 
-def test_the_model_averages_the_type_that_it_says() -> None:
+def test_forward_model_averages_the_configured_range_type() -> None:
     sample = _sample()
     kinds = {}
     for kind in (None, "perspective", "disparity"):
@@ -127,7 +127,7 @@ def _observe(rule: Variance, iterates: list[Tensor], start: int = 0) -> int | No
     return None
 
 
-def test_the_variance_rule_keeps_the_average_of_the_quietest_moment_and_stops_after_its_patience() -> None:
+def test_variance_rule_keeps_the_average_of_the_quietest_moment_and_stops_after_its_patience() -> None:
     iterates = _iterates(600, 300)
     rule = Variance(iterates[0], patience=100)
     stopped = _observe(rule, iterates)
@@ -137,7 +137,7 @@ def test_the_variance_rule_keeps_the_average_of_the_quietest_moment_and_stops_af
     assert 100 <= stopped - best <= 120
 
 
-def test_the_variance_is_the_exponential_moving_variance() -> None:
+def test_variance_is_the_exponential_moving_variance() -> None:
     """Against the closed form: weights 0.1 * 0.9^k on past values, as a variance about their weighted mean."""
     values = torch.randn(80, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
     rule = Variance(torch.zeros(1, 1, 1, 1, dtype=torch.float64), patience=1000)
@@ -149,14 +149,14 @@ def test_the_variance_is_the_exponential_moving_variance() -> None:
     torch.testing.assert_close(rule.state()["variance"], (weights * (values - mean).square()).sum())
 
 
-def test_a_falling_variance_never_stops() -> None:
+def test_variance_rule_never_stops_while_the_variance_falls() -> None:
     iterates = _iterates(300, 300)
     rule = Variance(iterates[0], patience=20)
     assert _observe(rule, iterates) is None
     assert float(rule.result(iterates[0]).mean()) > 285
 
 
-def test_the_variance_rule_goes_on_where_it_was_interrupted() -> None:
+def test_variance_rule_resumes_after_an_interruption() -> None:
     iterates = _iterates(600, 300)
     whole, first, second = (Variance(iterates[0], patience=100) for _ in range(3))
     end = _observe(whole, iterates)
@@ -167,7 +167,7 @@ def test_the_variance_rule_goes_on_where_it_was_interrupted() -> None:
 
 
 @pytest.mark.parametrize("std", [0.001, 0.01])
-def test_the_noise_of_a_depth_map_is_estimated_from_the_map_alone(std: float) -> None:
+def test_noise_level_is_estimated_from_the_depth_map_alone(std: float) -> None:
     v, u = torch.meshgrid(torch.linspace(0, 1, 90), torch.linspace(0, 1, 120), indexing="ij")
     depth = (2 + u + 0.5 * v + 1.5 * (u > 0.4))[None, None].double()
     noisy = depth * (
@@ -179,7 +179,7 @@ def test_the_noise_of_a_depth_map_is_estimated_from_the_map_alone(std: float) ->
     assert noise_level(depth[..., :2, :2]) == 0
 
 
-def test_noise_tilts_the_normals_of_a_frontal_surface_as_much_as_they_say() -> None:
+def test_normal_noise_deg_is_the_tilt_of_a_frontal_surface() -> None:
     camera = Camera(width=200, height=150, fx=80.0, fy=80.0, cx=99.5, cy=74.5)
     draws = torch.randn(1, 1, 150, 200, generator=torch.Generator().manual_seed(4), dtype=torch.float64)
     normals = depth_to_normals(3 * (1 + 0.001 * draws), camera.rays()[None])
@@ -188,7 +188,7 @@ def test_noise_tilts_the_normals_of_a_frontal_surface_as_much_as_they_say() -> N
     assert normal_noise_deg(0.0, camera) == 0
 
 
-def test_the_residual_rule_stops_when_the_map_is_explained_up_to_its_noise() -> None:
+def test_residual_rule_stops_when_the_map_is_explained_up_to_its_noise() -> None:
     problem = _problem()
     truth = _depth().float()[None]
     rule = Residual(problem.coarse, problem.residual)
@@ -201,7 +201,7 @@ def test_the_residual_rule_stops_when_the_map_is_explained_up_to_its_noise() -> 
     assert rule.result(near) is near
 
 
-def test_an_oracle_keeps_the_best_and_goes_on_after_an_interruption() -> None:
+def test_oracle_keeps_the_best_result_and_resumes_after_an_interruption() -> None:
     rule, maps = Oracle(), [torch.full((1, 1, 2, 2), float(i)) for i in range(4)]
     assert rule.result(maps[0]) is maps[0]
     for score, each in zip((0.3, 0.1, 0.2), maps[1:], strict=True):
@@ -213,7 +213,7 @@ def test_an_oracle_keeps_the_best_and_goes_on_after_an_interruption() -> None:
     assert torch.equal(again.result(maps[0]), maps[2])
 
 
-def test_without_a_rule_the_last_average_counts() -> None:
+def test_fixed_rule_returns_the_last_average() -> None:
     rule, last = Fixed(), torch.rand(1, 1, 2, 2)
     rule.judge(0.0, torch.zeros(1, 1, 2, 2))
     assert not rule.observe(10_000, last, last)

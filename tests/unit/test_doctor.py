@@ -105,25 +105,25 @@ def of(scene, check):
     return next(function for function in CHECKS if function.__name__ == f"check_{check}")(scene)
 
 
-def test_sound_rooms_are_in_order_in_every_respect(straight, sound):
+def test_sound_rooms_pass_every_check(straight, sound):
     for scene in (straight, sound):
         assert [(finding.check, finding.level) for finding in examine(scene)] == [
             (check.__name__.removeprefix("check_"), "ok") for check in CHECKS
         ]
 
 
-def test_single_precision_is_fine_enough(straight, sound):
+def test_single_precision_passes(straight, sound):
     for scene in (straight, sound):
         assert wrong(replace(scene, depth=scene.depth.float())) == {}
 
 
 @pytest.mark.parametrize("name", ["cube_no_texture", "sphere_cylinder_high_freq"])
-def test_embedded_scenes_are_sound(name):
+def test_embedded_scenes_pass(name):
     assert wrong(render_scene(name, 160).scene("simgeo", name)) == {}
 
 
 @pytest.mark.parametrize("index", range(3))
-def test_random_scenes_are_sound(index):
+def test_random_scenes_pass(index):
     assert wrong(render_random_scene(11, index, 128).scene("procedural", str(index))) == {}
 
 
@@ -140,7 +140,7 @@ def test_pictures_of_any_size_are_examined(size):
 
 
 @pytest.mark.parametrize(("factor", "cure"), [(1000, "x 0.001"), (0.001, "x 1000"), (5000, "x 0.0002")])
-def test_another_unit_is_found_with_its_factor(sound, factor, cure):
+def test_wrong_unit_is_found_with_its_factor(sound, factor, cure):
     level, message, advice = only(changed(sound, lambda z: z * factor), "units")
     assert level == "problem"
     assert cure in advice
@@ -148,7 +148,7 @@ def test_another_unit_is_found_with_its_factor(sound, factor, cure):
     assert ("farther" if factor > 1 else "nearer") in message
 
 
-def test_the_factor_s_meaning_and_result_are_told(sound):
+def test_unit_finding_states_factor_meaning_and_result(sound):
     _, message, advice = only(changed(sound, lambda z: z * 1000), "units")
     low, middle, high = np.percentile(sound.depth.numpy(), (1, 50, 99))
     assert message.startswith(f"depth {low:.3g} km to {high:.3g} km (1st to 99th percentile), median {middle:.3g} km")
@@ -156,25 +156,25 @@ def test_the_factor_s_meaning_and_result_are_told(sound):
 
 
 @pytest.mark.parametrize(("factor", "text"), [(1000, "200 m"), (0.001, "0.2 mm")])
-def test_a_baseline_in_another_unit_is_named_where_depth_is_off_by_the_same_factor(sound, factor, text):
+def test_baseline_in_another_unit_is_named_where_depth_is_off_by_the_same_factor(sound, factor, text):
     scene = with_camera(changed(sound, lambda z: z * factor), baseline=0.2 * factor)
     advice = [finding.advice for finding in examine(scene) if finding.level == "problem"]
     assert len(advice) == 1
     assert f'set "baseline_unit" in camera.json: the baseline of {text} is off by the same factor' in advice[0]
 
 
-def test_an_odd_baseline_is_noted_where_depth_is_plausible(sound):
+def test_odd_baseline_is_noted_where_depth_is_plausible(sound):
     notes = [finding for finding in examine(with_camera(sound, baseline=160.0)) if finding.level != "ok"]
     assert [(note.check, note.level) for note in notes] == [("units", "note")]
     assert notes[0].message.startswith("baseline 160 m")
 
 
 @pytest.mark.parametrize(("factor", "level"), [(20, "note"), (100, "warning"), (0.02, "warning")])
-def test_distances_between_a_room_s_and_another_unit_s_are_doubtful(sound, factor, level):
+def test_distances_between_two_units_are_doubtful(sound, factor, level):
     assert level_of(changed(sound, lambda z: z * factor), "units") == level
 
 
-def test_a_measured_map_in_another_unit_than_the_fine_one_is_found(sound):
+def test_measured_map_in_another_unit_than_the_high_resolution_map_is_found(sound):
     coarse = sound.depth[:, 2::4, 2::4]
     assert wrong(replace(sound, measured={4: coarse})) == {}
     _, message, _ = only(replace(sound, measured={4: coarse * 4}), "units")
@@ -184,7 +184,7 @@ def test_a_measured_map_in_another_unit_than_the_fine_one_is_found(sound):
 @pytest.mark.parametrize(
     ("metres", "text"), [(0.00123, "1.23 mm"), (0.05, "50 mm"), (0.2, "0.2 m"), (3.456, "3.46 m"), (5e3, "5 km")]
 )
-def test_lengths_are_told_in_fitting_units(metres, text):
+def test_lengths_are_printed_in_fitting_units(metres, text):
     assert length(metres) == text
 
 
@@ -201,7 +201,7 @@ def test_intrinsics_of_another_resolution_are_found_with_the_factor(sound, scale
     assert advice.startswith(f"divide them by {scale:g}")
 
 
-def test_swapped_intrinsics_are_put_in_order():
+def test_swapped_intrinsics_are_found():
     camera = Camera(320, 240, 300.0, 301.0, 159.5, 119.5)
     sound = room_scene(camera, 17.0)
     assert wrong(sound) == {}
@@ -212,7 +212,7 @@ def test_swapped_intrinsics_are_put_in_order():
     assert advice == "put them in order: cx is the number given as cy, cy is the number given as cx"
 
 
-def test_a_principal_point_far_off_the_centre_is_told_with_its_side(sound):
+def test_principal_point_far_off_the_centre_is_found_with_its_side(sound):
     _, message, advice = only(with_camera(sound, cx=127.5 - 0.3 * SIZE), "intrinsics")
     assert "lies 30% of the width left of the centre and 0% of the height above it" in message
     assert advice.startswith("check cx and cy")
@@ -220,13 +220,13 @@ def test_a_principal_point_far_off_the_centre_is_told_with_its_side(sound):
     assert level_of(with_camera(sound, cy=127.5 + 0.08 * SIZE), "intrinsics") == "ok"
 
 
-def test_unequal_focal_lengths_are_told(sound):
+def test_unequal_focal_lengths_are_found(sound):
     level, message, _ = only(with_camera(sound, fy=300.0), "intrinsics")
     assert (level, message) == ("warning", "fx 240 and fy 300 px differ by 25%")
 
 
 @pytest.mark.parametrize(("fx", "level"), [(35.0, "warning"), (60.0, "note"), (800.0, "note"), (2000.0, "warning")])
-def test_a_view_that_no_usual_lens_has_is_told_in_degrees(sound, fx, level):
+def test_implausible_field_of_view_is_found_in_degrees(sound, fx, level):
     scene = with_camera(sound, fx=fx, fy=fx)
     [finding] = of(scene, "intrinsics")
     degrees = 2 * math.degrees(math.atan(SIZE / 2 / fx))
@@ -234,7 +234,7 @@ def test_a_view_that_no_usual_lens_has_is_told_in_degrees(sound, fx, level):
     assert f"fx {fx:g} px makes a view of {degrees:.3g} degrees across" in finding.message
 
 
-def test_a_size_that_8_does_not_divide_is_noted():
+def test_size_that_8_does_not_divide_is_noted():
     scene = room_scene(Camera(250, 244, 240.0, 240.0, 124.5, 121.5), 17.0)
     [finding] = of(scene, "size")
     assert finding.level == "note"
@@ -248,20 +248,20 @@ def test_a_size_that_8_does_not_divide_is_noted():
     ("right", "down", "text"),
     [(6, 0, "6 px right, 0 px below"), (-4, 0, "4 px left, 0 px below"), (3, -5, "3 px right, 5 px above")],
 )
-def test_a_shifted_photo_is_found_with_its_shift(sound, right, down, text):
+def test_shifted_photo_is_found_with_its_shift(sound, right, down, text):
     shifted = replace(sound, rgb=sound.rgb.roll((down, right), (1, 2)))
     level, message, _ = only(shifted, "registration")
     assert (level, message) == ("warning", f"the photo's edges lie {text} of the depth's")
 
 
-def test_a_shift_in_a_large_picture_is_found_in_its_own_pixels():
+def test_shift_in_a_large_picture_is_found_in_its_own_pixels():
     camera = Camera(820, 700, 700.0, 700.0, 409.5, 349.5)
     scene = room_scene(camera, 17.0)
     [finding] = check_registration(replace(scene, rgb=scene.rgb.roll((0, 14), (1, 2))))
     assert finding.message == "the photo's edges lie 14 px right, 0 px below of the depth's"
 
 
-def test_a_shift_within_the_blur_of_edges_is_in_order(sound):
+def test_shift_within_the_blur_of_edges_passes(sound):
     assert level_of(replace(sound, rgb=sound.rgb.roll(2, 2)), "registration") == "ok"
 
 
@@ -269,12 +269,12 @@ def test_a_shift_within_the_blur_of_edges_is_in_order(sound):
     ("axes", "text"),
     [((2,), "mirrored left to right"), ((1,), "mirrored top to bottom"), ((1, 2), "turned by 180 degrees")],
 )
-def test_a_mirrored_photo_is_recognised(sound, axes, text):
+def test_mirrored_photo_is_recognised(sound, axes, text):
     level, message, _ = only(replace(sound, rgb=sound.rgb.flip(axes)), "registration")
     assert (level, message) == ("problem", f"the photo is {text} against the depth")
 
 
-def test_a_photo_of_something_else_is_noted(sound):
+def test_unrelated_photo_is_noted(sound):
     other = room_scene(turn=-50.0)
     other = replace(other, rgb=other.rgb.roll((100, 70), (1, 2)))
     [finding] = [finding for finding in examine(replace(sound, rgb=other.rgb)) if finding.level != "ok"]
@@ -282,7 +282,7 @@ def test_a_photo_of_something_else_is_noted(sound):
     assert finding.message.startswith("at no shift within 8 px")
 
 
-def test_too_few_depth_edges_are_no_reason_to_complain(sound):
+def test_too_few_depth_edges_pass(sound):
     depth = np.broadcast_to(2 + 0.001 * np.arange(SIZE) + 1e-6 * np.arange(SIZE)[:, None], (SIZE, SIZE)).copy()
     scene = replace(sound, depth=torch.from_numpy(depth)[None])
     assert wrong(scene) == {}
@@ -301,7 +301,7 @@ def test_edges_beside_holes_are_not_counted(sound):
 
 
 @pytest.mark.parametrize(("rows", "level"), [(10, "ok"), (64, "note"), (128, "warning")])
-def test_the_share_of_holes_is_judged(sound, rows, level):
+def test_fraction_of_holes_is_judged(sound, rows, level):
     depth = sound.depth.clone()
     depth[:, :rows] = torch.nan
     [finding] = of(replace(sound, depth=depth), "holes")
@@ -315,7 +315,7 @@ def scattered(share=0.05):
 
 
 @pytest.mark.parametrize("value", [65.535, 10.0, 655.35, 0.001, 0.0001, 7.77])
-def test_a_value_that_stands_for_holes_is_found(sound, value):
+def test_value_that_marks_holes_is_found(sound, value):
     where = scattered()
     _, message, advice = only(changed(sound, lambda z: np.where(where, value, z)), "holes")
     share = f"{where.mean():.1%}"
@@ -324,13 +324,13 @@ def test_a_value_that_stands_for_holes_is_found(sound, value):
     assert '"hole_value"' in advice
 
 
-def test_a_value_that_stands_for_holes_is_found_through_a_conversion_from_distance_along_the_ray(sound):
+def test_value_that_marks_holes_is_found_through_a_conversion_from_distance_along_the_ray(sound):
     rays = CAMERA.ray_lengths().numpy()
     _, message, _ = only(changed(sound, lambda z: np.where(scattered(), 50.0, z * rays) / rays), "holes")
     assert "exactly the largest value, 50 m" in message
 
 
-def test_a_value_that_lies_apart_in_one_piece_may_be_a_wall(sound):
+def test_separate_value_in_one_piece_may_be_a_wall(sound):
     wall = np.zeros((SIZE, SIZE), bool)
     wall[:40] = True
     scene = changed(sound, lambda z: np.where(wall, 9.0, z))
@@ -339,7 +339,7 @@ def test_a_value_that_lies_apart_in_one_piece_may_be_a_wall(sound):
     assert "apart from the next" in finding.message
 
 
-def test_a_map_of_one_value_is_doubtful(sound):
+def test_constant_map_is_doubtful(sound):
     level, message, _ = only(changed(sound, lambda z: np.full_like(z, 2.0)), "holes")
     assert (level, message) == ("warning", "every known pixel has the same value, 2 m")
 
@@ -352,7 +352,7 @@ def degrees(relative_step, camera=CAMERA):
 
 
 @pytest.mark.parametrize("step", [0.001, 0.002])
-def test_whole_millimetres_make_terraces(sound, step):
+def test_whole_millimetres_are_found_as_terraces(sound, step):
     scene = changed(sound, lambda z: np.round(z / step) * step)
     level, message, advice = only(scene, "precision")
     tilt = degrees(step / np.median(scene.depth))
@@ -362,11 +362,11 @@ def test_whole_millimetres_make_terraces(sound, step):
     assert advice
 
 
-def test_a_straight_room_in_whole_millimetres_is_found_too(straight):
+def test_whole_millimetres_are_found_in_a_straight_room(straight):
     assert "steps of 1 mm" in only(changed(straight, lambda z: np.round(z, 3)), "precision")[1]
 
 
-def test_tenths_of_millimetres_are_fine_enough(sound):
+def test_tenths_of_millimetres_pass(sound):
     scene = changed(sound, lambda z: np.round(z, 4))
     assert wrong(scene) == {}
     rounding = find_rounding(scene)
@@ -384,7 +384,7 @@ def test_8_bit_depth_is_a_problem(sound):
     assert "distinct values (8 bits hold 256)" in message
 
 
-def test_whole_disparities_are_told_in_pixels(sound):
+def test_whole_disparities_are_found_in_pixels(sound):
     disparity = to_range(sound.depth, CAMERA, "disparity").round()
     scene = replace(sound, depth=from_range(disparity, CAMERA, "disparity"))
     level, message, _ = only(scene, "precision")
@@ -400,7 +400,7 @@ def test_half_precision_is_recognised(sound):
 
 
 @pytest.mark.parametrize("factor", [2, 3, 4, 8])
-def test_a_map_enlarged_by_repeating_its_pixels_is_recognised(sound, factor):
+def test_map_enlarged_by_repeating_its_pixels_is_recognised(sound, factor):
     def enlarge(depth):
         return depth[::factor, ::factor].repeat(factor, 0).repeat(factor, 1)[:SIZE, :SIZE]
 
@@ -409,13 +409,13 @@ def test_a_map_enlarged_by_repeating_its_pixels_is_recognised(sound, factor):
     assert message == f"every value is repeated {factor} times across and down: a smaller map, enlarged"
 
 
-def test_flat_walls_and_level_floors_are_not_taken_for_terraces(straight):
+def test_flat_walls_and_level_floors_are_not_terraces(straight):
     depth = straight.depth[0].numpy()
     assert (np.diff(depth) == 0).mean() > 0.2
     assert find_rounding(straight) is None
 
 
-def test_cards_that_face_the_camera_are_not_taken_for_an_enlarged_map(sound):
+def test_cards_that_face_the_camera_are_not_an_enlarged_map(sound):
     depth = np.full((SIZE, SIZE), 3.0)
     depth[40:100, 32:96], depth[120:200, 160:240] = 2.0, 2.5
     assert level_of(changed(sound, lambda _: depth), "precision") == "ok"
@@ -424,7 +424,7 @@ def test_cards_that_face_the_camera_are_not_taken_for_an_enlarged_map(sound):
 # planes
 
 
-def test_distance_along_the_ray_is_recognised_and_the_reverse(straight, sound):
+def test_distance_along_the_ray_is_told_from_orthogonal_depth(straight, sound):
     rays = CAMERA.ray_lengths().numpy()
     for scene in (straight, sound):
         level, message, advice = only(changed(scene, lambda z: z * rays), "planes")
@@ -437,7 +437,7 @@ def test_distance_along_the_ray_is_recognised_and_the_reverse(straight, sound):
 
 
 @pytest.mark.parametrize("exponent", [0, 1, -1])
-def test_the_exponent_of_planes_is_measured(sound, exponent):
+def test_exponent_of_planes_is_measured(sound, exponent):
     votes = plane_votes(sound.depth[0].numpy() * CAMERA.ray_lengths().numpy() ** exponent, CAMERA)
     assert votes.size > 50
     assert np.median(votes) == pytest.approx(exponent, abs=0.1)
@@ -451,14 +451,14 @@ def test_planes_are_recognised_through_noise_and_holes(sound):
     assert level_of(changed(sound, lambda z: z * rays * noise * holes), "planes") == "problem"
 
 
-def test_a_narrow_view_leaves_the_planes_undecided(sound):
+def test_planes_of_a_narrow_view_are_undecided(sound):
     camera = replace(CAMERA, fx=6000.0, fy=6000.0)
     noise = 1 + 0.002 * np.random.default_rng(6).standard_normal((SIZE, SIZE))
     depth = torch.from_numpy(room(camera, 17.0)[0] * noise)[None]
     assert level_of(replace(sound, camera=camera, depth=depth), "planes") == "note"
 
 
-def test_balls_alone_leave_the_planes_undecided(sound):
+def test_planes_are_undecided_where_all_is_round(sound):
     rays = CAMERA.rays().numpy()
     square, half = (rays**2).sum(axis=0), 3 * rays[2]
     root = half**2 - square * (9 - 0.9**2)
@@ -483,7 +483,7 @@ def test_rounded_distance_along_the_ray_is_found_in_its_own_unit(sound):
     assert message.startswith("distance along the ray comes in steps of 1 mm, ")
 
 
-def test_rounding_below_the_noise_does_no_harm(sound):
+def test_rounding_below_the_noise_passes(sound):
     noise = 1 + 0.005 * np.random.default_rng(6).standard_normal((SIZE, SIZE))
     assert level_of(changed(sound, lambda z: np.round(z * noise, 3)), "precision") == "ok"
 
@@ -491,7 +491,7 @@ def test_rounding_below_the_noise_does_no_harm(sound):
 # scenes of which only a measured low-resolution map is known
 
 
-def test_a_measured_map_is_examined_at_its_own_resolution(sound):
+def test_measured_map_is_examined_at_its_own_resolution(sound):
     coarse = replace(sound, depth=None, measured={4: sound.depth[:, 2::4, 2::4], 2: sound.depth[:, 1::2, 1::2]})
     scene = with_depth(coarse)
     assert scene.rgb.shape == (3, SIZE // 2, SIZE // 2)
@@ -505,7 +505,7 @@ def test_a_measured_map_is_examined_at_its_own_resolution(sound):
 
 
 @pytest.mark.parametrize("name", ["lucy", "plant"])
-def test_published_scenes_are_sound(shared, name):
+def test_published_scenes_pass(shared, name):
     assert wrong(load_scene(shared / "scenes" / name, "folder")) == {}
 
 
@@ -526,13 +526,13 @@ def office(shared):
     return real_scene(read_rgb(folder / "scene_00_0000.png"), values, ICL)
 
 
-def test_a_real_office_s_distances_along_the_ray_are_recognised(shared):
+def test_distances_along_the_ray_of_a_real_office_are_recognised(shared):
     scene = office(shared)
     only(scene, "planes")
     assert wrong(replace(scene, depth=from_range(scene.depth, ICL, "perspective"))) == {}
 
 
-def test_a_real_living_room_is_orthogonal_and_in_whole_millimetres(shared):
+def test_real_living_room_is_orthogonal_and_in_whole_millimetres(shared):
     folder = shared / "real" / "icl_nuim" / "living"
     scene = real_scene(read_rgb(folder / "rgb.png"), read_map(folder / "depth.png") / 5000, ICL)
     level, message, _ = only(scene, "precision")
@@ -577,7 +577,7 @@ def write(folder, scene, **entries):
     np.save(folder / "depth.npy", scene.depth[0].numpy())
 
 
-def test_a_sound_scene_s_report_is_one_table_and_exit_code_0(tmp_path, capsys, sound):
+def test_report_of_a_sound_scene_is_one_table_and_exit_code_0(tmp_path, capsys, sound):
     write(tmp_path / "room", sound)
     assert examine_directory(tmp_path / "room") == 0
     out, err = capsys.readouterr()
@@ -588,7 +588,7 @@ def test_a_sound_scene_s_report_is_one_table_and_exit_code_0(tmp_path, capsys, s
     assert lines[-1] == "1 scene: 1 fine"
 
 
-def test_a_directory_of_scenes_is_summed_up(tmp_path, capsys, sound):
+def test_report_of_a_directory_ends_in_a_summary(tmp_path, capsys, sound):
     write(tmp_path / "a_sound", sound)
     write(tmp_path / "b_unit", changed(sound, lambda z: z * 1000))
     write(tmp_path / "c_rounded", changed(sound, lambda z: np.round(z, 3)))
@@ -606,7 +606,7 @@ def test_a_directory_of_scenes_is_summed_up(tmp_path, capsys, sound):
     assert out.splitlines()[-1] == "4 scenes: 1 fine, 1 with warnings, 2 with problems"
 
 
-def test_of_many_scenes_only_what_is_not_in_order_is_shown(tmp_path, capsys, sound):
+def test_report_of_many_scenes_shows_only_those_with_findings(tmp_path, capsys, sound):
     small = replace(sound, depth=sound.depth[:, :64, :64], rgb=sound.rgb[:, :64, :64], camera=CAMERA.crop(0, 0, 64, 64))
     centred = with_camera(small, cx=31.5, cy=31.5, fx=60.0, fy=60.0)
     for number in range(8):
@@ -620,7 +620,7 @@ def test_of_many_scenes_only_what_is_not_in_order_is_shown(tmp_path, capsys, sou
     assert out.splitlines()[-1] == "9 scenes: 8 fine, 1 with problems"
 
 
-def test_a_scene_with_a_measured_map_alone_says_what_was_examined(tmp_path, capsys, sound):
+def test_report_of_a_measured_map_alone_says_what_was_examined(tmp_path, capsys, sound):
     write(tmp_path / "sensor", sound)
     (tmp_path / "sensor" / "depth.npy").unlink()
     np.save(tmp_path / "sensor" / "depth_lr2.npy", sound.depth[0, ::2, ::2].numpy())
@@ -629,7 +629,7 @@ def test_a_scene_with_a_measured_map_alone_says_what_was_examined(tmp_path, caps
 
 
 @pytest.mark.parametrize("kind", ["missing", "file", "empty"])
-def test_a_place_without_scenes_is_one_line_on_stderr_and_exit_code_2(tmp_path, capsys, kind):
+def test_directory_without_scenes_is_one_line_on_stderr_and_exit_code_2(tmp_path, capsys, kind):
     place = tmp_path / kind
     if kind == "file":
         place.write_text("x")

@@ -122,7 +122,7 @@ def sha256(content):
     return hashlib.sha256(content).hexdigest()
 
 
-def test_a_file_comes_whole_is_recorded_and_is_not_asked_for_again(server, tmp_path):
+def test_file_is_fetched_recorded_and_not_requested_again(server, tmp_path):
     item = picture(server)
     assert fetched(item, tmp_path) == []
     assert (tmp_path / "set/a.png").read_bytes() == PNG
@@ -133,7 +133,7 @@ def test_a_file_comes_whole_is_recorded_and_is_not_asked_for_again(server, tmp_p
     assert len(server.log) == 1
 
 
-def test_a_connection_that_breaks_off_goes_on_where_it_stopped(server, tmp_path):
+def test_broken_connection_resumes_where_it_stopped(server, tmp_path):
     server.cuts = [200_000, 100_000]
     assert fetched(picture(server), tmp_path) == []
     assert (tmp_path / "set/a.png").read_bytes() == PNG
@@ -143,14 +143,14 @@ def test_a_connection_that_breaks_off_goes_on_where_it_stopped(server, tmp_path)
     assert server.log[-1][2] == len(PNG) - third
 
 
-def test_a_connection_that_gets_on_may_break_off_more_often_than_one_that_does_not(server, tmp_path):
+def test_connection_that_makes_progress_may_break_off_more_often(server, tmp_path):
     server.cuts = [100_000] * 3
     assert fetched(picture(server), tmp_path) == []
     server.cuts, server.ranges = [100_000] * 3, False
     one_line(fetched(picture(server, name="b.png"), tmp_path), "broke off")
 
 
-def test_a_later_command_goes_on_where_the_last_one_stopped(server, tmp_path, monkeypatch):
+def test_later_command_resumes_a_partial_file(server, tmp_path, monkeypatch):
     monkeypatch.setattr(download, "PAUSES", ())
     server.cuts = [200_000]
     one_line(fetched(picture(server), tmp_path), "set/a.png: ", f"{server.url}/a.png: ", "broke off")
@@ -164,7 +164,7 @@ def test_a_later_command_goes_on_where_the_last_one_stopped(server, tmp_path, mo
     assert left_in(tmp_path) == ["set/a.png"]
 
 
-def test_an_interruption_keeps_what_has_come(server, tmp_path):
+def test_interruption_keeps_the_partial_file(server, tmp_path):
     with pytest.raises(KeyboardInterrupt):
         get([picture(server)], tmp_path, Watcher(stop_at=200_000))
     assert left_in(tmp_path) == ["set/a.png.part", "set/a.png.part.json"]
@@ -174,7 +174,7 @@ def test_an_interruption_keeps_what_has_come(server, tmp_path):
     assert server.log[-1][1:] == (f"bytes={had}-", len(PNG) - had)
 
 
-def test_what_came_whole_before_an_interruption_is_not_asked_for_again(server, tmp_path, monkeypatch):
+def test_complete_files_are_not_requested_again_after_an_interruption(server, tmp_path, monkeypatch):
     with monkeypatch.context() as patch:
         patch.setattr("dsr.data.download.get.expect_kind", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
         with pytest.raises(KeyboardInterrupt):
@@ -186,7 +186,7 @@ def test_what_came_whole_before_an_interruption_is_not_asked_for_again(server, t
 
 
 @pytest.mark.parametrize("marks", [{"ETag": '"1"'}, {"Last-Modified": "Mon, 01 Jan 2024 00:00:00 GMT"}])
-def test_a_file_that_changed_in_between_starts_anew(server, tmp_path, marks):
+def test_file_that_changed_in_between_starts_anew(server, tmp_path, marks):
     server.marks = marks
     with pytest.raises(KeyboardInterrupt):
         get([picture(server)], tmp_path, Watcher(stop_at=200_000))
@@ -197,7 +197,7 @@ def test_a_file_that_changed_in_between_starts_anew(server, tmp_path, marks):
 
 
 @pytest.mark.parametrize(("length", "sent"), [(len(PNG), "rest"), (len(PNG) - 256, "whole")])
-def test_without_a_mark_of_the_version_the_size_decides(server, tmp_path, length, sent):
+def test_size_decides_where_the_server_sends_no_version(server, tmp_path, length, sent):
     server.marks = {"ETag": 'W/"weak"'}
     with pytest.raises(KeyboardInterrupt):
         get([picture(server)], tmp_path, Watcher(stop_at=200_000))
@@ -208,7 +208,7 @@ def test_without_a_mark_of_the_version_the_size_decides(server, tmp_path, length
     assert (tmp_path / "set/a.png").read_bytes() == PNG[:length]
 
 
-def test_without_a_mark_another_server_starts_anew(server, tmp_path):
+def test_another_server_without_a_version_starts_anew(server, tmp_path):
     server.marks = {}
     server.files["/b.png"] = OTHER
     with pytest.raises(KeyboardInterrupt):
@@ -218,14 +218,14 @@ def test_without_a_mark_another_server_starts_anew(server, tmp_path):
     assert (tmp_path / "set/a.png").read_bytes() == OTHER
 
 
-def test_a_server_without_ranges_sends_the_file_anew(server, tmp_path):
+def test_server_without_ranges_sends_the_file_anew(server, tmp_path):
     server.ranges, server.cuts = False, [200_000]
     assert fetched(picture(server), tmp_path) == []
     assert [sent for _, _, sent in server.log] == [200_000, len(PNG)]
     assert (tmp_path / "set/a.png").read_bytes() == PNG
 
 
-def test_a_beginning_longer_than_the_file_is_thrown_away(server, tmp_path):
+def test_partial_file_longer_than_the_file_is_discarded(server, tmp_path):
     part = tmp_path / "set/a.png.part"
     part.parent.mkdir()
     part.write_bytes(PNG + b"more")
@@ -236,7 +236,7 @@ def test_a_beginning_longer_than_the_file_is_thrown_away(server, tmp_path):
     assert (tmp_path / "set/a.png").read_bytes() == PNG
 
 
-def test_a_beginning_that_is_the_whole_file_needs_no_more_bytes(server, tmp_path):
+def test_complete_partial_file_needs_no_more_bytes(server, tmp_path):
     with pytest.raises(KeyboardInterrupt):
         get([picture(server)], tmp_path, Watcher(stop_at=len(PNG)))
     assert fetched(picture(server), tmp_path) == []
@@ -244,25 +244,25 @@ def test_a_beginning_that_is_the_whole_file_needs_no_more_bytes(server, tmp_path
     assert (tmp_path / "set/a.png").read_bytes() == PNG
 
 
-def test_a_server_that_is_busy_is_asked_again(server, tmp_path):
+def test_busy_server_is_retried(server, tmp_path):
     server.states = [503, 429]
     assert fetched(picture(server), tmp_path) == []
     assert len(server.log) == 3
 
 
-def test_a_server_that_stays_busy_is_one_line(server, tmp_path):
+def test_server_that_stays_busy_is_one_line(server, tmp_path):
     server.states = [503] * 9
     one_line(fetched(picture(server), tmp_path), f"set/a.png: {server.url}/a.png: HTTP 503")
     assert len(server.log) == 3
 
 
-def test_another_address_is_taken_where_the_first_has_no_such_file(server, tmp_path):
+def test_second_address_is_used_where_the_first_lacks_the_file(server, tmp_path):
     assert fetched(picture(server, "/gone.png", "/a.png"), tmp_path) == []
     assert [path for path, _, _ in server.log] == ["/gone.png", "/a.png"]
     assert (tmp_path / "set/a.png").read_bytes() == PNG
 
 
-def test_a_file_that_is_nowhere_is_one_line_and_the_others_come(server, tmp_path):
+def test_file_found_nowhere_is_one_line_and_the_others_come(server, tmp_path):
     items = [picture(server, "/gone.png", "/lost.png", name="x.png"), picture(server)]
     one_line(
         fetched(items, tmp_path),
@@ -271,7 +271,7 @@ def test_a_file_that_is_nowhere_is_one_line_and_the_others_come(server, tmp_path
     assert left_in(tmp_path) == ["set/a.png"]
 
 
-def test_a_server_that_is_not_there_is_one_line_a_file_and_retried_once(server, tmp_path, monkeypatch):
+def test_unreachable_server_is_one_line_per_file_and_retried_once(server, tmp_path, monkeypatch):
     slept = []
     monkeypatch.setattr(download.time, "sleep", slept.append)
     with socket.socket() as closed:
@@ -287,11 +287,11 @@ def test_a_server_that_is_not_there_is_one_line_a_file_and_retried_once(server, 
 
 
 @pytest.mark.parametrize("url", ["nonsense", "http://", "ftp://127.0.0.1/a.png", "http://127.0.0.1:99999/a.png"])
-def test_an_address_that_is_none_is_one_line(tmp_path, url):
+def test_invalid_address_is_one_line(tmp_path, url):
     one_line(fetched(Item("set/a.png", (url,)), tmp_path), f"set/a.png: {url}: ")
 
 
-def test_a_web_page_instead_of_the_file_is_refused(server, tmp_path):
+def test_web_page_instead_of_the_file_is_refused(server, tmp_path):
     server.files["/a.png"] = PAGE
     one_line(fetched(picture(server), tmp_path), f"{server.url}/a.png: expected a file, got a web page")
     assert left_in(tmp_path) == []
@@ -304,7 +304,7 @@ def test_a_web_page_instead_of_the_file_is_refused(server, tmp_path):
         ("a.mat", PNG), ("a.ppm", PNG), ("a.pgm", PNG), ("a.npy", PNG),
     ],
 )  # fmt: skip
-def test_a_file_of_another_kind_is_refused(server, tmp_path, name, content):
+def test_file_of_the_wrong_kind_is_refused(server, tmp_path, name, content):
     server.files["/a.png"] = content
     problems = fetched(picture(server, name=name), tmp_path)
     one_line(problems, f"set/{name}: {server.url}/a.png: expected a {Path(name).suffix} file, got one that begins with")
@@ -318,13 +318,13 @@ def test_a_file_of_another_kind_is_refused(server, tmp_path, name, content):
         ("a.pgm", b"P5 1 1"), ("a.npy", b"\x93NUMPY\1\0"), ("a.zip", b"PK\3\4"), ("a.tar.gz", b"\x1f\x8b\x08"),
     ],
 )  # fmt: skip
-def test_a_file_of_its_kind_is_taken(server, tmp_path, name, content):
+def test_file_of_the_right_kind_is_accepted(server, tmp_path, name, content):
     server.files["/a.png"] = content
     assert fetched(picture(server, name=name), tmp_path) == []
     assert (tmp_path / "set" / name).read_bytes() == content
 
 
-def test_an_empty_answer_and_a_compressed_one_are_refused(server, tmp_path):
+def test_empty_and_compressed_responses_are_refused(server, tmp_path):
     server.files["/a.png"] = b""
     server.files["/b.png"] = PNG
     one_line(fetched(picture(server), tmp_path), "got an empty one")
@@ -333,7 +333,7 @@ def test_an_empty_answer_and_a_compressed_one_are_refused(server, tmp_path):
     assert left_in(tmp_path) == []
 
 
-def test_another_checksum_than_recorded_is_refused_with_both(server, tmp_path):
+def test_checksum_mismatch_is_refused_with_both_checksums(server, tmp_path):
     fetched(picture(server), tmp_path)
     (tmp_path / "set/a.png").unlink()
     server.files["/a.png"] = OTHER
@@ -345,7 +345,7 @@ def test_another_checksum_than_recorded_is_refused_with_both(server, tmp_path):
     assert Checksums(tmp_path)["set/a.png"].sha256 == sha256(PNG)
 
 
-def test_another_checksum_is_taken_when_that_is_asked_for(server, tmp_path):
+def test_new_checksum_is_accepted_on_request(server, tmp_path):
     fetched(picture(server), tmp_path)
     (tmp_path / "set/a.png").unlink()
     server.files["/a.png"] = OTHER
@@ -354,14 +354,14 @@ def test_another_checksum_is_taken_when_that_is_asked_for(server, tmp_path):
     assert Checksums(tmp_path)["set/a.png"].sha256 == sha256(OTHER)
 
 
-def test_a_checksum_that_is_known_beforehand_holds_even_then(server, tmp_path):
+def test_checksum_known_in_advance_holds_even_on_request(server, tmp_path):
     item = Item("set/a.png", (f"{server.url}/a.png",), sha256=sha256(OTHER))
     one_line(fetched(item, tmp_path, accept_changed=True), sha256(OTHER), sha256(PNG))
     server.files["/a.png"] = OTHER
     assert fetched(item, tmp_path) == []
 
 
-def test_a_mirror_is_asked_first_under_the_same_path(server, tmp_path):
+def test_mirror_is_asked_first_under_the_same_path(server, tmp_path):
     server.files["/mirror/set/a.png"] = PNG
     assert fetched(picture(server), tmp_path, mirror=f"{server.url}/mirror/") == []
     assert [path for path, _, _ in server.log] == ["/mirror/set/a.png"]
@@ -369,7 +369,7 @@ def test_a_mirror_is_asked_first_under_the_same_path(server, tmp_path):
     assert [path for path, _, _ in server.log[1:]] == ["/mirror/set/b.png", "/a.png"]
 
 
-def test_a_mirror_with_another_file_is_passed_over(server, tmp_path):
+def test_mirror_with_another_file_is_skipped(server, tmp_path):
     fetched(picture(server), tmp_path)
     (tmp_path / "set/a.png").unlink()
     server.files["/mirror/set/a.png"] = OTHER
@@ -377,7 +377,7 @@ def test_a_mirror_with_another_file_is_passed_over(server, tmp_path):
     assert (tmp_path / "set/a.png").read_bytes() == PNG
 
 
-def test_a_member_of_an_archive_stands_for_a_file(server, tmp_path):
+def test_archive_member_stands_for_a_file(server, tmp_path):
     server.files["/two.zip"] = zipped({"Art/view1.png": PNG, "Art/view5.png": OTHER})
     assert fetched(picture(server, "/gone.png", "/two.zip#Art/view1.png"), tmp_path) == []
     assert (tmp_path / "set/a.png").read_bytes() == PNG
@@ -388,7 +388,7 @@ def test_a_member_of_an_archive_stands_for_a_file(server, tmp_path):
     one_line(fetched(picture(server, "/two.zip#Art/view1.png", name="c.png"), tmp_path), "expected an archive")
 
 
-def test_a_disk_too_small_for_the_file_ends_it_before_a_byte_is_written(server, tmp_path, monkeypatch):
+def test_disk_too_small_for_the_file_is_refused_before_a_byte_is_written(server, tmp_path, monkeypatch):
     usage = namedtuple("usage", "total used free")
     monkeypatch.setattr(shutil, "disk_usage", lambda _: usage(10**9, 10**9, 100_000))
     problems = fetched([picture(server), picture(server, name="b.png")], tmp_path)
@@ -396,7 +396,7 @@ def test_a_disk_too_small_for_the_file_ends_it_before_a_byte_is_written(server, 
     assert left_in(tmp_path) == []
 
 
-def test_an_archive_needs_space_for_what_it_unpacks_to(server, tmp_path, monkeypatch):
+def test_archive_needs_space_for_its_unpacked_size(server, tmp_path, monkeypatch):
     usage = namedtuple("usage", "total used free")
     monkeypatch.setattr(shutil, "disk_usage", lambda _: usage(10**9, 0, 500_000))
     server.files["/big.zip"] = b"PK" + bytes(300_000)
@@ -404,7 +404,7 @@ def test_an_archive_needs_space_for_what_it_unpacks_to(server, tmp_path, monkeyp
     one_line(fetched(item, tmp_path), "expected 0.7 MB of free disk space, there are 0.5 MB")
 
 
-def test_a_disk_that_fills_up_is_one_line_and_keeps_what_has_come(server, tmp_path, monkeypatch):
+def test_disk_that_fills_up_is_one_line_and_keeps_the_partial_file(server, tmp_path, monkeypatch):
     original = Path.open
 
     class Full:
@@ -440,7 +440,7 @@ def test_a_disk_that_fills_up_is_one_line_and_keeps_what_has_come(server, tmp_pa
     assert (tmp_path / "set/a.png").read_bytes() == PNG
 
 
-def test_a_directory_that_cannot_be_written_is_one_line_a_file(server, tmp_path):
+def test_directory_without_write_permission_is_one_line_per_file(server, tmp_path):
     (tmp_path / "set").write_text("a file in its place")
     one_line(fetched(picture(server), tmp_path), "set/a.png: ", str(tmp_path / "set"))
 
@@ -478,7 +478,7 @@ PACKED = {"s.zip": zipped(FILES), "s.tar.gz": tarred({f"./{name}": content for n
 
 
 @pytest.mark.parametrize("name", PACKED)
-def test_an_archive_is_unpacked_recorded_and_removed(server, tmp_path, name):
+def test_archive_is_unpacked_recorded_and_removed(server, tmp_path, name):
     item = archive(server, name, PACKED[name])
     assert fetched(item, tmp_path) == []
     assert left_in(tmp_path) == ["set/room/list.txt", "set/room/rgb/1.png", "set/room/rgb/2.png"]
@@ -494,12 +494,12 @@ def test_an_archive_is_unpacked_recorded_and_removed(server, tmp_path, name):
     assert len(server.log) == 1
 
 
-def test_an_archive_is_kept_when_that_is_asked_for(server, tmp_path):
+def test_archive_is_kept_on_request(server, tmp_path):
     assert fetched(archive(server, "s.zip", PACKED["s.zip"]), tmp_path, keep_archives=True) == []
     assert (tmp_path / "set/s.zip").read_bytes() == PACKED["s.zip"]
 
 
-def test_an_archive_that_lies_there_is_used_and_kept(server, tmp_path):
+def test_existing_archive_is_used_and_kept(server, tmp_path):
     item = archive(server, "s.zip", PACKED["s.zip"])
     (tmp_path / "set").mkdir()
     (tmp_path / "set/s.zip").write_bytes(PACKED["s.zip"])
@@ -509,7 +509,7 @@ def test_an_archive_that_lies_there_is_used_and_kept(server, tmp_path):
     assert (tmp_path / "set/s.zip").read_bytes() == PACKED["s.zip"]
 
 
-def test_what_was_unpacked_and_lost_is_fetched_again(server, tmp_path):
+def test_missing_unpacked_files_are_fetched_again(server, tmp_path):
     item = archive(server, "s.zip", PACKED["s.zip"])
     fetched(item, tmp_path)
     (tmp_path / "set/room/rgb/2.png").unlink()
@@ -543,7 +543,7 @@ OUTSIDE = {
 
 
 @pytest.mark.parametrize("case", OUTSIDE)
-def test_an_archive_that_leads_outside_is_refused_before_anything_is_unpacked(server, tmp_path, case):
+def test_archive_with_paths_outside_is_refused_before_anything_is_unpacked(server, tmp_path, case):
     root = tmp_path / "a" / "b"
     (tmp_path / "a" / "evil.txt").parent.mkdir()
     name, content = OUTSIDE[case]
@@ -552,7 +552,7 @@ def test_an_archive_that_leads_outside_is_refused_before_anything_is_unpacked(se
     assert not Path("/tmp/dsr_evil.txt").exists()
 
 
-def test_a_link_in_a_zip_is_refused(server, tmp_path):
+def test_link_in_a_zip_is_refused(server, tmp_path):
     member = zipfile.ZipInfo("rgb/evil")
     member.external_attr = 0o120777 << 16
     buffer = io.BytesIO()
@@ -574,7 +574,7 @@ def test_links_within_an_archive_become_copies(server, tmp_path):
 
 @pytest.mark.parametrize("name", PACKED)
 @pytest.mark.parametrize("share", [0.2, 0.7])
-def test_a_truncated_archive_is_refused_and_nothing_of_it_left(server, tmp_path, name, share):
+def test_truncated_archive_is_refused_and_nothing_of_it_left(server, tmp_path, name, share):
     content = PACKED[name][: int(len(PACKED[name]) * share)]
     one_line(
         fetched(archive(server, name, content), tmp_path), f"{tmp_path / 'set' / name}: expected an archive, got a"
@@ -582,7 +582,7 @@ def test_a_truncated_archive_is_refused_and_nothing_of_it_left(server, tmp_path,
     assert left_in(tmp_path) == [f"set/{name}"]
 
 
-def test_an_archive_with_a_flipped_bit_is_refused(server, tmp_path):
+def test_archive_with_a_flipped_bit_is_refused(server, tmp_path):
     content = bytearray(PACKED["s.zip"])
     content[5000] ^= 1
     one_line(
@@ -591,13 +591,13 @@ def test_an_archive_with_a_flipped_bit_is_refused(server, tmp_path):
     assert left_in(tmp_path) == ["set/s.zip"]
 
 
-def test_an_archive_of_something_else_is_refused(server, tmp_path):
+def test_archive_of_other_files_is_refused(server, tmp_path):
     problems = fetched(archive(server, "s.zip", PACKED["s.zip"], ("rgb", "depth")), tmp_path)
     one_line(problems, "expected depth in it, there is none")
     assert left_in(tmp_path) == ["set/s.zip"]
 
 
-def test_an_interrupted_unpacking_leaves_nothing_and_needs_no_second_download(server, tmp_path, monkeypatch):
+def test_interrupted_unpacking_leaves_nothing_and_needs_no_second_download(server, tmp_path, monkeypatch):
     item = archive(server, "s.zip", PACKED["s.zip"])
 
     def interrupted(source, sink, _):
@@ -613,7 +613,7 @@ def test_an_interrupted_unpacking_leaves_nothing_and_needs_no_second_download(se
     assert len(server.log) == 1
 
 
-def test_the_rest_of_a_killed_unpacking_is_swept_away(server, tmp_path):
+def test_leftovers_of_a_killed_unpacking_are_removed(server, tmp_path):
     rest = tmp_path / "set/.s.zip.unpacking/rgb/old.png"
     rest.parent.mkdir(parents=True)
     rest.write_bytes(PNG)
@@ -630,13 +630,13 @@ def verified(of, root, **options):
     return verify(of, root, watcher, **options), watcher.lines
 
 
-def test_files_as_recorded_are_found_right(server, tmp_path):
+def test_verification_accepts_recorded_files(server, tmp_path):
     items = picture(server), archive(server, "s.zip", PACKED["s.zip"])
     fetched(items, tmp_path)
     assert verified(collection(*items), tmp_path) == ([], [])
 
 
-def test_a_damaged_file_is_named_with_both_checksums_and_fetched_again(server, tmp_path):
+def test_damaged_file_is_named_with_both_checksums_and_fetched_again(server, tmp_path):
     item = picture(server)
     fetched(item, tmp_path)
     (tmp_path / "set/a.png").write_bytes(OTHER)
@@ -646,7 +646,7 @@ def test_a_damaged_file_is_named_with_both_checksums_and_fetched_again(server, t
     assert (tmp_path / "set/a.png").read_bytes() == PNG
 
 
-def test_a_file_of_another_size_and_a_missing_one_are_named(server, tmp_path):
+def test_verification_names_files_of_another_size_and_missing_ones(server, tmp_path):
     items = picture(server), picture(server, name="b.png"), archive(server, "s.zip", PACKED["s.zip"])
     fetched(items, tmp_path)
     (tmp_path / "set/a.png").write_bytes(PNG[:-1])
@@ -660,7 +660,7 @@ def test_a_file_of_another_size_and_a_missing_one_are_named(server, tmp_path):
     ]
 
 
-def test_nothing_is_made_where_nothing_is(server, tmp_path):
+def test_verification_of_nothing_creates_nothing(server, tmp_path):
     problems, _ = verified(collection(picture(server)), tmp_path / "nowhere")
     one_line(problems, "expected a file, there is none")
     assert not (tmp_path / "nowhere").exists()
@@ -677,7 +677,7 @@ def test_files_from_elsewhere_are_recorded_as_they_are(server, tmp_path):
     assert Checksums(tmp_path)["set/b.png"].sha256 == sha256(PNG)
 
 
-def test_an_archive_unpacked_by_hand_is_recorded_as_it_is(server, tmp_path):
+def test_archive_unpacked_by_hand_is_recorded_as_it_is(server, tmp_path):
     item = archive(server, "s.zip", PACKED["s.zip"])
     (tmp_path / "set/room").mkdir(parents=True)
     one_line(verified(collection(item), tmp_path)[0], f"{tmp_path / 'set/room'}: expected what s.zip unpacks to")
@@ -692,7 +692,7 @@ def test_an_archive_unpacked_by_hand_is_recorded_as_it_is(server, tmp_path):
 MANUAL = collection(manual="put *.mat into {folder}", patterns=("*.mat", "*/P*/*.png"))
 
 
-def test_the_manual_route_says_what_is_missing_and_where_it_belongs(tmp_path):
+def test_manual_route_names_what_is_missing_and_its_place(tmp_path):
     problems, _ = verified(MANUAL, tmp_path)
     assert [problem.split(": ")[1] for problem in problems] == [
         "expected *.mat, there is none",
@@ -703,7 +703,7 @@ def test_the_manual_route_says_what_is_missing_and_where_it_belongs(tmp_path):
         assert f"put *.mat into {tmp_path / 'set'}, then `dsr data verify mine`" in problem
 
 
-def test_the_manual_route_records_once_and_checks_ever_after(tmp_path):
+def test_manual_route_records_once_and_checks_afterwards(tmp_path):
     for name, content in {"set/a.mat": b"MATLAB 5.0", "set/sea/P000/1.png": PNG}.items():
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_bytes(content)
@@ -720,7 +720,7 @@ def test_the_manual_route_records_once_and_checks_ever_after(tmp_path):
     assert Checksums(tmp_path)["set/a.mat"].sha256 == sha256(b"MATLAB 7.3")
 
 
-def test_the_manual_route_leaves_other_data_sets_alone(server, tmp_path):
+def test_manual_route_leaves_other_data_sets_alone(server, tmp_path):
     fetched(Item("others/a.png", (f"{server.url}/a.png",)), tmp_path)
     (tmp_path / "others/a.png").unlink()
     (tmp_path / "set/sea/P000").mkdir(parents=True)
@@ -729,14 +729,14 @@ def test_the_manual_route_leaves_other_data_sets_alone(server, tmp_path):
     assert verified(MANUAL, tmp_path)[0] == []
 
 
-def test_a_web_page_put_there_by_hand_is_seen(tmp_path):
+def test_web_page_saved_by_hand_is_refused(tmp_path):
     (tmp_path / "set/sea/P000").mkdir(parents=True)
     (tmp_path / "set/sea/P000/1.png").write_bytes(PNG)
     (tmp_path / "set/a.mat").write_bytes(PAGE)
     one_line(verified(MANUAL, tmp_path)[0], f"{tmp_path / 'set/a.mat'}: expected a .mat file, got a web page")
 
 
-def test_the_state_of_a_collection(server, tmp_path):
+def test_collection_state_is_reported(server, tmp_path):
     items = picture(server), picture(server, name="b.png"), archive(server, "s.zip", PACKED["s.zip"])
     assert state(collection(*items), tmp_path) == "absent"
     fetched(items[0], tmp_path)
@@ -762,7 +762,7 @@ def test_damaged_records_are_one_line(server, tmp_path, text):
     one_line([str(caught.value)], tmp_path / "checksums.json")
 
 
-def test_two_commands_do_not_write_at_the_same_time(server, tmp_path):
+def test_second_command_waits_for_the_lock(server, tmp_path):
     with alone(tmp_path), pytest.raises(ValueError, match="another `dsr data` command"):
         fetched(picture(server), tmp_path)
     assert fetched(picture(server), tmp_path) == []

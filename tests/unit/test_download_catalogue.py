@@ -13,7 +13,7 @@ ITEMS = [item for collection in CATALOGUE.values() for item in collection.items]
 
 
 @pytest.mark.parametrize("name", CATALOGUE)
-def test_a_collection_says_what_it_is_and_on_which_terms(name):
+def test_collections_have_descriptions_and_terms(name):
     collection = CATALOGUE[name]
     assert collection.name == name
     assert urlsplit(collection.homepage).scheme in ("http", "https")
@@ -26,7 +26,7 @@ def test_a_collection_says_what_it_is_and_on_which_terms(name):
 
 
 @pytest.mark.parametrize("name", CATALOGUE)
-def test_the_files_of_a_collection_lie_in_its_folders(name):
+def test_files_of_a_collection_lie_in_its_folders(name):
     collection = CATALOGUE[name]
     assert {item.path.split("/")[0] for item in collection.items} == (
         set(collection.folders) if collection.items else set()
@@ -36,7 +36,7 @@ def test_the_files_of_a_collection_lie_in_its_folders(name):
 
 
 @pytest.mark.parametrize("item", ITEMS, ids=lambda item: item.path)
-def test_an_item_has_addresses_of_its_name_and_a_path_below_the_root(item):
+def test_items_have_addresses_of_their_names_and_paths_below_the_root(item):
     assert not PurePosixPath(item.path).is_absolute()
     assert ".." not in item.path
     assert item.urls
@@ -50,7 +50,7 @@ def test_an_item_has_addresses_of_its_name_and_a_path_below_the_root(item):
     assert bool(item.contains) == (item.unpack_to is not None)
 
 
-def test_an_item_is_the_same_wherever_it_occurs():
+def test_item_is_the_same_in_all_collections():
     by_path = {item.path: item for item in ITEMS}
     assert all(by_path[item.path] == item for item in ITEMS)
 
@@ -63,14 +63,14 @@ def test_middlebury_2014_has_its_23_public_scenes_once():
     assert not set(CATALOGUE["middlebury"].items) & set(CATALOGUE["middlebury_train"].items)
 
 
-def test_the_training_scenes_are_those_of_2014_2006_and_2001():
+def test_training_scenes_are_those_of_2014_2006_and_2001():
     items = CATALOGUE["middlebury_train"].items
     assert len(items) == 3 * 16 + 3 * 21 + 2 * 6
     assert {*CATALOGUE["middlebury2006"].items, *CATALOGUE["middlebury2001"].items} < set(items)
     assert len(SCENES_2006) == 21
 
 
-def test_the_scenes_are_those_that_are_read():
+def test_catalogue_scenes_are_those_that_the_readers_expect():
     assert {name.lower() for name in EVALUATION_2014} == set(EVALUATED)
     for year, scenes in SCENES.items():
         folders = {item.path.split("/")[1].lower() for item in CATALOGUE[f"middlebury{year}"].items}
@@ -84,16 +84,16 @@ def test_icl_has_a_directory_per_trajectory():
     assert items["icl_nuim/office_room_traj2"].endswith("/~ahanda/traj2_frei_png.tar.gz")
 
 
-def test_names_are_found_once_each_in_the_order_asked_for():
+def test_names_are_found_once_each_in_the_requested_order():
     found = find(["nyu", "icl", "nyu"], CATALOGUE)
     assert [collection.name for collection in found] == ["nyu", "icl"]
 
 
-def test_an_unknown_name_is_refused_with_the_known_ones():
+def test_unknown_name_is_refused_with_the_known_ones():
     with pytest.raises(ValueError, match=r"^middelbury: unknown data set; expected some of middlebury, ") as caught:
         find(["nyu", "middelbury"], CATALOGUE)
     assert "\n" not in str(caught.value)
 
 
-def test_an_instruction_names_the_directory():
+def test_manual_instruction_names_the_directory():
     assert str(Path("/data/tofmark")) in CATALOGUE["tofmark"].instruction(Path("/data"))

@@ -91,7 +91,7 @@ def test_nearest_is_the_pixel_at_half_a_block_and_keeps_its_hole(scale: int) -> 
 @pytest.mark.parametrize(
     ("kernel", "filter_"), [("bilinear", Image.Resampling.BILINEAR), ("bicubic", Image.Resampling.BICUBIC)]
 )
-def test_bilinear_and_bicubic_are_pillows(kernel: Kernel, filter_: Image.Resampling, scale: int) -> None:
+def test_bilinear_and_bicubic_equal_pillow(kernel: Kernel, filter_: Image.Resampling, scale: int) -> None:
     values = _values(32, 48)
     image = Image.fromarray(values[0].numpy().astype(np.float32))
     expected = np.asarray(image.resize((48 // scale, 32 // scale), filter_))
@@ -99,7 +99,7 @@ def test_bilinear_and_bicubic_are_pillows(kernel: Kernel, filter_: Image.Resampl
 
 
 @pytest.mark.parametrize("sigma", [0.3, 0.5, 0.7])
-def test_gaussian_is_its_formula(sigma: float) -> None:
+def test_gaussian_equals_its_formula(sigma: float) -> None:
     values = _values(12, 20)
     expected = _slow(values[0].numpy(), "gaussian", 4, sigma)
     np.testing.assert_allclose(Downsampling("gaussian", sigma)(values, 4)[0].numpy(), expected, rtol=1e-12)
@@ -107,7 +107,7 @@ def test_gaussian_is_its_formula(sigma: float) -> None:
 
 @pytest.mark.parametrize("scale", SCALES)
 @pytest.mark.parametrize("kernel", KERNELS)
-def test_a_constant_stays_one_up_to_the_border(kernel: Kernel, scale: int) -> None:
+def test_constant_is_reproduced_up_to_the_border(kernel: Kernel, scale: int) -> None:
     coarse = Downsampling(kernel)(torch.full((2, 1, 32, 48), 1.7, dtype=torch.float64), scale)
     assert coarse.shape == (2, 1, 32 // scale, 48 // scale)
     torch.testing.assert_close(coarse, torch.full_like(coarse, 1.7), rtol=1e-13, atol=0)
@@ -115,7 +115,7 @@ def test_a_constant_stays_one_up_to_the_border(kernel: Kernel, scale: int) -> No
 
 @pytest.mark.parametrize("scale", [2, 4])
 @pytest.mark.parametrize("kernel", KERNELS)
-def test_a_ramp_stays_one_where_the_kernel_fits_inside(kernel: Kernel, scale: int) -> None:
+def test_ramp_is_reproduced_where_the_kernel_fits_inside(kernel: Kernel, scale: int) -> None:
     v, u = torch.meshgrid(torch.arange(32.0).double(), torch.arange(48.0).double(), indexing="ij")
     coarse = Downsampling(kernel)(3 + 0.2 * u - 0.1 * v, scale)
     i, j = torch.meshgrid(torch.arange(32 // scale).double(), torch.arange(48 // scale).double(), indexing="ij")
@@ -137,7 +137,7 @@ def test_holes_are_left_out_of_the_average(kernel: Kernel, share: float) -> None
 
 
 @pytest.mark.parametrize("kernel", CENTRED)
-def test_where_less_than_half_the_weight_is_known_the_block_mean_stands_in(kernel: Kernel) -> None:
+def test_block_mean_replaces_the_kernel_where_less_than_half_its_weight_is_valid(kernel: Kernel) -> None:
     values = torch.full((1, 12, 12), torch.nan, dtype=torch.float64)
     values[0, 4, 4], values[0, 7, 5] = 2.0, 3.0  # in the middle block alone
     coarse = Downsampling(kernel)(values, 4)[0]
@@ -146,7 +146,7 @@ def test_where_less_than_half_the_weight_is_known_the_block_mean_stands_in(kerne
 
 
 @pytest.mark.parametrize("kernel", KERNELS)
-def test_every_map_of_a_batch_is_downsampled_by_itself(kernel: Kernel) -> None:
+def test_batch_is_downsampled_map_by_map(kernel: Kernel) -> None:
     values = torch.stack((_values(8, 12, 0), _values(8, 12, 1)))
     values[1, 0, 2, 3] = torch.nan
     together = Downsampling(kernel)(values, 2)
@@ -156,7 +156,7 @@ def test_every_map_of_a_batch_is_downsampled_by_itself(kernel: Kernel) -> None:
 
 @pytest.mark.parametrize("kernel", KERNELS)
 @pytest.mark.parametrize("holes", [False, True])
-def test_downsampling_has_the_gradient_of_its_value(kernel: Kernel, holes: bool) -> None:
+def test_gradient_of_downsampling_is_that_of_its_value(kernel: Kernel, holes: bool) -> None:
     values = _values(4, 6)
     mask = torch.ones_like(values, dtype=torch.bool)
     if holes:
@@ -175,12 +175,12 @@ def test_downsampling_keeps_the_precision(kernel: Kernel) -> None:
     assert Downsampling(kernel)(_values(8, 8).float(), 4).dtype == torch.float32
 
 
-def test_a_size_that_the_scale_does_not_divide_is_refused() -> None:
+def test_size_that_the_scale_does_not_divide_is_refused() -> None:
     with pytest.raises(ValueError, match="downsampling: expected a size divisible by 4, got 8 x 10"):
         Downsampling("box")(_values(8, 10), 4)
 
 
-def test_a_wrong_model_is_refused() -> None:
+def test_invalid_model_is_refused() -> None:
     with pytest.raises(ValueError, match=r"^kernel: expected one of box, nearest, bilinear, bicubic, gaussian, got"):
         Downsampling("lanczos")  # type: ignore[arg-type]
     for sigma in (0.0, 0.09, -1.0, math.nan):
@@ -197,14 +197,14 @@ COMBINATIONS = list(itertools.product(KERNELS, SCALES))
 
 @pytest.mark.parametrize(("kernel", "scale"), COMBINATIONS)
 @pytest.mark.parametrize("range_type", ["orthogonal", "disparity"])
-def test_a_fronto_parallel_plane_stays_where_it_is(kernel: Kernel, scale: int, range_type: RangeType) -> None:
+def test_fronto_parallel_plane_is_reproduced(kernel: Kernel, scale: int, range_type: RangeType) -> None:
     plane = torch.full((1, 32, 48), 2.5, dtype=torch.float64)
     sample = make_sample(_scene(plane, STEREO), scale, Downsampling(kernel), range_type)
     torch.testing.assert_close(sample.depth_lr, torch.full_like(sample.depth_lr, 2.5), rtol=1e-12, atol=0)
 
 
 @pytest.mark.parametrize(("kernel", "scale"), COMBINATIONS)
-def test_a_sphere_around_the_camera_stays_one_in_perspective_depth(kernel: Kernel, scale: int) -> None:
+def test_sphere_around_the_camera_is_reproduced_in_perspective_depth(kernel: Kernel, scale: int) -> None:
     sphere = (2.0 / CAMERA.ray_lengths())[None]
     sample = make_sample(_scene(sphere), scale, Downsampling(kernel), "perspective")
     radii = _points(sample.depth_lr, sample.camera_lr).norm(dim=0)
@@ -213,7 +213,7 @@ def test_a_sphere_around_the_camera_stays_one_in_perspective_depth(kernel: Kerne
 
 @pytest.mark.parametrize("camera", [CAMERA, STEREO])
 @pytest.mark.parametrize(("kernel", "scale"), [(k, s) for k, s in COMBINATIONS if s <= 4 or k in ("box", "nearest")])
-def test_the_coarse_camera_sees_the_points_of_a_tilted_plane(kernel: Kernel, scale: int, camera: Camera) -> None:
+def test_low_resolution_camera_has_the_points_of_a_tilted_plane(kernel: Kernel, scale: int, camera: Camera) -> None:
     normal = torch.tensor([0.3, -0.4, -1.0], dtype=torch.float64)[:, None, None]
     tilted = -2.0 / (normal * camera.rays()).sum(dim=0, keepdim=True)  # its disparity is linear in u and v
     sample = make_sample(_scene(tilted, camera), scale, Downsampling(kernel), "disparity")
@@ -222,7 +222,7 @@ def test_the_coarse_camera_sees_the_points_of_a_tilted_plane(kernel: Kernel, sca
     torch.testing.assert_close(offset[inside], torch.full_like(offset[inside], -2.0), rtol=1e-12, atol=0)
 
 
-def test_nearest_keeps_points_of_the_fine_map() -> None:
+def test_nearest_keeps_points_of_the_high_resolution_map() -> None:
     depth = _values(32, 48)
     sample = make_sample(_scene(depth), 4, Downsampling("nearest"), "perspective")
     fine = _points(depth, CAMERA)[:, 2::4, 2::4]
@@ -232,7 +232,7 @@ def test_nearest_keeps_points_of_the_fine_map() -> None:
 @pytest.mark.parametrize("camera", [CAMERA, STEREO])
 @pytest.mark.parametrize("asked", [None, *RANGE_TYPES])
 @pytest.mark.parametrize("method", RANGE_TYPES)
-def test_the_average_is_that_of_the_range_type(camera: Camera, asked: RangeType | None, method: RangeType) -> None:
+def test_average_is_taken_in_the_range_type(camera: Camera, asked: RangeType | None, method: RangeType) -> None:
     depth = _values(32, 48)
     sample = make_sample(_scene(depth, camera), 4, Downsampling("box", range_type=asked), method)
     z = depth.numpy()[0]
@@ -252,7 +252,7 @@ def test_the_average_is_that_of_the_range_type(camera: Camera, asked: RangeType 
     np.testing.assert_allclose(sample.depth_lr[0].numpy(), expected, rtol=1e-12)
 
 
-def test_coarse_disparity_counts_in_coarse_pixels() -> None:
+def test_disparity_of_the_low_resolution_map_is_in_its_own_pixels() -> None:
     disparity = to_range(_values(32, 48), STEREO, "disparity")
     depth = STEREO.baseline * 60.0 / (disparity + 1.7)  # type: ignore[operator]
     sample = make_sample(_scene(depth, STEREO), 4, Downsampling("box"), "disparity")
@@ -261,7 +261,7 @@ def test_coarse_disparity_counts_in_coarse_pixels() -> None:
     np.testing.assert_allclose(coarse.numpy(), expected, rtol=1e-12)
 
 
-def test_the_sample_carries_the_scene() -> None:
+def test_sample_has_the_scenes_data() -> None:
     scene = _scene(_values(32, 48))
     sample = make_sample(scene, 4, Downsampling("box"), "perspective")
     assert (sample.dataset, sample.scene, sample.scale, sample.notes) == ("set", "hall", 4, ())
@@ -272,7 +272,7 @@ def test_the_sample_carries_the_scene() -> None:
 
 
 @pytest.mark.parametrize("kernel", KERNELS)
-def test_a_size_that_the_scale_does_not_divide_is_cropped_and_the_notes_say_so(kernel: Kernel) -> None:
+def test_size_that_the_scale_does_not_divide_is_cropped_with_a_note(kernel: Kernel) -> None:
     camera = Camera(width=50, height=35, fx=60.0, fy=55.0, cx=21.3, cy=17.9)
     scene = _scene(_values(35, 50), camera)
     assert scene.depth is not None
@@ -301,7 +301,7 @@ def test_holes_of_the_scene_are_left_out_of_its_sample(range_type: RangeType) ->
 
 
 @pytest.mark.parametrize("range_type", RANGE_TYPES)
-def test_a_bicubic_undershoot_below_zero_is_a_hole(range_type: RangeType) -> None:
+def test_bicubic_undershoot_below_zero_is_a_hole(range_type: RangeType) -> None:
     depth = torch.full((1, 32, 48), 40.0, dtype=torch.float64)
     depth[..., :22] = 0.1
     sample = make_sample(_scene(depth), 4, Downsampling("bicubic"), range_type)
@@ -309,7 +309,7 @@ def test_a_bicubic_undershoot_below_zero_is_a_hole(range_type: RangeType) -> Non
     assert bool((sample.depth_lr[sample.mask_lr] > 0).all())
 
 
-def test_a_measured_map_is_taken_as_it_is() -> None:
+def test_measured_map_is_used_unchanged() -> None:
     measured = _values(8, 12)
     measured[0, 1, 1] = torch.nan
     sample = make_sample(_scene(None, measured={4: measured}), 4, Measured(), "disparity")
@@ -318,7 +318,7 @@ def test_a_measured_map_is_taken_as_it_is() -> None:
     assert sample.camera_lr == CAMERA.rescale(12, 8)
 
 
-def test_a_scene_that_lacks_what_the_problem_needs_is_refused() -> None:
+def test_scene_without_the_required_maps_is_refused() -> None:
     measured = _scene(None, measured={4: _values(8, 12)})
     with pytest.raises(ValueError, match="hall: expected a high-resolution depth map to downsample, there is none"):
         make_sample(measured, 4, Downsampling("box"), "disparity")
@@ -331,33 +331,33 @@ def test_a_scene_that_lacks_what_the_problem_needs_is_refused() -> None:
 
 
 @pytest.mark.parametrize("scale", [0, 1, 3, 32])
-def test_another_scale_is_refused(scale: int) -> None:
+def test_unsupported_scale_is_refused(scale: int) -> None:
     with pytest.raises(ValueError, match=f"scale: expected one of 2, 4, 8, 16, got {scale}"):
         make_sample(_scene(_values(32, 48)), scale, Downsampling("box"), "disparity")
 
 
-def test_a_scene_smaller_than_one_block_is_refused() -> None:
+def test_scene_smaller_than_one_block_is_refused() -> None:
     camera = Camera(48, 7, 60.0, 55.0, 21.3, 3.0)
     with pytest.raises(ValueError, match="hall: expected at least 8 x 8 pixels, got 7 x 48"):
         make_sample(_scene(_values(7, 48), camera), 8, Downsampling("box"), "disparity")
 
 
-def test_an_unknown_range_type_is_refused() -> None:
+def test_unknown_range_type_is_refused() -> None:
     arguments: Any = (_scene(_values(32, 48)), 4, Downsampling("box"), "inverse")
     with pytest.raises(ValueError, match="range_type: expected one of"):
         make_sample(*arguments)
 
 
-def test_samples_are_depth_samples() -> None:
+def test_make_sample_returns_depth_samples() -> None:
     assert isinstance(make_sample(_scene(_values(32, 48)), 2, Downsampling("gaussian"), "disparity"), DepthSample)
 
 
-def test_the_smallest_sigma_still_reaches_a_pixel_at_every_scale() -> None:
+def test_smallest_sigma_reaches_a_pixel_at_every_scale() -> None:
     for scale in SCALES:
         assert bool(Downsampling("gaussian", sigma=0.1)(torch.ones(1, 32, 32), scale).isfinite().all())
 
 
-def test_a_measured_map_of_a_size_that_the_scale_does_not_divide_is_that_of_the_cropped_photo() -> None:
+def test_measured_map_of_an_indivisible_size_is_that_of_the_cropped_photo() -> None:
     camera = Camera(width=23, height=21, fx=30.0, fy=30.0, cx=11.0, cy=10.0)
     measured = torch.full((1, 5, 5), 2.0, dtype=torch.float64)
     scene = Scene("test", "odd", torch.rand(3, 21, 23), camera, measured={4: measured})
@@ -380,7 +380,7 @@ BOX4: dict[str, Any] = {"scale": 4, "downsampling": Downsampling("box")}
 
 
 @pytest.mark.parametrize("range_type", RANGE_TYPES)
-def test_noise_multiplies_the_coarse_values_of_the_methods_range_type(range_type: RangeType) -> None:
+def test_noise_multiplies_the_low_resolution_values_of_the_methods_range_type(range_type: RangeType) -> None:
     noise = GaussianMultiplicative(0.02)
     noisy, clean = (make_sample(_wall(), **BOX4, range_type=range_type, noise=each) for each in (noise, None))
     one, other = (to_range(each.depth_lr, each.camera_lr, range_type) for each in (noisy, clean))
@@ -398,7 +398,7 @@ def test_noise_multiplies_the_coarse_values_of_the_methods_range_type(range_type
 @pytest.mark.parametrize("camera", [CAMERA, STEREO])
 @pytest.mark.parametrize("asked", [None, *RANGE_TYPES])
 @pytest.mark.parametrize("method", RANGE_TYPES)
-def test_noise_is_one_plus_std_times_the_draws_in_the_range_type_that_is_averaged(
+def test_noise_is_one_plus_std_times_the_draws_in_the_averaged_range_type(
     camera: Camera, asked: RangeType | None, method: RangeType
 ) -> None:
     noisy, clean = (
@@ -410,7 +410,7 @@ def test_noise_is_one_plus_std_times_the_draws_in_the_range_type_that_is_average
     torch.testing.assert_close(one, other * (1 + 0.03 * draws), rtol=1e-10, atol=1e-10)
 
 
-def test_noise_that_leads_behind_the_camera_makes_a_hole() -> None:
+def test_noise_beyond_the_camera_makes_a_hole() -> None:
     scene = _scene(torch.full((1, 32, 48), 2.0, dtype=torch.float64))
     for range_type in RANGE_TYPES:
         sample = make_sample(scene, 2, Downsampling("box"), range_type, GaussianMultiplicative(0.9))
@@ -419,7 +419,7 @@ def test_noise_that_leads_behind_the_camera_makes_a_hole() -> None:
         assert torch.equal(sample.mask_lr, 1 + 0.9 * draws > 0)
 
 
-def test_noise_is_the_scenes_own_and_a_function_of_seed_names_and_scale() -> None:
+def test_noise_is_a_function_of_seed_scene_names_and_scale() -> None:
     def coarse(scene: Scene, seed: int = 0, scale: int = 4) -> Tensor:
         noise = GaussianMultiplicative(0.01)
         return make_sample(scene, scale, Downsampling("box"), "disparity", noise, seed).depth_lr.flatten()[:300]
@@ -430,7 +430,7 @@ def test_noise_is_the_scenes_own_and_a_function_of_seed_names_and_scale() -> Non
         assert abs(float(torch.corrcoef(torch.stack((first, other)))[0, 1])) < 0.25
 
 
-def test_a_generator_of_ones_own_goes_on_from_sample_to_sample() -> None:
+def test_own_generator_continues_from_sample_to_sample() -> None:
     generator, noise = torch.Generator().manual_seed(5), GaussianMultiplicative(0.01)
     first, second = (
         make_sample(_wall(), **BOX4, range_type="disparity", noise=noise, generator=generator) for _ in "ab"
@@ -442,7 +442,7 @@ def test_a_generator_of_ones_own_goes_on_from_sample_to_sample() -> None:
     assert torch.equal(first.depth_lr, again.depth_lr)
 
 
-def test_holes_stay_holes_under_noise_and_dtype_and_device_stay() -> None:
+def test_noise_keeps_holes_dtype_and_device() -> None:
     values = torch.tensor([[1.0, torch.nan, 3.0]])
     noisy = GaussianMultiplicative(0.1)(values, torch.Generator().manual_seed(0))
     assert noisy.isnan().tolist() == [[False, True, False]]
@@ -451,23 +451,23 @@ def test_holes_stay_holes_under_noise_and_dtype_and_device_stay() -> None:
     torch.testing.assert_close(noisy.double(), exact, equal_nan=True, rtol=1e-6, atol=0)
 
 
-def test_noise_leaves_a_measured_map_alone() -> None:
+def test_measured_map_gets_no_noise() -> None:
     measured = {4: 1 + torch.rand(1, 8, 12, dtype=torch.float64)}
     sample = make_sample(_scene(None, measured=measured), 4, Measured(), "disparity", GaussianMultiplicative(0.1))
     assert torch.equal(sample.depth_lr, measured[4])
 
 
 @pytest.mark.parametrize("std", [0.0, 1.0, -0.1, math.nan])
-def test_a_noise_that_cannot_be_is_refused(std: float) -> None:
+def test_invalid_noise_is_refused(std: float) -> None:
     with pytest.raises(ValueError, match=r"^std: expected a number above 0 and below 1"):
         GaussianMultiplicative(std)
 
 
-def test_no_noise_is_none() -> None:
+def test_noise_of_none_is_none() -> None:
     assert no_noise() is None  # type: ignore[func-returns-value]
 
 
-def test_what_is_to_be_known_of_a_scene_is_known_of_its_samples() -> None:
+def test_scene_notes_are_passed_to_its_samples() -> None:
     known = replace(_scene(_values(32, 48)), notes=("not metric",))
     assert make_sample(known, 2, Downsampling("box"), "orthogonal").notes == ("not metric",)
     odd = replace(CAMERA, width=50)

@@ -34,7 +34,7 @@ def _stage(*, filters: int = 5, size: int = 5) -> Stage:
 
 
 @pytest.mark.parametrize("size", [3, 4, 7])
-def test_the_bases_are_orthonormal_and_blind_to_planes_or_constants(size: int) -> None:
+def test_bases_are_orthonormal_and_orthogonal_to_planes_or_constants(size: int) -> None:
     v, u = torch.meshgrid(torch.arange(size).double(), torch.arange(size).double(), indexing="ij")
     for basis, blind in ((plane_free_basis(size), (u, v, v - v + 1)), (zero_mean_basis(size), (v - v + 1,))):
         flat = basis.flatten(1)
@@ -44,7 +44,7 @@ def test_the_bases_are_orthonormal_and_blind_to_planes_or_constants(size: int) -
             assert float((basis * each).sum(dim=(1, 2)).abs().max()) < 1e-11
 
 
-def test_the_influence_is_the_derivative_of_the_penalty() -> None:
+def test_influence_is_the_derivative_of_the_penalty() -> None:
     z = torch.tensor([-2.0, -0.3, -4e-3, 0.0, 1e-3, 0.02, 0.7], dtype=torch.float64).view(1, 1, 1, 7)
     heights = torch.tensor([[1.0, -0.5, 0.3, 2.0, -1.0, 0.1]], dtype=torch.float64)
     z.requires_grad_()
@@ -54,14 +54,14 @@ def test_the_influence_is_the_derivative_of_the_penalty() -> None:
     assert float(influence(z, heights)[0, 0, 0, 5].detach()) == pytest.approx(0.02 * one, rel=1e-12)
 
 
-def test_the_influences_gradients_agree_with_differences() -> None:
+def test_gradients_of_the_influence_agree_with_finite_differences() -> None:
     generator = torch.Generator().manual_seed(3)
     z = torch.randn((2, 3, 2, 3), generator=generator, dtype=torch.float64).requires_grad_()
     heights = torch.randn((3, len(WIDTHS)), generator=generator, dtype=torch.float64).requires_grad_()
     assert torch.autograd.gradcheck(influence, (z, heights), eps=1e-7, atol=1e-4)
 
 
-def test_a_stage_is_a_step_towards_the_coarse_map_and_one_down_the_gradient_of_its_energy() -> None:
+def test_stage_is_a_gradient_step_on_its_energy_and_one_towards_the_low_resolution_map() -> None:
     stage, rgb = _stage(), photos(16, 20, 2).double()
     coarse = maps(4, 5, 2) / 30
     x = repeated(coarse, 4) + 0.1 * maps(16, 20, 2)
@@ -71,7 +71,7 @@ def test_a_stage_is_a_step_towards_the_coarse_map_and_one_down_the_gradient_of_i
     torch.testing.assert_close(stage(x, coarse, rgb), y.detach() - gradient, rtol=0, atol=1e-13)
 
 
-def test_a_stage_is_what_plain_loops_give() -> None:
+def test_stage_equals_plain_loops() -> None:
     stage, rgb = _stage(filters=3), photos(16, 16).double()
     coarse = maps(4, 4) / 30
     x = repeated(coarse, 4) + 0.1 * maps(16, 16)
@@ -94,7 +94,7 @@ def test_a_stage_is_what_plain_loops_give() -> None:
     np.testing.assert_allclose(result, expected, rtol=0, atol=1e-12)
 
 
-def test_gradients_reach_every_parameter_and_agree_with_differences() -> None:
+def test_gradients_reach_every_parameter_and_agree_with_finite_differences() -> None:
     net = _net(2, filters=2, size=3).double().requires_grad_()
     rgb, coarse = photos(8, 6).double(), maps(4, 3) / 30
     names, parameters = zip(*net.named_parameters(), strict=True)
@@ -109,20 +109,20 @@ def test_gradients_reach_every_parameter_and_agree_with_differences() -> None:
 
 
 @pytest.mark.parametrize("scale", SCALES)
-def test_a_plane_is_reproduced_whatever_weights_and_photo_are(scale: int) -> None:
+def test_plane_is_reproduced_for_any_weights_and_photo(scale: int) -> None:
     fine = plane_map(5 * scale, 6 * scale)
     net, rgb, coarse = _net(scale), photos(5 * scale, 6 * scale), functional.avg_pool2d(fine, scale)
     torch.testing.assert_close(net.upsample(rgb, coarse), fine, rtol=0, atol=1e-5 * float(fine.max() - fine.min()))
     torch.testing.assert_close(net.double().upsample(rgb, coarse), fine, rtol=0, atol=1e-12 * 30 * scale)
 
 
-def test_weights_of_half_precision_keep_planes() -> None:
+def test_plane_is_reproduced_with_half_precision_weights() -> None:
     fine = plane_map(24, 28)
     result = _net().bfloat16().upsample(photos(24, 28), functional.avg_pool2d(fine, 4))
     torch.testing.assert_close(result, fine, rtol=0, atol=1e-4)
 
 
-def test_training_in_mixed_precision_computes_in_float32() -> None:
+def test_mixed_precision_training_computes_in_float32() -> None:
     net, rgb, coarse = _net(), photos(24, 28), maps(6, 7)
     with torch.autocast("cpu", torch.bfloat16):
         mixed = net.upsample(rgb, coarse)
@@ -130,7 +130,7 @@ def test_training_in_mixed_precision_computes_in_float32() -> None:
 
 
 @pytest.mark.parametrize("scale", SCALES)
-def test_an_output_depends_on_no_coarse_pixel_beyond_the_reach_and_on_one_within_half_of_it(scale: int) -> None:
+def test_receptive_field_radius_bounds_the_low_resolution_pixels_that_matter(scale: int) -> None:
     net = _net(scale, stages=1)
     count = 2 * net.reach + 3
     values = torch.rand(1, 1, 1, count, generator=torch.Generator().manual_seed(4)).expand(-1, -1, 8, -1).clone()
@@ -147,7 +147,7 @@ def test_an_output_depends_on_no_coarse_pixel_beyond_the_reach_and_on_one_within
     assert not torch.allclose(answer(middle - net.reach // 2), same, rtol=0, atol=1e-7)
 
 
-def test_an_edge_of_the_photo_lets_the_map_break_there_and_a_flat_photo_has_no_say() -> None:
+def test_map_may_break_at_a_photo_edge_and_a_flat_photo_has_no_influence() -> None:
     stage = _stage()
     edge = torch.zeros(1, 3, 16, 16, dtype=torch.float64)
     edge[..., 8:] = 1.0
@@ -157,7 +157,7 @@ def test_an_edge_of_the_photo_lets_the_map_break_there_and_a_flat_photo_has_no_s
     torch.testing.assert_close(weights[..., :4], torch.ones(5, 12, 4).double(), rtol=0, atol=1e-12)
 
 
-def test_it_learns_an_edge_that_the_photo_shows() -> None:
+def test_training_learns_an_edge_that_the_photo_shows() -> None:
     torch.manual_seed(0)
     fine = torch.full((1, 1, 32, 32), 20.0)
     fine[..., 13:] = 26.0

@@ -50,7 +50,7 @@ def _step(size: int, degrees: float) -> tuple[Tensor, Tensor]:
 
 
 @pytest.mark.parametrize(("scale", "size"), [(2, (22, 34)), (4, (36, 28)), (8, (64, 40))])
-def test_a_plane_is_reproduced_exactly_at_any_size(scale: int, size: tuple[int, int]) -> None:
+def test_eg_reproduces_a_plane_exactly_at_any_size(scale: int, size: tuple[int, int]) -> None:
     v, u = _grid(*size)
     plane = 6 + 0.02 * u - 0.03 * v
     sample = _sample(plane, scale)
@@ -60,7 +60,7 @@ def test_a_plane_is_reproduced_exactly_at_any_size(scale: int, size: tuple[int, 
 @pytest.mark.parametrize("scale", [2, 4])
 @pytest.mark.parametrize("degrees", [0.0, 10.0, 30.0])
 @pytest.mark.parametrize("turned", [False, True])
-def test_a_straight_step_stays_straight_and_sharp(scale: int, degrees: float, turned: bool) -> None:
+def test_eg_keeps_a_straight_step_straight_and_sharp(scale: int, degrees: float, turned: bool) -> None:
     """Each row's edge is nearer than half a low-resolution pixel to the line; bicubic smears it over more pixels."""
     truth, line = _step(96, degrees)
     sample = _sample(truth.T.contiguous() if turned else truth, scale)
@@ -101,7 +101,7 @@ def _by_loops(coarse: np.ndarray, barrier: np.ndarray, radius: int, sigma: float
 
 
 @pytest.mark.parametrize("radius", [1, 2])
-def test_the_filter_is_a_mean_over_the_pixels_that_a_way_leads_to(radius: int) -> None:
+def test_filter_is_a_mean_over_the_pixels_connected_by_a_path(radius: int) -> None:
     random = np.random.default_rng(0)
     coarse = random.uniform(5, 9, (4, 4))
     barrier = random.random((16, 16)) < 0.2
@@ -115,7 +115,7 @@ def test_the_filter_is_a_mean_over_the_pixels_that_a_way_leads_to(radius: int) -
     np.testing.assert_array_equal(seen, reach & ~barrier)
 
 
-def test_an_edge_keeps_the_sides_apart() -> None:
+def test_filter_does_not_mix_the_sides_of_an_edge() -> None:
     coarse = torch.where(torch.arange(8) < 4, 5.0, 9.0).double().expand(8, 8)
     barrier = torch.zeros(16, 16, dtype=torch.bool)
     barrier[:, 8] = True
@@ -124,7 +124,7 @@ def test_an_edge_keeps_the_sides_apart() -> None:
 
 
 @pytest.mark.parametrize("fill", [False, True])
-def test_holes_stay_or_are_filled_and_what_is_around_stays_a_plane(fill: bool) -> None:
+def test_holes_are_kept_or_filled_and_their_surroundings_stay_a_plane(fill: bool) -> None:
     v, u = _grid(48, 48)
     plane = 6 + 0.02 * u - 0.03 * v
     sample = _sample(plane.masked_fill((v >= 16) & (v < 24) & (u >= 20) & (u < 32), torch.nan))
@@ -134,7 +134,7 @@ def test_holes_stay_or_are_filled_and_what_is_around_stays_a_plane(fill: bool) -
     assert float((fine - plane)[~hole].abs().max()) < (0.2 if fill else 1e-9)
 
 
-def test_twice_the_same_is_the_same_and_it_tells_how_it_went() -> None:
+def test_result_is_deterministic_and_its_progress_reported() -> None:
     sample = _sample(_step(96, 10.0)[0])
     method = EdgeGuided(iterations=30)
     told: list[tuple[int, int]] = []
@@ -145,7 +145,7 @@ def test_twice_the_same_is_the_same_and_it_tells_how_it_went() -> None:
     assert torch.equal(first, method(sample))
 
 
-def test_single_precision_in_gives_single_precision_out() -> None:
+def test_output_precision_is_that_of_the_input() -> None:
     v, u = _grid(32, 32)
     sample = _sample((6 + 0.02 * u - 0.03 * v).float())
     fine = EdgeGuided()(sample)
@@ -153,7 +153,7 @@ def test_single_precision_in_gives_single_precision_out() -> None:
     torch.testing.assert_close(fine, sample.depth, rtol=1e-5, atol=0)
 
 
-def test_a_map_too_small_for_patches_has_no_answer() -> None:
+def test_map_too_small_for_patches_has_no_solution() -> None:
     sample = _sample(_step(32, 0.0)[0])
     with pytest.raises(
         NoSolutionError, match="edge-guided upsampling: the edges of a map of 8 x 8 pixels do not recur"
@@ -161,17 +161,17 @@ def test_a_map_too_small_for_patches_has_no_answer() -> None:
         EdgeGuided()(sample)
 
 
-def test_a_scale_is_taken_in_its_prime_factors() -> None:
+def test_scale_is_split_into_prime_factors() -> None:
     assert [prime_factors(n) for n in (1, 2, 7, 8, 12)] == [[], [2], [7], [2, 2, 2], [2, 2, 3]]
 
 
 @pytest.mark.parametrize("name", ["step", "sharp_weight", "smoothness", "sigma_space", "mixed"])
-def test_a_parameter_that_is_not_positive_is_refused(name: str) -> None:
+def test_parameter_that_is_not_positive_is_refused(name: str) -> None:
     with pytest.raises(ValueError, match=rf"^{name}: expected a positive number for edge-guided upsampling"):
         EdgeGuided(**{name: 0.0})
 
 
 @pytest.mark.parametrize("name", ["candidates", "iterations", "radius"])
-def test_a_number_below_one_is_refused(name: str) -> None:
+def test_number_below_one_is_refused(name: str) -> None:
     with pytest.raises(ValueError, match=rf"^{name}: expected at least 1 for edge-guided upsampling, got 0"):
         EdgeGuided(**{name: 0})

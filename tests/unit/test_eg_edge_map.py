@@ -35,7 +35,7 @@ def _patches(count: int, seed: int = 0) -> Tensor:
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_on_a_tree_belief_propagation_finds_the_least_energy_of_all(seed: int) -> None:
+def test_belief_propagation_finds_the_minimum_on_a_tree(seed: int) -> None:
     field = _field(6, [(0, 1), (1, 2), (3, 1), (3, 4), (5, 3)], seed=seed)
     found = labelled(*field)
     assert found.converged
@@ -43,7 +43,7 @@ def test_on_a_tree_belief_propagation_finds_the_least_energy_of_all(seed: int) -
     assert energy(found.labels, *field) == pytest.approx(found.energy)
 
 
-def test_on_a_chain_it_is_viterbis_answer() -> None:
+def test_belief_propagation_equals_viterbi_on_a_chain() -> None:
     unary, pairs, costs = _field(40, [(i, i + 1) for i in range(39)], labels=5)
     best = unary[0]
     for i in range(39):
@@ -52,19 +52,19 @@ def test_on_a_chain_it_is_viterbis_answer() -> None:
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_on_a_small_grid_with_loops_it_finds_what_enumeration_finds(seed: int) -> None:
+def test_belief_propagation_finds_the_minimum_on_a_small_grid_with_loops(seed: int) -> None:
     pairs = [(0, 1), (1, 2), (3, 4), (4, 5), (0, 3), (1, 4), (2, 5)]
     unary, ends, costs = _field(6, pairs, seed=seed)
     found = labelled(unary, ends, 0.5 * costs)
     assert found.energy == pytest.approx(_least(unary, ends, 0.5 * costs), abs=1e-12)
 
 
-def test_without_pairs_each_node_takes_its_cheapest_label() -> None:
+def test_nodes_without_pairs_take_their_cheapest_label() -> None:
     unary, pairs, costs = _field(4, [])
     assert torch.equal(labelled(unary, pairs, costs).labels, unary.argmin(dim=1))
 
 
-def test_distances_are_scipys_and_overlaps_are_those_of_a_loop() -> None:
+def test_distances_equal_scipy_and_overlaps_equal_a_loop() -> None:
     masks = _patches(5)
     expected = [ndimage.distance_transform_edt(~each) for each in masks.numpy()]
     np.testing.assert_allclose(distances(masks), np.stack(expected), rtol=1e-6)
@@ -81,7 +81,7 @@ def test_distances_are_scipys_and_overlaps_are_those_of_a_loop() -> None:
             assert float(cost[x, y]) == pytest.approx(np.nansum((first - second) ** 2))
 
 
-def test_pairs_are_told_apart_kept_once_and_found_again() -> None:
+def test_distinct_pairs_are_kept_once_and_found_again() -> None:
     low, high = _patches(6), _patches(6, seed=1)
     known = distinct(Patches(torch.cat((low, low)), torch.cat((high, high))))
     assert len(known.low) == 6
@@ -91,14 +91,14 @@ def test_pairs_are_told_apart_kept_once_and_found_again() -> None:
     assert len(distinct(Patches(turned(low), turned(high))).low) == 48
 
 
-def test_the_mean_of_one_patch_is_the_patch() -> None:
+def test_average_of_one_patch_is_the_patch() -> None:
     patch = _patches(1)
     mean = averaged(patch.flatten(1).float(), torch.tensor([[7, 9]]), (20, 20))
     assert torch.equal(mean[2:13, 4:15].bool(), patch[0])
     assert int(mean.count_nonzero()) == int(patch.sum())
 
 
-def test_a_thick_bar_becomes_a_line_and_a_line_stays() -> None:
+def test_thinning_reduces_a_bar_to_a_line_and_keeps_a_line() -> None:
     bar = torch.zeros(20, 30, dtype=torch.bool)
     bar[8:11, 5:25] = True
     line = thinned(bar)
@@ -107,7 +107,7 @@ def test_a_thick_bar_becomes_a_line_and_a_line_stays() -> None:
     assert torch.equal(thinned(line), line)
 
 
-def test_a_plane_has_no_edge_however_steep_and_a_step_has_one_where_it_is() -> None:
+def test_edges_lie_at_steps_and_not_on_steep_planes() -> None:
     v, u = torch.meshgrid(torch.arange(16.0).double(), torch.arange(20.0).double(), indexing="ij")
     assert not bool(edges(3 * u - 2 * v, 2, 0.1).any())
     assert edge_map(3 * u - 2 * v, 2, 0.1)[1] is None
@@ -116,7 +116,7 @@ def test_a_plane_has_no_edge_however_steep_and_a_step_has_one_where_it_is() -> N
     assert not bool(found[:, :18].any() | found[:, 22:].any())
 
 
-def test_a_map_too_small_for_patches_has_no_answer_if_it_has_edges() -> None:
+def test_map_with_edges_too_small_for_patches_has_no_solution() -> None:
     step = torch.where(torch.arange(8) < 4, 0.0, 1.0).double().expand(8, 8)
     with pytest.raises(NoSolutionError, match="the edges of a map of 8 x 8 pixels do not recur at 1/2 of its size"):
         edge_map(step, 2, 0.1)

@@ -82,14 +82,14 @@ USAGE_ERRORS = {
 
 
 @pytest.mark.parametrize("argument", USAGE_ERRORS)
-def test_a_usage_error_is_one_line_that_names_the_key_and_the_choices(command, tmp_path, argument):
+def test_usage_error_is_one_line_with_the_key_and_the_choices(command, tmp_path, argument):
     code, error, seen = command(argument)
     assert (code, error) == (2, f"error: {USAGE_ERRORS[argument]}\n")
     assert seen == []
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_key_of_the_chosen_group_is_mistyped_among_that_group_s_keys(command):
+def test_mistyped_key_of_a_group_is_compared_with_the_keys_of_that_group(command):
     code, error, _ = command("dataset=folder", "dataset.rot=x")
     assert (code, error) == (
         2,
@@ -98,26 +98,26 @@ def test_a_key_of_the_chosen_group_is_mistyped_among_that_group_s_keys(command):
 
 
 @pytest.mark.parametrize("quoted", ['output_dir="a=b"', "output_dir='a=b'"])
-def test_a_quoted_value_is_taken_as_the_message_says(command, quoted):
+def test_quoted_value_of_the_message_is_accepted(command, quoted):
     code, error, [config] = command(quoted)
     assert (code, error, config.output_dir) == (0, "", "a=b")
 
 
-def test_the_job_gets_the_composed_configuration_and_no_directory_is_made(command, tmp_path):
+def test_job_gets_the_composed_configuration_and_no_directory_is_made(command, tmp_path):
     code, error, [config] = command("scale=8", "dataset=folder", "dataset.root=here")
     assert (code, error) == (0, "")
     assert (config.scale, config.dataset.root, config.method.name) == (8, "here", "msg_v")
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_configuration_error_of_the_job_is_one_line_and_exit_code_2(command):
+def test_configuration_error_of_the_job_is_one_line_and_exit_code_2(command):
     def job(config):
         raise ConfigError("dataset.root: first\n   second")
 
     assert command(job=job)[:2] == (2, "error: dataset.root: first second\n")
 
 
-def test_an_interruption_is_one_line_and_exit_code_130(command):
+def test_interruption_is_one_line_and_exit_code_130(command):
     def job(config):
         raise KeyboardInterrupt
 
@@ -127,7 +127,7 @@ def test_an_interruption_is_one_line_and_exit_code_130(command):
     assert error.startswith("interrupted; ")
 
 
-def test_a_defect_of_the_program_is_not_taken_for_a_usage_error(command):
+def test_program_defect_is_not_reported_as_a_usage_error(command):
     def job(config):
         raise ZeroDivisionError("our fault")
 
@@ -135,7 +135,7 @@ def test_a_defect_of_the_program_is_not_taken_for_a_usage_error(command):
         command(job=job)
 
 
-def test_a_multirun_calls_the_job_for_every_combination(command):
+def test_multirun_calls_the_job_for_every_combination(command):
     code, error, seen = command("-m", "scale=4,8", "method=nearest,bicubic")
     assert (code, error) == (0, "")
     assert [(config.scale, config.method.name) for config in seen] == [
@@ -143,7 +143,7 @@ def test_a_multirun_calls_the_job_for_every_combination(command):
     ]  # fmt: skip
 
 
-def test_a_failing_job_of_a_multirun_keeps_the_others_and_the_exit_code_says_so(command):
+def test_failing_job_of_a_multirun_keeps_the_others_and_sets_the_exit_code(command):
     def job(config):
         if config.scale == 4:
             raise ConfigError("scale: not this one")
@@ -153,13 +153,13 @@ def test_a_failing_job_of_a_multirun_keeps_the_others_and_the_exit_code_says_so(
     assert [config.scale for config in seen] == [2, 4, 8]
 
 
-def test_a_multirun_with_an_unknown_choice_starts_no_job(command):
+def test_multirun_with_an_unknown_choice_starts_no_job(command):
     code, error, seen = command("-m", "method=bicubic,neerest")
     assert (code, seen) == (2, [])
     assert error == f"error: method=neerest: unknown; expected one of {METHODS}\n"
 
 
-def test_a_missing_configuration_directory_says_where_to_run(monkeypatch, tmp_path, capsys):
+def test_missing_configuration_directory_names_where_to_run(monkeypatch, tmp_path, capsys):
     monkeypatch.setattr(sys, "argv", ["eval.py"])
     with pytest.raises(SystemExit) as ended:
         run_command(tmp_path / "conf", "eval", lambda config: None)

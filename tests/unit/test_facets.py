@@ -26,14 +26,14 @@ def _net(scale: int = 4, *, noise: float = 0.1, facets: int = 2) -> Facets:
 
 
 @pytest.mark.parametrize("scale", SCALES)
-def test_a_plane_is_reproduced_exactly_whatever_weights_and_photo_are(scale: int) -> None:
+def test_facets_reproduce_a_plane_exactly_for_any_weights_and_photo(scale: int) -> None:
     fine = plane_map(6 * scale, 7 * scale)
     coarse = functional.avg_pool2d(fine, scale)
     result = _net(scale).upsample(photos(6 * scale, 7 * scale), coarse)
     torch.testing.assert_close(result, fine, rtol=0, atol=1e-11)
 
 
-def test_before_training_the_mixture_is_the_splines_blend_of_central_differences_planes() -> None:
+def test_untrained_mixture_is_the_spline_blend_of_central_difference_planes() -> None:
     """A plain loop over high-resolution pixels, with every output of the network's three heads at 0."""
     net, coarse = _net(noise=0), maps(4, 5)
     for head in (net.planes, net.choice):
@@ -74,7 +74,7 @@ def test_before_training_the_mixture_is_the_splines_blend_of_central_differences
         assert float(result[y, x]) == pytest.approx(total / weights, rel=1e-6)
 
 
-def test_without_slopes_values_stay_within_those_around() -> None:
+def test_facets_without_slopes_stay_within_the_surrounding_values() -> None:
     net = Facets(4, width=12, blocks=1, slopes=False)
     coarse = torch.zeros(1, 1, 6, 6, dtype=torch.float64)
     coarse[..., 3:] = 1.0
@@ -92,7 +92,7 @@ def test_arguments_out_of_range_are_refused(arguments: dict[str, int]) -> None:
         Facets(**arguments)
 
 
-def test_holes_are_filled_from_outside_in_by_the_mean_of_the_known_around() -> None:
+def test_holes_are_filled_from_the_outside_in_with_means_of_valid_neighbours() -> None:
     x = torch.arange(49.0, dtype=torch.float64).view(1, 1, 7, 7)
     pierced = x.clone()
     pierced[..., 2:5, 2:5] = torch.nan
@@ -104,7 +104,7 @@ def test_holes_are_filled_from_outside_in_by_the_mean_of_the_known_around() -> N
     assert bool(filled(torch.full_like(x, torch.nan)).isnan().all())
 
 
-def test_the_bend_is_zero_on_planes_and_the_step_beside_an_edge() -> None:
+def test_bend_is_zero_on_planes_and_the_step_beside_an_edge() -> None:
     assert float(stencil(plane_map(8, 9)).bend.max()) < 1e-12
     step = torch.zeros(1, 1, 9, 12)
     step[..., 6:] = 2.0
@@ -112,7 +112,7 @@ def test_the_bend_is_zero_on_planes_and_the_step_beside_an_edge() -> None:
     assert bend.tolist() == [0, 0, 0, 0, 2, 2, 2, 2, 0, 0, 0, 0]
 
 
-def test_gradients_reach_every_parameter_and_agree_with_differences() -> None:
+def test_gradients_reach_every_parameter_and_agree_with_finite_differences() -> None:
     net = _net(2, facets=1).double().requires_grad_()
     rgb, coarse = photos(8, 6).double(), maps(4, 3)
     net.upsample(rgb, coarse).square().mean().backward()
@@ -127,7 +127,7 @@ def test_gradients_reach_every_parameter_and_agree_with_differences() -> None:
     assert torch.autograd.gradcheck(loss, bias.detach().clone().requires_grad_())
 
 
-def test_it_learns_an_edge_that_the_photo_shows() -> None:
+def test_training_learns_an_edge_that_the_photo_shows() -> None:
     """A wall behind a wall: after a few steps on one patch the edge is several times sharper than a spline's."""
     torch.manual_seed(0)
     fine = torch.full((1, 1, 32, 32), 20.0)
@@ -146,7 +146,7 @@ def test_it_learns_an_edge_that_the_photo_shows() -> None:
 
 
 @pytest.mark.parametrize("precision", [torch.float32, torch.bfloat16])
-def test_weights_of_half_precision_keep_planes_exact(precision: torch.dtype) -> None:
+def test_plane_is_reproduced_with_half_precision_weights(precision: torch.dtype) -> None:
     net = _net().to(precision)
     fine = plane_map(24, 28)
     result = net.upsample(photos(24, 28), functional.avg_pool2d(fine, 4))

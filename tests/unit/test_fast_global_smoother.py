@@ -44,14 +44,14 @@ def _sample(disparity: Tensor, photo: Tensor, kernel: Kernel = "box") -> DepthSa
     return make_sample(scene, 4, Downsampling(kernel), "disparity")
 
 
-def test_rows_then_columns_are_solved_three_times_with_the_papers_lambdas() -> None:
+def test_smoother_solves_rows_then_columns_three_times_with_the_papers_lambdas() -> None:
     guide, values = _noise(3, 16, 13), _noise(16, 13, seed=1)
     result = smoothed(guide, values[None], 30.0, 0.3)[0]
     np.testing.assert_allclose(result, _by_dense_systems(guide, values, 30.0, 0.3), rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize("length", [1, 2, 9])
-def test_lines_of_any_length_are_solved(length: int) -> None:
+def test_smoother_solves_lines_of_any_length(length: int) -> None:
     weights, right = _noise(length - 1, 4), _noise(length, 2, 4, seed=1)
     result = solved_lines(weights, right)
     for m in range(4):
@@ -61,7 +61,7 @@ def test_lines_of_any_length_are_solved(length: int) -> None:
         np.testing.assert_allclose(result[:, :, m], np.linalg.solve(system, right[:, :, m].numpy()), atol=1e-13)
 
 
-def test_the_mean_is_kept_and_nothing_overshoots() -> None:
+def test_smoother_keeps_the_mean_and_does_not_overshoot() -> None:
     """Each pass is a mean with symmetric weights."""
     values = _noise(1, 20, 24, seed=1)
     result = smoothed(_noise(3, 20, 24), values, 1e4, 0.5)
@@ -69,7 +69,7 @@ def test_the_mean_is_kept_and_nothing_overshoots() -> None:
     assert float(values.min()) <= float(result.min()) < float(result.max()) <= float(values.max())
 
 
-def test_smoothing_does_not_cross_an_edge_of_the_photo() -> None:
+def test_smoother_does_not_cross_a_photo_edge() -> None:
     columns = torch.arange(32).expand(24, 32)
     photo = torch.where(columns < 16, 0.0, 1.0).double().expand(3, 24, 32)
     step = torch.where(columns < 16, 1.0, 2.0).double()
@@ -80,7 +80,7 @@ def test_smoothing_does_not_cross_an_edge_of_the_photo() -> None:
 
 
 @pytest.mark.parametrize("slopes", [True, False])
-def test_a_step_along_an_edge_of_the_photo_stays_sharp_within_a_coarse_pixel(slopes: bool) -> None:
+def test_step_along_a_photo_edge_stays_sharp_within_a_low_resolution_pixel(slopes: bool) -> None:
     columns = torch.arange(64).expand(48, 64)
     photo = torch.where(columns < 32, 0.2, 0.8).double().expand(3, 48, 64).contiguous()
     truth = torch.where(columns < 32, 5.0, 9.0).double()
@@ -92,7 +92,7 @@ def test_a_step_along_an_edge_of_the_photo_stays_sharp_within_a_coarse_pixel(slo
 
 
 @pytest.mark.parametrize("kernel", ["box", "nearest"])
-def test_it_is_the_smoothed_data_over_the_smoothed_index_map(kernel: Kernel) -> None:
+def test_result_is_the_smoothed_data_divided_by_the_smoothed_index_map(kernel: Kernel) -> None:
     disparity = 5 + 4 * _noise(16, 16, seed=3)
     disparity[4:8, 8:12] = torch.nan
     photo = _noise(3, 16, 16)
@@ -109,6 +109,6 @@ def test_it_is_the_smoothed_data_over_the_smoothed_index_map(kernel: Kernel) -> 
 
 
 @pytest.mark.parametrize("name", ["smoothness", "sigma_colour", "iterations"])
-def test_a_parameter_that_is_not_positive_is_refused(name: str) -> None:
+def test_parameter_that_is_not_positive_is_refused(name: str) -> None:
     with pytest.raises(ValueError, match=rf"^{name}: expected a positive number for the fast global smoother"):
         FastGlobalSmoother(**{name: 0})

@@ -62,7 +62,7 @@ def change(path, **arrays):
     np.savez(path, **{**content, **arrays})
 
 
-def test_every_figure_is_a_pdf_and_a_png(tmp_path, results, monkeypatch):
+def test_figures_are_written_as_pdf_and_png(tmp_path, results, monkeypatch):
     monkeypatch.setattr(layout, "DPI", 60)  # for speed
     told = []
     paths = save_figures(tmp_path / "new", results, lambda *progress: told.append(progress))
@@ -81,7 +81,7 @@ def test_every_figure_is_a_pdf_and_a_png(tmp_path, results, monkeypatch):
         assert {"Bicubic", "MSG-V", "DIP", "photo", "input", "truth", "one", "two"} <= set(text.split())
 
 
-def test_columns_are_photo_input_methods_in_the_paper_s_order_and_truth(results, drawn, tmp_path):
+def test_columns_are_photo_input_methods_in_the_papers_order_and_truth(results, drawn, tmp_path):
     save_rendering_grids(tmp_path, results)
     [figure] = drawn.values()
     headings = ["photo", "input", "Bicubic", "DIP", "MSG-V", "truth"]
@@ -89,7 +89,7 @@ def test_columns_are_photo_input_methods_in_the_paper_s_order_and_truth(results,
     assert len(panels(figure, "one")) == len(panels(figure, "two")) == 6
 
 
-def test_a_method_without_a_result_has_an_empty_panel_that_says_so(results, drawn, tmp_path):
+def test_method_without_a_result_has_an_empty_labelled_panel(results, drawn, tmp_path):
     save_rendering_grids(tmp_path, results)
     figure = drawn["renderings_simgeo_x4_box_1"]
     empty = [axes for axes in panels(figure, "two") if not axes.images]
@@ -97,7 +97,7 @@ def test_a_method_without_a_result_has_an_empty_panel_that_says_so(results, draw
     assert all(axes.images for axes in panels(figure, "one"))
 
 
-def test_depth_has_the_same_limits_across_a_row_and_a_bar_with_them(results, drawn, tmp_path):
+def test_depth_limits_are_shared_across_a_row_with_a_bar(results, drawn, tmp_path):
     save_depth_grids(tmp_path, results)
     [figure] = drawn.values()
     for row in ("one", "two"):
@@ -141,7 +141,7 @@ def test_details_are_where_the_results_differ_most_from_the_truth():
     assert second == Window(24, 4, 8, 8)
 
 
-def test_without_a_truth_details_are_where_results_differ_from_each_other():
+def test_details_without_truth_are_where_results_differ_from_each_other():
     results = [np.full((40, 40), 0.5), np.full((40, 40), 0.5)]
     results[0][16:24, 24:32] = 0.9
     assert details_of(results, None, 1)[0] == Window(16, 24, 8, 8)
@@ -149,7 +149,7 @@ def test_without_a_truth_details_are_where_results_differ_from_each_other():
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_the_strongest_window_is_the_one_that_a_search_of_all_finds(seed):
+def test_strongest_window_equals_an_exhaustive_search(seed):
     values = np.random.default_rng(seed).random((9, 11))
     means = {(top, left): values[top : top + 3, left : left + 4].mean() for top in range(7) for left in range(8)}
     first = strongest_window(values, 3, 4)
@@ -158,7 +158,7 @@ def test_the_strongest_window_is_the_one_that_a_search_of_all_finds(seed):
     assert strongest_window(values, 3, 4, [first])[:2] == max(clear, key=clear.get)
 
 
-def test_there_may_be_no_room_for_a_window():
+def test_map_without_room_for_a_window_has_none():
     assert strongest_window(np.ones((3, 9)), 4, 2) is None
     assert strongest_window(np.ones((5, 5)), 3, 3, [Window(1, 1, 3, 3)]) is None
 
@@ -187,7 +187,7 @@ def test_scores_are_in_thousandths_and_the_best_is_bold(results, drawn, tmp_path
     assert [text.get_weight() == "bold" for text in captions[:3]] == [value == min(shown) for value in shown]
 
 
-def test_a_scene_that_no_run_keeps_is_left_out_with_a_note(results, drawn, tmp_path):
+def test_scene_that_no_run_stores_is_left_out_with_a_note(results, drawn, tmp_path):
     for path in (tmp_path / "runs").glob("*/scenes/two.npz"):
         path.unlink()
     notes = []
@@ -220,7 +220,7 @@ def test_holes_have_their_colour_and_are_explained(results, drawn, tmp_path):
     )
 
 
-def test_pages_have_five_scenes_and_problems_their_own_files(tmp_path, make_run, drawn):
+def test_figures_have_five_scenes_a_page_and_one_file_per_setting(tmp_path, make_run, drawn):
     make_run(tmp_path / "a", scenes=tuple(f"s{number}" for number in range(6)), size=8)
     make_run(tmp_path / "b", dataset="other", scale=2, downsampling="box, noise 1 %", scenes=("s0",), size=8)
     save_depth_grids(tmp_path, load_results([tmp_path]))
@@ -250,12 +250,12 @@ def test_long_names_do_not_overlap_and_aspects_may_differ():
         assert place.height / place.width == pytest.approx(h / w, rel=1e-6)
 
 
-def test_an_unknown_light_is_refused(results, tmp_path):
+def test_unknown_light_is_refused(results, tmp_path):
     with pytest.raises(ValueError, match="light: expected one of e1, e2, e3, e4, got 'e5'"):
         save_rendering_grids(tmp_path, results, "e5")
 
 
-def test_the_sphere_s_normals_are_unit_vectors_that_face_the_camera():
+def test_sphere_normals_are_unit_vectors_that_face_the_camera():
     x, y, z = sphere_normals(101)
     known = z.isfinite()
     assert known.double().mean() == pytest.approx(torch.pi / 4, rel=0.03)
@@ -265,7 +265,7 @@ def test_the_sphere_s_normals_are_unit_vectors_that_face_the_camera():
     assert y[75, 50] == pytest.approx(0.5)
 
 
-def test_the_figure_of_lights_shows_their_closed_form(drawn, tmp_path):
+def test_figure_of_lights_shows_their_closed_form(drawn, tmp_path):
     save_lights_figure(tmp_path)
     [figure] = drawn.values()
     size = 401
@@ -282,7 +282,7 @@ def test_the_figure_of_lights_shows_their_closed_form(drawn, tmp_path):
             assert np.dot(arrow.xyann, light[:2]) > np.dot(arrow.xy, light[:2]) > 0
 
 
-def test_the_figure_of_lights_shows_a_truth_of_the_results(results, drawn, tmp_path):
+def test_figure_of_lights_shows_a_truth_of_the_results(results, drawn, tmp_path):
     save_lights_figure(tmp_path, results)
     [figure] = drawn.values()
     assert sum(axes.get_label().split(" ")[0] in ("one", "two") for axes in figure.axes) == 4

@@ -49,7 +49,7 @@ def refusal(folder, capfd):
     return message.removeprefix(str(folder))
 
 
-def test_a_scene_has_its_folder_s_name_and_its_photo_in_0_to_1(scene):
+def test_scene_has_the_name_of_its_folder_and_its_photo_in_0_to_1(scene):
     np.save(scene / "depth.npy", Z)
     record = load_scene(scene, "mine")
     assert (record.dataset, record.name) == ("mine", "scene")
@@ -58,7 +58,7 @@ def test_a_scene_has_its_folder_s_name_and_its_photo_in_0_to_1(scene):
 
 
 @pytest.mark.parametrize("name", ["rgb.jpg", "rgb.jpeg"])
-def test_the_photo_may_be_a_jpg(scene, name):
+def test_photo_may_be_a_jpg(scene, name):
     (scene / "rgb.png").unlink()
     cv2.imwrite(str(scene / name), np.full((H, W, 3), (0, 128, 255), np.uint8))
     np.save(scene / "depth.npy", Z)
@@ -67,7 +67,7 @@ def test_the_photo_may_be_a_jpg(scene, name):
 
 @pytest.mark.parametrize(("unit", "metres"), [("m", 1.0), ("mm", 0.001), (0.25, 0.25)])
 @pytest.mark.parametrize("name", ["depth.npy", "depth.png", "depth.tiff", "depth.pfm"])
-def test_depth_counts_in_its_unit_whatever_the_format(scene, unit, metres, name):
+def test_depth_unit_applies_to_every_format(scene, unit, metres, name):
     stored = Z * 8  # whole numbers, for the PNG
     if name.endswith("npy"):
         np.save(scene / name, stored)
@@ -86,27 +86,27 @@ def test_floating_point_depth_without_a_unit_is_metres(scene, suffix):
     np.testing.assert_array_equal(loaded(scene), Z)
 
 
-def test_whole_numbers_of_a_png_without_a_unit_are_refused(scene, capfd):
+def test_png_of_whole_numbers_without_a_unit_is_refused(scene, capfd):
     cv2.imwrite(str(scene / "depth.png"), (Z * 8).astype(np.uint16))
     message = refusal(scene, capfd)
     assert message.startswith("/depth.png: ")
     assert "depth_unit" in message
 
 
-def test_an_unknown_unit_is_refused_by_file_and_key(scene, capfd):
+def test_unknown_unit_is_refused_by_file_and_key(scene, capfd):
     np.save(scene / "depth.npy", Z)
     describe(scene, depth_unit="furlong")
     assert refusal(scene, capfd).startswith("/camera.json: depth_unit: expected m, mm or a positive number")
 
 
-def test_perspective_depth_is_divided_by_the_length_of_each_pixel_s_ray(scene):
+def test_perspective_depth_is_divided_by_the_ray_lengths(scene):
     ray = [[math.hypot((u - CX) / F, (v - CY) / F, 1.0) for u in range(W)] for v in range(H)]
     np.save(scene / "depth.npy", Z * np.array(ray))
     describe(scene, range_type="perspective")
     np.testing.assert_allclose(loaded(scene), Z, rtol=1e-12)
 
 
-def test_orthogonal_depth_is_taken_as_it_is(scene):
+def test_orthogonal_depth_is_unchanged(scene):
     np.save(scene / "depth.npy", Z)
     describe(scene, range_type="orthogonal")
     np.testing.assert_array_equal(loaded(scene), Z)
@@ -114,14 +114,14 @@ def test_orthogonal_depth_is_taken_as_it_is(scene):
 
 @pytest.mark.parametrize(("baseline", "unit", "metres"), [(0.5, "m", 0.5), (500, "mm", 0.5), (0.25, None, 0.25)])
 @pytest.mark.parametrize("doffs", [0.0, 1.5])
-def test_disparity_becomes_baseline_times_focal_length_by_disparity_plus_doffs(scene, baseline, unit, metres, doffs):
+def test_disparity_is_converted_by_baseline_focal_length_and_doffs(scene, baseline, unit, metres, doffs):
     np.save(scene / "disparity.npy", metres * F / Z - doffs)
     units = {} if unit is None else {"baseline_unit": unit}
     describe(scene, range_type="disparity", baseline=baseline, doffs=doffs, **units)
     np.testing.assert_allclose(loaded(scene), Z, rtol=1e-12)
 
 
-def test_a_disparity_between_minus_doffs_and_0_is_a_far_point(scene):
+def test_disparity_between_minus_doffs_and_0_is_a_far_point(scene):
     values = np.full((H, W), -1.0)
     np.save(scene / "disparity.npy", values)
     describe(scene, baseline=0.5, doffs=3.0)
@@ -129,7 +129,7 @@ def test_a_disparity_between_minus_doffs_and_0_is_a_far_point(scene):
 
 
 @pytest.mark.parametrize("value", [-3.0, -4.0])
-def test_a_disparity_at_or_beyond_infinity_is_refused(scene, capfd, value):
+def test_disparity_at_or_beyond_infinity_is_refused(scene, capfd, value):
     values = np.ones((H, W))
     values[0, 0] = value
     np.save(scene / "disparity.npy", values)
@@ -137,7 +137,7 @@ def test_a_disparity_at_or_beyond_infinity_is_refused(scene, capfd, value):
     assert refusal(scene, capfd).startswith("/disparity.npy: expected positive values")
 
 
-def test_a_depth_unit_does_not_touch_disparity(scene):
+def test_depth_unit_does_not_apply_to_disparity(scene):
     np.save(scene / "disparity.npy", 0.5 * F / Z)
     describe(scene, baseline=0.5, depth_unit="mm")
     np.testing.assert_allclose(loaded(scene), Z, rtol=1e-12)
@@ -151,7 +151,7 @@ def test_disparity_without_a_baseline_is_refused(scene, capfd):
 
 
 @pytest.mark.parametrize(("name", "range_type"), [("disparity", "orthogonal"), ("depth", "disparity")])
-def test_a_file_name_that_contradicts_the_range_type_is_refused(scene, capfd, name, range_type):
+def test_file_name_that_contradicts_the_range_type_is_refused(scene, capfd, name, range_type):
     np.save(scene / f"{name}.npy", Z)
     describe(scene, baseline=0.5, range_type=range_type)
     message = refusal(scene, capfd)
@@ -168,7 +168,7 @@ def test_infinity_and_nan_are_holes(scene):
     np.testing.assert_array_equal(loaded(scene), expected)
 
 
-def test_infinite_disparity_is_a_hole_and_not_a_point_at_0(scene):
+def test_infinite_disparity_is_a_hole(scene):
     values = 0.5 * F / Z
     values[1, 1] = np.inf
     np.save(scene / "disparity.npy", values)
@@ -178,7 +178,7 @@ def test_infinite_disparity_is_a_hole_and_not_a_point_at_0(scene):
     assert np.isfinite(depth).sum() == H * W - 1
 
 
-def test_the_hole_value_of_the_camera_file_is_a_hole_before_units_count(scene):
+def test_hole_value_of_the_camera_file_is_compared_before_units(scene):
     stored = (Z * 8).astype(np.uint16)
     stored[1, 2] = 0
     cv2.imwrite(str(scene / "depth.png"), stored)
@@ -188,7 +188,7 @@ def test_the_hole_value_of_the_camera_file_is_a_hole_before_units_count(scene):
     np.testing.assert_array_equal(loaded(scene), expected)
 
 
-def test_mask_png_takes_pixels_out_where_it_is_0(scene):
+def test_mask_png_removes_pixels_where_it_is_0(scene):
     values = Z.copy()
     values[0, 0] = 0  # would be refused if the mask came too late
     np.save(scene / "depth.npy", values)
@@ -200,7 +200,7 @@ def test_mask_png_takes_pixels_out_where_it_is_0(scene):
     np.testing.assert_array_equal(loaded(scene), expected)
 
 
-def test_a_measured_disparity_counts_in_its_own_pixels(scene):
+def test_measured_disparity_is_in_its_own_pixels(scene):
     np.save(scene / "depth.npy", Z)
     coarse_z = np.array([[2.0, 4.0]])
     np.save(
@@ -212,7 +212,7 @@ def test_a_measured_disparity_counts_in_its_own_pixels(scene):
     np.testing.assert_allclose(record.measured[4][0].double().numpy(), coarse_z, rtol=1e-12)
 
 
-def test_measured_perspective_depth_is_divided_by_the_rays_of_the_coarse_camera(scene):
+def test_measured_perspective_depth_is_divided_by_the_low_resolution_ray_lengths(scene):
     def length(u, v):  # low-resolution pixel (u, v) looks along the centre of its 2 x 2 block
         return math.hypot((2 * u + 0.5 - CX) / F, (2 * v + 0.5 - CY) / F, 1.0)
 
@@ -223,7 +223,7 @@ def test_measured_perspective_depth_is_divided_by_the_rays_of_the_coarse_camera(
     np.testing.assert_allclose(load_scene(scene, "folder").measured[2][0].double().numpy(), 3.0, rtol=1e-12)
 
 
-def test_a_scene_with_a_measured_map_needs_no_fine_depth(scene):
+def test_scene_with_a_measured_map_needs_no_high_resolution_depth(scene):
     coarse = np.array([[1.0, np.nan]])
     np.save(scene / "depth_lr4.npy", coarse)
     record = load_scene(scene, "folder")
@@ -231,7 +231,7 @@ def test_a_scene_with_a_measured_map_needs_no_fine_depth(scene):
     np.testing.assert_array_equal(record.measured[4][0].numpy(), coarse)
 
 
-def test_the_mask_is_of_the_fine_depth_alone(scene):
+def test_mask_applies_to_the_high_resolution_depth_alone(scene):
     np.save(scene / "depth.npy", Z)
     np.save(scene / "depth_lr4.npy", np.array([[1.0, 2.0]]))
     mask = np.zeros((H, W), np.uint8)
@@ -243,26 +243,26 @@ def test_the_mask_is_of_the_fine_depth_alone(scene):
 
 
 @pytest.mark.parametrize("name", ["depth_lr0.npy", "depth_lr5.npy", "disparity_lr64.npy"])
-def test_a_measured_map_at_a_factor_that_the_photo_does_not_allow_is_refused(scene, capfd, name):
+def test_measured_map_at_an_impossible_factor_is_refused(scene, capfd, name):
     np.save(scene / "depth.npy", Z)
     np.save(scene / name, np.ones((1, 1)))
     assert refusal(scene, capfd).startswith(f"/{name}: ")
 
 
-def test_a_measured_map_of_another_size_is_refused(scene, capfd):
+def test_measured_map_of_another_size_is_refused(scene, capfd):
     np.save(scene / "depth_lr2.npy", np.ones((H, W)))
     message = refusal(scene, capfd)
     assert message.startswith("/depth_lr2.npy: expected 2 x 4 pixels")
     assert message.endswith("got 4 x 8")
 
 
-def test_a_scene_without_any_depth_is_refused_with_the_names_that_are_looked_for(scene, capfd):
+def test_scene_without_depth_is_refused_with_the_expected_names(scene, capfd):
     message = refusal(scene, capfd)
     assert "depth.{npy,png,tiff,pfm}" in message
     assert "disparity.{npy,png,tiff,pfm}" in message
 
 
-def test_a_scene_with_two_fine_depths_is_refused_with_both_names(scene, capfd):
+def test_scene_with_two_high_resolution_depths_is_refused_with_both_names(scene, capfd):
     np.save(scene / "depth.npy", Z)
     np.save(scene / "disparity.npy", Z)
     message = refusal(scene, capfd)
@@ -271,14 +271,14 @@ def test_a_scene_with_two_fine_depths_is_refused_with_both_names(scene, capfd):
 
 
 @pytest.mark.parametrize("name", ["rgb.png", "camera.json"])
-def test_a_missing_file_is_named(scene, capfd, name):
+def test_missing_file_is_refused_by_name(scene, capfd, name):
     np.save(scene / "depth.npy", Z)
     (scene / name).unlink()
     assert refusal(scene, capfd).startswith(f"/{name}: ")
 
 
 @pytest.mark.parametrize("name", ["depth.npy", "mask.png", "rgb.png"])
-def test_a_file_of_another_size_is_named_with_both_sizes(scene, capfd, name):
+def test_file_of_another_size_is_refused_with_both_sizes(scene, capfd, name):
     np.save(scene / "depth.npy", Z)
     if name == "depth.npy":
         np.save(scene / name, Z.T)
@@ -290,13 +290,13 @@ def test_a_file_of_another_size_is_named_with_both_sizes(scene, capfd, name):
 
 
 @pytest.mark.parametrize("name", ["depth.npy", "depth_lr4.npy"])
-def test_depth_without_a_known_pixel_is_refused(scene, capfd, name):
+def test_depth_without_a_valid_pixel_is_refused(scene, capfd, name):
     size = (1, 2) if "lr" in name else (H, W)
     np.save(scene / name, np.full(size, np.nan))
     assert refusal(scene, capfd) == f"/{name}: expected at least one known pixel, all are holes"
 
 
-def test_a_mask_that_leaves_no_pixel_is_refused(scene, capfd):
+def test_mask_without_a_valid_pixel_is_refused(scene, capfd):
     np.save(scene / "depth.npy", Z)
     cv2.imwrite(str(scene / "mask.png"), np.zeros((H, W), np.uint8))
     assert "all are holes" in refusal(scene, capfd)
@@ -304,7 +304,7 @@ def test_a_mask_that_leaves_no_pixel_is_refused(scene, capfd):
 
 @pytest.mark.parametrize("value", [0.0, -1.0])
 @pytest.mark.parametrize("name", ["depth.npy", "depth_lr4.npy", "disparity.npy"])
-def test_zero_or_negative_depth_is_refused_with_what_to_do(scene, capfd, name, value):
+def test_zero_or_negative_depth_is_refused_with_advice(scene, capfd, name, value):
     values = np.ones((1, 2) if "lr" in name else (H, W))
     values[0, 0] = value
     np.save(scene / name, values)
@@ -315,7 +315,7 @@ def test_zero_or_negative_depth_is_refused_with_what_to_do(scene, capfd, name, v
 
 
 @pytest.mark.parametrize("name", ["rgb.png", "mask.png", "depth.npy"])
-def test_a_broken_file_is_named(scene, capfd, name):
+def test_broken_file_is_refused_by_name(scene, capfd, name):
     np.save(scene / "depth.npy", Z)
     cv2.imwrite(str(scene / "mask.png"), np.full((H, W), 255, np.uint8))
     (scene / name).write_bytes((scene / name).read_bytes()[:50])
@@ -336,37 +336,37 @@ def root(tmp_path):
     return tmp_path
 
 
-def test_every_folder_but_the_hidden_is_a_scene_in_order(root):
+def test_scenes_are_all_visible_folders_in_order(root):
     assert Folder(str(root)).scenes() == ["a", "b", "ü [c]"]
 
 
-def test_chosen_scenes_are_used_in_the_order_given(root):
+def test_chosen_scenes_keep_the_given_order(root):
     assert Folder(str(root), ["b", "a"]).scenes() == ["b", "a"]
 
 
-def test_an_unknown_scene_is_refused_with_those_there_are(root):
+def test_unknown_scene_is_refused_with_the_known_ones(root):
     with pytest.raises(ValueError, match=r"^scenes: 'd' is not there; expected some of a, b, ü \[c\]"):
         Folder(str(root), ["a", "d"])
 
 
 @pytest.mark.parametrize("scenes", [[], ["a", "a"]])
-def test_no_scene_and_a_scene_twice_are_refused(root, scenes):
+def test_empty_and_duplicate_scene_lists_are_refused(root, scenes):
     with pytest.raises(ValueError, match=r"^scenes: expected names, each once"):
         Folder(str(root), scenes)
 
 
 @pytest.mark.parametrize("name", ["nowhere", "readme.txt"])
-def test_a_root_that_is_no_directory_is_refused(root, name):
+def test_root_that_is_no_directory_is_refused(root, name):
     with pytest.raises(ValueError, match=rf"^root: .*{name}"):
         Folder(str(root / name))
 
 
-def test_an_empty_root_is_refused(tmp_path):
+def test_empty_root_is_refused(tmp_path):
     with pytest.raises(ValueError, match=r"^root: expected a folder per scene"):
         Folder(str(tmp_path))
 
 
-def test_a_scene_s_fingerprint_changes_with_a_name_or_a_byte_and_with_nothing_else(scene):
+def test_fingerprint_of_a_scene_changes_with_names_and_bytes_alone(scene):
     source = Folder(str(scene.parent))
     prints = [source.fingerprint("scene")]
     np.save(scene / "depth.npy", Z)
@@ -382,7 +382,7 @@ def test_a_scene_s_fingerprint_changes_with_a_name_or_a_byte_and_with_nothing_el
     assert source.fingerprint("scene") == prints[-1]
 
 
-def test_the_released_scenes_load_with_the_holes_they_have(shared):
+def test_released_scenes_load_with_their_holes(shared):
     source = Folder(str(shared / "scenes"))
     assert source.scenes() == ["books", "lucy", "plant"]
     disparity = np.load(shared / "scenes" / "lucy" / "disparity.npy").astype(np.float64)

@@ -97,7 +97,7 @@ FORMATS = {
 
 
 @pytest.mark.parametrize("case", FORMATS)
-def test_a_map_of_every_format_is_read_exactly_top_row_first(tmp_path, case):
+def test_maps_of_all_formats_are_read_exactly_from_the_top_row(tmp_path, case):
     name, content, expected = FORMATS[case]
     values = read_map(written(tmp_path, name, content))
     assert values.dtype == np.float64
@@ -105,7 +105,7 @@ def test_a_map_of_every_format_is_read_exactly_top_row_first(tmp_path, case):
 
 
 @pytest.mark.parametrize("order", ["<", ">"])
-def test_infinities_and_nan_of_a_pfm_come_through(tmp_path, order):
+def test_infinities_and_nan_of_a_pfm_are_kept(tmp_path, order):
     marked = np.array([[np.inf, 1.0], [np.nan, -2.0]])
     np.testing.assert_array_equal(read_map(written(tmp_path, "d.pfm", pfm(marked, order))), marked)
 
@@ -119,7 +119,7 @@ def test_infinities_and_nan_of_a_pfm_come_through(tmp_path, order):
         b"Pf\n" + b"1" * 5000 + b" 1\n-1.0\n" + bytes(8), b"Pf\n# made by hand\n2 1\n-1.0\n" + bytes(8),
     ],
 )  # fmt: skip
-def test_a_pfm_that_is_no_single_channel_of_its_size_is_refused(tmp_path, capfd, content):
+def test_pfm_that_is_no_single_channel_of_its_size_is_refused(tmp_path, capfd, content):
     assert re.search(
         r"expected (one channel|a PFM file)", refusal(read_map, written(tmp_path, "d.pfm", content), capfd)
     )
@@ -141,18 +141,18 @@ def test_8_bit_depth_is_refused(tmp_path, capfd, name, content):
         ("d.npy", npy(np.ones(3), "<f4")),
     ],
 )
-def test_a_map_of_several_channels_is_refused_with_its_shape(tmp_path, capfd, name, content):
+def test_map_of_several_channels_is_refused_with_its_shape(tmp_path, capfd, name, content):
     assert "expected one channel" in refusal(read_map, written(tmp_path, name, content), capfd)
 
 
 @pytest.mark.parametrize("descr", ["<c16", "|b1"])
-def test_an_array_that_is_no_map_of_numbers_is_refused(tmp_path, capfd, descr):
+def test_array_that_is_no_numeric_map_is_refused(tmp_path, capfd, descr):
     refusal(read_map, written(tmp_path, "d.npy", npy(np.ones((2, 3)), descr)), capfd)
 
 
 @pytest.mark.parametrize("case", FORMATS)
 @pytest.mark.parametrize("share", [0, 0.3, 0.9])
-def test_a_truncated_map_is_refused(tmp_path, capfd, case, share):
+def test_truncated_map_is_refused(tmp_path, capfd, case, share):
     name, content, _ = FORMATS[case]
     refusal(read_map, written(tmp_path, name, content[: int(len(content) * share)]), capfd)
 
@@ -161,21 +161,21 @@ def test_a_truncated_map_is_refused(tmp_path, capfd, case, share):
 @pytest.mark.parametrize(
     "content", [b"", b"no picture, no array", bytes(200), b"\x93NUMPY\x01\0\x10\0{'descr': ((((", b"\x93NUMPY\x09\0ab"]
 )
-def test_a_foreign_file_is_refused(tmp_path, capfd, name, content):
+def test_foreign_file_is_refused(tmp_path, capfd, name, content):
     refusal(read_map, written(tmp_path, name, content), capfd)
 
 
-def test_an_archive_of_arrays_named_npy_is_refused(tmp_path, capfd):
+def test_npz_archive_named_npy_is_refused(tmp_path, capfd):
     np.savez(tmp_path / "d.npz", depth=np.ones((2, 3)))
     assert "expected a NumPy array" in refusal(read_map, (tmp_path / "d.npz").rename(tmp_path / "d.npy"), capfd)
 
 
-def test_an_array_that_would_run_code_is_refused(tmp_path, capfd):
+def test_pickled_array_is_refused(tmp_path, capfd):
     np.save(tmp_path / "d.npy", np.array([[{}]], dtype=object))
     refusal(read_map, tmp_path / "d.npy", capfd)
 
 
-def test_an_array_larger_than_any_memory_is_refused(tmp_path, capfd):
+def test_array_larger_than_memory_is_refused(tmp_path, capfd):
     header = "{'descr': '<f8', 'fortran_order': False, 'shape': (99999999, 99999999), }".ljust(117) + "\n"
     content = b"\x93NUMPY\x01\0" + struct.pack("<H", len(header)) + header.encode()
     refusal(read_map, written(tmp_path, "d.npy", content), capfd)
@@ -185,20 +185,20 @@ def test_an_array_larger_than_any_memory_is_refused(tmp_path, capfd):
     ("reader", "name"),
     [(read_map, "d.npy"), (read_map, "d.png"), (read_rgb, "rgb.png"), (read_mask, "mask.png"), (read_camera, "c.json")],
 )
-def test_a_missing_file_and_a_directory_in_its_place_are_refused(tmp_path, capfd, reader, name):
+def test_missing_file_and_directory_are_refused(tmp_path, capfd, reader, name):
     assert "there is none" in refusal(reader, tmp_path / name, capfd)
     (tmp_path / name).mkdir()
     assert "there is none" in refusal(reader, tmp_path / name, capfd)
 
 
-def test_a_photo_is_read_as_red_green_blue(tmp_path):
+def test_photo_is_read_as_red_green_blue(tmp_path):
     colours = np.array([[[255, 0, 0], [0, 255, 0]], [[0, 0, 255], [10, 20, 30]]])
     picture = read_rgb(written(tmp_path, "rgb.png", png(colours, 8, 2)))
     assert picture.dtype == np.uint8
     np.testing.assert_array_equal(picture, colours)
 
 
-def test_a_jpg_photo_is_read_as_red_green_blue(tmp_path):
+def test_jpg_photo_is_read_as_red_green_blue(tmp_path):
     orange = np.full((16, 24, 3), (0, 128, 255), np.uint8)  # blue, green, red
     assert cv2.imwrite(str(tmp_path / "rgb.jpg"), orange)
     picture = read_rgb(tmp_path / "rgb.jpg")
@@ -206,32 +206,32 @@ def test_a_jpg_photo_is_read_as_red_green_blue(tmp_path):
     np.testing.assert_allclose(picture, np.full((16, 24, 3), (255, 128, 0)), atol=3)
 
 
-def test_a_grey_photo_becomes_three_equal_channels(tmp_path):
+def test_grey_photo_becomes_three_equal_channels(tmp_path):
     grey = WHOLE % 256
     picture = read_rgb(written(tmp_path, "rgb.png", png(grey, 8, 0)))
     np.testing.assert_array_equal(picture, np.dstack([grey] * 3))
 
 
 @pytest.mark.parametrize("share", [0, 0.3, 0.7, 0.97])
-def test_a_broken_png_photo_is_refused(tmp_path, capfd, share):
+def test_broken_png_photo_is_refused(tmp_path, capfd, share):
     noise = np.random.default_rng(0).integers(0, 256, (32, 32, 3))
     content = png(noise, 8, 2)
     refusal(read_rgb, written(tmp_path, "rgb.png", content[: int(len(content) * share)]), capfd)
 
 
-def test_a_png_photo_with_a_flipped_bit_is_refused(tmp_path, capfd):
+def test_png_photo_with_a_flipped_bit_is_refused(tmp_path, capfd):
     content = bytearray(png(np.random.default_rng(0).integers(0, 256, (32, 32, 3)), 8, 2))
     content[len(content) // 2] ^= 1
     refusal(read_rgb, written(tmp_path, "rgb.png", bytes(content)), capfd)
 
 
-def test_a_refused_picture_leaves_the_standard_error_open(tmp_path, capfd):
+def test_refused_picture_leaves_stderr_open(tmp_path, capfd):
     refusal(read_rgb, written(tmp_path, "rgb.png", b"no"), capfd)
     os.write(2, b"heard")
     assert capfd.readouterr().err == "heard"
 
 
-def test_a_mask_is_true_where_its_picture_is_not_0(tmp_path):
+def test_mask_is_true_where_its_picture_is_not_0(tmp_path):
     mask = read_mask(written(tmp_path, "mask.png", png([[0, 1, 255], [128, 0, 0]], 8, 0)))
     assert mask.dtype == bool
     np.testing.assert_array_equal(mask, [[False, True, True], [True, False, False]])
@@ -244,7 +244,7 @@ def camera_file(folder, **changes):
     return path
 
 
-def test_a_camera_file_is_read_in_pixels_and_metres(tmp_path):
+def test_camera_file_is_read_in_pixels_and_metres(tmp_path):
     path = camera_file(
         tmp_path, range_type="disparity", baseline=160, baseline_unit="mm", doffs=2.5, depth_unit="mm", hole_value=0
     )
@@ -256,14 +256,14 @@ def test_a_camera_file_is_read_in_pixels_and_metres(tmp_path):
     assert (described.range_type, described.depth_unit, described.hole_value) == ("disparity", 0.001, 0.0)
 
 
-def test_a_camera_file_of_intrinsics_alone_has_no_baseline_and_says_nothing_of_the_maps(tmp_path):
+def test_camera_file_of_intrinsics_alone_is_enough(tmp_path):
     described = read_camera(camera_file(tmp_path))
     assert (described.camera.baseline, described.camera.doffs) == (None, 0)
     assert (described.range_type, described.depth_unit, described.hole_value) == (None, None, None)
 
 
 @pytest.mark.parametrize(("unit", "metres"), [("m", 1.0), ("mm", 0.001), (0.0002, 0.0002), (5, 5.0)])
-def test_the_depth_unit_is_m_mm_or_a_number(tmp_path, unit, metres):
+def test_depth_unit_is_m_mm_or_a_number(tmp_path, unit, metres):
     assert read_camera(camera_file(tmp_path, depth_unit=unit)).depth_unit == metres
 
 
@@ -278,32 +278,32 @@ def test_the_depth_unit_is_m_mm_or_a_number(tmp_path, unit, metres):
         ("depth_unit", float("nan")),
     ],
 )  # fmt: skip
-def test_a_bad_value_in_a_camera_file_is_refused_by_its_key(tmp_path, capfd, key, value):
+def test_camera_file_with_an_invalid_value_is_refused_by_its_key(tmp_path, capfd, key, value):
     assert key in refusal(read_camera, camera_file(tmp_path, **{key: value}), capfd).split(":")[0].split()[-1]
 
 
 @pytest.mark.parametrize("unit", ["cm", "", None, 0.001])
-def test_an_unknown_unit_of_the_baseline_is_refused_by_its_key(tmp_path, capfd, unit):
+def test_camera_file_with_an_unknown_baseline_unit_is_refused_by_its_key(tmp_path, capfd, unit):
     message = refusal(read_camera, camera_file(tmp_path, baseline=0.2, baseline_unit=unit), capfd)
     assert message.startswith("baseline_unit: expected m, mm, got")
 
 
-def test_an_unknown_key_in_a_camera_file_is_refused_with_the_known_ones(tmp_path, capfd):
+def test_camera_file_with_an_unknown_key_is_refused(tmp_path, capfd):
     message = refusal(read_camera, camera_file(tmp_path, basline=0.2), capfd)
     assert message.startswith("basline: unknown key; expected ")
     assert "baseline" in message
 
 
 @pytest.mark.parametrize("text", ["", "{", "[1, 2]", "3", "null", "[" * 100_000, '{"width": 3,}'])
-def test_a_camera_file_that_is_no_json_object_is_refused(tmp_path, capfd, text):
+def test_camera_file_that_is_no_json_object_is_refused(tmp_path, capfd, text):
     assert "expected" in refusal(read_camera, written(tmp_path, "camera.json", text.encode()), capfd)
 
 
-def test_a_camera_file_that_is_no_text_is_refused(tmp_path, capfd):
+def test_camera_file_that_is_no_text_is_refused(tmp_path, capfd):
     refusal(read_camera, written(tmp_path, "camera.json", b"\xff\xfe{}"), capfd)
 
 
-def test_threads_that_decode_at_the_same_time_leave_stderr_as_it_was(tmp_path, capfd):
+def test_concurrent_decoding_leaves_stderr_unchanged(tmp_path, capfd):
     picture = tmp_path / "a.png"
     cv2.imwrite(str(picture), np.zeros((300, 300, 3), np.uint8))
     damaged = tmp_path / "b.png"

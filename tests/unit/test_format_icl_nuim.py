@@ -62,14 +62,14 @@ def test_distances_in_centimetres_along_the_rays_become_orthogonal_metres(tmp_pa
     assert depth[0, 239, 320].item() == pytest.approx(3.3932, rel=1e-5)  # the ray of the centre: no conversion
 
 
-def test_a_ray_of_length_0_or_beyond_the_rooms_is_a_hole(tmp_path):
+def test_ray_of_length_0_or_beyond_the_rooms_is_a_hole(tmp_path):
     values = DISTANCES.copy()
     values[0, :3] = 0, 10001, np.inf
     depth = read_depth(written(tmp_path / "a.depth", text(values)))
     assert depth.isnan().nonzero().tolist() == [[0, 0, 0], [0, 0, 1], [0, 0, 2]]
 
 
-def test_a_depth_picture_counts_5000_levels_a_metre_and_0_is_a_hole(tmp_path):
+def test_depth_picture_has_5000_levels_a_metre_and_0_is_a_hole(tmp_path):
     levels = 1 + ROWS * 100 + COLUMNS
     levels[3, 7] = 0
     depth = read_depth(written(tmp_path / "0.png", png(levels)))
@@ -96,7 +96,7 @@ def test_a_depth_picture_counts_5000_levels_a_metre_and_0_is_a_hole(tmp_path):
         lambda whole: b"1e30 " * 307200,
     ],
 )
-def test_a_damaged_text_of_distances_is_refused_in_one_line(tmp_path, capfd, distances, damage):
+def test_damaged_text_of_distances_is_refused_in_one_line(tmp_path, capfd, distances, damage):
     refusal(written(tmp_path / "scene_00_0000.depth", damage(distances)), capfd)
 
 
@@ -112,16 +112,16 @@ def test_a_damaged_text_of_distances_is_refused_in_one_line(tmp_path, capfd, dis
         (png(np.zeros((480, 640))), "at least one known pixel"),
     ],
 )
-def test_a_depth_picture_of_another_kind_is_refused(tmp_path, capfd, content, reason):
+def test_depth_picture_of_another_kind_is_refused(tmp_path, capfd, content, reason):
     assert reason in refusal(written(tmp_path / "0.png", content), capfd)
 
 
 @pytest.mark.parametrize("name", ["none.depth", "none.png"])
-def test_a_missing_file_is_refused(tmp_path, capfd, name):
+def test_missing_file_is_refused(tmp_path, capfd, name):
     assert "there is none" in refusal(tmp_path / name, capfd)
 
 
-def test_a_picture_of_16_bits_keeps_them(tmp_path):
+def test_16_bit_picture_keeps_its_values(tmp_path):
     colours = np.zeros((480, 640, 3))
     colours[5, 6] = 65535, 257, 1
     rgb = written(tmp_path / "scene_00_0000.png", png(colours, colour=2))
@@ -131,7 +131,7 @@ def test_a_picture_of_16_bits_keeps_them(tmp_path):
     torch.testing.assert_close(scene.rgb[:, 5, 6], torch.tensor([1, 257 / 65535, 1 / 65535]))
 
 
-def test_a_photo_of_another_size_is_refused_by_name(tmp_path):
+def test_photo_of_another_size_is_refused_by_name(tmp_path):
     rgb = written(tmp_path / "rgb.png", png(np.zeros((240, 320, 3)), depth=8, colour=2))
     with pytest.raises(ValueError, match=r"rgb\.png: expected 480 x 640 pixels .* got 240 x 320"):
         load_frame(rgb, tmp_path / "depth.png", "icl_nuim", "a")
@@ -154,7 +154,7 @@ def test_frames_of_all_three_layouts_are_listed_by_folder_and_number(tmp_path, m
         find_frames(tmp_path / "nowhere")
 
 
-def test_the_ceiling_of_the_office_is_flat_once_distances_are_orthogonal(shared):
+def test_office_ceiling_is_flat_in_orthogonal_depth(shared):
     frames = find_frames(shared / "real/icl_nuim")
     assert list(frames) == ["living", "office/0000"]
     scene = load_frame(*frames["office/0000"], "icl_nuim", "office/0000")
@@ -172,7 +172,7 @@ def test_the_ceiling_of_the_office_is_flat_once_distances_are_orthogonal(shared)
     assert bend(along) > 5 * bend(orthogonal)
 
 
-def test_the_camera_beside_a_rendered_frame_agrees_with_the_published_one(shared):
+def test_camera_of_a_rendered_frame_agrees_with_the_published_one(shared):
     lines = (shared / "real/icl_nuim/office/scene_00_0000.txt").read_text().splitlines()
     vectors = {line.split("=")[0].strip(): line.partition("[")[2].partition("]")[0] for line in lines if "[" in line}
     ahead, right, up = (
@@ -182,7 +182,7 @@ def test_the_camera_beside_a_rendered_frame_agrees_with_the_published_one(shared
     assert 480 * ahead / up == pytest.approx(CAMERA.fy)
 
 
-def test_the_living_room_is_as_large_as_a_room(shared):
+def test_living_room_has_the_size_of_a_room(shared):
     folder = shared / "real/icl_nuim/living"
     scene = load_frame(folder / "rgb.png", folder / "depth.png", "icl_nuim", "living")
     assert (scene.depth.min().item(), scene.depth.max().item()) == (1.641, 3.43)

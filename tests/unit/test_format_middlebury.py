@@ -43,7 +43,7 @@ def scene_2014(tmp_path):
     return folder
 
 
-def test_a_calibration_with_stray_blanks_is_read(scene_2014):
+def test_calibration_with_stray_blanks_is_read(scene_2014):
     camera = read_calibration(scene_2014 / "calib.txt")
     assert (camera.width, camera.height) == (6, 4)
     assert (camera.fx, camera.fy, camera.cx, camera.cy) == (100.5, 100.5, 3.25, 2)
@@ -60,7 +60,7 @@ def test_depth_follows_from_disparity_with_and_without_the_offset(scene_2014):
     assert (without.depth[0, 2, 3], without.camera.doffs) == (pytest.approx(0.176252 * 100.5 / 33), 0)
 
 
-def test_the_evaluation_kit_s_name_of_the_disparity_is_known(scene_2014):
+def test_disparity_name_of_the_evaluation_kit_is_known(scene_2014):
     (scene_2014 / "disp0.pfm").rename(scene_2014 / "disp0GT.pfm")
     assert load_2014(scene_2014, "middlebury", "recycle").depth[0, 0, 0] == pytest.approx(0.176252 * 100.5 / 15)
 
@@ -90,7 +90,7 @@ DAMAGED_CALIBRATIONS = {
 
 
 @pytest.mark.parametrize("text", DAMAGED_CALIBRATIONS)
-def test_a_damaged_calibration_is_refused_in_one_line(scene_2014, text):
+def test_damaged_calibration_is_refused_in_one_line(scene_2014, text):
     (scene_2014 / "calib.txt").write_text(text)
     with pytest.raises(ValueError, match=r"calib\.txt: ") as refusal:
         load_2014(scene_2014, "middlebury", "recycle")
@@ -99,7 +99,7 @@ def test_a_damaged_calibration_is_refused_in_one_line(scene_2014, text):
     assert message.count("\n") == 0
 
 
-def test_files_that_are_missing_damaged_or_of_another_size_are_named(scene_2014):
+def test_missing_damaged_and_misfitting_files_are_refused_by_name(scene_2014):
     def message():
         with pytest.raises(ValueError, match=str(scene_2014)) as refusal:
             load_2014(scene_2014, "middlebury", "recycle")
@@ -123,7 +123,7 @@ def test_files_that_are_missing_damaged_or_of_another_size_are_named(scene_2014)
     assert "im0.png: expected a picture, got a damaged or foreign file of 4 bytes" in message()
 
 
-def test_levels_of_2006_count_in_pixels_of_the_full_size(tmp_path):
+def test_levels_of_2006_are_pixels_of_the_full_size(tmp_path):
     ground = np.full((370, 40), 90)
     ground[0, 0] = 0
     levels(tmp_path / "Aloe" / "disp1.png", ground)
@@ -136,7 +136,7 @@ def test_levels_of_2006_count_in_pixels_of_the_full_size(tmp_path):
     assert scene.depth.isnan().sum() == 1
 
 
-def test_without_its_shift_a_scene_of_2006_has_that_of_art(tmp_path):
+def test_scene_of_2006_without_an_offset_has_that_of_art(tmp_path):
     levels(tmp_path / "Aloe" / "disp1.png", np.full((370, 40), 90))
     picture(tmp_path / "Aloe" / "view1.png", 370, 40)
     scene = load_levels(find_levels(tmp_path)["aloe"], "middlebury2006", "aloe", 2006)
@@ -155,7 +155,7 @@ def test_levels_of_2003_and_2001_are_quarters_and_eighths_of_pixels(tmp_path):
 
 
 @pytest.mark.parametrize("smooth", [True, False])
-def test_terraces_become_slopes_unless_they_are_wanted(tmp_path, smooth):
+def test_terraces_become_slopes_unless_requested(tmp_path, smooth):
     ramp = np.round(60 + 0.05 * np.arange(200))[None].repeat(370, axis=0)
     levels(tmp_path / "Aloe" / "disp1.png", ramp)
     picture(tmp_path / "Aloe" / "view1.png", 370, 200)

@@ -48,7 +48,7 @@ def load(path):
     return load_frame(path, 1, "nyu", "0001")
 
 
-def test_a_frame_is_turned_upright_with_the_kinect_s_holes(labelled):
+def test_frame_is_turned_upright_with_its_kinect_holes(labelled):
     scene = load_frame(labelled, 1, "nyu", "0001", crop=False)
     assert scene.camera == CAMERA
     np.testing.assert_array_equal((scene.rgb * 255).round(), IMAGES[0])
@@ -56,12 +56,12 @@ def test_a_frame_is_turned_upright_with_the_kinect_s_holes(labelled):
     np.testing.assert_array_equal(scene.depth[0, 101:], RAW[0, 101:])
 
 
-def test_the_filled_depth_is_read_on_request(labelled):
+def test_inpainted_depth_is_read_on_request(labelled):
     scene = load_frame(labelled, 2, "nyu", "0002", filled=True, crop=False)
     np.testing.assert_array_equal(scene.depth[0], FILLED[1])
 
 
-def test_the_border_is_cut_off_and_the_camera_moves_along(labelled):
+def test_border_is_cropped_with_the_camera(labelled):
     scene = load_frame(labelled, 2, "nyu", "0002")
     np.testing.assert_array_equal(scene.depth[0], RAW[1, 44:471, 40:601])
     np.testing.assert_array_equal((scene.rgb * 255).round(), IMAGES[1, :, 44:471, 40:601])
@@ -75,7 +75,7 @@ def test_frames_are_counted_from_1(labelled):
 
 
 @pytest.mark.parametrize("number", [0, -1, 3, 1449])
-def test_a_frame_that_is_not_there_is_refused(labelled, capfd, number):
+def test_missing_frame_is_refused(labelled, capfd, number):
     message = refusal(lambda path: load_frame(path, number, "nyu", "a"), labelled, capfd)
     assert message.endswith(f"expected a frame from 1 to 2, got {number}")
 
@@ -93,13 +93,13 @@ def test_a_frame_that_is_not_there_is_refused(labelled, capfd, number):
         lambda whole: b"MATLAB 5.0 MAT-file".ljust(4096),
     ],
 )
-def test_a_damaged_or_foreign_file_is_refused_in_one_line(labelled, tmp_path, capfd, act, damage):
+def test_damaged_or_foreign_file_is_refused_in_one_line(labelled, tmp_path, capfd, act, damage):
     path = tmp_path / "nyu.mat"
     path.write_bytes(damage(labelled.read_bytes()))
     assert "expected" in refusal(act, path, capfd)
 
 
-def test_a_missing_file_is_refused(tmp_path, capfd):
+def test_missing_file_is_refused(tmp_path, capfd):
     assert "there is none" in refusal(load, tmp_path / "nyu.mat", capfd)
 
 
@@ -116,25 +116,25 @@ def test_a_missing_file_is_refused(tmp_path, capfd):
         {"depths": np.ones(5, np.float32)},
     ],
 )
-def test_a_file_of_other_arrays_is_refused_in_one_line(tmp_path, capfd, changes):
+def test_file_of_other_arrays_is_refused_in_one_line(tmp_path, capfd, changes):
     (key,) = changes
     path = official(tmp_path / "nyu.mat", **changes)
     assert key in refusal(load, path, capfd)
 
 
 @pytest.mark.parametrize("value", [np.nan, -1.0])
-def test_depth_that_is_no_number_or_negative_is_refused(tmp_path, capfd, value):
+def test_non_finite_or_negative_depth_is_refused(tmp_path, capfd, value):
     raw = RAW.swapaxes(1, 2).copy()
     raw[0, 3, 4] = value
     assert "expected positive depth" in refusal(load, official(tmp_path / "nyu.mat", rawDepths=raw), capfd)
 
 
-def test_a_frame_of_holes_is_refused(tmp_path, capfd):
+def test_frame_of_holes_is_refused(tmp_path, capfd):
     path = official(tmp_path / "nyu.mat", rawDepths=np.zeros((2, 640, 480), np.float32))
     assert "all are holes" in refusal(load, path, capfd)
 
 
-def test_a_damaged_block_is_refused_and_the_other_frames_are_not(tmp_path, capfd):
+def test_damaged_block_is_refused_without_affecting_other_frames(tmp_path, capfd):
     path = tmp_path / "nyu.mat"
     official(path, depths=None)
     with h5py.File(path, "a") as file:

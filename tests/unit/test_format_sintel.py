@@ -83,12 +83,12 @@ def test_infinite_depth_is_sky_and_0_is_a_hole(tmp_path):
         (dpt(np.full((2, 3), 1e10)), "within 1000 m"),
     ],
 )
-def test_a_damaged_depth_file_is_refused_in_one_line(tmp_path, capfd, content, reason):
+def test_damaged_depth_file_is_refused_in_one_line(tmp_path, capfd, content, reason):
     path = written(tmp_path / "frame_0001.dpt", content)
     assert reason in refusal(capfd, lambda: read_depth(path), path)
 
 
-def test_the_camera_is_the_first_matrix_of_its_file(tmp_path):
+def test_camera_is_the_first_matrix_of_its_file(tmp_path):
     camera = read_camera(written(tmp_path / "frame_0001.cam", cam()), SIZE)
     assert (camera.width, camera.height) == (1024, 436)
     assert (camera.fx, camera.fy, camera.cx, camera.cy) == (1120.0, 1120.0, 511.5, 217.5)
@@ -106,7 +106,7 @@ def swapped(index, value):
         cam(swapped(2, 5000.0)), cam(swapped(8, 0.0)), cam([0.0] * 9),
     ],
 )  # fmt: skip
-def test_a_damaged_camera_file_is_refused_in_one_line(tmp_path, capfd, content):
+def test_damaged_camera_file_is_refused_in_one_line(tmp_path, capfd, content):
     path = written(tmp_path / "frame_0001.cam", content)
     refusal(capfd, lambda: read_camera(path, SIZE), path)
 
@@ -116,7 +116,7 @@ def test_missing_files_are_refused(tmp_path, capfd):
         assert "there is none" in refusal(capfd, lambda act=act, path=path: act(path), path)
 
 
-def test_a_frame_joins_photo_depth_and_camera(tmp_path):
+def test_frame_has_photo_depth_and_camera(tmp_path):
     scene = load_frame(*frame(tmp_path), "sintel", "alley_1/frame_0001")
     np.testing.assert_allclose(scene.rgb[:, 3, 4], [1.0, 0.2, 0.0])
     assert scene.depth.unique().tolist() == [2.0]
@@ -141,5 +141,5 @@ def test_frames_are_listed_from_the_root_or_its_training_folder(tmp_path):
         find_frames(tmp_path / "nowhere")
 
 
-def test_the_sequences_have_1064_frames():
+def test_sequences_have_1064_frames():
     assert (len(SEQUENCES), sum(SEQUENCES.values())) == (23, 1064)

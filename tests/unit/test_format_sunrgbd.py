@@ -63,13 +63,13 @@ def refusal(capfd, act, named):
     return message
 
 
-def test_millimetres_are_turned_back_and_0_is_a_hole(tmp_path):
+def test_millimetres_are_rotated_back_and_0_is_a_hole(tmp_path):
     depth = read_depth(written(tmp_path / "d.png", png(turned(MILLIMETRES))))
     assert depth.isnan().nonzero().tolist() == [[0, 0, 0]]
     np.testing.assert_array_equal(depth[0].nan_to_num(0), MILLIMETRES / 1000)
 
 
-def test_a_scene_has_the_sensor_s_depth_or_the_refined_one(scene):
+def test_depth_of_a_scene_is_the_sensors_or_the_refined_one(scene):
     measured, refined = load_frame(scene, "sunrgbd", "a"), load_frame(scene, "sunrgbd", "a", refined=True)
     assert measured.depth[0, 0, 2].item() == 0.640
     assert refined.depth[0, 0, 2].item() == 0.641
@@ -96,12 +96,12 @@ def test_intrinsics_are_read_from_three_lines_or_one(tmp_path, text):
         "1e300 0 1 0 1e300 1 0 0 1",
     ],
 )  # fmt: skip
-def test_a_file_that_is_no_matrix_of_such_a_camera_is_refused(scene, capfd, text):
+def test_invalid_intrinsics_file_is_refused(scene, capfd, text):
     path = written(scene / "intrinsics.txt", text.encode())
     refusal(capfd, lambda: load_frame(scene, "sunrgbd", "a"), path)
 
 
-def test_a_folder_without_intrinsics_needs_them_from_the_caller(scene, capfd):
+def test_folder_without_intrinsics_needs_them_from_the_caller(scene, capfd):
     (scene / "intrinsics.txt").unlink()
     assert "intrinsics=(fx, fy, cx, cy)" in refusal(capfd, lambda: load_frame(scene, "sunrgbd", "a"), scene)
     loaded = load_frame(scene, "sunrgbd", "a", intrinsics=(3.0, 3.0, 1.0, 2.0))
@@ -114,18 +114,18 @@ def test_a_folder_without_intrinsics_needs_them_from_the_caller(scene, capfd):
     [b"", b"<html></html>", png(turned(MILLIMETRES))[:60], png(np.zeros((3, 4))), png(turned(MILLIMETRES[:2])),
      png(MILLIMETRES % 256, depth=8), jpg()],
 )  # fmt: skip
-def test_a_damaged_depth_picture_or_one_of_another_kind_is_refused(scene, capfd, content):
+def test_damaged_depth_picture_or_one_of_another_kind_is_refused(scene, capfd, content):
     path = written(scene / "depth/0000065.png", content)
     refusal(capfd, lambda: load_frame(scene, "sunrgbd", "a"), path)
 
 
 @pytest.mark.parametrize("content", [b"", b"text", jpg((30, 40))[:-200]])
-def test_a_damaged_photo_is_refused(scene, capfd, content):
+def test_damaged_photo_is_refused(scene, capfd, content):
     path = written(scene / "image/0000065.jpg", content)
     refusal(capfd, lambda: load_frame(scene, "sunrgbd", "a"), path)
 
 
-def test_a_folder_with_no_or_two_pictures_of_a_kind_is_refused(scene, capfd):
+def test_folder_with_no_or_two_pictures_of_a_kind_is_refused(scene, capfd):
     written(scene / "image/other.jpg", jpg())
     assert "got 2" in refusal(capfd, lambda: load_frame(scene, "sunrgbd", "a"), scene / "image")
     (scene / "depth/0000065.png").unlink()
@@ -148,7 +148,7 @@ def test_scenes_are_found_at_any_depth_by_their_path(tmp_path):
         find_frames(tmp_path / "nowhere")
 
 
-def test_the_real_scenes_are_read_and_the_refined_depth_agrees_where_both_are_known(shared):
+def test_real_scenes_are_read_and_the_refined_depth_agrees_where_both_are_known(shared):
     frames = find_frames(shared / "real/sunrgbd")
     assert list(frames) == ["2014-12-18_11-31-54_260595134347", "img_0063"]
     for name, arguments in frames.items():
@@ -159,7 +159,7 @@ def test_the_real_scenes_are_read_and_the_refined_depth_agrees_where_both_are_kn
         assert (raw.depth - refined.depth).abs().nanmedian() < 0.01
 
 
-def test_nyu_s_frame_was_cut_at_column_40_and_row_44_as_its_intrinsics_say_counted_from_0(shared):
+def test_nyu_crop_starts_at_column_40_and_row_44_as_its_intrinsics_say(shared):
     folder = shared / "real/sunrgbd/img_0063"
     full, cut = (cv2.imread(str(folder / part / "img_0063.jpg")) for part in ("fullres", "image"))
     _, _, best, _ = cv2.minMaxLoc(cv2.matchTemplate(full, cut, cv2.TM_SQDIFF))
@@ -170,13 +170,13 @@ def test_nyu_s_frame_was_cut_at_column_40_and_row_44_as_its_intrinsics_say_count
     assert (counted_from_0[0] - best[0], counted_from_0[1] - best[1]) == pytest.approx((camera.cx, camera.cy))
 
 
-def test_a_pair_of_loose_files_is_read_with_intrinsics(shared):
+def test_pair_of_loose_files_is_read_with_intrinsics(shared):
     folder = shared / "real/sunrgbd/open3d_sample"
     scene = load_pair(folder / "SUN_color.jpg", folder / "SUN_depth.png", "sunrgbd", "sample", (570, 570, 320, 240))
     assert scene.depth.nan_to_num(0).max().item() == 9.870  # beyond 8 m, not cut
 
 
-def test_scenes_behind_links_are_found_and_links_that_lead_back_do_no_harm(tmp_path):
+def test_scenes_behind_links_are_found_and_circular_links_are_harmless(tmp_path):
     for part in ("image", "depth"):
         (tmp_path / "elsewhere" / "one" / part).mkdir(parents=True)
     root = tmp_path / "root"

@@ -55,7 +55,7 @@ def test_depth_is_read_as_orthogonal_metres_and_the_sky_is_a_hole(tmp_path):
         npy(VALUES * 0 + 1e6),
     ],
 )  # fmt: skip
-def test_a_damaged_depth_file_is_refused_in_one_line(tmp_path, capfd, content):
+def test_damaged_depth_file_is_refused_in_one_line(tmp_path, capfd, content):
     path = written(tmp_path / "000000_left_depth.npy", content)
     with pytest.raises(ValueError) as caught:  # noqa: PT011 - every line below is about the message
         read_depth(path)
@@ -64,12 +64,12 @@ def test_a_damaged_depth_file_is_refused_in_one_line(tmp_path, capfd, content):
     assert "\n" not in str(caught.value)
 
 
-def test_a_missing_file_is_refused(tmp_path):
+def test_missing_file_is_refused(tmp_path):
     with pytest.raises(ValueError, match=r"a\.npy: expected a NumPy array, there is none"):
         read_depth(tmp_path / "a.npy")
 
 
-def test_a_frame_has_the_camera_of_all_frames(tmp_path):
+def test_frame_has_the_camera_of_all_frames(tmp_path):
     rgb, depth = written(tmp_path / "a.png", photo()), written(tmp_path / "a.npy", npy())
     scene = load_frame(rgb, depth, "tartanair", "office/000000")
     assert (scene.dataset, scene.name, scene.camera) == ("tartanair", "office/000000", CAMERA)
@@ -78,7 +78,7 @@ def test_a_frame_has_the_camera_of_all_frames(tmp_path):
 
 
 @pytest.mark.parametrize("content", [b"", photo()[:300], photo((480, 639, 3)), b"text"])
-def test_a_photo_that_is_damaged_or_of_another_size_is_refused(tmp_path, capfd, content):
+def test_damaged_photo_or_one_of_another_size_is_refused(tmp_path, capfd, content):
     rgb, depth = written(tmp_path / "a.png", content), written(tmp_path / "a.npy", npy())
     with pytest.raises(ValueError, match=r"a\.png: expected"):
         load_frame(rgb, depth, "tartanair", "a")
@@ -102,7 +102,7 @@ def test_frames_of_both_layouts_are_listed_by_folder_and_number(tmp_path):
         find_frames(tmp_path / "nowhere")
 
 
-def test_the_real_frame_is_read(shared):
+def test_real_frame_is_read(shared):
     frames = find_frames(shared / "real/tartanair")
     assert list(frames) == ["000000"]
     scene = load_frame(*frames["000000"], "tartanair", "000000")

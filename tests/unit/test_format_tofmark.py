@@ -71,7 +71,7 @@ def pictures(tmp_path):
     return written(tmp_path / "books.bmp", bmp(GREY)), written(tmp_path / "books_depth.bmp", bmp(levels))
 
 
-def test_samples_are_levels_over_255_and_0_is_none(pictures):
+def test_samples_are_levels_divided_by_255_and_0_is_none(pictures):
     values, known = read_samples(pictures[1])
     assert known.sum().item() == 28
     assert values.shape == (1, *SIZE)
@@ -79,7 +79,7 @@ def test_samples_are_levels_over_255_and_0_is_none(pictures):
     assert values[0, 7, 2].item() == 61 / 255
 
 
-def test_the_caller_s_range_makes_metres_of_levels(pictures):
+def test_range_of_the_caller_converts_levels_to_metres(pictures):
     scene = load_frame(*pictures, "tofmark", "books", intrinsics=INTRINSICS, depth_range=(0.5, 3.04), factors=(1, 4))
     assert scene.depth is None
     assert scene.measured[1][0, 1, 2].item() == pytest.approx(0.5)
@@ -99,27 +99,27 @@ def test_pictures_without_a_range_or_a_camera_are_refused_with_the_reason(pictur
 
 
 @pytest.mark.parametrize("depth_range", [(1.0, 0.5), (0.0, 1.0), (1.0, 1.0), (0.5, np.inf), (np.nan, 1.0)])
-def test_a_range_that_is_none_is_refused(pictures, capfd, depth_range):
+def test_invalid_range_is_refused(pictures, capfd, depth_range):
     act = lambda: load_frame(*pictures, "t", "b", intrinsics=INTRINSICS, depth_range=depth_range)  # noqa: E731
     refusal(act, "depth_range", capfd)
 
 
 @pytest.mark.parametrize("factor", [0, -4, 23])
-def test_a_factor_that_the_size_does_not_allow_is_refused(capfd, factor):
+def test_factor_that_does_not_divide_the_size_is_refused(capfd, factor):
     refusal(lambda: block_means(torch.ones(1, *SIZE), factor), "factors", capfd)
 
 
 @pytest.mark.parametrize(
     "content", [b"", b"BM", bmp(GREY)[:1078], bmp(GREY)[:-400], b"text", bmp(GREY * 0), bmp(GREY[:21])]
 )
-def test_a_damaged_picture_of_samples_is_refused(pictures, capfd, content):
+def test_damaged_picture_of_samples_is_refused(pictures, capfd, content):
     rgb, samples = pictures
     written(samples, content)
     act = lambda: load_frame(rgb, samples, "t", "b", intrinsics=INTRINSICS, depth_range=(0.5, 1.0))  # noqa: E731
     assert "expected" in refusal(act, samples, capfd)
 
 
-def test_a_block_s_depth_is_the_mean_of_its_samples_inverse_depths():
+def test_depth_of_a_block_is_the_mean_of_its_samples_inverse_depths():
     depth = torch.full((1, 5, 9), torch.nan, dtype=torch.float64)
     depth[0, 0, 0], depth[0, 3, 3], depth[0, 1, 5], depth[0, 4, 8] = 1.0, 2.0, 3.0, 9.0
     means = block_means(depth, 4)
@@ -139,7 +139,7 @@ NAMINGS = {
 @pytest.mark.parametrize("scale", [1.0, 1000.0])
 @pytest.mark.parametrize("kind", ["5", "5 compressed", "7.3"])
 @pytest.mark.parametrize("naming", NAMINGS)
-def test_variables_are_told_by_name_and_content_in_metres_or_millimetres(tmp_path, naming, kind, scale):
+def test_variables_are_recognised_by_name_and_content_in_metres_or_millimetres(tmp_path, naming, kind, scale):
     arrays = dict(zip(NAMINGS[naming], (GREY, TRUTH * scale, SPARSE * scale), strict=True))
     arrays |= {"weights": (SPARSE > 0) * 0.5, "tof_lowres": np.ones((6, 7)), "version": "1"}
     if "." in NAMINGS[naming][0] and kind != "7.3":
@@ -162,7 +162,7 @@ TYPES = ("i1", "u1", "i2", "u2", "i4", "u4", "i8", "u8", "f4", "f8")
 
 
 @pytest.mark.parametrize("compress", [False, True])
-def test_matrices_of_every_type_come_through_and_whatever_else_is_left_out(tmp_path, compress):
+def test_matrices_of_every_type_are_read_and_other_content_is_skipped(tmp_path, compress):
     arrays = {kind: (GREY % 100).astype(kind) for kind in TYPES}
     arrays |= {"logical": GREY > 9, "cube": np.arange(24.0).reshape(2, 3, 4), "empty": np.zeros((0, 3))}
     others = {"text": "abc", "cell": np.array([1, "a"], object), "sparse": scipy.sparse.csc_matrix(SPARSE)}
@@ -176,7 +176,7 @@ def test_matrices_of_every_type_come_through_and_whatever_else_is_left_out(tmp_p
         assert found[name].dtype == array.dtype or name == "logical"
 
 
-def test_a_file_of_a_machine_of_the_other_byte_order_is_read(tmp_path):
+def test_file_of_the_other_byte_order_is_read(tmp_path):
     def element(kind, content):
         return struct.pack(">II", kind, len(content)) + content + bytes(-len(content) % 8)
 
@@ -187,7 +187,7 @@ def test_a_file_of_a_machine_of_the_other_byte_order_is_read(tmp_path):
     np.testing.assert_array_equal(read_variables(path)["gt"], [[0.0, 2.0, 4.0], [1.0, 3.0, 5.0]])
 
 
-def test_the_caller_may_name_the_variables(tmp_path):
+def test_variable_names_can_be_given_by_the_caller(tmp_path):
     path = old(tmp_path / "a.mat", {"x": GREY / 255, "y": TRUTH, "z": TRUTH + 1, "w": SPARSE})
     rgb, depth, samples = read_matrices(path, {"intensity": "x", "depth": "z"})
     np.testing.assert_allclose(rgb[1], GREY / 255, rtol=1e-6)
@@ -195,7 +195,7 @@ def test_the_caller_may_name_the_variables(tmp_path):
     assert samples.isfinite().sum().item() == (SPARSE > 0).sum()
 
 
-def test_true_depth_may_be_missing_and_holes_may_be_nan(tmp_path):
+def test_truth_may_be_missing_and_holes_may_be_nan(tmp_path):
     path = old(tmp_path / "a.mat", {"intensity": GREY, "tof": np.where(SPARSE, SPARSE, np.nan)})
     _, depth, samples = read_matrices(path)
     assert depth is None
@@ -216,7 +216,7 @@ def test_true_depth_may_be_missing_and_holes_may_be_nan(tmp_path):
         ({"text": "nothing else"}, "no matrix"),
     ],
 )
-def test_a_file_of_other_variables_is_refused_with_what_it_has(tmp_path, capfd, variables, reason):
+def test_file_of_other_variables_is_refused_with_their_names(tmp_path, capfd, variables, reason):
     path = old(tmp_path / "a.mat", variables)
     assert reason in refusal(lambda: read_matrices(path), path, capfd)
 
@@ -228,7 +228,7 @@ def test_a_file_of_other_variables_is_refused_with_what_it_has(tmp_path, capfd, 
         ({"depth": "small"}, "small: expected shape (22, 40)"),
     ],
 )
-def test_names_of_the_caller_that_do_not_fit_are_refused(tmp_path, capfd, mapping, reason):
+def test_wrong_variable_names_of_the_caller_are_refused(tmp_path, capfd, mapping, reason):
     path = old(tmp_path / "a.mat", {"intensity": GREY, "depth_gt": TRUTH, "small": TRUTH[:9]})
     assert reason in refusal(lambda: read_matrices(path, mapping), path, capfd)
     refusal(lambda: read_matrices(path, {"weights": "depth_gt"}), "variables", capfd)
@@ -247,13 +247,13 @@ def test_names_of_the_caller_that_do_not_fit_are_refused(tmp_path, capfd, mappin
         lambda whole: bytes(5000),
     ],
 )
-def test_a_damaged_mat_file_is_refused_in_one_line(tmp_path, capfd, make, damage):
+def test_damaged_mat_file_is_refused_in_one_line(tmp_path, capfd, make, damage):
     path = make(tmp_path / "a.mat", {"intensity": GREY, "depth_gt": TRUTH, "tof": SPARSE})
     written(path, damage(path.read_bytes()))
     assert "expected" in refusal(lambda: read_matrices(path), path, capfd)
 
 
-def test_a_matrix_larger_than_its_file_can_hold_is_refused_before_it_is_read(tmp_path, capfd):
+def test_matrix_larger_than_its_file_can_hold_is_refused_before_it_is_read(tmp_path, capfd):
     path = tmp_path / "a.mat"
     with h5py.File(path, "w") as file:
         file.create_dataset("intensity", shape=(10**6, 10**6), dtype="f8", chunks=(100, 100))
@@ -272,7 +272,7 @@ def test_missing_files_are_refused(tmp_path, capfd):
     assert "there is none" in refusal(lambda: read_samples(path), path, capfd)
 
 
-def test_scenes_are_listed_once_the_metric_file_first(tmp_path):
+def test_scenes_are_listed_once_with_the_metric_file_first(tmp_path):
     for name in ("books.bmp", "books_depth.bmp", "benchmarking_dataset_books.mat", "shark.bmp", "shark_depth.bmp",
                  "devil_depth.bmp", "other.mat"):  # fmt: skip
         written(tmp_path / name, b"")
@@ -284,7 +284,7 @@ def test_scenes_are_listed_once_the_metric_file_first(tmp_path):
         find_frames(tmp_path / "nowhere")
 
 
-def test_the_real_pictures_have_samples_in_a_fortieth_of_their_pixels(shared):
+def test_real_pictures_have_samples_in_a_fortieth_of_their_pixels(shared):
     frames = find_frames(shared / "real/tofmark")
     assert list(frames) == ["books", "devil", "shark"]
     for name, files in frames.items():
@@ -295,7 +295,7 @@ def test_the_real_pictures_have_samples_in_a_fortieth_of_their_pixels(shared):
         assert scene.measured[8].isfinite().double().mean() > 0.98
 
 
-def test_255_is_far_as_the_wall_of_books_is_brighter_than_the_cup_before_it(shared):
+def test_level_255_is_far(shared):
     levels, known = read_samples(shared / "real/tofmark/books_depth.bmp")
 
     def middle(rows, columns):

@@ -38,7 +38,7 @@ def _by_loops(guide: Tensor, values: Tensor, radius: int, epsilon: float, weight
 
 @pytest.mark.parametrize("radius", [1, 3])
 @pytest.mark.parametrize("holes", [False, True])
-def test_it_is_the_mean_of_each_windows_ridge_regression_of_the_map_on_the_colours(radius: int, holes: bool) -> None:
+def test_guided_filter_is_the_mean_of_each_windows_ridge_regression(radius: int, holes: bool) -> None:
     guide, values, weight = _noise(3, 16, 16), _noise(16, 16, seed=1), torch.ones(16, 16).double()
     if holes:
         weight = _noise(16, 16, seed=2)
@@ -47,13 +47,13 @@ def test_it_is_the_mean_of_each_windows_ridge_regression_of_the_map_on_the_colou
     np.testing.assert_allclose(result, _by_loops(guide, values, radius, 1e-3, weight), rtol=0, atol=1e-9)
 
 
-def test_a_map_that_is_linear_in_the_colours_is_kept() -> None:
+def test_map_linear_in_the_colours_is_kept() -> None:
     guide = _noise(3, 20, 24)
     values = (torch.tensor([1.0, -2.0, 0.5]).double().view(3, 1, 1) * guide).sum(dim=0) + 3
     torch.testing.assert_close(guided_filter(guide, values[None], 2, 1e-12)[0], values, rtol=0, atol=1e-8)
 
 
-def test_under_a_photo_of_one_colour_it_is_the_box_filter_twice() -> None:
+def test_guided_filter_under_a_constant_photo_is_the_box_filter_twice() -> None:
     impulse = torch.zeros(1, 15, 15).double()
     impulse[0, 7, 7] = 1
     tent = torch.tensor([1.0, 2.0, 3.0, 2.0, 1.0]).double() / 9
@@ -61,14 +61,14 @@ def test_under_a_photo_of_one_colour_it_is_the_box_filter_twice() -> None:
     torch.testing.assert_close(result[5:10, 5:10], tent[:, None] * tent, rtol=0, atol=1e-15)
 
 
-def test_several_maps_are_filtered_alike() -> None:
+def test_several_maps_are_filtered_like_single_ones() -> None:
     guide, maps = _noise(3, 12, 10), _noise(2, 12, 10, seed=1)
     both = guided_filter(guide, maps, 2, 1e-2)
     for k in range(2):
         assert torch.equal(both[k], guided_filter(guide, maps[k : k + 1], 2, 1e-2)[0])
 
 
-def test_a_blurred_step_along_an_edge_of_the_photo_becomes_sharp() -> None:
+def test_blurred_step_along_a_photo_edge_becomes_sharp() -> None:
     """Half of it, as the windows that straddle the edge disagree."""
     columns = torch.arange(64).double().expand(64, 64)
     photo = torch.where(columns < 32, 0.2, 0.8).expand(3, 64, 64).contiguous()
@@ -80,6 +80,6 @@ def test_a_blurred_step_along_an_edge_of_the_photo_becomes_sharp() -> None:
 
 
 @pytest.mark.parametrize("name", ["radius", "epsilon"])
-def test_a_parameter_that_is_not_positive_is_refused(name: str) -> None:
+def test_parameter_that_is_not_positive_is_refused(name: str) -> None:
     with pytest.raises(ValueError, match=rf"^{name}: expected a positive number for the guided filter, got 0"):
         GuidedFilter(**{name: 0})

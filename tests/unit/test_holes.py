@@ -24,7 +24,7 @@ def _edges(mask: torch.Tensor) -> int:
 
 
 @pytest.mark.parametrize("share", [0.05, 0.2])
-def test_blobs_have_the_wanted_share_and_are_no_salt_and_pepper(share: float) -> None:
+def test_blobs_have_the_requested_fraction_and_are_connected(share: float) -> None:
     depth = torch.ones(1, 60, 80)
     fine, coarse = (Blobs(share, size)(depth, CAMERA, _generator()) for size in (8, 24))
     assert int(fine.sum()) == int(coarse.sum()) == round(share * 4800)
@@ -40,7 +40,7 @@ def test_blobs_depend_on_the_generator_alone() -> None:
 
 
 @pytest.mark.parametrize("baseline", [0.2, -0.2])
-def test_a_shadow_is_as_wide_as_the_disparities_differ(baseline: float) -> None:
+def test_shadow_is_as_wide_as_the_disparities_differ(baseline: float) -> None:
     depth = torch.full((1, 30, 40), 4.0)
     depth[:, 10:20, 15:25] = 1.0
     mask = Shadows(baseline)(depth, CAMERA, _generator())
@@ -53,7 +53,7 @@ def test_a_shadow_is_as_wide_as_the_disparities_differ(baseline: float) -> None:
     assert torch.equal(mask, expected)
 
 
-def test_a_plane_has_no_shadows_even_where_part_of_it_is_unknown() -> None:
+def test_plane_with_missing_parts_has_no_shadows() -> None:
     slope = torch.linspace(2, 3, 40).expand(1, 30, 40).clone()
     slope[:, 5:9, 10:20] = torch.nan
     assert not bool(Shadows(0.1)(slope, CAMERA, _generator()).any())
@@ -66,7 +66,7 @@ def test_values_out_of_range_are_refused(make: object) -> None:
         make()  # type: ignore[operator]
 
 
-def test_a_sample_with_holes_has_the_very_values_of_the_one_without_elsewhere() -> None:
+def test_sample_with_holes_has_the_same_values_elsewhere() -> None:
     depth = 2 + torch.rand(1, 32, 40)
     scene = Scene("set", "hall", torch.rand(3, 32, 40), CAMERA.crop(0, 0, 30, 40).rescale(40, 32), depth)
     given = (scene, 2, Downsampling("box"), "orthogonal", GaussianMultiplicative(0.01), 7)
@@ -79,7 +79,7 @@ def test_a_sample_with_holes_has_the_very_values_of_the_one_without_elsewhere() 
     assert torch.equal(again.depth_lr.isnan(), holes)
 
 
-def test_a_measured_map_can_be_cut_too() -> None:
+def test_measured_map_gets_holes_too() -> None:
     coarse = 2 + torch.rand(1, 8, 10)
     scene = Scene("set", "hall", torch.rand(3, 32, 40), CAMERA.rescale(40, 32), None, {4: coarse})
     sample = make_sample(scene, 4, Measured(), "orthogonal", holes=Blobs(0.25, 3))

@@ -67,12 +67,12 @@ def has_no_place(name):
     return name != "dsr" and place_of(name) is None and not (MODULES[name].name == "__init__.py" and not IMPORTS[name])
 
 
-def test_every_module_has_a_layer():
+def test_modules_all_have_a_layer():
     homeless = [name for name in MODULES if has_no_place(name)]
     assert not homeless, f"assign {', '.join(homeless)} to a layer in LAYERS of {Path(__file__).name}"
 
 
-def test_a_module_imports_from_layers_below_and_its_own_group_alone():
+def test_modules_import_from_layers_below_and_their_own_group_alone():
     assert [line for name in MODULES if place_of(name) is not None for line in offences(name, IMPORTS[name])] == []
 
 
@@ -106,17 +106,17 @@ def test_modules_do_not_import_each_other_in_a_circle():
         ("dsr.methods.networks.facets", "import hydra", "hydra"),
     ],
 )
-def test_the_test_itself_sees_a_forbidden_import(module, text, offence):
+def test_import_check_finds_a_forbidden_import(module, text, offence):
     known = {*MODULES, "dsr.metrics.losses"}
     imported = imports_of(text, module, known=known)
     assert any(within(name, offence) for name in imported)
     assert len(offences(module, imported)) == 1
 
 
-def test_the_modules_were_found():
+def test_module_graph_finds_the_modules():
     assert {"dsr.sample", "dsr.app.entry", "dsr.data.folder"} <= MODULES.keys()
     assert "dsr.data.base" in IMPORTS["dsr.data.folder"]
 
 
-def test_the_root_of_the_package_holds_no_module_but_the_sample():
+def test_package_root_holds_no_module_but_the_sample():
     assert {path.name for path in (SOURCE / "dsr").glob("*.py")} == {"__init__.py", "sample.py"}

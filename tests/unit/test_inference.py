@@ -44,7 +44,7 @@ def _photo(height: int, width: int) -> Tensor:
     ids=lambda size: "x".join(map(str, size)),
 )  # fmt: skip
 @pytest.mark.parametrize("method", ["facets", "bicubic"])
-def test_a_slanted_plane_comes_back_as_it_is_at_any_size_and_ratio(
+def test_slanted_plane_is_reproduced_at_any_size_and_ratio(
     method: str, size: tuple[int, int], coarse_size: tuple[int, int]
 ) -> None:
     camera = _camera(*size)
@@ -85,7 +85,7 @@ def test_depth_of_the_photos_size_keeps_its_own_holes() -> None:
     assert float((filled / _plane(33, 46, camera) - 1).abs().max()) < 0.05
 
 
-def test_depth_that_was_enlarged_by_repeating_pixels_is_taken_for_the_coarse_map() -> None:
+def test_enlarged_depth_is_reduced_to_its_low_resolution_map() -> None:
     camera = _camera(48, 64)
     coarse, rgb = _plane(6, 8, camera), _photo(48, 64)
     coarse[:, 1, 2] = torch.nan
@@ -97,7 +97,7 @@ def test_depth_that_was_enlarged_by_repeating_pixels_is_taken_for_the_coarse_map
     torch.testing.assert_close(upsample_depth(rgb, enlarged, camera), upsample_depth(rgb, coarse, camera))
 
 
-def test_nearest_repeats_the_pixels_and_a_sharp_step_stays_sharp_when_an_answer_is_reduced() -> None:
+def test_nearest_repeats_pixels_and_a_step_stays_sharp_when_the_result_is_reduced() -> None:
     camera = Camera(15, 12, 1e5, 1e5, 7.0, 5.5)  # of so narrow a view that all range types agree
     coarse = torch.full((1, 8, 10), 1.0)
     coarse[..., 4:] = 2.0
@@ -116,7 +116,7 @@ def test_resizing_keeps_planes_to_rounding_up_to_the_border(size: tuple[int, int
     torch.testing.assert_close(resized_inverse(plane(97, 80), size), plane(*size), rtol=0, atol=1e-12)
 
 
-def test_a_plan_says_what_is_done() -> None:
+def test_plan_describes_the_steps() -> None:
     assert plan((480, 640), (120, 160)).scale == 4
     assert plan((1440, 1920), (192, 256)).scale == 8  # 7.5
     assert plan((720, 1280), (240, 426)).steps == (4,)
@@ -146,7 +146,7 @@ def test_a_plan_says_what_is_done() -> None:
         (((2000, 2000), (500, 500), None, "dip_v"), "method=dip_v: expected a photo of up to 1048576 pixels"),
     ],
 )
-def test_what_can_not_be_done_is_refused_in_one_line(arguments: tuple, message: str) -> None:
+def test_invalid_request_is_refused_in_one_line(arguments: tuple, message: str) -> None:
     with pytest.raises(ValueError, match=message) as caught:
         plan(*arguments)
     assert "\n" not in str(caught.value)
@@ -160,14 +160,14 @@ def test_what_can_not_be_done_is_refused_in_one_line(arguments: tuple, message: 
         (math.inf, "to mark holes, got inf in 1"),
     ],
 )
-def test_a_depth_that_is_none_is_refused_with_how_to_mark_holes(change: float, message: str) -> None:
+def test_invalid_depth_is_refused_with_how_to_mark_holes(change: float, message: str) -> None:
     depth = torch.ones(1, 12, 16)
     depth[0, 3, 4] = change
     with pytest.raises(ValueError, match=message):
         upsample_depth(_photo(48, 64), depth, _camera(48, 64))
 
 
-def test_what_is_no_picture_is_refused() -> None:
+def test_invalid_picture_is_refused() -> None:
     depth, camera = torch.ones(1, 12, 16), _camera(48, 64)
     with pytest.raises(ValueError, match=r"rgb: expected shape \(3, 48, 64\), the camera's, got \(3, 48, 60\)"):
         upsample_depth(_photo(48, 60), depth, camera)
@@ -187,7 +187,7 @@ def test_what_is_no_picture_is_refused() -> None:
         dsr.upsample(_photo(48, 64), depth, camera, mask=torch.ones(48, 64))
 
 
-def test_arrays_and_tensors_give_the_same() -> None:
+def test_arrays_and_tensors_give_the_same_result() -> None:
     camera, depth = _camera(48, 64), _plane(12, 16, _camera(48, 64)).float()
     depth[0, 5, 5] = 1.0
     bytes_ = (255 * _photo(48, 64)).round().to(torch.uint8)
@@ -201,7 +201,7 @@ def test_arrays_and_tensors_give_the_same() -> None:
     np.testing.assert_allclose(floats, of_arrays, rtol=1e-4)
 
 
-def test_a_mask_makes_holes() -> None:
+def test_mask_makes_holes() -> None:
     camera, depth = _camera(48, 64), _plane(12, 16, _camera(48, 64))
     mask = torch.ones(12, 16)
     mask[4, 4] = 0
@@ -211,13 +211,13 @@ def test_a_mask_makes_holes() -> None:
     torch.testing.assert_close(fine, pierced)
 
 
-def test_progress_runs_to_the_end_over_all_steps() -> None:
+def test_progress_covers_all_steps() -> None:
     camera, parts = _camera(64, 96), []
     upsample_depth(_photo(64, 96), _plane(4, 6, camera), camera, progress=lambda *part: parts.append(part))
     assert parts == [(i + 1, 8) for i in range(8)]  # x8, then x4, each an ensemble of four
 
 
-def test_every_method_that_needs_no_optimisation_answers() -> None:
+def test_methods_without_optimisation_give_results() -> None:
     camera = _camera(32, 32)
     for method in METHODS:
         if not method.startswith("dip"):
@@ -226,7 +226,7 @@ def test_every_method_that_needs_no_optimisation_answers() -> None:
             assert float((fine / _plane(32, 32, camera) - 1).abs().max()) < 0.1, method
 
 
-def test_a_prior_answers_at_any_size(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_dip_gives_results_at_any_size(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("dsr.inference.engine._PRIOR_SETTINGS", {"dip": {"steps": 2, "widths": (4,), "skips": (2,)}})
     camera = _camera(31, 42)
     fine = upsample_depth(_photo(31, 42), _plane(15, 21, camera), camera, method="dip")
@@ -241,14 +241,14 @@ def test_depth_almost_of_the_photos_size_counts_as_such() -> None:
     assert float((fine / _plane(40, 60, camera) - 1).abs().max()) < 0.02
 
 
-def test_the_example_of_the_documentation_runs() -> None:
+def test_example_of_the_documentation_runs() -> None:
     for module in (people, dsr):
         result = doctest.testmod(module)
         assert result.attempted > 1
         assert result.failed == 0
 
 
-def test_importing_the_package_loads_nothing_heavy() -> None:
+def test_import_of_the_package_loads_nothing_heavy() -> None:
     code = "import sys, dsr; assert 'upsample' in dir(dsr); print(sorted({'torch', 'numpy'} & set(sys.modules)))"
     answer = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert answer.stdout.strip() == "[]"
@@ -258,21 +258,21 @@ def test_importing_the_package_loads_nothing_heavy() -> None:
 
 @pytest.mark.parametrize("repeats", [1, 4])
 @pytest.mark.parametrize(("noise", "method"), [(0.0005, "facets"), (0.004, "msg_v_noisy")])
-def test_the_suited_method_depends_on_how_noise_tilts_the_normals(noise, method, repeats):
+def test_suited_method_depends_on_the_normal_noise(noise, method, repeats):
     camera = Camera(128, 128, 128.0, 128.0, 63.5, 63.5)  # noise of 0.002 tilts by 5.2 degrees at 32 x 32
     coarse = 2 * (1 + noise * torch.randn(1, 32, 32, generator=torch.Generator().manual_seed(0)))
     given = coarse.repeat_interleave(repeats, 1).repeat_interleave(repeats, 2)
     assert suited_method(given, camera) == method
 
 
-def test_depth_of_the_photo_s_size_is_judged_after_it_was_averaged():
+def test_depth_of_the_photos_size_is_judged_after_averaging():
     camera = Camera(128, 128, 128.0, 128.0, 63.5, 63.5)
     fine = 2 * (1 + 0.008 * torch.randn(1, 128, 128, generator=torch.Generator().manual_seed(0)))
     assert suited_method(fine, camera) == "facets"  # averages of 16 have a quarter of the noise
     assert suited_method(2 + 2 * (fine - 2), camera) == "msg_v_noisy"
 
 
-def test_where_the_noisy_network_has_no_weights_the_other_is_taken():
+def test_missing_noisy_weights_are_replaced_by_the_others():
     camera = Camera(256, 256, 256.0, 256.0, 127.5, 127.5)
     noisy = 2 + 0.05 * torch.rand(1, 32, 32, generator=torch.Generator().manual_seed(0))
     assert suited_method(noisy, camera) == "facets"

@@ -47,20 +47,20 @@ def _result(sample: DepthSample, order: Order = "bicubic", *, fill_holes: bool =
 
 
 @pytest.mark.parametrize("scale", SCALES)
-def test_bicubic_is_scipys_zoom_of_the_box_mean_of_perspective_depth(scale: int) -> None:
+def test_bicubic_equals_scipys_zoom_of_the_box_mean_of_perspective_depth(scale: int) -> None:
     perspective = _random()
     expected = ndimage.zoom(_coarse(perspective.numpy(), scale), scale, order=3, grid_mode=True, mode="nearest")
     np.testing.assert_allclose(_result(_sample(perspective, scale=scale)), expected, rtol=0, atol=1e-9)
 
 
 @pytest.mark.parametrize("scale", SCALES)
-def test_nearest_repeats_each_coarse_pixel(scale: int) -> None:
+def test_nearest_repeats_each_low_resolution_pixel(scale: int) -> None:
     perspective = _random()
     expected = np.kron(_coarse(perspective.numpy(), scale), np.ones((scale, scale)))
     np.testing.assert_allclose(_result(_sample(perspective, scale=scale), "nearest"), expected, rtol=1e-12)
 
 
-def test_bilinear_weighs_the_four_coarse_neighbours_by_their_distance() -> None:
+def test_bilinear_weights_the_four_neighbours_by_distance() -> None:
     perspective = _random()
     coarse = np.pad(_coarse(perspective.numpy()), 1, mode="edge")
     v, u = (np.arange(size) / 4 - 0.375 + 1 for size in (32, 48))  # in the padded map
@@ -73,12 +73,12 @@ def test_bilinear_weighs_the_four_coarse_neighbours_by_their_distance() -> None:
 
 @pytest.mark.parametrize("order", ORDERS)
 @pytest.mark.parametrize("kernel", ["box", "nearest", "bicubic"])
-def test_a_sphere_around_the_camera_is_restored(order: Order, kernel: Kernel) -> None:
+def test_sphere_around_the_camera_is_reproduced(order: Order, kernel: Kernel) -> None:
     np.testing.assert_allclose(_result(_sample(torch.full((32, 48), 2.0).double(), kernel), order), 2.0, rtol=1e-12)
 
 
 @pytest.mark.parametrize("kernel", ["box", "nearest"])
-def test_coarse_and_fine_pixels_are_matched_through_their_cameras(kernel: Kernel) -> None:
+def test_low_and_high_resolution_pixels_are_matched_through_their_cameras(kernel: Kernel) -> None:
     perspective = _ramp()
     fine = _result(_sample(perspective, kernel), "bilinear")
     inside = (slice(2, -2), slice(2, -2))  # between the outermost low-resolution pixel centres
@@ -92,7 +92,7 @@ def test_bicubic_keeps_a_ramp_away_from_the_border() -> None:
 
 
 @pytest.mark.parametrize("order", ORDERS)
-def test_a_nearest_downsampled_pixel_keeps_its_value(order: Order) -> None:
+def test_nearest_downsampled_pixels_keep_their_values(order: Order) -> None:
     perspective = _random()
     fine = _result(_sample(perspective, "nearest"), order)
     np.testing.assert_allclose(fine[2::4, 2::4], perspective.numpy()[2::4, 2::4], rtol=1e-9)
@@ -107,7 +107,7 @@ def _with_holes() -> Tensor:
 
 
 @pytest.mark.parametrize("order", ORDERS)
-def test_a_fine_pixel_is_a_hole_where_its_nearest_coarse_pixel_is(order: Order) -> None:
+def test_holes_are_where_the_nearest_low_resolution_pixel_is_missing(order: Order) -> None:
     sample = _sample(_with_holes())
     expected = np.kron(~sample.mask_lr[0].numpy(), np.ones((4, 4), dtype=bool))
     assert expected.sum() == 80
@@ -115,7 +115,7 @@ def test_a_fine_pixel_is_a_hole_where_its_nearest_coarse_pixel_is(order: Order) 
 
 
 @pytest.mark.parametrize("order", ORDERS)
-def test_filled_holes_are_interpolated_from_their_nearest_known_pixels(order: Order) -> None:
+def test_inpainted_holes_are_interpolated_from_their_nearest_valid_pixels(order: Order) -> None:
     sample = _sample(_with_holes())
     filled = to_range(sample.depth_lr, sample.camera_lr, "perspective")[0].clone()
     for i, j, source in ((1, 2, (1, 1)), (2, 2, (2, 1)), (1, 3, (1, 4)), (2, 3, (2, 4))):
@@ -138,7 +138,7 @@ def test_values_far_from_a_hole_do_not_depend_on_it() -> None:
     )
 
 
-def test_an_overshoot_below_zero_becomes_a_hole() -> None:
+def test_overshoot_below_zero_becomes_a_hole() -> None:
     perspective = torch.full((32, 48), 60.0, dtype=torch.float64)
     perspective[:, :24] = 0.05
     fine = _result(_sample(perspective))
@@ -146,7 +146,7 @@ def test_an_overshoot_below_zero_becomes_a_hole() -> None:
     assert (fine[np.isfinite(fine)] > 0).all()
 
 
-def test_truth_and_photo_are_not_looked_at() -> None:
+def test_result_does_not_depend_on_truth_and_photo() -> None:
     sample = _sample(_random())
     blind = DepthSample(
         "", "", torch.ones_like(sample.rgb), sample.depth_lr, sample.camera, sample.camera_lr, sample.scale
@@ -154,16 +154,16 @@ def test_truth_and_photo_are_not_looked_at() -> None:
     assert torch.equal(Interpolation()(sample), Interpolation()(blind))
 
 
-def test_the_result_has_the_precision_of_the_coarse_depth() -> None:
+def test_result_has_the_precision_of_the_low_resolution_depth() -> None:
     fine = Interpolation()(_sample(_random().float()))
     assert fine.dtype == torch.float32
     np.testing.assert_allclose(fine.numpy(), Interpolation()(_sample(_random().float().double())).numpy(), rtol=1e-6)
 
 
-def test_the_method_works_on_perspective_depth() -> None:
+def test_interpolation_works_on_perspective_depth() -> None:
     assert Interpolation.range_type == "perspective"
 
 
-def test_an_unknown_order_is_refused() -> None:
+def test_unknown_order_is_refused() -> None:
     with pytest.raises(ValueError, match=r"^order: expected one of nearest, bilinear, bicubic, got 'cubic'"):
         Interpolation("cubic")  # type: ignore[arg-type]

@@ -44,7 +44,7 @@ def found(folder, **choice):
         ("open3d.json", {"width": 64, "height": 48, "intrinsic_matrix": [60.0, 0, 0, 0, 61, 0, 31, 24, 1]}),
     ],
 )
-def test_a_camera_file_of_the_photo_is_taken_as_it_is_without_a_word(tmp_path, name, content):
+def test_camera_file_of_the_photo_is_used_silently(tmp_path, name, content):
     assert found(tmp_path, file=written(tmp_path, name, content)) == (Camera(**OWN), [])
 
 
@@ -55,20 +55,20 @@ def test_a_camera_file_of_the_photo_is_taken_as_it_is_without_a_word(tmp_path, n
         "6e1 0 31 0\n0 61 24 0\n0 0 1 0\n0 0 0 1\n",
     ],
 )  # fmt: skip
-def test_a_matrix_of_sun_rgbd_or_scannet_is_of_the_photo_s_pixels(tmp_path, text):
+def test_matrix_of_sun_rgbd_or_scannet_is_in_photo_pixels(tmp_path, text):
     camera, facts = found(tmp_path, file=written(tmp_path, "intrinsics.txt", text))
     assert camera == Camera(**OWN)
     assert facts == ["camera: the matrix is taken for one of the photo's pixels"]
 
 
-def test_a_matrix_of_the_depth_map_s_pixels_is_recognised_and_scaled(tmp_path):
+def test_matrix_in_depth_map_pixels_is_recognised_and_scaled(tmp_path):
     camera, facts = found(tmp_path, file=written(tmp_path, "k.txt", "15 0 7.5 0 15 5.5 0 0 1"))
     assert camera == Camera(64, 48, 60, 60, 31.5, 23.5)
     assert "depth map's pixels" in facts[0]
     assert "16 x 12 pixels is scaled to the photo's 64 x 48" in facts[1]
 
 
-def test_a_camera_of_another_resolution_is_scaled_about_the_outer_edge(tmp_path):
+def test_camera_of_another_resolution_is_scaled_about_the_outer_edge(tmp_path):
     camera, facts = found(tmp_path, file=written(tmp_path, "c.json", {**OWN, "width": 128, "height": 96}))
     assert camera == Camera(64, 48, 30, 30.5, 31.5 / 2 - 0.5, 24.5 / 2 - 0.5)
     assert facts == ["camera: that of 128 x 96 pixels is scaled to the photo's 64 x 48"]
@@ -90,24 +90,24 @@ def test_a_camera_of_another_resolution_is_scaled_about_the_outer_edge(tmp_path)
         ("missing.txt", None, "expected a camera file, there is none"),
     ],
 )
-def test_a_camera_file_that_does_not_fit_is_refused_by_name(tmp_path, name, content, message):
+def test_camera_file_that_does_not_fit_is_refused_by_name(tmp_path, name, content, message):
     path = tmp_path / name if content is None else written(tmp_path, name, content)
     with pytest.raises(ValueError, match=message) as caught:
         found(tmp_path, file=path)
     assert str(caught.value).startswith(f"{path}: ")
 
 
-def test_numbers_of_the_command_line_are_pixels_of_the_photo(tmp_path):
+def test_command_line_numbers_are_photo_pixels(tmp_path):
     assert found(tmp_path, intrinsics=(60.0, 61.0, 31.0, 24.0)) == (Camera(**OWN), [])
 
 
-def test_the_field_of_view_is_the_angle_between_the_outer_edges(tmp_path):
+def test_field_of_view_is_the_angle_between_the_outer_edges(tmp_path):
     camera, facts = found(tmp_path, fov=90.0)
     assert (camera.fx, camera.fy, camera.cx, camera.cy) == pytest.approx((32, 32, 31.5, 23.5))
     assert facts == []
 
 
-def test_without_a_word_about_the_camera_60_degrees_are_assumed_and_said(tmp_path):
+def test_unknown_camera_is_assumed_to_have_60_degrees_with_a_note(tmp_path):
     camera, facts = found(tmp_path)
     assert math.degrees(2 * math.atan(32 / camera.fx)) == pytest.approx(60)
     assert facts == [
@@ -115,7 +115,7 @@ def test_without_a_word_about_the_camera_60_degrees_are_assumed_and_said(tmp_pat
     ]
 
 
-def test_the_focal_length_of_the_exif_data_is_along_the_diagonal_of_35_mm_film(tmp_path):
+def test_focal_length_of_exif_data_is_relative_to_the_35_mm_diagonal(tmp_path):
     description, facts = camera_of(CameraChoice(), photo(tmp_path, {0xA405: 26}), SIZE, COARSE)
     assert description.camera.fx == pytest.approx(26 / math.sqrt(36**2 + 24**2) * 80)
     assert "EXIF" in facts[0].text
@@ -123,19 +123,19 @@ def test_the_focal_length_of_the_exif_data_is_along_the_diagonal_of_35_mm_film(t
 
 
 @pytest.mark.parametrize("value", [0, 1, 65535])
-def test_an_exif_focal_length_that_is_none_is_left_out(tmp_path, value):
+def test_invalid_exif_focal_length_is_ignored(tmp_path, value):
     facts = camera_of(CameraChoice(), photo(tmp_path, {0xA405: value}), SIZE, COARSE)[1]
     assert facts[0].text.startswith("camera: none given")
 
 
 @pytest.mark.parametrize("choice", [{"fov": 0.0}, {"fov": 180.0}, {"fov": math.nan}, {"intrinsics": (1, 0, 1, 1)}])
-def test_impossible_numbers_are_refused(choice):
+def test_impossible_camera_numbers_are_refused(choice):
     with pytest.raises(ValueError, match=f"--{next(iter(choice))}: expected"):
         CameraChoice(**choice)
 
 
 @pytest.mark.parametrize("orientation", range(2, 9))
-def test_a_photo_is_turned_by_its_exif_data_only_where_depth_fits_that_alone(tmp_path, orientation):
+def test_exif_rotation_is_applied_only_where_depth_fits_it_alone(tmp_path, orientation):
     path = photo(tmp_path, {0x0112: orientation})
     plain = np.asarray(Image.open(path).convert("RGB")).astype(int)
     as_stored, facts = read_photo(path, COARSE)

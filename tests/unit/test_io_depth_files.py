@@ -53,7 +53,7 @@ INDEPENDENT = {
         ("npz", "i4"), ("npz", "f4"), ("pfm", "f4"), ("exr", "f4"), ("exr", "f2"),
     ],
 )  # fmt: skip
-def test_what_is_written_reads_the_same_here_and_in_another_program(tmp_path, suffix, dtype):
+def test_written_files_read_the_same_here_and_in_another_program(tmp_path, suffix, dtype):
     values = (WHOLE if dtype[0] in "iu" else FLOATS).astype(dtype)
     path = tmp_path / f"d.{suffix}"
     write_depth_file(path, values)
@@ -83,13 +83,13 @@ def test_files_of_other_programs_are_read_exactly(tmp_path):
         (("R", "G", "B", "scene.Z"), "scene.Z"), (("R", "depth.V", "left.depth"), "left.depth"),
     ],
 )  # fmt: skip
-def test_of_an_openexr_file_the_depth_channel_is_taken(tmp_path, names, taken):
+def test_depth_channel_of_an_openexr_file_is_read(tmp_path, names, taken):
     channels = {name: np.full((2, 3), float(number), np.float32) for number, name in enumerate(names, 1)}
     values = read_depth_file(exr(tmp_path / "d.exr", channels))
     np.testing.assert_array_equal(values, channels[taken])
 
 
-def test_an_openexr_file_without_a_depth_channel_is_refused_with_its_channels(tmp_path):
+def test_openexr_file_without_a_depth_channel_is_refused_with_its_channels(tmp_path):
     path = exr(tmp_path / "d.exr", {name: np.ones((2, 3), np.float32) for name in ("U", "V")})
     with pytest.raises(ValueError, match=r"d.exr: expected a channel named Z, Y or R, got U, V$"):
         read_depth_file(path)
@@ -97,7 +97,7 @@ def test_an_openexr_file_without_a_depth_channel_is_refused_with_its_channels(tm
 
 @pytest.mark.parametrize("suffix", ["png", "tiff", "npy", "npz", "pfm", "exr"])
 @pytest.mark.parametrize("share", [0.0, 0.5, 0.95])
-def test_a_truncated_file_is_refused_in_one_line_and_nothing_is_printed(tmp_path, suffix, share, capfd):
+def test_truncated_file_is_refused_in_one_line_and_nothing_is_printed(tmp_path, suffix, share, capfd):
     path = tmp_path / f"d.{suffix}"
     write_depth_file(
         path, np.random.default_rng(0).integers(1, 60000, (40, 50)).astype("u2" if suffix == "png" else "f4")
@@ -110,7 +110,7 @@ def test_a_truncated_file_is_refused_in_one_line_and_nothing_is_printed(tmp_path
     assert capfd.readouterr() == ("", "")
 
 
-def test_what_is_no_depth_map_is_refused(tmp_path):
+def test_file_that_is_no_depth_map_is_refused(tmp_path):
     cv2.imwrite(str(tmp_path / "eight.png"), np.ones((4, 4), np.uint8))
     cv2.imwrite(str(tmp_path / "colour.png"), np.ones((4, 4, 3), np.uint16))
     np.savez(tmp_path / "two.npz", a=FLOATS, b=FLOATS)
@@ -134,7 +134,7 @@ def test_what_is_no_depth_map_is_refused(tmp_path):
         assert str(tmp_path / name) in str(caught.value)
 
 
-def test_a_format_that_cannot_hold_the_values_is_refused(tmp_path):
+def test_format_that_cannot_hold_the_values_is_refused(tmp_path):
     assert can_hold(".tif", np.dtype("float32"))
     assert not can_hold(".png", np.dtype("float32"))
     with pytest.raises(ValueError, match=r"d.png: expected uint16 values, got float32"):

@@ -33,7 +33,7 @@ def guess(middle, dtype):
         (1500.0, "f4", 1e-3, "millimetres"),
     ],
 )
-def test_the_unit_is_told_from_type_and_median_and_said(middle, dtype, unit, word):
+def test_unit_is_guessed_from_type_and_median_and_reported(middle, dtype, unit, word):
     if word is None:
         with pytest.raises(ValueError, match="no usual unit makes its median of 4 a distance; give one"):
             guess(middle, dtype)
@@ -44,7 +44,7 @@ def test_the_unit_is_told_from_type_and_median_and_said(middle, dtype, unit, wor
     assert facts[0].detail
 
 
-def test_depth_too_far_too_near_or_too_sparse_for_a_depth_camera_is_pointed_out():
+def test_depth_too_far_too_near_or_too_sparse_is_pointed_out():
     assert any("1/5000" in fact.text for fact in guess(12_000, "u2")[1])
     assert not any("1/5000" in fact.text for fact in guess(9_000, "u2")[1])
     sparse = np.arange(9).reshape(3, 3) > 2
@@ -56,12 +56,12 @@ def test_depth_too_far_too_near_or_too_sparse_for_a_depth_camera_is_pointed_out(
 @pytest.mark.parametrize(
     ("text", "unit"), [("m", 1), ("cm", 0.01), ("mm", 0.001), ("0.0002", 0.0002), ("1/5000", 2e-4)]
 )
-def test_a_unit_is_a_name_a_number_or_a_fraction(text, unit):
+def test_unit_is_a_name_a_number_or_a_fraction(text, unit):
     assert parse_unit(text) == pytest.approx(unit)
 
 
 @pytest.mark.parametrize("text", ["inch", "", "0", "-1", "1/0", "nan", "inf", "1/2/3"])
-def test_another_unit_is_refused(text):
+def test_unknown_unit_is_refused(text):
     with pytest.raises(ValueError, match="--depth-unit: expected m, cm, mm or metres per value"):
         parse_unit(text)
 
@@ -83,7 +83,7 @@ def test_zeros_and_the_largest_whole_number_are_holes():
         ([1, -1, -2, 3], None, math.nan), ([1, 2, 3, 4], None, math.nan), ([1, -1, 2, 0], -1.0, -1.0),
     ],
 )  # fmt: skip
-def test_floats_have_holes_where_they_are_no_distance_and_the_commonest_mark_is_kept(values, hole_value, mark):
+def test_invalid_floats_are_holes_and_the_commonest_mark_is_kept(values, hole_value, mark):
     array = np.array([values], "f4")
     holes, found, _ = find_holes(array, hole_value)
     np.testing.assert_array_equal(holes, ~(np.isfinite(array) & (array > 0)))
@@ -99,7 +99,7 @@ def test_floats_have_holes_where_they_are_no_distance_and_the_commonest_mark_is_
         Encoding(".pfm", "float32", 1.0, math.inf, "disparity"),
     ],
 )
-def test_a_stored_map_comes_back_value_by_value(encoding):
+def test_stored_map_round_trips_value_by_value(encoding):
     stored = np.random.default_rng(1).integers(300, 5000, (3, 4)).astype(encoding.dtype)
     holes = np.zeros((3, 4), bool)
     holes[1, 2] = True
@@ -113,7 +113,7 @@ def test_a_stored_map_comes_back_value_by_value(encoding):
         np.testing.assert_array_equal(again, stored)
 
 
-def test_range_types_are_those_of_the_closed_forms():
+def test_range_types_equal_their_closed_forms():
     values, none = np.full((3, 4), 2.0), np.zeros((3, 4), bool)
     along_ray = decode(values, none, Encoding(".npy", "float64", 1.0, math.nan, "perspective"), CAMERA)
     assert float(along_ray[0, 0, 3]) == pytest.approx(2 / math.sqrt(1 + (2 / 5) ** 2 + (1.5 / 6) ** 2))
@@ -121,7 +121,7 @@ def test_range_types_are_those_of_the_closed_forms():
     assert float(disparity[0, 0, 0]) == pytest.approx(0.1 * 5 / 2)
 
 
-def test_what_16_bits_of_a_millimetre_cannot_hold_becomes_a_hole_and_is_counted():
+def test_values_beyond_16_bits_of_a_millimetre_become_counted_holes():
     depth = torch.tensor([[[65.534, 65.6, 0.0001, math.nan], [1.0004, 1.0006, 2, 3], [1, 1, 1, 1]]])
     values, lost = encode(depth, Encoding(".png", "uint16", 1e-3, 0.0, "orthogonal"), CAMERA)
     assert lost == 2

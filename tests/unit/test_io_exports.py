@@ -47,7 +47,7 @@ def read(path):
     return picture if picture.ndim == 2 else picture[..., [2, 1, 0, *range(3, picture.shape[2])]]
 
 
-def test_renderings_are_the_protocol_s_in_eight_bits(tmp_path):
+def test_renderings_are_those_of_the_protocol_in_eight_bits(tmp_path):
     paths = write_renderings(tmp_path / "new", bumpy(), CAMERA)
     assert [path.name for path in paths] == ["e1.png", "e2.png", "e3.png", "e4.png"]
     expected = render(depth_to_normals(bumpy().double()[None], CAMERA.rays()[None]))[0]
@@ -81,18 +81,18 @@ def test_holes_are_transparent(tmp_path):
         np.testing.assert_array_equal(picture[..., 3] == 0, transparent)
 
 
-def test_a_wall_s_normal_map_is_the_usual_light_blue(tmp_path):
+def test_normal_map_of_a_wall_is_light_blue(tmp_path):
     write_normals(tmp_path / "n.png", wall(), CAMERA)
     assert (read(tmp_path / "n.png") == NORMAL_OF_A_WALL).all()
 
 
 @pytest.mark.parametrize(("axis", "colour"), [(0, [218, 128, 218]), (1, [128, 37, 218])])
-def test_normals_to_the_right_are_red_and_downward_lack_green(tmp_path, axis, colour):
+def test_normal_map_has_red_right_and_no_green_downward(tmp_path, axis, colour):
     write_normals(tmp_path / "n.png", leaning(axis), CAMERA)
     np.testing.assert_allclose(read(tmp_path / "n.png").reshape(-1, 3), [colour] * (18 * 24), atol=1)
 
 
-def test_a_cloud_has_every_known_pixel_with_its_colour(tmp_path):
+def test_cloud_has_every_valid_pixel_with_its_colour(tmp_path):
     depth = bumpy()
     depth[0, 3] = torch.nan
     assert write_cloud(tmp_path / "c.ply", photo(), depth, CAMERA) == 17 * 24
@@ -103,7 +103,7 @@ def test_a_cloud_has_every_known_pixel_with_its_colour(tmp_path):
     np.testing.assert_allclose(cloud.colors[:, :3], 255 * photo().flatten(1).T[kept], atol=0.51)
 
 
-def test_the_ply_header_says_what_the_axes_are_and_the_normals_face_the_camera(tmp_path):
+def test_ply_header_describes_the_axes_and_normals_face_the_camera(tmp_path):
     write_cloud(tmp_path / "c.ply", photo(), wall(), CAMERA)
     header, _, content = (tmp_path / "c.ply").read_bytes().partition(b"end_header\n")
     assert b"comment camera frame: x right, y down, z forward; metres" in header
@@ -113,7 +113,7 @@ def test_the_ply_header_says_what_the_axes_are_and_the_normals_face_the_camera(t
     )
 
 
-def test_a_ply_mesh_is_read_back_with_its_faces(tmp_path):
+def test_ply_mesh_is_read_back_with_its_faces(tmp_path):
     mesh = write_mesh(tmp_path / "m.ply", photo(), bumpy(), CAMERA)
     again = trimesh.load(tmp_path / "m.ply", process=False)
     np.testing.assert_array_equal(again.vertices, mesh.vertices)
@@ -121,7 +121,7 @@ def test_a_ply_mesh_is_read_back_with_its_faces(tmp_path):
     np.testing.assert_allclose(again.visual.vertex_colors[:, :3], 255 * photo().flatten(1).T, atol=0.51)
 
 
-def test_a_glb_mesh_is_y_up_looks_along_minus_z_and_wears_the_photo(tmp_path):
+def test_glb_mesh_is_y_up_looks_along_minus_z_and_has_the_photo_as_texture(tmp_path):
     mesh = write_mesh([tmp_path / "m.glb"], photo(), bumpy(), CAMERA)
     [again] = trimesh.load(tmp_path / "m.glb", process=False).geometry.values()
     np.testing.assert_allclose(again.vertices, mesh.vertices * np.array([1, -1, -1]), rtol=1e-6)
@@ -134,7 +134,7 @@ def test_a_glb_mesh_is_y_up_looks_along_minus_z_and_wears_the_photo(tmp_path):
     assert (material.metallicFactor, material.roughnessFactor, material.doubleSided) == (0, 1, True)
 
 
-def test_a_large_photo_becomes_a_texture_that_viewers_take(tmp_path):
+def test_large_photo_becomes_a_texture_of_a_supported_size(tmp_path):
     picture = np.zeros((1, 5000, 3), np.uint8)
     picture[:, 2500:] = 200
     points = np.array([[0, 0, 1], [1, 0, 1], [0, 1, 1.0]])
@@ -155,13 +155,13 @@ def test_meshes_are_cut_at_steps_and_thinned(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["m.obj", "m"])
-def test_an_unknown_kind_of_mesh_is_refused_before_anything_is_written(tmp_path, name):
+def test_unknown_mesh_format_is_refused_before_anything_is_written(tmp_path, name):
     with pytest.raises(ValueError, match=r"m.*: expected a mesh file, .ply or .glb, got"):
         write_mesh([tmp_path / "a.ply", tmp_path / name], photo(), wall(), CAMERA)
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_map_without_two_neighbours_is_refused_and_an_older_file_is_kept(tmp_path):
+def test_map_without_two_neighbours_is_refused_and_an_older_file_is_kept(tmp_path):
     depth = torch.full_like(wall(), torch.nan)
     depth[0, 3, 3] = 2
     (tmp_path / "m.glb").write_text("old")
@@ -183,7 +183,7 @@ def drawn(monkeypatch):
 @pytest.mark.parametrize(
     ("size", "coarse"), [((18, 24), (5, 6)), ((18, 24), (18, 24)), ((9, 60), (3, 20)), ((60, 9), (15, 2))]
 )
-def test_a_before_after_picture_is_at_most_2400_pixels_wide(tmp_path, drawn, size, coarse):
+def test_before_after_picture_is_at_most_2400_pixels_wide(tmp_path, drawn, size, coarse):
     camera = Camera(size[1], size[0], 30, 30, size[1] / 2, size[0] / 2)
     write_before_after(tmp_path, photo(camera), bumpy(camera.rescale(*coarse[::-1])), bumpy(camera), camera, "t")
     [(figure, dpi)] = drawn
@@ -193,7 +193,7 @@ def test_a_before_after_picture_is_at_most_2400_pixels_wide(tmp_path, drawn, siz
     assert height / width == pytest.approx(size[0] / size[1])
 
 
-def test_a_before_after_picture_is_written_with_any_title_and_holes(tmp_path):
+def test_before_after_picture_is_written_with_any_title_and_holes(tmp_path):
     depth = bumpy()
     depth[0, 1, 2] = torch.nan
     write_before_after(tmp_path / "b.png", photo(), bumpy(CAMERA.rescale(6, 5)), depth, CAMERA, "a_b $c$ {} \u65e5")
@@ -201,7 +201,7 @@ def test_a_before_after_picture_is_written_with_any_title_and_holes(tmp_path):
     assert read(tmp_path / "b.png").shape[1] == 2388
 
 
-def test_the_detail_of_a_before_after_picture_is_where_the_surface_changed(tmp_path, drawn):
+def test_detail_of_a_before_after_picture_is_where_the_surface_changed(tmp_path, drawn):
     depth = wall()
     depth[0, 10:13, 15:19] += 0.05 * torch.rand(3, 4, generator=torch.Generator().manual_seed(1))
     write_before_after(tmp_path / "b.png", photo(), wall(), depth, CAMERA, "t")

@@ -41,7 +41,7 @@ def texts(picture):
     return [fact.text for fact in picture.facts]
 
 
-def test_the_photo_is_in_0_to_1_and_depth_in_metres_with_nan_in_holes(make):
+def test_photo_is_in_0_to_1_and_depth_in_metres_with_nan_in_holes(make):
     picture = read(make(np.array([[0, 1000], [2500, 65535]] * 3, np.uint16).repeat(4, 1), "depth.png"))
     assert torch.equal(picture.rgb, torch.full((3, 12, 16), 0.2))
     expected = torch.tensor([[torch.nan, 1.0], [2.5, torch.nan]] * 3).repeat_interleave(4, 1)[None]
@@ -55,22 +55,20 @@ def test_the_photo_is_in_0_to_1_and_depth_in_metres_with_nan_in_holes(make):
         (None, {}, None, 2.0),
     ],
 )  # fmt: skip
-def test_the_user_s_unit_goes_before_the_camera_file_s_and_that_before_the_layout_s(
-    make, given, entries, layout, metres
-):
+def test_unit_is_the_users_then_the_camera_files_then_the_layouts(make, given, entries, layout, metres):
     pair = make(np.full((3, 4), 2000, np.uint16), **entries)
     picture = read(Pair(pair.name, pair.rgb, pair.depth, pair.camera, unit=layout), unit=given)
     assert float(picture.coarse[0, 0, 0]) == pytest.approx(metres)
 
 
-def test_maps_beside_each_other_have_the_unit_of_the_first(make):
+def test_maps_of_a_folder_have_the_unit_of_the_first(make):
     units = {}
     assert float(read(make(np.full((3, 4), 2.0)), units).coarse[0, 0, 0]) == 2
     assert float(read(make(np.full((3, 4), 300.0)), units).coarse[0, 0, 0]) == 300
     assert float(read(make(np.full((3, 4), 300.0))).coarse[0, 0, 0]) == pytest.approx(0.3)
 
 
-def test_the_camera_file_tells_range_type_and_hole_value(make):
+def test_camera_file_sets_range_type_and_hole_value(make):
     pair = make(np.array([[2.0, 9.0], [2.0, 2.0]] * 3).repeat(4, 1), range_type="perspective", hole_value=9)
     picture = read(pair)
     corner = Camera(**OWN).rescale(8, 6).ray_lengths()[0, 0]
@@ -81,7 +79,7 @@ def test_the_camera_file_tells_range_type_and_hole_value(make):
     assert float(read(pair, range_type="orthogonal").coarse[0, 0, 0]) == 2
 
 
-def test_a_camera_that_the_user_gives_goes_before_the_one_beside_the_pictures(make):
+def test_camera_of_the_user_overrides_the_one_beside_the_pictures(make):
     pair = make(np.full((3, 4), 2.0))
     assert read(pair).camera.fx != 20
     pair = make(np.full((3, 4), 2.0), baseline=0.3)
@@ -92,7 +90,7 @@ def test_a_camera_that_the_user_gives_goes_before_the_one_beside_the_pictures(ma
     )
 
 
-def test_of_a_photo_that_is_no_multiple_the_part_that_a_coarse_map_covers_is_taken(make):
+def test_photo_is_cropped_to_the_part_covered_by_the_low_resolution_map(make):
     pair = make(np.full((3, 4), 2.0), "depth_lr4.npy", (14, 17), {**OWN, "width": 17, "height": 14})
     picture = read(Pair(pair.name, pair.rgb, pair.depth, pair.camera, factor=4))
     assert tuple(picture.rgb.shape) == (3, 12, 16)
@@ -100,7 +98,7 @@ def test_of_a_photo_that_is_no_multiple_the_part_that_a_coarse_map_covers_is_tak
     assert "the photo is cut to the part that the depth map covers" in texts(picture)
 
 
-def test_disparity_without_a_baseline_or_above_0_is_refused(make):
+def test_disparity_without_a_baseline_or_a_positive_value_is_refused(make):
     pair = make(np.full((3, 4), 2.0), "disparity.npy")
     with pytest.raises(
         ValueError, match=r"disparity.npy: disparities need the distance between the two cameras: --baseline"

@@ -42,7 +42,7 @@ LAYOUTS = {
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
-def test_the_pairs_of_a_folder_are_found_in_order(tmp_path, layout):
+def test_pairs_of_a_folder_are_found_in_order(tmp_path, layout):
     names = LAYOUTS[layout]
     found = pairs_of_folder(touch(tmp_path, *names))
     assert pairs(found, tmp_path) == [names[:2], names[2:]]
@@ -50,7 +50,7 @@ def test_the_pairs_of_a_folder_are_found_in_order(tmp_path, layout):
     assert len({pair.name for pair in found.pairs}) == 2
 
 
-def test_lists_of_tum_are_matched_by_time_within_20_ms_and_count_in_fifths_of_a_millimetre(tmp_path):
+def test_tum_lists_are_matched_by_time_within_20_ms_in_fifths_of_a_millimetre(tmp_path):
     (tmp_path / "rgb.txt").write_text(
         "# color images\n# timestamp filename\n10.00 rgb/a.png\n10.03 rgb/b.png\n11 rgb/c.png\n"
     )
@@ -61,14 +61,14 @@ def test_lists_of_tum_are_matched_by_time_within_20_ms_and_count_in_fifths_of_a_
     assert {pair.unit for pair in found.pairs} == {1 / 5000}
 
 
-def test_a_damaged_list_of_tum_is_refused_by_file_and_line(tmp_path):
+def test_damaged_tum_list_is_refused_by_file_and_line(tmp_path):
     (tmp_path / "rgb.txt").write_text("10.00\n")
     (tmp_path / "depth.txt").write_text("")
     with pytest.raises(ValueError, match=r"rgb.txt: line 1: expected a time and a file name, got '10.00'$"):
         pairs_of_folder(tmp_path)
 
 
-def test_the_nearer_of_two_times_is_taken_and_no_depth_map_twice(tmp_path):
+def test_nearest_time_is_matched_and_no_depth_map_twice(tmp_path):
     touch(
         tmp_path,
         "rgb/1700000000.000.png",
@@ -87,7 +87,7 @@ def test_pictures_without_a_partner_are_named(tmp_path):
     assert [path.name for path in found.alone] == ["1.png", "3.png", "9.png"]
 
 
-def test_masks_infrared_and_confidence_are_no_pictures_of_a_pair(tmp_path):
+def test_masks_infrared_and_confidence_are_not_paired(tmp_path):
     found = pairs_of_folder(
         touch(tmp_path, "a.jpg", "a_depth.png", "a_ir.png", "a_confidence.png", "a_mask.png", "a.txt")
     )
@@ -95,7 +95,7 @@ def test_masks_infrared_and_confidence_are_no_pictures_of_a_pair(tmp_path):
     assert found.alone == ()
 
 
-def test_files_whose_names_do_not_tell_are_told_apart_by_what_they_hold(tmp_path):
+def test_ambiguous_file_names_are_resolved_by_content(tmp_path):
     for number in range(2):
         cv2.imwrite(str(tmp_path / f"view{number}.png"), np.ones((4, 4), np.uint16))
         cv2.imwrite(str(tmp_path / f"view{number}.jpg"), np.ones((4, 4, 3), np.uint8))
@@ -103,7 +103,7 @@ def test_files_whose_names_do_not_tell_are_told_apart_by_what_they_hold(tmp_path
     assert pairs(found, tmp_path) == [("view0.jpg", "view0.png"), ("view1.jpg", "view1.png")]
 
 
-def test_a_scene_of_dsr_gives_its_coarse_map_its_camera_and_its_mask(tmp_path):
+def test_dsr_scene_has_its_low_resolution_map_camera_and_mask(tmp_path):
     touch(tmp_path, "a/rgb.png", "a/camera.json", "a/depth.npy", "a/depth_lr8.npy", "a/disparity_lr4.npy", "a/mask.png")
     touch(tmp_path, "b/rgb.jpg", "b/camera.json", "b/disparity.pfm", "b/mask.png")
     first, second = pairs_of_folder(tmp_path).pairs
@@ -113,7 +113,7 @@ def test_a_scene_of_dsr_gives_its_coarse_map_its_camera_and_its_mask(tmp_path):
     assert pairs_of_folder(tmp_path / "b").pairs[0].name == "b"
 
 
-def test_folders_in_a_folder_are_looked_through_but_not_that_of_the_results(tmp_path):
+def test_subfolders_are_searched_but_not_the_results(tmp_path):
     touch(tmp_path, "x/rgb/1.png", "x/depth/1.png", "x/intrinsics.txt", "y/deep/color_1.png", "y/deep/depth_1.png")
     touch(tmp_path, "out/color_7.png", "out/depth_7.png", "camera.json")
     found = pairs_of_folder(tmp_path, tmp_path / "out")
@@ -125,7 +125,7 @@ def test_folders_in_a_folder_are_looked_through_but_not_that_of_the_results(tmp_
     assert len(pairs_of_folder(tmp_path).pairs) == 3
 
 
-def test_of_several_folders_of_depth_one_is_taken_and_the_others_are_named(tmp_path):
+def test_one_of_several_depth_folders_is_used_and_the_others_are_named(tmp_path):
     touch(tmp_path, "image/0001.jpg", "depth/0000001-000000000001.png", "depth_bfx/0001.png", "intrinsics.txt")
     found = pairs_of_folder(tmp_path)
     assert pairs(found, tmp_path) == [("image/0001.jpg", "depth/0000001-000000000001.png")]
@@ -135,14 +135,14 @@ def test_of_several_folders_of_depth_one_is_taken_and_the_others_are_named(tmp_p
 @pytest.mark.parametrize(
     "names", [(), ("a.jpg", "b.jpg"), ("color_1.png", "color_2.png", "depth_3.png", "depth_4.png")]
 )
-def test_a_folder_without_pairs_is_refused(tmp_path, names):
+def test_folder_without_pairs_is_refused(tmp_path, names):
     with pytest.raises(ValueError, match="expected photos and depth maps that belong together, found no pair"):
         pairs_of_folder(touch(tmp_path, *names))
     with pytest.raises(ValueError, match="expected a folder of photos and depth maps, there is none"):
         pairs_of_folder(tmp_path / "none")
 
 
-def test_lists_of_files_are_paired_in_order_under_names_of_their_own(tmp_path):
+def test_file_lists_are_paired_in_order_with_distinct_names(tmp_path):
     touch(tmp_path, "a/p.jpg", "b/p.jpg", "q.jpg", "1.png", "2.png", "3.png", "camera.json")
     photos, depths = (
         [tmp_path / name for name in names] for names in (("a/p.jpg", "b/p.jpg", "q.jpg"), ("3.png", "1.png", "2.png"))
@@ -157,7 +157,7 @@ def test_lists_of_files_are_paired_in_order_under_names_of_their_own(tmp_path):
     assert [pair.name for pair in pairs_of_lists(photos[:1] * 2, depths[:2]).pairs] == ["a_p", "a_p_2"]
 
 
-def test_lists_that_cannot_be_meant_are_refused(tmp_path):
+def test_inconsistent_lists_are_refused(tmp_path):
     touch(tmp_path, "rgb/1.jpg", "depth/2.png", "rgb/3.jpg", "depth/4.png")
     one, two = tmp_path / "rgb" / "1.jpg", tmp_path / "depth" / "2.png"
     for photos, depths, masks, message in [
@@ -173,7 +173,7 @@ def test_lists_that_cannot_be_meant_are_refused(tmp_path):
             pairs_of_lists(photos, depths, masks)
 
 
-def test_names_are_read_as_words_and_numbers(tmp_path):
+def test_names_are_split_into_words_and_numbers(tmp_path):
     assert words_of("frame-000012.color") == ["frame", "12", "color"]
     assert words_of("DepthAligned_0012") == ["depth", "aligned", "12"]
     assert key_of(tmp_path / "rgbImage_0007.png") == key_of(tmp_path / "depth-raw-7.png") == ("7",)

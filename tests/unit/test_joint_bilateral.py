@@ -51,7 +51,7 @@ def _by_loops(sample: DepthSample, radius: int, sigma_space: float, sigma_colour
 
 @pytest.mark.parametrize(("radius", "sigma_space", "sigma_colour"), [(1, 0.5, 0.1), (2, 1.0, 0.3)])
 @pytest.mark.parametrize("holes", [False, True])
-def test_it_is_the_mean_over_neighbours_weighed_by_distance_and_colour(
+def test_joint_bilateral_is_the_mean_weighted_by_distance_and_colour(
     radius: int, sigma_space: float, sigma_colour: float, holes: bool
 ) -> None:
     random = np.random.default_rng(0)
@@ -65,7 +65,7 @@ def test_it_is_the_mean_over_neighbours_weighed_by_distance_and_colour(
     np.testing.assert_allclose(_disparity(sample, method(sample)), expected, rtol=1e-10)
 
 
-def test_under_a_photo_of_one_colour_it_is_a_gaussian_mean() -> None:
+def test_joint_bilateral_under_a_constant_photo_is_a_gaussian_mean() -> None:
     """Of an impulse at the LR pixel (4, 4), the answer at a HR pixel is that pixel's weight."""
     disparity = torch.full((36, 36), 5.0).double()
     disparity[16:20, 16:20] = 6.0
@@ -79,7 +79,7 @@ def test_under_a_photo_of_one_colour_it_is_a_gaussian_mean() -> None:
 
 
 @pytest.mark.parametrize("slopes", [True, False])
-def test_a_step_along_an_edge_of_the_photo_stays_sharp_within_a_coarse_pixel(slopes: bool) -> None:
+def test_step_along_a_photo_edge_stays_sharp_within_a_low_resolution_pixel(slopes: bool) -> None:
     columns = torch.arange(64).expand(48, 64)
     photo = torch.where(columns < 32, 0.2, 0.8).double().expand(3, 48, 64).contiguous()
     truth = torch.where(columns < 32, 5.0, 9.0).double()
@@ -90,7 +90,7 @@ def test_a_step_along_an_edge_of_the_photo_stays_sharp_within_a_coarse_pixel(slo
     assert bilinear.max() > 1
 
 
-def test_a_colour_unlike_all_around_takes_the_most_similar_neighbour() -> None:
+def test_colour_unlike_its_surroundings_takes_the_most_similar_neighbour() -> None:
     photo = torch.zeros(3, 16, 16).double()
     photo[:, :, 8:] = 0.3
     photo[:, 8, 5] = 1.0
@@ -102,6 +102,6 @@ def test_a_colour_unlike_all_around_takes_the_most_similar_neighbour() -> None:
 
 
 @pytest.mark.parametrize("name", ["radius", "sigma_space", "sigma_colour"])
-def test_a_parameter_that_is_not_positive_is_refused(name: str) -> None:
+def test_parameter_that_is_not_positive_is_refused(name: str) -> None:
     with pytest.raises(ValueError, match=rf"^{name}: expected a positive number for joint bilateral upsampling"):
         JointBilateral(**{name: -1})

@@ -78,24 +78,24 @@ def _slow_lap1(x: np.ndarray, y: np.ndarray, levels: int) -> float:
 
 @pytest.mark.parametrize("levels", [1, 2, 3])
 @pytest.mark.parametrize("size", [(12, 12), (13, 18), (16, 15)])
-def test_lap1_is_the_slow_pyramid(size: tuple[int, int], levels: int) -> None:
+def test_lap1_equals_a_plain_pyramid(size: tuple[int, int], levels: int) -> None:
     x, y = _map(0, *size), _map(1, *size)
     expected = _slow_lap1(x[0, 0].numpy(), y[0, 0].numpy(), levels)
     assert lap1(x, y, levels=levels).item() == pytest.approx(expected, rel=1e-12)
 
 
-def test_lap1_with_holes_weighs_pixels_by_the_share_that_is_known() -> None:
+def test_lap1_with_holes_weights_pixels_by_their_valid_fraction() -> None:
     x, y = _with_holes(_map(0), 2), _with_holes(_map(1), 3)
     expected = _slow_lap1(x[0, 0].numpy(), y[0, 0].numpy(), 3)
     assert lap1(x, y).item() == pytest.approx(expected, rel=1e-12)
 
 
-def test_lap1_has_three_levels_unless_told_otherwise() -> None:
+def test_lap1_defaults_to_three_levels() -> None:
     x, y = _map(0), _map(1)
     assert lap1(x, y).item() == lap1(x, y, levels=3).item() != lap1(x, y, levels=2).item()
 
 
-def test_where_sizes_are_even_a_level_s_mean_times_the_pixels_is_its_weighted_sum() -> None:
+def test_lap1_level_mean_times_the_pixels_is_its_weighted_sum_at_even_sizes() -> None:
     """The sum over levels of 4^j |L^j|_1, as the paper writes it, divided by the pixels."""
     difference = (_map(0, 16, 24) - _map(1, 16, 24))[0, 0].numpy()
     total = 0.0
@@ -108,7 +108,7 @@ def test_where_sizes_are_even_a_level_s_mean_times_the_pixels_is_its_weighted_su
 
 
 @pytest.mark.parametrize("holes", [0.0, 0.3])
-def test_l1_and_mse_are_plain_means_over_what_is_known(holes: float) -> None:
+def test_l1_and_mse_are_means_over_valid_pixels(holes: float) -> None:
     x, y = _with_holes(_map(0), 2, holes), _map(1)
     difference = (x - y).numpy()
     assert l1(x, y).item() == pytest.approx(np.nanmean(np.abs(difference)), rel=1e-13)
@@ -117,7 +117,7 @@ def test_l1_and_mse_are_plain_means_over_what_is_known(holes: float) -> None:
 
 @pytest.mark.parametrize("c", [-2.5, 0.1, 3.0])
 @pytest.mark.parametrize("size", [(12, 12), (17, 14)])
-def test_a_constant_offset_gives_its_absolute_value(size: tuple[int, int], c: float) -> None:
+def test_constant_offset_gives_its_absolute_value(size: tuple[int, int], c: float) -> None:
     x = _map(0, *size)
     assert lap1(x + c, x).item() == pytest.approx(abs(c), rel=1e-13)
     assert l1(x + c, x).item() == pytest.approx(abs(c), rel=1e-13)
@@ -129,7 +129,7 @@ def test_lap1_with_one_level_is_l1() -> None:
     assert lap1(x, y, levels=1).item() == pytest.approx(l1(x, y).item(), rel=1e-14)
 
 
-def test_a_ripple_weighs_more_in_lap1_than_in_l1_by_its_detail_alone() -> None:
+def test_ripple_costs_more_in_lap1_than_in_l1_by_its_detail() -> None:
     """The finest level has nearly all of a checkerboard, the coarser ones next to nothing."""
     rows, columns = np.indices((32, 32))
     ripple = torch.from_numpy((-1.0) ** (rows + columns))[None, None]
@@ -137,7 +137,7 @@ def test_a_ripple_weighs_more_in_lap1_than_in_l1_by_its_detail_alone() -> None:
 
 
 @pytest.mark.parametrize("name", LOSSES)
-def test_a_loss_is_symmetric_zero_at_the_target_and_positive_elsewhere(name: str) -> None:
+def test_losses_are_symmetric_zero_at_the_target_and_positive_elsewhere(name: str) -> None:
     x, y = _with_holes(_map(0), 2), _with_holes(_map(1), 3)
     loss = LOSSES[name]
     assert loss(x, y).item() == pytest.approx(loss(y, x).item(), rel=1e-14)
@@ -147,7 +147,7 @@ def test_a_loss_is_symmetric_zero_at_the_target_and_positive_elsewhere(name: str
 
 @pytest.mark.parametrize("name", LOSSES)
 @pytest.mark.parametrize("garbage", [1e30, -7.0, math.inf, math.nan])
-def test_what_lies_under_the_mask_or_in_a_hole_never_matters(name: str, garbage: float) -> None:
+def test_masked_and_missing_pixels_do_not_matter(name: str, garbage: float) -> None:
     x, y = _map(0), _map(1)
     mask = torch.from_numpy(np.random.default_rng(4).random((1, 1, 13, 18)) < 0.7)
     expected = LOSSES[name](x, y, mask).item()
@@ -158,7 +158,7 @@ def test_what_lies_under_the_mask_or_in_a_hole_never_matters(name: str, garbage:
 
 
 @pytest.mark.parametrize("name", LOSSES)
-def test_an_image_without_a_known_pixel_gets_nan_and_leaves_the_others_alone(name: str) -> None:
+def test_image_without_a_valid_pixel_has_loss_nan_and_leaves_the_others_unchanged(name: str) -> None:
     x, y = _map(0, batch=2), _map(1, batch=2)
     y[0] = torch.nan
     values = LOSSES[name](x, y)
@@ -168,7 +168,7 @@ def test_an_image_without_a_known_pixel_gets_nan_and_leaves_the_others_alone(nam
 
 
 @pytest.mark.parametrize("name", LOSSES)
-def test_gradients_are_free_of_nan_and_zero_in_holes_even_where_nothing_is_known(name: str) -> None:
+def test_gradients_are_finite_and_zero_in_holes(name: str) -> None:
     x, y = _map(0, batch=2).requires_grad_(), _with_holes(_map(1, batch=2), 3)
     y[0] = torch.nan
     LOSSES[name](x, y).nanmean().backward()
@@ -179,7 +179,7 @@ def test_gradients_are_free_of_nan_and_zero_in_holes_even_where_nothing_is_known
 
 
 @pytest.mark.parametrize("name", LOSSES)
-def test_a_batch_of_two_is_two_singles(name: str) -> None:
+def test_batch_of_two_equals_two_single_images(name: str) -> None:
     x, y = _with_holes(_map(0, batch=2), 2), _map(1, batch=2)
     mask = torch.from_numpy(np.random.default_rng(4).random((2, 1, 13, 18)) < 0.7)
     singles = [LOSSES[name](x[i : i + 1], y[i : i + 1], mask[i : i + 1]) for i in range(2)]
@@ -188,7 +188,7 @@ def test_a_batch_of_two_is_two_singles(name: str) -> None:
 
 @pytest.mark.parametrize("name", LOSSES)
 @pytest.mark.parametrize("holes", [0.0, 0.25])
-def test_a_loss_has_the_gradient_of_its_value(name: str, holes: float) -> None:
+def test_gradient_of_a_loss_is_that_of_its_value(name: str, holes: float) -> None:
     size = (12, 13) if name == "lap1" else (3, 4)
     x, y = _map(0, *size), _with_holes(_map(1, *size), 3, holes)
     assert torch.autograd.gradcheck(lambda x: LOSSES[name](x, y), x.requires_grad_())
@@ -196,11 +196,11 @@ def test_a_loss_has_the_gradient_of_its_value(name: str, holes: float) -> None:
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("name", LOSSES)
-def test_a_loss_keeps_the_precision(name: str, dtype: torch.dtype) -> None:
+def test_losses_keep_the_precision(name: str, dtype: torch.dtype) -> None:
     assert LOSSES[name](_map(0).to(dtype), _with_holes(_map(1), 2).to(dtype)).dtype == dtype
 
 
-def test_a_map_too_small_for_the_levels_is_refused() -> None:
+def test_map_too_small_for_the_levels_is_refused() -> None:
     with pytest.raises(ValueError, match=r"lap1: expected at least 12 pixels a side for 3 levels, got \(11, 18\)"):
         lap1(_map(0, 11), _map(1, 11))
     with pytest.raises(ValueError, match=r"lap1: expected at least 3 pixels a side for 0 levels"):
@@ -235,13 +235,13 @@ def _guess(batch: Batch) -> Tensor:
 
 @pytest.mark.parametrize("holes", [0.0, 0.15])
 @pytest.mark.parametrize("depth_loss", LOSSES)
-def test_the_objective_has_the_gradient_of_its_value(depth_loss: DepthLoss, holes: float) -> None:
+def test_gradient_of_the_objective_is_that_of_its_value(depth_loss: DepthLoss, holes: float) -> None:
     batch, objective = _batch(holes=holes), Objective(depth_loss, 0.7)
     assert torch.autograd.gradcheck(lambda guess: objective(guess, batch)["loss"], _guess(batch).requires_grad_())
 
 
 @pytest.mark.parametrize("holes", [0.0, 0.15])
-def test_the_objective_of_a_batch_is_the_mean_of_its_samples(holes: float) -> None:
+def test_objective_of_a_batch_is_the_mean_of_its_samples(holes: float) -> None:
     batch, objective = _batch(holes=holes), Objective("lap1", 0.7)
     guess = _guess(batch)
     singles = [
@@ -251,7 +251,7 @@ def test_the_objective_of_a_batch_is_the_mean_of_its_samples(holes: float) -> No
     assert objective(guess, batch)["loss"].item() == pytest.approx(sum(singles).item() / 2, rel=1e-13)
 
 
-def test_the_objective_gives_finite_gradients_at_the_truth_and_beyond_infinity() -> None:
+def test_objective_has_finite_gradients_at_the_truth_and_beyond_infinity() -> None:
     batch = _batch(holes=0.15)
     truth = (batch["bf"] / batch["depth"] - batch["doffs"]).nan_to_num(1.0)
     behind = truth.clone()

@@ -106,7 +106,7 @@ def _pair(*, seed: int = 0, holes: bool = False, size: tuple[int, int] = (36, 40
 
 
 @pytest.mark.parametrize(("name", "expected"), [("ex_p0", 0.7219), ("ex_p1", 0.1376)])
-def test_the_authors_example_pairs_have_the_published_distance(shared: Path, name: str, expected: float) -> None:
+def test_example_pairs_of_the_authors_have_the_published_distance(shared: Path, name: str, expected: float) -> None:
     def picture(stem: str) -> Tensor:
         with Image.open(shared / "lpips_example" / f"{stem}.png") as image:
             return torch.from_numpy(np.array(image.convert("RGB"))).permute(2, 0, 1)[None].float() / 127.5 - 1
@@ -117,12 +117,12 @@ def test_the_authors_example_pairs_have_the_published_distance(shared: Path, nam
 
 
 @pytest.mark.parametrize("size", [(31, 31), (40, 47), (64, 33)])
-def test_distance_is_that_of_alexnets_normalised_features(network: LPIPS, size: tuple[int, int]) -> None:
+def test_distance_equals_that_of_alexnets_normalised_features(network: LPIPS, size: tuple[int, int]) -> None:
     first, second = _images(1, size, 2), _images(2, size, 2)
     torch.testing.assert_close(network(first, second).double(), _reference(_trunk(), first, second), rtol=1e-4, atol=0)
 
 
-def test_masked_features_weigh_as_much_as_the_known_share_of_their_pixels(network: LPIPS) -> None:
+def test_masked_features_are_weighted_by_the_valid_fraction_of_their_pixels(network: LPIPS) -> None:
     first, second = _images(1, batch=2), _images(2, batch=2)
     mask = torch.rand(2, 1, 40, 47, generator=torch.Generator().manual_seed(3)) > 0.3
     mask[0, :, :20] = False
@@ -130,13 +130,13 @@ def test_masked_features_weigh_as_much_as_the_known_share_of_their_pixels(networ
     torch.testing.assert_close(network(first, second, mask).double(), expected, rtol=1e-4, atol=0)
 
 
-def test_a_fully_known_mask_is_no_mask(network: LPIPS) -> None:
+def test_full_mask_equals_no_mask(network: LPIPS) -> None:
     first, second = _images(1), _images(2)
     mask = torch.ones(1, 1, 40, 47, dtype=torch.bool)
     torch.testing.assert_close(network(first, second, mask), network(first, second), rtol=1e-6, atol=0)
 
 
-def test_a_mask_without_a_known_pixel_gives_nan(network: LPIPS) -> None:
+def test_mask_without_a_valid_pixel_gives_nan(network: LPIPS) -> None:
     assert bool(network(_images(1), _images(2), torch.zeros(1, 1, 40, 47, dtype=torch.bool)).isnan().all())
 
 
@@ -208,7 +208,7 @@ def test_depth_in_a_hole_does_not_matter(network: LPIPS) -> None:
     assert torch.equal(lpips_v(SurfacePair(noise, target, pair.rays), network), lpips_v(pair, network))
 
 
-def test_a_batch_of_complete_and_incomplete_pairs_is_each_by_itself(network: LPIPS) -> None:
+def test_batch_of_complete_and_incomplete_pairs_equals_single_pairs(network: LPIPS) -> None:
     pairs = [_pair(seed=1), _pair(seed=2, holes=True)]
     joined = SurfacePair(
         torch.cat([pair.prediction for pair in pairs]),
@@ -219,7 +219,7 @@ def test_a_batch_of_complete_and_incomplete_pairs_is_each_by_itself(network: LPI
     torch.testing.assert_close(lpips_v(joined, network), expected, rtol=1e-5, atol=0)
 
 
-def test_a_missing_or_misshapen_tensor_is_named() -> None:
+def test_missing_or_misshapen_tensor_is_refused_by_name() -> None:
     trunk = _trunk()
     del trunk["features.8.bias"]
     with pytest.raises(ValueError, match=r"features.8.bias: expected a tensor of shape \(256,\), got nothing"):
@@ -228,13 +228,13 @@ def test_a_missing_or_misshapen_tensor_is_named() -> None:
         LPIPS(_trunk() | {"features.0.weight": torch.zeros(64, 3, 7, 7)})
 
 
-def test_a_file_may_hold_more_than_the_features(tmp_path: Path, network: LPIPS) -> None:
+def test_weights_file_may_hold_more_than_the_features(tmp_path: Path, network: LPIPS) -> None:
     torch.save(_trunk() | {"classifier.1.weight": torch.zeros(3)}, tmp_path / "alexnet.pth")
     first, second = _images(1), _images(2)
     assert torch.equal(load_lpips(tmp_path / "alexnet.pth")(first, second), network(first, second))
 
 
-def test_building_the_network_draws_no_random_number() -> None:
+def test_network_construction_draws_no_random_number() -> None:
     trunk = _trunk()
     before = torch.get_rng_state()
     LPIPS(trunk)
@@ -265,7 +265,7 @@ def _damaged(kind: str, folder: Path) -> bytes:
 
 
 @pytest.mark.parametrize("kind", ["empty", "text", "cut", "list", "other", "trap"])
-def test_a_damaged_or_other_file_is_one_line_that_names_it(tmp_path: Path, kind: str) -> None:
+def test_damaged_or_foreign_weights_file_is_refused_in_one_line(tmp_path: Path, kind: str) -> None:
     path = tmp_path / "alexnet.pth"
     path.write_bytes(_damaged(kind, tmp_path))
     with pytest.raises(ValueError, match="expected the weights of torchvision's AlexNet: ") as caught:
@@ -287,21 +287,21 @@ def _unexpected(*_: Any, **__: Any) -> Any:
     raise AssertionError("nothing should be downloaded")
 
 
-def test_the_configured_file_comes_first(hub: Path, tmp_path: Path) -> None:
+def test_configured_weights_file_comes_first(hub: Path, tmp_path: Path) -> None:
     hub.mkdir(parents=True)
     (hub / TRUNK_FILE).touch()
     (tmp_path / "mine.pth").touch()
     assert find_trunk(tmp_path / "mine.pth") == tmp_path / "mine.pth"
 
 
-def test_a_configured_file_that_is_missing_is_not_replaced_by_another(hub: Path, tmp_path: Path) -> None:
+def test_missing_configured_weights_file_is_not_replaced_by_another(hub: Path, tmp_path: Path) -> None:
     hub.mkdir(parents=True)
     (hub / TRUNK_FILE).touch()
     with pytest.raises(FileNotFoundError, match=r"^expected a file, got .*mine.pth"):
         find_trunk(tmp_path / "mine.pth")
 
 
-def test_the_cached_file_comes_before_a_download(hub: Path) -> None:
+def test_cached_weights_file_comes_before_a_download(hub: Path) -> None:
     hub.mkdir(parents=True)
     (hub / TRUNK_FILE).touch()
     assert find_trunk(None) == hub / TRUNK_FILE
@@ -326,7 +326,7 @@ class _Response(io.BytesIO):
         return part
 
 
-def test_a_download_goes_into_the_cache(hub: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_download_goes_into_the_cache(hub: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     content, asked = b"weights", []
     monkeypatch.setattr(lpips, "TRUNK_HASH", hashlib.sha256(content).hexdigest()[:8])
 
@@ -352,7 +352,7 @@ FAILURES: dict[str, Exception | _Response] = {
 
 
 @pytest.mark.parametrize("kind", FAILURES)
-def test_a_failed_download_is_an_os_error_and_leaves_nothing(
+def test_failed_download_is_an_os_error_and_leaves_nothing(
     hub: Path, monkeypatch: pytest.MonkeyPatch, kind: str
 ) -> None:
     def respond(*_: Any, **__: Any) -> _Response:
@@ -369,6 +369,6 @@ def test_a_failed_download_is_an_os_error_and_leaves_nothing(
     assert socket.getdefaulttimeout() == before
 
 
-def test_the_trunk_is_the_official_file() -> None:
+def test_trunk_is_the_official_file() -> None:
     assert f"alexnet-owt-{TRUNK_HASH}.pth" == TRUNK_FILE
     assert f"https://download.pytorch.org/models/{TRUNK_FILE}" == TRUNK_URL

@@ -59,7 +59,7 @@ def lines_of(text, start):
     return [[cell.strip() for cell in line.strip("|").split(" | ")] for line in lines if line.startswith("|")]
 
 
-def test_markdown_has_means_spreads_ranks_missing_values_and_counts_of_scenes():
+def test_markdown_has_means_spreads_ranks_missing_values_and_scene_counts():
     head, _, *rows = lines_of(to_markdown(the_table()).split("###")[0], "##")
     assert head == ["scene", "method", "seeds", "RMSE_d (mm)", "DSSIM_v (1/1000)"]
     assert rows == [
@@ -75,7 +75,7 @@ def test_markdown_has_means_spreads_ranks_missing_values_and_counts_of_scenes():
     ]
 
 
-def test_markdown_has_the_paper_s_values_the_difference_and_the_ratio():
+def test_markdown_has_the_papers_values_the_difference_and_the_ratio():
     text = to_markdown(the_table())
     head, _, *rows = lines_of(text, "### ")
     assert head == ["scene", "method", "", "RMSE_d (mm)", "DSSIM_v (1/1000)"]
@@ -89,7 +89,7 @@ def test_markdown_has_the_paper_s_values_the_difference_and_the_ratio():
     assert "nan" not in text.casefold()
 
 
-def test_the_lines_of_a_markdown_table_are_equally_long():
+def test_markdown_table_lines_are_equally_long():
     for part in to_markdown(the_table()).split("\n\n"):
         assert len({len(line) for line in part.splitlines() if line.startswith("|")}) <= 1
     assert aligned(["a", "b"], [["long text", "1"]], 1).splitlines() == [
@@ -106,11 +106,11 @@ def test_the_lines_of_a_markdown_table_are_equally_long():
         ("<b>", "\\<b\\>"),
     ],
 )
-def test_markdown_shows_names_as_they_are(text, shown):
+def test_markdown_shows_names_unchanged(text, shown):
     assert escaped(text) == shown
 
 
-def test_csv_has_full_precision_the_paper_s_units_and_no_column_that_nobody_needs():
+def test_csv_has_full_precision_the_papers_units_and_no_empty_column():
     frame = pd.read_csv(io.StringIO(to_csv(the_table())))
     row = frame[(frame["scene"] == "lucy") & (frame["method"] == "DIP")].iloc[0]
     assert row["RMSE_d [mm]"] == 22
@@ -131,7 +131,7 @@ def test_csv_has_full_precision_the_paper_s_units_and_no_column_that_nobody_need
     assert not [name for name in alone if "spread" in name or "paper" in name]
 
 
-def test_the_answers_of_a_study_have_their_intervals_in_every_format():
+def test_study_answers_have_their_intervals_in_every_format():
     table = the_table(Results((run("A", {"lucy": 1.0}),)), study_of("A"))
     assert "61.5 [50.2, 71.0]" in to_markdown(table)
     assert "61.5 [50.2, 71.0]" in to_latex(table)
@@ -151,7 +151,7 @@ def test_latex_has_rules_units_marks_and_dashes():
     assert [text.count(f"\\{rule}rule") for rule in ("top", "mid", "bottom")] == [1, 3, 1]
 
 
-def test_the_other_latex_table_has_the_paper_s_values_in_parentheses():
+def test_second_latex_table_has_the_papers_values_in_parentheses():
     mine = run("Mine", {"lucy": 2.0})
     text = to_latex(the_table(Results((*results().runs, mine))), published=True)
     lines = [line.rstrip("\\ ").split(" & ") for line in text.splitlines() if " & " in line]
@@ -162,7 +162,7 @@ def test_the_other_latex_table_has_the_paper_s_values_in_parentheses():
     assert "b &" not in text  # the paper has no such scene
 
 
-def test_a_long_table_becomes_several_that_fit_on_a_page():
+def test_long_latex_table_is_split_to_fit_on_pages():
     scenes = {f"scene{number:02}": 1.0 for number in range(50)}
     text = to_latex(the_table(Results((run("A", scenes), run("B", scenes)))))
     parts = text.split("\\end{table}")[:-1]
@@ -172,11 +172,11 @@ def test_a_long_table_becomes_several_that_fit_on_a_page():
 
 
 @pytest.mark.parametrize(("text", "shown"), [("50%_&", "50\\%\\_\\&"), ("é", "é"), ("日本", "[U+65E5][U+672C]")])
-def test_latex_text_is_printed_as_it_is_or_named(text, shown):
+def test_latex_text_is_escaped_or_named(text, shown):
     assert latex_text(text) == shown
 
 
-def test_all_files_are_written_under_names_of_their_own(tmp_path):
+def test_table_files_have_distinct_names(tmp_path):
     paths = write_tables(tmp_path, results())
     assert sorted(path.name for path in tmp_path.iterdir()) == sorted(path.name for path in paths)
     assert {"all.md", "all.tex", "mine_x4_box.csv", "mine_x4_box_published.tex"} <= {path.name for path in paths}

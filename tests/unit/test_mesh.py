@@ -43,7 +43,7 @@ def spans(mesh, depth):
     return (z.max(axis=1) / z.min(axis=1)).max() - 1
 
 
-def test_a_wall_is_two_triangles_per_square_and_its_area_that_of_the_wall():
+def test_wall_mesh_has_two_triangles_per_square_and_the_area_of_the_wall():
     mesh = triangulate(wall(), CAMERA)
     assert len(mesh.vertices) == 40 * 30
     assert len(mesh.faces) == 2 * squares()
@@ -60,7 +60,7 @@ def test_vertices_are_the_back_projected_pixels():
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_faces_and_vertex_normals_look_at_the_camera(seed):
+def test_faces_and_vertex_normals_face_the_camera(seed):
     depth = 2 + 0.02 * torch.rand(1, 30, 40, generator=torch.Generator().manual_seed(seed))
     depth[0, 5:8, 5:8] = torch.nan
     mesh = triangulate(depth, CAMERA, largest_step=0.5)
@@ -69,7 +69,7 @@ def test_faces_and_vertex_normals_look_at_the_camera(seed):
     assert ((vertex_normals(mesh) * mesh.vertices).sum(axis=1) < 0).all()
 
 
-def test_a_floor_stays_whole_up_to_the_row_below_the_horizon():
+def test_floor_stays_whole_up_to_the_row_below_the_horizon():
     camera = Camera(20, 120, 400, 400, 9.5, 14.5)
     depth = floor(camera)
     assert float(depth[0, 15, 0] / depth[0, 16, 0]) == pytest.approx(3)  # the change that must not be cut
@@ -78,19 +78,19 @@ def test_a_floor_stays_whole_up_to_the_row_below_the_horizon():
 
 
 @pytest.mark.parametrize("slope", [(0.9, 0.0), (0.0, -0.9), (0.6, 0.6)])
-def test_a_slanted_plane_stays_whole(slope):
+def test_slanted_plane_stays_whole(slope):
     x, y, _ = CAMERA.rays()
     mesh = triangulate((1 / (1 + slope[0] * x + slope[1] * y))[None], CAMERA, largest_step=1e-6)
     assert len(mesh.faces) == 2 * squares()
 
 
-def test_a_fold_between_two_planes_stays_whole():
+def test_fold_between_two_planes_stays_whole():
     x = CAMERA.rays()[:1]
     mesh = triangulate(1 / (0.5 + 1.5 * x.abs()), CAMERA)
     assert len(mesh.faces) == 2 * squares()
 
 
-def test_a_sphere_loses_nothing_but_the_last_two_pixels_of_its_rim():
+def test_sphere_loses_only_the_last_two_pixels_of_its_rim():
     camera = Camera(200, 200, 250, 250, 99.5, 99.5)
     depth = sphere(camera)
     mesh = triangulate(depth, camera)
@@ -108,7 +108,7 @@ def test_a_sphere_loses_nothing_but_the_last_two_pixels_of_its_rim():
 
 @pytest.mark.parametrize("transposed", [False, True])
 @pytest.mark.parametrize(("step", "cut"), [(1.03, True), (1.01, False)])
-def test_a_step_of_three_percent_between_planes_is_cut_and_one_of_one_percent_is_not(step, cut, transposed):
+def test_step_of_three_percent_is_cut_and_one_of_one_percent_is_not(step, cut, transposed):
     camera = Camera(30, 30, 50, 50, 14.5, 14.5)
     depth = wall(camera=camera)
     depth[0, :, 15:] *= step
@@ -117,7 +117,7 @@ def test_a_step_of_three_percent_between_planes_is_cut_and_one_of_one_percent_is
     assert (spans(mesh, depth) < 1e-6) == cut
 
 
-def test_a_step_on_a_floor_is_cut():
+def test_step_on_a_floor_is_cut():
     camera = Camera(20, 120, 400, 400, 9.5, 14.5)
     depth = floor(camera).clone()
     depth[0, 60:, 10:] /= 1.2  # a box on the floor
@@ -129,7 +129,7 @@ def test_a_step_on_a_floor_is_cut():
     assert across.sum() == 2 * (60 - 15) - 1  # one more is cut at the box's corner
 
 
-def test_a_step_smeared_over_three_pixels_leaves_no_rubber_sheet():
+def test_step_smeared_over_three_pixels_leaves_no_connecting_faces():
     depth = wall()
     depth[0, :, 18:20] = torch.tensor([2.35, 2.7])
     depth[0, :, 20:] = 3
@@ -138,7 +138,7 @@ def test_a_step_smeared_over_three_pixels_leaves_no_rubber_sheet():
     assert set(np.unique(mesh.vertices[:, 2])) == {2.0, 3.0}
 
 
-def test_a_pole_of_one_pixel_is_cut_free_and_dropped():
+def test_pole_of_one_pixel_is_cut_free_and_dropped():
     depth = wall()
     depth[0, :, 20] = 1.5
     mesh = triangulate(depth, CAMERA)
@@ -146,7 +146,7 @@ def test_a_pole_of_one_pixel_is_cut_free_and_dropped():
     assert len(mesh.faces) == 2 * 29 * 37
 
 
-def test_isolated_pixels_are_dropped_unless_wanted():
+def test_isolated_pixels_are_dropped_unless_requested():
     depth = torch.full((1, 30, 40), torch.nan)
     depth[0, 3, 4] = 2
     depth[0, 10:12, 10:12] = 2
@@ -157,7 +157,7 @@ def test_isolated_pixels_are_dropped_unless_wanted():
     np.testing.assert_allclose(vertex_normals(mesh)[0], towards, rtol=1e-6)
 
 
-def test_three_known_pixels_of_a_square_make_a_triangle():
+def test_three_valid_pixels_of_a_square_make_a_triangle():
     for hole in ((0, 0), (0, 1), (1, 0), (1, 1)):
         depth = torch.full((1, 2, 2), 2.0)
         depth[0, *hole] = torch.nan
@@ -166,7 +166,7 @@ def test_three_known_pixels_of_a_square_make_a_triangle():
         assert face_normals(mesh)[0][0, 2] < 0
 
 
-def test_the_diagonal_follows_the_smaller_change_of_depth():
+def test_diagonal_follows_the_smaller_change_of_depth():
     depth = torch.tensor([[[2.0, 2.5], [2.2, 2.0]]])
     mesh = triangulate(depth, Camera(2, 2, 5, 5, 0.5, 0.5), largest_step=9)
     assert all({0, 3} <= set(face) for face in mesh.faces.tolist())
@@ -175,7 +175,7 @@ def test_the_diagonal_follows_the_smaller_change_of_depth():
 
 
 @pytest.mark.parametrize("most", [1200, 1199, 300, 100, 7, 1])
-def test_a_large_map_is_thinned_to_the_most_that_is_wanted(most):
+def test_large_map_is_thinned_to_the_requested_size(most):
     mesh = triangulate(wall(), CAMERA, most=most, isolated=True)
     stride = stride_for(wall(), most)
     assert len(mesh.vertices) <= most
@@ -186,25 +186,25 @@ def test_a_large_map_is_thinned_to_the_most_that_is_wanted(most):
     np.testing.assert_allclose(mesh.vertices, points[mesh.pixels], rtol=1e-6, atol=1e-7)
 
 
-def test_only_holes_give_an_empty_mesh():
+def test_mesh_of_holes_is_empty():
     mesh = triangulate(wall(torch.nan), CAMERA)
     assert mesh.vertices.shape == (0, 3)
     assert mesh.faces.shape == (0, 3)
 
 
 @pytest.mark.parametrize("size", [(1, 5), (5, 1), (1, 1), (2, 3)])
-def test_a_tiny_map_is_no_error(size):
+def test_mesh_of_a_tiny_map_is_valid(size):
     height, width = size
     camera = Camera(width, height, 5, 5, 0, 0)
     assert len(triangulate(wall(camera=camera), camera).faces) == 2 * (height - 1) * (width - 1)
 
 
 @pytest.mark.parametrize("values", [{"largest_step": 0}, {"largest_step": float("nan")}, {"most": 0}])
-def test_a_number_that_is_not_positive_is_refused(values):
+def test_number_that_is_not_positive_is_refused(values):
     with pytest.raises(ValueError, match="expected a positive step and number of vertices"):
         triangulate(wall(), CAMERA, **values)
 
 
-def test_a_map_of_another_size_is_refused():
+def test_map_of_another_size_is_refused():
     with pytest.raises(ValueError, match=r"depth: expected shape \(1, 30, 40\), got \(1, 3, 4\)"):
         triangulate(torch.ones(1, 3, 4), CAMERA)

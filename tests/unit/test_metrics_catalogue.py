@@ -48,14 +48,14 @@ def _scores(prediction: Tensor, target: Tensor, network: LPIPS | None = None) ->
     return rows
 
 
-def test_the_metrics_and_their_variants_are_those_of_the_paper(network: LPIPS) -> None:
+def test_metrics_and_variants_are_those_of_the_paper(network: LPIPS) -> None:
     variants = {"e1", "e2", "e3", "e4", "max", "avg"}
     expected = {(name, "") for name in WITHOUT_LIGHTS} | {(name, v) for name in WITH_LIGHTS for v in variants}
     assert set(_scores(*_maps(), network)) == expected
     assert {metric.name for metric in catalogue()} == WITHOUT_LIGHTS | WITH_LIGHTS - {"LPIPS_v"}
 
 
-def test_values_are_those_of_the_functions(network: LPIPS) -> None:
+def test_scores_equal_the_metric_functions(network: LPIPS) -> None:
     prediction, target = _maps()
     rows = _scores(prediction, target, network)
     pair = SurfacePair(prediction[None], target[None], CAMERA.rays()[None])
@@ -80,14 +80,14 @@ def test_values_are_those_of_the_functions(network: LPIPS) -> None:
         assert rows[name, "avg"].value == pytest.approx(sum(lights) / 4, rel=1e-5)
 
 
-def test_complete_maps_are_scored_on_all_their_pixels(network: LPIPS) -> None:
+def test_complete_maps_are_scored_on_all_pixels(network: LPIPS) -> None:
     assert {score.valid_share for score in _scores(*_maps(), network).values()} == {1.0}
 
 
 @pytest.mark.parametrize(
     "cut", [(slice(0, 39), slice(0, 47)), (slice(2, 40), slice(0, 48)), (slice(1, 38), slice(5, 44))]
 )
-def test_what_the_method_does_not_cover_is_cut_off_first(cut: tuple[slice, slice]) -> None:
+def test_pixels_outside_the_predictions_window_are_cropped_first(cut: tuple[slice, slice]) -> None:
     prediction, target = _maps()
     partial = torch.full_like(prediction, torch.nan)
     partial[(..., *cut)] = prediction[(..., *cut)]
@@ -102,7 +102,7 @@ def test_what_the_method_does_not_cover_is_cut_off_first(cut: tuple[slice, slice
         assert row.valid_share == pytest.approx(window.height * window.width / (40 * 48), rel=1e-12)
 
 
-def test_a_hole_inside_is_left_out_and_each_metric_tells_its_share() -> None:
+def test_inner_hole_is_left_out_and_each_metric_reports_its_valid_fraction() -> None:
     prediction, target = _maps()
     prediction[0, 10, 20] = torch.nan
     target[0, 30, 40] = torch.nan
@@ -129,7 +129,7 @@ def test_holes_of_the_truth_do_not_shrink_the_window() -> None:
     assert rows["DSSIM_v", "max"].valid_share == pytest.approx(33 / 34, rel=1e-12)  # of the rows 3 ... 36, but row 3
 
 
-def test_a_prediction_without_a_pixel_scores_nan_on_none(network: LPIPS) -> None:
+def test_prediction_without_a_valid_pixel_scores_nan_on_none(network: LPIPS) -> None:
     prediction, target = _maps()
     rows = _scores(torch.full_like(prediction, torch.nan), target, network)
     assert all(math.isnan(score.value) and score.valid_share == 0 for score in rows.values())
@@ -142,7 +142,7 @@ def test_a_prediction_without_a_pixel_scores_nan_on_none(network: LPIPS) -> None
         ((6, 30), {"RMSE_d", "BadPix_d_5cm", "BadPix_v_5", "RMSE_v", "RMSE_v1", "Bumpiness_d"}),
     ],
 )
-def test_a_window_too_small_for_a_metric_is_scored_by_the_others(
+def test_window_too_small_for_one_metric_is_scored_by_the_others(
     network: LPIPS, size: tuple[int, int], scored: set[str]
 ) -> None:
     prediction, target = _maps()
@@ -158,7 +158,7 @@ def test_a_window_too_small_for_a_metric_is_scored_by_the_others(
             assert score.valid_share == 0
 
 
-def test_a_prediction_of_one_pixel_has_no_score_by_its_look(network: LPIPS) -> None:
+def test_prediction_of_one_pixel_has_no_visual_score(network: LPIPS) -> None:
     prediction, target = _maps()
     spot = torch.full_like(prediction, torch.nan)
     spot[0, 20, 30] = prediction[0, 20, 30]

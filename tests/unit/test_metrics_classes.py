@@ -106,7 +106,7 @@ def test_variants_choose_among_the_lights_image_by_image(name: str, variant: str
 
 
 @pytest.mark.parametrize("name", PER_LIGHT)
-def test_the_worst_light_is_the_default(name: str) -> None:
+def test_default_variant_is_the_worst_light(name: str) -> None:
     make, function = PER_LIGHT[name]
     metric = make()
     metric.update(_pair(0))
@@ -128,13 +128,13 @@ def test_images_that_cannot_be_scored_are_left_out() -> None:
         assert metric.compute().item() == pytest.approx(alone.compute().item(), rel=1e-12)
 
 
-def test_without_an_image_to_score_the_mean_is_nan() -> None:
+def test_mean_without_a_scored_image_is_nan() -> None:
     metric = RMSEd()
     metric.update(_unknown())
     assert math.isnan(metric.compute())
 
 
-def test_reset_forgets_everything() -> None:
+def test_reset_clears_the_state() -> None:
     metric, fresh = DSSIMv(), DSSIMv()
     metric.update(_pair(0))
     metric.reset()
@@ -143,7 +143,7 @@ def test_reset_forgets_everything() -> None:
     assert torch.equal(metric.compute(), fresh.compute())
 
 
-def test_state_of_two_processes_adds_up() -> None:
+def test_states_of_two_processes_add_up() -> None:
     metric = RMSEd()
     assert {name: reduce.__name__ for name, reduce in metric._reductions.items()} == {  # type: ignore[union-attr]
         "total": "dim_zero_sum",
@@ -151,7 +151,7 @@ def test_state_of_two_processes_adds_up() -> None:
     }
 
 
-def test_an_update_keeps_no_graph() -> None:
+def test_update_keeps_no_graph() -> None:
     pair = _pair(0)
     depth = pair.prediction.requires_grad_()
     metric = RMSEv()
@@ -182,7 +182,7 @@ def test_collection_gives_each_metric_its_own_value(network: LPIPS) -> None:
     assert len({round(value.item(), 12) for value in values.values()}) == len(NAMES)  # all differ on these maps
 
 
-def test_metrics_that_agree_on_the_first_image_may_differ_on_the_next() -> None:
+def test_metrics_that_agree_on_the_first_image_stay_separate() -> None:
     metrics, pair = visual_metrics(), _pair(0)
     metrics.update(SurfacePair(pair.target, pair.target, pair.rays))  # all of them 0
     metrics.update(pair)
@@ -227,13 +227,13 @@ def test_checkpoints_hold_nothing_of_the_perceptual_network(network: LPIPS, tmp_
     assert set(torch.load(tmp_path / "last.ckpt", weights_only=True)["state_dict"]) == {"layer.weight", "layer.bias"}
 
 
-def test_an_unknown_variant_is_refused() -> None:
+def test_unknown_variant_is_refused() -> None:
     for make in (BadPixV, DSSIMv, RMSEv1):
         with pytest.raises(ValueError, match=r"variant: expected one of e1, e2, e3, e4, max, avg, got 'e5'"):
             make(variant="e5")
 
 
-def test_an_unknown_threshold_is_refused() -> None:
+def test_unknown_threshold_is_refused() -> None:
     with pytest.raises(ValueError, match=r"threshold: .*BadPix_d_1cm, BadPix_d_5cm, .*got 7"):
         BadPixD(threshold=7)
     with pytest.raises(ValueError, match=r"threshold: .*BadPix_d_10pct; got 7"):
@@ -242,11 +242,11 @@ def test_an_unknown_threshold_is_refused() -> None:
         BadPixV(threshold=2)
 
 
-def test_lower_is_better() -> None:
+def test_metrics_declare_that_lower_is_better() -> None:
     assert all(metric.higher_is_better is False for metric in visual_metrics().values())
 
 
-def test_an_image_whose_prediction_leaves_nothing_to_score_makes_the_mean_nan() -> None:
+def test_mean_is_nan_where_a_prediction_leaves_nothing_to_score() -> None:
     metric = RMSEd()
     metric.update(_pair(0))
     target = torch.full((1, 1, 36, 40), 2.0, dtype=torch.float64)

@@ -161,7 +161,7 @@ every_metric = pytest.mark.parametrize("name", METRICS)
 
 @every_metric
 @pytest.mark.parametrize("size", SIZES)
-def test_metric_is_that_of_the_protocol(name: str, size: tuple[int, int]) -> None:
+def test_metric_equals_the_protocol_in_plain_numpy(name: str, size: tuple[int, int]) -> None:
     maps = _maps(size)
     metric, reference = METRICS[name]
     value = metric(_pair(maps))[0].numpy()
@@ -173,7 +173,7 @@ def test_metric_is_that_of_the_protocol(name: str, size: tuple[int, int]) -> Non
 @every_metric
 @pytest.mark.parametrize("size", SIZES)
 @pytest.mark.parametrize("masked", [False, True])
-def test_with_holes_metric_is_that_of_the_known_pixels(name: str, size: tuple[int, int], masked: bool) -> None:
+def test_metric_with_holes_equals_that_of_the_valid_pixels(name: str, size: tuple[int, int], masked: bool) -> None:
     maps = _maps(size, holes=True)
     mask = np.random.default_rng(5).random(size) < 0.98 if masked else None
     metric, reference = METRICS[name]
@@ -181,7 +181,7 @@ def test_with_holes_metric_is_that_of_the_known_pixels(name: str, size: tuple[in
 
 
 @every_metric
-def test_depth_under_a_mask_does_not_count(name: str) -> None:
+def test_masked_depth_does_not_count(name: str) -> None:
     maps, mask = _maps(), np.ones((32, 48), dtype=bool)
     mask[10:14, 20:25] = False
     other = maps.prediction.copy()
@@ -191,7 +191,7 @@ def test_depth_under_a_mask_does_not_count(name: str) -> None:
 
 
 @every_metric
-def test_a_batch_of_two_is_two_single_images(name: str) -> None:
+def test_batch_of_two_equals_two_single_images(name: str) -> None:
     metric = METRICS[name][0]
     several = [_maps(seed=1), _maps(seed=2, holes=True)]
     singles = torch.cat([metric(_pair(maps)) for maps in several])
@@ -201,7 +201,7 @@ def test_a_batch_of_two_is_two_single_images(name: str) -> None:
 
 
 @every_metric
-def test_identical_maps_score_zero(name: str) -> None:
+def test_metric_of_identical_maps_is_zero(name: str) -> None:
     maps = _maps()
     value = METRICS[name][0](_pair(maps._replace(prediction=maps.target)))
     torch.testing.assert_close(value, torch.zeros_like(value), rtol=0, atol=1e-12)
@@ -223,7 +223,7 @@ def test_relative_thresholds_are_fractions_of_the_target() -> None:
         assert bad_pix_d(pair, 0.05, relative=True).item() == bad
 
 
-def test_an_offset_of_a_wall_is_measured_along_the_rays() -> None:
+def test_wall_offset_is_measured_along_the_rays() -> None:
     camera = Camera(5, 4, 5.0, 5.0, 1.5, 1.5)
     pair = _pair(Maps(np.full((4, 5), 2.1), np.full((4, 5), 2.0), camera))
     expected = 0.1 * np.sqrt((np.linalg.norm(camera.rays().numpy(), axis=0) ** 2).mean())
@@ -233,7 +233,7 @@ def test_an_offset_of_a_wall_is_measured_along_the_rays() -> None:
 
 @every_metric
 @pytest.mark.parametrize("unknown", ["prediction", "target"])
-def test_maps_without_a_common_pixel_score_nan(name: str, unknown: str) -> None:
+def test_metric_of_maps_without_a_common_pixel_is_nan(name: str, unknown: str) -> None:
     maps = _maps()
     value = METRICS[name][0](_pair(maps._replace(**{unknown: np.full((32, 48), np.nan)})))
     assert value.shape == ((1, 4) if name in PER_LIGHT else (1,))
@@ -251,7 +251,7 @@ def test_metric_works_in_float32(name: str, holes: bool) -> None:
 
 
 @every_metric
-def test_narrow_images_of_wide_depths_cost_a_ten_thousandth(name: str) -> None:
+def test_metric_in_float32_resolves_a_ten_thousandth_of_a_wide_depth(name: str) -> None:
     maps = _maps(holes=True)
     wide = _pair(maps)
     narrow = SurfacePair(wide.prediction, wide.target, wide.rays, wide.depth_mask, image_dtype=torch.float32)
@@ -283,7 +283,7 @@ def test_metric_takes_a_prediction_that_requires_its_gradient(name: str) -> None
 
 
 @pytest.mark.parametrize("size", [(6, 20), (20, 6)])
-def test_a_map_smaller_than_the_window_has_no_dssim(size: tuple[int, int]) -> None:
+def test_dssim_of_a_map_smaller_than_the_window_is_nan(size: tuple[int, int]) -> None:
     maps = _maps((20, 20))
     small = Maps(*(z[: size[0], : size[1]] for z in maps[:2]), maps.camera.crop(0, 0, *size))
     with pytest.raises(ValueError, match=f"DSSIM_v: expected a map of at least 7 x 7 pixels, got \\({size[0]}, "):
@@ -305,7 +305,7 @@ def test_inputs_that_do_not_fit_together_are_refused() -> None:
 
 @pytest.mark.parametrize("name", METRICS)
 @pytest.mark.parametrize("wrong", [0.0, -3.0])
-def test_a_depth_that_is_not_positive_is_a_hole(name: str, wrong: float) -> None:
+def test_non_positive_depth_is_a_hole(name: str, wrong: float) -> None:
     maps = _maps()
     holed, negative = maps.prediction.copy(), maps.prediction.copy()
     holed[..., 3:9, 4:20], negative[..., 3:9, 4:20] = np.nan, wrong

@@ -42,13 +42,13 @@ def _sample(scale: int, height: int, width: int, doffs: float = 0.0) -> DepthSam
 
 
 @pytest.mark.parametrize(("scale", "parameters"), [(4, 326_015), (8, 454_147)])
-def test_the_voynov_network_has_the_published_number_of_parameters(scale: int, parameters: int) -> None:
+def test_voynov_network_has_the_published_number_of_parameters(scale: int, parameters: int) -> None:
     assert sum(value.numel() for value in MSGNet(scale).parameters()) == parameters
 
 
 @pytest.mark.parametrize("scale", SCALES)
 @pytest.mark.parametrize("size", [(1, 3), (5, 4)])
-def test_the_voynov_network_covers_every_pixel_and_the_hui_network_all_but_the_last(
+def test_voynov_network_covers_every_pixel_and_the_hui_network_all_but_the_last(
     scale: int, size: tuple[int, int]
 ) -> None:
     rgb, disparity = _scene(scale, *size, batch=2)
@@ -57,7 +57,7 @@ def test_the_voynov_network_covers_every_pixel_and_the_hui_network_all_but_the_l
     assert upsample_disparity(_net(scale, "hui"), rgb, disparity).shape == (2, 1, rows - 1, columns - 1)
 
 
-def test_the_hui_networks_sizes_are_caffes_511_255_127() -> None:
+def test_hui_network_sizes_are_caffes_511_255_127() -> None:
     net = _net(8, "hui")
     with torch.inference_mode():
         pyramid = net._pyramid(torch.zeros(1, 1, 511, 39))
@@ -65,26 +65,26 @@ def test_the_hui_networks_sizes_are_caffes_511_255_127() -> None:
         assert net(torch.zeros(1, 1, 511, 39), torch.zeros(1, 1, 64, 5)).shape == (1, 1, 511, 39)
 
 
-def test_a_guidance_of_another_size_is_refused() -> None:
+def test_guidance_of_another_size_is_refused() -> None:
     with pytest.raises(ValueError, match=r"guidance: expected \(32, 32\).*got \(31, 32\)"):
         _net(4)(torch.zeros(1, 1, 31, 32), torch.zeros(1, 1, 8, 8))
 
 
-def test_an_unknown_scale_or_variant_is_refused() -> None:
+def test_unknown_scale_or_variant_is_refused() -> None:
     with pytest.raises(ValueError, match="scale: expected one of"):
         MSGNet(3)
     with pytest.raises(ValueError, match="variant: expected one of hui, voynov, dsr, got 'caffe'"):
         MSGNet(4, "caffe")  # type: ignore[arg-type]
 
 
-def test_the_3x3_mean_is_scipys_with_mirrored_borders() -> None:
+def test_3x3_mean_equals_scipy_with_mirrored_borders() -> None:
     x = torch.rand(2, 1, 5, 7, dtype=torch.float64)
     expected = [ndimage.convolve(image, np.full((3, 3), 1 / 9), mode="reflect") for image in x[:, 0].numpy()]
     torch.testing.assert_close(mean3x3(x)[:, 0], torch.from_numpy(np.stack(expected)))
 
 
 @pytest.mark.parametrize("scale", [2, 4, 8])
-def test_bicubic_upsampling_is_pillows_on_a_float_image(scale: int) -> None:
+def test_bicubic_upsampling_equals_pillow_on_a_float_image(scale: int) -> None:
     image = np.random.default_rng(0).random((6, 9), dtype=np.float32)
     expected = np.asarray(Image.fromarray(image).resize((9 * scale, 6 * scale), Image.Resampling.BICUBIC))
     ours = upsample_bicubic(torch.from_numpy(image)[None, None], scale)[0, 0]
@@ -99,7 +99,7 @@ def test_normalisation_is_per_sample_over_finite_values_and_holes_become_0() -> 
 
 
 @pytest.mark.parametrize("variant", list(VARIANTS))
-def test_a_constant_map_stays_constant_and_a_map_without_values_becomes_holes(variant: VariantName) -> None:
+def test_constant_map_stays_constant_and_an_empty_map_becomes_holes(variant: VariantName) -> None:
     rgb, disparity = torch.full((2, 3, 64, 64), 0.3), torch.full((2, 1, 16, 16), 7.0, dtype=torch.float64)
     disparity[1] = torch.nan
     fine = upsample_disparity(_net(4, variant), rgb, disparity)
@@ -107,7 +107,7 @@ def test_a_constant_map_stays_constant_and_a_map_without_values_becomes_holes(va
     assert bool(fine[1].isnan().all())
 
 
-def test_guidance_of_the_hui_variant_is_bt601_luma_less_its_mean() -> None:
+def test_hui_guidance_is_bt601_luma_minus_its_mean() -> None:
     rgb = torch.rand(1, 3, 6, 5, dtype=torch.float64)
     red, green, blue = rgb[0].numpy()
     luma = 16 + 65.481 * red + 128.553 * green + 24.966 * blue
@@ -117,7 +117,7 @@ def test_guidance_of_the_hui_variant_is_bt601_luma_less_its_mean() -> None:
     torch.testing.assert_close(guidance_map(rgb, VARIANTS["hui"])[0, 0], torch.from_numpy(expected))
 
 
-def test_guidance_of_the_voynov_variant_is_the_released_codes_clipped_red() -> None:
+def test_voynov_guidance_is_the_clipped_red_of_the_released_code() -> None:
     rgb = torch.rand(1, 3, 6, 5, dtype=torch.float64)
     red, green, blue = 255 * rgb[0].numpy()
     luma = np.clip(red - 0.34414 * (green - 128) - 0.71414 * (blue - 128), 0, 255)
@@ -128,7 +128,7 @@ def test_guidance_of_the_voynov_variant_is_the_released_codes_clipped_red() -> N
 
 
 @pytest.mark.parametrize("variant", list(VARIANTS))
-def test_a_batch_of_two_equals_two_singles(variant: VariantName) -> None:
+def test_batch_of_two_equals_two_single_images(variant: VariantName) -> None:
     net, (rgb, disparity) = _net(4, variant), _scene(4, 20, 17, batch=2)
     disparity[1] *= 3
     disparity[1, 0, 2, 3] = torch.nan
@@ -138,7 +138,7 @@ def test_a_batch_of_two_equals_two_singles(variant: VariantName) -> None:
     torch.testing.assert_close(together, alone, rtol=0, atol=1e-4)  # of a range of 15
 
 
-def test_pre_and_postprocessing_have_the_gradients_of_finite_differences() -> None:
+def test_gradients_of_pre_and_postprocessing_equal_finite_differences() -> None:
     rgb, disparity = _scene(2, 3, 4)
     disparity[0, 0, 1, 2] = torch.nan
     known = disparity.isfinite()
@@ -153,7 +153,7 @@ def test_pre_and_postprocessing_have_the_gradients_of_finite_differences() -> No
     assert torch.autograd.gradcheck(around_an_absent_network, inputs)
 
 
-def test_training_reaches_every_parameter_also_around_holes() -> None:
+def test_training_reaches_every_parameter_around_holes_too() -> None:
     net, (rgb, disparity) = _net(4).train(), _scene(4, 16, 16)
     disparity[0, 0, 2, 2] = torch.nan
     upsample_disparity(net, rgb, disparity.requires_grad_()).square().mean().backward()
@@ -165,7 +165,7 @@ def test_training_reaches_every_parameter_also_around_holes() -> None:
     ("scale", "height", "width"),
     [(2, 40, 90), (4, 64, 40), (4, 16, 33), (4, 9, 90), (4, 20, 20), (8, 40, 30), (8, 8, 8), (16, 20, 16), (4, 4, 4)],
 )
-def test_drift_of_the_crop_is_that_of_the_whole_image(scale: int, height: int, width: int) -> None:
+def test_drift_of_the_crop_equals_that_of_the_whole_image(scale: int, height: int, width: int) -> None:
     net, (rgb, disparity) = _net(scale), _scene(scale, height, width, batch=2)
     guidance, values = guidance_map(rgb, net.variant), normalised(disparity).values
     with torch.inference_mode():
@@ -192,7 +192,7 @@ def test_drift_is_0_where_its_region_is_empty() -> None:
 
 @pytest.mark.parametrize("scale", SCALES)
 @pytest.mark.parametrize("rows", [1, 4, 7])
-def test_outputs_depend_on_no_input_beyond_the_rows_seen(scale: int, rows: int) -> None:
+def test_receptive_field_bounds_the_input_rows_that_matter(scale: int, rows: int) -> None:
     net = _net(scale).double()
     seen = net.rows_seen(rows)
     height = seen + 6
@@ -227,7 +227,7 @@ def test_bfloat16_stays_within_a_thousandth_of_the_range(variant: VariantName) -
 
 
 @pytest.mark.parametrize("doffs", [0.0, 30.0])
-def test_the_method_keeps_a_plane_at_its_depth_with_and_without_a_disparity_offset(doffs: float) -> None:
+def test_plane_keeps_its_depth_with_and_without_a_disparity_offset(doffs: float) -> None:
     sample = _sample(4, 8, 8, doffs)
     flat = DepthSample("test", "flat", sample.rgb, torch.full((1, 8, 8), 2.5), sample.camera, sample.camera_lr, 4)
     depth = NetworkUpsampler(_net(4))(flat)
@@ -235,7 +235,7 @@ def test_the_method_keeps_a_plane_at_its_depth_with_and_without_a_disparity_offs
     torch.testing.assert_close(depth, torch.full_like(depth, 2.5))
 
 
-def test_the_hui_method_leaves_its_last_row_and_column_as_holes() -> None:
+def test_hui_method_leaves_its_last_row_and_column_missing() -> None:
     depth = NetworkUpsampler(_net(4, "hui"))(_sample(4, 8, 9))
     assert depth.shape == (1, 32, 36)
     assert bool(depth[0, -1].isnan().all())
@@ -249,14 +249,14 @@ def test_disparity_that_is_not_positive_becomes_a_hole() -> None:
     assert bool(NetworkUpsampler(net)(_sample(4, 8, 8)).isnan().all())
 
 
-def test_the_method_leaves_the_network_that_it_was_given_alone() -> None:
+def test_network_of_the_caller_is_unchanged() -> None:
     net = MSGNet(4).train()
     NetworkUpsampler(net, "bfloat16")
     assert net.training
     assert all(value.dtype == torch.float32 and value.requires_grad for value in net.parameters())
 
 
-def test_a_sample_of_another_scale_or_an_unknown_precision_is_refused() -> None:
+def test_other_scale_and_unknown_precision_are_refused() -> None:
     with pytest.raises(ValueError, match="scene: expected scale 4, the network's, got 2"):
         NetworkUpsampler(_net(4))(_sample(2, 8, 8))
     with pytest.raises(ValueError, match="precision: expected one of float32, bfloat16, got 'float16'"):
@@ -264,7 +264,7 @@ def test_a_sample_of_another_scale_or_an_unknown_precision_is_refused() -> None:
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
-def test_the_shared_slopes_gradients_are_the_librarys(dtype: torch.dtype) -> None:
+def test_prelu_gradients_equal_those_of_torch(dtype: torch.dtype) -> None:
     net = MSGNet(4, "dsr")
     layer = net.smooth.to(dtype)
     x = torch.randn(2, 32, 9, 8, generator=torch.Generator().manual_seed(0)).to(dtype).requires_grad_()
@@ -279,7 +279,7 @@ def test_the_shared_slopes_gradients_are_the_librarys(dtype: torch.dtype) -> Non
 
 
 @pytest.mark.parametrize("scale", [2, 4, 8])
-def test_before_training_our_variant_is_nearly_the_interpolation_without_a_checkerboard(scale: int) -> None:
+def test_untrained_variant_of_ours_is_nearly_the_interpolation_without_a_checkerboard(scale: int) -> None:
     torch.manual_seed(0)
     rgb, disparity = torch.rand(1, 3, 8 * scale, 9 * scale), torch.rand(1, 1, 8, 9, dtype=torch.float64)
     with torch.no_grad():
@@ -288,7 +288,7 @@ def test_before_training_our_variant_is_nearly_the_interpolation_without_a_check
     assert float((fine - base).abs().max()) < 0.02
 
 
-def test_bounds_take_the_place_of_the_maps_own_range() -> None:
+def test_given_min_max_replaces_the_maps_own_range() -> None:
     net, rgb, disparity = MSGNet(4, "dsr"), torch.rand(1, 3, 32, 32), 5 + torch.rand(1, 1, 8, 8)
     own = torch.stack((disparity.min(), disparity.max())).view(1, 2, 1, 1)
     with torch.no_grad():
@@ -297,7 +297,7 @@ def test_bounds_take_the_place_of_the_maps_own_range() -> None:
     assert not torch.allclose(wide, net.upsample(rgb, disparity).detach(), atol=1e-6)
 
 
-def test_our_variant_fills_holes_from_around() -> None:
+def test_our_variant_fills_holes_from_their_surroundings() -> None:
     net, rgb = MSGNet(4, "dsr"), torch.rand(1, 3, 64, 64)
     disparity = torch.full((1, 1, 16, 16), 7.0)
     disparity[..., :3] = 9.0

@@ -42,12 +42,12 @@ def net(build: Callable[..., WindowedNetwork]) -> WindowedNetwork:
     return build()
 
 
-def test_a_factor_and_a_constant_on_the_disparity_come_out_again(net: WindowedNetwork) -> None:
+def test_networks_are_equivariant_to_scale_and_offset_of_disparity(net: WindowedNetwork) -> None:
     rgb, coarse = photos(24, 28), maps(6, 7)
     torch.testing.assert_close(net.upsample(rgb, 3 * coarse + 7), 3 * net.upsample(rgb, coarse) + 7, rtol=1e-6, atol=0)
 
 
-def test_bounds_normalise_as_those_of_the_image_that_the_window_is_cut_from(net: WindowedNetwork) -> None:
+def test_given_min_max_normalises_a_window_like_its_image(net: WindowedNetwork) -> None:
     rgb, coarse = photos(24, 28), maps(6, 7)
     own = torch.tensor([coarse.min(), coarse.max()]).view(1, 2, 1, 1)
     torch.testing.assert_close(net.upsample(rgb, coarse, own), net.upsample(rgb, coarse), rtol=1e-6, atol=0)
@@ -55,18 +55,18 @@ def test_bounds_normalise_as_those_of_the_image_that_the_window_is_cut_from(net:
     assert not torch.allclose(net.upsample(rgb, coarse, wide), net.upsample(rgb, coarse), rtol=1e-5)
 
 
-def test_a_constant_map_stays_constant(net: WindowedNetwork) -> None:
+def test_constant_map_stays_constant(net: WindowedNetwork) -> None:
     result = net.upsample(photos(24, 28), torch.full((1, 1, 6, 7), 5.0))
     torch.testing.assert_close(result, torch.full((1, 1, 24, 28), 5.0), rtol=1e-6, atol=0)
 
 
-def test_the_photo_has_a_say(net: WindowedNetwork) -> None:
+def test_photo_influences_the_result(net: WindowedNetwork) -> None:
     coarse = maps(6, 7)
     one, other = (net.upsample(photo, coarse) for photo in (photos(24, 28), 1 - photos(24, 28).square()))
     assert not torch.allclose(one, other, rtol=1e-4)
 
 
-def test_each_image_of_a_batch_is_treated_alone_and_every_time_alike(net: WindowedNetwork) -> None:
+def test_batch_equals_single_images_every_time(net: WindowedNetwork) -> None:
     rgb, coarse = photos(24, 28, 3), maps(6, 7, 3)
     together = net.upsample(rgb, coarse)
     alone = torch.cat([net.upsample(rgb[i : i + 1], coarse[i : i + 1]) for i in range(3)])
@@ -76,14 +76,14 @@ def test_each_image_of_a_batch_is_treated_alone_and_every_time_alike(net: Window
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("size", [(1, 1), (1, 5), (2, 2), (3, 7)])
-def test_maps_of_any_size_pass_in_their_dtype(net: WindowedNetwork, size: tuple[int, int], dtype: torch.dtype) -> None:
+def test_maps_of_any_size_keep_their_dtype(net: WindowedNetwork, size: tuple[int, int], dtype: torch.dtype) -> None:
     result = net.upsample(photos(4 * size[0], 4 * size[1]), maps(*size).to(dtype))
     assert result.shape == (1, 1, 4 * size[0], 4 * size[1])
     assert result.dtype == dtype
     assert bool(result.isfinite().all())
 
 
-def test_a_hole_is_filled_from_around_and_reaches_no_farther_than_the_network(net: WindowedNetwork) -> None:
+def test_hole_is_filled_locally_within_the_receptive_field(net: WindowedNetwork) -> None:
     columns = 2 * net.reach + 6
     rgb, coarse = photos(32, 4 * columns), maps(8, columns)
     coarse[..., 0, 0], coarse[..., 0, 1] = 20, 29  # the range, which normalises
@@ -96,12 +96,12 @@ def test_a_hole_is_filled_from_around_and_reaches_no_farther_than_the_network(ne
     assert not torch.allclose(result[..., 12:16, 8:12], whole[..., 12:16, 8:12])
 
 
-def test_an_image_without_a_known_pixel_becomes_nan(net: WindowedNetwork) -> None:
+def test_image_without_a_valid_pixel_becomes_nan(net: WindowedNetwork) -> None:
     assert bool(net.upsample(photos(24, 28), torch.full((1, 1, 6, 7), torch.nan)).isnan().all())
 
 
 @pytest.mark.parametrize("scale", [2, 8])
-def test_tiles_agree_with_the_answer_in_one_piece(build: Callable[..., WindowedNetwork], scale: int) -> None:
+def test_tiles_equal_the_whole_image(build: Callable[..., WindowedNetwork], scale: int) -> None:
     net = build(scale)
     rows, columns = net.reach + 9, 2 * net.reach + 10
     rgb, coarse = photos(scale * rows, scale * columns).double(), maps(rows, columns).double()
@@ -113,14 +113,14 @@ def test_tiles_agree_with_the_answer_in_one_piece(build: Callable[..., WindowedN
     )
 
 
-def test_a_photo_of_another_size_is_refused(net: WindowedNetwork) -> None:
+def test_photo_of_another_size_is_refused(net: WindowedNetwork) -> None:
     with pytest.raises(
         ValueError, match=r"^rgb: expected \(24, 28\) pixels for a low-resolution map of \(6, 7\) at scale 4"
     ):
         net.upsample(photos(24, 24), maps(6, 7))
 
 
-def test_arguments_rebuild_the_network(net: WindowedNetwork) -> None:
+def test_network_is_rebuilt_from_its_arguments(net: WindowedNetwork) -> None:
     again = type(net)(**net.arguments())
     again.load_state_dict(net.state_dict())
     rgb, coarse = photos(16, 12), maps(4, 3)

@@ -51,9 +51,7 @@ def _scene(depth: Tensor | None = STEPS, measured: dict[int, Tensor] | None = No
         ("disparity", [1.2244615478680083, 1.3487868435516208, 1.5093446627187703, 1.6133715164190385]),
     ],
 )
-def test_multiplicative_noise_has_the_very_numbers_of_results_that_are_stored(
-    range_type: RangeType, expected: list[float]
-) -> None:
+def test_multiplicative_noise_equals_the_stored_numbers(range_type: RangeType, expected: list[float]) -> None:
     sample = make_sample(_scene(), 2, BOX, range_type, GaussianMultiplicative(0.05), 7)
     assert sample.depth_lr[0, 0].tolist() == expected
 
@@ -62,7 +60,7 @@ def test_multiplicative_noise_has_the_very_numbers_of_results_that_are_stored(
 
 
 @pytest.mark.parametrize("noise", KINDS)
-def test_a_generator_gives_the_same_noise_again_and_another_one_another(noise: Noise) -> None:
+def test_generator_reproduces_the_noise_and_another_one_differs(noise: Noise) -> None:
     depth = _wall(2.0, 20)
     first, again, other = (noise(depth, _generator(seed)) for seed in (1, 1, 2))
     assert torch.equal(first, again)
@@ -71,7 +69,7 @@ def test_a_generator_gives_the_same_noise_again_and_another_one_another(noise: N
 
 @pytest.mark.parametrize("noise", KINDS)
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_a_hole_stays_one_and_shape_and_dtype_stay(noise: Noise, dtype: torch.dtype) -> None:
+def test_noise_keeps_holes_shape_and_dtype(noise: Noise, dtype: torch.dtype) -> None:
     depth = torch.full((2, 1, 5, 7), 2.0, dtype=dtype)
     depth[1, 0, 2, 3] = torch.nan
     noisy = noise(depth, _generator())
@@ -80,14 +78,14 @@ def test_a_hole_stays_one_and_shape_and_dtype_stay(noise: Noise, dtype: torch.dt
 
 
 @pytest.mark.parametrize("noise", KINDS)
-def test_float32_gets_the_noise_of_float64(noise: Noise) -> None:
+def test_float32_noise_equals_float64_noise(noise: Noise) -> None:
     depth = (1 + torch.rand(1, 30, 40, generator=_generator(3))).float()
     single, double = noise(depth, _generator()), noise(depth.double(), _generator())
     torch.testing.assert_close(single.double(), double, rtol=1e-6, atol=0, equal_nan=True)
 
 
 @pytest.mark.parametrize("noise", KINDS)
-def test_the_depth_that_goes_in_is_left_alone(noise: Noise) -> None:
+def test_input_depth_is_unchanged(noise: Noise) -> None:
     depth = STEPS.clone()
     noise(depth, _generator())
     assert torch.equal(depth, STEPS)
@@ -95,14 +93,14 @@ def test_the_depth_that_goes_in_is_left_alone(noise: Noise) -> None:
 
 @pytest.mark.parametrize("method", RANGE_TYPES)
 @pytest.mark.parametrize("noise", SENSORS)
-def test_a_sensor_s_noise_is_one_of_metric_depth_whatever_is_averaged(noise: Noise, method: RangeType) -> None:
+def test_sensor_noise_applies_to_metric_depth_whatever_is_averaged(noise: Noise, method: RangeType) -> None:
     clean = make_sample(_scene(), 2, BOX, method).depth_lr
     noisy = make_sample(_scene(), 2, BOX, method, noise, _generator(5)).depth_lr
     torch.testing.assert_close(noisy, noise(clean, _generator(5)), rtol=1e-12, atol=0, equal_nan=True)
 
 
 @pytest.mark.parametrize("method", RANGE_TYPES)
-def test_a_noise_gets_the_range_type_that_it_says(method: RangeType) -> None:
+def test_noise_gets_its_declared_range_type(method: RangeType) -> None:
     class Offset:
         range_type = "perspective"
 
@@ -116,7 +114,7 @@ def test_a_noise_gets_the_range_type_that_it_says(method: RangeType) -> None:
 
 
 @pytest.mark.parametrize("noise", KINDS)
-def test_noise_in_a_sample_is_the_scene_s_own_and_depends_on_the_seed(noise: Noise) -> None:
+def test_noise_of_a_sample_depends_on_its_scene_and_the_seed(noise: Noise) -> None:
     first, again, other = (make_sample(_scene(), 2, BOX, "orthogonal", noise, seed).depth_lr for seed in (0, 0, 1))
     assert torch.equal(first.nan_to_num(), again.nan_to_num())
     assert not torch.equal(first.nan_to_num(), other.nan_to_num())
@@ -125,7 +123,7 @@ def test_noise_in_a_sample_is_the_scene_s_own_and_depends_on_the_seed(noise: Noi
 
 
 @pytest.mark.parametrize("noise", KINDS)
-def test_a_sample_that_is_refused_or_measured_draws_nothing(noise: Noise) -> None:
+def test_refused_or_measured_sample_draws_nothing(noise: Noise) -> None:
     generator = _generator(4)
     before = generator.get_state()
     measured = _scene(None, {2: BOX(STEPS, 2)})
@@ -136,7 +134,7 @@ def test_a_sample_that_is_refused_or_measured_draws_nothing(noise: Noise) -> Non
     assert torch.equal(generator.get_state(), before)
 
 
-def test_a_sensor_draws_as_much_whatever_its_settings() -> None:
+def test_sensor_draws_the_same_numbers_for_all_settings() -> None:
     states = []
     for noise in (Kinect(), Kinect(**QUIET, nearest=None, farthest=None), Kinect(reach=3, dropout=1.0)):
         generator = _generator(2)
@@ -146,7 +144,7 @@ def test_a_sensor_draws_as_much_whatever_its_settings() -> None:
 
 
 @pytest.mark.parametrize(("name", "expected"), [("tof", TimeOfFlight()), ("kinect", Kinect())])
-def test_the_files_of_the_configuration_hold_the_defaults(name: str, expected: Noise) -> None:
+def test_configuration_files_hold_the_defaults(name: str, expected: Noise) -> None:
     node = OmegaConf.to_container(OmegaConf.load(REPOSITORY / "conf" / "noise" / f"{name}.yaml"))
     assert isinstance(node, dict)
     assert node["name"] == name
@@ -176,7 +174,7 @@ def test_the_files_of_the_configuration_hold_the_defaults(name: str, expected: N
         (Kinect, {"farthest": 0.3}, "farthest: expected more than nearest, 0.4, got 0.3"),
     ],
 )
-def test_a_value_that_cannot_be_is_refused_by_its_key(kind: Any, values: dict[str, float], message: str) -> None:
+def test_invalid_value_is_refused_by_its_key(kind: Any, values: dict[str, float], message: str) -> None:
     with pytest.raises(ValueError, match="expected") as caught:
         kind(**values)
     assert str(caught.value) == message
@@ -192,7 +190,7 @@ def test_time_of_flight_noise_grows_with_the_third_power_of_depth(depth: float) 
     assert float(noisy.mean()) == pytest.approx(depth, rel=2e-3)
 
 
-def test_its_disparity_is_normal_with_a_standard_deviation_of_strength_by_disparity() -> None:
+def test_disparity_noise_of_time_of_flight_is_normal_with_the_given_deviation() -> None:
     depth = 1 + 2 * torch.rand(1, 40, 50, generator=_generator(1), dtype=torch.float64)
     noise = TimeOfFlight(strength=300.0, stereo_constant=500.0, doffs=20.0)
     clean = 500 / depth - 20
@@ -200,7 +198,7 @@ def test_its_disparity_is_normal_with_a_standard_deviation_of_strength_by_dispar
     torch.testing.assert_close(500 / noise(depth, _generator()) - 20, clean + 300 / clean * draws, rtol=1e-12, atol=0)
 
 
-def test_where_its_disparity_is_not_positive_there_is_a_hole() -> None:
+def test_non_positive_disparity_of_time_of_flight_is_a_hole() -> None:
     noisy = TimeOfFlight()(_wall(30.0, 100), _generator())
     draws = torch.randn(1, 100, 100, generator=_generator(), dtype=torch.float64)
     v = 598.4 / 30
@@ -210,7 +208,7 @@ def test_where_its_disparity_is_not_positive_there_is_a_hole() -> None:
 
 
 @pytest.mark.parametrize(("name", "scale"), [("art_depth_2_n.png", 4), ("art_depth_3_n.png", 8)])
-def test_the_noisy_middlebury_inputs_that_circulate_have_five_levels_of_noise_at_every_disparity(
+def test_noisy_middlebury_inputs_have_five_levels_of_noise_at_every_disparity(
     shared: Path, name: str, scale: int
 ) -> None:
     folder = shared / "real" / "middlebury2005"
@@ -238,7 +236,7 @@ def test_kinect_noise_is_that_of_khoshelham_and_grows_with_the_square_of_depth(d
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_disparity_comes_in_eighths_of_the_sensor_s_pixels(dtype: torch.dtype) -> None:
+def test_kinect_disparity_comes_in_eighths_of_the_sensors_pixels(dtype: torch.dtype) -> None:
     depth = 0.5 + 7 * torch.rand(1, 60, 80, generator=_generator(1), dtype=torch.float64).to(dtype)
     reading = Kinect()(depth, _generator())
     eighths = (8 * 0.075 * 580 / reading[reading.isfinite()]).double()
@@ -246,7 +244,7 @@ def test_disparity_comes_in_eighths_of_the_sensor_s_pixels(dtype: torch.dtype) -
     torch.testing.assert_close(eighths, eighths.round(), rtol=0, atol=1e-9 if dtype == torch.float64 else 2e-4)
 
 
-def test_without_noise_the_nearest_step_is_read() -> None:
+def test_kinect_without_noise_reads_the_nearest_step() -> None:
     noise = Kinect(**QUIET, step=0.5, stereo_constant=10.0, nearest=None, farthest=None)
     disparity = torch.tensor([[[9.8, 10.2, 10.3, 0.3, 0.2]]], dtype=torch.float64)
     expected = torch.tensor([[[1.0, 1.0, 10 / 10.5, 20.0, torch.nan]]], dtype=torch.float64)
@@ -261,7 +259,7 @@ def _step() -> Tensor:
 
 
 @pytest.mark.parametrize("reach", [1, 2, 4])
-def test_dropouts_lie_within_reach_of_depth_edges_and_nowhere_else(reach: int) -> None:
+def test_dropouts_lie_near_depth_edges_alone(reach: int) -> None:
     lost = Kinect(dropout=1.0, reach=reach)(_step(), _generator()).isnan()
     inside = {(row, column) for row in range(10, 20) for column in range(15, 25)}
     outside = {(row, column) for row in range(40) for column in range(40)} - inside
@@ -288,11 +286,11 @@ def test_dropouts_have_their_probability() -> None:
 
 
 @pytest.mark.parametrize(("jump", "expected"), [(0.49, True), (0.51, False)])
-def test_an_edge_is_a_jump_by_more_than_a_share_of_the_nearer_depth(jump: float, expected: bool) -> None:
+def test_edge_is_a_jump_by_more_than_a_fraction_of_the_nearer_depth(jump: float, expected: bool) -> None:
     assert bool(Kinect(dropout=1.0, jump=jump)(_step(), _generator()).isnan().any()) is expected
 
 
-def test_a_hole_makes_no_edge() -> None:
+def test_hole_makes_no_edge() -> None:
     depth = _wall(2.0, 20)
     depth[0, 5:9, 5:9] = torch.nan
     assert torch.equal(Kinect(dropout=1.0)(depth, _generator()).isnan(), depth.isnan())
@@ -306,7 +304,7 @@ def test_readings_out_of_range_are_holes_unless_the_limits_are_off() -> None:
     torch.testing.assert_close(open_ended, depth, rtol=0.03, atol=0)
 
 
-def test_a_reading_without_disparity_or_behind_the_sensor_is_a_hole() -> None:
+def test_reading_without_disparity_or_behind_the_sensor_is_a_hole() -> None:
     depth = torch.tensor([[[1e6, -1.0]]], dtype=torch.float64)
     assert bool(Kinect(**QUIET, nearest=None, farthest=None)(depth, _generator()).isnan().all())
     assert TimeOfFlight()(depth, _generator())[0, 0, 1].isnan()

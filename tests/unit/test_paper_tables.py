@@ -56,7 +56,7 @@ def all_of(names, value=10.0):
     return {name: value + number for number, name in enumerate(names)}
 
 
-def test_there_is_a_summary_and_a_table_per_data_set_for_each_scale_and_degradation():
+def test_tables_are_a_summary_and_one_per_dataset_for_each_scale_and_degradation():
     found = tables(
         run("Bicubic", {"lucy": 1.0}),
         run("Bicubic", {"sofa": 1.0}, dataset="icl"),
@@ -69,13 +69,13 @@ def test_there_is_a_summary_and_a_table_per_data_set_for_each_scale_and_degradat
     ]  # fmt: skip
 
 
-def test_names_of_files_differ_on_any_file_system_and_hold_no_odd_letters():
+def test_file_names_are_distinct_on_any_file_system_and_plain_ascii():
     found = tables(*(run("MSG", {"a": 1.0}, dataset=name) for name in ("a/b", "A b", "a:b")))
     assert len({name.casefold() for name in found}) == 4
     assert all(name.replace("_", "").replace("-", "").replace(".", "").isalnum() for name in found)
 
 
-def test_values_are_in_the_paper_s_units_and_the_worst_of_four_lights():
+def test_values_are_in_the_papers_units_under_the_worst_of_four_lights():
     table = tables(run("Bicubic", {"lucy": 70.4}))["simgeo_x4_box"]
     assert cell_of(table, "lucy", "Bicubic").mean == pytest.approx(70.4)
     assert cell_of(table, "lucy", "Bicubic", "DSSIM_v").mean == pytest.approx(704)
@@ -83,7 +83,7 @@ def test_values_are_in_the_paper_s_units_and_the_worst_of_four_lights():
     assert any(note.startswith("Not computed: BadPix_d_5cm") for note in table.notes)
 
 
-def test_seeds_are_averaged_first_and_the_spread_of_an_average_is_that_of_the_seeds_averages():
+def test_seeds_are_averaged_first_and_their_averages_give_the_spread():
     values = {0: {"a": 10.0, "b": 40.0}, 1: {"a": 12.0, "b": 50.0}, 2: {"a": 17.0, "b": 30.0}}
     table = tables(*(run("DIP", each, seed=seed, dataset="mine") for seed, each in values.items()))["mine_x4_box"]
     single = cell_of(table, "a", "DIP")
@@ -94,19 +94,19 @@ def test_seeds_are_averaged_first_and_the_spread_of_an_average_is_that_of_the_se
     assert average.spread == pytest.approx(statistics.stdev([25, 31, 23.5]))
 
 
-def test_scenes_of_uneven_seeds_weigh_the_same_and_only_whole_seeds_spread():
+def test_scenes_of_uneven_seeds_weigh_the_same_and_only_complete_seeds_spread():
     runs = [run("DIP", {"a": 10.0, "b": 40.0}, dataset="m"), run("DIP", {"a": 20.0, "b": 60.0}, dataset="m", seed=1)]
     average = cell_of(tables(*runs, run("DIP", {"a": 90.0}, dataset="m", seed=2))["m_x4_box"], "m,", "DIP")
     assert average.mean == pytest.approx((40 + 50) / 2)
     assert (average.seeds, average.spread) == (2, pytest.approx(statistics.stdev([25, 40])))
 
 
-def test_one_seed_has_no_spread():
+def test_single_seed_has_no_spread():
     table = tables(run("DIP", {"a": 10.0, "b": 1.0}, dataset="mine"))["mine_x4_box"]
     assert all(cell.spread is None for group in table.groups for row in group.rows for cell in row.cells.values())
 
 
-def test_the_best_and_second_best_shown_values_are_marked_and_equal_ones_share():
+def test_best_and_second_best_are_marked_and_ties_share():
     runs = [run(label, {"a": value}) for label, value in (("A", 10.01), ("B", 9.99), ("C", 12.0), ("D", 13.0))]
     table = tables(*runs)["simgeo_x4_box"]
     assert [row.cells["RMSE_d"].rank for row in table.groups[0].rows] == [1, 1, 2, 0]  # both read 10.0
@@ -114,11 +114,11 @@ def test_the_best_and_second_best_shown_values_are_marked_and_equal_ones_share()
     assert texts == ["10.0", "10.0", "12.0", "13.0"]
 
 
-def test_a_method_alone_is_not_the_best():
+def test_single_method_is_not_marked_as_best():
     assert cell_of(tables(run("A", {"a": 1.0}))["simgeo_x4_box"], "a", "A").rank == 0
 
 
-def test_an_average_over_fewer_scenes_says_so_and_is_not_compared():
+def test_average_over_fewer_scenes_is_labelled_and_not_ranked():
     runs = [run("A", {"a": 1.0, "b": 9.0}, dataset="m"), run("B", {"a": 2.0, "b": 10.0}, dataset="m")]
     table = tables(*runs, run("C", {"a": 0.5}, dataset="m"))["m_x4_box"]
     partial = cell_of(table, "m,", "C")
@@ -127,20 +127,20 @@ def test_an_average_over_fewer_scenes_says_so_and_is_not_compared():
     assert any(note.startswith("(k of n)") for note in table.notes)
 
 
-def test_a_method_without_a_value_keeps_its_row():
+def test_method_without_a_value_keeps_its_row():
     table = tables(run("A", {"a": 1.0, "b": 9.0}), run("B", {"a": 2.0}))["simgeo_x4_box"]
     assert [row.label for row in group_of(table, "b").rows] == ["A", "B"]
     assert cell_of(table, "b", "B") is None
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf])
-def test_what_is_no_number_is_missing(value):
+def test_non_numeric_value_is_missing(value):
     table = tables(run("A", {"a": value, "b": 1.0}))["simgeo_x4_box"]
     assert cell_of(table, "a", "A") is None
     assert cell_of(table, "b", "A") is not None
 
 
-def test_the_summary_has_the_paper_s_six_averages_with_its_values():
+def test_summary_has_the_papers_six_averages_with_its_values():
     runs = [run("MSG-V", all_of(names), dataset=name) for name, names in PAPER_SCENES.items()]
     table = tables(*runs)["summary_x4_box"]
     titles = [group.about.published for group in table.groups]
@@ -153,7 +153,7 @@ def test_the_summary_has_the_paper_s_six_averages_with_its_values():
     assert group_of(table, "With missing").rows[0].published["RMSE_d"] == 107
 
 
-def test_the_published_averages_are_means_over_the_very_scenes_that_ours_are():
+def test_published_averages_are_over_the_same_scenes_as_ours():
     places = [Place(name, scene) for name, scenes in PAPER_SCENES.items() for scene in scenes]
     rows = published()[published()["method"] == "Bicubic"].set_index(["scene", "scale"])["BadPix_v_5"]
     singles = {place: each.published for place in places for each in sets_of_dataset([place])}
@@ -165,19 +165,19 @@ def test_the_published_averages_are_means_over_the_very_scenes_that_ours_are():
         assert statistics.mean(own) == pytest.approx(rows[each.published, 4], abs=0.051)
 
 
-def test_with_scenes_lacking_an_average_says_so_and_has_no_published_value():
+def test_average_with_missing_scenes_is_labelled_and_has_no_published_value():
     table = tables(run("MSG-V", all_of(SIMGEO[:2])))["summary_x4_box"]
     assert [group.about.title for group in table.groups] == ["SimGeo, average of 2 of the paper's 6 scenes"]
     assert not table.has_published
 
 
-def test_sets_of_the_same_scenes_are_averaged_once_in_the_place_of_the_first():
+def test_datasets_of_the_same_scenes_are_averaged_once_in_the_place_of_the_first():
     places = [Place("icl", "sofa"), Place("middlebury", "recycle"), Place("simgeo", "lucy")]
     titles = [each.title.partition(",")[0] for each in sets_of_summary(places, lambda _: True)]
     assert titles == ["ICL-NUIM", "Middlebury", "SimGeo", "Without missing measurements (SimGeo", "SimGeo"]
 
 
-def test_further_scenes_do_not_enter_the_paper_s_averages():
+def test_additional_scenes_do_not_enter_the_papers_averages():
     scenes = [*PAPER_SCENES["middlebury"], "adirondack"]
     table = tables(run("MSG-V", all_of(scenes), dataset="middlebury"))["middlebury_x4_box"]
     assert cell_of(table, "Middlebury, average of 7", "MSG-V").mean == pytest.approx(13)
@@ -186,7 +186,7 @@ def test_further_scenes_do_not_enter_the_paper_s_averages():
     assert not group_of(table, "Middlebury, average of 8").rows[0].published
 
 
-def test_the_statue_takes_lucy_s_place_only_where_lucy_is_not():
+def test_statue_replaces_lucy_only_where_lucy_is_missing():
     both = sets_of_dataset([Place("simgeo", name) for name in (*SIMGEO, "lucy")])
     assert Place("simgeo", "statue") not in both[-2].places
     assert Place("simgeo", "lucy") in both[-2].places
@@ -196,7 +196,7 @@ def test_the_statue_takes_lucy_s_place_only_where_lucy_is_not():
 
 
 @pytest.mark.parametrize(("shares", "title"), [((0.9, 1.0), "without"), ((0.9, 0.95), "with")])
-def test_scenes_of_other_data_sets_are_sorted_by_holes_in_their_truth(shares, title):
+def test_scenes_of_other_datasets_are_grouped_by_holes_in_their_truth(shares, title):
     holes = ["b"] if title == "with" else []
     runs = [run(label, {"b": 1.0}, dataset="m", share=share) for label, share in zip("AB", shares, strict=True)]
     others = [run(label, {"a": 1.0, "c": 1.0}, dataset="m") for label in "AB"]
@@ -206,7 +206,7 @@ def test_scenes_of_other_data_sets_are_sorted_by_holes_in_their_truth(shares, ti
     assert sets.get("Other scenes without missing measurements", ["a", "b", "c"]) == sorted({"a", "b", "c"} - {*holes})
 
 
-def test_a_stored_scene_tells_holes_of_the_truth_from_those_of_a_prediction(make_run, tmp_path):
+def test_holes_of_the_truth_are_told_from_those_of_a_prediction(make_run, tmp_path):
     folder = make_run(tmp_path, dataset="m", scenes=("a", "b"))
     runs = [run("A", {"a": 1.0, "b": 2.0}, dataset="m", share=0.9)]
     runs = [Run(**{**vars(each), "folder": folder}) for each in runs]
@@ -216,7 +216,7 @@ def test_a_stored_scene_tells_holes_of_the_truth_from_those_of_a_prediction(make
     assert titles == ["m, average of 2 scenes"]  # the same scenes are not averaged twice
 
 
-def test_the_paper_s_values_of_methods_that_were_not_run_stand_only_beside_its_own_scenes():
+def test_papers_values_of_methods_that_were_not_run_stand_only_beside_its_own_scenes():
     folder = "dsr.data.folder.Folder"
     table = tables(run("MSG-V", {"lucy": 23.6}, dataset="mine", target=folder))["mine_x4_box"]
     [group] = table.groups
@@ -239,12 +239,12 @@ def published_value(scene, method, scale=4, key="RMSE_d"):
     [{"downsampling": "nearest"}, {"dataset": "sunrgbd"}, {"size": 256}, {"scale": 2}, {"method": "mine"}],
     ids=str,
 )
-def test_the_paper_has_nothing_to_say_of_other_data_degradations_sizes_scales_and_methods(settings):
+def test_other_data_degradations_sizes_scales_and_methods_have_no_published_value(settings):
     [single, *_] = [tables(run("Mine", {"lucy": 1.0}, **{"method": "msg_v", **settings}))]
     assert not any(table.has_published for table in single.values())
 
 
-def test_a_method_is_compared_with_the_paper_s_whatever_its_label_is():
+def test_published_method_is_matched_whatever_its_label():
     table = tables(run("MSG-V (ensemble=1)", {"lucy": 1.0}, method="msg_v"))["simgeo_x4_box"]
     assert table.groups[0].rows[0].published["RMSE_d"] == 74
 
@@ -255,7 +255,7 @@ def study_of(*rows):
     return frame.assign(scale=4, downsampling="box", user_second=5.0, user_top2=frame["user_first"] + 5)
 
 
-def test_the_columns_of_a_study_join_with_its_intervals_and_higher_is_better():
+def test_study_columns_join_with_their_intervals_and_higher_is_better():
     study = study_of(
         ("m", "a", "A", 80.0, 70, 90), ("m", "b", "A", 60.0, 50, 70), ("m", "average", "A", 70.0, 65, 75),
         ("m", "a", "B", 20.0, 10, 30), ("m", "b", "B", 40.0, 30, 50),
@@ -269,7 +269,7 @@ def test_the_columns_of_a_study_join_with_its_intervals_and_higher_is_better():
     assert (other.mean, other.interval, other.rank) == (30, None, 2)
 
 
-def test_a_study_of_some_scenes_is_not_taken_for_one_of_all():
+def test_study_of_some_scenes_is_not_taken_for_one_of_all():
     study = study_of(("m", "a", "A", 80.0, 70, 90), ("m", "average", "A", 80.0, 65, 75))
     table = tables(run("A", {"a": 1.0, "b": 2.0}, dataset="m"), study=study)["m_x4_box"]
     average = cell_of(table, "m,", "A", "user_first")
@@ -277,26 +277,26 @@ def test_a_study_of_some_scenes_is_not_taken_for_one_of_all():
     assert cell_of(table, "b", "A", "user_first") is None
 
 
-def test_a_table_that_is_no_study_is_refused():
+def test_table_that_is_no_study_is_refused():
     with pytest.raises(ValueError, match="study: expected the table of dsr study collect, got one without dataset"):
         tables(run("A", {"a": 1.0}), study=pd.DataFrame({"x": [1]}))
 
 
-def test_a_study_s_file_is_read_as_it_was_written(tmp_path):
+def test_study_file_round_trips(tmp_path):
     study = study_of(("m", "01", "None", 80.0, 70, 90), ("m", "a", "A", 20.0, math.nan, math.nan))
     study.to_csv(tmp_path / "study.csv", index=False)
     pd.testing.assert_frame_equal(read_study(tmp_path / "study.csv"), study, check_dtype=False)
 
 
 @pytest.mark.parametrize("content", [b"", b"\xff\xfe\x00", b'"a\nb,c\n1,2,3', b"dataset,scene\nm,a\n", None])
-def test_a_file_that_is_no_study_is_refused_in_one_line(tmp_path, content):
+def test_file_that_is_no_study_is_refused_in_one_line(tmp_path, content):
     if content is not None:
         (tmp_path / "study.csv").write_bytes(content)
     with pytest.raises(ValueError, match=r"study.csv: expected the table of dsr study collect, got [^\n]+$"):
         read_study(tmp_path / "study.csv")
 
 
-def test_shares_that_are_no_numbers_are_refused(tmp_path):
+def test_non_numeric_study_fractions_are_refused(tmp_path):
     study_of(("m", "a", "A", 80.0, 70, 90)).assign(user_first="most").to_csv(tmp_path / "study.csv", index=False)
     with pytest.raises(ValueError, match=r"study.csv: expected numbers in user_first, got text"):
         read_study(tmp_path / "study.csv")

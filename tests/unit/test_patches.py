@@ -101,7 +101,7 @@ def _equal(first: list[Batch], second: list[Batch]) -> bool:
     return len(first) == len(second) and all(map(_same, first, second))
 
 
-def test_a_patch_is_a_pure_function_of_the_seed_and_its_number() -> None:
+def test_patch_is_a_pure_function_of_the_seed_and_its_number() -> None:
     scenes, settings = [_scene(i) for i in range(3)], _settings(colour=0.1)
     whole = Patches([scenes], settings, X4, seed=5, count=12)
     later = Patches([scenes], settings, X4, seed=5, first=7, count=3)
@@ -113,7 +113,7 @@ def test_a_patch_is_a_pure_function_of_the_seed_and_its_number() -> None:
     assert not _same(Patches([scenes], settings, X4, seed=6, count=12)[7], whole[7])
 
 
-def test_the_global_random_states_neither_matter_nor_change() -> None:
+def test_patches_neither_use_nor_change_the_global_random_states() -> None:
     patches = _patches(colour=0.1)
     torch.manual_seed(1)
     before, first = torch.get_rng_state(), patches[3]
@@ -123,12 +123,12 @@ def test_the_global_random_states_neither_matter_nor_change() -> None:
     assert _same(patches[3], first)
 
 
-def test_workers_cut_the_patches_that_the_trainer_would() -> None:
+def test_workers_cut_the_same_patches_as_the_trainer() -> None:
     alone, helped = (_batches(_data(colour=0.1, workers=workers), 3, 1) for workers in (0, 2))
     assert _equal(alone, helped)
 
 
-def test_a_loader_begins_at_the_trainers_step_and_has_no_length() -> None:
+def test_loader_begins_at_the_trainers_step_and_has_no_length() -> None:
     data = _data(colour=0.1)
     whole = _batches(data, 6)
     assert _equal(_batches(data, 2, 4), whole[4:])
@@ -144,14 +144,14 @@ def test_devices_share_the_batches_of_a_step() -> None:
     assert _equal(_batches(data, 2, 1, rank=1, world=2), [whole[3], whole[5]])
 
 
-def test_some_patches_are_the_first_of_the_run() -> None:
+def test_first_patches_can_be_requested() -> None:
     data = _data()
     first = _batches(data, 2)
     for i, patch in enumerate(data.first_patches(4)):
         assert all(torch.equal(patch[name], first[i // 2][name][i % 2]) for name in patch)
 
 
-def test_held_out_scenes_are_validated_with_whole_and_never_trained_on() -> None:
+def test_held_out_scenes_are_validated_whole_and_never_trained_on() -> None:
     data = _data()
     assert data.training_count == 4
     assert {kind: names for kind, (_, names) in data.validation_scenes().items()} == {"set": ["scene4", "scene5"]}
@@ -165,7 +165,7 @@ def test_held_out_scenes_are_validated_with_whole_and_never_trained_on() -> None
     torch.testing.assert_close(whole[0]["depth"][0], _tilted(CAMERA), rtol=0, atol=0)
 
 
-def test_of_each_data_set_the_first_scenes_alone_can_be_used() -> None:
+def test_dataset_can_be_limited_to_its_first_scenes() -> None:
     sources = [Part(_Source([_scene(i) for i in range(6)]))]
     data = PatchData(sources, _settings(scenes=3, validation_scenes=1), X4)
     assert data.used_scenes[0][1] == ["scene0", "scene1"]
@@ -174,14 +174,14 @@ def test_of_each_data_set_the_first_scenes_alone_can_be_used() -> None:
         _settings(scenes=0)
 
 
-def test_parts_give_patches_by_their_shares() -> None:
+def test_parts_give_patches_by_their_fractions() -> None:
     parts = [_scene(0)], [_scene(1), _scene(2)], [_scene(3)]
     patches = Patches(parts, _settings(), X4, shares=[1, 3, 0], count=400)
     seen = np.array([_places(patches[i])[2] for i in range(400)])
     assert np.bincount(seen, minlength=4) / 400 == pytest.approx([0.25, 0.375, 0.375, 0], abs=0.07)
 
 
-def test_a_part_gets_its_share_and_a_scene_its_turn_though_their_depth_is_sparse() -> None:
+def test_part_keeps_its_fraction_and_a_scene_its_turn_with_sparse_depth() -> None:
     sparse = torch.full((1, 44, 60), torch.nan, dtype=torch.float64)
     sparse[0, ::3, ::3] = 2.0
     patches = Patches([[_scene(0)], [_scene(1), _scene(2, depth=sparse)]], _settings(), X4, shares=[2, 2], count=400)
@@ -189,19 +189,19 @@ def test_a_part_gets_its_share_and_a_scene_its_turn_though_their_depth_is_sparse
     assert np.bincount(seen) / 400 == pytest.approx([0.5, 0.25, 0.25], abs=0.07)
 
 
-def test_shares_that_are_all_zero_are_refused() -> None:
+def test_fractions_that_are_all_zero_are_refused() -> None:
     with pytest.raises(ValueError, match=r"^shares: expected a positive number among them, all are 0"):
         Patches([[_scene(0)], [_scene(1)]], _settings(), X4, shares=[0, 0])
 
 
-def test_patches_that_travel_to_another_process_stay_the_same() -> None:
+def test_patches_sent_to_another_process_are_unchanged() -> None:
     patches = _patches([_scene(i) for i in range(3)], count=12)
     before = [patches[i] for i in range(6)]
     travelled = pickle.loads(pickle.dumps(patches))
     assert _equal([travelled[i] for i in range(6)], before)
 
 
-def test_each_part_holds_its_last_scenes_out_under_a_name_of_its_own() -> None:
+def test_parts_hold_out_their_last_scenes_under_distinct_names() -> None:
     sources = [_Source([_scene(i) for i in numbers]) for numbers in ((0, 1, 2), (3, 4))]
     data = PatchData([Part(source) for source in sources], _settings(validation_scenes=1), X4)
     assert data.validation_sets == ["set", "set_2"]
@@ -212,7 +212,7 @@ def test_each_part_holds_its_last_scenes_out_under_a_name_of_its_own() -> None:
     assert [next(iter(loader))["rgb"][0, 2, 0, 0] * 255 for loader in data.val_dataloader()] == pytest.approx([2, 4])
 
 
-def test_other_data_sets_validate_whole_and_alone_where_nothing_is_held_out() -> None:
+def test_other_datasets_validate_whole_and_alone_where_nothing_is_held_out() -> None:
     bare = Scene("set", "bare", _scene().rgb, CAMERA, None, {4: torch.ones(1, 11, 15)})
     more: dict[str, SceneSource] = {"mine": _Source([_scene(8), bare, _scene(9)])}
     data = PatchData([Part(_Source([_scene(0)]))], _settings(validation_scenes=0), X4, validation=more)
@@ -223,13 +223,13 @@ def test_other_data_sets_validate_whole_and_alone_where_nothing_is_held_out() ->
         _data(validation_scenes=0)
 
 
-def test_a_scene_that_is_trained_on_cannot_validate() -> None:
+def test_training_scene_cannot_validate() -> None:
     more: dict[str, SceneSource] = {"mine": _Source([_scene(8), _scene(1)])}
     with pytest.raises(ValueError, match=r"validation.mine: expected scenes that are not trained on, got scene1"):
         PatchData([Part(_Source([_scene(i) for i in range(6)]))], _settings(), X4, validation=more)
 
 
-def test_a_scene_that_is_trained_on_cannot_validate_under_another_name() -> None:
+def test_training_scene_cannot_validate_under_another_name() -> None:
     class _Copies(_Source):
         def fingerprint(self, scene: str) -> str:
             return "the same" if scene in ("scene1", "scene8") else scene
@@ -242,7 +242,7 @@ def test_a_scene_that_is_trained_on_cannot_validate_under_another_name() -> None
     ]  # fmt: skip
 
 
-def test_a_validation_set_without_any_truth_is_refused() -> None:
+def test_validation_set_without_truth_is_refused() -> None:
     bare = Scene("set", "bare", _scene().rgb, CAMERA, None, {4: torch.ones(1, 11, 15)})
     more: dict[str, SceneSource] = {"mine": _Source([bare])}
     with pytest.raises(ValueError, match=r"validation.mine: expected scenes with a true depth, there is none"):
@@ -250,7 +250,7 @@ def test_a_validation_set_without_any_truth_is_refused() -> None:
 
 
 @pytest.mark.parametrize("share", [-1.0, float("nan"), float("inf")])
-def test_a_share_that_is_none_is_refused(share: float) -> None:
+def test_invalid_fraction_is_refused(share: float) -> None:
     with pytest.raises(ValueError, match=r"^share: expected 0 or a positive number"):
         Part(_Source([_scene()]), share)
 
@@ -265,7 +265,7 @@ def test_patches_reach_every_row_and_column_of_a_scene() -> None:
 
 
 @pytest.mark.parametrize("camera", [CAMERA, STEREO])
-def test_points_of_a_patch_are_those_of_its_pixels_in_the_scene_up_to_the_mirror(camera: Camera) -> None:
+def test_patch_has_the_points_of_its_pixels_in_the_scene_up_to_the_mirror(camera: Camera) -> None:
     bumps = torch.from_numpy(np.random.default_rng(0).uniform(1, 3, (1, 44, 60)))
     full = (bumps * camera.rays()).numpy()
     patches, mirrors = _patches([_scene(camera=camera, depth=bumps)], count=60), set()
@@ -280,7 +280,7 @@ def test_points_of_a_patch_are_those_of_its_pixels_in_the_scene_up_to_the_mirror
     assert mirrors == {(x, y) for x in (-1, 1) for y in (-1, 1)}
 
 
-def test_a_plane_is_a_plane_in_the_mirrored_frame() -> None:
+def test_plane_stays_a_plane_in_the_mirrored_frame() -> None:
     patches = _patches()
     for i in range(20):
         patch = patches[i]
@@ -290,7 +290,7 @@ def test_a_plane_is_a_plane_in_the_mirrored_frame() -> None:
         torch.testing.assert_close(offset, torch.full_like(offset, -2.0), rtol=2e-6, atol=0)
 
 
-def test_without_flip_nothing_is_mirrored() -> None:
+def test_nothing_is_mirrored_with_flip_off() -> None:
     patches = _patches(flip=False)
     for i in range(40):
         rows, columns, _ = _places(patches[i])
@@ -298,7 +298,7 @@ def test_without_flip_nothing_is_mirrored() -> None:
 
 
 @pytest.mark.parametrize("camera", [CAMERA, STEREO])
-def test_the_coarse_disparity_is_the_box_mean_of_the_fine_one_in_fine_pixels(camera: Camera) -> None:
+def test_low_resolution_disparity_is_the_box_mean_in_high_resolution_pixels(camera: Camera) -> None:
     patches = _patches([_scene(camera=camera)])
     for i in range(10):
         patch = patches[i]
@@ -310,7 +310,7 @@ def test_the_coarse_disparity_is_the_box_mean_of_the_fine_one_in_fine_pixels(cam
         np.testing.assert_allclose((patch["bf"] / patch["depth"] - patch["doffs"])[0].numpy(), fine, rtol=1e-5)
 
 
-def test_the_networks_input_depends_on_the_coarse_map_alone() -> None:
+def test_network_input_depends_on_the_low_resolution_map_alone() -> None:
     """High-resolution depth that changes within its blocks, far beyond the low-resolution range, leaves no trace."""
     disparity = 50 * 0.2 / _tilted(CAMERA)
     checker = torch.tensor([[1.0, -1.0], [-1.0, 1.0]]).repeat(22, 30).double()
@@ -325,7 +325,7 @@ def test_the_networks_input_depends_on_the_coarse_map_alone() -> None:
 
 
 @pytest.mark.parametrize("camera", [CAMERA, STEREO])
-def test_points_of_a_turned_patch_are_those_of_its_pixels_turned_about_the_axis(camera: Camera) -> None:
+def test_turned_patch_has_the_turned_points_of_its_pixels(camera: Camera) -> None:
     bumps = torch.from_numpy(np.random.default_rng(0).uniform(1, 3, (1, 44, 60)))
     full = (bumps * camera.rays()).numpy()
     patches, turns = _patches([_scene(camera=camera, depth=bumps)], count=80, flip=False, rotate=True), set()
@@ -341,7 +341,7 @@ def test_points_of_a_turned_patch_are_those_of_its_pixels_turned_about_the_axis(
     assert turns == {(1, 0), (-1, 0), (0, 1), (0, -1)}
 
 
-def test_depth_is_scaled_evenly_and_within_its_range() -> None:
+def test_depth_scales_are_uniform_within_their_range() -> None:
     plain, scaled = (_patches(count=60, depth_scale=s) for s in (0.0, 0.5))
     factors = []
     for i in range(60):
@@ -357,7 +357,7 @@ def test_depth_is_scaled_evenly_and_within_its_range() -> None:
 
 
 @pytest.mark.parametrize("camera", [CAMERA, STEREO])
-def test_bounds_lie_between_the_patchs_own_and_the_scenes_and_half_are_the_scenes(camera: Camera) -> None:
+def test_min_max_lies_between_the_patchs_and_the_scenes_and_half_are_the_scenes(camera: Camera) -> None:
     """The scene's, as the patch's camera counts it: turned, and nearer or farther."""
     patches = _patches([_scene(camera=camera)], count=200, rotate=True, depth_scale=0.5)
     coarse = 1 / (1 / _tilted(camera)).reshape(11, 4, 15, 4).mean(dim=(1, 3)).numpy()
@@ -380,7 +380,7 @@ def test_bounds_lie_between_the_patchs_own_and_the_scenes_and_half_are_the_scene
     assert between.std() == pytest.approx(12**-0.5, abs=0.05)  # of a uniform distribution
 
 
-def test_bounds_of_a_noisy_patch_contain_its_coarse_map_or_are_the_clean_scenes() -> None:
+def test_min_max_of_a_noisy_patch_contains_its_low_resolution_map_or_is_the_clean_scenes() -> None:
     patches = Patches([[_scene()]], _settings(), Degradation(4, BOX, GaussianMultiplicative(0.005)), count=60)
     coarse = 10 * (1 / _tilted(CAMERA)).reshape(11, 4, 15, 4).mean(dim=(1, 3))
     clean = 0
@@ -393,7 +393,7 @@ def test_bounds_of_a_noisy_patch_contain_its_coarse_map_or_are_the_clean_scenes(
     assert clean > 15
 
 
-def test_bounds_come_of_the_coarse_map_and_know_nothing_of_the_fine_one() -> None:
+def test_min_max_depends_on_the_low_resolution_map_alone() -> None:
     depth = torch.full((1, 44, 60), 2.0, dtype=torch.float64)
     depth[0, ::4, ::4] = 1.0  # one pixel of disparity 10 among fifteen of 5 in each block, wherever a patch begins
     patches = _patches([_scene(depth=depth)], count=20)
@@ -401,7 +401,7 @@ def test_bounds_come_of_the_coarse_map_and_know_nothing_of_the_fine_one() -> Non
         assert patches[i]["min_max"].flatten().tolist() == pytest.approx([5.3125, 1.001 * 5.3125], rel=1e-6)
 
 
-def test_bounds_of_a_whole_scene_are_its_coarse_maps_own_and_those_of_a_wall_some_way_apart() -> None:
+def test_min_max_of_a_whole_scene_is_its_low_resolution_maps_and_that_of_a_wall_has_width() -> None:
     whole = WholeScenes([_scene()], X4)[0]
     assert whole["min_max"].flatten().tolist() == pytest.approx(
         [float(whole["disparity_lr"].min()), float(whole["disparity_lr"].max())]
@@ -426,7 +426,7 @@ def test_noise_is_new_in_every_patch_and_the_same_in_every_run() -> None:
     assert not torch.equal(whole, other)
 
 
-def test_colour_is_a_gain_per_channel_of_the_asked_spread() -> None:
+def test_colour_is_a_gain_per_channel_of_the_given_spread() -> None:
     grey = replace(_scene(), rgb=torch.full((3, 44, 60), 0.4))
     patches = _patches([grey], count=300, colour=0.1)
     gains = np.stack([patches[i]["rgb"].numpy() / 0.4 for i in range(300)])
@@ -437,14 +437,14 @@ def test_colour_is_a_gain_per_channel_of_the_asked_spread() -> None:
     assert np.abs(np.corrcoef(gains.T)[np.triu_indices(3, 1)]).max() < 0.2
 
 
-def test_colour_stays_within_its_range_and_off_leaves_the_photo_as_it_is() -> None:
+def test_colour_stays_within_its_range_and_is_unchanged_when_off() -> None:
     bright = replace(_scene(), rgb=torch.full((3, 44, 60), 0.97))
     strong, off = _patches([bright], colour=0.5), _patches([bright])
     assert all(0 <= strong[i]["rgb"].min() <= strong[i]["rgb"].max() <= 1 for i in range(40))
     assert all(torch.equal(off[i]["rgb"], torch.full((3, SIZE, SIZE), 0.97)) for i in range(5))
 
 
-def test_a_share_of_the_photos_gets_another_gamma_blur_and_noise() -> None:
+def test_given_fraction_of_the_photos_gets_another_gamma_blur_and_noise() -> None:
     step = replace(_scene(), rgb=(0.2 + 0.6 * (torch.arange(60.0) >= 30)).expand(3, 44, 60).contiguous())
     patches = _patches([step], count=400, photo=0.5, flip=False)
     changed = [patch["rgb"] for patch in (patches[i] for i in range(400)) if len(patch["rgb"].unique()) > 2]
@@ -458,7 +458,7 @@ def test_a_share_of_the_photos_gets_another_gamma_blur_and_noise() -> None:
     assert all(photo.min() >= 0 and photo.max() <= 1 for photo in changed)
 
 
-def test_holes_stay_holes_and_half_of_a_patch_is_known_where_that_can_be_had() -> None:
+def test_holes_are_kept_and_half_of_a_patch_is_valid_where_possible() -> None:
     depth = _tilted(CAMERA)
     depth[:, :, :30] = torch.nan
     patches, shares = _patches([_scene(depth=depth)], count=60), []
@@ -479,7 +479,7 @@ def test_scenes_that_are_mostly_holes_still_give_patches() -> None:
     assert all(0 < patches[i]["depth"].isfinite().float().mean() < 0.5 for i in range(40))
 
 
-def test_shapes_and_types_are_those_promised() -> None:
+def test_batches_have_the_documented_shapes_and_types() -> None:
     shapes = {
         "rgb": (3, 16, 16),
         "disparity_lr": (1, 4, 4),
@@ -497,12 +497,12 @@ def test_shapes_and_types_are_those_promised() -> None:
     assert all(value.dtype == (torch.float32 if name in single else torch.float64) for name, value in whole.items())
 
 
-def test_a_data_set_with_too_few_scenes_is_refused() -> None:
+def test_dataset_with_too_few_scenes_is_refused() -> None:
     with pytest.raises(ValueError, match=r"^validation_scenes: expected fewer than the 6 scenes of set, got 6"):
         _data(validation_scenes=6)
 
 
-def test_a_scene_too_small_for_a_patch_is_refused_by_name_before_training() -> None:
+def test_scene_too_small_for_a_patch_is_refused_by_name_before_training() -> None:
     small = _scene(1, replace(CAMERA, width=60, height=30))
     message = "patch: expected at most scene1's 30 x 60, got 32"
     with pytest.raises(ValueError, match=message):
@@ -511,26 +511,26 @@ def test_a_scene_too_small_for_a_patch_is_refused_by_name_before_training() -> N
         _patches([_scene(0), small], patch=32)
 
 
-def test_a_scene_without_true_depth_is_refused_by_name() -> None:
+def test_scene_without_truth_is_refused_by_name() -> None:
     measured = Scene("set", "bare", _scene().rgb, CAMERA, None, {4: torch.ones(1, 11, 15)})
     with pytest.raises(ValueError, match="bare: expected a true depth to train with, there is none"):
         _data([measured, *(_scene(i) for i in range(2))], validation_scenes=1).setup()
 
 
-def test_a_patch_that_the_scale_does_not_divide_is_refused() -> None:
+def test_patch_that_the_scale_does_not_divide_is_refused() -> None:
     with pytest.raises(ValueError, match=r"^patch: expected a size that scale=4 divides, got 30"):
         _data(patch=30)
     with pytest.raises(ValueError, match=r"^patch: expected a size that scale=16 divides, got 24"):
         _data(degradation=Degradation(16, BOX), patch=24)
 
 
-def test_a_measured_map_cannot_be_cut() -> None:
+def test_measured_map_cannot_be_cropped() -> None:
     patches = Patches([[_scene()]], _settings(), Degradation(4, Measured()))  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="downsampling=measured expects a low-resolution map at x4"):
         patches[0]
 
 
-def test_no_scene_at_all_is_refused() -> None:
+def test_empty_dataset_is_refused() -> None:
     with pytest.raises(ValueError, match="expected a scene or more"):
         Patches([], _settings(), X4)
     with pytest.raises(ValueError, match="expected a scene or more"):
@@ -550,12 +550,12 @@ def test_no_scene_at_all_is_refused() -> None:
         ({"colour": float("nan")}, "colour: expected 0 or more, got nan"),
     ],
 )
-def test_a_setting_out_of_range_is_refused_by_its_key(changes: dict[str, Any], message: str) -> None:
+def test_setting_out_of_range_is_refused_by_its_key(changes: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         _settings(**changes)
 
 
-def test_where_noise_leaves_nothing_of_a_window_another_one_is_taken() -> None:
+def test_window_that_noise_leaves_empty_is_replaced_by_another() -> None:
     far = _scene(1, depth=torch.full((1, CAMERA.height, CAMERA.width), 50.0, dtype=torch.float64))
     degradation = Degradation(4, BOX, Kinect(nearest=None, farthest=20.0))
     patches = Patches([[far, _scene()]], _settings(), degradation)

@@ -52,7 +52,7 @@ def _map(height: int, width: int, count: int = 1) -> Tensor:
     return 20 + 9 * _random(count, 1, height, width, seed=4)
 
 
-def test_half_a_window_has_one_of_each_two_opposite_offsets() -> None:
+def test_half_window_has_one_of_each_two_opposite_offsets() -> None:
     for window in (3, 5, 7):
         half = half_window(window)
         both = {*half, *((-v, -u) for v, u in half)}
@@ -61,12 +61,12 @@ def test_half_a_window_has_one_of_each_two_opposite_offsets() -> None:
 
 
 @pytest.mark.parametrize("window", [1, 4, -3])
-def test_a_window_of_an_even_size_is_refused_in_one_line(window: int) -> None:
+def test_even_window_size_is_refused_in_one_line(window: int) -> None:
     with pytest.raises(ValueError, match=rf"^window: expected an odd number of at least 3, got {window}$"):
         UnrolledHuber(window)
 
 
-def test_the_sums_are_the_adjoint_of_the_differences_of_an_image_in_zeros() -> None:
+def test_window_sums_are_the_adjoint_of_zero_padded_differences() -> None:
     offsets = half_window(5)
     x, p = _random(2, 1, 6, 7), _random(2, 12, 8, 11, seed=1)
     padded = functional.pad(x, (4, 4, 2, 2))
@@ -74,7 +74,7 @@ def test_the_sums_are_the_adjoint_of_the_differences_of_an_image_in_zeros() -> N
     torch.testing.assert_close(left, (x * pair_sums(p, offsets)).sum())
 
 
-def test_the_unrolled_stage_equals_a_plain_loop() -> None:
+def test_unrolled_stage_equals_a_plain_loop() -> None:
     window, size, data, huber = 5, 16, 7.0, 0.4
     first, weights = _problem(size, window)
     stage = UnrolledHuber(window, 4, data, huber).double().requires_grad_(False)
@@ -122,7 +122,7 @@ def _energy(moved: Tensor, first: Tensor, weights: Tensor, data: float, huber: f
     return pairs.sum() + data / 2 * moved.square().sum()
 
 
-def test_many_steps_reach_the_least_energy_that_another_optimiser_finds() -> None:
+def test_many_steps_reach_the_minimum_that_another_optimiser_finds() -> None:
     window, data, huber = 3, 2.0, 0.3
     first, weights = _problem(8, window)
     steps = [safe_step(data, huber, window)] * 200
@@ -147,7 +147,7 @@ def test_many_steps_reach_the_least_energy_that_another_optimiser_finds() -> Non
     torch.testing.assert_close(found, other, rtol=0, atol=1e-6)
 
 
-def test_gradients_with_respect_to_maps_weights_and_parameters_are_right() -> None:
+def test_gradients_of_maps_weights_and_parameters_agree_with_finite_differences() -> None:
     window = 3
     first, weights = _problem(4, window)
     numbers = [torch.tensor(value, dtype=torch.float64) for value in (3.0, 0.5, 0.2, 0.6, 0.7)]
@@ -161,7 +161,7 @@ def test_gradients_with_respect_to_maps_weights_and_parameters_are_right() -> No
 
 
 @pytest.mark.parametrize("scale", [2, 4, 8, 16])
-def test_before_training_a_plane_is_reproduced_up_to_the_border(scale: int) -> None:
+def test_untrained_pdn_reproduces_a_plane_up_to_the_border(scale: int) -> None:
     torch.manual_seed(0)
     net = PrimalDualNetwork(scale, width=6, layers=3).requires_grad_(False)
     fine = plane_map(6 * scale, 7 * scale, 0.1, -0.07)
@@ -170,7 +170,7 @@ def test_before_training_a_plane_is_reproduced_up_to_the_border(scale: int) -> N
     torch.testing.assert_close(result, fine, rtol=0, atol=1e-6)
 
 
-def test_a_plane_stays_one_whatever_the_weights_are_where_it_is_not_too_steep_for_epsilon() -> None:
+def test_plane_is_reproduced_for_any_weights_where_it_is_not_too_steep_for_epsilon() -> None:
     net, fine = _net(noise=0.3), plane_map(80, 84)
     with torch.no_grad():
         net.stage.log_huber.fill_(3.0)  # e^3 times weights of about 1/4 is far above the slopes
@@ -179,7 +179,7 @@ def test_a_plane_stays_one_whatever_the_weights_are_where_it_is_not_too_steep_fo
     torch.testing.assert_close(result, fine, rtol=0, atol=1e-6)
 
 
-def test_windows_answer_as_the_whole_does() -> None:
+def test_windows_equal_the_whole_image() -> None:
     net = _net(2, iterations=2)
     rgb, coarse = _photo(80, 84), _map(40, 42)
     whole = net.upsample(rgb, coarse)
@@ -193,7 +193,7 @@ def test_windows_answer_as_the_whole_does() -> None:
     assert float(outside.abs().max()) > 1e-3  # nearer to the cut it differs
 
 
-def test_parameters_of_the_iteration_stay_positive_whatever_a_training_does_to_them() -> None:
+def test_iteration_parameters_stay_positive_in_any_training() -> None:
     stage = UnrolledHuber(3, 2).requires_grad_(False)
     with torch.no_grad():
         for parameter in stage.parameters():
@@ -201,7 +201,7 @@ def test_parameters_of_the_iteration_stay_positive_whatever_a_training_does_to_t
     assert all(float(value) > 0 for step in stage.steps() for value in step)
 
 
-def test_a_training_reaches_every_parameter() -> None:
+def test_training_reaches_every_parameter() -> None:
     net = PrimalDualNetwork(2, width=4, layers=2, window=3, iterations=2)
     torch.nn.init.normal_(net.head.weight, std=0.3)
     coarse = _map(6, 6)
@@ -212,7 +212,7 @@ def test_a_training_reaches_every_parameter() -> None:
         assert bool((parameter.grad != 0).any()), name
 
 
-def test_the_convolutions_may_run_in_bfloat16() -> None:
+def test_convolutions_may_run_in_bfloat16() -> None:
     net, rgb, coarse = _net(), _photo(24, 28), _map(6, 7)
     exact = net.upsample(rgb, coarse)
     with torch.autocast("cpu", torch.bfloat16):

@@ -54,20 +54,20 @@ def _random(height: int = 32, width: int = 48) -> Tensor:
 @every_method
 @pytest.mark.parametrize("scale", SCALES)
 @pytest.mark.parametrize("kernel", ["box", "nearest"])
-def test_a_plane_is_reproduced_exactly_under_a_photo_of_noise(method: Build, scale: int, kernel: Kernel) -> None:
+def test_plane_is_reproduced_exactly_under_a_photo_of_noise(method: Build, scale: int, kernel: Kernel) -> None:
     plane = _plane()
     torch.testing.assert_close(_result(method(), _sample(plane, kernel, scale)), plane, rtol=0, atol=1e-10)
 
 
 @every_method
-def test_without_slopes_a_plane_is_reproduced_to_a_coarse_pixels_rise_away_from_the_border(method: Build) -> None:
+def test_plane_without_slopes_is_reproduced_to_a_low_resolution_pixels_rise_away_from_the_border(method: Build) -> None:
     plane = _plane(64, 64)
     error = (_result(method(slopes=False), _sample(plane)) - plane).abs()[16:-16, 16:-16]
     assert 1e-3 < float(error.max()) < 4 * (0.05 + 0.03)
 
 
 @every_method
-def test_a_hole_in_a_plane_is_filled_with_the_plane(method: Build) -> None:
+def test_hole_in_a_plane_is_filled_with_the_plane(method: Build) -> None:
     holed = _plane()
     holed[8:24, 12:32] = torch.nan
     torch.testing.assert_close(_result(method(fill_holes=True), _sample(holed)), _plane(), rtol=0, atol=1e-10)
@@ -75,7 +75,7 @@ def test_a_hole_in_a_plane_is_filled_with_the_plane(method: Build) -> None:
 
 @every_method
 @pytest.mark.parametrize("slopes", [True, False])
-def test_a_factor_and_a_constant_on_the_disparity_come_out_again(method: Build, slopes: bool) -> None:
+def test_methods_are_equivariant_to_scale_and_offset_of_disparity(method: Build, slopes: bool) -> None:
     fine = _result(method(slopes=slopes), _sample(_random()))
     moved = _result(method(slopes=slopes), _sample(2 * _random() + 7))
     torch.testing.assert_close(moved, 2 * fine + 7, rtol=0, atol=1e-10)
@@ -83,9 +83,7 @@ def test_a_factor_and_a_constant_on_the_disparity_come_out_again(method: Build, 
 
 @every_method
 @pytest.mark.parametrize("fill", [True, False])
-def test_a_fine_pixel_is_a_hole_where_its_nearest_coarse_pixel_is_unless_holes_are_filled(
-    method: Build, fill: bool
-) -> None:
+def test_holes_are_where_the_nearest_low_resolution_pixel_is_missing_unless_filled(method: Build, fill: bool) -> None:
     holed = _random()
     holed[4:12, 8:16] = torch.nan
     holed[28:, :4] = torch.nan
@@ -96,7 +94,7 @@ def test_a_fine_pixel_is_a_hole_where_its_nearest_coarse_pixel_is_unless_holes_a
 
 
 @every_method
-def test_without_slopes_an_answer_lies_between_the_known_values_and_holes_count_nowhere(method: Build) -> None:
+def test_result_without_slopes_lies_between_the_valid_values(method: Build) -> None:
     """A hole that counted as 0 would pull its surroundings below 5."""
     flat = torch.full((32, 48), 5.0).double()
     flat[8:20, 12:32] = torch.nan
@@ -106,7 +104,7 @@ def test_without_slopes_an_answer_lies_between_the_known_values_and_holes_count_
 
 
 @every_method
-def test_one_known_coarse_pixel_is_enough(method: Build) -> None:
+def test_single_valid_low_resolution_pixel_is_enough(method: Build) -> None:
     lonely = torch.full((32, 48), torch.nan).double()
     lonely[8:12, 8:12] = 5.0
     fine = _result(method(fill_holes=True), _sample(lonely))
@@ -115,12 +113,12 @@ def test_one_known_coarse_pixel_is_enough(method: Build) -> None:
 
 @every_method
 @pytest.mark.parametrize(("height", "width"), [(4, 4), (4, 40), (36, 4), (20, 52)])
-def test_any_size_has_an_answer_everywhere(method: Build, height: int, width: int) -> None:
+def test_result_is_complete_at_any_size(method: Build, height: int, width: int) -> None:
     assert bool(_result(method(), _sample(_random(height, width))).isfinite().all())
 
 
 @every_method
-def test_turning_everything_by_a_half_turns_the_answer(method: Build) -> None:
+def test_half_turn_of_the_input_turns_the_result(method: Build) -> None:
     """Rows and columns are solved in order, but their own direction is none."""
     camera = Camera(48, 32, 60.0, 60.0, 23.5, 15.5)
     photo, depth = _photo(32, 48), 1 + _random()[None] / 9
@@ -132,7 +130,7 @@ def test_turning_everything_by_a_half_turns_the_answer(method: Build) -> None:
 
 
 @every_method
-def test_the_answer_is_positive_depth_even_where_far_and_near_meet(method: Build) -> None:
+def test_result_is_positive_depth_even_where_far_and_near_meet(method: Build) -> None:
     disparity = torch.where(torch.arange(48) % 16 < 8, 0.01, 40.0).double().expand(32, 48)
     sample = _sample(disparity)
     fine = method()(sample)
@@ -141,31 +139,31 @@ def test_the_answer_is_positive_depth_even_where_far_and_near_meet(method: Build
 
 
 @every_method
-def test_the_truth_is_not_looked_at_and_the_answer_is_the_same_each_time(method: Build) -> None:
+def test_result_is_deterministic_and_independent_of_the_truth(method: Build) -> None:
     sample = _sample(_random())
     blind = DepthSample("", "", sample.rgb, sample.depth_lr, sample.camera, sample.camera_lr, sample.scale)
     assert torch.equal(method()(sample), method()(blind))
 
 
 @every_method
-def test_the_result_has_the_precision_of_the_coarse_depth(method: Build) -> None:
+def test_result_has_the_precision_of_the_low_resolution_depth(method: Build) -> None:
     single = _sample(_random().float(), photo=_photo(32, 48).float())
     assert method()(single).dtype == torch.float32
     torch.testing.assert_close(method()(single), method()(_sample(_random())).float(), rtol=1e-3, atol=0)
 
 
 @every_method
-def test_the_method_works_on_disparity(method: Build) -> None:
+def test_guided_methods_work_on_disparity(method: Build) -> None:
     assert method().range_type == "disparity"
 
 
-def test_a_slope_is_the_smaller_difference_without_the_pixel_that_mixes_a_step() -> None:
+def test_slope_is_the_smaller_difference_without_the_pixel_that_mixes_a_step() -> None:
     values = torch.tensor([[0.0, 1.0, 2.0, 6.0, 10.0, 11.0, 12.0, 11.0, 10.0]]).double()
     expected = torch.tensor([[1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 0.0, -1.0, -1.0]]).double()
     torch.testing.assert_close(slopes_along(values, 1), expected)
     torch.testing.assert_close(slopes_along(values.T, 0), expected.T)
 
 
-def test_beside_a_hole_the_slope_is_the_one_difference_that_there_is() -> None:
+def test_slope_beside_a_hole_is_the_remaining_difference() -> None:
     values = torch.tensor([0.0, 2.0, 4.0, torch.nan, 9.0, 12.0, 15.0]).double()
     torch.testing.assert_close(slopes_along(values, 0), torch.tensor([2.0, 2.0, 2.0, 2.0, 3.0, 3.0, 3.0]).double())

@@ -105,7 +105,7 @@ def rows(folder):
         return list(csv.DictReader(file))
 
 
-def test_a_run_leaves_predictions_scores_and_a_summary_and_nothing_else(tmp_path):
+def test_run_writes_predictions_scores_and_a_summary_and_nothing_else(tmp_path):
     outcome, *_ = run(toy_study(), tmp_path)
     assert files(tmp_path) == [
         *("predictions/a.npz", "predictions/b.npz"),
@@ -114,7 +114,7 @@ def test_a_run_leaves_predictions_scores_and_a_summary_and_nothing_else(tmp_path
     assert (outcome.made, outcome.reused, outcome.failures, outcome.unscored) == (["a", "b"], [], {}, [])
 
 
-def test_a_prediction_is_metres_with_the_config_it_came_from(tmp_path):
+def test_prediction_is_in_metres_with_its_config(tmp_path):
     predict(toy_study(), tmp_path, plainly)
     with np.load(tmp_path / "predictions" / "a.npz") as kept:
         depth, config = kept["depth"], json.loads(str(kept["config"]))
@@ -123,7 +123,7 @@ def test_a_prediction_is_metres_with_the_config_it_came_from(tmp_path):
     assert config == {"method": {"name": "toy"}, "scale": SCALE, "scene": "a", "scene_content": "a-1"}
 
 
-def test_scores_csv_has_exactly_the_promised_columns_metrics_and_variants(tmp_path):
+def test_scores_csv_has_the_documented_columns_metrics_and_variants(tmp_path):
     run(toy_study(), tmp_path)
     header = (tmp_path / "scores.csv").read_text().splitlines()[0]
     assert header == "dataset,scene,scale,downsampling,method,seed,metric,variant,value,valid_share"
@@ -145,7 +145,7 @@ def test_scores_csv_has_exactly_the_promised_columns_metrics_and_variants(tmp_pa
         assert (row["method"], row["seed"], row["valid_share"]) == ("toy_method", "7", "1.0")
 
 
-def test_the_values_are_those_of_score_image_on_the_stored_prediction(tmp_path):
+def test_scores_equal_score_image_on_the_stored_prediction(tmp_path):
     run(toy_study(), tmp_path)
     prediction = load_prediction(tmp_path / "predictions" / "b.npz")
     expected = {
@@ -156,7 +156,7 @@ def test_the_values_are_those_of_score_image_on_the_stored_prediction(tmp_path):
     assert table == pytest.approx(expected, rel=1e-12)
 
 
-def test_rmse_d_in_the_file_is_the_root_mean_square_of_perspective_depth_in_metres(tmp_path):
+def test_rmse_d_is_the_root_mean_square_of_perspective_depth_in_metres(tmp_path):
     off = RAMP + 0.03
     run(toy_study(ToySource(a=toy_scene("a")), ToyMethod(a=off)), tmp_path)
     [value] = [float(row["value"]) for row in rows(tmp_path) if row["metric"] == "RMSE_d"]
@@ -164,7 +164,7 @@ def test_rmse_d_in_the_file_is_the_root_mean_square_of_perspective_depth_in_metr
     assert value == pytest.approx(0.03 * math.sqrt(sum(x * x for x in lengths) / len(lengths)), rel=1e-9)
 
 
-def test_scores_come_from_the_file_and_not_from_memory(tmp_path):
+def test_scores_are_computed_from_the_stored_file(tmp_path):
     study = toy_study(ToySource(a=toy_scene("a")))
     outcome = predict(study, tmp_path, plainly)
     path = tmp_path / "predictions" / "a.npz"
@@ -175,7 +175,7 @@ def test_scores_come_from_the_file_and_not_from_memory(tmp_path):
     assert table.loc[table["metric"] == "RMSE_d", "value"].tolist() == [0.0]
 
 
-def test_a_hole_in_the_truth_shows_in_the_valid_share(tmp_path):
+def test_valid_share_reflects_a_hole_in_the_truth(tmp_path):
     holed = RAMP.clone()
     holed[0, :4] = torch.nan
     run(toy_study(ToySource(a=toy_scene("a", holed)), ToyMethod(a=RAMP)), tmp_path)
@@ -184,7 +184,7 @@ def test_a_hole_in_the_truth_shows_in_the_valid_share(tmp_path):
     assert float(row["value"]) == 0
 
 
-def test_the_summary_has_the_means_of_the_worst_of_four_lights(tmp_path):
+def test_summary_has_the_means_of_the_worst_of_four_lights(tmp_path):
     run(toy_study(), tmp_path)
     content = json.loads((tmp_path / "summary.json").read_text())
     worst = [row for row in rows(tmp_path) if row["variant"] in ("", "max")]
@@ -198,7 +198,7 @@ def test_the_summary_has_the_means_of_the_worst_of_four_lights(tmp_path):
     assert list(content["seconds"]) == ["a", "b"]
 
 
-def test_the_picture_gets_the_prediction_and_its_worst_scores(tmp_path):
+def test_picture_gets_the_prediction_and_its_worst_scores(tmp_path):
     _, _, pictures = run(toy_study(), tmp_path)
     assert [sample.scene for sample, *_ in pictures] == ["a", "b"]
     worst = {
@@ -212,7 +212,7 @@ def test_the_picture_gets_the_prediction_and_its_worst_scores(tmp_path):
     assert sample.depth is not None
 
 
-def test_a_second_run_reuses_predictions_without_calling_the_method(tmp_path):
+def test_second_run_reuses_predictions_without_calling_the_method(tmp_path):
     _, first, _ = run(toy_study(), tmp_path)
     before = {name: (tmp_path / name).stat().st_mtime_ns for name in files(tmp_path) if name.startswith("pred")}
     method = ToyMethod()
@@ -232,7 +232,7 @@ def test_overwrite_makes_every_prediction_anew(tmp_path):
     assert torch.equal(load_prediction(tmp_path / "predictions" / "a.npz"), RAMP)
 
 
-def test_a_prediction_of_another_config_is_refused_by_file_and_key_and_kept(tmp_path):
+def test_prediction_of_another_config_is_refused_by_file_and_key_and_kept(tmp_path):
     run(toy_study(), tmp_path)
     content = (tmp_path / "predictions" / "a.npz").read_bytes()
     method = ToyMethod()
@@ -243,7 +243,7 @@ def test_a_prediction_of_another_config_is_refused_by_file_and_key_and_kept(tmp_
     assert (tmp_path / "predictions" / "a.npz").read_bytes() == content
 
 
-def test_a_prediction_of_a_changed_scene_is_refused(tmp_path):
+def test_prediction_of_a_changed_scene_is_refused(tmp_path):
     study = toy_study()
     run(study, tmp_path)
     study.source.version = "2"
@@ -253,7 +253,7 @@ def test_a_prediction_of_a_changed_scene_is_refused(tmp_path):
 
 @pytest.mark.parametrize("overwrite", [False, True])
 @pytest.mark.parametrize("damage", ["empty", "truncated", "foreign", "no config", "config no object"])
-def test_a_damaged_prediction_is_refused_or_made_anew(tmp_path, damage, overwrite):
+def test_damaged_prediction_is_refused_or_made_anew(tmp_path, damage, overwrite):
     run(toy_study(), tmp_path)
     path = tmp_path / "predictions" / "b.npz"
     if damage == "no config":
@@ -281,7 +281,7 @@ def test_a_damaged_prediction_is_refused_or_made_anew(tmp_path, damage, overwrit
         (ValueError(""), "bad: ValueError"),
     ],
 )
-def test_one_bad_scene_does_not_lose_the_others_results(tmp_path, failure, message):
+def test_bad_scene_does_not_lose_the_others_results(tmp_path, failure, message):
     source = ToySource(a=toy_scene("a"), bad=failure, c=toy_scene("c"))
     outcome, scores, pictures = run(toy_study(source), tmp_path)
     assert (outcome.made, outcome.failures) == (["a", "c"], {"bad": message})
@@ -294,14 +294,14 @@ def test_one_bad_scene_does_not_lose_the_others_results(tmp_path, failure, messa
     ]
 
 
-def test_a_scene_that_the_method_refuses_does_not_lose_the_others_results(tmp_path):
+def test_scene_that_the_method_refuses_does_not_lose_the_others_results(tmp_path):
     study = toy_study(method=ToyMethod(a=ValueError("too dark")))
     outcome, scores, _ = run(study, tmp_path)
     assert outcome.failures == {"a": "a: too dark"}
     assert scores["scene"].unique().tolist() == ["b"]
 
 
-def test_a_picture_that_cannot_be_drawn_fails_its_scene_and_keeps_its_scores(tmp_path):
+def test_picture_that_cannot_be_drawn_fails_its_scene_and_keeps_its_scores(tmp_path):
     def refuse(sample, depth, scores):
         if sample.scene == "a":
             raise OSError(28, "No space left")
@@ -313,7 +313,7 @@ def test_a_picture_that_cannot_be_drawn_fails_its_scene_and_keeps_its_scores(tmp
     assert {row["scene"] for row in rows(tmp_path)} == {"a", "b"}
 
 
-def test_where_every_scene_fails_the_score_file_has_its_header_alone(tmp_path):
+def test_score_file_has_its_header_alone_where_every_scene_fails(tmp_path):
     outcome, scores, _ = run(toy_study(ToySource(a=ValueError("no"), b=ValueError("no"))), tmp_path)
     assert len(outcome.failures) == 2
     assert scores.empty
@@ -322,13 +322,13 @@ def test_where_every_scene_fails_the_score_file_has_its_header_alone(tmp_path):
 
 
 @pytest.mark.parametrize("shape", [(1, SIZE, SIZE - 2), (SIZE, SIZE), (1, 1, SIZE, SIZE)])
-def test_a_prediction_of_the_wrong_shape_is_refused_and_not_written(tmp_path, shape):
+def test_prediction_of_the_wrong_shape_is_refused_and_not_written(tmp_path, shape):
     outcome = predict(toy_study(method=ToyMethod(a=torch.ones(shape))), tmp_path, plainly)
     assert "toy_method gave depth of shape" in outcome.failures["a"]
     assert files(tmp_path) == ["predictions/b.npz"]
 
 
-def test_a_stored_prediction_of_the_wrong_shape_is_not_scored(tmp_path):
+def test_stored_prediction_of_the_wrong_shape_is_not_scored(tmp_path):
     study = toy_study()
     predict(study, tmp_path, plainly)
     path = tmp_path / "predictions" / "a.npz"
@@ -340,7 +340,7 @@ def test_a_stored_prediction_of_the_wrong_shape_is_not_scored(tmp_path):
     assert scores["scene"].unique().tolist() == ["b"]
 
 
-def test_a_scene_without_truth_is_predicted_and_drawn_but_not_scored(tmp_path):
+def test_scene_without_truth_is_predicted_and_drawn_but_not_scored(tmp_path):
     blind = toy_scene("blind", None, measured={SCALE: torch.full((1, 8, 8), 2.0)})
     seen = toy_scene("seen", RAMP, measured={SCALE: torch.full((1, 8, 8), 2.0)})
     study = toy_study(ToySource(blind=blind, seen=seen), downsampling=Measured())
@@ -352,7 +352,7 @@ def test_a_scene_without_truth_is_predicted_and_drawn_but_not_scored(tmp_path):
     assert json.loads((tmp_path / "summary.json").read_text())["without_truth"] == ["blind"]
 
 
-def test_a_cropped_scene_says_so(tmp_path):
+def test_cropped_scene_is_noted(tmp_path):
     camera = Camera(SIZE + 1, SIZE, 20.0, 20.0, 7.5, 7.5)
     odd = Scene(
         "toy", "odd", torch.full((3, SIZE, SIZE + 1), 0.5), camera, torch.full((1, SIZE, SIZE + 1), 2.0).double()
@@ -361,7 +361,7 @@ def test_a_cropped_scene_says_so(tmp_path):
     assert outcome.notes == {"odd": ["cropped from 16 x 17 to 16 x 16, which 2 divides"]}
 
 
-def test_an_interruption_keeps_the_finished_scene_and_leaves_no_temporary_file(tmp_path):
+def test_interruption_keeps_the_finished_scene_and_leaves_no_temporary_file(tmp_path):
     with pytest.raises(KeyboardInterrupt):
         predict(toy_study(method=ToyMethod(b=KeyboardInterrupt())), tmp_path, plainly)
     assert files(tmp_path) == ["predictions/a.npz"]
@@ -370,7 +370,7 @@ def test_an_interruption_keeps_the_finished_scene_and_leaves_no_temporary_file(t
     assert (method.calls, outcome.made, outcome.reused) == (["b"], ["b"], ["a"])
 
 
-def test_an_interruption_while_a_prediction_is_written_leaves_no_half_file(tmp_path, monkeypatch):
+def test_interruption_while_a_prediction_is_written_leaves_no_partial_file(tmp_path, monkeypatch):
     whole = np.savez_compressed
 
     def cut(path, **arrays):
@@ -385,7 +385,7 @@ def test_an_interruption_while_a_prediction_is_written_leaves_no_half_file(tmp_p
     assert files(tmp_path) == ["predictions/a.npz"]
 
 
-def test_a_failed_rewrite_keeps_the_former_prediction(tmp_path, monkeypatch):
+def test_failed_rewrite_keeps_the_former_prediction(tmp_path, monkeypatch):
     run(toy_study(), tmp_path)
     before = (tmp_path / "predictions" / "a.npz").read_bytes()
 
@@ -399,19 +399,19 @@ def test_a_failed_rewrite_keeps_the_former_prediction(tmp_path, monkeypatch):
     assert (tmp_path / "predictions" / "a.npz").read_bytes() == before
 
 
-def test_a_missing_prediction_is_named(tmp_path):
+def test_missing_prediction_is_refused_by_name(tmp_path):
     with pytest.raises(ValueError, match=r"a\.npz: expected a prediction"):
         load_prediction(tmp_path / "a.npz")
 
 
-def test_a_scene_that_failed_to_be_predicted_is_not_scored_from_an_older_file(tmp_path):
+def test_scene_that_failed_is_not_scored_from_an_older_file(tmp_path):
     run(toy_study(), tmp_path)
     outcome = Outcome(failures={"a": "a: broken"})
     table = score(toy_study(), tmp_path, catalogue(), outcome, plainly, lambda *_: None)
     assert table["scene"].unique().tolist() == ["b"]
 
 
-def test_a_prediction_is_replaced_whole_and_a_reader_of_the_former_one_is_not_disturbed(tmp_path):
+def test_prediction_is_replaced_atomically(tmp_path):
     run(toy_study(), tmp_path)
     path = tmp_path / "predictions" / "a.npz"
     before = path.read_bytes()
@@ -422,7 +422,7 @@ def test_a_prediction_is_replaced_whole_and_a_reader_of_the_former_one_is_not_di
     assert path.stat().st_mode & 0o777 == 0o644
 
 
-def test_a_studys_samples_have_its_noise_under_its_seed():
+def test_samples_of_a_study_have_its_noise_under_its_seed():
     clean, noise = toy_study(), GaussianMultiplicative(0.02)
     noisy = dataclasses.replace(clean, noise=noise)
     expected = make_sample(toy_scene("a"), SCALE, Downsampling("box"), "orthogonal", noise, 7)
@@ -446,7 +446,7 @@ class Iterating(ToyMethod):
         return super().__call__(sample)
 
 
-def test_how_an_iteration_went_is_shown_while_it_goes_and_kept(tmp_path):
+def test_iteration_progress_is_shown_and_stored(tmp_path):
     shown = []
 
     @contextlib.contextmanager
@@ -458,7 +458,7 @@ def test_how_an_iteration_went_is_shown_while_it_goes_and_kept(tmp_path):
     assert (tmp_path / "iterations" / "a.csv").read_text() == "iteration,objective\n1.0,0.5\n3.0,0.25\n"
 
 
-def test_a_scene_without_an_answer_is_a_result_and_no_failure(tmp_path):
+def test_scene_without_a_solution_is_a_result_and_no_failure(tmp_path):
     method = ToyMethod(b=NoSolutionError("a map of 2 x 2 is smaller than a patch"))
     outcome, scores, _ = run(toy_study(method=method), tmp_path)
     reason = "b: a map of 2 x 2 is smaller than a patch"
@@ -469,7 +469,7 @@ def test_a_scene_without_an_answer_is_a_result_and_no_failure(tmp_path):
     assert not (tmp_path / "predictions" / "b.npz").exists()
 
 
-def test_what_a_scene_had_before_is_not_scored_where_there_is_no_answer_now(tmp_path):
+def test_earlier_prediction_is_not_scored_where_there_is_no_solution_now(tmp_path):
     run(toy_study(), tmp_path)
     _, scores, _ = run(toy_study(method=ToyMethod(b=NoSolutionError("none"))), tmp_path, overwrite=True)
     assert set(scores["scene"]) == {"a"}

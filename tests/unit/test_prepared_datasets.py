@@ -48,13 +48,13 @@ def kept():
     return sorted(path.name for path in (cache_directory() / "prepared" / "things").glob("*"))
 
 
-def test_the_scenes_are_those_named_or_chosen_or_all_that_are_there(files):
+def test_scenes_are_those_named_or_chosen_or_all_available(files):
     assert source(files).scenes() == ["a", "b"]
     assert source(files, wanted="found").scenes() == ["a", "b", "deep_c"]
     assert source(files, wanted=["deep_c", "a"]).scenes() == ["deep_c", "a"]
 
 
-def test_what_is_missing_is_named_with_the_command_that_gets_it(files):
+def test_missing_data_is_named_with_the_command_that_fetches_it(files):
     with pytest.raises(ValueError, match="things") as refusal:
         source(files, named=("a", "z", "y"))
     assert str(refusal.value) == (
@@ -82,13 +82,13 @@ def test_scenes_are_resized_cropped_and_named(files):
     assert not source(files, preparation=Preparation(48, fill=("b",))).load("b").depth.isnan().any()
 
 
-def test_without_a_size_scenes_are_as_they_are_and_nothing_is_kept(files):
+def test_scenes_without_a_size_are_unchanged_and_not_cached(files):
     scene = source(files, preparation=Preparation(None)).load("a")
     assert tuple(scene.depth.shape) == (1, 60, 90)
     assert kept() == []
 
 
-def test_a_prepared_scene_is_read_again_not_made_again(files, monkeypatch):
+def test_prepared_scene_is_read_from_the_cache(files, monkeypatch):
     first = source(files).load("a")
     assert len(kept()) == 1
     monkeypatch.setattr(module, "fitted", None)
@@ -98,7 +98,7 @@ def test_a_prepared_scene_is_read_again_not_made_again(files, monkeypatch):
     assert first.camera == again.camera
 
 
-def test_other_content_settings_or_code_make_it_anew(files, monkeypatch):
+def test_other_content_settings_or_code_prepare_anew(files, monkeypatch):
     plain = source(files)
     plain.load("a")
     assert plain.fingerprint("a") == source(files).fingerprint("a")
@@ -117,18 +117,18 @@ def test_other_content_settings_or_code_make_it_anew(files, monkeypatch):
     assert source(files).load("a").depth.nanmean() == pytest.approx(7)
 
 
-def test_filling_one_scene_does_not_make_the_others_anew(files):
+def test_inpainting_one_scene_does_not_prepare_the_others_anew(files):
     assert source(files).fingerprint("a") == source(files, preparation=Preparation(48, fill=("b",))).fingerprint("a")
 
 
-def test_a_damaged_copy_in_the_cache_is_made_anew(files):
+def test_damaged_cache_file_is_prepared_anew(files):
     first = source(files).load("a")
     [name] = kept()
     (cache_directory() / "prepared" / "things" / name).write_bytes(b"half a file")
     assert np.array_equal(source(files).load("a").depth, first.depth, equal_nan=True)
 
 
-def test_preparing_makes_what_is_missing_and_yields_every_scene(files):
+def test_preparation_makes_what_is_missing_and_yields_every_scene(files):
     data = source(files, wanted="found")
     data.load("b")
     assert sorted(data.prepare(data.scenes())) == ["a", "b", "deep_c"]
@@ -136,7 +136,7 @@ def test_preparing_makes_what_is_missing_and_yields_every_scene(files):
     assert sorted(data.prepare(data.scenes())) == ["a", "b", "deep_c"]
 
 
-def test_a_scene_that_cannot_be_prepared_does_not_keep_the_others_from_it(files):
+def test_scene_that_cannot_be_prepared_does_not_affect_the_others(files):
     files["a"][0].write_text("damaged")
     files["b"][0].unlink()
     data = source(files, wanted=["a", "b", "deep_c"])
@@ -148,13 +148,13 @@ def test_a_scene_that_cannot_be_prepared_does_not_keep_the_others_from_it(files)
         data.load("b")
 
 
-def test_the_content_of_a_scene_does_not_depend_on_what_is_done_to_it(files):
+def test_fingerprint_of_a_scene_does_not_depend_on_its_preparation(files):
     one, other = source(files), source(files, preparation=Preparation(32), near=2.0)
     assert one.content("a") == other.content("a") != one.content("b")
     assert one.fingerprint("a") != other.fingerprint("a")
 
 
-def test_what_is_to_be_known_of_a_scene_goes_with_it_prepared_or_not(files):
+def test_notes_of_a_scene_are_kept_prepared_or_not(files):
     records = {name: replace(record, note="not metric") for name, record in records_of(files, frame, "things").items()}
     for preparation in (Preparation(48), Preparation(48), Preparation(None)):
         data = PreparedDataset("things", Path("x"), records, ["a"], None, preparation)
@@ -162,18 +162,18 @@ def test_what_is_to_be_known_of_a_scene_goes_with_it_prepared_or_not(files):
     assert source(files).load("a").notes == ()
 
 
-def test_where_nothing_can_be_kept_scenes_are_made_each_time(files, monkeypatch):
+def test_scenes_are_prepared_each_time_without_a_writable_cache(files, monkeypatch):
     monkeypatch.setenv("DSR_CACHE", os.devnull)
     assert source(files).load("a").depth.nanmean() == pytest.approx(1)
 
 
-def test_frames_get_other_names(files):
+def test_renamed_frames_have_their_new_names(files):
     records = renamed(records_of(files, frame, "things"), {"first": "deep/c", "second": "z"})
     assert sorted(records) == ["a", "b", "first"]
     assert records["first"].load().name == "first"
 
 
-def test_all_files_of_a_folder_count_and_very_large_ones_by_size_and_time(files, monkeypatch, tmp_path):
+def test_folder_fingerprint_covers_all_files_and_large_ones_by_size_and_time(files, monkeypatch, tmp_path):
     folder = tmp_path / "set"
     data = PreparedDataset(
         "things", folder, records_of({"all": (folder, 3)}, frame, "things"), ["all"], None, Preparation(48)
@@ -187,7 +187,7 @@ def test_all_files_of_a_folder_count_and_very_large_ones_by_size_and_time(files,
     assert module.content_hash(path) == f"a.txt 5 {path.stat().st_mtime_ns}"
 
 
-def test_the_code_that_reads_and_resizes_is_there_to_be_hashed():
+def test_preparation_code_exists_to_be_hashed():
     package = Path(module.__file__).parents[2]
     assert all((package / name).exists() for name in module._READING_CODE)
 
@@ -204,7 +204,7 @@ def test_values_out_of_range_are_refused(settings, message):
         Preparation(**settings)
 
 
-def test_a_record_without_fine_depth_cannot_be_resized(files):
+def test_record_without_high_resolution_depth_cannot_be_resized(files):
     def measured_only():
         return Scene("things", "a", torch.zeros(3, 60, 90), Camera(90, 60, 80.0, 80.0, 44.5, 29.5), None,
                      {2: torch.ones(1, 30, 45)})  # fmt: skip

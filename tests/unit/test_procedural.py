@@ -32,7 +32,7 @@ def rays(size=SIZE):
     return camera_of(FORWARD, size).rays().numpy().reshape(3, -1)
 
 
-def test_a_scene_is_the_same_every_time_and_whatever_was_rendered_before():
+def test_scene_does_not_depend_on_earlier_renderings():
     first = render_random_scene(5, 2, 24)
     render_random_scene(5, 1, 24)
     second = render_random_scene(5, 2, 24)
@@ -41,14 +41,14 @@ def test_a_scene_is_the_same_every_time_and_whatever_was_rendered_before():
     assert first.camera == second.camera
 
 
-def test_seed_and_index_each_make_another_scene():
+def test_seed_and_index_each_give_another_scene():
     views = [scenes()[0], scenes()[1], render_random_scene(4, 0, 48)]
     assert len({view.camera.fx for view in views}) == 3
     assert len({view.rgb.tobytes() for view in views}) == 3
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
-def test_every_layout_closes_the_view_and_keeps_the_promised_types_and_ranges(layout):
+def test_layouts_close_the_view_and_keep_their_types_and_ranges(layout):
     scene = random_scene(np.random.default_rng(8), layout)
     picture = render(scene, SIZE)
     assert scene.layout == layout
@@ -63,7 +63,7 @@ def test_every_layout_closes_the_view_and_keeps_the_promised_types_and_ranges(la
     assert picture.rgb.std() > 4
 
 
-def test_another_size_is_another_sampling_of_the_same_scene():
+def test_size_changes_only_the_sampling_of_a_scene():
     large, small = (render_random_scene(0, 7, size) for size in (96, 32))
     for name in ("fx", "fy"):
         assert getattr(large.camera, name) == pytest.approx(3 * getattr(small.camera, name), abs=1e-12)
@@ -101,7 +101,7 @@ def test_photos_show_texture_without_geometry_and_geometry_without_texture():
     assert (counts > 200).all()
 
 
-def test_a_plane_has_the_depth_of_its_closed_form_without_a_staircase():
+def test_plane_has_the_depth_of_its_closed_form_without_steps():
     normal, distance = np.array([0.3, -0.5, -0.81]), 2.7
     normal /= np.linalg.norm(normal)
     side = np.cross(normal, [0.0, 1.0, 0.0])
@@ -116,7 +116,7 @@ def test_a_plane_has_the_depth_of_its_closed_form_without_a_staircase():
     np.testing.assert_allclose(seen, np.broadcast_to(normal[:, None, None], seen.shape), atol=1e-6)
 
 
-def test_a_wall_far_from_the_origin_of_the_scene_is_as_flat():
+def test_wall_far_from_the_scene_origin_is_as_flat():
     tracer = Tracer([quad([-60.0, 37.0, -60.0], [120, 0, 0], [0, 0, 120])])
     eye = np.array([3.3, 30.1, -7.7])
     axes = FORWARD.axes()
@@ -124,7 +124,7 @@ def test_a_wall_far_from_the_origin_of_the_scene_is_as_flat():
     np.testing.assert_allclose(depth, 6.9, rtol=1e-12)
 
 
-def test_a_ball_is_round_beyond_what_its_triangles_are():
+def test_ball_is_rounder_than_its_triangles():
     radius, centre = 0.8, np.array([0.1, -0.2, 3.0])
     shape = ellipsoid(np.full(3, radius), np.ones(2)).turned(about(0, 71.0)).moved(centre)
     tracer = Tracer([shape])
@@ -145,7 +145,7 @@ def test_a_ball_is_round_beyond_what_its_triangles_are():
     assert (n * hits.normals[:, inner]).sum(0).min() > 1 - 4e-6  # 0.16 degrees
 
 
-def test_hits_of_flat_things_lie_on_their_triangles():
+def test_hits_of_flat_objects_lie_on_their_triangles():
     rng = np.random.default_rng(4)
     things = [box([0.5, 0.7, 0.4]), extrusion([np.array([[0, 0], [0.5, 0.1], [0.3, 0.6]])], 0.4)]
     shapes = [s.turned(about(0, rng.uniform(0, 90))).moved([k - 0.5, 0.0, 3.0]) for k, s in enumerate(things)]
@@ -161,7 +161,7 @@ def test_hits_of_flat_things_lie_on_their_triangles():
     assert np.isinf(hits.depth[~on]).all()
 
 
-def test_depth_goes_on_without_steps_from_triangle_to_triangle_of_a_relief():
+def test_depth_of_a_relief_is_continuous_from_triangle_to_triangle():
     u, v = np.meshgrid(np.linspace(-2, 2, 60), np.linspace(-2, 2, 60))
     tracer = Tracer([surface(np.stack((u, v, 3 + 0.1 * np.sin(3 * u) * np.cos(2 * v)), axis=-1))])
     depth = tracer.hits(ORIGIN, rays(192)).depth.reshape(192, 192)
@@ -172,7 +172,7 @@ def test_depth_goes_on_without_steps_from_triangle_to_triangle_of_a_relief():
     assert kink.max() < 6 * np.median(kink) + 1e-4
 
 
-def test_what_lies_between_is_found():
+def test_object_in_between_is_found():
     tracer = Tracer([quad([-1.0, -1.0, 1.0], [2, 0, 0], [0, 2, 0])])
     origin = np.zeros((3, 4))
     toward = np.array([[0.0, 0, 0, 3], [0, 0, 0, 0], [2, 0.9, -2, 2]])
@@ -210,7 +210,7 @@ def test_reliefs_are_finite_and_shallow(maker):
 
 
 @pytest.mark.parametrize("make", [*PAINTS, picture_paint], ids=lambda make: make.__name__)
-def test_paints_are_colours_that_do_not_depend_on_how_they_are_asked(make):
+def test_paints_are_colours_independent_of_how_they_are_evaluated(make):
     points, chart = np.random.default_rng(0).uniform(-1, 1, (2, 3, 500))
     for seed in range(3):
         paint = make(np.random.default_rng(seed), "any", 0.5)

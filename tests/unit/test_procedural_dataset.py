@@ -20,7 +20,7 @@ def cache(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_a_scene_is_the_rendering_of_its_number(cache: Path) -> None:
+def test_scene_is_the_rendering_of_its_number(cache: Path) -> None:
     scene = Procedural(count=3, size=SIZE, seed=5).load("00002")
     expected = render_random_scene(5, 2, SIZE)
     assert scene.depth is not None
@@ -30,7 +30,7 @@ def test_a_scene_is_the_rendering_of_its_number(cache: Path) -> None:
     assert (scene.dataset, scene.name) == ("procedural", "00002")
 
 
-def test_a_scene_is_rendered_once(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_scene_is_rendered_once(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     first = Procedural(count=1, size=SIZE).load("00000")
     monkeypatch.setattr(module, "render_random_scene", lambda *_: pytest.fail("rendered again"))
     second = Procedural(count=1, size=SIZE).load("00000")

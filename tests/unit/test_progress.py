@@ -15,7 +15,7 @@ def _display(*, terminal: bool) -> tuple[Display, io.StringIO]:
     return Display(Console(file=text, force_terminal=terminal, width=100)), text
 
 
-def test_off_a_terminal_there_are_lines_alone() -> None:
+def test_output_off_a_terminal_is_lines_alone() -> None:
     display, text = _display(terminal=False)
     for item in display(["a", "b"], "predict"):
         display.say(f"{item}: [about] 3 min")
@@ -24,7 +24,7 @@ def test_off_a_terminal_there_are_lines_alone() -> None:
     assert text.getvalue().strip() == "a: [about] 3 min\nb: [about] 3 min"
 
 
-def test_steps_are_shown_below_the_pass_that_they_belong_to() -> None:
+def test_steps_are_shown_below_their_pass() -> None:
     display, text = _display(terminal=True)
     for item in display(["statue"], "predict"):
         with display.steps(item, 120, 40) as update:
@@ -43,7 +43,7 @@ def test_steps_need_no_pass_around_them() -> None:
     assert "statue" in text.getvalue()
 
 
-def test_parts_are_shown_once_it_is_known_how_many_there_are() -> None:
+def test_parts_are_shown_once_their_number_is_known() -> None:
     display, text = _display(terminal=True)
     for item in display(["statue"], "predict"):
         with display.parts(item) as update:
@@ -54,7 +54,7 @@ def test_parts_are_shown_once_it_is_known_how_many_there_are() -> None:
     assert "1000" not in before
 
 
-def test_after_an_error_the_terminal_is_free_again() -> None:
+def test_terminal_is_restored_after_an_error() -> None:
     display, _ = _display(terminal=True)
 
     def fail() -> None:

@@ -98,7 +98,7 @@ def _save(path: Path, content: object) -> Path:
 
 @pytest.mark.parametrize("packed", [True, False])
 @pytest.mark.parametrize("scale", [2, 8])
-def test_a_caffe_model_gives_back_the_parameters_that_were_written(tmp_path: Path, scale: int, packed: bool) -> None:
+def test_caffe_model_round_trips_its_parameters(tmp_path: Path, scale: int, packed: bool) -> None:
     net = MSGNet(scale, "hui")
     path = _write(tmp_path / "net.caffemodel", _caffemodel(_caffe_layers(net), packed=packed))
     loaded = load_msg_weights(path, scale)
@@ -106,14 +106,14 @@ def test_a_caffe_model_gives_back_the_parameters_that_were_written(tmp_path: Pat
     torch.testing.assert_close(dict(loaded.state_dict()), dict(net.state_dict()), rtol=0, atol=0)
 
 
-def test_a_torch_file_gives_back_the_parameters_that_were_written(tmp_path: Path) -> None:
+def test_torch_file_round_trips_its_parameters(tmp_path: Path) -> None:
     net = MSGNet(4)
     loaded = load_msg_weights(_save(tmp_path / "net.pth", {"model_state_dict": _author_state(net)}), 4, "voynov")
     assert loaded.variant.name == "voynov"
     torch.testing.assert_close(dict(loaded.state_dict()), dict(net.state_dict()), rtol=0, atol=0)
 
 
-def test_published_networks_run_as_they_were_published_unless_told_otherwise(tmp_path: Path) -> None:
+def test_published_networks_default_to_their_published_settings(tmp_path: Path) -> None:
     path = _save(tmp_path / "net.pth", {"model_state_dict": _author_state(MSGNet(4))})
     assert build_trained(path, 4, "msg_v", "voynov").ensemble == 1
     assert build_trained(path, 4, "msg_v", "voynov", ensemble=8).ensemble == 8
@@ -136,7 +136,7 @@ def _refusal(path: Path, scale: int = 4, variant: str | None = None) -> str:
     return message
 
 
-def test_a_missing_file_is_reported_as_missing(tmp_path: Path) -> None:
+def test_missing_file_is_refused_as_missing(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError, match=r"nowhere\.pth: no such weights file"):
         load_msg_weights(tmp_path / "nowhere.pth", 4)
 
@@ -165,7 +165,7 @@ class _Trap:
 
 
 @pytest.mark.parametrize("protocol", [0, 2, 4])
-def test_code_in_a_pickle_is_not_run(tmp_path: Path, protocol: int) -> None:
+def test_pickled_code_is_not_run(tmp_path: Path, protocol: int) -> None:
     mark = tmp_path / "trapped"
     path = _write(tmp_path / "net.pth", pickle.dumps({"model_state_dict": _Trap(mark)}, protocol))
     _refusal(path)
@@ -187,14 +187,14 @@ def test_damaged_and_foreign_files_are_refused(tmp_path: Path) -> None:
         assert "expected a torch" in _refusal(_write(tmp_path / "net.pth", content))
 
 
-def test_a_caffe_model_cut_off_anywhere_is_refused(tmp_path: Path) -> None:
+def test_caffe_model_truncated_anywhere_is_refused(tmp_path: Path) -> None:
     whole = _caffemodel(_caffe_layers(MSGNet(2, "hui")))
     for length in np.random.default_rng(0).integers(1, len(whole), 40).tolist():
         message = _refusal(_write(tmp_path / "net.caffemodel", whole[:length]), 2)
         assert "expected" in message
 
 
-def test_a_caffe_blob_whose_shape_does_not_fit_its_values_is_refused(tmp_path: Path) -> None:
+def test_caffe_blob_of_the_wrong_size_is_refused(tmp_path: Path) -> None:
     shape = _field(7, _field(1, _varint(2**62) + _varint(4)))
     blob = shape + _field(5, struct.pack("<2f", 1, 2))
     layer = _field(100, _field(1, b"conv") + _field(2, b"Convolution") + _field(7, blob))
@@ -213,13 +213,13 @@ def test_a_caffe_blob_whose_shape_does_not_fit_its_values_is_refused(tmp_path: P
         (_field(1, b"name"), "6 bytes without a Caffe layer"),
     ],
 )
-def test_what_is_wrong_with_a_protobuf_is_said(tmp_path: Path, content: bytes, problem: str) -> None:
+def test_protobuf_error_is_described(tmp_path: Path, content: bytes, problem: str) -> None:
     if content[0] == 0x80:  # a torch file's first byte, too
         content = _field(1, b"name") + content
     assert problem in _refusal(_write(tmp_path / "net.caffemodel", content))
 
 
-def test_a_torch_file_of_another_network_is_refused(tmp_path: Path) -> None:
+def test_torch_file_of_another_network_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "net.pth"
     expected = "expected tensors under the key model_state_dict, got"
     assert f"{expected} weight" in _refusal(_save(path, {"weight": torch.ones(1)}))

@@ -32,12 +32,12 @@ def scene_of(*surfaces, spread=0.02, light=(-1.0, -1.5, 1.0)):
     return World(tuple(Body(surface, grey) for surface in (*surfaces, BACK)), lights, spread)
 
 
-def test_a_facing_plane_has_constant_depth_not_constant_distance():
+def test_frontal_plane_has_constant_depth_not_constant_distance():
     _, depth = render(scene_of(), small_camera())
     np.testing.assert_array_equal(depth, 4.0)
 
 
-def test_a_slanted_plane_has_affine_inverse_depth():
+def test_slanted_plane_has_affine_inverse_depth():
     facing = np.array([0.6, 0.0, -0.8])
     slanted = Body(Plane(np.array([0.0, 0.0, 2.0]), facing), white)
     _, depth = render(World((slanted,), np.zeros((3, 9)), 0.0), small_camera())
@@ -45,12 +45,12 @@ def test_a_slanted_plane_has_affine_inverse_depth():
     np.testing.assert_allclose(1 / depth, np.broadcast_to((0.8 - 0.6 * x) / 1.6, (33, 33)), rtol=1e-14)
 
 
-def test_the_ray_through_a_spheres_centre_hits_at_its_distance_minus_the_radius():
+def test_ray_through_a_sphere_centre_hits_at_its_distance_minus_the_radius():
     hit = Sphere(np.array([0.0, 0.0, 3.0]), np.eye(3), 0.5).hit(EYE, AHEAD)
     assert hit[0] == pytest.approx(2.5, abs=1e-15)
 
 
-def test_an_off_axis_sphere_is_hit_where_the_quadratic_formula_says():
+def test_off_axis_sphere_is_hit_as_by_the_quadratic_formula():
     c, r = np.array([0.2, -0.1, 3.0]), 0.5
     d = np.array([0.1, -0.05, 1.0])
     a, b = d @ d, d @ c
@@ -66,7 +66,7 @@ def test_rays_miss_a_sphere_beyond_its_silhouette():
     assert outside == np.inf
 
 
-def test_a_cylinder_shows_its_side_and_its_cap_at_the_right_depths():
+def test_cylinder_shows_its_side_and_its_cap_at_the_right_depths():
     upright = Cylinder(np.array([0.0, 0.0, 3.0]), np.eye(3), 0.4, 0.7)
     assert upright.hit(EYE, AHEAD)[0] == pytest.approx(2.6, abs=1e-15)
     end_on = Cylinder(np.array([0.0, 0.0, 3.0]), np.array([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]]), 0.4, 0.7)
@@ -75,13 +75,13 @@ def test_a_cylinder_shows_its_side_and_its_cap_at_the_right_depths():
     np.testing.assert_allclose(end_on.normal(hit * AHEAD)[:, 0], [0, 0, -1], atol=1e-15)
 
 
-def test_a_box_on_edge_shows_its_edge_at_the_half_diagonal():
+def test_box_on_edge_shows_its_edge_at_the_half_diagonal():
     s = math.sqrt(0.5)
     box = Box(np.array([0.0, 0.0, 3.0]), np.array([[s, 0, s], [0, 1, 0], [-s, 0, s]]), np.full(3, 0.4))
     assert box.hit(EYE, AHEAD)[0] == pytest.approx(3 - 0.4 * math.sqrt(2), abs=1e-14)
 
 
-def test_nothing_behind_the_camera_is_hit():
+def test_objects_behind_the_camera_are_not_hit():
     for surface in (
         Sphere(np.array([0.0, 0.0, -3.0]), np.eye(3), 0.5),
         Box(np.array([0.0, 0.0, -3.0]), np.eye(3), np.full(3, 0.5)),
@@ -90,7 +90,7 @@ def test_nothing_behind_the_camera_is_hit():
         assert surface.hit(EYE, AHEAD)[0] == np.inf
 
 
-def test_an_implicit_sphere_agrees_with_the_exact_one():
+def test_implicit_sphere_agrees_with_the_exact_one():
     exact = Sphere(np.array([0.1, 0.0, 3.0]), np.eye(3), 0.5)
     bounds = Box(exact.centre, np.eye(3), np.full(3, 0.55))
     implicit = Implicit(lambda p: np.sqrt(((p - exact.centre[:, None]) ** 2).sum(0)) - 0.5, bounds)
@@ -103,14 +103,14 @@ def test_an_implicit_sphere_agrees_with_the_exact_one():
     np.testing.assert_allclose(implicit.normal(points), exact.normal(points), atol=1e-3)
 
 
-def test_the_nearest_body_is_seen():
+def test_nearest_body_is_seen():
     near, far = (Sphere(np.array([0.0, 0.0, z]), np.eye(3), 0.3) for z in (2.0, 3.0))
     depth, index = cast(scene_of(far, near), AHEAD)
     assert depth[0] == pytest.approx(1.7)
     assert index[0] == 1
 
 
-def test_a_plain_wall_is_brightest_where_the_cosine_law_says():
+def test_plain_wall_is_brightest_as_by_the_cosine_law():
     rgb, _ = render(scene_of(light=(0.5, -0.4, 2.0)), small_camera())
     v, u = np.unravel_index(rgb.sum(-1).astype(int).argmax(), (33, 33))
     assert (u - 16, v - 16) == pytest.approx((0.5 / 4 * 1.2 * 33, -0.4 / 4 * 1.2 * 33), abs=2.5)

@@ -55,7 +55,7 @@ def changed(run, **predictions):
     return run
 
 
-def test_the_renderings_that_the_page_computes_are_those_of_the_protocol_to_a_grey_level(make_run, tmp_path):
+def test_page_renderings_are_those_of_the_protocol_to_a_grey_level(make_run, tmp_path):
     results = load_results([make_run(tmp_path / "run")])
     content, _, scene = saved(tmp_path, results)
     run = results.runs[0]
@@ -69,7 +69,7 @@ def test_the_renderings_that_the_page_computes_are_those_of_the_protocol_to_a_gr
         assert np.abs(found[3] - expected[3]).max() <= math.sqrt(3) * 1.001 / 255
 
 
-def test_the_input_is_shown_at_its_own_size_seen_by_its_own_camera(make_run, tmp_path):
+def test_input_is_shown_at_its_own_size_from_its_own_camera(make_run, tmp_path):
     results = load_results([make_run(tmp_path / "run")])
     content, _, scene = saved(tmp_path, results)
     stored = results.runs[0].scene("cube_no_texture")
@@ -92,7 +92,7 @@ def test_stored_errors_are_result_minus_truth_within_a_hundredth_of_the_largest(
 
 
 @pytest.mark.parametrize(("error", "level"), [(0, 128), (2, 255), (-2, 1), (9, 255), (0.5, 192), (-0.5, 64)])
-def test_an_error_is_stored_by_the_root_of_its_share_of_the_largest(error, level):
+def test_error_is_stored_by_the_root_of_its_fraction_of_the_largest(error, level):
     assert error_picture(np.array([[float(error)]]), 2.0)[0, 0] == pytest.approx(level, abs=1)
 
 
@@ -100,17 +100,17 @@ def test_depth_is_stored_between_its_limits():
     assert depth_picture(np.array([[0.5, 1, 2, 3, 9.0]]), 1, 3).tolist() == [[0, 0, 128, 255, 255]]
 
 
-def test_shadings_of_minus_one_nought_and_one_are_stored_side_by_side():
+def test_shadings_are_stored_side_by_side_from_minus_one_to_one():
     assert shading_picture(np.array([[[-1.0, 0.0, 1.0]]])).tolist() == [[0, 128, 255]]
 
 
-def test_a_mask_tells_a_hole_from_a_depth_without_a_normal():
+def test_mask_tells_a_hole_from_a_depth_without_a_normal():
     depth, normal = np.array([[False, True, True]]), np.array([[False, False, True]])
     assert mask_picture(depth, normal).tolist() == [[0, 128, 255]]
     assert mask_picture(normal | True, normal | True) is None
 
 
-def test_holes_of_a_result_are_masked_and_those_around_them_have_no_normal(make_run, tmp_path):
+def test_holes_of_a_result_are_masked_and_their_neighbours_have_no_normal(make_run, tmp_path):
     [run] = load_results([make_run(tmp_path / "run")]).runs
     depth = run.prediction("cube_no_texture").clone()
     depth[0, 10, 20] = torch.nan
@@ -123,7 +123,7 @@ def test_holes_of_a_result_are_masked_and_those_around_them_have_no_normal(make_
     assert "mask" not in scene["surfaces"][2]
 
 
-def test_the_limits_of_errors_and_depth_are_the_same_for_all_methods(make_run, tmp_path):
+def test_limits_of_errors_and_depth_are_the_same_for_all_methods(make_run, tmp_path):
     runs = [make_run(tmp_path / "runs" / name, method=name, label=name) for name in ("a", "b")]
     _, _, scene = saved(tmp_path, load_results(runs))
     assert [surface["label"] for surface in scene["surfaces"]] == ["input", "a", "b", "truth"]
@@ -131,7 +131,7 @@ def test_the_limits_of_errors_and_depth_are_the_same_for_all_methods(make_run, t
     assert not any("limit" in surface["error"] for surface in scene["surfaces"][1:3])
 
 
-def test_a_photo_and_a_truth_of_several_methods_and_seeds_are_stored_once(make_run, tmp_path):
+def test_photo_and_truth_of_several_methods_and_seeds_are_stored_once(make_run, tmp_path):
     one = saved(tmp_path / "one", load_results([make_run(tmp_path / "runs" / "a", scale=2)]))[0]
     make_run(tmp_path / "runs" / "b", scale=4)
     two = saved(tmp_path / "two", load_results([tmp_path / "runs"]))[0]
@@ -142,7 +142,7 @@ def test_a_photo_and_a_truth_of_several_methods_and_seeds_are_stored_once(make_r
     assert scenes[0]["surfaces"][-1]["normals"] == scenes[1]["surfaces"][-1]["normals"]
 
 
-def test_pictures_above_the_budget_are_compressed_and_reduced_and_the_page_says_so(make_run, tmp_path):
+def test_pictures_above_the_budget_are_reduced_and_the_page_says_so(make_run, tmp_path):
     results = load_results([make_run(tmp_path / "run", size=208)])
     notes = save_page(tmp_path / "small.html", results, budget_mb=0.02)
     assert notes[0].startswith("pictures: compressed with losses (WebP, quality 75), reduced to 192 pixels at most")
@@ -151,7 +151,7 @@ def test_pictures_above_the_budget_are_compressed_and_reduced_and_the_page_says_
     assert (tmp_path / "small.html").stat().st_size < (tmp_path / "large.html").stat().st_size
 
 
-def test_reduced_values_are_averages_of_what_is_known():
+def test_reduced_values_are_averages_of_valid_pixels():
     pool = Pool(dataclasses.replace(LEVELS[0], longest=2))
     values = np.array([[1.0, 3, 5, np.nan], [1, 3, 7, 9], [np.nan, np.nan, 2, 2], [np.nan, 4, 2, 2]])
     reduced, known = pool.fitted(values)
@@ -161,12 +161,12 @@ def test_reduced_values_are_averages_of_what_is_known():
 
 
 @pytest.mark.parametrize("budget", [0, -1, math.nan])
-def test_a_budget_that_is_not_positive_is_refused(make_run, tmp_path, budget):
+def test_budget_that_is_not_positive_is_refused(make_run, tmp_path, budget):
     with pytest.raises(ValueError, match="budget_mb: expected a positive number"):
         save_page(tmp_path / "index.html", load_results([make_run(tmp_path / "run")]), budget_mb=budget)
 
 
-def test_of_several_seeds_the_page_has_mean_and_standard_deviation(make_run, tmp_path):
+def test_page_has_mean_and_standard_deviation_of_several_seeds(make_run, tmp_path):
     scenes = ("cube_no_texture", "statue")
     for seed in range(3):
         make_run(tmp_path / "runs" / str(seed), seed=seed, scenes=scenes)
@@ -183,7 +183,7 @@ def test_of_several_seeds_the_page_has_mean_and_standard_deviation(make_run, tmp
     assert [surface["text"] for surface in scene["surfaces"] if surface["kind"] == "method"] == ["seed 0"]
 
 
-def test_a_mean_over_fewer_scenes_than_others_have_says_over_how_many(make_run, tmp_path):
+def test_mean_over_fewer_scenes_is_labelled_with_their_number(make_run, tmp_path):
     make_run(tmp_path / "runs" / "all", scenes=("a", "b"))
     make_run(tmp_path / "runs" / "part", method="mine", label="Mine", scenes=("a",))
     _, data, _ = saved(tmp_path, load_results([tmp_path / "runs"]))
@@ -192,7 +192,7 @@ def test_a_mean_over_fewer_scenes_than_others_have_says_over_how_many(make_run, 
     assert counts["Mine"]["RMSE_d"] == 1
 
 
-def test_published_values_stand_with_scenes_of_the_paper_and_those_re_created_are_starred(make_run, tmp_path):
+def test_published_values_stand_with_the_papers_scenes_and_recreated_ones_are_starred(make_run, tmp_path):
     make_run(tmp_path / "runs" / "a", scenes=("cube_no_texture",))
     make_run(tmp_path / "runs" / "b", scenes=("lucy", "mine"), dataset="folder")
     _, data, _ = saved(tmp_path, load_results([tmp_path / "runs"]))
@@ -203,7 +203,7 @@ def test_published_values_stand_with_scenes_of_the_paper_and_those_re_created_ar
     assert rows["mine"]["paper"] == {}
 
 
-def test_a_run_without_stored_scenes_shows_its_tables_and_says_why_no_pictures(make_run, tmp_path):
+def test_run_without_stored_scenes_has_tables_and_says_why_no_pictures(make_run, tmp_path):
     folder = make_run(tmp_path / "run")
     (folder / "scenes" / "cube_no_texture.npz").unlink()
     content, data, scene = saved(tmp_path, load_results([folder]))
@@ -214,7 +214,7 @@ def test_a_run_without_stored_scenes_shows_its_tables_and_says_why_no_pictures(m
     assert not any(name.startswith("p") for name in content)
 
 
-def test_a_damaged_prediction_is_left_out_and_named(make_run, tmp_path):
+def test_damaged_prediction_is_left_out_and_named(make_run, tmp_path):
     runs = [make_run(tmp_path / name, method=name, label=name) for name in ("a", "b")]
     results = load_results(runs)
     (runs[1] / "predictions" / "cube_no_texture.npz").write_bytes(b"PK")
@@ -223,7 +223,7 @@ def test_a_damaged_prediction_is_left_out_and_named(make_run, tmp_path):
     assert any("expected a prediction" in note for note in data["notes"])
 
 
-def test_without_a_truth_there_are_renderings_and_no_errors(make_run, tmp_path):
+def test_scene_without_truth_has_renderings_and_no_errors(make_run, tmp_path):
     [run] = load_results([make_run(tmp_path / "run")]).runs
     stored = dataclasses.replace(run.scene("cube_no_texture"), depth=None)
     _, _, scene = saved(tmp_path, Results((changed(run, scene=lambda _: stored),)))
@@ -232,7 +232,7 @@ def test_without_a_truth_there_are_renderings_and_no_errors(make_run, tmp_path):
     assert "error" not in scene["surfaces"][1]
 
 
-def test_names_with_tags_in_them_end_no_block_and_begin_no_element(make_run, tmp_path):
+def test_names_with_tags_are_escaped(make_run, tmp_path):
     [run] = load_results([make_run(tmp_path / "run")]).runs
     spiteful = dataclasses.replace(run, label=SPITEFUL, dataset=SPITEFUL)
     path = tmp_path / "index.html"
@@ -243,7 +243,7 @@ def test_names_with_tags_in_them_end_no_block_and_begin_no_element(make_run, tmp
     assert json.loads(blocks(path)["data"])["methods"] == [SPITEFUL]
 
 
-def test_links_lead_to_the_files_that_lie_beside_the_page(make_run, tmp_path):
+def test_links_lead_to_the_files_beside_the_page(make_run, tmp_path):
     report = tmp_path / "report"
     for name in ("tables/all 1.csv", "tables/all.tex", "figures/x.pdf", "figures/x.log", "other/y.csv"):
         (report / name).parent.mkdir(parents=True, exist_ok=True)
@@ -255,7 +255,7 @@ def test_links_lead_to_the_files_that_lie_beside_the_page(make_run, tmp_path):
     assert [link["name"] for link in data["links"]] == ["other/y.csv", "figures/x.pdf"]
 
 
-def test_progress_is_told_and_an_interrupted_page_leaves_the_old_one_as_it_was(make_run, tmp_path):
+def test_progress_is_reported_and_an_interrupted_page_leaves_the_old_one(make_run, tmp_path):
     results = load_results([make_run(tmp_path / "run", scenes=("a", "b", "c"))])
     seen = []
     path = tmp_path / "report" / "index.html"
@@ -272,7 +272,7 @@ def test_progress_is_told_and_an_interrupted_page_leaves_the_old_one_as_it_was(m
     assert [file.name for file in path.parent.iterdir()] == ["index.html"]
 
 
-def test_settings_times_and_environment_are_there_by_dotted_key(make_run, tmp_path):
+def test_settings_times_and_environment_are_listed_by_dotted_key(make_run, tmp_path):
     _, data, _ = saved(tmp_path, load_results([make_run(tmp_path / "run")]))
     [run] = data["runs"]
     assert run["settings"]["method.name"] == "bicubic"

@@ -70,7 +70,7 @@ def test_raw_scores_become_millimetres_percents_and_thousandths():
     assert table.loc["lucy"].to_dict() == pytest.approx(UNITS)
 
 
-def test_the_table_shows_the_worst_of_the_four_lights():
+def test_table_shows_the_worst_of_the_four_lights():
     assert in_paper_units(scores("lucy")).loc["lucy", "DSSIM_v"] == pytest.approx(354)
 
 
@@ -80,37 +80,37 @@ def test_empty_variants_are_recognised_after_a_file_was_read_back(tmp_path):
     pd.testing.assert_frame_equal(in_paper_units(again), in_paper_units(scores("lucy")))
 
 
-def test_a_metric_that_was_not_computed_has_no_column():
+def test_metric_that_was_not_computed_has_no_column():
     without = {name: value for name, value in RAW.items() if name != "LPIPS_v"}
     assert "LPIPS_v" not in in_paper_units(scores("lucy", raw=without))
     assert "LPIPS_v" not in text(scores("lucy", raw=without))
 
 
-def test_the_paper_has_an_rmse_d_of_72_mm_for_lucy_x4_bicubic():
+def test_paper_has_an_rmse_d_of_72_mm_for_lucy_x4_bicubic():
     found = published_row("lucy", "Bicubic", 4)
     assert found is not None
     assert (found["RMSE_d"], found["BadPix_d_5cm"], found["DSSIM_v"], found["LPIPS_v"]) == (72, 6.8, 355, 398)
 
 
 @pytest.mark.parametrize(("scene", "method", "scale"), [("lucy", "Bicubic", 2), ("lucy", "Mine", 4), ("a", "MSG", 4)])
-def test_what_the_paper_has_not_is_not_found(scene, method, scale):
+def test_scene_that_the_paper_lacks_is_not_found(scene, method, scale):
     assert published_row(scene, method, scale) is None
 
 
 @pytest.mark.parametrize("scene", RECREATED)
 @pytest.mark.parametrize("method", ["Bicubic", "MSG", "MSG-V"])
 @pytest.mark.parametrize("scale", [4, 8])
-def test_every_recreated_scene_is_found_in_the_paper(scene, method, scale):
+def test_recreated_scenes_are_all_in_the_paper(scene, method, scale):
     found = published_row(scene, method, scale)
     assert found is not None
     assert math.isfinite(found["RMSE_d"])
 
 
-def test_the_published_figures_have_no_row_twice():
+def test_published_values_have_no_duplicate_row():
     assert not published().duplicated(["scene", "method", "scale"]).any()
 
 
-def test_the_published_figures_are_those_of_the_shared_transcription(shared):
+def test_published_values_equal_the_shared_transcription(shared):
     long = pd.read_csv(shared / "paper" / "tables.csv").set_index(["scene", "method", "scale", "metric"])["value"]
     ours = published().melt(["scene", "method", "scale"], list(METRICS), "metric").dropna()
     assert len(ours) > 500
@@ -118,34 +118,34 @@ def test_the_published_figures_are_those_of_the_shared_transcription(shared):
     pd.testing.assert_series_equal(ours["value"], theirs, check_index=False)
 
 
-def test_the_papers_values_stand_below_ours_in_the_same_units():
+def test_published_values_stand_below_ours_in_the_same_units():
     printed = text(scores("lucy"))
     assert row(printed, ["lucy"], "dsr") == ["70.4", "6.70", "49.5", "354", "424", "1.39", "274"]
     assert row(printed, [], "paper") == ["72.0", "6.80", "48.8", "355", "398", "1.37", "267"]
     assert "*" not in printed
 
 
-def test_the_papers_values_of_a_recreated_scene_are_starred_and_explained():
+def test_published_values_of_a_recreated_scene_are_starred_and_explained():
     printed = text(scores("cube_no_texture"))
     assert row(printed, [], "paper*")
     assert "* of the paper's own file" in printed
 
 
 @pytest.mark.parametrize("downsampling", ["nearest", "measured", "gaussian"])
-def test_under_another_downsampling_no_value_of_the_paper_is_shown(downsampling):
+def test_published_values_are_hidden_under_another_downsampling(downsampling):
     printed = text(scores("lucy", "cube_no_texture", downsampling=downsampling))
     assert "paper" not in printed
     assert f"{downsampling} downsampling" in printed
 
 
-def test_several_scenes_have_a_mean_and_one_has_none():
+def test_mean_is_shown_for_several_scenes_and_not_for_one():
     printed = text(scores("lucy", "other"))
     assert row(printed, ["mean"], "dsr")[0] == "120.4"  # of 70.4 and 170.4 mm
     assert row(printed, ["mean"], "dsr")[3] == "404"
     assert "mean" not in text(scores("lucy"))
 
 
-def test_below_the_mean_of_all_scenes_stands_the_paper_s_average_over_them():
+def test_published_average_stands_below_the_mean_of_all_scenes():
     seven = scores("vintage", "recycle", "umbrella", "classroom1", "playroom", "backpack", "jadeplant")
     seven["dataset"] = "middlebury"
     average = published()[
@@ -159,13 +159,13 @@ def test_below_the_mean_of_all_scenes_stands_the_paper_s_average_over_them():
     assert text(six).split("mean")[1].count("paper") == 0
 
 
-def test_of_frames_that_may_be_others_than_the_paper_s_the_row_is_starred():
+def test_row_is_starred_where_frames_may_differ_from_the_papers():
     table = scores("coat_rack")
     table["dataset"] = "icl"
     assert row(text(table), [], "paper*")
 
 
-def test_a_value_that_could_not_be_computed_is_a_dash_and_left_out_of_the_mean():
+def test_unknown_value_is_a_dash_and_left_out_of_the_mean():
     table = scores("lucy", "other")
     table.loc[(table["scene"] == "other") & (table["metric"] == "RMSE_d"), "value"] = math.nan
     printed = text(table)
@@ -174,10 +174,10 @@ def test_a_value_that_could_not_be_computed_is_a_dash_and_left_out_of_the_mean()
 
 
 @pytest.mark.parametrize("scene", ["[bold]", "a[red]b", "ünï", "[/]"])
-def test_a_scene_s_name_is_printed_as_it_is(scene):
+def test_scene_name_is_printed_unchanged(scene):
     assert scene in text(scores(scene))
 
 
-def test_the_title_names_method_data_scale_and_downsampling():
+def test_title_names_method_data_scale_and_downsampling():
     title = text(scores("lucy", scale=8), "MSG-V").splitlines()[0]
     assert title.strip() == "MSG-V on simgeo, x8, box downsampling - lower is better"

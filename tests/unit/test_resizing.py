@@ -23,7 +23,7 @@ def scene(depth, camera=CAMERA):
 
 
 @pytest.mark.parametrize(("height", "width"), [(20, 30), (17, 25), (41, 61), (60, 90), (66, 99), (120, 180)])
-def test_a_plane_stays_the_plane_that_the_new_camera_sees_up_to_the_border_and_beside_a_hole(height, width):
+def test_plane_is_reproduced_in_the_new_camera_up_to_the_border_and_beside_a_hole(height, width):
     depth = plane_depth(CAMERA)
     depth[:, 20:33, 11:40] = torch.nan
     fine = resized_depth(depth, height, width)
@@ -33,13 +33,13 @@ def test_a_plane_stays_the_plane_that_the_new_camera_sees_up_to_the_border_and_b
     assert 0.8 < known.double().mean() < 0.97
 
 
-def test_the_same_size_is_the_same_depth():
+def test_same_size_leaves_depth_unchanged():
     depth = 1 + torch.rand(1, 60, 90, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     assert torch.equal(resized(scene(depth), 60, 90).depth, depth)
 
 
 @pytest.mark.parametrize(("height", "width"), [(20, 30), (23, 31), (66, 99)])
-def test_nothing_is_mixed_across_a_depth_edge(height, width):
+def test_depth_edges_are_not_mixed(height, width):
     depth = torch.full((1, 60, 90), 2.0, dtype=torch.float64)
     depth[:, 15:41, 22:67] = 1.0
     fine = resized_depth(depth, height, width)
@@ -48,7 +48,7 @@ def test_nothing_is_mixed_across_a_depth_edge(height, width):
     assert share == pytest.approx(26 * 45 / 5400, abs=0.02)
 
 
-def test_a_pixel_is_a_hole_just_where_its_centre_falls_on_one():
+def test_pixel_is_a_hole_exactly_where_its_centre_falls_on_one():
     depth = torch.full((1, 60, 90), 2.0, dtype=torch.float64)
     depth[:, 10:20, 30:33] = torch.nan
     fine = resized_depth(depth, 20, 30)
@@ -57,13 +57,13 @@ def test_a_pixel_is_a_hole_just_where_its_centre_falls_on_one():
     assert torch.equal(fine.isnan(), expected)
 
 
-def test_averages_halve_the_noise_of_a_plane():
+def test_averaging_halves_the_noise_of_a_plane():
     noise = 1e-3 * torch.randn(1, 120, 180, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
     fine = resized_depth(2 + noise, 30, 45)
     assert float((fine - 2).std()) < 0.35e-3
 
 
-def test_a_scene_keeps_its_normals_and_disparities_scale_with_the_size():
+def test_scene_keeps_its_normals_and_disparities_scale_with_the_size():
     before = scene(plane_depth(CAMERA))
     after = resized(before, 30, 45)
     assert after.rgb.shape == (3, 30, 45)
@@ -84,7 +84,7 @@ def sphere_depth(camera):
 
 
 @pytest.mark.parametrize("size", [(120, 180), (200, 300), (480, 720), (520, 780)])
-def test_a_curved_surface_is_where_it_was(size):
+def test_curved_surface_keeps_its_place(size):
     camera = Camera(720, 480, 640.0, 640.0, 350.0, 244.0)
     small = resized(scene(sphere_depth(camera), camera), *size)
     truth = sphere_depth(small.camera)
@@ -96,7 +96,7 @@ def test_a_curved_surface_is_where_it_was(size):
     assert float(angle[0][inner[0]].quantile(0.95)) < 1.0
 
 
-def test_a_crop_sees_the_same_points():
+def test_crop_has_the_same_points():
     whole = scene(plane_depth(CAMERA))
     part = whole.crop(7, 11, 30, 40)
     points, window = (each.depth * each.camera.rays() for each in (whole, part))
@@ -104,7 +104,7 @@ def test_a_crop_sees_the_same_points():
 
 
 @pytest.mark.parametrize(("place", "left"), [(0.0, 0), (0.5, 12), (1.0, 24)])
-def test_fitting_makes_the_shorter_side_so_long_and_cuts_a_square_along_the_longer(place, left):
+def test_fitting_resizes_the_shorter_side_and_crops_the_longer(place, left):
     fit = fitted(scene(plane_depth(CAMERA)), 48, place)
     assert (fit.camera.height, fit.camera.width) == (48, 48)
     assert fit.camera == CAMERA.rescale(72, 48).crop(0, left, 48, 48)
@@ -117,7 +117,7 @@ def test_fitting_without_a_window_or_without_enlarging():
     assert fitted(whole, 120, 0.5, enlarge=False).rgb.shape == (3, 60, 60)
 
 
-def test_the_paper_s_camera_of_plant_follows_from_that_of_icl_nuim():
+def test_camera_of_plant_follows_from_that_of_icl_nuim():
     native = Camera(640, 480, 480.6, 480.6, 319.5, 239.5)  # the authors take the mean of 481.2 and 480 for both
     height, width = 480, 640
     depth = torch.full((1, height, width), 2.0, dtype=torch.float64)
@@ -127,7 +127,7 @@ def test_the_paper_s_camera_of_plant_follows_from_that_of_icl_nuim():
     assert (fit.camera.cx, fit.camera.cy) == (pytest.approx(255.8, abs=0.6), pytest.approx(255.4667, abs=0.04))
 
 
-def test_a_scene_without_fine_depth_cannot_be_resized():
+def test_scene_without_high_resolution_depth_cannot_be_resized():
     only = Scene("set", "one", torch.zeros(3, 60, 90), CAMERA, None, {2: torch.ones(1, 30, 45)})
     with pytest.raises(ValueError, match="one: expected a high-resolution depth map to resize, there is none"):
         resized(only, 30, 45)

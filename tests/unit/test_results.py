@@ -21,7 +21,7 @@ def change_method(folder, **entries):
     change(folder, "versions.json", identity={**identity, "method": {**identity["method"], **entries}})
 
 
-def test_a_run_is_read_with_its_scenes_predictions_and_scores(make_run, tmp_path):
+def test_run_is_read_with_its_scenes_predictions_and_scores(make_run, tmp_path):
     make_run(tmp_path / "a", scenes=("b", "c"))
     (run,) = load_results([tmp_path]).runs
     assert (run.problem, run.label, run.scenes) == (BenchmarkSetting("simgeo", 4, "box"), "Bicubic", ("b", "c"))
@@ -33,7 +33,7 @@ def test_a_run_is_read_with_its_scenes_predictions_and_scores(make_run, tmp_path
     assert run.settings["method"]["name"] == "bicubic"
 
 
-def test_a_stored_scene_is_the_sample_that_the_method_was_given(make_run, tmp_path):
+def test_stored_scene_is_the_sample_that_the_method_was_given(make_run, tmp_path):
     make_run(tmp_path / "a", scenes=("b",))
     (run,) = load_results([tmp_path]).runs
     scene = run.scene("b")
@@ -45,7 +45,7 @@ def test_a_stored_scene_is_the_sample_that_the_method_was_given(make_run, tmp_pa
     assert float(scene.rgb.max()) <= 1
 
 
-def test_methods_and_problems_come_in_the_order_of_the_paper(make_run, tmp_path):
+def test_methods_and_settings_come_in_the_order_of_the_paper(make_run, tmp_path):
     for number, (label, dataset) in enumerate(
         [("Facets", "icl"), ("MSG-V", "icl"), ("DIP", "icl"), ("Bicubic", "simgeo")]
     ):
@@ -56,7 +56,7 @@ def test_methods_and_problems_come_in_the_order_of_the_paper(make_run, tmp_path)
     assert [run.label for run in results.runs] == ["Bicubic", "DIP", "MSG-V", "Facets"]
 
 
-def test_runs_of_one_method_with_other_settings_are_told_apart_by_them(make_run, tmp_path):
+def test_runs_of_one_method_are_labelled_by_their_settings(make_run, tmp_path):
     for name, ensemble in (("a", 1), ("b", 4)):
         make_run(tmp_path / name, scenes=("s",))
         change_method(tmp_path / name, ensemble=ensemble, order="cubic")
@@ -72,7 +72,7 @@ def test_runs_that_differ_in_the_seed_have_one_label(make_run, tmp_path):
     assert not results.notes
 
 
-def test_of_two_predictions_for_a_scene_the_newer_counts_and_a_note_says_so(make_run, tmp_path):
+def test_newer_of_two_predictions_counts_with_a_note(make_run, tmp_path):
     for age, (name, scenes) in enumerate([("new", ("s",)), ("old", ("s", "t"))]):
         make_run(tmp_path / name, scenes=scenes)
         os.utime(tmp_path / name / "scores.csv", (1e9 - age, 1e9 - age))
@@ -84,7 +84,7 @@ def test_of_two_predictions_for_a_scene_the_newer_counts_and_a_note_says_so(make
     assert ": s; " in note
 
 
-def test_a_directory_that_is_named_twice_is_read_once(make_run, tmp_path):
+def test_directory_named_twice_is_read_once(make_run, tmp_path):
     make_run(tmp_path / "a", scenes=("s",))
     assert len(load_results([tmp_path, tmp_path / "a"]).runs) == 1
 
@@ -101,7 +101,7 @@ def test_a_directory_that_is_named_twice_is_read_once(make_run, tmp_path):
         ("scores.csv", "dataset,scene,scale,downsampling,method,seed,metric,variant,value,valid_share\na,b,x,,,,,,,\n"),
     ],
 )
-def test_a_damaged_run_is_left_out_and_the_others_are_read(make_run, tmp_path, name, content):
+def test_damaged_run_is_left_out_and_the_others_are_read(make_run, tmp_path, name, content):
     make_run(tmp_path / "fine", scenes=("s",))
     make_run(tmp_path / "damaged", scenes=("s",), label="MSG")
     (tmp_path / "damaged" / name).write_text(content)
@@ -111,14 +111,14 @@ def test_a_damaged_run_is_left_out_and_the_others_are_read(make_run, tmp_path, n
     assert str(tmp_path / "damaged" / name) in note
 
 
-def test_a_directory_without_runs_is_refused(tmp_path):
+def test_directory_without_runs_is_refused(tmp_path):
     with pytest.raises(ValueError, match=r"expected runs of eval.py .*found none"):
         load_results([tmp_path])
     with pytest.raises(ValueError, match="there is none"):
         load_results([tmp_path / "absent"])
 
 
-def test_a_scene_that_is_missing_or_damaged_is_refused_in_one_line(make_run, tmp_path):
+def test_scene_that_is_missing_or_damaged_is_refused_in_one_line(make_run, tmp_path):
     make_run(tmp_path, scenes=("s",))
     path = scene_path(tmp_path, "s")
     path.write_bytes(path.read_bytes()[:100])
@@ -131,7 +131,7 @@ def test_a_scene_that_is_missing_or_damaged_is_refused_in_one_line(make_run, tmp
         run.scene("s")
 
 
-def test_a_scene_without_prediction_is_none_of_the_run_s(make_run, tmp_path):
+def test_scene_without_prediction_is_left_out_of_the_run(make_run, tmp_path):
     make_run(tmp_path, scenes=("s", "t"))
     (tmp_path / "predictions" / "t.npz").unlink()
     (run,) = load_results([tmp_path]).runs
@@ -149,7 +149,7 @@ def test_scores_of_all_runs_name_their_method_and_run(make_run, tmp_path):
     assert (scores[scores["metric"] == "RMSE_d"]["variant"] == "").all()
 
 
-def test_some_runs_can_be_chosen_and_what_is_not_there_is_refused(make_run, tmp_path):
+def test_runs_can_be_chosen_and_unknown_ones_are_refused(make_run, tmp_path):
     for label, scale in (("Bicubic", 4), ("MSG", 4), ("MSG", 2)):
         make_run(tmp_path / f"{label}{scale}", label=label, method=label, scale=scale, scenes=("s",))
     results = load_results([tmp_path])
@@ -160,13 +160,13 @@ def test_some_runs_can_be_chosen_and_what_is_not_there_is_refused(make_run, tmp_
         results.only(["Bicubic"], scales=[2])
 
 
-def test_scenes_that_a_method_has_no_answer_for_are_noted(make_run, tmp_path):
+def test_scenes_without_a_solution_are_noted(make_run, tmp_path):
     make_run(tmp_path / "a", label="EG", method="eg", scenes=("s",))
     change(tmp_path / "a", "summary.json", unanswered={"t": "t: no edge is closed"})
     assert load_results([tmp_path]).notes == ("EG at x4 has no answer for t: no edge is closed",)
 
 
-def test_runs_without_any_answer_are_refused_with_the_reason(make_run, tmp_path):
+def test_runs_without_any_solution_are_refused_with_the_reason(make_run, tmp_path):
     make_run(tmp_path / "a", label="EG", method="eg", scenes=("s",))
     prediction_path(tmp_path / "a", "s").unlink()
     with pytest.raises(ValueError, match=r"expected runs with a prediction, found none$"):

@@ -41,7 +41,7 @@ def claimed(folder, plain, weights="abc"):
     claim(folder, plain, identity_of(plain, weights, CPU))
 
 
-def test_the_same_configuration_leads_to_the_same_directory():
+def test_same_configuration_gives_the_same_directory():
     assert directory(config()) == directory(config())
     folder = directory(config())
     assert folder.parts[:2] == ("outputs", "eval")
@@ -55,11 +55,11 @@ def test_the_same_configuration_leads_to_the_same_directory():
         {"downsampling": {"name": "box", "kernel": "gaussian"}}, {"method": {"name": "msg_v", "variant": "x"}},
     ],
 )  # fmt: skip
-def test_another_configuration_leads_to_another_directory(changes):
+def test_other_configuration_gives_another_directory(changes):
     assert directory(config(**changes)) != directory(config())
 
 
-def test_other_weights_or_another_kind_of_device_lead_to_another_directory():
+def test_other_weights_or_kind_of_device_give_another_directory():
     folders = {directory(config(), *rest) for rest in (("abc", CPU), ("abd", CPU), (None, CPU))}
     folders.add(directory(config(), "abc", torch.device("cuda")))
     assert len(folders) == 4
@@ -69,11 +69,11 @@ def test_other_weights_or_another_kind_of_device_lead_to_another_directory():
 @pytest.mark.parametrize(
     "changes", [{"weights": "elsewhere.pth"}, {"output_dir": "x"}, {"overwrite": True}, {"metrics": {"lpips": False}}]
 )
-def test_what_predictions_do_not_depend_on_does_not_move_the_directory(changes):
+def test_settings_without_influence_on_predictions_keep_the_directory(changes):
     assert directory(config(**changes)) == directory(config())
 
 
-def test_other_code_leads_to_another_directory(monkeypatch):
+def test_other_code_gives_another_directory(monkeypatch):
     before = directory(config())
     monkeypatch.setattr(rundir, "code_hash", lambda: "other")
     assert directory(config()) != before
@@ -107,11 +107,11 @@ def lacking(modules, code=PREDICTING_CODE):
     return sorted(path for path in paths if not any(path == each or path.startswith(f"{each}/") for each in named))
 
 
-def test_every_module_that_determines_a_prediction_is_in_the_list_of_its_code():
+def test_prediction_code_lists_every_module_that_determines_a_prediction():
     assert lacking(closure_of(modules_in(*PREDICTING_PACKAGES))) == []
 
 
-def test_a_module_that_a_method_imports_and_the_list_lacks_is_found():
+def test_prediction_code_lacking_an_imported_module_is_found():
     imports = {
         **IMPORTS,
         "dsr.methods.networks.facets": IMPORTS["dsr.methods.networks.facets"] | {"dsr.viz.palette"},
@@ -121,14 +121,14 @@ def test_a_module_that_a_method_imports_and_the_list_lacks_is_found():
     assert lacking(closure_of(["dsr.methods.dip.upsampler"]), without) == ["utils/lightning.py"]
 
 
-def test_the_lists_of_code_name_nothing_that_is_not_there():
+def test_prediction_code_names_only_existing_files():
     for name in (*PREDICTING_CODE, *NOT_PREDICTING):
         assert (SOURCE / "dsr" / name).exists(), name
     with pytest.raises(FileNotFoundError, match=r"nowhere\.py"):
         hash_of_code(["nowhere.py"])
 
 
-def test_the_hash_of_the_code_follows_what_makes_predictions_and_nothing_else(monkeypatch, tmp_path):
+def test_code_hash_follows_the_prediction_code_alone(monkeypatch, tmp_path):
     names = ("methods/a.py", "data/b.py", "geometry/c.py", "sample.py", "degrade.py", "report/d.py")
     for name in names:
         (tmp_path / name).parent.mkdir(exist_ok=True)
@@ -152,12 +152,12 @@ def test_the_hash_of_the_code_follows_what_makes_predictions_and_nothing_else(mo
         code_hash.cache_clear()
 
 
-def test_a_file_s_hash_is_its_sha_256(tmp_path):
+def test_file_hash_is_its_sha_256(tmp_path):
     (tmp_path / "abc").write_bytes(b"abc")
     assert file_hash(tmp_path / "abc") == "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"
 
 
-def test_a_claimed_directory_has_the_config_and_the_versions(tmp_path):
+def test_claimed_directory_has_the_config_and_the_versions(tmp_path):
     claimed(tmp_path / "new" / "run", config())
     assert sorted(path.name for path in (tmp_path / "new" / "run").iterdir()) == ["config.yaml", "versions.json"]
     assert OmegaConf.to_container(OmegaConf.load(tmp_path / "new" / "run" / "config.yaml")) == config()
@@ -168,12 +168,12 @@ def test_a_claimed_directory_has_the_config_and_the_versions(tmp_path):
     assert record["identity"]["device"] == "cpu"
 
 
-def test_an_empty_directory_and_the_same_run_may_be_claimed(tmp_path):
+def test_empty_directory_and_that_of_the_same_run_may_be_claimed(tmp_path):
     claimed(tmp_path, config())
     claimed(tmp_path, config(metrics={"lpips": False}, weights="elsewhere.pth"))
 
 
-def test_a_directory_of_another_run_is_refused_by_the_changed_keys(tmp_path):
+def test_directory_of_another_run_is_refused_with_the_changed_keys(tmp_path):
     claimed(tmp_path, config())
     before = (tmp_path / "config.yaml").read_bytes()
     other = config(scale=8, dataset={"name": "folder", "root": "other", "scenes": None})
@@ -186,7 +186,7 @@ def test_a_directory_of_another_run_is_refused_by_the_changed_keys(tmp_path):
 
 
 @pytest.mark.parametrize("content", [None, "", "[]", "{}", '{"identity": 3}', '{"identity": null}'])
-def test_a_directory_with_files_of_something_else_is_refused_and_left_alone(tmp_path, content):
+def test_directory_with_foreign_files_is_refused_and_unchanged(tmp_path, content):
     (tmp_path / "thesis.txt").write_text("precious")
     if content is not None:
         (tmp_path / "versions.json").write_text(content)
@@ -196,26 +196,26 @@ def test_a_directory_with_files_of_something_else_is_refused_and_left_alone(tmp_
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
 
 
-def test_overwrite_takes_the_directory_of_another_run(tmp_path):
+def test_overwrite_claims_the_directory_of_another_run(tmp_path):
     claimed(tmp_path, config())
     claimed(tmp_path, config(scale=8, overwrite=True))
     assert OmegaConf.load(tmp_path / "config.yaml").scale == 8
     assert json.loads((tmp_path / "versions.json").read_text())["identity"]["scale"] == 8
 
 
-def test_a_file_in_the_directory_s_place_is_refused(tmp_path):
+def test_file_in_place_of_the_directory_is_refused(tmp_path):
     (tmp_path / "file").write_text("x")
     with pytest.raises(ConfigError, match=r"^output_dir: expected a directory, .*file is a file"):
         claimed(tmp_path / "file", config())
 
 
-def test_a_directory_that_cannot_be_made_is_refused_on_one_line(tmp_path):
+def test_directory_that_cannot_be_made_is_refused_in_one_line(tmp_path):
     (tmp_path / "file").write_text("x")
     with pytest.raises(ConfigError, match=r"^output_dir: expected a directory to write to, got .*run \(Not a dir"):
         claimed(tmp_path / "file" / "run", config())
 
 
-def test_a_directory_that_cannot_be_written_is_refused_on_one_line(tmp_path, monkeypatch):
+def test_directory_that_cannot_be_written_is_refused_in_one_line(tmp_path, monkeypatch):
     def refuse(path, text):
         raise PermissionError(13, "Permission denied", str(path))
 
@@ -224,7 +224,7 @@ def test_a_directory_that_cannot_be_written_is_refused_on_one_line(tmp_path, mon
         claimed(tmp_path / "run", config())
 
 
-def test_the_versions_have_packages_commit_and_accelerator():
+def test_versions_have_packages_commit_and_accelerator():
     record = json.loads(json.dumps(versions()))
     assert {"dsr", "torch", "numpy", "hydra-core"} <= record["packages"].keys()
     assert record["accelerator"] == (torch.cuda.get_device_name() if torch.cuda.is_available() else None)
@@ -232,11 +232,11 @@ def test_the_versions_have_packages_commit_and_accelerator():
     assert isinstance(record["git_dirty"], bool)
 
 
-def test_the_versions_outside_of_a_checkout_have_no_commit(monkeypatch, tmp_path):
+def test_versions_outside_of_a_checkout_have_no_commit(monkeypatch, tmp_path):
     monkeypatch.setattr(dsr, "__file__", str(tmp_path / "dsr" / "__init__.py"))
     assert versions()["git_commit"] is None
 
 
-def test_a_package_that_is_not_installed_is_said_to_be_so(monkeypatch):
+def test_missing_package_is_recorded_as_such(monkeypatch):
     monkeypatch.setattr(rundir, "_PACKAGES", ("dsr", "no-such-package-here"))
     assert versions()["packages"]["no-such-package-here"] == "not installed"

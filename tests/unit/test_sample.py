@@ -38,7 +38,7 @@ def _with(shape: tuple[int, ...], value: float) -> torch.Tensor:
     return depth
 
 
-def test_good_records_are_accepted_with_holes_and_without_truth() -> None:
+def test_valid_records_are_accepted_with_holes_and_without_truth() -> None:
     _scene(depth=_with((1, 4, 8), torch.nan))
     _scene(depth=None, measured={2: torch.ones(1, 2, 4), 4: torch.ones(1, 1, 2).double()})
     sample = _sample(depth=None, depth_lr=_with((1, 2, 4), torch.nan))
@@ -58,7 +58,7 @@ def test_crop_takes_the_window_of_every_map_and_of_the_camera() -> None:
     assert torch.equal(window.measured[2], torch.tensor([[[7.0, 8.0]]]))
 
 
-def test_masks_tell_where_depth_is_known() -> None:
+def test_valid_masks_are_true_where_depth_is_known() -> None:
     sample = _sample(depth_lr=_with((1, 2, 4), torch.nan), depth=_with((1, 4, 8), torch.nan))
     assert sample.mask_lr.dtype == torch.bool
     assert (~sample.mask_lr).nonzero().tolist() == [[0, 1, 2]]
@@ -69,7 +69,7 @@ def test_masks_tell_where_depth_is_known() -> None:
 
 @pytest.mark.parametrize("make", [_scene, _sample])
 @pytest.mark.parametrize("shape", [(4, 8), (1, 4, 8), (3, 8, 4), (1, 3, 4, 8), (3, 4, 7)])
-def test_a_photo_of_another_shape_is_refused(make: Any, shape: tuple[int, ...]) -> None:
+def test_photo_of_another_shape_is_refused(make: Any, shape: tuple[int, ...]) -> None:
     with pytest.raises(ValueError, match=r"^hall: rgb: expected shape \(3, 4, 8\), got "):
         make(rgb=torch.zeros(shape))
 
@@ -85,7 +85,7 @@ def test_a_photo_of_another_shape_is_refused(make: Any, shape: tuple[int, ...]) 
         torch.full((3, 4, 8), 255.0),
     ],
 )
-def test_a_photo_of_other_values_is_refused(make: Any, rgb: torch.Tensor) -> None:
+def test_photo_with_values_out_of_range_is_refused(make: Any, rgb: torch.Tensor) -> None:
     with pytest.raises(ValueError, match=r"^hall: rgb: expected floating point values in \[0, 1\]"):
         make(rgb=rgb)
 
@@ -103,7 +103,7 @@ BAD_DEPTHS = [
 
 
 @pytest.mark.parametrize(("bad", "message"), BAD_DEPTHS)
-def test_a_wrong_depth_map_is_named(bad: Any, message: str) -> None:
+def test_invalid_depth_map_is_refused_by_name(bad: Any, message: str) -> None:
     with pytest.raises(ValueError, match=f"^hall: depth: {message}"):
         _scene(depth=bad((1, 4, 8)))
     with pytest.raises(ValueError, match=f"^hall: measured depth at x2: {message}"):
@@ -114,18 +114,18 @@ def test_a_wrong_depth_map_is_named(bad: Any, message: str) -> None:
         _sample(depth_lr=bad((1, 2, 4)))
 
 
-def test_a_scene_without_any_depth_is_refused() -> None:
+def test_scene_without_any_depth_is_refused() -> None:
     with pytest.raises(ValueError, match=r"^hall: expected a depth map, fine or measured, got none"):
         _scene(depth=None)
 
 
 @pytest.mark.parametrize("factor", [0, -2])
-def test_a_measured_map_at_no_factor_is_refused(factor: int) -> None:
+def test_measured_map_without_a_factor_is_refused(factor: int) -> None:
     with pytest.raises(ValueError, match=f"^hall: measured: expected a positive factor, got {factor}"):
         _scene(measured={factor: torch.ones(1, 2, 4)})
 
 
-def test_coarse_and_fine_sizes_must_differ_by_the_scale() -> None:
+def test_low_and_high_resolution_sizes_must_differ_by_the_scale() -> None:
     with pytest.raises(
         ValueError, match=r"^hall: depth_lr: expected 1 x 2 \(the photo's 4 x 8 at scale 4\), got 2 x 4"
     ):
@@ -135,12 +135,12 @@ def test_coarse_and_fine_sizes_must_differ_by_the_scale() -> None:
 
 
 @pytest.mark.parametrize("scale", [0, -2])
-def test_a_scale_that_is_not_positive_is_refused(scale: int) -> None:
+def test_scale_that_is_not_positive_is_refused(scale: int) -> None:
     with pytest.raises(ValueError, match=f"^hall: scale: expected a positive whole number, got {scale}"):
         _sample(scale=scale)
 
 
-def test_records_do_not_change() -> None:
+def test_records_are_immutable() -> None:
     with pytest.raises(AttributeError):
         _scene().name = "other"  # type: ignore[misc]
     with pytest.raises(AttributeError):

@@ -29,7 +29,7 @@ def test_lights_are_those_of_the_protocol() -> None:
     np.testing.assert_allclose(lights().numpy(), PROTOCOL, rtol=0, atol=1e-15)
 
 
-def test_the_first_three_lights_are_orthonormal_and_the_fourth_is_frontal() -> None:
+def test_first_three_lights_are_orthonormal_and_the_fourth_is_frontal() -> None:
     basis = lights()[:3].numpy()
     np.testing.assert_allclose(basis @ basis.T, np.eye(3), rtol=0, atol=1e-15)
     assert lights()[3].tolist() == [0, 0, -1]
@@ -44,7 +44,7 @@ def test_shading_is_the_cosine_to_each_light() -> None:
         np.testing.assert_allclose(shaded[:, light], expected, rtol=0, atol=1e-14)
 
 
-def test_mean_squared_difference_of_three_shadings_is_that_of_the_normal_maps() -> None:
+def test_difference_of_three_shadings_is_that_of_the_normal_maps() -> None:
     first, second = _normals(1), _normals(2)
     basis = lights()[:3]
     shaded = (shade(first, basis) - shade(second, basis)).square().mean()
@@ -58,14 +58,14 @@ def test_rendering_clips_the_shading_to_zero_and_one() -> None:
     np.testing.assert_array_equal(render(normals).numpy(), np.clip(shaded.numpy(), 0, 1))
 
 
-def test_a_fronto_parallel_wall_is_brightest_from_the_front_and_equal_from_the_sides() -> None:
+def test_frontal_wall_is_brightest_from_the_front_and_equal_from_the_sides() -> None:
     camera = Camera(5, 4, 10.0, 10.0, 2.0, 1.5)
     normals = depth_to_normals(torch.full((1, 1, 4, 5), 2.0, dtype=torch.float64), camera.rays()[None])
     brightness = render(normals).mean(dim=(0, 2, 3)).numpy()
     np.testing.assert_allclose(brightness, [3**-0.5, 3**-0.5, 3**-0.5, 1], rtol=1e-12)
 
 
-def test_a_floor_is_lit_from_above_and_a_wall_on_the_right_from_the_left() -> None:
+def test_floor_is_lit_from_above_and_a_wall_on_the_right_from_the_left() -> None:
     floor, right_wall = torch.tensor([0.0, -1.0, 0.0]), torch.tensor([-1.0, 0.0, 0.0])
     both = torch.stack((floor, right_wall))[:, :, None, None]
     floor_light, wall_light = render(both)[:, :, 0, 0].tolist()
@@ -73,6 +73,6 @@ def test_a_floor_is_lit_from_above_and_a_wall_on_the_right_from_the_left() -> No
     np.testing.assert_allclose(wall_light, [0, 1 / np.sqrt(2), 0, 0], atol=1e-7)
 
 
-def test_lights_come_in_the_wanted_precision() -> None:
+def test_lights_have_the_requested_precision() -> None:
     assert lights(dtype=torch.float32).dtype == torch.float32
     assert render(_normals(0).float()).dtype == torch.float32

@@ -52,7 +52,7 @@ def written(monkeypatch):
     return texts
 
 
-def test_a_row_shows_photo_depth_holes_and_renderings(tmp_path):
+def test_row_shows_photo_depth_holes_and_renderings(tmp_path):
     scene = toy_scene()
     scene.depth[0, :16, 16:] = torch.nan
     page = drawn(tmp_path, scene)
@@ -76,7 +76,7 @@ def test_rows_keep_the_order_of_the_scenes(tmp_path):
         assert (panel(page, 0, row) == round(255 * shade)).all()
 
 
-def test_beside_it_stand_name_size_field_of_view_range_and_share_of_holes(tmp_path, written):
+def test_captions_have_name_size_field_of_view_range_and_fraction_of_holes(tmp_path, written):
     scene = toy_scene(30, 40)
     scene.depth[0, 0, 0] = 1.25
     scene.depth[0, 5:8, :] = torch.nan
@@ -86,20 +86,20 @@ def test_beside_it_stand_name_size_field_of_view_range_and_share_of_holes(tmp_pa
     assert expected in written
 
 
-def test_the_field_of_view_of_a_crop_is_that_of_the_crop(tmp_path, written):
+def test_field_of_view_of_a_crop_is_that_of_the_crop(tmp_path, written):
     left_half = toy_scene().camera.crop(0, 0, 32, 16)
     drawn(tmp_path, toy_scene(32, 16, camera=left_half))
     assert any("field of view 45 x 90 degrees" in text for text in written)
 
 
-def test_a_scene_with_little_unknown_does_not_count_as_complete(tmp_path, written):
+def test_scene_with_few_holes_does_not_count_as_complete(tmp_path, written):
     scene = toy_scene(200, 200)
     scene.depth[0, 7, 7] = torch.nan
     drawn(tmp_path, scene)
     assert any(text.endswith("holes: 0.0025 %") for text in written)
 
 
-def test_a_scene_without_fine_depth_shows_its_coarsest_measured_map(tmp_path, written):
+def test_scene_without_high_resolution_depth_shows_its_lowest_measured_map(tmp_path, written):
     coarse = torch.full((1, 4, 4), 3.0)
     coarse[0, :2] = torch.nan
     page = drawn(tmp_path, toy_scene(depth=None, measured={2: torch.ones(1, 16, 16), 8: coarse}))
@@ -111,7 +111,7 @@ def test_a_scene_without_fine_depth_shows_its_coarsest_measured_map(tmp_path, wr
     )
 
 
-def test_a_measured_map_beside_the_fine_one_is_told_of(tmp_path, written):
+def test_measured_map_beside_the_high_resolution_map_is_mentioned(tmp_path, written):
     drawn(tmp_path, toy_scene(measured={4: torch.full((1, 8, 8), 2.0)}))
     assert any("measured, too: x4\ndepth 2 to 2 m" in text for text in written)
 
@@ -126,7 +126,7 @@ def test_many_scenes_make_numbered_pages(tmp_path, written, monkeypatch, count, 
     assert [text for text in written if text.startswith("scene ")] == [f"scene {number}" for number in range(count)]
 
 
-def test_scenes_are_taken_as_they_are_needed(tmp_path, monkeypatch):
+def test_scenes_are_loaded_one_at_a_time(tmp_path, monkeypatch):
     monkeypatch.setattr("dsr.viz.sheets._ROWS", 2)
 
     def scenes():
@@ -138,18 +138,18 @@ def test_scenes_are_taken_as_they_are_needed(tmp_path, monkeypatch):
     save_contact_sheet(tmp_path / "toys.png", scenes(), "Toys")
 
 
-def test_a_full_page_needs_no_number(tmp_path):
+def test_full_page_needs_no_number(tmp_path):
     assert drawn(tmp_path, *(toy_scene(8, 8) for _ in range(PAGE))).shape == (80 + PAGE * 306, WIDTH, 3)
 
 
-def test_no_scene_is_refused_and_writes_nothing(tmp_path):
+def test_empty_sheet_is_refused_and_writes_nothing(tmp_path):
     with pytest.raises(ValueError, match=r"toys.png: expected a scene or more for a contact sheet, got none"):
         save_contact_sheet(tmp_path / "toys.png", [], "Toys")
     assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize(("height", "width"), [(2, 2), (1, 9), (9, 1), (4, 90), (90, 4), (700, 900)])
-def test_any_size_is_drawn(tmp_path, height, width):
+def test_scenes_of_any_size_are_drawn(tmp_path, height, width):
     tallest = max(256 * height / max(height, width), 30)
     page = drawn(tmp_path, toy_scene(height, width))
     assert page.shape[1] == WIDTH
@@ -158,7 +158,7 @@ def test_any_size_is_drawn(tmp_path, height, width):
     )  # seven lines of text and a blank one
 
 
-def test_a_large_photo_is_averaged(tmp_path):
+def test_large_photo_is_averaged(tmp_path):
     stripes = torch.zeros(3, 1200, 1200)
     stripes[:, :, ::2] = 1
     page = drawn(tmp_path, toy_scene(1200, 1200, rgb=stripes))
@@ -166,11 +166,11 @@ def test_a_large_photo_is_averaged(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["$\\foo$", "日本 a_b^c", "{} %d ünï $", "n" * 100, "a-b " * 20, " "])
-def test_any_name_and_title_are_written_as_they_are(tmp_path, name):
+def test_any_name_and_title_are_written_unchanged(tmp_path, name):
     drawn(tmp_path, toy_scene(8, 8, name), title=name)
 
 
-def test_a_page_that_is_there_is_replaced_and_a_failure_leaves_it(tmp_path):
+def test_existing_page_is_replaced_and_kept_on_failure(tmp_path):
     path = tmp_path / "sheets" / "toys.png"
     drawn(tmp_path, toy_scene(8, 8))
     before = path.read_bytes()
@@ -188,7 +188,7 @@ def test_a_page_that_is_there_is_replaced_and_a_failure_leaves_it(tmp_path):
     assert len(list(path.parent.iterdir())) == 1
 
 
-def test_a_page_of_detailed_scenes_stays_below_two_megabytes(tmp_path, shared):
+def test_page_of_detailed_scenes_stays_below_two_megabytes(tmp_path, shared):
     scenes = []
     for folder in sorted((shared / "real" / "middlebury2014").iterdir()):
         photo = torch.from_numpy(cv2.imread(str(folder / "im0.png")) / 255).permute(2, 0, 1).float()

@@ -43,13 +43,13 @@ def assert_rendered(scene, name=NAME):
     assert scene.camera == expected.camera
 
 
-def test_there_are_five_scenes_like_the_papers_and_a_statue():
+def test_simgeo_has_five_scenes_like_the_papers_and_a_statue():
     assert SimGeo(size=SIZE).scenes() == list(SCENES)
     assert len(SCENES) == 6
     assert "statue" in SCENES
 
 
-def test_a_scene_is_its_rendering_with_depth_in_metres(cache, calls):
+def test_scene_is_its_rendering_with_depth_in_metres(cache, calls):
     scene = SimGeo(size=SIZE).load(NAME)
     assert (scene.dataset, scene.name) == ("simgeo", NAME)
     assert scene.rgb.shape == (3, SIZE, SIZE)
@@ -57,14 +57,14 @@ def test_a_scene_is_its_rendering_with_depth_in_metres(cache, calls):
     assert calls == [(NAME, SIZE)]
 
 
-def test_a_rendering_is_made_once_and_then_read_from_the_cache(cache, calls):
+def test_rendering_is_made_once_and_then_read_from_the_cache(cache, calls):
     SimGeo(size=SIZE).load(NAME)
     again = SimGeo(size=SIZE).load(NAME)
     assert calls == [(NAME, SIZE)]
     assert_rendered(again)
 
 
-def test_the_cache_is_really_what_a_second_load_shows(cache):
+def test_second_load_reads_the_cache(cache):
     SimGeo(size=SIZE).load(NAME)
     [file] = cache.rglob("*.npz")
     with np.load(file) as kept:
@@ -81,7 +81,7 @@ def test_sizes_do_not_share_a_rendering(cache, calls):
 
 
 @pytest.mark.parametrize("damage", ["empty", "truncated", "foreign", "without a camera", "a wrong camera"])
-def test_a_damaged_cache_file_is_replaced(cache, calls, damage):
+def test_damaged_cache_file_is_replaced(cache, calls, damage):
     SimGeo(size=SIZE).load(NAME)
     [file] = cache.rglob("*.npz")
     with np.load(file) as kept:
@@ -103,7 +103,7 @@ def test_a_damaged_cache_file_is_replaced(cache, calls, damage):
     assert [path.name for path in file.parent.iterdir()] == [f"{NAME}.npz"]
 
 
-def test_a_cache_that_cannot_be_written_is_done_without(tmp_path, monkeypatch, calls):
+def test_unwritable_cache_is_ignored(tmp_path, monkeypatch, calls):
     (tmp_path / "file").write_text("in the way")
     monkeypatch.setenv("DSR_CACHE", str(tmp_path / "file"))
     source = SimGeo(size=SIZE)
@@ -113,7 +113,7 @@ def test_a_cache_that_cannot_be_written_is_done_without(tmp_path, monkeypatch, c
     assert (tmp_path / "file").read_text() == "in the way"
 
 
-def test_the_cache_is_dsr_cache_else_the_users(monkeypatch, tmp_path):
+def test_cache_directory_is_dsr_cache_or_the_users(monkeypatch, tmp_path):
     monkeypatch.setenv("DSR_CACHE", str(tmp_path / "mine"))
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "xdg"))
     monkeypatch.setenv("HOME", str(tmp_path / "home"))
@@ -124,7 +124,7 @@ def test_the_cache_is_dsr_cache_else_the_users(monkeypatch, tmp_path):
     assert cache_directory() == tmp_path / "home" / ".cache" / "dsr"
 
 
-def test_the_tests_do_not_touch_the_users_cache(dsr_cache):
+def test_tests_do_not_use_the_users_cache(dsr_cache):
     assert cache_directory() == dsr_cache
 
 
@@ -140,7 +140,7 @@ def lucy(tmp_path):
     return folder
 
 
-def test_lucy_takes_the_statues_place_where_there_is_one(lucy):
+def test_lucy_replaces_the_statue_where_available(lucy):
     source = SimGeo(str(lucy.parent), size=SIZE)
     assert source.scenes() == [*(name for name in SCENES if name != "statue"), "lucy"]
     scene = source.load("lucy")
@@ -149,7 +149,7 @@ def test_lucy_takes_the_statues_place_where_there_is_one(lucy):
     assert bool((scene.depth == 2.5).all())
 
 
-def test_lucys_fingerprint_follows_her_files_and_the_renderings_their_size(lucy):
+def test_fingerprint_of_lucy_follows_her_files_and_that_of_renderings_their_size(lucy):
     source = SimGeo(str(lucy.parent), size=SIZE)
     before, cube = source.fingerprint("lucy"), source.fingerprint(NAME)
     np.save(lucy / "depth.npy", np.full((4, 8), 2.0))
@@ -159,17 +159,17 @@ def test_lucys_fingerprint_follows_her_files_and_the_renderings_their_size(lucy)
 
 
 @pytest.mark.parametrize("root", [None, "nowhere"])
-def test_without_a_lucy_there_is_the_statue(tmp_path, root):
+def test_statue_stands_in_for_a_missing_lucy(tmp_path, root):
     source = SimGeo(None if root is None else str(tmp_path / root), size=SIZE)
     assert source.scenes()[-1] == "statue"
 
 
-def test_only_chosen_scenes_are_there_and_an_unknown_one_is_refused(lucy):
+def test_chosen_scenes_alone_are_available_and_an_unknown_one_is_refused(lucy):
     assert SimGeo(None, ["statue"], SIZE).scenes() == ["statue"]
     with pytest.raises(ValueError, match=r"^scenes: 'lucy' is not there; expected some of .*statue"):
         SimGeo(None, ["lucy"], SIZE)
 
 
-def test_a_size_below_32_is_refused():
+def test_size_below_32_is_refused():
     with pytest.raises(ValueError, match=r"^size: expected at least 32 pixels, got 31"):
         SimGeo(size=31)

@@ -37,7 +37,7 @@ def depth_to_normals(picture):
 
 
 @pytest.mark.parametrize("name", SCENES)
-def test_images_have_the_promised_types_and_ranges(name):
+def test_images_have_the_documented_types_and_ranges(name):
     picture = rendering(name)
     assert picture.rgb.dtype == np.uint8
     assert picture.rgb.shape == (SIZE, SIZE, 3)
@@ -49,7 +49,7 @@ def test_images_have_the_promised_types_and_ranges(name):
     assert picture.rgb.min() < 110
 
 
-def test_the_camera_keeps_its_field_of_view_at_any_size():
+def test_camera_keeps_its_field_of_view_at_any_size():
     camera = rendering("cube_no_texture").camera
     assert camera.fx == camera.fy == pytest.approx(618.0386 * SIZE / 512, rel=1e-15)
     assert camera.cx == camera.cy == (SIZE - 1) / 2
@@ -57,13 +57,13 @@ def test_the_camera_keeps_its_field_of_view_at_any_size():
 
 
 @pytest.mark.parametrize("name", SCENES)
-def test_the_same_ray_has_the_same_depth_at_any_size(name):
+def test_same_ray_has_the_same_depth_at_any_size(name):
     # pixel u at 32 and pixel 3 u + 1 at 96 look along one ray
     np.testing.assert_allclose(rendering(name, 32).depth, rendering(name, 96).depth[1::3, 1::3], atol=1e-8)
 
 
 @pytest.mark.parametrize("name", ["cube_high_freq", "statue"])
-def test_rendering_twice_gives_the_same_bits(name):
+def test_rendering_is_deterministic(name):
     again = render_scene(name, SIZE)
     np.testing.assert_array_equal(again.rgb, rendering(name).rgb)
     np.testing.assert_array_equal(again.depth, rendering(name).depth)
@@ -77,7 +77,7 @@ def test_variants_of_a_scene_share_their_depth_but_not_their_photo():
             assert np.abs(other.rgb.astype(int) - first.rgb).mean() > 5
 
 
-def test_the_cube_and_the_wall_show_exactly_four_normals_three_of_them_orthogonal():
+def test_cube_and_wall_have_exactly_four_normals_three_of_them_orthogonal():
     normal, flat = depth_to_normals(rendering("cube_no_texture"))
     found, count = np.unique(np.round(normal[:, flat].T, 6) + 0.0, axis=0, return_counts=True)
     assert len(found) == 4
@@ -86,14 +86,14 @@ def test_the_cube_and_the_wall_show_exactly_four_normals_three_of_them_orthogona
     np.testing.assert_allclose(faces @ faces.T, np.eye(3), atol=1e-5)
 
 
-def test_all_points_of_the_sphere_lie_on_the_sphere():
+def test_sphere_points_lie_on_the_sphere():
     sphere = build_scene("sphere_cylinder_no_texture").bodies[0].surface
     points = object_points("sphere_cylinder_no_texture", 0)
     assert points.shape[1] > 300
     np.testing.assert_allclose(np.linalg.norm(points - sphere.centre[:, None], axis=0), sphere.radius, rtol=1e-13)
 
 
-def test_all_points_of_the_cylinder_lie_on_its_side_or_its_cap():
+def test_cylinder_points_lie_on_its_side_or_its_cap():
     cylinder = build_scene("sphere_cylinder_no_texture").bodies[1].surface
     away = object_points("sphere_cylinder_no_texture", 1) - cylinder.centre[:, None]
     axis = cylinder.axes[:, 1]
@@ -106,7 +106,7 @@ def test_all_points_of_the_cylinder_lie_on_its_side_or_its_cap():
     assert cap.sum() > 30
 
 
-def test_all_points_of_the_statue_are_roots_of_its_distance():
+def test_statue_points_are_roots_of_its_distance_function():
     statue = build_scene("statue").bodies[0].surface
     assert isinstance(statue, Implicit)
     points = object_points("statue", 0)
@@ -114,7 +114,7 @@ def test_all_points_of_the_statue_are_roots_of_its_distance():
     assert np.abs(statue.distance(points)).max() < 1e-9
 
 
-def test_the_statue_fills_the_height_of_the_picture_and_has_many_normals():
+def test_statue_fills_the_height_of_the_picture_and_has_many_normals():
     points = object_points("statue", 0)
     rows = points[1] / points[2] * rendering("statue").camera.fy
     assert rows.max() - rows.min() > 0.85 * SIZE
@@ -123,14 +123,14 @@ def test_the_statue_fills_the_height_of_the_picture_and_has_many_normals():
 
 
 @pytest.mark.parametrize("name", ["cube_no_texture", "sphere_cylinder_no_texture"])
-def test_no_texture_means_one_albedo_per_body(name):
+def test_untextured_bodies_have_one_albedo(name):
     points = np.random.default_rng(0).uniform(-1, 4, (3, 200))
     for body in build_scene(name).bodies:
         assert np.ptp(body.albedo(points), axis=1).max() == 0
 
 
 @pytest.mark.parametrize("kind", ["cube_high_freq", "sphere_cylinder_high_freq", "sphere_cylinder_low_freq"])
-def test_textures_vary_on_every_body_within_the_albedo_of_real_things(kind):
+def test_textures_vary_on_every_body_within_the_albedo_of_real_materials(kind):
     points = np.random.default_rng(0).uniform([[-1], [-1], [2.4]], [[1], [1], [4]], (3, 500))
     for body in build_scene(kind).bodies:
         paint = body.albedo(points)
@@ -149,6 +149,6 @@ def test_high_frequency_paint_changes_within_centimetres_and_low_frequency_paint
     assert change["high"] > 5 * change["low"]
 
 
-def test_an_unknown_scene_is_refused_with_the_choices():
+def test_unknown_scene_is_refused_with_the_choices():
     with pytest.raises(ValueError, match=r"sphere_cylinder_low_freq.*got 'teapot'"):
         render_scene("teapot")

@@ -17,18 +17,18 @@ def test_doubling_is_bilinear_interpolation(shape: tuple[int, ...], layout: torc
     torch.testing.assert_close(doubled(x), expected)
 
 
-def test_doublings_gradient_is_right() -> None:
+def test_gradient_of_doubling_agrees_with_finite_differences() -> None:
     x = torch.rand(1, 2, 3, 4, dtype=torch.float64, requires_grad=True)
     assert torch.autograd.gradcheck(doubled, x)
 
 
 @pytest.mark.parametrize(("height", "width"), [(32, 48), (37, 50), (33, 32)])
-def test_any_size_comes_out_as_it_went_in(height: int, width: int) -> None:
+def test_output_has_the_size_of_the_input(height: int, width: int) -> None:
     net = SkipNet(5, 2, (4, 6, 8), (2, 2, 2))
     assert net(torch.rand(1, 5, height, width)).shape == (1, 2, height, width)
 
 
-def test_the_network_is_the_hourglass_that_ulyanov_et_al_describe() -> None:
+def test_network_is_the_hourglass_of_ulyanov_et_al() -> None:
     """Against a plain construction from their supplementary material: two levels, written out."""
     torch.manual_seed(0)
     net = SkipNet(3, 2, (4, 6), (1, 2), padding="reflect").double()
@@ -56,7 +56,7 @@ def test_the_network_is_the_hourglass_that_ulyanov_et_al_describe() -> None:
     torch.testing.assert_close(net(x), functional.conv2d(y, net.last.weight, net.last.bias))
 
 
-def test_the_answer_has_more_than_bfloat16s_steps_even_if_the_convolutions_have_not() -> None:
+def test_output_is_finer_than_bfloat16_even_if_the_convolutions_are_not() -> None:
     torch.manual_seed(0)
     net, x = SkipNet(4, 1, (8, 8), (2, 2)), torch.rand(1, 4, 64, 64)
     with torch.autocast("cpu", torch.bfloat16):
@@ -70,7 +70,7 @@ def test_the_answer_has_more_than_bfloat16s_steps_even_if_the_convolutions_have_
     ("height", "width", "most", "levels"),
     [(512, 512, 5, 5), (32, 512, 5, 4), (4, 4, 5, 1), (2, 2, 5, 1), (64, 64, 2, 2)],
 )
-def test_a_small_image_has_fewer_levels(height: int, width: int, most: int, levels: int) -> None:
+def test_small_image_has_fewer_levels(height: int, width: int, most: int, levels: int) -> None:
     assert levels_for(height, width, most) == levels
 
 

@@ -107,7 +107,7 @@ def _dense(operator: Callable[[Tensor], Tensor], count: int, shape: tuple[int, .
 @pytest.mark.parametrize(
     ("build", "area_weight", "share"), [(_sphere, 0.2, 0.85), (_bumps, 0.02, 0.5)], ids=["sphere", "bumps"]
 )
-def test_normals_of_a_shaded_surface_are_better_than_bicubics(
+def test_normals_of_a_shaded_surface_are_better_than_those_of_bicubic(
     build: Callable[[int], Tensor], area_weight: float, share: float
 ) -> None:
     truth = build(40)
@@ -130,7 +130,7 @@ def _adjoint(slopes: Slopes) -> np.ndarray:
     return torch.stack([slopes.adjoint(each).flatten() for each in eye], dim=1).numpy()
 
 
-def test_slopes_of_a_map_make_the_geometrys_normals_to_first_order() -> None:
+def test_slopes_give_the_normals_of_geometry_to_first_order() -> None:
     truth = _sphere(64)
     solver, metres = ShapeFromShading().prepared(_sample(truth))
     found = surface_of(solver.slopes(truth[None, None] / metres), solver.problem.rays).normals
@@ -139,7 +139,7 @@ def test_slopes_of_a_map_make_the_geometrys_normals_to_first_order() -> None:
 
 
 @pytest.mark.parametrize(("holes", "mask"), [(False, False), (True, False), (False, True)])
-def test_the_step_of_depth_is_the_least_squares_solution(holes: bool, mask: bool) -> None:
+def test_depth_step_is_the_least_squares_solution(holes: bool, mask: bool) -> None:
     """Of sqrt(data) (K z - coarse) and sqrt(penalty) (G z - theta + u), as dense matrices by numpy."""
     solver = _solver(holes=holes, mask=mask)
     problem, before = solver.problem, solver.z.flatten().numpy().copy()
@@ -163,7 +163,7 @@ def test_the_step_of_depth_is_the_least_squares_solution(holes: bool, mask: bool
 
 
 @pytest.mark.parametrize(("holes", "mask"), [(False, False), (True, False), (False, True)])
-def test_no_step_raises_the_augmented_lagrangian_in_its_own_variable(holes: bool, mask: bool) -> None:
+def test_augmented_lagrangian_is_raised_by_no_step_in_its_own_variable(holes: bool, mask: bool) -> None:
     solver = _solver(holes=holes, mask=mask)
     lowered = {}
     for turn in range(6):
@@ -183,7 +183,7 @@ def test_no_step_raises_the_augmented_lagrangian_in_its_own_variable(holes: bool
     assert min(lowered.values()) > 0
 
 
-def test_the_step_of_theta_ends_where_the_gradient_is_small() -> None:
+def test_theta_step_ends_where_the_gradient_is_small() -> None:
     solver = _solver()
     for _ in range(20):
         solver.update_theta()
@@ -195,14 +195,14 @@ def test_the_step_of_theta_ends_where_the_gradient_is_small() -> None:
     assert float(slope.square().mean()) < 1e-3 * float(first.square().mean())
 
 
-def test_a_level_plane_of_one_colour_comes_out_to_a_thousandth_of_its_depth() -> None:
+def test_level_plane_of_one_colour_is_reproduced_to_a_thousandth_of_its_depth() -> None:
     """Not exactly: the area that a pixel sees is least on a sphere around the camera."""
     sample = _sample(torch.full((16, 24), 3.0).double(), focal=400.0)
     assert float((ShapeFromShading()(sample) / 3 - 1).abs().max()) < 1e-3
 
 
 @pytest.mark.parametrize("scale", [2, 4, 8])
-def test_a_slanted_plane_of_one_colour_comes_out_to_a_hundredth_of_its_depth(scale: int) -> None:
+def test_slanted_plane_of_one_colour_is_reproduced_to_a_hundredth_of_its_depth(scale: int) -> None:
     v, u = _grid(32, 48)
     camera = _camera(32, 48, 400.0)
     truth = from_range((40 + 0.05 * u - 0.03 * v)[None], camera, "disparity")[0]
@@ -212,7 +212,7 @@ def test_a_slanted_plane_of_one_colour_comes_out_to_a_hundredth_of_its_depth(sca
     assert float((fine / truth - 1).square().mean().sqrt()) < 1e-3
 
 
-def test_holes_are_filled_and_have_no_say() -> None:
+def test_holes_are_filled_and_have_no_influence() -> None:
     depth, rgb = _random(16, 24)
     sample = _sample(depth, rgb)
     sample.depth_lr[:, 1:3, 2:4] = torch.nan
@@ -224,7 +224,7 @@ def test_holes_are_filled_and_have_no_say() -> None:
 
 @pytest.mark.parametrize(("scale", "size"), [(2, (10, 6)), (8, (8, 24)), (16, (16, 16)), (2, (2, 2))])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_any_size_is_taken_in_single_and_double_precision(
+def test_srfs_takes_any_size_in_single_and_double_precision(
     scale: int, size: tuple[int, int], dtype: torch.dtype
 ) -> None:
     depth, rgb = _random(*size)
@@ -234,13 +234,13 @@ def test_any_size_is_taken_in_single_and_double_precision(
     assert bool(fine.isfinite().all())
 
 
-def test_an_object_of_millimetres_comes_out_as_one_of_metres() -> None:
+def test_result_is_independent_of_the_length_unit() -> None:
     truth = _bumps(32)
     large, small = (ShapeFromShading(iterations=3)(_sample(k * truth, _lit(truth))) for k in (1.0, 1e-3))
     torch.testing.assert_close(1e3 * small, large, rtol=1e-6, atol=0)
 
 
-def test_twice_the_same_is_the_same_and_the_truth_is_not_looked_at() -> None:
+def test_result_is_deterministic_and_independent_of_the_truth() -> None:
     sample = _sample(*_random(16, 24))
     method = ShapeFromShading(iterations=4)
     first = method(sample)
@@ -249,7 +249,7 @@ def test_twice_the_same_is_the_same_and_the_truth_is_not_looked_at() -> None:
     assert torch.equal(first, method(sample))
 
 
-def test_a_batch_is_what_its_problems_are_one_at_a_time() -> None:
+def test_batch_equals_its_problems_one_at_a_time() -> None:
     solvers = [ShapeFromShading().prepared(_sample(*_random(16, 16, seed)))[0] for seed in (0, 1)]
     one, other = (solver.problem for solver in solvers)
     both = ShadingProblem(
@@ -270,7 +270,7 @@ def test_a_batch_is_what_its_problems_are_one_at_a_time() -> None:
     torch.testing.assert_close(together.z, torch.cat([solver.z for solver in solvers]), rtol=1e-5, atol=0)
 
 
-def test_it_stops_where_it_has_converged_and_tells_its_progress() -> None:
+def test_iteration_stops_at_convergence_and_reports_progress() -> None:
     told: list[tuple[int, int]] = []
     truth = _sphere(32)
     method = ShapeFromShading(iterations=60, tolerance=3e-3)
@@ -288,7 +288,7 @@ def test_it_stops_where_it_has_converged_and_tells_its_progress() -> None:
     assert last["objective"] < method.history[0]["objective"]
 
 
-def test_outside_the_foreground_the_first_map_stays(tmp_path: Path) -> None:
+def test_background_keeps_the_initial_map(tmp_path: Path) -> None:
     truth = _bumps(32)
     sample = _sample(truth, _lit(truth), name="bumps")
     v, u = _grid(32, 32)
@@ -303,7 +303,7 @@ def test_outside_the_foreground_the_first_map_stays(tmp_path: Path) -> None:
     assert float((fine - truth)[inside].square().mean()) < float((first - truth)[inside].square().mean())
 
 
-def test_a_mask_that_is_missing_damaged_black_or_of_another_size_is_refused_by_name(tmp_path: Path) -> None:
+def test_missing_damaged_empty_or_misfitting_mask_is_refused_by_name(tmp_path: Path) -> None:
     sample = _sample(_bumps(16))
     path = tmp_path / "hall.png"
     method = ShapeFromShading(iterations=1, foreground=str(tmp_path))
@@ -334,6 +334,6 @@ def test_a_mask_that_is_missing_damaged_black_or_of_another_size_is_refused_by_n
         ("foreground", "/nowhere"),
     ],
 )
-def test_a_value_out_of_range_is_refused_by_name(key: str, value: object) -> None:
+def test_value_out_of_range_is_refused_by_name(key: str, value: object) -> None:
     with pytest.raises(ValueError, match=rf"^{key}: expected .* {value}"):
         ShapeFromShading(**{key: value})  # type: ignore[arg-type]

@@ -37,7 +37,7 @@ def test_two_regions_under_noise_are_found_exactly() -> None:
     assert torch.equal(regions.labels[0] == regions.labels[0, 13, 11], disc)
 
 
-def test_a_regions_albedo_is_the_least_squares_one() -> None:
+def test_albedo_of_a_region_is_the_least_squares_one() -> None:
     photo, shading, disc = _two()
     albedo = fitted(photo, shading, fused(photo, shading, 0.05))
     for channel in range(3):
@@ -50,7 +50,7 @@ def test_a_regions_albedo_is_the_least_squares_one() -> None:
 
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("weight", [0.001, 0.02, 0.5])
-def test_no_partition_of_a_small_picture_that_fuses_two_regions_has_less_energy(seed: int, weight: float) -> None:
+def test_partitions_that_fuse_two_regions_have_no_less_energy(seed: int, weight: float) -> None:
     rng = np.random.default_rng(seed)
     photo, shading = (torch.from_numpy(rng.uniform(0.2, 1, (1, 2, 4, 5))) for _ in range(2))
     regions = fused(photo, shading, weight)
@@ -60,7 +60,7 @@ def test_no_partition_of_a_small_picture_that_fuses_two_regions_has_less_energy(
         assert _energy(photo, shading, Regions(labels, regions.number), weight) >= least - 1e-12
 
 
-def test_a_row_of_pixels_is_cut_as_trying_all_cuts_says() -> None:
+def test_row_of_pixels_is_cut_as_by_an_exhaustive_search() -> None:
     values = torch.tensor([0.2, 0.22, 0.21, 0.6, 0.62, 0.9, 0.88, 0.91]).double()
     photo = values.reshape(1, 1, 1, 8)
     shading = torch.ones_like(photo)
@@ -72,7 +72,7 @@ def test_a_row_of_pixels_is_cut_as_trying_all_cuts_says() -> None:
 
 
 @pytest.mark.parametrize("shape", [(1, 1, 1, 1), (1, 1, 1, 6), (2, 3, 5, 1), (1, 2, 7, 5)])
-def test_little_weight_leaves_each_pixel_and_much_makes_each_picture_one(shape: tuple[int, ...]) -> None:
+def test_small_weight_keeps_each_pixel_and_a_large_one_fuses_the_picture(shape: tuple[int, ...]) -> None:
     photo = torch.from_numpy(np.random.default_rng(1).uniform(0.2, 1, shape))
     shading = torch.ones_like(photo)
     alone = fused(photo, shading, 1e-12)
@@ -84,7 +84,7 @@ def test_little_weight_leaves_each_pixel_and_much_makes_each_picture_one(shape: 
     torch.testing.assert_close(fitted(photo, shading, together), mean)
 
 
-def test_a_batch_is_what_its_pictures_are_one_at_a_time_and_twice_the_same_is_the_same() -> None:
+def test_batch_equals_its_pictures_one_at_a_time_and_is_deterministic() -> None:
     photo, shading, _ = _two()
     both = torch.cat((photo, photo.flip(-1))), torch.cat((shading, shading.flip(-1)))
     together = fitted(*both, fused(*both, 0.01))
@@ -97,7 +97,7 @@ def test_a_batch_is_what_its_pictures_are_one_at_a_time_and_twice_the_same_is_th
         )
 
 
-def test_pixels_outside_stay_alone_and_part_what_is_inside() -> None:
+def test_pixels_outside_stay_alone_and_separate_the_inside() -> None:
     photo = torch.full((1, 1, 3, 5), 0.5).double()
     inside = torch.ones(1, 1, 3, 5, dtype=torch.bool)
     inside[..., 2] = False
@@ -106,7 +106,7 @@ def test_pixels_outside_stay_alone_and_part_what_is_inside() -> None:
     assert boundary_length(regions, inside) == 0
 
 
-def test_albedos_stay_within_bounds_where_there_is_little_light() -> None:
+def test_albedos_stay_bounded_where_there_is_little_light() -> None:
     photo = torch.full((1, 1, 2, 2), 0.5).double()
     shading = torch.tensor([[1e-6, -1.0], [0.0, 1.0]]).double().reshape(1, 1, 2, 2)
     albedo = fitted(photo, shading, Regions(torch.arange(4).reshape(1, 2, 2), 4))

@@ -39,7 +39,7 @@ def _mixed_theta() -> tuple[Tensor, Tensor]:
     return theta, Camera(4, 3, 5.0, 6.0, 1.2, 0.9).rays()[None]
 
 
-def test_the_rendering_is_the_geometrys_normals_times_the_light_the_nearer_the_finer_the_map() -> None:
+def test_rendering_converges_to_that_of_the_geometrys_normals() -> None:
     errors = []
     for size in (64, 128):
         camera = _camera(size)
@@ -52,14 +52,14 @@ def test_the_rendering_is_the_geometrys_normals_times_the_light_the_nearer_the_f
     assert errors[1] == pytest.approx(errors[0] / 2, rel=0.1)  # of differences taken to one side
 
 
-def test_a_map_without_slopes_has_the_geometrys_normals_exactly() -> None:
+def test_map_without_slopes_has_the_geometrys_normals_exactly() -> None:
     camera = _camera(8)
     rays, depth = camera.rays()[None], torch.full((1, 1, 8, 8), 3.0).double()
     theta = torch.cat((torch.zeros(1, 2, 8, 8).double(), depth), dim=1)
     torch.testing.assert_close(surface_of(theta, rays).normals, depth_to_normals(depth, rays))
 
 
-def test_the_area_is_that_of_the_back_projected_pixels() -> None:
+def test_area_is_that_of_the_back_projected_pixels() -> None:
     camera = _camera(256)
     theta, depth = _theta(camera)
     rays = camera.rays()[None]
@@ -71,7 +71,7 @@ def test_the_area_is_that_of_the_back_projected_pixels() -> None:
     assert float(ours.sum()) == pytest.approx(float(expected.sum()), rel=2e-3)
 
 
-def test_what_the_photo_says_has_the_derivatives_that_are_given() -> None:
+def test_photometry_has_its_stated_derivatives() -> None:
     theta, rays = _mixed_theta()
     albedo, photo = _random(1, 3, 3, 4, seed=1).abs(), _random(1, 3, 3, 4, seed=2)
 
@@ -87,7 +87,7 @@ def test_what_the_photo_says_has_the_derivatives_that_are_given() -> None:
         torch.testing.assert_close(seen.slopes[:, channel], slope)
 
 
-def test_the_length_of_m_has_the_normal_for_a_derivative() -> None:
+def test_derivative_of_the_normal_length_is_the_normal() -> None:
     theta, rays = _mixed_theta()
     theta.requires_grad_()
     surface = surface_of(theta, rays)
@@ -95,7 +95,7 @@ def test_the_length_of_m_has_the_normal_for_a_derivative() -> None:
     torch.testing.assert_close(by_theta(surface.normals, rays), slope)
 
 
-def test_the_light_is_recovered_exactly_from_a_photo_without_noise() -> None:
+def test_light_is_recovered_exactly_from_a_photo_without_noise() -> None:
     theta, rays = _mixed_theta()
     normals = surface_of(theta, rays).normals
     albedo = _random(1, 3, 3, 4, seed=1).abs()
@@ -107,7 +107,7 @@ def test_the_light_is_recovered_exactly_from_a_photo_without_noise() -> None:
     torch.testing.assert_close(best_lighting(photo, albedo, normals, inside), LIGHT)
 
 
-def test_the_light_on_a_flat_wall_is_the_least_that_explains_it() -> None:
+def test_light_on_a_flat_wall_is_the_smallest_that_explains_it() -> None:
     normals = torch.tensor([0.0, 0.0, -1.0]).double()[:, None, None].expand(1, 3, 4, 5)
     albedo = torch.ones(1, 1, 4, 5).double()
     light = best_lighting(0.6 * albedo, albedo, normals, torch.ones_like(albedo))

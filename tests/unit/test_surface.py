@@ -57,14 +57,14 @@ def test_points_lie_on_their_rays_at_their_depth() -> None:
 
 
 @pytest.mark.parametrize("normal", PLANES)
-def test_a_plane_has_its_normal_at_every_pixel_to_the_last(normal: tuple[float, float, float]) -> None:
+def test_depth_to_normals_gives_the_plane_normal_at_every_pixel(normal: tuple[float, float, float]) -> None:
     normals = depth_to_normals(_plane(CAMERA, normal), CAMERA.rays()[None])
     expected = torch.tensor(normal, dtype=torch.float64)
     expected = (expected / expected.norm())[None, :, None, None].expand_as(normals)
     torch.testing.assert_close(normals, expected, rtol=0, atol=1e-9)
 
 
-def test_normals_of_a_sphere_converge_with_first_order() -> None:
+def test_depth_to_normals_converges_on_a_sphere_with_first_order() -> None:
     errors = [_sphere_error(Camera(32, 32, 160.0, 160.0, 15.5, 15.5).rescale(n, n)) for n in (32, 64, 128)]
     assert errors[0] < 0.05
     assert errors[0] / errors[1] == pytest.approx(2, abs=0.15)
@@ -72,14 +72,14 @@ def test_normals_of_a_sphere_converge_with_first_order() -> None:
 
 
 @pytest.mark.parametrize("size", [(7, 11), (2, 2), (2, 5), (6, 2)])
-def test_normals_are_the_normalised_cross_product_of_forward_differences(size: tuple[int, int]) -> None:
+def test_depth_to_normals_equals_the_cross_product_of_forward_differences(size: tuple[int, int]) -> None:
     camera = CAMERA.crop(0, 0, *size)
     depth = _random(camera)
     expected = torch.from_numpy(_cross_product_normals(depth[0, 0].numpy(), camera)).permute(2, 0, 1)[None]
     torch.testing.assert_close(depth_to_normals(depth, camera.rays()[None]), expected, rtol=0, atol=1e-10)
 
 
-def test_normals_have_unit_length_and_face_the_camera() -> None:
+def test_depth_to_normals_has_unit_length_and_faces_the_camera() -> None:
     rays = CAMERA.rays()[None]
     normals = depth_to_normals(_random(CAMERA), rays)
     torch.testing.assert_close(normals.norm(dim=1), torch.ones(1, 7, 11, dtype=torch.float64), rtol=0, atol=1e-14)
@@ -89,7 +89,7 @@ def test_normals_have_unit_length_and_face_the_camera() -> None:
 
 
 @pytest.mark.parametrize("hole", [(3, 4), (0, 0), (6, 10), (6, 0), (0, 10), (5, 10), (6, 9)])
-def test_a_normal_is_unknown_exactly_where_a_pixel_that_it_needs_is(hole: tuple[int, int]) -> None:
+def test_normal_is_missing_exactly_where_one_of_its_pixels_is(hole: tuple[int, int]) -> None:
     depth = _random(CAMERA)
     depth[0, 0, hole[0], hole[1]] = torch.nan
     known = np.isfinite(_cross_product_normals(depth[0, 0].numpy(), CAMERA)).all(axis=-1)
@@ -99,7 +99,7 @@ def test_a_normal_is_unknown_exactly_where_a_pixel_that_it_needs_is(hole: tuple[
     assert np.array_equal(normals.isfinite().all(dim=1)[0].numpy(), known)
 
 
-def test_normals_do_not_depend_on_the_batch() -> None:
+def test_depth_to_normals_does_not_depend_on_the_batch() -> None:
     depths = torch.cat((_random(CAMERA, 1), _random(CAMERA, 2)))
     other = Camera(11, 7, 30.0, 31.0, 2.0, 3.0)
     rays = torch.stack((CAMERA.rays(), other.rays()))
@@ -108,7 +108,7 @@ def test_normals_do_not_depend_on_the_batch() -> None:
         assert torch.equal(together[i : i + 1], depth_to_normals(depths[i : i + 1], rays[i : i + 1]))
 
 
-def test_a_narrower_result_keeps_the_digits_of_tiny_differences() -> None:
+def test_float32_normals_keep_the_digits_of_tiny_differences() -> None:
     camera = Camera(11, 7, 1e5, 1e5, 5.0, 3.0)
     depth = 1 + 1e-6 * (_random(camera) - 1)  # float32 depths would differ by 0 or 1.2e-7
     exact = depth_to_normals(depth, camera.rays()[None])
@@ -123,13 +123,13 @@ def test_length_is_the_euclidean_one() -> None:
 
 
 @pytest.mark.parametrize("size", [(1, 5), (5, 1)])
-def test_a_map_of_one_row_or_column_is_refused(size: tuple[int, int]) -> None:
+def test_map_of_one_row_or_column_is_refused(size: tuple[int, int]) -> None:
     with pytest.raises(ValueError, match=f"at least 2 x 2 pixels, got \\({size[0]}, {size[1]}\\)"):
         depth_to_normals(torch.ones(1, 1, *size), torch.ones(1, 3, *size))
 
 
 @pytest.mark.parametrize("masked", [False, True])
-def test_the_visual_loss_has_the_gradient_of_its_value(masked: bool) -> None:
+def test_gradient_of_the_visual_loss_is_that_of_its_value(masked: bool) -> None:
     camera = Camera(4, 3, 5.0, 6.0, 1.2, 0.9)
     target, depth = _random(camera, 3), _random(camera, 4).requires_grad_()
     mask = torch.ones(1, 1, 3, 4, dtype=torch.bool)
@@ -139,7 +139,7 @@ def test_the_visual_loss_has_the_gradient_of_its_value(masked: bool) -> None:
 
 
 @pytest.mark.parametrize("where", ["mask", "target", "prediction"])
-def test_the_gradient_at_a_hole_is_zero_and_finite_everywhere(where: str) -> None:
+def test_gradient_is_zero_at_holes_and_finite_everywhere(where: str) -> None:
     camera = Camera(6, 5, 5.0, 6.0, 1.2, 0.9)
     target, depth = _random(camera, 3), _random(camera, 4)
     mask = torch.ones(1, 1, 5, 6, dtype=torch.bool)

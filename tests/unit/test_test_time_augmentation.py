@@ -39,7 +39,7 @@ def _sample(height: int = 6, width: int = 8) -> DepthSample:
 
 
 @pytest.mark.parametrize("pose", range(8))
-def test_a_pose_is_undone_and_differs_from_the_others(pose: int) -> None:
+def test_dihedral_transforms_are_distinct_and_invertible(pose: int) -> None:
     x = torch.rand(2, 3, 5, 5)
     torch.testing.assert_close(undo_dihedral(apply_dihedral(x, pose), pose), x, rtol=0, atol=0)
     assert not any(
@@ -47,7 +47,7 @@ def test_a_pose_is_undone_and_differs_from_the_others(pose: int) -> None:
     )
 
 
-def test_an_ensemble_averages_what_depends_on_the_pose() -> None:
+def test_augmentation_averages_what_depends_on_the_orientation() -> None:
     sample = _sample()
     coarse = to_range(sample.depth_lr, sample.camera_lr, "disparity") * 2
     plain = functional.interpolate(coarse[None], scale_factor=2, mode="nearest")[0]
@@ -60,7 +60,7 @@ def test_an_ensemble_averages_what_depends_on_the_pose() -> None:
         torch.testing.assert_close(to_range(depth, sample.camera, "disparity"), expected)
 
 
-def test_an_ensemble_of_a_turned_scene_is_the_turned_ensemble() -> None:
+def test_augmentation_is_equivariant_to_turns() -> None:
     torch.manual_seed(0)
     method = NetworkUpsampler(MSGNet(2, "dsr"), ensemble=4)
     sample = _sample()
@@ -76,7 +76,7 @@ def test_an_ensemble_of_a_turned_scene_is_the_turned_ensemble() -> None:
     torch.testing.assert_close(both[0], both[1], rtol=0, atol=1e-6)
 
 
-def test_ensembles_that_cannot_be_are_refused() -> None:
+def test_invalid_augmentation_is_refused() -> None:
     with pytest.raises(ValueError, match="ensemble: expected one of 1, 4, 8, got 2"):
         NetworkUpsampler(MSGNet(2, "dsr"), ensemble=2)
     with pytest.raises(ValueError, match="ensemble: expected 1 for a network that leaves out pixels, got 4"):

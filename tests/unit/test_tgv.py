@@ -31,14 +31,14 @@ def test_divergence_is_minus_the_adjoint_of_the_gradient(shape: tuple[int, int, 
     assert float((gradient(x) * p).sum()) == pytest.approx(-float((x * divergence(p)).sum()), rel=1e-12)
 
 
-def test_the_gradient_is_numpys_forward_difference() -> None:
+def test_gradient_equals_numpys_forward_difference() -> None:
     x = _normals(1, 1, 5, 7)
     expected = np.zeros((2, 5, 7))
     expected[0, :, :-1], expected[1, :-1] = np.diff(x[0, 0].numpy(), axis=1), np.diff(x[0, 0].numpy(), axis=0)
     np.testing.assert_array_equal(gradient(x)[0, :, 0].numpy(), expected)
 
 
-def test_what_touches_a_pixel_is_the_sum_of_the_gradients_absolute_column() -> None:
+def test_preconditioner_is_the_absolute_column_sum_of_the_gradients() -> None:
     sizes = _normals(1, 2, 1, 4, 5).abs()
     eye = torch.eye(20).double().reshape(20, 1, 4, 5)
     expected = (gradient(eye).abs() * sizes).sum(dim=(1, 2, 3, 4)).reshape(4, 5)
@@ -53,7 +53,7 @@ def test_upsampling_and_extending_reproduce_a_plane_up_to_the_border(scale: int)
     torch.testing.assert_close(extended(flat[None, None, 3:-3, 3:-3], 3)[0, 0], flat)
 
 
-def test_the_tensor_shrinks_across_an_edge_and_leaves_what_runs_along_it() -> None:
+def test_tensor_shrinks_across_an_edge_and_keeps_the_direction_along_it() -> None:
     _, rgb = step(16, 8)
     g = TotalGeneralisedVariation(sharpness=9.0, exponent=0.85).tensors(rgb[None].double())
     assert float(g.uu[0, 0, 5, 7]) == pytest.approx(np.exp(-9.0), abs=1e-6)
@@ -62,7 +62,7 @@ def test_the_tensor_shrinks_across_an_edge_and_leaves_what_runs_along_it() -> No
     assert float(g.uu.sum()) == pytest.approx(16 * 15 + 16 * np.exp(-9.0), abs=1e-4)
 
 
-def test_the_tensors_root_has_the_eigenvalues_of_the_paper() -> None:
+def test_tensor_root_has_the_eigenvalues_of_the_paper() -> None:
     _, rgb = random_scene(6, 7)
     g = TotalGeneralisedVariation(sharpness=3.0, exponent=0.5).tensors(rgb[None].double())
     matrices = torch.stack((g.uu, g.uv, g.uv, g.vv), dim=-1).reshape(-1, 2, 2)
@@ -76,7 +76,7 @@ def test_the_tensors_root_has_the_eigenvalues_of_the_paper() -> None:
 
 @pytest.mark.parametrize("data_weight", [None, 20.0])
 @pytest.mark.parametrize("holes", [False, True])
-def test_the_objective_reaches_that_of_another_algorithm(data_weight: float | None, holes: bool) -> None:
+def test_objective_reaches_that_of_another_algorithm(data_weight: float | None, holes: bool) -> None:
     """Within 1e-3, on 16 x 16 pixels with depth steps, slopes and noise: ADMM with exact solves."""
     rng = np.random.default_rng(3)
     truth = np.where(np.arange(16) > 6, 0.8, 0.2) + 0.02 * np.arange(16)[:, None] + rng.normal(0, 0.03, (16, 16))
@@ -141,7 +141,7 @@ def _shrunk(y: np.ndarray, by: float) -> np.ndarray:
 
 
 @pytest.mark.parametrize("scale", [2, 4, 8])
-def test_a_plane_is_reproduced_exactly(scale: int) -> None:
+def test_tgv_reproduces_a_plane_exactly(scale: int) -> None:
     disparity = plane()
     sample = sample_of(disparity, random_scene(32, 48)[1], scale)
     fine = TotalGeneralisedVariation(iterations=300)(sample)
@@ -149,7 +149,7 @@ def test_a_plane_is_reproduced_exactly(scale: int) -> None:
     torch.testing.assert_close(disparity_of(fine, sample), disparity, rtol=0, atol=1e-9)
 
 
-def test_a_hole_in_a_plane_is_filled_with_the_plane() -> None:
+def test_tgv_fills_a_hole_in_a_plane_with_the_plane() -> None:
     disparity = plane()
     sample = sample_of(disparity)
     sample.depth_lr[:, 2:5, 4:7] = torch.nan
@@ -157,7 +157,7 @@ def test_a_hole_in_a_plane_is_filled_with_the_plane() -> None:
     assert (fine - disparity).abs().max() < 1e-3 * (disparity.max() - disparity.min())
 
 
-def test_a_step_stays_sharp_along_an_edge_of_the_photo_and_is_smoother_without_one() -> None:
+def test_step_stays_sharp_along_a_photo_edge_and_is_smoother_without_one() -> None:
     disparity, rgb = step()
     sharp, smooth = (
         disparity_of(TotalGeneralisedVariation(iterations=600)(sample), sample)
@@ -168,14 +168,14 @@ def test_a_step_stays_sharp_along_an_edge_of_the_photo_and_is_smoother_without_o
 
 
 @pytest.mark.parametrize(("scale", "size"), [(2, (10, 6)), (8, (8, 24)), (16, (16, 16))])
-def test_without_a_data_weight_block_means_are_the_input(scale: int, size: tuple[int, int]) -> None:
+def test_block_means_are_the_input_without_a_data_weight(scale: int, size: tuple[int, int]) -> None:
     sample = sample_of(*random_scene(*size), scale=scale)
     fine = disparity_of(TotalGeneralisedVariation(iterations=60)(sample), sample)
     coarse = to_range(sample.depth_lr, sample.camera_lr, "disparity")[0].numpy() * scale
     np.testing.assert_allclose(_means(fine, scale), coarse, rtol=1e-9)
 
 
-def test_a_small_data_weight_smooths_a_noisy_plane() -> None:
+def test_small_data_weight_smooths_a_noisy_plane() -> None:
     noisy = plane() + 0.1 * _normals(32, 48)
     sample = sample_of(noisy, scale=2)
     errors = [
@@ -185,7 +185,7 @@ def test_a_small_data_weight_smooths_a_noisy_plane() -> None:
     assert errors[1] < 0.5 * errors[0]
 
 
-def test_twice_the_same_is_the_same_and_the_truth_is_not_looked_at() -> None:
+def test_result_is_deterministic_and_independent_of_the_truth() -> None:
     sample = sample_of(*random_scene(16, 24))
     first = TotalGeneralisedVariation(iterations=100)(sample)
     assert sample.depth is not None
@@ -193,7 +193,7 @@ def test_twice_the_same_is_the_same_and_the_truth_is_not_looked_at() -> None:
     assert torch.equal(first, TotalGeneralisedVariation(iterations=100)(sample))
 
 
-def test_a_batch_is_what_its_samples_are_one_at_a_time() -> None:
+def test_batch_equals_its_samples_one_at_a_time() -> None:
     coarse, photos = _normals(2, 1, 4, 6).sigmoid(), _normals(2, 3, 16, 24, seed=1).sigmoid()
     method = TotalGeneralisedVariation(iterations=100, tolerance=0.0)
     together = method.minimised(photos, coarse, 4).values
@@ -202,7 +202,7 @@ def test_a_batch_is_what_its_samples_are_one_at_a_time() -> None:
         torch.testing.assert_close(together[number], alone)
 
 
-def test_a_flat_map_with_a_single_known_pixel_is_filled() -> None:
+def test_single_valid_pixel_of_a_flat_map_fills_it() -> None:
     sample = sample_of(torch.full((8, 8), 5.0).double())
     sample.depth_lr[:, 1:] = torch.nan
     sample.depth_lr[:, :, 1:] = torch.nan
@@ -210,7 +210,7 @@ def test_a_flat_map_with_a_single_known_pixel_is_filled() -> None:
     np.testing.assert_allclose(fine.numpy(), 5.0, rtol=1e-9)
 
 
-def test_it_stops_where_the_map_moves_no_longer_and_tells_its_progress() -> None:
+def test_iteration_stops_at_convergence_and_reports_progress() -> None:
     told: list[tuple[int, int]] = []
     sample = sample_of(plane())
     TotalGeneralisedVariation(iterations=5000)(sample, lambda done, most: told.append((done, most)))
@@ -234,6 +234,6 @@ def test_it_stops_where_the_map_moves_no_longer_and_tells_its_progress() -> None
         ("step_ratio", 0.0),
     ],
 )
-def test_a_value_out_of_range_is_refused_by_name(key: str, value: float) -> None:
+def test_value_out_of_range_is_refused_by_name(key: str, value: float) -> None:
     with pytest.raises(ValueError, match=rf"^{key}: expected .*, got {value}"):
         TotalGeneralisedVariation(**{key: value})  # type: ignore[arg-type]

@@ -43,7 +43,7 @@ def _pair(scale: int, height: int, width: int) -> tuple[Tensor, Tensor]:
 
 
 @pytest.mark.parametrize(("size", "tile", "overlap"), [(100, 30, 4), (31, 30, 4), (30, 30, 4), (7, 1, 2), (1, 5, 0)])
-def test_weights_of_tiles_add_up_to_one_everywhere(size: int, tile: int, overlap: int) -> None:
+def test_tile_weights_add_up_to_one_everywhere(size: int, tile: int, overlap: int) -> None:
     total = torch.zeros(2 * size)
     for span in spans(size, tile, 3, overlap):
         assert span.read.start <= span.kept.start < span.kept.stop <= span.read.stop
@@ -52,13 +52,13 @@ def test_weights_of_tiles_add_up_to_one_everywhere(size: int, tile: int, overlap
     torch.testing.assert_close(total, torch.ones(2 * size))
 
 
-def test_a_window_holds_the_reach_within_the_image() -> None:
+def test_window_covers_the_receptive_field_within_the_image() -> None:
     first, second, last = spans(90, 30, 7, 4)
     assert (first.read, second.read, last.read) == (slice(0, 39), slice(21, 69), slice(51, 90))
     assert (first.ramps, second.ramps, last.ramps) == ((0, 4), (4, 4), (4, 0))
 
 
-def test_answers_that_differ_by_a_constant_are_joined_by_a_ramp() -> None:
+def test_results_that_differ_by_a_constant_are_joined_by_a_ramp() -> None:
     values = iter((1.0, 2.0))
     rows, columns = spans(4, 4, 0, 0), spans(20, 10, 0, 4)
     line = blended(lambda r, c: torch.full((1, 1, 4, c.stop - c.start), next(values)), rows, columns, 1)[0, 0, 0]
@@ -67,7 +67,7 @@ def test_answers_that_differ_by_a_constant_are_joined_by_a_ramp() -> None:
 
 
 @pytest.mark.parametrize("name", NETS)
-def test_an_answer_in_tiles_is_the_answer_in_one_piece(name: str) -> None:
+def test_tiled_result_equals_the_whole_image(name: str) -> None:
     method = _method(name)
     scale = method.net.scale
     rgb, coarse = _pair(scale, 14, 48)
@@ -83,7 +83,7 @@ def test_an_answer_in_tiles_is_the_answer_in_one_piece(name: str) -> None:
     assert float((tiled - whole).abs().max() / (whole.max() - whole.min())) < 1e-5
 
 
-def test_an_ensemble_in_tiles_is_the_ensemble_in_one_piece() -> None:
+def test_tiled_augmentation_equals_the_whole_image() -> None:
     method = _method("facets", ensemble=8)
     rgb, coarse = _pair(4, 12, 36)
     parts: list[tuple[int, int]] = []
@@ -96,7 +96,7 @@ def test_an_ensemble_in_tiles_is_the_ensemble_in_one_piece() -> None:
 
 
 @pytest.mark.parametrize("name", NETS)
-def test_nothing_beyond_the_reach_counts(name: str) -> None:
+def test_pixels_beyond_the_receptive_field_do_not_matter(name: str) -> None:
     net = _method(name).net
     assert net.reach is not None
     size, at = 2 * net.reach + 9, net.reach + 4
@@ -113,7 +113,7 @@ def test_nothing_beyond_the_reach_counts(name: str) -> None:
         assert 0 < int(distance.max()) <= net.reach
 
 
-def test_a_large_photo_is_tiled_by_itself(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_large_photo_is_tiled_automatically(monkeypatch: pytest.MonkeyPatch) -> None:
     method = _method("facets")
     rgb, coarse = _pair(4, 12, 12)
     camera = Camera(48, 48, 50.0, 50.0, 24.0, 24.0)
@@ -128,7 +128,7 @@ def test_a_large_photo_is_tiled_by_itself(monkeypatch: pytest.MonkeyPatch) -> No
     torch.testing.assert_close(tiled, whole, rtol=1e-5, atol=0)
 
 
-def test_a_tile_below_a_coarse_pixel_is_refused() -> None:
+def test_tile_below_a_low_resolution_pixel_is_refused() -> None:
     with pytest.raises(ValueError, match="tile: expected at least 4 pixels, the scale, got 3"):
         _method("facets", tile=3)
     with pytest.raises(ValueError, match="tiles: expected a positive size and tile"):

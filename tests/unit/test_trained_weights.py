@@ -26,7 +26,7 @@ NETS = {
 
 
 @pytest.mark.parametrize("case", NETS)
-def test_a_file_gives_back_the_very_network_that_was_saved(tmp_path: Path, case: str) -> None:
+def test_file_restores_the_saved_network(tmp_path: Path, case: str) -> None:
     net = NETS[case]()
     net.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # as training has it
     save_network(tmp_path / "w.safetensors", net, "mine")
@@ -39,7 +39,7 @@ def test_a_file_gives_back_the_very_network_that_was_saved(tmp_path: Path, case:
         torch.testing.assert_close(loaded.upsample(rgb, disparity), net.upsample(rgb, disparity), rtol=1e-4, atol=1e-5)
 
 
-def test_equal_networks_give_equal_bytes_and_the_facts_come_back(tmp_path: Path) -> None:
+def test_equal_networks_give_equal_bytes_and_the_facts_are_restored(tmp_path: Path) -> None:
     net, facts = MSGNet(4, "dsr"), {"steps": 12, "loss": "lap1", "nested": {"b": 1, "a": [2]}}
     for name in ("a", "b"):
         save_network(tmp_path / name, net, "msg_v", facts)
@@ -56,7 +56,7 @@ def test_loading_draws_nothing_from_the_random_generator(tmp_path: Path) -> None
     assert torch.equal(torch.get_rng_state(), before)
 
 
-def test_a_file_is_told_from_a_published_one_by_its_content(tmp_path: Path) -> None:
+def test_file_is_told_from_a_published_one_by_its_content(tmp_path: Path) -> None:
     save_network(tmp_path / "w.pth", MSGNet(4, "dsr"), "msg_v")
     torch.save({"model_state_dict": {}}, tmp_path / "w.caffemodel")
     assert is_ours(tmp_path / "w.pth")
@@ -66,7 +66,7 @@ def test_a_file_is_told_from_a_published_one_by_its_content(tmp_path: Path) -> N
         build_trained(tmp_path / "w.caffemodel", 4, "msg_v", "voynov")
 
 
-def test_our_files_are_averaged_over_quarter_turns_unless_told_otherwise(tmp_path: Path) -> None:
+def test_trained_networks_default_to_averaging_over_quarter_turns(tmp_path: Path) -> None:
     save_network(tmp_path / "w", MSGNet(2, "dsr"), "msg_v")
     assert build_trained(tmp_path / "w", 2, "msg_v", "voynov").ensemble == 4
     assert build_trained(tmp_path / "w", 2, "msg_v", "voynov", ensemble=1).ensemble == 1
@@ -91,7 +91,7 @@ def _refusal(path: Path, scale: int | None = 4, model: str | None = None) -> str
     return message.removeprefix(f"{path}: ")
 
 
-def test_a_missing_file_is_reported_as_missing(tmp_path: Path) -> None:
+def test_missing_file_is_refused_as_missing(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError, match=r"nowhere: no such weights file"):
         load_network(tmp_path / "nowhere", NETWORKS)
 
@@ -104,7 +104,7 @@ def test_weights_of_another_model_or_scale_are_refused(tmp_path: Path) -> None:
         build_trained(path, 4, "facets")
 
 
-def test_a_file_cut_off_or_changed_anywhere_is_refused(tmp_path: Path) -> None:
+def test_file_truncated_or_changed_anywhere_is_refused(tmp_path: Path) -> None:
     path = _file(tmp_path / "w")
     whole = path.read_bytes()
     header = 8 + int.from_bytes(whole[:8], "little")
@@ -118,11 +118,11 @@ def test_a_file_cut_off_or_changed_anywhere_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("changes", [{"format": "other"}, {"format": None}])
-def test_a_foreign_format_is_refused(tmp_path: Path, changes: dict[str, Any]) -> None:
+def test_foreign_format_is_refused(tmp_path: Path, changes: dict[str, Any]) -> None:
     assert "expected weights that train.py wrote" in _refusal(_file(tmp_path / "w", changes))
 
 
-def test_safetensors_without_any_facts_are_refused(tmp_path: Path) -> None:
+def test_safetensors_without_metadata_are_refused(tmp_path: Path) -> None:
     save_file({"a": torch.ones(2)}, tmp_path / "w")
     assert _refusal(tmp_path / "w") == "expected weights that train.py wrote, got safetensors with no facts"
 
@@ -131,9 +131,7 @@ def test_safetensors_without_any_facts_are_refused(tmp_path: Path) -> None:
     "changes",
     [{"network": "UNet"}, {"arguments": {"scale": 3}}, {"arguments": {"scale": 4, "depth": 9}}, {"arguments": [4]}],
 )
-def test_an_unknown_network_or_arguments_that_it_does_not_take_are_refused(
-    tmp_path: Path, changes: dict[str, Any]
-) -> None:
+def test_unknown_network_or_arguments_are_refused(tmp_path: Path, changes: dict[str, Any]) -> None:
     refusal = _refusal(_file(tmp_path / "w", changes))
     assert refusal.startswith(f"expected one of the networks {', '.join(NETWORKS)}, got ")
 
@@ -148,7 +146,7 @@ def test_other_tensors_are_refused(tmp_path: Path) -> None:
     assert "smooth.conv.bias holds values other than finite" in _refusal(_file(tmp_path / "w", tensors=state))
 
 
-def test_every_file_that_comes_with_the_package_loads_as_the_model_and_scale_of_its_name() -> None:
+def test_packaged_files_load_as_the_model_and_scale_of_their_names() -> None:
     for name in packaged_names():
         path = packaged_weights(name)
         assert path is not None
@@ -158,5 +156,5 @@ def test_every_file_that_comes_with_the_package_loads_as_the_model_and_scale_of_
         assert read_head(path)["facts"]["steps"] > 0
 
 
-def test_a_name_that_does_not_come_with_the_package_is_none() -> None:
+def test_packaged_weights_of_an_unknown_name_are_none() -> None:
     assert packaged_weights("msg_v_x3") is None

@@ -81,7 +81,7 @@ def _ramp(slope: float, height: float = 4.0) -> Tensor:
 
 
 @pytest.mark.parametrize("depth_loss", ["lap1", "l1", "mse"])
-def test_the_loss_is_zero_at_the_truth(depth_loss: Any) -> None:
+def test_loss_is_zero_at_the_truth(depth_loss: Any) -> None:
     depth = torch.from_numpy(np.random.default_rng(0).uniform(1, 3, (1, 12, 13)))
     batch = _batch(depth, STEREO, (3.0, 5.0))
     terms = Objective(depth_loss, 2.0)(0.5 * 20 / depth[None] - 1, batch)
@@ -90,14 +90,14 @@ def test_the_loss_is_zero_at_the_truth(depth_loss: Any) -> None:
 
 
 @pytest.mark.parametrize(("depth_loss", "expected"), [("l1", 0.25), ("lap1", 0.25), ("mse", 0.0625)])
-def test_an_offset_counts_as_its_share_of_the_coarse_range(depth_loss: Any, expected: float) -> None:
+def test_offset_counts_as_its_fraction_of_the_low_resolution_range(depth_loss: Any, expected: float) -> None:
     terms = Objective(depth_loss, 3.0)(torch.full((1, 1, 12, 13), 4.5, dtype=torch.float64), _wall())
     assert float(terms[depth_loss]) == pytest.approx(expected, rel=1e-13)
     assert float(terms["mse_v"]) == pytest.approx(0, abs=1e-25)  # a wall elsewhere looks the same
     assert float(terms["loss"]) == pytest.approx(expected, rel=1e-13)
 
 
-def test_the_visual_term_is_that_of_the_angle_between_two_planes() -> None:
+def test_visual_term_is_that_of_the_angle_between_two_planes() -> None:
     """d + doffs = a u + b is the plane a fx X + (a cx + b) Z = baseline fx; the wall's normal is the optical axis."""
     slope = 0.3
     along, axis = slope * 20, slope * 4 + 5
@@ -108,38 +108,38 @@ def test_the_visual_term_is_that_of_the_angle_between_two_planes() -> None:
     assert float(terms["loss"]) == pytest.approx(slope * 3 + 0.5 * expected, rel=1e-12)
 
 
-def test_without_a_weight_the_visual_term_is_left_out() -> None:
+def test_visual_term_without_a_weight_is_left_out() -> None:
     assert Objective("l1").w == 0
     terms = Objective("l1")(_ramp(0.3), _wall())
     assert terms.keys() == {"loss", "l1"}
     assert float(terms["loss"]) == pytest.approx(0.9, rel=1e-12)
 
 
-def test_a_flat_coarse_map_has_a_span_that_is_not_zero() -> None:
+def test_flat_low_resolution_map_has_a_nonzero_range() -> None:
     batch = {**_wall(), "disparity_lr": torch.full((1, 1, 1, 2), 4.0, dtype=torch.float64)}
     terms = Objective("l1")(_ramp(0, 4.001), batch)
     assert float(terms["loss"]) == pytest.approx(0.001 / 0.004, rel=1e-9)
 
 
-def test_holes_of_the_coarse_map_do_not_widen_its_range() -> None:
+def test_holes_of_the_low_resolution_map_do_not_widen_its_range() -> None:
     batch = _wall()
     batch["disparity_lr"] = torch.tensor([3.0, torch.nan, 5.0], dtype=torch.float64).view(1, 1, 1, 3)
     assert float(Objective("l1")(_ramp(0, 4.5), batch)["loss"]) == pytest.approx(0.25, rel=1e-13)
 
 
-def test_an_unknown_depth_loss_is_refused() -> None:
+def test_unknown_depth_loss_is_refused() -> None:
     with pytest.raises(ValueError, match=r"^depth_loss: expected one of lap1, l1, mse, got 'ssim'"):
         Objective("ssim")  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("doffs", [0.0, 1.0, -2.5])
-def test_disparity_goes_back_to_the_depth_that_it_came_from(doffs: float) -> None:
+def test_disparity_is_converted_back_to_its_depth(doffs: float) -> None:
     depth = torch.from_numpy(np.random.default_rng(0).uniform(1, 3, (1, 12, 13)))
     batch = {**_batch(depth, STEREO, (3.0, 5.0)), "doffs": _four(doffs)}
     torch.testing.assert_close(to_depth(0.5 * 20 / depth[None] - doffs, batch), depth[None], rtol=1e-13, atol=0)
 
 
-def test_at_or_beyond_infinity_there_is_no_depth() -> None:
+def test_disparity_at_or_beyond_infinity_has_no_depth() -> None:
     disparity = torch.tensor([[[[-1.5, -1.0, -0.5]]]], dtype=torch.float64)
     assert to_depth(disparity, _wall())[0, 0, 0].isnan().tolist() == [True, True, False]
     assert to_depth(disparity, _wall())[0, 0, 0, 2] == pytest.approx(20)
@@ -158,7 +158,7 @@ def _plane(baseline: float | None = None, doffs: float = 0.0, slope: float = 0.0
 
 
 @pytest.mark.parametrize(("baseline", "doffs", "fx"), [(None, 0.0, 80.0), (0.12, 0.0, 80.0), (0.12, 1.5, 123.0)])
-def test_the_balanced_weight_of_a_plane_is_its_closed_form(baseline: float | None, doffs: float, fx: float) -> None:
+def test_balanced_weight_of_a_plane_is_its_closed_form(baseline: float | None, doffs: float, fx: float) -> None:
     stereo = (baseline or 0.2) * fx
     middle, spread = stereo / (3 + 0.02 * 50), 0.02 * 96  # the median's column; coarse centres from 1.5 to 97.5
     tilt = math.asin(5 / 255)
@@ -167,7 +167,7 @@ def test_the_balanced_weight_of_a_plane_is_its_closed_form(baseline: float | Non
     assert balance_weight([_plane(baseline, doffs, fx=fx)]) == pytest.approx(expected, rel=2e-6)
 
 
-def test_the_balanced_weight_balances_a_tilt_between_neighbours() -> None:
+def test_balanced_weight_balances_a_tilt_between_neighbours() -> None:
     """On a wall whose every second column stands out by tan(1.1 degrees) of a pixel's width, both terms weigh alike."""
     camera = Camera(width=100, height=16, fx=80.0, fy=80.0, cx=49.5, cy=7.5)
     wall = torch.full((1, 16, 100), 2.0, dtype=torch.float64)
@@ -182,23 +182,23 @@ def test_the_balanced_weight_balances_a_tilt_between_neighbours() -> None:
     assert float(2 * terms["l1"]) == pytest.approx(float(w * terms["mse_v"]), rel=0.05)
 
 
-def test_the_balanced_weight_is_the_median_over_the_patches() -> None:
+def test_balanced_weight_is_the_median_over_the_patches() -> None:
     patches = [_plane(slope=slope) for slope in (0.01, 0.05, 0.03)]
     assert balance_weight(patches) == balance_weight(patches[2:])
 
 
-def test_holes_hardly_touch_the_balanced_weight() -> None:
+def test_balanced_weight_hardly_depends_on_holes() -> None:
     patch = _plane()
     patch["depth"][0, :, 50] = torch.nan
     patch["disparity_lr"][0, 0, 12] = torch.nan
     assert balance_weight([patch]) == pytest.approx(balance_weight([_plane()]), rel=0.02)
 
 
-def test_the_balanced_weight_of_a_wall_is_finite() -> None:
+def test_balanced_weight_of_a_wall_is_finite() -> None:
     assert 0 < balance_weight([_plane(slope=0.0)]) < math.inf
 
 
-def test_a_balanced_weight_of_nothing_is_refused() -> None:
+def test_balanced_weight_of_nothing_is_refused() -> None:
     with pytest.raises(ValueError, match=r"^patches: expected one or more to compute w from, got none"):
         balance_weight([])
 
@@ -206,7 +206,7 @@ def test_a_balanced_weight_of_nothing_is_refused() -> None:
 # The schedule
 
 
-def test_the_learning_rate_warms_up_evenly_and_falls_as_a_cosine_to_zero() -> None:
+def test_learning_rate_warms_up_linearly_and_falls_as_a_cosine_to_zero() -> None:
     schedule = Schedule(steps=20, warmup=4)
     assert [schedule.factor(step) for step in range(5)] == pytest.approx([0.25, 0.5, 0.75, 1, 1])
     assert schedule.factor(12) == pytest.approx(0.5)  # halfway down
@@ -214,13 +214,13 @@ def test_the_learning_rate_warms_up_evenly_and_falls_as_a_cosine_to_zero() -> No
     assert schedule.factor(20) == schedule.factor(25) == pytest.approx(0, abs=1e-15)
 
 
-def test_there_may_be_no_warm_up_and_a_training_shorter_than_it() -> None:
+def test_warm_up_may_be_absent_or_longer_than_the_training() -> None:
     assert Schedule(steps=10, warmup=0).factor(0) == 1
     assert [Schedule(steps=2, warmup=4).factor(step) for step in range(2)] == [0.25, 0.5]
 
 
 @pytest.mark.parametrize("changes", [{"warmup": -1}, {"weight_decay": -0.1}, {"weight_decay": math.nan}])
-def test_a_schedule_that_cannot_be_is_refused(changes: dict[str, Any]) -> None:
+def test_invalid_schedule_is_refused(changes: dict[str, Any]) -> None:
     with pytest.raises(ValueError, match=rf"^{next(iter(changes))}: expected 0 or more, got"):
         Schedule(10, **changes)
 
@@ -268,7 +268,7 @@ def _one_batch() -> DataLoader[Batch]:
     return DataLoader(patches, batch_size=2)
 
 
-def test_thirty_steps_on_one_batch_bring_the_loss_down(tmp_path: Path) -> None:
+def test_loss_falls_in_thirty_steps_on_one_batch(tmp_path: Path) -> None:
     losses, module = _Losses(), _module()
     before = copy.deepcopy(module.net.state_dict())
     _trainer(tmp_path, max_epochs=30, callbacks=[losses], gradient_clip_val=1.0).fit(module, _one_batch())
@@ -278,9 +278,7 @@ def test_thirty_steps_on_one_batch_bring_the_loss_down(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("mixed", [False, True])
-def test_the_training_loss_is_the_objective_of_the_networks_output_in_full_precision(
-    tmp_path: Path, mixed: bool
-) -> None:
+def test_training_loss_is_the_objective_of_the_networks_output_in_full_precision(tmp_path: Path, mixed: bool) -> None:
     losses, module = _Losses(), _module(mixed=mixed)
     [batch] = _one_batch()
     with torch.no_grad(), torch.autocast("cpu", torch.bfloat16, enabled=mixed):
@@ -290,7 +288,7 @@ def test_the_training_loss_is_the_objective_of_the_networks_output_in_full_preci
     assert losses.values == pytest.approx([expected], rel=2e-5)
 
 
-def test_the_average_follows_the_weights_with_its_decay(tmp_path: Path) -> None:
+def test_weight_average_follows_the_weights_with_its_decay(tmp_path: Path) -> None:
     seen: list[Tensor] = []
 
     class _Watch(Callback):
@@ -309,7 +307,7 @@ def test_the_average_follows_the_weights_with_its_decay(tmp_path: Path) -> None:
     assert not any(parameter.requires_grad for parameter in module.average.parameters())
 
 
-def test_without_an_average_the_weights_themselves_are_kept(tmp_path: Path) -> None:
+def test_weights_are_stored_themselves_without_an_average(tmp_path: Path) -> None:
     module = _module(average=0.0)
     _trainer(tmp_path, max_epochs=2).fit(module, _one_batch())
     assert all(map(torch.equal, module.net.parameters(), module.average.parameters()))
@@ -324,7 +322,7 @@ def test_gradients_add_up_over_accumulated_batches(tmp_path: Path) -> None:
     assert not torch.equal(before, module.average.stem.conv.weight)
 
 
-def test_a_long_gradient_is_shortened_and_its_norm_logged(tmp_path: Path) -> None:
+def test_long_gradient_is_clipped_and_its_norm_logged(tmp_path: Path) -> None:
     module, norms = _module(clip=1e-3), []
 
     class _Norm(Callback):
@@ -339,7 +337,7 @@ def test_a_long_gradient_is_shortened_and_its_norm_logged(tmp_path: Path) -> Non
     assert trainer.callback_metrics["train/gradient_norm"] > 1e-2
 
 
-def test_a_gradient_that_is_not_finite_changes_nothing(tmp_path: Path) -> None:
+def test_non_finite_gradient_changes_nothing(tmp_path: Path) -> None:
     module = _module()
     before = copy.deepcopy(module.net.state_dict())
     [batch] = _one_batch()
@@ -350,12 +348,12 @@ def test_a_gradient_that_is_not_finite_changes_nothing(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("changes", [{"average": 1.0}, {"average": -0.1}, {"average": math.nan}])
-def test_an_average_that_cannot_be_is_refused(changes: dict[str, Any]) -> None:
+def test_invalid_average_is_refused(changes: dict[str, Any]) -> None:
     with pytest.raises(ValueError, match=rf"^{next(iter(changes))}: expected "):
         Schedule(10, **changes)
 
 
-def test_validation_logs_the_mean_over_the_scenes_of_the_metrics_worst_light(tmp_path: Path) -> None:
+def test_validation_logs_the_mean_over_the_scenes_under_the_worst_light(tmp_path: Path) -> None:
     module, scenes = _module(mixed=True), WholeScenes([_scene(3), _scene(4, holes=0.05), _scene(5)], X2)
     [logged] = _trainer(tmp_path).validate(module, DataLoader(scenes), verbose=False)
     values: dict[str, list[float]] = {"RMSE_d": [], "RMSE_v": [], "DSSIM_v": [], "BadPix_v_5": [], "Bumpiness_d": []}
@@ -374,7 +372,7 @@ def test_validation_logs_the_mean_over_the_scenes_of_the_metrics_worst_light(tmp
         assert logged[f"val/{name}"] == pytest.approx(np.mean(each), rel=1e-4), name
 
 
-def test_a_validation_forgets_the_one_before(tmp_path: Path) -> None:
+def test_validation_starts_anew_each_time(tmp_path: Path) -> None:
     module, trainer = _module(), _trainer(tmp_path)
     first, other = (DataLoader(WholeScenes([_scene(seed)], X2)) for seed in (3, 4))
     [before] = trainer.validate(module, first, verbose=False)
@@ -383,7 +381,7 @@ def test_a_validation_forgets_the_one_before(tmp_path: Path) -> None:
     assert before == after != between
 
 
-def test_a_checkpoint_holds_the_networks_tensors_alone_and_loads_as_plain_data(tmp_path: Path) -> None:
+def test_checkpoint_holds_the_networks_tensors_alone_and_loads_as_plain_data(tmp_path: Path) -> None:
     shapes = {0: (64, 3, 11, 11), 3: (192, 64, 5, 5), 6: (384, 192, 3, 3), 8: (256, 384, 3, 3), 10: (256, 256, 3, 3)}
     trunk = {f"features.{i}.weight": 0.05 * torch.randn(shape) for i, shape in shapes.items()}
     network = LPIPS(trunk | {f"features.{i}.bias": torch.zeros(shape[0]) for i, shape in shapes.items()})
@@ -400,6 +398,6 @@ def test_a_checkpoint_holds_the_networks_tensors_alone_and_loads_as_plain_data(t
     assert (tmp_path / "a.ckpt").stat().st_size < 4 * 4 * size + 200_000  # weights, their average, AdamW's two moments
 
 
-def test_a_network_that_leaves_out_pixels_is_refused() -> None:
+def test_network_that_leaves_out_pixels_is_refused() -> None:
     with pytest.raises(ValueError, match=r"model: expected a network that covers the whole image"):
         SuperResolution(MSGNet(4, "hui"), Objective(), Schedule(10), visual_metrics)

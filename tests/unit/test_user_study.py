@@ -93,16 +93,16 @@ FOUR = (
 
 
 @pytest.mark.parametrize(("count", "n"), [(0, 1), (1, 1), (0, 136), (3, 136), (130, 136), (5, 10), (136, 136)])
-def test_wilsons_interval_is_that_of_scipy(count, n):
+def test_wilson_interval_equals_scipy(count, n):
     theirs = binomtest(count, n).proportion_ci(0.95, method="wilson")
     assert wilson(count, n) == pytest.approx((theirs.low, theirs.high), abs=1e-12)
 
 
-def test_without_answers_there_is_no_interval():
+def test_interval_without_answers_is_unknown():
     assert all(math.isnan(bound) for bound in wilson(0, 0))
 
 
-def test_the_interval_of_an_average_over_one_scene_is_that_of_the_binomial():
+def test_interval_of_an_average_over_one_scene_is_that_of_the_binomial():
     asked = np.ones((400, 1), int)
     chosen = (np.arange(400) < 120).astype(int)[:, None]
     half = 1.96 * math.sqrt(0.3 * 0.7 / 400)
@@ -115,17 +115,17 @@ def test_people_who_answer_alike_everywhere_count_as_one_answer_each():
     assert bootstrap_of_average(chosen, np.ones((400, 9), int)) == pytest.approx(one)
 
 
-def test_where_everybody_agrees_the_interval_of_an_average_is_wilsons_with_one_answer_a_person():
+def test_interval_of_an_average_is_wilsons_with_one_answer_a_person_where_all_agree():
     ones = np.ones((12, 5), int)
     assert bootstrap_of_average(ones, ones) == pytest.approx(wilson(12, 12))
     assert bootstrap_of_average(0 * ones, ones) == pytest.approx(wilson(0, 12))
 
 
-def test_an_average_counts_each_scene_alike_and_scenes_without_answers_not_at_all():
+def test_average_weighs_scenes_equally_without_those_without_answers():
     assert average_share(np.array([1, 9, 0]), np.array([2, 9, 0])) == pytest.approx(0.75)
 
 
-def test_agreement_is_that_of_fleiss_own_example():
+def test_agreement_equals_fleiss_own_example():
     """Ten subjects, fourteen raters, five categories: 0.378 and kappa 0.210."""
     counts = [
         [0, 0, 0, 0, 14], [0, 2, 6, 4, 2], [0, 0, 3, 5, 6], [0, 3, 9, 2, 0], [2, 2, 8, 1, 1],
@@ -138,7 +138,7 @@ def test_agreement_of_one_person_is_unknown():
     assert all(math.isnan(value) for value in agreement(np.array([[1, 0], [0, 1]])))
 
 
-def test_percentages_of_a_scene_are_those_counted_by_hand(tmp_path):
+def test_percentages_of_a_scene_equal_a_count_by_hand(tmp_path):
     table = collected(tmp_path, *FOUR)
     assert tuple(table.columns) == COLUMNS
     found = row(table, "simgeo", "cube", "MSG-V")
@@ -165,7 +165,7 @@ def test_first_choices_of_all_methods_add_up_to_100_percent(tmp_path):
     assert shares.to_numpy() == pytest.approx(np.array([[100, 100, 200]] * len(shares)))
 
 
-def test_the_average_over_data_sets_counts_their_scenes_alike(tmp_path):
+def test_average_over_datasets_weighs_their_scenes_equally(tmp_path):
     other = Trial("paper", "lucy", 4, "box", CANDIDATES)
     key = Key(KEY.study, "e4", 2, 0, {**KEY.trials, "s2": other})
     table = collected(tmp_path, *FOUR, key=key)
@@ -173,7 +173,7 @@ def test_the_average_over_data_sets_counts_their_scenes_alike(tmp_path):
     assert row(table, ALL, AVERAGE, "Bicubic")["user_first"] == 37.5
 
 
-def test_a_scene_counts_only_those_who_were_shown_it(tmp_path):
+def test_scene_counts_only_those_who_saw_it(tmp_path):
     key = Key(KEY.study, "e4", 1, 0, KEY.trials)
     parts = copy.deepcopy(FOUR)
     for number, part in enumerate(parts):
@@ -184,7 +184,7 @@ def test_a_scene_counts_only_those_who_were_shown_it(tmp_path):
     assert shares == pytest.approx([200 / 3, 100, 250 / 3])
 
 
-def test_repeated_scenes_tell_how_sure_people_are_and_do_not_count_twice(tmp_path):
+def test_repeated_scenes_measure_consistency_and_do_not_count_twice(tmp_path):
     key = Key(KEY.study, "e4", 2, 2, KEY.trials)
     asked_again = copy.deepcopy(FOUR)
     for number, content in enumerate(asked_again):
@@ -197,7 +197,7 @@ def test_repeated_scenes_tell_how_sure_people_are_and_do_not_count_twice(tmp_pat
     assert any(line.startswith(f"{tmp_path / '3.json'}: another first choice") for line in lines)
 
 
-def test_how_far_people_agree_is_counted_over_pairs(tmp_path):
+def test_agreement_is_counted_over_pairs(tmp_path):
     given, _ = read_all(written(tmp_path, *FOUR), KEY)
     [line] = [line for line in remarks(given, KEY) if "two people" in line]
     assert "in 42 % of the cases (33 % by guessing)" in line  # cube: 3 of 6 pairs, statue: 2 of 6
@@ -243,7 +243,7 @@ DAMAGE = {
 
 
 @pytest.mark.parametrize("message", DAMAGE)
-def test_a_file_that_cannot_be_right_is_left_out_with_one_line_that_names_it(tmp_path, message):
+def test_invalid_answer_file_is_left_out_with_one_line_that_names_it(tmp_path, message):
     good, bad = written(tmp_path, FOUR[0], DAMAGE[message])
     given, left_out = read_all([good, bad], KEY)
     assert [each.file for each in given] == [good]
@@ -253,7 +253,7 @@ def test_a_file_that_cannot_be_right_is_left_out_with_one_line_that_names_it(tmp
     assert "\n" not in line
 
 
-def test_a_missing_file_a_picture_and_one_of_many_megabytes_are_left_out(tmp_path):
+def test_missing_file_picture_and_file_of_many_megabytes_are_left_out(tmp_path):
     picture, large = tmp_path / "picture.json", tmp_path / "large.json"
     picture.write_bytes(b"\x89PNG\r\n\xff\xfe")
     with large.open("wb") as file:
@@ -264,13 +264,13 @@ def test_a_missing_file_a_picture_and_one_of_many_megabytes_are_left_out(tmp_pat
     assert "20 MB" in left_out[2]
 
 
-def test_answers_survive_a_byte_order_mark_of_an_editor(tmp_path):
+def test_answers_with_a_byte_order_mark_are_read(tmp_path):
     file = tmp_path / "mailed.json"
     file.write_text(json.dumps(FOUR[0]) + "\r\n", encoding="utf-8-sig")
     assert read_answers(file, KEY).participant == "p1"
 
 
-def test_of_one_persons_files_the_one_finished_first_counts(tmp_path):
+def test_first_finished_of_one_persons_files_counts(tmp_path):
     later, first, other = answers("p1", "VB", "VB", minute=9), answers("p1", "BV", "BV", minute=3), FOUR[1]
     files = written(tmp_path, later, first, other)
     given, left_out = read_all(files, KEY)
@@ -278,7 +278,7 @@ def test_of_one_persons_files_the_one_finished_first_counts(tmp_path):
     assert left_out == [f"{files[0]}: a double of {files[1]} (the same person), which was finished first and counts"]
 
 
-def test_an_incomplete_file_does_not_keep_the_persons_complete_one_out(tmp_path):
+def test_incomplete_file_does_not_replace_the_persons_complete_one(tmp_path):
     half = answers("p1", "BV", "BV", minute=1)
     half["trials"][1]["second"] = None
     given, left_out = read_all(written(tmp_path, half, answers("p1", "VB", "VB", minute=9)), KEY)
@@ -286,18 +286,18 @@ def test_an_incomplete_file_does_not_keep_the_persons_complete_one_out(tmp_path)
     assert len(left_out) == 1
 
 
-def test_the_very_same_answers_under_another_name_count_once(tmp_path):
+def test_identical_answers_under_another_name_count_once(tmp_path):
     given, left_out = read_all(written(tmp_path, FOUR[0], FOUR[0] | {"participant": "p7"}), KEY)
     assert len(given) == 1
     assert "the very same answers" in left_out[0]
 
 
-def test_two_people_of_one_mind_both_count(tmp_path):
+def test_identical_choices_of_two_people_both_count(tmp_path):
     given, left_out = read_all(written(tmp_path, answers("p1", "VB", "VB"), answers("p2", "VB", "VB")), KEY)
     assert (len(given), left_out) == (2, [])
 
 
-def test_a_directory_stands_for_the_json_files_below_it_and_a_file_named_twice_counts_once(tmp_path):
+def test_directory_stands_for_its_json_files_and_a_file_named_twice_counts_once(tmp_path):
     (tmp_path / "deep").mkdir()
     files = [*written(tmp_path, FOUR[0]), *written(tmp_path / "deep", FOUR[1])]
     (tmp_path / "notes.txt").write_text("no answers")
@@ -306,7 +306,7 @@ def test_a_directory_stands_for_the_json_files_below_it_and_a_file_named_twice_c
         files_of([])
 
 
-def test_the_key_is_read_as_it_was_written_and_refused_when_damaged(tmp_path):
+def test_key_round_trips_and_a_damaged_one_is_refused(tmp_path):
     path = tmp_path / "key.json"
     write_key(path, KEY)
     assert read_key(path) == KEY
@@ -317,7 +317,7 @@ def test_the_key_is_read_as_it_was_written_and_refused_when_damaged(tmp_path):
         read_key(tmp_path / "none.json")
 
 
-def test_the_tables_of_the_terminal_show_shares_with_intervals(tmp_path, capsys):
+def test_terminal_tables_show_percentages_with_intervals(tmp_path, capsys):
     tables = list(tables_of(collected(tmp_path, *FOUR)))
     assert len(tables) == 1
     open_console().print(tables[0])
@@ -354,7 +354,7 @@ def decoded(text):
     return np.asarray(Image.open(io.BytesIO(base64.b64decode(text))).convert("LA"))
 
 
-def test_the_page_shows_what_the_key_says(tmp_path, runs):
+def test_page_shows_what_the_key_says(tmp_path, runs):
     built = build_study(load_results([runs]), tmp_path / "study")
     content, _ = content_of(built.page)
     assert read_key(tmp_path / "study" / "key.json") == built.key
@@ -372,7 +372,7 @@ def test_the_page_shows_what_the_key_says(tmp_path, runs):
         assert np.abs((image[..., 0] - 1.0) / 254 - expected).max() <= 0.51 / 254
 
 
-def test_nothing_on_the_page_tells_a_method_a_scene_or_a_directory(tmp_path, runs):
+def test_page_reveals_no_method_scene_or_directory(tmp_path, runs):
     built = build_study(load_results([runs]), tmp_path / "study")
     _, words = content_of(built.page)
     for name in ("bicubic", "msg", "dip", "folder_of", "simgeo", "cube", "statue"):
@@ -386,14 +386,14 @@ def test_nothing_on_the_page_tells_a_method_a_scene_or_a_directory(tmp_path, run
     assert len(sizes) == 1
 
 
-def test_the_order_on_the_page_is_that_of_hashes(tmp_path, runs):
+def test_page_order_is_that_of_hashes(tmp_path, runs):
     content, _ = content_of(build_study(load_results([runs]), tmp_path / "study").page)
     assert content["scenes"] == sorted(content["scenes"], key=lambda scene: scene["id"])
     for scene in content["scenes"]:
         assert list(scene["images"]) == sorted(scene["images"])
 
 
-def test_the_same_runs_make_the_same_study_and_others_another(tmp_path, runs):
+def test_same_runs_give_the_same_study_and_others_another(tmp_path, runs):
     results = load_results([runs])
     first = build_study(results, tmp_path / "one")
     second = build_study(results, tmp_path / "two", Choice(title="Other words"))
@@ -402,14 +402,14 @@ def test_the_same_runs_make_the_same_study_and_others_another(tmp_path, runs):
     assert third.key.study != first.key.study
 
 
-def test_the_key_has_the_methods_in_the_order_of_the_results(tmp_path, runs):
+def test_key_has_the_methods_in_the_order_of_the_results(tmp_path, runs):
     results = load_results([runs])
     for trial in build_study(results, tmp_path / "study").key.trials.values():
         labels = [candidate.label for candidate in trial.candidates.values()]
         assert labels == [label for label in results.methods() if label in labels]
 
 
-def test_a_scene_that_one_method_alone_has_is_left_out_and_one_without_some_is_noted(tmp_path, runs, make_run):
+def test_scene_of_one_method_alone_is_left_out_and_incomplete_ones_are_noted(tmp_path, runs, make_run):
     make_run(runs / "more", scenes=["alone"])
     built = build_study(load_results([runs]), tmp_path / "study")
     assert {trial.scene for trial in built.key.trials.values()} == {"cube_no_texture", "<_script><b>statue"}
@@ -417,7 +417,7 @@ def test_a_scene_that_one_method_alone_has_is_left_out_and_one_without_some_is_n
     assert any("without DIP" in note for note in built.notes)
 
 
-def test_of_several_seeds_the_lowest_is_shown(tmp_path, runs, make_run):
+def test_lowest_of_several_seeds_is_shown(tmp_path, runs, make_run):
     make_run(runs / "again", method="msg_v", label="MSG-V", seed=1)
     built = build_study(load_results([runs]), tmp_path / "study", Choice(scenes=["cube_no_texture"]))
     [trial] = built.key.trials.values()
@@ -440,13 +440,13 @@ def test_of_several_seeds_the_lowest_is_shown(tmp_path, runs, make_run):
         (Choice(title="Is bicubic best?"), "title: expected words without the methods' names, got 'Bicubic'"),
     ],
 )
-def test_a_study_that_cannot_be_made_is_refused_and_leaves_nothing(tmp_path, runs, choice, message):
+def test_invalid_study_is_refused_and_leaves_nothing(tmp_path, runs, choice, message):
     with pytest.raises(ValueError, match=message):
         build_study(load_results([runs]), tmp_path / "study", choice)
     assert not (tmp_path / "study").exists()
 
 
-def test_the_key_of_another_study_is_not_overwritten_unasked(tmp_path, runs):
+def test_key_of_another_study_is_not_overwritten_without_overwrite(tmp_path, runs):
     results = load_results([runs])
     first = build_study(results, tmp_path)
     assert build_study(results, tmp_path).key == first.key
@@ -456,14 +456,14 @@ def test_the_key_of_another_study_is_not_overwritten_unasked(tmp_path, runs):
     assert build_study(results, tmp_path, Choice(light="e1"), overwrite=True).key == read_key(tmp_path / "key.json")
 
 
-def test_words_of_the_page_are_shown_as_they_are(tmp_path, runs):
+def test_texts_of_the_page_are_shown_unchanged(tmp_path, runs):
     title = "</title><script>alert(1)</script> {{DATA}}"
     page = build_study(load_results([runs]), tmp_path / "study", Choice(title=title)).page.read_text()
     assert "alert(1)</script>" not in page
     assert page.count("&lt;/title&gt;&lt;script&gt;alert(1)&lt;/script&gt; {{DATA}}") == 2
 
 
-def test_what_the_truth_does_not_have_is_hidden_in_every_picture_alike():
+def test_missing_truth_is_hidden_in_every_picture_alike():
     camera = Camera(8, 6, 8.0, 8.0, 3.5, 2.5)
     depth = torch.full((1, 6, 8), 2.0)
     truth = depth.clone()
@@ -475,14 +475,14 @@ def test_what_the_truth_does_not_have_is_hidden_in_every_picture_alike():
     assert (~known).nonzero().tolist() == [[1, 3], [2, 2], [2, 3]]
 
 
-def test_of_a_wall_seen_head_on_the_fourth_lights_rendering_is_white():
+def test_fourth_rendering_of_a_frontal_wall_is_white():
     camera = Camera(8, 6, 8.0, 8.0, 3.5, 2.5)
     shades = shading_of(torch.full((1, 6, 8), 2.0), camera, "e4")
     picture = decoded(base64.b64encode(grey_png(shades, shades.isfinite())))
     assert (picture == 255).all()
 
 
-def test_methods_that_look_exactly_the_same_are_told_and_keep_ids_of_their_own(tmp_path, make_run):
+def test_identical_looking_methods_are_reported_and_keep_distinct_ids(tmp_path, make_run):
     for method in ("msg", "copy"):
         make_run(tmp_path / method, method=method, label=method)
     file = "predictions/cube_no_texture.npz"
@@ -505,7 +505,7 @@ class Commands:
         return options.run(options, open_console(), None)
 
 
-def test_the_command_collects_what_is_good_and_says_what_is_not(tmp_path, capsys):
+def test_command_collects_valid_answers_and_reports_the_others(tmp_path, capsys):
     write_key(tmp_path / "key.json", KEY)
     folder = tmp_path / "answers"
     folder.mkdir()
@@ -519,7 +519,7 @@ def test_the_command_collects_what_is_good_and_says_what_is_not(tmp_path, capsys
     assert row(table, "simgeo", "cube", "MSG-V")["user_first"] == 75
 
 
-def test_the_command_refuses_a_study_without_an_answer_that_counts(tmp_path):
+def test_command_refuses_a_study_without_a_valid_answer(tmp_path):
     write_key(tmp_path / "key.json", KEY)
     files = written(tmp_path, "{", "[]")
     with pytest.raises(ValueError, match="answers that count, got none in 2 files"):
@@ -527,7 +527,7 @@ def test_the_command_refuses_a_study_without_an_answer_that_counts(tmp_path):
     assert not (tmp_path / "study.csv").exists()
 
 
-def test_the_command_builds_with_the_options_given(tmp_path, runs, capsys):
+def test_command_builds_with_the_given_options(tmp_path, runs, capsys):
     words = ("--scale", 4, "--methods", "bicubic", "msg_v", "--repeat", 1, "--send-to", "Post it.")
     assert Commands()("build", runs, *words, "-o", tmp_path / "study") == []
     content, text = content_of(tmp_path / "study" / "index.html")
