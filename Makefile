@@ -1,13 +1,14 @@
 # make run   evaluate on the embedded scenes (ARGS="scale=8 method=..." are handed on to eval.py)
 # make test  lint, types and tests
-# Both set everything up in .venv first; they need Python >= 3.11 and nothing else.
+# make docs  the documentation as a site in outputs/site
+# All of them set everything up in .venv first; they need Python >= 3.11 and nothing else.
 
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 ARGS ?=
 
-.PHONY: run test lint benchmark clean
+.PHONY: run test lint docs benchmark clean
 
 run: $(VENV)/installed
 	$(BIN)/python eval.py $(ARGS)
@@ -19,6 +20,9 @@ lint: $(VENV)/installed-dev
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+
+docs: $(VENV)/installed-dev
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build
 
 benchmark: $(VENV)/installed-dev
 	for file in benchmarks/*_speed.py; do $(BIN)/python $$file || exit 1; done
@@ -33,7 +37,7 @@ $(VENV)/installed: pyproject.toml constraints.txt | $(VENV)/bin/python
 	@touch $@
 
 $(VENV)/installed-dev: pyproject.toml constraints.txt | $(VENV)/bin/python
-	$(BIN)/pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[dev]'
+	$(BIN)/pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[dev,docs]'
 	@touch $(VENV)/installed $@
 
 clean:

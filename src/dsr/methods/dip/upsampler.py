@@ -49,8 +49,8 @@ class DeepImagePrior:
     Args:
         scale: the upsampling factor.
         downsampling: the model that is assumed to have led to the low-resolution map.
-        steps, learning_rate, widths, skips, padding, border, guide, input_noise, perturbation, guide_perturbation,
-            average, margin: see :class:`~dsr.methods.dip.optimisation.PriorSettings`.
+        steps, learning_rate, widths, skips, padding, border: see :class:`~dsr.methods.dip.optimisation.PriorSettings`.
+        guide, input_noise, perturbation, guide_perturbation, average, margin: the same.
         data_loss, data_weight, w, w_intensity: see :class:`~dsr.methods.dip.problem.PriorObjective`.
         largest_tilt: degrees; where the noise that is estimated in the low-resolution map tilts its normals by more,
             they say nothing of the surface, and MSE_v is left out. None for never.

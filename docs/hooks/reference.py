@@ -1,0 +1,152 @@
+"""Write the generated pages of the documentation: commands, configuration, Python API, model card and change log.
+
+MkDocs calls :func:`on_files` at every build, so these pages always agree with the code and none of them is stored.
+"""
+
+from __future__ import annotations
+
+import argparse
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from mkdocs.config.defaults import MkDocsConfig
+    from mkdocs.structure.files import Files
+
+ROOT = Path(__file__).resolve().parents[2]
+CONF = ROOT / "conf"
+PACKAGES = (
+    "inference",
+    "sample",
+    "geometry",
+    "degradation",
+    "metrics",
+    "methods",
+    "data",
+    "training",
+    "evaluation",
+    "io",
+)
+"""Parts of dsr that have a page in the API reference."""
+
+_HEAD_COMMANDS = """\
+# Command reference
+
+This page is generated from the commands themselves; `dsr COMMAND --help` prints the same text. The settings of
+`eval.py` and `train.py` are listed in the [configuration reference](configuration.md).
+"""
+_HEAD_CONFIGURATION = """\
+# Configuration reference
+
+This page is generated from the files in `conf/`. `python eval.py --help` and `python train.py --help` print the
+choices and the complete configuration.
+
+- Choose a file of a group with `GROUP=NAME`, for example `method=tgv` or `dataset=icl`.
+- Set a single value with `GROUP.KEY=VALUE`, for example `method.data_weight=30`.
+- The value `???` has to be given. `null` means "not set"; the comment says what happens then.
+- `${oc.env:NAME,VALUE}` reads an environment variable, with a default; `${KEY}` repeats another value.
+
+Every key is checked before anything is computed: an unknown key or a value of the wrong type ends the command with one
+line and exit code 2.
+"""
+
+
+def on_files(files: Files, config: MkDocsConfig) -> Files:
+    """Add the generated pages to those that MkDocs found."""
+    from mkdocs.structure.files import File  # noqa: PLC0415 - the tests of the pages do without MkDocs
+
+    for path, content in generated_pages().items():
+        files.append(File.generated(config, path, content=content))
+    return files
+
+
+def generated_pages() -> dict[str, str]:
+    """Return the Markdown of every generated page by its path in the site."""
+    pages = {
+        "reference/commands.md": command_reference(command_parser()),
+        "reference/configuration.md": configuration_reference(CONF),
+        "weights.md": model_card(),
+        "changelog.md": (ROOT / "CHANGELOG.md").read_text(),
+    }
+    return pages | {f"api/{package}.md": f"# dsr.{package}\n\n::: dsr.{package}\n" for package in PACKAGES}
+
+
+def command_parser() -> argparse.ArgumentParser:
+    """Return the parser of the ``dsr`` command."""
+    from dsr import cli  # noqa: PLC0415
+
+    return cli._parser()
+
+
+def command_reference(parser: argparse.ArgumentParser) -> str:
+    """Return the help of a command and all its subcommands as Markdown."""
+    sections = [f"## {each.prog}\n\n```text\n{each.format_help().rstrip()}\n```\n" for each in all_parsers(parser)]
+    return "\n".join([_HEAD_COMMANDS, *sections])
+
+
+def all_parsers(parser: argparse.ArgumentParser) -> Iterator[argparse.ArgumentParser]:
+    """Yield a parser, then those of its subcommands, in the order of its help."""
+    parser.formatter_class = _wide(parser.formatter_class)
+    yield parser
+    for action in parser._actions:
+        if isinstance(action, argparse._SubParsersAction):
+            for child in action.choices.values():
+                yield from all_parsers(child)
+
+
+def _wide(base: type[argparse.HelpFormatter]) -> type[argparse.HelpFormatter]:
+    """Return a formatter that ignores the width of the terminal."""
+
+    class Wide(base):  # type: ignore[misc, valid-type]
+        def __init__(self, prog: str) -> None:
+            super().__init__(prog, width=100)
+
+    return Wide
+
+
+def configuration_reference(conf: Path) -> str:
+    """Return the files of a configuration directory as Markdown: the two commands first, then each group."""
+    commands = [_file_section(path, f"## {path.stem}.py", conf) for path in (conf / "eval.yaml", conf / "train.yaml")]
+    groups = [_group_section(folder, conf) for folder in sorted(conf.iterdir()) if folder.is_dir()]
+    return "\n".join([_HEAD_CONFIGURATION, *commands, *groups])
+
+
+def _group_section(folder: Path, conf: Path) -> str:
+    """Return a group: a table of its choices, then each file."""
+    paths = sorted(folder.glob("*.yaml"))
+    rows = [f"| [`{path.stem}`](#{folder.name}-{path.stem}) | {_escape(_summary(path))} |" for path in paths]
+    table = ["| choice | what |", "| --- | --- |", *rows]
+    files = [
+        _file_section(path, f"### {folder.name}={path.stem} {{ #{folder.name}-{path.stem} }}", conf) for path in paths
+    ]
+    return "\n".join([f"## {folder.name}\n", *table, "", *files])
+
+
+def _file_section(path: Path, heading: str, conf: Path) -> str:
+    """Return a configuration file under a heading."""
+    return f"{heading}\n\n```yaml title=\"{path.relative_to(conf.parent)}\"\n{path.read_text().rstrip()}\n```\n"
+
+
+def _summary(path: Path) -> str:
+    """Return the comment that a configuration file begins with, up to its first blank or non-comment line."""
+    lines = []
+    for line in path.read_text().splitlines():
+        text = line.removeprefix("#").strip()
+        if not line.startswith("#") or not text:
+            break
+        if not text.startswith("@package"):
+            lines.append(text)
+    return " ".join(lines)
+
+
+def _escape(text: str) -> str:
+    """Return a text that is safe in a table's cell."""
+    return text.replace("|", "\\|").replace("<", "&lt;")
+
+
+def model_card() -> str:
+    """Return the card of the packaged weights with its links adapted to the site."""
+    card = (ROOT / "src/dsr/methods/weights/README.md").read_text()
+    return re.sub(r"\]\((?:\.\./)+docs/", "](", card)
