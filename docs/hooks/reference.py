@@ -126,7 +126,7 @@ def _group_section(folder: Path, conf: Path) -> str:
 
 def _file_section(path: Path, heading: str, conf: Path) -> str:
     """Return a configuration file under a heading."""
-    return f"{heading}\n\n```yaml title=\"{path.relative_to(conf.parent)}\"\n{path.read_text().rstrip()}\n```\n"
+    return f'{heading}\n\n```yaml title="{path.relative_to(conf.parent)}"\n{path.read_text().rstrip()}\n```\n'
 
 
 def _summary(path: Path) -> str:

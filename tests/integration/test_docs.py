@@ -1,0 +1,148 @@
+"""The README, the documentation's pages and CITATION.cff: sizes, links, and commands that parse."""
+
+from __future__ import annotations
+
+import importlib.util
+import re
+import shlex
+from collections.abc import Iterator
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import pytest
+import yaml
+from hydra import compose, initialize_config_dir
+
+from dsr.app.schema import EvalConfig, TrainConfig, plain_config, register
+
+ROOT = Path(__file__).resolve().parents[2]
+DOCS = ROOT / "docs"
+PAGES = (ROOT / "README.md", *sorted(DOCS.glob("*.md")))
+EXTENDING = DOCS / "extend.md"
+"""Its commands use modules of the reader's own; tests/integration run such modules."""
+
+
+def load_hook() -> ModuleType:
+    """Return the module that writes the generated pages; it is no part of the package."""
+    spec = importlib.util.spec_from_file_location("reference", DOCS / "hooks" / "reference.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture(scope="module")
+def hook() -> ModuleType:
+    return load_hook()
+
+
+@pytest.fixture(scope="module")
+def generated(hook: ModuleType) -> dict[str, str]:
+    return hook.generated_pages()
+
+
+def commands(name: str) -> Iterator[tuple[str, list[str]]]:
+    """Yield the lines of the pages' shell blocks that begin with ``name``, and their arguments."""
+    for page in PAGES:
+        for block in re.findall(r"^```sh\n(.*?)^```", page.read_text(), re.MULTILINE | re.DOTALL):
+            for line in block.replace("\\\n", " ").splitlines():
+                words = shlex.split(line, comments=True)
+                if page != EXTENDING and words[: len(name.split())] == name.split():
+                    yield f"{page.name}: {' '.join(words)}", words[len(name.split()) :]
+
+
+def parametrize(name: str) -> Any:
+    found = dict(commands(name))
+    return pytest.mark.parametrize("arguments", found.values(), ids=found.keys())
+
+
+def test_readme_has_at_most_8_kb() -> None:
+    assert (ROOT / "README.md").stat().st_size <= 8192
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_relative_links_of_a_page_lead_somewhere(page: Path, generated: dict[str, str]) -> None:
+    text = re.sub(r"^```.*?^```", "", page.read_text(), flags=re.MULTILINE | re.DOTALL)
+    targets = [link.partition("#")[0] for link in re.findall(r"\]\(([^)\s]+)\)", text)]
+    local = {target for target in targets if target and "://" not in target}
+    missing = {target for target in local if not (page.parent / target).exists()}
+    assert missing <= (set(generated) if page.parent == DOCS else set())
+
+
+def test_every_picture_of_the_documentation_is_used() -> None:
+    text = "".join(page.read_text() for page in PAGES)
+    assert [path.name for path in sorted((DOCS / "pictures").iterdir()) if path.name not in text] == []
+
+
+@parametrize("dsr")
+def test_a_dsr_command_of_the_documentation_parses(arguments: list[str], hook: ModuleType) -> None:
+    if arguments[-1] in ("-h", "--help"):
+        with pytest.raises(SystemExit, match="0"):
+            hook.command_parser().parse_args(arguments)
+    else:
+        assert callable(hook.command_parser().parse_args(arguments).run)
+
+
+def compose_each(name: str, arguments: list[str]) -> Iterator[dict[str, Any]]:
+    """Yield the configurations that a command line leads to, one for each combination of a multirun."""
+    overrides = [argument for argument in arguments if argument not in ("-m", "--help")]
+    register()
+    several = "-m" in arguments
+    choices = [argument.partition("=")[2].split(",") if several else [""] for argument in overrides]
+    with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
+        for which in range(max(map(len, choices), default=1)):
+            chosen = [
+                f"{override.partition('=')[0]}={values[which % len(values)]}" if several else override
+                for override, values in zip(overrides, choices, strict=True)
+            ]
+            yield plain_config(compose(name, [override for override in chosen if "=..." not in override]))
+
+
+@parametrize("python eval.py")
+def test_an_evaluation_of_the_documentation_composes(arguments: list[str]) -> None:
+    for config in compose_each("eval", arguments):
+        assert EvalConfig.of(config).scale in (4, 8)
+
+
+@parametrize("python train.py")
+def test_a_training_of_the_documentation_composes(arguments: list[str]) -> None:
+    for config in compose_each("train", arguments):
+        assert TrainConfig.of(config).scale in (4, 8)
+
+
+def test_command_reference_has_every_command_and_option(hook: ModuleType, generated: dict[str, str]) -> None:
+    page = generated["reference/commands.md"]
+    parsers = list(hook.all_parsers(hook.command_parser()))
+    assert {"dsr", "dsr upsample", "dsr data get", "dsr study collect"} <= {parser.prog for parser in parsers}
+    for parser in parsers:
+        section = page.partition(f"\n## {parser.prog}\n")[2].partition("\n## ")[0]
+        for action in parser._actions:
+            assert [name for name in action.option_strings if name not in section] == []
+
+
+def test_configuration_reference_has_every_file_and_key(generated: dict[str, str]) -> None:
+    page = generated["reference/configuration.md"]
+    for path in (ROOT / "conf").rglob("*.yaml"):
+        if path.parent.name != "conf":
+            assert f"## {path.parent.name}={path.stem} " in page
+            assert f"](#{path.parent.name}-{path.stem})" in page
+        for key in yaml.safe_load(path.read_text()):
+            assert f"\n{key}:" in page
+
+
+def test_citation_has_what_the_format_requires() -> None:
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
+    assert {"cff-version", "message", "title", "authors", "version", "license"} <= set(citation)
+    paper = citation["preferred-citation"]
+    assert {"type", "title", "authors", "year"} <= set(paper)
+    assert paper["title"] == "Perceptual Deep Depth Super-Resolution"
+    assert [author["family-names"] for author in paper["authors"]][::6] == ["Voynov", "Zorin"]
+
+
+def test_citation_names_the_version_of_the_package() -> None:
+    import dsr  # noqa: PLC0415
+
+    assert yaml.safe_load((ROOT / "CITATION.cff").read_text())["version"] == dsr.__version__
+    assert f"version = {{{dsr.__version__}}}" in (DOCS / "citation.md").read_text()
