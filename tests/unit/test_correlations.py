@@ -9,6 +9,8 @@ import pytest
 from scipy import stats
 
 from dsr.evaluation.results import Results, Run
+from dsr.metrics.catalogue import KNOWN_FORMATS
+from dsr.metrics.formats import in_tables
 from dsr.report import correlation_figure
 from dsr.report.correlation_figure import density_of, save_scatter_matrix, scatter_matrix
 from dsr.report.correlations import correlate, metric_matrix, pairs, with_reference, write_correlations
@@ -126,7 +128,7 @@ def test_missing_lpips_leaves_the_rest_and_one_line_says_so(tmp_path, monkeypatc
 
 def test_scatter_matrix_has_points_coefficients_and_densities():
     matrix = metric_matrix(RESULTS)
-    figure = scatter_matrix(matrix, ["Bicubic", "MSG", "Mine"])
+    figure = scatter_matrix(matrix, ["Bicubic", "MSG", "Mine"], in_tables(KNOWN_FORMATS))
     axes = np.array(figure.axes).reshape(3, 3)
     drawn = axes[2, 0].collections[0].get_offsets()
     assert sorted(drawn[:, 0]) == pytest.approx(sorted(1000 * matrix["RMSE_d"]))
@@ -143,7 +145,7 @@ def test_scatter_matrix_has_points_coefficients_and_densities():
 
 def test_points_have_the_colours_of_their_methods():
     matrix = metric_matrix(RESULTS)
-    figure = scatter_matrix(matrix, ["Bicubic", "MSG", "Mine"])
+    figure = scatter_matrix(matrix, ["Bicubic", "MSG", "Mine"], in_tables(KNOWN_FORMATS))
     points = figure.axes[3].collections[0]
     colours = method_colours(["Bicubic", "MSG", "Mine"])
     by_place = {

@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from dsr.geometry.camera import Camera
+from dsr.metrics.catalogue import KNOWN_FORMATS
 from dsr.sample import DepthSample
 from dsr.viz.panels import save_picture
 
@@ -26,7 +27,7 @@ def toy_sample(height=32, width=32, *, truth=True, name="toy", scale=4):
 def drawn(folder, sample, depth, scores=SCORES, label="Toy"):
     """Draw and return the picture's width and height from the PNG's header."""
     path = folder / "pictures" / "scene.png"
-    save_picture(path, sample, depth, scores, label)
+    save_picture(path, sample, depth, scores, label, KNOWN_FORMATS)
     assert [file.name for file in path.parent.iterdir()] == ["scene.png"]
     content = path.read_bytes()
     assert content.startswith(b"\x89PNG")
@@ -106,6 +107,6 @@ def test_existing_picture_is_replaced_and_kept_on_failure(tmp_path):
     after = (tmp_path / "pictures" / "scene.png").read_bytes()
     assert before != after
     with pytest.raises((ValueError, RuntimeError, TypeError)):
-        save_picture(tmp_path / "pictures" / "scene.png", sample, torch.ones(1, 7, 9), SCORES, "Toy")
+        save_picture(tmp_path / "pictures" / "scene.png", sample, torch.ones(1, 7, 9), SCORES, "Toy", KNOWN_FORMATS)
     assert (tmp_path / "pictures" / "scene.png").read_bytes() == after
     assert len(list((tmp_path / "pictures").iterdir())) == 1

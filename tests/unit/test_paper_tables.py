@@ -8,7 +8,7 @@ import pandas as pd
 import pytest
 
 from dsr.evaluation.results import Results, Run
-from dsr.report.paper_tables import COLUMNS, build_tables
+from dsr.report.paper_tables import build_tables
 from dsr.report.scene_sets import PAPER_SCENES, Place, sets_of_dataset, sets_of_summary
 from dsr.report.tables import published
 from dsr.report.user_study import read_study
@@ -110,7 +110,7 @@ def test_best_and_second_best_are_marked_and_ties_share():
     runs = [run(label, {"a": value}) for label, value in (("A", 10.01), ("B", 9.99), ("C", 12.0), ("D", 13.0))]
     table = tables(*runs)["simgeo_x4_box"]
     assert [row.cells["RMSE_d"].rank for row in table.groups[0].rows] == [1, 1, 2, 0]  # both read 10.0
-    texts = [COLUMNS[0].text(row.cells["RMSE_d"].mean) for row in table.groups[0].rows]
+    texts = [table.columns[0].text(row.cells["RMSE_d"].mean) for row in table.groups[0].rows]
     assert texts == ["10.0", "10.0", "12.0", "13.0"]
 
 

@@ -462,7 +462,7 @@ def test_scene_without_a_solution_is_a_result_and_no_failure(tmp_path):
     method = ToyMethod(b=NoSolutionError("a map of 2 x 2 is smaller than a patch"))
     outcome, scores, _ = run(toy_study(method=method), tmp_path)
     reason = "b: a map of 2 x 2 is smaller than a patch"
-    assert outcome.unanswered == {"b": reason}
+    assert outcome.unsolved == {"b": reason}
     assert outcome.failures == {}
     assert set(scores["scene"]) == {"a"}
     assert json.loads((tmp_path / "summary.json").read_text())["unanswered"] == {"b": reason}

@@ -7,8 +7,9 @@ import pandas as pd
 import pytest
 from rich.console import Console
 
-from dsr.metrics.catalogue import METRICS
-from dsr.report.tables import RECREATED, in_paper_units, published, published_row, score_table
+from dsr.metrics.catalogue import KNOWN_FORMATS
+from dsr.metrics.formats import in_tables
+from dsr.report.tables import RECREATED, in_shown_units, published, published_row, score_table
 
 RAW = {
     "RMSE_d": 0.0704,
@@ -54,7 +55,7 @@ def scores(*scenes, raw=RAW, downsampling="box", scale=4):
 
 def text(table, label="Bicubic"):
     console = Console(width=120, file=io.StringIO())
-    console.print(score_table(table, label))
+    console.print(score_table(table, label, KNOWN_FORMATS))
     return console.file.getvalue()
 
 
@@ -65,24 +66,24 @@ def row(printed, first, second):
 
 
 def test_raw_scores_become_millimetres_percents_and_thousandths():
-    table = in_paper_units(scores("lucy"))
-    assert list(table.columns) == list(METRICS)
+    table = in_shown_units(scores("lucy"), KNOWN_FORMATS)
+    assert list(table.columns) == list(in_tables(KNOWN_FORMATS))
     assert table.loc["lucy"].to_dict() == pytest.approx(UNITS)
 
 
 def test_table_shows_the_worst_of_the_four_lights():
-    assert in_paper_units(scores("lucy")).loc["lucy", "DSSIM_v"] == pytest.approx(354)
+    assert in_shown_units(scores("lucy"), KNOWN_FORMATS).loc["lucy", "DSSIM_v"] == pytest.approx(354)
 
 
 def test_empty_variants_are_recognised_after_a_file_was_read_back(tmp_path):
     scores("lucy").to_csv(tmp_path / "scores.csv", index=False)
     again = pd.read_csv(tmp_path / "scores.csv")
-    pd.testing.assert_frame_equal(in_paper_units(again), in_paper_units(scores("lucy")))
+    pd.testing.assert_frame_equal(in_shown_units(again, KNOWN_FORMATS), in_shown_units(scores("lucy"), KNOWN_FORMATS))
 
 
 def test_metric_that_was_not_computed_has_no_column():
     without = {name: value for name, value in RAW.items() if name != "LPIPS_v"}
-    assert "LPIPS_v" not in in_paper_units(scores("lucy", raw=without))
+    assert "LPIPS_v" not in in_shown_units(scores("lucy", raw=without), KNOWN_FORMATS)
     assert "LPIPS_v" not in text(scores("lucy", raw=without))
 
 
@@ -112,7 +113,7 @@ def test_published_values_have_no_duplicate_row():
 
 def test_published_values_equal_the_shared_transcription(shared):
     long = pd.read_csv(shared / "paper" / "tables.csv").set_index(["scene", "method", "scale", "metric"])["value"]
-    ours = published().melt(["scene", "method", "scale"], list(METRICS), "metric").dropna()
+    ours = published().melt(["scene", "method", "scale"], list(in_tables(KNOWN_FORMATS)), "metric").dropna()
     assert len(ours) > 500
     theirs = long.loc[pd.MultiIndex.from_frame(ours[["scene", "method", "scale", "metric"]])]
     pd.testing.assert_series_equal(ours["value"], theirs, check_index=False)

@@ -163,7 +163,7 @@ def test_runs_can_be_chosen_and_unknown_ones_are_refused(make_run, tmp_path):
 def test_scenes_without_a_solution_are_noted(make_run, tmp_path):
     make_run(tmp_path / "a", label="EG", method="eg", scenes=("s",))
     change(tmp_path / "a", "summary.json", unanswered={"t": "t: no edge is closed"})
-    assert load_results([tmp_path]).notes == ("EG at x4 has no answer for t: no edge is closed",)
+    assert load_results([tmp_path]).notes == ("EG at x4 has no solution for t: no edge is closed",)
 
 
 def test_runs_without_any_solution_are_refused_with_the_reason(make_run, tmp_path):
@@ -172,5 +172,5 @@ def test_runs_without_any_solution_are_refused_with_the_reason(make_run, tmp_pat
     with pytest.raises(ValueError, match=r"expected runs with a prediction, found none$"):
         load_results([tmp_path])
     change(tmp_path / "a", "summary.json", unanswered={"s": "s: no edge is closed"})
-    with pytest.raises(ValueError, match=r"found none; EG at x4 has no answer for s: no edge is closed$"):
+    with pytest.raises(ValueError, match=r"found none; EG at x4 has no solution for s: no edge is closed$"):
         load_results([tmp_path])

@@ -13,12 +13,11 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import torch
-import torchmetrics
 from omegaconf import DictConfig
 from rich.console import Console
 
 from dsr.app import run_directory as rundir
-from dsr.app.perceptual import perceptual_network
+from dsr.app.metrics import check_metrics, chosen_metrics, metric_collection
 from dsr.app.progress import Display, prepare
 from dsr.app.schema import EvalConfig, given_keys, plain_config
 from dsr.app.training_runs import studies_of_run
@@ -26,9 +25,7 @@ from dsr.data.base import SceneSource
 from dsr.evaluation.predict import Evaluation, Outcome, StalePredictionError, predict, score
 from dsr.methods.dip.upsampler import WORKSPACE
 from dsr.methods.networks.trained import packaged_names, packaged_weights
-from dsr.metrics.catalogue import catalogue
-from dsr.metrics.classes import visual_metrics
-from dsr.metrics.lpips import LPIPS
+from dsr.metrics.formats import Formats
 from dsr.report.dashboard import save_dashboard
 from dsr.report.tables import score_table
 from dsr.sample import DepthSample
@@ -74,8 +71,7 @@ def _evaluate(plain: dict[str, Any], source: SceneSource | None) -> pd.DataFrame
     display = Display(console)
     given = {"device": device, "weights": weights, "workspace": folder, "display": display}
     study = _study(settings, identity, given, source)
-    if settings.metrics.lpips and settings.metrics.lpips_trunk is not None:
-        perceptual_network(settings.metrics.lpips_trunk)  # a wrong one is refused before anything is written
+    check_metrics(settings.metrics)
     rundir.claim(folder, plain, identity)
     if settings.overwrite:
         shutil.rmtree(folder / WORKSPACE, ignore_errors=True)
@@ -85,10 +81,12 @@ def _evaluate(plain: dict[str, Any], source: SceneSource | None) -> pd.DataFrame
         outcome = predict(study, folder, display, steps=display.parts, overwrite=settings.overwrite)
     except StalePredictionError as error:
         raise ConfigError(str(error)) from error
-    illustrate = functools.partial(_illustrate, folder, study.label)
-    scores = score(study, folder, catalogue(_perceptual(settings, device)), outcome, display, illustrate)
+    metrics = chosen_metrics(settings.metrics, device)
+    formats = {metric.name: metric.format for metric in metrics}
+    illustrate = functools.partial(_illustrate, folder, study.label, formats)
+    scores = score(study, folder, metrics, outcome, display, illustrate)
     save_dashboard(folder)
-    _report(console, folder, scores, study.label, outcome)
+    _report(console, folder, scores, study.label, outcome, formats)
     if outcome.failures:
         total = len(study.source.scenes())
         rest = f"; the others are in {folder}" if len(outcome.failures) < total else ""
@@ -126,7 +124,7 @@ def _study(
             "precision": settings.precision,
             "seed": settings.seed,
             "downsampling": downsampling.assumed_model(),
-            "metrics": functools.partial(_metrics, settings, given["device"]),
+            "metrics": functools.partial(metric_collection, settings.metrics, given["device"]),
         },
     )
     return Evaluation(
@@ -156,17 +154,6 @@ def _precision(settings: EvalConfig, device: torch.device) -> str:
     if settings.precision != "auto":
         return settings.precision
     return fast_precision(device) if trait("method", settings.method, "optimises") else "float32"
-
-
-def _perceptual(settings: EvalConfig, device: torch.device) -> LPIPS | None:
-    """Return the LPIPS network; None where it is not wanted, or not to be had."""
-    network = perceptual_network(settings.metrics.lpips_trunk) if settings.metrics.lpips else None
-    return None if network is None else network.to(device)
-
-
-def _metrics(settings: EvalConfig, device: torch.device) -> torchmetrics.MetricCollection:
-    """Return the metrics of a validation pass."""
-    return visual_metrics(_perceptual(settings, device))
 
 
 def _problem_name(settings: EvalConfig) -> str:
@@ -223,15 +210,17 @@ def _seed(seed: int) -> None:
 
 
 def _illustrate(
-    folder: Path, label: str, sample: DepthSample, depth: torch.Tensor, scores: Mapping[str, float]
+    folder: Path, label: str, formats: Formats, sample: DepthSample, depth: torch.Tensor, scores: Mapping[str, float]
 ) -> None:
-    save_picture(folder / "pictures" / f"{sample.scene}.png", sample, depth, scores, label)
+    save_picture(folder / "pictures" / f"{sample.scene}.png", sample, depth, scores, label, formats)
 
 
-def _report(console: Console, folder: Path, scores: pd.DataFrame, label: str, outcome: Outcome) -> None:
+def _report(
+    console: Console, folder: Path, scores: pd.DataFrame, label: str, outcome: Outcome, formats: Formats
+) -> None:
     """Print the table, and what a reader should know."""
     if not scores.empty:
-        console.print(score_table(scores, label))
+        console.print(score_table(scores, label, formats))
     told: dict[str, list[str]] = {}
     for scene, notes in outcome.notes.items():
         told.setdefault("; ".join(notes), []).append(scene)
@@ -240,8 +229,8 @@ def _report(console: Console, folder: Path, scores: pd.DataFrame, label: str, ou
     if outcome.unscored:
         unscored = ", ".join(outcome.unscored)
         show(console, f"note: no truth to score against: {unscored}")
-    for message in outcome.unanswered.values():
-        show(console, f"no answer: {message}")
+    for message in outcome.unsolved.values():
+        show(console, f"no solution: {message}")
     if outcome.reused:
         console.print(f"predictions re-used: {len(outcome.reused)} (overwrite=true makes them anew)", highlight=False)
     show(console, f"results: {folder}")

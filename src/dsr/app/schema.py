@@ -24,6 +24,7 @@ class MetricsConfig:
 
     lpips: bool = True
     lpips_trunk: str | None = None
+    extra: list[str] = field(default_factory=list)
 
 
 class Checked:

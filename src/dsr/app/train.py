@@ -15,7 +15,7 @@ from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 
 from dsr.app import run_directory as rundir
-from dsr.app.perceptual import perceptual_network
+from dsr.app.metrics import check_metrics, metric_collection
 from dsr.app.progress import Display, prepare
 from dsr.app.schema import TrainConfig, given_keys, plain_config
 from dsr.app.trainer import make_trainer, seconds_per_step
@@ -23,7 +23,6 @@ from dsr.app.training_runs import WEIGHTS, common, keyed, read_config, training_
 from dsr.methods.networks.base import DisparityNetwork
 from dsr.methods.networks.trained import NETWORKS
 from dsr.methods.networks.weight_files import load_network, save_network
-from dsr.metrics.classes import visual_metrics
 from dsr.training.data_module import PatchData
 from dsr.training.module import Schedule, SuperResolution
 from dsr.training.objective import Objective, balance_weight
@@ -67,14 +66,14 @@ def train(config: DictConfig) -> Path:
     lightning.seed_everything(settings.seed, workers=True, verbose=False)
     net = _network(settings)
     data = training_data(settings)
-    perceptual = perceptual_network(settings.metrics.lpips_trunk) if settings.metrics.lpips else None
+    check_metrics(settings.metrics)
     identity = rundir.identity_of(plain, None, device)
     folder = Path(settings.output_dir or rundir.default_directory("train", plain, identity)).expanduser()
     weights, last = folder / WEIGHTS, folder / "checkpoints" / "last.ckpt"
     if weights.exists() and not settings.overwrite:
         raise ConfigError(f"output_dir: {weights} is trained already; overwrite=true trains it anew")
     _prepare(console, data)
-    metrics = functools.partial(visual_metrics, None if perceptual is None else perceptual.to(device))
+    metrics = functools.partial(metric_collection, settings.metrics, device)
     module = _module(settings, net, data, metrics)
     tolerated = ("code", "device") if "resume" in given_keys() else ()
     for key in rundir.claim(folder, plain, identity, tolerated):

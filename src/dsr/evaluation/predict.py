@@ -4,7 +4,7 @@ A prediction is ``predictions/SCENE.npz``: ``depth`` (H, W) in metres, NaN in ho
 it came from; and the ``seconds`` that it took. Beside it lies the problem that it answers, see
 :mod:`dsr.evaluation.store`, and ``iterations/SCENE.csv``, how the iteration went, of a method that iterates. A
 prediction whose stored config is the wanted one is not made again, so an interrupted run goes on where it stopped. One
-scene that fails, or that the method has no answer for, does not keep the others from their results.
+scene that fails, or that the method has no solution for, does not keep the others from their results.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import re
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -29,7 +29,8 @@ from dsr.degradation.holes import Holes
 from dsr.degradation.noise import Noise
 from dsr.evaluation.store import iterations_path, load_prediction, prediction_path, save_scene, scene_path
 from dsr.methods.base import Iterative, NoSolutionError, Upsampler
-from dsr.metrics.catalogue import WORST, Metric, score_image
+from dsr.metrics.catalogue import Metric, score_image
+from dsr.metrics.formats import HEADLINES
 from dsr.sample import DepthSample
 from dsr.utils.console import one_line
 from dsr.utils.files import read_arrays, replacing, write_text
@@ -116,7 +117,7 @@ class Outcome:
     Args:
         made, reused: scenes whose prediction was computed, or found on disk.
         failures: scene and what was wrong, one line each.
-        unanswered: scene and why the method has no answer for it, one line each.
+        unsolved: scene and why the method has no solution for it, one line each.
         notes: scene and what a reader of the scores should know.
         seconds: computing time per scene.
         unscored: scenes without a high-resolution depth map to compare with.
@@ -126,7 +127,7 @@ class Outcome:
     made: list[str] = field(default_factory=list)
     reused: list[str] = field(default_factory=list)
     failures: dict[str, str] = field(default_factory=dict)
-    unanswered: dict[str, str] = field(default_factory=dict)
+    unsolved: dict[str, str] = field(default_factory=dict)
     notes: dict[str, list[str]] = field(default_factory=dict)
     seconds: dict[str, float] = field(default_factory=dict)
     unscored: list[str] = field(default_factory=list)
@@ -167,7 +168,7 @@ def predict(
         except StalePredictionError:
             raise
         except NoSolutionError as error:
-            outcome.unanswered[scene] = _failure(scene, error)
+            outcome.unsolved[scene] = _failure(scene, error)
             path.unlink(missing_ok=True)
         except (ValueError, OSError) as error:
             outcome.failures[scene] = _failure(scene, error)
@@ -197,7 +198,7 @@ def score(
 
     """
     rows: list[dict[str, Any]] = []
-    without = outcome.failures.keys() | outcome.unanswered.keys()
+    without = outcome.failures.keys() | outcome.unsolved.keys()
     for scene in progress([name for name in study.source.scenes() if name not in without], "score"):
         try:
             sample = study.sample(scene)
@@ -209,19 +210,19 @@ def score(
                 outcome.unscored.append(scene)
             if sample.notes:
                 outcome.notes[scene] = list(sample.notes)
-            illustrate(sample, depth, {row["metric"]: row["value"] for row in new if row["variant"] in ("", WORST)})
+            illustrate(sample, depth, {row["metric"]: row["value"] for row in new if row["variant"] in HEADLINES})
         except (ValueError, OSError) as error:
             outcome.failures[scene] = _failure(scene, error)
     scores = pd.DataFrame(rows, columns=list(SCORE_COLUMNS))
     with replacing(folder / "scores.csv") as temporary:
         scores.to_csv(temporary, index=False)
-    write_text(folder / "summary.json", json.dumps(summary(study, scores, outcome), indent=1) + "\n")
+    write_text(folder / "summary.json", json.dumps(summary(study, scores, outcome, metrics), indent=1) + "\n")
     return scores
 
 
-def summary(study: Evaluation, scores: pd.DataFrame, outcome: Outcome) -> dict[str, Any]:
+def summary(study: Evaluation, scores: pd.DataFrame, outcome: Outcome, metrics: Sequence[Metric]) -> dict[str, Any]:
     """Return means over the scenes of each metric (worst of four lights where it has lights) and how the run went."""
-    worst = scores[scores["variant"].isin(["", WORST])]
+    worst = scores[scores["variant"].isin(HEADLINES)]
     means = worst.groupby("metric", sort=False)["value"].mean()
     return {
         "dataset": study.source.name,
@@ -238,7 +239,8 @@ def summary(study: Evaluation, scores: pd.DataFrame, outcome: Outcome) -> dict[s
         "without_truth": outcome.unscored,
         "notes": outcome.notes,
         "failures": outcome.failures,
-        "unanswered": outcome.unanswered,
+        "unanswered": outcome.unsolved,
+        "metrics": {metric.name: asdict(metric.format) for metric in metrics},
     }
 
 

@@ -15,6 +15,8 @@ import pandas as pd
 from torch import Tensor
 
 from dsr.evaluation.store import StoredScene, load_prediction, load_scene, prediction_path, scene_path
+from dsr.metrics.catalogue import KNOWN_FORMATS
+from dsr.metrics.formats import MetricFormat, complete_formats, in_tables
 
 METHOD_ORDER = (
     "Nearest", "Bilinear", "Bicubic", "GF", "JBU", "FGS", "Diffusion", "TGV",
@@ -52,7 +54,8 @@ class Run:
         settings: the resolved configuration.
         versions: of packages, Python and the project.
         scenes: those that have a prediction.
-        unanswered: scenes that the method has no answer for, and why.
+        unsolved: scenes that the method has no solution for, and why.
+        formats: of its metrics, as far as the run keeps them.
 
     """
 
@@ -68,7 +71,8 @@ class Run:
     settings: Mapping[str, Any]
     versions: Mapping[str, Any]
     scenes: tuple[str, ...]
-    unanswered: Mapping[str, str] = field(default_factory=dict)
+    unsolved: Mapping[str, str] = field(default_factory=dict)
+    formats: Mapping[str, MetricFormat] = field(default_factory=dict)
 
     @property
     def problem(self) -> BenchmarkSetting:
@@ -117,6 +121,11 @@ class Results:
         parts = [run.scores.assign(label=run.label, run=str(run.folder)) for run in self.runs]
         return pd.concat(parts, ignore_index=True)
 
+    @property
+    def formats(self) -> dict[str, MetricFormat]:
+        """See :func:`formats_of`."""
+        return formats_of(self.runs)
+
     def methods(self) -> list[str]:
         """Return the labels of the methods, in order."""
         return sorted({run.label for run in self.runs}, key=_method_key)
@@ -149,6 +158,15 @@ class Results:
         return Results(runs, self.notes)
 
 
+def formats_of(runs: Sequence[Run]) -> dict[str, MetricFormat]:
+    """Return the formats of the metrics that tables of some runs show, in the order of the columns.
+
+    Metrics that neither this installation nor a run describes show their raw values under their own names.
+    """
+    names = dict.fromkeys(str(name) for run in runs for name in run.scores["metric"].unique())
+    return in_tables(complete_formats(names, KNOWN_FORMATS, *(run.formats for run in runs)))
+
+
 def one_per_method(runs: Sequence[Run]) -> tuple[Run, ...]:
     """Return the run of each label with the lowest seed, in the order of the labels."""
     lowest: dict[str, Run] = {}
@@ -179,17 +197,17 @@ def load_results(paths: Sequence[Path]) -> Results:
         detail = f"; {notes[0]}" if notes else ""
         raise ValueError(f"{where}: expected runs of eval.py (directories with {_SCORES}), found none{detail}")
     runs = _distinguished(runs)
-    unanswered = [
-        f"{run.label} at x{run.scale} has no answer for {message}"
+    unsolved = [
+        f"{run.label} at x{run.scale} has no solution for {message}"
         for run in runs
-        for message in run.unanswered.values()
+        for message in run.unsolved.values()
     ]
     runs, older = _newest(runs)
     if not runs:
-        reason = f"; {unanswered[0]}" if unanswered else ""
+        reason = f"; {unsolved[0]}" if unsolved else ""
         raise ValueError(f"{', '.join(map(str, paths))}: expected runs with a prediction, found none{reason}")
     runs.sort(key=lambda run: (_problem_key(run.problem), _method_key(run.label), run.seed))
-    return Results(tuple(runs), (*notes, *older, *unanswered))
+    return Results(tuple(runs), (*notes, *older, *unsolved))
 
 
 def _folders(paths: Sequence[Path]) -> Iterator[Path]:
@@ -219,14 +237,15 @@ def read_run(folder: Path) -> Run:
         label = str(summary.get("label") or settings.get("method", {}).get("label") or method)
         dataset = str(scores["dataset"].iloc[0]) if len(scores) else str(summary["dataset"])
         seconds = {str(scene): float(value) for scene, value in summary["seconds"].items()}
-        unanswered = {str(scene): str(why) for scene, why in summary.get("unanswered", {}).items()}
+        unsolved = {str(scene): str(why) for scene, why in summary.get("unanswered", {}).items()}
+        formats = {str(name): MetricFormat(**content) for name, content in summary.get("metrics", {}).items()}
         scale, seed, downsampling = int(summary["scale"]), int(summary["seed"]), str(summary["downsampling"])
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise ValueError(f"{folder / _SUMMARY}: expected the summary of a run, {error!r} is missing or wrong") from None
     scenes = tuple(scene for scene in seconds if prediction_path(folder, scene).is_file())
     scores = scores[scores["scene"].isin(scenes)]
     about = (folder, dataset, scale, downsampling, seed, method, label)
-    return Run(*about, scores, seconds, settings, versions, scenes, unanswered)
+    return Run(*about, scores, seconds, settings, versions, scenes, unsolved, formats)
 
 
 def _read_json(path: Path) -> dict[str, Any]:

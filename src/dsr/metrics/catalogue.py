@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 
 import torch
@@ -11,44 +11,44 @@ from torch import Tensor
 
 from dsr.geometry.shading import LIGHT_NAMES
 from dsr.metrics import functional
+from dsr.metrics.formats import MetricFormat
 from dsr.metrics.functional import SurfacePair
 from dsr.metrics.lpips import LPIPS, MIN_SIZE, lpips_v
 
-WORST = "max"
-VARIANTS = (*LIGHT_NAMES, WORST, "avg")
-METRICS: dict[str, tuple[str, str, float, int]] = {
-    "RMSE_d": ("RMSE_d", "mm", 1e3, 1),
-    "BadPix_d_5cm": ("BadPix_d", "5 cm, %", 1e2, 2),
-    "BadPix_v_5": ("BadPix_v", "5, %", 1e2, 1),
-    "DSSIM_v": ("DSSIM_v", "1/1000", 1e3, 0),
-    "LPIPS_v": ("LPIPS_v", "1/1000", 1e3, 0),
-    "Bumpiness_d": ("Bump_d", "", 1.0, 2),
-    "RMSE_v": ("RMSE_v", "1/1000", 1e3, 0),
-}
-"""The columns of the paper's tables: heading, unit, factor from raw units, digits after the point."""
+WORST, AVERAGE = "max", "avg"
+VARIANTS = (*LIGHT_NAMES, WORST, AVERAGE)
 
 
 @dataclass(frozen=True)
 class Metric:
-    """One metric of the paper.
+    """A metric: how it is computed and how it is shown.
 
     Args:
         name: as in ``scores.csv``.
         function: from a pair to (B,), or to (B, 4) where ``per_light``.
-        mask: from a pair to the (B, 1, H', W') pixels that it rests on.
+        mask: from a pair to the (B, 1, H', W') pixels that the metric uses.
+        format: how tables and figures show it.
         per_light: whether there is a value for each of the lights e1..e4.
         min_size: smallest height and width in pixels that it is defined for.
+        perceptual: whether the function takes an LPIPS network, ``network``.
 
     """
 
     name: str
-    function: Callable[[SurfacePair], Tensor]
+    function: Callable[..., Tensor]
     mask: Callable[[SurfacePair], Tensor]
+    format: MetricFormat
     per_light: bool = False
     min_size: int = 2
+    perceptual: bool = False
+
+    @property
+    def worst(self) -> str:
+        """The variant that is the worst of four lights: the largest value, the smallest where higher is better."""
+        return "min" if self.format.higher_is_better else WORST
 
     def variants(self, pair: SurfacePair) -> dict[str, Tensor]:
-        """Return the value per image, (B,), by variant: e1..e4, their maximum and average, or just "".
+        """Return the value per image, (B,), by variant: e1..e4, the worst of them and their average, or just "".
 
         NaN for images below the metric's smallest size.
         """
@@ -56,14 +56,23 @@ class Metric:
         if size < self.min_size:
             values = pair.target.new_full((count, len(LIGHT_NAMES)) if self.per_light else (count,), torch.nan)
         else:
-            values = self.function(pair)
+            values = self._values(pair)
         if not self.per_light:
             return {"": values}
         by_light = dict(zip(LIGHT_NAMES, values.unbind(1), strict=True))
-        return {**by_light, WORST: values.amax(dim=1), "avg": values.mean(dim=1)}
+        worst = values.amin(dim=1) if self.format.higher_is_better else values.amax(dim=1)
+        return {**by_light, self.worst: worst, AVERAGE: values.mean(dim=1)}
 
-    def share(self, pair: SurfacePair) -> Tensor:
-        """Return the share of the pixels that the metric would use in a complete map and that are known, (B,)."""
+    def _values(self, pair: SurfacePair) -> Tensor:
+        """Return the function's values, of the right shape."""
+        values = self.function(pair)
+        expected = (len(pair.target), len(LIGHT_NAMES)) if self.per_light else (len(pair.target),)
+        if tuple(values.shape) != expected:
+            raise ValueError(f"{self.name}: expected values of shape {expected}, got {tuple(values.shape)}")
+        return values
+
+    def valid_fraction(self, pair: SurfacePair) -> Tensor:
+        """Return the valid fraction of the pixels that the metric would use in a complete map, (B,)."""
         if min(pair.target.shape[-2:]) < self.min_size:
             return torch.zeros(len(pair.target), dtype=torch.float64)
         if pair.complete:
@@ -71,11 +80,13 @@ class Metric:
         return self.mask(pair).double().mean(dim=(-3, -2, -1))
 
 
-def _depth_mask(pair: SurfacePair) -> Tensor:
+def depth_mask(pair: SurfacePair) -> Tensor:
+    """Return the pixels with a depth in both maps."""
     return pair.depth_mask
 
 
-def _normal_mask(pair: SurfacePair) -> Tensor:
+def normal_mask(pair: SurfacePair) -> Tensor:
+    """Return the pixels with a normal in both maps."""
     return pair.normal_mask
 
 
@@ -87,32 +98,100 @@ def _bumpiness_mask(pair: SurfacePair) -> Tensor:
     return pair.bumpiness_mask
 
 
-def catalogue(network: LPIPS | None = None) -> tuple[Metric, ...]:
-    """Return the paper's metrics in the order of its tables; LPIPS_v only where there is a network for it."""
-    by_depth = [Metric("RMSE_d", functional.rmse_d, _depth_mask, min_size=1)]
-    for percent in (1, 5, 10):
-        bad = partial(functional.bad_pix_d, threshold=percent / 100)
-        by_depth.append(Metric(f"BadPix_d_{percent}cm", bad, _depth_mask, min_size=1))
-    for percent in (1, 5, 10):
-        bad = partial(functional.bad_pix_d, threshold=percent / 100, relative=True)
-        by_depth.append(Metric(f"BadPix_d_{percent}pct", bad, _depth_mask, min_size=1))
-    by_look = [
-        Metric(f"BadPix_v_{level}", partial(functional.bad_pix_v, threshold=level), _normal_mask, per_light=True)
-        for level in (1, 5, 10)
-    ]
-    by_look.append(Metric("DSSIM_v", functional.dssim_v, _ssim_mask, per_light=True, min_size=functional.SSIM_WINDOW))
-    if network is not None:
-        by_look.append(
-            Metric("LPIPS_v", partial(lpips_v, network=network), _normal_mask, per_light=True, min_size=MIN_SIZE)
-        )
-    by_look.append(Metric("RMSE_v", functional.rmse_v, _normal_mask))
-    by_look.append(Metric("RMSE_v1", functional.rmse_v1, _normal_mask, per_light=True))
-    return (*by_depth, *by_look, Metric("Bumpiness_d", functional.bumpiness_d, _bumpiness_mask, min_size=3))
+def _bad_pix_d(percent: int, position: int | None = None) -> Metric:
+    function = partial(functional.bad_pix_d, threshold=percent / 100)
+    shown = MetricFormat("BadPix_d", f"{percent} cm, %", 1e2, 2, position=position)
+    return Metric(f"BadPix_d_{percent}cm", function, depth_mask, shown, min_size=1)
+
+
+def _bad_pix_d_relative(percent: int) -> Metric:
+    function = partial(functional.bad_pix_d, threshold=percent / 100, relative=True)
+    shown = MetricFormat("BadPix_d", f"{percent} % of depth, %", 1e2, 2, position=None)
+    return Metric(f"BadPix_d_{percent}pct", function, depth_mask, shown, min_size=1)
+
+
+def _bad_pix_v(level: int, position: int | None = None) -> Metric:
+    function = partial(functional.bad_pix_v, threshold=level)
+    shown = MetricFormat("BadPix_v", f"{level}, %", 1e2, 1, position=position)
+    return Metric(f"BadPix_v_{level}", function, normal_mask, shown, per_light=True)
+
+
+METRICS: tuple[Metric, ...] = (
+    Metric("RMSE_d", functional.rmse_d, depth_mask, MetricFormat("RMSE_d", "mm", 1e3, 1, position=1), min_size=1),
+    _bad_pix_d(1),
+    _bad_pix_d(5, position=2),
+    _bad_pix_d(10),
+    *map(_bad_pix_d_relative, (1, 5, 10)),
+    _bad_pix_v(1),
+    _bad_pix_v(5, position=3),
+    _bad_pix_v(10),
+    Metric(
+        "DSSIM_v",
+        functional.dssim_v,
+        _ssim_mask,
+        MetricFormat("DSSIM_v", "1/1000", 1e3, 0, position=4),
+        per_light=True,
+        min_size=functional.SSIM_WINDOW,
+    ),
+    Metric(
+        "LPIPS_v",
+        lpips_v,
+        normal_mask,
+        MetricFormat("LPIPS_v", "1/1000", 1e3, 0, position=5),
+        per_light=True,
+        min_size=MIN_SIZE,
+        perceptual=True,
+    ),
+    Metric("RMSE_v", functional.rmse_v, normal_mask, MetricFormat("RMSE_v", "1/1000", 1e3, 0, position=7)),
+    Metric(
+        "RMSE_v1",
+        functional.rmse_v1,
+        normal_mask,
+        MetricFormat("RMSE_v1", "1/1000", 1e3, 0, position=None),
+        per_light=True,
+    ),
+    Metric(
+        "Bumpiness_d",
+        functional.bumpiness_d,
+        _bumpiness_mask,
+        MetricFormat("Bump_d", digits=2, position=6),
+        min_size=3,
+    ),
+)
+"""The metrics of the paper, in the order of ``scores.csv``; those with a position are the columns of its tables."""
+KNOWN_FORMATS = {metric.name: metric.format for metric in METRICS}
+
+
+def catalogue(network: LPIPS | None = None, extra: Sequence[Metric] = ()) -> tuple[Metric, ...]:
+    """Return the metrics that can be computed: the paper's, then others.
+
+    Args:
+        network: for perceptual metrics; None leaves them out.
+        extra: metrics beside the paper's.
+
+    Raises:
+        ValueError: two metrics have one name.
+
+    """
+    names = [metric.name for metric in (*METRICS, *extra)]
+    for name in names:
+        if names.count(name) > 1:
+            raise ValueError(f"{name}: expected metrics of different names, got two of this one")
+    return tuple(_with_network((*METRICS, *extra), network))
+
+
+def _with_network(metrics: Iterable[Metric], network: LPIPS | None) -> Iterator[Metric]:
+    """Yield the metrics with the network as an argument where they need one; without one leave these out."""
+    for metric in metrics:
+        if not metric.perceptual:
+            yield metric
+        elif network is not None:
+            yield replace(metric, function=partial(metric.function, network=network), perceptual=False)
 
 
 @dataclass(frozen=True)
 class Score:
-    """One row of ``scores.csv``: a metric's value for one image, and the share of its pixels that it rests on."""
+    """One row of ``scores.csv``: a metric's value for one image, and the valid fraction of the pixels that it uses."""
 
     metric: str
     variant: str
@@ -125,10 +204,10 @@ def score_image(prediction: Tensor, target: Tensor, rays: Tensor, metrics: tuple
     """Score one predicted depth map.
 
     What the method does not cover is cut off first: rows and columns at the border without a single predicted pixel
-    (MSG's published networks leave out the last of each). The shares count against the whole map all the same.
+    (MSG's published networks leave out the last of each). The fractions still count against the whole map.
 
     Args:
-        prediction: (1, H, W) orthogonal depth in metres, NaN where unknown.
+        prediction: (1, H, W) orthogonal depth in metres, NaN where missing.
         target: likewise.
         rays: (3, H, W), see :meth:`dsr.geometry.camera.Camera.rays`.
         metrics: from :func:`catalogue`.
@@ -142,16 +221,16 @@ def score_image(prediction: Tensor, target: Tensor, rays: Tensor, metrics: tuple
     window = (..., rows, columns)
     pair = SurfacePair(prediction[window][None], target[window][None], rays[window][None], image_dtype=torch.float32)
     for metric in metrics:
-        share = metric.share(pair).item() * kept
+        valid = metric.valid_fraction(pair).item() * kept
         for variant, value in metric.variants(pair).items():
-            yield Score(metric.name, variant, value.item(), share)
+            yield Score(metric.name, variant, value.item(), valid)
 
 
 def _covered(prediction: Tensor) -> tuple[slice, slice]:
     """Return the rows and columns of the smallest window with all predicted pixels; the whole map if there are none."""
-    known = prediction.isfinite()[0]
-    spans = []
+    valid = prediction.isfinite()[0]
+    ranges = []
     for axis in (1, 0):
-        hits = known.any(dim=axis).nonzero()
-        spans.append(slice(int(hits[0]), int(hits[-1]) + 1) if len(hits) else slice(0, known.shape[1 - axis]))
-    return spans[0], spans[1]
+        hits = valid.any(dim=axis).nonzero()
+        ranges.append(slice(int(hits[0]), int(hits[-1]) + 1) if len(hits) else slice(0, valid.shape[1 - axis]))
+    return ranges[0], ranges[1]

@@ -9,13 +9,14 @@ Masks, normals and renderings are computed once for all the metrics of a collect
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import torch
 import torchmetrics
 from torch import Tensor
 
-from dsr.metrics.catalogue import VARIANTS, WORST, Metric, catalogue
+from dsr.metrics.catalogue import METRICS, VARIANTS, WORST, Metric, catalogue
 from dsr.metrics.functional import SurfacePair
 from dsr.metrics.lpips import LPIPS
 
@@ -23,12 +24,13 @@ from dsr.metrics.lpips import LPIPS
 class PerImageMean(torchmetrics.Metric):
     """Mean over images of one metric.
 
-    An image whose target has no known pixel is left out. One whose prediction leaves nothing to score is not: the mean
-    is NaN then, lest a method that fails looked better than one that does not.
+    An image whose target has no valid pixel is left out. An image whose prediction leaves nothing to score is not: the
+    mean is NaN then, so that a method that fails never looks better than one that does not.
 
     Args:
         metric: from :func:`dsr.metrics.catalogue.catalogue`.
-        variant: ``max`` (worst of four lights), ``avg`` or one of e1..e4; without effect on metrics without lights.
+        variant: ``max`` (worst of four lights, the smallest value where higher is better), ``avg`` or one of e1..e4;
+            without effect on metrics without lights.
         **settings: as for every torchmetrics class.
 
     Raises:
@@ -36,7 +38,6 @@ class PerImageMean(torchmetrics.Metric):
 
     """
 
-    higher_is_better = False
     is_differentiable = False
     full_state_update = False
     total: Tensor
@@ -47,9 +48,15 @@ class PerImageMean(torchmetrics.Metric):
         if variant not in VARIANTS:
             raise ValueError(f"variant: expected one of {', '.join(VARIANTS)}, got {variant!r}")
         self._metric = metric
-        self._variant = variant if metric.per_light else ""
+        named = metric.worst if variant == WORST else variant
+        self._variant = named if metric.per_light else ""
         self.add_state("total", torch.zeros((), dtype=torch.float64), dist_reduce_fx="sum")
         self.add_state("count", torch.zeros((), dtype=torch.float64), dist_reduce_fx="sum")
+
+    @property
+    def higher_is_better(self) -> bool:  # type: ignore[override]  # torchmetrics has a constant per class
+        """Whether larger values are better."""
+        return self._metric.format.higher_is_better
 
     @torch.no_grad()
     def update(self, pair: SurfacePair) -> None:
@@ -65,7 +72,7 @@ class PerImageMean(torchmetrics.Metric):
 
 
 def _named(name: str) -> Metric:
-    return next(metric for metric in catalogue() if metric.name == name)
+    return next(metric for metric in METRICS if metric.name == name)
 
 
 def _with_threshold(name: str, threshold: int, unit: str = "") -> Metric:
@@ -73,7 +80,7 @@ def _with_threshold(name: str, threshold: int, unit: str = "") -> Metric:
     try:
         return _named(f"{name}_{threshold}{unit}")
     except StopIteration:
-        choices = ", ".join(metric.name for metric in catalogue() if metric.name.startswith(name))
+        choices = ", ".join(metric.name for metric in METRICS if metric.name.startswith(name))
         raise ValueError(f"threshold: expected one that gives {choices}; got {threshold!r}") from None
 
 
@@ -141,10 +148,18 @@ class BumpinessD(PerImageMean):
         super().__init__(_named("Bumpiness_d"), **settings)
 
 
-def visual_metrics(network: LPIPS | None = None, **settings: Any) -> torchmetrics.MetricCollection:
+def visual_metrics(
+    network: LPIPS | None = None, extra: Sequence[Metric] = (), **settings: Any
+) -> torchmetrics.MetricCollection:
     """Return every metric of the catalogue, worst of four lights, as one collection.
 
-    Compute groups stay off: they would merge metrics that differ in a threshold alone.
+    Compute groups stay off: they would merge metrics that differ only in a threshold.
+
+    Args:
+        network: for perceptual metrics; None leaves them out.
+        extra: metrics beside the paper's.
+        **settings: as for every torchmetrics class.
+
     """
-    metrics: dict[str, Any] = {metric.name: PerImageMean(metric, **settings) for metric in catalogue(network)}
+    metrics: dict[str, Any] = {metric.name: PerImageMean(metric, **settings) for metric in catalogue(network, extra)}
     return torchmetrics.MetricCollection(metrics, compute_groups=False)

@@ -6,7 +6,7 @@ above, densities per method on it.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,7 @@ from matplotlib.lines import Line2D
 from scipy.stats import gaussian_kde
 
 from dsr.evaluation.results import Results
-from dsr.metrics.catalogue import METRICS
+from dsr.metrics.formats import Formats
 from dsr.report.correlations import DEPTH_LIMIT, REFERENCE, correlate, metric_matrix, pairs, with_reference
 from dsr.viz.palette import method_colours
 from dsr.viz.panels import write_figure
@@ -57,7 +57,7 @@ def save_scatter_matrix(folder: Path, results: Results) -> list[Path]:
     labels = [label for label in results.methods() if label in matrix.index.get_level_values("label")]
     ranking = with_reference(matrix)
     with mpl.rc_context(_STYLE):
-        figures = {"scatter_matrix": scatter_matrix(matrix, labels)}
+        figures = {"scatter_matrix": scatter_matrix(matrix, labels, results.formats)}
         if len(ranking):
             figures["with_lpips"] = _ranking(ranking, len(matrix))
         paths = []
@@ -68,17 +68,18 @@ def save_scatter_matrix(folder: Path, results: Results) -> list[Path]:
     return paths
 
 
-def scatter_matrix(matrix: pd.DataFrame, labels: list[str]) -> Figure:
+def scatter_matrix(matrix: pd.DataFrame, labels: list[str], formats: Formats) -> Figure:
     """Return the figure.
 
     Args:
         matrix: of :func:`dsr.report.correlations.metric_matrix`.
         labels: the methods, in the legend's order.
+        formats: of the metrics to show, in order.
 
     """
-    names = [name for name in METRICS if name in matrix and name != REFERENCE]
+    names = [name for name in formats if name in matrix and name != REFERENCE]
     names += [REFERENCE] if REFERENCE in matrix else []
-    values = matrix[names] * [METRICS[name][2] for name in names]
+    values = matrix[names] * [formats[name].factor for name in names]
     method = matrix.index.get_level_values("label").to_numpy()
     colours = method_colours(labels)
     size = max(len(names), 2) * _PANEL
@@ -102,7 +103,11 @@ def scatter_matrix(matrix: pd.DataFrame, labels: list[str]) -> Figure:
                 _coefficients(axis, pearson, spearman, "" if count == len(matrix) else f"n = {count:.0f}")
             if REFERENCE in (vertical, across):
                 _highlight(axis, lit=row >= column)
-            _label(axis, row, column, vertical, across, len(names))
+            _label(axis, row, column, len(names))
+            if row == len(names) - 1:
+                _name_axis(axis.set_xlabel, across, formats)
+            if column == 0:
+                _name_axis(axis.set_ylabel, vertical, formats)
     _head(figure, len(matrix), colours, has_reference=REFERENCE in names)
     return figure
 
@@ -175,18 +180,14 @@ def _coefficients(axis: Axes, pearson: float, spearman: float, count: str) -> No
     axis.text(0.5, 0.09, count, ha="center", va="center", fontsize=6, transform=axis.transAxes)
 
 
-def _label(axis: Axes, row: int, column: int, vertical: str, across: str, count: int) -> None:
-    """Write the metrics' names and numbers at the outer panels alone."""
+def _label(axis: Axes, row: int, column: int, count: int) -> None:
+    """Write numbers at the outer panels alone."""
     axis.tick_params(length=2, width=0.5, labelsize=6, pad=1.5)
     axis.locator_params(nbins=4)
     if row < count - 1:
         axis.set_xticklabels([])
-    else:
-        axis.set_xlabel(_name(across), fontweight="bold" if across == REFERENCE else "normal", parse_math=False)
     if column > 0 or row == 0:
         axis.set_yticklabels([])
-    if column == 0:
-        axis.set_ylabel(_name(vertical), fontweight="bold" if vertical == REFERENCE else "normal", parse_math=False)
     if row == column:
         axis.set_yticks([])
     if row < column:
@@ -195,9 +196,9 @@ def _label(axis: Axes, row: int, column: int, vertical: str, across: str, count:
     axis.yaxis.set_label_coords(-0.24, 0.5)
 
 
-def _name(metric: str) -> str:
-    heading, unit, *_ = METRICS[metric]
-    return f"{heading} ({unit})" if unit else heading
+def _name_axis(write: Callable[..., object], metric: str, formats: Formats) -> None:
+    """Write a metric's name beside an axis, the reference's in bold."""
+    write(formats[metric].title, fontweight="bold" if metric == REFERENCE else "normal", parse_math=False)
 
 
 def _head(figure: Figure, count: int, colours: Mapping[str, str], *, has_reference: bool) -> None:

@@ -13,6 +13,7 @@ import numpy as np
 import pandas as pd
 
 from dsr.evaluation.results import Results
+from dsr.metrics.formats import HEADLINES
 from dsr.report.markup import MISSING, aligned, escaped
 from dsr.utils.files import replacing, write_text
 
@@ -40,7 +41,7 @@ def metric_matrix(results: Results) -> pd.DataFrame:
     """
     scores = pd.concat([run.scores.assign(dataset=run.dataset, label=run.label) for run in results.runs])
     variant = scores["variant"].fillna("")
-    name = scores["metric"].where(variant.isin(["", "max"]), scores["metric"] + "[" + variant + "]")
+    name = scores["metric"].where(variant.isin(HEADLINES), scores["metric"] + "[" + variant + "]")
     scores = scores.assign(name=name, value=scores["value"].where(np.isfinite(scores["value"])))
     scores = scores.drop_duplicates([*_ABOUT, "name"], keep="last")
     matrix = scores.pivot(index=_ABOUT, columns="name", values="value")

@@ -18,10 +18,10 @@ from torch import Tensor
 from torch.utils.tensorboard import SummaryWriter
 from torch.utils.tensorboard.summary import hparams
 
-from dsr.evaluation.results import Run, method_settings, read_run
+from dsr.evaluation.results import Run, formats_of, method_settings, read_run
 from dsr.evaluation.store import StoredScene
 from dsr.geometry.shading import LIGHT_NAMES, render
-from dsr.metrics.catalogue import METRICS
+from dsr.metrics.formats import HEADLINES
 from dsr.viz.panels import colours, normals_seen_by, reduced
 
 WORST = "worst of four lights"
@@ -65,20 +65,18 @@ def _write_scores(writer: SummaryWriter, run: Run) -> None:
     scored = list(run.scores["scene"].unique())
     means: dict[str, float] = {}
     scenes: dict[str, list[str]] = {"Depth and normals": [], f"Looks, {WORST}": []}
-    for name, (*_, factor, _digits) in METRICS.items():
+    for name, each in formats_of([run]).items():
         rows = run.scores[run.scores["metric"] == name]
-        if rows.empty:
-            continue
         by_light = bool((rows["variant"] != "").any())
         scenes[f"Looks, {WORST}" if by_light else "Depth and normals"].append(name)
-        headline = rows[rows["variant"].isin(["", "max"])].set_index("scene")["value"] * factor
+        headline = rows[rows["variant"].isin(HEADLINES)].set_index("scene")["value"] * each.factor
         means[name] = float(headline.mean())
         for number, scene in enumerate(scored):
             writer.add_scalar(f"scene/{name}", headline[scene], number)
             writer.add_scalar(f"{name}/{scene}", headline[scene], 0)
         for row in rows[rows["variant"].isin(LIGHT_NAMES)].itertuples():
             light = LIGHT_NAMES.index(row.variant) + 1
-            writer.add_scalar(f"light/{name}/{row.scene}", row.value * factor, light)
+            writer.add_scalar(f"light/{name}/{row.scene}", row.value * each.factor, light)
     for name, value in means.items():
         writer.add_scalar(f"mean/{name}", value, 0)
     layout = {

@@ -18,7 +18,8 @@ from dataclasses import dataclass, replace
 import pandas as pd
 
 from dsr.evaluation.results import Results, Run
-from dsr.metrics.catalogue import METRICS
+from dsr.metrics.catalogue import KNOWN_FORMATS
+from dsr.metrics.formats import AFTER_THE_PAPER, HEADLINES, Formats, describe_directions, in_tables
 from dsr.report.scene_sets import PAPER_SCENES, TITLES, Place, SceneSet, sets_of_dataset, sets_of_summary
 from dsr.report.table_parts import Cell, Column, Group, PaperTable, Row
 from dsr.report.tables import paper_row, published
@@ -32,10 +33,7 @@ _FOLDER = "dsr.data.folder.Folder"
 """What reads people's own folders, in which the paper's own scenes may be."""
 
 
-COLUMNS = (
-    *(Column(key, heading, unit, digits) for key, (heading, unit, _, digits) in METRICS.items()),
-    *(Column(key, heading, "%", 1, higher_is_better=True) for key, heading in USER_COLUMNS.items()),
-)
+_USER = tuple(Column(key, heading, "%", 1, higher_is_better=True) for key, heading in USER_COLUMNS.items())
 
 
 def build_tables(results: Results, study: pd.DataFrame | None = None) -> list[PaperTable]:
@@ -56,8 +54,10 @@ def build_tables(results: Results, study: pd.DataFrame | None = None) -> list[Pa
     tables: list[PaperTable] = []
     for scale, downsampling in dict.fromkeys((run.scale, run.downsampling) for run in results.runs):
         runs = [run for run in results.runs if (run.scale, run.downsampling) == (scale, downsampling)]
+        formats = results.formats
+        values = _values(runs, formats)
         make = _Maker(
-            scale, downsampling, results.methods(), _values(runs), _comparable(runs), _paper_names(runs), study
+            scale, downsampling, results.methods(), values, _comparable(runs), _paper_names(runs), study, formats
         )
         places = list(dict.fromkeys(place for scenes in make.values.values() for place in scenes))
         if not places:
@@ -70,7 +70,7 @@ def build_tables(results: Results, study: pd.DataFrame | None = None) -> list[Pa
 
 
 Values = Mapping[str, Mapping[Place, Mapping[str, Mapping[int, float]]]]
-"""By label, scene, metric and seed: worst of four lights, in the paper's units; what is not finite is not in it."""
+"""By label, scene, metric and seed: worst of four lights, in the units of tables, without values that are not finite."""
 
 
 @dataclass(frozen=True)
@@ -84,6 +84,7 @@ class _Maker:
         comparable: data sets whose scenes may be the paper's.
         names: the paper's name of a method by label.
         study: what people said.
+        formats: of the metrics, in the order of the columns.
 
     """
 
@@ -94,17 +95,29 @@ class _Maker:
     comparable: frozenset[str]
     names: Mapping[str, str]
     study: pd.DataFrame | None
+    formats: Formats
+
+    @property
+    def columns(self) -> tuple[Column, ...]:
+        """All columns: the metrics, then those of the user study."""
+        metrics = (
+            Column(name, each.heading, each.unit, each.digits, higher_is_better=each.higher_is_better)
+            for name, each in self.formats.items()
+        )
+        return (*metrics, *_USER)
 
     def table(self, name: str, title: str, sets: Sequence[SceneSet]) -> PaperTable:
         """Return a table of some sets of scenes."""
         places = {place for each in sets for place in each.places}
         labels = [label for label in self.methods if not places.isdisjoint(self.values.get(label, ()))]
-        groups = tuple(_ranked(self._group(each, labels)) for each in sets)
+        groups = tuple(_ranked(self._group(each, labels), self.columns) for each in sets)
         used = {key for group in groups for row in group.rows for key in row.cells}
-        columns = tuple(column for column in COLUMNS if column.key in used)
+        columns = tuple(column for column in self.columns if column.key in used)
         slug = re.sub(r"[^A-Za-z0-9.-]+", "_", f"{name}_x{self.scale}_{self.downsampling}").strip("._-")
         title = f"{title}, x{self.scale}, {self.downsampling} downsampling"
-        return PaperTable(slug, title, tuple(_notes(groups, columns)), self.scale, self.downsampling, columns, groups)
+        return PaperTable(
+            slug, title, tuple(_notes(groups, columns, self.formats)), self.scale, self.downsampling, columns, groups
+        )
 
     def _group(self, about: SceneSet, labels: Sequence[str]) -> Group:
         """Return the rows of some methods, empty where a method has no value."""
@@ -112,7 +125,7 @@ class _Maker:
         rows = []
         for label in labels:
             scenes = [self.values[label].get(place, {}) for place in about.places]
-            cells = {key: _cell([scene.get(key, {}) for scene in scenes]) for key in METRICS}
+            cells = {key: _cell([scene.get(key, {}) for scene in scenes]) for key in self.formats}
             known = {key: cell for key, cell in cells.items() if cell is not None} | self._user_cells(about, label)
             paper = self._published(about, self.names[label]) if comparable and known else {}
             rows.append(Row(label, known, paper, max([1, *(cell.seeds for cell in known.values())])))
@@ -124,8 +137,8 @@ class _Maker:
     def _published(self, about: SceneSet, method: str) -> dict[str, float]:
         """Return the paper's values by column."""
         row = paper_row(about.published, method, self.scale, self.downsampling)
-        keys = [column.key for column in COLUMNS]
-        return {} if row is None else {key: float(row[key]) for key in keys if pd.notna(row[key])}
+        keys = [column.key for column in self.columns]
+        return {} if row is None else {key: float(row[key]) for key in keys if pd.notna(row.get(key))}
 
     def _user_cells(self, about: SceneSet, label: str) -> dict[str, Cell]:
         """Return what a study's participants said of a method."""
@@ -133,16 +146,16 @@ class _Maker:
         return {key: Cell(mean, None, 0, count, len(about.places), ci) for key, (mean, count, ci) in found.items()}
 
 
-def _values(runs: Sequence[Run]) -> Values:
+def _values(runs: Sequence[Run], formats: Formats) -> Values:
     """Return what the tables are made of."""
     found: dict[str, dict[Place, dict[str, dict[int, float]]]] = {}
     for run in runs:
         scores = run.scores
-        shown = scores[scores["variant"].fillna("").isin(["", "max"]) & scores["metric"].isin(list(METRICS))]
+        shown = scores[scores["variant"].fillna("").isin(HEADLINES) & scores["metric"].isin(list(formats))]
         for scene, metric, value in zip(shown["scene"], shown["metric"], shown["value"], strict=True):
             by_metric = found.setdefault(run.label, {}).setdefault(Place(run.dataset, scene), {})
             if math.isfinite(value):
-                by_metric.setdefault(metric, {})[run.seed] = METRICS[metric][2] * value
+                by_metric.setdefault(metric, {})[run.seed] = formats[metric].factor * value
     return found
 
 
@@ -194,14 +207,14 @@ def _cell(scenes: Sequence[Mapping[int, float]]) -> Cell | None:
     return Cell(mean, spread, max(len(averages), 1), len(known), len(scenes))
 
 
-def _ranked(group: Group) -> Group:
+def _ranked(group: Group, columns: Sequence[Column]) -> Group:
     """Return the group with the best and second best marked.
 
     What is shown is compared, not what is behind it: equal texts share a rank. Averages over fewer scenes than there
     are take no part, nor does a value without another to compare it with.
     """
     ranks: dict[tuple[str, str], int] = {}
-    for column in COLUMNS:
+    for column in columns:
         cells = {row.label: row.cells[column.key] for row in group.rows if column.key in row.cells}
         shown = {label: float(column.text(cell.mean)) for label, cell in cells.items() if cell.complete}
         order = sorted(set(shown.values()), reverse=column.higher_is_better)[:2] if len(shown) > 1 else []
@@ -213,15 +226,20 @@ def _ranked(group: Group) -> Group:
     return replace(group, rows=tuple(rows))
 
 
-def _notes(groups: Sequence[Group], columns: Sequence[Column]) -> Iterator[str]:
+def _notes(groups: Sequence[Group], columns: Sequence[Column], formats: Formats) -> Iterator[str]:
     """Yield what a reader of the table should know."""
     rows = [row for group in groups for row in group.rows]
     cells = [cell for row in rows for cell in row.cells.values()]
     user = any(column.key in USER_COLUMNS for column in columns)
-    yield "Lower is better" + (", of User columns higher." if user else ".")
+    shown = {column.key: formats[column.key] for column in columns if column.key in formats}
+    direction = describe_directions(shown)
+    if user:
+        direction += " and User columns higher" if " of " in direction else ", of User columns higher"
+    yield f"{direction[0].upper()}{direction[1:]}."
     yield "Metrics of renderings are the worst of four lights."
     yield "Of our values as shown the best of each group is bold, the second underlined; equal ones share the mark."
-    missing = [name for name in METRICS if name not in {column.key for column in columns}]
+    of_paper = [name for name, each in in_tables(KNOWN_FORMATS).items() if each.position != AFTER_THE_PAPER]
+    missing = [name for name in of_paper if name not in shown]
     if missing:
         yield f"Not computed: {', '.join(missing)}."
     if any(cell.spread is not None for cell in cells):

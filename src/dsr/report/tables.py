@@ -10,7 +10,7 @@ from rich import box
 from rich.markup import escape
 from rich.table import Table
 
-from dsr.metrics.catalogue import METRICS
+from dsr.metrics.formats import HEADLINES, Formats, describe_directions, in_tables
 
 RECREATED = {
     "cube_high_freq": "Cube, high-frequency texture",
@@ -58,58 +58,60 @@ def paper_row(scene: str, method: str, scale: int, downsampling: str) -> pd.Seri
     return published_row(scene, method, scale) if downsampling == _PUBLISHED_DOWNSAMPLING else None
 
 
-def in_paper_units(scores: pd.DataFrame) -> pd.DataFrame:
-    """Return scene x metric of one run's scores, in the paper's units, worst of four lights.
+def in_shown_units(scores: pd.DataFrame, formats: Formats) -> pd.DataFrame:
+    """Return scene x metric of one run's scores, in the units of tables, worst of four lights.
 
     Args:
         scores: the content of one ``scores.csv``.
+        formats: of its metrics.
 
     """
-    worst = scores[scores["variant"].fillna("").isin(["", "max"])]
+    worst = scores[scores["variant"].fillna("").isin(HEADLINES)]
     wide = worst.pivot_table(index="scene", columns="metric", values="value", sort=False)
-    wide = wide[[name for name in METRICS if name in wide]]
-    return wide.mul(pd.Series({name: METRICS[name][2] for name in wide}))
+    columns = {name: each for name, each in in_tables(formats).items() if name in wide}
+    return wide[list(columns)].mul(pd.Series({name: each.factor for name, each in columns.items()}, dtype=float))
 
 
-def score_table(scores: pd.DataFrame, label: str) -> Table:
+def score_table(scores: pd.DataFrame, label: str, formats: Formats) -> Table:
     """Return the terminal's table of one run: each scene, the paper's values below ours, and our mean.
 
     Args:
         scores: the content of one ``scores.csv``.
         label: the method's name in the paper.
+        formats: of the metrics.
 
     """
-    ours = in_paper_units(scores)
+    ours = in_shown_units(scores, formats)
+    columns = {str(name): formats[str(name)] for name in ours}
     scale, downsampling = int(scores["scale"].iloc[0]), str(scores["downsampling"].iloc[0])
     dataset = str(scores["dataset"].iloc[0])
-    title = f"{label} on {dataset}, x{scale}, {downsampling} downsampling - lower is better"
+    title = f"{label} on {dataset}, x{scale}, {downsampling} downsampling - {describe_directions(columns)}"
     table = Table(title=escape(title), title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
     table.add_column("scene", overflow="fold")
     table.add_column("from")
-    for name in ours:
-        heading, unit, *_ = METRICS[str(name)]
-        table.add_column(f"{heading}\n{unit}", justify="right", no_wrap=True)
+    for column in columns.values():
+        table.add_column(escape(f"{column.heading}\n{column.unit}"), justify="right", no_wrap=True)
     starred = False
     for scene, values in ours.iterrows():
-        table.add_row(escape(str(scene)), "dsr", *_cells(values))
+        table.add_row(escape(str(scene)), "dsr", *_cells(values, columns))
         paper = paper_row(str(scene), label, scale, downsampling)
         if paper is not None:
             recreated = scene in RECREATED or dataset in OTHER_FRAMES
             starred |= recreated
-            table.add_row("", "paper*" if recreated else "paper", *_cells(paper[list(ours)]), style="dim")
+            table.add_row("", "paper*" if recreated else "paper", *_cells(paper, columns), style="dim")
     if len(ours) > 1:
         table.add_section()
-        table.add_row("mean", "dsr", *_cells(ours.mean()), style="bold")
+        table.add_row("mean", "dsr", *_cells(ours.mean(), columns), style="bold")
         name, count = AVERAGES.get(dataset, ("", 0))
         paper = paper_row(name, label, scale, downsampling)
         if paper is not None and len(ours) == count:
-            table.add_row("", "paper*" if starred else "paper", *_cells(paper[list(ours)]), style="dim")
+            table.add_row("", "paper*" if starred else "paper", *_cells(paper, columns), style="dim")
     if starred:
         table.caption = "* of the paper's own files; the scenes here are others of the same description"
         table.caption_justify = "left"
     return table
 
 
-def _cells(values: pd.Series) -> list[str]:
-    """Return a row's values as text, with as many digits as each metric's column has."""
-    return [f"{value:.{METRICS[str(name)][3]}f}" if pd.notna(value) else "-" for name, value in values.items()]
+def _cells(values: pd.Series, columns: Formats) -> list[str]:
+    """Return a row's values as text, with as many digits as each metric's column has; "-" for those that it lacks."""
+    return [each.text(values[name]) if pd.notna(values.get(name)) else "-" for name, each in columns.items()]

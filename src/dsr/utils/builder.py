@@ -79,16 +79,31 @@ def with_key(message: str, group: str, parameters: Collection[str]) -> str:
 def _load(group: str, node: Mapping[str, Any]) -> Any:
     """Return the class or function that a group names."""
     path = node.get("target")
-    if not isinstance(path, str) or "." not in path:
-        raise ConfigError(f"{group}.target: expected module.name of a class or function, got {path!r}")
-    module, _, name = path.rpartition(".")
-    try:
-        target = getattr(importlib.import_module(module), name)
-    except (ImportError, AttributeError, TypeError, ValueError) as error:
-        raise ConfigError(f"{group}.target: cannot import {path!r} ({error})") from error
+    target = load_object(f"{group}.target", path, "a class or function")
     if not callable(target):
         raise ConfigError(f"{group}.target: expected a class or function, {path!r} is none")
     return target
+
+
+def load_object(key: str, path: Any, what: str) -> Any:
+    """Return the object of a module that a configuration value names.
+
+    Args:
+        key: of the value, for messages.
+        path: the value, ``module.name``.
+        what: what the object should be, for messages.
+
+    Raises:
+        ConfigError: the value is no such path, or the module or the name cannot be imported.
+
+    """
+    if not isinstance(path, str) or "." not in path:
+        raise ConfigError(f"{key}: expected module.name of {what}, got {path!r}")
+    module, _, name = path.rpartition(".")
+    try:
+        return getattr(importlib.import_module(module), name)
+    except (ImportError, AttributeError, TypeError, ValueError) as error:
+        raise ConfigError(f"{key}: cannot import {path!r} ({error})") from error
 
 
 def _fits(value: Any, hint: Any) -> bool:

@@ -21,7 +21,7 @@ from torch.nn import functional
 from dsr.geometry.camera import Camera
 from dsr.geometry.shading import LIGHT_NAMES, render
 from dsr.geometry.surface import depth_to_normals
-from dsr.metrics.catalogue import METRICS
+from dsr.metrics.formats import Formats, describe_directions, in_tables
 from dsr.sample import DepthSample
 from dsr.utils.files import replacing
 
@@ -34,7 +34,9 @@ _DPI = 160
 """At five panels of 3.2 inches a panel has 512 pixels."""
 
 
-def save_picture(path: Path, sample: DepthSample, depth: Tensor, scores: Mapping[str, float], label: str) -> None:
+def save_picture(
+    path: Path, sample: DepthSample, depth: Tensor, scores: Mapping[str, float], label: str, formats: Formats
+) -> None:
     """Draw a scene's result and write it atomically.
 
     Args:
@@ -43,6 +45,7 @@ def save_picture(path: Path, sample: DepthSample, depth: Tensor, scores: Mapping
         depth: (1, H, W) the result in metres, NaN in holes.
         scores: worst-of-four scores in raw units, by metric; empty where there is no truth.
         label: the method's name.
+        formats: of the metrics.
 
     """
     truth = sample.depth
@@ -68,7 +71,7 @@ def save_picture(path: Path, sample: DepthSample, depth: Tensor, scores: Mapping
         _show_error(axes[0, 4], depth - truth)
         _show_renderings(axes[2], sample, truth, "truth")
         _show_angles(axes[1, 4], sample, depth, truth)
-        _write_scores(axes[2, 4], scores)
+        _write_scores(axes[2, 4], scores, formats)
     maps = (depth, sample.depth_lr) if truth is None else (depth, sample.depth_lr, truth)
     holes = "" if all(bool(values.isfinite().all()) for values in maps) else " (pink: holes)"
     heading = f"{sample.dataset} / {sample.scene}, {label} x{sample.scale}{holes}"
@@ -195,12 +198,21 @@ def normals_seen_by(camera: Camera, depth: Tensor) -> Tensor:
     return depth_to_normals(depth.double()[None], camera.rays()[None])
 
 
-def _write_scores(axis: Axes, scores: Mapping[str, float]) -> None:
-    """Write the scores in the paper's units."""
+def _write_scores(axis: Axes, scores: Mapping[str, float], formats: Formats) -> None:
+    """Write the scores in the units of tables."""
+    shown = {name: each for name, each in in_tables(formats).items() if name in scores}
     lines = [
-        f"{heading:<9}{unit:<8}{scores[name] * factor:>9.{digits}f}"
-        for name, (heading, unit, factor, digits) in METRICS.items()
-        if name in scores
+        f"{each.heading:<9}{each.unit:<8}{each.text(scores[name] * each.factor):>9}" for name, each in shown.items()
     ]
-    text = "\n".join(["scores, lower is better", *lines])
-    axis.text(0, 0.95, text, family="monospace", fontsize=11, va="top", linespacing=1.6, transform=axis.transAxes)
+    text = "\n".join([f"scores, {describe_directions(shown)}", *lines])
+    axis.text(
+        0,
+        0.95,
+        text,
+        family="monospace",
+        fontsize=11,
+        parse_math=False,
+        va="top",
+        linespacing=1.6,
+        transform=axis.transAxes,
+    )

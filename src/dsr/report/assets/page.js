@@ -5,7 +5,7 @@ function showSummary(data) {
   document.querySelectorAll(".title").forEach((each) => { each.textContent = data.title; });
   const runs = plural(data.runs.length, "run");
   find("#summary .lead").textContent =
-    `Guided depth super-resolution, judged by depth and by renderings under four lights (worst of four). ${runs}; lower is better throughout.`;
+    `Guided depth super-resolution, judged by depth and by renderings under four lights (worst of four). ${runs}; ${directions(data.metrics)}.`;
   const distinct = (of) => [...new Set(data.problems.map(of))];
   const scenes = new Set(data.problems.flatMap((problem) => problem.scenes.map((scene) => JSON.stringify([problem.dataset, scene]))));
   const facts = [
@@ -25,6 +25,13 @@ function showSummary(data) {
     const anchors = data.links.map((link) => make("a", { href: link.address, textContent: link.name }));
     find(".links").append(make("h3", { textContent: "Files beside this page" }), make("p", {}, ...anchors));
   }
+}
+
+/** Return which way is better. */
+function directions(metrics) {
+  const higher = metrics.filter((metric) => metric.higher).map((metric) => metric.name);
+  if (!higher.length) return "lower is better throughout";
+  return higher.length === metrics.length ? "higher is better throughout" : `lower is better, of ${higher.join(", ")} higher`;
 }
 
 /** Return bars of each metric's means. */

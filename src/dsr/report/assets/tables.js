@@ -63,12 +63,12 @@ function compare(a, b, down) {
   return down ? -order : order;
 }
 
-/** Return the two smallest shown values of a column: what is shown alike shares its place. */
+/** Return the two best shown values of a column: what is shown alike shares its place. */
 function ranked(rows, metric) {
   const shown = rows
     .filter((row) => row.values[metric.id] && !(row.counts && metric.id in row.counts))
     .map((row) => Number(row.values[metric.id][0].toFixed(metric.digits)));
-  const places = [...new Set(shown)].sort((a, b) => a - b);
+  const places = [...new Set(shown)].sort((a, b) => (metric.higher ? b - a : a - b));
   return shown.length > 1 ? places.slice(0, 2) : [];
 }
 

@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.colors import Colormap, ListedColormap
 from torch import Tensor
 
-from dsr.metrics.catalogue import METRICS
+from dsr.metrics.catalogue import KNOWN_FORMATS
 from dsr.report.figures.layout import Cell, Row
 from dsr.report.figures.scenes import Shown, details_of, rendering
 from dsr.viz.panels import limits_of
@@ -127,7 +127,7 @@ def _figures(scores: dict[str, float], metrics: tuple[str, ...]) -> str:
     """Return scores for a reader, a dash for what is missing, nothing where all are."""
     texts = []
     for name in metrics:
-        _, _, factor, digits = METRICS[name]
+        shown = KNOWN_FORMATS[name]
         value = scores.get(name, np.nan)
-        texts.append(f"{factor * value:.{digits}f}" if np.isfinite(value) else "-")
+        texts.append(shown.text(shown.factor * value) if np.isfinite(value) else "-")
     return "" if all(text == "-" for text in texts) else " / ".join(texts)

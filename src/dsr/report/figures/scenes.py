@@ -12,6 +12,7 @@ from dsr.evaluation.results import BenchmarkSetting, Results, Run
 from dsr.evaluation.store import StoredScene
 from dsr.geometry.camera import Camera
 from dsr.geometry.shading import LIGHT_NAMES, lights, shade
+from dsr.metrics.formats import HEADLINES
 from dsr.viz.panels import Window, normals_seen_by, strongest_window
 
 _DETAIL = 5
@@ -110,7 +111,7 @@ def _note(notes: list[str], line: str) -> None:
 
 def _scores(run: Run, name: str) -> dict[str, float]:
     """Return a scene's scores by metric, worst of four lights where there are lights."""
-    rows = run.scores[(run.scores["scene"] == name) & run.scores["variant"].fillna("").isin(["", "max"])]
+    rows = run.scores[(run.scores["scene"] == name) & run.scores["variant"].fillna("").isin(HEADLINES)]
     return {str(metric): float(value) for metric, value in zip(rows["metric"], rows["value"], strict=True)}
 
 

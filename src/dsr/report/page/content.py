@@ -11,8 +11,8 @@ from urllib.parse import quote
 import pandas as pd
 
 from dsr.evaluation.results import BenchmarkSetting, Results, Run
-from dsr.metrics.catalogue import METRICS
-from dsr.report.tables import AVERAGES, OTHER_FRAMES, RECREATED, in_paper_units, paper_row
+from dsr.metrics.formats import Formats
+from dsr.report.tables import AVERAGES, OTHER_FRAMES, RECREATED, in_shown_units, paper_row
 
 _FOLDERS = {"tables": (".csv", ".md", ".tex"), "metrics": (".csv",), "figures": (".pdf",)}
 """Folders beside the page whose files it links to."""
@@ -21,12 +21,10 @@ _BESIDES = " ("
 
 
 def metrics_data(results: Results) -> list[dict[str, Any]]:
-    """Return the metrics that any run has: heading, unit and digits."""
-    present = {name for run in results.runs for name in run.scores["metric"]}
+    """Return the metrics that any run has: heading, unit, digits, and whether higher is better."""
     return [
-        {"id": name, "name": heading, "unit": unit, "digits": digits}
-        for name, (heading, unit, _, digits) in METRICS.items()
-        if name in present
+        {"id": name, "name": each.heading, "unit": each.unit, "digits": each.digits, "higher": each.higher_is_better}
+        for name, each in results.formats.items()
     ]
 
 
@@ -34,7 +32,8 @@ def problem_data(results: Results, problem: BenchmarkSetting) -> dict[str, Any]:
     """Return a problem's scores in the paper's units, by scene and on average, with the published ones beside them."""
     runs = results.of(problem)
     methods = list(dict.fromkeys(run.label for run in runs))
-    wide = {id(run): _by_scene(run) for run in runs}
+    formats = results.formats
+    wide = {id(run): _by_scene(run, formats) for run in runs}
     scenes = list(dict.fromkeys(scene for run in runs for scene in wide[id(run)].index))
     rows: list[dict[str, Any]] = []
     means: list[dict[str, Any]] = []
@@ -43,11 +42,11 @@ def problem_data(results: Results, problem: BenchmarkSetting) -> dict[str, Any]:
         for scene in scenes:
             own = [table.loc[scene] for table in tables if scene in table.index]
             if own:
-                paper = _published(problem, scene, method)
+                paper = _published(problem, scene, method, formats)
                 starred = scene in RECREATED or problem.dataset in OTHER_FRAMES or _BESIDES in problem.dataset
                 rows.append({"scene": scene, "method": method, "seeds": len(own), "values": _over_seeds(own),
                              "paper": paper, "starred": starred and bool(paper)})  # fmt: skip
-        means.append(_mean_row(problem, method, scenes, tables))
+        means.append(_mean_row(problem, method, scenes, tables, formats))
     return {
         "dataset": problem.dataset,
         "scale": problem.scale,
@@ -60,9 +59,9 @@ def problem_data(results: Results, problem: BenchmarkSetting) -> dict[str, Any]:
     }
 
 
-def _by_scene(run: Run) -> pd.DataFrame:
-    """Return a run's scores, scene x metric, in the paper's units."""
-    table = in_paper_units(run.scores)
+def _by_scene(run: Run, formats: Formats) -> pd.DataFrame:
+    """Return a run's scores, scene x metric, in the units of tables."""
+    table = in_shown_units(run.scores, formats)
     table.index = table.index.map(str)
     return table
 
@@ -79,7 +78,9 @@ def _over_seeds(series: Sequence[pd.Series]) -> dict[str, list[float]]:
     return {name: numbers for name, numbers in values.items() if all(map(math.isfinite, numbers))}
 
 
-def _mean_row(problem: BenchmarkSetting, method: str, scenes: list[str], tables: list[pd.DataFrame]) -> dict[str, Any]:
+def _mean_row(
+    problem: BenchmarkSetting, method: str, scenes: list[str], tables: list[pd.DataFrame], formats: Formats
+) -> dict[str, Any]:
     """Return a method's averages over the scenes; ``counts``: by metric, over how many, where some are missing."""
     values = _over_seeds([table.mean() for table in tables])
     seen: dict[str, set[str]] = {name: set() for name in values}
@@ -89,16 +90,16 @@ def _mean_row(problem: BenchmarkSetting, method: str, scenes: list[str], tables:
                 seen[name] |= set(table.index[table[name].notna()])
     counts = {name: len(found) for name, found in seen.items() if len(found) < len(scenes)}
     name, count = AVERAGES.get(problem.dataset, ("", 0))
-    paper = _published(problem, name, method) if len(scenes) == count and not counts else {}
+    paper = _published(problem, name, method, formats) if len(scenes) == count and not counts else {}
     starred = problem.dataset in OTHER_FRAMES or any(scene in RECREATED for scene in scenes)
     return {"method": method, "seeds": len(tables), "values": values, "counts": counts, "paper": paper,
             "starred": starred and bool(paper)}  # fmt: skip
 
 
-def _published(problem: BenchmarkSetting, scene: str, method: str) -> dict[str, float]:
+def _published(problem: BenchmarkSetting, scene: str, method: str, formats: Formats) -> dict[str, float]:
     """Return the paper's figures by metric; it has some where the downsampling is its own."""
     row = paper_row(scene, method, problem.scale, problem.downsampling)
-    return {} if row is None else {name: float(row[name]) for name in METRICS if pd.notna(row[name])}
+    return {} if row is None else {name: float(row[name]) for name in formats if pd.notna(row.get(name))}
 
 
 def _seconds(runs: Iterable[Run], methods: Iterable[str]) -> dict[str, dict[str, float]]:

@@ -1,0 +1,90 @@
+"""The metrics that a configuration chooses: the paper's, with LPIPS where its network can be had, and one's own."""
+
+from __future__ import annotations
+
+import functools
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import torch
+import torchmetrics
+
+from dsr.app.schema import MetricsConfig
+from dsr.metrics.catalogue import Metric, catalogue
+from dsr.metrics.classes import visual_metrics
+from dsr.metrics.lpips import LPIPS, TRUNK_URL, load_lpips
+from dsr.utils.builder import ConfigError, load_object
+from dsr.utils.console import one_line
+
+
+def chosen_metrics(settings: MetricsConfig, device: torch.device) -> tuple[Metric, ...]:
+    """Return the metrics to compute.
+
+    Raises:
+        ConfigError: a metric or the network's file is not what it should be.
+
+    """
+    return catalogue(_network_on(settings, device), extra_metrics(settings.extra))
+
+
+def metric_collection(settings: MetricsConfig, device: torch.device) -> torchmetrics.MetricCollection:
+    """Return the same metrics as one collection, for a validation pass."""
+    return visual_metrics(_network_on(settings, device), extra_metrics(settings.extra))
+
+
+def check_metrics(settings: MetricsConfig) -> None:
+    """Check what a configuration says of metrics, before anything is written.
+
+    Raises:
+        ConfigError: a metric or the network's file is not what it should be.
+
+    """
+    extra_metrics(settings.extra)
+    if settings.lpips and settings.lpips_trunk is not None:
+        perceptual_network(settings.lpips_trunk)
+
+
+def extra_metrics(paths: Sequence[str]) -> tuple[Metric, ...]:
+    """Return the metrics beside the paper's.
+
+    Args:
+        paths: ``module.NAME`` of each.
+
+    Raises:
+        ConfigError: there is no such metric, or two metrics have one name.
+
+    """
+    metrics = tuple(load_object("metrics.extra", path, "a dsr.metrics.catalogue.Metric") for path in paths)
+    for path, metric in zip(paths, metrics, strict=True):
+        if not isinstance(metric, Metric):
+            raise ConfigError(f"metrics.extra: expected a dsr.metrics.catalogue.Metric, {path!r} is none")
+    try:
+        catalogue(extra=metrics)
+    except ValueError as error:
+        raise ConfigError(f"metrics.extra: {error}") from error
+    return metrics
+
+
+def _network_on(settings: MetricsConfig, device: torch.device) -> LPIPS | None:
+    """Return the LPIPS network; None where it is not wanted, or not to be had."""
+    network = perceptual_network(settings.lpips_trunk) if settings.lpips else None
+    return None if network is None else network.to(device)
+
+
+@functools.cache
+def perceptual_network(trunk: str | None) -> LPIPS | None:
+    """Return the LPIPS network; without a trunk, None and one line that says what to do."""
+    try:
+        return load_lpips(None if trunk is None else Path(trunk).expanduser())
+    except OSError as error:
+        if trunk is not None:
+            raise ConfigError(f"metrics.lpips_trunk: {error}") from error
+        print(  # noqa: T201
+            f"LPIPS_v is left out: AlexNet's weights {one_line(error)}; "
+            f"get {TRUNK_URL} and set metrics.lpips_trunk=FILE or $DSR_LPIPS_TRUNK",
+            file=sys.stderr,
+        )
+        return None
+    except ValueError as error:
+        raise ConfigError(f"metrics.lpips_trunk: {error}") from error

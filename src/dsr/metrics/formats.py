@@ -1,0 +1,88 @@
+"""How tables and figures show a metric: its heading, unit, precision, direction and place."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+
+AFTER_THE_PAPER = 100
+"""The position of metrics that the paper's tables do not have."""
+HEADLINES = ("", "max", "min")
+"""Variants of the value that stands for an image: without lights, or the worst of four lights (the smallest value where
+higher is better)."""
+
+
+@dataclass(frozen=True)
+class MetricFormat:
+    """How tables and figures show a metric.
+
+    Args:
+        heading: short name for readers.
+        unit: of the shown values; may be empty.
+        factor: from raw values, as in ``scores.csv``, to shown ones.
+        digits: number of digits after the decimal point.
+        higher_is_better: direction of the ranking.
+        position: place among the columns of a table, from the left; None for a metric that is only in ``scores.csv``.
+
+    Raises:
+        ValueError: ``factor`` is not positive, or ``digits`` is negative.
+
+    """
+
+    heading: str
+    unit: str = ""
+    factor: float = 1.0
+    digits: int = 3
+    higher_is_better: bool = False
+    position: int | None = AFTER_THE_PAPER
+
+    def __post_init__(self) -> None:
+        """Check the values."""
+        if not self.factor > 0:
+            raise ValueError(f"{self.heading}: factor: expected a positive number, got {self.factor}")
+        if self.digits < 0:
+            raise ValueError(f"{self.heading}: digits: expected 0 or more, got {self.digits}")
+
+    def text(self, value: float) -> str:
+        """Return a shown value with its digits."""
+        return f"{value:.{self.digits}f}"
+
+    @property
+    def title(self) -> str:
+        """The heading with the unit in parentheses."""
+        return f"{self.heading} ({self.unit})" if self.unit else self.heading
+
+
+Formats = Mapping[str, MetricFormat]
+"""Formats of metrics by their names in ``scores.csv``."""
+
+
+def in_tables(formats: Formats) -> dict[str, MetricFormat]:
+    """Return the formats of the metrics that tables show, in the order of the columns."""
+    shown = {name: each for name, each in formats.items() if each.position is not None}
+    return dict(sorted(shown.items(), key=lambda item: item[1].position or 0))
+
+
+def describe_directions(formats: Formats) -> str:
+    """Return which way is better, such as "lower is better" or "lower is better, of PSNR higher"."""
+    higher = [each.heading for each in formats.values() if each.higher_is_better]
+    if not higher:
+        return "lower is better"
+    if len(higher) == len(formats):
+        return "higher is better"
+    return f"lower is better, of {', '.join(higher)} higher"
+
+
+def complete_formats(names: Iterable[str], *known: Formats) -> dict[str, MetricFormat]:
+    """Return a format for each metric: the first known one, or the raw value under the metric's name.
+
+    Args:
+        names: of metrics, as in ``scores.csv``.
+        *known: formats to take, the preferred ones first.
+
+    """
+    found: dict[str, MetricFormat] = {}
+    for name in names:
+        formats = (each[name] for each in known if name in each)
+        found[name] = next(formats, MetricFormat(name))
+    return found
