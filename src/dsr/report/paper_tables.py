@@ -70,7 +70,7 @@ def build_tables(results: Results, study: pd.DataFrame | None = None) -> list[Pa
 
 
 Values = Mapping[str, Mapping[Place, Mapping[str, Mapping[int, float]]]]
-"""By label, scene, metric and seed: worst of four lights, in the units of tables, without values that are not finite."""
+"""By label, scene, metric and seed: worst of four lights, in the units of tables; finite values alone."""
 
 
 @dataclass(frozen=True)
