@@ -120,7 +120,7 @@ def test_eval_shows_a_metric_from_outside_with_its_unit_and_direction(home):
     assert (10 ** (-psnr / 20) * 10).to_dict() == pytest.approx(error.to_dict(), rel=1e-9)
 
 
-def test_a_report_elsewhere_shows_it_after_the_papers_and_ranks_by_its_direction(home):
+def test_report_elsewhere_shows_it_after_the_papers_and_ranks_by_its_direction(home):
     table = pd.read_csv(home / "report" / "tables" / "waves_x4_box.csv")
     of_long = table[table["scene"] == "long"].set_index("method")["PSNR_d [dB]"]
     best = of_long.idxmax()
@@ -136,7 +136,7 @@ def test_a_report_elsewhere_shows_it_after_the_papers_and_ranks_by_its_direction
     assert (home / "report" / "figures" / "depth_waves_x4_box_1.png").stat().st_size > 1000
 
 
-def test_a_metric_that_nobody_describes_is_shown_raw_under_its_name(home, tmp_path):
+def test_metric_that_nobody_describes_is_shown_raw_under_its_name(home, tmp_path):
     copy = tmp_path / "runs" / "nearest"
     shutil.copytree(home / "runs" / "nearest", copy)
     summary = json.loads((copy / "summary.json").read_text())
@@ -162,7 +162,7 @@ def test_a_metric_that_nobody_describes_is_shown_raw_under_its_name(home, tmp_pa
         ),
     ],
 )
-def test_what_is_no_metric_is_refused_in_one_line(home, monkeypatch, extra, message):
+def test_extra_metrics_refuse_what_is_no_metric_in_one_line(home, monkeypatch, extra, message):
     monkeypatch.syspath_prepend(str(home / "modules"))
     with pytest.raises(ConfigError) as caught:
         extra_metrics(extra.split(","))
