@@ -9,10 +9,10 @@ from dsr.synthetic.procedural.layouts import LAYOUTS
 from dsr.synthetic.procedural.paints import PAINTS
 from dsr.synthetic.procedural.pictures import PICTURES, palette, picture_paint
 from dsr.synthetic.procedural.reliefs import RELIEFS, relief
-from dsr.synthetic.procedural.scenes import camera_of, random_scene, render, render_random_scene
-from dsr.synthetic.procedural.shape import about, box, extrusion, merged, quad, surface
-from dsr.synthetic.procedural.solids import SOLIDS, any_solid, ellipsoid, frustum, rounded_box
-from dsr.synthetic.procedural.stage import Viewpoint
+from dsr.synthetic.procedural.scene_layout import Viewpoint
+from dsr.synthetic.procedural.scenes import make_camera, random_scene, render, render_random_scene
+from dsr.synthetic.procedural.shape import box, extrusion, merge, quad, rotation_about, surface
+from dsr.synthetic.procedural.solids import SOLIDS, ellipsoid, frustum, random_solid, rounded_box
 from dsr.synthetic.procedural.tracer import Tracer
 
 SIZE = 96
@@ -29,7 +29,7 @@ def scenes(count=10):
 @functools.cache
 def rays(size=SIZE):
     """Rays (3, size * size) of a camera at the origin that looks along z."""
-    return camera_of(FORWARD, size).rays().numpy().reshape(3, -1)
+    return make_camera(FORWARD, size).rays().numpy().reshape(3, -1)
 
 
 def test_scene_does_not_depend_on_earlier_renderings():
@@ -51,7 +51,7 @@ def test_seed_and_index_each_give_another_scene():
 def test_layouts_close_the_view_and_keep_their_types_and_ranges(layout):
     scene = random_scene(np.random.default_rng(8), layout)
     picture = render(scene, SIZE)
-    assert scene.layout == layout
+    assert scene.layout_name == layout
     assert picture.rgb.dtype == np.uint8
     assert picture.depth.dtype == np.float64
     assert picture.rgb.shape == (SIZE, SIZE, 3)
@@ -107,7 +107,7 @@ def test_plane_has_the_depth_of_its_closed_form_without_steps():
     side = np.cross(normal, [0.0, 1.0, 0.0])
     up = np.cross(normal, side)
     tracer = Tracer([quad(-distance * normal - 20 * side - 20 * up, 40 * side, 40 * up)])
-    depth = tracer.hits(ORIGIN, rays()).depth
+    depth = tracer.trace(ORIGIN, rays()).depth
     np.testing.assert_allclose(depth, -distance / (normal @ rays()), rtol=1e-12)
     points = (depth * rays()).reshape(3, SIZE, SIZE)
     du, dv = np.diff(points, axis=2)[:, :-1], np.diff(points, axis=1)[:, :, :-1]
@@ -120,15 +120,15 @@ def test_wall_far_from_the_scene_origin_is_as_flat():
     tracer = Tracer([quad([-60.0, 37.0, -60.0], [120, 0, 0], [0, 0, 120])])
     eye = np.array([3.3, 30.1, -7.7])
     axes = FORWARD.axes()
-    depth = tracer.hits(eye, axes.T @ rays()).depth
+    depth = tracer.trace(eye, axes.T @ rays()).depth
     np.testing.assert_allclose(depth, 6.9, rtol=1e-12)
 
 
 def test_ball_is_rounder_than_its_triangles():
     radius, centre = 0.8, np.array([0.1, -0.2, 3.0])
-    shape = ellipsoid(np.full(3, radius), np.ones(2)).turned(about(0, 71.0)).moved(centre)
+    shape = ellipsoid(np.full(3, radius), np.ones(2)).rotate(rotation_about(0, 71.0)).translate(centre)
     tracer = Tracer([shape])
-    hits = tracer.hits(ORIGIN, rays())
+    hits = tracer.trace(ORIGIN, rays())
     slope, square = centre @ rays(), (rays() ** 2).sum(0)
     root = slope**2 - square * (centre @ centre - radius**2)
     inner = root > 0.1 * slope**2 * radius**2 / (centre @ centre)  # away from the outline
@@ -148,9 +148,11 @@ def test_ball_is_rounder_than_its_triangles():
 def test_hits_of_flat_objects_lie_on_their_triangles():
     rng = np.random.default_rng(4)
     things = [box([0.5, 0.7, 0.4]), extrusion([np.array([[0, 0], [0.5, 0.1], [0.3, 0.6]])], 0.4)]
-    shapes = [s.turned(about(0, rng.uniform(0, 90))).moved([k - 0.5, 0.0, 3.0]) for k, s in enumerate(things)]
+    shapes = [
+        s.rotate(rotation_about(0, rng.uniform(0, 90))).translate([k - 0.5, 0.0, 3.0]) for k, s in enumerate(things)
+    ]
     tracer = Tracer(shapes)
-    hits = tracer.hits(ORIGIN, rays())
+    hits = tracer.trace(ORIGIN, rays())
     on = hits.face >= 0
     assert on.sum() > 500
     assert set(np.unique(hits.body[on])) == {0, 1}
@@ -164,7 +166,7 @@ def test_hits_of_flat_objects_lie_on_their_triangles():
 def test_depth_of_a_relief_is_continuous_from_triangle_to_triangle():
     u, v = np.meshgrid(np.linspace(-2, 2, 60), np.linspace(-2, 2, 60))
     tracer = Tracer([surface(np.stack((u, v, 3 + 0.1 * np.sin(3 * u) * np.cos(2 * v)), axis=-1))])
-    depth = tracer.hits(ORIGIN, rays(192)).depth.reshape(192, 192)
+    depth = tracer.trace(ORIGIN, rays(192)).depth.reshape(192, 192)
     points = depth * rays(192).reshape(3, 192, 192)
     exact = 3 + 0.1 * np.sin(3 * points[0]) * np.cos(2 * points[1])
     assert np.abs(points[2] - exact)[8:-8, 8:-8].max() < 4e-4  # triangles alone: 0.1 * 9 * 0.068**2 / 4 = 1e-3
@@ -176,7 +178,7 @@ def test_object_in_between_is_found():
     tracer = Tracer([quad([-1.0, -1.0, 1.0], [2, 0, 0], [0, 2, 0])])
     origin = np.zeros((3, 4))
     toward = np.array([[0.0, 0, 0, 3], [0, 0, 0, 0], [2, 0.9, -2, 2]])
-    assert tracer.blocked(origin, toward).tolist() == [True, False, False, False]
+    assert tracer.is_blocked(origin, toward).tolist() == [True, False, False, False]
 
 
 @pytest.mark.parametrize("maker", SOLIDS, ids=lambda maker: maker.__name__)
@@ -191,8 +193,8 @@ def test_solids_are_about_1_in_size_and_stand_on_the_ground(maker):
 
 
 def test_vertex_normals_agree_with_the_triangles():
-    parts = [any_solid(np.random.default_rng(seed)) for seed in range(12)] + [frustum(0.3, 0.1, 0.5)]
-    shape = merged([*parts, rounded_box(np.array([1.0, 0.5, 0.4]), 0.1)])
+    parts = [random_solid(np.random.default_rng(seed)) for seed in range(12)] + [frustum(0.3, 0.1, 0.5)]
+    shape = merge([*parts, rounded_box(np.array([1.0, 0.5, 0.4]), 0.1)])
     corners = shape.vertices[shape.faces]
     cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     area = np.linalg.norm(cross, axis=1)

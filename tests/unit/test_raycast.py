@@ -46,7 +46,7 @@ def test_slanted_plane_has_affine_inverse_depth():
 
 
 def test_ray_through_a_sphere_centre_hits_at_its_distance_minus_the_radius():
-    hit = Sphere(np.array([0.0, 0.0, 3.0]), np.eye(3), 0.5).hit(EYE, AHEAD)
+    hit = Sphere(np.array([0.0, 0.0, 3.0]), np.eye(3), 0.5).intersect(EYE, AHEAD)
     assert hit[0] == pytest.approx(2.5, abs=1e-15)
 
 
@@ -55,22 +55,22 @@ def test_off_axis_sphere_is_hit_as_by_the_quadratic_formula():
     d = np.array([0.1, -0.05, 1.0])
     a, b = d @ d, d @ c
     expected = (b - math.sqrt(b * b - a * (c @ c - r * r))) / a
-    assert Sphere(c, np.eye(3), r).hit(EYE, d[:, None])[0] == pytest.approx(expected, abs=1e-14)
+    assert Sphere(c, np.eye(3), r).intersect(EYE, d[:, None])[0] == pytest.approx(expected, abs=1e-14)
 
 
 def test_rays_miss_a_sphere_beyond_its_silhouette():
     sphere = Sphere(np.array([0.0, 0.0, 3.0]), np.eye(3), 0.5)
     edge = 0.5 / math.sqrt(9 - 0.25)  # tangent of the half angle of the silhouette
-    inside, outside = sphere.hit(np.zeros((3, 2)), np.array([[edge * 0.9999, edge * 1.0001], [0, 0], [1, 1]]))
+    inside, outside = sphere.intersect(np.zeros((3, 2)), np.array([[edge * 0.9999, edge * 1.0001], [0, 0], [1, 1]]))
     assert np.isfinite(inside)
     assert outside == np.inf
 
 
 def test_cylinder_shows_its_side_and_its_cap_at_the_right_depths():
     upright = Cylinder(np.array([0.0, 0.0, 3.0]), np.eye(3), 0.4, 0.7)
-    assert upright.hit(EYE, AHEAD)[0] == pytest.approx(2.6, abs=1e-15)
+    assert upright.intersect(EYE, AHEAD)[0] == pytest.approx(2.6, abs=1e-15)
     end_on = Cylinder(np.array([0.0, 0.0, 3.0]), np.array([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]]), 0.4, 0.7)
-    hit = end_on.hit(EYE, AHEAD)
+    hit = end_on.intersect(EYE, AHEAD)
     assert hit[0] == pytest.approx(2.3, abs=1e-15)
     np.testing.assert_allclose(end_on.normal(hit * AHEAD)[:, 0], [0, 0, -1], atol=1e-15)
 
@@ -78,7 +78,7 @@ def test_cylinder_shows_its_side_and_its_cap_at_the_right_depths():
 def test_box_on_edge_shows_its_edge_at_the_half_diagonal():
     s = math.sqrt(0.5)
     box = Box(np.array([0.0, 0.0, 3.0]), np.array([[s, 0, s], [0, 1, 0], [-s, 0, s]]), np.full(3, 0.4))
-    assert box.hit(EYE, AHEAD)[0] == pytest.approx(3 - 0.4 * math.sqrt(2), abs=1e-14)
+    assert box.intersect(EYE, AHEAD)[0] == pytest.approx(3 - 0.4 * math.sqrt(2), abs=1e-14)
 
 
 def test_objects_behind_the_camera_are_not_hit():
@@ -87,7 +87,7 @@ def test_objects_behind_the_camera_are_not_hit():
         Box(np.array([0.0, 0.0, -3.0]), np.eye(3), np.full(3, 0.5)),
         Plane(np.array([0.0, 0.0, -1.0]), np.array([0.0, 0.0, -1.0])),
     ):
-        assert surface.hit(EYE, AHEAD)[0] == np.inf
+        assert surface.intersect(EYE, AHEAD)[0] == np.inf
 
 
 def test_implicit_sphere_agrees_with_the_exact_one():
@@ -95,7 +95,7 @@ def test_implicit_sphere_agrees_with_the_exact_one():
     bounds = Box(exact.centre, np.eye(3), np.full(3, 0.55))
     implicit = Implicit(lambda p: np.sqrt(((p - exact.centre[:, None]) ** 2).sum(0)) - 0.5, bounds)
     rays = small_camera().rays().numpy().reshape(3, -1)
-    found, expected = (s.hit(np.zeros_like(rays), rays) for s in (implicit, exact))
+    found, expected = (s.intersect(np.zeros_like(rays), rays) for s in (implicit, exact))
     np.testing.assert_array_equal(np.isfinite(found), np.isfinite(expected))
     hit = np.isfinite(expected)
     np.testing.assert_allclose(found[hit], expected[hit], atol=1e-9)

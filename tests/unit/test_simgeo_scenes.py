@@ -21,7 +21,7 @@ def object_points(name, number):
     picture = rendering(name)
     rays = picture.camera.rays().numpy()
     origin = np.zeros((3, SIZE * SIZE))
-    hits = np.stack([body.surface.hit(origin, rays.reshape(3, -1)) for body in build_scene(name).bodies])
+    hits = np.stack([body.surface.intersect(origin, rays.reshape(3, -1)) for body in build_scene(name).bodies])
     mine = (hits.argmin(0) == number).reshape(SIZE, SIZE)
     return (picture.depth * rays)[:, mine]
 

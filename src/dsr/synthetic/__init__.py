@@ -1,1 +1,1 @@
-"""Everything that renders: ray casters, SimGeo's scenes, random scenes to train on."""
+"""Rendered scenes: ray casters, the SimGeo scenes, and random scenes to train on."""

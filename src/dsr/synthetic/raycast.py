@@ -30,12 +30,12 @@ class Body:
 
 @dataclass(frozen=True, eq=False)
 class World:
-    """What is seen.
+    """The bodies and lights of a scene.
 
     Args:
-        bodies: they have to cover the whole view.
-        lights: (3, L) points of the area light in metres, any number of which stands for the whole.
-        spread: radius in metres of the patch that one light point stands for.
+        bodies: bodies that cover the whole view.
+        lights: (3, L) sample points of the area light in metres.
+        spread: radius in metres of the patch that each sample point represents.
 
     """
 
@@ -60,13 +60,13 @@ def area_light(centre: Array, side: Array, up: Array, count: int) -> Array:
 def cast(scene: World, direction: Array) -> tuple[Array, NDArray[np.intp]]:
     """Return the depth (N,) along camera rays (3, N) with z = 1 and the number (N,) of the body that is hit."""
     origin = np.zeros_like(direction)
-    t = np.stack([body.surface.hit(origin, direction) for body in scene.bodies])
+    t = np.stack([body.surface.intersect(origin, direction) for body in scene.bodies])
     index = np.argmin(t, axis=0)
     return t[index, np.arange(index.size)], index
 
 
 def shade(scene: World, points: Array, index: NDArray[np.intp], lights: Array) -> Array:
-    """Return the linear RGB (3, N) that ``points`` of the bodies ``index`` send back, lit by the points ``lights``."""
+    """Return the linear RGB (3, N) that ``points`` of the bodies ``index`` reflect, lit by the points ``lights``."""
     out = np.empty_like(points)
     for number, body in enumerate(scene.bodies):
         mine = np.flatnonzero(index == number)
@@ -81,7 +81,7 @@ def shade(scene: World, points: Array, index: NDArray[np.intp], lights: Array) -
 
 
 def _direct(scene: World, points: Array, normals: Array, lights: Array) -> Array:
-    """Return the light (N,) that arrives from the area light, 1 at 3.4 m under a right angle."""
+    """Return the light (N,) that arrives from the area light; it is 1 at 3.4 m and normal incidence."""
     total = np.zeros(points.shape[1])
     origin = points + _LIFT * normals
     for light in lights.T:

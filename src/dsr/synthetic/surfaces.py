@@ -31,7 +31,7 @@ class Surface(ABC):
     """An opaque surface seen from outside."""
 
     @abstractmethod
-    def hit(self, origin: Array, direction: Array) -> Array:
+    def intersect(self, origin: Array, direction: Array) -> Array:
         """Return the smallest t > 0 with origin + t * direction on the surface, inf where there is none, shape (N,)."""
 
     @abstractmethod
@@ -39,14 +39,14 @@ class Surface(ABC):
         """Return the outward unit normals at ``points`` on the surface, shape (3, N)."""
 
     def visibility(self, origin: Array, direction: Array, spread: float) -> Array:
-        """Return how much of a light patch at origin + direction is seen, 0 to 1, shape (N,).
+        """Return the visible fraction of a light patch at origin + direction, shape (N,).
 
         ``spread`` is the radius of the patch in metres; surfaces with a closed form treat the patch as a point.
         """
-        return np.asarray(self.hit(origin, direction) >= 1, dtype=np.float64)
+        return np.asarray(self.intersect(origin, direction) >= 1, dtype=np.float64)
 
     def openness(self, points: Array, normals: Array) -> Array:
-        """Return how much of the surroundings the surface leaves open at its ``points``, 0 to 1, shape (N,)."""
+        """Return the fraction of the surroundings that the surface does not occlude at its ``points``, shape (N,)."""
         return np.ones(points.shape[1])
 
 
@@ -57,23 +57,23 @@ class Plane(Surface):
     point: Array
     facing: Array
 
-    def hit(self, origin: Array, direction: Array) -> Array:
-        """Return where the rays meet the plane; rays along it or away from it never do."""
+    def intersect(self, origin: Array, direction: Array) -> Array:
+        """Return where the rays meet the plane; inf for rays that are parallel to it or come from behind."""
         slope = self.facing @ direction
         t = (self.facing @ self.point - self.facing @ origin) / np.where(slope < 0, slope, np.nan)
         return np.where(t > 0, t, np.inf)
 
     def normal(self, points: Array) -> Array:
-        """Return the one normal for every point."""
+        """Return the plane's normal for every point."""
         return np.broadcast_to(self.facing[:, None], points.shape)
 
 
 @dataclass(frozen=True, eq=False)
 class Convex(Surface):
-    """A convex body: a ray is inside it for one interval of its parameter.
+    """A convex body: the part of a ray inside it is one interval.
 
     Args:
-        centre: (3,) in metres.
+        centre: (3,) centre in metres.
         axes: (3, 3) rotation whose columns are the body's own axes.
 
     """
@@ -81,26 +81,26 @@ class Convex(Surface):
     centre: Array
     axes: Array
 
-    def local(self, points: Array) -> Array:
+    def to_local(self, points: Array) -> Array:
         """Return ``points`` in the body's own frame, shape (3, N)."""
         return self.axes.T @ (points - self.centre[:, None])
 
     @abstractmethod
-    def span(self, origin: Array, direction: Array) -> tuple[Array, Array]:
-        """Return the parameters at which rays, in the body's own frame, enter and leave; enter > leave: a miss."""
+    def intersect_local(self, origin: Array, direction: Array) -> tuple[Array, Array]:
+        """Return the parameters at which rays in the body's own frame enter and leave it; enter > leave on a miss."""
 
     @abstractmethod
     def local_normal(self, points: Array) -> Array:
         """Return the unit normals in the body's own frame, shape (3, N)."""
 
-    def hit(self, origin: Array, direction: Array) -> Array:
+    def intersect(self, origin: Array, direction: Array) -> Array:
         """Return where the rays enter the body."""
-        enter, leave = self.span(self.local(origin), self.axes.T @ direction)
+        enter, leave = self.intersect_local(self.to_local(origin), self.axes.T @ direction)
         return np.where((enter <= leave) & (enter > 0), enter, np.inf)
 
     def normal(self, points: Array) -> Array:
         """Return the outward unit normals."""
-        return self.axes @ self.local_normal(self.local(points))
+        return self.axes @ self.local_normal(self.to_local(points))
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,9 +109,9 @@ class Sphere(Convex):
 
     radius: float
 
-    def span(self, origin: Array, direction: Array) -> tuple[Array, Array]:
+    def intersect_local(self, origin: Array, direction: Array) -> tuple[Array, Array]:
         """Return the roots of |origin + t direction| = radius."""
-        return _round_span(origin, direction, self.radius)
+        return _intersect_round(origin, direction, self.radius)
 
     def local_normal(self, points: Array) -> Array:
         """Return the directions from the centre."""
@@ -124,10 +124,10 @@ class Box(Convex):
 
     half: Array
 
-    def span(self, origin: Array, direction: Array) -> tuple[Array, Array]:
+    def intersect_local(self, origin: Array, direction: Array) -> tuple[Array, Array]:
         """Return the overlap of the three slabs."""
-        spans = [_slab_span(origin[i], direction[i], self.half[i]) for i in range(3)]
-        return np.maximum.reduce([s[0] for s in spans]), np.minimum.reduce([s[1] for s in spans])
+        slabs = [_intersect_slab(origin[i], direction[i], self.half[i]) for i in range(3)]
+        return np.maximum.reduce([s[0] for s in slabs]), np.minimum.reduce([s[1] for s in slabs])
 
     def local_normal(self, points: Array) -> Array:
         """Return the axis of the face nearest to each point."""
@@ -142,10 +142,10 @@ class Cylinder(Convex):
     radius: float
     half: float
 
-    def span(self, origin: Array, direction: Array) -> tuple[Array, Array]:
-        """Return the overlap of the endless cylinder and the slab between the caps."""
-        side = _round_span(origin[::2], direction[::2], self.radius)
-        caps = _slab_span(origin[1], direction[1], self.half)
+    def intersect_local(self, origin: Array, direction: Array) -> tuple[Array, Array]:
+        """Return the overlap of the infinite cylinder and the slab between the caps."""
+        side = _intersect_round(origin[::2], direction[::2], self.radius)
+        caps = _intersect_slab(origin[1], direction[1], self.half)
         return np.maximum(side[0], caps[0]), np.minimum(side[1], caps[1])
 
     def local_normal(self, points: Array) -> Array:
@@ -156,17 +156,17 @@ class Cylinder(Convex):
         return np.where(cap, np.sign(points[1]) * np.array([[0.0], [1.0], [0.0]]), side)
 
 
-def _slab_span(origin: Array, direction: Array, half: float) -> tuple[Array, Array]:
-    """Return when |origin + t direction| <= half, all of shape (N,)."""
+def _intersect_slab(origin: Array, direction: Array, half: float) -> tuple[Array, Array]:
+    """Return the interval of t in which |origin + t direction| <= half, all of shape (N,)."""
     slope = np.where(direction == 0, 1e-300, direction)
-    middle, reach = -origin / slope, half / np.abs(slope)
-    return middle - reach, middle + reach
+    middle, half_length = -origin / slope, half / np.abs(slope)
+    return middle - half_length, middle + half_length
 
 
-def _round_span(origin: Array, direction: Array, radius: float) -> tuple[Array, Array]:
-    """Return when the length of origin + t direction (k, N) is <= radius; (inf, -inf) on a miss."""
+def _intersect_round(origin: Array, direction: Array, radius: float) -> tuple[Array, Array]:
+    """Return the interval of t in which origin + t direction (k, N) has a length <= radius; (inf, -inf) on a miss."""
     square = np.maximum((direction**2).sum(0), 1e-300)
     middle = -(origin * direction).sum(0) / square
     nearest = ((origin + middle * direction) ** 2).sum(0)
-    reach = np.sqrt(np.maximum(radius**2 - nearest, 0) / square)
-    return np.where(nearest <= radius**2, middle - reach, np.inf), middle + reach
+    half_length = np.sqrt(np.maximum(radius**2 - nearest, 0) / square)
+    return np.where(nearest <= radius**2, middle - half_length, np.inf), middle + half_length

@@ -24,7 +24,7 @@ def plain(*rgb: float) -> Field:
 def noise(points: Array, cell: float, seed: int, order: int = 1) -> Array:
     """Return noise in [0, 1] at ``points`` (3, N), with one value per ``cell`` metres, shape (N,).
 
-    Order 1 fades from value to value; order 3 is a B-spline: smoother and weaker.
+    Order 1 interpolates between the values; order 3 is a B-spline, which is smoother and weaker.
     """
     place = points / cell
     if order == 1:
@@ -92,11 +92,11 @@ def weave(points: Array) -> Array:
     return mix(((0.16, 0.20, 0.26), (0.62, 0.60, 0.54)), stripe) * grain
 
 
-def unrolled(cylinder: Cylinder) -> Field:
-    """Return a map from points to the cylinder's (arc, height, depth below the side) in metres."""
+def unroll_chart(cylinder: Cylinder) -> Field:
+    """Return the chart that maps points to the cylinder's (arc length, height, depth below the side) in metres."""
 
     def unroll(points: Array) -> Array:
-        x, y, z = cylinder.local(points)
+        x, y, z = cylinder.to_local(points)
         below = cylinder.radius - np.hypot(x, z)
         cap = cylinder.half - np.abs(y) < np.abs(below)
         arc = np.arctan2(z, x) * cylinder.radius

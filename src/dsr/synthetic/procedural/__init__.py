@@ -1,7 +1,7 @@
-"""Endless random scenes with exact depth, to train on.
+"""Any number of random scenes with exact depth, to train on.
 
-Read :mod:`~dsr.synthetic.procedural.scenes` first; below it come the layouts, their props and furniture, the shapes and
-paints, the ray tracer and the photo.
+:mod:`~dsr.synthetic.procedural.scenes` renders a scene. It uses the layouts with their props and furniture, the shapes
+and materials, the ray tracer and the camera model.
 """
 
 from dsr.synthetic.procedural.scenes import PROCEDURAL_VERSION, render_random_scene

@@ -9,15 +9,15 @@ import numpy as np
 
 from dsr.synthetic.procedural.organic import plant
 from dsr.synthetic.procedural.reliefs import blanket
-from dsr.synthetic.procedural.shape import Shape, about, box, extrusion, lathe, merged, tube
-from dsr.synthetic.procedural.solids import any_solid, frustum, hollow, rounded_box
+from dsr.synthetic.procedural.shape import Shape, box, extrusion, lathe, merge, rotation_about, tube
+from dsr.synthetic.procedural.solids import frustum, hollow, random_solid, rounded_box
 from dsr.synthetic.surfaces import Array
 
 Parts = list[Shape]
 
 
 def _at(shape: Shape, x: float, y: float, z: float) -> Shape:
-    return shape.moved([x, y, z])
+    return shape.translate([x, y, z])
 
 
 def _rod(start: Array | list[float], end: Array | list[float], radius: float) -> Shape:
@@ -33,20 +33,20 @@ def table(rng: np.random.Generator, size: Array | None = None, height: float | N
     kind = rng.integers(4)
     if kind == 0:  # round, on one foot
         radius = min(wide, deep) / 2
-        foot = merged([frustum(0.6 * radius, 0.55 * radius, 0.03), frustum(0.04, 0.04, high - thick)])
+        foot = merge([frustum(0.6 * radius, 0.55 * radius, 0.03), frustum(0.04, 0.04, high - thick)])
         return [_at(frustum(radius, radius, thick), 0, 0, high - thick), foot]
     top = _at(rounded_box(np.array([wide, deep, thick]), 0.3 * thick, 4), 0, 0, high - thick)
     spots = [(sx * (wide / 2 - inset), sy * (deep / 2 - inset)) for sx in (-1, 1) for sy in (-1, 1)]
     if kind == 1:  # slanted round legs
         legs = [_rod([0.9 * x, 0.9 * y, high - thick], [x, y, 0], rng.uniform(0.015, 0.03)) for x, y in spots]
-        return [top, merged(legs)]
+        return [top, merge(legs)]
     if kind == 2:  # two side boards
         side = box([thick, 0.94 * deep, high - thick])
-        return [top, merged([_at(side, s * (wide / 2 - inset), 0, 0) for s in (-1, 1)])]
+        return [top, merge([_at(side, s * (wide / 2 - inset), 0, 0) for s in (-1, 1)])]
     leg = box([*[rng.uniform(0.035, 0.08)] * 2, high - thick])
     rail = box([wide - 2 * inset, 0.02, 0.08])
     rails = [_at(rail, 0, s * (deep / 2 - inset), high - thick - 0.08) for s in (-1, 1)]
-    return [top, merged([_at(leg, x, y, 0) for x, y in spots] + rails)]
+    return [top, merge([_at(leg, x, y, 0) for x, y in spots] + rails)]
 
 
 def chair(rng: np.random.Generator) -> Parts:
@@ -64,9 +64,9 @@ def chair(rng: np.random.Generator) -> Parts:
             x = (k + 0.5) / 6.5 * wide - wide / 2 + 0.03
             bars.append(_rod([x, deep / 2 - 0.03, seat], [x, deep / 2 - 0.03, seat + 0.92 * back], 0.4 * radius))
         board = box([wide - 0.04, 0.02, 0.08])
-        return [merged([pillow, _at(board, 0, deep / 2 - 0.03, seat + back - 0.1)]), merged(bars)]
+        return [merge([pillow, _at(board, 0, deep / 2 - 0.03, seat + back - 0.1)]), merge(bars)]
     panel = rounded_box(np.array([wide - 0.03, 0.035, 0.7 * back]), 0.015, 4)
-    return [merged([pillow, _at(panel, 0, deep / 2 - 0.03, seat + 0.28 * back)]), merged(bars)]
+    return [merge([pillow, _at(panel, 0, deep / 2 - 0.03, seat + 0.28 * back)]), merge(bars)]
 
 
 def sofa(rng: np.random.Generator) -> Parts:
@@ -82,9 +82,9 @@ def sofa(rng: np.random.Generator) -> Parts:
     for k in range(seats):
         x = (k - (seats - 1) / 2) * 0.62
         soft.append(_at(rounded_box(np.array([0.6, deep - 0.18, 0.16]), 0.05), x, -0.07, seat - 0.1))
-        pillow = blanket(rng, np.array([0.5, 0.45]), 0.13, 60).turned(about(0, 68 + rng.uniform(-8, 8)))
-        soft.append(_at(pillow.turned(about(2, rng.uniform(-15, 15))), x, deep / 2 - 0.3, seat + 0.28))
-    return [merged(body), merged(soft)]
+        pillow = blanket(rng, np.array([0.5, 0.45]), 0.13, 60).rotate(rotation_about(0, 68 + rng.uniform(-8, 8)))
+        soft.append(_at(pillow.rotate(rotation_about(2, rng.uniform(-15, 15))), x, deep / 2 - 0.3, seat + 0.28))
+    return [merge(body), merge(soft)]
 
 
 def shelf(rng: np.random.Generator, *, low: bool = False) -> Parts:
@@ -103,7 +103,7 @@ def shelf(rng: np.random.Generator, *, low: bool = False) -> Parts:
         while x < wide / 2 - 0.12:
             step = _shelf_item(rng, groups, np.array([x, deep, k * pitch + thick]), pitch - 2 * thick)
             x += step
-    return [merged(boards), *[merged(group) for group in groups if group]]
+    return [merge(boards), *[merge(group) for group in groups if group]]
 
 
 def _shelf_item(rng: np.random.Generator, groups: list[Parts], at: Array, room: float) -> float:
@@ -115,14 +115,14 @@ def _shelf_item(rng: np.random.Generator, groups: list[Parts], at: Array, room: 
         book = box([wide - 0.002, deep, high])
         if rng.random() < 0.08:
             lean = rng.uniform(5, 14)
-            book = book.turned(about(1, lean))
-            book = book.moved([0, 0, -book.vertices[:, 2].min()])
+            book = book.rotate(rotation_about(1, lean))
+            book = book.translate([0, 0, -book.vertices[:, 2].min()])
             wide += 0.25 * high
         group.append(_at(book, at[0] + wide / 2, -at[1] / 2 + deep / 2 + rng.uniform(0.01, 0.04), at[2]))
         return float(wide)
     if kind < 0.9:
         size = rng.uniform(0.1, 0.9 * min(room, at[1]))
-        thing = any_solid(rng).stretched(size)
+        thing = random_solid(rng).scale(size)
         wide = np.ptp(thing.vertices[:, 0])
         if np.ptp(thing.vertices[:, 2]) < room and wide < 0.25:
             group.append(_at(thing, at[0] + wide / 2, rng.uniform(-0.2, 0.1) * at[1], at[2]))
@@ -141,9 +141,9 @@ def cabinet(rng: np.random.Generator) -> Parts:
         for j in range(rows):
             x, z = (i + 0.5) * w - wide / 2, 0.05 + j * h
             body.append(_at(box([w - 2 * gap, out, h - 2 * gap]), x, -deep / 2 - out / 2 + 1e-3, z + gap))
-            knob = frustum(0.014, 0.018, 0.03).turned(about(0, 90))
+            knob = frustum(0.014, 0.018, 0.03).rotate(rotation_about(0, 90))
             knobs.append(_at(knob, x + 0.35 * w * (rows < 3), -deep / 2 - out, z + 0.5 * h))
-    return [merged(body), merged(knobs)]
+    return [merge(body), merge(knobs)]
 
 
 def lamp(rng: np.random.Generator, height: float) -> Parts:
@@ -157,7 +157,7 @@ def lamp(rng: np.random.Generator, height: float) -> Parts:
         ]
     )
     foot = frustum(0.7 * base, 0.6 * base, 0.03)
-    return [shade, merged([foot, frustum(0.012, 0.012, height - 0.3 * tall)])]
+    return [shade, merge([foot, frustum(0.012, 0.012, height - 0.3 * tall)])]
 
 
 def pot_plant(rng: np.random.Generator, height: float) -> Parts:
@@ -165,9 +165,10 @@ def pot_plant(rng: np.random.Generator, height: float) -> Parts:
     leaves, stems = plant(rng)
     wide = rng.uniform(0.1, 0.2)
     pot = hollow(wide * np.array([0.7, 0.85, 1.0, 1.05]), 0.28, 0.015)
-    earth = frustum(0.85 * wide, 0.85 * wide, 0.02).moved([0, 0, 0.2])
+    earth = frustum(0.85 * wide, 0.85 * wide, 0.02).translate([0, 0, 0.2])
     return [
-        s.stretched(height / 1.2) for s in (leaves.moved([0, 0, 0.2]), merged([stems.moved([0, 0, 0.2]), earth]), pot)
+        s.scale(height / 1.2)
+        for s in (leaves.translate([0, 0, 0.2]), merge([stems.translate([0, 0, 0.2]), earth]), pot)
     ]
 
 
@@ -176,12 +177,12 @@ def blinds(rng: np.random.Generator, width: float, height: float) -> Parts:
     pitch = rng.uniform(0.03, 0.09)
     count = int(height / pitch)
     if rng.random() < 0.6:
-        slat = box([width, 0.8 * pitch, 0.003]).turned(about(0, rng.uniform(-70, 70)))
-        return [merged([_at(slat, width / 2, 0, (k + 0.5) * pitch) for k in range(count)])]
+        slat = box([width, 0.8 * pitch, 0.003]).rotate(rotation_about(0, rng.uniform(-70, 70)))
+        return [merge([_at(slat, width / 2, 0, (k + 0.5) * pitch) for k in range(count)])]
     radius = rng.uniform(0.005, 0.015)
     bars = [_rod([x, 0, 0], [x, 0, height], radius) for x in np.arange(0, width, 1.6 * pitch)]
     bars += [_rod([0, 0, z], [width, 0, z], 1.5 * radius) for z in (0.0, height)]
-    return [merged(bars)]
+    return [merge(bars)]
 
 
 def window(rng: np.random.Generator, width: float, height: float) -> Parts:
@@ -195,8 +196,8 @@ def window(rng: np.random.Generator, width: float, height: float) -> Parts:
         for j in range(rows):
             low, high = np.array([i * w, j * h]) + rim, np.array([(i + 1) * w, (j + 1) * h])
             holes.append(np.array([low, [low[0], high[1]], high, [high[0], low[1]]]))
-    frame = extrusion([outer, *holes], out).turned(about(0, 90)).moved([0, 0, 0])
-    pane = box([width - rim, 0.004, height - rim]).moved([width / 2, 0, rim / 2])
+    frame = extrusion([outer, *holes], out).rotate(rotation_about(0, 90)).translate([0, 0, 0])
+    pane = box([width - rim, 0.004, height - rim]).translate([width / 2, 0, rim / 2])
     return [pane, frame]
 
 
@@ -206,8 +207,8 @@ def picture(rng: np.random.Generator) -> Parts:
     rim, out = rng.uniform(0.015, 0.06), rng.uniform(0.01, 0.04)
     outer = np.array([[-wide, -high], [wide, -high], [wide, high], [-wide, high]]) / 2
     inner = (outer - np.sign(outer) * rim)[::-1]
-    frame = extrusion([outer, inner], out).turned(about(0, 90))
-    sheet = box([wide - rim, 0.004, high - rim]).moved([0, 0, -(high - rim) / 2])
+    frame = extrusion([outer, inner], out).rotate(rotation_about(0, 90))
+    sheet = box([wide - rim, 0.004, high - rim]).translate([0, 0, -(high - rim) / 2])
     return [sheet, frame]
 
 
@@ -219,4 +220,4 @@ def bed(rng: np.random.Generator) -> Parts:
     bedding.append(_at(blanket(rng, np.array([wide + 0.1, 1.3]), 0.14, 200), 0, -0.3, high - 0.03))
     for s in (-1, 1) if wide > 1.2 else (0,):
         bedding.append(_at(blanket(rng, np.array([0.6, 0.4]), 0.16, 80), s * wide / 4, long / 2 - 0.3, high))
-    return [merged(frame), merged(bedding)]
+    return [merge(frame), merge(bedding)]

@@ -1,4 +1,4 @@
-"""Lights of random scenes: a lamp with soft shadows, light from all around with occlusion, shadow patterns."""
+"""Lights of random scenes: a lamp with soft shadows, ambient light with occlusion, and shadow patterns."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from dsr.synthetic.surfaces import Array
 
 Cookie = Callable[[Array], Array]
 SETS = 16
-"""Neighbouring pixels use different sixteenths of the samples of a light."""
-_EACH = 3
+"""Number of sets into which the samples of a light are divided; neighbouring pixels use different sets."""
+_SAMPLES_PER_SET = 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,12 +23,14 @@ class Lighting:
     """The light in a scene.
 
     Args:
-        lamp: (SETS, L, 3) points that stand for the lamp.
-        colour: (3,) of the lamp.
-        cookie: share of the lamp's light let through at points (3, N), such as by leaves or a window.
-        ambient: (3,) colour of the light from all around, and ``sky`` (3,) what is added from above.
-        directions: (SETS, A, 3) unit vectors, as many upward as cosine asks for (z is the normal).
-        reach: metres within which surfaces take ambient light from each other.
+        lamp: (SETS, L, 3) sample points of the lamp in metres.
+        colour: (3,) colour and strength of the lamp.
+        cookie: function from points (3, N) to the fraction (N,) of the lamp's light that arrives there, for example
+            through leaves or a window.
+        ambient: (3,) colour of the light from all directions.
+        sky: (3,) colour of additional light from above.
+        directions: (SETS, A, 3) unit vectors, cosine distributed about z, the normal.
+        occlusion_distance: distance in metres within which surfaces occlude each other's ambient light.
 
     """
 
@@ -38,11 +40,20 @@ class Lighting:
     ambient: Array
     sky: Array
     directions: Array
-    reach: float
+    occlusion_distance: float
 
 
 def random_lighting(rng: np.random.Generator, tracer: Tracer, seen: Hits, low: Array, high: Array) -> Lighting:
-    """Return lights for what a coarse picture has ``seen``, the lamp between the corners ``low`` and ``high`` (3,)."""
+    """Return random lights for the surfaces of a preview.
+
+    Args:
+        rng: source of random numbers.
+        tracer: ray tracer of the scene.
+        seen: hits of the preview's rays.
+        low: (3,) lower corner of the box in which the lamp may hang, in metres.
+        high: (3,) upper corner of the same.
+
+    """
     middle = np.median(seen.points, axis=1)
     extent = float(np.median(seen.depth))
     points, normals = seen.points, seen.normals
@@ -52,7 +63,7 @@ def random_lighting(rng: np.random.Generator, tracer: Tracer, seen: Hits, low: A
         spot = np.clip(middle + extent * rng.uniform(0.5, 2.5) * way, low, high)
         toward = spot[:, None] - points
         slope = (toward * normals).sum(0) / np.sqrt((toward**2).sum(0))
-        lit = (slope > 0.02) & ~tracer.blocked(lifted(seen, extent), toward)
+        lit = (slope > 0.02) & ~tracer.is_blocked(offset_points(seen, extent), toward)
         score = min(float(lit.mean()), 0.75) + 0.3 * rng.random()
         if score > best:
             best, position = score, spot
@@ -65,14 +76,19 @@ def _build(rng: np.random.Generator, position: Array, middle: Array, extent: flo
     distance = float(np.linalg.norm(toward))
     radius = distance * np.exp(rng.uniform(np.log(0.01), np.log(0.3)))
     frame = np.linalg.svd(unit(toward[None]))[2][1:]  # (2, 3): across the way to the lamp
-    cells = _stratified(rng, SETS * _EACH) * 2 - 1
-    lamp = position + radius * (cells @ frame).reshape(_EACH, SETS, 3).transpose(1, 0, 2)
+    cells = _stratified(rng, SETS * _SAMPLES_PER_SET) * 2 - 1
+    lamp = position + radius * (cells @ frame).reshape(_SAMPLES_PER_SET, SETS, 3).transpose(1, 0, 2)
     warm = np.array([1.0, 1.0, 1.0]) + rng.uniform(-0.25, 0.35) * np.array([0.5, 0.0, -0.6])
-    share = rng.uniform(0.12, 0.9)  # of the light that is ambient
-    ambient, sky = share * 0.7 * (2 - warm), share * rng.uniform(0.0, 0.6) * np.array([0.9, 1.0, 1.15])
+    ambient_fraction = rng.uniform(0.12, 0.9)
+    ambient, sky = (
+        ambient_fraction * 0.7 * (2 - warm),
+        ambient_fraction * rng.uniform(0.0, 0.6) * np.array([0.9, 1.0, 1.15]),
+    )
     cookie = _cookie(rng, frame, middle, distance) if rng.random() < 0.22 else _clear
-    strength = (1.15 - share) * distance**2
-    directions = _hemisphere(_stratified(rng, SETS * _EACH)).reshape(_EACH, SETS, 3).transpose(1, 0, 2)
+    strength = (1.15 - ambient_fraction) * distance**2
+    directions = (
+        _hemisphere(_stratified(rng, SETS * _SAMPLES_PER_SET)).reshape(_SAMPLES_PER_SET, SETS, 3).transpose(1, 0, 2)
+    )
     return Lighting(lamp, strength * warm, cookie, ambient, sky, directions, 0.35 * extent)
 
 
@@ -93,7 +109,7 @@ def _clear(points: Array) -> Array:
 
 
 def _cookie(rng: np.random.Generator, frame: Array, middle: Array, distance: float) -> Cookie:
-    """Return shadows of slats, of a window's bars or of leaves, projected onto everything along parallel lines."""
+    """Return the shadow pattern of slats, window bars or leaves, projected along parallel lines."""
     kind, soft = rng.integers(3), rng.uniform(0.01, 0.12)
     period, dark = distance * rng.uniform(0.06, 0.3), rng.uniform(0.0, 0.45)
     turn, seed, cut = rng.uniform(0, np.pi), int(rng.integers(1 << 31)), rng.uniform(0.42, 0.58)
@@ -113,31 +129,31 @@ def _cookie(rng: np.random.Generator, frame: Array, middle: Array, distance: flo
     return through
 
 
-def lifted(hits: Hits, extent: float) -> Array:
-    """Return the points (3, N) a little above the surface, out of reach of the triangles that stand for it."""
+def offset_points(hits: Hits, extent: float) -> Array:
+    """Return the points (3, N) moved along their normals, so that their own triangles do not shadow them."""
     rise = 2e-4 * extent + 2.2 * np.abs(hits.bulge)
     return hits.points + rise * hits.normals
 
 
 def visibility(tracer: Tracer, lighting: Lighting, hits: Hits, which: Index, extent: float) -> tuple[Array, Array]:
-    """Return the seen shares (N,) of the lamp and of the surroundings, from the samples of the sets ``which`` (N,)."""
-    start = lifted(hits, extent)
+    """Return the visible fractions (N,) of the lamp and of the surroundings, from the sample sets ``which`` (N,)."""
+    start = offset_points(hits, extent)
     lamp, open_ = np.zeros(len(which)), np.zeros(len(which))
     n = hits.normals
     side = np.where(np.abs(n[2]) < 0.9, np.stack((-n[1], n[0], 0 * n[2])), np.stack((0 * n[0], -n[2], n[1])))
     side /= np.sqrt((side**2).sum(0))
     up = np.stack((n[1] * side[2] - n[2] * side[1], n[2] * side[0] - n[0] * side[2], n[0] * side[1] - n[1] * side[0]))
-    for k in range(_EACH):
+    for k in range(_SAMPLES_PER_SET):
         toward = lighting.lamp[which, k].T - start
         facing = np.flatnonzero((toward * n).sum(0) > 0)
-        lamp[facing] += ~tracer.blocked(start[:, facing], toward[:, facing])
-        a, b, c = lighting.reach * lighting.directions[which, k].T
-        open_ += ~tracer.blocked(start, a * side + b * up + c * n)
-    return lamp / _EACH, open_ / _EACH
+        lamp[facing] += ~tracer.is_blocked(start[:, facing], toward[:, facing])
+        a, b, c = lighting.occlusion_distance * lighting.directions[which, k].T
+        open_ += ~tracer.is_blocked(start, a * side + b * up + c * n)
+    return lamp / _SAMPLES_PER_SET, open_ / _SAMPLES_PER_SET
 
 
-def arriving(lighting: Lighting, points: Array, normals: Array, seen: tuple[Array, Array]) -> tuple[Array, Array]:
-    """Return the light (3, N) that surfaces get, and the lamp's part at a right angle (N,) for highlights."""
+def incident_light(lighting: Lighting, points: Array, normals: Array, seen: tuple[Array, Array]) -> tuple[Array, Array]:
+    """Return the light (3, N) that arrives at surfaces, and the lamp's at normal incidence (N,) for highlights."""
     toward = lighting.lamp.mean((0, 1))[:, None] - points
     square = (toward**2).sum(0)
     direct = seen[0] * lighting.cookie(points) / square

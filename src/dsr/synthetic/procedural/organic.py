@@ -1,4 +1,4 @@
-"""Things that grew or were modelled by hand: smooth unions of blobs with folds, displaced balls, leaves, plants."""
+"""Organic shapes: smooth unions of blobs with folds, lumpy balls, leaves, plants."""
 
 from __future__ import annotations
 
@@ -7,20 +7,20 @@ from dataclasses import dataclass
 import numpy as np
 from skimage.measure import marching_cubes
 
-from dsr.synthetic.procedural.shape import Shape, about, merged, surface, tube, unit
-from dsr.synthetic.procedural.solids import grounded
+from dsr.synthetic.procedural.shape import Shape, merge, rotation_about, surface, tube, unit
+from dsr.synthetic.procedural.solids import place_on_ground
 from dsr.synthetic.surfaces import Array
 
 
 @dataclass(frozen=True, eq=False)
 class Blobs:
-    """The field sum of B Gaussian blobs - 0.5 + ripples, positive inside; everything has a closed gradient.
+    """A field, the sum of B Gaussian blobs - 0.5 + ripples, positive inside, with a gradient in closed form.
 
     Args:
         centres, radii: (B, 3) of the blobs along the coordinate axes.
         weights: (B,) 1 for a blob, below 0 for a hollow.
         waves: (K, 3) wave vectors of the ripples; phases, heights: (K,).
-        ridged: whether ripples are folds (sharp below) instead of hills.
+        ridged: whether ripples are folds with sharp valleys instead of hills.
 
     """
 
@@ -41,9 +41,9 @@ class Blobs:
             len(self.centres), -1
         )
         swing = (turns[0].T @ (turns[1][:, :, None] * turns[2][:, None, :]).reshape(len(self.heights), -1)).imag
-        return (flat - 0.5 + self._shaped(swing)[0]).reshape([len(a) for a in axes])
+        return (flat - 0.5 + self._shape_ripples(swing)[0]).reshape([len(a) for a in axes])
 
-    def _shaped(self, swing: Array) -> tuple[Array, Array]:
+    def _shape_ripples(self, swing: Array) -> tuple[Array, Array]:
         """Return the ripples and their derivative for sums of waves."""
         if not self.ridged:
             return swing, np.ones_like(swing)
@@ -60,12 +60,12 @@ class Blobs:
             total += bell
             gradient -= 2 * bell[:, None] * off / radius
         phase = points @ self.waves.T + self.phases
-        swing, slope = self._shaped(np.sin(phase) @ self.heights)
+        swing, slope = self._shape_ripples(np.sin(phase) @ self.heights)
         return total + swing, gradient + slope[:, None] * ((np.cos(phase) * self.heights) @ self.waves)
 
 
 def polygonise(field: Blobs, cells: int) -> Shape:
-    """Return the surface where the field is 0, its vertices and normals exact, from ``cells`` per longest side."""
+    """Return the zero set of the field with exact vertices and normals, from ``cells`` cells along the longest side."""
     low = (field.centres - 1.9 * field.radii).min(0)
     high = (field.centres + 1.9 * field.radii).max(0)
     step = (high - low).max() / cells
@@ -111,7 +111,7 @@ def creature(rng: np.random.Generator, cells: int = 96) -> Shape:
     field = Blobs(
         np.array(centres), np.array(radii), np.ones(len(radii)), waves, phases, heights, bool(rng.random() < 0.5)
     )
-    return grounded(polygonise(field, cells))
+    return place_on_ground(polygonise(field, cells))
 
 
 _FACE = np.array(
@@ -175,8 +175,8 @@ def figure(rng: np.random.Generator, cells: int = 120) -> Shape:
         waves, heights = rng.normal(size=(count, 3)) * [60, 40, 9], rng.uniform(0.005, 0.03, count)
     phases = rng.uniform(0, 6.28, count)
     field = Blobs(blobs[:, :3], blobs[:, 3:6], blobs[:, 6], waves, phases, heights, bool(rng.random() < 0.5))
-    shape = grounded(polygonise(field, cells))
-    return shape.stretched(1 / float(shape.vertices[:, 2].max()))
+    shape = place_on_ground(polygonise(field, cells))
+    return shape.scale(1 / float(shape.vertices[:, 2].max()))
 
 
 def pebble(rng: np.random.Generator, cells: int = 56) -> Shape:
@@ -187,7 +187,7 @@ def pebble(rng: np.random.Generator, cells: int = 56) -> Shape:
     field = Blobs(
         np.zeros((1, 3)), size[None] * 1.2, np.ones(1), waves, phases, heights * rough * 4, bool(rng.random() < 0.5)
     )
-    return grounded(polygonise(field, cells))
+    return place_on_ground(polygonise(field, cells))
 
 
 def leaf(rng: np.random.Generator, length: float, wide: float) -> Shape:
@@ -211,15 +211,15 @@ def plant(rng: np.random.Generator) -> list[Shape]:
         yaw, rise = rng.uniform(0, 360), rng.uniform(0.35, 0.9)
         s = np.linspace(0, 1, 8)
         out = rng.uniform(0.1, 0.35)
-        path = np.column_stack((out * s**1.8, 0.05 * np.sin(4 * s), rise * s)) @ about(2, yaw).T
+        path = np.column_stack((out * s**1.8, 0.05 * np.sin(4 * s), rise * s)) @ rotation_about(2, yaw).T
         stems.append(tube(path, 0.012, 8))
         for at in rng.uniform(0.35, 1.0, 2 if slender else 4):
             spot = path[int(at * 7)]
             size = rng.uniform(0.35, 0.6) if slender else rng.uniform(0.15, 0.3)
             blade = leaf(rng, size, size * (0.08 if slender else rng.uniform(0.22, 0.4)))
-            turn = about(2, yaw + rng.uniform(-90, 90)) @ about(1, -rng.uniform(0, 70))
-            leaves.append(blade.turned(turn).moved(spot))
-    return [merged(leaves), merged(stems)]
+            turn = rotation_about(2, yaw + rng.uniform(-90, 90)) @ rotation_about(1, -rng.uniform(0, 70))
+            leaves.append(blade.rotate(turn).translate(spot))
+    return [merge(leaves), merge(stems)]
 
 
 def branches(rng: np.random.Generator) -> Shape:
@@ -236,4 +236,4 @@ def branches(rng: np.random.Generator) -> Shape:
             for _ in range(2 + int(rng.random() < 0.3)):
                 heading = unit((way + spread * rng.normal(size=3))[None])[0]
                 tips.append((path[-1], heading, length * rng.uniform(0.55, 0.9), 0.7 * radius))
-    return merged(parts)
+    return merge(parts)

@@ -1,8 +1,8 @@
 """Random paints: functions from the paint's coordinates to linear RGB.
 
 A paint takes points (3, N) in a shape's own frame and the chart (3, N), two surface coordinates in metres and a tone,
-and returns (3, N). ``scale`` is the size in metres of the thing that is painted. Most patterns know nothing of the
-shape's edges: they are the false geometry that a photo must not be mistaken for.
+and returns (3, N). ``scale`` is the size of the painted object in metres. Most patterns are independent
+of the shape's edges, so that a network learns not to take edges of texture for edges of depth.
 """
 
 from __future__ import annotations
@@ -11,13 +11,13 @@ from collections.abc import Callable
 
 import numpy as np
 
-from dsr.synthetic.procedural.shape import any_turn
+from dsr.synthetic.procedural.shape import random_rotation
 from dsr.synthetic.surfaces import Array, rotation
 from dsr.synthetic.textures import noise
 
 Paint = Callable[[Array, Array], Array]
 Palette = Array
-_TILT = rotation(37.0, 31.0, 29.0)  # the noise's lattice lies along no edge
+_TILT = rotation(37.0, 31.0, 29.0)  # so that the noise's lattice is not parallel to edges
 _FAMILIES = {
     "wood": ((0.40, 0.22, 0.10), (0.16, 0.07, 0.03), (0.60, 0.42, 0.24), (0.30, 0.15, 0.07)),
     "stone": ((0.55, 0.52, 0.47), (0.33, 0.31, 0.29), (0.70, 0.66, 0.58), (0.20, 0.19, 0.19)),
@@ -31,7 +31,7 @@ _FAMILIES = {
 
 
 def palette(rng: np.random.Generator, family: str, count: int = 4) -> Palette:
-    """Return ``count`` linear RGB colours (count, 3): of a material, or any ("any")."""
+    """Return ``count`` linear RGB colours (count, 3) of a material, or of any colour for "any"."""
     if family in _FAMILIES:
         table = np.array(_FAMILIES[family])
         picked = table[rng.integers(len(table), size=count)]
@@ -61,7 +61,7 @@ def mix(colours: Palette, position: Array) -> Array:
 
 
 def solid_colour(rng: np.random.Generator, family: str, scale: float) -> Paint:
-    """Return one colour, nearly."""
+    """Return a nearly uniform colour."""
     colour = palette(rng, family, 1)[0][:, None]
     depth, cell, seed = rng.choice([0.0, 0.06, 0.25]), scale * rng.uniform(0.05, 0.4), _seed(rng)
     return lambda p, chart: colour * (1 + depth * (fractal(p, cell, seed, 2) - 0.5))
@@ -191,7 +191,7 @@ def toned(rng: np.random.Generator, family: str, scale: float) -> Paint:
 def speckles(rng: np.random.Generator, family: str, scale: float) -> Paint:
     """Return granite, terrazzo, gravel or coarse cloth."""
     colours, seed, cell = palette(rng, family), _seed(rng), scale * np.exp(rng.uniform(-5.2, -3.0))
-    turn = any_turn(rng)
+    turn = random_rotation(rng)
 
     def paint(p: Array, chart: Array) -> Array:
         value = noise(turn @ p, cell, seed) * 0.6 + 0.4 * noise(p, 2.7 * cell, seed + 1)

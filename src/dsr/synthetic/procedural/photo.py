@@ -1,4 +1,4 @@
-"""From a scene to a photo: visibility, shading, antialiasing, and what a camera adds."""
+"""From a scene to a photo: visibility, shading, antialiasing, and the camera's exposure, lens and noise."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, maximum_filter, minimum_filter
 
-from dsr.synthetic.procedural.lighting import SETS, Lighting, arriving, visibility
+from dsr.synthetic.procedural.lighting import SETS, Lighting, incident_light, visibility
 from dsr.synthetic.procedural.paints import Paint
 from dsr.synthetic.procedural.shape import Shape
 from dsr.synthetic.procedural.tracer import Hits, Tracer
@@ -17,12 +17,12 @@ from dsr.synthetic.surfaces import Array
 
 _CHUNK = 1 << 15
 _SUBPIXELS = ((-0.375, -0.125), (0.125, -0.375), (0.375, 0.125), (-0.125, 0.375))
-_MOST_ROUGH = 0.45  # share of the pixels that are cast again at most
+_MAX_SUPERSAMPLED = 0.45  # largest fraction of the pixels that are supersampled
 
 
 @dataclass(frozen=True, eq=False)
 class Body:
-    """A shape with its paint, and the strength and sharpness of its highlights."""
+    """A shape with its paint, and the strength ``gloss`` and exponent ``shine`` of its highlights."""
 
     shape: Shape
     paint: Paint
@@ -32,7 +32,14 @@ class Body:
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """Where rays start, (3,), and the rays (3, H, W), of length 1 along the view, with their steps (3,) per pixel."""
+    """The rays of a camera.
+
+    Args:
+        eye: (3,) origin of the rays in metres.
+        rays: (3, H, W) directions of length 1 along the optical axis.
+        right, down: (3,) steps of the directions from pixel to pixel.
+
+    """
 
     eye: Array
     rays: Array
@@ -44,40 +51,40 @@ def radiance(tracer: Tracer, bodies: Sequence[Body], view: View, lighting: Light
     """Return the linear RGB (3, H, W) and the depth (H, W) of a view."""
     shape = view.rays.shape[1:]
     rays = view.rays.reshape(3, -1)
-    parts = [tracer.hits(view.eye, rays[:, i : i + _CHUNK]) for i in range(0, rays.shape[1], _CHUNK)]
-    hits = _joined(parts)
+    parts = [tracer.trace(view.eye, rays[:, i : i + _CHUNK]) for i in range(0, rays.shape[1], _CHUNK)]
+    hits = _join_hits(parts)
     extent = float(np.median(hits.depth))
     which = _pattern(shape)
     pieces = [
         visibility(tracer, lighting, part, which[i * _CHUNK :][: len(part.depth)], extent)
         for i, part in enumerate(parts)
     ]
-    seen = _smoothed(np.stack([np.concatenate(p) for p in zip(*pieces, strict=True)]), hits, shape)
+    seen = _smooth_visibility(np.stack([np.concatenate(p) for p in zip(*pieces, strict=True)]), hits, shape)
     colour = shade(bodies, hits, lighting, view.eye, seen)
     display = np.clip(colour / (2.5 * np.median(colour) + 1e-9), 0, 1) ** (1 / 2.2)
     contrast = _contrast(display.reshape(3, *shape))
-    limit = max(0.04, float(np.quantile(contrast, 1 - _MOST_ROUGH)))
+    limit = max(0.04, float(np.quantile(contrast, 1 - _MAX_SUPERSAMPLED)))
     rough = np.flatnonzero(contrast > limit)
     for start in range(0, rough.size, _CHUNK):
         pixels = rough[start : start + _CHUNK]
-        colour[:, pixels] = _refined(tracer, bodies, view, lighting, hits, seen, pixels)
+        colour[:, pixels] = _supersample(tracer, bodies, view, lighting, hits, seen, pixels)
     return colour.reshape(3, *shape), hits.depth.reshape(shape)
 
 
-def _joined(parts: Sequence[Hits]) -> Hits:
-    """Return several parts as one."""
+def _join_hits(parts: Sequence[Hits]) -> Hits:
+    """Return the hits of several parts as one."""
     names = Hits.__dataclass_fields__
     return Hits(**{name: np.concatenate([getattr(part, name) for part in parts], axis=-1) for name in names})
 
 
 def _pattern(shape: tuple[int, ...]) -> NDArray[np.intp]:
-    """Return the set of light samples (H * W,) of each pixel: all of them in each 4 x 4 window."""
+    """Return the set of light samples (H * W,) of each pixel; each 4 x 4 window has every set once."""
     v, u = np.indices(shape)
     return np.asarray((u % 4 + 4 * (v % 4)) * 7 % SETS).ravel()
 
 
-def _smoothed(seen: Array, hits: Hits, shape: tuple[int, ...]) -> Array:
-    """Return what is seen (2, N) averaged over 4 x 4 pixels of the same surface."""
+def _smooth_visibility(seen: Array, hits: Hits, shape: tuple[int, ...]) -> Array:
+    """Return the visibilities (2, N) averaged over 4 x 4 pixels of the same surface."""
     height, width = shape
     values = seen.reshape(2, height, width).astype(np.float32)
     normals = hits.normals.reshape(3, height, width).astype(np.float32)
@@ -98,14 +105,14 @@ def _smoothed(seen: Array, hits: Hits, shape: tuple[int, ...]) -> Array:
 
 
 def _overlap(count: int, step: int) -> tuple[slice, slice]:
-    """Return the slices of those that have a neighbour ``step`` further, and of the neighbours."""
+    """Return the slice of the indices that have a neighbour ``step`` further, and the slice of the neighbours."""
     here = slice(max(0, -step), count - max(0, step))
     return here, slice(here.start + step, here.stop + step)
 
 
 def shade(bodies: Sequence[Body], hits: Hits, lighting: Lighting, eye: Array, seen: Array) -> Array:
-    """Return the linear RGB (3, N) that comes from the hits, given the visibilities (2, N)."""
-    light, direct = arriving(lighting, hits.points, hits.normals, (seen[0], seen[1]))
+    """Return the linear RGB (3, N) of the hits, given the visibilities (2, N) of lamp and surroundings."""
+    light, direct = incident_light(lighting, hits.points, hits.normals, (seen[0], seen[1]))
     half = _unit(_unit(lighting.lamp.mean((0, 1))[:, None] - hits.points) + _unit(eye[:, None] - hits.points))
     mirror = np.maximum((half * hits.normals).sum(0), 0.0)
     out = np.empty_like(light)
@@ -125,7 +132,7 @@ def _unit(vectors: Array) -> Array:
     return vectors / np.sqrt((vectors**2).sum(0))
 
 
-def _refined(
+def _supersample(
     tracer: Tracer,
     bodies: Sequence[Body],
     view: View,
@@ -140,7 +147,7 @@ def _refined(
     row, column = np.divmod(pixels, width)
     rays = view.rays.reshape(3, -1)[:, pixels]
     for du, dv in _SUBPIXELS:
-        fine = tracer.hits(view.eye, rays + du * view.right[:, None] + dv * view.down[:, None])
+        fine = tracer.trace(view.eye, rays + du * view.right[:, None] + dv * view.down[:, None])
         best, nearest = pixels, np.full(pixels.size, np.inf)
         for i, j in ((0, 0), (0, 1), (1, 0), (1, 1)):
             v = np.clip(row + i * int(np.sign(dv)), 0, height - 1)
@@ -160,7 +167,7 @@ def _contrast(image: Array) -> Array:
     return np.asarray(difference.max(0).ravel(), dtype=np.float64)
 
 
-def developed(linear: Array, rng: np.random.Generator) -> NDArray[np.uint8]:
+def develop(linear: Array, rng: np.random.Generator) -> NDArray[np.uint8]:
     """Return the photo (H, W, 3) of linear RGB (3, H, W): exposure, white balance, lens, noise, tone curve."""
     height, width = linear.shape[1:]
     light, gamma = np.quantile(linear.max(0), rng.uniform(0.85, 0.98)), rng.uniform(1.9, 2.4)

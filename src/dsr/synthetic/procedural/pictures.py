@@ -1,4 +1,4 @@
-"""Flat pictures as paint: posters, pages of text, fake facades, photograph-like noise; drawn once, then sampled."""
+"""Pictures as paint: posters, pages of text, painted facades, noise like photographs, scribbles."""
 
 from __future__ import annotations
 
@@ -31,8 +31,8 @@ def _sheet(colour: tuple[float, ...]) -> Image:
     return np.full((_SIDE, _SIDE, 3), colour, dtype=np.uint8)
 
 
-def _whole(rng: np.random.Generator, low: float, high: float) -> int:
-    """Return a random whole number between shares of the picture's side."""
+def _random_pixels(rng: np.random.Generator, low: float, high: float) -> int:
+    """Return a random number of pixels between two fractions of the picture's side."""
     return int(rng.uniform(low, high) * _SIDE)
 
 
@@ -40,13 +40,13 @@ def poster(rng: np.random.Generator, colours: Palette) -> Image:
     """Return rectangles, discs, lines and a title."""
     image = _sheet(_colour(rng, colours))
     for _ in range(rng.integers(3, 16)):
-        x, y = _whole(rng, -0.1, 1), _whole(rng, -0.1, 1)
+        x, y = _random_pixels(rng, -0.1, 1), _random_pixels(rng, -0.1, 1)
         kind, width = rng.integers(4), int(rng.choice([-1, -1, 2, 6]))
         if kind == 0:
-            corner = (x + _whole(rng, 0.05, 0.6), y + _whole(rng, 0.05, 0.6))
+            corner = (x + _random_pixels(rng, 0.05, 0.6), y + _random_pixels(rng, 0.05, 0.6))
             cv2.rectangle(image, (x, y), corner, _colour(rng, colours), width)
         elif kind == 1:
-            cv2.circle(image, (x, y), _whole(rng, 0.03, 0.3), _colour(rng, colours), width, cv2.LINE_AA)
+            cv2.circle(image, (x, y), _random_pixels(rng, 0.03, 0.3), _colour(rng, colours), width, cv2.LINE_AA)
         elif kind == 2:
             corners = rng.integers(0, _SIDE, (3, 2)).astype(np.int32)
             cv2.fillPoly(image, [corners], _colour(rng, colours), cv2.LINE_AA)
@@ -74,14 +74,14 @@ def page(rng: np.random.Generator, colours: Palette) -> Image:
         cv2.putText(image, text, (14, y), _FONTS[0], size, ink, 1, cv2.LINE_AA)
         y += int(28 * size)
         if rng.random() < 0.07:
-            high = _whole(rng, 0.15, 0.35)
+            high = _random_pixels(rng, 0.15, 0.35)
             cv2.rectangle(image, (14, y), (_SIDE - 14, y + high), _colour(rng, colours), -1)
             y += high + int(28 * size)
     return image
 
 
 def facade(rng: np.random.Generator, colours: Palette) -> Image:
-    """Return painted boxes with lit and dark sides and cast shadows: geometry that is not there."""
+    """Return painted boxes with lit and dark sides and cast shadows, which are not geometry."""
     image = _sheet(_colour(rng, colours))
     image = (image * np.linspace(0.7, 1.0, _SIDE)[:, None, None]).astype(np.uint8)
     count, margin = int(rng.integers(2, 7)), rng.uniform(0.1, 0.3)
@@ -104,7 +104,7 @@ def facade(rng: np.random.Generator, colours: Palette) -> Image:
 
 
 def photograph(rng: np.random.Generator, colours: Palette) -> Image:
-    """Return coloured noise with the spectrum of photographs, cut by a few occluding outlines."""
+    """Return coloured noise with the spectrum of photographs and a few occluding outlines."""
     image = np.zeros((_SIDE, _SIDE, 3))
     for _ in range(rng.integers(1, 5)):
         weight = spectrum(rng, _SIDE, rng.uniform(1.1, 1.9))
@@ -130,7 +130,7 @@ def scribble(rng: np.random.Generator, colours: Palette) -> Image:
     return image
 
 
-def sampled(image: Image, size: float, *, turn: float = 0.0) -> Paint:
+def tile_picture(image: Image, size: float, *, turn: float = 0.0) -> Paint:
     """Return the paint that repeats the picture (S, S, 3), ``size`` metres wide, turned by ``turn`` radians."""
     count = len(image)
     flat = np.ascontiguousarray(((image / np.float32(255)) ** 2).reshape(-1, 3).T, dtype=np.float32)
@@ -153,7 +153,7 @@ PICTURES = (poster, page, facade, photograph, scribble)
 
 
 def picture_paint(rng: np.random.Generator, family: str, scale: float) -> Paint:
-    """Return a random picture, one or a few of it over ``scale`` metres."""
+    """Return a random picture as paint, repeated one to three times over ``scale`` metres."""
     colours = palette(rng, family, 6)
     image = PICTURES[rng.choice(5, p=[0.3, 0.15, 0.15, 0.25, 0.15])](rng, colours)
-    return sampled(image, scale * rng.uniform(0.3, 1.1), turn=rng.choice([0.0, rng.uniform(0, 6.28)]))
+    return tile_picture(image, scale * rng.uniform(0.3, 1.1), turn=rng.choice([0.0, rng.uniform(0, 6.28)]))

@@ -1,6 +1,6 @@
 """Heightfields: reliefs, masonry, folds, crumpled cloth, ground. Heights are (R, C) on a grid over [0, 1] x [0, 1].
 
-Each maker returns heights in about [0, 1], the tone that paint may follow, and how high 1 is, as a share of the side.
+Each function returns heights in about [0, 1], a tone for paint, and the height of 1 as a fraction of the side.
 """
 
 from __future__ import annotations
@@ -22,9 +22,11 @@ _FACE = cv2.FONT_HERSHEY_TRIPLEX
 def spectrum(rng: np.random.Generator, count: int, slope: float, squeeze: float = 1.0) -> Array:
     """Return a periodic random surface (count, count) whose amplitudes fall with frequency**-slope, from 0 to 1."""
     fy, fx = np.meshgrid(np.fft.fftfreq(count), np.fft.rfftfreq(count) * squeeze, indexing="ij")
-    reach = np.hypot(fx, fy) * count
+    frequency = np.hypot(fx, fy) * count
     waves = (
-        np.fft.rfft2(rng.normal(size=(count, count))) * np.maximum(reach, 1.0) ** -slope * np.exp(-((reach / 90) ** 2))
+        np.fft.rfft2(rng.normal(size=(count, count)))
+        * np.maximum(frequency, 1.0) ** -slope
+        * np.exp(-((frequency / 90) ** 2))
     )
     waves[0, 0] = 0
     out = np.fft.irfft2(waves, s=(count, count))
@@ -170,16 +172,16 @@ def relief(rng: np.random.Generator, maker: Maker, side: float, count: int = 300
     """Return a square relief of ``side`` metres: (x, y) in the middle of the origin, heights along z.
 
     Args:
-        rng: where the randomness comes from.
+        rng: source of random numbers.
         maker: one of :data:`RELIEFS`.
-        side: metres.
-        count: grid points per side.
-        bend: how much the sheet curves, as height of the middle over the edges along x, in sides.
+        side: length of a side in metres.
+        count: number of grid points per side.
+        bend: height of the middle above the edges along x as a fraction of the side.
 
     """
-    height, tone, share = maker(rng, count)
+    height, tone, amplitude = maker(rng, count)
     u, v = _grid(count)
-    z = side * (share * height + bend * (1 - (2 * u - 1) ** 2))
+    z = side * (amplitude * height + bend * (1 - (2 * u - 1) ** 2))
     return surface(np.stack((side * (u - 0.5), side * (v - 0.5), z), axis=-1), tone=tone)
 
 

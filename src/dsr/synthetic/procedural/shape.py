@@ -1,7 +1,7 @@
-"""Triangle meshes with what the renderer needs at every vertex, and the general ways to make them.
+"""Triangle meshes with normals and paint coordinates, and general functions that make them.
 
-A shape stands for the curved surface that its vertex normals suggest (see :mod:`dsr.synthetic.procedural.tracer`), so
-edges that are to stay sharp have their vertices twice. Local frames have z up; lengths are in metres.
+A shape stands for the curved surface that its vertex normals define (see :mod:`dsr.synthetic.procedural.tracer`), so
+the vertices of sharp edges occur twice, with different normals. Local frames have z up; lengths are in metres.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ class Shape:
 
     Args:
         vertices: (V, 3) in metres.
-        faces: (F, 3) numbers of vertices; the sense does not matter.
-        normals: (V, 3) unit normals; either side.
-        chart: (V, 3) surface coordinates for paint: two in metres, and a tone in [0, 1] such as the relief's height.
-        rest: (V, 3) where the vertex was in the shape's own frame, for solid paint.
+        faces: (F, 3) vertex indices, in any orientation.
+        normals: (V, 3) unit normals, to either side.
+        chart: (V, 3) surface coordinates for paint: two in metres and a tone in [0, 1], such as the height of a relief.
+        rest: (V, 3) coordinates of the vertices in the shape's own frame, for solid paint.
 
     """
 
@@ -37,16 +37,16 @@ class Shape:
     chart: Array
     rest: Array
 
-    def moved(self, shift: Sequence[float] | Array) -> Shape:
-        """Return the shape moved by ``shift`` (3,)."""
+    def translate(self, shift: Sequence[float] | Array) -> Shape:
+        """Return the shape translated by ``shift`` (3,) metres."""
         return replace(self, vertices=self.vertices + np.asarray(shift, dtype=np.float64))
 
-    def turned(self, turn: Array) -> Shape:
-        """Return the shape turned about the origin by the rotation ``turn`` (3, 3)."""
+    def rotate(self, turn: Array) -> Shape:
+        """Return the shape rotated about the origin by the matrix ``turn`` (3, 3)."""
         return replace(self, vertices=self.vertices @ turn.T, normals=self.normals @ turn.T)
 
-    def stretched(self, factors: Sequence[float] | float) -> Shape:
-        """Return the shape stretched along its axes, paint and all staying metric."""
+    def scale(self, factors: Sequence[float] | float) -> Shape:
+        """Return the shape scaled along its axes, its paint coordinates with it."""
         by = np.broadcast_to(np.asarray(factors, dtype=np.float64), (3,))
         chart = self.chart * [by.prod() ** (1 / 3), by.prod() ** (1 / 3), 1.0]
         return Shape(self.vertices * by, self.faces, unit(self.normals / by), chart, self.rest * by)
@@ -58,23 +58,23 @@ def unit(vectors: Array) -> Array:
     return np.where(length > 1e-300, vectors / np.maximum(length, 1e-300), [0.0, 0.0, 1.0])
 
 
-def about(axis: int, degrees: float) -> Array:
-    """Return the rotation (3, 3) about the coordinate axis ``axis``."""
+def rotation_about(axis: int, degrees: float) -> Array:
+    """Return the matrix (3, 3) of the rotation about the coordinate axis ``axis``."""
     i, j = ((1, 2), (2, 0), (0, 1))[axis]
     turn, angle = np.eye(3), np.deg2rad(degrees)
     turn[[i, i, j, j], [i, j, i, j]] = np.cos(angle), -np.sin(angle), np.sin(angle), np.cos(angle)
     return turn
 
 
-def any_turn(rng: np.random.Generator) -> Array:
-    """Return a random rotation (3, 3), uniform over all."""
+def random_rotation(rng: np.random.Generator) -> Array:
+    """Return a uniformly distributed random rotation matrix (3, 3)."""
     q = unit(rng.normal(size=(1, 3)))[0]
-    spin = about(2, rng.uniform(0, 360))
+    spin = rotation_about(2, rng.uniform(0, 360))
     other = unit(np.cross(q, [0.3, 0.5, 0.81])[None])[0]
     return np.asarray(np.stack((other, np.cross(q, other), q), axis=1) @ spin)
 
 
-def merged(shapes: Sequence[Shape]) -> Shape:
+def merge(shapes: Sequence[Shape]) -> Shape:
     """Return several shapes as one."""
     starts = np.cumsum([0, *(len(s.vertices) for s in shapes[:-1])])
     faces = np.concatenate([s.faces + start for s, start in zip(shapes, starts, strict=True)])
@@ -127,11 +127,11 @@ def _grid_normals(points: Array) -> Array:
 
 
 def lathe(sections: Sequence[Array], segments: int = 80) -> Shape:
-    """Return the profile ``sections`` turned about the z axis.
+    """Return the surface of revolution of the profile ``sections`` about the z axis.
 
     Args:
-        sections: each (K, 2): radius and height along a smooth piece; the profile is sharp between two pieces.
-        segments: steps around.
+        sections: radius and height along the smooth pieces of the profile, (K, 2) each; edges between pieces are sharp.
+        segments: number of segments around the axis.
 
     """
     angle = np.linspace(0, 2 * np.pi, segments + 1)
@@ -144,7 +144,7 @@ def lathe(sections: Sequence[Array], segments: int = 80) -> Shape:
         normals = np.concatenate((tangent[:, 1:, None] * circle, np.zeros((len(section), len(angle), 1))), axis=2)
         normals[..., 2] = -tangent[:, :1]
         parts.append(surface(points, normals))
-    return merged(parts)
+    return merge(parts)
 
 
 def extrusion(outlines: Sequence[Array], height: float, crease: float = 32.0) -> Shape:
@@ -153,7 +153,7 @@ def extrusion(outlines: Sequence[Array], height: float, crease: float = 32.0) ->
     Args:
         outlines: (K, 2) closed polygons: the outer one, then holes.
         height: in metres.
-        crease: degrees; flatter corners of the outline are rounded off in the normals.
+        crease: angle in degrees below which corners of the outline get smooth normals.
 
     """
     sides = [_side(outline, height, crease) for outline in outlines]
@@ -165,7 +165,7 @@ def extrusion(outlines: Sequence[Array], height: float, crease: float = 32.0) ->
         points = np.column_stack((flat, np.full(len(flat), z)))
         normals = np.broadcast_to([0.0, 0.0, 1.0], points.shape)
         caps.append(Shape(points, faces, normals, np.column_stack((flat, 0 * flat[:, 0])), points))
-    return merged([*sides, *caps])
+    return merge([*sides, *caps])
 
 
 def _side(outline: Array, height: float, crease: float) -> Shape:
@@ -198,10 +198,9 @@ def tube(path: Array, radius: Array | float, segments: int = 20) -> Shape:
     angle = np.linspace(0, 2 * np.pi, segments + 1)
     frame = np.array(frames)  # (K, 2, 3)
     out = np.cos(angle)[:, None] * frame[:, None, 0] + np.sin(angle)[:, None] * frame[:, None, 1]  # (K, S, 3)
-    reach = np.broadcast_to(radius, (len(path),))[:, None, None]
-    ring = path[:, None] + reach * out
+    ring = path[:, None] + np.broadcast_to(radius, (len(path),))[:, None, None] * out
     caps = [_disc(path[i], ring[i], tangent[i]) for i in (0, -1)]
-    return merged([surface(ring, out), *caps])
+    return merge([surface(ring, out), *caps])
 
 
 def _disc(centre: Array, ring: Array, normal: Array) -> Shape:
@@ -222,4 +221,4 @@ def box(size: Sequence[float] | Array) -> Shape:
     e = np.diag(np.asarray(size, dtype=np.float64))
     low, high = np.array([-x / 2, -y / 2, 0.0]), np.array([x / 2, y / 2, float(z)])
     pairs = ((0, 1), (0, 2), (1, 2))
-    return merged([quad(low, e[i], e[j]) for i, j in pairs] + [quad(high, -e[i], -e[j]) for i, j in pairs])
+    return merge([quad(low, e[i], e[j]) for i, j in pairs] + [quad(high, -e[i], -e[j]) for i, j in pairs])

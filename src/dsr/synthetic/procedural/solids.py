@@ -1,4 +1,4 @@
-"""Small solid things: functions from a random generator to a shape about 1 in size that stands on z = 0."""
+"""Small solid objects: functions from a random generator to a shape about 1 in size that stands on z = 0."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from scipy.interpolate import CubicSpline, PchipInterpolator
 
 from dsr.synthetic.procedural.shape import (
     Shape,
-    about,
-    any_turn,
     box,
     extrusion,
     lathe,
-    merged,
+    merge,
     quad,
+    random_rotation,
+    rotation_about,
     surface,
     tube,
     unit,
@@ -28,10 +28,10 @@ Maker = Callable[[np.random.Generator], Shape]
 _GLYPHS = "ABCDEFGHJKLMNPRSTUVXYZ23456789&QO"
 
 
-def grounded(shape: Shape) -> Shape:
+def place_on_ground(shape: Shape) -> Shape:
     """Return the shape moved so that it stands on z = 0 with its middle over the origin."""
     low, high = shape.vertices.min(0), shape.vertices.max(0)
-    return shape.moved([-(low[0] + high[0]) / 2, -(low[1] + high[1]) / 2, -low[2]])
+    return shape.translate([-(low[0] + high[0]) / 2, -(low[1] + high[1]) / 2, -low[2]])
 
 
 def block(rng: np.random.Generator) -> Shape:
@@ -60,14 +60,14 @@ def rounded_box(size: Array, radius: float, steps: int = 8) -> Shape:
     centre[..., :2], centre[..., 2] = side * half[:2], lift[:, None] * half[2]
     span = 2 * half
     lids = [quad([-half[0], -half[1], z], [span[0], 0, 0], [0, span[1], 0]) for z in (-size[2] / 2, size[2] / 2)]
-    return merged([surface(centre + radius * normal, normal), *lids]).moved([0, 0, size[2] / 2])
+    return merge([surface(centre + radius * normal, normal), *lids]).translate([0, 0, size[2] / 2])
 
 
 def superquadric(rng: np.random.Generator) -> Shape:
     """Return a ball between an octahedron and a rounded cube, turned any way."""
     power = rng.uniform(0.35, 1.5, 2) if rng.random() < 0.7 else np.ones(2)
     size = rng.uniform(0.3, 0.5, 3) if rng.random() < 0.7 else np.full(3, rng.uniform(0.3, 0.5))
-    return grounded(ellipsoid(size, power).turned(any_turn(rng)))
+    return place_on_ground(ellipsoid(size, power).rotate(random_rotation(rng)))
 
 
 def ellipsoid(size: Array, power: Array, steps: int = 48) -> Shape:
@@ -90,7 +90,11 @@ def cylinder(rng: np.random.Generator) -> Shape:
     radius, height = rng.uniform(0.15, 0.45), rng.uniform(0.3, 1.0)
     top = radius * (1.0 if rng.random() < 0.6 else rng.uniform(0.02, 0.9))
     shape = frustum(radius, top, height)
-    return shape if rng.random() < 0.7 else grounded(shape.turned(about(2, rng.uniform(0, 360)) @ about(0, 90)))
+    return (
+        shape
+        if rng.random() < 0.7
+        else place_on_ground(shape.rotate(rotation_about(2, rng.uniform(0, 360)) @ rotation_about(0, 90)))
+    )
 
 
 def frustum(radius: float, top: float, height: float) -> Shape:
@@ -105,7 +109,9 @@ def torus(rng: np.random.Generator) -> Shape:
     angle = np.linspace(0, 2 * np.pi, 49)
     thick = rng.uniform(0.12, 0.42) * outer
     shape = lathe([np.column_stack((outer + thick * np.cos(angle), thick * np.sin(angle) * rng.uniform(0.6, 1.3)))])
-    return grounded(shape.turned(about(2, rng.uniform(0, 360)) @ about(0, rng.choice([0.0, 20.0, 65.0, 90.0]))))
+    return place_on_ground(
+        shape.rotate(rotation_about(2, rng.uniform(0, 360)) @ rotation_about(0, rng.choice([0.0, 20.0, 65.0, 90.0])))
+    )
 
 
 def vase(rng: np.random.Generator) -> Shape:
@@ -125,8 +131,8 @@ def bowl(rng: np.random.Generator) -> Shape:
         cup = hollow(radius * np.array([rng.uniform(0.6, 1), 0.95, 1, 1]), height, 0.02)
         bend = np.linspace(-0.55, 0.55, 15) * np.pi
         handle = np.column_stack((0.45 * height * np.cos(bend) * 0.8, 0 * bend, 0.38 * height * np.sin(bend)))
-        grip = tube(handle, rng.uniform(0.025, 0.045), 14).moved([radius * 0.97, 0, height * 0.5])
-        return merged([cup, grip]).turned(about(2, rng.uniform(0, 360)))
+        grip = tube(handle, rng.uniform(0.025, 0.045), 14).translate([radius * 0.97, 0, height * 0.5])
+        return merge([cup, grip]).rotate(rotation_about(2, rng.uniform(0, 360)))
     depth = rng.uniform(0.05, 0.12) if kind < 0.6 else rng.uniform(0.2, 0.4)
     return hollow(0.48 * np.array([0.5, 0.72, 0.9, 1.0]) ** rng.uniform(0.6, 1.6), depth, 0.015)
 
@@ -149,7 +155,11 @@ def prism(rng: np.random.Generator) -> Shape:
     """Return an extruded polygon, star, gear or smooth outline, standing or lying."""
     maker = (_polygon, _gear, _lobes, _frame)[rng.integers(4)]
     shape = extrusion(maker(rng), rng.uniform(0.08, 0.7))
-    return shape if rng.random() < 0.5 else grounded(shape.turned(about(2, rng.uniform(0, 360)) @ about(0, 90)))
+    return (
+        shape
+        if rng.random() < 0.5
+        else place_on_ground(shape.rotate(rotation_about(2, rng.uniform(0, 360)) @ rotation_about(0, 90)))
+    )
 
 
 def _ring(radius: Array | float, count: int, phase: float = 0.0) -> Array:
@@ -195,8 +205,8 @@ def letter(rng: np.random.Generator) -> Shape:
     rings.sort(key=lambda p: -np.ptp(p[:, 0]) * np.ptp(p[:, 1]))
     shape = extrusion([r[np.linalg.norm(r - np.roll(r, 1, 0), axis=1) > 1e-9] for r in rings], rng.uniform(0.15, 0.4))
     lying = rng.random() < 0.3
-    turn = about(2, rng.uniform(-60, 60)) @ (np.eye(3) if lying else about(0, 90))
-    return grounded(shape.turned(turn))
+    turn = rotation_about(2, rng.uniform(-60, 60)) @ (np.eye(3) if lying else rotation_about(0, 90))
+    return place_on_ground(shape.rotate(turn))
 
 
 def coil(rng: np.random.Generator) -> Shape:
@@ -205,18 +215,18 @@ def coil(rng: np.random.Generator) -> Shape:
     if rng.random() < 0.5:
         turns, wide = rng.integers(3, 8), rng.uniform(0.15, 0.35)
         path = np.column_stack((wide * np.cos(2 * np.pi * turns * s), wide * np.sin(2 * np.pi * turns * s), 0.8 * s))
-        return grounded(tube(path, rng.uniform(0.012, 0.05), 14))
+        return place_on_ground(tube(path, rng.uniform(0.012, 0.05), 14))
     p, q = ((2, 3), (3, 2), (3, 4), (2, 5))[rng.integers(4)]
     a = 2 * np.pi * s
-    reach = 0.3 + 0.12 * np.cos(q * a)
-    path = np.column_stack((reach * np.cos(p * a), reach * np.sin(p * a), 0.14 * np.sin(q * a)))
-    return grounded(tube(path, rng.uniform(0.02, 0.06), 14).turned(about(0, rng.choice([0.0, 80.0]))))
+    radius = 0.3 + 0.12 * np.cos(q * a)
+    path = np.column_stack((radius * np.cos(p * a), radius * np.sin(p * a), 0.14 * np.sin(q * a)))
+    return place_on_ground(tube(path, rng.uniform(0.02, 0.06), 14).rotate(rotation_about(0, rng.choice([0.0, 80.0]))))
 
 
 SOLIDS: tuple[Maker, ...] = (block, superquadric, cylinder, torus, vase, bowl, prism, letter, coil)
 
 
-def any_solid(rng: np.random.Generator) -> Shape:
-    """Return one of :data:`SOLIDS`, boxes, balls and vessels more often."""
+def random_solid(rng: np.random.Generator) -> Shape:
+    """Return a random one of :data:`SOLIDS`; boxes, balls and vessels are more frequent."""
     weights = np.array([5, 4, 4, 2, 5, 4, 3, 2, 1.5])
     return SOLIDS[rng.choice(len(SOLIDS), p=weights / weights.sum())](rng)

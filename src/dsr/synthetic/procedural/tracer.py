@@ -1,7 +1,7 @@
-"""Rays against triangle meshes: Embree finds the triangle, float64 arithmetic the depth.
+"""Ray tracing of triangle meshes: Embree finds the triangle, float64 arithmetic the depth.
 
 Each triangle stands for the quadratic patch that its vertex normals suggest (half of the displacement of Phong
-tessellation, Boubekeur and Alexa 2008, which is exact for a paraboloid). Flat triangles stay flat, spheres get no
+tessellation, Boubekeur and Alexa 2008, which is exact for a paraboloid). Flat triangles stay flat, spheres have no
 facets, and the depth is continuous across edges.
 """
 
@@ -15,23 +15,23 @@ from embreex.mesh_construction import TriangleMesh  # type: ignore[import-untype
 from embreex.rtcore_scene import EmbreeScene  # type: ignore[import-untyped]
 from numpy.typing import NDArray
 
-from dsr.synthetic.procedural.shape import Index, Shape, merged
+from dsr.synthetic.procedural.shape import Index, Shape, merge
 from dsr.synthetic.surfaces import Array
 
-_GRAZING = 0.12  # smallest cosine between ray and normal by which a displacement is divided
+_GRAZING = 0.12  # smallest cosine between ray and normal that a displacement is divided by
 
 
 @dataclass(frozen=True, eq=False)
 class Hits:
-    """Where N rays from the camera meet the surfaces.
+    """The points where N rays from the camera meet the surfaces.
 
     Args:
-        depth: (N,) the rays' parameter; inf where there is nothing.
-        face: (N,) the number of the triangle, -1 where there is nothing.
-        body: (N,) the number of the shape.
+        depth: (N,) ray parameter, which is the orthogonal depth; inf where nothing is hit.
+        face: (N,) number of the triangle, -1 where nothing is hit.
+        body: (N,) number of the shape.
         points, normals: (3, N) in the frame of the shapes; normals face the camera.
         rest, chart: (3, N) the paint's coordinates, as in :class:`dsr.synthetic.procedural.shape.Shape`.
-        bulge: (N,) metres from the triangle to the point along the normal.
+        bulge: (N,) distance in metres from the triangle to the point along the normal.
 
     """
 
@@ -46,10 +46,10 @@ class Hits:
 
 
 class Tracer:
-    """Shapes, ready to be hit by rays. A ray's direction has length 1 along the camera's axis: t is the depth."""
+    """Intersects rays with shapes. Ray directions have length 1 along the optical axis, so that t is the depth."""
 
     def __init__(self, shapes: Sequence[Shape]) -> None:
-        mesh = merged(shapes)
+        mesh = merge(shapes)
         corners = mesh.vertices[mesh.faces]
         area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
         keep = area > 1e-13
@@ -59,7 +59,7 @@ class Tracer:
         self._scene = EmbreeScene(robust=True)
         TriangleMesh(self._scene, mesh.vertices.astype(np.float32), self._faces.astype(np.int32))
 
-    def first(self, eye: Array, rays: Array) -> Index:
+    def first_triangle(self, eye: Array, rays: Array) -> Index:
         """Return the triangle (N,) that each ray (3, N) from ``eye`` (3,) meets first, -1 for none."""
         ahead = np.ascontiguousarray(rays.T, dtype=np.float32)
         start = np.ascontiguousarray(np.broadcast_to(eye, ahead.shape), dtype=np.float32)
@@ -69,9 +69,9 @@ class Tracer:
         """Return the corners (3 of the triangle, 3 coordinates, N) of the triangles ``face`` (N,)."""
         return np.stack([self._table[self._faces[face, i], :3].T for i in range(3)])
 
-    def hits(self, eye: Array, rays: Array) -> Hits:
-        """Return where rays (3, N) from ``eye`` (3,) meet the surfaces first."""
-        face = self.first(eye, rays)
+    def trace(self, eye: Array, rays: Array) -> Hits:
+        """Return the first hits of rays (3, N) from ``eye`` (3,)."""
+        face = self.first_triangle(eye, rays)
         known = np.maximum(face, 0)
         rows = [self._table[self._faces[known, i]].T for i in range(3)]  # 3 x (12, N)
         corners = [row[:3] - eye[:, None] for row in rows]
@@ -83,12 +83,12 @@ class Tracer:
         points = eye[:, None] + np.where(face < 0, 0.0, depth) * rays
         return Hits(depth, face, self._body[known], points, normal * facing, paint[:3], paint[3:], bulge * facing)
 
-    def blocked(self, origin: Array, toward: Array) -> NDArray[np.bool_]:
+    def is_blocked(self, origin: Array, toward: Array) -> NDArray[np.bool_]:
         """Return whether something lies between ``origin`` and ``origin + toward``, both (3, N), shape (N,)."""
         start = np.ascontiguousarray(origin.T, dtype=np.float32)
         ahead = np.ascontiguousarray(toward.T, dtype=np.float32)
-        reach = np.ones(len(start), dtype=np.float32)
-        return np.asarray(self._scene.run(start, ahead, dists=reach, query="OCCLUDED")) >= 0
+        lengths = np.ones(len(start), dtype=np.float32)
+        return np.asarray(self._scene.run(start, ahead, dists=lengths, query="OCCLUDED")) >= 0
 
 
 def _intersect(corners: Sequence[Array], rays: Array) -> tuple[Array, Array]:

@@ -1,7 +1,8 @@
 """SimGeo: six synthetic scenes of simple and of intricate geometry in front of a wall, with exact depth.
 
-After the synthetic test set of Voynov et al., "Perceptual Deep Depth Super-Resolution" (ICCV 2019): the same geometry
-with different textures tells whether a method mistakes texture for shape. The scenes are computed, nothing is loaded.
+They follow the synthetic test set of Voynov et al., "Perceptual Deep Depth Super-Resolution" (ICCV 2019). The same
+geometry with different textures shows whether a method mistakes texture for shape. The scenes are rendered by this
+package; no file is read.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from dsr.synthetic.raycast import Body, World, area_light, render
 from dsr.synthetic.rendering import Rendering
 from dsr.synthetic.simgeo.statue import statue_distance
 from dsr.synthetic.surfaces import Array, Box, Cylinder, Field, Plane, Sphere, rotation
-from dsr.synthetic.textures import CLOUD, DUSK, blobs, marble, mosaic, noise, plain, unrolled, weave
+from dsr.synthetic.textures import CLOUD, DUSK, blobs, marble, mosaic, noise, plain, unroll_chart, weave
 
 SCENES: tuple[str, ...] = (
     "cube_high_freq",
@@ -27,19 +28,21 @@ SCENES: tuple[str, ...] = (
     "statue",
 )
 SCENES_VERSION = 1
-"""Raised whenever an image would change."""
+"""Version of the scenes; it has to be increased whenever an image changes."""
 FOCAL = 618.0386 / 512
 """Focal length in image widths."""
 WALL_Z = 3.95
 STATUE_BASE = (0.0, 1.09, 3.02)
-"""Camera coordinates of the point of the floor, in metres, that the statue stands on."""
+"""Point of the floor on which the statue stands, in camera coordinates in metres."""
 
 
 def render_scene(name: str, size: int = 512) -> Rendering:
-    """Return the scene ``name``, one of :data:`SCENES`, at ``size`` x ``size`` pixels, with one view at any size.
+    """Return the scene ``name``, one of :data:`SCENES`, at ``size`` x ``size`` pixels.
+
+    The view is the same at any size.
 
     Raises:
-        ValueError: there is no such scene, or the size is not positive.
+        ValueError: the name is unknown, or the size is not positive.
 
     """
     scene = build_scene(name)
@@ -69,7 +72,7 @@ def _wall() -> Plane:
 def _cube(style: str) -> list[Body]:
     cube = Box(np.array([0.0, 0.02, 3.1]), rotation(41.0, -31.0, 7.0), np.full(3, 0.44))
     # the faces lie in the middle of a layer of the solid mosaic
-    paint = mosaic(cube.local, 0.44 / 14, 11) if style == "high" else plain(0.62, 0.60, 0.57)
+    paint = mosaic(cube.to_local, 0.44 / 14, 11) if style == "high" else plain(0.62, 0.60, 0.57)
     return [Body(cube, paint)]
 
 
@@ -77,9 +80,9 @@ def _sphere_cylinder(style: str) -> list[Body]:
     sphere = Sphere(np.array([-0.45, 0.33, 2.84]), np.eye(3), 0.45)
     cylinder = Cylinder(np.array([0.40, -0.03, 3.2]), rotation(0.0, 33.0, 14.0), 0.37, 0.64)
     if style == "high":
-        paints = [marble(sphere.local), mosaic(unrolled(cylinder), 2 * np.pi * 0.37 / 76, 12)]
+        paints = [marble(sphere.to_local), mosaic(unroll_chart(cylinder), 2 * np.pi * 0.37 / 76, 12)]
     elif style == "low":
-        paints = [blobs(sphere.local, 0.25, 21, CLOUD), blobs(cylinder.local, 0.25, 22, CLOUD)]
+        paints = [blobs(sphere.to_local, 0.25, 21, CLOUD), blobs(cylinder.to_local, 0.25, 22, CLOUD)]
     else:
         paints = [plain(0.62, 0.60, 0.57)] * 2
     return [Body(surface, paint) for surface, paint in zip((sphere, cylinder), paints, strict=True)]
@@ -94,7 +97,9 @@ def _wall_paint(style: str) -> Field:
 def _statue_scene() -> World:
     base = np.array(STATUE_BASE)
     bounds = Box(base - [0.0, 1.13, 0.0], np.eye(3), np.array([0.95, 1.135, 0.46]))
-    statue = Implicit(lambda p: statue_distance((p - base[:, None]) * [[1.0], [-1.0], [-1.0]]), bounds, caution=0.95)
+    statue = Implicit(
+        lambda p: statue_distance((p - base[:, None]) * [[1.0], [-1.0], [-1.0]]), bounds, step_fraction=0.95
+    )
     floor = Plane(base, np.array([0.0, -1.0, 0.0]))
     lights = area_light(np.array([-1.75, -2.05, 0.6]), np.array([0.32, 0.0, 0.24]), np.array([0.08, 0.24, -0.28]), 3)
     bodies = (Body(statue, _stone), Body(floor, plain(0.30, 0.29, 0.28)), Body(_wall(), plain(0.20, 0.24, 0.29)))

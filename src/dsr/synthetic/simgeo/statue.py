@@ -16,7 +16,7 @@ Vector = tuple[float, float, float]
 
 
 def statue_distance(p: Array) -> Array:
-    """Return about the distance, (N,) metres, to a winged, draped figure with a torch on a fluted plinth.
+    """Return the approximate distance, (N,) metres, to a winged, draped figure with a torch on a fluted plinth.
 
     ``p`` is (3, N) metres: x right, y up from the floor, z towards the viewer. Each part is computed only near its box.
     """
@@ -179,22 +179,26 @@ def _wings(p: Array) -> Array:
     x, y = np.abs(p[0]), p[1]
     back = p[2] + 0.115 + 0.30 * x - 0.28 * x**2  # the wings sweep back, then level out
     a, b = x - 0.23, y - 1.66  # around the wrist
-    reach, angle = np.hypot(a, b), np.arctan2(b, a) + np.deg2rad(12)
+    radius, angle = np.hypot(a, b), np.arctan2(b, a) + np.deg2rad(12)
     t = np.clip((np.deg2rad(86) - angle) / np.deg2rad(172), 0.0, 1.0)  # 0 along the leading edge, 1 towards the hip
-    side = reach * np.sin(np.clip(np.abs(angle) - np.deg2rad(86), -np.pi / 2, np.pi / 2))
+    side = radius * np.sin(np.clip(np.abs(angle) - np.deg2rad(86), -np.pi / 2, np.pi / 2))
     length = 0.46 + 0.22 * np.exp(-(((t - 0.20) / 0.24) ** 2)) + 0.14 * t**2
     wing = _limb(np.stack((x, y, back)), (0.05, 1.40, 0.0), (0.23, 1.66, 0.0), (0.045, 0.038))
     wing = _blend(wing, _limb(np.stack((x, y, back)), (0.23, 1.66, 0.0), (0.31, 2.0, 0.01), (0.036, 0.012)), 0.03)
     wing = _blend(wing, _ellipsoid(np.stack((x, y, back)), (0.25, 1.69, 0.008), (0.085, 0.125, 0.034)), 0.03)
-    for count, share, thick, front in ((13, 1.0, 0.010, -0.006), (17, 0.62, 0.011, 0.006), (21, 0.36, 0.012, 0.016)):
+    for count, relative_length, thick, front in (
+        (13, 1.0, 0.010, -0.006),
+        (17, 0.62, 0.011, 0.006),
+        (21, 0.36, 0.012, 0.016),
+    ):
         place = (t * count) % 1.0
         step = np.minimum(place / 0.90, (1 - place) / 0.10)  # each feather overlaps the next
         shaft = 0.005 * np.maximum(1 - np.abs(place - 0.5) / 0.08, 0)
-        barbs = 0.0007 * np.sin(230 * reach + 32 * np.abs(place - 0.5))
-        relief = (0.012 * step + shaft + barbs) * np.minimum(reach / 0.12, 1)
-        tip = length * share * (1 - 0.16 * (2 * place - 1) ** 2)
+        barbs = 0.0007 * np.sin(230 * radius + 32 * np.abs(place - 0.5))
+        relief = (0.012 * step + shaft + barbs) * np.minimum(radius / 0.12, 1)
+        tip = length * relative_length * (1 - 0.16 * (2 * place - 1) ** 2)
         blade = np.maximum(back - front - thick / 2 - relief, front - thick - back)
-        wing = np.minimum(wing, np.maximum(np.maximum(blade, 0.5 * (reach - tip)), side))
+        wing = np.minimum(wing, np.maximum(np.maximum(blade, 0.5 * (radius - tip)), side))
     return wing * 0.6
 
 
