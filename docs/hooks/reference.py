@@ -31,6 +31,9 @@ PACKAGES = (
 )
 """Parts of dsr that have a page in the API reference."""
 
+_KEY = re.compile(r"(?P<indent> *)(?P<key>[\w/@.+]+):(?P<value>(?: +[^#\s][^#]*)?)(?:\s*# ?(?P<comment>.*))?$")
+_ITEM = re.compile(r" *- (?P<value>[^#]*?)(?:\s*#.*)?$")
+
 _HEAD_COMMANDS = """\
 # Command reference
 
@@ -45,6 +48,7 @@ choices and the complete configuration.
 
 - Choose a file of a group with `GROUP=NAME`, for example `method=tgv` or `dataset=icl`.
 - Set a single value with `GROUP.KEY=VALUE`, for example `method.data_weight=30`.
+- `defaults` lists the files that a file starts from.
 - The value `???` has to be given. `null` means "not set"; the comment says what happens then.
 - `${oc.env:NAME,VALUE}` reads an environment variable, with a default; `${KEY}` repeats another value.
 
@@ -108,42 +112,77 @@ def _wide(base: type[argparse.HelpFormatter]) -> type[argparse.HelpFormatter]:
 
 def configuration_reference(conf: Path) -> str:
     """Return the files of a configuration directory as Markdown: the two commands first, then each group."""
-    commands = [_file_section(path, f"## {path.stem}.py", conf) for path in (conf / "eval.yaml", conf / "train.yaml")]
-    groups = [_group_section(folder, conf) for folder in sorted(conf.iterdir()) if folder.is_dir()]
+    commands = [f"## {name}.py\n\n{_file_text(conf / f'{name}.yaml')}" for name in ("eval", "train")]
+    groups = [_group_section(folder) for folder in sorted(conf.iterdir()) if folder.is_dir()]
     return "\n".join([_HEAD_CONFIGURATION, *commands, *groups])
 
 
-def _group_section(folder: Path, conf: Path) -> str:
+def _group_section(folder: Path) -> str:
     """Return a group: a table of its choices, then each file."""
     paths = sorted(folder.glob("*.yaml"))
-    rows = [f"| [`{path.stem}`](#{folder.name}-{path.stem}) | {_escape(_summary(path))} |" for path in paths]
-    table = ["| choice | what |", "| --- | --- |", *rows]
-    files = [
-        _file_section(path, f"### {folder.name}={path.stem} {{ #{folder.name}-{path.stem} }}", conf) for path in paths
-    ]
-    return "\n".join([f"## {folder.name}\n", *table, "", *files])
+    lines = [f"## {folder.name}\n", "| choice | what |", "| --- | --- |"]
+    lines += [f"| [`{path.stem}`](#{folder.name}-{path.stem}) | {_escape(_summary(path))} |" for path in paths]
+    lines.append("")
+    for path in paths:
+        lines.append(f"### {folder.name}={path.stem} {{ #{folder.name}-{path.stem} }}\n\n{_file_text(path)}")
+    return "\n".join(lines)
 
 
-def _file_section(path: Path, heading: str, conf: Path) -> str:
-    """Return a configuration file under a heading."""
-    return f'{heading}\n\n```yaml title="{path.relative_to(conf.parent)}"\n{path.read_text().rstrip()}\n```\n'
+def _file_text(path: Path) -> str:
+    """Return a configuration file: its first comment and a table of its keys, or an experiment as it is."""
+    if path.parent.name == "experiment":
+        return f"```yaml\n{path.read_text().rstrip()}\n```\n"
+    comment, body = _split_comment(path)
+    about = "\n".join(comment)
+    indented = any(line.startswith(" ") for line in comment)  # commands and tables
+    about = f"```text\n{about}\n```" if indented else _escape(about)
+    rows = [f"| `{key}` | {_code(value)} | {_escape(meaning)} |" for key, value, meaning in config_keys(body)]
+    return "\n".join([about, "", "| key | default | meaning |", "| --- | --- | --- |", *rows, ""])
+
+
+def config_keys(lines: list[str]) -> Iterator[tuple[str, str, str]]:
+    """Yield the dotted keys of a configuration file's lines, with their values and comments; Hydra's own are left out.
+
+    A list on lines of its own is joined into the value of its key, and so is a comment.
+    """
+    entries: list[tuple[str, str, str]] = []
+    above: list[tuple[int, str]] = []
+    for line in lines:
+        found = _KEY.match(line)
+        item = _ITEM.match(line)
+        if found:
+            indent = len(found["indent"])
+            above = [(depth, key) for depth, key in above if depth < indent] + [(indent, found["key"])]
+            entries.append((".".join(key for _, key in above), found["value"].strip(), found["comment"] or ""))
+        elif item and entries:
+            key, value, comment = entries[-1]
+            entries[-1] = (key, f"{value}, {item['value']}".removeprefix(", "), comment)
+    return (entry for entry in entries if entry[0].partition(".")[0] != "hydra")
+
+
+def _split_comment(path: Path) -> tuple[list[str], list[str]]:
+    """Return the lines of the comment that a file begins with, without the marks, and the lines after it."""
+    lines = path.read_text().splitlines()
+    count = next((number for number, line in enumerate(lines) if not line.startswith("#")), len(lines))
+    comment = [line.removeprefix("#").removeprefix(" ") for line in lines[:count]]
+    return [line for line in comment if not line.startswith("@package")], lines[count:]
 
 
 def _summary(path: Path) -> str:
-    """Return the comment that a configuration file begins with, up to its first blank or non-comment line."""
-    lines = []
-    for line in path.read_text().splitlines():
-        text = line.removeprefix("#").strip()
-        if not line.startswith("#") or not text:
-            break
-        if not text.startswith("@package"):
-            lines.append(text)
-    return " ".join(lines)
+    """Return what the comment says that a configuration file begins with, up to an experiment's table."""
+    comment, _ = _split_comment(path)
+    return " ".join(" ".join(comment).partition("Table:")[0].split())
 
 
 def _escape(text: str) -> str:
-    """Return a text that is safe in a table's cell."""
-    return text.replace("|", "\\|").replace("<", "&lt;")
+    """Return a text whose brackets and bars Markdown shows as they are, outside of code."""
+    marks = {"[": "\\[", "<": "&lt;", "|": "\\|"}
+    return re.sub(r"(`[^`]*`)|([\[<|])", lambda found: found[1] or marks[found[2]], text)
+
+
+def _code(text: str) -> str:
+    """Return a value as code, nothing for none."""
+    return f"`{text}`" if text else ""
 
 
 def model_card() -> str:

@@ -122,14 +122,34 @@ def test_command_reference_has_every_command_and_option(hook: ModuleType, genera
             assert [name for name in action.option_strings if name not in section] == []
 
 
-def test_configuration_reference_has_every_file_and_key(generated: dict[str, str]) -> None:
+def leaves(node: Any, above: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield the dotted keys of nested mappings, with their values where these are no mappings."""
+    for key, value in node.items():
+        yield f"{above}{key}", None if isinstance(value, dict) else value
+        if isinstance(value, dict):
+            yield from leaves(value, f"{above}{key}.")
+
+
+@pytest.mark.parametrize(
+    "path", sorted((ROOT / "conf").rglob("*.yaml")), ids=lambda path: f"{path.parent.name}-{path.stem}"
+)
+def test_configuration_reference_has_every_key_and_default(path: Path, generated: dict[str, str]) -> None:
     page = generated["reference/configuration.md"]
-    for path in (ROOT / "conf").rglob("*.yaml"):
-        if path.parent.name != "conf":
-            assert f"## {path.parent.name}={path.stem} " in page
-            assert f"](#{path.parent.name}-{path.stem})" in page
-        for key in yaml.safe_load(path.read_text()):
-            assert f"\n{key}:" in page
+    group = path.parent.name
+    heading = f"\n## {path.stem}.py\n" if group == "conf" else f"\n### {group}={path.stem} {{ #{group}-{path.stem} }}\n"
+    if group != "conf":
+        assert f"\n## {group}\n" in page
+        assert f"| [`{path.stem}`](#{group}-{path.stem}) |" in page
+    section = re.split(r"\n##", page.partition(heading)[2], maxsplit=1)[0]
+    if group == "experiment":
+        assert path.read_text().strip() in section
+        return
+    rows = dict(re.findall(r"^\| `([^`]+)` \| (?:`([^`]*)`)? \|", section, re.MULTILINE))
+    content = yaml.safe_load(path.read_text())
+    expected = {key: value for key, value in leaves(content) if key.partition(".")[0] != "hydra"}
+    assert list(rows) == list(expected)
+    scalars = {key: value for key, value in expected.items() if key != "defaults" and value not in (None, {}, "")}
+    assert {key: yaml.safe_load(rows[key]) for key in scalars} == scalars
 
 
 def test_citation_has_what_the_format_requires() -> None:
