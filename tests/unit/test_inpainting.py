@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from dsr.data.preparation.inpainting import filled_depth
+from dsr.data.preparation.inpainting import inpaint_depth
 
 
 def inverse_plane(height=40, width=60):
@@ -16,15 +16,15 @@ def test_plane_is_restored_in_any_holes_and_valid_pixels_are_unchanged():
     holed = plane.clone()
     holed[:, 5:20, 10:33] = torch.nan
     holed[:, 30:33, 40:58] = torch.nan
-    torch.testing.assert_close(filled_depth(holed), plane, rtol=1e-10, atol=0)
+    torch.testing.assert_close(inpaint_depth(holed), plane, rtol=1e-10, atol=0)
     holed[:, 3, 3] = 7.0
-    assert filled_depth(holed)[0, 3, 3] == 7
+    assert inpaint_depth(holed)[0, 3, 3] == 7
 
 
 def test_hole_at_the_border_is_filled_from_its_partial_rim():
     holed = torch.full((1, 20, 30), 2.0, dtype=torch.float64)
     holed[:, :, :7] = torch.nan
-    torch.testing.assert_close(filled_depth(holed), torch.full_like(holed, 2.0))
+    torch.testing.assert_close(inpaint_depth(holed), torch.full_like(holed, 2.0))
 
 
 def test_occlusion_behind_a_near_object_takes_the_background():
@@ -33,24 +33,24 @@ def test_occlusion_behind_a_near_object_takes_the_background():
     depth[:, 10:30, 30:50] = 0.7
     truth[:, 10:30, 30:50] = 0.7
     depth[:, 10:30, 24:30] = torch.nan  # what a second camera on the left does not see
-    filled = filled_depth(depth)
+    filled = inpaint_depth(depth)
     torch.testing.assert_close(filled[:, 12:28, 24:30], truth[:, 12:28, 24:30], rtol=1.5e-2, atol=0)
 
 
 def test_inpainted_values_lie_within_those_of_the_rim():
     depth = 1 + 0.02 * torch.rand(1, 30, 30, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     depth[:, 8:22, 8:22] = torch.nan
-    filled = filled_depth(depth)[:, 8:22, 8:22]
+    filled = inpaint_depth(depth)[:, 8:22, 8:22]
     assert 1 <= float(filled.min()) <= float(filled.max()) <= 1.02
 
 
 def test_map_without_holes_is_unchanged():
     depth = torch.rand(1, 5, 6) + 1
-    assert torch.equal(filled_depth(depth), depth.double())
+    assert torch.equal(inpaint_depth(depth), depth.double())
 
 
 @pytest.mark.parametrize("place", [(slice(0, 1), slice(0, 1)), (slice(19, 20), slice(29, 30))])
 def test_single_pixel_in_a_corner_is_filled(place):
     depth = torch.full((1, 20, 30), 3.0, dtype=torch.float64)
     depth[0][place] = torch.nan
-    assert torch.allclose(filled_depth(depth), torch.tensor(3.0, dtype=torch.float64))
+    assert torch.allclose(inpaint_depth(depth), torch.tensor(3.0, dtype=torch.float64))

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-import dsr.data.preparation.records as module
-from dsr.data.preparation.records import Preparation, PreparedDataset, Record, records_of, renamed
+import dsr.data.preparation.dataset as module
+from dsr.data.preparation.dataset import Preparation, PreparedDataset, SceneRecord, make_records, rename_records
 from dsr.geometry.camera import Camera
 from dsr.sample import Scene
 from dsr.synthetic.rendering import cache_directory
@@ -40,8 +40,8 @@ def files(tmp_path):
 
 
 def source(files, named=("a", "b"), wanted=None, preparation=None, **settings):
-    records = records_of(files, frame, "things", **settings)
-    return PreparedDataset("things", Path("data/things"), records, named, wanted, preparation or Preparation(48))
+    records = make_records(files, frame, "things", **settings)
+    return PreparedDataset("things", "data/things", records, named, wanted, preparation or Preparation(48))
 
 
 def kept():
@@ -91,7 +91,7 @@ def test_scenes_without_a_size_are_unchanged_and_not_cached(files):
 def test_prepared_scene_is_read_from_the_cache(files, monkeypatch):
     first = source(files).load("a")
     assert len(kept()) == 1
-    monkeypatch.setattr(module, "fitted", None)
+    monkeypatch.setattr(module, "fit", None)
     again = source(files).load("a")
     assert np.array_equal(first.depth, again.depth, equal_nan=True)
     assert torch.equal(first.rgb, again.rgb)
@@ -155,9 +155,10 @@ def test_fingerprint_of_a_scene_does_not_depend_on_its_preparation(files):
 
 
 def test_notes_of_a_scene_are_kept_prepared_or_not(files):
-    records = {name: replace(record, note="not metric") for name, record in records_of(files, frame, "things").items()}
+    found = make_records(files, frame, "things")
+    records = {name: replace(record, note="not metric") for name, record in found.items()}
     for preparation in (Preparation(48), Preparation(48), Preparation(None)):
-        data = PreparedDataset("things", Path("x"), records, ["a"], None, preparation)
+        data = PreparedDataset("things", "x", records, ["a"], None, preparation)
         assert data.load("a").notes == ("not metric",)
     assert source(files).load("a").notes == ()
 
@@ -168,7 +169,7 @@ def test_scenes_are_prepared_each_time_without_a_writable_cache(files, monkeypat
 
 
 def test_renamed_frames_have_their_new_names(files):
-    records = renamed(records_of(files, frame, "things"), {"first": "deep/c", "second": "z"})
+    records = rename_records(make_records(files, frame, "things"), {"first": "deep/c", "second": "z"})
     assert sorted(records) == ["a", "b", "first"]
     assert records["first"].load().name == "first"
 
@@ -176,12 +177,12 @@ def test_renamed_frames_have_their_new_names(files):
 def test_folder_fingerprint_covers_all_files_and_large_ones_by_size_and_time(files, monkeypatch, tmp_path):
     folder = tmp_path / "set"
     data = PreparedDataset(
-        "things", folder, records_of({"all": (folder, 3)}, frame, "things"), ["all"], None, Preparation(48)
+        "things", folder, make_records({"all": (folder, 3)}, frame, "things"), ["all"], None, Preparation(48)
     )
     before = data.content("all")
     files["deep/c"][0].write_text("4")
     assert data.content("all") != before
-    monkeypatch.setattr(module, "_HASHED_WHOLE", 0)
+    monkeypatch.setattr(module, "_MAX_HASHED", 0)
     path = files["a"][0]
     path.write_text("12345")
     assert module.content_hash(path) == f"a.txt 5 {path.stat().st_mtime_ns}"
@@ -209,7 +210,7 @@ def test_record_without_high_resolution_depth_cannot_be_resized(files):
         return Scene("things", "a", torch.zeros(3, 60, 90), Camera(90, 60, 80.0, 80.0, 44.5, 29.5), None,
                      {2: torch.ones(1, 30, 45)})  # fmt: skip
 
-    data = PreparedDataset("things", Path("x"), {"a": Record((), measured_only)}, ["a"], None, Preparation(48))
+    data = PreparedDataset("things", Path("x"), {"a": SceneRecord((), measured_only)}, ["a"], None, Preparation(48))
     with pytest.raises(
         ValueError, match=r"a: expected a high-resolution depth map to resize, there is none \(dataset\.size=null\)"
     ):

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from dsr.data.preparation.resizing import fitted, resized, resized_depth
+from dsr.data.preparation.resizing import fit, resize, resize_depth
 from dsr.geometry.camera import Camera
 from dsr.geometry.surface import depth_to_normals
 from dsr.sample import Scene
@@ -26,7 +26,7 @@ def scene(depth, camera=CAMERA):
 def test_plane_is_reproduced_in_the_new_camera_up_to_the_border_and_beside_a_hole(height, width):
     depth = plane_depth(CAMERA)
     depth[:, 20:33, 11:40] = torch.nan
-    fine = resized_depth(depth, height, width)
+    fine = resize_depth(depth, height, width)
     truth = plane_depth(CAMERA.rescale(width, height))
     known = fine.isfinite()
     torch.testing.assert_close(fine[known], truth[known], rtol=1e-7, atol=0)
@@ -35,14 +35,14 @@ def test_plane_is_reproduced_in_the_new_camera_up_to_the_border_and_beside_a_hol
 
 def test_same_size_leaves_depth_unchanged():
     depth = 1 + torch.rand(1, 60, 90, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
-    assert torch.equal(resized(scene(depth), 60, 90).depth, depth)
+    assert torch.equal(resize(scene(depth), 60, 90).depth, depth)
 
 
 @pytest.mark.parametrize(("height", "width"), [(20, 30), (23, 31), (66, 99)])
 def test_depth_edges_are_not_mixed(height, width):
     depth = torch.full((1, 60, 90), 2.0, dtype=torch.float64)
     depth[:, 15:41, 22:67] = 1.0
-    fine = resized_depth(depth, height, width)
+    fine = resize_depth(depth, height, width)
     assert set(fine.unique().tolist()) == {1.0, 2.0}
     share = (fine == 1).double().mean()
     assert share == pytest.approx(26 * 45 / 5400, abs=0.02)
@@ -51,7 +51,7 @@ def test_depth_edges_are_not_mixed(height, width):
 def test_pixel_is_a_hole_exactly_where_its_centre_falls_on_one():
     depth = torch.full((1, 60, 90), 2.0, dtype=torch.float64)
     depth[:, 10:20, 30:33] = torch.nan
-    fine = resized_depth(depth, 20, 30)
+    fine = resize_depth(depth, 20, 30)
     expected = torch.zeros(1, 20, 30, dtype=torch.bool)
     expected[:, 3:7, 10] = True  # centres at rows 10, 13, 16, 19 and column 31
     assert torch.equal(fine.isnan(), expected)
@@ -59,13 +59,13 @@ def test_pixel_is_a_hole_exactly_where_its_centre_falls_on_one():
 
 def test_averaging_halves_the_noise_of_a_plane():
     noise = 1e-3 * torch.randn(1, 120, 180, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
-    fine = resized_depth(2 + noise, 30, 45)
+    fine = resize_depth(2 + noise, 30, 45)
     assert float((fine - 2).std()) < 0.35e-3
 
 
 def test_scene_keeps_its_normals_and_disparities_scale_with_the_size():
     before = scene(plane_depth(CAMERA))
-    after = resized(before, 30, 45)
+    after = resize(before, 30, 45)
     assert after.rgb.shape == (3, 30, 45)
     assert after.camera == CAMERA.rescale(45, 30)
     normal = depth_to_normals(before.depth[None], before.camera.rays()[None])[0, :, 5, 5]
@@ -86,7 +86,7 @@ def sphere_depth(camera):
 @pytest.mark.parametrize("size", [(120, 180), (200, 300), (480, 720), (520, 780)])
 def test_curved_surface_keeps_its_place(size):
     camera = Camera(720, 480, 640.0, 640.0, 350.0, 244.0)
-    small = resized(scene(sphere_depth(camera), camera), *size)
+    small = resize(scene(sphere_depth(camera), camera), *size)
     truth = sphere_depth(small.camera)
     inner = (truth < 1.7) & (small.depth < 1.7)  # the sphere but for its rim
     assert inner.double().mean() > 0.05
@@ -105,29 +105,29 @@ def test_crop_has_the_same_points():
 
 @pytest.mark.parametrize(("place", "left"), [(0.0, 0), (0.5, 12), (1.0, 24)])
 def test_fitting_resizes_the_shorter_side_and_crops_the_longer(place, left):
-    fit = fitted(scene(plane_depth(CAMERA)), 48, place)
-    assert (fit.camera.height, fit.camera.width) == (48, 48)
-    assert fit.camera == CAMERA.rescale(72, 48).crop(0, left, 48, 48)
+    found = fit(scene(plane_depth(CAMERA)), 48, place)
+    assert (found.camera.height, found.camera.width) == (48, 48)
+    assert found.camera == CAMERA.rescale(72, 48).crop(0, left, 48, 48)
 
 
 def test_fitting_without_a_window_or_without_enlarging():
     whole = scene(plane_depth(CAMERA))
-    assert fitted(whole, 48, None).rgb.shape == (3, 48, 72)
-    assert fitted(whole, 120, None, enlarge=False).rgb.shape == (3, 60, 90)
-    assert fitted(whole, 120, 0.5, enlarge=False).rgb.shape == (3, 60, 60)
+    assert fit(whole, 48, None).rgb.shape == (3, 48, 72)
+    assert fit(whole, 120, None, enlarge=False).rgb.shape == (3, 60, 90)
+    assert fit(whole, 120, 0.5, enlarge=False).rgb.shape == (3, 60, 60)
 
 
 def test_camera_of_plant_follows_from_that_of_icl_nuim():
     native = Camera(640, 480, 480.6, 480.6, 319.5, 239.5)  # the authors take the mean of 481.2 and 480 for both
     height, width = 480, 640
     depth = torch.full((1, height, width), 2.0, dtype=torch.float64)
-    fit = fitted(Scene("icl", "plant", torch.zeros(3, height, width), native, depth), 512)
-    assert (fit.camera.width, fit.camera.height) == (512, 512)
-    assert (fit.camera.fx, fit.camera.fy) == (pytest.approx(512.64, rel=1e-3), pytest.approx(512.64))
-    assert (fit.camera.cx, fit.camera.cy) == (pytest.approx(255.8, abs=0.6), pytest.approx(255.4667, abs=0.04))
+    found = fit(Scene("icl", "plant", torch.zeros(3, height, width), native, depth), 512)
+    assert (found.camera.width, found.camera.height) == (512, 512)
+    assert (found.camera.fx, found.camera.fy) == (pytest.approx(512.64, rel=1e-3), pytest.approx(512.64))
+    assert (found.camera.cx, found.camera.cy) == (pytest.approx(255.8, abs=0.6), pytest.approx(255.4667, abs=0.04))
 
 
 def test_scene_without_high_resolution_depth_cannot_be_resized():
     only = Scene("set", "one", torch.zeros(3, 60, 90), CAMERA, None, {2: torch.ones(1, 30, 45)})
     with pytest.raises(ValueError, match="one: expected a high-resolution depth map to resize, there is none"):
-        resized(only, 30, 45)
+        resize(only, 30, 45)

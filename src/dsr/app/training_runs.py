@@ -10,7 +10,7 @@ from typing import Any
 from omegaconf import OmegaConf
 
 from dsr.app.schema import TrainConfig, TrainerConfig
-from dsr.data.base import SceneSource, Some
+from dsr.data.base import SceneSource, SceneSubset
 from dsr.degradation.downsampling import Downsampling
 from dsr.training.data_module import Part, PatchData
 from dsr.training.degradation import Degradation
@@ -72,7 +72,7 @@ def studies_of_run(
     for kind, (source, names) in data.validation_scenes().items():
         several = len(data.validation_sets) > 1 and base["output_dir"] is not None
         place = {"output_dir": str(Path(base["output_dir"]) / kind)} if several else {}
-        yield {**base, **place, "dataset": {"name": kind, "validation_of": str(folder)}}, Some(source, names)
+        yield {**base, **place, "dataset": {"name": kind, "validation_of": str(folder)}}, SceneSubset(source, names)
 
 
 def training_data(settings: TrainConfig) -> PatchData:

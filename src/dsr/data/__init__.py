@@ -1,1 +1,1 @@
-"""Data sets: each module reads one and yields DepthSamples."""
+"""Data sets, a module each, with readers of their formats, preparation and download."""

@@ -1,4 +1,4 @@
-"""What every data set is."""
+"""The protocol of data sets."""
 
 from __future__ import annotations
 
@@ -8,17 +8,17 @@ from typing import Literal, Protocol, runtime_checkable
 from dsr.sample import Scene
 
 SceneSelection = Sequence[str] | Literal["found"] | None
-"""Names of scenes; ``found`` for all that are on disk, None for those that the data set names."""
+"""Names of scenes; None for those that belong to the data set, ``found`` for all that are on disk."""
 
-_MOST_LISTED = 60
+_MAX_LISTED = 60
 
 
 class SceneSource(Protocol):
     """A data set: named scenes that are loaded one at a time.
 
     Attributes:
-        name: as in ``scores.csv``.
-        evaluation: whether its scenes are those that methods are compared on, which none may be trained on.
+        name: name in ``scores.csv``.
+        evaluation: whether methods are compared on its scenes, so that none may be trained on them.
 
     """
 
@@ -33,37 +33,37 @@ class SceneSource(Protocol):
         """Return one scene.
 
         Raises:
-            ValueError: what is on disk is not what it should be; the message names the file.
+            ValueError: a file is missing or damaged; the message names it.
 
         """
         ...
 
     def fingerprint(self, scene: str) -> str:
-        """Return a text that changes when the scene's content does."""
+        """Return a text that changes whenever the scene's content changes."""
         ...
 
 
-def content_of(source: SceneSource, scene: str) -> str:
-    """Return a text that is the same for the same scene of two data sets, however each prepares it, if they know."""
+def content_key(source: SceneSource, scene: str) -> str:
+    """Return a text that is equal for two data sets' scenes of the same files; else the fingerprint."""
     content: Callable[[str], str] = getattr(source, "content", source.fingerprint)
     return content(scene)
 
 
 @runtime_checkable
 class Prepared(Protocol):
-    """A data set that makes its scenes ready once."""
+    """A data set that prepares its scenes once, before they are loaded."""
 
     def prepare(self, scenes: Sequence[str]) -> Iterable[str]:
-        """Make some scenes ready, several at a time, and yield the names as they are done."""
+        """Prepare scenes, several at a time, and yield the name of each that is ready."""
         ...
 
 
-class Some:
-    """Some scenes of a data set.
+class SceneSubset:
+    """A subset of the scenes of a data set.
 
     Args:
         source: the data set.
-        names: of the scenes.
+        names: names of the scenes.
 
     """
 
@@ -80,15 +80,15 @@ class Some:
         return self._source.load(scene)
 
     def fingerprint(self, scene: str) -> str:
-        """Return a text that changes when the scene's content does."""
+        """Return a text that changes whenever the scene's content changes."""
         return self._source.fingerprint(scene)
 
 
-def chosen(available: Sequence[str], wanted: SceneSelection) -> list[str]:
-    """Return the scenes to use: those wanted, or all.
+def select_scenes(available: Sequence[str], wanted: SceneSelection) -> list[str]:
+    """Return the ``wanted`` scenes, or all available ones for None.
 
     Raises:
-        ValueError: a wanted scene is not available or is named twice, or none is wanted.
+        ValueError: a wanted scene is not available or is named twice, or the list is empty.
 
     """
     if wanted == "found":
@@ -98,7 +98,7 @@ def chosen(available: Sequence[str], wanted: SceneSelection) -> list[str]:
         raise ValueError(f"scenes: expected names, each once, or null for all; got {came}")
     for name in wanted or ():
         if name not in available:
-            rest = f", ... ({len(available)} in all)" if len(available) > _MOST_LISTED else ""
-            some = ", ".join(available[:_MOST_LISTED])
+            rest = f", ... ({len(available)} in all)" if len(available) > _MAX_LISTED else ""
+            some = ", ".join(available[:_MAX_LISTED])
             raise ValueError(f"scenes: {name!r} is not there; expected some of {some}{rest}")
     return list(available) if wanted is None else list(wanted)

@@ -1,4 +1,4 @@
-"""What lies in a directory: the scenes of any layout that dsr reads."""
+"""Detection of the scenes in a directory of any layout that dsr reads."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ _FRAMES: tuple[tuple[Callable[[Path], Mapping[str, tuple[Any, ...]]], Callable[.
 )
 
 
-def scenes_in(folder: Path) -> Iterator[tuple[str, Loader]]:
-    """Yield the name of each scene in a directory, or of the one that it is, and what loads it.
+def find_scenes(folder: Path) -> Iterator[tuple[str, Loader]]:
+    """Yield the name and the loader of each scene in a directory, or of the scene that the directory is.
 
     Raises:
         ValueError: there is no such directory.
@@ -32,25 +32,25 @@ def scenes_in(folder: Path) -> Iterator[tuple[str, Loader]]:
     """
     if not folder.is_dir():
         raise ValueError(f"{folder}: expected a directory, there is none")
-    for place in (folder, *_folders(folder)):
+    for place in (folder, *_subfolders(folder)):
         yield from _own_layout(place)
         yield from _stereo(place, itself=place == folder)
         yield from _labelled(place)
     yield from _frames(folder)
 
 
-def _folders(folder: Path) -> list[Path]:
+def _subfolders(folder: Path) -> list[Path]:
     return sorted(path for path in folder.iterdir() if path.is_dir() and not path.name.startswith("."))
 
 
 def _own_layout(place: Path) -> Iterator[tuple[str, Loader]]:
-    """Yield the scene of a folder with a camera file."""
+    """Yield the scene of a folder that has a camera file."""
     if (place / "camera.json").is_file():
         yield place.name, functools.partial(load_scene, place, "folder")
 
 
 def _stereo(place: Path, *, itself: bool) -> Iterator[tuple[str, Loader]]:
-    """Yield the scenes of Middlebury directly below a folder, and the one that it is."""
+    """Yield the Middlebury scenes directly below a folder, and the one that the folder is."""
     for name, scene in middlebury.find_2014(place).items():
         yield name, functools.partial(middlebury.load_2014, scene, "middlebury", name)
     for name, files in middlebury.find_levels(place).items():
@@ -68,7 +68,7 @@ def _levels(name: str, files: middlebury.Files) -> Loader:
 
 
 def _labelled(place: Path) -> Iterator[tuple[str, Loader]]:
-    """Yield the frames of NYU's labelled file, some of them: one in a hundred."""
+    """Yield every hundredth frame of NYU's labelled file."""
     path = place / "nyu_depth_v2_labeled.mat"
     if path.is_file():
         for name, arguments in itertools.islice(nyu.find_frames(path).items(), 0, None, 100):
@@ -76,7 +76,7 @@ def _labelled(place: Path) -> Iterator[tuple[str, Loader]]:
 
 
 def _frames(folder: Path) -> Iterator[tuple[str, Loader]]:
-    """Yield frames at any depth below a folder."""
+    """Yield the frames of other data sets in a folder and its subfolders."""
     for find, load, dataset in _FRAMES:
         for name, arguments in find(folder).items():
             if not any((path.parent / "camera.json").is_file() for path in arguments if isinstance(path, Path)):

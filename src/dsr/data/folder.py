@@ -1,4 +1,4 @@
-"""``dataset=folder``: one folder a scene.
+"""``dataset=folder``: a directory with one folder per scene.
 
     DIR/SCENE/rgb.png (or .jpg, .jpeg)
               camera.json
@@ -21,23 +21,23 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dsr.data.base import SceneSelection, chosen
+from dsr.data.base import SceneSelection, select_scenes
 from dsr.data.formats.files import MAP_SUFFIXES, CameraFile, read_camera, read_map, read_mask, read_rgb
 from dsr.geometry.camera import Camera, RangeType, from_range
 from dsr.sample import Scene
 
 _RGB_NAMES = ("rgb.png", "rgb.jpg", "rgb.jpeg")
 _QUANTITIES = ("depth", "disparity")
-_COARSE = re.compile(r"(depth|disparity)_lr(\d+)")
+_MEASURED = re.compile(r"(depth|disparity)_lr(\d+)")
 
 
 class Folder:
     """The scenes of a directory.
 
     Args:
-        root: the directory.
-        scenes: names of the ones to use; None for all.
-        name: as in ``scores.csv``.
+        root: directory of the scenes.
+        scenes: names of the scenes to use; None for all.
+        name: name in ``scores.csv``.
 
     Raises:
         ValueError: the directory is missing or has no scene.
@@ -54,7 +54,7 @@ class Folder:
         found = sorted(path.name for path in self._root.iterdir() if path.is_dir() and not path.name.startswith("."))
         if not found:
             raise ValueError(f"root: expected a folder per scene in {root}, there is none")
-        self._scenes = chosen(found, scenes)
+        self._scenes = select_scenes(found, scenes)
 
     def scenes(self) -> list[str]:
         """Return the names of the scenes, in order."""
@@ -86,15 +86,15 @@ def load_scene(folder: Path, dataset: str) -> Scene:
     _expect_size(rgb_path, rgb.shape[:2], (camera.height, camera.width))
     measured = {}
     for path in sorted(folder.iterdir()):
-        match = _COARSE.fullmatch(path.stem)
+        match = _MEASURED.fullmatch(path.stem)
         if match and path.suffix.lower() in MAP_SUFFIXES:
             factor = int(match[2])
             size = (camera.width // max(factor, 1), camera.height // max(factor, 1))
             if factor < 1 or not all(size):
                 raise ValueError(f"{path}: expected a factor that the {camera.height} x {camera.width} photo allows")
             measured[factor] = _read_depth(path, match[1], description, camera.coarser(factor))
-    fine = _find_fine(folder)
-    depth = None if fine is None else _read_depth(fine, fine.stem, description, camera, folder / "mask.png")
+    path_hr = _find_depth_hr(folder)
+    depth = None if path_hr is None else _read_depth(path_hr, path_hr.stem, description, camera, folder / "mask.png")
     if depth is None and not measured:
         names = " or ".join(f"{name}.{{npy,png,tiff,pfm}}" for name in _QUANTITIES)
         raise ValueError(f"{folder}: expected {names}, there is none")
@@ -103,11 +103,11 @@ def load_scene(folder: Path, dataset: str) -> Scene:
 
 
 def _first(folder: Path, names: Sequence[str]) -> Path:
-    """Return the first of the files that is there; the first name where none is, for its reader to miss."""
+    """Return the first of the files that exists; where none does, the first, so that its reader names it as missing."""
     return next((folder / name for name in names if (folder / name).is_file()), folder / names[0])
 
 
-def _find_fine(folder: Path) -> Path | None:
+def _find_depth_hr(folder: Path) -> Path | None:
     """Return the file of the high-resolution depth, None where there is none."""
     found = [folder / f"{name}{suffix}" for name in _QUANTITIES for suffix in MAP_SUFFIXES]
     found = [path for path in found if path.is_file()]
@@ -125,7 +125,7 @@ def _read_depth(
     values = read_map(path)
     _expect_size(path, values.shape, (camera.height, camera.width))
     unit = 1.0 if quantity == "disparity" else _depth_unit(path, description)
-    values[np.isinf(values)] = np.nan  # Middlebury's mark of an unknown disparity
+    values[np.isinf(values)] = np.nan  # infinity stands for an unknown disparity at Middlebury
     if description.hole_value is not None:
         values[values == description.hole_value] = np.nan
     if mask_path is not None and mask_path.is_file():
@@ -144,7 +144,7 @@ def _read_depth(
 
 
 def _depth_unit(path: Path, description: CameraFile) -> float:
-    """Return metres per value of a depth file; whole numbers do not tell it by themselves."""
+    """Return metres per value of a depth file; PNG files have no default unit."""
     if description.depth_unit is not None:
         return description.depth_unit
     if path.suffix.lower() == ".png":

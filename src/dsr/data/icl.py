@@ -1,19 +1,18 @@
 """``dataset=icl``: synthetic rooms with exact depth (Handa et al., ICRA 2014).
 
-Voynov et al. 2019 evaluate on six frames, which they name by what they show, not by number. Their size and crop are
-known: their camera of Plant is that of a frame whose height was made 512 and whose middle was cut out. Which frames
-theirs are is not; those below are spread over the trajectories, and ``dataset.frames`` takes others.
+Voynov et al. 2019 evaluate on six frames, which they name by what they show, not by number. Their size and crop follow
+from their camera of Plant: frames are resized to a height of 512 and cropped to the square in the middle. Which frames
+they used is unknown. Those below are spread over the trajectories; ``dataset.frames`` takes others.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from pathlib import Path
 from types import MappingProxyType
 
 from dsr.data.base import SceneSelection
 from dsr.data.formats import icl_nuim
-from dsr.data.preparation.records import Preparation, PreparedDataset, listed, records_of, renamed
+from dsr.data.preparation.dataset import Preparation, PreparedDataset, list_frames, make_records, rename_records
 
 FRAMES = MappingProxyType(
     {
@@ -31,14 +30,14 @@ class ICL(PreparedDataset):
     """Frames of ICL-NUIM.
 
     Args:
-        root: where the trajectories' folders lie.
-        scenes: names of the ones to use; None for the paper's six, ``found`` for every frame in ``root``.
-        size: height and width in pixels; None for frames as they are.
-        crop: see :class:`dsr.data.preparation.records.Preparation`.
-        frames: which frame each of the paper's names stands for.
+        root: directory of the folders of the trajectories.
+        scenes: names of the scenes to use; None for the paper's six, ``found`` for every frame in ``root``.
+        size: height and width in pixels; None for the original size.
+        crop: see :class:`dsr.data.preparation.dataset.Preparation`.
+        frames: frame of each of the paper's names.
 
     Raises:
-        ValueError: a scene is not there, or a value is out of range.
+        ValueError: a scene is not on disk, or a value is out of range.
 
     """
 
@@ -50,6 +49,7 @@ class ICL(PreparedDataset):
         crop: float = 0.5,
         frames: Mapping[str, str] = FRAMES,
     ) -> None:
-        folder = Path(root).expanduser()
-        found = renamed(records_of(listed(icl_nuim.find_frames, folder), icl_nuim.load_frame, "icl"), frames)
-        super().__init__("icl", folder, found, tuple(FRAMES), scenes, Preparation(size, crop))
+        found = rename_records(
+            make_records(list_frames(icl_nuim.find_frames, root), icl_nuim.load_frame, "icl"), frames
+        )
+        super().__init__("icl", root, found, tuple(FRAMES), scenes, Preparation(size, crop))

@@ -1,7 +1,7 @@
 """``dataset=middlebury``, ``middlebury2001`` .. ``middlebury2006``: stereo benchmarks to evaluate on.
 
-Of the 2014 data set the seven scenes of Voynov et al. 2019, of the others all. Scenes to train on: see
-:mod:`dsr.data.middlebury_train`.
+``middlebury`` has the seven scenes of the 2014 data set on which Voynov et al. 2019 evaluate, the others have all
+scenes of their year. :mod:`dsr.data.middlebury_train` has scenes to train on.
 """
 
 from __future__ import annotations
@@ -13,11 +13,11 @@ from pathlib import Path
 from dsr.data.base import SceneSelection
 from dsr.data.download import catalogue
 from dsr.data.formats import middlebury
-from dsr.data.preparation.records import Preparation, PreparedDataset, Record
+from dsr.data.preparation.dataset import Preparation, PreparedDataset, SceneRecord
 
 
 def _names(folders: Sequence[str]) -> tuple[str, ...]:
-    """Return the names of scenes, small letters, by their folders' names."""
+    """Return the names of scenes: those of their folders in lower case."""
     return tuple(name.casefold() for name in folders)
 
 
@@ -37,15 +37,15 @@ class Middlebury(PreparedDataset):
     """Scenes of Middlebury 2014.
 
     Args:
-        root: where folders such as ``Recycle-perfect`` or ``Recycle`` lie.
-        scenes: names of the ones to use; None for the paper's seven, ``found`` for all in ``root``.
-        size, crop: see :class:`dsr.data.preparation.records.Preparation`.
-        fill: names of the scenes whose holes are filled.
-        without_offset: names of the scenes whose disparity offset is taken for 0, so that their depth is not what it
-            was: the paper's figures of Vintage are of such depth, those of Recycle and Playroom are not.
+        root: directory of folders such as ``Recycle-perfect`` or ``Recycle``.
+        scenes: names of the scenes to use; None for the paper's seven, ``found`` for all in ``root``.
+        size, crop: see :class:`dsr.data.preparation.dataset.Preparation`.
+        fill: names of the scenes whose holes are inpainted.
+        without_offset: names of the scenes whose disparity offset is replaced by 0, which makes their depth wrong. The
+            paper does so with Vintage, but not with Recycle and Playroom.
 
     Raises:
-        ValueError: a scene is not there, or a value is out of range.
+        ValueError: a scene is not on disk, or a value is out of range.
 
     """
 
@@ -58,27 +58,24 @@ class Middlebury(PreparedDataset):
         fill: Sequence[str] = ("vintage",),
         without_offset: Sequence[str] = ("vintage",),
     ) -> None:
-        folder = Path(root).expanduser()
-        found = records_2014(folder, "middlebury", without_offset)
-        super().__init__(
-            "middlebury", folder, found, EVALUATION_2014, scenes, Preparation(size, crop, fill=tuple(fill))
-        )
+        found = records_2014(Path(root).expanduser(), "middlebury", without_offset)
+        super().__init__("middlebury", root, found, EVALUATION_2014, scenes, Preparation(size, crop, fill=tuple(fill)))
 
 
 class MiddleburyLevels(PreparedDataset):
     """Scenes of Middlebury 2001, 2003, 2005 or 2006, with disparities in 8 bits.
 
     Args:
-        root: where the scenes lie.
-        year: of the data set.
-        scenes: names of the ones to use; None for all that there are, ``found`` for all in ``root``.
-        size, crop: see :class:`dsr.data.preparation.records.Preparation`.
-        fill: names of the scenes whose holes are filled.
-        smooth: whether terraces of the rounding to whole levels become slopes; see
+        root: directory of the scenes.
+        year: year of the data set.
+        scenes: names of the scenes to use; None for all of the data set, ``found`` for all in ``root``.
+        size, crop: see :class:`dsr.data.preparation.dataset.Preparation`.
+        fill: names of the scenes whose holes are inpainted.
+        smooth: whether the steps that rounding to whole levels makes are smoothed; see
             :mod:`dsr.data.preparation.dequantization`.
 
     Raises:
-        ValueError: a scene is not there, or a value is out of range.
+        ValueError: a scene is not on disk, or a value is out of range.
 
     """
 
@@ -94,16 +91,16 @@ class MiddleburyLevels(PreparedDataset):
     ) -> None:
         if year not in middlebury.YEARS:
             raise ValueError(f"year: expected one of {', '.join(map(str, middlebury.YEARS))}, got {year}")
-        folder, name = Path(root).expanduser(), f"middlebury{year}"
-        found = records_levels(folder, name, year, smooth=smooth)
+        name = f"middlebury{year}"
+        found = records_levels(Path(root).expanduser(), name, year, smooth=smooth)
         preparation = Preparation(size, crop, fill=tuple(fill))
-        super().__init__(name, folder, found, SCENES[year], scenes, preparation)
+        super().__init__(name, root, found, SCENES[year], scenes, preparation)
 
 
-def records_2014(folder: Path, dataset: str, without_offset: Collection[str] = ()) -> dict[str, Record]:
-    """Return the scenes of 2014 on disk; the disparity offset of some may be taken for 0."""
+def records_2014(folder: Path, dataset: str, without_offset: Collection[str] = ()) -> dict[str, SceneRecord]:
+    """Return the records of the scenes of 2014 on disk; the disparity offset of ``without_offset`` is replaced by 0."""
     return {
-        name: Record(
+        name: SceneRecord(
             tuple(path for path in map(place.joinpath, _FILES_2014) if path.is_file()),
             functools.partial(middlebury.load_2014, place, dataset, name, offset=name not in without_offset),
             settings="without offset" if name in without_offset else "",
@@ -113,10 +110,10 @@ def records_2014(folder: Path, dataset: str, without_offset: Collection[str] = (
     }
 
 
-def records_levels(folder: Path, dataset: str, year: int, *, smooth: bool = True) -> dict[str, Record]:
-    """Return the scenes of 2001 to 2006 on disk."""
+def records_levels(folder: Path, dataset: str, year: int, *, smooth: bool = True) -> dict[str, SceneRecord]:
+    """Return the records of the scenes of 2001 to 2006 on disk."""
     return {
-        name: Record(
+        name: SceneRecord(
             tuple(path for path in (files.photo, files.disparity, files.shift, *files.measured.values()) if path),
             functools.partial(middlebury.load_levels, files, dataset, name, year, smooth=smooth),
             settings="" if smooth else "terraces",

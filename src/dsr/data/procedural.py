@@ -1,4 +1,4 @@
-"""The data set class of the procedural scenes."""
+"""``dataset=procedural``: random rendered scenes to train on."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ from pathlib import Path
 
 from dsr.sample import Scene
 from dsr.synthetic.procedural.scenes import PROCEDURAL_VERSION, render_random_scene
-from dsr.synthetic.rendering import cache_directory, cached
+from dsr.synthetic.rendering import cache_directory, load_or_render
 
 
 class Procedural:
     """Random scenes number 0 .. ``count`` - 1 of a seed, rendered once and kept in the cache.
 
     Args:
-        count: how many.
+        count: number of scenes.
         size: height and width in pixels.
-        seed: of the scenes; each is a pure function of seed, number and size.
+        seed: seed of the scenes; each is a pure function of seed, number and size.
 
     Raises:
         ValueError: a value is out of range.
@@ -37,20 +37,20 @@ class Procedural:
         self._count, self._size, self._seed = count, size, seed
 
     def scenes(self) -> list[str]:
-        """Return the scenes' numbers as names."""
+        """Return the names of the scenes: their numbers."""
         return [f"{index:05d}" for index in range(self._count)]
 
     def load(self, scene: str) -> Scene:
         """Return one scene; see :class:`dsr.data.base.SceneSource`."""
-        rendering = cached(self._path(scene), lambda: render_random_scene(self._seed, int(scene), self._size))
+        rendering = load_or_render(self._path(scene), lambda: render_random_scene(self._seed, int(scene), self._size))
         return rendering.scene(self.name, scene)
 
     def fingerprint(self, scene: str) -> str:
-        """Return what the scene is a function of."""
+        """Return the version, seed, size and number that determine the scene."""
         return f"procedural-v{PROCEDURAL_VERSION}-{self._seed}-{self._size}-{scene}"
 
     def prepare(self, scenes: Sequence[str]) -> Iterable[str]:
-        """Render what the cache lacks of some scenes, on every processor, and yield the names as they are done."""
+        """Render scenes that are not in the cache, on all processors, and yield the name of each that is ready."""
         there = {scene: (cache_directory() / self._path(scene)).is_file() for scene in scenes}
         missing = [scene for scene in scenes if not there[scene]]
         yield from (scene for scene in scenes if there[scene])
@@ -68,8 +68,8 @@ class Procedural:
                 raise
 
     def _render(self, scene: str) -> None:
-        """Make sure that the cache has a scene."""
-        cached(self._path(scene), lambda: render_random_scene(self._seed, int(scene), self._size))
+        """Render a scene into the cache unless it is there."""
+        load_or_render(self._path(scene), lambda: render_random_scene(self._seed, int(scene), self._size))
 
     def _path(self, scene: str) -> Path:
         return Path(f"procedural-v{PROCEDURAL_VERSION}-{self._seed}-{self._size}", f"{scene}.npz")

@@ -1,18 +1,17 @@
-"""``dataset=simgeo``: the paper's geometric scenes, rendered here, and a statue.
+"""``dataset=simgeo``: geometric scenes like the paper's, and a statue, all rendered by this package.
 
-The paper's own files are not needed. Its sixth scene, Lucy, takes the statue's place where ``root/lucy`` holds it in
-the layout of :mod:`dsr.data.folder`. Renderings are kept in a cache: $DSR_CACHE, else $XDG_CACHE_HOME/dsr or
-~/.cache/dsr.
+The paper's sixth scene, Lucy, replaces the statue where ``root/lucy`` holds it in the layout of
+:mod:`dsr.data.folder`. Renderings are cached, see :func:`dsr.synthetic.rendering.cache_directory`.
 """
 
 from __future__ import annotations
 
 from pathlib import Path
 
-from dsr.data.base import SceneSelection, chosen
+from dsr.data.base import SceneSelection, select_scenes
 from dsr.data.folder import Folder
 from dsr.sample import Scene
-from dsr.synthetic.rendering import cached
+from dsr.synthetic.rendering import load_or_render
 from dsr.synthetic.simgeo.scenes import SCENES, SCENES_VERSION, render_scene
 
 
@@ -20,9 +19,9 @@ class SimGeo:
     """The SimGeo scenes.
 
     Args:
-        root: where ``lucy`` may lie; None or a missing directory for the statue instead.
-        scenes: names of the ones to use; None for all.
-        size: height and width in pixels; the paper's are 512.
+        root: directory that may hold ``lucy``; without it the statue is used.
+        scenes: names of the scenes to use; None for all.
+        size: height and width in pixels, 512 in the paper.
 
     Raises:
         ValueError: an unknown scene or a size below 32.
@@ -41,7 +40,7 @@ class SimGeo:
         if root is not None and (Path(root).expanduser() / "lucy").is_dir():
             self._lucy = Folder(root, ["lucy"], self.name)
             available[available.index("statue")] = "lucy"
-        self._scenes = chosen(available, scenes)
+        self._scenes = select_scenes(available, scenes)
 
     def scenes(self) -> list[str]:
         """Return the names of the scenes, in order."""
@@ -52,7 +51,7 @@ class SimGeo:
         if scene == "lucy" and self._lucy is not None:
             return self._lucy.load(scene)
         path = Path(f"simgeo-v{SCENES_VERSION}-{self._size}", f"{scene}.npz")
-        return cached(path, lambda: render_scene(scene, self._size)).scene(self.name, scene)
+        return load_or_render(path, lambda: render_scene(scene, self._size)).scene(self.name, scene)
 
     def fingerprint(self, scene: str) -> str:
         """Return the version of the renderings, or the SHA-256 of Lucy's files."""

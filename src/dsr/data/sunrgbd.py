@@ -1,17 +1,23 @@
-"""``dataset=sunrgbd``: real rooms by four sensors (Song et al., CVPR 2015).
+"""``dataset=sunrgbd``: indoor scenes of four sensors (Song et al., CVPR 2015).
 
-Voynov et al. 2019 evaluate on twelve images and do not say which. Here: three of each sensor.
+Voynov et al. 2019 evaluate on twelve images and do not say which. This data set has three of each sensor.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from types import MappingProxyType
 
 from dsr.data.base import SceneSelection
 from dsr.data.formats import sunrgbd
-from dsr.data.preparation.records import Preparation, PreparedDataset, Record, listed, records_of, renamed
+from dsr.data.preparation.dataset import (
+    Preparation,
+    PreparedDataset,
+    SceneRecord,
+    list_frames,
+    make_records,
+    rename_records,
+)
 
 FRAMES = MappingProxyType(
     {
@@ -29,23 +35,23 @@ FRAMES = MappingProxyType(
         "xtion_3": "xtion/sun3ddata/brown_bm_2/brown_bm_2",
     }
 )
-"""Folders; where several scenes lie below one, its first."""
+"""Folders of the scenes; where several scenes lie below one, its first is used."""
 
 
 class SunRGBD(PreparedDataset):
-    """Scenes of SUN RGB-D; what the sensor measured is taken for the truth, holes and all.
+    """Scenes of SUN RGB-D; the depth that the sensor measured, with its holes, is the true depth.
 
     Args:
-        root: where the scenes' folders lie, at any depth.
-        scenes: names of the ones to use; None for twelve, ``found`` for all in ``root``.
-        size: height and width in pixels; None for scenes as they are.
-        crop: see :class:`dsr.data.preparation.records.Preparation`.
-        refined: whether the authors' refined depth, without holes, is taken for the truth.
-        frames: which folder each of the twelve names stands for.
+        root: directory of the scenes' folders, at any depth.
+        scenes: names of the scenes to use; None for twelve, ``found`` for all in ``root``.
+        size: height and width in pixels; None for the original size.
+        crop: see :class:`dsr.data.preparation.dataset.Preparation`.
+        refined: whether the authors' refined depth without holes is the true depth.
+        frames: folder of each of the twelve names.
         intrinsics: fx, fy, cx, cy in pixels for folders without ``intrinsics.txt``.
 
     Raises:
-        ValueError: a scene is not there, or a value is out of range.
+        ValueError: a scene is not on disk, or a value is out of range.
 
     """
 
@@ -61,14 +67,13 @@ class SunRGBD(PreparedDataset):
     ) -> None:
         if intrinsics is not None and len(intrinsics) != 4:
             raise ValueError(f"intrinsics: expected fx, fy, cx, cy, got {len(intrinsics)} numbers")
-        folder = Path(root).expanduser()
         settings = {"refined": refined, "intrinsics": intrinsics and tuple(intrinsics)}
-        records = records_of(listed(sunrgbd.find_frames, folder), sunrgbd.load_frame, "sunrgbd", **settings)
-        found = renamed(records, {name: _first_below(records, path) for name, path in frames.items()})
-        super().__init__("sunrgbd", folder, found, tuple(FRAMES), scenes, Preparation(size, crop))
+        records = make_records(list_frames(sunrgbd.find_frames, root), sunrgbd.load_frame, "sunrgbd", **settings)
+        found = rename_records(records, {name: _first_below(records, path) for name, path in frames.items()})
+        super().__init__("sunrgbd", root, found, tuple(FRAMES), scenes, Preparation(size, crop))
 
 
-def _first_below(records: Mapping[str, Record], path: str) -> str:
+def _first_below(records: Mapping[str, SceneRecord], path: str) -> str:
     """Return the first scene whose name is or begins with a path, below ``SUNRGBD`` or not; the path where none is."""
     beginnings = tuple(f"{above}{path.replace('/', '_')}_" for above in ("", "SUNRGBD_"))
     return next((name for name in records if f"{name}_".startswith(beginnings)), path)

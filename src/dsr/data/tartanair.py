@@ -2,25 +2,23 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 from dsr.data.base import SceneSelection
 from dsr.data.formats import tartanair
-from dsr.data.preparation.records import Preparation, PreparedDataset, listed, records_of
+from dsr.data.preparation.dataset import Preparation, PreparedDataset, list_frames, make_records
 
 
 class TartanAir(PreparedDataset):
     """Frames of TartanAir: rendered outdoor and indoor scenes (Wang et al., IROS 2020).
 
     Args:
-        root: where the trajectories lie.
-        scenes: names of the ones to use; None and ``found`` for all in ``root``.
-        size: height and width in pixels; None for frames as they are.
-        crop: see :class:`dsr.data.preparation.records.Preparation`.
-        farthest: metres beyond which a pixel is sky, a hole.
+        root: directory of the trajectories.
+        scenes: names of the scenes to use; None and ``found`` for all in ``root``.
+        size: height and width in pixels; None for the original size.
+        crop: see :class:`dsr.data.preparation.dataset.Preparation`.
+        farthest: depth in metres beyond which pixels are sky, that is, missing.
 
     Raises:
-        ValueError: a scene is not there, or a value is out of range.
+        ValueError: a scene is not on disk, or a value is out of range.
 
     """
 
@@ -32,7 +30,6 @@ class TartanAir(PreparedDataset):
         crop: float = 0.5,
         farthest: float = tartanair.FARTHEST,
     ) -> None:
-        folder = Path(root).expanduser()
-        frames = listed(tartanair.find_frames, folder)
-        found = records_of(frames, tartanair.load_frame, "tartanair", farthest=farthest)
-        super().__init__("tartanair", folder, found, tuple(found), scenes, Preparation(size, crop))
+        frames = list_frames(tartanair.find_frames, root)
+        found = make_records(frames, tartanair.load_frame, "tartanair", farthest=farthest)
+        super().__init__("tartanair", root, found, None, scenes, Preparation(size, crop))

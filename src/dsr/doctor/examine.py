@@ -11,7 +11,7 @@ from rich.progress import Progress
 from rich.table import Table
 from rich.text import Text
 
-from dsr.data.detection import scenes_in
+from dsr.data.detection import find_scenes
 from dsr.doctor.finding import LEVELS, Finding, Level, with_depth, worst
 from dsr.doctor.holes import check_holes
 from dsr.doctor.intrinsics import check_intrinsics, check_size
@@ -41,7 +41,7 @@ def examine_directory(folder: Path, most: int | None = None) -> int:
     """Print what looks wrong with the scenes of a directory, or with the one scene that it is.
 
     Args:
-        folder: of any layout that :func:`dsr.data.detection.scenes_in` knows.
+        folder: of any layout that :func:`dsr.data.detection.find_scenes` knows.
         most: examine so many scenes at most, spread over all; None for all.
 
     Returns:
@@ -50,7 +50,7 @@ def examine_directory(folder: Path, most: int | None = None) -> int:
 
     """
     try:
-        scenes = list(scenes_in(folder)) if folder.is_dir() else []
+        scenes = list(find_scenes(folder)) if folder.is_dir() else []
         if most is not None and most < 1:
             raise ValueError(f"--most: expected a positive number, got {most}")
         if not scenes:

@@ -39,7 +39,7 @@ class Rendering:
         return Scene(dataset, name, rgb, self.camera, torch.from_numpy(self.depth)[None])
 
 
-def cached(path: Path, make: Callable[[], Rendering]) -> Rendering:
+def load_or_render(path: Path, make: Callable[[], Rendering]) -> Rendering:
     """Return the rendering kept at ``path`` below the cache directory, or make it and try to keep it there.
 
     A damaged file is replaced; where nothing can be written the rendering is made each time.

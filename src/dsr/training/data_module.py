@@ -13,7 +13,7 @@ import lightning
 import torch
 from torch.utils.data import DataLoader, Dataset
 
-from dsr.data.base import SceneSource, content_of
+from dsr.data.base import SceneSource, content_key
 from dsr.sample import Scene
 from dsr.training.degradation import Batch, Degradation, to_tensors
 from dsr.training.patches import Patches, PatchSettings, check_patches
@@ -195,13 +195,13 @@ class PatchData(lightning.LightningDataModule):
     def _refuse_leaks(self) -> None:
         """Refuse a scene that is both trained on and validated with, under whatever name."""
         trained = {
-            content_of(part.source, name)
+            content_key(part.source, name)
             for part, names in zip(self._parts, self._training_names, strict=True)
             for name in names
         }
         for kind, (source, names) in self._held_out.items():
             for name in names:
-                if content_of(source, name) in trained:
+                if content_key(source, name) in trained:
                     raise ValueError(f"validation.{kind}: expected scenes that are not trained on, got {name}")
 
 

@@ -28,7 +28,7 @@ from torch import Tensor
 
 from dsr.data.formats.files import read_levels, read_map
 from dsr.data.formats.shared import expect_size, read_picture
-from dsr.data.preparation.dequantization import smoothed_levels
+from dsr.data.preparation.dequantization import smooth_levels
 from dsr.geometry.camera import Camera, from_range
 from dsr.sample import Scene
 
@@ -132,7 +132,7 @@ def load_levels(files: Files, dataset: str, name: str, year: int, *, smooth: boo
     height, width = levels.shape
     camera, per_pixel = _CAMERAS[year](files, height, width)
     levels[levels == 0] = np.nan
-    depth = _depth(files.disparity, (smoothed_levels(levels) if smooth else levels) / per_pixel, camera)
+    depth = _depth(files.disparity, (smooth_levels(levels) if smooth else levels) / per_pixel, camera)
     measured = {}
     for factor, path in files.measured.items():
         coarse = camera.coarser(factor)

@@ -1,1 +1,1 @@
-"""Scenes made ready: resized, cropped, inpainted, freed of quantization."""
+"""Preparation of scenes: resizing, cropping, inpainting, dequantization."""

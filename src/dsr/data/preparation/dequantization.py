@@ -1,8 +1,8 @@
-"""Undoing the rounding of maps that hold whole levels, so that slopes are slopes and not terraces.
+"""Dequantization of maps of whole levels, which replaces the steps of the rounding by slopes.
 
-A level L says that the value lay between L - 1/2 and L + 1/2. Between pixels of levels L and L + 1 it passed L + 1/2,
-so the lines between levels are known as the contour lines of a map are. Between them the result is harmonic: it solves
-Laplace's equation given the contours, with holes and the edges of surfaces, where levels jump, as free boundaries.
+A value with the level L lies between L - 1/2 and L + 1/2. Between pixels of the levels L and L + 1 it is L + 1/2, so
+the lines between levels are contours of known value. Between them the result is harmonic: it solves Laplace's equation
+given the contours, with free boundaries at holes and at edges of surfaces, where levels jump.
 """
 
 from __future__ import annotations
@@ -12,21 +12,21 @@ from scipy import sparse
 from scipy.sparse import linalg
 
 _CONTOUR = 2.0
-"""Weight of a contour's value: it lies half a pixel from the pixels on its sides."""
+"""Weight of the value at a contour, which lies half a pixel from the pixels on its sides."""
 _ANCHOR = 1e-6
-"""Weight of the level itself, for plateaus that no contour touches."""
+"""Weight of the level itself, for plateaus without a contour."""
 _TOLERANCE = 1e-5
 
 
-def smoothed_levels(levels: np.ndarray, largest_step: int = 2) -> np.ndarray:
-    """Return values between levels.
+def smooth_levels(levels: np.ndarray, largest_step: int = 2) -> np.ndarray:
+    """Return a map whose values vary smoothly between the levels.
 
     Args:
-        levels: (H, W) whole numbers, NaN where unknown.
-        largest_step: neighbours whose levels differ by more are of different surfaces.
+        levels: (H, W) whole numbers, NaN where missing.
+        largest_step: largest difference of neighbours' levels within a surface.
 
     Returns:
-        (H, W) float64, within half a level of ``levels``; NaN where they are.
+        (H, W) float64, within half a level of ``levels``, NaN where they are NaN.
 
     """
     known = np.isfinite(levels)
@@ -45,11 +45,11 @@ def smoothed_levels(levels: np.ndarray, largest_step: int = 2) -> np.ndarray:
     weight += _CONTOUR * np.bincount(ends, minlength=own.size)
     right = _ANCHOR * own + _CONTOUR * np.bincount(ends, values, minlength=own.size)
     result = np.full(levels.shape, np.nan)
-    result[known] = np.clip(_solved(weight, first[level], second[level], right, own), own - 0.5, own + 0.5)
+    result[known] = np.clip(_solve(weight, first[level], second[level], right, own), own - 0.5, own + 0.5)
     return result
 
 
-def _solved(
+def _solve(
     weight: np.ndarray, first: np.ndarray, second: np.ndarray, right: np.ndarray, start: np.ndarray
 ) -> np.ndarray:
     """Solve weight x - (sum of x over the neighbours) = right by conjugate gradients."""

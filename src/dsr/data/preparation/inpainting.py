@@ -1,8 +1,8 @@
-"""Filling holes of a data set's depth where its evaluation is to have none: the background goes on behind what is near.
+"""Inpainting of the holes of a data set's depth, for evaluation without holes.
 
-Inside a hole inverse depth solves Laplace's equation with the hole's rim as its boundary. Where the rim spans a depth
-step (an occlusion, as stereo leaves them), only its farther part counts, as what is hidden from the second camera is
-background.
+Inside a hole inverse depth solves Laplace's equation with the values at the hole's rim as boundary. Where the rim has a
+depth step, as at occlusions in stereo, only its farther part is used, because the background is what the second camera
+does not see.
 """
 
 from __future__ import annotations
@@ -14,18 +14,18 @@ from scipy.sparse import linalg
 from torch import Tensor
 
 _STEP = 0.05
-"""Relative gap between the inverse depths of a rim beyond which it counts as a depth step."""
+"""Smallest relative gap between the sorted inverse depths of a rim that is a depth step."""
 _SIDES = ((0, 1), (1, 0), (0, -1), (-1, 0))
 
 
-def filled_depth(depth: Tensor) -> Tensor:
-    """Return a depth map without holes.
+def inpaint_depth(depth: Tensor) -> Tensor:
+    """Return a depth map with its holes inpainted.
 
     Args:
-        depth: (1, H, W) orthogonal depth in metres, NaN where unknown; at least one pixel is known.
+        depth: (1, H, W) orthogonal depth in metres, NaN where missing; at least one pixel is valid.
 
     Returns:
-        (1, H, W) float64; known pixels are as they were.
+        (1, H, W) float64; valid pixels are unchanged.
 
     """
     inverse = 1 / depth[0].double().numpy()
@@ -38,12 +38,12 @@ def filled_depth(depth: Tensor) -> Tensor:
         hole = labels[window] == label
         rim = ndimage.binary_dilation(hole) & ~holes[window]
         used = rim & (inverse[window] <= _farther_part(inverse[window][rim]))
-        inverse[window][hole] = _membrane(np.where(used, inverse[window], 0), hole, used)
+        inverse[window][hole] = _solve_laplace(np.where(used, inverse[window], 0), hole, used)
     return torch.from_numpy(1 / inverse)[None]
 
 
 def _farther_part(rim: np.ndarray) -> float:
-    """Return the largest inverse depth of a rim's farther part; of the whole rim where it spans no depth step."""
+    """Return the largest inverse depth of the rim's part beyond a depth step, or of the whole rim if it has none."""
     values = np.sort(rim)
     gaps = np.diff(values)
     if not gaps.size or gaps.max() <= _STEP * values[0]:
@@ -51,8 +51,8 @@ def _farther_part(rim: np.ndarray) -> float:
     return float(values[gaps.argmax()])
 
 
-def _membrane(values: np.ndarray, hole: np.ndarray, rim: np.ndarray) -> np.ndarray:
-    """Return the harmonic values of a hole's pixels, given those of its rim."""
+def _solve_laplace(values: np.ndarray, hole: np.ndarray, rim: np.ndarray) -> np.ndarray:
+    """Return the harmonic values of the pixels of a hole, given those of its rim."""
     number = np.full(hole.shape, -1)
     number[hole] = np.arange(hole.sum())
     rows, columns, count = [], [], np.zeros(hole.sum())
@@ -60,7 +60,7 @@ def _membrane(values: np.ndarray, hole: np.ndarray, rim: np.ndarray) -> np.ndarr
     for step in _SIDES:
         there = np.roll(number, step, (0, 1))
         known, beside = np.roll(rim, step, (0, 1)), np.roll(values, step, (0, 1))
-        _forget_wrapped(step, there, known)
+        _clear_wrapped(step, there, known)
         inner = hole & (there >= 0)
         rows.append(number[inner])
         columns.append(there[inner])
@@ -73,7 +73,7 @@ def _membrane(values: np.ndarray, hole: np.ndarray, rim: np.ndarray) -> np.ndarr
     return solution
 
 
-def _forget_wrapped(step: tuple[int, int], number: np.ndarray, known: np.ndarray) -> None:
-    """Take away what a roll brought in from the other side."""
+def _clear_wrapped(step: tuple[int, int], number: np.ndarray, known: np.ndarray) -> None:
+    """Clear the row or column that a roll moved in from the opposite side."""
     edge = (slice(None), 0 if step[1] > 0 else -1) if step[1] else (0 if step[0] > 0 else -1, slice(None))
     number[edge], known[edge] = -1, False

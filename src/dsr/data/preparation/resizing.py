@@ -1,11 +1,12 @@
-"""Resizing scenes: photos antialiased, depth surface by surface.
+"""Resizing of scenes: rgb with antialiasing, depth separately for each surface.
 
-The rule for depth. A pixel of the new map belongs to the surface of the old pixel that its centre falls on; where that
-is a hole, so is the new pixel. The new depth is that of the plane which fits the old pixels around best, by weighted
-least squares in inverse depth (a plane's is linear in the pixel), over the known pixels of that surface alone: those
-whose depth differs by less than ``JUMP`` from its own. Weights are a triangle as wide as in antialiased bilinear
-resizing, or a little wider where the map is enlarged. So nothing is mixed across a hole or a depth edge, holes neither
-grow nor shrink by more than half a pixel, and planes stay planes to rounding, at a border and beside a hole, too.
+Depth is resized as follows. A new pixel belongs to the surface of the old pixel at its centre; where that is missing,
+so is the new pixel. The new depth is that of a plane fitted to the old pixels around it, by weighted least squares in
+inverse depth, which is linear in the pixel for a plane. The fit uses the valid pixels of the same surface only, those
+whose depth differs from the centre's by less than the fraction ``JUMP``. The weights are triangular, as wide as in
+antialiased bilinear resizing, or a little wider where the map is enlarged. So depth is never mixed across a hole or a
+depth edge, holes neither grow nor shrink by more than half a pixel, and planes stay planes up to rounding, also at
+borders and beside holes.
 """
 
 from __future__ import annotations
@@ -21,19 +22,19 @@ from torch.nn import functional
 from dsr.sample import Scene
 
 JUMP = 0.02
-"""Relative difference of depth beyond which neighbours are of different surfaces."""
-_LEAST_REACH = 1.5
-"""In old pixels: so that there are two on either side of a border, which a slope needs."""
+"""Relative difference of depth above which neighbours belong to different surfaces."""
+_MIN_RADIUS = 1.5
+"""Smallest radius of the weights in old pixels: it leaves two pixels at a border, which a slope needs."""
 _RIDGE = 1e-9
 
 
-def resized(scene: Scene, height: int, width: int) -> Scene:
-    """Return a scene at another size, its camera along with it; measured low-resolution maps are left out.
+def resize(scene: Scene, height: int, width: int) -> Scene:
+    """Return a scene at another size, its camera included; measured low-resolution maps are left out.
 
     Args:
-        scene: with a high-resolution depth.
-        height: of the result in pixels.
-        width: the same.
+        scene: scene with a high-resolution depth.
+        height: height of the result in pixels.
+        width: width of the result in pixels.
 
     Raises:
         ValueError: the scene has no high-resolution depth.
@@ -46,26 +47,26 @@ def resized(scene: Scene, height: int, width: int) -> Scene:
     if (height, width) == (scene.camera.height, scene.camera.width):
         return replace(scene, measured={})
     photo = functional.interpolate(scene.rgb[None], (height, width), mode="bicubic", antialias=True)[0].clamp(0, 1)
-    depth = resized_depth(scene.depth, height, width)
+    depth = resize_depth(scene.depth, height, width)
     return replace(scene, rgb=photo, depth=depth, camera=scene.camera.rescale(width, height), measured={})
 
 
-def fitted(scene: Scene, size: int, place: float | None = 0.5, *, enlarge: bool = True) -> Scene:
-    """Return a scene whose shorter side is ``size`` pixels long.
+def fit(scene: Scene, size: int, place: float | None = 0.5, *, enlarge: bool = True) -> Scene:
+    """Return a scene resized so that its shorter side is ``size`` pixels long, and cropped to a square.
 
     Args:
-        scene: with a high-resolution depth.
-        size: in pixels.
-        place: where along the longer side a square window is cut out: 0 at the top or left, 1 at the bottom or right;
-            None for no window.
-        enlarge: whether smaller scenes are enlarged, or left as they are.
+        scene: scene with a high-resolution depth.
+        size: length of the shorter side in pixels.
+        place: position of the square along the longer side, from 0 (top or left) to 1 (bottom or right); None for no
+            cropping.
+        enlarge: whether smaller scenes are enlarged.
 
     """
     height, width = scene.camera.height, scene.camera.width
     shorter = min(height, width)
     if size < shorter or enlarge:
         height, width = (size if side == shorter else round(side * size / shorter) for side in (height, width))
-        scene = resized(scene, height, width)
+        scene = resize(scene, height, width)
     if place is None:
         return scene
     side = min(height, width)
@@ -73,13 +74,13 @@ def fitted(scene: Scene, size: int, place: float | None = 0.5, *, enlarge: bool 
     return replace(window, measured={})
 
 
-def resized_depth(depth: Tensor, height: int, width: int) -> Tensor:
-    """Return a depth map at another size, by the module's rule.
+def resize_depth(depth: Tensor, height: int, width: int) -> Tensor:
+    """Return a depth map at another size, resized as the module describes.
 
     Args:
-        depth: (1, H, W) orthogonal depth in metres, NaN where unknown.
-        height: of the result in pixels.
-        width: the same.
+        depth: (1, H, W) orthogonal depth in metres, NaN where missing.
+        height: height of the result in pixels.
+        width: width of the result in pixels.
 
     Returns:
         (1, height, width) float64.
@@ -99,8 +100,8 @@ def resized_depth(depth: Tensor, height: int, width: int) -> Tensor:
         value, y, x = torch.where(same, values - own, 0), shift_y + step_y, shift_x + step_x
         terms = (torch.ones_like(y), y, x, y * y, y * x, x * x, value, value * y, value * x)
         sums = [total + weight * term for total, term in zip(sums, terms, strict=True)]
-    fine = own + _plane_at_centre(sums, rows.reach * columns.reach)
-    return torch.where(fine > 0, fine, own).reciprocal()[None]
+    resized = own + _plane_at_centre(sums, rows.radius * columns.radius)
+    return torch.where(resized > 0, resized, own).reciprocal()[None]
 
 
 class _Axis:
@@ -112,30 +113,30 @@ class _Axis:
     """
 
     def __init__(self, old: int, new: int) -> None:
-        self.reach = max(old / new, _LEAST_REACH)
+        self.radius = max(old / new, _MIN_RADIUS)
         self.centre = (torch.arange(new, dtype=torch.float64) + 0.5) * (old / new) - 0.5
         self.nearest = self.centre.round().long().clamp(0, old - 1)
         self._old = old
 
     def steps(self) -> range:
-        """Return the distances of old pixels from the nearest one that may count."""
-        most = math.ceil(self.reach + 0.5) - 1
+        """Return the offsets from the nearest old pixel that may have a weight."""
+        most = math.ceil(self.radius + 0.5) - 1
         return range(-most, most + 1)
 
     def neighbour(self, step: int) -> tuple[Tensor, Tensor]:
-        """Return the old pixels ``step`` from the nearest ones, and their weights; 0 beyond the border."""
+        """Return the old pixels ``step`` from the nearest ones, and their weights, which are 0 beyond the border."""
         index = self.nearest + step
-        weight = (1 - (index - self.centre).abs() / self.reach).clamp(min=0)
+        weight = (1 - (index - self.centre).abs() / self.radius).clamp(min=0)
         inside = (index >= 0) & (index < self._old)
         return index.clamp(0, self._old - 1), torch.where(inside, weight, 0)
 
 
 def _plane_at_centre(sums: list[Tensor], area: float) -> Tensor:
-    """Return the value at 0 of the plane that fits best, from sums of w times 1, y, x, yy, yx, xx, v, vy, vx."""
+    """Return the value at 0 of the fitted plane, from sums of w times 1, y, x, yy, yx, xx, v, vy, vx."""
     total, y, x, yy, yx, xx, v, vy, vx = sums
     weight = total.clamp(min=torch.finfo(total.dtype).tiny)
     mean_y, mean_x, mean = y / weight, x / weight, v / weight
-    ridge = _RIDGE * area  # where all lie in a line, the slope across it is taken for 0
+    ridge = _RIDGE * area  # makes the slope across a line 0 where all pixels lie in one
     var_y, var_x = yy / weight - mean_y.square() + ridge, xx / weight - mean_x.square() + ridge
     both = yx / weight - mean_y * mean_x
     with_y, with_x = vy / weight - mean * mean_y, vx / weight - mean * mean_x

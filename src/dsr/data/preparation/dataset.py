@@ -1,7 +1,7 @@
-"""Data sets in their owners' formats, prepared: resized and cropped once, and kept in the cache.
+"""Data sets in their original formats, whose scenes are resized and cropped once and kept in the cache.
 
-What is kept is named by the content of the files, the settings, and the code that reads and resizes, so that whatever
-changes makes it anew.
+The name of a cached file contains a hash of the scene's files, the settings, and the code that reads and resizes. So a
+change of any of them prepares the scene again.
 """
 
 from __future__ import annotations
@@ -18,29 +18,29 @@ from typing import Any
 
 import torch
 
-from dsr.data.base import SceneSelection, chosen
-from dsr.data.preparation.inpainting import filled_depth
-from dsr.data.preparation.resizing import fitted
+from dsr.data.base import SceneSelection, select_scenes
+from dsr.data.preparation.inpainting import inpaint_depth
+from dsr.data.preparation.resizing import fit
 from dsr.sample import Scene
-from dsr.synthetic.rendering import Rendering, cache_directory, cached
+from dsr.synthetic.rendering import Rendering, cache_directory, load_or_render
 from dsr.utils.hashing import file_hash, hash_of_code
 
-_SMALLEST = 32
+_MIN_SIZE = 32
 _READING_CODE = ("geometry/camera.py", "data/preparation", "data/formats")
-_HASHED_WHOLE = 1 << 28
-"""Bytes; of a larger file the name, the size and the time of its last change stand for the content."""
+_MAX_HASHED = 1 << 28
+"""Largest size in bytes of files whose content is hashed."""
 
 
 @dataclass(frozen=True)
-class Record:
+class SceneRecord:
     """A scene on disk.
 
     Args:
-        files: all that it is read from; a folder for all that is in it.
-        load: reads it at its own size.
-        frame: which part of the files it is, where they hold several scenes.
+        files: files and folders that the scene is read from; a folder stands for all files in it.
+        load: function that reads the scene at its original size.
+        frame: part of the files that holds the scene, where they hold several.
         settings: how the files are read.
-        note: what somebody who reads its scores should know; empty for nothing.
+        note: remark for readers of the scene's scores; empty for none.
 
     """
 
@@ -51,14 +51,22 @@ class Record:
     note: str = ""
 
 
-def records_of(
+def list_frames(
+    find: Callable[..., Mapping[str, tuple[Any, ...]]], root: str, *arguments: Any
+) -> Mapping[str, tuple[Any, ...]]:
+    """Return the frames that a reader finds in the directory ``root``; none where there is no such directory."""
+    folder = Path(root).expanduser()
+    return find(folder, *arguments) if folder.is_dir() else {}
+
+
+def make_records(
     frames: Mapping[str, tuple[Any, ...]], load: Callable[..., Scene], dataset: str, **settings: Any
-) -> dict[str, Record]:
-    """Return frames on disk as records, by their names with _ for /.
+) -> dict[str, SceneRecord]:
+    """Return the records of frames on disk, by their names with _ in place of /.
 
     Args:
-        frames: the first arguments of ``load`` by name, as the readers in :mod:`dsr.data.formats` list them.
-        load: reads a frame; called with these, the data set's and the scene's name, and ``settings``.
+        frames: first arguments of ``load`` by name, as from :func:`list_frames`.
+        load: function that reads a frame, given these, the names of data set and scene, and ``settings``.
         dataset: name of the data set.
         settings: further arguments of ``load``.
 
@@ -69,7 +77,7 @@ def records_of(
         files = tuple(path for path in arguments if isinstance(path, Path))
         which = json.dumps([each for each in arguments if not isinstance(each, Path)])
         read = functools.partial(load, *arguments, dataset, name, **settings)
-        records[name] = Record(files, read, which, json.dumps(settings))
+        records[name] = SceneRecord(files, read, which, json.dumps(settings))
     return records
 
 
@@ -78,35 +86,35 @@ def _files_of(path: Path) -> list[Path]:
     return [path] if not path.is_dir() else sorted(file for file in path.rglob("*") if file.is_file())
 
 
-def renamed(records: Mapping[str, Record], names: Mapping[str, str]) -> dict[str, Record]:
-    """Return records, some under other names.
+def rename_records(records: Mapping[str, SceneRecord], names: Mapping[str, str]) -> dict[str, SceneRecord]:
+    """Return the records, some of them under other names.
 
     Args:
-        records: by name.
-        names: the frame on disk that each new name stands for, with / or _; those that are not there are left out.
+        records: records by name.
+        names: names of frames by their new names, with / or _; frames that are not in ``records`` are left out.
 
     """
     frames = {name: frame.replace("/", "_") for name, frame in names.items()}
-    chosen = {name: _named(records[frame], name) for name, frame in frames.items() if frame in records}
-    taken = set(frames.values())
-    return {**chosen, **{name: record for name, record in records.items() if name not in taken | chosen.keys()}}
+    new = {name: _with_scene_name(records[frame], name) for name, frame in frames.items() if frame in records}
+    replaced = new.keys() | set(frames.values())
+    return {**new, **{name: record for name, record in records.items() if name not in replaced}}
 
 
-def _named(record: Record, name: str) -> Record:
-    """Return a record whose scene has another name."""
+def _with_scene_name(record: SceneRecord, name: str) -> SceneRecord:
+    """Return the record with another name for its scene."""
     return replace(record, load=lambda: replace(record.load(), name=name))
 
 
 @dataclass(frozen=True)
 class Preparation:
-    """What is done to scenes after they are read.
+    """Resizing, cropping and inpainting of scenes after they are read.
 
     Args:
-        size: of the shorter side in pixels; None for the scenes as they are.
-        crop: where along the longer side a square window lies: 0 at the top or left, 1 at the bottom or right; None for
+        size: length of the shorter side in pixels; None for the original size.
+        crop: position of a square window along the longer side, from 0 (top or left) to 1 (bottom or right); None for
             no window.
         enlarge: whether smaller scenes are enlarged.
-        fill: names of the scenes whose holes are filled; see :mod:`dsr.data.preparation.inpainting`.
+        fill: names of the scenes whose holes are inpainted; see :mod:`dsr.data.preparation.inpainting`.
 
     Raises:
         ValueError: a value is out of range.
@@ -120,33 +128,33 @@ class Preparation:
 
     def __post_init__(self) -> None:
         """Check the values."""
-        if self.size is not None and self.size < _SMALLEST:
-            raise ValueError(f"size: expected at least {_SMALLEST} pixels, or null, got {self.size}")
+        if self.size is not None and self.size < _MIN_SIZE:
+            raise ValueError(f"size: expected at least {_MIN_SIZE} pixels, or null, got {self.size}")
         if self.crop is not None and not 0 <= self.crop <= 1:
             raise ValueError(f"crop: expected a number from 0 to 1, or null, got {self.crop}")
 
     def __call__(self, scene: Scene) -> Scene:
         """Return the scene prepared."""
         if self.size is not None:
-            scene = fitted(scene, self.size, self.crop, enlarge=self.enlarge)
+            scene = fit(scene, self.size, self.crop, enlarge=self.enlarge)
         if scene.name in self.fill and scene.depth is not None:
-            scene = replace(scene, depth=filled_depth(scene.depth))
+            scene = replace(scene, depth=inpaint_depth(scene.depth))
         return scene
 
 
 class PreparedDataset:
-    """A data set in its own format; the base of those in this package.
+    """A data set in its original format; the base class of those in this package.
 
     Args:
-        name: as in ``scores.csv``, and what ``dsr data get`` calls it.
-        folder: where it was looked for.
-        found: the scenes on disk.
-        named: the scenes that belong to the data set.
-        wanted: the scenes to use.
-        preparation: what is done to them.
+        name: name in ``scores.csv`` and in ``dsr data get``.
+        root: directory of the data set.
+        found: records of the scenes on disk.
+        named: names of the scenes that belong to the data set; None for all that are on disk.
+        scenes: names of the scenes to use; None for those of ``named``, ``found`` for all that are on disk.
+        preparation: how scenes are resized, cropped and inpainted.
 
     Raises:
-        ValueError: a scene is not on disk; the message says what to do.
+        ValueError: a scene is not on disk; the message says how to get it.
 
     """
 
@@ -155,26 +163,27 @@ class PreparedDataset:
     def __init__(
         self,
         name: str,
-        folder: Path,
-        found: Mapping[str, Record],
-        named: Sequence[str],
-        wanted: SceneSelection,
+        root: str,
+        found: Mapping[str, SceneRecord],
+        named: Sequence[str] | None,
+        scenes: SceneSelection,
         preparation: Preparation,
     ) -> None:
         self.name = name
+        folder, named = Path(root).expanduser(), tuple(found if named is None else named)
         remedy = f"get it with: dsr data get {name}; or say where it is: dataset.root=DIR"
         if not found:
             there = "no scene of it" if folder.is_dir() else "no such directory"
             raise ValueError(f"dataset={name}: expected its files in {folder}, got {there}; {remedy}")
-        if wanted is None:
+        if scenes is None:
             missing = [scene for scene in named if scene not in found]
             if missing:
                 raise ValueError(
                     f"dataset={name}: expected {', '.join(missing)} in {folder}, got {len(named) - len(missing)} "
                     f"of {len(named)} scenes; {remedy}; or use what is there: dataset.scenes=found"
                 )
-            wanted = named
-        self._scenes = chosen(list(found), wanted)
+            scenes = named
+        self._scenes = select_scenes(list(found), scenes)
         unknown = [scene for scene in preparation.fill if scene not in (*named, *found)]
         if unknown:
             raise ValueError(f"fill: expected names of scenes, got {', '.join(unknown)}")
@@ -190,17 +199,17 @@ class PreparedDataset:
         notes = (record.note,) if record.note else ()
         if self._preparation.size is None and scene not in self._preparation.fill:
             return replace(record.load(), notes=notes)
-        prepared = cached(self._path(scene), lambda: _rendering(self._preparation(record.load())))
+        prepared = load_or_render(self._path(scene), lambda: _rendering(self._preparation(record.load())))
         return replace(prepared.scene(self.name, scene), notes=notes)
 
     def fingerprint(self, scene: str) -> str:
-        """Return the SHA-256 of the scene's files and of what is done to them."""
+        """Return the SHA-256 of the scene's files and of the settings that they are read and prepared with."""
         plain = asdict(replace(self._preparation, fill=()))
         settings = json.dumps([self._found[scene].settings, scene in self._preparation.fill, plain])
         return hashlib.sha256(f"{settings}{self.content(scene)}".encode()).hexdigest()
 
     def content(self, scene: str) -> str:
-        """Return the SHA-256 of the scene's files, whatever is done to them."""
+        """Return the SHA-256 of the scene's files alone."""
         record = self._found[scene]
         digest = hashlib.sha256(record.frame.encode())
         for path in record.files:
@@ -209,9 +218,9 @@ class PreparedDataset:
         return digest.hexdigest()
 
     def prepare(self, scenes: Sequence[str]) -> Iterator[str]:
-        """Prepare what the cache lacks of some scenes, several at a time, and yield the names as they are done.
+        """Prepare scenes that are not in the cache, several at a time, and yield the name of each that is ready.
 
-        A scene that fails is yielded, too; loading it says why.
+        The name of a scene that fails is yielded, too; loading the scene raises the error.
         """
         with ThreadPoolExecutor(min(len(scenes), os.cpu_count() or 1) or 1) as pool:
             ready = {scene: self._is_ready(scene) for scene in scenes}
@@ -227,7 +236,7 @@ class PreparedDataset:
     def _is_ready(self, scene: str) -> bool:
         try:
             return self._preparation.size is None or (cache_directory() / self._path(scene)).is_file()
-        except (OSError, ValueError):  # loading it says why
+        except (OSError, ValueError):  # loading the scene raises it again
             return True
 
     def _path(self, scene: str) -> Path:
@@ -235,20 +244,15 @@ class PreparedDataset:
         return Path("prepared", self.name, f"{scene.replace('/', '_')}-{key}.npz")
 
 
-def listed(find: Callable[..., Mapping[str, tuple[Any, ...]]], folder: Path, *arguments: Any) -> Mapping[str, Any]:
-    """Return what a reader finds in a directory; nothing where there is none."""
-    return find(folder, *arguments) if folder.is_dir() else {}
-
-
 @functools.lru_cache(maxsize=4096)
 def _hash_of(path: Path, size: int, changed: int) -> str:
-    if size > _HASHED_WHOLE:
+    if size > _MAX_HASHED:
         return f"{path.name} {size} {changed}"
     return file_hash(path)
 
 
 def content_hash(path: Path) -> str:
-    """Return the SHA-256 of a file; of a very large one, a text of its name, size and time of change.
+    """Return the SHA-256 of a file; of a file above 256 MiB, its name, size and time of the last change.
 
     Raises:
         ValueError: there is no such file.
@@ -267,7 +271,7 @@ def _rules_hash() -> str:
 
 
 def _rendering(scene: Scene) -> Rendering:
-    """Return a scene as it is kept: its photo in 8 bits."""
+    """Return a scene as it is cached, with its rgb in 8 bits."""
     if scene.depth is None:
         raise ValueError(f"{scene.name}: expected a high-resolution depth map, there is none")
     photo = (scene.rgb * 255).round().to(torch.uint8).permute(1, 2, 0).numpy()
