@@ -156,22 +156,14 @@ def test_camera_with_an_upward_y_axis_is_converted() -> None:
     assert Camera(640, 480, 481.2, -480.0, 319.5, 239.5) == Camera(640, 480, 481.2, 480.0, 319.5, 239.5)
 
 
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [
-        *((name, value) for name in ("width", "height") for value in (0, -3, 2.5, math.nan, math.inf)),
-        *((name, value) for name in ("fx", "fy", "cx", "cy", "doffs", "baseline") for value in (math.nan, -math.inf)),
-        ("fx", 0.0),
-        ("fx", -20.0),
-        ("fy", 0.0),
-        ("baseline", 0.0),
-        ("baseline", -0.1),
-    ],
-)
-def test_invalid_field_is_refused_by_name(name: str, value: float) -> None:
+@pytest.mark.parametrize("name", ["width", "height", "fx", "fy", "cx", "cy", "doffs", "baseline"])
+def test_invalid_field_is_refused_by_name(name: str) -> None:
     fields = {"width": 4, "height": 3, "fx": 5.0, "fy": 5.0, "cx": 1.5, "cy": 1.0}
-    with pytest.raises(ValueError, match=f"^camera {name}: expected "):
-        Camera(**(fields | {name: value}))  # type: ignore[arg-type]
+    further = {"fx": [0, -20.0], "fy": [0], "baseline": [0, -0.1], "width": [0, -3, 2.5], "height": [0, -3, 2.5]}
+    wrong = [math.nan, math.inf, -math.inf, *further.get(name, [])]
+    for value in wrong:
+        with pytest.raises(ValueError, match=f"^camera {name}: expected "):
+            Camera(**(fields | {name: value}))  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(

@@ -150,19 +150,18 @@ def test_array_that_is_no_numeric_map_is_refused(tmp_path, capfd, descr):
     refusal(read_map, written(tmp_path, "d.npy", npy(np.ones((2, 3)), descr)), capfd)
 
 
-@pytest.mark.parametrize("case", FORMATS)
-@pytest.mark.parametrize("share", [0, 0.3, 0.9])
-def test_truncated_map_is_refused(tmp_path, capfd, case, share):
+@pytest.mark.parametrize("case", ["npy float32", "png 16-bit", "tiff float", "pfm little-endian"])
+def test_truncated_map_is_refused(tmp_path, capfd, case):
     name, content, _ = FORMATS[case]
-    refusal(read_map, written(tmp_path, name, content[: int(len(content) * share)]), capfd)
+    for fraction in (0.3, 0.9):  # within the header, within the values
+        refusal(read_map, written(tmp_path, name, content[: int(len(content) * fraction)]), capfd)
 
 
 @pytest.mark.parametrize("name", ["d.npy", "d.png", "d.tiff", "d.pfm"])
-@pytest.mark.parametrize(
-    "content", [b"", b"no picture, no array", bytes(200), b"\x93NUMPY\x01\0\x10\0{'descr': ((((", b"\x93NUMPY\x09\0ab"]
-)
-def test_foreign_file_is_refused(tmp_path, capfd, name, content):
-    refusal(read_map, written(tmp_path, name, content), capfd)
+def test_foreign_file_is_refused(tmp_path, capfd, name):
+    numpy_like = (b"\x93NUMPY\x01\0\x10\0{'descr': ((((", b"\x93NUMPY\x09\0ab")
+    for content in (b"", b"no picture, no array", bytes(200), *numpy_like):
+        refusal(read_map, written(tmp_path, name, content), capfd)
 
 
 def test_npz_archive_named_npy_is_refused(tmp_path, capfd):
@@ -212,11 +211,10 @@ def test_grey_photo_becomes_three_equal_channels(tmp_path):
     np.testing.assert_array_equal(picture, np.dstack([grey] * 3))
 
 
-@pytest.mark.parametrize("share", [0, 0.3, 0.7, 0.97])
-def test_broken_png_photo_is_refused(tmp_path, capfd, share):
-    noise = np.random.default_rng(0).integers(0, 256, (32, 32, 3))
-    content = png(noise, 8, 2)
-    refusal(read_rgb, written(tmp_path, "rgb.png", content[: int(len(content) * share)]), capfd)
+def test_broken_png_photo_is_refused(tmp_path, capfd):
+    content = png(np.random.default_rng(0).integers(0, 256, (32, 32, 3)), 8, 2)
+    for fraction in (0, 0.3, 0.97):
+        refusal(read_rgb, written(tmp_path, "rgb.png", content[: int(len(content) * fraction)]), capfd)
 
 
 def test_png_photo_with_a_flipped_bit_is_refused(tmp_path, capfd):

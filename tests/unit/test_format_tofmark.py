@@ -136,8 +136,7 @@ NAMINGS = {
 }
 
 
-@pytest.mark.parametrize("scale", [1.0, 1000.0])
-@pytest.mark.parametrize("kind", ["5", "5 compressed", "7.3"])
+@pytest.mark.parametrize(("kind", "scale"), [("5", 1.0), ("5 compressed", 1000.0), ("7.3", 1000.0)])
 @pytest.mark.parametrize("naming", NAMINGS)
 def test_variables_are_recognised_by_name_and_content_in_metres_or_millimetres(tmp_path, naming, kind, scale):
     arrays = dict(zip(NAMINGS[naming], (GREY, TRUTH * scale, SPARSE * scale), strict=True))

@@ -96,18 +96,17 @@ def test_openexr_file_without_a_depth_channel_is_refused_with_its_channels(tmp_p
 
 
 @pytest.mark.parametrize("suffix", ["png", "tiff", "npy", "npz", "pfm", "exr"])
-@pytest.mark.parametrize("share", [0.0, 0.5, 0.95])
-def test_truncated_file_is_refused_in_one_line_and_nothing_is_printed(tmp_path, suffix, share, capfd):
+def test_truncated_file_is_refused_in_one_line_and_nothing_is_printed(tmp_path, suffix, capfd):
     path = tmp_path / f"d.{suffix}"
-    write_depth_file(
-        path, np.random.default_rng(0).integers(1, 60000, (40, 50)).astype("u2" if suffix == "png" else "f4")
-    )
+    values = np.random.default_rng(0).integers(1, 60000, (40, 50))
+    write_depth_file(path, values.astype("u2" if suffix == "png" else "f4"))
     content = path.read_bytes()
-    path.write_bytes(content[: int(len(content) * share)])
-    with pytest.raises(ValueError, match=r"d\..*: expected") as caught:
-        read_depth_file(path)
-    assert "\n" not in str(caught.value)
-    assert capfd.readouterr() == ("", "")
+    for fraction in (0.0, 0.5, 0.95):
+        path.write_bytes(content[: int(len(content) * fraction)])
+        with pytest.raises(ValueError, match=r"d\..*: expected") as caught:
+            read_depth_file(path)
+        assert "\n" not in str(caught.value)
+        assert capfd.readouterr() == ("", "")
 
 
 def test_file_that_is_no_depth_map_is_refused(tmp_path):

@@ -95,14 +95,14 @@ def test_metric_is_the_mean_over_images_not_over_batches(name: str) -> None:
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
-@pytest.mark.parametrize("name", PER_LIGHT)
-def test_variants_choose_among_the_lights_image_by_image(name: str, variant: str) -> None:
-    make, function = PER_LIGHT[name]
-    metric, pairs = make(variant=variant), [_pair(0, batch=2), _pair(1)]
-    for pair in pairs:
-        metric.update(pair)
-    values = np.concatenate([function(pair).numpy() for pair in pairs])
-    assert metric.compute().item() == pytest.approx(VARIANTS[variant](values).mean(), rel=1e-12)
+def test_variants_choose_among_the_lights_image_by_image(variant: str) -> None:
+    pairs = [_pair(0, batch=2), _pair(1)]
+    for make, function in PER_LIGHT.values():
+        metric = make(variant=variant)
+        for pair in pairs:
+            metric.update(pair)
+        values = np.concatenate([function(pair).numpy() for pair in pairs])
+        assert metric.compute().item() == pytest.approx(VARIANTS[variant](values).mean(), rel=1e-12)
 
 
 @pytest.mark.parametrize("name", PER_LIGHT)

@@ -52,11 +52,11 @@ def _random(height: int = 32, width: int = 48) -> Tensor:
 
 
 @every_method
-@pytest.mark.parametrize("scale", SCALES)
 @pytest.mark.parametrize("kernel", ["box", "nearest"])
-def test_plane_is_reproduced_exactly_under_a_photo_of_noise(method: Build, scale: int, kernel: Kernel) -> None:
+def test_plane_is_reproduced_exactly_under_a_photo_of_noise(method: Build, kernel: Kernel) -> None:
     plane = _plane()
-    torch.testing.assert_close(_result(method(), _sample(plane, kernel, scale)), plane, rtol=0, atol=1e-10)
+    for scale in SCALES:
+        torch.testing.assert_close(_result(method(), _sample(plane, kernel, scale)), plane, rtol=0, atol=1e-10)
 
 
 @every_method
@@ -112,9 +112,9 @@ def test_single_valid_low_resolution_pixel_is_enough(method: Build) -> None:
 
 
 @every_method
-@pytest.mark.parametrize(("height", "width"), [(4, 4), (4, 40), (36, 4), (20, 52)])
-def test_result_is_complete_at_any_size(method: Build, height: int, width: int) -> None:
-    assert bool(_result(method(), _sample(_random(height, width))).isfinite().all())
+def test_result_is_complete_at_any_size(method: Build) -> None:
+    for height, width in ((4, 4), (4, 40), (36, 4), (20, 52)):
+        assert bool(_result(method(), _sample(_random(height, width))).isfinite().all())
 
 
 @every_method
