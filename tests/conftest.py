@@ -17,8 +17,8 @@ import pytest
 import torch
 
 from dsr.degradation.downsampling import Downsampling, make_sample
-from dsr.evaluation.predict import SCORE_COLUMNS
-from dsr.evaluation.store import prediction_path, save_scene, scene_path
+from dsr.evaluation.score import SCORE_COLUMNS
+from dsr.evaluation.store import prediction_path, sample_path
 from dsr.geometry.camera import Camera
 from dsr.metrics.catalogue import catalogue, score_image
 from dsr.sample import Scene
@@ -162,7 +162,7 @@ def write_run(
         noise = torch.Generator().manual_seed(seed + sum((method + label + scene).encode()))
         depth = sample.depth_lr.repeat_interleave(scale, 1).repeat_interleave(scale, 2)
         depth = depth + 0.002 * torch.randn(depth.shape, generator=noise, dtype=depth.dtype)
-        save_scene(scene_path(folder, scene), sample)
+        sample.save(sample_path(folder, scene))
         seconds[scene] = 0.25
         path = prediction_path(folder, scene)
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -106,11 +106,11 @@ def run_of(results, label):
 
 def depth_of(results, label, scene=SCENES[0]):
     run = run_of(results, "Bicubic" if label == "truth" else label)
-    return run.scene(scene).depth if label == "truth" else run.prediction(scene)
+    return run.sample(scene).depth if label == "truth" else run.prediction(scene)
 
 
 def normals(results, label, scene=SCENES[0]):
-    return normals_seen_by(run_of(results, "Bicubic").scene(scene).camera, depth_of(results, label, scene))
+    return normals_seen_by(run_of(results, "Bicubic").sample(scene).camera, depth_of(results, label, scene))
 
 
 def rendering(results, label, light):
@@ -264,7 +264,7 @@ def test_error_map_is_red_where_the_result_is_farther_and_blue_where_it_is_neare
 def test_depth_has_the_colours_of_the_other_pictures_and_the_photo_is_unchanged(opened, results):
     page = opened()
     choose(page, "left", "photo")
-    photo = run_of(results, "Bicubic").scene(SCENES[0]).rgb.permute(1, 2, 0).numpy() * 255
+    photo = run_of(results, "Bicubic").sample(SCENES[0]).rgb.permute(1, 2, 0).numpy() * 255
     assert np.abs(pixels(page, ".pane-left canvas") - photo).max() <= 1
     page.click("[data-view=depth]")
     settle(page)

@@ -11,7 +11,7 @@ from tensorboard.plugins.custom_scalar import layout_pb2
 from tensorboard.plugins.hparams import plugin_data_pb2
 
 from dsr.evaluation.results import load_results
-from dsr.evaluation.store import scene_path
+from dsr.evaluation.store import sample_path
 from dsr.geometry.shading import render
 from dsr.report.dashboard import save_dashboard
 from dsr.viz.panels import normals_seen_by
@@ -79,7 +79,7 @@ def test_picture_has_renderings_of_the_result_above_those_of_the_truth(log, tmp_
     (run,) = load_results([tmp_path]).runs
     encoded = np.frombuffer(log.Images("renderings/a")[0].encoded_image_string, np.uint8)
     picture = cv2.imdecode(encoded, cv2.IMREAD_COLOR)
-    scene = run.scene("a")
+    scene = run.sample("a")
     result, truth = (render(normals_seen_by(scene.camera, depth))[0] for depth in (run.prediction("a"), scene.depth))
     expected = torch.cat([torch.cat(list(result), dim=-1), torch.cat(list(truth), dim=-1)])
     np.testing.assert_allclose(picture[..., 0], 255 * expected.numpy(), atol=1.01)
@@ -87,7 +87,7 @@ def test_picture_has_renderings_of_the_result_above_those_of_the_truth(log, tmp_
 
 def test_error_colours_are_the_same_for_all_methods(make_run, tmp_path):
     folder = make_run(tmp_path, scenes=("s",))
-    truth = load_results([folder]).runs[0].scene("s").depth
+    truth = load_results([folder]).runs[0].sample("s").depth
     step = 0.005 * truth.nanmedian()
     shown = []
     for outlier in (0, 1):
@@ -113,7 +113,7 @@ def test_second_log_replaces_the_first(make_run, tmp_path):
 
 def test_scene_that_is_not_stored_has_scores_and_no_picture(make_run, tmp_path):
     make_run(tmp_path, scenes=("s", "t"))
-    scene_path(tmp_path, "t").unlink()
+    sample_path(tmp_path, "t").unlink()
     save_dashboard(tmp_path)
     log = read(tmp_path)
     assert "RMSE_d/t" in log.Tags()["scalars"]

@@ -113,7 +113,7 @@ def test_depth_limits_are_shared_across_a_row_with_a_bar(results, drawn, tmp_pat
 def test_errors_are_centred_at_zero_and_signed(tmp_path, make_run, drawn, error, unit, factor):
     for name, sign in (("a", 1), ("b", -1)):
         run = make_run(tmp_path / name, method=name, label=name, size=16, scenes=("one",))
-        scene = load_results([run]).runs[0].scene("one")
+        scene = load_results([run]).runs[0].sample("one")
         change(run / "predictions" / "one.npz", depth=(scene.depth + sign * error)[0].numpy())
     save_error_grids(tmp_path, load_results([tmp_path]))
     [figure] = drawn.values()

@@ -7,24 +7,24 @@ import json
 import math
 
 import numpy as np
+import pandas as pd
 import pytest
 import torch
 
 from dsr.degradation.downsampling import Downsampling, Measured, make_sample
 from dsr.degradation.noise import GaussianMultiplicative
 from dsr.evaluation.predict import (
-    SCORE_COLUMNS,
     Evaluation,
     Outcome,
     StalePredictionError,
-    load_prediction,
     predict,
-    score,
 )
+from dsr.evaluation.score import SCORE_COLUMNS, score
+from dsr.evaluation.store import load_prediction
 from dsr.geometry.camera import Camera
 from dsr.methods.base import NoSolutionError
 from dsr.metrics.catalogue import catalogue, score_image
-from dsr.sample import Scene
+from dsr.sample import DepthSample, Scene
 
 SIZE, SCALE = 16, 2
 CAMERA = Camera(SIZE, SIZE, 20.0, 20.0, 7.5, 7.5)
@@ -325,7 +325,7 @@ def test_score_file_has_its_header_alone_where_every_scene_fails(tmp_path):
 def test_prediction_of_the_wrong_shape_is_refused_and_not_written(tmp_path, shape):
     outcome = predict(toy_study(method=ToyMethod(a=torch.ones(shape))), tmp_path, plainly)
     assert "toy_method gave depth of shape" in outcome.failures["a"]
-    assert files(tmp_path) == ["predictions/b.npz"]
+    assert files(tmp_path) == ["predictions/b.npz", "scenes/b.npz"]
 
 
 def test_stored_prediction_of_the_wrong_shape_is_not_scored(tmp_path):
@@ -364,7 +364,7 @@ def test_cropped_scene_is_noted(tmp_path):
 def test_interruption_keeps_the_finished_scene_and_leaves_no_temporary_file(tmp_path):
     with pytest.raises(KeyboardInterrupt):
         predict(toy_study(method=ToyMethod(b=KeyboardInterrupt())), tmp_path, plainly)
-    assert files(tmp_path) == ["predictions/a.npz"]
+    assert files(tmp_path) == ["predictions/a.npz", "scenes/a.npz"]
     method = ToyMethod()
     outcome, *_ = run(toy_study(method=method), tmp_path)
     assert (method.calls, outcome.made, outcome.reused) == (["b"], ["b"], ["a"])
@@ -382,7 +382,7 @@ def test_interruption_while_a_prediction_is_written_leaves_no_partial_file(tmp_p
     monkeypatch.setattr(np, "savez_compressed", cut)
     with pytest.raises(KeyboardInterrupt):
         predict(toy_study(), tmp_path, plainly)
-    assert files(tmp_path) == ["predictions/a.npz"]
+    assert files(tmp_path) == ["predictions/a.npz", "scenes/a.npz"]
 
 
 def test_failed_rewrite_keeps_the_former_prediction(tmp_path, monkeypatch):
@@ -406,7 +406,7 @@ def test_missing_prediction_is_refused_by_name(tmp_path):
 
 def test_scene_that_failed_is_not_scored_from_an_older_file(tmp_path):
     run(toy_study(), tmp_path)
-    outcome = Outcome(failures={"a": "a: broken"})
+    outcome = Outcome(seconds={"b": 1.0}, failures={"a": "a: broken"})
     table = score(toy_study(), tmp_path, catalogue(), outcome, plainly, lambda *_: None)
     assert table["scene"].unique().tolist() == ["b"]
 
@@ -474,3 +474,32 @@ def test_earlier_prediction_is_not_scored_where_there_is_no_solution_now(tmp_pat
     _, scores, _ = run(toy_study(method=ToyMethod(b=NoSolutionError("none"))), tmp_path, overwrite=True)
     assert set(scores["scene"]) == {"a"}
     assert not (tmp_path / "predictions" / "b.npz").exists()
+
+
+def test_score_reads_the_run_directory_alone(tmp_path):
+    _, expected, _ = run(toy_study(), tmp_path)
+    gone = toy_study(ToySource(a=ValueError("gone"), b=ValueError("gone")))
+    outcome = predict(toy_study(), tmp_path, plainly)
+    again = score(gone, tmp_path, catalogue(), outcome, plainly, lambda *_: None)
+    assert outcome.failures == {}
+    pd.testing.assert_frame_equal(again, expected, check_exact=True)
+
+
+def test_predict_stores_a_sample_that_is_missing_beside_its_prediction(tmp_path):
+    run(toy_study(), tmp_path)
+    before = DepthSample.load(tmp_path / "scenes" / "a.npz")
+    (tmp_path / "scenes" / "a.npz").unlink()
+    method = ToyMethod()
+    outcome, scores, _ = run(toy_study(method=method), tmp_path)
+    assert (method.calls, outcome.reused, outcome.failures) == ([], ["a", "b"], {})
+    assert torch.equal(DepthSample.load(tmp_path / "scenes" / "a.npz").depth_lr, before.depth_lr)
+    assert set(scores["scene"]) == {"a", "b"}
+
+
+def test_score_names_a_damaged_sample_and_keeps_the_other_scenes(tmp_path):
+    outcome = predict(toy_study(), tmp_path, plainly)
+    path = tmp_path / "scenes" / "a.npz"
+    path.write_bytes(path.read_bytes()[:50])
+    scores = score(toy_study(), tmp_path, catalogue(), outcome, plainly, lambda *_: None)
+    assert outcome.failures == {"a": f"{path}: expected the sample of a scene, got a damaged or foreign file"}
+    assert set(scores["scene"]) == {"b"}

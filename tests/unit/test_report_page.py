@@ -59,7 +59,7 @@ def test_page_renderings_are_those_of_the_protocol_to_a_grey_level(make_run, tmp
     results = load_results([make_run(tmp_path / "run")])
     content, _, scene = saved(tmp_path, results)
     run = results.runs[0]
-    stored = run.scene("cube_no_texture")
+    stored = run.sample("cube_no_texture")
     depths = {"Bicubic": run.prediction("cube_no_texture"), "truth": stored.depth}
     for surface in scene["surfaces"][1:]:
         expected = render(normals_seen_by(stored.camera, depths[surface["label"]]))[0].numpy()
@@ -72,10 +72,10 @@ def test_page_renderings_are_those_of_the_protocol_to_a_grey_level(make_run, tmp
 def test_input_is_shown_at_its_own_size_from_its_own_camera(make_run, tmp_path):
     results = load_results([make_run(tmp_path / "run")])
     content, _, scene = saved(tmp_path, results)
-    stored = results.runs[0].scene("cube_no_texture")
+    stored = results.runs[0].sample("cube_no_texture")
     surface = scene["surfaces"][0]
     assert (surface["kind"], surface["size"]) == ("input", [8, 8])
-    expected = render(normals_seen_by(stored.camera_lr, stored.coarse))[0, 0].numpy()
+    expected = render(normals_seen_by(stored.camera_lr, stored.depth_lr))[0, 0].numpy()
     assert np.abs(shadings(content, surface)[0].clip(0, 1) - expected).max() <= 1.001 / 255
 
 
@@ -83,7 +83,7 @@ def test_stored_errors_are_result_minus_truth_within_a_hundredth_of_the_largest(
     results = load_results([make_run(tmp_path / "run")])
     content, _, scene = saved(tmp_path, results)
     run = results.runs[0]
-    expected = (run.prediction("cube_no_texture") - run.scene("cube_no_texture").depth)[0].numpy()
+    expected = (run.prediction("cube_no_texture") - run.sample("cube_no_texture").depth)[0].numpy()
     largest = scene["error"]["largest"]
     levels = picture(content, scene["surfaces"][1]["error"]["values"]).astype(float) - 128
     found = np.sign(levels) * levels**2 / 127**2 * largest
@@ -225,7 +225,7 @@ def test_damaged_prediction_is_left_out_and_named(make_run, tmp_path):
 
 def test_scene_without_truth_has_renderings_and_no_errors(make_run, tmp_path):
     [run] = load_results([make_run(tmp_path / "run")]).runs
-    stored = dataclasses.replace(run.scene("cube_no_texture"), depth=None)
+    stored = dataclasses.replace(run.sample("cube_no_texture"), depth=None)
     _, _, scene = saved(tmp_path, Results((changed(run, scene=lambda _: stored),)))
     assert [surface["kind"] for surface in scene["surfaces"]] == ["input", "method"]
     assert "error" not in scene

@@ -7,7 +7,8 @@ import pytest
 import torch
 
 from dsr.evaluation.results import BenchmarkSetting, load_results
-from dsr.evaluation.store import load_scene, prediction_path, scene_path
+from dsr.evaluation.store import prediction_path, sample_path
+from dsr.sample import DepthSample
 
 
 def change(folder, name, **entries):
@@ -36,11 +37,11 @@ def test_run_is_read_with_its_scenes_predictions_and_scores(make_run, tmp_path):
 def test_stored_scene_is_the_sample_that_the_method_was_given(make_run, tmp_path):
     make_run(tmp_path / "a", scenes=("b",))
     (run,) = load_results([tmp_path]).runs
-    scene = run.scene("b")
-    assert (scene.dataset, scene.name, scene.scale) == ("simgeo", "b", 4)
-    assert scene.coarse.shape == (1, 8, 8)
+    scene = run.sample("b")
+    assert (scene.dataset, scene.scene, scene.scale) == ("simgeo", "b", 4)
+    assert scene.depth_lr.shape == (1, 8, 8)
     blocks = scene.depth[0].unfold(0, 4, 4).unfold(1, 4, 4).mean(dim=(-1, -2))
-    assert torch.allclose(blocks, scene.coarse[0], atol=1e-6)
+    assert torch.allclose(blocks, scene.depth_lr[0], atol=1e-6)
     assert scene.camera_lr == scene.camera.coarser(4)
     assert float(scene.rgb.max()) <= 1
 
@@ -120,15 +121,15 @@ def test_directory_without_runs_is_refused(tmp_path):
 
 def test_scene_that_is_missing_or_damaged_is_refused_in_one_line(make_run, tmp_path):
     make_run(tmp_path, scenes=("s",))
-    path = scene_path(tmp_path, "s")
+    path = sample_path(tmp_path, "s")
     path.write_bytes(path.read_bytes()[:100])
     with pytest.raises(ValueError, match="got a damaged"):
-        load_scene(path)
+        DepthSample.load(path)
     path.unlink()
     (run,) = load_results([tmp_path]).runs
-    assert not run.has_scene("s")
+    assert not run.has_sample("s")
     with pytest.raises(ValueError, match="there is none"):
-        run.scene("s")
+        run.sample("s")
 
 
 def test_scene_without_prediction_is_left_out_of_the_run(make_run, tmp_path):

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import json
+from dataclasses import asdict
+from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 
@@ -145,3 +149,51 @@ def test_records_are_immutable() -> None:
         _scene().name = "other"  # type: ignore[misc]
     with pytest.raises(AttributeError):
         _sample().scale = 4  # type: ignore[misc]
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("levels", [255, 65535, None])
+def test_sample_is_read_with_the_same_bits(tmp_path: Path, dtype: torch.dtype, levels: int | None) -> None:
+    generator = torch.Generator().manual_seed(0)
+    rgb = torch.rand(3, 4, 8, generator=generator, dtype=dtype)
+    rgb = rgb if levels is None else (rgb * levels).round() / levels
+    depth = 1 + torch.rand(1, 4, 8, generator=generator, dtype=dtype)
+    depth[0, 1, 2] = torch.nan
+    depth_lr = 1 + torch.rand(1, 2, 4, generator=generator, dtype=dtype)
+    sample = _sample(rgb=rgb, depth=depth, depth_lr=depth_lr, notes=("cropped",), camera=CAMERA.crop(0, 0, 4, 8))
+    sample.save(tmp_path / "hall.npz")
+    read = DepthSample.load(tmp_path / "hall.npz")
+    for name in ("rgb", "depth", "depth_lr"):
+        torch.testing.assert_close(getattr(read, name), getattr(sample, name), rtol=0, atol=0, equal_nan=True)
+    for name in ("dataset", "scene", "scale", "camera", "camera_lr", "notes"):
+        assert getattr(read, name) == getattr(sample, name)
+    with np.load(tmp_path / "hall.npz") as stored:
+        assert stored["rgb"].dtype == {255: np.uint8, 65535: np.uint16}.get(levels or 0, str(dtype)[6:])
+
+
+def test_sample_without_truth_is_read_without_truth(tmp_path: Path) -> None:
+    _sample(depth=None).save(tmp_path / "hall.npz")
+    assert DepthSample.load(tmp_path / "hall.npz").depth is None
+
+
+def test_sample_of_an_earlier_version_is_read(tmp_path: Path) -> None:
+    about = {
+        "dataset": "set", "name": "hall", "scale": 2, "notes": [],
+        "camera": asdict(CAMERA), "camera_lr": asdict(CAMERA.rescale(4, 2)),
+    }  # fmt: skip
+    rgb = np.arange(96, dtype=np.uint8).reshape(4, 8, 3)
+    coarse = np.full((2, 4), 2, np.float32)
+    np.savez(tmp_path / "hall.npz", about=json.dumps(about), rgb=rgb, coarse=coarse)
+    read = DepthSample.load(tmp_path / "hall.npz")
+    torch.testing.assert_close(read.rgb, torch.from_numpy(rgb).permute(2, 0, 1) / 255, rtol=0, atol=0)
+    assert (read.scene, read.depth_lr.dtype, read.depth_lr.shape) == ("hall", torch.float32, (1, 2, 4))
+
+
+@pytest.mark.parametrize("content", [b"", b"text", None])
+def test_file_that_is_no_sample_is_refused_by_its_name(tmp_path: Path, content: bytes | None) -> None:
+    path = tmp_path / "hall.npz"
+    if content is not None:
+        path.write_bytes(content)
+    came = "there is none" if content is None else "got a damaged or foreign file"
+    with pytest.raises(ValueError, match=f"hall.npz: expected the sample of a scene, {came}"):
+        DepthSample.load(path)

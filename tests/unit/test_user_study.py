@@ -366,7 +366,7 @@ def test_page_shows_what_the_key_says(tmp_path, runs):
     [shown] = [scene for scene in content["scenes"] if scene["id"] == cube[0]]
     for name, candidate in cube[1].candidates.items():
         [run] = [run for run in load_results([runs]).runs if run.label == candidate.label]
-        scene = run.scene("cube_no_texture")
+        scene = run.sample("cube_no_texture")
         expected = shading_of(run.prediction("cube_no_texture"), scene.camera, "e4").numpy()
         image = decoded(shown["images"][name])
         assert np.abs((image[..., 0] - 1.0) / 254 - expected).max() <= 0.51 / 254

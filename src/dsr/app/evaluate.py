@@ -22,7 +22,8 @@ from dsr.app.progress import Display, prepare
 from dsr.app.schema import EvalConfig, given_keys, plain_config
 from dsr.app.training_runs import studies_of_run
 from dsr.data.base import SceneSource
-from dsr.evaluation.predict import Evaluation, Outcome, StalePredictionError, predict, score
+from dsr.evaluation.predict import Evaluation, Outcome, StalePredictionError, predict
+from dsr.evaluation.score import score
 from dsr.methods.dip.upsampler import WORKSPACE
 from dsr.methods.networks.trained import packaged_names, packaged_weights
 from dsr.metrics.formats import Formats

@@ -1,10 +1,10 @@
-"""Evaluation in two passes: predictions to files, then scores from files.
+"""The first pass of an evaluation: predictions to files. The second one scores them, see :mod:`dsr.evaluation.score`.
 
-A prediction is ``predictions/SCENE.npz``: ``depth`` (H, W) in metres, NaN in holes; ``config``, a JSON text of all that
-it came from; and the ``seconds`` that it took. Beside it lies the problem that it answers, see
-:mod:`dsr.evaluation.store`, and ``iterations/SCENE.csv``, how the iteration went, of a method that iterates. A
-prediction whose stored config is the wanted one is not made again, so an interrupted run goes on where it stopped. One
-scene that fails, or that the method has no solution for, does not keep the others from their results.
+A prediction is ``predictions/SCENE.npz``: ``depth`` (H, W) in metres, NaN where missing; ``config``, a JSON text of all
+that it depends on; and the ``seconds`` that it took. The sample that it was made from lies beside it, see
+:mod:`dsr.evaluation.store`. A prediction whose stored config is the requested one is not made again, so an interrupted
+run continues where it stopped. One scene that fails, or that the method has no solution for, does not keep the others
+from their results.
 """
 
 from __future__ import annotations
@@ -12,9 +12,9 @@ from __future__ import annotations
 import json
 import re
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -27,26 +27,11 @@ from dsr.data.base import SceneSource
 from dsr.degradation.downsampling import Downsampling, Measured, make_sample
 from dsr.degradation.holes import Holes
 from dsr.degradation.noise import Noise
-from dsr.evaluation.store import iterations_path, load_prediction, prediction_path, save_scene, scene_path
+from dsr.evaluation.store import iterations_path, prediction_path, sample_path
 from dsr.methods.base import Iterative, NoSolutionError, Upsampler
-from dsr.metrics.catalogue import Metric, score_image
-from dsr.metrics.formats import HEADLINES
 from dsr.sample import DepthSample
 from dsr.utils.console import one_line
-from dsr.utils.files import read_arrays, replacing, write_text
-
-SCORE_COLUMNS = (
-    "dataset",
-    "scene",
-    "scale",
-    "downsampling",
-    "method",
-    "seed",
-    "metric",
-    "variant",
-    "value",
-    "valid_share",
-)
+from dsr.utils.files import read_arrays, replacing
 
 
 class Progress(Protocol):
@@ -76,7 +61,7 @@ class Evaluation:
         config: all that the predictions depend on besides the scene, as plain values; stored with each.
         device: where predictions and scores are computed.
         noise: of the low-resolution maps.
-        holes: where the low-resolution maps lose their values.
+        holes: where values are missing in the low-resolution maps.
         label: the method's name for readers; empty where that is ``method_name``.
 
     """
@@ -95,7 +80,7 @@ class Evaluation:
     label: str = ""
 
     def sample(self, scene: str) -> DepthSample:
-        """Return the problem that a scene poses.
+        """Return what the method is given of a scene.
 
         Raises:
             ValueError: the scene's files are not as they should be.
@@ -115,10 +100,10 @@ class Outcome:
     """What a pass over the scenes led to.
 
     Args:
-        made, reused: scenes whose prediction was computed, or found on disk.
+        made, reused: scenes whose prediction was computed, and those where it was found on disk.
         failures: scene and what was wrong, one line each.
         unsolved: scene and why the method has no solution for it, one line each.
-        notes: scene and what a reader of the scores should know.
+        notes: scene and what readers of the scores should know.
         seconds: computing time per scene.
         unscored: scenes without a high-resolution depth map to compare with.
 
@@ -140,7 +125,7 @@ class StalePredictionError(ValueError):
 def predict(
     study: Evaluation, folder: Path, progress: Progress, *, steps: Steps | None = None, overwrite: bool = False
 ) -> Outcome:
-    """Write the prediction of every scene that has none yet to ``folder / "predictions"``.
+    """Write the sample and the prediction of every scene that has none yet.
 
     Args:
         study: what to evaluate.
@@ -163,88 +148,21 @@ def predict(
                 outcome.seconds[scene] = _predict_scene(study, scene, folder, config, steps)
                 outcome.made.append(scene)
             else:
+                if not sample_path(folder, scene).is_file():
+                    study.sample(scene).save(sample_path(folder, scene))
                 outcome.seconds[scene] = seconds
                 outcome.reused.append(scene)
         except StalePredictionError:
             raise
         except NoSolutionError as error:
-            outcome.unsolved[scene] = _failure(scene, error)
+            outcome.unsolved[scene] = failure_line(scene, error)
             path.unlink(missing_ok=True)
         except (ValueError, OSError) as error:
-            outcome.failures[scene] = _failure(scene, error)
+            outcome.failures[scene] = failure_line(scene, error)
     return outcome
 
 
-def score(
-    study: Evaluation,
-    folder: Path,
-    metrics: tuple[Metric, ...],
-    outcome: Outcome,
-    progress: Progress,
-    illustrate: Callable[[DepthSample, Tensor, Mapping[str, float]], None],
-) -> pd.DataFrame:
-    """Score the predictions in ``folder``; write ``scores.csv`` and ``summary.json``.
-
-    Args:
-        study: what was evaluated.
-        folder: the run's directory.
-        metrics: from :func:`dsr.metrics.catalogue.catalogue`.
-        outcome: of :func:`predict`; failures and scenes without truth are added to it.
-        progress: shows how far it is.
-        illustrate: draws a picture from a sample, the predicted depth and its worst-of-four scores.
-
-    Returns:
-        The content of ``scores.csv``.
-
-    """
-    rows: list[dict[str, Any]] = []
-    without = outcome.failures.keys() | outcome.unsolved.keys()
-    for scene in progress([name for name in study.source.scenes() if name not in without], "score"):
-        try:
-            sample = study.sample(scene)
-            depth = load_prediction(prediction_path(folder, scene))
-            new = list(_score_scene(study, sample, depth, metrics))
-            save_scene(scene_path(folder, scene), sample)
-            rows += new
-            if sample.depth is None:
-                outcome.unscored.append(scene)
-            if sample.notes:
-                outcome.notes[scene] = list(sample.notes)
-            illustrate(sample, depth, {row["metric"]: row["value"] for row in new if row["variant"] in HEADLINES})
-        except (ValueError, OSError) as error:
-            outcome.failures[scene] = _failure(scene, error)
-    scores = pd.DataFrame(rows, columns=list(SCORE_COLUMNS))
-    with replacing(folder / "scores.csv") as temporary:
-        scores.to_csv(temporary, index=False)
-    write_text(folder / "summary.json", json.dumps(summary(study, scores, outcome, metrics), indent=1) + "\n")
-    return scores
-
-
-def summary(study: Evaluation, scores: pd.DataFrame, outcome: Outcome, metrics: Sequence[Metric]) -> dict[str, Any]:
-    """Return means over the scenes of each metric (worst of four lights where it has lights) and how the run went."""
-    worst = scores[scores["variant"].isin(HEADLINES)]
-    means = worst.groupby("metric", sort=False)["value"].mean()
-    return {
-        "dataset": study.source.name,
-        "scale": study.scale,
-        "downsampling": study.downsampling_name,
-        "method": study.method_name,
-        "label": study.label or study.method_name,
-        "seed": study.seed,
-        "scenes": scores["scene"].nunique(),
-        "mean": {str(name): float(value) for name, value in means.items()},
-        "seconds": outcome.seconds,
-        "predicted": outcome.made,
-        "reused": outcome.reused,
-        "without_truth": outcome.unscored,
-        "notes": outcome.notes,
-        "failures": outcome.failures,
-        "unanswered": outcome.unsolved,
-        "metrics": {metric.name: asdict(metric.format) for metric in metrics},
-    }
-
-
-def _failure(scene: str, error: BaseException) -> str:
+def failure_line(scene: str, error: BaseException) -> str:
     """Return an error's message on one line that names the scene."""
     message = one_line(error)
     named = re.search(rf"(^|[/\\]){re.escape(scene)}[/\\:.]", message)  # first, or in a path
@@ -272,7 +190,7 @@ def _seconds_of_current(path: Path, config: Mapping[str, Any]) -> float | None:
 def _predict_scene(
     study: Evaluation, scene: str, folder: Path, config: Mapping[str, Any], steps: Steps | None
 ) -> float:
-    """Compute and write one prediction, and how the iteration went; return the seconds that the method took."""
+    """Compute one prediction; write it, its sample and the iteration's history; return the method's seconds."""
     sample = study.sample(scene)
     start = time.perf_counter()
     depth = _answer(study.method, sample, steps)
@@ -283,6 +201,7 @@ def _predict_scene(
     if isinstance(study.method, Iterative):
         with replacing(iterations_path(folder, scene)) as temporary:
             pd.DataFrame(study.method.history).to_csv(temporary, index=False)
+    sample.save(sample_path(folder, scene))
     with replacing(prediction_path(folder, scene)) as temporary:
         np.savez_compressed(
             temporary, depth=depth[0].cpu().numpy(), config=json.dumps(dict(config), sort_keys=True), seconds=seconds
@@ -296,29 +215,3 @@ def _answer(method: Upsampler, sample: DepthSample, steps: Steps | None) -> Tens
         return method(sample)
     with steps(sample.scene) as step:
         return method(sample, step)
-
-
-def _score_scene(
-    study: Evaluation, sample: DepthSample, depth: Tensor, metrics: tuple[Metric, ...]
-) -> Iterator[dict[str, Any]]:
-    """Yield the rows of one scene; none where there is no truth."""
-    if sample.depth is None:
-        return
-    if depth.shape != sample.depth.shape:
-        came, expected = tuple(depth.shape), tuple(sample.depth.shape)
-        raise ValueError(f"{sample.scene}: expected a prediction of shape {expected}, got {came}")
-    rays = sample.camera.rays(device=study.device)
-    truth = sample.depth.to(study.device, torch.float64)
-    for result in score_image(depth.to(study.device, torch.float64), truth, rays, metrics):
-        yield {
-            "dataset": sample.dataset,
-            "scene": sample.scene,
-            "scale": sample.scale,
-            "downsampling": study.downsampling_name,
-            "method": study.method_name,
-            "seed": study.seed,
-            "metric": result.metric,
-            "variant": result.variant,
-            "value": result.value,
-            "valid_share": result.valid_share,
-        }

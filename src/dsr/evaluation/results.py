@@ -14,9 +14,10 @@ from typing import Any, NamedTuple
 import pandas as pd
 from torch import Tensor
 
-from dsr.evaluation.store import StoredScene, load_prediction, load_scene, prediction_path, scene_path
+from dsr.evaluation.store import load_prediction, prediction_path, sample_path
 from dsr.metrics.catalogue import KNOWN_FORMATS
 from dsr.metrics.formats import MetricFormat, complete_formats, in_tables
+from dsr.sample import DepthSample
 
 METHOD_ORDER = (
     "Nearest", "Bilinear", "Bicubic", "GF", "JBU", "FGS", "Diffusion", "TGV",
@@ -88,18 +89,18 @@ class Run:
         """
         return load_prediction(prediction_path(self.folder, scene))
 
-    def scene(self, scene: str) -> StoredScene:
-        """Return the problem that a scene apply_dihedral.
+    def sample(self, scene: str) -> DepthSample:
+        """Return what the method was given of a scene.
 
         Raises:
             ValueError: the file is damaged, or missing as in a run of an older dsr.
 
         """
-        return load_scene(scene_path(self.folder, scene))
+        return DepthSample.load(sample_path(self.folder, scene))
 
-    def has_scene(self, scene: str) -> bool:
-        """Return whether the problem that a scene apply_dihedral is kept."""
-        return scene_path(self.folder, scene).is_file()
+    def has_sample(self, scene: str) -> bool:
+        """Return whether the run keeps what the method was given of a scene."""
+        return sample_path(self.folder, scene).is_file()
 
 
 @dataclass(frozen=True)

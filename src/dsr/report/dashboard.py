@@ -19,9 +19,9 @@ from torch.utils.tensorboard import SummaryWriter
 from torch.utils.tensorboard.summary import hparams
 
 from dsr.evaluation.results import Run, formats_of, method_settings, read_run
-from dsr.evaluation.store import StoredScene
 from dsr.geometry.shading import LIGHT_NAMES, render
 from dsr.metrics.formats import HEADLINES
+from dsr.sample import DepthSample
 from dsr.viz.panels import colours, normals_seen_by, reduced
 
 WORST = "worst of four lights"
@@ -50,8 +50,8 @@ def save_dashboard(folder: Path) -> None:
         with SummaryWriter(temporary) as writer:
             _write_scores(writer, run)
             for number, scene in enumerate(run.scenes):
-                if run.has_scene(scene):
-                    _write_pictures(writer, number, run.scene(scene), run.prediction(scene))
+                if run.has_sample(scene):
+                    _write_pictures(writer, number, run.sample(scene), run.prediction(scene))
         for old in folder.glob(_EVENTS):
             old.unlink()
         for new in temporary.glob(_EVENTS):
@@ -106,15 +106,15 @@ def _hyperparameters(run: Run) -> dict[str, Any]:
     }
 
 
-def _write_pictures(writer: SummaryWriter, number: int, scene: StoredScene, depth: Tensor) -> None:
+def _write_pictures(writer: SummaryWriter, number: int, scene: DepthSample, depth: Tensor) -> None:
     """Write a scene's renderings, result above truth, and the errors of depth and normals."""
     shades = [render(normals_seen_by(scene.camera, depth))[0]]
     if scene.depth is not None:
         shades.append(render(normals_seen_by(scene.camera, scene.depth))[0])
     rows = [torch.cat(list(reduced(each, _PANEL)), dim=-1) for each in shades]
-    writer.add_image(f"renderings/{scene.name}", _grey(torch.cat(rows, dim=-2)), number, dataformats="HWC")
+    writer.add_image(f"renderings/{scene.scene}", _grey(torch.cat(rows, dim=-2)), number, dataformats="HWC")
     if scene.depth is not None:
-        writer.add_image(f"depth_error/{scene.name}", _error(depth, scene.depth), number, dataformats="HWC")
+        writer.add_image(f"depth_error/{scene.scene}", _error(depth, scene.depth), number, dataformats="HWC")
 
 
 def _grey(values: Tensor) -> np.ndarray:

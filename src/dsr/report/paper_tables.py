@@ -188,8 +188,8 @@ def _truth_is_complete(results: Results) -> Callable[[Place], bool]:
     def complete(place: Place) -> bool:
         if shares.get(tuple(place), 0.0) == 1:
             return True
-        kept = [run for run in results.runs if run.dataset == place.dataset and run.has_scene(place.scene)]
-        truth = kept[0].scene(place.scene).depth if kept else None
+        kept = [run for run in results.runs if run.dataset == place.dataset and run.has_sample(place.scene)]
+        truth = kept[0].sample(place.scene).depth if kept else None
         return truth is not None and bool(truth.isfinite().all())
 
     return complete

@@ -181,8 +181,8 @@ def _why_not(runs: Sequence[Run], scene: str) -> str | None:
     """Return why a scene cannot be asked about, None where it can."""
     if len(runs) < _FEWEST:
         return f"only {', '.join(run.label for run in runs)} has a prediction of it"
-    if not any(run.has_scene(scene) for run in runs):
-        return "no run has kept the scene itself; the run's command writes it anew"
+    if not any(run.has_sample(scene) for run in runs):
+        return "no run has kept the scene itself; a newer dsr keeps it, with overwrite=true"
     return None
 
 
@@ -198,7 +198,7 @@ def _draw(question: Question, light: str) -> _Drawn:
     """Return a scene's pictures; none where its truth is not known."""
     problem = question.problem
     place = f"{problem.dataset}/{question.scene} x{problem.scale} {problem.downsampling}"
-    scene = next(run for run in question.runs if run.has_scene(question.scene)).scene(question.scene)
+    scene = next(run for run in question.runs if run.has_sample(question.scene)).sample(question.scene)
     if scene.depth is None:
         return _Drawn(question, notes=(f"left out: {place}: its truth is not known",))
     truth = shading_of(scene.depth, scene.camera, light)

@@ -13,10 +13,10 @@ from matplotlib.patches import Circle
 from torch import Tensor
 
 from dsr.evaluation.results import Results
-from dsr.evaluation.store import StoredScene
 from dsr.geometry.shading import LIGHT_NAMES, lights, render
 from dsr.report.figures.layout import save_both
 from dsr.report.figures.scenes import rendering
+from dsr.sample import DepthSample
 from dsr.viz.panels import colours
 
 _SPHERE = 401
@@ -71,7 +71,7 @@ def save_lights_figure(folder: Path, results: Results | None = None) -> list[Pat
             place = ((left + _PANEL / 2) / width, (upper + _PANEL + 0.08 + 0.16 * line) / height)
             figure.text(*place, text, ha="center", va="baseline", fontsize=_FONT - 0.5)
         if scene is not None and scene.depth is not None:
-            surface = axes(left, _MARGIN, _PANEL, _PANEL * aspect, f"{scene.name} under {name}")
+            surface = axes(left, _MARGIN, _PANEL, _PANEL * aspect, f"{scene.scene} under {name}")
             shades = rendering(scene.depth, scene.camera, name)
             surface.imshow(shades, cmap=colours("gray"), vmin=0, vmax=1, aspect="auto")
     return save_both(folder, "lights", figure)
@@ -120,14 +120,14 @@ def _draw_away(axes: Axes, x: float, y: float, radius: float, colour: str) -> No
         axes.plot((x - reach, x + reach), (y - sign * reach, y + sign * reach), color=colour, linewidth=1.2, zorder=4)
 
 
-def _most_varied(results: Results) -> StoredScene | None:
+def _most_varied(results: Results) -> DepthSample | None:
     """Return a scene with a truth: of those by known names the first, else the one whose normals vary most."""
-    found: dict[str, StoredScene] = {}
+    found: dict[str, DepthSample] = {}
     for run in results.runs:
         for name in run.scenes:
-            if name not in found and len(found) < _CANDIDATES and run.has_scene(name):
+            if name not in found and len(found) < _CANDIDATES and run.has_sample(name):
                 try:
-                    scene = run.scene(name)
+                    scene = run.sample(name)
                 except ValueError:
                     continue
                 if scene.depth is not None and min(scene.depth.shape[-2:]) > 1:
@@ -136,7 +136,7 @@ def _most_varied(results: Results) -> StoredScene | None:
     return next(iter(named), max(found.values(), key=_variety, default=None))
 
 
-def _variety(scene: StoredScene) -> float:
+def _variety(scene: DepthSample) -> float:
     """Return the standard deviation of the brightness under the first light."""
     values = rendering(scene.depth, scene.camera, LIGHT_NAMES[0]) if scene.depth is not None else np.zeros(1)
     return float(np.nan_to_num(np.nanstd(values)))

@@ -29,7 +29,7 @@ def rendering_row(shown: Shown, light: str) -> Row:
     scores = _captions(shown, "DSSIM_v", "RMSE_v")
     cells = [
         _photo(shown),
-        Cell(_enlarged(rendering(scene.coarse, scene.camera_lr, light), scene.scale)),
+        Cell(_enlarged(rendering(scene.depth_lr, scene.camera_lr, light), scene.scale)),
         *(_panel(picture, scores[label]) for label, picture in results.items()),
         _panel(truth, missing="no truth"),
     ]
@@ -41,11 +41,11 @@ def rendering_row(shown: Shown, light: str) -> Row:
 def depth_row(shown: Shown) -> Row:
     """Return a scene's depth maps."""
     scene = shown.scene
-    style = _Style("viridis", limits_of(scene.coarse if scene.depth is None else scene.depth))
+    style = _Style("viridis", limits_of(scene.depth_lr if scene.depth is None else scene.depth))
     scores = _captions(shown, "RMSE_d")
     cells = [
         _photo(shown),
-        _panel(_enlarged(scene.coarse[0].numpy(), scene.scale), style=style),
+        _panel(_enlarged(scene.depth_lr[0].numpy(), scene.scale), style=style),
         *(_panel(_pixels(depth), scores[label], style=style) for label, depth in shown.depths.items()),
         _panel(_pixels(scene.depth), missing="no truth", style=style),
     ]

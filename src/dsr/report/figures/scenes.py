@@ -9,10 +9,10 @@ import numpy as np
 from torch import Tensor
 
 from dsr.evaluation.results import BenchmarkSetting, Results, Run
-from dsr.evaluation.store import StoredScene
 from dsr.geometry.camera import Camera
 from dsr.geometry.shading import LIGHT_NAMES, lights, shade
 from dsr.metrics.formats import HEADLINES
+from dsr.sample import DepthSample
 from dsr.viz.panels import Window, normals_seen_by, strongest_window
 
 _DETAIL = 5
@@ -32,7 +32,7 @@ class Shown:
     """
 
     name: str
-    scene: StoredScene
+    scene: DepthSample
     depths: dict[str, Tensor | None]
     scores: dict[str, dict[str, float]]
 
@@ -77,13 +77,13 @@ def shown_scenes(results: Results, problem: BenchmarkSetting, notes: list[str]) 
         yield Shown(name, scene, depths, scores)
 
 
-def _stored(name: str, runs: Sequence[Run], notes: list[str]) -> StoredScene | None:
+def _stored(name: str, runs: Sequence[Run], notes: list[str]) -> DepthSample | None:
     """Return the scene from the first run that keeps it whole."""
     reason = "no run keeps its photo and input"
     for run in runs:
-        if run.has_scene(name):
+        if run.has_sample(name):
             try:
-                return run.scene(name)
+                return run.sample(name)
             except ValueError as error:
                 reason = str(error)
     _note(notes, f"no figures of {name}: {reason}")

@@ -10,10 +10,10 @@ import numpy as np
 from torch import Tensor
 
 from dsr.evaluation.results import BenchmarkSetting, Results, Run, one_per_method
-from dsr.evaluation.store import StoredScene
 from dsr.geometry.camera import Camera
 from dsr.geometry.shading import lights, shade
 from dsr.report.page.encoding import Pool, depth_picture, error_picture, mask_picture, shading_picture
+from dsr.sample import DepthSample
 from dsr.viz.panels import limits_of, normals_seen_by
 
 _LEAST_ERROR = 1e-4
@@ -66,7 +66,7 @@ def scene_data(view: View, pool: Pool, notes: list[str]) -> dict[str, Any] | Non
     if stored is None:
         return None
     answers = _results(view, stored, notes)
-    reference = stored.depth if stored.depth is not None else (answers[0].depth if answers else stored.coarse)
+    reference = stored.depth if stored.depth is not None else (answers[0].depth if answers else stored.depth_lr)
     low, high = limits_of(reference)
     data: dict[str, Any] = {
         "scene": view.scene,
@@ -80,7 +80,7 @@ def scene_data(view: View, pool: Pool, notes: list[str]) -> dict[str, Any] | Non
         largest, data["error"] = _error_limits([each.depth - stored.depth for each in answers])
     coarse = f"{stored.camera_lr.width} x {stored.camera_lr.height}"
     surfaces = [
-        {"label": "input", "kind": "input", "text": coarse, **_surface(stored.coarse, stored.camera_lr, data, pool)}
+        {"label": "input", "kind": "input", "text": coarse, **_surface(stored.depth_lr, stored.camera_lr, data, pool)}
     ]
     for each in answers:
         surface = _surface(each.depth, stored.camera, data, pool)
@@ -93,12 +93,12 @@ def scene_data(view: View, pool: Pool, notes: list[str]) -> dict[str, Any] | Non
     return {**data, "surfaces": surfaces}
 
 
-def _stored(view: View, notes: list[str]) -> StoredScene | None:
+def _stored(view: View, notes: list[str]) -> DepthSample | None:
     """Return the scene as the first run that has it keeps it."""
     for run in view.runs:
-        if run.has_scene(view.scene):
+        if run.has_sample(view.scene):
             try:
-                return run.scene(view.scene)
+                return run.sample(view.scene)
             except ValueError as error:
                 notes.append(str(error))
     dataset, scale, downsampling = view.problem
@@ -108,7 +108,7 @@ def _stored(view: View, notes: list[str]) -> StoredScene | None:
     return None
 
 
-def _results(view: View, stored: StoredScene, notes: list[str]) -> list[_Result]:
+def _results(view: View, stored: DepthSample, notes: list[str]) -> list[_Result]:
     """Return the predictions that fit the scene."""
     found = []
     for run in view.runs:
