@@ -226,7 +226,7 @@ def test_damaged_prediction_is_left_out_and_named(make_run, tmp_path):
 def test_scene_without_truth_has_renderings_and_no_errors(make_run, tmp_path):
     [run] = load_results([make_run(tmp_path / "run")]).runs
     stored = dataclasses.replace(run.sample("cube_no_texture"), depth=None)
-    _, _, scene = saved(tmp_path, Results((changed(run, scene=lambda _: stored),)))
+    _, _, scene = saved(tmp_path, Results((changed(run, sample=lambda _: stored),)))
     assert [surface["kind"] for surface in scene["surfaces"]] == ["input", "method"]
     assert "error" not in scene
     assert "error" not in scene["surfaces"][1]
