@@ -173,6 +173,7 @@ def test_density_of_too_few_distinct_values_is_empty(values):
     assert density_of(np.array(values), np.linspace(0, 3, 10)) is None
 
 
+@pytest.mark.slow
 def test_figures_are_vector_text_and_pictures(tmp_path, monkeypatch):
     monkeypatch.setitem(correlation_figure._STYLE, "pdf.compression", 0)
     paths = save_scatter_matrix(tmp_path, Results((run("Bicubic", 5), run("Odd $_ name", 5))))

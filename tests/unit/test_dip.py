@@ -116,6 +116,7 @@ def _fitted(*, visual: bool) -> tuple[Tensor, DepthSample]:
     return _prior(**ENOUGH, **loss)(sample), sample
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("visual", [False, True])
 def test_dip_approximates_two_planes(visual: bool) -> None:
     depth, sample = _fitted(visual=visual)
@@ -132,6 +133,7 @@ def test_visual_loss_gives_better_normals() -> None:
     assert errors[True] < 0.8 * errors[False]
 
 
+@pytest.mark.slow
 def test_holes_are_filled_better_than_with_the_nearest_values() -> None:
     sample = _sample(holes=Blobs(0.15, 8))
     depth = _prior(**ENOUGH)(sample)
@@ -149,6 +151,7 @@ def test_diverging_optimisation_is_reported(monkeypatch: pytest.MonkeyPatch) -> 
         _prior(steps=1)(_sample())
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("_every_step")
 @pytest.mark.parametrize("stopping", ["fixed", "variance", "oracle"])
 def test_interrupted_optimisation_gives_bit_identical_results(tmp_path: Path, stopping: str) -> None:
@@ -169,6 +172,7 @@ def test_interrupted_optimisation_gives_bit_identical_results(tmp_path: Path, st
     assert "80,val,RMSE_v," in tables[0]
 
 
+@pytest.mark.slow
 def test_killed_optimisation_resumes_from_the_last_minute(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     sample, settings = _sample(), {"steps": 30}
     whole = _prior(**settings)(sample)
@@ -186,6 +190,7 @@ def test_killed_optimisation_resumes_from_the_last_minute(tmp_path: Path, monkey
     assert "resumed" in display.lines[0]
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("_every_step")
 @pytest.mark.parametrize("spoil", ["settings", "input", "bytes"])
 def test_checkpoint_of_another_optimisation_is_not_resumed(tmp_path: Path, spoil: str) -> None:
@@ -213,6 +218,7 @@ def test_expected_duration_is_announced_at_the_start() -> None:
     assert re.fullmatch(pattern, display.lines[0])
 
 
+@pytest.mark.slow
 def test_stopping_rule_reports_its_step() -> None:
     display = Stopper(-1)
     noisy = _sample()
@@ -270,6 +276,7 @@ def test_oracle_is_flagged() -> None:
     assert _prior(stopping="variance").flag == ""
 
 
+@pytest.mark.slow
 def test_warm_start_begins_at_the_result_of_the_trained_network() -> None:
     weights = packaged_weights("msg_v_x4")
     assert weights is not None

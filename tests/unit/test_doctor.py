@@ -122,6 +122,7 @@ def test_embedded_scenes_pass(name):
     assert wrong(render_scene(name, 160).scene("simgeo", name)) == {}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("index", range(3))
 def test_random_scenes_pass(index):
     assert wrong(render_random_scene(11, index, 128).scene("procedural", str(index))) == {}

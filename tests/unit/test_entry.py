@@ -135,6 +135,7 @@ def test_program_defect_is_not_reported_as_a_usage_error(command):
         command(job=job)
 
 
+@pytest.mark.slow
 def test_multirun_calls_the_job_for_every_combination(command):
     code, error, seen = command("-m", "scale=4,8", "method=nearest,bicubic")
     assert (code, error) == (0, "")

@@ -26,6 +26,8 @@ from dsr.report.figures.lights import sphere_normals
 from dsr.report.figures.scenes import details_of
 from dsr.viz.panels import HOLE_COLOUR, Window, colours, strongest_window
 
+pytestmark = pytest.mark.slow  # drawing takes a second
+
 TOGETHER = (save_rendering_grids, save_depth_grids, save_error_grids)
 
 

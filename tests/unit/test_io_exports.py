@@ -193,6 +193,7 @@ def test_before_after_picture_is_at_most_2400_pixels_wide(tmp_path, drawn, size,
     assert height / width == pytest.approx(size[0] / size[1])
 
 
+@pytest.mark.slow
 def test_before_after_picture_is_written_with_any_title_and_holes(tmp_path):
     depth = bumpy()
     depth[0, 1, 2] = torch.nan

@@ -100,7 +100,7 @@ def test_image_without_a_valid_pixel_becomes_nan(net: WindowedNetwork) -> None:
     assert bool(net.upsample(photos(24, 28), torch.full((1, 1, 6, 7), torch.nan)).isnan().all())
 
 
-@pytest.mark.parametrize("scale", [2, 8])
+@pytest.mark.parametrize("scale", [2, 4])
 def test_tiles_equal_the_whole_image(build: Callable[..., WindowedNetwork], scale: int) -> None:
     net = build(scale)
     rows, columns = net.reach + 9, 2 * net.reach + 10

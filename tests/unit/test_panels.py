@@ -10,6 +10,8 @@ from dsr.metrics.catalogue import KNOWN_FORMATS
 from dsr.sample import DepthSample
 from dsr.viz.panels import save_picture
 
+pytestmark = pytest.mark.slow  # drawing takes a second
+
 SCORES = {"RMSE_d": 0.07, "DSSIM_v": 0.3}
 WIDTH = 2656
 """Pixels: five panels of 3.2 inches and 0.6 inches of margin at 160 dpi."""

@@ -32,6 +32,7 @@ def rays(size=SIZE):
     return make_camera(FORWARD, size).rays().numpy().reshape(3, -1)
 
 
+@pytest.mark.slow
 def test_scene_does_not_depend_on_earlier_renderings():
     first = render_random_scene(5, 2, 24)
     render_random_scene(5, 1, 24)
@@ -41,12 +42,14 @@ def test_scene_does_not_depend_on_earlier_renderings():
     assert first.camera == second.camera
 
 
+@pytest.mark.slow
 def test_seed_and_index_each_give_another_scene():
     views = [scenes()[0], scenes()[1], render_random_scene(4, 0, 48)]
     assert len({view.camera.fx for view in views}) == 3
     assert len({view.rgb.tobytes() for view in views}) == 3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("layout", LAYOUTS)
 def test_layouts_close_the_view_and_keep_their_types_and_ranges(layout):
     scene = random_scene(np.random.default_rng(8), layout)
@@ -63,6 +66,7 @@ def test_layouts_close_the_view_and_keep_their_types_and_ranges(layout):
     assert picture.rgb.std() > 4
 
 
+@pytest.mark.slow
 def test_size_changes_only_the_sampling_of_a_scene():
     large, small = (render_random_scene(0, 7, size) for size in (96, 32))
     for name in ("fx", "fy"):

@@ -39,6 +39,7 @@ def test_scene_is_rendered_once(cache: Path, monkeypatch: pytest.MonkeyPatch) ->
     assert first.depth.equal(second.depth)
 
 
+@pytest.mark.slow
 def test_preparing_renders_what_is_missing_and_names_every_scene(cache: Path) -> None:
     source = Procedural(count=3, size=SIZE)
     source.load("00001")

@@ -10,6 +10,8 @@ from dsr.geometry.camera import Camera
 from dsr.sample import Scene
 from dsr.viz.sheets import save_contact_sheet
 
+pytestmark = pytest.mark.slow  # drawing takes a second
+
 PHOTO = (0.2, 0.4, 0.6)
 PINK = (214, 132, 180)
 KNOWN = (228, 228, 228)
