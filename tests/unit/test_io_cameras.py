@@ -8,7 +8,7 @@ import pytest
 from PIL import Image
 
 from dsr.geometry.camera import Camera
-from dsr.io.cameras import CameraChoice, camera_of
+from dsr.io.cameras import CameraChoice, find_camera
 from dsr.io.photos import read_photo
 
 SIZE, COARSE = (48, 64), (12, 16)
@@ -33,8 +33,8 @@ def photo(folder, exif=None, size=SIZE):
 
 
 def found(folder, **choice):
-    description, facts = camera_of(CameraChoice(**choice), photo(folder), SIZE, COARSE)
-    return description.camera, [str(fact) for fact in facts]
+    description, assumptions = find_camera(CameraChoice(**choice), photo(folder), SIZE, COARSE)
+    return description.camera, [str(assumption) for assumption in assumptions]
 
 
 @pytest.mark.parametrize(
@@ -56,22 +56,22 @@ def test_camera_file_of_the_photo_is_used_silently(tmp_path, name, content):
     ],
 )  # fmt: skip
 def test_matrix_of_sun_rgbd_or_scannet_is_in_photo_pixels(tmp_path, text):
-    camera, facts = found(tmp_path, file=written(tmp_path, "intrinsics.txt", text))
+    camera, assumptions = found(tmp_path, file=written(tmp_path, "intrinsics.txt", text))
     assert camera == Camera(**OWN)
-    assert facts == ["camera: the matrix is taken for one of the photo's pixels"]
+    assert assumptions == ["camera: the matrix is taken for one of the photo's pixels"]
 
 
 def test_matrix_in_depth_map_pixels_is_recognised_and_scaled(tmp_path):
-    camera, facts = found(tmp_path, file=written(tmp_path, "k.txt", "15 0 7.5 0 15 5.5 0 0 1"))
+    camera, assumptions = found(tmp_path, file=written(tmp_path, "k.txt", "15 0 7.5 0 15 5.5 0 0 1"))
     assert camera == Camera(64, 48, 60, 60, 31.5, 23.5)
-    assert "depth map's pixels" in facts[0]
-    assert "16 x 12 pixels is scaled to the photo's 64 x 48" in facts[1]
+    assert "depth map's pixels" in assumptions[0]
+    assert "16 x 12 pixels is scaled to the photo's 64 x 48" in assumptions[1]
 
 
 def test_camera_of_another_resolution_is_scaled_about_the_outer_edge(tmp_path):
-    camera, facts = found(tmp_path, file=written(tmp_path, "c.json", {**OWN, "width": 128, "height": 96}))
+    camera, assumptions = found(tmp_path, file=written(tmp_path, "c.json", {**OWN, "width": 128, "height": 96}))
     assert camera == Camera(64, 48, 30, 30.5, 31.5 / 2 - 0.5, 24.5 / 2 - 0.5)
-    assert facts == ["camera: that of 128 x 96 pixels is scaled to the photo's 64 x 48"]
+    assert assumptions == ["camera: that of 128 x 96 pixels is scaled to the photo's 64 x 48"]
 
 
 @pytest.mark.parametrize(
@@ -102,30 +102,30 @@ def test_command_line_numbers_are_photo_pixels(tmp_path):
 
 
 def test_field_of_view_is_the_angle_between_the_outer_edges(tmp_path):
-    camera, facts = found(tmp_path, fov=90.0)
+    camera, assumptions = found(tmp_path, fov=90.0)
     assert (camera.fx, camera.fy, camera.cx, camera.cy) == pytest.approx((32, 32, 31.5, 23.5))
-    assert facts == []
+    assert assumptions == []
 
 
 def test_unknown_camera_is_assumed_to_have_60_degrees_with_a_note(tmp_path):
-    camera, facts = found(tmp_path)
+    camera, assumptions = found(tmp_path)
     assert math.degrees(2 * math.atan(32 / camera.fx)) == pytest.approx(60)
-    assert facts == [
+    assert assumptions == [
         "camera: none given, 60 degrees of horizontal view assumed (--camera, --fov or --intrinsics) (55.426 pixels)"
     ]
 
 
 def test_focal_length_of_exif_data_is_relative_to_the_35_mm_diagonal(tmp_path):
-    description, facts = camera_of(CameraChoice(), photo(tmp_path, {0xA405: 26}), SIZE, COARSE)
+    description, assumptions = find_camera(CameraChoice(), photo(tmp_path, {0xA405: 26}), SIZE, COARSE)
     assert description.camera.fx == pytest.approx(26 / math.sqrt(36**2 + 24**2) * 80)
-    assert "EXIF" in facts[0].text
-    assert facts[0].detail.startswith("26 mm")
+    assert "EXIF" in assumptions[0].text
+    assert assumptions[0].detail.startswith("26 mm")
 
 
 @pytest.mark.parametrize("value", [0, 1, 65535])
 def test_invalid_exif_focal_length_is_ignored(tmp_path, value):
-    facts = camera_of(CameraChoice(), photo(tmp_path, {0xA405: value}), SIZE, COARSE)[1]
-    assert facts[0].text.startswith("camera: none given")
+    assumptions = find_camera(CameraChoice(), photo(tmp_path, {0xA405: value}), SIZE, COARSE)[1]
+    assert assumptions[0].text.startswith("camera: none given")
 
 
 @pytest.mark.parametrize("choice", [{"fov": 0.0}, {"fov": 180.0}, {"fov": math.nan}, {"intrinsics": (1, 0, 1, 1)}])
@@ -138,10 +138,10 @@ def test_impossible_camera_numbers_are_refused(choice):
 def test_exif_rotation_is_applied_only_where_depth_fits_it_alone(tmp_path, orientation):
     path = photo(tmp_path, {0x0112: orientation})
     plain = np.asarray(Image.open(path).convert("RGB")).astype(int)
-    as_stored, facts = read_photo(path, COARSE)
+    as_stored, assumptions = read_photo(path, COARSE)
     assert np.abs(as_stored - plain).max() <= 2
-    assert "left out" in facts[0].text
-    upright, facts = read_photo(path, COARSE[::-1])
+    assert "left out" in assumptions[0].text
+    upright, assumptions = read_photo(path, COARSE[::-1])
     if orientation < 5:
         assert upright.shape == (48, 64, 3)
         return
@@ -150,4 +150,4 @@ def test_exif_rotation_is_applied_only_where_depth_fits_it_alone(tmp_path, orien
     expected = np.asarray(ImageOps.exif_transpose(Image.open(path)).convert("RGB")).astype(int)
     assert upright.shape == expected.shape
     assert np.abs(upright - expected).max() <= 2
-    assert "turned" in facts[0].text
+    assert "turned" in assumptions[0].text

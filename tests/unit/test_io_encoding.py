@@ -38,19 +38,21 @@ def test_unit_is_guessed_from_type_and_median_and_reported(middle, dtype, unit, 
         with pytest.raises(ValueError, match="no usual unit makes its median of 4 a distance; give one"):
             guess(middle, dtype)
         return
-    found, facts = guess(middle, dtype)
+    found, assumptions = guess(middle, dtype)
     assert found == unit
-    assert word in facts[0].text
-    assert facts[0].detail
+    assert word in assumptions[0].text
+    assert assumptions[0].detail
 
 
 def test_depth_too_far_too_near_or_too_sparse_is_pointed_out():
-    assert any("1/5000" in fact.text for fact in guess(12_000, "u2")[1])
-    assert not any("1/5000" in fact.text for fact in guess(9_000, "u2")[1])
+    assert any("1/5000" in assumption.text for assumption in guess(12_000, "u2")[1])
+    assert not any("1/5000" in assumption.text for assumption in guess(9_000, "u2")[1])
     sparse = np.arange(9).reshape(3, 3) > 2
-    assert any("1/256" in fact.text for fact in guess_unit("d", np.full((3, 3), 2000, "u2"), sparse)[1])
-    assert not any("1/256" in fact.text for fact in guess_unit("d", np.full((3, 3), 2000, "u2"), ~sparse)[1])
-    assert any("nearer than 5 cm" in fact.text for fact in guess(0.01, "f4")[1])
+    assert any("1/256" in assumption.text for assumption in guess_unit("d", np.full((3, 3), 2000, "u2"), sparse)[1])
+    assert not any(
+        "1/256" in assumption.text for assumption in guess_unit("d", np.full((3, 3), 2000, "u2"), ~sparse)[1]
+    )
+    assert any("nearer than 5 cm" in assumption.text for assumption in guess(0.01, "f4")[1])
 
 
 @pytest.mark.parametrize(
@@ -67,10 +69,10 @@ def test_unknown_unit_is_refused(text):
 
 
 def test_zeros_and_the_largest_whole_number_are_holes():
-    holes, mark, facts = find_holes(np.array([[0, 1, 65535], [0, 65534, 7]], "u2"), None)
+    holes, mark, assumptions = find_holes(np.array([[0, 1, 65535], [0, 65534, 7]], "u2"), None)
     np.testing.assert_array_equal(holes, [[1, 0, 1], [1, 0, 0]])
     assert mark == 0
-    assert [str(fact) for fact in facts] == [
+    assert [str(assumption) for assumption in assumptions] == [
         "zeros count as holes (33.3%)",
         "values that are 65535 count as holes (16.7%)",
     ]

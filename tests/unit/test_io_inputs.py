@@ -38,14 +38,14 @@ def read(pair, units=None, **reading):
 
 
 def texts(picture):
-    return [fact.text for fact in picture.facts]
+    return [assumption.text for assumption in picture.assumptions]
 
 
 def test_photo_is_in_0_to_1_and_depth_in_metres_with_nan_in_holes(make):
     picture = read(make(np.array([[0, 1000], [2500, 65535]] * 3, np.uint16).repeat(4, 1), "depth.png"))
     assert torch.equal(picture.rgb, torch.full((3, 12, 16), 0.2))
     expected = torch.tensor([[torch.nan, 1.0], [2.5, torch.nan]] * 3).repeat_interleave(4, 1)[None]
-    assert torch.allclose(picture.coarse, expected, equal_nan=True)
+    assert torch.allclose(picture.depth_lr, expected, equal_nan=True)
 
 
 @pytest.mark.parametrize(
@@ -58,25 +58,25 @@ def test_photo_is_in_0_to_1_and_depth_in_metres_with_nan_in_holes(make):
 def test_unit_is_the_users_then_the_camera_files_then_the_layouts(make, given, entries, layout, metres):
     pair = make(np.full((3, 4), 2000, np.uint16), **entries)
     picture = read(Pair(pair.name, pair.rgb, pair.depth, pair.camera, unit=layout), unit=given)
-    assert float(picture.coarse[0, 0, 0]) == pytest.approx(metres)
+    assert float(picture.depth_lr[0, 0, 0]) == pytest.approx(metres)
 
 
 def test_maps_of_a_folder_have_the_unit_of_the_first(make):
     units = {}
-    assert float(read(make(np.full((3, 4), 2.0)), units).coarse[0, 0, 0]) == 2
-    assert float(read(make(np.full((3, 4), 300.0)), units).coarse[0, 0, 0]) == 300
-    assert float(read(make(np.full((3, 4), 300.0))).coarse[0, 0, 0]) == pytest.approx(0.3)
+    assert float(read(make(np.full((3, 4), 2.0)), units).depth_lr[0, 0, 0]) == 2
+    assert float(read(make(np.full((3, 4), 300.0)), units).depth_lr[0, 0, 0]) == 300
+    assert float(read(make(np.full((3, 4), 300.0))).depth_lr[0, 0, 0]) == pytest.approx(0.3)
 
 
 def test_camera_file_sets_range_type_and_hole_value(make):
     pair = make(np.array([[2.0, 9.0], [2.0, 2.0]] * 3).repeat(4, 1), range_type="perspective", hole_value=9)
     picture = read(pair)
     corner = Camera(**OWN).rescale(8, 6).ray_lengths()[0, 0]
-    assert float(picture.coarse[0, 0, 0]) == pytest.approx(float(2 / corner))
-    assert bool(picture.coarse[0, 0, 4].isnan())
+    assert float(picture.depth_lr[0, 0, 0]) == pytest.approx(float(2 / corner))
+    assert bool(picture.depth_lr[0, 0, 4].isnan())
     assert picture.encoding.hole == 9
     assert any("perspective, says the camera file" in text for text in texts(picture))
-    assert float(read(pair, range_type="orthogonal").coarse[0, 0, 0]) == 2
+    assert float(read(pair, range_type="orthogonal").depth_lr[0, 0, 0]) == 2
 
 
 def test_camera_of_the_user_overrides_the_one_beside_the_pictures(make):

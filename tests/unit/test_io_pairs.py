@@ -4,9 +4,9 @@ import cv2
 import numpy as np
 import pytest
 
-from dsr.io.layouts import pairs_of_folder
+from dsr.io.layouts import find_pairs_of_folder
 from dsr.io.names import key_of, role_of, time_of, words_of
-from dsr.io.pairs import pairs_of_lists
+from dsr.io.pairs import find_pairs_of_lists
 
 
 def touch(folder, *names):
@@ -44,9 +44,9 @@ LAYOUTS = {
 @pytest.mark.parametrize("layout", LAYOUTS)
 def test_pairs_of_a_folder_are_found_in_order(tmp_path, layout):
     names = LAYOUTS[layout]
-    found = pairs_of_folder(touch(tmp_path, *names))
+    found = find_pairs_of_folder(touch(tmp_path, *names))
     assert pairs(found, tmp_path) == [names[:2], names[2:]]
-    assert found.alone == ()
+    assert found.unpaired == ()
     assert len({pair.name for pair in found.pairs}) == 2
 
 
@@ -55,9 +55,9 @@ def test_tum_lists_are_matched_by_time_within_20_ms_in_fifths_of_a_millimetre(tm
         "# color images\n# timestamp filename\n10.00 rgb/a.png\n10.03 rgb/b.png\n11 rgb/c.png\n"
     )
     (tmp_path / "depth.txt").write_text("# depth maps\n10.019 depth/x.png\n10.035 depth/y.png\n11.021 depth/z.png\n")
-    found = pairs_of_folder(tmp_path)
+    found = find_pairs_of_folder(tmp_path)
     assert pairs(found, tmp_path) == [("rgb/a.png", "depth/x.png"), ("rgb/b.png", "depth/y.png")]
-    assert [path.name for path in found.alone] == ["c.png", "z.png"]
+    assert [path.name for path in found.unpaired] == ["c.png", "z.png"]
     assert {pair.unit for pair in found.pairs} == {1 / 5000}
 
 
@@ -65,7 +65,7 @@ def test_damaged_tum_list_is_refused_by_file_and_line(tmp_path):
     (tmp_path / "rgb.txt").write_text("10.00\n")
     (tmp_path / "depth.txt").write_text("")
     with pytest.raises(ValueError, match=r"rgb.txt: line 1: expected a time and a file name, got '10.00'$"):
-        pairs_of_folder(tmp_path)
+        find_pairs_of_folder(tmp_path)
 
 
 def test_nearest_time_is_matched_and_no_depth_map_twice(tmp_path):
@@ -76,60 +76,60 @@ def test_nearest_time_is_matched_and_no_depth_map_twice(tmp_path):
         "depth/1700000000.008.png",
         "depth/1699999999.9.png",
     )
-    found = pairs_of_folder(tmp_path)
+    found = find_pairs_of_folder(tmp_path)
     assert pairs(found, tmp_path) == [("rgb/1700000000.010.png", "depth/1700000000.008.png")]
-    assert len(found.alone) == 2
+    assert len(found.unpaired) == 2
 
 
 def test_pictures_without_a_partner_are_named(tmp_path):
-    found = pairs_of_folder(touch(tmp_path, "rgb/1.png", "rgb/2.png", "rgb/3.png", "depth/2.png", "depth/9.png"))
+    found = find_pairs_of_folder(touch(tmp_path, "rgb/1.png", "rgb/2.png", "rgb/3.png", "depth/2.png", "depth/9.png"))
     assert pairs(found, tmp_path) == [("rgb/2.png", "depth/2.png")]
-    assert [path.name for path in found.alone] == ["1.png", "3.png", "9.png"]
+    assert [path.name for path in found.unpaired] == ["1.png", "3.png", "9.png"]
 
 
 def test_masks_infrared_and_confidence_are_not_paired(tmp_path):
-    found = pairs_of_folder(
+    found = find_pairs_of_folder(
         touch(tmp_path, "a.jpg", "a_depth.png", "a_ir.png", "a_confidence.png", "a_mask.png", "a.txt")
     )
     assert pairs(found, tmp_path) == [("a.jpg", "a_depth.png")]
-    assert found.alone == ()
+    assert found.unpaired == ()
 
 
 def test_ambiguous_file_names_are_resolved_by_content(tmp_path):
     for number in range(2):
         cv2.imwrite(str(tmp_path / f"view{number}.png"), np.ones((4, 4), np.uint16))
         cv2.imwrite(str(tmp_path / f"view{number}.jpg"), np.ones((4, 4, 3), np.uint8))
-    found = pairs_of_folder(tmp_path)
+    found = find_pairs_of_folder(tmp_path)
     assert pairs(found, tmp_path) == [("view0.jpg", "view0.png"), ("view1.jpg", "view1.png")]
 
 
 def test_dsr_scene_has_its_low_resolution_map_camera_and_mask(tmp_path):
     touch(tmp_path, "a/rgb.png", "a/camera.json", "a/depth.npy", "a/depth_lr8.npy", "a/disparity_lr4.npy", "a/mask.png")
     touch(tmp_path, "b/rgb.jpg", "b/camera.json", "b/disparity.pfm", "b/mask.png")
-    first, second = pairs_of_folder(tmp_path).pairs
+    first, second = find_pairs_of_folder(tmp_path).pairs
     assert (first.name, first.depth.name, first.factor, first.mask) == ("a", "disparity_lr4.npy", 4, None)
     assert (second.name, second.depth.name, second.factor) == ("b", "disparity.pfm", None)
     assert (second.mask, second.camera) == (tmp_path / "b" / "mask.png", tmp_path / "b" / "camera.json")
-    assert pairs_of_folder(tmp_path / "b").pairs[0].name == "b"
+    assert find_pairs_of_folder(tmp_path / "b").pairs[0].name == "b"
 
 
 def test_subfolders_are_searched_but_not_the_results(tmp_path):
     touch(tmp_path, "x/rgb/1.png", "x/depth/1.png", "x/intrinsics.txt", "y/deep/color_1.png", "y/deep/depth_1.png")
     touch(tmp_path, "out/color_7.png", "out/depth_7.png", "camera.json")
-    found = pairs_of_folder(tmp_path, tmp_path / "out")
+    found = find_pairs_of_folder(tmp_path, tmp_path / "out")
     assert [(pair.name, pair.camera.name) for pair in found.pairs] == [
         ("x/1", "intrinsics.txt"),
         ("y/deep/color_1", "camera.json"),
     ]
-    assert [fact.text for fact in found.facts] == ["folders rgb and depth"]
-    assert len(pairs_of_folder(tmp_path).pairs) == 3
+    assert [assumption.text for assumption in found.assumptions] == ["folders rgb and depth"]
+    assert len(find_pairs_of_folder(tmp_path).pairs) == 3
 
 
 def test_one_of_several_depth_folders_is_used_and_the_others_are_named(tmp_path):
     touch(tmp_path, "image/0001.jpg", "depth/0000001-000000000001.png", "depth_bfx/0001.png", "intrinsics.txt")
-    found = pairs_of_folder(tmp_path)
+    found = find_pairs_of_folder(tmp_path)
     assert pairs(found, tmp_path) == [("image/0001.jpg", "depth/0000001-000000000001.png")]
-    assert found.facts[0].text == "folders image and depth; not looked at: depth_bfx"
+    assert found.assumptions[0].text == "folders image and depth; not looked at: depth_bfx"
 
 
 @pytest.mark.parametrize(
@@ -137,9 +137,9 @@ def test_one_of_several_depth_folders_is_used_and_the_others_are_named(tmp_path)
 )
 def test_folder_without_pairs_is_refused(tmp_path, names):
     with pytest.raises(ValueError, match="expected photos and depth maps that belong together, found no pair"):
-        pairs_of_folder(touch(tmp_path, *names))
+        find_pairs_of_folder(touch(tmp_path, *names))
     with pytest.raises(ValueError, match="expected a folder of photos and depth maps, there is none"):
-        pairs_of_folder(tmp_path / "none")
+        find_pairs_of_folder(tmp_path / "none")
 
 
 def test_file_lists_are_paired_in_order_with_distinct_names(tmp_path):
@@ -147,14 +147,14 @@ def test_file_lists_are_paired_in_order_with_distinct_names(tmp_path):
     photos, depths = (
         [tmp_path / name for name in names] for names in (("a/p.jpg", "b/p.jpg", "q.jpg"), ("3.png", "1.png", "2.png"))
     )
-    found = pairs_of_lists(photos, depths)
+    found = find_pairs_of_lists(photos, depths)
     assert [(pair.name, pair.depth.name) for pair in found.pairs] == [
         ("a_p", "3.png"),
         ("b_p", "1.png"),
         ("q", "2.png"),
     ]
     assert [pair.camera for pair in found.pairs] == [None, None, tmp_path / "camera.json"]
-    assert [pair.name for pair in pairs_of_lists(photos[:1] * 2, depths[:2]).pairs] == ["a_p", "a_p_2"]
+    assert [pair.name for pair in find_pairs_of_lists(photos[:1] * 2, depths[:2]).pairs] == ["a_p", "a_p_2"]
 
 
 def test_inconsistent_lists_are_refused(tmp_path):
@@ -170,7 +170,7 @@ def test_inconsistent_lists_are_refused(tmp_path):
         ([tmp_path / "rgb"], [tmp_path / "depth"], [two], "--mask: expected photos and depth maps as files"),
     ]:
         with pytest.raises(ValueError, match=message):
-            pairs_of_lists(photos, depths, masks)
+            find_pairs_of_lists(photos, depths, masks)
 
 
 def test_names_are_split_into_words_and_numbers(tmp_path):

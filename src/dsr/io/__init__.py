@@ -1,1 +1,1 @@
-"""People's files: photos, depth maps, cameras, meshes, and how they belong together."""
+"""Files of users: photos, depth maps, cameras and meshes, and which of them belong together."""

@@ -1,4 +1,4 @@
-"""The camera of somebody's photo: from a file, from numbers, from the photo's EXIF data, or assumed."""
+"""The camera of a photo: from a file, from numbers, from the photo's EXIF data, or assumed."""
 
 from __future__ import annotations
 
@@ -16,21 +16,21 @@ from dsr.geometry.camera import Camera
 from dsr.io.encoding import Assumption
 from dsr.io.photos import Size, focal_in_exif, same_aspect
 
-_ASSUMED_FOV = 60.0
-"""Degrees, horizontally: about a phone's main camera in 4:3, and a depth camera's colour sensor."""
+_DEFAULT_FOV = 60.0
+"""Horizontal field of view in degrees, about that of a phone's main camera and of a depth camera's colour sensor."""
 _FILM_DIAGONAL = math.hypot(36, 24)
-"""Millimetres: 35 mm equivalents compare diagonals (CIPA DCG-001)."""
-_OFF_CENTRE = 0.25
-"""Of the width: a principal point farther off the middle is one of another picture size."""
+"""Diagonal of 35 mm film in millimetres, to which equivalent focal lengths refer (CIPA DCG-001)."""
+_MAX_OFF_CENTRE = 0.25
+"""Largest distance of a plausible principal point from the middle as a fraction of the size."""
 
 
 @dataclass(frozen=True)
 class CameraChoice:
-    """What a user says about the camera; at most one of the three.
+    """What the user says about the camera: at most one of the three.
 
     Args:
-        file: a camera file, see :func:`read_any_camera`.
-        fov: the horizontal field of view in degrees.
+        file: camera file, see :func:`read_any_camera`.
+        fov: horizontal field of view in degrees.
         intrinsics: fx, fy, cx, cy in pixels of the photo.
 
     """
@@ -50,48 +50,48 @@ class CameraChoice:
             raise ValueError(f"--intrinsics: expected FX FY CX CY in pixels, FX and FY above 0, got {came}")
 
 
-def camera_of(choice: CameraChoice, photo: Path, size: Size, coarse: Size) -> tuple[CameraFile, list[Assumption]]:
-    """Return the camera of a photo's pixels, with what its file says of depth, and what was assumed.
+def find_camera(choice: CameraChoice, photo: Path, size: Size, size_lr: Size) -> tuple[CameraFile, list[Assumption]]:
+    """Return the camera of a photo's pixels, with what its file says about depth, and the assumptions.
 
     Args:
-        choice: what the user says.
-        photo: the photo's file, for its EXIF data.
-        size: of the photo.
-        coarse: of the depth map, which a matrix without a size may belong to.
+        choice: what the user says about the camera.
+        photo: file of the photo, for its EXIF data.
+        size: size of the photo.
+        size_lr: size of the depth map, to which a matrix without an image size may belong.
 
     Raises:
-        ValueError: the camera file is damaged or one of another aspect than the photo.
+        ValueError: the camera file is damaged, or its image has another aspect than the photo.
 
     """
     height, width = size
     if choice.file is not None:
-        return _fitted(choice.file, read_any_camera(choice.file), size, coarse)
+        return _fit_to_photo(choice.file, read_any_camera(choice.file), size, size_lr)
     if choice.intrinsics is not None:
-        return _alone(Camera(width, height, *choice.intrinsics)), []
+        return _camera_only(Camera(width, height, *choice.intrinsics)), []
     if choice.fov is not None:
-        return _alone(_centred(size, width / 2 / math.tan(math.radians(choice.fov) / 2))), []
+        return _camera_only(_centred_camera(size, width / 2 / math.tan(math.radians(choice.fov) / 2))), []
     equivalent = focal_in_exif(photo)
     if equivalent is not None:
         focal = equivalent / _FILM_DIAGONAL * math.hypot(width, height)
-        fact = Assumption(
+        assumption = Assumption(
             "camera: focal length from the photo's EXIF data, principal point in the middle",
             f"{equivalent:g} mm for 35 mm film = {focal:.5g} pixels",
         )
-        return _alone(_centred(size, focal)), [fact]
-    focal = width / 2 / math.tan(math.radians(_ASSUMED_FOV) / 2)
-    text = f"camera: none given, {_ASSUMED_FOV:g} degrees of horizontal view assumed (--camera, --fov or --intrinsics)"
-    return _alone(_centred(size, focal)), [Assumption(text, f"{focal:.5g} pixels")]
+        return _camera_only(_centred_camera(size, focal)), [assumption]
+    focal = width / 2 / math.tan(math.radians(_DEFAULT_FOV) / 2)
+    text = f"camera: none given, {_DEFAULT_FOV:g} degrees of horizontal view assumed (--camera, --fov or --intrinsics)"
+    return _camera_only(_centred_camera(size, focal)), [Assumption(text, f"{focal:.5g} pixels")]
 
 
 def read_any_camera(path: Path) -> CameraFile | np.ndarray:
-    """Return a camera file's content; of a matrix without an image size its (3, 3) numbers.
+    """Return the content of a camera file; for a matrix without an image size the matrix, (3, 3).
 
-    Read are dsr's ``camera.json``; Open3D's JSON (``width``, ``height`` and ``intrinsic_matrix``, nine numbers column
-    by column, https://www.open3d.org/docs/release/python_api/open3d.camera.PinholeCameraIntrinsic.html); and text of
-    3 x 3 or 4 x 4 numbers, as SUN RGB-D and ScanNet have it.
+    The formats are dsr's ``camera.json``; Open3D's JSON (``width``, ``height`` and ``intrinsic_matrix``, nine numbers
+    column by column, https://www.open3d.org/docs/release/python_api/open3d.camera.PinholeCameraIntrinsic.html);
+    and text of 3 x 3 or 4 x 4 numbers, as SUN RGB-D and ScanNet have it.
 
     Raises:
-        ValueError: it is none of these.
+        ValueError: the file has none of these formats.
 
     """
     if not path.is_file():
@@ -108,52 +108,52 @@ def read_any_camera(path: Path) -> CameraFile | np.ndarray:
     return read_camera(path)
 
 
-def _alone(camera: Camera) -> CameraFile:
-    """Return a camera about which no file says more."""
+def _camera_only(camera: Camera) -> CameraFile:
+    """Return a camera file that says nothing about depth."""
     return CameraFile(camera, None, None, None)
 
 
-def _centred(size: Size, focal: float) -> Camera:
+def _centred_camera(size: Size, focal: float) -> Camera:
     height, width = size
     return Camera(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
 
 
-def _fitted(
-    path: Path, content: CameraFile | np.ndarray, size: Size, coarse: Size
+def _fit_to_photo(
+    path: Path, content: CameraFile | np.ndarray, size: Size, size_lr: Size
 ) -> tuple[CameraFile, list[Assumption]]:
-    """Return a file's camera for the pixels of the photo."""
+    """Return the camera of a file for the pixels of the photo, and the assumptions."""
     height, width = size
     if isinstance(content, np.ndarray):
-        content, facts = _sized(path, content, size, coarse)
+        content, assumptions = _camera_of_matrix(path, content, size, size_lr)
     else:
-        facts = []
+        assumptions = []
     camera = content.camera
     if (camera.height, camera.width) == size:
-        return content, facts
+        return content, assumptions
     if not same_aspect((camera.height, camera.width), size):
         raise ValueError(
             f"{path}: the camera is of {camera.width} x {camera.height} pixels (width x height), the photo has "
             f"{width} x {height}, another aspect"
         )
     text = f"camera: that of {camera.width} x {camera.height} pixels is scaled to the photo's {width} x {height}"
-    return replace(content, camera=camera.rescale(width, height)), [*facts, Assumption(text)]
+    return replace(content, camera=camera.rescale(width, height)), [*assumptions, Assumption(text)]
 
 
-def _sized(path: Path, matrix: np.ndarray, size: Size, coarse: Size) -> tuple[CameraFile, list[Assumption]]:
+def _camera_of_matrix(path: Path, matrix: np.ndarray, size: Size, size_lr: Size) -> tuple[CameraFile, list[Assumption]]:
     """Return the camera of a matrix: of the photo's pixels, or else of the depth map's, by its principal point."""
-    for name, (height, width) in (("photo", size), ("depth map", coarse)):
+    for name, (height, width) in (("photo", size), ("depth map", size_lr)):
         cx, cy = matrix[0, 2], matrix[1, 2]
-        if max(abs((cx + 0.5) / width - 0.5), abs((cy + 0.5) / height - 0.5)) <= _OFF_CENTRE:
+        if max(abs((cx + 0.5) / width - 0.5), abs((cy + 0.5) / height - 0.5)) <= _MAX_OFF_CENTRE:
             camera = Camera(width, height, matrix[0, 0], matrix[1, 1], cx, cy)
-            return _alone(camera), [Assumption(f"camera: the matrix is taken for one of the {name}'s pixels")]
+            return _camera_only(camera), [Assumption(f"camera: the matrix is taken for one of the {name}'s pixels")]
     raise ValueError(
         f"{path}: expected a principal point near the middle of the photo, {size[1]} x {size[0]} pixels (width x "
-        f"height), or of the depth map, {coarse[1]} x {coarse[0]}; got {cx:g}, {cy:g}"
+        f"height), or of the depth map, {size_lr[1]} x {size_lr[0]}; got {cx:g}, {cy:g}"
     )
 
 
 def _matrix(path: Path, text: str) -> np.ndarray:
-    """Return a text's intrinsics, (3, 3)."""
+    """Return the intrinsics (3, 3) that a text holds."""
     try:
         numbers = [float(word) for word in text.replace(",", " ").replace(";", " ").split()]
     except ValueError:
@@ -161,7 +161,7 @@ def _matrix(path: Path, text: str) -> np.ndarray:
     if len(numbers) not in (9, 16):
         raise ValueError(f"{path}: expected JSON or a matrix of 3 x 3 or 4 x 4 numbers, got something else")
     side = math.isqrt(len(numbers))
-    return _checked(path, np.array(numbers).reshape(side, side)[:3, :3])
+    return _check_matrix(path, np.array(numbers).reshape(side, side)[:3, :3])
 
 
 def _open3d(path: Path, entries: dict[str, Any]) -> CameraFile:
@@ -169,16 +169,16 @@ def _open3d(path: Path, entries: dict[str, Any]) -> CameraFile:
     numbers = entries["intrinsic_matrix"]
     if not isinstance(numbers, Sequence) or len(numbers) != 9 or not all(isinstance(n, (int, float)) for n in numbers):
         raise ValueError(f"{path}: intrinsic_matrix: expected nine numbers, column by column")
-    matrix = _checked(path, np.array(numbers, dtype=float).reshape(3, 3).T)
+    matrix = _check_matrix(path, np.array(numbers, dtype=float).reshape(3, 3).T)
     try:
         width, height = entries["width"], entries["height"]
-        return _alone(Camera(width, height, matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]))
+        return _camera_only(Camera(width, height, matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]))
     except (KeyError, TypeError, ValueError) as error:
         raise ValueError(f'{path}: expected "width" and "height" in pixels beside intrinsic_matrix') from error
 
 
-def _checked(path: Path, matrix: np.ndarray) -> np.ndarray:
-    """Return a matrix of intrinsics, or say that it is none."""
+def _check_matrix(path: Path, matrix: np.ndarray) -> np.ndarray:
+    """Return a matrix after checking that it is one of intrinsics."""
     upright = np.isfinite(matrix).all() and matrix[0, 0] > 0 and matrix[1, 1] > 0
     if not upright or not np.allclose(matrix[2], (0, 0, 1)) or matrix[1, 0] != 0:
         raise ValueError(f"{path}: expected a matrix (fx 0 cx; 0 fy cy; 0 0 1), got {matrix.tolist()}")

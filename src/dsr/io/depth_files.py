@@ -1,6 +1,6 @@
-"""Depth maps in the files that people have, read and written value by value: PNG, TIFF, NPY, NPZ, PFM and OpenEXR.
+"""Depth maps read and written with their stored values: PNG, TIFF, NPY, NPZ, PFM and OpenEXR.
 
-Units and holes are the business of :mod:`dsr.io.encoding`; here a value is what the file holds.
+:mod:`dsr.io.encoding` converts the values to metres and handles holes.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What the values of somebody's depth file mean, and back: unit, holes, range type, and what was assumed of them."""
+"""Decoding and encoding of the values of depth files: unit, holes, range type, and assumptions about them."""
 
 from __future__ import annotations
 
@@ -12,26 +12,26 @@ from torch import Tensor
 
 from dsr.geometry.camera import Camera, RangeType, from_range, to_range
 
-_NEAREST, _FARTHEST = 0.05, 80.0
-"""Metres: a median outside speaks against a unit."""
+_MIN_MEDIAN, _MAX_MEDIAN = 0.05, 80.0
+"""Range of plausible medians in metres; a unit that gives another median is not assumed."""
 _OTHER_UNITS = ((1e-4, "0.1 mm"), (1e-6, "micrometres"), (1e-2, "centimetres"))
-"""Of whole numbers that cannot be millimetres, from the likeliest down."""
-_SPARSE = 0.6
-"""Share of holes beyond which whole numbers may be a laser scanner's."""
+"""Units of whole numbers that cannot be millimetres, the most likely first."""
+_SPARSE_FRACTION = 0.6
+"""Fraction of holes above which whole numbers may come from a laser scanner."""
 _FAR_FOR_A_SENSOR = 10.0
-"""Metres: depth cameras that count in millimetres see no farther than that."""
+"""Largest depth in metres of depth cameras that store millimetres."""
 _FLOAT_MILLIMETRES = 200.0
-"""A median of floats beyond which they are millimetres."""
+"""Median above which floats are millimetres."""
 _UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
 _LARGEST_UNIT = 1e6
 
 
 class Assumption(NamedTuple):
-    """Something that was assumed or found.
+    """Something that was assumed about the files, or found in them.
 
     Attributes:
-        text: the same for all pictures that it holds for.
-        detail: figures of the one picture.
+        text: statement, equal for all pictures to which it applies.
+        detail: figures of a single picture.
 
     """
 
@@ -44,14 +44,14 @@ class Assumption(NamedTuple):
 
 @dataclass(frozen=True)
 class Encoding:
-    """How a depth file counts.
+    """How the values of a depth file are stored.
 
     Args:
-        suffix: of its format, such as ``.png``.
-        dtype: NumPy's name of the type of its values.
+        suffix: suffix of the file's format, such as ``.png``.
+        dtype: NumPy's name of the type of the values.
         unit: metres per value; pixels per value for disparities.
-        hole: the value that stands for a hole when it is written: 0, NaN, inf or another.
-        range_type: what the values measure.
+        hole: value that is written for a hole: 0, NaN, inf or another.
+        range_type: quantity that the values measure.
 
     """
 
@@ -82,14 +82,14 @@ def parse_unit(text: str) -> float:
 
 
 def find_holes(values: np.ndarray, hole_value: float | None) -> tuple[np.ndarray, float, list[Assumption]]:
-    """Return where a stored map is unknown, the value that marks a hole in it, and what was assumed.
+    """Return where a stored map is missing, the value that most of its holes have, and the assumptions.
 
-    GlobalContext numbers have holes at 0 and at the largest number of their type, floats at 0, below, at NaN and
-    infinities; both at ``hole_value`` too.
+    Whole numbers are holes at 0 and at the largest number of their type, floats at 0, below 0, at NaN and at
+    infinity, and both at ``hole_value``.
 
     Args:
         values: (h, w) as stored.
-        hole_value: one more value of holes; None for none.
+        hole_value: additional value of holes; None for none.
 
     """
     if values.dtype.kind in "iu":
@@ -106,11 +106,13 @@ def find_holes(values: np.ndarray, hole_value: float | None) -> tuple[np.ndarray
         kinds = {f"{hole_value:g}": values == hole_value, **kinds}
     holes = np.logical_or.reduce(list(kinds.values()))
     found = {name: float(mask.mean()) for name, mask in kinds.items() if mask.any()}
-    facts = [
-        Assumption(f"values that are {name} count as holes" if name != "0" else "zeros count as holes", f"{share:.1%}")
-        for name, share in found.items()
+    assumptions = [
+        Assumption(
+            f"values that are {name} count as holes" if name != "0" else "zeros count as holes", f"{fraction:.1%}"
+        )
+        for name, fraction in found.items()
     ]
-    return holes, _mark(values, found, hole_value), facts
+    return holes, _mark(values, found, hole_value), assumptions
 
 
 def _mark(values: np.ndarray, found: dict[str, float], hole_value: float | None) -> float:
@@ -119,17 +121,17 @@ def _mark(values: np.ndarray, found: dict[str, float], hole_value: float | None)
         return hole_value
     if values.dtype.kind in "iu":
         return 0.0
-    found = {name: share for name, share in found.items() if name != "below 0"}
+    found = {name: fraction for name, fraction in found.items() if name != "below 0"}
     return {"0": 0.0, "infinity": math.inf}.get(max(found, key=found.__getitem__, default=""), math.nan)
 
 
 def guess_unit(name: str, values: np.ndarray, holes: np.ndarray) -> tuple[float, list[Assumption]]:
-    """Return metres per value of a stored map, told from its type and its median, and what was assumed.
+    """Return metres per value of a stored map, judged by its type and its median, and the assumptions.
 
     Args:
-        name: of the file, for the error.
-        values: (h, w) as stored, orthogonal or perspective depth.
-        holes: (h, w) bool, where it is unknown.
+        name: name of the file, for the error.
+        values: (h, w) stored values of orthogonal or perspective depth.
+        holes: (h, w) bool, where depth is missing.
 
     Raises:
         ValueError: no usual unit makes the distances plausible.
@@ -139,23 +141,27 @@ def guess_unit(name: str, values: np.ndarray, holes: np.ndarray) -> tuple[float,
     if values.dtype.kind == "f":
         if middle > _FLOAT_MILLIMETRES:
             return 1e-3, [Assumption("floats this large are taken for millimetres", f"median {middle:.4g}")]
-        facts = [Assumption("floats are taken for metres", f"median {middle:.3g} m")]
-        if middle < _NEAREST:
-            facts.append(Assumption("the depth is nearer than 5 cm: is it in metres? --depth-unit gives another unit"))
-        return 1.0, facts
-    if _NEAREST <= middle * 1e-3 <= _FARTHEST:
-        facts = [Assumption("whole numbers are taken for millimetres", f"median {middle * 1e-3:.3g} m")]
+        assumptions = [Assumption("floats are taken for metres", f"median {middle:.3g} m")]
+        if middle < _MIN_MEDIAN:
+            assumptions.append(
+                Assumption("the depth is nearer than 5 cm: is it in metres? --depth-unit gives another unit")
+            )
+        return 1.0, assumptions
+    if _MIN_MEDIAN <= middle * 1e-3 <= _MAX_MEDIAN:
+        assumptions = [Assumption("whole numbers are taken for millimetres", f"median {middle * 1e-3:.3g} m")]
         if middle * 1e-3 > _FAR_FOR_A_SENSOR:
-            facts.append(
+            assumptions.append(
                 Assumption(
                     "that is far for a sensor: TUM and ICL-NUIM store 1/5000 m, SUN RGB-D 1/8000 m (--depth-unit)"
                 )
             )
-        if holes.mean() > _SPARSE:
-            facts.append(Assumption("that is sparse, as of a laser scanner: KITTI stores 1/256 m (--depth-unit 1/256)"))
-        return 1e-3, facts
+        if holes.mean() > _SPARSE_FRACTION:
+            assumptions.append(
+                Assumption("that is sparse, as of a laser scanner: KITTI stores 1/256 m (--depth-unit 1/256)")
+            )
+        return 1e-3, assumptions
     for unit, label in _OTHER_UNITS:
-        if _NEAREST <= middle * unit <= _FARTHEST:
+        if _MIN_MEDIAN <= middle * unit <= _MAX_MEDIAN:
             why = f"as millimetres the median would be {middle * 1e-3:.3g} m, now {middle * unit:.3g} m"
             return unit, [Assumption(f"whole numbers are taken for {label}", why)]
     raise ValueError(f"{name}: no usual unit makes its median of {middle:g} a distance; give one with --depth-unit")
@@ -165,10 +171,10 @@ def decode(values: np.ndarray, holes: np.ndarray, encoding: Encoding, camera: Ca
     """Return orthogonal depth in metres, (1, h, w) float32, NaN in holes.
 
     Args:
-        values: (h, w) as stored.
-        holes: (h, w) bool, where they are unknown.
-        encoding: what they mean.
-        camera: of these very pixels.
+        values: (h, w) stored values.
+        holes: (h, w) bool, where depth is missing.
+        encoding: how the values are stored.
+        camera: camera of these pixels.
 
     """
     known = np.where(holes, np.nan, values.astype(np.float64)) * encoding.unit
@@ -176,14 +182,14 @@ def decode(values: np.ndarray, holes: np.ndarray, encoding: Encoding, camera: Ca
 
 
 def encode(depth: Tensor, encoding: Encoding, camera: Camera) -> tuple[np.ndarray, int]:
-    """Return depth as a file stores it, and how many known pixels it cannot hold: those become holes.
+    """Return the values that a file stores, and the number of valid pixels outside their range, which become holes.
 
-    GlobalContext numbers are rounded to the nearest.
+    Whole numbers are rounded to the nearest.
 
     Args:
-        depth: (1, H, W) orthogonal metres, NaN in holes.
-        encoding: how to count.
-        camera: of these very pixels.
+        depth: (1, H, W) orthogonal depth in metres, NaN in holes.
+        encoding: how the values are to be stored.
+        camera: camera of these pixels.
 
     """
     values = to_range(depth.double(), camera, encoding.range_type)[0].cpu().numpy() / encoding.unit
@@ -195,5 +201,5 @@ def encode(depth: Tensor, encoding: Encoding, camera: Camera) -> tuple[np.ndarra
 
 
 def _largest(dtype: np.dtype) -> float:
-    """Return the largest value of a type that is not taken for a hole."""
+    """Return the largest value of a type that is not a hole."""
     return np.iinfo(dtype).max - 1 if dtype.kind in "iu" else float(np.finfo(dtype).max)

@@ -1,4 +1,4 @@
-"""One pair of somebody's files as a photo in [0, 1] and a depth map in metres, with all that was assumed."""
+"""Reading of a pair of files as rgb in [0, 1] and depth in metres, with the assumptions that this needed."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from torch import Tensor
 
 from dsr.data.formats.files import CameraFile, read_mask
 from dsr.geometry.camera import Camera, RangeType
-from dsr.io.cameras import CameraChoice, camera_of
+from dsr.io.cameras import CameraChoice, find_camera
 from dsr.io.depth_files import read_depth_file
 from dsr.io.encoding import Assumption, Encoding, decode, find_holes, guess_unit
 from dsr.io.names import words_of
@@ -23,14 +23,14 @@ _DISPARITY_WORDS = frozenset({"disparity", "disp"})
 
 @dataclass(frozen=True)
 class Reading:
-    """How the files are to be read; None is for what they tell themselves, or for what is usual.
+    """What the user says about the files; None where it is to be read from the files or assumed.
 
     Args:
-        camera: the camera.
+        camera: camera of the photo.
         unit: metres per value of the depth files; pixels per value of disparities.
-        range_type: what the values measure.
-        baseline: between the two cameras of a disparity, in metres.
-        hole_value: a value that stands for a hole, beside the usual ones.
+        range_type: quantity that the values measure.
+        baseline: distance in metres between the two cameras of disparities.
+        hole_value: value that stands for a hole, in addition to the usual ones.
 
     """
 
@@ -43,86 +43,93 @@ class Reading:
 
 @dataclass(frozen=True)
 class Picture:
-    """A pair, read.
+    """A pair of photo and depth map as tensors.
 
     Args:
         rgb: (3, H, W) float32 in [0, 1].
-        coarse: (1, h, w) float32 orthogonal depth in metres, NaN in holes.
-        camera: of the photo's pixels.
-        encoding: how the depth file counts.
-        facts: what was assumed.
+        depth_lr: (1, h, w) float32 orthogonal depth in metres, NaN in holes.
+        camera: camera of the photo's pixels.
+        encoding: encoding of the depth file.
+        assumptions: assumptions about the files.
 
     """
 
     rgb: Tensor
-    coarse: Tensor
+    depth_lr: Tensor
     camera: Camera
     encoding: Encoding
-    facts: tuple[Assumption, ...]
+    assumptions: tuple[Assumption, ...]
 
 
 UnitMemory = dict[tuple[Path, str, str], tuple[float, list[Assumption]]]
-"""Units told from a first depth map, by folder, suffix and type of value: the maps beside it have the same."""
+"""Units by folder, suffix and type of value: the first depth map of each determines that of the others."""
 
 
 def read_picture(pair: Pair, reading: Reading, units: UnitMemory) -> Picture:
-    """Read a pair.
+    """Return a pair of files as tensors.
 
     Args:
         pair: the files.
-        reading: how.
-        units: of depth maps read before; what is found out here is added.
+        reading: what the user says about them.
+        units: units of depth maps read before, to which this function adds.
 
     Raises:
         ValueError: a file is missing or damaged, or the files do not fit each other.
 
     """
     stored = read_depth_file(pair.depth)
-    coarse_size: Size = (stored.shape[0], stored.shape[1])
-    pixels, facts = read_photo(pair.rgb, coarse_size)
-    described, camera_facts = _camera(pair, reading, (pixels.shape[0], pixels.shape[1]), coarse_size)
-    pixels, cut_facts = _cut_to_multiple(pixels, pair.factor, coarse_size)
+    size_lr: Size = (stored.shape[0], stored.shape[1])
+    pixels, assumptions = read_photo(pair.rgb, size_lr)
+    described, camera_assumptions = _camera(pair, reading, (pixels.shape[0], pixels.shape[1]), size_lr)
+    pixels, crop_assumptions = _crop_to_multiple(pixels, pair.factor, size_lr)
     size: Size = (pixels.shape[0], pixels.shape[1])
-    _expect_coarser(pair, size, coarse_size)
+    _expect_lower_resolution(pair, size, size_lr)
     camera = described.camera.crop(0, 0, *size)
     if reading.baseline is not None:
         camera = replace(camera, baseline=reading.baseline)
     hole_value = described.hole_value if reading.hole_value is None else reading.hole_value
-    holes, mark, hole_facts = find_holes(stored, hole_value)
+    holes, mark, hole_assumptions = find_holes(stored, hole_value)
     if pair.mask is not None:
-        holes |= ~_mask(pair.mask, coarse_size)
+        holes |= ~_mask(pair.mask, size_lr)
     if holes.all():
         raise ValueError(f"{pair.depth}: expected at least one known pixel, all are holes")
-    range_type, range_facts = _range_type(pair, reading, described, camera)
-    unit, unit_facts = _unit(pair, reading, described, range_type, stored, holes, units)
+    range_type, range_assumptions = _range_type(pair, reading, described, camera)
+    unit, unit_assumptions = _unit(pair, reading, described, range_type, stored, holes, units)
     encoding = Encoding(pair.depth.suffix.lower(), str(stored.dtype), unit, mark, range_type)
-    coarse = decode(stored, holes, encoding, camera.rescale(coarse_size[1], coarse_size[0]))
-    if not bool(coarse.isfinite().any()):
+    depth_lr = decode(stored, holes, encoding, camera.rescale(size_lr[1], size_lr[0]))
+    if not bool(depth_lr.isfinite().any()):
         raise ValueError(f"{pair.depth}: expected at least one disparity above 0, got none")
     rgb = torch.from_numpy(np.ascontiguousarray(pixels.transpose(2, 0, 1))).float() / 255
-    all_facts = (*facts, *camera_facts, *cut_facts, *range_facts, *unit_facts, *hole_facts)
-    return Picture(rgb, coarse, camera, encoding, all_facts)
+    all_assumptions = (
+        *assumptions,
+        *camera_assumptions,
+        *crop_assumptions,
+        *range_assumptions,
+        *unit_assumptions,
+        *hole_assumptions,
+    )
+    return Picture(rgb, depth_lr, camera, encoding, all_assumptions)
 
 
-def _cut_to_multiple(pixels: np.ndarray, factor: int | None, coarse: Size) -> tuple[np.ndarray, list[Assumption]]:
-    """Return the part of a photo that a map ``factor`` times coarser covers."""
+def _crop_to_multiple(pixels: np.ndarray, factor: int | None, size_lr: Size) -> tuple[np.ndarray, list[Assumption]]:
+    """Return the part of a photo that a depth map with ``factor`` times larger pixels covers."""
     if factor is None:
         return pixels, []
-    covered = pixels[: coarse[0] * factor, : coarse[1] * factor]
-    if covered.shape == pixels.shape or covered.shape[:2] != (coarse[0] * factor, coarse[1] * factor):
+    covered = pixels[: size_lr[0] * factor, : size_lr[1] * factor]
+    if covered.shape == pixels.shape or covered.shape[:2] != (size_lr[0] * factor, size_lr[1] * factor):
         return pixels, []
     return covered, [
         Assumption("the photo is cut to the part that the depth map covers", f"{pixels.shape[1]} x {pixels.shape[0]}")
     ]
 
 
-def _expect_coarser(pair: Pair, size: Size, coarse: Size) -> None:
-    """Say where the two pictures cannot belong together."""
-    (height, width), (low, narrow) = size, coarse
+def _expect_lower_resolution(pair: Pair, size: Size, size_lr: Size) -> None:
+    """Check that a depth map of size ``size_lr`` may belong to a photo of size ``size``."""
+    (height, width), (low, narrow) = size, size_lr
     what = f"the photo {pair.rgb.name} has {width} x {height} (width x height)"
     if low > height or narrow > width:
         raise ValueError(f"{pair.depth}: expected no more pixels than the photo, got {narrow} x {low}; {what}")
-    if not same_aspect(size, coarse) and abs(low - height * narrow / width) >= 1:
+    if not same_aspect(size, size_lr) and abs(low - height * narrow / width) >= 1:
         raise ValueError(
             f"{pair.depth}: expected the photo's aspect and field of view, got {narrow} x {low}; {what}: "
             "crop the one that sees more"
@@ -131,16 +138,16 @@ def _expect_coarser(pair: Pair, size: Size, coarse: Size) -> None:
         raise ValueError(f"{pair.depth}: expected at least 2 x 2 pixels, got {narrow} x {low}")
 
 
-def _camera(pair: Pair, reading: Reading, size: Size, coarse: Size) -> tuple[CameraFile, list[Assumption]]:
-    """Return the camera that the user gives, else the one beside the pictures, else one assumed."""
+def _camera(pair: Pair, reading: Reading, size: Size, size_lr: Size) -> tuple[CameraFile, list[Assumption]]:
+    """Return the camera that the user gives, else that of a file beside the pictures, else an assumed one."""
     if reading.camera != CameraChoice() or pair.camera is None:
-        return camera_of(reading.camera, pair.rgb, size, coarse)
-    described, facts = camera_of(CameraChoice(file=pair.camera), pair.rgb, size, coarse)
-    return described, [Assumption(f"camera: {pair.camera.name} beside the pictures"), *facts]
+        return find_camera(reading.camera, pair.rgb, size, size_lr)
+    described, assumptions = find_camera(CameraChoice(file=pair.camera), pair.rgb, size, size_lr)
+    return described, [Assumption(f"camera: {pair.camera.name} beside the pictures"), *assumptions]
 
 
 def _mask(path: Path, size: Size) -> np.ndarray:
-    """Return where the mask says that depth is known."""
+    """Return the valid mask in a file, (h, w) bool."""
     mask = read_mask(path)
     if mask.shape != size:
         raise ValueError(
@@ -153,27 +160,27 @@ def _mask(path: Path, size: Size) -> np.ndarray:
 def _range_type(
     pair: Pair, reading: Reading, described: CameraFile, camera: Camera
 ) -> tuple[RangeType, list[Assumption]]:
-    """Return what the values measure: as the user says, else by the file's name, else by the camera file."""
-    facts: list[Assumption] = []
+    """Return the range type that the user gives, else that of the file's name, else that of the camera file."""
+    assumptions: list[Assumption] = []
     if reading.range_type is not None:
         range_type = reading.range_type
     elif _DISPARITY_WORDS & set(words_of(pair.depth.stem)):
         range_type = "disparity"
-        facts.append(Assumption("values are taken for disparities, by the file's name"))
+        assumptions.append(Assumption("values are taken for disparities, by the file's name"))
     else:
         range_type = described.range_type or "orthogonal"
         if described.range_type not in (None, "orthogonal"):
-            facts.append(Assumption(f"values are of range type {range_type}, says the camera file"))
+            assumptions.append(Assumption(f"values are of range type {range_type}, says the camera file"))
     if range_type == "disparity" and camera.baseline is None:
         raise ValueError(f"{pair.depth}: disparities need the distance between the two cameras: --baseline METRES")
-    return range_type, facts
+    return range_type, assumptions
 
 
 def _unit(
     pair: Pair, reading: Reading, described: CameraFile, range_type: RangeType,
     stored: np.ndarray, holes: np.ndarray, units: UnitMemory,
 ) -> tuple[float, list[Assumption]]:  # fmt: skip
-    """Return metres per value (for disparities, pixels), and what was assumed."""
+    """Return metres per value, or pixels per value of disparities, and the assumptions."""
     if reading.unit is not None:
         return reading.unit, []
     if range_type == "disparity":

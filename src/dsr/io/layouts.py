@@ -1,4 +1,4 @@
-"""Finding pairs of photo and depth map in folders as recorders, data sets and people lay them out."""
+"""Pairs of photo and depth map in folders of any layout: of recording apps, data sets, or one's own."""
 
 from __future__ import annotations
 
@@ -13,24 +13,32 @@ from dsr.data.formats.files import read_pixels
 from dsr.io.depth_files import DEPTH_SUFFIXES
 from dsr.io.encoding import Assumption
 from dsr.io.names import match_times, role_of, role_of_words, words_of
-from dsr.io.pairs import Pair, PairingResult, camera_beside, matched, named_apart, pairs_of_two_folders, pictures_in
+from dsr.io.pairs import (
+    Pair,
+    PairingResult,
+    find_camera_file,
+    find_pairs_of_two_folders,
+    list_pictures,
+    make_names_unique,
+    match_pairs,
+)
 
-_COARSE = re.compile(r"(depth|disparity)_lr(\d+)")
+_DEPTH_LR = re.compile(r"(depth|disparity)_lr(\d+)")
 _TUM_UNIT = 1 / 5000
-_DEEPEST = 3
-"""Folders below the one given that are looked through."""
+_MAX_DEPTH = 3
+"""Levels of subfolders that are searched."""
 
 
-def pairs_of_folder(folder: Path, leave: Path | None = None) -> PairingResult:
-    """Return the pairs in a folder of any layout, or in the folders in it.
+def find_pairs_of_folder(folder: Path, leave: Path | None = None) -> PairingResult:
+    """Return the pairs in a folder of any of these layouts, or in its subfolders.
 
-    Known are: a scene of dsr (``rgb.png``, ``camera.json`` and ``depth*`` or ``disparity*``); lists of TUM RGB-D
+    The layouts are: a scene of dsr (``rgb.png``, ``camera.json`` and ``depth*`` or ``disparity*``); lists of TUM RGB-D
     (``rgb.txt`` and ``depth.txt``, https://cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats); two folders named
     for photos and depth maps; and files side by side, told apart by their names or by what they hold.
 
     Args:
-        folder: the folder.
-        leave: a folder that is not looked into, as that of the results.
+        folder: folder to search.
+        leave: folder that is skipped, such as that of the results.
 
     Raises:
         ValueError: there is no such folder, or no pair in it.
@@ -40,47 +48,47 @@ def pairs_of_folder(folder: Path, leave: Path | None = None) -> PairingResult:
         raise ValueError(f"{folder}: expected a folder of photos and depth maps, there is none")
     found = _search(folder, folder, None if leave is None else leave.resolve(), 0)
     if not found.pairs:
-        alone = f"; {len(found.alone)} pictures have no partner" if found.alone else ""
-        raise ValueError(f"{folder}: expected photos and depth maps that belong together, found no pair{alone}")
-    return PairingResult(named_apart(found.pairs), found.facts, found.alone)
+        unpaired = f"; {len(found.unpaired)} pictures have no partner" if found.unpaired else ""
+        raise ValueError(f"{folder}: expected photos and depth maps that belong together, found no pair{unpaired}")
+    return PairingResult(make_names_unique(found.pairs), found.assumptions, found.unpaired)
 
 
 def _search(folder: Path, root: Path, leave: Path | None, depth: int) -> PairingResult:
-    """Return the pairs in a folder, else those of the folders in it together."""
+    """Return the pairs in a folder or, if there are none, those in its subfolders."""
     for layout in (_scene, _tum, _role_folders, _side_by_side):
         found = layout(folder)
         if found.pairs:
-            camera = camera_beside(folder, root)
+            camera = find_camera_file(folder, root)
             return replace(found, pairs=tuple(replace(pair, camera=pair.camera or camera) for pair in found.pairs))
     deeper = [
         (path, _search(path, root, leave, depth + 1))
         for path in sorted(folder.iterdir())
-        if depth < _DEEPEST and path.is_dir() and not path.name.startswith(".") and path.resolve() != leave
+        if depth < _MAX_DEPTH and path.is_dir() and not path.name.startswith(".") and path.resolve() != leave
     ]
     pairs = [
         replace(pair, name=path.name if pair.name in ("rgb", path.name) else f"{path.name}/{pair.name}")
         for path, below in deeper
         for pair in below.pairs
     ]
-    facts = tuple(dict.fromkeys(fact for _, below in deeper for fact in below.facts))
-    alone = (*found.alone, *(path for _, below in deeper for path in below.alone))
-    return PairingResult(tuple(pairs), facts, alone)
+    assumptions = tuple(dict.fromkeys(assumption for _, below in deeper for assumption in below.assumptions))
+    unpaired = (*found.unpaired, *(path for _, below in deeper for path in below.unpaired))
+    return PairingResult(tuple(pairs), assumptions, unpaired)
 
 
 def _scene(folder: Path) -> PairingResult:
-    """Return the pair of dsr's own layout: its LR map, the finest of several, else the HR one."""
+    """Return the pair of a scene of dsr, with its low-resolution map of the smallest factor if it has one."""
     photo = next((folder / name for name in ("rgb.png", "rgb.jpg", "rgb.jpeg") if (folder / name).is_file()), None)
     if photo is None or not (folder / "camera.json").is_file():
         return PairingResult(())
     maps = sorted(path for path in folder.iterdir() if path.suffix.lower() in DEPTH_SUFFIXES)
-    coarse = {path: int(match[2]) for path in maps if (match := _COARSE.fullmatch(path.stem)) and int(match[2]) > 0}
+    factors = {path: int(match[2]) for path in maps if (match := _DEPTH_LR.fullmatch(path.stem)) and int(match[2]) > 0}
     camera = folder / "camera.json"
-    if coarse:
-        path = min(coarse, key=coarse.__getitem__)
-        return PairingResult((Pair(folder.name, photo, path, camera, None, None, coarse[path]),))
-    fine = [path for path in maps if path.stem in ("depth", "disparity")]
+    if factors:
+        path = min(factors, key=factors.__getitem__)
+        return PairingResult((Pair(folder.name, photo, path, camera, None, None, factors[path]),))
+    maps_hr = [path for path in maps if path.stem in ("depth", "disparity")]
     mask = folder / "mask.png"
-    pairs = [Pair(folder.name, photo, path, camera, mask if mask.is_file() else None) for path in fine[:1]]
+    pairs = [Pair(folder.name, photo, path, camera, mask if mask.is_file() else None) for path in maps_hr[:1]]
     return PairingResult(tuple(pairs))
 
 
@@ -92,12 +100,12 @@ def _tum(folder: Path) -> PairingResult:
     photos, depths = (_timed(path) for path in lists)
     partner = match_times(photos, depths)
     pairs = tuple(Pair(path.stem, path, partner[path], unit=_TUM_UNIT) for path in photos if path in partner)
-    alone = [path for path in (*photos, *depths) if path not in partner and path not in partner.values()]
-    return PairingResult(pairs, (Assumption("rgb.txt and depth.txt of TUM RGB-D: depth in 1/5000 m"),), tuple(alone))
+    unpaired = [path for path in (*photos, *depths) if path not in partner and path not in partner.values()]
+    return PairingResult(pairs, (Assumption("rgb.txt and depth.txt of TUM RGB-D: depth in 1/5000 m"),), tuple(unpaired))
 
 
 def _timed(path: Path) -> dict[Path, float]:
-    """Return the files that a list of TUM names, and their times."""
+    """Return the files in a list of TUM RGB-D, with their times in seconds."""
     times: dict[Path, float] = {}
     for number, line in enumerate(path.read_text(encoding="utf-8", errors="replace").splitlines(), 1):
         words = line.split()
@@ -111,34 +119,34 @@ def _timed(path: Path) -> dict[Path, float]:
 
 
 def _role_folders(folder: Path) -> PairingResult:
-    """Return the pairs of two folders in a folder that are named for photos and for depth maps."""
+    """Return the pairs of two subfolders whose names say that they hold photos and depth maps."""
     named: dict[str, list[Path]] = {"rgb": [], "depth": [], "other": []}
     for path in sorted(folder.iterdir(), key=lambda path: (len(path.name), path.name)):
         role = role_of_words(words_of(path.name)) if path.is_dir() else None
-        if role is not None and pictures_in(path):
+        if role is not None and list_pictures(path):
             named[role].append(path)
     if not named["rgb"] or not named["depth"]:
         return PairingResult(())
-    found = pairs_of_two_folders(named["rgb"][0], named["depth"][0], ())
+    found = find_pairs_of_two_folders(named["rgb"][0], named["depth"][0], ())
     extra = [path.name for paths in (named["rgb"], named["depth"]) for path in paths[1:]]
     text = f"folders {named['rgb'][0].name} and {named['depth'][0].name}"
-    fact = Assumption(text + (f"; not looked at: {', '.join(extra)}" if extra else ""))
-    return replace(found, facts=(fact, *found.facts))
+    assumption = Assumption(text + (f"; not looked at: {', '.join(extra)}" if extra else ""))
+    return replace(found, assumptions=(assumption, *found.assumptions))
 
 
 def _side_by_side(folder: Path) -> PairingResult:
     """Return the pairs among the files of a folder."""
-    roles = {path: role_of(path) for path in pictures_in(folder)}
+    roles = {path: role_of(path) for path in list_pictures(folder)}
     photos = [path for path, role in roles.items() if role == "rgb"]
-    if "depth" not in roles.values():  # the names do not tell: a depth map has one channel of 16 bits or floats
-        depths = [path for path in photos if path.suffix.lower() in DEPTH_SUFFIXES and _looks_like_depth(path)]
+    if "depth" not in roles.values():  # then depth maps are recognised by their single channel of 16 bits or floats
+        depths = [path for path in photos if path.suffix.lower() in DEPTH_SUFFIXES and _is_depth_map(path)]
         photos = [path for path in photos if path not in depths]
     else:
         depths = [path for path, role in roles.items() if role == "depth"]
-    return matched(photos, depths)
+    return match_pairs(photos, depths)
 
 
-def _looks_like_depth(path: Path) -> bool:
+def _is_depth_map(path: Path) -> bool:
     """Return whether a picture has one channel of more than 8 bits."""
     try:
         pixels = read_pixels(path, cv2.IMREAD_UNCHANGED)

@@ -1,8 +1,7 @@
-"""Three-dimensional models as files: PLY and binary glTF, by trimesh.
+"""Three-dimensional models as files: PLY and binary glTF, written by trimesh.
 
-Points stay in the camera frame in a PLY file: x right, y down, z forward. glTF has y up and +z towards the viewer
-(Khronos, glTF 2.0 specification, section 3.4), so there y and z change their signs: a half turn about x, which mirrors
-nothing.
+A PLY file has points in the camera frame: x right, y down, z forward. glTF has y up and +z towards the viewer (Khronos,
+glTF 2.0 specification, section 3.4), so y and z change their signs there, which is a rotation about x by 180 degrees.
 """
 
 from __future__ import annotations
@@ -23,9 +22,9 @@ from dsr.utils.files import replacing
 
 _TO_GLTF = np.array([1, -1, -1])
 _LARGEST_TEXTURE = 4096
-"""Pixels of a side that every viewer takes."""
+"""Largest side of a texture in pixels, which every viewer supports."""
 _LOSSLESS = 2**21
-"""Pixels up to which a texture is kept without loss."""
+"""Largest number of pixels of a texture that is stored without loss."""
 _FRAME = b"comment camera frame: x right, y down, z forward; metres\n"
 
 

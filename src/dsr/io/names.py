@@ -1,4 +1,4 @@
-"""What file names say: whether a file is a photo or a depth map, which frame it is of, and when it was taken."""
+"""Information in file names: whether a file is a photo or a depth map, of which frame, and when it was taken."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ _OTHER_WORDS = frozenset(
 _FILLERS = frozenset({"raw", "aligned", "registered", "map", "to", "frame", "in"})
 _SECONDS_BY_DIGITS = {10: 1.0, 13: 1e-3, 16: 1e-6, 19: 1e-9}
 """Times since 1970 as whole seconds, milli-, micro- and nanoseconds."""
-_WITHIN = 0.02
-"""Seconds between the two pictures of a pair."""
+_MAX_GAP = 0.02
+"""Largest time in seconds between the two pictures of a pair."""
 
 
 def words_of(name: str) -> list[str]:
-    """Return the words and numbers of a name, in small letters, numbers without leading zeros."""
+    """Return the words and numbers of a name, in lower case, numbers without leading zeros."""
     split = re.findall(r"[a-z]+|[A-Z]+(?![a-z])|[A-Z][a-z]+|\d+|[^\W\d_A-Za-z]+", name)
     return [word.lstrip("0") or "0" if word.isdigit() else word.lower() for word in split]
 
 
 def role_of(path: Path) -> Role:
-    """Return what a file is by its suffix and the words of its name, photo where they say nothing."""
+    """Return the role of a file by its suffix and the words of its name, ``rgb`` where they say nothing."""
     suffix = path.suffix.lower()
     found = role_of_words(words_of(path.stem))
     if found == "other" or suffix not in (*PHOTO_SUFFIXES, *DEPTH_SUFFIXES):
@@ -52,13 +52,13 @@ def role_of_words(words: Iterable[str]) -> Role | None:
 
 
 def key_of(path: Path) -> tuple[str, ...]:
-    """Return what is left of a name without the words that say its role: the same for the two of a pair."""
+    """Return the words of a name without those that say its role, which are equal for the two files of a pair."""
     words = words_of(path.stem)
     return tuple(word for word in words if word not in _RGB_WORDS | _DEPTH_WORDS | _FILLERS)
 
 
 def time_of(path: Path) -> float | None:
-    """Return the time in seconds that a name is, such as 1305031102.175304; None where it is none."""
+    """Return the time in seconds in a name such as 1305031102.175304; None if there is none."""
     numbers = re.findall(r"\d+(?:\.\d+)?", path.stem)
     numbers = [number for number in numbers if len(number.split(".")[0]) in _SECONDS_BY_DIGITS]
     if len(numbers) != 1:
@@ -93,11 +93,11 @@ def match_times(photos: dict[Path, float], depths: dict[Path, float]) -> dict[Pa
     order = sorted(depths, key=depths.__getitem__)
     candidates, first = [], 0
     for path in sorted(photos, key=photos.__getitem__):
-        while first < len(order) and depths[order[first]] < photos[path] - _WITHIN:
+        while first < len(order) and depths[order[first]] < photos[path] - _MAX_GAP:
             first += 1
         for other in order[first:]:
             gap = depths[other] - photos[path]
-            if gap > _WITHIN:
+            if gap > _MAX_GAP:
                 break
             candidates.append((abs(gap), path, other))
     partner: dict[Path, Path] = {}

@@ -21,12 +21,12 @@ class Pair:
     """Two files of one view.
 
     Args:
-        name: of the result; unique among the pairs found together.
-        rgb, depth: the files.
-        camera: a camera file that lies beside them; None for none.
-        mask: a picture that is 0 where depth is unknown; None for none.
-        unit: metres per value where the layout tells it.
-        factor: how many times coarser the depth is where its name tells it, as in ``depth_lr4.npy``.
+        name: name of the result, unique among the pairs found together.
+        rgb, depth: files of the photo and the depth map.
+        camera: camera file beside them; None for none.
+        mask: picture that is 0 where depth is missing; None for none.
+        unit: metres per value if the layout defines it.
+        factor: upsampling factor if the file's name has it, as in ``depth_lr4.npy``.
 
     """
 
@@ -44,18 +44,18 @@ class PairingResult:
     """What was found.
 
     Args:
-        pairs: in order.
-        facts: how they were recognised.
-        alone: pictures without a partner.
+        pairs: pairs in order.
+        assumptions: how they were recognised.
+        unpaired: pictures without a partner.
 
     """
 
     pairs: tuple[Pair, ...]
-    facts: tuple[Assumption, ...] = ()
-    alone: tuple[Path, ...] = ()
+    assumptions: tuple[Assumption, ...] = ()
+    unpaired: tuple[Path, ...] = ()
 
 
-def pairs_of_lists(photos: Sequence[Path], depths: Sequence[Path], masks: Sequence[Path] = ()) -> PairingResult:
+def find_pairs_of_lists(photos: Sequence[Path], depths: Sequence[Path], masks: Sequence[Path] = ()) -> PairingResult:
     """Return the pairs of files in the order given, or of two folders by the names in them.
 
     Raises:
@@ -71,7 +71,7 @@ def pairs_of_lists(photos: Sequence[Path], depths: Sequence[Path], masks: Sequen
             raise ValueError(
                 f"{photos[0]}: expected two folders; one that holds both is given without --rgb and --depth"
             )
-        return pairs_of_two_folders(photos[0], depths[0], masks)
+        return find_pairs_of_two_folders(photos[0], depths[0], masks)
     for path in (*photos, *depths, *masks):
         if path.is_dir():
             raise ValueError(f"{path}: expected files, or one folder each for --rgb and --depth")
@@ -79,31 +79,31 @@ def pairs_of_lists(photos: Sequence[Path], depths: Sequence[Path], masks: Sequen
         counts = f"{len(photos)} for --rgb, {len(depths)} for --depth" + (f", {len(masks)} for --mask" if masks else "")
         raise ValueError(f"expected as many depth maps (and masks, if any) as photos, got {counts}")
     pairs = [
-        Pair(rgb.stem, rgb, depth, camera_beside(rgb.parent, rgb.parent))
+        Pair(rgb.stem, rgb, depth, find_camera_file(rgb.parent, rgb.parent))
         for rgb, depth in zip(photos, depths, strict=True)
     ]
     if masks:
         pairs = [replace(pair, mask=mask) for pair, mask in zip(pairs, masks, strict=True)]
-    return PairingResult(named_apart(pairs))
+    return PairingResult(make_names_unique(pairs))
 
 
-def pairs_of_two_folders(photos: Path, depths: Path, masks: Sequence[Path]) -> PairingResult:
+def find_pairs_of_two_folders(photos: Path, depths: Path, masks: Sequence[Path]) -> PairingResult:
     """Return the pairs of two folders by name."""
     if masks:
         raise ValueError("--mask: expected photos and depth maps as files, one for each mask; got folders")
-    left = [path for path in pictures_in(photos) if path.suffix.lower() in PHOTO_SUFFIXES]
-    right = [path for path in pictures_in(depths) if path.suffix.lower() in DEPTH_SUFFIXES]
-    found = matched(left, right)
+    left = [path for path in list_pictures(photos) if path.suffix.lower() in PHOTO_SUFFIXES]
+    right = [path for path in list_pictures(depths) if path.suffix.lower() in DEPTH_SUFFIXES]
+    found = match_pairs(left, right)
     if not found.pairs:
         raise ValueError(
             f"{photos} and {depths}: expected photos and depth maps of the same names, numbers or times (within 20 "
             f"ms); of {len(left)} and {len(right)} none belong together"
         )
-    camera = camera_beside(photos, photos.parent)
+    camera = find_camera_file(photos, photos.parent)
     return replace(found, pairs=tuple(replace(pair, camera=camera) for pair in found.pairs))
 
 
-def camera_beside(folder: Path, root: Path) -> Path | None:
+def find_camera_file(folder: Path, root: Path) -> Path | None:
     """Return a camera file in the folder, in its folders of intrinsics, or above it up to the root."""
     places = [folder, folder / "intrinsic", folder / "intrinsics"]
     while folder != root:
@@ -112,16 +112,16 @@ def camera_beside(folder: Path, root: Path) -> Path | None:
     return next((place / name for place in places for name in CAMERA_NAMES if (place / name).is_file()), None)
 
 
-def matched(photos: Iterable[Path], depths: Iterable[Path]) -> PairingResult:
+def match_pairs(photos: Iterable[Path], depths: Iterable[Path]) -> PairingResult:
     """Return the pairs among photos and depth maps by name; see :func:`dsr.io.names.match_names`."""
     photos, depths = list(photos), list(depths)
     matches = match_names(photos, depths)
     used = {path for match in matches for path in match}
-    alone = tuple(path for path in (*photos, *depths) if path not in used)
-    return PairingResult(tuple(Pair(rgb.stem, rgb, depth) for rgb, depth in matches), (), alone)
+    unpaired = tuple(path for path in (*photos, *depths) if path not in used)
+    return PairingResult(tuple(Pair(rgb.stem, rgb, depth) for rgb, depth in matches), (), unpaired)
 
 
-def pictures_in(folder: Path) -> list[Path]:
+def list_pictures(folder: Path) -> list[Path]:
     """Return the pictures and maps in a folder."""
     suffixes = (*PHOTO_SUFFIXES, *DEPTH_SUFFIXES)
     return sorted(
@@ -130,7 +130,7 @@ def pictures_in(folder: Path) -> list[Path]:
     )  # fmt: skip
 
 
-def named_apart(pairs: Iterable[Pair]) -> tuple[Pair, ...]:
+def make_names_unique(pairs: Iterable[Pair]) -> tuple[Pair, ...]:
     """Return the pairs under names of their own: that of the folder in front where two are the same, else a number."""
     pairs = list(pairs)
     names = [pair.name for pair in pairs]

@@ -1,4 +1,4 @@
-"""Photos as they lie in their files, and what their EXIF data tell (CIPA DC-008, JEITA CP-3451)."""
+"""Reading of photos and of their EXIF data (CIPA DC-008, JEITA CP-3451)."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ _TURNS: dict[int, Callable[[np.ndarray], np.ndarray]] = {
     7: lambda pixels: pixels[::-1, ::-1].transpose(1, 0, 2),
     8: lambda pixels: pixels.transpose(1, 0, 2)[::-1],
 }
-"""What shows a photo upright, by EXIF orientation."""
+"""Operations that turn a photo upright, by EXIF orientation."""
 
 Size = tuple[int, int]
 """Height and width in pixels."""
 
 
-def read_photo(path: Path, coarse: Size) -> tuple[np.ndarray, list[Assumption]]:
-    """Return the photo, (H, W, 3) uint8 RGB, as it lies in its file; turned upright where depth fits that alone."""
+def read_photo(path: Path, size_lr: Size) -> tuple[np.ndarray, list[Assumption]]:
+    """Return the photo, (H, W, 3) uint8 RGB, turned upright only if the depth map fits so, and the assumptions."""
     if path.suffix.lower() in (".heic", ".heif"):
         raise ValueError(f"{path}: expected a JPEG or PNG photo, got HEIC; export it as JPEG")
     pixels = cv2.cvtColor(read_pixels(path, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION), cv2.COLOR_BGR2RGB)
@@ -38,7 +38,7 @@ def read_photo(path: Path, coarse: Size) -> tuple[np.ndarray, list[Assumption]]:
     if orientation == 1:
         return pixels, []
     size: Size = (pixels.shape[0], pixels.shape[1])
-    if orientation >= 5 and not same_aspect(size, coarse) and same_aspect(size[::-1], coarse):
+    if orientation >= 5 and not same_aspect(size, size_lr) and same_aspect(size[::-1], size_lr):
         return _TURNS[orientation](pixels), [
             Assumption("the photo is turned as its EXIF data say: so the depth map fits")
         ]
@@ -48,12 +48,12 @@ def read_photo(path: Path, coarse: Size) -> tuple[np.ndarray, list[Assumption]]:
 
 
 def same_aspect(first: Size, second: Size) -> bool:
-    """Return whether two sizes have one aspect, but for 2 %."""
+    """Return whether the aspects of two sizes differ by at most 2 %."""
     return abs(first[0] * second[1] / (first[1] * second[0]) - 1) <= _ASPECT_TOLERANCE
 
 
 def focal_in_exif(photo: Path) -> float | None:
-    """Return the focal length in millimetres for 35 mm film that the photo's EXIF data tell; None where they do not."""
+    """Return the equivalent focal length for 35 mm film in the EXIF data, in millimetres; None if there is none."""
     value = _exif(photo).get(_EXIF_FOCAL_35)
     return float(value) if isinstance(value, (int, float)) and 1 < value < 10_000 else None
 
@@ -66,7 +66,7 @@ def _exif(photo: Path) -> dict[int, Any]:
         with Image.open(photo) as image:
             exif = image.getexif()
             return {**dict(exif), **exif.get_ifd(_EXIF_IFD)}
-    except Exception:  # damaged data of whatever camera are as good as none
+    except Exception:  # damaged data are ignored
         return {}
 
 

@@ -1,4 +1,4 @@
-"""Rendered scenes, and the cache that keeps them: $DSR_CACHE, else $XDG_CACHE_HOME/dsr or ~/.cache/dsr."""
+"""Rendered scenes and their cache."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from platformdirs import user_cache_path
 
 from dsr.geometry.camera import Camera
 from dsr.sample import Scene
@@ -20,12 +21,12 @@ from dsr.utils.files import read_arrays, replacing
 
 @dataclass(frozen=True)
 class Rendering:
-    """A photo with its exact depth.
+    """An rgb image with exact depth.
 
     Args:
         rgb: (H, W, 3) uint8.
-        depth: (H, W) float64 distance to the image plane in metres.
-        camera: the camera of both.
+        depth: (H, W) float64 orthogonal depth in metres.
+        camera: camera of both.
 
     """
 
@@ -34,18 +35,18 @@ class Rendering:
     camera: Camera
 
     def scene(self, dataset: str, name: str) -> Scene:
-        """Return it as a scene of a data set."""
+        """Return the rendering as a scene of a data set."""
         rgb = torch.from_numpy(self.rgb).permute(2, 0, 1).float() / 255
         return Scene(dataset, name, rgb, self.camera, torch.from_numpy(self.depth)[None])
 
 
 def load_or_render(path: Path, make: Callable[[], Rendering]) -> Rendering:
-    """Return the rendering kept at ``path`` below the cache directory, or make it and try to keep it there.
+    """Return the rendering at ``path`` in the cache directory; if there is none, make it and store it there.
 
-    A damaged file is replaced; where nothing can be written the rendering is made each time.
+    A damaged file is replaced. If the cache cannot be written, the rendering is made each time.
     """
     path = cache_directory() / path
-    with contextlib.suppress(OSError, ValueError, KeyError, TypeError):  # missing, damaged, without a key, a wrong one
+    with contextlib.suppress(OSError, ValueError, KeyError, TypeError):  # missing or damaged
         kept = read_arrays(path)
         return Rendering(kept["rgb"], kept["depth"], Camera(**json.loads(str(kept["camera"]))))
     rendering = make()
@@ -56,7 +57,7 @@ def load_or_render(path: Path, make: Callable[[], Rendering]) -> Rendering:
 
 
 def cache_directory() -> Path:
-    """Return where things that can be made again are kept."""
+    """Return the directory for files that can be made again: $DSR_CACHE, else the platform's, such as ~/.cache/dsr."""
     if "DSR_CACHE" in os.environ:
         return Path(os.environ["DSR_CACHE"]).expanduser()
-    return Path(os.environ.get("XDG_CACHE_HOME", "~/.cache")).expanduser() / "dsr"
+    return user_cache_path("dsr", appauthor=False)

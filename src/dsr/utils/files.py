@@ -1,4 +1,4 @@
-"""Files that appear whole or not at all, and archives of arrays that are read whole or refused."""
+"""Atomic writing of files, and reading of archives of arrays."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ import numpy as np
 
 @contextlib.contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """Yield a temporary path beside ``path``, of the same suffix, that replaces it once the block ends without error.
+    """Yield a temporary path beside ``path`` that replaces it when the block ends without error.
 
-    The directory is made if need be. After an error or an interruption nothing is left of the temporary file.
+    The directory is created if it does not exist. After an error or an interruption the temporary file is deleted.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     handle, name = tempfile.mkstemp(prefix=f".{path.stem}-", suffix=path.suffix, dir=path.parent)
@@ -33,8 +33,8 @@ def read_arrays(path: Path) -> dict[str, np.ndarray]:
     """Return the arrays of an ``.npz`` file.
 
     Raises:
-        FileNotFoundError: there is none.
-        ValueError: it is damaged or something else.
+        FileNotFoundError: the file does not exist.
+        ValueError: the file is damaged or no archive of arrays.
 
     """
     with path.open("rb") as file:

@@ -16,10 +16,10 @@ def file_hash(path: Path) -> str:
 
 
 def hash_of_code(names: Iterable[str]) -> str:
-    """Return a hash of modules and packages, by their paths below the package.
+    """Return a hash of the code of modules and packages, given by their paths below the package.
 
     Raises:
-        FileNotFoundError: there is no such module or package.
+        FileNotFoundError: a module or package does not exist.
 
     """
     package = Path(dsr.__file__).parent

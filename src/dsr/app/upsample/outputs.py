@@ -148,7 +148,7 @@ def write_parts(
             facts.append(Assumption("no mesh", str(error)))
             parts = [part for part in parts if part != "mesh"]
     if "before_after" in parts:
-        write_before_after(folder / "before_after.png", rgb, picture.coarse, depth, camera, title)
+        write_before_after(folder / "before_after.png", rgb, picture.depth_lr, depth, camera, title)
     return [*files, *(name for part in parts if part != "depth" for name in _FILES[part])], facts
 
 
@@ -197,8 +197,8 @@ def described(picture: Picture, encoding: Encoding) -> dict[str, Any]:
     """Return sizes, camera and files' conventions for ``info.json``."""
     return {
         "photo_size": [picture.camera.width, picture.camera.height],
-        "input_size": [picture.coarse.shape[-1], picture.coarse.shape[-2]],
-        "input_holes": round(1 - float(picture.coarse.isfinite().float().mean()), 6),
+        "input_size": [picture.depth_lr.shape[-1], picture.depth_lr.shape[-2]],
+        "input_holes": round(1 - float(picture.depth_lr.isfinite().float().mean()), 6),
         "camera": asdict(picture.camera),
         "input_depth": _plain(picture.encoding),
         "depth_file": _plain(encoding),

@@ -31,8 +31,8 @@ from dsr.app.upsample.request import UpsampleRequest, files_of, inputs_of, setti
 from dsr.inference import AUTO, NOISY, Plan, enlarged_by, plan, suited_method, upsample_depth
 from dsr.io.encoding import Assumption
 from dsr.io.inputs import Picture, UnitMemory, read_picture
-from dsr.io.layouts import pairs_of_folder
-from dsr.io.pairs import Pair, PairingResult, pairs_of_lists
+from dsr.io.layouts import find_pairs_of_folder
+from dsr.io.pairs import Pair, PairingResult, find_pairs_of_lists
 from dsr.utils.console import bar, show
 
 
@@ -78,8 +78,8 @@ def run(wanted: UpsampleRequest, console: Console) -> list[str]:
 def _find(wanted: UpsampleRequest) -> PairingResult:
     """Return the pairs."""
     if not wanted.folders:
-        return pairs_of_lists(wanted.rgb, wanted.depth, wanted.mask)
-    parts = [pairs_of_folder(folder, wanted.output) for folder in wanted.folders]
+        return find_pairs_of_lists(wanted.rgb, wanted.depth, wanted.mask)
+    parts = [find_pairs_of_folder(folder, wanted.output) for folder in wanted.folders]
     if len(parts) == 1:
         return parts[0]
     pairs = [
@@ -89,8 +89,8 @@ def _find(wanted: UpsampleRequest) -> PairingResult:
     ]
     if len({pair.name for pair in pairs}) < len(pairs):
         raise ValueError("expected folders of different names; give those of one name in commands of their own")
-    facts = tuple(dict.fromkeys(fact for part in parts for fact in part.facts))
-    return PairingResult(tuple(pairs), facts, tuple(path for part in parts for path in part.alone))
+    facts = tuple(dict.fromkeys(fact for part in parts for fact in part.assumptions))
+    return PairingResult(tuple(pairs), facts, tuple(path for part in parts for path in part.unpaired))
 
 
 def _tell_found(console: Console, found: PairingResult) -> None:
@@ -99,9 +99,11 @@ def _tell_found(console: Console, found: PairingResult) -> None:
     lines = [
         f"{count} pairs of photo and depth map" if count > 1 else f"{found.pairs[0].rgb} and {found.pairs[0].depth}"
     ]
-    lines += [f"  {fact}" for fact in found.facts]
-    if found.alone:
-        lines.append(f"  {len(found.alone)} without a partner, left out: {listed([path.name for path in found.alone])}")
+    lines += [f"  {fact}" for fact in found.assumptions]
+    if found.unpaired:
+        lines.append(
+            f"  {len(found.unpaired)} without a partner, left out: {listed([path.name for path in found.unpaired])}"
+        )
     for line in lines:
         show(console, line)
 
@@ -157,11 +159,11 @@ def _one(
         reporter.say(f"{pair.name}: complete already, in {target}")
         return "complete already"
     picture = _without_repeats(read_picture(pair, wanted.reading, units))
-    coarse_size = (picture.coarse.shape[-2], picture.coarse.shape[-1])
+    coarse_size = (picture.depth_lr.shape[-2], picture.depth_lr.shape[-1])
     method, suits = _method(picture, wanted)
-    picture = replace(picture, facts=(*picture.facts, *suits))
+    picture = replace(picture, assumptions=(*picture.assumptions, *suits))
     planned = plan((picture.camera.height, picture.camera.width), coarse_size, wanted.scale, method)
-    reporter.facts(picture.facts)
+    reporter.facts(picture.assumptions)
     if wanted.dry_run:
         reporter.say(f"{pair.name}: {planned.text} -> {target}")
         return "to do"
@@ -183,7 +185,7 @@ def _method(picture: Picture, wanted: UpsampleRequest) -> tuple[str, list[Assump
     """Return the method to use, and what there is to say of it."""
     if wanted.method != AUTO:
         return wanted.method, []
-    method = suited_method(picture.coarse, picture.camera, wanted.scale)
+    method = suited_method(picture.depth_lr, picture.camera, wanted.scale)
     if method == NOISY:
         return method, [
             Assumption(f"the depth map is noisy: {NOISY}, which was trained for that (--method facets keeps more)")
@@ -193,12 +195,12 @@ def _method(picture: Picture, wanted: UpsampleRequest) -> tuple[str, list[Assump
 
 def _without_repeats(picture: Picture) -> Picture:
     """Return the picture with a depth map that was enlarged by repeating pixels as it was before."""
-    height, width = picture.coarse.shape[-2:]
-    block = enlarged_by(picture.coarse) if (height, width) == (picture.camera.height, picture.camera.width) else 1
+    height, width = picture.depth_lr.shape[-2:]
+    block = enlarged_by(picture.depth_lr) if (height, width) == (picture.camera.height, picture.camera.width) else 1
     if block == 1 or height % block or width % block:
         return picture
     fact = Assumption(f"the depth map was enlarged x{block} by repeating pixels, which are dropped")
-    return replace(picture, coarse=picture.coarse[:, ::block, ::block], facts=(*picture.facts, fact))
+    return replace(picture, depth_lr=picture.depth_lr[:, ::block, ::block], assumptions=(*picture.assumptions, fact))
 
 
 def _upsampled(job: _Job, picture: Picture, method: str, progress: Progress) -> Tensor:
@@ -207,7 +209,7 @@ def _upsampled(job: _Job, picture: Picture, method: str, progress: Progress) -> 
     with steps(progress, job.pair.name) as step:
         return upsample_depth(
             picture.rgb,
-            picture.coarse,
+            picture.depth_lr,
             picture.camera,
             wanted.scale,
             method=method,
@@ -230,7 +232,7 @@ def _write(job: _Job, picture: Picture, depth: Tensor, planned: Plan, seconds: f
         "scale": planned.scale,
         "plan": planned.text,
         **described(picture, encoding),
-        "assumptions": [str(fact) for fact in (*picture.facts, *facts)],
+        "assumptions": [str(fact) for fact in (*picture.assumptions, *facts)],
         "seconds": {"upsampling": round(seconds, 3), "writing": round(time.perf_counter() - started, 3)},
         "versions": versions(),
     }
