@@ -58,11 +58,11 @@ def module_of(sample: DepthSample, *, plain: bool, widths: tuple[int, ...] | Non
 def in_plain_layout(module: PriorOptimisation) -> tuple[Tensor, Tensor]:
     """Return the answer as :meth:`PriorOptimisation.answer` does, without a memory layout of its own."""
     draws = torch.randn(module.start.shape, generator=module.generator)
-    before, skip_net.doubled = skip_net.doubled, library
+    before, skip_net.upsample_2x = skip_net.upsample_2x, library
     try:
         y = module.net(torch.addcmul(module.start, draws, module.spread).contiguous())
     finally:
-        skip_net.doubled = before
+        skip_net.upsample_2x = before
     return module._depth(y[:, :1]), y[:, 1:].sigmoid()
 
 

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from dsr.geometry.camera import to_range
 from dsr.methods.classical.anisotropic_diffusion import AnisotropicDiffusion
-from dsr.methods.classical.finite_differences import upsampled
+from dsr.methods.classical.finite_differences import upsample_linear_border
 from dsr.sample import DepthSample
 
 
@@ -29,27 +29,27 @@ def _means(x: Tensor, scale: int) -> np.ndarray:
 @pytest.mark.parametrize("doffs", [0.0, 2.5])
 def test_diffusion_keeps_the_block_means_of_disparity(scale: int, size: tuple[int, int], doffs: float) -> None:
     sample = sample_of(*random_scene(*size), scale=scale, doffs=doffs)
-    fine = AnisotropicDiffusion(steps=60)(sample)
-    assert fine.shape == (1, *size)
-    np.testing.assert_allclose(_means(disparity_of(fine, sample), scale), _coarse(sample), rtol=1e-9)
+    hr = AnisotropicDiffusion(steps=60)(sample)
+    assert hr.shape == (1, *size)
+    np.testing.assert_allclose(_means(disparity_of(hr, sample), scale), _coarse(sample), rtol=1e-9)
 
 
 def test_diffusion_equals_a_plain_loop_over_pixels() -> None:
     disparity, rgb = random_scene(16, 16)
     sample = sample_of(disparity, rgb)
     method = AnisotropicDiffusion(steps=20, edge=0.2, depth_weight=0.0, border=0)
-    coarse = torch.from_numpy(_coarse(sample))[None, None]
-    start = upsampled(coarse, 4)[0, 0].numpy()
-    expected = _plain(start, rgb.double().numpy(), coarse[0, 0].numpy(), steps=20, edge=0.2)
-    found = method.diffused(rgb[None], coarse, 4)
-    assert found.steps == 20
-    np.testing.assert_allclose(found.values[0, 0].numpy(), expected, rtol=1e-5)
+    lr = torch.from_numpy(_coarse(sample))[None, None]
+    start = upsample_linear_border(lr, 4)[0, 0].numpy()
+    expected = _plain(start, rgb.double().numpy(), lr[0, 0].numpy(), steps=20, edge=0.2)
+    result = method.diffuse(rgb[None], lr, 4)
+    assert result.steps == 20
+    np.testing.assert_allclose(result.values[0, 0].numpy(), expected, rtol=1e-5)
 
 
-def _plain(x: np.ndarray, rgb: np.ndarray, coarse: np.ndarray, *, steps: int, edge: float) -> np.ndarray:
+def _plain(x: np.ndarray, rgb: np.ndarray, lr: np.ndarray, *, steps: int, edge: float) -> np.ndarray:
     """Return the two steps in turn, pixel by pixel; the photo alone guides."""
     height, width = x.shape
-    scale = height // coarse.shape[0]
+    scale = height // lr.shape[0]
     x = x.copy()
     for _ in range(steps):
         change = np.zeros_like(x)
@@ -59,9 +59,9 @@ def _plain(x: np.ndarray, rgb: np.ndarray, coarse: np.ndarray, *, steps: int, ed
                     difference = np.abs(rgb[:, k, m] - rgb[:, i, j]).sum() / 4  # the fourth channel is the map, times 0
                     change[i, j] += 0.24 / (1 + (difference / edge) ** 2) * (x[k, m] - x[i, j])
         x += change
-        for i, j in np.ndindex(coarse.shape):
+        for i, j in np.ndindex(lr.shape):
             block = x[scale * i : scale * (i + 1), scale * j : scale * (j + 1)]
-            block *= coarse[i, j] / block.mean()
+            block *= lr[i, j] / block.mean()
     return x
 
 
@@ -94,25 +94,25 @@ def test_hole_is_filled_from_the_side_of_the_photo_edge_that_it_lies_on() -> Non
     disparity, rgb = step(64, 32)
     sample = sample_of(disparity, rgb)
     sample.depth_lr[:, 4:10, 5:8] = torch.nan
-    fine = disparity_of(AnisotropicDiffusion(edge=0.01, depth_weight=0.0)(sample), sample)
-    assert (fine - disparity).abs().max() < 0.1
-    known = sample.mask_lr[0].numpy()
-    np.testing.assert_allclose(_means(fine, 4)[known], _coarse(sample)[known], rtol=1e-9)
+    hr = disparity_of(AnisotropicDiffusion(edge=0.01, depth_weight=0.0)(sample), sample)
+    assert (hr - disparity).abs().max() < 0.1
+    valid = sample.mask_lr[0].numpy()
+    np.testing.assert_allclose(_means(hr, 4)[valid], _coarse(sample)[valid], rtol=1e-9)
 
 
 def test_single_valid_pixel_fills_the_map() -> None:
     sample = sample_of(torch.full((8, 8), 5.0).double())
     sample.depth_lr[:, 1:] = torch.nan
     sample.depth_lr[:, :, 1:] = torch.nan
-    fine = disparity_of(AnisotropicDiffusion()(sample), sample)
-    np.testing.assert_allclose(fine.numpy(), 5.0, rtol=1e-6)
+    hr = disparity_of(AnisotropicDiffusion()(sample), sample)
+    np.testing.assert_allclose(hr.numpy(), 5.0, rtol=1e-6)
 
 
 def test_iteration_stops_at_convergence_and_more_steps_change_little() -> None:
     sample = sample_of(*random_scene(32, 48))
-    coarse, rgb = torch.from_numpy(_coarse(sample))[None, None], sample.rgb[None]
-    early = AnisotropicDiffusion(edge=0.3, depth_weight=0.0).diffused(rgb, coarse, 4)
-    late = AnisotropicDiffusion(edge=0.3, depth_weight=0.0, tolerance=0.0, steps=3000).diffused(rgb, coarse, 4)
+    lr, rgb = torch.from_numpy(_coarse(sample))[None, None], sample.rgb[None]
+    early = AnisotropicDiffusion(edge=0.3, depth_weight=0.0).diffuse(rgb, lr, 4)
+    late = AnisotropicDiffusion(edge=0.3, depth_weight=0.0, tolerance=0.0, steps=3000).diffuse(rgb, lr, 4)
     assert early.steps < 1000
     assert late.steps == 3000
     assert early.moved[-1] < 1e-5 <= early.moved[-2]
@@ -121,20 +121,20 @@ def test_iteration_stops_at_convergence_and_more_steps_change_little() -> None:
 
 def test_batch_equals_its_samples_one_at_a_time() -> None:
     maps, photos = zip(*(random_scene(16, 24, seed) for seed in (1, 2)), strict=True)
-    coarse = torch.stack([torch.from_numpy(_means(each, 4)) for each in maps])[:, None]
+    lr = torch.stack([torch.from_numpy(_means(each, 4)) for each in maps])[:, None]
     method = AnisotropicDiffusion(steps=100, tolerance=0.0)
-    together = method.diffused(torch.stack(photos), coarse, 4).values
-    for number, photo in enumerate(photos):
-        alone = method.diffused(photo[None], coarse[number : number + 1], 4).values[0]
+    together = method.diffuse(torch.stack(photos), lr, 4).values
+    for number, guide_rgb in enumerate(photos):
+        alone = method.diffuse(guide_rgb[None], lr[number : number + 1], 4).values[0]
         torch.testing.assert_close(together[number], alone, rtol=1e-5, atol=0)
 
 
 def test_result_is_deterministic_and_independent_of_the_truth() -> None:
     sample = sample_of(*random_scene(16, 24))
-    first = AnisotropicDiffusion(steps=100)(sample)
+    start_hr = AnisotropicDiffusion(steps=100)(sample)
     assert sample.depth is not None
     sample.depth.fill_(torch.nan)
-    assert torch.equal(first, AnisotropicDiffusion(steps=100)(sample))
+    assert torch.equal(start_hr, AnisotropicDiffusion(steps=100)(sample))
 
 
 def test_progress_ends_at_the_maximum_number_of_steps() -> None:

@@ -11,7 +11,7 @@ from torch import Tensor
 from dsr.degradation.downsampling import Downsampling, make_sample
 from dsr.geometry.camera import Camera
 from dsr.geometry.surface import depth_to_normals
-from dsr.methods.dip.noise import noise_level, normal_noise_deg
+from dsr.methods.dip.noise import estimate_noise, normal_noise_deg
 from dsr.methods.dip.problem import ImageProblem, PriorObjective
 from dsr.methods.dip.stopping import Fixed, Oracle, Residual, Variance
 from dsr.metrics.functional import SurfacePair, rmse_v
@@ -98,7 +98,7 @@ def test_forward_model_averages_the_configured_range_type() -> None:
     for kind in (None, "perspective", "disparity"):
         model = Downsampling("box", range_type=kind)  # type: ignore[arg-type]
         problem = ImageProblem.of(sample, model, "orthogonal", CPU)
-        kinds[kind] = problem.coarsened(sample.depth[None].float())  # type: ignore[index]
+        kinds[kind] = problem.downsample(sample.depth[None].float())  # type: ignore[index]
     torch.testing.assert_close(kinds[None][0], sample.depth_lr.float())
     lengths = CAMERA.ray_lengths(dtype=torch.float32)
     blocks = (sample.depth.float() * lengths).view(1, 16, 2, 24, 2).mean(dim=(2, 4))  # type: ignore[union-attr]
@@ -174,9 +174,9 @@ def test_noise_level_is_estimated_from_the_depth_map_alone(std: float) -> None:
         1 + std * torch.randn(depth.shape, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
     )
     noisy[..., 20:40, 30:60] = torch.nan
-    assert noise_level(noisy) == pytest.approx(std, rel=0.1)
-    assert noise_level(depth) < 1e-5
-    assert noise_level(depth[..., :2, :2]) == 0
+    assert estimate_noise(noisy) == pytest.approx(std, rel=0.1)
+    assert estimate_noise(depth) < 1e-5
+    assert estimate_noise(depth[..., :2, :2]) == 0
 
 
 def test_normal_noise_deg_is_the_tilt_of_a_frontal_surface() -> None:

@@ -9,7 +9,7 @@ from small_scenes import maps, photos, plane_map
 from torch import Tensor
 from torch.nn import functional
 
-from dsr.methods.classical.finite_differences import box_mean, repeated, upsampled
+from dsr.methods.classical.finite_differences import box_mean, repeat_blocks, upsample_linear_border
 from dsr.methods.networks.analysis_filters import WIDTHS, influence, penalty, plane_free_basis, zero_mean_basis
 from dsr.methods.networks.dg import DynamicGuidance, Stage
 
@@ -64,8 +64,8 @@ def test_gradients_of_the_influence_agree_with_finite_differences() -> None:
 def test_stage_is_a_gradient_step_on_its_energy_and_one_towards_the_low_resolution_map() -> None:
     stage, rgb = _stage(), photos(16, 20, 2).double()
     coarse = maps(4, 5, 2) / 30
-    x = repeated(coarse, 4) + 0.1 * maps(16, 20, 2)
-    y = (x - stage.fidelity * upsampled(box_mean(x, 4) - coarse, 4)).requires_grad_()
+    x = repeat_blocks(coarse, 4) + 0.1 * maps(16, 20, 2)
+    y = (x - stage.fidelity * upsample_linear_border(box_mean(x, 4) - coarse, 4)).requires_grad_()
     (gradient,) = torch.autograd.grad(stage.energy(y, rgb).sum(), y)
     assert float(gradient.abs().max()) > 1e-2
     torch.testing.assert_close(stage(x, coarse, rgb), y.detach() - gradient, rtol=0, atol=1e-13)
@@ -74,10 +74,10 @@ def test_stage_is_a_gradient_step_on_its_energy_and_one_towards_the_low_resoluti
 def test_stage_equals_plain_loops() -> None:
     stage, rgb = _stage(filters=3), photos(16, 16).double()
     coarse = maps(4, 4) / 30
-    x = repeated(coarse, 4) + 0.1 * maps(16, 16)
+    x = repeat_blocks(coarse, 4) + 0.1 * maps(16, 16)
     with torch.no_grad():
         result = stage(x, coarse, rgb)[0, 0].numpy()
-        misfit = upsampled(box_mean(x, 4) - coarse, 4)[0, 0].numpy()
+        misfit = upsample_linear_border(box_mean(x, 4) - coarse, 4)[0, 0].numpy()
     y = x[0, 0].numpy() - float(stage.fidelity) * misfit
     photo = rgb[0].numpy()
     combined = stage.analysis.numpy() / np.linalg.norm(stage.analysis.numpy(), axis=1, keepdims=True)

@@ -13,10 +13,10 @@ from torch import Tensor
 from dsr.degradation.downsampling import Downsampling, make_sample
 from dsr.geometry.camera import Camera, from_range, to_range
 from dsr.methods.base import Iterative, NoSolutionError
-from dsr.methods.classical.eg.bilateral import filtered, reachable
+from dsr.methods.classical.eg.bilateral import bilateral_filter, find_reachable
 from dsr.methods.classical.eg.upsampler import EdgeGuided, prime_factors
 from dsr.methods.classical.interpolation import Interpolation
-from dsr.methods.classical.photo_guided import slopes_along
+from dsr.methods.classical.photo_guided import estimate_slopes
 from dsr.sample import DepthSample, Scene
 
 
@@ -76,7 +76,7 @@ def test_eg_keeps_a_straight_step_straight_and_sharp(scale: int, degrees: float,
 def _by_loops(coarse: np.ndarray, barrier: np.ndarray, radius: int, sigma: float, mixed: float) -> np.ndarray:
     """The filter at scale 4, NaN on edges and where nothing is to be seen; ways are found by breadth-first search."""
     h, w = coarse.shape
-    down, across = (slopes_along(torch.from_numpy(coarse), axis).numpy() for axis in (0, 1))
+    down, across = (estimate_slopes(torch.from_numpy(coarse), axis).numpy() for axis in (0, 1))
     total, weights = (np.zeros(barrier.shape) for _ in range(2))
     for i in range(h):
         for j in range(w):
@@ -107,11 +107,11 @@ def test_filter_is_a_mean_over_the_pixels_connected_by_a_path(radius: int) -> No
     barrier = random.random((16, 16)) < 0.2
     barrier[:12, 7] = True
     expected = _by_loops(coarse, barrier, radius, 0.6, 0.1)
-    answer = filtered(torch.from_numpy(coarse), torch.from_numpy(barrier), 4, radius, 0.6, 0.1).numpy()
+    answer = bilateral_filter(torch.from_numpy(coarse), torch.from_numpy(barrier), 4, radius, 0.6, 0.1).numpy()
     seen = np.isfinite(expected)
     assert seen.sum() > 150
     np.testing.assert_allclose(answer[seen], expected[seen], rtol=1e-10)
-    reach = reachable(torch.from_numpy(barrier), 4, radius).any(dim=0).any(dim=0).numpy()
+    reach = find_reachable(torch.from_numpy(barrier), 4, radius).any(dim=0).any(dim=0).numpy()
     np.testing.assert_array_equal(seen, reach & ~barrier)
 
 
@@ -119,7 +119,7 @@ def test_filter_does_not_mix_the_sides_of_an_edge() -> None:
     coarse = torch.where(torch.arange(8) < 4, 5.0, 9.0).double().expand(8, 8)
     barrier = torch.zeros(16, 16, dtype=torch.bool)
     barrier[:, 8] = True
-    fine = filtered(coarse, barrier, 2, 1, 0.5, 0.01)
+    fine = bilateral_filter(coarse, barrier, 2, 1, 0.5, 0.01)
     torch.testing.assert_close(fine, torch.where(torch.arange(16) < 8, 5.0, 9.0).double().expand(16, 16))
 
 

@@ -7,13 +7,22 @@ import itertools
 import numpy as np
 import pytest
 import torch
+from dsr.methods.classical.eg.edge_map import detect_edges, predict_edge_map, thin
 from scipy import ndimage
 from torch import Tensor
 
 from dsr.methods.base import NoSolutionError
-from dsr.methods.classical.eg.belief_propagation import energy, labelled
-from dsr.methods.classical.eg.edge_map import edge_map, edges, thinned
-from dsr.methods.classical.eg.patches import PATCH, Patches, averaged, distances, distinct, nearest, overlaps, turned
+from dsr.methods.classical.eg.belief_propagation import energy, label
+from dsr.methods.classical.eg.patches import (
+    PATCH,
+    Patches,
+    average_patches,
+    deduplicate,
+    edge_distances,
+    find_nearest,
+    find_overlaps,
+    orient,
+)
 
 
 def _field(nodes: int, pairs: list[tuple[int, int]], labels: int = 3, seed: int = 0) -> tuple[Tensor, Tensor, Tensor]:
@@ -37,7 +46,7 @@ def _patches(count: int, seed: int = 0) -> Tensor:
 @pytest.mark.parametrize("seed", range(3))
 def test_belief_propagation_finds_the_minimum_on_a_tree(seed: int) -> None:
     field = _field(6, [(0, 1), (1, 2), (3, 1), (3, 4), (5, 3)], seed=seed)
-    found = labelled(*field)
+    found = label(*field)
     assert found.converged
     assert found.energy == pytest.approx(_least(*field), abs=1e-12)
     assert energy(found.labels, *field) == pytest.approx(found.energy)
@@ -48,52 +57,52 @@ def test_belief_propagation_equals_viterbi_on_a_chain() -> None:
     best = unary[0]
     for i in range(39):
         best = (best[:, None] + costs[i]).amin(dim=0) + unary[i + 1]
-    assert labelled(unary, pairs, costs, 300, 1e-9).energy == pytest.approx(float(best.min()), abs=1e-9)
+    assert label(unary, pairs, costs, 300, 1e-9).energy == pytest.approx(float(best.min()), abs=1e-9)
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_belief_propagation_finds_the_minimum_on_a_small_grid_with_loops(seed: int) -> None:
     pairs = [(0, 1), (1, 2), (3, 4), (4, 5), (0, 3), (1, 4), (2, 5)]
     unary, ends, costs = _field(6, pairs, seed=seed)
-    found = labelled(unary, ends, 0.5 * costs)
+    found = label(unary, ends, 0.5 * costs)
     assert found.energy == pytest.approx(_least(unary, ends, 0.5 * costs), abs=1e-12)
 
 
 def test_nodes_without_pairs_take_their_cheapest_label() -> None:
     unary, pairs, costs = _field(4, [])
-    assert torch.equal(labelled(unary, pairs, costs).labels, unary.argmin(dim=1))
+    assert torch.equal(label(unary, pairs, costs).labels, unary.argmin(dim=1))
 
 
 def test_distances_equal_scipy_and_overlaps_equal_a_loop() -> None:
     masks = _patches(5)
     expected = [ndimage.distance_transform_edt(~each) for each in masks.numpy()]
-    np.testing.assert_allclose(distances(masks), np.stack(expected), rtol=1e-6)
+    np.testing.assert_allclose(edge_distances(masks), np.stack(expected), rtol=1e-6)
     places = torch.tensor([[5, 7], [8, 5], [8, 17], [30, 30]])
     patches = _patches(8, seed=1).flatten(1).float().view(4, 2, -1)
-    pairs, costs = overlaps(places, patches)
+    pairs, costs = find_overlaps(places, patches)
     assert sorted(sorted(pair) for pair in pairs.tolist()) == [[0, 1], [0, 2]]
     for (a, b), cost in zip(pairs.tolist(), costs, strict=True):
         for x, y in itertools.product(range(2), repeat=2):
             first, second = (np.full((50, 50), np.nan) for _ in range(2))
-            for canvas, node, label in ((first, a, x), (second, b, y)):
+            for canvas, node, chosen in ((first, a, x), (second, b, y)):
                 v, u = (places[node] - PATCH // 2).tolist()
-                canvas[v : v + PATCH, u : u + PATCH] = patches[node, label].view(PATCH, PATCH)
+                canvas[v : v + PATCH, u : u + PATCH] = patches[node, chosen].view(PATCH, PATCH)
             assert float(cost[x, y]) == pytest.approx(np.nansum((first - second) ** 2))
 
 
 def test_distinct_pairs_are_kept_once_and_found_again() -> None:
     low, high = _patches(6), _patches(6, seed=1)
-    known = distinct(Patches(torch.cat((low, low)), torch.cat((high, high))))
+    known = deduplicate(Patches(torch.cat((low, low)), torch.cat((high, high))))
     assert len(known.low) == 6
-    far, which = nearest(high, Patches(high, high), 3, 3.0)
+    far, which = find_nearest(high, Patches(high, high), 3, 3.0)
     assert torch.equal(which[:, 0], torch.arange(6))
     assert float(far[:, 0].max()) < 1e-3
-    assert len(distinct(Patches(turned(low), turned(high))).low) == 48
+    assert len(deduplicate(Patches(orient(low), orient(high))).low) == 48
 
 
 def test_average_of_one_patch_is_the_patch() -> None:
     patch = _patches(1)
-    mean = averaged(patch.flatten(1).float(), torch.tensor([[7, 9]]), (20, 20))
+    mean = average_patches(patch.flatten(1).float(), torch.tensor([[7, 9]]), (20, 20))
     assert torch.equal(mean[2:13, 4:15].bool(), patch[0])
     assert int(mean.count_nonzero()) == int(patch.sum())
 
@@ -101,17 +110,17 @@ def test_average_of_one_patch_is_the_patch() -> None:
 def test_thinning_reduces_a_bar_to_a_line_and_keeps_a_line() -> None:
     bar = torch.zeros(20, 30, dtype=torch.bool)
     bar[8:11, 5:25] = True
-    line = thinned(bar)
+    line = thin(bar)
     assert int(line.sum(dim=0).max()) == 1
     assert int(line.any(dim=0).sum()) >= 16
-    assert torch.equal(thinned(line), line)
+    assert torch.equal(thin(line), line)
 
 
 def test_edges_lie_at_steps_and_not_on_steep_planes() -> None:
     v, u = torch.meshgrid(torch.arange(16.0).double(), torch.arange(20.0).double(), indexing="ij")
-    assert not bool(edges(3 * u - 2 * v, 2, 0.1).any())
-    assert edge_map(3 * u - 2 * v, 2, 0.1)[1] is None
-    found = edges(torch.where(u < 10, 0.0, 1.0).double(), 2, 0.1)
+    assert not bool(detect_edges(3 * u - 2 * v, 2, 0.1).any())
+    assert predict_edge_map(3 * u - 2 * v, 2, 0.1)[1] is None
+    found = detect_edges(torch.where(u < 10, 0.0, 1.0).double(), 2, 0.1)
     assert bool(found[:, 18:22].any(dim=1).all())
     assert not bool(found[:, :18].any() | found[:, 22:].any())
 
@@ -119,4 +128,4 @@ def test_edges_lie_at_steps_and_not_on_steep_planes() -> None:
 def test_map_with_edges_too_small_for_patches_has_no_solution() -> None:
     step = torch.where(torch.arange(8) < 4, 0.0, 1.0).double().expand(8, 8)
     with pytest.raises(NoSolutionError, match="the edges of a map of 8 x 8 pixels do not recur at 1/2 of its size"):
-        edge_map(step, 2, 0.1)
+        predict_edge_map(step, 2, 0.1)

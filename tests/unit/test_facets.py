@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from dsr.methods.networks.facets import Facets, stencil
-from dsr.methods.networks.inpainting import filled
+from dsr.methods.networks.inpainting import inpaint
 
 SCALES = (2, 4, 8, 16)
 
@@ -96,12 +96,12 @@ def test_holes_are_filled_from_the_outside_in_with_means_of_valid_neighbours() -
     x = torch.arange(49.0, dtype=torch.float64).view(1, 1, 7, 7)
     pierced = x.clone()
     pierced[..., 2:5, 2:5] = torch.nan
-    result = filled(pierced)
+    result = inpaint(pierced)
     assert float(result[0, 0, 2, 2]) == pytest.approx((8 + 9 + 10 + 15 + 22) / 5)
     assert float(result[0, 0, 3, 3]) == pytest.approx(24)  # the mean of the ring, which is symmetric about it
     torch.testing.assert_close(result[..., 5:, :], x[..., 5:, :], rtol=0, atol=0)
-    assert filled(x) is x
-    assert bool(filled(torch.full_like(x, torch.nan)).isnan().all())
+    assert inpaint(x) is x
+    assert bool(inpaint(torch.full_like(x, torch.nan)).isnan().all())
 
 
 def test_bend_is_zero_on_planes_and_the_step_beside_an_edge() -> None:

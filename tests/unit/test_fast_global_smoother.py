@@ -9,7 +9,7 @@ from torch import Tensor
 
 from dsr.degradation.downsampling import Downsampling, Kernel, make_sample
 from dsr.geometry.camera import Camera, from_range, to_range
-from dsr.methods.classical.fast_global_smoother import FastGlobalSmoother, smoothed, solved_lines
+from dsr.methods.classical.fast_global_smoother import FastGlobalSmoother, smooth, solve_lines
 from dsr.methods.classical.interpolation import Interpolation
 from dsr.sample import DepthSample, Scene
 
@@ -37,23 +37,23 @@ def _by_dense_systems(guide: Tensor, values: Tensor, strength: float, sigma: flo
     return u
 
 
-def _sample(disparity: Tensor, photo: Tensor, kernel: Kernel = "box") -> DepthSample:
+def _sample(disparity: Tensor, rgb: Tensor, kernel: Kernel = "box") -> DepthSample:
     height, width = disparity.shape
     camera = Camera(width, height, 60.0, 60.0, width / 2, height / 2)
-    scene = Scene("set", "hall", photo, camera, from_range(disparity[None], camera, "disparity"))
+    scene = Scene("set", "hall", rgb, camera, from_range(disparity[None], camera, "disparity"))
     return make_sample(scene, 4, Downsampling(kernel), "disparity")
 
 
 def test_smoother_solves_rows_then_columns_three_times_with_the_papers_lambdas() -> None:
     guide, values = _noise(3, 16, 13), _noise(16, 13, seed=1)
-    result = smoothed(guide, values[None], 30.0, 0.3)[0]
+    result = smooth(guide, values[None], 30.0, 0.3)[0]
     np.testing.assert_allclose(result, _by_dense_systems(guide, values, 30.0, 0.3), rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize("length", [1, 2, 9])
 def test_smoother_solves_lines_of_any_length(length: int) -> None:
     weights, right = _noise(length - 1, 4), _noise(length, 2, 4, seed=1)
-    result = solved_lines(weights, right)
+    result = solve_lines(weights, right)
     for m in range(4):
         system = np.eye(length)
         for k in range(length - 1):
@@ -64,27 +64,27 @@ def test_smoother_solves_lines_of_any_length(length: int) -> None:
 def test_smoother_keeps_the_mean_and_does_not_overshoot() -> None:
     """Each pass is a mean with symmetric weights."""
     values = _noise(1, 20, 24, seed=1)
-    result = smoothed(_noise(3, 20, 24), values, 1e4, 0.5)
+    result = smooth(_noise(3, 20, 24), values, 1e4, 0.5)
     assert float(result.mean()) == pytest.approx(float(values.mean()), rel=1e-12)
     assert float(values.min()) <= float(result.min()) < float(result.max()) <= float(values.max())
 
 
 def test_smoother_does_not_cross_a_photo_edge() -> None:
     columns = torch.arange(32).expand(24, 32)
-    photo = torch.where(columns < 16, 0.0, 1.0).double().expand(3, 24, 32)
+    rgb = torch.where(columns < 16, 0.0, 1.0).double().expand(3, 24, 32)
     step = torch.where(columns < 16, 1.0, 2.0).double()
     noisy = step + 0.1 * (_noise(24, 32) - 0.5)
-    result = smoothed(photo, noisy[None], 100.0, 0.03)[0]
-    torch.testing.assert_close(smoothed(photo, step[None], 100.0, 0.03)[0], step, rtol=0, atol=1e-9)
+    result = smooth(rgb, noisy[None], 100.0, 0.03)[0]
+    torch.testing.assert_close(smooth(rgb, step[None], 100.0, 0.03)[0], step, rtol=0, atol=1e-9)
     assert float((result - step).abs().max()) < 0.3 * float((noisy - step).abs().max())
 
 
 @pytest.mark.parametrize("slopes", [True, False])
 def test_step_along_a_photo_edge_stays_sharp_within_a_low_resolution_pixel(slopes: bool) -> None:
     columns = torch.arange(64).expand(48, 64)
-    photo = torch.where(columns < 32, 0.2, 0.8).double().expand(3, 48, 64).contiguous()
+    rgb = torch.where(columns < 32, 0.2, 0.8).double().expand(3, 48, 64).contiguous()
     truth = torch.where(columns < 32, 5.0, 9.0).double()
-    sample = _sample(truth, photo)
+    sample = _sample(truth, rgb)
     results = (FastGlobalSmoother(slopes=slopes), Interpolation("bilinear"))
     ours, bilinear = (to_range(method(sample), sample.camera, "disparity")[0] for method in results)
     assert float((ours - truth).abs().max()) < 1e-6
@@ -95,15 +95,15 @@ def test_step_along_a_photo_edge_stays_sharp_within_a_low_resolution_pixel(slope
 def test_result_is_the_smoothed_data_divided_by_the_smoothed_index_map(kernel: Kernel) -> None:
     disparity = 5 + 4 * _noise(16, 16, seed=3)
     disparity[4:8, 8:12] = torch.nan
-    photo = _noise(3, 16, 16)
-    sample = _sample(disparity, photo, kernel)
+    rgb = _noise(3, 16, 16)
+    sample = _sample(disparity, rgb, kernel)
     coarse = to_range(sample.depth_lr, sample.camera_lr, "disparity")[0].numpy() * 4
     data, index = np.zeros((16, 16)), np.zeros((16, 16))
     for i, j in np.argwhere(np.isfinite(coarse)):
         first, last = (1, 3) if kernel == "box" else (2, 3)  # the centre lies between four pixels, or on one
         block = (slice(4 * i + first, 4 * i + last), slice(4 * j + first, 4 * j + last))
         data[block], index[block] = coarse[i, j], 1
-    total, weight = (_by_dense_systems(photo, torch.from_numpy(each), 0.7 * 16, 0.3) for each in (data, index))
+    total, weight = (_by_dense_systems(rgb, torch.from_numpy(each), 0.7 * 16, 0.3) for each in (data, index))
     fine = FastGlobalSmoother(0.7, 0.3, fill_holes=True, slopes=False)(sample)
     np.testing.assert_allclose(to_range(fine, sample.camera, "disparity")[0], total / weight, rtol=1e-9)
 

@@ -71,9 +71,9 @@ def test_several_maps_are_filtered_like_single_ones() -> None:
 def test_blurred_step_along_a_photo_edge_becomes_sharp() -> None:
     """Half of it, as the windows that straddle the edge disagree."""
     columns = torch.arange(64).double().expand(64, 64)
-    photo = torch.where(columns < 32, 0.2, 0.8).expand(3, 64, 64).contiguous()
+    rgb = torch.where(columns < 32, 0.2, 0.8).expand(3, 64, 64).contiguous()
     blurred = ((columns - 27.5) / 8).clamp(0, 1)
-    sharp = guided_filter(photo, blurred[None], 8, 1e-4)[0]
+    sharp = guided_filter(rgb, blurred[None], 8, 1e-4)[0]
     before, after = ((each[:, 32] - each[:, 31]) for each in (blurred, sharp))
     torch.testing.assert_close(before, torch.full_like(before, 1 / 8))
     assert float(after.min()) > 0.5

@@ -16,10 +16,10 @@ from dsr.methods.classical.joint_bilateral import JointBilateral
 from dsr.sample import DepthSample, Scene
 
 
-def _sample(disparity: Tensor, photo: Tensor, scale: int = 4) -> DepthSample:
+def _sample(disparity: Tensor, rgb: Tensor, scale: int = 4) -> DepthSample:
     height, width = disparity.shape
     camera = Camera(width, height, 60.0, 60.0, width / 2, height / 2)
-    scene = Scene("set", "hall", photo, camera, from_range(disparity[None], camera, "disparity"))
+    scene = Scene("set", "hall", rgb, camera, from_range(disparity[None], camera, "disparity"))
     return make_sample(scene, scale, Downsampling("box"), "disparity")
 
 
@@ -30,9 +30,9 @@ def _disparity(sample: DepthSample, depth: Tensor) -> np.ndarray:
 def _by_loops(sample: DepthSample, radius: int, sigma_space: float, sigma_colour: float) -> np.ndarray:
     """Sum over the neighbours of each HR pixel, LR pixel (i, j) lying at its block's centre."""
     coarse = to_range(sample.depth_lr, sample.camera_lr, "disparity")[0].numpy() * 4
-    photo = sample.rgb.numpy()
-    height, width = photo.shape[1:]
-    means = photo.reshape(3, height // 4, 4, width // 4, 4).mean(axis=(2, 4))
+    rgb = sample.rgb.numpy()
+    height, width = rgb.shape[1:]
+    means = rgb.reshape(3, height // 4, 4, width // 4, 4).mean(axis=(2, 4))
     result = np.full((height, width), np.nan)
     for v in range(height):
         for u in range(width):
@@ -42,7 +42,7 @@ def _by_loops(sample: DepthSample, radius: int, sigma_space: float, sigma_colour
                     if math.isnan(coarse[i, j]):
                         continue
                     distance = math.hypot((v - 1.5) / 4 - i, (u - 1.5) / 4 - j)
-                    unlike = np.linalg.norm(photo[:, v, u] - means[:, i, j])
+                    unlike = np.linalg.norm(rgb[:, v, u] - means[:, i, j])
                     weight = math.exp(-0.5 * (distance / sigma_space) ** 2 - 0.5 * (unlike / sigma_colour) ** 2)
                     total, weights = total + weight * coarse[i, j], weights + weight
             result[v, u] = total / weights if weights else np.nan
@@ -81,9 +81,9 @@ def test_joint_bilateral_under_a_constant_photo_is_a_gaussian_mean() -> None:
 @pytest.mark.parametrize("slopes", [True, False])
 def test_step_along_a_photo_edge_stays_sharp_within_a_low_resolution_pixel(slopes: bool) -> None:
     columns = torch.arange(64).expand(48, 64)
-    photo = torch.where(columns < 32, 0.2, 0.8).double().expand(3, 48, 64).contiguous()
+    rgb = torch.where(columns < 32, 0.2, 0.8).double().expand(3, 48, 64).contiguous()
     truth = torch.where(columns < 32, 5.0, 9.0).double()
-    sample = _sample(truth, photo)
+    sample = _sample(truth, rgb)
     ours = np.abs(_disparity(sample, JointBilateral(slopes=slopes)(sample)) - truth.numpy())
     bilinear = np.abs(_disparity(sample, Interpolation("bilinear")(sample)) - truth.numpy())
     assert ours.max() < 1e-6
@@ -91,11 +91,11 @@ def test_step_along_a_photo_edge_stays_sharp_within_a_low_resolution_pixel(slope
 
 
 def test_colour_unlike_its_surroundings_takes_the_most_similar_neighbour() -> None:
-    photo = torch.zeros(3, 16, 16).double()
-    photo[:, :, 8:] = 0.3
-    photo[:, 8, 5] = 1.0
+    rgb = torch.zeros(3, 16, 16).double()
+    rgb[:, :, 8:] = 0.3
+    rgb[:, 8, 5] = 1.0
     disparity = torch.where(torch.arange(16) < 8, 5.0, 9.0).double().expand(16, 16)
-    sample = _sample(disparity, photo)
+    sample = _sample(disparity, rgb)
     fine = _disparity(sample, JointBilateral(sigma_colour=1e-3, slopes=False)(sample))
     assert np.isfinite(fine).all()
     assert fine[8, 5] == pytest.approx(9.0)

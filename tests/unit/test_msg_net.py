@@ -14,7 +14,7 @@ from torch import Tensor
 from dsr.degradation.downsampling import SCALES
 from dsr.geometry.camera import Camera, from_range, to_range
 from dsr.methods.networks.base import NetworkUpsampler
-from dsr.methods.networks.maps import mean3x3, normalised, upsample_bicubic
+from dsr.methods.networks.maps import mean3x3, normalise, upsample_bicubic
 from dsr.methods.networks.msg_guidance import VARIANTS, VariantName, guidance_map
 from dsr.methods.networks.msg_net import MSGNet, output_drift, upsample_disparity
 from dsr.sample import DepthSample
@@ -93,7 +93,7 @@ def test_bicubic_upsampling_equals_pillow_on_a_float_image(scale: int) -> None:
 
 def test_normalisation_is_per_sample_over_finite_values_and_holes_become_0() -> None:
     x = torch.tensor([[2.0, torch.nan, 6.0], [3.0, torch.inf, 4.0]])[:, None, None]
-    values, minimum, span = normalised(x)
+    values, minimum, span = normalise(x)
     assert values[:, 0, 0].tolist() == [[0, 0, 1], [0, 0, 1]]
     assert (minimum.flatten().tolist(), span.flatten().tolist()) == ([2, 3], [4, 1])
 
@@ -144,8 +144,8 @@ def test_gradients_of_pre_and_postprocessing_equal_finite_differences() -> None:
     known = disparity.isfinite()
 
     def around_an_absent_network(rgb: Tensor, values: Tensor) -> Tensor:
-        filled = torch.full_like(disparity, torch.nan).masked_scatter(known, values)
-        low, minimum, span = normalised(filled)
+        inpaint = torch.full_like(disparity, torch.nan).masked_scatter(known, values)
+        low, minimum, span = normalise(inpaint)
         outside = upsample_bicubic(mean3x3(low), 2) * guidance_map(rgb, VARIANTS["voynov"])
         return outside * span + minimum
 
@@ -167,7 +167,7 @@ def test_training_reaches_every_parameter_around_holes_too() -> None:
 )
 def test_drift_of_the_crop_equals_that_of_the_whole_image(scale: int, height: int, width: int) -> None:
     net, (rgb, disparity) = _net(scale), _scene(scale, height, width, batch=2)
-    guidance, values = guidance_map(rgb, net.variant), normalised(disparity).values
+    guidance, values = guidance_map(rgb, net.variant), normalise(disparity).values
     with torch.inference_mode():
         fast, slow = (output_drift(net, guidance, values, crop=crop) for crop in (True, False))
     assert slow.shape == (2, 1, 1, 1)
@@ -176,7 +176,7 @@ def test_drift_of_the_crop_equals_that_of_the_whole_image(scale: int, height: in
 
 def test_drift_is_the_mean_of_the_output_for_a_probe_of_one_half() -> None:
     net, (rgb, disparity) = _net(4), _scene(4, 32, 48)
-    guidance, probe = guidance_map(rgb, net.variant), normalised(disparity).values
+    guidance, probe = guidance_map(rgb, net.variant), normalise(disparity).values
     with torch.inference_mode():
         drift = output_drift(net, guidance, probe)
         probe[..., :8, :12] = 0.5
@@ -187,7 +187,7 @@ def test_drift_is_the_mean_of_the_output_for_a_probe_of_one_half() -> None:
 
 def test_drift_is_0_where_its_region_is_empty() -> None:
     net, (rgb, disparity) = _net(4), _scene(4, 3, 40)
-    assert output_drift(net, guidance_map(rgb, net.variant), normalised(disparity).values).tolist() == [[[[0.0]]]]
+    assert output_drift(net, guidance_map(rgb, net.variant), normalise(disparity).values).tolist() == [[[[0.0]]]]
 
 
 @pytest.mark.parametrize("scale", SCALES)

@@ -18,7 +18,7 @@ from dsr.methods.networks.primal_dual import (
     pair_differences,
     pair_sums,
     safe_step,
-    unrolled,
+    unroll,
 )
 
 
@@ -127,7 +127,7 @@ def test_many_steps_reach_the_minimum_that_another_optimiser_finds() -> None:
     first, weights = _problem(8, window)
     steps = [safe_step(data, huber, window)] * 200
     slopes = pair_differences(first, half_window(window))
-    found = unrolled(slopes, weights, steps, data, huber, window)
+    found = unroll(slopes, weights, steps, data, huber, window)
     other = torch.zeros_like(found).requires_grad_()
     optimiser = torch.optim.LBFGS(
         [other], max_iter=500, tolerance_grad=1e-12, tolerance_change=0, line_search_fn="strong_wolfe"
@@ -154,7 +154,7 @@ def test_gradients_of_maps_weights_and_parameters_agree_with_finite_differences(
 
     def answer(slopes: Tensor, weights: Tensor, data: Tensor, huber: Tensor, *step: Tensor) -> Tensor:
         s, t, theta = step
-        return unrolled(slopes, weights, [Step(s, t, theta), Step(1.2 * s, t, theta)], data, huber, window)
+        return unroll(slopes, weights, [Step(s, t, theta), Step(1.2 * s, t, theta)], data, huber, window)
 
     inputs = [each.requires_grad_() for each in (pair_differences(first, half_window(window)), weights, *numbers)]
     assert torch.autograd.gradcheck(answer, inputs)

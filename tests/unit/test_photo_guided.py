@@ -14,7 +14,7 @@ from dsr.geometry.camera import Camera, from_range, to_range
 from dsr.methods.classical.fast_global_smoother import FastGlobalSmoother
 from dsr.methods.classical.guided_filter import GuidedFilter
 from dsr.methods.classical.joint_bilateral import JointBilateral
-from dsr.methods.classical.photo_guided import GuidedMethod, slopes_along
+from dsr.methods.classical.photo_guided import GuidedMethod, estimate_slopes
 from dsr.sample import DepthSample, Scene
 
 METHODS = (GuidedFilter, JointBilateral, FastGlobalSmoother)
@@ -26,12 +26,12 @@ def _photo(height: int, width: int) -> Tensor:
     return torch.from_numpy(np.random.default_rng(1).uniform(size=(3, height, width)))
 
 
-def _sample(disparity: Tensor, kernel: Kernel = "box", scale: int = 4, photo: Tensor | None = None) -> DepthSample:
+def _sample(disparity: Tensor, kernel: Kernel = "box", scale: int = 4, rgb: Tensor | None = None) -> DepthSample:
     """Return the problem of a scene with these disparities, (H, W)."""
     height, width = disparity.shape
     camera = Camera(width, height, 60.0, 55.0, 21.3, 17.9)
     depth = from_range(disparity[None], camera, "disparity")
-    scene = Scene("set", "hall", _photo(height, width) if photo is None else photo, camera, depth)
+    scene = Scene("set", "hall", _photo(height, width) if rgb is None else rgb, camera, depth)
     return make_sample(scene, scale, Downsampling(kernel), "disparity")
 
 
@@ -121,10 +121,10 @@ def test_result_is_complete_at_any_size(method: Build) -> None:
 def test_half_turn_of_the_input_turns_the_result(method: Build) -> None:
     """Rows and columns are solved in order, but their own direction is none."""
     camera = Camera(48, 32, 60.0, 60.0, 23.5, 15.5)
-    photo, depth = _photo(32, 48), 1 + _random()[None] / 9
+    rgb, depth = _photo(32, 48), 1 + _random()[None] / 9
     sample, turned = (
         make_sample(Scene("", "", p, camera, d), 4, Downsampling("box"), "disparity")
-        for p, d in ((photo, depth), (photo.rot90(2, (1, 2)), depth.rot90(2, (1, 2))))
+        for p, d in ((rgb, depth), (rgb.rot90(2, (1, 2)), depth.rot90(2, (1, 2))))
     )
     torch.testing.assert_close(method()(turned).rot90(2, (1, 2)), method()(sample), rtol=1e-9, atol=0)
 
@@ -147,7 +147,7 @@ def test_result_is_deterministic_and_independent_of_the_truth(method: Build) -> 
 
 @every_method
 def test_result_has_the_precision_of_the_low_resolution_depth(method: Build) -> None:
-    single = _sample(_random().float(), photo=_photo(32, 48).float())
+    single = _sample(_random().float(), rgb=_photo(32, 48).float())
     assert method()(single).dtype == torch.float32
     torch.testing.assert_close(method()(single), method()(_sample(_random())).float(), rtol=1e-3, atol=0)
 
@@ -160,10 +160,10 @@ def test_guided_methods_work_on_disparity(method: Build) -> None:
 def test_slope_is_the_smaller_difference_without_the_pixel_that_mixes_a_step() -> None:
     values = torch.tensor([[0.0, 1.0, 2.0, 6.0, 10.0, 11.0, 12.0, 11.0, 10.0]]).double()
     expected = torch.tensor([[1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 0.0, -1.0, -1.0]]).double()
-    torch.testing.assert_close(slopes_along(values, 1), expected)
-    torch.testing.assert_close(slopes_along(values.T, 0), expected.T)
+    torch.testing.assert_close(estimate_slopes(values, 1), expected)
+    torch.testing.assert_close(estimate_slopes(values.T, 0), expected.T)
 
 
 def test_slope_beside_a_hole_is_the_remaining_difference() -> None:
     values = torch.tensor([0.0, 2.0, 4.0, torch.nan, 9.0, 12.0, 15.0]).double()
-    torch.testing.assert_close(slopes_along(values, 0), torch.tensor([2.0, 2.0, 2.0, 2.0, 3.0, 3.0, 3.0]).double())
+    torch.testing.assert_close(estimate_slopes(values, 0), torch.tensor([2.0, 2.0, 2.0, 2.0, 3.0, 3.0, 3.0]).double())

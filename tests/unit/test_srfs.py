@@ -18,7 +18,7 @@ from dsr.geometry.surface import depth_to_normals
 from dsr.methods.base import Iterative
 from dsr.methods.classical.interpolation import Interpolation
 from dsr.methods.classical.srfs.admm import ShadingProblem, ShadingSolver, Slopes
-from dsr.methods.classical.srfs.shading import shading_of, surface_of
+from dsr.methods.classical.srfs.shading import compute_shading, compute_surface
 from dsr.methods.classical.srfs.upsampler import ShapeFromShading
 from dsr.sample import DepthSample, Scene
 
@@ -48,7 +48,7 @@ def _lit(depth: Tensor) -> Tensor:
     """Return the photo of a surface of one colour under LIGHT, (3, H, W)."""
     normals = depth_to_normals(depth[None, None], _camera(*depth.shape).rays()[None])
     colour = torch.tensor([0.8, 0.7, 0.6]).double()[:, None, None]
-    return (colour * shading_of(normals, torch.tensor(LIGHT).double()[None])[0]).clamp(0, 1)
+    return (colour * compute_shading(normals, torch.tensor(LIGHT).double()[None])[0]).clamp(0, 1)
 
 
 def _sphere(size: int) -> Tensor:
@@ -85,7 +85,7 @@ def _solver(*, holes: bool = False, mask: bool = False) -> ShadingSolver:
     sample = _sample(depth, rgb)
     if holes:
         sample.depth_lr[:, 1:3, 2] = torch.nan
-    solver, _ = ShapeFromShading().prepared(sample)
+    solver, _ = ShapeFromShading().prepare(sample)
     if mask:
         v, u = _grid(16, 16)
         inside = ((u - 7) ** 2 + (v - 8) ** 2 < 40)[None, None]
@@ -132,8 +132,8 @@ def _adjoint(slopes: Slopes) -> np.ndarray:
 
 def test_slopes_give_the_normals_of_geometry_to_first_order() -> None:
     truth = _sphere(64)
-    solver, metres = ShapeFromShading().prepared(_sample(truth))
-    found = surface_of(solver.slopes(truth[None, None] / metres), solver.problem.rays).normals
+    solver, metres = ShapeFromShading().prepare(_sample(truth))
+    found = compute_surface(solver.slopes(truth[None, None] / metres), solver.problem.rays).normals
     expected = depth_to_normals(truth[None, None], solver.problem.rays)
     assert float((found - expected).abs().mean()) < 5e-3
 
@@ -250,7 +250,7 @@ def test_result_is_deterministic_and_independent_of_the_truth() -> None:
 
 
 def test_batch_equals_its_problems_one_at_a_time() -> None:
-    solvers = [ShapeFromShading().prepared(_sample(*_random(16, 16, seed)))[0] for seed in (0, 1)]
+    solvers = [ShapeFromShading().prepare(_sample(*_random(16, 16, seed)))[0] for seed in (0, 1)]
     one, other = (solver.problem for solver in solvers)
     both = ShadingProblem(
         torch.cat((one.photo, other.photo)),
@@ -295,7 +295,7 @@ def test_background_keeps_the_initial_map(tmp_path: Path) -> None:
     inside = (u - 15) ** 2 + (v - 17) ** 2 < 90
     cv2.imwrite(str(tmp_path / "bumps.png"), 255 * inside.numpy().astype(np.uint8))
     method = ShapeFromShading(iterations=5, foreground=str(tmp_path))
-    solver, metres = method.prepared(sample)
+    solver, metres = method.prepare(sample)
     first = solver.z[0, 0] * metres
     fine = method(sample)[0]
     torch.testing.assert_close(fine[~inside], first[~inside])

@@ -9,11 +9,11 @@ import pytest
 import torch
 from torch import Tensor
 
-from dsr.methods.classical.srfs.potts import BRIGHTEST, Regions, boundary_length, fitted, fused
+from dsr.methods.classical.srfs.potts import BRIGHTEST, Regions, boundary_length, fit_albedo, fuse
 
 
 def _energy(photo: Tensor, shading: Tensor, regions: Regions, weight: float) -> float:
-    missed = fitted(photo, shading, regions) * shading - photo
+    missed = fit_albedo(photo, shading, regions) * shading - photo
     return 0.5 * float(missed.square().sum()) + weight * boundary_length(regions)
 
 
@@ -32,14 +32,14 @@ def _two(size: int = 24, noise: float = 0.03) -> tuple[Tensor, Tensor, Tensor]:
 
 def test_two_regions_under_noise_are_found_exactly() -> None:
     photo, shading, disc = _two()
-    regions = fused(photo, shading, 0.05)
+    regions = fuse(photo, shading, 0.05)
     assert regions.number == 2
     assert torch.equal(regions.labels[0] == regions.labels[0, 13, 11], disc)
 
 
 def test_albedo_of_a_region_is_the_least_squares_one() -> None:
     photo, shading, disc = _two()
-    albedo = fitted(photo, shading, fused(photo, shading, 0.05))
+    albedo = fit_albedo(photo, shading, fuse(photo, shading, 0.05))
     for channel in range(3):
         for where in (disc, ~disc):
             expected = np.linalg.lstsq(
@@ -53,7 +53,7 @@ def test_albedo_of_a_region_is_the_least_squares_one() -> None:
 def test_partitions_that_fuse_two_regions_have_no_less_energy(seed: int, weight: float) -> None:
     rng = np.random.default_rng(seed)
     photo, shading = (torch.from_numpy(rng.uniform(0.2, 1, (1, 2, 4, 5))) for _ in range(2))
-    regions = fused(photo, shading, weight)
+    regions = fuse(photo, shading, weight)
     least = _energy(photo, shading, regions, weight)
     for one, other in itertools.combinations(range(regions.number), 2):
         labels = torch.where(regions.labels == other, one, regions.labels)
@@ -68,32 +68,32 @@ def test_row_of_pixels_is_cut_as_by_an_exhaustive_search() -> None:
         (torch.tensor([0, *np.cumsum(cuts)]) for cuts in itertools.product((0, 1), repeat=7)),
         key=lambda labels: _energy(photo, shading, Regions(labels.reshape(1, 1, 8), 8), 0.02),
     )
-    assert torch.equal(fused(photo, shading, 0.02).labels.reshape(-1), best)
+    assert torch.equal(fuse(photo, shading, 0.02).labels.reshape(-1), best)
 
 
 @pytest.mark.parametrize("shape", [(1, 1, 1, 1), (1, 1, 1, 6), (2, 3, 5, 1), (1, 2, 7, 5)])
 def test_small_weight_keeps_each_pixel_and_a_large_one_fuses_the_picture(shape: tuple[int, ...]) -> None:
     photo = torch.from_numpy(np.random.default_rng(1).uniform(0.2, 1, shape))
     shading = torch.ones_like(photo)
-    alone = fused(photo, shading, 1e-12)
-    torch.testing.assert_close(fitted(photo, shading, alone), photo)
-    together = fused(photo, shading, 1e6)
+    alone = fuse(photo, shading, 1e-12)
+    torch.testing.assert_close(fit_albedo(photo, shading, alone), photo)
+    together = fuse(photo, shading, 1e6)
     assert together.number == shape[0]
     assert boundary_length(together) == 0
     mean = photo.mean(dim=(-2, -1), keepdim=True).expand(shape)
-    torch.testing.assert_close(fitted(photo, shading, together), mean)
+    torch.testing.assert_close(fit_albedo(photo, shading, together), mean)
 
 
 def test_batch_equals_its_pictures_one_at_a_time_and_is_deterministic() -> None:
     photo, shading, _ = _two()
     both = torch.cat((photo, photo.flip(-1))), torch.cat((shading, shading.flip(-1)))
-    together = fitted(*both, fused(*both, 0.01))
-    again = fitted(*both, fused(*both, 0.01))
+    together = fit_albedo(*both, fuse(*both, 0.01))
+    again = fit_albedo(*both, fuse(*both, 0.01))
     assert torch.equal(together, again)
     for number in range(2):
         one = both[0][number : number + 1], both[1][number : number + 1]
-        assert _energy(*one, fused(*one, 0.05), 0.05) == pytest.approx(
-            _energy(photo, shading, fused(photo, shading, 0.05), 0.05)
+        assert _energy(*one, fuse(*one, 0.05), 0.05) == pytest.approx(
+            _energy(photo, shading, fuse(photo, shading, 0.05), 0.05)
         )
 
 
@@ -101,7 +101,7 @@ def test_pixels_outside_stay_alone_and_separate_the_inside() -> None:
     photo = torch.full((1, 1, 3, 5), 0.5).double()
     inside = torch.ones(1, 1, 3, 5, dtype=torch.bool)
     inside[..., 2] = False
-    regions = fused(photo, torch.ones_like(photo), 0.1, inside)
+    regions = fuse(photo, torch.ones_like(photo), 0.1, inside)
     assert regions.number == 2 + 3
     assert boundary_length(regions, inside) == 0
 
@@ -109,5 +109,5 @@ def test_pixels_outside_stay_alone_and_separate_the_inside() -> None:
 def test_albedos_stay_bounded_where_there_is_little_light() -> None:
     photo = torch.full((1, 1, 2, 2), 0.5).double()
     shading = torch.tensor([[1e-6, -1.0], [0.0, 1.0]]).double().reshape(1, 1, 2, 2)
-    albedo = fitted(photo, shading, Regions(torch.arange(4).reshape(1, 2, 2), 4))
+    albedo = fit_albedo(photo, shading, Regions(torch.arange(4).reshape(1, 2, 2), 4))
     assert albedo.flatten().tolist() == [BRIGHTEST, 0.0, 0.0, 0.5]

@@ -8,8 +8,15 @@ import torch
 from torch import Tensor
 
 from dsr.geometry.camera import Camera
-from dsr.geometry.surface import depth_to_normals, points_of
-from dsr.methods.classical.srfs.shading import area_of, best_lighting, by_theta, photometry, shading_of, surface_of
+from dsr.geometry.surface import back_project, depth_to_normals
+from dsr.methods.classical.srfs.shading import (
+    chain_to_theta,
+    compute_area,
+    compute_shading,
+    compute_surface,
+    fit_lighting,
+    linearise_photometry,
+)
 
 LIGHT = torch.tensor([[[0.3, -0.4, -0.6, 0.2], [0.2, -0.5, -0.5, 0.1], [0.4, -0.2, -0.4, 0.3]]]).double()
 
@@ -47,7 +54,7 @@ def test_rendering_converges_to_that_of_the_geometrys_normals() -> None:
         rays = camera.rays()[None]
         normals = depth_to_normals(depth, rays)
         expected = torch.einsum("bck,bkhw->bchw", LIGHT, torch.cat((normals, torch.ones_like(normals[:, :1])), dim=1))
-        errors.append(float((shading_of(surface_of(theta, rays).normals, LIGHT) - expected).abs().max()))
+        errors.append(float((compute_shading(compute_surface(theta, rays).normals, LIGHT) - expected).abs().max()))
     assert errors[0] < 0.01
     assert errors[1] == pytest.approx(errors[0] / 2, rel=0.1)  # of differences taken to one side
 
@@ -56,17 +63,17 @@ def test_map_without_slopes_has_the_geometrys_normals_exactly() -> None:
     camera = _camera(8)
     rays, depth = camera.rays()[None], torch.full((1, 1, 8, 8), 3.0).double()
     theta = torch.cat((torch.zeros(1, 2, 8, 8).double(), depth), dim=1)
-    torch.testing.assert_close(surface_of(theta, rays).normals, depth_to_normals(depth, rays))
+    torch.testing.assert_close(compute_surface(theta, rays).normals, depth_to_normals(depth, rays))
 
 
 def test_area_is_that_of_the_back_projected_pixels() -> None:
     camera = _camera(256)
     theta, depth = _theta(camera)
     rays = camera.rays()[None]
-    points = points_of(depth, rays)[0]
+    points = back_project(depth, rays)[0]
     along_u, along_v = points.diff(dim=2)[:, :-1], points.diff(dim=1)[:, :, :-1]
     expected = torch.linalg.cross(along_u, along_v, dim=0).norm(dim=0)
-    ours = area_of(theta, surface_of(theta, rays))[0, 0, :-1, :-1] / (camera.fx * camera.fy)
+    ours = compute_area(theta, compute_surface(theta, rays))[0, 0, :-1, :-1] / (camera.fx * camera.fy)
     torch.testing.assert_close(ours, expected, rtol=0.02, atol=0)
     assert float(ours.sum()) == pytest.approx(float(expected.sum()), rel=2e-3)
 
@@ -76,11 +83,11 @@ def test_photometry_has_its_stated_derivatives() -> None:
     albedo, photo = _random(1, 3, 3, 4, seed=1).abs(), _random(1, 3, 3, 4, seed=2)
 
     def residual(theta: Tensor) -> Tensor:
-        return albedo * shading_of(surface_of(theta, rays).normals, LIGHT) - photo
+        return albedo * compute_shading(compute_surface(theta, rays).normals, LIGHT) - photo
 
     theta.requires_grad_()
     assert torch.autograd.gradcheck(residual, (theta,))
-    seen = photometry(photo, albedo, LIGHT, surface_of(theta, rays), rays)
+    seen = linearise_photometry(photo, albedo, LIGHT, compute_surface(theta, rays), rays)
     torch.testing.assert_close(seen.residual, residual(theta))
     for channel in range(3):
         (slope,) = torch.autograd.grad(residual(theta)[:, channel].sum(), theta)
@@ -90,25 +97,25 @@ def test_photometry_has_its_stated_derivatives() -> None:
 def test_derivative_of_the_normal_length_is_the_normal() -> None:
     theta, rays = _mixed_theta()
     theta.requires_grad_()
-    surface = surface_of(theta, rays)
+    surface = compute_surface(theta, rays)
     (slope,) = torch.autograd.grad(surface.length.sum(), theta)
-    torch.testing.assert_close(by_theta(surface.normals, rays), slope)
+    torch.testing.assert_close(chain_to_theta(surface.normals, rays), slope)
 
 
 def test_light_is_recovered_exactly_from_a_photo_without_noise() -> None:
     theta, rays = _mixed_theta()
-    normals = surface_of(theta, rays).normals
+    normals = compute_surface(theta, rays).normals
     albedo = _random(1, 3, 3, 4, seed=1).abs()
-    photo = albedo * shading_of(normals, LIGHT)
+    photo = albedo * compute_shading(normals, LIGHT)
     inside = torch.ones(1, 1, 3, 4).double()
-    torch.testing.assert_close(best_lighting(photo, albedo, normals, inside), LIGHT)
+    torch.testing.assert_close(fit_lighting(photo, albedo, normals, inside), LIGHT)
     photo[..., 1:3, 2] = 0.7
     inside[..., 1:3, 2] = 0
-    torch.testing.assert_close(best_lighting(photo, albedo, normals, inside), LIGHT)
+    torch.testing.assert_close(fit_lighting(photo, albedo, normals, inside), LIGHT)
 
 
 def test_light_on_a_flat_wall_is_the_smallest_that_explains_it() -> None:
     normals = torch.tensor([0.0, 0.0, -1.0]).double()[:, None, None].expand(1, 3, 4, 5)
     albedo = torch.ones(1, 1, 4, 5).double()
-    light = best_lighting(0.6 * albedo, albedo, normals, torch.ones_like(albedo))
+    light = fit_lighting(0.6 * albedo, albedo, normals, torch.ones_like(albedo))
     torch.testing.assert_close(light, torch.tensor([[[0.0, 0.0, -0.3, 0.3]]]).double())

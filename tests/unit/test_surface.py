@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from dsr.geometry.camera import Camera
-from dsr.geometry.surface import depth_to_normals, length, normal_mask, points_of
+from dsr.geometry.surface import back_project, depth_to_normals, length, normal_mask
 from dsr.metrics.functional import SurfacePair, mse_v
 
 CAMERA = Camera(width=11, height=7, fx=9.0, fy=12.0, cx=4.3, cy=3.9)
@@ -44,13 +44,13 @@ def _sphere_error(camera: Camera) -> float:
     rays = camera.rays()
     a, b, c = (rays * rays).sum(0), (rays * centre).sum(0), (centre * centre).sum() - radius**2
     depth = ((b - (b * b - a * c).sqrt()) / a)[None]
-    truth = (points_of(depth[None], rays[None])[0] - centre) / radius
+    truth = (back_project(depth[None], rays[None])[0] - centre) / radius
     return float((depth_to_normals(depth[None], rays[None])[0] - truth).abs().max())
 
 
 def test_points_lie_on_their_rays_at_their_depth() -> None:
     depth = _random(CAMERA)
-    points = points_of(depth, CAMERA.rays()[None])
+    points = back_project(depth, CAMERA.rays()[None])
     v, u = 5, 8
     z = depth[0, 0, v, u].item()
     assert points[0, :, v, u].tolist() == pytest.approx([(u - 4.3) / 9.0 * z, (v - 3.9) / 12.0 * z, z], rel=1e-14)

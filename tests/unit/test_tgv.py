@@ -11,7 +11,13 @@ from small_scenes import disparity_of, plane, random_scene, sample_of, step
 from torch import Tensor
 
 from dsr.geometry.camera import to_range
-from dsr.methods.classical.finite_differences import divergence, extended, gradient, touching, upsampled
+from dsr.methods.classical.finite_differences import (
+    divergence,
+    extend_linearly,
+    gradient,
+    sum_adjacent,
+    upsample_linear_border,
+)
 from dsr.methods.classical.tgv import Tensors, TotalGeneralisedVariation
 
 
@@ -42,20 +48,20 @@ def test_preconditioner_is_the_absolute_column_sum_of_the_gradients() -> None:
     sizes = _normals(1, 2, 1, 4, 5).abs()
     eye = torch.eye(20).double().reshape(20, 1, 4, 5)
     expected = (gradient(eye).abs() * sizes).sum(dim=(1, 2, 3, 4)).reshape(4, 5)
-    torch.testing.assert_close(touching(sizes)[0, 0], expected)
+    torch.testing.assert_close(sum_adjacent(sizes)[0, 0], expected)
 
 
 @pytest.mark.parametrize("scale", [2, 4, 8])
 def test_upsampling_and_extending_reproduce_a_plane_up_to_the_border(scale: int) -> None:
     flat = plane()
     coarse = torch.from_numpy(_means(flat, scale))[None, None]
-    torch.testing.assert_close(upsampled(coarse, scale)[0, 0], flat)
-    torch.testing.assert_close(extended(flat[None, None, 3:-3, 3:-3], 3)[0, 0], flat)
+    torch.testing.assert_close(upsample_linear_border(coarse, scale)[0, 0], flat)
+    torch.testing.assert_close(extend_linearly(flat[None, None, 3:-3, 3:-3], 3)[0, 0], flat)
 
 
 def test_tensor_shrinks_across_an_edge_and_keeps_the_direction_along_it() -> None:
     _, rgb = step(16, 8)
-    g = TotalGeneralisedVariation(sharpness=9.0, exponent=0.85).tensors(rgb[None].double())
+    g = TotalGeneralisedVariation(sharpness=9.0, exponent=0.85).diffusion_tensors(rgb[None].double())
     assert float(g.uu[0, 0, 5, 7]) == pytest.approx(np.exp(-9.0), abs=1e-6)
     assert torch.equal(g.vv, torch.ones_like(g.vv))
     assert torch.equal(g.uv, torch.zeros_like(g.uv))
@@ -64,7 +70,7 @@ def test_tensor_shrinks_across_an_edge_and_keeps_the_direction_along_it() -> Non
 
 def test_tensor_root_has_the_eigenvalues_of_the_paper() -> None:
     _, rgb = random_scene(6, 7)
-    g = TotalGeneralisedVariation(sharpness=3.0, exponent=0.5).tensors(rgb[None].double())
+    g = TotalGeneralisedVariation(sharpness=3.0, exponent=0.5).diffusion_tensors(rgb[None].double())
     matrices = torch.stack((g.uu, g.uv, g.uv, g.vv), dim=-1).reshape(-1, 2, 2)
     grey = (rgb.double() * torch.tensor([0.299, 0.587, 0.114]).double()[:, None, None]).sum(dim=0)
     slope = torch.zeros(2, 6, 7).double()
@@ -85,14 +91,14 @@ def test_objective_reaches_that_of_another_algorithm(data_weight: float | None, 
         coarse[0, 0, 2:4, 3:5] = torch.nan
     rgb = torch.from_numpy(rng.uniform(0, 1, (1, 3, 16, 16)))
     method = TotalGeneralisedVariation(iterations=3000, tolerance=0.0, data_weight=data_weight, second=2.0)
-    tensors = method.tensors(rgb)
-    found = method.minimised(rgb, coarse, 2)
-    ours = float(method.objective(found.values, found.slopes, coarse, tensors))
-    reference = _reference(coarse[0, 0].numpy(), tensors, method.first, method.second, data_weight)
+    diffusion_tensors = method.diffusion_tensors(rgb)
+    found = method.minimise(rgb, coarse, 2)
+    ours = float(method.objective(found.values, found.slopes, coarse, diffusion_tensors))
+    reference = _reference(coarse[0, 0].numpy(), diffusion_tensors, method.first, method.second, data_weight)
     assert ours == pytest.approx(reference, rel=1e-3)
     early = TotalGeneralisedVariation(iterations=20, tolerance=0.0, data_weight=data_weight, second=2.0)
-    start = early.minimised(rgb, coarse, 2)
-    assert float(method.objective(start.values, start.slopes, coarse, tensors)) > 1.01 * ours
+    start = early.minimise(rgb, coarse, 2)
+    assert float(method.objective(start.values, start.slopes, coarse, diffusion_tensors)) > 1.01 * ours
 
 
 def _reference(coarse: np.ndarray, g: Tensors, first: float, second: float, weight: float | None) -> float:
@@ -106,12 +112,12 @@ def _reference(coarse: np.ndarray, g: Tensors, first: float, second: float, weig
     bent = sparse.bmat([[uu, uv], [uv, vv]]) @ sparse.bmat([[du, -inside_u, None], [dv, None, -inside_v]])
     none = sparse.csr_matrix((size, size))
     k = sparse.vstack((bent, sparse.bmat([[none, d, None] for d in (du, dv)] + [[none, None, d] for d in (du, dv)])))
-    known = np.isfinite(coarse).ravel()
+    valid = np.isfinite(coarse).ravel()
     pair = sparse.csr_matrix(np.ones((1, 2)))
     means = sparse.kron(sparse.kron(sparse.eye(height // 2), pair), sparse.kron(sparse.eye(width // 2), pair))
-    means = sparse.csr_matrix(means)[known] / 4
+    means = sparse.csr_matrix(means)[valid] / 4
     means = sparse.hstack((means, sparse.csr_matrix((means.shape[0], 2 * size))))
-    d, heavy, rho = coarse.ravel()[known], 1e7 if weight is None else weight, 20.0
+    d, heavy, rho = coarse.ravel()[valid], 1e7 if weight is None else weight, 20.0
     solve = splu((rho * k.T @ k + 4 * heavy * means.T @ means).tocsc()).solve
     z = w = np.zeros(k.shape[0])
     x = np.zeros(3 * size)
@@ -196,9 +202,9 @@ def test_result_is_deterministic_and_independent_of_the_truth() -> None:
 def test_batch_equals_its_samples_one_at_a_time() -> None:
     coarse, photos = _normals(2, 1, 4, 6).sigmoid(), _normals(2, 3, 16, 24, seed=1).sigmoid()
     method = TotalGeneralisedVariation(iterations=100, tolerance=0.0)
-    together = method.minimised(photos, coarse, 4).values
+    together = method.minimise(photos, coarse, 4).values
     for number in range(2):
-        alone = method.minimised(photos[number : number + 1], coarse[number : number + 1], 4).values[0]
+        alone = method.minimise(photos[number : number + 1], coarse[number : number + 1], 4).values[0]
         torch.testing.assert_close(together[number], alone)
 
 
@@ -216,7 +222,7 @@ def test_iteration_stops_at_convergence_and_reports_progress() -> None:
     TotalGeneralisedVariation(iterations=5000)(sample, lambda done, most: told.append((done, most)))
     assert told == [(50, 5000), (5000, 5000)]
     coarse, photo = _normals(1, 1, 4, 6).sigmoid(), _normals(1, 3, 16, 24, seed=1).sigmoid()
-    found = TotalGeneralisedVariation(iterations=5000, tolerance=2e-3).minimised(photo, coarse, 4)
+    found = TotalGeneralisedVariation(iterations=5000, tolerance=2e-3).minimise(photo, coarse, 4)
     assert 50 * len(found.moved) == found.iterations < 5000
     assert found.moved[-1] < 2e-3 <= min(found.moved[:-1])
 

@@ -97,14 +97,14 @@ class Downsampling:
         known = values.isfinite()
         if bool(known.all()):
             return self._apply(values, scale)
-        filled, weight = torch.where(known, values, 0), known.to(values.dtype)
-        mean, share = self._apply(filled, scale), self._apply(weight, scale)
+        complete, weight = torch.where(known, values, 0), known.to(values.dtype)
+        mean, fraction = self._apply(complete, scale), self._apply(weight, scale)
         box = Downsampling("box")
-        block_mean, block_share = box._apply(filled, scale), box._apply(weight, scale)
+        block_mean, block_fraction = box._apply(complete, scale), box._apply(weight, scale)
         tiny = torch.finfo(values.dtype).tiny
-        smooth = mean / share.clamp(min=_LEAST_WEIGHT)
-        coarse = torch.where(share >= _LEAST_WEIGHT, smooth, block_mean / block_share.clamp(min=tiny))
-        return torch.where(block_share > 0, coarse, torch.nan)
+        smooth = mean / fraction.clamp(min=_LEAST_WEIGHT)
+        depth_lr = torch.where(fraction >= _LEAST_WEIGHT, smooth, block_mean / block_fraction.clamp(min=tiny))
+        return torch.where(block_fraction > 0, depth_lr, torch.nan)
 
     def _apply(self, values: Tensor, scale: int) -> Tensor:
         """Return the plain weighted averages of complete maps."""
@@ -196,23 +196,23 @@ def make_sample(
 
     """
     check_scale(scale)
-    scene, notes = _divisible(scene, scale)
+    scene, notes = _crop_to_multiple(scene, scale)
     if isinstance(generator, int):
         of_noise = scene_generator(generator, scene.dataset, scene.name, scale)
         of_holes = scene_generator(generator, scene.dataset, scene.name, scale, "holes")
     else:
         of_noise = of_holes = generator
     if isinstance(downsampling, Measured):
-        coarse, coarse_camera = _measured(scene, scale), scene.camera.coarser(scale)
+        depth_lr, camera_lr = _measured_depth(scene, scale), scene.camera.coarser(scale)
     else:
         if scene.depth is None:
             raise ValueError(f"{scene.name}: expected a high-resolution depth map to downsample, there is none")
         noisy = None if noise is None else (noise, of_noise)
-        coarse, coarse_camera = downsampled(scene.depth, scene.camera, scale, downsampling, range_type, noisy)
+        depth_lr, camera_lr = downsample_depth(scene.depth, scene.camera, scale, downsampling, range_type, noisy)
     if holes is not None:
-        coarse = coarse.masked_fill(holes(coarse, coarse_camera, of_holes), torch.nan)
+        depth_lr = depth_lr.masked_fill(holes(depth_lr, camera_lr, of_holes), torch.nan)
     return DepthSample(
-        scene.dataset, scene.name, scene.rgb, coarse, scene.camera, coarse_camera, scale, scene.depth, notes
+        scene.dataset, scene.name, scene.rgb, depth_lr, scene.camera, camera_lr, scale, scene.depth, notes
     )
 
 
@@ -222,7 +222,7 @@ def check_scale(scale: int) -> None:
         raise ValueError(f"scale: expected one of {', '.join(map(str, SCALES))}, got {scale}")
 
 
-def _divisible(scene: Scene, scale: int) -> tuple[Scene, tuple[str, ...]]:
+def _crop_to_multiple(scene: Scene, scale: int) -> tuple[Scene, tuple[str, ...]]:
     """Return the scene, cropped to a size that the scale divides, and what to say of it."""
     camera = scene.camera
     height, width = (size // scale * scale for size in (camera.height, camera.width))
@@ -239,7 +239,7 @@ def _divisible(scene: Scene, scale: int) -> tuple[Scene, tuple[str, ...]]:
     )
 
 
-def downsampled(
+def downsample_depth(
     depth: Tensor,
     camera: Camera,
     scale: int,
@@ -259,22 +259,22 @@ def downsampled(
 
     """
     range_type = downsampling.range_type or range_type
-    coarse_camera = downsampling.camera(camera, scale)
-    fine = to_range(depth, camera, range_type)
+    camera_lr = downsampling.camera(camera, scale)
+    values_hr = to_range(depth, camera, range_type)
     if range_type == "disparity":  # in the low-resolution camera's pixels
-        fine = fine / scale
-    values = downsampling(fine, scale)
+        values_hr = values_hr / scale
+    values = downsampling(values_hr, scale)
     if noise is not None:
         kind, generator = noise
         if kind.range_type is not None:
-            averages = from_range(values, coarse_camera, range_type)
-            range_type, values = kind.range_type, to_range(averages, coarse_camera, kind.range_type)
+            averages = from_range(values, camera_lr, range_type)
+            range_type, values = kind.range_type, to_range(averages, camera_lr, kind.range_type)
         values = kind(values, generator)
-    coarse = from_range(values, coarse_camera, range_type)
-    return torch.where(coarse > 0, coarse, torch.nan), coarse_camera  # bicubic may undershoot beside a depth step
+    depth_lr = from_range(values, camera_lr, range_type)
+    return torch.where(depth_lr > 0, depth_lr, torch.nan), camera_lr  # bicubic may undershoot beside a depth step
 
 
-def _measured(scene: Scene, scale: int) -> Tensor:
+def _measured_depth(scene: Scene, scale: int) -> Tensor:
     """Return the low-resolution depth that the scene brings."""
     if scale not in scene.measured:
         have = ", ".join(f"x{factor}" for factor in scene.measured) or "none"

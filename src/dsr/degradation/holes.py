@@ -46,7 +46,7 @@ class Blobs:
         """Return where the holes are, (1, h, w); the share is met to the pixel."""
         draws = torch.randn(1, *depth.shape, generator=generator, dtype=torch.float64)
         for axis in (-2, -1):
-            draws = _blurred(draws, self.size / 4, axis)
+            draws = _blur(draws, self.size / 4, axis)
         values = draws[0].flatten()
         holes = torch.zeros_like(values, dtype=torch.bool)
         holes[values.argsort(descending=True)[: round(self.share * values.numel())]] = True
@@ -89,7 +89,7 @@ def no_holes() -> None:
     return
 
 
-def _blurred(values: Tensor, sigma: float, axis: int) -> Tensor:
+def _blur(values: Tensor, sigma: float, axis: int) -> Tensor:
     """Return (1, 1, h, w) convolved with a Gaussian along an axis; edge pixels repeated."""
     radius = max(round(3 * sigma), 1)
     taps = torch.exp(-0.5 * (torch.arange(-radius, radius + 1, dtype=values.dtype) / sigma).square())

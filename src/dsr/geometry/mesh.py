@@ -70,9 +70,9 @@ def triangulate(
         raise ValueError(f"mesh: expected a positive step and number of vertices, got {largest_step} and {most}")
     stride = stride_for(depth, most)
     thinned = depth[0, ::stride, ::stride].detach().cpu().double().numpy()
-    known = np.isfinite(thinned)
+    valid = np.isfinite(thinned)
     faces = _faces(1 / thinned, largest_step)
-    kept = known.ravel().copy()
+    kept = valid.ravel().copy()
     if not isolated:
         kept[:] = False
         kept[faces.ravel()] = True
@@ -86,9 +86,9 @@ def triangulate(
 
 def stride_for(depth: Tensor, most: int) -> int:
     """Return the smallest stride at which a map, (1, H, W), has at most that many known pixels."""
-    known = depth[0].isfinite()
-    stride = max(1, math.isqrt(int(known.sum()) // most))
-    while int(known[::stride, ::stride].sum()) > most:
+    valid = depth[0].isfinite()
+    stride = max(1, math.isqrt(int(valid.sum()) // most))
+    while int(valid[::stride, ::stride].sum()) > most:
         stride += 1
     return stride
 
@@ -111,7 +111,7 @@ def vertex_normals(mesh: Mesh) -> np.ndarray:
 def _faces(inverse: np.ndarray, largest_step: float) -> np.ndarray:
     """Return the triangles of a map of inverse depth, (H, W), as (M, 3) indices into the flattened map."""
     height, width = inverse.shape
-    across, down = _joined(inverse, largest_step), _joined(inverse.T, largest_step).T
+    across, down = _connected(inverse, largest_step), _connected(inverse.T, largest_step).T
     top, bottom, left, right = across[:-1], across[1:], down[:, :-1], down[:, 1:]
     falling = np.abs(inverse[:-1, :-1] - inverse[1:, 1:])  # from the upper left pixel to the lower right one
     rising = np.abs(inverse[1:, :-1] - inverse[:-1, 1:])
@@ -128,14 +128,14 @@ def _faces(inverse: np.ndarray, largest_step: float) -> np.ndarray:
     return np.concatenate([np.stack([corner[where] for corner in corners], axis=1) for where, corners in choices])
 
 
-def _joined(inverse: np.ndarray, largest_step: float) -> np.ndarray:
+def _connected(inverse: np.ndarray, largest_step: float) -> np.ndarray:
     """Return whether each pixel and its right neighbour are of one surface, (H, W - 1) bool; False beside holes."""
     change = np.diff(inverse, axis=1)  # (H, W - 1)
     scale = largest_step * np.minimum(inverse[:, :-1], inverse[:, 1:])
     step = np.zeros(change.shape, dtype=bool)
     for reach in _REACHES:
-        far, near = _shifted(inverse, reach)[:, :-1], _shifted(inverse, 1 - reach)[:, :-1]
-        beyond, before = _shifted(inverse, 2 * reach)[:, :-1], _shifted(inverse, 1 - 2 * reach)[:, :-1]
+        far, near = _shift(inverse, reach)[:, :-1], _shift(inverse, 1 - reach)[:, :-1]
+        beyond, before = _shift(inverse, 2 * reach)[:, :-1], _shift(inverse, 1 - 2 * reach)[:, :-1]
         total, pairs = far - near, 2 * reach - 1
         excess, own = np.abs(total), np.abs(change)
         for slope in ((beyond - far) / reach, (near - before) / reach):
@@ -145,7 +145,7 @@ def _joined(inverse: np.ndarray, largest_step: float) -> np.ndarray:
     return np.isfinite(change) & ~step
 
 
-def _shifted(values: np.ndarray, by: int) -> np.ndarray:
+def _shift(values: np.ndarray, by: int) -> np.ndarray:
     """Return what is ``by`` columns further along, (H, W), NaN beyond the border."""
     shifted = np.full_like(values, np.nan)
     width = values.shape[1]

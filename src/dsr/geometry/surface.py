@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 
-def points_of(depth: Tensor, rays: Tensor) -> Tensor:
+def back_project(depth: Tensor, rays: Tensor) -> Tensor:
     """Back-project depth: P = z r.
 
     Args:
@@ -48,7 +48,7 @@ def depth_to_normals(depth: Tensor, rays: Tensor, dtype: torch.dtype | None = No
     dtype = dtype or depth.dtype
     step_u = _repeat_last(depth.diff(dim=-1).to(dtype), dim=-1)
     step_v = _repeat_last(depth.diff(dim=-2).to(dtype), dim=-2)
-    along_u, along_v = (_neighbour(depth.to(dtype), dim) for dim in (-1, -2))
+    along_u, along_v = (_next_pixel(depth.to(dtype), dim) for dim in (-1, -2))
     x, y, _ = rays.split(1, dim=-3)
     height, width = depth.shape[-2:]
     fx = ((width - 1) / (x[..., :1, -1:] - x[..., :1, :1])).to(dtype)
@@ -90,7 +90,7 @@ def _repeat_last(values: Tensor, dim: int) -> Tensor:
     return torch.cat((values, values.narrow(dim, -1, 1)), dim)
 
 
-def _neighbour(values: Tensor, dim: int) -> Tensor:
+def _next_pixel(values: Tensor, dim: int) -> Tensor:
     """Return each pixel's next one along ``dim``; the last pixel's is the one before it."""
     size = values.shape[dim]
     return torch.cat((values.narrow(dim, 1, size - 1), values.narrow(dim, size - 2, 1)), dim)

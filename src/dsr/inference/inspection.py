@@ -8,7 +8,7 @@ from torch import Tensor
 from dsr.degradation.downsampling import Downsampling
 from dsr.geometry.camera import Camera
 from dsr.inference.planning import OWN_SIZE, USUAL_SCALE
-from dsr.methods.dip.noise import noise_level, normal_noise_deg
+from dsr.methods.dip.noise import estimate_noise, normal_noise_deg
 
 CLEAN, NOISY = "facets", "msg_v_noisy"
 LARGEST_TILT = 8.0
@@ -39,7 +39,7 @@ def suited_method(depth: Tensor, camera: Camera, scale: int | None = None) -> st
     ratio = max(camera.height / coarse.shape[-2], camera.width / coarse.shape[-1])
     if scale not in _SCALES_OF_NOISY or ratio > _LARGEST_RATIO:
         return CLEAN
-    tilt = normal_noise_deg(noise_level(coarse[None]), camera.rescale(coarse.shape[-1], coarse.shape[-2]))
+    tilt = normal_noise_deg(estimate_noise(coarse[None]), camera.rescale(coarse.shape[-1], coarse.shape[-2]))
     return NOISY if tilt > LARGEST_TILT else CLEAN
 
 

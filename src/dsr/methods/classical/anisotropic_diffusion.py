@@ -31,9 +31,9 @@ from torch.nn import functional
 
 from dsr.geometry.camera import RangeType, from_range, to_range
 from dsr.methods.base import expect_limits, history_of
-from dsr.methods.classical.finite_differences import box_mean, extended, upsampled
-from dsr.methods.networks.inpainting import filled
-from dsr.methods.networks.maps import min_max, normalised
+from dsr.methods.classical.finite_differences import box_mean, extend_linearly, upsample_linear_border
+from dsr.methods.networks.inpainting import inpaint
+from dsr.methods.networks.maps import min_max, normalise
 from dsr.sample import DepthSample
 from dsr.utils.progress import Steps
 
@@ -43,7 +43,7 @@ _LEAST = 0.5
 """A map continued beyond the border stays within this share of its lowest value."""
 
 
-class Diffused(NamedTuple):
+class Diffusion(NamedTuple):
     """What an iteration found: the map (B, 1, H, W), the steps it took, and how far it moved between two looks."""
 
     values: Tensor
@@ -103,38 +103,38 @@ class AnisotropicDiffusion:
             progress: is told the steps done and the most that it may take.
 
         """
-        coarse = to_range(sample.depth_lr.double(), sample.camera_lr, "disparity") + sample.camera_lr.doffs
-        inverse = (coarse * sample.scale)[None]  # in pixels of the high-resolution camera
-        found = self.diffused(sample.rgb[None], inverse, sample.scale, progress)
-        self.history = history_of(found.moved, CHECK_EVERY)
-        fine = found.values[0]
-        return from_range(fine - sample.camera.doffs, sample.camera, "disparity").to(sample.depth_lr.dtype)
+        lr = to_range(sample.depth_lr.double(), sample.camera_lr, "disparity") + sample.camera_lr.doffs
+        inverse = (lr * sample.scale)[None]  # in pixels of the high-resolution camera
+        result = self.diffuse(sample.rgb[None], inverse, sample.scale, progress)
+        self.history = history_of(result.moved, CHECK_EVERY)
+        hr = result.values[0]
+        return from_range(hr - sample.camera.doffs, sample.camera, "disparity").to(sample.depth_lr.dtype)
 
-    def diffused(self, rgb: Tensor, coarse: Tensor, scale: int, progress: Steps | None = None) -> Diffused:
+    def diffuse(self, rgb: Tensor, lr: Tensor, scale: int, progress: Steps | None = None) -> Diffusion:
         """Return positive maps upsampled.
 
         Args:
             rgb: (B, 3, H, W) in [0, 1].
-            coarse: (B, 1, H / scale, W / scale) float64, positive, NaN where it is not known.
+            lr: (B, 1, H / scale, W / scale) float64, positive, NaN where it is not known.
             scale: the factor; at 1, holes are filled.
             progress: as above.
 
         """
-        start = filled(coarse)
-        if scale > 1 and not bool(coarse.isfinite().all()):
-            start = self.diffused(box_mean(rgb, scale), coarse, 1).values
+        start = inpaint(lr)
+        if scale > 1 and not bool(lr.isfinite().all()):
+            start = self.diffuse(box_mean(rgb, scale), lr, 1).values
         low, high = min_max(start).chunk(2, dim=1)
-        wide = extended(start, self.border).clamp(min=_LEAST * low, max=high / _LEAST)
-        known = functional.pad(coarse.isfinite(), [self.border] * 4, value=True)
+        lr_extended = extend_linearly(start, self.border).clamp(min=_LEAST * low, max=high / _LEAST)
+        valid = functional.pad(lr.isfinite(), [self.border] * 4, value=True)
         edge = self.border * scale
-        photo = functional.pad(rgb.float(), [edge] * 4, mode="replicate") if edge else rgb.float()
-        first = upsampled(wide, scale).clamp(min=low / 2)
+        guide_rgb = functional.pad(rgb.float(), [edge] * 4, mode="replicate") if edge else rgb.float()
+        start_hr = upsample_linear_border(lr_extended, scale).clamp(min=low / 2)
         weight = self.depth_weight if scale > 1 else 0.0  # what stands in a hole at first knows nothing of it
-        conductances = self._conductances(photo, weight * normalised(first).values)
-        found = self._iterated(first, wide, known, conductances, progress)
+        conductances = self._conductances(guide_rgb, weight * normalise(start_hr).values)
+        result = self._iterate(start_hr, lr_extended, valid, conductances, progress)
         inner = (slice(edge, edge + rgb.shape[-2]), slice(edge, edge + rgb.shape[-1]))
-        exact = _adjusted(found.values[..., inner[0], inner[1]].double(), coarse, coarse.isfinite())
-        return found._replace(values=exact)
+        exact = _adjust_copy(result.values[..., inner[0], inner[1]].double(), lr, lr.isfinite())
+        return result._replace(values=exact)
 
     def _conductances(self, rgb: Tensor, depth: Tensor) -> tuple[Tensor, Tensor]:
         """Return step * c along u, (B, 1, H, W - 1), and along v, (B, 1, H - 1, W), of photos and weighted maps."""
@@ -145,18 +145,18 @@ class AnisotropicDiffusion:
         )
         return along_u, along_v
 
-    def _iterated(
+    def _iterate(
         self,
-        first: Tensor,
-        coarse: Tensor,
-        known: Tensor,
+        start_hr: Tensor,
+        lr: Tensor,
+        valid: Tensor,
         conductances: tuple[Tensor, Tensor],
         progress: Steps | None,
-    ) -> Diffused:
+    ) -> Diffusion:
         """Return where the two steps, in turn, end."""
-        mean = first.mean(dim=(-2, -1), keepdim=True)
-        x, target = (first / mean).float(), (coarse / mean).float()
-        span = min_max(target).diff(dim=1).clamp(min=1e-12)
+        mean = start_hr.mean(dim=(-2, -1), keepdim=True)
+        x, target = (start_hr / mean).float(), (lr / mean).float()
+        value_range = min_max(target).diff(dim=1).clamp(min=1e-12)
         along_u, along_v = torch.empty_like(conductances[0]), torch.empty_like(conductances[1])
         before, moved, done = x.clone(), [], 0
         for done in range(1, self.steps + 1):
@@ -166,28 +166,28 @@ class AnisotropicDiffusion:
             x[..., :-1] += along_u
             x[..., 1:, :] -= along_v
             x[..., :-1, :] += along_v
-            _adjust(x, target, known)
+            _adjust(x, target, valid)
             if done % CHECK_EVERY == 0:
                 if progress is not None:
                     progress(done, self.steps)
-                moved.append(float(((x - before) / span).square().mean(dim=(-2, -1)).max().sqrt()))
+                moved.append(float(((x - before) / value_range).square().mean(dim=(-2, -1)).max().sqrt()))
                 if moved[-1] < self.tolerance:
                     break
                 before.copy_(x)
         if progress is not None:
             progress(self.steps, self.steps)
-        return Diffused(x.double() * mean, done, moved)
+        return Diffusion(x.double() * mean, done, moved)
 
 
-def _adjust(x: Tensor, coarse: Tensor, known: Tensor) -> None:
+def _adjust(x: Tensor, lr: Tensor, valid: Tensor) -> None:
     """Multiply each known block of x, (B, 1, H, W), so that its mean is the low-resolution pixel, in place."""
-    scale = x.shape[-1] // coarse.shape[-1]
-    ratio = torch.where(known, coarse / box_mean(x, scale), 1)
-    blocks = x.view(*coarse.shape[:-1], scale, coarse.shape[-1], scale)
+    scale = x.shape[-1] // lr.shape[-1]
+    ratio = torch.where(valid, lr / box_mean(x, scale), 1)
+    blocks = x.view(*lr.shape[:-1], scale, lr.shape[-1], scale)
     blocks *= ratio[..., :, None, :, None]
 
 
-def _adjusted(x: Tensor, coarse: Tensor, known: Tensor) -> Tensor:
+def _adjust_copy(x: Tensor, lr: Tensor, valid: Tensor) -> Tensor:
     x = x.clone(memory_format=torch.contiguous_format)
-    _adjust(x, coarse, known)
+    _adjust(x, lr, valid)
     return x

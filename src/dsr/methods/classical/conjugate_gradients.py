@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 
-class Solved(NamedTuple):
+class Solution(NamedTuple):
     """What was found: ``values`` (B, ...), the steps taken, and the largest |b - A x| / |b| in the batch."""
 
     values: Tensor
@@ -23,7 +23,7 @@ class Solved(NamedTuple):
 
 def conjugate_gradients(
     operator: Callable[[Tensor], Tensor], right: Tensor, start: Tensor, *, iterations: int, tolerance: float
-) -> Solved:
+) -> Solution:
     """Solve A x = b for each of a batch.
 
     Args:
@@ -47,7 +47,7 @@ def conjugate_gradients(
         before, size = size, _dot(residual, residual)
         direction = residual + _ratio(size, before) * direction
         done += 1
-    return Solved(x, done, float(_ratio(size, _dot(right, right)).max().sqrt()))
+    return Solution(x, done, float(_ratio(size, _dot(right, right)).max().sqrt()))
 
 
 def _dot(a: Tensor, b: Tensor) -> Tensor:

@@ -25,7 +25,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from dsr.methods.classical.photo_guided import Guided, GuidedMethod, positive
+from dsr.methods.classical.photo_guided import Guided, GuidedMethod, expect_positive
 
 _LEAST = 1e-200
 """Of smoothed confidence, a sum of positive terms: below it digits get lost, and the nearest LR value stands in."""
@@ -58,10 +58,12 @@ class FastGlobalSmoother(GuidedMethod):
         slopes: bool = True,
     ) -> None:
         super().__init__(fill_holes=fill_holes, slopes=slopes)
-        positive("the fast global smoother", smoothness=smoothness, sigma_colour=sigma_colour, iterations=iterations)
+        expect_positive(
+            "the fast global smoother", smoothness=smoothness, sigma_colour=sigma_colour, iterations=iterations
+        )
         self._smoothness, self._sigma_colour, self._iterations = smoothness, sigma_colour, iterations
 
-    def filtered(self, guided: Guided) -> Tensor:
+    def filter_maps(self, guided: Guided) -> Tensor:
         """Return the smoothed maps, (N, H, W)."""
         i, j = guided.nearest()
         at_centre = [
@@ -69,15 +71,15 @@ class FastGlobalSmoother(GuidedMethod):
             for where, nearest in ((guided.rows, i), (guided.columns, j))
         ]
         data = guided.maps[:, i[:, None], j]
-        index = at_centre[0][:, None] * at_centre[1] * guided.known[i[:, None], j]
+        index = at_centre[0][:, None] * at_centre[1] * guided.valid[i[:, None], j]
         strength = self._smoothness * guided.scale**2
         both = torch.cat((index * data, index[None]))
-        both = smoothed(guided.photo, both, strength, self._sigma_colour, self._iterations)
+        both = smooth(guided.rgb, both, strength, self._sigma_colour, self._iterations)
         enough = both[-1] > _LEAST
         return torch.where(enough, both[:-1] / torch.where(enough, both[-1], 1), data)
 
 
-def smoothed(guide: Tensor, maps: Tensor, strength: float, sigma_colour: float, iterations: int = 3) -> Tensor:
+def smooth(guide: Tensor, maps: Tensor, strength: float, sigma_colour: float, iterations: int = 3) -> Tensor:
     """Return maps smoothed where the guide is smooth.
 
     Args:
@@ -95,12 +97,12 @@ def smoothed(guide: Tensor, maps: Tensor, strength: float, sigma_colour: float, 
     along_columns = _weights(guide, sigma_colour)  # (H - 1, W)
     for t in range(1, iterations + 1):
         share = 1.5 * 4.0 ** (iterations - t) / (4.0**iterations - 1) * strength
-        maps = solved_lines(share * along_rows, maps.permute(2, 0, 1)).permute(1, 2, 0)
-        maps = solved_lines(share * along_columns, maps.transpose(0, 1)).transpose(0, 1)
+        maps = solve_lines(share * along_rows, maps.permute(2, 0, 1)).permute(1, 2, 0)
+        maps = solve_lines(share * along_columns, maps.transpose(0, 1)).transpose(0, 1)
     return maps.contiguous()
 
 
-def solved_lines(weights: Tensor, right: Tensor) -> Tensor:
+def solve_lines(weights: Tensor, right: Tensor) -> Tensor:
     """Return the solutions of (1 + A) u = f for all lines at once, A being each line's weighted Laplacian.
 
     Gaussian elimination for tridiagonal systems (Thomas), stable without pivots as the diagonal dominates.

@@ -34,7 +34,7 @@ def divergence(p: Tensor) -> Tensor:
     return total
 
 
-def touching(p: Tensor) -> Tensor:
+def sum_adjacent(p: Tensor) -> Tensor:
     """Return the sum of what belongs to each pixel's differences, (B, 2, C, H, W) -> (B, C, H, W).
 
     The adjoint of :func:`gradient` with a plus for every minus: its columns' absolute sums, weighted.
@@ -53,7 +53,7 @@ def box_mean(x: Tensor, scale: int) -> Tensor:
     return functional.avg_pool2d(x, scale)
 
 
-def repeated(x: Tensor, scale: int) -> Tensor:
+def repeat_blocks(x: Tensor, scale: int) -> Tensor:
     """Return each pixel as a scale x scale block, (B, C, h, w) -> (B, C, scale h, scale w)."""
     return x.repeat_interleave(scale, -2).repeat_interleave(scale, -1)
 
@@ -63,17 +63,17 @@ def grey(rgb: Tensor) -> Tensor:
     return (rgb * rgb.new_tensor(LUMA)[:, None, None]).sum(dim=1, keepdim=True)
 
 
-def extended(x: Tensor, border: int) -> Tensor:
+def extend_linearly(x: Tensor, border: int) -> Tensor:
     """Return (B, C, h, w) with ``border`` pixels more on each side, where it goes on linearly; a plane stays one."""
-    return _extended(_extended(x, border, -1), border, -2)
+    return _extend(_extend(x, border, -1), border, -2)
 
 
-def upsampled(coarse: Tensor, scale: int) -> Tensor:
+def upsample_linear_border(coarse: Tensor, scale: int) -> Tensor:
     """Return (B, 1, h, w) upsampled bicubically to (B, 1, scale h, scale w), exact on planes up to the border."""
     if scale == 1:
         return coarse.clone()
     edge = _REACH * scale
-    return upsample_bicubic(extended(coarse, _REACH), scale)[..., edge:-edge, edge:-edge].contiguous()
+    return upsample_bicubic(extend_linearly(coarse, _REACH), scale)[..., edge:-edge, edge:-edge].contiguous()
 
 
 def _forward(x: Tensor, dim: int) -> Tensor:
@@ -81,7 +81,7 @@ def _forward(x: Tensor, dim: int) -> Tensor:
     return functional.pad(x.diff(dim=dim), ends)
 
 
-def _extended(x: Tensor, border: int, dim: int) -> Tensor:
+def _extend(x: Tensor, border: int, dim: int) -> Tensor:
     count = x.shape[dim]
     first, last = x.narrow(dim, 0, 1), x.narrow(dim, count - 1, 1)
     before = first - x.narrow(dim, min(1, count - 1), 1)  # 0 where there is a single pixel

@@ -23,7 +23,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from dsr.methods.classical.photo_guided import Guided, GuidedMethod, positive
+from dsr.methods.classical.photo_guided import Guided, GuidedMethod, expect_positive
 
 _PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 """The entries of a symmetric 3 x 3 matrix, in the order in which they are kept."""
@@ -49,14 +49,14 @@ class GuidedFilter(GuidedMethod):
         self, radius: float = 0.5, epsilon: float = 1e-3, *, fill_holes: bool = False, slopes: bool = True
     ) -> None:
         super().__init__(fill_holes=fill_holes, slopes=slopes)
-        positive("the guided filter", radius=radius, epsilon=epsilon)
+        expect_positive("the guided filter", radius=radius, epsilon=epsilon)
         self._radius, self._epsilon = radius, epsilon
 
-    def filtered(self, guided: Guided) -> Tensor:
+    def filter_maps(self, guided: Guided) -> Tensor:
         """Return the filtered interpolations, (N, H, W)."""
-        maps, confidence = guided.interpolated()
+        maps, confidence = guided.interpolate()
         radius = max(round(self._radius * guided.scale), 1)
-        return guided_filter(guided.photo, maps, radius, self._epsilon, confidence)
+        return guided_filter(guided.rgb, maps, radius, self._epsilon, confidence)
 
 
 def guided_filter(guide: Tensor, maps: Tensor, radius: int, epsilon: float, confidence: Tensor | None = None) -> Tensor:
@@ -82,7 +82,7 @@ def guided_filter(guide: Tensor, maps: Tensor, radius: int, epsilon: float, conf
     del products
     for k in (0, 3, 5):
         variances[k] += epsilon
-    inverse = _inverse(variances)
+    inverse = _invert(variances)
     of_image = share / _box(torch.ones_like(weight), radius)  # the mean confidence of a window's pixels
     total = _box(of_image, radius)
 
@@ -105,7 +105,7 @@ def _box(x: Tensor, radius: int) -> Tensor:
     return maps.reshape(x.shape)
 
 
-def _inverse(matrix: Tensor) -> Tensor:
+def _invert(matrix: Tensor) -> Tensor:
     """Return the inverses of symmetric 3 x 3 matrices, (6, H, W) both, by cofactors.
 
     Covariances plus epsilon have determinants of at least epsilon cubed.

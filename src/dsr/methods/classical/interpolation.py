@@ -10,7 +10,7 @@ from scipy import ndimage
 from torch import Tensor
 
 from dsr.geometry.camera import Camera, RangeType, from_range, to_range
-from dsr.methods.networks.maps import coarse_coordinates
+from dsr.methods.networks.maps import lr_coordinates
 from dsr.sample import DepthSample
 from dsr.utils.progress import Steps
 
@@ -53,7 +53,7 @@ class Interpolation:
         if not known.all():
             nearest = ndimage.distance_transform_edt(~known, return_distances=False, return_indices=True)
             values = values[tuple(nearest)]
-        places = coarse_coordinates(fine_camera, camera)
+        places = lr_coordinates(fine_camera, camera)
         where = torch.stack(torch.meshgrid(*places, indexing="ij")).numpy()
         fine = ndimage.map_coordinates(values, where, order=self._degree, mode="nearest")
         if not (known.all() or self._fill_holes):

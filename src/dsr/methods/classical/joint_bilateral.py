@@ -23,7 +23,7 @@ from collections.abc import Iterator
 import torch
 from torch import Tensor
 
-from dsr.methods.classical.photo_guided import Guided, GuidedMethod, positive
+from dsr.methods.classical.photo_guided import Guided, GuidedMethod, expect_positive
 
 
 class JointBilateral(GuidedMethod):
@@ -51,22 +51,22 @@ class JointBilateral(GuidedMethod):
         slopes: bool = True,
     ) -> None:
         super().__init__(fill_holes=fill_holes, slopes=slopes)
-        positive("joint bilateral upsampling", radius=radius, sigma_space=sigma_space, sigma_colour=sigma_colour)
+        expect_positive("joint bilateral upsampling", radius=radius, sigma_space=sigma_space, sigma_colour=sigma_colour)
         self._radius, self._sigma_space, self._sigma_colour = radius, sigma_space, sigma_colour
 
-    def filtered(self, guided: Guided) -> Tensor:
+    def filter_maps(self, guided: Guided) -> Tensor:
         """Return the weighted means of the low-resolution maps, (N, H, W)."""
-        height, width = guided.known.shape
+        height, width = guided.valid.shape
         coarse_photo = _block_means(guided)
         nearest = guided.nearest()
-        largest = torch.full_like(guided.photo[0], -torch.inf)
-        for exponent, _, _ in self._neighbours(guided, coarse_photo):
+        largest = torch.full_like(guided.rgb[0], -torch.inf)
+        for exponent, _, _ in self._iterate_neighbours(guided, coarse_photo):
             torch.maximum(largest, exponent, out=largest)
         found = largest.isfinite()
         largest = torch.where(found, largest, 0)
         weights = torch.zeros_like(largest)
         totals = largest.new_zeros((len(guided.maps), *largest.shape))
-        for exponent, i, j in self._neighbours(guided, coarse_photo):
+        for exponent, i, j in self._iterate_neighbours(guided, coarse_photo):
             weight = exponent.sub_(largest).exp_()
             weights += weight
             rows, columns = i.clamp(0, height - 1)[:, None], j.clamp(0, width - 1)
@@ -75,12 +75,12 @@ class JointBilateral(GuidedMethod):
         around = guided.maps[:, nearest[0][:, None], nearest[1]]
         return torch.where(found, totals / torch.where(found, weights, 1), around)
 
-    def _neighbours(self, guided: Guided, coarse_photo: Tensor) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
+    def _iterate_neighbours(self, guided: Guided, coarse_photo: Tensor) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
         """Yield, neighbour by neighbour, its weights' exponents (H, W), its rows (H,) and its columns (W,).
 
         Where the neighbour is a hole or lies outside, the exponent is minus infinity.
         """
-        height, width = guided.known.shape
+        height, width = guided.valid.shape
         i, j = guided.nearest()
         for down in range(-self._radius, self._radius + 1):
             for across in range(-self._radius, self._radius + 1):
@@ -88,17 +88,17 @@ class JointBilateral(GuidedMethod):
                 kept_rows, kept_columns = rows.clamp(0, height - 1)[:, None], columns.clamp(0, width - 1)
                 squares = (guided.rows - rows).square()[:, None] + (guided.columns - columns).square()
                 exponent = squares / (-2 * self._sigma_space**2)
-                for photo, coarse in zip(guided.photo, coarse_photo, strict=True):
-                    exponent -= (photo - coarse[kept_rows, kept_columns]).square() / (2 * self._sigma_colour**2)
+                for rgb, coarse in zip(guided.rgb, coarse_photo, strict=True):
+                    exponent -= (rgb - coarse[kept_rows, kept_columns]).square() / (2 * self._sigma_colour**2)
                 inside = (rows == rows.clamp(0, height - 1))[:, None] & (columns == columns.clamp(0, width - 1))
-                counts = inside & (guided.known[kept_rows, kept_columns] > 0)
+                counts = inside & (guided.valid[kept_rows, kept_columns] > 0)
                 yield exponent.masked_fill_(~counts, -torch.inf), rows, columns
 
 
 def _block_means(guided: Guided) -> Tensor:
     """Return the photo's mean over the HR pixels that are nearest to each LR one, (3, h, w)."""
     matrices = []
-    for nearest, size in zip(guided.nearest(), guided.known.shape, strict=True):
+    for nearest, size in zip(guided.nearest(), guided.valid.shape, strict=True):
         belongs = (nearest == torch.arange(size, device=nearest.device)[:, None]).double()
         matrices.append(belongs / belongs.sum(dim=1, keepdim=True).clamp(min=1))
-    return matrices[0] @ guided.photo @ matrices[1].T
+    return matrices[0] @ guided.rgb @ matrices[1].T

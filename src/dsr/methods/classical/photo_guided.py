@@ -20,8 +20,8 @@ import torch
 from torch import Tensor
 
 from dsr.geometry.camera import RangeType, from_range, to_range
-from dsr.methods.networks.inpainting import filled
-from dsr.methods.networks.maps import coarse_coordinates
+from dsr.methods.networks.inpainting import inpaint
+from dsr.methods.networks.maps import lr_coordinates
 from dsr.sample import DepthSample
 from dsr.utils.progress import Steps
 
@@ -34,47 +34,47 @@ class Guided:
     """Low-resolution maps and the photo that guides their upsampling.
 
     Args:
-        photo: (3, H, W) float64 in [0, 1].
+        rgb: (3, H, W) float64 in [0, 1].
         maps: (N, h, w) float64, to be upsampled alike; finite everywhere, in holes what stands around them.
-        known: (h, w) float64, 1 where the maps are known and 0 in holes.
+        valid: (h, w) float64, 1 where the maps are known and 0 in holes.
         rows, columns: (H,), (W,) float64, where each high-resolution pixel lies in the low-resolution maps, in
             low-resolution pixels.
 
     """
 
-    photo: Tensor
+    rgb: Tensor
     maps: Tensor
-    known: Tensor
+    valid: Tensor
     rows: Tensor
     columns: Tensor
 
     @property
     def scale(self) -> float:
         """High-resolution pixels per low-resolution one."""
-        return self.photo.shape[-1] / self.maps.shape[-1]
+        return self.rgb.shape[-1] / self.maps.shape[-1]
 
     def nearest(self) -> tuple[Tensor, Tensor]:
         """Return the row (H,) and the column (W,) of the LR pixel that each HR pixel is nearest to."""
-        height, width = self.known.shape
-        return _nearest(self.rows, height), _nearest(self.columns, width)
+        height, width = self.valid.shape
+        return _nearest_index(self.rows, height), _nearest_index(self.columns, width)
 
-    def interpolated(self) -> tuple[Tensor, Tensor]:
+    def interpolate(self) -> tuple[Tensor, Tensor]:
         """Return the maps, (N, H, W), and their confidence, (H, W), at the high-resolution pixels.
 
         A value is the bilinear mean of the known among the four low-resolution pixels around, its confidence the
         bilinear weight of these: 1 away from holes, 0 within, where the filled value stands in.
         """
-        height, width = self.known.shape
-        down, across = _linear(self.rows, height), _linear(self.columns, width)
-        if bool(self.known.all()):
-            return down @ self.maps @ across.T, torch.ones_like(self.photo[0])
-        confidence = (down @ self.known @ across.T).clamp(0, 1)
-        mean = down @ (self.maps * self.known) @ across.T / torch.where(confidence > 0, confidence, 1)
+        height, width = self.valid.shape
+        down, across = _linear_weights(self.rows, height), _linear_weights(self.columns, width)
+        if bool(self.valid.all()):
+            return down @ self.maps @ across.T, torch.ones_like(self.rgb[0])
+        confidence = (down @ self.valid @ across.T).clamp(0, 1)
+        mean = down @ (self.maps * self.valid) @ across.T / torch.where(confidence > 0, confidence, 1)
         return torch.where(confidence > 0, mean, down @ self.maps @ across.T), confidence
 
 
 class GuidedMethod(ABC):
-    """A filter of the low-resolution disparity that a photo guides: what comes before and after :meth:`filtered`.
+    """A filter of the low-resolution disparity that a photo guides: what comes before and after :meth:`filter_maps`.
 
     Args:
         fill_holes: whether holes of the low-resolution map are filled; otherwise a high-resolution pixel whose nearest
@@ -90,31 +90,31 @@ class GuidedMethod(ABC):
         self._slopes = slopes
 
     @abstractmethod
-    def filtered(self, guided: Guided) -> Tensor:
+    def filter_maps(self, guided: Guided) -> Tensor:
         """Return the high-resolution maps, (N, H, W) float64, finite everywhere: the same weighted means of each."""
 
     def __call__(self, sample: DepthSample, progress: Steps | None = None) -> Tensor:
         """Return the high-resolution depth, (1, H, W) in metres in the precision of the low-resolution depth."""
         device = sample.depth_lr.device
-        rows, columns = coarse_coordinates(sample.camera, sample.camera_lr, device)
+        rows, columns = lr_coordinates(sample.camera, sample.camera_lr, device)
         coarse = to_range(sample.depth_lr.double(), sample.camera_lr, "disparity")[0] * sample.scale
-        known = coarse.isfinite()
-        maps = _planes(coarse) if self._slopes else coarse[None]
-        guided = Guided(sample.rgb.to(device).double(), filled(maps[:, None])[:, 0], known.double(), rows, columns)
-        answers = self.filtered(guided)
+        valid = coarse.isfinite()
+        maps = _fit_planes(coarse) if self._slopes else coarse[None]
+        guided = Guided(sample.rgb.to(device).double(), inpaint(maps[:, None])[:, 0], valid.double(), rows, columns)
+        answers = self.filter_maps(guided)
         fine = answers[0]
         if self._slopes:
             fine = fine + answers[1] * rows[:, None] + answers[2] * columns
         doffs = sample.camera.doffs  # disparity + doffs is inverse depth
-        least, most = (float(bound) + doffs for bound in coarse[known].aminmax())
+        least, most = (float(bound) + doffs for bound in coarse[valid].aminmax())
         fine = fine.clamp(least / _BEYOND - doffs, most * _BEYOND - doffs)
-        if not (self._fill_holes or bool(known.all())):
+        if not (self._fill_holes or bool(valid.all())):
             i, j = guided.nearest()
-            fine = fine.masked_fill(~known[i[:, None], j], torch.nan)
+            fine = fine.masked_fill(~valid[i[:, None], j], torch.nan)
         return from_range(fine[None], sample.camera, "disparity").to(sample.depth_lr)
 
 
-def slopes_along(values: Tensor, axis: int) -> Tensor:
+def estimate_slopes(values: Tensor, axis: int) -> Tensor:
     """Return the local slope of a map along an axis, of its shape; unknown values (NaN) have slope 0.
 
     Of backward and forward difference the one nearer to 0, or 0 where their signs differ; at a border or a hole the one
@@ -132,26 +132,26 @@ def slopes_along(values: Tensor, axis: int) -> Tensor:
     return torch.stack((padded[:-2], slope, padded[2:])).median(dim=0).values.movedim(0, axis)
 
 
-def positive(method: str, **values: float) -> None:
+def expect_positive(method: str, **values: float) -> None:
     """Raise a ValueError for the first of a method's parameters that is not a positive finite number."""
     for name, value in values.items():
         if not 0 < value < float("inf"):
             raise ValueError(f"{name}: expected a positive number for {method}, got {value}")
 
 
-def _planes(coarse: Tensor) -> Tensor:
+def _fit_planes(coarse: Tensor) -> Tensor:
     """Return each LR pixel's plane: its value at row and column 0, per row, per column, (3, h, w); NaN in holes."""
     height, width = coarse.shape
-    down, across = slopes_along(coarse, 0), slopes_along(coarse, 1)
+    down, across = estimate_slopes(coarse, 0), estimate_slopes(coarse, 1)
     constant = coarse - down * torch.arange(height).to(coarse)[:, None] - across * torch.arange(width).to(coarse)
     return torch.stack((constant, down, across)).masked_fill(coarse.isnan(), torch.nan)
 
 
-def _nearest(where: Tensor, size: int) -> Tensor:
+def _nearest_index(where: Tensor, size: int) -> Tensor:
     return (where + 0.5).floor().long().clamp(0, size - 1)
 
 
-def _linear(where: Tensor, size: int) -> Tensor:
+def _linear_weights(where: Tensor, size: int) -> Tensor:
     """Return the weights of linear interpolation, (len(where), size); edge pixels are repeated beyond the border."""
     places = torch.arange(size).to(where)
     return (1 - (where.clamp(0, size - 1)[:, None] - places).abs()).clamp(min=0)

@@ -34,9 +34,17 @@ from torch import Tensor
 
 from dsr.geometry.camera import RangeType, from_range, to_range
 from dsr.methods.base import expect_limits, history_of
-from dsr.methods.classical.finite_differences import box_mean, divergence, gradient, grey, repeated, touching, upsampled
-from dsr.methods.networks.inpainting import filled
-from dsr.methods.networks.maps import normalised
+from dsr.methods.classical.finite_differences import (
+    box_mean,
+    divergence,
+    gradient,
+    grey,
+    repeat_blocks,
+    sum_adjacent,
+    upsample_linear_border,
+)
+from dsr.methods.networks.inpainting import inpaint
+from dsr.methods.networks.maps import normalise
 from dsr.sample import DepthSample
 from dsr.utils.progress import Steps
 
@@ -60,7 +68,7 @@ class Tensors(NamedTuple):
         return torch.stack((self.uu * p[:, 0] + self.uv * p[:, 1], self.uv * p[:, 0] + self.vv * p[:, 1]), dim=1)
 
 
-class Minimised(NamedTuple):
+class Solution(NamedTuple):
     """What the minimisation found.
 
     ``values`` (B, 1, H, W) is u, ``slopes`` (B, 2, H, W) is v, each the mean of the iterates since the last look, for
@@ -137,15 +145,15 @@ class TotalGeneralisedVariation:
 
         """
         coarse = to_range(sample.depth_lr.double(), sample.camera_lr, "disparity")[None] * sample.scale
-        scaled = normalised(coarse)
-        known = coarse.isfinite()
-        values = torch.where(known, scaled.values, torch.nan)
-        found = self.minimised(sample.rgb[None].double(), values, sample.scale, progress)
+        scaled = normalise(coarse)
+        valid = coarse.isfinite()
+        values = torch.where(valid, scaled.values, torch.nan)
+        found = self.minimise(sample.rgb[None].double(), values, sample.scale, progress)
         self.history = history_of(found.moved, CHECK_EVERY)
         fine = found.values * scaled.span + scaled.minimum
         return from_range(fine[0], sample.camera, "disparity").to(sample.depth_lr.dtype)
 
-    def minimised(self, rgb: Tensor, coarse: Tensor, scale: int, progress: Steps | None = None) -> Minimised:
+    def minimise(self, rgb: Tensor, coarse: Tensor, scale: int, progress: Steps | None = None) -> Solution:
         """Return the minimum of E for normalised maps.
 
         Args:
@@ -155,13 +163,13 @@ class TotalGeneralisedVariation:
             progress: as above.
 
         """
-        start = filled(coarse)
+        start = inpaint(coarse)
         if scale > 1 and not bool(coarse.isfinite().all()):
-            start = self.minimised(box_mean(rgb, scale), coarse, 1).values
-        first = upsampled(start, scale)
-        return self._iterated(first, coarse, self.tensors(rgb), progress)
+            start = self.minimise(box_mean(rgb, scale), coarse, 1).values
+        first = upsample_linear_border(start, scale)
+        return self._iterate(first, coarse, self.diffusion_tensors(rgb), progress)
 
-    def tensors(self, rgb: Tensor) -> Tensors:
+    def diffusion_tensors(self, rgb: Tensor) -> Tensors:
         """Return G for (B, 3, H, W) photos; the identity where a photo is constant."""
         slope = gradient(grey(rgb))
         size = slope.square().sum(dim=1).sqrt()
@@ -172,7 +180,7 @@ class TotalGeneralisedVariation:
 
     def objective(self, values: Tensor, slopes: Tensor, coarse: Tensor, tensors: Tensors) -> Tensor:
         """Return E(u, v), (B,); of the data term, 0 where ``data_weight`` is None."""
-        bent = tensors.times(_within(gradient(values) - slopes[:, :, None]))
+        bent = tensors.times(_zero_border(gradient(values) - slopes[:, :, None]))
         total = self.first * _lengths(bent).sum(dim=(1, 2, 3))
         total = total + self.second * _lengths(gradient(slopes)).sum(dim=(1, 2, 3))
         if self.data_weight is None:
@@ -181,7 +189,7 @@ class TotalGeneralisedVariation:
         miss = torch.where(coarse.isfinite(), box_mean(values, scale) - coarse, 0)
         return total + self.data_weight / 2 * scale**2 * miss.square().sum(dim=(1, 2, 3))
 
-    def _iterated(self, first: Tensor, coarse: Tensor, g: Tensors, progress: Steps | None) -> Minimised:
+    def _iterate(self, first: Tensor, coarse: Tensor, g: Tensors, progress: Steps | None) -> Solution:
         """Return what the primal-dual iteration makes of a first map."""
         steps = _Steps.of(g, self.step_ratio)
         data = _DataTerm(coarse, steps.u, self.data_weight)
@@ -191,17 +199,19 @@ class TotalGeneralisedVariation:
         mean_u, mean_v = torch.zeros_like(u), torch.zeros_like(v)
         before, moved, done = u, [], 0
         for done in range(1, self.iterations + 1):
-            gp = _within(g.times(p))
-            near_u = data.nearest(u + steps.u * divergence(gp))
-            near_v = v + steps.v * (gp[:, :, 0] + divergence(q))
-            ahead_u, ahead_v = 2 * near_u - u, 2 * near_v - v
-            near_p = _ball(p + steps.p * g.times(_within(gradient(ahead_u) - ahead_v[:, :, None])), self.first)
-            near_q = _ball(q + steps.q * gradient(ahead_v), self.second)
+            gp = _zero_border(g.times(p))
+            prox_u = data.prox(u + steps.u * divergence(gp))
+            prox_v = v + steps.v * (gp[:, :, 0] + divergence(q))
+            ahead_u, ahead_v = 2 * prox_u - u, 2 * prox_v - v
+            prox_p = _project_ball(
+                p + steps.p * g.times(_zero_border(gradient(ahead_u) - ahead_v[:, :, None])), self.first
+            )
+            prox_q = _project_ball(q + steps.q * gradient(ahead_v), self.second)
             u, v, p, q = (
-                old.lerp(near, _RELAXATION) for old, near in ((u, near_u), (v, near_v), (p, near_p), (q, near_q))
+                old.lerp(near, _RELAXATION) for old, near in ((u, prox_u), (v, prox_v), (p, prox_p), (q, prox_q))
             )
             since = (done - 1) % CHECK_EVERY + 1
-            mean_u, mean_v = mean_u.lerp(near_u, 1 / since), mean_v.lerp(near_v, 1 / since)
+            mean_u, mean_v = mean_u.lerp(prox_u, 1 / since), mean_v.lerp(prox_v, 1 / since)
             if since == CHECK_EVERY:
                 if progress is not None:
                     progress(done, self.iterations)
@@ -211,7 +221,7 @@ class TotalGeneralisedVariation:
                 before = mean_u
         if progress is not None:
             progress(self.iterations, self.iterations)
-        return Minimised(mean_u, mean_v, done, moved)
+        return Solution(mean_u, mean_v, done, moved)
 
 
 class _Steps(NamedTuple):
@@ -230,8 +240,8 @@ class _Steps(NamedTuple):
         """
         root = ratio**0.5
         along_u, along_v = g.uu + g.uv.abs(), g.vv + g.uv.abs()
-        inside = _within(torch.stack((along_u, along_v), dim=1))
-        columns = touching(inside)
+        inside = _zero_border(torch.stack((along_u, along_v), dim=1))
+        columns = sum_adjacent(inside)
         v = _SLOPE / (inside[:, :, 0] + 4)
         p = 1 / ((2 + _SLOPE) * torch.maximum(along_u, along_v))[:, None]
         return cls(1 / (root * columns.clamp(min=1e-6)), v / root, p * root, root / (2 * _SLOPE))
@@ -246,15 +256,15 @@ class _DataTerm:
 
     def __init__(self, coarse: Tensor, steps: Tensor, weight: float | None) -> None:
         self.scale = steps.shape[-1] // coarse.shape[-1]
-        known = coarse.isfinite()
-        self.coarse = torch.where(known, coarse, 0)
+        valid = coarse.isfinite()
+        self.coarse = torch.where(valid, coarse, 0)
         mean = box_mean(steps, self.scale)
-        share = 1 / mean if weight is None else weight / (1 + weight * mean)
-        self.share = steps * repeated(torch.where(known, share, 0), self.scale)
+        gain = 1 / mean if weight is None else weight / (1 + weight * mean)
+        self.gain = steps * repeat_blocks(torch.where(valid, gain, 0), self.scale)
 
-    def nearest(self, u: Tensor) -> Tensor:
+    def prox(self, u: Tensor) -> Tensor:
         """Return the proximal map of u, (B, 1, H, W)."""
-        return u - self.share * repeated(box_mean(u, self.scale) - self.coarse, self.scale)
+        return u - self.gain * repeat_blocks(box_mean(u, self.scale) - self.coarse, self.scale)
 
 
 def slopes(u: Tensor) -> Tensor:
@@ -267,7 +277,7 @@ def slopes(u: Tensor) -> Tensor:
     return v
 
 
-def _within(p: Tensor) -> Tensor:
+def _zero_border(p: Tensor) -> Tensor:
     """Set to 0, in place, what (B, 2, C, H, W) says of differences beyond the border."""
     p[:, 0, ..., -1] = 0
     p[:, 1, ..., -1, :] = 0
@@ -279,6 +289,6 @@ def _lengths(p: Tensor) -> Tensor:
     return p.square().sum(dim=(1, 2), keepdim=True)[:, 0].sqrt()
 
 
-def _ball(p: Tensor, radius: float) -> Tensor:
+def _project_ball(p: Tensor, radius: float) -> Tensor:
     """Return (B, 2, C, H, W) with each pixel's vector or matrix cut to a length."""
     return p / (_lengths(p)[:, None] / radius).clamp(min=1)

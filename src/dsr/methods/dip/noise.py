@@ -14,7 +14,7 @@ _SHARE, _QUANTILE = 0.1, 0.12566
 """A tenth of a normal variable's absolute values are below that many standard deviations."""
 
 
-def noise_level(coarse: Tensor) -> float:
+def estimate_noise(coarse: Tensor) -> float:
     """Return the standard deviation of a depth map's relative noise, estimated from the map alone.
 
     Immerkaer, *Fast Noise Variance Estimation*, CVIU 1996: the difference of two Laplacians, which is 0 on planes and

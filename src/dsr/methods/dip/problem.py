@@ -8,7 +8,7 @@ from typing import Literal, Self
 import torch
 from torch import Tensor
 
-from dsr.degradation.downsampling import Downsampling, downsampled
+from dsr.degradation.downsampling import Downsampling, downsample_depth
 from dsr.geometry.camera import Camera, RangeType
 from dsr.methods.classical.finite_differences import grey
 from dsr.metrics import losses
@@ -69,13 +69,13 @@ class ImageProblem:
             span=max(high - low, _LEAST_SPAN * high),
         )
 
-    def coarsened(self, depth: Tensor) -> Tensor:
+    def downsample(self, depth: Tensor) -> Tensor:
         """Return what the model makes of high-resolution depth, (1, 1, H, W) to (1, 1, h, w), both in metres."""
-        return downsampled(depth, self.camera, self.scale, self.downsampling, self.range_type)[0]
+        return downsample_depth(depth, self.camera, self.scale, self.downsampling, self.range_type)[0]
 
     def residual(self, depth: Tensor) -> Tensor:
         """Return the root mean square of D(depth) / coarse - 1 over the known low-resolution pixels, a scalar."""
-        share = self.coarsened(depth) / self.coarse - 1
+        share = self.downsample(depth) / self.coarse - 1
         known = share.isfinite()
         return (torch.where(known, share, 0).square().sum() / known.sum()).sqrt()
 
@@ -120,7 +120,7 @@ class PriorObjective:
             problem: the image.
 
         """
-        coarse, span = problem.coarsened(depth), problem.span
+        coarse, span = problem.downsample(depth), problem.span
         if self.data_loss == "mse":
             data = losses.mse(coarse / span, problem.coarse / span).mean()
         else:

@@ -66,7 +66,7 @@ class SkipNet(nn.Module):
             x = down(x)
         for side, norm, up in zip(reversed(sides), reversed(self.norm), reversed(self.up), strict=True):
             height, width = side.shape[-2:]
-            x = up(norm(torch.cat((side, doubled(x)[..., :height, :width]), dim=1)))
+            x = up(norm(torch.cat((side, upsample_2x(x)[..., :height, :width]), dim=1)))
         with torch.autocast(x.device.type, enabled=False):  # in bfloat16 depth would come in 256 steps
             return self.last(x.to(self.last.weight.dtype))
 
@@ -79,13 +79,13 @@ def levels_for(height: int, width: int, most: int) -> int:
     return max(levels, 1)
 
 
-def doubled(x: Tensor) -> Tensor:
+def upsample_2x(x: Tensor) -> Tensor:
     """Return (B, C, h, w) bilinearly upsampled to (B, C, 2 h, 2 w): pixels as areas, edges repeated."""
-    result: Tensor = _Doubled.apply(x)
+    result: Tensor = _Upsample2x.apply(x)
     return result
 
 
-class _Doubled(torch.autograd.Function):
+class _Upsample2x(torch.autograd.Function):
     """Bilinear upsampling by slices: the library's backward pass takes several times as long on a CPU."""
 
     @staticmethod

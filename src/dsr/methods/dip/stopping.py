@@ -13,7 +13,7 @@ from typing import Literal, Protocol
 import torch
 from torch import Tensor
 
-from dsr.methods.dip.noise import noise_level
+from dsr.methods.dip.noise import estimate_noise
 
 StoppingName = Literal["fixed", "variance", "residual", "oracle"]
 _EVERY = 20
@@ -134,7 +134,7 @@ class Residual(Fixed):
     """
 
     def __init__(self, coarse: Tensor, residual: Callable[[Tensor], Tensor]) -> None:
-        self.noise = noise_level(coarse)
+        self.noise = estimate_noise(coarse)
         self._residual = residual
 
     def observe(self, step: int, depth: Tensor, average: Tensor) -> bool:

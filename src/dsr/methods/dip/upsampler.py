@@ -24,7 +24,7 @@ from torch.utils.data import DataLoader
 from dsr.degradation.downsampling import Downsampling, scene_generator
 from dsr.geometry.camera import RangeType
 from dsr.methods.dip.callbacks import Advance, Display, Keep, Provenance, Silent, checkpoint_of, cost_of_step
-from dsr.methods.dip.noise import noise_level, normal_noise_deg
+from dsr.methods.dip.noise import estimate_noise, normal_noise_deg
 from dsr.methods.dip.optimisation import PriorOptimisation, PriorSettings
 from dsr.methods.dip.problem import DataLoss, ImageProblem, PriorObjective
 from dsr.methods.dip.skip_net import Padding
@@ -192,7 +192,7 @@ class DeepImagePrior:
 
     def _normals_count(self, sample: DepthSample) -> bool:
         """Return whether the low-resolution map's normals are more than noise."""
-        tilt = normal_noise_deg(noise_level(sample.depth_lr[None]), sample.camera_lr)
+        tilt = normal_noise_deg(estimate_noise(sample.depth_lr[None]), sample.camera_lr)
         return self.largest_tilt is None or tilt <= self.largest_tilt
 
     def _rule(self, problem: ImageProblem) -> Stopping:
@@ -279,7 +279,7 @@ class WarmStarted(DeepImagePrior):
 
 def _noise_of(sample: DepthSample) -> str:
     """Return the noise that is estimated in a low-resolution map, for a reader."""
-    noise = noise_level(sample.depth_lr[None])
+    noise = estimate_noise(sample.depth_lr[None])
     return f"noise of {noise:.2%} tilts the input's normals by {normal_noise_deg(noise, sample.camera_lr):.0f} degrees"
 
 

@@ -14,8 +14,8 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from dsr.geometry.camera import RangeType, from_range, to_range
-from dsr.methods.networks.inpainting import filled
-from dsr.methods.networks.maps import min_max, normalised
+from dsr.methods.networks.inpainting import inpaint
+from dsr.methods.networks.maps import min_max, normalise
 from dsr.methods.tiling import Span, blended, spans
 from dsr.sample import DepthSample
 from dsr.utils.progress import Steps
@@ -108,16 +108,16 @@ class NormalisedNetwork(WindowedNetwork):
     def global_context(self, rgb: Tensor, disparity: Tensor) -> GlobalContext:
         """Return what answers windows: the disparity's range and the context are the whole image's."""
         bounds, context = min_max(disparity), self.context(rgb)
-        return GlobalContext(filled(disparity), lambda photo, window: self._over_range(photo, window, bounds, context))
+        return GlobalContext(inpaint(disparity), lambda photo, window: self._over_range(photo, window, bounds, context))
 
     def context(self, rgb: Tensor) -> tuple[Tensor, ...]:
         """Return what the network takes from the whole photo, (B, 3, H, W)."""
         return ()
 
     def _over_range(self, rgb: Tensor, disparity: Tensor, bounds: Tensor | None, context: tuple[Tensor, ...]) -> Tensor:
-        known = normalised(disparity, bounds)
+        known = normalise(disparity, bounds)
         span = torch.where(known.span > 0, known.span, 1)
-        values = (filled(disparity) - known.minimum) / span
+        values = (inpaint(disparity) - known.minimum) / span
         return self(rgb, values, *context) * span + known.minimum
 
 

@@ -42,7 +42,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from dsr.degradation.downsampling import check_scale
-from dsr.methods.classical.finite_differences import box_mean, upsampled
+from dsr.methods.classical.finite_differences import box_mean, upsample_linear_border
 from dsr.methods.networks.analysis_filters import WIDTHS, influence, penalty, plane_free_basis, zero_mean_basis
 from dsr.methods.networks.base import NormalisedNetwork, expect_photo
 
@@ -105,7 +105,7 @@ class Stage(nn.Module):
 
         """
         scale = x.shape[-1] // coarse.shape[-1]
-        x = x - self.fidelity.to(x) * upsampled(box_mean(x, scale) - coarse, scale)
+        x = x - self.fidelity.to(x) * upsample_linear_border(box_mean(x, scale) - coarse, scale)
         if min(x.shape[-2:]) < self.size:
             return x
         filters = self.filters(x)
@@ -174,7 +174,7 @@ class DynamicGuidance(NormalisedNetwork):
         weight = next(self.parameters())
         with torch.autocast(rgb.device.type, enabled=False):
             photo, coarse = (x.to(torch.promote_types(weight.dtype, torch.float32)) for x in (rgb, values))
-            x = upsampled(coarse, self.scale)
+            x = upsample_linear_border(coarse, self.scale)
             for stage in self.stages:
                 x = stage(x, coarse, photo)
         return x.to(values.dtype)

@@ -23,7 +23,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from dsr.degradation.downsampling import check_scale
-from dsr.methods.classical.finite_differences import extended
+from dsr.methods.classical.finite_differences import extend_linearly
 from dsr.methods.networks.base import NormalisedNetwork, expect_photo
 
 _NEIGHBOURS = 9
@@ -50,7 +50,7 @@ class Stencil(NamedTuple):
 
 def stencil(values: Tensor) -> Stencil:
     """Return the differences of (B, 1, h, w) maps; beyond the border a map goes on linearly."""
-    padded = extended(values, 1)  # (B, 1, h + 2, w + 2)
+    padded = extend_linearly(values, 1)  # (B, 1, h + 2, w + 2)
     left, here, right = padded[..., 1:-1, :-2], padded[..., 1:-1, 1:-1], padded[..., 1:-1, 2:]
     above, below = padded[..., :-2, 1:-1], padded[..., 2:, 1:-1]
     along_u = torch.cat((here - left, (right - left) / 2, right - here), dim=1)

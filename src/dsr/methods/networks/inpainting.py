@@ -7,7 +7,7 @@ from torch import Tensor
 from torch.nn import functional
 
 
-def filled(x: Tensor) -> Tensor:
+def inpaint(x: Tensor) -> Tensor:
     """Return (B, 1, h, w) with its non-finite values replaced by the mean of the known in their 3 x 3, from outside in.
 
     An image without a known value stays as it is.

@@ -19,7 +19,7 @@ class Normalised(NamedTuple):
     span: Tensor
 
 
-def normalised(x: Tensor, bounds: Tensor | None = None) -> Normalised:
+def normalise(x: Tensor, bounds: Tensor | None = None) -> Normalised:
     """Return (x - min) / (max - min) per sample of (B, 1, H, W), over the finite values; the others become 0.
 
     A constant map becomes 0 with a span of 0. Where nothing is finite the minimum is NaN.
@@ -61,7 +61,7 @@ def upsample_bicubic(x: Tensor, scale: int) -> Tensor:
     return functional.interpolate(x, size=size, mode="bicubic", align_corners=False, antialias=True)
 
 
-def coarse_coordinates(fine: Camera, coarse: Camera, device: torch.device | str = "cpu") -> tuple[Tensor, Tensor]:
+def lr_coordinates(fine: Camera, coarse: Camera, device: torch.device | str = "cpu") -> tuple[Tensor, Tensor]:
     """Return the LR row of each HR row, (H,), and the LR column of each HR column, (W,), in float64."""
     rows = torch.arange(fine.height, dtype=torch.float64, device=device)
     columns = torch.arange(fine.width, dtype=torch.float64, device=device)

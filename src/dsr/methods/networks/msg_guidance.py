@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from dsr.methods.classical.finite_differences import LUMA
-from dsr.methods.networks.maps import mean3x3, normalised
+from dsr.methods.networks.maps import mean3x3, normalise
 
 VariantName = Literal["hui", "voynov", "dsr"]
 
@@ -83,8 +83,8 @@ def guidance_map(rgb: Tensor, variant: MSGVariant, traits: Traits | None = None)
     intensity = intensity_of(rgb, variant)
     if variant.plain_guidance:
         return intensity / 127.5 - 1
-    intensity = normalised(intensity, traits and traits.intensity).values
-    return normalised(intensity - mean3x3(intensity), traits and traits.detail).values
+    intensity = normalise(intensity, traits and traits.intensity).values
+    return normalise(intensity - mean3x3(intensity), traits and traits.detail).values
 
 
 def intensity_of(rgb: Tensor, variant: MSGVariant) -> Tensor:

@@ -19,9 +19,9 @@ from torch import Tensor, nn
 
 from dsr.degradation.downsampling import check_scale
 from dsr.methods.networks.base import GlobalContext, WindowedNetwork
-from dsr.methods.networks.inpainting import filled
+from dsr.methods.networks.inpainting import inpaint
 from dsr.methods.networks.layers import ConvLayer, Level
-from dsr.methods.networks.maps import mean3x3, min_max, normalised, upsample_bicubic
+from dsr.methods.networks.maps import mean3x3, min_max, normalise, upsample_bicubic
 from dsr.methods.networks.msg_guidance import VARIANTS, Traits, VariantName, guidance_map, intensity_of
 
 FEATURES = 32
@@ -64,7 +64,7 @@ class MSGNet(WindowedNetwork):
 
         Args:
             guidance: (B, 1, H, W) of :func:`guidance_map`, the size being ``output_size`` of the depth's.
-            depth: (B, 1, h, w) normalised disparity minus its mean, see :func:`normalised`.
+            depth: (B, 1, h, w) normalised disparity minus its mean, see :func:`normalise`.
 
         Returns:
             (B, 1, H, W) residual, in units of the disparity's range.
@@ -97,7 +97,7 @@ class MSGNet(WindowedNetwork):
         """Return what answers windows: ranges, drift and filled holes are the whole image's."""
         bounds = min_max(disparity)
         traits = traits_of(self, rgb, disparity)
-        known = filled(disparity) if self.variant.fill_holes else disparity
+        known = inpaint(disparity) if self.variant.fill_holes else disparity
         return GlobalContext(known, lambda photo, window: upsample_disparity(self, photo, window, bounds, traits))
 
     def output_size(self, depth: Tensor) -> torch.Size:
@@ -165,10 +165,10 @@ def traits_of(net: MSGNet, rgb: Tensor, disparity: Tensor) -> Traits:
     intensity = detail = drift = None
     if not variant.plain_guidance:
         grey = intensity_of(rgb, variant)
-        intensity, grey = min_max(grey), normalised(grey).values
+        intensity, grey = min_max(grey), normalise(grey).values
         detail = min_max(grey - mean3x3(grey))
     if variant.drift_compensation:
-        drift = output_drift(net, guidance_map(rgb, variant), normalised(disparity).values)
+        drift = output_drift(net, guidance_map(rgb, variant), normalise(disparity).values)
     return Traits(intensity, detail, drift)
 
 
@@ -182,7 +182,7 @@ def output_drift(net: MSGNet, guidance: Tensor, disparity: Tensor, *, crop: bool
     Args:
         net: the network, of the ``voynov`` variant.
         guidance: (B, 1, H, W) of :func:`guidance_map`.
-        disparity: (B, 1, h, w) of :func:`normalised`.
+        disparity: (B, 1, h, w) of :func:`normalise`.
         crop: run the network only on the inputs which those pixels see: the same value for far less work.
 
     """
@@ -231,9 +231,9 @@ def upsample_disparity(
         is NaN for a sample without a finite value.
 
     """
-    values, minimum, span = normalised(disparity, bounds)
+    values, minimum, span = normalise(disparity, bounds)
     if net.variant.fill_holes:
-        values = filled(torch.where(disparity.isfinite(), values, torch.nan))
+        values = inpaint(torch.where(disparity.isfinite(), values, torch.nan))
     low_pass = mean3x3(values)
     height, width = net.output_size(values)
     guidance = guidance_map(rgb, net.variant, traits)[..., :height, :width]

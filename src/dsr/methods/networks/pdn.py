@@ -33,7 +33,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from dsr.degradation.downsampling import check_scale
-from dsr.methods.classical.finite_differences import extended, upsampled
+from dsr.methods.classical.finite_differences import extend_linearly, upsample_linear_border
 from dsr.methods.networks.base import NormalisedNetwork, expect_photo
 from dsr.methods.networks.facets import stencil
 from dsr.methods.networks.primal_dual import UnrolledHuber
@@ -109,7 +109,7 @@ class PrimalDualNetwork(NormalisedNetwork):
 
         """
         expect_photo(rgb, values, self.scale)
-        fine = upsampled(values, self.scale)
+        fine = upsample_linear_border(values, self.scale)
         seen, bend = self._seen(rgb, values, fine)
         output = self.head(self.trunk(seen.to(self.head.weight.dtype)))
         with torch.autocast(rgb.device.type, enabled=False):
@@ -118,7 +118,7 @@ class PrimalDualNetwork(NormalisedNetwork):
             strength = self.log_strength.to(output.dtype).exp()
             weights = (-strength * output[:, 1:].abs()).softmax(dim=1) + _TINY
             r = self.window // 2
-            first = extended(fine, 2 * r) + functional.pad(residual, (2 * r,) * 4, mode="replicate")
+            first = extend_linearly(fine, 2 * r) + functional.pad(residual, (2 * r,) * 4, mode="replicate")
             moved = self.stage(first[..., r:-r, :], weights)
             return fine + residual + moved.to(fine.dtype)
 
@@ -134,7 +134,7 @@ class PrimalDualNetwork(NormalisedNetwork):
         size = tuple(fine.shape[-2:])
         bend = functional.interpolate(around.bend.float(), size=size, mode="bilinear")
         slopes = functional.interpolate(coarse.float(), size=size, mode="bilinear")
-        away = (fine - upsampled(around.mean, self.scale)).float()
+        away = (fine - upsample_linear_border(around.mean, self.scale)).float()
         turned = away / bend.clamp(min=torch.finfo(torch.float32).tiny)
         depth = torch.asinh(torch.cat((slopes, away, bend), dim=1) / _FAINT) / 3
         return torch.cat((rgb.float() - 0.5, depth, turned.clamp(-2, 2)), dim=1), bend

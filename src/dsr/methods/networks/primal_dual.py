@@ -110,18 +110,18 @@ class _DualStep(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, p: Tensor, x: Tensor, sigma: Tensor, huber: Tensor, w: Tensor) -> Tensor:
         """Return the dual variable after the step."""
-        shares = torch.addcmul(p, x, sigma).div_(1 + sigma * huber).div_(w).clamp_(-1, 1)
-        ctx.save_for_backward(p, x, sigma, huber, shares)
-        return shares * w
+        fractions = torch.addcmul(p, x, sigma).div_(1 + sigma * huber).div_(w).clamp_(-1, 1)
+        ctx.save_for_backward(p, x, sigma, huber, fractions)
+        return fractions * w
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, ...]:
         """Let the gradient pass to p and x where nothing is clipped, to w elsewhere."""
-        p, x, sigma, huber, shares = ctx.saved_tensors
+        p, x, sigma, huber, fractions = ctx.saved_tensors
         keep = 1 / (1 + sigma * huber)
-        within = torch.ops.aten.hardtanh_backward(gradients[0], shares, -1.0, 1.0)
-        of_w = (gradients[0] - within).mul_(shares)
+        within = torch.ops.aten.hardtanh_backward(gradients[0], fractions, -1.0, 1.0)
+        of_w = (gradients[0] - within).mul_(fractions)
         of_p, of_x = (torch.dot(within.flatten(), each.flatten()) for each in (p, x))
         numerator = of_p + sigma * of_x
         of_sigma = keep * of_x - keep.square() * huber * numerator
@@ -144,7 +144,7 @@ class _Sums(torch.autograd.Function):
         return _Differences.apply(gradients[0], ctx.offsets), None
 
 
-def unrolled(
+def unroll(
     slopes: Tensor, weights: Tensor, steps: Sequence[Step], data: Tensor | float, huber: Tensor | float, window: int
 ) -> Tensor:
     """Return u - f after a number of steps.
@@ -237,7 +237,7 @@ class UnrolledHuber(nn.Module):
         dtype = weights.dtype
         slopes = pair_differences(first, self.offsets).to(dtype)
         data, huber = self.log_data.to(dtype).exp(), self.log_huber.to(dtype).exp()
-        return unrolled(slopes, weights, self.steps(dtype), data, huber, self.window)
+        return unroll(slopes, weights, self.steps(dtype), data, huber, self.window)
 
 
 def _radius(offsets: Sequence[Offset]) -> int:

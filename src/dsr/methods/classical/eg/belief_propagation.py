@@ -42,7 +42,7 @@ class Labelling(NamedTuple):
     history: list[dict[str, float]]
 
 
-def labelled(
+def label(
     unary: Tensor,
     pairs: Tensor,
     costs: Tensor,

@@ -12,9 +12,9 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from dsr.methods.classical.finite_differences import box_mean, repeated, upsampled
-from dsr.methods.classical.photo_guided import slopes_along
-from dsr.methods.networks.inpainting import filled
+from dsr.methods.classical.finite_differences import box_mean, repeat_blocks, upsample_linear_border
+from dsr.methods.classical.photo_guided import estimate_slopes
+from dsr.methods.networks.inpainting import inpaint
 
 _CHUNK = 4096
 """Low-resolution pixels whose ways are looked for at once."""
@@ -31,7 +31,7 @@ class _Planes(NamedTuple):
     trust: Tensor
 
 
-def filtered(
+def bilateral_filter(
     coarse: Tensor,
     barrier: Tensor,
     scale: int,
@@ -57,21 +57,21 @@ def filtered(
     """
     known = coarse.isfinite()
     doubtful = torch.zeros_like(known) if doubtful is None else doubtful
-    whole = filled(coarse[None, None])
+    whole = inpaint(coarse[None, None])
     cut = functional.max_pool2d(barrier[None, None].float(), scale)[0, 0] > 0
     clean = coarse.masked_fill(doubtful, torch.nan)
     trust = torch.where(cut | doubtful, mixed, 1.0).to(coarse) * known
-    planes = _Planes(whole[0, 0], slopes_along(clean, 0), slopes_along(clean, 1), trust)
-    smooth = upsampled(whole, scale)[0, 0]
-    reach = reachable(barrier, scale, radius)
-    fine = _between(_means(planes, reach, scale, sigma_space, smooth), barrier, whole, smooth, scale)
+    planes = _Planes(whole[0, 0], estimate_slopes(clean, 0), estimate_slopes(clean, 1), trust)
+    smooth = upsample_linear_border(whole, scale)[0, 0]
+    reach = find_reachable(barrier, scale, radius)
+    fine = _fill_edges(_filter(planes, reach, scale, sigma_space, smooth), barrier, whole, smooth, scale)
     if sharp:
         _take_sides(reach, barrier, fine, scale)
-        fine = torch.where(barrier, _means(planes, reach, scale, sigma_space, smooth), fine)
-    return fine.masked_fill(~repeated(known[None, None], scale)[0, 0], torch.nan)
+        fine = torch.where(barrier, _filter(planes, reach, scale, sigma_space, smooth), fine)
+    return fine.masked_fill(~repeat_blocks(known[None, None], scale)[0, 0], torch.nan)
 
 
-def reachable(barrier: Tensor, scale: int, radius: int) -> Tensor:
+def find_reachable(barrier: Tensor, scale: int, radius: int) -> Tensor:
     """Return which low-resolution pixels each high-resolution pixel has a way to that crosses no edge.
 
     A way starts in the middle of the low-resolution pixel, goes over 4-connected high-resolution pixels that are no
@@ -93,19 +93,19 @@ def reachable(barrier: Tensor, scale: int, radius: int) -> Tensor:
     windows = padded.unfold(0, side * scale, scale).unfold(1, side * scale, scale).flatten(0, 1)
     ways = torch.ones_like(windows)
     for some in windows.flatten(1).any(dim=1).nonzero()[:, 0].split(_CHUNK):
-        ways[some] = _flooded(~windows[some])
+        ways[some] = _flood(~windows[some])
     ways = ways.view(height, width, side, scale, side, scale)
     result = barrier.new_zeros(side, side, height, scale, width, scale)
     for a in range(-radius, radius + 1):
-        rows, from_rows = _shifted(a, height)
+        rows, from_rows = _shift(a, height)
         for b in range(-radius, radius + 1):
-            columns, from_columns = _shifted(b, width)
+            columns, from_columns = _shift(b, width)
             there = ways[from_rows, from_columns, radius - a, :, radius - b]
             result[radius + a, radius + b, rows, :, columns] = there.transpose(1, 2)
     return result.view(side, side, *barrier.shape)
 
 
-def _means(planes: _Planes, reach: Tensor, scale: int, sigma_space: float, smooth: Tensor) -> Tensor:
+def _filter(planes: _Planes, reach: Tensor, scale: int, sigma_space: float, smooth: Tensor) -> Tensor:
     """Return the weighted means of the planes, (H, W); where no weight is, the smooth map."""
     height, width = planes.values.shape
     rows, columns = (torch.arange(n, device=smooth.device) for n in smooth.shape)
@@ -124,14 +124,14 @@ def _means(planes: _Planes, reach: Tensor, scale: int, sigma_space: float, smoot
     return torch.where(weights > 0, total / torch.where(weights > 0, weights, 1), smooth)
 
 
-def _between(fine: Tensor, barrier: Tensor, coarse: Tensor, smooth: Tensor, scale: int) -> Tensor:
+def _fill_edges(fine: Tensor, barrier: Tensor, coarse: Tensor, smooth: Tensor, scale: int) -> Tensor:
     """Return the high-resolution map with new values on edges: the smooth map, moved as the means of blocks need.
 
     They stay between the least and the most of the neighbours off the edge.
     """
     start = torch.where(barrier, smooth, fine)[None, None]
     share = box_mean(barrier[None, None].to(fine), scale)
-    missing = repeated((coarse - box_mean(start, scale)) / torch.where(share > 0, share, 1), scale)
+    missing = repeat_blocks((coarse - box_mean(start, scale)) / torch.where(share > 0, share, 1), scale)
     beside = torch.cat((start, -start)).masked_fill(barrier, -torch.inf)
     most, least = functional.max_pool2d(beside, 3, stride=1, padding=1).unbind(0)
     value = (start + missing)[0].clamp(-least, most)
@@ -159,7 +159,7 @@ def _take_sides(reach: Tensor, barrier: Tensor, fine: Tensor, scale: int) -> Non
     reach[:, :, places[:, 0], places[:, 1]] = seen & within[:, None, :, 0] & within[None, :, :, 1]
 
 
-def _flooded(free: Tensor) -> Tensor:
+def _flood(free: Tensor) -> Tensor:
     """Return the pixels of windows (N, K, K) that 4-connected ways over free pixels lead to from the middle."""
     size = free.shape[-1]
     middle = slice((size - 1) // 2, size // 2 + 1)
@@ -177,6 +177,6 @@ def _flooded(free: Tensor) -> Tensor:
         reached = new
 
 
-def _shifted(by: int, size: int) -> tuple[slice, slice]:
+def _shift(by: int, size: int) -> tuple[slice, slice]:
     """Return the places of a line whose neighbour so far on there is, and these neighbours."""
     return slice(max(-by, 0), size - max(by, 0)), slice(max(by, 0), size - max(-by, 0))

@@ -30,21 +30,21 @@ from torch import Tensor
 from torch.nn import functional
 
 from dsr.methods.base import NoSolutionError
-from dsr.methods.classical.eg.belief_propagation import Labelling, labelled
+from dsr.methods.classical.eg.belief_propagation import Labelling, label
 from dsr.methods.classical.eg.patches import (
     PATCH,
     Patches,
-    averaged,
-    distinct,
-    nearest,
+    average_patches,
+    deduplicate,
+    extract_patches,
+    find_nearest,
+    find_overlaps,
     no_patches,
-    overlaps,
-    taken,
-    turned,
+    orient,
 )
-from dsr.methods.classical.finite_differences import box_mean, extended, upsampled
-from dsr.methods.classical.photo_guided import slopes_along
-from dsr.methods.networks.inpainting import filled
+from dsr.methods.classical.finite_differences import box_mean, extend_linearly, upsample_linear_border
+from dsr.methods.classical.photo_guided import estimate_slopes
+from dsr.methods.networks.inpainting import inpaint
 from dsr.utils.progress import Steps
 
 KEPT = 0.2
@@ -59,7 +59,7 @@ _AROUND = ((0, 1), (0, 2), (1, 2), (2, 2), (2, 1), (2, 0), (1, 0), (0, 0))
 """Rows and columns of the 8 neighbours in a 3 x 3 window, clockwise from the one above."""
 
 
-def edge_map(
+def predict_edge_map(
     coarse: Tensor,
     scale: int,
     step: float,
@@ -86,63 +86,63 @@ def edge_map(
 
     """
     border = -(-(PATCH // 2 + 1) // scale)
-    found = edges(extended(coarse[None, None], border)[0, 0], scale, step)
+    found = detect_edges(extend_linearly(coarse[None, None], border)[0, 0], scale, step)
     within = (slice(border * scale, -border * scale),) * 2
     if not bool(found[within].any()):
         return torch.zeros_like(found[within]), None
-    known = recurring(coarse, scale, step)
+    known = find_recurring(coarse, scale, step)
     if len(known.low) == 0:
         raise NoSolutionError(
             f"edge-guided upsampling: the edges of a map of {coarse.shape[0]} x {coarse.shape[1]} pixels do not recur "
             f"at 1/{scale} of its size, so nothing tells how high-resolution ones look"
         )
-    places = _places(found)
-    far, which = nearest(taken(found, places), known, candidates, sharp_weight)
+    places = _patch_centres(found)
+    far, which = find_nearest(extract_patches(found, places), known, candidates, sharp_weight)
     patches = known.high.flatten(1)[which].float()  # (N, K, PATCH^2)
-    pairs, costs = overlaps(places, patches)
-    answer = labelled(far / PATCH**2, pairs, smoothness * costs, iterations, progress=progress)
+    pairs, costs = find_overlaps(places, patches)
+    answer = label(far / PATCH**2, pairs, smoothness * costs, iterations, progress=progress)
     chosen = patches[torch.arange(len(patches), device=patches.device), answer.labels]
-    mean = averaged(chosen, places, (found.shape[0], found.shape[1]))
-    return _large(thinned(mean > KEPT))[within], answer
+    mean = average_patches(chosen, places, (found.shape[0], found.shape[1]))
+    return _drop_small(thin(mean > KEPT))[within], answer
 
 
-def edges(coarse: Tensor, scale: int, step: float) -> Tensor:
+def detect_edges(coarse: Tensor, scale: int, step: float) -> Tensor:
     """Return the steps of a map (h, w) upsampled by ``scale``, (h * scale, w * scale) bool, about a pixel wide.
 
     Canny, *A Computational Approach to Edge Detection*, PAMI 1986: pixels whose gradient is the largest along its
     direction and large enough, or less large and connected with such. A step of height s between low-resolution pixels
-    has a gradient of s / 2 at least. Only as much of a gradient counts as exceeds the slope of the surface (see
-    :func:`dsr.methods.classical.photo_guided.slopes_along`) there or at a low-resolution pixel beside: planes have no
-    edge, however steep, and nor has what a hole (NaN) is filled with.
+    has a gradient of at least s / 2. A gradient counts only by how much it exceeds the slope of the surface (see
+    :func:`dsr.methods.classical.photo_guided.estimate_slopes`) there or at a neighbouring low-resolution pixel. So a
+    plane has no edge, however steep it is, and neither has an inpainted hole.
     """
-    fine = upsampled(filled(coarse[None, None]), scale)[0, 0]
-    down, across = (_central(fine, axis) * scale for axis in (0, 1))
+    fine = upsample_linear_border(inpaint(coarse[None, None]), scale)[0, 0]
+    down, across = (_central_difference(fine, axis) * scale for axis in (0, 1))
     strength = (down.square() + across.square()).sqrt()
-    excess = [(_central(coarse, axis) - slopes_along(coarse, axis)).square() for axis in (0, 1)]
+    excess = [(_central_difference(coarse, axis) - estimate_slopes(coarse, axis)).square() for axis in (0, 1)]
     most = functional.max_pool2d((excess[0] + excess[1]).sqrt().nan_to_num(nan=0.0)[None, None], 3, stride=1, padding=1)
     most = most.repeat_interleave(scale, 2).repeat_interleave(scale, 3)[0, 0]
-    ridge = torch.minimum(strength, most) * _largest_across(strength, down, across)
+    ridge = torch.minimum(strength, most) * _is_ridge(strength, down, across)
     strong, weak = ridge > step / 2, ridge > _WEAK * step / 2
-    return _large(_grown(strong, weak))
+    return _drop_small(_grow(strong, weak))
 
 
-def recurring(coarse: Tensor, scale: int, step: float) -> Patches:
+def find_recurring(coarse: Tensor, scale: int, step: float) -> Patches:
     """Return what the map (h, w) itself teaches, at a level ``scale`` times coarser; empty where it is too small."""
     height, width = (n - n % scale for n in coarse.shape)
     if min(height, width) < max(PATCH, 2 * scale):
         return no_patches(coarse.device)
     truth = coarse[:height, :width]
-    low, high = edges(box_mean(truth[None, None], scale)[0, 0], scale, step), edges(truth, 1, step)
+    low, high = detect_edges(box_mean(truth[None, None], scale)[0, 0], scale, step), detect_edges(truth, 1, step)
     reach = PATCH // 2
     places = low[reach : height - reach, reach : width - reach].nonzero() + reach
-    lows, highs = taken(low, places), taken(high, places)
+    lows, highs = extract_patches(low, places), extract_patches(high, places)
     first, second = lows.sum(dim=(1, 2)), highs.sum(dim=(1, 2))
     enough = min(2 * scale, PATCH - 3)
     kept = (first > enough) & (second > enough) & ((first - second).abs() < 0.8 * PATCH)
-    return distinct(Patches(turned(lows[kept]), turned(highs[kept])))
+    return deduplicate(Patches(orient(lows[kept]), orient(highs[kept])))
 
 
-def thinned(mask: Tensor) -> Tensor:
+def thin(mask: Tensor) -> Tensor:
     """Return a mask (H, W) thinned to lines about a pixel wide that connect what it connects.
 
     Zhang, Suen, *A Fast Parallel Algorithm for Thinning Digital Patterns*, CACM 27(3), 1984.
@@ -166,12 +166,12 @@ def _neighbours(x: Tensor) -> Tensor:
     return torch.stack([padded[v : v + height, u : u + width] for v, u in _AROUND])
 
 
-def _central(x: Tensor, axis: int) -> Tensor:
+def _central_difference(x: Tensor, axis: int) -> Tensor:
     """Return the central difference along an axis, one-sided at the border, 0 along a single pixel."""
     return torch.gradient(x, dim=axis)[0] if x.shape[axis] > 1 else torch.zeros_like(x)
 
 
-def _largest_across(strength: Tensor, down: Tensor, across: Tensor) -> Tensor:
+def _is_ridge(strength: Tensor, down: Tensor, across: Tensor) -> Tensor:
     """Return where the strength is the largest of three pixels along the gradient, (H, W) bool; of equal ones one.
 
     The gradient's direction is rounded to the nearest of the 8 neighbours'.
@@ -181,7 +181,7 @@ def _largest_across(strength: Tensor, down: Tensor, across: Tensor) -> Tensor:
     return (strength > ring.gather(0, turn)[0]) & (strength >= ring.gather(0, turn + 4)[0])
 
 
-def _grown(strong: Tensor, weak: Tensor) -> Tensor:
+def _grow(strong: Tensor, weak: Tensor) -> Tensor:
     """Return the weak pixels that are connected with strong ones."""
     grown = strong & weak
     while True:
@@ -191,14 +191,14 @@ def _grown(strong: Tensor, weak: Tensor) -> Tensor:
         grown = new
 
 
-def _large(mask: Tensor) -> Tensor:
+def _drop_small(mask: Tensor) -> Tensor:
     """Return a mask without the pixels that have less than ``_SMALLEST`` in the window that so many can span."""
     size = 2 * _SMALLEST - 1
     number = functional.avg_pool2d(mask[None, None].float(), size, 1, size // 2, divisor_override=1)[0, 0]
     return mask & (number > _SMALLEST - 0.5)
 
 
-def _places(found: Tensor) -> Tensor:
+def _patch_centres(found: Tensor) -> Tensor:
     """Return the first edge pixel of each cell, as far inside as a patch needs, (N, 2)."""
     reach = PATCH // 2
     places = found[reach:-reach, reach:-reach].nonzero() + reach

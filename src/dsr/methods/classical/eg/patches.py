@@ -32,19 +32,19 @@ def no_patches(device: torch.device) -> Patches:
     return Patches(none, none)
 
 
-def taken(mask: Tensor, places: Tensor) -> Tensor:
+def extract_patches(mask: Tensor, places: Tensor) -> Tensor:
     """Return the patches of a mask (H, W) around places (N, 2), rows and columns that far inside."""
     reach = torch.arange(PATCH, device=mask.device) - PATCH // 2
     return mask[places[:, 0, None, None] + reach[:, None], places[:, 1, None, None] + reach]
 
 
-def turned(patches: Tensor) -> Tensor:
+def orient(patches: Tensor) -> Tensor:
     """Return patches in their 8 orientations, (8 N, PATCH, PATCH): turned by right angles and mirrored."""
     quarters = [patches.rot90(k, (1, 2)) for k in range(4)]
     return torch.cat(quarters + [each.mT for each in quarters])
 
 
-def distinct(patches: Patches) -> Patches:
+def deduplicate(patches: Patches) -> Patches:
     """Return the pairs without repetitions, in an order of their own."""
     pixels = 2 * PATCH**2
     bits = torch.cat((patches.low.flatten(1), patches.high.flatten(1)), dim=1).long()
@@ -55,7 +55,7 @@ def distinct(patches: Patches) -> Patches:
     return Patches(*bits.bool().unflatten(1, (2, PATCH, PATCH)).unbind(1))
 
 
-def distances(patches: Tensor) -> Tensor:
+def edge_distances(patches: Tensor) -> Tensor:
     """Return each pixel's Euclidean distance from the edges of its patch, (N, PATCH, PATCH) float32.
 
     Infinite in a patch without an edge.
@@ -66,10 +66,10 @@ def distances(patches: Tensor) -> Tensor:
     return (along[:, None] + square[:, :, None]).amin(dim=2).sqrt()
 
 
-def nearest(query: Tensor, known: Patches, count: int, weight: float) -> tuple[Tensor, Tensor]:
+def find_nearest(query: Tensor, known: Patches, count: int, weight: float) -> tuple[Tensor, Tensor]:
     """Return the known pairs most like patches, as squared distances and as numbers, (N, count) each; the best first.
 
-    |D(query) - D(low)|^2 + weight^2 |query - high|^2, D being :func:`distances`.
+    |D(query) - D(low)|^2 + weight^2 |query - high|^2, D being :func:`edge_distances`.
     """
     there = _features(known.low, known.high, weight)
     length = there.square().sum(dim=1)
@@ -83,7 +83,7 @@ def nearest(query: Tensor, known: Patches, count: int, weight: float) -> tuple[T
     return torch.cat(far), torch.cat(which)
 
 
-def overlaps(places: Tensor, patches: Tensor) -> tuple[Tensor, Tensor]:
+def find_overlaps(places: Tensor, patches: Tensor) -> tuple[Tensor, Tensor]:
     """Return the pairs of patches that overlap, (E, 2), and how their candidates disagree there, (E, K, K).
 
     A disagreement is the sum of squared differences over the pixels that both cover.
@@ -108,7 +108,7 @@ def overlaps(places: Tensor, patches: Tensor) -> tuple[Tensor, Tensor]:
     return torch.cat(pairs), torch.cat(costs)
 
 
-def averaged(patches: Tensor, places: Tensor, shape: tuple[int, int]) -> Tensor:
+def average_patches(patches: Tensor, places: Tensor, shape: tuple[int, int]) -> Tensor:
     """Return the mean of the patches (N, PATCH^2) that cover each pixel, (H, W); 0 where none does."""
     total, number = patches.new_zeros(shape), patches.new_zeros(shape)
     for k in range(PATCH**2):  # of one k no two fall on the same pixel
@@ -119,7 +119,7 @@ def averaged(patches: Tensor, places: Tensor, shape: tuple[int, int]) -> Tensor:
 
 
 def _features(low: Tensor, high: Tensor, weight: float) -> Tensor:
-    return torch.cat((distances(low).flatten(1), weight * high.flatten(1).float()), dim=1)
+    return torch.cat((edge_distances(low).flatten(1), weight * high.flatten(1).float()), dim=1)
 
 
 def _disagreement(first: Tensor, second: Tensor, down: int, across: int) -> Tensor:

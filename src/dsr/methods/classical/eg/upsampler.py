@@ -40,10 +40,10 @@ import torch
 from torch import Tensor
 
 from dsr.geometry.camera import RangeType, from_range, to_range
-from dsr.methods.classical.eg.bilateral import filtered
-from dsr.methods.classical.eg.edge_map import edge_map
-from dsr.methods.classical.photo_guided import positive
-from dsr.methods.networks.inpainting import filled
+from dsr.methods.classical.eg.bilateral import bilateral_filter
+from dsr.methods.classical.eg.edge_map import predict_edge_map
+from dsr.methods.classical.photo_guided import expect_positive
+from dsr.methods.networks.inpainting import inpaint
 from dsr.sample import DepthSample
 from dsr.utils.progress import Steps, part_of
 
@@ -88,8 +88,8 @@ class EdgeGuided:
         *,
         fill_holes: bool = False,
     ) -> None:
-        positive("edge-guided upsampling", step=step, sharp_weight=sharp_weight, smoothness=smoothness)
-        positive("edge-guided upsampling", sigma_space=sigma_space, mixed=mixed)
+        expect_positive("edge-guided upsampling", step=step, sharp_weight=sharp_weight, smoothness=smoothness)
+        expect_positive("edge-guided upsampling", sigma_space=sigma_space, mixed=mixed)
         for name, value in (("candidates", candidates), ("iterations", iterations), ("radius", radius)):
             if value < 1:
                 raise ValueError(f"{name}: expected at least 1 for edge-guided upsampling, got {value}")
@@ -117,7 +117,7 @@ class EdgeGuided:
             told = part_of(progress, number * self._iterations, len(stages) * self._iterations)
             doubtful = barrier
             barrier = self._edges(fine, scale, self._step * (most - least), told)
-            fine = filtered(
+            fine = bilateral_filter(
                 fine,
                 barrier,
                 scale,
@@ -130,12 +130,12 @@ class EdgeGuided:
         doffs = sample.camera.doffs  # disparity + doffs is inverse depth
         fine = fine.clamp((least + doffs) / _BEYOND - doffs, (most + doffs) * _BEYOND - doffs)
         if self._fill_holes:
-            fine = filled(fine[None, None])[0, 0]
+            fine = inpaint(fine[None, None])[0, 0]
         return from_range(fine[None], sample.camera, "disparity").to(sample.depth_lr)
 
     def _edges(self, coarse: Tensor, scale: int, step: float, told: Steps | None) -> Tensor:
         """Return the high-resolution edge map of a map (h, w), and add to the history how it was found."""
-        barrier, answer = edge_map(
+        barrier, answer = predict_edge_map(
             coarse, scale, step, self._candidates, self._sharp_weight, self._smoothness, self._iterations, told
         )
         if told is not None:

@@ -23,9 +23,16 @@ import torch
 from torch import Tensor
 
 from dsr.methods.classical.conjugate_gradients import conjugate_gradients
-from dsr.methods.classical.finite_differences import box_mean, repeated
-from dsr.methods.classical.srfs.potts import Regions, boundary_length, fitted, fused
-from dsr.methods.classical.srfs.shading import area_of, best_lighting, by_theta, photometry, shading_of, surface_of
+from dsr.methods.classical.finite_differences import box_mean, repeat_blocks
+from dsr.methods.classical.srfs.potts import Regions, boundary_length, fit_albedo, fuse
+from dsr.methods.classical.srfs.shading import (
+    chain_to_theta,
+    compute_area,
+    compute_shading,
+    compute_surface,
+    fit_lighting,
+    linearise_photometry,
+)
 
 _CG_ITERATIONS, _CG_TOLERANCE = 60, 1e-6
 _INNER = 3
@@ -140,20 +147,20 @@ class ShadingSolver:
         The first call replaces the photo, which stands for the albedo before it.
         """
         photo, inside = self.problem.photo, self.problem.inside
-        shading = shading_of(surface_of(self.theta, self.problem.rays).normals, self.lighting)
+        shading = compute_shading(compute_surface(self.theta, self.problem.rays).normals, self.lighting)
         found = []
         if self.regions is not None:
             found.append(self.regions)
         if anew or not found:
-            found.append(fused(photo, shading, self.weights.boundary, inside))
-        tried = [(fitted(photo, shading, regions), regions) for regions in found]
+            found.append(fuse(photo, shading, self.weights.boundary, inside))
+        tried = [(fit_albedo(photo, shading, regions), regions) for regions in found]
         energies = [self._shading_energy(albedo, shading) + self._boundaries(regions) for albedo, regions in tried]
         self.albedo, self.regions = tried[energies.index(min(energies))]
 
     def update_lighting(self) -> None:
         """Take the best lighting."""
-        normals = surface_of(self.theta, self.problem.rays).normals
-        lighting = best_lighting(self.problem.photo, self.albedo, normals, self._weight)
+        normals = compute_surface(self.theta, self.problem.rays).normals
+        lighting = fit_lighting(self.problem.photo, self.albedo, normals, self._weight)
         self.lighting = lighting.to(self.problem.photo)
 
     def update_theta(self) -> None:
@@ -162,7 +169,7 @@ class ShadingSolver:
         theta, damping = self.theta, self._damping
         energy = self._pixel_energy(theta, target)
         for _ in range(_INNER):
-            near = theta - _solved(*self._quadratic(theta, target), damping)
+            near = theta - _solve(*self._quadratic(theta, target), damping)
             lower = self._pixel_energy(near, target)
             better = lower < energy
             theta, energy = torch.where(better, near, theta), torch.where(better, lower, energy)
@@ -203,11 +210,11 @@ class ShadingSolver:
     def terms(self, theta: Tensor | None = None) -> dict[str, float]:
         """Return E's ``shading``, ``data``, ``area`` and ``boundaries``; without theta, of z alone."""
         theta = self.slopes(self.z) if theta is None else theta
-        surface = surface_of(theta, self.problem.rays)
+        surface = compute_surface(theta, self.problem.rays)
         return {
-            "shading": self._shading_energy(self.albedo, shading_of(surface.normals, self.lighting)),
+            "shading": self._shading_energy(self.albedo, compute_shading(surface.normals, self.lighting)),
             "data": 0.5 * self.weights.data * float((self._coarse - self._means(self.z)).square().sum()),
-            "area": self.weights.area * float((self._weight * area_of(theta, surface)).sum()),
+            "area": self.weights.area * float((self._weight * compute_area(theta, surface)).sum()),
             "boundaries": 0.0 if self.regions is None else self._boundaries(self.regions),
         }
 
@@ -216,7 +223,7 @@ class ShadingSolver:
 
     def _spread(self, coarse: Tensor) -> Tensor:
         """Return the adjoint of the means."""
-        return repeated(coarse, self.problem.scale) / self.problem.scale**2
+        return repeat_blocks(coarse, self.problem.scale) / self.problem.scale**2
 
     def _shading_energy(self, albedo: Tensor, shading: Tensor) -> float:
         return 0.5 * float((self._weight * (albedo * shading - self.problem.photo).square()).sum())
@@ -226,21 +233,21 @@ class ShadingSolver:
 
     def _pixel_energy(self, theta: Tensor, target: Tensor) -> Tensor:
         """Return what a theta costs in each pixel, (B, 1, H, W)."""
-        surface = surface_of(theta, self.problem.rays)
-        missed = self.albedo * shading_of(surface.normals, self.lighting) - self.problem.photo
-        own = 0.5 * missed.square().sum(dim=1, keepdim=True) + self.weights.area * area_of(theta, surface)
+        surface = compute_surface(theta, self.problem.rays)
+        missed = self.albedo * compute_shading(surface.normals, self.lighting) - self.problem.photo
+        own = 0.5 * missed.square().sum(dim=1, keepdim=True) + self.weights.area * compute_area(theta, surface)
         bound = 0.5 * self.penalty * (self._coupling * (theta - target).square()).sum(dim=1, keepdim=True)
         return self._weight * own + bound
 
     def _quadratic(self, theta: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
         """Return gradient (B, 3, H, W) and an approximate Hessian (B, 6, H, W): its upper triangle, row by row."""
         problem, weights = self.problem, self.weights
-        surface = surface_of(theta, problem.rays)
+        surface = compute_surface(theta, problem.rays)
         n = surface.normals
-        seen = photometry(problem.photo, self.albedo, self.lighting, surface, problem.rays)
+        seen = linearise_photometry(problem.photo, self.albedo, self.lighting, surface, problem.rays)
         gradient = (seen.residual[:, :, None] * seen.slopes).sum(dim=1)
         depth = theta[:, 2:]
-        size = by_theta(n, problem.rays)  # the derivative of |m|
+        size = chain_to_theta(n, problem.rays)  # the derivative of |m|
         gradient = gradient + weights.area * depth.abs() * size
         gradient[:, 2:] += weights.area * depth.sign() * surface.length
         curved = weights.area * depth.abs() / surface.length
@@ -262,7 +269,7 @@ class ShadingSolver:
         return gradient * self._weight + self.penalty * self._coupling * (theta - target), hessian
 
 
-def _solved(gradient: Tensor, hessian: Tensor, damping: Tensor) -> Tensor:
+def _solve(gradient: Tensor, hessian: Tensor, damping: Tensor) -> Tensor:
     """Return the inverse of the Hessian, its diagonal raised by ``damping`` of it, times the gradient."""
     a, b, c, d, e, f = hessian.unbind(dim=1)
     more = 1 + damping[:, 0]

@@ -67,7 +67,7 @@ class _Borders(NamedTuple):
     length: Tensor
 
 
-def fused(photo: Tensor, shading: Tensor, weight: float, inside: Tensor | None = None) -> Regions:
+def fuse(photo: Tensor, shading: Tensor, weight: float, inside: Tensor | None = None) -> Regions:
     """Return regions that are a local minimum of E.
 
     Args:
@@ -88,18 +88,18 @@ def fused(photo: Tensor, shading: Tensor, weight: float, inside: Tensor | None =
     turn = 0
     for level in range(_LEVELS, -1, -1):
         price = weight / _GROWTH**level
-        while (parent := _stars(fits, borders, price, turn)) is not None:
+        while (parent := _choose_fusions(fits, borders, price, turn)) is not None:
             turn += 1
             roots = parent == torch.arange(len(parent), device=parent.device)
             renamed = (roots.cumsum(0) - 1)[parent]
             joined = ~roots
             fits = _Fits(*(each.index_add(0, parent[joined], each[joined])[roots] for each in fits))
-            borders = _joined(borders, renamed, len(fits.squares))
+            borders = _merge_borders(borders, renamed, len(fits.squares))
             labels = renamed[labels]
     return Regions(labels.reshape(batch, height, width), len(fits.squares))
 
 
-def fitted(photo: Tensor, shading: Tensor, regions: Regions) -> Tensor:
+def fit_albedo(photo: Tensor, shading: Tensor, regions: Regions) -> Tensor:
     """Return the best albedo that is constant in regions, (B, C, H, W)."""
     channels = photo.shape[1]
     flat = regions.labels.reshape(-1)
@@ -129,7 +129,7 @@ def _borders(labels: Tensor, inside: Tensor | None) -> _Borders:
     return _Borders(one, other, torch.ones_like(one))
 
 
-def _stars(fits: _Fits, borders: _Borders, price: float, turn: int) -> Tensor | None:
+def _choose_fusions(fits: _Fits, borders: _Borders, price: float, turn: int) -> Tensor | None:
     """Return what each region becomes part of, (count,), None where no fusion of two lowers E.
 
     Each region's best neighbour is the one with the least cost of fusing for a unit of the boundary that this saves.
@@ -146,32 +146,32 @@ def _stars(fits: _Fits, borders: _Borders, price: float, turn: int) -> Tensor | 
     ends = torch.cat((torch.stack((one, other)), torch.stack((other, one))), dim=1)[:, cheap.repeat(2)]
     length, cost = length[cheap].repeat(2), cost[cheap].repeat(2)
     count = len(worth)
-    takes = (_hashed(torch.arange(count, device=one.device) + turn * count) & 1).bool()
-    leaf, centre, length, cost = _kept(~takes[ends[0]] & takes[ends[1]], ends[0], ends[1], length, cost)
-    leaf, centre, length, cost = _kept(_first(leaf, cost, count), leaf, centre, length, cost)
+    takes = (_hash(torch.arange(count, device=one.device) + turn * count) & 1).bool()
+    leaf, centre, length, cost = _select(~takes[ends[0]] & takes[ends[1]], ends[0], ends[1], length, cost)
+    leaf, centre, length, cost = _select(_is_cheapest(leaf, cost, count), leaf, centre, length, cost)
     union = _Fits(*(each.index_add(0, centre, each[leaf]) for each in fits))
     lost = worth.index_add(0, centre, worth[leaf]) - union.worth()
     saved = torch.zeros_like(worth).index_add_(0, centre, price * length.to(worth))
-    alone = _first(centre, cost, count)
+    alone = _is_cheapest(centre, cost, count)
     parent = torch.arange(count, device=one.device)
     joins = (lost < saved)[centre] | alone
     parent[leaf[joins]] = centre[joins]
     return parent
 
 
-def _first(owner: Tensor, cost: Tensor, count: int) -> Tensor:
+def _is_cheapest(owner: Tensor, cost: Tensor, count: int) -> Tensor:
     """Return which entry is the cheapest of its owner, one each; ties are broken by a hash."""
     least = cost.new_full((count,), torch.inf).scatter_reduce_(0, owner, cost, "amin")
-    number = _hashed(torch.arange(len(owner), device=owner.device))
+    number = _hash(torch.arange(len(owner), device=owner.device))
     number = torch.where(cost == least[owner], number, _RANGE)
     return number == torch.full((count,), _RANGE, device=owner.device).scatter_reduce_(0, owner, number, "amin")[owner]
 
 
-def _kept(which: Tensor, *values: Tensor) -> tuple[Tensor, ...]:
+def _select(which: Tensor, *values: Tensor) -> tuple[Tensor, ...]:
     return tuple(each[which] for each in values)
 
 
-def _hashed(number: Tensor) -> Tensor:
+def _hash(number: Tensor) -> Tensor:
     """Return whole numbers below 2^32 that look random; none twice for numbers below it."""
     for _ in range(2):
         number = (number * _SHUFFLE) % _RANGE
@@ -179,7 +179,7 @@ def _hashed(number: Tensor) -> Tensor:
     return number
 
 
-def _joined(borders: _Borders, renamed: Tensor, count: int) -> _Borders:
+def _merge_borders(borders: _Borders, renamed: Tensor, count: int) -> _Borders:
     """Return the borders between regions that have new names, each once."""
     one, other = renamed[borders.one], renamed[borders.other]
     apart = one != other

@@ -40,7 +40,7 @@ class Photometry(NamedTuple):
     slopes: Tensor
 
 
-def surface_of(theta: Tensor, rays: Tensor) -> Surface:
+def compute_surface(theta: Tensor, rays: Tensor) -> Surface:
     """Return normals and the lengths that they had.
 
     Args:
@@ -54,33 +54,33 @@ def surface_of(theta: Tensor, rays: Tensor) -> Surface:
     return Surface(m / size, size)
 
 
-def shading_of(normals: Tensor, lighting: Tensor) -> Tensor:
+def compute_shading(normals: Tensor, lighting: Tensor) -> Tensor:
     """Return the shading, (B, C, H, W)."""
     return torch.einsum("bck,bkhw->bchw", lighting[..., :3], normals) + lighting[..., 3, None, None]
 
 
-def photometry(photo: Tensor, albedo: Tensor, lighting: Tensor, surface: Surface, rays: Tensor) -> Photometry:
+def linearise_photometry(photo: Tensor, albedo: Tensor, lighting: Tensor, surface: Surface, rays: Tensor) -> Photometry:
     """Return albedo * shading - photo and its derivatives: albedo (l - (l . n) n) / |m| times those of m."""
     n = surface.normals
     directed = torch.einsum("bck,bkhw->bchw", lighting[..., :3], n)
     across = (lighting[..., :3, None, None] - directed[:, :, None] * n[:, None]) * (albedo / surface.length)[:, :, None]
     residual = albedo * (directed + lighting[..., 3, None, None]) - photo
-    return Photometry(residual, by_theta(across, rays))
+    return Photometry(residual, chain_to_theta(across, rays))
 
 
-def by_theta(by_m: Tensor, rays: Tensor) -> Tensor:
+def chain_to_theta(by_m: Tensor, rays: Tensor) -> Tensor:
     """Turn derivatives by m into those by theta, (..., 3, H, W)."""
     x, y = rays[0, 0], rays[0, 1]
     along_u, along_v, ahead = by_m.unbind(dim=-3)
     return torch.stack((along_u - x * ahead, along_v - y * ahead, -ahead), dim=-3)
 
 
-def area_of(theta: Tensor, surface: Surface) -> Tensor:
+def compute_area(theta: Tensor, surface: Surface) -> Tensor:
     """Return z |m|, (B, 1, H, W): fx fy times the area of what a pixel sees."""
     return theta[:, 2:].abs() * surface.length
 
 
-def best_lighting(photo: Tensor, albedo: Tensor, normals: Tensor, inside: Tensor) -> Tensor:
+def fit_lighting(photo: Tensor, albedo: Tensor, normals: Tensor, inside: Tensor) -> Tensor:
     """Return the lighting with the least squared error in each channel, (B, C, 4) float64.
 
     Where normals do not determine it, as on a plane, that of least length among the best.

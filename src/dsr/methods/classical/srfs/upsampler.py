@@ -41,9 +41,9 @@ from torch import Tensor
 
 from dsr.geometry.camera import RangeType
 from dsr.methods.base import expect_limits
-from dsr.methods.classical.finite_differences import upsampled
+from dsr.methods.classical.finite_differences import upsample_linear_border
 from dsr.methods.classical.srfs.admm import ShadingProblem, ShadingSolver, Weights
-from dsr.methods.networks.inpainting import filled
+from dsr.methods.networks.inpainting import inpaint
 from dsr.sample import DepthSample
 from dsr.utils.progress import Steps
 
@@ -125,7 +125,7 @@ class ShapeFromShading:
 
         """
         self.history = []
-        solver, metres = self.prepared(sample)
+        solver, metres = self.prepare(sample)
         for done in range(1, self.iterations + 1):
             before = solver.z
             solver.update_albedo(anew=done % _RENEW == 1)
@@ -133,7 +133,7 @@ class ShapeFromShading:
             solver.update_theta()
             solver.update_depth()
             solver.update_missed(self.growth)
-            self.history.append({"iteration": done, **_watched(solver, before)})
+            self.history.append({"iteration": done, **_diagnostics(solver, before)})
             if progress is not None:
                 progress(done, self.iterations)
             if self._converged():
@@ -143,7 +143,7 @@ class ShapeFromShading:
         nearest = float(sample.depth_lr[sample.mask_lr].min()) / _NEARER
         return (solver.z[0] * metres).clamp(min=nearest).to(sample.depth_lr.dtype)
 
-    def prepared(self, sample: DepthSample) -> tuple[ShadingSolver, float]:
+    def prepare(self, sample: DepthSample) -> tuple[ShadingSolver, float]:
         """Return the solver of a sample before its first step, and the metres that its unit of depth is."""
         coarse = sample.depth_lr[None].double()
         camera = sample.camera
@@ -157,7 +157,7 @@ class ShapeFromShading:
             unit=unit,
             inside=self._inside(sample),
         )
-        first = upsampled(filled(problem.coarse), sample.scale)
+        first = upsample_linear_border(inpaint(problem.coarse), sample.scale)
         return ShadingSolver(problem, self.weights, first, self.penalty), metres
 
     def _inside(self, sample: DepthSample) -> Tensor:
@@ -202,7 +202,7 @@ def read_foreground(path: Path, size: tuple[int, int]) -> np.ndarray:
     return levels > _WHITE
 
 
-def _watched(solver: ShadingSolver, before: Tensor) -> dict[str, float]:
+def _diagnostics(solver: ShadingSolver, before: Tensor) -> dict[str, float]:
     """Return the energy and how far the variables are from agreeing and from standing still."""
     terms = solver.terms()
     missed = (solver.slopes(solver.z) - solver.theta)[:, :2]
