@@ -134,7 +134,7 @@ class Watch(Fixed):
     def __init__(self, problem: ImageProblem, patience: int) -> None:
         self.rules = {
             "variance": Variance(problem.grey, patience),
-            "residual": Residual(problem.coarse, problem.residual),
+            "residual": Residual(problem.depth_lr, problem.residual),
         }
         self.stopped: dict[str, tuple[int, Tensor]] = {}
         self.passes: list[tuple[float, Tensor]] = []

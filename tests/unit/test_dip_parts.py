@@ -49,17 +49,17 @@ def test_loss_is_the_sum_of_its_terms_on_low_resolution_maps() -> None:
     problem = _problem()
     depth, intensity = _depth(3).float()[None], torch.rand(1, 1, 32, 48)
     blocks = depth.view(1, 1, 16, 2, 24, 2).mean(dim=(3, 5))
-    coarse = problem.coarse
-    span = float(coarse.max() - coarse.min())
+    depth_lr = problem.depth_lr
+    depth_range = float(depth_lr.max() - depth_lr.min())
     terms = PriorObjective("lap1", 2.0, 0.7, 0.3)(depth, intensity, problem)
-    data = lap1(blocks / span, coarse / span)
-    visual = rmse_v(SurfacePair(blocks, coarse, CAMERA.coarser(2).rays(dtype=torch.float32)[None])).square()
+    data = lap1(blocks / depth_range, depth_lr / depth_range)
+    visual = rmse_v(SurfacePair(blocks, depth_lr, CAMERA.coarser(2).rays(dtype=torch.float32)[None])).square()
     photo = lap1(intensity, problem.grey)
     torch.testing.assert_close(terms["data_lap1"], data[0])
     torch.testing.assert_close(terms["mse_v"], visual[0])
     torch.testing.assert_close(terms["loss"], 2 * data[0] + 0.7 * visual[0] + 0.3 * photo[0])
     plain = PriorObjective("mse", 10.0, 0.0, 0.0)(depth, intensity, problem)
-    torch.testing.assert_close(plain["loss"], 10 * ((blocks - coarse) / span).square().mean())
+    torch.testing.assert_close(plain["loss"], 10 * ((blocks - depth_lr) / depth_range).square().mean())
     assert plain.keys() == {"loss", "data_mse"}
 
 
@@ -71,10 +71,10 @@ def test_photo_term_uses_luminance() -> None:
 
 @pytest.mark.parametrize("objective", [PriorObjective("mse", 10.0, 0.0, 0.0), PriorObjective("lap1", 1.0, 1.0, 0.0)])
 def test_depth_under_a_hole_does_not_matter(objective: PriorObjective) -> None:
-    coarse = _sample().depth_lr.clone()
-    coarse[:, 4:9, 6:14] = torch.nan
+    depth_lr = _sample().depth_lr.clone()
+    depth_lr[:, 4:9, 6:14] = torch.nan
     depth = _depth(3).float()[None].requires_grad_()
-    objective(depth, torch.rand(1, 1, 32, 48), _problem(depth_lr=coarse))["loss"].backward()
+    objective(depth, torch.rand(1, 1, 32, 48), _problem(depth_lr=depth_lr))["loss"].backward()
     gradient = depth.grad
     assert gradient is not None
     assert bool(gradient.isfinite().all())
@@ -83,10 +83,10 @@ def test_depth_under_a_hole_does_not_matter(objective: PriorObjective) -> None:
 
 
 def test_loss_is_finite_where_no_two_neighbours_are_valid() -> None:
-    coarse = torch.full((1, 16, 24), torch.nan, dtype=torch.float64)
-    coarse[:, ::3, ::3] = 2.5
+    depth_lr = torch.full((1, 16, 24), torch.nan, dtype=torch.float64)
+    depth_lr[:, ::3, ::3] = 2.5
     depth = _depth().float()[None].requires_grad_()
-    terms = PriorObjective()(depth, torch.rand(1, 1, 32, 48), _problem(depth_lr=coarse))
+    terms = PriorObjective()(depth, torch.rand(1, 1, 32, 48), _problem(depth_lr=depth_lr))
     terms["loss"].backward()
     assert bool(terms["loss"].isfinite())
     assert bool(depth.grad.isfinite().all())  # type: ignore[union-attr]
@@ -191,7 +191,7 @@ def test_normal_noise_deg_is_the_tilt_of_a_frontal_surface() -> None:
 def test_residual_rule_stops_when_the_map_is_explained_up_to_its_noise() -> None:
     problem = _problem()
     truth = _depth().float()[None]
-    rule = Residual(problem.coarse, problem.residual)
+    rule = Residual(problem.depth_lr, problem.residual)
     rule.noise = 0.01
     near, far = truth * 1.009, truth * 1.011
     assert float(problem.residual(near)) == pytest.approx(0.009, rel=1e-3)

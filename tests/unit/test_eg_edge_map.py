@@ -7,12 +7,12 @@ import itertools
 import numpy as np
 import pytest
 import torch
-from dsr.methods.classical.eg.edge_map import detect_edges, predict_edge_map, thin
 from scipy import ndimage
 from torch import Tensor
 
 from dsr.methods.base import NoSolutionError
 from dsr.methods.classical.eg.belief_propagation import energy, label
+from dsr.methods.classical.eg.edge_map import detect_edges, predict_edge_map, thin
 from dsr.methods.classical.eg.patches import (
     PATCH,
     Patches,

@@ -27,10 +27,10 @@ def _net(scale: int = 4, *, noise: float = 0.1, facets: int = 2) -> Facets:
 
 @pytest.mark.parametrize("scale", SCALES)
 def test_facets_reproduce_a_plane_exactly_for_any_weights_and_photo(scale: int) -> None:
-    fine = plane_map(6 * scale, 7 * scale)
-    coarse = functional.avg_pool2d(fine, scale)
+    hr = plane_map(6 * scale, 7 * scale)
+    coarse = functional.avg_pool2d(hr, scale)
     result = _net(scale).upsample(photos(6 * scale, 7 * scale), coarse)
-    torch.testing.assert_close(result, fine, rtol=0, atol=1e-11)
+    torch.testing.assert_close(result, hr, rtol=0, atol=1e-11)
 
 
 def test_untrained_mixture_is_the_spline_blend_of_central_difference_planes() -> None:
@@ -81,9 +81,9 @@ def test_facets_without_slopes_stay_within_the_surrounding_values() -> None:
     with torch.no_grad():
         for parameter in (net.planes.weight, net.planes.bias):
             parameter.zero_()
-        fine = net.upsample(photos(24, 24), coarse)
-    assert 0 <= float(fine.min()) < 1e-12
-    assert 1 - 1e-12 < float(fine.max()) <= 1 + 1e-12
+        hr = net.upsample(photos(24, 24), coarse)
+    assert 0 <= float(hr.min()) < 1e-12
+    assert 1 - 1e-12 < float(hr.max()) <= 1 + 1e-12
 
 
 @pytest.mark.parametrize("arguments", [{"scale": 3}, {"scale": 4, "width": 0}, {"scale": 4, "facets": 0}])
@@ -130,14 +130,14 @@ def test_gradients_reach_every_parameter_and_agree_with_finite_differences() -> 
 def test_training_learns_an_edge_that_the_photo_shows() -> None:
     """A wall behind a wall: after a few steps on one patch the edge is several times sharper than a spline's."""
     torch.manual_seed(0)
-    fine = torch.full((1, 1, 32, 32), 20.0)
-    fine[..., 13:] = 26.0
-    rgb = (fine / 40).expand(1, 3, 32, 32)
-    coarse, net = functional.avg_pool2d(fine, 4), Facets(4, width=16, blocks=1)
+    hr = torch.full((1, 1, 32, 32), 20.0)
+    hr[..., 13:] = 26.0
+    rgb = (hr / 40).expand(1, 3, 32, 32)
+    coarse, net = functional.avg_pool2d(hr, 4), Facets(4, width=16, blocks=1)
     optimiser = torch.optim.Adam(net.parameters(), 3e-3)
     errors = []
     for _ in range(80):
-        loss = (net.upsample(rgb, coarse) - fine).abs().mean()
+        loss = (net.upsample(rgb, coarse) - hr).abs().mean()
         optimiser.zero_grad()
         loss.backward()
         optimiser.step()
@@ -148,6 +148,6 @@ def test_training_learns_an_edge_that_the_photo_shows() -> None:
 @pytest.mark.parametrize("precision", [torch.float32, torch.bfloat16])
 def test_plane_is_reproduced_with_half_precision_weights(precision: torch.dtype) -> None:
     net = _net().to(precision)
-    fine = plane_map(24, 28)
-    result = net.upsample(photos(24, 28), functional.avg_pool2d(fine, 4))
-    torch.testing.assert_close(result, fine, rtol=0, atol=1e-11)
+    hr = plane_map(24, 28)
+    result = net.upsample(photos(24, 28), functional.avg_pool2d(hr, 4))
+    torch.testing.assert_close(result, hr, rtol=0, atol=1e-11)

@@ -144,14 +144,14 @@ def test_depth_step_is_the_least_squares_solution(holes: bool, mask: bool) -> No
     solver = _solver(holes=holes, mask=mask)
     problem, before = solver.problem, solver.z.flatten().numpy().copy()
     means = np.kron(np.kron(np.eye(4), np.full((1, 4), 0.25)), np.kron(np.eye(4), np.full((1, 4), 0.25)))
-    coarse = problem.coarse.flatten().numpy()
-    known = np.isfinite(coarse)
+    lr = problem.lr.flatten().numpy()
+    known = np.isfinite(lr)
     weights = np.array([1.0, 1.0, (problem.unit / 4) ** 2]).repeat(256) * np.tile(problem.inside.flatten().numpy(), 3)
     root = np.sqrt(solver.penalty * weights)[:, None]
     matrix = np.concatenate((np.sqrt(solver.weights.data) * means[known], root * _dense(solver.slopes, 256, (16, 16))))
     right = np.concatenate(
         (
-            np.sqrt(solver.weights.data) * coarse[known],
+            np.sqrt(solver.weights.data) * lr[known],
             root[:, 0] * (solver.theta - solver.missed).flatten().numpy(),
         )
     )
@@ -253,8 +253,8 @@ def test_batch_equals_its_problems_one_at_a_time() -> None:
     solvers = [ShapeFromShading().prepare(_sample(*_random(16, 16, seed)))[0] for seed in (0, 1)]
     one, other = (solver.problem for solver in solvers)
     both = ShadingProblem(
-        torch.cat((one.photo, other.photo)),
-        torch.cat((one.coarse, other.coarse)),
+        torch.cat((one.rgb, other.rgb)),
+        torch.cat((one.lr, other.lr)),
         one.rays,
         one.focal,
         one.unit,

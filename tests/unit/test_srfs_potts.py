@@ -12,8 +12,8 @@ from torch import Tensor
 from dsr.methods.classical.srfs.potts import BRIGHTEST, Regions, boundary_length, fit_albedo, fuse
 
 
-def _energy(photo: Tensor, shading: Tensor, regions: Regions, weight: float) -> float:
-    missed = fit_albedo(photo, shading, regions) * shading - photo
+def _energy(rgb: Tensor, shading: Tensor, regions: Regions, weight: float) -> float:
+    missed = fit_albedo(rgb, shading, regions) * shading - rgb
     return 0.5 * float(missed.square().sum()) + weight * boundary_length(regions)
 
 
@@ -26,24 +26,24 @@ def _two(size: int = 24, noise: float = 0.03) -> tuple[Tensor, Tensor, Tensor]:
         disc, torch.tensor([0.8, 0.3, 0.5])[:, None, None], torch.tensor([0.4, 0.6, 0.5])[:, None, None]
     )
     shading = torch.from_numpy(0.5 + 0.4 * u / size + 0.1 * np.sin(v)).expand(1, 3, size, size)
-    photo = albedo[None] * shading + noise * torch.from_numpy(rng.normal(size=(1, 3, size, size)))
-    return photo, shading, disc
+    rgb = albedo[None] * shading + noise * torch.from_numpy(rng.normal(size=(1, 3, size, size)))
+    return rgb, shading, disc
 
 
 def test_two_regions_under_noise_are_found_exactly() -> None:
-    photo, shading, disc = _two()
-    regions = fuse(photo, shading, 0.05)
+    rgb, shading, disc = _two()
+    regions = fuse(rgb, shading, 0.05)
     assert regions.number == 2
     assert torch.equal(regions.labels[0] == regions.labels[0, 13, 11], disc)
 
 
 def test_albedo_of_a_region_is_the_least_squares_one() -> None:
-    photo, shading, disc = _two()
-    albedo = fit_albedo(photo, shading, fuse(photo, shading, 0.05))
+    rgb, shading, disc = _two()
+    albedo = fit_albedo(rgb, shading, fuse(rgb, shading, 0.05))
     for channel in range(3):
         for where in (disc, ~disc):
             expected = np.linalg.lstsq(
-                shading[0, channel][where].numpy()[:, None], photo[0, channel][where].numpy(), rcond=None
+                shading[0, channel][where].numpy()[:, None], rgb[0, channel][where].numpy(), rcond=None
             )[0]
             torch.testing.assert_close(albedo[0, channel][where], torch.full((int(where.sum()),), expected[0]).double())
 
@@ -52,62 +52,62 @@ def test_albedo_of_a_region_is_the_least_squares_one() -> None:
 @pytest.mark.parametrize("weight", [0.001, 0.02, 0.5])
 def test_partitions_that_fuse_two_regions_have_no_less_energy(seed: int, weight: float) -> None:
     rng = np.random.default_rng(seed)
-    photo, shading = (torch.from_numpy(rng.uniform(0.2, 1, (1, 2, 4, 5))) for _ in range(2))
-    regions = fuse(photo, shading, weight)
-    least = _energy(photo, shading, regions, weight)
+    rgb, shading = (torch.from_numpy(rng.uniform(0.2, 1, (1, 2, 4, 5))) for _ in range(2))
+    regions = fuse(rgb, shading, weight)
+    least = _energy(rgb, shading, regions, weight)
     for one, other in itertools.combinations(range(regions.number), 2):
         labels = torch.where(regions.labels == other, one, regions.labels)
-        assert _energy(photo, shading, Regions(labels, regions.number), weight) >= least - 1e-12
+        assert _energy(rgb, shading, Regions(labels, regions.number), weight) >= least - 1e-12
 
 
 def test_row_of_pixels_is_cut_as_by_an_exhaustive_search() -> None:
     values = torch.tensor([0.2, 0.22, 0.21, 0.6, 0.62, 0.9, 0.88, 0.91]).double()
-    photo = values.reshape(1, 1, 1, 8)
-    shading = torch.ones_like(photo)
+    rgb = values.reshape(1, 1, 1, 8)
+    shading = torch.ones_like(rgb)
     best = min(
         (torch.tensor([0, *np.cumsum(cuts)]) for cuts in itertools.product((0, 1), repeat=7)),
-        key=lambda labels: _energy(photo, shading, Regions(labels.reshape(1, 1, 8), 8), 0.02),
+        key=lambda labels: _energy(rgb, shading, Regions(labels.reshape(1, 1, 8), 8), 0.02),
     )
-    assert torch.equal(fuse(photo, shading, 0.02).labels.reshape(-1), best)
+    assert torch.equal(fuse(rgb, shading, 0.02).labels.reshape(-1), best)
 
 
 @pytest.mark.parametrize("shape", [(1, 1, 1, 1), (1, 1, 1, 6), (2, 3, 5, 1), (1, 2, 7, 5)])
 def test_small_weight_keeps_each_pixel_and_a_large_one_fuses_the_picture(shape: tuple[int, ...]) -> None:
-    photo = torch.from_numpy(np.random.default_rng(1).uniform(0.2, 1, shape))
-    shading = torch.ones_like(photo)
-    alone = fuse(photo, shading, 1e-12)
-    torch.testing.assert_close(fit_albedo(photo, shading, alone), photo)
-    together = fuse(photo, shading, 1e6)
+    rgb = torch.from_numpy(np.random.default_rng(1).uniform(0.2, 1, shape))
+    shading = torch.ones_like(rgb)
+    alone = fuse(rgb, shading, 1e-12)
+    torch.testing.assert_close(fit_albedo(rgb, shading, alone), rgb)
+    together = fuse(rgb, shading, 1e6)
     assert together.number == shape[0]
     assert boundary_length(together) == 0
-    mean = photo.mean(dim=(-2, -1), keepdim=True).expand(shape)
-    torch.testing.assert_close(fit_albedo(photo, shading, together), mean)
+    mean = rgb.mean(dim=(-2, -1), keepdim=True).expand(shape)
+    torch.testing.assert_close(fit_albedo(rgb, shading, together), mean)
 
 
 def test_batch_equals_its_pictures_one_at_a_time_and_is_deterministic() -> None:
-    photo, shading, _ = _two()
-    both = torch.cat((photo, photo.flip(-1))), torch.cat((shading, shading.flip(-1)))
+    rgb, shading, _ = _two()
+    both = torch.cat((rgb, rgb.flip(-1))), torch.cat((shading, shading.flip(-1)))
     together = fit_albedo(*both, fuse(*both, 0.01))
     again = fit_albedo(*both, fuse(*both, 0.01))
     assert torch.equal(together, again)
     for number in range(2):
         one = both[0][number : number + 1], both[1][number : number + 1]
         assert _energy(*one, fuse(*one, 0.05), 0.05) == pytest.approx(
-            _energy(photo, shading, fuse(photo, shading, 0.05), 0.05)
+            _energy(rgb, shading, fuse(rgb, shading, 0.05), 0.05)
         )
 
 
 def test_pixels_outside_stay_alone_and_separate_the_inside() -> None:
-    photo = torch.full((1, 1, 3, 5), 0.5).double()
+    rgb = torch.full((1, 1, 3, 5), 0.5).double()
     inside = torch.ones(1, 1, 3, 5, dtype=torch.bool)
     inside[..., 2] = False
-    regions = fuse(photo, torch.ones_like(photo), 0.1, inside)
+    regions = fuse(rgb, torch.ones_like(rgb), 0.1, inside)
     assert regions.number == 2 + 3
     assert boundary_length(regions, inside) == 0
 
 
 def test_albedos_stay_bounded_where_there_is_little_light() -> None:
-    photo = torch.full((1, 1, 2, 2), 0.5).double()
+    rgb = torch.full((1, 1, 2, 2), 0.5).double()
     shading = torch.tensor([[1e-6, -1.0], [0.0, 1.0]]).double().reshape(1, 1, 2, 2)
-    albedo = fit_albedo(photo, shading, Regions(torch.arange(4).reshape(1, 2, 2), 4))
+    albedo = fit_albedo(rgb, shading, Regions(torch.arange(4).reshape(1, 2, 2), 4))
     assert albedo.flatten().tolist() == [BRIGHTEST, 0.0, 0.0, 0.5]

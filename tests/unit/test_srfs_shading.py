@@ -80,14 +80,14 @@ def test_area_is_that_of_the_back_projected_pixels() -> None:
 
 def test_photometry_has_its_stated_derivatives() -> None:
     theta, rays = _mixed_theta()
-    albedo, photo = _random(1, 3, 3, 4, seed=1).abs(), _random(1, 3, 3, 4, seed=2)
+    albedo, rgb = _random(1, 3, 3, 4, seed=1).abs(), _random(1, 3, 3, 4, seed=2)
 
     def residual(theta: Tensor) -> Tensor:
-        return albedo * compute_shading(compute_surface(theta, rays).normals, LIGHT) - photo
+        return albedo * compute_shading(compute_surface(theta, rays).normals, LIGHT) - rgb
 
     theta.requires_grad_()
     assert torch.autograd.gradcheck(residual, (theta,))
-    seen = linearise_photometry(photo, albedo, LIGHT, compute_surface(theta, rays), rays)
+    seen = linearise_photometry(rgb, albedo, LIGHT, compute_surface(theta, rays), rays)
     torch.testing.assert_close(seen.residual, residual(theta))
     for channel in range(3):
         (slope,) = torch.autograd.grad(residual(theta)[:, channel].sum(), theta)
@@ -106,12 +106,12 @@ def test_light_is_recovered_exactly_from_a_photo_without_noise() -> None:
     theta, rays = _mixed_theta()
     normals = compute_surface(theta, rays).normals
     albedo = _random(1, 3, 3, 4, seed=1).abs()
-    photo = albedo * compute_shading(normals, LIGHT)
+    rgb = albedo * compute_shading(normals, LIGHT)
     inside = torch.ones(1, 1, 3, 4).double()
-    torch.testing.assert_close(fit_lighting(photo, albedo, normals, inside), LIGHT)
-    photo[..., 1:3, 2] = 0.7
+    torch.testing.assert_close(fit_lighting(rgb, albedo, normals, inside), LIGHT)
+    rgb[..., 1:3, 2] = 0.7
     inside[..., 1:3, 2] = 0
-    torch.testing.assert_close(fit_lighting(photo, albedo, normals, inside), LIGHT)
+    torch.testing.assert_close(fit_lighting(rgb, albedo, normals, inside), LIGHT)
 
 
 def test_light_on_a_flat_wall_is_the_smallest_that_explains_it() -> None:

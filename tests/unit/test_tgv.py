@@ -94,7 +94,7 @@ def test_objective_reaches_that_of_another_algorithm(data_weight: float | None, 
     diffusion_tensors = method.diffusion_tensors(rgb)
     found = method.minimise(rgb, coarse, 2)
     ours = float(method.objective(found.values, found.slopes, coarse, diffusion_tensors))
-    reference = _reference(coarse[0, 0].numpy(), diffusion_tensors, method.first, method.second, data_weight)
+    reference = _reference(coarse[0, 0].numpy(), diffusion_tensors, method.alpha1, method.alpha0, data_weight)
     assert ours == pytest.approx(reference, rel=1e-3)
     early = TotalGeneralisedVariation(iterations=20, tolerance=0.0, data_weight=data_weight, second=2.0)
     start = early.minimise(rgb, coarse, 2)

@@ -94,10 +94,10 @@ class Downsampling:
             raise ValueError(f"downsampling: expected a size divisible by {scale}, got {height} x {width}")
         if self.kernel == "nearest":
             return values[..., scale // 2 :: scale, scale // 2 :: scale]
-        known = values.isfinite()
-        if bool(known.all()):
+        valid = values.isfinite()
+        if bool(valid.all()):
             return self._apply(values, scale)
-        complete, weight = torch.where(known, values, 0), known.to(values.dtype)
+        complete, weight = torch.where(valid, values, 0), valid.to(values.dtype)
         mean, fraction = self._apply(complete, scale), self._apply(weight, scale)
         box = Downsampling("box")
         block_mean, block_fraction = box._apply(complete, scale), box._apply(weight, scale)
@@ -124,11 +124,11 @@ def _box(x: Tensor, _: float) -> Tensor:
     return (x < 0.5).double()
 
 
-def _triangle(x: Tensor, _: float) -> Tensor:
+def _bilinear(x: Tensor, _: float) -> Tensor:
     return (1 - x).clamp(min=0)
 
 
-def _keys(x: Tensor, _: float) -> Tensor:
+def _bicubic(x: Tensor, _: float) -> Tensor:
     """Cubic convolution (Keys 1981) with a = -0.5."""
     near = (1.5 * x - 2.5) * x * x + 1
     far = ((-0.5 * x + 2.5) * x - 4) * x + 2
@@ -141,8 +141,8 @@ def _gaussian(x: Tensor, sigma: float) -> Tensor:
 
 _PROFILES: dict[str, Callable[[Tensor, float], Tensor]] = {
     "box": _box,
-    "bilinear": _triangle,
-    "bicubic": _keys,
+    "bilinear": _bilinear,
+    "bicubic": _bicubic,
     "gaussian": _gaussian,
 }
 

@@ -76,11 +76,11 @@ class Shadows:
         """Return where the shadows are, (1, h, w): points whose place in the second image something nearer takes."""
         columns = torch.arange(depth.shape[-1], dtype=torch.float64, device=depth.device)
         seen_at = columns - self.baseline * camera.fx / depth.double()  # the column in the second image
-        unknown = seen_at.isnan()
+        missing = seen_at.isnan()
         if self.baseline > 0:  # what lies to the right comes before it there
-            nearest = seen_at.masked_fill(unknown, torch.inf).flip(-1).cummin(dim=-1).values.flip(-1)
+            nearest = seen_at.masked_fill(missing, torch.inf).flip(-1).cummin(dim=-1).values.flip(-1)
             return seen_at > nearest
-        nearest = seen_at.masked_fill(unknown, -torch.inf).cummax(dim=-1).values
+        nearest = seen_at.masked_fill(missing, -torch.inf).cummax(dim=-1).values
         return seen_at < nearest
 
 

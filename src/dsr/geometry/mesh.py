@@ -19,9 +19,9 @@ from dsr.geometry.camera import Camera
 LARGEST_STEP = 0.02
 """Of depth, by which neighbours on one surface may deviate from its slope."""
 MOST_VERTICES = 2_000_000
-_REACHES = (1, 2, 3)
+_HALF_WIDTHS = (1, 2, 3)
 """Half widths of the windows in pixels: the step is between two of them, or spread over up to five."""
-_OWN_SHARE = 0.25
+_OWN_FRACTION = 0.25
 """Of ``largest_step``, that a pair within a wider window must itself change by to be cut."""
 
 
@@ -69,19 +69,19 @@ def triangulate(
     if not largest_step > 0 or most < 1:
         raise ValueError(f"mesh: expected a positive step and number of vertices, got {largest_step} and {most}")
     stride = stride_for(depth, most)
-    thinned = depth[0, ::stride, ::stride].detach().cpu().double().numpy()
-    valid = np.isfinite(thinned)
-    faces = _faces(1 / thinned, largest_step)
+    strided = depth[0, ::stride, ::stride].detach().cpu().double().numpy()
+    valid = np.isfinite(strided)
+    faces = _faces(1 / strided, largest_step)
     kept = valid.ravel().copy()
     if not isolated:
         kept[:] = False
         kept[faces.ravel()] = True
-    place = np.cumsum(kept, dtype=np.int32) - 1
-    rows, columns = np.divmod(np.flatnonzero(kept), thinned.shape[1])
+    vertex_of = np.cumsum(kept, dtype=np.int32) - 1
+    rows, columns = np.divmod(np.flatnonzero(kept), strided.shape[1])
     rows, columns = rows * stride, columns * stride
-    z = thinned.ravel()[kept]
+    z = strided.ravel()[kept]
     vertices = np.stack(((columns - camera.cx) / camera.fx * z, (rows - camera.cy) / camera.fy * z, z), axis=1)
-    return Mesh(vertices.astype(np.float32), place[faces], rows * camera.width + columns)
+    return Mesh(vertices.astype(np.float32), vertex_of[faces], rows * camera.width + columns)
 
 
 def stride_for(depth: Tensor, most: int) -> int:
@@ -133,15 +133,15 @@ def _connected(inverse: np.ndarray, largest_step: float) -> np.ndarray:
     change = np.diff(inverse, axis=1)  # (H, W - 1)
     scale = largest_step * np.minimum(inverse[:, :-1], inverse[:, 1:])
     step = np.zeros(change.shape, dtype=bool)
-    for reach in _REACHES:
-        far, near = _shift(inverse, reach)[:, :-1], _shift(inverse, 1 - reach)[:, :-1]
-        beyond, before = _shift(inverse, 2 * reach)[:, :-1], _shift(inverse, 1 - 2 * reach)[:, :-1]
-        total, pairs = far - near, 2 * reach - 1
+    for half_width in _HALF_WIDTHS:
+        far, near = _shift(inverse, half_width)[:, :-1], _shift(inverse, 1 - half_width)[:, :-1]
+        beyond, before = _shift(inverse, 2 * half_width)[:, :-1], _shift(inverse, 1 - 2 * half_width)[:, :-1]
+        total, pairs = far - near, 2 * half_width - 1
         excess, own = np.abs(total), np.abs(change)
-        for slope in ((beyond - far) / reach, (near - before) / reach):
+        for slope in ((beyond - far) / half_width, (near - before) / half_width):
             excess = np.fmin(excess, np.abs(total - pairs * slope))
             own = np.fmin(own, np.abs(change - slope))
-        step |= (excess > scale) & (own > (1.0 if reach == 1 else _OWN_SHARE) * scale)
+        step |= (excess > scale) & (own > (1.0 if half_width == 1 else _OWN_FRACTION) * scale)
     return np.isfinite(change) & ~step
 
 

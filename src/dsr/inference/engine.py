@@ -96,7 +96,7 @@ def _answer(
     if method in INTERPOLATIONS:
         interpolation = Interpolation(cast("Order", method), fill_holes=True)
         coarse_camera = camera.rescale(inverse.shape[-1], inverse.shape[-2])
-        return interpolation.interpolated(inverse.reciprocal(), coarse_camera, camera).reciprocal()
+        return interpolation.interpolate(inverse.reciprocal(), coarse_camera, camera).reciprocal()
     planned = plan(size, _size(inverse), scale, method)
     on = _device(device)
     if method in PRIORS:

@@ -55,14 +55,6 @@ class Iterative(Protocol):
     history: list[dict[str, float]]
 
 
-def history_of(moved: list[float], every: int) -> list[dict[str, float]]:
-    """Return the history of an iteration that looks, every so many iterations, at how far its map has moved.
-
-    ``moved`` is the RMS since the last look, as a share of the map's range.
-    """
-    return [{"iteration": float(every * (look + 1)), "moved": value} for look, value in enumerate(moved)]
-
-
 def expect_limits(tolerance: float, **counts: int) -> None:
     """Check when an iteration ends.
 

@@ -30,15 +30,14 @@ from torch import Tensor
 from torch.nn import functional
 
 from dsr.geometry.camera import RangeType, from_range, to_range
-from dsr.methods.base import expect_limits, history_of
+from dsr.methods.base import expect_limits
+from dsr.methods.classical.convergence import CHECK_EVERY, Movement, history_of
 from dsr.methods.classical.finite_differences import box_mean, extend_linearly, upsample_linear_border
 from dsr.methods.networks.inpainting import inpaint
 from dsr.methods.networks.maps import min_max, normalise
 from dsr.sample import DepthSample
 from dsr.utils.progress import Steps
 
-CHECK_EVERY = 50
-"""Steps between two looks at how far the map has moved."""
 _LEAST = 0.5
 """A map continued beyond the border stays within this share of its lowest value."""
 
@@ -106,7 +105,7 @@ class AnisotropicDiffusion:
         lr = to_range(sample.depth_lr.double(), sample.camera_lr, "disparity") + sample.camera_lr.doffs
         inverse = (lr * sample.scale)[None]  # in pixels of the high-resolution camera
         result = self.diffuse(sample.rgb[None], inverse, sample.scale, progress)
-        self.history = history_of(result.moved, CHECK_EVERY)
+        self.history = history_of(result.moved)
         hr = result.values[0]
         return from_range(hr - sample.camera.doffs, sample.camera, "disparity").to(sample.depth_lr.dtype)
 
@@ -158,7 +157,7 @@ class AnisotropicDiffusion:
         x, target = (start_hr / mean).float(), (lr / mean).float()
         value_range = min_max(target).diff(dim=1).clamp(min=1e-12)
         along_u, along_v = torch.empty_like(conductances[0]), torch.empty_like(conductances[1])
-        before, moved, done = x.clone(), [], 0
+        movement, done = Movement(x, self.steps, self.tolerance, progress, value_range), 0
         for done in range(1, self.steps + 1):
             torch.sub(x[..., 1:], x[..., :-1], out=along_u).mul_(conductances[0])
             torch.sub(x[..., 1:, :], x[..., :-1, :], out=along_v).mul_(conductances[1])
@@ -167,16 +166,10 @@ class AnisotropicDiffusion:
             x[..., 1:, :] -= along_v
             x[..., :-1, :] += along_v
             _adjust(x, target, valid)
-            if done % CHECK_EVERY == 0:
-                if progress is not None:
-                    progress(done, self.steps)
-                moved.append(float(((x - before) / value_range).square().mean(dim=(-2, -1)).max().sqrt()))
-                if moved[-1] < self.tolerance:
-                    break
-                before.copy_(x)
-        if progress is not None:
-            progress(self.steps, self.steps)
-        return Diffusion(x.double() * mean, done, moved)
+            if done % CHECK_EVERY == 0 and movement.converged(x):
+                break
+        movement.finish()
+        return Diffusion(x.double() * mean, done, movement.moved)
 
 
 def _adjust(x: Tensor, lr: Tensor, valid: Tensor) -> None:

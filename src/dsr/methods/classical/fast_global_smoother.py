@@ -96,9 +96,9 @@ def smooth(guide: Tensor, maps: Tensor, strength: float, sigma_colour: float, it
     along_rows = _weights(guide.mT, sigma_colour)  # (W - 1, H), the axis that is solved along comes first
     along_columns = _weights(guide, sigma_colour)  # (H - 1, W)
     for t in range(1, iterations + 1):
-        share = 1.5 * 4.0 ** (iterations - t) / (4.0**iterations - 1) * strength
-        maps = solve_lines(share * along_rows, maps.permute(2, 0, 1)).permute(1, 2, 0)
-        maps = solve_lines(share * along_columns, maps.transpose(0, 1)).transpose(0, 1)
+        lambda_t = 1.5 * 4.0 ** (iterations - t) / (4.0**iterations - 1) * strength
+        maps = solve_lines(lambda_t * along_rows, maps.permute(2, 0, 1)).permute(1, 2, 0)
+        maps = solve_lines(lambda_t * along_columns, maps.transpose(0, 1)).transpose(0, 1)
     return maps.contiguous()
 
 
@@ -118,11 +118,11 @@ def solve_lines(weights: Tensor, right: Tensor) -> Tensor:
     length = right.shape[0]
     solution = right.contiguous().clone()
     upper = torch.zeros_like(right[:, 0]).contiguous()  # what is left of the entries above the diagonal
-    none = torch.zeros_like(upper[0])
+    zeros = torch.zeros_like(upper[0])
     for k in range(length):
-        before = weights[k - 1] if k else none
-        after = weights[k] if k + 1 < length else none
-        previous = upper[k - 1] if k else none
+        before = weights[k - 1] if k else zeros
+        after = weights[k] if k + 1 < length else zeros
+        previous = upper[k - 1] if k else zeros
         pivot = 1 + after + before * (1 + previous)
         upper[k] = -after / pivot
         if k:

@@ -68,12 +68,12 @@ def extend_linearly(x: Tensor, border: int) -> Tensor:
     return _extend(_extend(x, border, -1), border, -2)
 
 
-def upsample_linear_border(coarse: Tensor, scale: int) -> Tensor:
+def upsample_linear_border(lr: Tensor, scale: int) -> Tensor:
     """Return (B, 1, h, w) upsampled bicubically to (B, 1, scale h, scale w), exact on planes up to the border."""
     if scale == 1:
-        return coarse.clone()
+        return lr.clone()
     edge = _REACH * scale
-    return upsample_bicubic(extend_linearly(coarse, _REACH), scale)[..., edge:-edge, edge:-edge].contiguous()
+    return upsample_bicubic(extend_linearly(lr, _REACH), scale)[..., edge:-edge, edge:-edge].contiguous()
 
 
 def _forward(x: Tensor, dim: int) -> Tensor:

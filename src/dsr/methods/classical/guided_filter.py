@@ -74,27 +74,27 @@ def guided_filter(guide: Tensor, maps: Tensor, radius: int, epsilon: float, conf
 
     """
     weight = torch.ones_like(guide[0]) if confidence is None else confidence
-    share = _box(weight, radius)
-    counted = torch.where(share > 0, share, 1)
-    mean = _box(weight * guide, radius) / counted
+    mean_weight = _box(weight, radius)
+    divisor = torch.where(mean_weight > 0, mean_weight, 1)
+    mean = _box(weight * guide, radius) / divisor
     products = torch.stack([guide[i] * guide[j] for i, j in _PAIRS])
-    variances = _box(weight * products, radius) / counted - torch.stack([mean[i] * mean[j] for i, j in _PAIRS])
+    variances = _box(weight * products, radius) / divisor - torch.stack([mean[i] * mean[j] for i, j in _PAIRS])
     del products
     for k in (0, 3, 5):
         variances[k] += epsilon
     inverse = _invert(variances)
-    of_image = share / _box(torch.ones_like(weight), radius)  # the mean confidence of a window's pixels
-    total = _box(of_image, radius)
+    mean_confidence = mean_weight / _box(torch.ones_like(weight), radius)  # the mean confidence of a window's pixels
+    total = _box(mean_confidence, radius)
 
-    def one(values: Tensor) -> Tensor:
-        mean_value = _box(weight * values, radius) / counted
-        cross = _box(weight * guide * values, radius) / counted - mean * mean_value
+    def filter_one(values: Tensor) -> Tensor:
+        mean_value = _box(weight * values, radius) / divisor
+        cross = _box(weight * guide * values, radius) / divisor - mean * mean_value
         slopes = torch.stack([(inverse[row] * cross).sum(dim=0) for row in _ROWS])
         constant = mean_value - (slopes * mean).sum(dim=0)
-        slopes, constant = _box(of_image * slopes, radius), _box(of_image * constant, radius)
+        slopes, constant = _box(mean_confidence * slopes, radius), _box(mean_confidence * constant, radius)
         return torch.where(total > 0, ((slopes * guide).sum(dim=0) + constant) / total.clamp(min=_TINY), values)
 
-    return torch.stack([one(values) for values in maps])
+    return torch.stack([filter_one(values) for values in maps])
 
 
 def _box(x: Tensor, radius: int) -> Tensor:

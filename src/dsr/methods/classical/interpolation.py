@@ -43,20 +43,20 @@ class Interpolation:
 
     def __call__(self, sample: DepthSample, progress: Steps | None = None) -> Tensor:
         """Return the high-resolution depth, (1, H, W) in metres."""
-        return self.interpolated(sample.depth_lr, sample.camera_lr, sample.camera)
+        return self.interpolate(sample.depth_lr, sample.camera_lr, sample.camera)
 
-    def interpolated(self, depth: Tensor, camera: Camera, fine_camera: Camera) -> Tensor:
+    def interpolate(self, depth: Tensor, camera: Camera, camera_hr: Camera) -> Tensor:
         """Return depth, (1, h, w) in metres, at the pixels of another camera, whatever the ratio of their sizes."""
-        coarse = to_range(depth, camera, "perspective")[0]
-        known = depth.isfinite()[0].cpu().numpy()
-        values = coarse.cpu().numpy()
-        if not known.all():
-            nearest = ndimage.distance_transform_edt(~known, return_distances=False, return_indices=True)
+        range_lr = to_range(depth, camera, "perspective")[0]
+        valid = depth.isfinite()[0].cpu().numpy()
+        values = range_lr.cpu().numpy()
+        if not valid.all():
+            nearest = ndimage.distance_transform_edt(~valid, return_distances=False, return_indices=True)
             values = values[tuple(nearest)]
-        places = lr_coordinates(fine_camera, camera)
-        where = torch.stack(torch.meshgrid(*places, indexing="ij")).numpy()
-        fine = ndimage.map_coordinates(values, where, order=self._degree, mode="nearest")
-        if not (known.all() or self._fill_holes):
-            fine[ndimage.map_coordinates(known.astype(np.uint8), where, order=0, mode="nearest") == 0] = np.nan
-        fine[fine <= 0] = np.nan  # a spline may overshoot beside a depth step
-        return from_range(torch.from_numpy(fine).to(coarse)[None], fine_camera, "perspective")
+        coordinates = lr_coordinates(camera_hr, camera)
+        grid = torch.stack(torch.meshgrid(*coordinates, indexing="ij")).numpy()
+        range_hr = ndimage.map_coordinates(values, grid, order=self._degree, mode="nearest")
+        if not (valid.all() or self._fill_holes):
+            range_hr[ndimage.map_coordinates(valid.astype(np.uint8), grid, order=0, mode="nearest") == 0] = np.nan
+        range_hr[range_hr <= 0] = np.nan  # a spline may overshoot beside a depth step
+        return from_range(torch.from_numpy(range_hr).to(range_lr)[None], camera_hr, "perspective")

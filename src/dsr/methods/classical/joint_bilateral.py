@@ -57,16 +57,16 @@ class JointBilateral(GuidedMethod):
     def filter_maps(self, guided: Guided) -> Tensor:
         """Return the weighted means of the low-resolution maps, (N, H, W)."""
         height, width = guided.valid.shape
-        coarse_photo = _block_means(guided)
+        rgb_lr = _block_means(guided)
         nearest = guided.nearest()
         largest = torch.full_like(guided.rgb[0], -torch.inf)
-        for exponent, _, _ in self._iterate_neighbours(guided, coarse_photo):
+        for exponent, _, _ in self._iterate_neighbours(guided, rgb_lr):
             torch.maximum(largest, exponent, out=largest)
         found = largest.isfinite()
         largest = torch.where(found, largest, 0)
         weights = torch.zeros_like(largest)
         totals = largest.new_zeros((len(guided.maps), *largest.shape))
-        for exponent, i, j in self._iterate_neighbours(guided, coarse_photo):
+        for exponent, i, j in self._iterate_neighbours(guided, rgb_lr):
             weight = exponent.sub_(largest).exp_()
             weights += weight
             rows, columns = i.clamp(0, height - 1)[:, None], j.clamp(0, width - 1)
@@ -75,7 +75,7 @@ class JointBilateral(GuidedMethod):
         around = guided.maps[:, nearest[0][:, None], nearest[1]]
         return torch.where(found, totals / torch.where(found, weights, 1), around)
 
-    def _iterate_neighbours(self, guided: Guided, coarse_photo: Tensor) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
+    def _iterate_neighbours(self, guided: Guided, rgb_lr: Tensor) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
         """Yield, neighbour by neighbour, its weights' exponents (H, W), its rows (H,) and its columns (W,).
 
         Where the neighbour is a hole or lies outside, the exponent is minus infinity.
@@ -88,8 +88,8 @@ class JointBilateral(GuidedMethod):
                 kept_rows, kept_columns = rows.clamp(0, height - 1)[:, None], columns.clamp(0, width - 1)
                 squares = (guided.rows - rows).square()[:, None] + (guided.columns - columns).square()
                 exponent = squares / (-2 * self._sigma_space**2)
-                for rgb, coarse in zip(guided.rgb, coarse_photo, strict=True):
-                    exponent -= (rgb - coarse[kept_rows, kept_columns]).square() / (2 * self._sigma_colour**2)
+                for channel, channel_lr in zip(guided.rgb, rgb_lr, strict=True):
+                    exponent -= (channel - channel_lr[kept_rows, kept_columns]).square() / (2 * self._sigma_colour**2)
                 inside = (rows == rows.clamp(0, height - 1))[:, None] & (columns == columns.clamp(0, width - 1))
                 counts = inside & (guided.valid[kept_rows, kept_columns] > 0)
                 yield exponent.masked_fill_(~counts, -torch.inf), rows, columns

@@ -97,21 +97,21 @@ class GuidedMethod(ABC):
         """Return the high-resolution depth, (1, H, W) in metres in the precision of the low-resolution depth."""
         device = sample.depth_lr.device
         rows, columns = lr_coordinates(sample.camera, sample.camera_lr, device)
-        coarse = to_range(sample.depth_lr.double(), sample.camera_lr, "disparity")[0] * sample.scale
-        valid = coarse.isfinite()
-        maps = _fit_planes(coarse) if self._slopes else coarse[None]
+        disparity_lr = to_range(sample.depth_lr.double(), sample.camera_lr, "disparity")[0] * sample.scale
+        valid = disparity_lr.isfinite()
+        maps = _fit_planes(disparity_lr) if self._slopes else disparity_lr[None]
         guided = Guided(sample.rgb.to(device).double(), inpaint(maps[:, None])[:, 0], valid.double(), rows, columns)
         answers = self.filter_maps(guided)
-        fine = answers[0]
+        disparity = answers[0]
         if self._slopes:
-            fine = fine + answers[1] * rows[:, None] + answers[2] * columns
+            disparity = disparity + answers[1] * rows[:, None] + answers[2] * columns
         doffs = sample.camera.doffs  # disparity + doffs is inverse depth
-        least, most = (float(bound) + doffs for bound in coarse[valid].aminmax())
-        fine = fine.clamp(least / _BEYOND - doffs, most * _BEYOND - doffs)
+        lowest, highest = (float(bound) + doffs for bound in disparity_lr[valid].aminmax())
+        disparity = disparity.clamp(lowest / _BEYOND - doffs, highest * _BEYOND - doffs)
         if not (self._fill_holes or bool(valid.all())):
             i, j = guided.nearest()
-            fine = fine.masked_fill(~valid[i[:, None], j], torch.nan)
-        return from_range(fine[None], sample.camera, "disparity").to(sample.depth_lr)
+            disparity = disparity.masked_fill(~valid[i[:, None], j], torch.nan)
+        return from_range(disparity[None], sample.camera, "disparity").to(sample.depth_lr)
 
 
 def estimate_slopes(values: Tensor, axis: int) -> Tensor:
@@ -139,12 +139,16 @@ def expect_positive(method: str, **values: float) -> None:
             raise ValueError(f"{name}: expected a positive number for {method}, got {value}")
 
 
-def _fit_planes(coarse: Tensor) -> Tensor:
+def _fit_planes(disparity_lr: Tensor) -> Tensor:
     """Return each LR pixel's plane: its value at row and column 0, per row, per column, (3, h, w); NaN in holes."""
-    height, width = coarse.shape
-    down, across = estimate_slopes(coarse, 0), estimate_slopes(coarse, 1)
-    constant = coarse - down * torch.arange(height).to(coarse)[:, None] - across * torch.arange(width).to(coarse)
-    return torch.stack((constant, down, across)).masked_fill(coarse.isnan(), torch.nan)
+    height, width = disparity_lr.shape
+    down, across = estimate_slopes(disparity_lr, 0), estimate_slopes(disparity_lr, 1)
+    constant = (
+        disparity_lr
+        - down * torch.arange(height).to(disparity_lr)[:, None]
+        - across * torch.arange(width).to(disparity_lr)
+    )
+    return torch.stack((constant, down, across)).masked_fill(disparity_lr.isnan(), torch.nan)
 
 
 def _nearest_index(where: Tensor, size: int) -> Tensor:

@@ -33,7 +33,8 @@ import torch
 from torch import Tensor
 
 from dsr.geometry.camera import RangeType, from_range, to_range
-from dsr.methods.base import expect_limits, history_of
+from dsr.methods.base import expect_limits
+from dsr.methods.classical.convergence import CHECK_EVERY, Movement, history_of
 from dsr.methods.classical.finite_differences import (
     box_mean,
     divergence,
@@ -48,8 +49,6 @@ from dsr.methods.networks.maps import normalise
 from dsr.sample import DepthSample
 from dsr.utils.progress import Steps
 
-CHECK_EVERY = 50
-"""Iterations between two looks at how far the map has moved."""
 _RELAXATION = 1.9
 """By how much of a step the iterates move; converges below 2."""
 _SLOPE = 0.3
@@ -129,7 +128,7 @@ class TotalGeneralisedVariation:
         if not sharpness >= 0:
             raise ValueError(f"sharpness: expected 0 or more, got {sharpness}")
         self.iterations, self.tolerance = iterations, tolerance
-        self.first, self.second, self.data_weight = first, second, data_weight
+        self.alpha1, self.alpha0, self.data_weight = first, second, data_weight
         self.sharpness, self.exponent, self.step_ratio = sharpness, exponent, step_ratio
         self.history: list[dict[str, float]] = []
 
@@ -144,30 +143,30 @@ class TotalGeneralisedVariation:
             progress: is told the iterations done and the most that it may take.
 
         """
-        coarse = to_range(sample.depth_lr.double(), sample.camera_lr, "disparity")[None] * sample.scale
-        scaled = normalise(coarse)
-        valid = coarse.isfinite()
+        lr = to_range(sample.depth_lr.double(), sample.camera_lr, "disparity")[None] * sample.scale
+        scaled = normalise(lr)
+        valid = lr.isfinite()
         values = torch.where(valid, scaled.values, torch.nan)
         found = self.minimise(sample.rgb[None].double(), values, sample.scale, progress)
-        self.history = history_of(found.moved, CHECK_EVERY)
-        fine = found.values * scaled.span + scaled.minimum
-        return from_range(fine[0], sample.camera, "disparity").to(sample.depth_lr.dtype)
+        self.history = history_of(found.moved)
+        hr = found.values * scaled.span + scaled.minimum
+        return from_range(hr[0], sample.camera, "disparity").to(sample.depth_lr.dtype)
 
-    def minimise(self, rgb: Tensor, coarse: Tensor, scale: int, progress: Steps | None = None) -> Solution:
+    def minimise(self, rgb: Tensor, lr: Tensor, scale: int, progress: Steps | None = None) -> Solution:
         """Return the minimum of E for normalised maps.
 
         Args:
             rgb: (B, 3, H, W) in [0, 1].
-            coarse: (B, 1, H / scale, W / scale) of the same type, in [0, 1], NaN where it is not known.
+            lr: (B, 1, H / scale, W / scale) of the same type, in [0, 1], NaN where it is not known.
             scale: the factor; at 1, holes are filled.
             progress: as above.
 
         """
-        start = inpaint(coarse)
-        if scale > 1 and not bool(coarse.isfinite().all()):
-            start = self.minimise(box_mean(rgb, scale), coarse, 1).values
+        start = inpaint(lr)
+        if scale > 1 and not bool(lr.isfinite().all()):
+            start = self.minimise(box_mean(rgb, scale), lr, 1).values
         first = upsample_linear_border(start, scale)
-        return self._iterate(first, coarse, self.diffusion_tensors(rgb), progress)
+        return self._iterate(first, lr, self.diffusion_tensors(rgb), progress)
 
     def diffusion_tensors(self, rgb: Tensor) -> Tensors:
         """Return G for (B, 3, H, W) photos; the identity where a photo is constant."""
@@ -178,50 +177,44 @@ class TotalGeneralisedVariation:
         x, y = normal[:, 0], normal[:, 1]
         return Tensors(1 - less * x * x, -less * x * y, 1 - less * y * y)
 
-    def objective(self, values: Tensor, slopes: Tensor, coarse: Tensor, tensors: Tensors) -> Tensor:
+    def objective(self, values: Tensor, slopes: Tensor, lr: Tensor, tensors: Tensors) -> Tensor:
         """Return E(u, v), (B,); of the data term, 0 where ``data_weight`` is None."""
         bent = tensors.times(_zero_border(gradient(values) - slopes[:, :, None]))
-        total = self.first * _lengths(bent).sum(dim=(1, 2, 3))
-        total = total + self.second * _lengths(gradient(slopes)).sum(dim=(1, 2, 3))
+        total = self.alpha1 * _lengths(bent).sum(dim=(1, 2, 3))
+        total = total + self.alpha0 * _lengths(gradient(slopes)).sum(dim=(1, 2, 3))
         if self.data_weight is None:
             return total
-        scale = values.shape[-1] // coarse.shape[-1]
-        miss = torch.where(coarse.isfinite(), box_mean(values, scale) - coarse, 0)
+        scale = values.shape[-1] // lr.shape[-1]
+        miss = torch.where(lr.isfinite(), box_mean(values, scale) - lr, 0)
         return total + self.data_weight / 2 * scale**2 * miss.square().sum(dim=(1, 2, 3))
 
-    def _iterate(self, first: Tensor, coarse: Tensor, g: Tensors, progress: Steps | None) -> Solution:
+    def _iterate(self, first: Tensor, lr: Tensor, g: Tensors, progress: Steps | None) -> Solution:
         """Return what the primal-dual iteration makes of a first map."""
         steps = _Steps.of(g, self.step_ratio)
-        data = _DataTerm(coarse, steps.u, self.data_weight)
+        data = _DataTerm(lr, steps.u, self.data_weight)
         u = first
         v = slopes(u)
         p, q = torch.zeros_like(v)[:, :, None], torch.zeros_like(gradient(v))
         mean_u, mean_v = torch.zeros_like(u), torch.zeros_like(v)
-        before, moved, done = u, [], 0
+        movement, done = Movement(u, self.iterations, self.tolerance, progress), 0
         for done in range(1, self.iterations + 1):
             gp = _zero_border(g.times(p))
             prox_u = data.prox(u + steps.u * divergence(gp))
             prox_v = v + steps.v * (gp[:, :, 0] + divergence(q))
             ahead_u, ahead_v = 2 * prox_u - u, 2 * prox_v - v
             prox_p = _project_ball(
-                p + steps.p * g.times(_zero_border(gradient(ahead_u) - ahead_v[:, :, None])), self.first
+                p + steps.p * g.times(_zero_border(gradient(ahead_u) - ahead_v[:, :, None])), self.alpha1
             )
-            prox_q = _project_ball(q + steps.q * gradient(ahead_v), self.second)
+            prox_q = _project_ball(q + steps.q * gradient(ahead_v), self.alpha0)
             u, v, p, q = (
                 old.lerp(near, _RELAXATION) for old, near in ((u, prox_u), (v, prox_v), (p, prox_p), (q, prox_q))
             )
             since = (done - 1) % CHECK_EVERY + 1
             mean_u, mean_v = mean_u.lerp(prox_u, 1 / since), mean_v.lerp(prox_v, 1 / since)
-            if since == CHECK_EVERY:
-                if progress is not None:
-                    progress(done, self.iterations)
-                moved.append(float((mean_u - before).square().mean(dim=(-2, -1)).max().sqrt()))
-                if moved[-1] < self.tolerance:
-                    break
-                before = mean_u
-        if progress is not None:
-            progress(self.iterations, self.iterations)
-        return Solution(mean_u, mean_v, done, moved)
+            if since == CHECK_EVERY and movement.converged(mean_u):
+                break
+        movement.finish()
+        return Solution(mean_u, mean_v, done, movement.moved)
 
 
 class _Steps(NamedTuple):
@@ -254,17 +247,17 @@ class _DataTerm:
     the mean. As data_weight grows, it becomes the projection onto mean = coarse.
     """
 
-    def __init__(self, coarse: Tensor, steps: Tensor, weight: float | None) -> None:
-        self.scale = steps.shape[-1] // coarse.shape[-1]
-        valid = coarse.isfinite()
-        self.coarse = torch.where(valid, coarse, 0)
+    def __init__(self, lr: Tensor, steps: Tensor, weight: float | None) -> None:
+        self.scale = steps.shape[-1] // lr.shape[-1]
+        valid = lr.isfinite()
+        self.lr = torch.where(valid, lr, 0)
         mean = box_mean(steps, self.scale)
         gain = 1 / mean if weight is None else weight / (1 + weight * mean)
         self.gain = steps * repeat_blocks(torch.where(valid, gain, 0), self.scale)
 
     def prox(self, u: Tensor) -> Tensor:
         """Return the proximal map of u, (B, 1, H, W)."""
-        return u - self.gain * repeat_blocks(box_mean(u, self.scale) - self.coarse, self.scale)
+        return u - self.gain * repeat_blocks(box_mean(u, self.scale) - self.lr, self.scale)
 
 
 def slopes(u: Tensor) -> Tensor:

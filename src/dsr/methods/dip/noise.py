@@ -10,11 +10,11 @@ from torch.nn import functional
 
 from dsr.geometry.camera import Camera
 
-_SHARE, _QUANTILE = 0.1, 0.12566
+_FRACTION, _QUANTILE = 0.1, 0.12566
 """A tenth of a normal variable's absolute values are below that many standard deviations."""
 
 
-def estimate_noise(coarse: Tensor) -> float:
+def estimate_noise(depth_lr: Tensor) -> float:
     """Return the standard deviation of a depth map's relative noise, estimated from the map alone.
 
     Immerkaer, *Fast Noise Variance Estimation*, CVIU 1996: the difference of two Laplacians, which is 0 on planes and
@@ -22,20 +22,20 @@ def estimate_noise(coarse: Tensor) -> float:
     everywhere, while steps and curves of the surface are not.
 
     Args:
-        coarse: (1, 1, h, w) in metres, NaN in holes.
+        depth_lr: (1, 1, h, w) in metres, NaN in holes.
 
     Returns:
         0 where fewer than one 3 x 3 window is known.
 
     """
-    if min(coarse.shape[-2:]) < 3:
+    if min(depth_lr.shape[-2:]) < 3:
         return 0.0
-    row = torch.tensor([1.0, -2.0, 1.0], dtype=torch.float64, device=coarse.device)
-    answers = functional.conv2d(coarse.double().log(), torch.outer(row, row)[None, None]).abs()
-    known = answers[answers.isfinite()]
-    if not len(known):
+    row = torch.tensor([1.0, -2.0, 1.0], dtype=torch.float64, device=depth_lr.device)
+    responses = functional.conv2d(depth_lr.double().log(), torch.outer(row, row)[None, None]).abs()
+    valid = responses[responses.isfinite()]
+    if not len(valid):
         return 0.0
-    return float(known.kthvalue(max(round(_SHARE * len(known)), 1)).values) / _QUANTILE / 6
+    return float(valid.kthvalue(max(round(_FRACTION * len(valid)), 1)).values) / _QUANTILE / 6
 
 
 def normal_noise_deg(noise: float, camera: Camera) -> float:

@@ -198,8 +198,8 @@ class PriorOptimisation(lightning.LightningModule):
     def _depth(self, y: Tensor) -> Tensor:
         """Return depth in metres for the network's first channel."""
         problem = self.problem
-        margin = self.settings.margin * problem.span
-        least = max(problem.low - margin, 0.5 * problem.low)
+        margin = self.settings.margin * problem.depth_range
+        least = max(problem.min_depth - margin, 0.5 * problem.min_depth)
         if self.base is not None:
-            return (self.base + margin * y).clamp(min=0.5 * problem.low)
-        return least + (problem.low + problem.span + margin - least) * y.sigmoid()
+            return (self.base + margin * y).clamp(min=0.5 * problem.min_depth)
+        return least + (problem.min_depth + problem.depth_range + margin - least) * y.sigmoid()

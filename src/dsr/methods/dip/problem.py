@@ -16,8 +16,8 @@ from dsr.metrics.functional import SurfacePair, mse_v
 from dsr.sample import DepthSample
 
 DataLoss = Literal["lap1", "mse"]
-_LEAST_SPAN = 1e-3
-_MOST_LEVELS = 3
+_MIN_RANGE = 1e-3
+_MAX_LEVELS = 3
 
 
 @dataclass(frozen=True)
@@ -27,46 +27,46 @@ class ImageProblem:
     Args:
         rgb: (1, 3, H, W) the photo in [0, 1].
         grey: (1, 1, H, W) its luminance.
-        coarse: (1, 1, h, w) the coarse depth in metres, NaN in holes.
+        depth_lr: (1, 1, h, w) low-resolution depth in metres, NaN in holes.
         rays, rays_lr: (1, 3, H, W) and (1, 3, h, w), of the cameras.
         camera: of the photo.
         scale: the upsampling factor.
-        downsampling: the model that leads from fine to low-resolution depth, as far as one knows.
+        downsampling: the model that is assumed to lead from high- to low-resolution depth.
         range_type: the type that the model averages unless it says one itself.
-        low, span: the least known low-resolution depth, and how far the largest is from it; metres.
+        min_depth, depth_range: minimum and range (maximum less minimum) of the valid low-resolution depth in metres.
 
     """
 
     rgb: Tensor
     grey: Tensor
-    coarse: Tensor
+    depth_lr: Tensor
     rays: Tensor
     rays_lr: Tensor
     camera: Camera
     scale: int
     downsampling: Downsampling
     range_type: RangeType
-    low: float
-    span: float
+    min_depth: float
+    depth_range: float
 
     @classmethod
     def of(cls, sample: DepthSample, downsampling: Downsampling, range_type: RangeType, device: torch.device) -> Self:
         """Return the problem that a sample poses; its true depth is not looked at."""
         known = sample.depth_lr[sample.mask_lr]
-        low, high = float(known.min()), float(known.max())
+        min_depth, max_depth = float(known.min()), float(known.max())
         rgb = sample.rgb[None].to(device, torch.float32)
         return cls(
             rgb=rgb,
             grey=grey(rgb),
-            coarse=sample.depth_lr[None].to(device, torch.float32),
+            depth_lr=sample.depth_lr[None].to(device, torch.float32),
             rays=sample.camera.rays(dtype=torch.float32, device=device)[None],
             rays_lr=sample.camera_lr.rays(dtype=torch.float32, device=device)[None],
             camera=sample.camera,
             scale=sample.scale,
             downsampling=downsampling,
             range_type=range_type,
-            low=low,
-            span=max(high - low, _LEAST_SPAN * high),
+            min_depth=min_depth,
+            depth_range=max(max_depth - min_depth, _MIN_RANGE * max_depth),
         )
 
     def downsample(self, depth: Tensor) -> Tensor:
@@ -75,9 +75,9 @@ class ImageProblem:
 
     def residual(self, depth: Tensor) -> Tensor:
         """Return the root mean square of D(depth) / coarse - 1 over the known low-resolution pixels, a scalar."""
-        share = self.downsample(depth) / self.coarse - 1
-        known = share.isfinite()
-        return (torch.where(known, share, 0).square().sum() / known.sum()).sqrt()
+        ratio = self.downsample(depth) / self.depth_lr - 1
+        known = ratio.isfinite()
+        return (torch.where(known, ratio, 0).square().sum() / known.sum()).sqrt()
 
 
 @dataclass(frozen=True)
@@ -120,15 +120,17 @@ class PriorObjective:
             problem: the image.
 
         """
-        coarse, span = problem.downsample(depth), problem.span
+        depth_lr, depth_range = problem.downsample(depth), problem.depth_range
         if self.data_loss == "mse":
-            data = losses.mse(coarse / span, problem.coarse / span).mean()
+            data = losses.mse(depth_lr / depth_range, problem.depth_lr / depth_range).mean()
         else:
-            data = losses.lap1(coarse / span, problem.coarse / span, levels=_levels(coarse)).mean()
+            data = losses.lap1(depth_lr / depth_range, problem.depth_lr / depth_range, levels=_levels(depth_lr)).mean()
         terms = {f"data_{self.data_loss}": data}
         loss = self.data_weight * data
         if self.w:
-            terms["mse_v"] = mse_v(SurfacePair(coarse, problem.coarse, problem.rays_lr)).nansum()  # none between holes
+            terms["mse_v"] = mse_v(
+                SurfacePair(depth_lr, problem.depth_lr, problem.rays_lr)
+            ).nansum()  # none between holes
             loss = loss + self.w * terms["mse_v"]
         if self.w_intensity:
             terms["intensity"] = losses.lap1(intensity, problem.grey, levels=_levels(intensity)).mean()
@@ -139,6 +141,6 @@ class PriorObjective:
 def _levels(x: Tensor) -> int:
     """Return as many levels of a Laplacian pyramid as a map has room for."""
     side, levels = min(x.shape[-2:]), 1
-    while levels < _MOST_LEVELS and side >= 3 * 2**levels:
+    while levels < _MAX_LEVELS and side >= 3 * 2**levels:
         levels += 1
     return levels

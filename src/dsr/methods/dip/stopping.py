@@ -127,14 +127,14 @@ class Residual(Fixed):
     """Stops when the average explains the LR map as well as its noise allows: Morozov's discrepancy principle.
 
     Args:
-        coarse: (1, 1, h, w) the coarse depth in metres, NaN in holes; its noise is estimated.
+        depth_lr: (1, 1, h, w) low-resolution depth in metres, NaN in holes; its noise is estimated.
         residual: from a map (1, 1, H, W) to the root mean square of its low-resolution version's relative error, a
             scalar.
 
     """
 
-    def __init__(self, coarse: Tensor, residual: Callable[[Tensor], Tensor]) -> None:
-        self.noise = estimate_noise(coarse)
+    def __init__(self, depth_lr: Tensor, residual: Callable[[Tensor], Tensor]) -> None:
+        self.noise = estimate_noise(depth_lr)
         self._residual = residual
 
     def observe(self, step: int, depth: Tensor, average: Tensor) -> bool:

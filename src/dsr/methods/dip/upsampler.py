@@ -200,7 +200,7 @@ class DeepImagePrior:
         if self.stopping == "variance":
             return Variance(problem.grey, self.patience)
         if self.stopping == "residual":
-            return Residual(problem.coarse, problem.residual)
+            return Residual(problem.depth_lr, problem.residual)
         return Oracle() if self.stopping == "oracle" else Fixed()
 
     def _announcement(self, module: PriorOptimisation, scene: str, resumed: bool) -> str:

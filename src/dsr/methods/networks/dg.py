@@ -95,17 +95,17 @@ class Stage(nn.Module):
         responses = functional.conv2d(x, self.filters(x))
         return (self.weights(rgb) * penalty(responses, self._heights(x))).sum(dim=(1, 2, 3))
 
-    def forward(self, x: Tensor, coarse: Tensor, rgb: Tensor) -> Tensor:
+    def forward(self, x: Tensor, lr: Tensor, rgb: Tensor) -> Tensor:
         """Return the next map, (B, 1, H, W): a step towards the low-resolution map, then one down the gradient of E.
 
         Args:
             x: (B, 1, H, W) the map.
-            coarse: (B, 1, h, w) its block means as they should be.
+            lr: (B, 1, h, w) its block means as they should be.
             rgb: (B, 3, H, W) the photos.
 
         """
-        scale = x.shape[-1] // coarse.shape[-1]
-        x = x - self.fidelity.to(x) * upsample_linear_border(box_mean(x, scale) - coarse, scale)
+        scale = x.shape[-1] // lr.shape[-1]
+        x = x - self.fidelity.to(x) * upsample_linear_border(box_mean(x, scale) - lr, scale)
         if min(x.shape[-2:]) < self.size:
             return x
         filters = self.filters(x)
@@ -173,8 +173,8 @@ class DynamicGuidance(NormalisedNetwork):
         expect_photo(rgb, values, self.scale)
         weight = next(self.parameters())
         with torch.autocast(rgb.device.type, enabled=False):
-            photo, coarse = (x.to(torch.promote_types(weight.dtype, torch.float32)) for x in (rgb, values))
-            x = upsample_linear_border(coarse, self.scale)
+            guide, lr = (x.to(torch.promote_types(weight.dtype, torch.float32)) for x in (rgb, values))
+            x = upsample_linear_border(lr, self.scale)
             for stage in self.stages:
-                x = stage(x, coarse, photo)
+                x = stage(x, lr, guide)
         return x.to(values.dtype)

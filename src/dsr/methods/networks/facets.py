@@ -27,7 +27,7 @@ from dsr.methods.classical.finite_differences import extend_linearly
 from dsr.methods.networks.base import NormalisedNetwork, expect_photo
 
 _NEIGHBOURS = 9
-_FINE, _HALF = 16, 32
+_FULL, _HALF = 16, 32
 """Channels of the photo's features at the full and at half the resolution."""
 _HEAD = 24
 _FAINT, _STRONG = 1e-3, 0.25
@@ -89,20 +89,20 @@ class Facets(NormalisedNetwork):
             )
         self.scale, self.width, self.blocks, self.facets, self.slopes = scale, width, blocks, facets, slopes
         levels = scale.bit_length() - 1
-        channels = [*[_FINE, _HALF, width, width][:levels], width]
+        channels = [*[_FULL, _HALF, width, width][:levels], width]
         self.photo = nn.Conv2d(4, channels[0], 5, padding=2)
         self.down = nn.ModuleList(
             nn.Conv2d(before, after, 4, stride=2, padding=1) for before, after in itertools.pairwise(channels)
         )
         self.coarse = nn.Conv2d(10, width, 3, padding=1)
         self.trunk = nn.Sequential(*(_Residual(width) for _ in range(blocks)))
-        self.planes = _quiet(nn.Conv2d(width, 3 * facets + 6, 3, padding=1))
+        self.planes = _scale_down(nn.Conv2d(width, 3 * facets + 6, 3, padding=1))
         outputs = [_HEAD, *channels[1:-1]]
         self.up = nn.ModuleList(nn.Conv2d(channels[i + 1], 4 * outputs[i], 1) for i in reversed(range(levels)))
         self.join = nn.ModuleList(
             nn.Conv2d(outputs[i] + channels[i], outputs[i], 3, padding=1) for i in reversed(range(levels))
         )
-        self.choice = _quiet(nn.Conv2d(_HEAD, _NEIGHBOURS * facets, 3, padding=1))
+        self.choice = _scale_down(nn.Conv2d(_HEAD, _NEIGHBOURS * facets, 3, padding=1))
         offsets = (
             torch.arange(scale) + 0.5
         ) / scale - 0.5  # of high-resolution pixels from their low-resolution one's centre
@@ -142,16 +142,16 @@ class Facets(NormalisedNetwork):
         expect_photo(rgb, values, self.scale)
         around = stencil(values)
         dtype = self.photo.weight.dtype
-        pyramid = [functional.relu(self.photo(_photo_input(rgb, mean).to(dtype)))]
+        pyramid = [functional.relu(self.photo(_rgb_input(rgb, mean).to(dtype)))]
         for layer in self.down:
             pyramid.append(functional.relu(layer(pyramid[-1])))
-        x = self.trunk(functional.relu(pyramid[-1] + self.coarse(_coarse_input(around).to(dtype))))
-        planes = self._proposed(self.planes(x), around)
+        x = self.trunk(functional.relu(pyramid[-1] + self.coarse(_lr_input(around).to(dtype))))
+        planes = self._propose_planes(self.planes(x), around)
         for up, join, photo in zip(self.up, self.join, reversed(pyramid[:-1]), strict=True):
             x = functional.relu(join(torch.cat((functional.pixel_shuffle(up(x), 2), photo), dim=1)))
-        return self._mixed(planes, self.choice(x))
+        return self._mix_planes(planes, self.choice(x))
 
-    def _proposed(self, output: Tensor, around: Stencil) -> Tensor:
+    def _propose_planes(self, output: Tensor, around: Stencil) -> Tensor:
         """Return the planes of each LR pixel, (B, facets, 3, h, w): value at its centre, slopes along u and v."""
         output = output.to(torch.promote_types(around.value.dtype, torch.float32))
         batch, _, height, width = output.shape
@@ -165,7 +165,7 @@ class Facets(NormalisedNetwork):
         planes = base + moves.view(batch, self.facets, 3, height, width) * around.bend[:, None]
         return planes if self.slopes else torch.cat((planes[:, :, :1], torch.zeros_like(planes[:, :, 1:])), dim=2)
 
-    def _mixed(self, planes: Tensor, choice: Tensor) -> Tensor:
+    def _mix_planes(self, planes: Tensor, choice: Tensor) -> Tensor:
         """Return the mixture of the planes around each high-resolution pixel, (B, 1, H, W).
 
         Args:
@@ -178,11 +178,11 @@ class Facets(NormalisedNetwork):
         logits = choice.to(planes.dtype).view(batch, _NEIGHBOURS, facets, height, s, width, s)
         logits = logits + self.prior.to(planes.dtype).view(_NEIGHBOURS, 1, 1, s, 1, s)
         weights = logits.reshape(batch, count, height, s, width, s).softmax(dim=1)
-        near = _neighbours(planes).reshape(batch, count, 3, height, 1, width, 1)
+        near = _gather_neighbours(planes).reshape(batch, count, 3, height, 1, width, 1)
         value, slope_u, slope_v = ((weights * near[:, :, i]).sum(dim=1) for i in range(3))  # (B, h, s, w, s)
         offsets = self.offsets.to(planes.dtype)
-        fine = value + slope_u * offsets + slope_v * offsets[:, None, None]
-        return fine.reshape(batch, 1, height * s, width * s)
+        hr = value + slope_u * offsets + slope_v * offsets[:, None, None]
+        return hr.reshape(batch, 1, height * s, width * s)
 
 
 class _Residual(nn.Module):
@@ -200,7 +200,7 @@ class _Residual(nn.Module):
         return x + self.second(functional.relu(self.first(x)))
 
 
-def _quiet(conv: nn.Conv2d) -> nn.Conv2d:
+def _scale_down(conv: nn.Conv2d) -> nn.Conv2d:
     """Return a convolution whose output is small at first."""
     with torch.no_grad():
         conv.weight.mul_(0.1)
@@ -214,13 +214,13 @@ def _mean(rgb: Tensor) -> Tensor:
     return rgb.mean(dim=(-2, -1), keepdim=True)
 
 
-def _photo_input(rgb: Tensor, mean: Tensor | None = None) -> Tensor:
+def _rgb_input(rgb: Tensor, mean: Tensor | None = None) -> Tensor:
     """Return (B, 4, H, W): the colours, and how much brighter than the picture's mean a pixel is."""
     brightness = (rgb - (_mean(rgb) if mean is None else mean)).mean(dim=1, keepdim=True)
     return torch.cat((rgb - 0.5, 2 * brightness), dim=1)
 
 
-def _coarse_input(around: Stencil) -> Tensor:
+def _lr_input(around: Stencil) -> Tensor:
     """Return (B, 10, h, w): differences, once compressed so that faint ones count, once as they are; and directions."""
     differences = torch.cat(
         (around.value - around.mean, around.along_u[:, 1:2], around.along_v[:, 1:2], around.bend), dim=1
@@ -231,7 +231,7 @@ def _coarse_input(around: Stencil) -> Tensor:
     return torch.cat((torch.asinh(differences / _FAINT) / 3, differences / _STRONG, *turns), dim=1)
 
 
-def _neighbours(planes: Tensor) -> Tensor:
+def _gather_neighbours(planes: Tensor) -> Tensor:
     """Return the planes of the 3 x 3 low-resolution pixels around each, extended to its centre.
 
     Args:

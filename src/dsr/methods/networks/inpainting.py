@@ -12,15 +12,15 @@ def inpaint(x: Tensor) -> Tensor:
 
     An image without a known value stays as it is.
     """
-    known = x.isfinite()
-    if bool(known.all()):
+    valid = x.isfinite()
+    if bool(valid.all()):
         return x
-    values, weight = torch.where(known, x, 0), known.to(x.dtype)
+    values, weight = torch.where(valid, x, 0), valid.to(x.dtype)
     for _ in range(max(x.shape[-2:])):
-        total, share = (functional.avg_pool2d(each, 3, stride=1, padding=1) for each in (values, weight))
-        new = (weight == 0) & (share > 0)
+        total, fraction = (functional.avg_pool2d(each, 3, stride=1, padding=1) for each in (values, weight))
+        new = (weight == 0) & (fraction > 0)
         if not bool(new.any()):
             break
-        values = torch.where(new, total / torch.where(share > 0, share, 1), values)
+        values = torch.where(new, total / torch.where(fraction > 0, fraction, 1), values)
         weight = torch.where(new, 1, weight)
     return torch.where(weight > 0, values, torch.nan)

@@ -29,12 +29,12 @@ def normalise(x: Tensor, bounds: Tensor | None = None) -> Normalised:
         bounds: (B, 2, 1, 1) minimum and maximum to use instead of the map's own.
 
     """
-    known = x.isfinite()
+    valid = x.isfinite()
     bounds = min_max(x) if bounds is None else bounds.to(x)
-    least = bounds[:, :1]
-    span = bounds[:, 1:] - least  # -inf where nothing is finite
-    values = torch.where(known, x - least, 0) / torch.where(span > 0, span, 1)
-    return Normalised(values, torch.where(span >= 0, least, torch.nan), span)
+    lowest = bounds[:, :1]
+    span = bounds[:, 1:] - lowest  # -inf where nothing is finite
+    values = torch.where(valid, x - lowest, 0) / torch.where(span > 0, span, 1)
+    return Normalised(values, torch.where(span >= 0, lowest, torch.nan), span)
 
 
 def min_max(x: Tensor) -> Tensor:
@@ -42,9 +42,9 @@ def min_max(x: Tensor) -> Tensor:
 
     Infinity and minus infinity where nothing is finite.
     """
-    known, dims = x.isfinite(), (-3, -2, -1)
-    least = x.masked_fill(~known, torch.inf).amin(dims, keepdim=True)
-    return torch.cat((least, x.masked_fill(~known, -torch.inf).amax(dims, keepdim=True)), dim=1)
+    valid, dims = x.isfinite(), (-3, -2, -1)
+    lowest = x.masked_fill(~valid, torch.inf).amin(dims, keepdim=True)
+    return torch.cat((lowest, x.masked_fill(~valid, -torch.inf).amax(dims, keepdim=True)), dim=1)
 
 
 def mean3x3(x: Tensor) -> Tensor:
@@ -61,11 +61,11 @@ def upsample_bicubic(x: Tensor, scale: int) -> Tensor:
     return functional.interpolate(x, size=size, mode="bicubic", align_corners=False, antialias=True)
 
 
-def lr_coordinates(fine: Camera, coarse: Camera, device: torch.device | str = "cpu") -> tuple[Tensor, Tensor]:
+def lr_coordinates(camera: Camera, camera_lr: Camera, device: torch.device | str = "cpu") -> tuple[Tensor, Tensor]:
     """Return the LR row of each HR row, (H,), and the LR column of each HR column, (W,), in float64."""
-    rows = torch.arange(fine.height, dtype=torch.float64, device=device)
-    columns = torch.arange(fine.width, dtype=torch.float64, device=device)
+    rows = torch.arange(camera.height, dtype=torch.float64, device=device)
+    columns = torch.arange(camera.width, dtype=torch.float64, device=device)
     return (
-        (rows - fine.cy) / fine.fy * coarse.fy + coarse.cy,
-        (columns - fine.cx) / fine.fx * coarse.fx + coarse.cx,
+        (rows - camera.cy) / camera.fy * camera_lr.fy + camera_lr.cy,
+        (columns - camera.cx) / camera.fx * camera_lr.fx + camera_lr.cx,
     )

@@ -94,8 +94,8 @@ class PrimalDualNetwork(NormalisedNetwork):
         A high-resolution pixel for each convolution, half a window for each step of the iteration; the upsampling and
         the differences of the low-resolution map that go in look four low-resolution pixels far.
         """
-        fine = self.layers + self.stage.reach
-        return -(-fine // self.scale) + 4
+        radius_hr = self.layers + self.stage.reach
+        return -(-radius_hr // self.scale) + 4
 
     def forward(self, rgb: Tensor, values: Tensor) -> Tensor:
         """Map a photo and normalised low-resolution disparity to high-resolution disparity.
@@ -109,20 +109,20 @@ class PrimalDualNetwork(NormalisedNetwork):
 
         """
         expect_photo(rgb, values, self.scale)
-        fine = upsample_linear_border(values, self.scale)
-        seen, bend = self._seen(rgb, values, fine)
-        output = self.head(self.trunk(seen.to(self.head.weight.dtype)))
+        hr = upsample_linear_border(values, self.scale)
+        inputs, bend = self._inputs(rgb, values, hr)
+        output = self.head(self.trunk(inputs.to(self.head.weight.dtype)))
         with torch.autocast(rgb.device.type, enabled=False):
             output = output.to(torch.float32 if output.dtype == torch.bfloat16 else output.dtype)
-            residual = (output[:, :1] * bend).to(fine.dtype)
+            residual = (output[:, :1] * bend).to(hr.dtype)
             strength = self.log_strength.to(output.dtype).exp()
             weights = (-strength * output[:, 1:].abs()).softmax(dim=1) + _TINY
             r = self.window // 2
-            first = extend_linearly(fine, 2 * r) + functional.pad(residual, (2 * r,) * 4, mode="replicate")
+            first = extend_linearly(hr, 2 * r) + functional.pad(residual, (2 * r,) * 4, mode="replicate")
             moved = self.stage(first[..., r:-r, :], weights)
-            return fine + residual + moved.to(fine.dtype)
+            return hr + residual + moved.to(hr.dtype)
 
-    def _seen(self, rgb: Tensor, values: Tensor, fine: Tensor) -> tuple[Tensor, Tensor]:
+    def _inputs(self, rgb: Tensor, values: Tensor, hr: Tensor) -> tuple[Tensor, Tensor]:
         """Return what the convolutions take, (B, 9, H, W), and the bend that their residual is a multiple of.
 
         These are the photo's 3 colours; the low-resolution map's slopes along u and v and its distance from the mean of
@@ -130,11 +130,11 @@ class PrimalDualNetwork(NormalisedNetwork):
         ones count; and the latter distance over the bend.
         """
         around = stencil(values)
-        coarse = torch.cat((around.along_u[:, 1:2], around.along_v[:, 1:2], around.value - around.mean), dim=1)
-        size = tuple(fine.shape[-2:])
+        slopes_lr = torch.cat((around.along_u[:, 1:2], around.along_v[:, 1:2], around.value - around.mean), dim=1)
+        size = tuple(hr.shape[-2:])
         bend = functional.interpolate(around.bend.float(), size=size, mode="bilinear")
-        slopes = functional.interpolate(coarse.float(), size=size, mode="bilinear")
-        away = (fine - upsample_linear_border(around.mean, self.scale)).float()
-        turned = away / bend.clamp(min=torch.finfo(torch.float32).tiny)
-        depth = torch.asinh(torch.cat((slopes, away, bend), dim=1) / _FAINT) / 3
-        return torch.cat((rgb.float() - 0.5, depth, turned.clamp(-2, 2)), dim=1), bend
+        slopes = functional.interpolate(slopes_lr.float(), size=size, mode="bilinear")
+        detail = (hr - upsample_linear_border(around.mean, self.scale)).float()
+        relative = detail / bend.clamp(min=torch.finfo(torch.float32).tiny)
+        depth = torch.asinh(torch.cat((slopes, detail, bend), dim=1) / _FAINT) / 3
+        return torch.cat((rgb.float() - 0.5, depth, relative.clamp(-2, 2)), dim=1), bend

@@ -32,7 +32,7 @@ class _Planes(NamedTuple):
 
 
 def bilateral_filter(
-    coarse: Tensor,
+    lr: Tensor,
     barrier: Tensor,
     scale: int,
     radius: int,
@@ -45,7 +45,7 @@ def bilateral_filter(
     """Return a map (h, w) upsampled by the modified joint bilateral filter, (H, W), NaN where it is.
 
     Args:
-        coarse: the map, NaN where it is not known; some of it must be.
+        lr: the map, NaN where it is not known; some of it must be.
         barrier: (H, W) bool, the edges.
         scale: high-resolution pixels per low-resolution one.
         radius: of the neighbourhood, in low-resolution pixels.
@@ -55,20 +55,20 @@ def bilateral_filter(
         sharp: whether pixels on edges take a side; otherwise they keep what leaves block means as they are.
 
     """
-    known = coarse.isfinite()
-    doubtful = torch.zeros_like(known) if doubtful is None else doubtful
-    whole = inpaint(coarse[None, None])
+    valid = lr.isfinite()
+    doubtful = torch.zeros_like(valid) if doubtful is None else doubtful
+    lr_inpainted = inpaint(lr[None, None])
     cut = functional.max_pool2d(barrier[None, None].float(), scale)[0, 0] > 0
-    clean = coarse.masked_fill(doubtful, torch.nan)
-    trust = torch.where(cut | doubtful, mixed, 1.0).to(coarse) * known
-    planes = _Planes(whole[0, 0], estimate_slopes(clean, 0), estimate_slopes(clean, 1), trust)
-    smooth = upsample_linear_border(whole, scale)[0, 0]
-    reach = find_reachable(barrier, scale, radius)
-    fine = _fill_edges(_filter(planes, reach, scale, sigma_space, smooth), barrier, whole, smooth, scale)
+    lr_certain = lr.masked_fill(doubtful, torch.nan)
+    trust = torch.where(cut | doubtful, mixed, 1.0).to(lr) * valid
+    planes = _Planes(lr_inpainted[0, 0], estimate_slopes(lr_certain, 0), estimate_slopes(lr_certain, 1), trust)
+    smooth = upsample_linear_border(lr_inpainted, scale)[0, 0]
+    reachable = find_reachable(barrier, scale, radius)
+    hr = _fill_edges(_filter(planes, reachable, scale, sigma_space, smooth), barrier, lr_inpainted, smooth, scale)
     if sharp:
-        _take_sides(reach, barrier, fine, scale)
-        fine = torch.where(barrier, _filter(planes, reach, scale, sigma_space, smooth), fine)
-    return fine.masked_fill(~repeat_blocks(known[None, None], scale)[0, 0], torch.nan)
+        _take_sides(reachable, barrier, hr, scale)
+        hr = torch.where(barrier, _filter(planes, reachable, scale, sigma_space, smooth), hr)
+    return hr.masked_fill(~repeat_blocks(valid[None, None], scale)[0, 0], torch.nan)
 
 
 def find_reachable(barrier: Tensor, scale: int, radius: int) -> Tensor:
@@ -92,8 +92,8 @@ def find_reachable(barrier: Tensor, scale: int, radius: int) -> Tensor:
     padded = functional.pad(barrier, (edge, edge, edge, edge), value=True)
     windows = padded.unfold(0, side * scale, scale).unfold(1, side * scale, scale).flatten(0, 1)
     ways = torch.ones_like(windows)
-    for some in windows.flatten(1).any(dim=1).nonzero()[:, 0].split(_CHUNK):
-        ways[some] = _flood(~windows[some])
+    for chunk in windows.flatten(1).any(dim=1).nonzero()[:, 0].split(_CHUNK):
+        ways[chunk] = _flood(~windows[chunk])
     ways = ways.view(height, width, side, scale, side, scale)
     result = barrier.new_zeros(side, side, height, scale, width, scale)
     for a in range(-radius, radius + 1):
@@ -105,40 +105,40 @@ def find_reachable(barrier: Tensor, scale: int, radius: int) -> Tensor:
     return result.view(side, side, *barrier.shape)
 
 
-def _filter(planes: _Planes, reach: Tensor, scale: int, sigma_space: float, smooth: Tensor) -> Tensor:
+def _filter(planes: _Planes, reachable: Tensor, scale: int, sigma_space: float, smooth: Tensor) -> Tensor:
     """Return the weighted means of the planes, (H, W); where no weight is, the smooth map."""
     height, width = planes.values.shape
     rows, columns = (torch.arange(n, device=smooth.device) for n in smooth.shape)
     y, x = ((n.to(smooth) + 0.5) / scale - 0.5 for n in (rows, columns))
     total, weights = torch.zeros_like(smooth), torch.zeros_like(smooth)
-    radius = reach.shape[0] // 2
+    radius = reachable.shape[0] // 2
     for a in range(-radius, radius + 1):
         for b in range(-radius, radius + 1):
             i, j = rows // scale + a, columns // scale + b
             at = i.clamp(0, height - 1)[:, None], j.clamp(0, width - 1)  # beyond the border nothing is reachable
             down, across = (y - i)[:, None], x - j
             weight = torch.exp((down.square() + across.square()) / (-2 * sigma_space**2))
-            weight = weight * planes.trust[at] * reach[radius + a, radius + b]
+            weight = weight * planes.trust[at] * reachable[radius + a, radius + b]
             total += weight * (planes.values[at] + planes.down[at] * down + planes.across[at] * across)
             weights += weight
     return torch.where(weights > 0, total / torch.where(weights > 0, weights, 1), smooth)
 
 
-def _fill_edges(fine: Tensor, barrier: Tensor, coarse: Tensor, smooth: Tensor, scale: int) -> Tensor:
+def _fill_edges(hr: Tensor, barrier: Tensor, lr: Tensor, smooth: Tensor, scale: int) -> Tensor:
     """Return the high-resolution map with new values on edges: the smooth map, moved as the means of blocks need.
 
     They stay between the least and the most of the neighbours off the edge.
     """
-    start = torch.where(barrier, smooth, fine)[None, None]
-    share = box_mean(barrier[None, None].to(fine), scale)
-    missing = repeat_blocks((coarse - box_mean(start, scale)) / torch.where(share > 0, share, 1), scale)
+    start = torch.where(barrier, smooth, hr)[None, None]
+    fraction = box_mean(barrier[None, None].to(hr), scale)
+    missing = repeat_blocks((lr - box_mean(start, scale)) / torch.where(fraction > 0, fraction, 1), scale)
     beside = torch.cat((start, -start)).masked_fill(barrier, -torch.inf)
     most, least = functional.max_pool2d(beside, 3, stride=1, padding=1).unbind(0)
     value = (start + missing)[0].clamp(-least, most)
     return torch.where(barrier & most.isfinite(), value, start[0])[0]
 
 
-def _take_sides(reach: Tensor, barrier: Tensor, fine: Tensor, scale: int) -> None:
+def _take_sides(reachable: Tensor, barrier: Tensor, hr: Tensor, scale: int) -> None:
     """Let each edge pixel reach, in place, what its neighbour off the edge does that is the most like its own value.
 
     An edge pixel without such a neighbour reaches nothing.
@@ -148,15 +148,15 @@ def _take_sides(reach: Tensor, barrier: Tensor, fine: Tensor, scale: int) -> Non
     inside = ((beside >= 0) & (beside < places.new_tensor(barrier.shape))).all(dim=2)
     beside = torch.where(inside[:, :, None], beside, places[:, None])
     off = ~barrier[beside[..., 0], beside[..., 1]]
-    apart = (fine[beside[..., 0], beside[..., 1]] - fine[places[:, 0], places[:, 1]][:, None]).abs()
+    apart = (hr[beside[..., 0], beside[..., 1]] - hr[places[:, 0], places[:, 1]][:, None]).abs()
     best = apart.masked_fill(~off, torch.inf).argmin(dim=1)
     chosen = beside[torch.arange(len(places), device=places.device), best]  # an edge where there is no neighbour
-    side = len(reach)
+    side = len(reachable)
     there = places // scale - chosen // scale + torch.arange(side, device=places.device)[:, None, None]  # (side, N, 2)
     within = (there >= 0) & (there < side)
     rows, columns = there.clamp(0, side - 1).unbind(2)
-    seen = reach[rows[:, None], columns[None], chosen[:, 0], chosen[:, 1]]  # (side, side, N)
-    reach[:, :, places[:, 0], places[:, 1]] = seen & within[:, None, :, 0] & within[None, :, :, 1]
+    seen = reachable[rows[:, None], columns[None], chosen[:, 0], chosen[:, 1]]  # (side, side, N)
+    reachable[:, :, places[:, 0], places[:, 1]] = seen & within[:, None, :, 0] & within[None, :, :, 1]
 
 
 def _flood(free: Tensor) -> Tensor:

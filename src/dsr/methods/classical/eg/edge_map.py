@@ -60,7 +60,7 @@ _AROUND = ((0, 1), (0, 2), (1, 2), (2, 2), (2, 1), (2, 0), (1, 0), (0, 0))
 
 
 def predict_edge_map(
-    coarse: Tensor,
+    lr: Tensor,
     scale: int,
     step: float,
     candidates: int = 5,
@@ -72,7 +72,7 @@ def predict_edge_map(
     """Return the HR edge map, (h * scale, w * scale) bool, and how its patches were chosen; None without an edge.
 
     Args:
-        coarse: (h, w) map, NaN where it is not known.
+        lr: (h, w) map, NaN where it is not known.
         scale: high-resolution pixels per low-resolution one, at least 2.
         step: how high a step is an edge, in the map's unit.
         candidates: pairs that each patch chooses from.
@@ -86,27 +86,27 @@ def predict_edge_map(
 
     """
     border = -(-(PATCH // 2 + 1) // scale)
-    found = detect_edges(extend_linearly(coarse[None, None], border)[0, 0], scale, step)
+    edges = detect_edges(extend_linearly(lr[None, None], border)[0, 0], scale, step)
     within = (slice(border * scale, -border * scale),) * 2
-    if not bool(found[within].any()):
-        return torch.zeros_like(found[within]), None
-    known = find_recurring(coarse, scale, step)
-    if len(known.low) == 0:
+    if not bool(edges[within].any()):
+        return torch.zeros_like(edges[within]), None
+    examples = find_recurring(lr, scale, step)
+    if len(examples.low) == 0:
         raise NoSolutionError(
-            f"edge-guided upsampling: the edges of a map of {coarse.shape[0]} x {coarse.shape[1]} pixels do not recur "
+            f"edge-guided upsampling: the edges of a map of {lr.shape[0]} x {lr.shape[1]} pixels do not recur "
             f"at 1/{scale} of its size, so nothing tells how high-resolution ones look"
         )
-    places = _patch_centres(found)
-    far, which = find_nearest(extract_patches(found, places), known, candidates, sharp_weight)
-    patches = known.high.flatten(1)[which].float()  # (N, K, PATCH^2)
+    places = _patch_centres(edges)
+    distances, indices = find_nearest(extract_patches(edges, places), examples, candidates, sharp_weight)
+    patches = examples.high.flatten(1)[indices].float()  # (N, K, PATCH^2)
     pairs, costs = find_overlaps(places, patches)
-    answer = label(far / PATCH**2, pairs, smoothness * costs, iterations, progress=progress)
+    answer = label(distances / PATCH**2, pairs, smoothness * costs, iterations, progress=progress)
     chosen = patches[torch.arange(len(patches), device=patches.device), answer.labels]
-    mean = average_patches(chosen, places, (found.shape[0], found.shape[1]))
+    mean = average_patches(chosen, places, (edges.shape[0], edges.shape[1]))
     return _drop_small(thin(mean > KEPT))[within], answer
 
 
-def detect_edges(coarse: Tensor, scale: int, step: float) -> Tensor:
+def detect_edges(lr: Tensor, scale: int, step: float) -> Tensor:
     """Return the steps of a map (h, w) upsampled by ``scale``, (h * scale, w * scale) bool, about a pixel wide.
 
     Canny, *A Computational Approach to Edge Detection*, PAMI 1986: pixels whose gradient is the largest along its
@@ -115,10 +115,10 @@ def detect_edges(coarse: Tensor, scale: int, step: float) -> Tensor:
     :func:`dsr.methods.classical.photo_guided.estimate_slopes`) there or at a neighbouring low-resolution pixel. So a
     plane has no edge, however steep it is, and neither has an inpainted hole.
     """
-    fine = upsample_linear_border(inpaint(coarse[None, None]), scale)[0, 0]
-    down, across = (_central_difference(fine, axis) * scale for axis in (0, 1))
+    hr = upsample_linear_border(inpaint(lr[None, None]), scale)[0, 0]
+    down, across = (_central_difference(hr, axis) * scale for axis in (0, 1))
     strength = (down.square() + across.square()).sqrt()
-    excess = [(_central_difference(coarse, axis) - estimate_slopes(coarse, axis)).square() for axis in (0, 1)]
+    excess = [(_central_difference(lr, axis) - estimate_slopes(lr, axis)).square() for axis in (0, 1)]
     most = functional.max_pool2d((excess[0] + excess[1]).sqrt().nan_to_num(nan=0.0)[None, None], 3, stride=1, padding=1)
     most = most.repeat_interleave(scale, 2).repeat_interleave(scale, 3)[0, 0]
     ridge = torch.minimum(strength, most) * _is_ridge(strength, down, across)
@@ -126,15 +126,15 @@ def detect_edges(coarse: Tensor, scale: int, step: float) -> Tensor:
     return _drop_small(_grow(strong, weak))
 
 
-def find_recurring(coarse: Tensor, scale: int, step: float) -> Patches:
+def find_recurring(lr: Tensor, scale: int, step: float) -> Patches:
     """Return what the map (h, w) itself teaches, at a level ``scale`` times coarser; empty where it is too small."""
-    height, width = (n - n % scale for n in coarse.shape)
+    height, width = (n - n % scale for n in lr.shape)
     if min(height, width) < max(PATCH, 2 * scale):
-        return no_patches(coarse.device)
-    truth = coarse[:height, :width]
+        return no_patches(lr.device)
+    truth = lr[:height, :width]
     low, high = detect_edges(box_mean(truth[None, None], scale)[0, 0], scale, step), detect_edges(truth, 1, step)
-    reach = PATCH // 2
-    places = low[reach : height - reach, reach : width - reach].nonzero() + reach
+    half = PATCH // 2
+    places = low[half : height - half, half : width - half].nonzero() + half
     lows, highs = extract_patches(low, places), extract_patches(high, places)
     first, second = lows.sum(dim=(1, 2)), highs.sum(dim=(1, 2))
     enough = min(2 * scale, PATCH - 3)
@@ -198,11 +198,11 @@ def _drop_small(mask: Tensor) -> Tensor:
     return mask & (number > _SMALLEST - 0.5)
 
 
-def _patch_centres(found: Tensor) -> Tensor:
+def _patch_centres(edges: Tensor) -> Tensor:
     """Return the first edge pixel of each cell, as far inside as a patch needs, (N, 2)."""
-    reach = PATCH // 2
-    places = found[reach:-reach, reach:-reach].nonzero() + reach
-    number = places[:, 0] // _CELL * found.shape[1] + places[:, 1] // _CELL
+    half = PATCH // 2
+    places = edges[half:-half, half:-half].nonzero() + half
+    number = places[:, 0] // _CELL * edges.shape[1] + places[:, 1] // _CELL
     order = number.argsort(stable=True)
     first = torch.ones_like(number, dtype=torch.bool)
     first[1:] = number[order].diff() != 0

@@ -34,8 +34,8 @@ def no_patches(device: torch.device) -> Patches:
 
 def extract_patches(mask: Tensor, places: Tensor) -> Tensor:
     """Return the patches of a mask (H, W) around places (N, 2), rows and columns that far inside."""
-    reach = torch.arange(PATCH, device=mask.device) - PATCH // 2
-    return mask[places[:, 0, None, None] + reach[:, None], places[:, 1, None, None] + reach]
+    offsets = torch.arange(PATCH, device=mask.device) - PATCH // 2
+    return mask[places[:, 0, None, None] + offsets[:, None], places[:, 1, None, None] + offsets]
 
 
 def orient(patches: Tensor) -> Tensor:
@@ -66,21 +66,21 @@ def edge_distances(patches: Tensor) -> Tensor:
     return (along[:, None] + square[:, :, None]).amin(dim=2).sqrt()
 
 
-def find_nearest(query: Tensor, known: Patches, count: int, weight: float) -> tuple[Tensor, Tensor]:
+def find_nearest(query: Tensor, examples: Patches, count: int, weight: float) -> tuple[Tensor, Tensor]:
     """Return the known pairs most like patches, as squared distances and as numbers, (N, count) each; the best first.
 
     |D(query) - D(low)|^2 + weight^2 |query - high|^2, D being :func:`edge_distances`.
     """
-    there = _features(known.low, known.high, weight)
-    length = there.square().sum(dim=1)
-    far, which = [], []
-    for some in query.split(max(_ENTRIES // len(there), 1)):
-        here = _features(some, some, weight)
-        square = here.square().sum(dim=1, keepdim=True) + length - 2 * here @ there.T
-        least = square.clamp_(min=0).topk(min(count, len(there)), dim=1, largest=False)
-        far.append(least.values)
-        which.append(least.indices)
-    return torch.cat(far), torch.cat(which)
+    features = _features(examples.low, examples.high, weight)
+    length = features.square().sum(dim=1)
+    distances, indices = [], []
+    for chunk in query.split(max(_ENTRIES // len(features), 1)):
+        query_features = _features(chunk, chunk, weight)
+        square = query_features.square().sum(dim=1, keepdim=True) + length - 2 * query_features @ features.T
+        least = square.clamp_(min=0).topk(min(count, len(features)), dim=1, largest=False)
+        distances.append(least.values)
+        indices.append(least.indices)
+    return torch.cat(distances), torch.cat(indices)
 
 
 def find_overlaps(places: Tensor, patches: Tensor) -> tuple[Tensor, Tensor]:

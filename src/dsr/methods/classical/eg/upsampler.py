@@ -106,19 +106,19 @@ class EdgeGuided:
             NoSolutionError: edges do not recur across scales, see the module.
 
         """
-        coarse = to_range(sample.depth_lr.double(), sample.camera_lr, "disparity")[0] * sample.scale
-        known = coarse.isfinite()
-        least, most = (float(bound) for bound in coarse[known].aminmax())
+        disparity_lr = to_range(sample.depth_lr.double(), sample.camera_lr, "disparity")[0] * sample.scale
+        valid = disparity_lr.isfinite()
+        lowest, highest = (float(bound) for bound in disparity_lr[valid].aminmax())
         self.history = []
-        fine = coarse
+        disparity = disparity_lr
         stages = prime_factors(sample.scale)
         barrier: Tensor | None = None
         for number, scale in enumerate(stages):
-            told = part_of(progress, number * self._iterations, len(stages) * self._iterations)
+            report = part_of(progress, number * self._iterations, len(stages) * self._iterations)
             doubtful = barrier
-            barrier = self._edges(fine, scale, self._step * (most - least), told)
-            fine = bilateral_filter(
-                fine,
+            barrier = self._predict_edges(disparity, scale, self._step * (highest - lowest), report)
+            disparity = bilateral_filter(
+                disparity,
                 barrier,
                 scale,
                 self._radius,
@@ -128,18 +128,18 @@ class EdgeGuided:
                 sharp=number == len(stages) - 1,
             )
         doffs = sample.camera.doffs  # disparity + doffs is inverse depth
-        fine = fine.clamp((least + doffs) / _BEYOND - doffs, (most + doffs) * _BEYOND - doffs)
+        disparity = disparity.clamp((lowest + doffs) / _BEYOND - doffs, (highest + doffs) * _BEYOND - doffs)
         if self._fill_holes:
-            fine = inpaint(fine[None, None])[0, 0]
-        return from_range(fine[None], sample.camera, "disparity").to(sample.depth_lr)
+            disparity = inpaint(disparity[None, None])[0, 0]
+        return from_range(disparity[None], sample.camera, "disparity").to(sample.depth_lr)
 
-    def _edges(self, coarse: Tensor, scale: int, step: float, told: Steps | None) -> Tensor:
+    def _predict_edges(self, disparity_lr: Tensor, scale: int, step: float, report: Steps | None) -> Tensor:
         """Return the high-resolution edge map of a map (h, w), and add to the history how it was found."""
         barrier, answer = predict_edge_map(
-            coarse, scale, step, self._candidates, self._sharp_weight, self._smoothness, self._iterations, told
+            disparity_lr, scale, step, self._candidates, self._sharp_weight, self._smoothness, self._iterations, report
         )
-        if told is not None:
-            told(self._iterations, self._iterations)
+        if report is not None:
+            report(self._iterations, self._iterations)
         done = self.history[-1]["iteration"] if self.history else 0.0
         if answer is not None:
             self.history += [{**entry, "iteration": entry["iteration"] + done} for entry in answer.history]

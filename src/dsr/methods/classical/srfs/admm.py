@@ -52,13 +52,13 @@ class Weights(NamedTuple):
 class ShadingProblem(NamedTuple):
     """What does not change.
 
-    ``photo`` (B, C, H, W); ``coarse`` (B, 1, h, w) in the unit of z, NaN in holes; ``rays`` (1, 3, H, W) and
+    ``rgb`` (B, C, H, W); ``lr`` (B, 1, h, w) in the unit of z, NaN in holes; ``rays`` (1, 3, H, W) and
     ``focal`` (fx, fy) of the photo's camera, ``unit`` by which z is more than depth of about 1; ``inside``
     (B, 1, H, W) bool, the pixels that may change.
     """
 
-    photo: Tensor
-    coarse: Tensor
+    rgb: Tensor
+    lr: Tensor
     rays: Tensor
     focal: tuple[float, float]
     unit: float
@@ -67,7 +67,7 @@ class ShadingProblem(NamedTuple):
     @property
     def scale(self) -> int:
         """The upsampling factor."""
-        return self.photo.shape[-1] // self.coarse.shape[-1]
+        return self.rgb.shape[-1] // self.lr.shape[-1]
 
 
 class Slopes:
@@ -87,8 +87,8 @@ class Slopes:
             both = inside.narrow(dim, 0, size - 1) & inside.narrow(dim, 1, size - 1)
             none = torch.zeros_like(inside.narrow(dim, 0, 1))
             ahead, behind = torch.cat((both, none), dim), torch.cat((none, both), dim)
-            self._forward.append(ahead.to(problem.photo))
-            self._backward.append((behind & ~ahead).to(problem.photo))
+            self._forward.append(ahead.to(problem.rgb))
+            self._backward.append((behind & ~ahead).to(problem.rgb))
 
     def __call__(self, z: Tensor) -> Tensor:
         """Return theta of z, (B, 1, H, W) -> (B, 3, H, W)."""
@@ -129,15 +129,15 @@ class ShadingSolver:
     def __init__(self, problem: ShadingProblem, weights: Weights, first: Tensor, penalty: float) -> None:
         self.problem, self.weights, self.penalty = problem, weights, penalty
         self.slopes = Slopes(problem)
-        self._weight = problem.inside.to(problem.photo)
-        self._known = problem.coarse.isfinite()
-        self._coarse = torch.where(self._known, problem.coarse, 0)
-        coupling = problem.photo.new_tensor((1.0, 1.0, (problem.unit / problem.scale) ** 2))
+        self._weight = problem.inside.to(problem.rgb)
+        self._valid = problem.lr.isfinite()
+        self._lr = torch.where(self._valid, problem.lr, 0)
+        coupling = problem.rgb.new_tensor((1.0, 1.0, (problem.unit / problem.scale) ** 2))
         self._coupling = coupling[:, None, None] * self._weight
         self.z, self.theta = first, self.slopes(first)
         self.missed = torch.zeros_like(self.theta)
-        self.albedo = problem.photo
-        self.lighting = problem.photo.new_tensor((0.0, 0.0, -1.0, 0.0)).expand(*problem.photo.shape[:2], 4)
+        self.albedo = problem.rgb
+        self.lighting = problem.rgb.new_tensor((0.0, 0.0, -1.0, 0.0)).expand(*problem.rgb.shape[:2], 4)
         self.regions: Regions | None = None
         self._damping = torch.full_like(first, 1e-3)
 
@@ -146,22 +146,22 @@ class ShadingSolver:
 
         The first call replaces the photo, which stands for the albedo before it.
         """
-        photo, inside = self.problem.photo, self.problem.inside
+        rgb, inside = self.problem.rgb, self.problem.inside
         shading = compute_shading(compute_surface(self.theta, self.problem.rays).normals, self.lighting)
         found = []
         if self.regions is not None:
             found.append(self.regions)
         if anew or not found:
-            found.append(fuse(photo, shading, self.weights.boundary, inside))
-        tried = [(fit_albedo(photo, shading, regions), regions) for regions in found]
+            found.append(fuse(rgb, shading, self.weights.boundary, inside))
+        tried = [(fit_albedo(rgb, shading, regions), regions) for regions in found]
         energies = [self._shading_energy(albedo, shading) + self._boundaries(regions) for albedo, regions in tried]
         self.albedo, self.regions = tried[energies.index(min(energies))]
 
     def update_lighting(self) -> None:
         """Take the best lighting."""
         normals = compute_surface(self.theta, self.problem.rays).normals
-        lighting = fit_lighting(self.problem.photo, self.albedo, normals, self._weight)
-        self.lighting = lighting.to(self.problem.photo)
+        lighting = fit_lighting(self.problem.rgb, self.albedo, normals, self._weight)
+        self.lighting = lighting.to(self.problem.rgb)
 
     def update_theta(self) -> None:
         """Lower the Lagrangian in theta, pixel by pixel."""
@@ -180,9 +180,9 @@ class ShadingSolver:
         """Lower the Lagrangian, quadratic in z, by conjugate gradients, from z as it is."""
         weight = self._weight
         wanted = self.theta - self.missed
-        rest = self._coarse - self._means(self.z)
+        rest = self._lr - self._block_means(self.z)
         right = weight * (
-            self.weights.data * self._spread(rest)
+            self.weights.data * self._block_means_adjoint(rest)
             + self.penalty * self.slopes.adjoint(self._coupling * (wanted - self.slopes(self.z)))
         )
         found = conjugate_gradients(
@@ -199,7 +199,7 @@ class ShadingSolver:
         """Return the Lagrangian's second derivative in z, times z; 0 outside."""
         inside = self._weight * z
         own = self.penalty * self.slopes.adjoint(self._coupling * self.slopes(inside))
-        return self._weight * (own + self.weights.data * self._spread(self._means(inside)))
+        return self._weight * (own + self.weights.data * self._block_means_adjoint(self._block_means(inside)))
 
     def lagrangian(self) -> float:
         """Return the augmented Lagrangian."""
@@ -213,20 +213,20 @@ class ShadingSolver:
         surface = compute_surface(theta, self.problem.rays)
         return {
             "shading": self._shading_energy(self.albedo, compute_shading(surface.normals, self.lighting)),
-            "data": 0.5 * self.weights.data * float((self._coarse - self._means(self.z)).square().sum()),
+            "data": 0.5 * self.weights.data * float((self._lr - self._block_means(self.z)).square().sum()),
             "area": self.weights.area * float((self._weight * compute_area(theta, surface)).sum()),
             "boundaries": 0.0 if self.regions is None else self._boundaries(self.regions),
         }
 
-    def _means(self, z: Tensor) -> Tensor:
-        return torch.where(self._known, box_mean(z, self.problem.scale), 0)
+    def _block_means(self, z: Tensor) -> Tensor:
+        return torch.where(self._valid, box_mean(z, self.problem.scale), 0)
 
-    def _spread(self, coarse: Tensor) -> Tensor:
+    def _block_means_adjoint(self, lr: Tensor) -> Tensor:
         """Return the adjoint of the means."""
-        return repeat_blocks(coarse, self.problem.scale) / self.problem.scale**2
+        return repeat_blocks(lr, self.problem.scale) / self.problem.scale**2
 
     def _shading_energy(self, albedo: Tensor, shading: Tensor) -> float:
-        return 0.5 * float((self._weight * (albedo * shading - self.problem.photo).square()).sum())
+        return 0.5 * float((self._weight * (albedo * shading - self.problem.rgb).square()).sum())
 
     def _boundaries(self, regions: Regions) -> float:
         return self.weights.boundary * boundary_length(regions, self.problem.inside)
@@ -234,7 +234,7 @@ class ShadingSolver:
     def _pixel_energy(self, theta: Tensor, target: Tensor) -> Tensor:
         """Return what a theta costs in each pixel, (B, 1, H, W)."""
         surface = compute_surface(theta, self.problem.rays)
-        missed = self.albedo * compute_shading(surface.normals, self.lighting) - self.problem.photo
+        missed = self.albedo * compute_shading(surface.normals, self.lighting) - self.problem.rgb
         own = 0.5 * missed.square().sum(dim=1, keepdim=True) + self.weights.area * compute_area(theta, surface)
         bound = 0.5 * self.penalty * (self._coupling * (theta - target).square()).sum(dim=1, keepdim=True)
         return self._weight * own + bound
@@ -244,7 +244,7 @@ class ShadingSolver:
         problem, weights = self.problem, self.weights
         surface = compute_surface(theta, problem.rays)
         n = surface.normals
-        seen = linearise_photometry(problem.photo, self.albedo, self.lighting, surface, problem.rays)
+        seen = linearise_photometry(problem.rgb, self.albedo, self.lighting, surface, problem.rays)
         gradient = (seen.residual[:, :, None] * seen.slopes).sum(dim=1)
         depth = theta[:, 2:]
         size = chain_to_theta(n, problem.rays)  # the derivative of |m|

@@ -67,11 +67,11 @@ class _Borders(NamedTuple):
     length: Tensor
 
 
-def fuse(photo: Tensor, shading: Tensor, weight: float, inside: Tensor | None = None) -> Regions:
+def fuse(rgb: Tensor, shading: Tensor, weight: float, inside: Tensor | None = None) -> Regions:
     """Return regions that are a local minimum of E.
 
     Args:
-        photo: (B, C, H, W) float64.
+        rgb: (B, C, H, W) float64.
         shading: likewise.
         weight: of a unit of boundary.
         inside: (B, 1, H, W) bool, the pixels that belong to the problem, None for all; others stay alone.
@@ -80,10 +80,10 @@ def fuse(photo: Tensor, shading: Tensor, weight: float, inside: Tensor | None = 
         the regions, the same for the same input.
 
     """
-    batch, channels, height, width = photo.shape
+    batch, channels, height, width = rgb.shape
     count = batch * height * width
-    labels = torch.arange(count, device=photo.device)
-    fits = _Fits(*(each.movedim(1, -1).reshape(count, channels) for each in (shading.square(), shading * photo)))
+    labels = torch.arange(count, device=rgb.device)
+    fits = _Fits(*(each.movedim(1, -1).reshape(count, channels) for each in (shading.square(), shading * rgb)))
     borders = _borders(labels.reshape(batch, height, width), inside)
     turn = 0
     for level in range(_LEVELS, -1, -1):
@@ -99,13 +99,13 @@ def fuse(photo: Tensor, shading: Tensor, weight: float, inside: Tensor | None = 
     return Regions(labels.reshape(batch, height, width), len(fits.squares))
 
 
-def fit_albedo(photo: Tensor, shading: Tensor, regions: Regions) -> Tensor:
+def fit_albedo(rgb: Tensor, shading: Tensor, regions: Regions) -> Tensor:
     """Return the best albedo that is constant in regions, (B, C, H, W)."""
-    channels = photo.shape[1]
+    channels = rgb.shape[1]
     flat = regions.labels.reshape(-1)
     sums = [
         each.new_zeros(regions.number, channels).index_add_(0, flat, each.movedim(1, -1).reshape(-1, channels))
-        for each in (shading.square(), shading * photo)
+        for each in (shading.square(), shading * rgb)
     ]
     return _Fits(*sums).albedo()[regions.labels].movedim(-1, 1)
 

@@ -59,12 +59,12 @@ def compute_shading(normals: Tensor, lighting: Tensor) -> Tensor:
     return torch.einsum("bck,bkhw->bchw", lighting[..., :3], normals) + lighting[..., 3, None, None]
 
 
-def linearise_photometry(photo: Tensor, albedo: Tensor, lighting: Tensor, surface: Surface, rays: Tensor) -> Photometry:
+def linearise_photometry(rgb: Tensor, albedo: Tensor, lighting: Tensor, surface: Surface, rays: Tensor) -> Photometry:
     """Return albedo * shading - photo and its derivatives: albedo (l - (l . n) n) / |m| times those of m."""
     n = surface.normals
     directed = torch.einsum("bck,bkhw->bchw", lighting[..., :3], n)
     across = (lighting[..., :3, None, None] - directed[:, :, None] * n[:, None]) * (albedo / surface.length)[:, :, None]
-    residual = albedo * (directed + lighting[..., 3, None, None]) - photo
+    residual = albedo * (directed + lighting[..., 3, None, None]) - rgb
     return Photometry(residual, chain_to_theta(across, rays))
 
 
@@ -80,13 +80,13 @@ def compute_area(theta: Tensor, surface: Surface) -> Tensor:
     return theta[:, 2:].abs() * surface.length
 
 
-def fit_lighting(photo: Tensor, albedo: Tensor, normals: Tensor, inside: Tensor) -> Tensor:
+def fit_lighting(rgb: Tensor, albedo: Tensor, normals: Tensor, inside: Tensor) -> Tensor:
     """Return the lighting with the least squared error in each channel, (B, C, 4) float64.
 
     Where normals do not determine it, as on a plane, that of least length among the best.
 
     Args:
-        photo: (B, C, H, W).
+        rgb: (B, C, H, W).
         albedo: likewise.
         normals: (B, 3, H, W).
         inside: (B, 1, H, W), the weight of each pixel.
@@ -96,7 +96,7 @@ def fit_lighting(photo: Tensor, albedo: Tensor, normals: Tensor, inside: Tensor)
     design = (torch.cat((normals, ones), dim=1) * inside)[:, None] * albedo[:, :, None]  # (B, C, 4, H, W)
     columns = design.flatten(3).double()
     gram = columns @ columns.mT
-    right = columns @ (photo * inside).flatten(2).double()[..., None]
+    right = columns @ (rgb * inside).flatten(2).double()[..., None]
     return (torch.linalg.pinv(gram, hermitian=True, rtol=_RANK) @ right)[..., 0]
 
 

@@ -145,19 +145,19 @@ class ShapeFromShading:
 
     def prepare(self, sample: DepthSample) -> tuple[ShadingSolver, float]:
         """Return the solver of a sample before its first step, and the metres that its unit of depth is."""
-        coarse = sample.depth_lr[None].double()
+        lr = sample.depth_lr[None].double()
         camera = sample.camera
         unit = (camera.fx * camera.fy) ** 0.5
-        metres = float(coarse[coarse.isfinite()].median()) / unit
+        metres = float(lr[lr.isfinite()].median()) / unit
         problem = ShadingProblem(
-            photo=sample.rgb[None].to(coarse),
-            coarse=coarse / metres,
-            rays=camera.rays(device=coarse.device)[None],
+            rgb=sample.rgb[None].to(lr),
+            lr=lr / metres,
+            rays=camera.rays(device=lr.device)[None],
             focal=(camera.fx, camera.fy),
             unit=unit,
             inside=self._inside(sample),
         )
-        first = upsample_linear_border(inpaint(problem.coarse), sample.scale)
+        first = upsample_linear_border(inpaint(problem.lr), sample.scale)
         return ShadingSolver(problem, self.weights, first, self.penalty), metres
 
     def _inside(self, sample: DepthSample) -> Tensor:
