@@ -1,15 +1,14 @@
 """Downsampling models: how a high-resolution depth map becomes a low-resolution one.
 
-Every model is a separable kernel, applied as two small matrices, so it is exact, batched and differentiable, and knows
-holes: an average runs over the known pixels alone. Kernels for factor f, in high-resolution pixels from the
-    low-resolution pixel's centre:
+Every model is a separable kernel, applied as two small matrices. It is batched and differentiable, and averages valid
+pixels only. Kernels for the factor f, in high-resolution pixels from the centre of the low-resolution pixel:
 
 - ``box``: the mean of the f x f block.
 - ``nearest``: the block's pixel [f // 2, f // 2], as in ``depth[f // 2 :: f, f // 2 :: f]``.
 - ``bilinear``, ``bicubic`` (a = -0.5): antialiased, their kernels stretched by f, as Pillow resizes.
-- ``gaussian``: standard deviation ``sigma`` * f, cut at three of them.
+- ``gaussian``: standard deviation ``sigma`` * f, truncated at three standard deviations.
 
-Where a kernel would reach over the border it is cut and normalised.
+At the border, kernels are truncated and normalised.
 """
 
 from __future__ import annotations
@@ -31,7 +30,7 @@ Kernel = Literal["box", "nearest", "bilinear", "bicubic", "gaussian"]
 SCALES = (2, 4, 8, 16)
 _LEAST_WEIGHT = 0.5
 _LEAST_SIGMA = 0.1
-"""Of a gaussian, as a fraction of the scale: at x2 the nearest pixel centre is 0.25 away, and three sigmas reach it."""
+"""Minimum sigma as a fraction of the scale: at x2 the nearest pixel centre is 0.25 away, within three sigmas."""
 
 
 @dataclass(frozen=True)
@@ -39,13 +38,13 @@ class Downsampling:
     """A downsampling model.
 
     Args:
-        kernel: see the module.
+        kernel: name of the kernel, see the module.
         sigma: standard deviation of the gaussian as a fraction of the scale factor.
-        range_type: the range type that is averaged; None for the one that the method works on, as in the paper.
-        assumed: the kernel that a method which needs a model takes this one for; None for the true one.
+        range_type: range type that is averaged; None for the one that the method works on, as in the paper.
+        assumed: kernel of the forward model that methods assume (DIP); None for the true one.
 
     Raises:
-        ValueError: an unknown kernel or a sigma that is not positive.
+        ValueError: the kernel is unknown, or sigma is below 0.1.
 
     """
 
@@ -63,11 +62,11 @@ class Downsampling:
             raise ValueError(f"sigma: expected at least {_LEAST_SIGMA} (of the scale), got {self.sigma}")
 
     def assumed_model(self) -> Downsampling:
-        """Return the model that a method takes this one for."""
+        """Return the forward model that a method assumes."""
         return replace(self, kernel=self.assumed or self.kernel, assumed=None)
 
     def camera(self, camera: Camera, scale: int) -> Camera:
-        """Return the camera of the LR map; ``nearest`` looks along other rays than the centred kernels do."""
+        """Return the camera of the low-resolution map; that of ``nearest`` differs from that of the centred kernels."""
         if self.kernel == "nearest":
             return camera.decimate(scale, scale // 2)
         return camera.coarser(scale)
@@ -75,8 +74,8 @@ class Downsampling:
     def __call__(self, values: Tensor, scale: int) -> Tensor:
         """Downsample maps.
 
-        A low-resolution pixel whose block has no known pixel is a hole. Where less than half of a kernel's weight falls
-        on known pixels, the mean of the block's known pixels stands in.
+        A low-resolution pixel whose block has no valid pixel is a hole. If less than half of a kernel's weight falls on
+        valid pixels, the result is the mean of the block's valid pixels.
 
         Args:
             values: (..., H, W), NaN where unknown; H and W divisible by ``scale``.
@@ -107,7 +106,7 @@ class Downsampling:
         return torch.where(block_fraction > 0, depth_lr, torch.nan)
 
     def _apply(self, values: Tensor, scale: int) -> Tensor:
-        """Return the plain weighted averages of complete maps."""
+        """Return the weighted averages of maps without holes."""
         rows = self._matrix(values.shape[-2], scale).to(values)
         columns = self._matrix(values.shape[-1], scale).to(values)
         return rows @ values @ columns.T
@@ -149,17 +148,17 @@ _PROFILES: dict[str, Callable[[Tensor, float], Tensor]] = {
 
 @dataclass(frozen=True)
 class Measured:
-    """The stand-in for a downsampling model where the scene brings a low-resolution map that a sensor measured.
+    """In place of a downsampling model: the scene's own low-resolution map, measured by a sensor.
 
     Args:
-        assumed: the kernel of the model that a method which needs one takes the sensor for.
+        assumed: kernel of the forward model that methods assume for the sensor (DIP).
 
     """
 
     assumed: Kernel = "box"
 
     def assumed_model(self) -> Downsampling:
-        """Return the model that a method takes the sensor for."""
+        """Return the forward model that a method assumes."""
         return Downsampling(self.assumed)
 
 
@@ -178,21 +177,21 @@ def make_sample(
     generator: torch.Generator | int = 0,
     holes: Holes | None = None,
 ) -> DepthSample:
-    """Return the super-resolution problem that a scene poses.
+    """Return the super-resolution problem of a scene.
 
-    A size that the scale does not divide is cropped at the bottom and the right, and the sample's notes say so.
+    An image whose size is not a multiple of the scale is cropped at the bottom and the right, with a note.
 
     Args:
         scene: the high-resolution maps.
         scale: the upsampling factor, one of 2, 4, 8, 16.
         downsampling: the model, or :class:`Measured` for the scene's own low-resolution map.
-        range_type: the type that the method works on.
-        noise: of the low-resolution map, unless it is measured.
-        generator: of noise and holes, or a seed that gives each of them, in each scene, its own.
-        holes: where the low-resolution map loses its values.
+        range_type: range type that the method works on.
+        noise: noise of the low-resolution map, unless it is measured.
+        generator: random generator of noise and holes, or a seed, from which each scene gets generators of its own.
+        holes: holes of the low-resolution map.
 
     Raises:
-        ValueError: the scene lacks what the problem needs, or a value is out of range.
+        ValueError: the scene has no depth or no measured map at this scale, or a value is out of range.
 
     """
     check_scale(scale)
@@ -223,7 +222,7 @@ def check_scale(scale: int) -> None:
 
 
 def _crop_to_multiple(scene: Scene, scale: int) -> tuple[Scene, tuple[str, ...]]:
-    """Return the scene, cropped to a size that the scale divides, and what to say of it."""
+    """Return the scene cropped to a multiple of the scale, and its notes."""
     camera = scene.camera
     height, width = (size // scale * scale for size in (camera.height, camera.width))
     before = f"{camera.height} x {camera.width}"
@@ -247,15 +246,17 @@ def downsample_depth(
     range_type: RangeType,
     noise: tuple[Noise, torch.Generator] | None = None,
 ) -> tuple[Tensor, Camera]:
-    """Return the LR depth that a model and noise make of a HR one, and its camera; differentiable.
+    """Return the low-resolution depth that a model and noise make of high-resolution depth, and its camera.
+
+    Differentiable.
 
     Args:
         depth: (..., H, W) orthogonal depth in metres.
-        camera: of these pixels.
-        scale: the factor.
-        downsampling: the model.
-        range_type: the type that is averaged, unless the model says one.
-        noise: of the averages, and its generator; in that type, unless the noise says one.
+        camera: camera of the high-resolution map.
+        scale: downsampling factor.
+        downsampling: downsampling model.
+        range_type: range type that is averaged, unless the model sets one.
+        noise: noise of the averages and its generator, in the same range type, unless the noise sets one.
 
     """
     range_type = downsampling.range_type or range_type
@@ -275,7 +276,7 @@ def downsample_depth(
 
 
 def _measured_depth(scene: Scene, scale: int) -> Tensor:
-    """Return the low-resolution depth that the scene brings."""
+    """Return the scene's measured low-resolution depth."""
     if scale not in scene.measured:
         have = ", ".join(f"x{factor}" for factor in scene.measured) or "none"
         raise ValueError(

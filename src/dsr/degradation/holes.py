@@ -1,4 +1,4 @@
-"""Holes of LR depth maps, as sensors leave them: blobs of any shape, and the strips that a second camera misses.
+"""Holes of low-resolution depth maps, as sensors leave them: irregular blobs, and strips hidden from a second camera.
 
 A kind of holes is a callable from a low-resolution map, its camera and a generator to a mask; see
 :func:`dsr.degradation.downsampling.make_sample`.
@@ -16,19 +16,19 @@ from torch.nn import functional
 from dsr.geometry.camera import Camera
 
 Holes = Callable[[Tensor, Camera, torch.Generator], Tensor]
-"""From (1, h, w) depth in metres, NaN where unknown, to (1, h, w) bool: where it is to be unknown."""
+"""From (1, h, w) depth in metres, NaN where missing, to a (1, h, w) bool mask of the pixels to remove."""
 
 
 @dataclass(frozen=True)
 class Blobs:
-    """Blobs of random shape and place, where smooth random values are highest.
+    """Blobs of random shape and position: the highest values of smoothed noise.
 
     Args:
-        share: of the pixels.
+        share: fraction of the pixels.
         size: typical diameter in low-resolution pixels.
 
     Raises:
-        ValueError: the share is not between 0 and 1, or the size is below 1.
+        ValueError: the fraction is not between 0 and 1, or the size is below 1.
 
     """
 
@@ -43,7 +43,7 @@ class Blobs:
             raise ValueError(f"size: expected 1 or more low-resolution pixels, got {self.size}")
 
     def __call__(self, depth: Tensor, camera: Camera, generator: torch.Generator) -> Tensor:
-        """Return where the holes are, (1, h, w); the share is met to the pixel."""
+        """Return the mask of the holes, (1, h, w) bool; their number is exact to the pixel."""
         draws = torch.randn(1, *depth.shape, generator=generator, dtype=torch.float64)
         for axis in (-2, -1):
             draws = _blur(draws, self.size / 4, axis)
@@ -55,13 +55,13 @@ class Blobs:
 
 @dataclass(frozen=True)
 class Shadows:
-    """What a second camera or a projector ``baseline`` metres beside the first does not see: strips beside depth steps.
+    """Strips beside depth steps, hidden from a second camera or projector ``baseline`` metres beside the first.
 
     Args:
-        baseline: in metres; positive for one to the right, whose shadows lie to the left of what is near.
+        baseline: in metres; positive if the second is to the right, so that holes lie to the left of near objects.
 
     Raises:
-        ValueError: it is 0 or no number.
+        ValueError: the baseline is 0 or not finite.
 
     """
 
@@ -73,11 +73,11 @@ class Shadows:
             raise ValueError(f"baseline: expected metres other than 0, got {self.baseline}")
 
     def __call__(self, depth: Tensor, camera: Camera, generator: torch.Generator) -> Tensor:
-        """Return where the shadows are, (1, h, w): points whose place in the second image something nearer takes."""
+        """Return the mask of the holes, (1, h, w) bool: points that a nearer one covers in the second image."""
         columns = torch.arange(depth.shape[-1], dtype=torch.float64, device=depth.device)
         seen_at = columns - self.baseline * camera.fx / depth.double()  # the column in the second image
         missing = seen_at.isnan()
-        if self.baseline > 0:  # what lies to the right comes before it there
+        if self.baseline > 0:  # points to the right that are nearer cover it
             nearest = seen_at.masked_fill(missing, torch.inf).flip(-1).cummin(dim=-1).values.flip(-1)
             return seen_at > nearest
         nearest = seen_at.masked_fill(missing, -torch.inf).cummax(dim=-1).values
@@ -90,7 +90,7 @@ def no_holes() -> None:
 
 
 def _blur(values: Tensor, sigma: float, axis: int) -> Tensor:
-    """Return (1, 1, h, w) convolved with a Gaussian along an axis; edge pixels repeated."""
+    """Convolve (1, 1, h, w) with a Gaussian along an axis; edge pixels are repeated."""
     radius = max(round(3 * sigma), 1)
     taps = torch.exp(-0.5 * (torch.arange(-radius, radius + 1, dtype=values.dtype) / sigma).square())
     vertical = axis == -2

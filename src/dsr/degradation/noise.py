@@ -1,7 +1,7 @@
 """Noise of low-resolution depth maps: multiplicative, and that of two kinds of sensors.
 
-A kind of noise says which range type it acts on and maps a coarse map in that type, with a generator, to a noisy one;
-see :func:`dsr.degradation.downsampling.make_sample`.
+A noise model states the range type that it acts on, and maps low-resolution values of that type to noisy ones; see
+:func:`dsr.degradation.downsampling.make_sample`.
 """
 
 from __future__ import annotations
@@ -18,11 +18,12 @@ from dsr.geometry.camera import RangeType
 
 
 class Noise(Protocol):
-    """A kind of noise.
+    """A noise model.
 
-    ``range_type`` is the type of the values that it takes and returns; None for whichever type is averaged. Calls get
-    (..., h, w) values of that type, NaN where unknown, and a generator, and return as many; NaN stays NaN, and what the
-    sensor would not see becomes NaN. Draws are made on the CPU in float64, so they are the same on every device.
+    ``range_type`` is the type of the values that it takes and returns; None for the type that is averaged. It is called
+    with (..., h, w) values of that type, NaN in holes, and a random generator, and returns values of the same shape.
+    NaN stays NaN, and what the sensor would not see becomes NaN. Random numbers are drawn on the CPU in float64, so
+    they are the same on every device.
     """
 
     range_type: ClassVar[RangeType | None]
@@ -33,13 +34,13 @@ class Noise(Protocol):
 
 @dataclass(frozen=True)
 class GaussianMultiplicative:
-    """Noise of the LR map: values times 1 + std N(0, 1), in the range type that is averaged (Voynov et al. 2019).
+    """Multiplicative noise: values times 1 + std N(0, 1), in the range type that is averaged (Voynov et al. 2019).
 
     Args:
-        std: of the factor.
+        std: standard deviation of the factor.
 
     Raises:
-        ValueError: it is not between 0 and 1.
+        ValueError: std is not between 0 and 1.
 
     """
 
@@ -67,17 +68,17 @@ class TimeOfFlight:
         v = stereo_constant / z - doffs,
 
     which to first order makes the depth's standard deviation strength z^3 / stereo_constant^2 for ``doffs`` = 0. With
-    the defaults it is 1.8 mm at 1 m, 15 mm at 2 m, 49 mm at 3 m, 116 mm at 4 m; it is a noise for rooms, as from about
-    10 m on the tail of the distribution reaches infinity.
+    the defaults it is 1.8 mm at 1 m, 15 mm at 2 m, 49 mm at 3 m, 116 mm at 4 m. It suits rooms: from about 10 m on, the
+    tail of the distribution reaches infinity.
 
     Their v lacks the pixels by which Middlebury's views of 2005 were shifted (``dmin.txt``), so it is smaller, and
-    their noise larger, than that of the defaults at the same depth: for the very law on such a scene let ``doffs`` be
-    that shift.
+    their noise larger, than that of the defaults at the same depth. To apply their model to such a scene, set ``doffs``
+    to that shift.
 
-    What the law does not describe are the noisy Middlebury inputs that circulate beside it, after Park et al., ICCV
-    2011: on Art at x4 and x8, away from edges, the standard deviation is that of the right-hand columns (n: pixels).
-    The fit is 5.01 (v / 130)^p with p = 0.005 +- 0.008, neither -1 nor -1/2: white noise of five levels everywhere,
-    rounded to whole levels, on averages by antialiased bicubic. As 651 = 5 x 130, the two agree at a medium v alone.
+    The model does not describe the noisy Middlebury inputs that are often used with it, after Park et al., ICCV 2011.
+    On Art at x4 and x8, away from edges, their standard deviation is in the right-hand columns (n: pixels). The fit is
+    5.01 (v / 130)^p with p = 0.005 +- 0.008, neither -1 nor -1/2: white noise of five levels everywhere, rounded to
+    whole levels, added to averages by antialiased bicubic. As 651 = 5 x 130, the two agree only at a medium v.
 
         ==== ========= ============= ================ ==============
           v   651 / v   (651 / v)^.5  x4               x8
@@ -93,7 +94,7 @@ class TimeOfFlight:
     Args:
         strength: the product of v and its standard deviation, in square pixels.
         stereo_constant: baseline times focal length in metre pixels; 0.16 m x 3740 px for Middlebury 2005 and 2006.
-        doffs: what the map's disparities lack, in pixels.
+        doffs: offset that the map's disparities lack, in pixels.
 
     Raises:
         ValueError: a value is not positive (``doffs``: is negative).
@@ -113,11 +114,11 @@ class TimeOfFlight:
             raise ValueError(f"doffs: expected 0 or a positive number, got {self.doffs}")
 
     def __call__(self, values: Tensor, generator: torch.Generator) -> Tensor:
-        """Return noisy depth in metres; NaN stays NaN, and where v, before or after the noise, is not positive is NaN.
+        """Return noisy depth in metres, NaN in holes and where v is not positive, before or after the noise.
 
         Args:
             values: (..., h, w) orthogonal depth in metres.
-            generator: of one normal draw per pixel.
+            generator: random generator; one normal number is drawn per pixel.
 
         """
         draws = torch.randn(values.shape, generator=generator, dtype=torch.float64).to(values.device)
@@ -128,26 +129,26 @@ class TimeOfFlight:
 
 @dataclass(frozen=True)
 class Kinect:
-    """A structured-light sensor: noise and steps of its disparity, dropouts beside depth edges, limits of range.
+    """A structured-light sensor: disparity noise and quantisation, dropouts beside depth edges, limits of range.
 
     The sensor counts disparity d = stereo_constant / z in eighths of a pixel (Khoshelham and Oude Elberink, *Accuracy
     and Resolution of Kinect Depth Data*, Sensors 2012), so depth comes in steps of step z^2 / stereo_constant: 3 mm at
-    1 m, 11 mm at 2 m, 72 mm at 5 m. Their random error is 1.425e-3 z^2 m, half a step. It holds what rounding adds,
-    step / sqrt(12); so N(0, std^2) with the default ``std`` of 0.05 px and rounding together make 1.42e-3 z^2 m: 1.4 mm
+    1 m, 11 mm at 2 m, 72 mm at 5 m. Their random error is 1.425e-3 z^2 m, half a step. It includes the rounding error,
+    step / sqrt(12). So N(0, std^2) with the default ``std`` of 0.05 px and rounding together give 1.42e-3 z^2 m: 1.4 mm
     at 1 m, 6 mm at 2 m, 35 mm at 5 m. Nguyen, Izadi and Lovell (3DIMPVT 2012) measured 0.0012 + 0.0019 (z - 0.4)^2 m
-    on surfaces that face the sensor: 1.9, 6 and 41 mm. The draws of neighbouring pixels are independent; a sensor's,
-    which match windows, are not.
+    on surfaces that face the sensor: 1.9, 6 and 41 mm. The noise of neighbouring pixels is independent here; that of a
+    sensor, which matches windows, is not.
 
-    Sensor and map are two things: whatever the map's camera, disparity and its steps are the sensor's.
+    Disparity and its steps are the sensor's, whatever the camera of the map.
 
     Args:
-        std: of the disparity noise, in the sensor's pixels.
-        step: of disparity, in the sensor's pixels.
-        stereo_constant: of the sensor, baseline times focal length in metre pixels; 0.075 m x 580 px for a Kinect.
+        std: standard deviation of the disparity noise, in the sensor's pixels.
+        step: quantisation step of disparity, in the sensor's pixels.
+        stereo_constant: baseline times focal length of the sensor in metre pixels; 0.075 m x 580 px for a Kinect.
         dropout: probability that a pixel beside a depth edge is a hole.
         jump: relative difference of two neighbours' depths beyond which an edge lies between them.
-        reach: how many low-resolution pixels wide the band of dropouts is on each side of an edge, diagonally, too.
-        nearest, farthest: readings in metres that still count; null for no such limit.
+        reach: width of the band of dropouts on each side of an edge, in low-resolution pixels.
+        nearest, farthest: range of valid readings in metres; None for no limit.
 
     Raises:
         ValueError: a value is out of range.
@@ -181,11 +182,11 @@ class Kinect:
             raise ValueError(f"farthest: expected more than nearest, {self.nearest}, got {self.farthest}")
 
     def __call__(self, values: Tensor, generator: torch.Generator) -> Tensor:
-        """Return the sensor's reading in metres; NaN stays NaN, and dropouts and what is out of range are NaN.
+        """Return the sensor's reading in metres, NaN in holes, at dropouts and out of range.
 
         Args:
             values: (..., h, w) orthogonal depth in metres.
-            generator: of a normal and a uniform draw per pixel.
+            generator: random generator; a normal and a uniform number are drawn per pixel.
 
         """
         draws = torch.randn(values.shape, generator=generator, dtype=torch.float64).to(values.device)
@@ -211,12 +212,12 @@ def _check_positive(name: str, value: float) -> None:
 
 
 def _positive(values: Tensor) -> Tensor:
-    """Return what is positive of the values, NaN elsewhere."""
+    """Return the values with those that are not positive replaced by NaN."""
     return torch.where(values > 0, values, torch.nan)
 
 
 def _beside_edges(depth: Tensor, jump: float, reach: int) -> Tensor:
-    """Return where (..., h, w) depth lies within ``reach`` pixels of a relative jump; a hole makes none."""
+    """Return the mask of pixels within ``reach`` pixels of a relative jump of (..., h, w) depth; holes make no jump."""
     edge = torch.zeros_like(depth, dtype=torch.bool)
     for axis in (-2, -1):
         size = depth.shape[axis] - 1

@@ -1,1 +1,1 @@
-"""Cameras, surfaces and their renderings."""
+"""Cameras, surface normals, shading and meshes."""

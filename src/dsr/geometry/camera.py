@@ -16,7 +16,7 @@ from torch import Tensor
 RangeType = Literal["orthogonal", "perspective", "disparity"]
 RANGE_TYPES: tuple[RangeType, ...] = get_args(RangeType)
 VIRTUAL_BASELINE = 0.2
-"""Baseline in metres of the virtual stereo pair that stands in where a camera has none (Voynov et al. 2019)."""
+"""Baseline in metres of the virtual stereo pair of a camera without a second one (Voynov et al. 2019)."""
 
 
 @dataclass(frozen=True)
@@ -25,8 +25,8 @@ class Camera:
 
     Args:
         width, height: image size in pixels.
-        fx, fy: focal lengths in pixels. A negative ``fy`` (ICL-NUIM) says that the calibration's y axis points up; as
-            points here always have y down, its absolute value is kept.
+        fx, fy: focal lengths in pixels. A negative ``fy`` (ICL-NUIM) means that the calibration's y axis points up;
+            its absolute value is stored, because y always points down here.
         cx, cy: principal point in pixels, pixel centres at integers.
         baseline: distance to the second camera in metres, None where there is none.
         doffs: difference of the two principal points' x in pixels.
@@ -91,7 +91,7 @@ class Camera:
         )
 
     def coarser(self, factor: int) -> Camera:
-        """Return the camera of a map ``factor`` times coarser, of the part of the image that the factor divides."""
+        """Return the camera of a map downsampled by ``factor``, of the part of the image that the factor divides."""
         width, height = self.width // factor, self.height // factor
         return self.crop(0, 0, height * factor, width * factor).rescale(width, height)
 
@@ -111,8 +111,8 @@ class Camera:
     def rotate90(self, turns: int = 1) -> Camera:
         """Return the camera of the image turned by ``turns`` quarter turns counterclockwise, as ``torch.rot90`` does.
 
-        The focal lengths change places and the principal point turns along. A baseline stays what it is, the constant
-        of an encoding of depth, though the cameras that it lies between turn too.
+        The focal lengths are swapped and the principal point is rotated. The baseline stays unchanged, because it only
+        serves to convert between depth and disparity.
         """
         camera = self
         for _ in range(turns % 4):
@@ -144,7 +144,7 @@ def to_range(depth: Tensor, camera: Camera, range_type: RangeType) -> Tensor:
 
     Args:
         depth: (..., H, W) distance to the image plane in metres.
-        camera: the camera of these very pixels.
+        camera: the camera of these pixels.
         range_type: ``orthogonal`` (metres), ``perspective`` (metres along the ray, p = z |r|) or ``disparity``
             (pixels, d = baseline * fx / z - doffs, with a virtual baseline of 0.2 m where the camera has none).
 

@@ -1,4 +1,4 @@
-"""A picture of a result's renderings beside the truth's, for logs."""
+"""Renderings of a result beside those of the true depth, for logs."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ from dsr.geometry.surface import depth_to_normals
 
 
 def comparison(depth: Tensor, truth: Tensor | None, rays: Tensor) -> Tensor:
-    """Return a picture of a result beside the truth, holes black.
+    """Return an image of the renderings of a result beside those of the true depth; holes are black.
 
     Args:
         depth: (1, 1, H, W) in metres.
-        truth: likewise; None where it is not known.
+        truth: true depth, (1, 1, H, W) in metres, or None.
         rays: (1, 3, H, W), see :meth:`dsr.geometry.camera.Camera.rays`.
 
     Returns:
         (1, 2 H, 3 W) in [0, 1]: the renderings of the result and of the truth, and twice their difference; under the
-        first light, and below under the last. Without a truth (1, 2 H, W), the result's alone.
+        first light, and below them under the last. Without true depth only the result, (1, 2 H, W).
 
     """
     result = render(depth_to_normals(depth, rays))[0]  # (4, H, W)

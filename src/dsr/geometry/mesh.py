@@ -1,9 +1,9 @@
 """Triangle meshes of depth maps, cut at depth steps.
 
-A plane's inverse depth is linear in the pixel, however grazing the view. So a pair of neighbours lies across a step
-where inverse depth changes by more than the slopes on both sides of the pair predict; the mere difference of the two
-depths would cut floors before the horizon. Steps that interpolation has spread over a few pixels are found by the
-change over a window of up to five pairs.
+The inverse depth of a plane is linear in the pixel at any viewing angle. So two neighbouring pixels lie on different
+sides of a step if inverse depth changes by more than the slopes on both sides predict. A threshold on the difference of
+the two depths would cut floors at a distance. Steps that interpolation has spread over a few pixels are found from the
+change over windows of up to five pairs of pixels.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ from torch import Tensor
 from dsr.geometry.camera import Camera
 
 LARGEST_STEP = 0.02
-"""Of depth, by which neighbours on one surface may deviate from its slope."""
+"""Maximum relative deviation of a neighbour's depth from the slope of the surface."""
 MOST_VERTICES = 2_000_000
 _HALF_WIDTHS = (1, 2, 3)
-"""Half widths of the windows in pixels: the step is between two of them, or spread over up to five."""
+"""Half widths of the windows in pixels."""
 _OWN_FRACTION = 0.25
-"""Of ``largest_step``, that a pair within a wider window must itself change by to be cut."""
+"""Fraction of ``largest_step`` by which a pair within a wider window must itself change to be cut."""
 
 
 class Mesh(NamedTuple):
@@ -48,16 +48,16 @@ def triangulate(
     most: int = MOST_VERTICES,
     isolated: bool = False,
 ) -> Mesh:
-    """Join neighbouring known pixels by triangles, two per square of four, but for those that span a step in depth.
+    """Join neighbouring valid pixels by triangles, two per square of four pixels, except across steps in depth.
 
-    The diagonal of a square is the one with the smaller change of depth; of a square with one hole the other three
-    pixels make a triangle. Takes about 120 bytes per vertex at most, and 240 for :func:`vertex_normals`.
+    The diagonal of a square is the one with the smaller change of depth. A square with one missing pixel gives one
+    triangle. Memory: at most 120 bytes per vertex, and 240 bytes for :func:`vertex_normals`.
 
     Args:
         depth: (1, H, W) orthogonal depth in metres, NaN in holes.
         camera: of these pixels.
-        largest_step: what is cut: a change of depth, as a share of it, beyond what the slopes beside it predict.
-        most: vertices; of a map with more pixels every second, third, ... row and column is taken.
+        largest_step: relative change of depth, beyond what the slopes on both sides predict, from which a pair is cut.
+        most: maximum number of vertices; a larger map is subsampled by a whole stride.
         isolated: whether vertices without a triangle are kept.
 
     Raises:
@@ -85,7 +85,7 @@ def triangulate(
 
 
 def stride_for(depth: Tensor, most: int) -> int:
-    """Return the smallest stride at which a map, (1, H, W), has at most that many known pixels."""
+    """Return the smallest stride at which a map, (1, H, W), has at most ``most`` valid pixels."""
     valid = depth[0].isfinite()
     stride = max(1, math.isqrt(int(valid.sum()) // most))
     while int(valid[::stride, ::stride].sum()) > most:
@@ -96,7 +96,7 @@ def stride_for(depth: Tensor, most: int) -> int:
 def vertex_normals(mesh: Mesh) -> np.ndarray:
     """Return the unit normals of the vertices, (N, 3) float32: the mean of their triangles', weighted by area.
 
-    A vertex without a triangle looks at the camera.
+    The normal of a vertex without a triangle points to the camera.
     """
     corners = mesh.vertices[mesh.faces]  # (M, 3, 3)
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -129,7 +129,7 @@ def _faces(inverse: np.ndarray, largest_step: float) -> np.ndarray:
 
 
 def _connected(inverse: np.ndarray, largest_step: float) -> np.ndarray:
-    """Return whether each pixel and its right neighbour are of one surface, (H, W - 1) bool; False beside holes."""
+    """Return whether each pixel and its right neighbour lie on one surface, (H, W - 1) bool; False beside holes."""
     change = np.diff(inverse, axis=1)  # (H, W - 1)
     scale = largest_step * np.minimum(inverse[:, :-1], inverse[:, 1:])
     step = np.zeros(change.shape, dtype=bool)
@@ -146,7 +146,7 @@ def _connected(inverse: np.ndarray, largest_step: float) -> np.ndarray:
 
 
 def _shift(values: np.ndarray, by: int) -> np.ndarray:
-    """Return what is ``by`` columns further along, (H, W), NaN beyond the border."""
+    """Return the map shifted by ``by`` columns, (H, W), NaN beyond the border."""
     shifted = np.full_like(values, np.nan)
     width = values.shape[1]
     if abs(by) < width:

@@ -28,7 +28,7 @@ def depth_to_normals(depth: Tensor, rays: Tensor, dtype: torch.dtype | None = No
 
     For a pinhole camera the product is known in closed form. With z' and z'' the depths of the neighbours along u and
     v it is, up to a positive factor, n = (fx (z' - z) z'', fy (z'' - z) z', -z' z'' - x n_x - y n_y), as
-    n . r = -z' z''. Unlike differences of points this loses no digits but in z' - z itself.
+    n . r = -z' z''. Unlike differences of points, this cancels digits only in z' - z.
 
     Args:
         depth: (B, 1, H, W) orthogonal depth in metres, H and W at least 2. Where it is NaN
@@ -64,17 +64,17 @@ def depth_to_normals(depth: Tensor, rays: Tensor, dtype: torch.dtype | None = No
 def length(vectors: Tensor) -> Tensor:
     """Return the Euclidean lengths of (..., 3, H, W) vectors, (..., 1, H, W).
 
-    Many times faster on the CPU than ``torch.linalg.vector_norm`` over an axis that is not the last.
+    Much faster on the CPU than ``torch.linalg.vector_norm`` over an axis that is not the last.
     """
     x, y, z = vectors.split(1, dim=-3)
     return (x.square() + y.square() + z.square()).sqrt()
 
 
 def normal_mask(mask: Tensor) -> Tensor:
-    """Return where a normal is known: where the three pixels that its differences need are.
+    """Return the valid mask of normals: a normal needs its pixel and the two that its differences use.
 
     Args:
-        mask: (B, 1, H, W) bool, where depth is known.
+        mask: (B, 1, H, W) bool, the valid mask of depth.
 
     Returns:
         (B, 1, H, W) bool.

@@ -5,20 +5,20 @@ The untrained mode of Metzger, Daudt and Schindler, *Guided Depth Super-Resoluti
 
 - diffusion (their eq. 1, Perona and Malik 1990): u += step * sum over the four neighbours n of c_n (u_n - u), with
   c = 1 / (1 + (x / edge)^2), where x is the mean absolute difference between the two pixels over the channels of the
-  guide, the photo and the interpolated map; c is computed once;
+  guide: the colour image and the interpolated map. c is computed once;
 - adjustment (their eq. 3): each block is multiplied by the ratio of the low-resolution pixel to the block's mean.
 
 What differs from the original:
 
-- It works on inverse depth (disparity without its offset): always positive, as the multiplication asks, and linear on
-  planes. The photo is in [0, 1] and the map, in the guide, in [0, 1] over its range times ``depth_weight``; there, both
-  are standardised with constants of each data set.
-- The iteration stops where it no longer moves the map, instead of after 8000 steps in every case.
-- The map is continued linearly by ``border`` low-resolution pixels, for the diffusion flattens it along the image's
-  edge: a plane comes out within 3e-4 of its range, and exactly but for that.
-- Holes of the low-resolution map have no adjustment, as there. They are filled by the same iteration on the
-  low-resolution map first, for diffusion into a large hole takes as many steps as the square of its width.
-- A map is iterated in float32, and adjusted in float64 at the end.
+- It works on inverse depth (disparity without its offset), which is always positive, as the multiplication requires,
+  and linear on planes. In the guide, the colours are in [0, 1] and the map, normalised by its range, is multiplied by
+  ``depth_weight``; the original standardises both with constants of each data set.
+- The iteration stops when the map no longer moves, instead of always after 8000 steps.
+- The map is extrapolated linearly by ``border`` low-resolution pixels, because diffusion flattens it along the border
+  of the image: a plane is reproduced within 3e-4 of its range there, and exactly elsewhere.
+- Holes of the low-resolution map have no adjustment, as in the original. The same iteration first inpaints them at the
+  low resolution, because diffusion into a hole takes as many steps as the square of its width.
+- The iteration runs in float32; the last adjustment is in float64.
 """
 
 from __future__ import annotations
@@ -39,11 +39,11 @@ from dsr.sample import DepthSample
 from dsr.utils.progress import Steps
 
 _LEAST = 0.5
-"""A map continued beyond the border stays within this share of its lowest value."""
+"""Minimum of an extrapolated map as a fraction of its lowest value, and of its highest value over the maximum."""
 
 
 class Diffusion(NamedTuple):
-    """What an iteration found: the map (B, 1, H, W), the steps it took, and how far it moved between two looks."""
+    """The map (B, 1, H, W), the number of steps, and the RMS movement between two checks."""
 
     values: Tensor
     steps: int
@@ -51,18 +51,18 @@ class Diffusion(NamedTuple):
 
 
 class AnisotropicDiffusion:
-    """Guided anisotropic diffusion; the box means of its inverse depth are the input's.
+    """Guided anisotropic diffusion; the block means of its inverse depth equal the input.
 
-    Holes of the input are filled. Memory: about 15 float64 maps of the photo's size, 30 MB for 512 x 512. It takes the
-    low-resolution map for block means of disparity, whatever the downsampling model was.
+    Holes of the input are inpainted. Memory: about 15 float64 maps of the image's size, 30 MB for 512 x 512. The
+    low-resolution map is assumed to hold block means of disparity, whatever the downsampling model was.
 
     Args:
-        steps: at most so many.
-        tolerance: it stops after moving, within 50 steps, by less than this share of the map's range (RMS).
-        step: length of a step; above 0.25 diffusion is unstable.
+        steps: maximum number of steps.
+        tolerance: RMS movement within 50 steps, relative to the map's range, below which it stops.
+        step: size of a step; above 0.25 diffusion is unstable.
         edge: difference of the guide at which diffusion is halved (K).
-        depth_weight: weight of the interpolated map, over its range, in the guide; 0 leaves the photo alone.
-        border: low-resolution pixels by which the map is continued linearly.
+        depth_weight: weight of the interpolated map, normalised by its range, in the guide; 0 for the colours alone.
+        border: number of low-resolution pixels by which the map is extrapolated linearly.
 
     Raises:
         ValueError: a value is out of range.
@@ -95,11 +95,11 @@ class AnisotropicDiffusion:
 
     @torch.inference_mode()
     def __call__(self, sample: DepthSample, progress: Steps | None = None) -> Tensor:
-        """Return the high-resolution depth, (1, H, W) in metres, on the sample's device and without holes.
+        """Return high-resolution depth without holes, (1, H, W) in metres on the sample's device.
 
         Args:
             sample: the problem.
-            progress: is told the steps done and the most that it may take.
+            progress: is called with the steps done and their maximum.
 
         """
         lr = to_range(sample.depth_lr.double(), sample.camera_lr, "disparity") + sample.camera_lr.doffs
@@ -110,12 +110,12 @@ class AnisotropicDiffusion:
         return from_range(hr - sample.camera.doffs, sample.camera, "disparity").to(sample.depth_lr.dtype)
 
     def diffuse(self, rgb: Tensor, lr: Tensor, scale: int, progress: Steps | None = None) -> Diffusion:
-        """Return positive maps upsampled.
+        """Upsample positive maps.
 
         Args:
             rgb: (B, 3, H, W) in [0, 1].
-            lr: (B, 1, H / scale, W / scale) float64, positive, NaN where it is not known.
-            scale: the factor; at 1, holes are filled.
+            lr: (B, 1, H / scale, W / scale) float64, positive, NaN in holes.
+            scale: upsampling factor; at 1, only holes are inpainted.
             progress: as above.
 
         """
@@ -128,7 +128,7 @@ class AnisotropicDiffusion:
         edge = self.border * scale
         guide_rgb = functional.pad(rgb.float(), [edge] * 4, mode="replicate") if edge else rgb.float()
         start_hr = upsample_linear_border(lr_extended, scale).clamp(min=low / 2)
-        weight = self.depth_weight if scale > 1 else 0.0  # what stands in a hole at first knows nothing of it
+        weight = self.depth_weight if scale > 1 else 0.0  # an inpainted hole says nothing about edges
         conductances = self._conductances(guide_rgb, weight * normalise(start_hr).values)
         result = self._iterate(start_hr, lr_extended, valid, conductances, progress)
         inner = (slice(edge, edge + rgb.shape[-2]), slice(edge, edge + rgb.shape[-1]))
@@ -136,7 +136,7 @@ class AnisotropicDiffusion:
         return result._replace(values=exact)
 
     def _conductances(self, rgb: Tensor, depth: Tensor) -> tuple[Tensor, Tensor]:
-        """Return step * c along u, (B, 1, H, W - 1), and along v, (B, 1, H - 1, W), of photos and weighted maps."""
+        """Return step * c along u, (B, 1, H, W - 1), and along v, (B, 1, H - 1, W), of images and weighted maps."""
         guide = torch.cat((rgb, depth.to(rgb)), dim=1)
         along_u, along_v = (
             self.step / (1 + (guide.diff(dim=dim).abs().mean(dim=1, keepdim=True) / self.edge).square())
@@ -152,7 +152,7 @@ class AnisotropicDiffusion:
         conductances: tuple[Tensor, Tensor],
         progress: Steps | None,
     ) -> Diffusion:
-        """Return where the two steps, in turn, end."""
+        """Alternate diffusion and adjustment until the map stops moving."""
         mean = start_hr.mean(dim=(-2, -1), keepdim=True)
         x, target = (start_hr / mean).float(), (lr / mean).float()
         value_range = min_max(target).diff(dim=1).clamp(min=1e-12)
@@ -173,7 +173,7 @@ class AnisotropicDiffusion:
 
 
 def _adjust(x: Tensor, lr: Tensor, valid: Tensor) -> None:
-    """Multiply each known block of x, (B, 1, H, W), so that its mean is the low-resolution pixel, in place."""
+    """Multiply each valid block of x, (B, 1, H, W), in place, so that its mean is the low-resolution pixel."""
     scale = x.shape[-1] // lr.shape[-1]
     ratio = torch.where(valid, lr / box_mean(x, scale), 1)
     blocks = x.view(*lr.shape[:-1], scale, lr.shape[-1], scale)

@@ -1,7 +1,7 @@
-"""Linear systems with symmetric positive definite operators that are given as functions: conjugate gradients.
+"""Conjugate gradients for linear systems with symmetric positive definite operators, given as functions.
 
 Hestenes and Stiefel, *Methods of Conjugate Gradients for Solving Linear Systems*, 1952. Each step lowers the quadratic
-1/2 <x, A x> - <b, x>, so an early stop is still nearer to the solution than the start.
+1/2 <x, A x> - <b, x>, so an early stop is still closer to the solution than the start.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from torch import Tensor
 
 
 class Solution(NamedTuple):
-    """What was found: ``values`` (B, ...), the steps taken, and the largest |b - A x| / |b| in the batch."""
+    """The solution ``values`` (B, ...), the number of steps, and the largest |b - A x| / |b| in the batch."""
 
     values: Tensor
     iterations: int
@@ -24,15 +24,15 @@ class Solution(NamedTuple):
 def conjugate_gradients(
     operator: Callable[[Tensor], Tensor], right: Tensor, start: Tensor, *, iterations: int, tolerance: float
 ) -> Solution:
-    """Solve A x = b for each of a batch.
+    """Solve A x = b for each element of a batch.
 
     Args:
         operator: x -> A x, (B, ...) -> (B, ...), symmetric positive definite for each element of the batch, on the
             subspace that b - A start lies in; elements do not mix.
         right: b, (B, ...).
         start: the first x, (B, ...).
-        iterations: at most so many steps.
-        tolerance: it stops where |b - A x| is at most this share of |b|, in all elements.
+        iterations: maximum number of steps.
+        tolerance: relative residual |b - A x| / |b|, in all elements, at which it stops.
 
     """
     x, residual = start, right - operator(start)
@@ -56,5 +56,5 @@ def _dot(a: Tensor, b: Tensor) -> Tensor:
 
 
 def _ratio(above: Tensor, below: Tensor) -> Tensor:
-    """Return above / below, 0 where that is 0: an element that is solved stands still."""
+    """Return above / below, 0 where ``below`` is 0, so that a solved element stays unchanged."""
     return torch.where(below > 0, above / torch.where(below > 0, below, 1), 0)

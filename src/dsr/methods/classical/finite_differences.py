@@ -1,4 +1,4 @@
-"""Differences of maps and their adjoints, block means, where an iteration starts: what variational methods share."""
+"""Finite differences and their adjoints, block means and the initial map: operators that variational methods share."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from torch.nn import functional
 from dsr.methods.networks.maps import upsample_bicubic
 
 LUMA = (0.299, 0.587, 0.114)
-"""Weights of red, green and blue in a grey photo (ITU-R BT.601)."""
+"""Weights of red, green and blue in the luma (ITU-R BT.601)."""
 _REACH = 2
-"""Low-resolution pixels that Keys' kernel reaches beyond the border."""
+"""Half width of Keys' kernel in low-resolution pixels."""
 
 
 def gradient(x: Tensor) -> Tensor:
@@ -22,8 +22,8 @@ def gradient(x: Tensor) -> Tensor:
 def divergence(p: Tensor) -> Tensor:
     """Return minus the adjoint of :func:`gradient`, (B, 2, C, H, W) -> (B, C, H, W).
 
-    <gradient(x), p> = -<x, divergence(p)> for all x and p; what p says in the last column along u, and in the last row
-    along v, does not count.
+    <gradient(x), p> = -<x, divergence(p)> for all x and p. The last column of p along u and its last row along v are
+    ignored.
     """
     total = torch.zeros_like(p[:, 0])
     along_u, along_v = p[:, 0, ..., :-1], p[:, 1, ..., :-1, :]
@@ -35,9 +35,9 @@ def divergence(p: Tensor) -> Tensor:
 
 
 def sum_adjacent(p: Tensor) -> Tensor:
-    """Return the sum of what belongs to each pixel's differences, (B, 2, C, H, W) -> (B, C, H, W).
+    """Return the sum of the values at the differences that use each pixel, (B, 2, C, H, W) -> (B, C, H, W).
 
-    The adjoint of :func:`gradient` with a plus for every minus: its columns' absolute sums, weighted.
+    This is the adjoint of :func:`gradient` with absolute values of its coefficients.
     """
     total = torch.zeros_like(p[:, 0])
     along_u, along_v = p[:, 0, ..., :-1], p[:, 1, ..., :-1, :]
@@ -54,22 +54,22 @@ def box_mean(x: Tensor, scale: int) -> Tensor:
 
 
 def repeat_blocks(x: Tensor, scale: int) -> Tensor:
-    """Return each pixel as a scale x scale block, (B, C, h, w) -> (B, C, scale h, scale w)."""
+    """Repeat each pixel as a scale x scale block, (B, C, h, w) -> (B, C, scale h, scale w)."""
     return x.repeat_interleave(scale, -2).repeat_interleave(scale, -1)
 
 
 def grey(rgb: Tensor) -> Tensor:
-    """Return the luma of (B, 3, H, W) photos, (B, 1, H, W)."""
+    """Return the luma of (B, 3, H, W) images, (B, 1, H, W)."""
     return (rgb * rgb.new_tensor(LUMA)[:, None, None]).sum(dim=1, keepdim=True)
 
 
 def extend_linearly(x: Tensor, border: int) -> Tensor:
-    """Return (B, C, h, w) with ``border`` pixels more on each side, where it goes on linearly; a plane stays one."""
+    """Extrapolate (B, C, h, w) linearly by ``border`` pixels on each side; planes are continued exactly."""
     return _extend(_extend(x, border, -1), border, -2)
 
 
 def upsample_linear_border(lr: Tensor, scale: int) -> Tensor:
-    """Return (B, 1, h, w) upsampled bicubically to (B, 1, scale h, scale w), exact on planes up to the border."""
+    """Upsample (B, 1, h, w) bicubically to (B, 1, scale h, scale w); planes are exact up to the border."""
     if scale == 1:
         return lr.clone()
     edge = _REACH * scale

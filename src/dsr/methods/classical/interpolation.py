@@ -1,4 +1,4 @@
-"""Interpolation of the LR depth alone: nearest neighbour, bilinear, cubic spline (the paper's "Bicubic")."""
+"""Interpolation of low-resolution depth without a guide: nearest neighbour, bilinear, cubic spline ("Bicubic")."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ Order = Literal["nearest", "bilinear", "bicubic"]
 
 
 class Interpolation:
-    """Spline interpolation of the coarse perspective depth; the photo is not looked at.
+    """Spline interpolation of low-resolution perspective depth, without a guide.
 
-    ``bicubic`` is the interpolating cubic spline, with the outermost pixels repeated beyond the border. Coarse and fine
-    pixels are matched through their cameras, so each downsampling model's own pixel centres are honoured.
+    ``bicubic`` is the interpolating cubic spline, with the outermost pixels repeated beyond the border. Pixels are
+    matched through the cameras, so that the pixel centres of each downsampling model are respected.
 
     Args:
         order: ``nearest``, ``bilinear`` or ``bicubic``.
-        fill_holes: whether holes of the low-resolution map are filled with their nearest known pixel; otherwise a
-            high-resolution pixel whose nearest low-resolution pixel is a hole stays one.
+        fill_holes: whether holes of the low-resolution map take the value of the nearest valid pixel; otherwise a
+            high-resolution pixel whose nearest low-resolution pixel is a hole is a hole.
 
     Raises:
         ValueError: an unknown order.

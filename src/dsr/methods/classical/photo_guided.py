@@ -1,12 +1,11 @@
-"""What photo-guided filters share: pixels matched through the cameras, holes, and slopes.
+"""The base class of guided filters: pixels matched through the cameras, holes, and slopes.
 
-A filter of this kind is a weighted mean of low-resolution values, u_p = sum of W_pq d_q with weights that add up to 1.
-Such means flatten slopes at borders, and where the photo makes the weights uneven they copy its texture into the
-surface. With ``slopes`` each low-resolution pixel stands for a plane instead, u_p = sum of W_pq (d_q + s_q . (p - q)),
-s_q being the local slope of the low-resolution disparity, and the weights stay what they are. A plane in space has a
-disparity linear in the pixel, so planes come out exactly, whatever the photo; a constant added to the disparity and a
-factor applied to it come out again, as without. No filter's paper does this: ``slopes=False`` is the filter as
-published.
+A guided filter is a weighted mean of low-resolution values, u_p = sum of W_pq d_q, with weights that add up to 1. Such
+means flatten slopes at borders, and where the guide makes the weights uneven they copy its texture into the surface.
+With ``slopes``, each low-resolution pixel stands for a plane instead, u_p = sum of W_pq (d_q + s_q . (p - q)), with the
+local slope s_q of the low-resolution disparity and the same weights. A plane in space has a disparity that is linear in
+the pixel, so planes are reproduced exactly under any guide. The filter commutes with an affine map of the disparity,
+with slopes as without. None of the filters' papers does this: ``slopes=False`` is the filter as published.
 
 Everything is computed in float64, without randomness, on the sample's device.
 """
@@ -26,19 +25,18 @@ from dsr.sample import DepthSample
 from dsr.utils.progress import Steps
 
 _BEYOND = 4.0
-"""How many times farther than the farthest known low-resolution pixel an answer may be, and how many times nearer."""
+"""Factor by which a result may be farther than the farthest valid low-resolution pixel, or nearer than the nearest."""
 
 
 @dataclass(frozen=True)
 class Guided:
-    """Low-resolution maps and the photo that guides their upsampling.
+    """Low-resolution maps and the image that guides their upsampling.
 
     Args:
         rgb: (3, H, W) float64 in [0, 1].
-        maps: (N, h, w) float64, to be upsampled alike; finite everywhere, in holes what stands around them.
-        valid: (h, w) float64, 1 where the maps are known and 0 in holes.
-        rows, columns: (H,), (W,) float64, where each high-resolution pixel lies in the low-resolution maps, in
-            low-resolution pixels.
+        maps: (N, h, w) float64, to be upsampled with the same weights; holes are inpainted.
+        valid: (h, w) float64, 1 where the maps are valid and 0 in holes.
+        rows, columns: (H,), (W,) float64, position of each high-resolution pixel in low-resolution pixels.
 
     """
 
@@ -54,15 +52,15 @@ class Guided:
         return self.rgb.shape[-1] / self.maps.shape[-1]
 
     def nearest(self) -> tuple[Tensor, Tensor]:
-        """Return the row (H,) and the column (W,) of the LR pixel that each HR pixel is nearest to."""
+        """Return the row (H,) and the column (W,) of the low-resolution pixel nearest to each high-resolution pixel."""
         height, width = self.valid.shape
         return _nearest_index(self.rows, height), _nearest_index(self.columns, width)
 
     def interpolate(self) -> tuple[Tensor, Tensor]:
         """Return the maps, (N, H, W), and their confidence, (H, W), at the high-resolution pixels.
 
-        A value is the bilinear mean of the known among the four low-resolution pixels around, its confidence the
-        bilinear weight of these: 1 away from holes, 0 within, where the filled value stands in.
+        A value is the bilinear mean of the valid ones among the four low-resolution pixels around it, and its
+        confidence their bilinear weight: 1 away from holes, 0 within them, where the value is inpainted.
         """
         height, width = self.valid.shape
         down, across = _linear_weights(self.rows, height), _linear_weights(self.columns, width)
@@ -74,11 +72,11 @@ class Guided:
 
 
 class GuidedMethod(ABC):
-    """A filter of the low-resolution disparity that a photo guides: what comes before and after :meth:`filter_maps`.
+    """A guided filter of the low-resolution disparity: everything but :meth:`filter_maps`.
 
     Args:
-        fill_holes: whether holes of the low-resolution map are filled; otherwise a high-resolution pixel whose nearest
-            low-resolution pixel is a hole stays one. No answer depends on a value in a hole.
+        fill_holes: whether holes of the low-resolution map are inpainted; otherwise a high-resolution pixel whose
+            nearest low-resolution pixel is a hole is a hole.
         slopes: whether each low-resolution pixel stands for a plane, see the module.
 
     """
@@ -91,7 +89,7 @@ class GuidedMethod(ABC):
 
     @abstractmethod
     def filter_maps(self, guided: Guided) -> Tensor:
-        """Return the high-resolution maps, (N, H, W) float64, finite everywhere: the same weighted means of each."""
+        """Return the high-resolution maps, (N, H, W) float64, without holes, all with the same weights."""
 
     def __call__(self, sample: DepthSample, progress: Steps | None = None) -> Tensor:
         """Return the high-resolution depth, (1, H, W) in metres in the precision of the low-resolution depth."""
@@ -115,11 +113,11 @@ class GuidedMethod(ABC):
 
 
 def estimate_slopes(values: Tensor, axis: int) -> Tensor:
-    """Return the local slope of a map along an axis, of its shape; unknown values (NaN) have slope 0.
+    """Return the local slope of a map along an axis, in its shape; missing values (NaN) have slope 0.
 
-    Of backward and forward difference the one nearer to 0, or 0 where their signs differ; at a border or a hole the one
-    that there is. The median of that along three pixels then leaves out the pixel in a depth step that mixes both
-    sides.
+    The slope is the backward or the forward difference, whichever is closer to 0, or 0 if their signs differ; at a
+    border or a hole it is the one that exists. The median over three pixels then removes the pixel of a depth step that
+    mixes both sides.
     """
     values = values.movedim(axis, 0)
     difference = torch.full_like(values[:1], torch.nan)
@@ -140,7 +138,7 @@ def expect_positive(method: str, **values: float) -> None:
 
 
 def _fit_planes(disparity_lr: Tensor) -> Tensor:
-    """Return each LR pixel's plane: its value at row and column 0, per row, per column, (3, h, w); NaN in holes."""
+    """Return each low-resolution pixel's plane, (3, h, w): value at row and column 0, slope per row and per column."""
     height, width = disparity_lr.shape
     down, across = estimate_slopes(disparity_lr, 0), estimate_slopes(disparity_lr, 1)
     constant = (

@@ -1,28 +1,28 @@
 """Upsampling by anisotropic total generalised variation, without training.
 
 Ferstl, Reinbacher, Ranftl, Rüther and Bischof, *Image Guided Depth Upsampling using Anisotropic Total Generalized
-Variation*, ICCV 2013: of all high-resolution maps u and vector fields v, the pair with the least
+Variation*, ICCV 2013: of all high-resolution maps u and vector fields v, the pair that minimises
 
-    E(u, v) = first * sum |G (grad u - v)| + second * sum |grad v| + data_weight / 2 * sum w (mean u - d)^2,
+    E(u, v) = alpha_1 * sum |G (grad u - v)| + alpha_0 * sum |grad v| + data_weight / 2 * sum w (mean u - d)^2,
 
-their eq. 6 with first = alpha_1 and second = alpha_0. v is the map's slope where it is smooth, so planes cost nothing.
-G = exp(-sharpness |grad I|^exponent) n n^T + t t^T, with n = grad I / |grad I| and t across it, is their tensor from
-the grey photo I (eq. 5): across its edges the map may jump. Solved by the primal-dual method of Chambolle and Pock
+their eq. 6. v is the slope of the map where it is smooth, so planes have no cost. G = exp(-sharpness |grad I|^exponent)
+n n^T + t t^T, with n = grad I / |grad I| and t perpendicular to it, is their diffusion tensor of the grey image I
+(eq. 5): the map may jump across edges of I. E is minimised by the primal-dual method of Chambolle and Pock
 (2011), with the diagonal step sizes of Pock and Chambolle (ICCV 2011, eq. 10 with alpha = 1), over-relaxed (Condat
 2013, algorithm 3.1).
 
 What differs from the original:
 
-- A low-resolution pixel d says what the *mean* of u over its block is, w = the block's pixels; there, it is the value
-  of a single high-resolution pixel. Such a data term's proximal map has a closed form as well, and without a finite
-  ``data_weight`` it is a projection: block means are the input's exactly.
-- It works on disparity, linear on planes, over its range in the image.
-- A difference that would need a pixel beyond the border is left out, whereas the original takes it for 0, which bends
-  planes there.
-- It starts from the bicubic map and its gradient, and stops where the map no longer moves. Holes have no data term, as
-  there; with them, it starts from its own solution on the low-resolution map, for a hole is filled pixel by pixel.
-- ``second`` is 2.4 instead of 17: on procedural scenes, renderings are better by a quarter, and it converges sooner.
-  The iteration is slow at the end: 1000 iterations come close to the least E, and ripples of walls may remain.
+- A low-resolution pixel d is the *mean* of u over its block of w pixels; in the original it is the value of a single
+  high-resolution pixel. The proximal map of this data term also has a closed form, and without a finite
+  ``data_weight`` it is a projection: the block means equal the input exactly.
+- It works on disparity, which is linear on planes, normalised by its range in the image.
+- A difference that would need a pixel beyond the border is left out; the original sets it to 0, which bends planes.
+- It starts from the bicubic map and its gradient, and stops when the map no longer moves. Holes have no data term, as
+  in the original; a map with holes starts from its own solution at the low resolution, because a hole is filled only
+  one pixel per iteration.
+- alpha_0 (``second``) is 2.4 instead of 17: on procedural scenes, renderings are better by a quarter, and convergence
+  is faster. The last iterations gain little: 1000 come close to the minimum of E, and walls may keep ripples.
 """
 
 from __future__ import annotations
@@ -50,13 +50,13 @@ from dsr.sample import DepthSample
 from dsr.utils.progress import Steps
 
 _RELAXATION = 1.9
-"""By how much of a step the iterates move; converges below 2."""
+"""Over-relaxation factor; the iteration converges below 2."""
 _SLOPE = 0.3
-"""Unit of slopes, in that of the map a pixel, for step sizes."""
+"""Scale of slopes relative to the map, per pixel, for step sizes."""
 
 
 class Tensors(NamedTuple):
-    """Symmetric 2 x 2 matrices, one a pixel: [[uu, uv], [uv, vv]], each (B, 1, H, W)."""
+    """Symmetric 2 x 2 matrices, one per pixel: [[uu, uv], [uv, vv]], each (B, 1, H, W)."""
 
     uu: Tensor
     uv: Tensor
@@ -68,10 +68,10 @@ class Tensors(NamedTuple):
 
 
 class Solution(NamedTuple):
-    """What the minimisation found.
+    """The minimiser.
 
-    ``values`` (B, 1, H, W) is u, ``slopes`` (B, 2, H, W) is v, each the mean of the iterates since the last look, for
-    they oscillate; the iterations taken, and the RMS by which u moved between two looks.
+    ``values`` (B, 1, H, W) is u and ``slopes`` (B, 2, H, W) is v, each the mean of the iterates since the last check,
+    because the iterates oscillate; ``iterations`` their number, and ``moved`` the RMS movement of u between two checks.
     """
 
     values: Tensor
@@ -83,18 +83,18 @@ class Solution(NamedTuple):
 class TotalGeneralisedVariation:
     """TGV-guided upsampling.
 
-    Holes of the input are filled. Memory: about 90 float64 maps of the photo's size, 180 MB for 512 x 512. It takes the
-    low-resolution map for block means of disparity, whatever the downsampling model was.
+    Holes of the input are inpainted. Memory: about 90 float64 maps of the image's size, 180 MB for 512 x 512. The
+    low-resolution map is assumed to hold block means of disparity, whatever the downsampling model was.
 
     Args:
-        iterations: at most so many.
-        tolerance: it stops after moving, within 50 iterations, by less than this share of the map's range (RMS).
-        first: weight of the map's distance from its slopes (alpha_1).
-        second: weight of the slopes' variation (alpha_0).
-        data_weight: weight of the input (lambda); null: its block means are met exactly.
-        sharpness: how much an edge of the photo lets the map jump (beta).
-        exponent: of the photo's gradient (gamma).
-        step_ratio: of the dual to the primal steps; moves the time that it takes, not the minimum.
+        iterations: maximum number of iterations.
+        tolerance: RMS movement within 50 iterations, relative to the map's range, below which it stops.
+        first: weight alpha_1 of the distance between the map's gradient and v.
+        second: weight alpha_0 of the variation of v.
+        data_weight: weight of the input (lambda); None for block means that equal the input exactly.
+        sharpness: strength of the image's edges, across which the map may jump (beta).
+        exponent: exponent of the image's gradient (gamma).
+        step_ratio: ratio of dual to primal step sizes; changes the speed of convergence, not the minimum.
 
     Raises:
         ValueError: a value is out of range.
@@ -134,13 +134,13 @@ class TotalGeneralisedVariation:
 
     @torch.inference_mode()
     def __call__(self, sample: DepthSample, progress: Steps | None = None) -> Tensor:
-        """Return the high-resolution depth, (1, H, W) in metres, on the sample's device and without holes.
+        """Return high-resolution depth without holes, (1, H, W) in metres on the sample's device.
 
         A disparity at or beyond infinity becomes NaN.
 
         Args:
             sample: the problem.
-            progress: is told the iterations done and the most that it may take.
+            progress: is called with the iterations done and their maximum.
 
         """
         lr = to_range(sample.depth_lr.double(), sample.camera_lr, "disparity")[None] * sample.scale
@@ -153,12 +153,12 @@ class TotalGeneralisedVariation:
         return from_range(hr[0], sample.camera, "disparity").to(sample.depth_lr.dtype)
 
     def minimise(self, rgb: Tensor, lr: Tensor, scale: int, progress: Steps | None = None) -> Solution:
-        """Return the minimum of E for normalised maps.
+        """Return the minimiser of E for normalised maps.
 
         Args:
             rgb: (B, 3, H, W) in [0, 1].
-            lr: (B, 1, H / scale, W / scale) of the same type, in [0, 1], NaN where it is not known.
-            scale: the factor; at 1, holes are filled.
+            lr: (B, 1, H / scale, W / scale) of the same type, in [0, 1], NaN in holes.
+            scale: upsampling factor; at 1, only holes are inpainted.
             progress: as above.
 
         """
@@ -169,7 +169,7 @@ class TotalGeneralisedVariation:
         return self._iterate(first, lr, self.diffusion_tensors(rgb), progress)
 
     def diffusion_tensors(self, rgb: Tensor) -> Tensors:
-        """Return G for (B, 3, H, W) photos; the identity where a photo is constant."""
+        """Return G for (B, 3, H, W) images; the identity where an image is constant."""
         slope = gradient(grey(rgb))
         size = slope.square().sum(dim=1).sqrt()
         normal = slope / torch.where(size > 0, size, 1)[:, None]  # 0 where there is none
@@ -178,7 +178,7 @@ class TotalGeneralisedVariation:
         return Tensors(1 - less * x * x, -less * x * y, 1 - less * y * y)
 
     def objective(self, values: Tensor, slopes: Tensor, lr: Tensor, tensors: Tensors) -> Tensor:
-        """Return E(u, v), (B,); of the data term, 0 where ``data_weight`` is None."""
+        """Return E(u, v), (B,), without the data term if ``data_weight`` is None."""
         bent = tensors.times(_zero_border(gradient(values) - slopes[:, :, None]))
         total = self.alpha1 * _lengths(bent).sum(dim=(1, 2, 3))
         total = total + self.alpha0 * _lengths(gradient(slopes)).sum(dim=(1, 2, 3))
@@ -189,7 +189,7 @@ class TotalGeneralisedVariation:
         return total + self.data_weight / 2 * scale**2 * miss.square().sum(dim=(1, 2, 3))
 
     def _iterate(self, first: Tensor, lr: Tensor, g: Tensors, progress: Steps | None) -> Solution:
-        """Return what the primal-dual iteration makes of a first map."""
+        """Iterate from an initial map, (B, 1, H, W)."""
         steps = _Steps.of(g, self.step_ratio)
         data = _DataTerm(lr, steps.u, self.data_weight)
         u = first
@@ -227,9 +227,9 @@ class _Steps(NamedTuple):
 
     @classmethod
     def of(cls, g: Tensors, ratio: float) -> _Steps:
-        """Return the inverse sums of the operator's absolute rows and columns, times and by the ratio's root.
+        """Return the inverse absolute row and column sums of the operator, scaled by the root of the ratio.
 
-        Those are of the operator on (u, v / _SLOPE), for slopes are smaller than what they lead to.
+        The operator acts on (u, v / _SLOPE), because slopes are smaller than differences of the map.
         """
         root = ratio**0.5
         along_u, along_v = g.uu + g.uv.abs(), g.vv + g.uv.abs()
@@ -241,10 +241,10 @@ class _Steps(NamedTuple):
 
 
 class _DataTerm:
-    """The proximal map of data_weight / 2 * sum over blocks of size^2 (mean - coarse)^2, for step sizes one a pixel.
+    """The proximal map of data_weight / 2 * sum over blocks of size^2 (mean - lr)^2, with one step size per pixel.
 
-    With steps t, the pixels of a block move by -t * data_weight * (mean - coarse): the mean of that is an equation for
-    the mean. As data_weight grows, it becomes the projection onto mean = coarse.
+    With step sizes t, the pixels of a block move by -t * data_weight * (mean - lr). Averaging this over the block gives
+    an equation for the mean. As data_weight goes to infinity, it becomes the projection onto mean = lr.
     """
 
     def __init__(self, lr: Tensor, steps: Tensor, weight: float | None) -> None:
@@ -261,7 +261,7 @@ class _DataTerm:
 
 
 def slopes(u: Tensor) -> Tensor:
-    """Return the gradient of (B, 1, H, W) maps, (B, 2, H, W), with the last column and row that have one repeated."""
+    """Return the gradient of (B, 1, H, W) maps, (B, 2, H, W); the last column and row repeat the one before."""
     v = gradient(u)[:, :, 0]
     if u.shape[-1] > 1:
         v[:, 0, :, -1] = v[:, 0, :, -2]
@@ -271,7 +271,7 @@ def slopes(u: Tensor) -> Tensor:
 
 
 def _zero_border(p: Tensor) -> Tensor:
-    """Set to 0, in place, what (B, 2, C, H, W) says of differences beyond the border."""
+    """Set the entries of (B, 2, C, H, W) for differences beyond the border to 0, in place."""
     p[:, 0, ..., -1] = 0
     p[:, 1, ..., -1, :] = 0
     return p
@@ -283,5 +283,5 @@ def _lengths(p: Tensor) -> Tensor:
 
 
 def _project_ball(p: Tensor, radius: float) -> Tensor:
-    """Return (B, 2, C, H, W) with each pixel's vector or matrix cut to a length."""
+    """Project each pixel's vector or matrix of (B, 2, C, H, W) onto the ball of a radius."""
     return p / (_lengths(p)[:, None] / radius).clamp(min=1)
