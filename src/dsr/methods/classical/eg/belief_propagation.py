@@ -1,17 +1,17 @@
-"""Labels of least energy in a Markov random field, by loopy min-sum belief propagation, batched over all pairs.
+"""Labels of low energy in a Markov random field by loopy min-sum belief propagation, batched over all pairs.
 
 Pearl, *Probabilistic Reasoning in Intelligent Systems*, 1988; min-sum is max-product in negative logarithms, as used by
 Freeman, Pasztor, Carmichael, *Learning Low-Level Vision*, IJCV 2000. The energy of labels x is
 
     E(x) = sum over nodes i of unary_i(x_i) + sum over pairs (i, j) of cost_ij(x_i, x_j),
 
-the message from i to j is m_ij(x_j) = min over x_i of unary_i(x_i) + cost_ij(x_i, x_j) + sum of what i hears from
-others than j, less its minimum, and a node's label is the least of unary_i plus all that it hears. On trees that is the
-minimum; on other graphs a good answer, and the best labels seen are kept. Messages move half of the way at each step,
-for on loops they may oscillate.
+the message from i to j is m_ij(x_j) = min over x_i of unary_i(x_i) + cost_ij(x_i, x_j) + the messages to i from nodes
+other than j, less its minimum. A node's label minimises unary_i plus all messages to it. On trees this is the minimum;
+on other graphs it is an approximation, and the best labels so far are kept. Messages are damped by one half, because
+they may oscillate on loops.
 
-Sums run in the order of the pairs, on any device: equal input gives equal labels. Memory: 4 messages of K values a pair
-and its K x K costs, K being the labels.
+Sums run in the order of the pairs, on any device: equal input gives equal labels. Memory: for each pair, 4 messages of
+K values and K x K costs, with K labels.
 """
 
 from __future__ import annotations
@@ -24,16 +24,16 @@ from torch import Tensor
 from dsr.utils.progress import Steps
 
 _MOVE = 0.5
-"""By how much of a step messages move; 1 would be undamped."""
+"""Damping factor of messages; 1 would be undamped."""
 CHECK_EVERY = 5
-"""Iterations between two looks at the labels."""
+"""Iterations between two evaluations of the labels."""
 
 
 class Labelling(NamedTuple):
-    """Labels (N,), their energy, whether messages settled, and the looks at them on the way.
+    """Labels (N,), their energy, whether the messages converged, and the history.
 
-    Each entry of ``history`` has ``iteration``, ``objective`` (the energy of the labels then) and ``moved`` (the
-    largest change of a message, as a share of the largest cost).
+    Each entry of ``history`` has ``iteration``, ``objective`` (the energy of the labels) and ``moved`` (the largest
+    change of a message, relative to the largest cost).
     """
 
     labels: Tensor
@@ -56,9 +56,9 @@ def label(
         unary: (N, K) costs of each node's labels, finite.
         pairs: (E, 2) nodes, each pair once.
         costs: (E, K, K) of the labels of a pair's first node (rows) and second node (columns), finite.
-        iterations: at most so many.
-        tolerance: it stops where no message moves by more than this share of the largest cost.
-        progress: is told the iterations done and the most that it may take.
+        iterations: maximum number of iterations.
+        tolerance: largest change of a message, relative to the largest cost, at which it stops.
+        progress: is called with the iterations done and their maximum.
 
     """
     count, labels = unary.shape
@@ -73,7 +73,7 @@ def label(
     moved = 0.0
     for done in range(1, iterations + 1):
         beliefs = unary + torch.cat((messages, silence))[heard].sum(dim=1)
-        told = beliefs[sources] - messages.roll(len(pairs), 0)  # less what the target said
+        told = beliefs[sources] - messages.roll(len(pairs), 0)  # less the target's message
         new = (told[:, :, None] + both).amin(dim=1)
         step = (new - new.amin(dim=1, keepdim=True) - messages) * _MOVE
         messages = messages + step
@@ -100,7 +100,7 @@ def energy(labels: Tensor, unary: Tensor, pairs: Tensor, costs: Tensor) -> float
 
 
 def _incoming(targets: Tensor, count: int) -> Tensor:
-    """Return, for each node, the messages that go to it, (count, most), filled up with the index past the last."""
+    """Return the indices of the messages to each node, (count, most), padded with the index past the last."""
     order = targets.argsort(stable=True)
     numbers = torch.bincount(targets, minlength=count)
     starts = numbers.cumsum(0) - numbers

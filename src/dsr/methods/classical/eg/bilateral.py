@@ -1,7 +1,7 @@
 """The modified joint bilateral filter of edge-guided upsampling: means that do not cross edges.
 
-Xie, Feris, Sun, *Edge-Guided Single Depth Image Super Resolution*, IEEE TIP 25(1), 2016; what is taken over and what
-differs is said in :mod:`dsr.methods.classical.eg.upsampler`.
+Xie, Feris, Sun, *Edge-Guided Single Depth Image Super Resolution*, IEEE TIP 25(1), 2016. For the differences from the
+original see :mod:`dsr.methods.classical.eg.upsampler`.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ from dsr.methods.classical.photo_guided import estimate_slopes
 from dsr.methods.networks.inpainting import inpaint
 
 _CHUNK = 4096
-"""Low-resolution pixels whose ways are looked for at once."""
+"""Low-resolution pixels that are flooded at once."""
 _BESIDE = ((-1, 0), (0, -1), (0, 1), (1, 0), (-1, -1), (-1, 1), (1, -1), (1, 1))
-"""Rows and columns to a pixel's neighbours, the nearest first."""
+"""Rows and columns from a pixel to its neighbours, the nearest first."""
 
 
 class _Planes(NamedTuple):
-    """Low-resolution pixels (h, w): value, slopes per row and per column, and how much each counts."""
+    """Planes of low-resolution pixels, each (h, w): value, slope per row and per column, and weight."""
 
     values: Tensor
     down: Tensor
@@ -42,17 +42,17 @@ def bilateral_filter(
     doubtful: Tensor | None = None,
     sharp: bool = True,
 ) -> Tensor:
-    """Return a map (h, w) upsampled by the modified joint bilateral filter, (H, W), NaN where it is.
+    """Upsample a map, (h, w), by the modified joint bilateral filter to (H, W); holes stay holes.
 
     Args:
-        lr: the map, NaN where it is not known; some of it must be.
-        barrier: (H, W) bool, the edges.
+        lr: (h, w) map with at least one valid pixel, NaN in holes.
+        barrier: (H, W) bool, the edge map.
         scale: high-resolution pixels per low-resolution one.
-        radius: of the neighbourhood, in low-resolution pixels.
+        radius: radius of the neighbourhood in low-resolution pixels.
         sigma_space: standard deviation of the distance's Gaussian, in low-resolution pixels.
-        mixed: what a low-resolution pixel with an edge through it counts.
-        doubtful: (h, w) bool, more low-resolution pixels that mix two sides; None for none.
-        sharp: whether pixels on edges take a side; otherwise they keep what leaves block means as they are.
+        mixed: weight of a low-resolution pixel with an edge through it, relative to others.
+        doubtful: (h, w) bool, further low-resolution pixels that mix two sides; None for none.
+        sharp: whether pixels on edges take a side; otherwise they keep the value that preserves the block means.
 
     """
     valid = lr.isfinite()
@@ -72,19 +72,19 @@ def bilateral_filter(
 
 
 def find_reachable(barrier: Tensor, scale: int, radius: int) -> Tensor:
-    """Return which low-resolution pixels each high-resolution pixel has a way to that crosses no edge.
+    """Return which low-resolution pixels each high-resolution pixel reaches by a path that crosses no edge.
 
-    A way starts in the middle of the low-resolution pixel, goes over 4-connected high-resolution pixels that are no
-    edge, and stays within the low-resolution pixels at most ``radius`` rows and columns off.
+    A path starts in the middle of the low-resolution pixel, runs over 4-connected high-resolution pixels off the edges,
+    and stays within the low-resolution pixels at most ``radius`` rows and columns away.
 
     Args:
         barrier: (H, W) bool, the edge map.
         scale: high-resolution pixels per low-resolution one.
-        radius: of the neighbourhood, in low-resolution pixels.
+        radius: radius of the neighbourhood in low-resolution pixels.
 
     Returns:
-        (2 radius + 1, 2 radius + 1, H, W) bool: [radius + a, radius + b] says it of the low-resolution pixel a rows
-        below and b columns right of the one that the high-resolution pixel lies in.
+        (2 radius + 1, 2 radius + 1, H, W) bool: [radius + a, radius + b] is for the low-resolution pixel a rows below
+        and b columns right of the one that contains the high-resolution pixel.
 
     """
     height, width = barrier.shape[0] // scale, barrier.shape[1] // scale
@@ -106,7 +106,7 @@ def find_reachable(barrier: Tensor, scale: int, radius: int) -> Tensor:
 
 
 def _filter(planes: _Planes, reachable: Tensor, scale: int, sigma_space: float, smooth: Tensor) -> Tensor:
-    """Return the weighted means of the planes, (H, W); where no weight is, the smooth map."""
+    """Return the weighted means of the planes, (H, W), and the smooth map where all weights are 0."""
     height, width = planes.values.shape
     rows, columns = (torch.arange(n, device=smooth.device) for n in smooth.shape)
     y, x = ((n.to(smooth) + 0.5) / scale - 0.5 for n in (rows, columns))
@@ -115,7 +115,7 @@ def _filter(planes: _Planes, reachable: Tensor, scale: int, sigma_space: float, 
     for a in range(-radius, radius + 1):
         for b in range(-radius, radius + 1):
             i, j = rows // scale + a, columns // scale + b
-            at = i.clamp(0, height - 1)[:, None], j.clamp(0, width - 1)  # beyond the border nothing is reachable
+            at = i.clamp(0, height - 1)[:, None], j.clamp(0, width - 1)  # nothing beyond the border is reachable
             down, across = (y - i)[:, None], x - j
             weight = torch.exp((down.square() + across.square()) / (-2 * sigma_space**2))
             weight = weight * planes.trust[at] * reachable[radius + a, radius + b]
@@ -125,9 +125,9 @@ def _filter(planes: _Planes, reachable: Tensor, scale: int, sigma_space: float, 
 
 
 def _fill_edges(hr: Tensor, barrier: Tensor, lr: Tensor, smooth: Tensor, scale: int) -> Tensor:
-    """Return the high-resolution map with new values on edges: the smooth map, moved as the means of blocks need.
+    """Return the high-resolution map with new values on edges: the smooth map, shifted to preserve block means.
 
-    They stay between the least and the most of the neighbours off the edge.
+    The values stay between the minimum and the maximum of the neighbours off the edge.
     """
     start = torch.where(barrier, smooth, hr)[None, None]
     fraction = box_mean(barrier[None, None].to(hr), scale)
@@ -139,9 +139,9 @@ def _fill_edges(hr: Tensor, barrier: Tensor, lr: Tensor, smooth: Tensor, scale: 
 
 
 def _take_sides(reachable: Tensor, barrier: Tensor, hr: Tensor, scale: int) -> None:
-    """Let each edge pixel reach, in place, what its neighbour off the edge does that is the most like its own value.
+    """Copy to each edge pixel, in place, the reachable pixels of its most similar neighbour off the edge.
 
-    An edge pixel without such a neighbour reaches nothing.
+    An edge pixel without a neighbour off the edge reaches nothing.
     """
     places = barrier.nonzero()
     beside = places[:, None] + places.new_tensor(_BESIDE)  # (N, 8, 2)
@@ -160,7 +160,7 @@ def _take_sides(reachable: Tensor, barrier: Tensor, hr: Tensor, scale: int) -> N
 
 
 def _flood(free: Tensor) -> Tensor:
-    """Return the pixels of windows (N, K, K) that 4-connected ways over free pixels lead to from the middle."""
+    """Return the pixels of windows, (N, K, K), that are 4-connected with the middle over free pixels."""
     size = free.shape[-1]
     middle = slice((size - 1) // 2, size // 2 + 1)
     reached = torch.zeros_like(free)
@@ -178,5 +178,5 @@ def _flood(free: Tensor) -> Tensor:
 
 
 def _shift(by: int, size: int) -> tuple[slice, slice]:
-    """Return the places of a line whose neighbour so far on there is, and these neighbours."""
+    """Return the slice of a line whose pixels have a neighbour ``by`` pixels further on, and that of the neighbours."""
     return slice(max(-by, 0), size - max(by, 0)), slice(max(by, 0), size - max(-by, 0))

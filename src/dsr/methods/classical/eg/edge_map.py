@@ -1,26 +1,27 @@
-"""The HR edge map of a LR map: patches of edges that recur across scales, chosen by a Markov random field.
+"""The high-resolution edge map of a low-resolution map: recurring patches of edges and a Markov random field.
 
 Xie, Feris, Sun, *Edge-Guided Single Depth Image Super Resolution*, IEEE TIP 25(1), 2016, the self-similar mode, which
-needs no training data. The map itself at a coarser level, where the truth is known, gives pairs of patches: edges found
-after upsampling, and the true ones. Each patch of edges found in the upsampled map then has the few pairs nearest to it
-as candidates, and a Markov random field says which: its data term is the squared distance of the patches' distance
+needs no training data. The map itself, downsampled once more, gives pairs of patches: edges found after upsampling, and
+the true ones. The candidates of each patch of edges in the upsampled map are the pairs most similar to it, and a Markov
+random field selects one of them: its data term is the squared distance of the patches' distance
 transforms plus ``sharp_weight``^2 times that of the sharp edges, by the number of pixels, and its smoothness term the
 squared difference of the true patches where two patches overlap. Loopy belief propagation finds the labels
 (:mod:`dsr.methods.classical.eg.belief_propagation`). The mean of the chosen patches, where it is above ``KEPT``, is the
 edge map.
 
-As there: patches of 11 x 11 pixels in the self-similar mode, 5 candidates, weight 3, 100 iterations, a mean above 0.2,
-edges of less than 4 pixels dropped, pairs only where both have edge pixels enough and about equally many.
+As in the original: patches of 11 x 11 pixels in the self-similar mode, 5 candidates, weight 3, 100 iterations, a mean
+above 0.2, edges of less than 4 pixels dropped, pairs only if both have enough edge pixels and similar numbers of them.
 
 What differs:
 
-- Edges are Canny's of the bicubic map, whose inflection lines say within a low-resolution pixel where a step of box
-  means is. There, maps are single samples, each repeated as a block, and a shock filter makes a second, sharper edge
-  map for the data term; as it leaves inflection lines where they are, one map serves for both here.
-- The surface's own slope does not count as a step.
-- Pairs come in the 8 orientations of the grid, exactly, rather than turned by multiples of 18 degrees.
-- One patch at most in each cell of 2 x 2 pixels, rather than a scan that skips the neighbours of what it took.
-- The edge map is thinned to lines a pixel wide. Beyond the border the map goes on linearly, so that edges reach it.
+- Edges are Canny's edges of the bicubic map, whose inflection lines locate a step of block means within a
+  low-resolution pixel. In the original, a map holds single samples, each repeated as a block, and a shock filter makes
+  a second, sharper edge map for the data term. As that filter does not move inflection lines, one map serves for both
+  here.
+- The slope of the surface does not count as a step.
+- Pairs are used in the 8 exact orientations of the grid, not rotated by multiples of 18 degrees.
+- Each cell of 2 x 2 pixels has at most one patch; the original scans, and skips the neighbours of each patch.
+- The edge map is thinned to lines one pixel wide. The map is extrapolated linearly, so that edges reach the border.
 """
 
 from __future__ import annotations
@@ -48,13 +49,13 @@ from dsr.methods.networks.inpainting import inpaint
 from dsr.utils.progress import Steps
 
 KEPT = 0.2
-"""An edge is where more than this share of the chosen patches says so."""
+"""Fraction of the chosen patches from which a pixel is an edge."""
 _WEAK = 0.4
-"""Canny's lower threshold, as a share of the upper."""
+"""Canny's lower threshold relative to the upper one."""
 _CELL = 2
-"""One patch at most is looked for in each cell of so many rows and columns."""
+"""Side in pixels of the cells with at most one patch each."""
 _SMALLEST = 4
-"""A pixel with less edge pixels around, itself included, is no edge."""
+"""Minimum number of edge pixels around an edge pixel, itself included."""
 _AROUND = ((0, 1), (0, 2), (1, 2), (2, 2), (2, 1), (2, 0), (1, 0), (0, 0))
 """Rows and columns of the 8 neighbours in a 3 x 3 window, clockwise from the one above."""
 
@@ -69,20 +70,20 @@ def predict_edge_map(
     iterations: int = 100,
     progress: Steps | None = None,
 ) -> tuple[Tensor, Labelling | None]:
-    """Return the HR edge map, (h * scale, w * scale) bool, and how its patches were chosen; None without an edge.
+    """Return the high-resolution edge map, (h * scale, w * scale) bool, and its labelling; None without an edge.
 
     Args:
-        lr: (h, w) map, NaN where it is not known.
+        lr: (h, w) map, NaN in holes.
         scale: high-resolution pixels per low-resolution one, at least 2.
-        step: how high a step is an edge, in the map's unit.
-        candidates: pairs that each patch chooses from.
-        sharp_weight: weight of the sharp edges against the distances of the edges.
+        step: minimum height of an edge, in the map's unit.
+        candidates: number of candidates for each patch.
+        sharp_weight: weight of the edges relative to that of their distance transform.
         smoothness: weight of the smoothness term.
-        iterations: of belief propagation, at most so many.
-        progress: is told the iterations done and the most that it may take.
+        iterations: maximum number of iterations of belief propagation.
+        progress: is called with the iterations done and their maximum.
 
     Raises:
-        NoSolutionError: the map has edges, but none at the coarser level.
+        NoSolutionError: the map has edges, but none once it is downsampled.
 
     """
     border = -(-(PATCH // 2 + 1) // scale)
@@ -107,11 +108,12 @@ def predict_edge_map(
 
 
 def detect_edges(lr: Tensor, scale: int, step: float) -> Tensor:
-    """Return the steps of a map (h, w) upsampled by ``scale``, (h * scale, w * scale) bool, about a pixel wide.
+    """Return the edges of a map, (h, w), upsampled by ``scale``, (h * scale, w * scale) bool, about one pixel wide.
 
-    Canny, *A Computational Approach to Edge Detection*, PAMI 1986: pixels whose gradient is the largest along its
-    direction and large enough, or less large and connected with such. A step of height s between low-resolution pixels
-    has a gradient of at least s / 2. A gradient counts only by how much it exceeds the slope of the surface (see
+    Canny, *A Computational Approach to Edge Detection*, PAMI 1986: pixels whose gradient is a maximum
+    along its direction and above a threshold, or above a lower one and connected with such a pixel. A step of height s
+    between low-resolution pixels has a gradient of at least s / 2. A gradient counts only by how much it exceeds the
+    slope of the surface (see
     :func:`dsr.methods.classical.photo_guided.estimate_slopes`) there or at a neighbouring low-resolution pixel. So a
     plane has no edge, however steep it is, and neither has an inpainted hole.
     """
@@ -127,7 +129,7 @@ def detect_edges(lr: Tensor, scale: int, step: float) -> Tensor:
 
 
 def find_recurring(lr: Tensor, scale: int, step: float) -> Patches:
-    """Return what the map (h, w) itself teaches, at a level ``scale`` times coarser; empty where it is too small."""
+    """Return the pairs of patches of a map, (h, w), downsampled by ``scale``; none if it is too small."""
     height, width = (n - n % scale for n in lr.shape)
     if min(height, width) < max(PATCH, 2 * scale):
         return no_patches(lr.device)
@@ -143,7 +145,7 @@ def find_recurring(lr: Tensor, scale: int, step: float) -> Patches:
 
 
 def thin(mask: Tensor) -> Tensor:
-    """Return a mask (H, W) thinned to lines about a pixel wide that connect what it connects.
+    """Thin a mask, (H, W), to lines about one pixel wide, preserving connectivity.
 
     Zhang, Suen, *A Fast Parallel Algorithm for Thinning Digital Patterns*, CACM 27(3), 1984.
     """
@@ -172,9 +174,9 @@ def _central_difference(x: Tensor, axis: int) -> Tensor:
 
 
 def _is_ridge(strength: Tensor, down: Tensor, across: Tensor) -> Tensor:
-    """Return where the strength is the largest of three pixels along the gradient, (H, W) bool; of equal ones one.
+    """Return where the strength is the maximum of three pixels along the gradient, (H, W) bool; of equal ones one.
 
-    The gradient's direction is rounded to the nearest of the 8 neighbours'.
+    The direction of the gradient is rounded to that of the nearest of the 8 neighbours.
     """
     ring = _neighbours(strength)
     turn = (torch.atan2(across, -down) / (torch.pi / 4)).round().long().remainder(4)[None]
@@ -192,14 +194,14 @@ def _grow(strong: Tensor, weak: Tensor) -> Tensor:
 
 
 def _drop_small(mask: Tensor) -> Tensor:
-    """Return a mask without the pixels that have less than ``_SMALLEST`` in the window that so many can span."""
+    """Return a mask without pixels that have less than ``_SMALLEST`` pixels in the window around them."""
     size = 2 * _SMALLEST - 1
     number = functional.avg_pool2d(mask[None, None].float(), size, 1, size // 2, divisor_override=1)[0, 0]
     return mask & (number > _SMALLEST - 0.5)
 
 
 def _patch_centres(edges: Tensor) -> Tensor:
-    """Return the first edge pixel of each cell, as far inside as a patch needs, (N, 2)."""
+    """Return the first edge pixel of each cell whose patch lies inside the map, (N, 2)."""
     half = PATCH // 2
     places = edges[half:-half, half:-half].nonzero() + half
     number = places[:, 0] // _CELL * edges.shape[1] + places[:, 1] // _CELL

@@ -1,6 +1,6 @@
-"""Patches of edge maps: pairs of one as it comes and as it is, their distances, and how neighbours disagree.
+"""Patches of edge maps: pairs of upsampled and true edges, their distances, and the disagreement of overlapping ones.
 
-The parts of :mod:`dsr.methods.classical.eg.edge_map` that know of patches alone. Patches are (N, PATCH, PATCH) bool.
+Patches are (N, PATCH, PATCH) bool; :mod:`dsr.methods.classical.eg.edge_map` uses them.
 """
 
 from __future__ import annotations
@@ -14,38 +14,38 @@ from torch.nn import functional
 PATCH = 11
 """Rows and columns of a patch, in high-resolution pixels."""
 _ENTRIES = 2**24
-"""Distances between patches that are held at once."""
+"""Maximum number of distances between patches in memory."""
 _BITS = 62
-"""Pixels that a 64-bit word holds, its sign left out."""
+"""Pixels per 64-bit word, without its sign."""
 
 
 class Patches(NamedTuple):
-    """Edges as upsampling shows them, and the true edges at the same places."""
+    """Edges of an upsampled map, and the true edges at the same positions."""
 
     low: Tensor
     high: Tensor
 
 
 def no_patches(device: torch.device) -> Patches:
-    """Return none."""
+    """Return an empty set of patches."""
     none = torch.zeros(0, PATCH, PATCH, dtype=torch.bool, device=device)
     return Patches(none, none)
 
 
 def extract_patches(mask: Tensor, places: Tensor) -> Tensor:
-    """Return the patches of a mask (H, W) around places (N, 2), rows and columns that far inside."""
+    """Return the patches of a mask, (H, W), around positions (N, 2), rows and columns, whose patches lie inside."""
     offsets = torch.arange(PATCH, device=mask.device) - PATCH // 2
     return mask[places[:, 0, None, None] + offsets[:, None], places[:, 1, None, None] + offsets]
 
 
 def orient(patches: Tensor) -> Tensor:
-    """Return patches in their 8 orientations, (8 N, PATCH, PATCH): turned by right angles and mirrored."""
+    """Return patches under the 8 dihedral transforms, (8 N, PATCH, PATCH)."""
     quarters = [patches.rot90(k, (1, 2)) for k in range(4)]
     return torch.cat(quarters + [each.mT for each in quarters])
 
 
 def deduplicate(patches: Patches) -> Patches:
-    """Return the pairs without repetitions, in an order of their own."""
+    """Return the pairs without repetitions, sorted."""
     pixels = 2 * PATCH**2
     bits = torch.cat((patches.low.flatten(1), patches.high.flatten(1)), dim=1).long()
     place = torch.arange(_BITS, device=bits.device)
@@ -67,7 +67,7 @@ def edge_distances(patches: Tensor) -> Tensor:
 
 
 def find_nearest(query: Tensor, examples: Patches, count: int, weight: float) -> tuple[Tensor, Tensor]:
-    """Return the known pairs most like patches, as squared distances and as numbers, (N, count) each; the best first.
+    """Return the examples most similar to patches: squared distances and indices, (N, count) each, the best first.
 
     |D(query) - D(low)|^2 + weight^2 |query - high|^2, D being :func:`edge_distances`.
     """
@@ -84,12 +84,12 @@ def find_nearest(query: Tensor, examples: Patches, count: int, weight: float) ->
 
 
 def find_overlaps(places: Tensor, patches: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the pairs of patches that overlap, (E, 2), and how their candidates disagree there, (E, K, K).
+    """Return the pairs of overlapping patches, (E, 2), and the disagreement of their candidates, (E, K, K).
 
-    A disagreement is the sum of squared differences over the pixels that both cover.
+    The disagreement is the sum of squared differences over the pixels that both patches cover.
 
     Args:
-        places: (N, 2) rows and columns of the patches' centres, no two alike.
+        places: (N, 2) rows and columns of the patches' centres, all different.
         patches: (N, K, PATCH^2) float, the candidates of each.
 
     """
@@ -109,9 +109,9 @@ def find_overlaps(places: Tensor, patches: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def average_patches(patches: Tensor, places: Tensor, shape: tuple[int, int]) -> Tensor:
-    """Return the mean of the patches (N, PATCH^2) that cover each pixel, (H, W); 0 where none does."""
+    """Return the mean of the patches, (N, PATCH^2), that cover each pixel, (H, W); 0 where there is none."""
     total, number = patches.new_zeros(shape), patches.new_zeros(shape)
-    for k in range(PATCH**2):  # of one k no two fall on the same pixel
+    for k in range(PATCH**2):  # for one k, all patches touch different pixels
         rows, columns = places[:, 0] + k // PATCH - PATCH // 2, places[:, 1] + k % PATCH - PATCH // 2
         total[rows, columns] += patches[:, k]
         number[rows, columns] += 1
@@ -123,7 +123,7 @@ def _features(low: Tensor, high: Tensor, weight: float) -> Tensor:
 
 
 def _disagreement(first: Tensor, second: Tensor, down: int, across: int) -> Tensor:
-    """Return the squared differences of (E, K, PATCH, PATCH) patches, the second so many rows and columns further."""
+    """Return the squared differences of (E, K, PATCH, PATCH) patches, the second shifted by rows and columns."""
     left, right = max(across, 0), max(-across, 0)
     a = first[:, :, down:, left : PATCH - right].flatten(2)
     b = second[:, :, : PATCH - down, right : PATCH - left].flatten(2)

@@ -6,32 +6,32 @@ bilateral filter then is
 
     S_p = 1 / k_p * sum over low-resolution pixels q of S_q f(|p - q|) r(p, q),
 
-f being a Gaussian of the distance in low-resolution pixels, r = 1 where a way leads from p to q that crosses no edge
-and 0 elsewhere, and k_p the weights' sum. The photo is not looked at.
+with f a Gaussian of the distance in low-resolution pixels, r = 1 if a path from p to q crosses no edge and 0 otherwise,
+and k_p the sum of the weights. The colour image is not used.
 
 What differs from the original, besides the edge map:
 
 - It works on disparity, and each low-resolution pixel stands for a plane, as in
-  :mod:`dsr.methods.classical.photo_guided`: planes come out exactly, where constants would make stairs of every slope.
-- A low-resolution pixel is a mean over its block, not a sample. One that an edge cuts through mixes both sides, so it
-  counts ``mixed`` times what others count: where there is another pixel on the side of p, next to nothing.
-- A way is 4-connected, within the neighbourhood of the low-resolution pixel, and does not tread on edges. There, it is
-  the shortest path with edges made costly, widened by a pixel.
-- Pixels on edges get what is missing to the coarse value in their block's mean, starting from the bicubic map and
-  staying between the sides: so an edge keeps its place to a part of a pixel. Then each sees what its neighbour off the
-  edge sees whose answer is the most like that. There, they see both sides.
-- Where nothing is to be seen, the bicubic map stands rather than the nearest sample.
-- The scale is taken in its prime factors, x8 as x2 three times, each stage with an edge map of its own; the original
-  has one stage and stops at x4. Between neighbouring scales more patches recur. Only in the last stage pixels on edges
-  take sides; in the next after another they count as ``mixed`` and have no slope.
+  :mod:`dsr.methods.classical.photo_guided`: planes are reproduced exactly, where constants would give stairs.
+- A low-resolution pixel is a mean over its block, not a sample. A pixel with an edge through it mixes both sides, so
+  its weight is multiplied by ``mixed``: it counts only if there is no other pixel on the side of p.
+- A path is 4-connected, within the neighbourhood of the low-resolution pixel, and does not touch edges. In the original
+  it is the shortest path with a high cost of edges, one pixel wider.
+- Pixels on edges get the value that makes the mean of their block equal to the low-resolution value, starting from the
+  bicubic map and staying between the two sides: so an edge is placed with subpixel accuracy. Then each takes the
+  reachable pixels of its most similar neighbour off the edge. In the original, they reach both sides.
+- Where no pixel is reachable, the result is the bicubic map, not the nearest sample.
+- The scale is split into prime factors, x8 into three stages of x2, each with an edge map of its own, because more
+  patches recur between neighbouring scales; the original has one stage, up to x4. Pixels on edges take sides only in
+  the last stage; after the other stages they count as ``mixed`` and have no slope.
 
-It has no answer for a map with edges that do not recur at half its size, such as one too small for patches: see
-:class:`dsr.methods.base.NoSolutionError`. A map without an edge needs none. Box means are expected; with
-``downsampling=nearest`` it is half a pixel off.
+There is no solution for a map with edges that do not recur at half its size, such as one too small for patches: see
+:class:`dsr.methods.base.NoSolutionError`. A map without edges needs none. Block means are expected; with
+``downsampling=nearest`` the result is half a pixel off.
 
-Everything that is a depth is computed in float64. Time grows with the pixels, and with edge patches times those known.
-Memory: about 27 float64 maps of the photo's size, at most 2^24 distances of 4 bytes, and what grows with the edge
-pixels; for a statue before a wall at 512 x 512 165 maps in all.
+Depth is computed in float64. Time grows with the number of pixels, and with edge patches times example patches. Memory:
+about 27 float64 maps of the image's size, at most 2^24 distances of 4 bytes, and a part that grows with the edge
+pixels; for a statue before a wall at 512 x 512, 165 maps in total.
 """
 
 from __future__ import annotations
@@ -48,25 +48,25 @@ from dsr.sample import DepthSample
 from dsr.utils.progress import Steps, part_of
 
 _BEYOND = 4.0
-"""How many times farther than the farthest known low-resolution pixel an answer may be, and how many times nearer."""
+"""Factor by which a result may be farther than the farthest valid low-resolution pixel, or nearer than the nearest."""
 
 
 class EdgeGuided:
     """Edge-guided upsampling of the low-resolution disparity.
 
     Args:
-        step: how high a step of disparity is an edge, as a share of the map's range.
-        candidates: pairs of patches that each patch of edges chooses from.
-        sharp_weight: weight of the sharp edges against the distances of the edges, in patches' likeness.
-        smoothness: weight of neighbouring patches' disagreement.
-        iterations: of belief propagation, at most so many in each stage.
-        radius: of the filter's neighbourhood, in low-resolution pixels of the stage.
+        step: minimum step of disparity at an edge, as a fraction of the map's range.
+        candidates: number of candidates for each patch of edges.
+        sharp_weight: weight of the edges relative to that of their distance transform, in the similarity of patches.
+        smoothness: weight of the disagreement of overlapping patches.
+        iterations: maximum number of iterations of belief propagation in each stage.
+        radius: radius of the filter's neighbourhood in low-resolution pixels of the stage.
         sigma_space: standard deviation of the distance's Gaussian, in low-resolution pixels of the stage.
-        mixed: what a low-resolution pixel with an edge through it counts.
-        fill_holes: whether holes of the low-resolution map are filled, from around; otherwise they stay.
+        mixed: weight of a low-resolution pixel with an edge through it, relative to others.
+        fill_holes: whether holes of the low-resolution map are inpainted; otherwise they stay.
 
     Attributes:
-        history: of the last call: iterations (through all stages), the field's energy, the largest change of a message.
+        history: of the last call: iterations (over all stages), energy of the labels, largest change of a message.
 
     Raises:
         ValueError: a value is out of range.
@@ -134,7 +134,7 @@ class EdgeGuided:
         return from_range(disparity[None], sample.camera, "disparity").to(sample.depth_lr)
 
     def _predict_edges(self, disparity_lr: Tensor, scale: int, step: float, report: Steps | None) -> Tensor:
-        """Return the high-resolution edge map of a map (h, w), and add to the history how it was found."""
+        """Return the high-resolution edge map of a map (h, w), and append its labelling to the history."""
         barrier, answer = predict_edge_map(
             disparity_lr, scale, step, self._candidates, self._sharp_weight, self._smoothness, self._iterations, report
         )
