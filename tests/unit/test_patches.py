@@ -17,7 +17,7 @@ from dsr.data.base import SceneSource
 from dsr.degradation.downsampling import Downsampling, Measured, make_sample
 from dsr.degradation.noise import GaussianMultiplicative, Kinect
 from dsr.geometry.camera import Camera
-from dsr.methods.networks.maps import normalised
+from dsr.methods.networks.maps import normalise
 from dsr.sample import Scene
 from dsr.training.data_module import Part, PatchData, WholeScenes
 from dsr.training.degradation import Batch, Degradation, to_tensors
@@ -320,7 +320,7 @@ def test_network_input_depends_on_the_low_resolution_map_alone() -> None:
     assert second["depth"].max() > 1.2 * first["depth"].max()
     assert torch.equal(first["rgb"], second["rgb"])
     torch.testing.assert_close(second["disparity_lr"], first["disparity_lr"], rtol=1e-6, atol=0)
-    for one, other in zip(*(normalised(each["disparity_lr"][None]) for each in (first, second)), strict=True):
+    for one, other in zip(*(normalise(each["disparity_lr"][None]) for each in (first, second)), strict=True):
         torch.testing.assert_close(one, other, rtol=1e-5, atol=1e-6)
 
 
