@@ -4,17 +4,18 @@ Min, Choi, Lu, Ham, Sohn, Do, *Fast Global Image Smoothing Based on Weighted Lea
 
     sum over p of (u_p - f_p)^2 + lambda * sum over neighbours p, q of w_pq (u_p - u_q)^2,  w_pq = exp(-|I_p - I_q| / s)
 
-along one row or column solves a tridiagonal system: off its diagonal -lambda w, on it 1 + lambda times the sum of the
-two. The image's is approximated by solving all rows, then all columns, T times (the paper's T is 3), with
+along one row or column solves a tridiagonal system: -lambda w off the diagonal, and 1 + lambda times the sum of the two
+weights on it. The minimiser over the image is approximated by solving all rows, then all columns, T times (the paper's
+T is 3), with
 
     lambda_t = 3/2 * 4^(T - t) / (4^T - 1) * lambda.
 
-For sparse data the paper smooths the data and an index map of where they are alike, and divides: E(c f) / E(c), with E
-for the smoothing and c = 1 at data, 0 elsewhere. So it is here: f is the low-resolution map at its pixels' centres (the
-four high-resolution pixels around a centre where it lies between them), and c is 0 elsewhere and in holes.
+For sparse data, the paper smooths both the data and their index map, and divides: E(c f) / E(c), with the smoothing E
+and c = 1 at data, 0 elsewhere. The same is done here: f is the low-resolution map at the centres of its pixels (the
+four high-resolution pixels around a centre that lies between them), and c is 0 elsewhere and in holes.
 
 What differs: lambda is in units of the squared low-resolution pixel, so that one value fits all scales. It is far
-smaller than the paper's, which renders as blur; and the paper's way without ``slopes`` renders as a tent at each
+smaller than the paper's, which blurs renderings. Without ``slopes``, as in the paper, renderings show a tent at each
 low-resolution pixel.
 
 Time grows as iterations * H * W; memory peaks at about 25 maps of H * W float64 values (19 without ``slopes``).
@@ -28,19 +29,18 @@ from torch import Tensor
 from dsr.methods.classical.photo_guided import Guided, GuidedMethod, expect_positive
 
 _LEAST = 1e-200
-"""Of smoothed confidence, a sum of positive terms: below it digits get lost, and the nearest LR value stands in."""
+"""Minimum smoothed confidence; below it digits are lost, and the result is the nearest low-resolution value."""
 _HALF = 0.5 + 1e-6
-"""High-resolution pixels from a low-resolution pixel's centre within which a high-resolution pixel is data."""
+"""Maximum distance, in high-resolution pixels, of data from the centre of a low-resolution pixel."""
 
 
 class FastGlobalSmoother(GuidedMethod):
     """The fast global smoother of the low-resolution disparity, as sparse data.
 
     Args:
-        smoothness: lambda, in squared low-resolution pixels; well below 1 the rows between those of the data show as
-            stripes.
-        sigma_colour: the difference of colours, Euclidean in [0, 1], that divides a neighbour's weight by e.
-        iterations: pairs of passes.
+        smoothness: lambda, in squared low-resolution pixels; well below 1 the rows without data show as stripes.
+        sigma_colour: Euclidean colour difference, colours in [0, 1], at which a neighbour's weight is 1 / e.
+        iterations: number of pairs of passes.
         fill_holes, slopes: see :class:`dsr.methods.classical.photo_guided.GuidedMethod`.
 
     Raises:
@@ -80,13 +80,13 @@ class FastGlobalSmoother(GuidedMethod):
 
 
 def smooth(guide: Tensor, maps: Tensor, strength: float, sigma_colour: float, iterations: int = 3) -> Tensor:
-    """Return maps smoothed where the guide is smooth.
+    """Smooth maps where the guide is smooth.
 
     Args:
-        guide: (3, H, W).
-        maps: (N, H, W), smoothed alike.
+        guide: (3, H, W) colours.
+        maps: (N, H, W), smoothed with the same weights.
         strength: lambda, in squared pixels.
-        sigma_colour: the difference of the guide's colours that divides a weight by e.
+        sigma_colour: colour difference of the guide at which a weight is 1 / e.
         iterations: T.
 
     Returns:
@@ -103,9 +103,9 @@ def smooth(guide: Tensor, maps: Tensor, strength: float, sigma_colour: float, it
 
 
 def solve_lines(weights: Tensor, right: Tensor) -> Tensor:
-    """Return the solutions of (1 + A) u = f for all lines at once, A being each line's weighted Laplacian.
+    """Solve (1 + A) u = f for all lines at once, with the weighted Laplacian A of each line.
 
-    Gaussian elimination for tridiagonal systems (Thomas), stable without pivots as the diagonal dominates.
+    Gaussian elimination for tridiagonal systems (Thomas), stable without pivoting because the diagonal dominates.
 
     Args:
         weights: (L - 1, M) lambda w between the neighbours of M lines of L pixels, not negative.
@@ -117,7 +117,7 @@ def solve_lines(weights: Tensor, right: Tensor) -> Tensor:
     """
     length = right.shape[0]
     solution = right.contiguous().clone()
-    upper = torch.zeros_like(right[:, 0]).contiguous()  # what is left of the entries above the diagonal
+    upper = torch.zeros_like(right[:, 0]).contiguous()  # the eliminated entries above the diagonal
     zeros = torch.zeros_like(upper[0])
     for k in range(length):
         before = weights[k - 1] if k else zeros

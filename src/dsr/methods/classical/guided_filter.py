@@ -1,18 +1,17 @@
-"""Guided filter upsampling: in each window, depth is a linear function of the photo's colours.
+"""Guided filter upsampling: in each window, depth is a linear function of the colours.
 
 He, Sun, Tang, *Guided Image Filtering*, TPAMI 2013, with the colour guide of its section on colour images. In every
-window w_k of the fine image, q_i = a_k . I_i + b_k with
+window w_k of the high-resolution image, q_i = a_k . I_i + b_k with
 
     a_k = (S_k + eps U)^-1 (mean(I p) - m_k mean(p)),    b_k = mean(p) - a_k . m_k,
 
-m_k and S_k being mean and 3 x 3 covariance of the photo I in the window, p the input and U the identity; the answer is
-q_i = mean(a_k) . I_i + mean(b_k) over the windows that hold pixel i. For upsampling, p is the bilinear interpolation of
-the low-resolution map, as in the paper's joint upsampling.
+with the mean m_k and the 3 x 3 covariance S_k of the colours I in the window, the input p and the identity U. The
+result is q_i = mean(a_k) . I_i + mean(b_k) over the windows that contain pixel i. For upsampling, p is the bilinear
+interpolation of the low-resolution map, as in the paper's joint upsampling.
 
-What differs: every mean over a window counts pixels by their confidence (see
-:mod:`dsr.methods.classical.photo_guided`), so holes do not spread, and each window counts by its pixels' mean
-confidence; without holes that is the paper's filter. Windows are cut at the border. The radius is in low-resolution
-pixels.
+What differs: means over a window weight pixels by their confidence (see :mod:`dsr.methods.classical.photo_guided`), so
+that holes do not spread, and windows are weighted by the mean confidence of their pixels; without holes this is the
+paper's filter. Windows are truncated at the border. The radius is in low-resolution pixels.
 
 Time grows as H * W * radius * scale; memory peaks at about 50 maps of H * W float64 values, whatever the radius.
 """
@@ -26,9 +25,9 @@ from torch.nn import functional
 from dsr.methods.classical.photo_guided import Guided, GuidedMethod, expect_positive
 
 _PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
-"""The entries of a symmetric 3 x 3 matrix, in the order in which they are kept."""
+"""The entries of a symmetric 3 x 3 matrix, in the order of storage."""
 _ROWS = ([0, 1, 2], [1, 3, 4], [2, 4, 5])
-"""Where the matrix's rows are among these."""
+"""Indices of the matrix's rows among these."""
 _TINY = 1e-30
 
 
@@ -36,8 +35,8 @@ class GuidedFilter(GuidedMethod):
     """The guided filter of the interpolated low-resolution disparity.
 
     Args:
-        radius: of the windows, in low-resolution pixels.
-        epsilon: added to the photo's variances, colours being in [0, 1]: colours that vary less do not count.
+        radius: radius of the windows in low-resolution pixels.
+        epsilon: regularisation added to the variances of colours in [0, 1]; smaller variances have no effect.
         fill_holes, slopes: see :class:`dsr.methods.classical.photo_guided.GuidedMethod`.
 
     Raises:
@@ -60,17 +59,17 @@ class GuidedFilter(GuidedMethod):
 
 
 def guided_filter(guide: Tensor, maps: Tensor, radius: int, epsilon: float, confidence: Tensor | None = None) -> Tensor:
-    """Return maps filtered with a colour guide.
+    """Filter maps with a colour guide.
 
     Args:
         guide: (3, H, W).
         maps: (N, H, W), finite.
-        radius: windows are of 2 * radius + 1 pixels on each side, cut at the border.
-        epsilon: added to the guide's variances.
-        confidence: (H, W) in [0, 1], how much each value counts; None for 1.
+        radius: radius of the windows of (2 * radius + 1)^2 pixels, truncated at the border.
+        epsilon: regularisation added to the variances of the guide.
+        confidence: (H, W) weights in [0, 1]; None for 1.
 
     Returns:
-        (N, H, W); a pixel that no window with a confident value holds keeps its value.
+        (N, H, W); a pixel in no window with a positive confidence keeps its value.
 
     """
     weight = torch.ones_like(guide[0]) if confidence is None else confidence
@@ -83,7 +82,7 @@ def guided_filter(guide: Tensor, maps: Tensor, radius: int, epsilon: float, conf
     for k in (0, 3, 5):
         variances[k] += epsilon
     inverse = _invert(variances)
-    mean_confidence = mean_weight / _box(torch.ones_like(weight), radius)  # the mean confidence of a window's pixels
+    mean_confidence = mean_weight / _box(torch.ones_like(weight), radius)
     total = _box(mean_confidence, radius)
 
     def filter_one(values: Tensor) -> Tensor:
@@ -98,7 +97,7 @@ def guided_filter(guide: Tensor, maps: Tensor, radius: int, epsilon: float, conf
 
 
 def _box(x: Tensor, radius: int) -> Tensor:
-    """Return the means over windows of (..., H, W), what lies beyond the border being 0; where all are 0, exactly 0."""
+    """Return the means over windows of (..., H, W), with 0 beyond the border; exactly 0 where all values are 0."""
     maps, side = x.reshape(-1, 1, *x.shape[-2:]), 2 * radius + 1
     maps = functional.avg_pool2d(functional.pad(maps, (0, 0, radius, radius)), (side, 1), stride=1)
     maps = functional.avg_pool2d(functional.pad(maps, (radius, radius)), (1, side), stride=1)

@@ -1,17 +1,16 @@
-"""Joint bilateral upsampling: means of low-resolution values, weighed by distance and by likeness in the photo.
+"""Joint bilateral upsampling: means of low-resolution values, weighted by distance and by similarity of colours.
 
 Kopf, Cohen, Lischinski, Uyttendaele, *Joint Bilateral Upsampling*, SIGGRAPH 2007. The high-resolution value at pixel p
 is
 
     S_p = 1 / k_p * sum over low-resolution pixels q of S_q f(|p - q|) g(|I_p - I_q|),
 
-f and g being Gaussians, of the distance in low-resolution pixels and of the difference of colours, and k_p the weights'
-sum; q runs over the (2 * radius + 1)^2 low-resolution pixels around p.
+with Gaussians f of the distance in low-resolution pixels and g of the colour difference, and the sum k_p of the
+weights; q runs over the (2 * radius + 1)^2 low-resolution pixels around p.
 
-What differs: I_q is the mean of the photo over the low-resolution pixel, which is what a low-resolution depth stands
-for, where the paper takes a single pixel of the photo. Low-resolution pixels that are holes do not count. The largest
-weight of each pixel is scaled to 1, so that a colour unlike all those around gets its most similar neighbours, and no 0
-/ 0.
+What differs: I_q is the mean colour over the low-resolution pixel, as low-resolution depth is a mean; the paper takes a
+single pixel of the image. Low-resolution pixels that are holes have no weight. The weights of each pixel are scaled so
+that the largest is 1: a pixel unlike all around it takes the value of its most similar neighbours, without 0 / 0.
 
 Time grows as H * W * (2 * radius + 1)^2; memory peaks at about 20 maps of H * W float64 values, whatever the radius.
 """
@@ -30,11 +29,11 @@ class JointBilateral(GuidedMethod):
     """Joint bilateral upsampling of the low-resolution disparity.
 
     Args:
-        radius: of the neighbourhood, in low-resolution pixels.
+        radius: radius of the neighbourhood in low-resolution pixels.
         sigma_space: standard deviation of the distance's Gaussian, in low-resolution pixels.
-        sigma_colour: standard deviation of the Gaussian of the colours' Euclidean distance, colours being in [0, 1].
+        sigma_colour: standard deviation of the Gaussian of the Euclidean colour difference, colours in [0, 1].
         fill_holes, slopes: see :class:`dsr.methods.classical.photo_guided.GuidedMethod`; a hole is filled by this
-            filter within the radius, and from around farther inside.
+            filter within the radius, and inpainted beyond it.
 
     Raises:
         ValueError: a value is not positive.
@@ -76,9 +75,9 @@ class JointBilateral(GuidedMethod):
         return torch.where(found, totals / torch.where(found, weights, 1), around)
 
     def _iterate_neighbours(self, guided: Guided, rgb_lr: Tensor) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
-        """Yield, neighbour by neighbour, its weights' exponents (H, W), its rows (H,) and its columns (W,).
+        """Yield the exponents of the weights, (H, W), the rows, (H,), and the columns, (W,), of each neighbour.
 
-        Where the neighbour is a hole or lies outside, the exponent is minus infinity.
+        The exponent is minus infinity where the neighbour is a hole or lies outside.
         """
         height, width = guided.valid.shape
         i, j = guided.nearest()
@@ -96,7 +95,7 @@ class JointBilateral(GuidedMethod):
 
 
 def _block_means(guided: Guided) -> Tensor:
-    """Return the photo's mean over the HR pixels that are nearest to each LR one, (3, h, w)."""
+    """Return the mean colour over the high-resolution pixels nearest to each low-resolution one, (3, h, w)."""
     matrices = []
     for nearest, size in zip(guided.nearest(), guided.valid.shape, strict=True):
         belongs = (nearest == torch.arange(size, device=nearest.device)[:, None]).double()

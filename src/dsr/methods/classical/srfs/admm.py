@@ -1,18 +1,18 @@
-"""Depth, albedo and lighting that explain a photo and a LR depth map: the energy and the steps that lower it.
+"""Depth, albedo and lighting that explain an image and low-resolution depth: the energy and its minimisation.
 
 Haefner et al., CVPR 2018 (see :mod:`dsr.methods.classical.srfs.upsampler`) minimise
 
-    E = 1/2 sum |albedo * shading(z, grad z) - photo|^2 + data / 2 * sum |mean z - coarse|^2
+    E = 1/2 sum |albedo * shading(z, grad z) - rgb|^2 + data / 2 * sum |mean z - lr|^2
         + area * sum z |m| + boundary * (length of the albedo's boundaries),
 
-z in pixels here (times the focal length, by the typical depth), so slopes are numbers without a unit. With a copy
-theta of (grad z, z) for the terms that are not linear, and u for what the copy has missed so far, the augmented
-Lagrangian is E with theta in the place of (grad z, z) but in the data term, plus
+with z in pixels here (multiplied by the focal length, divided by the typical depth), so that slopes have no unit. With
+a copy theta of (grad z, z) for the nonlinear terms, and the scaled multiplier u, the augmented Lagrangian is E with
+theta in place of (grad z, z) except in the data term, plus
 
     penalty / 2 * (|(grad z, z) + u - theta|^2 - |u|^2).
 
-Each ``update_`` lowers it, or leaves it, in its own variable: the albedo by region fusion, the lighting by least
-squares, theta pixel by pixel by Levenberg and Marquardt's method, z by conjugate gradients.
+Each ``update_`` method does not increase it, and changes one variable: the albedo by region fusion, the lighting by
+least squares, theta pixel by pixel by Levenberg and Marquardt's method, z by conjugate gradients.
 """
 
 from __future__ import annotations
@@ -36,13 +36,13 @@ from dsr.methods.classical.srfs.shading import (
 
 _CG_ITERATIONS, _CG_TOLERANCE = 60, 1e-6
 _INNER = 3
-"""Steps of Levenberg and Marquardt's method in an update of theta."""
+"""Levenberg-Marquardt steps in an update of theta."""
 _LESS, _MORE = 0.2, 5.0
-"""What its damping is multiplied with after a step that lowers the energy, and after one that would not."""
+"""Factors of its damping after a step that lowers the energy, and after one that does not."""
 
 
 class Weights(NamedTuple):
-    """The weights of E's terms: of the low-resolution map, of the area and of the albedo's boundaries."""
+    """Weights of the terms of E: low-resolution map, area, and boundaries of the albedo."""
 
     data: float
     area: float
@@ -50,7 +50,7 @@ class Weights(NamedTuple):
 
 
 class ShadingProblem(NamedTuple):
-    """What does not change.
+    """The constants of the problem.
 
     ``rgb`` (B, C, H, W); ``lr`` (B, 1, h, w) in the unit of z, NaN in holes; ``rays`` (1, 3, H, W) and
     ``focal`` (fx, fy) of the photo's camera, ``unit`` by which z is more than depth of about 1; ``inside``
@@ -71,10 +71,10 @@ class ShadingProblem(NamedTuple):
 
 
 class Slopes:
-    """(fx dz/du, fy dz/dv, z) / unit of maps, as a linear operator, and its adjoint.
+    """The linear operator z -> (fx dz/du, fy dz/dv, z) / unit, and its adjoint.
 
-    Forward differences between pixels that are inside; where there is no next one, backward; where neither, 0. Without
-    a mask, the differences that :func:`dsr.geometry.surface.depth_to_normals` takes.
+    Differences are forward between pixels inside the mask, backward where there is no next pixel, and 0 where there is
+    neither. Without a mask, these are the differences that :func:`dsr.geometry.surface.depth_to_normals` takes.
     """
 
     def __init__(self, problem: ShadingProblem) -> None:
@@ -116,10 +116,10 @@ class ShadingSolver:
     """The variables of a problem, and their updates.
 
     Args:
-        problem: what is given.
-        weights: of E's terms.
-        first: (B, 1, H, W), the first z; outside it stays.
-        penalty: the first one.
+        problem: the constants.
+        weights: weights of the terms of E.
+        first: (B, 1, H, W) initial z, which stays unchanged outside the mask.
+        penalty: initial penalty.
 
     Attributes:
         z, theta, missed, albedo, lighting, regions: the variables; ``missed`` is u.
@@ -142,9 +142,9 @@ class ShadingSolver:
         self._damping = torch.full_like(first, 1e-3)
 
     def update_albedo(self, *, anew: bool = True) -> None:
-        """Take the best albedo that is constant in regions: in new ones, if they are better than the old.
+        """Set the best piecewise constant albedo, in new regions if these are better than the old ones.
 
-        The first call replaces the photo, which stands for the albedo before it.
+        Before the first call, the albedo is the image itself.
         """
         rgb, inside = self.problem.rgb, self.problem.inside
         shading = compute_shading(compute_surface(self.theta, self.problem.rays).normals, self.lighting)
@@ -158,7 +158,7 @@ class ShadingSolver:
         self.albedo, self.regions = tried[energies.index(min(energies))]
 
     def update_lighting(self) -> None:
-        """Take the best lighting."""
+        """Set the best lighting."""
         normals = compute_surface(self.theta, self.problem.rays).normals
         lighting = fit_lighting(self.problem.rgb, self.albedo, normals, self._weight)
         self.lighting = lighting.to(self.problem.rgb)
@@ -177,7 +177,7 @@ class ShadingSolver:
         self.theta, self._damping = theta, damping
 
     def update_depth(self) -> None:
-        """Lower the Lagrangian, quadratic in z, by conjugate gradients, from z as it is."""
+        """Lower the Lagrangian, which is quadratic in z, by conjugate gradients from the current z."""
         weight = self._weight
         wanted = self.theta - self.missed
         rest = self._lr - self._block_means(self.z)
@@ -191,12 +191,12 @@ class ShadingSolver:
         self.z = self.z + found.values
 
     def update_missed(self, growth: float) -> None:
-        """Add to u what theta misses of (grad z, z), and multiply the penalty."""
+        """Add (grad z, z) - theta to the multiplier, and multiply the penalty."""
         self.missed = (self.missed + self.slopes(self.z) - self.theta) / growth
         self.penalty *= growth
 
     def normal_operator(self, z: Tensor) -> Tensor:
-        """Return the Lagrangian's second derivative in z, times z; 0 outside."""
+        """Return the second derivative of the Lagrangian in z, times z; 0 outside the mask."""
         inside = self._weight * z
         own = self.penalty * self.slopes.adjoint(self._coupling * self.slopes(inside))
         return self._weight * (own + self.weights.data * self._block_means_adjoint(self._block_means(inside)))
@@ -208,7 +208,7 @@ class ShadingSolver:
         return sum(self.terms(self.theta).values()) + bound
 
     def terms(self, theta: Tensor | None = None) -> dict[str, float]:
-        """Return E's ``shading``, ``data``, ``area`` and ``boundaries``; without theta, of z alone."""
+        """Return the terms ``shading``, ``data``, ``area`` and ``boundaries`` of E; None for (grad z, z)."""
         theta = self.slopes(self.z) if theta is None else theta
         surface = compute_surface(theta, self.problem.rays)
         return {
@@ -232,7 +232,7 @@ class ShadingSolver:
         return self.weights.boundary * boundary_length(regions, self.problem.inside)
 
     def _pixel_energy(self, theta: Tensor, target: Tensor) -> Tensor:
-        """Return what a theta costs in each pixel, (B, 1, H, W)."""
+        """Return the Lagrangian of theta in each pixel, (B, 1, H, W)."""
         surface = compute_surface(theta, self.problem.rays)
         missed = self.albedo * compute_shading(surface.normals, self.lighting) - self.problem.rgb
         own = 0.5 * missed.square().sum(dim=1, keepdim=True) + self.weights.area * compute_area(theta, surface)
@@ -270,7 +270,7 @@ class ShadingSolver:
 
 
 def _solve(gradient: Tensor, hessian: Tensor, damping: Tensor) -> Tensor:
-    """Return the inverse of the Hessian, its diagonal raised by ``damping`` of it, times the gradient."""
+    """Return the inverse of the damped Hessian, its diagonal multiplied by 1 + damping, times the gradient."""
     a, b, c, d, e, f = hessian.unbind(dim=1)
     more = 1 + damping[:, 0]
     a, d, f = (torch.where(each > 0, each * more, 1) for each in (a, d, f))

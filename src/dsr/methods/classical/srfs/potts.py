@@ -1,20 +1,20 @@
 """Piecewise constant albedo: the Potts problem, by region fusion.
 
-Of all albedos that are constant in regions, the one with the least
+Of all piecewise constant albedos, it finds one with a low
 
-    E = 1/2 sum (photo - albedo * shading)^2 + weight * (length of the regions' boundaries)
+    E = 1/2 sum (rgb - albedo * shading)^2 + weight * (length of the regions' boundaries)
 
-where the length counts the pairs of neighbours, left and right or above and below, that belong to different regions:
-the Potts prior on the albedo of Haefner et al. (CVPR 2018), who minimise it with the primal-dual iteration of
-Strekalovskiy and Cremers (*Real-Time Minimization of the Piecewise Smooth Mumford-Shah Functional*, ECCV 2014) and
-count pixels whose gradient is not 0. Here regions are fused, as by Nguyen and Brown (*Fast and Effective L0 Gradient
-Minimization by Region Fusion*, ICCV 2015): it starts with a region a pixel; two neighbours become one where that costs
-less than the boundary between them, the weight of which grows from little to its value. Many are fused at once, in
-groups that do not touch each other and only where that lowers E as weighed at the time. Albedos are constant to the
-last digit, boundaries exact, and no fusion of two of the regions that result lowers E.
+where the length is the number of pairs of neighbours, horizontal or vertical, in different regions: the Potts prior on
+the albedo of Haefner et al. (CVPR 2018), who minimise it with the primal-dual iteration of Strekalovskiy and Cremers
+(*Real-Time Minimization of the Piecewise Smooth Mumford-Shah Functional*, ECCV 2014) and count pixels whose gradient is
+not 0. Here regions are fused, as in Nguyen and Brown (*Fast and Effective L0 Gradient Minimization by Region Fusion*,
+ICCV 2015): it starts with one region per pixel, and fuses two neighbours if this costs less than the boundary between
+them, whose weight grows to its value in a few levels. Many are fused at once, in disjoint groups, and only if this
+lowers E at the current weight. Albedos are exactly constant, boundaries exact, and no fusion of two of the resulting
+regions lowers E.
 
-A region's best albedo is sum (shading * photo) / sum shading^2 in each channel, cut to 0 .. BRIGHTEST: a shading near 0
-asks for any albedo. Memory: about 60 maps of 8 bytes.
+The best albedo of a region is sum (shading * rgb) / sum shading^2 in each channel, clamped to 0 .. BRIGHTEST, because a
+shading near 0 does not determine it. Memory: about 60 maps of 8 bytes.
 """
 
 from __future__ import annotations
@@ -25,42 +25,42 @@ import torch
 from torch import Tensor
 
 BRIGHTEST = 2.0
-"""The most that an albedo may be; the least is 0."""
+"""Maximum albedo; the minimum is 0."""
 _LEVELS = 5
-"""How often the weight of a boundary grows to its value."""
+"""Number of times that the weight of boundaries grows to reach its value."""
 _GROWTH = 4.0
-"""By what it grows each time."""
+"""Factor of its growth."""
 _SHUFFLE = 2654435761
 """Multiplier of Knuth's hash."""
 _RANGE = 2**32
 
 
 class Regions(NamedTuple):
-    """A partition: ``labels`` (B, H, W) int64 from 0 on, none in two images; ``number`` of them."""
+    """A partition: ``labels`` (B, H, W) int64, from 0 to ``number`` - 1, different in each image."""
 
     labels: Tensor
     number: int
 
 
 class _Fits(NamedTuple):
-    """Of each region, (count, C): the sums of squared shading and of shading times photo."""
+    """Sums of squared shading and of shading times image over each region, (count, C)."""
 
     squares: Tensor
     products: Tensor
 
     def albedo(self) -> Tensor:
-        """Return the best albedo within its bounds; 0 where there is no shading."""
+        """Return the best albedo within its limits; 0 where there is no shading."""
         best = self.products / torch.where(self.squares > 0, self.squares, 1)
         return torch.where(self.squares > 0, best, 0).clamp(0, BRIGHTEST)
 
     def worth(self) -> Tensor:
-        """Return by how much the best albedo lowers the data term below that of albedo 0, (count,)."""
+        """Return the decrease of the data term from albedo 0 to the best albedo, (count,)."""
         albedo = self.albedo()
         return ((self.products - 0.5 * self.squares * albedo) * albedo).sum(dim=1)
 
 
 class _Borders(NamedTuple):
-    """Of each pair of neighbouring regions, (N,): the one, the other, and the length between them."""
+    """Pairs of neighbouring regions, (N,) each: both labels, and the length of the boundary between them."""
 
     one: Tensor
     other: Tensor
@@ -73,11 +73,11 @@ def fuse(rgb: Tensor, shading: Tensor, weight: float, inside: Tensor | None = No
     Args:
         rgb: (B, C, H, W) float64.
         shading: likewise.
-        weight: of a unit of boundary.
-        inside: (B, 1, H, W) bool, the pixels that belong to the problem, None for all; others stay alone.
+        weight: weight of a unit of boundary length.
+        inside: (B, 1, H, W) bool mask of the problem, None for all pixels; each pixel outside is a region of its own.
 
     Returns:
-        the regions, the same for the same input.
+        The regions; equal for equal input.
 
     """
     batch, channels, height, width = rgb.shape
@@ -100,7 +100,7 @@ def fuse(rgb: Tensor, shading: Tensor, weight: float, inside: Tensor | None = No
 
 
 def fit_albedo(rgb: Tensor, shading: Tensor, regions: Regions) -> Tensor:
-    """Return the best albedo that is constant in regions, (B, C, H, W)."""
+    """Return the best albedo that is constant in each region, (B, C, H, W)."""
     channels = rgb.shape[1]
     flat = regions.labels.reshape(-1)
     sums = [
@@ -111,7 +111,7 @@ def fit_albedo(rgb: Tensor, shading: Tensor, regions: Regions) -> Tensor:
 
 
 def boundary_length(regions: Regions, inside: Tensor | None = None) -> int:
-    """Return how many pairs of neighbours belong to different regions; both ``inside``."""
+    """Return the number of pairs of neighbours in different regions, both inside the mask."""
     borders = _borders(regions.labels, inside)
     return int((borders.one != borders.other).sum())
 
@@ -130,11 +130,11 @@ def _borders(labels: Tensor, inside: Tensor | None) -> _Borders:
 
 
 def _choose_fusions(fits: _Fits, borders: _Borders, price: float, turn: int) -> Tensor | None:
-    """Return what each region becomes part of, (count,), None where no fusion of two lowers E.
+    """Return the region that each region is fused into, (count,), or None if no fusion of two lowers E.
 
-    Each region's best neighbour is the one with the least cost of fusing for a unit of the boundary that this saves.
-    A hash says which regions may take others in, and which may join their best neighbour, if that takes in. Where that
-    costs more than the boundaries between them, the region takes in its best one alone.
+    The best neighbour of a region has the lowest cost of fusing per unit of boundary saved. A hash splits regions into
+    centres and those that may join their best neighbour, if it is a centre. If all fusions of a centre together cost
+    more than the boundaries between them, it only takes its best neighbour.
     """
     worth = fits.worth()
     one, other, length = borders
@@ -160,7 +160,7 @@ def _choose_fusions(fits: _Fits, borders: _Borders, price: float, turn: int) -> 
 
 
 def _is_cheapest(owner: Tensor, cost: Tensor, count: int) -> Tensor:
-    """Return which entry is the cheapest of its owner, one each; ties are broken by a hash."""
+    """Return the mask of the cheapest entry of each owner; ties are broken by a hash."""
     least = cost.new_full((count,), torch.inf).scatter_reduce_(0, owner, cost, "amin")
     number = _hash(torch.arange(len(owner), device=owner.device))
     number = torch.where(cost == least[owner], number, _RANGE)
@@ -172,7 +172,7 @@ def _select(which: Tensor, *values: Tensor) -> tuple[Tensor, ...]:
 
 
 def _hash(number: Tensor) -> Tensor:
-    """Return whole numbers below 2^32 that look random; none twice for numbers below it."""
+    """Return pseudo-random integers below 2^32; the map is one-to-one below 2^32."""
     for _ in range(2):
         number = (number * _SHUFFLE) % _RANGE
         number = number ^ (number >> 15)
@@ -180,7 +180,7 @@ def _hash(number: Tensor) -> Tensor:
 
 
 def _merge_borders(borders: _Borders, renamed: Tensor, count: int) -> _Borders:
-    """Return the borders between regions that have new names, each once."""
+    """Return the borders after regions were renamed, each pair once."""
     one, other = renamed[borders.one], renamed[borders.other]
     apart = one != other
     low, high = torch.minimum(one, other)[apart], torch.maximum(one, other)[apart]
