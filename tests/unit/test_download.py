@@ -19,7 +19,7 @@ import pytest
 from dsr.data.download import transfer as download
 from dsr.data.download import unpack
 from dsr.data.download.catalogue import Collection, Item
-from dsr.data.download.checksums import Checksums, alone
+from dsr.data.download.checksums import Checksums, lock_directory
 from dsr.data.download.get import Options, get
 from dsr.data.download.inventory import state, verify
 
@@ -763,6 +763,6 @@ def test_damaged_records_are_one_line(server, tmp_path, text):
 
 
 def test_second_command_waits_for_the_lock(server, tmp_path):
-    with alone(tmp_path), pytest.raises(ValueError, match="another `dsr data` command"):
+    with lock_directory(tmp_path), pytest.raises(ValueError, match="another `dsr data` command"):
         fetched(picture(server), tmp_path)
     assert fetched(picture(server), tmp_path) == []

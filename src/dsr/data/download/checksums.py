@@ -5,17 +5,15 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import json
+import os
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from dsr.utils.files import write_text
+from filelock import FileLock, Timeout
 
-try:
-    import fcntl
-except ImportError:  # there is none on Windows
-    fcntl = None  # type: ignore[assignment]
+from dsr.utils.files import write_text
 
 Moved = Callable[[int, int | None], None]
 """Takes how many bytes are done, and of how many, None where that is not known."""
@@ -104,20 +102,18 @@ def sha256_of(path: Path, moved: Moved | None = None) -> str:
 
 
 @contextlib.contextmanager
-def alone(root: Path) -> Iterator[None]:
-    """Keep other commands from writing into the directory of the data sets meanwhile.
+def lock_directory(root: Path) -> Iterator[None]:
+    """Lock the directory of the data sets, if it exists and can be written, against other ``dsr data`` commands.
 
     Raises:
-        ValueError: another one is at it.
+        ValueError: another command has locked it.
 
     """
-    with contextlib.ExitStack() as stack:
-        try:
-            file = stack.enter_context((root / ".dsr-data.lock").open("w"))
-            if fcntl is not None:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            raise ValueError(f"{root}: another `dsr data` command is writing there; wait for it to end") from error
-        except OSError:  # there is no such directory, it is read-only, or its file system has no locks
-            pass
+    if not os.access(root, os.W_OK):
         yield
+        return
+    try:
+        with FileLock(root / ".dsr-data.lock", blocking=False):
+            yield
+    except Timeout as error:
+        raise ValueError(f"{root}: another `dsr data` command is writing there; wait for it to end") from error

@@ -11,10 +11,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from urllib.parse import urlsplit
 
-import pooch  # type: ignore[import-untyped]
-
 from dsr.data.download.catalogue import Item
-from dsr.data.download.checksums import Checksums, Entry, alone, sha256_of
+from dsr.data.download.checksums import Checksums, Entry, lock_directory, sha256_of
 from dsr.data.download.inventory import Watcher, compare, expect_kind, lack, record
 from dsr.data.download.transfer import FetchError, NoSpaceError, UnreachableError, download, megabytes
 from dsr.data.download.unpack import take_member, unpack
@@ -60,7 +58,7 @@ def get(items: Iterable[Item], root: Path, watcher: Watcher, options: Options | 
     """
     problems: list[str] = []
     root.mkdir(parents=True, exist_ok=True)
-    with alone(root):
+    with lock_directory(root):
         job = _Job(root, Checksums(root), watcher, options or Options())
         for item in {item.path: item for item in items}.values():
             try:
@@ -140,14 +138,11 @@ class _Job:
         name = f"{target.name}.zip" if member else target.name
         part = target.with_name(f"{name}.part")
         room = 0.0 if item.unpack_to is None else _UNPACKED
-        with self.watcher.transfer(item.path) as moved:
-
-            def downloader(address: str, output: str, _: object) -> None:
+        new = target.with_name(f"{name}.new")
+        if not new.is_file():
+            with self.watcher.transfer(item.path) as moved:
                 download(address, part, moved, room=room, pauses=pauses)
-                part.replace(output)
-
-            pooch.get_logger().setLevel("WARNING")
-            new = Path(pooch.retrieve(address, None, f"{name}.new", target.parent, downloader=downloader))
+            part.replace(new)
         try:
             if member:
                 new = _member_of(new, member)

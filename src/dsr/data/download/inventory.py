@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Protocol
 
 from dsr.data.download.catalogue import Collection, Item
-from dsr.data.download.checksums import Checksums, Entry, Moved, alone, sha256_of
+from dsr.data.download.checksums import Checksums, Entry, Moved, lock_directory, sha256_of
 from dsr.data.download.transfer import is_page
 
 _BEGINNINGS: Mapping[str, tuple[bytes, ...]] = {
@@ -77,7 +77,7 @@ def verify(collection: Collection, root: Path, watcher: Watcher, *, accept_chang
 
     """
     new: dict[str, Entry] = {}
-    with alone(root):
+    with lock_directory(root):
         checksums = Checksums(root)
         old: Mapping[str, Entry] = {} if accept_changed else checksums
         found: list[str | None]
