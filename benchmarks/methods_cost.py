@@ -17,15 +17,11 @@ import time
 from pathlib import Path
 
 import torch
-from hydra import compose, initialize_config_dir
 
-from dsr.app.schema import plain_config, register
 from dsr.data.folder import Folder
 from dsr.degradation.downsampling import Downsampling, make_sample
-from dsr.methods.networks.trained import packaged_weights
-from dsr.utils.builder import build
+from dsr.methods.registry import build_method, read_method
 
-CONF = Path(__file__).resolve().parents[1] / "conf"
 METHODS = (
     "bicubic,guided_filter,joint_bilateral,fast_global_smoother,anisotropic_diffusion,tgv,srfs,eg,pdn,dg,msg_v,facets"
 )
@@ -38,12 +34,8 @@ def peak() -> float:
 
 def measured(scenes: Path, scene: str, name: str, scale: int, device: str) -> dict[str, float]:
     """Return the seconds and the megabytes of one call."""
-    register()
-    with initialize_config_dir(str(CONF), version_base=None):
-        plain = plain_config(compose("eval", [f"method={name}", f"scale={scale}"]))
-    weights = packaged_weights(str(plain["method"].get("weights_packaged")))
-    given = {"scale": scale, "weights": weights, "precision": "float32", "device": torch.device(device), "seed": 0}
-    method = build("method", plain["method"], {**given, "downsampling": Downsampling("box")})
+    given = {"precision": "float32", "device": torch.device(device), "downsampling": Downsampling("box")}
+    method = build_method(read_method(name, scale), scale, **given)
     sample = make_sample(Folder(str(scenes), [scene]).load(scene), scale, Downsampling("box"), method.range_type)
     before, start = peak(), time.perf_counter()
     method(sample)

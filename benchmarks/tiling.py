@@ -20,9 +20,8 @@ from torch import Tensor
 from dsr.data.folder import Folder
 from dsr.geometry.camera import Camera
 from dsr.inference import upsample_depth
-from dsr.inference.planning import NETWORKS
 from dsr.methods.networks import base as network
-from dsr.methods.networks.trained import build_trained, packaged_weights
+from dsr.methods.registry import build_method, list_methods, read_method
 
 
 def mirrored(values: Tensor, height: int, width: int) -> Tensor:
@@ -46,7 +45,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--shared", type=Path, required=True, help="the folder that holds scenes/")
     parser.add_argument("--scene", default="plant")
-    parser.add_argument("--method", default="facets", choices=list(NETWORKS))
+    parser.add_argument("--method", default="facets", choices=list_methods())
     parser.add_argument("--scale", type=int, default=4)
     parser.add_argument("--width", type=int, default=4000)
     parser.add_argument("--height", type=int, default=3000)
@@ -71,7 +70,7 @@ def main() -> None:
 
 def seams(rgb: Tensor, inverse: Tensor, method: str, scale: int) -> None:
     """Print how much answers with tiles of two sizes differ."""
-    net = build_trained(packaged_weights(NETWORKS[method].format(scale)), scale, method, ensemble=1)
+    net = build_method(read_method(method, scale, {"ensemble": 1}), scale, device="cpu", precision="float32")
     with torch.inference_mode():
         usual = net.fine_disparity(rgb[None], inverse[None])
         net.tile = network.TILE * 5 // 8

@@ -14,12 +14,13 @@ from torch import Tensor
 
 import dsr
 from dsr.geometry.camera import Camera
-from dsr.inference import METHODS, plan, upsample_depth
 from dsr.inference import api as people
-from dsr.inference.engine import enlarged_by
+from dsr.inference import plan, upsample_depth
+from dsr.inference.engine import _nearest, enlarged_by
 from dsr.inference.inspection import suited_method
 from dsr.inference.planning import OWN_SIZE
-from dsr.inference.resampling import resized_inverse
+from dsr.inference.resampling import resize_inverse_depth
+from dsr.methods.registry import list_methods
 
 
 def _camera(height: int, width: int) -> Camera:
@@ -103,7 +104,7 @@ def test_nearest_repeats_pixels_and_a_step_stays_sharp_when_the_result_is_reduce
     coarse[..., 4:] = 2.0
     fine = upsample_depth(_photo(12, 15), coarse, camera, method="nearest")
     torch.testing.assert_close(fine[0], torch.tensor([1.0] * 6 + [2.0] * 9).expand(12, 15))
-    step = resized_inverse(torch.cat((torch.ones(1, 30, 13), torch.full((1, 30, 17), 0.5)), -1), (20, 20))
+    step = resize_inverse_depth(torch.cat((torch.ones(1, 30, 13), torch.full((1, 30, 17), 0.5)), -1), (20, 20))
     assert set(step.unique().tolist()) == {0.5, 1.0}
 
 
@@ -113,7 +114,7 @@ def test_resizing_keeps_planes_to_rounding_up_to_the_border(size: tuple[int, int
         y, x = ((torch.arange(n, dtype=torch.float64) + 0.5) / n for n in (height, width))
         return (0.3 + 0.5 * x + y[:, None])[None]
 
-    torch.testing.assert_close(resized_inverse(plane(97, 80), size), plane(*size), rtol=0, atol=1e-12)
+    torch.testing.assert_close(resize_inverse_depth(plane(97, 80), size), plane(*size), rtol=0, atol=1e-12)
 
 
 def test_plan_describes_the_steps() -> None:
@@ -136,7 +137,7 @@ def test_plan_describes_the_steps() -> None:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (((48, 64), (12, 16), 4, "fcets"), "method: expected one of facets, msg_v, .*, got 'fcets'"),
+        (((48, 64), (12, 16), 4, "fcets"), "method: expected one of anisotropic_diffusion, .*, tgv, got 'fcets'"),
         (((48, 64), (12, 16), 2, "facets"), "scale: expected one of 4, 8, 16, 32 for facets, got 2"),
         (((48, 64), (12, 16), 8, "msg_v_noisy"), "scale: expected one of 4, 16 for msg_v_noisy, got 8"),
         (((48, 64), (12, 16), 0, "bicubic"), "scale: expected a positive whole number, got 0"),
@@ -177,7 +178,7 @@ def test_invalid_picture_is_refused() -> None:
         upsample_depth(_photo(48, 64), depth * torch.nan, camera)
     with pytest.raises(ValueError, match="depth: expected floating point of shape"):
         upsample_depth(_photo(48, 64), depth.int(), camera)
-    with pytest.raises(ValueError, match="device: expected auto, cpu, cuda or cuda:N of this machine, got 'gpu'"):
+    with pytest.raises(ValueError, match="device: expected auto, cpu or a device of this machine, got 'gpu'"):
         upsample_depth(_photo(48, 64), depth, camera, device="gpu")
     with pytest.raises(ValueError, match="two NumPy arrays or two tensors, got Tensor and ndarray"):
         dsr.upsample(_photo(48, 64), np.ones((12, 16)), camera)  # type: ignore[type-var]
@@ -217,21 +218,49 @@ def test_progress_covers_all_steps() -> None:
     assert parts == [(i + 1, 8) for i in range(8)]  # x8, then x4, each an ensemble of four
 
 
-def test_methods_without_optimisation_give_results() -> None:
-    camera = _camera(32, 32)
-    for method in METHODS:
-        if not method.startswith("dip"):
-            fine = upsample_depth(_photo(32, 32), _plane(8, 8, camera), camera, method=method)
-            assert fine.shape == (1, 32, 32), method
-            assert float((fine / _plane(32, 32, camera) - 1).abs().max()) < 0.1, method
-
-
-def test_dip_gives_results_at_any_size(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("dsr.inference.engine._PRIOR_SETTINGS", {"dip": {"steps": 2, "widths": (4,), "skips": (2,)}})
+@pytest.mark.parametrize("method", list_methods())
+def test_every_method_upsamples_any_size_and_its_holes(method: str) -> None:
     camera = _camera(31, 42)
-    fine = upsample_depth(_photo(31, 42), _plane(15, 21, camera), camera, method="dip")
-    assert fine.shape == (1, 31, 42)
-    assert bool(fine.isfinite().all())
+    depth = _plane(15, 21, camera)
+    depth[:, 4:6, 5:8] = torch.nan
+    quick = {"steps": 2} if method.startswith("dip") else {}
+    steps: list[tuple[int, int]] = []
+    full, kept = (
+        upsample_depth(
+            _photo(31, 42), depth, camera, method=method, settings=quick, keep_holes=keep,
+            progress=lambda *step: steps.append(step),
+        )
+        for keep in (False, True)
+    )  # fmt: skip
+    assert full.shape == (1, 31, 42)
+    assert bool(full.isfinite().all())
+    assert int(kept.isnan().sum()) == int(_nearest(depth.isnan(), (31, 42)).sum())
+    assert all(done == total for done, total in steps[-1:])
+    if not quick:
+        assert float((full / _plane(31, 42, camera) - 1).abs().max()) < 0.1
+
+
+def test_settings_change_the_result_and_are_checked() -> None:
+    camera, depth = _camera(32, 32), _plane(8, 8, _camera(32, 32))
+    depth[:, 2:5, 2:5] *= 0.8
+    exact, loose = (
+        dsr.upsample(_photo(32, 32), depth, camera, method="tgv", **settings) for settings in ({}, {"data_weight": 0.1})
+    )
+    assert float((exact - loose).abs().max()) > 1e-3
+    for settings, message in (
+        ({"data_wieght": 3}, "data_wieght: unknown key; method=tgv takes iterations, .*data_weight"),
+        ({"data_weight": "x"}, "data_weight: expected a number or null, got 'x'"),
+        ({"data_weight": -3}, "data_weight: expected more than 0, got -3"),
+        ({"fill_holes": False}, "fill_holes: unknown key"),
+    ):
+        with pytest.raises(ValueError, match=f"^{message}"):
+            dsr.upsample(_photo(32, 32), depth, camera, method="tgv", **settings)  # type: ignore[arg-type]
+
+
+def test_plan_states_the_time_of_slow_methods() -> None:
+    text = plan((1000, 1000), (250, 250), None, "tgv").text
+    assert text.endswith("by tgv x4, in about 1.1 GB of memory and about 60 s on two CPU cores")
+    assert plan((1000, 1000), (500, 500), None, "tgv").steps == (2,)
 
 
 def test_depth_almost_of_the_photos_size_counts_as_such() -> None:

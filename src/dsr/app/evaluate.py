@@ -19,13 +19,13 @@ from rich.console import Console
 from dsr.app import run_directory as rundir
 from dsr.app.metrics import check_metrics, chosen_metrics, metric_collection
 from dsr.app.progress import Display, prepare
-from dsr.app.schema import EvalConfig, given_keys, plain_config
+from dsr.app.schema import EvalConfig, given_keys, plain_config, user_directories
 from dsr.app.training_runs import studies_of_run
 from dsr.data.base import SceneSource
 from dsr.evaluation.predict import Evaluation, Outcome, StalePredictionError, predict
 from dsr.evaluation.score import score
 from dsr.methods.dip.upsampler import WORKSPACE
-from dsr.methods.networks.trained import packaged_names, packaged_weights
+from dsr.methods.registry import build_method, find_weights, target_paths
 from dsr.metrics.formats import Formats
 from dsr.report.dashboard import save_dashboard
 from dsr.report.tables import score_table
@@ -67,7 +67,8 @@ def _evaluate(plain: dict[str, Any], source: SceneSource | None) -> pd.DataFrame
     plain = {**plain, "precision": _precision(settings, device)}
     settings.precision = plain["precision"]
     weights = _weights(settings)
-    identity = rundir.identity_of(plain, None if weights is None else file_hash(weights), device)
+    targets = target_paths(settings.method, user_directories())
+    identity = rundir.identity_of(plain, None if weights is None else file_hash(weights), device, targets)
     folder = Path(settings.output_dir or rundir.default_directory("eval", plain, identity)).expanduser()
     display = Display(console)
     given = {"device": device, "weights": weights, "workspace": folder, "display": display}
@@ -116,17 +117,15 @@ def _study(
     name = str(settings.method["name"])
     if "downsampling.assumed" in given_keys() and not takes("method", settings.method, "downsampling"):
         raise ConfigError(f"downsampling.assumed: method={name} assumes no downsampling model; leave it out")
-    method = build(
-        "method",
+    method = build_method(
         settings.method,
-        {
-            **given,
-            "scale": settings.scale,
-            "precision": settings.precision,
-            "seed": settings.seed,
-            "downsampling": downsampling.assumed_model(),
-            "metrics": functools.partial(metric_collection, settings.metrics, given["device"]),
-        },
+        settings.scale,
+        directories=user_directories(),
+        precision=settings.precision,
+        seed=settings.seed,
+        downsampling=downsampling.assumed_model(),
+        metrics=functools.partial(metric_collection, settings.metrics, given["device"]),
+        **given,
     )
     return Evaluation(
         source,
@@ -173,34 +172,13 @@ def _problem_name(settings: EvalConfig) -> str:
 
 def _weights(settings: EvalConfig) -> Path | None:
     """Return the file of weights for the method; None for a method that has no use for one."""
-    name = settings.method["name"]
     given = None if settings.weights is None else Path(settings.weights).expanduser()
-    if not takes("method", settings.method, "weights"):
-        if given is not None and not given.is_dir():  # a directory serves all methods of a multirun
-            print(f"note: method={name} has no weights; weights={given} is not used", file=sys.stderr)  # noqa: T201
-        return None
-    file = settings.method.get("weights_file")
-    if given is None or (given.is_dir() and file is None):
-        return _packaged(settings)
-    if given.is_dir():
-        given = given / str(file)
-    if not given.is_file():
-        raise ConfigError(f"weights: expected a file of weights for method={name}, got {given} (no such file)")
-    return given
-
-
-def _packaged(settings: EvalConfig) -> Path:
-    """Return the file of the weights that come with dsr."""
-    wanted = settings.method.get("weights_packaged")
-    found = None if wanted is None else packaged_weights(str(wanted))
-    if found is not None:
-        return found
-    file, source = settings.method.get("weights_file"), settings.method.get("weights_source")
-    published = f", or a directory with {file} (from {source})" if file else ""
-    raise ConfigError(
-        f"weights: dsr comes with {', '.join(packaged_names())}; method={settings.method['name']} at scale "
-        f"{settings.scale} needs weights=FILE{published}"
-    )
+    if takes("method", settings.method, "weights"):
+        return find_weights(settings.method, settings.scale, given)
+    if given is not None and not given.is_dir():  # a directory serves all methods of a multirun
+        name = settings.method["name"]
+        print(f"note: method={name} has no weights; weights={given} is not used", file=sys.stderr)  # noqa: T201
+    return None
 
 
 def _seed(seed: int) -> None:

@@ -8,7 +8,7 @@ import importlib.metadata
 import json
 import platform
 import subprocess
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,7 @@ from omegaconf import OmegaConf
 import dsr
 from dsr.utils.builder import ConfigError
 from dsr.utils.files import write_text
-from dsr.utils.hashing import hash_of_code
+from dsr.utils.hashing import hash_of_code, hash_outside_code
 
 _PACKAGES = (
     "dsr", "hydra-core", "lightning", "numpy", "omegaconf", "opencv-python-headless",
@@ -27,15 +27,30 @@ _PACKAGES = (
 _NOT_IDENTITY = ("output_dir", "overwrite", "metrics", "weights", "resume", "run")  # of the weights, the content counts
 PREDICTING_CODE = (
     "sample.py", "degradation", "geometry", "metrics", "synthetic", "methods", "data", "training",
-    "utils/lightning.py", "utils/progress.py", "evaluation/predict.py",
+    "utils/builder.py", "utils/config_files.py", "utils/devices.py", "utils/lightning.py", "utils/progress.py",
+    "evaluation/predict.py",
 )  # fmt: skip
 """Modules and packages that determine a prediction, by their paths below the package."""
 
 
-def identity_of(config: Mapping[str, Any], weights_hash: str | None, device: torch.device) -> dict[str, Any]:
-    """Return all that a run's predictions depend on, as plain values: settings, weights, kind of device, code."""
+def identity_of(
+    config: Mapping[str, Any], weights_hash: str | None, device: torch.device, targets: Iterable[str] = ()
+) -> dict[str, Any]:
+    """Return all that a run's predictions depend on, as plain values: settings, weights, kind of device, code.
+
+    Args:
+        config: of the run.
+        weights_hash: of the file of weights; None for none.
+        device: where predictions are computed.
+        targets: dotted paths of classes and functions, beside those that the groups of ``config`` name; the code of
+            those outside of dsr counts, too.
+
+    """
     kept = {key: value for key, value in config.items() if key not in _NOT_IDENTITY}
-    return {**kept, "device": device.type, "weights_sha256": weights_hash, "code": code_hash()}
+    named = [str(node["target"]) for node in kept.values() if isinstance(node, Mapping) and "target" in node]
+    outside = hash_outside_code([*named, *targets])
+    more = {} if outside is None else {"outside_code": outside}
+    return {**kept, "device": device.type, "weights_sha256": weights_hash, "code": code_hash(), **more}
 
 
 def default_directory(kind: str, config: Mapping[str, Any], identity: Mapping[str, Any]) -> Path:

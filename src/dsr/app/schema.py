@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, fields, is_dataclass
+from pathlib import Path
 from typing import Any, ClassVar, Self
 
 from hydra.core.config_store import ConfigStore
@@ -187,6 +188,14 @@ def given_keys() -> list[str]:
     if not HydraConfig.initialized():
         return []
     return [override.partition("=")[0].lstrip("+~") for override in HydraConfig.get().overrides.task]
+
+
+def user_directories() -> tuple[Path, ...]:
+    """Return the user's configuration directories, of ``--config-dir``; none outside of a Hydra command."""
+    if not HydraConfig.initialized():
+        return ()
+    sources = HydraConfig.get().runtime.config_sources
+    return tuple(Path(each.path) for each in sources if each.schema == "file" and each.provider != "main")
 
 
 def plain_config(config: DictConfig) -> dict[str, Any]:

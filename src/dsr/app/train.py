@@ -22,7 +22,7 @@ from dsr.app.trainer import make_trainer, seconds_per_step
 from dsr.app.training_runs import WEIGHTS, common, keyed, read_config, training_data
 from dsr.methods.networks.base import DisparityNetwork
 from dsr.methods.networks.trained import NETWORKS
-from dsr.methods.networks.weight_files import load_network, save_network
+from dsr.methods.networks.weight_files import load_network, network_name, save_network
 from dsr.training.data_module import PatchData
 from dsr.training.module import Schedule, SuperResolution
 from dsr.training.objective import Objective, balance_weight
@@ -116,7 +116,8 @@ def _network(settings: TrainConfig) -> DisparityNetwork:
     if settings.trainer.init is None:
         return net
     try:
-        first = load_network(Path(settings.trainer.init).expanduser(), NETWORKS)
+        networks = {**NETWORKS, network_name(type(net)): type(net)}
+        first = load_network(Path(settings.trainer.init).expanduser(), networks)
     except (ValueError, OSError) as error:
         raise ConfigError(f"trainer.init: {error}") from error
     of_another_scale = {**first.arguments(), "scale": settings.scale}

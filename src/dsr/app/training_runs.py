@@ -64,6 +64,9 @@ def studies_of_run(
     name = run["model"]["name"]
     target = "dsr.methods.networks.trained.build_trained"
     method = {"name": name, "label": name, "target": target, "model": name, "ensemble": 1}  # as validations scored it
+    network = str(run["model"]["target"])
+    if not network.startswith("dsr."):
+        method["network"] = network
     base = {**plain, **own, "method": method, "weights": str(weights)}
     if "dataset" in chosen:
         yield base, None

@@ -22,6 +22,7 @@ examples:
   dsr upsample --rgb a.jpg b.jpg --depth a.png b.png --intrinsics 615 615 319.5 239.5 -o out
   dsr upsample --rgb rgb/ --depth depth/ --depth-unit 1/5000 -o out
   dsr upsample rgbd_dataset_freiburg1_xyz -o out
+  dsr upsample --rgb photo.jpg --depth depth.png --method tgv --set data_weight=30 -o out
   dsr upsample recordings --dry-run -o out       what would be done, and what would be assumed
 
 A single pair's results lie in OUT itself, those of several in OUT/NAME: depth.* as the input counts, depth_metres.npy,
@@ -73,7 +74,23 @@ def _add_method(parser: argparse.ArgumentParser) -> None:
         "--method",
         default="auto",
         metavar="NAME",
-        help="auto (default): msg_v_noisy for noisy depth, else facets; bicubic, ...",
+        help="auto (default): msg_v_noisy for noisy depth, else facets; or another: tgv, guided_filter, dip_v, ...",
+    )
+    method.add_argument(
+        "--set",
+        action="append",
+        default=[],
+        dest="settings",
+        metavar="KEY=VALUE",
+        help="an argument of the method, as in its file in conf/method: data_weight=30; may be repeated",
+    )
+    method.add_argument(
+        "--config-dir",
+        action="append",
+        type=Path,
+        default=[],
+        metavar="DIR",
+        help="a folder with a method/ of your own YAML files; may be repeated",
     )
     method.add_argument("--scale", type=int, metavar="N", help="upsampling factor (default: from the sizes)")
     method.add_argument("--device", default="auto", metavar="DEVICE", help="auto (default), cpu, cuda, cuda:1, ...")
@@ -102,6 +119,7 @@ def _run(options: argparse.Namespace, console: Console, _: object) -> list[str]:
     """Upsample, and return what went wrong."""
     from dsr.app.upsample.outputs import PARTS  # noqa: PLC0415
     from dsr.app.upsample.run import UpsampleRequest, run  # noqa: PLC0415
+    from dsr.app.upsample.settings import parse_settings  # noqa: PLC0415
     from dsr.io.cameras import CameraChoice  # noqa: PLC0415 - they take seconds to import
     from dsr.io.encoding import parse_unit  # noqa: PLC0415
     from dsr.io.inputs import Reading  # noqa: PLC0415
@@ -123,6 +141,8 @@ def _run(options: argparse.Namespace, console: Console, _: object) -> list[str]:
         mask=tuple(options.mask),
         reading=Reading(choice, unit, options.range_type, options.baseline, options.hole_value),
         method=options.method,
+        settings=parse_settings(options.settings),
+        directories=tuple(options.config_dir),
         scale=options.scale,
         device=options.device,
         keep_holes=options.keep_holes,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TypeVar, cast
+from typing import Any, TypeVar, cast
 
 import numpy as np
 import torch
@@ -27,6 +27,7 @@ def upsample(
     device: str = "auto",
     keep_holes: bool = False,
     progress: Steps | None = None,
+    **settings: Any,
 ) -> Array:
     """Return depth as fine as the photo.
 
@@ -39,18 +40,20 @@ def upsample(
         camera: of the photo, ``dsr.Camera(width, height, fx, fy, cx, cy)``, all in the photo's pixels.
         scale: how much finer the result is, 4 or 8 for networks; None for what suits the sizes. Where the depth map has
             the photo's size already it is first averaged over so many pixels, 4 for None.
-        method: ``auto`` for ``msg_v_noisy`` where the depth is noisy, else ``facets``; also ``msg_v``, ``msg``,
-            ``bicubic``, ``bilinear``, ``nearest``, and ``dip``, ``dip_v``, which take minutes.
+        method: ``auto`` for ``msg_v_noisy`` where the depth is noisy, else ``facets``; or any other of the methods that
+            ``conf/method`` names, such as ``msg_v``, ``tgv``, ``guided_filter``, ``bicubic``, and ``dip_v``, which
+            takes minutes.
         mask: where the depth is known, of the depth's shape; for maps that mark holes by a mask.
         device: ``auto`` for a GPU where there is one, else ``cpu``, ``cuda`` or ``cuda:1``.
         keep_holes: whether holes stay NaN; otherwise they are filled.
-        progress: a function that is told how many parts are done, and of how many.
+        progress: a function that is called with the number of parts done and their total.
+        **settings: arguments of the method, by the names in its file in ``conf/method``, such as ``data_weight=30``.
 
     Returns:
         Depth in metres, float32: (H, W) for an array, (1, H, W) for a tensor.
 
     Raises:
-        ValueError: a shape, value, method or scale is not as above.
+        ValueError: a shape, value, method, setting or scale is not as above, or the method has no solution.
 
     Example:
         A sphere before a wall, as a coarse sensor sees it:
@@ -86,7 +89,15 @@ def upsample(
             )
         coarse = coarse.masked_fill(~known, torch.nan) if coarse.is_floating_point() else coarse
     fine = upsample_depth(
-        photo, coarse, camera, scale, method=method, device=device, keep_holes=keep_holes, progress=progress
+        photo,
+        coarse,
+        camera,
+        scale,
+        method=method,
+        settings=settings,
+        device=device,
+        keep_holes=keep_holes,
+        progress=progress,
     )
     return cast("Array", fine[0].cpu().numpy() if arrays else fine)
 

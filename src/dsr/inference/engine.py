@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import math
-from typing import Any, cast
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -11,17 +15,75 @@ from torch.nn import functional
 
 from dsr.degradation.downsampling import Downsampling
 from dsr.geometry.camera import Camera
-from dsr.inference.inspection import enlarged_by, suited_method
-from dsr.inference.planning import AUTO, INTERPOLATIONS, NETWORKS, OWN_SIZE, PRIORS, plan
-from dsr.inference.resampling import resized_inverse
-from dsr.methods.classical.interpolation import Interpolation, Order
-from dsr.methods.dip.upsampler import DeepImagePrior
+from dsr.inference.inspection import CLEAN, enlarged_by, suited_method
+from dsr.inference.planning import AUTO, OWN_SIZE, USUAL_SCALE, Plan, plan, read_ability
+from dsr.inference.resampling import resize_inverse_depth
+from dsr.methods.base import Upsampler
+from dsr.methods.classical.interpolation import Interpolation
 from dsr.methods.networks.base import NetworkUpsampler
-from dsr.methods.networks.trained import build_trained, packaged_weights
+from dsr.methods.networks.inpainting import inpaint
+from dsr.methods.registry import build_method, read_method
 from dsr.sample import DepthSample
+from dsr.utils.builder import ConfigError
+from dsr.utils.devices import pick_device
 from dsr.utils.progress import Steps, part_of
 
-_PRIOR_SETTINGS: dict[str, dict[str, Any]] = {"dip": {"data_loss": "mse", "data_weight": 10.0, "w": 0.0}, "dip_v": {}}
+_DECIDED = MappingProxyType({"fill_holes": True, "validate_every": 0})
+"""Arguments of methods that are decided here: holes are put back afterwards, and there is no truth to compare with."""
+
+
+@dataclass(frozen=True)
+class MethodChoice:
+    """A method to run, by its name in the registry.
+
+    Args:
+        name: the method's name.
+        settings: its arguments that differ from its file, by name.
+        directories: the user's configuration directories.
+        device: where to compute.
+
+    """
+
+    name: str
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    directories: tuple[Path, ...] = ()
+    device: torch.device = field(default=torch.device("cpu"))
+
+    def build(self, scale: int) -> Upsampler:
+        """Return the method for a factor.
+
+        Raises:
+            ValueError: there is no such method or setting, or it refuses a value.
+
+        """
+        node = read_method(self.name, scale, self.settings, self.directories)
+        node = {key: value for key, value in node.items() if key not in _DECIDED or key in self.settings}
+        given: dict[str, Any] = {
+            "device": self.device,
+            "precision": "float32",
+            "downsampling": Downsampling("box"),
+            **_DECIDED,
+        }
+        try:
+            return build_method(node, scale, directories=self.directories, **given)
+        except ConfigError as error:
+            raise ValueError(str(error).removeprefix("method.")) from error
+
+    def plan(self, size: tuple[int, int], size_lr: tuple[int, int], scale: int | None) -> Plan:
+        """Return what is done with a photo and a depth map of these heights and widths."""
+        return plan(size, size_lr, scale, self.name, self.directories)
+
+
+def check_settings(choice: MethodChoice) -> None:
+    """Check that a method takes the settings.
+
+    Raises:
+        ValueError: a setting is unknown, of another type, or the method refuses it; the message begins with its
+            name and a colon.
+
+    """
+    choice = replace(choice, name=CLEAN if choice.name == AUTO else choice.name)
+    choice.build(next(iter(read_ability(choice.name, choice.directories).steps), USUAL_SCALE))
 
 
 def upsample_depth(
@@ -31,6 +93,8 @@ def upsample_depth(
     scale: int | None = None,
     *,
     method: str = AUTO,
+    settings: Mapping[str, Any] | None = None,
+    directories: Sequence[Path] = (),
     device: str = "auto",
     keep_holes: bool = False,
     progress: Steps | None = None,
@@ -48,23 +112,27 @@ def upsample_depth(
         depth: (1, h, w) orthogonal depth in metres, NaN in holes.
         camera: the photo's; interpolation alone depends on it, and priors.
         scale: see :func:`dsr.inference.plan`.
-        method: one of ``METHODS``, or ``auto``, see :func:`dsr.inference.inspection.suited_method`.
+        method: the name of one in :mod:`dsr.methods.registry`, or ``auto``, see
+            :func:`dsr.inference.inspection.suited_method`.
+        settings: arguments of the method that differ from its file, by name.
+        directories: the user's configuration directories.
         device: ``auto`` for a GPU where there is one, else as torch names it.
         keep_holes: whether pixels whose own depth, or nearest low-resolution pixel, is unknown stay NaN; else they are
             filled.
-        progress: is told how many parts are done, and of how many.
+        progress: is called with the number of parts done and their total.
 
     Returns:
         (1, H, W) float32 in metres, on the device of ``depth``.
 
     Raises:
-        ValueError: a shape, value, method or scale is not as above.
+        ValueError: a shape, value, method, setting or scale is not as above, or the method has no solution.
 
     """
     _check(rgb, depth, camera)
     size = (camera.height, camera.width)
     method = suited_method(depth, camera, scale) if method == AUTO else method
-    plan(size, _size(depth), scale, method)  # refuses what can't be
+    choice = MethodChoice(method, settings or {}, tuple(directories), pick_device(device))
+    choice.plan(size, _size(depth), scale)  # refuses what can't be
     inverse = depth.float().reciprocal()
     known = inverse.isfinite()
     if size[0] <= OWN_SIZE * inverse.shape[-2] and size[1] <= OWN_SIZE * inverse.shape[-1]:
@@ -72,15 +140,15 @@ def upsample_depth(
         block = enlarged_by(inverse)
         if block > 1 and not any(n % block for n in size):
             inverse = inverse[:, ::block, ::block]
-            fine = _answer(rgb, inverse, camera, None, method, device, progress)
+            fine = _answer(rgb, inverse, camera, None, choice, progress)
         else:
-            factor = plan(size, size, scale, method).scale
+            factor = choice.plan(size, size, scale).scale
             wide = _padded_photo(rgb, factor)
             coarse = Downsampling("box")(_padded_inverse(inverse, factor), factor)
             around = Camera(wide.shape[-1], wide.shape[-2], camera.fx, camera.fy, camera.cx, camera.cy)
-            fine = _answer(wide, coarse, around, factor, method, device, progress)[:, : size[0], : size[1]]
+            fine = _answer(wide, coarse, around, factor, choice, progress)[:, : size[0], : size[1]]
     else:
-        fine = _answer(rgb, inverse, camera, scale, method, device, progress)
+        fine = _answer(rgb, inverse, camera, scale, choice, progress)
     lowest = inverse.nan_to_num(nan=torch.inf).amin()
     result = torch.where(fine > 0, fine, lowest.to(fine.device)).reciprocal_()  # nothing lies beyond infinity
     if keep_holes and not bool(known.all()):
@@ -89,67 +157,62 @@ def upsample_depth(
 
 
 def _answer(
-    rgb: Tensor, inverse: Tensor, camera: Camera, scale: int | None, method: str, device: str, progress: Steps | None
+    rgb: Tensor, inverse: Tensor, camera: Camera, scale: int | None, choice: MethodChoice, progress: Steps | None
 ) -> Tensor:
     """Return high-resolution inverse depth, (1, H, W), of low-resolution inverse depth, (1, h, w)."""
     size = (camera.height, camera.width)
-    if method in INTERPOLATIONS:
-        interpolation = Interpolation(cast("Order", method), fill_holes=True)
-        coarse_camera = camera.rescale(inverse.shape[-1], inverse.shape[-2])
-        return interpolation.interpolate(inverse.reciprocal(), coarse_camera, camera).reciprocal()
-    planned = plan(size, _size(inverse), scale, method)
-    on = _device(device)
-    if method in PRIORS:
-        return _optimised(rgb, inverse, camera, planned.steps[0], method, on)
-    networks = [_network(method, step, on) for step in planned.steps]
+    planned = choice.plan(size, _size(inverse), scale)
+    methods = [choice.build(step) for step in planned.steps or (planned.scale,)]
+    method = methods[0]
+    if isinstance(method, Interpolation):
+        camera_lr = camera.rescale(inverse.shape[-1], inverse.shape[-2])
+        return method.interpolate(inverse.reciprocal(), camera_lr, camera).reciprocal()
+    networks = [method for method in methods if isinstance(method, NetworkUpsampler)]
+    if networks:
+        return _answer_by_networks(rgb, inverse, size, networks, choice.device, progress)
+    return _answer_by_sample(rgb, inverse, camera, planned.steps[0], method, progress)
+
+
+def _answer_by_networks(
+    rgb: Tensor,
+    inverse: Tensor,
+    size: tuple[int, int],
+    networks: Sequence[NetworkUpsampler],
+    device: torch.device,
+    progress: Steps | None,
+) -> Tensor:
+    """Return the high-resolution inverse depth of networks, each of which works on what the one before it found."""
+    steps = [each.net.scale for each in networks]
     sizes = [_size(inverse)]  # of the low-resolution map of each step
-    sizes += [(-(-size[0] // step), -(-size[1] // step)) for step in planned.steps[1:]]
-    parts = [net.parts(step * s[0], step * s[1]) for net, step, s in zip(networks, planned.steps, sizes, strict=True)]
-    for i, (net, coarse_size) in enumerate(zip(networks, sizes, strict=True)):
-        inverse = resized_inverse(inverse, coarse_size, math.inf)
-        before, total = sum(parts[:i]), sum(parts)
-        report = part_of(progress, before, total)
-        photo = resized_photo(rgb, (net.net.scale * coarse_size[0], net.net.scale * coarse_size[1]))
-        inverse = net.fine_disparity(photo[None].to(on), inverse[None].to(on), report)[0]
-        del photo
-    return resized_inverse(inverse, size)
+    sizes += [(-(-size[0] // step), -(-size[1] // step)) for step in steps[1:]]
+    parts = [net.parts(step * s[0], step * s[1]) for net, step, s in zip(networks, steps, sizes, strict=True)]
+    for i, (net, size_lr) in enumerate(zip(networks, sizes, strict=True)):
+        inverse = resize_inverse_depth(inverse, size_lr, math.inf)
+        report = part_of(progress, sum(parts[:i]), sum(parts))
+        guide = resize_rgb(rgb, (net.net.scale * size_lr[0], net.net.scale * size_lr[1]))
+        inverse = net.fine_disparity(guide[None].to(device), inverse[None].to(device), report)[0]
+        del guide
+    return resize_inverse_depth(inverse, size)
 
 
-def resized_photo(rgb: Tensor, size: tuple[int, int]) -> Tensor:
+def _answer_by_sample(
+    rgb: Tensor, inverse: Tensor, camera: Camera, scale: int, method: Upsampler, progress: Steps | None
+) -> Tensor:
+    """Return the high-resolution inverse depth of a method, its missing pixels inpainted."""
+    height, width = _size(inverse)
+    camera_hr = camera.rescale(scale * width, scale * height)
+    guide = resize_rgb(rgb, (camera_hr.height, camera_hr.width))
+    camera_lr = camera.rescale(width, height)
+    sample = DepthSample("upsample", "depth", guide, inverse.reciprocal(), camera_hr, camera_lr, scale)
+    answer = inpaint(method(sample, progress).reciprocal()[None])[0]
+    return resize_inverse_depth(answer, (camera.height, camera.width))
+
+
+def resize_rgb(rgb: Tensor, size: tuple[int, int]) -> Tensor:
     """Return a photo, (3, H, W), at another size, antialiased."""
     if _size(rgb) == size:
         return rgb
     return functional.interpolate(rgb[None], size, mode="bicubic", antialias=True)[0].clamp_(0, 1)
-
-
-def _network(method: str, scale: int, device: torch.device) -> NetworkUpsampler:
-    """Return a network with the weights that come with the package."""
-    name = NETWORKS[method].format(scale)
-    weights = packaged_weights(name)
-    if weights is None:
-        raise ValueError(f"method={method}: expected the weights {name} in the package, they are not there")
-    return build_trained(weights, scale, "msg_v" if method == "msg_v_noisy" else method, device=device)
-
-
-def _optimised(rgb: Tensor, inverse: Tensor, camera: Camera, scale: int, method: str, device: torch.device) -> Tensor:
-    """Return the answer of a deep image prior, (1, H, W) inverse depth."""
-    height, width = _size(inverse)
-    fine = camera.rescale(scale * width, scale * height)
-    photo = resized_photo(rgb, (fine.height, fine.width))
-    sample = DepthSample("upsample", "depth", photo, inverse.reciprocal(), fine, camera.rescale(width, height), scale)
-    settings = _PRIOR_SETTINGS[method]
-    prior = DeepImagePrior(scale=scale, downsampling=Downsampling("box"), device=device, validate_every=0, **settings)
-    return resized_inverse(prior(sample).reciprocal(), (camera.height, camera.width))
-
-
-def _device(name: str) -> torch.device:
-    """Return the device to compute on."""
-    if name == "auto":
-        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    try:
-        return torch.zeros(1, device=name).device
-    except (RuntimeError, AssertionError) as error:
-        raise ValueError(f"device: expected auto, cpu, cuda or cuda:N of this machine, got {name!r}") from error
 
 
 def _nearest(values: Tensor, size: tuple[int, int]) -> Tensor:

@@ -19,28 +19,48 @@ averaged to a quarter of the photo: at ratio 16 RMSE_v is 0.215, against 0.222 o
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from types import MappingProxyType
+from pathlib import Path
+from typing import Literal
 
+from dsr.degradation.downsampling import SCALES
+from dsr.methods.base import Cost
+from dsr.methods.classical.interpolation import Interpolation
 from dsr.methods.networks.base import TILE, UNTILED
+from dsr.methods.networks.trained import build_trained
+from dsr.methods.registry import has_weights, read_method
+from dsr.utils.builder import load_target, takes, trait
 
-INTERPOLATIONS = ("nearest", "bilinear", "bicubic")
-PRIORS = ("dip", "dip_v")
-NETWORKS = MappingProxyType(
-    {"facets": "facets_x{}", "msg_v": "msg_v_x{}", "msg": "msg_x{}", "msg_v_noisy": "msg_v_x{}_noisy"}
-)
 AUTO = "auto"
-METHODS = (*NETWORKS, *INTERPOLATIONS, *PRIORS)
-LARGEST_FOR_PRIORS = 2**20
-"""Pixels; an optimisation beyond takes hours."""
+LARGEST_OPTIMISED = 2**20
+"""Pixels; the optimisation of a network for a larger picture takes hours."""
 OWN_SIZE = 1.25
 """A depth map whose sides differ from the photo's by no more than this factor counts as one of the photo's size."""
-_STEPS = MappingProxyType({4: (4,), 8: (8,), 16: (8, 4), 32: (8, 4)})
-_STEPS_OF_X4 = MappingProxyType({4: (4,), 16: (4, 4)})
-_STEPS_OF_PRIORS = MappingProxyType({scale: (scale,) for scale in (2, 4, 8, 16)})
 USUAL_SCALE = 4
 _ASPECT = 0.02
 _SLACK = 1.05
+_UNKNOWN_COST = Cost(1000, 0)
+"""Of a method that states none."""
+
+
+@dataclass(frozen=True)
+class Ability:
+    """What a method can do.
+
+    Args:
+        kind: ``interpolation`` gives any size; a ``network`` has factors and may follow itself; any other method
+            answers a ``sample``.
+        steps: for each factor, those of the calls that lead to it; empty for any factor in one call.
+        optimises: whether it optimises a network for each picture.
+        cost: rough, where the method states it.
+
+    """
+
+    kind: Literal["interpolation", "network", "sample"]
+    steps: Mapping[int, tuple[int, ...]]
+    optimises: bool = False
+    cost: Cost | None = None
 
 
 @dataclass(frozen=True)
@@ -63,8 +83,46 @@ class Plan:
     text: str
 
 
+def read_ability(method: str, directories: Sequence[Path] = ()) -> Ability:
+    """Return what a method of the registry can do.
+
+    Args:
+        method: its name.
+        directories: the user's configuration directories.
+
+    Raises:
+        ValueError: there is no such method, or it has no weights for any factor.
+
+    """
+    node = read_method(method, USUAL_SCALE, directories=directories)
+    target = load_target("method", node)
+    if target is Interpolation:
+        return Ability("interpolation", {})
+    factors: tuple[int, ...] = SCALES
+    if takes("method", node, "weights"):
+        factors = tuple(scale for scale in SCALES if has_weights(read_method(method, scale, None, directories), scale))
+        if not factors:
+            raise ValueError(f"method={method}: expected weights that it names, or that come with dsr; there are none")
+    steps: dict[int, tuple[int, ...]] = {factor: (factor,) for factor in factors}
+    if target is build_trained:
+        return Ability("network", _with_second_step(steps))
+    return Ability("sample", steps, bool(trait("method", node, "optimises")), trait("method", node, "cost"))
+
+
+def _with_second_step(steps: dict[int, tuple[int, ...]]) -> dict[int, tuple[int, ...]]:
+    """Return a network's steps with those of the factors that it reaches by a second step of 4."""
+    if 4 not in steps:
+        return steps
+    second = {16: (8, 4), 32: (8, 4)} if 8 in steps else {16: (4, 4)}
+    return second | steps if 16 not in steps else steps
+
+
 def plan(
-    photo_size: tuple[int, int], depth_size: tuple[int, int], scale: int | None = None, method: str = "facets"
+    photo_size: tuple[int, int],
+    depth_size: tuple[int, int],
+    scale: int | None = None,
+    method: str = "facets",
+    directories: Sequence[Path] = (),
 ) -> Plan:
     """Return what :func:`dsr.inference.upsample_depth` does.
 
@@ -75,22 +133,22 @@ def plan(
         photo_size: height and width.
         depth_size: height and width.
         scale: the factor; None for one that suits the sizes, 4 where they are equal.
-        method: one of ``METHODS``.
+        method: the name of one in the registry.
+        directories: the user's configuration directories.
 
     Raises:
         ValueError: no such method, a scale that it has no weights for, or sizes that do not go together.
 
     """
-    if method not in METHODS:
-        raise ValueError(f"method: expected one of {', '.join(METHODS)}, got {method!r}")
+    ability = read_ability(method, directories)
     ratio = _ratio(photo_size, depth_size)
     own = ratio <= OWN_SIZE
-    chosen = _scale(scale, USUAL_SCALE if own else ratio, method)
-    steps = () if method in INTERPOLATIONS else _steps_of(method)[chosen]
+    chosen = _scale(scale, USUAL_SCALE if own else ratio, method, ability)
+    steps = ability.steps.get(chosen, ())
     pixels = math.prod(photo_size)
-    if method in PRIORS and pixels > LARGEST_FOR_PRIORS:
+    if ability.optimises and pixels > LARGEST_OPTIMISED:
         raise ValueError(
-            f"method={method}: expected a photo of up to {LARGEST_FOR_PRIORS} pixels, as it is optimised for each "
+            f"method={method}: expected a photo of up to {LARGEST_OPTIMISED} pixels, as it is optimised for each "
             f"picture, got {photo_size[0]} x {photo_size[1]}; method=facets takes any"
         )
     coarsened = chosen if own else 1
@@ -101,8 +159,10 @@ def plan(
     worked_on = _worked_on(photo_size, depth_size, steps, coarsened)
     text = (
         f"{depth_size[0]} x {depth_size[1]} depth {before}to {photo_size[0]} x {photo_size[1]} by {what}, "
-        f"in about {_memory(pixels, worked_on, method) / 2**30:.1f} GB of memory"
+        f"in about {_memory(pixels, worked_on, ability) / 2**30:.1f} GB of memory"
     )
+    if ability.cost is not None:
+        text += f" and {_duration(ability.cost.seconds * worked_on / 1e6)} on two CPU cores"
     return Plan(method, chosen, steps, coarsened, text)
 
 
@@ -120,23 +180,16 @@ def _ratio(photo_size: tuple[int, int], depth_size: tuple[int, int]) -> float:
     return ratio
 
 
-def _steps_of(method: str) -> MappingProxyType[int, tuple[int, ...]]:
-    """Return the factors that a method has, and its steps for each."""
-    if method in PRIORS:
-        return _STEPS_OF_PRIORS
-    return _STEPS_OF_X4 if method == "msg_v_noisy" else _STEPS
-
-
-def _scale(wanted: int | None, ratio: float, method: str) -> int:
+def _scale(wanted: int | None, ratio: float, method: str, ability: Ability) -> int:
     """Return the factor that is wanted, else the smallest that is enough."""
-    if method in INTERPOLATIONS:
+    there = ability.steps
+    if not there:
         if wanted is not None and wanted < 1:
             raise ValueError(f"scale: expected a positive whole number, got {wanted}")
         return wanted or math.ceil(ratio - 1e-9)
-    there = _steps_of(method)
     if wanted is not None and wanted not in there:
-        raise ValueError(f"scale: expected one of {', '.join(map(str, there))} for {method}, got {wanted}")
-    enough = [scale for scale in there if ratio <= _SLACK * scale]
+        raise ValueError(f"scale: expected one of {', '.join(map(str, sorted(there)))} for {method}, got {wanted}")
+    enough = [scale for scale in sorted(there) if ratio <= _SLACK * scale]
     if wanted is None and not enough:
         raise ValueError(f"depth: expected at least 1/{max(there)} of the photo's size for {method}, got 1/{ratio:.3g}")
     return wanted or enough[0]
@@ -150,11 +203,17 @@ def _worked_on(photo_size: tuple[int, int], depth_size: tuple[int, int], steps: 
     return max(first, math.prod(photo_size)) if len(steps) > 1 else first
 
 
-def _memory(pixels: int, worked_on: int, method: str) -> float:
-    """Return bytes, roughly, with the 0.4 GB of the program itself."""
-    if method in INTERPOLATIONS:
+def _memory(pixels: int, worked_on: int, ability: Ability) -> float:
+    """Return bytes, roughly, with the 0.4 GB of the program itself, 0.6 GB where it trains."""
+    if ability.kind == "interpolation":
         return 4e8 + 100 * pixels
-    if method in PRIORS:
-        return 6e8 + 2500 * worked_on
+    if ability.kind == "sample":
+        cost = ability.cost or _UNKNOWN_COST
+        return (6e8 if ability.optimises else 4e8) + cost.memory * worked_on
     window = worked_on if worked_on <= UNTILED else (TILE + 160) ** 2
     return 4e8 + 40 * pixels + 40 * worked_on + 700 * window
+
+
+def _duration(seconds: float) -> str:
+    """Return a rough time for a reader."""
+    return f"about {max(seconds, 1):.0f} s" if seconds < 90 else f"about {seconds / 60:.0f} min"

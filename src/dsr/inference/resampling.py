@@ -18,13 +18,13 @@ from torch import Tensor
 
 JUMP = 0.02
 """Relative second difference of inverse depth; between 0.01 and 0.04 scores hardly change."""
-_BORDER_REACH = 1.25
+_BORDER_RADIUS = 1.25
 """In old pixels beyond the outermost centre, for pixels that lie there: a line needs two."""
 _STRIP = 256
 """Rows that are resized at a time."""
 
 
-def resized_inverse(inverse: Tensor, size: tuple[int, int], jump: float = JUMP) -> Tensor:
+def resize_inverse_depth(inverse: Tensor, size: tuple[int, int], jump: float = JUMP) -> Tensor:
     """Return inverse depth at another size, by the module's rule.
 
     Args:
@@ -46,7 +46,7 @@ def resized_inverse(inverse: Tensor, size: tuple[int, int], jump: float = JUMP) 
             max(int(strip.index.min()) - 1, 0), int(strip.index.max()) + 2
         )  # a row more for second differences
         strip.index -= read.start
-        parts.append(_resized(inverse[:, read], strip, columns, jump))
+        parts.append(_resize_strip(inverse[:, read], strip, columns, jump))
     return torch.cat(parts, dim=-2)
 
 
@@ -59,10 +59,10 @@ class _Axis:
     def __init__(self, old: int, new: int, like: Tensor) -> None:
         centre = (torch.arange(new, dtype=torch.float64) + 0.5) * (old / new) - 0.5
         outside = (centre - centre.clamp(0, old - 1)).abs()
-        reach = torch.where(outside > 0, outside + _BORDER_REACH, 1.0).clamp(min=old / new)
-        most = math.ceil(float(reach.max()))
+        radius = torch.where(outside > 0, outside + _BORDER_RADIUS, 1.0).clamp(min=old / new)
+        most = math.ceil(float(radius.max()))
         index = centre.floor().long()[:, None] + torch.arange(1 - most, most + 1)
-        weight = (1 - (index - centre[:, None]).abs() / reach[:, None]).clamp(min=0)
+        weight = (1 - (index - centre[:, None]).abs() / radius[:, None]).clamp(min=0)
         weight = torch.where((index >= 0) & (index < old), weight, 0)
         self.weight = _linear(weight, index - centre[:, None]).to(like)
         self.index = index.clamp(0, old - 1).to(like.device)
@@ -84,7 +84,7 @@ def _linear(weight: Tensor, offset: Tensor) -> Tensor:
     return weight / total * (1 + slope * (offset - mean))
 
 
-def _resized(x: Tensor, rows: _Axis, columns: _Axis, jump: float) -> Tensor:
+def _resize_strip(x: Tensor, rows: _Axis, columns: _Axis, jump: float) -> Tensor:
     """Return (1, new rows, new columns) of (1, H, W)."""
     mean, bend = _along(*_along(x, _bend(x), columns, -1), rows, -2)
     best = torch.full_like(mean, torch.inf)

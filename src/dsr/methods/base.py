@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
 from torch import Tensor
@@ -13,6 +14,20 @@ from dsr.utils.progress import Steps
 
 class NoSolutionError(ValueError):
     """A method has no answer for an image, through no fault of the image's: a result to report, as papers do."""
+
+
+@dataclass(frozen=True)
+class Cost:
+    """What a method costs, roughly, as measured on two CPU cores; a class says it as its attribute ``cost``.
+
+    Args:
+        memory: bytes for each pixel of the guide image.
+        seconds: for a million of these pixels.
+
+    """
+
+    memory: float
+    seconds: float
 
 
 class Upsampler(Protocol):

@@ -34,7 +34,7 @@ def build(group: str, node: Mapping[str, Any], given: Mapping[str, Any] | None =
         ConfigError: a key is unknown, missing or of another type, or the target refuses a value.
 
     """
-    target = _load(group, node)
+    target = load_target(group, node)
     parameters = inspect.signature(target).parameters
     hints = get_type_hints(target.__init__ if inspect.isclass(target) else target)
     given = {key: value for key, value in (given or {}).items() if key in parameters}
@@ -56,12 +56,12 @@ def build(group: str, node: Mapping[str, Any], given: Mapping[str, Any] | None =
 
 def takes(group: str, node: Mapping[str, Any], key: str) -> bool:
     """Return whether the target of a group has a parameter ``key``."""
-    return key in inspect.signature(_load(group, node)).parameters
+    return key in inspect.signature(load_target(group, node)).parameters
 
 
 def trait(group: str, node: Mapping[str, Any], name: str) -> Any:
     """Return an attribute of a group's target, such as ``optimises``; None where it has none."""
-    return getattr(_load(group, node), name, None)
+    return getattr(load_target(group, node), name, None)
 
 
 def with_key(message: str, group: str, parameters: Collection[str]) -> str:
@@ -76,8 +76,13 @@ def with_key(message: str, group: str, parameters: Collection[str]) -> str:
     return f"{group}.{message}" if message.partition(":")[0] in parameters else message
 
 
-def _load(group: str, node: Mapping[str, Any]) -> Any:
-    """Return the class or function that a group names."""
+def load_target(group: str, node: Mapping[str, Any]) -> Any:
+    """Return the class or function that a group names.
+
+    Raises:
+        ConfigError: it cannot be imported, or is no class or function.
+
+    """
     path = node.get("target")
     target = load_object(f"{group}.target", path, "a class or function")
     if not callable(target):

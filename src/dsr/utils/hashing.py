@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import importlib.util
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -31,3 +32,28 @@ def hash_of_code(names: Iterable[str]) -> str:
         for file in [path] if path.is_file() else sorted(path.rglob("*.py")):
             digest.update(file.relative_to(package).as_posix().encode() + b"\0" + file.read_bytes())
     return digest.hexdigest()
+
+
+def hash_outside_code(targets: Iterable[str]) -> str | None:
+    """Return a hash of the modules outside of this package that classes and functions come from; None for no such.
+
+    A module in a package stands for all modules in its folder and the folders below.
+
+    Args:
+        targets: dotted paths, ``module.name``.
+
+    """
+    own = dsr.__name__
+    modules = sorted({target.rpartition(".")[0] for target in targets if target.partition(".")[0] != own})
+    digest = hashlib.sha256()
+    for name in modules:
+        try:
+            spec = importlib.util.find_spec(name)
+        except (ImportError, ValueError):  # what cannot be imported is refused where it is built
+            continue
+        if spec is None or spec.origin is None:
+            continue
+        path = Path(spec.origin)
+        for file in [path] if "." not in name else sorted(path.parent.rglob("*.py")):
+            digest.update(file.name.encode() + b"\0" + file.read_bytes())
+    return digest.hexdigest()[:16] if modules else None

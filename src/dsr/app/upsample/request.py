@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
 from dsr.app.upsample.outputs import FORMATS, PARTS
-from dsr.inference import AUTO, METHODS
+from dsr.inference import AUTO, MethodChoice, check_settings
+from dsr.inference.planning import USUAL_SCALE
 from dsr.io.inputs import Reading
 from dsr.io.pairs import Pair
-from dsr.utils.hashing import file_hash
+from dsr.methods.registry import list_methods, read_method, target_paths
+from dsr.utils.hashing import file_hash, hash_outside_code
 
 
 @dataclass(frozen=True)
@@ -22,7 +25,7 @@ class UpsampleRequest:
         folders: to look for pairs in.
         rgb, depth, mask: files, or one folder each of the first two.
         reading: how the files are to be read.
-        method, scale, device, keep_holes: see :func:`dsr.inference.upsample_depth`.
+        method, settings, directories, scale, device, keep_holes: see :func:`dsr.inference.upsample_depth`.
         depth_format: of the result; None for the input's.
         parts: what to write, some of :data:`dsr.app.upsample.outputs.PARTS`.
         overwrite: whether to redo what is there.
@@ -37,6 +40,8 @@ class UpsampleRequest:
     mask: tuple[Path, ...] = ()
     reading: Reading = field(default_factory=Reading)
     method: str = AUTO
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    directories: tuple[Path, ...] = ()
     scale: int | None = None
     device: str = "auto"
     keep_holes: bool = False
@@ -48,7 +53,7 @@ class UpsampleRequest:
     def __post_init__(self) -> None:
         """Check what does not need the files."""
         for name, value, known in (
-            ("--method", self.method, (AUTO, *METHODS)),
+            ("--method", self.method, (AUTO, *list_methods(self.directories))),
             ("--format", self.depth_format, FORMATS),
         ):
             if value is not None and value not in known:
@@ -62,6 +67,16 @@ class UpsampleRequest:
             raise ValueError("expected --rgb and --depth, or folders that hold both")
         if self.folders and self.mask:
             raise ValueError("--mask: expected --rgb and --depth with it, got folders")
+        if self.settings:
+            self._check_settings()
+
+    def _check_settings(self) -> None:
+        """Check that the method takes the settings."""
+        try:
+            check_settings(MethodChoice(self.method, self.settings, self.directories))
+        except ValueError as error:
+            named = str(error).partition(":")[0] in self.settings
+            raise ValueError(f"--set {error}" if named else str(error)) from error
 
 
 def settings_of(wanted: UpsampleRequest) -> dict[str, Any]:
@@ -76,7 +91,18 @@ def settings_of(wanted: UpsampleRequest) -> dict[str, Any]:
         **reading,
         "fov": choice["fov"],
         "intrinsics": None if choice["intrinsics"] is None else list(choice["intrinsics"]),
+        **({"set": dict(wanted.settings)} if wanted.settings else {}),
+        **({"code": code} if (code := hash_outside_code(_targets(wanted))) else {}),
     }
+
+
+def _targets(wanted: UpsampleRequest) -> list[str]:
+    """Return the dotted paths of the code that the method's file names; none where the method is chosen later."""
+    if wanted.method == AUTO:
+        return []
+    return list(
+        target_paths(read_method(wanted.method, USUAL_SCALE, directories=wanted.directories), wanted.directories)
+    )
 
 
 def files_of(pair: Pair, reading: Reading) -> dict[str, Path]:

@@ -162,7 +162,7 @@ def _one(
     coarse_size = (picture.depth_lr.shape[-2], picture.depth_lr.shape[-1])
     method, suits = _method(picture, wanted)
     picture = replace(picture, assumptions=(*picture.assumptions, *suits))
-    planned = plan((picture.camera.height, picture.camera.width), coarse_size, wanted.scale, method)
+    planned = plan((picture.camera.height, picture.camera.width), coarse_size, wanted.scale, method, wanted.directories)
     reporter.facts(picture.assumptions)
     if wanted.dry_run:
         reporter.say(f"{pair.name}: {planned.text} -> {target}")
@@ -213,6 +213,8 @@ def _upsampled(job: _Job, picture: Picture, method: str, progress: Progress) -> 
             picture.camera,
             wanted.scale,
             method=method,
+            settings=wanted.settings,
+            directories=wanted.directories,
             device=wanted.device,
             keep_holes=wanted.keep_holes,
             progress=step,

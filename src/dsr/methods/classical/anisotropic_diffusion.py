@@ -23,14 +23,14 @@ What differs from the original:
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import torch
 from torch import Tensor
 from torch.nn import functional
 
 from dsr.geometry.camera import RangeType, from_range, to_range
-from dsr.methods.base import expect_limits
+from dsr.methods.base import Cost, expect_limits
 from dsr.methods.classical.convergence import CHECK_EVERY, Movement, history_of
 from dsr.methods.classical.finite_differences import box_mean, extend_linearly, upsample_linear_border
 from dsr.methods.networks.inpainting import inpaint
@@ -70,6 +70,7 @@ class AnisotropicDiffusion:
     """
 
     range_type: RangeType = "disparity"
+    cost: ClassVar[Cost] = Cost(120, 2)
 
     def __init__(
         self,

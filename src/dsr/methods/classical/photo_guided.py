@@ -14,11 +14,13 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
+from typing import ClassVar
 
 import torch
 from torch import Tensor
 
 from dsr.geometry.camera import RangeType, from_range, to_range
+from dsr.methods.base import Cost
 from dsr.methods.networks.inpainting import inpaint
 from dsr.methods.networks.maps import lr_coordinates
 from dsr.sample import DepthSample
@@ -82,6 +84,7 @@ class GuidedMethod(ABC):
     """
 
     range_type: RangeType = "disparity"
+    cost: ClassVar[Cost] = Cost(600, 2)
 
     def __init__(self, *, fill_holes: bool = False, slopes: bool = True) -> None:
         self._fill_holes = fill_holes

@@ -27,13 +27,13 @@ What differs from the original:
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import torch
 from torch import Tensor
 
 from dsr.geometry.camera import RangeType, from_range, to_range
-from dsr.methods.base import expect_limits
+from dsr.methods.base import Cost, expect_limits
 from dsr.methods.classical.convergence import CHECK_EVERY, Movement, history_of
 from dsr.methods.classical.finite_differences import (
     box_mean,
@@ -102,6 +102,7 @@ class TotalGeneralisedVariation:
     """
 
     range_type: RangeType = "disparity"
+    cost: ClassVar[Cost] = Cost(800, 60)
 
     def __init__(
         self,

@@ -23,6 +23,7 @@ from torch.utils.data import DataLoader
 
 from dsr.degradation.downsampling import Downsampling, scene_generator
 from dsr.geometry.camera import RangeType
+from dsr.methods.base import Cost
 from dsr.methods.dip.callbacks import Advance, Display, Keep, Provenance, Silent, checkpoint_of, cost_of_step
 from dsr.methods.dip.noise import estimate_noise, normal_noise_deg
 from dsr.methods.dip.optimisation import PriorOptimisation, PriorSettings
@@ -73,6 +74,7 @@ class DeepImagePrior:
 
     range_type: ClassVar[RangeType] = "orthogonal"
     optimises: ClassVar[bool] = True
+    cost: ClassVar[Cost] = Cost(2500, 2300)
 
     scale: int
     downsampling: Downsampling

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from importlib import resources
 from pathlib import Path
 from types import MappingProxyType
@@ -32,6 +33,7 @@ def build_trained(
     precision: Precision = "float32",
     device: torch.device | str = "cpu",
     ensemble: int | None = None,
+    networks: Mapping[str, type[DisparityNetwork]] = NETWORKS,
 ) -> NetworkUpsampler:
     """Return the method with the weights of a file.
 
@@ -44,6 +46,7 @@ def build_trained(
         device: where to compute.
         ensemble: see :class:`~dsr.methods.networks.base.NetworkUpsampler`; None for 4 with a file of ours and 1 with a
             published one, as it was published.
+        networks: the classes that files of ours may name, by :func:`~dsr.methods.networks.weight_files.network_name`.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -52,7 +55,7 @@ def build_trained(
     """
     weights = Path(weights)
     ours = variant is None or (weights.is_file() and is_ours(weights))
-    net = load_network(weights, NETWORKS, scale, model) if ours else load_msg_weights(weights, scale, variant)
+    net = load_network(weights, networks, scale, model) if ours else load_msg_weights(weights, scale, variant)
     if ensemble is None:
         ensemble = _OUR_ENSEMBLE if ours else 1
     return NetworkUpsampler(net, precision, device, ensemble)

@@ -30,13 +30,19 @@ def save_network(path: Path, net: DisparityNetwork, model: str, facts: Mapping[s
     """
     head = {
         "format": FORMAT,
-        "network": type(net).__name__,
+        "network": network_name(type(net)),
         "arguments": net.arguments(),
         "model": model,
         "facts": dict(facts or {}),
     }
     tensors = {name: value.detach().cpu().contiguous() for name, value in net.state_dict().items()}
     safetensors.torch.save_file(tensors, path, {_KEY: json.dumps(head, sort_keys=True)})
+
+
+def network_name(network: type[DisparityNetwork]) -> str:
+    """Return how a file of weights names a class: the package's by its name, others by their dotted path."""
+    inside = network.__module__.partition(".")[0] == __name__.partition(".")[0]
+    return network.__name__ if inside else f"{network.__module__}.{network.__qualname__}"
 
 
 def is_ours(path: Path) -> bool:

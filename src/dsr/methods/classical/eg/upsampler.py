@@ -36,10 +36,13 @@ pixels; for a statue before a wall at 512 x 512, 165 maps in total.
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 import torch
 from torch import Tensor
 
 from dsr.geometry.camera import RangeType, from_range, to_range
+from dsr.methods.base import Cost
 from dsr.methods.classical.eg.bilateral import bilateral_filter
 from dsr.methods.classical.eg.edge_map import predict_edge_map
 from dsr.methods.classical.photo_guided import expect_positive
@@ -74,6 +77,7 @@ class EdgeGuided:
     """
 
     range_type: RangeType = "disparity"
+    cost: ClassVar[Cost] = Cost(1500, 12)
 
     def __init__(
         self,

@@ -33,6 +33,7 @@ without the copy, may rise while the copy still differs. Holes have no data term
 from __future__ import annotations
 
 from pathlib import Path
+from typing import ClassVar
 
 import cv2
 import numpy as np
@@ -40,7 +41,7 @@ import torch
 from torch import Tensor
 
 from dsr.geometry.camera import RangeType
-from dsr.methods.base import expect_limits
+from dsr.methods.base import Cost, expect_limits
 from dsr.methods.classical.finite_differences import upsample_linear_border
 from dsr.methods.classical.srfs.admm import ShadingProblem, ShadingSolver, Weights
 from dsr.methods.networks.inpainting import inpaint
@@ -83,6 +84,7 @@ class ShapeFromShading:
     """
 
     range_type: RangeType = "orthogonal"
+    cost: ClassVar[Cost] = Cost(1300, 60)
 
     def __init__(
         self,

@@ -1,0 +1,32 @@
+"""Arguments of methods as the command line gives them, ``KEY=VALUE``."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import yaml
+from omegaconf import OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+
+def parse_settings(arguments: Sequence[str]) -> dict[str, Any]:
+    """Return arguments by name, their values read as YAML.
+
+    Args:
+        arguments: ``KEY=VALUE`` each.
+
+    Raises:
+        ValueError: an argument is of another form, or its value cannot be read.
+
+    """
+    settings: dict[str, Any] = {}
+    for argument in arguments:
+        key, equals, value = argument.partition("=")
+        if not equals or not key.isidentifier():
+            raise ValueError(f"--set {argument}: expected KEY=VALUE")
+        try:
+            settings |= OmegaConf.to_container(OmegaConf.from_dotlist([f"{key}={value}"]), resolve=True)  # type: ignore[arg-type]
+        except (yaml.YAMLError, OmegaConfBaseException) as error:
+            raise ValueError(f"--set {key}: expected a value as in a YAML file, got {value!r}") from error
+    return settings

@@ -1,0 +1,189 @@
+"""The methods that there are, and how one of them is built.
+
+A method is a file of ``conf/method``, in the project's configuration or in a directory of the user's: its ``target`` is
+the class or function that makes it, its other keys are the arguments. ``eval.py`` composes that file with Hydra;
+everything else reads it with :func:`read_method`. Both then call :func:`build_method`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import yaml
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from dsr.methods.base import Upsampler
+from dsr.methods.networks.base import DisparityNetwork
+from dsr.methods.networks.trained import NETWORKS, packaged_names, packaged_weights
+from dsr.methods.networks.weight_files import is_ours, network_name, read_head
+from dsr.utils.builder import ConfigError, build, load_target, takes
+from dsr.utils.config_files import config_directories, list_choices
+
+_NETWORK = "network"
+"""Key of a method's node: the dotted path of the network's class, where the method is what a training led to."""
+
+
+def list_methods(directories: Sequence[Path] = ()) -> list[str]:
+    """Return the names of all methods.
+
+    Args:
+        directories: the user's configuration directories.
+
+    """
+    return list_choices("method", config_directories(directories))
+
+
+def read_method(
+    name: str, scale: int, settings: Mapping[str, Any] | None = None, directories: Sequence[Path] = ()
+) -> dict[str, Any]:
+    """Return the node that describes a method, as plain values.
+
+    Args:
+        name: the method's name.
+        scale: the upsampling factor, which ``${scale}`` stands for.
+        settings: arguments to change, by name.
+        directories: the user's configuration directories.
+
+    Raises:
+        ConfigError: there is no such method, or its file cannot be read.
+
+    """
+    places = config_directories(directories)
+    names = list_choices("method", places)
+    if name not in names:
+        raise ConfigError(f"method: expected one of {', '.join(names)}, got {name!r}")
+    config = OmegaConf.create({"scale": scale, "seed": 0})
+    try:
+        config["method"] = OmegaConf.merge(_read_file("method", name, places, ()), dict(settings or {}))
+        plain: dict[str, Any] = OmegaConf.to_container(config, resolve=True)["method"]  # type: ignore[index,assignment,call-overload]
+    except OmegaConfBaseException as error:
+        raise ConfigError(f"method={name}: {str(error).splitlines()[0]}") from error
+    return plain
+
+
+def build_method(
+    node: Mapping[str, Any], scale: int, *, directories: Sequence[Path] = (), weights: Path | None = None, **given: Any
+) -> Upsampler:
+    """Return the method that a node describes.
+
+    Args:
+        node: of :func:`read_method`, or the group ``method`` of a composed configuration.
+        scale: the upsampling factor.
+        directories: the user's configuration directories.
+        weights: a file of weights, or a directory with the published files; None for those that the node names.
+        **given: what the run decides and the method's file does not, such as ``device``, ``precision``, ``seed`` and
+            ``downsampling``, the assumed model; a target gets those that its signature names.
+
+    Raises:
+        ConfigError: a key is unknown, missing or of another type, the method refuses a value, or there are no weights.
+
+    """
+    known = {**dict.fromkeys(("metrics", "workspace", "display")), "seed": 0, **given, "scale": scale}
+    if takes("method", node, "weights"):
+        known |= {"weights": find_weights(node, scale, weights), "networks": _networks(node, directories)}
+    arguments = {key: value for key, value in node.items() if key not in ("weights", _NETWORK)}
+    method: Upsampler = build("method", arguments, known)
+    return method
+
+
+def find_weights(node: Mapping[str, Any], scale: int, given: Path | None = None) -> Path:
+    """Return the file of weights of a method that takes one.
+
+    Args:
+        node: the method's; ``weights`` names its file, or ``weights_packaged`` one that comes with dsr.
+        scale: the upsampling factor, for the message.
+        given: a file of weights, or a directory in which ``weights_file`` is looked for; None for the node's own.
+
+    Raises:
+        ConfigError: there is none.
+
+    """
+    name, file = node["name"], node.get("weights_file")
+    if given is None and node.get("weights") is not None:
+        given = Path(str(node["weights"])).expanduser()
+    if given is None or (given.is_dir() and file is None):
+        return _packaged(node, scale)
+    if given.is_dir():
+        given = given / str(file)
+    if not given.is_file():
+        raise ConfigError(f"weights: expected a file of weights for method={name}, got {given} (no such file)")
+    return given
+
+
+def has_weights(node: Mapping[str, Any], scale: int) -> bool:
+    """Return whether the weights that a method's node names are there, for that scale."""
+    if node.get("weights") is not None:
+        path = Path(str(node["weights"])).expanduser()
+        return path.is_file() and (not is_ours(path) or read_head(path)["arguments"].get("scale") == scale)
+    wanted = node.get("weights_packaged")
+    return wanted is not None and packaged_weights(str(wanted)) is not None
+
+
+def target_paths(node: Mapping[str, Any], directories: Sequence[Path] = ()) -> Iterator[str]:
+    """Yield the dotted paths of a method's class or function and of its network's class."""
+    if "target" in node:
+        yield str(node["target"])
+    network = _network_path(node, directories)
+    if network is not None:
+        yield network
+
+
+def _packaged(node: Mapping[str, Any], scale: int) -> Path:
+    """Return the file of the weights that come with dsr."""
+    wanted = node.get("weights_packaged")
+    found = None if wanted is None else packaged_weights(str(wanted))
+    if found is not None:
+        return found
+    file, source = node.get("weights_file"), node.get("weights_source")
+    published = f", or a directory with {file} (from {source})" if file else ""
+    raise ConfigError(
+        f"weights: dsr comes with {', '.join(packaged_names())}; method={node['name']} at scale "
+        f"{scale} needs weights=FILE{published}"
+    )
+
+
+def _networks(node: Mapping[str, Any], directories: Sequence[Path]) -> dict[str, type[DisparityNetwork]]:
+    """Return the network classes that weights may name: the package's, and the one that the configuration names."""
+    path = _network_path(node, directories)
+    if path is None:
+        return dict(NETWORKS)
+    network = load_target("model", {"target": path})
+    return {**NETWORKS, network_name(network): network}
+
+
+def _network_path(node: Mapping[str, Any], directories: Sequence[Path]) -> str | None:
+    """Return the dotted path of the class of a method's network, from its node or from ``conf/model``."""
+    if node.get(_NETWORK) is not None:
+        return str(node[_NETWORK])
+    model, places = node.get("model"), config_directories(directories)
+    if model is None or model not in list_choices("model", places):
+        return None
+    target = _read_file("model", str(model), places, ()).get("target")
+    return None if target is None else str(target)
+
+
+def _read_file(group: str, name: str, places: Sequence[Path], above: tuple[str, ...]) -> DictConfig:
+    """Return the content of a group's file, merged with the files of its ``defaults``."""
+    path = next(
+        (place / group / f"{name}.yaml" for place in places if (place / group / f"{name}.yaml").is_file()), None
+    )
+    if path is None or name in above:
+        raise ConfigError(f"{group}: expected a file {name}.yaml that {above[-1]}.yaml begins with")
+    try:
+        own = OmegaConf.load(path)
+    except (OSError, yaml.YAMLError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: expected a readable YAML file, got {type(error).__name__}") from error
+    if not isinstance(own, DictConfig):
+        raise ConfigError(f"{path}: expected keys and values")
+    defaults = [str(each) for each in own.pop("defaults", [])]
+    parts = [
+        own if each == "_self_" else _read_file(group, each, places, (*above, name))
+        for each in (defaults if "_self_" in defaults else [*defaults, "_self_"])
+    ]
+    merged = OmegaConf.merge(*parts)
+    if not isinstance(merged, DictConfig):
+        raise ConfigError(f"{path}: expected keys and values")
+    return merged
