@@ -52,14 +52,14 @@ class Scene:
         """Check shapes and value ranges."""
         _expect_rgb(self.name, self.rgb, self.camera)
         if self.depth is None and not self.measured:
-            raise ValueError(f"{self.name}: expected a depth map, fine or measured, got none")
+            raise ValueError(f"{self.name}: expected a depth map, high-resolution or measured, got none")
         if self.depth is not None:
             _expect_depth(self.name, "depth", self.depth, (self.camera.height, self.camera.width))
-        for factor, coarse in self.measured.items():
+        for factor, depth in self.measured.items():
             if factor < 1:
                 raise ValueError(f"{self.name}: measured: expected a positive factor, got {factor}")
             size = (self.camera.height // factor, self.camera.width // factor)
-            _expect_depth(self.name, f"measured depth at x{factor}", coarse, size)
+            _expect_depth(self.name, f"measured depth at x{factor}", depth, size)
 
     def crop(self, top: int, left: int, height: int, width: int) -> Scene:
         """Return a window of the scene: ``height`` x ``width`` pixels from row ``top`` and column ``left`` on.

@@ -543,7 +543,7 @@ def test_empty_dataset_is_refused() -> None:
         ({"patch": 15}, "patch: expected at least 16 pixels, got 15"),
         ({"batch": 0}, "batch: expected a positive number, got 0"),
         ({"validation_scenes": -1}, "validation_scenes: expected 0 or more, got -1"),
-        ({"photo": 1.1}, "photo: expected a share from 0 to 1, got 1.1"),
+        ({"photo": 1.1}, "photo: expected a fraction from 0 to 1, got 1.1"),
         ({"depth_scale": -0.1}, "depth_scale: expected 0 to 3, got -0.1"),
         ({"workers": -1}, "workers: expected 0 or more, got -1"),
         ({"colour": -0.1}, "colour: expected 0 or more, got -0.1"),

@@ -119,7 +119,7 @@ def test_invalid_depth_map_is_refused_by_name(bad: Any, message: str) -> None:
 
 
 def test_scene_without_any_depth_is_refused() -> None:
-    with pytest.raises(ValueError, match=r"^hall: expected a depth map, fine or measured, got none"):
+    with pytest.raises(ValueError, match=r"^hall: expected a depth map, high-resolution or measured, got none"):
         _scene(depth=None)
 
 

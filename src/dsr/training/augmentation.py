@@ -46,7 +46,7 @@ class Augmentation:
         if not 0 <= self.colour < math.inf:
             raise ValueError(f"colour: expected 0 or more, got {self.colour}")
         if not 0 <= self.photo <= 1:
-            raise ValueError(f"photo: expected a share from 0 to 1, got {self.photo}")
+            raise ValueError(f"photo: expected a fraction from 0 to 1, got {self.photo}")
 
     def __call__(self, scene: Scene, random: np.random.Generator) -> tuple[Scene, float]:
         """Return the augmented scene and the factor by which its depth was multiplied."""

@@ -1,1 +1,1 @@
-"""The native file formats of data sets: a module each, one frame in, one Scene out."""
+"""Readers of the original formats of data sets, a module each; each reads a frame as a Scene."""

@@ -1,4 +1,4 @@
-"""Reading pictures, range maps and cameras from files: whatever is wrong is one line that names the file."""
+"""Readers of pictures, range maps and cameras, whose errors are one line that names the file."""
 
 from __future__ import annotations
 
@@ -243,9 +243,9 @@ def read_pixels(path: Path, flags: int) -> np.ndarray:
 
 
 class _QuietStderr:
-    """Keeps the decoders' own messages (libpng, OpenCV) off the terminal: our one line says it all.
+    """A context in which stderr is discarded, so that messages of decoders (libpng, OpenCV) are not shown.
 
-    Threads that decode at the same time share one silence: the first begins it and the last ends it.
+    Threads may be in it at the same time: the first redirects stderr and the last restores it.
     """
 
     def __init__(self) -> None:
@@ -271,5 +271,5 @@ _QUIET_STDERR = _QuietStderr()
 
 
 def quiet_decoders() -> _QuietStderr:
-    """Return a context in which nothing reaches stderr: what decoders say of damaged files is left to our own line."""
+    """Return a context in which messages of decoders about damaged files are not shown."""
     return _QUIET_STDERR

@@ -24,9 +24,9 @@ from dsr.sample import Scene
 
 CAMERA = Camera(640, 480, 481.2, -480.0, 319.5, 239.5)
 FARTHEST = 100.0
-"""Metres; no wall of the two rooms is as far, so a longer ray has met nothing."""
+"""Largest depth in metres; longer rays have hit nothing."""
 LEVELS = 5000
-"""Levels a metre of the depth pictures."""
+"""Levels per metre of the depth pictures."""
 _RENDERED = re.compile(r"scene_00_(\d+)\.depth")
 _SIZE = (480, 640)
 

@@ -1,6 +1,6 @@
-"""Matrices from MATLAB files: version 5 by its published description, 7.3 as the HDF5 that it is.
+"""Matrices from MATLAB files, of version 5 by its published description and of version 7.3 as HDF5.
 
-SciPy reads version 5, too, but a damaged file can end the whole process there.
+SciPy reads version 5, too, but a damaged file can crash the whole process there.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import numpy as np
 from dsr.utils.console import one_line
 
 _LARGEST = 1 << 26
-"""Numbers in a matrix that is read."""
+"""Largest number of elements of a matrix that is read."""
 _MATRIX, _COMPRESSED, _STRUCTURE = 14, 15, 2
 _STORED = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}
 _CLASSES = {6: "f8", 7: "f4", 8: "i1", 9: "u1", 10: "i2", 11: "u2", 12: "i4", 13: "u4", 14: "i8", 15: "u8"}
@@ -50,7 +50,7 @@ def read_variables(path: Path) -> dict[str, np.ndarray]:
 
 
 def _old_variables(content: bytes) -> dict[str, Any]:
-    """Return what a file of version 5 holds: matrices, structures as dictionaries, None for the rest."""
+    """Return the content of a file of version 5: matrices, structures as dictionaries, None for the rest."""
     order = {b"IM": "<", b"MI": ">"}.get(content[126:128])
     if order is None:
         raise ValueError("no header of MATLAB 5")
@@ -88,7 +88,7 @@ def _old_variable(content: bytes, order: str) -> tuple[str, Any]:
 
 
 def _elements(content: bytes, order: str) -> Iterator[tuple[int, bytes]]:
-    """Yield kind and content of the elements that stand one behind the other in a file of version 5."""
+    """Yield kind and content of the successive elements in a file of version 5."""
     at = 0
     while at < len(content):
         kind, length = struct.unpack_from(order + "II", content, at)

@@ -58,7 +58,7 @@ class Files:
 
 
 def find_2014(root: Path) -> dict[str, Path]:
-    """Return the folders of the scenes of 2014 below ``root``, by name in small letters, without ``-perfect``."""
+    """Return the folders of the scenes of 2014 below ``root``, by name in lower case, without ``-perfect``."""
     found: dict[str, Path] = {}
     for folder in sorted(path.parent for path in root.glob("*/calib.txt")):
         found.setdefault(re.sub(r"-(im)?perfect$", "", folder.name).casefold(), folder)  # imperfect sorts first
@@ -68,7 +68,7 @@ def find_2014(root: Path) -> dict[str, Path]:
 
 
 def find_levels(root: Path) -> dict[str, Files]:
-    """Return the files of the scenes of 2001 to 2006 below ``root``, by name in small letters.
+    """Return the files of the scenes of 2001 to 2006 below ``root``, by name in lower case.
 
     ``NAME/view1.png``, ``NAME/im2.png`` or ``.ppm`` with their disparity, or ``NAME_color.png`` and ``NAME_big.png``.
     """
@@ -122,7 +122,7 @@ def load_levels(files: Files, dataset: str, name: str, year: int, *, smooth: boo
         dataset: of the scene returned.
         name: the same.
         year: that of the data set, which says how levels count.
-        smooth: whether terraces of the rounding become slopes; see :mod:`dsr.data.preparation.dequantization`.
+        smooth: whether the steps of the rounding are smoothed; see :mod:`dsr.data.preparation.dequantization`.
 
     Raises:
         ValueError: a file is missing, damaged, or does not fit the others; the message names it.
@@ -135,11 +135,11 @@ def load_levels(files: Files, dataset: str, name: str, year: int, *, smooth: boo
     depth = _depth(files.disparity, (smooth_levels(levels) if smooth else levels) / per_pixel, camera)
     measured = {}
     for factor, path in files.measured.items():
-        coarse = camera.coarser(factor)
+        camera_lr = camera.coarser(factor)
         values = read_levels(path).astype(np.float64)
-        expect_size(path, values.shape, (coarse.height, coarse.width))
+        expect_size(path, values.shape, (camera_lr.height, camera_lr.width))
         values[values == 0] = np.nan
-        measured[factor] = _depth(path, values / (per_pixel * factor), coarse)
+        measured[factor] = _depth(path, values / (per_pixel * factor), camera_lr)
     return Scene(dataset, name, _photo(files.photo, camera), camera, depth, measured)
 
 

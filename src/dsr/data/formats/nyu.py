@@ -27,7 +27,7 @@ from dsr.sample import Scene
 
 CAMERA = Camera(640, 480, 518.85790117450188, 519.46961112127485, 325.58244941119034 - 1, 253.73616633400465 - 1)
 BORDER = (44, 40, 427, 561)
-"""First row, first column, height and width, from 0, of what the projected depth covers."""
+"""First row and column, from 0, height and width of the window that the projected depth covers."""
 _FRAME = MappingProxyType({
     "images": ((3, 640, 480), np.dtype(np.uint8)),
     "depths": ((640, 480), np.dtype(np.float32)),

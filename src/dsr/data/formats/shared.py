@@ -1,4 +1,4 @@
-"""What the readers of native formats share: numbers and pictures from files, checks that name the file."""
+"""Functions that several readers use: numbers and pictures from files, and checks whose errors name the file."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from dsr.data.formats.files import read_pixels
 from dsr.geometry.camera import Camera
 
 _LONGEST = 40
-"""Bytes that one number and the blank behind it may take."""
+"""Largest number of bytes of a number and the blank behind it."""
 _TEXT = re.compile(rb"[-+.\deEnaifNAIF\s]*")
 
 
@@ -44,7 +44,7 @@ def read_numbers(path: Path, count: int) -> np.ndarray:
 
 
 def read_bytes(path: Path, what: str) -> bytes:
-    """Return what is in a file.
+    """Return the content of a file.
 
     Raises:
         ValueError: there is none; ``what`` says what was expected.

@@ -30,7 +30,7 @@ SEQUENCES = MappingProxyType({
 })  # fmt: skip
 """Frames of each training sequence, 1064 in all."""
 FARTHEST = 1000.0
-"""Metres; what the files say of the sky is far beyond."""
+"""Largest depth in metres; the sky has a larger one."""
 _TAG = struct.pack("<f", 202021.25)
 _DPT_HEADER = struct.Struct("<4sii")
 _CAM_LENGTH = 4 + 8 * (9 + 12)
@@ -105,5 +105,5 @@ def load_frame(
 
 
 def _opening(content: bytes) -> str:
-    """Return what a foreign file is like, in words."""
+    """Return a description of a file of another kind."""
     return f"{len(content)} bytes that start with {content[:4]!r}"

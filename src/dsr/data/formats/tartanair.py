@@ -21,7 +21,7 @@ from dsr.sample import Scene
 
 CAMERA = Camera(640, 480, 320.0, 320.0, 320.0, 240.0)
 FARTHEST = 1000.0
-"""Metres; beyond it is sky."""
+"""Largest depth in metres; the sky has a larger one."""
 _SIZE = (480, 640)
 _COLOUR = re.compile(r"(\d{1,9})_left\.png")
 
@@ -80,7 +80,7 @@ def load_frame(rgb_path: Path, depth_path: Path, dataset: str, name: str, *, far
 
 
 def _header(path: Path) -> tuple[tuple[int, ...], np.dtype, int]:
-    """Return what a .npy file says of its shape and type, and how many bytes follow."""
+    """Return the shape and the type in the header of a .npy file, and the number of bytes behind it."""
     with path.open("rb") as file:
         try:
             version = np.lib.format.read_magic(file)

@@ -5,7 +5,7 @@
     benchmarking_dataset_NAME.mat     intensity, true depth, and the sensor's samples projected into the intensity image
     NAME.bmp, NAME_depth.bmp          intensity and samples in 8 bits; 0 = no sample, which 97.5 % of the pixels are
 
-No names of variables are published for the ``.mat`` files, so variables are told by their names and sizes, and may be
+No names of variables are published for the ``.mat`` files, so variables are recognised by their names and sizes, or
 named by the caller. Depths are orthogonal, in millimetres where their median exceeds 50, else in metres.
 
 In ``*_depth.bmp`` 255 is the farthest sample: the wall behind the objects is bright, and along Books the levels go with
