@@ -10,11 +10,13 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from dsr.app.entry import run_command
@@ -28,14 +30,32 @@ QUICK = (
 )  # fmt: skip
 
 
+Run = Callable[..., tuple[int, str, str]]
+
+
 def _command(*arguments: str) -> list[str]:
     return [sys.executable, str(REPOSITORY / "eval.py"), *QUICK, *arguments]
 
 
-def _run(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        _command(*arguments), cwd=folder, env=ENVIRONMENT, capture_output=True, text=True, timeout=120, check=False
-    )
+@pytest.fixture
+def run(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> Iterator[Run]:
+    """Return a runner of the command in this process: the exit code, the output and the errors."""
+    monkeypatch.setenv("HYDRA_FULL_ERROR", "1")
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)  # as in the processes that results are compared with
+
+    def call(folder: Path, *arguments: str, quick: Sequence[str] = QUICK) -> tuple[int, str, str]:
+        monkeypatch.chdir(folder)
+        monkeypatch.setattr(sys, "argv", ["eval.py", *quick, *arguments])
+        code = 0
+        try:
+            run_command(REPOSITORY / "conf", "eval", evaluate)
+        except SystemExit as ended:
+            code = int(ended.code or 0)
+        return code, *capfd.readouterr()
+
+    yield call
+    torch.set_num_threads(threads)
 
 
 def _depth(home: Path, scene: str) -> Any:
@@ -52,7 +72,10 @@ def _rows(home: Path) -> list[dict[str, str]]:
 def both(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, subprocess.CompletedProcess[str]]:
     """The run's directory and the finished process of an evaluation of two scenes."""
     folder = tmp_path_factory.mktemp("both")
-    done = _run(folder, "method=dip_v", "dataset.scenes=[statue,cube_no_texture]", "output_dir=out")
+    done = subprocess.run(
+        _command("method=dip_v", "dataset.scenes=[statue,cube_no_texture]", "output_dir=out"),
+        cwd=folder, env=ENVIRONMENT, capture_output=True, text=True, timeout=120, check=False,
+    )  # fmt: skip
     return folder / "out", done
 
 
@@ -86,26 +109,26 @@ def test_log_has_the_losses_all_scores_and_renderings(
 
 
 def test_result_does_not_depend_on_the_other_scenes_nor_on_their_order(
-    both: tuple[Path, subprocess.CompletedProcess[str]], tmp_path: Path
+    both: tuple[Path, subprocess.CompletedProcess[str]], tmp_path: Path, run: Run
 ) -> None:
     home, _ = both
-    assert _run(tmp_path, "method=dip_v", "dataset.scenes=[cube_no_texture]", "output_dir=one").returncode == 0
+    assert run(tmp_path, "method=dip_v", "dataset.scenes=[cube_no_texture]", "output_dir=one")[0] == 0
     assert np.array_equal(_depth(home, "cube_no_texture"), _depth(tmp_path / "one", "cube_no_texture"))
     order = "dataset.scenes=[cube_no_texture,statue]"
-    assert _run(tmp_path, "method=dip_v", order, "output_dir=turned", "method.validate_every=0").returncode == 0
+    assert run(tmp_path, "method=dip_v", order, "output_dir=turned", "method.validate_every=0")[0] == 0
     for scene in ("statue", "cube_no_texture"):
         assert np.array_equal(_depth(home, scene), _depth(tmp_path / "turned", scene))
 
 
-def test_second_run_reuses_what_is_there(both: tuple[Path, subprocess.CompletedProcess[str]]) -> None:
+def test_second_run_reuses_what_is_there(both: tuple[Path, subprocess.CompletedProcess[str]], run: Run) -> None:
     home, _ = both
-    again = _run(home.parent, "method=dip_v", "dataset.scenes=[statue,cube_no_texture]", "output_dir=out")
-    assert again.returncode == 0
-    assert "predictions re-used: 2" in again.stdout
-    assert "steps at" not in again.stdout
+    code, output, _ = run(home.parent, "method=dip_v", "dataset.scenes=[statue,cube_no_texture]", "output_dir=out")
+    assert code == 0
+    assert "predictions re-used: 2" in output
+    assert "steps at" not in output
 
 
-def test_interrupted_run_resumes_within_the_image(tmp_path: Path) -> None:
+def test_interrupted_run_resumes_within_the_image(tmp_path: Path, run: Run) -> None:
     arguments = ("method=dip_v", "dataset.scenes=[statue]", "method.steps=200", "method.validate_every=10")
     with subprocess.Popen(
         _command(*arguments, "output_dir=out"), cwd=tmp_path, env=ENVIRONMENT, stdout=subprocess.PIPE,
@@ -121,40 +144,41 @@ def test_interrupted_run_resumes_within_the_image(tmp_path: Path) -> None:
     assert step is not None, errors
     assert 10 <= int(step[1]) < 200
     assert (tmp_path / "out" / "optimisation" / "statue" / "last.ckpt").is_file()
-    done = _run(tmp_path, *arguments, "output_dir=out")
-    assert done.returncode == 0, done.stderr
-    assert "resumed" in done.stdout
-    assert _run(tmp_path, *arguments, "output_dir=whole").returncode == 0
+    code, output, errors = run(tmp_path, *arguments, "output_dir=out")
+    assert code == 0, errors
+    assert "resumed" in output
+    assert run(tmp_path, *arguments, "output_dir=whole")[0] == 0
     assert np.array_equal(_depth(tmp_path / "out", "statue"), _depth(tmp_path / "whole", "statue"))
     assert not (tmp_path / "out" / "optimisation" / "statue" / "last.ckpt").exists()
 
 
-def test_oracle_is_named_in_scores_and_table(tmp_path: Path) -> None:
-    done = _run(tmp_path, "method=dip", "dataset.scenes=[statue]", "method.stopping=oracle", "output_dir=out")
-    assert done.returncode == 0, done.stderr
-    assert "DIP (oracle) on simgeo" in done.stdout
+def test_oracle_is_named_in_scores_and_table(tmp_path: Path, run: Run) -> None:
+    given = ("method=dip", "dataset.scenes=[statue]", "method.stopping=oracle", "output_dir=out")
+    code, output, errors = run(tmp_path, *given)
+    assert code == 0, errors
+    assert "DIP (oracle) on simgeo" in output
     assert {row["method"] for row in _rows(tmp_path / "out")} == {"dip_oracle"}
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert summary["method"] == "dip_oracle"
 
 
-def test_holes_and_a_wrong_model_are_part_of_the_setting_name(tmp_path: Path) -> None:
+def test_holes_and_a_wrong_model_are_part_of_the_setting_name(tmp_path: Path, run: Run) -> None:
     given = ("method=dip", "dataset.scenes=[statue]", "method.validate_every=0", "output_dir=out")
-    done = _run(tmp_path, *given, "holes=blobs", "holes.size=3", "downsampling.assumed=nearest")
-    assert done.returncode == 0, done.stderr
+    code, _, errors = run(tmp_path, *given, "holes=blobs", "holes.size=3", "downsampling.assumed=nearest")
+    assert code == 0, errors
     table = _rows(tmp_path / "out")
     assert {row["downsampling"] for row in table} == {"box+assumed-nearest+blobs-0.1-3"}
     assert {row["valid_share"] for row in table} == {"1.0"}  # filled
     assert np.isfinite(_depth(tmp_path / "out", "statue")).all()
-    right = _run(tmp_path, *given[:-1], "output_dir=right", "holes=blobs", "holes.size=3")
-    assert right.returncode == 0
+    assert run(tmp_path, *given[:-1], "output_dir=right", "holes=blobs", "holes.size=3")[0] == 0
     assert not np.array_equal(_depth(tmp_path / "out", "statue"), _depth(tmp_path / "right", "statue"))
 
 
-def test_warm_start_works_by_default(tmp_path: Path) -> None:
-    done = _run(tmp_path, "method=dip_v_warm", "dataset.scenes=[statue]", "method.steps=3", "output_dir=out")
-    assert done.returncode == 0, done.stderr
-    assert "DIP-V (warm)" in done.stdout
+def test_warm_start_works_by_default(tmp_path: Path, run: Run) -> None:
+    given = ("method=dip_v_warm", "dataset.scenes=[statue]", "method.steps=3", "output_dir=out")
+    code, output, errors = run(tmp_path, *given)
+    assert code == 0, errors
+    assert "DIP-V (warm)" in output
 
 
 @pytest.mark.parametrize(
@@ -174,19 +198,11 @@ def test_warm_start_works_by_default(tmp_path: Path) -> None:
     ],
 )
 def test_usage_error_is_one_line_and_writes_nothing(
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capfd: pytest.CaptureFixture[str],
-    arguments: tuple[str, ...],
-    message: str,
+    tmp_path: Path, run: Run, arguments: tuple[str, ...], message: str
 ) -> None:
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("HYDRA_FULL_ERROR", "1")
     quick = QUICK if arguments[0].startswith("method=dip") else QUICK[:2]
-    monkeypatch.setattr(sys, "argv", ["eval.py", *quick, *arguments])
-    with pytest.raises(SystemExit) as ended:
-        run_command(REPOSITORY / "conf", "eval", evaluate)
-    assert ended.value.code == 2
-    [line] = capfd.readouterr().err.splitlines()
+    code, _, errors = run(tmp_path, *arguments, quick=quick)
+    assert code == 2
+    [line] = errors.splitlines()
     assert line.startswith(f"error: {message}")
     assert not list(tmp_path.iterdir())
