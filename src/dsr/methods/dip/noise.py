@@ -1,4 +1,4 @@
-"""How noisy a low-resolution depth map is, from the map alone, and what that does to its normals."""
+"""Estimates of the noise of a low-resolution depth map and of its normals."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from torch.nn import functional
 from dsr.geometry.camera import Camera
 
 _FRACTION, _QUANTILE = 0.1, 0.12566
-"""A tenth of a normal variable's absolute values are below that many standard deviations."""
+"""A tenth of a normal variable's absolute values are below this many standard deviations."""
 
 
 def estimate_noise(depth_lr: Tensor) -> float:
@@ -25,7 +25,7 @@ def estimate_noise(depth_lr: Tensor) -> float:
         depth_lr: (1, 1, h, w) in metres, NaN in holes.
 
     Returns:
-        0 where fewer than one 3 x 3 window is known.
+        Standard deviation of relative depth; 0 without a valid 3 x 3 window.
 
     """
     if min(depth_lr.shape[-2:]) < 3:

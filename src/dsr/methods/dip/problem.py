@@ -1,4 +1,4 @@
-"""What the optimisation of one image works on, and the loss that it lowers."""
+"""The tensors of one image that the optimisation uses, and its loss."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ class ImageProblem:
 
     @classmethod
     def of(cls, sample: DepthSample, downsampling: Downsampling, range_type: RangeType, device: torch.device) -> Self:
-        """Return the problem that a sample poses; its true depth is not looked at."""
+        """Return the problem of a sample; its true depth is not used."""
         known = sample.depth_lr[sample.mask_lr]
         min_depth, max_depth = float(known.min()), float(known.max())
         rgb = sample.rgb[None].to(device, torch.float32)
@@ -70,11 +70,11 @@ class ImageProblem:
         )
 
     def downsample(self, depth: Tensor) -> Tensor:
-        """Return what the model makes of high-resolution depth, (1, 1, H, W) to (1, 1, h, w), both in metres."""
+        """Downsample depth in metres by the assumed model, (1, 1, H, W) to (1, 1, h, w)."""
         return downsample_depth(depth, self.camera, self.scale, self.downsampling, self.range_type)[0]
 
     def residual(self, depth: Tensor) -> Tensor:
-        """Return the root mean square of D(depth) / coarse - 1 over the known low-resolution pixels, a scalar."""
+        """Return the RMS of D(depth) / depth_lr - 1 over the valid low-resolution pixels, a scalar."""
         ratio = self.downsample(depth) / self.depth_lr - 1
         known = ratio.isfinite()
         return (torch.where(known, ratio, 0).square().sum() / known.sum()).sqrt()
@@ -85,7 +85,7 @@ class PriorObjective:
     """The loss of Voynov et al. 2019 for image priors: a data term on LR depth, and the photo's reconstruction.
 
     L = c * data(D d / r, d_LR / r) + w * MSE_v(D d, d_LR) + w_I * Lap_1(intensity, photo), where r is the range of the
-    low-resolution depth. In holes of the low-resolution map nothing is asked of the depth.
+    low-resolution depth. Holes of the low-resolution map have no data term.
 
     Args:
         data_loss: ``mse`` for DIP, ``lap1`` for DIP-V.
@@ -139,7 +139,7 @@ class PriorObjective:
 
 
 def _levels(x: Tensor) -> int:
-    """Return as many levels of a Laplacian pyramid as a map has room for."""
+    """Return the number of levels of a Laplacian pyramid that a map has room for."""
     side, levels = min(x.shape[-2:]), 1
     while levels < _MAX_LEVELS and side >= 3 * 2**levels:
         levels += 1

@@ -1,8 +1,7 @@
-"""When to stop optimising one image, and which of the iterates to keep.
+"""Rules for when to stop the optimisation of one image, and which iterate to keep.
 
-An untrained network fits what is natural first and noise last. Where the input is noisy a good moment lies in between;
-where it is clean there may be none. Every rule sees a step's depth map and the running average of them all, which is
-the answer, and none but :class:`Oracle` ever sees the truth.
+An untrained network fits the image first and its noise last, so early stopping helps if the input is noisy. Every rule
+sees the depth map of each step and the running average, which is the result. Only :class:`Oracle` uses the true depth.
 """
 
 from __future__ import annotations
@@ -17,7 +16,7 @@ from dsr.methods.dip.noise import estimate_noise
 
 StoppingName = Literal["fixed", "variance", "residual", "oracle"]
 _EVERY = 20
-"""Steps between looks at a value on the device, each of which waits for it."""
+"""Steps between reads of a value from the device, each of which synchronises."""
 _RATE = 0.1
 _SETTLED = 50
 
@@ -41,7 +40,7 @@ class Stopping(Protocol):
         ...
 
     def result(self, average: Tensor) -> Tensor:
-        """Return the map to answer with, given the running average at the end."""
+        """Return the resulting map, given the running average at the end."""
         ...
 
     def state(self) -> dict[str, Tensor]:
@@ -49,19 +48,19 @@ class Stopping(Protocol):
         ...
 
     def restore(self, state: dict[str, Tensor]) -> None:
-        """Go on from a checkpoint's state."""
+        """Continue from the state of a checkpoint."""
         ...
 
 
 class Fixed:
-    """Never stops before the last step."""
+    """Never stop before the last step."""
 
     def observe(self, step: int, depth: Tensor, average: Tensor) -> bool:
-        """Go on."""
+        """Continue."""
         return False
 
     def judge(self, score: float, average: Tensor) -> None:
-        """Look away."""
+        """Ignore the score."""
 
     def result(self, average: Tensor) -> Tensor:
         """Return the average at the end."""
@@ -76,7 +75,7 @@ class Fixed:
 
 
 class Variance(Fixed):
-    """Stops when the exponential moving variance of the iterates has had its minimum: ES-EMV.
+    """Stop at the minimum of the exponential moving variance of the iterates (ES-EMV).
 
     Wang et al., *Early Stopping for Deep Image Prior*, TMLR 2023, algorithm 2, with the network's depth maps as the
     iterates. Keeps the average at the minimum.
@@ -118,13 +117,13 @@ class Variance(Fixed):
         return {name: getattr(self, f"_{name}").clone() for name in names}
 
     def restore(self, state: dict[str, Tensor]) -> None:
-        """Go on from such a state."""
+        """Continue from the state of a checkpoint."""
         for name, value in state.items():
             setattr(self, f"_{name}", value.clone().to(self._mean.device))
 
 
 class Residual(Fixed):
-    """Stops when the average explains the LR map as well as its noise allows: Morozov's discrepancy principle.
+    """Stop when the residual of the average reaches the noise level: Morozov's discrepancy principle.
 
     Args:
         depth_lr: (1, 1, h, w) low-resolution depth in metres, NaN in holes; its noise is estimated.
@@ -143,7 +142,7 @@ class Residual(Fixed):
 
 
 class Oracle(Fixed):
-    """Keeps the average that is nearest to the truth. No method: it shows what the best moment would be worth."""
+    """Keep the average closest to the true depth: an upper bound for stopping rules, not a method."""
 
     def __init__(self) -> None:
         self._lowest, self._best = torch.inf, torch.zeros(())
@@ -162,5 +161,5 @@ class Oracle(Fixed):
         return {"lowest": torch.tensor(self._lowest, dtype=torch.float64), "best": self._best.clone()}
 
     def restore(self, state: dict[str, Tensor]) -> None:
-        """Go on from such a state."""
+        """Continue from the state of a checkpoint."""
         self._lowest, self._best = float(state["lowest"]), state["best"].clone()

@@ -1,16 +1,16 @@
 """Facets: guided super-resolution by a mixture of planes, dsr's own network.
 
-What renderings show first is the error of normals on smooth surfaces: convolutions that write disparity pixel by pixel
-leave a faint texture there. A plane's disparity is linear in the pixel, so this network never writes disparity. Each
-low-resolution pixel proposes a few planes ("facets"), built from the differences to its neighbours; each
-high-resolution pixel takes the planes of the 3 x 3 low-resolution pixels around it, extended to where it is, and the
-photo decides whose count how much. Three properties hold whatever the weights are: a planar surface is reproduced
-exactly, a constant added to the disparity or a factor applied to it comes out again, and nothing overshoots the
-extended planes.
+Renderings are most sensitive to errors of normals on smooth surfaces, where convolutions that predict disparity pixel
+by pixel leave a faint texture. The disparity of a plane is linear in the pixel, so this network predicts planes
+instead. Each low-resolution pixel proposes a few planes ("facets"), built from the differences to its neighbours. Each
+high-resolution pixel mixes the planes of the 3 x 3 low-resolution pixels around it, extended to its position, with
+weights predicted from the colour image; at an edge the network switches from one plane to another. Three properties
+hold for any weights: planes are reproduced exactly, the network commutes with an affine map of the disparity, and the
+result does not overshoot the extended planes.
 
-Each low-resolution pixel's planes may leave the differences that they come from by no more than a multiple of the local
-*bend* (the largest second difference around it), which is 0 where the surface is planar, and large beside a depth step,
-where the low-resolution value mixes both sides.
+The planes of a low-resolution pixel differ from the differences that they are built from by at most a multiple of the
+local *bend* (the largest second difference around it). The bend is 0 on planes, and large beside a depth step, where
+the low-resolution value mixes both sides.
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ from dsr.methods.networks.base import NormalisedNetwork, expect_photo
 
 _NEIGHBOURS = 9
 _FULL, _HALF = 16, 32
-"""Channels of the photo's features at the full and at half the resolution."""
+"""Channels of the image's features at the full and at half the resolution."""
 _HEAD = 24
 _FAINT, _STRONG = 1e-3, 0.25
-"""Differences of normalised disparity that become about 1 in the network's input, compressed and as they are."""
+"""Differences of normalised disparity that become about 1 in the network's compressed and linear inputs."""
 
 
 class Stencil(NamedTuple):
@@ -49,7 +49,7 @@ class Stencil(NamedTuple):
 
 
 def stencil(values: Tensor) -> Stencil:
-    """Return the differences of (B, 1, h, w) maps; beyond the border a map goes on linearly."""
+    """Return the differences of (B, 1, h, w) maps, which are extrapolated linearly beyond the border."""
     padded = extend_linearly(values, 1)  # (B, 1, h + 2, w + 2)
     left, here, right = padded[..., 1:-1, :-2], padded[..., 1:-1, 1:-1], padded[..., 1:-1, 2:]
     above, below = padded[..., :-2, 1:-1], padded[..., 2:, 1:-1]
@@ -68,9 +68,9 @@ class Facets(NormalisedNetwork):
         scale: upsampling factor, 2, 4, 8 or 16.
         width: channels at the low resolution.
         blocks: residual blocks there.
-        facets: planes that each low-resolution pixel proposes.
-        slopes: whether planes have slopes; without them each is a constant, and the network predicts an interpolation
-            kernel for each pixel. For comparison: renderings show why it needs them.
+        facets: number of planes that each low-resolution pixel proposes.
+        slopes: whether planes have slopes; if not, each is a constant, and the network predicts an interpolation kernel
+            for each pixel (an ablation).
 
     Raises:
         ValueError: a value is out of range.
@@ -118,22 +118,23 @@ class Facets(NormalisedNetwork):
     def reach(self) -> int:
         """How many low-resolution pixels around its own an output depends on.
 
-        One for its planes' neighbours and what follows the trunk, two for each residual block, one each for the planes'
-        and the low-resolution map's convolutions, two for the differences; the photo's features look less far.
+        One for the neighbours' planes and the layers after the trunk, two for each residual block, one for each
+        convolution of the planes and of the low-resolution map, two for the differences; the image's features have a
+        smaller receptive field.
         """
         return 2 * self.blocks + 6
 
     def context(self, rgb: Tensor) -> tuple[Tensor, ...]:
-        """Return the photo's mean colour, (B, 3, 1, 1)."""
+        """Return the mean colour of the image, (B, 3, 1, 1)."""
         return (_mean(rgb),)
 
     def forward(self, rgb: Tensor, values: Tensor, mean: Tensor | None = None) -> Tensor:
-        """Map a photo and normalised low-resolution disparity to high-resolution disparity.
+        """Map an image and normalised low-resolution disparity to high-resolution disparity.
 
         Args:
             rgb: (B, 3, H, W).
             values: (B, 1, h, w).
-            mean: (B, 3, 1, 1) colour of the photo that this is a window of; None for that of ``rgb`` itself.
+            mean: (B, 3, 1, 1) mean colour of the image that ``rgb`` is a window of; None for that of ``rgb``.
 
         Returns:
             (B, 1, H, W).
@@ -152,12 +153,12 @@ class Facets(NormalisedNetwork):
         return self._mix_planes(planes, self.choice(x))
 
     def _propose_planes(self, output: Tensor, around: Stencil) -> Tensor:
-        """Return the planes of each LR pixel, (B, facets, 3, h, w): value at its centre, slopes along u and v."""
+        """Return the planes of each low-resolution pixel, (B, facets, 3, h, w): value at its centre and slopes."""
         output = output.to(torch.promote_types(around.value.dtype, torch.float32))
         batch, _, height, width = output.shape
         moves, picks = output.split((3 * self.facets, 6), dim=1)
         picks = picks.unflatten(1, (2, 3))
-        first = picks.new_tensor([0.0, 2.0, 0.0])[:, None, None]  # before training: the central difference, mostly
+        first = picks.new_tensor([0.0, 2.0, 0.0])[:, None, None]  # mostly the central difference at first
         picks = (picks + first).softmax(dim=2)
         differences = torch.stack((around.along_u, around.along_v), dim=1)  # (B, 2, 3, h, w)
         slopes = (picks * differences).sum(dim=2)  # (B, 2, h, w)
@@ -186,7 +187,7 @@ class Facets(NormalisedNetwork):
 
 
 class _Residual(nn.Module):
-    """x + conv(relu(conv(x))), near the identity at first."""
+    """x + conv(relu(conv(x))), initialised close to the identity."""
 
     def __init__(self, width: int) -> None:
         super().__init__()
@@ -201,7 +202,7 @@ class _Residual(nn.Module):
 
 
 def _scale_down(conv: nn.Conv2d) -> nn.Conv2d:
-    """Return a convolution whose output is small at first."""
+    """Return the convolution with small initial weights."""
     with torch.no_grad():
         conv.weight.mul_(0.1)
     if conv.bias is not None:
@@ -215,13 +216,13 @@ def _mean(rgb: Tensor) -> Tensor:
 
 
 def _rgb_input(rgb: Tensor, mean: Tensor | None = None) -> Tensor:
-    """Return (B, 4, H, W): the colours, and how much brighter than the picture's mean a pixel is."""
+    """Return (B, 4, H, W): the colours, and the brightness relative to the image's mean."""
     brightness = (rgb - (_mean(rgb) if mean is None else mean)).mean(dim=1, keepdim=True)
     return torch.cat((rgb - 0.5, 2 * brightness), dim=1)
 
 
 def _lr_input(around: Stencil) -> Tensor:
-    """Return (B, 10, h, w): differences, once compressed so that faint ones count, once as they are; and directions."""
+    """Return (B, 10, h, w): differences compressed so that small ones count, linear differences, and directions."""
     differences = torch.cat(
         (around.value - around.mean, around.along_u[:, 1:2], around.along_v[:, 1:2], around.bend), dim=1
     ).float()
@@ -238,7 +239,7 @@ def _gather_neighbours(planes: Tensor) -> Tensor:
         planes: (B, facets, 3, h, w).
 
     Returns:
-        (B, 9, facets, 3, h, w), row by row; beyond the border a pixel's own planes.
+        (B, 9, facets, 3, h, w), row by row; a pixel's own planes in place of those beyond the border.
 
     """
     value, slope_u, slope_v = planes.unbind(dim=2)  # (B, facets, h, w)
@@ -266,7 +267,7 @@ def _steps(size: int, step: int, like: Tensor) -> Tensor:
 def _spline_logits(offsets: Tensor) -> Tensor:
     """Return the logarithm of the quadratic B-spline's weights of the 3 x 3 neighbours, (9, scale, scale).
 
-    A little is added to each, so that no neighbour is out of reach.
+    A small constant is added to each weight, so that no neighbour is excluded.
     """
     one = torch.stack((0.5 * (0.5 - offsets) ** 2, 0.75 - offsets**2, 0.5 * (0.5 + offsets) ** 2))  # (3, scale)
     both = one[:, None, :, None] * one[None, :, None, :]

@@ -1,4 +1,4 @@
-"""Holes of low-resolution maps, for networks that need a value everywhere."""
+"""Inpainting of holes in low-resolution maps, for methods that need a value everywhere."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from torch.nn import functional
 
 
 def inpaint(x: Tensor) -> Tensor:
-    """Return (B, 1, h, w) with its non-finite values replaced by the mean of the known in their 3 x 3, from outside in.
+    """Replace the non-finite values of (B, 1, h, w) by the mean of the valid ones in 3 x 3 pixels, from outside in.
 
-    An image without a known value stays as it is.
+    An image without a valid value stays unchanged.
     """
     valid = x.isfinite()
     if bool(valid.all()):

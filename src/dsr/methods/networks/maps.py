@@ -1,4 +1,4 @@
-"""What several networks do with a map before and after: normalise, smooth, interpolate."""
+"""Operations on maps that several networks share: normalise, smooth, interpolate."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from dsr.geometry.camera import Camera
 
 
 class Normalised(NamedTuple):
-    """A map brought to 0..1 per sample, (B, 1, H, W), and the minimum and span (B, 1, 1, 1) to undo it with."""
+    """A map normalised to 0..1 per sample, (B, 1, H, W), and its minimum and range, (B, 1, 1, 1), to undo it."""
 
     values: Tensor
     minimum: Tensor
@@ -22,11 +22,11 @@ class Normalised(NamedTuple):
 def normalise(x: Tensor, bounds: Tensor | None = None) -> Normalised:
     """Return (x - min) / (max - min) per sample of (B, 1, H, W), over the finite values; the others become 0.
 
-    A constant map becomes 0 with a span of 0. Where nothing is finite the minimum is NaN.
+    A constant map becomes 0 with a range of 0. Without a finite value, the minimum is NaN.
 
     Args:
-        x: the map.
-        bounds: (B, 2, 1, 1) minimum and maximum to use instead of the map's own.
+        x: (B, 1, H, W) map.
+        bounds: (B, 2, 1, 1) minimum and maximum to use; None for those of the map.
 
     """
     valid = x.isfinite()
@@ -38,9 +38,9 @@ def normalise(x: Tensor, bounds: Tensor | None = None) -> Normalised:
 
 
 def min_max(x: Tensor) -> Tensor:
-    """Return the lowest and the highest finite value of each map of (B, 1, H, W), (B, 2, 1, 1).
+    """Return the minimum and the maximum finite value of each map of (B, 1, H, W), (B, 2, 1, 1).
 
-    Infinity and minus infinity where nothing is finite.
+    They are infinity and minus infinity for a map without a finite value.
     """
     valid, dims = x.isfinite(), (-3, -2, -1)
     lowest = x.masked_fill(~valid, torch.inf).amin(dims, keepdim=True)
@@ -48,21 +48,21 @@ def min_max(x: Tensor) -> Tensor:
 
 
 def mean3x3(x: Tensor) -> Tensor:
-    """Return the 3 x 3 mean of (B, 1, H, W); borders are mirrored, edge pixels repeated."""
+    """Return the 3 x 3 mean of (B, 1, H, W); edge pixels are repeated."""
     return functional.avg_pool2d(functional.pad(x, (1, 1, 1, 1), mode="replicate"), 3, stride=1)
 
 
 def upsample_bicubic(x: Tensor, scale: int) -> Tensor:
     """Upsample (B, 1, h, w) to (B, 1, scale h, scale w): Keys' cubic kernel with a = -0.5, as Pillow resizes.
 
-    Beyond the border the kernel is cut off and renormalised.
+    At the border, the kernel is truncated and renormalised.
     """
     size = [scale * n for n in x.shape[-2:]]
     return functional.interpolate(x, size=size, mode="bicubic", align_corners=False, antialias=True)
 
 
 def lr_coordinates(camera: Camera, camera_lr: Camera, device: torch.device | str = "cpu") -> tuple[Tensor, Tensor]:
-    """Return the LR row of each HR row, (H,), and the LR column of each HR column, (W,), in float64."""
+    """Return the low-resolution row of each high-resolution row, (H,), and likewise the columns, (W,), in float64."""
     rows = torch.arange(camera.height, dtype=torch.float64, device=device)
     columns = torch.arange(camera.width, dtype=torch.float64, device=device)
     return (

@@ -1,13 +1,13 @@
-"""How a photo follows from depth: Lambertian shading under light of first-order spherical harmonics.
+"""The image formation model: Lambertian shading under first-order spherical harmonics lighting.
 
 Haefner, Quéau, Möllenhoff and Cremers, *Fight Ill-Posedness with Ill-Posedness: Single-shot Variational Depth
 Super-Resolution from Shading*, CVPR 2018, section 3: in each channel
 
-    photo = albedo * (l_1 n_x + l_2 n_y + l_3 n_z + l_4),    n = m / |m|,    m = (p, q, -z - x p - y q),
+    rgb = albedo * (l_1 n_x + l_2 n_y + l_3 n_z + l_4),    n = m / |m|,    m = (p, q, -z - x p - y q),
 
 with the depth z, its slopes p = fx dz/du and q = fy dz/dv, and the ray (x, y, 1) of the pixel. m is the normal that
-faces the camera, by its length a surface element: a pixel sees the area z |m| / (fx fy), whose sum is the prior on the
-shape. z is any multiple of metres; m scales along and n does not.
+faces the camera, and its length gives the surface element: a pixel sees the area z |m| / (fx fy), whose sum is the
+prior on the shape. z may be any multiple of depth in metres: m scales with it, n does not.
 
 Shapes are (B, 3, H, W) for (p, q, z), called theta as in the paper, and for normals; (B, C, H, W) for photos and
 albedos; (B, C, 4) for lighting.
@@ -23,7 +23,7 @@ from torch import Tensor
 from dsr.geometry.surface import length
 
 _TINY = 1e-12
-"""Least length of m, so that a normal is never a division by 0."""
+"""Minimum length of m, which avoids division by 0."""
 
 
 class Surface(NamedTuple):
@@ -34,14 +34,14 @@ class Surface(NamedTuple):
 
 
 class Photometry(NamedTuple):
-    """What the photo says of theta, (B, C, H, W), and its derivatives by theta, (B, C, 3, H, W)."""
+    """The photometric residual, (B, C, H, W), and its derivatives by theta, (B, C, 3, H, W)."""
 
     residual: Tensor
     slopes: Tensor
 
 
 def compute_surface(theta: Tensor, rays: Tensor) -> Surface:
-    """Return normals and the lengths that they had.
+    """Return the normals, and the lengths of m.
 
     Args:
         theta: (B, 3, H, W), slopes along u and v and depth.
@@ -60,7 +60,7 @@ def compute_shading(normals: Tensor, lighting: Tensor) -> Tensor:
 
 
 def linearise_photometry(rgb: Tensor, albedo: Tensor, lighting: Tensor, surface: Surface, rays: Tensor) -> Photometry:
-    """Return albedo * shading - photo and its derivatives: albedo (l - (l . n) n) / |m| times those of m."""
+    """Return albedo * shading - rgb and its derivatives: albedo (l - (l . n) n) / |m| times those of m."""
     n = surface.normals
     directed = torch.einsum("bck,bkhw->bchw", lighting[..., :3], n)
     across = (lighting[..., :3, None, None] - directed[:, :, None] * n[:, None]) * (albedo / surface.length)[:, :, None]
@@ -69,27 +69,27 @@ def linearise_photometry(rgb: Tensor, albedo: Tensor, lighting: Tensor, surface:
 
 
 def chain_to_theta(by_m: Tensor, rays: Tensor) -> Tensor:
-    """Turn derivatives by m into those by theta, (..., 3, H, W)."""
+    """Convert derivatives by m to derivatives by theta, (..., 3, H, W)."""
     x, y = rays[0, 0], rays[0, 1]
     along_u, along_v, ahead = by_m.unbind(dim=-3)
     return torch.stack((along_u - x * ahead, along_v - y * ahead, -ahead), dim=-3)
 
 
 def compute_area(theta: Tensor, surface: Surface) -> Tensor:
-    """Return z |m|, (B, 1, H, W): fx fy times the area of what a pixel sees."""
+    """Return z |m|, (B, 1, H, W): fx fy times the surface area that a pixel sees."""
     return theta[:, 2:].abs() * surface.length
 
 
 def fit_lighting(rgb: Tensor, albedo: Tensor, normals: Tensor, inside: Tensor) -> Tensor:
     """Return the lighting with the least squared error in each channel, (B, C, 4) float64.
 
-    Where normals do not determine it, as on a plane, that of least length among the best.
+    If the normals do not determine it, as on a plane, it is the one of minimum norm.
 
     Args:
         rgb: (B, C, H, W).
-        albedo: likewise.
+        albedo: (B, C, H, W).
         normals: (B, 3, H, W).
-        inside: (B, 1, H, W), the weight of each pixel.
+        inside: (B, 1, H, W) weight of each pixel.
 
     """
     ones = torch.ones_like(normals[:, :1])
@@ -101,4 +101,4 @@ def fit_lighting(rgb: Tensor, albedo: Tensor, normals: Tensor, inside: Tensor) -
 
 
 _RANK = 1e-10
-"""Directions of the light that are seen by less than this share of the best seen are not determined."""
+"""Relative cutoff of singular values, below which a direction of the light is not determined."""

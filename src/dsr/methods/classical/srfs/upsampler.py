@@ -11,23 +11,24 @@ the penalty growing, over albedo, lighting, theta = (z, grad z), z and the multi
 The energy per pixel, with intensities in [0, 1] and z in pixels (times the focal length f, by the median depth):
 
     1/2 |albedo * shading - photo|^2 + area_weight * z |m| + boundary_weight * boundaries
-    + data_weight / (2 scale^2) * (mean z - coarse)^2.
+    + data_weight / (2 scale^2) * (mean z - lr)^2.
 
 What differs from the original, besides what those modules name:
 
 - Weights. Its code (mu = 0.1, nu = 1e-4, lambda = 1, doubling the penalty 1e-4 each time) has, in these units at x4
-  with f = 500: data_weight 0.0015, area_weight 1e-7 and boundary_weight 0.5. So weak a data term follows the
-  low-resolution map from hundreds of pixels on, and every texture that the albedo leaves becomes relief. Ours were
-  chosen on procedural scenes and on a bumpy surface under known light. With area_weight = 0.02 such a surface has half
-  the error that 0.2 leaves; with 1 rooms, where depth steps and texture rule, are a tenth better.
-- Each channel has a light of its own; in its code they share one. Albedos are between 0 and 2.
+  with f = 500: data_weight 0.0015, area_weight 1e-7 and boundary_weight 0.5. With so weak a data term the result
+  follows the low-resolution map only over hundreds of pixels, and texture that the albedo does not explain becomes
+  relief. Ours were chosen on procedural scenes and on a bumpy surface under known light. With area_weight = 0.02 such a
+  surface has half the error that 0.2 leaves; with 1 rooms, where depth steps and texture rule, are a tenth better.
+- Each channel has a light of its own; in the original code they share one. Albedos are between 0 and 2.
 - The penalty of the copy of z is weighted by 1 / scale^2: with 1 a step spreads over a pixel, and blocks have several.
 - theta by Levenberg and Marquardt's method, its 3 x 3 systems solved in closed form, instead of BFGS; z by plain
   conjugate gradients; it starts from the bicubic map, not smoothed first.
-- Outside the foreground the first map stays, and holds the blocks that the border cuts; there, blocks are cut instead.
+- Outside the foreground the initial map stays unchanged, including in blocks that cross its border; the original cuts
+  these blocks.
 
-The albedo's, the lighting's, theta's and z's step each lower the augmented Lagrangian; the energy itself, logged of z
-without the copy, may rise while the copy still differs. Holes have no data term and start from what surrounds them.
+The steps of albedo, lighting, theta and z each lower the augmented Lagrangian. The energy itself, logged for z without
+the copy, may rise while the copy still differs. Holes have no data term, and start from inpainted values.
 """
 
 from __future__ import annotations
@@ -49,34 +50,34 @@ from dsr.sample import DepthSample
 from dsr.utils.progress import Steps
 
 _RENEW = 10
-"""Regions of the albedo are sought anew every so many iterations; in between, each takes its best albedo."""
+"""Iterations between two searches for the regions of the albedo."""
 _NEARER = 4.0
-"""How many times nearer than the nearest known low-resolution pixel an answer may be."""
+"""Factor by which a result may be nearer than the nearest valid low-resolution pixel."""
 _WHITE = 127
-"""Above it, a pixel of a mask is white."""
+"""Value of a mask above which a pixel is white."""
 
 
 class ShapeFromShading:
     """Variational super-resolution from shading.
 
-    Holes of the input are filled. Memory: about 130 float64 maps of the photo's size. It takes the low-resolution map
-    for block means of depth.
+    Holes of the input are inpainted. Memory: about 130 float64 maps of the image's size. The low-resolution map is
+    assumed to hold block means of depth.
 
     Args:
-        iterations: at most so many.
-        tolerance: it stops where, in an iteration, the energy changes by less than this share and theta misses slopes
-            by less than this (RMS).
+        iterations: maximum number of iterations.
+        tolerance: relative change of the energy in an iteration, and RMS difference of theta and the slopes, below
+            which it stops.
         data_weight: weight of the low-resolution map (mu).
         area_weight: weight of the surface's area (nu).
         boundary_weight: weight of the albedo's boundaries (lambda).
-        penalty: the first one of what theta misses (kappa).
-        growth: what the penalty is multiplied with in each iteration.
-        foreground: a folder of masks, SCENE.png of the photo's size, white where the object is; null: everywhere.
+        penalty: initial penalty of the difference of theta and the slopes (kappa).
+        growth: factor of the penalty in each iteration.
+        foreground: folder of masks SCENE.png of the image's size, white at the object; None for the whole image.
 
     Attributes:
         history: of the last call, each iteration's ``objective``, its terms ``shading``, ``data``, ``area`` and
-            ``boundaries``, the ``residual`` (what theta misses of slopes, RMS) and how far z has ``moved`` (RMS, of
-            the median depth).
+            ``boundaries``, the ``residual`` (RMS difference of theta and the slopes) and the movement of z, ``moved``
+            (RMS, relative to the median depth).
 
     Raises:
         ValueError: a value is out of range, or there is no such folder.
@@ -116,14 +117,14 @@ class ShapeFromShading:
 
     @torch.inference_mode()
     def __call__(self, sample: DepthSample, progress: Steps | None = None) -> Tensor:
-        """Return the high-resolution depth, (1, H, W) in metres, on the sample's device and without holes.
+        """Return high-resolution depth without holes, (1, H, W) in metres on the sample's device.
 
         Args:
             sample: the problem.
-            progress: is told the iterations done and the most that it may take.
+            progress: is called with the iterations done and their maximum.
 
         Raises:
-            ValueError: the sample's mask is missing or no picture of its size.
+            ValueError: the sample's mask is missing, or is no image of its size.
 
         """
         self.history = []
@@ -146,7 +147,7 @@ class ShapeFromShading:
         return (solver.z[0] * metres).clamp(min=nearest).to(sample.depth_lr.dtype)
 
     def prepare(self, sample: DepthSample) -> tuple[ShadingSolver, float]:
-        """Return the solver of a sample before its first step, and the metres that its unit of depth is."""
+        """Return the solver of a sample before its first step, and its unit of depth in metres."""
         lr = sample.depth_lr[None].double()
         camera = sample.camera
         unit = (camera.fx * camera.fy) ** 0.5
@@ -205,7 +206,7 @@ def read_foreground(path: Path, size: tuple[int, int]) -> np.ndarray:
 
 
 def _diagnostics(solver: ShadingSolver, before: Tensor) -> dict[str, float]:
-    """Return the energy and how far the variables are from agreeing and from standing still."""
+    """Return the terms of the energy, the residual of the splitting and the movement of z."""
     terms = solver.terms()
     missed = (solver.slopes(solver.z) - solver.theta)[:, :2]
     moved = float((solver.z - before).square().mean().sqrt()) / solver.problem.unit
