@@ -2,32 +2,32 @@
 
 Gu, Zuo, Guo, Chen, Chen and Zhang, *Learning Dynamic Guidance for Depth Image Enhancement*, CVPR 2017; extended as
 *Learned Dynamic Guidance for Depth Image Reconstruction*, TPAMI 2020. Their weighted analysis representation model
-penalises what filters k_l say of the map x, where the photo g weighs the penalty at each pixel i,
+penalises the responses of filters k_l on the map x, with weights at each pixel i from the image g,
 
     E(x) = sum over l and i of w_l(g)_i rho_l((k_l * x)_i),
 
-beside a data term. Its minimisation by gradient descent is cut after a few steps, the *stages*, and each stage has
-filters, penalties and weights of its own: the guidance is dynamic, for it changes as the map gets better. They are
-learned from what the stages give (task-driven), by back-propagation. A stage here is
+besides a data term. Its minimisation by gradient descent is truncated after a few steps, the *stages*. Each stage has
+filters, penalties and weights of its own: the guidance is dynamic, because it changes as the map improves. They are
+learned from the result of the stages (task-driven), by back-propagation. A stage here is
 
     y = x - fidelity * U(A x - d),    A x the block means, d the low-resolution map, U bicubic upsampling,
     x = y - sum over l of k_l' (w_l(g) rho_l'(k_l y)),    the gradient step of E, step size 1,
 
 with k_l y at the positions where the filter lies inside, and k_l' the adjoint. w_l(g) = exp(-sum over m of c_lm
-(b_m * g)^2) lies in 0..1, with filters b_m on the photo's three colours and c_lm >= 0: where the photo has an edge the
-map may break. For k_l and rho_l see :mod:`dsr.methods.networks.analysis_filters`.
+(b_m * g)^2) lies in 0..1, with filters b_m on the three colours and c_lm >= 0: the map may jump
+at an edge of the image. For k_l and rho_l see :mod:`dsr.methods.networks.analysis_filters`.
 
 What differs from the original:
 
-- Filters answer a plane with 0, so that planes are reproduced under any photo. With filters of zero mean alone, which
-  answer a slope with a constant, the weights would copy the photo's texture into it.
+- Filters have response 0 on a plane, so that planes are reproduced under any guide. Filters that only have zero mean
+  respond to a slope with a constant, and the weights would copy the texture of the image into it.
 - A penalty is a mixture of Lorentzians whose widths grow by factors; there, its derivative is a sum of Gaussian radial
-  basis functions. Disparity has faint bends and large steps, so widths from 1/1000 to 1 of its range are needed.
+  basis functions. Disparity has weak curvature and large steps, so widths from 1/1000 to 1 of its range are needed.
 - The data step comes first, is smooth, and knows that low-resolution values are block means (iterative back-projection:
   Irani and Peleg, *Improving Resolution by Image Registration*, 1991). After 160 steps of training for MSE its RMSE_d
   and RMSE_v on procedural scenes were 43 mm and .224, with the gradient of |A x - d|^2 in its place 45 mm and .240.
 - The form of w_l is ours. With one squared filter of the grey photo for each k_l RMSE_d was higher, 49 against 47 mm,
-  and RMSE_v, for which that training was not, lower, .234 against .251.
+  and RMSE_v, which was not trained for, was lower, .234 against .251.
 - All stages are trained at once, from polynomial filters and weak penalties, without training one after another before.
 - It works on disparity over its range in the low-resolution map.
 """
@@ -47,9 +47,9 @@ from dsr.methods.networks.analysis_filters import WIDTHS, influence, penalty, pl
 from dsr.methods.networks.base import NormalisedNetwork, expect_photo
 
 _HEIGHT, _CONTRAST, _SHARED, _FIDELITY = 0.05, 2.0, 0.02, 0.5
-"""Before training: of penalties; of the b_m; the c_lm of other filters than the l-th; of the data step."""
+"""Initial height of penalties; scale of the b_m; c_lm for m other than l; size of the data step."""
 _BICUBIC = 2
-"""Low-resolution pixels that bicubic upsampling looks at on either side."""
+"""Half width of the bicubic kernel in low-resolution pixels."""
 
 
 class Stage(nn.Module):
@@ -100,7 +100,7 @@ class Stage(nn.Module):
 
         Args:
             x: (B, 1, H, W) the map.
-            lr: (B, 1, h, w) its block means as they should be.
+            lr: (B, 1, h, w) target of its block means.
             rgb: (B, 3, H, W) the photos.
 
         """
@@ -120,14 +120,14 @@ class Stage(nn.Module):
 class DynamicGuidance(NormalisedNetwork):
     """The network.
 
-    Holes of the input are filled. Everything is computed in float32, or float64 where the weights are; weights of half
-    precision save memory and no time.
+    Holes of the input are inpainted. Everything is computed in float32, or float64 where the weights are; weights of
+    half precision save memory and no time.
 
     Args:
         scale: upsampling factor, 2, 4, 8 or 16.
-        stages: unrolled steps.
-        filters: of each step, at most size^2 - 3.
-        size: of a filter, pixels, at least 3.
+        stages: number of unrolled steps.
+        filters: number of filters of each step, at most size^2 - 3.
+        size: size of a filter in pixels, at least 3.
 
     Raises:
         ValueError: a value is out of range.
@@ -157,7 +157,7 @@ class DynamicGuidance(NormalisedNetwork):
         return _BICUBIC + len(self.stages) * (_BICUBIC + math.ceil((self.size - 1) / self.scale))
 
     def forward(self, rgb: Tensor, values: Tensor) -> Tensor:
-        """Map a photo and normalised low-resolution disparity to high-resolution disparity.
+        """Map an image and normalised low-resolution disparity to high-resolution disparity.
 
         Args:
             rgb: (B, 3, H, W).

@@ -51,10 +51,10 @@ class PrimalDualNetwork(NormalisedNetwork):
 
     Args:
         scale: upsampling factor, 2, 4, 8 or 16.
-        width: channels of the convolutions.
-        layers: 3 x 3 convolutions.
-        window: size of the window that a pixel is compared within, odd.
-        iterations: steps of the unrolled iteration.
+        width: number of channels of the convolutions.
+        layers: number of 3 x 3 convolutions.
+        window: size in pixels of the window that a pixel is compared within, odd.
+        iterations: number of unrolled iterations.
 
     Raises:
         ValueError: a value is out of range.
@@ -98,7 +98,7 @@ class PrimalDualNetwork(NormalisedNetwork):
         return -(-radius_hr // self.scale) + 4
 
     def forward(self, rgb: Tensor, values: Tensor) -> Tensor:
-        """Map a photo and normalised low-resolution disparity to high-resolution disparity.
+        """Map an image and normalised low-resolution disparity to high-resolution disparity.
 
         Args:
             rgb: (B, 3, H, W).
@@ -123,11 +123,11 @@ class PrimalDualNetwork(NormalisedNetwork):
             return hr + residual + moved.to(hr.dtype)
 
     def _inputs(self, rgb: Tensor, values: Tensor, hr: Tensor) -> tuple[Tensor, Tensor]:
-        """Return what the convolutions take, (B, 9, H, W), and the bend that their residual is a multiple of.
+        """Return the input of the convolutions, (B, 9, H, W), and the bend, the unit of their residual.
 
-        These are the photo's 3 colours; the low-resolution map's slopes along u and v and its distance from the mean of
-        3 x 3 pixels, the high-resolution map's distance from the same means, and the bend, compressed so that faint
-        ones count; and the latter distance over the bend.
+        The channels are the 3 colours; the slopes of the low-resolution map along u and v, its difference from the mean
+        of 3 x 3 pixels, the difference of the high-resolution map from the same means, and the bend, all compressed so
+        that small values count; and the second difference divided by the bend.
         """
         around = stencil(values)
         slopes_lr = torch.cat((around.along_u[:, 1:2], around.along_v[:, 1:2], around.value - around.mean), dim=1)
