@@ -71,13 +71,13 @@ def test_relative_links_of_a_page_lead_somewhere(page: Path, generated: dict[str
     assert missing <= (set(generated) if page.parent == DOCS else set())
 
 
-def test_every_picture_of_the_documentation_is_used() -> None:
+def test_documentation_pictures_are_all_used() -> None:
     text = "".join(page.read_text() for page in PAGES)
     assert [path.name for path in sorted((DOCS / "pictures").iterdir()) if path.name not in text] == []
 
 
 @parametrize("dsr")
-def test_a_dsr_command_of_the_documentation_parses(arguments: list[str], hook: ModuleType) -> None:
+def test_dsr_command_of_the_documentation_parses(arguments: list[str], hook: ModuleType) -> None:
     if arguments[-1] in ("-h", "--help"):
         with pytest.raises(SystemExit, match="0"):
             hook.command_parser().parse_args(arguments)
@@ -101,13 +101,13 @@ def compose_each(name: str, arguments: list[str]) -> Iterator[dict[str, Any]]:
 
 
 @parametrize("python eval.py")
-def test_an_evaluation_of_the_documentation_composes(arguments: list[str]) -> None:
+def test_evaluation_of_the_documentation_composes(arguments: list[str]) -> None:
     for config in compose_each("eval", arguments):
         assert EvalConfig.of(config).scale in (4, 8)
 
 
 @parametrize("python train.py")
-def test_a_training_of_the_documentation_composes(arguments: list[str]) -> None:
+def test_training_of_the_documentation_composes(arguments: list[str]) -> None:
     for config in compose_each("train", arguments):
         assert TrainConfig.of(config).scale in (4, 8)
 

@@ -275,7 +275,7 @@ def test_message_mentions_no_other_scenes_where_all_fail(tmp_path, within):
     ]
 
 
-def test_changed_scene_is_predicted_anew(tmp_path, within):
+def test_changed_scene_is_refused_unless_overwritten(tmp_path, within):
     folder = write_scene(tmp_path / "data" / "a")
     arguments = ("dataset=folder", "dataset.root=data", "output_dir=out")
     assert within(*arguments)[0] == 0

@@ -152,7 +152,7 @@ def test_range_conversion_takes_any_leading_axes_and_keeps_the_precision(range_t
     torch.testing.assert_close(values[1, 2], to_range(depth[0, 0], STEREO, range_type), rtol=0, atol=0)
 
 
-def test_camera_with_an_upward_y_axis_is_converted() -> None:
+def test_camera_with_an_upward_y_axis_equals_the_downward_one() -> None:
     assert Camera(640, 480, 481.2, -480.0, 319.5, 239.5) == Camera(640, 480, 481.2, 480.0, 319.5, 239.5)
 
 

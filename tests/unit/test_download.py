@@ -440,7 +440,7 @@ def test_disk_that_fills_up_is_one_line_and_keeps_the_partial_file(server, tmp_p
     assert (tmp_path / "set/a.png").read_bytes() == PNG
 
 
-def test_directory_without_write_permission_is_one_line_per_file(server, tmp_path):
+def test_directory_that_cannot_be_made_is_one_line_per_file(server, tmp_path):
     (tmp_path / "set").write_text("a file in its place")
     one_line(fetched(picture(server), tmp_path), "set/a.png: ", str(tmp_path / "set"))
 
@@ -762,7 +762,7 @@ def test_damaged_records_are_one_line(server, tmp_path, text):
     one_line([str(caught.value)], tmp_path / "checksums.json")
 
 
-def test_second_command_waits_for_the_lock(server, tmp_path):
+def test_second_command_is_refused_while_one_writes(server, tmp_path):
     with lock_directory(tmp_path), pytest.raises(ValueError, match="another `dsr data` command"):
         fetched(picture(server), tmp_path)
     assert fetched(picture(server), tmp_path) == []

@@ -44,5 +44,5 @@ def test_library_errors_name_arguments_rather_than_configuration_keys():
         ('raise ValueError(str(error).removeprefix("method."))', []),
     ],
 )
-def test_a_message_that_begins_with_a_key_is_found(text, expected):
+def test_message_that_begins_with_a_key_is_found(text, expected):
     assert messages_with_keys(text) == expected

@@ -170,7 +170,7 @@ def test_metric_works_in_float32(name: str) -> None:
 
 
 @every_metric
-def test_metric_in_float32_resolves_a_ten_thousandth_of_a_wide_depth(name: str) -> None:
+def test_metric_of_float32_renderings_equals_float64_to_a_ten_thousandth(name: str) -> None:
     maps = _maps(holes=True)
     wide = _pair(maps)
     narrow = SurfacePair(wide.prediction, wide.target, wide.rays, wide.depth_mask, image_dtype=torch.float32)
