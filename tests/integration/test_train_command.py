@@ -87,7 +87,7 @@ def within(monkeypatch, tmp_path, capfd):
 @pytest.fixture
 def interrupt(monkeypatch):
     """Return a function after which trainings are interrupted when they are about to do a step; None: not."""
-    bar = trainer_module.TrainingBar
+    bar = trainer_module.StepProgress
 
     def at(step):
         class Interrupting(bar):
@@ -95,7 +95,7 @@ def interrupt(monkeypatch):
                 if trainer.global_step == step:
                     raise KeyboardInterrupt
 
-        monkeypatch.setattr(trainer_module, "TrainingBar", Interrupting if step is not None else bar)
+        monkeypatch.setattr(trainer_module, "StepProgress", Interrupting if step is not None else bar)
 
     return at
 
@@ -131,13 +131,18 @@ def test_training_reports_its_plan_and_where_the_weights_are(smoke):
     lines = done.stdout.splitlines()
     assert re.fullmatch(r"model  msg_v x4, 326,015 parameters, (float32|bfloat16)", lines[0])
     assert lines[1] == "data   5 scenes of procedural to train on, 1 of procedural to validate with"
-    assert re.fullmatch(r"loss   lap1 \+ \d\.\d+ MSE_v", lines[2])
+    assert lines[2] == "loss   lap1 + w MSE_v; w is computed from the scenes"
     assert lines[3] == "steps  2 of 2 patches of 32 x 32"
     assert re.fullmatch(r"time   about \d+ s \(\S+ s a step as measured now\), and the validations", lines[4])
     assert lines[5] == f"log    tensorboard --logdir outputs/train/{home.name}"
+    prepared = [line for line in lines if line.startswith("prepare ")]
+    assert re.fullmatch(r"prepare \d+: 1 of 5, \d+\.\d s, elapsed \d:\d\d:\d\d, remaining \d:\d\d:\d\d", prepared[0])
+    assert [line.split(": ")[1].split(",")[0] for line in prepared] == [*(f"{n} of 5" for n in range(1, 6)), "1 of 1"]
+    assert re.fullmatch(r"loss   lap1 \+ \d\.\d+ MSE_v", lines[lines.index(prepared[-1]) + 1])
     assert validated(done.stdout) == [1, 2]
-    assert "RMSE_v 0." in lines[6]
-    assert lines[8:] == [f"weights: outputs/train/{home.name}/weights.safetensors"]
+    validations = [line for line in lines if "validation:" in line]
+    assert re.match(r"step +2  loss \d+\.\d{4}  validation: RMSE_d \S+  RMSE_v 0\.", validations[1])
+    assert lines[-1:] == [f"weights: outputs/train/{home.name}/weights.safetensors"]
 
 
 def test_training_emits_no_warning(smoke):
@@ -197,7 +202,7 @@ def test_log_has_losses_scores_rates_renderings_and_the_configuration(smoke):
 
 def test_training_loss_is_the_sum_of_its_terms(smoke):
     loss, depth, visual = (scalars_of(smoke[1], f"train/{name}") for name in ("loss", "lap1", "mse_v"))
-    w = float(smoke[2].stdout.split("lap1 + ")[1].split()[0])
+    w = float(smoke[2].stdout.split("lap1 + ")[-1].split()[0])
     for step, value in loss.items():
         assert value == pytest.approx(depth[step] + w * visual[step], rel=2e-3)
 

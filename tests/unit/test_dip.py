@@ -7,7 +7,7 @@ import functools
 import os
 import re
 import signal
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -23,6 +23,7 @@ from dsr.methods.networks.trained import packaged_weights
 from dsr.metrics.classes import visual_metrics
 from dsr.metrics.functional import SurfacePair, rmse_v
 from dsr.sample import DepthSample, Scene
+from dsr.utils.progress import Progress, Task, Unit
 
 BOX = Downsampling("box")
 ENOUGH = {"steps": 120, "widths": (16, 32), "skips": (4, 4), "average": 0.9, "learning_rate": 0.02}
@@ -43,8 +44,8 @@ def _prior(**settings: object) -> DeepImagePrior:
     return DeepImagePrior(scale=2, downsampling=BOX, **{**quick, **settings})  # type: ignore[arg-type]
 
 
-class Stopper:
-    """A display that has the process terminated at a step."""
+class Stopper(Progress):
+    """Keeps the lines, and has the process terminated at a step."""
 
     def __init__(self, at: int) -> None:
         self.lines: list[str] = []
@@ -54,18 +55,12 @@ class Stopper:
         self.lines.append(line)
 
     @contextlib.contextmanager
-    def steps(self, name: str, total: int, done: int) -> Iterator[Callable[[int, str], None]]:
-        def update(now: int, remark: str) -> None:
-            if now == self._at:
+    def task(self, name: str, total: int | None = None, *, done: int = 0, unit: Unit = "items") -> Iterator[Task]:
+        def update(done: int, total: int | None = None, remark: str | None = None) -> None:
+            if name == "steps" and done == self._at:
                 os.kill(os.getpid(), signal.SIGTERM)
 
         yield update
-
-
-@pytest.fixture
-def _every_step(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Have the display told of every step."""
-    monkeypatch.setattr("dsr.methods.dip.callbacks._SECONDS_BETWEEN_LOOKS", -1.0)
 
 
 def _error(depth: Tensor, sample: DepthSample, where: Tensor | None = None) -> float:
@@ -152,7 +147,6 @@ def test_diverging_optimisation_is_reported(monkeypatch: pytest.MonkeyPatch) -> 
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("_every_step")
 @pytest.mark.parametrize("stopping", ["fixed", "variance", "oracle"])
 def test_interrupted_optimisation_gives_bit_identical_results(tmp_path: Path, stopping: str) -> None:
     sample = _sample()
@@ -191,7 +185,6 @@ def test_killed_optimisation_resumes_from_the_last_minute(tmp_path: Path, monkey
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("_every_step")
 @pytest.mark.parametrize("spoil", ["settings", "input", "bytes"])
 def test_checkpoint_of_another_optimisation_is_not_resumed(tmp_path: Path, spoil: str) -> None:
     sample = _sample()

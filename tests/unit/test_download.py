@@ -22,6 +22,7 @@ from dsr.data.download.catalogue import Collection, Item
 from dsr.data.download.checksums import Checksums, lock_directory
 from dsr.data.download.get import Options, get
 from dsr.data.download.inventory import state, verify
+from dsr.utils.progress import Progress
 
 PNG = b"\x89PNG\r\n\x1a\n" + bytes(range(256)) * 1600
 OTHER = b"\x89PNG\r\n\x1a\n" + bytes(range(255, -1, -1)) * 1600
@@ -76,7 +77,7 @@ def server(monkeypatch, serve):
     return running
 
 
-class Watcher:
+class Watcher(Progress):
     """Keeps what it is told; ``stop_at`` bytes of a transfer are an interruption."""
 
     def __init__(self, stop_at=None):
@@ -86,11 +87,11 @@ class Watcher:
         self.lines.append(line)
 
     @contextlib.contextmanager
-    def transfer(self, name):
+    def task(self, name, total=None, *, done=0, unit="items"):
         self.names.append(name)
         yield self.moved
 
-    def moved(self, done, total):
+    def moved(self, done, total=None, remark=None):
         assert total is None or 0 <= done <= total
         if self.stop_at is not None and done >= self.stop_at:
             raise KeyboardInterrupt

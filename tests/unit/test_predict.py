@@ -25,6 +25,7 @@ from dsr.geometry.camera import Camera
 from dsr.methods.base import NoSolutionError
 from dsr.metrics.catalogue import catalogue, score_image
 from dsr.sample import DepthSample, Scene
+from dsr.utils.progress import SILENT, Progress
 
 SIZE, SCALE = 16, 2
 CAMERA = Camera(SIZE, SIZE, 20.0, 20.0, 7.5, 7.5)
@@ -84,15 +85,11 @@ def toy_study(source=None, method=None, config=None, downsampling=None):
     return Evaluation(source, downsampling, "box", SCALE, method or ToyMethod(), "toy_method", 7, config)
 
 
-def plainly(items, description):
-    return items
-
-
 def run(study, folder, *, overwrite=False):
     """Return the outcome, the scores and the scenes that were illustrated."""
     pictures = []
-    outcome = predict(study, folder, plainly, overwrite=overwrite)
-    scores = score(study, folder, catalogue(), outcome, plainly, lambda *entry: pictures.append(entry))
+    outcome = predict(study, folder, overwrite=overwrite)
+    scores = score(study, folder, catalogue(), outcome, SILENT, lambda *entry: pictures.append(entry))
     return outcome, scores, pictures
 
 
@@ -115,7 +112,7 @@ def test_run_writes_predictions_scores_and_a_summary_and_nothing_else(tmp_path):
 
 
 def test_prediction_is_in_metres_with_its_config(tmp_path):
-    predict(toy_study(), tmp_path, plainly)
+    predict(toy_study(), tmp_path)
     with np.load(tmp_path / "predictions" / "a.npz") as kept:
         depth, config = kept["depth"], json.loads(str(kept["config"]))
     blocks = RAMP[0].numpy().reshape(8, 2, 8, 2).mean(axis=(1, 3))
@@ -166,12 +163,12 @@ def test_rmse_d_is_the_root_mean_square_of_perspective_depth_in_metres(tmp_path)
 
 def test_scores_are_computed_from_the_stored_file(tmp_path):
     study = toy_study(ToySource(a=toy_scene("a")))
-    outcome = predict(study, tmp_path, plainly)
+    outcome = predict(study, tmp_path)
     path = tmp_path / "predictions" / "a.npz"
     with np.load(path) as kept:
         config = kept["config"]
     np.savez(path, depth=RAMP[0].numpy(), config=config, seconds=1.0)
-    table = score(study, tmp_path, catalogue(), outcome, plainly, lambda *_: None)
+    table = score(study, tmp_path, catalogue(), outcome, SILENT, lambda *_: None)
     assert table.loc[table["metric"] == "RMSE_d", "value"].tolist() == [0.0]
 
 
@@ -238,7 +235,7 @@ def test_prediction_of_another_config_is_refused_by_file_and_key_and_kept(tmp_pa
     method = ToyMethod()
     study = toy_study(method=method, config={"method": {"name": "toy"}, "scale": 4})
     with pytest.raises(StalePredictionError, match=r"predictions/a\.npz: made with another scale; overwrite=true"):
-        predict(study, tmp_path, plainly)
+        predict(study, tmp_path)
     assert method.calls == []
     assert (tmp_path / "predictions" / "a.npz").read_bytes() == content
 
@@ -248,7 +245,7 @@ def test_prediction_of_a_changed_scene_is_refused(tmp_path):
     run(study, tmp_path)
     study.source.version = "2"
     with pytest.raises(StalePredictionError, match="another scene_content"):
-        predict(study, tmp_path, plainly)
+        predict(study, tmp_path)
 
 
 @pytest.mark.parametrize("overwrite", [False, True])
@@ -268,7 +265,7 @@ def test_damaged_prediction_is_refused_or_made_anew(tmp_path, damage, overwrite)
         load_prediction(path)
     else:
         with pytest.raises(StalePredictionError, match=r"b\.npz: damaged; overwrite=true makes it anew"):
-            predict(toy_study(), tmp_path, plainly)
+            predict(toy_study(), tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -307,8 +304,8 @@ def test_picture_that_cannot_be_drawn_fails_its_scene_and_keeps_its_scores(tmp_p
             raise OSError(28, "No space left")
 
     study = toy_study()
-    outcome = predict(study, tmp_path, plainly)
-    score(study, tmp_path, catalogue(), outcome, plainly, refuse)
+    outcome = predict(study, tmp_path)
+    score(study, tmp_path, catalogue(), outcome, SILENT, refuse)
     assert list(outcome.failures) == ["a"]
     assert {row["scene"] for row in rows(tmp_path)} == {"a", "b"}
 
@@ -323,14 +320,14 @@ def test_score_file_has_its_header_alone_where_every_scene_fails(tmp_path):
 
 @pytest.mark.parametrize("shape", [(1, SIZE, SIZE - 2), (SIZE, SIZE), (1, 1, SIZE, SIZE)])
 def test_prediction_of_the_wrong_shape_is_refused_and_not_written(tmp_path, shape):
-    outcome = predict(toy_study(method=ToyMethod(a=torch.ones(shape))), tmp_path, plainly)
+    outcome = predict(toy_study(method=ToyMethod(a=torch.ones(shape))), tmp_path)
     assert "toy_method gave depth of shape" in outcome.failures["a"]
     assert files(tmp_path) == ["predictions/b.npz", "scenes/b.npz"]
 
 
 def test_stored_prediction_of_the_wrong_shape_is_not_scored(tmp_path):
     study = toy_study()
-    predict(study, tmp_path, plainly)
+    predict(study, tmp_path)
     path = tmp_path / "predictions" / "a.npz"
     with np.load(path) as kept:
         config = kept["config"]
@@ -363,7 +360,7 @@ def test_cropped_scene_is_noted(tmp_path):
 
 def test_interruption_keeps_the_finished_scene_and_leaves_no_temporary_file(tmp_path):
     with pytest.raises(KeyboardInterrupt):
-        predict(toy_study(method=ToyMethod(b=KeyboardInterrupt())), tmp_path, plainly)
+        predict(toy_study(method=ToyMethod(b=KeyboardInterrupt())), tmp_path)
     assert files(tmp_path) == ["predictions/a.npz", "scenes/a.npz"]
     method = ToyMethod()
     outcome, *_ = run(toy_study(method=method), tmp_path)
@@ -381,7 +378,7 @@ def test_interruption_while_a_prediction_is_written_leaves_no_partial_file(tmp_p
 
     monkeypatch.setattr(np, "savez_compressed", cut)
     with pytest.raises(KeyboardInterrupt):
-        predict(toy_study(), tmp_path, plainly)
+        predict(toy_study(), tmp_path)
     assert files(tmp_path) == ["predictions/a.npz", "scenes/a.npz"]
 
 
@@ -394,7 +391,7 @@ def test_failed_rewrite_keeps_the_former_prediction(tmp_path, monkeypatch):
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(np, "savez_compressed", full)
-    outcome = predict(toy_study(), tmp_path, plainly, overwrite=True)
+    outcome = predict(toy_study(), tmp_path, overwrite=True)
     assert list(outcome.failures) == ["a", "b"]
     assert (tmp_path / "predictions" / "a.npz").read_bytes() == before
 
@@ -407,7 +404,7 @@ def test_missing_prediction_is_refused_by_name(tmp_path):
 def test_scene_that_failed_is_not_scored_from_an_older_file(tmp_path):
     run(toy_study(), tmp_path)
     outcome = Outcome(seconds={"b": 1.0}, failures={"a": "a: broken"})
-    table = score(toy_study(), tmp_path, catalogue(), outcome, plainly, lambda *_: None)
+    table = score(toy_study(), tmp_path, catalogue(), outcome, SILENT, lambda *_: None)
     assert table["scene"].unique().tolist() == ["b"]
 
 
@@ -433,6 +430,17 @@ def test_samples_of_a_study_have_its_noise_under_its_seed():
     assert torch.equal(reseeded.depth, clean.sample("a").depth)
 
 
+class Recorder(Progress):
+    """Keeps what the tasks report: name, done and total."""
+
+    def __init__(self, shown):
+        self.shown = shown
+
+    @contextlib.contextmanager
+    def task(self, name, total=None, *, done=0, unit="items"):
+        yield lambda done, total: self.shown.append((name, done, total))
+
+
 class Iterating(ToyMethod):
     """Tells its steps, and how they went."""
 
@@ -449,12 +457,8 @@ class Iterating(ToyMethod):
 def test_iteration_progress_is_shown_and_stored(tmp_path):
     shown = []
 
-    @contextlib.contextmanager
-    def steps(scene):
-        yield lambda done, total: shown.append((scene, done, total))
-
-    predict(toy_study(method=Iterating()), tmp_path, plainly, steps=steps)
-    assert shown == [(scene, done, 3) for scene in "ab" for done in (1, 2, 3)]
+    predict(toy_study(method=Iterating()), tmp_path, Recorder(shown))
+    assert shown == [("steps", done, 3) for _ in "ab" for done in (1, 2, 3)]
     assert (tmp_path / "iterations" / "a.csv").read_text() == "iteration,objective\n1.0,0.5\n3.0,0.25\n"
 
 
@@ -479,8 +483,8 @@ def test_earlier_prediction_is_not_scored_where_there_is_no_solution_now(tmp_pat
 def test_score_reads_the_run_directory_alone(tmp_path):
     _, expected, _ = run(toy_study(), tmp_path)
     gone = toy_study(ToySource(a=ValueError("gone"), b=ValueError("gone")))
-    outcome = predict(toy_study(), tmp_path, plainly)
-    again = score(gone, tmp_path, catalogue(), outcome, plainly, lambda *_: None)
+    outcome = predict(toy_study(), tmp_path)
+    again = score(gone, tmp_path, catalogue(), outcome, SILENT, lambda *_: None)
     assert outcome.failures == {}
     pd.testing.assert_frame_equal(again, expected, check_exact=True)
 
@@ -497,9 +501,9 @@ def test_predict_stores_a_sample_that_is_missing_beside_its_prediction(tmp_path)
 
 
 def test_score_names_a_damaged_sample_and_keeps_the_other_scenes(tmp_path):
-    outcome = predict(toy_study(), tmp_path, plainly)
+    outcome = predict(toy_study(), tmp_path)
     path = tmp_path / "scenes" / "a.npz"
     path.write_bytes(path.read_bytes()[:50])
-    scores = score(toy_study(), tmp_path, catalogue(), outcome, plainly, lambda *_: None)
+    scores = score(toy_study(), tmp_path, catalogue(), outcome, SILENT, lambda *_: None)
     assert outcome.failures == {"a": f"{path}: expected the sample of a scene, got a damaged or foreign file"}
     assert set(scores["scene"]) == {"b"}

@@ -1,68 +1,222 @@
-"""Bars and lines on the console."""
+"""Progress on the console: bars on a terminal, lines off it, with named times."""
 
 from __future__ import annotations
 
 import io
+import threading
+import time
 
 import pytest
 from rich.console import Console
 
-from dsr.app.progress import Display
+from dsr.utils.console import ConsoleProgress
+from dsr.utils.progress import SILENT, part_of
+from dsr.utils.units import clock, duration, megabytes
 
 
-def _display(*, terminal: bool) -> tuple[Display, io.StringIO]:
+class Clock:
+    """A clock that is set by hand."""
+
+    def __init__(self) -> None:
+        self.seconds = 100.0
+
+    def __call__(self) -> float:
+        return self.seconds
+
+
+@pytest.fixture
+def now() -> Clock:
+    return Clock()
+
+
+def _progress(now: Clock, *, terminal: bool = False) -> tuple[ConsoleProgress, io.StringIO]:
     text = io.StringIO()
-    return Display(Console(file=text, force_terminal=terminal, width=100)), text
+    console = Console(file=text, force_terminal=terminal, width=120, color_system=None)
+    return ConsoleProgress(console, now), text
 
 
-def test_output_off_a_terminal_is_lines_alone() -> None:
-    display, text = _display(terminal=False)
-    for item in display(["a", "b"], "predict"):
-        display.say(f"{item}: [about] 3 min")
-        with display.steps(item, 10, 0) as update:
-            update(5, "loss 0.1")
-    assert text.getvalue().strip() == "a: [about] 3 min\nb: [about] 3 min"
+def _rows(progress: ConsoleProgress) -> list[str]:
+    """Return the rows that a terminal would show now."""
+    text = io.StringIO()
+    Console(file=text, width=120, color_system=None).print(progress._table())
+    return [" ".join(line.split()) for line in text.getvalue().splitlines()]
 
 
-def test_steps_are_shown_below_their_pass() -> None:
-    display, text = _display(terminal=True)
-    for item in display(["statue"], "predict"):
-        with display.steps(item, 120, 40) as update:
-            update(60, "loss 0.25")
-            display._passes.refresh()  # type: ignore[union-attr]
-    shown = text.getvalue()
-    assert "predict" in shown
-    assert "60/120" in shown
-    assert "loss 0.25" in shown
+def test_track_prints_a_line_for_each_item_off_a_terminal(now: Clock) -> None:
+    progress, text = _progress(now)
+    for _ in progress.track(["statue", "room", "plant"], "predict"):
+        now.seconds += 90.5
+    assert text.getvalue().splitlines() == [
+        "predict statue: 1 of 3, 90.5 s, elapsed 0:01:30, remaining 0:03:01",
+        "predict room: 2 of 3, 90.5 s, elapsed 0:03:01, remaining 0:01:30",
+        "predict plant: 3 of 3, 90.5 s, elapsed 0:04:32, remaining 0:00:00",
+    ]
 
 
-def test_steps_need_no_pass_around_them() -> None:
-    display, text = _display(terminal=True)
-    with display.steps("statue", 120, 40) as update:
-        update(120, "loss 0.25")
-    assert "statue" in text.getvalue()
+def test_track_prints_no_line_for_each_of_many_short_items(now: Clock) -> None:
+    progress, text = _progress(now)
+    for number in progress.track(range(200), "prepare"):
+        now.seconds += 3.0 if number == 7 else 0.01
+    assert [line.split(",")[0] for line in text.getvalue().splitlines()] == [
+        "prepare 7: 8 of 200",
+        "prepare 199: 200 of 200",
+    ]
 
 
-def test_parts_are_shown_once_their_number_is_known() -> None:
-    display, text = _display(terminal=True)
-    for item in display(["statue"], "predict"):
-        with display.parts(item) as update:
-            before = text.getvalue()
-            update(50, 1000)
-            display._passes.refresh()  # type: ignore[union-attr]
-    assert "50/1000" in text.getvalue()
-    assert "1000" not in before
+def test_track_prints_no_line_where_the_caller_prints_one(now: Clock) -> None:
+    progress, text = _progress(now)
+    assert list(progress.track(["a"], "examine", lines=False)) == ["a"]
+    assert text.getvalue() == ""
 
 
-def test_terminal_is_restored_after_an_error() -> None:
-    display, _ = _display(terminal=True)
+def test_track_takes_an_iterator_of_known_length(now: Clock) -> None:
+    progress, text = _progress(now)
+    assert list(progress.track(iter("ab"), "draw", 2, label=str.upper)) == ["a", "b"]
+    assert text.getvalue().splitlines()[0].startswith("draw A: 1 of 2, 0.0 s, elapsed 0:00:00")
+
+
+def test_long_task_prints_a_line_after_three_seconds_and_then_every_ten(now: Clock) -> None:
+    progress, text = _progress(now)
+    with progress.task("train", 1000) as task:
+        for step in range(1, 401):
+            now.seconds += 0.125
+            task(step, remark=f"loss {1 / step:.4f}")
+            progress.tick()
+    assert text.getvalue().splitlines() == [
+        "train: 24 of 1000, elapsed 0:00:03, remaining 0:02:02, loss 0.0417",
+        "train: 104 of 1000, elapsed 0:00:13, remaining 0:01:52, loss 0.0096",
+        "train: 184 of 1000, elapsed 0:00:23, remaining 0:01:42, loss 0.0054",
+        "train: 264 of 1000, elapsed 0:00:33, remaining 0:01:32, loss 0.0038",
+        "train: 344 of 1000, elapsed 0:00:43, remaining 0:01:22, loss 0.0029",
+    ]
+
+
+def test_line_about_steps_names_the_scene_that_they_belong_to(now: Clock) -> None:
+    progress, text = _progress(now)
+    for _ in progress.track(["statue"], "predict"):
+        with progress.task("steps") as step:
+            now.seconds += 10
+            step(50, 1000)
+            progress.tick()
+    assert text.getvalue().splitlines()[0] == ("predict statue: steps: 50 of 1000, elapsed 0:00:10, remaining 0:03:10")
+
+
+def test_long_step_is_reported_while_it_runs(now: Clock, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A thread prints the lines: there is nobody else while a step takes minutes."""
+    monkeypatch.setattr("dsr.utils.console._TICK", 0.01)
+    progress, text = _progress(now)
+    with progress.task("predict", 2):
+        now.seconds += 60
+        limit = time.monotonic() + 10
+        while not text.getvalue() and time.monotonic() < limit:
+            time.sleep(0.01)
+    assert text.getvalue() == "predict: 0 of 2, elapsed 0:01:00\n"
+
+
+def test_thread_ends_with_the_task(now: Clock) -> None:
+    progress, _ = _progress(now)
+    before = threading.active_count()
+    counts = []
 
     def fail() -> None:
-        for item in display(["a", "b"], "predict"):
-            with display.steps(item, 10, 0):
+        with progress.task("train", 2):
+            counts.append(threading.active_count())
+            raise ValueError("broken")
+
+    with pytest.raises(ValueError, match="broken"):
+        fail()
+    assert (*counts, threading.active_count()) == (before + 1, before)
+
+
+def test_terminal_shows_a_row_for_each_task_with_named_times(now: Clock) -> None:
+    progress, _ = _progress(now, terminal=True)
+    for scene in progress.track(["statue", "room"], "predict"):
+        with progress.task("steps") as step:
+            assert len(_rows(progress)) == 1  # until it is known how many steps there are
+            now.seconds += 269
+            step(65, 100, "loss 0.25")
+            rows = _rows(progress)
+        if scene == "statue":
+            assert rows[0].endswith("0 of 2 elapsed 0:04:29 remaining -:--:-- statue")
+            assert rows[1].startswith("steps ")
+            assert rows[1].endswith("65 of 100 elapsed 0:04:29 remaining 0:02:25 loss 0.25")
+    assert rows[0].endswith("1 of 2 elapsed 0:08:58 remaining 0:00:00 room")
+
+
+def test_terminal_keeps_one_line_of_a_pass_that_took_long(now: Clock) -> None:
+    progress, text = _progress(now, terminal=True)
+    for _ in progress.track(["statue"], "predict"):
+        now.seconds += 75
+        progress.say("statue: [about] 3 min")
+    assert "statue: [about] 3 min\n" in text.getvalue()
+    assert text.getvalue().endswith("predict: 1 of 1, elapsed 0:01:15\n")
+
+
+def test_bytes_are_shown_with_their_speed_which_leaves_out_what_was_there_before(now: Clock) -> None:
+    progress, text = _progress(now)
+    with progress.task("set/a.zip", unit="bytes") as moved:
+        moved(500_000_000, 800_000_000)
+        now.seconds += 100
+        moved(600_000_000, 800_000_000)
+        progress.tick()
+    assert text.getvalue() == ("set/a.zip: 600 MB of 800 MB, 1.0 MB/s, elapsed 0:01:40, remaining 0:03:20\n")
+
+
+def test_work_that_starts_again_is_measured_anew(now: Clock) -> None:
+    progress, text = _progress(now)
+    with progress.task("scenes", 10) as task:
+        now.seconds += 100
+        task(9)
+        task(0)
+        now.seconds += 10
+        task(1)
+        progress.tick()
+    assert text.getvalue() == "scenes: 1 of 10, elapsed 0:01:50, remaining 0:01:30\n"
+
+
+def test_work_that_goes_on_counts_only_new_steps_for_the_time_that_remains(now: Clock) -> None:
+    progress, text = _progress(now)
+    with progress.task("train", 1000, done=900) as task:
+        now.seconds += 10
+        task(950)
+        progress.tick()
+    assert text.getvalue() == "train: 950 of 1000, elapsed 0:00:10, remaining 0:00:10\n"
+
+
+@pytest.mark.parametrize("terminal", [True, False])
+def test_next_pass_is_shown_after_an_error(now: Clock, *, terminal: bool) -> None:
+    progress, _ = _progress(now, terminal=terminal)
+
+    def fail() -> None:
+        for _ in progress.track(["a", "b"], "predict"):
+            with progress.task("steps", 10):
                 raise ValueError("broken")
 
     for _ in range(2):
         with pytest.raises(ValueError, match="broken"):
             fail()
-    assert list(display(["c"], "score")) == ["c"]
+    assert list(progress.track(["c"], "score")) == ["c"]
+    assert progress._tasks == []
+
+
+def test_silent_progress_shows_nothing_and_passes_items_on(capsys: pytest.CaptureFixture[str]) -> None:
+    assert list(SILENT.track("ab", "predict")) == ["a", "b"]
+    with SILENT.task("steps") as task:
+        task(1, 2, "loss 0.1")
+    SILENT.say("a line")
+    assert capsys.readouterr().out == ""
+
+
+def test_part_of_counts_the_steps_of_earlier_stages() -> None:
+    reported: list[tuple[int, int]] = []
+    stage = part_of(lambda done, total: reported.append((done, total)), 10, 30)
+    assert stage is not None
+    stage(5, 10)
+    assert reported == [(15, 30)]
+    assert part_of(None, 10, 30) is None
+
+
+def test_times_and_sizes_are_written_for_readers() -> None:
+    assert [clock(seconds) for seconds in (0, 269, 3600, 90061)] == ["0:00:00", "0:04:29", "1:00:00", "25:01:01"]
+    assert [duration(seconds) for seconds in (40, 720, 12600)] == ["40 s", "12 min", "3.5 h"]
+    assert [megabytes(size) for size in (3.2e6, 45e6, 1.3e9)] == ["3.2 MB", "45 MB", "1.3 GB"]

@@ -92,6 +92,8 @@ NOT_PREDICTING = (
     "utils/files.py",
     "utils/hashing.py",
     "utils/console.py",
+    "utils/progress.py",
+    "utils/units.py",
     "evaluation/__init__.py",
     "evaluation/store.py",
     "inference",

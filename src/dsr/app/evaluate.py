@@ -18,10 +18,9 @@ from rich.console import Console
 
 from dsr.app import run_directory as rundir
 from dsr.app.metrics import check_metrics, chosen_metrics, metric_collection
-from dsr.app.progress import Display, prepare
 from dsr.app.schema import EvalConfig, given_keys, plain_config, user_directories
 from dsr.app.training_runs import studies_of_run
-from dsr.data.base import SceneSource
+from dsr.data.base import SceneSource, prepare_scenes
 from dsr.evaluation.predict import Evaluation, Outcome, StalePredictionError, predict
 from dsr.evaluation.score import score
 from dsr.methods.dip.upsampler import WORKSPACE
@@ -31,7 +30,7 @@ from dsr.report.dashboard import save_dashboard
 from dsr.report.tables import score_table
 from dsr.sample import DepthSample
 from dsr.utils.builder import ConfigError, build, takes, trait
-from dsr.utils.console import open_console, print_error, show
+from dsr.utils.console import ConsoleProgress, open_console, print_error, show
 from dsr.utils.devices import fast_precision, pick_device
 from dsr.utils.hashing import file_hash
 from dsr.viz.panels import save_picture
@@ -70,23 +69,23 @@ def _evaluate(plain: dict[str, Any], source: SceneSource | None) -> pd.DataFrame
     targets = target_paths(settings.method, user_directories())
     identity = rundir.identity_of(plain, None if weights is None else file_hash(weights), device, targets)
     folder = Path(settings.output_dir or rundir.default_directory("eval", plain, identity)).expanduser()
-    display = Display(console)
-    given = {"device": device, "weights": weights, "workspace": folder, "display": display}
+    progress = ConsoleProgress(console)
+    given = {"device": device, "weights": weights, "workspace": folder, "display": progress}
     study = _study(settings, identity, given, source)
     check_metrics(settings.metrics)
     rundir.claim(folder, plain, identity)
     if settings.overwrite:
         shutil.rmtree(folder / WORKSPACE, ignore_errors=True)
     _seed(settings.seed)
-    prepare(display, study.source, study.source.scenes())
+    prepare_scenes(study.source, study.source.scenes(), progress)
     try:
-        outcome = predict(study, folder, display, steps=display.parts, overwrite=settings.overwrite)
+        outcome = predict(study, folder, progress, overwrite=settings.overwrite)
     except StalePredictionError as error:
         raise ConfigError(str(error)) from error
     metrics = chosen_metrics(settings.metrics, device)
     formats = {metric.name: metric.format for metric in metrics}
     illustrate = functools.partial(_illustrate, folder, study.label, formats)
-    scores = score(study, folder, metrics, outcome, display, illustrate)
+    scores = score(study, folder, metrics, outcome, progress, illustrate)
     save_dashboard(folder)
     _report(console, folder, scores, study.label, outcome, formats)
     if outcome.failures:

@@ -12,12 +12,11 @@ from rich.console import Console
 
 import dsr
 from dsr.app.entry import explain
-from dsr.app.progress import Display, prepare
 from dsr.app.schema import plain_config, register
-from dsr.data.base import SceneSource
+from dsr.data.base import SceneSource, prepare_scenes
 from dsr.sample import Scene
 from dsr.utils.builder import ConfigError, build
-from dsr.utils.console import one_line, show
+from dsr.utils.console import ConsoleProgress, one_line, show
 from dsr.viz.sheets import save_contact_sheet
 
 
@@ -34,10 +33,10 @@ def prepare_dataset(name: str, overrides: Sequence[str], console: Console) -> No
 
     """
     source = _source(name, overrides)
-    display = Display(console)
-    prepare(display, source, source.scenes())
+    progress = ConsoleProgress(console)
+    prepare_scenes(source, source.scenes(), progress)
     failures: dict[str, str] = {}
-    scenes = _loaded(source, display(source.scenes(), "draw"), failures)
+    scenes = _loaded(source, progress.track(source.scenes(), "draw"), failures)
     folder = Path("outputs", "data", name)
     before = set(folder.glob("sheet*.png"))
     pages = save_contact_sheet(folder / "sheet.png", scenes, f"{name}, as prepared")

@@ -12,7 +12,6 @@ from pathlib import Path
 import pandas as pd
 from rich.console import Console
 
-from dsr.app.progress import Display
 from dsr.evaluation.results import Results, load_results
 from dsr.geometry.shading import LIGHT_NAMES
 from dsr.report.correlation_figure import save_scatter_matrix
@@ -21,8 +20,9 @@ from dsr.report.figures import save_figures
 from dsr.report.markup import write_tables
 from dsr.report.page import save_page
 from dsr.report.user_study import read_study
-from dsr.utils.console import show
+from dsr.utils.console import ConsoleProgress, show
 from dsr.utils.files import write_text
+from dsr.utils.progress import Progress
 
 _MARK = "report.json"
 """What makes a directory one that a report may replace."""
@@ -81,7 +81,7 @@ def make_report(
     output.parent.mkdir(parents=True, exist_ok=True)
     temporary = Path(tempfile.mkdtemp(prefix=f".{output.name}-", dir=output.parent))
     try:
-        notes = _write(temporary, results, answers, wanted, Display(console))
+        notes = _write(temporary, results, answers, wanted, ConsoleProgress(console))
         write_text(temporary / _MARK, json.dumps({"runs": [str(run.folder) for run in results.runs]}, indent=1) + "\n")
         temporary.chmod(0o755)
         if output.exists():
@@ -110,7 +110,7 @@ def _check(output: Path, wanted: ReportRequest) -> None:
 
 
 def _write(
-    folder: Path, results: Results, study: pd.DataFrame | None, wanted: ReportRequest, display: Display
+    folder: Path, results: Results, study: pd.DataFrame | None, wanted: ReportRequest, progress: Progress
 ) -> list[str]:
     """Write the parts, and return what a reader should know."""
     notes: list[str] = []
@@ -123,15 +123,13 @@ def _write(
         save_scatter_matrix(folder / "metrics", results)
 
     def figures() -> None:
-        with display.parts() as progress:
-            save_figures(folder / "figures", results, progress, light=wanted.light, notes=notes)
+        with progress.task("figures") as task:
+            save_figures(folder / "figures", results, task, light=wanted.light, notes=notes)
 
     def page() -> None:  # the last, as it links to the others' files
-        with display.parts() as progress:
+        with progress.task("scenes") as task:
             notes.extend(
-                save_page(
-                    folder / "index.html", results, title=wanted.title, budget_mb=wanted.page_mb, progress=progress
-                )
+                save_page(folder / "index.html", results, title=wanted.title, budget_mb=wanted.page_mb, progress=task)
             )
 
     parts = {"tables": tables, "metrics": metrics, "figures": figures, "page": page}
@@ -139,6 +137,6 @@ def _write(
     if all(run.scores.empty for run in results.runs):
         notes.append("no scene has a truth to score against, so there are no tables and no metric study")
         todo = [part for part in todo if part not in ("tables", "metrics")]
-    for part in display(todo, "report"):
+    for part in progress.track(todo, "report"):
         parts[part]()
     return notes

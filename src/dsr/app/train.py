@@ -6,6 +6,7 @@ import functools
 import os
 import shutil
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,10 +17,10 @@ from rich.console import Console
 
 from dsr.app import run_directory as rundir
 from dsr.app.metrics import check_metrics, metric_collection
-from dsr.app.progress import Display, prepare
 from dsr.app.schema import TrainConfig, given_keys, plain_config
-from dsr.app.trainer import make_trainer, seconds_per_step
+from dsr.app.trainer import seconds_per_step, training_trainer
 from dsr.app.training_runs import WEIGHTS, common, keyed, read_config, training_data
+from dsr.data.base import prepare_scenes
 from dsr.methods.networks.base import DisparityNetwork
 from dsr.methods.networks.trained import NETWORKS
 from dsr.methods.networks.weight_files import load_network, network_name, save_network
@@ -27,10 +28,12 @@ from dsr.training.data_module import PatchData
 from dsr.training.module import Schedule, SuperResolution
 from dsr.training.objective import Objective, balance_weight
 from dsr.utils.builder import ConfigError, build
-from dsr.utils.console import show
+from dsr.utils.console import ConsoleProgress
 from dsr.utils.devices import fast_precision, pick_device
 from dsr.utils.files import replacing
-from dsr.utils.lightning import duration, fit
+from dsr.utils.lightning import fit
+from dsr.utils.progress import Progress
+from dsr.utils.units import duration
 
 _PATCHES_FOR_W = 64
 _LARGEST_SEED = 2**32 - 1
@@ -60,7 +63,7 @@ def train(config: DictConfig) -> Path:
     if settings.precision == "auto":
         plain["precision"] = settings.precision = fast_precision(device)
     first = os.environ.get("LOCAL_RANK", "0") == "0"  # Lightning runs this command once per device
-    console = Console(quiet=not first)
+    progress = ConsoleProgress(Console(quiet=not first))
     if settings.seed > _LARGEST_SEED:
         raise ConfigError(f"seed: expected at most {_LARGEST_SEED}, got {settings.seed}")
     lightning.seed_everything(settings.seed, workers=True, verbose=False)
@@ -72,18 +75,18 @@ def train(config: DictConfig) -> Path:
     weights, last = folder / WEIGHTS, folder / "checkpoints" / "last.ckpt"
     if weights.exists() and not settings.overwrite:
         raise ConfigError(f"output_dir: {weights} is trained already; overwrite=true trains it anew")
-    _prepare(console, data)
     metrics = functools.partial(metric_collection, settings.metrics, device)
     module = _module(settings, net, data, metrics)
+    resume = last if last.is_file() and not settings.overwrite else None
+    _announce(progress, settings, module, data, folder, resume)
+    _load(progress, settings, module, data)
     tolerated = ("code", "device") if "resume" in given_keys() else ()
     for key in rundir.claim(folder, plain, identity, tolerated):
-        console.print(f"note: the run began with another {key}", markup=False, highlight=False)
+        progress.say(f"note: the run began with another {key}")
     if settings.overwrite and first:
         _clear(folder)
-    resume = last if last.is_file() else None
-    _announce(console, settings, module, data, folder, resume)
     facts = _facts(plain, module)
-    trainer, best = make_trainer(settings.trainer, folder, device, console, facts)
+    trainer, best = training_trainer(settings.trainer, folder, device, progress, facts)
     _describe(trainer, plain, module)
     try:
         fit(trainer, module, data, resume)
@@ -93,7 +96,7 @@ def train(config: DictConfig) -> Path:
         ) from None
     if trainer.is_global_zero:
         _export(module, Path(best.best_model_path), weights, facts)
-    show(console, f"weights: {weights}")
+    progress.say(f"weights: {weights}")
     return weights
 
 
@@ -140,33 +143,38 @@ def _shapes(net: DisparityNetwork) -> dict[str, torch.Size]:
     return {name: value.shape for name, value in net.state_dict().items()}
 
 
-def _prepare(console: Console, data: PatchData) -> None:
-    """Let the data sets that render or resize their scenes do so, with a bar."""
-    for source, names in data.used_scenes:
-        prepare(Display(console), source, names)
-
-
 def _module(settings: TrainConfig, net: DisparityNetwork, data: PatchData, metrics: Any) -> SuperResolution:
-    """Return the network under training; loads the scenes, which its loss may depend on."""
-    try:
-        data.setup()
-        mixed = settings.precision == "bfloat16"
-        schedule = Schedule(mixed=mixed, **common(Schedule, settings.trainer))
-        return SuperResolution(net, _objective(settings, data), schedule, metrics, data.validation_sets)
-    except (ValueError, OSError) as error:
-        raise keyed(error) from error
-
-
-def _objective(settings: TrainConfig, data: PatchData) -> Objective:
-    """Return the loss; w is computed from training patches unless it is a number."""
+    """Return the network under training; where w is computed from the scenes, its loss has a provisional w of 1."""
     depth_loss: Any = settings.model.get("depth_loss")
     visual = settings.model.get("visual")
     if not isinstance(visual, bool):
         raise ConfigError(f"model.visual: expected true or false, got {visual!r}")
-    if not visual:
-        return Objective(depth_loss)
-    w = balance_weight(data.first_patches(_PATCHES_FOR_W)) if settings.loss.w == "auto" else float(settings.loss.w)
-    return Objective(depth_loss, w)
+    w = (1.0 if settings.loss.w == "auto" else float(settings.loss.w)) if visual else 0.0
+    try:
+        mixed = settings.precision == "bfloat16"
+        schedule = Schedule(mixed=mixed, **common(Schedule, settings.trainer))
+        return SuperResolution(net, Objective(depth_loss, w), schedule, metrics, data.validation_sets)
+    except (ValueError, OSError) as error:
+        raise keyed(error) from error
+
+
+def _load(progress: Progress, settings: TrainConfig, module: SuperResolution, data: PatchData) -> None:
+    """Have the scenes rendered or resized, load them, and compute w from training patches where it is ``auto``."""
+    for source, names in data.used_scenes:
+        prepare_scenes(source, names, progress)
+    try:
+        data.setup()
+        if _computes_w(settings):
+            w = balance_weight(data.first_patches(_PATCHES_FOR_W))
+            module.objective = replace(module.objective, w=w)
+            progress.say(f"loss   {_formula(module.objective)}")
+    except (ValueError, OSError) as error:
+        raise keyed(error) from error
+
+
+def _computes_w(settings: TrainConfig) -> bool:
+    """Return whether the weight of MSE_v is to be computed from the scenes."""
+    return bool(settings.model["visual"]) and settings.loss.w == "auto"
 
 
 def _clear(folder: Path) -> None:
@@ -177,27 +185,36 @@ def _clear(folder: Path) -> None:
 
 
 def _announce(
-    console: Console, settings: TrainConfig, module: SuperResolution, data: PatchData, folder: Path, resume: Path | None
+    progress: Progress,
+    settings: TrainConfig,
+    module: SuperResolution,
+    data: PatchData,
+    folder: Path,
+    resume: Path | None,
 ) -> None:
     """Say what the run will do, and how long it will take."""
     trainer, objective = settings.trainer, module.objective
-    visual = f" + {objective.w:.3g} MSE_v" if objective.w else ""
-    batch = torch.utils.data.default_collate(data.first_patches(trainer.batch))
-    step = seconds_per_step(module, batch) * trainer.accumulate
+    step = seconds_per_step(module, data.example_batch()) * trainer.accumulate
     held_out = ", ".join(f"{len(names)} of {kind}" for kind, (_, names) in data.validation_scenes().items())
     parameters = sum(each.numel() for each in module.net.parameters())
     accumulate = f" x {trainer.accumulate} batches" if trainer.accumulate > 1 else ""
+    computed = f"{objective.depth_loss} + w MSE_v; w is computed from the scenes"
     lines: Mapping[str, Any] = {
         "model": f"{settings.model['name']} x{settings.scale}, {parameters:,} parameters, {settings.precision}",
         "data": f"{data.training_count} scenes of {settings.dataset['name']} to train on, {held_out} to validate with",
-        "loss": f"{objective.depth_loss}{visual}",
+        "loss": computed if _computes_w(settings) else _formula(objective),
         "steps": f"{trainer.steps} of {trainer.batch} patches of {trainer.patch} x {trainer.patch}{accumulate}"
         + (", resumed" if resume else ""),
         "time": f"about {duration(step * trainer.steps)} ({step:.2g} s a step as measured now), and the validations",
         "log": f"tensorboard --logdir {folder}",
     }
     for name, line in lines.items():
-        show(console, f"{name:<6} {line}")
+        progress.say(f"{name:<6} {line}")
+
+
+def _formula(objective: Objective) -> str:
+    """Return the loss as a formula."""
+    return objective.depth_loss + (f" + {objective.w:.3g} MSE_v" if objective.w else "")
 
 
 def _describe(trainer: lightning.Trainer, plain: Mapping[str, Any], module: SuperResolution) -> None:

@@ -10,13 +10,12 @@ from typing import Any
 import lightning
 import torch
 from lightning.pytorch.callbacks import Callback, LearningRateMonitor, ModelCheckpoint
-from rich.console import Console
 
-from dsr.app.progress import TrainingBar
 from dsr.app.schema import TrainerConfig
 from dsr.training.degradation import Batch
 from dsr.training.module import SuperResolution
-from dsr.utils.lightning import Interruption, LastValidation, Log, ValidationTable, without_chatter
+from dsr.utils.lightning import Interruption, Log, StepProgress, ValidationTable, make_trainer
+from dsr.utils.progress import Progress
 
 MONITOR = "val/RMSE_v"
 VALIDATION = "validation.csv"
@@ -45,43 +44,44 @@ class Throughput(Callback):
         self._start = time.perf_counter()
 
 
-def make_trainer(
-    settings: TrainerConfig, folder: Path, device: torch.device, console: Console, table: Mapping[str, Any]
+def training_trainer(
+    settings: TrainerConfig, folder: Path, device: torch.device, progress: Progress, table: Mapping[str, Any]
 ) -> tuple[lightning.Trainer, ModelCheckpoint]:
-    """Return the trainer, and the callback that knows the best checkpoint."""
+    """Return the trainer, and the callback that knows the best checkpoint.
+
+    Args:
+        settings: of the training.
+        folder: the run's directory.
+        device: to train on.
+        progress: shows the steps.
+        table: the run's entries in TensorBoard's table of runs.
+
+    """
     checkpoints = folder / "checkpoints"
     best = ModelCheckpoint(checkpoints, "best", monitor=MONITOR, mode="min", save_on_train_epoch_end=False)
     latest = ModelCheckpoint(
         checkpoints, "last", enable_version_counter=False, save_on_train_epoch_end=False
     )  # save_last=True keeps the best's
-    interval = min(settings.validate_every, settings.steps)
     callbacks = [
         Throughput(),
-        LastValidation(interval),
         ValidationTable(folder / VALIDATION),
         best,
         latest,
         LearningRateMonitor("step"),
-        TrainingBar(console),
+        StepProgress(progress, "train"),
         Interruption(checkpoints / "last.ckpt"),
     ]
     logger = Log(folder, name="", version="tensorboard", default_hp_metric=False)
     logger.list_run(table)
-    with without_chatter():
-        trainer = lightning.Trainer(
-            accelerator="gpu" if device.type == "cuda" else device.type,
-            devices=_devices(settings, device),
-            max_steps=settings.steps,
-            accumulate_grad_batches=settings.accumulate,
-            val_check_interval=interval * settings.accumulate,
-            check_val_every_n_epoch=None,
-            log_every_n_steps=min(10, interval),
-            logger=logger,
-            callbacks=callbacks,
-            enable_model_summary=False,
-            num_sanity_val_steps=0,
-            use_distributed_sampler=False,
-        )
+    trainer = make_trainer(
+        device,
+        settings.steps,
+        min(settings.validate_every, settings.steps),
+        callbacks=callbacks,
+        logger=logger,
+        devices=settings.devices,
+        accumulate=settings.accumulate,
+    )
     return trainer, best
 
 
@@ -95,12 +95,3 @@ def seconds_per_step(module: SuperResolution, batch: Batch) -> float:
         taken = time.perf_counter() - start
     module.net.zero_grad(set_to_none=True)
     return taken
-
-
-def _devices(settings: TrainerConfig, device: torch.device) -> Any:
-    """Return what Lightning is to be told of the devices."""
-    if device.type == "cpu" and settings.devices == "auto":
-        return 1
-    if device.type != "cpu" and settings.devices == 1 and device.index is not None:
-        return [device.index]
-    return settings.devices

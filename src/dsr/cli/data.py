@@ -12,12 +12,11 @@ from rich.console import Console
 from rich.table import Table
 
 from dsr.data.download.catalogue import Collection, find
-from dsr.data.download.display import Display
 from dsr.data.download.get import Options, get
 from dsr.data.download.inventory import absent, state, verify
 from dsr.data.download.location import data_root
-from dsr.data.download.transfer import megabytes
-from dsr.utils.console import show
+from dsr.utils.console import ConsoleProgress, show
+from dsr.utils.units import megabytes
 
 _EXAMPLES = """\
 examples:
@@ -110,7 +109,7 @@ def _get(options: argparse.Namespace, console: Console, catalogue: Mapping[str, 
     collections = find(options.names, catalogue)
     if options.mirror is not None and not options.mirror.startswith(("http://", "https://")):
         raise ValueError(f"--mirror: expected an address that begins with http:// or https://, got {options.mirror!r}")
-    root, display = data_root(), Display(console)
+    root, progress = data_root(), ConsoleProgress(console)
     items = {item.path: item for collection in collections for item in collection.items}
     missing = len(absent(items.values(), root))
     for collection in collections:
@@ -120,10 +119,10 @@ def _get(options: argparse.Namespace, console: Console, catalogue: Mapping[str, 
     if missing and not options.yes and sys.stdin.isatty() and console.is_terminal and not _agreed(console):
         return []
     settings = Options(options.mirror, options.accept_changed, options.keep_archives)
-    problems = get(items.values(), root, display, settings) if items else []
+    problems = get(items.values(), root, progress, settings) if items else []
     for collection in collections:
         if not collection.items:
-            problems += verify(collection, root, display, accept_changed=options.accept_changed)
+            problems += verify(collection, root, progress, accept_changed=options.accept_changed)
     if not problems:
         show(console, f"{', '.join(collection.name for collection in collections)}: complete")
     return problems
@@ -151,9 +150,9 @@ def _agreed(console: Console) -> bool:
 
 def _verify(options: argparse.Namespace, console: Console, catalogue: Mapping[str, Collection]) -> list[str]:
     """Check collections, and show which are complete."""
-    problems = []
+    problems, progress = [], ConsoleProgress(console)
     for collection in find(options.names, catalogue):
-        found = verify(collection, data_root(), Display(console), accept_changed=options.accept_changed)
+        found = verify(collection, data_root(), progress, accept_changed=options.accept_changed)
         if not found:
             show(console, f"{collection.name}: complete, as recorded")
         elif collection.items:

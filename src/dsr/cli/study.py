@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 
-from dsr.utils.console import show
+from dsr.utils.console import ConsoleProgress, show
 
 if TYPE_CHECKING:
     import pandas as pd
-
-    from dsr.user_study.build import Question
 
 _EXAMPLES = """\
 examples:
@@ -85,10 +82,8 @@ def _build(options: argparse.Namespace, console: Console, _: object) -> list[str
         **words,
     )
 
-    def watch(questions: Sequence[Question]) -> Iterable[Question]:
-        return _watched(questions, console)
-
-    built = build_study(load_results(options.runs), options.output, choice, overwrite=options.overwrite, watch=watch)
+    progress = ConsoleProgress(console)
+    built = build_study(load_results(options.runs), options.output, choice, progress, overwrite=options.overwrite)
     for note in built.notes:
         show(console, note)
     key = built.key
@@ -99,13 +94,6 @@ def _build(options: argparse.Namespace, console: Console, _: object) -> list[str
     show(console, f"{built.page}  {size:.1f} MB, {asked} questions for each person; give people this file alone")
     show(console, f"{options.output / 'key.json'}  which picture is of which method; keep it to yourself")
     return []
-
-
-def _watched(questions: Sequence[Question], console: Console) -> Iterator[Question]:
-    """Yield the scenes to draw, with a bar on a terminal."""
-    from rich.progress import track  # noqa: PLC0415
-
-    yield from track(questions, "drawing", console=console, disable=not console.is_terminal, transient=True)
 
 
 def _collect(options: argparse.Namespace, console: Console, _: object) -> list[str]:

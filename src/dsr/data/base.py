@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import Literal, Protocol, runtime_checkable
 
 from dsr.sample import Scene
+from dsr.utils.progress import Progress
 
 SceneSelection = Sequence[str] | Literal["found"] | None
 """Names of scenes; None for those that belong to the data set, ``found`` for all that are on disk."""
@@ -56,6 +57,20 @@ class Prepared(Protocol):
     def prepare(self, scenes: Sequence[str]) -> Iterable[str]:
         """Prepare scenes, several at a time, and yield the name of each that is ready."""
         ...
+
+
+def prepare_scenes(source: SceneSource, names: Sequence[str], progress: Progress) -> None:
+    """Have a data set that renders or resizes its scenes make some of them ready.
+
+    Args:
+        source: the data set.
+        names: scenes to make ready.
+        progress: shows how many are ready.
+
+    """
+    if isinstance(source, Prepared):
+        for _ in progress.track(source.prepare(names), "prepare", len(names)):
+            pass
 
 
 class SceneSubset:

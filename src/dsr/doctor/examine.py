@@ -7,7 +7,6 @@ from collections.abc import Callable
 from pathlib import Path
 
 from rich.console import Console
-from rich.progress import Progress
 from rich.table import Table
 from rich.text import Text
 
@@ -20,7 +19,7 @@ from dsr.doctor.precision import check_precision
 from dsr.doctor.registration import check_registration
 from dsr.doctor.units import check_units
 from dsr.sample import Scene
-from dsr.utils.console import USAGE_ERROR, one_line, open_console, print_error
+from dsr.utils.console import USAGE_ERROR, ConsoleProgress, one_line, open_console, print_error
 
 FINE, FAULTY = 0, 1
 CHECKS: tuple[Callable[[Scene], list[Finding]], ...] = (
@@ -64,11 +63,10 @@ def examine_directory(folder: Path, most: int | None = None) -> int:
         console.print(f"{most} of {len(scenes)} scenes, spread over all", highlight=False)
         scenes = [scenes[index * len(scenes) // most] for index in range(most)]
     verdicts: Counter[Level] = Counter()
-    with Progress(console=console, transient=True, disable=not console.is_terminal or len(scenes) <= _MANY) as bar:
-        for name, load in bar.track(scenes, description="examining"):
-            title, findings = _examine(name, load)
-            _show(console, title, findings, brief=len(scenes) > _MANY)
-            verdicts[worst(findings)] += 1
+    for name, load in ConsoleProgress(console).track(scenes, "examine", label=lambda scene: scene[0], lines=False):
+        title, findings = _examine(name, load)
+        _show(console, title, findings, brief=len(scenes) > _MANY)
+        verdicts[worst(findings)] += 1
     console.print(_summary(verdicts), style="bold", highlight=False)
     return FAULTY if verdicts["warning"] or verdicts["problem"] else FINE
 

@@ -12,11 +12,10 @@ from __future__ import annotations
 import json
 import re
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import AbstractContextManager
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -32,18 +31,7 @@ from dsr.methods.base import Iterative, NoSolutionError, Upsampler
 from dsr.sample import DepthSample
 from dsr.utils.console import one_line
 from dsr.utils.files import read_arrays, replacing
-
-
-class Progress(Protocol):
-    """Shows how far a pass over scenes is: ``for scene in progress(scenes, "predict")``."""
-
-    def __call__(self, items: Sequence[str], description: str) -> Iterable[str]:
-        """Return the items, one at a time."""
-        ...
-
-
-Steps = Callable[[str], AbstractContextManager[Callable[[int, int], object]]]
-"""Shows how far a method is within the scene of that name: ``with steps(scene) as step: step(done, total)``."""
+from dsr.utils.progress import SILENT, Progress
 
 
 @dataclass(frozen=True)
@@ -122,16 +110,13 @@ class StalePredictionError(ValueError):
     """A prediction on disk was made from something else, and nobody allowed to overwrite it."""
 
 
-def predict(
-    study: Evaluation, folder: Path, progress: Progress, *, steps: Steps | None = None, overwrite: bool = False
-) -> Outcome:
+def predict(study: Evaluation, folder: Path, progress: Progress = SILENT, *, overwrite: bool = False) -> Outcome:
     """Write the sample and the prediction of every scene that has none yet.
 
     Args:
         study: what to evaluate.
         folder: the run's directory.
-        progress: shows how far it is.
-        steps: shows how far a method is within a scene.
+        progress: shows the scenes that are done, and the method's steps within a scene.
         overwrite: whether predictions on disk are made anew, whatever they came from.
 
     Raises:
@@ -139,13 +124,13 @@ def predict(
 
     """
     outcome = Outcome()
-    for scene in progress(study.source.scenes(), "predict"):
+    for scene in progress.track(study.source.scenes(), "predict"):
         path = prediction_path(folder, scene)
         try:
             config = study.stored_config(scene)
             seconds = None if overwrite else _seconds_of_current(path, config)
             if seconds is None:
-                outcome.seconds[scene] = _predict_scene(study, scene, folder, config, steps)
+                outcome.seconds[scene] = _predict_scene(study, scene, folder, config, progress)
                 outcome.made.append(scene)
             else:
                 if not sample_path(folder, scene).is_file():
@@ -187,13 +172,11 @@ def _seconds_of_current(path: Path, config: Mapping[str, Any]) -> float | None:
     )
 
 
-def _predict_scene(
-    study: Evaluation, scene: str, folder: Path, config: Mapping[str, Any], steps: Steps | None
-) -> float:
+def _predict_scene(study: Evaluation, scene: str, folder: Path, config: Mapping[str, Any], progress: Progress) -> float:
     """Compute one prediction; write it, its sample and the iteration's history; return the method's seconds."""
     sample = study.sample(scene)
     start = time.perf_counter()
-    depth = _answer(study.method, sample, steps)
+    depth = _answer(study.method, sample, progress)
     seconds = time.perf_counter() - start
     expected = (1, sample.camera.height, sample.camera.width)
     if tuple(depth.shape) != expected:
@@ -209,9 +192,7 @@ def _predict_scene(
     return seconds
 
 
-def _answer(method: Upsampler, sample: DepthSample, steps: Steps | None) -> Tensor:
-    """Return a method's depth, and show how far it is."""
-    if steps is None:
-        return method(sample)
-    with steps(sample.scene) as step:
+def _answer(method: Upsampler, sample: DepthSample, progress: Progress) -> Tensor:
+    """Return a method's depth, and show its steps."""
+    with progress.task("steps") as step:
         return method(sample, step)

@@ -12,12 +12,13 @@ import pandas as pd
 import torch
 from torch import Tensor
 
-from dsr.evaluation.predict import Evaluation, Outcome, Progress, failure_line
+from dsr.evaluation.predict import Evaluation, Outcome, failure_line
 from dsr.evaluation.store import load_prediction, prediction_path, sample_path
 from dsr.metrics.catalogue import Metric, score_image
 from dsr.metrics.formats import HEADLINES
 from dsr.sample import DepthSample
 from dsr.utils.files import replacing, write_text
+from dsr.utils.progress import Progress
 
 SCORE_COLUMNS = (
     "dataset",
@@ -48,7 +49,7 @@ def score(
         folder: the run's directory.
         metrics: from :func:`dsr.metrics.catalogue.catalogue`.
         outcome: of :func:`predict`; failures and scenes without truth are added to it.
-        progress: shows how far it is.
+        progress: shows the scenes that are done.
         illustrate: draws a picture from a sample, the predicted depth and its worst-of-four scores.
 
     Returns:
@@ -56,7 +57,7 @@ def score(
 
     """
     rows: list[dict[str, Any]] = []
-    for scene in progress(list(outcome.seconds), "score"):
+    for scene in progress.track(outcome.seconds, "score"):
         try:
             sample = DepthSample.load(sample_path(folder, scene))
             depth = load_prediction(prediction_path(folder, scene))

@@ -11,9 +11,10 @@ from typing import Any
 
 import lightning
 import torch
-from torch.utils.data import DataLoader, Dataset
+from torch.utils.data import DataLoader, Dataset, default_collate
 
 from dsr.data.base import SceneSource, content_key
+from dsr.geometry.camera import Camera
 from dsr.sample import Scene
 from dsr.training.degradation import Batch, Degradation, to_tensors
 from dsr.training.patches import Patches, PatchSettings, check_patches
@@ -143,6 +144,15 @@ class PatchData(lightning.LightningDataModule):
                 raise ValueError(f"validation.{kind}: expected scenes with a true depth, there is none")
             self._held_out[kind] = (source, [scene.name for scene in scenes])
             self._validation.append(scenes)
+
+    def example_batch(self) -> Batch:
+        """Return a batch of the run's size that needs no scene: a grey slope, repeated."""
+        size = self._settings.patch
+        camera = Camera(size, size, size, size, (size - 1) / 2, (size - 1) / 2)
+        depth = torch.linspace(1, 2, size, dtype=torch.float64).repeat(1, size, 1)
+        scene = Scene("example", "slope", torch.full((3, size, size), 0.5), camera, depth)
+        tensors = to_tensors(self._degradation.sample(scene, clean=True))
+        return default_collate([tensors] * self._settings.batch)
 
     def first_patches(self, count: int) -> list[Batch]:
         """Return the first ``count`` patches of the run."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import hashlib
 import json
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -17,14 +17,13 @@ from dsr.user_study.key import KEY_NAME, PAGE_VERSION, Candidate, Key, Trial, re
 from dsr.user_study.page import page_of
 from dsr.user_study.pictures import grey_png, shading_of
 from dsr.utils.files import write_text
+from dsr.utils.progress import SILENT, Progress
 
 PAGE_NAME = "index.html"
 _DIGITS = 12
 """Of a hash, so many digits are an id."""
 _FEWEST = 2
 """Methods that there is something to choose between."""
-
-Watch = Callable[[Sequence["Question"]], Iterable["Question"]]
 
 
 @dataclass(frozen=True)
@@ -89,7 +88,12 @@ class Built:
 
 
 def build_study(
-    results: Results, folder: Path, choice: Choice | None = None, *, overwrite: bool = False, watch: Watch = iter
+    results: Results,
+    folder: Path,
+    choice: Choice | None = None,
+    progress: Progress = SILENT,
+    *,
+    overwrite: bool = False,
 ) -> Built:
     """Write ``index.html``, the page, and ``key.json`` into a directory.
 
@@ -97,8 +101,8 @@ def build_study(
         results: the runs.
         folder: where to; made if need be.
         choice: what of the runs to show.
+        progress: shows the scenes that are drawn.
         overwrite: whether to replace another study there, whose answers can then no longer be collected.
-        watch: is handed the scenes and yields them one by one, such as a progress bar.
 
     Raises:
         ValueError: nothing is left to compare, a choice names what the runs have not, a file is damaged, the title
@@ -109,7 +113,10 @@ def build_study(
     questions, notes = _questions(results, choice)
     labels = {run.label for question in questions for run in question.runs}
     _expect_blind(choice, labels)
-    drawn = [_draw(question, choice.light) for question in watch(questions)]
+    drawn = [
+        _draw(question, choice.light)
+        for question in progress.track(questions, "draw", label=lambda question: question.scene)
+    ]
     notes += [note for each in drawn for note in each.notes]
     scenes, trials = _with_ids([each for each in drawn if each.pictures])
     if not scenes:

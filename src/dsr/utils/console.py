@@ -1,16 +1,33 @@
-"""What all commands have in common: exit codes, a console, lines and bars on it."""
+"""What all commands share: exit codes, a console, and the progress shown on it."""
 
 from __future__ import annotations
 
+import contextlib
 import sys
+import threading
+import time
+from collections.abc import Callable, Iterable, Iterator
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.live import Live
+from rich.progress_bar import ProgressBar
+from rich.table import Table
+from rich.text import Text
+
+from dsr.utils.progress import Item, Progress, Unit
+from dsr.utils.units import clock, megabytes
 
 USAGE_ERROR = 2
 INTERRUPTED = 130
 _LOG_WIDTH = 110
 """Columns where the output is not a terminal."""
+_FIRST_LINE, _NEXT_LINE = 3.0, 10.0
+"""Seconds until the first line about something that goes on, and between two of them, off a terminal."""
+_TICK = 0.5
+_MANY = 50
+"""Items up to which each gets a line of its own, off a terminal."""
+_LONG = 2.0
+"""Seconds from which an item among many gets a line, too, and a finished pass over items, on a terminal."""
 
 
 def open_console() -> Console:
@@ -24,26 +41,6 @@ def show(console: Console, line: str) -> None:
     console.print(line, markup=False, highlight=False, soft_wrap=True)
 
 
-def bar(console: Console, *, transient: bool = False) -> Progress:
-    """Return a bar of a name, how much of how much, the time passed and left, and a remark; on a terminal only.
-
-    Args:
-        console: where it is shown.
-        transient: whether it goes away at the end.
-
-    """
-    columns = (
-        TextColumn("{task.description:<8}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        TextColumn("left"),
-        TimeRemainingColumn(elapsed_when_finished=False),
-        TextColumn("{task.fields[remark]}", markup=False),
-    )
-    return Progress(*columns, console=console, transient=transient, disable=not console.is_terminal)
-
-
 def print_error(message: str) -> None:
     """Print one line on stderr."""
     print(f"error: {' '.join(message.split())}", file=sys.stderr, flush=True)  # noqa: T201
@@ -52,3 +49,183 @@ def print_error(message: str) -> None:
 def one_line(error: BaseException) -> str:
     """Return an error's message on one line."""
     return " ".join(str(error).split()) or type(error).__name__
+
+
+class ConsoleProgress(Progress):
+    """Shows progress with named times: bars on a terminal, elsewhere plain lines.
+
+    Off a terminal there is a line for each finished item, and one every ten seconds about what is going on.
+
+    Args:
+        console: where it is shown.
+        now: returns the time in seconds.
+
+    """
+
+    def __init__(self, console: Console, now: Callable[[], float] = time.monotonic) -> None:
+        self._console, self._now = console, now
+        self._tasks: list[_ConsoleTask] = []  # from the outermost to the innermost
+        self._next_line = 0.0
+
+    def say(self, line: str) -> None:
+        """Show a line of text, above the bars if there are any."""
+        show(self._console, line)
+
+    @contextlib.contextmanager
+    def task(
+        self, name: str, total: int | None = None, *, done: int = 0, unit: Unit = "items"
+    ) -> Iterator[_ConsoleTask]:
+        """Return a context in which a piece of work is shown; see :class:`dsr.utils.progress.Progress`."""
+        task = _ConsoleTask(name, total, done, unit, self._now)
+        outermost = not self._tasks
+        self._tasks.append(task)
+        try:
+            with self._display() if outermost else contextlib.nullcontext():
+                yield task
+        finally:
+            self._tasks.remove(task)
+
+    def track(
+        self,
+        items: Iterable[Item],
+        name: str,
+        total: int | None = None,
+        *,
+        label: Callable[[Item], str] = str,
+        lines: bool = True,
+    ) -> Iterator[Item]:
+        """Yield items, and show how many are done; see :class:`dsr.utils.progress.Progress`."""
+        if total is None:
+            items = list(items)
+            total = len(items)
+        with self.task(name, total) as task:
+            before = self._now()
+            for done, item in enumerate(items):
+                task(done, remark=label(item))
+                yield item
+                task(done + 1)
+                now = self._now()
+                if lines and not self._console.is_terminal:
+                    self._show_item(task, now - before)
+                before = now
+        if lines and self._console.is_terminal and task.elapsed >= _LONG:
+            self.say(f"{name}: {task.amount}, elapsed {clock(task.elapsed)}")
+
+    def tick(self) -> None:
+        """Print a line about what is going on, off a terminal, if it is time for one."""
+        tasks = [task for task in tuple(self._tasks) if task.is_shown]
+        if not tasks or tasks[-1].done == tasks[-1].total or self._now() < self._next_line:
+            return
+        self._next_line = self._now() + _NEXT_LINE
+        path = ": ".join(f"{outer.name} {outer.remark}".rstrip() for outer in tasks[:-1])
+        self.say(f"{path}: {tasks[-1].line}" if path else tasks[-1].line)
+
+    def _show_item(self, task: _ConsoleTask, seconds: float) -> None:
+        """Print a line about a finished item, unless it is one of many short ones."""
+        if task.total is not None and (task.total <= _MANY or task.done == task.total or seconds >= _LONG):
+            self._next_line = self._now() + _NEXT_LINE
+            self.say(f"{task.name} {task.remark}: {task.amount}, {seconds:.1f} s, {', '.join(task.times)}")
+
+    def _display(self) -> contextlib.AbstractContextManager[object]:
+        """Return a context in which the tasks are shown."""
+        if self._console.is_terminal:
+            return Live(console=self._console, get_renderable=self._table, transient=True, refresh_per_second=8)
+        self._next_line = self._now() + _FIRST_LINE
+        return self._ticking()
+
+    @contextlib.contextmanager
+    def _ticking(self) -> Iterator[None]:
+        """Call :meth:`tick` from a thread, so that there are lines however long a step takes."""
+        ended = threading.Event()
+
+        def run() -> None:
+            while not ended.wait(_TICK):
+                self.tick()
+
+        thread = threading.Thread(target=run, daemon=True)
+        thread.start()
+        try:
+            yield
+        finally:
+            ended.set()
+            thread.join()
+
+    def _table(self) -> Table:
+        """Return a row with a bar for each task."""
+        grid = Table.grid(padding=(0, 1))
+        for task in tuple(self._tasks):
+            if task.is_shown:
+                bar = ProgressBar(task.total, task.done, width=24, pulse=task.total is None)
+                elapsed, remaining = (*task.times, "remaining -:--:--")[:2]
+                cells = (f"{task.name:<8}", bar, task.amount, elapsed, remaining, task.remark)
+                grid.add_row(*(Text(cell, no_wrap=True) if isinstance(cell, str) else cell for cell in cells))
+        return grid
+
+
+class _ConsoleTask:
+    """A piece of work under way, with its times.
+
+    Args:
+        name, total, done, unit: see :meth:`dsr.utils.progress.Progress.task`.
+        now: returns the time in seconds.
+
+    """
+
+    def __init__(self, name: str, total: int | None, done: int, unit: Unit, now: Callable[[], float]) -> None:
+        self.name, self.total, self.done, self.remark = name, total, done, ""
+        self._unit, self._now = unit, now
+        self._started = self._measured = self._updated = now()
+        self._before: int | None = done if unit == "items" else None  # a download tells first what was there before
+
+    def __call__(self, done: int, total: int | None = None, remark: str | None = None) -> None:
+        """Report how much is done; see :class:`dsr.utils.progress.Task`."""
+        self._updated = self._now()
+        if self._before is None or done < self.done:
+            self._before, self._measured = done, self._updated
+        self.done = done
+        if total is not None:
+            self.total = total
+        if remark is not None:
+            self.remark = remark
+
+    @property
+    def is_shown(self) -> bool:
+        """Whether there is something to show: nothing of a task that has not reported and has no total."""
+        return self.total is not None or self.done > 0
+
+    @property
+    def elapsed(self) -> float:
+        """Seconds since the beginning."""
+        return self._now() - self._started
+
+    @property
+    def remaining(self) -> float | None:
+        """Seconds to the end at the speed so far; None where that is not known."""
+        if self.total is None or not self._speed:
+            return None
+        return max((self.total - self.done) / self._speed - (self._now() - self._updated), 0.0)
+
+    @property
+    def amount(self) -> str:
+        """How much is done, of how much."""
+        if self._unit == "items":
+            return f"{self.done}" if self.total is None else f"{self.done} of {self.total}"
+        total = "" if self.total is None else f" of {megabytes(self.total)}"
+        return f"{megabytes(self.done)}{total}" + (f", {megabytes(self._speed)}/s" if self._speed else "")
+
+    @property
+    def times(self) -> tuple[str, ...]:
+        """The named times."""
+        remaining = self.remaining
+        return (f"elapsed {clock(self.elapsed)}", *([] if remaining is None else [f"remaining {clock(remaining)}"]))
+
+    @property
+    def line(self) -> str:
+        """All of it on one line."""
+        return f"{self.name}: {', '.join(filter(None, (self.amount, *self.times, self.remark)))}"
+
+    @property
+    def _speed(self) -> float:
+        """Amount per second, 0 where that is not known."""
+        passed = self._updated - self._measured
+        return 0.0 if self._before is None or passed <= 0 else (self.done - self._before) / passed

@@ -1,4 +1,4 @@
-"""What trainings and per-image optimisations with Lightning share: interruption, logs, quiet."""
+"""What trainings and per-image optimisations with Lightning share: the trainer, progress, interruption, logs."""
 
 from __future__ import annotations
 
@@ -6,21 +6,28 @@ import contextlib
 import csv
 import logging
 import signal
+import time
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Literal, Protocol
 
 import lightning
+import torch
 from lightning.pytorch.callbacks import Callback
 from lightning.pytorch.loggers import TensorBoardLogger
 from lightning.pytorch.utilities import rank_zero_only
 from torch.utils.tensorboard.summary import hparams
 
 from dsr.utils.files import replacing
+from dsr.utils.progress import Progress, Task
 
 IN_TABLE = ("RMSE_v", "DSSIM_v", "LPIPS_v", "BadPix_v_5", "Bumpiness_d", "RMSE_d")
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
+_LOG_EVERY = 10
+"""Steps between two values of a training in TensorBoard's log."""
+_SECONDS_BETWEEN_LOSSES = 0.2
+"""Between two losses that are fetched from the device to be shown, each of which waits for it."""
 
 
 class Scored(Protocol):
@@ -112,6 +119,73 @@ class LastValidation(Callback):
             trainer.should_stop = True
 
 
+class StepProgress(Callback):
+    """Shows the steps of a training with the latest loss, the scenes of a validation, and its scores.
+
+    Args:
+        progress: where they are shown.
+        name: what the steps are called, such as ``train``.
+        subject: what the lines about validations begin with, such as a scene's name; empty for nothing.
+
+    """
+
+    def __init__(self, progress: Progress, name: str, subject: str = "") -> None:
+        self._progress, self._name, self._subject = progress, name, subject
+        self._stack = contextlib.ExitStack()
+        self._validation = contextlib.ExitStack()
+        self._steps: Task | None = None
+        self._scenes: Task | None = None
+        self._fetched, self._validated = 0.0, 0
+
+    def on_train_start(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
+        """Begin at the step that the training begins with."""
+        task = self._progress.task(self._name, int(trainer.max_steps), done=trainer.global_step)
+        self._steps = self._stack.enter_context(task)
+
+    def on_train_batch_end(self, trainer: lightning.Trainer, *_: Any) -> None:
+        """Show a step; the loss is fetched from the device a few times a second."""
+        if self._steps is None:
+            return
+        now, remark = time.monotonic(), None
+        if now - self._fetched > _SECONDS_BETWEEN_LOSSES:
+            self._fetched, remark = now, _loss_text(trainer)
+        self._steps(trainer.global_step, remark=remark)
+
+    def on_validation_start(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
+        """Begin to show the scenes of a validation."""
+        total = sum(int(count) for count in trainer.num_val_batches)
+        self._validated = 0
+        self._scenes = self._validation.enter_context(self._progress.task("validate", total))
+
+    def on_validation_batch_end(self, *_: Any) -> None:
+        """Show a scene."""
+        self._validated += 1
+        if self._scenes is not None:
+            self._scenes(self._validated)
+
+    def on_validation_end(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
+        """Print the scores of the validation."""
+        self._validation.close()
+        scores = scores_line(trainer)
+        if scores:
+            subject = f"{self._subject}: " if self._subject else ""
+            parts = (f"{subject}step {trainer.global_step:>6}", _loss_text(trainer), f"validation: {scores}")
+            self._progress.say("  ".join(filter(None, parts)))
+
+    def on_train_end(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
+        """Stop showing steps."""
+        self._close()
+
+    def on_exception(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule, _: BaseException) -> None:
+        """Give the terminal back."""
+        self._close()
+
+    def _close(self) -> None:
+        """Stop showing anything."""
+        self._validation.close()
+        self._stack.close()
+
+
 class Log(TensorBoardLogger):
     """TensorBoard's log without the number of the epoch, of which there is one."""
 
@@ -126,6 +200,49 @@ class Log(TensorBoardLogger):
         scores = dict.fromkeys((f"val/{name}" for name in IN_TABLE), 0.0)  # the names count, values come from the log
         for part in hparams(dict(settings), scores):
             self.experiment.file_writer.add_summary(part)
+
+
+def make_trainer(
+    device: torch.device,
+    steps: int,
+    interval: int,
+    *,
+    callbacks: Sequence[Callback],
+    logger: Any,
+    devices: int | Literal["auto"] = 1,
+    accumulate: int = 1,
+    **named: Any,
+) -> lightning.Trainer:
+    """Return a trainer for a number of steps, with a validation after every few and after the last one.
+
+    Args:
+        device: to train on.
+        steps: of the training.
+        interval: steps between two validations.
+        callbacks: of Lightning.
+        logger: of Lightning; False for none.
+        devices: how many devices of that kind to train on; ``auto`` for all that there are.
+        accumulate: batches of a step.
+        **named: more settings of :class:`lightning.Trainer`.
+
+    """
+    with without_chatter():
+        return lightning.Trainer(
+            accelerator="gpu" if device.type == "cuda" else device.type,
+            devices=_lightning_devices(device, devices),
+            max_steps=steps,
+            accumulate_grad_batches=accumulate,
+            val_check_interval=interval * accumulate,
+            check_val_every_n_epoch=None,
+            log_every_n_steps=min(_LOG_EVERY, interval),
+            logger=logger,
+            callbacks=[LastValidation(interval), *callbacks],
+            enable_progress_bar=False,
+            enable_model_summary=False,
+            num_sanity_val_steps=0,
+            use_distributed_sampler=False,
+            **named,
+        )
 
 
 def save_checkpoint(trainer: lightning.Trainer, path: Path) -> None:
@@ -152,18 +269,25 @@ def fit(
         raise KeyboardInterrupt
 
 
+def _lightning_devices(device: torch.device, count: int | Literal["auto"]) -> Any:
+    """Return what Lightning is told of the devices: how many, or the one."""
+    if device.type == "cpu" and count == "auto":
+        return 1
+    if device.type != "cpu" and count == 1 and device.index is not None:
+        return [device.index]
+    return count
+
+
+def _loss_text(trainer: lightning.Trainer) -> str:
+    """Return the loss of the last step; nothing where there is none."""
+    loss = trainer.callback_metrics.get("train/loss")
+    return "" if loss is None else f"loss {float(loss):.4f}"
+
+
 def scores_line(trainer: lightning.Trainer) -> str:
     """Return the main scores of the last validation for a reader; nothing where there are none."""
     scores = {name: trainer.callback_metrics.get(f"val/{name}") for name in ("RMSE_d", "RMSE_v", "DSSIM_v", "LPIPS_v")}
     return "  ".join(f"{name} {float(value):.4f}" for name, value in scores.items() if value is not None)
-
-
-def duration(seconds: float) -> str:
-    """Return a time for a reader: 40 s, 12 min, 3.5 h."""
-    if seconds < 100:
-        return f"{seconds:.0f} s"
-    minutes = seconds / 60
-    return f"{minutes:.0f} min" if minutes < 100 else f"{minutes / 60:.1f} h"
 
 
 @contextlib.contextmanager

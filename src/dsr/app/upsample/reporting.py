@@ -1,14 +1,12 @@
-"""What ``dsr upsample`` shows: facts, each once, and bars with the time left."""
+"""What ``dsr upsample`` says of its inputs and results: facts, each once, and problems."""
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 
 import torch
 from rich.console import Console
-from rich.progress import Progress
 
 from dsr.io.encoding import Assumption
 from dsr.utils.console import one_line, show
@@ -53,13 +51,3 @@ def listed(names: Sequence[str]) -> str:
     """Return some of the names, and how many more there are."""
     more = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
     return ", ".join(names[:_SHOWN]) + more
-
-
-@contextmanager
-def steps(progress: Progress, name: str) -> Iterator[Callable[[int, int], None]]:
-    """Show the parts of one picture as they come."""
-    task = progress.add_task("parts", total=None, remark=name)
-    try:
-        yield lambda done, total: progress.update(task, completed=done, total=total)
-    finally:
-        progress.remove_task(task)

@@ -11,7 +11,6 @@ from typing import Any
 
 import torch
 from rich.console import Console
-from rich.progress import Progress
 from torch import Tensor
 
 from dsr.app.upsample.outputs import (
@@ -26,14 +25,15 @@ from dsr.app.upsample.outputs import (
     versions,
     write_parts,
 )
-from dsr.app.upsample.reporting import Reporter, listed, problem_line, steps
+from dsr.app.upsample.reporting import Reporter, listed, problem_line
 from dsr.app.upsample.request import UpsampleRequest, files_of, inputs_of, settings_of
 from dsr.inference import AUTO, NOISY, Plan, enlarged_by, plan, suited_method, upsample_depth
 from dsr.io.encoding import Assumption
 from dsr.io.inputs import Picture, UnitMemory, read_picture
 from dsr.io.layouts import find_pairs_of_folder
 from dsr.io.pairs import Pair, PairingResult, find_pairs_of_lists
-from dsr.utils.console import bar, show
+from dsr.utils.console import ConsoleProgress, show
+from dsr.utils.progress import Progress
 
 
 def run(wanted: UpsampleRequest, console: Console) -> list[str]:
@@ -56,16 +56,13 @@ def run(wanted: UpsampleRequest, console: Console) -> list[str]:
     reporter, units = Reporter(console), UnitMemory()
     problems: dict[str, list[str]] = {}
     outcomes: Counter[str] = Counter()
-    with bar(console, transient=True) as progress:
-        total = progress.add_task("pictures", total=len(found.pairs), remark="", visible=not single)
-        for pair in found.pairs:
-            progress.update(total, remark=pair.name)
-            target = wanted.output if single else wanted.output / pair.name
-            try:
-                outcomes[_one(wanted, pair, target, units, reporter, progress)] += 1
-            except (ValueError, OSError, MemoryError, torch.OutOfMemoryError) as error:
-                problems.setdefault(problem_line(error), []).append(pair.name)
-            progress.advance(total)
+    progress = ConsoleProgress(console)
+    for pair in progress.track(found.pairs, "upsample", label=lambda pair: pair.name, lines=not single):
+        target = wanted.output if single else wanted.output / pair.name
+        try:
+            outcomes[_one(wanted, pair, target, units, reporter, progress)] += 1
+        except (ValueError, OSError, MemoryError, torch.OutOfMemoryError) as error:
+            problems.setdefault(problem_line(error), []).append(pair.name)
     if not single:
         reporter.summary(outcomes["done"] + outcomes["to do"])
         counts = [f"{count} {outcome}" for outcome, count in outcomes.items()]
@@ -206,7 +203,7 @@ def _without_repeats(picture: Picture) -> Picture:
 def _upsampled(job: _Job, picture: Picture, method: str, progress: Progress) -> Tensor:
     """Return the high-resolution depth, (1, H, W) in metres."""
     wanted = job.wanted
-    with steps(progress, job.pair.name) as step:
+    with progress.task("steps") as step:
         return upsample_depth(
             picture.rgb,
             picture.depth_lr,

@@ -6,7 +6,7 @@ import contextlib
 import hashlib
 import json
 import os
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -14,9 +14,8 @@ from typing import Any
 from filelock import FileLock, Timeout
 
 from dsr.utils.files import write_text
+from dsr.utils.progress import Task
 
-Moved = Callable[[int, int | None], None]
-"""Takes how many bytes are done, and of how many, None where that is not known."""
 _CHUNK = 1 << 20
 
 
@@ -89,7 +88,7 @@ def _entry(fields: Any) -> Entry:
     return Entry(sha256, size, files)
 
 
-def sha256_of(path: Path, moved: Moved | None = None) -> str:
+def sha256_of(path: Path, moved: Task | None = None) -> str:
     """Return the SHA-256 of a file, 64 hexadecimal digits."""
     digest, done, total = hashlib.sha256(), 0, path.stat().st_size
     with path.open("rb") as file:

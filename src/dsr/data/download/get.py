@@ -13,10 +13,12 @@ from urllib.parse import urlsplit
 
 from dsr.data.download.catalogue import Item
 from dsr.data.download.checksums import Checksums, Entry, lock_directory, sha256_of
-from dsr.data.download.inventory import Watcher, compare, expect_kind, lack, record
-from dsr.data.download.transfer import FetchError, NoSpaceError, UnreachableError, download, megabytes
+from dsr.data.download.inventory import compare, expect_kind, lack, record
+from dsr.data.download.transfer import FetchError, NoSpaceError, UnreachableError, download
 from dsr.data.download.unpack import take_member, unpack
 from dsr.utils.console import one_line
+from dsr.utils.progress import Progress
+from dsr.utils.units import megabytes
 
 _UNPACKED = 1.25
 """Size of what an archive of pictures unpacks to, as a multiple of its own: for a first check of the disk."""
@@ -38,7 +40,7 @@ class Options:
     keep_archives: bool = False
 
 
-def get(items: Iterable[Item], root: Path, watcher: Watcher, options: Options | None = None) -> list[str]:
+def get(items: Iterable[Item], root: Path, progress: Progress, options: Options | None = None) -> list[str]:
     """Fetch what is not there, or not as recorded.
 
     An interruption keeps what has come of a file beside it, ``.part``, and the next call goes on from there.
@@ -46,7 +48,7 @@ def get(items: Iterable[Item], root: Path, watcher: Watcher, options: Options | 
     Args:
         items: what to fetch; a path that occurs twice is fetched once.
         root: the directory of the data sets.
-        watcher: is told how it goes.
+        progress: shows what is done.
         options: see :class:`Options`.
 
     Returns:
@@ -59,7 +61,7 @@ def get(items: Iterable[Item], root: Path, watcher: Watcher, options: Options | 
     problems: list[str] = []
     root.mkdir(parents=True, exist_ok=True)
     with lock_directory(root):
-        job = _Job(root, Checksums(root), watcher, options or Options())
+        job = _Job(root, Checksums(root), progress, options or Options())
         for item in {item.path: item for item in items}.values():
             try:
                 job.get(item)
@@ -76,7 +78,7 @@ class _Job:
 
     root: Path
     checksums: Checksums
-    watcher: Watcher
+    progress: Progress
     options: Options
     gone: set[str] = field(default_factory=set)
 
@@ -87,18 +89,18 @@ class _Job:
             if not self._is_good(item):
                 digest = self._fetch(item)
                 self.checksums.update({item.path: Entry(digest, target.stat().st_size)})
-                self.watcher.say(f"{item.path}: {megabytes(target.stat().st_size)}")
+                self.progress.say(f"{item.path}: {megabytes(target.stat().st_size)}")
             return
         if lack(item, self.root, entry) is None:
             return
         given = target.is_file()
         digest = self._digest(item, target, str(target)) if given else self._fetch(item)
-        with self.watcher.transfer(f"unpacking {item.path}") as moved:
+        with self.progress.task(f"unpacking {item.path}", unit="bytes") as moved:
             files = unpack(target, self.root / item.unpack_to, moved, item.contains)
         self.checksums.update({item.path: Entry(digest, target.stat().st_size, files)})
-        self.watcher.say(f"{item.path}: {megabytes(target.stat().st_size)}, unpacked to {len(files)} files")
+        self.progress.say(f"{item.path}: {megabytes(target.stat().st_size)}, unpacked to {len(files)} files")
         if given:
-            self.watcher.say(f"{item.path}: was there before and is kept; it is not needed any more")
+            self.progress.say(f"{item.path}: was there before and is kept; it is not needed any more")
         elif not self.options.keep_archives:
             target.unlink()
 
@@ -107,11 +109,11 @@ class _Job:
         if not (self.root / item.path).is_file():
             return False
         new: dict[str, Entry] = {}
-        problem = compare(item.path, self.root, self.checksums, new, self.watcher, item.sha256)
+        problem = compare(item.path, self.root, self.checksums, new, self.progress, item.sha256)
         if problem is not None:
-            self.watcher.say(f"{problem}: fetching it again")
+            self.progress.say(f"{problem}: fetching it again")
             return False
-        record(self.checksums, new, self.watcher)
+        record(self.checksums, new, self.progress)
         return True
 
     def _fetch(self, item: Item) -> str:
@@ -140,7 +142,7 @@ class _Job:
         room = 0.0 if item.unpack_to is None else _UNPACKED
         new = target.with_name(f"{name}.new")
         if not new.is_file():
-            with self.watcher.transfer(item.path) as moved:
+            with self.progress.task(item.path, unit="bytes") as moved:
                 download(address, part, moved, room=room, pauses=pauses)
             part.replace(new)
         try:

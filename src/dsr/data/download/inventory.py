@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Protocol
 
 from dsr.data.download.catalogue import Collection, Item
-from dsr.data.download.checksums import Checksums, Entry, Moved, lock_directory, sha256_of
+from dsr.data.download.checksums import Checksums, Entry, lock_directory, sha256_of
 from dsr.data.download.transfer import is_page
+from dsr.utils.progress import Progress
 
 _BEGINNINGS: Mapping[str, tuple[bytes, ...]] = {
     ".gz": (b"\x1f\x8b",),
@@ -21,18 +20,6 @@ _BEGINNINGS: Mapping[str, tuple[bytes, ...]] = {
     ".ppm": (b"P3", b"P6"),
     ".zip": (b"PK",),
 }
-
-
-class Watcher(Protocol):
-    """Who is told how it goes."""
-
-    def say(self, line: str) -> None:
-        """Take a line about what was done."""
-        ...
-
-    def transfer(self, name: str) -> contextlib.AbstractContextManager[Moved]:
-        """Return a context for the bytes of one file; its value takes how many are done, and of how many."""
-        ...
 
 
 def state(collection: Collection, root: Path) -> str:
@@ -58,7 +45,7 @@ def absent(items: Iterable[Item], root: Path) -> list[Item]:
     return [item for item in by_path.values() if lack(item, root, checksums.get(item.path)) is not None]
 
 
-def verify(collection: Collection, root: Path, watcher: Watcher, *, accept_changed: bool = False) -> list[str]:
+def verify(collection: Collection, root: Path, progress: Progress, *, accept_changed: bool = False) -> list[str]:
     """Check the files of a collection against their recorded sizes and checksums; those without get them recorded.
 
     Of unpacked archives the names and sizes of the files are checked.
@@ -66,7 +53,7 @@ def verify(collection: Collection, root: Path, watcher: Watcher, *, accept_chang
     Args:
         collection: what to check.
         root: the directory of the data sets.
-        watcher: is told how it goes.
+        progress: shows what is done.
         accept_changed: whether to record anew what differs.
 
     Returns:
@@ -82,18 +69,23 @@ def verify(collection: Collection, root: Path, watcher: Watcher, *, accept_chang
         old: Mapping[str, Entry] = {} if accept_changed else checksums
         found: list[str | None]
         if collection.items:
-            found = [_verify_item(item, root, old, new, watcher) for item in collection.items]
+            found = [_verify_item(item, root, old, new, progress) for item in collection.items]
         else:
             paths = {path for pattern in collection.patterns for path in _matches(collection, root, pattern)}
             names = sorted(path.relative_to(root).as_posix() for path in paths)
             found = [*_misses(collection, root, checksums)]
-            found += [compare(name, root, old, new, watcher) for name in names]
-        record(checksums, new, watcher)
+            found += [compare(name, root, old, new, progress) for name in names]
+        record(checksums, new, progress)
     return [problem for problem in found if problem is not None]
 
 
 def compare(
-    name: str, root: Path, old: Mapping[str, Entry], new: dict[str, Entry], watcher: Watcher, sha256: str | None = None
+    name: str,
+    root: Path,
+    old: Mapping[str, Entry],
+    new: dict[str, Entry],
+    progress: Progress,
+    sha256: str | None = None,
 ) -> str | None:
     """Return how a file differs from what it should be, None where it does not.
 
@@ -102,7 +94,7 @@ def compare(
         root: the directory of the data sets.
         old: what is recorded.
         new: takes its entry where none is recorded.
-        watcher: is told how it goes.
+        progress: shows what is done.
         sha256: its checksum where that is known beforehand.
 
     """
@@ -110,7 +102,7 @@ def compare(
     expected = sha256 or (None if entry is None else entry.sha256)
     try:
         expect_kind(path, path.suffix, str(path))
-        with watcher.transfer(name) as moved:
+        with progress.task(name, unit="bytes") as moved:
             digest = sha256_of(path, moved)
     except (ValueError, OSError) as error:
         return str(error)
@@ -121,7 +113,7 @@ def compare(
     return None
 
 
-def record(checksums: Checksums, new: Mapping[str, Entry], watcher: Watcher) -> None:
+def record(checksums: Checksums, new: Mapping[str, Entry], progress: Progress) -> None:
     """Record what was there without a record."""
     if not new:
         return
@@ -130,9 +122,9 @@ def record(checksums: Checksums, new: Mapping[str, Entry], watcher: Watcher) -> 
     try:
         checksums.update(new)
     except OSError as error:
-        watcher.say(f"{checksums.path}: not written: {error}")
+        progress.say(f"{checksums.path}: not written: {error}")
     else:
-        watcher.say(f"{checksums.path}: recorded as found: {few}")
+        progress.say(f"{checksums.path}: recorded as found: {few}")
 
 
 def lack(item: Item, root: Path, entry: Entry | None) -> str | None:
@@ -163,7 +155,7 @@ def expect_kind(path: Path, suffix: str, source: str) -> None:
 
 
 def _verify_item(
-    item: Item, root: Path, old: Mapping[str, Entry], new: dict[str, Entry], watcher: Watcher
+    item: Item, root: Path, old: Mapping[str, Entry], new: dict[str, Entry], progress: Progress
 ) -> str | None:
     """Return what is wrong with an item."""
     entry = old.get(item.path)
@@ -172,7 +164,7 @@ def _verify_item(
         new.update({} if entry is None else {item.path: entry})
     problem = lack(item, root, entry)
     if problem is None and item.unpack_to is None:
-        problem = compare(item.path, root, old, new, watcher, item.sha256)
+        problem = compare(item.path, root, old, new, progress, item.sha256)
     return problem
 
 

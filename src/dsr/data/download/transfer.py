@@ -16,9 +16,10 @@ from urllib.parse import urlsplit
 import requests
 import urllib3
 
-from dsr.data.download.checksums import Moved
 from dsr.utils.console import one_line
 from dsr.utils.files import write_text
+from dsr.utils.progress import Task
+from dsr.utils.units import megabytes
 
 PAUSES = (1.0, 3.0, 9.0)
 """Seconds before each further try where a connection fails."""
@@ -50,7 +51,7 @@ class _TryAgainError(Exception):
         self.reached = reached
 
 
-def download(url: str, part: Path, moved: Moved, *, room: float = 0.0, pauses: Sequence[float] | None = None) -> None:
+def download(url: str, part: Path, moved: Task, *, room: float = 0.0, pauses: Sequence[float] | None = None) -> None:
     """Download a file, from where ``part`` ends on if the server can.
 
     Args:
@@ -112,12 +113,7 @@ def disk_errors(path: Path) -> Iterator[None]:
         raise NoSpaceError(f"{path}: the disk is full; make space, the same command goes on from there") from error
 
 
-def megabytes(size: float) -> str:
-    """Return a number of bytes as text."""
-    return f"{size / 1e9:.1f} GB" if size >= 1e9 else f"{size / 1e6:.{0 if size >= 1e7 else 1}f} MB"
-
-
-def _transfer(url: str, part: Path, moved: Moved, room: float) -> None:
+def _transfer(url: str, part: Path, moved: Task, room: float) -> None:
     """Ask once for what is missing, and write what comes."""
     note = _read_note(part, url)
     have = _size(part) if note else 0
@@ -173,7 +169,7 @@ def _extent(
     raise FetchError(f"{url}: {reason}")
 
 
-def _write(url: str, response: requests.Response, part: Path, start: int, total: int | None, moved: Moved) -> None:
+def _write(url: str, response: requests.Response, part: Path, start: int, total: int | None, moved: Task) -> None:
     """Write an answer to the end of ``part``, or over it where it starts at 0."""
     done = start
     moved(done, total)

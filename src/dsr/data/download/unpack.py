@@ -15,9 +15,9 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import IO
 
-from dsr.data.download.checksums import Moved
 from dsr.data.download.transfer import disk_errors, expect_room
 from dsr.utils.console import one_line
+from dsr.utils.progress import Task
 
 _CHUNK = 1 << 20
 _DAMAGE = (zipfile.BadZipFile, tarfile.TarError, EOFError, zlib.error, KeyError, RuntimeError, OSError)
@@ -35,7 +35,7 @@ class _Member:
     special: bool = False
 
 
-def unpack(archive: Path, target: Path, moved: Moved, contains: Sequence[str] = ()) -> dict[str, int]:
+def unpack(archive: Path, target: Path, moved: Task, contains: Sequence[str] = ()) -> dict[str, int]:
     """Unpack a zip or tar archive into a directory, beside the files that are there already.
 
     Everything is unpacked beside ``target`` first; an interruption before the end leaves nothing in it. Links become
@@ -146,7 +146,7 @@ def _leads_outside(name: str) -> bool:
     return path.is_absolute() or ".." in path.parts or "\0" in name or bool(re.match(r"[A-Za-z]:", name))
 
 
-def _extract(members: Sequence[_Member], work: Path, moved: Moved) -> dict[str, int]:
+def _extract(members: Sequence[_Member], work: Path, moved: Task) -> dict[str, int]:
     """Write the members below ``work``."""
     total, done, files = sum(member.size for member in members), 0, {}
     expect_room(work, total)

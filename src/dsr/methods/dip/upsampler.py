@@ -24,7 +24,7 @@ from torch.utils.data import DataLoader
 from dsr.degradation.downsampling import Downsampling, scene_generator
 from dsr.geometry.camera import RangeType
 from dsr.methods.base import Cost
-from dsr.methods.dip.callbacks import Advance, Display, Keep, Provenance, Silent, checkpoint_of, cost_of_step
+from dsr.methods.dip.callbacks import Keep, Provenance, checkpoint_of, cost_of_step
 from dsr.methods.dip.noise import estimate_noise, normal_noise_deg
 from dsr.methods.dip.optimisation import PriorOptimisation, PriorSettings
 from dsr.methods.dip.problem import DataLoss, ImageProblem, PriorObjective
@@ -33,11 +33,11 @@ from dsr.methods.dip.stopping import Fixed, Oracle, Residual, Stopping, Stopping
 from dsr.methods.networks.base import DTYPES, Precision
 from dsr.methods.networks.trained import build_trained
 from dsr.sample import DepthSample
-from dsr.utils.lightning import Interruption, LastValidation, Log, ValidationTable, duration, fit, without_chatter
-from dsr.utils.progress import Steps
+from dsr.utils.lightning import Interruption, Log, StepProgress, ValidationTable, fit, make_trainer
+from dsr.utils.progress import Progress, Steps, StepsProgress
+from dsr.utils.units import duration
 
 WORKSPACE = "optimisation"
-_LOG_EVERY = 10
 
 
 @dataclass(kw_only=True)
@@ -65,7 +65,7 @@ class DeepImagePrior:
         device: where to compute.
         metrics: makes the metrics of a validation pass; None for none.
         workspace: a directory for logs, and for checkpoints to go on from; None for neither.
-        display: shows how far an optimisation is.
+        display: shows the steps of an optimisation.
 
     Raises:
         ValueError: a value is out of range.
@@ -103,7 +103,7 @@ class DeepImagePrior:
     device: torch.device | str = "cpu"
     metrics: Callable[[], torchmetrics.MetricCollection] | None = None
     workspace: Path | None = None
-    display: Display | None = None
+    display: Progress | None = None
 
     def __post_init__(self) -> None:
         """Check the values."""
@@ -145,7 +145,7 @@ class DeepImagePrior:
         """
         with torch.inference_mode(mode=False), torch.enable_grad():
             module, origin = self.module(sample)
-            display = self.display or Silent(progress)
+            display = self.display or StepsProgress(progress)
             folder = None if self.workspace is None else self.workspace / WORKSPACE / sample.scene
             resume = None if folder is None else checkpoint_of(folder / "last.ckpt", origin)
             display.say(self._announcement(module, sample.scene, resume is not None))
@@ -217,11 +217,10 @@ class DeepImagePrior:
         )
 
     def _trainer(
-        self, module: PriorOptimisation, folder: Path | None, origin: str, display: Display, scene: str
+        self, module: PriorOptimisation, folder: Path | None, origin: str, display: Progress, scene: str
     ) -> lightning.Trainer:
         """Return Lightning's trainer for one image."""
-        interval = min(self.validate_every or self.steps, self.steps)
-        callbacks: list[Callback] = [LastValidation(interval), Advance(display, scene, self.steps)]
+        callbacks: list[Callback] = [StepProgress(display, "steps", scene)]
         logger: Any = False
         if folder is not None:
             callbacks += [Provenance(origin), Keep(folder / "last.ckpt"), Interruption(folder / "last.ckpt")]
@@ -230,24 +229,15 @@ class DeepImagePrior:
             logger = Log(folder.parent, name="", version=scene, default_hp_metric=False)
             logger.list_run({"scene": scene, "scale": self.scale, "stopping": self.stopping, "w": module.objective.w,
                              "data_loss": self.data_loss, "steps": self.steps, "seed": self.seed})  # fmt: skip
-        device = torch.device(self.device)
-        with without_chatter():
-            return lightning.Trainer(
-                accelerator="gpu" if device.type == "cuda" else device.type,
-                devices=[device.index or 0] if device.type == "cuda" else 1,
-                max_steps=self.steps,
-                val_check_interval=interval,
-                check_val_every_n_epoch=None,
-                limit_val_batches=1 if self.validate_every else 0,
-                log_every_n_steps=min(_LOG_EVERY, interval),
-                logger=logger,
-                callbacks=callbacks,
-                enable_checkpointing=False,
-                enable_model_summary=False,
-                enable_progress_bar=False,
-                num_sanity_val_steps=0,
-                use_distributed_sampler=False,
-            )
+        return make_trainer(
+            torch.device(self.device),
+            self.steps,
+            min(self.validate_every or self.steps, self.steps),
+            callbacks=callbacks,
+            logger=logger,
+            limit_val_batches=1 if self.validate_every else 0,
+            enable_checkpointing=False,
+        )
 
 
 @dataclass(kw_only=True)

@@ -7,7 +7,7 @@ import functools
 import html
 import json
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
@@ -22,9 +22,9 @@ from dsr.report.page.content import links, metrics_data, problem_data, run_data
 from dsr.report.page.encoding import LEVELS, Level, Pool, megabytes
 from dsr.report.page.scenes import View, scene_data, views_of
 from dsr.utils.files import write_text
+from dsr.utils.progress import Steps
 from dsr.viz.panels import HOLE_COLOUR
 
-Progress = Callable[[int, int], None]
 _COLOUR_MAPS = {"depth": "viridis", "error": "RdBu_r", "angle": "magma"}
 _SCRIPTS = ("dom.js", "pictures.js", "tables.js", "viewer.js", "page.js")
 _SAMPLE = 6
@@ -51,7 +51,7 @@ def save_page(
     tables: Sequence[Path] | None = None,
     title: str = "dsr report",
     budget_mb: float = 60,
-    progress: Progress | None = None,
+    progress: Steps | None = None,
 ) -> list[str]:
     """Write a page with the scores, renderings, errors, times and settings of runs, atomically.
 
@@ -98,7 +98,7 @@ def save_page(
     return notes
 
 
-def _pictures(views: Sequence[View], budget: float, progress: Progress) -> _Stored:
+def _pictures(views: Sequence[View], budget: float, progress: Steps) -> _Stored:
     """Return the pictures of all scenes at the best level that the budget allows, else at the last."""
     for level in LEVELS[:-1]:
         with contextlib.suppress(_TooLargeError):
@@ -106,7 +106,7 @@ def _pictures(views: Sequence[View], budget: float, progress: Progress) -> _Stor
     return _at_level(views, LEVELS[-1], math.inf, progress)
 
 
-def _at_level(views: Sequence[View], level: Level, budget: float, progress: Progress) -> _Stored:
+def _at_level(views: Sequence[View], level: Level, budget: float, progress: Steps) -> _Stored:
     """Return the pictures of all scenes.
 
     Raises:
