@@ -16,6 +16,7 @@ import torch
 from omegaconf import OmegaConf
 
 import dsr
+from dsr.app.moved_targets import update_targets
 from dsr.utils.builder import ConfigError
 from dsr.utils.files import write_text
 from dsr.utils.hashing import hash_of_code, hash_outside_code
@@ -85,7 +86,7 @@ def claim(
         raise ConfigError(f"output_dir: expected a directory, {folder} is a file")
     if folder.is_dir() and any(folder.iterdir()) and not config["overwrite"]:
         try:
-            before = dict(json.loads(record.read_text(encoding="utf-8"))["identity"])
+            before = update_targets(dict(json.loads(record.read_text(encoding="utf-8"))["identity"]))
         except (OSError, ValueError, KeyError, TypeError):
             raise ConfigError(
                 f"output_dir: {folder} holds files of something else; another output_dir keeps them"

@@ -9,6 +9,7 @@ from typing import Any
 
 from omegaconf import OmegaConf
 
+from dsr.app.moved_targets import update_targets
 from dsr.app.schema import TrainConfig, TrainerConfig
 from dsr.data.base import SceneSource, SceneSubset
 from dsr.degradation.downsampling import Downsampling
@@ -23,7 +24,7 @@ _NOT_WITH_RUN = ("method", "scale", "weights")
 
 
 def read_config(folder: Path) -> dict[str, Any]:
-    """Return the configuration of a training.
+    """Return the configuration of a training, its targets named as they are now.
 
     Raises:
         ConfigError: the directory is no training's.
@@ -35,7 +36,7 @@ def read_config(folder: Path) -> dict[str, Any]:
         raise ConfigError(f"{folder}: expected the directory of a training, it has no readable config.yaml") from error
     if not isinstance(config, dict) or "model" not in config:
         raise ConfigError(f"{folder}: expected the directory of a training, its config.yaml names no model")
-    return {str(key): value for key, value in config.items()}
+    return {str(key): update_targets(value) for key, value in config.items()}
 
 
 def studies_of_run(

@@ -277,7 +277,7 @@ def _distinguished(runs: Sequence[Run]) -> list[Run]:
     What differs is said: "MSG-V (ensemble=1)", "middlebury (size=256)".
     """
     methods = [_identity_of_method(run.settings) for run in runs]
-    datasets = [{**run.settings.get("dataset", {}), "root": None, "scenes": None} for run in runs]
+    datasets = [{**run.settings.get("dataset", {}), "root": None, "scenes": None, "target": None} for run in runs]
     labels = _told_apart([(run.label, run.scale) for run in runs], methods)
     names = _told_apart([(run.dataset, 0) for run in runs], datasets)
     return [

@@ -1,0 +1,39 @@
+"""Where the classes and functions are now that the configurations of earlier runs name as ``target``."""
+
+from __future__ import annotations
+
+from typing import Any
+
+MOVED_TARGETS = {
+    "dsr.data.extras.NYU": "dsr.data.nyu.NYU",
+    "dsr.data.extras.TartanAir": "dsr.data.tartanair.TartanAir",
+    "dsr.data.procedural.source.Procedural": "dsr.data.procedural.Procedural",
+    "dsr.data.training_sets.MiddleburyTrain": "dsr.data.middlebury_train.MiddleburyTrain",
+    "dsr.data.training_sets.Sintel": "dsr.data.sintel.Sintel",
+    "dsr.degrade.Downsampling": "dsr.degradation.downsampling.Downsampling",
+    "dsr.degrade.Measured": "dsr.degradation.downsampling.Measured",
+    "dsr.holes.Blobs": "dsr.degradation.holes.Blobs",
+    "dsr.holes.Shadows": "dsr.degradation.holes.Shadows",
+    "dsr.holes.no_holes": "dsr.degradation.holes.no_holes",
+    "dsr.methods.dynamic_guidance.DynamicGuidance": "dsr.methods.networks.dg.DynamicGuidance",
+    "dsr.methods.facets.Facets": "dsr.methods.networks.facets.Facets",
+    "dsr.methods.msg_net.MSGNet": "dsr.methods.networks.msg_net.MSGNet",
+    "dsr.methods.pdn.PrimalDualNetwork": "dsr.methods.networks.pdn.PrimalDualNetwork",
+    "dsr.noise.GaussianMultiplicative": "dsr.degradation.noise.GaussianMultiplicative",
+    "dsr.noise.Kinect": "dsr.degradation.noise.Kinect",
+    "dsr.noise.TimeOfFlight": "dsr.degradation.noise.TimeOfFlight",
+    "dsr.noise.no_noise": "dsr.degradation.noise.no_noise",
+}
+"""All that the configuration of a training can name, from where it was to where it is."""
+
+
+def update_targets(node: Any) -> Any:
+    """Return a configuration in which each ``target`` that has moved is named as it is now."""
+    if isinstance(node, dict):
+        return {
+            key: MOVED_TARGETS.get(value, value)
+            if key == "target" and isinstance(value, str)
+            else update_targets(value)
+            for key, value in node.items()
+        }
+    return node
