@@ -66,10 +66,10 @@ def test_report_and_study_are_made_of_earlier_runs(tmp_path):
         shutil.copytree(EARLIER / "eval", copy)
         summary = json.loads((copy / "summary.json").read_text())
         (copy / "summary.json").write_text(json.dumps({**summary, "label": label}))
-    assert main(["report", str(tmp_path / "runs"), "-o", str(tmp_path / "report"), "--only", "tables", "page"]) == 0
+    assert main(["report", str(tmp_path / "runs"), "-o", str(tmp_path / "report"), "--only", "tables,page"]) == 0
     table = (tmp_path / "report" / "tables" / "procedural_x4_box.md").read_text()
     assert "| 228.1" in table
-    assert (tmp_path / "report" / "index.html").stat().st_size > 50_000
+    assert "MSG-V" in (tmp_path / "report" / "index.html").read_text()
     assert main(["study", "build", str(tmp_path / "runs"), "-o", str(tmp_path / "study")]) == 0
     assert (tmp_path / "study" / "key.json").is_file()
 
