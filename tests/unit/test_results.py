@@ -175,3 +175,20 @@ def test_runs_without_any_solution_are_refused_with_the_reason(make_run, tmp_pat
     change(tmp_path / "a", "summary.json", unanswered={"s": "s: no edge is closed"})
     with pytest.raises(ValueError, match=r"found none; EG at x4 has no solution for s: no edge is closed$"):
         load_results([tmp_path])
+
+
+@pytest.mark.parametrize(
+    ("name", "entries", "message"),
+    [
+        ("summary.json", {"scale": "four"}, "scale: expected a valid integer"),
+        ("summary.json", {"seconds": [1]}, "seconds: expected an object, got [1]"),
+        ("summary.json", {"metrics": {"PSNR": {"unit": "dB"}}}, "metrics.PSNR.heading: it is missing"),
+        ("versions.json", {"identity": "x"}, "identity: expected an object, got 'x'"),
+    ],
+)
+def test_wrong_key_of_a_runs_file_is_named_with_what_was_expected(make_run, tmp_path, name, entries, message):
+    make_run(tmp_path / "fine", scenes=("s",))
+    make_run(tmp_path / "wrong", scenes=("s",), label="MSG")
+    change(tmp_path / "wrong", name, **entries)
+    [note] = load_results([tmp_path]).notes
+    assert note.startswith(f"left out: {tmp_path / 'wrong' / name}: {message}")

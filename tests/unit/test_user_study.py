@@ -311,7 +311,11 @@ def test_key_round_trips_and_a_damaged_one_is_refused(tmp_path):
     write_key(path, KEY)
     assert read_key(path) == KEY
     path.write_text(path.read_text()[:-30])
-    with pytest.raises(ValueError, match="damaged or foreign"):
+    with pytest.raises(ValueError, match=r"key.json: expected the key of a study; got damaged JSON"):
+        read_key(path)
+    write_key(path, KEY)
+    path.write_text(path.read_text().replace('"repeat": ', '"repeat": "no", "was": '))
+    with pytest.raises(ValueError, match=r"key.json: expected the key of a study; repeat: expected a valid integer"):
         read_key(path)
     with pytest.raises(ValueError, match="there is none"):
         read_key(tmp_path / "none.json")

@@ -5,19 +5,20 @@ Nothing but files is looked at: ``scores.csv``, ``summary.json``, ``versions.jso
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import pandas as pd
+from pydantic import BaseModel, ValidationError
 from torch import Tensor
 
 from dsr.evaluation.store import load_prediction, prediction_path, sample_path
 from dsr.metrics.catalogue import KNOWN_FORMATS
 from dsr.metrics.formats import MetricFormat, complete_formats, in_tables
 from dsr.sample import DepthSample
+from dsr.utils.validation import describe
 
 METHOD_ORDER = (
     "Nearest", "Bilinear", "Bicubic", "GF", "JBU", "FGS", "Diffusion", "TGV",
@@ -30,7 +31,8 @@ _TEXT_COLUMNS = ("dataset", "scene", "downsampling", "method", "metric", "varian
 _NUMBER_COLUMNS = ("scale", "seed", "value", "valid_share")
 _NAMES = ("name", "label", "target")
 _DIGEST = 8
-"""Of a hash, as many digits are shown."""
+"""Digits of a hash that are shown."""
+_Content = TypeVar("_Content", bound=BaseModel)
 
 
 class BenchmarkSetting(NamedTuple):
@@ -230,34 +232,55 @@ def read_run(folder: Path) -> Run:
         ValueError: a file of the directory is missing or damaged.
 
     """
-    summary, versions = _read_json(folder / _SUMMARY), _read_json(folder / _VERSIONS)
-    settings = dict(versions.pop("identity", {}))
+    summary, versions = _read(_Summary, folder / _SUMMARY), _read(_Versions, folder / _VERSIONS)
+    settings = versions.identity
     scores = _read_scores(folder / _SCORES)
-    try:
-        method = str(summary["method"])
-        label = str(summary.get("label") or settings.get("method", {}).get("label") or method)
-        dataset = str(scores["dataset"].iloc[0]) if len(scores) else str(summary["dataset"])
-        seconds = {str(scene): float(value) for scene, value in summary["seconds"].items()}
-        unsolved = {str(scene): str(why) for scene, why in summary.get("unanswered", {}).items()}
-        formats = {str(name): MetricFormat(**content) for name, content in summary.get("metrics", {}).items()}
-        scale, seed, downsampling = int(summary["scale"]), int(summary["seed"]), str(summary["downsampling"])
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise ValueError(f"{folder / _SUMMARY}: expected the summary of a run, {error!r} is missing or wrong") from None
-    scenes = tuple(scene for scene in seconds if prediction_path(folder, scene).is_file())
+    method = settings.get("method")
+    label = summary.label or (method.get("label") if isinstance(method, Mapping) else None) or summary.method
+    dataset = str(scores["dataset"].iloc[0]) if len(scores) else summary.dataset
+    scenes = tuple(scene for scene in summary.seconds if prediction_path(folder, scene).is_file())
     scores = scores[scores["scene"].isin(scenes)]
-    about = (folder, dataset, scale, downsampling, seed, method, label)
-    return Run(*about, scores, seconds, settings, versions, scenes, unsolved, formats)
+    about = (folder, dataset, summary.scale, summary.downsampling, summary.seed, summary.method, str(label))
+    return Run(
+        *about,
+        scores,
+        summary.seconds,
+        settings,
+        versions.model_extra or {},
+        scenes,
+        summary.unanswered,
+        summary.metrics,
+    )
 
 
-def _read_json(path: Path) -> dict[str, Any]:
-    """Return a JSON object."""
+class _Summary(BaseModel):
+    """What is read of ``summary.json``; runs of earlier versions lack the keys that have defaults."""
+
+    dataset: str
+    scale: int
+    downsampling: str
+    method: str
+    seed: int
+    seconds: dict[str, float]
+    label: str | None = None
+    unanswered: dict[str, str] = {}
+    metrics: dict[str, MetricFormat] = {}
+
+
+class _Versions(BaseModel, extra="allow"):
+    """``versions.json``: versions of packages, Python and the project, and the run's settings."""
+
+    identity: dict[str, Any] = {}
+
+
+def _read(kind: type[_Content], path: Path) -> _Content:
+    """Return what a JSON file of a run says."""
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError) as error:
-        raise ValueError(f"{path}: expected a run's JSON, got {type(error).__name__}") from error
-    if not isinstance(content, dict):
-        raise ValueError(f"{path}: expected a JSON object, got {type(content).__name__}")
-    return content
+        return kind.model_validate_json(path.read_bytes())
+    except OSError as error:
+        raise ValueError(f"{path}: expected a run's JSON, got {error.strerror or error}") from error
+    except ValidationError as error:
+        raise ValueError(f"{path}: {describe(error)}") from error
 
 
 def _read_scores(path: Path) -> pd.DataFrame:

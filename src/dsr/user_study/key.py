@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
-from typing import Any
+
+from pydantic import TypeAdapter, ValidationError
 
 from dsr.utils.files import write_text
+from dsr.utils.validation import describe
 
 PAGE_VERSION = 1
 """Of the page and of the answers that it writes."""
@@ -81,22 +83,23 @@ def read_key(path: Path) -> Key:
 
     """
     try:
-        content: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-        version = content["page"]
-        trials = {name: _trial(trial) for name, trial in content["trials"].items()}
-        per_person, repeat = int(content["scenes_per_person"]), int(content["repeat"])
-        key = Key(str(content["study"]), str(content["light"]), per_person, repeat, trials)
+        stored = _KEY.validate_json(path.read_bytes())
     except FileNotFoundError:
         raise ValueError(f"{path}: expected the key of a study that dsr study build made, there is none") from None
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-        raise ValueError(f"{path}: expected the key of a study, got a damaged or foreign file") from error
-    if version != PAGE_VERSION:
-        raise ValueError(f"{path}: expected the key of a study of version {PAGE_VERSION}, got {version!r}")
-    return key
+    except ValidationError as error:
+        raise ValueError(f"{path}: expected the key of a study; {describe(error)}") from error
+    except OSError as error:
+        raise ValueError(f"{path}: expected the key of a study, got {error.strerror or error}") from error
+    if stored.page != PAGE_VERSION:
+        raise ValueError(f"{path}: expected the key of a study of version {PAGE_VERSION}, got {stored.page!r}")
+    return Key(**{each.name: getattr(stored, each.name) for each in fields(Key)})
 
 
-def _trial(content: Mapping[str, Any]) -> Trial:
-    """Return one trial from its JSON."""
-    candidates = {name: Candidate(**candidate) for name, candidate in content["candidates"].items()}
-    scale = int(content["scale"])
-    return Trial(str(content["dataset"]), str(content["scene"]), scale, str(content["downsampling"]), candidates)
+@dataclass(frozen=True)
+class _StoredKey(Key):
+    """The key as its file has it."""
+
+    page: int
+
+
+_KEY = TypeAdapter(_StoredKey)
