@@ -1,0 +1,137 @@
+"""A method and a network from outside the package: one module, and a YAML file of each."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+REPOSITORY = Path(__file__).resolve().parents[2]
+MODULE = '''
+import torch
+from torch import nn
+
+from dsr.methods.networks.base import DisparityNetwork
+
+
+class Constant:
+    """Fills the map with its mean, plus an offset in metres."""
+
+    range_type = "orthogonal"
+
+    def __init__(self, offset: float = 0.0) -> None:
+        self.offset = offset
+
+    def __call__(self, sample, progress=None):
+        if progress is not None:
+            progress(1, 1)
+        size = (1, sample.camera.height, sample.camera.width)
+        return torch.full(size, float(sample.depth_lr.nanmean()) + self.offset, dtype=sample.depth_lr.dtype)
+
+
+class Shifted(DisparityNetwork):
+    """Repeats the low-resolution disparity and adds a learned number."""
+
+    def __init__(self, scale: int) -> None:
+        super().__init__()
+        self.scale = scale
+        self.shift = nn.Parameter(torch.zeros(()))
+
+    def arguments(self):
+        return {"scale": self.scale}
+
+    def upsample(self, rgb, disparity, bounds=None):
+        known = torch.where(disparity.isfinite(), disparity, disparity.nanmean())
+        return nn.functional.interpolate(known, scale_factor=self.scale) + self.shift
+'''
+FILES = {
+    "modules/outside.py": MODULE,
+    "conf/method/constant.yaml": "name: constant\nlabel: Constant\ntarget: outside.Constant\noffset: 0.0\n",
+    "conf/model/shifted.yaml": "name: shifted\ntarget: outside.Shifted\ndepth_loss: lap1\nvisual: false\n",
+    "conf/method/shifted.yaml": (
+        "name: shifted\ntarget: dsr.methods.networks.trained.build_trained\nmodel: shifted\nensemble: 1\n"
+        "weights: training/weights.safetensors\n"
+    ),
+}
+TRAINING = (
+    "dataset.count=2", "dataset.size=64", "trainer=smoke", "trainer.steps=2", "trainer.batch=1", "trainer.patch=32",
+    "trainer.validate_every=2", "trainer.validation_scenes=1", "precision=float32", "metrics.lpips=false", "device=cpu",
+    "model=shifted", "output_dir=training",
+)  # fmt: skip
+
+
+def run(folder, *command):
+    """Run a Python command in a folder, with the module outside of the package on the path."""
+    paths = os.pathsep.join([str(REPOSITORY / "src"), str(folder / "modules")])
+    return subprocess.run(
+        [sys.executable, *command],
+        cwd=folder,
+        env={**os.environ, "PYTHONPATH": paths, "OMP_NUM_THREADS": "1"},
+        capture_output=True,
+        text=True,
+        timeout=300,
+        check=False,
+    )
+
+
+def evaluate(folder, *arguments):
+    """Run ``eval.py`` on a small scene."""
+    small = ("dataset.size=32", "dataset.scenes=[statue]", "metrics.lpips=false", "device=cpu")
+    return run(folder, str(REPOSITORY / "eval.py"), "--config-dir", "conf", *small, *arguments)
+
+
+def upsample(folder, *arguments):
+    """Run ``dsr upsample`` on a small picture."""
+    files = ("--rgb", "photo.png", "--depth", "depth.png", "--fov", "60", "--only", "depth")
+    return run(folder, "-m", "dsr.cli", "upsample", *files, "--config-dir", "conf", *arguments)
+
+
+@pytest.fixture(scope="module")
+def home(tmp_path_factory, dsr_cache):
+    """A folder with the module, its configuration, a picture, and a run of the method."""
+    folder = tmp_path_factory.mktemp("outside")
+    for name, text in FILES.items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_text(text)
+    cv2.imwrite(str(folder / "photo.png"), np.random.default_rng(0).integers(0, 255, (32, 48, 3), dtype=np.uint8))
+    cv2.imwrite(str(folder / "depth.png"), np.full((8, 12), 1500, np.uint16))
+    done = evaluate(folder, "method=constant", "output_dir=runs/constant")
+    assert (done.returncode, done.stderr) == (0, "")
+    return folder
+
+
+def test_report_shows_a_method_from_outside(home):
+    done = run(home, "-m", "dsr.cli", "report", "runs", "-o", "report")
+    assert (done.returncode, done.stderr) == (0, "")
+    tables = "".join(path.read_text() for path in (home / "report").rglob("*.md"))
+    assert "Constant" in tables
+
+
+def test_changed_code_of_a_method_from_outside_makes_another_run(home):
+    assert evaluate(home, "method=constant", "output_dir=runs/constant").returncode == 0
+    module = home / "modules" / "outside.py"
+    try:
+        module.write_text(MODULE + "\n# changed\n")
+        done = evaluate(home, "method=constant", "output_dir=runs/constant")
+    finally:
+        module.write_text(MODULE)
+    assert done.returncode == 2
+    assert "holds a run with another outside_code" in done.stderr
+    identity = json.loads((home / "runs" / "constant" / "versions.json").read_text())["identity"]
+    assert len(identity["outside_code"]) == 16
+
+
+def test_upsample_runs_a_method_from_outside_with_settings(home):
+    done = upsample(home, "--method", "constant", "--set", "offset=0.25", "-o", "picture")
+    assert (done.returncode, done.stderr) == (0, "")
+    np.testing.assert_allclose(np.load(home / "picture" / "depth_metres.npy"), 1.75, rtol=1e-6)
+    done = upsample(home, "--method", "constant", "--set", "ofset=0.25", "-o", "other")
+    assert done.returncode == 2
+    assert done.stderr == "error: --set ofset: unknown key; method=constant takes offset\n"
+    assert not (home / "other").exists()
