@@ -49,7 +49,7 @@ def test_missing_dataset_names_the_command_that_fetches_it_and_nothing_is_writte
     monkeypatch.setenv("HYDRA_FULL_ERROR", "1")
     monkeypatch.setattr(sys, "argv", [f"{name}.py", *arguments, *QUICK])
     with pytest.raises(SystemExit) as ended:
-        run_command(REPOSITORY / "conf", name, command)
+        run_command(name, command)
     assert ended.value.code == 2
     which = message.partition(":")[0]
     assert capfd.readouterr().err == (

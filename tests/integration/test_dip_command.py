@@ -49,7 +49,7 @@ def run(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> I
         monkeypatch.setattr(sys, "argv", ["eval.py", *quick, *arguments])
         code = 0
         try:
-            run_command(REPOSITORY / "conf", "eval", evaluate)
+            run_command("eval", evaluate)
         except SystemExit as ended:
             code = int(ended.code or 0)
         return code, *capfd.readouterr()

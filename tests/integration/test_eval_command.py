@@ -74,7 +74,7 @@ def within(monkeypatch, tmp_path, capfd):
         monkeypatch.setattr(sys, "argv", ["eval.py", *quick(arguments), *switch])
         code = 0
         try:
-            run_command(REPOSITORY / "conf", "eval", evaluate)
+            run_command("eval", evaluate)
         except SystemExit as ended:
             code = ended.code
         captured = capfd.readouterr()

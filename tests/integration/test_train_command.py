@@ -75,7 +75,7 @@ def within(monkeypatch, tmp_path, capfd):
         monkeypatch.setattr(sys, "argv", [f"{name}.py", *arguments])
         code = 0
         try:
-            run_command(REPOSITORY / "conf", name, {"train": command.train, "eval": evaluate}[name])
+            run_command(name, {"train": command.train, "eval": evaluate}[name])
         except SystemExit as ended:
             code = ended.code
         captured = capfd.readouterr()

@@ -1,14 +1,11 @@
 """The command line: whatever is wrong ends as one clear line on stderr and exit code 2, before anything is written."""
 
 import sys
-from pathlib import Path
 
 import pytest
 
 from dsr.app.entry import run_command
 from dsr.utils.builder import ConfigError
-
-CONF = Path(__file__).resolve().parents[2] / "conf"
 
 
 @pytest.fixture
@@ -28,7 +25,7 @@ def command(monkeypatch, tmp_path, capfd):
 
         code = 0
         try:
-            run_command(CONF, "eval", remember)
+            run_command("eval", remember)
         except SystemExit as ended:
             code = ended.code
         return code, capfd.readouterr().err, seen
@@ -48,6 +45,10 @@ METHODS = (
     "anisotropic_diffusion, bicubic, bilinear, dg, dip, dip_v, dip_v_warm, eg, facets, fast_global_smoother, "
     "guided_filter, joint_bilateral, msg, msg_v, msg_v_noisy, nearest, pdn, srfs, tgv"
 )
+EXPERIMENTS = (
+    "dg_x4, dg_x8, downsampling_mismatch, facets_x4, facets_x8, msg_v_x4, msg_v_x4_noisy, msg_v_x4_stage1, "
+    "msg_v_x4_stage2, msg_v_x4_stage3, msg_v_x8, msg_v_x8_stage1, msg_x4, msg_x8, noise, paper_tables, pdn_x4, pdn_x8"
+)
 USAGE_ERRORS = {
     "dataset=fodler": f"dataset=fodler: unknown; expected one of {DATASETS}",
     "method=msgv": f"method=msgv: unknown; expected one of {METHODS}",
@@ -59,7 +60,7 @@ USAGE_ERRORS = {
     "scal=8": f"scal: unknown key; expected {SETTINGS}",
     "lpips=false": f"lpips: unknown key; expected {SETTINGS}",
     "dataset.rot=x": "dataset.rot: unknown key; expected dataset.name, dataset.root, dataset.scenes, dataset.size",
-    "metrics.lpip=false": "metrics.lpip: unknown key; expected metrics.lpips, metrics.lpips_trunk",
+    "metrics.lpip=false": "metrics.lpip: unknown key; expected metrics.lpips, metrics.lpips_trunk, metrics.extra",
     "scale=four": "scale: Value 'four' of type 'str' could not be converted to Integer",
     "seed=1.5": "seed: Value '1.5' of type 'float' could not be converted to Integer",
     "overwrite=maybe": "overwrite: Value 'maybe' is not a valid bool (type str)",
@@ -78,6 +79,10 @@ USAGE_ERRORS = {
         "method: got several values; -m runs each of them, method=[msg,msg_v] is a list, 'method=\"msg,msg_v\"' a text"
     ),
     "--config-name=other": "--config-name other: unknown; expected eval",
+    "--config-dir=nowhere": "--config-dir: expected a directory, got nowhere",
+    "+experiment=papers": f"experiment=papers: unknown; expected one of {EXPERIMENTS}",
+    "experiment=paper_tables": f"experiment: write +experiment=NAME, NAME one of {EXPERIMENTS}",
+    "model=msg": f"model: unknown key; expected {SETTINGS}",
 }
 
 
@@ -160,11 +165,22 @@ def test_multirun_with_an_unknown_choice_starts_no_job(command):
     assert error == f"error: method=neerest: unknown; expected one of {METHODS}\n"
 
 
-def test_missing_configuration_directory_names_where_to_run(monkeypatch, tmp_path, capsys):
-    monkeypatch.setattr(sys, "argv", ["eval.py"])
-    with pytest.raises(SystemExit) as ended:
-        run_command(tmp_path / "conf", "eval", lambda config: None)
-    assert ended.value.code == 2
-    error = capsys.readouterr().err
-    assert error.startswith(f"error: {tmp_path / 'conf'}: expected the directory of the configuration files")
-    assert error.count("\n") == 1
+def test_config_dir_adds_choices(command, tmp_path):
+    (tmp_path / "own" / "method").mkdir(parents=True)
+    (tmp_path / "own" / "method" / "mine.yaml").write_text("name: mine\ntarget: dsr.methods.base.mine\nstrength: 1\n")
+    code, error, [config] = command("--config-dir", "own", "method=mine", "method.strength=2")
+    assert (code, error, config.method.strength) == (0, "", 2)
+    code, error, _ = command("method=mein", "--config-dir=own")
+    choices = METHODS.replace("msg,", "mine, msg,")
+    assert (code, error) == (2, f"error: method=mein: unknown; expected one of {choices}\n")
+    code, error, _ = command("-cd", "own", "method=mine", "method.strenth=2")
+    assert (code, error) == (2, "error: method.strenth: unknown key; expected method.name, method.strength\n")
+
+
+def test_run_command_takes_arguments_and_the_process_keeps_its_own(monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["dsr", "eval", "scale=8"])
+    seen = []
+    run_command("eval", lambda config: seen.append((config.scale, list(sys.argv))), ["scale=8"])
+    assert seen == [(8, ["dsr", "eval", "scale=8"])]
+    assert sys.argv == ["dsr", "eval", "scale=8"]

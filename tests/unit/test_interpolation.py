@@ -8,7 +8,8 @@ import torch
 from scipy import ndimage
 from torch import Tensor
 
-from dsr.degradation.downsampling import SCALES, Downsampling, Kernel, make_sample
+from dsr.degradation.downsampling import Downsampling, Kernel, make_sample
+from dsr.degradation.scales import SCALES
 from dsr.geometry.camera import Camera, from_range, to_range
 from dsr.methods.classical.interpolation import Interpolation, Order
 from dsr.sample import DepthSample, Scene

@@ -11,7 +11,7 @@ from PIL import Image
 from scipy import ndimage
 from torch import Tensor
 
-from dsr.degradation.downsampling import SCALES
+from dsr.degradation.scales import SCALES
 from dsr.geometry.camera import Camera, from_range, to_range
 from dsr.methods.networks.base import NetworkUpsampler
 from dsr.methods.networks.maps import mean3x3, normalise, upsample_bicubic

@@ -9,7 +9,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from dsr.degradation.downsampling import SCALES, Downsampling, Kernel, make_sample
+from dsr.degradation.downsampling import Downsampling, Kernel, make_sample
+from dsr.degradation.scales import SCALES
 from dsr.geometry.camera import Camera, from_range, to_range
 from dsr.methods.classical.fast_global_smoother import FastGlobalSmoother
 from dsr.methods.classical.guided_filter import GuidedFilter

@@ -1,79 +1,136 @@
-"""Running a Hydra command so that whatever is wrong ends as one line on stderr and exit code 2."""
+"""Running a Hydra command so that whatever is wrong ends as one line on stderr and exit code 2.
+
+torch and Lightning take seconds to import. So a command's module is imported when its configuration has been composed
+and checked, and a mistyped argument is answered at once.
+"""
 
 from __future__ import annotations
 
+import argparse
+import contextlib
 import os
 import re
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import hydra
 from hydra.errors import HydraException, MissingConfigException, OverrideParseException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from dsr.app.schema import register
+from dsr.app.experiments import register_resolvers, without_overridden_sweeps
+from dsr.app.schema import EvalConfig, TrainConfig, plain_config, register
 from dsr.utils.builder import ConfigError
+from dsr.utils.config_files import config_directories, list_choices, list_groups
 from dsr.utils.console import INTERRUPTED, USAGE_ERROR, print_error
 
 
-def run_command(conf: Path, name: str, command: Callable[[DictConfig], Any]) -> None:
-    """Compose the configuration ``name`` of the directory ``conf`` from the command line, and run the command on it.
+def run_eval(arguments: Sequence[str] | None = None) -> None:
+    """Run ``eval.py``, which is ``dsr eval``, with the given arguments or those of the process."""
+    run_command("eval", _evaluate, arguments)
+
+
+def run_train(arguments: Sequence[str] | None = None) -> None:
+    """Run ``train.py``, which is ``dsr train``, with the given arguments or those of the process."""
+    run_command("train", _train, arguments)
+
+
+def _evaluate(config: DictConfig) -> None:
+    EvalConfig.of(plain_config(config))
+    from dsr.app.evaluate import evaluate  # noqa: PLC0415 - it imports torch
+
+    evaluate(config)
+
+
+def _train(config: DictConfig) -> None:
+    TrainConfig.of(plain_config(config))
+    from dsr.app.train import train  # noqa: PLC0415 - it imports torch
+
+    train(config)
+
+
+def run_command(name: str, command: Callable[[DictConfig], Any], arguments: Sequence[str] | None = None) -> None:
+    """Compose a configuration from the command line, and run the command on it.
 
     Exits with 2 and one line on stderr when the configuration cannot be run, with 130 when interrupted.
 
     Args:
-        conf: Hydra's configuration directory.
-        name: without ``.yaml``.
+        name: of the configuration, without ``.yaml``.
         command: what to run; a multirun calls it once per combination.
+        arguments: of the command line, Hydra's options and overrides; those of the process where None.
 
     """
     register()
-    if not conf.is_dir():
-        fail(f"{conf}: expected the directory of the configuration files; run the command in a checkout of the project")
+    register_resolvers()
+    arguments = sys.argv[1:] if arguments is None else list(arguments)
     os.environ.setdefault("HYDRA_FULL_ERROR", "1")  # exceptions arrive here instead of being printed by Hydra
     failures: list[str] = []
-    _expect_choices(conf)
+    try:
+        directories = config_directories(_config_dirs(arguments))
+    except ValueError as error:
+        fail(str(error))
+    _expect_choices(name, arguments, directories)
+    arguments = without_overridden_sweeps(arguments, directories)
+    process = sys.argv
 
     def job(config: DictConfig) -> None:
         try:
-            command(config)
+            with _argv(process):  # from which Lightning starts the processes of further devices
+                command(config)
         except ConfigError as error:  # a multirun goes on with its other jobs
             failures.append(str(error))
             print_error(str(error))
 
     try:
-        hydra.main(version_base="1.3", config_path=str(conf.resolve()), config_name=name)(job)()
+        with _argv([process[0], *arguments]):  # which Hydra parses
+            hydra.main(version_base="1.3", config_path=str(directories[0]), config_name=name)(job)()
     except KeyboardInterrupt as interruption:
         message = str(interruption) or "interrupted; what is finished is kept, the same command goes on from there"
         print(message, file=sys.stderr)  # noqa: T201
         sys.exit(INTERRUPTED)
     except (HydraException, OmegaConfBaseException) as error:
-        fail(explain(error, conf, name))
+        fail(explain(error, name, arguments, directories))
     if failures:
         sys.exit(USAGE_ERROR)
 
 
-def fail(message: str) -> None:
+def compose(name: str, overrides: Sequence[str], directories: Sequence[Path]) -> DictConfig:
+    """Return a configuration, composed outside of a command.
+
+    Args:
+        name: without ``.yaml``.
+        overrides: as on the command line.
+        directories: those of :func:`dsr.utils.config_files.config_directories`.
+
+    """
+    register()
+    register_resolvers()
+    places = ",".join(f'"file://{directory.resolve()}"' for directory in directories[1:])
+    more = [f"hydra.searchpath=[{places}]"] if places else []
+    with hydra.initialize_config_dir(str(directories[0]), version_base="1.3"):
+        return hydra.compose(name, [*overrides, *more])
+
+
+def fail(message: str) -> NoReturn:
     """Print one line on stderr and exit with 2."""
     print_error(message)
     sys.exit(USAGE_ERROR)
 
 
-def explain(error: Exception, conf: Path, name: str, arguments: Sequence[str] | None = None) -> str:
+def explain(error: Exception, name: str, arguments: Sequence[str], directories: Sequence[Path]) -> str:
     """Return what is wrong with a configuration, on one line, with the choices where a name is mistyped.
 
     Args:
         error: Hydra's or OmegaConf's.
-        conf: Hydra's configuration directory.
         name: of the configuration.
-        arguments: that it was composed from; None for the command line's.
+        arguments: that it was composed from.
+        directories: of configuration files.
 
     """
     if isinstance(error, MissingConfigException) and error.missing_cfg_file is not None:
-        return _explain_missing(str(error.missing_cfg_file), conf, name)
+        return _explain_missing(str(error.missing_cfg_file), name, directories)
     if isinstance(error, OverrideParseException):
         return _explain_syntax(error.override)
     text = " ".join(str(error).split())
@@ -83,30 +140,42 @@ def explain(error: Exception, conf: Path, name: str, arguments: Sequence[str] | 
         return (
             f"{key}: got several values; -m runs each of them, {key}=[{values}] is a list, '{key}=\"{values}\"' a text"
         )
-    return _explain_value(error, text, conf, name, sys.argv[1:] if arguments is None else arguments)
+    return _explain_value(error, text, name, arguments, directories)
 
 
-def _explain_value(error: Exception, text: str, conf: Path, name: str, arguments: Sequence[str]) -> str:
+def _explain_value(
+    error: Exception, text: str, name: str, arguments: Sequence[str], directories: Sequence[Path]
+) -> str:
     """Return which key of an override is unknown, or does not take its value."""
     cause = error.__cause__
     key = re.search(r"Could not override '([^']+)'", text)
     if key:
         if cause is not None and "not in struct" not in str(cause) and "not in '" not in str(cause):
             return f"{key[1]}: {_first_line(cause)}"
-        return f"{key[1]}: unknown key; expected {', '.join(_siblings(key[1], conf, name, arguments))}"
+        return _explain_key(key[1], name, arguments, directories)
     value = re.match(r"Error merging override (\S+?)=", text)
     return f"{value[1]}: {_first_line(cause)}" if value and cause is not None else text
 
 
-def _explain_missing(file: str, conf: Path, name: str) -> str:
+def _explain_key(key: str, name: str, arguments: Sequence[str], directories: Sequence[Path]) -> str:
+    """Return which keys there are instead of an unknown one."""
+    if key == "experiment":
+        return f"experiment: write +experiment=NAME, NAME one of {', '.join(list_choices(key, directories))}"
+    prefix = key.rpartition(".")[0]
+    node = _node_of(key, name, arguments, directories)
+    siblings = [f"{prefix}.{child!s}" if prefix else str(child) for child in node if child != "target"]
+    return f"{key}: unknown key; expected {', '.join(siblings)}"
+
+
+def _explain_missing(file: str, name: str, directories: Sequence[Path]) -> str:
     """Return what there is instead of a configuration file that is not there."""
     group, _, choice = file.rpartition("/")
     if not group:
         return f"--config-name {choice}: unknown; expected {name}"
-    files = sorted(path.stem for path in (conf / group).glob("*.yaml"))
-    if files:
-        return f"{group}={choice}: unknown; expected one of {', '.join(files)}"
-    return f"{group}: no such group of choices; expected one of {', '.join(sorted(_groups(conf)))}"
+    choices = list_choices(group, directories)
+    if choices:
+        return f"{group}={choice}: unknown; expected one of {', '.join(choices)}"
+    return f"{group}: no such group of choices; expected one of {', '.join(list_groups(directories))}"
 
 
 def _explain_syntax(override: str) -> str:
@@ -118,32 +187,61 @@ def _explain_syntax(override: str) -> str:
     return f"{key}: cannot read the value {value}; special characters need quotes within quotes: '{key}={quoted}'"
 
 
-def _expect_choices(conf: Path) -> None:
-    """Exit where the command line takes away a choice that must be made."""
-    for argument in sys.argv[1:]:
+def _expect_choices(name: str, arguments: Sequence[str], directories: Sequence[Path]) -> None:
+    """Exit where the command line names a choice that does not exist, or takes away one that must be made."""
+    if any(argument.startswith("hydra.searchpath=") for argument in arguments):
+        return  # there may be choices in other places
+    defaults = OmegaConf.load(directories[0] / f"{name}.yaml").defaults
+    groups = {str(key) for entry in defaults if isinstance(entry, DictConfig) for key in entry} | {"+experiment"}
+    for argument in arguments:
         group, equals, choice = argument.partition("=")
-        if equals and choice in ("", "null") and group in _groups(conf):
-            choices = ", ".join(sorted(path.stem for path in (conf / group).glob("*.yaml")))
-            fail(f"{argument}: expected one of {choices}")
+        if equals and group in groups:
+            _expect_choice(argument, group.lstrip("+"), choice, directories)
+
+
+def _expect_choice(argument: str, group: str, choice: str, directories: Sequence[Path]) -> None:
+    """Exit where ``choice``, or one of several between commas, is no file of a group."""
+    choices = list_choices(group, directories)
+    if choice in ("", "null"):
+        fail(f"{argument}: expected one of {', '.join(choices)}")
+    for each in choice.split(","):
+        if re.fullmatch(r"[\w-]+", each) and each not in choices:
+            fail(f"{group}={each}: unknown; expected one of {', '.join(choices)}")
 
 
 def _first_line(error: BaseException) -> str:
     return str(error).splitlines()[0] if str(error) else type(error).__name__
 
 
-def _siblings(key: str, conf: Path, name: str, arguments: Sequence[str]) -> Sequence[str]:
-    """Return the keys that stand where ``key`` was looked for."""
-    overrides = [argument for argument in arguments if re.match(rf"({'|'.join(_groups(conf))})=[\w-]+$", argument)]
-    with hydra.initialize_config_dir(str(conf.resolve()), version_base="1.3"):
-        node: Any = hydra.compose(name, overrides)
+def _node_of(key: str, name: str, arguments: Sequence[str], directories: Sequence[Path]) -> DictConfig:
+    """Return the node in which ``key`` was looked for, or the innermost one above it."""
+    choice = re.compile(rf"({'|'.join(list_groups(directories))})=[\w-]+")
+    overrides = [argument for argument in arguments if choice.fullmatch(argument)]
+    try:
+        node = compose(name, overrides, directories)
+    except HydraException:  # one of these choices is the wrong one
+        node = compose(name, [], directories)
     for part in key.split(".")[:-1]:
         child = OmegaConf.select(node, part)
         if not isinstance(child, DictConfig):
             break
         node = child
-    prefix = key.rpartition(".")[0]
-    return [f"{prefix}.{child}" if prefix else str(child) for child in node if child != "target"]
+    return node
 
 
-def _groups(conf: Path) -> list[str]:
-    return [path.name for path in conf.iterdir() if path.is_dir()]
+def _config_dirs(arguments: Sequence[str]) -> list[Path]:
+    """Return the user's directory of configuration files, which Hydra's option names."""
+    parser = argparse.ArgumentParser(add_help=False)
+    parser.add_argument("--config-dir", "-cd", type=Path, nargs="?")
+    given = parser.parse_known_args(arguments)[0].config_dir
+    return [] if given is None else [given]
+
+
+@contextlib.contextmanager
+def _argv(arguments: list[str]) -> Iterator[None]:
+    """Let the command line of the process read so."""
+    before, sys.argv = sys.argv, arguments
+    try:
+        yield
+    finally:
+        sys.argv = before

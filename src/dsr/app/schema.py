@@ -12,7 +12,7 @@ from hydra.core.config_store import ConfigStore
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import MISSING, DictConfig, OmegaConf
 
-from dsr.degradation.downsampling import SCALES
+from dsr.degradation.scales import SCALES
 from dsr.utils.builder import ConfigError
 
 PRECISIONS = ("float32", "bfloat16")

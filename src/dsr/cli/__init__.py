@@ -7,13 +7,15 @@ from collections.abc import Mapping, Sequence
 
 from rich.console import Console
 
-from dsr.cli import data, doctor, report, study, upsample
+from dsr.cli import data, doctor, hydra_commands, report, study, upsample
 from dsr.data.download.catalogue import CATALOGUE, Collection
 from dsr.utils.console import INTERRUPTED, USAGE_ERROR, one_line, open_console, print_error, show
 
 _EXAMPLES = """\
 examples:
   dsr upsample --rgb photo.jpg --depth depth.png -o out    finer depth, mesh and pictures from your own camera
+  dsr eval method=facets dataset=simgeo scale=8            evaluate a method; more with dsr eval --help
+  dsr train model=facets trainer=smoke                     train a network; more with dsr train --help
   dsr report outputs/eval -o report                        tables, figures and a page of all evaluations
   dsr study build outputs/eval --scale 4 -o study          a page that asks people which result looks best
   dsr study collect study answers/*.json                   what they answered, with intervals
@@ -21,9 +23,9 @@ examples:
   dsr data get middlebury                                  fetch the seven scenes of the paper's tables
   dsr doctor my_scenes                                     check a directory of your own scenes
 
-Training and evaluation have commands of their own, train.py and eval.py in a checkout of the project.
+In a checkout of the project, `python eval.py` and `python train.py` are the same as `dsr eval` and `dsr train`.
 """
-_COMMANDS = (upsample, report, study, data, doctor)
+_COMMANDS = (upsample, hydra_commands, report, study, data, doctor)
 
 
 def main(arguments: Sequence[str] | None = None, catalogue: Mapping[str, Collection] | None = None) -> int:

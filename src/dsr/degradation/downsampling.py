@@ -23,11 +23,11 @@ from torch import Tensor
 
 from dsr.degradation.holes import Holes
 from dsr.degradation.noise import Noise
+from dsr.degradation.scales import check_scale
 from dsr.geometry.camera import Camera, RangeType, from_range, to_range
 from dsr.sample import DepthSample, Scene
 
 Kernel = Literal["box", "nearest", "bilinear", "bicubic", "gaussian"]
-SCALES = (2, 4, 8, 16)
 _LEAST_WEIGHT = 0.5
 _LEAST_SIGMA = 0.1
 """Minimum sigma as a fraction of the scale: at x2 the nearest pixel centre is 0.25 away, within three sigmas."""
@@ -213,12 +213,6 @@ def make_sample(
     return DepthSample(
         scene.dataset, scene.name, scene.rgb, depth_lr, scene.camera, camera_lr, scale, scene.depth, notes
     )
-
-
-def check_scale(scale: int) -> None:
-    """Raise a ValueError for a factor that is none of ``SCALES``."""
-    if scale not in SCALES:
-        raise ValueError(f"scale: expected one of {', '.join(map(str, SCALES))}, got {scale}")
 
 
 def _crop_to_multiple(scene: Scene, scale: int) -> tuple[Scene, tuple[str, ...]]:

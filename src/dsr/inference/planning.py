@@ -24,7 +24,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from dsr.degradation.downsampling import SCALES
+from dsr.degradation.scales import SCALES
 from dsr.methods.base import Cost
 from dsr.methods.classical.interpolation import Interpolation
 from dsr.methods.networks.base import TILE, UNTILED

@@ -17,7 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dsr.degradation.downsampling import SCALES
+from dsr.degradation.scales import SCALES
 from dsr.methods.networks.msg_guidance import VariantName
 from dsr.methods.networks.msg_net import MSGNet
 from dsr.methods.networks.weight_files import fill

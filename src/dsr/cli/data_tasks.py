@@ -1,0 +1,116 @@
+"""The tasks of ``dsr data``; apart from its options, as what they import is not needed to parse these."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import textwrap
+from collections.abc import Mapping
+
+from rich.console import Console
+from rich.table import Table
+
+from dsr.data.download.catalogue import Collection, find
+from dsr.data.download.get import Options, get
+from dsr.data.download.inventory import absent, state, verify
+from dsr.data.download.location import data_root
+from dsr.utils.console import ConsoleProgress, show
+from dsr.utils.units import megabytes
+
+
+def list_data_sets(_: argparse.Namespace, console: Console, catalogue: Mapping[str, Collection]) -> list[str]:
+    """Show a table of the data sets."""
+    table = Table(box=None, pad_edge=False)
+    for header in ("name", "what", "about", "here"):
+        table.add_column(header, overflow="fold", no_wrap=header != "what")
+    for collection in catalogue.values():
+        size = "" if collection.size is None else megabytes(collection.size)
+        table.add_row(collection.name, collection.title, size, state(collection, data_root()))
+    console.print(table, markup=False, highlight=False)
+    return []
+
+
+def show_folders(options: argparse.Namespace, console: Console, catalogue: Mapping[str, Collection]) -> list[str]:
+    """Show the directory of the data sets, and their folders."""
+    collections = find(options.names, catalogue)
+    if not collections:
+        show(console, str(data_root().absolute()))
+    for collection in collections or catalogue.values():
+        for folder in collection.folders:
+            path = (data_root() / folder).absolute()
+            show(console, str(path) if collections else f"  {collection.name:<17} {path}")
+    return []
+
+
+def get_data_sets(options: argparse.Namespace, console: Console, catalogue: Mapping[str, Collection]) -> list[str]:
+    """Show what will be fetched and on which terms, ask on a terminal, and fetch it."""
+    collections = find(options.names, catalogue)
+    if options.mirror is not None and not options.mirror.startswith(("http://", "https://")):
+        raise ValueError(f"--mirror: expected an address that begins with http:// or https://, got {options.mirror!r}")
+    root, progress = data_root(), ConsoleProgress(console)
+    items = {item.path: item for collection in collections for item in collection.items}
+    missing = len(absent(items.values(), root))
+    for collection in collections:
+        _describe(collection, console)
+    if items:
+        show(console, f"{missing} of {len(items)} files are missing in {root.absolute()}")
+    if missing and not options.yes and sys.stdin.isatty() and console.is_terminal and not _agreed(console):
+        return []
+    settings = Options(options.mirror, options.accept_changed, options.keep_archives)
+    problems = get(items.values(), root, progress, settings) if items else []
+    for collection in collections:
+        if not collection.items:
+            problems += verify(collection, root, progress, accept_changed=options.accept_changed)
+    if not problems:
+        show(console, f"{', '.join(collection.name for collection in collections)}: complete")
+    return problems
+
+
+def _describe(collection: Collection, console: Console) -> None:
+    """Show what a collection is, and on which terms."""
+    size = "" if collection.size is None else f", about {megabytes(collection.size)}"
+    show(console, f"{collection.name}: {collection.title}{size}")
+    for key, text in (("page", collection.homepage), ("licence", collection.licence), ("cite", collection.citation)):
+        lines = textwrap.wrap(text, max(console.width - 12, 20), break_long_words=False, break_on_hyphens=False)
+        for number, line in enumerate(lines):
+            show(console, f"  {'' if number else key:<9} {line}")
+
+
+def _agreed(console: Console) -> bool:
+    """Return whether the user wants it."""
+    console.print("fetch them? [Y/n] ", markup=False, highlight=False, end="")
+    try:
+        answer = console.input()
+    except EOFError:
+        return False
+    return answer.strip().lower() in ("", "y", "yes")
+
+
+def verify_data_sets(options: argparse.Namespace, console: Console, catalogue: Mapping[str, Collection]) -> list[str]:
+    """Check collections, and show which are complete."""
+    problems, progress = [], ConsoleProgress(console)
+    for collection in find(options.names, catalogue):
+        found = verify(collection, data_root(), progress, accept_changed=options.accept_changed)
+        if not found:
+            show(console, f"{collection.name}: complete, as recorded")
+        elif collection.items:
+            show(console, f"{collection.name}: `dsr data get {collection.name}` fetches what is missing or damaged")
+        problems += found
+    return problems
+
+
+def prepare_data_set(options: argparse.Namespace, console: Console, _: object) -> list[str]:
+    """Resize and keep a data set's scenes, and draw its contact sheet."""
+    from dsr.app.prepare import prepare_dataset  # noqa: PLC0415 - it takes seconds to import
+
+    prepare_dataset(options.name, options.settings, console, [options.config_dir] if options.config_dir else [])
+    return []
+
+
+TASKS = {
+    "list": list_data_sets,
+    "where": show_folders,
+    "get": get_data_sets,
+    "verify": verify_data_sets,
+    "prepare": prepare_data_set,
+}

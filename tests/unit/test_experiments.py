@@ -1,0 +1,152 @@
+"""Every experiment is documented, composes, and is valid; recipes of weights are those that made them."""
+
+import re
+from itertools import product
+
+import pytest
+from omegaconf import OmegaConf
+
+from dsr.app.entry import compose
+from dsr.app.experiments import register_resolvers, without_overridden_sweeps
+from dsr.app.schema import EvalConfig, TrainConfig, plain_config
+from dsr.app.training_runs import training_data
+from dsr.methods.networks.trained import packaged_names
+from dsr.utils.builder import build, takes
+from dsr.utils.config_files import config_directories, list_choices
+
+DIRECTORIES = config_directories()
+FOLDER = DIRECTORIES[0] / "experiment"
+EVALUATIONS = ("downsampling_mismatch", "noise", "paper_tables")
+FULL = ["trainer=full", "dataset.count=800"]
+PDN = ["model=pdn", *FULL, "trainer.average=0.998"]
+DG = ["model=dg", "model.depth_loss=lap1", "model.visual=true", "dataset.count=800", "trainer.weight_decay=0",
+      "trainer.average=0.998", "precision=float32"]  # fmt: skip
+FACETS = ["model=facets", *FULL, "trainer.patch=128", "trainer.batch=4", "trainer.photo=0"]
+MSG_V = ["model=msg_v", *FULL, "loss.w=1.5"]
+RECIPES = {
+    "msg_v_x4_stage1": ["model=msg_v", *FULL, "loss.w=0.36", "trainer.photo=0"],
+    "msg_v_x4_stage2": [*MSG_V, "trainer.steps=4000", "trainer.learning_rate=4e-4", "trainer.average=0.999",
+                        "trainer.photo=0"],
+    "msg_v_x4_stage3": [*MSG_V, "trainer.steps=4000", "trainer.learning_rate=4e-4", "trainer.average=0.999"],
+    "msg_v_x4": [*MSG_V, "trainer.steps=12000", "trainer.learning_rate=6e-4", "seed=1"],
+    "msg_v_x8_stage1": ["model=msg_v", "scale=8"],
+    "msg_v_x8": [*MSG_V, "scale=8", "trainer.steps=12000", "trainer.learning_rate=8e-4", "seed=1"],
+    "msg_x4": ["model=msg", *FULL, "trainer.steps=10000"],
+    "msg_x8": ["model=msg", *FULL, "trainer.steps=10000", "scale=8"],
+    "msg_v_x4_noisy": [*MSG_V, "noise=gaussian_multiplicative", "noise.std=0.003", "trainer.steps=5000",
+                       "trainer.learning_rate=6e-4", "seed=2"],
+    "facets_x4": [*FACETS, "loss.w=0.27"],
+    "facets_x8": [*FACETS, "loss.w=0.28", "scale=8"],
+    "pdn_x4": [*PDN, "trainer.steps=3000", "trainer.warmup=200", "trainer.validate_every=1000"],
+    "pdn_x8": [*PDN, "scale=8", "trainer.steps=1000", "trainer.warmup=50", "trainer.learning_rate=5e-4",
+               "trainer.validate_every=500"],
+    "dg_x4": [*DG, "trainer.steps=2000", "trainer.validate_every=500", "trainer.learning_rate=0.02",
+              "trainer.warmup=100", "trainer.patch=64", "trainer.batch=5"],
+    "dg_x8": [*DG, "scale=8", "trainer.steps=1200", "trainer.validate_every=400", "trainer.learning_rate=0.01",
+              "trainer.warmup=50", "trainer.batch=3"],
+}  # fmt: skip
+"""The overrides of ``train.py`` that each training had, but for ``trainer.init``."""
+STARTS = {
+    "msg_v_x4_stage2": "outputs/train/msg_v_x4_stage1/weights.safetensors",
+    "msg_v_x4_stage3": "outputs/train/msg_v_x4_stage2/weights.safetensors",
+    "msg_v_x4": "outputs/train/msg_v_x4_stage3/weights.safetensors",
+    "msg_v_x8": "outputs/train/msg_v_x8_stage1/weights.safetensors",
+    "msg_v_x4_noisy": "src/dsr/methods/weights/msg_v_x4.safetensors",
+    "pdn_x8": "outputs/train/pdn_x4/weights.safetensors",
+    "dg_x8": "outputs/train/dg_x4/weights.safetensors",
+}
+"""What they started from."""
+
+
+def experiment(name, command, *overrides):
+    return plain_config(compose(command, [f"+experiment={name}", *overrides], DIRECTORIES))
+
+
+def sweep_of(name):
+    """Return the overrides of each job of an experiment."""
+    register_resolvers()
+    params = OmegaConf.load(FOLDER / f"{name}.yaml").hydra.sweeper.params
+    keys = [(str(key), str(value).split(",")) for key, value in params.items()]
+    return [[f"{key}={value}" for (key, _), value in zip(keys, values, strict=True)]
+            for values in product(*(values for _, values in keys))]  # fmt: skip
+
+
+def test_every_experiment_is_tested_here():
+    assert list_choices("experiment", DIRECTORIES) == sorted([*EVALUATIONS, *RECIPES])
+
+
+@pytest.mark.parametrize("name", [*EVALUATIONS, *RECIPES])
+def test_an_experiment_opens_with_its_table_figures_cost_and_command(name):
+    lines = (FOLDER / f"{name}.yaml").read_text(encoding="utf-8").splitlines()
+    assert lines[0] == "# @package _global_"
+    comment = " ".join(line.removeprefix("# ") for line in lines[1:] if line.startswith("#"))
+    assert re.search(r"Table: .+ Expected.+\d.+ Cost: .*\d.+ Command: ", comment)
+    script, flag = ("eval.py", "-m ") if name in EVALUATIONS else ("train.py", "")
+    assert f"Command: python {script} {flag}+experiment={name}" in comment
+
+
+@pytest.mark.parametrize("name", RECIPES)
+def test_a_recipe_is_the_training_that_made_the_weights(name):
+    documented = plain_config(compose("train", RECIPES[name], DIRECTORIES))
+    documented["trainer"]["init"] = STARTS.get(name)
+    documented["output_dir"] = f"outputs/train/{name}"
+    assert experiment(name, "train") == documented
+
+
+@pytest.mark.parametrize("name", RECIPES)
+def test_a_recipe_is_valid(name):
+    settings = TrainConfig.of(experiment(name, "train"))
+    build("model", settings.model, {"scale": settings.scale})
+    training_data(settings)
+
+
+def test_a_recipe_starts_from_weights_that_another_one_makes():
+    made = {f"outputs/train/{name}/weights.safetensors" for name in RECIPES}
+    packaged = {f"src/dsr/methods/weights/{name}.safetensors" for name in packaged_names()}
+    assert set(STARTS.values()) <= made | packaged
+
+
+def test_all_packaged_weights_have_a_recipe():
+    assert {name for name in RECIPES if "stage" not in name} == set(packaged_names())
+
+
+@pytest.mark.parametrize("name", EVALUATIONS)
+def test_all_jobs_of_an_experiment_are_valid(name, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("DSR_DATA", raising=False)
+    jobs = sweep_of(name)
+    assert len(jobs) > 1
+    choices = {override for overrides in jobs for override in overrides}
+    for choice in sorted(choices):  # each of them, not all combinations
+        plain = experiment(name, "eval", choice)
+        settings = EvalConfig.of(plain)
+        for group in ("dataset", "downsampling", "noise", "holes"):
+            build(group, plain[group])
+        assert not takes("method", settings.method, "nosuch")  # its target can be imported
+
+
+def test_paper_tables_runs_the_data_sets_that_are_here(tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("DSR_DATA", str(tmp_path))
+    (tmp_path / "middlebury2014").mkdir()
+    (tmp_path / "simgeo").mkdir()
+    assert {job[-1] for job in sweep_of("paper_tables")} == {"dataset=simgeo", "dataset=middlebury"}
+    assert "left out" in (note := capsys.readouterr().err)
+    assert note.count("\n") == 1
+    assert "icl" in note
+
+
+def test_a_value_on_the_command_line_replaces_the_sweep_over_it():
+    arguments = ["+experiment=noise", "method=facets", "scale=8"]
+    assert without_overridden_sweeps(arguments, DIRECTORIES) == [*arguments, "~hydra.sweeper.params.method"]
+
+
+def test_own_experiments_are_narrowed_too(tmp_path):
+    (tmp_path / "experiment").mkdir()
+    (tmp_path / "experiment" / "mine.yaml").write_text("hydra: {sweeper: {params: {seed: '0,1'}}}\n")
+    found = without_overridden_sweeps(["+experiment=mine", "seed=2"], (*DIRECTORIES, tmp_path))
+    assert found[-1] == "~hydra.sweeper.params.seed"
+
+
+def test_an_experiment_without_a_sweep_is_left_as_it_is():
+    arguments = ["+experiment=facets_x4", "scale=8"]
+    assert without_overridden_sweeps(arguments, DIRECTORIES) == arguments
