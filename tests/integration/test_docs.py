@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import importlib.util
+import os
 import re
 import shlex
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+import pandas as pd
 import pytest
 import yaml
 from hydra import compose, initialize_config_dir
@@ -20,7 +24,12 @@ ROOT = Path(__file__).resolve().parents[2]
 DOCS = ROOT / "docs"
 PAGES = (ROOT / "README.md", *sorted(DOCS.glob("*.md")))
 EXTENDING = DOCS / "extend.md"
-"""Its commands use modules of the reader's own; tests/integration run such modules."""
+"""Its commands use the modules that it contains; a test runs them."""
+SMALL = {
+    "eval.py": ("metrics.lpips=false", "device=cpu"),
+    "train.py": ("trainer=smoke", "dataset.size=64", "dataset.count=8", "metrics.lpips=false", "device=cpu"),
+}
+"""What is added to those commands to make them quick."""
 
 
 def load_hook() -> ModuleType:
@@ -110,6 +119,38 @@ def test_evaluation_of_the_documentation_composes(arguments: list[str]) -> None:
 def test_training_of_the_documentation_composes(arguments: list[str]) -> None:
     for config in compose_each("train", arguments):
         assert TrainConfig.of(config).scale in (4, 8)
+
+
+@pytest.fixture(scope="module")
+def extension(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with the files of the page about extending."""
+    folder = tmp_path_factory.mktemp("extension")
+    blocks = re.findall(r'^```\w+ title="([^"]+)"\n(.*?)^```', EXTENDING.read_text(), re.MULTILINE | re.DOTALL)
+    for path, content in blocks:
+        (folder / path).parent.mkdir(parents=True, exist_ok=True)
+        (folder / path).write_text(content)
+    return folder
+
+
+@pytest.mark.parametrize("about", ["metrics=mine", "model=tiny"])
+def test_example_of_extending_runs(about: str, extension: Path, dsr_cache: Path) -> None:
+    line = next(line for line in EXTENDING.read_text().splitlines() if line.startswith("PYTHONPATH") and about in line)
+    _, _, name, *arguments = shlex.split(line)
+    done = subprocess.run(
+        [sys.executable, str(ROOT / name), *arguments, *SMALL[name], "output_dir=run"],
+        cwd=extension,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT / "src"), "."]), "OMP_NUM_THREADS": "1"},
+        capture_output=True,
+        text=True,
+        timeout=300,
+        check=False,
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+    if about == "metrics=mine":
+        assert re.search(r"Bump_d\s+RMSE_v\s+PSNR", done.stdout)
+        assert set(pd.read_csv(extension / "run" / "scores.csv")["method"]) == {"blend"}
+    else:
+        assert (extension / "run" / "weights.safetensors").is_file()
 
 
 def test_command_reference_has_every_command_and_option(hook: ModuleType, generated: dict[str, str]) -> None:
