@@ -137,7 +137,7 @@ def test_example_of_extending_runs(about: str, extension: Path, dsr_cache: Path)
     line = next(line for line in EXTENDING.read_text().splitlines() if line.startswith("PYTHONPATH") and about in line)
     _, _, name, *arguments = shlex.split(line)
     done = subprocess.run(
-        [sys.executable, str(ROOT / name), *arguments, *SMALL[name], "output_dir=run"],
+        [sys.executable, str(ROOT / name), *arguments, *SMALL[name], f"output_dir=run/{name}"],
         cwd=extension,
         env={**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT / "src"), "."]), "OMP_NUM_THREADS": "1"},
         capture_output=True,
@@ -148,9 +148,9 @@ def test_example_of_extending_runs(about: str, extension: Path, dsr_cache: Path)
     assert (done.returncode, done.stderr) == (0, "")
     if about == "metrics=mine":
         assert re.search(r"Bump_d\s+RMSE_v\s+PSNR", done.stdout)
-        assert set(pd.read_csv(extension / "run" / "scores.csv")["method"]) == {"blend"}
+        assert set(pd.read_csv(extension / "run" / name / "scores.csv")["method"]) == {"blend"}
     else:
-        assert (extension / "run" / "weights.safetensors").is_file()
+        assert (extension / "run" / name / "weights.safetensors").is_file()
 
 
 def test_command_reference_has_every_command_and_option(hook: ModuleType, generated: dict[str, str]) -> None:
