@@ -25,11 +25,6 @@ DOCS = ROOT / "docs"
 PAGES = (ROOT / "README.md", *sorted(DOCS.glob("*.md")))
 EXTENDING = DOCS / "extend.md"
 """Its commands use the modules that it contains; a test runs them."""
-SMALL = {
-    "eval.py": ("metrics.lpips=false", "device=cpu"),
-    "train.py": ("trainer=smoke", "dataset.size=64", "dataset.count=8", "metrics.lpips=false", "device=cpu"),
-}
-"""What is added to those commands to make them quick."""
 
 
 def load_hook() -> ModuleType:
@@ -132,12 +127,12 @@ def extension(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.mark.parametrize("about", ["metrics=mine", "model=tiny"])
-def test_example_of_extending_runs(about: str, extension: Path, dsr_cache: Path) -> None:
+def run_example(about: str, extension: Path, *added: str) -> str:
+    """Run the first Python command of the page that contains ``about``, with more arguments; return its output."""
     line = next(line for line in EXTENDING.read_text().splitlines() if line.startswith("PYTHONPATH") and about in line)
     _, _, name, *arguments = shlex.split(line)
     done = subprocess.run(
-        [sys.executable, str(ROOT / name), *arguments, *SMALL[name], f"output_dir=run/{name}"],
+        [sys.executable, str(ROOT / name), *arguments, *added],
         cwd=extension,
         env={**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT / "src"), "."]), "OMP_NUM_THREADS": "1"},
         capture_output=True,
@@ -146,11 +141,20 @@ def test_example_of_extending_runs(about: str, extension: Path, dsr_cache: Path)
         check=False,
     )
     assert (done.returncode, done.stderr) == (0, "")
-    if about == "metrics=mine":
-        assert re.search(r"Bump_d\s+RMSE_v\s+PSNR", done.stdout)
-        assert set(pd.read_csv(extension / "run" / name / "scores.csv")["method"]) == {"blend"}
-    else:
-        assert (extension / "run" / name / "weights.safetensors").is_file()
+    return done.stdout
+
+
+def test_examples_of_a_method_a_data_set_and_a_metric_run_together(extension: Path) -> None:
+    output = run_example("metrics=mine", extension, "metrics.lpips=false", "device=cpu", "output_dir=run")
+    assert re.search(r"Bump_d\s+RMSE_v\s+PSNR", output)
+    assert set(pd.read_csv(extension / "run" / "scores.csv")["method"]) == {"blend"}
+
+
+def test_example_of_a_network_trains_and_is_evaluated(extension: Path, dsr_cache: Path) -> None:
+    small = ("trainer=smoke", "dataset.size=64", "dataset.count=8", "metrics.lpips=false", "device=cpu")
+    run_example("train.py", extension, *small)
+    run_example("run=outputs/train/tiny", extension, "metrics.lpips=false", "device=cpu", "output_dir=again")
+    assert (extension / "again" / "scores.csv").is_file()
 
 
 def test_command_reference_has_every_command_and_option(hook: ModuleType, generated: dict[str, str]) -> None:
