@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
-import struct
-import zlib
+import io
 
-import cv2
 import numpy as np
 import torch
+from PIL import Image
 from torch import Tensor
 
 from dsr.geometry.camera import Camera
 from dsr.geometry.shading import LIGHT_NAMES, render
 from dsr.viz.panels import normals_seen_by
-
-_SIGNATURE_AND_HEADER = 8 + 25
-"""Bytes of a PNG before its second chunk."""
 
 
 def shading_of(depth: Tensor, camera: Camera, light: str) -> Tensor:
@@ -31,21 +27,15 @@ def shading_of(depth: Tensor, camera: Camera, light: str) -> Tensor:
 
 
 def grey_png(shades: Tensor, known: Tensor) -> bytes:
-    """Return a PNG of 8 bits: black is level 1, white is 255, and what is unknown is level 0 and transparent.
+    """Return a PNG of 8 bits: black is level 1, white is 255, and what is missing is level 0 and transparent.
 
     Args:
         shades: (H, W) in [0, 1], NaN where unknown.
-        known: (H, W) bool, what to show of it.
+        known: (H, W) bool, the pixels to show.
 
     """
     levels = torch.where(known & shades.isfinite(), 1 + (254 * shades).round(), torch.zeros_like(shades))
-    encoded, data = cv2.imencode(".png", levels.numpy().astype(np.uint8), [cv2.IMWRITE_PNG_COMPRESSION, 9])
-    if not encoded:
-        raise ValueError(f"expected a picture, got one of {tuple(shades.shape)} pixels that cannot be encoded")
-    png = data.tobytes()
-    return png[:_SIGNATURE_AND_HEADER] + _chunk(b"tRNS", struct.pack(">H", 0)) + png[_SIGNATURE_AND_HEADER:]
-
-
-def _chunk(kind: bytes, content: bytes) -> bytes:
-    """Return a chunk of a PNG (W3C recommendation "Portable Network Graphics", section 5.3)."""
-    return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", zlib.crc32(kind + content))
+    content = io.BytesIO()
+    picture = Image.fromarray(levels.numpy().astype(np.uint8))
+    picture.save(content, "PNG", transparency=0, compress_level=9)
+    return content.getvalue()
