@@ -8,6 +8,7 @@ from __future__ import annotations
 import argparse
 import re
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -37,8 +38,8 @@ _ITEM = re.compile(r" *- (?P<value>[^#]*?)(?:\s*#.*)?$")
 _HEAD_COMMANDS = """\
 # Command reference
 
-This page is generated from the commands themselves; `dsr COMMAND --help` prints the same text. The settings of
-`eval.py` and `train.py` are listed in the [configuration reference](configuration.md).
+This page is generated from the commands; `dsr COMMAND --help` prints the same text. The settings of `dsr eval`
+(`python eval.py`) and `dsr train` (`python train.py`) are in the [configuration reference](configuration.md).
 """
 _HEAD_CONFIGURATION = """\
 # Configuration reference
@@ -85,29 +86,21 @@ def command_parser() -> argparse.ArgumentParser:
 
 
 def command_reference(parser: argparse.ArgumentParser) -> str:
-    """Return the help of a command and all its subcommands as Markdown."""
-    sections = [f"## {each.prog}\n\n```text\n{each.format_help().rstrip()}\n```\n" for each in all_parsers(parser)]
+    """Return the help of a command and all its subcommands as Markdown, whatever the width of the terminal."""
+    sections = []
+    for each in all_parsers(parser):
+        each.formatter_class = partial(each.formatter_class, width=100)  # type: ignore[assignment]
+        sections.append(f"## {each.prog}\n\n```text\n{each.format_help().rstrip()}\n```\n")
     return "\n".join([_HEAD_COMMANDS, *sections])
 
 
 def all_parsers(parser: argparse.ArgumentParser) -> Iterator[argparse.ArgumentParser]:
     """Yield a parser, then those of its subcommands, in the order of its help."""
-    parser.formatter_class = _wide(parser.formatter_class)
     yield parser
     for action in parser._actions:
         if isinstance(action, argparse._SubParsersAction):
             for child in action.choices.values():
                 yield from all_parsers(child)
-
-
-def _wide(base: type[argparse.HelpFormatter]) -> type[argparse.HelpFormatter]:
-    """Return a formatter that ignores the width of the terminal."""
-
-    class Wide(base):  # type: ignore[misc, valid-type]
-        def __init__(self, prog: str) -> None:
-            super().__init__(prog, width=100)
-
-    return Wide
 
 
 def configuration_reference(conf: Path) -> str:

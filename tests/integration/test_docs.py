@@ -22,7 +22,8 @@ from dsr.app.schema import EvalConfig, TrainConfig, plain_config, register
 
 ROOT = Path(__file__).resolve().parents[2]
 DOCS = ROOT / "docs"
-PAGES = (ROOT / "README.md", *sorted(DOCS.glob("*.md")))
+CARD = ROOT / "src/dsr/methods/weights/README.md"
+PAGES = (ROOT / "README.md", CARD, *sorted(DOCS.glob("*.md")))
 EXTENDING = DOCS / "extend.md"
 """Its commands use the modules that it contains; a test runs them."""
 
