@@ -129,10 +129,13 @@ def digest(path: Path) -> str | None:
     if path.name in {"scores.csv", "validation.csv"} or path.parent.name == "iterations":
         table = pd.read_csv(path)
         content = table.drop(columns=[name for name in table if "seconds" in name]).to_csv(index=False).encode()
-    elif path.suffix == ".npz" and path.parent.name in ("predictions", "scenes"):
+    elif path.suffix == ".npz" and path.parent.name == "predictions":
         with np.load(path) as arrays:
-            names = [name for name in ("depth", "rgb", "coarse") if name in arrays.files]
-            content = b"".join(arrays[name].tobytes() for name in names)
+            content = arrays["depth"].tobytes()
+    elif path.suffix == ".npz" and path.parent.name == "scenes":
+        with np.load(path) as arrays:  # older versions stored float32, and the low-resolution map as "coarse"
+            lr = arrays["depth_lr" if "depth_lr" in arrays.files else "coarse"].astype(np.float32)
+            content = arrays["depth"].astype(np.float32).tobytes() + arrays["rgb"].tobytes() + lr.tobytes()
     elif path.name == "weights.safetensors":
         content = b"".join(key.encode() + value.tobytes() for key, value in sorted(load_file(path).items()))
     elif path.name == "info.json":
