@@ -135,3 +135,22 @@ def test_upsample_runs_a_method_from_outside_with_settings(home):
     assert done.returncode == 2
     assert done.stderr == "error: --set ofset: unknown key; method=constant takes offset\n"
     assert not (home / "other").exists()
+
+
+@pytest.mark.slow
+def test_network_from_outside_is_trained_evaluated_and_used(home):
+    program = str(REPOSITORY / "eval.py")
+    small = ("dataset.size=32", "metrics.lpips=false", "device=cpu")
+    for command in (
+        (str(REPOSITORY / "train.py"), "--config-dir", "conf", *TRAINING),
+        (program, "run=training", "metrics.lpips=false", "device=cpu", "output_dir=runs/run"),
+        (program, "--config-dir", "conf", "method=shifted", *small, "output_dir=runs/shifted"),
+    ):
+        done = run(home, *command)
+        assert done.returncode == 0, done.stderr
+    done = upsample(home, "--method", "shifted", "-o", "by_network")
+    assert done.returncode == 0, done.stderr
+    assert np.load(home / "by_network" / "depth_metres.npy").shape == (32, 48)
+    done = run(home, program, "method=facets", "weights=training/weights.safetensors", *small, "output_dir=runs/wrong")
+    assert done.returncode == 2
+    assert "expected weights of model facets, got those of shifted" in done.stderr
