@@ -14,7 +14,6 @@ from PIL import Image
 from torch import Tensor
 
 from dsr.degradation.downsampling import (
-    SCALES,
     Downsampling,
     Kernel,
     Measured,
@@ -22,6 +21,7 @@ from dsr.degradation.downsampling import (
     scene_generator,
 )
 from dsr.degradation.noise import GaussianMultiplicative, no_noise
+from dsr.degradation.scales import SCALES
 from dsr.geometry.camera import RANGE_TYPES, Camera, RangeType, to_range
 from dsr.sample import DepthSample, Scene
 

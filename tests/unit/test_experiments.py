@@ -110,6 +110,7 @@ def test_all_packaged_weights_have_a_recipe():
     assert {name for name in RECIPES if "stage" not in name} == set(packaged_names())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", EVALUATIONS)
 def test_all_jobs_of_an_experiment_are_valid(name, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)

@@ -127,6 +127,7 @@ def test_gradients_reach_every_parameter_and_agree_with_finite_differences() -> 
     assert torch.autograd.gradcheck(loss, bias.detach().clone().requires_grad_())
 
 
+@pytest.mark.slow
 def test_training_learns_an_edge_that_the_photo_shows() -> None:
     """A wall behind a wall: after a few steps on one patch the edge is several times sharper than a spline's."""
     torch.manual_seed(0)

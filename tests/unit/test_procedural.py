@@ -77,6 +77,7 @@ def test_size_changes_only_the_sampling_of_a_scene():
     assert np.median(close) < 8
 
 
+@pytest.mark.slow
 def test_scenes_vary_in_depth_focal_length_and_brightness():
     ratios = np.array([np.quantile(s.depth, 0.98) / np.quantile(s.depth, 0.02) for s in scenes()])
     focal = np.array([s.camera.fx / s.camera.width for s in scenes()])

@@ -48,6 +48,7 @@ def test_preparing_renders_what_is_missing_and_names_every_scene(cache: Path) ->
     assert list(source.prepare(["00002", "00000"])) == ["00002", "00000"]
 
 
+@pytest.mark.slow
 def test_seeds_and_sizes_do_not_share_scenes(cache: Path) -> None:
     sources = [Procedural(count=1, size=SIZE), Procedural(count=1, size=SIZE, seed=1), Procedural(count=1, size=64)]
     for source in sources:

@@ -36,6 +36,7 @@ def depth_to_normals(picture):
     return normal, np.abs((normal * corner).sum(0)) < 1e-9
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SCENES)
 def test_images_have_the_documented_types_and_ranges(name):
     picture = rendering(name)
@@ -56,12 +57,14 @@ def test_camera_keeps_its_field_of_view_at_any_size():
     assert camera.baseline == 0.2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SCENES)
 def test_same_ray_has_the_same_depth_at_any_size(name):
     # pixel u at 32 and pixel 3 u + 1 at 96 look along one ray
     np.testing.assert_allclose(rendering(name, 32).depth, rendering(name, 96).depth[1::3, 1::3], atol=1e-8)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["cube_high_freq", "statue"])
 def test_rendering_is_deterministic(name):
     again = render_scene(name, SIZE)

@@ -43,6 +43,7 @@ COMMANDS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("command", COMMANDS)
 def test_startup_imports_nothing_heavy(command, tmp_path):
     program, *arguments = command.split()
@@ -55,7 +56,7 @@ def test_startup_imports_nothing_heavy(command, tmp_path):
     assert done.stderr.splitlines()[-1].strip() == "HEAVY"
 
 
-def test_the_test_itself_sees_a_heavy_import(tmp_path):
+def test_startup_check_sees_a_heavy_import(tmp_path):
     code = PROGRAM.format(heavy=HEAVY, argv=["x"], start="import scipy")
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stderr.splitlines()[-1] == "HEAVY scipy"

@@ -83,6 +83,7 @@ def test_tiled_result_equals_the_whole_image(name: str) -> None:
     assert float((tiled - whole).abs().max() / (whole.max() - whole.min())) < 1e-5
 
 
+@pytest.mark.slow
 def test_tiled_augmentation_equals_the_whole_image() -> None:
     method = _method("facets", ensemble=8)
     rgb, coarse = _pair(4, 12, 36)
