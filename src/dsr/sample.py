@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dsr.geometry.camera import Camera
+from dsr.geometry.camera import Camera, to_range
 from dsr.utils.files import read_arrays, replacing
 
 
@@ -175,6 +175,15 @@ class DepthSample:
     def mask_lr(self) -> Tensor:
         """(1, h, w) bool: where the low-resolution depth is known."""
         return self.depth_lr.isfinite()
+
+    def disparity_lr(self, dtype: torch.dtype | None = None) -> Tensor:
+        """Return the low-resolution disparity in pixels of the high-resolution camera, (1, h, w), NaN where missing.
+
+        Args:
+            dtype: to compute in; None for that of ``depth_lr``.
+
+        """
+        return to_range(self.depth_lr.to(dtype or self.depth_lr.dtype), self.camera_lr, "disparity") * self.scale
 
     @property
     def mask(self) -> Tensor | None:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict
+import math
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,7 @@ import numpy as np
 import pytest
 import torch
 
-from dsr.geometry.camera import Camera
+from dsr.geometry.camera import Camera, baseline_times_focal
 from dsr.sample import DepthSample, Scene
 
 CAMERA = Camera(width=8, height=4, fx=9.0, fy=9.0, cx=3.5, cy=1.5)
@@ -197,3 +198,14 @@ def test_file_that_is_no_sample_is_refused_by_its_name(tmp_path: Path, content: 
     came = "there is none" if content is None else "got a damaged or foreign file"
     with pytest.raises(ValueError, match=f"hall.npz: expected the sample of a scene, {came}"):
         DepthSample.load(path)
+
+
+def test_disparity_lr_is_in_pixels_of_the_high_resolution_camera() -> None:
+    camera = replace(CAMERA, doffs=1.5)
+    sample = _sample(camera=camera, camera_lr=camera.rescale(4, 2), depth_lr=_with((1, 2, 4), math.nan))
+    disparity = sample.disparity_lr(torch.float64)
+    assert disparity.dtype == torch.float64
+    assert sample.disparity_lr().dtype == torch.float32
+    expected = baseline_times_focal(camera) / 2.0 - 1.5
+    torch.testing.assert_close(disparity[sample.mask_lr], torch.full((7,), expected).double())
+    assert bool(disparity[~sample.mask_lr].isnan().all())

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from dsr.degradation.downsampling import Downsampling, make_sample
 from dsr.degradation.noise import Noise
-from dsr.geometry.camera import baseline_times_focal, to_range
+from dsr.geometry.camera import baseline_times_focal
 from dsr.sample import DepthSample, Scene
 
 Batch = dict[str, Tensor]
@@ -55,7 +55,7 @@ def to_tensors(sample: DepthSample, dtype: torch.dtype = torch.float32) -> Batch
     if sample.depth is None:
         raise ValueError(f"{sample.scene}: expected a true depth to train with, there is none")
     camera = sample.camera
-    disparity = sample.scale * to_range(sample.depth_lr, sample.camera_lr, "disparity")
+    disparity = sample.disparity_lr()
     return {
         "rgb": sample.rgb.float(),
         "disparity_lr": disparity.to(dtype),

@@ -19,7 +19,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from dsr.geometry.camera import RangeType, from_range, to_range
+from dsr.geometry.camera import RangeType, from_range
 from dsr.methods.base import Cost
 from dsr.methods.networks.inpainting import inpaint
 from dsr.methods.networks.maps import lr_coordinates
@@ -98,7 +98,7 @@ class GuidedMethod(ABC):
         """Return the high-resolution depth, (1, H, W) in metres in the precision of the low-resolution depth."""
         device = sample.depth_lr.device
         rows, columns = lr_coordinates(sample.camera, sample.camera_lr, device)
-        disparity_lr = to_range(sample.depth_lr.double(), sample.camera_lr, "disparity")[0] * sample.scale
+        disparity_lr = sample.disparity_lr(torch.float64)[0]
         valid = disparity_lr.isfinite()
         maps = _fit_planes(disparity_lr) if self._slopes else disparity_lr[None]
         guided = Guided(sample.rgb.to(device).double(), inpaint(maps[:, None])[:, 0], valid.double(), rows, columns)

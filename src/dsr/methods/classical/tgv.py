@@ -32,7 +32,7 @@ from typing import ClassVar, NamedTuple
 import torch
 from torch import Tensor
 
-from dsr.geometry.camera import RangeType, from_range, to_range
+from dsr.geometry.camera import RangeType, from_range
 from dsr.methods.base import Cost, expect_limits
 from dsr.methods.classical.convergence import CHECK_EVERY, Movement, history_of
 from dsr.methods.classical.finite_differences import (
@@ -144,7 +144,7 @@ class TotalGeneralisedVariation:
             progress: is called with the iterations done and their maximum.
 
         """
-        lr = to_range(sample.depth_lr.double(), sample.camera_lr, "disparity")[None] * sample.scale
+        lr = sample.disparity_lr(torch.float64)[None]
         scaled = normalise(lr)
         valid = lr.isfinite()
         values = torch.where(valid, scaled.values, torch.nan)

@@ -41,7 +41,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from dsr.geometry.camera import RangeType, from_range, to_range
+from dsr.geometry.camera import RangeType, from_range
 from dsr.methods.base import Cost
 from dsr.methods.classical.eg.bilateral import bilateral_filter
 from dsr.methods.classical.eg.edge_map import predict_edge_map
@@ -110,7 +110,7 @@ class EdgeGuided:
             NoSolutionError: edges do not recur across scales, see the module.
 
         """
-        disparity_lr = to_range(sample.depth_lr.double(), sample.camera_lr, "disparity")[0] * sample.scale
+        disparity_lr = sample.disparity_lr(torch.float64)[0]
         valid = disparity_lr.isfinite()
         lowest, highest = (float(bound) for bound in disparity_lr[valid].aminmax())
         self.history = []
