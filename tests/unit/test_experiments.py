@@ -85,8 +85,9 @@ def test_an_experiment_opens_with_its_table_figures_cost_and_command(name):
     assert f"Command: python {script} {flag}+experiment={name}" in comment
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", RECIPES)
-def test_a_recipe_is_the_training_that_made_the_weights(name):
+def test_recipe_is_the_training_that_made_the_weights(name):
     documented = plain_config(compose("train", RECIPES[name], DIRECTORIES))
     documented["trainer"]["init"] = STARTS.get(name)
     documented["output_dir"] = f"outputs/train/{name}"

@@ -233,6 +233,7 @@ def _guess(batch: Batch) -> Tensor:
     return truth + 0.05 * _map(7, 12, 14, batch=2)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("holes", [0.0, 0.15])
 @pytest.mark.parametrize("depth_loss", LOSSES)
 def test_gradient_of_the_objective_is_that_of_its_value(depth_loss: DepthLoss, holes: float) -> None:

@@ -94,6 +94,7 @@ def test_scenes_vary_in_depth_focal_length_and_brightness():
     assert len({s.camera.cx for s in scenes()}) == len(scenes())
 
 
+@pytest.mark.slow
 def test_photos_show_texture_without_geometry_and_geometry_without_texture():
     counts = np.zeros(2)
     for scene in scenes():

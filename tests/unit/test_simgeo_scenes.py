@@ -109,6 +109,7 @@ def test_cylinder_points_lie_on_its_side_or_its_cap():
     assert cap.sum() > 30
 
 
+@pytest.mark.slow
 def test_statue_points_are_roots_of_its_distance_function():
     statue = build_scene("statue").bodies[0].surface
     assert isinstance(statue, Implicit)
@@ -117,6 +118,7 @@ def test_statue_points_are_roots_of_its_distance_function():
     assert np.abs(statue.distance(points)).max() < 1e-9
 
 
+@pytest.mark.slow
 def test_statue_fills_the_height_of_the_picture_and_has_many_normals():
     points = object_points("statue", 0)
     rows = points[1] / points[2] * rendering("statue").camera.fy

@@ -268,6 +268,7 @@ def _one_batch() -> DataLoader[Batch]:
     return DataLoader(patches, batch_size=2)
 
 
+@pytest.mark.slow
 def test_loss_falls_in_thirty_steps_on_one_batch(tmp_path: Path) -> None:
     losses, module = _Losses(), _module()
     before = copy.deepcopy(module.net.state_dict())
