@@ -20,8 +20,9 @@ import torch
 
 from dsr.data.folder import Folder
 from dsr.degradation.downsampling import Downsampling, make_sample
-from dsr.methods.networks.trained import build_trained, packaged_weights
+from dsr.methods.networks.trained import packaged_weights
 from dsr.methods.networks.weight_files import read_head
+from dsr.methods.registry import build_method, read_method
 from dsr.metrics.catalogue import WORST, Metric, catalogue, score_image
 from dsr.metrics.lpips import load_lpips
 
@@ -35,7 +36,8 @@ def scores(
     """Return the worst-of-four scores of a network on one scene."""
     head = read_head(weights)
     scale = head["arguments"]["scale"]
-    method = build_trained(weights, scale, head["model"], ensemble=ensemble)
+    node = read_method(head["model"], scale, {} if ensemble is None else {"ensemble": ensemble})
+    method = build_method(node, scale, weights=weights)
     sample = make_sample(
         Folder(str(shared / "scenes"), [scene]).load(scene), scale, Downsampling("box"), method.range_type
     )

@@ -12,6 +12,7 @@ from __future__ import annotations
 import argparse
 import os
 from pathlib import Path
+from typing import Any
 
 import matplotlib as mpl
 import torch
@@ -24,9 +25,7 @@ from dsr.degradation.downsampling import Downsampling, make_sample
 from dsr.degradation.holes import Blobs, Holes, Shadows
 from dsr.geometry.shading import render
 from dsr.geometry.surface import depth_to_normals
-from dsr.methods.classical.interpolation import Interpolation
-from dsr.methods.dip.upsampler import DeepImagePrior
-from dsr.methods.networks.trained import build_trained, packaged_weights
+from dsr.methods.registry import build_method, has_weights, read_method
 from dsr.metrics.functional import SurfacePair, rmse_d, rmse_v
 from dsr.sample import DepthSample, Scene
 from dsr.utils.devices import fast_precision
@@ -42,18 +41,16 @@ def centre(scene: Scene, size: int) -> Scene:
 
 def results(sample: DepthSample, steps: int) -> dict[str, Tensor]:
     """Return what each method makes of a sample with holes."""
-    found = {"Bicubic, nearest fill": Interpolation("bicubic", fill_holes=True)(sample)}
-    weights = packaged_weights(f"msg_v_x{sample.scale}")
-    if weights is not None:
-        found["MSG-V"] = build_trained(weights, sample.scale, "msg_v")(sample)
-    precision = fast_precision(torch.device("cpu"))
-    found["DIP-V"] = DeepImagePrior(
-        scale=sample.scale,
-        downsampling=BOX,
-        steps=steps,
-        validate_every=0,
-        precision=precision,  # type: ignore[arg-type]
-    )(sample)
+    methods: dict[str, tuple[str, dict[str, Any], str]] = {
+        "Bicubic, nearest fill": ("bicubic", {"fill_holes": True}, "float32"),
+        "MSG-V": ("msg_v", {}, "float32"),
+        "DIP-V": ("dip_v", {"steps": steps, "validate_every": 0}, fast_precision(torch.device("cpu"))),
+    }
+    found = {}
+    for label, (name, settings, precision) in methods.items():
+        node = read_method(name, sample.scale, settings)
+        if name != "msg_v" or has_weights(node, sample.scale):
+            found[label] = build_method(node, sample.scale, downsampling=BOX, precision=precision)(sample)
     return found
 
 
