@@ -21,7 +21,7 @@ import torch
 from dsr.data.folder import Folder
 from dsr.degradation.downsampling import Downsampling, make_sample
 from dsr.methods.networks.trained import packaged_weights
-from dsr.methods.networks.weight_files import read_head
+from dsr.methods.networks.weight_files import read_header
 from dsr.methods.registry import build_method, read_method
 from dsr.metrics.catalogue import WORST, Metric, catalogue, score_image
 from dsr.metrics.lpips import load_lpips
@@ -34,7 +34,7 @@ def scores(
     shared: Path, weights: Path, scene: str, metrics: tuple[Metric, ...], ensemble: int | None = None
 ) -> dict[str, float]:
     """Return the worst-of-four scores of a network on one scene."""
-    head = read_head(weights)
+    head = read_header(weights)
     scale = head["arguments"]["scale"]
     node = read_method(head["model"], scale, {} if ensemble is None else {"ensemble": ensemble})
     method = build_method(node, scale, weights=weights)
@@ -76,7 +76,7 @@ def main() -> None:
     if not (arguments.shared / "expected" / "metrics.json").is_file():
         print(f"skipped: needs the published network's scores, there are none in {arguments.shared}")
         return
-    heads = {path: read_head(path) for path in arguments.weights}
+    heads = {path: read_header(path) for path in arguments.weights}
     files = {f"{head['model']}_x{head['arguments']['scale']}": path for path, head in heads.items()}
     ratios = table(arguments.shared, arguments.methods.split(","), files, arguments.ensemble)
     if arguments.csv:

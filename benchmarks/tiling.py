@@ -72,9 +72,9 @@ def seams(rgb: Tensor, inverse: Tensor, method: str, scale: int) -> None:
     """Print how much answers with tiles of two sizes differ."""
     net = build_method(read_method(method, scale, {"ensemble": 1}), scale, device="cpu", precision="float32")
     with torch.inference_mode():
-        usual = net.fine_disparity(rgb[None], inverse[None])
+        usual = net.upsample_disparity(rgb[None], inverse[None])
         net.tile = network.TILE * 5 // 8
-        other = net.fine_disparity(rgb[None], inverse[None])
+        other = net.upsample_disparity(rgb[None], inverse[None])
     off = (usual - other).abs() / (inverse.max() - inverse.min())
     print(f"largest difference of inverse depth: {float(off.max()):.1e} of its range, mean {float(off.mean()):.1e}")
 

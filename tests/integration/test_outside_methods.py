@@ -46,7 +46,7 @@ class Shifted(DisparityNetwork):
     def arguments(self):
         return {"scale": self.scale}
 
-    def upsample(self, rgb, disparity, bounds=None):
+    def upsample(self, rgb, disparity, min_max=None):
         known = torch.where(disparity.isfinite(), disparity, disparity.nanmean())
         return nn.functional.interpolate(known, scale_factor=self.scale) + self.shift
 '''

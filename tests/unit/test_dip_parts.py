@@ -53,7 +53,7 @@ def test_loss_is_the_sum_of_its_terms_on_low_resolution_maps() -> None:
     depth_range = float(depth_lr.max() - depth_lr.min())
     terms = PriorObjective("lap1", 2.0, 0.7, 0.3)(depth, intensity, problem)
     data = lap1(blocks / depth_range, depth_lr / depth_range)
-    visual = rmse_v(SurfacePair(blocks, depth_lr, CAMERA.coarser(2).rays(dtype=torch.float32)[None])).square()
+    visual = rmse_v(SurfacePair(blocks, depth_lr, CAMERA.downscale(2).rays(dtype=torch.float32)[None])).square()
     photo = lap1(intensity, problem.grey)
     torch.testing.assert_close(terms["data_lap1"], data[0])
     torch.testing.assert_close(terms["mse_v"], visual[0])
@@ -102,7 +102,7 @@ def test_forward_model_averages_the_configured_range_type() -> None:
     torch.testing.assert_close(kinds[None][0], sample.depth_lr.float())
     lengths = CAMERA.ray_lengths(dtype=torch.float32)
     blocks = (sample.depth.float() * lengths).view(1, 16, 2, 24, 2).mean(dim=(2, 4))  # type: ignore[union-attr]
-    torch.testing.assert_close(kinds["perspective"][0], blocks / CAMERA.coarser(2).ray_lengths(dtype=torch.float32))
+    torch.testing.assert_close(kinds["perspective"][0], blocks / CAMERA.downscale(2).ray_lengths(dtype=torch.float32))
     assert bool((kinds["disparity"] <= kinds[None] + 1e-6).all())  # a harmonic mean is no larger
 
 

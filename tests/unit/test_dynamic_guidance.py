@@ -132,7 +132,7 @@ def test_mixed_precision_training_computes_in_float32() -> None:
 @pytest.mark.parametrize("scale", SCALES)
 def test_receptive_field_radius_bounds_the_low_resolution_pixels_that_matter(scale: int) -> None:
     net = _net(scale, stages=1)
-    count = 2 * net.reach + 3
+    count = 2 * net.receptive_field_radius + 3
     values = torch.rand(1, 1, 1, count, generator=torch.Generator().manual_seed(4)).expand(-1, -1, 8, -1).clone()
     rgb, middle = photos(8 * scale, count * scale), count // 2
 
@@ -142,9 +142,9 @@ def test_receptive_field_radius_bounds_the_low_resolution_pixels_that_matter(sca
         return net(rgb, changed)[..., middle * scale : (middle + 1) * scale]
 
     same = net(rgb, values)[..., middle * scale : (middle + 1) * scale]
-    for beyond in (middle - net.reach - 1, middle + net.reach + 1):
+    for beyond in (middle - net.receptive_field_radius - 1, middle + net.receptive_field_radius + 1):
         torch.testing.assert_close(answer(beyond), same, rtol=0, atol=0)
-    assert not torch.allclose(answer(middle - net.reach // 2), same, rtol=0, atol=1e-7)
+    assert not torch.allclose(answer(middle - net.receptive_field_radius // 2), same, rtol=0, atol=1e-7)
 
 
 def test_map_may_break_at_a_photo_edge_and_a_flat_photo_has_no_influence() -> None:

@@ -84,14 +84,14 @@ def test_maps_of_any_size_keep_their_dtype(net: WindowedNetwork) -> None:
 
 
 def test_hole_is_filled_locally_within_the_receptive_field(net: WindowedNetwork) -> None:
-    columns = 2 * net.reach + 6
+    columns = 2 * net.receptive_field_radius + 6
     rgb, coarse = photos(32, 4 * columns), maps(8, columns)
     coarse[..., 0, 0], coarse[..., 0, 1] = 20, 29  # the range, which normalises
     pierced = coarse.clone()
     pierced[..., 3, 2] = torch.nan
     result, whole = net.upsample(rgb, pierced), net.upsample(rgb, coarse)
     assert bool(result.isfinite().all())
-    far = 4 * (2 + net.reach + 2)
+    far = 4 * (2 + net.receptive_field_radius + 2)
     torch.testing.assert_close(result[..., far:], whole[..., far:], rtol=1e-6, atol=0)
     assert not torch.allclose(result[..., 12:16, 8:12], whole[..., 12:16, 8:12])
 
@@ -103,13 +103,15 @@ def test_image_without_a_valid_pixel_becomes_nan(net: WindowedNetwork) -> None:
 @pytest.mark.parametrize("scale", [2, 4])
 def test_tiles_equal_the_whole_image(build: Callable[..., WindowedNetwork], scale: int) -> None:
     net = build(scale)
-    rows, columns = net.reach + 9, 2 * net.reach + 10
+    rows, columns = net.receptive_field_radius + 9, 2 * net.receptive_field_radius + 10
     rgb, coarse = photos(scale * rows, scale * columns).double(), maps(rows, columns).double()
     tiled, whole = NetworkUpsampler(net, tile=4 * scale), NetworkUpsampler(net)
     for method in (tiled, whole):
         method.net.double()  # in float32 the rounding depends on the processor
     atol = 2e-5 if isinstance(net, PrimalDualNetwork) else 1e-10  # PDN's inputs are always float32
-    torch.testing.assert_close(tiled.fine_disparity(rgb, coarse), whole.fine_disparity(rgb, coarse), rtol=0, atol=atol)
+    torch.testing.assert_close(
+        tiled.upsample_disparity(rgb, coarse), whole.upsample_disparity(rgb, coarse), rtol=0, atol=atol
+    )
 
 
 def test_photo_of_another_size_is_refused(net: WindowedNetwork) -> None:

@@ -183,13 +183,13 @@ def test_windows_equal_the_whole_image() -> None:
     net = _net(2, iterations=2)
     rgb, coarse = _photo(80, 84), _map(40, 42)
     whole = net.upsample(rgb, coarse)
-    answers = net.global_context(rgb, coarse)
-    reach, start, stop = net.reach, 12, 40
-    part = answers.answer(rgb[..., 2 * start : 2 * stop, 20:], answers.disparity[..., start:stop, 10:])
-    top, left = 2 * (start + reach), 20 + 2 * reach
-    kept = part[..., 2 * reach :, 2 * reach :]
+    context = net.global_context(rgb, coarse)
+    radius, start, stop = net.receptive_field_radius, 12, 40
+    part = context.upsample_window(rgb[..., 2 * start : 2 * stop, 20:], context.disparity[..., start:stop, 10:])
+    top, left = 2 * (start + radius), 20 + 2 * radius
+    kept = part[..., 2 * radius :, 2 * radius :]
     torch.testing.assert_close(kept, whole[..., top:, left:], rtol=1e-6, atol=0)
-    outside = part[..., : 2 * reach, :] - whole[..., 2 * start : top, 20:]
+    outside = part[..., : 2 * radius, :] - whole[..., 2 * start : top, 20:]
     assert float(outside.abs().max()) > 1e-3  # nearer to the cut it differs
 
 
@@ -219,7 +219,7 @@ def test_convolutions_may_run_in_bfloat16() -> None:
         mixed = net.upsample(rgb, coarse)
     assert mixed.dtype == torch.float64
     assert 0 < float((mixed - exact).abs().max()) < 0.05 * 9
-    halved = NetworkUpsampler(net, "bfloat16").fine_disparity(rgb, coarse)
+    halved = NetworkUpsampler(net, "bfloat16").upsample_disparity(rgb, coarse)
     assert float((halved - exact).abs().max()) < 0.05 * 9
 
 

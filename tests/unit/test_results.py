@@ -42,7 +42,7 @@ def test_stored_scene_is_the_sample_that_the_method_was_given(make_run, tmp_path
     assert scene.depth_lr.shape == (1, 8, 8)
     blocks = scene.depth[0].unfold(0, 4, 4).unfold(1, 4, 4).mean(dim=(-1, -2))
     assert torch.allclose(blocks, scene.depth_lr[0], atol=1e-6)
-    assert scene.camera_lr == scene.camera.coarser(4)
+    assert scene.camera_lr == scene.camera.downscale(4)
     assert float(scene.rgb.max()) <= 1
 
 

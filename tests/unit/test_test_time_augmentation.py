@@ -1,4 +1,4 @@
-"""What the method around a network does: the ensemble of poses."""
+"""Test-time augmentation: dihedral transforms and the average over them."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from dsr.sample import DepthSample
 
 
 class _Leaning(DisparityNetwork):
-    """Repeats the LR pixels, and adds what depends on the pose: a ramp to the right, an arc from top to bottom."""
+    """Repeats the low-resolution pixels and adds a ramp to the right and an arc from top to bottom."""
 
     scale = 2
 
     def arguments(self) -> dict[str, Any]:
         return {}
 
-    def upsample(self, rgb: Tensor, disparity: Tensor, bounds: Tensor | None = None) -> Tensor:
+    def upsample(self, rgb: Tensor, disparity: Tensor, min_max: Tensor | None = None) -> Tensor:
         ramp = torch.linspace(-1, 1, rgb.shape[-1], dtype=disparity.dtype)
         arc = torch.linspace(-1, 1, rgb.shape[-2], dtype=disparity.dtype)[:, None] ** 2
         return functional.interpolate(disparity, scale_factor=2, mode="nearest") + ramp + arc
@@ -38,12 +38,12 @@ def _sample(height: int = 6, width: int = 8) -> DepthSample:
     return DepthSample("test", "scene", rgb, from_range(disparity / 2, coarse, "disparity"), camera, coarse, 2)
 
 
-@pytest.mark.parametrize("pose", range(8))
-def test_dihedral_transforms_are_distinct_and_invertible(pose: int) -> None:
+@pytest.mark.parametrize("index", range(8))
+def test_dihedral_transforms_are_distinct_and_invertible(index: int) -> None:
     x = torch.rand(2, 3, 5, 5)
-    torch.testing.assert_close(undo_dihedral(apply_dihedral(x, pose), pose), x, rtol=0, atol=0)
+    torch.testing.assert_close(undo_dihedral(apply_dihedral(x, index), index), x, rtol=0, atol=0)
     assert not any(
-        torch.equal(apply_dihedral(x, pose), apply_dihedral(x, other)) for other in range(8) if other != pose
+        torch.equal(apply_dihedral(x, index), apply_dihedral(x, other)) for other in range(8) if other != index
     )
 
 
@@ -70,8 +70,8 @@ def test_augmentation_is_equivariant_to_turns() -> None:
     )
     assert float(single.abs().max()) > 1e-3
     both = [
-        method.fine_disparity(apply_dihedral(rgb, 1), apply_dihedral(coarse, 1)),
-        apply_dihedral(method.fine_disparity(rgb, coarse), 1),
+        method.upsample_disparity(apply_dihedral(rgb, 1), apply_dihedral(coarse, 1)),
+        apply_dihedral(method.upsample_disparity(rgb, coarse), 1),
     ]
     torch.testing.assert_close(both[0], both[1], rtol=0, atol=1e-6)
 

@@ -12,7 +12,7 @@ from dsr.geometry.camera import Camera, from_range
 from dsr.methods.networks.base import DisparityNetwork, NetworkUpsampler
 from dsr.methods.networks.facets import Facets
 from dsr.methods.networks.msg_net import MSGNet
-from dsr.methods.tiling import blended, spans
+from dsr.methods.tiling import blend_tiles, split_axis
 from dsr.sample import DepthSample
 
 NETS: dict[str, Callable[[], DisparityNetwork]] = {
@@ -45,7 +45,7 @@ def _pair(scale: int, height: int, width: int) -> tuple[Tensor, Tensor]:
 @pytest.mark.parametrize(("size", "tile", "overlap"), [(100, 30, 4), (31, 30, 4), (30, 30, 4), (7, 1, 2), (1, 5, 0)])
 def test_tile_weights_add_up_to_one_everywhere(size: int, tile: int, overlap: int) -> None:
     total = torch.zeros(2 * size)
-    for span in spans(size, tile, 3, overlap):
+    for span in split_axis(size, tile, 3, overlap):
         assert span.read.start <= span.kept.start < span.kept.stop <= span.read.stop
         assert span.kept.stop - span.kept.start <= max(tile, overlap + 1) + overlap
         total[2 * span.kept.start : 2 * span.kept.stop] += span.weights(2)
@@ -53,15 +53,15 @@ def test_tile_weights_add_up_to_one_everywhere(size: int, tile: int, overlap: in
 
 
 def test_window_covers_the_receptive_field_within_the_image() -> None:
-    first, second, last = spans(90, 30, 7, 4)
+    first, second, last = split_axis(90, 30, 7, 4)
     assert (first.read, second.read, last.read) == (slice(0, 39), slice(21, 69), slice(51, 90))
     assert (first.ramps, second.ramps, last.ramps) == ((0, 4), (4, 4), (4, 0))
 
 
 def test_results_that_differ_by_a_constant_are_joined_by_a_ramp() -> None:
     values = iter((1.0, 2.0))
-    rows, columns = spans(4, 4, 0, 0), spans(20, 10, 0, 4)
-    line = blended(lambda r, c: torch.full((1, 1, 4, c.stop - c.start), next(values)), rows, columns, 1)[0, 0, 0]
+    rows, columns = split_axis(4, 4, 0, 0), split_axis(20, 10, 0, 4)
+    line = blend_tiles(lambda r, c: torch.full((1, 1, 4, c.stop - c.start), next(values)), rows, columns, 1)[0, 0, 0]
     expected = torch.cat((torch.ones(8), torch.tensor([1.125, 1.375, 1.625, 1.875]), torch.full((8,), 2.0)))
     torch.testing.assert_close(line, expected)
 
@@ -75,11 +75,11 @@ def test_tiled_result_equals_the_whole_image(name: str) -> None:
     if method.net.arguments().get("variant") in ("voynov", "hui"):
         coarse = coarse.nan_to_num(nan=20.5)  # random networks turn the step at a hole into anything
     with torch.inference_mode():
-        whole = method.fine_disparity(rgb, coarse)
+        whole = method.upsample_disparity(rgb, coarse)
         method.tile = 12 * scale
-        tiled = method.fine_disparity(rgb, coarse)
+        tiled = method.upsample_disparity(rgb, coarse)
     assert tiled.shape == whole.shape
-    assert method.parts(*rgb.shape[-2:]) == 8
+    assert method.count_steps(*rgb.shape[-2:]) == 8
     assert float((tiled - whole).abs().max() / (whole.max() - whole.min())) < 1e-5
 
 
@@ -89,29 +89,29 @@ def test_tiled_augmentation_equals_the_whole_image() -> None:
     rgb, coarse = _pair(4, 12, 36)
     parts: list[tuple[int, int]] = []
     with torch.inference_mode():
-        whole = method.fine_disparity(rgb, coarse)
+        whole = method.upsample_disparity(rgb, coarse)
         method.tile = 24
-        tiled = method.fine_disparity(rgb, coarse, lambda done, total: parts.append((done, total)))
+        tiled = method.upsample_disparity(rgb, coarse, lambda done, total: parts.append((done, total)))
     assert float((tiled - whole).abs().max() / (whole.max() - whole.min())) < 1e-5
-    assert parts == [(i + 1, method.parts(48, 144)) for i in range(8 * 2 * 6)]
+    assert parts == [(i + 1, method.count_steps(48, 144)) for i in range(8 * 2 * 6)]
 
 
 @pytest.mark.parametrize("name", NETS)
 def test_pixels_beyond_the_receptive_field_do_not_matter(name: str) -> None:
     net = _method(name).net
-    assert net.reach is not None
-    size, at = 2 * net.reach + 9, net.reach + 4
+    assert net.receptive_field_radius is not None
+    size, at = 2 * net.receptive_field_radius + 9, net.receptive_field_radius + 4
     rgb, coarse = _pair(net.scale, size, size)
     coarse[..., at, at], rgb[..., net.scale * at + 1, net.scale * at + 1] = 22.0, 0.5
     other, photo = coarse.clone(), rgb.clone()
     other[..., at, at], photo[..., net.scale * at + 1, net.scale * at + 1] = 23.0, 0.6
     with torch.inference_mode():
-        whole = net.global_context(rgb, coarse)
-        change = (whole.answer(photo, other) - whole.answer(rgb, coarse)).abs()[0, 0]
+        context = net.global_context(rgb, coarse)
+        change = (context.upsample_window(photo, other) - context.upsample_window(rgb, coarse)).abs()[0, 0]
     rows, columns = (change > 1e-6).nonzero().T
     for index in (rows, columns):
         distance = (index // net.scale - at).abs()
-        assert 0 < int(distance.max()) <= net.reach
+        assert 0 < int(distance.max()) <= net.receptive_field_radius
 
 
 def test_large_photo_is_tiled_automatically(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -133,4 +133,4 @@ def test_tile_below_a_low_resolution_pixel_is_refused() -> None:
     with pytest.raises(ValueError, match="tile: expected at least 4 pixels, the scale, got 3"):
         _method("facets", tile=3)
     with pytest.raises(ValueError, match="tiles: expected a positive size and tile"):
-        spans(10, 0, 1, 2)
+        split_axis(10, 0, 1, 2)

@@ -15,7 +15,7 @@ from dsr.methods.networks.base import DisparityNetwork
 from dsr.methods.networks.facets import Facets
 from dsr.methods.networks.msg_net import MSGNet
 from dsr.methods.networks.trained import NETWORKS, build_trained, packaged_names, packaged_weights
-from dsr.methods.networks.weight_files import is_ours, load_network, read_head, save_network
+from dsr.methods.networks.weight_files import is_dsr_weights, load_network, read_header, save_network
 
 NETS = {
     "msg": lambda: MSGNet(2, "dsr"),
@@ -44,7 +44,7 @@ def test_equal_networks_give_equal_bytes_and_the_facts_are_restored(tmp_path: Pa
     for name in ("a", "b"):
         save_network(tmp_path / name, net, "msg_v", facts)
     assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
-    head = read_head(tmp_path / "a")
+    head = read_header(tmp_path / "a")
     assert head["facts"] == facts
     assert (head["network"], head["model"], head["arguments"]) == ("MSGNet", "msg_v", {"scale": 4, "variant": "dsr"})
 
@@ -59,8 +59,8 @@ def test_loading_draws_nothing_from_the_random_generator(tmp_path: Path) -> None
 def test_file_is_told_from_a_published_one_by_its_content(tmp_path: Path) -> None:
     save_network(tmp_path / "w.pth", MSGNet(4, "dsr"), "msg_v")
     torch.save({"model_state_dict": {}}, tmp_path / "w.caffemodel")
-    assert is_ours(tmp_path / "w.pth")
-    assert not is_ours(tmp_path / "w.caffemodel")
+    assert is_dsr_weights(tmp_path / "w.pth")
+    assert not is_dsr_weights(tmp_path / "w.caffemodel")
     assert build_trained(tmp_path / "w.pth", 4, "msg_v", "voynov").net.scale == 4
     with pytest.raises(ValueError, match=r"w.caffemodel: expected MSG-Net for a scale"):
         build_trained(tmp_path / "w.caffemodel", 4, "msg_v", "voynov")
@@ -153,7 +153,7 @@ def test_packaged_files_load_as_the_model_and_scale_of_their_names() -> None:
         model, _, rest = name.partition("_x")
         net: DisparityNetwork = load_network(path, NETWORKS, int(rest.split("_")[0]), model)
         assert net.covers
-        assert read_head(path)["facts"]["steps"] > 0
+        assert read_header(path)["facts"]["steps"] > 0
 
 
 def test_packaged_weights_of_an_unknown_name_are_none() -> None:

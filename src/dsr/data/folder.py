@@ -92,7 +92,7 @@ def load_scene(folder: Path, dataset: str) -> Scene:
             size = (camera.width // max(factor, 1), camera.height // max(factor, 1))
             if factor < 1 or not all(size):
                 raise ValueError(f"{path}: expected a factor that the {camera.height} x {camera.width} photo allows")
-            measured[factor] = _read_depth(path, match[1], description, camera.coarser(factor))
+            measured[factor] = _read_depth(path, match[1], description, camera.downscale(factor))
     path_hr = _find_depth_hr(folder)
     depth = None if path_hr is None else _read_depth(path_hr, path_hr.stem, description, camera, folder / "mask.png")
     if depth is None and not measured:

@@ -69,7 +69,7 @@ class Downsampling:
         """Return the camera of the low-resolution map; that of ``nearest`` differs from that of the centred kernels."""
         if self.kernel == "nearest":
             return camera.decimate(scale, scale // 2)
-        return camera.coarser(scale)
+        return camera.downscale(scale)
 
     def __call__(self, values: Tensor, scale: int) -> Tensor:
         """Downsample maps.
@@ -202,7 +202,7 @@ def make_sample(
     else:
         of_noise = of_holes = generator
     if isinstance(downsampling, Measured):
-        depth_lr, camera_lr = _measured_depth(scene, scale), scene.camera.coarser(scale)
+        depth_lr, camera_lr = _measured_depth(scene, scale), scene.camera.downscale(scale)
     else:
         if scene.depth is None:
             raise ValueError(f"{scene.name}: expected a high-resolution depth map to downsample, there is none")

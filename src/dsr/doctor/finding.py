@@ -45,7 +45,7 @@ def with_depth(scene: Scene) -> Scene:
     if scene.depth is not None:
         return scene
     factor = min(scene.measured)
-    depth, camera = scene.measured[factor], scene.camera.coarser(factor)
+    depth, camera = scene.measured[factor], scene.camera.downscale(factor)
     photo = functional.avg_pool2d(scene.rgb[:, : camera.height * factor, : camera.width * factor][None], factor)[0]
     return replace(scene, rgb=photo.clamp(0, 1), camera=camera, depth=depth, measured={})
 

@@ -90,7 +90,7 @@ class Camera:
             doffs=self.doffs * sx,
         )
 
-    def coarser(self, factor: int) -> Camera:
+    def downscale(self, factor: int) -> Camera:
         """Return the camera of a map downsampled by ``factor``, of the part of the image that the factor divides."""
         width, height = self.width // factor, self.height // factor
         return self.crop(0, 0, height * factor, width * factor).rescale(width, height)

@@ -185,12 +185,12 @@ def _answer_by_networks(
     steps = [each.net.scale for each in networks]
     sizes = [_size(inverse)]  # of the low-resolution map of each step
     sizes += [(-(-size[0] // step), -(-size[1] // step)) for step in steps[1:]]
-    parts = [net.parts(step * s[0], step * s[1]) for net, step, s in zip(networks, steps, sizes, strict=True)]
+    parts = [net.count_steps(step * s[0], step * s[1]) for net, step, s in zip(networks, steps, sizes, strict=True)]
     for i, (net, size_lr) in enumerate(zip(networks, sizes, strict=True)):
         inverse = resize_inverse_depth(inverse, size_lr, math.inf)
         report = part_of(progress, sum(parts[:i]), sum(parts))
         guide = resize_rgb(rgb, (net.net.scale * size_lr[0], net.net.scale * size_lr[1]))
-        inverse = net.fine_disparity(guide[None].to(device), inverse[None].to(device), report)[0]
+        inverse = net.upsample_disparity(guide[None].to(device), inverse[None].to(device), report)[0]
         del guide
     return resize_inverse_depth(inverse, size)
 

@@ -18,7 +18,7 @@ from omegaconf.errors import OmegaConfBaseException
 from dsr.methods.base import Upsampler
 from dsr.methods.networks.base import DisparityNetwork
 from dsr.methods.networks.trained import NETWORKS, packaged_names, packaged_weights
-from dsr.methods.networks.weight_files import is_ours, network_name, read_head
+from dsr.methods.networks.weight_files import is_dsr_weights, network_name, read_header
 from dsr.utils.builder import ConfigError, build, load_target, takes
 from dsr.utils.config_files import config_directories, list_choices
 
@@ -117,7 +117,7 @@ def has_weights(node: Mapping[str, Any], scale: int) -> bool:
     """Return whether the weights that a method's node names are there, for that scale."""
     if node.get("weights") is not None:
         path = Path(str(node["weights"])).expanduser()
-        return path.is_file() and (not is_ours(path) or read_head(path)["arguments"].get("scale") == scale)
+        return path.is_file() and (not is_dsr_weights(path) or read_header(path)["arguments"].get("scale") == scale)
     wanted = node.get("weights_packaged")
     return wanted is not None and packaged_weights(str(wanted)) is not None
 

@@ -10,6 +10,7 @@ from torch import Tensor
 from dsr.degradation.downsampling import Downsampling, make_sample
 from dsr.degradation.noise import Noise
 from dsr.geometry.camera import baseline_times_focal
+from dsr.methods.networks.maps import compute_min_max
 from dsr.sample import DepthSample, Scene
 
 Batch = dict[str, Tensor]
@@ -69,7 +70,6 @@ def to_tensors(sample: DepthSample, dtype: torch.dtype = torch.float32) -> Batch
 
 def _min_max(disparity: Tensor) -> Tensor:
     """Return the lowest and the highest valid value, (2, 1, 1), which differ by a thousandth at least."""
-    valid = disparity[disparity.isfinite()]
-    low, high = valid.min(), valid.max()
+    low, high = compute_min_max(disparity[None]).flatten()
     min_range = _MIN_RELATIVE_RANGE * high.abs().clamp(min=_MIN_RELATIVE_RANGE)
     return torch.stack((low, torch.maximum(high, low + min_range))).view(2, 1, 1)

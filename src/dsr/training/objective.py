@@ -10,6 +10,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from dsr.methods.networks.maps import compute_min_max
 from dsr.metrics import losses
 from dsr.metrics.functional import SurfacePair, mse_v
 from dsr.training.degradation import Batch
@@ -64,7 +65,7 @@ class Objective:
 
 
 def to_depth(disparity: Tensor, batch: Batch) -> Tensor:
-    """Return orthogonal depth in metres, (B, 1, H, W); NaN where the disparity lies at or beyond infinity."""
+    """Return orthogonal depth in metres, (B, 1, H, W); NaN where it would be infinite or negative."""
     shifted = disparity + batch["doffs"]
     return torch.where(shifted > 0, batch["bf"] / torch.where(shifted > 0, shifted, 1), torch.nan)
 
@@ -98,7 +99,5 @@ def balance_weight(patches: Iterable[Batch]) -> float:
 
 def _range(disparity: Tensor) -> Tensor:
     """Return the range of valid disparities per image, (B, 1, 1, 1), at least a thousandth of the largest."""
-    valid, dims = disparity.isfinite(), (-3, -2, -1)
-    low = disparity.masked_fill(~valid, torch.inf).amin(dim=dims, keepdim=True)
-    high = disparity.masked_fill(~valid, -torch.inf).amax(dim=dims, keepdim=True)
+    low, high = compute_min_max(disparity).chunk(2, dim=1)
     return (high - low).clamp(min=1e-3 * high.abs().clamp(min=1e-3))

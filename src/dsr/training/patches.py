@@ -16,6 +16,7 @@ from torch import Tensor
 from torch.utils.data import Dataset
 
 from dsr.geometry.camera import baseline_times_focal
+from dsr.methods.networks.maps import compute_min_max
 from dsr.sample import AllHolesError, DepthSample, Scene
 from dsr.training.augmentation import Augmentation
 from dsr.training.degradation import Batch, Degradation, to_tensors
@@ -191,8 +192,8 @@ class Patches(Dataset[Batch]):
         key = group, number
         if key not in self._depth_ranges:
             depth = self._degradation.sample(self._groups[group][number], clean=True).depth_lr
-            valid = depth[depth.isfinite()]
-            self._depth_ranges[key] = (float(valid.min()), float(valid.max()))
+            low, high = compute_min_max(depth[None]).flatten().tolist()
+            self._depth_ranges[key] = (low, high)
         return self._depth_ranges[key]
 
 

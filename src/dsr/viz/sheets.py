@@ -130,7 +130,7 @@ def _shown_map(scene: Scene) -> tuple[Tensor, Camera, list[str]]:
     size = f"{coarse.shape[-1]} x {coarse.shape[-2]}"
     return (
         coarse,
-        scene.camera.coarser(factor),
+        scene.camera.downscale(factor),
         [f"measured: {measured}; no high-resolution depth", f"shown: x{factor}, {size}"],
     )
 

@@ -135,7 +135,7 @@ def load_levels(files: Files, dataset: str, name: str, year: int, *, smooth: boo
     depth = _depth(files.disparity, (smooth_levels(levels) if smooth else levels) / per_pixel, camera)
     measured = {}
     for factor, path in files.measured.items():
-        camera_lr = camera.coarser(factor)
+        camera_lr = camera.downscale(factor)
         values = read_levels(path).astype(np.float64)
         expect_size(path, values.shape, (camera_lr.height, camera_lr.width))
         values[values == 0] = np.nan

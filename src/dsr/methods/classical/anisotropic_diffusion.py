@@ -34,7 +34,7 @@ from dsr.methods.base import Cost, expect_limits
 from dsr.methods.classical.convergence import CHECK_EVERY, Movement, history_of
 from dsr.methods.classical.finite_differences import box_mean, extend_linearly, upsample_linear_border
 from dsr.methods.networks.inpainting import inpaint
-from dsr.methods.networks.maps import min_max, normalise
+from dsr.methods.networks.maps import compute_min_max, normalise
 from dsr.sample import DepthSample
 from dsr.utils.progress import Steps
 
@@ -123,7 +123,7 @@ class AnisotropicDiffusion:
         start = inpaint(lr)
         if scale > 1 and not bool(lr.isfinite().all()):
             start = self.diffuse(box_mean(rgb, scale), lr, 1).values
-        low, high = min_max(start).chunk(2, dim=1)
+        low, high = compute_min_max(start).chunk(2, dim=1)
         lr_extended = extend_linearly(start, self.border).clamp(min=_LEAST * low, max=high / _LEAST)
         valid = functional.pad(lr.isfinite(), [self.border] * 4, value=True)
         edge = self.border * scale
@@ -156,7 +156,7 @@ class AnisotropicDiffusion:
         """Alternate diffusion and adjustment until the map stops moving."""
         mean = start_hr.mean(dim=(-2, -1), keepdim=True)
         x, target = (start_hr / mean).float(), (lr / mean).float()
-        value_range = min_max(target).diff(dim=1).clamp(min=1e-12)
+        value_range = compute_min_max(target).diff(dim=1).clamp(min=1e-12)
         along_u, along_v = torch.empty_like(conductances[0]), torch.empty_like(conductances[1])
         movement, done = Movement(x, self.steps, self.tolerance, progress, value_range), 0
         for done in range(1, self.steps + 1):

@@ -150,7 +150,7 @@ class TotalGeneralisedVariation:
         values = torch.where(valid, scaled.values, torch.nan)
         found = self.minimise(sample.rgb[None].double(), values, sample.scale, progress)
         self.history = history_of(found.moved)
-        hr = found.values * scaled.span + scaled.minimum
+        hr = found.values * scaled.value_range + scaled.minimum
         return from_range(hr[0], sample.camera, "disparity").to(sample.depth_lr.dtype)
 
     def minimise(self, rgb: Tensor, lr: Tensor, scale: int, progress: Steps | None = None) -> Solution:

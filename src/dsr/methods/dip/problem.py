@@ -11,6 +11,7 @@ from torch import Tensor
 from dsr.degradation.downsampling import Downsampling, downsample_depth
 from dsr.geometry.camera import Camera, RangeType
 from dsr.methods.classical.finite_differences import grey
+from dsr.methods.networks.maps import compute_min_max
 from dsr.metrics import losses
 from dsr.metrics.functional import SurfacePair, mse_v
 from dsr.sample import DepthSample
@@ -25,14 +26,14 @@ class ImageProblem:
     """One image's tensors in float32 on the device of the optimisation.
 
     Args:
-        rgb: (1, 3, H, W) the photo in [0, 1].
-        grey: (1, 1, H, W) its luminance.
+        rgb: (1, 3, H, W) RGB image in [0, 1].
+        grey: (1, 1, H, W) luminance of the image.
         depth_lr: (1, 1, h, w) low-resolution depth in metres, NaN in holes.
-        rays, rays_lr: (1, 3, H, W) and (1, 3, h, w), of the cameras.
-        camera: of the photo.
-        scale: the upsampling factor.
-        downsampling: the model that is assumed to lead from high- to low-resolution depth.
-        range_type: the type that the model averages unless it says one itself.
+        rays, rays_lr: (1, 3, H, W) and (1, 3, h, w), rays of the cameras.
+        camera: camera of the image.
+        scale: upsampling factor.
+        downsampling: assumed model from high- to low-resolution depth.
+        range_type: range type that the model averages, unless it has one of its own.
         min_depth, depth_range: minimum and range (maximum less minimum) of the valid low-resolution depth in metres.
 
     """
@@ -52,8 +53,7 @@ class ImageProblem:
     @classmethod
     def of(cls, sample: DepthSample, downsampling: Downsampling, range_type: RangeType, device: torch.device) -> Self:
         """Return the problem of a sample; its true depth is not used."""
-        known = sample.depth_lr[sample.mask_lr]
-        min_depth, max_depth = float(known.min()), float(known.max())
+        min_depth, max_depth = compute_min_max(sample.depth_lr[None]).flatten().tolist()
         rgb = sample.rgb[None].to(device, torch.float32)
         return cls(
             rgb=rgb,
@@ -76,8 +76,8 @@ class ImageProblem:
     def residual(self, depth: Tensor) -> Tensor:
         """Return the RMS of D(depth) / depth_lr - 1 over the valid low-resolution pixels, a scalar."""
         ratio = self.downsample(depth) / self.depth_lr - 1
-        known = ratio.isfinite()
-        return (torch.where(known, ratio, 0).square().sum() / known.sum()).sqrt()
+        valid = ratio.isfinite()
+        return (torch.where(valid, ratio, 0).square().sum() / valid.sum()).sqrt()
 
 
 @dataclass(frozen=True)

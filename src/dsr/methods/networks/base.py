@@ -1,4 +1,4 @@
-"""What the project's networks have in common: they map LR disparity and a photo to HR disparity."""
+"""Base classes of the networks, which map low-resolution disparity and an RGB image to high-resolution disparity."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from torch.nn import functional
 
 from dsr.geometry.camera import RangeType, from_range, to_range
 from dsr.methods.networks.inpainting import inpaint
-from dsr.methods.networks.maps import min_max, normalise
-from dsr.methods.tiling import Span, blended, spans
+from dsr.methods.networks.maps import compute_min_max, normalise
+from dsr.methods.tiling import AxisTile, blend_tiles, split_axis
 from dsr.sample import DepthSample
 from dsr.utils.progress import Steps
 
@@ -24,34 +24,34 @@ Precision = Literal["float32", "bfloat16"]
 ENSEMBLES = (1, 4, 8)
 DTYPES = MappingProxyType({"float32": torch.float32, "bfloat16": torch.bfloat16})
 TILE = 1024
-"""Side of a tile in pixels of the photo."""
+"""Side of a tile in high-resolution pixels."""
 UNTILED = 2**21
-"""Photos of up to so many pixels are answered in one piece."""
+"""Number of high-resolution pixels up to which an image is processed without tiles."""
 _OVERLAP = 4
 
 
 @dataclass(frozen=True)
 class GlobalContext:
-    """What a network found in a whole image, with which it answers windows as it would have answered the image.
+    """The values of a whole image that a network needs to process windows of it as it processes the image.
 
     Args:
-        disparity: (B, 1, h, w) the low-resolution disparity, its holes filled if the network fills them.
-        answer: from a window of the photo, (B, 3, scale * n, scale * m), and one of ``disparity``, (B, 1, n, m), to
-            high-resolution disparity, right for pixels at least the network's reach away from the window's borders
-            within the image.
+        disparity: (B, 1, h, w) low-resolution disparity, inpainted if the network inpaints holes.
+        upsample_window: function from a window of the RGB image, (B, 3, scale * n, scale * m), and one of
+            ``disparity``, (B, 1, n, m), to high-resolution disparity. The result is valid except within the network's
+            receptive-field radius of a window border inside the image.
 
     """
 
     disparity: Tensor
-    answer: Callable[[Tensor, Tensor], Tensor]
+    upsample_window: Callable[[Tensor, Tensor], Tensor]
 
 
 class DisparityNetwork(nn.Module, abc.ABC):
-    """A network that upsamples disparity under a photo's guidance.
+    """A network that upsamples disparity, guided by an RGB image.
 
     Attributes:
-        scale: the upsampling factor.
-        covers: whether the output has all of the photo's pixels; some published networks leave out a row and a column.
+        scale: upsampling factor.
+        covers: whether the output covers the whole image; some published networks leave out a row and a column.
 
     """
 
@@ -60,77 +60,78 @@ class DisparityNetwork(nn.Module, abc.ABC):
 
     @abc.abstractmethod
     def arguments(self) -> dict[str, Any]:
-        """Return what the constructor was given, as plain values; a file of weights keeps it."""
+        """Return the constructor's arguments as plain values; weights files store them."""
 
     @abc.abstractmethod
-    def upsample(self, rgb: Tensor, disparity: Tensor, bounds: Tensor | None = None) -> Tensor:
+    def upsample(self, rgb: Tensor, disparity: Tensor, min_max: Tensor | None = None) -> Tensor:
         """Return high-resolution disparity.
 
         Args:
             rgb: (B, 3, H, W) in [0, 1], H = scale * h and W = scale * w.
-            disparity: (B, 1, h, w) in pixels of the photo's camera; non-finite values are holes.
-            bounds: (B, 2, 1, 1) lowest and highest low-resolution disparity of the image that this is a window of,
-                which normalise it; None for those of ``disparity`` itself.
+            disparity: (B, 1, h, w) in pixels of the high-resolution camera; non-finite values are holes.
+            min_max: (B, 2, 1, 1) minimum and maximum low-resolution disparity of the image that this is a window of,
+                for the normalisation; None for those of ``disparity``.
 
         Returns:
-            (B, 1, H, W) in the dtype of ``disparity``; NaN for an image without a known pixel.
+            (B, 1, H, W) in the dtype of ``disparity``; NaN for an image without a valid pixel.
 
         """
 
 
 class WindowedNetwork(DisparityNetwork):
-    """A network whose outputs depend on what is near them alone, beside a few values of the whole image.
+    """A network whose outputs depend on a neighbourhood and a few global values only.
 
-    So it answers large images window by window; another :class:`DisparityNetwork` answers them in one piece.
+    Large images can therefore be processed in tiles; other networks process them without tiles.
     """
 
     @property
     @abc.abstractmethod
-    def reach(self) -> int:
-        """How many low-resolution pixels around its own an output depends on."""
+    def receptive_field_radius(self) -> int:
+        """Receptive-field radius in low-resolution pixels."""
 
     @abc.abstractmethod
     def global_context(self, rgb: Tensor, disparity: Tensor) -> GlobalContext:
-        """Return what answers windows of an image; see :meth:`upsample` for the arguments."""
+        """Return the context of an image, to upsample windows of it; see :meth:`upsample` for the arguments."""
 
 
 class NormalisedNetwork(WindowedNetwork):
-    """A network on a photo and low-resolution disparity that is brought to 0..1 and has its holes filled.
+    """A network whose input is an RGB image and inpainted low-resolution disparity, normalised to 0..1.
 
-    So the disparity's unit and offset come out as they went in. Called with (B, 3, H, W) and (B, 1, h, w), and the
-    whole photo's :meth:`context` where these are a window, it returns (B, 1, H, W).
+    The output is rescaled to the range of the input, so the network commutes with affine maps of the disparity. The
+    module maps (B, 3, H, W) and (B, 1, h, w) to (B, 1, H, W). For a window, the :meth:`context` of the whole image is
+    passed as further arguments.
     """
 
-    def upsample(self, rgb: Tensor, disparity: Tensor, bounds: Tensor | None = None) -> Tensor:
+    def upsample(self, rgb: Tensor, disparity: Tensor, min_max: Tensor | None = None) -> Tensor:
         """Return high-resolution disparity; see :meth:`DisparityNetwork.upsample`."""
-        return self._over_range(rgb, disparity, bounds, ())
+        return self._upsample(rgb, disparity, min_max, ())
 
     def global_context(self, rgb: Tensor, disparity: Tensor) -> GlobalContext:
-        """Return what answers windows: the disparity's range and the context are the whole image's."""
-        bounds, context = min_max(disparity), self.context(rgb)
-        return GlobalContext(inpaint(disparity), lambda photo, window: self._over_range(photo, window, bounds, context))
+        """Return a context with the disparity's range and the :meth:`context` of the whole image."""
+        min_max, context = compute_min_max(disparity), self.context(rgb)
+        return GlobalContext(inpaint(disparity), lambda rgb, window: self._upsample(rgb, window, min_max, context))
 
     def context(self, rgb: Tensor) -> tuple[Tensor, ...]:
-        """Return what the network takes from the whole photo, (B, 3, H, W)."""
+        """Return the global values that the network computes from the whole image, (B, 3, H, W)."""
         return ()
 
-    def _over_range(self, rgb: Tensor, disparity: Tensor, bounds: Tensor | None, context: tuple[Tensor, ...]) -> Tensor:
-        known = normalise(disparity, bounds)
-        span = torch.where(known.span > 0, known.span, 1)
-        values = (inpaint(disparity) - known.minimum) / span
-        return self(rgb, values, *context) * span + known.minimum
+    def _upsample(self, rgb: Tensor, disparity: Tensor, min_max: Tensor | None, context: tuple[Tensor, ...]) -> Tensor:
+        _, minimum, value_range = normalise(disparity, min_max)
+        value_range = torch.where(value_range > 0, value_range, 1)
+        values = (inpaint(disparity) - minimum) / value_range
+        return self(rgb, values, *context) * value_range + minimum
 
 
-def expect_photo(rgb: Tensor, coarse: Tensor, scale: int) -> None:
-    """Check a photo's size, (..., H, W), against a low-resolution map's, (..., h, w).
+def expect_rgb_size(rgb: Tensor, values_lr: Tensor, scale: int) -> None:
+    """Check that an RGB image, (..., H, W), is ``scale`` times the size of a low-resolution map, (..., h, w).
 
     Raises:
-        ValueError: it is not scale times the map's.
+        ValueError: it is not.
 
     """
-    expected, came = tuple(scale * n for n in coarse.shape[-2:]), tuple(rgb.shape[-2:])
+    expected, came = tuple(scale * n for n in values_lr.shape[-2:]), tuple(rgb.shape[-2:])
     if came != expected:
-        size = tuple(coarse.shape[-2:])
+        size = tuple(values_lr.shape[-2:])
         raise ValueError(
             f"rgb: expected {expected} pixels for a low-resolution map of {size} at scale {scale}, got {came}"
         )
@@ -139,24 +140,25 @@ def expect_photo(rgb: Tensor, coarse: Tensor, scale: int) -> None:
 class NetworkUpsampler:
     """An :class:`~dsr.methods.base.Upsampler` around a trained network.
 
-    A photo of more than ``UNTILED`` pixels is answered in tiles, see :mod:`dsr.methods.tiling`, which bounds the
-    memory: about 40 bytes for each pixel of the photo, and for each pixel of a window (a tile, and the network's reach
-    on each side) 700 to 1000 bytes, by network and by the depth's precision. Whatever a network takes from the whole
-    image, such as the range of the disparity, it takes from the whole image, so the answer is the same to rounding.
+    Images of more than ``UNTILED`` pixels are processed in tiles, see :mod:`dsr.methods.tiling`. This bounds the memory
+    to about 40 bytes per pixel of the image, and 700 to 1000 bytes per pixel of a window (a tile and the network's
+    receptive-field radius on each side), depending on the network and the depth's precision. Global values, such as
+    the range of the disparity, are computed from the whole image, so tiles change the result by rounding errors only.
 
     Args:
-        net: the network; a copy is taken.
-        precision: of the convolutions; everything around them stays in the depth's dtype.
-        device: where to compute.
-        ensemble: 1 for the network's answer; 4 for the mean of its answers to the image in four quarter turns, 8 to
-            these and their mirror images, each turned back, in as many times the time: the geometric self-ensemble of
-            Timofte, Rothe, Van Gool, *Seven Ways to Improve Example-Based Single Image Super Resolution*, CVPR 2016,
-            section 3.6. What is right agrees in all of them, and much of what is wrong doesn't.
-        tile: side of a tile in pixels of the photo; None for ``TILE``, and no tiles up to ``UNTILED`` pixels.
+        net: the network; it is copied.
+        precision: dtype of the convolutions; all other computations use the depth's dtype.
+        device: device of the computations.
+        ensemble: number of test-time augmentations: 1 for none, 4 for the rotations by multiples of 90 degrees, 8 for
+            these and their mirror images. Each transformed image is upsampled, the results are transformed back and
+            averaged, which takes 4 or 8 times as long. Errors that depend on the orientation partly cancel. This is the
+            geometric self-ensemble of Timofte, Rothe, Van Gool, *Seven Ways to Improve Example-Based Single Image
+            Super Resolution*, CVPR 2016, section 3.6.
+        tile: side of a tile in high-resolution pixels; None for ``TILE``, and no tiles up to ``UNTILED`` pixels.
 
     Raises:
-        ValueError: there is no such precision or ensemble, the network leaves out pixels and can't be averaged, or a
-            tile is smaller than a low-resolution pixel.
+        ValueError: the precision or the ensemble is not supported, the ensemble is larger than 1 for a network that
+            leaves out pixels, or a tile is smaller than a low-resolution pixel.
 
     """
 
@@ -188,88 +190,95 @@ class NetworkUpsampler:
     def __call__(self, sample: DepthSample, progress: Steps | None = None) -> Tensor:
         """Return the high-resolution orthogonal depth, (1, H, W) in metres on the sample's device.
 
-        NaN where the network's disparity lies at or beyond infinity, and in the last row and column where the network
-        does not cover them.
+        It is NaN where the disparity corresponds to a depth at or beyond infinity, and in the last row and column if
+        the network does not cover them.
         """
         if sample.scale != self.net.scale:
             raise ValueError(f"{sample.scene}: expected scale {self.net.scale}, the network's, got {sample.scale}")
-        coarse = to_range(sample.depth_lr, sample.camera_lr, "disparity") * sample.scale  # in pixels of sample.camera
-        fine = self.fine_disparity(sample.rgb.to(self.device)[None], coarse.to(self.device)[None], progress)[0]
-        missing = (sample.camera.width - fine.shape[-1], sample.camera.height - fine.shape[-2])
+        # in pixels of sample.camera
+        disparity_lr = to_range(sample.depth_lr, sample.camera_lr, "disparity") * sample.scale
+        rgb = sample.rgb.to(self.device)[None]
+        disparity = self.upsample_disparity(rgb, disparity_lr.to(self.device)[None], progress)[0]
+        missing = (sample.camera.width - disparity.shape[-1], sample.camera.height - disparity.shape[-2])
         if any(missing):
-            fine = functional.pad(fine, (0, missing[0], 0, missing[1]), value=torch.nan)
-        return from_range(fine, sample.camera, "disparity").to(sample.depth_lr.device)
+            disparity = functional.pad(disparity, (0, missing[0], 0, missing[1]), value=torch.nan)
+        return from_range(disparity, sample.camera, "disparity").to(sample.depth_lr.device)
 
-    def fine_disparity(self, rgb: Tensor, coarse: Tensor, progress: Steps | None = None) -> Tensor:
-        """Return the mean of the ensemble's high-resolution disparities, (B, 1, H, W).
+    def upsample_disparity(self, rgb: Tensor, disparity_lr: Tensor, progress: Steps | None = None) -> Tensor:
+        """Return high-resolution disparity, averaged over the test-time augmentations, (B, 1, H, W).
 
         Args:
             rgb: (B, 3, H, W) in [0, 1].
-            coarse: (B, 1, h, w) disparity in pixels of the photo's camera; non-finite values are holes.
-            progress: is told after each of the ensemble's answers, and each tile of it.
+            disparity_lr: (B, 1, h, w) in pixels of the high-resolution camera; non-finite values are holes.
+            progress: called after each augmentation, or each augmentation of each tile.
 
         """
-        net = self._windowed(rgb.shape[-2], rgb.shape[-1])
+        net = self._tiled_network(rgb.shape[-2], rgb.shape[-1])
         if net is None:
-            return self._mean_of_poses(
-                lambda pose: self.net.upsample(apply_dihedral(rgb, pose), apply_dihedral(coarse, pose)), progress
+            return self._average_transforms(
+                lambda index: self.net.upsample(apply_dihedral(rgb, index), apply_dihedral(disparity_lr, index)),
+                progress,
             )
-        rows, columns = (self._spans(n, net) for n in coarse.shape[-2:])
-        wholes = [
-            net.global_context(apply_dihedral(rgb, pose), apply_dihedral(coarse, pose)) for pose in range(self.ensemble)
+        rows, columns = (self._split_axis(n, net) for n in disparity_lr.shape[-2:])
+        contexts = [
+            net.global_context(apply_dihedral(rgb, index), apply_dihedral(disparity_lr, index))
+            for index in range(self.ensemble)
         ]
-        tiles, done, scale = len(rows) * len(columns), 0, self.net.scale
+        total, done, scale = len(rows) * len(columns) * self.ensemble, 0, self.net.scale
 
-        def told(part: int, parts: int) -> None:
+        def count(part: int, parts: int) -> None:
             nonlocal done
             done += 1
             if progress is not None:
-                progress(done, tiles * self.ensemble)
+                progress(done, total)
 
-        def answer(high: slice, wide: slice) -> Tensor:
-            photo = rgb[..., scale * high.start : scale * high.stop, scale * wide.start : scale * wide.stop]
-            known = wholes[0].disparity[..., high, wide]
-            return self._mean_of_poses(
-                lambda pose: wholes[pose].answer(apply_dihedral(photo, pose), apply_dihedral(known, pose)), told
+        def compute(row: slice, column: slice) -> Tensor:
+            window = rgb[..., scale * row.start : scale * row.stop, scale * column.start : scale * column.stop]
+            window_lr = contexts[0].disparity[..., row, column]
+            return self._average_transforms(
+                lambda index: contexts[index].upsample_window(
+                    apply_dihedral(window, index), apply_dihedral(window_lr, index)
+                ),
+                count,
             )
 
-        return blended(answer, rows, columns, scale)
+        return blend_tiles(compute, rows, columns, scale)
 
-    def parts(self, height: int, width: int) -> int:
-        """Return how many parts ``progress`` counts for a photo of that size."""
-        net = self._windowed(height, width)
+    def count_steps(self, height: int, width: int) -> int:
+        """Return the total that ``progress`` receives for an image of height x width pixels."""
+        net = self._tiled_network(height, width)
         if net is None:
             return self.ensemble
-        tiles = [len(self._spans(n // net.scale, net)) for n in (height, width)]
+        tiles = [len(self._split_axis(n // net.scale, net)) for n in (height, width)]
         return tiles[0] * tiles[1] * self.ensemble
 
-    def _windowed(self, height: int, width: int) -> WindowedNetwork | None:
-        """Return the network if a photo of that size is to be answered in tiles, and can be."""
+    def _tiled_network(self, height: int, width: int) -> WindowedNetwork | None:
+        """Return the network if it processes images of height x width pixels in tiles, else None."""
         large = self.tile is not None or height * width > UNTILED
         return self.net if large and isinstance(self.net, WindowedNetwork) else None
 
-    def _spans(self, size: int, net: WindowedNetwork) -> list[Span]:
-        """Return the tiles along an axis of so many low-resolution pixels."""
-        return spans(size, (self.tile or TILE) // net.scale, net.reach, _OVERLAP)
+    def _split_axis(self, size: int, net: WindowedNetwork) -> list[AxisTile]:
+        """Return the tiles along an axis of ``size`` low-resolution pixels."""
+        return split_axis(size, (self.tile or TILE) // net.scale, net.receptive_field_radius, _OVERLAP)
 
-    def _mean_of_poses(self, answer: Callable[[int], Tensor], progress: Steps | None) -> Tensor:
-        """Return the mean of what ``answer`` says for each pose, turned back."""
-        total = answer(0)
-        for pose in range(1, self.ensemble):
+    def _average_transforms(self, compute: Callable[[int], Tensor], progress: Steps | None) -> Tensor:
+        """Return the mean of ``compute`` over the dihedral transforms, each result transformed back."""
+        total = compute(0)
+        for index in range(1, self.ensemble):
             if progress is not None:
-                progress(pose, self.ensemble)
-            total += undo_dihedral(answer(pose), pose)
+                progress(index, self.ensemble)
+            total += undo_dihedral(compute(index), index)
         if progress is not None:
             progress(self.ensemble, self.ensemble)
         return total / self.ensemble
 
 
-def apply_dihedral(x: Tensor, pose: int) -> Tensor:
-    """Return (B, C, H, W) after ``pose`` % 4 quarter turns, mirrored first if ``pose`` is 4 or more."""
-    return torch.rot90(x.flip(-1) if pose >= 4 else x, pose % 4, (-2, -1)).contiguous()
+def apply_dihedral(x: Tensor, index: int) -> Tensor:
+    """Mirror (B, C, H, W) if ``index`` is 4 or more, then rotate it by ``index`` % 4 quarter turns."""
+    return torch.rot90(x.flip(-1) if index >= 4 else x, index % 4, (-2, -1)).contiguous()
 
 
-def undo_dihedral(x: Tensor, pose: int) -> Tensor:
+def undo_dihedral(x: Tensor, index: int) -> Tensor:
     """Undo :func:`apply_dihedral`."""
-    x = torch.rot90(x, -(pose % 4), (-2, -1))
-    return x.flip(-1) if pose >= 4 else x
+    x = torch.rot90(x, -(index % 4), (-2, -1))
+    return x.flip(-1) if index >= 4 else x

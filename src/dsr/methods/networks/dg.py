@@ -44,7 +44,7 @@ from torch.nn import functional
 from dsr.degradation.downsampling import check_scale
 from dsr.methods.classical.finite_differences import box_mean, upsample_linear_border
 from dsr.methods.networks.analysis_filters import WIDTHS, influence, penalty, plane_free_basis, zero_mean_basis
-from dsr.methods.networks.base import NormalisedNetwork, expect_photo
+from dsr.methods.networks.base import NormalisedNetwork, expect_rgb_size
 
 _HEIGHT, _CONTRAST, _SHARED, _FIDELITY = 0.05, 2.0, 0.02, 0.5
 """Initial height of penalties; scale of the b_m; c_lm for m other than l; size of the data step."""
@@ -149,10 +149,11 @@ class DynamicGuidance(NormalisedNetwork):
         return {"scale": self.scale, "stages": len(self.stages), "filters": self.filters, "size": self.size}
 
     @property
-    def reach(self) -> int:
-        """How many low-resolution pixels around its own an output depends on.
+    def receptive_field_radius(self) -> int:
+        """Receptive-field radius in low-resolution pixels.
 
-        Bicubic upsampling's at the start and in each stage, and in each stage a filter's and its adjoint's.
+        The sum of the radii of the initial bicubic upsampling and, for each stage, of a bicubic upsampling, a filter
+        and its adjoint.
         """
         return _BICUBIC + len(self.stages) * (_BICUBIC + math.ceil((self.size - 1) / self.scale))
 
@@ -170,7 +171,7 @@ class DynamicGuidance(NormalisedNetwork):
             ValueError: the photo's size is not scale times the map's.
 
         """
-        expect_photo(rgb, values, self.scale)
+        expect_rgb_size(rgb, values, self.scale)
         weight = next(self.parameters())
         with torch.autocast(rgb.device.type, enabled=False):
             guide, lr = (x.to(torch.promote_types(weight.dtype, torch.float32)) for x in (rgb, values))

@@ -24,7 +24,7 @@ from torch.nn import functional
 
 from dsr.degradation.downsampling import check_scale
 from dsr.methods.classical.finite_differences import extend_linearly
-from dsr.methods.networks.base import NormalisedNetwork, expect_photo
+from dsr.methods.networks.base import NormalisedNetwork, expect_rgb_size
 
 _NEIGHBOURS = 9
 _FULL, _HALF = 16, 32
@@ -103,9 +103,8 @@ class Facets(NormalisedNetwork):
             nn.Conv2d(outputs[i] + channels[i], outputs[i], 3, padding=1) for i in reversed(range(levels))
         )
         self.choice = _scale_down(nn.Conv2d(_HEAD, _NEIGHBOURS * facets, 3, padding=1))
-        offsets = (
-            torch.arange(scale) + 0.5
-        ) / scale - 0.5  # of high-resolution pixels from their low-resolution one's centre
+        # of the high-resolution pixels from the centre of their low-resolution pixel, in low-resolution pixels
+        offsets = (torch.arange(scale) + 0.5) / scale - 0.5
         self.register_buffer("offsets", offsets, persistent=False)
         self.register_buffer("prior", _spline_logits(offsets), persistent=False)
 
@@ -115,12 +114,12 @@ class Facets(NormalisedNetwork):
         return {**sizes, "slopes": self.slopes}
 
     @property
-    def reach(self) -> int:
-        """How many low-resolution pixels around its own an output depends on.
+    def receptive_field_radius(self) -> int:
+        """Receptive-field radius in low-resolution pixels.
 
-        One for the neighbours' planes and the layers after the trunk, two for each residual block, one for each
-        convolution of the planes and of the low-resolution map, two for the differences; the image's features have a
-        smaller receptive field.
+        The sum of one pixel for the neighbours' planes and the layers after the trunk, two for each residual block, one
+        for each convolution of the planes and of the low-resolution map, and two for the differences. The image's
+        features have a smaller receptive field.
         """
         return 2 * self.blocks + 6
 
@@ -140,7 +139,7 @@ class Facets(NormalisedNetwork):
             (B, 1, H, W).
 
         """
-        expect_photo(rgb, values, self.scale)
+        expect_rgb_size(rgb, values, self.scale)
         around = stencil(values)
         dtype = self.photo.weight.dtype
         pyramid = [functional.relu(self.photo(_rgb_input(rgb, mean).to(dtype)))]
@@ -148,8 +147,8 @@ class Facets(NormalisedNetwork):
             pyramid.append(functional.relu(layer(pyramid[-1])))
         x = self.trunk(functional.relu(pyramid[-1] + self.coarse(_lr_input(around).to(dtype))))
         planes = self._propose_planes(self.planes(x), around)
-        for up, join, photo in zip(self.up, self.join, reversed(pyramid[:-1]), strict=True):
-            x = functional.relu(join(torch.cat((functional.pixel_shuffle(up(x), 2), photo), dim=1)))
+        for up, join, features in zip(self.up, self.join, reversed(pyramid[:-1]), strict=True):
+            x = functional.relu(join(torch.cat((functional.pixel_shuffle(up(x), 2), features), dim=1)))
         return self._mix_planes(planes, self.choice(x))
 
     def _propose_planes(self, output: Tensor, around: Stencil) -> Tensor:
@@ -211,7 +210,7 @@ def _scale_down(conv: nn.Conv2d) -> nn.Conv2d:
 
 
 def _mean(rgb: Tensor) -> Tensor:
-    """Return the mean colour of photos, (B, 3, 1, 1)."""
+    """Return the mean colour of images, (B, 3, 1, 1)."""
     return rgb.mean(dim=(-2, -1), keepdim=True)
 
 

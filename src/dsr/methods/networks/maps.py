@@ -16,28 +16,28 @@ class Normalised(NamedTuple):
 
     values: Tensor
     minimum: Tensor
-    span: Tensor
+    value_range: Tensor
 
 
-def normalise(x: Tensor, bounds: Tensor | None = None) -> Normalised:
+def normalise(x: Tensor, min_max: Tensor | None = None) -> Normalised:
     """Return (x - min) / (max - min) per sample of (B, 1, H, W), over the finite values; the others become 0.
 
     A constant map becomes 0 with a range of 0. Without a finite value, the minimum is NaN.
 
     Args:
         x: (B, 1, H, W) map.
-        bounds: (B, 2, 1, 1) minimum and maximum to use; None for those of the map.
+        min_max: (B, 2, 1, 1) minimum and maximum to use; None for those of the map.
 
     """
     valid = x.isfinite()
-    bounds = min_max(x) if bounds is None else bounds.to(x)
-    lowest = bounds[:, :1]
-    span = bounds[:, 1:] - lowest  # -inf where nothing is finite
-    values = torch.where(valid, x - lowest, 0) / torch.where(span > 0, span, 1)
-    return Normalised(values, torch.where(span >= 0, lowest, torch.nan), span)
+    min_max = compute_min_max(x) if min_max is None else min_max.to(x)
+    minimum = min_max[:, :1]
+    value_range = min_max[:, 1:] - minimum  # -inf where nothing is finite
+    values = torch.where(valid, x - minimum, 0) / torch.where(value_range > 0, value_range, 1)
+    return Normalised(values, torch.where(value_range >= 0, minimum, torch.nan), value_range)
 
 
-def min_max(x: Tensor) -> Tensor:
+def compute_min_max(x: Tensor) -> Tensor:
     """Return the minimum and the maximum finite value of each map of (B, 1, H, W), (B, 2, 1, 1).
 
     They are infinity and minus infinity for a map without a finite value.

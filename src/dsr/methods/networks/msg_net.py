@@ -1,12 +1,12 @@
-"""MSG-Net, the multi-scale guided depth super-resolution network, and what goes in and comes out of it.
+"""MSG-Net, the multi-scale guided depth super-resolution network, its inputs and its output.
 
 Hui, Loy, Tang, *Depth Map Super-Resolution by Deep Multi-Scale Guidance*, ECCV 2016 (variant ``hui``), and the version
 that Voynov et al., *Perceptual Deep Depth Super-Resolution*, ICCV 2019, trained for renderings (variant ``voynov``);
 ``dsr`` is the latter as this project trains it.
 
-The network refines what is left of the normalised low-resolution disparity once its 3 x 3 mean is taken away, guided by
-a normalised intensity image; the mean itself is upsampled bicubically and added back. Everything here is plain torch:
-batched, differentiable, on any device, for any image size.
+The network refines the difference of the normalised low-resolution disparity to its 3 x 3 mean, guided by a normalised
+intensity image. The mean itself is upsampled bicubically and added back. All functions are batched, differentiable, and
+work on any device and for any image size.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ from dsr.degradation.downsampling import check_scale
 from dsr.methods.networks.base import GlobalContext, WindowedNetwork
 from dsr.methods.networks.inpainting import inpaint
 from dsr.methods.networks.layers import ConvLayer, Level
-from dsr.methods.networks.maps import mean3x3, min_max, normalise, upsample_bicubic
+from dsr.methods.networks.maps import compute_min_max, mean3x3, normalise, upsample_bicubic
 from dsr.methods.networks.msg_guidance import VARIANTS, Traits, VariantName, guidance_map, intensity_of
 
 FEATURES = 32
 
 
 class MSGNet(WindowedNetwork):
-    """The network of both variants; modules are registered in the order in which data passes them.
+    """The network of all variants; modules are registered in the order in which data passes them.
 
     Args:
         scale: upsampling factor, 2, 4, 8 or 16; log2(scale) levels.
@@ -63,7 +63,7 @@ class MSGNet(WindowedNetwork):
         """Map normalised inputs to the high-resolution residual.
 
         Args:
-            guidance: (B, 1, H, W) of :func:`guidance_map`, the size being ``output_size`` of the depth's.
+            guidance: (B, 1, H, W) from :func:`guidance_map`, of the size given by :meth:`output_size`.
             depth: (B, 1, h, w) normalised disparity minus its mean, see :func:`normalise`.
 
         Returns:
@@ -84,33 +84,33 @@ class MSGNet(WindowedNetwork):
         """Return the constructor's arguments."""
         return {"scale": self.scale, "variant": self.variant.name}
 
-    def upsample(self, rgb: Tensor, disparity: Tensor, bounds: Tensor | None = None) -> Tensor:
+    def upsample(self, rgb: Tensor, disparity: Tensor, min_max: Tensor | None = None) -> Tensor:
         """Return high-resolution disparity; see :func:`upsample_disparity`."""
-        return upsample_disparity(self, rgb, disparity, bounds)
+        return upsample_disparity(self, rgb, disparity, min_max)
 
     @property
-    def reach(self) -> int:
-        """How many LR pixels around its own an output depends on, two of them for ``hui``'s uneven padding."""
+    def receptive_field_radius(self) -> int:
+        """Receptive-field radius in low-resolution pixels; two of them are for the uneven padding of ``hui``."""
         return self.rows_seen(0) + 2
 
     def global_context(self, rgb: Tensor, disparity: Tensor) -> GlobalContext:
-        """Return what answers windows: ranges, drift and filled holes are the whole image's."""
-        bounds = min_max(disparity)
-        traits = traits_of(self, rgb, disparity)
-        known = inpaint(disparity) if self.variant.fill_holes else disparity
-        return GlobalContext(known, lambda photo, window: upsample_disparity(self, photo, window, bounds, traits))
+        """Return a context with the ranges, the drift and the inpainted disparity of the whole image."""
+        min_max = compute_min_max(disparity)
+        traits = compute_traits(self, rgb, disparity)
+        disparity = inpaint(disparity) if self.variant.fill_holes else disparity
+        return GlobalContext(disparity, lambda rgb, window: upsample_disparity(self, rgb, window, min_max, traits))
 
     def output_size(self, depth: Tensor) -> torch.Size:
-        """Return (H, W) for depth of (..., h, w)."""
+        """Return the output's size (H, W) for depth of (..., h, w)."""
         lost = 0 if self.variant.same_size else 1
         return torch.Size(self.scale * n - lost for n in depth.shape[-2:])
 
     def rows_seen(self, rows: int) -> int:
         """Return how many low-resolution rows (times scale, guidance rows) the outputs 0 .. ``rows`` - 1 depend on.
 
-        Holds for columns as well, and for the ``voynov`` variant's padding. Followed backwards from the output along
-        the depth branch: a 5 x 5 convolution needs 2 rows more, and output o of a transposed convolution reads inputs
-        up to (o + 2) // 2. The guidance branch never needs more than that, at any scale.
+        The same number holds for columns. It assumes the ``voynov`` variant's padding, and is computed backwards along
+        the depth branch: a 5 x 5 convolution needs 2 more rows, and output o of a transposed convolution reads inputs
+        up to (o + 2) // 2. The guidance branch needs no more than that at any scale.
         """
         seen = rows + 4  # reconstruction, smoothing
         for _ in self.levels:
@@ -118,7 +118,7 @@ class MSGNet(WindowedNetwork):
         return seen + 2
 
     def _pyramid(self, guidance: Tensor) -> list[Tensor]:
-        """Return the guidance features from the full resolution down, (B, 32, H, W), (B, 32, H / 2, W / 2), ..."""
+        """Return the guidance features, full resolution first: (B, 32, H, W), (B, 32, H / 2, W / 2), ..."""
         pyramid = [self.guidance[1](self.guidance[0](guidance))]
         for layer in self.guidance[2:]:
             pyramid.append(self.pool(layer(pyramid[-1])))
@@ -126,10 +126,10 @@ class MSGNet(WindowedNetwork):
 
     @torch.no_grad()
     def _start_smooth(self) -> None:
-        """Initialise for a smooth start: interpolating kernels, no biases, next to no residual.
+        """Initialise with interpolating kernels, zero biases and a small residual, for a smooth initial output.
 
-        A random transposed convolution treats even and odd pixels differently; the checkerboard that this leaves on
-        smooth surfaces is slow to unlearn. A bilinear kernel treats them alike.
+        A random transposed convolution treats even and odd pixels differently. This causes a checkerboard on smooth
+        surfaces, which training removes only slowly. A bilinear kernel treats them alike.
         """
         line = torch.tensor([0.0, 0.5, 1.0, 0.5, 0.0])
         slope = 0.25  # of a new PReLU
@@ -159,31 +159,31 @@ class MSGNet(WindowedNetwork):
         return ConvLayer(conv, self._slopes(FEATURES))
 
 
-def traits_of(net: MSGNet, rgb: Tensor, disparity: Tensor) -> Traits:
-    """Return the traits of an image; see :func:`upsample_disparity`."""
+def compute_traits(net: MSGNet, rgb: Tensor, disparity: Tensor) -> Traits:
+    """Compute the traits of an image; see :func:`upsample_disparity`."""
     variant = net.variant
     intensity = detail = drift = None
     if not variant.plain_guidance:
         grey = intensity_of(rgb, variant)
-        intensity, grey = min_max(grey), normalise(grey).values
-        detail = min_max(grey - mean3x3(grey))
+        intensity, grey = compute_min_max(grey), normalise(grey).values
+        detail = compute_min_max(grey - mean3x3(grey))
     if variant.drift_compensation:
         drift = output_drift(net, guidance_map(rgb, variant), normalise(disparity).values)
     return Traits(intensity, detail, drift)
 
 
 def output_drift(net: MSGNet, guidance: Tensor, disparity: Tensor, *, crop: bool = True) -> Tensor:
-    """Return the constant that the network adds by itself, (B, 1, 1, 1).
+    """Return the constant offset of the network's output, (B, 1, 1, 1).
 
-    The normalised disparity's first quarter of rows and columns is set to 0.5, and the network's output averaged over
-    rows h // 16 .. h // 4 - h // 16 and columns likewise, where h, w is the low-resolution size and the indices count
-    high-resolution pixels (so did the released code). 0 where that region is empty.
+    The first quarter of rows and columns of the normalised disparity is set to 0.5. The network's output is averaged
+    over rows h // 16 .. h // 4 - h // 16 and the corresponding columns, where h, w is the low-resolution size and the
+    indices count high-resolution pixels, as in the released code. The offset is 0 where that region is empty.
 
     Args:
         net: the network, of the ``voynov`` variant.
-        guidance: (B, 1, H, W) of :func:`guidance_map`.
-        disparity: (B, 1, h, w) of :func:`normalise`.
-        crop: run the network only on the inputs which those pixels see: the same value for far less work.
+        guidance: (B, 1, H, W) from :func:`guidance_map`.
+        disparity: (B, 1, h, w) from :func:`normalise`.
+        crop: whether to run the network only on the inputs that those pixels depend on: the same value in less time.
 
     """
     height, width = disparity.shape[-2:]
@@ -201,7 +201,7 @@ def output_drift(net: MSGNet, guidance: Tensor, disparity: Tensor, *, crop: bool
 
 
 def residual(net: MSGNet, guidance: Tensor, depth: Tensor) -> Tensor:
-    """Run the network in its own precision; the output has the dtype of ``depth``, at least float32."""
+    """Run the network in the precision of its weights; the output has the dtype of ``depth``, at least float32."""
     dtype = net.stem.conv.weight.dtype
     output = net(guidance.to(dtype), (net.variant.depth_gain * depth).to(dtype))
     return net.variant.residual_gain * output.to(torch.promote_types(depth.dtype, torch.float32))
@@ -211,7 +211,7 @@ def upsample_disparity(
     net: MSGNet,
     rgb: Tensor,
     disparity: Tensor,
-    bounds: Tensor | None = None,
+    min_max: Tensor | None = None,
     traits: Traits | None = None,
     *,
     crop_drift: bool = True,
@@ -222,8 +222,8 @@ def upsample_disparity(
         net: the network.
         rgb: (B, 3, H, W) in 0..1, with H = scale * h and W = scale * w.
         disparity: (B, 1, h, w); non-finite values are holes.
-        bounds: see :meth:`dsr.methods.networks.base.DisparityNetwork.upsample`.
-        traits: of the image that this is a window of; None for its own.
+        min_max: see :meth:`dsr.methods.networks.base.DisparityNetwork.upsample`.
+        traits: traits of the image that this is a window of; None for those of ``rgb`` and ``disparity``.
         crop_drift: see :func:`output_drift`.
 
     Returns:
@@ -231,7 +231,7 @@ def upsample_disparity(
         is NaN for a sample without a finite value.
 
     """
-    values, minimum, span = normalise(disparity, bounds)
+    values, minimum, value_range = normalise(disparity, min_max)
     if net.variant.fill_holes:
         values = inpaint(torch.where(disparity.isfinite(), values, torch.nan))
     low_pass = mean3x3(values)
@@ -243,4 +243,4 @@ def upsample_disparity(
     elif net.variant.drift_compensation:
         output = output - output_drift(net, guidance, values, crop=crop_drift)
     output = output + upsample_bicubic(low_pass, net.scale)[..., :height, :width]
-    return output * span + minimum
+    return output * value_range + minimum

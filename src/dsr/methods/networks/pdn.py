@@ -34,7 +34,7 @@ from torch.nn import functional
 
 from dsr.degradation.downsampling import check_scale
 from dsr.methods.classical.finite_differences import extend_linearly, upsample_linear_border
-from dsr.methods.networks.base import NormalisedNetwork, expect_photo
+from dsr.methods.networks.base import NormalisedNetwork, expect_rgb_size
 from dsr.methods.networks.facets import stencil
 from dsr.methods.networks.primal_dual import UnrolledHuber
 
@@ -88,13 +88,13 @@ class PrimalDualNetwork(NormalisedNetwork):
         return {**sizes, "window": self.window, "iterations": self.iterations}
 
     @property
-    def reach(self) -> int:
-        """How many low-resolution pixels around its own an output depends on.
+    def receptive_field_radius(self) -> int:
+        """Receptive-field radius in low-resolution pixels.
 
-        A high-resolution pixel for each convolution, half a window for each step of the iteration; the upsampling and
-        the differences of the low-resolution map that go in look four low-resolution pixels far.
+        One high-resolution pixel for each convolution, half a window for each iteration, and four low-resolution pixels
+        for the upsampling and the differences of the low-resolution input.
         """
-        radius_hr = self.layers + self.stage.reach
+        radius_hr = self.layers + self.stage.receptive_field_radius
         return -(-radius_hr // self.scale) + 4
 
     def forward(self, rgb: Tensor, values: Tensor) -> Tensor:
@@ -108,7 +108,7 @@ class PrimalDualNetwork(NormalisedNetwork):
             (B, 1, H, W).
 
         """
-        expect_photo(rgb, values, self.scale)
+        expect_rgb_size(rgb, values, self.scale)
         hr = upsample_linear_border(values, self.scale)
         inputs, bend = self._inputs(rgb, values, hr)
         output = self.head(self.trunk(inputs.to(self.head.weight.dtype)))

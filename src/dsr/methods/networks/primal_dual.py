@@ -215,8 +215,8 @@ class UnrolledHuber(nn.Module):
         self.log_steps = nn.Parameter(first.repeat(iterations, 1))  # (iterations, 3): sigma, tau, theta
 
     @property
-    def reach(self) -> int:
-        """How many pixels around its own an output depends on."""
+    def receptive_field_radius(self) -> int:
+        """Receptive-field radius in pixels."""
         return self.iterations * (self.window // 2)
 
     def steps(self, dtype: torch.dtype = torch.float32) -> list[Step]:

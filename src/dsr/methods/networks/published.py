@@ -20,7 +20,7 @@ from torch import Tensor
 from dsr.degradation.scales import SCALES
 from dsr.methods.networks.msg_guidance import VariantName
 from dsr.methods.networks.msg_net import MSGNet
-from dsr.methods.networks.weight_files import fill
+from dsr.methods.networks.weight_files import load_parameters
 
 TORCH_MAGIC = (b"PK\x03\x04", b"\x80")
 PARTS = ("conv.weight", "conv.bias", "activation.weight")
@@ -58,7 +58,7 @@ def load_msg_weights(path: Path, scale: int, variant: VariantName | None = None)
         raise ValueError(f"{path}: weights are for scale {weights.scale}, the run is at scale {scale}")
     with torch.device("meta"):  # without memory, and without a draw from the random generator
         net = MSGNet(scale, weights.variant)
-    fill(net, weights.tensors, path, f"MSG-Net ({weights.variant}) at scale {scale}")
+    load_parameters(net, weights.tensors, path, f"MSG-Net ({weights.variant}) at scale {scale}")
     return net
 
 

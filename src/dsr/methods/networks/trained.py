@@ -1,4 +1,4 @@
-"""Methods that are trained networks: ours, whose weights come with the package, and the published ones."""
+"""Methods that run a trained network, from weights of this package or published ones."""
 
 from __future__ import annotations
 
@@ -16,13 +16,14 @@ from dsr.methods.networks.msg_guidance import VariantName
 from dsr.methods.networks.msg_net import MSGNet
 from dsr.methods.networks.pdn import PrimalDualNetwork
 from dsr.methods.networks.published import load_msg_weights
-from dsr.methods.networks.weight_files import is_ours, load_network
+from dsr.methods.networks.weight_files import is_dsr_weights, load_network
 
 NETWORKS: MappingProxyType[str, type[DisparityNetwork]] = MappingProxyType(
     {"MSGNet": MSGNet, "Facets": Facets, "PrimalDualNetwork": PrimalDualNetwork, "DynamicGuidance": DynamicGuidance}
 )
 
-_OUR_ENSEMBLE = 4
+_DSR_ENSEMBLE = 4
+"""Test-time augmentations with weights of this package; published networks are run as published."""
 
 
 def build_trained(
@@ -35,38 +36,38 @@ def build_trained(
     ensemble: int | None = None,
     networks: Mapping[str, type[DisparityNetwork]] = NETWORKS,
 ) -> NetworkUpsampler:
-    """Return the method with the weights of a file.
+    """Build a method from a weights file.
 
     Args:
-        weights: a file of ours, or one of the published ones where there is a ``variant``.
-        scale: the scale of the run.
-        model: the model that our files must be of.
-        variant: the variant of MSG-Net that published files must be of.
-        precision: of the convolutions.
-        device: where to compute.
-        ensemble: see :class:`~dsr.methods.networks.base.NetworkUpsampler`; None for 4 with a file of ours and 1 with a
-            published one, as it was published.
-        networks: the classes that files of ours may name, by :func:`~dsr.methods.networks.weight_files.network_name`.
+        weights: file that ``train.py`` wrote; or, with a ``variant``, one that the authors of MSG-Net published.
+        scale: upsampling factor of the run.
+        model: name of the model that dsr files must contain.
+        variant: variant of MSG-Net that published files must contain.
+        precision: dtype of the convolutions.
+        device: device of the computations.
+        ensemble: number of test-time augmentations, see :class:`~dsr.methods.networks.base.NetworkUpsampler`; None for
+            4 with dsr files and 1 with published ones.
+        networks: network classes by their :func:`~dsr.methods.networks.weight_files.network_name` in dsr files.
 
     Raises:
         FileNotFoundError: there is no such file.
-        ValueError: the file is damaged, or of another model, variant or scale; the ensemble is impossible.
+        ValueError: the file is damaged or of another model, variant or scale, or the ensemble is not supported.
 
     """
     weights = Path(weights)
-    ours = variant is None or (weights.is_file() and is_ours(weights))
-    net = load_network(weights, networks, scale, model) if ours else load_msg_weights(weights, scale, variant)
+    dsr = variant is None or (weights.is_file() and is_dsr_weights(weights))
+    net = load_network(weights, networks, scale, model) if dsr else load_msg_weights(weights, scale, variant)
     if ensemble is None:
-        ensemble = _OUR_ENSEMBLE if ours else 1
+        ensemble = _DSR_ENSEMBLE if dsr else 1
     return NetworkUpsampler(net, precision, device, ensemble)
 
 
 def packaged_weights(name: str) -> Path | None:
-    """Return the file ``name.safetensors`` of the weights that come with the package; None if there is none."""
+    """Return the path of the packaged weights ``name.safetensors``, or None if there are none."""
     path = Path(str(resources.files("dsr.methods.weights"))) / f"{name}.safetensors"
     return path if path.is_file() else None
 
 
 def packaged_names() -> list[str]:
-    """Return the names of the weights that come with the package."""
+    """Return the names of the packaged weights."""
     return sorted(path.stem for path in Path(str(resources.files("dsr.methods.weights"))).glob("*.safetensors"))

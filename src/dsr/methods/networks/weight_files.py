@@ -1,4 +1,4 @@
-"""Files of our own networks' weights: ``.safetensors`` with the few facts that rebuild the network."""
+"""Weights files of dsr's networks: ``.safetensors`` with the metadata from which the network is rebuilt."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ def save_network(path: Path, net: DisparityNetwork, model: str, facts: Mapping[s
     """Write a network's weights; equal networks and facts give equal bytes.
 
     Args:
-        path: the file; written as it is, wrap it for atomicity.
+        path: path of the file; the write is not atomic.
         net: the network.
-        model: its name in ``conf/model/``, such as ``msg_v``.
-        facts: more that a reader may want to know, as plain values: data, steps, scores.
+        model: name of the model in ``conf/model/``, such as ``msg_v``.
+        facts: further plain values for readers of the file, such as data, steps and scores.
 
     """
-    head = {
+    header = {
         "format": FORMAT,
         "network": network_name(type(net)),
         "arguments": net.arguments(),
@@ -36,27 +36,27 @@ def save_network(path: Path, net: DisparityNetwork, model: str, facts: Mapping[s
         "facts": dict(facts or {}),
     }
     tensors = {name: value.detach().cpu().contiguous() for name, value in net.state_dict().items()}
-    safetensors.torch.save_file(tensors, path, {_KEY: json.dumps(head, sort_keys=True)})
+    safetensors.torch.save_file(tensors, path, {_KEY: json.dumps(header, sort_keys=True)})
 
 
 def network_name(network: type[DisparityNetwork]) -> str:
-    """Return how a file of weights names a class: the package's by its name, others by their dotted path."""
+    """Return the name of a class in weights files: the plain name within the package, else the dotted path."""
     inside = network.__module__.partition(".")[0] == __name__.partition(".")[0]
     return network.__name__ if inside else f"{network.__module__}.{network.__qualname__}"
 
 
-def is_ours(path: Path) -> bool:
-    """Return whether a file looks like one of ours rather than like one of the published networks'."""
+def is_dsr_weights(path: Path) -> bool:
+    """Return whether a file starts like a safetensors file; the published networks' files do not."""
     with path.open("rb") as file:
         return file.read(9)[8:] == b"{"
 
 
-def read_head(path: Path) -> dict[str, Any]:
-    """Return what a file of ours says of its network: ``network``, ``arguments``, ``model``, ``facts``.
+def read_header(path: Path) -> dict[str, Any]:
+    """Read the metadata of a dsr weights file: ``network``, ``arguments``, ``model``, ``facts``.
 
     Raises:
         FileNotFoundError: there is no such file.
-        ValueError: it is damaged or none of ours.
+        ValueError: the file is damaged or not a dsr weights file.
 
     """
     if not path.is_file():
@@ -67,9 +67,9 @@ def read_head(path: Path) -> dict[str, Any]:
     except Exception as error:  # the library names no set of errors for damaged files
         raise ValueError(f"{path}: expected a safetensors file, got a damaged one ({type(error).__name__})") from error
     try:
-        head = dict(json.loads(metadata[_KEY]))
-        if head["format"] == FORMAT and head.keys() >= {"network", "arguments", "model"}:
-            return head
+        header = dict(json.loads(metadata[_KEY]))
+        if header["format"] == FORMAT and header.keys() >= {"network", "arguments", "model"}:
+            return header
     except (KeyError, ValueError, TypeError):
         pass
     raise ValueError(f"{path}: expected weights that train.py wrote, got safetensors with {metadata or 'no facts'}")
@@ -78,30 +78,30 @@ def read_head(path: Path) -> dict[str, Any]:
 def load_network(
     path: Path, networks: Mapping[str, type[DisparityNetwork]], scale: int | None = None, model: str | None = None
 ) -> DisparityNetwork:
-    """Return the network of a file of ours, float32, on the CPU.
+    """Load the network of a dsr weights file, in float32 on the CPU.
 
     Args:
-        path: the file.
-        networks: the classes that there are, by name.
-        scale: the scale that the run needs, None for any.
-        model: the model that the run needs, None for any.
+        path: path of the file.
+        networks: network classes by name.
+        scale: scale that the run requires, None for any.
+        model: model that the run requires, None for any.
 
     Raises:
         FileNotFoundError: there is no such file.
-        ValueError: it is damaged, none of ours, or of another model, scale or architecture.
+        ValueError: the file is damaged, not a dsr weights file, or of another model, scale or architecture.
 
     """
     path = Path(path)
-    head = read_head(path)
-    if model is not None and head["model"] != model:
-        raise ValueError(f"{path}: expected weights of model {model}, got those of {head['model']}")
+    header = read_header(path)
+    if model is not None and header["model"] != model:
+        raise ValueError(f"{path}: expected weights of model {model}, got those of {header['model']}")
     try:
-        with torch.random.fork_rng(devices=[]):  # its first weights, replaced below, draw from the generator
-            net = networks[head["network"]](**head["arguments"])
+        with torch.random.fork_rng(devices=[]):  # the initial weights draw random numbers
+            net = networks[header["network"]](**header["arguments"])
     except (KeyError, TypeError, ValueError) as error:
-        known = ", ".join(networks)
+        names = ", ".join(networks)
         raise ValueError(
-            f"{path}: expected one of the networks {known}, got {head['network']} of {head['arguments']}"
+            f"{path}: expected one of the networks {names}, got {header['network']} of {header['arguments']}"
         ) from error
     if scale is not None and net.scale != scale:
         raise ValueError(f"{path}: weights are for scale {net.scale}, the run is at scale {scale}")
@@ -109,33 +109,33 @@ def load_network(
         tensors = safetensors.torch.load(path.read_bytes())
     except Exception as error:  # the library names no set of errors for damaged files
         raise ValueError(f"{path}: expected a safetensors file, got a damaged one ({type(error).__name__})") from error
-    fill(net, tensors, path, f"{head['network']} at scale {net.scale}")
+    load_parameters(net, tensors, path, f"{header['network']} at scale {net.scale}")
     return net
 
 
-def fill(net: DisparityNetwork, tensors: Mapping[str, Tensor], path: Path, expected: str) -> None:
-    """Give a network its parameters.
+def load_parameters(net: DisparityNetwork, tensors: Mapping[str, Tensor], path: Path, expected: str) -> None:
+    """Check the tensors of a file and load them into a network.
 
     Args:
         net: the network.
-        tensors: by parameter name.
-        path: of the file, for the message.
-        expected: what it should hold, for the message.
+        tensors: tensors by parameter name.
+        path: path of the file, for the message.
+        expected: description of the expected network, for the message.
 
     Raises:
-        ValueError: a tensor is missing, unexpected, of another shape or kind, or not finite.
+        ValueError: a tensor is missing, unexpected, of another shape or dtype, or not finite.
 
     """
     shapes = {name: tuple(value.shape) for name, value in net.state_dict().items()}
-    problems = _misfits(tensors, shapes)
+    problems = _find_mismatches(tensors, shapes)
     if problems:
         found = problems[0] if len(problems) == 1 else f"{problems[0]}, and {len(problems) - 1} more do not fit"
         raise ValueError(f"{path}: expected the tensors of {expected}, but {found}")
     net.load_state_dict({name: value.float().contiguous() for name, value in tensors.items()}, assign=True)
 
 
-def _misfits(tensors: Mapping[str, Tensor], shapes: Mapping[str, tuple[int, ...]]) -> list[str]:
-    """Return what is wrong with the tensors, in words: missing, unexpected, of another shape or kind."""
+def _find_mismatches(tensors: Mapping[str, Tensor], shapes: Mapping[str, tuple[int, ...]]) -> list[str]:
+    """Describe the tensors that are missing, unexpected, of another shape or dtype, or not finite."""
     problems = [f"{name} is missing" for name in shapes if name not in tensors]
     problems += [f"{name!r} is unexpected" for name in tensors if name not in shapes]
     for name, value in ((name, tensors[name]) for name in shapes if name in tensors):
