@@ -91,7 +91,7 @@ def test_limit_examines_some_of_many_scenes(tmp_path, cube, capsys):
         write(tmp_path / f"cube{number}", cube, cube.depth)
     assert main(["doctor", str(tmp_path), "--most", "2"]) == 0
     output = capsys.readouterr().out
-    assert output.startswith("2 of 5 scenes, spread over all\ncube0: fine")
+    assert output.startswith("2 of 5 scenes, at equal distances\ncube0: fine")
     assert "cube2: fine" in output
     assert output.endswith("2 scenes: 2 fine\n")
     assert main(["doctor", str(tmp_path), "--most", "0"]) == 2

@@ -208,14 +208,14 @@ def test_swapped_intrinsics_are_found():
     assert wrong(sound) == {}
     _, message, advice = only(with_camera(sound, fy=159.5, cx=301.0), "intrinsics")
     assert "fx 300, fy 159.5, cx 301, cy 119.5 px" in message
-    assert advice == "put them in order: fy is the number given as cx, cx is the number given as fy"
+    assert advice == "correct the order: fy is the number given as cx, cx is the number given as fy"
     _, _, advice = only(with_camera(sound, cx=119.5, cy=159.5), "intrinsics")
-    assert advice == "put them in order: cx is the number given as cy, cy is the number given as cx"
+    assert advice == "correct the order: cx is the number given as cy, cy is the number given as cx"
 
 
 def test_principal_point_far_off_the_centre_is_found_with_its_side(sound):
     _, message, advice = only(with_camera(sound, cx=127.5 - 0.3 * SIZE), "intrinsics")
-    assert "lies 30% of the width left of the centre and 0% of the height above it" in message
+    assert "is 30% of the width left of the centre and 0% of the height above it" in message
     assert advice.startswith("check cx and cy")
     assert level_of(with_camera(sound, cy=127.5 + 0.12 * SIZE), "intrinsics") == "note"
     assert level_of(with_camera(sound, cy=127.5 + 0.08 * SIZE), "intrinsics") == "ok"
@@ -232,7 +232,7 @@ def test_implausible_field_of_view_is_found_in_degrees(sound, fx, level):
     [finding] = of(scene, "intrinsics")
     degrees = 2 * math.degrees(math.atan(SIZE / 2 / fx))
     assert finding.level == level
-    assert f"fx {fx:g} px makes a view of {degrees:.3g} degrees across" in finding.message
+    assert f"fx {fx:g} px gives a horizontal field of view of {degrees:.3g} degrees" in finding.message
 
 
 def test_size_that_8_does_not_divide_is_noted():
@@ -252,14 +252,14 @@ def test_size_that_8_does_not_divide_is_noted():
 def test_shifted_photo_is_found_with_its_shift(sound, right, down, text):
     shifted = replace(sound, rgb=sound.rgb.roll((down, right), (1, 2)))
     level, message, _ = only(shifted, "registration")
-    assert (level, message) == ("warning", f"the photo's edges lie {text} of the depth's")
+    assert (level, message) == ("warning", f"the photo's edges are {text} of the depth edges")
 
 
 def test_shift_in_a_large_picture_is_found_in_its_own_pixels():
     camera = Camera(820, 700, 700.0, 700.0, 409.5, 349.5)
     scene = room_scene(camera, 17.0)
     [finding] = check_registration(replace(scene, rgb=scene.rgb.roll((0, 14), (1, 2))))
-    assert finding.message == "the photo's edges lie 14 px right, 0 px below of the depth's"
+    assert finding.message == "the photo's edges are 14 px right, 0 px below of the depth edges"
 
 
 def test_shift_within_the_blur_of_edges_passes(sound):
@@ -272,7 +272,7 @@ def test_shift_within_the_blur_of_edges_passes(sound):
 )
 def test_mirrored_photo_is_recognised(sound, axes, text):
     level, message, _ = only(replace(sound, rgb=sound.rgb.flip(axes)), "registration")
-    assert (level, message) == ("problem", f"the photo is {text} against the depth")
+    assert (level, message) == ("problem", f"the photo is {text} relative to the depth")
 
 
 def test_unrelated_photo_is_noted(sound):
@@ -280,7 +280,7 @@ def test_unrelated_photo_is_noted(sound):
     other = replace(other, rgb=other.rgb.roll((100, 70), (1, 2)))
     [finding] = [finding for finding in examine(replace(sound, rgb=other.rgb)) if finding.level != "ok"]
     assert (finding.check, finding.level) == ("registration", "note")
-    assert finding.message.startswith("at no shift within 8 px")
+    assert finding.message.endswith("the depth edges at no shift within 8 px")
 
 
 def test_too_few_depth_edges_pass(sound):
@@ -307,7 +307,7 @@ def test_fraction_of_holes_is_judged(sound, rows, level):
     depth[:, :rows] = torch.nan
     [finding] = of(replace(sound, depth=depth), "holes")
     assert finding.level == level
-    assert finding.message == f"{1 - rows / SIZE:.1%} of the pixels known"
+    assert finding.message == f"{1 - rows / SIZE:.1%} of the pixels are valid"
 
 
 def scattered(share=0.05):
@@ -321,7 +321,7 @@ def test_value_that_marks_holes_is_found(sound, value):
     _, message, advice = only(changed(sound, lambda z: np.where(where, value, z)), "holes")
     share = f"{where.mean():.1%}"
     side = "largest" if value > 4 else "smallest"
-    assert message.startswith(f"{share} of the known pixels have exactly the {side} value, {value:g} m")
+    assert message.startswith(f"{share} of the valid pixels have exactly the {side} value, {value:g} m")
     assert '"hole_value"' in advice
 
 
@@ -337,12 +337,12 @@ def test_separate_value_in_one_piece_may_be_a_wall(sound):
     scene = changed(sound, lambda z: np.where(wall, 9.0, z))
     [finding] = [finding for finding in of(scene, "holes") if finding.level != "ok"]
     assert finding.level == "note"
-    assert "apart from the next" in finding.message
+    assert "; the next value is " in finding.message
 
 
 def test_constant_map_is_doubtful(sound):
     level, message, _ = only(changed(sound, lambda z: np.full_like(z, 2.0)), "holes")
-    assert (level, message) == ("warning", "every known pixel has the same value, 2 m")
+    assert (level, message) == ("warning", "all valid pixels have the same value, 2 m")
 
 
 # precision
@@ -397,7 +397,7 @@ def test_whole_disparities_are_found_in_pixels(sound):
 
 def test_half_precision_is_recognised(sound):
     _, message, _ = only(changed(sound, lambda z: z.astype(np.float16).astype(np.float64)), "precision")
-    assert message.startswith("values of half precision (float16), ")
+    assert message.startswith("values have half precision (float16), ")
 
 
 @pytest.mark.parametrize("factor", [2, 3, 4, 8])
@@ -407,7 +407,7 @@ def test_map_enlarged_by_repeating_its_pixels_is_recognised(sound, factor):
 
     level, message, _ = only(changed(sound, enlarge), "precision")
     assert level == "problem"
-    assert message == f"every value is repeated {factor} times across and down: a smaller map, enlarged"
+    assert message == f"every value is repeated {factor} times across and down: an enlarged smaller map"
 
 
 def test_flat_walls_and_level_floors_are_not_terraces(straight):
@@ -433,7 +433,7 @@ def test_distance_along_the_ray_is_told_from_orthogonal_depth(straight, sound):
         assert message.startswith("depth looks like distance along the ray: ")
         assert advice == 'set "range_type": "perspective" in camera.json'
         _, message, advice = only(changed(scene, lambda z: z / rays), "planes")
-        assert message.startswith("depth was taken for distance along the ray but looks orthogonal in the file: ")
+        assert message.startswith("depth was read as distance along the ray but looks orthogonal in the file: ")
         assert advice == 'set "range_type": "orthogonal" in camera.json'
 
 
@@ -548,7 +548,7 @@ def test_tartanair_is_in_half_precision(shared):
     depth = np.load(folder / "000000_left_depth.npy").astype(np.float64)
     camera = Camera(640, 480, 320.0, 320.0, 320.0, 240.0)
     scene = real_scene(read_rgb(folder / "000000_left.png"), depth, camera)
-    assert only(scene, "precision")[1].startswith("values of half precision (float16), 934 distinct values")
+    assert only(scene, "precision")[1].startswith("values have half precision (float16), 934 distinct values")
 
 
 @pytest.mark.parametrize("name", ["Aloe", "Midd1"])

@@ -1,4 +1,4 @@
-"""``dsr doctor``: what looks wrong with the depth and the cameras of scenes, and what to do about it."""
+"""``dsr doctor``: checks of the depth maps and cameras of scenes, with advice on how to correct them."""
 
 from dsr.doctor.examine import examine_directory
 

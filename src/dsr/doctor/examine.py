@@ -1,4 +1,4 @@
-"""Examining scenes and telling what was found."""
+"""Run all checks on scenes and print the findings."""
 
 from __future__ import annotations
 
@@ -33,19 +33,19 @@ CHECKS: tuple[Callable[[Scene], list[Finding]], ...] = (
 )
 _COLOURS: dict[Level, str] = {"ok": "green", "note": "cyan", "warning": "yellow", "problem": "bold red"}
 _MANY = 8
-"""Scenes beyond which what is in order is left out."""
+"""Number of scenes beyond which checks without a finding are not listed."""
 
 
 def examine_directory(folder: Path, most: int | None = None) -> int:
-    """Print what looks wrong with the scenes of a directory, or with the one scene that it is.
+    """Examine the scenes of a directory, or a single scene, and print the findings.
 
     Args:
-        folder: of any layout that :func:`dsr.data.detection.find_scenes` knows.
-        most: examine so many scenes at most, spread over all; None for all.
+        folder: directory of any layout that :func:`dsr.data.detection.find_scenes` supports.
+        most: maximum number of scenes, taken at equal distances from all; None for all.
 
     Returns:
-        0 where nothing looks wrong (there may be notes), 1 where there are warnings or problems, 2, with one line on
-        stderr, where there is no scene to examine.
+        Exit status: 0 without warnings and problems, 1 with warnings or problems, 2, with one line on stderr, if there
+        is no scene to examine.
 
     """
     try:
@@ -60,7 +60,7 @@ def examine_directory(folder: Path, most: int | None = None) -> int:
         return USAGE_ERROR
     console = open_console()
     if most is not None and len(scenes) > most:
-        console.print(f"{most} of {len(scenes)} scenes, spread over all", highlight=False)
+        console.print(f"{most} of {len(scenes)} scenes, at equal distances", highlight=False)
         scenes = [scenes[index * len(scenes) // most] for index in range(most)]
     verdicts: Counter[Level] = Counter()
     for name, load in ConsoleProgress(console).track(scenes, "examine", label=lambda scene: scene[0], lines=False):
@@ -72,25 +72,25 @@ def examine_directory(folder: Path, most: int | None = None) -> int:
 
 
 def examine(scene: Scene) -> list[Finding]:
-    """Return what all checks find in a scene, in the order of :data:`CHECKS`."""
+    """Run all checks on a scene and return their findings, in the order of :data:`CHECKS`."""
     scene = with_depth(scene)
     return [finding for check in CHECKS for finding in check(scene)]
 
 
 def _examine(name: str, load: Callable[[], Scene]) -> tuple[str, list[Finding]]:
-    """Return a title and the findings of a scene that may be impossible to load."""
+    """Return a title and the findings of a scene; a failure to load it is a finding."""
     try:
         scene = load()
     except (ValueError, OSError) as error:
         message = f"cannot be read: {one_line(error)}"
-        return name, [Finding("files", "problem", message, "repair the file, or describe it as the message says")]
+        return name, [Finding("files", "problem", message, "correct the file or its description")]
     if scene.depth is None:
         return f"{name} (the map measured at x{min(scene.measured)})", examine(scene)
     return name, examine(scene)
 
 
 def _show(console: Console, title: str, findings: list[Finding], *, brief: bool) -> None:
-    """Print a scene's findings, if ``brief`` those alone that are not in order, and its verdict."""
+    """Print a scene's verdict and findings; if ``brief``, without those of level ``ok``."""
     grid = Table.grid(padding=(0, 2))
     grid.add_column(no_wrap=True)
     grid.add_column(no_wrap=True)
@@ -109,7 +109,7 @@ def _show(console: Console, title: str, findings: list[Finding], *, brief: bool)
 
 
 def _verdict(findings: list[Finding]) -> str:
-    """Return how a scene is, in a few words."""
+    """Return the number of findings of a scene by level."""
     counts = Counter(finding.level for finding in findings)
     parts = [f"{counts[level]} {level}{'s' if counts[level] > 1 else ''}" for level in LEVELS[:0:-1] if counts[level]]
     if worst(findings) in ("warning", "problem"):
@@ -118,7 +118,7 @@ def _verdict(findings: list[Finding]) -> str:
 
 
 def _summary(verdicts: Counter[Level]) -> str:
-    """Return how many scenes are how."""
+    """Return the number of scenes by verdict."""
     total, fine = sum(verdicts.values()), verdicts["ok"] + verdicts["note"]
     parts = [f"{fine} fine"] if fine else []
     parts += [f"{verdicts[level]} with {level}s" for level in ("warning", "problem") if verdicts[level]]

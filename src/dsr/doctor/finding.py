@@ -1,4 +1,4 @@
-"""What a check says, and the arrays that every check looks at."""
+"""The result of a check, and the arrays that the checks examine."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ from dsr.sample import Scene
 
 Level = Literal["ok", "note", "warning", "problem"]
 LEVELS: tuple[Level, ...] = get_args(Level)
-"""From the best to the worst; from ``warning`` on something looks wrong."""
+"""From the best to the worst; ``warning`` and ``problem`` mean that the scene is probably wrong."""
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class Finding:
-    """What one check found.
+    """A finding of one check.
 
     Args:
-        check: its name.
-        level: how bad it is.
-        message: what was measured, with units.
-        advice: what to do; empty where there is nothing to do.
+        check: name of the check.
+        level: severity.
+        message: measured values, with units.
+        advice: recommended action; empty for none.
 
     """
 
@@ -36,25 +36,25 @@ class Finding:
 
 
 def worst(findings: list[Finding]) -> Level:
-    """Return the worst level, ``ok`` where there is no finding."""
+    """Return the worst level; ``ok`` without findings."""
     return max((finding.level for finding in findings), key=LEVELS.index, default="ok")
 
 
 def with_depth(scene: Scene) -> Scene:
-    """Return the scene at the resolution of the depth to examine: of the HR one, else of the finest measured one."""
+    """Return the scene at the resolution of its high-resolution depth, else of its largest measured map."""
     if scene.depth is not None:
         return scene
     factor = min(scene.measured)
     depth, camera = scene.measured[factor], scene.camera.downscale(factor)
-    photo = functional.avg_pool2d(scene.rgb[:, : camera.height * factor, : camera.width * factor][None], factor)[0]
-    return replace(scene, rgb=photo.clamp(0, 1), camera=camera, depth=depth, measured={})
+    rgb = functional.avg_pool2d(scene.rgb[:, : camera.height * factor, : camera.width * factor][None], factor)[0]
+    return replace(scene, rgb=rgb.clamp(0, 1), camera=camera, depth=depth, measured={})
 
 
 def metres(scene: Scene) -> Array:
     """Return a scene's high-resolution depth, (H, W) float64 in metres, NaN in holes.
 
     Raises:
-        ValueError: it has none.
+        ValueError: the scene has none.
 
     """
     if scene.depth is None:
@@ -64,7 +64,7 @@ def metres(scene: Scene) -> Array:
 
 
 def length(value: float) -> str:
-    """Return positive metres as a text of a fitting unit."""
+    """Format a positive length in metres with a suitable unit."""
     if value >= 1e3:
         return f"{value / 1e3:.3g} km"
     return f"{value:.3g} m" if value >= 0.1 else f"{value * 1e3:.3g} mm"

@@ -1,10 +1,10 @@
-"""Whether stored depth is orthogonal: walls are bowls where distance along the ray was taken for it.
+"""Check that depth is orthogonal: planes become curved if distance along the ray is read as orthogonal depth.
 
 A plane is linear in 1 / z over the image. If the values s follow z = s / |r|**k, with k = 0 for orthogonal depth, 1 for
-distance along the ray, and -1 for orthogonal depth that was taken for distance along the ray and divided by |r|, then
-1 / s = (a u + b v + c) / |r|**k, which is linear in a, b, c and, as |r| changes little within a window, in k:
-1 / s = a u + b v + c - k log|r| / s. A robust fit to windows of many sizes and places estimates k; those that this
-explains are planar and vote.
+distance along the ray, and -1 for orthogonal depth that was read as distance along the ray and divided by |r|, then
+1 / s = (a u + b v + c) / |r|**k. This is linear in a, b, c and, as |r| changes little within a window, in k:
+1 / s = a u + b v + c - k log|r| / s. A robust fit to windows of many sizes and positions estimates k. Windows with a
+good fit are planar and vote.
 """
 
 from __future__ import annotations
@@ -19,78 +19,78 @@ from dsr.geometry.camera import Camera
 from dsr.sample import Scene
 
 _SIZES = (1.0, 2 / 3, 1 / 2, 1 / 3, 1 / 4, 1 / 6)
-"""Of windows, as shares of the image's shorter side."""
+"""Sizes of windows, as fractions of the shorter image side."""
 _CELLS = 16
-"""Across a window: values are averaged within cells, which quiets noise."""
+"""Cells across a window; values are averaged within cells to reduce noise."""
 _ITERATIONS = 12
-_KNOWN, _INLIERS = 0.6, 0.55
-"""Shares of a window's cells that have to be known, and on the plane."""
+_MIN_VALID, _INLIERS = 0.6, 0.55
+"""Minimum fractions of a window's cells that are valid, and that are on the plane."""
 _NOISE = 0.5
-"""Of the bend that k = 1 makes: what a planar window may deviate from its fit."""
+"""Largest deviation of a planar window from its fit, as a fraction of the curvature that k = 1 causes."""
 _NEAR = 0.3
-"""From a vote's k to what it votes for."""
+"""Largest distance of k from the value that a window votes for."""
 _WHOLE = 0.95
-"""Of a cell's pixels that have to be known."""
+"""Minimum fraction of valid pixels in a cell."""
 _LARGEST = 1e3
-"""Inverse depth, as a multiple of the median's, beyond which it is cut."""
+"""Upper limit of inverse depth, as a multiple of the median's."""
 _EXACT = 1e-12
 _LEAST, _LEAD = 4, 3
-"""Votes for orthogonal depth, and how many times as many as for the others."""
+"""Minimum number of votes for orthogonal depth, and their minimum ratio to all others."""
 _LEAST_BENT, _MAJORITY_BENT = 6, 0.7
-"""Votes for another type, and their share of the planar windows."""
+"""Minimum number of votes for another type, and their minimum fraction of the planar windows."""
 
 
 @dataclass(frozen=True)
 class Windows:
-    """Square windows of a map of inverse depth, as averages within cells.
+    """Square windows of a map of inverse depth, averaged within cells.
 
     Args:
-        inverse: (N, cells) of 1 / s, as a multiple of the window's median; 0 where not known.
-        known: (N, cells) bool.
+        inverse: (N, cells) 1 / s, as a multiple of the window's median; 0 where invalid.
+        valid: (N, cells) bool.
         u, v: (N, cells) position within the window, about -1 to 1.
-        bend: (N, cells) logarithm of |r|, less its mean over the window.
+        bend: (N, cells) logarithm of |r|, minus its mean over the window.
 
     """
 
     inverse: Array
-    known: np.ndarray
+    valid: np.ndarray
     u: Array
     v: Array
     bend: Array
 
 
 def check_planes(scene: Scene) -> list[Finding]:
-    """Return whether flat surfaces are flat when the depth is taken as orthogonal.
+    """Check whether planar surfaces are planar if the depth is orthogonal.
 
     Args:
-        scene: with high-resolution depth.
+        scene: scene with high-resolution depth.
 
     """
     depth = metres(scene)
     rounding = find_rounding(scene)
     votes = plane_votes(depth, scene.camera, 0.0 if rounding is None else rounding.relative)
     flat, ray, reverse = (int((np.abs(votes - k) < _NEAR).sum()) for k in (0, 1, -1))
-    bent = f"{{}} of {votes.size} planar windows are flat then, {flat} are as it was read"
+    bent = f"{{}} of {votes.size} planar windows support this, {flat} support the present type"
     if ray >= _LEAST_BENT and ray > _MAJORITY_BENT * votes.size:
         message = f"depth looks like distance along the ray: {bent.format(ray)}"
         return [Finding("planes", "problem", message, 'set "range_type": "perspective" in camera.json')]
     if reverse >= _LEAST_BENT and reverse > _MAJORITY_BENT * votes.size:
-        message = f"depth was taken for distance along the ray but looks orthogonal in the file: {bent.format(reverse)}"
+        message = f"depth was read as distance along the ray but looks orthogonal in the file: {bent.format(reverse)}"
         return [Finding("planes", "problem", message, 'set "range_type": "orthogonal" in camera.json')]
     if flat >= _LEAST and flat > _LEAD * (ray + reverse):
-        return [Finding("planes", "ok", f"{flat} of {votes.size} planar windows are flat in orthogonal depth")]
+        return [Finding("planes", "ok", f"{flat} of {votes.size} planar windows support orthogonal depth")]
     counts = f"planar windows: {flat} and {ray}"
-    message = f"too few planes for this view to tell orthogonal depth from distance along the ray ({counts})"
+    message = f"too few planes to distinguish orthogonal depth from distance along the ray ({counts})"
     return [Finding("planes", "note", message)]
 
 
 def plane_votes(values: Array, camera: Camera, step: float = 0.0) -> Array:
-    """Return the exponent k that each planar window speaks for: near 0 orthogonal, 1 along the ray, -1 the reverse.
+    """Estimate the exponent k of each planar window: near 0 orthogonal, 1 along the ray, -1 the reverse.
 
     Args:
         values: (H, W) positive, in any unit, NaN in holes.
-        camera: of these pixels.
-        step: that the values were rounded to, as a share of them.
+        camera: camera of these pixels.
+        step: rounding step of the values, as a fraction of them.
 
     """
     windows = _windows(values, camera)
@@ -111,16 +111,16 @@ def plane_votes(values: Array, camera: Camera, step: float = 0.0) -> Array:
 
 
 def _windows(values: Array, camera: Camera) -> Windows:
-    """Return the windows of a map of which enough is known."""
-    known = np.isfinite(values)
-    inverse = np.where(known, np.nanmedian(values) / values, 0).clip(max=_LARGEST)
+    """Return the windows of a map that have enough valid pixels."""
+    valid = np.isfinite(values)
+    inverse = np.where(valid, np.nanmedian(values) / values, 0).clip(max=_LARGEST)
     tops, lefts, sizes = _places(*values.shape)
     ends = np.round(np.arange(_CELLS + 1) * sizes[:, None] / _CELLS).astype(int)
     rows, columns = tops[:, None] + ends, lefts[:, None] + ends
     area = np.diff(rows)[:, :, None] * np.diff(columns)[:, None, :]
-    count = _totals(known.astype(np.float64), rows, columns)
+    count = _totals(valid.astype(np.float64), rows, columns)
     whole = count > _WHOLE * area
-    enough = whole.mean(axis=(1, 2)) > _KNOWN
+    enough = whole.mean(axis=(1, 2)) > _MIN_VALID
     rows, columns, whole, count = rows[enough], columns[enough], whole[enough], count[enough]
     means = np.where(whole, _totals(inverse, rows, columns) / np.maximum(count, 1), 0)
     v, u = (((part[:, 1:] + part[:, :-1]) - 1) / 2 for part in (rows, columns))
@@ -136,10 +136,10 @@ def _windows(values: Array, camera: Camera) -> Windows:
 
 
 def _places(height: int, width: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return first rows, first columns and sizes of windows that overlap by half."""
+    """Return the first rows, first columns and sizes of windows that overlap by half."""
     found = []
-    for share in _SIZES:
-        size = int(min(height, width) * share)
+    for fraction in _SIZES:
+        size = int(min(height, width) * fraction)
         if size >= _CELLS:
             tops, lefts = (
                 np.linspace(0, n - size, round(2 * (n - size) / size) + 1).astype(int) for n in (height, width)
@@ -150,34 +150,35 @@ def _places(height: int, width: int) -> tuple[np.ndarray, np.ndarray, np.ndarray
 
 
 def _totals(values: Array, rows: np.ndarray, columns: np.ndarray) -> Array:
-    """Return the sums over the cells between rows (N, n + 1) and columns (N, n + 1), shape (N, n, n)."""
+    """Return the sums over the cells with borders at rows (N, n + 1) and columns (N, n + 1), (N, n, n)."""
     sums = np.pad(values.cumsum(axis=0).cumsum(axis=1), ((1, 0), (1, 0)))
     totals: Array = np.diff(np.diff(sums[rows[:, :, None], columns[:, None, :]], axis=1), axis=2)
     return totals
 
 
 def _robust_fit(columns: Array, windows: Windows) -> tuple[Array, Array]:
-    """Return coefficients (N, 4), and weights (N, cells) of 1 for the cells that they explain and 0 for others.
+    """Return coefficients (N, 4), and weights (N, cells), 1 for inliers and 0 for outliers.
 
-    Least absolute deviations first, which up to half of the cells may contradict, then Tukey's biweight.
+    The first iterations minimise absolute deviations, which tolerates up to half of the cells as outliers; the others
+    use Tukey's biweight.
     """
-    known = windows.known.astype(np.float64)
-    weight = known
+    valid = windows.valid.astype(np.float64)
+    weight = valid
     for iteration in range(_ITERATIONS):
         size = np.abs(windows.inverse - _product(columns, _solve(columns, weight, windows.inverse)))
-        ratio = size / _deviation(size, windows.known)
+        ratio = size / _deviation(size, windows.valid)
         absolute = iteration < _ITERATIONS // 2
-        weight = known * (
+        weight = valid * (
             1 / np.maximum(ratio, 0.05) if absolute else np.square((1 - np.square(ratio / 4)).clip(min=0))
         )
     fit = _solve(columns, weight, windows.inverse)
     size = np.abs(windows.inverse - _product(columns, fit))
-    return fit, known * (size < 3 * _deviation(size, windows.known))
+    return fit, valid * (size < 3 * _deviation(size, windows.valid))
 
 
-def _deviation(size: Array, known: np.ndarray) -> Array:
-    """Return the standard deviation that the median of absolute residuals implies, (N, 1)."""
-    return 1.4826 * np.nanmedian(np.where(known, size, np.nan), axis=1, keepdims=True) + _EXACT
+def _deviation(size: Array, valid: np.ndarray) -> Array:
+    """Estimate the standard deviation from the median absolute residual, (N, 1)."""
+    return 1.4826 * np.nanmedian(np.where(valid, size, np.nan), axis=1, keepdims=True) + _EXACT
 
 
 def _solve(columns: Array, weight: Array, target: Array) -> Array:

@@ -1,9 +1,9 @@
-"""Whether depth is fine enough for a surface: rounded values make terraces, whose steps tilt the normals.
+"""Check of the rounding of depth, which turns smooth surfaces into terraces and tilts the normals at their steps.
 
-Rounded values are multiples of a unit, in depth, in inverse depth (as disparity) or in distance along the ray. That
-alone may be so by construction, as of the rows of a level floor; where it was rounding, the slope of a smooth surface
-jitters by one unit from pixel to pixel. Values that were rounded and then changed are no multiples any more, but still
-stay exactly equal for some pixels of a slope and then step, which those of other surfaces do not.
+Rounded values are multiples of a unit, in depth, in inverse depth (as disparity) or in distance along the ray. Values
+may also be multiples of a unit by construction, such as those of the rows of a level floor. If they were rounded, the
+slope of a smooth surface changes by one unit from pixel to pixel. Values that were processed after rounding are no
+longer multiples, but along a slope they are still exactly equal for some pixels and then step.
 """
 
 from __future__ import annotations
@@ -21,33 +21,33 @@ from dsr.sample import Scene
 Quantity = Literal["depth", "inverse depth", "distance along the ray"]
 
 _JUMP = 0.03
-"""Relative: a larger difference of neighbours is an edge, no step of a slope."""
+"""Relative difference of neighbouring pixels beyond which they are an edge."""
 _SAME = 3e-7
-"""Relative: what a conversion in single precision may change."""
+"""Largest relative error of a conversion in single precision."""
 _LEVELS = 4
-"""Gaps between values to judge by."""
+"""Minimum number of gaps between values."""
 _MULTIPLES = 0.95
-"""Share of the gaps between values that have to be multiples of the unit."""
+"""Minimum fraction of the gaps between values that are multiples of the unit."""
 _JITTER, _OF_ALL = 0.01, 0.5
-"""Shares of the smooth pixels, and of those whose slope changes, where it does so by one or two units."""
+"""Minimum fractions, of smooth pixels and of those whose slope changes, with a change of one or two units."""
 _TERRACED, _SPREAD = 0.2, 0.02
-"""Shares of the slopes, and of all smooth pixels, that have to be terraced where no unit shows."""
+"""Minimum fractions of terraced pixels, of the slopes and of all smooth pixels, if no unit is found."""
 _TILT, _STEEP = 3.0, 20.0
-"""Degrees that one step may tilt a normal: beyond the first the renderings show it, beyond the second little else."""
+"""Tilt of a normal by one step, in degrees, that becomes visible in renderings, and that dominates them."""
 _LEAST = 100
-"""Pixels to judge by."""
+"""Minimum number of pixels."""
 _REPEATED = (8, 6, 5, 4, 3, 2)
 
 
 @dataclass(frozen=True)
 class Rounding:
-    """What the values of a depth map were rounded to.
+    """The rounding of a depth map.
 
     Args:
-        quantity: that was rounded.
-        step: in metres, of inverse depth in 1 / m.
-        relative: the step as a share of the median value.
-        tilt: by which one step tilts a surface that faces the camera, in degrees, at the median depth.
+        quantity: quantity that was rounded.
+        step: rounding step in metres, of inverse depth in 1 / m.
+        relative: the step as a fraction of the median value.
+        tilt: tilt in degrees that one step causes on a surface that faces the camera at the median depth.
 
     """
 
@@ -58,17 +58,17 @@ class Rounding:
 
 
 def check_precision(scene: Scene) -> list[Finding]:
-    """Return whether the depth was rounded so much that it shows.
+    """Check whether the rounding of the depth is visible in renderings.
 
     Args:
-        scene: with high-resolution depth.
+        scene: scene with high-resolution depth.
 
     """
     depth = metres(scene)
-    factor = repeated(depth)
+    factor = find_repetition(depth)
     if factor > 1:
-        message = f"every value is repeated {factor} times across and down: a smaller map, enlarged"
-        advice = f"give the smaller map itself, as depth_lr{factor}, or find the high-resolution one"
+        message = f"every value is repeated {factor} times across and down: an enlarged smaller map"
+        advice = f"provide the smaller map as depth_lr{factor}, or the original high-resolution map"
         return [Finding("precision", "problem", message, advice)]
     rounding = find_rounding(scene)
     count = np.unique(depth[np.isfinite(depth)]).size
@@ -79,12 +79,12 @@ def check_precision(scene: Scene) -> list[Finding]:
     if rounding.tilt <= _TILT:
         return [Finding("precision", "ok", text)]
     level: Level = "problem" if rounding.tilt > _STEEP else "warning"
-    advice = "find the unrounded map (float, or 16 bits of a smaller unit); normals and renderings of this one mislead"
-    return [Finding("precision", level, f"{text}, which renderings show as terraces", advice)]
+    advice = "use the unrounded map (float, or 16 bits of a smaller unit); normals and renderings of this map are wrong"
+    return [Finding("precision", level, f"{text}, visible as terraces in renderings", advice)]
 
 
 def find_rounding(scene: Scene) -> Rounding | None:
-    """Return what the depth of a scene was rounded to, None where it does not look rounded."""
+    """Return the rounding of a scene's depth, or None if it does not look rounded."""
     depth, camera = metres(scene), scene.camera
     quantities: dict[Quantity, Array] = {
         "depth": depth,
@@ -101,8 +101,8 @@ def find_rounding(scene: Scene) -> Rounding | None:
     return Rounding(quantity, step, relative, tilt)
 
 
-def repeated(depth: Array) -> int:
-    """Return how many times each value of a map is repeated across and down, 1 for a map that is not enlarged."""
+def find_repetition(depth: Array) -> int:
+    """Return the factor by which a map was enlarged by repeating pixels, 1 for a map that was not."""
     for factor in _REPEATED:
         if all(_in_phase(lines, factor) for lines in (depth, depth.T)):
             return factor
@@ -110,7 +110,7 @@ def repeated(depth: Array) -> int:
 
 
 def _in_phase(lines: Array, factor: int) -> bool:
-    """Return whether values change along the lines at every ``factor``-th pixel alone."""
+    """Return whether values along the lines change only at every ``factor``-th pixel."""
     change = np.diff(lines)
     counts = (np.isfinite(change) & (change != 0)).sum(axis=0)
     phases = np.bincount(np.arange(counts.size) % factor, counts, minlength=factor)
@@ -119,7 +119,7 @@ def _in_phase(lines: Array, factor: int) -> bool:
 
 
 def _unit(values: Array) -> float:
-    """Return what all values are multiples of, up to an offset; 0 where there is nothing."""
+    """Return the unit that all values are multiples of, up to an offset; 0 if there is none."""
     levels = np.unique(values[np.isfinite(values)])
     gaps = np.diff(levels)
     gaps = gaps[gaps > _SAME * levels[1:]]
@@ -132,7 +132,7 @@ def _unit(values: Array) -> float:
 
 
 def _jitters(values: Array, unit: float) -> bool:
-    """Return whether slopes change from pixel to pixel by one or two units, and seldom otherwise."""
+    """Return whether most changes of slope between pixels are of one or two units."""
     smooth = jitter = bent = 0
     for lines in (values, values.T):
         before, after = np.diff(lines[:, :-1]), np.diff(lines[:, 1:])
@@ -147,7 +147,7 @@ def _jitters(values: Array, unit: float) -> bool:
 
 
 def _terrace(depth: Array) -> float:
-    """Return the size of the smaller steps of slopes that rise in steps; 0 where they do not."""
+    """Return the size of the smaller steps of terraced slopes; 0 if slopes are not terraced."""
     steps, slopes, smooth = [], 0, 0
     for lines in (depth, depth.T):
         before, after = np.diff(lines[:, :-1]), np.diff(lines[:, 1:])
@@ -163,10 +163,10 @@ def _terrace(depth: Array) -> float:
 
 
 def _source(scene: Scene, depth: Array, rounding: Rounding) -> str:
-    """Return what the values look like: half precision, or steps of some size."""
-    known = depth[np.isfinite(depth)]
-    if known.max() < 6e4 and np.array_equal(known.astype(np.float16).astype(np.float64), known):
-        return "values of half precision (float16)"
+    """Describe the rounding: half precision, or the size of the steps."""
+    valid = depth[np.isfinite(depth)]
+    if valid.max() < 6e4 and np.array_equal(valid.astype(np.float16).astype(np.float64), valid):
+        return "values have half precision (float16)"
     if rounding.quantity != "inverse depth":
         return f"{rounding.quantity} comes in steps of {length(rounding.step)}"
     if scene.camera.baseline is None:

@@ -1,8 +1,8 @@
-"""Whether photo and depth fit each other: edges of the depth have to lie on edges of the photo.
+"""Check of the registration of photo and depth: edges of the depth should coincide with edges of the photo.
 
-Where depth jumps between two neighbouring pixels, the photo's gradient in the same direction is looked up, for every
-shift of the photo within a window. A photo that belongs to the depth has one shift that stands out; how much it has to
-is measured by tiles of the image, as the pixels of one contour are no independent witnesses.
+At each jump of depth between two neighbouring pixels, the photo's gradient in the same direction is read, for every
+shift of the photo within a window. If photo and depth belong together, the mean gradient has a distinct maximum at one
+shift. Its significance is estimated from tiles of the image, because the pixels of a contour are correlated.
 """
 
 from __future__ import annotations
@@ -19,24 +19,24 @@ from dsr.doctor.finding import Array, Finding, metres
 from dsr.sample import Scene
 
 _JUMP = 0.03
-"""Relative difference of neighbouring depths that makes an edge."""
+"""Relative difference of neighbouring depths that counts as an edge."""
 _WORKING_SIZE = 800
-_REACH = 16 / 512
-"""Of the window of shifts, as a share of the size."""
+_MAX_SHIFT = 16 / 512
+"""Largest shift as a fraction of the size."""
 _SHIFT = 3
-"""Working pixels that photo and depth may be apart."""
+"""Shift between photo and depth that is reported, in working pixels."""
 _TILE = 32
 _LEAST_EDGES, _LEAST_TILES, _MOST_EDGES = 300, 12, 20_000
 _ABOVE_CHANCE, _ABOVE_OTHERS, _ABOVE_ZERO = 2.8, 2.0, 2.5
-"""Standard errors by which the best shift has to exceed the median of all, the best one elsewhere, and no shift."""
+"""Standard errors by which the best shift must exceed the median of all, the best other one, and no shift."""
 _EXPECTED = 0.7
-"""Of the second, for a best shift where one expects it."""
+"""Factor of the second threshold for a shift below ``_SHIFT``."""
 _STRICTER = 1.5
-"""Times as many for a photo that is turned, as three turns are tried."""
+"""Factor of the thresholds for a flipped photo, because three flips are tried."""
 _CONTRAST = 1.3
-"""Ratio of the gradients at the best shift and at the median one."""
+"""Minimum ratio of the gradients at the best shift and at the median one."""
 _APART = 4
-"""Pixels from the best shift to one elsewhere."""
+"""Minimum distance in pixels of another shift from the best one."""
 _TURNS: dict[str, Callable[[Array], Array]] = {
     "mirrored left to right": lambda photo: photo[:, :, ::-1],
     "mirrored top to bottom": lambda photo: photo[:, ::-1],
@@ -49,8 +49,8 @@ class Edges:
     """The edges of a depth map, half a pixel right of and half a pixel below some pixels.
 
     Args:
-        right: (2, N) rows and columns of pixels whose neighbour to the right is at another depth.
-        below: (2, N) of those whose neighbour below is.
+        right: (2, N) rows and columns of pixels whose right neighbour has another depth.
+        below: (2, N) rows and columns of pixels whose neighbour below has another depth.
 
     """
 
@@ -58,19 +58,19 @@ class Edges:
     below: NDArray[np.intp]
 
     def tiles(self) -> NDArray[np.intp]:
-        """Return the tile of each edge, those right first; counted from 0."""
+        """Return the index of the tile of each edge, first of ``right``, then of ``below``."""
         rows, columns = np.concatenate((self.right, self.below), axis=1) // _TILE
         return np.unique(np.stack((rows, columns)), axis=1, return_inverse=True)[1].ravel()
 
 
 @dataclass(frozen=True)
 class Match:
-    """Where the photo's edges lie.
+    """The best shift between the edges of depth and photo.
 
     Args:
-        right, down: pixels from the depth's edges to the photo's.
-        found: whether this shift stands out.
-        needed: whether it fits clearly better than no shift.
+        right, down: pixels from the depth edges to the photo's edges.
+        found: whether this shift is significantly better than others.
+        needed: whether it is significantly better than no shift.
 
     """
 
@@ -81,62 +81,66 @@ class Match:
 
 
 def check_registration(scene: Scene) -> list[Finding]:
-    """Return whether the photo's edges lie on the depth's.
+    """Check whether the photo's edges coincide with the depth edges.
 
     Args:
-        scene: with high-resolution depth.
+        scene: scene with high-resolution depth.
 
     """
     every = math.ceil(max(scene.camera.height, scene.camera.width) / _WORKING_SIZE)
-    depth, photo = _reduced(scene, every)
-    reach = max(round(max(depth.shape) * _REACH), _APART)
-    edges = _edges(depth, reach)
+    depth, photo = _reduce(scene, every)
+    radius = max(round(max(depth.shape) * _MAX_SHIFT), _APART)
+    edges = _find_edges(depth, radius)
     tiles = edges.tiles()
     if tiles.size < _LEAST_EDGES or tiles.max() + 1 < _LEAST_TILES:
-        return [Finding("registration", "note", f"not enough depth edges to tell ({tiles.size} pixels)")]
-    match = best_match(edges, photo, reach)
+        return [Finding("registration", "note", f"not enough depth edges for this check ({tiles.size} pixels)")]
+    match = best_match(edges, photo, radius)
     if match.found:
-        return [_placed(match, every)]
+        return [_report(match, every)]
     for name, turn in _TURNS.items():
-        if best_match(edges, turn(photo), reach, _STRICTER).found:
-            advice = "turn the photo, or the depth, so that both show the same"
-            return [Finding("registration", "problem", f"the photo is {name} against the depth", advice)]
-    message = f"at no shift within {reach * every} px do the photo's edges lie on the depth's"
-    return [Finding("registration", "note", message, "see whether they belong together; noisy depth hides it, too")]
+        if best_match(edges, turn(photo), radius, _STRICTER).found:
+            advice = "flip or rotate the photo or the depth"
+            return [Finding("registration", "problem", f"the photo is {name} relative to the depth", advice)]
+    message = f"the photo's edges match the depth edges at no shift within {radius * every} px"
+    return [
+        Finding(
+            "registration", "note", message, "check that they belong together; noisy depth can have the same effect"
+        )
+    ]
 
 
-def best_match(edges: Edges, photo: Array, reach: int, strictness: float = 1.0) -> Match:
-    """Return the shift of the photo, up to ``reach`` pixels, whose gradients are largest at the depth's edges.
+def best_match(edges: Edges, photo: Array, radius: int, strictness: float = 1.0) -> Match:
+    """Return the shift of the photo, up to ``radius`` pixels, with the largest gradients at the depth edges.
 
     Args:
-        edges: at least ``reach`` pixels from the border.
+        edges: depth edges at least ``radius`` pixels from the border.
         photo: (3, H, W).
-        reach: in pixels.
-        strictness: factor of how clearly a shift has to stand out.
+        radius: largest shift in pixels.
+        strictness: factor of the thresholds.
 
     """
-    sums, counts = _sums(edges, photo, reach)
+    sums, counts = _sum_gradients(edges, photo, radius)
     mean = sums.sum(axis=0) / counts.sum()
     row, column = np.unravel_index(mean.argmax(), mean.shape)
     elsewhere = mean.copy()
     elsewhere[max(row - _APART, 0) : row + _APART + 1, max(column - _APART, 0) : column + _APART + 1] = -1
     best, median = sums[:, row, column], float(np.median(mean))
     other = sums[(slice(None), *np.unravel_index(elsewhere.argmax(), mean.shape))]
-    down, right = int(row) - reach, int(column) - reach
+    down, right = int(row) - radius, int(column) - radius
     expected = _EXPECTED if max(abs(down), abs(right)) < _SHIFT else 1.0
     found = (
         mean[row, column] > _CONTRAST * median
         and _errors(best - median * counts) > strictness * _ABOVE_CHANCE
         and _errors(best - other) > strictness * expected * _ABOVE_OTHERS
-        and max(abs(down), abs(right)) < reach
+        and max(abs(down), abs(right)) < radius
     )
-    return Match(right, down, bool(found), bool(_errors(best - sums[:, reach, reach]) > _ABOVE_ZERO))
+    return Match(right, down, bool(found), bool(_errors(best - sums[:, radius, radius]) > _ABOVE_ZERO))
 
 
-def _sums(edges: Edges, photo: Array, reach: int) -> tuple[Array, Array]:
-    """Return the gradients at the edges, summed by tile and shift down and right, and the number of edges by tile."""
+def _sum_gradients(edges: Edges, photo: Array, radius: int) -> tuple[Array, Array]:
+    """Return the gradients at the edges, summed by tile and by shift down and right, and the edges per tile."""
     tiles = edges.tiles()
-    count, shifts = int(tiles.max()) + 1, range(-reach, reach + 1)
+    count, shifts = int(tiles.max()) + 1, range(-radius, radius + 1)
     sums = np.zeros((count, len(shifts), len(shifts)))
     parts = np.split(tiles, [edges.right.shape[1]])
     for (rows, columns), own, gradient in zip((edges.right, edges.below), parts, _gradients(photo), strict=True):
@@ -151,12 +155,12 @@ def _sums(edges: Edges, photo: Array, reach: int) -> tuple[Array, Array]:
 
 
 def _errors(gains: Array) -> float:
-    """Return the sum over the tiles in standard errors."""
+    """Return the sum over the tiles, in standard errors."""
     return float(gains.sum() / max(np.sqrt(np.square(gains).sum()), 1e-12))
 
 
-def _reduced(scene: Scene, every: int) -> tuple[Array, Array]:
-    """Return depth and photo, reduced by a factor; the depth by its pixels, so that its edges stay sharp."""
+def _reduce(scene: Scene, every: int) -> tuple[Array, Array]:
+    """Return depth and photo reduced by a factor; depth is subsampled, which keeps its edges sharp."""
     photo = scene.rgb.double().numpy()
     height, width = (size // every for size in photo.shape[1:])
     blocks = photo[:, : height * every, : width * every].reshape(3, height, every, width, every)
@@ -164,8 +168,8 @@ def _reduced(scene: Scene, every: int) -> tuple[Array, Array]:
     return depth, blocks.mean(axis=(2, 4))
 
 
-def _edges(depth: Array, margin: int) -> Edges:
-    """Return where depth jumps, away from holes and the border; of very many edges every n-th."""
+def _find_edges(depth: Array, margin: int) -> Edges:
+    """Return the jumps of depth away from holes and the border; a regular subset if there are very many."""
     safe = ~ndimage.binary_dilation(np.isnan(depth), iterations=2)
     safe[:margin] = safe[-margin:] = safe[:, :margin] = safe[:, -margin:] = False
     found = []
@@ -180,22 +184,24 @@ def _edges(depth: Array, margin: int) -> Edges:
 
 
 def _gradients(photo: Array) -> tuple[Array, Array]:
-    """Return the largest gradient of the channels to the right and below, as a multiple of its local mean, up to 4."""
+    """Return the largest gradients of the channels to the right and down, relative to their local mean, up to 4."""
     smooth = ndimage.gaussian_filter(photo, (0, 0.7, 0.7))
     right, below = (np.abs(np.diff(smooth, axis=axis)).max(axis=0) for axis in (2, 1))
     ratios = [np.minimum(gradient / (ndimage.uniform_filter(gradient, 31) + 0.01), 4) for gradient in (right, below)]
     return ratios[0], ratios[1]
 
 
-def _placed(match: Match, every: int) -> Finding:
-    """Return how well photo and depth fit, given the shift between them."""
+def _report(match: Match, every: int) -> Finding:
+    """Return the finding for a shift between photo and depth."""
     across = f"{abs(match.right) * every} px {'left' if match.right < 0 else 'right'}"
     down = f"{abs(match.down) * every} px {'above' if match.down < 0 else 'below'}"
     shifted = bool(match.right or match.down)
     text = (
-        f"the photo's edges lie {across}, {down} of the depth's" if shifted else "the photo's edges lie on the depth's"
+        f"the photo's edges are {across}, {down} of the depth edges"
+        if shifted
+        else "the photo's edges match the depth edges"
     )
     if max(abs(match.right), abs(match.down)) < _SHIFT or not match.needed:
         return Finding("registration", "ok", text)
-    advice = "shift one of them; look for a crop, a resize or a lens correction that only one of them had"
+    advice = "shift one of them; check for a crop, a resize or a lens correction applied to only one of them"
     return Finding("registration", "warning", text, advice)

@@ -1,4 +1,4 @@
-"""Whether depth is in metres: distances that no room or table has come from another unit, and often tell which."""
+"""Check that depth is in metres: implausible distances indicate another unit, and often which one."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from dsr.doctor.finding import Array, Finding, Level, length, metres
 from dsr.sample import Scene
 
 _NEAREST, _FARTHEST = 0.05, 200.0
-"""Metres: depth that lies below or beyond as a whole is in another unit."""
+"""Metres; depth entirely below or above is in another unit."""
 _NEAR, _FAR = 0.1, 30.0
-"""Metres: a median below is macro photography, one beyond is outdoors; or both are in another unit."""
+"""Metres; a median below suggests macro photography, one above outdoors, or another unit."""
 _TYPICAL = (0.4, 8.0)
-"""Metres: where the median of a room or a table lies."""
+"""Metres; range of the median depth of a room or a table."""
 _FACTORS: tuple[tuple[float, str], ...] = (
     (1e-3, "millimetres read as metres"),
     (1e3, "metres read as millimetres"),
@@ -23,18 +23,18 @@ _FACTORS: tuple[tuple[float, str], ...] = (
     (1 / 8, "SUN RGB-D's values read without turning them by three bits"),
     (1 / 256, "values of 1/256 m, as KITTI stores them, read as metres"),
 )
-"""From the likeliest down."""
+"""Most likely first."""
 _BASELINES = (1e-3, 5.0)
-"""Metres between two cameras."""
+"""Plausible range of baselines in metres."""
 _AGREEMENT = 1.25
-"""Ratio of measured and high-resolution depth beyond which they disagree."""
+"""Largest ratio of measured and high-resolution depth."""
 
 
 def check_units(scene: Scene) -> list[Finding]:
-    """Return whether depth, baseline and measured maps are as far and as wide as metres are.
+    """Check whether depth, baseline and measured maps are plausible in metres.
 
     Args:
-        scene: with high-resolution depth.
+        scene: scene with high-resolution depth.
 
     """
     depth = metres(scene)
@@ -47,13 +47,13 @@ def check_units(scene: Scene) -> list[Finding]:
     elif middle < _NEAR or middle > _FARTHEST:
         level, remark = "warning", f": {'nearer' if middle < _NEAR else 'farther'} than most rooms and tables"
     elif middle > _FAR:
-        level, remark = "note", ": too far for a room, right for outdoors"
-    findings = [Finding("units", level, text + remark, "" if level == "ok" else _cure(scene, middle))]
+        level, remark = "note", ": too far for a room, plausible outdoors"
+    findings = [Finding("units", level, text + remark, "" if level == "ok" else _advise(scene, middle))]
     return findings + _baseline(scene) + _measured(scene, depth)
 
 
-def _cure(scene: Scene, middle: float) -> str:
-    """Return which factors make a median depth plausible."""
+def _advise(scene: Scene, middle: float) -> str:
+    """Return the factors that make a median depth plausible."""
     fitting = [(factor, why) for factor, why in _FACTORS if _TYPICAL[0] <= middle * factor <= _TYPICAL[1]]
     if not fitting:
         return "check the unit"
@@ -70,29 +70,29 @@ def _plausible_baseline(baseline: float) -> bool:
 
 
 def _baseline(scene: Scene) -> list[Finding]:
-    """Return what is odd about the distance between the cameras."""
+    """Check whether the baseline is plausible."""
     baseline = scene.camera.baseline
     if baseline is None or _plausible_baseline(baseline):
         return []
     low, high = (length(limit) for limit in _BASELINES)
-    message = f"baseline {length(baseline)}, usual are {low} to {high}"
-    advice = 'check "baseline_unit" in camera.json; leave it where depth, if computed from it, is plausible'
+    message = f"baseline {length(baseline)}; {low} to {high} are usual"
+    advice = 'check "baseline_unit" in camera.json; keep it if depth computed from it is plausible'
     return [Finding("units", "note", message, advice)]
 
 
 def _measured(scene: Scene, depth: Array) -> list[Finding]:
-    """Return where a measured low-resolution map disagrees with the high-resolution one."""
+    """Check the measured low-resolution maps against the high-resolution depth."""
     findings = []
-    for factor, coarse in sorted(scene.measured.items()):
-        values = coarse[0].double().numpy()
-        fine = depth[factor // 2 :: factor, factor // 2 :: factor][: values.shape[0], : values.shape[1]]
-        values = values[: fine.shape[0], : fine.shape[1]]
-        both = np.isfinite(fine) & np.isfinite(values)
+    for factor, measured in sorted(scene.measured.items()):
+        depth_lr = measured[0].double().numpy()
+        subsampled = depth[factor // 2 :: factor, factor // 2 :: factor][: depth_lr.shape[0], : depth_lr.shape[1]]
+        depth_lr = depth_lr[: subsampled.shape[0], : subsampled.shape[1]]
+        both = np.isfinite(subsampled) & np.isfinite(depth_lr)
         if not both.any():
             continue
-        ratio = float(np.median(values[both] / fine[both]))
+        ratio = float(np.median(depth_lr[both] / subsampled[both]))
         if not 1 / _AGREEMENT <= ratio <= _AGREEMENT:
             message = f"the measured map at x{factor} is {ratio:.3g} times as far as the high-resolution depth"
-            advice = "give both in one unit; the disparity of a low-resolution map is in pixels of its own"
+            advice = "use one unit for both; the disparity of a low-resolution map is in its own pixels"
             findings.append(Finding("units", "problem", message, advice))
     return findings
