@@ -1,4 +1,4 @@
-"""What surrounds the optimisation of one image: its checkpoints, and what it will cost."""
+"""Checkpoints of the optimisation of one image, and its cost."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from dsr.utils.lightning import save_checkpoint
 
 _SECONDS_BETWEEN_CHECKPOINTS = 60.0
 _TEMPORARY = 1.6
-"""What a step needs at its peak, relative to what the forward pass keeps for the backward pass; measured."""
+"""Measured ratio of the peak memory of a step to the memory that the forward pass saves for the backward pass."""
 
 
 class Provenance(Callback):
-    """Keeps in each checkpoint what it came from."""
+    """Stores a digest of the problem and the settings in each checkpoint."""
 
     def __init__(self, origin: str) -> None:
         self._origin = origin
@@ -28,7 +28,7 @@ class Provenance(Callback):
     def on_save_checkpoint(
         self, trainer: lightning.Trainer, pl_module: lightning.LightningModule, checkpoint: dict[str, Any]
     ) -> None:
-        """Write it down."""
+        """Store the digest."""
         checkpoint["origin"] = self._origin
 
 
@@ -39,7 +39,7 @@ class Keep(Callback):
         self._path, self._last = path, time.monotonic()
 
     def on_train_batch_end(self, trainer: lightning.Trainer, *_: Any) -> None:
-        """Save if it is time."""
+        """Save a checkpoint if a minute has passed."""
         now = time.monotonic()
         if now - self._last > _SECONDS_BETWEEN_CHECKPOINTS:
             self._last = now
@@ -47,7 +47,7 @@ class Keep(Callback):
 
 
 def cost_of_step(module: PriorOptimisation) -> tuple[float, float]:
-    """Return the seconds of a step, and the bytes that it and the optimiser need; the module is left as it was."""
+    """Measure the seconds of a step and the bytes that it and the optimiser need; the module stays unchanged."""
     state, taken = module.generator.get_state(), 0.0
     kept: dict[int, int] = {}
 
@@ -70,7 +70,7 @@ def cost_of_step(module: PriorOptimisation) -> tuple[float, float]:
 
 
 def checkpoint_of(path: Path, origin: str) -> Path | None:
-    """Return the checkpoint if there is one that came from the same problem and settings."""
+    """Return the path if it holds a checkpoint of the same problem and settings, else None."""
     if not path.is_file():
         return None
     try:

@@ -27,17 +27,17 @@ class PriorSettings:
     """The network, its input and its optimiser.
 
     Args:
-        steps: at most.
-        learning_rate: of Adam.
-        widths, skips: of the network's levels, see :class:`~dsr.methods.dip.skip_net.SkipNet`; a small image has fewer.
-        padding: of its convolutions.
-        border: pixels by which the network's image is larger on each side, filled with the mirrored photo and cut off
-            again: no pixel of the answer lies at a border.
-        guide: whether the photo is part of the network's input, beside 32 channels of noise.
-        input_noise: the fixed noise is U[0, input_noise].
-        perturbation, guide_perturbation: standard deviation of what is added to noise and photo, anew each step.
+        steps: maximum number of steps.
+        learning_rate: learning rate of Adam.
+        widths, skips: channels by level, see :class:`~dsr.methods.dip.skip_net.SkipNet`; small images use fewer levels.
+        padding: padding of the convolutions.
+        border: pixels that are added on each side by reflection and cropped from the output, to avoid border effects.
+        guide: whether the RGB image is part of the network's input, besides 32 channels of noise.
+        input_noise: upper limit of the uniform input noise, which is fixed.
+        perturbation, guide_perturbation: standard deviations of the noise added to the input noise and to the image in
+            each step.
         average: decay of the exponential moving average of the depth maps.
-        margin: by how much depth may leave the low-resolution map's range, as a share of it.
+        margin: extension of the depth range beyond the low-resolution map's, as a fraction of it.
         mixed: whether convolutions run in bfloat16.
 
     Raises:
@@ -79,17 +79,17 @@ class PriorSettings:
 
 
 class PriorOptimisation(lightning.LightningModule):
-    """One network for one image.
+    """The optimisation of one network for one image.
 
     Args:
         problem: the image.
         objective: the loss.
-        settings: of the network and the optimiser.
-        stopping: the rule.
-        seed: of the weights, the input and its perturbations.
-        metrics: of a validation pass; None for none.
-        truth: (1, 1, H, W) true depth to validate with, never used by anything else but an oracle; None for none.
-        base: (1, 1, H, W) depth in metres that the network's answer is added to; None for an answer from scratch.
+        settings: settings of the network and the optimiser.
+        stopping: stopping rule.
+        seed: seed of the weights, the input and its perturbations.
+        metrics: metrics of a validation pass; None for none.
+        truth: (1, 1, H, W) true depth for validation, otherwise only used by the oracle; None for none.
+        base: (1, 1, H, W) initial depth in metres that the network's output is added to; None for none.
 
     """
 
@@ -113,7 +113,7 @@ class PriorOptimisation(lightning.LightningModule):
         self.metrics, self.truth, self.base = metrics, truth, base
         self.validation_scores: dict[str, dict[str, float]] = {}
         device, size = problem.rgb.device, problem.rgb.shape[-2:]
-        self._border = min(settings.border, min(size) - 1)  # what mirroring has pixels for
+        self._border = min(settings.border, min(size) - 1)  # reflection needs as many pixels
         self.generator = torch.Generator(device).manual_seed(seed)
         with torch.random.fork_rng([]):
             torch.manual_seed(seed)
@@ -128,7 +128,7 @@ class PriorOptimisation(lightning.LightningModule):
         self.register_buffer("average", torch.zeros_like(problem.grey))
 
     def training_step(self, _: Any, __: int) -> Tensor:
-        """Return the loss of this step's depth map, which joins the average."""
+        """Return the loss of this step's depth map, and update the average."""
         depth, intensity = self.answer()
         terms = self.objective(depth, intensity, self.problem)
         self.log_dict({f"train/{name}": value.detach() for name, value in terms.items()}, batch_size=1)
@@ -140,7 +140,7 @@ class PriorOptimisation(lightning.LightningModule):
         return terms["loss"]
 
     def answer(self) -> tuple[Tensor, Tensor]:
-        """Return depth in metres and intensity in [0, 1], both (1, 1, H, W), for an input perturbed anew."""
+        """Return depth in metres and intensity in [0, 1], both (1, 1, H, W), for a newly perturbed input."""
         shape, device = self.start.shape, self.start.device
         draws = torch.randn(shape, generator=self.generator, device=device)
         x = torch.addcmul(self.start, draws, self.spread).contiguous(memory_format=torch.channels_last)
@@ -151,11 +151,11 @@ class PriorOptimisation(lightning.LightningModule):
         return self._depth(y[:, :1]), y[:, 1:].sigmoid()
 
     def result(self) -> Tensor:
-        """Return the depth map to answer with, (1, 1, H, W) in metres."""
+        """Return the resulting depth map, (1, 1, H, W) in metres."""
         return self.stopping.result(self.average)
 
     def validation_step(self, _: Any, __: int) -> None:
-        """Score the average so far, where there is a truth, and draw it."""
+        """Score the current average if there is a true depth, and log renderings."""
         depth = self.average
         if self.truth is not None:
             pair = SurfacePair(depth, self.truth, self.problem.rays)
@@ -175,16 +175,16 @@ class PriorOptimisation(lightning.LightningModule):
         return torch.optim.Adam(self.net.parameters(), self.settings.learning_rate, fused=True)
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Keep what is not a parameter: where the random numbers are, and what the stopping rule knows."""
+        """Store the states of the random generator and of the stopping rule."""
         checkpoint["generator"], checkpoint["stopping"] = self.generator.get_state(), self.stopping.state()
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Go on from there."""
+        """Restore the states of the random generator and of the stopping rule."""
         self.generator.set_state(checkpoint["generator"].cpu())
         self.stopping.restore(checkpoint["stopping"])
 
     def _network(self) -> SkipNet:
-        """Return the network; with a base it starts by answering nothing."""
+        """Return the network; with a base its initial depth output is 0."""
         settings = self.settings
         height, width = self.problem.rgb.shape[-2:]
         levels = levels_for(height, width, len(settings.widths))
@@ -196,7 +196,7 @@ class PriorOptimisation(lightning.LightningModule):
         return net
 
     def _depth(self, y: Tensor) -> Tensor:
-        """Return depth in metres for the network's first channel."""
+        """Convert the network's first channel to depth in metres."""
         problem = self.problem
         margin = self.settings.margin * problem.depth_range
         least = max(problem.min_depth - margin, 0.5 * problem.min_depth)

@@ -1,12 +1,12 @@
-"""The untrained network of deep image priors: an hourglass with thin skip connections.
+"""The untrained network of deep image priors: an hourglass with narrow skip connections.
 
-Ulyanov, Vedaldi, Lempitsky, *Deep Image Prior*, CVPR 2018, supplementary material. On the way down each level halves
-the resolution by a strided 3 x 3 convolution and follows it with another; on the way up it doubles it bilinearly, joins
-the few channels of its skip connection and ends in a 3 x 3 and a 1 x 1 convolution. Batch normalisation over the one
+Ulyanov, Vedaldi, Lempitsky, *Deep Image Prior*, CVPR 2018, supplementary material. In the encoder, each level halves
+the resolution by a strided 3 x 3 convolution, followed by another one. In the decoder, each level doubles it
+bilinearly, concatenates the skip connection and applies a 3 x 3 and a 1 x 1 convolution. Batch normalisation over the
 image and a leaky ReLU follow every convolution.
 
-What differs from the original: convolutions are padded with zeros by default, the last one computes in float32 whatever
-the others do, and the widths may differ by level.
+Differences from the original: convolutions are padded with zeros by default, the last one always computes in float32,
+and the widths may differ between levels.
 """
 
 from __future__ import annotations
@@ -20,21 +20,21 @@ from torch import Tensor, nn
 Padding = Literal["zeros", "reflect"]
 _SLOPE = 0.2
 _LEAST = 2
-"""Pixels of the deepest level's shorter side: batch normalisation needs several."""
+"""Minimum shorter side of the deepest level in pixels, for batch normalisation."""
 
 
 class SkipNet(nn.Module):
     """An hourglass with skip connections.
 
     Args:
-        inputs: channels.
-        outputs: channels.
-        widths: channels of each level, from the full resolution down.
+        inputs: number of input channels.
+        outputs: number of output channels.
+        widths: channels of each level, full resolution first.
         skips: channels of each level's skip connection.
-        padding: of the 3 x 3 convolutions, ``zeros`` or ``reflect``; the latter is the original's and slow.
+        padding: padding of the 3 x 3 convolutions, ``zeros``, or ``reflect`` as in the original, which is slow.
 
     Raises:
-        ValueError: there is no level, or another number of skip connections.
+        ValueError: there is no level, or the numbers of widths and skips differ.
 
     """
 
@@ -59,7 +59,7 @@ class SkipNet(nn.Module):
         self.last = nn.Conv2d(widths[0], outputs, 1)
 
     def forward(self, x: Tensor) -> Tensor:
-        """Return (B, outputs, H, W) in float32 at least, for (B, inputs, H, W) of any size that the levels halve."""
+        """Map (B, inputs, H, W) to (B, outputs, H, W), at least in float32."""
         sides: list[Tensor] = []
         for skip, down in zip(self.skip, self.down, strict=True):
             sides.append(skip(x))
@@ -67,12 +67,12 @@ class SkipNet(nn.Module):
         for side, norm, up in zip(reversed(sides), reversed(self.norm), reversed(self.up), strict=True):
             height, width = side.shape[-2:]
             x = up(norm(torch.cat((side, upsample_2x(x)[..., :height, :width]), dim=1)))
-        with torch.autocast(x.device.type, enabled=False):  # in bfloat16 depth would come in 256 steps
+        with torch.autocast(x.device.type, enabled=False):  # bfloat16 would round depth to 256 steps
             return self.last(x.to(self.last.weight.dtype))
 
 
 def levels_for(height: int, width: int, most: int) -> int:
-    """Return how many times an image may be halved for a SkipNet, ``most`` at the most and 1 at least."""
+    """Return the number of levels of a SkipNet for an image size, between 1 and ``most``."""
     levels, side = 0, min(height, width)
     while levels < most and (side := -(-side // 2)) >= _LEAST:
         levels += 1
@@ -80,17 +80,17 @@ def levels_for(height: int, width: int, most: int) -> int:
 
 
 def upsample_2x(x: Tensor) -> Tensor:
-    """Return (B, C, h, w) bilinearly upsampled to (B, C, 2 h, 2 w): pixels as areas, edges repeated."""
+    """Upsample (B, C, h, w) bilinearly to (B, C, 2 h, 2 w), with pixels as areas and border pixels repeated."""
     result: Tensor = _Upsample2x.apply(x)
     return result
 
 
 class _Upsample2x(torch.autograd.Function):
-    """Bilinear upsampling by slices: the library's backward pass takes several times as long on a CPU."""
+    """Bilinear upsampling by slices, whose backward pass is several times as fast as the library's on a CPU."""
 
     @staticmethod
     def forward(ctx: Any, x: Tensor) -> Tensor:
-        """Double both axes, one after the other."""
+        """Upsample along both axes."""
         return _double(_double(x, 2), 3)
 
     @staticmethod
@@ -100,7 +100,7 @@ class _Upsample2x(torch.autograd.Function):
 
 
 def _double(x: Tensor, axis: int) -> Tensor:
-    """Return x with twice as many entries along an axis: a quarter of one neighbour and three of the other."""
+    """Upsample x by 2 along an axis, with weights 1/4 and 3/4 of the two nearest entries."""
     size = x.shape[axis]
     shape = list(x.shape)
     shape[axis] = 2 * size
@@ -138,5 +138,5 @@ def _block(inputs: int, outputs: int, kernel: int, stride: int = 1, padding: Pad
 
 
 def _norm(channels: int) -> nn.BatchNorm2d:
-    """Return a normalisation by the statistics of the image at hand."""
+    """Return a batch normalisation that always uses the statistics of the current image."""
     return nn.BatchNorm2d(channels, track_running_stats=False)

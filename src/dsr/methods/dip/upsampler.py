@@ -1,9 +1,9 @@
 """DIP and DIP-V: depth super-resolution by an untrained network that is optimised for each image.
 
 Ulyanov, Vedaldi, Lempitsky, *Deep Image Prior*, CVPR 2018, guided by the photo and with the visual loss of Voynov et
-al., *Perceptual Deep Depth Super-Resolution*, ICCV 2019, section 4.2. The network's answers are a depth map, whose
-low-resolution version is compared with the input, and the photo's intensities. As holes of the input are compared with
-nothing, they are filled with what the network finds natural.
+al., *Perceptual Deep Depth Super-Resolution*, ICCV 2019, section 4.2. The network outputs a depth map, whose
+low-resolution version is compared with the input, and the photo's intensity. Holes of the input have no data term and
+are inpainted by the network.
 """
 
 from __future__ import annotations
@@ -44,28 +44,28 @@ WORKSPACE = "optimisation"
 class DeepImagePrior:
     """An :class:`~dsr.methods.base.Upsampler` that optimises a network for each image.
 
-    Each image has its own network and its own random numbers, which follow from the seed, the data set, the scene and
-    the scale: whatever else is optimised before it makes no difference.
+    Each image has its own network and its own random numbers, which depend on the seed, the data set, the scene and the
+    scale only, not on other images.
 
     Args:
-        scale: the upsampling factor.
-        downsampling: the model that is assumed to have led to the low-resolution map.
+        scale: upsampling factor.
+        downsampling: assumed downsampling model of the low-resolution map.
         steps, learning_rate, widths, skips, padding, border: see :class:`~dsr.methods.dip.optimisation.PriorSettings`.
         guide, input_noise, perturbation, guide_perturbation, average, margin: the same.
         data_loss, data_weight, w, w_intensity: see :class:`~dsr.methods.dip.problem.PriorObjective`.
-        largest_tilt: degrees; where the noise that is estimated in the low-resolution map tilts its normals by more,
-            they say nothing of the surface, and MSE_v is left out. None for never.
-        stopping: ``fixed``: after ``steps``; ``variance``: at the minimum of the iterates' variance; ``residual``: as
-            soon as the low-resolution map is explained up to its estimated noise; ``oracle``: at the validation pass
-            with the lowest RMSE_v, for which the truth is looked at.
+        largest_tilt: limit in degrees; MSE_v is omitted if the estimated noise of the low-resolution map tilts its
+            normals by more. None for no limit.
+        stopping: ``fixed``: after ``steps``; ``variance``: at the minimum of the iterates' variance; ``residual``: when
+            the residual reaches the estimated noise of the low-resolution map; ``oracle``: at the validation pass with
+            the lowest RMSE_v, which uses the true depth.
         patience: steps without a new minimum until ``variance`` stops.
         validate_every: steps between validation passes, which log scores and renderings; 0 for none.
-        precision: of the convolutions.
-        seed: of all that is random.
-        device: where to compute.
-        metrics: makes the metrics of a validation pass; None for none.
-        workspace: a directory for logs, and for checkpoints to go on from; None for neither.
-        display: shows the steps of an optimisation.
+        precision: dtype of the convolutions.
+        seed: seed of all random numbers.
+        device: device of the computations.
+        metrics: function that returns the metrics of a validation pass; None for none.
+        workspace: directory for logs and checkpoints; None for neither.
+        display: display of the progress.
 
     Raises:
         ValueError: a value is out of range.
@@ -124,23 +124,23 @@ class DeepImagePrior:
 
     @property
     def flag(self) -> str:
-        """What has to stand beside every score: ``oracle`` where the truth was looked at."""
+        """Mark for scores: ``oracle`` if the true depth was used, else empty."""
         return "oracle" if self.stopping == "oracle" else ""
 
     def base(self, sample: DepthSample) -> Tensor | None:
-        """Return the depth that the optimisation starts from, (1, H, W) in metres; None for none."""
+        """Return the initial depth of the optimisation, (1, H, W) in metres; None for none."""
         return None
 
     def __call__(self, sample: DepthSample, progress: Steps | None = None) -> Tensor:
-        """Return the high-resolution orthogonal depth, (1, H, W) in metres on the sample's device; known everywhere.
+        """Return the high-resolution orthogonal depth, (1, H, W) in metres on the sample's device; valid everywhere.
 
         Args:
             sample: the problem.
-            progress: is called with the steps done and their total, unless there is a display.
+            progress: called with the number of steps done and their total, unless there is a display.
 
         Raises:
             ValueError: the optimisation diverged.
-            KeyboardInterrupt: somebody stopped it; with a workspace, a second call goes on from there.
+            KeyboardInterrupt: the user interrupted it; with a workspace, the next call resumes.
 
         """
         with torch.inference_mode(mode=False), torch.enable_grad():
@@ -168,7 +168,7 @@ class DeepImagePrior:
         return depth[0].detach().to(sample.depth_lr)
 
     def module(self, sample: DepthSample) -> tuple[PriorOptimisation, str]:
-        """Return an image's LightningModule, and a digest of all that it works on."""
+        """Return an image's LightningModule, and a digest of its problem and settings."""
         device = torch.device(self.device)
         problem = ImageProblem.of(sample, self.downsampling, self.range_type, device)
         base = self.base(sample)
@@ -193,7 +193,7 @@ class DeepImagePrior:
         return module, digest.hexdigest()
 
     def _normals_count(self, sample: DepthSample) -> bool:
-        """Return whether the low-resolution map's normals are more than noise."""
+        """Return whether noise tilts the low-resolution map's normals by at most ``largest_tilt``."""
         tilt = normal_noise_deg(estimate_noise(sample.depth_lr[None]), sample.camera_lr)
         return self.largest_tilt is None or tilt <= self.largest_tilt
 
@@ -206,7 +206,7 @@ class DeepImagePrior:
         return Oracle() if self.stopping == "oracle" else Fixed()
 
     def _announcement(self, module: PriorOptimisation, scene: str, resumed: bool) -> str:
-        """Return what is about to happen: how many steps, how long, in how much memory."""
+        """Return a line with the number of steps, the expected time and memory."""
         seconds, memory = cost_of_step(module)
         most = "" if self.stopping in ("fixed", "oracle") else "up to "
         height, width = module.problem.grey.shape[-2:]
@@ -242,13 +242,13 @@ class DeepImagePrior:
 
 @dataclass(kw_only=True)
 class WarmStarted(DeepImagePrior):
-    """A deep image prior that starts from a trained network's answer, and adds to it.
+    """A deep image prior that starts from the result of a trained network.
 
     Args:
-        weights: of the network.
-        model: the network's name.
-        **settings: as for :class:`DeepImagePrior`; ``margin`` is the depth that an answer of 1 adds, as a share of the
-            low-resolution map's range.
+        weights: weights file of the network.
+        model: name of the network's model.
+        **settings: as for :class:`DeepImagePrior`; ``margin`` is the depth that an output of 1 adds, as a fraction of
+            the low-resolution map's range.
 
     Raises:
         ValueError: a value is out of range, or the weights are of another network.
@@ -264,18 +264,18 @@ class WarmStarted(DeepImagePrior):
         self._trained = build_trained(Path(self.weights), self.scale, self.model, device=self.device)
 
     def base(self, sample: DepthSample) -> Tensor:
-        """Return the trained network's answer; its holes are filled with the low-resolution map's mean."""
+        """Return the trained network's depth; holes are filled with the low-resolution map's mean."""
         depth = self._trained(sample).clone()
         return torch.where(depth.isfinite(), depth, sample.depth_lr.nanmean())
 
 
 def _noise_of(sample: DepthSample) -> str:
-    """Return the noise that is estimated in a low-resolution map, for a reader."""
+    """Describe the estimated noise of a low-resolution map."""
     noise = estimate_noise(sample.depth_lr[None])
     return f"noise of {noise:.2%} tilts the input's normals by {normal_noise_deg(noise, sample.camera_lr):.0f} degrees"
 
 
 def _numbers(count: int) -> Any:
-    """Return a loader of numbers, one for each step; it leaves the global random numbers alone."""
+    """Return a loader of numbers, one for each step, that does not use the global random generator."""
     numbers: Any = range(count)
     return DataLoader(numbers, batch_size=None, generator=torch.Generator())

@@ -1,4 +1,4 @@
-"""The layers that MSG-Net is made of, fast on the CPU."""
+"""Layers of MSG-Net, optimised for the CPU."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from torch.nn import functional
 
 
 class ConvLayer(nn.Module):
-    """A convolution that keeps the size, or a transposed one that doubles it, and its PReLU."""
+    """A convolution that keeps the size, or a transposed one that doubles it, followed by a PReLU."""
 
     def __init__(self, conv: nn.Conv2d | nn.ConvTranspose2d, slopes: int) -> None:
-        """Put ``slopes`` (1, one per channel, or 0 for none) PReLU parameters behind ``conv``."""
+        """Append a PReLU with ``slopes`` parameters (1, one per channel, or 0 for no PReLU) to ``conv``."""
         super().__init__()
         self.conv = conv
         self.activation = nn.PReLU(slopes) if slopes else nn.Identity()
@@ -22,7 +22,7 @@ class ConvLayer(nn.Module):
         """Map (B, C_in, H, W) to (B, C_out, H', W')."""
         x = self.conv(x)
         if isinstance(self.activation, nn.PReLU) and self.activation.num_parameters == 1:
-            # In place, without a second map of this size, but only where no gradient can ever be asked for.
+            # In place, to save memory, but only in inference mode, where no gradient can be requested.
             if torch.is_inference(x):
                 return functional.leaky_relu_(x, float(self.activation.weight))
             if x.device.type == "cpu":
@@ -31,11 +31,11 @@ class ConvLayer(nn.Module):
 
 
 class _SharedPReLU(torch.autograd.Function):
-    """A PReLU with one slope; its gradient on the CPU takes a fraction of the library's time."""
+    """A PReLU with one slope, whose gradient on the CPU is several times as fast as the library's."""
 
     @staticmethod
     def forward(ctx: Any, x: Tensor, slope: Tensor) -> Tensor:
-        """Return x where it is positive, else slope * x."""
+        """Return x if positive, else slope * x."""
         ctx.save_for_backward(x)
         ctx.slope = float(slope)
         return functional.leaky_relu(x, ctx.slope)
@@ -53,7 +53,7 @@ class Level(nn.Module):
     """One doubling of the resolution: transposed convolution, fusion with the guidance, refinement."""
 
     def __init__(self, up: ConvLayer, fuse: ConvLayer, refine: ConvLayer) -> None:
-        """Take the three layers."""
+        """Store the three layers."""
         super().__init__()
         self.up, self.fuse, self.refine = up, fuse, refine
 

@@ -1,4 +1,4 @@
-"""The variants of MSG-Net, :mod:`dsr.methods.networks.msg_net`, and the guidance that each makes of a photo."""
+"""The variants of MSG-Net, :mod:`dsr.methods.networks.msg_net`, and their guidance maps."""
 
 from __future__ import annotations
 
@@ -17,21 +17,21 @@ VariantName = Literal["hui", "voynov", "dsr"]
 
 @dataclass(frozen=True)
 class MSGVariant:
-    """What tells the published networks and ours, and their inputs, apart.
+    """The differences between the published networks and dsr's, and between their inputs.
 
     Args:
-        name: the variant's name.
-        shared_slopes: each PReLU has a single slope, else one per channel.
-        activate_output: a PReLU follows the reconstruction too.
-        same_size: the output has scale * h rows, else scale * h - 1 (Caffe's transposed convolutions, which know no
+        name: name of the variant.
+        shared_slopes: whether each PReLU has a single slope, else one per channel.
+        activate_output: whether a PReLU follows the reconstruction.
+        same_size: whether the output has scale * h rows, else scale * h - 1 (Caffe's transposed convolutions have no
             output padding), and likewise columns; the guidance has the output's size.
         rgb_weights, rgb_offset: intensity = weights . (R, G, B in 0..255) + offset, clipped to 0..255.
-        plain_guidance: the guidance is the intensity, -1..1, whatever the rest of the photo holds, so that a patch and
-            the whole photo look alike to the network; else see :func:`guidance_map`.
-        depth_gain, residual_gain: factors of the depth that goes in and of the residual that comes out. Small residuals
-            of large activations: a step of the optimiser moves smooth surfaces less.
-        fill_holes: holes of the low-resolution map are filled from around; else they are the least disparity.
-        drift_compensation: the output's mean over a flat probe is taken off the output, see
+        plain_guidance: whether the guidance is the intensity, -1..1, which does not depend on the rest of the image;
+            else see :func:`guidance_map`.
+        depth_gain, residual_gain: factors of the input depth and of the output residual. A small residual gain reduces
+            the effect of an optimiser step on smooth surfaces.
+        fill_holes: whether holes of the low-resolution map are inpainted; else they are set to the minimum disparity.
+        drift_compensation: whether the output's mean over a flat probe is subtracted from the output, see
             :func:`dsr.methods.networks.msg_net.output_drift`.
 
     """
@@ -53,20 +53,20 @@ VARIANTS = MappingProxyType(
     {
         # BT.601 luma with its 16..235 range.
         "hui": MSGVariant("hui", False, False, False, (65.481 / 255, 128.553 / 255, 24.966 / 255), 16.0, False),
-        # The released code takes YCbCr's inverse for its forward transform; the weights were trained on this image.
+        # The released code uses the inverse YCbCr transform as the forward one; the weights were trained with it.
         "voynov": MSGVariant("voynov", True, True, True, (1.0, -0.34414, -0.71414), 128 * (0.34414 + 0.71414), True),
-        # What dsr trains: the graph of voynov, guided by real luma, without a constant to take off afterwards.
+        # The variant that dsr trains: the graph of voynov, guided by luma, without drift compensation.
         "dsr": MSGVariant("dsr", True, True, True, LUMA, 0.0, False, True, 10.0, 0.05, True),
     }
 )
 
 
 class Traits(NamedTuple):
-    """What MSG-Net's answer takes from the whole image, beside the range of its disparity.
+    """The global values of an image that MSG-Net uses, besides the range of the disparity.
 
-    ``intensity`` and ``detail`` (B, 2, 1, 1): bounds of the photo's intensity and of its difference to its 3 x 3 mean,
-    None for plain guidance; ``drift`` (B, 1, 1, 1): see :func:`dsr.methods.networks.msg_net.output_drift`, None without
-    its compensation.
+    ``intensity`` and ``detail`` (B, 2, 1, 1): minimum and maximum of the intensity and of its difference to its 3 x 3
+    mean, None for plain guidance; ``drift`` (B, 1, 1, 1): see :func:`dsr.methods.networks.msg_net.output_drift`, None
+    without drift compensation.
     """
 
     intensity: Tensor | None
@@ -75,10 +75,11 @@ class Traits(NamedTuple):
 
 
 def guidance_map(rgb: Tensor, variant: MSGVariant, traits: Traits | None = None) -> Tensor:
-    """Return the guidance (B, 1, H, W) of a photo (B, 3, H, W) in 0..1.
+    """Return the guidance map (B, 1, H, W) of an image (B, 3, H, W) in 0..1.
 
-    An intensity (see :class:`MSGVariant`), normalised, less its 3 x 3 mean, normalised again, 0..1; or the intensity
-    itself, -1..1, where the variant has plain guidance. With traits, the photo is a window of the one that has them.
+    The intensity (see :class:`MSGVariant`) is normalised, its 3 x 3 mean is subtracted, and the result is normalised
+    again to 0..1. With plain guidance, the map is the intensity in -1..1. ``traits`` are those of the whole image if
+    ``rgb`` is a window.
     """
     intensity = intensity_of(rgb, variant)
     if variant.plain_guidance:
@@ -88,6 +89,6 @@ def guidance_map(rgb: Tensor, variant: MSGVariant, traits: Traits | None = None)
 
 
 def intensity_of(rgb: Tensor, variant: MSGVariant) -> Tensor:
-    """Return the photo's intensity, (B, 1, H, W) in 0..255."""
+    """Return the intensity of an image, (B, 1, H, W) in 0..255."""
     weights = torch.tensor(variant.rgb_weights, dtype=rgb.dtype, device=rgb.device)[:, None, None]
     return ((255 * rgb * weights).sum(-3, keepdim=True) + variant.rgb_offset).clip(0, 255)

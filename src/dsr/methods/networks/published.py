@@ -1,8 +1,8 @@
-"""Readers of the published MSG-Net weights, straight from their authors' files.
+"""Readers of the published MSG-Net weights in their authors' formats.
 
 ``.pth`` (Voynov et al. 2019) is read by torch's own unpickler for plain tensors, ``.caffemodel`` (Hui et al. 2016) by a
-reader of the protobuf wire format (protobuf.dev/programming-guides/encoding). Neither ever runs code that a file holds,
-and whatever does not fit raises a ``ValueError`` that names the file, what was expected and what came.
+reader of the protobuf wire format (protobuf.dev/programming-guides/encoding). Neither executes code from a file.
+Invalid files raise a ``ValueError`` that names the file, the expected content and the content found.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ NET_LAYER, LAYER_NAME, LAYER_TYPE, LAYER_BLOBS, BLOB_DATA, BLOB_SHAPE, SHAPE_DIM
 
 
 class MSGWeights(NamedTuple):
-    """What a file holds; tensors go by our parameter names, those that we don't know by the file's."""
+    """The content of a file; tensors have dsr's parameter names, unknown ones the file's."""
 
     variant: VariantName
     scale: int
@@ -38,12 +38,12 @@ class MSGWeights(NamedTuple):
 
 
 def load_msg_weights(path: Path, scale: int, variant: VariantName | None = None) -> MSGNet:
-    """Return the network with the weights of one of the authors' files, float32, on the CPU.
+    """Load the network of one of the authors' files, in float32 on the CPU.
 
     Args:
-        path: a ``.pth`` of Voynov et al. or a ``.caffemodel`` of Hui et al.; the content tells.
-        scale: the scale that the run needs.
-        variant: the variant that the run needs, None for any.
+        path: ``.pth`` of Voynov et al. or ``.caffemodel`` of Hui et al., recognised by its content.
+        scale: scale that the run requires.
+        variant: variant that the run requires, None for any.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -56,14 +56,14 @@ def load_msg_weights(path: Path, scale: int, variant: VariantName | None = None)
         raise ValueError(f"{path}: expected weights of variant {variant}, got those of variant {weights.variant}")
     if weights.scale != scale:
         raise ValueError(f"{path}: weights are for scale {weights.scale}, the run is at scale {scale}")
-    with torch.device("meta"):  # without memory, and without a draw from the random generator
+    with torch.device("meta"):  # without memory and random numbers
         net = MSGNet(scale, weights.variant)
     load_parameters(net, weights.tensors, path, f"MSG-Net ({weights.variant}) at scale {scale}")
     return net
 
 
 def read_msg_weights(path: Path) -> MSGWeights:
-    """Return what the file holds, with its variant and scale; shapes are not checked yet."""
+    """Read a file's tensors, variant and scale; shapes are not checked."""
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such weights file")
     data = path.read_bytes()
@@ -94,14 +94,14 @@ def _from_torch(path: Path) -> MSGWeights:
 
 
 def _layer_names(levels: int) -> list[str]:
-    """Return the names of our layers in the order in which data passes them."""
+    """Return the names of dsr's layers in the order of the data flow."""
     guidance = [f"guidance.{i}" for i in range(levels + 1)]
     depth = [f"levels.{level}.{part}" for level in range(levels) for part in ("up", "fuse", "refine")]
     return [*guidance, "stem", *depth, "smooth", "reconstruct"]
 
 
 def _author_names(levels: int) -> list[str]:
-    """Return Voynov et al.'s names for the same layers; their guidance branch counts its poolings, too."""
+    """Return Voynov et al.'s names of the same layers; their guidance branch also counts poolings."""
     guidance = [f"feature_extraction_Y.{max(i, 2 * i - 2)}" for i in range(levels + 1)]
     return [*guidance, "feature_extraction_X", *(f"upsampling_X.{i}" for i in range(3 * levels + 2))]
 
@@ -124,7 +124,7 @@ class _Layer(NamedTuple):
 
 
 def _from_caffe(path: Path, data: bytes) -> MSGWeights:
-    """Read a Caffe model: its layers lie in the order in which data passes them, whatever their names."""
+    """Read a Caffe model; its layers are identified by their order, which is that of the data flow."""
     try:
         layers = [layer for layer in map(_layer, _messages(memoryview(data), NET_LAYER)) if layer.blobs]
     except ValueError as error:
