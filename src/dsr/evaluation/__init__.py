@@ -1,1 +1,1 @@
-"""Predictions to files, scores from files, and what runs left in their directories."""
+"""Write predictions, score them, and read the directories of runs."""

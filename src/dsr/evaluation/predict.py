@@ -1,10 +1,9 @@
 """The first pass of an evaluation: predictions to files. The second one scores them, see :mod:`dsr.evaluation.score`.
 
 A prediction is ``predictions/SCENE.npz``: ``depth`` (H, W) in metres, NaN where missing; ``config``, a JSON text of all
-that it depends on; and the ``seconds`` that it took. The sample that it was made from lies beside it, see
-:mod:`dsr.evaluation.store`. A prediction whose stored config is the requested one is not made again, so an interrupted
-run continues where it stopped. One scene that fails, or that the method has no solution for, does not keep the others
-from their results.
+settings that it depends on; and ``seconds``, its computing time. Its sample is stored too, see
+:mod:`dsr.evaluation.store`. Predictions whose stored config equals the requested one are reused, so an interrupted run
+continues where it stopped. A scene that fails, or without a solution, does not affect the others.
 """
 
 from __future__ import annotations
@@ -36,7 +35,7 @@ from dsr.utils.progress import SILENT, Progress
 
 @dataclass(frozen=True)
 class Evaluation:
-    """What is evaluated: one method on one data set under one downsampling model.
+    """The evaluation of one method on one data set with one downsampling model.
 
     Args:
         source: the data set.
@@ -45,12 +44,12 @@ class Evaluation:
         scale: the upsampling factor.
         method: the method.
         method_name: as in ``scores.csv``.
-        seed: of whatever is random.
-        config: all that the predictions depend on besides the scene, as plain values; stored with each.
-        device: where predictions and scores are computed.
-        noise: of the low-resolution maps.
-        holes: where values are missing in the low-resolution maps.
-        label: the method's name for readers; empty where that is ``method_name``.
+        seed: seed of all random numbers.
+        config: settings that the predictions depend on besides the scene, as plain values; stored with each.
+        device: device of the predictions and scores.
+        noise: noise of the low-resolution maps.
+        holes: holes of the low-resolution maps.
+        label: displayed name of the method; empty for ``method_name``.
 
     """
 
@@ -68,10 +67,10 @@ class Evaluation:
     label: str = ""
 
     def sample(self, scene: str) -> DepthSample:
-        """Return what the method is given of a scene.
+        """Return the method's input for a scene.
 
         Raises:
-            ValueError: the scene's files are not as they should be.
+            ValueError: a file of the scene is invalid.
 
         """
         loaded = self.source.load(scene)
@@ -79,19 +78,19 @@ class Evaluation:
         return make_sample(loaded, self.scale, self.downsampling, kind, self.noise, self.seed, self.holes)
 
     def stored_config(self, scene: str) -> dict[str, Any]:
-        """Return what a prediction of this scene depends on."""
+        """Return the settings that a prediction of this scene depends on."""
         return {**self.config, "scene": scene, "scene_content": self.source.fingerprint(scene)}
 
 
 @dataclass
 class Outcome:
-    """What a pass over the scenes led to.
+    """The outcome of a pass over the scenes.
 
     Args:
-        made, reused: scenes whose prediction was computed, and those where it was found on disk.
-        failures: scene and what was wrong, one line each.
-        unsolved: scene and why the method has no solution for it, one line each.
-        notes: scene and what readers of the scores should know.
+        made, reused: scenes whose prediction was computed, and scenes whose stored prediction was reused.
+        failures: error message by scene, one line each.
+        unsolved: reason by scene why the method has no solution, one line each.
+        notes: notes on the scores by scene.
         seconds: computing time per scene.
         unscored: scenes without a high-resolution depth map to compare with.
 
@@ -107,20 +106,20 @@ class Outcome:
 
 
 class StalePredictionError(ValueError):
-    """A prediction on disk was made from something else, and nobody allowed to overwrite it."""
+    """A stored prediction has other settings, and overwriting is not enabled."""
 
 
 def predict(study: Evaluation, folder: Path, progress: Progress = SILENT, *, overwrite: bool = False) -> Outcome:
-    """Write the sample and the prediction of every scene that has none yet.
+    """Write the samples and predictions of all scenes without one.
 
     Args:
-        study: what to evaluate.
-        folder: the run's directory.
-        progress: shows the scenes that are done, and the method's steps within a scene.
-        overwrite: whether predictions on disk are made anew, whatever they came from.
+        study: evaluation to run.
+        folder: directory of the run.
+        progress: display of the completed scenes, and of the method's steps within a scene.
+        overwrite: whether stored predictions are recomputed.
 
     Raises:
-        StalePredictionError: a prediction of another configuration is there and ``overwrite`` is not set.
+        StalePredictionError: a stored prediction has another configuration and ``overwrite`` is not set.
 
     """
     outcome = Outcome()
@@ -148,14 +147,14 @@ def predict(study: Evaluation, folder: Path, progress: Progress = SILENT, *, ove
 
 
 def failure_line(scene: str, error: BaseException) -> str:
-    """Return an error's message on one line that names the scene."""
+    """Return an error message as one line that names the scene."""
     message = one_line(error)
     named = re.search(rf"(^|[/\\]){re.escape(scene)}[/\\:.]", message)  # first, or in a path
     return message if named else f"{scene}: {message}"
 
 
 def _seconds_of_current(path: Path, config: Mapping[str, Any]) -> float | None:
-    """Return how long the prediction on disk took if it was made from ``config``; None if there is none."""
+    """Return the computing time of the stored prediction if its config is ``config``; None if there is none."""
     try:
         arrays = read_arrays(path)
         stored, seconds = dict(json.loads(str(arrays["config"]))), float(arrays["seconds"])
@@ -176,7 +175,7 @@ def _predict_scene(study: Evaluation, scene: str, folder: Path, config: Mapping[
     """Compute one prediction; write it, its sample and the iteration's history; return the method's seconds."""
     sample = study.sample(scene)
     start = time.perf_counter()
-    depth = _answer(study.method, sample, progress)
+    depth = _run(study.method, sample, progress)
     seconds = time.perf_counter() - start
     expected = (1, sample.camera.height, sample.camera.width)
     if tuple(depth.shape) != expected:
@@ -192,7 +191,7 @@ def _predict_scene(study: Evaluation, scene: str, folder: Path, config: Mapping[
     return seconds
 
 
-def _answer(method: Upsampler, sample: DepthSample, progress: Progress) -> Tensor:
-    """Return a method's depth, and show its steps."""
+def _run(method: Upsampler, sample: DepthSample, progress: Progress) -> Tensor:
+    """Run a method and display its steps."""
     with progress.task("steps") as step:
         return method(sample, step)

@@ -1,6 +1,6 @@
-"""What evaluations left in their directories, read for tables, figures and pages.
+"""Read the directories of evaluations, for tables, figures and pages.
 
-Nothing but files is looked at: ``scores.csv``, ``summary.json``, ``versions.json``, predictions and stored scenes.
+Only files are read: ``scores.csv``, ``summary.json``, ``versions.json``, predictions and stored scenes.
 """
 
 from __future__ import annotations
@@ -24,19 +24,19 @@ METHOD_ORDER = (
     "Nearest", "Bilinear", "Bicubic", "GF", "JBU", "FGS", "Diffusion", "TGV",
     "SRfS", "EG", "PDN", "DG", "DIP", "MSG", "DIP-V", "MSG-V",
 )  # fmt: skip
-"""The paper's methods in the order of its tables, after simpler ones; what it did not have follows."""
+"""Order of the methods: simple ones, then those of the paper in the order of its tables; others follow."""
 _DATASET_ORDER = ("simgeo", "icl", "middlebury", "sunrgbd", "tofmark")
 _SCORES, _SUMMARY, _VERSIONS = "scores.csv", "summary.json", "versions.json"
 _TEXT_COLUMNS = ("dataset", "scene", "downsampling", "method", "metric", "variant")
 _NUMBER_COLUMNS = ("scale", "seed", "value", "valid_share")
 _NAMES = ("name", "label", "target")
 _DIGEST = 8
-"""Digits of a hash that are shown."""
+"""Number of displayed digits of a hash."""
 _Content = TypeVar("_Content", bound=BaseModel)
 
 
 class BenchmarkSetting(NamedTuple):
-    """What methods are compared on: a data set, a scale, a degradation."""
+    """The setting in which methods are compared: a data set, a scale, a degradation."""
 
     dataset: str
     scale: int
@@ -48,17 +48,17 @@ class Run:
     """One run of ``eval.py``: one method on one data set, at one scale, under one degradation, with one seed.
 
     Args:
-        folder: its directory.
-        dataset, scale, downsampling, seed, method: as in ``scores.csv``; ``downsampling`` has noise and holes in it.
-        label: the method's name for readers. Runs of one method with other settings have labels that differ; runs
-            that differ in the seed alone have the same.
-        scores: its ``scores.csv``, raw units; rows of the scenes in ``scenes`` alone.
+        folder: directory of the run.
+        dataset, scale, downsampling, seed, method: as in ``scores.csv``; ``downsampling`` includes noise and holes.
+        label: displayed name of the method. Runs of a method with different settings have different labels; runs
+            that differ only in the seed have the same label.
+        scores: rows of ``scores.csv`` for the scenes in ``scenes``, in raw units.
         seconds: computing time by scene.
         settings: the resolved configuration.
-        versions: of packages, Python and the project.
-        scenes: those that have a prediction.
-        unsolved: scenes that the method has no solution for, and why.
-        formats: of its metrics, as far as the run keeps them.
+        versions: versions of packages, Python and the project.
+        scenes: scenes with a prediction.
+        unsolved: reason by scene why the method has no solution.
+        formats: formats of its metrics that the run stores.
 
     """
 
@@ -79,7 +79,7 @@ class Run:
 
     @property
     def problem(self) -> BenchmarkSetting:
-        """What it answers."""
+        """The setting of the run."""
         return BenchmarkSetting(self.dataset, self.scale, self.downsampling)
 
     def prediction(self, scene: str) -> Tensor:
@@ -92,7 +92,7 @@ class Run:
         return load_prediction(prediction_path(self.folder, scene))
 
     def sample(self, scene: str) -> DepthSample:
-        """Return what the method was given of a scene.
+        """Return the method's input for a scene.
 
         Raises:
             ValueError: the file is damaged, or missing as in a run of an older dsr.
@@ -101,7 +101,7 @@ class Run:
         return DepthSample.load(sample_path(self.folder, scene))
 
     def has_sample(self, scene: str) -> bool:
-        """Return whether the run keeps what the method was given of a scene."""
+        """Return whether the run stores the method's input for a scene."""
         return sample_path(self.folder, scene).is_file()
 
 
@@ -111,7 +111,7 @@ class Results:
 
     Args:
         runs: ordered by data set, scale, degradation, and then by method as in the paper's tables, and seed.
-        notes: what was left out and why.
+        notes: omitted data and reasons.
 
     """
 
@@ -134,18 +134,18 @@ class Results:
         return sorted({run.label for run in self.runs}, key=_method_key)
 
     def problems(self) -> list[BenchmarkSetting]:
-        """Return what was evaluated, in order."""
+        """Return the evaluated settings, in order."""
         return list(dict.fromkeys(run.problem for run in self.runs))
 
     def of(self, problem: BenchmarkSetting) -> list[Run]:
-        """Return the runs that answer a problem, in order."""
+        """Return the runs of a setting, in order."""
         return [run for run in self.runs if run.problem == problem]
 
     def only(self, methods: Sequence[str] = (), datasets: Sequence[str] = (), scales: Sequence[int] = ()) -> Results:
-        """Return the runs of some methods (by label), data sets and scales; an empty choice is no choice.
+        """Return the runs of some methods (by label), data sets and scales; an empty sequence selects all.
 
         Raises:
-            ValueError: there is none of a wanted value, or none of all together.
+            ValueError: no run has a requested value, or none has all of them.
 
         """
         runs = self.runs
@@ -181,11 +181,10 @@ def one_per_method(runs: Sequence[Run]) -> tuple[Run, ...]:
 def load_results(paths: Sequence[Path]) -> Results:
     """Read all runs in and below some directories.
 
-    A run that is damaged is left out, and of two predictions for the same scene by the same method the older; the notes
-    say so.
+    Damaged runs are omitted, and so is the older of two predictions of a scene by the same method. The notes list them.
 
     Raises:
-        ValueError: a path is no directory, or there is no run that can be read.
+        ValueError: a path is not a directory, or there is no readable run.
 
     """
     runs: list[Run] = []
@@ -199,7 +198,7 @@ def load_results(paths: Sequence[Path]) -> Results:
         where = ", ".join(map(str, paths))
         detail = f"; {notes[0]}" if notes else ""
         raise ValueError(f"{where}: expected runs of eval.py (directories with {_SCORES}), found none{detail}")
-    runs = _distinguished(runs)
+    runs = _distinguish(runs)
     unsolved = [
         f"{run.label} at x{run.scale} has no solution for {message}"
         for run in runs
@@ -254,7 +253,7 @@ def read_run(folder: Path) -> Run:
 
 
 class _Summary(BaseModel):
-    """What is read of ``summary.json``; runs of earlier versions lack the keys that have defaults."""
+    """The content of ``summary.json``; runs of earlier versions lack the keys with defaults."""
 
     dataset: str
     scale: int
@@ -274,7 +273,7 @@ class _Versions(BaseModel, extra="allow"):
 
 
 def _read(kind: type[_Content], path: Path) -> _Content:
-    """Return what a JSON file of a run says."""
+    """Read and check a JSON file of a run."""
     try:
         return kind.model_validate_json(path.read_bytes())
     except OSError as error:
@@ -294,15 +293,15 @@ def _read_scores(path: Path) -> pd.DataFrame:
     return scores
 
 
-def _distinguished(runs: Sequence[Run]) -> list[Run]:
-    """Return the runs with labels and data sets' names that differ where settings do.
+def _distinguish(runs: Sequence[Run]) -> list[Run]:
+    """Append the differing settings to equal labels and data sets' names of runs.
 
-    What differs is said: "MSG-V (ensemble=1)", "middlebury (size=256)".
+    Examples: "MSG-V (ensemble=1)", "middlebury (size=256)".
     """
     methods = [_identity_of_method(run.settings) for run in runs]
     datasets = [{**run.settings.get("dataset", {}), "root": None, "scenes": None, "target": None} for run in runs]
-    labels = _told_apart([(run.label, run.scale) for run in runs], methods)
-    names = _told_apart([(run.dataset, 0) for run in runs], datasets)
+    labels = _distinguishing_suffixes([(run.label, run.scale) for run in runs], methods)
+    names = _distinguishing_suffixes([(run.dataset, 0) for run in runs], datasets)
     return [
         replace(run, label=run.label + label, dataset=run.dataset + name)
         for run, label, name in zip(runs, labels, names, strict=True)
@@ -310,14 +309,14 @@ def _distinguished(runs: Sequence[Run]) -> list[Run]:
 
 
 def method_settings(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the parameters of a run's method: its configuration without names and where weights come from."""
+    """Return the parameters of a run's method: its configuration without names and the origin of weights."""
     method = settings.get("method")
     known = method if isinstance(method, Mapping) else {}
     return {key: value for key, value in known.items() if key not in _NAMES and not key.startswith("weights_")}
 
 
 def _identity_of_method(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Return what tells methods of one label apart: parameters, weights, precision."""
+    """Return the settings that distinguish methods of one label: parameters, weights, precision."""
     found = method_settings(settings)
     for key, name in (("weights_sha256", "weights"), ("precision", "precision")):
         if settings.get(key) is not None:
@@ -325,8 +324,8 @@ def _identity_of_method(settings: Mapping[str, Any]) -> dict[str, Any]:
     return found
 
 
-def _told_apart(names: Sequence[Any], settings: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Return what to add to each name, such as " (ensemble=1)": the settings in which those of one name differ."""
+def _distinguishing_suffixes(names: Sequence[Any], settings: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Return a suffix for each name, such as " (ensemble=1)": the settings in which equal names differ."""
     added = []
     for name, own in zip(names, settings, strict=True):
         others = [other for theirs, other in zip(names, settings, strict=True) if theirs == name]
@@ -337,7 +336,7 @@ def _told_apart(names: Sequence[Any], settings: Sequence[Mapping[str, Any]]) -> 
 
 
 def _newest(runs: Sequence[Run]) -> tuple[list[Run], list[str]]:
-    """Return the runs without what a newer run of the same method has, too, and notes on what was left out."""
+    """Remove scenes that a newer run of the same method has too; return the runs and notes on removed scenes."""
     kept: list[Run] = []
     notes = []
     taken: dict[tuple[Any, ...], Path] = {}

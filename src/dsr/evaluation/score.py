@@ -45,12 +45,12 @@ def score(
     """Score the predictions in ``folder`` against the samples there; write ``scores.csv`` and ``summary.json``.
 
     Args:
-        study: what was evaluated; its data set is not read.
-        folder: the run's directory.
+        study: the evaluation; its data set is not read.
+        folder: directory of the run.
         metrics: from :func:`dsr.metrics.catalogue.catalogue`.
-        outcome: of :func:`predict`; failures and scenes without truth are added to it.
-        progress: shows the scenes that are done.
-        illustrate: draws a picture from a sample, the predicted depth and its worst-of-four scores.
+        outcome: outcome of :func:`predict`; failures and scenes without true depth are added to it.
+        progress: display of the completed scenes.
+        illustrate: function that draws a picture of a sample, the predicted depth and its worst-of-four scores.
 
     Returns:
         The content of ``scores.csv``.
@@ -78,7 +78,7 @@ def score(
 
 
 def summary(study: Evaluation, scores: pd.DataFrame, outcome: Outcome, metrics: Sequence[Metric]) -> dict[str, Any]:
-    """Return means over the scenes of each metric (worst of four lights where it has lights) and how the run went."""
+    """Return each metric's mean over the scenes (of the worst of four lights, if any) and the outcome of the run."""
     worst = scores[scores["variant"].isin(HEADLINES)]
     means = worst.groupby("metric", sort=False)["value"].mean()
     return {
@@ -104,7 +104,7 @@ def summary(study: Evaluation, scores: pd.DataFrame, outcome: Outcome, metrics: 
 def _score_scene(
     study: Evaluation, sample: DepthSample, depth: Tensor, metrics: tuple[Metric, ...]
 ) -> Iterator[dict[str, Any]]:
-    """Yield the rows of one scene; none where there is no truth."""
+    """Yield the rows of one scene; none without true depth."""
     if sample.depth is None:
         return
     if depth.shape != sample.depth.shape:

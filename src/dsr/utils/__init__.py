@@ -1,1 +1,1 @@
-"""What every part of the package uses: files, hashes, the console, what Lightning is told."""
+"""Utilities of the whole package: files, hashes, the console, Lightning."""

@@ -1,4 +1,4 @@
-"""What pydantic found wrong in a file, on one line: the key, what was expected and what came."""
+"""Format errors of pydantic as one line: the key, the expected and the actual value."""
 
 from __future__ import annotations
 

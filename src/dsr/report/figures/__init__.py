@@ -25,7 +25,7 @@ def save_figures(
     Args:
         folder: for the files, which are replaced where they are there.
         results: to draw.
-        progress: is told, before each figure, how many are done, how many there are at most, and its name.
+        progress: called before each figure with the number done, the maximum number, and the name.
         light: of the renderings, ``e1`` to ``e4``.
         notes: is extended by a line for each scene or result that could not be drawn.
 

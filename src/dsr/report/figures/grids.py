@@ -18,7 +18,7 @@ LIGHT = "e1"
 ROWS = 5
 """Scenes on a page."""
 Progress = Callable[[str], None]
-"""Is told the name of a figure before it is drawn."""
+"""Called with the name of a figure before it is drawn."""
 
 
 def save_rendering_grids(
@@ -38,7 +38,7 @@ def save_rendering_grids(
         folder: for ``renderings_DATASET_xSCALE_DOWNSAMPLING_PAGE.pdf`` and ``.png``, five scenes a page.
         results: of any number of methods, data sets, scales and degradations; a page is of one of each but methods.
         light: ``e1`` to ``e4``.
-        progress: is told the name of each figure.
+        progress: called with the name of each figure.
         notes: is extended by a line for each scene or result that could not be drawn.
 
     Returns:

@@ -65,7 +65,7 @@ def save_page(
         title: the page's.
         budget_mb: megabytes that its pictures may have. They are stored without loss where that fits, else with more
             and more compression, then smaller; the page says which.
-        progress: is told how many scenes of how many are done; begins anew where pictures need more compression.
+        progress: called with the numbers of done and of all scenes; starts again if more compression is needed.
 
     Returns:
         What could not be shown, and how pictures were stored.
