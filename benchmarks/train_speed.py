@@ -21,7 +21,8 @@ from dsr.degradation.downsampling import Downsampling
 from dsr.methods.networks.msg_net import MSGNet
 from dsr.training.degradation import Batch, Degradation
 from dsr.training.objective import Objective
-from dsr.training.patches import Patches, PatchSettings
+from dsr.training.patches import Patches
+from dsr.training.settings import PatchSettings
 
 SCALE = 4
 

@@ -325,7 +325,6 @@ USAGE_ERRORS = {
     "a mistyped loss": (["model.depth_loss=l3"], "model.depth_loss: expected one of lap1, l1, mse, got 'l3'"),
     "a network that leaves out pixels": (["model.variant=hui"], "model: expected a network that covers the whole"),
     "a patch the scale does not divide": (["trainer.patch=30"], "trainer.patch: expected a size that scale=4 divides"),
-    "a patch larger than a scene": (["trainer.patch=128"], "trainer.patch: expected at most 00000's 64 x 64"),
     "a patch too small": (["trainer.patch=8"], "trainer.patch: expected at least 16 pixels, got 8"),
     "no step": (["trainer.steps=0"], "trainer.steps: expected a positive number, got 0"),
     "no batch": (["trainer.batch=0"], "trainer.batch: expected a positive number, got 0"),
@@ -355,6 +354,14 @@ def test_usage_error_is_one_line_with_exit_code_2_and_writes_nothing(tmp_path, w
     assert errors[0].startswith(f"error: {start}")
     assert tree(tmp_path) == ["file", "foreign/thesis.txt"]
     assert not (tmp_path / "outputs").exists()
+
+
+def test_patch_larger_than_a_scene_is_refused_when_the_scenes_are_there(tmp_path, within):
+    code, output, errors = within(*SMOKE, "trainer.patch=128")
+    assert code == 2
+    assert output.startswith("model  msg_v x4, ")
+    assert errors == ["error: trainer.patch: expected at most 00000's 64 x 64, got 128"]
+    assert tree(tmp_path) == []
 
 
 def test_help_lists_the_choices(within):

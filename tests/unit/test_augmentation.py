@@ -13,7 +13,8 @@ from dsr.geometry.camera import Camera
 from dsr.geometry.shading import lights, render
 from dsr.geometry.surface import depth_to_normals
 from dsr.sample import Scene
-from dsr.training.augmentation import Augmentation, mirror, rotate90
+from dsr.training.augmentation import augment, mirror, rotate90
+from dsr.training.settings import PatchSettings
 
 CAMERA = Camera(width=31, height=23, fx=30.0, fy=27.0, cx=13.3, cy=9.9, baseline=0.1, doffs=0.7)
 
@@ -96,13 +97,10 @@ def test_window_has_the_points_of_its_pixels() -> None:
 
 
 def test_factor_of_a_varied_scene_is_that_of_its_depth() -> None:
-    vary, random, factors = (
-        Augmentation(flip=False, rotate=False, depth_scale=0.5, colour=0.0),
-        np.random.default_rng(0),
-        [],
-    )
+    settings = PatchSettings(flip=False, rotate=False, depth_scale=0.5, colour=0.0)
+    random, factors = np.random.default_rng(0), []
     for _ in range(200):
-        scene, factor = vary(_scene(), random)
+        scene, factor = augment(_scene(), settings, random)
         torch.testing.assert_close(_points(scene), factor * _points(_scene()), rtol=1e-13, atol=0, equal_nan=True)
         assert scene.camera == CAMERA
         factors.append(np.log(factor))
@@ -112,9 +110,8 @@ def test_factor_of_a_varied_scene_is_that_of_its_depth() -> None:
 
 
 def test_scene_without_variation_is_unchanged() -> None:
-    scene, factor = Augmentation(flip=False, rotate=False, depth_scale=0.0, colour=0.0)(
-        _scene(), np.random.default_rng(0)
-    )
+    settings = PatchSettings(flip=False, rotate=False, depth_scale=0.0, colour=0.0)
+    scene, factor = augment(_scene(), settings, np.random.default_rng(0))
     assert factor == 1
     assert torch.equal(scene.rgb, _scene().rgb)
     torch.testing.assert_close(_points(scene), _points(_scene()), rtol=0, atol=0, equal_nan=True)
@@ -123,4 +120,4 @@ def test_scene_without_variation_is_unchanged() -> None:
 @pytest.mark.parametrize("changes", [{"depth_scale": -0.1}, {"depth_scale": 3.1}, {"colour": float("nan")}])
 def test_invalid_variation_is_refused(changes: dict[str, Any]) -> None:
     with pytest.raises(ValueError, match=rf"^{next(iter(changes))}: expected 0 (or more|to 3), got"):
-        Augmentation(**changes)
+        PatchSettings(**changes)

@@ -23,7 +23,7 @@ from dsr.report.tables import published_row
 from dsr.synthetic.simgeo.scenes import SCENES as SIMGEO_SCENES
 from dsr.training.data_module import Part, PatchData
 from dsr.training.degradation import Degradation
-from dsr.training.patches import PatchSettings
+from dsr.training.settings import PatchSettings
 from dsr.utils.builder import ConfigError, build, trait
 
 CONF = Path(__file__).resolve().parents[2] / "conf" / "dataset"

@@ -21,7 +21,8 @@ from dsr.methods.networks.maps import normalise
 from dsr.sample import Scene
 from dsr.training.data_module import Part, PatchData, WholeScenes
 from dsr.training.degradation import Batch, Degradation, to_tensors
-from dsr.training.patches import Patches, PatchSettings
+from dsr.training.patches import Patches
+from dsr.training.settings import PatchSettings
 
 BOX = Downsampling("box")
 X4 = Degradation(4, BOX)

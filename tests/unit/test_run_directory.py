@@ -10,9 +10,10 @@ from omegaconf import OmegaConf
 
 import dsr
 from dsr.app import run_directory as rundir
-from dsr.app.run_directory import PREDICTING_CODE, claim, code_hash, default_directory, identity_of, versions
+from dsr.app.run_directory import PREDICTING_CODE, claim, code_hash, default_directory, expect_free, identity_of
 from dsr.utils.builder import ConfigError
 from dsr.utils.hashing import file_hash, hash_of_code
+from dsr.utils.versions import package_versions, versions
 
 CPU = torch.device("cpu")
 
@@ -175,6 +176,18 @@ def test_empty_directory_and_that_of_the_same_run_may_be_claimed(tmp_path):
     claimed(tmp_path, config(metrics={"lpips": False}, weights="elsewhere.pth"))
 
 
+def test_check_before_the_claim_refuses_the_same_and_writes_nothing(tmp_path):
+    plain = config()
+    identity = identity_of(plain, "abc", CPU)
+    assert expect_free(tmp_path / "new", plain, identity) == []
+    assert list(tmp_path.iterdir()) == []
+    claim(tmp_path / "run", plain, identity)
+    other = identity_of(config(scale=8), "abc", CPU)
+    with pytest.raises(ConfigError, match="holds a run with another scale; "):
+        expect_free(tmp_path / "run", plain, other)
+    assert expect_free(tmp_path / "run", plain, other, ["scale"]) == ["scale"]
+
+
 def test_directory_of_another_run_is_refused_with_the_changed_keys(tmp_path):
     claimed(tmp_path, config())
     before = (tmp_path / "config.yaml").read_bytes()
@@ -239,6 +252,6 @@ def test_versions_outside_of_a_checkout_have_no_commit(monkeypatch, tmp_path):
     assert versions()["git_commit"] is None
 
 
-def test_missing_package_is_recorded_as_such(monkeypatch):
-    monkeypatch.setattr(rundir, "_PACKAGES", ("dsr", "no-such-package-here"))
-    assert versions()["packages"]["no-such-package-here"] == "not installed"
+def test_missing_package_is_recorded_as_such():
+    found = package_versions(["dsr", "no-such-package-here"])
+    assert found == {"dsr": importlib.metadata.version("dsr"), "no-such-package-here": "not installed"}

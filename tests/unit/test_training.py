@@ -27,9 +27,10 @@ from dsr.metrics.lpips import LPIPS
 from dsr.sample import Scene
 from dsr.training.data_module import WholeScenes
 from dsr.training.degradation import Batch, Degradation, to_tensors
-from dsr.training.module import Schedule, SuperResolution
+from dsr.training.module import SuperResolution
 from dsr.training.objective import Objective, balance_weight, to_depth
-from dsr.training.patches import Patches, PatchSettings
+from dsr.training.patches import Patches
+from dsr.training.settings import PatchSettings, Schedule
 
 BOX = Downsampling("box")
 X2 = Degradation(2, BOX)

@@ -4,10 +4,7 @@ from __future__ import annotations
 
 import functools
 import hashlib
-import importlib.metadata
 import json
-import platform
-import subprocess
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -15,16 +12,13 @@ from typing import Any
 import torch
 from omegaconf import OmegaConf
 
-import dsr
 from dsr.app.moved_targets import update_targets
 from dsr.utils.builder import ConfigError
 from dsr.utils.files import write_text
 from dsr.utils.hashing import hash_of_code, hash_outside_code
+from dsr.utils.versions import versions
 
-_PACKAGES = (
-    "dsr", "hydra-core", "lightning", "numpy", "omegaconf", "opencv-python-headless",
-    "pandas", "scikit-image", "scipy", "torch", "torchmetrics",
-)  # fmt: skip
+_RECORD = "versions.json"
 _NOT_IDENTITY = ("output_dir", "overwrite", "metrics", "weights", "resume", "run")  # of the weights, the content counts
 PREDICTING_CODE = (
     "sample.py", "degradation", "geometry", "metrics", "synthetic", "methods", "data", "training",
@@ -62,6 +56,44 @@ def default_directory(kind: str, config: Mapping[str, Any], identity: Mapping[st
     return Path("outputs") / kind / "_".join((*names, digest))
 
 
+def expect_free(
+    folder: Path, config: Mapping[str, Any], identity: Mapping[str, Any], tolerated: Sequence[str] = ()
+) -> list[str]:
+    """Check that ``folder`` can become the directory of this run; nothing is written.
+
+    Args:
+        folder: the directory.
+        config: of the run.
+        identity: see :func:`identity_of`.
+        tolerated: keys of the identity in which what is there already may differ.
+
+    Returns:
+        Those tolerated keys in which it does.
+
+    Raises:
+        ConfigError: something else is there already and ``overwrite`` is not set.
+
+    """
+    if folder.exists() and not folder.is_dir():
+        raise ConfigError(f"output_dir: expected a directory, {folder} is a file")
+    if not folder.is_dir() or not any(folder.iterdir()) or config["overwrite"]:
+        return []
+    try:
+        before = update_targets(dict(json.loads((folder / _RECORD).read_text(encoding="utf-8"))["identity"]))
+    except (OSError, ValueError, KeyError, TypeError):
+        raise ConfigError(
+            f"output_dir: {folder} holds files of something else; another output_dir keeps them"
+        ) from None
+    different = _changes(before, json.loads(json.dumps(identity)))
+    changed = [key for key in different if key not in tolerated]
+    if changed:
+        raise ConfigError(
+            f"output_dir: {folder} holds a run with another {', '.join(changed)}; "
+            "another output_dir keeps it, overwrite=true replaces it"
+        )
+    return different
+
+
 def claim(
     folder: Path, config: Mapping[str, Any], identity: Mapping[str, Any], tolerated: Sequence[str] = ()
 ) -> list[str]:
@@ -74,57 +106,19 @@ def claim(
         tolerated: keys of the identity in which what is there already may differ.
 
     Returns:
-        Those tolerated keys in which it does.
+        The tolerated keys in which what is there already differs.
 
     Raises:
         ConfigError: something else is there already and ``overwrite`` is not set, or the directory cannot be written.
 
     """
-    record = folder / "versions.json"
-    excused: list[str] = []
-    if folder.exists() and not folder.is_dir():
-        raise ConfigError(f"output_dir: expected a directory, {folder} is a file")
-    if folder.is_dir() and any(folder.iterdir()) and not config["overwrite"]:
-        try:
-            before = update_targets(dict(json.loads(record.read_text(encoding="utf-8"))["identity"]))
-        except (OSError, ValueError, KeyError, TypeError):
-            raise ConfigError(
-                f"output_dir: {folder} holds files of something else; another output_dir keeps them"
-            ) from None
-        different = _changes(before, json.loads(json.dumps(identity)))
-        excused = [key for key in different if key in tolerated]
-        changed = [key for key in different if key not in tolerated]
-        if changed:
-            raise ConfigError(
-                f"output_dir: {folder} holds a run with another {', '.join(changed)}; "
-                "another output_dir keeps it, overwrite=true replaces it"
-            )
+    different = expect_free(folder, config, identity, tolerated)
     try:
-        write_text(record, json.dumps({**versions(), "identity": dict(identity)}, indent=1) + "\n")
+        write_text(folder / _RECORD, json.dumps({**versions(), "identity": dict(identity)}, indent=1) + "\n")
         write_text(folder / "config.yaml", OmegaConf.to_yaml(OmegaConf.create(dict(config))))
     except OSError as error:
         raise ConfigError(f"output_dir: expected a directory to write to, got {folder} ({error.strerror})") from error
-    return excused
-
-
-def versions() -> dict[str, Any]:
-    """Return the versions of packages, Python and this project, and the accelerator."""
-    packages = {}
-    for name in _PACKAGES:
-        try:
-            packages[name] = importlib.metadata.version(name)
-        except importlib.metadata.PackageNotFoundError:
-            packages[name] = "not installed"
-    accelerator = torch.cuda.get_device_name() if torch.cuda.is_available() else None
-    return {
-        "packages": packages,
-        "python": platform.python_version(),
-        "platform": platform.platform(),
-        "git_commit": _git("rev-parse", "HEAD"),
-        "git_dirty": bool(_git("status", "--porcelain", "--untracked-files=no")),
-        "accelerator": accelerator,
-        "cpu_threads": torch.get_num_threads(),
-    }
+    return different
 
 
 @functools.cache
@@ -143,12 +137,3 @@ def _changes(before: Mapping[str, Any], now: Mapping[str, Any], prefix: str = ""
         elif old != new:
             changed.append(f"{prefix}{key}")
     return changed
-
-
-def _git(*arguments: str) -> str | None:
-    """Return what git says of the checkout that this package runs from; None outside of one."""
-    command = ["git", "-C", str(Path(dsr.__file__).parent), *arguments]
-    try:
-        return subprocess.run(command, capture_output=True, text=True, check=True, timeout=10).stdout.strip()  # noqa: S603
-    except (OSError, subprocess.SubprocessError):
-        return None

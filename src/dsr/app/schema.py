@@ -6,16 +6,17 @@ import math
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, fields, is_dataclass
 from pathlib import Path
-from typing import Any, ClassVar, Self
+from typing import Any, Self
 
 from hydra.core.config_store import ConfigStore
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import MISSING, DictConfig, OmegaConf
 
 from dsr.degradation.scales import SCALES
+from dsr.training.settings import PatchSettings, Schedule
 from dsr.utils.builder import ConfigError
 
-PRECISIONS = ("float32", "bfloat16")
+PRECISIONS = ("float32", "bfloat16", "auto")
 _GROUPS = ("dataset", "downsampling", "noise", "holes", "method", "metrics", "model", "trainer", "loss")
 
 
@@ -82,12 +83,10 @@ class RunConfig(Checked):
     metrics: MetricsConfig = field(default_factory=MetricsConfig)
     scale: int = 4
     device: str = "auto"
-    precision: str = "float32"
+    precision: str = "auto"
     seed: int = 0
     output_dir: str | None = None
     overwrite: bool = False
-
-    precisions: ClassVar[tuple[str, ...]] = PRECISIONS
 
     def check(self) -> None:
         """Check the values that a type cannot.
@@ -98,8 +97,8 @@ class RunConfig(Checked):
         """
         if self.scale not in SCALES:
             raise ConfigError(f"scale: expected one of {', '.join(map(str, SCALES))}, got {self.scale}")
-        if self.precision not in self.precisions:
-            raise ConfigError(f"precision: expected one of {', '.join(self.precisions)}, got {self.precision}")
+        if self.precision not in PRECISIONS:
+            raise ConfigError(f"precision: expected one of {', '.join(PRECISIONS)}, got {self.precision}")
         if self.seed < 0:
             raise ConfigError(f"seed: expected 0 or a positive number, got {self.seed}")
 
@@ -110,11 +109,8 @@ class EvalConfig(RunConfig):
 
     holes: dict[str, Any] = MISSING
     method: dict[str, Any] = MISSING
-    precision: str = "auto"
     weights: str | None = None
     run: str | None = None
-
-    precisions: ClassVar[tuple[str, ...]] = (*PRECISIONS, "auto")
 
 
 @dataclass
@@ -124,22 +120,22 @@ class TrainerConfig:
     name: str = "default"
     steps: int = 12000
     validate_every: int = 1000
-    learning_rate: float = 1e-3
-    warmup: int = 300
-    weight_decay: float = 1e-4
-    clip: float = 1.0
-    average: float = 0.999
-    patch: int = 96
-    batch: int = 6
+    learning_rate: float = Schedule.learning_rate
+    warmup: int = Schedule.warmup
+    weight_decay: float = Schedule.weight_decay
+    clip: float = Schedule.clip
+    average: float = Schedule.average
+    patch: int = PatchSettings.patch
+    batch: int = PatchSettings.batch
     accumulate: int = 1
-    validation_scenes: int = 4
-    scenes: int | None = None
-    flip: bool = True
-    rotate: bool = True
-    depth_scale: float = 0.3
-    colour: float = 0.1
-    photo: float = 0.5
-    workers: int = 0
+    validation_scenes: int = PatchSettings.validation_scenes
+    scenes: int | None = PatchSettings.scenes
+    flip: bool = PatchSettings.flip
+    rotate: bool = PatchSettings.rotate
+    depth_scale: float = PatchSettings.depth_scale
+    colour: float = PatchSettings.colour
+    photo: float = PatchSettings.photo
+    workers: int = PatchSettings.workers
     devices: Any = 1
     init: str | None = None
 
@@ -160,9 +156,6 @@ class TrainConfig(RunConfig):
     loss: LossConfig = field(default_factory=LossConfig)
     validation: dict[str, Any] = field(default_factory=dict)
     resume: str | None = None
-    precision: str = "auto"
-
-    precisions: ClassVar[tuple[str, ...]] = (*PRECISIONS, "auto")
 
     def check(self) -> None:
         """Check the values that a type cannot.

@@ -25,8 +25,9 @@ from dsr.methods.networks.base import DisparityNetwork
 from dsr.methods.networks.trained import NETWORKS
 from dsr.methods.networks.weight_files import load_network, network_name, save_network
 from dsr.training.data_module import PatchData
-from dsr.training.module import Schedule, SuperResolution
+from dsr.training.module import SuperResolution
 from dsr.training.objective import Objective, balance_weight
+from dsr.training.settings import Schedule
 from dsr.utils.builder import ConfigError, build
 from dsr.utils.console import ConsoleProgress
 from dsr.utils.devices import fast_precision, pick_device
@@ -77,10 +78,11 @@ def train(config: DictConfig) -> Path:
         raise ConfigError(f"output_dir: {weights} is trained already; overwrite=true trains it anew")
     metrics = functools.partial(metric_collection, settings.metrics, device)
     module = _module(settings, net, data, metrics)
+    tolerated = ("code", "device") if "resume" in given_keys() else ()
+    rundir.expect_free(folder, plain, identity, tolerated)
     resume = last if last.is_file() and not settings.overwrite else None
     _announce(progress, settings, module, data, folder, resume)
     _load(progress, settings, module, data)
-    tolerated = ("code", "device") if "resume" in given_keys() else ()
     for key in rundir.claim(folder, plain, identity, tolerated):
         progress.say(f"note: the run began with another {key}")
     if settings.overwrite and first:

@@ -15,7 +15,7 @@ from dsr.data.base import SceneSource, SceneSubset
 from dsr.degradation.downsampling import Downsampling
 from dsr.training.data_module import Part, PatchData
 from dsr.training.degradation import Degradation
-from dsr.training.patches import PatchSettings
+from dsr.training.settings import PatchSettings
 from dsr.utils.builder import ConfigError, build, with_key
 
 WEIGHTS = "weights.safetensors"

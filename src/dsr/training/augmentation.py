@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -11,59 +11,27 @@ from scipy import ndimage
 from torch import Tensor
 
 from dsr.sample import Scene
+from dsr.training.settings import PatchSettings
 
 _BLUR, _NOISE = 1.0, 0.03
-_MAX_DEPTH_SCALE = 3.0
-"""Depth changes by a factor of exp(3) = 20 at most."""
 
 
-@dataclass(frozen=True)
-class Augmentation:
-    """Random changes of a scene that keep rgb, depth and camera consistent.
-
-    Args:
-        flip: whether scenes are mirrored at random, horizontally and vertically.
-        rotate: whether scenes are rotated by random quarter turns, the camera included.
-        depth_scale: s, where depth is multiplied by exp(U(-s, s)).
-        colour: standard deviation of the gain of each colour channel.
-        photo: fraction of the scenes whose rgb is changed by :func:`simulate_camera`.
-
-    Raises:
-        ValueError: a value is out of range.
-
-    """
-
-    flip: bool = True
-    rotate: bool = True
-    depth_scale: float = 0.3
-    colour: float = 0.1
-    photo: float = 0.5
-
-    def __post_init__(self) -> None:
-        """Check the values."""
-        if not 0 <= self.depth_scale <= _MAX_DEPTH_SCALE:
-            raise ValueError(f"depth_scale: expected 0 to {_MAX_DEPTH_SCALE:g}, got {self.depth_scale}")
-        if not 0 <= self.colour < math.inf:
-            raise ValueError(f"colour: expected 0 or more, got {self.colour}")
-        if not 0 <= self.photo <= 1:
-            raise ValueError(f"photo: expected a fraction from 0 to 1, got {self.photo}")
-
-    def __call__(self, scene: Scene, random: np.random.Generator) -> tuple[Scene, float]:
-        """Return the augmented scene and the factor by which its depth was multiplied."""
-        if self.colour:
-            gain = torch.from_numpy(1 + self.colour * random.standard_normal((3, 1, 1))).float()
-            scene = replace(scene, rgb=(scene.rgb * gain).clamp(0, 1))
-        if random.random() < self.photo:
-            scene = replace(scene, rgb=simulate_camera(scene.rgb, random))
-        if self.flip:
-            for vertical in (False, True):
-                if random.random() < 0.5:
-                    scene = mirror(scene, vertical=vertical)
-        if self.rotate:
-            scene = rotate90(scene, int(random.integers(4)))
-        factor = math.exp(random.uniform(-self.depth_scale, self.depth_scale)) if self.depth_scale else 1.0
-        depth = None if scene.depth is None else scene.depth * factor
-        return replace(scene, depth=depth), factor
+def augment(scene: Scene, settings: PatchSettings, random: np.random.Generator) -> tuple[Scene, float]:
+    """Return a scene changed at random, rgb, depth and camera alike, and the factor that multiplied its depth."""
+    if settings.colour:
+        gain = torch.from_numpy(1 + settings.colour * random.standard_normal((3, 1, 1))).float()
+        scene = replace(scene, rgb=(scene.rgb * gain).clamp(0, 1))
+    if random.random() < settings.photo:
+        scene = replace(scene, rgb=simulate_camera(scene.rgb, random))
+    if settings.flip:
+        for vertical in (False, True):
+            if random.random() < 0.5:
+                scene = mirror(scene, vertical=vertical)
+    if settings.rotate:
+        scene = rotate90(scene, int(random.integers(4)))
+    factor = math.exp(random.uniform(-settings.depth_scale, settings.depth_scale)) if settings.depth_scale else 1.0
+    depth = None if scene.depth is None else scene.depth * factor
+    return replace(scene, depth=depth), factor
 
 
 def simulate_camera(rgb: Tensor, random: np.random.Generator) -> Tensor:

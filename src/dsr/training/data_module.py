@@ -17,7 +17,8 @@ from dsr.data.base import SceneSource, content_key
 from dsr.geometry.camera import Camera
 from dsr.sample import Scene
 from dsr.training.degradation import Batch, Degradation, to_tensors
-from dsr.training.patches import Patches, PatchSettings, check_patches
+from dsr.training.patches import Patches, check_patches
+from dsr.training.settings import PatchSettings
 
 
 @dataclass(frozen=True)

@@ -1,11 +1,9 @@
-"""Training of super-resolution networks with Lightning: the schedule and the LightningModule."""
+"""Training of super-resolution networks with Lightning."""
 
 from __future__ import annotations
 
 import copy
-import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import lightning
@@ -19,59 +17,10 @@ from dsr.methods.networks.base import DisparityNetwork
 from dsr.metrics.functional import SurfacePair
 from dsr.training.degradation import Batch
 from dsr.training.objective import Objective, to_depth
+from dsr.training.settings import Schedule
 
 _RENDERED_SCENES = 4
 """Number of scenes of each validation set that are rendered for TensorBoard."""
-
-
-@dataclass(frozen=True)
-class Schedule:
-    """Optimisation settings: AdamW with linear warm-up and cosine decay to zero, and an average of the weights.
-
-    Args:
-        steps: number of steps of the whole training.
-        learning_rate: highest learning rate.
-        warmup: number of steps until the highest learning rate.
-        weight_decay: weight decay of AdamW.
-        clip: largest norm of the gradient; longer gradients are scaled down to it.
-        average: decay of the exponential moving average of the weights, which is validated and saved; 0 for the weights
-            themselves. The decay is smaller in the first steps.
-        mixed: whether the network's convolutions run in bfloat16; losses and weights stay in float32.
-
-    Raises:
-        ValueError: a value is out of range.
-
-    """
-
-    steps: int
-    learning_rate: float = 1e-3
-    warmup: int = 100
-    weight_decay: float = 1e-4
-    clip: float = 1.0
-    average: float = 0.999
-    mixed: bool = False
-
-    def __post_init__(self) -> None:
-        """Check the values."""
-        for name in ("steps", "learning_rate", "clip"):
-            if not 0 < getattr(self, name) < math.inf:
-                raise ValueError(f"{name}: expected a positive number, got {getattr(self, name)}")
-        for name in ("warmup", "weight_decay"):
-            if not 0 <= getattr(self, name) < math.inf:
-                raise ValueError(f"{name}: expected 0 or more, got {getattr(self, name)}")
-        if not 0 <= self.average < 1:
-            raise ValueError(f"average: expected 0 or more and less than 1, got {self.average}")
-
-    def factor(self, step: int) -> float:
-        """Return the learning rate at a step as a fraction of the highest."""
-        if step < self.warmup:
-            return (step + 1) / self.warmup
-        done = min((step - self.warmup) / max(self.steps - self.warmup, 1), 1.0)
-        return 0.5 * (1 + math.cos(math.pi * done))
-
-    def decay(self, step: int) -> float:
-        """Return the decay of the moving average after a step, counted from 1."""
-        return min(self.average, step / (step + 9))
 
 
 class SuperResolution(lightning.LightningModule):

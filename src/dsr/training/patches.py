@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -18,49 +18,12 @@ from torch.utils.data import Dataset
 from dsr.geometry.camera import baseline_times_focal
 from dsr.methods.networks.maps import compute_min_max
 from dsr.sample import AllHolesError, DepthSample, Scene
-from dsr.training.augmentation import Augmentation
+from dsr.training.augmentation import augment
 from dsr.training.degradation import Batch, Degradation, to_tensors
+from dsr.training.settings import PatchSettings
 
 _WINDOW_TRIES, _SCENE_TRIES = 10, 100
 _MIN_VALID_FRACTION = 0.5
-_MIN_SIZE = 16
-
-
-@dataclass(frozen=True)
-class PatchSettings(Augmentation):
-    """How patches are cropped and augmented.
-
-    Args:
-        patch: height and width in pixels, a multiple of the scale.
-        batch: number of patches per step and device.
-        validation_scenes: number of scenes at the end of each data set that are kept for validation.
-        scenes: number of scenes to use of each data set, from its first on; None for all.
-        workers: number of additional processes that crop patches.
-        flip, rotate, depth_scale, colour, photo: see :class:`dsr.training.augmentation.Augmentation`.
-
-    Raises:
-        ValueError: a value is out of range.
-
-    """
-
-    patch: int = 96
-    batch: int = 16
-    validation_scenes: int = 4
-    scenes: int | None = None
-    workers: int = 0
-
-    def __post_init__(self) -> None:
-        """Check the values."""
-        super().__post_init__()
-        if self.patch < _MIN_SIZE:
-            raise ValueError(f"patch: expected at least {_MIN_SIZE} pixels, got {self.patch}")
-        if self.batch < 1:
-            raise ValueError(f"batch: expected a positive number, got {self.batch}")
-        if self.scenes is not None and self.scenes < 1:
-            raise ValueError(f"scenes: expected a positive number, or null for all, got {self.scenes}")
-        for name in ("workers", "validation_scenes"):
-            if getattr(self, name) < 0:
-                raise ValueError(f"{name}: expected 0 or more, got {getattr(self, name)}")
 
 
 class Patches(Dataset[Batch]):
@@ -133,7 +96,7 @@ class Patches(Dataset[Batch]):
         size = self._settings.patch
         cropped = source.crop(top, left, size, size)
         depth = None if cropped.depth is None else cropped.depth.double()
-        scene, factor = self._settings(replace(cropped, depth=depth, measured={}), random)
+        scene, factor = augment(replace(cropped, depth=depth, measured={}), self._settings, random)
         generator = torch.Generator().manual_seed(int(random.integers(2**63)))
         sample = self._degradation.sample(scene, generator)
         patch = to_tensors(sample)

@@ -5,10 +5,8 @@ from __future__ import annotations
 import contextlib
 import json
 import math
-import platform
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -37,7 +35,6 @@ _FILES: Mapping[str, tuple[str, ...]] = {
     "mesh": ("mesh.ply", "mesh.glb"),
     "before_after": ("before_after.png",),
 }
-_PACKAGES = ("torch", "numpy", "opencv-python-headless")
 
 
 @dataclass(frozen=True)
@@ -203,11 +200,6 @@ def described(picture: Picture, encoding: Encoding) -> dict[str, Any]:
         "input_depth": _plain(picture.encoding),
         "depth_file": _plain(encoding),
     }
-
-
-def versions() -> dict[str, str]:
-    """Return the versions of what computed the result."""
-    return {"dsr": version("dsr"), "python": platform.python_version(), **{name: version(name) for name in _PACKAGES}}
 
 
 def _plain(encoding: Encoding) -> dict[str, Any]:

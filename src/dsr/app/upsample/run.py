@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import platform
 import time
 from collections import Counter
 from collections.abc import Mapping
@@ -22,7 +23,6 @@ from dsr.app.upsample.outputs import (
     kept_depth,
     output_encoding,
     read_previous_run,
-    versions,
     write_parts,
 )
 from dsr.app.upsample.reporting import Reporter, listed, problem_line
@@ -34,6 +34,9 @@ from dsr.io.layouts import find_pairs_of_folder
 from dsr.io.pairs import Pair, PairingResult, find_pairs_of_lists
 from dsr.utils.console import ConsoleProgress, show
 from dsr.utils.progress import Progress
+from dsr.utils.versions import package_versions
+
+_PACKAGES = ("dsr", "torch", "numpy", "opencv-python-headless")
 
 
 def run(wanted: UpsampleRequest, console: Console) -> list[str]:
@@ -57,7 +60,7 @@ def run(wanted: UpsampleRequest, console: Console) -> list[str]:
     problems: dict[str, list[str]] = {}
     outcomes: Counter[str] = Counter()
     progress = ConsoleProgress(console)
-    for pair in progress.track(found.pairs, "upsample", label=lambda pair: pair.name, lines=not single):
+    for pair in progress.track(found.pairs, "upsample", label=lambda pair: pair.name, lines=False):
         target = wanted.output if single else wanted.output / pair.name
         try:
             outcomes[_one(wanted, pair, target, units, reporter, progress)] += 1
@@ -233,7 +236,7 @@ def _write(job: _Job, picture: Picture, depth: Tensor, planned: Plan, seconds: f
         **described(picture, encoding),
         "assumptions": [str(fact) for fact in (*picture.assumptions, *facts)],
         "seconds": {"upsampling": round(seconds, 3), "writing": round(time.perf_counter() - started, 3)},
-        "versions": versions(),
+        "versions": {"python": platform.python_version(), **package_versions(_PACKAGES)},
     }
     kept = job.earlier.files if job.earlier is not None and job.same else ()
     finish(job.target, job.earlier, entries, [*files, *(name for name in kept if name not in files)])

@@ -45,19 +45,19 @@ class PriorSettings:
 
     """
 
-    steps: int
-    learning_rate: float
-    widths: Sequence[int]
-    skips: Sequence[int]
-    padding: Padding
-    border: int
-    guide: bool
-    input_noise: float
-    perturbation: float
-    guide_perturbation: float
-    average: float
-    margin: float
-    mixed: bool
+    steps: int = 600
+    learning_rate: float = 0.01
+    widths: Sequence[int] = (32, 64, 128, 128, 128)
+    skips: Sequence[int] = (4, 4, 4, 4, 4)
+    padding: Padding = "zeros"
+    border: int = 8
+    guide: bool = True
+    input_noise: float = 0.1
+    perturbation: float = 0.1
+    guide_perturbation: float = 0.05
+    average: float = 0.99
+    margin: float = 0.1
+    mixed: bool = False
 
     def __post_init__(self) -> None:
         """Check the values."""

@@ -78,22 +78,22 @@ class DeepImagePrior:
 
     scale: int
     downsampling: Downsampling
-    steps: int = 600
-    learning_rate: float = 0.01
-    widths: Sequence[int] = (32, 64, 128, 128, 128)
-    skips: Sequence[int] = (4, 4, 4, 4, 4)
-    padding: Padding = "zeros"
-    border: int = 8
-    guide: bool = True
-    input_noise: float = 0.1
-    perturbation: float = 0.1
-    guide_perturbation: float = 0.05
-    average: float = 0.99
-    margin: float = 0.1
-    data_loss: DataLoss = "lap1"
-    data_weight: float = 1.0
-    w: float = 1.0
-    w_intensity: float = 0.01
+    steps: int = PriorSettings.steps
+    learning_rate: float = PriorSettings.learning_rate
+    widths: Sequence[int] = PriorSettings.widths
+    skips: Sequence[int] = PriorSettings.skips
+    padding: Padding = PriorSettings.padding
+    border: int = PriorSettings.border
+    guide: bool = PriorSettings.guide
+    input_noise: float = PriorSettings.input_noise
+    perturbation: float = PriorSettings.perturbation
+    guide_perturbation: float = PriorSettings.guide_perturbation
+    average: float = PriorSettings.average
+    margin: float = PriorSettings.margin
+    data_loss: DataLoss = PriorObjective.data_loss
+    data_weight: float = PriorObjective.data_weight
+    w: float = PriorObjective.w
+    w_intensity: float = PriorObjective.w_intensity
     largest_tilt: float | None = 10.0
     stopping: StoppingName = "fixed"
     patience: int = 200
@@ -257,6 +257,7 @@ class WarmStarted(DeepImagePrior):
 
     weights: Path
     model: str
+    steps: int = 100
 
     def __post_init__(self) -> None:
         """Load the network."""

@@ -1,0 +1,111 @@
+"""The settings of a training, without torch: a configuration is checked before torch is imported."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+_MAX_DEPTH_SCALE = 3.0
+"""Depth changes by a factor of exp(3) = 20 at most."""
+_MIN_SIZE = 16
+
+
+@dataclass(frozen=True)
+class PatchSettings:
+    """How patches are cropped and augmented.
+
+    Args:
+        patch: height and width in pixels, a multiple of the scale.
+        batch: number of patches per step and device.
+        validation_scenes: number of scenes at the end of each data set that are kept for validation.
+        scenes: number of scenes to use of each data set, from its first on; None for all.
+        workers: number of additional processes that crop patches.
+        flip: whether scenes are mirrored at random, horizontally and vertically.
+        rotate: whether scenes are rotated by random quarter turns, the camera included.
+        depth_scale: s, where depth is multiplied by exp(U(-s, s)).
+        colour: standard deviation of the gain of each colour channel.
+        photo: fraction of the patches whose rgb is changed by :func:`dsr.training.augmentation.simulate_camera`.
+
+    Raises:
+        ValueError: a value is out of range.
+
+    """
+
+    patch: int = 96
+    batch: int = 6
+    validation_scenes: int = 4
+    scenes: int | None = None
+    workers: int = 0
+    flip: bool = True
+    rotate: bool = True
+    depth_scale: float = 0.3
+    colour: float = 0.1
+    photo: float = 0.5
+
+    def __post_init__(self) -> None:
+        """Check the values."""
+        if not 0 <= self.depth_scale <= _MAX_DEPTH_SCALE:
+            raise ValueError(f"depth_scale: expected 0 to {_MAX_DEPTH_SCALE:g}, got {self.depth_scale}")
+        if not 0 <= self.colour < math.inf:
+            raise ValueError(f"colour: expected 0 or more, got {self.colour}")
+        if not 0 <= self.photo <= 1:
+            raise ValueError(f"photo: expected a fraction from 0 to 1, got {self.photo}")
+        if self.patch < _MIN_SIZE:
+            raise ValueError(f"patch: expected at least {_MIN_SIZE} pixels, got {self.patch}")
+        if self.batch < 1:
+            raise ValueError(f"batch: expected a positive number, got {self.batch}")
+        if self.scenes is not None and self.scenes < 1:
+            raise ValueError(f"scenes: expected a positive number, or null for all, got {self.scenes}")
+        for name in ("workers", "validation_scenes"):
+            if getattr(self, name) < 0:
+                raise ValueError(f"{name}: expected 0 or more, got {getattr(self, name)}")
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """Optimisation settings: AdamW with linear warm-up and cosine decay to zero, and an average of the weights.
+
+    Args:
+        steps: number of steps of the whole training.
+        learning_rate: highest learning rate.
+        warmup: number of steps until the highest learning rate.
+        weight_decay: weight decay of AdamW.
+        clip: largest norm of the gradient; longer gradients are scaled down to it.
+        average: decay of the exponential moving average of the weights, which is validated and saved; 0 for the weights
+            themselves. The decay is smaller in the first steps.
+        mixed: whether the network's convolutions run in bfloat16; losses and weights stay in float32.
+
+    Raises:
+        ValueError: a value is out of range.
+
+    """
+
+    steps: int
+    learning_rate: float = 1e-3
+    warmup: int = 300
+    weight_decay: float = 1e-4
+    clip: float = 1.0
+    average: float = 0.999
+    mixed: bool = False
+
+    def __post_init__(self) -> None:
+        """Check the values."""
+        for name in ("steps", "learning_rate", "clip"):
+            if not 0 < getattr(self, name) < math.inf:
+                raise ValueError(f"{name}: expected a positive number, got {getattr(self, name)}")
+        for name in ("warmup", "weight_decay"):
+            if not 0 <= getattr(self, name) < math.inf:
+                raise ValueError(f"{name}: expected 0 or more, got {getattr(self, name)}")
+        if not 0 <= self.average < 1:
+            raise ValueError(f"average: expected 0 or more and less than 1, got {self.average}")
+
+    def factor(self, step: int) -> float:
+        """Return the learning rate at a step as a fraction of the highest."""
+        if step < self.warmup:
+            return (step + 1) / self.warmup
+        done = min((step - self.warmup) / max(self.steps - self.warmup, 1), 1.0)
+        return 0.5 * (1 + math.cos(math.pi * done))
+
+    def decay(self, step: int) -> float:
+        """Return the decay of the moving average after a step, counted from 1."""
+        return min(self.average, step / (step + 9))

@@ -1,0 +1,107 @@
+"""A setting has one default: the value in ``conf`` is the one that the class or function has."""
+
+import inspect
+from collections.abc import Sequence
+from pathlib import Path
+
+import pytest
+from omegaconf import OmegaConf
+
+from dsr.app.schema import EvalConfig, MetricsConfig, TrainConfig, TrainerConfig
+from dsr.methods.dip.optimisation import PriorSettings
+from dsr.methods.dip.problem import PriorObjective
+from dsr.methods.dip.upsampler import DeepImagePrior
+from dsr.methods.registry import read_method
+from dsr.training.settings import PatchSettings, Schedule
+from dsr.utils.builder import load_target
+
+CONF = Path(__file__).resolve().parents[2] / "conf"
+GROUPS = ("method", "model", "noise", "holes", "downsampling", "dataset")
+DIFFERENT = {
+    "method/dip": {"data_loss", "data_weight", "w"},  # the class's are those of dip_v, which shares it
+    "method/bilinear": {"order"},  # one function, three orders; its default is bicubic
+    "method/nearest": {"order"},
+    "method/msg": {"variant"},  # three networks of one function
+    "method/msg_v": {"variant"},
+    "method/msg_v_noisy": {"variant"},
+    "model/msg": {"variant"},  # trained by the project; the class's is the published MSG-V
+    "model/msg_v": {"variant"},
+    "dataset/simgeo": {"root"},  # on the command line the folder of data is looked at for Lucy
+}
+"""Files whose keys are what tells one choice from another of the same class, by the keys."""
+TRAINER = OmegaConf.to_container(OmegaConf.load(CONF / "trainer" / "default.yaml"))
+
+
+def read_file(group, name):
+    """Return a file's keys, those that it takes from others included; interpolations stay as they are."""
+    node = OmegaConf.load(CONF / group / f"{name}.yaml")
+    above = [each for each in node.pop("defaults", []) if each != "_self_" and "@" not in each]
+    return {key: value for each in above for key, value in read_file(group, each).items()} | OmegaConf.to_container(
+        node
+    )
+
+
+FILES = {f"{path.parent.name}/{path.stem}" for group in GROUPS for path in (CONF / group).glob("*.yaml")}
+MIXTURES = {"dataset/mixture", "dataset/paper_train"}  # parts, each a data set's file
+
+
+def defaults_of(target):
+    parameters = inspect.signature(target).parameters.values()
+    return {each.name: plain(each.default) for each in parameters if each.default is not each.empty}
+
+
+def plain(value):
+    return list(value) if isinstance(value, Sequence) and not isinstance(value, str) else value
+
+
+def differences(values, defaults):
+    return {key for key in values.keys() & defaults.keys() if values[key] != defaults[key]}
+
+
+@pytest.mark.parametrize("name", sorted(FILES - MIXTURES))
+def test_value_in_conf_is_the_default_of_the_target(name):
+    node = read_file(*name.split("/"))
+    assert differences(node, defaults_of(load_target(name, node))) == DIFFERENT.get(name, set())
+
+
+def test_every_setting_of_deep_image_priors_is_in_conf():
+    own = {"precision", "seed", "device", "metrics", "workspace", "display"}  # of the run, not of the method
+    assert defaults_of(DeepImagePrior).keys() - own == read_method("dip", 4).keys() - {"name", "label", "target"}
+
+
+@pytest.mark.parametrize("part", [PriorSettings, PriorObjective])
+def test_deep_image_prior_has_the_defaults_of_its_parts(part):
+    assert differences(defaults_of(part), defaults_of(DeepImagePrior)) == set()
+
+
+def test_trainer_in_conf_has_the_defaults_of_the_schema():
+    assert defaults_of(TrainerConfig) == TRAINER
+
+
+@pytest.mark.parametrize("part", [PatchSettings, Schedule])
+def test_trainer_in_conf_has_the_defaults_of_the_parts_of_a_training(part):
+    defaults = defaults_of(part)
+    assert defaults.keys() - {"mixed"} <= TRAINER.keys()  # mixed comes from the key precision
+    assert differences(TRAINER, defaults) == set()
+
+
+def test_metrics_in_conf_have_the_defaults_of_the_schema():
+    node = read_file("metrics", "paper")
+    assert node.pop("lpips_trunk") == "${oc.env:DSR_LPIPS_TRUNK,null}"
+    assert {**node, "lpips_trunk": None} == vars(MetricsConfig())
+
+
+@pytest.mark.parametrize(("command", "schema"), [("eval", EvalConfig), ("train", TrainConfig)])
+def test_command_in_conf_has_the_defaults_of_the_schema(command, schema):
+    node = OmegaConf.to_container(OmegaConf.load(CONF / f"{command}.yaml"))
+    own = {key: value for key, value in node.items() if key not in ("defaults", "hydra")}
+    if command == "eval":
+        assert own.pop("weights") == "${oc.env:DSR_WEIGHTS,null}"
+        own["weights"] = None
+    settings = schema()
+    values = {key: getattr(settings, key) for key in own}
+    assert {key: vars(value) if key == "loss" else value for key, value in values.items()} == own
+
+
+def test_difference_is_noticed():
+    assert differences({"a": 1, "b": 2, "c": 3}, {"a": 1, "b": 3, "d": 4}) == {"b"}
