@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import shutil
@@ -22,6 +23,7 @@ from dsr.evaluation.store import prediction_path, sample_path
 from dsr.geometry.camera import Camera
 from dsr.metrics.catalogue import catalogue, score_image
 from dsr.sample import Scene
+from dsr.utils.console import ConsoleProgress, _ConsoleTask
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 UNIT_TESTS = REPOSITORY / "tests" / "unit"
@@ -128,6 +130,28 @@ def browser() -> Iterator[Any]:
         started = driver.chromium.launch(executable_path=path, args=list(CHROMIUM_ARGUMENTS))
         yield started
         started.close()
+
+
+@pytest.fixture
+def line_per_report(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Make commands print a line for each report of progress, as if seconds lay between them."""
+    make_task, report = ConsoleProgress.task, _ConsoleTask.__call__
+    shown_by: dict[int, ConsoleProgress] = {}
+
+    @contextlib.contextmanager
+    def task(self: ConsoleProgress, *arguments: Any, **named: Any) -> Iterator[_ConsoleTask]:
+        with make_task(self, *arguments, **named) as made:
+            shown_by[id(made)] = self
+            yield made
+
+    def report_and_print(self: _ConsoleTask, *arguments: Any, **named: Any) -> None:
+        report(self, *arguments, **named)
+        shown_by[id(self)].tick()
+
+    monkeypatch.setattr(ConsoleProgress, "task", task)
+    monkeypatch.setattr(_ConsoleTask, "__call__", report_and_print)
+    monkeypatch.setattr("dsr.utils.console._FIRST_LINE", 0.0)
+    monkeypatch.setattr("dsr.utils.console._NEXT_LINE", 0.0)
 
 
 @pytest.fixture

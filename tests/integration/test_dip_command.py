@@ -93,6 +93,17 @@ def test_cost_of_each_scene_is_announced_and_the_run_ends_in_a_table(
     assert {row["method"] for row in _rows(home)} == {"dip_v"}
 
 
+@pytest.mark.usefixtures("line_per_report")
+def test_steps_have_lines_with_named_times_off_a_terminal(tmp_path: Path, run: Run) -> None:
+    code, output, errors = run(
+        tmp_path, "method=dip", "dataset.scenes=[statue]", "method.steps=4", "method.validate_every=0"
+    )
+    assert (code, errors) == (0, "")
+    times = r"elapsed \d:\d\d:\d\d, remaining \d:\d\d:\d\d"
+    steps = rf"^predict statue \(0 of 1\): steps: (\d) of 4, {times}(?:, loss \d+\.\d{{4}})?$"
+    assert list(dict.fromkeys(re.findall(steps, output, re.MULTILINE))) == ["1", "2", "3"]
+
+
 def test_log_has_the_losses_all_scores_and_renderings(
     both: tuple[Path, subprocess.CompletedProcess[str]],
 ) -> None:

@@ -140,6 +140,25 @@ def test_default_run_writes_the_documented_files_and_nothing_else(default_run):
     assert [path.name for path in folder.iterdir()] == ["outputs"]
 
 
+def test_every_scene_has_lines_with_named_times_off_a_terminal(default_run):
+    lines = default_run[2].stdout.splitlines()
+    times = r"elapsed \d:\d\d:\d\d, remaining \d:\d\d:\d\d"
+    for number, scene in enumerate(SIMGEO, 1):
+        for work in ("predict", "score"):
+            [line] = [line for line in lines if line.startswith(f"{work} {scene}: ")]
+            assert re.fullmatch(rf"{work} {scene}: {number} of 6, \d+\.\d s, {times}", line)
+
+
+@pytest.mark.usefixtures("line_per_report")
+def test_network_reports_its_steps_within_a_scene(within):
+    code, output, errors = within("method=facets", "dataset.scenes=[statue]", "dataset.size=64", "output_dir=out")
+    assert (code, errors) == (0, [])
+    steps = r"predict statue \(0 of 1\): steps: (\d+) of (\d+), elapsed \d:\d\d:\d\d, remaining \d:\d\d:\d\d"
+    found = re.findall(f"^{steps}$", output, re.MULTILINE)
+    assert found
+    assert all(0 < int(done) < int(total) for done, total in found)
+
+
 def test_missing_lpips_trunk_is_one_line_with_advice(default_run):
     _, _, done = default_run
     assert done.stderr.count("LPIPS_v is left out") == 1

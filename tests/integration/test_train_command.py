@@ -145,6 +145,16 @@ def test_training_reports_its_plan_and_where_the_weights_are(smoke):
     assert lines[-1:] == [f"weights: outputs/train/{home.name}/weights.safetensors"]
 
 
+@pytest.mark.usefixtures("line_per_report")
+def test_steps_and_validations_have_lines_with_named_times_off_a_terminal(within):
+    code, output, errors = within(*SMOKE, "trainer.validation_scenes=2", "output_dir=out")
+    assert (code, errors) == (0, [])
+    times = r"elapsed \d:\d\d:\d\d, remaining \d:\d\d:\d\d"
+    assert re.search(rf"^train: 1 of 2, {times}, loss \d+\.\d{{4}}$", output, re.MULTILINE)
+    whole = r"train loss \d+\.\d{4} \(1 of 2, remaining \d:\d\d:\d\d\)"
+    assert re.search(rf"^{whole}: validate: 1 of 2, {times}$", output, re.MULTILINE)
+
+
 def test_training_emits_no_warning(smoke):
     assert smoke[2].stderr == ""
 

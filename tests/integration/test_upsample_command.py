@@ -235,6 +235,10 @@ def test_broken_picture_does_not_stop_the_others(pair, tmp_path, capsys):
         "3 pairs of photo and depth map\n  folders rgb and depth\n  1 without a partner, left out: 000007.png"
         in told.out
     )
+    for name in ("000000", "000002"):
+        [line] = [line for line in told.out.splitlines() if name in line]
+        assert line.startswith(f"{name}: ")
+        assert line.endswith(f" -> {out / name}")
     assert told.out.count("degrees of horizontal view assumed") == 1
     assert f"3 pictures: 2 done, 1 failed -> {out}" in told.out
     assert files_in(out) == {

@@ -93,12 +93,17 @@ def test_long_task_prints_a_line_after_three_seconds_and_then_every_ten(now: Clo
 
 def test_line_about_steps_names_the_scene_that_they_belong_to(now: Clock) -> None:
     progress, text = _progress(now)
-    for _ in progress.track(["statue"], "predict"):
+    for _ in progress.track(["statue", "room"], "predict"):
         with progress.task("steps") as step:
-            now.seconds += 10
+            now.seconds += 11
             step(50, 1000)
             progress.tick()
-    assert text.getvalue().splitlines()[0] == ("predict statue: steps: 50 of 1000, elapsed 0:00:10, remaining 0:03:10")
+    assert text.getvalue().splitlines() == [
+        "predict statue (0 of 2): steps: 50 of 1000, elapsed 0:00:11, remaining 0:03:29",
+        "predict statue: 1 of 2, 11.0 s, elapsed 0:00:11, remaining 0:00:11",
+        "predict room (1 of 2, remaining 0:00:00): steps: 50 of 1000, elapsed 0:00:11, remaining 0:03:29",
+        "predict room: 2 of 2, 11.0 s, elapsed 0:00:22, remaining 0:00:00",
+    ]
 
 
 def test_long_step_is_reported_while_it_runs(now: Clock, monkeypatch: pytest.MonkeyPatch) -> None:

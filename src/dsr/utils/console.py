@@ -117,8 +117,7 @@ class ConsoleProgress(Progress):
         if not tasks or tasks[-1].done == tasks[-1].total or self._now() < self._next_line:
             return
         self._next_line = self._now() + _NEXT_LINE
-        path = ": ".join(f"{outer.name} {outer.remark}".rstrip() for outer in tasks[:-1])
-        self.say(f"{path}: {tasks[-1].line}" if path else tasks[-1].line)
+        self.say(": ".join([*(outer.heading for outer in tasks[:-1]), tasks[-1].line]))
 
     def _show_item(self, task: _ConsoleTask, seconds: float) -> None:
         """Print a line about a finished item, unless it is one of many short ones."""
@@ -218,6 +217,12 @@ class _ConsoleTask:
         """The named times."""
         remaining = self.remaining
         return (f"elapsed {clock(self.elapsed)}", *([] if remaining is None else [f"remaining {clock(remaining)}"]))
+
+    @property
+    def heading(self) -> str:
+        """What is worked on, and how much is done and left of the whole, for a line about a part of it."""
+        about = ", ".join((self.amount, *self.times[1:]))
+        return f"{self.name} {self.remark} ({about})" if self.remark else f"{self.name} ({about})"
 
     @property
     def line(self) -> str:
