@@ -35,6 +35,13 @@ def test_configuration_of_an_earlier_training_describes_its_network_and_data():
     assert [type(source) for source, _ in data.validation_scenes().values()] == [Procedural]
 
 
+def test_configuration_that_lacks_later_keys_has_their_defaults():
+    config = read_config(EARLIER / "train")
+    trainer = {key: value for key, value in config["trainer"].items() if key not in ("photo", "init", "accumulate")}
+    settings = TrainConfig.of({**config, "trainer": trainer}).trainer
+    assert (settings.photo, settings.init, settings.accumulate) == (0.5, None, 1)
+
+
 def test_earlier_training_is_evaluated_on_its_validation_scenes(tmp_path):
     shutil.copytree(EARLIER / "train", tmp_path / "train")
     (tmp_path / "train" / "weights.safetensors").write_bytes(b"")
