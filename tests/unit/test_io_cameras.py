@@ -13,7 +13,7 @@ from dsr.io.photos import read_photo
 
 SIZE, COARSE = (48, 64), (12, 16)
 OWN = {"width": 64, "height": 48, "fx": 60.0, "fy": 61.0, "cx": 31.0, "cy": 24.0}
-MATRIX = [[60.0, 0, 31], [0, 61, 24], [0, 0, 1]]
+OPEN3D = {"width": 64, "height": 48, "intrinsic_matrix": [60.0, 0, 0, 0, 61, 0, 31, 24, 1]}
 
 
 def written(folder, name, content):
@@ -41,7 +41,7 @@ def found(folder, **choice):
     ("name", "content"),
     [
         ("camera.json", OWN),
-        ("open3d.json", {"width": 64, "height": 48, "intrinsic_matrix": [60.0, 0, 0, 0, 61, 0, 31, 24, 1]}),
+        ("open3d.json", OPEN3D),
     ],
 )
 def test_camera_file_of_the_photo_is_used_silently(tmp_path, name, content):
@@ -78,11 +78,14 @@ def test_camera_of_another_resolution_is_scaled_about_the_outer_edge(tmp_path):
     ("name", "content", "message"),
     [
         ("c.json", {**OWN, "width": 80}, "another aspect"),
-        ("c.json", {**OWN, "fx": "wide"}, "fx: expected a number"),
-        ("c.json", {"intrinsic_matrix": [1, 2]}, "intrinsic_matrix: expected nine numbers"),
-        ("c.json", {"intrinsic_matrix": np.transpose(MATRIX).ravel().tolist()}, '"width" and "height"'),
-        ("c.json", {"width": 64, "height": 48, "intrinsic_matrix": np.ravel(MATRIX).tolist()}, "expected a matrix"),
-        ("c.json", "{", "expected JSON"),
+        ("c.json", {**OWN, "fx": "wide"}, "fx: expected a valid number, got 'wide'"),
+        ("c.json", {**OPEN3D, "intrinsic_matrix": [1, 2]}, "intrinsic_matrix: expected at least 9 items"),
+        ("c.json", {**OPEN3D, "intrinsic_matrix": [True] * 9}, "intrinsic_matrix.0: expected a valid number, got True"),
+        ("c.json", {**OPEN3D, "intrinsic_matrix": [10**400] * 9}, "expected a matrix"),
+        ("c.json", {"intrinsic_matrix": OPEN3D["intrinsic_matrix"]}, "width: it is missing"),
+        ("c.json", {**OPEN3D, "height": "48"}, "height: expected a valid integer, got '48'"),
+        ("c.json", {**OPEN3D, "intrinsic_matrix": [60.0, 0, 31, 0, 61, 24, 0, 0, 1]}, "expected a matrix"),
+        ("c.json", "{", "got damaged JSON"),
         ("k.txt", "a matrix", "expected JSON or a matrix"),
         ("k.txt", "1 2 3", "expected JSON or a matrix"),
         ("k.txt", "60 0 310 0 61 240 0 0 1", "expected a principal point near the middle"),

@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-import json
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated
 
 import numpy as np
+from pydantic import BaseModel, Field, ValidationError
 
-from dsr.data.formats.files import CameraFile, read_camera
+from dsr.data.formats.files import CameraFile, Pixels, read_camera
 from dsr.geometry.camera import Camera
 from dsr.io.encoding import Assumption
 from dsr.io.photos import Size, focal_in_exif, same_aspect
+from dsr.utils.validation import describe
 
 _DEFAULT_FOV = 60.0
 """Horizontal field of view in degrees, about that of a phone's main camera and of a depth camera's colour sensor."""
@@ -99,13 +99,7 @@ def read_any_camera(path: Path) -> CameraFile | np.ndarray:
     text = path.read_text(encoding="utf-8", errors="replace")
     if path.suffix.lower() != ".json" and not text.lstrip().startswith("{"):
         return _matrix(path, text)
-    try:
-        entries = json.loads(text)
-    except (ValueError, RecursionError):
-        entries = None
-    if isinstance(entries, dict) and "intrinsic_matrix" in entries:
-        return _open3d(path, entries)
-    return read_camera(path)
+    return _open3d(path, text) if '"intrinsic_matrix"' in text else read_camera(path)
 
 
 def _camera_only(camera: Camera) -> CameraFile:
@@ -164,17 +158,22 @@ def _matrix(path: Path, text: str) -> np.ndarray:
     return _check_matrix(path, np.array(numbers).reshape(side, side)[:3, :3])
 
 
-def _open3d(path: Path, entries: dict[str, Any]) -> CameraFile:
+class _Open3d(BaseModel, strict=True):
+    """Open3D's JSON."""
+
+    width: Pixels
+    height: Pixels
+    intrinsic_matrix: Annotated[list[float], Field(min_length=9, max_length=9)]
+
+
+def _open3d(path: Path, text: str) -> CameraFile:
     """Return the camera of Open3D's JSON."""
-    numbers = entries["intrinsic_matrix"]
-    if not isinstance(numbers, Sequence) or len(numbers) != 9 or not all(isinstance(n, (int, float)) for n in numbers):
-        raise ValueError(f"{path}: intrinsic_matrix: expected nine numbers, column by column")
-    matrix = _check_matrix(path, np.array(numbers, dtype=float).reshape(3, 3).T)
     try:
-        width, height = entries["width"], entries["height"]
-        return _camera_only(Camera(width, height, matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]))
-    except (KeyError, TypeError, ValueError) as error:
-        raise ValueError(f'{path}: expected "width" and "height" in pixels beside intrinsic_matrix') from error
+        stored = _Open3d.model_validate_json(text)
+    except ValidationError as error:
+        raise ValueError(f"{path}: {describe(error)}") from error
+    matrix = _check_matrix(path, np.array(stored.intrinsic_matrix).reshape(3, 3).T)
+    return _camera_only(Camera(stored.width, stored.height, matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]))
 
 
 def _check_matrix(path: Path, matrix: np.ndarray) -> np.ndarray:

@@ -2,15 +2,26 @@
 
 from __future__ import annotations
 
+import re
+from collections.abc import Iterable
+
 from pydantic import ValidationError
 
 
-def describe(error: ValidationError) -> str:
-    """Return the first thing that is wrong, such as ``trials.a1.scale: expected a valid integer, got 'x'``."""
+def describe(error: ValidationError, known: Iterable[str] = ()) -> str:
+    """Return the first thing that is wrong, such as ``trials.a1.scale: expected a valid integer, got 'x'``.
+
+    Args:
+        error: what the validation raised.
+        known: the keys to name where one is unknown.
+
+    """
     first = error.errors(include_url=False, include_context=False)[0]
     key = ".".join(map(str, first["loc"]))
-    what = {"missing": "it is missing", "json_invalid": "got damaged JSON"}.get(first["type"])
-    if what is None:
-        expected = first["msg"].removeprefix("Input should be ").removeprefix("Value error, ")
-        what = f"expected {expected}, got {first['input']!r:.60}"
+    message = re.sub(r"^(\w+ should (be|have) |Value error, )", "", first["msg"])
+    what = {
+        "missing": "it is missing",
+        "json_invalid": message.replace("Invalid JSON:", "got damaged JSON:"),
+        "extra_forbidden": f"unknown key; expected {', '.join(known)}",
+    }.get(first["type"], f"expected {message}, got {first['input']!r:.60}")
     return f"{key}: {what}" if key else what

@@ -2,26 +2,23 @@
 
 from __future__ import annotations
 
-import json
 import math
 import os
 import re
 import threading
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import cv2
 import numpy as np
+from pydantic import BaseModel, BeforeValidator, Field, ValidationError
 
-from dsr.geometry.camera import RANGE_TYPES, Camera, RangeType
+from dsr.geometry.camera import Camera, RangeType
+from dsr.utils.validation import describe
 
 MAP_SUFFIXES = (".npy", ".png", ".tiff", ".tif", ".pfm")
 _METRES = {"m": 1.0, "mm": 1e-3}
-_LARGEST = 1e12
-"""Beyond it, no number in a camera file means anything."""
-_NUMBERS = ("width", "height", "fx", "fy", "cx", "cy")
-_OPTIONAL = ("range_type", "baseline", "baseline_unit", "doffs", "depth_unit", "hole_value")
 
 
 def read_rgb(path: Path) -> np.ndarray:
@@ -124,60 +121,52 @@ def read_camera(path: Path) -> CameraFile:
     if not path.is_file():
         raise ValueError(f"{path}: expected a camera file, there is none")
     try:
-        entries = json.loads(path.read_text(encoding="utf-8"))
-    except (ValueError, RecursionError) as error:
-        raise ValueError(f"{path}: expected JSON, got: {error}") from error
-    if not isinstance(entries, dict):
-        raise ValueError(f"{path}: expected a JSON object, got {type(entries).__name__}")
-    for key in entries:
-        if key not in (*_NUMBERS, *_OPTIONAL):
-            raise ValueError(f"{path}: {key}: unknown key; expected {', '.join((*_NUMBERS, *_OPTIONAL))}")
-    numbers = {key: _number(path, entries, key) for key in _NUMBERS}
-    range_type = entries.get("range_type")
-    if range_type is not None and range_type not in RANGE_TYPES:
-        raise ValueError(f"{path}: range_type: expected one of {', '.join(RANGE_TYPES)}, got {range_type!r}")
-    baseline = None
-    if entries.get("baseline") is not None:
-        baseline = _number(path, entries, "baseline") * _unit(path, entries, "baseline_unit", numeric=False)
-    width, height = (_whole(path, key, numbers.pop(key)) for key in ("width", "height"))
-    doffs = _number(path, entries, "doffs") if "doffs" in entries else 0.0
-    try:
-        camera = Camera(width, height, **numbers, baseline=baseline, doffs=doffs)
+        entries = _CameraJson.model_validate_json(path.read_bytes()).model_dump(exclude_unset=True, exclude_none=True)
+        if "baseline" in entries:
+            entries["baseline"] *= _METRES[entries.get("baseline_unit", "m")]
+        camera = Camera(**{each.name: entries[each.name] for each in fields(Camera) if each.name in entries})
+    except ValidationError as error:
+        raise ValueError(f"{path}: {describe(error, _CameraJson.model_fields)}") from error
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
-    return CameraFile(
-        camera,
-        range_type,
-        _unit(path, entries, "depth_unit", numeric=True) if "depth_unit" in entries else None,
-        _number(path, entries, "hole_value") if "hole_value" in entries else None,
-    )
+    return CameraFile(camera, *map(entries.get, ("range_type", "depth_unit", "hole_value")))
 
 
-def _number(path: Path, entries: dict[str, Any], key: str) -> float:
-    """Return a finite number, or say what is there instead."""
-    value = entries.get(key)
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) <= _LARGEST:
-        came = repr(value) if key in entries else "nothing"
-        raise ValueError(f"{path}: {key}: expected a number, got {came:.40}")
-    return float(value)
+def _whole(value: Any) -> Any:
+    """Return a whole float, such as 640.0, as int and anything else as it is."""
+    return int(value) if isinstance(value, float) and value.is_integer() else value
 
 
-def _whole(path: Path, key: str, value: float) -> int:
-    """Return a whole number as int."""
-    if not value.is_integer():
-        raise ValueError(f"{path}: {key}: expected a whole number of pixels, got {value:g}")
-    return int(value)
+def _metres(unit: Any) -> Any:
+    """Return metres per value for the name of a unit, and anything else as it is."""
+    if not isinstance(unit, str):
+        return unit
+    if unit not in _METRES:
+        raise ValueError("m, mm or a positive number of metres per value")
+    return _METRES[unit]
 
 
-def _unit(path: Path, entries: dict[str, Any], key: str, *, numeric: bool) -> float:
-    """Return metres per unit of the unit that a key names; metres where the key is missing."""
-    value = entries.get(key, "m")
-    if isinstance(value, str) and value in _METRES:
-        return _METRES[value]
-    if numeric and isinstance(value, (int, float)) and not isinstance(value, bool) and 0 < value < math.inf:
-        return float(value)
-    choices = "m, mm" + (" or a positive number of metres per value" if numeric else "")
-    raise ValueError(f"{path}: {key}: expected {choices}, got {value!r}")
+_Number = Annotated[float, Field(ge=-1e12, le=1e12, allow_inf_nan=False)]
+"""Beyond these limits, no number in a camera file means anything."""
+Pixels = Annotated[int, Field(ge=1, le=1e12), BeforeValidator(_whole)]
+"""A size in a camera file."""
+
+
+class _CameraJson(BaseModel, strict=True, extra="forbid"):
+    """A ``camera.json`` as it is stored; keys that it lacks do not get the defaults."""
+
+    width: Pixels
+    height: Pixels
+    fx: _Number
+    fy: _Number
+    cx: _Number
+    cy: _Number
+    range_type: RangeType | None = None
+    baseline: _Number | None = None
+    baseline_unit: Literal["m", "mm"] = "m"
+    doffs: _Number = 0.0
+    depth_unit: Annotated[_Number, Field(gt=0), BeforeValidator(_metres)] = 1.0
+    hole_value: _Number = 0.0
 
 
 def _content(path: Path) -> bytes:
