@@ -276,7 +276,7 @@ def test_repaired_scene_is_added_by_the_same_command(tmp_path, within):
     camera.write_text("{}")
     arguments = ("dataset=folder", "dataset.root=data", "output_dir=out")
     code, _, errors = within(*arguments)
-    assert (code, errors[0]) == (2, "error: data/b/camera.json: width: expected a number, got nothing")
+    assert (code, errors[0]) == (2, "error: data/b/camera.json: width: it is missing")
     camera.write_text(content)
     code, output, errors = within(*arguments)
     assert (code, errors) == (0, [])

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
-import math
-from collections.abc import Iterable, Mapping, Sequence
+from codecs import BOM_UTF8
+from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
+
+from pydantic import AfterValidator, BaseModel, BeforeValidator, Field, ValidationError, ValidationInfo
 
 from dsr.user_study.key import PAGE_VERSION, Key
+from dsr.utils.validation import describe
 
 _LARGEST = 10_000_000
 """Bytes; a file of answers has some thousands."""
@@ -44,7 +46,7 @@ class Answers:
         file: where it was read.
         participant: a random id.
         finished: when.
-        content: a hash of what was answered, whoever it was.
+        content: the trials as JSON; equal in two files that hold the very same answers.
         given: one for each scene shown.
 
     """
@@ -103,84 +105,81 @@ def read_answers(file: Path, key: Key) -> Answers:
         ValueError: it is damaged, of another study, incomplete, or has answers that the page cannot give; one line.
 
     """
-    content = _read(file)
-    study, version = content.get("study"), content.get("page")
-    if study != key.study:
-        raise ValueError(f"{file}: expected answers to the study {key.study}, got those to {study!r}")
-    if version != PAGE_VERSION:
-        raise ValueError(f"{file}: expected answers of version {PAGE_VERSION}, got {version!r}")
-    participant = content.get("participant")
-    if not isinstance(participant, str) or not participant:
-        raise ValueError(f"{file}: participant: expected an id, got {participant!r}")
-    finished = _time(file, content.get("finished"))
-    trials = content.get("trials")
-    if not isinstance(trials, list):
-        raise ValueError(f"{file}: trials: expected a list, got {type(trials).__name__}")
-    given = tuple(_answer(f"{file}: trial {number}", trial, key) for number, trial in enumerate(trials, 1))
+    stored = _read(file, key)
+    if stored.finished is None:
+        raise ValueError(f"{file}: incomplete, it was saved before the last scene was answered")
+    given = tuple(_answer(f"{file}: trials.{number}", trial, key) for number, trial in enumerate(stored.trials))
     _expect_all(file, given, key)
-    digest = hashlib.sha256(json.dumps(trials, sort_keys=True).encode()).hexdigest()
-    return Answers(file, participant, finished, digest, given)
+    return Answers(file, stored.participant, stored.finished, stored.model_dump_json(include={"trials"}), given)
 
 
-def _read(file: Path) -> dict[str, Any]:
-    """Return a JSON object of a sane size."""
+def _expect(value: Any, info: ValidationInfo) -> Any:
+    """Refuse answers to another study, or of another version."""
+    expected = (info.context or {})[info.field_name]
+    if value != expected:
+        raise ValueError(repr(expected))
+    return value
+
+
+def _time(text: Any) -> datetime:
+    """Return a time with its zone, as ISO 8601 writes it."""
+    with suppress(TypeError, ValueError):
+        time = datetime.fromisoformat(text)
+        if time.tzinfo is not None:
+            return time
+    raise ValueError("a time such as 2024-05-01T12:00:00Z")
+
+
+class _Trial(BaseModel, strict=True, extra="allow"):
+    """What the page stores of one scene; a choice is None until it is made."""
+
+    scene: str
+    again: bool
+    order: list[str]
+    first: str | None
+    second: str | None
+    ms: Annotated[float, Field(ge=0, allow_inf_nan=False)]
+
+
+class _Stored(BaseModel, strict=True):
+    """What the page saves; ``finished`` is None until the last scene is answered."""
+
+    study: Annotated[str, AfterValidator(_expect)]
+    page: Annotated[int, AfterValidator(_expect)]
+    participant: Annotated[str, Field(min_length=1)]
+    finished: Annotated[datetime, BeforeValidator(_time)] | None
+    trials: list[_Trial]
+
+
+def _read(file: Path, key: Key) -> _Stored:
+    """Return the content of a file of a sane size."""
     try:
         if file.stat().st_size > _LARGEST:
             raise ValueError(f"{file}: expected a file of answers, got one of {file.stat().st_size / 1e6:.0f} MB")
-        content = json.loads(file.read_text(encoding="utf-8-sig"))
+        content = file.read_bytes().removeprefix(BOM_UTF8)
+        return _Stored.model_validate_json(content, context={"study": key.study, "page": PAGE_VERSION})
     except OSError as error:
         raise ValueError(f"{file}: expected a file of answers, got {error.strerror or error}") from error
-    except (json.JSONDecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise ValueError(f"{file}: expected a file of answers, got damaged JSON") from error
-    if not isinstance(content, dict):
-        raise ValueError(f"{file}: expected a file of answers, got a JSON {type(content).__name__}")
-    return content
+    except ValidationError as error:
+        raise ValueError(f"{file}: {describe(error)}") from error
 
 
-def _time(file: Path, text: Any) -> datetime:
-    """Return a time with its zone, as ISO 8601 writes it."""
-    if text is None:
-        raise ValueError(f"{file}: incomplete, it was saved before the last scene was answered")
-    try:
-        time = datetime.fromisoformat(text)
-    except (TypeError, ValueError):
-        time = None
-    if time is None or time.tzinfo is None:
-        raise ValueError(f"{file}: finished: expected a time such as 2024-05-01T12:00:00Z, got {text!r}")
-    return time
-
-
-def _answer(where: str, trial: Any, key: Key) -> Answer:
+def _answer(where: str, trial: _Trial, key: Key) -> Answer:
     """Return what was chosen in one trial."""
-    if not isinstance(trial, Mapping):
-        raise ValueError(f"{where}: expected an object, got {type(trial).__name__}")
-    scene, order = trial.get("scene"), trial.get("order")
-    if not isinstance(scene, str) or scene not in key.trials:
-        raise ValueError(f"{where}: scene: expected one of the study's, got {scene!r}")
-    candidates = key.trials[scene].candidates
-    if not isinstance(order, list) or not all(isinstance(name, str) for name in order):
-        raise ValueError(f"{where}: order: expected a list of pictures, got {order!r}")
-    if sorted(order) != sorted(candidates):
-        raise ValueError(f"{where}: order: expected each picture of the scene once, got others")
-    for name in ("first", "second"):
-        if trial.get(name) is None:
-            raise ValueError(f"{where}: incomplete, no {name} choice")
-        if not isinstance(trial[name], str) or trial[name] not in candidates:
-            raise ValueError(f"{where}: {name}: expected a picture that was shown, got {trial[name]!r}")
-    if trial["first"] == trial["second"]:
+    if trial.scene not in key.trials:
+        raise ValueError(f"{where}.scene: expected one of the study's, got {trial.scene!r}")
+    candidates = key.trials[trial.scene].candidates
+    if sorted(trial.order) != sorted(candidates):
+        raise ValueError(f"{where}.order: expected each picture of the scene once, got others")
+    first, second = trial.first, trial.second
+    if first is None or second is None:
+        raise ValueError(f"{where}: incomplete, no {'first' if first is None else 'second'} choice")
+    for name, choice in (("first", first), ("second", second)):
+        if choice not in candidates:
+            raise ValueError(f"{where}.{name}: expected a picture that was shown, got {choice!r}")
+    if first == second:
         raise ValueError(f"{where}: expected two different pictures, got the same as first and second")
-    again, milliseconds = trial.get("again"), trial.get("ms")
-    if not isinstance(again, bool):
-        raise ValueError(f"{where}: again: expected true or false, got {again!r}")
-    return Answer(scene, again, trial["first"], trial["second"], _seconds(where, milliseconds))
-
-
-def _seconds(where: str, milliseconds: Any) -> float:
-    """Return a duration in seconds."""
-    number = isinstance(milliseconds, int | float) and not isinstance(milliseconds, bool)
-    if not number or not math.isfinite(milliseconds) or milliseconds < 0:
-        raise ValueError(f"{where}: ms: expected milliseconds, got {milliseconds!r}")
-    return float(milliseconds) / 1000
+    return Answer(trial.scene, trial.again, first, second, trial.ms / 1000)
 
 
 def _expect_all(file: Path, given: Sequence[Answer], key: Key) -> None:
