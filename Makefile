@@ -1,5 +1,6 @@
 # make run   evaluate on the embedded scenes (ARGS="scale=8 method=..." are handed on to eval.py)
 # make test  lint, types and tests
+# make unit  the unit tests alone, about a minute
 # make docs  the documentation as a site in outputs/site
 # All of them set everything up in .venv first; they need Python >= 3.11 and nothing else.
 
@@ -8,13 +9,16 @@ VENV := .venv
 BIN := $(VENV)/bin
 ARGS ?=
 
-.PHONY: run test lint docs benchmark clean
+.PHONY: run test unit lint docs benchmark clean
 
 run: $(VENV)/installed
 	$(BIN)/python eval.py $(ARGS)
 
 test: lint
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest --numprocesses auto --maxprocesses 8 --dist loadfile
+
+unit: $(VENV)/installed-dev
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest --numprocesses auto --maxprocesses 8 --dist loadfile -m unit
 
 lint: $(VENV)/installed-dev
 	$(BIN)/ruff check .
@@ -32,11 +36,11 @@ $(VENV)/bin/python:
 		{ echo "error: Python 3.11 or newer is needed; name one with PYTHON=..." >&2; exit 2; }
 	$(PYTHON) -m venv $(VENV)
 
-$(VENV)/installed: pyproject.toml constraints.txt | $(VENV)/bin/python
+$(VENV)/installed: pyproject.toml setup.py constraints.txt | $(VENV)/bin/python
 	$(BIN)/pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable .
 	@touch $@
 
-$(VENV)/installed-dev: pyproject.toml constraints.txt | $(VENV)/bin/python
+$(VENV)/installed-dev: pyproject.toml setup.py constraints.txt | $(VENV)/bin/python
 	$(BIN)/pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[dev,docs]'
 	@touch $(VENV)/installed $@
 
