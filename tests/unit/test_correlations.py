@@ -14,7 +14,7 @@ from dsr.metrics.formats import in_tables
 from dsr.report import correlation_figure
 from dsr.report.correlation_figure import density_of, save_scatter_matrix, scatter_matrix
 from dsr.report.correlations import correlate, metric_matrix, pairs, with_reference, write_correlations
-from dsr.viz.palette import KNOWN, method_colours
+from dsr.viz.palette import FIXED, method_colours
 
 VARIANTS = ("e1", "e2", "e3", "e4", "max", "avg")
 
@@ -136,8 +136,8 @@ def test_scatter_matrix_has_points_coefficients_and_densities():
     assert f"{expected:.2f}" in axes[0, 2].texts[1].get_text()
     curves = [line for line in axes[1, 1].lines if len(line.get_xdata()) == 200]
     assert [line.get_color() for line in curves] == [
-        KNOWN["Bicubic"],
-        KNOWN["MSG"],
+        FIXED["Bicubic"],
+        FIXED["MSG"],
     ]  # of two results there is no density
     assert all(max(line.get_ydata()) == pytest.approx(1) for line in curves)
     assert axes[2, 2].get_xlabel() == "LPIPS_v (1/1000)"
@@ -192,5 +192,5 @@ def test_colour_of_a_known_method_does_not_depend_on_the_others():
 
 
 def test_colours_of_any_number_of_methods_differ():
-    colours = method_colours([*KNOWN, *(f"method {number}" for number in range(40))])
+    colours = method_colours([*FIXED, *(f"method {number}" for number in range(40))])
     assert len({colour.lower() for colour in colours.values()}) == 50

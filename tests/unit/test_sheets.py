@@ -115,7 +115,7 @@ def test_scene_without_high_resolution_depth_shows_its_lowest_measured_map(tmp_p
 
 def test_measured_map_beside_the_high_resolution_map_is_mentioned(tmp_path, written):
     drawn(tmp_path, toy_scene(measured={4: torch.full((1, 8, 8), 2.0)}))
-    assert any("measured, too: x4\ndepth 2 to 2 m" in text for text in written)
+    assert any("also measured: x4\ndepth 2 to 2 m" in text for text in written)
 
 
 @pytest.mark.parametrize(("count", "pages"), [(3, 2), (4, 2), (5, 3)])

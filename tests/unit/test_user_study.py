@@ -23,7 +23,7 @@ from dsr.geometry.camera import Camera
 from dsr.user_study.answers import files_of, read_all, read_answers
 from dsr.user_study.build import Choice, build_study
 from dsr.user_study.collect import ALL, AVERAGE, COLUMNS, collect, remarks
-from dsr.user_study.intervals import agreement, average_share, bootstrap_of_average, wilson
+from dsr.user_study.intervals import agreement, average_fraction, bootstrap_of_average, wilson
 from dsr.user_study.key import Candidate, Key, Trial, read_key, write_key
 from dsr.user_study.pictures import grey_png, shading_of
 from dsr.user_study.summary import tables_of
@@ -122,7 +122,7 @@ def test_interval_of_an_average_is_wilsons_with_one_answer_a_person_where_all_ag
 
 
 def test_average_weighs_scenes_equally_without_those_without_answers():
-    assert average_share(np.array([1, 9, 0]), np.array([2, 9, 0])) == pytest.approx(0.75)
+    assert average_fraction(np.array([1, 9, 0]), np.array([2, 9, 0])) == pytest.approx(0.75)
 
 
 def test_agreement_equals_fleiss_own_example():
@@ -284,7 +284,7 @@ def test_first_finished_of_one_persons_files_counts(tmp_path):
     files = written(tmp_path, later, first, other)
     given, left_out = read_all(files, KEY)
     assert [each.file for each in given] == files[1:]
-    assert left_out == [f"{files[0]}: a double of {files[1]} (the same person), which was finished first and counts"]
+    assert left_out == [f"{files[0]}: duplicate of {files[1]} (the same person), which was finished first"]
 
 
 def test_incomplete_file_does_not_replace_the_persons_complete_one(tmp_path):
@@ -298,7 +298,7 @@ def test_incomplete_file_does_not_replace_the_persons_complete_one(tmp_path):
 def test_identical_answers_under_another_name_count_once(tmp_path):
     given, left_out = read_all(written(tmp_path, FOUR[0], FOUR[0] | {"participant": "p7"}), KEY)
     assert len(given) == 1
-    assert "the very same answers" in left_out[0]
+    assert "identical answers" in left_out[0]
 
 
 def test_identical_choices_of_two_people_both_count(tmp_path):

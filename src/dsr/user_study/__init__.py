@@ -1,1 +1,1 @@
-"""The perceptual study: a page that people answer, and the percentages of their answers."""
+"""Perceptual study: a page of questions for participants, and the percentages of their answers."""

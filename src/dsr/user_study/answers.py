@@ -1,4 +1,4 @@
-"""The files of answers that people send back: read, checked, and each person's taken once."""
+"""Read and check the answer files of a study; each participant counts once."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ from dsr.user_study.key import PAGE_VERSION, Key
 from dsr.utils.validation import describe
 
 _LARGEST = 10_000_000
-"""Bytes; a file of answers has some thousands."""
+"""Maximum file size, bytes; an answer file has a few thousand."""
 
 
 @dataclass(frozen=True)
 class Answer:
-    """What somebody chose for one scene.
+    """The choice of a participant for one scene.
 
     Args:
-        scene: the scene's id.
-        again: whether it is the second time that this person is asked.
-        first, second: the ids of the pictures chosen.
-        seconds: how long it took.
+        scene: id of the scene.
+        again: whether this participant saw the scene for the second time.
+        first, second: ids of the pictures chosen.
+        seconds: time taken.
 
     """
 
@@ -40,14 +40,14 @@ class Answer:
 
 @dataclass(frozen=True)
 class Answers:
-    """A complete file of answers.
+    """A complete answer file.
 
     Args:
-        file: where it was read.
-        participant: a random id.
-        finished: when.
-        content: the trials as JSON; equal in two files that hold the very same answers.
-        given: one for each scene shown.
+        file: path of the file.
+        participant: random id.
+        finished: time of the last answer.
+        content: trials as JSON; equal for two files with identical answers.
+        given: one answer per scene shown.
 
     """
 
@@ -59,7 +59,7 @@ class Answers:
 
 
 def files_of(paths: Iterable[Path]) -> list[Path]:
-    """Return the files named and those called ``*.json`` below directories named, each once.
+    """Return the given files and all ``*.json`` files below the given directories, without duplicates.
 
     Raises:
         ValueError: there is no file.
@@ -75,34 +75,34 @@ def files_of(paths: Iterable[Path]) -> list[Path]:
 
 
 def read_all(files: Sequence[Path], key: Key) -> tuple[list[Answers], list[str]]:
-    """Return the answers that count, in the order of their files, and why each of the others is left out.
+    """Read all files; return the accepted answers in file order, and one line per rejected file.
 
-    Of one person's files, and of files that hold the very same answers, the one finished first counts.
+    Of several files of one participant, or with identical answers, the one finished first is accepted.
     """
-    good: list[Answers] = []
-    left_out = []
+    accepted: list[Answers] = []
+    rejected = []
     for file in files:
         try:
-            good.append(read_answers(file, key))
+            accepted.append(read_answers(file, key))
         except ValueError as error:
-            left_out.append(str(error))
+            rejected.append(str(error))
     taken: dict[str, Answers] = {}
-    for answers in sorted(good, key=lambda each: (each.finished, str(each.file))):
+    for answers in sorted(accepted, key=lambda each: (each.finished, str(each.file))):
         earlier = taken.get(answers.participant) or taken.get(answers.content)
         if earlier:
-            what = "the same person" if earlier.participant == answers.participant else "the very same answers"
-            left_out.append(f"{answers.file}: a double of {earlier.file} ({what}), which was finished first and counts")
+            what = "the same person" if earlier.participant == answers.participant else "identical answers"
+            rejected.append(f"{answers.file}: duplicate of {earlier.file} ({what}), which was finished first")
             continue
         taken |= {answers.participant: answers, answers.content: answers}
     kept = {answers.file for answers in taken.values()}
-    return [answers for answers in good if answers.file in kept], left_out
+    return [answers for answers in accepted if answers.file in kept], rejected
 
 
 def read_answers(file: Path, key: Key) -> Answers:
-    """Return one file of answers.
+    """Read one answer file.
 
     Raises:
-        ValueError: it is damaged, of another study, incomplete, or has answers that the page cannot give; one line.
+        ValueError: the file is damaged, incomplete, of another study, or has answers that the page cannot produce.
 
     """
     stored = _read(file, key)
@@ -114,7 +114,7 @@ def read_answers(file: Path, key: Key) -> Answers:
 
 
 def _expect(value: Any, info: ValidationInfo) -> Any:
-    """Refuse answers to another study, or of another version."""
+    """Check that the answers belong to this study and page version."""
     expected = (info.context or {})[info.field_name]
     if value != expected:
         raise ValueError(repr(expected))
@@ -122,7 +122,7 @@ def _expect(value: Any, info: ValidationInfo) -> Any:
 
 
 def _time(text: Any) -> datetime:
-    """Return a time with its zone, as ISO 8601 writes it."""
+    """Parse an ISO 8601 time with its time zone."""
     with suppress(TypeError, ValueError):
         time = datetime.fromisoformat(text)
         if time.tzinfo is not None:
@@ -131,7 +131,7 @@ def _time(text: Any) -> datetime:
 
 
 class _Trial(BaseModel, strict=True, extra="allow"):
-    """What the page stores of one scene; a choice is None until it is made."""
+    """One scene in an answer file; a choice is None until it is made."""
 
     scene: str
     again: bool
@@ -142,7 +142,7 @@ class _Trial(BaseModel, strict=True, extra="allow"):
 
 
 class _Stored(BaseModel, strict=True):
-    """What the page saves; ``finished`` is None until the last scene is answered."""
+    """Content of an answer file; ``finished`` is None until the last scene is answered."""
 
     study: Annotated[str, AfterValidator(_expect)]
     page: Annotated[int, AfterValidator(_expect)]
@@ -152,7 +152,7 @@ class _Stored(BaseModel, strict=True):
 
 
 def _read(file: Path, key: Key) -> _Stored:
-    """Return the content of a file of a sane size."""
+    """Read and validate a file, unless it is too large."""
     try:
         if file.stat().st_size > _LARGEST:
             raise ValueError(f"{file}: expected a file of answers, got one of {file.stat().st_size / 1e6:.0f} MB")
@@ -165,7 +165,7 @@ def _read(file: Path, key: Key) -> _Stored:
 
 
 def _answer(where: str, trial: _Trial, key: Key) -> Answer:
-    """Return what was chosen in one trial."""
+    """Validate one trial."""
     if trial.scene not in key.trials:
         raise ValueError(f"{where}.scene: expected one of the study's, got {trial.scene!r}")
     candidates = key.trials[trial.scene].candidates
@@ -183,7 +183,7 @@ def _answer(where: str, trial: _Trial, key: Key) -> Answer:
 
 
 def _expect_all(file: Path, given: Sequence[Answer], key: Key) -> None:
-    """Refuse a file that has not exactly what one person is shown."""
+    """Check that a file has exactly the scenes shown to one participant."""
     fresh = [answer.scene for answer in given if not answer.again]
     again = [answer.scene for answer in given if answer.again]
     for scenes, number, what in ((fresh, key.scenes_per_person, "scenes"), (again, key.repeat, "repeated scenes")):

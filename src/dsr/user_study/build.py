@@ -1,4 +1,4 @@
-"""Make the page of a study from runs, and the key that says whose the pictures are."""
+"""Build the page of a study from runs, and the key that maps its pictures to methods."""
 
 from __future__ import annotations
 
@@ -21,22 +21,22 @@ from dsr.utils.progress import SILENT, Progress
 
 PAGE_NAME = "index.html"
 _DIGITS = 12
-"""Of a hash, so many digits are an id."""
+"""Digits of a hash that make an id."""
 _FEWEST = 2
-"""Methods that there is something to choose between."""
+"""Minimum number of methods in a question."""
 
 
 @dataclass(frozen=True)
 class Choice:
-    """What of the runs to ask about, and how.
+    """Selection of the questions, and texts of the page.
 
     Args:
-        light: e1..e4, that of the renderings.
-        scales, downsamplings, methods, scenes: those to take; all where empty. Methods by label or by name.
-        scenes_per_person: how many scenes each person sees, drawn at random; all where None.
-        repeat: how many of a person's scenes come a second time, to see how consistent the answers are.
-        title: of the page.
-        send_to: what the last page says to do with the file of answers.
+        light: light of the renderings, e1..e4.
+        scales, downsamplings, methods, scenes: values to include; all if empty. Methods by label or by name.
+        scenes_per_person: number of scenes that each participant sees, drawn at random; None for all.
+        repeat: number of those scenes shown a second time, to measure consistency.
+        title: title of the page.
+        send_to: instruction on the last screen about the answer file.
 
     """
 
@@ -53,7 +53,7 @@ class Choice:
 
 @dataclass(frozen=True)
 class Question:
-    """A scene and the runs to show of it, in the order of the results."""
+    """A scene and the runs to compare on it, in the order of the results."""
 
     problem: BenchmarkSetting
     scene: str
@@ -62,7 +62,7 @@ class Question:
 
 @dataclass(frozen=True)
 class _Drawn:
-    """The pictures of a question: PNGs of the truth and of the runs in their order, and their width and height."""
+    """The pictures of a question: PNGs of the ground truth and of each run in order, their width and height."""
 
     question: Question
     truth: bytes = b""
@@ -73,12 +73,12 @@ class _Drawn:
 
 @dataclass(frozen=True)
 class Built:
-    """What was written.
+    """A study that was written.
 
     Args:
-        page: the page.
-        key: what is in the key beside it.
-        notes: what was left out and what to know, one line each.
+        page: path of the page.
+        key: content of the key file beside the page.
+        notes: omissions and remarks, one line each.
 
     """
 
@@ -95,18 +95,18 @@ def build_study(
     *,
     overwrite: bool = False,
 ) -> Built:
-    """Write ``index.html``, the page, and ``key.json`` into a directory.
+    """Write the page ``index.html`` and the key ``key.json`` of a study.
 
     Args:
-        results: the runs.
-        folder: where to; made if need be.
-        choice: what of the runs to show.
+        results: runs to compare.
+        folder: output directory, created if missing.
+        choice: selection of the questions.
         progress: shows the scenes that are drawn.
-        overwrite: whether to replace another study there, whose answers can then no longer be collected.
+        overwrite: whether to replace another study in the directory; its answers can then no longer be collected.
 
     Raises:
-        ValueError: nothing is left to compare, a choice names what the runs have not, a file is damaged, the title
-            has a method's name in it, or the directory holds another study.
+        ValueError: nothing is left to compare, the choice names a value that no run has, a file is damaged, the title
+            contains the name of a method, or the directory holds another study.
 
     """
     choice = choice or Choice()
@@ -134,25 +134,25 @@ def build_study(
 
 
 def _questions(results: Results, choice: Choice) -> tuple[list[Question], list[str]]:
-    """Return what to ask, and notes on what cannot be."""
-    runs = [run for run in results.runs if _wanted(run, choice)]
-    _expect_known(results, choice)
+    """Return the questions, and notes on the scenes left out."""
+    runs = [run for run in results.runs if _is_selected(run, choice)]
+    _expect_existing(results, choice)
     notes = list(results.notes)
     questions = []
     for problem in dict.fromkeys(run.problem for run in runs):
         of_problem = [run for run in runs if run.problem == problem]
         scenes = dict.fromkeys(scene for run in of_problem for scene in run.scenes)
-        everyone = {run.label for run in of_problem}
+        all_labels = {run.label for run in of_problem}
         for scene in scenes:
             if choice.scenes and scene not in choice.scenes:
                 continue
             place = f"{problem.dataset}/{scene} x{problem.scale} {problem.downsampling}"
             shown = one_per_method([run for run in of_problem if scene in run.scenes])
-            reason = _why_not(shown, scene)
+            reason = _reason_to_skip(shown, scene)
             if reason:
                 notes.append(f"left out: {place}: {reason}")
                 continue
-            missing = sorted(everyone - {run.label for run in shown})
+            missing = sorted(all_labels - {run.label for run in shown})
             notes += [f"{place}: without {', '.join(missing)}, which has no prediction of it"] if missing else []
             questions.append(Question(problem, scene, shown))
     if not questions:
@@ -161,8 +161,8 @@ def _questions(results: Results, choice: Choice) -> tuple[list[Question], list[s
     return questions, notes
 
 
-def _wanted(run: Run, choice: Choice) -> bool:
-    """Return whether a run is among those to show."""
+def _is_selected(run: Run, choice: Choice) -> bool:
+    """Return whether a run is selected."""
     return (
         (not choice.scales or run.scale in choice.scales)
         and (not choice.downsamplings or run.downsampling in choice.downsamplings)
@@ -170,22 +170,22 @@ def _wanted(run: Run, choice: Choice) -> bool:
     )
 
 
-def _expect_known(results: Results, choice: Choice) -> None:
-    """Refuse the name of what no run has."""
-    there: dict[str, tuple[Sequence[Any], set[Any]]] = {
+def _expect_existing(results: Results, choice: Choice) -> None:
+    """Check that each value in the choice occurs in a run."""
+    available: dict[str, tuple[Sequence[Any], set[Any]]] = {
         "scale": (choice.scales, {run.scale for run in results.runs}),
         "downsampling": (choice.downsamplings, {run.downsampling for run in results.runs}),
         "method": (choice.methods, {name for run in results.runs for name in (run.label, run.method)}),
         "scene": (choice.scenes, {scene for run in results.runs for scene in run.scenes}),
     }
-    for what, (asked, known) in there.items():
+    for what, (asked, existing) in available.items():
         for name in asked:
-            if name not in known:
-                raise ValueError(f"{what}: expected one of {', '.join(map(str, sorted(known)))}, got {name!r}")
+            if name not in existing:
+                raise ValueError(f"{what}: expected one of {', '.join(map(str, sorted(existing)))}, got {name!r}")
 
 
-def _why_not(runs: Sequence[Run], scene: str) -> str | None:
-    """Return why a scene cannot be asked about, None where it can."""
+def _reason_to_skip(runs: Sequence[Run], scene: str) -> str | None:
+    """Return the reason to leave out a scene, None if it can be shown."""
     if len(runs) < _FEWEST:
         return f"only {', '.join(run.label for run in runs)} has a prediction of it"
     if not any(run.has_sample(scene) for run in runs):
@@ -194,7 +194,7 @@ def _why_not(runs: Sequence[Run], scene: str) -> str | None:
 
 
 def _expect_blind(choice: Choice, labels: Iterable[str]) -> None:
-    """Refuse words of the page that would tell a method's name."""
+    """Check that the texts of the page do not contain the name of a method."""
     for name, text in (("title", choice.title), ("send-to", choice.send_to)):
         for label in labels:
             if label.casefold() in text.casefold():
@@ -202,38 +202,38 @@ def _expect_blind(choice: Choice, labels: Iterable[str]) -> None:
 
 
 def _draw(question: Question, light: str) -> _Drawn:
-    """Return a scene's pictures; none where its truth is not known."""
+    """Draw the pictures of a question; none for a scene without ground truth."""
     problem = question.problem
     place = f"{problem.dataset}/{question.scene} x{problem.scale} {problem.downsampling}"
     scene = next(run for run in question.runs if run.has_sample(question.scene)).sample(question.scene)
     if scene.depth is None:
-        return _Drawn(question, notes=(f"left out: {place}: its truth is not known",))
+        return _Drawn(question, notes=(f"left out: {place}: no ground truth",))
     truth = shading_of(scene.depth, scene.camera, light)
-    known = truth.isfinite()
+    valid = truth.isfinite()
     pictures: dict[bytes, str] = {}
     notes = []
     shown = []
     for run in question.runs:
         depth = run.prediction(question.scene)
         _expect_size(run, question.scene, depth, scene.depth)
-        picture = grey_png(shading_of(depth, scene.camera, light), known)
+        picture = grey_png(shading_of(depth, scene.camera, light), valid)
         if pictures.setdefault(picture, run.label) != run.label:
             notes.append(f"{place}: {pictures[picture]} and {run.label} look exactly the same")
         shown.append(picture)
-    return _Drawn(question, grey_png(truth, known), tuple(shown), (known.shape[1], known.shape[0]), tuple(notes))
+    return _Drawn(question, grey_png(truth, valid), tuple(shown), (valid.shape[1], valid.shape[0]), tuple(notes))
 
 
 def _expect_size(run: Run, scene: str, depth: Tensor, truth: Tensor) -> None:
-    """Refuse a prediction of another size than the truth's."""
+    """Check that a prediction has the size of the ground truth."""
     if depth.shape != truth.shape:
         sizes = [" x ".join(map(str, reversed(each.shape[-2:]))) for each in (truth, depth)]
         raise ValueError(f"{run.folder}: prediction of {scene}: expected {sizes[0]} pixels, got {sizes[1]}")
 
 
 def _with_ids(drawn: Sequence[_Drawn]) -> tuple[list[dict[str, Any]], dict[str, Trial]]:
-    """Return the page's scenes, ordered by id, and the key's trials; ids are hashes of pictures.
+    """Return the scenes of the page, ordered by id, and the trials of the key.
 
-    Neither an id nor the order on the page tells anything of a name.
+    Ids are hashes of pictures, so neither the ids nor the order on the page reveal a name.
     """
     scenes, trials = [], {}
     for number, each in enumerate(drawn):
@@ -255,7 +255,7 @@ def _with_ids(drawn: Sequence[_Drawn]) -> tuple[list[dict[str, Any]], dict[str, 
 
 
 def _hash(*parts: bytes) -> str:
-    """Return an id of some bytes."""
+    """Return the id of some bytes."""
     digest = hashlib.sha256()
     for part in parts:
         digest.update(len(part).to_bytes(8, "big") + part)
@@ -267,7 +267,7 @@ def _text(png: bytes) -> str:
 
 
 def _within(what: str, value: int | None, low: int, high: int, default: int) -> int:
-    """Return a number that is in a range, or the default."""
+    """Return the value if it is within a range, or the default for None."""
     if value is None:
         return default
     if not low <= value <= high:
@@ -276,7 +276,7 @@ def _within(what: str, value: int | None, low: int, high: int, default: int) -> 
 
 
 def _expect_free(path: Path, study: str, *, overwrite: bool) -> None:
-    """Refuse to lose the key of another study, without which its answers mean nothing."""
+    """Check that no key of another study is overwritten; its answers need that key."""
     if not overwrite and path.exists() and read_key(path).study != study:
         where = "take another directory or --overwrite"
         raise ValueError(f"{path}: expected no other study, whose answers need this key, got one; {where}")

@@ -1,7 +1,7 @@
-"""From answers to the paper's columns "User 1st", "2nd" and "Top 2", with confidence intervals.
+"""Aggregate answers into the paper's columns "User 1st", "User 2nd" and "Top 2", with confidence intervals.
 
-User 1st is the share of the people who chose a method's rendering as the one most similar to the truth's, User 2nd as
-the second most similar, Top 2 as either (Voynov et al., "Perceptual Deep Depth Super-Resolution", ICCV 2019).
+User 1st is the fraction of participants who chose a method's rendering as most similar to that of the ground truth,
+User 2nd as second most similar, Top 2 as either (Voynov et al., "Perceptual Deep Depth Super-Resolution", ICCV 2019).
 """
 
 from __future__ import annotations
@@ -16,25 +16,25 @@ import numpy as np
 import pandas as pd
 
 from dsr.user_study.answers import Answer, Answers
-from dsr.user_study.intervals import agreement, average_share, bootstrap_of_average, wilson
+from dsr.user_study.intervals import agreement, average_fraction, bootstrap_of_average, wilson
 from dsr.user_study.key import Candidate, Key, Trial
 
-SHARES = ("user_first", "user_second", "user_top2")
+PERCENTAGES = ("user_first", "user_second", "user_top2")
 PLACE = ("dataset", "scene", "scale", "downsampling", "method", "label")
-COLUMNS = (*PLACE, *SHARES, "n", *(f"{share}_{bound}" for share in SHARES for bound in ("low", "high")))
-"""Of the table: percent, and bounds of 95 % intervals."""
+COLUMNS = (*PLACE, *PERCENTAGES, "n", *(f"{column}_{bound}" for column in PERCENTAGES for bound in ("low", "high")))
+"""Columns of the table: percentages, and bounds of their 95 % intervals."""
 AVERAGE, ALL = "average", "all"
-"""The scene's name in rows of averages, and the data set's in those over all data sets."""
+"""Scene name of rows of averages, and data set name of averages over all data sets."""
 
 
 @dataclass(frozen=True)
 class _Votes:
-    """What everybody chose of one method.
+    """Votes for one method.
 
     Args:
         candidate: the method.
-        asked: (people, scenes) 1 where somebody was asked about it.
-        chosen: (people, scenes) for each of the columns in ``SHARES``, 1 where somebody chose it.
+        asked: (people, scenes) 1 where the participant saw the method.
+        chosen: (people, scenes) for each column in ``PERCENTAGES``, 1 where the participant chose the method.
 
     """
 
@@ -44,15 +44,15 @@ class _Votes:
 
 
 def collect(answers: Sequence[Answers], key: Key) -> pd.DataFrame:
-    """Return the table: rows for each scene and method, for averages over a data set's scenes, and over all scenes.
+    """Return the table of a study: rows per scene and method, and averages over each data set and over all scenes.
 
-    Percentages of scenes have Wilson's intervals; those of averages come from resampling people, for one person's
-    answers to several scenes belong together. An average counts each scene that a method was shown in alike. Scenes
-    that nobody was shown have no rows.
+    Percentages of single scenes have Wilson intervals. Intervals of averages come from resampling participants, since
+    the answers of one participant are not independent. In an average each scene that showed the method has the same
+    weight. Scenes without answers have no rows.
 
     Args:
-        answers: those that count, at least one.
-        key: of the study.
+        answers: accepted answers, at least one.
+        key: key of the study.
 
     """
     groups: dict[tuple[int, str], dict[str, list[str]]] = {}
@@ -70,22 +70,22 @@ def collect(answers: Sequence[Answers], key: Key) -> pd.DataFrame:
 
 
 def remarks(answers: Sequence[Answers], key: Key) -> list[str]:
-    """Return what there is to say of the answers, one line each: how many, how long, how far people agree."""
+    """Summarize the answers, one line each: number, duration, agreement and consistency of participants."""
     times = [sum(answer.seconds for answer in each.given) / 60 for each in answers]
     people = len(answers)
-    said = [f"{people} {'person' if people == 1 else 'people'}, {median(times):.1f} minutes each (median)"]
+    lines = [f"{people} {'person' if people == 1 else 'people'}, {median(times):.1f} minutes each (median)"]
     counts, labels = _first_choices(answers, key)
     same, kappa = agreement(counts)
     if math.isfinite(same):
         chance = float(np.mean([1 / len(key.trials[name].candidates) for name in _seen(answers, key)]))
         text = f"two people choose the same picture first in {100 * same:.0f} % of the cases ({100 * chance:.0f} % by "
         text += "guessing)"
-        said.append(text + (f"; Fleiss' kappa {kappa:.2f}" if math.isfinite(kappa) and len(labels) > 1 else ""))
-    return [*said, *_consistency(answers)]
+        lines.append(text + (f"; Fleiss' kappa {kappa:.2f}" if math.isfinite(kappa) and len(labels) > 1 else ""))
+    return [*lines, *_consistency(answers)]
 
 
 def _seen(answers: Iterable[Answers], key: Key) -> list[str]:
-    """Return the scenes that somebody was asked about, in the key's order."""
+    """Return the scenes with answers, in the order of the key."""
     asked = {answer.scene for each in answers for answer in each.given}
     return [name for name in key.trials if name in asked]
 
@@ -93,7 +93,7 @@ def _seen(answers: Iterable[Answers], key: Key) -> list[str]:
 def _rows(
     answers: Sequence[Answers], key: Key, scenes: Sequence[str], dataset: str, name: str | None = None
 ) -> list[dict[str, Any]]:
-    """Return the rows of all methods for one scene, or for the average over several, which then has a name."""
+    """Return the rows of all methods for one scene, or for a named average over several."""
     trials = [key.trials[scene] for scene in scenes]
     place = (dataset, name or trials[0].scene, trials[0].scale, trials[0].downsampling)
     rows = []
@@ -102,16 +102,16 @@ def _rows(
         people = int(votes.asked.any(axis=1).sum())
         method = (votes.candidate.method, label)
         row: dict[str, Any] = {**dict(zip(PLACE, (*place, *method), strict=True)), "n": people}
-        for column, chosen in zip(SHARES, votes.chosen, strict=True):
-            share = float(average_share(chosen.sum(0), votes.asked.sum(0)))
+        for column, chosen in zip(PERCENTAGES, votes.chosen, strict=True):
+            fraction = float(average_fraction(chosen.sum(0), votes.asked.sum(0)))
             bounds = bootstrap_of_average(chosen, votes.asked) if name else wilson(chosen.sum(), people)
-            row |= {column: 100 * share, f"{column}_low": 100 * bounds[0], f"{column}_high": 100 * bounds[1]}
+            row |= {column: 100 * fraction, f"{column}_low": 100 * bounds[0], f"{column}_high": 100 * bounds[1]}
         rows.append(row)
     return rows
 
 
 def _votes(answers: Sequence[Answers], scenes: Sequence[str], trials: Sequence[Trial], label: str) -> _Votes:
-    """Return what everybody chose of one method in some scenes; people who were shown none of them are left out."""
+    """Count the votes for one method in some scenes; participants who saw none of them are left out."""
     first, second, asked = (np.zeros((len(answers), len(scenes)), int) for _ in range(3))
     candidate = None
     for column, (scene, trial) in enumerate(zip(scenes, trials, strict=True)):
@@ -124,12 +124,12 @@ def _votes(answers: Sequence[Answers], scenes: Sequence[str], trials: Sequence[T
                     second[row, column] = answer.second == picture
     if candidate is None:
         raise ValueError(f"{label}: expected a method of the scenes {', '.join(scenes)}")
-    there = asked.any(axis=1)
-    return _Votes(candidate, asked[there], (first[there], second[there], (first + second)[there]))
+    present = asked.any(axis=1)
+    return _Votes(candidate, asked[present], (first[present], second[present], (first + second)[present]))
 
 
 def _answers_to(answers: Sequence[Answers], scene: str) -> list[tuple[int, Answer]]:
-    """Return the number of each person who was asked about a scene, and the answer, that of the first time."""
+    """Return the index of each participant who saw a scene, and the first answer."""
     return [
         (number, answer)
         for number, each in enumerate(answers)
@@ -139,7 +139,7 @@ def _answers_to(answers: Sequence[Answers], scene: str) -> list[tuple[int, Answe
 
 
 def _first_choices(answers: Sequence[Answers], key: Key) -> tuple[np.ndarray, list[str]]:
-    """Return how often each method was chosen first, (scenes, methods), and the methods."""
+    """Count the first choices of each method, (scenes, methods); return the counts and the methods."""
     scenes = _seen(answers, key)
     labels = sorted({candidate.label for name in scenes for candidate in key.trials[name].candidates.values()})
     counts = np.zeros((len(scenes), len(labels)), int)
@@ -150,13 +150,13 @@ def _first_choices(answers: Sequence[Answers], key: Key) -> tuple[np.ndarray, li
 
 
 def _consistency(answers: Sequence[Answers]) -> list[str]:
-    """Return how often people chose the same when they were asked again, overall and where one never did."""
-    said = []
+    """Report how often participants repeated their first choice, overall, and who never did."""
+    lines = []
     same, asked = 0, 0
     for each in answers:
         before = {answer.scene: answer.first for answer in each.given if not answer.again}
         repeated = [answer.first == before[answer.scene] for answer in each.given if answer.again]
         same, asked = same + sum(repeated), asked + len(repeated)
         if len(repeated) > 1 and not any(repeated):
-            said.append(f"{each.file}: another first choice each of the {len(repeated)} times a scene came again")
-    return [f"asked again, people chose the same picture first {same} of {asked} times", *said] if asked else []
+            lines.append(f"{each.file}: another first choice each of the {len(repeated)} times a scene came again")
+    return [f"asked again, people chose the same picture first {same} of {asked} times", *lines] if asked else []

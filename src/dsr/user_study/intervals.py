@@ -1,4 +1,4 @@
-"""Confidence intervals of percentages, and how far people agree."""
+"""Confidence intervals of fractions, and agreement of participants."""
 
 from __future__ import annotations
 
@@ -13,70 +13,70 @@ _RESAMPLES = 2000
 
 
 def wilson(count: float, n: int) -> tuple[float, float]:
-    """Return the 95 % score interval of a share (Wilson 1927, "Probable inference", JASA 22).
+    """Compute the 95 % score interval of a fraction (Wilson 1927, "Probable inference", JASA 22).
 
     Args:
-        count: how many of the answers, 0 to ``n``.
-        n: how many answers.
+        count: number of positive answers, 0 to ``n``.
+        n: number of answers.
 
     Returns:
-        The bounds in [0, 1]; (NaN, NaN) without answers.
+        Lower and upper bound in [0, 1]; (NaN, NaN) without answers.
 
     """
     if n == 0:
         return math.nan, math.nan
-    share = count / n
-    centre = share + _Z**2 / (2 * n)
-    half = _Z * math.sqrt(share * (1 - share) / n + _Z**2 / (4 * n**2))
+    fraction = count / n
+    centre = fraction + _Z**2 / (2 * n)
+    half = _Z * math.sqrt(fraction * (1 - fraction) / n + _Z**2 / (4 * n**2))
     scale = 1 + _Z**2 / n
     return max((centre - half) / scale, 0.0), min((centre + half) / scale, 1.0)
 
 
 def bootstrap_of_average(chosen: np.ndarray, asked: np.ndarray, seed: int = 0) -> tuple[float, float]:
-    """Return the 95 % interval of a share averaged over scenes, resampling people.
+    """Compute the 95 % interval of a fraction averaged over scenes by resampling participants.
 
-    A person answers for several scenes, so the answers are not independent, and people are what is drawn again
-    (percentile bootstrap of clusters: Davison and Hinkley 1997, "Bootstrap Methods and their Application", ch. 2-3).
-    Where all resamples agree, as when everybody or nobody chose a method, the bootstrap says nothing; then it is
-    Wilson's interval with one answer per person.
+    The answers of one participant to several scenes are not independent, so participants are resampled (cluster
+    percentile bootstrap: Davison and Hinkley 1997, "Bootstrap Methods and their Application", ch. 2-3). If all
+    resamples agree, for example because all or no participants chose a method, the Wilson interval with one answer per
+    participant is returned.
 
     Args:
-        chosen: (people, scenes) 1 where somebody chose it, else 0.
-        asked: (people, scenes) 1 where somebody was asked, else 0.
-        seed: of the resampling.
+        chosen: (people, scenes) 1 where the participant chose the method, else 0.
+        asked: (people, scenes) 1 where the participant saw the method, else 0.
+        seed: seed of the resampling.
 
     Returns:
-        The bounds in [0, 1].
+        Lower and upper bound in [0, 1].
 
     """
     people = len(asked)
     weights = np.random.default_rng(seed).multinomial(people, np.full(people, 1 / people), size=_RESAMPLES)
-    shares = average_share(weights @ chosen, weights @ asked)
-    shares = shares[np.isfinite(shares)]
-    low, high = np.quantile(shares, [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2])
+    fractions = average_fraction(weights @ chosen, weights @ asked)
+    fractions = fractions[np.isfinite(fractions)]
+    low, high = np.quantile(fractions, [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2])
     if high - low > 1e-12:
         return float(low), float(high)
-    return wilson(float(average_share(chosen.sum(0), asked.sum(0))) * people, people)
+    return wilson(float(average_fraction(chosen.sum(0), asked.sum(0))) * people, people)
 
 
-def average_share(chosen: np.ndarray, asked: np.ndarray) -> np.ndarray:
-    """Return the mean of chosen / asked over the scenes, the last axis, that somebody was asked about."""
+def average_fraction(chosen: np.ndarray, asked: np.ndarray) -> np.ndarray:
+    """Average chosen / asked over the scenes (last axis) with answers; NaN without any."""
     counted = asked > 0
-    shares = np.where(counted, chosen / np.maximum(asked, 1), 0.0)
+    fractions = np.where(counted, chosen / np.maximum(asked, 1), 0.0)
     scenes = counted.sum(-1)
-    return np.where(scenes > 0, shares.sum(-1) / np.maximum(scenes, 1), np.nan)
+    return np.where(scenes > 0, fractions.sum(-1) / np.maximum(scenes, 1), np.nan)
 
 
 def agreement(counts: np.ndarray) -> tuple[float, float]:
-    """Return how often two people choose the same, and Fleiss' kappa of it (Fleiss 1971, Psychological Bulletin 76).
+    """Compute the agreement of pairs of participants, and Fleiss' kappa (Fleiss 1971, Psychological Bulletin 76).
 
     Args:
-        counts: (scenes, methods) how many people chose a method first. Scenes with fewer than two answers are left out.
+        counts: (scenes, methods) number of first choices. Scenes with fewer than two answers are left out.
 
     Returns:
-        The share of pairs of people that agree, averaged over scenes, and kappa, which is 1 for full agreement and 0
-        for that of chance, given how often each method is chosen overall. NaN where there are no such pairs, and kappa
-        also where everybody always chose the same method.
+        The fraction of pairs of participants that agree, averaged over scenes, and kappa: 1 for full agreement, 0 for
+        agreement by chance given the overall frequency of each method. Both are NaN without pairs; kappa is also NaN if
+        all participants always chose the same method.
 
     """
     counts = counts[counts.sum(1) >= 2]

@@ -1,4 +1,4 @@
-"""The key of a study: which picture of its page is of which method and scene. It stays with whoever runs the study."""
+"""Key of a study: maps each picture of the page to its method and scene. Participants do not get it."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from dsr.utils.files import write_text
 from dsr.utils.validation import describe
 
 PAGE_VERSION = 1
-"""Of the page and of the answers that it writes."""
+"""Version of the page and of the answer files that it writes."""
 KEY_NAME = "key.json"
 
 
 @dataclass(frozen=True)
 class Candidate:
-    """What one picture shows.
+    """The method of one picture.
 
     Args:
-        label: the method's name for readers.
-        method: its name in ``scores.csv``.
-        run: the directory that its prediction came from.
+        label: display name of the method.
+        method: name of the method in ``scores.csv``.
+        run: directory of the run with the prediction.
 
     """
 
@@ -35,11 +35,11 @@ class Candidate:
 
 @dataclass(frozen=True)
 class Trial:
-    """What a person is asked about one scene.
+    """One scene of a study.
 
     Args:
         dataset, scene, scale, downsampling: as in ``scores.csv``.
-        candidates: the methods to choose from, by the opaque id of their picture.
+        candidates: methods to choose from, by the opaque id of their picture.
 
     """
 
@@ -52,14 +52,14 @@ class Trial:
 
 @dataclass(frozen=True)
 class Key:
-    """What a study asks.
+    """The questions of a study.
 
     Args:
-        study: a hash of all that is shown.
-        light: e1..e4, that of the renderings.
-        scenes_per_person: how many scenes each person sees.
-        repeat: how many of them come twice.
-        trials: by the opaque id of the scene.
+        study: hash of everything shown.
+        light: light of the renderings, e1..e4.
+        scenes_per_person: number of scenes that each participant sees.
+        repeat: number of those scenes shown twice.
+        trials: scenes by opaque id.
 
     """
 
@@ -71,12 +71,12 @@ class Key:
 
 
 def write_key(path: Path, key: Key) -> None:
-    """Write a key, atomically."""
+    """Write a key atomically."""
     write_text(path, json.dumps({"page": PAGE_VERSION, **asdict(key)}, indent=1, ensure_ascii=False) + "\n")
 
 
 def read_key(path: Path) -> Key:
-    """Return what :func:`write_key` wrote.
+    """Read a key written by :func:`write_key`.
 
     Raises:
         ValueError: the file is missing, damaged, or of another version.
@@ -97,7 +97,7 @@ def read_key(path: Path) -> Key:
 
 @dataclass(frozen=True)
 class _StoredKey(Key):
-    """The key as its file has it."""
+    """A key with the version stored in its file."""
 
     page: int
 

@@ -1,4 +1,4 @@
-"""The page: its parts put into one file that needs no other and asks nobody."""
+"""The page of a study: one self-contained HTML file without network access."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from typing import Any
 def page_of(content: Mapping[str, Any], *, title: str, send_to: str) -> str:
     """Return the page's HTML.
 
-    A content security policy lets it run its own script and style and show its own pictures, and nothing else: it
-    cannot send anything anywhere (W3C "Content Security Policy Level 3").
+    A content security policy allows only the page's own script, style and pictures, so the page cannot send data
+    (W3C "Content Security Policy Level 3").
 
     Args:
-        content: what ``study.js`` reads: the study, what each person sees, scenes and pictures.
-        title: of the page.
-        send_to: what to do with the file of answers.
+        content: data for ``study.js``: study id, scenes per participant, scenes and pictures.
+        title: title of the page.
+        send_to: instruction about the answer file.
 
     """
     style, script = _asset("study.css"), _asset("study.js")
@@ -41,10 +41,10 @@ def page_of(content: Mapping[str, Any], *, title: str, send_to: str) -> str:
 
 
 def _asset(name: str) -> str:
-    """Return a part of the page as it lies in the package."""
+    """Read an asset of the package."""
     return resources.files("dsr.user_study").joinpath("assets", name).read_text(encoding="utf-8")
 
 
 def _digest(text: str) -> str:
-    """Return a text's hash as a content security policy names it."""
+    """Return the hash of a text in the form of a content security policy."""
     return "sha256-" + base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()

@@ -1,4 +1,4 @@
-"""Renderings as the study shows them: all of one scene encoded alike, without loss, and without a word in the file."""
+"""Renderings of the study as lossless PNG files, all encoded with the same settings and without metadata."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from dsr.viz.panels import normals_seen_by
 
 
 def shading_of(depth: Tensor, camera: Camera, light: str) -> Tensor:
-    """Return the rendering of a depth map, (1, H, W) in metres, under one light: (H, W) in [0, 1], NaN where unknown.
+    """Render a depth map, (1, H, W) in metres, under one light: (H, W) in [0, 1], NaN where undefined.
 
     Raises:
         ValueError: there is no such light.
@@ -26,15 +26,15 @@ def shading_of(depth: Tensor, camera: Camera, light: str) -> Tensor:
     return render(normals_seen_by(camera, depth))[0, LIGHT_NAMES.index(light)]
 
 
-def grey_png(shades: Tensor, known: Tensor) -> bytes:
-    """Return a PNG of 8 bits: black is level 1, white is 255, and what is missing is level 0 and transparent.
+def grey_png(shades: Tensor, valid: Tensor) -> bytes:
+    """Encode an 8-bit PNG: black is level 1, white is 255, and missing pixels are level 0 and transparent.
 
     Args:
-        shades: (H, W) in [0, 1], NaN where unknown.
-        known: (H, W) bool, the pixels to show.
+        shades: (H, W) in [0, 1], NaN where undefined.
+        valid: (H, W) bool mask of the pixels to show.
 
     """
-    levels = torch.where(known & shades.isfinite(), 1 + (254 * shades).round(), torch.zeros_like(shades))
+    levels = torch.where(valid & shades.isfinite(), 1 + (254 * shades).round(), torch.zeros_like(shades))
     content = io.BytesIO()
     picture = Image.fromarray(levels.numpy().astype(np.uint8))
     picture.save(content, "PNG", transparency=0, compress_level=9)

@@ -1,4 +1,4 @@
-"""One picture that shows what upsampling did to somebody's depth: the surface before and after, lit from above."""
+"""Comparison picture of a depth map before and after upsampling, as a surface lit from above."""
 
 from __future__ import annotations
 
@@ -23,20 +23,20 @@ from dsr.viz.panels import colours, limits_of, reduced, strongest_window, write_
 
 _DPI = 200
 _PANEL, _TALLEST, _NARROWEST = 3.78, 4.6, 2.2
-"""Inches of a panel's width, its greatest height, and the least room across."""
+"""Maximum panel width, maximum panel height and minimum column width, inches."""
 _LEFT, _GAP, _HEADING, _BETWEEN, _BELOW = 0.3, 0.1, 0.92, 0.1, 0.62
-"""Inches left of the panels, between them, above the first row, between rows, and below the last."""
+"""Space left of the panels, between columns, above the first row, between rows and below the last row, inches."""
 _LONGEST = 1536
-"""Pixels of a whole picture's longer side as it is drawn: twice a panel's."""
+"""Maximum longer side of a drawn picture, pixels: twice the side of a panel."""
 _DETAIL = 4
-"""The detail is this part of the picture's sides."""
+"""The detail is 1/4 of the picture wide and high."""
 _FRAME = "#ff8c00"
 _LIGHT = 0
 _ROWS = ("lit from above", "detail", "normals | depth")
 
 
 class _Part(NamedTuple):
-    """A part of the view; 0 is the left or upper edge and 1 the right or lower."""
+    """A rectangle of the picture in relative coordinates: 0 is the left or upper edge, 1 the right or lower edge."""
 
     left: float
     right: float
@@ -47,29 +47,29 @@ class _Part(NamedTuple):
 _WHOLE = _Part(0, 1, 0, 1)
 
 
-def write_before_after(path: Path, rgb: Tensor, coarse: Tensor, depth: Tensor, camera: Camera, title: str) -> None:
+def write_before_after(path: Path, rgb: Tensor, depth_lr: Tensor, depth: Tensor, camera: Camera, title: str) -> None:
     """Draw the photo, the input and the result, both as a surface under light e1 and as depth.
 
-    The input is rendered from its own pixels, not from interpolated ones. The detail is where the two renderings differ
-    most. At most 2400 pixels wide, whatever the photo's size.
+    The input is rendered at its own resolution, without interpolation. The detail is the window in which the two
+    renderings differ most. The picture is at most 2400 pixels wide.
 
     Args:
-        path: a PNG, written atomically.
+        path: PNG file, written atomically.
         rgb: (3, H, W) in [0, 1].
-        coarse: (1, h, w) the input, of any size and of the same view; orthogonal depth in metres, NaN in holes.
-        depth: (1, H, W) the result, likewise.
-        camera: of the photo and the result.
-        title: the heading.
+        depth_lr: (1, h, w) input of any size and the same field of view; orthogonal depth in metres, NaN in holes.
+        depth: (1, H, W) result; orthogonal depth in metres, NaN in holes.
+        camera: camera of the photo and the result.
+        title: heading.
 
     Raises:
         ValueError: a map is less than 2 pixels high or wide.
 
     """
     normals = _normals(depth, camera)
-    before = _lit(_normals(coarse, camera.rescale(coarse.shape[-1], coarse.shape[-2])))
-    after = _lit(normals)
+    before = _render_light(_normals(depth_lr, camera.rescale(depth_lr.shape[-1], depth_lr.shape[-2])))
+    after = _render_light(normals)
     part = _detail(before, after)
-    size, size_lr = (f"{each.shape[-1]} x {each.shape[-2]}" for each in (depth, coarse))
+    size, size_lr = (f"{each.shape[-1]} x {each.shape[-2]}" for each in (depth, depth_lr))
     sheet = _Sheet(camera.height / camera.width, title)
     pictures = ((rgb.float(), f"photo, {size}"), (before, f"before, {size_lr}"), (after, f"after, {size}"))
     for column, (picture, heading) in enumerate(pictures):
@@ -78,31 +78,31 @@ def write_before_after(path: Path, rgb: Tensor, coarse: Tensor, depth: Tensor, c
         axes.add_patch(Rectangle((part.left, part.top), *frame, fill=False, color=_FRAME, linewidth=1.8))
         sheet.panel(1, column, picture, part, frame=_FRAME)
     sheet.panel(2, 0, (1 + torch.tensor([1, -1, -1])[:, None, None] * reduced(normals, _LONGEST)) / 2)
-    limits = limits_of(coarse)
-    for column, values in ((1, coarse), (2, depth)):
+    limits = limits_of(depth_lr)
+    for column, values in ((1, depth_lr), (2, depth)):
         axes = sheet.panel(2, column, reduced(values.float(), _LONGEST), depth=limits)
     sheet.colour_bar(axes)
-    if not (coarse.isfinite().all() and depth.isfinite().all()):
+    if not (depth_lr.isfinite().all() and depth.isfinite().all()):
         sheet.figure.text(0.99, sheet.line, "pink: holes", ha="right", va="center", fontsize=11)
     write_figure(path, sheet.figure, _DPI)
 
 
 def _normals(depth: Tensor, camera: Camera) -> Tensor:
-    """Return the normals of a map, (3, H, W) float32."""
+    """Compute the normals of a depth map, (3, H, W) float32."""
     normals = torch.empty((3, camera.height, camera.width))
     for rows, part in normal_strips(depth, camera):
         normals[:, rows] = part
     return normals
 
 
-def _lit(normals: Tensor) -> Tensor:
-    """Return the rendering under the light, (1, H, W)."""
+def _render_light(normals: Tensor) -> Tensor:
+    """Render normals under the light, (1, H, W)."""
     x, y, z = lights()[_LIGHT].tolist()
     return (x * normals[:1] + y * normals[1:2] + z * normals[2:]).clamp(0, 1)
 
 
 def _detail(before: Tensor, after: Tensor) -> _Part:
-    """Return where two renderings, of any sizes, differ most."""
+    """Find the window in which two renderings, of any sizes, differ most."""
     enlarged = functional.interpolate(before[None], tuple(after.shape[-2:]), mode="nearest-exact")[0]
     difference = reduced((enlarged - after).abs(), _LONGEST)[0].numpy()
     height, width = difference.shape
@@ -117,8 +117,8 @@ class _Sheet:
     """Three by three panels under a heading.
 
     Args:
-        aspect: height of the view by its width.
-        title: the heading.
+        aspect: ratio of height to width of the pictures.
+        title: heading.
 
     """
 
@@ -126,17 +126,17 @@ class _Sheet:
         width = min(_PANEL, _TALLEST / aspect)
         self._size = (width, width * aspect)
         self._pitch = max(width, _NARROWEST) + _GAP
-        whole = (_LEFT + 3 * self._pitch, _HEADING + 3 * (self._size[1] + _BETWEEN) + _BELOW)
-        self.figure = Figure(figsize=whole)
+        page_size = (_LEFT + 3 * self._pitch, _HEADING + 3 * (self._size[1] + _BETWEEN) + _BELOW)
+        self.figure = Figure(figsize=page_size)
         FigureCanvasAgg(self.figure)
-        self.line = 0.3 / whole[1]
-        self.figure.text(_LEFT / whole[0], 1 - 0.3 / whole[1], title, fontsize=16, va="center", weight="bold",
+        self.line = 0.3 / page_size[1]
+        self.figure.text(_LEFT / page_size[0], 1 - 0.3 / page_size[1], title, fontsize=16, va="center", weight="bold",
                          parse_math=False)  # fmt: skip
 
     def _axes(self, left: float, bottom: float, width: float, height: float) -> Axes:
-        """Return axes at a place in inches."""
-        whole, total = self.figure.get_size_inches()
-        return self.figure.add_axes((left / whole, bottom / total, width / whole, height / total))
+        """Add axes at a position given in inches."""
+        page_width, page_height = self.figure.get_size_inches()
+        return self.figure.add_axes((left / page_width, bottom / page_height, width / page_width, height / page_height))
 
     def panel(
         self,
@@ -149,7 +149,7 @@ class _Sheet:
         frame: str = "none",
         depth: tuple[float, float] | None = None,
     ) -> Axes:
-        """Draw a picture, (3, H, W), a rendering or depth between two limits, (1, H, W), or a part of it."""
+        """Draw a picture (3, H, W), a rendering (1, H, W) or depth (1, H, W) within two limits, or a part of it."""
         width, height = self._size
         total = float(self.figure.get_size_inches()[1])
         left = _LEFT + column * self._pitch + (self._pitch - _GAP - width) / 2
@@ -179,7 +179,7 @@ class _Sheet:
 
 
 def _cut(values: Tensor, part: _Part) -> tuple[Tensor, tuple[float, float, float, float]]:
-    """Return the pixels of a (C, H, W) picture that a part of it touches, and their extent for Matplotlib."""
+    """Return the pixels of a (C, H, W) picture that overlap a part of it, and their extent for Matplotlib."""
     height, width = values.shape[-2:]
     top, bottom = math.floor(part.top * height), math.ceil(part.bottom * height)
     left, right = math.floor(part.left * width), math.ceil(part.right * width)
@@ -187,7 +187,7 @@ def _cut(values: Tensor, part: _Part) -> tuple[Tensor, tuple[float, float, float
 
 
 def _with_holes(picture: Tensor) -> np.ndarray:
-    """Return a (3, H, W) picture as (H, W, 3) with holes in their colour."""
-    known = picture.isfinite().all(dim=0)
-    hole = torch.tensor(colours("gray").get_bad()[:3], dtype=picture.dtype)
-    return torch.where(known[..., None], picture.permute(1, 2, 0), hole).clamp(0, 1).numpy()
+    """Convert a (3, H, W) picture to (H, W, 3) with holes in the hole colour."""
+    valid = picture.isfinite().all(dim=0)
+    hole_colour = torch.tensor(colours("gray").get_bad()[:3], dtype=picture.dtype)
+    return torch.where(valid[..., None], picture.permute(1, 2, 0), hole_colour).clamp(0, 1).numpy()

@@ -29,9 +29,9 @@ HOLE_COLOUR = "#d684b4"
 _PANEL = 3.2
 _ABOVE = 0.8
 _BETWEEN = 0.95
-"""Inches of a panel's width, of the room for the heading, and of that for a colour bar and a title between panels."""
+"""Panel width, space for the heading, and space between rows for a colour bar and a title, inches."""
 _DPI = 160
-"""At five panels of 3.2 inches a panel has 512 pixels."""
+"""A panel of 3.2 inches has 512 pixels."""
 
 
 def save_picture(
@@ -40,12 +40,12 @@ def save_picture(
     """Draw a scene's result and write it atomically.
 
     Args:
-        path: a PNG.
-        sample: what the method was given.
-        depth: (1, H, W) the result in metres, NaN in holes.
-        scores: worst-of-four scores in raw units, by metric; empty where there is no truth.
-        label: the method's name.
-        formats: of the metrics.
+        path: PNG file.
+        sample: input of the method.
+        depth: (1, H, W) result in metres, NaN in holes.
+        scores: worst-of-four scores in raw units, by metric; empty without ground truth.
+        label: name of the method.
+        formats: formats of the metrics.
 
     """
     truth = sample.depth
@@ -80,26 +80,26 @@ def save_picture(
 
 
 def write_figure(path: Path, figure: Figure, dpi: int, metadata: Mapping[str, Any] | None = None) -> None:
-    """Write a figure atomically, in the format that the suffix says."""
+    """Write a figure atomically, in the format given by the suffix."""
     with replacing(path) as temporary, warnings.catch_warnings():
-        warnings.filterwarnings("ignore", "Glyph .* missing from font")  # a name that the font lacks letters for
+        warnings.filterwarnings("ignore", "Glyph .* missing from font")  # a name may have letters that the font lacks
         figure.savefig(temporary, dpi=dpi, metadata=metadata)
 
 
 def limits_of(depth: Tensor) -> tuple[float, float]:
-    """Return the 1st and 99th percentile of the known depths: one outlier does not take all the colours."""
-    known = depth[depth.isfinite()].numpy()
-    low, high = np.percentile(known, [1, 99]) if known.size else (0, 1)
+    """Return the 1st and 99th percentile of the valid depths, so that outliers do not stretch the colour range."""
+    valid = depth[depth.isfinite()].numpy()
+    low, high = np.percentile(valid, [1, 99]) if valid.size else (0, 1)
     return float(low), float(max(high, low + 1e-6))
 
 
 def colours(name: str | Colormap) -> Any:
-    """Return a colour map that shows holes in their colour."""
+    """Return a colour map that shows NaN in the hole colour."""
     return mpl.colormaps.get_cmap(name).with_extremes(bad=HOLE_COLOUR)
 
 
 class Window(NamedTuple):
-    """A part of a picture: ``height x width`` pixels, the first of them at (``top``, ``left``)."""
+    """A window of a picture: ``height x width`` pixels, the first at (``top``, ``left``)."""
 
     top: int
     left: int
@@ -108,28 +108,28 @@ class Window(NamedTuple):
 
     @property
     def slices(self) -> tuple[slice, slice]:
-        """Its rows and columns."""
+        """Rows and columns of the window."""
         return slice(self.top, self.top + self.height), slice(self.left, self.left + self.width)
 
 
 def strongest_window(values: np.ndarray, height: int, width: int, taken: Sequence[Window] = ()) -> Window | None:
-    """Return the window with the largest mean, clear of others.
+    """Return the window with the largest mean that does not overlap others.
 
     Args:
-        values: (H, W), at least 0; NaN counts as 0.
-        height: of the window in pixels.
-        width: the same.
-        taken: windows that it must not overlap.
+        values: (H, W) non-negative values; NaN counts as 0.
+        height: height of the window, pixels.
+        width: width of the window, pixels.
+        taken: windows that the result must not overlap.
 
     Returns:
-        The first of the best in reading order; None where there is no room.
+        The first of the best windows in reading order; None if no window fits.
 
     """
     if height > values.shape[0] or width > values.shape[1]:
         return None
     sums = np.pad(np.nan_to_num(values).astype(np.float64).cumsum(axis=0).cumsum(axis=1), ((1, 0), (1, 0)))
     totals = sums[height:, width:] - sums[:-height, width:] - sums[height:, :-width] + sums[:-height, :-width]
-    totals = totals.round(9)  # so that rounding does not choose among equals
+    totals = totals.round(9)  # rounding errors must not decide between equal windows
     for other in taken:
         rows = slice(max(0, other.top - height + 1), other.top + other.height)
         totals[rows, max(0, other.left - width + 1) : other.left + other.width] = -1
@@ -138,14 +138,17 @@ def strongest_window(values: np.ndarray, height: int, width: int, taken: Sequenc
 
 
 def reduced(values: Tensor, longest: int) -> Tensor:
-    """Return (C, H, W) averaged over whole pixels to at most ``longest`` of them; NaN where most of them are."""
+    """Reduce (C, H, W) by averaging blocks of pixels until the longer side is at most ``longest`` pixels.
+
+    A block of which less than half is valid becomes NaN.
+    """
     factor = math.ceil(max(values.shape[-2:]) / longest)
     if factor == 1:
         return values
-    known = values.isfinite()
+    valid = values.isfinite()
     total, weight = (
         functional.avg_pool2d(each.to(values.dtype), factor, ceil_mode=True, count_include_pad=False)
-        for each in (torch.where(known, values, 0), known)
+        for each in (torch.where(valid, values, 0), valid)
     )
     return torch.where(weight >= 0.5, total / weight.clamp(min=0.5), torch.nan)
 
@@ -159,10 +162,10 @@ def _show_depth(axis: Axes, depth: Tensor, limits: tuple[float, float], title: s
 
 
 def _show_error(axis: Axes, difference: Tensor) -> None:
-    """Draw the signed error, (1, H, W) in metres, in centimetres."""
+    """Draw a signed error, (1, H, W) in metres, in centimetres."""
     centimetres = 100 * difference[0].numpy()
-    known = centimetres[np.isfinite(centimetres)]
-    limit = max(float(np.percentile(np.abs(known), 98)), 0.1) if known.size else 1.0
+    valid = centimetres[np.isfinite(centimetres)]
+    limit = max(float(np.percentile(np.abs(valid), 98)), 0.1) if valid.size else 1.0
     image = axis.imshow(centimetres, cmap=colours("RdBu_r"), vmin=-limit, vmax=limit, interpolation="nearest")
     axis.set_title("error")
     _colour_bar(axis, image, "result - truth, cm", extend="both")
@@ -194,7 +197,7 @@ def _colour_bar(axis: Axes, image: Any, label: str, extend: str = "neither") -> 
 
 
 def normals_seen_by(camera: Camera, depth: Tensor) -> Tensor:
-    """Return the normals of a depth map, (1, H, W) in metres, as (1, 3, H, W), NaN where unknown."""
+    """Compute the normals of a depth map, (1, H, W) in metres, as (1, 3, H, W); NaN where they are undefined."""
     return depth_to_normals(depth.double()[None], camera.rays()[None])
 
 

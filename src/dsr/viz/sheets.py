@@ -1,4 +1,4 @@
-"""Contact sheets: one row per scene of a data set, to see at a glance whether it was read as it should be."""
+"""Contact sheets: one row per scene of a data set, to check that it was read correctly."""
 
 from __future__ import annotations
 
@@ -26,46 +26,46 @@ from dsr.viz.panels import HOLE_COLOUR, colours, limits_of, normals_seen_by, red
 _ROWS = 6
 _DPI = 100
 _PANEL = 2.56
-"""Inches of a panel's longer side: 256 pixels."""
+"""Longer side of a panel, inches: 256 pixels."""
 _LONGEST = 512
-"""Pixels of a picture's longer side, at most."""
+"""Maximum longer side of a picture, pixels."""
 _LEAST_PANEL = 0.3
-"""Inches of its shorter side."""
+"""Minimum shorter side of a panel, inches."""
 _TEXT, _MARGIN, _GAP, _ABOVE, _BELOW = 2.6, 0.15, 0.14, 0.8, 0.5
-"""Inches of the text's column, the margin, and the room between panels, above the first row and below each."""
+"""Width of the text column, margin, and space between panels, above the first row and below each row, inches."""
 _SEAM, _LEAST_LABELLED = 0.04, 0.35
-"""Inches between the renderings, and of the shorter side of one that has room for a label."""
+"""Space between the renderings, and minimum shorter side of a rendering with a label, inches."""
 _LABEL = {"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 1.2}
-_KNOWN_COLOUR = "#e4e4e4"
+_VALID_COLOUR = "#e4e4e4"
 _LETTERS = 27
 _LINE = 0.165
-"""Of a line of text, and its height in inches."""
+"""Maximum letters of a line of text, and its height in inches."""
 
 
 @dataclass(frozen=True)
 class _Row:
-    """What a sheet shows of a scene: pictures (H, W), (H, W, 3) or (4, H, W), no larger than need be."""
+    """What a sheet shows of a scene: pictures (H, W), (H, W, 3) or (4, H, W), reduced to the size drawn."""
 
     text: str
     shape: tuple[int, int]
     photo: np.ndarray
     depth: np.ndarray
     limits: tuple[float, float]
-    unknown: np.ndarray
-    share: float
+    missing: np.ndarray
+    missing_fraction: float
     renderings: np.ndarray
 
 
 def save_contact_sheet(path: Path, scenes: Iterable[Scene], title: str) -> list[Path]:
     """Draw the photo, depth, holes and renderings of scenes, a row each, and write the pages atomically.
 
-    Scenes are taken one by one, so there may be more of them than fit into memory. One without a high-resolution depth
-    shows its coarsest measured map.
+    Scenes are read one by one, so they need not fit into memory together. A scene without high-resolution depth shows
+    its measured map of the lowest resolution.
 
     Args:
-        path: a PNG; where there are more than six scenes, of each page: ``NAME-1.png``, ``NAME-2.png``, ...
-        scenes: a scene or more.
-        title: the heading of every page.
+        path: PNG file; more than six scenes are written to ``NAME-1.png``, ``NAME-2.png``, ..., six per file.
+        scenes: one or more scenes.
+        title: heading of every page.
 
     Returns:
         The files, in order.
@@ -92,10 +92,10 @@ def save_contact_sheet(path: Path, scenes: Iterable[Scene], title: str) -> list[
 
 
 def _row(scene: Scene) -> _Row:
-    """Return what a sheet shows of a scene."""
+    """Collect what a sheet shows of a scene."""
     depth, camera, what = _shown_map(scene)
-    known = depth[depth.isfinite()]
-    share = 1 - known.numel() / depth.numel()
+    valid = depth[depth.isfinite()]
+    missing_fraction = 1 - valid.numel() / depth.numel()
     lines = [
         *textwrap.wrap(scene.name, _LETTERS, break_on_hyphens=False),
         "",
@@ -103,8 +103,8 @@ def _row(scene: Scene) -> _Row:
         f"{scene.camera.width} x {scene.camera.height} pixels",
         "field of view {:.0f} x {:.0f} degrees".format(*_field_of_view(scene.camera)),
         *what,
-        f"depth {float(known.min()):.3g} to {float(known.max()):.3g} m",
-        f"holes: {_percent(share)}",
+        f"depth {float(valid.min()):.3g} to {float(valid.max()):.3g} m",
+        f"holes: {_percent(missing_fraction)}",
     ]
     large_enough = min(depth.shape[-2:]) >= 2
     shades = render(normals_seen_by(camera, depth))[0] if large_enough else torch.full((4, 2, 2), torch.nan)
@@ -115,45 +115,45 @@ def _row(scene: Scene) -> _Row:
         _reduced(depth)[0].numpy(),
         limits_of(depth),
         _reduced((~depth.isfinite()).float())[0].numpy(),
-        share,
+        missing_fraction,
         _reduced(shades).numpy(),
     )
 
 
 def _shown_map(scene: Scene) -> tuple[Tensor, Camera, list[str]]:
-    """Return the map that stands for the scene, its camera, and what to say of the maps that a sensor measured."""
+    """Return the depth map to show, its camera, and lines of text about the maps measured by a sensor."""
     measured = ", ".join(f"x{factor}" for factor in sorted(scene.measured))
     if scene.depth is not None:
-        return scene.depth, scene.camera, [f"measured, too: {measured}"] if measured else []
+        return scene.depth, scene.camera, [f"also measured: {measured}"] if measured else []
     factor = max(scene.measured)
-    coarse = scene.measured[factor]
-    size = f"{coarse.shape[-1]} x {coarse.shape[-2]}"
+    depth_lr = scene.measured[factor]
+    size = f"{depth_lr.shape[-1]} x {depth_lr.shape[-2]}"
     return (
-        coarse,
+        depth_lr,
         scene.camera.downscale(factor),
         [f"measured: {measured}; no high-resolution depth", f"shown: x{factor}, {size}"],
     )
 
 
 def _field_of_view(camera: Camera) -> tuple[float, float]:
-    """Return the horizontal and the vertical angle in degrees that the pixels cover, from outer edge to outer edge."""
+    """Return the horizontal and vertical field of view in degrees, between the outer edges of the pixels."""
     axes = ((camera.width, camera.fx, camera.cx), (camera.height, camera.fy, camera.cy))
     across, down = (math.atan((at + 0.5) / f) + math.atan((size - 0.5 - at) / f) for size, f, at in axes)
     return math.degrees(across), math.degrees(down)
 
 
-def _percent(share: float) -> str:
-    """Return a share for a reader; what is little does not become nothing."""
-    return "none" if share == 0 else f"{100 * share:.3g} %"
+def _percent(fraction: float) -> str:
+    """Format a fraction as a percentage; a small fraction is not rounded to 0."""
+    return "none" if fraction == 0 else f"{100 * fraction:.3g} %"
 
 
 def _reduced(values: Tensor) -> Tensor:
-    """Return (C, H, W) in float64, reduced to at most twice a panel's pixels."""
+    """Convert (C, H, W) to float64 and reduce it to at most twice the pixels of a panel."""
     return reduced(values.double(), _LONGEST)
 
 
 def _save_page(path: Path, rows: list[_Row], title: str) -> None:
-    """Draw rows and write them."""
+    """Draw a page and write it."""
     sizes = [_panel_size(*row.shape) for row in rows]
     heights = [max(size[1] + _BELOW, (row.text.count("\n") + 2) * _LINE) for row, size in zip(rows, sizes, strict=True)]
     total = _ABOVE + sum(heights)
@@ -177,12 +177,12 @@ def _panel_size(height: int, width: int) -> tuple[float, float]:
 
 
 def _left(column: int) -> float:
-    """Return where a column of panels begins, in inches."""
+    """Return the left edge of a column of panels, in inches."""
     return _MARGIN + _TEXT + column * (_PANEL + _GAP)
 
 
 def _head_columns(figure: Figure, top: float) -> None:
-    """Write what the columns show."""
+    """Write the headings of the columns."""
     width, height = figure.get_size_inches()
     headings = ("photo", "depth, m", "holes", f"under {LIGHT_NAMES[0]} to {LIGHT_NAMES[-1]}")
     for column, heading in enumerate(headings):
@@ -190,7 +190,7 @@ def _head_columns(figure: Figure, top: float) -> None:
 
 
 def _draw_row(figure: Figure, row: _Row, top: float, size: tuple[float, float]) -> None:
-    """Draw a scene's text and panels, their upper edge ``top`` inches above the page's lower one."""
+    """Draw the text and panels of a scene with their upper edge ``top`` inches above the lower edge of the page."""
     width, height = figure.get_size_inches()
     name, _, rest = row.text.partition("\n\n")
     lines = name.count("\n") + 1
@@ -200,20 +200,20 @@ def _draw_row(figure: Figure, row: _Row, top: float, size: tuple[float, float]) 
     photo, depth, holes = (_panel(figure, column, top, size) for column in range(3))
     photo.imshow(row.photo, aspect="auto")
     low, high = row.limits
-    high = max(high, 1.01 * low)  # a wall, too, gets a bar with numbers that differ
+    high = max(high, 1.01 * low)  # so that the ticks of a constant depth differ
     image = depth.imshow(row.depth, cmap=colours("viridis"), vmin=low, vmax=high, aspect="auto")
     place = (_left(1) + 0.1 * _PANEL, top - size[1] - 0.14, 0.8 * _PANEL, 0.07)
     bar = figure.colorbar(image, cax=_axes(figure, *place), orientation="horizontal", ticks=MaxNLocator(4),
                           format=ScalarFormatter(useOffset=False))  # fmt: skip
     bar.ax.tick_params(labelsize=8, pad=1.5, length=2)
-    holes.imshow(_mixed(row.unknown), aspect="auto")
-    caption = f"{_percent(row.share)} unknown" if row.share else "complete"
+    holes.imshow(_blend_missing(row.missing), aspect="auto")
+    caption = f"{_percent(row.missing_fraction)} missing" if row.missing_fraction else "complete"
     holes.text(0.5, -0.06 / size[1], caption, transform=holes.transAxes, ha="center", va="top", fontsize=9)
     _draw_renderings(figure, row.renderings, top, size)
 
 
 def _draw_renderings(figure: Figure, renderings: np.ndarray, top: float, size: tuple[float, float]) -> None:
-    """Draw four renderings, (4, H, W), as two by two in the last column."""
+    """Draw four renderings, (4, H, W), in a 2 x 2 grid in the last column."""
     width, height = ((side - _SEAM) / 2 for side in size)
     left = _left(3) + (_PANEL - size[0]) / 2
     for number, (name, shades) in enumerate(zip(LIGHT_NAMES, renderings, strict=True)):
@@ -226,20 +226,20 @@ def _draw_renderings(figure: Figure, renderings: np.ndarray, top: float, size: t
 
 
 def _panel(figure: Figure, column: int, top: float, size: tuple[float, float]) -> Axes:
-    """Return the axes of a panel, in the middle of its column."""
+    """Add the axes of a panel, centred in its column."""
     return _axes(figure, _left(column) + (_PANEL - size[0]) / 2, top - size[1], *size, frame=False)
 
 
 def _axes(figure: Figure, left: float, bottom: float, width: float, height: float, *, frame: bool = True) -> Axes:
-    """Return axes at a place in inches."""
-    whole, total = figure.get_size_inches()
-    axes = figure.add_axes((left / whole, bottom / total, width / whole, height / total))
+    """Add axes at a position given in inches."""
+    page_width, page_height = figure.get_size_inches()
+    axes = figure.add_axes((left / page_width, bottom / page_height, width / page_width, height / page_height))
     if not frame:
         axes.set_axis_off()
     return axes
 
 
-def _mixed(share: np.ndarray) -> np.ndarray:
-    """Return the colour of pixels, (H, W, 3), of which a share is unknown."""
-    known, hole = (np.array(to_rgb(colour)) for colour in (_KNOWN_COLOUR, HOLE_COLOUR))
-    return known + share[..., None] * (hole - known)
+def _blend_missing(missing_fraction: np.ndarray) -> np.ndarray:
+    """Blend the colours of valid and missing pixels by the fraction missing, (H, W), as (H, W, 3)."""
+    valid, hole = (np.array(to_rgb(colour)) for colour in (_VALID_COLOUR, HOLE_COLOUR))
+    return valid + missing_fraction[..., None] * (hole - valid)
