@@ -195,7 +195,7 @@ def test_scene_that_no_run_stores_is_left_out_with_a_note(results, drawn, tmp_pa
     notes = []
     for save in TOGETHER:
         save(tmp_path, results, notes=notes)
-    assert notes == ["no figures of two: no run keeps its photo and input"]
+    assert notes == ["no figures of two: no run has stored its photo and input"]
     assert all(not panels(figure, "two") and panels(figure, "one") for figure in drawn.values())
 
 

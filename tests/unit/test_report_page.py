@@ -154,7 +154,7 @@ def test_pictures_above_the_budget_are_reduced_and_the_page_says_so(make_run, tm
 def test_reduced_values_are_averages_of_valid_pixels():
     pool = Pool(dataclasses.replace(LEVELS[0], longest=2))
     values = np.array([[1.0, 3, 5, np.nan], [1, 3, 7, 9], [np.nan, np.nan, 2, 2], [np.nan, 4, 2, 2]])
-    reduced, known = pool.fitted(values)
+    reduced, known = pool.fit(values)
     assert pool.reduced
     assert reduced[known].tolist() == [2, 7, 2]
     assert known.tolist() == [[True, True], [False, True]]

@@ -35,22 +35,22 @@ _STYLE: dict[Any, Any] = {
 _DPI = 200
 _PANEL = 1.35
 _ABOVE = 0.95
-"""Inches of a panel, and of the room for the title and the legend."""
+"""Size of a panel, and height of the title and legend, inches."""
 _HIGHLIGHT, _FRAME = "#fff4d6", "#c98a00"
 _STRENGTH = "RdBu_r"
 _MANY = 3000
-"""From so many points on they are an image in the PDF, which would take minutes to open."""
+"""Number of points above which the PDF has them as an image, since it would take minutes to open otherwise."""
 
 
 def save_scatter_matrix(folder: Path, results: Results) -> list[Path]:
     """Draw the scatter matrix of the paper's metrics, and the correlations of all versions with LPIPS_v.
 
     Args:
-        folder: gets ``scatter_matrix.pdf`` and ``.png``, and ``with_lpips.pdf`` and ``.png`` where there is an LPIPS_v.
-        results: the runs.
+        folder: directory for ``scatter_matrix`` and, if there is LPIPS_v, ``with_lpips``, each as PDF and PNG.
+        results: runs.
 
     Returns:
-        The files.
+        Paths of the files.
 
     """
     matrix = metric_matrix(results)
@@ -69,12 +69,12 @@ def save_scatter_matrix(folder: Path, results: Results) -> list[Path]:
 
 
 def scatter_matrix(matrix: pd.DataFrame, labels: list[str], formats: Formats) -> Figure:
-    """Return the figure.
+    """Draw the scatter matrix.
 
     Args:
-        matrix: of :func:`dsr.report.correlations.metric_matrix`.
-        labels: the methods, in the legend's order.
-        formats: of the metrics to show, in order.
+        matrix: result of :func:`dsr.report.correlations.metric_matrix`.
+        labels: methods in the order of the legend.
+        formats: formats of the metrics to show, in order.
 
     """
     names = [name for name in formats if name in matrix and name != REFERENCE]
@@ -114,8 +114,8 @@ def scatter_matrix(matrix: pd.DataFrame, labels: list[str], formats: Formats) ->
 
 def _limits(values: pd.Series) -> tuple[float, float]:
     """Return the range of an axis with a margin."""
-    known = values.dropna()
-    low, high = (float(known.min()), float(known.max())) if len(known) else (0.0, 1.0)
+    finite = values.dropna()
+    low, high = (float(finite.min()), float(finite.max())) if len(finite) else (0.0, 1.0)
     margin = 0.06 * (high - low) or 0.06 * abs(high) or 0.5
     return low - margin, high + margin
 
@@ -123,7 +123,7 @@ def _limits(values: pd.Series) -> tuple[float, float]:
 def _scatter(
     axis: Axes, across: np.ndarray, vertical: np.ndarray, method: np.ndarray, colours: Mapping[str, str]
 ) -> None:
-    """Draw the results of a pair of metrics; the order of drawing is shuffled, so that no method covers another."""
+    """Draw the results of a pair of metrics in random order, so that no method covers another."""
     order = np.random.default_rng(0).permutation(len(across))
     points = [colours[label] for label in method[order]]
     many = len(across) > _MANY
@@ -133,7 +133,7 @@ def _scatter(
 def _densities(
     axis: Axes, values: np.ndarray, method: np.ndarray, colours: Mapping[str, str], limits: tuple[float, float]
 ) -> None:
-    """Draw a kernel density estimate per method, each to its own height; ticks below where there is none."""
+    """Draw a kernel density estimate per method, each scaled to its maximum; ticks if there is no estimate."""
     grid = np.linspace(*limits, 200)
     for label, colour in colours.items():
         own = values[(method == label) & np.isfinite(values)]
@@ -147,11 +147,11 @@ def _densities(
 
 
 def density_of(values: np.ndarray, grid: np.ndarray) -> np.ndarray | None:
-    """Return the Gaussian kernel density of values on a grid (Scott's bandwidth); None for fewer than three different.
+    """Estimate the Gaussian kernel density on a grid (Scott's bandwidth); None for fewer than three distinct values.
 
     Args:
-        values: (N,) finite.
-        grid: (M,) where it is wanted.
+        values: (N,) finite values.
+        grid: (M,) points of the density.
 
     """
     if len(np.unique(values)) < 3:
@@ -161,7 +161,7 @@ def density_of(values: np.ndarray, grid: np.ndarray) -> np.ndarray | None:
 
 
 def _highlight(axis: Axes, *, lit: bool) -> None:
-    """Mark a panel of the reference's row or column."""
+    """Highlight a panel in the row or column of the reference."""
     if lit:
         axis.set_facecolor(_HIGHLIGHT)
     for spine in axis.spines.values():
@@ -169,19 +169,19 @@ def _highlight(axis: Axes, *, lit: bool) -> None:
 
 
 def _coefficients(axis: Axes, pearson: float, spearman: float, count: str) -> None:
-    """Write Pearson's and Spearman's coefficient, the larger and the more colourful the stronger."""
+    """Write Pearson's and Spearman's coefficients; size and background show the strength."""
     if np.isfinite(pearson):
         axis.set_facecolor(mpl.colormaps[_STRENGTH](0.5 + 0.27 * (pearson + spearman) / 2))
     for value, letter, height in ((pearson, "r", 0.66), (spearman, "\N{GREEK SMALL LETTER RHO}", 0.34)):
-        known = bool(np.isfinite(value))
-        text = f"{letter} = {value:.2f}" if known else f"{letter} \N{EN DASH}"
-        size = 7 + 6 * abs(value) if known else 7
+        finite = bool(np.isfinite(value))
+        text = f"{letter} = {value:.2f}" if finite else f"{letter} \N{EN DASH}"
+        size = 7 + 6 * abs(value) if finite else 7
         axis.text(0.5, height, text, ha="center", va="center", fontsize=size, transform=axis.transAxes)
     axis.text(0.5, 0.09, count, ha="center", va="center", fontsize=6, transform=axis.transAxes)
 
 
 def _label(axis: Axes, row: int, column: int, count: int) -> None:
-    """Write numbers at the outer panels alone."""
+    """Write tick labels at the outer panels only."""
     axis.tick_params(length=2, width=0.5, labelsize=6, pad=1.5)
     axis.locator_params(nbins=4)
     if row < count - 1:
@@ -197,17 +197,17 @@ def _label(axis: Axes, row: int, column: int, count: int) -> None:
 
 
 def _name_axis(write: Callable[..., object], metric: str, formats: Formats) -> None:
-    """Write a metric's name beside an axis, the reference's in bold."""
+    """Write the name of a metric beside an axis, in bold for the reference."""
     write(formats[metric].title, fontweight="bold" if metric == REFERENCE else "normal", parse_math=False)
 
 
 def _head(figure: Figure, count: int, colours: Mapping[str, str], *, has_reference: bool) -> None:
-    """Write what the figure shows, and the methods."""
+    """Write the title and the legend."""
     width, height = figure.get_size_inches()
     reference = f"{REFERENCE} is highlighted" if has_reference else f"no {REFERENCE} in these results"
     text = (
         f"{count} results; worst of four lights; RMSE_d clipped at {1000 * DEPTH_LIMIT:g} mm; {reference}\n"
-        "r: Pearson, \N{GREEK SMALL LETTER RHO}: Spearman; on the diagonal kernel densities, each to its own height"
+        "r: Pearson, \N{GREEK SMALL LETTER RHO}: Spearman; on the diagonal kernel densities, each scaled to its maximum"
     )
     figure.text(0.6 / width, 1 - 0.12 / height, text, va="top", fontsize=8, parse_math=False)
     handles: list[Any] = [
@@ -219,7 +219,7 @@ def _head(figure: Figure, count: int, colours: Mapping[str, str], *, has_referen
 
 
 def _ranking(ranking: pd.DataFrame, count: int) -> Figure:
-    """Return the figure of all metrics' correlations with LPIPS_v, the strongest on top."""
+    """Draw the correlations of all metrics with LPIPS_v, the strongest on top."""
     rows = len(ranking)
     height = 0.19 * rows + 0.85
     figure = Figure(figsize=(5.6, height))

@@ -21,22 +21,22 @@ Kind = Literal["pearson", "spearman"]
 KINDS: tuple[Kind, ...] = ("pearson", "spearman")
 REFERENCE = "LPIPS_v"
 DEPTH_LIMIT = 0.5
-"""Metres that RMSE_d is clipped at, as in the paper: a few results are far off."""
+"""Limit at which RMSE_d is clipped as in the paper, metres, because of a few outliers."""
 _ABOUT = ["dataset", "scene", "scale", "downsampling", "label", "seed"]
 _LEAST = 3
-"""Points that a correlation needs."""
+"""Minimum number of points of a correlation."""
 
 
 def metric_matrix(results: Results) -> pd.DataFrame:
-    """Return one row per result and one column per version of a metric, in raw units.
+    """Return a table with one row per result and one column per version of a metric, in raw units.
 
     Args:
-        results: the runs.
+        results: runs.
 
     Returns:
         Rows: ``dataset, scene, scale, downsampling, label, seed``. Columns: ``DSSIM_v`` for the worst of the four
         lights, ``DSSIM_v[e1]`` to ``[e4]`` and ``[avg]``, metrics without lights by their name. RMSE_d is clipped at
-        0.5 m. What is unknown is NaN.
+        0.5 m. Missing values are NaN.
 
     """
     scores = pd.concat([run.scores.assign(dataset=run.dataset, label=run.label) for run in results.runs])
@@ -52,7 +52,7 @@ def metric_matrix(results: Results) -> pd.DataFrame:
 
 
 def correlate(matrix: pd.DataFrame, kind: Kind) -> pd.DataFrame:
-    """Return the correlation of every pair of columns, over the rows in which both are known.
+    """Compute the correlation of every pair of columns over the rows with both values.
 
     It is NaN where these are fewer than three or where a column is constant in them.
 
@@ -70,16 +70,16 @@ def correlate(matrix: pd.DataFrame, kind: Kind) -> pd.DataFrame:
 
 
 def pairs(matrix: pd.DataFrame) -> pd.DataFrame:
-    """Return for every pair of columns in how many rows both are known."""
-    known = matrix.notna().astype(int)
-    return known.T @ known
+    """Count for every pair of columns the rows with both values."""
+    present = matrix.notna().astype(int)
+    return present.T @ present
 
 
 def with_reference(matrix: pd.DataFrame) -> pd.DataFrame:
-    """Return how every version of a metric but LPIPS_v's own correlates with LPIPS_v.
+    """Correlate every version of a metric other than LPIPS_v with LPIPS_v.
 
     Returns:
-        Columns ``metric, pearson, spearman, n``, the largest of ``spearman`` first, unknown ones last; no row without
+        Columns ``metric, pearson, spearman, n``, the largest of ``spearman`` first, NaN last; empty without
         LPIPS_v.
 
     """
@@ -97,7 +97,7 @@ def write_correlations(folder: Path, results: Results) -> list[Path]:
     """Write the correlations of all versions of all metrics.
 
     Args:
-        folder: gets ``pearson.csv``, ``spearman.csv``, ``pairs.csv`` (how many results each rests on),
+        folder: gets ``pearson.csv``, ``spearman.csv``, ``pairs.csv`` (number of results per pair),
             ``with_lpips.csv`` and ``with_lpips.md``.
         results: the runs.
 
@@ -122,7 +122,7 @@ def write_correlations(folder: Path, results: Results) -> list[Path]:
 
 
 def _ranking_text(ranking: pd.DataFrame, count: int) -> str:
-    """Return the table of correlations with LPIPS_v as Markdown."""
+    """Format the table of correlations with LPIPS_v as Markdown."""
     title = f"## Correlation with {REFERENCE}\n\n"
     if ranking.empty:
         return f"{title}There is no {REFERENCE} in these {count} results (metrics.lpips=true computes it).\n"
@@ -132,7 +132,7 @@ def _ranking_text(ranking: pd.DataFrame, count: int) -> str:
     ]
     text = (
         f"Over {count} results of all methods, scenes and scales. A name by itself is the worst of four lights; "
-        f"RMSE_d is clipped at {DEPTH_LIMIT:g} m. n: results in which both metrics are known."
+        f"RMSE_d is clipped at {DEPTH_LIMIT:g} m. n: number of results with both metrics."
     )
     return f"{title}{text}\n\n{aligned(['metric', 'Pearson', 'Spearman', 'n'], rows, 1)}\n"
 

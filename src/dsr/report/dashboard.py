@@ -27,21 +27,21 @@ from dsr.viz.panels import colours, normals_seen_by, reduced
 WORST = "worst of four lights"
 _EVENTS = "events.out.tfevents.*"
 _PANEL = 320
-"""Pixels of the longer side of a rendering in a picture, at most."""
+"""Maximum longer side of a rendering in a picture, pixels."""
 
 
 def save_dashboard(folder: Path) -> None:
-    """Write the TensorBoard log of a run into its directory, in place of an earlier one.
+    """Write the TensorBoard log of a run into its directory, replacing an earlier one.
 
     Scalars, in the units of the paper's tables: ``mean/METRIC``; ``scene/METRIC`` over the scenes; ``METRIC/SCENE``;
     ``light/METRIC/SCENE`` over the lights e1..e4. Pictures of each scene: renderings of the result above those of the
     truth, and errors. A custom layout has a chart per metric; the table of runs (hparams) has settings and means.
 
     Args:
-        folder: a run's directory; nothing but its files is looked at.
+        folder: directory of a run; only its files are read.
 
     Raises:
-        ValueError: it is no run's directory.
+        ValueError: the directory is not that of a run.
 
     """
     run = read_run(folder)
@@ -90,7 +90,7 @@ def _write_scores(writer: SummaryWriter, run: Run) -> None:
 
 
 def _hyperparameters(run: Run) -> dict[str, Any]:
-    """Return what the table of runs says of one: the problem, the method and its settings."""
+    """Return the hyperparameters of a run: setting, method and settings of the method."""
     settings = {
         f"method.{key}": value
         for key, value in method_settings(run.settings).items()
@@ -118,14 +118,14 @@ def _write_pictures(writer: SummaryWriter, number: int, scene: DepthSample, dept
 
 
 def _grey(values: Tensor) -> np.ndarray:
-    """Return (H, W) in [0, 1] as grey levels, holes in their colour, (H, W, 3) uint8."""
+    """Convert (H, W) in [0, 1] to grey levels with holes in the hole colour, (H, W, 3) uint8."""
     return (colours("gray")(np.ma.masked_invalid(values.numpy()))[..., :3] * 255).round().astype(np.uint8)
 
 
 def _error(depth: Tensor, truth: Tensor) -> np.ndarray:
-    """Return the signed error, blue where the result is nearer, (H, W, 3) uint8.
+    """Draw the signed error, blue where the result is too near, (H, W, 3) uint8.
 
-    The strongest colours are 1 % of the scene's median depth, whatever the method, so that runs can be compared.
+    The colour limits are +-1 % of the scene's median depth for every method, so that runs can be compared.
     """
     limit = 0.01 * float(truth.nanmedian())
     scaled = Normalize(-limit, limit)(np.ma.masked_invalid(reduced(depth - truth, _PANEL)[0].numpy()))

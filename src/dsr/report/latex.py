@@ -1,4 +1,4 @@
-"""Tables as LaTeX with the rules of booktabs: to be read by a paper, or a document that compiles by itself."""
+"""Tables as LaTeX with booktabs rules: for inclusion in a paper, or as a complete document."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from dsr.report.table_parts import STAR_NOTE, Cell, Column, Group, PaperTable, R
 MISSING = "--"
 _END = "\\end{table}\n"
 _ROWS, _ROWS_TURNED = 42, 26
-"""More do not fit on a page, upright or turned."""
+"""Maximum rows of a portrait and of a landscape page."""
 _WIDE = 135
-"""Characters of a row that do not fit on an upright page in a legible size."""
+"""Maximum characters of a row that is legible on a portrait page."""
 _SPECIAL = {
     "\\": "\\textbackslash{}", "{": "\\{", "}": "\\}", "$": "\\$", "&": "\\&", "#": "\\#", "%": "\\%", "_": "\\_",
     "~": "\\textasciitilde{}", "^": "\\textasciicircum{}", "<": "\\textless{}", ">": "\\textgreater{}",
@@ -20,7 +20,7 @@ _SPECIAL = {
     "\N{PLUS-MINUS SIGN}": "$\\pm$", "\N{EN DASH}": "--", "\N{MULTIPLICATION SIGN}": "$\\times$",
 }  # fmt: skip
 _LAST_LETTER = 0x17F
-"""The last of Latin Extended-A: the font encoding T1 has no letters beyond."""
+"""Last code point of Latin Extended-A; the font encoding T1 has no letters after it."""
 _HEAD = r"""\documentclass{article}
 \usepackage[T1]{fontenc}
 \usepackage[utf8]{inputenc}
@@ -34,7 +34,7 @@ _HEAD = r"""\documentclass{article}
 
 
 def to_document(tables: Sequence[PaperTable]) -> str:
-    """Return a document with all tables, each with its variant beside the paper's values, that compiles by itself."""
+    """Return a complete document with all tables, each also with the paper's values."""
     parts = [_HEAD]
     for table in tables:
         for published in (False, True)[: 1 + table.has_published]:
@@ -48,11 +48,11 @@ def to_document(tables: Sequence[PaperTable]) -> str:
 def to_latex(table: PaperTable, *, published: bool = False) -> str:
     r"""Return a table as LaTeX for ``\input``; it needs the packages booktabs and graphicx, and the encoding T1.
 
-    It is as wide as the line at most. What is too long for a page becomes several tables.
+    A table is at most as wide as the text. A table too long for a page is split.
 
     Args:
-        table: what to write.
-        published: whether the paper's values stand in parentheses after ours; then without spreads and intervals.
+        table: table to write.
+        published: whether to add the paper's values in parentheses, without spreads and intervals.
 
     """
     columns = table.published_columns() if published else table.columns
@@ -63,13 +63,13 @@ def to_latex(table: PaperTable, *, published: bool = False) -> str:
 
 
 def latex_text(text: str) -> str:
-    r"""Return a text that LaTeX prints as it is, on one line; letters that its fonts lack are named, as U+65E5."""
+    r"""Escape a text for LaTeX, on one line; letters missing from the fonts become code points such as U+65E5."""
     composed = unicodedata.normalize("NFC", " ".join(text.split()))
     return "".join(map(_letter, composed))
 
 
 def _heading(column: Column) -> str:
-    """Return a metric's name, what follows its underscore as an index."""
+    """Format the name of a metric with the part after the underscore as a subscript."""
     name, _, index = column.heading.partition("_")
     return latex_text(name) + (f"$_{{{latex_text(index)}}}$" if index else "")
 
@@ -82,7 +82,7 @@ def _letter(letter: str) -> str:
 
 
 def _pages(groups: Sequence[list[str]], most: int) -> Iterator[list[list[str]]]:
-    """Yield the rows of each page by group, ``most`` of them; a group that fits on a page is not torn."""
+    """Yield the rows of each page by group, at most ``most``; a group that fits on one page is not split."""
     page: list[list[str]] = []
     for rows in groups:
         for start in range(0, len(rows), most):
@@ -125,9 +125,9 @@ def _page(
 
 
 def _rows(table: PaperTable, group: Group, columns: Sequence[Column], *, published: bool) -> Iterator[str]:
-    """Yield the lines of a scene, its name in the first; that of an average has a line to itself."""
+    """Yield the lines of a group; the title is in the first line, that of an average in a line of its own."""
     title = latex_text(group.about.title) + ("*" if published and group.about.recreated else "")
-    compared = any(row.published for row in group.rows)  # all of ours, for the best of them is marked
+    compared = any(row.published for row in group.rows)  # all of our rows are needed, since the best is marked
     shown = [row for row in group.rows if not published or (compared and row.cells)]
     if group.about.average and shown:
         seeds_too = table.seeded and not published
@@ -145,7 +145,7 @@ def _rows(table: PaperTable, group: Group, columns: Sequence[Column], *, publish
 
 
 def _beside(column: Column, row: Row) -> str:
-    """Return our value and the paper's."""
+    """Format our value and the paper's."""
     cell, paper = row.cells.get(column.key), row.published.get(column.key)
     ours = MISSING if cell is None else _STYLE.text(column, _bare(cell), 1)
     return f"{ours} ({MISSING if paper is None else f'{paper:g}'})"
@@ -157,12 +157,12 @@ def _bare(cell: Cell) -> Cell:
 
 
 def _number(text: str) -> str:
-    """Return a number with a true minus sign."""
+    """Format a number with a proper minus sign."""
     return f"${text}$" if text.startswith("-") else text
 
 
 def _width(table: PaperTable, *, published: bool) -> int:
-    """Return the characters of the longest row, without its markup."""
+    """Return the number of characters of the longest row, without markup."""
     columns = table.published_columns() if published else table.columns
     wide = 0
     for group in table.groups:

@@ -20,23 +20,23 @@ MISSING = "\N{EN DASH}"
 _STYLE = Style(MISSING, {0: ("", ""), 1: ("**", "**"), 2: ("<ins>", "</ins>")}, "\N{PLUS-MINUS SIGN}", "n = {}")
 _SPECIAL = re.compile(r"[\\`*\[\]<>|~&#]|(?<![A-Za-z0-9])_|_(?![A-Za-z0-9])")
 _FACTS_FROM = 7
-"""In a CSV the columns before tell what a row is about."""
+"""Index of the first CSV column with values; earlier columns identify the row."""
 
 
 def write_tables(folder: Path, results: Results, study: pd.DataFrame | None = None) -> list[Path]:
     """Write all tables of some runs.
 
     Args:
-        folder: gets ``NAME.md``, ``NAME.tex``, ``NAME_published.tex`` (where the paper has values) and ``NAME.csv`` of
-            each table, and ``all.md`` and ``all.tex`` with all of them.
-        results: the runs.
+        folder: output directory for ``NAME.md``, ``NAME.tex``, ``NAME_published.tex`` (if the paper has values) and
+            ``NAME.csv`` of each table, and for ``all.md`` and ``all.tex`` with all tables.
+        results: runs.
         study: see :func:`dsr.report.paper_tables.build_tables`.
 
     Returns:
-        The files.
+        Paths of the files.
 
     Raises:
-        ValueError: the study's table is something else.
+        ValueError: the table of the study is invalid.
 
     """
     tables = build_tables(results, study)
@@ -52,7 +52,7 @@ def write_tables(folder: Path, results: Results, study: pd.DataFrame | None = No
 
 
 def to_markdown(table: PaperTable) -> str:
-    """Return a table as Markdown; below it, where the paper has values, ours beside them with difference and ratio."""
+    """Format a table as Markdown, followed by a comparison with the paper's values if there are any."""
     head = ["scene", "method", *(["seeds"] if table.seeded else []), *map(_heading, table.columns)]
     rows = [row for group in table.groups for row in _rows(table, group)]
     parts = [f"## {escaped(table.title)}", aligned(head, rows, 2), "\n".join(f"- {note}" for note in table.notes)]
@@ -67,9 +67,9 @@ def to_markdown(table: PaperTable) -> str:
 
 
 def to_csv(table: PaperTable) -> str:
-    """Return a table as CSV at full precision, in the paper's units: one row per method and scene or average.
+    """Format a table as CSV at full precision, in the paper's units: one row per method and scene or average.
 
-    What is missing is empty; a kind of value that no row has (spread, interval, the paper's) has no column.
+    Missing values are empty; columns without any value (spread, interval, paper) are left out.
     """
     rows = [
         {
@@ -92,12 +92,12 @@ def to_csv(table: PaperTable) -> str:
 
 
 def aligned(head: Sequence[str], rows: Sequence[Sequence[str]], texts: int) -> str:
-    """Return a Markdown table whose columns are aligned in the file, too.
+    """Format a Markdown table with aligned columns.
 
     Args:
-        head: its headings, escaped.
-        rows: its cells, escaped.
-        texts: how many columns from the left are text; those after them are numbers, and stand to the right.
+        head: headings, escaped.
+        rows: cells, escaped.
+        texts: number of text columns from the left; the remaining columns are numbers, aligned to the right.
 
     """
     widths = [max(3, *map(len, column)) for column in zip(head, *rows, strict=True)]
@@ -113,14 +113,14 @@ def aligned(head: Sequence[str], rows: Sequence[Sequence[str]], texts: int) -> s
 
 
 def escaped(text: str) -> str:
-    """Return a text that Markdown shows as it is, on one line."""
+    """Escape a text for Markdown, on one line."""
     return _SPECIAL.sub(r"\\\g<0>", " ".join(text.split()))
 
 
 def _facts(column: Column, row: Row) -> Iterator[tuple[str, float | int | None]]:
-    """Yield the columns of a CSV that tell of one metric."""
+    """Yield the CSV columns of one metric."""
     cell, paper = row.cells.get(column.key), row.published.get(column.key)
-    unit = f" [{column.unit.split(', ')[-1]}]" if column.unit else ""  # the key says of which threshold
+    unit = f" [{column.unit.split(', ')[-1]}]" if column.unit else ""  # the key names the threshold
     low, high = (None, None) if cell is None or cell.interval is None else cell.interval
     difference, ratio = (None if cell is None else cell.against(paper)) or (None, None)
     yield f"{column.key}{unit}", None if cell is None else cell.mean
@@ -139,7 +139,7 @@ def _heading(column: Column) -> str:
 
 
 def _rows(table: PaperTable, group: Group) -> Iterator[list[str]]:
-    """Yield our rows of a scene, its name in the first."""
+    """Yield our rows of a group, with the title in the first."""
     title = escaped(group.about.title)
     for row in group.rows:
         seeds = [str(row.seeds)] if table.seeded else []
@@ -153,7 +153,7 @@ def _rows(table: PaperTable, group: Group) -> Iterator[list[str]]:
 
 
 def _compared(columns: Sequence[Column], group: Group) -> Iterator[list[str]]:
-    """Yield ours, the paper's, difference and ratio of the methods that the paper has, then its other methods."""
+    """Yield our value, the paper's, difference and ratio of each method in the paper, then its other methods."""
     title = escaped(group.about.title) + ("\\*" if group.about.recreated else "")
     for row in (row for row in group.rows if row.published):
         both = [_against(column, row) for column in columns]
@@ -168,7 +168,7 @@ def _compared(columns: Sequence[Column], group: Group) -> Iterator[list[str]]:
 
 
 def _plain(column: Column, row: Row) -> str:
-    """Return a mean, and of how many scenes where these are not all."""
+    """Format a mean, with the number of scenes if some are missing."""
     cell = row.cells.get(column.key)
     if cell is None:
         return MISSING
@@ -176,12 +176,12 @@ def _plain(column: Column, row: Row) -> str:
 
 
 def _paper(columns: Sequence[Column], values: Mapping[str, float]) -> list[str]:
-    """Return the paper's values with the digits that it gives."""
+    """Format the paper's values with its own number of digits."""
     return [f"{values[column.key]:g}" if column.key in values else MISSING for column in columns]
 
 
 def _against(column: Column, row: Row) -> tuple[str, str]:
-    """Return the difference from the paper's value and the ratio to it, as shown."""
+    """Format the difference from the paper's value and the ratio to it."""
     cell, paper = row.cells.get(column.key), row.published.get(column.key)
     both = None if cell is None else cell.against(paper)
     if both is None:

@@ -1,10 +1,10 @@
-"""The paper's tables of any number of runs: methods x metrics for each scene and for averages over scenes.
+"""Tables like those of the paper for any number of runs: methods x metrics per scene and averaged over scenes.
 
-Voynov et al., *Perceptual Deep Depth Super-Resolution* (ICCV 2019), its summary table and those of its supplement. A
-table has no layout; :mod:`dsr.report.markup` writes it.
+The model is Voynov et al., *Perceptual Deep Depth Super-Resolution* (ICCV 2019): its summary table and those of its
+supplement. A table has no layout; :mod:`dsr.report.markup` writes it.
 
-Seeds are averaged first, within each scene, then scenes. A spread is the sample standard deviation over seeds: of an
-average over scenes, that of the averages of each seed that has all of its scenes.
+Scores are averaged over the seeds within each scene, then over scenes. A spread is the sample standard deviation over
+seeds; for an average over scenes, over the averages of the seeds that have all of its scenes.
 """
 
 from __future__ import annotations
@@ -26,22 +26,22 @@ from dsr.report.tables import paper_row, published
 from dsr.report.user_study import USER_COLUMNS, check_study, user_cells
 
 PAPER_METHODS = {"bicubic": "Bicubic", "dip": "DIP", "dip_v": "DIP-V", "msg": "MSG", "msg_v": "MSG-V"}
-"""The paper's name of a method by that in ``scores.csv``."""
+"""Method names of the paper by name in ``scores.csv``."""
 _PAPER_SIZE = 512
-"""Pixels of the paper's pictures; of other sizes its figures say nothing."""
+"""Size of the paper's pictures, pixels; its values do not apply to other sizes."""
 _FOLDER = "dsr.data.folder.Folder"
-"""What reads people's own folders, in which the paper's own scenes may be."""
+"""Reader of users' own folders, which may contain the paper's scenes."""
 
 
 _USER = tuple(Column(key, heading, "%", 1, higher_is_better=True) for key, heading in USER_COLUMNS.items())
 
 
 def build_tables(results: Results, study: pd.DataFrame | None = None) -> list[PaperTable]:
-    """Return the tables of all runs: for each scale and degradation the summary, then one for each data set.
+    """Build the tables of all runs: per scale and degradation a summary, then one table per data set.
 
     Args:
-        results: the runs.
-        study: what ``dsr study collect`` wrote: columns ``dataset, scene, scale, downsampling, label``, and
+        results: runs.
+        study: table written by ``dsr study collect``: columns ``dataset, scene, scale, downsampling, label``, and
             ``user_first, user_second, user_top2`` in percent with ``_low`` and ``_high`` of each.
 
     Raises:
@@ -66,25 +66,25 @@ def build_tables(results: Results, study: pd.DataFrame | None = None) -> list[Pa
         for dataset in dict.fromkeys(place.dataset for place in places):
             sets = sets_of_dataset([place for place in places if place.dataset == dataset])
             tables.append(make.table(dataset, TITLES.get(dataset, dataset), sets))
-    return _named_apart(tables)
+    return _with_unique_names(tables)
 
 
 Values = Mapping[str, Mapping[Place, Mapping[str, Mapping[int, float]]]]
-"""By label, scene, metric and seed: worst of four lights, in the units of tables; finite values alone."""
+"""Scores by label, scene, metric and seed: worst of four lights, in the units of tables; only finite values."""
 
 
 @dataclass(frozen=True)
 class _Maker:
-    """Makes the tables of one scale and degradation.
+    """Builder of the tables of one scale and degradation.
 
     Args:
-        scale, downsampling: which.
+        scale, downsampling: degradation of the runs.
         methods: all labels, in order.
-        values: the scores.
-        comparable: data sets whose scenes may be the paper's.
-        names: the paper's name of a method by label.
-        study: what people said.
-        formats: of the metrics, in the order of the columns.
+        values: scores.
+        comparable: data sets whose scenes may be those of the paper.
+        names: method names of the paper by label.
+        study: table of the user study.
+        formats: formats of the metrics, in column order.
 
     """
 
@@ -107,7 +107,7 @@ class _Maker:
         return (*metrics, *_USER)
 
     def table(self, name: str, title: str, sets: Sequence[SceneSet]) -> PaperTable:
-        """Return a table of some sets of scenes."""
+        """Build a table of some sets of scenes."""
         places = {place for each in sets for place in each.places}
         labels = [label for label in self.methods if not places.isdisjoint(self.values.get(label, ()))]
         groups = tuple(_ranked(self._group(each, labels), self.columns) for each in sets)
@@ -120,15 +120,15 @@ class _Maker:
         )
 
     def _group(self, about: SceneSet, labels: Sequence[str]) -> Group:
-        """Return the rows of some methods, empty where a method has no value."""
+        """Build the rows of some methods; a method without values has an empty row."""
         comparable = about.published != "" and self.comparable.issuperset(place.dataset for place in about.places)
         rows = []
         for label in labels:
             scenes = [self.values[label].get(place, {}) for place in about.places]
             cells = {key: _cell([scene.get(key, {}) for scene in scenes]) for key in self.formats}
-            known = {key: cell for key, cell in cells.items() if cell is not None} | self._user_cells(about, label)
-            paper = self._published(about, self.names[label]) if comparable and known else {}
-            rows.append(Row(label, known, paper, max([1, *(cell.seeds for cell in known.values())])))
+            valid = {key: cell for key, cell in cells.items() if cell is not None} | self._user_cells(about, label)
+            paper = self._published(about, self.names[label]) if comparable and valid else {}
+            rows.append(Row(label, valid, paper, max([1, *(cell.seeds for cell in valid.values())])))
         ran = {self.names[row.label] for row in rows if row.cells}
         others = [str(name) for name in published()["method"].unique() if name not in ran]
         only = {name: self._published(about, name) for name in others} if comparable and not about.recreated else {}
@@ -141,13 +141,13 @@ class _Maker:
         return {} if row is None else {key: float(row[key]) for key in keys if pd.notna(row.get(key))}
 
     def _user_cells(self, about: SceneSet, label: str) -> dict[str, Cell]:
-        """Return what a study's participants said of a method."""
+        """Return the study's cells of a method."""
         found = user_cells(self.study, about.places, self.scale, self.downsampling, label)
         return {key: Cell(mean, None, 0, count, len(about.places), ci) for key, (mean, count, ci) in found.items()}
 
 
 def _values(runs: Sequence[Run], formats: Formats) -> Values:
-    """Return what the tables are made of."""
+    """Collect the scores of the tables."""
     found: dict[str, dict[Place, dict[str, dict[int, float]]]] = {}
     for run in runs:
         scores = run.scores
@@ -160,12 +160,12 @@ def _values(runs: Sequence[Run], formats: Formats) -> Values:
 
 
 def _comparable(runs: Sequence[Run]) -> frozenset[str]:
-    """Return the data sets whose scenes may be those that the paper has figures of."""
+    """Return the data sets whose scenes may be those of the paper."""
     others = set()
     for run in runs:
         dataset = run.settings.get("dataset", {})
-        known = run.dataset in PAPER_SCENES or dataset.get("target") == _FOLDER
-        if not known or dataset.get("size", _PAPER_SIZE) != _PAPER_SIZE:
+        valid = run.dataset in PAPER_SCENES or dataset.get("target") == _FOLDER
+        if not valid or dataset.get("size", _PAPER_SIZE) != _PAPER_SIZE:
             others.add(run.dataset)
     return frozenset({run.dataset for run in runs} - others)
 
@@ -196,22 +196,22 @@ def _truth_is_complete(results: Results) -> Callable[[Place], bool]:
 
 
 def _cell(scenes: Sequence[Mapping[int, float]]) -> Cell | None:
-    """Return the mean over seeds, then scenes, of one method's and metric's values by seed; None without any."""
-    known = [by_seed for by_seed in scenes if by_seed]
-    if not known:
+    """Average one method's values of a metric over seeds, then over scenes; None without values."""
+    valid = [by_seed for by_seed in scenes if by_seed]
+    if not valid:
         return None
-    mean = statistics.fmean(statistics.fmean(by_seed.values()) for by_seed in known)
-    seeds = set.intersection(*map(set, known))  # those that have all of these scenes
-    averages = [statistics.fmean(by_seed[seed] for by_seed in known) for seed in sorted(seeds)]
+    mean = statistics.fmean(statistics.fmean(by_seed.values()) for by_seed in valid)
+    seeds = set.intersection(*map(set, valid))  # seeds that have all of these scenes
+    averages = [statistics.fmean(by_seed[seed] for by_seed in valid) for seed in sorted(seeds)]
     spread = statistics.stdev(averages) if len(averages) > 1 else None
-    return Cell(mean, spread, max(len(averages), 1), len(known), len(scenes))
+    return Cell(mean, spread, max(len(averages), 1), len(valid), len(scenes))
 
 
 def _ranked(group: Group, columns: Sequence[Column]) -> Group:
     """Return the group with the best and second best marked.
 
-    What is shown is compared, not what is behind it: equal texts share a rank. Averages over fewer scenes than there
-    are take no part, nor does a value without another to compare it with.
+    Values are compared as displayed, so equal texts share a rank. Averages over a subset of the scenes are not ranked,
+    and a single value is not ranked.
     """
     ranks: dict[tuple[str, str], int] = {}
     for column in columns:
@@ -227,7 +227,7 @@ def _ranked(group: Group, columns: Sequence[Column]) -> Group:
 
 
 def _notes(groups: Sequence[Group], columns: Sequence[Column], formats: Formats) -> Iterator[str]:
-    """Yield what a reader of the table should know."""
+    """Yield the notes of a table."""
     rows = [row for group in groups for row in group.rows]
     cells = [cell for row in rows for cell in row.cells.values()]
     user = any(column.key in USER_COLUMNS for column in columns)
@@ -237,7 +237,7 @@ def _notes(groups: Sequence[Group], columns: Sequence[Column], formats: Formats)
         direction += " and User columns higher" if " of " in direction else ", of User columns higher"
     yield f"{direction[0].upper()}{direction[1:]}."
     yield "Metrics of renderings are the worst of four lights."
-    yield "Of our values as shown the best of each group is bold, the second underlined; equal ones share the mark."
+    yield "In each group our best displayed value is bold, the second best underlined; equal values share the mark."
     of_paper = [name for name, each in in_tables(KNOWN_FORMATS).items() if each.position != AFTER_THE_PAPER]
     missing = [name for name in of_paper if name not in shown]
     if missing:
@@ -247,11 +247,11 @@ def _notes(groups: Sequence[Group], columns: Sequence[Column], formats: Formats)
     if any(not cell.complete for cell in cells):
         yield "(k of n): an average over k of the n scenes; it is not compared with the others."
     if user:
-        yield "User: share of answers that chose the method as most similar (1st), as second most (2nd), or as either."
+        yield "User: percentage of answers with the method as most similar (1st), second most similar (2nd), or either."
 
 
-def _named_apart(tables: Sequence[PaperTable]) -> list[PaperTable]:
-    """Return the tables with names that differ on any file system."""
+def _with_unique_names(tables: Sequence[PaperTable]) -> list[PaperTable]:
+    """Return the tables with names that are unique on any file system."""
     taken: set[str] = set()
     named = []
     for table in tables:

@@ -1,7 +1,7 @@
-"""The scenes of a table: one by one, and in the sets that the paper averages over (Voynov et al. 2019, summary table).
+"""Scenes of a table: single scenes, and the sets that the paper averages over (Voynov et al. 2019, summary table).
 
-SimGeo, ICL-NUIM and Middlebury's Vintage are the paper's 13 scenes without missing measurements, Middlebury's other six
-those with. Scenes of other data sets are sorted by their truth: with holes in it or without.
+The paper's 13 scenes without missing measurements are SimGeo, ICL-NUIM and Middlebury's Vintage; Middlebury's other six
+scenes have missing measurements. Scenes of other data sets are grouped by whether their ground truth has holes.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ PAPER_SCENES = {
 }
 """The scenes that the paper averages over, by data set."""
 STAND_IN = "statue"
-"""Of SimGeo, where Lucy is not there."""
+"""SimGeo scene used if Lucy is not available."""
 _WITHOUT = "Average performance on the scenes without missing measurements (SimGeo, ICL-NUIM, Vintage)"
 _WITH = "Average performance on the scenes with missing measurements (Middlebury excluding Vintage)"
 _ALL = "Average performance on SimGeo, ICL-NUIM, Middlebury"
@@ -35,14 +35,14 @@ class Place(NamedTuple):
 
 @dataclass(frozen=True)
 class SceneSet:
-    """Scenes that a row of a table is about.
+    """The scenes of a table row.
 
     Args:
-        title: for readers.
-        places: the scenes, one or more.
-        published: the name of the paper's row about them; "" where it has none or where scenes of its are not here.
-        recreated: whether some of the scenes only re-create the paper's.
-        average: whether it is an average, if only over one scene.
+        title: display title.
+        places: one or more scenes.
+        published: name of the paper's row for these scenes; "" if it has none or if some of its scenes are missing.
+        recreated: whether some of the scenes re-create those of the paper.
+        average: whether the row is an average, possibly over one scene.
 
     """
 
@@ -54,18 +54,18 @@ class SceneSet:
 
 
 def sets_of_dataset(places: Sequence[Place]) -> list[SceneSet]:
-    """Return each scene of a data set, then their averages where there are two scenes or more."""
+    """Return each scene of a data set, then their averages if there are at least two scenes."""
     dataset = places[0].dataset
     averages = _averages_of_dataset(dataset, places) if len(places) > 1 else []
     return [*map(_single, places), *averages]
 
 
 def sets_of_summary(places: Sequence[Place], complete: Callable[[Place], bool]) -> list[SceneSet]:
-    """Return the averages over each data set and those of the paper's summary; of other data sets those alike.
+    """Return the averages over each data set, those of the paper's summary, and similar ones over other data sets.
 
     Args:
         places: all scenes.
-        complete: whether the truth of a scene has no hole; asked only of scenes that the paper has not.
+        complete: predicate, whether the ground truth of a scene has no holes; only called for scenes not in the paper.
 
     """
     datasets = list(dict.fromkeys(place.dataset for place in places))
@@ -73,10 +73,10 @@ def sets_of_summary(places: Sequence[Place], complete: Callable[[Place], bool]) 
     found += _averages_of_paper(places)
     if any(name not in PAPER_SCENES for name in datasets):
         others = [place for place in places if place.dataset not in PAPER_SCENES]
-        whole = [place for place in others if complete(place)]
-        broken = [place for place in others if place not in whole]
-        found += [_counted("Other scenes without missing measurements", whole)] if whole else []
-        found += [_counted("Other scenes with missing measurements", broken)] if broken else []
+        without_holes = [place for place in others if complete(place)]
+        with_holes = [place for place in others if place not in without_holes]
+        found += [_counted("Other scenes without missing measurements", without_holes)] if without_holes else []
+        found += [_counted("Other scenes with missing measurements", with_holes)] if with_holes else []
     distinct: dict[frozenset[Place], SceneSet] = {}
     for each in found:
         distinct.setdefault(frozenset(each.places), each)
@@ -88,28 +88,28 @@ def _within(places: Sequence[Place], dataset: str) -> list[Place]:
 
 
 def _single(place: Place) -> SceneSet:
-    """Return a scene by itself; one of another data set may be the paper's own file, in somebody's folder."""
+    """Return a set of one scene; a scene of an unlisted data set may be a file of the paper in a user's folder."""
     dataset, scene = place
-    known = scene in PAPER_SCENES.get(dataset, (scene,))
-    name = RECREATED.get(scene, scene.replace("_", " ")) if known else ""
+    in_paper = scene in PAPER_SCENES.get(dataset, (scene,))
+    name = RECREATED.get(scene, scene.replace("_", " ")) if in_paper else ""
     return SceneSet(scene, (place,), name, _recreated([place]), average=False)
 
 
 def _recreated(places: Sequence[Place]) -> bool:
-    """Return whether a scene is not of the paper's own files."""
+    """Return whether some of the scenes are not the paper's own files."""
     return any(dataset in OTHER_FRAMES or scene in (*RECREATED, STAND_IN) for dataset, scene in places)
 
 
 def _of_paper(places: Sequence[Place], dataset: str) -> list[Place]:
-    """Return those of the scenes that the paper averages over, the stand-in among them where it is needed."""
+    """Return the scenes that the paper averages over, including the stand-in if Lucy is missing."""
     own = _within(places, dataset)
-    wanted = PAPER_SCENES.get(dataset, ())
+    paper_scenes = PAPER_SCENES.get(dataset, ())
     stand_in = dataset == "simgeo" and Place(dataset, "lucy") not in own
-    return [place for place in own if place.scene in wanted or (stand_in and place.scene == STAND_IN)]
+    return [place for place in own if place.scene in paper_scenes or (stand_in and place.scene == STAND_IN)]
 
 
 def _averages_of_dataset(dataset: str, places: Sequence[Place]) -> list[SceneSet]:
-    """Return the average over the paper's scenes of a data set, and over all where there are others."""
+    """Return the average over the paper's scenes of a data set, and over all scenes if there are others."""
     title = TITLES.get(dataset, dataset)
     paper = _of_paper(places, dataset)
     found = [_paper_set(title, paper, len(PAPER_SCENES[dataset]), AVERAGES[dataset][0])] if paper else []
@@ -119,26 +119,26 @@ def _averages_of_dataset(dataset: str, places: Sequence[Place]) -> list[SceneSet
 
 
 def _averages_of_paper(places: Sequence[Place]) -> Iterator[SceneSet]:
-    """Yield the paper's averages over data sets, as far as their scenes are here."""
-    all_of_them = [place for dataset in PAPER_SCENES for place in _of_paper(places, dataset)]
-    broken = [place for place in all_of_them if place.dataset == "middlebury" and place.scene != "vintage"]
-    whole = [place for place in all_of_them if place not in broken]
-    if whole:
-        yield _paper_set("Without missing measurements (SimGeo, ICL-NUIM, Vintage)", whole, 13, _WITHOUT)
-    if broken:
-        yield _paper_set("With missing measurements (Middlebury excluding Vintage)", broken, 6, _WITH)
-    if all_of_them:
-        yield _paper_set("SimGeo, ICL-NUIM, Middlebury", all_of_them, 19, _ALL)
+    """Yield the paper's averages over data sets, over those of their scenes that are available."""
+    available = [place for dataset in PAPER_SCENES for place in _of_paper(places, dataset)]
+    with_holes = [place for place in available if place.dataset == "middlebury" and place.scene != "vintage"]
+    without_holes = [place for place in available if place not in with_holes]
+    if without_holes:
+        yield _paper_set("Without missing measurements (SimGeo, ICL-NUIM, Vintage)", without_holes, 13, _WITHOUT)
+    if with_holes:
+        yield _paper_set("With missing measurements (Middlebury excluding Vintage)", with_holes, 6, _WITH)
+    if available:
+        yield _paper_set("SimGeo, ICL-NUIM, Middlebury", available, 19, _ALL)
 
 
 def _paper_set(title: str, places: Sequence[Place], count: int, published: str) -> SceneSet:
-    """Return an average of the paper's; without the paper's figures where scenes lack."""
+    """Return an average of the paper; without the paper's values if scenes are missing."""
     if len(places) == count:
         return SceneSet(f"{title}, average of {count} scenes", tuple(places), published, _recreated(places))
     return SceneSet(f"{title}, average of {len(places)} of the paper's {count} scenes", tuple(places))
 
 
 def _counted(title: str, places: Sequence[Place]) -> SceneSet:
-    """Return an average that the paper has not."""
+    """Return an average that is not in the paper."""
     count = f"{len(places)} scenes" if len(places) > 1 else "1 scene"
     return SceneSet(f"{title}, average of {count}", tuple(places))

@@ -1,4 +1,4 @@
-"""What a table of the paper's kind is made of, without a layout."""
+"""Parts of a table like those of the paper, without layout."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ class Column:
     """A column of a table.
 
     Args:
-        key: the metric as in ``scores.csv``, or a column of the user study.
-        heading, unit: for readers; the unit may be empty.
-        digits: how many after the point are shown.
-        higher_is_better: whether the largest value is the best one.
+        key: metric as in ``scores.csv``, or column of the user study.
+        heading, unit: displayed texts; the unit may be empty.
+        digits: number of decimals.
+        higher_is_better: whether the largest value is the best.
 
     """
 
@@ -29,7 +29,7 @@ class Column:
     higher_is_better: bool = False
 
     def text(self, value: float) -> str:
-        """Return a value as it is shown, without a sign before zero."""
+        """Format a value, without a sign before zero."""
         text = f"{value:.{self.digits}f}"
         return text.removeprefix("-") if float(text) == 0 else text
 
@@ -39,12 +39,12 @@ class Cell:
     """One value of a table, in its column's unit.
 
     Args:
-        mean: over seeds, then over scenes.
+        mean: mean over seeds, then over scenes.
         spread: sample standard deviation over seeds; None for one seed.
-        seeds: how many the spread is of; 0 for what has nothing to do with seeds.
-        scenes, of: how many scenes it rests on, and how many it should.
-        interval: 95 % confidence interval of a share of answers.
-        rank: 1 for the best shown value, 2 for the second; 0 for others and for averages over fewer scenes.
+        seeds: number of seeds of the spread; 0 for values without seeds.
+        scenes, of: number of scenes with a value, and of all scenes of the row.
+        interval: 95 % confidence interval of a percentage of answers.
+        rank: 1 for the best displayed value, 2 for the second best; 0 for others and for incomplete averages.
 
     """
 
@@ -57,26 +57,26 @@ class Cell:
     rank: int = 0
 
     def against(self, paper: float | None) -> tuple[float, float | None] | None:
-        """Return its difference from the paper's value and its ratio to it; None where they don't compare."""
+        """Return the difference from the paper's value and the ratio to it; None if they are not comparable."""
         if paper is None or not self.complete:
             return None
         return self.mean - paper, self.mean / paper if paper else None
 
     @property
     def complete(self) -> bool:
-        """Whether it rests on all scenes that it should."""
+        """Whether all scenes of the row have a value."""
         return self.scenes == self.of
 
 
 @dataclass(frozen=True)
 class Row:
-    """A method's values.
+    """The values of a method.
 
     Args:
-        label: its name.
-        cells: by column; what is missing has none.
-        published: the paper's values by column, where it has any.
-        seeds: the most seeds of a cell.
+        label: name of the method.
+        cells: cells by column; missing values have none.
+        published: the paper's values by column, if any.
+        seeds: maximum number of seeds of a cell.
 
     """
 
@@ -88,12 +88,12 @@ class Row:
 
 @dataclass(frozen=True)
 class Group:
-    """The methods' rows for a scene or an average.
+    """The rows of all methods for a scene or an average.
 
     Args:
-        about: the scenes.
+        about: scenes.
         rows: methods in order.
-        paper_only: the paper's values of methods that were not run here; only where the scenes are the paper's own.
+        paper_only: the paper's values of methods that were not run; only if the scenes are the paper's own.
 
     """
 
@@ -104,14 +104,14 @@ class Group:
 
 @dataclass(frozen=True)
 class PaperTable:
-    """A table of the paper's kind.
+    """A table like those of the paper.
 
     Args:
-        name: of its files; letters, digits, "_", "-" and "." alone.
+        name: file name without suffix: letters, digits, "_", "-" and "." only.
         title: one line.
-        notes: what a reader should know, one sentence each.
-        scale, downsampling: of the problem.
-        columns: those that have a value, in order.
+        notes: remarks, one sentence each.
+        scale, downsampling: degradation of the runs.
+        columns: columns with values, in order.
         groups: scenes, then averages.
 
     """
@@ -126,35 +126,35 @@ class PaperTable:
 
     @property
     def has_published(self) -> bool:
-        """Whether the paper's values stand beside some of ours."""
+        """Whether some rows have values of the paper."""
         return any(row.published for group in self.groups for row in group.rows)
 
     @property
     def starred(self) -> bool:
-        """Whether some of them are of other files of the same description."""
+        """Whether some of the paper's values are of other files of the same description."""
         return any(row.published for group in self.groups if group.about.recreated for row in group.rows)
 
     @property
     def seeded(self) -> bool:
-        """Whether a row is of several seeds."""
+        """Whether a row has several seeds."""
         return any(row.seeds > 1 for group in self.groups for row in group.rows)
 
     def published_columns(self) -> tuple[Column, ...]:
-        """Return the columns in which the paper's values stand beside ours."""
+        """Return the columns with values of the paper."""
         rows = [row for group in self.groups for row in group.rows]
         return tuple(column for column in self.columns if any(column.key in row.published for row in rows))
 
 
 @dataclass(frozen=True)
 class Style:
-    """How a layout writes a cell.
+    """Formatting of cells in a layout.
 
     Args:
-        missing: for a value that there is not.
-        marks: what stands before and after a value, by rank.
-        number: writes a number.
-        plus_minus: between a value and its spread.
-        seeds: says how many seeds there were, ``{}``.
+        missing: text of a missing value.
+        marks: text before and after a value, by rank.
+        plus_minus: separator between a value and its spread.
+        seeds: format of the number of seeds, with ``{}``.
+        number: formats a number.
 
     """
 
@@ -165,7 +165,7 @@ class Style:
     number: Callable[[str], str] = str
 
     def text(self, column: Column, cell: Cell | None, seeds: int) -> str:
-        """Return a value with all that belongs to it; a number of seeds that is not the row's is said."""
+        """Format a cell; the number of seeds is added if it differs from that of the row."""
         if cell is None:
             return self.missing
         before, after = self.marks[cell.rank]

@@ -19,27 +19,27 @@ RECREATED = {
     "sphere_cylinder_low_freq": "Sphere and cylinder, low-frequency texture",
     "sphere_cylinder_no_texture": "Sphere and cylinder, no texture",
 }
-"""Embedded SimGeo scenes and the scene of the paper that each re-creates."""
+"""Embedded SimGeo scenes, and the scenes of the paper that they re-create."""
 OTHER_FRAMES = ("icl",)
-"""Data sets of which the paper does not say which frames its scenes are."""
+"""Data sets for which the paper does not specify the frames of its scenes."""
 AVERAGES = {
     "simgeo": ("Average performance on SimGeo dataset", 6),
     "icl": ("Average performance on ICL-NUIM dataset", 6),
     "middlebury": ("Average performance on Middlebury dataset", 7),
 }
-"""The paper's averages over its scenes of a data set, and how many these are."""
+"""The paper's averages over its scenes of a data set, and the number of scenes."""
 _PUBLISHED_DOWNSAMPLING = "box"
 
 
 @functools.cache
 def published() -> pd.DataFrame:
-    """Return the paper's figures in its units, one row per scene, method and scale."""
+    """Read the paper's values in its units, one row per scene, method and scale."""
     with resources.files("dsr.report").joinpath("published.csv").open(encoding="utf-8") as file:
         return pd.read_csv(file)
 
 
 def published_row(scene: str, method: str, scale: int) -> pd.Series | None:
-    """Return the paper's figures for a scene (by our name or its own) and a method (by its name in the paper)."""
+    """Return the paper's values for a scene (by our name or the paper's) and a method (by its name in the paper)."""
     name = RECREATED.get(scene, scene.replace("_", " "))
     number = _published_places().get((name.casefold(), method, scale))
     return None if number is None else published().iloc[number]
@@ -47,23 +47,23 @@ def published_row(scene: str, method: str, scale: int) -> pd.Series | None:
 
 @functools.cache
 def _published_places() -> dict[tuple[str, str, int], int]:
-    """Return in which row of :func:`published` the figures of a scene, method and scale are."""
+    """Return the row number in :func:`published` by scene, method and scale."""
     table = published()
     keys = zip(table["scene"].str.casefold(), table["method"], table["scale"], strict=True)
     return {(scene, method, int(scale)): number for number, (scene, method, scale) in enumerate(keys)}
 
 
 def paper_row(scene: str, method: str, scale: int, downsampling: str) -> pd.Series | None:
-    """Return the paper's figures as :func:`published_row` does, where they are of the same downsampling."""
+    """Return the paper's values like :func:`published_row`, None for a downsampling other than the paper's."""
     return published_row(scene, method, scale) if downsampling == _PUBLISHED_DOWNSAMPLING else None
 
 
 def in_shown_units(scores: pd.DataFrame, formats: Formats) -> pd.DataFrame:
-    """Return scene x metric of one run's scores, in the units of tables, worst of four lights.
+    """Return one run's scores as scene x metric, in the units of tables, worst of four lights.
 
     Args:
-        scores: the content of one ``scores.csv``.
-        formats: of its metrics.
+        scores: content of one ``scores.csv``.
+        formats: formats of its metrics.
 
     """
     worst = scores[scores["variant"].fillna("").isin(HEADLINES)]
@@ -73,12 +73,12 @@ def in_shown_units(scores: pd.DataFrame, formats: Formats) -> pd.DataFrame:
 
 
 def score_table(scores: pd.DataFrame, label: str, formats: Formats) -> Table:
-    """Return the terminal's table of one run: each scene, the paper's values below ours, and our mean.
+    """Build the terminal table of one run: per scene our values and the paper's, then the mean.
 
     Args:
-        scores: the content of one ``scores.csv``.
-        label: the method's name in the paper.
-        formats: of the metrics.
+        scores: content of one ``scores.csv``.
+        label: name of the method in the paper.
+        formats: formats of the metrics.
 
     """
     ours = in_shown_units(scores, formats)
@@ -113,5 +113,5 @@ def score_table(scores: pd.DataFrame, label: str, formats: Formats) -> Table:
 
 
 def _cells(values: pd.Series, columns: Formats) -> list[str]:
-    """Return a row's values as text, with as many digits as each metric's column has; "-" for those that it lacks."""
+    """Format the values of a row with the digits of each column; "-" for missing values."""
     return [each.text(values[name]) if pd.notna(values.get(name)) else "-" for name, each in columns.items()]

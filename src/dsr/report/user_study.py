@@ -1,4 +1,4 @@
-"""What the participants of a study said, as columns of tables."""
+"""Results of a user study as columns of tables."""
 
 from __future__ import annotations
 
@@ -9,20 +9,20 @@ from typing import NamedTuple
 import pandas as pd
 
 USER_COLUMNS = {"user_first": "User 1st", "user_second": "User 2nd", "user_top2": "User Top 2"}
-"""The paper's columns: which share of the answers named a method the most similar, the second most, or either."""
+"""The paper's columns: percentage of answers with a method as most similar, second most similar, or either."""
 _TEXTS = ("dataset", "scene", "downsampling", "label")
 _KEYS = (*_TEXTS, "scale")
 _AVERAGE, _ALL = "average", "all"
-"""A study's own averages are rows of this scene; the one over all data sets is of this data set."""
+"""Scene name of the study's own averages, and data set name of the average over all data sets."""
 
 
 class Answer(NamedTuple):
-    """A share of the answers in percent.
+    """A percentage of the answers.
 
     Args:
-        mean: over scenes.
-        scenes: how many it is about.
-        interval: its 95 % confidence interval, where the study gives one.
+        mean: mean over scenes.
+        scenes: number of scenes.
+        interval: 95 % confidence interval, if the study gives one.
 
     """
 
@@ -32,25 +32,25 @@ class Answer(NamedTuple):
 
 
 def read_study(path: Path) -> pd.DataFrame:
-    """Read what ``dsr study collect`` wrote.
+    """Read a table written by ``dsr study collect``.
 
     Raises:
-        ValueError: the file is no such table.
+        ValueError: the file is not such a table.
 
     """
     try:
         study = pd.read_csv(path, dtype=dict.fromkeys(_TEXTS, str), keep_default_na=False, na_values=[""])
-    except (OSError, ValueError) as error:  # what pandas raises of damaged files is a ValueError, too
+    except (OSError, ValueError) as error:  # pandas raises subclasses of ValueError for damaged files
         raise ValueError(f"{path}: expected the table of dsr study collect, got {type(error).__name__}") from error
     check_study(study, str(path))
     return study
 
 
 def check_study(study: pd.DataFrame, name: str = "study") -> None:
-    """Refuse a table that is not one of a study.
+    """Check that a table is that of a study.
 
     Raises:
-        ValueError: a column is missing, or holds no numbers.
+        ValueError: a column is missing or not numeric.
 
     """
     missing = [column for column in (*_KEYS, *USER_COLUMNS) if column not in study]
@@ -65,36 +65,38 @@ def check_study(study: pd.DataFrame, name: str = "study") -> None:
 def user_cells(
     study: pd.DataFrame | None, places: Sequence[tuple[str, str]], scale: int, downsampling: str, label: str
 ) -> dict[str, Answer]:
-    """Return the share of the answers in percent that named a method, by column of :data:`USER_COLUMNS`.
+    """Return the percentages of answers that chose a method, by column of :data:`USER_COLUMNS`.
 
-    An average over scenes is the mean of the scenes' shares, as in the paper, or the study's own row about these very
-    scenes; only that one has an interval, since the study alone knows who answered what.
+    An average over scenes is the study's own row for exactly these scenes if there is one, otherwise the mean over the
+    scenes, as in the paper. Only the study's own row has a confidence interval, which needs the individual answers.
 
     Args:
-        study: its table; see :func:`dsr.report.paper_tables.build_tables`.
+        study: table of the study; see :func:`dsr.report.paper_tables.build_tables`.
         places: data sets and scenes.
-        scale: of the rows that count.
-        downsampling: of those, too.
-        label: and the method's.
+        scale: scale factor of the rows to use.
+        downsampling: downsampling of the rows to use.
+        label: label of the method.
 
     """
     if study is None:
         return {}
-    fits = (study["scale"] == scale) & (study["downsampling"] == downsampling) & (study["label"] == label)
-    rows = study[fits].drop_duplicates(list(_KEYS), keep="last").set_index(["dataset", "scene"])
+    matches = (study["scale"] == scale) & (study["downsampling"] == downsampling) & (study["label"] == label)
+    rows = study[matches].drop_duplicates(list(_KEYS), keep="last").set_index(["dataset", "scene"])
     here = [place for place in places if place in rows.index]
     found = {}
     for key in USER_COLUMNS:
         values = rows.loc[here, key].dropna()
         if len(values):
-            whole = _own_average(rows, places) if len(values) == len(places) else None
-            mean, interval = (values.mean(), None) if whole is None else (whole[key], _interval(whole, key))
+            own_average = _own_average(rows, places) if len(values) == len(places) else None
+            mean, interval = (
+                (values.mean(), None) if own_average is None else (own_average[key], _interval(own_average, key))
+            )
             found[key] = Answer(float(mean), len(values), interval)
     return found
 
 
 def _own_average(rows: pd.DataFrame, places: Sequence[tuple[str, str]]) -> pd.Series | None:
-    """Return the study's row about exactly these scenes."""
+    """Return the study's row for exactly these scenes, None without one."""
     if len(places) == 1:
         return rows.loc[places[0]]
     datasets = {dataset for dataset, _ in places}
@@ -110,6 +112,6 @@ def _own_average(rows: pd.DataFrame, places: Sequence[tuple[str, str]]) -> pd.Se
 
 
 def _interval(row: pd.Series, key: str) -> tuple[float, float] | None:
-    """Return the 95 % confidence interval of a share."""
+    """Return the 95 % confidence interval of a percentage."""
     low, high = row.get(f"{key}_low"), row.get(f"{key}_high")
     return None if pd.isna(low) or pd.isna(high) else (float(low), float(high))

@@ -23,14 +23,14 @@ def save_figures(
     """Draw all figures.
 
     Args:
-        folder: for the files, which are replaced where they are there.
-        results: to draw.
+        folder: output directory; existing files are replaced.
+        results: runs to draw.
         progress: called before each figure with the number done, the maximum number, and the name.
-        light: of the renderings, ``e1`` to ``e4``.
-        notes: is extended by a line for each scene or result that could not be drawn.
+        light: light of the renderings, ``e1`` to ``e4``.
+        notes: list to which one line is added per scene or result that could not be drawn.
 
     Returns:
-        The files: a PDF and a PNG of each figure.
+        Paths of the files: a PDF and a PNG of each figure.
 
     Raises:
         ValueError: there is no such light.
@@ -38,14 +38,14 @@ def save_figures(
     """
     total, done = figure_count(results) + 1, 0
 
-    def tell(name: str) -> None:
+    def report(name: str) -> None:
         nonlocal done
         if progress is not None:
             progress(done, total, name)
         done += 1
 
-    paths = save_rendering_grids(folder, results, light, progress=tell, notes=notes)
-    paths += save_depth_grids(folder, results, progress=tell, notes=notes)
-    paths += save_error_grids(folder, results, progress=tell, notes=notes)
-    tell("lights")
+    paths = save_rendering_grids(folder, results, light, progress=report, notes=notes)
+    paths += save_depth_grids(folder, results, progress=report, notes=notes)
+    paths += save_error_grids(folder, results, progress=report, notes=notes)
+    report("lights")
     return paths + save_lights_figure(folder, results)

@@ -16,7 +16,7 @@ from dsr.report.figures.scenes import Shown, first_runs, scene_names, shown_scen
 
 LIGHT = "e1"
 ROWS = 5
-"""Scenes on a page."""
+"""Maximum number of scenes on a page."""
 Progress = Callable[[str], None]
 """Called with the name of a figure before it is drawn."""
 
@@ -29,20 +29,20 @@ def save_rendering_grids(
     progress: Progress | None = None,
     notes: list[str] | None = None,
 ) -> list[Path]:
-    """Draw photo, renderings of the input, of each method's result and of the truth, with two details a scene.
+    """Draw photo and renderings of input, results and ground truth, with two details per scene.
 
-    Details are where the methods differ most from the truth on average, the same for all. Below are DSSIM_v and RMSE_v
-    in 1/1000, worst of four lights, the best in bold. The input is rendered from its own pixels.
+    Details are the windows in which the methods differ most from the ground truth on average. The captions are DSSIM_v
+    and RMSE_v in 1/1000, worst of four lights, the best in bold. The input is rendered at its own resolution.
 
     Args:
-        folder: for ``renderings_DATASET_xSCALE_DOWNSAMPLING_PAGE.pdf`` and ``.png``, five scenes a page.
-        results: of any number of methods, data sets, scales and degradations; a page is of one of each but methods.
-        light: ``e1`` to ``e4``.
+        folder: directory for ``renderings_DATASET_xSCALE_DOWNSAMPLING_PAGE.pdf`` and ``.png``, five scenes per page.
+        results: runs to draw; a page has one data set, scale and degradation.
+        light: light of the renderings, ``e1`` to ``e4``.
         progress: called with the name of each figure.
-        notes: is extended by a line for each scene or result that could not be drawn.
+        notes: list to which one line is added per scene or result that could not be drawn.
 
     Returns:
-        The files.
+        Paths of the files.
 
     Raises:
         ValueError: there is no such light.
@@ -60,10 +60,10 @@ def save_rendering_grids(
 def save_depth_grids(
     folder: Path, results: Results, *, progress: Progress | None = None, notes: list[str] | None = None
 ) -> list[Path]:
-    """Draw photo, input, each method's depth and the truth in pseudo-colour, the same colours across a row.
+    """Draw photo, and depth of input, results and ground truth in pseudo-colour, with the same limits across a row.
 
     Files are ``depth_DATASET_xSCALE_DOWNSAMPLING_PAGE``; otherwise like :func:`save_rendering_grids`. Limits are the
-    1st and 99th percentile of the truth, of the input where there is none.
+    1st and 99th percentile of the ground truth, or of the input if there is none.
     """
     texts = (("photo", "input"), ("truth",), "distance to the image plane; below: RMSE_d, mm, lower is better")
     return _save(folder, "depth", results, depth_row, texts, progress, notes)
@@ -72,17 +72,17 @@ def save_depth_grids(
 def save_error_grids(
     folder: Path, results: Results, *, progress: Progress | None = None, notes: list[str] | None = None
 ) -> list[Path]:
-    """Draw photo and signed error (result - truth) of each method, centred at 0, the same colours across a row.
+    """Draw photo and signed error (result - truth) of each method, with the same limits across a row.
 
-    Files are ``errors_DATASET_xSCALE_DOWNSAMPLING_PAGE``; otherwise like :func:`save_rendering_grids`. Colours end at
-    the 98th percentile of all methods' absolute errors. Scenes without truth are left out.
+    Files are ``errors_DATASET_xSCALE_DOWNSAMPLING_PAGE``; otherwise like :func:`save_rendering_grids`. Limits are
+    +-98th percentile of the absolute errors of all methods. Scenes without ground truth are left out.
     """
     texts = (("photo",), (), "result - truth: red is too far, blue too near; below: RMSE_d, mm, lower is better")
     return _save(folder, "errors", results, error_row, texts, progress, notes)
 
 
 def figure_count(results: Results) -> int:
-    """Return how many pages the three kinds of grids have at most."""
+    """Return the maximum number of pages of the three kinds of grids."""
     scenes = (len(scene_names(first_runs(results, problem))) for problem in results.problems())
     return 3 * sum(-(-count // ROWS) for count in scenes)
 
@@ -96,7 +96,7 @@ def _save(
     progress: Progress | None,
     notes: list[str] | None,
 ) -> list[Path]:
-    """Draw the pages of one kind for each problem."""
+    """Draw the pages of one kind for each benchmark setting."""
     before, after, below = texts
     paths: list[Path] = []
     notes = [] if notes is None else notes
@@ -119,7 +119,7 @@ def _pages(rows: Iterator[Row]) -> Iterator[list[Row]]:
 
 
 def _names(problems: list[BenchmarkSetting]) -> list[str]:
-    """Return a part of a file's name for each problem, no two the same."""
+    """Return a unique part of a file name for each benchmark setting."""
     names: list[str] = []
     for dataset, scale, downsampling in problems:
         name = re.sub(r"[^\w.-]+", "_", f"{dataset}_x{scale}_{downsampling}").strip("_")
@@ -130,5 +130,5 @@ def _names(problems: list[BenchmarkSetting]) -> list[str]:
 
 
 def _has_holes(row: Row) -> bool:
-    """Return whether a picture of a row has holes."""
+    """Return whether a picture of the row has holes."""
     return any(cell.picture is not None and not np.isfinite(cell.picture).all() for cell in row.cells)

@@ -1,4 +1,4 @@
-"""The common look of the grids: rows of panels of one width, details below them, and one colour bar per row."""
+"""Layout of the grids: rows of panels of one width, details below them, and one colour bar per row."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ from dsr.viz.panels import Window, colours, write_figure
 
 DPI = 300
 FRAMES = ("#ff8c00", "#00a5e3")
-"""Colours of the first and second detail."""
+"""Frame colours of the first and second detail."""
 _WIDTH, _LEAST_PANEL, _MOST_PANEL = 7.0, 0.95, 1.6
-"""Inches of a page's width as long as panels are within bounds."""
+"""Page width, inches, unless a panel would exceed its minimum or maximum width."""
 _TALLEST = 1.5
-"""A panel's greatest height by its width; pictures that are taller become narrower."""
+"""Maximum ratio of height to width of a panel; taller pictures become narrower."""
 _GAP, _SEAM, _MARGIN, _LINE = 0.05, 0.04, 0.06, 0.125
-"""Inches between panels, between details, around the page, and of a line of text."""
+"""Space between panels, between details and around the page, and height of a line of text, inches."""
 _BAR, _BAR_TEXT = 0.09, 0.42
 _FONT = 7.0
-_LETTER = 0.062
-"""Inches that a letter takes, generously."""
+_LETTER_WIDTH = 0.062
+"""Upper estimate of the width of a letter, inches."""
 _EMPTY = "#f2f2f2"
 
 
@@ -41,9 +41,9 @@ class Cell:
 
     Args:
         picture: (H, W), NaN in holes, or (H, W, 3) in [0, 1]; None for an empty panel.
-        caption: a line below; of a panel without picture, what is written into it.
-        bold: whether the caption is.
-        colour_map, limits: for (H, W).
+        caption: line below the panel, or text inside an empty panel.
+        bold: whether the caption is bold.
+        colour_map, limits: colours of an (H, W) picture.
 
     """
 
@@ -56,16 +56,16 @@ class Cell:
 
 @dataclass(frozen=True)
 class Row:
-    """A scene.
+    """The row of a scene.
 
     Args:
-        label: its name.
-        aspect: height by width of its pictures.
+        label: name of the scene.
+        aspect: ratio of height to width of its pictures.
         cells: one per column.
-        details: windows that are shown enlarged, square, in pixels of a picture of ``size``.
-        size: height and width.
-        bar: what the colour bar counts; empty for none. It is that of the last cell with limits.
-        extend: see Matplotlib's colour bars.
+        details: square windows shown enlarged, in pixels of a picture of ``size``.
+        size: height and width, pixels.
+        bar: label of the colour bar, which is that of the last (H, W) picture; empty for no bar.
+        extend: Matplotlib's ``extend`` of colour bars.
 
     """
 
@@ -81,7 +81,7 @@ class Row:
 def save_both(folder: Path, name: str, figure: Figure) -> list[Path]:
     """Write a figure as PDF and PNG atomically, and return the files.
 
-    In the PDF text is text, and pictures keep their own pixels.
+    In the PDF text is stored as text, and pictures are not resampled.
     """
     paths = []
     for suffix, interpolation, metadata in ((".pdf", "none", {"CreationDate": None}), (".png", "auto", {})):
@@ -95,20 +95,20 @@ def save_both(folder: Path, name: str, figure: Figure) -> list[Path]:
 
 
 def draw_grid(columns: Sequence[str], rows: Sequence[Row], texts: tuple[str, str]) -> Figure:
-    """Return a page.
+    """Draw a page.
 
     Args:
-        columns: the headings.
-        rows: from top to bottom, each with a cell per column.
-        texts: above and below.
+        columns: column headings.
+        rows: rows from top to bottom, each with one cell per column.
+        texts: texts above and below the grid.
 
     """
     right = _MARGIN + (_BAR + _BAR_TEXT if any(row.bar for row in rows) else 0)
     panel = min(max((_WIDTH - 0.3 - right) / len(columns) - _GAP, _LEAST_PANEL), _MOST_PANEL)
     boxes = [_boxes(row, panel) for row in rows]
-    labels = [_wrapped(row.label, sum(heights)) for row, (_, *heights) in zip(rows, boxes, strict=True)]
+    labels = [_wrap(row.label, sum(heights)) for row, (_, *heights) in zip(rows, boxes, strict=True)]
     left = _MARGIN + _LINE * max(label.count("\n") + 1 for label in labels) + 0.03
-    heads = [_wrapped(column, panel) for column in columns]
+    heads = [_wrap(column, panel) for column in columns]
     head = _LINE * max(text.count("\n") + 1 for text in heads)
     top = _MARGIN + _LINE * 1.5 + head
     total = top + sum(sum(heights) + _GAP for _, *heights in boxes) + _LINE * 1.3 + _MARGIN
@@ -130,20 +130,20 @@ def draw_grid(columns: Sequence[str], rows: Sequence[Row], texts: tuple[str, str
 
 
 def _boxes(row: Row, panel: float) -> tuple[float, float, float, float]:
-    """Return a row's sizes in inches: a picture's width and height, and the heights of details and caption."""
+    """Return the sizes of a row in inches: width and height of a picture, and heights of details and caption."""
     width = panel * min(1.0, _TALLEST / row.aspect)
     details = (panel - _SEAM * (len(row.details) - 1)) / len(row.details) + _SEAM if row.details else 0.0
     caption = _LINE if any(cell.caption and cell.picture is not None for cell in row.cells) else 0.0
     return width, max(width * row.aspect, 0.15), details, caption
 
 
-def _wrapped(text: str, length: float) -> str:
-    """Return a text as lines that are at most so many inches long."""
-    return "\n".join(textwrap.wrap(text, max(int(length / _LETTER), 4), break_on_hyphens=False)) or text
+def _wrap(text: str, length: float) -> str:
+    """Wrap a text to lines of at most a given length in inches."""
+    return "\n".join(textwrap.wrap(text, max(int(length / _LETTER_WIDTH), 4), break_on_hyphens=False)) or text
 
 
 class _Page:
-    """A figure whose places are in inches from the lower left corner."""
+    """A figure with positions in inches from the lower left corner."""
 
     def __init__(self, width: float, height: float) -> None:
         self.figure = Figure(figsize=(width, height))
@@ -155,9 +155,11 @@ class _Page:
         self.figure.text(x / width, y / height, text, fontsize=_FONT, parse_math=False, linespacing=1.1, **style)
 
     def axes(self, left: float, bottom: float, width: float, height: float, label: str = "") -> Axes:
-        """Return axes without ticks."""
-        whole, total = self.figure.get_size_inches()
-        axes = self.figure.add_axes((left / whole, bottom / total, width / whole, height / total), label=label)
+        """Add axes without ticks."""
+        page_width, page_height = self.figure.get_size_inches()
+        axes = self.figure.add_axes(
+            (left / page_width, bottom / page_height, width / page_width, height / page_height), label=label
+        )
         axes.set(xticks=[], yticks=[])
         for spine in axes.spines.values():
             spine.set_visible(False)
@@ -166,7 +168,7 @@ class _Page:
     def cell(
         self, row: Row, cell: Cell, left: float, top: float, panel: float, box: tuple[float, float, float, float]
     ) -> None:
-        """Draw a panel, its details and its caption, the picture's upper edge at ``top``."""
+        """Draw a panel, its details and its caption; ``top`` is the upper edge of the picture."""
         width, height, below, _ = box
         axes = self.axes(left + (panel - width) / 2, top - height, width, height, label=f"{row.label}: panel")
         if cell.picture is None:
@@ -176,7 +178,7 @@ class _Page:
         _show(axes, cell, cell.picture)
         size = below - _SEAM
         for number, (window, colour) in enumerate(zip(row.details, FRAMES, strict=False)):
-            part = _scaled(window, row.size, cell.picture.shape[:2])
+            part = _scale_window(window, row.size, cell.picture.shape[:2])
             axes.add_patch(_frame(part, colour))
             inset = self.axes(left + number * (size + _SEAM), top - height - below, size, size, f"{row.label}: detail")
             _show(inset, cell, cell.picture[part.slices])
@@ -212,8 +214,8 @@ def _frame(window: Window, colour: str) -> Rectangle:
     return Rectangle(corner, window.width, window.height, fill=False, edgecolor=colour, linewidth=0.9)
 
 
-def _scaled(window: Window, size: tuple[int, int], shape: tuple[int, ...]) -> Window:
-    """Return a window of a picture of one size in one of another, to whole pixels, at least one."""
+def _scale_window(window: Window, size: tuple[int, int], shape: tuple[int, ...]) -> Window:
+    """Convert a window to a picture of another size, rounded to whole pixels, at least one."""
     down, across = shape[0] / size[0], shape[1] / size[1]
     top, left = int(window.top * down), int(window.left * across)
     bottom, right = round((window.top + window.height) * down), round((window.left + window.width) * across)

@@ -1,4 +1,4 @@
-"""The four lights, explained: a sphere and a surface under each."""
+"""Figure of the four lights: a sphere and a surface under each."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from dsr.sample import DepthSample
 from dsr.viz.panels import colours
 
 _SPHERE = 401
-"""Pixels across."""
+"""Diameter of a sphere, pixels."""
 _FORMULAS = {
     "e1": r"$-(0,\,\sqrt{2/3},\,1/\sqrt{3})$",
     "e2": r"$-(1/\sqrt{2},\,-1/\sqrt{6},\,1/\sqrt{3})$",
@@ -30,21 +30,21 @@ _FORMULAS = {
 _FONT = 8
 _PANEL, _GAP, _AXES, _ABOVE, _MARGIN = 1.42, 0.08, 0.95, 0.4, 0.06
 _ARROW = "#d1495b"
-_REACH = 1.32
-"""Of the half width of a sphere's panel, in radii."""
+_HALF_WIDTH = 1.32
+"""Half the width of a sphere's panel, in radii."""
 _PREFERRED = ("statue", "lucy")
 _CANDIDATES = 8
 
 
 def save_lights_figure(folder: Path, results: Results | None = None) -> list[Path]:
-    """Draw a sphere, and the truth of a scene, under the four lights; arrows show the way that the light takes.
+    """Draw a sphere and the ground truth of a scene under the four lights, with arrows along the light.
 
     Args:
-        folder: for ``lights.pdf`` and ``lights.png``.
-        results: the truth of their most varied scene is shown; None for the sphere alone.
+        folder: directory for ``lights.pdf`` and ``lights.png``.
+        results: runs, of which the scene with the most varied normals is shown; None for the sphere alone.
 
     Returns:
-        The files.
+        Paths of the files.
 
     """
     scene = None if results is None else _most_varied(results)
@@ -78,7 +78,7 @@ def save_lights_figure(folder: Path, results: Results | None = None) -> list[Pat
 
 
 def sphere_normals(size: int) -> Tensor:
-    """Return the normals of a sphere seen from afar, (3, size, size), NaN beside it.
+    """Return the normals of a sphere in orthographic projection, (3, size, size), NaN outside it.
 
     n = (x, y, -sqrt(1 - x^2 - y^2)) with x and y from -1 to 1.
     """
@@ -89,10 +89,10 @@ def sphere_normals(size: int) -> Tensor:
 
 
 def _draw_sphere(axes: Axes, shades: np.ndarray, direction: Tensor) -> None:
-    """Draw a sphere on white and an arrow along which the light comes."""
+    """Draw a sphere on white, and an arrow in the direction of the light."""
     axes.imshow(np.ma.masked_invalid(shades), cmap="gray", vmin=0, vmax=1, extent=(-1, 1, 1, -1))
     axes.add_patch(Circle((0, 0), 1, facecolor="none", edgecolor="0.6", linewidth=0.5))
-    axes.set(xlim=(-_REACH, _REACH), ylim=(_REACH, -_REACH))
+    axes.set(xlim=(-_HALF_WIDTH, _HALF_WIDTH), ylim=(_HALF_WIDTH, -_HALF_WIDTH))
     x, y, _ = direction.tolist()
     if abs(x) + abs(y) > 0:
         style = {"arrowstyle": "-|>", "color": _ARROW, "linewidth": 1.8, "shrinkA": 0, "shrinkB": 0}
@@ -102,7 +102,7 @@ def _draw_sphere(axes: Axes, shades: np.ndarray, direction: Tensor) -> None:
 
 
 def _draw_frame(axes: Axes) -> None:
-    """Draw the axes of the camera frame as the viewer sees them."""
+    """Draw the axes of the camera frame."""
     axes.set(xlim=(-0.5, 1.35), ylim=(1.35, -0.5))
     style = {"arrowstyle": "-|>", "color": "0.15", "linewidth": 1.2, "shrinkA": 5, "shrinkB": 0}
     for name, end in (("x", (0.8, 0.0)), ("y", (0.0, 0.8))):
@@ -113,15 +113,17 @@ def _draw_frame(axes: Axes) -> None:
 
 
 def _draw_away(axes: Axes, x: float, y: float, radius: float, colour: str) -> None:
-    """Draw the sign of a vector that points away from the viewer: a crossed circle."""
+    """Draw the symbol of a vector that points away from the viewer: a crossed circle."""
     axes.add_patch(Circle((x, y), radius, facecolor="white", edgecolor=colour, linewidth=1.2, zorder=3))
-    reach = radius / 2**0.5
+    offset = radius / 2**0.5
     for sign in (1, -1):
-        axes.plot((x - reach, x + reach), (y - sign * reach, y + sign * reach), color=colour, linewidth=1.2, zorder=4)
+        axes.plot(
+            (x - offset, x + offset), (y - sign * offset, y + sign * offset), color=colour, linewidth=1.2, zorder=4
+        )
 
 
 def _most_varied(results: Results) -> DepthSample | None:
-    """Return a scene with a truth: of those by known names the first, else the one whose normals vary most."""
+    """Return a scene with ground truth: the first preferred one, otherwise the one with the most varied normals."""
     found: dict[str, DepthSample] = {}
     for run in results.runs:
         for name in run.scenes:
@@ -132,8 +134,8 @@ def _most_varied(results: Results) -> DepthSample | None:
                     continue
                 if scene.depth is not None and min(scene.depth.shape[-2:]) > 1:
                     found[name] = scene
-    named = [found[name] for name in _PREFERRED if name in found]
-    return next(iter(named), max(found.values(), key=_variety, default=None))
+    preferred = [found[name] for name in _PREFERRED if name in found]
+    return next(iter(preferred), max(found.values(), key=_variety, default=None))
 
 
 def _variety(scene: DepthSample) -> float:

@@ -1,4 +1,4 @@
-"""The rows of the grids: what each kind of figure shows of one scene."""
+"""Rows of the grids: the pictures of one scene in each kind of figure."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from dsr.report.figures.layout import Cell, Row
 from dsr.report.figures.scenes import Shown, details_of, rendering
 from dsr.viz.panels import limits_of
 
-_COARSE_ERROR = 0.02
-"""Metres of a row's limit from which on errors are told in centimetres."""
+_CENTIMETRE_LIMIT = 0.02
+"""Limit of a row, metres, from which errors are shown in centimetres."""
 _LEAST_ERROR = 1e-5
 
 
 def rendering_row(shown: Shown, light: str) -> Row:
-    """Return a scene's renderings."""
+    """Build the row of a scene's renderings."""
     scene = shown.scene
     results = {
         label: None if depth is None else rendering(depth, scene.camera, light) for label, depth in shown.depths.items()
@@ -29,7 +29,7 @@ def rendering_row(shown: Shown, light: str) -> Row:
     scores = _captions(shown, "DSSIM_v", "RMSE_v")
     cells = [
         _photo(shown),
-        Cell(_enlarged(rendering(scene.depth_lr, scene.camera_lr, light), scene.scale)),
+        Cell(_enlarge(rendering(scene.depth_lr, scene.camera_lr, light), scene.scale)),
         *(_panel(picture, scores[label]) for label, picture in results.items()),
         _panel(truth, missing="no truth"),
     ]
@@ -39,13 +39,13 @@ def rendering_row(shown: Shown, light: str) -> Row:
 
 
 def depth_row(shown: Shown) -> Row:
-    """Return a scene's depth maps."""
+    """Build the row of a scene's depth maps."""
     scene = shown.scene
     style = _Style("viridis", limits_of(scene.depth_lr if scene.depth is None else scene.depth))
     scores = _captions(shown, "RMSE_d")
     cells = [
         _photo(shown),
-        _panel(_enlarged(scene.depth_lr[0].numpy(), scene.scale), style=style),
+        _panel(_enlarge(scene.depth_lr[0].numpy(), scene.scale), style=style),
         *(_panel(_pixels(depth), scores[label], style=style) for label, depth in shown.depths.items()),
         _panel(_pixels(scene.depth), missing="no truth", style=style),
     ]
@@ -53,15 +53,15 @@ def depth_row(shown: Shown) -> Row:
 
 
 def error_row(shown: Shown) -> Row | None:
-    """Return a scene's errors, None where there is no truth or no result."""
+    """Build the row of a scene's errors, None without ground truth or without results."""
     truth = shown.scene.depth
-    if truth is None or not shown.known():
+    if truth is None or not shown.existing():
         return None
     errors = {name: None if depth is None else depth.double() - truth for name, depth in shown.depths.items()}
-    known = [error[error.isfinite()].abs().numpy() for error in errors.values() if error is not None]
-    pooled = np.concatenate(known)
+    valid = [error[error.isfinite()].abs().numpy() for error in errors.values() if error is not None]
+    pooled = np.concatenate(valid)
     limit = max(float(np.percentile(pooled, 98)) if pooled.size else 0.0, _LEAST_ERROR)
-    factor, unit = (100, "cm") if limit >= _COARSE_ERROR else (1000, "mm")
+    factor, unit = (100, "cm") if limit >= _CENTIMETRE_LIMIT else (1000, "mm")
     style, scores = _Style(_diverging(), (-factor * limit, factor * limit)), _captions(shown, "RMSE_d")
     cells = [_photo(shown)]
     for label, error in errors.items():
@@ -91,7 +91,7 @@ def _panel(
     missing: str = "no result",
     style: _Style = _GREY,
 ) -> Cell:
-    """Return a panel of (H, W) values, or one that says what is missing."""
+    """Build a panel of (H, W) values, or a panel with the text ``missing``."""
     return Cell(None, missing) if picture is None else Cell(picture, *caption, *style)
 
 
@@ -100,31 +100,31 @@ def _pixels(values: Tensor | None) -> np.ndarray | None:
     return None if values is None else values[0].numpy()
 
 
-def _enlarged(picture: np.ndarray, scale: int) -> np.ndarray:
-    """Return a picture with each pixel repeated, so that no viewer smooths what is coarse."""
+def _enlarge(picture: np.ndarray, scale: int) -> np.ndarray:
+    """Repeat each pixel, so that viewers do not smooth a low-resolution picture."""
     return picture.repeat(scale, axis=0).repeat(scale, axis=1)
 
 
 def _diverging() -> Colormap:
-    """Return blue to white to red, without the ends that are nearly black."""
+    """Return a colour map from blue over white to red, without its nearly black ends."""
     return ListedColormap(mpl.colormaps["RdBu_r"](np.linspace(0.1, 0.9, 255)), "errors")
 
 
 def _label(shown: Shown) -> str:
-    """Return a scene's name with spaces, where lines may end."""
+    """Return the name of a scene with spaces, at which it can be wrapped."""
     return shown.name.replace("_", " ")
 
 
 def _captions(shown: Shown, *metrics: str) -> dict[str, tuple[str, bool]]:
-    """Return the scores of each method in the paper's units, and whether the first of them is the best."""
+    """Format the scores of each method in the paper's units, and determine whether the first is the best."""
     first = {label: scores[metrics[0]] for label, scores in shown.scores.items() if metrics[0] in scores}
-    known = [value for value in first.values() if np.isfinite(value)]
-    best = min(known) if len(known) > 1 else None
-    return {label: (_figures(scores, metrics), first.get(label) == best) for label, scores in shown.scores.items()}
+    valid = [value for value in first.values() if np.isfinite(value)]
+    best = min(valid) if len(valid) > 1 else None
+    return {label: (_score_text(scores, metrics), first.get(label) == best) for label, scores in shown.scores.items()}
 
 
-def _figures(scores: dict[str, float], metrics: tuple[str, ...]) -> str:
-    """Return scores for a reader, a dash for what is missing, nothing where all are."""
+def _score_text(scores: dict[str, float], metrics: tuple[str, ...]) -> str:
+    """Format scores with a dash for each missing one; empty if all are missing."""
     texts = []
     for name in metrics:
         shown = KNOWN_FORMATS[name]

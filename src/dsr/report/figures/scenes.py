@@ -1,4 +1,4 @@
-"""What the figures show: the scenes of a problem, with the result of every method that has one."""
+"""Scenes of a benchmark setting with the results of all methods, as shown in figures."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from dsr.sample import DepthSample
 from dsr.viz.panels import Window, normals_seen_by, strongest_window
 
 _DETAIL = 5
-"""A detail's side is this part of the picture's shorter one."""
+"""The side of a detail is 1/5 of the shorter side of the picture."""
 
 
 @dataclass(frozen=True)
@@ -24,10 +24,10 @@ class Shown:
     """A scene and its results.
 
     Args:
-        name: the scene's.
-        scene: what was asked.
-        depths: (1, H, W) in metres by method, None where there is no result.
-        scores: worst of four lights, raw units, by method and metric.
+        name: name of the scene.
+        scene: input and ground truth.
+        depths: (1, H, W) results in metres by method, None without a result.
+        scores: scores by method and metric, worst of four lights, raw units.
 
     """
 
@@ -36,13 +36,13 @@ class Shown:
     depths: dict[str, Tensor | None]
     scores: dict[str, dict[str, float]]
 
-    def known(self) -> list[Tensor]:
-        """Return the results that there are."""
+    def existing(self) -> list[Tensor]:
+        """Return the existing results."""
         return [depth for depth in self.depths.values() if depth is not None]
 
 
 def first_runs(results: Results, problem: BenchmarkSetting) -> dict[str, list[Run]]:
-    """Return the runs of a problem by method; the first is of the lowest seed."""
+    """Return the runs of a benchmark setting by method, sorted by seed."""
     runs: dict[str, list[Run]] = {}
     for run in results.of(problem):
         runs.setdefault(run.label, []).append(run)
@@ -50,17 +50,17 @@ def first_runs(results: Results, problem: BenchmarkSetting) -> dict[str, list[Ru
 
 
 def scene_names(runs: dict[str, list[Run]]) -> list[str]:
-    """Return the scenes that a method or more has a result of, in the order of the runs."""
+    """Return the scenes with a result of at least one method, in the order of the runs."""
     return list(dict.fromkeys(scene for each in runs.values() for run in each for scene in run.scenes))
 
 
 def shown_scenes(results: Results, problem: BenchmarkSetting, notes: list[str]) -> Iterator[Shown]:
-    """Yield the scenes of a problem one by one.
+    """Yield the scenes of a benchmark setting one by one.
 
     Args:
-        results: all.
-        problem: which of them.
-        notes: is extended by a line for each scene or result that is left out.
+        results: all runs.
+        problem: benchmark setting.
+        notes: list to which one line is added per scene or result left out.
 
     """
     runs = first_runs(results, problem)
@@ -78,8 +78,8 @@ def shown_scenes(results: Results, problem: BenchmarkSetting, notes: list[str]) 
 
 
 def _stored(name: str, runs: Sequence[Run], notes: list[str]) -> DepthSample | None:
-    """Return the scene from the first run that keeps it whole."""
-    reason = "no run keeps its photo and input"
+    """Return the scene from the first run that has stored it."""
+    reason = "no run has stored its photo and input"
     for run in runs:
         if run.has_sample(name):
             try:
@@ -91,7 +91,7 @@ def _stored(name: str, runs: Sequence[Run], notes: list[str]) -> DepthSample | N
 
 
 def _prediction(run: Run, name: str, camera: Camera, notes: list[str]) -> Tensor | None:
-    """Return a result that can be drawn."""
+    """Return a result, None if it cannot be drawn."""
     try:
         depth = run.prediction(name)
     except ValueError as error:
@@ -110,13 +110,13 @@ def _note(notes: list[str], line: str) -> None:
 
 
 def _scores(run: Run, name: str) -> dict[str, float]:
-    """Return a scene's scores by metric, worst of four lights where there are lights."""
+    """Return the scores of a scene by metric, worst of four lights for metrics of renderings."""
     rows = run.scores[(run.scores["scene"] == name) & run.scores["variant"].fillna("").isin(HEADLINES)]
     return {str(metric): float(value) for metric, value in zip(rows["metric"], rows["value"], strict=True)}
 
 
 def rendering(depth: Tensor, camera: Camera, light: str) -> np.ndarray:
-    """Return the rendering of a map, (1, H, W), under one light, (H, W) in [0, 1], NaN where unknown.
+    """Render a depth map, (1, H, W), under one light: (H, W) in [0, 1], NaN where undefined.
 
     Raises:
         ValueError: there is no such light.
@@ -131,13 +131,13 @@ def rendering(depth: Tensor, camera: Camera, light: str) -> np.ndarray:
 
 
 def details_of(pictures: Sequence[np.ndarray], truth: np.ndarray | None, grain: int, count: int = 2) -> list[Window]:
-    """Return square windows where results differ most, on average, from the truth, or without one from their mean.
+    """Find square windows in which results differ most, on average, from the ground truth or else from their mean.
 
     Args:
-        pictures: renderings of the results, (H, W), NaN where unknown.
-        truth: likewise.
-        grain: pixels of the result by those of the input; windows lie on whole pixels of the input.
-        count: how many at most; they do not overlap.
+        pictures: renderings of the results, (H, W), NaN where undefined.
+        truth: rendering of the ground truth, (H, W), NaN where undefined; None without one.
+        grain: scale factor; windows are aligned with the pixels of the input.
+        count: maximum number of windows, which do not overlap.
 
     """
     if not pictures:

@@ -1,4 +1,4 @@
-"""``index.html``: one page of a whole evaluation that needs nothing but itself."""
+"""Report page ``index.html``: one self-contained HTML file of an evaluation."""
 
 from __future__ import annotations
 
@@ -28,16 +28,16 @@ from dsr.viz.panels import HOLE_COLOUR
 _COLOUR_MAPS = {"depth": "viridis", "error": "RdBu_r", "angle": "magma"}
 _SCRIPTS = ("dom.js", "pictures.js", "tables.js", "viewer.js", "page.js")
 _SAMPLE = 6
-"""Scenes by which the size of all is estimated."""
+"""Number of scenes from which the total size is estimated."""
 
 
 class _TooLargeError(Exception):
-    """Pictures that do not fit the budget."""
+    """The pictures exceed the budget."""
 
 
 @dataclass(frozen=True)
 class _Stored:
-    """The pictures of all scenes, the scenes' data (None for one without pictures), and what to say."""
+    """Pictures of all scenes, data of the scenes (None for a scene without pictures), and notes."""
 
     pool: Pool
     scenes: list[dict[str, Any] | None]
@@ -55,20 +55,20 @@ def save_page(
 ) -> list[str]:
     """Write a page with the scores, renderings, errors, times and settings of runs, atomically.
 
-    It works from a file, asks no server for anything, and computes the renderings itself from normals in 8 bits: they
-    are those of :func:`dsr.geometry.shading.render` but for their last grey levels.
+    The page works as a local file, without a server. It computes the renderings from 8-bit normals, so they differ from
+    :func:`dsr.geometry.shading.render` by quantization only.
 
     Args:
-        path: an HTML file.
-        results: the runs.
-        tables: files to link to, below the page's folder; None for those in ``tables`` beside the page.
-        title: the page's.
-        budget_mb: megabytes that its pictures may have. They are stored without loss where that fits, else with more
-            and more compression, then smaller; the page says which.
-        progress: called with the numbers of done and of all scenes; starts again if more compression is needed.
+        path: HTML file.
+        results: runs.
+        tables: files to link to, below the folder of the page; None for those in ``tables`` beside the page.
+        title: title of the page.
+        budget_mb: maximum size of the pictures, megabytes. Pictures are stored losslessly if they fit, otherwise with
+            increasing compression, then at lower resolution; the page reports the choice.
+        progress: called with the number of finished scenes and of all; restarts if more compression is needed.
 
     Returns:
-        What could not be shown, and how pictures were stored.
+        Notes on what could not be shown and how the pictures were stored.
 
     Raises:
         ValueError: the budget is not positive.
@@ -94,12 +94,12 @@ def save_page(
     blocks = [_block("data", _json(data))]
     blocks += [_block(f"s{number}", _json(scene)) for number, (_, scene) in enumerate(shown)]
     blocks += [_block(name, content, "text/plain") for name, content in stored.pool.pictures.items()]
-    write_text(path, _filled(title, blocks))
+    write_text(path, _fill_template(title, blocks))
     return notes
 
 
 def _pictures(views: Sequence[View], budget: float, progress: Steps) -> _Stored:
-    """Return the pictures of all scenes at the best level that the budget allows, else at the last."""
+    """Encode the pictures of all scenes at the best level within the budget, otherwise at the last level."""
     for level in LEVELS[:-1]:
         with contextlib.suppress(_TooLargeError):
             return _at_level(views, level, budget, progress)
@@ -107,10 +107,10 @@ def _pictures(views: Sequence[View], budget: float, progress: Steps) -> _Stored:
 
 
 def _at_level(views: Sequence[View], level: Level, budget: float, progress: Steps) -> _Stored:
-    """Return the pictures of all scenes.
+    """Encode the pictures of all scenes.
 
     Raises:
-        _TooLargeError: they are larger than the budget, or a sample says that they will be.
+        _TooLargeError: the size, or its estimate from the first scenes, exceeds the budget.
 
     """
     pool = Pool(level)
@@ -124,19 +124,19 @@ def _at_level(views: Sequence[View], level: Level, budget: float, progress: Step
             raise _TooLargeError
         progress(done, len(views))
     ordered = range(len(views))
-    said = dict.fromkeys(note for number in ordered for note in notes[number])
-    return _Stored(pool, [scenes[number] for number in ordered], list(said))
+    distinct_notes = dict.fromkeys(note for number in ordered for note in notes[number])
+    return _Stored(pool, [scenes[number] for number in ordered], list(distinct_notes))
 
 
 def _spread(count: int) -> Iterator[int]:
-    """Yield the numbers below ``count``, first some that are spread over all."""
+    """Yield the numbers below ``count``, first a sample of evenly spaced ones."""
     first = dict.fromkeys(int(number) for number in np.linspace(0, count - 1, min(count, _SAMPLE)).round())
     yield from first
     yield from (number for number in range(count) if number not in first)
 
 
 def _data(path: Path, results: Results, tables: Sequence[Path] | None, title: str) -> dict[str, Any]:
-    """Return everything but the pictures."""
+    """Return the data of the page without scenes and pictures."""
     problems = results.problems()
     return {
         "title": title,
@@ -154,12 +154,12 @@ def _data(path: Path, results: Results, tables: Sequence[Path] | None, title: st
 
 @functools.cache
 def _colours(name: str) -> str:
-    """Return a colour map's 256 colours, six hexadecimal digits each."""
+    """Return the 256 colours of a colour map, six hexadecimal digits each."""
     return mpl.colormaps[name](np.arange(256), bytes=True)[:, :3].tobytes().hex()
 
 
 def _json(value: Any) -> str:
-    """Return JSON in which no tag can begin or end."""
+    """Serialize as JSON without characters that could begin or end an HTML tag."""
     text = json.dumps(value, ensure_ascii=False, separators=(",", ":"), allow_nan=False)
     return text.replace("&", "\\u0026").replace("<", "\\u003c").replace(">", "\\u003e")
 
@@ -172,8 +172,8 @@ def _asset(name: str) -> str:
     return resources.files("dsr.report").joinpath("assets", name).read_text(encoding="utf-8")
 
 
-def _filled(title: str, blocks: Sequence[str]) -> str:
-    """Return the page."""
+def _fill_template(title: str, blocks: Sequence[str]) -> str:
+    """Fill the page template."""
     parts = {
         "TITLE": html.escape(title),
         "STYLE": _asset("page.css"),

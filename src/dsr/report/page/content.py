@@ -1,4 +1,4 @@
-"""What a report's page says in words and numbers: scores, published values, times, settings, links."""
+"""Texts and numbers of a report page: scores, published values, times, settings, links."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from dsr.metrics.formats import Formats
 from dsr.report.tables import AVERAGES, OTHER_FRAMES, RECREATED, in_shown_units, paper_row
 
 _FOLDERS = {"tables": (".csv", ".md", ".tex"), "metrics": (".csv",), "figures": (".pdf",)}
-"""Folders beside the page whose files it links to."""
+"""Folders beside the page with files to link to, and their suffixes."""
 _BESIDES = " ("
-"""Begins what tells data sets of one name apart: settings that are not the paper's."""
+"""Start of the suffix that distinguishes data sets of one name: settings other than the paper's."""
 
 
 def metrics_data(results: Results) -> list[dict[str, Any]]:
-    """Return the metrics that any run has: heading, unit, digits, and whether higher is better."""
+    """Return the metrics of all runs: heading, unit, digits, and whether higher is better."""
     return [
         {"id": name, "name": each.heading, "unit": each.unit, "digits": each.digits, "higher": each.higher_is_better}
         for name, each in results.formats.items()
@@ -29,7 +29,7 @@ def metrics_data(results: Results) -> list[dict[str, Any]]:
 
 
 def problem_data(results: Results, problem: BenchmarkSetting) -> dict[str, Any]:
-    """Return a problem's scores in the paper's units, by scene and on average, with the published ones beside them."""
+    """Return the scores of a setting in the paper's units, per scene and on average, with the published values."""
     runs = results.of(problem)
     methods = list(dict.fromkeys(run.label for run in runs))
     formats = results.formats
@@ -60,21 +60,21 @@ def problem_data(results: Results, problem: BenchmarkSetting) -> dict[str, Any]:
 
 
 def _by_scene(run: Run, formats: Formats) -> pd.DataFrame:
-    """Return a run's scores, scene x metric, in the units of tables."""
+    """Return the scores of a run, scene x metric, in the units of tables."""
     table = in_shown_units(run.scores, formats)
     table.index = table.index.map(str)
     return table
 
 
 def _over_seeds(series: Sequence[pd.Series]) -> dict[str, list[float]]:
-    """Return by metric the mean over seeds, and where there are several their sample standard deviation."""
+    """Return by metric the mean over seeds and, for several seeds, their sample standard deviation."""
     values: dict[str, list[float]] = {}
     together = pd.DataFrame(list(series)).astype(float)
     for name in together:
-        known = together[name].dropna()
-        if len(known):
-            mean = float(known.mean())
-            values[str(name)] = [mean] if len(known) < 2 else [mean, float(known.std(ddof=1))]
+        valid = together[name].dropna()
+        if len(valid):
+            mean = float(valid.mean())
+            values[str(name)] = [mean] if len(valid) < 2 else [mean, float(valid.std(ddof=1))]
     return {name: numbers for name, numbers in values.items() if all(map(math.isfinite, numbers))}
 
 
@@ -97,13 +97,13 @@ def _mean_row(
 
 
 def _published(problem: BenchmarkSetting, scene: str, method: str, formats: Formats) -> dict[str, float]:
-    """Return the paper's figures by metric; it has some where the downsampling is its own."""
+    """Return the paper's values by metric; empty for a downsampling other than the paper's."""
     row = paper_row(scene, method, problem.scale, problem.downsampling)
     return {} if row is None else {name: float(row[name]) for name in formats if pd.notna(row.get(name))}
 
 
 def _seconds(runs: Iterable[Run], methods: Iterable[str]) -> dict[str, dict[str, float]]:
-    """Return by method and scene the seconds of computing, the mean over seeds."""
+    """Return the computing time in seconds by method and scene, averaged over seeds."""
     found: dict[str, dict[str, list[float]]] = {method: {} for method in methods}
     for run in runs:
         for scene, seconds in run.seconds.items():
@@ -116,7 +116,7 @@ def _seconds(runs: Iterable[Run], methods: Iterable[str]) -> dict[str, dict[str,
 
 
 def run_data(run: Run) -> dict[str, Any]:
-    """Return a run's settings and environment as text by key."""
+    """Return the settings and versions of a run as text by key."""
     return {
         "folder": run.folder.name,
         "label": run.label,
@@ -130,7 +130,7 @@ def run_data(run: Run) -> dict[str, Any]:
 
 
 def flat(values: Mapping[str, Any], above: str = "") -> dict[str, str]:
-    """Return nested values as text by dotted key."""
+    """Flatten nested values to text by dotted key."""
     found: dict[str, str] = {}
     for key, value in values.items():
         name = f"{above}{key}"
@@ -142,7 +142,7 @@ def flat(values: Mapping[str, Any], above: str = "") -> dict[str, str]:
 
 
 def links(folder: Path, tables: Sequence[Path] | None) -> list[dict[str, str]]:
-    """Return the files beside the page that there are: a name, and an address relative to it."""
+    """Return the existing files beside the page: name and relative address."""
     paths = [
         path
         for name, suffixes in _FOLDERS.items()

@@ -1,12 +1,12 @@
-"""Pictures of a report's page: maps as 8-bit pictures, and how much they may be compressed and reduced.
+"""Pictures of a report page: encoding of maps as 8-bit pictures, and levels of compression and reduction.
 
-The page computes renderings, colours and readouts itself, so it gets values and no renderings:
+The page computes renderings, colours and readouts itself from stored values:
 
-- The normals as the unclipped shadings under e1, e2, e3, which are orthonormal: any light follows from them, e4 being
-  (e1 + e2 + e3) / sqrt(3). A value s in [-1, 1] is stored as 255 (s + 1) / 2; the three stand side by side.
-- The depth between two limits, linearly.
-- The error E(q) = sign(q - 128) (q - 128)^2 / 127^2 times the largest: fine steps where it is small.
-- What is known as a mask of its own, for compression with losses leaves no value untouched.
+- Normals are stored as unclipped shadings under the orthonormal lights e1, e2, e3, which determine any other light;
+  e4 = (e1 + e2 + e3) / sqrt(3). A value s in [-1, 1] is stored as 255 (s + 1) / 2; the three maps are side by side.
+- Depth is stored linearly between two limits.
+- The error is sign(q - 128) (q - 128)^2 / 127^2 times the largest error, so that small errors have small steps.
+- The valid mask is a separate lossless picture, since lossy compression changes every value.
 """
 
 from __future__ import annotations
@@ -19,19 +19,19 @@ from dataclasses import dataclass, field
 import cv2
 import numpy as np
 
-NOTHING_KNOWN, DEPTH_KNOWN, ALL_KNOWN = 0, 128, 255
-"""The values of a mask: a hole; depth without a normal; depth and normal."""
+NOTHING_VALID, DEPTH_VALID, ALL_VALID = 0, 128, 255
+"""Values of a mask: missing; valid depth without a normal; valid depth and normal."""
 _LOSSLESS = 101
-"""OpenCV's WebP quality that stands for compression without loss."""
+"""OpenCV's WebP quality for lossless compression."""
 
 
 @dataclass(frozen=True)
 class Level:
-    """How pictures are stored.
+    """Storage of pictures.
 
     Args:
-        quality: of WebP, 1..100; None without loss.
-        longest: pixels of the longer side; larger pictures are reduced.
+        quality: WebP quality, 1..100; None for lossless.
+        longest: maximum longer side, pixels; larger pictures are reduced.
 
     """
 
@@ -39,7 +39,7 @@ class Level:
     longest: int
 
     def text(self, reduced: bool) -> str:
-        """Return what a reader must know of the pictures."""
+        """Describe the compression and reduction for users."""
         parts = [
             "lossless, 8 bits" if self.quality is None else f"compressed with losses (WebP, quality {self.quality})"
         ]
@@ -57,7 +57,7 @@ LEVELS = (
     Level(80, 256),
     Level(75, 192),
 )
-"""From the best down; the last is taken whatever it comes to."""
+"""Levels from best to worst; the last is used regardless of the size."""
 
 
 @dataclass
@@ -65,7 +65,7 @@ class Pool:
     """Pictures by name, each stored once.
 
     Args:
-        level: how they are stored.
+        level: compression and reduction of the pictures.
 
     """
 
@@ -75,7 +75,7 @@ class Pool:
     reduced: bool = False
 
     def add(self, picture: np.ndarray, *, exact: bool = False) -> str:
-        """Encode a picture, (H, W) or (H, W, 3) RGB in 8 bits, and return its name; ``exact``: always without loss."""
+        """Encode an 8-bit picture, (H, W) or (H, W, 3) RGB, and return its name; ``exact`` forces lossless encoding."""
         quality = _LOSSLESS if exact or self.level.quality is None else self.level.quality
         ordered = picture if picture.ndim == 2 else picture[..., ::-1]
         _, content = cv2.imencode(".webp", np.ascontiguousarray(ordered), [cv2.IMWRITE_WEBP_QUALITY, quality])
@@ -85,47 +85,47 @@ class Pool:
             self.size += len(self.pictures[name])
         return name
 
-    def fitted(self, values: np.ndarray, known: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
-        """Return (H, W) or (H, W, C) values at the size of the level, averaged over what is known, and what is."""
-        known = np.isfinite(values).reshape(*values.shape[:2], -1).all(axis=-1) if known is None else known
+    def fit(self, values: np.ndarray, valid: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+        """Resize (H, W) or (H, W, C) values to the level by averaging valid pixels; return them and the valid mask."""
+        valid = np.isfinite(values).reshape(*values.shape[:2], -1).all(axis=-1) if valid is None else valid
         height, width = values.shape[:2]
-        share = min(1.0, self.level.longest / max(height, width))
-        if share == 1:
-            return np.nan_to_num(values), known
+        factor = min(1.0, self.level.longest / max(height, width))
+        if factor == 1:
+            return np.nan_to_num(values), valid
         self.reduced = True
-        size = (max(1, round(width * share)), max(1, round(height * share)))
-        weight = cv2.resize(known.astype(np.float64), size, interpolation=cv2.INTER_AREA)
-        expanded = known if values.ndim == 2 else known[..., None]
+        size = (max(1, round(width * factor)), max(1, round(height * factor)))
+        weight = cv2.resize(valid.astype(np.float64), size, interpolation=cv2.INTER_AREA)
+        expanded = valid if values.ndim == 2 else valid[..., None]
         total = cv2.resize(np.where(expanded, values, 0).astype(np.float64), size, interpolation=cv2.INTER_AREA)
         divisor = np.maximum(weight, 0.5) if values.ndim == 2 else np.maximum(weight, 0.5)[..., None]
         return total / divisor, weight >= 0.5
 
 
 def shading_picture(shadings: np.ndarray) -> np.ndarray:
-    """Return (H, W, 3) shadings in [-1, 1] as an (H, 3 W) picture: e1, e2, e3 side by side."""
+    """Encode (H, W, 3) shadings in [-1, 1] as an (H, 3 W) picture: e1, e2, e3 side by side."""
     levels = np.rint((np.clip(shadings, -1, 1) + 1) * 127.5).astype(np.uint8)
     return np.concatenate(list(np.moveaxis(levels, -1, 0)), axis=1)
 
 
 def depth_picture(depth: np.ndarray, low: float, high: float) -> np.ndarray:
-    """Return (H, W) depth in metres as a picture: 0 at ``low`` and below, 255 at ``high`` and above."""
+    """Encode (H, W) depth in metres as a picture: 0 at ``low`` and below, 255 at ``high`` and above."""
     return np.rint(255 * np.clip((depth - low) / (high - low), 0, 1)).astype(np.uint8)
 
 
 def error_picture(error: np.ndarray, largest: float) -> np.ndarray:
-    """Return (H, W) signed errors as a picture: 128 is none, 1 and 255 are ``largest`` and beyond."""
-    share = np.clip(error / largest, -1, 1)
-    return (128 + np.rint(127 * np.sign(share) * np.sqrt(np.abs(share)))).astype(np.uint8)
+    """Encode (H, W) signed errors as a picture: 128 is zero, 1 and 255 are -``largest`` and ``largest`` or beyond."""
+    relative = np.clip(error / largest, -1, 1)
+    return (128 + np.rint(127 * np.sign(relative) * np.sqrt(np.abs(relative)))).astype(np.uint8)
 
 
-def mask_picture(depth_known: np.ndarray, normal_known: np.ndarray) -> np.ndarray | None:
-    """Return what is known as a picture, None where everything is."""
-    if depth_known.all() and normal_known.all():
+def mask_picture(depth_valid: np.ndarray, normal_valid: np.ndarray) -> np.ndarray | None:
+    """Encode valid masks as a picture, None if all pixels are valid."""
+    if depth_valid.all() and normal_valid.all():
         return None
-    picture = np.where(normal_known & depth_known, ALL_KNOWN, DEPTH_KNOWN)
-    return np.where(depth_known, picture, NOTHING_KNOWN).astype(np.uint8)
+    picture = np.where(normal_valid & depth_valid, ALL_VALID, DEPTH_VALID)
+    return np.where(depth_valid, picture, NOTHING_VALID).astype(np.uint8)
 
 
 def megabytes(size: float) -> str:
-    """Return a size in bytes for a reader."""
+    """Format a size in bytes as megabytes."""
     return f"{size / 1e6:.1f} MB" if size < 1e7 else f"{math.ceil(size / 1e6)} MB"

@@ -1,4 +1,4 @@
-"""What a report's page holds of each scene: photo, input, results and truth as pictures of values."""
+"""Scenes of a report page: photo, input, results and ground truth as pictures of values."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from dsr.sample import DepthSample
 from dsr.viz.panels import limits_of, normals_seen_by
 
 _LEAST_ERROR = 1e-4
-"""Metres; the colours of smaller errors do not go over the whole bar."""
+"""Minimum limit of the error colours, metres."""
 
 
 @dataclass(frozen=True)
 class View:
-    """A scene of a problem, and the runs that answered it, one of each method."""
+    """A scene of a benchmark setting and its runs, one per method."""
 
     problem: BenchmarkSetting
     scene: str
@@ -31,7 +31,7 @@ class View:
 
 @dataclass(frozen=True)
 class _Result:
-    """A method's answer, (1, H, W) in metres."""
+    """The prediction of a method, (1, H, W) in metres."""
 
     label: str
     seed: int | None
@@ -39,7 +39,7 @@ class _Result:
 
 
 def views_of(results: Results) -> list[View]:
-    """Return every scene that has pictures, by problem; of several seeds of a method the lowest counts."""
+    """Return all scenes with predictions, by setting; of several seeds of a method the lowest is used."""
     views: list[View] = []
     for problem in results.problems():
         runs = results.of(problem)
@@ -51,22 +51,22 @@ def views_of(results: Results) -> list[View]:
 
 
 def scene_data(view: View, pool: Pool, notes: list[str]) -> dict[str, Any] | None:
-    """Return what the page needs to show a scene; its pictures go to the pool.
+    """Return the data of a scene for the page, and add its pictures to the pool.
 
     Args:
-        view: the scene and its runs.
-        pool: takes the pictures.
-        notes: takes what could not be shown, and why.
+        view: scene and its runs.
+        pool: pool to which the pictures are added.
+        notes: list to which omissions and their reasons are added.
 
     Returns:
-        Plain values; None where no run keeps the scene.
+        Values that JSON can represent; None if no run has stored the scene.
 
     """
     stored = _stored(view, notes)
     if stored is None:
         return None
-    answers = _results(view, stored, notes)
-    reference = stored.depth if stored.depth is not None else (answers[0].depth if answers else stored.depth_lr)
+    predictions = _results(view, stored, notes)
+    reference = stored.depth if stored.depth is not None else (predictions[0].depth if predictions else stored.depth_lr)
     low, high = limits_of(reference)
     data: dict[str, Any] = {
         "scene": view.scene,
@@ -77,12 +77,12 @@ def scene_data(view: View, pool: Pool, notes: list[str]) -> dict[str, Any] | Non
     }
     largest = None
     if stored.depth is not None:
-        largest, data["error"] = _error_limits([each.depth - stored.depth for each in answers])
-    coarse = f"{stored.camera_lr.width} x {stored.camera_lr.height}"
+        largest, data["error"] = _error_limits([each.depth - stored.depth for each in predictions])
+    size_lr = f"{stored.camera_lr.width} x {stored.camera_lr.height}"
     surfaces = [
-        {"label": "input", "kind": "input", "text": coarse, **_surface(stored.depth_lr, stored.camera_lr, data, pool)}
+        {"label": "input", "kind": "input", "text": size_lr, **_surface(stored.depth_lr, stored.camera_lr, data, pool)}
     ]
-    for each in answers:
+    for each in predictions:
         surface = _surface(each.depth, stored.camera, data, pool)
         if stored.depth is not None and largest is not None:
             surface["error"] = _error(each.depth - stored.depth, largest, pool)
@@ -94,7 +94,7 @@ def scene_data(view: View, pool: Pool, notes: list[str]) -> dict[str, Any] | Non
 
 
 def _stored(view: View, notes: list[str]) -> DepthSample | None:
-    """Return the scene as the first run that has it keeps it."""
+    """Return the scene from the first run that has stored it."""
     for run in view.runs:
         if run.has_sample(view.scene):
             try:
@@ -103,13 +103,13 @@ def _stored(view: View, notes: list[str]) -> DepthSample | None:
                 notes.append(str(error))
     dataset, scale, downsampling = view.problem
     notes.append(
-        f"{dataset} x{scale} {downsampling}, {view.scene}: no pictures, for no run keeps the photo and the input"
+        f"{dataset} x{scale} {downsampling}, {view.scene}: no pictures, because no run has stored photo and input"
     )
     return None
 
 
 def _results(view: View, stored: DepthSample, notes: list[str]) -> list[_Result]:
-    """Return the predictions that fit the scene."""
+    """Return the predictions that have the size of the scene."""
     found = []
     for run in view.runs:
         try:
@@ -127,7 +127,7 @@ def _results(view: View, stored: DepthSample, notes: list[str]) -> list[_Result]
 
 def _photo(rgb: Tensor, pool: Pool) -> str:
     """Store a photo, (3, H, W) in [0, 1]."""
-    values, _ = pool.fitted(rgb.permute(1, 2, 0).double().numpy())
+    values, _ = pool.fit(rgb.permute(1, 2, 0).double().numpy())
     return pool.add(np.rint(255 * np.clip(values, 0, 1)).astype(np.uint8))
 
 
@@ -138,27 +138,27 @@ def _surface(depth: Tensor, camera: Camera, data: dict[str, Any], pool: Pool) ->
         shadings = np.full((*depth.shape[-2:], 3), np.nan)
     else:
         shadings = shade(normals_seen_by(camera, depth), basis)[0].permute(1, 2, 0).numpy()
-    fitted, normal_known = pool.fitted(shadings)
-    metres, depth_known = pool.fitted(depth[0].double().numpy())
+    fitted, normal_valid = pool.fit(shadings)
+    metres, depth_valid = pool.fit(depth[0].double().numpy())
     surface = {
         "size": [fitted.shape[1], fitted.shape[0]],
         "normals": pool.add(shading_picture(fitted)),
         "depth": pool.add(depth_picture(metres, *data["depth"])),
     }
-    mask = mask_picture(depth_known, normal_known)
+    mask = mask_picture(depth_valid, normal_valid)
     return surface if mask is None else {**surface, "mask": pool.add(mask, exact=True)}
 
 
 def _error(difference: Tensor, largest: float, pool: Pool) -> dict[str, str]:
     """Store a signed error, (1, H, W) in metres."""
-    values, known = pool.fitted(difference[0].numpy())
+    values, valid = pool.fit(difference[0].numpy())
     stored = {"values": pool.add(error_picture(values, largest))}
-    mask = mask_picture(known, known)
+    mask = mask_picture(valid, valid)
     return stored if mask is None else {**stored, "mask": pool.add(mask, exact=True)}
 
 
 def _error_limits(differences: Sequence[Tensor]) -> tuple[float, dict[str, float]]:
-    """Return the largest error that is stored, and that and the limit of the colours: the same for all methods.
+    """Return the largest stored error, and the page's error limits; the same for all methods.
 
     The largest is the 99.9th percentile of the worst method, the limit of the colours the 98th of the median method.
     """
