@@ -1,7 +1,7 @@
-"""How metrics agree with each other, and with LPIPS_v, over all results.
+"""Correlation of metrics with each other and with LPIPS_v over all results.
 
-The study of metrics of Voynov et al., *Perceptual Deep Depth Super-Resolution* (ICCV 2019): every result, whatever its
-method, scene and scale, is a point; correlations are Pearson's and Spearman's.
+This is the study of metrics of Voynov et al., *Perceptual Deep Depth Super-Resolution* (ICCV 2019): every result of any
+method, scene and scale is a point; correlations are Pearson's and Spearman's.
 """
 
 from __future__ import annotations
@@ -54,14 +54,14 @@ def metric_matrix(results: Results) -> pd.DataFrame:
 def correlate(matrix: pd.DataFrame, kind: Kind) -> pd.DataFrame:
     """Compute the correlation of every pair of columns over the rows with both values.
 
-    It is NaN where these are fewer than three or where a column is constant in them.
+    A correlation is NaN for fewer than three such rows, or if a column is constant in them.
 
     Args:
-        matrix: of :func:`metric_matrix`.
-        kind: ``pearson``, or ``spearman``: that of the ranks among these rows, equal values sharing theirs.
+        matrix: result of :func:`metric_matrix`.
+        kind: ``pearson``, or ``spearman`` for ranks, where equal values share a rank.
 
     Raises:
-        ValueError: another kind.
+        ValueError: the kind is something else.
 
     """
     if kind not in KINDS:

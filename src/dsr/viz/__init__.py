@@ -1,1 +1,1 @@
-"""Plotting that several parts share: colour maps, panels, contact sheets, comparisons."""
+"""Plotting used by several packages: colour maps, panels, contact sheets, comparisons."""

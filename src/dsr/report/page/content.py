@@ -81,7 +81,7 @@ def _over_seeds(series: Sequence[pd.Series]) -> dict[str, list[float]]:
 def _mean_row(
     problem: BenchmarkSetting, method: str, scenes: list[str], tables: list[pd.DataFrame], formats: Formats
 ) -> dict[str, Any]:
-    """Return a method's averages over the scenes; ``counts``: by metric, over how many, where some are missing."""
+    """Return a method's averages over scenes; ``counts`` has the number of scenes of each incomplete metric."""
     values = _over_seeds([table.mean() for table in tables])
     seen: dict[str, set[str]] = {name: set() for name in values}
     for table in tables:
