@@ -16,7 +16,7 @@ import dsr
 from dsr.geometry.camera import Camera
 from dsr.inference import api as people
 from dsr.inference import plan, upsample_depth
-from dsr.inference.engine import _nearest, enlarged_by
+from dsr.inference.engine import _resize_nearest, enlarged_by
 from dsr.inference.inspection import suited_method
 from dsr.inference.planning import OWN_SIZE
 from dsr.inference.resampling import resize_inverse_depth
@@ -234,7 +234,7 @@ def test_every_method_upsamples_any_size_and_its_holes(method: str) -> None:
     )  # fmt: skip
     assert full.shape == (1, 31, 42)
     assert bool(full.isfinite().all())
-    assert int(kept.isnan().sum()) == int(_nearest(depth.isnan(), (31, 42)).sum())
+    assert int(kept.isnan().sum()) == int(_resize_nearest(depth.isnan(), (31, 42)).sum())
     assert all(done == total for done, total in steps[-1:])
     if not quick:
         assert float((full / _plane(31, 42, camera) - 1).abs().max()) < 0.1

@@ -1,4 +1,4 @@
-"""Finer depth for anybody's photo and depth map: any size, any ratio of the sizes, holes, bounded memory."""
+"""Upsample the depth map of a photo: any size, any ratio of the sizes, maps with holes, bounded memory."""
 
 from dsr.inference.api import upsample
 from dsr.inference.engine import MethodChoice, check_settings, upsample_depth

@@ -1,4 +1,4 @@
-"""``dsr.upsample``: the same for NumPy arrays and for tensors."""
+"""``dsr.upsample``: depth super-resolution for NumPy arrays and tensors."""
 
 from __future__ import annotations
 
@@ -29,25 +29,26 @@ def upsample(
     progress: Steps | None = None,
     **settings: Any,
 ) -> Array:
-    """Return depth as fine as the photo.
+    """Upsample a depth map to the photo's resolution.
 
     The depth map has to be registered to the photo: the same view and the same field of view, at any size up to the
     photo's, with holes or without. Weights come with the package.
 
     Args:
-        rgb: the photo: a NumPy array (H, W, 3), 0..255 as uint8 or 0..1 as floats; or a tensor (3, H, W), the same.
+        rgb: the photo: a NumPy array (H, W, 3), 0..255 as uint8 or 0..1 as floats; or a tensor
+            (3, H, W) with the same values.
         depth: distance to the image plane in metres, as floats, NaN in holes: (h, w), a tensor may be (1, h, w).
-        camera: of the photo, ``dsr.Camera(width, height, fx, fy, cx, cy)``, all in the photo's pixels.
-        scale: how much finer the result is, 4 or 8 for networks; None for what suits the sizes. Where the depth map has
-            the photo's size already it is first averaged over so many pixels, 4 for None.
-        method: ``auto`` for ``msg_v_noisy`` where the depth is noisy, else ``facets``; or any other of the methods that
-            ``conf/method`` names, such as ``msg_v``, ``tgv``, ``guided_filter``, ``bicubic``, and ``dip_v``, which
+        camera: the photo's, ``dsr.Camera(width, height, fx, fy, cx, cy)``, all values in the photo's pixels.
+        scale: the upsampling factor, 4 or 8 for networks; None to choose it by the sizes. A depth map that already has
+            the photo's size is first averaged over blocks of scale x scale pixels, 4 x 4 for None.
+        method: ``auto`` for ``msg_v_noisy`` if the depth is noisy, else ``facets``; or any other method in
+            ``conf/method``, such as ``msg_v``, ``tgv``, ``guided_filter``, ``bicubic``, and ``dip_v``, which
             takes minutes.
-        mask: where the depth is known, of the depth's shape; for maps that mark holes by a mask.
-        device: ``auto`` for a GPU where there is one, else ``cpu``, ``cuda`` or ``cuda:1``.
-        keep_holes: whether holes stay NaN; otherwise they are filled.
+        mask: valid mask of the depth's shape, for maps whose holes are not NaN.
+        device: ``auto`` for a GPU if there is one; or ``cpu``, ``cuda``, ``cuda:1``.
+        keep_holes: whether holes stay NaN; otherwise they are inpainted.
         progress: a function that is called with the number of parts done and their total.
-        **settings: arguments of the method, by the names in its file in ``conf/method``, such as ``data_weight=30``.
+        **settings: the method's arguments, by their names in its file in ``conf/method``, such as ``data_weight=30``.
 
     Returns:
         Depth in metres, float32: (H, W) for an array, (1, H, W) for a tensor.
@@ -56,20 +57,20 @@ def upsample(
         ValueError: a shape, value, method, setting or scale is not as above, or the method has no solution.
 
     Example:
-        A sphere before a wall, as a coarse sensor sees it:
+        A disc in front of a wall, as a low-resolution sensor sees it:
 
         >>> import numpy as np
         >>> import dsr
         >>> rows, columns = np.mgrid[0:64, 0:96]
         >>> inside = (rows - 32) ** 2 + (columns - 48) ** 2 < 20**2
         >>> photo = np.where(inside[..., None], [200, 120, 80], [60, 70, 90]).astype(np.uint8)
-        >>> coarse = np.where(inside, 1.0, 2.0).reshape(16, 4, 24, 4).mean(axis=(1, 3))
-        >>> coarse[3, 5] = np.nan  # a hole
+        >>> depth_lr = np.where(inside, 1.0, 2.0).reshape(16, 4, 24, 4).mean(axis=(1, 3))
+        >>> depth_lr[3, 5] = np.nan  # a hole
         >>> camera = dsr.Camera(width=96, height=64, fx=80.0, fy=80.0, cx=47.5, cy=31.5)
-        >>> fine = dsr.upsample(photo, coarse, camera, scale=4)
-        >>> fine.shape, bool(np.isfinite(fine).all())
+        >>> depth_hr = dsr.upsample(photo, depth_lr, camera, scale=4)
+        >>> depth_hr.shape, bool(np.isfinite(depth_hr).all())
         ((64, 96), True)
-        >>> float(fine[32, 48].round(1)), float(fine[2, 2].round(1))
+        >>> float(depth_hr[32, 48].round(1)), float(depth_hr[2, 2].round(1))
         (1.0, 2.0)
 
     """
@@ -78,19 +79,19 @@ def upsample(
         raise ValueError(
             f"rgb, depth: expected two NumPy arrays or two tensors, got {type(rgb).__name__} and {type(depth).__name__}"
         )
-    photo, coarse = _photo(rgb), torch.as_tensor(depth)
-    if coarse.dim() == 2:
-        coarse = coarse[None]
+    photo, depth_lr = _photo(rgb), torch.as_tensor(depth)
+    if depth_lr.dim() == 2:
+        depth_lr = depth_lr[None]
     if mask is not None:
-        known = torch.as_tensor(mask).bool()
-        if known.shape[-2:] != coarse.shape[-2:]:
+        valid = torch.as_tensor(mask).bool()
+        if valid.shape[-2:] != depth_lr.shape[-2:]:
             raise ValueError(
-                f"mask: expected the depth's shape {tuple(coarse.shape[-2:])}, got {tuple(known.shape[-2:])}"
+                f"mask: expected the depth's shape {tuple(depth_lr.shape[-2:])}, got {tuple(valid.shape[-2:])}"
             )
-        coarse = coarse.masked_fill(~known, torch.nan) if coarse.is_floating_point() else coarse
-    fine = upsample_depth(
+        depth_lr = depth_lr.masked_fill(~valid, torch.nan) if depth_lr.is_floating_point() else depth_lr
+    depth_hr = upsample_depth(
         photo,
-        coarse,
+        depth_lr,
         camera,
         scale,
         method=method,
@@ -99,11 +100,11 @@ def upsample(
         keep_holes=keep_holes,
         progress=progress,
     )
-    return cast("Array", fine[0].cpu().numpy() if arrays else fine)
+    return cast("Array", depth_hr[0].cpu().numpy() if arrays else depth_hr)
 
 
 def _photo(rgb: np.ndarray | Tensor) -> Tensor:
-    """Return a photo as (3, H, W) float32 in [0, 1]; what is no photo is left to be refused."""
+    """Return a photo as (3, H, W) float32 in [0, 1]; an invalid one is left for :func:`upsample_depth` to reject."""
     photo = torch.as_tensor(rgb)
     if isinstance(rgb, np.ndarray):
         if rgb.ndim != 3 or rgb.shape[-1] != 3:

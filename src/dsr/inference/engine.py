@@ -29,7 +29,7 @@ from dsr.utils.devices import pick_device
 from dsr.utils.progress import Steps, part_of
 
 _DECIDED = MappingProxyType({"fill_holes": True, "validate_every": 0})
-"""Arguments of methods that are decided here: holes are put back afterwards, and there is no truth to compare with."""
+"""Arguments of methods that are set here: holes are restored afterwards, and validation has no ground truth."""
 
 
 @dataclass(frozen=True)
@@ -50,10 +50,10 @@ class MethodChoice:
     device: torch.device = field(default=torch.device("cpu"))
 
     def build(self, scale: int) -> Upsampler:
-        """Return the method for a factor.
+        """Build the method for a factor.
 
         Raises:
-            ValueError: there is no such method or setting, or it refuses a value.
+            ValueError: there is no such method or setting, or the method rejects a value.
 
         """
         node = read_method(self.name, scale, self.settings, self.directories)
@@ -70,15 +70,15 @@ class MethodChoice:
             raise ValueError(str(error).removeprefix("method.")) from error
 
     def plan(self, size: tuple[int, int], size_lr: tuple[int, int], scale: int | None) -> Plan:
-        """Return what is done with a photo and a depth map of these heights and widths."""
+        """Return the plan for a photo and a depth map of these heights and widths."""
         return plan(size, size_lr, scale, self.name, self.directories)
 
 
 def check_settings(choice: MethodChoice) -> None:
-    """Check that a method takes the settings.
+    """Check that a method accepts the settings.
 
     Raises:
-        ValueError: a setting is unknown, of another type, or the method refuses it; the message begins with its
+        ValueError: a setting is unknown, of another type, or the method rejects it; the message begins with its
             name and a colon.
 
     """
@@ -99,26 +99,27 @@ def upsample_depth(
     keep_holes: bool = False,
     progress: Steps | None = None,
 ) -> Tensor:
-    """Return depth of the photo's size.
+    """Upsample a depth map to the photo's size.
 
-    The depth map is registered to the photo: the same view and field of view, outer edge on outer edge. Where it is
-    coarse, see :mod:`dsr.inference.planning` for what is done. Where it has the photo's size it is made coarser by
-    ``scale`` first, its known pixels' inverse depth averaged; where it was enlarged by repeating pixels, these are
-    dropped instead. Averages across a depth step do no harm: the networks were trained on them. (With a tenth of the
-    map unknown, their RMSE_v on Lucy is 0.127, against 0.142 and more of means, medians and planes of one surface.)
+    The depth map is registered to the photo: the same view and field of view, outer edge on outer edge. A
+    low-resolution map is upsampled as :mod:`dsr.inference.planning` describes. A map of the photo's size is first
+    downsampled by ``scale``, by averaging the inverse depth of its valid pixels; if it was enlarged by repeating
+    pixels, the repeated ones are dropped instead. The averages may cross depth steps, as in the networks' training.
+    (With a tenth of the map missing, RMSE_v on Lucy is 0.127, against 0.142 or more with means, medians or planes of
+    one surface.)
 
     Args:
         rgb: (3, H, W) floating point, in [0, 1].
         depth: (1, h, w) orthogonal depth in metres, NaN in holes.
-        camera: the photo's; interpolation alone depends on it, and priors.
+        camera: the photo's; only interpolation and deep image priors depend on it.
         scale: see :func:`dsr.inference.plan`.
         method: the name of one in :mod:`dsr.methods.registry`, or ``auto``, see
             :func:`dsr.inference.inspection.suited_method`.
         settings: arguments of the method that differ from its file, by name.
         directories: the user's configuration directories.
-        device: ``auto`` for a GPU where there is one, else as torch names it.
-        keep_holes: whether pixels whose own depth, or nearest low-resolution pixel, is unknown stay NaN; else they are
-            filled.
+        device: ``auto`` for a GPU if there is one, or a device as torch names it.
+        keep_holes: whether pixels whose own depth, or whose nearest low-resolution pixel, is missing stay NaN;
+            otherwise they are inpainted.
         progress: is called with the number of parts done and their total.
 
     Returns:
@@ -132,31 +133,33 @@ def upsample_depth(
     size = (camera.height, camera.width)
     method = suited_method(depth, camera, scale) if method == AUTO else method
     choice = MethodChoice(method, settings or {}, tuple(directories), pick_device(device))
-    choice.plan(size, _size(depth), scale)  # refuses what can't be
+    choice.plan(size, _size(depth), scale)  # raises ValueError for sizes or a scale that cannot be used
     inverse = depth.float().reciprocal()
-    known = inverse.isfinite()
+    valid = inverse.isfinite()
     if size[0] <= OWN_SIZE * inverse.shape[-2] and size[1] <= OWN_SIZE * inverse.shape[-1]:
-        inverse = _nearest(inverse, size)
+        inverse = _resize_nearest(inverse, size)
         block = enlarged_by(inverse)
         if block > 1 and not any(n % block for n in size):
             inverse = inverse[:, ::block, ::block]
-            fine = _answer(rgb, inverse, camera, None, choice, progress)
+            inverse_hr = _upsample_inverse(rgb, inverse, camera, None, choice, progress)
         else:
             factor = choice.plan(size, size, scale).scale
-            wide = _padded_photo(rgb, factor)
-            coarse = Downsampling("box")(_padded_inverse(inverse, factor), factor)
-            around = Camera(wide.shape[-1], wide.shape[-2], camera.fx, camera.fy, camera.cx, camera.cy)
-            fine = _answer(wide, coarse, around, factor, choice, progress)[:, : size[0], : size[1]]
+            padded = _pad_photo(rgb, factor)
+            inverse_lr = Downsampling("box")(_pad_inverse(inverse, factor), factor)
+            camera_padded = Camera(padded.shape[-1], padded.shape[-2], camera.fx, camera.fy, camera.cx, camera.cy)
+            inverse_hr = _upsample_inverse(padded, inverse_lr, camera_padded, factor, choice, progress)
+            inverse_hr = inverse_hr[:, : size[0], : size[1]]
     else:
-        fine = _answer(rgb, inverse, camera, scale, choice, progress)
+        inverse_hr = _upsample_inverse(rgb, inverse, camera, scale, choice, progress)
     lowest = inverse.nan_to_num(nan=torch.inf).amin()
-    result = torch.where(fine > 0, fine, lowest.to(fine.device)).reciprocal_()  # nothing lies beyond infinity
-    if keep_holes and not bool(known.all()):
-        result = result.masked_fill(~_nearest(known, size).to(result.device), torch.nan)
+    inverse_hr = torch.where(inverse_hr > 0, inverse_hr, lowest.to(inverse_hr.device))  # 0 is infinitely far
+    result = inverse_hr.reciprocal_()
+    if keep_holes and not bool(valid.all()):
+        result = result.masked_fill(~_resize_nearest(valid, size).to(result.device), torch.nan)
     return result.to(depth.device)
 
 
-def _answer(
+def _upsample_inverse(
     rgb: Tensor, inverse: Tensor, camera: Camera, scale: int | None, choice: MethodChoice, progress: Steps | None
 ) -> Tensor:
     """Return high-resolution inverse depth, (1, H, W), of low-resolution inverse depth, (1, h, w)."""
@@ -169,11 +172,11 @@ def _answer(
         return method.interpolate(inverse.reciprocal(), camera_lr, camera).reciprocal()
     networks = [method for method in methods if isinstance(method, NetworkUpsampler)]
     if networks:
-        return _answer_by_networks(rgb, inverse, size, networks, choice.device, progress)
-    return _answer_by_sample(rgb, inverse, camera, planned.steps[0], method, progress)
+        return _run_networks(rgb, inverse, size, networks, choice.device, progress)
+    return _run_method(rgb, inverse, camera, planned.steps[0], method, progress)
 
 
-def _answer_by_networks(
+def _run_networks(
     rgb: Tensor,
     inverse: Tensor,
     size: tuple[int, int],
@@ -181,7 +184,7 @@ def _answer_by_networks(
     device: torch.device,
     progress: Steps | None,
 ) -> Tensor:
-    """Return the high-resolution inverse depth of networks, each of which works on what the one before it found."""
+    """Return the high-resolution inverse depth of networks applied in turn, each to the result of the one before."""
     steps = [each.net.scale for each in networks]
     sizes = [_size(inverse)]  # of the low-resolution map of each step
     sizes += [(-(-size[0] // step), -(-size[1] // step)) for step in steps[1:]]
@@ -195,7 +198,7 @@ def _answer_by_networks(
     return resize_inverse_depth(inverse, size)
 
 
-def _answer_by_sample(
+def _run_method(
     rgb: Tensor, inverse: Tensor, camera: Camera, scale: int, method: Upsampler, progress: Steps | None
 ) -> Tensor:
     """Return the high-resolution inverse depth of a method, its missing pixels inpainted."""
@@ -204,19 +207,19 @@ def _answer_by_sample(
     guide = resize_rgb(rgb, (camera_hr.height, camera_hr.width))
     camera_lr = camera.rescale(width, height)
     sample = DepthSample("upsample", "depth", guide, inverse.reciprocal(), camera_hr, camera_lr, scale)
-    answer = inpaint(method(sample, progress).reciprocal()[None])[0]
-    return resize_inverse_depth(answer, (camera.height, camera.width))
+    result = inpaint(method(sample, progress).reciprocal()[None])[0]
+    return resize_inverse_depth(result, (camera.height, camera.width))
 
 
 def resize_rgb(rgb: Tensor, size: tuple[int, int]) -> Tensor:
-    """Return a photo, (3, H, W), at another size, antialiased."""
+    """Resize a photo, (3, H, W), with antialiasing."""
     if _size(rgb) == size:
         return rgb
     return functional.interpolate(rgb[None], size, mode="bicubic", antialias=True)[0].clamp_(0, 1)
 
 
-def _nearest(values: Tensor, size: tuple[int, int]) -> Tensor:
-    """Return (1, h, w) at another size, each pixel that of the old one it lies in."""
+def _resize_nearest(values: Tensor, size: tuple[int, int]) -> Tensor:
+    """Resize (1, h, w) to another size by nearest neighbour."""
     if _size(values) == size:
         return values
     rows, columns = (
@@ -226,21 +229,21 @@ def _nearest(values: Tensor, size: tuple[int, int]) -> Tensor:
     return values[:, rows][:, :, columns]
 
 
-def _padded_photo(rgb: Tensor, factor: int) -> Tensor:
-    """Return a photo with pixels repeated at the right and the bottom up to a multiple of the factor."""
+def _pad_photo(rgb: Tensor, factor: int) -> Tensor:
+    """Pad a photo at the right and the bottom to a multiple of the factor, by repeating its border pixels."""
     padding = [-n % factor for n in (rgb.shape[-1], rgb.shape[-2])]
     return functional.pad(rgb[None], (0, padding[0], 0, padding[1]), mode="replicate")[0] if any(padding) else rgb
 
 
-def _padded_inverse(inverse: Tensor, factor: int) -> Tensor:
-    """Return inverse depth, (1, H, W), that goes on linearly, so that a slanted plane's averages stay on it."""
+def _pad_inverse(inverse: Tensor, factor: int) -> Tensor:
+    """Pad inverse depth, (1, H, W), by linear extrapolation, so that averages of a slanted plane stay on the plane."""
     for dim in (-2, -1):
         more, size = -inverse.shape[dim] % factor, inverse.shape[dim]
         if not more:
             continue
         last = inverse.narrow(dim, size - 1, 1)
         slope = (last - inverse.narrow(dim, max(size - 1 - factor, 0), 1)) / min(factor, max(size - 1, 1))
-        slope = torch.where(slope.abs() * factor <= 0.1 * last, slope, 0)  # no plane but a step, or unknown
+        slope = torch.where(slope.abs() * factor <= 0.1 * last, slope, 0)  # a depth step or a hole, not a plane
         steps = torch.arange(1, more + 1, dtype=inverse.dtype, device=inverse.device)
         further = last + slope * (steps[:, None] if dim == -2 else steps)
         inverse = torch.cat((inverse, further), dim)
@@ -253,7 +256,7 @@ def _size(values: Tensor) -> tuple[int, int]:
 
 
 def _check(rgb: Tensor, depth: Tensor, camera: Camera) -> None:
-    """Raise a ValueError for what is no photo, depth map or camera of the photo."""
+    """Raise ValueError unless the photo, the depth map and the camera are valid and fit together."""
     size = (camera.height, camera.width)
     if tuple(rgb.shape) != (3, *size):
         raise ValueError(f"rgb: expected shape (3, {size[0]}, {size[1]}), the camera's, got {tuple(rgb.shape)}")

@@ -1,4 +1,4 @@
-"""What a depth map is like: enlarged by somebody before, noisy; and which method suits it."""
+"""Inspect a depth map: whether it was enlarged before, whether it is noisy, and which method suits it."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from dsr.methods.dip.noise import estimate_noise, normal_noise_deg
 
 CLEAN, NOISY = "facets", "msg_v_noisy"
 LARGEST_TILT = 8.0
-"""Degrees: a depth map whose noise tilts its normals by more is noisy."""
+"""Degrees; a depth map is noisy if its noise tilts the normals by more."""
 _LARGEST_BLOCK = 16
 _SCALES_OF_NOISY = (None, 4, 16)
 _LARGEST_RATIO = 4.2
@@ -21,8 +21,8 @@ _LARGEST_RATIO = 4.2
 def suited_method(depth: Tensor, camera: Camera, scale: int | None = None) -> str:
     """Return the network for a depth map: one that was trained on noisy depth where the map is noisy.
 
-    With noise that tilts the low-resolution map's normals (:func:`dsr.methods.dip.noise.normal_noise_deg`) by so many
-    degrees RMSE_v on Lucy and Plant at x4 is
+    RMSE_v on Lucy and Plant at x4, by how many degrees the noise tilts the low-resolution map's normals
+    (:func:`dsr.methods.dip.noise.normal_noise_deg`):
 
     | tilt | 2, 2 | 7, 5 | 12, 9 | 22, 17 | 37, 30 |
     | --- | --- | --- | --- | --- | --- |
@@ -31,20 +31,20 @@ def suited_method(depth: Tensor, camera: Camera, scale: int | None = None) -> st
 
     Args:
         depth: (1, h, w) orthogonal depth in metres, NaN in holes.
-        camera: of the photo.
-        scale: the factor that is wanted; the noisy network has x4, once or twice.
+        camera: the photo's.
+        scale: the requested factor; the noisy network upsamples by 4, once or twice.
 
     """
-    coarse = _coarse(depth, camera, scale)
-    ratio = max(camera.height / coarse.shape[-2], camera.width / coarse.shape[-1])
+    depth_lr = _low_resolution(depth, camera, scale)
+    ratio = max(camera.height / depth_lr.shape[-2], camera.width / depth_lr.shape[-1])
     if scale not in _SCALES_OF_NOISY or ratio > _LARGEST_RATIO:
         return CLEAN
-    tilt = normal_noise_deg(estimate_noise(coarse[None]), camera.rescale(coarse.shape[-1], coarse.shape[-2]))
+    tilt = normal_noise_deg(estimate_noise(depth_lr[None]), camera.rescale(depth_lr.shape[-1], depth_lr.shape[-2]))
     return NOISY if tilt > LARGEST_TILT else CLEAN
 
 
-def _coarse(depth: Tensor, camera: Camera, scale: int | None) -> Tensor:
-    """Return the low-resolution map that a network will be given, about."""
+def _low_resolution(depth: Tensor, camera: Camera, scale: int | None) -> Tensor:
+    """Return approximately the low-resolution map that a network will be given."""
     height, width = depth.shape[-2:]
     if camera.height > OWN_SIZE * height or camera.width > OWN_SIZE * width:
         return depth
@@ -60,14 +60,15 @@ def _coarse(depth: Tensor, camera: Camera, scale: int | None) -> Tensor:
 
 def enlarged_by(values: Tensor) -> int:
     """Return the factor by which a map, (..., H, W), was enlarged by repeating pixels; 1 for none."""
-    known = values.nan_to_num(nan=-1.0)
-    if bool((known == known.flatten()[0]).all()):
+    filled = values.nan_to_num(nan=-1.0)
+    if bool((filled == filled.flatten()[0]).all()):
         return 1
     for block in range(_LARGEST_BLOCK, 1, -1):
-        one = known[..., ::block, ::block]
+        one = filled[..., ::block, ::block]
         if all(
             torch.equal(
-                known[..., i::block, j::block], one[..., : _count(known, -2, i, block), : _count(known, -1, j, block)]
+                filled[..., i::block, j::block],
+                one[..., : _count(filled, -2, i, block), : _count(filled, -1, j, block)],
             )
             for i in range(block)
             for j in range(block)

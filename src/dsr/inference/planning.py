@@ -1,10 +1,10 @@
-"""What is going to be done with a photo and a depth map of given sizes, and what it costs.
+"""Plan how a depth map is upsampled to a photo's size, and estimate the memory and time that it takes.
 
-Networks are trained for fixed factors. A low-resolution depth map stays as it is: the photo is resized to a multiple of
-its size, the network answers at that size, and the answer is resized to the photo (:mod:`dsr.inference.resampling`).
-RMSE_v and RMSE_d in mm of Facets on Lucy and Plant, box averages at the ratio given, means of both scenes:
+Networks are trained for fixed factors. A low-resolution depth map is not resized: the photo is resized to a multiple
+of its size, and the network's result is resized to the photo's size (:mod:`dsr.inference.resampling`).
+RMSE_v and RMSE_d in mm of Facets on Lucy and Plant, box averages at the given ratio, means of both scenes:
 
-| ratio | so, x4 | so, x8 | depth resized instead, x4 | x8 | cubic spline |
+| ratio | photo resized, x4 | x8 | depth resized instead, x4 | x8 | cubic spline |
 | --- | --- | --- | --- | --- | --- |
 | 2 | 0.103, 20 | | 0.155, 80 | 0.185, 79 | 0.218, 35 |
 | 3 | 0.119, 25 | | | | 0.245, 45 |
@@ -12,8 +12,9 @@ RMSE_v and RMSE_d in mm of Facets on Lucy and Plant, box averages at the ratio g
 | 6 | 0.162, 51 | 0.151, 33 | 0.251, 93 | 0.191, 75 | 0.294, 69 |
 | 7.5 | | 0.163, 37 | | | 0.305, 71 |
 
-So the factor is the smallest that reaches the photo. Beyond x8 there are two steps, x8 and then x4 on the answer,
-averaged to a quarter of the photo: at ratio 16 RMSE_v is 0.215, against 0.222 of x8 and an answer enlarged twice.
+The factor is therefore the smallest that reaches the photo's size. Larger ratios than 8 take two steps, x8 and then x4
+on the result averaged to a quarter of the photo's size: at ratio 16 RMSE_v is 0.215, against 0.222 for x8 with the
+result enlarged by 2.
 """
 
 from __future__ import annotations
@@ -34,14 +35,14 @@ from dsr.utils.builder import load_target, takes, trait
 
 AUTO = "auto"
 LARGEST_OPTIMISED = 2**20
-"""Pixels; the optimisation of a network for a larger picture takes hours."""
+"""Pixels; optimising a network for a larger picture takes hours."""
 OWN_SIZE = 1.25
-"""A depth map whose sides differ from the photo's by no more than this factor counts as one of the photo's size."""
+"""A depth map whose sides differ from the photo's by no more than this factor is treated as having the photo's size."""
 USUAL_SCALE = 4
 _ASPECT = 0.02
 _SLACK = 1.05
 _UNKNOWN_COST = Cost(1000, 0)
-"""Of a method that states none."""
+"""The cost of a method that states none."""
 
 
 @dataclass(frozen=True)
@@ -49,11 +50,11 @@ class Ability:
     """What a method can do.
 
     Args:
-        kind: ``interpolation`` gives any size; a ``network`` has factors and may follow itself; any other method
-            answers a ``sample``.
-        steps: for each factor, those of the calls that lead to it; empty for any factor in one call.
+        kind: ``interpolation`` gives any size; a ``network`` has fixed factors and may be applied twice; any other
+            method takes a ``sample``.
+        steps: for each factor, the factors of the calls that give it; empty for any factor in one call.
         optimises: whether it optimises a network for each picture.
-        cost: rough, where the method states it.
+        cost: the method's rough cost; None if it states none.
 
     """
 
@@ -65,14 +66,14 @@ class Ability:
 
 @dataclass(frozen=True)
 class Plan:
-    """What is going to be done.
+    """How a depth map is upsampled.
 
     Args:
         method: the method.
-        scale: by how much finer depth becomes, about.
+        scale: the approximate upsampling factor.
         steps: the networks' factors, one after the other; empty for interpolation.
-        coarsened: by how much depth of the photo's own size is made coarser first; 1 for low-resolution depth.
-        text: this, and the memory that it takes, in one line.
+        coarsened: the factor by which depth of the photo's own size is downsampled first; 1 for low-resolution depth.
+        text: the plan and the memory that it takes, in one line.
 
     """
 
@@ -84,7 +85,7 @@ class Plan:
 
 
 def read_ability(method: str, directories: Sequence[Path] = ()) -> Ability:
-    """Return what a method of the registry can do.
+    """Read what a method of the registry can do.
 
     Args:
         method: its name.
@@ -124,20 +125,20 @@ def plan(
     method: str = "facets",
     directories: Sequence[Path] = (),
 ) -> Plan:
-    """Return what :func:`dsr.inference.upsample_depth` does.
+    """Plan what :func:`dsr.inference.upsample_depth` does.
 
-    A depth map of the photo's size that turns out to be enlarged by repeating pixels is taken for the low-resolution
-    map that it was, whatever the plan says.
+    This plan does not apply to a depth map of the photo's size that was enlarged by repeating pixels: it is upsampled
+    from the low-resolution map that it was before.
 
     Args:
         photo_size: height and width.
         depth_size: height and width.
-        scale: the factor; None for one that suits the sizes, 4 where they are equal.
-        method: the name of one in the registry.
+        scale: the factor; None to choose it by the sizes, 4 if they are equal.
+        method: its name in the registry.
         directories: the user's configuration directories.
 
     Raises:
-        ValueError: no such method, a scale that it has no weights for, or sizes that do not go together.
+        ValueError: no such method, a scale that it has no weights for, or sizes that do not fit together.
 
     """
     ability = read_ability(method, directories)
@@ -180,23 +181,25 @@ def _ratio(photo_size: tuple[int, int], depth_size: tuple[int, int]) -> float:
     return ratio
 
 
-def _scale(wanted: int | None, ratio: float, method: str, ability: Ability) -> int:
-    """Return the factor that is wanted, else the smallest that is enough."""
-    there = ability.steps
-    if not there:
-        if wanted is not None and wanted < 1:
-            raise ValueError(f"scale: expected a positive whole number, got {wanted}")
-        return wanted or math.ceil(ratio - 1e-9)
-    if wanted is not None and wanted not in there:
-        raise ValueError(f"scale: expected one of {', '.join(map(str, sorted(there)))} for {method}, got {wanted}")
-    enough = [scale for scale in sorted(there) if ratio <= _SLACK * scale]
-    if wanted is None and not enough:
-        raise ValueError(f"depth: expected at least 1/{max(there)} of the photo's size for {method}, got 1/{ratio:.3g}")
-    return wanted or enough[0]
+def _scale(requested: int | None, ratio: float, method: str, ability: Ability) -> int:
+    """Return the requested factor, or the smallest that reaches the photo's size."""
+    factors = ability.steps
+    if not factors:
+        if requested is not None and requested < 1:
+            raise ValueError(f"scale: expected a positive whole number, got {requested}")
+        return requested or math.ceil(ratio - 1e-9)
+    if requested is not None and requested not in factors:
+        raise ValueError(f"scale: expected one of {', '.join(map(str, sorted(factors)))} for {method}, got {requested}")
+    enough = [scale for scale in sorted(factors) if ratio <= _SLACK * scale]
+    if requested is None and not enough:
+        raise ValueError(
+            f"depth: expected at least 1/{max(factors)} of the photo's size for {method}, got 1/{ratio:.3g}"
+        )
+    return requested or enough[0]
 
 
 def _worked_on(photo_size: tuple[int, int], depth_size: tuple[int, int], steps: tuple[int, ...], coarsened: int) -> int:
-    """Return the pixels of the largest picture that a network answers."""
+    """Return the number of pixels of the largest picture that a network computes."""
     if not steps or coarsened > 1:
         return math.prod(photo_size)
     first = math.prod(depth_size) * steps[0] ** 2
@@ -204,7 +207,7 @@ def _worked_on(photo_size: tuple[int, int], depth_size: tuple[int, int], steps: 
 
 
 def _memory(pixels: int, worked_on: int, ability: Ability) -> float:
-    """Return bytes, roughly, with the 0.4 GB of the program itself, 0.6 GB where it trains."""
+    """Estimate the memory in bytes, including the program's own 0.4 GB, or 0.6 GB if it trains."""
     if ability.kind == "interpolation":
         return 4e8 + 100 * pixels
     if ability.kind == "sample":

@@ -1,1 +1,1 @@
-"""Metrics of depth maps and of their renderings, and the losses that share their kernels."""
+"""Metrics of depth maps and of their renderings, and the losses that use the same kernels."""

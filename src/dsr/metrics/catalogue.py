@@ -1,4 +1,4 @@
-"""The catalogue of metrics, and all of them at once for a pair of depth maps."""
+"""The catalogue of metrics, and the scores of all of them for a pair of depth maps."""
 
 from __future__ import annotations
 
@@ -181,7 +181,7 @@ def catalogue(network: LPIPS | None = None, extra: Sequence[Metric] = ()) -> tup
 
 
 def _with_network(metrics: Iterable[Metric], network: LPIPS | None) -> Iterator[Metric]:
-    """Yield the metrics with the network as an argument where they need one; without one leave these out."""
+    """Yield the metrics with the network as an argument where they need one; leave these out if there is none."""
     for metric in metrics:
         if not metric.perceptual:
             yield metric
@@ -203,12 +203,12 @@ class Score:
 def score_image(prediction: Tensor, target: Tensor, rays: Tensor, metrics: tuple[Metric, ...]) -> Iterator[Score]:
     """Score one predicted depth map.
 
-    What the method does not cover is cut off first: rows and columns at the border without a single predicted pixel
-    (MSG's published networks leave out the last of each). The fractions still count against the whole map.
+    Rows and columns at the border without any predicted pixel are cut off first (MSG's published networks leave out the
+    last of each). The valid fractions still refer to the complete map.
 
     Args:
         prediction: (1, H, W) orthogonal depth in metres, NaN where missing.
-        target: likewise.
+        target: (1, H, W) orthogonal depth in metres, NaN where missing.
         rays: (3, H, W), see :meth:`dsr.geometry.camera.Camera.rays`.
         metrics: from :func:`catalogue`.
 
@@ -227,7 +227,7 @@ def score_image(prediction: Tensor, target: Tensor, rays: Tensor, metrics: tuple
 
 
 def _covered(prediction: Tensor) -> tuple[slice, slice]:
-    """Return the rows and columns of the smallest window with all predicted pixels; the whole map if there are none."""
+    """Return the rows and columns of the smallest window with all predicted pixels; all of them if there are none."""
     valid = prediction.isfinite()[0]
     ranges = []
     for axis in (1, 0):

@@ -1,4 +1,4 @@
-"""torchmetrics classes of the paper's metrics: the mean over images, worst of four lights unless told otherwise.
+"""torchmetrics classes of the paper's metrics: the mean over images, by default of the worst of four lights.
 
     metrics = visual_metrics(network)                       # a MetricCollection
     metrics.update(SurfacePair(prediction, target, rays))
@@ -24,13 +24,13 @@ from dsr.metrics.lpips import LPIPS
 class PerImageMean(torchmetrics.Metric):
     """Mean over images of one metric.
 
-    An image whose target has no valid pixel is left out. An image whose prediction leaves nothing to score is not: the
-    mean is NaN then, so that a method that fails never looks better than one that does not.
+    An image whose target has no valid pixel is left out. If a prediction has no pixel that can be scored, the mean is
+    NaN, so that a method that fails never looks better than one that does not.
 
     Args:
         metric: from :func:`dsr.metrics.catalogue.catalogue`.
         variant: ``max`` (worst of four lights, the smallest value where higher is better), ``avg`` or one of e1..e4;
-            without effect on metrics without lights.
+            has no effect on metrics without lights.
         **settings: as for every torchmetrics class.
 
     Raises:
@@ -62,9 +62,9 @@ class PerImageMean(torchmetrics.Metric):
     def update(self, pair: SurfacePair) -> None:
         """Add a batch of pairs."""
         values = self._metric.variants(pair)[self._variant]
-        known = pair.target_mask.flatten(1).any(dim=1)
-        self.total += torch.where(known, values, 0).sum().to(self.total)
-        self.count += known.sum().to(self.count)
+        valid = pair.target_mask.flatten(1).any(dim=1)
+        self.total += torch.where(valid, values, 0).sum().to(self.total)
+        self.count += valid.sum().to(self.count)
 
     def compute(self) -> Tensor:
         """Return the mean, NaN where no image could be scored."""
@@ -76,7 +76,7 @@ def _named(name: str) -> Metric:
 
 
 def _with_threshold(name: str, threshold: int, unit: str = "") -> Metric:
-    """Return a metric that the catalogue holds at some thresholds."""
+    """Return the catalogue's metric of this name and threshold."""
     try:
         return _named(f"{name}_{threshold}{unit}")
     except StopIteration:
@@ -116,7 +116,7 @@ class LPIPSv(PerImageMean):
     """LPIPS_v.
 
     Args:
-        network: kept out of the module tree, so that no checkpoint ever holds it.
+        network: the LPIPS network, not registered as a submodule, so that checkpoints do not contain it.
         variant: as for :class:`PerImageMean`.
         **settings: as for every torchmetrics class.
 
@@ -151,7 +151,7 @@ class BumpinessD(PerImageMean):
 def visual_metrics(
     network: LPIPS | None = None, extra: Sequence[Metric] = (), **settings: Any
 ) -> torchmetrics.MetricCollection:
-    """Return every metric of the catalogue, worst of four lights, as one collection.
+    """Return all metrics of the catalogue, each of the worst of four lights, as one collection.
 
     Compute groups stay off: they would merge metrics that differ only in a threshold.
 

@@ -1,4 +1,4 @@
-"""How tables and figures show a metric: its heading, unit, precision, direction and place."""
+"""How tables and figures show a metric: its heading, unit, precision, direction and position."""
 
 from __future__ import annotations
 
@@ -73,16 +73,16 @@ def describe_directions(formats: Formats) -> str:
     return f"lower is better, of {', '.join(higher)} higher"
 
 
-def complete_formats(names: Iterable[str], *known: Formats) -> dict[str, MetricFormat]:
-    """Return a format for each metric: the first known one, or the raw value under the metric's name.
+def complete_formats(names: Iterable[str], *defined: Formats) -> dict[str, MetricFormat]:
+    """Return a format for each metric: the first that is defined, or the raw value under the metric's name.
 
     Args:
         names: of metrics, as in ``scores.csv``.
-        *known: formats to take, the preferred ones first.
+        *defined: formats to choose from, in order of preference.
 
     """
     found: dict[str, MetricFormat] = {}
     for name in names:
-        formats = (each[name] for each in known if name in each)
+        formats = (each[name] for each in defined if name in each)
         found[name] = next(formats, MetricFormat(name))
     return found

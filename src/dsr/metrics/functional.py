@@ -1,15 +1,16 @@
 """The paper's metrics: pure functions of a pair of depth maps, one value per image (and light).
 
 Voynov et al., *Perceptual Deep Depth Super-Resolution*, ICCV 2019, section 3, with the conventions that reproduce its
-tables. Lower is better throughout; units are metres and fractions. A :class:`SurfacePair` computes what the metrics
-share - masks, perspective depths, normals, renderings - once, when first asked for.
+tables. Lower is better throughout; units are metres and fractions. A :class:`SurfacePair` computes what several
+metrics use (masks, perspective depths, normals, renderings) once, on first access.
 
     pair = SurfacePair(prediction, target, camera.rays()[None])
     rmse_v(pair)      # (B,)
     dssim_v(pair)     # (B, 4), lights e1..e4
 
-Masks: a pixel counts where both depths are known; a normal where all the pixels that it needs are. What is unknown is
-left out of every mean, and is 0 in both renderings where a window reaches it. An image with nothing to score gets NaN.
+Masks: a pixel is valid if both depths are; a normal, if all pixels that it is computed from are. Invalid pixels are
+left out of every mean, and are 0 in both renderings inside windows that contain them. An image without a valid pixel
+gets NaN.
 """
 
 from __future__ import annotations
@@ -30,15 +31,15 @@ BUMPINESS_DISPARITY = 20.48
 
 
 class SurfacePair:
-    """Two depth maps of the same pixels, and what metrics derive from them.
+    """Two depth maps of the same pixels, and the quantities that metrics derive from them.
 
     Args:
         prediction, target: (B, 1, H, W) orthogonal depth in metres; NaN is a hole, and so is a depth that is not
             positive, which no camera sees.
         rays: (B or 1, 3, H, W) rays with z = 1, see :meth:`dsr.geometry.camera.Camera.rays`.
-        mask: (B, 1, H, W) bool, the pixels to look at; None for all.
-        image_dtype: of normals and renderings, None for the depth's. float32 halves the time that they take and moves
-            scores by about 1e-7; depths and their differences stay in their own dtype.
+        mask: (B, 1, H, W) bool, the pixels to compare; None for all.
+        image_dtype: of normals and renderings, None for the depth's. float32 halves their computing time and changes
+            scores by about 1e-7; depths and their differences keep their own dtype.
 
     Raises:
         ValueError: shapes or types do not fit together.
@@ -88,19 +89,19 @@ class SurfacePair:
 
     @cached_property
     def normal_mask(self) -> Tensor:
-        """(B, 1, H, W) bool: where both normals are known."""
+        """(B, 1, H, W) bool: where both normals are valid."""
         return self.depth_mask if self.complete else normal_mask(self.depth_mask)
 
     @cached_property
     def shadings(self) -> tuple[Tensor, Tensor]:
-        """The two maps of e . n for the four lights, (B, 4, H, W), unclipped; 0 where unknown."""
+        """The two maps of e . n for the four lights, (B, 4, H, W), unclipped; 0 where invalid."""
         directions = lights(dtype=self.image_dtype, device=self.target.device)
         first, second = (shade(normals, directions) for normals in self.normals)
         return self._blank(first), self._blank(second)
 
     @cached_property
     def renderings(self) -> tuple[Tensor, Tensor]:
-        """The two maps of clip(e . n, 0, 1) for the four lights, (B, 4, H, W); 0 where unknown."""
+        """The two maps of clip(e . n, 0, 1) for the four lights, (B, 4, H, W); 0 where invalid."""
         first, second = self.shadings
         return first.clamp(0, 1), second.clamp(0, 1)
 
@@ -111,31 +112,31 @@ class SurfacePair:
 
     @cached_property
     def perspective_error(self) -> Tensor:
-        """(B, 1, H, W) absolute difference of the perspective depths in metres; 0 where unknown."""
+        """(B, 1, H, W) absolute difference of the perspective depths in metres; 0 where invalid."""
         error = (self.prediction - self.target).abs() * self.ray_lengths
         return error if self.complete else error * self.depth_mask
 
     @cached_property
     def rendering_error(self) -> Tensor:
-        """(B, 4, H, W) absolute difference of the renderings; 0 where unknown."""
+        """(B, 4, H, W) absolute difference of the renderings; 0 where invalid."""
         first, second = self.renderings
         return (first - second).abs()
 
     @cached_property
     def ssim_mask(self) -> Tensor:
-        """(B, 1, H - 6, W - 6) bool: window centres whose normal is known."""
+        """(B, 1, H - 6, W - 6) bool: window centres whose normal is valid."""
         return self.normal_mask[..., SSIM_WINDOW // 2 : -(SSIM_WINDOW // 2), SSIM_WINDOW // 2 : -(SSIM_WINDOW // 2)]
 
     @cached_property
     def bumpiness_mask(self) -> Tensor:
-        """(B, 1, H, W) bool: where the 5 x 5 pixels that a second derivative needs are known, or outside the map."""
+        """(B, 1, H, W) bool: where the 5 x 5 pixels of a second derivative are valid or outside the map."""
         if self.complete:
             return self.depth_mask
-        unknown = (~self.depth_mask).to(self.target.dtype)
-        return torch.nn.functional.max_pool2d(unknown, 5, stride=1, padding=2) == 0
+        missing = (~self.depth_mask).to(self.target.dtype)
+        return torch.nn.functional.max_pool2d(missing, 5, stride=1, padding=2) == 0
 
     def _blank(self, values: Tensor) -> Tensor:
-        """Return ``values`` with 0 where a normal is unknown."""
+        """Return ``values`` with 0 where a normal is invalid."""
         return values if self.complete else values * self.normal_mask
 
 
@@ -145,7 +146,7 @@ def rmse_d(pair: SurfacePair) -> Tensor:
 
 
 def bad_pix_d(pair: SurfacePair, threshold: float, *, relative: bool = False) -> Tensor:
-    """Return the share of pixels whose perspective depths differ by more than a threshold, (B,).
+    """Return the fraction of pixels whose perspective depths differ by more than a threshold, (B,).
 
     Args:
         pair: the two surfaces.
@@ -160,7 +161,7 @@ def bad_pix_d(pair: SurfacePair, threshold: float, *, relative: bool = False) ->
 def mse_v(pair: SurfacePair) -> Tensor:
     """Return MSE_v, (B,): the mean squared difference of the unclipped renderings under e1, e2, e3 (eq. 3).
 
-    As these lights are orthonormal it is the mean squared difference of the normal maps' three components.
+    As these lights are orthonormal, this is the mean squared difference of the normal maps' three components.
     """
     first, second = pair.normals
     return _mean((first - second).square().mean(dim=1, keepdim=True), pair.normal_mask).squeeze(1)
@@ -178,15 +179,15 @@ def rmse_v1(pair: SurfacePair) -> Tensor:
 
 
 def bad_pix_v(pair: SurfacePair, threshold: float) -> Tensor:
-    """Return per light the share of pixels whose renderings differ by more than ``threshold`` / 255, (B, 4)."""
+    """Return the fraction of pixels whose renderings differ by more than ``threshold`` / 255, per light, (B, 4)."""
     return _mean(pair.rendering_error > threshold / 255, pair.normal_mask)
 
 
 def dssim_v(pair: SurfacePair) -> Tensor:
     """Return DSSIM_v = 1 - SSIM per light, (B, 4).
 
-    SSIM (Wang et al. 2004) with a 7 x 7 uniform window, sample covariance and a data range of 2; windows that would
-    reach over the border are left out.
+    SSIM (Wang et al. 2004) with a 7 x 7 uniform window, sample covariance and a data range of 2; windows that
+    would extend beyond the border are left out.
 
     Raises:
         ValueError: the map is smaller than a window.
@@ -224,7 +225,7 @@ def _mean(values: Tensor, mask: Tensor) -> Tensor:
 
 def _ssim_map(x: Tensor, y: Tensor) -> Tensor:
     """Return SSIM at every window inside the map, (B, H, W) -> (B, H - 6, W - 6)."""
-    # With sums over N pixels in place of means, numerators and denominators each times N (N - 1) N^2 / 4 or so:
+    # With sums over N pixels in place of means, the numerators and denominators are multiplied by the same factor.
     area = SSIM_WINDOW**2
     c1 = (0.01 * SSIM_DATA_RANGE) ** 2 * area**2
     c2 = (0.03 * SSIM_DATA_RANGE) ** 2 * area * (area - 1)  # N - 1: sample covariance

@@ -22,7 +22,7 @@ from dsr.metrics.functional import SurfacePair
 TRUNK_FILE = "alexnet-owt-7be5be79.pth"
 TRUNK_URL = f"https://download.pytorch.org/models/{TRUNK_FILE}"
 TRUNK_HASH = "7be5be79"
-"""First digits of the official file's SHA-256, as its name carries them."""
+"""First digits of the official file's SHA-256, as in its name."""
 _MEAN = (-0.030, -0.088, -0.188)
 _STD = (0.458, 0.448, 0.450)
 _CONVOLUTIONS = {  # index in torchvision's `features`: (in, out, kernel, stride, padding)
@@ -35,7 +35,7 @@ _CONVOLUTIONS = {  # index in torchvision's `features`: (in, out, kernel, stride
 _POOL_BEFORE = (3, 6)
 _DOWNLOAD_TIMEOUT = 15.0
 MIN_SIZE = 31
-"""Smallest height and width in pixels that the trunk's poolings leave a feature of."""
+"""Smallest height and width in pixels for which the trunk's last level has a feature."""
 
 
 class LPIPS(nn.Module):
@@ -92,8 +92,8 @@ class LPIPS(nn.Module):
 
         Args:
             first: (B, 3, H, W) in [-1, 1], at least 31 x 31.
-            second: likewise.
-            mask: (B, 1, H, W) bool; each feature weighs as much as the share of its pixels that is known. None for all.
+            second: (B, 3, H, W) in [-1, 1].
+            mask: (B, 1, H, W) bool; each feature is weighted by the fraction of its pixels that is set. None for all.
 
         Raises:
             ValueError: the images are smaller than the trunk can take.
@@ -134,11 +134,11 @@ def find_trunk(configured: Path | None) -> Path:
     """Return the file of AlexNet's weights: the configured one, the torch hub cache's, or downloaded into that cache.
 
     Args:
-        configured: a file, or None to look on.
+        configured: a file; None to use the cache.
 
     Raises:
         FileNotFoundError: the configured file does not exist.
-        OSError: it is not in the cache and could not be downloaded; nothing half-written is left.
+        OSError: it is not in the cache and could not be downloaded; no partial file is left.
 
     """
     if configured is not None:
@@ -161,7 +161,7 @@ def load_lpips(configured: Path | None = None) -> LPIPS:
 
     Raises:
         ValueError: the file is not a state dict of AlexNet.
-        OSError: no trunk can be had.
+        OSError: no trunk is available.
 
     """
     path = find_trunk(configured)
@@ -170,7 +170,7 @@ def load_lpips(configured: Path | None = None) -> LPIPS:
         if not isinstance(trunk, dict):
             raise ValueError(f"expected a state dict, got {type(trunk).__name__}")
         return LPIPS(trunk)
-    except Exception as error:  # torch.load raises whatever a damaged file makes it stumble over
+    except Exception as error:  # torch.load raises many types for a damaged file
         reason = str(error) if isinstance(error, ValueError) else "not a file of plain tensors"
         raise ValueError(f"{path}: expected the weights of torchvision's AlexNet: {reason}") from error
 
