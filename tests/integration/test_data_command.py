@@ -136,7 +136,7 @@ def test_interrupted_command_resumes(mirror, root):
     _, errors = process.communicate(timeout=30)
     assert (process.returncode, errors) == (
         130,
-        "interrupted; what was finished is kept, run the same command again to go on\n",
+        "interrupted; finished work is kept, run the same command again to continue\n",
     )
     had = part.stat().st_size
     assert not (root / NAMES[0]).exists()

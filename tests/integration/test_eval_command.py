@@ -227,7 +227,7 @@ def test_second_run_reuses_the_predictions_and_says_so(default_run, within, monk
     table = rows(home)
     code, output, errors = within("dataset.size=64")
     assert (code, errors) == (0, [])
-    assert "predictions re-used: 6 (overwrite=true makes them anew)" in output.splitlines()
+    assert "predictions re-used: 6 (overwrite=true computes them again)" in output.splitlines()
     assert [path.name for path in (folder / "outputs" / "eval").iterdir()] == [home.name]
     assert {path.name: path.stat().st_mtime_ns for path in (home / "predictions").iterdir()} == before
     assert rows(home) == table

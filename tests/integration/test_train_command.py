@@ -32,7 +32,7 @@ FOUR = (*SMOKE, "trainer.steps=4", "trainer.validate_every=2", "output_dir=out")
 
 
 def interrupted(step, home="out"):
-    return f"interrupted at step {step}; python train.py resume={home} goes on from there"
+    return f"interrupted at step {step}; resume={home} goes on from there"
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -224,7 +224,7 @@ def test_repeated_command_is_refused_and_changes_nothing(smoke, within, monkeypa
     code, output, errors = within(*SMOKE)
     assert (code, output) == (2, "")
     file = f"outputs/train/{home.name}/weights.safetensors"
-    assert errors == [f"error: output_dir: {file} is trained already; overwrite=true trains it anew"]
+    assert errors == [f"error: output_dir: {file} is trained already; overwrite=true trains it again"]
     assert {name: (home / name).read_bytes() for name in tree(home)} == before
 
 
@@ -513,7 +513,7 @@ def test_resume_takes_the_runs_own_configuration_alone(smoke, tmp_path, within):
     )  # fmt: skip
     code, _, errors = within(f"resume='{smoke[1]}'")
     assert code == 2
-    assert errors[0].endswith("is trained already; overwrite=true trains it anew")
+    assert errors[0].endswith("is trained already; overwrite=true trains it again")
 
 
 def validation_of(home):
@@ -557,8 +557,8 @@ def test_evaluation_of_a_run_on_another_dataset_keeps_its_setting(smoke, tmp_pat
     ("arguments", "message"),
     [
         (["run=nowhere"], "nowhere: expected the directory of a training, it has no readable config.yaml"),
-        (["run={run}", "method=bicubic"], "method: run={run} says it itself; leave one of them out"),
-        (["run={run}", "scale=8"], "scale: run={run} says it itself; leave one of them out"),
+        (["run={run}", "method=bicubic"], "method: run={run} sets it, too; leave one of them out"),
+        (["run={run}", "scale=8"], "scale: run={run} sets it, too; leave one of them out"),
     ],
 )
 def test_run_that_cannot_be_evaluated_is_refused(smoke, tmp_path, within, arguments, message):

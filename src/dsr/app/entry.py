@@ -1,7 +1,7 @@
-"""Running a Hydra command so that whatever is wrong ends as one line on stderr and exit code 2.
+"""Run a Hydra command so that every error ends as one line on stderr and exit code 2.
 
-torch and Lightning take seconds to import. So a command's module is imported when its configuration has been composed
-and checked, and a mistyped argument is answered at once.
+torch and Lightning take seconds to import. A command's module is therefore imported only after its configuration has
+been composed and checked, so that a mistyped argument is reported immediately.
 """
 
 from __future__ import annotations
@@ -57,15 +57,15 @@ def run_command(name: str, command: Callable[[DictConfig], Any], arguments: Sequ
     Exits with 2 and one line on stderr when the configuration cannot be run, with 130 when interrupted.
 
     Args:
-        name: of the configuration, without ``.yaml``.
-        command: what to run; a multirun calls it once per combination.
-        arguments: of the command line, Hydra's options and overrides; those of the process where None.
+        name: the configuration's name, without ``.yaml``.
+        command: the function to run; a multirun calls it once per combination.
+        arguments: command-line arguments, Hydra's options and overrides; None for those of the process.
 
     """
     register()
     register_resolvers()
     arguments = sys.argv[1:] if arguments is None else list(arguments)
-    os.environ.setdefault("HYDRA_FULL_ERROR", "1")  # exceptions arrive here instead of being printed by Hydra
+    os.environ.setdefault("HYDRA_FULL_ERROR", "1")  # Hydra then raises exceptions instead of printing them
     failures: list[str] = []
     try:
         directories = config_directories(_config_dirs(arguments))
@@ -77,14 +77,14 @@ def run_command(name: str, command: Callable[[DictConfig], Any], arguments: Sequ
 
     def job(config: DictConfig) -> None:
         try:
-            with _argv(process):  # from which Lightning starts the processes of further devices
+            with _argv(process):  # Lightning starts the processes of further devices from it
                 command(config)
-        except ConfigError as error:  # a multirun goes on with its other jobs
+        except ConfigError as error:  # a multirun continues with its other jobs
             failures.append(str(error))
             print_error(str(error))
 
     try:
-        with _argv([process[0], *arguments]):  # which Hydra parses
+        with _argv([process[0], *arguments]):  # parsed by Hydra
             hydra.main(version_base="1.3", config_path=str(directories[0]), config_name=name)(job)()
     except KeyboardInterrupt as interruption:
         message = str(interruption) or "interrupted; what is finished is kept, the same command goes on from there"
@@ -97,7 +97,7 @@ def run_command(name: str, command: Callable[[DictConfig], Any], arguments: Sequ
 
 
 def compose(name: str, overrides: Sequence[str], directories: Sequence[Path]) -> DictConfig:
-    """Return a configuration, composed outside of a command.
+    """Compose a configuration outside of a command.
 
     Args:
         name: without ``.yaml``.
@@ -120,13 +120,13 @@ def fail(message: str) -> NoReturn:
 
 
 def explain(error: Exception, name: str, arguments: Sequence[str], directories: Sequence[Path]) -> str:
-    """Return what is wrong with a configuration, on one line, with the choices where a name is mistyped.
+    """Explain an error of a configuration in one line, with the choices if a name is mistyped.
 
     Args:
-        error: Hydra's or OmegaConf's.
-        name: of the configuration.
-        arguments: that it was composed from.
-        directories: of configuration files.
+        error: the exception of Hydra or OmegaConf.
+        name: the configuration's name.
+        arguments: the arguments that it was composed from.
+        directories: directories of configuration files.
 
     """
     if isinstance(error, MissingConfigException) and error.missing_cfg_file is not None:
@@ -146,7 +146,7 @@ def explain(error: Exception, name: str, arguments: Sequence[str], directories: 
 def _explain_value(
     error: Exception, text: str, name: str, arguments: Sequence[str], directories: Sequence[Path]
 ) -> str:
-    """Return which key of an override is unknown, or does not take its value."""
+    """Explain which key of an override is unknown or has an invalid value."""
     cause = error.__cause__
     key = re.search(r"Could not override '([^']+)'", text)
     if key:
@@ -158,7 +158,7 @@ def _explain_value(
 
 
 def _explain_key(key: str, name: str, arguments: Sequence[str], directories: Sequence[Path]) -> str:
-    """Return which keys there are instead of an unknown one."""
+    """Explain which keys exist instead of an unknown one."""
     if key == "experiment":
         return f"experiment: write +experiment=NAME, NAME one of {', '.join(list_choices(key, directories))}"
     prefix = key.rpartition(".")[0]
@@ -168,7 +168,7 @@ def _explain_key(key: str, name: str, arguments: Sequence[str], directories: Seq
 
 
 def _explain_missing(file: str, name: str, directories: Sequence[Path]) -> str:
-    """Return what there is instead of a configuration file that is not there."""
+    """Explain which files exist instead of a missing configuration file."""
     group, _, choice = file.rpartition("/")
     if not group:
         return f"--config-name {choice}: unknown; expected {name}"
@@ -179,7 +179,7 @@ def _explain_missing(file: str, name: str, directories: Sequence[Path]) -> str:
 
 
 def _explain_syntax(override: str) -> str:
-    """Return how to write an argument that Hydra cannot read."""
+    """Explain how to write an argument that Hydra cannot parse."""
     key, equals, value = override.partition("=")
     if not equals:
         return f"{override}: expected KEY=VALUE"
@@ -188,9 +188,9 @@ def _explain_syntax(override: str) -> str:
 
 
 def _expect_choices(name: str, arguments: Sequence[str], directories: Sequence[Path]) -> None:
-    """Exit where the command line names a choice that does not exist, or takes away one that must be made."""
+    """Exit if the command line names a choice that does not exist, or removes a required one."""
     if any(argument.startswith("hydra.searchpath=") for argument in arguments):
-        return  # there may be choices in other places
+        return  # other directories may have further choices
     defaults = OmegaConf.load(directories[0] / f"{name}.yaml").defaults
     groups = {str(key) for entry in defaults if isinstance(entry, DictConfig) for key in entry} | {"+experiment"}
     for argument in arguments:
@@ -200,7 +200,7 @@ def _expect_choices(name: str, arguments: Sequence[str], directories: Sequence[P
 
 
 def _expect_choice(argument: str, group: str, choice: str, directories: Sequence[Path]) -> None:
-    """Exit where ``choice``, or one of several between commas, is no file of a group."""
+    """Exit if ``choice``, or one of several separated by commas, is not a file of the group."""
     choices = list_choices(group, directories)
     if choice in ("", "null"):
         fail(f"{argument}: expected one of {', '.join(choices)}")
@@ -219,7 +219,7 @@ def _node_of(key: str, name: str, arguments: Sequence[str], directories: Sequenc
     overrides = [argument for argument in arguments if choice.fullmatch(argument)]
     try:
         node = compose(name, overrides, directories)
-    except HydraException:  # one of these choices is the wrong one
+    except HydraException:  # one of these choices is invalid
         node = compose(name, [], directories)
     for part in key.split(".")[:-1]:
         child = OmegaConf.select(node, part)
@@ -239,7 +239,7 @@ def _config_dirs(arguments: Sequence[str]) -> list[Path]:
 
 @contextlib.contextmanager
 def _argv(arguments: list[str]) -> Iterator[None]:
-    """Let the command line of the process read so."""
+    """Replace ``sys.argv`` within the context."""
     before, sys.argv = sys.argv, arguments
     try:
         yield

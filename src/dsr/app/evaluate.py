@@ -45,7 +45,7 @@ def evaluate(config: DictConfig) -> pd.DataFrame:
         config: composed from ``conf/eval.yaml``.
 
     Returns:
-        The content of ``scores.csv``, one after the other where a run was validated with several data sets.
+        The content of ``scores.csv``; if a run was validated with several data sets, their tables concatenated.
 
     Raises:
         ConfigError: the configuration cannot be run, or a scene failed (the others' results are written).
@@ -103,7 +103,7 @@ def _study(
     Args:
         settings: the configuration.
         identity: what identifies its predictions.
-        given: what a method may ask for beside the configuration's own values: device, weights, workspace, display.
+        given: values that a method may take in addition to the configuration's: device, weights, workspace, display.
         source: the data set; None for the one that the configuration describes.
 
     """
@@ -143,13 +143,13 @@ def _study(
 
 
 def _flagged(name: str, method: Any, form: str) -> str:
-    """Return the name of a method, with what has to stand beside its scores."""
+    """Return the name of a method, with the flag that its scores have to be marked with, if any."""
     flag = getattr(method, "flag", "")
     return name + form.format(flag) if flag else name
 
 
 def _precision(settings: EvalConfig, device: torch.device) -> str:
-    """Return float32, or for an optimisation what is fast on the device, where ``auto`` leaves the choice."""
+    """Return the precision; ``auto`` is float32, or for an optimisation the device's fast one."""
     if settings.precision != "auto":
         return settings.precision
     return fast_precision(device) if trait("method", settings.method, "optimises") else "float32"
@@ -170,7 +170,7 @@ def _problem_name(settings: EvalConfig) -> str:
 
 
 def _weights(settings: EvalConfig) -> Path | None:
-    """Return the file of weights for the method; None for a method that has no use for one."""
+    """Return the file of weights for the method; None for a method without weights."""
     given = None if settings.weights is None else Path(settings.weights).expanduser()
     if takes("method", settings.method, "weights"):
         return find_weights(settings.method, settings.scale, given)
@@ -181,7 +181,7 @@ def _weights(settings: EvalConfig) -> Path | None:
 
 
 def _seed(seed: int) -> None:
-    """Seed every global generator; what dsr itself draws comes from explicit ones."""
+    """Seed every global generator; dsr itself uses explicit ones."""
     random.seed(seed)
     np.random.seed(seed % 2**32)  # noqa: NPY002 - the legacy generator, for libraries that use it
     torch.manual_seed(seed)
@@ -196,13 +196,13 @@ def _illustrate(
 def _report(
     console: Console, folder: Path, scores: pd.DataFrame, label: str, outcome: Outcome, formats: Formats
 ) -> None:
-    """Print the table, and what a reader should know."""
+    """Print the table of scores, notes and failures."""
     if not scores.empty:
         console.print(score_table(scores, label, formats))
-    told: dict[str, list[str]] = {}
+    scenes_by_note: dict[str, list[str]] = {}
     for scene, notes in outcome.notes.items():
-        told.setdefault("; ".join(notes), []).append(scene)
-    for note, scenes in told.items():
+        scenes_by_note.setdefault("; ".join(notes), []).append(scene)
+    for note, scenes in scenes_by_note.items():
         show(console, f"note: {', '.join(scenes)}: {note}")
     if outcome.unscored:
         unscored = ", ".join(outcome.unscored)
@@ -210,7 +210,9 @@ def _report(
     for message in outcome.unsolved.values():
         show(console, f"no solution: {message}")
     if outcome.reused:
-        console.print(f"predictions re-used: {len(outcome.reused)} (overwrite=true makes them anew)", highlight=False)
+        console.print(
+            f"predictions re-used: {len(outcome.reused)} (overwrite=true computes them again)", highlight=False
+        )
     show(console, f"results: {folder}")
     for message in outcome.failures.values():
         print_error(message)

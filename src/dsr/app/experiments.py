@@ -1,6 +1,6 @@
 """What experiments (``conf/experiment``) need beyond Hydra.
 
-Sweeps over the data sets that are there, and sweeps that the command line narrows.
+Sweeps over the data sets that are on this machine, and sweeps that the command line overrides.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ from dsr.data.download.location import data_root
 
 
 def register_resolvers() -> None:
-    """Let configuration files write ``${present:NAME,NAME}``: those of some data sets that are there."""
+    """Let configuration files use ``${present:NAME,NAME}``: those of the named data sets that are on this machine."""
     OmegaConf.register_new_resolver("present", _present, replace=True)
 
 
 def without_overridden_sweeps(arguments: Sequence[str], directories: Sequence[Path]) -> list[str]:
-    """Return the arguments of a command, and what takes the keys that they set out of their experiment's sweep.
+    """Return a command's arguments, with overrides that remove the keys that they set from their experiment's sweep.
 
-    Without it, each value of the experiment would run once more with the value of the command line.
+    Otherwise the sweep of the experiment would run in addition to the value of the command line.
     """
     swept = {key for argument in arguments for key in _swept_keys(argument, directories)}
     given = {argument.partition("=")[0] for argument in arguments}
@@ -43,7 +43,7 @@ def _swept_keys(argument: str, directories: Sequence[Path]) -> list[str]:
 
 
 def _present(*names: str) -> str:
-    """Return the data sets that are there, and those that are embedded, between commas; name the others."""
+    """Return the data sets that are on this machine or embedded, separated by commas; print a note on the others."""
     absent = []
     for name in names:
         folders = CATALOGUE[name].folders if name in CATALOGUE else ()

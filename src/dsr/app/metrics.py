@@ -1,4 +1,4 @@
-"""The metrics that a configuration chooses: the paper's, with LPIPS where its network can be had, and one's own."""
+"""The metrics that a configuration chooses: the paper's, LPIPS if its network is available, and the user's own."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def chosen_metrics(settings: MetricsConfig, device: torch.device) -> tuple[Metri
     """Return the metrics to compute.
 
     Raises:
-        ConfigError: a metric or the network's file is not what it should be.
+        ConfigError: a metric or the network's file is not valid.
 
     """
     return catalogue(_network_on(settings, device), extra_metrics(settings.extra))
@@ -34,10 +34,10 @@ def metric_collection(settings: MetricsConfig, device: torch.device) -> torchmet
 
 
 def check_metrics(settings: MetricsConfig) -> None:
-    """Check what a configuration says of metrics, before anything is written.
+    """Check a configuration's metrics, before anything is written.
 
     Raises:
-        ConfigError: a metric or the network's file is not what it should be.
+        ConfigError: a metric or the network's file is not valid.
 
     """
     extra_metrics(settings.extra)
@@ -67,14 +67,14 @@ def extra_metrics(paths: Sequence[str]) -> tuple[Metric, ...]:
 
 
 def _network_on(settings: MetricsConfig, device: torch.device) -> LPIPS | None:
-    """Return the LPIPS network; None where it is not wanted, or not to be had."""
+    """Return the LPIPS network; None if it is disabled or not available."""
     network = perceptual_network(settings.lpips_trunk) if settings.lpips else None
     return None if network is None else network.to(device)
 
 
 @functools.cache
 def perceptual_network(trunk: str | None) -> LPIPS | None:
-    """Return the LPIPS network; without a trunk, None and one line that says what to do."""
+    """Return the LPIPS network; without a trunk, print one line that says what to do, and return None."""
     try:
         return load_lpips(None if trunk is None else Path(trunk).expanduser())
     except OSError as error:

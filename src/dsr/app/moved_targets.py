@@ -1,4 +1,4 @@
-"""Where the classes and functions are now that the configurations of earlier runs name as ``target``."""
+"""The current paths of classes and functions that configurations of earlier runs name as ``target``."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ MOVED_TARGETS = {
     "dsr.noise.TimeOfFlight": "dsr.degradation.noise.TimeOfFlight",
     "dsr.noise.no_noise": "dsr.degradation.noise.no_noise",
 }
-"""All that the configuration of a training can name, from where it was to where it is."""
+"""All targets that a training's configuration can name, from the old path to the current one."""
 
 
 def update_targets(node: Any) -> Any:
-    """Return a configuration in which each ``target`` that has moved is named as it is now."""
+    """Return a configuration with the current path of each ``target`` that has moved."""
     if isinstance(node, dict):
         return {
             key: MOVED_TARGETS.get(value, value)

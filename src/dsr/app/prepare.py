@@ -1,4 +1,4 @@
-"""The command behind ``dsr data prepare``: a data set made ready, and pictures of what that led to."""
+"""The command behind ``dsr data prepare``: prepare a data set, and draw its scenes."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ def prepare_dataset(name: str, overrides: Sequence[str], console: Console, confi
     """Prepare every scene of a data set and draw the contact sheet, ``outputs/data/NAME/sheet.png`` or its pages.
 
     Args:
-        name: of a file in ``conf/dataset``.
-        overrides: as on the command line of ``eval.py``, such as ``dataset.size=256``.
+        name: the name of a file in ``conf/dataset``.
+        overrides: overrides as on the command line of ``eval.py``, such as ``dataset.size=256``.
         console: where progress is shown.
         config_dirs: the user's own directories of configuration files.
 
     Raises:
-        ConfigError: there is no such data set, it is not there, or a scene of it cannot be read (the others are drawn).
+        ConfigError: the data set is unknown, its files are missing, or a scene cannot be read (the others are drawn).
 
     """
     source = _source(name, overrides, config_dirs)
@@ -50,7 +50,7 @@ def prepare_dataset(name: str, overrides: Sequence[str], console: Console, confi
 
 
 def _source(name: str, overrides: Sequence[str], config_dirs: Sequence[Path]) -> SceneSource:
-    """Return the data set that a configuration describes."""
+    """Build the data set that a configuration describes."""
     directories = config_directories(config_dirs)
     arguments = [f"dataset={name}", *overrides]
     try:
@@ -64,7 +64,7 @@ def _source(name: str, overrides: Sequence[str], config_dirs: Sequence[Path]) ->
 
 
 def _loaded(source: SceneSource, names: Iterator[str], failures: dict[str, str]) -> Iterator[Scene]:
-    """Yield the scenes that can be read; say of the others why not."""
+    """Yield the scenes that can be read, and record the errors of the others in ``failures``."""
     for name in names:
         try:
             yield source.load(name)

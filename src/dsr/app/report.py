@@ -25,7 +25,7 @@ from dsr.utils.files import write_text
 from dsr.utils.progress import Progress
 
 _MARK = "report.json"
-"""What makes a directory one that a report may replace."""
+"""A file that marks a directory as a report, which a new one may replace."""
 PARTS = ("tables", "metrics", "figures", "page")
 _MAIN = {
     "page": "index.html",
@@ -38,14 +38,14 @@ _MAIN = {
 
 @dataclass(frozen=True)
 class ReportRequest:
-    """What of the results goes into the report.
+    """What the report contains.
 
     Args:
-        methods, datasets, scales: these alone; empty for all.
-        parts: of tables, metrics, figures, page.
-        light: of the figures.
-        title: of the page.
-        page_mb: the most that the page may weigh.
+        methods, datasets, scales: the ones to show; empty for all.
+        parts: some of tables, metrics, figures, page.
+        light: the figures' light.
+        title: the page's title.
+        page_mb: the maximum size of the page in MB.
 
     """
 
@@ -59,29 +59,29 @@ class ReportRequest:
 
 
 def make_report(
-    runs: Sequence[Path], output: Path, study: Path | None, wanted: ReportRequest, console: Console
+    runs: Sequence[Path], output: Path, study: Path | None, request: ReportRequest, console: Console
 ) -> None:
     """Write the tables, figures, correlations and page of some runs into a directory, whole or not at all.
 
     Args:
         runs: directories of runs, or with runs below them.
-        output: the report's directory; an earlier report there is replaced.
-        study: what ``dsr study collect`` wrote.
-        wanted: what goes in.
+        output: the report's directory; an earlier report in it is replaced.
+        study: the table that ``dsr study collect`` wrote; None for none.
+        request: what the report contains.
         console: where progress is shown.
 
     Raises:
-        ValueError: there is no run, a choice is none of those there are, or the directory holds something else.
+        ValueError: there is no run, a choice does not exist, or the directory holds something else.
 
     """
-    _check(output, wanted)
+    _check(output, request)
     results = load_results(runs)
-    results = results.only(wanted.methods, wanted.datasets, wanted.scales)
+    results = results.only(request.methods, request.datasets, request.scales)
     answers = None if study is None else read_study(study)
     output.parent.mkdir(parents=True, exist_ok=True)
     temporary = Path(tempfile.mkdtemp(prefix=f".{output.name}-", dir=output.parent))
     try:
-        notes = _write(temporary, results, answers, wanted, ConsoleProgress(console))
+        notes = _write(temporary, results, answers, request, ConsoleProgress(console))
         write_text(temporary / _MARK, json.dumps({"runs": [str(run.folder) for run in results.runs]}, indent=1) + "\n")
         temporary.chmod(0o755)
         if output.exists():
@@ -96,23 +96,23 @@ def make_report(
             show(console, f"{what:<8} {output / file}")
 
 
-def _check(output: Path, wanted: ReportRequest) -> None:
-    """Refuse what cannot be made, before anything is read."""
-    for part in wanted.parts:
+def _check(output: Path, request: ReportRequest) -> None:
+    """Check the request, before anything is read."""
+    for part in request.parts:
         if part not in PARTS:
             raise ValueError(f"--only: expected some of {', '.join(PARTS)}, got {part}")
-    if wanted.light not in LIGHT_NAMES:
-        raise ValueError(f"--light: expected one of {', '.join(LIGHT_NAMES)}, got {wanted.light}")
-    if not wanted.page_mb > 0:
-        raise ValueError(f"--page-mb: expected a positive number, got {wanted.page_mb:g}")
+    if request.light not in LIGHT_NAMES:
+        raise ValueError(f"--light: expected one of {', '.join(LIGHT_NAMES)}, got {request.light}")
+    if not request.page_mb > 0:
+        raise ValueError(f"--page-mb: expected a positive number, got {request.page_mb:g}")
     if output.exists() and not (output.is_dir() and ((output / _MARK).is_file() or not any(output.iterdir()))):
         raise ValueError(f"{output}: expected a new directory or an earlier report, it holds something else")
 
 
 def _write(
-    folder: Path, results: Results, study: pd.DataFrame | None, wanted: ReportRequest, progress: Progress
+    folder: Path, results: Results, study: pd.DataFrame | None, request: ReportRequest, progress: Progress
 ) -> list[str]:
-    """Write the parts, and return what a reader should know."""
+    """Write the parts, and return notes for the reader."""
     notes: list[str] = []
 
     def tables() -> None:
@@ -124,16 +124,16 @@ def _write(
 
     def figures() -> None:
         with progress.task("figures") as task:
-            save_figures(folder / "figures", results, task, light=wanted.light, notes=notes)
+            save_figures(folder / "figures", results, task, light=request.light, notes=notes)
 
-    def page() -> None:  # the last, as it links to the others' files
+    def page() -> None:  # last, as it links to the other parts' files
         with progress.task("scenes") as task:
             notes.extend(
-                save_page(folder / "index.html", results, title=wanted.title, budget_mb=wanted.page_mb, progress=task)
+                save_page(folder / "index.html", results, title=request.title, budget_mb=request.page_mb, progress=task)
             )
 
     parts = {"tables": tables, "metrics": metrics, "figures": figures, "page": page}
-    todo = [part for part in parts if part in wanted.parts]
+    todo = [part for part in parts if part in request.parts]
     if all(run.scores.empty for run in results.runs):
         notes.append("no scene has a truth to score against, so there are no tables and no metric study")
         todo = [part for part in todo if part not in ("tables", "metrics")]

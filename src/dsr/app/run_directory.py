@@ -1,4 +1,4 @@
-"""The directory of a run: named by its configuration, never another run's, never silently overwritten."""
+"""The directory of a run: named by its configuration, and never overwritten unless the user asks for it."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from dsr.utils.hashing import hash_of_code, hash_outside_code
 from dsr.utils.versions import versions
 
 _RECORD = "versions.json"
-_NOT_IDENTITY = ("output_dir", "overwrite", "metrics", "weights", "resume", "run")  # of the weights, the content counts
+_NOT_IDENTITY = ("output_dir", "overwrite", "metrics", "weights", "resume", "run")  # weights count by their content
 PREDICTING_CODE = (
     "sample.py", "degradation", "geometry", "metrics", "synthetic", "methods", "data", "training",
     "utils/builder.py", "utils/config_files.py", "utils/devices.py", "utils/lightning.py", "utils/progress.py",
@@ -31,14 +31,14 @@ PREDICTING_CODE = (
 def identity_of(
     config: Mapping[str, Any], weights_hash: str | None, device: torch.device, targets: Iterable[str] = ()
 ) -> dict[str, Any]:
-    """Return all that a run's predictions depend on, as plain values: settings, weights, kind of device, code.
+    """Return everything that a run's predictions depend on, as plain values: settings, weights, kind of device, code.
 
     Args:
-        config: of the run.
-        weights_hash: of the file of weights; None for none.
-        device: where predictions are computed.
-        targets: dotted paths of classes and functions, beside those that the groups of ``config`` name; the code of
-            those outside of dsr counts, too.
+        config: the run's configuration.
+        weights_hash: the hash of the file of weights; None for none.
+        device: the device that computes the predictions.
+        targets: dotted paths of classes and functions in addition to those that the groups of ``config`` name; the
+            code of those outside dsr is part of the identity.
 
     """
     kept = {key: value for key, value in config.items() if key not in _NOT_IDENTITY}
@@ -49,7 +49,7 @@ def identity_of(
 
 
 def default_directory(kind: str, config: Mapping[str, Any], identity: Mapping[str, Any]) -> Path:
-    """Return outputs/KIND/DATASET_DOWNSAMPLING_xSCALE_METHOD_HASH; the same configuration leads to the same one."""
+    """Return outputs/KIND/DATASET_DOWNSAMPLING_xSCALE_METHOD_HASH; the same configuration gives the same one."""
     digest = hashlib.sha256(json.dumps(identity, sort_keys=True).encode()).hexdigest()[:8]
     what = config["method"] if "method" in config else config["model"]
     names = (config["dataset"]["name"], config["downsampling"]["name"], f"x{config['scale']}", what["name"])
@@ -63,12 +63,12 @@ def expect_free(
 
     Args:
         folder: the directory.
-        config: of the run.
+        config: the run's configuration.
         identity: see :func:`identity_of`.
-        tolerated: keys of the identity in which what is there already may differ.
+        tolerated: keys of the identity that may differ from those of the run that is there already.
 
     Returns:
-        Those tolerated keys in which it does.
+        The tolerated keys that differ.
 
     Raises:
         ConfigError: something else is there already and ``overwrite`` is not set.
@@ -101,12 +101,12 @@ def claim(
 
     Args:
         folder: the directory.
-        config: of the run.
+        config: the run's configuration.
         identity: see :func:`identity_of`.
-        tolerated: keys of the identity in which what is there already may differ.
+        tolerated: keys of the identity that may differ from those of the run that is there already.
 
     Returns:
-        The tolerated keys in which what is there already differs.
+        The tolerated keys that differ.
 
     Raises:
         ConfigError: something else is there already and ``overwrite`` is not set, or the directory cannot be written.
@@ -123,12 +123,12 @@ def claim(
 
 @functools.cache
 def code_hash() -> str:
-    """Return a hash of the code that makes predictions, so that those of older code are not taken for new ones."""
+    """Return a hash of the code that computes predictions, so that those of older code are not used again."""
     return hash_of_code(PREDICTING_CODE)[:16]
 
 
 def _changes(before: Mapping[str, Any], now: Mapping[str, Any], prefix: str = "") -> list[str]:
-    """Return the keys, dotted, whose values differ."""
+    """Return the dotted keys whose values differ."""
     changed = []
     for key in sorted(before.keys() | now.keys()):
         old, new = before.get(key), now.get(key)

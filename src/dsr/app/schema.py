@@ -30,7 +30,7 @@ class MetricsConfig:
 
 
 class Checked:
-    """A dataclass of settings that checks what it is made from."""
+    """A dataclass of settings that is checked when it is made from a configuration."""
 
     @classmethod
     def of(cls, plain: Mapping[str, Any]) -> Self:
@@ -52,7 +52,7 @@ class Checked:
         return settings
 
     def check(self) -> None:
-        """Check the values that a type cannot.
+        """Check values beyond their types.
 
         Raises:
             ConfigError: a value is not one of its choices.
@@ -61,7 +61,7 @@ class Checked:
 
 
 def _refuse_unknown(plain: Any, names: Collection[str], place: str = "") -> None:
-    """Raise a ConfigError for the first key that is none of ``names``, and for what has no keys."""
+    """Raise ConfigError for the first key that is not in ``names``, and for a value that has no keys."""
     if not isinstance(plain, Mapping):
         raise ConfigError(f"{place.rstrip('.')}: expected the keys {', '.join(names)}, got {plain!r}")
     for key in plain:
@@ -71,7 +71,7 @@ def _refuse_unknown(plain: Any, names: Collection[str], place: str = "") -> None
 
 @dataclass
 class RunConfig(Checked):
-    """What all commands have.
+    """The configuration that all commands have.
 
     The groups (dataset, downsampling, noise, method, model) are made by :func:`dsr.utils.builder.build`, which checks
     their keys against what the class or function that they name takes.
@@ -89,7 +89,7 @@ class RunConfig(Checked):
     overwrite: bool = False
 
     def check(self) -> None:
-        """Check the values that a type cannot.
+        """Check values beyond their types.
 
         Raises:
             ConfigError: a value is not one of its choices.
@@ -115,7 +115,7 @@ class EvalConfig(RunConfig):
 
 @dataclass
 class TrainerConfig:
-    """How long and with what to train; see ``conf/trainer/default.yaml``."""
+    """The training's steps, data and optimiser; see ``conf/trainer/default.yaml``."""
 
     name: str = "default"
     steps: int = 12000
@@ -158,7 +158,7 @@ class TrainConfig(RunConfig):
     resume: str | None = None
 
     def check(self) -> None:
-        """Check the values that a type cannot.
+        """Check values beyond their types.
 
         Raises:
             ConfigError: a value is not one of its choices.
@@ -192,11 +192,11 @@ def user_directories() -> tuple[Path, ...]:
 
 
 def plain_config(config: DictConfig) -> dict[str, Any]:
-    """Return a composed configuration as plain Python, interpolations resolved; what is missing is "???"."""
+    """Return a composed configuration as plain Python, interpolations resolved; missing values are "???"."""
     return OmegaConf.to_container(config, resolve=True)  # type: ignore[return-value]
 
 
 def register() -> None:
-    """Tell Hydra of the schemas."""
+    """Register the schemas with Hydra."""
     ConfigStore.instance().store(name="eval_schema", node=EvalConfig)
     ConfigStore.instance().store(name="train_schema", node=TrainConfig)

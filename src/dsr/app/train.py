@@ -44,8 +44,7 @@ _RESUMABLE = ("resume", "device")
 def train(config: DictConfig) -> Path:
     """Train a network: checkpoints, a TensorBoard log, and the weights of the best validation RMSE_v.
 
-    A run that was interrupted goes on from its last checkpoint when the same command is given again, or
-    ``resume=RUN_DIR``.
+    An interrupted run is continued from its last checkpoint by the same command or by ``resume=RUN_DIR``.
 
     Args:
         config: composed from ``conf/train.yaml``.
@@ -54,8 +53,8 @@ def train(config: DictConfig) -> Path:
         The file of weights.
 
     Raises:
-        ConfigError: the configuration cannot be run, or is trained already.
-        KeyboardInterrupt: somebody stopped it; the message says how to go on.
+        ConfigError: the configuration cannot be run, or its training is already complete.
+        KeyboardInterrupt: the training was interrupted; the message says how to resume it.
 
     """
     plain = _resumed(plain_config(config))
@@ -75,7 +74,7 @@ def train(config: DictConfig) -> Path:
     folder = Path(settings.output_dir or rundir.default_directory("train", plain, identity)).expanduser()
     weights, last = folder / WEIGHTS, folder / "checkpoints" / "last.ckpt"
     if weights.exists() and not settings.overwrite:
-        raise ConfigError(f"output_dir: {weights} is trained already; overwrite=true trains it anew")
+        raise ConfigError(f"output_dir: {weights} is trained already; overwrite=true trains it again")
     metrics = functools.partial(metric_collection, settings.metrics, device)
     module = _module(settings, net, data, metrics)
     tolerated = ("code", "device") if "resume" in given_keys() else ()
@@ -94,7 +93,7 @@ def train(config: DictConfig) -> Path:
         fit(trainer, module, data, resume)
     except KeyboardInterrupt:
         raise KeyboardInterrupt(
-            f"interrupted at step {trainer.global_step}; python train.py resume={folder} goes on from there"
+            f"interrupted at step {trainer.global_step}; resume={folder} goes on from there"
         ) from None
     if trainer.is_global_zero:
         _export(module, Path(best.best_model_path), weights, facts)
@@ -103,7 +102,7 @@ def train(config: DictConfig) -> Path:
 
 
 def _resumed(plain: dict[str, Any]) -> dict[str, Any]:
-    """Return the configuration, or that of the run which is to be gone on with."""
+    """Return the configuration, or the configuration of the run to resume."""
     if plain.get("resume") is None:
         return plain
     folder = Path(plain["resume"]).expanduser()
@@ -116,7 +115,7 @@ def _resumed(plain: dict[str, Any]) -> dict[str, Any]:
 
 
 def _network(settings: TrainConfig) -> DisparityNetwork:
-    """Return the network, with weights to start from where they are given."""
+    """Build the network, with initial weights if they are given."""
     net: DisparityNetwork = build("model", settings.model, {"scale": settings.scale})
     if settings.trainer.init is None:
         return net
@@ -146,7 +145,7 @@ def _shapes(net: DisparityNetwork) -> dict[str, torch.Size]:
 
 
 def _module(settings: TrainConfig, net: DisparityNetwork, data: PatchData, metrics: Any) -> SuperResolution:
-    """Return the network under training; where w is computed from the scenes, its loss has a provisional w of 1."""
+    """Build the training module; if w is computed from the scenes, its loss has a provisional w of 1."""
     depth_loss: Any = settings.model.get("depth_loss")
     visual = settings.model.get("visual")
     if not isinstance(visual, bool):
@@ -161,7 +160,7 @@ def _module(settings: TrainConfig, net: DisparityNetwork, data: PatchData, metri
 
 
 def _load(progress: Progress, settings: TrainConfig, module: SuperResolution, data: PatchData) -> None:
-    """Have the scenes rendered or resized, load them, and compute w from training patches where it is ``auto``."""
+    """Prepare and load the scenes, and compute w from training patches if it is ``auto``."""
     for source, names in data.used_scenes:
         prepare_scenes(source, names, progress)
     try:
@@ -180,7 +179,7 @@ def _computes_w(settings: TrainConfig) -> bool:
 
 
 def _clear(folder: Path) -> None:
-    """Take away what a former training left, lest it pass for this one's should it be interrupted."""
+    """Remove the files of an earlier training, so that they are not taken for this one's if it is interrupted."""
     (folder / WEIGHTS).unlink(missing_ok=True)
     for name in ("checkpoints", "tensorboard"):
         shutil.rmtree(folder / name, ignore_errors=True)
@@ -194,7 +193,7 @@ def _announce(
     folder: Path,
     resume: Path | None,
 ) -> None:
-    """Say what the run will do, and how long it will take."""
+    """Show what the run will do, and how long it will take."""
     trainer, objective = settings.trainer, module.objective
     step = seconds_per_step(module, data.example_batch()) * trainer.accumulate
     held_out = ", ".join(f"{len(names)} of {kind}" for kind, (_, names) in data.validation_scenes().items())
@@ -220,14 +219,14 @@ def _formula(objective: Objective) -> str:
 
 
 def _describe(trainer: lightning.Trainer, plain: Mapping[str, Any], module: SuperResolution) -> None:
-    """Write the configuration, and the w that came of it, where the dashboard shows them."""
+    """Write the configuration and the resulting w to TensorBoard's log."""
     writer: Any = trainer.logger.experiment  # type: ignore[union-attr]
     text = OmegaConf.to_yaml(OmegaConf.create({**plain, "loss": {"w": module.objective.w}}))
     writer.add_text("config", f"```yaml\n{text}```")
 
 
 def _facts(plain: Mapping[str, Any], module: SuperResolution) -> dict[str, Any]:
-    """Return what a reader of the weights or of the log should know of the training."""
+    """Return the training's main settings, for the weights' header and the log."""
     groups = ("model", "dataset", "downsampling", "noise", "trainer")
     return {
         **{group: plain[group]["name"] for group in groups},
@@ -239,7 +238,7 @@ def _facts(plain: Mapping[str, Any], module: SuperResolution) -> dict[str, Any]:
 
 
 def _export(module: SuperResolution, best: Path, weights: Path, facts: Mapping[str, Any]) -> None:
-    """Write the averaged weights of the best checkpoint, and what led to them."""
+    """Write the averaged weights of the best checkpoint, with the training's main settings."""
     checkpoint = torch.load(best, map_location="cpu", weights_only=True)
     state = checkpoint["state_dict"]
     prefix = "average."

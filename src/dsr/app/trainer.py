@@ -28,26 +28,26 @@ class Throughput(Callback):
         self._start = time.perf_counter()
 
     def on_train_start(self, *_: Any) -> None:
-        """Begin."""
+        """Start the clock."""
         self._start = time.perf_counter()
 
     def on_train_batch_end(
         self, trainer: lightning.Trainer, pl_module: lightning.LightningModule, outputs: Any, batch: Batch, *_: Any
     ) -> None:
-        """Log the speed of the batch, the time that it took to load included."""
+        """Log the speed of the batch, including its loading time."""
         now = time.perf_counter()
         pl_module.log("train/patches_per_second", len(batch["rgb"]) * trainer.world_size / (now - self._start))
         self._start = now
 
     def on_validation_end(self, *_: Any) -> None:
-        """Leave the validation out."""
+        """Restart the clock, so that the validation is not counted."""
         self._start = time.perf_counter()
 
 
 def training_trainer(
     settings: TrainerConfig, folder: Path, device: torch.device, progress: Progress, table: Mapping[str, Any]
 ) -> tuple[lightning.Trainer, ModelCheckpoint]:
-    """Return the trainer, and the callback that knows the best checkpoint.
+    """Return the trainer, and the callback that keeps the best checkpoint.
 
     Args:
         settings: of the training.
@@ -86,7 +86,7 @@ def training_trainer(
 
 
 def seconds_per_step(module: SuperResolution, batch: Batch) -> float:
-    """Return how long a step takes, measured; the module is left as it was."""
+    """Measure the seconds of a step; the module is left unchanged."""
     batch = {name: value.to(module.device) for name, value in batch.items()}
     taken = 0.0
     for _ in range(2):  # the first one warms up

@@ -1,4 +1,4 @@
-"""The directory of a training, seen from outside: its configuration, its data, and how to evaluate its network."""
+"""Read the directory of a training: its configuration, its data, and how to evaluate its network."""
 
 from __future__ import annotations
 
@@ -24,15 +24,15 @@ _NOT_WITH_RUN = ("method", "scale", "weights")
 
 
 def read_config(folder: Path) -> dict[str, Any]:
-    """Return the configuration of a training, its targets named as they are now.
+    """Read the configuration of a training, with the current paths of its targets.
 
     Raises:
-        ConfigError: the directory is no training's.
+        ConfigError: the directory is not that of a training.
 
     """
     try:
         config = OmegaConf.to_container(OmegaConf.load(folder / "config.yaml"))
-    except Exception as error:  # a file that is missing, no text, no YAML: each library has its own
+    except Exception as error:  # a file that is missing, not text or not YAML raises many types
         raise ConfigError(f"{folder}: expected the directory of a training, it has no readable config.yaml") from error
     if not isinstance(config, dict) or "model" not in config:
         raise ConfigError(f"{folder}: expected the directory of a training, its config.yaml names no model")
@@ -42,7 +42,7 @@ def read_config(folder: Path) -> dict[str, Any]:
 def studies_of_run(
     plain: Mapping[str, Any], given: Sequence[str]
 ) -> Iterator[tuple[dict[str, Any], SceneSource | None]]:
-    """Yield what ``eval.py run=RUN_DIR`` evaluates: configurations, and the data set unless it is the configuration's.
+    """Yield what ``eval.py run=RUN_DIR`` evaluates: configurations, with data sets (None for the configuration's own).
 
     Args:
         plain: the composed configuration of ``eval.py``.
@@ -59,7 +59,7 @@ def studies_of_run(
         raise ConfigError(f"run: {folder} has no {WEIGHTS}; the training is not finished")
     for key in given:
         if key.partition(".")[0] in _NOT_WITH_RUN:
-            raise ConfigError(f"{key}: run={folder} says it itself; leave one of them out")
+            raise ConfigError(f"{key}: run={folder} sets it, too; leave one of them out")
     chosen = {key.partition(".")[0] for key in given}
     own = {key: run[key] for key in _FROM_RUN if key not in chosen}
     name = run["model"]["name"]
@@ -80,7 +80,7 @@ def studies_of_run(
 
 
 def training_data(settings: TrainConfig) -> PatchData:
-    """Return the patches that the configuration describes."""
+    """Build the patches that the configuration describes."""
     trainer = settings.trainer
     downsampling = build("downsampling", settings.downsampling)
     if not isinstance(downsampling, Downsampling):
@@ -95,28 +95,28 @@ def training_data(settings: TrainConfig) -> PatchData:
 
 
 def keyed(error: Exception) -> ConfigError:
-    """Return an error of a training's parts, with the key that sets the argument which it names."""
+    """Return an error of a training's parts as a ConfigError that names the configuration key."""
     names = [field.name for field in dataclasses.fields(TrainerConfig)]
     return ConfigError(with_key(with_key(str(error), "trainer", names), "model", ["depth_loss"]))
 
 
 def common(target: type, settings: TrainerConfig) -> dict[str, Any]:
-    """Return the trainer's settings that a dataclass has, too, by name."""
+    """Return the trainer's settings that are also fields of a dataclass, by name."""
     theirs = {field.name for field in dataclasses.fields(target)}
     return {name: value for name, value in dataclasses.asdict(settings).items() if name in theirs}
 
 
 def _parts(node: Mapping[str, Any]) -> list[Part]:
-    """Return the data sets to train on, with their shares."""
+    """Build the data sets to train on, with their fractions."""
     if "parts" not in node:
         return [Part(build("dataset", node))]
-    parts, shares = node["parts"], node.get("shares")
-    if not isinstance(parts, Mapping) or not isinstance(shares, Mapping) or parts.keys() != shares.keys():
-        raise ConfigError(f"dataset.shares: expected a number for each of {', '.join(parts)}, got {shares}")
-    for name, share in shares.items():
-        if isinstance(share, bool) or not isinstance(share, (int, float)) or not share >= 0:
-            raise ConfigError(f"dataset.shares.{name}: expected 0 or a positive number, got {share!r}")
-    used = {name: share for name, share in shares.items() if share > 0}
+    parts, fractions = node["parts"], node.get("shares")
+    if not isinstance(parts, Mapping) or not isinstance(fractions, Mapping) or parts.keys() != fractions.keys():
+        raise ConfigError(f"dataset.shares: expected a number for each of {', '.join(parts)}, got {fractions}")
+    for name, fraction in fractions.items():
+        if isinstance(fraction, bool) or not isinstance(fraction, (int, float)) or not fraction >= 0:
+            raise ConfigError(f"dataset.shares.{name}: expected 0 or a positive number, got {fraction!r}")
+    used = {name: fraction for name, fraction in fractions.items() if fraction > 0}
     if not used:
         raise ConfigError("dataset.shares: expected a positive number among them, all are 0")
-    return [Part(build(f"dataset.parts.{name}", parts[name]), share) for name, share in used.items()]
+    return [Part(build(f"dataset.parts.{name}", parts[name]), fraction) for name, fraction in used.items()]

@@ -13,14 +13,14 @@ from dsr.utils.console import INTERRUPTED, USAGE_ERROR, one_line, open_console, 
 
 _EXAMPLES = """\
 examples:
-  dsr upsample --rgb photo.jpg --depth depth.png -o out    finer depth, mesh and pictures from your own camera
+  dsr upsample --rgb photo.jpg --depth depth.png -o out    high-resolution depth, mesh and pictures
   dsr eval method=facets dataset=simgeo scale=8            evaluate a method; more with dsr eval --help
   dsr train model=facets trainer=smoke                     train a network; more with dsr train --help
   dsr report outputs/eval -o report                        tables, figures and a page of all evaluations
   dsr study build outputs/eval --scale 4 -o study          a page that asks people which result looks best
-  dsr study collect study answers/*.json                   what they answered, with intervals
-  dsr data list                                            which data sets there are, and what of them is here
-  dsr data get middlebury                                  fetch the seven scenes of the paper's tables
+  dsr study collect study answers/*.json                   their answers, with confidence intervals
+  dsr data list                                            all data sets, and which of them are on this machine
+  dsr data get middlebury                                  download the seven scenes of the paper's tables
   dsr doctor my_scenes                                     check a directory of your own scenes
 
 In a checkout of the project, `python eval.py` and `python train.py` are the same as `dsr eval` and `dsr train`.
@@ -29,11 +29,11 @@ _COMMANDS = (upsample, hydra_commands, report, study, data, doctor)
 
 
 def main(arguments: Sequence[str] | None = None, catalogue: Mapping[str, Collection] | None = None) -> int:
-    """Run the command, and return its exit code: 0, 2 where something is wrong, 130 when interrupted.
+    """Run the command, and return its exit code: 0, 2 after an error, 130 when interrupted.
 
     Args:
-        arguments: of the command line; those of the process where None.
-        catalogue: the data sets to offer; :data:`dsr.data.download.catalogue.CATALOGUE` where None.
+        arguments: command-line arguments; None for those of the process.
+        catalogue: the data sets to offer; None for :data:`dsr.data.download.catalogue.CATALOGUE`.
 
     """
     options = _parser().parse_args(arguments)
@@ -41,7 +41,7 @@ def main(arguments: Sequence[str] | None = None, catalogue: Mapping[str, Collect
     try:
         problems = options.run(options, console, CATALOGUE if catalogue is None else catalogue)
     except KeyboardInterrupt:
-        show(Console(stderr=True), "interrupted; what was finished is kept, run the same command again to go on")
+        show(Console(stderr=True), "interrupted; finished work is kept, run the same command again to continue")
         return INTERRUPTED
     except (ValueError, OSError) as error:
         problems = [one_line(error)]

@@ -15,19 +15,19 @@ examples:
   dsr data prepare middlebury dataset.scenes=found
   DSR_DATA=/large/disk dsr data where icl
 
-Everything lies below one directory: $DSR_DATA, or ./data.
+All data sets are below one directory: $DSR_DATA, or ./data.
 """
 _GET_NOTES = """\
-An interrupted download goes on where it stopped when the same command is run again.
+Run the same command again to continue an interrupted download.
 
-The first time a file comes, its SHA-256 is written into checksums.json; ever after it has to have that one.
+The SHA-256 of a file is written into checksums.json when it is first downloaded; later downloads have to match it.
 
-A mirror has every file under the path that it has below the directory of the data sets, and every archive in the
-folder of its data set:
+A mirror has every file under the same path as below the directory of the data sets, and every archive in the folder
+of its data set:
   URL/middlebury2014/Vintage-perfect/im0.png
   URL/sunrgbd/SUNRGBD.zip
   URL/icl_nuim/office_room_traj0_frei_png.tar.gz
-An archive that you put there by hand is used instead of being fetched, and kept.
+An archive that you put there by hand is used instead of being downloaded, and kept.
 """
 
 
@@ -42,7 +42,9 @@ def add(commands: Any) -> None:
         formatter_class=style,
     )
     tasks = data.add_subparsers(title="commands", metavar="COMMAND", required=True)
-    tasks.add_parser("list", help="what there is, and what of it is here").set_defaults(run=_run, task="list")
+    tasks.add_parser("list", help="all data sets, and which of them are on this machine").set_defaults(
+        run=_run, task="list"
+    )
 
     where = tasks.add_parser("where", help="the directory of the data sets, or the folders of some")
     where.add_argument("names", nargs="*", metavar="NAME", help="a data set, as in `dsr data list`")
@@ -52,7 +54,7 @@ def add(commands: Any) -> None:
     fetch.add_argument("names", nargs="+", metavar="NAME", help="a data set, as in `dsr data list`")
     fetch.add_argument("--mirror", metavar="URL", help="a server to try first, see below")
     fetch.add_argument("--yes", "-y", action="store_true", help="do not ask")
-    fetch.add_argument("--keep-archives", action="store_true", help="keep archives after they were unpacked")
+    fetch.add_argument("--keep-archives", action="store_true", help="keep archives after unpacking")
     fetch.set_defaults(run=_run, task="get")
 
     check = tasks.add_parser("verify", help="check every file against its recorded size and checksum")

@@ -1,4 +1,4 @@
-"""The tasks of ``dsr data``; apart from its options, as what they import is not needed to parse these."""
+"""The tasks of ``dsr data``; separate from its options, which are parsed without importing them."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def show_folders(options: argparse.Namespace, console: Console, catalogue: Mappi
 
 
 def get_data_sets(options: argparse.Namespace, console: Console, catalogue: Mapping[str, Collection]) -> list[str]:
-    """Show what will be fetched and on which terms, ask on a terminal, and fetch it."""
+    """Show what will be downloaded and its licence, ask for confirmation on a terminal, and download it."""
     collections = find(options.names, catalogue)
     if options.mirror is not None and not options.mirror.startswith(("http://", "https://")):
         raise ValueError(f"--mirror: expected an address that begins with http:// or https://, got {options.mirror!r}")
@@ -67,7 +67,7 @@ def get_data_sets(options: argparse.Namespace, console: Console, catalogue: Mapp
 
 
 def _describe(collection: Collection, console: Console) -> None:
-    """Show what a collection is, and on which terms."""
+    """Show a collection's title, size, page, licence and citation."""
     size = "" if collection.size is None else f", about {megabytes(collection.size)}"
     show(console, f"{collection.name}: {collection.title}{size}")
     for key, text in (("page", collection.homepage), ("licence", collection.licence), ("cite", collection.citation)):
@@ -77,7 +77,7 @@ def _describe(collection: Collection, console: Console) -> None:
 
 
 def _agreed(console: Console) -> bool:
-    """Return whether the user wants it."""
+    """Ask for confirmation, and return whether the user agrees."""
     console.print("fetch them? [Y/n] ", markup=False, highlight=False, end="")
     try:
         answer = console.input()

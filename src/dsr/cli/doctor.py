@@ -11,7 +11,9 @@ def add(commands: Any) -> None:
     """Add the command to the parser's commands."""
     parser = commands.add_parser("doctor", help="check a directory of your own scenes")
     parser.add_argument("directory", type=Path, metavar="DIR", help="a scene, or a directory of scenes")
-    parser.add_argument("--most", type=int, metavar="N", help="examine N scenes at most, spread over all")
+    parser.add_argument(
+        "--most", type=int, metavar="N", help="examine at most N scenes, taken at equal distances from all"
+    )
     parser.set_defaults(run=_run)
 
 

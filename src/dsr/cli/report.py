@@ -9,8 +9,8 @@ from typing import Any
 from rich.console import Console
 
 _DESCRIPTION = """\
-Tables, figures, the metric study and a page from runs of eval.py: whatever lies in and below the directories is read,
-and nothing else is needed.
+Make tables, figures, the metric study and a page from runs of eval.py. All runs in and below the directories are read;
+no other files are needed.
 """
 _EXAMPLES = """\
 examples:
@@ -42,7 +42,7 @@ def add(commands: Any) -> None:
     parser.add_argument("--scale", type=int, nargs="+", default=[], metavar="N", help="these alone")
     parser.add_argument("--light", default="e1", metavar="NAME", help="of the figures: e1 (default), e2, e3 or e4")
     parser.add_argument("--title", default="Depth super-resolution", help="of the page")
-    parser.add_argument("--page-mb", type=float, default=60.0, metavar="MB", help="most that the page may weigh; 60")
+    parser.add_argument("--page-mb", type=float, default=60.0, metavar="MB", help="maximum size of the page; 60")
     parser.add_argument("--only", metavar="A,B", help="these parts alone, of tables, metrics, figures, page")
     parser.set_defaults(run=_run)
 
@@ -51,7 +51,7 @@ def _run(options: argparse.Namespace, console: Console, _: object) -> list[str]:
     """Make the report."""
     from dsr.app.report import PARTS, ReportRequest, make_report  # noqa: PLC0415 - it takes seconds to import
 
-    wanted = ReportRequest(
+    request = ReportRequest(
         tuple(options.methods),
         tuple(options.datasets),
         tuple(options.scale),
@@ -60,5 +60,5 @@ def _run(options: argparse.Namespace, console: Console, _: object) -> list[str]:
         options.title,
         options.page_mb,
     )
-    make_report(options.runs, options.output, options.study, wanted, console)
+    make_report(options.runs, options.output, options.study, request, console)
     return []

@@ -1,4 +1,4 @@
-"""``dsr study``: a page that asks people which rendering looks most like the truth, and what they said."""
+"""``dsr study``: ask people which rendering looks most like the ground truth, and collect their answers."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ examples:
   dsr study build outputs/eval --scale 4 --methods bicubic msg_v facets --repeat 2 -o study
   dsr study build outputs/eval --scenes-per-person 10 --send-to "Mail the file to study@example.org." -o study
 
-Give people index.html alone: key.json says which picture is of which method.
+Give people only index.html: key.json says which method made which picture.
 """
 _COLLECT_NOTES = """\
-Files that are damaged, incomplete or of another study are named and left out, and so are doubles: of one person's
-files the one finished first counts. Exit code 2 where nothing is left.
+Files that are damaged, incomplete or of another study are named and left out. If one person sent several files, only
+the one finished first counts. The exit code is 2 if no file is left.
 
 Join the table to a report: dsr report RUNS --study study/study.csv
 """
@@ -37,7 +37,7 @@ Join the table to a report: dsr report RUNS --study study/study.csv
 def add(commands: Any) -> None:
     """Add the command to the parser's commands."""
     raw = argparse.RawDescriptionHelpFormatter
-    about = "ask people which rendering looks most like the truth"
+    about = "ask people which rendering looks most like the ground truth"
     parser = commands.add_parser("study", help=about, description=about, epilog=_EXAMPLES, formatter_class=raw)
     steps = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
     about = "make a page that needs no network, from runs of eval.py"
@@ -49,13 +49,21 @@ def add(commands: Any) -> None:
     build.add_argument("--downsampling", nargs="+", default=[], metavar="NAME", help="these alone")
     build.add_argument("--methods", nargs="+", default=[], metavar="NAME", help="these alone")
     build.add_argument("--scenes", nargs="+", default=[], metavar="NAME", help="these alone")
-    build.add_argument("--scenes-per-person", type=int, metavar="N", help="of each person, drawn at random")
+    build.add_argument("--scenes-per-person", type=int, metavar="N", help="for each person, drawn at random")
     build.add_argument(
-        "--repeat", type=int, default=0, metavar="N", help="N of them come twice, to see how sure people are"
+        "--repeat",
+        type=int,
+        default=0,
+        metavar="N",
+        help="N of them are shown twice, to measure how consistent people are",
     )
     build.add_argument("--title", metavar="TEXT", help="of the page")
-    build.add_argument("--send-to", metavar="TEXT", help="what the last page says to do with the file of answers")
-    build.add_argument("--overwrite", action="store_true", help="replace another study; its answers lose their key")
+    build.add_argument(
+        "--send-to", metavar="TEXT", help="instructions on the last page for sending the file of answers"
+    )
+    build.add_argument(
+        "--overwrite", action="store_true", help="replace another study, whose answers can then no longer be collected"
+    )
     build.set_defaults(run=_build)
     about = "turn the files that people saved into a table"
     collect = steps.add_parser("collect", help=about, description=about, epilog=_COLLECT_NOTES, formatter_class=raw)
@@ -90,9 +98,9 @@ def _build(options: argparse.Namespace, console: Console, _: object) -> list[str
     labels = dict.fromkeys(each.label for trial in key.trials.values() for each in trial.candidates.values())
     count, size = len(key.trials), built.page.stat().st_size / 1e6
     show(console, f"study {key.study}: {count} scenes under {key.light}; {', '.join(labels)}")
-    asked = key.scenes_per_person + key.repeat
-    show(console, f"{built.page}  {size:.1f} MB, {asked} questions for each person; give people this file alone")
-    show(console, f"{options.output / 'key.json'}  which picture is of which method; keep it to yourself")
+    questions = key.scenes_per_person + key.repeat
+    show(console, f"{built.page}  {size:.1f} MB, {questions} questions for each person; give people only this file")
+    show(console, f"{options.output / 'key.json'}  which method made which picture; keep it to yourself")
     return []
 
 

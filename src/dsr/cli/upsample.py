@@ -1,4 +1,4 @@
-"""``dsr upsample``: finer depth for people's own pairs of photo and depth map."""
+"""``dsr upsample``: depth super-resolution for your own photos and depth maps."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from typing import Any
 from rich.console import Console
 
 _DESCRIPTION = """\
-Make the depth maps of your own photos as fine as the photos, and their surfaces as they look.
+Upsample the depth maps of your own photos to the photos' resolution.
 
 Give --rgb and --depth, or folders that hold both. The depth map has to be registered to the photo: the same view, the
-same field of view, any size up to the photo's. What is not given is told from the files or assumed, and said."""
+same field of view, any size up to the photo's. What is not given is read from the files or assumed, and reported."""
 _EXAMPLES = """\
 examples:
   dsr upsample --rgb photo.jpg --depth depth.png -o out
@@ -25,9 +25,9 @@ examples:
   dsr upsample --rgb photo.jpg --depth depth.png --method tgv --set data_weight=30 -o out
   dsr upsample recordings --dry-run -o out       what would be done, and what would be assumed
 
-A single pair's results lie in OUT itself, those of several in OUT/NAME: depth.* as the input counts, depth_metres.npy,
+The results of a single pair are in OUT, those of several in OUT/NAME: depth.* as the input is stored, depth_metres.npy,
 renderings/, normals.png, cloud.ply, mesh.ply, mesh.glb, before_after.png, and info.json with all settings and
-assumptions. The same command goes on where it was interrupted. More in docs/upsample.md.
+assumptions. Run the same command again to continue after an interruption. More in docs/upsample.md.
 """
 
 
@@ -35,7 +35,7 @@ def add(commands: Any) -> None:
     """Add the command to the parser's commands."""
     parser = commands.add_parser(
         "upsample",
-        help="make the depth of your own photos finer",
+        help="upsample the depth of your own photos",
         description=_DESCRIPTION,
         epilog=_EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
@@ -44,7 +44,9 @@ def add(commands: Any) -> None:
     what.add_argument("folders", nargs="*", type=Path, metavar="FOLDER", help="folders of photos and depth maps")
     what.add_argument("--rgb", nargs="+", type=Path, default=[], metavar="PHOTO", help="photos, or a folder of them")
     what.add_argument("--depth", nargs="+", type=Path, default=[], metavar="MAP", help="depth maps, one for each photo")
-    what.add_argument("--mask", nargs="+", type=Path, default=[], metavar="MASK", help="pictures, 0 at unknown depth")
+    what.add_argument(
+        "--mask", nargs="+", type=Path, default=[], metavar="MASK", help="pictures, 0 where depth is missing"
+    )
     _add_reading(parser)
     _add_method(parser)
     _add_results(parser)
@@ -52,8 +54,10 @@ def add(commands: Any) -> None:
 
 
 def _add_reading(parser: argparse.ArgumentParser) -> None:
-    """Add how the files are to be read."""
-    reading = parser.add_argument_group("how the files count (told from the files, or assumed and said)")
+    """Add the options of how to read the files."""
+    reading = parser.add_argument_group(
+        "how to read the files (if not given: read from the files, or assumed and reported)"
+    )
     camera = reading.add_mutually_exclusive_group()
     camera.add_argument("--camera", type=Path, metavar="FILE", help="camera.json, Open3D's JSON, or a 3 x 3 matrix")
     camera.add_argument("--fov", type=float, metavar="DEGREES", help="horizontal field of view of the photo")
@@ -64,12 +68,12 @@ def _add_reading(parser: argparse.ArgumentParser) -> None:
         "--range-type", choices=types, help="depth along the axis (default), along the ray, or disparity"
     )
     reading.add_argument("--baseline", type=float, metavar="METRES", help="between the cameras, for disparity")
-    reading.add_argument("--hole-value", type=float, metavar="VALUE", help="one more value that means unknown")
+    reading.add_argument("--hole-value", type=float, metavar="VALUE", help="another value that marks missing depth")
 
 
 def _add_method(parser: argparse.ArgumentParser) -> None:
-    """Add how it is computed."""
-    method = parser.add_argument_group("how it is done")
+    """Add the options of the method."""
+    method = parser.add_argument_group("method")
     method.add_argument(
         "--method",
         default="auto",
@@ -94,11 +98,11 @@ def _add_method(parser: argparse.ArgumentParser) -> None:
     )
     method.add_argument("--scale", type=int, metavar="N", help="upsampling factor (default: from the sizes)")
     method.add_argument("--device", default="auto", metavar="DEVICE", help="auto (default), cpu, cuda, cuda:1, ...")
-    method.add_argument("--keep-holes", action="store_true", help="leave holes of the input holes")
+    method.add_argument("--keep-holes", action="store_true", help="keep the input's holes")
 
 
 def _add_results(parser: argparse.ArgumentParser) -> None:
-    """Add what is written."""
+    """Add the options of the results."""
     results = parser.add_argument_group("what is written")
     results.add_argument("-o", "--output", type=Path, required=True, metavar="OUT", help="folder of the results")
     results.add_argument("--format", metavar="FORMAT", help="of the depth: png, tiff, npy, npz, pfm, exr (the input's)")
@@ -106,7 +110,7 @@ def _add_results(parser: argparse.ArgumentParser) -> None:
     chosen = results.add_mutually_exclusive_group()
     chosen.add_argument("--only", type=_words, metavar="PARTS", help=f"some of {parts}")
     chosen.add_argument("--without", type=_words, default=(), metavar="PARTS", help="all but these")
-    results.add_argument("--overwrite", action="store_true", help="redo what is there, replace other results")
+    results.add_argument("--overwrite", action="store_true", help="redo existing results, replace other ones")
     results.add_argument("--dry-run", action="store_true", help="read the files and say what would be done")
 
 
@@ -116,7 +120,7 @@ def _words(text: str) -> tuple[str, ...]:
 
 
 def _run(options: argparse.Namespace, console: Console, _: object) -> list[str]:
-    """Upsample, and return what went wrong."""
+    """Upsample, and return the problems."""
     from dsr.app.upsample.outputs import PARTS  # noqa: PLC0415
     from dsr.app.upsample.run import UpsampleRequest, run  # noqa: PLC0415
     from dsr.app.upsample.settings import parse_settings  # noqa: PLC0415
@@ -128,7 +132,7 @@ def _run(options: argparse.Namespace, console: Console, _: object) -> list[str]:
     unit = None if options.depth_unit is None else parse_unit(options.depth_unit)
     if options.baseline is not None and not 0 < options.baseline < float("inf"):
         raise ValueError(f"--baseline: expected a positive number of metres, got {options.baseline:g}")
-    if options.hole_value is not None and math.isnan(options.hole_value):  # NaN is one anyway
+    if options.hole_value is not None and math.isnan(options.hole_value):  # NaN always marks missing depth
         options.hole_value = None
     choice = CameraChoice(options.camera, options.fov, intrinsics)
     unknown = [part for part in options.without if part not in PARTS]
