@@ -23,7 +23,7 @@ _NOT_IDENTITY = ("output_dir", "overwrite", "metrics", "weights", "resume", "run
 PREDICTING_CODE = (
     "sample.py", "degradation", "geometry", "metrics", "synthetic", "methods", "data", "training",
     "utils/builder.py", "utils/config_files.py", "utils/devices.py", "utils/lightning.py", "utils/progress.py",
-    "evaluation/predict.py",
+    "utils/validation.py", "evaluation/predict.py",
 )  # fmt: skip
 """Modules and packages that determine a prediction, by their paths below the package."""
 
