@@ -1,7 +1,7 @@
-"""What the directory of an evaluation holds of each scene: the sample, the prediction, and how the iteration went.
+"""The files of each scene in the directory of an evaluation: the sample, the prediction and the iterations.
 
 ``scenes/SCENE.npz`` is the sample that the method was given, see :meth:`dsr.sample.DepthSample.save`. It is written
-with the prediction, so that scoring and drawing need nothing but the directory. ``predictions/SCENE.npz`` has ``depth``
+with the prediction, so that scoring and drawing need only the directory. ``predictions/SCENE.npz`` has ``depth``
 (H, W) in metres, NaN where missing, and what it was made from. ``iterations/SCENE.csv`` is the history of a method that
 iterates.
 """

@@ -1,4 +1,4 @@
-"""What every super-resolution method is: a callable from a sample to high-resolution depth."""
+"""The interface of super-resolution methods: a callable from a sample to high-resolution depth."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from dsr.utils.progress import Steps
 
 
 class NoSolutionError(ValueError):
-    """A method has no answer for an image, through no fault of the image's: a result to report, as papers do."""
+    """A method has no solution for a valid image, which is reported as a result, as papers do."""
 
 
 @dataclass(frozen=True)
 class Cost:
-    """What a method costs, roughly, as measured on two CPU cores; a class says it as its attribute ``cost``.
+    """The rough cost of a method, measured on two CPU cores; a class states it as its attribute ``cost``.
 
     Args:
         memory: bytes for each pixel of the guide image.
-        seconds: for a million of these pixels.
+        seconds: seconds for a million of these pixels.
 
     """
 
@@ -31,27 +31,27 @@ class Cost:
 
 
 class Upsampler(Protocol):
-    """A depth super-resolution method: a network, a per-image optimisation or a classical filter alike.
+    """A depth super-resolution method: a network, a per-image optimisation or a classical filter.
 
     Attributes:
-        range_type: the range type that it works on. Unless told otherwise the downsampling model is applied to that
-            type too, as in the paper, which evaluates every method on the type that it was designed for.
+        range_type: the range type that it works on. By default the downsampling model is applied to that
+            type, too, as in the paper, which evaluates every method on the type that it was designed for.
 
     """
 
     range_type: RangeType
 
     def __call__(self, sample: DepthSample, progress: Steps | None = None) -> Tensor:
-        """Return the HR orthogonal depth, (1, H, W) in metres on the sample's device, NaN where there is none.
+        """Return the HR orthogonal depth, (1, H, W) in metres on the sample's device, NaN where missing.
 
         A method never reads ``sample.depth``.
 
         Args:
-            sample: the problem.
+            sample: the guide image, the low-resolution depth and the cameras.
             progress: is called with the steps done and their total, by methods that take more than one.
 
         Raises:
-            NoSolutionError: it has none for this image.
+            NoSolutionError: the method has no solution for this image.
 
         """
         ...
@@ -59,11 +59,11 @@ class Upsampler(Protocol):
 
 @runtime_checkable
 class Iterative(Protocol):
-    """An :class:`Upsampler` that iterates, and records how it went.
+    """An :class:`Upsampler` that iterates, and records its progress.
 
     Attributes:
-        history: of the last call, one entry for each look at the iterates: ``iteration`` first, then what the method
-            watches, such as ``objective`` and ``moved``, in an order of its own.
+        history: of the last call, one entry per recorded iteration: ``iteration`` first, then the method's own
+            quantities, such as ``objective`` and ``moved``, in an order of its own.
 
     """
 
@@ -71,11 +71,11 @@ class Iterative(Protocol):
 
 
 def expect_limits(tolerance: float, **counts: int) -> None:
-    """Check when an iteration ends.
+    """Check the stopping criteria of an iteration.
 
     Args:
-        tolerance: how little has to change.
-        **counts: the most steps that it may take, by the parameter's name.
+        tolerance: the change below which the iteration stops.
+        **counts: maximum numbers of steps, by the parameter's name.
 
     Raises:
         ValueError: the tolerance is negative, or a count less than 1.

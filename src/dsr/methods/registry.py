@@ -1,4 +1,4 @@
-"""The methods that there are, and how one of them is built.
+"""List, read and build the methods.
 
 A method is a file of ``conf/method``, in the project's configuration or in a directory of the user's: its ``target`` is
 the class or function that makes it, its other keys are the arguments. ``eval.py`` composes that file with Hydra;
@@ -23,7 +23,7 @@ from dsr.utils.builder import ConfigError, build, load_target, takes
 from dsr.utils.config_files import config_directories, list_choices
 
 _NETWORK = "network"
-"""Key of a method's node: the dotted path of the network's class, where the method is what a training led to."""
+"""Key of a method's node: the dotted path of the network's class, for a method whose weights come from a training."""
 
 
 def list_methods(directories: Sequence[Path] = ()) -> list[str]:
@@ -39,7 +39,7 @@ def list_methods(directories: Sequence[Path] = ()) -> list[str]:
 def read_method(
     name: str, scale: int, settings: Mapping[str, Any] | None = None, directories: Sequence[Path] = ()
 ) -> dict[str, Any]:
-    """Return the node that describes a method, as plain values.
+    """Read the node that describes a method, as plain values.
 
     Args:
         name: the method's name.
@@ -67,30 +67,30 @@ def read_method(
 def build_method(
     node: Mapping[str, Any], scale: int, *, directories: Sequence[Path] = (), weights: Path | None = None, **given: Any
 ) -> Upsampler:
-    """Return the method that a node describes.
+    """Build the method that a node describes.
 
     Args:
         node: of :func:`read_method`, or the group ``method`` of a composed configuration.
         scale: the upsampling factor.
         directories: the user's configuration directories.
         weights: a file of weights, or a directory with the published files; None for those that the node names.
-        **given: what the run decides and the method's file does not, such as ``device``, ``precision``, ``seed`` and
+        **given: values that the run sets, not the method's file, such as ``device``, ``precision``, ``seed`` and
             ``downsampling``, the assumed model; a target gets those that its signature names.
 
     Raises:
-        ConfigError: a key is unknown, missing or of another type, the method refuses a value, or there are no weights.
+        ConfigError: a key is unknown, missing or of another type, the method rejects a value, or there are no weights.
 
     """
-    known = {**dict.fromkeys(("metrics", "workspace", "display")), "seed": 0, **given, "scale": scale}
+    available = {**dict.fromkeys(("metrics", "workspace", "display")), "seed": 0, **given, "scale": scale}
     if takes("method", node, "weights"):
-        known |= {"weights": find_weights(node, scale, weights), "networks": _networks(node, directories)}
+        available |= {"weights": find_weights(node, scale, weights), "networks": _networks(node, directories)}
     arguments = {key: value for key, value in node.items() if key not in ("weights", _NETWORK)}
-    method: Upsampler = build("method", arguments, known)
+    method: Upsampler = build("method", arguments, available)
     return method
 
 
 def find_weights(node: Mapping[str, Any], scale: int, given: Path | None = None) -> Path:
-    """Return the file of weights of a method that takes one.
+    """Find the file of weights of a method that takes one.
 
     Args:
         node: the method's; ``weights`` names its file, or ``weights_packaged`` one that comes with dsr.
@@ -98,7 +98,7 @@ def find_weights(node: Mapping[str, Any], scale: int, given: Path | None = None)
         given: a file of weights, or a directory in which ``weights_file`` is looked for; None for the node's own.
 
     Raises:
-        ConfigError: there is none.
+        ConfigError: there is no such file.
 
     """
     name, file = node["name"], node.get("weights_file")
@@ -118,8 +118,8 @@ def has_weights(node: Mapping[str, Any], scale: int) -> bool:
     if node.get("weights") is not None:
         path = Path(str(node["weights"])).expanduser()
         return path.is_file() and (not is_dsr_weights(path) or read_header(path)["arguments"].get("scale") == scale)
-    wanted = node.get("weights_packaged")
-    return wanted is not None and packaged_weights(str(wanted)) is not None
+    packaged = node.get("weights_packaged")
+    return packaged is not None and packaged_weights(str(packaged)) is not None
 
 
 def target_paths(node: Mapping[str, Any], directories: Sequence[Path] = ()) -> Iterator[str]:
@@ -133,8 +133,8 @@ def target_paths(node: Mapping[str, Any], directories: Sequence[Path] = ()) -> I
 
 def _packaged(node: Mapping[str, Any], scale: int) -> Path:
     """Return the file of the weights that come with dsr."""
-    wanted = node.get("weights_packaged")
-    found = None if wanted is None else packaged_weights(str(wanted))
+    packaged = node.get("weights_packaged")
+    found = None if packaged is None else packaged_weights(str(packaged))
     if found is not None:
         return found
     file, source = node.get("weights_file"), node.get("weights_source")

@@ -1,8 +1,9 @@
 """Build the object that a configuration group describes.
 
-A group's file names its class or function as ``target``; the other keys are the arguments. So the schema of a group is
-the signature of its target, and a new method needs one module and one file. An error of the target that begins with an
-argument's name (``sharpness: expected ...``) is shown with the key that sets it (``method.sharpness: expected ...``).
+A group's file names its class or function as ``target``; the other keys are the arguments. The schema of a group is
+therefore the signature of its target, and a new method needs one module and one file. An error of the target that
+begins with an argument's name (``sharpness: expected ...``) is shown with the key that sets it
+(``method.sharpness: expected ...``).
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ class ConfigError(ValueError):
 
 
 def build(group: str, node: Mapping[str, Any], given: Mapping[str, Any] | None = None) -> Any:
-    """Return what a configuration group describes.
+    """Build the object that a configuration group describes.
 
     Args:
         group: its name, for messages.
@@ -31,7 +32,7 @@ def build(group: str, node: Mapping[str, Any], given: Mapping[str, Any] | None =
         given: values of the whole run (scale, weights, device, ...); the target gets those that its signature names.
 
     Raises:
-        ConfigError: a key is unknown, missing or of another type, or the target refuses a value.
+        ConfigError: a key is unknown, missing or of another type, or the target rejects a value.
 
     """
     target = load_target(group, node)
@@ -42,8 +43,8 @@ def build(group: str, node: Mapping[str, Any], given: Mapping[str, Any] | None =
     own = [key for key in parameters if key not in given]
     for key, value in arguments.items():
         if key not in own:
-            known = ", ".join(own) or "none"
-            raise ConfigError(f"{group}.{key}: unknown key; {group}={node.get('name')} takes {known}")
+            accepted = ", ".join(own) or "none"
+            raise ConfigError(f"{group}.{key}: unknown key; {group}={node.get('name')} takes {accepted}")
         if value == _MISSING:
             raise ConfigError(f"{group}.{key}: {group}={node.get('name')} needs it: {group}.{key}=...")
         if key in hints and not _fits(value, hints[key]):
@@ -60,7 +61,7 @@ def takes(group: str, node: Mapping[str, Any], key: str) -> bool:
 
 
 def trait(group: str, node: Mapping[str, Any], name: str) -> Any:
-    """Return an attribute of a group's target, such as ``optimises``; None where it has none."""
+    """Return an attribute of a group's target, such as ``optimises``; None if it has none."""
     return getattr(load_target(group, node), name, None)
 
 
@@ -80,7 +81,7 @@ def load_target(group: str, node: Mapping[str, Any]) -> Any:
     """Return the class or function that a group names.
 
     Raises:
-        ConfigError: it cannot be imported, or is no class or function.
+        ConfigError: it cannot be imported, or is not a class or function.
 
     """
     path = node.get("target")
@@ -99,7 +100,7 @@ def load_object(key: str, path: Any, what: str) -> Any:
         what: what the object should be, for messages.
 
     Raises:
-        ConfigError: the value is no such path, or the module or the name cannot be imported.
+        ConfigError: the value is not such a path, or the module or the name cannot be imported.
 
     """
     if not isinstance(path, str) or "." not in path:

@@ -1,4 +1,4 @@
-"""What all commands share: exit codes, a console, and the progress shown on it."""
+"""Exit codes, the console and the progress display of all commands."""
 
 from __future__ import annotations
 
@@ -22,22 +22,23 @@ INTERRUPTED = 130
 _LOG_WIDTH = 110
 """Columns where the output is not a terminal."""
 _FIRST_LINE, _NEXT_LINE = 3.0, 10.0
-"""Seconds until the first line about something that goes on, and between two of them, off a terminal."""
+"""Seconds until the first line about running work, and between two such lines, if the output is not a terminal."""
 _TICK = 0.5
 _MANY = 50
-"""Items up to which each gets a line of its own, off a terminal."""
+"""Largest number of items that each get a line, if the output is not a terminal."""
 _LONG = 2.0
-"""Seconds from which an item among many gets a line, too, and a finished pass over items, on a terminal."""
+"""Smallest duration in seconds of an item among many that gets a line, and of a pass over items that gets a line on a
+terminal."""
 
 
 def open_console() -> Console:
-    """Return a console on stdout, wide enough for tables where that is no terminal."""
+    """Return a console on stdout, wide enough for tables if that is not a terminal."""
     console = Console()
     return console if console.is_terminal else Console(width=_LOG_WIDTH)
 
 
 def show(console: Console, line: str) -> None:
-    """Show a line as it is."""
+    """Show a line without markup or highlighting."""
     console.print(line, markup=False, highlight=False, soft_wrap=True)
 
 
@@ -54,7 +55,7 @@ def one_line(error: BaseException) -> str:
 class ConsoleProgress(Progress):
     """Shows progress with named times: bars on a terminal, elsewhere plain lines.
 
-    Off a terminal there is a line for each finished item, and one every ten seconds about what is going on.
+    If the output is not a terminal, each finished item gets a line, and running work gets one every ten seconds.
 
     Args:
         console: where it is shown.
@@ -112,7 +113,7 @@ class ConsoleProgress(Progress):
             self.say(f"{name}: {task.amount}, elapsed {clock(task.elapsed)}")
 
     def tick(self) -> None:
-        """Print a line about what is going on, off a terminal, if it is time for one."""
+        """Print a line about running work if one is due and the output is not a terminal."""
         tasks = [task for task in tuple(self._tasks) if task.is_shown]
         if not tasks or tasks[-1].done == tasks[-1].total or self._now() < self._next_line:
             return
@@ -174,7 +175,9 @@ class _ConsoleTask:
         self.name, self.total, self.done, self.remark = name, total, done, ""
         self._unit, self._now = unit, now
         self._started = self._measured = self._updated = now()
-        self._before: int | None = done if unit == "items" else None  # a download tells first what was there before
+        self._before: int | None = (
+            done if unit == "items" else None
+        )  # a download first reports the bytes that were there before
 
     def __call__(self, done: int, total: int | None = None, remark: str | None = None) -> None:
         """Report how much is done; see :class:`dsr.utils.progress.Task`."""
@@ -189,7 +192,7 @@ class _ConsoleTask:
 
     @property
     def is_shown(self) -> bool:
-        """Whether there is something to show: nothing of a task that has not reported and has no total."""
+        """Whether the task is shown: not before it has a total or has reported progress."""
         return self.total is not None or self.done > 0
 
     @property
@@ -199,14 +202,14 @@ class _ConsoleTask:
 
     @property
     def remaining(self) -> float | None:
-        """Seconds to the end at the speed so far; None where that is not known."""
+        """Seconds to the end at the speed so far; None if unknown."""
         if self.total is None or not self._speed:
             return None
         return max((self.total - self.done) / self._speed - (self._now() - self._updated), 0.0)
 
     @property
     def amount(self) -> str:
-        """How much is done, of how much."""
+        """The amount done and the total."""
         if self._unit == "items":
             return f"{self.done}" if self.total is None else f"{self.done} of {self.total}"
         total = "" if self.total is None else f" of {megabytes(self.total)}"
@@ -220,17 +223,17 @@ class _ConsoleTask:
 
     @property
     def heading(self) -> str:
-        """What is worked on, and how much is done and left of the whole, for a line about a part of it."""
+        """The task with its amount and remaining time, as the beginning of a line about a part of it."""
         about = ", ".join((self.amount, *self.times[1:]))
         return f"{self.name} {self.remark} ({about})" if self.remark else f"{self.name} ({about})"
 
     @property
     def line(self) -> str:
-        """All of it on one line."""
+        """The task's state in one line."""
         return f"{self.name}: {', '.join(filter(None, (self.amount, *self.times, self.remark)))}"
 
     @property
     def _speed(self) -> float:
-        """Amount per second, 0 where that is not known."""
+        """Amount per second, 0 if unknown."""
         passed = self._updated - self._measured
         return 0.0 if self._before is None or passed <= 0 else (self.done - self._before) / passed

@@ -1,4 +1,4 @@
-"""What trainings and per-image optimisations with Lightning share: the trainer, progress, interruption, logs."""
+"""Lightning for trainings and per-image optimisations: the trainer, progress, interruption, logs."""
 
 from __future__ import annotations
 
@@ -37,39 +37,39 @@ class Scored(Protocol):
 
 
 class Interruption(Callback):
-    """Ends a training between two steps at Ctrl-C or SIGTERM, with a checkpoint of that very step.
+    """Ends a training between two steps at Ctrl-C or SIGTERM, with a checkpoint of that step.
 
     Args:
-        path: of the checkpoint.
+        path: the checkpoint's path.
 
     """
 
     def __init__(self, path: Path) -> None:
-        self._path, self._wanted = path, False
+        self._path, self._requested = path, False
         self._before: dict[int, Any] = {}
 
     def on_train_start(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
-        """Listen."""
+        """Install the signal handlers."""
         with contextlib.suppress(ValueError):  # not in the main thread
-            self._before = {number: signal.signal(number, self._want) for number in _SIGNALS}
+            self._before = {number: signal.signal(number, self._request) for number in _SIGNALS}
 
     def on_train_batch_end(self, trainer: lightning.Trainer, *_: Any) -> None:
-        """Save and stop, if that is wanted and no gradient is being accumulated."""
-        if self._wanted and trainer.fit_loop.batch_idx % trainer.accumulate_grad_batches == (
+        """Save and stop, if an interruption was requested and no gradient is being accumulated."""
+        if self._requested and trainer.fit_loop.batch_idx % trainer.accumulate_grad_batches == (
             trainer.accumulate_grad_batches - 1
         ):
             save_checkpoint(trainer, self._path)
             raise KeyboardInterrupt
 
     def teardown(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule, stage: str) -> None:
-        """Listen no more."""
+        """Restore the signal handlers."""
         for number, handler in self._before.items():
             signal.signal(number, handler)
         self._before = {}
 
-    def _want(self, number: int, _: Any) -> None:
-        """Remember the first time; the second time the default applies."""
-        self._wanted = True
+    def _request(self, number: int, _: Any) -> None:
+        """Remember the first signal; the default handler applies to the second one."""
+        self._requested = True
         signal.signal(number, signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL)
 
 
@@ -79,7 +79,7 @@ class ValidationTable(Callback):
     Its columns are step, set, metric and value.
 
     Args:
-        path: of the file.
+        path: the file's path.
 
     """
 
@@ -87,7 +87,7 @@ class ValidationTable(Callback):
         self._path = path
 
     def on_validation_end(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
-        """Add a pass; rows of later steps, of before an interruption, are dropped."""
+        """Add the scores of a validation; rows of later steps, from before an interruption, are dropped."""
         if trainer.sanity_checking or not trainer.is_global_zero:
             return
         scored: Any = pl_module
@@ -103,7 +103,7 @@ class ValidationTable(Callback):
 
 
 class LastValidation(Callback):
-    """Has the last step validated where the interval does not divide the steps.
+    """Validates after the last step if the interval does not divide the number of steps.
 
     Args:
         interval: between validations, in steps.
@@ -114,7 +114,7 @@ class LastValidation(Callback):
         self._interval = interval
 
     def on_train_batch_end(self, trainer: lightning.Trainer, *_: Any) -> None:
-        """Let Lightning stop by itself, which it does with a validation."""
+        """Let Lightning stop, which runs a validation."""
         if trainer.global_step == trainer.max_steps and trainer.global_step % self._interval:
             trainer.should_stop = True
 
@@ -124,8 +124,8 @@ class StepProgress(Callback):
 
     Args:
         progress: where they are shown.
-        name: what the steps are called, such as ``train``.
-        subject: what the lines about validations begin with, such as a scene's name; empty for nothing.
+        name: the name of the steps, such as ``train``.
+        subject: the beginning of lines about validations, such as a scene's name; empty for none.
 
     """
 
@@ -138,7 +138,7 @@ class StepProgress(Callback):
         self._fetched, self._validated = 0.0, 0
 
     def on_train_start(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
-        """Begin at the step that the training begins with."""
+        """Show the steps, beginning with the training's first one."""
         task = self._progress.task(self._name, int(trainer.max_steps), done=trainer.global_step)
         self._steps = self._stack.enter_context(task)
 
@@ -177,7 +177,7 @@ class StepProgress(Callback):
         self._close()
 
     def on_exception(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule, _: BaseException) -> None:
-        """Give the terminal back."""
+        """Stop showing progress."""
         self._close()
 
     def _close(self) -> None:
@@ -187,10 +187,10 @@ class StepProgress(Callback):
 
 
 class Log(TensorBoardLogger):
-    """TensorBoard's log without the number of the epoch, of which there is one."""
+    """TensorBoard's log without the number of the epoch, as there is only one epoch."""
 
     def log_metrics(self, metrics: Mapping[str, float], step: int | None = None) -> None:
-        """Log all but that."""
+        """Log all metrics except the epoch."""
         super().log_metrics({name: value for name, value in metrics.items() if name != "epoch"}, step)
 
     @rank_zero_only
@@ -246,7 +246,7 @@ def make_trainer(
 
 
 def save_checkpoint(trainer: lightning.Trainer, path: Path) -> None:
-    """Write a checkpoint, whole or not at all."""
+    """Write a checkpoint atomically."""
     with replacing(path) as temporary:
         trainer.save_checkpoint(temporary)
 
@@ -258,7 +258,7 @@ def fit(
     resume: Path | None = None,
     **named: Any,
 ) -> None:
-    """Train; an interruption comes out as the KeyboardInterrupt that it is."""
+    """Train; an interruption raises KeyboardInterrupt."""
     try:
         with without_chatter():
             trainer.fit(module, data, ckpt_path=resume, weights_only=True, **named)
@@ -270,7 +270,7 @@ def fit(
 
 
 def _lightning_devices(device: torch.device, count: int | Literal["auto"]) -> Any:
-    """Return what Lightning is told of the devices: how many, or the one."""
+    """Return the devices for Lightning: their number, or a list of one."""
     if device.type == "cpu" and count == "auto":
         return 1
     if device.type != "cpu" and count == 1 and device.index is not None:
@@ -279,20 +279,20 @@ def _lightning_devices(device: torch.device, count: int | Literal["auto"]) -> An
 
 
 def _loss_text(trainer: lightning.Trainer) -> str:
-    """Return the loss of the last step; nothing where there is none."""
+    """Return the loss of the last step; empty if there is none."""
     loss = trainer.callback_metrics.get("train/loss")
     return "" if loss is None else f"loss {float(loss):.4f}"
 
 
 def scores_line(trainer: lightning.Trainer) -> str:
-    """Return the main scores of the last validation for a reader; nothing where there are none."""
+    """Return the main scores of the last validation for a reader; empty if there are none."""
     scores = {name: trainer.callback_metrics.get(f"val/{name}") for name in ("RMSE_d", "RMSE_v", "DSSIM_v", "LPIPS_v")}
     return "  ".join(f"{name} {float(value):.4f}" for name, value in scores.items() if value is not None)
 
 
 @contextlib.contextmanager
 def without_chatter() -> Iterator[None]:
-    """Keep Lightning's tips, and its warnings of what is meant to be so, off the terminal."""
+    """Keep Lightning's tips, and its warnings of what is intended, off the terminal."""
     logger = logging.getLogger("lightning.pytorch")
     level = logger.level
     logger.setLevel(logging.ERROR)

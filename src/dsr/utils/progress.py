@@ -1,6 +1,6 @@
-"""How work that takes long reports its progress.
+"""Progress of long-running work.
 
-Library code takes a :class:`Progress`, which shows nothing by itself; commands pass the one on the console, see
+Library code takes a :class:`Progress`, which by itself shows nothing; commands pass the console's, see
 :class:`dsr.utils.console.ConsoleProgress`. A method takes :data:`Steps`, a plain function; a :class:`Task` is one.
 """
 
@@ -23,16 +23,16 @@ class Task(Protocol):
         """Report how much is done.
 
         Args:
-            done: amount of work done; less than before where the work starts again.
-            total: amount of all work; None where it is as before, or not known.
-            remark: short text shown beside the numbers; None for the one before.
+            done: amount of work done; less than before if the work starts again.
+            total: amount of all work; None if unchanged or unknown.
+            remark: short text shown beside the numbers; None if unchanged.
 
         """
         ...
 
 
 class Progress:
-    """Shows nothing; the base of what shows something."""
+    """Shows nothing; the base class of progress displays."""
 
     def say(self, line: str) -> None:
         """Show a line of text."""
@@ -44,7 +44,7 @@ class Progress:
 
         Args:
             name: what is done, such as ``train``.
-            total: amount of all work; None where it is not known yet.
+            total: amount of all work; None if not yet known.
             done: amount of work done before.
             unit: what the amounts count.
 
@@ -67,7 +67,7 @@ class Progress:
             name: what is done to them, such as ``predict``.
             total: number of items; None where ``items`` can be counted.
             label: returns the name of an item.
-            lines: whether each item gets a line where the output is no terminal; False where the caller prints one.
+            lines: whether each item gets a line if the output is not a terminal; False if the caller prints one.
 
         """
         yield from items
@@ -77,10 +77,10 @@ SILENT = Progress()
 
 
 class StepsProgress(Progress):
-    """Reports the steps of the outermost task to a function, and nothing else.
+    """Reports only the steps of the outermost task, to a function.
 
     Args:
-        steps: is called with the number of steps done and their total, at the end with both the same; None for nothing.
+        steps: is called with the number of steps done and their total, at the end with both equal; None for no report.
 
     """
 
@@ -90,27 +90,27 @@ class StepsProgress(Progress):
     @contextlib.contextmanager
     def task(self, name: str, total: int | None = None, *, done: int = 0, unit: Unit = "items") -> Iterator[Task]:
         """Return a context in which the steps of a task are reported, unless it is part of another."""
-        steps, whole = self._steps, total or 0
+        steps, all_steps = self._steps, total or 0
         if steps is None or self._busy:
             yield _ignore
             return
 
         def report(done: int, total: int | None = None, remark: str | None = None) -> None:
-            steps(done, total or whole)
+            steps(done, total or all_steps)
 
         self._busy = True
         try:
             yield report
         finally:
             self._busy = False
-        steps(whole, whole)
+        steps(all_steps, all_steps)
 
 
 def part_of(progress: Steps | None, before: int, total: int) -> Steps | None:
-    """Return what one of several stages reports its steps to.
+    """Return a function to which one of several stages reports its steps.
 
     Args:
-        progress: what the whole is reported to; None for nothing.
+        progress: the function to which all stages are reported; None for no report.
         before: number of steps of the stages before.
         total: number of steps of all stages.
 

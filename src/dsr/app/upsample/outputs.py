@@ -1,4 +1,4 @@
-"""The folder of one result: what is written into it, what an earlier run left there, and ``info.json``."""
+"""The folder of one result: the files of a result, those of an earlier run, and ``info.json``."""
 
 from __future__ import annotations
 
@@ -39,12 +39,12 @@ _FILES: Mapping[str, tuple[str, ...]] = {
 
 @dataclass(frozen=True)
 class PreviousRun:
-    """What ``info.json`` says of an earlier run.
+    """An earlier run, as recorded in ``info.json``.
 
     Args:
-        complete: whether it came to its end.
-        settings, inputs: as this module wrote them.
-        files: names of what it wrote.
+        complete: whether it finished.
+        settings, inputs: those of the run, as JSON has them.
+        files: names of the files that it wrote.
 
     """
 
@@ -54,27 +54,27 @@ class PreviousRun:
     files: tuple[str, ...]
 
 
-def output_encoding(encoding: Encoding, wanted: str | None) -> Encoding:
+def output_encoding(encoding: Encoding, chosen: str | None) -> Encoding:
     """Return how the result is stored: as the input in the input's format, else in metres, or in whole millimetres.
 
     Args:
-        encoding: of the input.
-        wanted: one of :data:`FORMATS`; None for the input's.
+        encoding: the input's.
+        chosen: one of :data:`FORMATS`; None for the input's.
 
     """
     own = "tiff" if encoding.suffix == ".tif" else encoding.suffix[1:]
-    if wanted in (None, own):
+    if chosen in (None, own):
         return encoding
-    if wanted == "png":
+    if chosen == "png":
         return Encoding(".png", "uint16", 1e-3, 0.0, "orthogonal")
-    return Encoding(f".{wanted}", "float32", 1.0, math.nan, "orthogonal")
+    return Encoding(f".{chosen}", "float32", 1.0, math.nan, "orthogonal")
 
 
 def read_previous_run(folder: Path) -> PreviousRun | None:
-    """Return what an earlier run left in a folder, None where there was none.
+    """Read what an earlier run left in a folder; None if there was none.
 
     Raises:
-        ValueError: there is an ``info.json`` of something else.
+        ValueError: there is an ``info.json`` that `dsr upsample` did not write.
 
     """
     path = folder / INFO
@@ -90,15 +90,15 @@ def read_previous_run(folder: Path) -> PreviousRun | None:
 
 
 def expect_free(folder: Path, inputs: Iterable[Path], *, ours: bool) -> None:
-    """Say where a result would overwrite its input, or files that no earlier run wrote.
+    """Check that a result would not overwrite its input, or files that no earlier run wrote.
 
     Args:
-        folder: of the result.
-        inputs: files that must stay.
-        ours: whether what lies there may be replaced.
+        folder: the result's folder.
+        inputs: files that must not be overwritten.
+        ours: whether existing results may be replaced.
 
     Raises:
-        ValueError: it would.
+        ValueError: it would overwrite one of them.
 
     """
     names = [name for names in _FILES.values() for name in names] + [INFO]
@@ -116,15 +116,15 @@ def write_parts(
     """Write the parts of a result.
 
     Args:
-        folder: is made if need be.
+        folder: the result's folder, created if it is missing.
         picture: the input.
-        depth: (1, H, W) the result, orthogonal depth in metres, NaN in holes.
+        depth: (1, H, W) the resulting orthogonal depth in metres, NaN in holes.
         parts: some of :data:`PARTS`.
-        encoding: of the depth file.
-        title: of the picture of before and after.
+        encoding: the depth file's encoding.
+        title: the title of the before-and-after picture.
 
     Returns:
-        The names of the files, and what should be said of them.
+        The names of the files, and notes for the user.
 
     """
     rgb, camera = picture.rgb, picture.camera
@@ -150,7 +150,7 @@ def write_parts(
 
 
 def _write_depth(folder: Path, depth: Tensor, camera: Camera, encoding: Encoding) -> tuple[list[str], list[Assumption]]:
-    """Write the depth as the input counts, and in metres where that is something else."""
+    """Write the depth in the output's encoding, and also in metres if that is a different one."""
     values, lost = encode(depth, encoding, camera)
     name = f"depth{encoding.suffix}"
     facts = []
@@ -168,7 +168,7 @@ def _write_depth(folder: Path, depth: Tensor, camera: Camera, encoding: Encoding
 
 
 def kept_depth(folder: Path, camera: Camera) -> Tensor | None:
-    """Return the depth in metres of an earlier complete run, (1, H, W); None where it is not there."""
+    """Load the depth in metres of an earlier complete run, (1, H, W); None if it is missing."""
     with contextlib.suppress(OSError, ValueError, EOFError):
         values = np.load(folder / METRES)
         if values.shape == (camera.height, camera.width) and values.dtype == np.float32:
@@ -177,13 +177,13 @@ def kept_depth(folder: Path, camera: Camera) -> Tensor | None:
 
 
 def begin(folder: Path, settings: Mapping[str, Any], inputs: Mapping[str, Any], files: Sequence[str]) -> None:
-    """Mark a folder as one of an unfinished run."""
+    """Mark a folder as that of an unfinished run."""
     entries = {"complete": False, "inputs": inputs, "settings": settings, "files": files}
     write_text(folder / INFO, json.dumps(entries, indent=2) + "\n")
 
 
 def finish(folder: Path, earlier: PreviousRun | None, entries: Mapping[str, Any], files: Sequence[str]) -> None:
-    """Write ``info.json`` of a finished run; files of an earlier one that are no part of it are removed."""
+    """Write ``info.json`` of a finished run, and remove files of an earlier run that do not belong to it."""
     for name in () if earlier is None else earlier.files:
         if name not in files and any(name in names for names in _FILES.values()):
             (folder / name).unlink(missing_ok=True)
@@ -191,7 +191,7 @@ def finish(folder: Path, earlier: PreviousRun | None, entries: Mapping[str, Any]
 
 
 def described(picture: Picture, encoding: Encoding) -> dict[str, Any]:
-    """Return sizes, camera and files' conventions for ``info.json``."""
+    """Return the sizes, the camera and the files' encodings for ``info.json``."""
     return {
         "photo_size": [picture.camera.width, picture.camera.height],
         "input_size": [picture.depth_lr.shape[-1], picture.depth_lr.shape[-2]],
@@ -203,6 +203,6 @@ def described(picture: Picture, encoding: Encoding) -> dict[str, Any]:
 
 
 def _plain(encoding: Encoding) -> dict[str, Any]:
-    """Return an encoding as JSON has it, which knows no NaN."""
+    """Return an encoding as values for JSON, which has no NaN."""
     entries = asdict(encoding)
     return entries if math.isfinite(encoding.hole) else {**entries, "hole": str(encoding.hole)}

@@ -1,4 +1,4 @@
-"""What ``dsr upsample`` says of its inputs and results: facts, each once, and problems."""
+"""Report the notes and problems of ``dsr upsample``."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from dsr.io.encoding import Assumption
 from dsr.utils.console import one_line, show
 
 _SHOWN = 5
-"""Names that a line lists before it only counts."""
+"""Number of names that a line lists; further ones are only counted."""
 
 
 class Reporter:
-    """Says every fact once, and counts for how many pictures it held."""
+    """Shows every note once, and counts the pictures that it applies to."""
 
     def __init__(self, console: Console) -> None:
         self._console = console
@@ -27,14 +27,14 @@ class Reporter:
         show(self._console, line)
 
     def facts(self, facts: Sequence[Assumption]) -> None:
-        """Show those facts that no picture before had."""
+        """Show the notes that no earlier picture had."""
         for fact in facts:
             if not self._counts[fact.text]:
                 self.say(f"  {fact}")
             self._counts[fact.text] += 1
 
     def summary(self, pictures: int) -> None:
-        """Show which facts held for some pictures only."""
+        """Show the notes that apply to some of the pictures only."""
         for text, count in self._counts.items():
             if count < pictures:
                 self.say(f"  {count} of {pictures} pictures: {text}")
@@ -48,6 +48,6 @@ def problem_line(error: BaseException) -> str:
 
 
 def listed(names: Sequence[str]) -> str:
-    """Return some of the names, and how many more there are."""
+    """Return the first names, and how many more there are."""
     more = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
     return ", ".join(names[:_SHOWN]) + more

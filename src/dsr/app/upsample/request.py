@@ -1,4 +1,4 @@
-"""What a user of ``dsr upsample`` asks for, and what of it a result depends on."""
+"""The request of a user of ``dsr upsample``, and the settings and inputs that a result depends on."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ from dsr.utils.hashing import file_hash, hash_outside_code
 
 @dataclass(frozen=True)
 class UpsampleRequest:
-    """What the user asks for.
+    """What to upsample, how, and which results to write.
 
     Args:
         output: the folder of the results.
-        folders: to look for pairs in.
+        folders: the folders that are searched for pairs.
         rgb, depth, mask: files, or one folder each of the first two.
-        reading: how the files are to be read.
+        reading: how to read the files.
         method, settings, directories, scale, device, keep_holes: see :func:`dsr.inference.upsample_depth`.
-        depth_format: of the result; None for the input's.
+        depth_format: the result's format; None for the input's.
         parts: what to write, some of :data:`dsr.app.upsample.outputs.PARTS`.
-        overwrite: whether to redo what is there.
-        dry_run: whether only to say what would be done.
+        overwrite: whether to replace existing results.
+        dry_run: whether to show only what would be done.
 
     """
 
@@ -51,13 +51,13 @@ class UpsampleRequest:
     dry_run: bool = False
 
     def __post_init__(self) -> None:
-        """Check what does not need the files."""
-        for name, value, known in (
+        """Check everything that does not depend on the files."""
+        for name, value, choices in (
             ("--method", self.method, (AUTO, *list_methods(self.directories))),
             ("--format", self.depth_format, FORMATS),
         ):
-            if value is not None and value not in known:
-                raise ValueError(f"{name}: expected one of {', '.join(known)}, got {value!r}")
+            if value is not None and value not in choices:
+                raise ValueError(f"{name}: expected one of {', '.join(choices)}, got {value!r}")
         for part in self.parts:
             if part not in PARTS:
                 raise ValueError(f"--only, --without: expected some of {', '.join(PARTS)}, got {part!r}")
@@ -71,7 +71,7 @@ class UpsampleRequest:
             self._check_settings()
 
     def _check_settings(self) -> None:
-        """Check that the method takes the settings."""
+        """Check that the method accepts the settings."""
         try:
             check_settings(MethodChoice(self.method, self.settings, self.directories))
         except ValueError as error:
@@ -79,29 +79,29 @@ class UpsampleRequest:
             raise ValueError(f"--set {error}" if named else str(error)) from error
 
 
-def settings_of(wanted: UpsampleRequest) -> dict[str, Any]:
-    """Return what a result depends on beside its inputs, as JSON has it."""
-    reading = asdict(wanted.reading)
+def settings_of(request: UpsampleRequest) -> dict[str, Any]:
+    """Return the settings that a result depends on, as values for JSON."""
+    reading = asdict(request.reading)
     choice = reading.pop("camera")
     return {
-        "method": wanted.method,
-        "scale": wanted.scale,
-        "keep_holes": wanted.keep_holes,
-        "format": wanted.depth_format,
+        "method": request.method,
+        "scale": request.scale,
+        "keep_holes": request.keep_holes,
+        "format": request.depth_format,
         **reading,
         "fov": choice["fov"],
         "intrinsics": None if choice["intrinsics"] is None else list(choice["intrinsics"]),
-        **({"set": dict(wanted.settings)} if wanted.settings else {}),
-        **({"code": code} if (code := hash_outside_code(_targets(wanted))) else {}),
+        **({"set": dict(request.settings)} if request.settings else {}),
+        **({"code": code} if (code := hash_outside_code(_targets(request))) else {}),
     }
 
 
-def _targets(wanted: UpsampleRequest) -> list[str]:
+def _targets(request: UpsampleRequest) -> list[str]:
     """Return the dotted paths of the code that the method's file names; none where the method is chosen later."""
-    if wanted.method == AUTO:
+    if request.method == AUTO:
         return []
     return list(
-        target_paths(read_method(wanted.method, USUAL_SCALE, directories=wanted.directories), wanted.directories)
+        target_paths(read_method(request.method, USUAL_SCALE, directories=request.directories), request.directories)
     )
 
 
@@ -114,7 +114,7 @@ def files_of(pair: Pair, reading: Reading) -> dict[str, Path]:
 
 
 def inputs_of(pair: Pair, reading: Reading) -> dict[str, dict[str, str]]:
-    """Return the inputs and their hashes, as JSON has them."""
+    """Return the inputs and their hashes, as values for JSON."""
     inputs = {}
     for name, path in files_of(pair, reading).items():
         if not path.is_file():

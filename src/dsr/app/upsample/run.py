@@ -1,4 +1,4 @@
-"""``dsr upsample``: from somebody's files to folders of results, one picture after another."""
+"""The command behind ``dsr upsample``: read the user's files, and write a folder of results for each picture."""
 
 from __future__ import annotations
 
@@ -39,31 +39,31 @@ from dsr.utils.versions import package_versions
 _PACKAGES = ("dsr", "torch", "numpy", "opencv-python-headless")
 
 
-def run(wanted: UpsampleRequest, console: Console) -> list[str]:
-    """Upsample all that is asked for.
+def run(request: UpsampleRequest, console: Console) -> list[str]:
+    """Upsample all pictures of a request.
 
     Args:
-        wanted: what.
+        request: the request.
         console: where progress and assumptions are shown.
 
     Returns:
-        What went wrong, one line for each; empty where nothing did.
+        The problems, one line each; empty if there were none.
 
     Raises:
-        ValueError: nothing can be done at all.
+        ValueError: the pairs cannot be determined.
 
     """
-    found = _find(wanted)
-    single = len(found.pairs) == 1 and not wanted.folders and not wanted.rgb[0].is_dir()
-    _tell_found(console, found)
+    found = _find(request)
+    single = len(found.pairs) == 1 and not request.folders and not request.rgb[0].is_dir()
+    _show_found(console, found)
     reporter, units = Reporter(console), UnitMemory()
     problems: dict[str, list[str]] = {}
     outcomes: Counter[str] = Counter()
     progress = ConsoleProgress(console)
     for pair in progress.track(found.pairs, "upsample", label=lambda pair: pair.name, lines=False):
-        target = wanted.output if single else wanted.output / pair.name
+        target = request.output if single else request.output / pair.name
         try:
-            outcomes[_one(wanted, pair, target, units, reporter, progress)] += 1
+            outcomes[_one(request, pair, target, units, reporter, progress)] += 1
         except (ValueError, OSError, MemoryError, torch.OutOfMemoryError) as error:
             problems.setdefault(problem_line(error), []).append(pair.name)
     if not single:
@@ -71,20 +71,20 @@ def run(wanted: UpsampleRequest, console: Console) -> list[str]:
         counts = [f"{count} {outcome}" for outcome, count in outcomes.items()]
         counts += [f"{sum(map(len, problems.values()))} failed"] if problems else []
         pictures = "1 picture" if len(found.pairs) == 1 else f"{len(found.pairs)} pictures"
-        show(console, f"{pictures}: {', '.join(counts)} -> {wanted.output}")
+        show(console, f"{pictures}: {', '.join(counts)} -> {request.output}")
     return [f"{listed(names)}: {message}" if len(found.pairs) > 1 else message for message, names in problems.items()]
 
 
-def _find(wanted: UpsampleRequest) -> PairingResult:
+def _find(request: UpsampleRequest) -> PairingResult:
     """Return the pairs."""
-    if not wanted.folders:
-        return find_pairs_of_lists(wanted.rgb, wanted.depth, wanted.mask)
-    parts = [find_pairs_of_folder(folder, wanted.output) for folder in wanted.folders]
+    if not request.folders:
+        return find_pairs_of_lists(request.rgb, request.depth, request.mask)
+    parts = [find_pairs_of_folder(folder, request.output) for folder in request.folders]
     if len(parts) == 1:
         return parts[0]
     pairs = [
         replace(pair, name=f"{folder.resolve().name}/{pair.name}")
-        for folder, part in zip(wanted.folders, parts, strict=True)
+        for folder, part in zip(request.folders, parts, strict=True)
         for pair in part.pairs
     ]
     if len({pair.name for pair in pairs}) < len(pairs):
@@ -93,8 +93,8 @@ def _find(wanted: UpsampleRequest) -> PairingResult:
     return PairingResult(tuple(pairs), facts, tuple(path for part in parts for path in part.unpaired))
 
 
-def _tell_found(console: Console, found: PairingResult) -> None:
-    """Show how many pairs there are, and what has no partner."""
+def _show_found(console: Console, found: PairingResult) -> None:
+    """Show how many pairs there are, and which files have no partner."""
     count = len(found.pairs)
     lines = [
         f"{count} pairs of photo and depth map" if count > 1 else f"{found.pairs[0].rgb} and {found.pairs[0].depth}"
@@ -110,9 +110,9 @@ def _tell_found(console: Console, found: PairingResult) -> None:
 
 @dataclass(frozen=True)
 class _Job:
-    """One picture, and what an earlier run left in its folder."""
+    """One picture, and the earlier run in its folder, if any."""
 
-    wanted: UpsampleRequest
+    request: UpsampleRequest
     pair: Pair
     target: Path
     settings: Mapping[str, Any]
@@ -121,8 +121,8 @@ class _Job:
 
     @property
     def reusable(self) -> bool:
-        """Whether the earlier run came to its end with the same inputs and settings, and may stay."""
-        return self.earlier is not None and self.earlier.complete and self.same and not self.wanted.overwrite
+        """Whether the earlier run finished with the same inputs and settings, and may be kept."""
+        return self.earlier is not None and self.earlier.complete and self.same and not self.request.overwrite
 
     @property
     def same(self) -> bool:
@@ -130,9 +130,9 @@ class _Job:
         return self.earlier is not None and (self.earlier.settings, self.earlier.inputs) == (self.settings, self.inputs)
 
     def expect_agreement(self) -> None:
-        """Raise ValueError where the folder holds a complete result of something else."""
+        """Raise ValueError if the folder holds a complete result of other inputs or settings."""
         earlier = self.earlier
-        if earlier is None or not earlier.complete or self.same or self.wanted.overwrite:
+        if earlier is None or not earlier.complete or self.same or self.request.overwrite:
             return
         if earlier.inputs != self.inputs:
             what = "other inputs: " + ", ".join(str(entry.get("file")) for entry in earlier.inputs.values())
@@ -142,38 +142,38 @@ class _Job:
         raise ValueError(f"{self.target}: holds a result of {what}; take another -o, or --overwrite")
 
     def is_done(self) -> bool:
-        """Return whether everything that is wanted is there."""
+        """Return whether all requested parts exist."""
         if not self.reusable or self.earlier is None:
             return False
         there = {name.split("/")[0].split(".")[0] for name in self.earlier.files if (self.target / name).is_file()}
-        return there >= set(self.wanted.parts)
+        return there >= set(self.request.parts)
 
 
 def _one(
-    wanted: UpsampleRequest, pair: Pair, target: Path, units: UnitMemory, reporter: Reporter, progress: Progress
+    request: UpsampleRequest, pair: Pair, target: Path, units: UnitMemory, reporter: Reporter, progress: Progress
 ) -> str:
-    """Do one picture, and return how it went."""
-    job = _Job(wanted, pair, target, settings_of(wanted), inputs_of(pair, wanted.reading), read_previous_run(target))
+    """Upsample one picture, and return the outcome."""
+    job = _Job(request, pair, target, settings_of(request), inputs_of(pair, request.reading), read_previous_run(target))
     job.expect_agreement()
     if job.is_done():
         reporter.say(f"{pair.name}: complete already, in {target}")
         return "complete already"
-    picture = _without_repeats(read_picture(pair, wanted.reading, units))
-    coarse_size = (picture.depth_lr.shape[-2], picture.depth_lr.shape[-1])
-    method, suits = _method(picture, wanted)
+    picture = _without_repeats(read_picture(pair, request.reading, units))
+    size_lr = (picture.depth_lr.shape[-2], picture.depth_lr.shape[-1])
+    method, suits = _method(picture, request)
     picture = replace(picture, assumptions=(*picture.assumptions, *suits))
-    planned = plan((picture.camera.height, picture.camera.width), coarse_size, wanted.scale, method, wanted.directories)
+    planned = plan((picture.camera.height, picture.camera.width), size_lr, request.scale, method, request.directories)
     reporter.facts(picture.assumptions)
-    if wanted.dry_run:
+    if request.dry_run:
         reporter.say(f"{pair.name}: {planned.text} -> {target}")
         return "to do"
-    inputs = files_of(pair, wanted.reading).values()
-    expect_free(target, inputs, ours=wanted.overwrite or job.earlier is not None)
+    inputs = files_of(pair, request.reading).values()
+    expect_free(target, inputs, ours=request.overwrite or job.earlier is not None)
     depth = kept_depth(target, picture.camera) if job.reusable else None
     begin(target, job.settings, job.inputs, () if job.earlier is None else job.earlier.files)
     started = time.perf_counter()
     if depth is None:
-        depth = _upsampled(job, picture, planned.method, progress)
+        depth = _upsample(job, picture, planned.method, progress)
     seconds = time.perf_counter() - started
     facts = _write(job, picture, depth, planned, seconds)
     reporter.facts(facts)
@@ -181,11 +181,11 @@ def _one(
     return "done"
 
 
-def _method(picture: Picture, wanted: UpsampleRequest) -> tuple[str, list[Assumption]]:
-    """Return the method to use, and what there is to say of it."""
-    if wanted.method != AUTO:
-        return wanted.method, []
-    method = suited_method(picture.depth_lr, picture.camera, wanted.scale)
+def _method(picture: Picture, request: UpsampleRequest) -> tuple[str, list[Assumption]]:
+    """Return the method to use, and notes on the choice."""
+    if request.method != AUTO:
+        return request.method, []
+    method = suited_method(picture.depth_lr, picture.camera, request.scale)
     if method == NOISY:
         return method, [
             Assumption(f"the depth map is noisy: {NOISY}, which was trained for that (--method facets keeps more)")
@@ -194,7 +194,7 @@ def _method(picture: Picture, wanted: UpsampleRequest) -> tuple[str, list[Assump
 
 
 def _without_repeats(picture: Picture) -> Picture:
-    """Return the picture with a depth map that was enlarged by repeating pixels as it was before."""
+    """Undo an enlargement of the depth map by repeated pixels."""
     height, width = picture.depth_lr.shape[-2:]
     block = enlarged_by(picture.depth_lr) if (height, width) == (picture.camera.height, picture.camera.width) else 1
     if block == 1 or height % block or width % block:
@@ -203,30 +203,30 @@ def _without_repeats(picture: Picture) -> Picture:
     return replace(picture, depth_lr=picture.depth_lr[:, ::block, ::block], assumptions=(*picture.assumptions, fact))
 
 
-def _upsampled(job: _Job, picture: Picture, method: str, progress: Progress) -> Tensor:
-    """Return the high-resolution depth, (1, H, W) in metres."""
-    wanted = job.wanted
+def _upsample(job: _Job, picture: Picture, method: str, progress: Progress) -> Tensor:
+    """Compute the high-resolution depth, (1, H, W) in metres."""
+    request = job.request
     with progress.task("steps") as step:
         return upsample_depth(
             picture.rgb,
             picture.depth_lr,
             picture.camera,
-            wanted.scale,
+            request.scale,
             method=method,
-            settings=wanted.settings,
-            directories=wanted.directories,
-            device=wanted.device,
-            keep_holes=wanted.keep_holes,
+            settings=request.settings,
+            directories=request.directories,
+            device=request.device,
+            keep_holes=request.keep_holes,
             progress=step,
         ).cpu()
 
 
 def _write(job: _Job, picture: Picture, depth: Tensor, planned: Plan, seconds: float) -> list[Assumption]:
-    """Write all parts and ``info.json``, and return what should be said of them."""
+    """Write all parts and ``info.json``, and return notes for the user."""
     started = time.perf_counter()
-    encoding = output_encoding(picture.encoding, job.wanted.depth_format)
+    encoding = output_encoding(picture.encoding, job.request.depth_format)
     title = f"{job.pair.name}, {planned.method} x{planned.scale}"
-    files, facts = write_parts(job.target, picture, depth, job.wanted.parts, encoding, title)
+    files, facts = write_parts(job.target, picture, depth, job.request.parts, encoding, title)
     entries = {
         "inputs": job.inputs,
         "settings": job.settings,

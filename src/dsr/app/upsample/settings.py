@@ -1,4 +1,4 @@
-"""Arguments of methods as the command line gives them, ``KEY=VALUE``."""
+"""Parse arguments of methods from the command line, ``KEY=VALUE``."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from omegaconf.errors import OmegaConfBaseException
 
 
 def parse_settings(arguments: Sequence[str]) -> dict[str, Any]:
-    """Return arguments by name, their values read as YAML.
+    """Parse arguments, with their values read as YAML.
 
     Args:
         arguments: ``KEY=VALUE`` each.
 
     Raises:
-        ValueError: an argument is of another form, or its value cannot be read.
+        ValueError: an argument is not of that form, or its value cannot be read.
 
     """
     settings: dict[str, Any] = {}
