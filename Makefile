@@ -8,6 +8,9 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 ARGS ?=
+# One worker more than there are processors, as tests of commands wait for them; each computes with one thread.
+PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest --dist loadfile --maxprocesses 8 \
+	--numprocesses $$(( $$(getconf _NPROCESSORS_ONLN) + 1 ))
 
 .PHONY: run test unit lint docs benchmark clean
 
@@ -15,10 +18,10 @@ run: $(VENV)/installed
 	$(BIN)/python eval.py $(ARGS)
 
 test: lint
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest --numprocesses auto --maxprocesses 8 --dist loadfile
+	$(PYTEST)
 
 unit: $(VENV)/installed-dev
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest --numprocesses auto --maxprocesses 8 --dist loadfile -m unit
+	$(PYTEST) -m unit
 
 lint: $(VENV)/installed-dev
 	$(BIN)/ruff check .

@@ -470,7 +470,7 @@ def test_resume_from_any_step_gives_bit_identical_weights(tmp_path, within, monk
     end = trainer_module.Interruption.on_train_batch_end
 
     def stop(self, trainer, *rest):
-        self._wanted = trainer.global_step == 3
+        self._requested = trainer.global_step == 3
         end(self, trainer, *rest)
 
     monkeypatch.setattr(trainer_module.Interruption, "on_train_batch_end", stop)
