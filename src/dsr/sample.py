@@ -6,6 +6,7 @@ Depth is orthogonal depth (distance to the image plane) in metres. A hole is NaN
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -24,6 +25,43 @@ class AllHolesError(ValueError):
 
 
 @dataclass(frozen=True)
+class Unit:
+    """The quantity and the unit that a benchmark prints its errors in.
+
+    Args:
+        name: of the unit, such as ``cm``.
+        inverse: whether the quantity is ``factor / depth - offset`` (disparity), else ``factor * depth``.
+        factor: see ``inverse``; depth in metres.
+        offset: see ``inverse``.
+        limits: smallest and largest value that a prediction may have; the benchmark clamps to them. None for any value.
+
+    Raises:
+        ValueError: ``factor`` is not positive, or ``offset`` is not 0 for depth.
+
+    """
+
+    name: str
+    inverse: bool = False
+    factor: float = 100.0
+    offset: float = 0.0
+    limits: tuple[float, float] | None = None
+
+    def __post_init__(self) -> None:
+        """Check the values."""
+        if not 0 < self.factor < math.inf:
+            raise ValueError(f"unit {self.name}: factor: expected a positive number, got {self.factor}")
+        if self.offset and not self.inverse:
+            raise ValueError(f"unit {self.name}: offset: expected 0 for depth, got {self.offset}")
+
+    def convert(self, depth: Tensor) -> Tensor:
+        """Return depth in metres, of any shape, in this unit; the limits are not applied."""
+        return self.factor / depth - self.offset if self.inverse else self.factor * depth
+
+
+CENTIMETRES = Unit("cm")
+
+
+@dataclass(frozen=True)
 class Scene:
     """A photo and its high-resolution depth, before any downsampling.
 
@@ -34,6 +72,7 @@ class Scene:
         depth: (1, H, W) true depth, or None where it is not known.
         measured: low-resolution depth maps that a sensor measured, (1, H / factor, W / factor) by factor.
         notes: what somebody who reads the scores should know, such as "depth is not metric".
+        unit: the unit in which the data set's benchmark prints errors.
 
     Raises:
         ValueError: a shape, range or unit is not as above.
@@ -47,6 +86,7 @@ class Scene:
     depth: Tensor | None = None
     measured: Mapping[int, Tensor] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
+    unit: Unit = CENTIMETRES
 
     def __post_init__(self) -> None:
         """Check shapes and value ranges."""
@@ -90,6 +130,7 @@ class DepthSample:
         scale: the upsampling factor.
         depth: (1, H, W) true high-resolution depth, or None where it is not known.
         notes: what somebody who reads the scores should know, such as "cropped from 513 x 512".
+        unit: the unit in which the data set's benchmark prints errors.
 
     Raises:
         ValueError: a shape, range or unit is not as above.
@@ -105,6 +146,7 @@ class DepthSample:
     scale: int
     depth: Tensor | None = None
     notes: tuple[str, ...] = field(default=())
+    unit: Unit = CENTIMETRES
 
     def __post_init__(self) -> None:
         """Check shapes, value ranges and cameras against each other."""
@@ -131,6 +173,7 @@ class DepthSample:
             "camera": asdict(self.camera),
             "camera_lr": asdict(self.camera_lr),
             "rgb": str(self.rgb.dtype).removeprefix("torch."),
+            "unit": asdict(self.unit),
         }
         arrays: dict[str, Any] = {
             "rgb": _pack(self.rgb.permute(1, 2, 0).cpu().numpy()),
@@ -145,7 +188,8 @@ class DepthSample:
     def load(cls, path: Path) -> Self:
         """Return the sample that :meth:`save` wrote.
 
-        Files of earlier versions have an 8-bit photo, float32 depth, and ``depth_lr`` under the name ``coarse``.
+        Files of earlier versions have an 8-bit photo, float32 depth, ``depth_lr`` under the name ``coarse``, and no
+        unit, which means centimetres.
 
         Raises:
             ValueError: the file is missing, damaged or something else.
@@ -165,6 +209,7 @@ class DepthSample:
                 int(about["scale"]),
                 torch.from_numpy(arrays["depth"])[None] if "depth" in arrays else None,
                 tuple(about["notes"]),
+                _read_unit(about),
             )
         except FileNotFoundError:
             raise ValueError(f"{path}: expected the sample of a scene, there is none") from None
@@ -189,6 +234,14 @@ class DepthSample:
     def mask(self) -> Tensor | None:
         """(1, H, W) bool: where the true depth is known; None where there is no truth."""
         return None if self.depth is None else self.depth.isfinite()
+
+
+def _read_unit(about: Mapping[str, Any]) -> Unit:
+    """Return the unit of a sample's description."""
+    if "unit" not in about:
+        return CENTIMETRES
+    limits = about["unit"]["limits"]
+    return Unit(**{**about["unit"], "limits": None if limits is None else tuple(limits)})
 
 
 _BITS = {"uint8": 255, "uint16": 65535}

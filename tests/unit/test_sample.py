@@ -13,7 +13,7 @@ import pytest
 import torch
 
 from dsr.geometry.camera import Camera, baseline_times_focal
-from dsr.sample import DepthSample, Scene
+from dsr.sample import CENTIMETRES, DepthSample, Scene, Unit
 
 CAMERA = Camera(width=8, height=4, fx=9.0, fy=9.0, cx=3.5, cy=1.5)
 
@@ -166,7 +166,7 @@ def test_sample_is_read_with_the_same_bits(tmp_path: Path, dtype: torch.dtype, l
     read = DepthSample.load(tmp_path / "hall.npz")
     for name in ("rgb", "depth", "depth_lr"):
         torch.testing.assert_close(getattr(read, name), getattr(sample, name), rtol=0, atol=0, equal_nan=True)
-    for name in ("dataset", "scene", "scale", "camera", "camera_lr", "notes"):
+    for name in ("dataset", "scene", "scale", "camera", "camera_lr", "notes", "unit"):
         assert getattr(read, name) == getattr(sample, name)
     with np.load(tmp_path / "hall.npz") as stored:
         assert stored["rgb"].dtype == {255: np.uint8, 65535: np.uint16}.get(levels or 0, str(dtype)[6:])
@@ -188,6 +188,29 @@ def test_sample_of_an_earlier_version_is_read(tmp_path: Path) -> None:
     read = DepthSample.load(tmp_path / "hall.npz")
     torch.testing.assert_close(read.rgb, torch.from_numpy(rgb).permute(2, 0, 1) / 255, rtol=0, atol=0)
     assert (read.scene, read.depth_lr.dtype, read.depth_lr.shape) == ("hall", torch.float32, (1, 2, 4))
+    assert read.unit == CENTIMETRES
+
+
+def test_unit_of_a_sample_is_read(tmp_path: Path) -> None:
+    unit = Unit("levels", inverse=True, factor=300.0, offset=64.0, limits=(0.0, 255.0))
+    _sample(unit=unit).save(tmp_path / "hall.npz")
+    assert DepthSample.load(tmp_path / "hall.npz").unit == unit
+
+
+def test_unit_converts_depth() -> None:
+    depth = torch.tensor([2.0, math.nan, 3.0])
+    levels = Unit("levels", inverse=True, factor=300.0, offset=64.0)
+    torch.testing.assert_close(CENTIMETRES.convert(depth), torch.tensor([200, math.nan, 300]), equal_nan=True)
+    torch.testing.assert_close(levels.convert(depth), torch.tensor([86, math.nan, 36.0]), equal_nan=True)
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [({"factor": 0.0}, "factor: expected a positive number"), ({"offset": 1.0}, "offset: expected 0 for depth")],
+)
+def test_unit_refuses(settings: dict[str, float], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        Unit("cm", **settings)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("content", [b"", b"text", None])

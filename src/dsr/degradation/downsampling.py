@@ -211,7 +211,7 @@ def make_sample(
     if holes is not None:
         depth_lr = depth_lr.masked_fill(holes(depth_lr, camera_lr, of_holes), torch.nan)
     return DepthSample(
-        scene.dataset, scene.name, scene.rgb, depth_lr, scene.camera, camera_lr, scale, scene.depth, notes
+        scene.dataset, scene.name, scene.rgb, depth_lr, scene.camera, camera_lr, scale, scene.depth, notes, scene.unit
     )
 
 

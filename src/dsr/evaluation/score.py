@@ -112,7 +112,7 @@ def _score_scene(
         raise ValueError(f"{sample.scene}: expected a prediction of shape {expected}, got {came}")
     rays = sample.camera.rays(device=study.device)
     truth = sample.depth.to(study.device, torch.float64)
-    for result in score_image(depth.to(study.device, torch.float64), truth, rays, metrics):
+    for result in score_image(depth.to(study.device, torch.float64), truth, rays, metrics, sample.unit):
         yield {
             "dataset": sample.dataset,
             "scene": sample.scene,

@@ -14,6 +14,7 @@ from dsr.metrics import functional
 from dsr.metrics.formats import MetricFormat
 from dsr.metrics.functional import SurfacePair
 from dsr.metrics.lpips import LPIPS, MIN_SIZE, lpips_v
+from dsr.sample import CENTIMETRES, Unit
 
 WORST, AVERAGE = "max", "avg"
 VARIANTS = (*LIGHT_NAMES, WORST, AVERAGE)
@@ -200,7 +201,9 @@ class Score:
 
 
 @torch.no_grad()
-def score_image(prediction: Tensor, target: Tensor, rays: Tensor, metrics: tuple[Metric, ...]) -> Iterator[Score]:
+def score_image(
+    prediction: Tensor, target: Tensor, rays: Tensor, metrics: tuple[Metric, ...], unit: Unit = CENTIMETRES
+) -> Iterator[Score]:
     """Score one predicted depth map.
 
     Rows and columns at the border without any predicted pixel are cut off first (MSG's published networks leave out the
@@ -211,6 +214,7 @@ def score_image(prediction: Tensor, target: Tensor, rays: Tensor, metrics: tuple
         target: (1, H, W) orthogonal depth in metres, NaN where missing.
         rays: (3, H, W), see :meth:`dsr.geometry.camera.Camera.rays`.
         metrics: from :func:`catalogue`.
+        unit: of the metrics that are in the benchmark's own.
 
     Yields:
         The scores, NaN where no pixel can be scored.
@@ -219,7 +223,9 @@ def score_image(prediction: Tensor, target: Tensor, rays: Tensor, metrics: tuple
     rows, columns = _covered(prediction)
     kept = (rows.stop - rows.start) * (columns.stop - columns.start) / target.numel()
     window = (..., rows, columns)
-    pair = SurfacePair(prediction[window][None], target[window][None], rays[window][None], image_dtype=torch.float32)
+    pair = SurfacePair(
+        prediction[window][None], target[window][None], rays[window][None], unit=unit, image_dtype=torch.float32
+    )
     for metric in metrics:
         valid = metric.valid_fraction(pair).item() * kept
         for variant, value in metric.variants(pair).items():

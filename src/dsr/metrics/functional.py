@@ -22,6 +22,7 @@ from torch import Tensor
 
 from dsr.geometry.shading import lights, shade
 from dsr.geometry.surface import depth_to_normals, length, normal_mask
+from dsr.sample import CENTIMETRES, Unit
 
 SSIM_WINDOW = 7
 SSIM_DATA_RANGE = 2.0
@@ -38,6 +39,7 @@ class SurfacePair:
             positive, which no camera sees.
         rays: (B or 1, 3, H, W) rays with z = 1, see :meth:`dsr.geometry.camera.Camera.rays`.
         mask: (B, 1, H, W) bool, the pixels to compare; None for all.
+        unit: unit of the metrics that are in the benchmark's own.
         image_dtype: of normals and renderings, None for the depth's. float32 halves their computing time and changes
             scores by about 1e-7; depths and their differences keep their own dtype.
 
@@ -53,6 +55,7 @@ class SurfacePair:
         rays: Tensor,
         mask: Tensor | None = None,
         *,
+        unit: Unit = CENTIMETRES,
         image_dtype: torch.dtype | None = None,
     ) -> None:
         if prediction.dim() != 4 or prediction.shape[1] != 1 or prediction.shape != target.shape:
@@ -73,6 +76,7 @@ class SurfacePair:
         self.depth_mask = self.target_mask & prediction.isfinite() & (prediction > 0)
         self.complete = bool(self.depth_mask.all())
         self.rays = rays.to(target.dtype)
+        self.unit = unit
         self.image_dtype = image_dtype or target.dtype
         self.prediction, self.target = prediction, target
         if not self.complete:  # a finite stand-in keeps NaN out of sums and gradients
