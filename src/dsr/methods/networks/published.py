@@ -20,7 +20,7 @@ from torch import Tensor
 from dsr.degradation.scales import SCALES
 from dsr.methods.networks.msg_guidance import VariantName
 from dsr.methods.networks.msg_net import MSGNet
-from dsr.methods.networks.weight_files import load_parameters
+from dsr.methods.networks.weight_files import load_parameters, read_torch_file
 
 TORCH_MAGIC = (b"PK\x03\x04", b"\x80")
 PARTS = ("conv.weight", "conv.bias", "activation.weight")
@@ -75,13 +75,7 @@ def read_msg_weights(path: Path) -> MSGWeights:
 
 def _from_torch(path: Path) -> MSGWeights:
     """Read a torch file that holds tensors only, under ``model_state_dict``."""
-    try:
-        content = torch.load(path, map_location="cpu", weights_only=True)
-    except Exception as error:  # torch names no set of errors for damaged files
-        raise ValueError(
-            f"{path}: expected a torch file of plain tensors, got one that is damaged or holds other Python objects, "
-            f"which are never loaded ({type(error).__name__})"
-        ) from error
+    content = read_torch_file(path)
     found = content.get("model_state_dict") if isinstance(content, dict) else None
     if not isinstance(found, dict) or not all(isinstance(value, Tensor) for value in found.values()):
         keys = ", ".join(map(str, list(content)[:4])) if isinstance(content, dict) else type(content).__name__

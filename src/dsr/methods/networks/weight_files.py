@@ -10,7 +10,7 @@ from typing import Any
 import safetensors
 import safetensors.torch
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from dsr.methods.networks.base import DisparityNetwork
 
@@ -113,7 +113,26 @@ def load_network(
     return net
 
 
-def load_parameters(net: DisparityNetwork, tensors: Mapping[str, Tensor], path: Path, expected: str) -> None:
+def read_torch_file(path: Path) -> Any:
+    """Return the content of a torch file of plain values and tensors, on the CPU; no code in it is executed.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: the file is damaged or holds other Python objects.
+
+    """
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such weights file")
+    try:
+        return torch.load(path, map_location="cpu", weights_only=True)
+    except Exception as error:  # torch names no set of errors for damaged files
+        raise ValueError(
+            f"{path}: expected a torch file of plain tensors, got one that is damaged or holds other Python objects, "
+            f"which are never loaded ({type(error).__name__})"
+        ) from error
+
+
+def load_parameters(net: nn.Module, tensors: Mapping[str, Tensor], path: Path, expected: str) -> None:
     """Check the tensors of a file and load them into a network.
 
     Args:

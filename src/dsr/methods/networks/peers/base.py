@@ -1,0 +1,227 @@
+"""The base of the field's published networks, which work on a low-resolution map that was enlarged to the photo's size.
+
+Such a network maps a photo and an enlarged map in 0..1 to a refined map in 0..1. Its authors trained it on depth or on
+disparity of one data set, normalised; most of them normalise by the minimum and the maximum of the *true* map, which no
+method can know. :class:`PeerUpsampler` takes those of the low-resolution map, and the true ones only on request, to
+reproduce the authors' figures.
+"""
+
+from __future__ import annotations
+
+import abc
+import copy
+from collections.abc import Iterable
+from typing import ClassVar, Literal, get_args
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from dsr.geometry.camera import RANGE_TYPES, RangeType, from_range, to_range
+from dsr.methods.base import Cost
+from dsr.methods.networks.base import DTYPES, TILE, UNTILED, Precision
+from dsr.methods.networks.inpainting import inpaint
+from dsr.methods.networks.maps import compute_min_max, normalise
+from dsr.methods.tiling import AxisTile, blend_tiles, split_axis
+from dsr.sample import DepthSample
+from dsr.utils.progress import Steps
+
+Range = Literal["measured", "truth"]
+_OVERLAP = 16
+"""Overlap of neighbouring tiles in pixels."""
+
+
+class PeerNetwork(nn.Module, abc.ABC):
+    """A published network that refines an enlarged depth map, guided by a photo.
+
+    Attributes:
+        title: the name in messages.
+        multiple: the number that divides the sizes of its images.
+        receptive_field_radius: in pixels of the photo; None where an output depends on the whole image. Large images
+            are processed in tiles if there is one.
+        cost: the rough cost.
+
+    """
+
+    title: ClassVar[str]
+    multiple: ClassVar[int] = 1
+    receptive_field_radius: ClassVar[int | None] = None
+    cost: ClassVar[Cost]
+
+    @abc.abstractmethod
+    def enlarge(self, values_lr: Tensor, size: tuple[int, int]) -> Tensor:
+        """Enlarge a low-resolution map as the authors do.
+
+        Args:
+            values_lr: (B, 1, h, w) map without holes.
+            size: height and width of the photo.
+
+        Returns:
+            (B, 1, *size).
+
+        """
+
+    @abc.abstractmethod
+    def forward(self, rgb: Tensor, values: Tensor) -> Tensor:
+        """Refine an enlarged map.
+
+        Args:
+            rgb: (B, 3, H, W) photo in 0..1; ``multiple`` divides H and W.
+            values: (B, 1, H, W) enlarged map, of which 0..1 is the range.
+
+        Returns:
+            (B, 1, H, W) in the same range.
+
+        """
+
+    @classmethod
+    def convert(cls, tensors: dict[str, Tensor]) -> dict[str, Tensor]:
+        """Return the network's parameters by their names here.
+
+        Args:
+            tensors: content of any file, by the authors' names without ``module.``. Names that the authors' files do
+                not have are kept, so that another network's file is recognised.
+
+        """
+        return tensors
+
+
+class PeerUpsampler:
+    """An :class:`~dsr.methods.base.Upsampler` around a published network.
+
+    It takes a low-resolution map of any ratio, as the network works at the photo's size. Images of more than
+    ``UNTILED`` pixels are processed in tiles where the network's receptive field is limited.
+
+    Args:
+        net: the network; it is copied.
+        range_type: the range type of the map that the network gets.
+        value_range: the minimum and maximum that map to 0 and 1: ``measured`` for those of the low-resolution map,
+            ``truth`` for those of the true one, which is how the authors get their figures. It is the one case besides
+            the oracle of deep image priors in which a method reads ``sample.depth``; ``flag`` marks its scores.
+        precision: dtype of the convolutions.
+        device: device of the computations.
+        tile: side of a tile in pixels; None for ``TILE``, and no tiles up to ``UNTILED`` pixels.
+
+    Raises:
+        ValueError: a value is not supported.
+
+    """
+
+    def __init__(
+        self,
+        net: PeerNetwork,
+        range_type: RangeType = "disparity",
+        value_range: Range = "measured",
+        precision: Precision = "float32",
+        device: torch.device | str = "cpu",
+        tile: int | None = None,
+    ) -> None:
+        _expect("range_type", range_type, RANGE_TYPES)
+        _expect("range", value_range, get_args(Range))
+        _expect("precision", precision, DTYPES)
+        if tile is not None and tile < net.multiple:
+            raise ValueError(f"tile: expected at least {net.multiple} pixels, got {tile}")
+        self.range_type = range_type
+        self.device = torch.device(device)
+        self._uses_truth = value_range == "truth"
+        self._dtype = DTYPES[precision]
+        self._tile = tile
+        net = copy.deepcopy(net).eval().requires_grad_(False).to(self.device)
+        self.net: PeerNetwork = net.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # torch's stubs
+
+    @property
+    def flag(self) -> str:
+        """Mark for scores: ``true-range`` if the true map's minimum and maximum were used, else empty."""
+        return "true-range" if self._uses_truth else ""
+
+    @torch.inference_mode()
+    def __call__(self, sample: DepthSample, progress: Steps | None = None) -> Tensor:
+        """Return the high-resolution orthogonal depth, (1, H, W) in metres on the sample's device.
+
+        It is NaN where the disparity corresponds to a depth at or beyond infinity.
+
+        Raises:
+            ValueError: the truth's range is needed, and there is no truth.
+
+        """
+        values_lr = self._convert(sample).to(self.device)[None]
+        values = self.refine(sample.rgb.to(self.device)[None], values_lr, self._true_min_max(sample), progress)[0]
+        return from_range(values, sample.camera, self.range_type).to(sample.depth_lr.device)
+
+    def refine(
+        self, rgb: Tensor, values_lr: Tensor, min_max: Tensor | None = None, progress: Steps | None = None
+    ) -> Tensor:
+        """Return the high-resolution map.
+
+        Args:
+            rgb: (B, 3, H, W) in 0..1.
+            values_lr: (B, 1, h, w) low-resolution map; non-finite values are holes.
+            min_max: (B, 2, 1, 1) values that map to 0 and 1; None for the map's minimum and maximum.
+            progress: called after each tile.
+
+        Returns:
+            (B, 1, H, W) in the dtype of ``values_lr``.
+
+        """
+        height, width = rgb.shape[-2:]
+        normalised = normalise(inpaint(values_lr), min_max)
+        values = self.net.enlarge(normalised.values.float(), (height, width))
+        padding = (0, -width % self.net.multiple, 0, -height % self.net.multiple)
+        rgb, values = (functional.pad(each.float(), padding, mode="replicate") for each in (rgb, values))
+        refined = self._run(rgb, values, progress)[..., :height, :width].to(values_lr.dtype)
+        return refined * normalised.value_range + normalised.minimum
+
+    def _run(self, rgb: Tensor, values: Tensor, progress: Steps | None) -> Tensor:
+        """Apply the network to maps whose sizes are multiples of its own, in tiles if they are large."""
+        multiple, radius = self.net.multiple, self.net.receptive_field_radius
+        height, width = rgb.shape[-2:]
+        if radius is None or (self._tile is None and height * width <= UNTILED):
+            refined = self._apply(rgb, values)
+            if progress is not None:
+                progress(1, 1)
+            return refined
+
+        def compute(row: slice, column: slice) -> Tensor:
+            down, across = (slice(multiple * each.start, multiple * each.stop) for each in (row, column))
+            return self._apply(rgb[..., down, across], values[..., down, across])
+
+        rows, columns = (self._split_axis(n // multiple, radius) for n in (height, width))
+        return blend_tiles(compute, rows, columns, multiple, progress)
+
+    def _split_axis(self, size: int, radius: int) -> list[AxisTile]:
+        """Return the tiles along an axis, in multiples of the network's."""
+        multiple = self.net.multiple
+        return split_axis(size, (self._tile or TILE) // multiple, -(-radius // multiple), max(_OVERLAP // multiple, 2))
+
+    def _apply(self, rgb: Tensor, values: Tensor) -> Tensor:
+        """Apply the network, its convolutions in the precision."""
+        with torch.autocast(self.device.type, self._dtype, enabled=self._dtype != torch.float32):
+            return self.net(rgb, values).float()
+
+    def _convert(self, sample: DepthSample) -> Tensor:
+        """Return the low-resolution map in the range type, (1, h, w)."""
+        if self.range_type == "disparity":
+            return sample.disparity_lr()
+        return to_range(sample.depth_lr, sample.camera_lr, self.range_type)
+
+    def _true_min_max(self, sample: DepthSample) -> Tensor | None:
+        """Return the true map's minimum and maximum if they are wanted, (1, 2, 1, 1)."""
+        if not self._uses_truth:
+            return None
+        if sample.depth is None:
+            raise ValueError(f"{sample.scene}: range=truth expects a scene with a true depth map, there is none")
+        return compute_min_max(to_range(sample.depth, sample.camera, self.range_type)[None])
+
+
+def upsample_pillow(values_lr: Tensor, size: tuple[int, int]) -> Tensor:
+    """Enlarge (B, 1, h, w) to (B, 1, *size) as Pillow resizes: Keys' cubic kernel with a = -0.5.
+
+    At the border, the kernel is truncated and renormalised.
+    """
+    return functional.interpolate(values_lr, size, mode="bicubic", align_corners=False, antialias=True)
+
+
+def _expect(name: str, value: str, accepted: Iterable[str]) -> None:
+    """Raise a ValueError unless a value is an accepted one."""
+    if value not in accepted:
+        raise ValueError(f"{name}: expected one of {', '.join(accepted)}, got {value!r}")
