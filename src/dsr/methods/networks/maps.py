@@ -10,6 +10,9 @@ from torch.nn import functional
 
 from dsr.geometry.camera import Camera
 
+_IMAGENET_MEAN = (0.485, 0.456, 0.406)
+_IMAGENET_DEVIATION = (0.229, 0.224, 0.225)
+
 
 class Normalised(NamedTuple):
     """A map normalised to 0..1 per sample, (B, 1, H, W), and its minimum and range, (B, 1, 1, 1), to undo it."""
@@ -59,6 +62,12 @@ def upsample_bicubic(x: Tensor, scale: int) -> Tensor:
     """
     size = [scale * n for n in x.shape[-2:]]
     return functional.interpolate(x, size=size, mode="bicubic", align_corners=False, antialias=True)
+
+
+def normalise_imagenet(rgb: Tensor) -> Tensor:
+    """Return images, (B, 3, H, W) in 0..1, minus the mean colour of ImageNet, divided by its standard deviation."""
+    mean, deviation = (rgb.new_tensor(values).view(3, 1, 1) for values in (_IMAGENET_MEAN, _IMAGENET_DEVIATION))
+    return (rgb - mean) / deviation
 
 
 def lr_coordinates(camera: Camera, camera_lr: Camera, device: torch.device | str = "cpu") -> tuple[Tensor, Tensor]:

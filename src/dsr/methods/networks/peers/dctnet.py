@@ -11,6 +11,7 @@ the left-hand side the eigenvalues of the Laplacian of four neighbours.
 from __future__ import annotations
 
 import math
+import re
 from typing import ClassVar
 
 import torch
@@ -18,21 +19,25 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from dsr.methods.base import Cost
+from dsr.methods.networks.maps import normalise_imagenet
 from dsr.methods.networks.peers.base import PeerNetwork, upsample_pillow
 from dsr.methods.networks.peers.dct import dct2, idct2
 
 FEATURES = 64
-_SHARED = 32
 _LAYERS = 4
 _CHUNK = 2**20
 """Number of values that the transforms process at once, so that they stay in the processor's cache."""
-_RENAMED = (
-    ("WPNet.", "attention."),
-    ("Encoder_coupled.init_deep.0.", "depth_head."),
-    ("Encoder_coupled.init_rgb.0.", "rgb_head."),
-    ("Encoder_coupled.coupled_feat_extractor.", "layers."),
-    ("Decoder_depth.Decoder_Deep.", "decoder."),
-)
+_UNUSED = "WPNet.conv_dilation."
+_RENAMED = {
+    r"^WPNet\.": "attention.",
+    r"^Encoder_coupled\.init_deep\.0\.": "depth_head.",
+    r"^Encoder_coupled\.init_rgb\.0\.": "rgb_head.",
+    r"^Encoder_coupled\.coupled_feat_extractor\.": "layers.",
+    r"\.kernel_(shared|depth|rgb)_([12])$": r".conv\2.\1.weight",
+    r"\.bias_(shared|depth|rgb)_([12])$": r".conv\2.\1.bias",
+    r"^Decoder_depth\.Decoder_Deep\.": "decoder.",
+}
+"""Regular expressions of the authors' names, and their replacements here."""
 
 
 class EdgeAttention(nn.Module):
@@ -59,33 +64,40 @@ class EdgeAttention(nn.Module):
         return self.conv4(coarse + self.conv_f(x)).sigmoid()
 
 
-class CoupledLayer(nn.Module):
-    """A residual block for depth and one for the photo, which share half of their kernels."""
+class CoupledConv(nn.Module):
+    """A convolution of the depth's features and one of the photo's, which share half of their kernels."""
 
     def __init__(self) -> None:
-        """Make the parameters; they get their values from a file."""
+        """Make the kernels of both, the depth's and the photo's."""
         super().__init__()
-        for index in (1, 2):
-            for kind, count in (("shared", _SHARED), ("depth", FEATURES - _SHARED), ("rgb", FEATURES - _SHARED)):
-                self.register_parameter(f"kernel_{kind}_{index}", nn.Parameter(torch.zeros(count, FEATURES, 3, 3)))
-                self.register_parameter(f"bias_{kind}_{index}", nn.Parameter(torch.zeros(count)))
+        half = FEATURES // 2
+        self.shared, self.depth, self.rgb = (nn.Conv2d(FEATURES, half, 3, padding=1) for _ in range(3))
 
     def forward(self, depth: Tensor, rgb: Tensor) -> tuple[Tensor, Tensor]:
         """Map two tensors of (B, 64, H, W) to two of the same shape."""
-        return self._refine(depth, "depth"), self._refine(rgb, "rgb")
+        return self._convolve(depth, self.depth), self._convolve(rgb, self.rgb)
 
-    def _refine(self, x: Tensor, kind: str) -> Tensor:
-        """Apply the residual block of a kind."""
-        y = functional.conv2d(x, *self._parameters_of(kind, 1), padding=1).relu_()
-        return functional.conv2d(y, *self._parameters_of(kind, 2), padding=1).add_(x).relu_()
-
-    def _parameters_of(self, kind: str, index: int) -> tuple[Tensor, Tensor]:
-        """Return the kernels and biases of a convolution."""
-        kernels, biases = (
-            torch.cat([self.get_parameter(f"{part}_{each}_{index}") for each in ("shared", kind)])
-            for part in ("kernel", "bias")
+    def _convolve(self, x: Tensor, own: nn.Conv2d) -> Tensor:
+        """Apply the shared kernels and others, (B, 64, H, W)."""
+        weight, bias = (
+            torch.cat([conv.get_parameter(name) for conv in (self.shared, own)]) for name in ("weight", "bias")
         )
-        return kernels.contiguous(memory_format=torch.channels_last), biases
+        return functional.conv2d(x, weight.contiguous(memory_format=torch.channels_last), bias, padding=1)
+
+
+class CoupledLayer(nn.Module):
+    """A residual block of two coupled convolutions."""
+
+    def __init__(self) -> None:
+        """Make the convolutions."""
+        super().__init__()
+        self.conv1, self.conv2 = CoupledConv(), CoupledConv()
+
+    def forward(self, depth: Tensor, rgb: Tensor) -> tuple[Tensor, Tensor]:
+        """Map two tensors of (B, 64, H, W) to two of the same shape."""
+        first = [each.relu_() for each in self.conv1(depth, rgb)]
+        second = self.conv2(*first)
+        return second[0].add_(depth).relu_(), second[1].add_(rgb).relu_()
 
 
 class DCTNet(PeerNetwork):
@@ -96,8 +108,7 @@ class DCTNet(PeerNetwork):
     """
 
     title = "DCTNet"
-    scales = (4, 8, 16)
-    cost: ClassVar[Cost] = Cost(work=300_000, memory=2_000)
+    cost: ClassVar[Cost] = Cost(memory=2000, seconds=20)
 
     def __init__(self) -> None:
         """Make the layers."""
@@ -117,14 +128,9 @@ class DCTNet(PeerNetwork):
         )
 
     @classmethod
-    def rename(cls, name: str) -> str | None:
-        """Return the name here of a tensor of the authors' file; None for the one layer that they do not use."""
-        if name.startswith("WPNet.conv_dilation."):
-            return None
-        for theirs, ours in _RENAMED:
-            if name.startswith(theirs):
-                return ours + name.removeprefix(theirs)
-        return name
+    def convert(cls, tensors: dict[str, Tensor]) -> dict[str, Tensor]:
+        """Return the parameters by their names here, without the one layer that the authors do not use."""
+        return {_rename(name): value for name, value in tensors.items() if not name.startswith(_UNUSED)}
 
     def enlarge(self, values_lr: Tensor, size: tuple[int, int]) -> Tensor:
         """Enlarge as Pillow's bicubic filter does."""
@@ -183,3 +189,10 @@ def _laplacian_eigenvalues(height: int, width: int, like: Tensor) -> Tensor:
         for size in (height, width)
     )
     return (2 * (rows[:, None] + columns - 2)).to(like)
+
+
+def _rename(name: str) -> str:
+    """Return the name here of a tensor of the authors' files."""
+    for pattern, replacement in _RENAMED.items():
+        name = re.sub(pattern, replacement, name)
+    return name
