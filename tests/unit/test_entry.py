@@ -38,8 +38,8 @@ SETTINGS = (
     "method, weights, run"
 )
 DATASETS = (
-    "folder, icl, middlebury, middlebury2001, middlebury2003, middlebury2005, middlebury2006, middlebury_train, "
-    "mixture, nyu, paper_train, procedural, simgeo, sintel, sunrgbd, tartanair, tofmark"
+    "folder, icl, lu, middlebury, middlebury2001, middlebury2003, middlebury2005, middlebury2006, middlebury8, "
+    "middlebury_train, mixture, nyu, paper_train, procedural, simgeo, sintel, sunrgbd, tartanair, tofmark"
 )
 METHODS = (
     "anisotropic_diffusion, bicubic, bilinear, dg, dip, dip_v, dip_v_warm, eg, facets, fast_global_smoother, "

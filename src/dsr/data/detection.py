@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from dsr.data.folder import load_scene
-from dsr.data.formats import icl_nuim, middlebury, nyu, sintel, sunrgbd, tartanair, tofmark
+from dsr.data.formats import eight_bit, icl_nuim, middlebury, nyu, sintel, sunrgbd, tartanair, tofmark
 from dsr.sample import Scene
 
 Loader = Callable[[], Scene]
@@ -20,6 +20,10 @@ _FRAMES: tuple[tuple[Callable[[Path], Mapping[str, tuple[Any, ...]]], Callable[.
     (tartanair.find_frames, tartanair.load_frame, "tartanair"),
     (sintel.find_frames, sintel.load_frame, "sintel"),
     (tofmark.find_frames, tofmark.load_frame, "tofmark"),
+    *(
+        (functools.partial(eight_bit.find_frames, dataset=benchmark), eight_bit.load_frame, benchmark)
+        for benchmark in eight_bit.BENCHMARKS
+    ),
 )
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Literal, get_args
+from typing import Literal, Self, get_args
 
 import torch
 from torch import Tensor
@@ -17,6 +17,8 @@ RangeType = Literal["orthogonal", "perspective", "disparity"]
 RANGE_TYPES: tuple[RangeType, ...] = get_args(RangeType)
 VIRTUAL_BASELINE = 0.2
 """Baseline in metres of the virtual stereo pair of a camera without a second one (Voynov et al. 2019)."""
+ASSUMED_FOV = 60.0
+"""Horizontal field of view in degrees, about that of a phone's main camera and of a depth camera's colour sensor."""
 
 
 @dataclass(frozen=True)
@@ -61,6 +63,16 @@ class Camera:
         if self.baseline is not None and not (math.isfinite(self.baseline) and self.baseline > 0):
             raise ValueError(f"camera baseline: expected a positive number of metres, got {self.baseline!r}")
         object.__setattr__(self, "fy", abs(self.fy))
+
+    @classmethod
+    def centred(cls, width: int, height: int, focal: float) -> Self:
+        """Return the camera with a focal length in pixels and the principal point in the middle of the image."""
+        return cls(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
+
+    @classmethod
+    def from_fov(cls, width: int, height: int, fov: float = ASSUMED_FOV) -> Self:
+        """Return the camera with a horizontal field of view in degrees and a centred principal point."""
+        return cls.centred(width, height, width / 2 / math.tan(math.radians(fov) / 2))
 
     def crop(self, top: int, left: int, height: int, width: int) -> Camera:
         """Return the camera of the ``height x width`` window whose first pixel is (``top``, ``left``)."""

@@ -11,13 +11,11 @@ import numpy as np
 from pydantic import BaseModel, Field, ValidationError
 
 from dsr.data.formats.files import CameraFile, Pixels, read_camera
-from dsr.geometry.camera import Camera
+from dsr.geometry.camera import ASSUMED_FOV, Camera
 from dsr.io.encoding import Assumption
 from dsr.io.photos import Size, focal_in_exif, same_aspect
 from dsr.utils.validation import describe
 
-_DEFAULT_FOV = 60.0
-"""Horizontal field of view in degrees, about that of a phone's main camera and of a depth camera's colour sensor."""
 _FILM_DIAGONAL = math.hypot(36, 24)
 """Diagonal of 35 mm film in millimetres, to which equivalent focal lengths refer (CIPA DCG-001)."""
 _MAX_OFF_CENTRE = 0.25
@@ -69,7 +67,7 @@ def find_camera(choice: CameraChoice, photo: Path, size: Size, size_lr: Size) ->
     if choice.intrinsics is not None:
         return _camera_only(Camera(width, height, *choice.intrinsics)), []
     if choice.fov is not None:
-        return _camera_only(_centred_camera(size, width / 2 / math.tan(math.radians(choice.fov) / 2))), []
+        return _camera_only(Camera.from_fov(width, height, choice.fov)), []
     equivalent = focal_in_exif(photo)
     if equivalent is not None:
         focal = equivalent / _FILM_DIAGONAL * math.hypot(width, height)
@@ -77,10 +75,10 @@ def find_camera(choice: CameraChoice, photo: Path, size: Size, size_lr: Size) ->
             "camera: focal length from the photo's EXIF data, principal point in the middle",
             f"{equivalent:g} mm for 35 mm film = {focal:.5g} pixels",
         )
-        return _camera_only(_centred_camera(size, focal)), [assumption]
-    focal = width / 2 / math.tan(math.radians(_DEFAULT_FOV) / 2)
-    text = f"camera: none given, {_DEFAULT_FOV:g} degrees of horizontal view assumed (--camera, --fov or --intrinsics)"
-    return _camera_only(_centred_camera(size, focal)), [Assumption(text, f"{focal:.5g} pixels")]
+        return _camera_only(Camera.centred(width, height, focal)), [assumption]
+    camera = Camera.from_fov(width, height)
+    text = f"camera: none given, {ASSUMED_FOV:g} degrees of horizontal view assumed (--camera, --fov or --intrinsics)"
+    return _camera_only(camera), [Assumption(text, f"{camera.fx:.5g} pixels")]
 
 
 def read_any_camera(path: Path) -> CameraFile | np.ndarray:
@@ -105,11 +103,6 @@ def read_any_camera(path: Path) -> CameraFile | np.ndarray:
 def _camera_only(camera: Camera) -> CameraFile:
     """Return a camera file that says nothing about depth."""
     return CameraFile(camera, None, None, None)
-
-
-def _centred_camera(size: Size, focal: float) -> Camera:
-    height, width = size
-    return Camera(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
 
 
 def _fit_to_photo(

@@ -141,6 +141,20 @@ def _icl(room: str, archive: str) -> tuple[Item, ...]:
     )
 
 
+_DCTNET = "https://github.com/Zhaozixiang1228/GDSR-DCTNet"
+_DCTNET_FILES = (
+    "https://raw.githubusercontent.com/Zhaozixiang1228/GDSR-DCTNet/5243875223398fd7996bca2e54dc2792bb96862a/RawDatasets"
+)
+"""Test images of the field, at the commit of which the files are known."""
+_CITE_LU = "S. Lu, X. Ren, F. Liu: Depth enhancement via low-rank matrix completion. CVPR 2014."
+
+
+def _levels(folder: str, source: str, names: Sequence[str], spelling: str) -> tuple[Item, ...]:
+    """Return the photos and maps of an 8-bit benchmark."""
+    paths = [path for name in names for path in (f"RGB/{name}_{spelling}_color.png", f"Depth/{name}_output_depth.png")]
+    return tuple(Item(f"{folder}/{path}", (f"{_DCTNET_FILES}/{source}/{path}",)) for path in paths)
+
+
 def _sintel(path: str, contains: tuple[str, ...]) -> Item:
     name = path.rpartition("/")[2]
     hosts = ("https://files.is.tue.mpg.de", "http://files.is.tue.mpg.de")
@@ -294,6 +308,26 @@ _COLLECTIONS = (
         manual="fetch any environment with the tool of its homepage and put its trajectories, such as "
         "P000/image_left/*.png and P000/depth_left/*.npy, anywhere below {folder}",
         patterns=("**/image_left/*.png", "**/depth_left/*.npy"),
+    ),
+    Collection(
+        "lu",
+        "Lu's six pairs of a structured-light sensor, 8 bits, as the field evaluates on them",
+        _DCTNET,
+        _RESEARCH,
+        _CITE_LU,
+        ("lu",),
+        2e6,
+        _levels("lu", "Lu", [f"RGBD_{number:02d}" for number in range(1, 7)], "ouput"),
+    ),
+    Collection(
+        "middlebury8",
+        "Thirty pairs of Middlebury 2001 to 2006, 8 bits, as the field evaluates on them",
+        _DCTNET,
+        _MIDDLEBURY,
+        f"{_CITE_2001} {_CITE_2006} {_CITE_LU}",
+        ("middlebury8",),
+        12e6,
+        _levels("middlebury8", "Middlebury", [f"Middlebury_{number:02d}" for number in range(1, 31)], "output"),
     ),
 )
 CATALOGUE: dict[str, Collection] = {collection.name: collection for collection in _COLLECTIONS}

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import cv2
@@ -81,6 +81,16 @@ def read_16bit(path: Path) -> np.ndarray:
         channels = 1 if pixels.ndim == 2 else pixels.shape[2]
         raise ValueError(f"{path}: expected one channel of 16 bits, got {channels} of {pixels.dtype}")
     return pixels
+
+
+def read_millimetres(path: Path) -> Tensor:
+    """Return a depth picture of 16 bits that holds millimetres, 0 for a hole: (1, H, W) float64 in metres, NaN there.
+
+    Raises:
+        ValueError: it is missing, damaged, no such picture, or all holes.
+
+    """
+    return to_depth(path, read_16bit(path) / 1000)
 
 
 def to_depth(path: Path, values: np.ndarray, farthest: float = math.inf) -> Tensor:
@@ -173,3 +183,31 @@ def name_of(root: Path, folder: Path, frame: str = "") -> str:
     """Return the name of a frame of a folder, "a/b/0001", from ``root`` on; of ``root`` itself the directory's name."""
     path = folder.relative_to(root) / frame
     return path.as_posix() if path.parts else root.resolve().name
+
+
+def find_beside(
+    root: Path, photos: str, pattern: re.Pattern[str], others: Sequence[str]
+) -> Iterator[tuple[Path, str, tuple[Path, ...]]]:
+    """Yield the frames of a data set that has its photos in one folder and their maps in folders beside it.
+
+    Args:
+        root: directory of the data set; the folders lie at any depth.
+        photos: name of the folders of photos.
+        pattern: of a photo's file name; its first group identifies the frame.
+        others: the frame's other files, from the folder that ``photos`` lies in, with ``{}`` for the frame.
+
+    Yields:
+        The folder that ``photos`` lies in, the frame, and its files: the photo, then the others. A frame that lacks one
+        of them is left out.
+
+    Raises:
+        ValueError: there is no such directory.
+
+    """
+    for place, below, _ in walk(root):
+        if photos in below:
+            for photo in sorted((place / photos).iterdir()):
+                if match := pattern.fullmatch(photo.name):
+                    files = (photo, *(place / other.format(match[1]) for other in others))
+                    if all(path.is_file() for path in files):
+                        yield place, match[1], files
