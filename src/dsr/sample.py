@@ -7,8 +7,9 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from fractions import Fraction
 from pathlib import Path
 from typing import Any, Self
 
@@ -18,6 +19,7 @@ from torch import Tensor
 
 from dsr.geometry.camera import Camera, to_range
 from dsr.utils.files import read_arrays, replacing
+from dsr.utils.ratios import as_ratio, round_ratio
 
 
 class AllHolesError(ValueError):
@@ -70,7 +72,9 @@ class Scene:
         rgb: (3, H, W) floating point, in [0, 1].
         camera: the camera of both.
         depth: (1, H, W) true depth, or None where it is not known.
-        measured: low-resolution depth maps that a sensor measured, (1, H / factor, W / factor) by factor.
+        measured: low-resolution depth maps that a sensor measured, (1, h, w) by the ratio of the photo's width to w: 1,
+            2.667, 4. At a whole ratio, the map has H // ratio x W // ratio pixels and leaves out what remains of the
+            photo at the bottom and the right; at any other it covers the whole photo, to within a pixel.
         notes: what somebody who reads the scores should know, such as "depth is not metric".
         unit: the unit in which the data set's benchmark prints errors.
 
@@ -84,7 +88,7 @@ class Scene:
     rgb: Tensor
     camera: Camera
     depth: Tensor | None = None
-    measured: Mapping[int, Tensor] = field(default_factory=dict)
+    measured: Mapping[float, Tensor] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
     unit: Unit = CENTIMETRES
 
@@ -95,26 +99,37 @@ class Scene:
             raise ValueError(f"{self.name}: expected a depth map, high-resolution or measured, got none")
         if self.depth is not None:
             _expect_depth(self.name, "depth", self.depth, (self.camera.height, self.camera.width))
-        for factor, depth in self.measured.items():
-            if factor < 1:
-                raise ValueError(f"{self.name}: measured: expected a positive factor, got {factor}")
-            size = (self.camera.height // factor, self.camera.width // factor)
-            _expect_depth(self.name, f"measured depth at x{factor}", depth, size)
+        object.__setattr__(self, "measured", {as_ratio(ratio): depth for ratio, depth in self.measured.items()})
+        for ratio, depth in self.measured.items():
+            if not 1 <= ratio < math.inf:
+                raise ValueError(f"{self.name}: measured: expected a ratio of 1 or more, got {ratio}")
+            what, size = f"measured depth at x{round_ratio(ratio)}", (self.camera.height, self.camera.width)
+            _expect_depth(self.name, what, depth, _reduced_size(size, ratio, depth.shape[-2:]))
 
     def crop(self, top: int, left: int, height: int, width: int) -> Scene:
         """Return a window of the scene: ``height`` x ``width`` pixels from row ``top`` and column ``left`` on.
 
-        A measured map is cropped along with it where its factor divides all four numbers, and left out otherwise.
+        A measured map is cropped along with it where the window consists of whole pixels of the map, and left out
+        otherwise.
         """
         window = (slice(None), slice(top, top + height), slice(left, left + width))
-        measured = {
-            factor: depth[:, top // factor : (top + height) // factor, left // factor : (left + width) // factor]
-            for factor, depth in self.measured.items()
-            if not any(number % factor for number in (top, left, height, width))
-        }
+        measured = {}
+        for ratio, depth_lr in self.measured.items():
+            down, across = self._steps(ratio)
+            rows, columns = (top / down, (top + height) / down), (left / across, (left + width) / across)
+            if all(place.denominator == 1 for place in (*rows, *columns)):
+                (first_row, end_row), (first_column, end_column) = map(int, rows), map(int, columns)
+                measured[ratio] = depth_lr[:, first_row:end_row, first_column:end_column]
         depth = None if self.depth is None else self.depth[window]
         camera = self.camera.crop(top, left, height, width)
         return replace(self, rgb=self.rgb[window], depth=depth, camera=camera, measured=measured)
+
+    def _steps(self, ratio: float) -> tuple[Fraction, Fraction]:
+        """Return the height and the width of a pixel of a measured map in the photo's pixels."""
+        if isinstance(ratio, int):
+            return Fraction(ratio), Fraction(ratio)
+        height, width = self.measured[ratio].shape[-2:]
+        return Fraction(self.camera.height, height), Fraction(self.camera.width, width)
 
 
 @dataclass(frozen=True)
@@ -124,10 +139,11 @@ class DepthSample:
     Args:
         dataset, scene: names; together they identify the sample.
         rgb: (3, H, W) floating point, in [0, 1].
-        depth_lr: (1, h, w) low-resolution depth, H = h * scale and W = w * scale.
+        depth_lr: (1, h, w) low-resolution depth; H = h * scale and W = w * scale, to within a low-resolution pixel
+            where the scale is not whole.
         camera: the camera of the photo and of ``depth``.
         camera_lr: the camera of ``depth_lr``.
-        scale: the upsampling factor.
+        scale: the upsampling factor W / w: 1, 2.667, 4.
         depth: (1, H, W) true high-resolution depth, or None where it is not known.
         notes: what somebody who reads the scores should know, such as "cropped from 513 x 512".
         unit: the unit in which the data set's benchmark prints errors.
@@ -143,7 +159,7 @@ class DepthSample:
     depth_lr: Tensor
     camera: Camera
     camera_lr: Camera
-    scale: int
+    scale: float
     depth: Tensor | None = None
     notes: tuple[str, ...] = field(default=())
     unit: Unit = CENTIMETRES
@@ -151,15 +167,18 @@ class DepthSample:
     def __post_init__(self) -> None:
         """Check shapes, value ranges and cameras against each other."""
         _expect_rgb(self.scene, self.rgb, self.camera)
-        if self.scale < 1:
-            raise ValueError(f"{self.scene}: scale: expected a positive whole number, got {self.scale}")
-        size, coarse_size = (self.camera.height, self.camera.width), (self.camera_lr.height, self.camera_lr.width)
-        if (coarse_size[0] * self.scale, coarse_size[1] * self.scale) != size:
+        object.__setattr__(self, "scale", as_ratio(self.scale))
+        if not 1 <= self.scale < math.inf:
+            raise ValueError(f"{self.scene}: scale: expected a number of 1 or more, got {self.scale}")
+        size, size_lr = (self.camera.height, self.camera.width), (self.camera_lr.height, self.camera_lr.width)
+        expected = _reduced_size(size, self.scale, size_lr)
+        whole = isinstance(self.scale, int)
+        if size_lr != expected or (whole and (size_lr[0] * self.scale, size_lr[1] * self.scale) != size):
             raise ValueError(
-                f"{self.scene}: depth_lr: expected {size[0] // self.scale} x {size[1] // self.scale} (the photo's "
-                f"{size[0]} x {size[1]} at scale {self.scale}), got {coarse_size[0]} x {coarse_size[1]}"
+                f"{self.scene}: depth_lr: expected {expected[0]} x {expected[1]} (the photo's "
+                f"{size[0]} x {size[1]} at scale {round_ratio(self.scale)}), got {size_lr[0]} x {size_lr[1]}"
             )
-        _expect_depth(self.scene, "depth_lr", self.depth_lr, coarse_size)
+        _expect_depth(self.scene, "depth_lr", self.depth_lr, size_lr)
         if self.depth is not None:
             _expect_depth(self.scene, "depth", self.depth, size)
 
@@ -206,7 +225,7 @@ class DepthSample:
                 torch.from_numpy(depth_lr)[None],
                 Camera(**about["camera"]),
                 Camera(**about["camera_lr"]),
-                int(about["scale"]),
+                float(about["scale"]),
                 torch.from_numpy(arrays["depth"])[None] if "depth" in arrays else None,
                 tuple(about["notes"]),
                 _read_unit(about),
@@ -228,7 +247,8 @@ class DepthSample:
             dtype: to compute in; None for that of ``depth_lr``.
 
         """
-        return to_range(self.depth_lr.to(dtype or self.depth_lr.dtype), self.camera_lr, "disparity") * self.scale
+        pixels = self.camera.width / self.camera_lr.width  # of the high-resolution camera in a low-resolution one
+        return to_range(self.depth_lr.to(dtype or self.depth_lr.dtype), self.camera_lr, "disparity") * pixels
 
     @property
     def mask(self) -> Tensor | None:
@@ -261,6 +281,15 @@ def _unpack(stored: np.ndarray, dtype: str) -> np.ndarray:
     """Return the values that :func:`_pack` was given."""
     largest = _BITS.get(str(stored.dtype))
     return stored if largest is None else stored.astype(dtype) / np.dtype(dtype).type(largest)
+
+
+def _reduced_size(size: tuple[int, int], ratio: float, size_lr: Sequence[int]) -> tuple[int, int]:
+    """Return the height and width that a map at a ratio has to have; ``size_lr`` itself where it is near enough."""
+    if isinstance(ratio, int):
+        return size[0] // ratio, size[1] // ratio
+    near = all(abs(n / ratio - n_lr) <= 1 for n, n_lr in zip(size, size_lr, strict=True))
+    height, width = size_lr if near else (round(n / ratio) for n in size)
+    return height, width
 
 
 def _expect_shape(scene: str, name: str, value: Tensor, shape: tuple[int, ...]) -> None:

@@ -445,6 +445,38 @@ def test_size_that_the_scale_does_not_divide_is_cropped_with_a_note(tmp_path, wi
         assert kept["depth"].shape == (40, 48)
 
 
+@pytest.mark.parametrize(("size", "ratio"), [((40, 48), "1"), ((15, 18), "2.667"), ((10, 12), "4")])
+def test_measured_map_of_any_size_is_upsampled_at_its_own_ratio(tmp_path, within, size, ratio):
+    write_scene(tmp_path / "data" / "a", height=40, width=48)
+    np.save(tmp_path / "data" / "a" / "depth_lr.npy", np.full(size, 2.0, np.float32))
+    arguments = ("dataset=folder", "dataset.root=data", "downsampling=measured")
+    code, output, errors = within(*arguments, "scale=native")
+    assert (code, errors) == (0, [])
+    assert f"Bicubic on folder, x{ratio}, measured downsampling" in output
+    (folder,) = (tmp_path / "outputs" / "eval").iterdir()
+    assert folder.name.startswith(f"folder_measured_x{ratio}_bicubic_")
+    with (folder / "scores.csv").open(newline="") as file:
+        assert {row["scale"] for row in csv.DictReader(file)} == {ratio}
+    with np.load(folder / "predictions" / "a.npz") as kept:
+        np.testing.assert_allclose(kept["depth"], 2.0, rtol=0.02)
+    code, output, errors = within(*arguments, f"scale={ratio}")
+    assert (code, errors) == (0, [])
+    assert "predictions re-used: 1" in output
+
+
+def test_scale_that_names_no_measured_map_is_refused(tmp_path, within):
+    write_scene(tmp_path / "data" / "a", height=40, width=48)
+    arguments = ("dataset=folder", "dataset.root=data", "downsampling=measured")
+    message = "expects a low-resolution map, exactly one, there is none"
+    assert within(*arguments, "scale=native")[::2] == (2, [f"error: a: downsampling=measured scale=native {message}"])
+    np.save(tmp_path / "data" / "a" / "depth_lr.npy", np.full((15, 18), 2.0, np.float32))
+    message = "expects a low-resolution map at x2.5, the scene has x2.667"
+    assert within(*arguments, "scale=2.5")[::2] == (2, [f"error: a: downsampling=measured {message}"])
+    code, _, errors = within(*arguments, "scale=0.5")
+    assert code == 2
+    assert errors == ["error: scale: expected native or the ratio of the measured maps, 1 or more, got 0.5"]
+
+
 @pytest.mark.parametrize("size", [4, 12])
 def test_picture_too_small_for_the_scale_is_refused_by_name(tmp_path, within, size):
     write_scene(tmp_path / "data" / "dwarf", height=size, width=size)

@@ -36,7 +36,7 @@ def _values(height: int, width: int, seed: int = 0) -> Tensor:
     return torch.from_numpy(np.random.default_rng(seed).uniform(1.0, 3.0, (1, height, width)))
 
 
-def _scene(depth: Tensor | None, camera: Camera = CAMERA, measured: dict[int, Tensor] | None = None) -> Scene:
+def _scene(depth: Tensor | None, camera: Camera = CAMERA, measured: dict[float, Tensor] | None = None) -> Scene:
     rgb = torch.linspace(0, 1, 3 * camera.height * camera.width).view(3, camera.height, camera.width)
     return Scene("set", "hall", rgb, camera, depth, measured or {})
 
@@ -317,6 +317,40 @@ def test_measured_map_is_used_unchanged() -> None:
     assert sample.depth_lr is measured
     assert sample.depth is None
     assert sample.camera_lr == CAMERA.rescale(12, 8)
+
+
+@pytest.mark.parametrize("scale", [2.6667, 2.65, "native"])
+def test_measured_map_at_any_ratio_covers_the_whole_photo(scale: Any) -> None:
+    camera = Camera(width=16, height=11, fx=9.0, fy=9.0, cx=7.5, cy=5.0)
+    measured = _values(4, 6)
+    sample = make_sample(_scene(None, camera, {16 / 6: measured}), scale, Measured(), "disparity")
+    assert sample.depth_lr is measured
+    assert (sample.camera, sample.camera_lr, sample.scale) == (camera, camera.rescale(6, 4), 16 / 6)
+    assert sample.notes == ()
+
+
+def test_measured_map_at_the_photo_s_own_resolution_has_its_camera() -> None:
+    measured = _values(32, 48)
+    sample = make_sample(_scene(_values(32, 48), measured={1: measured}), "native", Measured(), "disparity")
+    assert (sample.camera_lr, sample.scale) == (CAMERA, 1)
+    assert sample.depth_lr is measured
+
+
+def test_native_scale_needs_exactly_one_measured_map() -> None:
+    both = {1: _values(32, 48), 4: _values(8, 12)}
+    with pytest.raises(ValueError, match=r"^hall: .*scale=native expects .* exactly one, the scene has x1, x4; give "):
+        make_sample(_scene(None, measured=both), "native", Measured(), "disparity")
+    with pytest.raises(ValueError, match=r"^hall: .*scale=native expects .* exactly one, there is none$"):
+        make_sample(_scene(_values(32, 48)), "native", Measured(), "disparity")
+    with pytest.raises(ValueError, match=r"^scale: expected one of 2, 4, 8, 16, got native$"):
+        make_sample(_scene(_values(32, 48)), "native", Downsampling("box"), "disparity")
+
+
+@pytest.mark.parametrize("scale", [0, 2.63, 2.7, math.nan])
+def test_ratio_that_no_measured_map_has_is_refused(scale: float) -> None:
+    camera = Camera(width=16, height=11, fx=9.0, fy=9.0, cx=7.5, cy=5.0)
+    with pytest.raises(ValueError, match=r"expects a low-resolution map at x.*, the scene has x2.667"):
+        make_sample(_scene(None, camera, {16 / 6: _values(4, 6)}), scale, Measured(), "disparity")
 
 
 def test_scene_without_the_required_maps_is_refused() -> None:

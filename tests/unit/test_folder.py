@@ -242,6 +242,35 @@ def test_mask_applies_to_the_high_resolution_depth_alone(scene):
     assert bool(record.measured[4].isfinite().all())
 
 
+@pytest.mark.parametrize(("size", "ratio"), [((H, W), 1), ((2, 4), 2), ((1, 3), 8 / 3), ((3, 5), 1.6)])
+def test_measured_map_of_any_size_has_the_ratio_of_the_widths(scene, size, ratio):
+    values = np.random.default_rng(0).uniform(1, 2, size)
+    np.save(scene / "depth_lr.npy", values)
+    record = load_scene(scene, "folder")
+    assert list(record.measured) == [ratio]
+    np.testing.assert_array_equal(record.measured[ratio][0].numpy(), values)
+
+
+def test_measured_disparity_of_any_size_is_in_its_own_pixels(scene):
+    np.save(scene / "disparity_lr.npy", np.full((1, 3), 0.5 * F * 3 / 8 / 4.0))
+    describe(scene, baseline=0.5)
+    np.testing.assert_allclose(load_scene(scene, "folder").measured[8 / 3].numpy(), 4.0, rtol=1e-6)
+
+
+@pytest.mark.parametrize("size", [(H, 2 * W), (2 * H, W), (4, 4), (1, 6)])
+def test_measured_map_of_another_aspect_or_larger_than_the_photo_is_refused(scene, capfd, size):
+    np.save(scene / "depth_lr.npy", np.ones(size))
+    message = refusal(scene, capfd)
+    assert message.startswith("/depth_lr.npy: expected the aspect ratio of the 4 x 8 photo")
+    assert message.endswith(f"got {size[0]} x {size[1]}")
+
+
+def test_two_measured_maps_of_one_size_are_refused(scene, capfd):
+    np.save(scene / "depth_lr.npy", np.ones((1, 2)))
+    np.save(scene / "depth_lr4.npy", np.ones((1, 2)))
+    assert refusal(scene, capfd).startswith("/depth_lr4.npy: expected one map at x4, there is another")
+
+
 @pytest.mark.parametrize("name", ["depth_lr0.npy", "depth_lr5.npy", "disparity_lr64.npy"])
 def test_measured_map_at_an_impossible_factor_is_refused(scene, capfd, name):
     np.save(scene / "depth.npy", Z)

@@ -126,7 +126,7 @@ def test_scene_without_any_depth_is_refused() -> None:
 
 @pytest.mark.parametrize("factor", [0, -2])
 def test_measured_map_without_a_factor_is_refused(factor: int) -> None:
-    with pytest.raises(ValueError, match=f"^hall: measured: expected a positive factor, got {factor}"):
+    with pytest.raises(ValueError, match=f"^hall: measured: expected a ratio of 1 or more, got {factor}"):
         _scene(measured={factor: torch.ones(1, 2, 4)})
 
 
@@ -139,10 +139,50 @@ def test_low_and_high_resolution_sizes_must_differ_by_the_scale() -> None:
         _sample(camera_lr=CAMERA.rescale(3, 2), depth_lr=torch.ones(1, 2, 3))
 
 
-@pytest.mark.parametrize("scale", [0, -2])
-def test_scale_that_is_not_positive_is_refused(scale: int) -> None:
-    with pytest.raises(ValueError, match=f"^hall: scale: expected a positive whole number, got {scale}"):
+@pytest.mark.parametrize("scale", [0, -2, 0.5, math.nan, math.inf])
+def test_scale_below_1_is_refused(scale: float) -> None:
+    with pytest.raises(ValueError, match=f"^hall: scale: expected a number of 1 or more, got {scale}"):
         _sample(scale=scale)
+
+
+def test_ratios_are_whole_numbers_where_they_can_be() -> None:
+    assert isinstance(_sample(scale=2.0).scale, int)
+    (ratio,) = _scene(measured={2.0: torch.ones(1, 2, 4)}).measured
+    assert isinstance(ratio, int)
+
+
+def test_map_at_a_ratio_that_is_not_whole_may_miss_the_photo_by_a_pixel() -> None:
+    camera = Camera(width=16, height=11, fx=9.0, fy=9.0, cx=7.5, cy=5.0)
+    fields = {"rgb": torch.rand(3, 11, 16), "camera": camera, "depth": None}
+    for height in (4, 5):  # 11 / (16 / 6) is 4.1
+        scene = _scene(**fields, measured={16 / 6: torch.ones(1, height, 6)})
+        low = camera.rescale(6, height)
+        sample = _sample(**fields, depth_lr=torch.ones(1, height, 6), camera_lr=low, scale=16 / 6)
+        assert scene.camera.reduce(6, height) == low
+        assert sample.disparity_lr()[0, 0, 0] == pytest.approx(baseline_times_focal(camera))
+    with pytest.raises(ValueError, match=r"measured depth at x2.667: expected shape \(1, 4, 6\), got \(1, 6, 6\)"):
+        _scene(**fields, measured={16 / 6: torch.ones(1, 6, 6)})
+    with pytest.raises(ValueError, match=r"depth_lr: expected 4 x 6 \(the photo's 11 x 16 at scale 2.667\), got 4 x 8"):
+        _sample(**fields, depth_lr=torch.ones(1, 4, 8), camera_lr=camera.rescale(8, 4), scale=16 / 6)
+
+
+def test_crop_keeps_a_map_at_any_ratio_where_the_window_has_whole_pixels_of_it() -> None:
+    camera = Camera(width=24, height=16, fx=9.0, fy=9.0, cx=11.5, cy=7.5)
+    depth_lr = torch.arange(1.0, 55.0).view(1, 6, 9)
+    scene = _scene(rgb=torch.rand(3, 16, 24), camera=camera, depth=None, measured={24 / 9: depth_lr})
+    window = scene.crop(8, 0, 8, 16)
+    assert torch.equal(window.measured[24 / 9], depth_lr[:, 3:, :6])
+    with pytest.raises(ValueError, match="expected a depth map, high-resolution or measured, got none"):
+        scene.crop(0, 0, 12, 24)
+
+
+def test_sample_at_a_ratio_that_is_not_whole_is_read_as_it_was_written(tmp_path: Path) -> None:
+    camera = Camera(width=16, height=11, fx=9.0, fy=9.0, cx=7.5, cy=5.0)
+    low = camera.rescale(6, 4)
+    rgb = torch.zeros(3, 11, 16)
+    sample = _sample(rgb=rgb, camera=camera, depth=None, depth_lr=torch.ones(1, 4, 6), camera_lr=low, scale=16 / 6)
+    sample.save(tmp_path / "hall.npz")
+    assert DepthSample.load(tmp_path / "hall.npz").scale == 16 / 6
 
 
 def test_records_are_immutable() -> None:

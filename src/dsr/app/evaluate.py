@@ -21,7 +21,8 @@ from dsr.app.metrics import check_metrics, chosen_metrics, metric_collection
 from dsr.app.schema import EvalConfig, given_keys, plain_config, user_directories
 from dsr.app.training_runs import studies_of_run
 from dsr.data.base import SceneSource, prepare_scenes
-from dsr.evaluation.predict import Evaluation, Outcome, StalePredictionError, predict
+from dsr.degradation.scales import NATIVE, match_ratio
+from dsr.evaluation.predict import Evaluation, Outcome, StalePredictionError, failure_line, predict
 from dsr.evaluation.score import score
 from dsr.methods.dip.upsampler import WORKSPACE
 from dsr.methods.registry import build_method, find_weights, target_paths
@@ -63,8 +64,9 @@ def _evaluate(plain: dict[str, Any], source: SceneSource | None) -> pd.DataFrame
     settings = EvalConfig.of(plain)
     console = open_console()
     device = pick_device(settings.device)
-    plain = {**plain, "precision": _precision(settings, device)}
-    settings.precision = plain["precision"]
+    source = source or _source(settings)
+    plain = {**plain, "precision": _precision(settings, device), "scale": _scale(settings, source)}
+    settings = EvalConfig.of(plain)
     weights = _weights(settings)
     targets = target_paths(settings.method, user_directories())
     identity = rundir.identity_of(plain, None if weights is None else file_hash(weights), device, targets)
@@ -95,23 +97,38 @@ def _evaluate(plain: dict[str, Any], source: SceneSource | None) -> pd.DataFrame
     return scores
 
 
+def _source(settings: EvalConfig) -> SceneSource:
+    """Build the data set that the configuration describes."""
+    if "parts" in settings.dataset:
+        name = settings.dataset["name"]
+        raise ConfigError(f"dataset={name}: several data sets are for training; name one of them")
+    source: SceneSource = build("dataset", settings.dataset)
+    return source
+
+
+def _scale(settings: EvalConfig, source: SceneSource) -> float:
+    """Return the upsampling factor; where it is not whole, the exact ratio of the first scene's measured map."""
+    if settings.scale != NATIVE and float(settings.scale).is_integer():
+        return int(settings.scale)
+    first = source.scenes()[0]
+    try:
+        return match_ratio(settings.scale, source.load(first).measured)
+    except (ValueError, OSError) as error:
+        raise ConfigError(failure_line(first, error)) from error
+
+
 def _study(
-    settings: EvalConfig, identity: Mapping[str, Any], given: Mapping[str, Any], source: SceneSource | None
+    settings: EvalConfig, identity: Mapping[str, Any], given: Mapping[str, Any], source: SceneSource
 ) -> Evaluation:
-    """Build what the configuration describes.
+    """Build the evaluation that the configuration describes.
 
     Args:
         settings: the configuration.
         identity: what identifies its predictions.
         given: values that a method may take in addition to the configuration's: device, weights, workspace, display.
-        source: the data set; None for the one that the configuration describes.
+        source: the data set.
 
     """
-    if source is None:
-        if "parts" in settings.dataset:
-            name = settings.dataset["name"]
-            raise ConfigError(f"dataset={name}: several data sets are for training; name one of them")
-        source = build("dataset", settings.dataset)
     downsampling = build("downsampling", settings.downsampling)
     name = str(settings.method["name"])
     if "downsampling.assumed" in given_keys() and not takes("method", settings.method, "downsampling"):

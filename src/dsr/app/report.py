@@ -51,7 +51,7 @@ class ReportRequest:
 
     methods: tuple[str, ...]
     datasets: tuple[str, ...]
-    scales: tuple[int, ...]
+    scales: tuple[float, ...]
     parts: tuple[str, ...]
     light: str
     title: str

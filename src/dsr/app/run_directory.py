@@ -16,6 +16,7 @@ from dsr.app.moved_targets import update_targets
 from dsr.utils.builder import ConfigError
 from dsr.utils.files import write_text
 from dsr.utils.hashing import hash_of_code, hash_outside_code
+from dsr.utils.ratios import round_ratio
 from dsr.utils.versions import versions
 
 _RECORD = "versions.json"
@@ -23,7 +24,7 @@ _NOT_IDENTITY = ("output_dir", "overwrite", "metrics", "weights", "resume", "run
 PREDICTING_CODE = (
     "sample.py", "degradation", "geometry", "metrics", "synthetic", "methods", "data", "training",
     "utils/builder.py", "utils/config_files.py", "utils/devices.py", "utils/lightning.py", "utils/progress.py",
-    "utils/validation.py", "evaluation/predict.py",
+    "utils/ratios.py", "utils/validation.py", "evaluation/predict.py",
 )  # fmt: skip
 """Modules and packages that determine a prediction, by their paths below the package."""
 
@@ -52,7 +53,12 @@ def default_directory(kind: str, config: Mapping[str, Any], identity: Mapping[st
     """Return outputs/KIND/DATASET_DOWNSAMPLING_xSCALE_METHOD_HASH; the same configuration gives the same one."""
     digest = hashlib.sha256(json.dumps(identity, sort_keys=True).encode()).hexdigest()[:8]
     what = config["method"] if "method" in config else config["model"]
-    names = (config["dataset"]["name"], config["downsampling"]["name"], f"x{config['scale']}", what["name"])
+    names = (
+        config["dataset"]["name"],
+        config["downsampling"]["name"],
+        f"x{round_ratio(config['scale'])}",
+        what["name"],
+    )
     return Path("outputs") / kind / "_".join((*names, digest))
 
 

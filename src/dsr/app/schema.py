@@ -12,7 +12,7 @@ from hydra.core.config_store import ConfigStore
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import MISSING, DictConfig, OmegaConf
 
-from dsr.degradation.scales import SCALES
+from dsr.degradation.scales import NATIVE, check_scale
 from dsr.training.settings import PatchSettings, Schedule
 from dsr.utils.builder import ConfigError
 
@@ -60,6 +60,14 @@ class Checked:
         """
 
 
+def _expect_factor(scale: Any) -> None:
+    """Raise ConfigError for a scale that downsampling models do not have."""
+    try:
+        check_scale(scale)
+    except ValueError as error:
+        raise ConfigError(str(error)) from error
+
+
 def _refuse_unknown(plain: Any, names: Collection[str], place: str = "") -> None:
     """Raise ConfigError for the first key that is not in ``names``, and for a value that has no keys."""
     if not isinstance(plain, Mapping):
@@ -95,8 +103,6 @@ class RunConfig(Checked):
             ConfigError: a value is not one of its choices.
 
         """
-        if self.scale not in SCALES:
-            raise ConfigError(f"scale: expected one of {', '.join(map(str, SCALES))}, got {self.scale}")
         if self.precision not in PRECISIONS:
             raise ConfigError(f"precision: expected one of {', '.join(PRECISIONS)}, got {self.precision}")
         if self.seed < 0:
@@ -107,10 +113,27 @@ class RunConfig(Checked):
 class EvalConfig(RunConfig):
     """The configuration of ``eval.py``."""
 
+    scale: Any = 4
     holes: dict[str, Any] = MISSING
     method: dict[str, Any] = MISSING
     weights: str | None = None
     run: str | None = None
+
+    def check(self) -> None:
+        """Check values beyond their types.
+
+        Raises:
+            ConfigError: a value is not one of its choices.
+
+        """
+        super().check()
+        if not str(self.downsampling.get("target")).endswith(".Measured"):
+            _expect_factor(self.scale)
+        number = isinstance(self.scale, (int, float)) and not isinstance(self.scale, bool) and self.scale >= 1
+        if not number and self.scale != NATIVE:
+            raise ConfigError(
+                f"scale: expected {NATIVE} or the ratio of the measured maps, 1 or more, got {self.scale!r}"
+            )
 
 
 @dataclass
@@ -165,6 +188,7 @@ class TrainConfig(RunConfig):
 
         """
         super().check()
+        _expect_factor(self.scale)
         w = self.loss.w
         if w != "auto" and (isinstance(w, bool) or not isinstance(w, (int, float)) or not 0 <= w < math.inf):
             raise ConfigError(f"loss.w: expected auto or a number, 0 or more, got {w!r}")

@@ -8,6 +8,8 @@ from typing import Any
 
 from rich.console import Console
 
+from dsr.utils.ratios import as_ratio
+
 _DESCRIPTION = """\
 Make tables, figures, the metric study and a page from runs of eval.py. All runs in and below the directories are read;
 no other files are needed.
@@ -39,7 +41,7 @@ def add(commands: Any) -> None:
     parser.add_argument("--study", type=Path, metavar="CSV", help="what `dsr study collect` wrote")
     parser.add_argument("--methods", nargs="+", default=[], metavar="NAME", help="these alone, as the tables name them")
     parser.add_argument("--datasets", nargs="+", default=[], metavar="NAME", help="these alone")
-    parser.add_argument("--scale", type=int, nargs="+", default=[], metavar="N", help="these alone")
+    parser.add_argument("--scale", type=float, nargs="+", default=[], metavar="N", help="these alone")
     parser.add_argument("--light", default="e1", metavar="NAME", help="of the figures: e1 (default), e2, e3 or e4")
     parser.add_argument("--title", default="Depth super-resolution", help="of the page")
     parser.add_argument("--page-mb", type=float, default=60.0, metavar="MB", help="maximum size of the page; 60")
@@ -54,7 +56,7 @@ def _run(options: argparse.Namespace, console: Console, _: object) -> list[str]:
     request = ReportRequest(
         tuple(options.methods),
         tuple(options.datasets),
-        tuple(options.scale),
+        tuple(map(as_ratio, options.scale)),
         tuple(part.strip() for part in options.only.split(",")) if options.only is not None else PARTS,
         options.light,
         options.title,

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 from rich.console import Console
 
 from dsr.utils.console import ConsoleProgress, show
+from dsr.utils.ratios import as_ratio
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -45,7 +46,7 @@ def add(commands: Any) -> None:
     build.add_argument("runs", nargs="+", type=Path, metavar="RUNS", help="runs, or directories with runs below")
     build.add_argument("-o", "--output", type=Path, required=True, metavar="DIR", help="where to")
     build.add_argument("--light", default="e4", help="of the renderings: e1, e2, e3 or e4, the default")
-    build.add_argument("--scale", type=int, nargs="+", default=[], metavar="N", help="these alone")
+    build.add_argument("--scale", type=float, nargs="+", default=[], metavar="N", help="these alone")
     build.add_argument("--downsampling", nargs="+", default=[], metavar="NAME", help="these alone")
     build.add_argument("--methods", nargs="+", default=[], metavar="NAME", help="these alone")
     build.add_argument("--scenes", nargs="+", default=[], metavar="NAME", help="these alone")
@@ -81,7 +82,7 @@ def _build(options: argparse.Namespace, console: Console, _: object) -> list[str
     words = {name: text for name, text in (("title", options.title), ("send_to", options.send_to)) if text is not None}
     choice = Choice(
         light=options.light,
-        scales=options.scale,
+        scales=[as_ratio(scale) for scale in options.scale],
         downsamplings=options.downsampling,
         methods=options.methods,
         scenes=options.scenes,

@@ -4,8 +4,9 @@
               camera.json
               depth.* or disparity.*         high-resolution depth; .npy, .png (16 bit), .tiff, .pfm
               mask.png                       optional; 0 where the high-resolution depth is unknown
-              depth_lr4.*, disparity_lr4.*   optional; a measured low-resolution map, here at x4, disparity in its own
-              pixels
+              depth_lr.*, disparity_lr.*     optional; a measured low-resolution map of any size with the photo's field
+                                             of view, disparity in its own pixels
+              depth_lr4.*, disparity_lr4.*   the same, whose size has to be that of the factor in its name, here 4
 
 Depth and disparity follow ``camera.json``; see :func:`dsr.data.formats.files.read_camera` for its keys.
 """
@@ -25,10 +26,11 @@ from dsr.data.base import SceneSelection, select_scenes
 from dsr.data.formats.files import MAP_SUFFIXES, CameraFile, read_camera, read_map, read_mask, read_rgb
 from dsr.geometry.camera import Camera, RangeType, from_range
 from dsr.sample import Scene
+from dsr.utils.ratios import round_ratio
 
 _RGB_NAMES = ("rgb.png", "rgb.jpg", "rgb.jpeg")
 _QUANTITIES = ("depth", "disparity")
-_MEASURED = re.compile(r"(depth|disparity)_lr(\d+)")
+_MEASURED = re.compile(r"(depth|disparity)_lr(\d*)")
 
 
 class Folder:
@@ -84,15 +86,14 @@ def load_scene(folder: Path, dataset: str) -> Scene:
     rgb_path = _first(folder, _RGB_NAMES)
     rgb = read_rgb(rgb_path)
     _expect_size(rgb_path, rgb.shape[:2], (camera.height, camera.width))
-    measured = {}
+    measured: dict[float, Tensor] = {}
     for path in sorted(folder.iterdir()):
         match = _MEASURED.fullmatch(path.stem)
         if match and path.suffix.lower() in MAP_SUFFIXES:
-            factor = int(match[2])
-            size = (camera.width // max(factor, 1), camera.height // max(factor, 1))
-            if factor < 1 or not all(size):
-                raise ValueError(f"{path}: expected a factor that the {camera.height} x {camera.width} photo allows")
-            measured[factor] = _read_depth(path, match[1], description, camera.downscale(factor))
+            ratio, depth_lr = _read_measured(path, match[1], match[2], description)
+            if ratio in measured:
+                raise ValueError(f"{path}: expected one map at x{round_ratio(ratio)}, there is another")
+            measured[ratio] = depth_lr
     path_hr = _find_depth_hr(folder)
     depth = None if path_hr is None else _read_depth(path_hr, path_hr.stem, description, camera, folder / "mask.png")
     if depth is None and not measured:
@@ -100,6 +101,24 @@ def load_scene(folder: Path, dataset: str) -> Scene:
         raise ValueError(f"{folder}: expected {names}, there is none")
     pixels = torch.from_numpy(rgb).permute(2, 0, 1).float() / 255
     return Scene(dataset, folder.name, pixels, camera, depth, measured)
+
+
+def _read_measured(path: Path, quantity: str, factor: str, description: CameraFile) -> tuple[float, Tensor]:
+    """Return the ratio and the depth of a measured map; ``factor`` is the number in its name, or empty."""
+    camera = description.camera
+    if factor:
+        size = (camera.width // max(int(factor), 1), camera.height // max(int(factor), 1))
+        if not int(factor) or not all(size):
+            raise ValueError(f"{path}: expected a factor that the {camera.height} x {camera.width} photo allows")
+        return int(factor), _read_depth(path, quantity, description, camera.downscale(int(factor)))
+    height, width = read_map(path).shape
+    ratios = camera.width / width, camera.height / height
+    if min(ratios) < 1 or abs(width * camera.height / camera.width - height) > 1:
+        raise ValueError(
+            f"{path}: expected the aspect ratio of the {camera.height} x {camera.width} photo (height x width) and no "
+            f"more pixels, got {height} x {width}"
+        )
+    return camera.ratio_to(width, height), _read_depth(path, quantity, description, camera.reduce(width, height))
 
 
 def _first(folder: Path, names: Sequence[str]) -> Path:

@@ -23,7 +23,7 @@ from torch import Tensor
 
 from dsr.degradation.holes import Holes
 from dsr.degradation.noise import Noise
-from dsr.degradation.scales import check_scale
+from dsr.degradation.scales import check_scale, match_ratio
 from dsr.geometry.camera import Camera, RangeType, from_range, to_range
 from dsr.sample import DepthSample, Scene
 
@@ -162,7 +162,7 @@ class Measured:
         return Downsampling(self.assumed)
 
 
-def scene_generator(seed: int, *names: str | int) -> torch.Generator:
+def scene_generator(seed: int, *names: str | float) -> torch.Generator:
     """Return a generator that is a pure function of a seed and of names."""
     digest = hashlib.sha256(repr((seed, *names)).encode()).digest()
     return torch.Generator().manual_seed(int.from_bytes(digest[:8], "little") >> 1)
@@ -170,7 +170,7 @@ def scene_generator(seed: int, *names: str | int) -> torch.Generator:
 
 def make_sample(
     scene: Scene,
-    scale: int,
+    scale: float | Literal["native"],
     downsampling: Downsampling | Measured,
     range_type: RangeType,
     noise: Noise | None = None,
@@ -179,11 +179,12 @@ def make_sample(
 ) -> DepthSample:
     """Return the super-resolution problem of a scene.
 
-    An image whose size is not a multiple of the scale is cropped at the bottom and the right, with a note.
+    An image whose size is not a multiple of a whole scale is cropped at the bottom and the right, with a note.
 
     Args:
         scene: the high-resolution maps.
-        scale: the upsampling factor, one of 2, 4, 8, 16.
+        scale: the upsampling factor: 2, 4, 8 or 16 with a model; for a measured map its ratio (to within 1 %), or
+            ``native`` for that of the scene's only one.
         downsampling: the model, or :class:`Measured` for the scene's own low-resolution map.
         range_type: range type that the method works on.
         noise: noise of the low-resolution map, unless it is measured.
@@ -194,41 +195,61 @@ def make_sample(
         ValueError: the scene has no depth or no measured map at this scale, or a value is out of range.
 
     """
-    check_scale(scale)
-    scene, notes = _crop_to_multiple(scene, scale)
+    if isinstance(downsampling, Measured):
+        ratio = _match_measured(scene, scale)
+        factor = ratio if isinstance(ratio, int) else 1
+    else:
+        check_scale(scale)
+        ratio = factor = int(scale)
+        _true_depth(scene)
+    scene, notes = _crop_to_multiple(scene, factor)
     if isinstance(generator, int):
-        of_noise = scene_generator(generator, scene.dataset, scene.name, scale)
-        of_holes = scene_generator(generator, scene.dataset, scene.name, scale, "holes")
+        of_noise = scene_generator(generator, scene.dataset, scene.name, ratio)
+        of_holes = scene_generator(generator, scene.dataset, scene.name, ratio, "holes")
     else:
         of_noise = of_holes = generator
     if isinstance(downsampling, Measured):
-        depth_lr, camera_lr = _measured_depth(scene, scale), scene.camera.downscale(scale)
+        depth_lr = scene.measured[ratio]
+        camera_lr = scene.camera.reduce(depth_lr.shape[-1], depth_lr.shape[-2])
     else:
-        if scene.depth is None:
-            raise ValueError(f"{scene.name}: expected a high-resolution depth map to downsample, there is none")
         noisy = None if noise is None else (noise, of_noise)
-        depth_lr, camera_lr = downsample_depth(scene.depth, scene.camera, scale, downsampling, range_type, noisy)
+        depth_lr, camera_lr = downsample_depth(
+            _true_depth(scene), scene.camera, factor, downsampling, range_type, noisy
+        )
     if holes is not None:
         depth_lr = depth_lr.masked_fill(holes(depth_lr, camera_lr, of_holes), torch.nan)
     return DepthSample(
-        scene.dataset, scene.name, scene.rgb, depth_lr, scene.camera, camera_lr, scale, scene.depth, notes, scene.unit
+        scene.dataset, scene.name, scene.rgb, depth_lr, scene.camera, camera_lr, ratio, scene.depth, notes, scene.unit
     )
 
 
-def _crop_to_multiple(scene: Scene, scale: int) -> tuple[Scene, tuple[str, ...]]:
-    """Return the scene cropped to a multiple of the scale, and its notes."""
+def _true_depth(scene: Scene) -> Tensor:
+    """Return the scene's high-resolution depth."""
+    if scene.depth is None:
+        raise ValueError(f"{scene.name}: expected a high-resolution depth map to downsample, there is none")
+    return scene.depth
+
+
+def _match_measured(scene: Scene, scale: float | str) -> float:
+    """Return the ratio of the scene's measured map that a scale names."""
+    try:
+        return match_ratio(scale, scene.measured)
+    except ValueError as error:
+        raise ValueError(f"{scene.name}: {error}") from error
+
+
+def _crop_to_multiple(scene: Scene, factor: int) -> tuple[Scene, tuple[str, ...]]:
+    """Return the scene cropped to a multiple of the factor, and its notes."""
     camera = scene.camera
-    height, width = (size // scale * scale for size in (camera.height, camera.width))
+    height, width = (size // factor * factor for size in (camera.height, camera.width))
     before = f"{camera.height} x {camera.width}"
     if not height or not width:
-        raise ValueError(f"{scene.name}: expected at least {scale} x {scale} pixels, got {before}")
+        raise ValueError(f"{scene.name}: expected at least {factor} x {factor} pixels, got {before}")
     if (height, width) == (camera.height, camera.width):
         return scene, scene.notes
-    if scene.depth is None and scale not in scene.measured:
-        raise ValueError(f"{scene.name}: expected a measured map at x{scale}, there is none")
     return scene.crop(0, 0, height, width), (
         *scene.notes,
-        f"cropped from {before} to {height} x {width}, which {scale} divides",
+        f"cropped from {before} to {height} x {width}, which {factor} divides",
     )
 
 
@@ -267,13 +288,3 @@ def downsample_depth(
         values = kind(values, generator)
     depth_lr = from_range(values, camera_lr, range_type)
     return torch.where(depth_lr > 0, depth_lr, torch.nan), camera_lr  # bicubic may undershoot beside a depth step
-
-
-def _measured_depth(scene: Scene, scale: int) -> Tensor:
-    """Return the scene's measured low-resolution depth."""
-    if scale not in scene.measured:
-        have = ", ".join(f"x{factor}" for factor in scene.measured) or "none"
-        raise ValueError(
-            f"{scene.name}: downsampling=measured expects a low-resolution map at x{scale}, the scene has {have}"
-        )
-    return scene.measured[scale]

@@ -20,6 +20,7 @@ from dsr.doctor.registration import check_registration
 from dsr.doctor.units import check_units
 from dsr.sample import Scene
 from dsr.utils.console import USAGE_ERROR, ConsoleProgress, one_line, open_console, print_error
+from dsr.utils.ratios import round_ratio
 
 FINE, FAULTY = 0, 1
 CHECKS: tuple[Callable[[Scene], list[Finding]], ...] = (
@@ -85,7 +86,7 @@ def _examine(name: str, load: Callable[[], Scene]) -> tuple[str, list[Finding]]:
         message = f"cannot be read: {one_line(error)}"
         return name, [Finding("files", "problem", message, "correct the file or its description")]
     if scene.depth is None:
-        return f"{name} (the map measured at x{min(scene.measured)})", examine(scene)
+        return f"{name} (the map measured at x{round_ratio(min(scene.measured))})", examine(scene)
     return name, examine(scene)
 
 

@@ -44,9 +44,11 @@ def with_depth(scene: Scene) -> Scene:
     """Return the scene at the resolution of its high-resolution depth, else of its largest measured map."""
     if scene.depth is not None:
         return scene
-    factor = min(scene.measured)
-    depth, camera = scene.measured[factor], scene.camera.downscale(factor)
-    rgb = functional.avg_pool2d(scene.rgb[:, : camera.height * factor, : camera.width * factor][None], factor)[0]
+    depth = scene.measured[min(scene.measured)]
+    height, width = depth.shape[-2:]
+    camera, ratio = scene.camera.reduce(width, height), scene.camera.ratio_to(width, height)
+    rgb = scene.rgb[:, : camera.height * ratio, : camera.width * ratio] if isinstance(ratio, int) else scene.rgb
+    rgb = functional.interpolate(rgb[None], (height, width), mode="area")[0]
     return replace(scene, rgb=rgb.clamp(0, 1), camera=camera, depth=depth, measured={})
 
 

@@ -6,6 +6,7 @@ import numpy as np
 
 from dsr.doctor.finding import Array, Finding, Level, length, metres
 from dsr.sample import Scene
+from dsr.utils.ratios import round_ratio
 
 _NEAREST, _FARTHEST = 0.05, 200.0
 """Metres; depth entirely below or above is in another unit."""
@@ -85,14 +86,19 @@ def _measured(scene: Scene, depth: Array) -> list[Finding]:
     findings = []
     for factor, measured in sorted(scene.measured.items()):
         depth_lr = measured[0].double().numpy()
-        subsampled = depth[factor // 2 :: factor, factor // 2 :: factor][: depth_lr.shape[0], : depth_lr.shape[1]]
-        depth_lr = depth_lr[: subsampled.shape[0], : subsampled.shape[1]]
+        rows, columns = (
+            np.minimum(((np.arange(n) + 0.5) * factor).astype(int), size - 1)
+            for n, size in zip(depth_lr.shape, depth.shape, strict=True)
+        )
+        subsampled = depth[rows[:, None], columns]
         both = np.isfinite(subsampled) & np.isfinite(depth_lr)
         if not both.any():
             continue
         ratio = float(np.median(depth_lr[both] / subsampled[both]))
         if not 1 / _AGREEMENT <= ratio <= _AGREEMENT:
-            message = f"the measured map at x{factor} is {ratio:.3g} times as far as the high-resolution depth"
+            message = (
+                f"the measured map at x{round_ratio(factor)} is {ratio:.3g} times as far as the high-resolution depth"
+            )
             advice = "use one unit for both; the disparity of a low-resolution map is in its own pixels"
             findings.append(Finding("units", "problem", message, advice))
     return findings

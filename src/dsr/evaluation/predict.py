@@ -56,7 +56,7 @@ class Evaluation:
     source: SceneSource
     downsampling: Downsampling | Measured
     downsampling_name: str
-    scale: int
+    scale: float
     method: Upsampler
     method_name: str
     seed: int

@@ -18,6 +18,7 @@ from dsr.evaluation.store import load_prediction, prediction_path, sample_path
 from dsr.metrics.catalogue import KNOWN_FORMATS
 from dsr.metrics.formats import MetricFormat, complete_formats, in_tables
 from dsr.sample import DepthSample
+from dsr.utils.ratios import as_ratio
 from dsr.utils.validation import describe
 
 METHOD_ORDER = (
@@ -39,7 +40,7 @@ class BenchmarkSetting(NamedTuple):
     """The setting in which methods are compared: a data set, a scale, a degradation."""
 
     dataset: str
-    scale: int
+    scale: float
     downsampling: str
 
 
@@ -64,7 +65,7 @@ class Run:
 
     folder: Path
     dataset: str
-    scale: int
+    scale: float
     downsampling: str
     seed: int
     method: str
@@ -141,7 +142,7 @@ class Results:
         """Return the runs of a setting, in order."""
         return [run for run in self.runs if run.problem == problem]
 
-    def only(self, methods: Sequence[str] = (), datasets: Sequence[str] = (), scales: Sequence[int] = ()) -> Results:
+    def only(self, methods: Sequence[str] = (), datasets: Sequence[str] = (), scales: Sequence[float] = ()) -> Results:
         """Return the runs of some methods (by label), data sets and scales; an empty sequence selects all.
 
         Raises:
@@ -239,7 +240,7 @@ def read_run(folder: Path) -> Run:
     dataset = str(scores["dataset"].iloc[0]) if len(scores) else summary.dataset
     scenes = tuple(scene for scene in summary.seconds if prediction_path(folder, scene).is_file())
     scores = scores[scores["scene"].isin(scenes)]
-    about = (folder, dataset, summary.scale, summary.downsampling, summary.seed, summary.method, str(label))
+    about = (folder, dataset, as_ratio(summary.scale), summary.downsampling, summary.seed, summary.method, str(label))
     return Run(
         *about,
         scores,
@@ -256,7 +257,7 @@ class _Summary(BaseModel):
     """The content of ``summary.json``; runs of earlier versions lack the keys with defaults."""
 
     dataset: str
-    scale: int
+    scale: float
     downsampling: str
     method: str
     seed: int
@@ -287,7 +288,8 @@ def _read_scores(path: Path) -> pd.DataFrame:
     try:
         missing = {name: [""] for name in _NUMBER_COLUMNS}
         scores = pd.read_csv(path, dtype=dict.fromkeys(_TEXT_COLUMNS, str), keep_default_na=False, na_values=missing)
-        scores = scores[[*_TEXT_COLUMNS, *_NUMBER_COLUMNS]].astype({"scale": int, "seed": int, "value": float})
+        scores = scores[[*_TEXT_COLUMNS, *_NUMBER_COLUMNS]].astype({"seed": int, "value": float})
+        scores["scale"] = pd.to_numeric(scores["scale"])
     except (OSError, ValueError, KeyError, pd.errors.ParserError) as error:
         raise ValueError(f"{path}: expected a run's scores, got a damaged or foreign file") from error
     return scores

@@ -19,6 +19,7 @@ from dsr.metrics.formats import HEADLINES
 from dsr.sample import DepthSample
 from dsr.utils.files import replacing, write_text
 from dsr.utils.progress import Progress
+from dsr.utils.ratios import round_ratio
 
 SCORE_COLUMNS = (
     "dataset",
@@ -83,7 +84,7 @@ def summary(study: Evaluation, scores: pd.DataFrame, outcome: Outcome, metrics: 
     means = worst.groupby("metric", sort=False)["value"].mean()
     return {
         "dataset": study.source.name,
-        "scale": study.scale,
+        "scale": round_ratio(study.scale),
         "downsampling": study.downsampling_name,
         "method": study.method_name,
         "label": study.label or study.method_name,
@@ -116,7 +117,7 @@ def _score_scene(
         yield {
             "dataset": sample.dataset,
             "scene": sample.scene,
-            "scale": sample.scale,
+            "scale": round_ratio(sample.scale),
             "downsampling": study.downsampling_name,
             "method": study.method_name,
             "seed": study.seed,

@@ -107,6 +107,22 @@ class Camera:
         width, height = self.width // factor, self.height // factor
         return self.crop(0, 0, height * factor, width * factor).rescale(width, height)
 
+    def ratio_to(self, width: int, height: int) -> float:
+        """Return how many pixels of this camera lie side by side in one of a smaller map of the same view.
+
+        It is whole, an ``int``, if the map has the size of :meth:`downscale`, else the ratio of the widths, or of the
+        heights where that of the widths is whole.
+        """
+        factor = self.width // width
+        if factor and (width, height) == (self.width // factor, self.height // factor):
+            return factor
+        return self.height / height if self.width % width == 0 else self.width / width
+
+    def reduce(self, width: int, height: int) -> Camera:
+        """Return the camera of a smaller map of the same view; see :meth:`ratio_to`."""
+        ratio = self.ratio_to(width, height)
+        return self.downscale(ratio) if isinstance(ratio, int) else self.rescale(width, height)
+
     def decimate(self, factor: int, offset: float) -> Camera:
         """Return the camera whose pixel (i, j) is this one's (i * factor + offset, j * factor + offset)."""
         return replace(

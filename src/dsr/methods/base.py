@@ -10,6 +10,7 @@ from torch import Tensor
 from dsr.geometry.camera import RangeType
 from dsr.sample import DepthSample
 from dsr.utils.progress import Steps
+from dsr.utils.ratios import round_ratio
 
 
 class NoSolutionError(ValueError):
@@ -68,6 +69,18 @@ class Iterative(Protocol):
     """
 
     history: list[dict[str, float]]
+
+
+def whole_scale(sample: DepthSample) -> int:
+    """Return the scale of a sample for a method that needs a whole one.
+
+    Raises:
+        ValueError: it is not whole.
+
+    """
+    if not isinstance(sample.scale, int):
+        raise ValueError(f"{sample.scene}: expected a whole scale for this method, got {round_ratio(sample.scale)}")
+    return sample.scale
 
 
 def expect_limits(tolerance: float, **counts: int) -> None:

@@ -88,7 +88,7 @@ class _Maker:
 
     """
 
-    scale: int
+    scale: float
     downsampling: str
     methods: Sequence[str]
     values: Values

@@ -119,7 +119,7 @@ class PaperTable:
     name: str
     title: str
     notes: tuple[str, ...]
-    scale: int
+    scale: float
     downsampling: str
     columns: tuple[Column, ...]
     groups: tuple[Group, ...]

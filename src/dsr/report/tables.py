@@ -11,6 +11,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from dsr.metrics.formats import HEADLINES, Formats, describe_directions, in_tables
+from dsr.utils.ratios import as_ratio
 
 RECREATED = {
     "cube_high_freq": "Cube, high-frequency texture",
@@ -38,7 +39,7 @@ def published() -> pd.DataFrame:
         return pd.read_csv(file)
 
 
-def published_row(scene: str, method: str, scale: int) -> pd.Series | None:
+def published_row(scene: str, method: str, scale: float) -> pd.Series | None:
     """Return the paper's values for a scene (by our name or the paper's) and a method (by its name in the paper)."""
     name = RECREATED.get(scene, scene.replace("_", " "))
     number = _published_places().get((name.casefold(), method, scale))
@@ -46,14 +47,14 @@ def published_row(scene: str, method: str, scale: int) -> pd.Series | None:
 
 
 @functools.cache
-def _published_places() -> dict[tuple[str, str, int], int]:
+def _published_places() -> dict[tuple[str, str, float], int]:
     """Return the row number in :func:`published` by scene, method and scale."""
     table = published()
     keys = zip(table["scene"].str.casefold(), table["method"], table["scale"], strict=True)
     return {(scene, method, int(scale)): number for number, (scene, method, scale) in enumerate(keys)}
 
 
-def paper_row(scene: str, method: str, scale: int, downsampling: str) -> pd.Series | None:
+def paper_row(scene: str, method: str, scale: float, downsampling: str) -> pd.Series | None:
     """Return the paper's values like :func:`published_row`, None for a downsampling other than the paper's."""
     return published_row(scene, method, scale) if downsampling == _PUBLISHED_DOWNSAMPLING else None
 
@@ -83,7 +84,7 @@ def score_table(scores: pd.DataFrame, label: str, formats: Formats) -> Table:
     """
     ours = in_shown_units(scores, formats)
     columns = {str(name): formats[str(name)] for name in ours}
-    scale, downsampling = int(scores["scale"].iloc[0]), str(scores["downsampling"].iloc[0])
+    scale, downsampling = as_ratio(scores["scale"].iloc[0]), str(scores["downsampling"].iloc[0])
     dataset = str(scores["dataset"].iloc[0])
     title = f"{label} on {dataset}, x{scale}, {downsampling} downsampling - {describe_directions(columns)}"
     table = Table(title=escape(title), title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))

@@ -63,7 +63,7 @@ def check_study(study: pd.DataFrame, name: str = "study") -> None:
 
 
 def user_cells(
-    study: pd.DataFrame | None, places: Sequence[tuple[str, str]], scale: int, downsampling: str, label: str
+    study: pd.DataFrame | None, places: Sequence[tuple[str, str]], scale: float, downsampling: str, label: str
 ) -> dict[str, Answer]:
     """Return the percentages of answers that chose a method, by column of :data:`USER_COLUMNS`.
 

@@ -41,7 +41,7 @@ class Choice:
     """
 
     light: str = "e4"
-    scales: Sequence[int] = ()
+    scales: Sequence[float] = ()
     downsamplings: Sequence[str] = ()
     methods: Sequence[str] = ()
     scenes: Sequence[str] = ()

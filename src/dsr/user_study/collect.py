@@ -55,7 +55,7 @@ def collect(answers: Sequence[Answers], key: Key) -> pd.DataFrame:
         key: key of the study.
 
     """
-    groups: dict[tuple[int, str], dict[str, list[str]]] = {}
+    groups: dict[tuple[float, str], dict[str, list[str]]] = {}
     for name in _seen(answers, key):
         trial = key.trials[name]
         groups.setdefault((trial.scale, trial.downsampling), {}).setdefault(trial.dataset, []).append(name)

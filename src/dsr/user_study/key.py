@@ -45,7 +45,7 @@ class Trial:
 
     dataset: str
     scene: str
-    scale: int
+    scale: int | float  # as two types, so that a stored whole number is read as one
     downsampling: str
     candidates: Mapping[str, Candidate]
 

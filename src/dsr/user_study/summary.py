@@ -10,6 +10,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from dsr.user_study.collect import ALL, AVERAGE, PERCENTAGES
+from dsr.utils.ratios import as_ratio
 
 _HEADINGS = ("User 1st", "User 2nd", "Top 2")
 
@@ -25,7 +26,7 @@ def tables_of(collected: pd.DataFrame) -> Iterator[Table]:
         dataset, scale, downsampling = place
         others = collected[(collected["scale"] == scale) & (collected["downsampling"] == downsampling)]
         if dataset != ALL or others["dataset"].nunique() > 2:
-            yield _table(rows, f"{dataset}, x{scale}, {downsampling} downsampling")
+            yield _table(rows, f"{dataset}, x{as_ratio(scale)}, {downsampling} downsampling")
 
 
 def _table(rows: pd.DataFrame, where: str) -> Table:

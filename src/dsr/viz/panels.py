@@ -24,6 +24,7 @@ from dsr.geometry.surface import depth_to_normals
 from dsr.metrics.formats import Formats, describe_directions, in_tables
 from dsr.sample import DepthSample
 from dsr.utils.files import replacing
+from dsr.utils.ratios import round_ratio
 
 HOLE_COLOUR = "#d684b4"
 _PANEL = 3.2
@@ -74,7 +75,7 @@ def save_picture(
         _write_scores(axes[2, 4], scores, formats)
     maps = (depth, sample.depth_lr) if truth is None else (depth, sample.depth_lr, truth)
     holes = "" if all(bool(values.isfinite().all()) for values in maps) else " (pink: holes)"
-    heading = f"{sample.dataset} / {sample.scene}, {label} x{sample.scale}{holes}"
+    heading = f"{sample.dataset} / {sample.scene}, {label} x{round_ratio(sample.scale)}{holes}"
     figure.suptitle(heading, fontsize=16, y=1 - 0.12 / figure_height, parse_math=False)
     write_figure(path, figure, _DPI)
 

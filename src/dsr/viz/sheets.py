@@ -21,6 +21,7 @@ from torch import Tensor
 from dsr.geometry.camera import Camera
 from dsr.geometry.shading import LIGHT_NAMES, render
 from dsr.sample import Scene
+from dsr.utils.ratios import round_ratio
 from dsr.viz.panels import HOLE_COLOUR, colours, limits_of, normals_seen_by, reduced, write_figure
 
 _ROWS = 6
@@ -122,16 +123,16 @@ def _row(scene: Scene) -> _Row:
 
 def _shown_map(scene: Scene) -> tuple[Tensor, Camera, list[str]]:
     """Return the depth map to show, its camera, and lines of text about the maps measured by a sensor."""
-    measured = ", ".join(f"x{factor}" for factor in sorted(scene.measured))
+    measured = ", ".join(f"x{round_ratio(ratio)}" for ratio in sorted(scene.measured))
     if scene.depth is not None:
         return scene.depth, scene.camera, [f"also measured: {measured}"] if measured else []
-    factor = max(scene.measured)
-    depth_lr = scene.measured[factor]
-    size = f"{depth_lr.shape[-1]} x {depth_lr.shape[-2]}"
+    ratio = max(scene.measured)
+    depth_lr = scene.measured[ratio]
+    width, height = depth_lr.shape[-1], depth_lr.shape[-2]
     return (
         depth_lr,
-        scene.camera.downscale(factor),
-        [f"measured: {measured}; no high-resolution depth", f"shown: x{factor}, {size}"],
+        scene.camera.reduce(width, height),
+        [f"measured: {measured}; no high-resolution depth", f"shown: x{round_ratio(ratio)}, {width} x {height}"],
     )
 
 

@@ -133,7 +133,7 @@ def load_levels(files: Files, dataset: str, name: str, year: int, *, smooth: boo
     camera, per_pixel = _CAMERAS[year](files, height, width)
     levels[levels == 0] = np.nan
     depth = _depth(files.disparity, (smooth_levels(levels) if smooth else levels) / per_pixel, camera)
-    measured = {}
+    measured: dict[float, Tensor] = {}
     for factor, path in files.measured.items():
         camera_lr = camera.downscale(factor)
         values = read_levels(path).astype(np.float64)

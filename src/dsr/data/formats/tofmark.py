@@ -103,7 +103,9 @@ def load_frame(
         samples = _metres(samples_path, *read_samples(samples_path), depth_range)
         expect_size(samples_path, tuple(samples.shape[1:]), tuple(rgb.shape[1:]))
     camera = given_camera(intrinsics, (rgb.shape[1], rgb.shape[2]))
-    measured = {} if samples is None else {factor: block_means(samples, factor) for factor in factors}
+    measured: dict[float, Tensor] = {}
+    if samples is not None:
+        measured = {factor: block_means(samples, factor) for factor in factors}
     return Scene(dataset, name, rgb, camera, depth, measured)
 
 

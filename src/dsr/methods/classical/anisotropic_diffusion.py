@@ -30,7 +30,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from dsr.geometry.camera import RangeType, from_range, to_range
-from dsr.methods.base import Cost, expect_limits
+from dsr.methods.base import Cost, expect_limits, whole_scale
 from dsr.methods.classical.convergence import CHECK_EVERY, Movement, history_of
 from dsr.methods.classical.finite_differences import box_mean, extend_linearly, upsample_linear_border
 from dsr.methods.networks.inpainting import inpaint
@@ -105,7 +105,7 @@ class AnisotropicDiffusion:
         """
         lr = to_range(sample.depth_lr.double(), sample.camera_lr, "disparity") + sample.camera_lr.doffs
         inverse = (lr * sample.scale)[None]  # in pixels of the high-resolution camera
-        result = self.diffuse(sample.rgb[None], inverse, sample.scale, progress)
+        result = self.diffuse(sample.rgb[None], inverse, whole_scale(sample), progress)
         self.history = history_of(result.moved)
         hr = result.values[0]
         return from_range(hr - sample.camera.doffs, sample.camera, "disparity").to(sample.depth_lr.dtype)

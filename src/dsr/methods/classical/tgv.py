@@ -33,7 +33,7 @@ import torch
 from torch import Tensor
 
 from dsr.geometry.camera import RangeType, from_range
-from dsr.methods.base import Cost, expect_limits
+from dsr.methods.base import Cost, expect_limits, whole_scale
 from dsr.methods.classical.convergence import CHECK_EVERY, Movement, history_of
 from dsr.methods.classical.finite_differences import (
     box_mean,
@@ -148,7 +148,7 @@ class TotalGeneralisedVariation:
         scaled = normalise(lr)
         valid = lr.isfinite()
         values = torch.where(valid, scaled.values, torch.nan)
-        found = self.minimise(sample.rgb[None].double(), values, sample.scale, progress)
+        found = self.minimise(sample.rgb[None].double(), values, whole_scale(sample), progress)
         self.history = history_of(found.moved)
         hr = found.values * scaled.value_range + scaled.minimum
         return from_range(hr[0], sample.camera, "disparity").to(sample.depth_lr.dtype)

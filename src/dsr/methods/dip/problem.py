@@ -10,6 +10,7 @@ from torch import Tensor
 
 from dsr.degradation.downsampling import Downsampling, downsample_depth
 from dsr.geometry.camera import Camera, RangeType
+from dsr.methods.base import whole_scale
 from dsr.methods.classical.finite_differences import grey
 from dsr.methods.networks.maps import compute_min_max
 from dsr.metrics import losses
@@ -62,7 +63,7 @@ class ImageProblem:
             rays=sample.camera.rays(dtype=torch.float32, device=device)[None],
             rays_lr=sample.camera_lr.rays(dtype=torch.float32, device=device)[None],
             camera=sample.camera,
-            scale=sample.scale,
+            scale=whole_scale(sample),
             downsampling=downsampling,
             range_type=range_type,
             min_depth=min_depth,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import matplotlib as mpl
@@ -26,15 +27,17 @@ def rendering_row(shown: Shown, light: str) -> Row:
         label: None if depth is None else rendering(depth, scene.camera, light) for label, depth in shown.depths.items()
     }
     truth = None if scene.depth is None else rendering(scene.depth, scene.camera, light)
+    size = (scene.camera.height, scene.camera.width)
     scores = _captions(shown, "DSSIM_v", "RMSE_v")
     cells = [
         _photo(shown),
-        Cell(_enlarge(rendering(scene.depth_lr, scene.camera_lr, light), scene.scale)),
+        Cell(_enlarge(rendering(scene.depth_lr, scene.camera_lr, light), size)),
         *(_panel(picture, scores[label]) for label, picture in results.items()),
         _panel(truth, missing="no truth"),
     ]
-    size = (scene.camera.height, scene.camera.width)
-    details = details_of([picture for picture in results.values() if picture is not None], truth, scene.scale)
+    details = details_of(
+        [picture for picture in results.values() if picture is not None], truth, math.ceil(scene.scale)
+    )
     return Row(_label(shown), size[0] / size[1], cells, details, size)
 
 
@@ -42,14 +45,15 @@ def depth_row(shown: Shown) -> Row:
     """Build the row of a scene's depth maps."""
     scene = shown.scene
     style = _Style("viridis", limits_of(scene.depth_lr if scene.depth is None else scene.depth))
+    size = (scene.camera.height, scene.camera.width)
     scores = _captions(shown, "RMSE_d")
     cells = [
         _photo(shown),
-        _panel(_enlarge(scene.depth_lr[0].numpy(), scene.scale), style=style),
+        _panel(_enlarge(scene.depth_lr[0].numpy(), size), style=style),
         *(_panel(_pixels(depth), scores[label], style=style) for label, depth in shown.depths.items()),
         _panel(_pixels(scene.depth), missing="no truth", style=style),
     ]
-    return Row(_label(shown), scene.camera.height / scene.camera.width, cells, bar="depth, m", extend="both")
+    return Row(_label(shown), size[0] / size[1], cells, bar="depth, m", extend="both")
 
 
 def error_row(shown: Shown) -> Row | None:
@@ -100,9 +104,12 @@ def _pixels(values: Tensor | None) -> np.ndarray | None:
     return None if values is None else values[0].numpy()
 
 
-def _enlarge(picture: np.ndarray, scale: int) -> np.ndarray:
-    """Repeat each pixel, so that viewers do not smooth a low-resolution picture."""
-    return picture.repeat(scale, axis=0).repeat(scale, axis=1)
+def _enlarge(picture: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    """Repeat pixels up to a height and width, so that viewers do not smooth a low-resolution picture."""
+    rows, columns = (
+        ((np.arange(new) + 0.5) * old / new).astype(int) for old, new in zip(picture.shape, size, strict=True)
+    )
+    return picture[rows[:, None], columns]
 
 
 def _diverging() -> Colormap:

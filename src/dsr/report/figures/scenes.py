@@ -136,7 +136,7 @@ def details_of(pictures: Sequence[np.ndarray], truth: np.ndarray | None, grain: 
     Args:
         pictures: renderings of the results, (H, W), NaN where undefined.
         truth: rendering of the ground truth, (H, W), NaN where undefined; None without one.
-        grain: scale factor; windows are aligned with the pixels of the input.
+        grain: pixels in a block; windows consist of whole blocks, at a whole scale factor of pixels of the input.
         count: maximum number of windows, which do not overlap.
 
     """

@@ -42,7 +42,7 @@ import torch
 from torch import Tensor
 
 from dsr.geometry.camera import RangeType, from_range
-from dsr.methods.base import Cost
+from dsr.methods.base import Cost, whole_scale
 from dsr.methods.classical.eg.bilateral import bilateral_filter
 from dsr.methods.classical.eg.edge_map import predict_edge_map
 from dsr.methods.classical.photo_guided import expect_positive
@@ -115,7 +115,7 @@ class EdgeGuided:
         lowest, highest = (float(bound) for bound in disparity_lr[valid].aminmax())
         self.history = []
         disparity = disparity_lr
-        stages = prime_factors(sample.scale)
+        stages = prime_factors(whole_scale(sample))
         barrier: Tensor | None = None
         for number, scale in enumerate(stages):
             report = part_of(progress, number * self._iterations, len(stages) * self._iterations)

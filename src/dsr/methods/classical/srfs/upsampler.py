@@ -42,7 +42,7 @@ import torch
 from torch import Tensor
 
 from dsr.geometry.camera import RangeType
-from dsr.methods.base import Cost, expect_limits
+from dsr.methods.base import Cost, expect_limits, whole_scale
 from dsr.methods.classical.finite_differences import upsample_linear_border
 from dsr.methods.classical.srfs.admm import ShadingProblem, ShadingSolver, Weights
 from dsr.methods.networks.inpainting import inpaint
@@ -160,7 +160,7 @@ class ShapeFromShading:
             unit=unit,
             inside=self._inside(sample),
         )
-        first = upsample_linear_border(inpaint(problem.lr), sample.scale)
+        first = upsample_linear_border(inpaint(problem.lr), whole_scale(sample))
         return ShadingSolver(problem, self.weights, first, self.penalty), metres
 
     def _inside(self, sample: DepthSample) -> Tensor:
