@@ -81,6 +81,11 @@ def test_icl_has_a_directory_per_trajectory():
     assert items["icl_nuim/office_room_traj2"].endswith("/~ahanda/traj2_frei_png.tar.gz")
 
 
+def test_benchmarks_of_the_field_have_as_many_files_as_their_scenes_need():
+    counts = {name: len(CATALOGUE[name].items) for name in ("lu", "middlebury8", "ddrnet")}
+    assert counts == {"lu": 2 * 6, "middlebury8": 2 * 30, "ddrnet": 3 * 22}
+
+
 def test_names_are_found_once_each_in_the_requested_order():
     found = find(["nyu", "icl", "nyu"], CATALOGUE)
     assert [collection.name for collection in found] == ["nyu", "icl"]

@@ -3,63 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
 
-
-@dataclass(frozen=True)
-class Item:
-    """A file to fetch.
-
-    Args:
-        path: below the directory of the data sets, with slashes; a mirror has the file under the same path.
-        urls: where it is, tried in order; ``ADDRESS#NAME`` is the member NAME of a zip archive.
-        unpack_to: the directory, below that of the data sets, that the archive is unpacked into; None for a file that
-            stays as it is.
-        contains: what there must be in ``unpack_to`` afterwards, such as ``training/final``.
-        sha256: of the file, where it is known beforehand.
-
-    """
-
-    path: str
-    urls: tuple[str, ...]
-    unpack_to: str | None = None
-    contains: tuple[str, ...] = ()
-    sha256: str | None = None
-
-
-@dataclass(frozen=True)
-class Collection:
-    """Files that go together.
-
-    Args:
-        name: as it is typed.
-        title: what it is, a few words.
-        homepage: address of its page.
-        licence: its terms, as far as its owners state them.
-        citation: authors, title, venue, year.
-        folders: its directories below that of the data sets.
-        size: of the downloads in bytes, about; None where that is not known.
-        items: what is fetched; empty where nobody but the user can.
-        manual: how to get it by hand, with ``{folder}`` for its directory; None where ``items`` are all there is.
-        patterns: of the files that the user puts into the first of ``folders``, as for :meth:`pathlib.Path.glob`.
-
-    """
-
-    name: str
-    title: str
-    homepage: str
-    licence: str
-    citation: str
-    folders: tuple[str, ...]
-    size: float | None
-    items: tuple[Item, ...] = field(default=(), repr=False)
-    manual: str | None = None
-    patterns: tuple[str, ...] = ()
-
-    def instruction(self, root: Path) -> str:
-        """Return how to get it by hand."""
-        return (self.manual or "").format(folder=root / self.folders[0])
+from dsr.data.download.collection import CITE_2001, CITE_2006, MIDDLEBURY, RESEARCH, Collection, Item
+from dsr.data.download.field import FIELD
 
 
 def find(names: Iterable[str], catalogue: Mapping[str, Collection]) -> list[Collection]:
@@ -76,8 +23,6 @@ def find(names: Iterable[str], catalogue: Mapping[str, Collection]) -> list[Coll
 
 
 _STEREO = "https://vision.middlebury.edu/stereo/data"
-_MIDDLEBURY = "Its owners permit using and publishing the images and disparity maps, and ask for the citation."
-_RESEARCH = "Its owners state no licence: for research, see the homepage."
 
 EVALUATION_2014 = ("Vintage", "Recycle", "Umbrella", "Classroom1", "Playroom", "Backpack", "Jadeplant")
 """The scenes of Middlebury 2014 that Voynov et al. (ICCV 2019) evaluate on."""
@@ -121,11 +66,6 @@ _CITE_2014 = (
     "D. Scharstein, H. Hirschmüller, Y. Kitajima, G. Krathwohl, N. Nešić, X. Wang, P. Westling: High-resolution stereo "
     "datasets with subpixel-accurate ground truth. GCPR 2014."
 )
-_CITE_2006 = "H. Hirschmüller, D. Scharstein: Evaluation of cost functions for stereo matching. CVPR 2007."
-_CITE_2001 = (
-    "D. Scharstein, R. Szeliski: A taxonomy and evaluation of dense two-frame stereo correspondence algorithms. "
-    "IJCV 47, 2002."
-)
 
 
 def _icl(room: str, archive: str) -> tuple[Item, ...]:
@@ -141,20 +81,6 @@ def _icl(room: str, archive: str) -> tuple[Item, ...]:
     )
 
 
-_DCTNET = "https://github.com/Zhaozixiang1228/GDSR-DCTNet"
-_DCTNET_FILES = (
-    "https://raw.githubusercontent.com/Zhaozixiang1228/GDSR-DCTNet/5243875223398fd7996bca2e54dc2792bb96862a/RawDatasets"
-)
-"""Test images of the field, at the commit of which the files are known."""
-_CITE_LU = "S. Lu, X. Ren, F. Liu: Depth enhancement via low-rank matrix completion. CVPR 2014."
-
-
-def _levels(folder: str, source: str, names: Sequence[str], spelling: str) -> tuple[Item, ...]:
-    """Return the photos and maps of an 8-bit benchmark."""
-    paths = [path for name in names for path in (f"RGB/{name}_{spelling}_color.png", f"Depth/{name}_output_depth.png")]
-    return tuple(Item(f"{folder}/{path}", (f"{_DCTNET_FILES}/{source}/{path}",)) for path in paths)
-
-
 def _sintel(path: str, contains: tuple[str, ...]) -> Item:
     name = path.rpartition("/")[2]
     hosts = ("https://files.is.tue.mpg.de", "http://files.is.tue.mpg.de")
@@ -166,7 +92,7 @@ _COLLECTIONS = (
         "middlebury",
         f"Middlebury 2014, the paper's {len(EVALUATION_2014)} evaluation scenes",
         f"{_STEREO}/scenes2014/",
-        _MIDDLEBURY,
+        MIDDLEBURY,
         _CITE_2014,
         ("middlebury2014",),
         0.25e9,
@@ -176,8 +102,8 @@ _COLLECTIONS = (
         "middlebury_train",
         "Middlebury 2014 (the other 16 scenes), 2006 and 2001",
         f"{_STEREO}/",
-        _MIDDLEBURY,
-        f"{_CITE_2014} {_CITE_2006} {_CITE_2001}",
+        MIDDLEBURY,
+        f"{_CITE_2014} {CITE_2006} {CITE_2001}",
         ("middlebury2014", "middlebury2006", "middlebury2001"),
         0.65e9,
         _perfect(TRAINING_2014) + _ITEMS_2006 + _ITEMS_2001,
@@ -186,8 +112,8 @@ _COLLECTIONS = (
         "middlebury2006",
         f"Middlebury 2006, {len(SCENES_2006)} scenes",
         f"{_STEREO}/scenes2006/",
-        _MIDDLEBURY,
-        _CITE_2006,
+        MIDDLEBURY,
+        CITE_2006,
         ("middlebury2006",),
         50e6,
         _ITEMS_2006,
@@ -196,8 +122,8 @@ _COLLECTIONS = (
         "middlebury2005",
         f"Middlebury 2005, {len(SCENES_2005)} scenes",
         f"{_STEREO}/scenes2005/",
-        _MIDDLEBURY,
-        f"D. Scharstein, C. Pal: Learning conditional random fields for stereo. CVPR 2007. {_CITE_2006}",
+        MIDDLEBURY,
+        f"D. Scharstein, C. Pal: Learning conditional random fields for stereo. CVPR 2007. {CITE_2006}",
         ("middlebury2005",),
         15e6,
         _full_size("middlebury2005", SCENES_2005, f"{_STEREO}/scenes2005/FullSize"),
@@ -206,7 +132,7 @@ _COLLECTIONS = (
         "middlebury2003",
         "Middlebury 2003, cones and teddy",
         f"{_STEREO}/scenes2003/",
-        _MIDDLEBURY,
+        MIDDLEBURY,
         "D. Scharstein, R. Szeliski: High-accuracy stereo depth maps using structured light. CVPR 2003.",
         ("middlebury2003",),
         1e6,
@@ -216,8 +142,8 @@ _COLLECTIONS = (
         "middlebury2001",
         f"Middlebury 2001, {len(SCENES_2001)} planar scenes",
         f"{_STEREO}/scenes2001/",
-        _MIDDLEBURY,
-        _CITE_2001,
+        MIDDLEBURY,
+        CITE_2001,
         ("middlebury2001",),
         4e6,
         _ITEMS_2001,
@@ -237,7 +163,7 @@ _COLLECTIONS = (
         "sunrgbd",
         "SUN RGB-D, four kinds of depth camera",
         "https://rgbd.cs.princeton.edu/",
-        _RESEARCH,
+        RESEARCH,
         "S. Song, S. P. Lichtenberg, J. Xiao: SUN RGB-D: a RGB-D scene understanding benchmark suite. CVPR 2015. Parts "
         "of it are NYU Depth v2, Berkeley B3DO and SUN3D: its homepage asks to cite these, too.",
         ("sunrgbd",),
@@ -255,7 +181,7 @@ _COLLECTIONS = (
         "tofmark",
         "ToFMark, time-of-flight depth with measured ground truth",
         "https://rvlab.icg.tugraz.at/tofmark/",
-        _RESEARCH,
+        RESEARCH,
         "D. Ferstl, C. Reinbacher, R. Ranftl, M. Rüther, H. Bischof: Image guided depth upsampling using anisotropic "
         "total generalized variation. ICCV 2013.",
         ("tofmark",),
@@ -284,7 +210,7 @@ _COLLECTIONS = (
         "nyu",
         "NYU Depth v2, the 1449 labelled frames",
         "https://cs.nyu.edu/~fergus/datasets/nyu_depth_v2.html",
-        _RESEARCH,
+        RESEARCH,
         "N. Silberman, D. Hoiem, P. Kohli, R. Fergus: Indoor segmentation and support inference from RGBD images. "
         "ECCV 2012.",
         ("nyu_v2",),
@@ -309,25 +235,5 @@ _COLLECTIONS = (
         "P000/image_left/*.png and P000/depth_left/*.npy, anywhere below {folder}",
         patterns=("**/image_left/*.png", "**/depth_left/*.npy"),
     ),
-    Collection(
-        "lu",
-        "Lu's six pairs of a structured-light sensor, 8 bits, as the field evaluates on them",
-        _DCTNET,
-        _RESEARCH,
-        _CITE_LU,
-        ("lu",),
-        2e6,
-        _levels("lu", "Lu", [f"RGBD_{number:02d}" for number in range(1, 7)], "ouput"),
-    ),
-    Collection(
-        "middlebury8",
-        "Thirty pairs of Middlebury 2001 to 2006, 8 bits, as the field evaluates on them",
-        _DCTNET,
-        _MIDDLEBURY,
-        f"{_CITE_2001} {_CITE_2006} {_CITE_LU}",
-        ("middlebury8",),
-        12e6,
-        _levels("middlebury8", "Middlebury", [f"Middlebury_{number:02d}" for number in range(1, 31)], "output"),
-    ),
 )
-CATALOGUE: dict[str, Collection] = {collection.name: collection for collection in _COLLECTIONS}
+CATALOGUE: dict[str, Collection] = {collection.name: collection for collection in (*_COLLECTIONS, *FIELD)}

@@ -11,8 +11,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from urllib.parse import urlsplit
 
-from dsr.data.download.catalogue import Item
 from dsr.data.download.checksums import Checksums, Entry, lock_directory, sha256_of
+from dsr.data.download.collection import Item
 from dsr.data.download.inventory import compare, expect_kind, lack, record
 from dsr.data.download.transfer import FetchError, NoSpaceError, UnreachableError, download
 from dsr.data.download.unpack import take_member, unpack

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 
-from dsr.data.download.catalogue import Collection, Item
 from dsr.data.download.checksums import Checksums, Entry, lock_directory, sha256_of
+from dsr.data.download.collection import Collection, Item
 from dsr.data.download.transfer import is_page
 from dsr.utils.progress import Progress
 

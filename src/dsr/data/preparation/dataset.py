@@ -152,6 +152,7 @@ class PreparedDataset:
         named: names of the scenes that belong to the data set; None for all that are on disk.
         scenes: names of the scenes to use; None for those of ``named``, ``found`` for all that are on disk.
         preparation: how scenes are resized, cropped and inpainted.
+        count: number of scenes that belong to the data set, where their names are not known; None otherwise.
 
     Raises:
         ValueError: a scene is not on disk; the message says how to get it.
@@ -168,6 +169,7 @@ class PreparedDataset:
         named: Sequence[str] | None,
         scenes: SceneSelection,
         preparation: Preparation,
+        count: int | None = None,
     ) -> None:
         self.name = name
         folder, named = Path(root).expanduser(), tuple(found if named is None else named)
@@ -176,11 +178,12 @@ class PreparedDataset:
             there = "no scene of it" if folder.is_dir() else "no such directory"
             raise ValueError(f"dataset={name}: expected its files in {folder}, got {there}; {remedy}")
         if scenes is None:
-            missing = [scene for scene in named if scene not in found]
-            if missing:
+            missing, total = [scene for scene in named if scene not in found], count or len(named)
+            if missing or len(named) < total:
                 raise ValueError(
-                    f"dataset={name}: expected {', '.join(missing)} in {folder}, got {len(named) - len(missing)} "
-                    f"of {len(named)} scenes; {remedy}; or use what is there: dataset.scenes=found"
+                    f"dataset={name}: expected {', '.join(missing) or 'all scenes'} in {folder}, got "
+                    f"{len(named) - len(missing)} of {total} scenes; {remedy}; "
+                    "or use what is there: dataset.scenes=found"
                 )
             scenes = named
         self._scenes = select_scenes(list(found), scenes)

@@ -1,0 +1,97 @@
+"""RGB-D-D: photos with the depth of an industrial time-of-flight sensor and of a phone's.
+
+He et al., "Towards Fast and Accurate Real-World Depth Super-Resolution: Benchmark Dataset and Baseline", CVPR 2021;
+github.com/lingzhi96/RGB-D-D-Dataset. As its owners hand it out:
+
+    portraits/portraits_test/ID/ID_RGB.jpg              the photo, 512 x 384
+    portraits/portraits_test/ID/ID_HR_gt.png            the industrial sensor's depth, 512 x 384, 16 bits, mm, filled
+    portraits/portraits_test/ID/ID_LR_fill_depth.png    the phone's depth, 192 x 144, mm, filled
+
+likewise ``plants`` and ``models``, and ``_train`` in place of ``_test``: 2215 to train on, 405 to test. The test images
+are also in circulation, with DCTNet (Zhao et al., CVPR 2022), as
+
+    DIR/RGB/ID_RGB.jpg   DIR/Depth/ID_HR_gt.png   DIR/DepthLR/ID_LR_fill_depth.png
+
+No camera is published; 60 degrees of horizontal view are assumed.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Literal
+
+from dsr.data.formats.shared import expect_size, find_beside, read_millimetres, read_picture, walk
+from dsr.geometry.camera import Camera
+from dsr.sample import Scene
+
+Split = Literal["test", "train"]
+COUNTS = {"test": 405, "train": 2215}
+"""Numbers of scenes."""
+RATIO = 8 / 3
+"""Of the photo's size and that of the phone's depth."""
+Files = tuple[Path, ...]
+_PHOTO = re.compile(r"(\d+)_RGB\.jpg")
+_PARTS = ("models", "plants", "portraits")
+_DEPTH, _MEASURED = "{0}_HR_gt.png", "{0}_LR_fill_depth.png"
+
+
+def find_frames(root: Path, split: Split = "test", measured: bool = False) -> dict[str, Files]:
+    """Return photos, true depth and, if ``measured``, the phone's depth, by their number "20200509112638", in order.
+
+    Args:
+        root: directory of the data set, or one above it.
+        split: which images; those in ``RGB`` and ``Depth`` are test images.
+        measured: whether to find images with the phone's depth alone.
+
+    Raises:
+        ValueError: there is no such directory.
+
+    """
+    found: dict[str, Files] = {}
+    for name, files in _find_owners_layout(root, split, measured=measured):
+        found.setdefault(name, files)
+    if split == "test":
+        others = (f"Depth/{_DEPTH}", f"DepthLR/{_MEASURED}")[: 2 if measured else 1]
+        for _, name, files in find_beside(root, "RGB", _PHOTO, others):
+            found.setdefault(name, files)
+    return dict(sorted(found.items()))
+
+
+def load_frame(rgb_path: Path, depth_path: Path, dataset: str, name: str) -> Scene:
+    """Return one image with the industrial sensor's depth as the truth.
+
+    Raises:
+        ValueError: a file is missing, damaged, or does not fit the other; the message names it.
+
+    """
+    rgb, depth = read_picture(rgb_path), read_millimetres(depth_path)
+    height, width = rgb.shape[1:]
+    expect_size(depth_path, tuple(depth.shape[1:]), (height, width))
+    return Scene(dataset, name, rgb, Camera.from_fov(width, height), depth)
+
+
+def load_measured_frame(rgb_path: Path, depth_path: Path, measured_path: Path, dataset: str, name: str) -> Scene:
+    """Return one image as :func:`load_frame` does, with the phone's depth as the measured map.
+
+    Raises:
+        ValueError: a file is missing, damaged, or does not fit the others; the message names it.
+
+    """
+    scene, measured = load_frame(rgb_path, depth_path, dataset, name), read_millimetres(measured_path)
+    size = (round(scene.camera.height / RATIO), round(scene.camera.width / RATIO))
+    expect_size(measured_path, tuple(measured.shape[1:]), size)
+    return replace(scene, measured={scene.camera.width / size[1]: measured})
+
+
+def _find_owners_layout(root: Path, split: Split, *, measured: bool) -> Iterator[tuple[str, Files]]:
+    """Yield the number and the files of the images that have a folder each."""
+    names = ("{0}_RGB.jpg", _DEPTH, _MEASURED)[: 3 if measured else 2]
+    folders = [f"{part}_{split}" for part in _PARTS]
+    for folder, _, files in walk(root):
+        if folder.parent.name in folders:
+            wanted = [name.format(folder.name) for name in names]
+            if set(wanted) <= set(files):
+                yield folder.name, tuple(folder / name for name in wanted)
