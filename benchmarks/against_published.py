@@ -23,8 +23,9 @@ from dsr.degradation.downsampling import Downsampling, make_sample
 from dsr.methods.networks.trained import packaged_weights
 from dsr.methods.networks.weight_files import read_header
 from dsr.methods.registry import build_method, read_method
-from dsr.metrics.catalogue import WORST, Metric, catalogue, score_image
+from dsr.metrics.catalogue import Metric, catalogue, score_image
 from dsr.metrics.lpips import load_lpips
+from dsr.metrics.metric import WORST
 
 SCENES, SCALES = ("lucy", "plant"), (4, 8)
 METRICS = ("RMSE_v", "DSSIM_v", "BadPix_v_5", "Bumpiness_d", "LPIPS_v", "RMSE_d")

@@ -15,8 +15,9 @@ from dsr.data.simgeo import SimGeo
 from dsr.degradation.downsampling import Downsampling, make_sample
 from dsr.methods.networks.base import NetworkUpsampler
 from dsr.methods.networks.trained import build_trained, packaged_weights
-from dsr.metrics.catalogue import WORST, Metric, catalogue, score_image
+from dsr.metrics.catalogue import Metric, catalogue, score_image
 from dsr.metrics.lpips import load_lpips
+from dsr.metrics.metric import WORST
 from dsr.sample import DepthSample
 
 REPOSITORY = Path(__file__).resolve().parents[2]

@@ -14,6 +14,7 @@ import pandas as pd
 import pytest
 
 from dsr.app.metrics import extra_metrics
+from dsr.app.schema import MetricsConfig
 from dsr.utils.builder import ConfigError
 
 REPOSITORY = Path(__file__).resolve().parents[2]
@@ -165,5 +166,5 @@ def test_metric_that_nobody_describes_is_shown_raw_under_its_name(home, tmp_path
 def test_extra_metrics_refuse_what_is_no_metric_in_one_line(home, monkeypatch, extra, message):
     monkeypatch.syspath_prepend(str(home / "modules"))
     with pytest.raises(ConfigError) as caught:
-        extra_metrics(extra.split(","))
+        extra_metrics(MetricsConfig(extra=extra.split(",")))
     assert str(caught.value) == message

@@ -56,12 +56,14 @@ USAGE_ERRORS = {
     "downsampling=boxx": (
         "downsampling=boxx: unknown; expected one of bicubic, bilinear, box, gaussian, measured, nearest"
     ),
-    "metrics=none": "metrics=none: unknown; expected one of paper",
+    "metrics=none": "metrics=none: unknown; expected one of field, paper, sensor",
     "datset=folder": f"datset: unknown key; expected {SETTINGS}",
     "scal=8": f"scal: unknown key; expected {SETTINGS}",
     "lpips=false": f"lpips: unknown key; expected {SETTINGS}",
     "dataset.rot=x": "dataset.rot: unknown key; expected dataset.name, dataset.root, dataset.scenes, dataset.size",
-    "metrics.lpip=false": "metrics.lpip: unknown key; expected metrics.lpips, metrics.lpips_trunk, metrics.extra",
+    "metrics.lpip=false": (
+        "metrics.lpip: unknown key; expected metrics.protocols, metrics.lpips, metrics.lpips_trunk, metrics.extra"
+    ),
     "seed=four": "seed: Value 'four' of type 'str' could not be converted to Integer",
     "seed=1.5": "seed: Value '1.5' of type 'float' could not be converted to Integer",
     "overwrite=maybe": "overwrite: Value 'maybe' is not a valid bool (type str)",

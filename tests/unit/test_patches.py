@@ -18,7 +18,7 @@ from dsr.degradation.downsampling import Downsampling, Measured, make_sample
 from dsr.degradation.noise import GaussianMultiplicative, Kinect
 from dsr.geometry.camera import Camera
 from dsr.methods.networks.maps import normalise
-from dsr.sample import Scene
+from dsr.sample import CENTIMETRES, Scene, Unit
 from dsr.training.data_module import Part, PatchData, WholeScenes
 from dsr.training.degradation import Batch, Degradation, to_tensors
 from dsr.training.patches import Patches
@@ -495,6 +495,7 @@ def test_batches_have_the_documented_shapes_and_types() -> None:
     assert {value.dtype for value in patch.values()} == {torch.float32}
     whole = WholeScenes([_scene()], X4)[0]
     single = {"rgb", "min_max"}
+    assert Unit(**whole.pop("unit")) == CENTIMETRES
     assert all(value.dtype == (torch.float32 if name in single else torch.float64) for name, value in whole.items())
 
 

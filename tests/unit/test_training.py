@@ -6,6 +6,7 @@ import copy
 import functools
 import math
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -24,8 +25,8 @@ from dsr.metrics import functional as scores
 from dsr.metrics.classes import visual_metrics
 from dsr.metrics.functional import SurfacePair
 from dsr.metrics.lpips import LPIPS
-from dsr.sample import Scene
-from dsr.training.data_module import WholeScenes
+from dsr.sample import CENTIMETRES, Scene, Unit
+from dsr.training.data_module import WholeScenes, collate_scene
 from dsr.training.degradation import Batch, Degradation, to_tensors
 from dsr.training.module import SuperResolution
 from dsr.training.objective import Objective, balance_weight, to_depth
@@ -355,12 +356,30 @@ def test_invalid_average_is_refused(changes: dict[str, Any]) -> None:
         Schedule(10, **changes)
 
 
+def _loader(scenes: WholeScenes) -> DataLoader[Batch]:
+    return DataLoader(scenes, collate_fn=collate_scene)
+
+
+def test_validation_is_in_the_unit_of_its_benchmark(tmp_path: Path) -> None:
+    levels = Unit("levels", inverse=True, factor=8.0, limits=(0, 255))
+    module = SuperResolution(
+        MSGNet(2, "dsr"), Objective(), Schedule(1), lambda: visual_metrics(protocols=("field",)), ("a", "b")
+    )
+    sets = [_loader(WholeScenes([replace(_scene(3), unit=unit)], X2)) for unit in (levels, CENTIMETRES)]
+    in_levels, in_cm = (dict(each) for each in _trainer(tmp_path).validate(module, sets, verbose=False))
+    assert {name for name in in_levels if name.startswith("val_a/")} == {"val_a/RMSE_levels", "val_a/MAE_levels"}
+    assert {name for name in in_cm if name.startswith("val_b/")} == {
+        *("val_b/RMSE_cm", "val_b/MAE_cm", "val_b/Beyond_5cm", "val_b/Beyond_delta1")
+    }
+    assert in_levels["val/RMSE_levels"] == in_levels["val_a/RMSE_levels"] > 0
+
+
 def test_validation_logs_the_mean_over_the_scenes_under_the_worst_light(tmp_path: Path) -> None:
     module, scenes = _module(mixed=True), WholeScenes([_scene(3), _scene(4, holes=0.05), _scene(5)], X2)
-    [logged] = _trainer(tmp_path).validate(module, DataLoader(scenes), verbose=False)
+    [logged] = _trainer(tmp_path).validate(module, _loader(scenes), verbose=False)
     values: dict[str, list[float]] = {"RMSE_d": [], "RMSE_v": [], "DSSIM_v": [], "BadPix_v_5": [], "Bumpiness_d": []}
     for i in range(3):
-        batch = {name: value[None] for name, value in scenes[i].items()}
+        batch = collate_scene([scenes[i]])
         with torch.no_grad():
             disparity = upsample_disparity(module.average, batch["rgb"], batch["disparity_lr"])
         assert bool((disparity > 0).all())
@@ -376,7 +395,7 @@ def test_validation_logs_the_mean_over_the_scenes_under_the_worst_light(tmp_path
 
 def test_validation_starts_anew_each_time(tmp_path: Path) -> None:
     module, trainer = _module(), _trainer(tmp_path)
-    first, other = (DataLoader(WholeScenes([_scene(seed)], X2)) for seed in (3, 4))
+    first, other = (_loader(WholeScenes([_scene(seed)], X2)) for seed in (3, 4))
     [before] = trainer.validate(module, first, verbose=False)
     [between] = trainer.validate(module, other, verbose=False)
     [after] = trainer.validate(module, first, verbose=False)
@@ -388,7 +407,7 @@ def test_checkpoint_holds_the_networks_tensors_alone_and_loads_as_plain_data(tmp
     trunk = {f"features.{i}.weight": 0.05 * torch.randn(shape) for i, shape in shapes.items()}
     network = LPIPS(trunk | {f"features.{i}.bias": torch.zeros(shape[0]) for i, shape in shapes.items()})
     module, trainer = _module(network), _trainer(tmp_path, max_steps=1)
-    loader = DataLoader(WholeScenes([_scene(3)], X2))
+    loader = _loader(WholeScenes([_scene(3)], X2))
     trainer.fit(module, _one_batch(), loader)
     assert math.isfinite(trainer.callback_metrics["val/LPIPS_v"])
     trainer.save_checkpoint(tmp_path / "a.ckpt")

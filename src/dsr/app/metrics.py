@@ -1,17 +1,17 @@
-"""The metrics that a configuration chooses: the paper's, LPIPS if its network is available, and the user's own."""
+"""The metrics that a configuration chooses: of protocols, LPIPS if its network is available, and the user's own."""
 
 from __future__ import annotations
 
 import functools
 import sys
-from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import torch
 import torchmetrics
 
 from dsr.app.schema import MetricsConfig
-from dsr.metrics.catalogue import Metric, catalogue
+from dsr.metrics.catalogue import PROTOCOLS, Metric, catalogue
 from dsr.metrics.classes import visual_metrics
 from dsr.metrics.lpips import LPIPS, TRUNK_URL, load_lpips
 from dsr.utils.builder import ConfigError, load_object
@@ -25,12 +25,13 @@ def chosen_metrics(settings: MetricsConfig, device: torch.device) -> tuple[Metri
         ConfigError: a metric or the network's file is not valid.
 
     """
-    return catalogue(_network_on(settings, device), extra_metrics(settings.extra))
+    return catalogue(_network_on(settings, device), extra_metrics(settings), settings.protocols)
 
 
 def metric_collection(settings: MetricsConfig, device: torch.device) -> torchmetrics.MetricCollection:
-    """Return the same metrics as one collection, for a validation pass."""
-    return visual_metrics(_network_on(settings, device), extra_metrics(settings.extra))
+    """Return the same metrics as one collection, for a validation pass, which is always judged by the paper's too."""
+    settings = replace(settings, protocols=list(dict.fromkeys((*settings.protocols, "paper"))))
+    return visual_metrics(_network_on(settings, device), extra_metrics(settings), settings.protocols)
 
 
 def check_metrics(settings: MetricsConfig) -> None:
@@ -40,35 +41,36 @@ def check_metrics(settings: MetricsConfig) -> None:
         ConfigError: a metric or the network's file is not valid.
 
     """
-    extra_metrics(settings.extra)
+    extra_metrics(settings)
     if settings.lpips and settings.lpips_trunk is not None:
         perceptual_network(settings.lpips_trunk)
 
 
-def extra_metrics(paths: Sequence[str]) -> tuple[Metric, ...]:
-    """Return the metrics beside the paper's.
-
-    Args:
-        paths: ``module.NAME`` of each.
+def extra_metrics(settings: MetricsConfig) -> tuple[Metric, ...]:
+    """Return the metrics beside those of the protocols.
 
     Raises:
-        ConfigError: there is no such metric, or two metrics have one name.
+        ConfigError: there is no such metric or protocol, or two metrics have one name.
 
     """
+    paths = settings.extra
     metrics = tuple(load_object("metrics.extra", path, "a dsr.metrics.catalogue.Metric") for path in paths)
     for path, metric in zip(paths, metrics, strict=True):
         if not isinstance(metric, Metric):
             raise ConfigError(f"metrics.extra: expected a dsr.metrics.catalogue.Metric, {path!r} is none")
     try:
-        catalogue(extra=metrics)
+        catalogue(None, metrics, settings.protocols)
     except ValueError as error:
-        raise ConfigError(f"metrics.extra: {error}") from error
+        about = str(error)
+        raise ConfigError(f"metrics.{'' if about.startswith('protocols') else 'extra: '}{about}") from error
     return metrics
 
 
 def _network_on(settings: MetricsConfig, device: torch.device) -> LPIPS | None:
-    """Return the LPIPS network; None if it is disabled or not available."""
-    network = perceptual_network(settings.lpips_trunk) if settings.lpips else None
+    """Return the LPIPS network; None if it is disabled, not used, or not available."""
+    chosen = (*(metric for name in settings.protocols for metric in PROTOCOLS[name]), *extra_metrics(settings))
+    used = any(metric.perceptual for metric in chosen)
+    network = perceptual_network(settings.lpips_trunk) if settings.lpips and used else None
     return None if network is None else network.to(device)
 
 

@@ -24,6 +24,7 @@ _GROUPS = ("dataset", "downsampling", "noise", "holes", "method", "metrics", "mo
 class MetricsConfig:
     """Which metrics to compute."""
 
+    protocols: list[str] = field(default_factory=lambda: ["paper"])
     lpips: bool = True
     lpips_trunk: str | None = None
     extra: list[str] = field(default_factory=list)

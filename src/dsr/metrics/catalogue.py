@@ -2,93 +2,32 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from dsr.geometry.shading import LIGHT_NAMES
-from dsr.metrics import functional
+from dsr.metrics import field, functional, sensor
 from dsr.metrics.formats import MetricFormat
 from dsr.metrics.functional import SurfacePair
 from dsr.metrics.lpips import LPIPS, MIN_SIZE, lpips_v
+from dsr.metrics.metric import Metric, depth_mask, normal_mask
 from dsr.sample import CENTIMETRES, Unit
 
-WORST, AVERAGE = "max", "avg"
-VARIANTS = (*LIGHT_NAMES, WORST, AVERAGE)
-
-
-@dataclass(frozen=True)
-class Metric:
-    """A metric: how it is computed and how it is shown.
-
-    Args:
-        name: as in ``scores.csv``.
-        function: from a pair to (B,), or to (B, 4) where ``per_light``.
-        mask: from a pair to the (B, 1, H', W') pixels that the metric uses.
-        format: how tables and figures show it.
-        per_light: whether there is a value for each of the lights e1..e4.
-        min_size: smallest height and width in pixels that it is defined for.
-        perceptual: whether the function takes an LPIPS network, ``network``.
-
-    """
-
-    name: str
-    function: Callable[..., Tensor]
-    mask: Callable[[SurfacePair], Tensor]
-    format: MetricFormat
-    per_light: bool = False
-    min_size: int = 2
-    perceptual: bool = False
-
-    @property
-    def worst(self) -> str:
-        """The variant that is the worst of four lights: the largest value, the smallest where higher is better."""
-        return "min" if self.format.higher_is_better else WORST
-
-    def variants(self, pair: SurfacePair) -> dict[str, Tensor]:
-        """Return the value per image, (B,), by variant: e1..e4, the worst of them and their average, or just "".
-
-        NaN for images below the metric's smallest size.
-        """
-        count, size = len(pair.target), min(pair.target.shape[-2:])
-        if size < self.min_size:
-            values = pair.target.new_full((count, len(LIGHT_NAMES)) if self.per_light else (count,), torch.nan)
-        else:
-            values = self._values(pair)
-        if not self.per_light:
-            return {"": values}
-        by_light = dict(zip(LIGHT_NAMES, values.unbind(1), strict=True))
-        worst = values.amin(dim=1) if self.format.higher_is_better else values.amax(dim=1)
-        return {**by_light, self.worst: worst, AVERAGE: values.mean(dim=1)}
-
-    def _values(self, pair: SurfacePair) -> Tensor:
-        """Return the function's values, of the right shape."""
-        values = self.function(pair)
-        expected = (len(pair.target), len(LIGHT_NAMES)) if self.per_light else (len(pair.target),)
-        if tuple(values.shape) != expected:
-            raise ValueError(f"{self.name}: expected values of shape {expected}, got {tuple(values.shape)}")
-        return values
-
-    def valid_fraction(self, pair: SurfacePair) -> Tensor:
-        """Return the valid fraction of the pixels that the metric would use in a complete map, (B,)."""
-        if min(pair.target.shape[-2:]) < self.min_size:
-            return torch.zeros(len(pair.target), dtype=torch.float64)
-        if pair.complete:
-            return torch.ones(len(pair.target), dtype=torch.float64)
-        return self.mask(pair).double().mean(dim=(-3, -2, -1))
-
-
-def depth_mask(pair: SurfacePair) -> Tensor:
-    """Return the pixels with a depth in both maps."""
-    return pair.depth_mask
-
-
-def normal_mask(pair: SurfacePair) -> Tensor:
-    """Return the pixels with a normal in both maps."""
-    return pair.normal_mask
+__all__ = [
+    "KNOWN_FORMATS",
+    "METRICS",
+    "PROTOCOLS",
+    "Metric",
+    "Score",
+    "catalogue",
+    "depth_mask",
+    "normal_mask",
+    "score_image",
+]
 
 
 def _ssim_mask(pair: SurfacePair) -> Tensor:
@@ -160,25 +99,33 @@ METRICS: tuple[Metric, ...] = (
     ),
 )
 """The metrics of the paper, in the order of ``scores.csv``; those with a position are the columns of its tables."""
+PROTOCOLS: Mapping[str, tuple[Metric, ...]] = {"paper": METRICS, "field": field.METRICS, "sensor": sensor.METRICS}
+"""Sets of metrics by name: the paper's, those that the field prints, and those for real sensors."""
 KNOWN_FORMATS = {metric.name: metric.format for metric in METRICS}
 
 
-def catalogue(network: LPIPS | None = None, extra: Sequence[Metric] = ()) -> tuple[Metric, ...]:
-    """Return the metrics that can be computed: the paper's, then others.
+def catalogue(
+    network: LPIPS | None = None, extra: Sequence[Metric] = (), protocols: Sequence[str] = ("paper",)
+) -> tuple[Metric, ...]:
+    """Return the metrics that can be computed: those of some protocols, then others.
 
     Args:
         network: for perceptual metrics; None leaves them out.
-        extra: metrics beside the paper's.
+        extra: metrics beside those of the protocols.
+        protocols: names of protocols, in the order of the metrics.
 
     Raises:
-        ValueError: two metrics have one name.
+        ValueError: there is no such protocol, or two metrics have one name.
 
     """
-    names = [metric.name for metric in (*METRICS, *extra)]
+    if not protocols or not set(protocols) <= set(PROTOCOLS):
+        raise ValueError(f"protocols: expected some of {', '.join(PROTOCOLS)}, got {', '.join(protocols) or 'none'}")
+    metrics = (*(metric for name in dict.fromkeys(protocols) for metric in PROTOCOLS[name]), *extra)
+    names = [metric.name for metric in metrics]
     for name in names:
         if names.count(name) > 1:
             raise ValueError(f"{name}: expected metrics of different names, got two of this one")
-    return tuple(_with_network((*METRICS, *extra), network))
+    return tuple(_with_network(metrics, network))
 
 
 def _with_network(metrics: Iterable[Metric], network: LPIPS | None) -> Iterator[Metric]:
@@ -207,27 +154,34 @@ def score_image(
     """Score one predicted depth map.
 
     Rows and columns at the border without any predicted pixel are cut off first (MSG's published networks leave out the
-    last of each). The valid fractions still refer to the complete map.
+    last of each), except for metrics of the whole image. The valid fractions still refer to the complete map.
 
     Args:
         prediction: (1, H, W) orthogonal depth in metres, NaN where missing.
         target: (1, H, W) orthogonal depth in metres, NaN where missing.
         rays: (3, H, W), see :meth:`dsr.geometry.camera.Camera.rays`.
-        metrics: from :func:`catalogue`.
-        unit: of the metrics that are in the benchmark's own.
+        metrics: from :func:`catalogue`; those for other units are left out.
+        unit: of the benchmark.
 
     Yields:
         The scores, NaN where no pixel can be scored.
 
     """
+
+    def pair_of(window: tuple[Any, ...]) -> SurfacePair:
+        maps = (values[window][None] for values in (prediction, target, rays))
+        return SurfacePair(*maps, unit=unit, image_dtype=torch.float32)
+
     rows, columns = _covered(prediction)
-    kept = (rows.stop - rows.start) * (columns.stop - columns.start) / target.numel()
-    window = (..., rows, columns)
-    pair = SurfacePair(
-        prediction[window][None], target[window][None], rays[window][None], unit=unit, image_dtype=torch.float32
-    )
+    whole = pair_of((...,))
+    covered = pair_of((..., rows, columns))
+    if covered.target.shape == whole.target.shape:
+        covered = whole
     for metric in metrics:
-        valid = metric.valid_fraction(pair).item() * kept
+        pair = whole if metric.whole else covered
+        if not metric.applies(pair):
+            continue
+        valid = metric.valid_fraction(pair).item() * (pair.target.numel() / target.numel())
         for variant, value in metric.variants(pair).items():
             yield Score(metric.name, variant, value.item(), valid)
 

@@ -16,9 +16,10 @@ import torch
 import torchmetrics
 from torch import Tensor
 
-from dsr.metrics.catalogue import METRICS, VARIANTS, WORST, Metric, catalogue
+from dsr.metrics.catalogue import METRICS, catalogue
 from dsr.metrics.functional import SurfacePair
 from dsr.metrics.lpips import LPIPS
+from dsr.metrics.metric import VARIANTS, WORST, Metric
 
 
 class PerImageMean(torchmetrics.Metric):
@@ -26,6 +27,9 @@ class PerImageMean(torchmetrics.Metric):
 
     An image whose target has no valid pixel is left out. If a prediction has no pixel that can be scored, the mean is
     NaN, so that a method that fails never looks better than one that does not.
+
+    Attributes:
+        applied: whether the metric is for all benchmarks, or for that of a pair so far.
 
     Args:
         metric: from :func:`dsr.metrics.catalogue.catalogue`.
@@ -48,6 +52,7 @@ class PerImageMean(torchmetrics.Metric):
         if variant not in VARIANTS:
             raise ValueError(f"variant: expected one of {', '.join(VARIANTS)}, got {variant!r}")
         self._metric = metric
+        self.applied = metric.unit is None
         named = metric.worst if variant == WORST else variant
         self._variant = named if metric.per_light else ""
         self.add_state("total", torch.zeros((), dtype=torch.float64), dist_reduce_fx="sum")
@@ -60,7 +65,10 @@ class PerImageMean(torchmetrics.Metric):
 
     @torch.no_grad()
     def update(self, pair: SurfacePair) -> None:
-        """Add a batch of pairs."""
+        """Add a batch of pairs; those of another benchmark than the metric's are left out."""
+        if not self._metric.applies(pair):
+            return
+        self.applied = True
         values = self._metric.variants(pair)[self._variant]
         valid = pair.target_mask.flatten(1).any(dim=1)
         self.total += torch.where(valid, values, 0).sum().to(self.total)
@@ -149,17 +157,25 @@ class BumpinessD(PerImageMean):
 
 
 def visual_metrics(
-    network: LPIPS | None = None, extra: Sequence[Metric] = (), **settings: Any
+    network: LPIPS | None = None, extra: Sequence[Metric] = (), protocols: Sequence[str] = ("paper",), **settings: Any
 ) -> torchmetrics.MetricCollection:
-    """Return all metrics of the catalogue, each of the worst of four lights, as one collection.
+    """Return all metrics of some protocols, each of the worst of four lights, as one collection.
 
     Compute groups stay off: they would merge metrics that differ only in a threshold.
 
     Args:
         network: for perceptual metrics; None leaves them out.
-        extra: metrics beside the paper's.
+        extra: metrics beside those of the protocols.
+        protocols: names of :data:`dsr.metrics.catalogue.PROTOCOLS`.
         **settings: as for every torchmetrics class.
 
     """
-    metrics: dict[str, Any] = {metric.name: PerImageMean(metric, **settings) for metric in catalogue(network, extra)}
+    chosen = catalogue(network, extra, protocols)
+    metrics: dict[str, Any] = {metric.name: PerImageMean(metric, **settings) for metric in chosen}
     return torchmetrics.MetricCollection(metrics, compute_groups=False)
+
+
+def compute_means(metrics: torchmetrics.MetricCollection) -> dict[str, Tensor]:
+    """Return the means of a collection of :func:`visual_metrics` by name, without metrics of other benchmarks."""
+    applied = {name for name, metric in metrics.items() if getattr(metric, "applied", True)}
+    return {name: value for name, value in metrics.compute().items() if name in applied}

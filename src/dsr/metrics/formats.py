@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
+BEFORE_THE_PAPER = 0
+"""The position of metrics that stand before those of the paper's tables."""
 AFTER_THE_PAPER = 100
 """The position of metrics that the paper's tables do not have."""
 HEADLINES = ("", "max", "min")

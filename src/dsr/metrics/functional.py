@@ -15,7 +15,9 @@ gets NaN.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import cached_property
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
@@ -24,6 +26,7 @@ from dsr.geometry.shading import lights, shade
 from dsr.geometry.surface import depth_to_normals, length, normal_mask
 from dsr.sample import CENTIMETRES, Unit
 
+_Derived = TypeVar("_Derived")
 SSIM_WINDOW = 7
 SSIM_DATA_RANGE = 2.0
 BUMPINESS_CLIP = 0.05
@@ -78,10 +81,19 @@ class SurfacePair:
         self.rays = rays.to(target.dtype)
         self.unit = unit
         self.image_dtype = image_dtype or target.dtype
+        self.given = prediction, target
+        self._derived: dict[Callable[[SurfacePair], Any], Any] = {}
         self.prediction, self.target = prediction, target
         if not self.complete:  # a finite stand-in keeps NaN out of sums and gradients
             self.prediction = torch.where(self.depth_mask, prediction, 1.0)
             self.target = torch.where(self.depth_mask, target, 1.0)
+
+    def derive(self, make: Callable[[SurfacePair], _Derived]) -> _Derived:
+        """Return ``make(self)``, which is called once: quantities of their own that several metrics share."""
+        if make not in self._derived:
+            self._derived[make] = make(self)
+        derived: _Derived = self._derived[make]
+        return derived
 
     @cached_property
     def normals(self) -> tuple[Tensor, Tensor]:
@@ -146,7 +158,7 @@ class SurfacePair:
 
 def rmse_d(pair: SurfacePair) -> Tensor:
     """Return the RMS difference of the perspective depths in metres, (B,)."""
-    return _mean(pair.perspective_error.square(), pair.depth_mask).sqrt().squeeze(1)
+    return masked_mean(pair.perspective_error.square(), pair.depth_mask).sqrt().squeeze(1)
 
 
 def bad_pix_d(pair: SurfacePair, threshold: float, *, relative: bool = False) -> Tensor:
@@ -159,7 +171,7 @@ def bad_pix_d(pair: SurfacePair, threshold: float, *, relative: bool = False) ->
 
     """
     limit = pair.target * pair.ray_lengths * threshold if relative else threshold
-    return _mean(pair.perspective_error > limit, pair.depth_mask).squeeze(1)
+    return masked_mean(pair.perspective_error > limit, pair.depth_mask).squeeze(1)
 
 
 def mse_v(pair: SurfacePair) -> Tensor:
@@ -168,7 +180,7 @@ def mse_v(pair: SurfacePair) -> Tensor:
     As these lights are orthonormal, this is the mean squared difference of the normal maps' three components.
     """
     first, second = pair.normals
-    return _mean((first - second).square().mean(dim=1, keepdim=True), pair.normal_mask).squeeze(1)
+    return masked_mean((first - second).square().mean(dim=1, keepdim=True), pair.normal_mask).squeeze(1)
 
 
 def rmse_v(pair: SurfacePair) -> Tensor:
@@ -179,12 +191,12 @@ def rmse_v(pair: SurfacePair) -> Tensor:
 def rmse_v1(pair: SurfacePair) -> Tensor:
     """Return RMSE_v^1 per light, (B, 4): the RMS difference of the unclipped renderings e . n."""
     first, second = pair.shadings
-    return _mean((first - second).square(), pair.normal_mask).sqrt()
+    return masked_mean((first - second).square(), pair.normal_mask).sqrt()
 
 
 def bad_pix_v(pair: SurfacePair, threshold: float) -> Tensor:
     """Return the fraction of pixels whose renderings differ by more than ``threshold`` / 255, per light, (B, 4)."""
-    return _mean(pair.rendering_error > threshold / 255, pair.normal_mask)
+    return masked_mean(pair.rendering_error > threshold / 255, pair.normal_mask)
 
 
 def dssim_v(pair: SurfacePair) -> Tensor:
@@ -201,7 +213,7 @@ def dssim_v(pair: SurfacePair) -> Tensor:
     if min(first.shape[-2:]) < SSIM_WINDOW:
         raise ValueError(f"DSSIM_v: expected a map of at least 7 x 7 pixels, got {tuple(first.shape[-2:])}")
     lights_apart = zip(first.unbind(1), second.unbind(1), strict=True)  # one light's maps stay in the cache
-    return torch.cat([1 - _mean(_ssim_map(x, y)[:, None], pair.ssim_mask) for x, y in lights_apart], dim=1)
+    return torch.cat([1 - masked_mean(ssim_map(x, y)[:, None], pair.ssim_mask) for x, y in lights_apart], dim=1)
 
 
 def bumpiness_d(pair: SurfacePair) -> Tensor:
@@ -216,10 +228,10 @@ def bumpiness_d(pair: SurfacePair) -> Tensor:
     along_v, along_u = _scharr(difference)
     squares = sum(second.square() for first in (along_v, along_u) for second in _scharr(first))
     assert isinstance(squares, Tensor)  # noqa: S101 - sum() of tensors is one
-    return 100 * _mean(squares.sqrt().clamp(max=BUMPINESS_CLIP), pair.bumpiness_mask).squeeze(1)
+    return 100 * masked_mean(squares.sqrt().clamp(max=BUMPINESS_CLIP), pair.bumpiness_mask).squeeze(1)
 
 
-def _mean(values: Tensor, mask: Tensor) -> Tensor:
+def masked_mean(values: Tensor, mask: Tensor) -> Tensor:
     """Return the mean over the last two axes of ``values`` (B, C, H, W) where ``mask`` (B, 1, H, W) is set, (B, C)."""
     if bool(mask.all()):
         return values.mean(dim=(-2, -1)) if values.is_floating_point() else values.double().mean(dim=(-2, -1))
@@ -227,7 +239,7 @@ def _mean(values: Tensor, mask: Tensor) -> Tensor:
     return total / mask.sum(dim=(-2, -1))
 
 
-def _ssim_map(x: Tensor, y: Tensor) -> Tensor:
+def ssim_map(x: Tensor, y: Tensor) -> Tensor:
     """Return SSIM at every window inside the map, (B, H, W) -> (B, H - 6, W - 6)."""
     # With sums over N pixels in place of means, the numerators and denominators are multiplied by the same factor.
     area = SSIM_WINDOW**2

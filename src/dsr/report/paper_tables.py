@@ -240,7 +240,7 @@ def _notes(groups: Sequence[Group], columns: Sequence[Column], formats: Formats)
     yield "In each group our best displayed value is bold, the second best underlined; equal values share the mark."
     of_paper = [name for name, each in in_tables(KNOWN_FORMATS).items() if each.position != AFTER_THE_PAPER]
     missing = [name for name in of_paper if name not in shown]
-    if missing:
+    if 0 < len(missing) < len(of_paper):
         yield f"Not computed: {', '.join(missing)}."
     if any(cell.spread is not None for cell in cells):
         yield "Mean ± sample standard deviation over seeds; seeds are averaged within each scene, then scenes."

@@ -96,7 +96,7 @@ def score_table(scores: pd.DataFrame, label: str, formats: Formats) -> Table:
     for scene, values in ours.iterrows():
         table.add_row(escape(str(scene)), "dsr", *_cells(values, columns))
         paper = paper_row(str(scene), label, scale, downsampling)
-        if paper is not None:
+        if paper is not None and _has_any(paper, columns):
             recreated = scene in RECREATED or dataset in OTHER_FRAMES
             starred |= recreated
             table.add_row("", "paper*" if recreated else "paper", *_cells(paper, columns), style="dim")
@@ -105,12 +105,17 @@ def score_table(scores: pd.DataFrame, label: str, formats: Formats) -> Table:
         table.add_row("mean", "dsr", *_cells(ours.mean(), columns), style="bold")
         name, count = AVERAGES.get(dataset, ("", 0))
         paper = paper_row(name, label, scale, downsampling)
-        if paper is not None and len(ours) == count:
+        if paper is not None and len(ours) == count and _has_any(paper, columns):
             table.add_row("", "paper*" if starred else "paper", *_cells(paper, columns), style="dim")
     if starred:
         table.caption = "* of the paper's own files; the scenes here are others of the same description"
         table.caption_justify = "left"
     return table
+
+
+def _has_any(values: pd.Series, columns: Formats) -> bool:
+    """Return whether a row has a value for one of the columns."""
+    return bool(values.reindex(list(columns)).notna().any())
 
 
 def _cells(values: pd.Series, columns: Formats) -> list[str]:

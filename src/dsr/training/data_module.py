@@ -6,7 +6,7 @@ import itertools
 import math
 import sys
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import lightning
@@ -60,8 +60,16 @@ class WholeScenes(Dataset[Batch]):
         return len(self._samples)
 
     def __getitem__(self, index: int) -> Batch:
-        """Return one sample's tensors."""
-        return to_tensors(self._samples[index], torch.float64)
+        """Return one sample's tensors, and ``unit``."""
+        sample = self._samples[index]
+        return {**to_tensors(sample, torch.float64), "unit": asdict(sample.unit)}
+
+
+def collate_scene(samples: Sequence[Batch]) -> Batch:
+    """Return a batch of one whole scene."""
+    (sample,) = samples
+    tensors = {name: value for name, value in sample.items() if name != "unit"}
+    return {**default_collate([tensors]), "unit": sample["unit"]}
 
 
 class PatchData(lightning.LightningDataModule):
@@ -178,7 +186,8 @@ class PatchData(lightning.LightningDataModule):
     def val_dataloader(self) -> list[DataLoader[Batch]]:
         """Return a loader for each validation set, of whole scenes, one at a time."""
         return [
-            DataLoader(WholeScenes(scenes, self._degradation, self._seed), batch_size=1) for scenes in self._validation
+            DataLoader(WholeScenes(scenes, self._degradation, self._seed), batch_size=1, collate_fn=collate_scene)
+            for scenes in self._validation
         ]
 
     def _load_patches(self) -> Patches:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -13,7 +14,8 @@ from dsr.geometry.camera import baseline_times_focal
 from dsr.methods.networks.maps import compute_min_max
 from dsr.sample import DepthSample, Scene
 
-Batch = dict[str, Tensor]
+Batch = dict[str, Any]
+"""Tensors by name; whole scenes also have ``unit``, the benchmark's as plain values."""
 _MIN_RELATIVE_RANGE = 1e-3
 """Smallest range of a map as a fraction of its disparity."""
 

@@ -14,7 +14,9 @@ from torch.optim.swa_utils import get_ema_multi_avg_fn
 
 from dsr.geometry.comparison import comparison
 from dsr.methods.networks.base import DisparityNetwork
+from dsr.metrics.classes import compute_means
 from dsr.metrics.functional import SurfacePair
+from dsr.sample import Unit
 from dsr.training.degradation import Batch
 from dsr.training.objective import Objective, to_depth
 from dsr.training.settings import Schedule
@@ -87,7 +89,7 @@ class SuperResolution(lightning.LightningModule):
         disparity = self.average.upsample(batch["rgb"], batch["disparity_lr"])
         depth = to_depth(disparity.to(batch["depth"].dtype), batch)
         self.metrics[dataloader_idx].update(  # type: ignore[operator]
-            SurfacePair(depth, batch["depth"], batch["rays"], image_dtype=torch.float32)
+            SurfacePair(depth, batch["depth"], batch["rays"], unit=Unit(**batch["unit"]), image_dtype=torch.float32)
         )
         writer: Any = getattr(self.logger, "experiment", None)
         if hasattr(writer, "add_image") and index < _RENDERED_SCENES:
@@ -96,8 +98,10 @@ class SuperResolution(lightning.LightningModule):
 
     def on_validation_epoch_end(self) -> None:
         """Log the mean scores over the scenes, worst of four lights, of all sets and, if there are several, of each."""
-        scores = [{name: value.double() for name, value in each.compute().items()} for each in self.metrics]  # type: ignore[operator]
-        means = {name: torch.stack([each[name] for each in scores]).nanmean() for name in scores[0]}
+        collections: Any = self.metrics
+        scores = [{name: value.double() for name, value in compute_means(each).items()} for each in collections]
+        names = dict.fromkeys(name for each in scores for name in each)
+        means = {name: torch.stack([each[name] for each in scores if name in each]).nanmean() for name in names}
         named = {"val": means}
         if len(self.sets) > 1:
             named |= {f"val_{name}": each for name, each in zip(self.sets, scores, strict=True)}

@@ -17,6 +17,7 @@ from dsr.geometry.comparison import comparison
 from dsr.methods.dip.problem import ImageProblem, PriorObjective
 from dsr.methods.dip.skip_net import Padding, SkipNet, levels_for
 from dsr.methods.dip.stopping import Stopping
+from dsr.metrics.classes import compute_means
 from dsr.metrics.functional import SurfacePair, rmse_v
 
 _NOISE_CHANNELS = 32
@@ -158,12 +159,12 @@ class PriorOptimisation(lightning.LightningModule):
         """Score the current average if there is a true depth, and log renderings."""
         depth = self.average
         if self.truth is not None:
-            pair = SurfacePair(depth, self.truth, self.problem.rays)
+            pair = SurfacePair(depth, self.truth, self.problem.rays, unit=self.problem.unit)
             self.stopping.judge(float(rmse_v(pair).nanmean()), depth)
             if self.metrics is not None:
                 self.metrics.reset()
                 self.metrics.update(pair)
-                self.validation_scores = {"val": {name: float(v) for name, v in self.metrics.compute().items()}}
+                self.validation_scores = {"val": {name: float(v) for name, v in compute_means(self.metrics).items()}}
                 named = {f"val/{k}": value for k, value in self.validation_scores["val"].items()}
                 self.log_dict({"step": float(self.global_step), **named}, batch_size=1)  # else Lightning counts from 0
         writer: Any = getattr(self.logger, "experiment", None)

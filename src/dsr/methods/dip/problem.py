@@ -15,7 +15,7 @@ from dsr.methods.classical.finite_differences import grey
 from dsr.methods.networks.maps import compute_min_max
 from dsr.metrics import losses
 from dsr.metrics.functional import SurfacePair, mse_v
-from dsr.sample import DepthSample
+from dsr.sample import DepthSample, Unit
 
 DataLoss = Literal["lap1", "mse"]
 _MIN_RANGE = 1e-3
@@ -35,6 +35,7 @@ class ImageProblem:
         scale: upsampling factor.
         downsampling: assumed model from high- to low-resolution depth.
         range_type: range type that the model averages, unless it has one of its own.
+        unit: unit of the benchmark, for validation.
         min_depth, depth_range: minimum and range (maximum less minimum) of the valid low-resolution depth in metres.
 
     """
@@ -48,6 +49,7 @@ class ImageProblem:
     scale: int
     downsampling: Downsampling
     range_type: RangeType
+    unit: Unit
     min_depth: float
     depth_range: float
 
@@ -66,6 +68,7 @@ class ImageProblem:
             scale=whole_scale(sample),
             downsampling=downsampling,
             range_type=range_type,
+            unit=sample.unit,
             min_depth=min_depth,
             depth_range=max(max_depth - min_depth, _MIN_RANGE * max_depth),
         )

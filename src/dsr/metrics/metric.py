@@ -1,0 +1,93 @@
+"""A metric: how it is computed and how it is shown."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from dsr.geometry.shading import LIGHT_NAMES
+from dsr.metrics.formats import MetricFormat
+from dsr.metrics.functional import SurfacePair
+
+WORST, AVERAGE = "max", "avg"
+VARIANTS = (*LIGHT_NAMES, WORST, AVERAGE)
+
+
+@dataclass(frozen=True)
+class Metric:
+    """A metric: how it is computed and how it is shown.
+
+    Args:
+        name: as in ``scores.csv``.
+        function: from a pair to (B,), or to (B, 4) where ``per_light``.
+        mask: from a pair to the (B, 1, H', W') pixels that the metric uses.
+        format: how tables and figures show it.
+        per_light: whether there is a value for each of the lights e1..e4.
+        min_size: smallest height and width in pixels that it is defined for.
+        perceptual: whether the function takes an LPIPS network, ``network``.
+        unit: name of the unit of the benchmarks that it is for, see :class:`dsr.sample.Unit`; None for all of them.
+        whole: whether it is computed of the whole image even where a method left out rows or columns at the border.
+
+    """
+
+    name: str
+    function: Callable[..., Tensor]
+    mask: Callable[[SurfacePair], Tensor]
+    format: MetricFormat
+    per_light: bool = False
+    min_size: int = 2
+    perceptual: bool = False
+    unit: str | None = None
+    whole: bool = False
+
+    def applies(self, pair: SurfacePair) -> bool:
+        """Return whether the metric is for the pair's benchmark."""
+        return self.unit in (None, pair.unit.name)
+
+    @property
+    def worst(self) -> str:
+        """The variant that is the worst of four lights: the largest value, the smallest where higher is better."""
+        return "min" if self.format.higher_is_better else WORST
+
+    def variants(self, pair: SurfacePair) -> dict[str, Tensor]:
+        """Return the value per image, (B,), by variant: e1..e4, the worst of them and their average, or just "".
+
+        NaN for images below the metric's smallest size.
+        """
+        count, size = len(pair.target), min(pair.target.shape[-2:])
+        if size < self.min_size:
+            values = pair.target.new_full((count, len(LIGHT_NAMES)) if self.per_light else (count,), torch.nan)
+        else:
+            values = self._values(pair)
+        if not self.per_light:
+            return {"": values}
+        by_light = dict(zip(LIGHT_NAMES, values.unbind(1), strict=True))
+        worst = values.amin(dim=1) if self.format.higher_is_better else values.amax(dim=1)
+        return {**by_light, self.worst: worst, AVERAGE: values.mean(dim=1)}
+
+    def _values(self, pair: SurfacePair) -> Tensor:
+        """Return the function's values, of the right shape."""
+        values = self.function(pair)
+        expected = (len(pair.target), len(LIGHT_NAMES)) if self.per_light else (len(pair.target),)
+        if tuple(values.shape) != expected:
+            raise ValueError(f"{self.name}: expected values of shape {expected}, got {tuple(values.shape)}")
+        return values
+
+    def valid_fraction(self, pair: SurfacePair) -> Tensor:
+        """Return the valid fraction of the pixels that the metric would use in a complete map, (B,)."""
+        if min(pair.target.shape[-2:]) < self.min_size:
+            return torch.zeros(len(pair.target), dtype=torch.float64)
+        return self.mask(pair).double().mean(dim=(-3, -2, -1))
+
+
+def depth_mask(pair: SurfacePair) -> Tensor:
+    """Return the pixels with a depth in both maps."""
+    return pair.depth_mask
+
+
+def normal_mask(pair: SurfacePair) -> Tensor:
+    """Return the pixels with a normal in both maps."""
+    return pair.normal_mask

@@ -1,0 +1,171 @@
+"""Metrics of a depth map refined from a real sensor's against a truth that was measured, too.
+
+Neither map is perfect: the sensor has a constant bias, which is not shape, the truth ends at ragged borders, and a few
+pixels of either belong to another surface. Therefore the scored pixels are those at least four pixels away from unknown
+truth, and two away from unknown predictions and from those more than 0.1 m off; distances are counted along rows and
+columns. The median difference over them is subtracted from the prediction, and normals and renderings are compared as
+in the paper's metrics, with unknown pixels replaced by the truth's median depth. A method must not look better for
+leaving out what is difficult, so the fraction of scored pixels, ``Sensor_covered``, belongs to every score.
+"""
+
+from __future__ import annotations
+
+from functools import cached_property
+
+import torch
+from torch import Tensor
+
+from dsr.geometry.surface import length
+from dsr.metrics.formats import BEFORE_THE_PAPER, MetricFormat
+from dsr.metrics.functional import SSIM_WINDOW, SurfacePair, masked_mean, ssim_map
+from dsr.metrics.metric import Metric
+
+TRUTH_EROSION = 3
+PREDICTION_EROSION = 1
+LARGEST_ERROR = 0.1
+"""Metres; a prediction further off is another surface, not a shape of this one."""
+
+
+class SensorComparison:
+    """What the metrics derive from a pair.
+
+    Args:
+        pair: the refined map and the truth.
+
+    Attributes:
+        inner: (B, 1, H, W) bool, the pixels that a prediction should cover.
+        scored: (B, 1, H, W) bool, those that it covers.
+        offset: (B, 1, 1, 1) median of prediction - truth over the scored pixels, in metres.
+        surfaces: the prediction less the offset, and the truth, without unknown pixels.
+
+    """
+
+    def __init__(self, pair: SurfacePair) -> None:
+        prediction, target = pair.given
+        known = prediction.isfinite() & (prediction > 0)
+        near = pair.target_mask & known & ((prediction - target).abs() < LARGEST_ERROR)
+        self.inner = erode(pair.target_mask, TRUTH_EROSION)
+        self.scored = self.inner & erode(near, PREDICTION_EROSION)
+        self.offset = masked_median(prediction - target, self.scored)
+        filler = masked_median(target, pair.target_mask)
+        self.surfaces = SurfacePair(
+            torch.where(known, prediction - self.offset, filler),
+            torch.where(pair.target_mask, target, filler),
+            pair.rays,
+            image_dtype=pair.image_dtype,
+        )
+
+    @cached_property
+    def angle(self) -> Tensor:
+        """(B, 1, H, W) angle between the normals in degrees."""
+        first, second = self.surfaces.normals
+        return torch.rad2deg(2 * (length(first - second) / 2).clamp(max=1).asin())  # precise for small angles, too
+
+
+def erode(mask: Tensor, steps: int) -> Tensor:
+    """Return a mask without the pixels within ``steps`` of an unset one, counted along rows and columns.
+
+    Args:
+        mask: (B, 1, H, W) bool; pixels outside count as unset.
+        steps: distance in pixels.
+
+    """
+    for _ in range(steps):
+        padded = torch.nn.functional.pad(mask, (1, 1, 1, 1))
+        along_u = padded[..., 1:-1, 2:] & padded[..., 1:-1, :-2]
+        mask = mask & along_u & padded[..., 2:, 1:-1] & padded[..., :-2, 1:-1]
+    return mask
+
+
+def masked_median(values: Tensor, mask: Tensor) -> Tensor:
+    """Return the median over the pixels that are set, (B, 1, 1, 1); of an even number the mean of the middle two.
+
+    Args:
+        values: (B, 1, H, W).
+        mask: (B, 1, H, W) bool; NaN for an image without a set pixel.
+
+    """
+    ordered = values.masked_fill(~mask, torch.inf).flatten(1).sort(dim=1).values
+    count = mask.flatten(1).sum(dim=1, keepdim=True)
+    middle = torch.cat(((count - 1).clamp(min=0) // 2, count // 2), dim=1)
+    median = ordered.gather(1, middle.clamp(max=ordered.shape[1] - 1)).mean(dim=1)
+    return torch.where(count[:, 0] > 0, median, torch.nan)[:, None, None, None]
+
+
+def covered(pair: SurfacePair) -> Tensor:
+    """Return the fraction of the inner pixels that are scored, (B,)."""
+    comparison = pair.derive(SensorComparison)
+    return masked_mean(comparison.scored, comparison.inner).squeeze(1)
+
+
+def offset_d(pair: SurfacePair) -> Tensor:
+    """Return the absolute value of the offset in metres, (B,)."""
+    return pair.derive(SensorComparison).offset.abs().flatten()
+
+
+def rmse_d(pair: SurfacePair) -> Tensor:
+    """Return the RMS difference of orthogonal depth in metres after the offset's removal, (B,)."""
+    comparison = pair.derive(SensorComparison)
+    difference = comparison.surfaces.prediction - comparison.surfaces.target
+    return masked_mean(difference.square(), comparison.scored).sqrt().squeeze(1)
+
+
+def rmse_v(pair: SurfacePair) -> Tensor:
+    """Return RMSE_v over the scored pixels, (B,), see :func:`dsr.metrics.functional.rmse_v`."""
+    comparison = pair.derive(SensorComparison)
+    first, second = comparison.surfaces.normals
+    squares = (first - second).square().mean(dim=1, keepdim=True)
+    return masked_mean(squares, comparison.scored).sqrt().squeeze(1)
+
+
+def dssim_v(pair: SurfacePair) -> Tensor:
+    """Return DSSIM_v over the scored pixels per light, (B, 4), see :func:`dsr.metrics.functional.dssim_v`."""
+    comparison = pair.derive(SensorComparison)
+    border = SSIM_WINDOW // 2  # no scored pixel is so close to it
+    scored = comparison.scored[..., border:-border, border:-border]
+    lights = zip(*(maps.unbind(1) for maps in comparison.surfaces.renderings), strict=True)
+    return torch.cat([1 - masked_mean(ssim_map(x, y)[:, None], scored) for x, y in lights], dim=1)
+
+
+def angle_mean(pair: SurfacePair) -> Tensor:
+    """Return the mean angle between the normals over the scored pixels, (B,) in degrees."""
+    comparison = pair.derive(SensorComparison)
+    return masked_mean(comparison.angle, comparison.scored).squeeze(1)
+
+
+def angle_median(pair: SurfacePair) -> Tensor:
+    """Return the median angle between the normals over the scored pixels, (B,) in degrees."""
+    comparison = pair.derive(SensorComparison)
+    return masked_median(comparison.angle, comparison.scored).flatten()
+
+
+def _inner(pair: SurfacePair) -> Tensor:
+    return pair.derive(SensorComparison).inner
+
+
+def _scored(pair: SurfacePair) -> Tensor:
+    return pair.derive(SensorComparison).scored
+
+
+def _shown(heading: str, unit: str, factor: float, digits: int, *, higher_is_better: bool = False) -> MetricFormat:
+    return MetricFormat(heading, unit, factor, digits, higher_is_better, BEFORE_THE_PAPER)
+
+
+METRICS: tuple[Metric, ...] = (
+    Metric("Sensor_RMSE_v", rmse_v, _scored, _shown("RMSE_v", "sensor, 1/1000", 1e3, 0), whole=True),
+    Metric(
+        "Sensor_DSSIM_v",
+        dssim_v,
+        _scored,
+        _shown("DSSIM_v", "sensor, 1/1000", 1e3, 0),
+        per_light=True,
+        min_size=SSIM_WINDOW,
+        whole=True,
+    ),
+    Metric("Sensor_angle_mean", angle_mean, _scored, _shown("Angle", "mean, deg", 1, 1), whole=True),
+    Metric("Sensor_angle_median", angle_median, _scored, _shown("Angle", "median, deg", 1, 1), whole=True),
+    Metric("Sensor_covered", covered, _inner, _shown("Covered", "%", 1e2, 1, higher_is_better=True), whole=True),
+    Metric("Sensor_offset", offset_d, _scored, _shown("Offset", "mm", 1e3, 2), whole=True),
+    Metric("Sensor_RMSE_d", rmse_d, _scored, _shown("RMSE_d", "sensor, mm", 1e3, 2), whole=True),
+)
+"""The metrics of ``metrics=sensor``."""
