@@ -394,9 +394,9 @@ def test_help_lists_the_choices(within):
     code, output, errors = within("--help")
     assert (code, errors) == (0, [])
     for line in (
-        "dataset: ddrnet, folder, icl, lu, middlebury, middlebury2001, middlebury2003, middlebury2005, "
-        "middlebury2006, middlebury8, middlebury_train, mixture, nyu, paper_train, procedural, rgbdd, rgbdd_real, "
-        "simgeo, sintel, sunrgbd, tartanair, tofmark",
+        "dataset: arkitscenes, ddrnet, diml, folder, icl, lu, middlebury, middlebury2001, middlebury2003, "
+        "middlebury2005, middlebury2006, middlebury8, middlebury_train, mixture, nyu, paper_train, procedural, rgbdd, "
+        "rgbdd_real, simgeo, sintel, sunrgbd, tartanair, tofmark",
         "method: anisotropic_diffusion, bicubic, bilinear, dg, dip, dip_v, dip_v_warm, eg, facets, "
         "fast_global_smoother, guided_filter, joint_bilateral, msg, msg_v",
     ):

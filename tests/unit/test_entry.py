@@ -38,9 +38,9 @@ SETTINGS = (
     "method, weights, run"
 )
 DATASETS = (
-    "ddrnet, folder, icl, lu, middlebury, middlebury2001, middlebury2003, middlebury2005, middlebury2006, middlebury8, "
-    "middlebury_train, mixture, nyu, paper_train, procedural, rgbdd, rgbdd_real, simgeo, sintel, sunrgbd, tartanair, "
-    "tofmark"
+    "arkitscenes, ddrnet, diml, folder, icl, lu, middlebury, middlebury2001, middlebury2003, middlebury2005, "
+    "middlebury2006, middlebury8, middlebury_train, mixture, nyu, paper_train, procedural, rgbdd, rgbdd_real, simgeo, "
+    "sintel, sunrgbd, tartanair, tofmark"
 )
 METHODS = (
     "anisotropic_diffusion, bicubic, bilinear, dg, dip, dip_v, dip_v_warm, eg, facets, fast_global_smoother, "

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from dsr.data.formats.rgbdd import find_frames, load_frame, load_measured_frame
-from dsr.data.rgbdd import NOTE, RGBDD
+from dsr.data.formats.shared import NO_CAMERA
+from dsr.data.rgbdd import RGBDD
 
 ROWS, COLUMNS = np.mgrid[0:384, 0:512]
 DEPTH = (1000 + 2 * ROWS + COLUMNS).astype(np.uint16)
@@ -58,8 +59,9 @@ def test_both_layouts_and_their_splits_are_found(tmp_path):
     image(tmp_path / "owners/plants/plants_train", "20200101000004", OWNERS)
     image(tmp_path / "owners/models/models_train", "20200101000005", OWNERS, count=2)
     image(tmp_path / "owners/lights/lights_test", "20200101000006", OWNERS)
-    assert list(find_frames(tmp_path)) == [f"2020010100000{number}" for number in (1, 2, 3)]
-    assert list(find_frames(tmp_path, measured=True)) == [f"2020010100000{number}" for number in (2, 3)]
+    assert list(find_frames(tmp_path)) == [f"2020010100000{number}" for number in (1, 2, 3, 4, 5)]
+    assert list(find_frames(tmp_path, "test")) == [f"2020010100000{number}" for number in (1, 2, 3)]
+    assert list(find_frames(tmp_path, "test", measured=True)) == [f"2020010100000{number}" for number in (2, 3)]
     assert list(find_frames(tmp_path, "train")) == [f"2020010100000{number}" for number in (4, 5)]
     assert list(find_frames(tmp_path / "owners", "train", measured=True)) == ["20200101000004"]
     with pytest.raises(ValueError, match="expected a directory"):
@@ -72,7 +74,7 @@ def test_test_images_are_to_evaluate_on_and_the_others_to_train_on(tmp_path):
     test, train = RGBDD(str(tmp_path), False, scenes="found"), RGBDD(str(tmp_path), True, "train", "found")
     assert (test.name, test.evaluation, test.scenes()) == ("rgbdd", True, ["20200101000002"])
     assert (train.name, train.evaluation, train.scenes()) == ("rgbdd_real", False, ["20200101000004"])
-    assert test.load("20200101000002").notes == (NOTE,)
+    assert test.load("20200101000002").notes == (NO_CAMERA,)
     with pytest.raises(ValueError, match=r"expected all scenes in .* got 1 of 405 scenes; .*dataset\.scenes=found"):
         RGBDD(str(tmp_path), real=False)
     with pytest.raises(ValueError, match="got 1 of 2215 scenes"):

@@ -9,7 +9,20 @@ from pathlib import Path
 from typing import Any
 
 from dsr.data.folder import load_scene
-from dsr.data.formats import ddrnet, eight_bit, icl_nuim, middlebury, nyu, rgbdd, sintel, sunrgbd, tartanair, tofmark
+from dsr.data.formats import (
+    arkitscenes,
+    ddrnet,
+    diml,
+    eight_bit,
+    icl_nuim,
+    middlebury,
+    nyu,
+    rgbdd,
+    sintel,
+    sunrgbd,
+    tartanair,
+    tofmark,
+)
 from dsr.sample import Scene
 
 Loader = Callable[[], Scene]
@@ -22,7 +35,9 @@ _FRAMES: tuple[tuple[Callable[[Path], Mapping[str, tuple[Any, ...]]], Callable[.
     (tofmark.find_frames, tofmark.load_frame, "tofmark"),
     (ddrnet.find_frames, ddrnet.load_frame, "ddrnet"),
     (rgbdd.find_frames, rgbdd.load_frame, "rgbdd"),
-    (functools.partial(rgbdd.find_frames, split="train"), rgbdd.load_frame, "rgbdd"),
+    (nyu.find_files, nyu.load_files, "nyu"),
+    (arkitscenes.find_frames, arkitscenes.load_frame, "arkitscenes"),
+    (diml.find_frames, diml.load_frame, "diml"),
     *(
         (functools.partial(eight_bit.find_frames, dataset=benchmark), eight_bit.load_frame, benchmark)
         for benchmark in eight_bit.BENCHMARKS

@@ -10,10 +10,8 @@ from dataclasses import replace
 
 from dsr.data.base import SceneSelection
 from dsr.data.formats import rgbdd
+from dsr.data.formats.shared import NO_CAMERA
 from dsr.data.preparation.dataset import Preparation, PreparedDataset, list_frames, make_records
-from dsr.geometry.camera import ASSUMED_FOV
-
-NOTE = f"no camera is published: {ASSUMED_FOV:g} degrees of horizontal view are assumed"
 
 
 class RGBDD(PreparedDataset):
@@ -36,6 +34,6 @@ class RGBDD(PreparedDataset):
             raise ValueError(f"split: expected one of {', '.join(rgbdd.COUNTS)}, got {split}")
         name, load = ("rgbdd_real", rgbdd.load_measured_frame) if real else ("rgbdd", rgbdd.load_frame)
         records = make_records(list_frames(rgbdd.find_frames, root, split, real), load, name)
-        found = {scene: replace(record, note=NOTE) for scene, record in records.items()}
+        found = {scene: replace(record, note=NO_CAMERA) for scene, record in records.items()}
         super().__init__(name, root, found, None, scenes, Preparation(None), count=rgbdd.COUNTS[split])
         self.evaluation = split == "test"

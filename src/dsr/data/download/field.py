@@ -94,5 +94,32 @@ FIELD = (
         "below {folder}",
         patterns=("**/*_RGB.jpg", "**/*_HR_gt.png", "**/*_LR_fill_depth.png"),
     ),
+    Collection(
+        "arkitscenes",
+        "ARKitScenes, a tablet's lidar beside a laser scanner's depth",
+        "https://github.com/apple/ARKitScenes",
+        "Its owners' own licence, for non-commercial use: see the homepage.",
+        "G. Baruch, Z. Chen, A. Dehghan, T. Dimry, Y. Feigin, P. Fu, T. Gebauer, B. Joffe, D. Kurz, A. Schwartz, "
+        "E. Shulman: ARKitScenes: a diverse real-world dataset for 3D indoor scene understanding using mobile RGB-D "
+        "data. NeurIPS Datasets and Benchmarks 2021.",
+        ("arkitscenes",),
+        None,
+        manual="fetch videos with its download_data.py (data set upsampling) and put Training and Validation anywhere "
+        "below {folder}",
+        patterns=("**/highres_depth/*.png", "**/lowres_depth/*.png"),
+    ),
+    Collection(
+        "diml",
+        "DIML/CVL RGB-D, rooms before a Kinect v2",
+        "https://dimlrgbd.github.io/",
+        RESEARCH,
+        "J. Cho, D. Min, Y. Kim, K. Sohn: DIML/CVL RGB-D dataset: 2M RGB-D images of natural indoor and outdoor "
+        "scenes. arXiv 2110.11590, 2021.",
+        ("diml",),
+        None,
+        manual="fetch the indoor sample data from its homepage and put test and train, with HR or LR in each, anywhere "
+        "below {folder}",
+        patterns=("**/color/*_c.png", "**/depth_filled/*_depth_filled.png"),
+    ),
 )
 """The collections."""

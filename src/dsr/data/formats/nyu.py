@@ -8,26 +8,41 @@ for a hole; depths was filled by the authors (colourisation after Levin et al.).
 
 The camera is camera_params.m of the official toolbox, which counts pixels from 1. The toolbox cuts off the white border
 (get_projection_mask.m): rows 45 to 471, columns 41 to 601, counted from 1, which leaves 427 x 561.
+
+Guided depth super-resolution trains on the first 1000 frames and tests on the last 449 (Kim et al., "Deformable Kernel
+Networks for Joint Image Filtering", IJCV 2021), 640 x 480 pixels with the border and the filled depth. DCTNet (Zhao et
+al., CVPR 2022) has the latter as files, whose numbers count from 0:
+
+    DIR/RGB/1000.jpg   DIR/Depth/1000.npy         frame 1001, float32 metres, to frame 1449
+
+The first image of the test split in the repository of Kim et al. is 1000.jpg.
 """
 
 from __future__ import annotations
 
 import contextlib
+import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from types import MappingProxyType
+from typing import Literal
 
 import h5py
 import numpy as np
 import torch
 
-from dsr.data.formats.shared import to_depth
+from dsr.data.formats.files import read_map
+from dsr.data.formats.shared import expect_size, find_beside, read_picture, to_depth
 from dsr.geometry.camera import Camera
 from dsr.sample import Scene
 
 CAMERA = Camera(640, 480, 518.85790117450188, 519.46961112127485, 325.58244941119034 - 1, 253.73616633400465 - 1)
 BORDER = (44, 40, 427, 561)
 """First row and column, from 0, height and width of the window that the projected depth covers."""
+Split = Literal["train", "test"]
+SPLITS = MappingProxyType({"train": range(1, 1001), "test": range(1001, 1450)})
+"""Numbers of the frames by what guided depth super-resolution uses them for."""
+_PHOTO = re.compile(r"(\d{1,4})\.jpg")
 _FRAME = MappingProxyType({
     "images": ((3, 640, 480), np.dtype(np.uint8)),
     "depths": ((640, 480), np.dtype(np.float32)),
@@ -81,6 +96,35 @@ def load_frame(path: Path, number: int, dataset: str, name: str, *, filled: bool
     if not depth.isfinite().any():
         raise ValueError(f"{path}: expected at least one known pixel in frame {number}, all are holes")
     return Scene(dataset, name, rgb, camera, depth)
+
+
+def find_files(root: Path) -> dict[str, tuple[Path, Path]]:
+    """Return the photos and depths that lie in files of their own, arguments of :func:`load_files`, by name, in order.
+
+    Names are those of the frames in the labelled file: ``RGB/1000.jpg`` is "1001".
+
+    Raises:
+        ValueError: there is no such directory.
+
+    """
+    found: dict[str, tuple[Path, Path]] = {}
+    for _, number, (photo, depth) in find_beside(root, "RGB", _PHOTO, ("Depth/{}.npy",)):
+        found.setdefault(f"{int(number) + 1:04d}", (photo, depth))
+    return dict(sorted(found.items()))
+
+
+def load_files(rgb_path: Path, depth_path: Path, dataset: str, name: str) -> Scene:
+    """Return one frame of files of their own, with its border and the filled depth.
+
+    Raises:
+        ValueError: a file is missing, damaged, or not of 640 x 480 pixels; the message names it.
+
+    """
+    size = (CAMERA.height, CAMERA.width)
+    rgb, depth = read_picture(rgb_path), to_depth(depth_path, read_map(depth_path))
+    expect_size(rgb_path, tuple(rgb.shape[1:]), size)
+    expect_size(depth_path, tuple(depth.shape[1:]), size)
+    return Scene(dataset, name, rgb, CAMERA, depth)
 
 
 @contextlib.contextmanager

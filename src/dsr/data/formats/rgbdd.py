@@ -38,12 +38,12 @@ _PARTS = ("models", "plants", "portraits")
 _DEPTH, _MEASURED = "{0}_HR_gt.png", "{0}_LR_fill_depth.png"
 
 
-def find_frames(root: Path, split: Split = "test", measured: bool = False) -> dict[str, Files]:
+def find_frames(root: Path, split: Split | None = None, measured: bool = False) -> dict[str, Files]:
     """Return photos, true depth and, if ``measured``, the phone's depth, by their number "20200509112638", in order.
 
     Args:
         root: directory of the data set, or one above it.
-        split: which images; those in ``RGB`` and ``Depth`` are test images.
+        split: of the images, None for both; those in ``RGB`` and ``Depth`` are test images.
         measured: whether to find images with the phone's depth alone.
 
     Raises:
@@ -53,7 +53,7 @@ def find_frames(root: Path, split: Split = "test", measured: bool = False) -> di
     found: dict[str, Files] = {}
     for name, files in _find_owners_layout(root, split, measured=measured):
         found.setdefault(name, files)
-    if split == "test":
+    if split in (None, "test"):
         others = (f"Depth/{_DEPTH}", f"DepthLR/{_MEASURED}")[: 2 if measured else 1]
         for _, name, files in find_beside(root, "RGB", _PHOTO, others):
             found.setdefault(name, files)
@@ -86,10 +86,10 @@ def load_measured_frame(rgb_path: Path, depth_path: Path, measured_path: Path, d
     return replace(scene, measured={scene.camera.width / size[1]: measured})
 
 
-def _find_owners_layout(root: Path, split: Split, *, measured: bool) -> Iterator[tuple[str, Files]]:
+def _find_owners_layout(root: Path, split: Split | None, *, measured: bool) -> Iterator[tuple[str, Files]]:
     """Yield the number and the files of the images that have a folder each."""
     names = ("{0}_RGB.jpg", _DEPTH, _MEASURED)[: 3 if measured else 2]
-    folders = [f"{part}_{split}" for part in _PARTS]
+    folders = [f"{part}_{each}" for part in _PARTS for each in COUNTS if split in (None, each)]
     for folder, _, files in walk(root):
         if folder.parent.name in folders:
             wanted = [name.format(folder.name) for name in names]

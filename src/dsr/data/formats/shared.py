@@ -14,8 +14,10 @@ import torch
 from torch import Tensor
 
 from dsr.data.formats.files import read_pixels
-from dsr.geometry.camera import Camera
+from dsr.geometry.camera import ASSUMED_FOV, Camera
 
+NO_CAMERA = f"no camera is published: {ASSUMED_FOV:g} degrees of horizontal view are assumed"
+"""Note of scenes whose camera is :meth:`dsr.geometry.camera.Camera.from_fov`."""
 _LONGEST = 40
 """Largest number of bytes of a number and the blank behind it."""
 _TEXT = re.compile(rb"[-+.\deEnaifNAIF\s]*")

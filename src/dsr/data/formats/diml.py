@@ -1,0 +1,63 @@
+"""DIML/CVL RGB-D, the indoor sample data: rooms before a Kinect v2.
+
+Cho et al., "DIML/CVL RGB-D Dataset: 2M RGB-D Images of Natural Indoor and Outdoor Scenes", arXiv 2110.11590;
+dimlrgbd.github.io. As the readers of de Lutio et al. ("Learning Graph Regularisation for Guided Super-Resolution", CVPR
+2022) and of others have it:
+
+    test/HR/12. Livingroom/color/in_01_160217_123138_c.png                       the photo, 1344 x 756
+    test/HR/12. Livingroom/depth_filled/in_01_160217_123138_depth_filled.png     depth without holes, 16 bits, mm
+
+likewise ``LR``, the same at 512 x 288, and ``train``. No camera is published for these sizes; 60 degrees of horizontal
+view are assumed. The outdoor data, whose depth comes from stereo matching, is not read.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Literal
+
+from dsr.data.formats.shared import expect_size, find_beside, read_millimetres, read_picture
+from dsr.geometry.camera import Camera
+from dsr.sample import Scene
+
+Split = Literal["test", "train"]
+Resolution = Literal["HR", "LR"]
+COUNTS = {"test": 503, "train": 1609}
+"""Numbers of scenes."""
+_PHOTO = re.compile(r"(.+)_c\.png")
+
+
+def find_frames(
+    root: Path, split: Split | None = None, resolution: Resolution | None = None
+) -> dict[str, tuple[Path, Path]]:
+    """Return photos and depths, the first two arguments of :func:`load_frame`, by name "in_01_160217_123138", in order.
+
+    Args:
+        root: directory of the data, or any directory above a room.
+        split: folder of the frames; None for both.
+        resolution: folder of the frames below that; None for both, of which a frame is used at the higher one.
+
+    Raises:
+        ValueError: there is no such directory.
+
+    """
+    found: dict[str, tuple[Path, Path]] = {}
+    for place, frame, (photo, depth) in find_beside(root, "color", _PHOTO, ("depth_filled/{}_depth_filled.png",)):
+        at_split, at_resolution = place.resolve().parts[-3:-1]
+        if split in (None, at_split) and resolution in (None, at_resolution):
+            found.setdefault(frame, (photo, depth))
+    return dict(sorted(found.items()))
+
+
+def load_frame(rgb_path: Path, depth_path: Path, dataset: str, name: str) -> Scene:
+    """Return one frame.
+
+    Raises:
+        ValueError: a file is missing, damaged, or does not fit the other; the message names it.
+
+    """
+    rgb, depth = read_picture(rgb_path), read_millimetres(depth_path)
+    height, width = rgb.shape[1:]
+    expect_size(depth_path, tuple(depth.shape[1:]), (height, width))
+    return Scene(dataset, name, rgb, Camera.from_fov(width, height), depth)
