@@ -65,13 +65,21 @@ def test_value_in_conf_is_the_default_of_the_target(name):
 
 
 def test_every_setting_of_deep_image_priors_is_in_conf():
-    own = {"precision", "seed", "device", "metrics", "workspace", "display"}  # of the run, not of the method
+    own = {
+        "precision",
+        "seed",
+        "device",
+        "metrics",
+        "workspace",
+        "display",
+        "lpips_trunk",
+    }  # of the run, not of the method
     assert defaults_of(DeepImagePrior).keys() - own == read_method("dip", 4).keys() - {"name", "label", "target"}
 
 
-@pytest.mark.parametrize("part", [PriorSettings, PriorObjective])
-def test_deep_image_prior_has_the_defaults_of_its_parts(part):
-    assert differences(defaults_of(part), defaults_of(DeepImagePrior)) == set()
+@pytest.mark.parametrize(("part", "resolved"), [(PriorSettings, set()), (PriorObjective, {"w", "visual"})])
+def test_deep_image_prior_has_the_defaults_of_its_parts_but_for_what_it_resolves(part, resolved):
+    assert differences(defaults_of(part), defaults_of(DeepImagePrior)) == resolved
 
 
 def test_trainer_in_conf_has_the_defaults_of_the_schema():

@@ -140,6 +140,7 @@ def _study(
         precision=settings.precision,
         seed=settings.seed,
         downsampling=downsampling.assumed_model(),
+        lpips_trunk=settings.metrics.lpips_trunk,
         metrics=functools.partial(metric_collection, settings.metrics, given["device"]),
         **given,
     )

@@ -166,8 +166,9 @@ class TrainerConfig:
 
 @dataclass
 class LossConfig:
-    """Weight of MSE_v beside the depth loss, for a model with a visual loss."""
+    """The loss on renderings beside the depth loss, for a model with a visual loss, and its weight."""
 
+    visual: str = "mse_v"
     w: Any = "auto"
 
 

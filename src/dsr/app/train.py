@@ -24,6 +24,7 @@ from dsr.data.base import prepare_scenes
 from dsr.methods.networks.base import DisparityNetwork
 from dsr.methods.networks.trained import NETWORKS
 from dsr.methods.networks.weight_files import load_network, network_name, save_network
+from dsr.metrics.visual_loss import VisualLoss, make_visual_loss
 from dsr.training.data_module import PatchData
 from dsr.training.module import SuperResolution
 from dsr.training.objective import Objective, balance_weight
@@ -150,13 +151,26 @@ def _module(settings: TrainConfig, net: DisparityNetwork, data: PatchData, metri
     visual = settings.model.get("visual")
     if not isinstance(visual, bool):
         raise ConfigError(f"model.visual: expected true or false, got {visual!r}")
+    if not visual and settings.loss.visual != "mse_v":
+        name = settings.model["name"]
+        raise ConfigError(f"loss.visual: model={name} has no visual loss, which model.visual=true adds; leave it out")
     w = (1.0 if settings.loss.w == "auto" else float(settings.loss.w)) if visual else 0.0
     try:
+        loss = _visual_loss(settings)
         mixed = settings.precision == "bfloat16"
         schedule = Schedule(mixed=mixed, **common(Schedule, settings.trainer))
-        return SuperResolution(net, Objective(depth_loss, w), schedule, metrics, data.validation_sets)
+        return SuperResolution(net, Objective(depth_loss, w, visual=loss), schedule, metrics, data.validation_sets)
     except (ValueError, OSError) as error:
         raise keyed(error) from error
+
+
+def _visual_loss(settings: TrainConfig) -> VisualLoss:
+    """Return the loss on renderings."""
+    name: Any = settings.loss.visual
+    trunk = settings.metrics.lpips_trunk
+    loss = make_visual_loss(name, None if trunk is None else Path(trunk).expanduser())
+    loss.check_size(settings.trainer.patch, settings.trainer.patch)
+    return loss
 
 
 def _load(progress: Progress, settings: TrainConfig, module: SuperResolution, data: PatchData) -> None:
@@ -166,7 +180,7 @@ def _load(progress: Progress, settings: TrainConfig, module: SuperResolution, da
     try:
         data.setup()
         if _computes_w(settings):
-            w = balance_weight(data.first_patches(_PATCHES_FOR_W))
+            w = balance_weight(data.first_patches(_PATCHES_FOR_W), module.objective.visual)
             module.objective = replace(module.objective, w=w)
             progress.say(f"loss   {_formula(module.objective)}")
     except (ValueError, OSError) as error:
@@ -174,7 +188,7 @@ def _load(progress: Progress, settings: TrainConfig, module: SuperResolution, da
 
 
 def _computes_w(settings: TrainConfig) -> bool:
-    """Return whether the weight of MSE_v is to be computed from the scenes."""
+    """Return whether the weight of the visual loss is to be computed from the scenes."""
     return bool(settings.model["visual"]) and settings.loss.w == "auto"
 
 
@@ -199,7 +213,7 @@ def _announce(
     held_out = ", ".join(f"{len(names)} of {kind}" for kind, (_, names) in data.validation_scenes().items())
     parameters = sum(each.numel() for each in module.net.parameters())
     accumulate = f" x {trainer.accumulate} batches" if trainer.accumulate > 1 else ""
-    computed = f"{objective.depth_loss} + w MSE_v; w is computed from the scenes"
+    computed = f"{objective.depth_loss} + w {objective.visual.title}; w is computed from the scenes"
     lines: Mapping[str, Any] = {
         "model": f"{settings.model['name']} x{settings.scale}, {parameters:,} parameters, {settings.precision}",
         "data": f"{data.training_count} scenes of {settings.dataset['name']} to train on, {held_out} to validate with",
@@ -215,13 +229,13 @@ def _announce(
 
 def _formula(objective: Objective) -> str:
     """Return the loss as a formula."""
-    return objective.depth_loss + (f" + {objective.w:.3g} MSE_v" if objective.w else "")
+    return objective.depth_loss + (f" + {objective.w:.3g} {objective.visual.title}" if objective.w else "")
 
 
 def _describe(trainer: lightning.Trainer, plain: Mapping[str, Any], module: SuperResolution) -> None:
     """Write the configuration and the resulting w to TensorBoard's log."""
     writer: Any = trainer.logger.experiment  # type: ignore[union-attr]
-    text = OmegaConf.to_yaml(OmegaConf.create({**plain, "loss": {"w": module.objective.w}}))
+    text = OmegaConf.to_yaml(OmegaConf.create({**plain, "loss": {**plain["loss"], "w": module.objective.w}}))
     writer.add_text("config", f"```yaml\n{text}```")
 
 
@@ -233,6 +247,7 @@ def _facts(plain: Mapping[str, Any], module: SuperResolution) -> dict[str, Any]:
         **{key: plain[key] for key in ("scale", "seed", "precision")},
         **{key: plain["trainer"][key] for key in ("steps", "learning_rate", "batch", "patch")},
         "loss": module.objective.depth_loss,
+        "visual": module.objective.visual.name if module.objective.w else "none",
         "w": module.objective.w,
     }
 

@@ -7,6 +7,7 @@ everything else reads it with :func:`read_method`. Both then call :func:`build_m
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -81,7 +82,9 @@ def build_method(
         ConfigError: a key is unknown, missing or of another type, the method rejects a value, or there are no weights.
 
     """
-    available = {**dict.fromkeys(("metrics", "workspace", "display")), "seed": 0, **given, "scale": scale}
+    trunk = os.environ.get("DSR_LPIPS_TRUNK")
+    run = {**dict.fromkeys(("metrics", "workspace", "display")), "lpips_trunk": trunk, "seed": 0}
+    available = {**run, **given, "scale": scale}
     if takes("method", node, "weights"):
         available |= {"weights": find_weights(node, scale, weights), "networks": _networks(node, directories)}
     arguments = {key: value for key, value in node.items() if key not in ("weights", _NETWORK)}

@@ -1,18 +1,19 @@
-"""The training loss, a loss on disparity plus w MSE_v, and the weight w that balances the two."""
+"""The training loss, a loss on disparity plus w times a visual loss, MSE_v or another, and the weight w."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
 import torch
 from torch import Tensor
 
-from dsr.methods.networks.maps import compute_min_max
+from dsr.methods.networks.maps import compute_min_max, upsample_bicubic
 from dsr.metrics import losses
-from dsr.metrics.functional import SurfacePair, mse_v
+from dsr.metrics.functional import SurfacePair
+from dsr.metrics.visual_loss import MSE_V, VisualLoss, match_weight
 from dsr.training.degradation import Batch
 
 DepthLoss = Literal["lap1", "l1", "mse"]
@@ -23,14 +24,15 @@ _DEPTH_LOSSES = {"lap1": losses.lap1, "l1": losses.l1, "mse": losses.mse}
 
 @dataclass(frozen=True)
 class Objective:
-    """The loss: depth_loss + w MSE_v (Voynov et al. 2019, eq. 4: Lap_1 + w MSE_v).
+    """The loss: depth_loss + w visual (Voynov et al. 2019, eq. 4: Lap_1 + w MSE_v).
 
     The depth loss compares disparities divided by the range of the low-resolution ones, so that it does not depend on
     the scale of the scene.
 
     Args:
         depth_loss: ``lap1``, ``l1`` or ``mse``.
-        w: weight of MSE_v; 0 for the depth loss alone.
+        w: weight of the visual loss; 0 for the depth loss alone.
+        visual: the visual loss.
 
     Raises:
         ValueError: there is no such depth loss.
@@ -39,6 +41,7 @@ class Objective:
 
     depth_loss: DepthLoss = "lap1"
     w: float = 0.0
+    visual: VisualLoss = MSE_V
 
     def __post_init__(self) -> None:
         """Check the name."""
@@ -59,8 +62,8 @@ class Objective:
         terms: dict[str, Tensor] = {self.depth_loss: loss}
         if self.w:
             pair = SurfacePair(to_depth(disparity, batch), batch["depth"], batch["rays"])
-            terms["mse_v"] = mse_v(pair).nanmean()
-            loss = loss + self.w * terms["mse_v"]
+            terms[self.visual.name] = self.visual(pair).nanmean()
+            loss = loss + self.w * terms[self.visual.name]
         return {"loss": loss, **terms}
 
 
@@ -70,16 +73,18 @@ def to_depth(disparity: Tensor, batch: Batch) -> Tensor:
     return torch.where(shifted > 0, batch["bf"] / torch.where(shifted > 0, shifted, 1), torch.nan)
 
 
-def balance_weight(patches: Iterable[Batch]) -> float:
+def balance_weight(patches: Sequence[Batch], visual: VisualLoss = MSE_V) -> float:
     """Return the weight w for which one depth error gives both terms of the loss the same size.
 
     A depth error of tan(a) z / f metres between two neighbouring pixels, z / f metres apart, tilts the normal by a. The
     depth term of this error is bf tan(a) / (f z range), where bf is the baseline times the focal length and range that
     of the low-resolution disparities; MSE_v is (2 - 2 cos a) / 3. w is the median over the patches of their ratio for a
-    tilt of 1.1 degrees, which changes a rendering by 5 of 255.
+    tilt of 1.1 degrees, which changes a rendering by 5 of 255. For another visual loss, w makes it as large as w MSE_v
+    would be for bicubic interpolation, where a training begins.
 
     Args:
         patches: single training patches, without a batch axis, as from :func:`dsr.training.degradation.to_tensors`.
+        visual: the visual loss.
 
     Raises:
         ValueError: there is no patch.
@@ -94,7 +99,15 @@ def balance_weight(patches: Iterable[Batch]) -> float:
         ratios.append(float(patch["bf"]) * math.tan(_TILT) / (focal * depth * extent))
     if not ratios:
         raise ValueError("patches: expected one or more to compute w from, got none")
-    return float(torch.tensor(ratios, dtype=torch.float64).median()) / ((2 - 2 * math.cos(_TILT)) / 3)
+    w = float(torch.tensor(ratios, dtype=torch.float64).median()) / ((2 - 2 * math.cos(_TILT)) / 3)
+    return w if visual.name == "mse_v" else w * match_weight(visual, map(_interpolate, patches))
+
+
+def _interpolate(patch: Batch) -> SurfacePair:
+    """Return the bicubic interpolation of a patch's low-resolution disparity, and the patch."""
+    batch = {name: value[None] for name, value in patch.items()}
+    scale = batch["depth"].shape[-1] // batch["disparity_lr"].shape[-1]
+    return SurfacePair(to_depth(upsample_bicubic(batch["disparity_lr"], scale), batch), batch["depth"], batch["rays"])
 
 
 def _range(disparity: Tensor) -> Tensor:

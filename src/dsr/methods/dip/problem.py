@@ -12,9 +12,10 @@ from dsr.degradation.downsampling import Downsampling, downsample_depth
 from dsr.geometry.camera import Camera, RangeType
 from dsr.methods.base import whole_scale
 from dsr.methods.classical.finite_differences import grey
-from dsr.methods.networks.maps import compute_min_max
+from dsr.methods.networks.maps import compute_min_max, mean3x3
 from dsr.metrics import losses
-from dsr.metrics.functional import SurfacePair, mse_v
+from dsr.metrics.functional import SurfacePair
+from dsr.metrics.visual_loss import MSE_V, VisualLoss, match_weight
 from dsr.sample import DepthSample, Unit
 
 DataLoss = Literal["lap1", "mse"]
@@ -77,6 +78,12 @@ class ImageProblem:
         """Downsample depth in metres by the assumed model, (1, 1, H, W) to (1, 1, h, w)."""
         return downsample_depth(depth, self.camera, self.scale, self.downsampling, self.range_type)[0]
 
+    def balance_weight(self, visual: VisualLoss) -> float:
+        """Return the weight with which a visual loss is as large as MSE_v with 1 for a smoothed low-resolution map."""
+        if visual.name == "mse_v":
+            return 1.0
+        return match_weight(visual, [SurfacePair(mean3x3(self.depth_lr), self.depth_lr, self.rays_lr)])
+
     def residual(self, depth: Tensor) -> Tensor:
         """Return the RMS of D(depth) / depth_lr - 1 over the valid low-resolution pixels, a scalar."""
         ratio = self.downsample(depth) / self.depth_lr - 1
@@ -88,14 +95,15 @@ class ImageProblem:
 class PriorObjective:
     """The loss of Voynov et al. 2019 for image priors: a data term on LR depth, and the photo's reconstruction.
 
-    L = c * data(D d / r, d_LR / r) + w * MSE_v(D d, d_LR) + w_I * Lap_1(intensity, photo), where r is the range of the
-    low-resolution depth. Holes of the low-resolution map have no data term.
+    L = c * data(D d / r, d_LR / r) + w * visual(D d, d_LR) + w_I * Lap_1(intensity, photo), where r is the range of the
+    low-resolution depth, and visual is MSE_v in the paper. Holes of the low-resolution map have no data term.
 
     Args:
         data_loss: ``mse`` for DIP, ``lap1`` for DIP-V.
         data_weight: c.
-        w: weight of MSE_v, whose normals are taken with the low-resolution camera; 0 for DIP.
+        w: weight of the visual loss, whose normals are taken with the low-resolution camera; 0 for DIP.
         w_intensity: w_I.
+        visual: the visual loss.
 
     Raises:
         ValueError: an unknown name or a negative weight.
@@ -106,6 +114,7 @@ class PriorObjective:
     data_weight: float = 1.0
     w: float = 1.0
     w_intensity: float = 0.01
+    visual: VisualLoss = MSE_V
 
     def __post_init__(self) -> None:
         """Check the values."""
@@ -132,10 +141,9 @@ class PriorObjective:
         terms = {f"data_{self.data_loss}": data}
         loss = self.data_weight * data
         if self.w:
-            terms["mse_v"] = mse_v(
-                SurfacePair(depth_lr, problem.depth_lr, problem.rays_lr)
-            ).nansum()  # none between holes
-            loss = loss + self.w * terms["mse_v"]
+            pair = SurfacePair(depth_lr, problem.depth_lr, problem.rays_lr)
+            terms[self.visual.name] = self.visual(pair).nansum()  # none between holes
+            loss = loss + self.w * terms[self.visual.name]
         if self.w_intensity:
             terms["intensity"] = losses.lap1(intensity, problem.grey, levels=_levels(intensity)).mean()
             loss = loss + self.w_intensity * terms["intensity"]

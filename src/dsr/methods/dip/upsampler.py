@@ -12,7 +12,7 @@ import hashlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Any, ClassVar, get_args
+from typing import Any, ClassVar, Literal, get_args
 
 import lightning
 import torch
@@ -32,6 +32,7 @@ from dsr.methods.dip.skip_net import Padding
 from dsr.methods.dip.stopping import Fixed, Oracle, Residual, Stopping, StoppingName, Variance
 from dsr.methods.networks.base import DTYPES, Precision
 from dsr.methods.networks.trained import build_trained
+from dsr.metrics.visual_loss import VisualLossName, make_visual_loss
 from dsr.sample import DepthSample
 from dsr.utils.lightning import Interruption, Log, StepProgress, ValidationTable, fit, make_trainer
 from dsr.utils.progress import Progress, Steps, StepsProgress
@@ -52,9 +53,12 @@ class DeepImagePrior:
         downsampling: assumed downsampling model of the low-resolution map.
         steps, learning_rate, widths, skips, padding, border: see :class:`~dsr.methods.dip.optimisation.PriorSettings`.
         guide, input_noise, perturbation, guide_perturbation, average, margin: the same.
-        data_loss, data_weight, w, w_intensity: see :class:`~dsr.methods.dip.problem.PriorObjective`.
-        largest_tilt: limit in degrees; MSE_v is omitted if the estimated noise of the low-resolution map tilts its
-            normals by more. None for no limit.
+        data_loss, data_weight, w_intensity: see :class:`~dsr.methods.dip.problem.PriorObjective`.
+        w: weight of the visual loss; ``auto`` is 1 for MSE_v, and makes another loss as large as MSE_v for a smoothed
+            low-resolution map.
+        visual: the visual loss, see :class:`~dsr.metrics.visual_loss.VisualLoss`.
+        largest_tilt: limit in degrees; the visual loss is omitted if the estimated noise of the low-resolution map
+            tilts its normals by more. None for no limit.
         stopping: ``fixed``: after ``steps``; ``variance``: at the minimum of the iterates' variance; ``residual``: when
             the residual reaches the estimated noise of the low-resolution map; ``oracle``: at the validation pass with
             the lowest RMSE_v, which uses the true depth.
@@ -66,9 +70,10 @@ class DeepImagePrior:
         metrics: function that returns the metrics of a validation pass; None for none.
         workspace: directory for logs and checkpoints; None for neither.
         display: display of the progress.
+        lpips_trunk: file of AlexNet's weights for ``visual=lpips``; None to use torch's hub cache.
 
     Raises:
-        ValueError: a value is out of range.
+        ValueError: a value is out of range, or ``visual`` needs weights that are not there.
 
     """
 
@@ -92,8 +97,9 @@ class DeepImagePrior:
     margin: float = PriorSettings.margin
     data_loss: DataLoss = PriorObjective.data_loss
     data_weight: float = PriorObjective.data_weight
-    w: float = PriorObjective.w
+    w: float | Literal["auto"] = "auto"
     w_intensity: float = PriorObjective.w_intensity
+    visual: VisualLossName = "mse_v"
     largest_tilt: float | None = 10.0
     stopping: StoppingName = "fixed"
     patience: int = 200
@@ -104,6 +110,7 @@ class DeepImagePrior:
     metrics: Callable[[], torchmetrics.MetricCollection] | None = None
     workspace: Path | None = None
     display: Progress | None = None
+    lpips_trunk: str | Path | None = None
 
     def __post_init__(self) -> None:
         """Check the values."""
@@ -120,7 +127,13 @@ class DeepImagePrior:
         given = {each.name: getattr(self, each.name) for each in fields(PriorSettings) if each.name != "mixed"}
         given |= {"widths": tuple(self.widths), "skips": tuple(self.skips)}
         self._settings = PriorSettings(**given, mixed=self.precision == "bfloat16")
-        self._objective = PriorObjective(self.data_loss, self.data_weight, self.w, self.w_intensity)
+        if self.visual != "mse_v" and self.w == 0:
+            raise ValueError(f"visual: expected mse_v where w is 0, as for DIP, got {self.visual}")
+        visual = make_visual_loss(
+            self.visual, None if self.lpips_trunk is None else Path(self.lpips_trunk).expanduser()
+        )
+        w = 1.0 if self.w == "auto" else self.w
+        self._objective = PriorObjective(self.data_loss, self.data_weight, w, self.w_intensity, visual)
 
     @property
     def flag(self) -> str:
@@ -149,8 +162,9 @@ class DeepImagePrior:
             folder = None if self.workspace is None else self.workspace / WORKSPACE / sample.scene
             resume = None if folder is None else checkpoint_of(folder / "last.ckpt", origin)
             display.say(self._announcement(module, sample.scene, resume is not None))
-            if module.objective.w < self.w:
-                display.say(f"{sample.scene}: without MSE_v; {_noise_of(sample)}, more than largest_tilt")
+            if not module.objective.w and self._objective.w:
+                title = module.objective.visual.title
+                display.say(f"{sample.scene}: without {title}; {_noise_of(sample)}, more than largest_tilt")
             trainer = self._trainer(module, folder, origin, display, sample.scene)
             try:
                 fit(trainer, module, _numbers(self.steps), resume, val_dataloaders=_numbers(1))
@@ -174,7 +188,7 @@ class DeepImagePrior:
         base = self.base(sample)
         truth = None if sample.depth is None else sample.depth[None].to(device, torch.float32)
         seed = scene_generator(self.seed, sample.dataset, sample.scene, sample.scale, "prior").initial_seed()
-        objective = self._objective if self._normals_count(sample) else replace(self._objective, w=0.0)
+        objective = replace(self._objective, w=self._weight(problem, sample))
         facts = (self._settings, objective, self.downsampling, self.stopping, self.patience, seed)
         digest = hashlib.sha256(repr((facts, sample.camera, sample.camera_lr)).encode())
         for values in (sample.rgb, sample.depth_lr, base):
@@ -191,6 +205,15 @@ class DeepImagePrior:
             None if base is None else base[None].to(device, torch.float32),
         )
         return module, digest.hexdigest()
+
+    def _weight(self, problem: ImageProblem, sample: DepthSample) -> float:
+        """Return the weight of the visual loss; 0 if the noise of the low-resolution map is too large for normals."""
+        visual = self._objective.visual
+        if self._objective.w:
+            visual.check_size(sample.camera_lr.height, sample.camera_lr.width)
+        if not self._normals_count(sample):
+            return 0.0
+        return problem.balance_weight(visual) if self.w == "auto" else self._objective.w
 
     def _normals_count(self, sample: DepthSample) -> bool:
         """Return whether noise tilts the low-resolution map's normals by at most ``largest_tilt``."""
@@ -228,7 +251,8 @@ class DeepImagePrior:
                 callbacks.append(ValidationTable(folder / "validation.csv"))
             logger = Log(folder.parent, name="", version=scene, default_hp_metric=False)
             logger.list_run({"scene": scene, "scale": self.scale, "stopping": self.stopping, "w": module.objective.w,
-                             "data_loss": self.data_loss, "steps": self.steps, "seed": self.seed})  # fmt: skip
+                             "visual": self.visual, "data_loss": self.data_loss, "steps": self.steps,
+                             "seed": self.seed})  # fmt: skip
         return make_trainer(
             torch.device(self.device),
             self.steps,

@@ -1,0 +1,200 @@
+"""Visual losses: the metrics' kernels, averaged over the lights, with gradients and automatic weights."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import get_args
+
+import pytest
+import torch
+from torch import Tensor
+
+from dsr.app.schema import TrainConfig
+from dsr.app.train import _module
+from dsr.degradation.downsampling import Downsampling, make_sample
+from dsr.geometry.camera import Camera
+from dsr.methods.dip.problem import ImageProblem, PriorObjective
+from dsr.methods.dip.upsampler import DeepImagePrior
+from dsr.methods.networks.maps import mean3x3
+from dsr.metrics.functional import SurfacePair, dssim_v, mse_v
+from dsr.metrics.lpips import LPIPS, lpips_v
+from dsr.metrics.visual_loss import MSE_V, VisualLoss, VisualLossName, make_visual_loss, match_weight
+from dsr.sample import DepthSample, Scene
+from dsr.training.degradation import Batch, to_tensors
+from dsr.training.objective import Objective, balance_weight
+from dsr.utils.builder import ConfigError
+
+SIZE = 32
+CAMERA = Camera(SIZE, SIZE, 40.0, 40.0, 15.5, 15.5)
+NAMES: tuple[VisualLossName, ...] = get_args(VisualLossName)
+
+
+@pytest.fixture(scope="module")
+def network() -> LPIPS:
+    """LPIPS with a random trunk."""
+    random = torch.Generator().manual_seed(0)
+    shapes = {0: (64, 3, 11, 11), 3: (192, 64, 5, 5), 6: (384, 192, 3, 3), 8: (256, 384, 3, 3), 10: (256, 256, 3, 3)}
+    trunk = {f"features.{i}.weight": 0.1 * torch.randn(shape, generator=random) for i, shape in shapes.items()}
+    return LPIPS(trunk | {f"features.{i}.bias": torch.zeros(shape[0]) for i, shape in shapes.items()})
+
+
+def _loss(name: VisualLossName, network: LPIPS) -> VisualLoss:
+    return VisualLoss(name, network if name == "lpips" else None)
+
+
+def _surface(seed: int, size: int = SIZE) -> Tensor:
+    """Return a wavy surface, (1, 1, size, size) float64."""
+    random = torch.Generator().manual_seed(seed)
+    x = torch.arange(size, dtype=torch.float64)
+    frequency, phase = torch.rand(2, 2, generator=random, dtype=torch.float64)
+    waves = torch.sin((0.3 + 0.3 * frequency[0]) * x + 6 * phase[0]) * torch.cos((0.3 + frequency[1]) * x[:, None])
+    return 2 + 0.02 * waves[None, None]
+
+
+def _sample(size: int = SIZE, scale: int = 2) -> DepthSample:
+    camera = Camera(size, size, 1.2 * size, 1.2 * size, (size - 1) / 2, (size - 1) / 2)
+    scene = Scene("set", "waves", torch.full((3, size, size), 0.5), camera, _surface(3, size)[0])
+    return make_sample(scene, scale, Downsampling("box"), "disparity")
+
+
+def test_a_visual_loss_is_the_metric_averaged_over_the_lights(network: LPIPS) -> None:
+    pair = SurfacePair(
+        torch.cat((_surface(0), _surface(1))), torch.cat((_surface(2), _surface(3))), CAMERA.rays()[None]
+    )
+    assert torch.equal(VisualLoss()(pair), mse_v(pair))
+    torch.testing.assert_close(VisualLoss("dssim")(pair), dssim_v(pair).mean(dim=1), rtol=0, atol=0)
+    torch.testing.assert_close(VisualLoss("lpips", network)(pair), lpips_v(pair, network).mean(dim=1), rtol=0, atol=0)
+
+
+@pytest.mark.parametrize("holes", [False, True])
+@pytest.mark.parametrize("name", NAMES)
+def test_gradient_of_a_visual_loss_is_that_of_its_value(name: VisualLossName, holes: bool, network: LPIPS) -> None:
+    loss, target, rays = _loss(name, network), _surface(2), CAMERA.rays()[None]
+    if holes:
+        target[..., 5:9, 20:23] = torch.nan
+    if loss.network is not None:
+        loss.network.double()
+    start = _surface(0)
+
+    def value(surface: Tensor) -> Tensor:
+        return loss(SurfacePair(surface, target, rays)).sum()
+
+    surface = start.clone().requires_grad_()
+    value(surface).backward()
+    assert surface.grad is not None
+    for seed in range(3):  # along random directions
+        random = torch.Generator().manual_seed(seed)
+        step = 1e-9 * torch.randn(start.shape, generator=random, dtype=torch.float64)
+        numeric = (value(start + step) - value(start - step)) / 2
+        analytic = (surface.grad * step).sum()
+        assert numeric.item() == pytest.approx(analytic.item(), rel=1e-4, abs=1e-13)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_image_without_a_valid_pixel_has_no_loss_and_no_gradient(name: VisualLossName, network: LPIPS) -> None:
+    prediction = torch.cat((_surface(0), _surface(1))).float().requires_grad_()
+    target = torch.cat((_surface(2), torch.full_like(_surface(2), torch.nan))).float()
+    loss = _loss(name, network.float())(SurfacePair(prediction, target, CAMERA.rays(dtype=torch.float32)[None]))
+    assert loss.isfinite().tolist() == [True, False]
+    loss.nanmean().backward()
+    assert prediction.grad is not None
+    assert bool(prediction.grad.isfinite().all())
+    assert float(prediction.grad[0].abs().max()) > 0
+    assert float(prediction.grad[1].abs().max()) == 0
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_objectives_have_the_visual_loss_as_a_term(name: VisualLossName, network: LPIPS) -> None:
+    loss, sample = _loss(name, network.float()), _sample(64)
+    batch: Batch = {key: value[None] for key, value in to_tensors(sample).items()}
+    disparity = 1.02 * batch["bf"] / batch["depth"] + 0.02 * torch.sin(torch.arange(64.0))
+    terms = Objective("l1", 0.3, visual=loss)(disparity, batch)
+    assert terms.keys() == {"loss", "l1", name}
+    assert terms["loss"].item() == pytest.approx((terms["l1"] + 0.3 * terms[name]).item(), rel=1e-6)
+    expected = loss(SurfacePair(batch["bf"] / disparity, batch["depth"], batch["rays"]))
+    assert terms[name].item() == pytest.approx(expected.item(), rel=1e-6)
+    problem = ImageProblem.of(sample, Downsampling("box"), "orthogonal", torch.device("cpu"))
+    depth, photo = _surface(0, 64).float(), torch.rand(1, 1, 64, 64)
+    terms = PriorObjective("mse", 1.0, 0.3, 0.0, loss)(depth, photo, problem)
+    assert terms["loss"].item() == pytest.approx((terms["data_mse"] + 0.3 * terms[name]).item(), rel=1e-6)
+    expected = loss(SurfacePair(problem.downsample(depth), problem.depth_lr, problem.rays_lr))
+    assert terms[name].item() == pytest.approx(expected.item(), rel=1e-6)
+
+
+def test_automatic_weight_makes_a_loss_as_large_as_mse_v_for_interpolation() -> None:
+    patches = [to_tensors(_sample(size)) for size in (32, 40, 48)]
+    w, other = balance_weight(patches), balance_weight(patches, VisualLoss("dssim"))
+    ratios = []
+    for patch in patches:
+        batch = {key: value[None] for key, value in patch.items()}
+        enlarged = torch.nn.functional.interpolate(
+            batch["disparity_lr"], scale_factor=2, mode="bicubic", antialias=True
+        )
+        pair = SurfacePair(batch["bf"] / enlarged, batch["depth"], batch["rays"])
+        ratios.append((mse_v(pair) / dssim_v(pair).mean()).item())
+    assert other == pytest.approx(w * sorted(ratios)[1], rel=1e-5)
+    assert balance_weight(patches, MSE_V) == w
+
+
+def test_automatic_weight_of_a_prior_makes_a_loss_as_large_as_mse_v_for_a_smoothed_input() -> None:
+    sample = _sample(64)
+    prior = DeepImagePrior(scale=2, downsampling=Downsampling("box"), steps=1, visual="dssim", largest_tilt=None)
+    objective = prior.module(sample)[0].objective
+    depth_lr = sample.depth_lr[None].float()
+    pair = SurfacePair(mean3x3(depth_lr), depth_lr, sample.camera_lr.rays(dtype=torch.float32)[None])
+    assert objective.w * dssim_v(pair).mean().item() == pytest.approx(mse_v(pair).item(), rel=1e-5)
+    for visual, w, expected in (("mse_v", "auto", 1.0), ("dssim", 0.25, 0.25)):
+        settings = {"visual": visual, "w": w, "largest_tilt": None}
+        prior = DeepImagePrior(scale=2, downsampling=Downsampling("box"), steps=1, **settings)  # type: ignore[arg-type]
+        assert prior.module(sample)[0].objective.w == expected
+
+
+def test_weight_without_a_typical_error_is_one() -> None:
+    pair = SurfacePair(_surface(0), _surface(0), CAMERA.rays()[None])
+    assert match_weight(VisualLoss("dssim"), [pair]) == 1
+    assert match_weight(VisualLoss("dssim"), []) == 1
+
+
+def test_prior_refuses_a_visual_loss_that_it_cannot_use(tmp_path: Path) -> None:
+    def prior(**settings: object) -> DeepImagePrior:
+        return DeepImagePrior(scale=2, downsampling=Downsampling("box"), steps=1, **settings)  # type: ignore[arg-type]
+
+    with pytest.raises(ValueError, match=r"^visual: expected mse_v where w is 0, as for DIP, got dssim$"):
+        prior(visual="dssim", w=0.0)
+    with pytest.raises(ValueError, match=r"^visual: expected one of mse_v, dssim, lpips, got 'ssim'$"):
+        prior(visual="ssim")
+    absent = tmp_path / "none.pth"
+    with pytest.raises(ValueError, match=rf"^visual: lpips needs AlexNet's weights: expected a file, got {absent} "):
+        prior(visual="lpips", lpips_trunk=absent)
+    with pytest.raises(ValueError, match=r"^visual: dssim expects maps of at least 7 x 7 pixels, got 5 x 5$"):
+        prior(visual="dssim").module(_sample(10))
+
+
+def test_lpips_without_its_weights_is_one_line_that_says_what_to_do(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"set metrics\.lpips_trunk=FILE or") as caught:
+        make_visual_loss("lpips", tmp_path / "none.pth")
+    assert "\n" not in str(caught.value)
+    damaged = tmp_path / "damaged.pth"
+    damaged.write_bytes(b"not weights")
+    with pytest.raises(ValueError, match=r"^visual: lpips needs AlexNet's weights: .*damaged\.pth"):
+        make_visual_loss("lpips", damaged)
+    with pytest.raises(ValueError, match=r"^visual: expected a network for lpips, got none$"):
+        VisualLoss("lpips")
+
+
+def test_training_refuses_a_visual_loss_that_it_cannot_use(tmp_path: Path) -> None:
+    def refused(model: dict[str, object], visual: str, patch: int = 96) -> str:
+        settings = TrainConfig(model={"name": "msg", "depth_loss": "mse", **model})
+        settings.loss.visual, settings.trainer.patch = visual, patch
+        settings.metrics.lpips_trunk = str(tmp_path / "none.pth")
+        with pytest.raises(ConfigError) as caught:
+            _module(settings, None, None, None)  # type: ignore[arg-type]
+        return str(caught.value)
+
+    assert refused({"visual": False}, "dssim") == (
+        "loss.visual: model=msg has no visual loss, which model.visual=true adds; leave it out"
+    )
+    assert refused({"visual": True}, "ssim") == "loss.visual: expected one of mse_v, dssim, lpips, got 'ssim'"
+    assert refused({"visual": True}, "lpips").startswith("loss.visual: lpips needs AlexNet's weights: expected a file")
+    message = refused({"visual": True}, "dssim", patch=6)
+    assert message == "loss.visual: dssim expects maps of at least 7 x 7 pixels, got 6 x 6"
