@@ -248,6 +248,17 @@ def test_manual_route_names_the_files_places_and_checks_them(root, capsys):
     assert in_process(capsys, "data", "verify", "tofmark")[0] == 2
 
 
+def test_manual_route_takes_photos_in_any_folder(root, capsys):
+    for name, content in (("20200509112638_RGB.jpg", b"\xff\xd8\xff\xe0"), ("20200509112638_HR_gt.png", PNG)):
+        path = root / "rgbdd/portraits/portraits_test/20200509112638" / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(content)
+    code, lines, errors = in_process(capsys, "data", "verify", "rgbdd")
+    assert (code, errors, lines[-1]) == (0, [], "rgbdd: complete, as recorded")
+    path.with_name("20200509112638_RGB.jpg").write_bytes(b"GIF89a")
+    assert "expected a .jpg file" in in_process(capsys, "data", "verify", "rgbdd")[2][0]
+
+
 def test_locations_of_the_datasets_are_printed(root, capsys):
     code, lines, _ = in_process(capsys, "data", "where")
     assert (code, lines[0]) == (0, str(root))

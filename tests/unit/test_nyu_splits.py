@@ -48,7 +48,7 @@ def test_splits_of_the_labelled_file_are_whole_frames_with_filled_depth(labelled
     assert (test.evaluation, train.evaluation, whole.evaluation) == (True, False, True)
     scene = test.load("1001")
     assert (scene.camera, scene.depth.unique().tolist(), tuple(scene.depth.shape)) == (CAMERA, [2.0], (1, 480, 640))
-    assert tuple(whole.load("1001").depth.shape) == (1, 512, 512)
+    assert tuple(NYU(labelled, size=None).load("1001").depth.shape) == (1, 427, 561)
 
 
 def test_files_are_named_as_the_frames_of_the_labelled_file(tmp_path):

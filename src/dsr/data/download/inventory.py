@@ -12,6 +12,7 @@ from dsr.utils.progress import Progress
 
 _BEGINNINGS: Mapping[str, tuple[bytes, ...]] = {
     ".gz": (b"\x1f\x8b",),
+    ".jpg": (b"\xff\xd8\xff",),
     ".mat": (b"MATLAB", b"\x89HDF"),
     ".npy": (b"\x93NUMPY",),
     ".pfm": (b"Pf", b"PF"),
