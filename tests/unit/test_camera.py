@@ -192,3 +192,10 @@ def test_turned_camera_has_the_turned_rays(turns: int) -> None:
     assert (turned.height, turned.width) == tuple(expected.shape[-2:])
     torch.testing.assert_close(turned.rays(), expected, rtol=0, atol=1e-12)
     assert (turned.baseline, turned.doffs) == (0.1, 0.5)
+
+
+def test_camera_of_a_field_of_view_spans_it_between_the_outer_edges() -> None:
+    camera = Camera.from_fov(512, 384, 60.0)
+    left, right = ((edge - camera.cx) / camera.fx for edge in (-0.5, 511.5))
+    assert math.degrees(math.atan(right) - math.atan(left)) == pytest.approx(60)
+    assert (camera.fy, camera.cy) == (camera.fx, 191.5)
