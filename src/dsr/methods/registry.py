@@ -18,6 +18,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from dsr.methods.base import Upsampler
 from dsr.methods.networks.base import DisparityNetwork
+from dsr.methods.networks.peers.files import nearest_scale
 from dsr.methods.networks.trained import NETWORKS, packaged_names, packaged_weights
 from dsr.methods.networks.weight_files import is_dsr_weights, network_name, read_header
 from dsr.utils.builder import ConfigError, build, load_target, takes
@@ -97,21 +98,23 @@ def find_weights(node: Mapping[str, Any], scale: int, given: Path | None = None)
 
     Args:
         node: the method's; ``weights`` names its file, or ``weights_packaged`` one that comes with dsr.
-        scale: the upsampling factor, for the message.
-        given: a file of weights, or a directory in which ``weights_file`` is looked for; None for the node's own.
+        scale: the upsampling factor.
+        given: a file of weights, or a directory in which ``weights_file`` or one of ``weights_files`` is looked for;
+            None for the node's own.
 
     Raises:
         ConfigError: there is no such file.
 
     """
-    name, file = node["name"], node.get("weights_file")
     if given is None and node.get("weights") is not None:
         given = Path(str(node["weights"])).expanduser()
-    if given is None or (given.is_dir() and file is None):
+    files = _files_for(node, scale)
+    if given is None or (given.is_dir() and not files):
         return _packaged(node, scale)
     if given.is_dir():
-        given = given / str(file)
+        given = next((given / file for file in files if (given / file).is_file()), given / files[0])
     if not given.is_file():
+        name = node["name"]
         raise ConfigError(f"weights: expected a file of weights for method={name}, got {given} (no such file)")
     return given
 
@@ -120,6 +123,8 @@ def has_weights(node: Mapping[str, Any], scale: int) -> bool:
     """Return whether the weights that a method's node names are there, for that scale."""
     if node.get("weights") is not None:
         path = Path(str(node["weights"])).expanduser()
+        if path.is_dir():
+            return any((path / file).is_file() for file in _files_for(node, scale))
         return path.is_file() and (not is_dsr_weights(path) or read_header(path)["arguments"].get("scale") == scale)
     packaged = node.get("weights_packaged")
     return packaged is not None and packaged_weights(str(packaged)) is not None
@@ -140,12 +145,21 @@ def _packaged(node: Mapping[str, Any], scale: int) -> Path:
     found = None if packaged is None else packaged_weights(str(packaged))
     if found is not None:
         return found
-    file, source = node.get("weights_file"), node.get("weights_source")
-    published = f", or a directory with {file} (from {source})" if file else ""
-    raise ConfigError(
-        f"weights: dsr comes with {', '.join(packaged_names())}; method={node['name']} at scale "
-        f"{scale} needs weights=FILE{published}"
-    )
+    files, source = _files_for(node, scale), node.get("weights_source")
+    published = f", or a directory with {files[0]} (from {source})" if files else ""
+    needs = f"method={node['name']} at scale {scale} needs weights=FILE{published}"
+    if "weights_files" in node:
+        raise ConfigError(f"weights: {needs}; its authors publish them, dsr does not come with them")
+    raise ConfigError(f"weights: dsr comes with {', '.join(packaged_names())}; {needs}")
+
+
+def _files_for(node: Mapping[str, Any], scale: float) -> list[str]:
+    """Return the names of published files with the weights for a scale, in order of preference."""
+    files = node.get("weights_files")
+    if files is None:
+        return [str(node["weights_file"])] if node.get("weights_file") else []
+    trained = nearest_scale(files, scale)
+    return [str(file) for file, factor in files.items() if factor == trained]
 
 
 def _networks(node: Mapping[str, Any], directories: Sequence[Path]) -> dict[str, type[DisparityNetwork]]:

@@ -16,7 +16,10 @@ from pathlib import Path
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
 _MISSING = "???"
-_ABOUT = ("name", "label", "target", "weights_packaged", "weights_file", "weights_source", "depth_loss", "visual")
+_ABOUT = (
+    "name", "label", "target", "weights_packaged", "weights_file", "weights_files", "weights_source", "depth_loss",
+    "visual",
+)  # fmt: skip
 
 
 class ConfigError(ValueError):

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import abc
 import copy
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import ClassVar, Literal, get_args
 
 import torch
@@ -27,6 +27,8 @@ from dsr.sample import DepthSample
 from dsr.utils.progress import Steps
 
 Range = Literal["measured", "truth"]
+IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
+"""Mean and standard deviation of red, green and blue in ImageNet, by which some networks normalise the photo."""
 _OVERLAP = 16
 """Overlap of neighbouring tiles in pixels."""
 
@@ -34,8 +36,12 @@ _OVERLAP = 16
 class PeerNetwork(nn.Module, abc.ABC):
     """A published network that refines an enlarged depth map, guided by a photo.
 
+    Args:
+        scale: the factor that its weights were trained for.
+
     Attributes:
         title: the name in messages.
+        checksums: the factors of its authors' files by the first 16 digits of their SHA-256.
         multiple: the number that divides the sizes of its images.
         receptive_field_radius: in pixels of the photo; None where an output depends on the whole image. Large images
             are processed in tiles if there is one.
@@ -44,9 +50,14 @@ class PeerNetwork(nn.Module, abc.ABC):
     """
 
     title: ClassVar[str]
+    checksums: ClassVar[Mapping[str, float]]
     multiple: ClassVar[int] = 1
     receptive_field_radius: ClassVar[int | None] = None
     cost: ClassVar[Cost]
+
+    def __init__(self, scale: float) -> None:
+        super().__init__()
+        self.scale = scale
 
     @abc.abstractmethod
     def enlarge(self, values_lr: Tensor, size: tuple[int, int]) -> Tensor:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import torch
@@ -15,8 +16,13 @@ _PARALLEL = "module."
 _NORM_PARTS = ("weight", "bias", "running_mean", "running_var")
 
 
-def load_peer(path: Path, network: type[PeerNetwork]) -> PeerNetwork:
+def load_peer(path: Path, network: type[PeerNetwork], scale: float) -> PeerNetwork:
     """Load a network of its authors' file, in float32 on the CPU.
+
+    Args:
+        path: path of the file.
+        network: the network's class.
+        scale: the factor that the weights were trained for.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -25,9 +31,20 @@ def load_peer(path: Path, network: type[PeerNetwork]) -> PeerNetwork:
     """
     tensors = network.convert(read_tensors(path))
     with torch.random.fork_rng(devices=[]):  # the initial weights draw random numbers
-        net = network()
+        net = network(scale)
     load_parameters(net, tensors, path, network.title)
     return net
+
+
+def nearest_scale(files: Mapping[str, float], scale: float) -> float:
+    """Return the smallest trained factor that reaches a factor, or the largest.
+
+    Args:
+        files: the trained factors of files of weights by their names.
+        scale: the upsampling factor.
+
+    """
+    return min((trained for trained in files.values() if trained >= scale), default=max(files.values()))
 
 
 def read_tensors(path: Path) -> dict[str, Tensor]:

@@ -1,0 +1,70 @@
+"""Methods that run a published network of the field."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from types import MappingProxyType
+
+import torch
+
+from dsr.geometry.camera import RangeType
+from dsr.methods.networks.base import Precision
+from dsr.methods.networks.peers.base import PeerNetwork, PeerUpsampler, Range
+from dsr.methods.networks.peers.fdkn import FDKN
+from dsr.methods.networks.peers.files import load_peer, nearest_scale
+from dsr.methods.networks.peers.pgsr import PGSR
+from dsr.methods.networks.peers.svlrm import SVLRM
+from dsr.utils.hashing import file_hash
+
+PEERS: MappingProxyType[str, type[PeerNetwork]] = MappingProxyType({"fdkn": FDKN, "pgsr": PGSR, "svlrm": SVLRM})
+
+
+def build_peer(
+    peer: str,
+    weights: Path,
+    scale: float,
+    weights_files: Mapping[str, float],
+    range_type: RangeType = "disparity",
+    range: Range = "measured",  # noqa: A002 - the key's name
+    precision: Precision = "float32",
+    device: torch.device | str = "cpu",
+) -> PeerUpsampler:
+    """Build a method from a file of weights that the network's authors published.
+
+    A file at one of the network's own factors must be for that factor. At any other factor, any of its files may be
+    taken.
+
+    Args:
+        peer: name of the network, a key of ``PEERS``.
+        weights: the file.
+        scale: the upsampling factor of the run.
+        weights_files: the trained factors of the authors' files by their names.
+        range_type: see :class:`~dsr.methods.networks.peers.base.PeerUpsampler`.
+        range: its ``value_range``.
+        precision: dtype of the convolutions.
+        device: device of the computations.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: the file is damaged or of another network or scale, or a value is not supported.
+
+    """
+    if peer not in PEERS:
+        raise ValueError(f"peer: expected one of {', '.join(PEERS)}, got {peer!r}")
+    network, weights = PEERS[peer], Path(weights)
+    if not weights.is_file():
+        raise FileNotFoundError(f"{weights}: no such weights file")
+    trained = _trained_scale(weights, network, weights_files)
+    if trained is not None and scale != trained and scale in weights_files.values():
+        raise ValueError(f"{weights}: weights are for scale {trained:g}, the run is at scale {scale:g}")
+    net = load_peer(weights, network, trained or nearest_scale(weights_files, scale))
+    return PeerUpsampler(net, range_type, range, precision, device)
+
+
+def _trained_scale(weights: Path, network: type[PeerNetwork], files: Mapping[str, float]) -> float | None:
+    """Return the factor that a file's weights were trained for: by its content, else its name; None if unknown."""
+    known = network.checksums.get(file_hash(weights)[:16])
+    if known is not None:
+        return known
+    return next((factor for name, factor in files.items() if weights.as_posix().endswith(f"/{name}")), None)

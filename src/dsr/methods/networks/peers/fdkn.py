@@ -1,0 +1,116 @@
+"""FDKN: the fast deformable kernel network.
+
+Kim, Ponce, Ham, *Deformable Kernel Networks for Joint Image Filtering*, IJCV 2021 (arXiv 1910.08373). For each pixel
+the network estimates nine positions around it and their weights, from the enlarged map and the photo, and adds the
+weighted sum of the map there. Weights: github.com/cvlab-yonsei/dkn (GPL-3).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from itertools import pairwise
+from types import MappingProxyType
+from typing import ClassVar
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from dsr.methods.base import Cost
+from dsr.methods.networks.peers.base import PeerNetwork, upsample_pillow
+from dsr.methods.networks.peers.files import fold_batch_norm
+
+_FACTOR, _TAPS, _RADIUS = 4, 3, 7
+_GREY = (0.114, 0.587, 0.299)
+"""Weights of red, green and blue: those of ITU-R BT.601 in reverse, as the authors' code applies them to RGB."""
+_WIDTHS = (16, 32, 32, 64, 64, 128, 128)
+
+
+class FDKN(PeerNetwork):
+    """The network of :mod:`dsr.methods.networks.peers.fdkn`."""
+
+    title: ClassVar[str] = "FDKN"
+    checksums: ClassVar[Mapping[str, float]] = MappingProxyType({"036ec8f27eec624c": 8})
+    multiple: ClassVar[int] = _FACTOR
+    receptive_field_radius: ClassVar[int | None] = _FACTOR * len(_WIDTHS)
+    cost: ClassVar[Cost] = Cost(1000, 10)
+
+    def __init__(self, scale: float) -> None:
+        super().__init__(scale)
+        self.rgb_kernel, self.depth_kernel = _Kernel(), _Kernel()
+
+    @classmethod
+    def convert(cls, tensors: dict[str, Tensor]) -> dict[str, Tensor]:
+        """Merge the batch normalisations into the convolutions before them."""
+        for branch in ("ImageKernel", "DepthKernel"):
+            for index in (1, 3, 5):
+                fold_batch_norm(tensors, f"{branch}.conv{index}", f"{branch}.conv{index}_bn")
+        names = {"ImageKernel.": "rgb_kernel.", "DepthKernel.": "depth_kernel."}
+        names |= {f"conv{index}.": f"layers.{index - 1}." for index in range(1, len(_WIDTHS))}
+        names |= {"conv_weight.": "weights.", "conv_offset.": "offsets."}
+        return {_rename(name, names): value for name, value in tensors.items()}
+
+    def enlarge(self, values_lr: Tensor, size: tuple[int, int]) -> Tensor:
+        """Enlarge a map; see :func:`~dsr.methods.networks.peers.base.upsample_pillow`."""
+        return upsample_pillow(values_lr, size)
+
+    def forward(self, rgb: Tensor, values: Tensor) -> Tensor:
+        """Refine an enlarged map; see :meth:`PeerNetwork.forward`."""
+        grey = (rgb * torch.tensor(_GREY, dtype=rgb.dtype, device=rgb.device)[:, None, None]).sum(dim=1, keepdim=True)
+        branches = zip(self.rgb_kernel(grey), self.depth_kernel(values), strict=True)
+        weights, offsets = (functional.pixel_shuffle(rgb * depth, _FACTOR).float() for rgb, depth in branches)
+        return values + _sample(values, weights - weights.mean(dim=1, keepdim=True), offsets)
+
+
+class _Kernel(nn.Module):
+    """The branch of one image, (B, 1, H, W): weights and offsets for each block of 4 x 4 pixels."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.layers = nn.ModuleList(nn.Conv2d(before, after, 3, padding=1) for before, after in pairwise(_WIDTHS))
+        self.weights = nn.Conv2d(_WIDTHS[-1], _TAPS**2 * _FACTOR**2, 1)
+        self.offsets = nn.Conv2d(_WIDTHS[-1], 2 * _TAPS**2 * _FACTOR**2, 1)
+
+    def forward(self, image: Tensor) -> tuple[Tensor, Tensor]:
+        x = functional.pixel_unshuffle(image, _FACTOR)
+        for layer in self.layers:
+            x = functional.relu_(layer(x))
+        return self.weights(x).sigmoid_(), self.offsets(x)
+
+
+def _sample(values: Tensor, weights: Tensor, offsets: Tensor) -> Tensor:
+    """Return the weighted sum of a map at nine positions around each pixel.
+
+    Each pixel sees a window of 15 x 15 pixels, interpolated bilinearly; outside of it and of the map, values are 0.
+
+    Args:
+        values: (B, 1, H, W) map.
+        weights: (B, 9, H, W) weights.
+        offsets: (B, 18, H, W): across and down in pixels, of each position from its place in a 3 x 3 grid.
+
+    """
+    height, width = values.shape[-2:]
+    rows = torch.arange(height, device=values.device, dtype=values.dtype)[:, None]
+    columns = torch.arange(width, device=values.device, dtype=values.dtype)
+    total = torch.zeros_like(values)
+    for tap in range(_TAPS**2):
+        # The grid's first pixel is the window's middle one, less half a pixel, and its rows lie across.
+        across, down = (offsets[:, 2 * tap + axis] + place - 0.5 for axis, place in enumerate(divmod(tap, _TAPS)))
+        inside = _fraction_inside(across) * _fraction_inside(down)
+        x, y = (each.clamp(-_RADIUS, _RADIUS) + start for each, start in ((across, columns), (down, rows)))
+        grid = torch.stack((2 * x / max(width - 1, 1) - 1, 2 * y / max(height - 1, 1) - 1), dim=-1)
+        sampled = functional.grid_sample(values, grid, align_corners=True)
+        total += sampled * (weights[:, tap] * inside)[:, None]
+    return total
+
+
+def _fraction_inside(displacement: Tensor) -> Tensor:
+    """Return the weight that interpolation along an axis gives to pixels of the window."""
+    return (_RADIUS + 1 - displacement.abs()).clamp(0, 1)
+
+
+def _rename(name: str, names: Mapping[str, str]) -> str:
+    """Return a name with its parts replaced."""
+    for theirs, ours in names.items():
+        name = name.replace(theirs, ours)
+    return name
