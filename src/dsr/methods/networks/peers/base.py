@@ -27,8 +27,6 @@ from dsr.sample import DepthSample
 from dsr.utils.progress import Steps
 
 Range = Literal["measured", "truth"]
-IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
-"""Mean and standard deviation of red, green and blue in ImageNet, by which some networks normalise the photo."""
 _OVERLAP = 16
 """Overlap of neighbouring tiles in pixels."""
 

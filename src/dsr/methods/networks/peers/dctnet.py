@@ -11,7 +11,8 @@ the left-hand side the eigenvalues of the Laplacian of four neighbours.
 from __future__ import annotations
 
 import math
-import re
+from collections.abc import Mapping
+from types import MappingProxyType
 from typing import ClassVar
 
 import torch
@@ -22,6 +23,7 @@ from dsr.methods.base import Cost
 from dsr.methods.networks.maps import normalise_imagenet
 from dsr.methods.networks.peers.base import PeerNetwork, upsample_pillow
 from dsr.methods.networks.peers.dct import dct2, idct2
+from dsr.methods.networks.peers.files import rename
 
 FEATURES = 64
 _LAYERS = 4
@@ -107,12 +109,15 @@ class DCTNet(PeerNetwork):
     memory per pixel.
     """
 
-    title = "DCTNet"
+    title: ClassVar[str] = "DCTNet"
+    checksums: ClassVar[Mapping[str, float]] = MappingProxyType(
+        {"383745e7223d0b2c": 4, "2526a628d307b79c": 8, "b9a75d3c1404c01d": 16}
+    )
     cost: ClassVar[Cost] = Cost(memory=2000, seconds=20)
 
-    def __init__(self) -> None:
+    def __init__(self, scale: float) -> None:
         """Make the layers."""
-        super().__init__()
+        super().__init__(scale)
         self.lambd = nn.Parameter(torch.zeros(1, FEATURES, 1, 1))
         self.depth_head = nn.Conv2d(1, FEATURES, 3, padding=1)
         self.rgb_head = nn.Conv2d(3, FEATURES, 3, padding=1)
@@ -130,7 +135,7 @@ class DCTNet(PeerNetwork):
     @classmethod
     def convert(cls, tensors: dict[str, Tensor]) -> dict[str, Tensor]:
         """Return the parameters by their names here, without the one layer that the authors do not use."""
-        return {_rename(name): value for name, value in tensors.items() if not name.startswith(_UNUSED)}
+        return rename({name: value for name, value in tensors.items() if not name.startswith(_UNUSED)}, _RENAMED)
 
     def enlarge(self, values_lr: Tensor, size: tuple[int, int]) -> Tensor:
         """Enlarge as Pillow's bicubic filter does."""
@@ -189,10 +194,3 @@ def _laplacian_eigenvalues(height: int, width: int, like: Tensor) -> Tensor:
         for size in (height, width)
     )
     return (2 * (rows[:, None] + columns - 2)).to(like)
-
-
-def _rename(name: str) -> str:
-    """Return the name here of a tensor of the authors' files."""
-    for pattern, replacement in _RENAMED.items():
-        name = re.sub(pattern, replacement, name)
-    return name

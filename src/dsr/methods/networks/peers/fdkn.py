@@ -18,12 +18,20 @@ from torch.nn import functional
 
 from dsr.methods.base import Cost
 from dsr.methods.networks.peers.base import PeerNetwork, upsample_pillow
-from dsr.methods.networks.peers.files import fold_batch_norm
+from dsr.methods.networks.peers.files import fold_batch_norm, rename
 
 _FACTOR, _TAPS, _RADIUS = 4, 3, 7
 _GREY = (0.114, 0.587, 0.299)
 """Weights of red, green and blue: those of ITU-R BT.601 in reverse, as the authors' code applies them to RGB."""
 _WIDTHS = (16, 32, 32, 64, 64, 128, 128)
+_NAMES = {
+    r"^ImageKernel\.": "rgb_kernel.",
+    r"^DepthKernel\.": "depth_kernel.",
+    **{rf"\.conv{index + 1}\.": f".layers.{index}." for index in range(len(_WIDTHS) - 1)},
+    r"\.conv_weight\.": ".weights.",
+    r"\.conv_offset\.": ".offsets.",
+}
+"""Regular expressions of the authors' names, and their replacements here."""
 
 
 class FDKN(PeerNetwork):
@@ -45,10 +53,7 @@ class FDKN(PeerNetwork):
         for branch in ("ImageKernel", "DepthKernel"):
             for index in (1, 3, 5):
                 fold_batch_norm(tensors, f"{branch}.conv{index}", f"{branch}.conv{index}_bn")
-        names = {"ImageKernel.": "rgb_kernel.", "DepthKernel.": "depth_kernel."}
-        names |= {f"conv{index}.": f"layers.{index - 1}." for index in range(1, len(_WIDTHS))}
-        names |= {"conv_weight.": "weights.", "conv_offset.": "offsets."}
-        return {_rename(name, names): value for name, value in tensors.items()}
+        return rename(tensors, _NAMES)
 
     def enlarge(self, values_lr: Tensor, size: tuple[int, int]) -> Tensor:
         """Enlarge a map; see :func:`~dsr.methods.networks.peers.base.upsample_pillow`."""
@@ -56,7 +61,7 @@ class FDKN(PeerNetwork):
 
     def forward(self, rgb: Tensor, values: Tensor) -> Tensor:
         """Refine an enlarged map; see :meth:`PeerNetwork.forward`."""
-        grey = (rgb * torch.tensor(_GREY, dtype=rgb.dtype, device=rgb.device)[:, None, None]).sum(dim=1, keepdim=True)
+        grey = (rgb * rgb.new_tensor(_GREY).view(3, 1, 1)).sum(dim=1, keepdim=True)
         branches = zip(self.rgb_kernel(grey), self.depth_kernel(values), strict=True)
         weights, offsets = (functional.pixel_shuffle(rgb * depth, _FACTOR).float() for rgb, depth in branches)
         return values + _sample(values, weights - weights.mean(dim=1, keepdim=True), offsets)
@@ -107,10 +112,3 @@ def _sample(values: Tensor, weights: Tensor, offsets: Tensor) -> Tensor:
 def _fraction_inside(displacement: Tensor) -> Tensor:
     """Return the weight that interpolation along an axis gives to pixels of the window."""
     return (_RADIUS + 1 - displacement.abs()).clamp(0, 1)
-
-
-def _rename(name: str, names: Mapping[str, str]) -> str:
-    """Return a name with its parts replaced."""
-    for theirs, ours in names.items():
-        name = name.replace(theirs, ours)
-    return name

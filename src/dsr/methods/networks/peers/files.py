@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -60,6 +61,22 @@ def read_tensors(path: Path) -> dict[str, Tensor]:
         keys = ", ".join(map(str, list(content)[:4])) if isinstance(content, dict) else type(content).__name__
         raise ValueError(f"{path}: expected a network's tensors by name, got {keys}")
     return {str(name).removeprefix(_PARALLEL): value for name, value in content.items()}
+
+
+def rename(tensors: Mapping[str, Tensor], names: Mapping[str, str]) -> dict[str, Tensor]:
+    """Return tensors by new names.
+
+    Args:
+        tensors: tensors by name.
+        names: replacements of regular expressions, applied one after the other to every name.
+
+    """
+    renamed = {}
+    for name, value in tensors.items():
+        for pattern, replacement in names.items():
+            name = re.sub(pattern, replacement, name)  # noqa: PLW2901 - each replaces its part
+        renamed[name] = value
+    return renamed
 
 
 def fold_batch_norm(tensors: dict[str, Tensor], conv: str, norm: str, eps: float = 1e-5) -> None:

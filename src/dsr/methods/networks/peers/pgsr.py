@@ -19,8 +19,9 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from dsr.methods.base import Cost
-from dsr.methods.networks.peers.base import IMAGENET_MEAN, IMAGENET_STD, PeerNetwork
-from dsr.methods.networks.peers.files import fold_batch_norm
+from dsr.methods.networks.maps import normalise_imagenet
+from dsr.methods.networks.peers.base import PeerNetwork
+from dsr.methods.networks.peers.files import fold_batch_norm, rename
 
 _FACTOR, _WIDTH, _SHARED, _LAST = 4, 32, 16, 64
 _ROUNDS, _GROUPS, _BLOCKS, _SQUEEZED = 3, 2, 2, 2
@@ -33,36 +34,36 @@ _STRIP = 2**18
 """Number of the photo's pixels that the last layers compute at a time."""
 _HALO = 2
 """Rows, at a quarter of the resolution, that a row of the last layers depends on at either side."""
-_NAMES = (
-    (r"\.body\.(\d)\.body\.0\.0\.", r".blocks.\1.first."),
-    (r"\.body\.(\d)\.body\.2\.0\.", r".blocks.\1.second."),
-    (r"\.body\.(\d)\.body\.3\.conv_du\.0\.", r".blocks.\1.squeeze."),
-    (r"\.body\.(\d)\.body\.3\.conv_du\.2\.", r".blocks.\1.excite."),
-    (rf"\.body\.{_BLOCKS}\.0\.", ".last."),
-    (r"^conv_(depth|rgb|shared)\.", r"stems.\1."),
-    (r"^feature_extraction_", "features."),
-    (r"^conv_(depth|rgb)_semi\.", r"merges.\1."),
-    (r"^conv_(depth|rgb)_mapping1\.", r"updates.\1."),
-    (r"^PAI_(\d)\.", r"interactions.\1."),
-    (r"^PGR\.", "reconstruction."),
-    (r"\.conv_offset\.", ".offset."),
-    (r"\.conv_parameterized_depth\.", ".planes."),
-    (r"\.conv_depth2Plane\.", ".depth_planes."),
-    (r"(offset|planes)\.3\.", r"\1.2."),
-    (r"\.conv_depth2feature\.", ".estimate."),
-    (r"\.conv_depthMapping\.", ".depth."),
-    (r"\.conv_fusion\.", ".fusion."),
-    (r"\.conv_MP\.", ".mutual."),
-    (r"\.depth_mapping\.body\.(\d)\.", r".depth.\1."),
-    (r"\.Q_(\d)\.", r".query.\1."),
-    (r"\.K_(\d)\.", r".key.\1."),
-    (r"\.V\.", ".value."),
-    (r"\.recon_trunk\.", ".trunk."),
-    (r"\.upconv(\d)\.", r".doublings.\1."),
-    (r"\.HRconv\.", ".smooth."),
-    (r"\.conv_last\.", ".last."),
-)
-"""Patterns of the authors' names and the names here."""
+_NAMES = {
+    r"\.body\.(\d)\.body\.0\.0\.": r".blocks.\1.first.",
+    r"\.body\.(\d)\.body\.2\.0\.": r".blocks.\1.second.",
+    r"\.body\.(\d)\.body\.3\.conv_du\.0\.": r".blocks.\1.squeeze.",
+    r"\.body\.(\d)\.body\.3\.conv_du\.2\.": r".blocks.\1.excite.",
+    rf"\.body\.{_BLOCKS}\.0\.": ".last.",
+    r"^conv_(depth|rgb|shared)\.": r"stems.\1.",
+    r"^feature_extraction_": "features.",
+    r"^conv_(depth|rgb)_semi\.": r"merges.\1.",
+    r"^conv_(depth|rgb)_mapping1\.": r"updates.\1.",
+    r"^PAI_(\d)\.": r"interactions.\1.",
+    r"^PGR\.": "reconstruction.",
+    r"\.conv_offset\.": ".offset.",
+    r"\.conv_parameterized_depth\.": ".planes.",
+    r"\.conv_depth2Plane\.": ".depth_planes.",
+    r"(offset|planes)\.3\.": r"\1.2.",
+    r"\.conv_depth2feature\.": ".estimate.",
+    r"\.conv_depthMapping\.": ".depth.",
+    r"\.conv_fusion\.": ".fusion.",
+    r"\.conv_MP\.": ".mutual.",
+    r"\.depth_mapping\.body\.(\d)\.": r".depth.\1.",
+    r"\.Q_(\d)\.": r".query.\1.",
+    r"\.K_(\d)\.": r".key.\1.",
+    r"\.V\.": ".value.",
+    r"\.recon_trunk\.": ".trunk.",
+    r"\.upconv(\d)\.": r".doublings.\1.",
+    r"\.HRconv\.": ".smooth.",
+    r"\.conv_last\.": ".last.",
+}
+"""Regular expressions of the authors' names, and their replacements here."""
 _UNUSED = re.compile(r"^(PAI_\d\.(upconv\d|fusion2Depth)|conv_(depth|rgb)_mapping[23])\.(weight|bias)$")
 """Tensors of the authors' file that serve the training, or nothing."""
 
@@ -98,7 +99,7 @@ class PGSR(PeerNetwork):
         heads = [f"PAI_{i}.conv_{kind}" for i in range(1, _ROUNDS + 1) for kind in ("offset", "parameterized_depth")]
         for head in (*heads, "PGR.conv_depth2Plane", "PGR.conv_parameterized_depth"):
             fold_batch_norm(tensors, f"{head}.0", f"{head}.1")
-        return {_rename(name): value for name, value in tensors.items() if not _UNUSED.match(name)}
+        return rename({name: value for name, value in tensors.items() if not _UNUSED.match(name)}, _NAMES)
 
     def enlarge(self, values_lr: Tensor, size: tuple[int, int]) -> Tensor:
         """Enlarge a map by cubic convolution with a = -0.75, edge pixels repeated."""
@@ -106,11 +107,7 @@ class PGSR(PeerNetwork):
 
     def forward(self, rgb: Tensor, values: Tensor) -> Tensor:
         """Refine an enlarged map; see :meth:`PeerNetwork.forward`."""
-        mean, std, weights = (
-            torch.tensor(each, dtype=rgb.dtype, device=rgb.device)[:, None, None]
-            for each in (IMAGENET_MEAN, IMAGENET_STD, _GREY)
-        )
-        grey = ((rgb - mean) / std * weights).sum(dim=1, keepdim=True)
+        grey = (normalise_imagenet(rgb) * rgb.new_tensor(_GREY).view(3, 1, 1)).sum(dim=1, keepdim=True)
         depth, photo = (functional.pixel_unshuffle(each, _FACTOR) for each in (values, grey))
         of_depth, of_photo = self._extract("shared", torch.cat((depth, photo))).chunk(2)
         depth = _apply(self.merges["depth"], self._extract("depth", depth), of_depth)
@@ -260,10 +257,3 @@ def _plane_coordinates(size: int, longest: int, like: Tensor) -> Tensor:
     """Return the coordinates of pixels along an axis, as the authors' code has them: nearly constant."""
     centred = torch.arange(size, dtype=like.dtype, device=like.device) - (size - 1) / 2
     return 2 * (centred / (longest * max(size - 1, 1)) - 0.5)
-
-
-def _rename(name: str) -> str:
-    """Return the name here of a tensor of the authors' file."""
-    for theirs, ours in _NAMES:
-        name = re.sub(theirs, ours, name)
-    return name

@@ -55,8 +55,7 @@ class SVLRM(PeerNetwork):
 
     def forward(self, rgb: Tensor, values: Tensor) -> Tensor:
         """Refine an enlarged map; see :meth:`PeerNetwork.forward`."""
-        weights = torch.tensor(_GREY, dtype=rgb.dtype, device=rgb.device)
-        grey = (rgb * weights[:, None, None]).sum(dim=1, keepdim=True)
+        grey = (rgb * rgb.new_tensor(_GREY).view(3, 1, 1)).sum(dim=1, keepdim=True)
         x = functional.leaky_relu(self.first_layer(torch.cat((values, grey), dim=1)), _SLOPE)
         for layer in self.feature_block.values():
             x = functional.leaky_relu(layer(x), _SLOPE)
