@@ -43,6 +43,8 @@ def identity_of(
 
     """
     kept = {key: value for key, value in config.items() if key not in _NOT_IDENTITY}
+    if isinstance(kept.get("method"), Mapping):
+        kept["method"] = {key: value for key, value in kept["method"].items() if key != "weights"}
     named = [str(node["target"]) for node in kept.values() if isinstance(node, Mapping) and "target" in node]
     outside = hash_outside_code([*named, *targets])
     more = {} if outside is None else {"outside_code": outside}

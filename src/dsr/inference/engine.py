@@ -71,7 +71,7 @@ class MethodChoice:
 
     def plan(self, size: tuple[int, int], size_lr: tuple[int, int], scale: int | None) -> Plan:
         """Return the plan for a photo and a depth map of these heights and widths."""
-        return plan(size, size_lr, scale, self.name, self.directories)
+        return plan(size, size_lr, scale, self.name, self.directories, self.settings)
 
 
 def check_settings(choice: MethodChoice) -> None:
@@ -83,7 +83,7 @@ def check_settings(choice: MethodChoice) -> None:
 
     """
     choice = replace(choice, name=CLEAN if choice.name == AUTO else choice.name)
-    choice.build(next(iter(read_ability(choice.name, choice.directories).steps), USUAL_SCALE))
+    choice.build(next(iter(read_ability(choice.name, choice.directories, choice.settings).steps), USUAL_SCALE))
 
 
 def upsample_depth(

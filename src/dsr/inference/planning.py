@@ -23,14 +23,15 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from dsr.degradation.scales import SCALES
 from dsr.methods.base import Cost
 from dsr.methods.classical.interpolation import Interpolation
 from dsr.methods.networks.base import TILE, UNTILED
+from dsr.methods.networks.peers.build import PEERS, build_peer
 from dsr.methods.networks.trained import build_trained
-from dsr.methods.registry import has_weights, read_method
+from dsr.methods.registry import find_weights, has_weights, read_method
 from dsr.utils.builder import load_target, takes, trait
 
 AUTO = "auto"
@@ -84,30 +85,34 @@ class Plan:
     text: str
 
 
-def read_ability(method: str, directories: Sequence[Path] = ()) -> Ability:
+def read_ability(method: str, directories: Sequence[Path] = (), settings: Mapping[str, Any] | None = None) -> Ability:
     """Read what a method of the registry can do.
 
     Args:
         method: its name.
         directories: the user's configuration directories.
+        settings: its arguments that differ from its file, by name.
 
     Raises:
         ValueError: there is no such method, or it has no weights for any factor.
 
     """
-    node = read_method(method, USUAL_SCALE, directories=directories)
+    node = read_method(method, USUAL_SCALE, settings, directories)
     target = load_target("method", node)
     if target is Interpolation:
         return Ability("interpolation", {})
     factors: tuple[int, ...] = SCALES
     if takes("method", node, "weights"):
-        factors = tuple(scale for scale in SCALES if has_weights(read_method(method, scale, None, directories), scale))
+        nodes = {scale: read_method(method, scale, settings, directories) for scale in SCALES}
+        factors = tuple(scale for scale in SCALES if has_weights(nodes[scale], scale))
         if not factors:
+            find_weights(node, USUAL_SCALE)  # its error says where to get them
             raise ValueError(f"method={method}: expected weights that it names, or that come with dsr; there are none")
     steps: dict[int, tuple[int, ...]] = {factor: (factor,) for factor in factors}
     if target is build_trained:
         return Ability("network", _with_second_step(steps))
-    return Ability("sample", steps, bool(trait("method", node, "optimises")), trait("method", node, "cost"))
+    cost = PEERS[node["peer"]].cost if target is build_peer else trait("method", node, "cost")
+    return Ability("sample", steps, bool(trait("method", node, "optimises")), cost)
 
 
 def _with_second_step(steps: dict[int, tuple[int, ...]]) -> dict[int, tuple[int, ...]]:
@@ -124,6 +129,7 @@ def plan(
     scale: int | None = None,
     method: str = "facets",
     directories: Sequence[Path] = (),
+    settings: Mapping[str, Any] | None = None,
 ) -> Plan:
     """Plan what :func:`dsr.inference.upsample_depth` does.
 
@@ -136,12 +142,13 @@ def plan(
         scale: the factor; None to choose it by the sizes, 4 if they are equal.
         method: its name in the registry.
         directories: the user's configuration directories.
+        settings: the method's arguments that differ from its file, by name.
 
     Raises:
         ValueError: no such method, a scale that it has no weights for, or sizes that do not fit together.
 
     """
-    ability = read_ability(method, directories)
+    ability = read_ability(method, directories, settings)
     ratio = _ratio(photo_size, depth_size)
     own = ratio <= OWN_SIZE
     chosen = _scale(scale, USUAL_SCALE if own else ratio, method, ability)

@@ -139,7 +139,7 @@ def target_paths(node: Mapping[str, Any], directories: Sequence[Path] = ()) -> I
         yield network
 
 
-def _packaged(node: Mapping[str, Any], scale: int) -> Path:
+def _packaged(node: Mapping[str, Any], scale: float) -> Path:
     """Return the file of the weights that come with dsr."""
     packaged = node.get("weights_packaged")
     found = None if packaged is None else packaged_weights(str(packaged))

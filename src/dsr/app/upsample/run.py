@@ -162,7 +162,8 @@ def _one(
     size_lr = (picture.depth_lr.shape[-2], picture.depth_lr.shape[-1])
     method, suits = _method(picture, request)
     picture = replace(picture, assumptions=(*picture.assumptions, *suits))
-    planned = plan((picture.camera.height, picture.camera.width), size_lr, request.scale, method, request.directories)
+    size = (picture.camera.height, picture.camera.width)
+    planned = plan(size, size_lr, request.scale, method, request.directories, request.settings)
     reporter.facts(picture.assumptions)
     if request.dry_run:
         reporter.say(f"{pair.name}: {planned.text} -> {target}")
