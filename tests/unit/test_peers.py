@@ -1,0 +1,312 @@
+"""What all published networks of the field share: how they are fed, and how their authors' files are read."""
+
+from __future__ import annotations
+
+import os
+import pickle
+from collections.abc import Mapping
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from torch import Tensor, nn
+
+from dsr.geometry.camera import Camera, from_range
+from dsr.methods.base import Cost
+from dsr.methods.networks.inpainting import inpaint
+from dsr.methods.networks.peers.base import PeerNetwork, PeerUpsampler, upsample_pillow
+from dsr.methods.networks.peers.build import PEERS, build_peer
+from dsr.methods.networks.peers.files import fold_batch_norm, load_peer, nearest_scale
+from dsr.methods.networks.peers.svlrm import SVLRM
+from dsr.methods.registry import find_weights, has_weights, read_method
+from dsr.sample import DepthSample
+from dsr.utils.builder import ConfigError
+from dsr.utils.hashing import file_hash
+
+FILES = {"SVLRM_X4.pth": 4, "SVLRM_X8.pth": 8, "X8/model.pth": 8}
+
+
+class Enlarged(PeerNetwork):
+    """Returns its enlarged map."""
+
+    title = "Enlarged"
+    multiple: ClassVar[int] = 4
+    cost: ClassVar[Cost] = Cost(1, 1)
+
+    def __init__(self, scale: float = 4) -> None:
+        super().__init__(scale)
+        self.seen: list[Tensor] = []
+
+    def enlarge(self, values_lr: Tensor, size: tuple[int, int]) -> Tensor:
+        return upsample_pillow(values_lr, size)
+
+    def forward(self, rgb: Tensor, values: Tensor) -> Tensor:
+        assert not any(n % self.multiple for n in values.shape[-2:])
+        assert rgb.shape[-2:] == values.shape[-2:]
+        self.seen.append(values)
+        return values
+
+
+class Smoothed(Enlarged):
+    """Two convolutions, which need a neighbourhood of four pixels."""
+
+    receptive_field_radius: ClassVar[int | None] = 4
+
+    def __init__(self, scale: float = 4) -> None:
+        super().__init__(scale)
+        torch.manual_seed(0)
+        self.layers = nn.Sequential(nn.Conv2d(4, 8, 5, padding=2), nn.ReLU(), nn.Conv2d(8, 1, 5, padding=2))
+
+    def forward(self, rgb: Tensor, values: Tensor) -> Tensor:
+        return values + self.layers(torch.cat((rgb, values), dim=1))
+
+
+def _sample(size_lr: tuple[int, int] = (6, 9), scale: float = 4, doffs: float = 0.0) -> DepthSample:
+    """Return a sample whose true disparity goes beyond the low-resolution one."""
+    generator = torch.Generator().manual_seed(3)
+    height, width = (round(scale * n) for n in size_lr)
+    camera = Camera(width, height, 600.0, 600.0, 3.0, 4.0, baseline=0.2, doffs=doffs)
+    camera_lr = camera.rescale(size_lr[1], size_lr[0])
+    disparity_lr = 20 + 5 * torch.rand((1, *size_lr), generator=generator, dtype=torch.float64)
+    disparity = torch.linspace(10, 40, height * width, dtype=torch.float64).view(1, height, width)
+    depth_lr = from_range(disparity_lr / (width / size_lr[1]), camera_lr, "disparity")
+    rgb = torch.rand((3, height, width), generator=generator)
+    return DepthSample(
+        "test", "scene", rgb, depth_lr, camera, camera_lr, scale, from_range(disparity, camera, "disparity")
+    )
+
+
+def _pillow(values: Tensor, size: tuple[int, int]) -> Tensor:
+    image = Image.fromarray(values.numpy().astype(np.float32))
+    return torch.from_numpy(np.array(image.resize((size[1], size[0]), Image.Resampling.BICUBIC))).double()
+
+
+@pytest.mark.parametrize(("size_lr", "scale"), [((6, 9), 4), ((9, 12), 8 / 3), ((5, 7), 3), ((10, 11), 1)])
+@pytest.mark.parametrize("range_type", ["disparity", "orthogonal"])
+def test_map_of_any_ratio_is_fed_in_its_range_type(size_lr, scale, range_type) -> None:
+    sample = _sample(size_lr, scale, doffs=3.0)
+    depth = PeerUpsampler(Enlarged(), range_type)(sample)
+    size = (sample.camera.height, sample.camera.width)
+    values_lr = sample.disparity_lr() if range_type == "disparity" else sample.depth_lr
+    expected = from_range(_pillow(values_lr[0], size)[None], sample.camera, range_type)
+    assert depth.dtype == torch.float64
+    torch.testing.assert_close(depth, expected, rtol=1e-5, atol=0)
+
+
+def test_range_is_that_of_the_low_resolution_map() -> None:
+    upsampler, sample = PeerUpsampler(Enlarged()), _sample(scale=1)
+    upsampler(sample)
+    [values] = upsampler.net.seen
+    assert (float(values.min()), float(values.max())) == pytest.approx((0, 1), abs=1e-6)
+    assert upsampler.flag == ""
+
+
+def test_true_range_is_flagged_and_needs_the_truth() -> None:
+    upsampler, sample = PeerUpsampler(Enlarged(), value_range="truth"), _sample(scale=1)
+    depth = upsampler(sample)
+    assert upsampler.flag == "true-range"
+    expected = (sample.disparity_lr() - 10) / 30
+    torch.testing.assert_close(upsampler.net.seen[0][0, :, :6, :9].double(), expected, rtol=0, atol=1e-6)
+    torch.testing.assert_close(depth, sample.depth_lr, rtol=1e-5, atol=0)
+    unknown = DepthSample("test", "scene", sample.rgb, sample.depth_lr, sample.camera, sample.camera_lr, 1)
+    with pytest.raises(ValueError, match="scene: range=truth expects a scene with a true depth map, there is none"):
+        upsampler(unknown)
+
+
+def test_only_the_true_range_reads_the_truth() -> None:
+    sample = _sample()
+    blind = DepthSample("test", "scene", sample.rgb, sample.depth_lr, sample.camera, sample.camera_lr, 4)
+    upsampler = PeerUpsampler(Smoothed())
+    assert torch.equal(upsampler(sample), upsampler(blind))
+
+
+def test_holes_are_inpainted_before_the_range_is_taken() -> None:
+    sample = _sample(scale=1)
+    holes = sample.depth_lr.clone()
+    holes[0, 2:4, 3:6] = torch.nan
+    pierced = DepthSample("test", "scene", sample.rgb, holes, sample.camera, sample.camera_lr, 1)
+    depth = PeerUpsampler(Enlarged())(pierced)
+    expected = from_range(inpaint(pierced.disparity_lr()[None])[0], sample.camera, "disparity")
+    torch.testing.assert_close(depth, expected, rtol=1e-5, atol=0)
+
+
+def test_constant_map_stays_constant() -> None:
+    sample = _sample()
+    flat = torch.full_like(sample.depth_lr, 2.5)
+    depth = PeerUpsampler(Enlarged())(DepthSample("t", "s", sample.rgb, flat, sample.camera, sample.camera_lr, 4))
+    torch.testing.assert_close(depth, torch.full_like(depth, 2.5))
+
+
+def test_tiles_change_rounding_errors_only() -> None:
+    sample, steps = _sample((17, 23), 4), []
+    whole = PeerUpsampler(Smoothed())(sample)
+    tiled = PeerUpsampler(Smoothed(), tile=24)(sample, lambda *step: steps.append(step))
+    torch.testing.assert_close(tiled, whole, rtol=1e-5, atol=0)
+    assert steps == [(i + 1, 12) for i in range(12)]
+
+
+def test_bfloat16_changes_the_result_a_little() -> None:
+    exact, rounded = (PeerUpsampler(Smoothed(), precision=each)(_sample()) for each in ("float32", "bfloat16"))
+    assert 1e-7 < float((rounded / exact - 1).abs().max()) < 0.02
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"range_type": "depth"}, "range_type: expected one of orthogonal, perspective, disparity, got 'depth'"),
+        ({"value_range": "full"}, "range: expected one of measured, truth, got 'full'"),
+        ({"precision": "float16"}, "precision: expected one of float32, bfloat16, got 'float16'"),
+        ({"tile": 3}, "tile: expected at least 4 pixels, got 3"),
+    ],
+)
+def test_unsupported_value_is_refused(arguments: dict[str, str], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        PeerUpsampler(Enlarged(), **arguments)
+
+
+def test_folded_batch_normalisation_gives_the_same_result() -> None:
+    torch.manual_seed(1)
+    conv, norm = nn.Conv2d(3, 5, 3), nn.BatchNorm2d(5)
+    for part in (norm.weight, norm.bias, norm.running_mean, norm.running_var):
+        part.data.uniform_(0.5, 2)
+    tensors = {f"a.{name}": value for name, value in conv.state_dict().items()}
+    tensors |= {f"b.{name}": value for name, value in norm.state_dict().items()}
+    x = torch.rand(2, 3, 8, 8)
+    expected = norm.eval()(conv(x))
+    fold_batch_norm(tensors, "a", "b")
+    assert set(tensors) == {"a.weight", "a.bias"}
+    torch.testing.assert_close(nn.functional.conv2d(x, tensors["a.weight"], tensors["a.bias"]), expected)
+
+
+def test_batch_normalisation_that_does_not_fit_is_left_in_place() -> None:
+    tensors = {"a.weight": torch.ones(2, 1, 3, 3), "a.bias": torch.ones(2)}
+    tensors |= {f"b.{name}": torch.ones(3) for name in ("weight", "bias", "running_mean", "running_var")}
+    before = dict(tensors)
+    fold_batch_norm(tensors, "a", "b")
+    fold_batch_norm(tensors, "missing", "b")
+    assert tensors == before
+
+
+@pytest.mark.parametrize(("scale", "trained"), [(1, 4), (8 / 3, 4), (4, 4), (4.5, 8), (8, 8), (32, 8)])
+def test_weights_are_those_of_the_next_larger_factor(scale: float, trained: float) -> None:
+    assert nearest_scale(FILES, scale) == trained
+
+
+def _state(prefix: str = "") -> dict[str, Tensor]:
+    torch.manual_seed(0)
+    return {prefix + name: value for name, value in SVLRM(4).state_dict().items()}
+
+
+def _build(path: Path, scale: float = 4) -> PeerUpsampler:
+    return build_peer("svlrm", path, scale, FILES)
+
+
+def _save(path: Path, content: object) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    torch.save(content, path)
+    return path
+
+
+@pytest.mark.parametrize("prefix", ["", "module."])
+def test_authors_file_gives_its_network(tmp_path: Path, prefix: str) -> None:
+    net = load_peer(_save(tmp_path / "net.pth", _state(prefix)), SVLRM, 8)
+    assert net.scale == 8
+    assert all(torch.equal(value, _state()[name]) for name, value in net.state_dict().items())
+
+
+def test_scale_is_read_from_the_name_where_the_content_is_unknown(tmp_path: Path) -> None:
+    for name in ("SVLRM_X8.pth", "X8/model.pth"):
+        path = _save(tmp_path / name, _state())
+        assert _build(path, 8).net.scale == 8
+        assert _build(path, 8 / 3).net.scale == 8  # any file, where the network has no weights for the ratio
+        with pytest.raises(ValueError, match=rf"{name}: weights are for scale 8, the run is at scale 4"):
+            _build(path)
+    assert _build(_save(tmp_path / "renamed.pth", _state()), 8).net.scale == 8
+    assert _build(tmp_path / "renamed.pth", 2).net.scale == 4
+
+
+def test_scale_is_recognised_by_the_content_before_the_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = _save(tmp_path / "SVLRM_X4.pth", _state())
+    monkeypatch.setattr(SVLRM, "checksums", {file_hash(path)[:16]: 8})
+    assert _build(path, 8).net.scale == 8
+    with pytest.raises(ValueError, match="weights are for scale 8, the run is at scale 4"):
+        _build(path)
+
+
+class _Trap:
+    """Unpickled, it leaves a directory behind."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def __reduce__(self) -> tuple[object, tuple[str]]:
+        return os.mkdir, (str(self.path),)
+
+
+def _bad_files(folder: Path) -> Mapping[str, tuple[Path, str]]:
+    """Return files that are refused, and the end of the message."""
+    whole = _save(folder / "whole.pth", _state()).read_bytes()
+    truncated, text, pickled = (folder / name for name in ("truncated.pth", "text.pth", "pickled.pth"))
+    truncated.write_bytes(whole[: len(whole) // 2])
+    text.write_text("no weights")
+    pickled.write_bytes(pickle.dumps(_Trap(folder / "sprung")))
+    damaged = "expected a torch file of plain tensors, got one that is damaged or holds other Python objects"
+    missing = {name: value for name, value in _state().items() if name != "final_layer.bias"}
+    shape, infinite = _state() | {"final_layer.bias": torch.ones(3)}, _state()
+    infinite["final_layer.bias"][0] = torch.nan
+    other = {"first_layer.weight": torch.ones(2), "extra": torch.ones(2)}
+    expected = "expected the tensors of SVLRM, but "
+    return {
+        "truncated": (truncated, damaged),
+        "text": (text, damaged),
+        "pickle": (pickled, damaged),
+        "code": (_save(folder / "code.pth", {**_state(), "x": _Trap(folder / "sprung")}), damaged),
+        "list": (_save(folder / "list.pth", [1, 2]), "expected a network's tensors by name, got list"),
+        "steps": (_save(folder / "steps.pth", {"step": 3}), "expected a network's tensors by name, got step"),
+        "missing": (_save(folder / "missing.pth", missing), f"{expected}final_layer.bias is missing"),
+        "shape": (_save(folder / "shape.pth", shape), f"{expected}final_layer.bias has shape "),
+        "infinite": (_save(folder / "infinite.pth", infinite), f"{expected}final_layer.bias holds values other than"),
+        "other": (_save(folder / "other.pth", other), f"{expected}first_layer.bias is missing, and "),
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", [
+    "truncated", "text", "pickle", "code", "list", "steps", "missing", "shape", "infinite", "other",
+])  # fmt: skip
+def test_bad_file_is_refused_in_one_line_and_runs_nothing(tmp_path: Path, kind: str) -> None:
+    path, message = _bad_files(tmp_path)[kind]
+    with pytest.raises(ValueError, match=f"^{path}: {message}") as error:
+        _build(path)
+    assert "\n" not in str(error.value)
+    assert not (tmp_path / "sprung").exists()
+
+
+def test_missing_file_and_unknown_network_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError, match="nowhere: no such weights file"):
+        _build(tmp_path / "nowhere")
+    with pytest.raises(ValueError, match=f"peer: expected one of {', '.join(PEERS)}, got 'svlr'"):
+        build_peer("svlr", tmp_path, 4, FILES)
+
+
+def test_directory_is_searched_for_the_authors_names(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("DSR_WEIGHTS", raising=False)
+    node = read_method("svlrm", 8)
+    assert not has_weights(node, 8)
+    message = (
+        r"weights: method=svlrm at scale 8 needs weights=FILE, or a directory with SVLRM_X8.pth "
+        r"\(from github.com/sunny2109/SVLRM, weights/\); its authors publish them, dsr does not come with them"
+    )
+    with pytest.raises(ConfigError, match=message):
+        find_weights(node, 8)
+    monkeypatch.setenv("DSR_WEIGHTS", str(tmp_path))
+    node = read_method("svlrm", 8)
+    with pytest.raises(ConfigError, match=r"SVLRM_X8.pth \(no such file\)"):
+        find_weights(node, 8)
+    path = _save(tmp_path / "X8" / "model_177200_iter.pth", _state())
+    assert [find_weights(node, scale) for scale in (8, 7.5)] == [path, path]
+    assert [has_weights(node, scale) for scale in (4, 8)] == [False, True]
+    renamed = _save(tmp_path / "SVLRM_X8.pth", _state())
+    assert find_weights(node, 8, tmp_path) == renamed
