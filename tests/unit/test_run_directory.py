@@ -11,6 +11,7 @@ from omegaconf import OmegaConf
 import dsr
 from dsr.app import run_directory as rundir
 from dsr.app.run_directory import PREDICTING_CODE, claim, code_hash, default_directory, expect_free, identity_of
+from dsr.utils import hashing
 from dsr.utils.builder import ConfigError
 from dsr.utils.hashing import file_hash, hash_of_code
 from dsr.utils.versions import package_versions, versions
@@ -136,7 +137,7 @@ def test_code_hash_follows_the_prediction_code_alone(monkeypatch, tmp_path):
     for name in names:
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).write_text("x = 1\n")
-    monkeypatch.setattr(dsr, "__file__", str(tmp_path / "__init__.py"))
+    monkeypatch.setattr(hashing, "PACKAGE", tmp_path)
     monkeypatch.setattr(rundir, "PREDICTING_CODE", ("methods", "data", "geometry", "sample.py", "degrade.py"))
 
     def fresh():

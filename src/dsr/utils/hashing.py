@@ -7,7 +7,8 @@ import importlib.util
 from collections.abc import Iterable
 from pathlib import Path
 
-import dsr
+PACKAGE = Path(__file__).parents[1]
+"""The folder of the package."""
 
 
 def file_hash(path: Path) -> str:
@@ -23,14 +24,13 @@ def hash_of_code(names: Iterable[str]) -> str:
         FileNotFoundError: a module or package does not exist.
 
     """
-    package = Path(dsr.__file__).parent
     digest = hashlib.sha256()
     for name in names:
-        path = package / name
+        path = PACKAGE / name
         if not path.exists():
             raise FileNotFoundError(f"{path}: no such module or package")
         for file in [path] if path.is_file() else sorted(path.rglob("*.py")):
-            digest.update(file.relative_to(package).as_posix().encode() + b"\0" + file.read_bytes())
+            digest.update(file.relative_to(PACKAGE).as_posix().encode() + b"\0" + file.read_bytes())
     return digest.hexdigest()
 
 
@@ -43,7 +43,7 @@ def hash_outside_code(targets: Iterable[str]) -> str | None:
         targets: dotted paths, ``module.name``.
 
     """
-    own = dsr.__name__
+    own = __name__.partition(".")[0]
     modules = sorted({target.rpartition(".")[0] for target in targets if target.partition(".")[0] != own})
     digest = hashlib.sha256()
     for name in modules:
