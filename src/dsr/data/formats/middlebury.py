@@ -81,11 +81,11 @@ def find_levels(root: Path) -> dict[str, Files]:
             found[path.parent.name.casefold()] = files
     for path in sorted(root.glob("*_color.png")):
         name = path.name.removesuffix("_color.png")
-        disparity = root / f"{name}_big.png"
-        if not disparity.is_file():  # other benchmarks' photos are called so, too
+        level_path = root / f"{name}_big.png"
+        if not level_path.is_file():  # other benchmarks' photos are called so, too
             continue
         measured = {factor: root / (name + end) for factor, end in _NOISY.items() if (root / (name + end)).is_file()}
-        found[name.casefold()] = Files(path, disparity, None, measured)
+        found[name.casefold()] = Files(path, level_path, None, measured)
     return found
 
 
