@@ -85,5 +85,9 @@ def test_installed_help_lists_the_commands_and_choices(dsr):
     for line in ("dataset: folder, icl,", "method: ", "facets, ", "experiment: ", "paper_tables", "scale: 4"):
         assert line in choices
     choices = dsr("train", "-h")
-    for line in ("model: dg, facets, msg, msg_v, pdn", "trainer: default, full, smoke", "experiment: "):
+    for line in (
+        "model: ddrnet, dg, facets, msg, msg_v, pdn, sparse_to_dense",
+        "trainer: default, full, smoke",
+        "experiment: ",
+    ):
         assert line in choices

@@ -330,9 +330,13 @@ def test_mixed_precision_losses_are_close_to_full_precision(smoke, tmp_path, wit
 USAGE_ERRORS = {
     "a weight that is none": (["loss.w=abc"], "loss.w: expected auto or a number, 0 or more, got 'abc'"),
     "a negative weight": (["loss.w=-1"], "loss.w: expected auto or a number, 0 or more, got -1"),
-    "a mistyped model": (["model=foo"], "model=foo: unknown; expected one of dg, facets, msg, msg_v, pdn"),
+    "a mistyped model": (
+        ["model=foo"],
+        "model=foo: unknown; expected one of ddrnet, dg, facets, msg, msg_v, pdn, sparse_to_dense",
+    ),
     "a model taken away": (["~model"], "model: missing; give it as model=..."),
     "a mistyped loss": (["model.depth_loss=l3"], "model.depth_loss: expected one of lap1, l1, mse, got 'l3'"),
+    "a negative shading": (["model=ddrnet", "model.shading=-1"], "model.shading: expected 0 or a positive number"),
     "a network that leaves out pixels": (["model.variant=hui"], "model: expected a network that covers the whole"),
     "a patch the scale does not divide": (["trainer.patch=30"], "trainer.patch: expected a size that scale=4 divides"),
     "a patch too small": (["trainer.patch=8"], "trainer.patch: expected at least 16 pixels, got 8"),
@@ -378,7 +382,11 @@ def test_help_lists_the_choices(within):
     code, output, errors = within("--help")
     assert (code, errors) == (0, [])
     noises = "noise: gaussian_multiplicative, kinect, none, tof"
-    for line in ("model: dg, facets, msg, msg_v, pdn", "trainer: default, full, smoke", noises):
+    for line in (
+        "model: ddrnet, dg, facets, msg, msg_v, pdn, sparse_to_dense",
+        "trainer: default, full, smoke",
+        noises,
+    ):
         assert line in output
 
 

@@ -9,45 +9,59 @@ import pytest
 import torch
 from small_scenes import maps, photos
 
-from dsr.methods.networks.base import NetworkUpsampler, WindowedNetwork
+from dsr.methods.networks.base import DisparityNetwork, NetworkUpsampler, WindowedNetwork
+from dsr.methods.networks.ddrnet import DDRNet
 from dsr.methods.networks.dg import DynamicGuidance
 from dsr.methods.networks.facets import Facets
 from dsr.methods.networks.pdn import PrimalDualNetwork
+from dsr.methods.networks.sparse_to_dense import SparseToDense
 
-BUILDERS: MappingProxyType[str, Callable[[int], WindowedNetwork]] = MappingProxyType(
+WINDOWED: MappingProxyType[str, Callable[[int], WindowedNetwork]] = MappingProxyType(
     {
         "facets": lambda scale: Facets(scale, width=8, blocks=1),
         "pdn": lambda scale: PrimalDualNetwork(scale, width=6, layers=2, window=3, iterations=1),
         "dg": lambda scale: DynamicGuidance(scale, stages=1, filters=4, size=3),
+        "ddrnet": lambda scale: DDRNet(scale, denoising=4, refinement=4),
     }
+)
+BUILDERS: MappingProxyType[str, Callable[[int], DisparityNetwork]] = MappingProxyType(
+    {**WINDOWED, "sparse_to_dense": lambda scale: SparseToDense(scale, width=4)}
 )
 
 
+def _disturb(net: DisparityNetwork) -> None:
+    """Change the weights of a network to some that are far from those that it starts with."""
+    torch.manual_seed(net.scale)
+    for parameter in net.eval().requires_grad_(False).parameters():
+        parameter.add_(0.1 * torch.randn_like(parameter))
+
+
 @pytest.fixture(params=BUILDERS)
-def build(request: pytest.FixtureRequest) -> Callable[..., WindowedNetwork]:
-    """Return what builds a small network, with weights far from those that it starts with."""
+def net(request: pytest.FixtureRequest) -> DisparityNetwork:
+    """Return a small network of scale 4."""
+    net = BUILDERS[request.param](4)
+    _disturb(net)
+    return net
+
+
+@pytest.fixture(params=WINDOWED)
+def build_windowed(request: pytest.FixtureRequest) -> Callable[..., WindowedNetwork]:
+    """Return what builds a small network that processes windows."""
 
     def built(scale: int = 4) -> WindowedNetwork:
-        torch.manual_seed(scale)
-        net = BUILDERS[request.param](scale).requires_grad_(False)
-        for parameter in net.parameters():
-            parameter.add_(0.1 * torch.randn_like(parameter))
+        net = WINDOWED[request.param](scale)
+        _disturb(net)
         return net
 
     return built
 
 
-@pytest.fixture
-def net(build: Callable[..., WindowedNetwork]) -> WindowedNetwork:
-    return build()
-
-
-def test_networks_are_equivariant_to_scale_and_offset_of_disparity(net: WindowedNetwork) -> None:
+def test_networks_are_equivariant_to_scale_and_offset_of_disparity(net: DisparityNetwork) -> None:
     rgb, coarse = photos(24, 28), maps(6, 7)
     torch.testing.assert_close(net.upsample(rgb, 3 * coarse + 7), 3 * net.upsample(rgb, coarse) + 7, rtol=1e-6, atol=0)
 
 
-def test_given_min_max_normalises_a_window_like_its_image(net: WindowedNetwork) -> None:
+def test_given_min_max_normalises_a_window_like_its_image(net: DisparityNetwork) -> None:
     rgb, coarse = photos(24, 28), maps(6, 7)
     own = torch.tensor([coarse.min(), coarse.max()]).view(1, 2, 1, 1)
     torch.testing.assert_close(net.upsample(rgb, coarse, own), net.upsample(rgb, coarse), rtol=1e-6, atol=0)
@@ -55,18 +69,18 @@ def test_given_min_max_normalises_a_window_like_its_image(net: WindowedNetwork) 
     assert not torch.allclose(net.upsample(rgb, coarse, wide), net.upsample(rgb, coarse), rtol=1e-5)
 
 
-def test_constant_map_stays_constant(net: WindowedNetwork) -> None:
+def test_constant_map_stays_constant(net: DisparityNetwork) -> None:
     result = net.upsample(photos(24, 28), torch.full((1, 1, 6, 7), 5.0))
     torch.testing.assert_close(result, torch.full((1, 1, 24, 28), 5.0), rtol=1e-6, atol=0)
 
 
-def test_photo_influences_the_result(net: WindowedNetwork) -> None:
+def test_photo_influences_the_result(net: DisparityNetwork) -> None:
     coarse = maps(6, 7)
     one, other = (net.upsample(photo, coarse) for photo in (photos(24, 28), 1 - photos(24, 28).square()))
     assert not torch.allclose(one, other, rtol=1e-4)
 
 
-def test_batch_equals_single_images_every_time(net: WindowedNetwork) -> None:
+def test_batch_equals_single_images_every_time(net: DisparityNetwork) -> None:
     rgb, coarse = photos(24, 28, 3), maps(6, 7, 3)
     together = net.upsample(rgb, coarse)
     alone = torch.cat([net.upsample(rgb[i : i + 1], coarse[i : i + 1]) for i in range(3)])
@@ -74,7 +88,7 @@ def test_batch_equals_single_images_every_time(net: WindowedNetwork) -> None:
     assert torch.equal(net.upsample(rgb, coarse), together)
 
 
-def test_maps_of_any_size_keep_their_dtype(net: WindowedNetwork) -> None:
+def test_maps_of_any_size_keep_their_dtype(net: DisparityNetwork) -> None:
     for height, width in ((1, 1), (1, 5), (2, 2), (3, 7)):
         for dtype in (torch.float32, torch.float64):
             result = net.upsample(photos(4 * height, 4 * width), maps(height, width).to(dtype))
@@ -83,7 +97,8 @@ def test_maps_of_any_size_keep_their_dtype(net: WindowedNetwork) -> None:
             assert bool(result.isfinite().all())
 
 
-def test_hole_is_filled_locally_within_the_receptive_field(net: WindowedNetwork) -> None:
+def test_hole_is_filled_locally_within_the_receptive_field(build_windowed: Callable[..., WindowedNetwork]) -> None:
+    net = build_windowed()
     columns = 2 * net.receptive_field_radius + 6
     rgb, coarse = photos(32, 4 * columns), maps(8, columns)
     coarse[..., 0, 0], coarse[..., 0, 1] = 20, 29  # the range, which normalises
@@ -96,13 +111,13 @@ def test_hole_is_filled_locally_within_the_receptive_field(net: WindowedNetwork)
     assert not torch.allclose(result[..., 12:16, 8:12], whole[..., 12:16, 8:12])
 
 
-def test_image_without_a_valid_pixel_becomes_nan(net: WindowedNetwork) -> None:
+def test_image_without_a_valid_pixel_becomes_nan(net: DisparityNetwork) -> None:
     assert bool(net.upsample(photos(24, 28), torch.full((1, 1, 6, 7), torch.nan)).isnan().all())
 
 
 @pytest.mark.parametrize("scale", [2, 4])
-def test_tiles_equal_the_whole_image(build: Callable[..., WindowedNetwork], scale: int) -> None:
-    net = build(scale)
+def test_tiles_equal_the_whole_image(build_windowed: Callable[..., WindowedNetwork], scale: int) -> None:
+    net = build_windowed(scale)
     rows, columns = net.receptive_field_radius + 9, 2 * net.receptive_field_radius + 10
     rgb, coarse = photos(scale * rows, scale * columns).double(), maps(rows, columns).double()
     tiled, whole = NetworkUpsampler(net, tile=4 * scale), NetworkUpsampler(net)
@@ -114,15 +129,15 @@ def test_tiles_equal_the_whole_image(build: Callable[..., WindowedNetwork], scal
     )
 
 
-def test_photo_of_another_size_is_refused(net: WindowedNetwork) -> None:
+def test_photo_of_another_size_is_refused(net: DisparityNetwork) -> None:
     with pytest.raises(
         ValueError, match=r"^rgb: expected \(24, 28\) pixels for a low-resolution map of \(6, 7\) at scale 4"
     ):
         net.upsample(photos(24, 24), maps(6, 7))
 
 
-def test_network_is_rebuilt_from_its_arguments(net: WindowedNetwork) -> None:
-    again = type(net)(**net.arguments())
+def test_network_is_rebuilt_from_its_arguments(net: DisparityNetwork) -> None:
+    again = type(net)(**net.arguments()).eval()
     again.load_state_dict(net.state_dict())
     rgb, coarse = photos(16, 12), maps(4, 3)
     assert torch.equal(again.upsample(rgb, coarse), net.upsample(rgb, coarse))

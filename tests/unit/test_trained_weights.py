@@ -14,6 +14,7 @@ from torch import Tensor
 from dsr.methods.networks.base import DisparityNetwork
 from dsr.methods.networks.facets import Facets
 from dsr.methods.networks.msg_net import MSGNet
+from dsr.methods.networks.sparse_to_dense import SparseToDense
 from dsr.methods.networks.trained import NETWORKS, build_trained, packaged_names, packaged_weights
 from dsr.methods.networks.weight_files import is_dsr_weights, load_network, read_header, save_network
 
@@ -22,6 +23,7 @@ NETS = {
     "msg_v": lambda: MSGNet(8, "dsr"),
     "as published": lambda: MSGNet(4, "voynov"),
     "facets": lambda: Facets(4, width=8, blocks=1, facets=1),
+    "with batch normalisation": lambda: SparseToDense(4, width=4).eval(),
 }
 
 
@@ -30,13 +32,25 @@ def test_file_restores_the_saved_network(tmp_path: Path, case: str) -> None:
     net = NETS[case]()
     net.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # as training has it
     save_network(tmp_path / "w.safetensors", net, "mine")
-    loaded = load_network(tmp_path / "w.safetensors", NETWORKS, net.scale, "mine")
+    loaded = load_network(tmp_path / "w.safetensors", NETWORKS, net.scale, "mine").train(net.training)
     assert (type(loaded), loaded.arguments()) == (type(net), net.arguments())
     assert list(loaded.state_dict()) == list(net.state_dict())
     torch.testing.assert_close(dict(loaded.state_dict()), dict(net.state_dict()), rtol=0, atol=0)
     rgb, disparity = torch.rand(1, 3, 8 * net.scale, 8 * net.scale), torch.rand(1, 1, 8, 8)
     with torch.no_grad():
         torch.testing.assert_close(loaded.upsample(rgb, disparity), net.upsample(rgb, disparity), rtol=1e-4, atol=1e-5)
+
+
+def test_half_precision_halves_the_kernels_and_is_loaded_as_float32(tmp_path: Path) -> None:
+    net = SparseToDense(4, width=16).eval()
+    save_network(tmp_path / "whole", net, "mine")
+    save_network(tmp_path / "half", net, "mine", half=True)
+    assert (tmp_path / "half").stat().st_size < 0.52 * (tmp_path / "whole").stat().st_size
+    loaded = load_network(tmp_path / "half", NETWORKS).state_dict()
+    for name, value in net.state_dict().items():
+        assert loaded[name].dtype == torch.float32
+        expected = value.half().float() if value.dim() > 1 else value
+        assert torch.equal(loaded[name], expected), name
 
 
 def test_equal_networks_give_equal_bytes_and_the_facts_are_restored(tmp_path: Path) -> None:

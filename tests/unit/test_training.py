@@ -18,9 +18,11 @@ from lightning.pytorch.callbacks import Callback
 from torch import Tensor
 from torch.utils.data import DataLoader
 
+from dsr.app.trainer import seconds_per_step
 from dsr.degradation.downsampling import Downsampling, make_sample
 from dsr.geometry.camera import Camera
 from dsr.methods.networks.msg_net import MSGNet, upsample_disparity
+from dsr.methods.networks.sparse_to_dense import SparseToDense
 from dsr.metrics import functional as scores
 from dsr.metrics.classes import visual_metrics
 from dsr.metrics.functional import SurfacePair
@@ -32,6 +34,7 @@ from dsr.training.module import SuperResolution
 from dsr.training.objective import Objective, balance_weight, to_depth
 from dsr.training.patches import Patches
 from dsr.training.settings import PatchSettings, Schedule
+from dsr.training.shading import shading_loss
 
 BOX = Downsampling("box")
 X2 = Degradation(2, BOX)
@@ -115,6 +118,29 @@ def test_visual_term_without_a_weight_is_left_out() -> None:
     terms = Objective("l1")(_ramp(0.3), _wall())
     assert terms.keys() == {"loss", "l1"}
     assert float(terms["loss"]) == pytest.approx(0.9, rel=1e-12)
+
+
+def test_intermediate_stages_get_the_depth_loss_too() -> None:
+    terms = Objective("l1", 2.0)(_ramp(0, 4.0), _wall(), [_ramp(0, 4.5), _ramp(0, 6.0)])
+    assert {name: float(value) for name, value in terms.items()} == pytest.approx(
+        {"loss": 1.25, "l1": 0, "l1_stage1": 0.25, "l1_stage2": 1.0, "mse_v": 0}, abs=1e-13
+    )
+
+
+def test_shading_term_is_that_of_the_surface_and_the_photo() -> None:
+    batch = {**_wall(), "rgb": torch.rand((1, 3, 12, 13), generator=torch.Generator().manual_seed(0)).double()}
+    disparity = _ramp(0.3)
+    expected = shading_loss(SurfacePair(to_depth(disparity, batch), batch["depth"], batch["rays"]), batch["rgb"])
+    terms = Objective("l1", shading=0.5)(disparity, batch)
+    assert terms.keys() == {"loss", "l1", "shading"}
+    assert float(terms["shading"]) == pytest.approx(float(expected), rel=1e-12)
+    assert float(terms["loss"]) == pytest.approx(float(terms["l1"]) + 0.5 * float(expected), rel=1e-12)
+
+
+@pytest.mark.parametrize("weight", [-0.1, math.nan, math.inf])
+def test_shading_weight_that_is_none_is_refused(weight: float) -> None:
+    with pytest.raises(ValueError, match=r"^shading: expected 0 or a positive number, got"):
+        Objective("l1", shading=weight)
 
 
 def test_flat_low_resolution_map_has_a_nonzero_range() -> None:
@@ -308,6 +334,17 @@ def test_weight_average_follows_the_weights_with_its_decay(tmp_path: Path) -> No
     torch.testing.assert_close(module.average.stem.conv.weight, expected)
     assert not torch.equal(module.net.stem.conv.weight, expected)
     assert not any(parameter.requires_grad for parameter in module.average.parameters())
+
+
+def test_average_has_the_statistics_of_batch_normalisation(tmp_path: Path) -> None:
+    torch.manual_seed(0)
+    metrics = functools.partial(visual_metrics, None)
+    module = SuperResolution(SparseToDense(2, width=4), Objective("l1"), Schedule(steps=9, warmup=1), metrics)
+    seconds_per_step(module, next(iter(_one_batch())))
+    assert not any(bool(mean.any()) for name, mean in module.net.named_buffers() if name.endswith("mean"))
+    _trainer(tmp_path, max_epochs=2).fit(module, _one_batch())
+    assert all(map(torch.equal, module.net.buffers(), module.average.buffers()))
+    assert all(bool(mean.any()) for name, mean in module.average.named_buffers() if name.endswith("mean"))
 
 
 def test_weights_are_stored_themselves_without_an_average(tmp_path: Path) -> None:

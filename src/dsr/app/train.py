@@ -159,7 +159,8 @@ def _module(settings: TrainConfig, net: DisparityNetwork, data: PatchData, metri
         loss = _visual_loss(settings)
         mixed = settings.precision == "bfloat16"
         schedule = Schedule(mixed=mixed, **common(Schedule, settings.trainer))
-        return SuperResolution(net, Objective(depth_loss, w, visual=loss), schedule, metrics, data.validation_sets)
+        objective = Objective(depth_loss, w, loss, settings.model.get("shading", 0.0))
+        return SuperResolution(net, objective, schedule, metrics, data.validation_sets)
     except (ValueError, OSError) as error:
         raise keyed(error) from error
 
@@ -229,7 +230,8 @@ def _announce(
 
 def _formula(objective: Objective) -> str:
     """Return the loss as a formula."""
-    return objective.depth_loss + (f" + {objective.w:.3g} {objective.visual.title}" if objective.w else "")
+    terms = {objective.visual.title: objective.w, "shading": objective.shading}
+    return " + ".join([objective.depth_loss, *(f"{weight:.3g} {name}" for name, weight in terms.items() if weight)])
 
 
 def _describe(trainer: lightning.Trainer, plain: Mapping[str, Any], module: SuperResolution) -> None:
@@ -249,6 +251,7 @@ def _facts(plain: Mapping[str, Any], module: SuperResolution) -> dict[str, Any]:
         "loss": module.objective.depth_loss,
         "visual": module.objective.visual.name if module.objective.w else "none",
         "w": module.objective.w,
+        "shading": module.objective.shading,
     }
 
 

@@ -97,7 +97,7 @@ def training_data(settings: TrainConfig) -> PatchData:
 def keyed(error: Exception) -> ConfigError:
     """Return an error of a training's parts as a ConfigError that names the configuration key."""
     names = [field.name for field in dataclasses.fields(TrainerConfig)]
-    message = with_key(with_key(str(error), "trainer", names), "model", ["depth_loss"])
+    message = with_key(with_key(str(error), "trainer", names), "model", ["depth_loss", "shading"])
     return ConfigError(with_key(message, "loss", ["visual"]))
 
 

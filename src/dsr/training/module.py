@@ -68,8 +68,9 @@ class SuperResolution(lightning.LightningModule):
     def loss_terms(self, batch: Batch) -> dict[str, Tensor]:
         """Return ``loss`` and its terms."""
         with torch.autocast(self.device.type, torch.bfloat16, enabled=self.schedule.mixed):
-            disparity = self.net.upsample(batch["rgb"], batch["disparity_lr"], batch["min_max"])
-        return self.objective(disparity.float(), batch)
+            stages = self.net.upsample_stages(batch["rgb"], batch["disparity_lr"], batch["min_max"])
+        *intermediate, disparity = (stage.float() for stage in stages)
+        return self.objective(disparity, batch, intermediate)
 
     def configure_gradient_clipping(self, optimizer: Any, *_: Any, **__: Any) -> None:
         """Clip the gradient and log its norm; drop a gradient that is not finite, so that the step changes nothing."""
@@ -83,6 +84,8 @@ class SuperResolution(lightning.LightningModule):
         super().optimizer_step(*arguments, **named)
         update = get_ema_multi_avg_fn(self.schedule.decay(self.global_step + 1))
         update(list(self.average.parameters()), list(self.net.parameters()), None)
+        for average, current in zip(self.average.buffers(), self.net.buffers(), strict=True):
+            average.copy_(current)  # such as the statistics of batch normalisation, which are averages already
 
     def validation_step(self, batch: Batch, index: int, dataloader_idx: int = 0) -> None:
         """Score a whole scene; render the first few for TensorBoard."""

@@ -1,4 +1,4 @@
-"""The training loss, a loss on disparity plus w times a visual loss, MSE_v or another, and the weight w."""
+"""The training loss: a loss on disparity, plus w times a visual loss, plus a shading loss; and the weight w."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from dsr.metrics import losses
 from dsr.metrics.functional import SurfacePair
 from dsr.metrics.visual_loss import MSE_V, VisualLoss, match_weight
 from dsr.training.degradation import Batch
+from dsr.training.shading import shading_loss
 
 DepthLoss = Literal["lap1", "l1", "mse"]
 _TILT = math.asin(5 / 255)
@@ -24,7 +25,7 @@ _DEPTH_LOSSES = {"lap1": losses.lap1, "l1": losses.l1, "mse": losses.mse}
 
 @dataclass(frozen=True)
 class Objective:
-    """The loss: depth_loss + w visual (Voynov et al. 2019, eq. 4: Lap_1 + w MSE_v).
+    """The loss: depth_loss + w visual (Voynov et al. 2019, eq. 4: Lap_1 + w MSE_v), and perhaps a shading loss.
 
     The depth loss compares disparities divided by the range of the low-resolution ones, so that it does not depend on
     the scale of the scene.
@@ -33,37 +34,53 @@ class Objective:
         depth_loss: ``lap1``, ``l1`` or ``mse``.
         w: weight of the visual loss; 0 for the depth loss alone.
         visual: the visual loss.
+        shading: weight of :func:`dsr.training.shading.shading_loss`; 0 for none.
 
     Raises:
-        ValueError: there is no such depth loss.
+        ValueError: there is no such depth loss, or the weight of the shading loss is negative.
 
     """
 
     depth_loss: DepthLoss = "lap1"
     w: float = 0.0
     visual: VisualLoss = MSE_V
+    shading: float = 0.0
 
     def __post_init__(self) -> None:
-        """Check the name."""
+        """Check the values."""
+        if not 0 <= self.shading < math.inf:
+            raise ValueError(f"shading: expected 0 or a positive number, got {self.shading}")
         if self.depth_loss not in _DEPTH_LOSSES:
             raise ValueError(f"depth_loss: expected one of {', '.join(_DEPTH_LOSSES)}, got {self.depth_loss!r}")
 
-    def __call__(self, disparity: Tensor, batch: Batch) -> dict[str, Tensor]:
+    def __call__(self, disparity: Tensor, batch: Batch, intermediate: Sequence[Tensor] = ()) -> dict[str, Tensor]:
         """Return ``loss`` and its terms, means over the images of the batch that have valid depth.
 
         Args:
             disparity: (B, 1, H, W) the network's disparity in pixels.
             batch: tensors of :func:`dsr.training.degradation.to_tensors`.
+            intermediate: (B, 1, H, W) results of earlier stages of the network, which get the depth loss, too.
 
         """
         target = batch["bf"] / batch["depth"] - batch["doffs"]
         extent = _range(batch["disparity_lr"])
-        loss = _DEPTH_LOSSES[self.depth_loss](disparity / extent, target / extent).nanmean()
+
+        def compare(disparity: Tensor) -> Tensor:
+            return _DEPTH_LOSSES[self.depth_loss](disparity / extent, target / extent).nanmean()
+
+        loss = compare(disparity)
         terms: dict[str, Tensor] = {self.depth_loss: loss}
-        if self.w:
+        for number, each in enumerate(intermediate, 1):
+            terms[f"{self.depth_loss}_stage{number}"] = compare(each)
+            loss = loss + terms[f"{self.depth_loss}_stage{number}"]
+        if self.w or self.shading:
             pair = SurfacePair(to_depth(disparity, batch), batch["depth"], batch["rays"])
+        if self.w:
             terms[self.visual.name] = self.visual(pair).nanmean()
             loss = loss + self.w * terms[self.visual.name]
+        if self.shading:
+            terms["shading"] = shading_loss(pair, batch["rgb"]).nanmean()
+            loss = loss + self.shading * terms["shading"]
         return {"loss": loss, **terms}
 
 

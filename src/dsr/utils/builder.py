@@ -18,7 +18,7 @@ from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 _MISSING = "???"
 _ABOUT = (
     "name", "label", "target", "weights_packaged", "weights_file", "weights_files", "weights_source", "depth_loss",
-    "visual",
+    "visual", "shading",
 )  # fmt: skip
 
 

@@ -77,6 +77,10 @@ class DisparityNetwork(nn.Module, abc.ABC):
 
         """
 
+    def upsample_stages(self, rgb: Tensor, disparity: Tensor, min_max: Tensor | None = None) -> tuple[Tensor, ...]:
+        """Return the maps that a training supervises: those of intermediate stages, if any, then :meth:`upsample`'s."""
+        return (self.upsample(rgb, disparity, min_max),)
+
 
 class WindowedNetwork(DisparityNetwork):
     """A network whose outputs depend on a neighbourhood and a few global values only.
@@ -94,32 +98,46 @@ class WindowedNetwork(DisparityNetwork):
         """Return the context of an image, to upsample windows of it; see :meth:`upsample` for the arguments."""
 
 
-class NormalisedNetwork(WindowedNetwork):
+class RangeNetwork(DisparityNetwork):
     """A network whose input is an RGB image and inpainted low-resolution disparity, normalised to 0..1.
 
-    The output is rescaled to the range of the input, so the network commutes with affine maps of the disparity. The
-    module maps (B, 3, H, W) and (B, 1, h, w) to (B, 1, H, W). For a window, the :meth:`context` of the whole image is
-    passed as further arguments.
+    The output is rescaled to the range of the input, so the network commutes with affine maps of the disparity, and a
+    constant map stays constant. The module maps (B, 3, H, W) and (B, 1, h, w) to (B, 1, H, W).
     """
 
     def upsample(self, rgb: Tensor, disparity: Tensor, min_max: Tensor | None = None) -> Tensor:
         """Return high-resolution disparity; see :meth:`DisparityNetwork.upsample`."""
-        return self._upsample(rgb, disparity, min_max, ())
+        return self.in_range(disparity, min_max, lambda values: (self(rgb, values),))[0]
+
+    @staticmethod
+    def in_range(
+        disparity: Tensor, min_max: Tensor | None, compute: Callable[[Tensor], tuple[Tensor, ...]]
+    ) -> tuple[Tensor, ...]:
+        """Return the maps that ``compute`` makes of inpainted, normalised disparity, in the unit of the disparity."""
+        _, minimum, value_range = normalise(disparity, min_max)
+        varies = value_range > 0
+        value_range = torch.where(varies, value_range, 1)
+        values = (inpaint(disparity) - minimum) / value_range
+        return tuple(torch.where(varies, values * value_range, 0) + minimum for values in compute(values))
+
+
+class NormalisedNetwork(RangeNetwork, WindowedNetwork):
+    """A :class:`RangeNetwork` whose outputs depend on a neighbourhood and a few global values only.
+
+    For a window, the :meth:`context` of the whole image is passed to the module as further arguments.
+    """
 
     def global_context(self, rgb: Tensor, disparity: Tensor) -> GlobalContext:
         """Return a context with the disparity's range and the :meth:`context` of the whole image."""
         min_max, context = compute_min_max(disparity), self.context(rgb)
-        return GlobalContext(inpaint(disparity), lambda rgb, window: self._upsample(rgb, window, min_max, context))
+        return GlobalContext(
+            inpaint(disparity),
+            lambda rgb, window: self.in_range(window, min_max, lambda values: (self(rgb, values, *context),))[0],
+        )
 
     def context(self, rgb: Tensor) -> tuple[Tensor, ...]:
         """Return the global values that the network computes from the whole image, (B, 3, H, W)."""
         return ()
-
-    def _upsample(self, rgb: Tensor, disparity: Tensor, min_max: Tensor | None, context: tuple[Tensor, ...]) -> Tensor:
-        _, minimum, value_range = normalise(disparity, min_max)
-        value_range = torch.where(value_range > 0, value_range, 1)
-        values = (inpaint(disparity) - minimum) / value_range
-        return self(rgb, values, *context) * value_range + minimum
 
 
 def expect_rgb_size(rgb: Tensor, values_lr: Tensor, scale: int) -> None:

@@ -10,16 +10,25 @@ from types import MappingProxyType
 import torch
 
 from dsr.methods.networks.base import DisparityNetwork, NetworkUpsampler, Precision
+from dsr.methods.networks.ddrnet import DDRNet
 from dsr.methods.networks.dg import DynamicGuidance
 from dsr.methods.networks.facets import Facets
 from dsr.methods.networks.msg_guidance import VariantName
 from dsr.methods.networks.msg_net import MSGNet
 from dsr.methods.networks.pdn import PrimalDualNetwork
 from dsr.methods.networks.published import load_msg_weights
+from dsr.methods.networks.sparse_to_dense import SparseToDense
 from dsr.methods.networks.weight_files import is_dsr_weights, load_network
 
 NETWORKS: MappingProxyType[str, type[DisparityNetwork]] = MappingProxyType(
-    {"MSGNet": MSGNet, "Facets": Facets, "PrimalDualNetwork": PrimalDualNetwork, "DynamicGuidance": DynamicGuidance}
+    {
+        "MSGNet": MSGNet,
+        "Facets": Facets,
+        "PrimalDualNetwork": PrimalDualNetwork,
+        "DynamicGuidance": DynamicGuidance,
+        "SparseToDense": SparseToDense,
+        "DDRNet": DDRNet,
+    }
 )
 
 _DSR_ENSEMBLE = 4

@@ -18,7 +18,9 @@ FORMAT = "dsr-network-1"
 _KEY = "dsr"
 
 
-def save_network(path: Path, net: DisparityNetwork, model: str, facts: Mapping[str, Any] | None = None) -> None:
+def save_network(
+    path: Path, net: DisparityNetwork, model: str, facts: Mapping[str, Any] | None = None, *, half: bool = False
+) -> None:
     """Write a network's weights; equal networks and facts give equal bytes.
 
     Args:
@@ -26,6 +28,7 @@ def save_network(path: Path, net: DisparityNetwork, model: str, facts: Mapping[s
         net: the network.
         model: name of the model in ``conf/model/``, such as ``msg_v``.
         facts: further plain values for readers of the file, such as data, steps and scores.
+        half: whether to store the kernels of convolutions in half precision; biases and normalisations are not.
 
     """
     header = {
@@ -35,7 +38,10 @@ def save_network(path: Path, net: DisparityNetwork, model: str, facts: Mapping[s
         "model": model,
         "facts": dict(facts or {}),
     }
-    tensors = {name: value.detach().cpu().contiguous() for name, value in net.state_dict().items()}
+    tensors = {
+        name: value.detach().to("cpu", torch.float16 if half and value.dim() > 1 else value.dtype).contiguous()
+        for name, value in net.state_dict().items()
+    }
     safetensors.torch.save_file(tensors, path, {_KEY: json.dumps(header, sort_keys=True)})
 
 

@@ -1,0 +1,225 @@
+"""DDRNet: a network that denoises a depth map, then one that refines it with the photo.
+
+Yan, Wu, Wang, Xu, An, Guo and Liu, *DDRNet: Depth Map Denoising and Refinement for Consumer Depth Cameras Using
+Cascaded CNNs*, ECCV 2018. The denoising network, a U-net with residual blocks at a quarter of the size, sees the depth
+alone and corrects its low frequencies. The refinement network adds detail from the photo's intensity: its features at
+three sizes are brought to the first and joined (*hypercolumns*). Both maps are compared with the reference depth, and
+the second one's shading with the photo, under the light that explains the photo best
+(:func:`dsr.training.shading.shading_loss`). Sizes of layers and losses are those of the authors' code for single
+frames, github.com/neycyanshi/DDRNet.
+
+What differs from the original:
+
+- The input is not a sensor's map, but the bicubic upsampling of a low-resolution one, exact on planes. It works on
+  disparity, normalised to -1..1 by the low-resolution map; the original on depth of 0.5 to 3 m.
+- The refinement network, too, learns a residual. That of the authors' code outputs the map itself.
+- The sizes are halved at most as often as the scale can be, once at x2 and twice otherwise, so that tiles of
+  low-resolution pixels keep them aligned.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from dsr.degradation.scales import check_scale
+from dsr.methods.classical.finite_differences import grey, upsample_linear_border
+from dsr.methods.networks.base import NormalisedNetwork, expect_rgb_size
+
+_HALVINGS = 2
+_BLOCKS = 2
+_SLOPE = 0.2
+_GAIN = 0.05
+"""Factor of the last layers' outputs: a step of the optimiser changes maps that are nearly right by less."""
+_UPSAMPLING = 4
+"""Receptive-field radius of the upsampling in low-resolution pixels."""
+
+
+class DDRNet(NormalisedNetwork):
+    """The network.
+
+    Args:
+        scale: upsampling factor, 2, 4, 8 or 16.
+        denoising: channels of the first layer of the denoising network.
+        refinement: channels of the first layers of the refinement network, even.
+
+    Raises:
+        ValueError: a value is out of range.
+
+    """
+
+    def __init__(self, scale: int, denoising: int = 32, refinement: int = 16) -> None:
+        super().__init__()
+        check_scale(scale)
+        if denoising < 1 or refinement < 4 or refinement % 4:
+            raise ValueError(
+                f"model: expected denoising of at least 1 and refinement a positive multiple of 4, "
+                f"got {denoising} and {refinement}"
+            )
+        self.scale, self.denoising, self.refinement = scale, denoising, refinement
+        self.halvings = min(_HALVINGS, scale.bit_length() - 1)
+        self.denoise = Denoising(denoising, self.halvings)
+        self.refine = Refinement(refinement, self.halvings)
+
+    def arguments(self) -> dict[str, Any]:
+        """Return the constructor's arguments."""
+        return {"scale": self.scale, "denoising": self.denoising, "refinement": self.refinement}
+
+    @property
+    def receptive_field_radius(self) -> int:
+        """Receptive-field radius in low-resolution pixels."""
+        radius_hr = self.denoise.receptive_field_radius + self.refine.receptive_field_radius
+        return -(-radius_hr // self.scale) + _UPSAMPLING
+
+    def upsample_stages(self, rgb: Tensor, disparity: Tensor, min_max: Tensor | None = None) -> tuple[Tensor, ...]:
+        """Return the denoised and the refined map."""
+        return self.in_range(disparity, min_max, lambda values: self._compute_stages(rgb, values))
+
+    def forward(self, rgb: Tensor, values: Tensor) -> Tensor:
+        """Map an image and normalised low-resolution disparity to high-resolution disparity.
+
+        Args:
+            rgb: (B, 3, H, W).
+            values: (B, 1, h, w).
+
+        Returns:
+            (B, 1, H, W) in the dtype of ``values``.
+
+        Raises:
+            ValueError: the photo's size is not scale times the map's.
+
+        """
+        return self._compute_stages(rgb, values)[-1]
+
+    def _compute_stages(self, rgb: Tensor, values: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the denoised and the refined map, (B, 1, H, W) each, normalised to 0..1."""
+        expect_rgb_size(rgb, values, self.scale)
+        weight = self.denoise.last.weight
+        enlarged = 2 * upsample_linear_border(values, self.scale) - 1
+        denoised = enlarged + self.denoise(enlarged.to(weight.dtype)).to(values.dtype)
+        intensity = 2 * grey(rgb).to(weight.dtype) - 1
+        refined = denoised + self.refine(denoised.to(weight.dtype), intensity).to(values.dtype)
+        return (denoised + 1) / 2, (refined + 1) / 2
+
+
+class Denoising(nn.Module):
+    """The denoising network: a U-net whose coarsest level has residual blocks.
+
+    Args:
+        width: channels of the first layer; they double with each halving of the size.
+        halvings: how often the size is halved.
+
+    """
+
+    def __init__(self, width: int, halvings: int) -> None:
+        super().__init__()
+        self.halvings = halvings
+        widths = [width * 2**level for level in range(halvings + 1)]
+        self.first = nn.Conv2d(1, width, 3, padding=1)
+        self.down = nn.ModuleList(nn.Conv2d(n, 2 * n, 3, stride=2, padding=1) for n in widths[:-1])
+        self.blocks = nn.ModuleList(_PreactivatedBlock(widths[-1]) for _ in range(_BLOCKS))
+        self.up = nn.ModuleList(
+            nn.ConvTranspose2d(4 * n, n, 3, stride=2, padding=1, output_padding=1) for n in reversed(widths[:-1])
+        )
+        self.last = nn.Conv2d(2 * width, 1, 3, padding=1)
+        _initialise(self, self.last)
+
+    @property
+    def receptive_field_radius(self) -> int:
+        """Receptive-field radius in pixels of the map."""
+        coarsest = 2**self.halvings
+        return 2 + (coarsest - 1) + 2 * _BLOCKS * coarsest + 2 * (coarsest - 1)
+
+    def forward(self, depth: Tensor) -> Tensor:
+        """Map (B, 1, H, W) to the residual, (B, 1, H, W)."""
+        x = _relu(self.first(depth))
+        skips = [x]
+        for layer in self.down:
+            x = _relu(layer(x))
+            skips.append(x)
+        for block in self.blocks:
+            x = block(x)
+        for layer in self.up:
+            x = _relu(layer(torch.cat((skips.pop(), x), dim=1)))
+        return (_GAIN * self.last(torch.cat((skips.pop(), x), dim=1))).tanh()
+
+
+class Refinement(nn.Module):
+    """The refinement network: hypercolumns of depth and intensity.
+
+    Args:
+        width: channels at the map's own size; they double with each halving of it.
+        halvings: how often the size is halved.
+
+    """
+
+    def __init__(self, width: int, halvings: int) -> None:
+        super().__init__()
+        self.halvings = halvings
+        self.depth, self.intensity = (nn.Conv2d(1, width // 2, 3, padding=1) for _ in range(2))
+        self.joined = nn.Conv2d(width, width, 3, padding=1)
+        self.levels = nn.ModuleList()
+        before = 2 * width
+        for level in range(1, halvings + 1):
+            after = width * 2**level
+            layers = [nn.Conv2d(n, after, 3, padding=1) for n in (before, *[after] * level)]
+            self.levels.append(nn.ModuleList(layers))
+            before = 2 * after
+        columns = width * (2 ** (halvings + 1) - 1)
+        self.mix = nn.ModuleList([nn.Conv2d(columns, width, 1), nn.Conv2d(width, width // 4, 1)])
+        self.last = nn.Conv2d(width // 4, 1, 1)
+        _initialise(self, self.last)
+
+    @property
+    def receptive_field_radius(self) -> int:
+        """Receptive-field radius in pixels of the map: of the convolutions, the pooling and the enlargement."""
+        coarsest = 2**self.halvings
+        convolutions = 2 + sum((level + 1) * 2**level for level in range(1, self.halvings + 1))
+        return convolutions + (coarsest - 1) + coarsest
+
+    def forward(self, depth: Tensor, intensity: Tensor) -> Tensor:
+        """Map depth and intensity, (B, 1, H, W) each, to the residual, (B, 1, H, W)."""
+        first = _relu(torch.cat((self.depth(depth), self.intensity(intensity)), dim=1))
+        x = _relu(self.joined(first))
+        columns, features = [x], torch.cat((first, x), dim=1)
+        for layers in self.levels:
+            x = functional.max_pool2d(features, 2)
+            made = []
+            for layer in layers:  # type: ignore[attr-defined]
+                x = _relu(layer(x))
+                made.append(x)
+            features = torch.cat((made[0], x), dim=1)
+            columns.append(functional.interpolate(x, size=depth.shape[-2:], mode="bilinear", align_corners=False))
+        x = torch.cat(columns, dim=1)
+        for layer in self.mix:
+            x = _relu(layer(x))
+        return (_GAIN * self.last(x)).tanh()
+
+
+class _PreactivatedBlock(nn.Module):
+    """A residual block that applies its rectifiers before the convolutions."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.first, self.second = (nn.Conv2d(width, width, 3, padding=1) for _ in range(2))
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Map (B, C, H, W) to (B, C, H, W)."""
+        return x + self.second(functional.relu(self.first(functional.relu(x))))
+
+
+def _relu(x: Tensor) -> Tensor:
+    return functional.leaky_relu(x, _SLOPE)
+
+
+def _initialise(net: nn.Module, last: nn.Conv2d) -> None:
+    """Initialise the convolutions of a network; its last one gives no residual at first."""
+    for layer in net.modules():
+        if isinstance(layer, nn.Conv2d | nn.ConvTranspose2d):
+            nn.init.kaiming_normal_(layer.weight, a=_SLOPE)
+            if layer.bias is not None:
+                layer.bias.data.zero_()
+    last.weight.data.zero_()

@@ -1,0 +1,193 @@
+"""Sparse-to-Dense: a residual encoder-decoder that completes a few samples of depth.
+
+Ma and Karaman, *Sparse-to-Dense: Depth Prediction from Sparse Depth Samples and a Single Image*, ICRA 2018. The photo
+and an image that holds the samples, and 0 elsewhere, are one input of four channels (early fusion). ResNet-18 (He et
+al., CVPR 2016) encodes it at 1/32 of its size; a 1 x 1 convolution halves the channels; four up-projections (Laina et
+al., *Deeper Depth Prediction with Fully Convolutional Residual Networks*, 3DV 2016) double the size four times; a 3 x 3
+convolution and a bilinear enlargement make the map. It is trained with the mean absolute error.
+
+An up-projection inserts zeros between the pixels, then applies two branches, a 5 x 5 and a 3 x 3 convolution, and a
+5 x 5 convolution alone, and adds them. Zeros and a 5 x 5 convolution are one transposed convolution, which takes a
+quarter of the time.
+
+What differs from the original:
+
+- The samples are a low-resolution map: pixel (i, j) becomes the sample at (scale i + scale // 2, scale j + scale // 2),
+  the pixel next to the centre of its block. The original draws random pixels of the true depth.
+- It works on disparity, normalised by the low-resolution map to 1..2, so that 0 is no value.
+- The trunk has half the channels by default, and starts from random weights instead of ImageNet's.
+- The final enlargement aligns the images' outer edges, the original's the centres of their outer pixels.
+"""
+
+from __future__ import annotations
+
+import itertools
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from dsr.degradation.scales import check_scale
+from dsr.methods.networks.base import RangeNetwork, expect_rgb_size
+
+_STRIDE = 32
+"""The photo's pixels, along an axis, for each pixel of the encoder's result."""
+_STAGES = 4
+
+
+class SparseToDense(RangeNetwork):
+    """The network.
+
+    An image is processed as a whole, because the receptive field is wider than most images, in about 150 bytes for each
+    pixel of the photo.
+
+    Args:
+        scale: upsampling factor, 2, 4, 8 or 16.
+        width: channels of the first residual blocks, a multiple of 4; the original has 64.
+
+    Raises:
+        ValueError: a value is out of range.
+
+    """
+
+    def __init__(self, scale: int, width: int = 32) -> None:
+        super().__init__()
+        check_scale(scale)
+        if width < 4 or width % 4:
+            raise ValueError(f"width: expected a positive multiple of 4, got {width}")
+        self.scale, self.width = scale, width
+        widths = [width * 2**stage for stage in range(_STAGES)]
+        self.stem = nn.Sequential(nn.Conv2d(4, width, 7, 2, 3, bias=False), BatchNorm(width), nn.ReLU())
+        self.encoder = nn.Sequential()
+        for before, after in itertools.pairwise([width, *widths]):
+            self.encoder.extend([ResidualBlock(before, after), ResidualBlock(after, after)])
+        half = widths[-1] // 2
+        self.middle = nn.Sequential(nn.Conv2d(widths[-1], half, 1, bias=False), BatchNorm(half))
+        self.decoder = nn.Sequential(*(UpProjection(half // 2**stage) for stage in range(_STAGES)))
+        self.head = nn.Conv2d(half // 2**_STAGES, 1, 3, padding=1, bias=False)
+        for layer in self.modules():
+            if isinstance(layer, nn.Conv2d | nn.ConvTranspose2d):
+                nn.init.kaiming_normal_(layer.weight, mode="fan_out", nonlinearity="relu")
+        nn.init.kaiming_normal_(self.head.weight, nonlinearity="linear")
+
+    def arguments(self) -> dict[str, Any]:
+        """Return the constructor's arguments."""
+        return {"scale": self.scale, "width": self.width}
+
+    def forward(self, rgb: Tensor, values: Tensor) -> Tensor:
+        """Map an image and normalised low-resolution disparity to high-resolution disparity.
+
+        Args:
+            rgb: (B, 3, H, W).
+            values: (B, 1, h, w).
+
+        Returns:
+            (B, 1, H, W) in the dtype of ``values``.
+
+        Raises:
+            ValueError: the photo's size is not scale times the map's.
+
+        """
+        expect_rgb_size(rgb, values, self.scale)
+        height, width = rgb.shape[-2:]
+        bottom, right = (-n % max(_STRIDE // self.scale, 1) for n in values.shape[-2:])
+        samples = place_samples(functional.pad(values, (0, right, 0, bottom), mode="replicate") + 1, self.scale)
+        padded = functional.pad(rgb, (0, self.scale * right, 0, self.scale * bottom), mode="replicate")
+        x = torch.cat((padded, samples.to(rgb)), dim=1).to(self.head.weight.dtype)
+        x = functional.max_pool2d(self.stem(x), 3, stride=2, padding=1)
+        x = self.decoder(self.middle(self.encoder(x)))  # (B, C, H / 2, W / 2)
+        with torch.autocast(rgb.device.type, enabled=False):
+            dtype = torch.promote_types(x.dtype, torch.float32)
+            result = functional.conv2d(x.to(dtype), self.head.weight.to(dtype), padding=1)
+            result = functional.interpolate(result, scale_factor=2, mode="bilinear", align_corners=False)
+            return result[..., :height, :width].to(values.dtype) - 1
+
+
+class ResidualBlock(nn.Module):
+    """Two 3 x 3 convolutions and a shortcut; a block that changes the number of channels halves the size.
+
+    Args:
+        before: channels of the input.
+        after: channels of the output.
+
+    """
+
+    def __init__(self, before: int, after: int) -> None:
+        super().__init__()
+        stride = 1 if before == after else 2
+        self.branch = nn.Sequential(
+            nn.Conv2d(before, after, 3, stride, 1, bias=False),
+            BatchNorm(after),
+            nn.ReLU(),
+            nn.Conv2d(after, after, 3, 1, 1, bias=False),
+            BatchNorm(after),
+        )
+        self.shortcut = nn.Sequential()
+        if before != after:
+            self.shortcut.extend([nn.Conv2d(before, after, 1, stride, bias=False), BatchNorm(after)])
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Map (B, before, H, W) to (B, after, H, W), or half the size."""
+        return functional.relu(self.branch(x) + self.shortcut(x))
+
+
+class UpProjection(nn.Module):
+    """An up-projection, which doubles the size and halves the channels.
+
+    Args:
+        before: channels of the input.
+
+    """
+
+    def __init__(self, before: int) -> None:
+        super().__init__()
+        after = before // 2
+        self.upper = nn.Sequential(
+            _zeros_and_5x5(before, after),
+            BatchNorm(after),
+            nn.ReLU(),
+            nn.Conv2d(after, after, 3, padding=1, bias=False),
+            BatchNorm(after),
+        )
+        self.lower = nn.Sequential(_zeros_and_5x5(before, after), BatchNorm(after))
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Map (B, before, H, W) to (B, before / 2, 2 H, 2 W)."""
+        return functional.relu(self.upper(x) + self.lower(x))
+
+
+class BatchNorm(nn.Module):
+    """Batch normalisation without the library's counter of batches, so that its state consists of real numbers alone.
+
+    Args:
+        channels: channels of the input.
+
+    """
+
+    running_mean: Tensor
+    running_var: Tensor
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.weight = nn.Parameter(torch.ones(channels))
+        self.bias = nn.Parameter(torch.zeros(channels))
+        self.register_buffer("running_mean", torch.zeros(channels))
+        self.register_buffer("running_var", torch.ones(channels))
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Normalise (B, C, H, W) with the statistics of the batch in a training, and else with their moving average."""
+        return functional.batch_norm(x, self.running_mean, self.running_var, self.weight, self.bias, self.training)
+
+
+def place_samples(values: Tensor, scale: int) -> Tensor:
+    """Return (B, 1, scale h, scale w) with values (B, 1, h, w) at the pixel next to each block's centre, else 0."""
+    *lead, height, width = values.shape
+    blocks = values.new_zeros(*lead, height, scale, width, scale)
+    blocks[..., scale // 2, :, scale // 2] = values
+    return blocks.view(*lead, height * scale, width * scale)
+
+
+def _zeros_and_5x5(before: int, after: int) -> nn.ConvTranspose2d:
+    """Return the layer that inserts zeros right and below of each pixel, then applies a 5 x 5 convolution."""
+    return nn.ConvTranspose2d(before, after, 5, stride=2, padding=2, output_padding=1, bias=False)

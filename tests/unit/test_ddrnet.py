@@ -1,0 +1,83 @@
+"""DDRNet: its sizes against the published ones, its two stages, and what it starts from."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from small_scenes import maps, photos, plane_map
+
+from dsr.methods.classical.finite_differences import upsample_linear_border
+from dsr.methods.networks.ddrnet import DDRNet
+
+# (inputs, outputs, size) of the convolutions of the authors' convResnet and hypercolumn
+DENOISING = [(1, 32, 3), (32, 64, 3), (64, 128, 3), *[(128, 128, 3)] * 4, (256, 64, 3), (128, 32, 3), (64, 1, 3)]
+REFINEMENT = [(1, 8, 3), (1, 8, 3), (16, 16, 3), (32, 32, 3), (32, 32, 3), (64, 64, 3), (64, 64, 3), (64, 64, 3),
+              (112, 16, 1), (16, 4, 1), (4, 1, 1)]  # fmt: skip
+
+
+def _net(scale: int = 4) -> DDRNet:
+    """Return a small network with weights far from those that it starts with."""
+    torch.manual_seed(scale)
+    net = DDRNet(scale, denoising=4, refinement=4)
+    for parameter in net.parameters():
+        parameter.data.add_(0.3 * torch.randn_like(parameter))
+    return net
+
+
+def test_networks_have_the_parameters_of_the_published_code() -> None:
+    net = DDRNet(4)
+    for part, layers in ((net.denoise, DENOISING), (net.refine, REFINEMENT)):
+        expected = sum(inputs * outputs * size**2 + outputs for inputs, outputs, size in layers)
+        assert sum(each.numel() for each in part.parameters()) == expected
+
+
+@pytest.mark.parametrize("scale", [2, 4, 8])
+def test_new_network_is_bicubic_upsampling(scale: int) -> None:
+    torch.manual_seed(0)
+    values, rgb = maps(5, 6), photos(5 * scale, 6 * scale)
+    expected = upsample_linear_border(values, scale)
+    for stage in DDRNet(scale, denoising=4, refinement=4).upsample_stages(rgb, values):
+        torch.testing.assert_close(stage, expected, rtol=1e-12, atol=0)
+
+
+def test_refined_map_is_the_result_and_the_denoised_one_knows_no_photo() -> None:
+    net, values, rgb = _net(), maps(6, 7), photos(24, 28)
+    denoised, refined = net.upsample_stages(rgb, values)
+    assert torch.equal(refined, net.upsample(rgb, values))
+    others = net.upsample_stages(1 - rgb, values)
+    assert torch.equal(others[0], denoised)
+    assert not torch.allclose(others[1], refined, rtol=1e-4)
+
+
+def test_photo_counts_by_its_luma() -> None:
+    net, values, rgb = _net(), maps(6, 7), photos(24, 28)
+    grey = (0.299 * rgb[:, :1] + 0.587 * rgb[:, 1:2] + 0.114 * rgb[:, 2:]).expand(-1, 3, -1, -1)
+    torch.testing.assert_close(net.upsample(grey, values), net.upsample(rgb, values), rtol=1e-6, atol=0)
+
+
+def test_receptive_field_radius_bounds_the_influence_of_a_pixel() -> None:
+    for scale in (2, 4, 8):
+        net = _net(scale)
+        radius = scale * net.receptive_field_radius
+        columns = 2 * net.receptive_field_radius + 8
+        values = plane_map(4, columns).requires_grad_()
+        result = net.upsample(photos(4 * scale, columns * scale), values, torch.tensor([0.0, 60]).view(1, 2, 1, 1))
+        centre = scale * (columns // 2)
+        (gradient,) = torch.autograd.grad(result[..., centre].sum(), values)
+        reached = gradient.abs().sum(dim=(0, 1, 2)).nonzero().flatten()
+        distance = (scale * reached - centre).abs().max()
+        assert radius / 3 < float(distance) <= radius
+
+
+def test_gradients_reach_every_parameter() -> None:
+    net = _net()
+    sum(stage.square().mean() for stage in net.upsample_stages(photos(32, 32), maps(8, 8).float())).backward()
+    for name, parameter in net.named_parameters():
+        assert parameter.grad is not None, name
+        assert bool(parameter.grad.isfinite().all()), name
+        assert bool(parameter.grad.any()), name
+
+
+def test_sizes_that_do_not_halve_are_refused() -> None:
+    with pytest.raises(ValueError, match=r"^model: expected denoising of at least 1 and refinement a positive"):
+        DDRNet(4, refinement=6)
