@@ -60,7 +60,9 @@ class EdgeAttention(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         """Map (B, 64, H, W) to (B, 64, H, W)."""
         x = self.conv1(x)
-        coarse = functional.max_pool2d(self.conv2(x), 7, stride=3)  # a sixth of the size
+        coarse = self.conv2(x)
+        # a sixth of the size; the authors' code has no answer to images of less than 15 pixels
+        coarse = functional.max_pool2d(coarse, [min(7, size) for size in coarse.shape[-2:]], stride=3)
         coarse = self.conv3_(self.conv3(self.conv_max(coarse).relu()).relu())
         coarse = functional.interpolate(coarse, x.shape[-2:], mode="bilinear", align_corners=False)
         return self.conv4(coarse + self.conv_f(x)).sigmoid()
