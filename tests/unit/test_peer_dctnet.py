@@ -80,13 +80,13 @@ def test_transfer_edges_does_not_depend_on_the_chunks(monkeypatch) -> None:
 
 
 def test_dctnet_shares_half_of_the_kernels() -> None:
-    assert sum(each.numel() for each in DCTNet().parameters()) == 482865 - 16 * 16 * 9 - 16  # the file's, less unused
+    assert sum(each.numel() for each in DCTNet(4).parameters()) == 482865 - 16 * 16 * 9 - 16  # the file's, less unused
 
 
 @pytest.mark.parametrize("size", [(16, 23), (9, 12)])
 def test_dctnet_trains(size) -> None:
     torch.manual_seed(0)
-    net = DCTNet()
+    net = DCTNet(4)
     rgb, values = torch.rand(2, 3, *size), torch.rand(2, 1, *size)
     refined = net(rgb, values)
     assert refined.shape == values.shape

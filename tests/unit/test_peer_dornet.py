@@ -74,7 +74,7 @@ def test_deformable_conv3x3_has_the_right_gradients() -> None:
 
 def test_dornet_refines_each_image_of_a_batch_alone() -> None:
     torch.manual_seed(0)
-    net = DORNet().eval()
+    net = DORNet(4).eval()
     rgb, values = torch.rand(2, 3, 12, 17), torch.rand(2, 1, 12, 17)
     with torch.inference_mode():
         both = net(rgb, values)
@@ -84,7 +84,7 @@ def test_dornet_refines_each_image_of_a_batch_alone() -> None:
 
 def test_dornet_trains() -> None:
     torch.manual_seed(0)
-    net = DORNet()
+    net = DORNet(4)
     rgb, values = torch.rand(1, 3, 9, 12), torch.rand(1, 1, 9, 12)
     refined = net(rgb, values)
     assert refined.shape == values.shape

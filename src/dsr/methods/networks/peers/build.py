@@ -11,13 +11,17 @@ import torch
 from dsr.geometry.camera import RangeType
 from dsr.methods.networks.base import Precision
 from dsr.methods.networks.peers.base import PeerNetwork, PeerUpsampler, Range
+from dsr.methods.networks.peers.dctnet import DCTNet
+from dsr.methods.networks.peers.dornet import DORNet
 from dsr.methods.networks.peers.fdkn import FDKN
 from dsr.methods.networks.peers.files import load_peer, nearest_scale
 from dsr.methods.networks.peers.pgsr import PGSR
 from dsr.methods.networks.peers.svlrm import SVLRM
 from dsr.utils.hashing import file_hash
 
-PEERS: MappingProxyType[str, type[PeerNetwork]] = MappingProxyType({"fdkn": FDKN, "pgsr": PGSR, "svlrm": SVLRM})
+PEERS: MappingProxyType[str, type[PeerNetwork]] = MappingProxyType(
+    {"dctnet": DCTNet, "dornet": DORNet, "fdkn": FDKN, "pgsr": PGSR, "svlrm": SVLRM}
+)
 
 
 def build_peer(
@@ -32,8 +36,8 @@ def build_peer(
 ) -> PeerUpsampler:
     """Build a method from a file of weights that the network's authors published.
 
-    A file at one of the network's own factors must be for that factor. At any other factor, any of its files may be
-    taken.
+    At a whole factor that the network was trained for, the file must be for that factor. At any other factor, such as a
+    sensor's 8/3, any of its files may be taken.
 
     Args:
         peer: name of the network, a key of ``PEERS``.
@@ -56,7 +60,7 @@ def build_peer(
     if not weights.is_file():
         raise FileNotFoundError(f"{weights}: no such weights file")
     trained = _trained_scale(weights, network, weights_files)
-    if trained is not None and scale != trained and scale in weights_files.values():
+    if trained is not None and scale != trained and scale in weights_files.values() and float(scale).is_integer():
         raise ValueError(f"{weights}: weights are for scale {trained:g}, the run is at scale {scale:g}")
     net = load_peer(weights, network, trained or nearest_scale(weights_files, scale))
     return PeerUpsampler(net, range_type, range, precision, device)

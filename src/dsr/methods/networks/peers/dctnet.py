@@ -113,7 +113,7 @@ class DCTNet(PeerNetwork):
 
     title: ClassVar[str] = "DCTNet"
     checksums: ClassVar[Mapping[str, float]] = MappingProxyType(
-        {"383745e7223d0b2c": 4, "2526a628d307b79c": 8, "b9a75d3c1404c01d": 16}
+        {"383745e7223d0b2c": 4, "2526a628d307b79c": 8, "b9a75d3c1404c01d": 16, "87dee6a437887894": 8 / 3}
     )
     cost: ClassVar[Cost] = Cost(memory=2000, seconds=20)
 

@@ -8,7 +8,8 @@ depth's. The branch that learns the degradation by simulating it is needed for t
 
 from __future__ import annotations
 
-import re
+from collections.abc import Mapping
+from types import MappingProxyType
 from typing import ClassVar
 
 import torch
@@ -18,7 +19,7 @@ from torch.nn import functional
 from dsr.methods.base import Cost
 from dsr.methods.networks.peers.base import PeerNetwork, upsample_pillow
 from dsr.methods.networks.peers.deformable import deformable_conv3x3
-from dsr.methods.networks.peers.files import fold_batch_norm
+from dsr.methods.networks.peers.files import fold_batch_norm, rename
 
 FEATURES = 24
 _INNER = 6
@@ -175,12 +176,15 @@ class DORNet(PeerNetwork):
     Averages over the whole image steer it, so there are no tiles: large images need about 3 kB of memory per pixel.
     """
 
-    title = "DORNet-T"
+    title: ClassVar[str] = "DORNet-T"
+    checksums: ClassVar[Mapping[str, float]] = MappingProxyType(
+        {"f91a4b6387036348": 4, "6cbd299ec3a589c2": 8, "38bd20f150d138e3": 8 / 3}
+    )
     cost: ClassVar[Cost] = Cost(memory=3000, seconds=20)
 
-    def __init__(self) -> None:
+    def __init__(self, scale: float) -> None:
         """Make the layers."""
-        super().__init__()
+        super().__init__(scale)
         self.encoder = DegradationEncoder()
         self.depth_head, self.rgb_head = _conv(1, FEATURES), _conv(3, FEATURES)
         self.rgb_convs = nn.ModuleDict({str(i + 1): _conv(FEATURES, FEATURES) for i in range(_STAGES - 1)})
@@ -198,7 +202,7 @@ class DORNet(PeerNetwork):
             if weight is not None and conv.startswith("Enc.E_pre."):  # these have no bias of their own
                 tensors.setdefault(f"{conv}.bias", weight.new_zeros(weight.shape[:1]))
             fold_batch_norm(tensors, conv, norm)
-        return {_rename(name): value for name, value in tensors.items()}
+        return rename(tensors, _RENAMED)
 
     def enlarge(self, values_lr: Tensor, size: tuple[int, int]) -> Tensor:
         """Enlarge as Pillow's bicubic filter does."""
@@ -225,10 +229,3 @@ class DORNet(PeerNetwork):
 def _conv(inputs: int, outputs: int, bias: bool = True) -> nn.Conv2d:
     """Make a 3 x 3 convolution that keeps the size."""
     return nn.Conv2d(inputs, outputs, 3, padding=1, bias=bias)
-
-
-def _rename(name: str) -> str:
-    """Return the name here of a tensor of the authors' files."""
-    for pattern, replacement in _RENAMED.items():
-        name = re.sub(pattern, replacement, name)
-    return name
