@@ -44,7 +44,7 @@ def find_frames(root: Path, split: Split | None = None, measured: bool = False) 
     Args:
         root: directory of the data set, or one above it.
         split: of the images, None for both; those in ``RGB`` and ``Depth`` are test images.
-        measured: whether to find images with the phone's depth alone.
+        measured: whether to find only images that have the phone's depth.
 
     Raises:
         ValueError: there is no such directory.

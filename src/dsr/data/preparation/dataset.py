@@ -26,6 +26,7 @@ from dsr.synthetic.rendering import Rendering, cache_directory, load_or_render
 from dsr.utils.hashing import file_hash, hash_of_code
 
 _MIN_SIZE = 32
+_MAX_LISTED = 30
 _READING_CODE = ("geometry/camera.py", "data/preparation", "data/formats")
 _MAX_HASHED = 1 << 28
 """Largest size in bytes of files whose content is hashed."""
@@ -180,10 +181,11 @@ class PreparedDataset:
         if scenes is None:
             missing, total = [scene for scene in named if scene not in found], count or len(named)
             if missing or len(named) < total:
+                listed = ", ".join(missing[:_MAX_LISTED]) or "all scenes"
+                rest = f" and {len(missing) - _MAX_LISTED} more" if len(missing) > _MAX_LISTED else ""
                 raise ValueError(
-                    f"dataset={name}: expected {', '.join(missing) or 'all scenes'} in {folder}, got "
-                    f"{len(named) - len(missing)} of {total} scenes; {remedy}; "
-                    "or use what is there: dataset.scenes=found"
+                    f"dataset={name}: expected {listed}{rest} in {folder}, got {len(named) - len(missing)} of {total} "
+                    f"scenes; {remedy}; or use what is there: dataset.scenes=found"
                 )
             scenes = named
         self._scenes = select_scenes(list(found), scenes)
