@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -11,10 +12,12 @@ import pytest
 import torch
 from torch import Tensor
 
+from dsr.data.folder import Folder
 from dsr.data.simgeo import SimGeo
 from dsr.degradation.downsampling import Downsampling, make_sample
 from dsr.methods.networks.base import NetworkUpsampler
 from dsr.methods.networks.trained import build_trained, packaged_weights
+from dsr.methods.registry import build_method, read_method
 from dsr.metrics.catalogue import Metric, catalogue, score_image
 from dsr.metrics.lpips import load_lpips
 from dsr.metrics.metric import WORST
@@ -66,6 +69,20 @@ def test_visual_loss_shows_on_simgeo(shared: Path, scale: int) -> None:
         scores = {model: _worst(_packaged(model, scale)(sample), sample, metrics) for model in ("msg", "msg_v")}
         gain = {metric: scores["msg_v"][metric] / scores["msg"][metric] for metric in VISUAL}
         assert max(gain.values()) < 1.0, (name, gain)
+
+
+@pytest.mark.parametrize("name", ["ddrnet_x4", "ddrnet_x8"])
+def test_scores_on_lucy_are_those_that_the_recipe_expects(shared: Path, name: str) -> None:
+    header = (REPOSITORY / "conf" / "experiment" / f"{name}.yaml").read_text(encoding="utf-8")
+    found = re.search(r"Expected: .*Lucy (\d+) / (\d+) / (\d+),", header)
+    assert found is not None
+    model, _, scale = name.rpartition("_x")
+    method = build_method(read_method(model, int(scale)), int(scale))
+    scene = Folder(str(shared / "scenes"), ["lucy"]).load("lucy")
+    sample = make_sample(scene, int(scale), Downsampling("box"), method.range_type)
+    scores = _worst(method(sample), sample, catalogue())
+    measured = [1000 * scores["RMSE_v"], 1000 * scores["DSSIM_v"], 1000 * scores["RMSE_d"]]
+    assert measured == pytest.approx([float(each) for each in found.groups()], abs=0.6)
 
 
 def _packaged(model: str, scale: int) -> NetworkUpsampler:

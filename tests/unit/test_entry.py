@@ -43,13 +43,14 @@ DATASETS = (
     "sintel, sunrgbd, tartanair, tofmark"
 )
 METHODS = (
-    "anisotropic_diffusion, bicubic, bilinear, dctnet, dg, dip, dip_v, dip_v_warm, dornet, eg, facets, "
+    "anisotropic_diffusion, bicubic, bilinear, dctnet, ddrnet, dg, dip, dip_v, dip_v_warm, dornet, eg, facets, "
     "fast_global_smoother, fdkn, guided_filter, joint_bilateral, msg, msg_v, msg_v_noisy, nearest, pdn, pgsr, srfs, "
     "svlrm, tgv"
 )
 EXPERIMENTS = (
-    "dg_x4, dg_x8, downsampling_mismatch, facets_x4, facets_x8, msg_v_x4, msg_v_x4_noisy, msg_v_x4_stage1, "
-    "msg_v_x4_stage2, msg_v_x4_stage3, msg_v_x8, msg_v_x8_stage1, msg_x4, msg_x8, noise, paper_tables, pdn_x4, pdn_x8"
+    "ddrnet_x4, ddrnet_x8, dg_x4, dg_x8, downsampling_mismatch, facets_x4, facets_x8, msg_v_x4, msg_v_x4_noisy, "
+    "msg_v_x4_stage1, msg_v_x4_stage2, msg_v_x4_stage3, msg_v_x8, msg_v_x8_stage1, msg_x4, msg_x8, noise, "
+    "paper_tables, pdn_x4, pdn_x8"
 )
 USAGE_ERRORS = {
     "dataset=fodler": f"dataset=fodler: unknown; expected one of {DATASETS}",

@@ -21,6 +21,7 @@ FULL = ["trainer=full", "dataset.count=800"]
 PDN = ["model=pdn", *FULL, "trainer.average=0.998"]
 DG = ["model=dg", "model.depth_loss=lap1", "model.visual=true", "dataset.count=800", "trainer.weight_decay=0",
       "trainer.average=0.998", "precision=float32"]  # fmt: skip
+DDRNET = ["model=ddrnet", "dataset.count=360", "trainer.average=0.998", "trainer.photo=0", "precision=float32"]
 FACETS = ["model=facets", *FULL, "trainer.patch=128", "trainer.batch=4", "trainer.photo=0"]
 MSG_V = ["model=msg_v", *FULL, "loss.w=1.5"]
 RECIPES = {
@@ -44,6 +45,9 @@ RECIPES = {
               "trainer.warmup=100", "trainer.patch=64", "trainer.batch=5"],
     "dg_x8": [*DG, "scale=8", "trainer.steps=1200", "trainer.validate_every=400", "trainer.learning_rate=0.01",
               "trainer.warmup=50", "trainer.batch=3"],
+    "ddrnet_x4": [*DDRNET, "trainer.steps=4000", "trainer.warmup=200", "trainer.patch=64", "trainer.batch=4"],
+    "ddrnet_x8": [*DDRNET, "scale=8", "trainer.steps=2000", "trainer.learning_rate=5e-4", "trainer.warmup=50",
+                  "trainer.batch=2"],
 }  # fmt: skip
 """The overrides of ``train.py`` that each training had, but for ``trainer.init``."""
 STARTS = {
@@ -54,6 +58,7 @@ STARTS = {
     "msg_v_x4_noisy": "src/dsr/methods/weights/msg_v_x4.safetensors",
     "pdn_x8": "outputs/train/pdn_x4/weights.safetensors",
     "dg_x8": "outputs/train/dg_x4/weights.safetensors",
+    "ddrnet_x8": "outputs/train/ddrnet_x4/weights.safetensors",
 }
 """What they started from."""
 
