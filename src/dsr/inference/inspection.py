@@ -8,7 +8,7 @@ from torch import Tensor
 from dsr.degradation.downsampling import Downsampling
 from dsr.geometry.camera import Camera
 from dsr.inference.planning import OWN_SIZE, USUAL_SCALE
-from dsr.methods.dip.noise import estimate_noise, normal_noise_deg
+from dsr.methods.noise import estimate_noise, normal_noise_deg
 
 CLEAN, NOISY = "facets", "msg_v_noisy"
 LARGEST_TILT = 8.0
@@ -22,7 +22,7 @@ def suited_method(depth: Tensor, camera: Camera, scale: int | None = None) -> st
     """Return the network for a depth map: one that was trained on noisy depth where the map is noisy.
 
     RMSE_v on Lucy and Plant at x4, by how many degrees the noise tilts the low-resolution map's normals
-    (:func:`dsr.methods.dip.noise.normal_noise_deg`):
+    (:func:`dsr.methods.noise.normal_noise_deg`):
 
     | tilt | 2, 2 | 7, 5 | 12, 9 | 22, 17 | 37, 30 |
     | --- | --- | --- | --- | --- | --- |

@@ -25,7 +25,7 @@ from dsr.degradation.downsampling import Downsampling, scene_generator
 from dsr.geometry.camera import RangeType
 from dsr.methods.base import Cost
 from dsr.methods.dip.callbacks import Keep, Provenance, checkpoint_of, cost_of_step
-from dsr.methods.dip.noise import estimate_noise, normal_noise_deg
+from dsr.methods.noise import estimate_noise, normal_noise_deg
 from dsr.methods.dip.optimisation import PriorOptimisation, PriorSettings
 from dsr.methods.dip.problem import DataLoss, ImageProblem, PriorObjective
 from dsr.methods.dip.skip_net import Padding
