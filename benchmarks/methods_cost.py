@@ -27,8 +27,8 @@ from dsr.degradation.downsampling import Downsampling, make_sample
 from dsr.methods.registry import build_method, read_method
 
 METHODS = (
-    "bicubic,guided_filter,joint_bilateral,fast_global_smoother,anisotropic_diffusion,tgv,srfs,eg,pdn,dg,ddrnet,msg_v,"
-    "facets"
+    "bicubic,bilateral,guided_filter,joint_bilateral,fast_global_smoother,anisotropic_diffusion,tgv,srfs,eg,"
+    "pdn,dg,ddrnet,msg_v,facets"
 )
 
 

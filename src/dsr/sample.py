@@ -19,7 +19,7 @@ from torch import Tensor
 
 from dsr.geometry.camera import Camera, to_range
 from dsr.utils.files import read_arrays, replacing
-from dsr.utils.ratios import as_ratio, round_ratio
+from dsr.utils.ratios import as_ratio, fits_ratio, round_ratio
 
 
 class AllHolesError(ValueError):
@@ -74,7 +74,8 @@ class Scene:
         depth: (1, H, W) true depth, or None where it is not known.
         measured: low-resolution depth maps that a sensor measured, (1, h, w) by the ratio of the photo's width to w: 1,
             2.667, 4. At a whole ratio, the map has H // ratio x W // ratio pixels and leaves out what remains of the
-            photo at the bottom and the right; at any other it covers the whole photo, to within a pixel.
+            photo at the bottom and the right; at any other it covers the whole photo, and their aspect ratios may
+            differ by 2 %.
         notes: what somebody who reads the scores should know, such as "depth is not metric".
         unit: the unit in which the data set's benchmark prints errors.
 
@@ -139,8 +140,8 @@ class DepthSample:
     Args:
         dataset, scene: names; together they identify the sample.
         rgb: (3, H, W) floating point, in [0, 1].
-        depth_lr: (1, h, w) low-resolution depth; H = h * scale and W = w * scale, to within a low-resolution pixel
-            where the scale is not whole.
+        depth_lr: (1, h, w) low-resolution depth; H = h * scale and W = w * scale, where the scale is not whole to
+            within a low-resolution pixel or 2 %.
         camera: the camera of the photo and of ``depth``.
         camera_lr: the camera of ``depth_lr``.
         scale: the upsampling factor W / w: 1, 2.667, 4.
@@ -287,8 +288,7 @@ def _reduced_size(size: tuple[int, int], ratio: float, size_lr: Sequence[int]) -
     """Return the height and width that a map at a ratio has to have; ``size_lr`` itself where it is near enough."""
     if isinstance(ratio, int):
         return size[0] // ratio, size[1] // ratio
-    near = all(abs(n / ratio - n_lr) <= 1 for n, n_lr in zip(size, size_lr, strict=True))
-    height, width = size_lr if near else (round(n / ratio) for n in size)
+    height, width = size_lr if fits_ratio(size, size_lr, ratio) else (round(n / ratio) for n in size)
     return height, width
 
 

@@ -86,6 +86,7 @@ PREDICTING_PACKAGES = (
     "dsr.data",
     "dsr.degradation",
     "dsr.training.module",
+    "dsr.inference",
 )
 """Where what makes predictions lies: all that these import determines a prediction, too."""
 NOT_PREDICTING = (
@@ -98,10 +99,9 @@ NOT_PREDICTING = (
     "utils/units.py",
     "evaluation/__init__.py",
     "evaluation/store.py",
-    "inference",
     "data/download",
 )
-"""What they import and what does not determine one: files, texts, downloads; ``dsr.upsample`` is imported by name."""
+"""What they import and what does not determine one: files, texts, downloads."""
 
 
 def lacking(modules, code=PREDICTING_CODE):

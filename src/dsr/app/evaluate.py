@@ -5,7 +5,6 @@ from __future__ import annotations
 import functools
 import random
 import shutil
-import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -17,6 +16,7 @@ from omegaconf import DictConfig
 from rich.console import Console
 
 from dsr.app import run_directory as rundir
+from dsr.app.methods import adapt_method, hash_weights, weights_of
 from dsr.app.metrics import check_metrics, chosen_metrics, metric_collection
 from dsr.app.schema import EvalConfig, given_keys, plain_config, user_directories
 from dsr.app.training_runs import studies_of_run
@@ -24,8 +24,9 @@ from dsr.data.base import SceneSource, prepare_scenes
 from dsr.degradation.scales import NATIVE, match_ratio
 from dsr.evaluation.predict import Evaluation, Outcome, StalePredictionError, failure_line, predict
 from dsr.evaluation.score import score
+from dsr.inference.adapter import AnyScale
 from dsr.methods.dip.upsampler import WORKSPACE
-from dsr.methods.registry import build_method, find_weights, target_paths
+from dsr.methods.registry import build_method, target_paths
 from dsr.metrics.formats import Formats
 from dsr.report.dashboard import save_dashboard
 from dsr.report.tables import score_table
@@ -33,7 +34,6 @@ from dsr.sample import DepthSample
 from dsr.utils.builder import ConfigError, build, takes, trait
 from dsr.utils.console import ConsoleProgress, open_console, print_error, show
 from dsr.utils.devices import fast_precision, pick_device
-from dsr.utils.hashing import file_hash
 from dsr.viz.panels import save_picture
 
 
@@ -67,13 +67,15 @@ def _evaluate(plain: dict[str, Any], source: SceneSource | None) -> pd.DataFrame
     source = source or _source(settings)
     plain = {**plain, "precision": _precision(settings, device), "scale": _scale(settings, source)}
     settings = EvalConfig.of(plain)
-    weights = _weights(settings)
+    adapted = adapt_method(settings, device)
+    weights = weights_of(settings) if adapted is None else None
+    files = adapted.weights() if adapted is not None else [weights] if weights is not None else []
     targets = target_paths(settings.method, user_directories())
-    identity = rundir.identity_of(plain, None if weights is None else file_hash(weights), device, targets)
+    identity = rundir.identity_of(plain, hash_weights(files), device, targets)
     folder = Path(settings.output_dir or rundir.default_directory("eval", plain, identity)).expanduser()
     progress = ConsoleProgress(console)
     given = {"device": device, "weights": weights, "workspace": folder, "display": progress}
-    study = _study(settings, identity, given, source)
+    study = _study(settings, identity, given, source, adapted)
     check_metrics(settings.metrics)
     rundir.claim(folder, plain, identity)
     if settings.overwrite:
@@ -118,7 +120,11 @@ def _scale(settings: EvalConfig, source: SceneSource) -> float:
 
 
 def _study(
-    settings: EvalConfig, identity: Mapping[str, Any], given: Mapping[str, Any], source: SceneSource
+    settings: EvalConfig,
+    identity: Mapping[str, Any],
+    given: Mapping[str, Any],
+    source: SceneSource,
+    adapted: AnyScale | None,
 ) -> Evaluation:
     """Build the evaluation that the configuration describes.
 
@@ -127,13 +133,14 @@ def _study(
         identity: what identifies its predictions.
         given: values that a method may take in addition to the configuration's: device, weights, workspace, display.
         source: the data set.
+        adapted: the method, if it does not take the scale itself; None to build it.
 
     """
     downsampling = build("downsampling", settings.downsampling)
     name = str(settings.method["name"])
     if "downsampling.assumed" in given_keys() and not takes("method", settings.method, "downsampling"):
         raise ConfigError(f"downsampling.assumed: method={name} assumes no downsampling model; leave it out")
-    method = build_method(
+    method = adapted or build_method(
         settings.method,
         settings.scale,
         directories=user_directories(),
@@ -157,6 +164,7 @@ def _study(
         noise=build("noise", settings.noise),
         holes=build("holes", settings.holes),
         label=_flagged(str(settings.method.get("label", name)), method, " ({})"),
+        note=None if adapted is None else adapted.describe,
     )
 
 
@@ -185,17 +193,6 @@ def _problem_name(settings: EvalConfig) -> str:
             values = ["none" if value is None else f"{value:g}" for value in settings_of]
             parts.append("-".join((str(group["name"]), *values)))
     return "+".join(parts)
-
-
-def _weights(settings: EvalConfig) -> Path | None:
-    """Return the file of weights for the method; None for a method without weights."""
-    given = None if settings.weights is None else Path(settings.weights).expanduser()
-    if takes("method", settings.method, "weights"):
-        return find_weights(settings.method, settings.scale, given)
-    if given is not None and not given.is_dir():  # a directory serves all methods of a multirun
-        name = settings.method["name"]
-        print(f"note: method={name} has no weights; weights={given} is not used", file=sys.stderr)  # noqa: T201
-    return None
 
 
 def _seed(seed: int) -> None:

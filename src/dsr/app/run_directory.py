@@ -22,7 +22,7 @@ from dsr.utils.versions import versions
 _RECORD = "versions.json"
 _NOT_IDENTITY = ("output_dir", "overwrite", "metrics", "weights", "resume", "run")  # weights count by their content
 PREDICTING_CODE = (
-    "sample.py", "degradation", "geometry", "metrics", "synthetic", "methods", "data", "training",
+    "sample.py", "degradation", "geometry", "metrics", "synthetic", "methods", "data", "training", "inference",
     "utils/builder.py", "utils/config_files.py", "utils/devices.py", "utils/hashing.py", "utils/lightning.py",
     "utils/progress.py", "utils/ratios.py", "utils/validation.py", "evaluation/predict.py",
 )  # fmt: skip

@@ -120,6 +120,11 @@ class EvalConfig(RunConfig):
     weights: str | None = None
     run: str | None = None
 
+    @property
+    def measured(self) -> bool:
+        """Whether the low-resolution maps are the scenes' own."""
+        return str(self.downsampling.get("target")).endswith(".Measured")
+
     def check(self) -> None:
         """Check values beyond their types.
 
@@ -128,7 +133,7 @@ class EvalConfig(RunConfig):
 
         """
         super().check()
-        if not str(self.downsampling.get("target")).endswith(".Measured"):
+        if not self.measured:
             _expect_factor(self.scale)
         number = isinstance(self.scale, (int, float)) and not isinstance(self.scale, bool) and self.scale >= 1
         if not number and self.scale != NATIVE:

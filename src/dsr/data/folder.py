@@ -26,7 +26,7 @@ from dsr.data.base import SceneSelection, select_scenes
 from dsr.data.formats.files import MAP_SUFFIXES, CameraFile, read_camera, read_map, read_mask, read_rgb
 from dsr.geometry.camera import Camera, RangeType, from_range
 from dsr.sample import Scene
-from dsr.utils.ratios import round_ratio
+from dsr.utils.ratios import fits_ratio, round_ratio
 
 _RGB_NAMES = ("rgb.png", "rgb.jpg", "rgb.jpeg")
 _QUANTITIES = ("depth", "disparity")
@@ -112,13 +112,13 @@ def _read_measured(path: Path, quantity: str, factor: str, description: CameraFi
             raise ValueError(f"{path}: expected a factor that the {camera.height} x {camera.width} photo allows")
         return int(factor), _read_depth(path, quantity, description, camera.downscale(int(factor)))
     height, width = read_map(path).shape
-    ratios = camera.width / width, camera.height / height
-    if min(ratios) < 1 or abs(width * camera.height / camera.width - height) > 1:
+    camera_lr, ratio = camera.reduce(width, height), camera.ratio_to(width, height)
+    if ratio < 1 or not fits_ratio((camera.height, camera.width), (height, width), ratio):
         raise ValueError(
             f"{path}: expected the aspect ratio of the {camera.height} x {camera.width} photo (height x width) and no "
             f"more pixels, got {height} x {width}"
         )
-    return camera.ratio_to(width, height), _read_depth(path, quantity, description, camera.reduce(width, height))
+    return ratio, _read_depth(path, quantity, description, camera_lr)
 
 
 def _first(folder: Path, names: Sequence[str]) -> Path:

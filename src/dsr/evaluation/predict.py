@@ -11,8 +11,8 @@ from __future__ import annotations
 import json
 import re
 import time
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -50,6 +50,7 @@ class Evaluation:
         noise: noise of the low-resolution maps.
         holes: holes of the low-resolution maps.
         label: displayed name of the method; empty for ``method_name``.
+        note: says of a sample how the method is run, for a note on the scores; None for nothing to say.
 
     """
 
@@ -65,6 +66,7 @@ class Evaluation:
     noise: Noise | None = None
     holes: Holes | None = None
     label: str = ""
+    note: Callable[[DepthSample], str] | None = None
 
     def sample(self, scene: str) -> DepthSample:
         """Return the method's input for a scene.
@@ -75,7 +77,8 @@ class Evaluation:
         """
         loaded = self.source.load(scene)
         kind = self.method.range_type
-        return make_sample(loaded, self.scale, self.downsampling, kind, self.noise, self.seed, self.holes)
+        sample = make_sample(loaded, self.scale, self.downsampling, kind, self.noise, self.seed, self.holes)
+        return sample if self.note is None else replace(sample, notes=(*sample.notes, self.note(sample)))
 
     def stored_config(self, scene: str) -> dict[str, Any]:
         """Return the settings that a prediction of this scene depends on."""

@@ -22,7 +22,7 @@ from dsr.utils.ratios import as_ratio
 from dsr.utils.validation import describe
 
 METHOD_ORDER = (
-    "Nearest", "Bilinear", "Bicubic", "GF", "JBU", "FGS", "Diffusion", "TGV",
+    "Nearest", "Bilinear", "Bicubic", "Bilateral", "GF", "JBU", "FGS", "Diffusion", "TGV",
     "SRfS", "EG", "PDN", "DG", "DIP", "MSG", "DIP-V", "MSG-V",
 )  # fmt: skip
 """Order of the methods: simple ones, then those of the paper in the order of its tables; others follow."""

@@ -56,6 +56,7 @@ class Ability:
         steps: for each factor, the factors of the calls that give it; empty for any factor in one call.
         optimises: whether it optimises a network for each picture.
         cost: the method's rough cost; None if it states none.
+        own_resolution: whether it takes a depth map of the photo's own size as it is.
 
     """
 
@@ -63,6 +64,7 @@ class Ability:
     steps: Mapping[int, tuple[int, ...]]
     optimises: bool = False
     cost: Cost | None = None
+    own_resolution: bool = False
 
 
 @dataclass(frozen=True)
@@ -74,7 +76,8 @@ class Plan:
         scale: the approximate upsampling factor.
         steps: the networks' factors, one after the other; empty for interpolation.
         coarsened: the factor by which depth of the photo's own size is downsampled first; 1 for low-resolution depth.
-        text: the plan and the memory that it takes, in one line.
+        way: the sizes and the method in one line.
+        text: the same and the memory that it takes.
 
     """
 
@@ -82,6 +85,7 @@ class Plan:
     scale: int
     steps: tuple[int, ...]
     coarsened: int
+    way: str
     text: str
 
 
@@ -101,6 +105,9 @@ def read_ability(method: str, directories: Sequence[Path] = (), settings: Mappin
     target = load_target("method", node)
     if target is Interpolation:
         return Ability("interpolation", {})
+    optimises, cost = bool(trait("method", node, "optimises")), trait("method", node, "cost")
+    if trait("method", node, "own_resolution"):
+        return Ability("sample", {}, optimises, cost, own_resolution=True)
     factors: tuple[int, ...] = SCALES
     if takes("method", node, "weights"):
         nodes = {scale: read_method(method, scale, settings, directories) for scale in SCALES}
@@ -111,8 +118,8 @@ def read_ability(method: str, directories: Sequence[Path] = (), settings: Mappin
     steps: dict[int, tuple[int, ...]] = {factor: (factor,) for factor in factors}
     if target is build_trained:
         return Ability("network", _with_second_step(steps))
-    cost = PEERS[node["peer"]].cost if target is build_peer else trait("method", node, "cost")
-    return Ability("sample", steps, bool(trait("method", node, "optimises")), cost)
+    cost = PEERS[node["peer"]].cost if target is build_peer else cost
+    return Ability("sample", steps, optimises, cost)
 
 
 def _with_second_step(steps: dict[int, tuple[int, ...]]) -> dict[int, tuple[int, ...]]:
@@ -150,8 +157,9 @@ def plan(
     """
     ability = read_ability(method, directories, settings)
     ratio = _ratio(photo_size, depth_size)
-    own = ratio <= OWN_SIZE
-    chosen = _scale(scale, USUAL_SCALE if own else ratio, method, ability)
+    as_it_is = ratio <= OWN_SIZE and ability.own_resolution and scale in (None, 1)
+    own = ratio <= OWN_SIZE and not as_it_is
+    chosen = 1 if as_it_is else _scale(scale, USUAL_SCALE if own else ratio, method, ability)
     steps = ability.steps.get(chosen, ())
     pixels = math.prod(photo_size)
     if ability.optimises and pixels > LARGEST_OPTIMISED:
@@ -165,13 +173,11 @@ def plan(
         f" in two steps ({', '.join(f'x{step}' for step in steps)})" if len(steps) > 1 else ""
     )
     worked_on = _worked_on(photo_size, depth_size, steps, coarsened)
-    text = (
-        f"{depth_size[0]} x {depth_size[1]} depth {before}to {photo_size[0]} x {photo_size[1]} by {what}, "
-        f"in about {_memory(pixels, worked_on, ability) / 2**30:.1f} GB of memory"
-    )
+    way = f"{depth_size[0]} x {depth_size[1]} depth {before}to {photo_size[0]} x {photo_size[1]} by {what}"
+    text = f"{way}, in about {_memory(pixels, worked_on, ability) / 2**30:.1f} GB of memory"
     if ability.cost is not None:
         text += f" and {_duration(ability.cost.seconds * worked_on / 1e6)} on two CPU cores"
-    return Plan(method, chosen, steps, coarsened, text)
+    return Plan(method, chosen, steps, coarsened, way, text)
 
 
 def _ratio(photo_size: tuple[int, int], depth_size: tuple[int, int]) -> float:

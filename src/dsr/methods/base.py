@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from typing import Literal, Protocol, runtime_checkable
 
 from torch import Tensor
 
@@ -29,6 +29,12 @@ class Cost:
 
     memory: float
     seconds: float
+
+
+Ratios = Literal["any", "whole"]
+"""The scales that a method takes beyond 2, 4, 8 and 16: any of 1 or more, or whole ones of 1 or more. A class states it
+as its attribute ``ratios``; one without it takes no other, see :mod:`dsr.inference.adapter`. At 1 the depth map has the
+photo's size: a filter smooths it, and a method that reproduces block means only fills its holes."""
 
 
 class Upsampler(Protocol):

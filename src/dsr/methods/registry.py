@@ -121,10 +121,11 @@ def find_weights(node: Mapping[str, Any], scale: int, given: Path | None = None)
 
 def has_weights(node: Mapping[str, Any], scale: int) -> bool:
     """Return whether the weights that a method's node names are there, for that scale."""
-    if node.get("weights") is not None:
-        path = Path(str(node["weights"])).expanduser()
-        if path.is_dir():
-            return any((path / file).is_file() for file in _files_for(node, scale))
+    path = None if node.get("weights") is None else Path(str(node["weights"])).expanduser()
+    files = _files_for(node, scale)
+    if path is not None and path.is_dir() and files:
+        return any((path / file).is_file() for file in files)
+    if path is not None and not path.is_dir():
         return path.is_file() and (not is_dsr_weights(path) or read_header(path)["arguments"].get("scale") == scale)
     packaged = node.get("weights_packaged")
     return packaged is not None and packaged_weights(str(packaged)) is not None

@@ -30,7 +30,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from dsr.geometry.camera import RangeType, from_range, to_range
-from dsr.methods.base import Cost, expect_limits, whole_scale
+from dsr.methods.base import Cost, Ratios, expect_limits, whole_scale
 from dsr.methods.classical.convergence import CHECK_EVERY, Movement, history_of
 from dsr.methods.classical.finite_differences import box_mean, extend_linearly, upsample_linear_border
 from dsr.methods.networks.inpainting import inpaint
@@ -71,6 +71,7 @@ class AnisotropicDiffusion:
 
     range_type: RangeType = "disparity"
     cost: ClassVar[Cost] = Cost(120, 2)
+    ratios: ClassVar[Ratios] = "whole"
 
     def __init__(
         self,

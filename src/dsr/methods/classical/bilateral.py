@@ -6,8 +6,8 @@ while a depth step of several ``sigma_depth`` stays. Where the photo has more pi
 then interpolated: bilinear means of the planes that its pixels stand for, see
 :mod:`dsr.methods.classical.photo_guided`.
 
-Holes have no weight and stay holes; with ``fill_holes`` they are inpainted after filtering. OpenCV does the filtering,
-in float32, and repeats its table of weights over the map's whole range: a single pixel at a kilometre costs accuracy.
+Holes have no weight and stay holes; with ``fill_holes`` they are inpainted after filtering. OpenCV filters, in float32,
+with weights from a table of 4096 entries over the map's range of depth.
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal, get_args
+from typing import ClassVar, Literal, get_args
 
 import numpy as np
 import torch
@@ -10,6 +10,7 @@ from scipy import ndimage
 from torch import Tensor
 
 from dsr.geometry.camera import Camera, RangeType, from_range, to_range
+from dsr.methods.base import Ratios
 from dsr.methods.networks.maps import lr_coordinates
 from dsr.sample import DepthSample
 from dsr.utils.progress import Steps
@@ -34,6 +35,7 @@ class Interpolation:
     """
 
     range_type: RangeType = "perspective"
+    ratios: ClassVar[Ratios] = "any"
 
     def __init__(self, order: Order = "bicubic", *, fill_holes: bool = False) -> None:
         if order not in get_args(Order):

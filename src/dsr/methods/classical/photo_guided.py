@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from dsr.geometry.camera import RangeType, from_range
-from dsr.methods.base import Cost
+from dsr.methods.base import Cost, Ratios
 from dsr.methods.networks.inpainting import inpaint
 from dsr.methods.networks.maps import lr_coordinates
 from dsr.sample import DepthSample
@@ -85,6 +85,7 @@ class GuidedMethod(ABC):
 
     range_type: RangeType = "disparity"
     cost: ClassVar[Cost] = Cost(600, 2)
+    ratios: ClassVar[Ratios] = "any"
 
     def __init__(self, *, fill_holes: bool = False, slopes: bool = True) -> None:
         self._fill_holes = fill_holes

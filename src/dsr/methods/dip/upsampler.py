@@ -23,15 +23,15 @@ from torch.utils.data import DataLoader
 
 from dsr.degradation.downsampling import Downsampling, scene_generator
 from dsr.geometry.camera import RangeType
-from dsr.methods.base import Cost
+from dsr.methods.base import Cost, Ratios
 from dsr.methods.dip.callbacks import Keep, Provenance, checkpoint_of, cost_of_step
-from dsr.methods.noise import estimate_noise, normal_noise_deg
 from dsr.methods.dip.optimisation import PriorOptimisation, PriorSettings
 from dsr.methods.dip.problem import DataLoss, ImageProblem, PriorObjective
 from dsr.methods.dip.skip_net import Padding
 from dsr.methods.dip.stopping import Fixed, Oracle, Residual, Stopping, StoppingName, Variance
 from dsr.methods.networks.base import DTYPES, Precision
 from dsr.methods.networks.trained import build_trained
+from dsr.methods.noise import estimate_noise, normal_noise_deg
 from dsr.metrics.visual_loss import VisualLossName, make_visual_loss
 from dsr.sample import DepthSample
 from dsr.utils.lightning import Interruption, Log, StepProgress, ValidationTable, fit, make_trainer
@@ -79,6 +79,7 @@ class DeepImagePrior:
 
     range_type: ClassVar[RangeType] = "orthogonal"
     optimises: ClassVar[bool] = True
+    ratios: ClassVar[Ratios | None] = "whole"
     cost: ClassVar[Cost] = Cost(2500, 2300)
 
     scale: int
@@ -278,6 +279,8 @@ class WarmStarted(DeepImagePrior):
         ValueError: a value is out of range, or the weights are of another network.
 
     """
+
+    ratios: ClassVar[Ratios | None] = None
 
     weights: Path
     model: str

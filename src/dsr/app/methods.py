@@ -1,0 +1,58 @@
+"""Choose how an evaluation runs its method: itself, or at another scale than it is made for."""
+
+from __future__ import annotations
+
+import hashlib
+import sys
+from pathlib import Path
+
+import torch
+
+from dsr.app.schema import EvalConfig, user_directories
+from dsr.inference.adapter import AnyScale, takes_scale
+from dsr.methods.registry import find_weights, has_weights
+from dsr.utils.builder import ConfigError, takes
+from dsr.utils.hashing import file_hash
+
+
+def adapt_method(settings: EvalConfig, device: torch.device) -> AnyScale | None:
+    """Return the method as ``dsr upsample`` runs it, None for one that takes the scale itself.
+
+    Raises:
+        ConfigError: the method rejects a setting, or has no weights.
+
+    """
+    node, given = settings.method, _given_weights(settings)
+    lacks = settings.measured and given is None and node.get("weights_packaged") is not None
+    if takes_scale(node, settings.scale) and not (lacks and not has_weights(node, settings.scale)):
+        return None
+    try:
+        return AnyScale(node, user_directories(), device, given)
+    except ConfigError:
+        raise
+    except ValueError as error:
+        raise ConfigError(str(error)) from error
+
+
+def weights_of(settings: EvalConfig) -> Path | None:
+    """Return the file of weights for the method; None for a method without weights."""
+    given = _given_weights(settings)
+    if takes("method", settings.method, "weights"):
+        return find_weights(settings.method, settings.scale, given)
+    if given is not None and not given.is_dir():  # a directory serves all methods of a multirun
+        name = settings.method["name"]
+        print(f"note: method={name} has no weights; weights={given} is not used", file=sys.stderr)  # noqa: T201
+    return None
+
+
+def hash_weights(files: list[Path]) -> str | None:
+    """Return the SHA-256 of a file of weights, or of those of several; None without any."""
+    hashes = [file_hash(file) for file in files]
+    if len(hashes) < 2:
+        return next(iter(hashes), None)
+    return hashlib.sha256("".join(hashes).encode()).hexdigest()
+
+
+def _given_weights(settings: EvalConfig) -> Path | None:
+    """Return the file or directory of weights that the configuration names."""
+    return None if settings.weights is None else Path(settings.weights).expanduser()

@@ -1,0 +1,105 @@
+"""Methods of fixed factors at other scales: what ``dsr.upsample`` gives, and a note."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import torch
+
+from dsr.geometry.camera import Camera
+from dsr.inference import upsample_depth
+from dsr.inference.adapter import AnyScale, takes_scale
+from dsr.methods.registry import build_method, read_method
+from dsr.sample import DepthSample
+
+CAMERA = Camera(48, 36, 50.0, 50.0, 23.5, 17.5)
+
+
+def _sample(width: int, height: int, hole: bool = False) -> DepthSample:
+    generator = torch.Generator().manual_seed(0)
+    depth_lr = 2 + torch.linspace(0, 1, width).expand(1, height, width).clone()
+    if hole:
+        depth_lr[0, 2, 3] = torch.nan
+    photo = torch.rand(3, 36, 48, generator=generator)
+    scale = CAMERA.ratio_to(width, height)
+    return DepthSample("set", "hall", photo, depth_lr, CAMERA, CAMERA.reduce(width, height), scale)
+
+
+@pytest.mark.parametrize(
+    ("name", "scales"),
+    [
+        ("bicubic", (1, 1.5, 2, 3)),
+        ("guided_filter", (1, 1.5, 2, 3)),
+        ("joint_bilateral", (1, 1.5, 2, 3)),
+        ("fast_global_smoother", (1, 1.5, 2, 3)),
+        ("bilateral", (1, 1.5, 2, 3)),
+        ("tgv", (1, 2, 3)),
+        ("anisotropic_diffusion", (1, 2, 3)),
+        ("dip", (1, 2, 3)),
+        ("dip_v_warm", (2,)),
+        ("facets", (2,)),
+        ("srfs", (2,)),
+        ("eg", (2,)),
+    ],
+)
+def test_methods_take_the_scales_that_they_are_made_for(name: str, scales: tuple[float, ...]) -> None:
+    node = read_method(name, 4)
+    assert tuple(scale for scale in (1, 1.5, 2, 3) if takes_scale(node, scale)) == scales
+
+
+SETTINGS: dict[str, Any] = {"tgv": {"iterations": 50}, "anisotropic_diffusion": {"steps": 50}}
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["nearest", "bilinear", "bicubic", "guided_filter", "joint_bilateral", "fast_global_smoother", "bilateral", "tgv",
+     "anisotropic_diffusion"],
+)  # fmt: skip
+@pytest.mark.parametrize("size", [(48, 36), (18, 13), (16, 12)])
+def test_methods_reproduce_a_wall_at_any_ratio_that_they_take(name: str, size: tuple[int, int]) -> None:
+    node = read_method(name, 4, SETTINGS.get(name))
+    sample = _sample(*size)
+    if not takes_scale(node, sample.scale):
+        pytest.skip("takes whole ratios only")
+    wall = torch.full_like(sample.depth_lr, 2.0)
+    sample = DepthSample("set", "hall", sample.rgb, wall, CAMERA, sample.camera_lr, sample.scale)
+    depth = build_method(node, 4)(sample)
+    assert tuple(depth.shape) == (1, 36, 48)
+    torch.testing.assert_close(depth, torch.full_like(depth, 2.0), rtol=0.05, atol=0)
+
+
+@pytest.mark.parametrize("name", ["tgv", "anisotropic_diffusion"])
+def test_method_that_reproduces_block_means_only_fills_holes_at_a_scale_of_1(name: str) -> None:
+    sample = _sample(48, 36, hole=True)
+    depth = build_method(read_method(name, 4, SETTINGS[name]), 4)(sample)
+    valid = sample.mask_lr
+    torch.testing.assert_close(depth[valid], sample.depth_lr[valid], rtol=1e-5, atol=0)
+    assert bool(depth.isfinite().all())
+
+
+@pytest.mark.parametrize("name", ["tgv", "anisotropic_diffusion", "eg", "srfs"])
+def test_method_of_whole_scales_refuses_another_by_itself(name: str) -> None:
+    with pytest.raises(ValueError, match=r"^hall: expected a whole scale for this method, got 1\.5$"):
+        build_method(read_method(name, 4), 4)(_sample(32, 24))
+
+
+@pytest.mark.parametrize("size", [(48, 36), (32, 24)])
+@pytest.mark.parametrize("name", ["facets", "eg"])
+def test_any_scale_gives_what_upsample_gives(name: str, size: tuple[int, int]) -> None:
+    sample = _sample(*size, hole=True)
+    settings = {"ensemble": 1} if name == "facets" else {"radius": 2}
+    depth = AnyScale(read_method(name, sample.scale, settings))(sample)  # type: ignore[arg-type]
+    expected = upsample_depth(
+        sample.rgb, sample.depth_lr, CAMERA, method=name, settings=settings, device="cpu", keep_holes=name == "eg"
+    )
+    assert torch.equal(depth.isnan(), expected.isnan())
+    assert torch.equal(depth.nan_to_num(), expected.nan_to_num())
+    assert bool(depth.isnan().any()) == (name == "eg")
+
+
+def test_any_scale_describes_how_the_map_is_resized() -> None:
+    adapted = AnyScale(read_method("facets", 1))
+    assert adapted.describe(_sample(48, 36)) == "36 x 48 depth averaged over 4 x 4 pixels, to 36 x 48 by facets x4"
+    assert adapted.describe(_sample(7, 5)) == "5 x 7 depth to 36 x 48 by facets x8"
+    assert [path.stem for path in adapted.weights()] == ["facets_x4", "facets_x8"]
