@@ -171,7 +171,7 @@ class Transfer(nn.Module):
 
 
 class DORNet(PeerNetwork):
-    """The tiny DORNet: 24 features; 0.46 million parameters in a file, of which inference needs 0.44.
+    """The tiny DORNet: 24 features; 0.46 million parameters in a file, of which inference needs 0.43.
 
     Averages over the whole image steer it, so there are no tiles: large images need about 3 kB of memory per pixel.
     """
