@@ -119,12 +119,15 @@ def measure(functions: dict[str, Callable[[], Tensor]], runs: int) -> dict[str, 
 def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    parser.add_argument("checkouts", type=Path, help="directory with the authors' repositories")
-    parser.add_argument("weights", type=Path, help="directory with their weights")
+    parser.add_argument("checkouts", nargs="?", type=Path, help="directory with the authors' repositories")
+    parser.add_argument("weights", nargs="?", type=Path, help="directory with their weights")
     parser.add_argument("--only", nargs="+", choices=AUTHORS, default=list(AUTHORS))
     parser.add_argument("--size", type=int, default=512, help="rows and columns, a multiple of 16")
     parser.add_argument("--runs", type=int, default=3)
     arguments = parser.parse_args()
+    if arguments.weights is None:
+        print("published networks of the field: skipped, needs their authors' repositories and weights (see --help)")
+        return
     torch.set_num_threads(1)
     if not torch.cuda.is_available():  # the authors' code asks for a GPU
         torch.Tensor.cuda = lambda self, *_, **__: self  # type: ignore[method-assign,assignment]

@@ -23,6 +23,7 @@ from dsr.methods.networks.trained import NETWORKS, packaged_names, packaged_weig
 from dsr.methods.networks.weight_files import is_dsr_weights, network_name, read_header
 from dsr.utils.builder import ConfigError, build, load_target, takes
 from dsr.utils.config_files import config_directories, list_choices
+from dsr.utils.ratios import round_ratio
 
 _NETWORK = "network"
 """Key of a method's node: the dotted path of the network's class, for a method whose weights come from a training."""
@@ -148,7 +149,7 @@ def _packaged(node: Mapping[str, Any], scale: float) -> Path:
         return found
     files, source = _files_for(node, scale), node.get("weights_source")
     published = f", or a directory with {files[0]} (from {source})" if files else ""
-    needs = f"method={node['name']} at scale {scale} needs weights=FILE{published}"
+    needs = f"method={node['name']} at scale {round_ratio(scale)} needs weights=FILE{published}"
     if "weights_files" in node:
         raise ConfigError(f"weights: {needs}; its authors publish them, dsr does not come with them")
     raise ConfigError(f"weights: dsr comes with {', '.join(packaged_names())}; {needs}")
