@@ -41,7 +41,7 @@ class FDKN(PeerNetwork):
     checksums: ClassVar[Mapping[str, float]] = MappingProxyType({"036ec8f27eec624c": 8})
     multiple: ClassVar[int] = _FACTOR
     receptive_field_radius: ClassVar[int | None] = _FACTOR * len(_WIDTHS)
-    cost: ClassVar[Cost] = Cost(1000, 10)
+    cost: ClassVar[Cost] = Cost(420, 1)
 
     def __init__(self, scale: float) -> None:
         super().__init__(scale)

@@ -80,7 +80,7 @@ class PGSR(PeerNetwork):
         {"4e652c04c6523058": 4, "0774dd5c80ddc29a": 8, "ea327e3050228fb5": 16}
     )
     multiple: ClassVar[int] = _FACTOR
-    cost: ClassVar[Cost] = Cost(1000, 10)
+    cost: ClassVar[Cost] = Cost(320, 1.5)
 
     def __init__(self, scale: float) -> None:
         super().__init__(scale)

@@ -33,7 +33,7 @@ class SVLRM(PeerNetwork):
         {"d0b47c00e5a8e074": 4, "a23c7cda0bccb284": 8, "77f6b973783a722d": 16}
     )
     receptive_field_radius: ClassVar[int | None] = _DEPTH + 2
-    cost: ClassVar[Cost] = Cost(1000, 10)
+    cost: ClassVar[Cost] = Cost(800, 5)
 
     def __init__(self, scale: float) -> None:
         super().__init__(scale)
