@@ -9,7 +9,7 @@ from small_scenes import maps, photos
 from torch import Tensor, nn
 from torch.nn import functional
 
-from dsr.methods.networks.sparse_to_dense import BatchNorm, SparseToDense, UpProjection, place_samples
+from dsr.methods.networks.sparse_to_dense import BatchRenorm, SparseToDense, UpProjection, place_samples
 
 RESNET18 = 11_689_512 - 513_000 + 64 * 49
 """Parameters of ResNet-18 (He et al. 2016) without its classifier, with a fourth input channel."""
@@ -52,12 +52,12 @@ def test_up_projection_equals_unpooling_and_convolutions() -> None:
     torch.manual_seed(1)
     block = UpProjection(6).double().eval()
     for layer in block.modules():
-        if isinstance(layer, BatchNorm):
+        if isinstance(layer, BatchRenorm):
             layer.running_mean = torch.randn_like(layer.running_mean)
             layer.running_var = torch.rand_like(layer.running_var) + 0.5
     x = torch.randn(2, 6, 4, 5, dtype=torch.float64)
 
-    def norm(x: Tensor, layer: BatchNorm) -> Tensor:
+    def norm(x: Tensor, layer: BatchRenorm) -> Tensor:
         mean, var, weight, bias = (
             each.view(1, -1, 1, 1) for each in (layer.running_mean, layer.running_var, layer.weight, layer.bias)
         )
@@ -68,6 +68,47 @@ def test_up_projection_equals_unpooling_and_convolutions() -> None:
     above = norm(functional.conv2d(first, upper[3].weight, padding=1), upper[4])
     expected = (above + norm(_unpool_and_convolve(x, lower[0]), lower[1])).clamp(min=0)
     torch.testing.assert_close(block(x), expected, rtol=0, atol=1e-12)
+
+
+def _renorm() -> BatchRenorm:
+    """Return a layer with random parameters and statistics."""
+    torch.manual_seed(2)
+    layer = BatchRenorm(3).double()
+    for parameter in layer.parameters():
+        parameter.data.normal_()
+    layer.running_mean.normal_()
+    layer.running_var.uniform_(0.5, 2)
+    return layer
+
+
+def test_renormalisation_gives_in_a_training_what_it_gives_in_use() -> None:
+    layer, x = _renorm(), 2 * torch.randn(40, 3, 8, 9, dtype=torch.float64) + 1
+    expected = layer.eval()(x)
+    mean, var = layer.running_mean.clone(), layer.running_var.clone()
+    torch.testing.assert_close(layer.train()(x), expected, rtol=0, atol=1e-3)
+    torch.testing.assert_close(layer.running_mean, 0.9 * mean + 0.1 * x.mean(dim=(0, 2, 3)))
+    torch.testing.assert_close(layer.running_var, 0.9 * var + 0.1 * x.transpose(0, 1).flatten(1).var(dim=1))
+
+
+def test_renormalisation_has_the_gradient_of_batch_normalisation_with_its_corrections_fixed() -> None:
+    layer, x = _renorm(), torch.randn(6, 3, 4, 5, dtype=torch.float64).requires_grad_()
+    mean, var = x.detach().mean(dim=(0, 2, 3)), x.detach().transpose(0, 1).flatten(1).var(dim=1)
+    factor = ((var + 1e-5) / (layer.running_var + 1e-5)).sqrt()
+    shift = (mean - layer.running_mean) / (layer.running_var + 1e-5).sqrt()
+    weight, bias = layer.weight * factor, layer.weight * shift + layer.bias
+    expected = functional.batch_norm(x, None, None, weight, bias, training=True)
+    upstream = torch.randn_like(expected)
+    (wanted,) = torch.autograd.grad(expected, x, upstream)
+    (found,) = torch.autograd.grad(layer.train()(x), x, upstream)
+    torch.testing.assert_close(found, wanted, rtol=0, atol=1e-12)
+
+
+def test_renormalisation_limits_its_corrections() -> None:
+    layer = BatchRenorm(1).double().train()
+    x = 1e3 + 1e2 * torch.randn(9, 1, 5, 5, dtype=torch.float64)
+    result = layer(x).detach()
+    assert float(result.mean()) == pytest.approx(5, abs=1e-9)
+    assert float(result.std()) == pytest.approx(3, rel=0.01)
 
 
 @pytest.mark.parametrize("scale", [2, 8])

@@ -159,7 +159,7 @@ class NetworkUpsampler:
     """An :class:`~dsr.methods.base.Upsampler` around a trained network.
 
     Images of more than ``UNTILED`` pixels are processed in tiles, see :mod:`dsr.methods.tiling`. This bounds the memory
-    to about 40 bytes per pixel of the image, and 700 to 1000 bytes per pixel of a window (a tile and the network's
+    to about 40 bytes per pixel of the image, and 700 to 1300 bytes per pixel of a window (a tile and the network's
     receptive-field radius on each side), depending on the network and the depth's precision. Global values, such as
     the range of the disparity, are computed from the whole image, so tiles change the result by rounding errors only.
 
