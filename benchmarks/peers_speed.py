@@ -74,7 +74,31 @@ def svlrm(checkouts: Path) -> tuple[nn.Module, Callable[[nn.Module, Tensor, Tens
     return net, lambda net, rgb, values: net(values, (rgb * grey).sum(dim=1, keepdim=True))[0]
 
 
-AUTHORS = {"pgsr": pgsr, "fdkn": fdkn, "svlrm": svlrm}
+def dctnet(checkouts: Path) -> tuple[nn.Module, Callable[[nn.Module, Tensor, Tensor], Tensor]]:
+    """Return the authors' network and how it is called with a photo and an enlarged map.
+
+    Their transforms call functions that torch has no longer; here they are those of ``torch.fft``.
+    """
+    module = load_module(checkouts / "GDSR-DCTNet", "model")
+    transforms = vars(module)["dct_2d"].__globals__
+    transforms["torch"] = SimpleNamespace(
+        **{name: getattr(torch, name) for name in ("arange", "cat", "cos", "sin")},
+        rfft=lambda x, _, onesided: torch.view_as_real(torch.fft.fft(x)),
+        irfft=lambda x, _, onesided: torch.fft.irfft(torch.view_as_complex(x), n=x.shape[1]),
+    )
+    net: nn.Module = module.DCTNet()
+    return net, lambda net, rgb, values: net(values, normalise_imagenet(rgb))
+
+
+def dornet(checkouts: Path) -> tuple[nn.Module, Callable[[nn.Module, Tensor, Tensor], Tensor]]:
+    """Return the authors' network and how it is called with a photo and an enlarged map."""
+    net: nn.Module = load_module(checkouts / "DORNet", "net.dornet").Net(tiny_model=True)
+    return net, lambda net, rgb, values: net(x_query=values, rgb=rgb)
+
+
+AUTHORS = {"pgsr": pgsr, "dctnet": dctnet, "dornet": dornet, "fdkn": fdkn, "svlrm": svlrm}
+NEEDED = {"dctnet": "kornia", "dornet": "mmcv"}
+"""Libraries that the authors' networks need, and that dsr does without."""
 
 
 def scene(size: int) -> tuple[Tensor, Tensor]:
@@ -133,6 +157,9 @@ def main() -> None:
         torch.Tensor.cuda = lambda self, *_, **__: self  # type: ignore[method-assign,assignment]
     print(f"{'method':10} {'authors, s':>10} {'dsr, s':>8} {'ratio':>6}  max difference")
     for name in arguments.only:
+        if name in NEEDED and importlib.util.find_spec(NEEDED[name]) is None:
+            print(f"{name:10} left out: its authors' code needs {NEEDED[name]}")
+            continue
         functions = ways(name, arguments.checkouts, arguments.weights, arguments.size)
         seconds = measure(functions, arguments.runs)
         difference = float((functions["dsr"]() - functions["authors"]()).abs().max())

@@ -21,7 +21,7 @@ from dsr.metrics.catalogue import catalogue, score_image
 from dsr.metrics.lpips import LPIPS, load_lpips
 from dsr.sample import Scene
 
-NAMES = {"pgsr": "PGSR", "svlrm": "SVLRM", "fdkn": "FDKN"}
+NAMES = {"pgsr": "PGSR", "dctnet": "DCTNet", "dornet": "DORNet-T", "svlrm": "SVLRM", "fdkn": "FDKN"}
 FEEDS: dict[str, tuple[Downsampling, RangeType]] = {
     "box-disp": (Downsampling("box"), "disparity"),
     "box-depth": (Downsampling("box", range_type="disparity"), "orthogonal"),
@@ -29,10 +29,11 @@ FEEDS: dict[str, tuple[Downsampling, RangeType]] = {
     "bic-depth": (Downsampling("bicubic"), "orthogonal"),
 }
 """How the low-resolution map is made, and what the network gets."""
+X4_AND_X8 = ("dctnet", "dornet", "svlrm")
 SETTINGS = [
     *(("pgsr", scale, variant) for scale in (4, 8) for variant in FEEDS),
-    *(("svlrm", 4, variant) for variant in ("box-disp", "box-depth", "bic-disp")),
-    ("svlrm", 8, "box-disp"),
+    *((method, 4, variant) for method in X4_AND_X8 for variant in ("box-disp", "box-depth", "bic-disp")),
+    *((method, 8, "box-disp") for method in X4_AND_X8),
     *(("fdkn", 8, variant) for variant in ("box-disp", "box-depth", "bic-disp")),
 ]
 COLUMNS = {
@@ -67,7 +68,7 @@ def _predict(shared: Path, method: str, scene: Scene, scale: int, variant: str) 
     return upsampler(make_sample(scene, scale, downsampling, range_type))
 
 
-@pytest.mark.parametrize(("method", "scale"), [("pgsr", 4), ("svlrm", 4), ("fdkn", 8)])
+@pytest.mark.parametrize(("method", "scale"), [("pgsr", 4), ("dctnet", 4), ("dornet", 4), ("svlrm", 4), ("fdkn", 8)])
 def test_depth_is_that_of_the_authors_code(shared: Path, method: str, scale: int) -> None:
     file = shared / "expected" / f"peer_{NAMES[method]}_lucy_x{scale}_box_disparity.npz"
     expected = torch.from_numpy(np.load(file)["depth"]).double()
@@ -99,25 +100,28 @@ def test_scores_are_those_of_the_authors_code(
 
 
 FIELD = [
-    ("lu", "RGBD_01_output_depth", 4),
-    ("middlebury8", "Middlebury_02_output_depth", 8),
-    ("rgbdd", "20200518161728_HR_gt", 4),
+    ("pgsr", "lu", "RGBD_01_output_depth", 4),
+    ("pgsr", "middlebury8", "Middlebury_02_output_depth", 8),
+    ("pgsr", "rgbdd", "20200518161728_HR_gt", 4),
+    ("dctnet", "lu", "RGBD_03_output_depth", 4),
+    ("dctnet", "lu", "RGBD_01_output_depth", 8),
+    ("dctnet", "rgbdd", "20200518161728_HR_gt", 4),
 ]
 
 
-@pytest.mark.parametrize(("dataset", "image", "scale"), FIELD)
+@pytest.mark.parametrize(("method", "dataset", "image", "scale"), FIELD)
 def test_field_scores_with_the_true_range_are_those_of_the_authors_code(
-    shared: Path, dataset: str, image: str, scale: int
+    shared: Path, method: str, dataset: str, image: str, scale: int
 ) -> None:
     rows = pd.read_csv(shared / "expected" / "peers.csv", dtype={"scale": int})
-    rows = rows[(rows["method"] == "PGSR") & (rows["scene"] == f"{image}.png") & (rows["metric"] == "RMSE")]
+    rows = rows[(rows["method"] == NAMES[method]) & (rows["scene"] == f"{image}.png") & (rows["metric"] == "RMSE")]
     expected = rows[rows["scale"] == scale]["value"].item()
     source = _field_source(shared, dataset)
     scene = source.load(next(name for name in source.scenes() if image.startswith(name)))
     height, width = (n // 16 * 16 for n in (scene.camera.height, scene.camera.width))
     scene = scene.crop(0, 0, height, width)
     node = read_method(
-        "pgsr", scale, {"range": "truth", "range_type": "disparity" if scene.unit.inverse else "orthogonal"}
+        method, scale, {"range": "truth", "range_type": "disparity" if scene.unit.inverse else "orthogonal"}
     )
     upsampler = build_method(node, scale, weights=shared / "weights" / "peers", device="cpu", precision="float32")
     assert getattr(upsampler, "flag", "") == "true-range"

@@ -173,14 +173,14 @@ class Transfer(nn.Module):
 class DORNet(PeerNetwork):
     """The tiny DORNet: 24 features; 0.46 million parameters in a file, of which inference needs 0.43.
 
-    Averages over the whole image steer it, so there are no tiles: large images need about 3 kB of memory per pixel.
+    Averages over the whole image steer it, so there are no tiles: large images need about 2 kB of memory per pixel.
     """
 
     title: ClassVar[str] = "DORNet-T"
     checksums: ClassVar[Mapping[str, float]] = MappingProxyType(
         {"f91a4b6387036348": 4, "6cbd299ec3a589c2": 8, "38bd20f150d138e3": 8 / 3}
     )
-    cost: ClassVar[Cost] = Cost(memory=3000, seconds=20)
+    cost: ClassVar[Cost] = Cost(memory=2000, seconds=10)
 
     def __init__(self, scale: float) -> None:
         """Make the layers."""
