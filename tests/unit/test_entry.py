@@ -43,9 +43,9 @@ DATASETS = (
     "sintel, sunrgbd, tartanair, tofmark"
 )
 METHODS = (
-    "anisotropic_diffusion, bicubic, bilateral, bilinear, dctnet, ddrnet, dg, dip, dip_v, dip_v_warm, dornet, eg, "
-    "facets, fast_global_smoother, fdkn, guided_filter, joint_bilateral, msg, msg_v, msg_v_noisy, nearest, pdn, pgsr, "
-    "srfs, svlrm, tgv"
+    "anisotropic_diffusion, bicubic, bilateral, bilinear, cubic_convolution, dctnet, ddrnet, dg, dip, dip_v, "
+    "dip_v_warm, dornet, eg, facets, fast_global_smoother, fdkn, guided_filter, joint_bilateral, msg, msg_v, "
+    "msg_v_noisy, nearest, pdn, pgsr, srfs, svlrm, tgv"
 )
 EXPERIMENTS = (
     "ddrnet_x4, ddrnet_x8, dg_x4, dg_x8, downsampling_mismatch, facets_x4, facets_x8, msg_v_x4, msg_v_x4_noisy, "

@@ -127,11 +127,15 @@ def _bilinear(x: Tensor, _: float) -> Tensor:
     return (1 - x).clamp(min=0)
 
 
-def _bicubic(x: Tensor, _: float) -> Tensor:
-    """Cubic convolution (Keys 1981) with a = -0.5."""
+def cubic_kernel(x: Tensor) -> Tensor:
+    """Return the weights of cubic convolution (Keys 1981) with a = -0.5 at distances of ``x`` pixels, 0 or more."""
     near = (1.5 * x - 2.5) * x * x + 1
     far = ((-0.5 * x + 2.5) * x - 4) * x + 2
     return torch.where(x < 1, near, torch.where(x < 2, far, 0))
+
+
+def _bicubic(x: Tensor, _: float) -> Tensor:
+    return cubic_kernel(x)
 
 
 def _gaussian(x: Tensor, sigma: float) -> Tensor:

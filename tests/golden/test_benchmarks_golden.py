@@ -1,0 +1,99 @@
+"""The protocols of real sensors and of the field's benchmarks, through the data sets, against independent figures.
+
+``expected/real_sensor.json`` and ``expected/peers.csv`` were computed by other code than ours.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections.abc import Iterator
+from functools import cache
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from dsr.data.base import SceneSource
+from dsr.data.ddrnet import DDRNetFrames
+from dsr.data.eight_bit import EightBit
+from dsr.data.rgbdd import RGBDD
+from dsr.degradation.downsampling import Downsampling, make_sample
+from dsr.geometry.camera import RangeType
+from dsr.methods.base import Upsampler
+from dsr.methods.classical.cubic_convolution import CubicConvolution
+from dsr.metrics.catalogue import catalogue, score_image
+from dsr.metrics.formats import HEADLINES
+
+FRAMES = [f"frame_{number:06d}" for number in (1, 3, 5, 7, 9, 11)]
+SENSOR_UNITS = {
+    "Sensor_covered": ("covered", 1),
+    "Sensor_offset": ("offset_mm", 1e3),
+    "Sensor_RMSE_d": ("RMSE_d_mm", 1e3),
+    "Sensor_RMSE_v": ("RMSE_v", 1),
+    "Sensor_DSSIM_v": ("DSSIM_v", 1),
+    "Sensor_angle_mean": ("angle_mean", 1),
+    "Sensor_angle_median": ("angle_median", 1),
+}
+BICUBIC = {  # mean RMSE over the images, x4 and x8
+    "Middlebury": (2.281, 3.983),
+    "Lu": (2.419, 4.538),
+    "RGBDD": (1.749, 2.953),
+}
+
+
+@pytest.mark.parametrize("frame", FRAMES)
+def test_sensor_scores_equal_the_golden_file(shared: Path, frame: str) -> None:
+    expected = json.loads((shared / "expected" / "real_sensor.json").read_text())["frames"][frame]
+    scene = DDRNetFrames(str(shared / "real" / "ddrnet"), "found").load(frame)
+    assert scene.depth is not None
+    raw = scene.measured[1]
+    filtered = cv2.bilateralFilter(raw[0].nan_to_num(0).float().numpy(), 19, 0.03, 3).astype(np.float64)
+    maps = {"input": raw, "bilateral_19_0.03_3": torch.from_numpy(np.where(filtered > 0, filtered, np.nan))[None]}
+    for name, depth in maps.items():
+        rows = score_image(depth.double(), scene.depth, scene.camera.rays(), catalogue(protocols=("sensor",)))
+        found = {row.metric: row.value for row in rows if row.variant in HEADLINES}
+        assert found.keys() == SENSOR_UNITS.keys()
+        shown = {key: factor * found[metric] for metric, (key, factor) in SENSOR_UNITS.items()}
+        assert shown == pytest.approx(expected[name], rel=1e-3, abs=1e-5), name
+
+
+@cache
+def _published(shared: Path, benchmark: str, method: str, scale: int) -> dict[str, float]:
+    """Return the RMSE of each image, by its name."""
+    part = (f"protocol:{benchmark}", method, str(scale), "pillow-bicubic", "RMSE")
+    with (shared / "expected" / "peers.csv").open(newline="", encoding="utf-8") as file:
+        rows = [row for row in csv.reader(file) if (row[0], row[1], *row[3:6]) == part]
+    return {row[2].partition("_output")[0].partition("_HR")[0]: float(row[6]) for row in rows}
+
+
+def _source(shared: Path, benchmark: str) -> tuple[SceneSource, RangeType]:
+    """Return a benchmark's images, and the range type that it downsamples."""
+    root = str(shared / "modern" / benchmark)
+    if benchmark == "RGBDD":
+        return RGBDD(root, real=False, scenes="found"), "orthogonal"
+    return EightBit(root, "lu" if benchmark == "Lu" else "middlebury8"), "disparity"
+
+
+def _rmse(source: SceneSource, kind: RangeType, method: Upsampler, scale: int) -> Iterator[tuple[str, float]]:
+    """Yield the RMSE of each image in the benchmark's unit."""
+    for name in source.scenes():
+        sample = make_sample(source.load(name), scale, Downsampling("bicubic"), kind)
+        assert sample.depth is not None
+        truth: Tensor = sample.depth.double()
+        metrics = catalogue(protocols=("field",))
+        rows = score_image(method(sample).double(), truth, sample.camera.rays(), metrics, sample.unit)
+        yield name, next(row.value for row in rows if row.metric in ("RMSE_levels", "RMSE_cm"))
+
+
+@pytest.mark.parametrize("scale", [4, 8])
+@pytest.mark.parametrize("benchmark", BICUBIC)
+def test_bicubic_has_the_errors_of_the_fields_protocol(shared: Path, benchmark: str, scale: int) -> None:
+    source, kind = _source(shared, benchmark)
+    found = dict(_rmse(source, kind, CubicConvolution(kind), scale))
+    assert found == pytest.approx(_published(shared, benchmark, "bicubic", scale), rel=1e-3)
+    mean = BICUBIC[benchmark][scale // 4 - 1]
+    assert np.mean(list(found.values())) == pytest.approx(mean, rel=1e-3)
