@@ -1,5 +1,6 @@
 """Every experiment is documented, composes, and is valid; recipes of weights are those that made them."""
 
+import contextlib
 import re
 from itertools import product
 
@@ -11,12 +12,12 @@ from dsr.app.experiments import register_resolvers, without_overridden_sweeps
 from dsr.app.schema import EvalConfig, TrainConfig, plain_config
 from dsr.app.training_runs import training_data
 from dsr.methods.networks.trained import packaged_names
-from dsr.utils.builder import build, takes
+from dsr.utils.builder import ConfigError, build, takes
 from dsr.utils.config_files import config_directories, list_choices
 
 DIRECTORIES = config_directories()
 FOLDER = DIRECTORIES[0] / "experiment"
-EVALUATIONS = ("downsampling_mismatch", "noise", "paper_tables")
+EVALUATIONS = ("downsampling_mismatch", "field_benchmarks", "noise", "paper_tables", "visual_losses")
 FULL = ["trainer=full", "dataset.count=800"]
 PDN = ["model=pdn", *FULL, "trainer.average=0.998"]
 DG = ["model=dg", "model.depth_loss=lap1", "model.visual=true", "dataset.count=800", "trainer.weight_decay=0",
@@ -127,8 +128,11 @@ def test_all_jobs_of_an_experiment_are_valid(name, tmp_path, monkeypatch):
     for choice in sorted(choices):  # each of them, not all combinations
         plain = experiment(name, "eval", choice)
         settings = EvalConfig.of(plain)
-        for group in ("dataset", "downsampling", "noise", "holes"):
+        for group in ("downsampling", "noise", "holes"):
             build(group, plain[group])
+        absent = plain["dataset"]["name"] in ("lu", "middlebury8")
+        with pytest.raises(ConfigError, match="expected its files in") if absent else contextlib.nullcontext():
+            build("dataset", plain["dataset"])
         assert not takes("method", settings.method, "nosuch")  # its target can be imported
 
 

@@ -7,13 +7,14 @@ does not overshoot beyond them.
 
 from __future__ import annotations
 
-from typing import get_args
+from typing import ClassVar, get_args
 
 import torch
 from torch import Tensor
 
 from dsr.degradation.downsampling import cubic_kernel
 from dsr.geometry.camera import RANGE_TYPES, RangeType, from_range, to_range
+from dsr.methods.base import Ratios
 from dsr.methods.networks.maps import lr_coordinates
 from dsr.sample import DepthSample
 from dsr.utils.progress import Steps
@@ -32,6 +33,8 @@ class CubicConvolution:
         ValueError: an unknown range type.
 
     """
+
+    ratios: ClassVar[Ratios] = "any"
 
     def __init__(self, range_type: RangeType = "disparity") -> None:
         if range_type not in get_args(RangeType):
