@@ -400,8 +400,8 @@ def test_help_lists_the_choices(within):
         "dataset: arkitscenes, ddrnet, diml, folder, icl, lu, middlebury, middlebury2001, middlebury2003, "
         "middlebury2005, middlebury2006, middlebury8, middlebury_train, mixture, nyu, paper_train, procedural, rgbdd, "
         "rgbdd_real, simgeo, sintel, sunrgbd, tartanair, tofmark",
-        "method: anisotropic_diffusion, bicubic, bilateral, bilinear, cubic_convolution, dctnet, ddrnet, dg, dip, dip_v, "
-        "dip_v_warm, dornet, eg, facets, fast_global_smoother, fdkn, guided_filter, joint_bilateral, msg, msg_v",
+        "method: anisotropic_diffusion, bicubic, bilateral, bilinear, cubic_convolution, dctnet, ddrnet, dg, dip, "
+        "dip_v, dip_v_warm, dornet, eg, facets, fast_global_smoother, fdkn, guided_filter, joint_bilateral, msg, msg_v",
     ):
         assert line in output
 

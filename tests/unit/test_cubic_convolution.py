@@ -77,3 +77,13 @@ def test_unknown_range_type_is_refused() -> None:
         ValueError, match=r"^range_type: expected one of orthogonal, perspective, disparity, got 'depth'$"
     ):
         CubicConvolution("depth")  # type: ignore[arg-type]
+
+
+def test_map_of_the_photos_own_size_is_returned_and_any_ratio_is_taken() -> None:
+    depth = torch.from_numpy(1 + np.random.default_rng(0).random((1, 40, 48)))
+    sample = DepthSample("set", "random", torch.zeros(3, 40, 48), depth, CAMERA, CAMERA, 1)
+    torch.testing.assert_close(CubicConvolution("orthogonal")(sample), depth)
+    small = CAMERA.rescale(18, 15)
+    sample = DepthSample("set", "random", torch.zeros(3, 40, 48), depth[:, :15, :18], CAMERA, small, 48 / 18)
+    expected = _pillow(depth[:, :15, :18], 40, 48)
+    np.testing.assert_allclose(CubicConvolution("orthogonal")(sample)[0].numpy(), expected, rtol=2e-5)
