@@ -191,6 +191,38 @@ def test_small_data_weight_smooths_a_noisy_plane() -> None:
     assert errors[1] < 0.5 * errors[0]
 
 
+@pytest.mark.parametrize("scale", [1, 4])
+def test_automatic_weight_falls_with_the_noise_and_the_scale(scale: int) -> None:
+    tgv = TotalGeneralisedVariation(data_weight="auto")
+    flat = plane()[None, None]
+    assert tgv.choose_weight(flat, scale) is None
+    for std in (0.01, 0.02):
+        noisy = flat + std * _normals(*flat.shape)
+        assert tgv.choose_weight(noisy, scale) == pytest.approx(0.6 / (std * scale), rel=0.2)
+    assert tgv.choose_weight(flat + 1e-5 * _normals(*flat.shape), scale) is None  # block means are nearly the input
+
+
+def test_automatic_weight_smooths_a_noisy_plane_and_reproduces_a_clean_one() -> None:
+    flat = plane()
+    means = torch.from_numpy(_means(flat, 4))
+    noisy = means + 0.02 * (means.max() - means.min()) * _normals(*means.shape)
+    errors = []
+    for weight in (None, "auto"):
+        tgv = TotalGeneralisedVariation(iterations=300, data_weight=weight)  # type: ignore[arg-type]
+        errors.append(float((_upsampled(tgv, noisy) - flat).square().mean().sqrt()))
+    assert errors[1] < 0.5 * errors[0]
+    exact = TotalGeneralisedVariation(iterations=300, data_weight="auto")
+    np.testing.assert_allclose(_means(_upsampled(exact, means), 4), means, atol=1e-6)
+
+
+def _upsampled(tgv: TotalGeneralisedVariation, lr: Tensor) -> Tensor:
+    """Return the map of a grey photo that fits a low-resolution one."""
+    height, width = lr.shape
+    low, size = lr.min(), lr.max() - lr.min()
+    rgb = torch.full((1, 3, 4 * height, 4 * width), 0.5, dtype=torch.float64)
+    return tgv.minimise(rgb, ((lr - low) / size)[None, None], 4).values[0, 0] * size + low
+
+
 def test_result_is_deterministic_and_independent_of_the_truth() -> None:
     sample = sample_of(*random_scene(16, 24))
     first = TotalGeneralisedVariation(iterations=100)(sample)

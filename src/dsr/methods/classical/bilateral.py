@@ -50,7 +50,7 @@ class Bilateral(GuidedMethod):
     """
 
     range_type: RangeType = "orthogonal"
-    cost: ClassVar[Cost] = Cost(300, 5)
+    cost: ClassVar[Cost] = Cost(150, 1)
     own_resolution: ClassVar[bool] = True
 
     def __init__(

@@ -123,6 +123,8 @@ class TotalGeneralisedVariation:
         step_ratio: float = 1e4,
     ) -> None:
         expect_limits(tolerance, iterations=iterations)
+        if isinstance(data_weight, str) and data_weight != "auto":
+            raise ValueError(f"data_weight: expected a number, auto or None, got {data_weight!r}")
         positive = {
             "first": first,
             "second": second,

@@ -1,0 +1,45 @@
+"""The estimate of a sensor's noise, where the usual one fails: rounded values and correlated noise."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from dsr.methods.noise import estimate_noise, estimate_sensor_noise
+
+
+def _ramp() -> Tensor:
+    rows, columns = torch.meshgrid(torch.arange(120.0), torch.arange(160.0), indexing="ij")
+    return (2 + 0.01 * rows + 0.005 * columns).double()[None, None]
+
+
+def _draws() -> Tensor:
+    generator = torch.Generator().manual_seed(0)
+    return torch.randn(1, 1, 120, 160, generator=generator, dtype=torch.float64)
+
+
+def test_white_noise_is_estimated_with_steps_and_holes() -> None:
+    values = _ramp() + 0.01 * _draws()
+    values[..., 80:] += 3
+    values[..., 20:40, 30:60] = torch.nan
+    assert estimate_sensor_noise(values) == pytest.approx(0.01, rel=0.1)
+
+
+def test_noise_of_rounded_values_is_found() -> None:
+    values = ((3 + 0.005 * _draws()) / 0.0125).round() * 0.0125  # mostly one of two values
+    assert estimate_noise(values.exp()) == 0
+    assert estimate_sensor_noise(values) == pytest.approx(0.006, rel=0.7)
+
+
+def test_noise_that_neighbours_share_is_found_better_than_from_neighbours_alone() -> None:
+    smooth = functional.avg_pool2d(functional.pad(_draws(), (1, 1, 1, 1), mode="replicate"), 3, stride=1)
+    values = 0.01 * smooth / smooth.std()
+    assert 2 * estimate_noise(values.exp()) < 0.004 < estimate_sensor_noise(values) < 0.012
+
+
+def test_clean_and_tiny_maps_have_no_noise() -> None:
+    assert estimate_sensor_noise(_ramp()) < 1e-9
+    assert estimate_sensor_noise(_ramp()[..., :2, :2]) == 0
+    assert estimate_sensor_noise(torch.full((1, 1, 8, 8), torch.nan)) == 0
