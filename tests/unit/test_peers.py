@@ -276,12 +276,15 @@ def _bad_files(folder: Path) -> Mapping[str, tuple[Path, str]]:
 @pytest.mark.parametrize("kind", [
     "truncated", "text", "pickle", "code", "list", "steps", "missing", "shape", "infinite", "other",
 ])  # fmt: skip
-def test_bad_file_is_refused_in_one_line_and_runs_nothing(tmp_path: Path, kind: str) -> None:
+def test_bad_file_is_refused_in_one_line_and_runs_nothing(
+    tmp_path: Path, recwarn: pytest.WarningsRecorder, kind: str
+) -> None:
     path, message = _bad_files(tmp_path)[kind]
     with pytest.raises(ValueError, match=f"^{path}: {message}") as error:
         _build(path)
     assert "\n" not in str(error.value)
     assert not (tmp_path / "sprung").exists()
+    assert not recwarn.list
 
 
 def test_missing_file_and_unknown_network_are_refused(tmp_path: Path) -> None:

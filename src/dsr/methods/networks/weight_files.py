@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -130,7 +131,9 @@ def read_torch_file(path: Path) -> Any:
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such weights file")
     try:
-        return torch.load(path, map_location="cpu", weights_only=True)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # on files that it then refuses
+            return torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:  # torch names no set of errors for damaged files
         raise ValueError(
             f"{path}: expected a torch file of plain tensors, got one that is damaged or holds other Python objects, "
