@@ -17,7 +17,8 @@ from dsr.utils.config_files import config_directories, list_choices
 
 DIRECTORIES = config_directories()
 FOLDER = DIRECTORIES[0] / "experiment"
-EVALUATIONS = ("downsampling_mismatch", "field_benchmarks", "noise", "paper_tables", "visual_losses")
+EVALUATIONS = ("all_methods", "downsampling_mismatch", "field_benchmarks", "noise", "paper_tables",
+               "published_networks", "sensors", "visual_losses")  # fmt: skip
 FULL = ["trainer=full", "dataset.count=800"]
 PDN = ["model=pdn", *FULL, "trainer.average=0.998"]
 DG = ["model=dg", "model.depth_loss=lap1", "model.visual=true", "dataset.count=800", "trainer.weight_decay=0",
@@ -130,7 +131,7 @@ def test_all_jobs_of_an_experiment_are_valid(name, tmp_path, monkeypatch):
         settings = EvalConfig.of(plain)
         for group in ("downsampling", "noise", "holes"):
             build(group, plain[group])
-        absent = plain["dataset"]["name"] in ("lu", "middlebury8")
+        absent = plain["dataset"]["name"] in ("lu", "middlebury8", "ddrnet", "rgbdd_real")
         with pytest.raises(ConfigError, match="expected its files in") if absent else contextlib.nullcontext():
             build("dataset", plain["dataset"])
         assert not takes("method", settings.method, "nosuch")  # its target can be imported
