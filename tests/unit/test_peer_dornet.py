@@ -112,3 +112,8 @@ def test_dornet_folds_batch_normalisation_into_convolutions_with_and_without_a_b
         expected = functional.batch_norm(functional.conv2d(x, weight, bias), **statistics, **parts)
         folded = functional.conv2d(x, converted[f"{ours}.weight"], converted[f"{ours}.bias"])
         torch.testing.assert_close(folded, expected, atol=1e-4, rtol=1e-4)
+
+
+def test_dornet_has_a_range_of_depth_with_the_weights_for_a_phone_alone() -> None:
+    assert DORNet(8 / 3).depth_range == (0, 5)
+    assert DORNet(4).depth_range is None

@@ -104,6 +104,20 @@ def test_range_is_that_of_the_low_resolution_map() -> None:
     assert upsampler.flag == ""
 
 
+def test_weights_trained_on_a_range_of_depth_get_depth_normalised_by_it() -> None:
+    class Metric(Enlarged):
+        depth_range = (1.0, 9.0)
+
+    upsampler, sample = PeerUpsampler(Metric(), "disparity"), _sample(scale=1)
+    depth = upsampler(sample)
+    assert upsampler.range_type == "orthogonal"
+    torch.testing.assert_close(upsampler.net.seen[0][0, :, :6, :9].double(), (sample.depth_lr - 1) / 8)
+    torch.testing.assert_close(depth, sample.depth_lr, rtol=1e-5, atol=0)
+    message = "range: expected measured for weights trained on depth of 1 to 9 m, got truth"
+    with pytest.raises(ValueError, match=message):
+        PeerUpsampler(Metric(), value_range="truth")
+
+
 def test_true_range_is_flagged_and_needs_the_truth() -> None:
     upsampler, sample = PeerUpsampler(Enlarged(), value_range="truth"), _sample(scale=1)
     depth = upsampler(sample)
@@ -193,6 +207,11 @@ def test_batch_normalisation_that_does_not_fit_is_left_in_place() -> None:
 @pytest.mark.parametrize(("scale", "trained"), [(1, 4), (8 / 3, 4), (4, 4), (4.5, 8), (8, 8), (32, 8)])
 def test_weights_are_those_of_the_next_larger_factor(scale: float, trained: float) -> None:
     assert nearest_scale(FILES, scale) == trained
+
+
+@pytest.mark.parametrize(("scale", "trained"), [(1, 4), (2, 4), (8 / 3, 8 / 3), (3, 4)])
+def test_weights_of_a_sensor_are_those_of_its_own_factor_alone(scale: float, trained: float) -> None:
+    assert nearest_scale({"sensor.pth": 8 / 3, **FILES}, scale) == trained
 
 
 def _state(prefix: str = "") -> dict[str, Tensor]:

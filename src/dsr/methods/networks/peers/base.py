@@ -57,6 +57,11 @@ class PeerNetwork(nn.Module, abc.ABC):
         super().__init__()
         self.scale = scale
 
+    @property
+    def depth_range(self) -> tuple[float, float] | None:
+        """Orthogonal depth in metres that became 0 and 1 in the training; None if each map's own range did."""
+        return None
+
     @abc.abstractmethod
     def enlarge(self, values_lr: Tensor, size: tuple[int, int]) -> Tensor:
         """Enlarge a low-resolution map as the authors do.
@@ -106,7 +111,8 @@ class PeerUpsampler:
         range_type: the range type of the map that the network gets.
         value_range: the minimum and maximum that map to 0 and 1: ``measured`` for those of the low-resolution map,
             ``truth`` for those of the true one, which is how the authors get their figures. It is the one case besides
-            the oracle of deep image priors in which a method reads ``sample.depth``; ``flag`` marks its scores.
+            the oracle of deep image priors in which a method reads ``sample.depth``; ``flag`` marks its scores. Weights
+            with a ``depth_range`` of their own get orthogonal depth, normalised by it.
         precision: dtype of the convolutions.
         device: device of the computations.
         tile: side of a tile in pixels; None for ``TILE``, and no tiles up to ``UNTILED`` pixels.
@@ -130,7 +136,12 @@ class PeerUpsampler:
         _expect("precision", precision, DTYPES)
         if tile is not None and tile < net.multiple:
             raise ValueError(f"tile: expected at least {net.multiple} pixels, got {tile}")
-        self.range_type = range_type
+        if net.depth_range is not None and value_range == "truth":
+            low, high = net.depth_range
+            raise ValueError(
+                f"range: expected measured for weights trained on depth of {low:g} to {high:g} m, got truth"
+            )
+        self.range_type: RangeType = range_type if net.depth_range is None else "orthogonal"
         self.device = torch.device(device)
         self._uses_truth = value_range == "truth"
         self._dtype = DTYPES[precision]
@@ -154,7 +165,7 @@ class PeerUpsampler:
 
         """
         values_lr = self._convert(sample).to(self.device)[None]
-        values = self.refine(sample.rgb.to(self.device)[None], values_lr, self._true_min_max(sample), progress)[0]
+        values = self.refine(sample.rgb.to(self.device)[None], values_lr, self._min_max(sample), progress)[0]
         return from_range(values, sample.camera, self.range_type).to(sample.depth_lr.device)
 
     def refine(
@@ -213,8 +224,10 @@ class PeerUpsampler:
             return sample.disparity_lr()
         return to_range(sample.depth_lr, sample.camera_lr, self.range_type)
 
-    def _true_min_max(self, sample: DepthSample) -> Tensor | None:
-        """Return the true map's minimum and maximum if they are wanted, (1, 2, 1, 1)."""
+    def _min_max(self, sample: DepthSample) -> Tensor | None:
+        """Return the values that map to 0 and 1, (1, 2, 1, 1); None for the low-resolution map's own."""
+        if self.net.depth_range is not None:
+            return torch.tensor(self.net.depth_range).view(1, 2, 1, 1)
         if not self._uses_truth:
             return None
         if sample.depth is None:

@@ -25,6 +25,8 @@ FEATURES = 24
 _INNER = 6
 """Number of features in the bottlenecks."""
 _STAGES = 5
+_SENSOR_RATIO = 8 / 3
+"""Ratio of RGB-D-D's photos to the maps of its phone."""
 _UNUSED = "Dab."
 _BLOCK = (("backbone", 0), ("backbone", 3), ("shortcut", 0))
 _NORMALISED = {
@@ -178,7 +180,7 @@ class DORNet(PeerNetwork):
 
     title: ClassVar[str] = "DORNet-T"
     checksums: ClassVar[Mapping[str, float]] = MappingProxyType(
-        {"f91a4b6387036348": 4, "6cbd299ec3a589c2": 8, "38bd20f150d138e3": 8 / 3}
+        {"f91a4b6387036348": 4, "6cbd299ec3a589c2": 8, "38bd20f150d138e3": _SENSOR_RATIO}
     )
     cost: ClassVar[Cost] = Cost(memory=2000, seconds=10)
 
@@ -192,6 +194,11 @@ class DORNet(PeerNetwork):
         self.refinements = nn.ModuleDict({str(i + 1): ResidualGroup() for i in range(_STAGES)})
         self.merge = nn.Conv2d(_STAGES * FEATURES, FEATURES, 1)
         self.tail = _conv(FEATURES, 1)
+
+    @property
+    def depth_range(self) -> tuple[float, float] | None:
+        """Return 0 to 5 m for the weights that were trained on RGB-D-D's phone."""
+        return (0.0, 5.0) if self.scale == _SENSOR_RATIO else None
 
     @classmethod
     def convert(cls, tensors: dict[str, Tensor]) -> dict[str, Tensor]:

@@ -38,14 +38,19 @@ def load_peer(path: Path, network: type[PeerNetwork], scale: float) -> PeerNetwo
 
 
 def nearest_scale(files: Mapping[str, float], scale: float) -> float:
-    """Return the smallest trained factor that reaches a factor, or the largest.
+    """Return the trained factor whose weights suit a factor: itself, else the smallest whole one above, or the largest.
+
+    Weights for a factor that is not whole were trained on one sensor's maps and suit no others.
 
     Args:
         files: the trained factors of files of weights by their names.
         scale: the upsampling factor.
 
     """
-    return min((trained for trained in files.values() if trained >= scale), default=max(files.values()))
+    if scale in files.values():
+        return scale
+    whole = [trained for trained in files.values() if float(trained).is_integer()]
+    return min((trained for trained in whole if trained >= scale), default=max(whole))
 
 
 def read_tensors(path: Path) -> dict[str, Tensor]:
