@@ -34,6 +34,7 @@ def _sample(width: int, height: int, hole: bool = False) -> DepthSample:
         ("joint_bilateral", (1, 1.5, 2, 3)),
         ("fast_global_smoother", (1, 1.5, 2, 3)),
         ("bilateral", (1, 1.5, 2, 3)),
+        ("dornet", (1, 1.5, 2, 3)),
         ("tgv", (1, 2, 3)),
         ("anisotropic_diffusion", (1, 2, 3)),
         ("dip", (1, 2, 3)),
