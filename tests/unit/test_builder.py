@@ -194,8 +194,8 @@ def test_unknown_setting_is_refused_with_the_known_ones():
 @pytest.mark.parametrize(
     ("metrics", "message"),
     [
-        ({"lpips": False, "lpip": 1}, "metrics.lpip: unknown key; expected lpips, lpips_trunk, extra"),
-        (3, "metrics: expected the keys lpips, lpips_trunk, extra, got 3"),
+        ({"lpips": False, "lpip": 1}, "metrics.lpip: unknown key; expected protocols, lpips, lpips_trunk, extra"),
+        (3, "metrics: expected the keys protocols, lpips, lpips_trunk, extra, got 3"),
     ],
 )
 def test_settings_group_that_is_no_mapping_is_refused(metrics, message):

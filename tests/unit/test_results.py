@@ -180,7 +180,7 @@ def test_runs_without_any_solution_are_refused_with_the_reason(make_run, tmp_pat
 @pytest.mark.parametrize(
     ("name", "entries", "message"),
     [
-        ("summary.json", {"scale": "four"}, "scale: expected a valid integer"),
+        ("summary.json", {"scale": "four"}, "scale: expected a valid number"),
         ("summary.json", {"seconds": [1]}, "seconds: expected an object, got [1]"),
         ("summary.json", {"metrics": {"PSNR": {"unit": "dB"}}}, "metrics.PSNR.heading: it is missing"),
         ("versions.json", {"identity": "x"}, "identity: expected an object, got 'x'"),
