@@ -28,7 +28,7 @@ from dsr.methods.registry import build_method, read_method
 
 METHODS = (
     "bicubic,bilateral,guided_filter,joint_bilateral,fast_global_smoother,anisotropic_diffusion,tgv,srfs,eg,"
-    "pdn,dg,ddrnet,msg_v,facets"
+    "pdn,dg,sparse_to_dense,ddrnet,msg_v,facets"
 )
 
 

@@ -9,7 +9,7 @@ from small_scenes import maps, photos
 from torch import Tensor, nn
 from torch.nn import functional
 
-from dsr.methods.networks.sparse_to_dense import BatchRenorm, SparseToDense, UpProjection, place_samples
+from dsr.methods.networks.sparse_to_dense import BatchNorm, SparseToDense, UpProjection, place_samples
 
 RESNET18 = 11_689_512 - 513_000 + 64 * 49
 """Parameters of ResNet-18 (He et al. 2016) without its classifier, with a fourth input channel."""
@@ -52,12 +52,12 @@ def test_up_projection_equals_unpooling_and_convolutions() -> None:
     torch.manual_seed(1)
     block = UpProjection(6).double().eval()
     for layer in block.modules():
-        if isinstance(layer, BatchRenorm):
+        if isinstance(layer, BatchNorm):
             layer.running_mean = torch.randn_like(layer.running_mean)
             layer.running_var = torch.rand_like(layer.running_var) + 0.5
     x = torch.randn(2, 6, 4, 5, dtype=torch.float64)
 
-    def norm(x: Tensor, layer: BatchRenorm) -> Tensor:
+    def norm(x: Tensor, layer: BatchNorm) -> Tensor:
         mean, var, weight, bias = (
             each.view(1, -1, 1, 1) for each in (layer.running_mean, layer.running_var, layer.weight, layer.bias)
         )
@@ -70,45 +70,32 @@ def test_up_projection_equals_unpooling_and_convolutions() -> None:
     torch.testing.assert_close(block(x), expected, rtol=0, atol=1e-12)
 
 
-def _renorm() -> BatchRenorm:
-    """Return a layer with random parameters and statistics."""
+def test_settled_normalisation_gives_in_a_training_what_it_gives_in_use() -> None:
     torch.manual_seed(2)
-    layer = BatchRenorm(3).double()
-    for parameter in layer.parameters():
-        parameter.data.normal_()
-    layer.running_mean.normal_()
-    layer.running_var.uniform_(0.5, 2)
-    return layer
-
-
-def test_renormalisation_gives_in_a_training_what_it_gives_in_use() -> None:
-    layer, x = _renorm(), 2 * torch.randn(40, 3, 8, 9, dtype=torch.float64) + 1
-    expected = layer.eval()(x)
+    layer, x = BatchNorm(3).double().train(), 2 * torch.randn(4, 3, 8, 9, dtype=torch.float64) + 1
+    unsettled = layer(x)
     mean, var = layer.running_mean.clone(), layer.running_var.clone()
-    torch.testing.assert_close(layer.train()(x), expected, rtol=0, atol=1e-3)
-    torch.testing.assert_close(layer.running_mean, 0.9 * mean + 0.1 * x.mean(dim=(0, 2, 3)))
-    torch.testing.assert_close(layer.running_var, 0.9 * var + 0.1 * x.transpose(0, 1).flatten(1).var(dim=1))
+    layer.settled = True
+    result = layer(x)
+    torch.testing.assert_close(layer.running_mean, 0.99 * mean + 0.01 * x.mean(dim=(0, 2, 3)))
+    torch.testing.assert_close(layer.running_var, 0.99 * var + 0.01 * x.transpose(0, 1).flatten(1).var(dim=1))
+    assert torch.equal(layer.eval()(x), result)
+    assert not torch.allclose(unsettled, result, atol=0.1)
 
 
-def test_renormalisation_has_the_gradient_of_batch_normalisation_with_its_corrections_fixed() -> None:
-    layer, x = _renorm(), torch.randn(6, 3, 4, 5, dtype=torch.float64).requires_grad_()
-    mean, var = x.detach().mean(dim=(0, 2, 3)), x.detach().transpose(0, 1).flatten(1).var(dim=1)
-    factor = ((var + 1e-5) / (layer.running_var + 1e-5)).sqrt()
-    shift = (mean - layer.running_mean) / (layer.running_var + 1e-5).sqrt()
-    weight, bias = layer.weight * factor, layer.weight * shift + layer.bias
-    expected = functional.batch_norm(x, None, None, weight, bias, training=True)
-    upstream = torch.randn_like(expected)
-    (wanted,) = torch.autograd.grad(expected, x, upstream)
-    (found,) = torch.autograd.grad(layer.train()(x), x, upstream)
-    torch.testing.assert_close(found, wanted, rtol=0, atol=1e-12)
-
-
-def test_renormalisation_limits_its_corrections() -> None:
-    layer = BatchRenorm(1).double().train()
-    x = 1e3 + 1e2 * torch.randn(9, 1, 5, 5, dtype=torch.float64)
-    result = layer(x).detach()
-    assert float(result.mean()) == pytest.approx(5, abs=1e-9)
-    assert float(result.std()) == pytest.approx(3, rel=0.01)
+def test_settled_network_differs_in_trainings_alone() -> None:
+    nets = []
+    for settled in (False, True):
+        torch.manual_seed(3)
+        nets.append(SparseToDense(4, 4, settled))
+    assert nets[0].arguments() == nets[1].arguments()
+    rgb, values = photos(32, 32, 2), maps(8, 8, 2).float()
+    trained, used = ([net.train(mode).upsample(rgb, values) for net in nets] for mode in (True, False))
+    assert not torch.allclose(trained[0], trained[1], rtol=1e-3)
+    assert all(layer.settled for layer in nets[1].modules() if isinstance(layer, BatchNorm))
+    assert not torch.allclose(used[0], trained[0], rtol=1e-3)
+    nets[1].train().load_state_dict(nets[0].state_dict())
+    assert torch.equal(nets[1].eval().upsample(rgb, values), nets[0].eval().upsample(rgb, values))
 
 
 @pytest.mark.parametrize("scale", [2, 8])

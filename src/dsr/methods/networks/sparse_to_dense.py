@@ -14,10 +14,8 @@ What differs from the original:
 
 - The samples are a low-resolution map: pixel (i, j) becomes the sample at (scale i + scale // 2, scale j + scale // 2),
   the pixel next to the centre of its block. The original draws random pixels of the true depth.
-- It works on disparity, normalised by the low-resolution map to 1..11; the original on metres, of rooms up to 10.
+- It works on disparity, normalised by the low-resolution map to 1..2, so that 0 is no value.
 - The trunk has half the channels by default, and starts from random weights instead of ImageNet's.
-- Batch renormalisation replaces batch normalisation, because the mean depth of a few patches differs from that of all.
-  With batch normalisation the result was off by 5 to 13 % of the range.
 - The final enlargement aligns the images' outer edges, the original's the centres of their outer pixels.
 """
 
@@ -36,11 +34,8 @@ from dsr.methods.networks.base import RangeNetwork, expect_rgb_size
 _STRIDE = 32
 """The photo's pixels, along an axis, for each pixel of the encoder's result."""
 _STAGES = 4
-_LOWEST, _RANGE = 1.0, 10.0
-"""The lowest value and the range of normalised samples, about those of rooms in metres; 0 is no value."""
-_MOMENTUM, _EPSILON = 0.1, 1e-5
-_LARGEST_FACTOR, _LARGEST_SHIFT = 3.0, 5.0
-"""Limits of the corrections of batch renormalisation, as published."""
+_MOMENTUM = 0.01
+"""Weight of a batch in the moving averages of a settled training."""
 
 
 class SparseToDense(RangeNetwork):
@@ -52,34 +47,38 @@ class SparseToDense(RangeNetwork):
     Args:
         scale: upsampling factor, 2, 4, 8 or 16.
         width: channels of the first residual blocks, a multiple of 4; the original has 64.
+        settled: whether a training normalises with the moving averages of the statistics, as use does, instead of with
+            those of the batch; for a last stage, since a few patches say little of the depth of all.
 
     Raises:
         ValueError: a value is out of range.
 
     """
 
-    def __init__(self, scale: int, width: int = 32) -> None:
+    def __init__(self, scale: int, width: int = 32, settled: bool = False) -> None:
         super().__init__()
         check_scale(scale)
         if width < 4 or width % 4:
             raise ValueError(f"width: expected a positive multiple of 4, got {width}")
         self.scale, self.width = scale, width
         widths = [width * 2**stage for stage in range(_STAGES)]
-        self.stem = nn.Sequential(nn.Conv2d(4, width, 7, 2, 3, bias=False), BatchRenorm(width), nn.ReLU())
+        self.stem = nn.Sequential(nn.Conv2d(4, width, 7, 2, 3, bias=False), BatchNorm(width), nn.ReLU())
         self.encoder = nn.Sequential()
         for before, after in itertools.pairwise([width, *widths]):
             self.encoder.extend([ResidualBlock(before, after), ResidualBlock(after, after)])
         half = widths[-1] // 2
-        self.middle = nn.Sequential(nn.Conv2d(widths[-1], half, 1, bias=False), BatchRenorm(half))
+        self.middle = nn.Sequential(nn.Conv2d(widths[-1], half, 1, bias=False), BatchNorm(half))
         self.decoder = nn.Sequential(*(UpProjection(half // 2**stage) for stage in range(_STAGES)))
         self.head = nn.Conv2d(half // 2**_STAGES, 1, 3, padding=1, bias=False)
         for layer in self.modules():
+            if isinstance(layer, BatchNorm):
+                layer.settled = settled
             if isinstance(layer, nn.Conv2d | nn.ConvTranspose2d):
                 nn.init.kaiming_normal_(layer.weight, mode="fan_out", nonlinearity="relu")
         nn.init.kaiming_normal_(self.head.weight, nonlinearity="linear")
 
     def arguments(self) -> dict[str, Any]:
-        """Return the constructor's arguments."""
+        """Return the constructor's arguments that matter in use."""
         return {"scale": self.scale, "width": self.width}
 
     def forward(self, rgb: Tensor, values: Tensor) -> Tensor:
@@ -99,8 +98,7 @@ class SparseToDense(RangeNetwork):
         expect_rgb_size(rgb, values, self.scale)
         height, width = rgb.shape[-2:]
         bottom, right = (-n % max(_STRIDE // self.scale, 1) for n in values.shape[-2:])
-        padded_values = functional.pad(values, (0, right, 0, bottom), mode="replicate")
-        samples = place_samples(_LOWEST + _RANGE * padded_values, self.scale)
+        samples = place_samples(functional.pad(values, (0, right, 0, bottom), mode="replicate") + 1, self.scale)
         padded = functional.pad(rgb, (0, self.scale * right, 0, self.scale * bottom), mode="replicate")
         x = torch.cat((padded, samples.to(rgb)), dim=1).to(self.head.weight.dtype)
         x = functional.max_pool2d(self.stem(x), 3, stride=2, padding=1)
@@ -109,7 +107,7 @@ class SparseToDense(RangeNetwork):
             dtype = torch.promote_types(x.dtype, torch.float32)
             result = functional.conv2d(x.to(dtype), self.head.weight.to(dtype), padding=1)
             result = functional.interpolate(result, scale_factor=2, mode="bilinear", align_corners=False)
-            return (result[..., :height, :width].to(values.dtype) - _LOWEST) / _RANGE
+            return result[..., :height, :width].to(values.dtype) - 1
 
 
 class ResidualBlock(nn.Module):
@@ -126,14 +124,14 @@ class ResidualBlock(nn.Module):
         stride = 1 if before == after else 2
         self.branch = nn.Sequential(
             nn.Conv2d(before, after, 3, stride, 1, bias=False),
-            BatchRenorm(after),
+            BatchNorm(after),
             nn.ReLU(),
             nn.Conv2d(after, after, 3, 1, 1, bias=False),
-            BatchRenorm(after),
+            BatchNorm(after),
         )
         self.shortcut = nn.Sequential()
         if before != after:
-            self.shortcut.extend([nn.Conv2d(before, after, 1, stride, bias=False), BatchRenorm(after)])
+            self.shortcut.extend([nn.Conv2d(before, after, 1, stride, bias=False), BatchNorm(after)])
 
     def forward(self, x: Tensor) -> Tensor:
         """Map (B, before, H, W) to (B, after, H, W), or half the size."""
@@ -153,31 +151,32 @@ class UpProjection(nn.Module):
         after = before // 2
         self.upper = nn.Sequential(
             _zeros_and_5x5(before, after),
-            BatchRenorm(after),
+            BatchNorm(after),
             nn.ReLU(),
             nn.Conv2d(after, after, 3, padding=1, bias=False),
-            BatchRenorm(after),
+            BatchNorm(after),
         )
-        self.lower = nn.Sequential(_zeros_and_5x5(before, after), BatchRenorm(after))
+        self.lower = nn.Sequential(_zeros_and_5x5(before, after), BatchNorm(after))
 
     def forward(self, x: Tensor) -> Tensor:
         """Map (B, before, H, W) to (B, before / 2, 2 H, 2 W)."""
         return functional.relu(self.upper(x) + self.lower(x))
 
 
-class BatchRenorm(nn.Module):
-    """Batch renormalisation (Ioffe, *Batch Renormalization*, NIPS 2017).
-
-    The gradient is that of batch normalisation, but the values are normalised with the moving averages of the
-    statistics, in a training as in use, up to limits of the correction. So they do not depend on the rest of the batch.
+class BatchNorm(nn.Module):
+    """Batch normalisation without the library's counter of batches, so that its state consists of real numbers alone.
 
     Args:
         channels: channels of the input.
+
+    Attributes:
+        settled: whether a training, too, normalises with the moving averages.
 
     """
 
     running_mean: Tensor
     running_var: Tensor
+    settled = False
 
     def __init__(self, channels: int) -> None:
         super().__init__()
@@ -187,18 +186,14 @@ class BatchRenorm(nn.Module):
         self.register_buffer("running_var", torch.ones(channels))
 
     def forward(self, x: Tensor) -> Tensor:
-        """Normalise (B, C, H, W)."""
-        if not self.training:
-            return functional.batch_norm(x, self.running_mean, self.running_var, self.weight, self.bias)
-        mean, var = torch.zeros_like(self.running_mean), torch.ones_like(self.running_var)
-        x = functional.batch_norm(x, mean, var, training=True, momentum=1.0)  # writes the batch's statistics
-        deviation = (self.running_var + _EPSILON).sqrt()
-        factor = ((var + _EPSILON).sqrt() / deviation).clamp(1 / _LARGEST_FACTOR, _LARGEST_FACTOR)
-        shift = ((mean - self.running_mean) / deviation).clamp(-_LARGEST_SHIFT, _LARGEST_SHIFT)
-        self.running_mean.lerp_(mean, _MOMENTUM)
-        self.running_var.lerp_(var, _MOMENTUM)
-        scale, offset = self.weight * factor, self.weight * shift + self.bias
-        return x * scale.view(-1, 1, 1).to(x.dtype) + offset.view(-1, 1, 1).to(x.dtype)
+        """Normalise (B, C, H, W) with the statistics of the batch in a training, and else with their moving average."""
+        by_batch = self.training and not self.settled
+        if self.training and self.settled:
+            with torch.no_grad():
+                var, mean = torch.var_mean(x.float(), dim=(0, 2, 3))
+                self.running_mean.lerp_(mean.to(self.running_mean), _MOMENTUM)
+                self.running_var.lerp_(var.to(self.running_var), _MOMENTUM)
+        return functional.batch_norm(x, self.running_mean, self.running_var, self.weight, self.bias, by_batch)
 
 
 def place_samples(values: Tensor, scale: int) -> Tensor:
