@@ -82,7 +82,7 @@ def test_installed_help_lists_the_commands_and_choices(dsr):
     for name in ("upsample", "eval", "train", "report", "study", "data", "doctor"):
         assert f"    {name} " in commands
     choices = dsr("eval", "--help")
-    for line in ("dataset: folder, icl,", "method: ", "facets, ", "experiment: ", "paper_tables", "scale: 4"):
+    for line in ("dataset: arkitscenes,", "method: ", "facets, ", "experiment: ", "paper_tables", "scale: 4"):
         assert line in choices
     choices = dsr("train", "-h")
     for line in (

@@ -180,7 +180,7 @@ def test_config_yaml_is_the_resolved_configuration(smoke):
     assert config["trainer"]["name"] == "smoke"
     assert config["dataset"]["size"] == 64
     assert config["model"]["name"] == "msg_v"
-    assert config["loss"] == {"w": "auto"}
+    assert config["loss"] == {"visual": "mse_v", "w": "auto"}
 
 
 def test_versions_json_records_what_made_the_weights(smoke):
