@@ -201,6 +201,12 @@ def test_directory_of_another_run_is_refused_with_the_changed_keys(tmp_path):
     assert (tmp_path / "config.yaml").read_bytes() == before
 
 
+def test_directory_in_which_another_run_begins_can_be_claimed(tmp_path):
+    (tmp_path / ".versions-8f3k.json").touch()  # what replacing() writes before the record is there
+    claimed(tmp_path, config())
+    assert (tmp_path / "versions.json").is_file()
+
+
 @pytest.mark.parametrize("content", [None, "", "[]", "{}", '{"identity": 3}', '{"identity": null}'])
 def test_directory_with_foreign_files_is_refused_and_unchanged(tmp_path, content):
     (tmp_path / "thesis.txt").write_text("precious")

@@ -84,7 +84,7 @@ def expect_free(
     """
     if folder.exists() and not folder.is_dir():
         raise ConfigError(f"output_dir: expected a directory, {folder} is a file")
-    if not folder.is_dir() or not any(folder.iterdir()) or config["overwrite"]:
+    if not folder.is_dir() or _is_unused(folder) or config["overwrite"]:
         return []
     try:
         before = update_targets(dict(json.loads((folder / _RECORD).read_text(encoding="utf-8"))["identity"]))
@@ -100,6 +100,11 @@ def expect_free(
             "another output_dir keeps it, overwrite=true replaces it"
         )
     return different
+
+
+def _is_unused(folder: Path) -> bool:
+    """Return whether a directory is empty, but for a record that another run is writing right now."""
+    return all(path.name.startswith(f".{Path(_RECORD).stem}-") for path in folder.iterdir())
 
 
 def claim(
