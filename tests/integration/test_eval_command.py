@@ -332,7 +332,7 @@ USAGE_ERRORS = {
     "an added key": (["+scal=8"], "scal: unknown key; expected dataset, "),
     "an added key of a group": (["+method.sharp=1"], "method.sharp: unknown key; method=bicubic takes order, "),
     "a group taken away": (["~method"], "method: missing; give it as method=..."),
-    "a scale that is none": (["scale=3"], "scale: expected one of 2, 4, 8, 16, got 3"),
+    "a scale that is none": (["scale=3"], "scale: expected one of 2, 4, 8, 16, got 3; downsampling=measured takes "),
     "a number that is none": (["scale=big"], "scale: "),
     "a type in a group": (["dataset.size=big"], "dataset.size: expected a whole number, got 'big'"),
     "a choice in a group": (["method.order=cubic"], "method.order: expected one of nearest, bilinear, bicubic, got"),
@@ -350,7 +350,7 @@ USAGE_ERRORS = {
     "a scene twice": (["dataset.scenes=[statue,statue]"], "dataset.scenes: expected names, each once"),
     "a scene without a list": (
         ["dataset.scenes=statue"],
-        "dataset.scenes: expected a list of text or one of found or null, got",
+        "dataset.scenes: expected a list of text, found or null, got",
     ),
     "no weights": (["method=msg_v", "scale=16"], "weights: dsr comes with "),
     "a mixture": (["dataset=mixture"], "dataset=mixture: several data sets are for training; name one of them"),

@@ -173,7 +173,10 @@ def test_run_settings_are_checked():
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"scale": 3}, "scale: expected one of 2, 4, 8, 16, got 3"),
+        (
+            {"scale": 3},
+            "scale: expected one of 2, 4, 8, 16, got 3; downsampling=measured takes a sensor's map of any ratio",
+        ),
         ({"precision": "float16"}, "precision: expected one of float32, bfloat16, auto, got float16"),
         ({"seed": -1}, "seed: expected 0 or a positive number, got -1"),
         ({"method": "???"}, "method: missing; give it as method=..."),

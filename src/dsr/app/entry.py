@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import logging
 import os
 import re
 import sys
@@ -66,6 +67,7 @@ def run_command(name: str, command: Callable[[DictConfig], Any], arguments: Sequ
     register_resolvers()
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     os.environ.setdefault("HYDRA_FULL_ERROR", "1")  # Hydra then raises exceptions instead of printing them
+    logging.getLogger("matplotlib").setLevel(logging.WARNING)  # Hydra would show when it caches fonts
     failures: list[str] = []
     try:
         directories = config_directories(_config_dirs(arguments))

@@ -61,12 +61,12 @@ class Checked:
         """
 
 
-def _expect_factor(scale: Any) -> None:
-    """Raise ConfigError for a scale that downsampling models do not have."""
+def _expect_factor(scale: Any, hint: str = "") -> None:
+    """Raise ConfigError, with a hint, for a scale that downsampling models do not have."""
     try:
         check_scale(scale)
     except ValueError as error:
-        raise ConfigError(str(error)) from error
+        raise ConfigError(f"{error}{hint}") from error
 
 
 def _refuse_unknown(plain: Any, names: Collection[str], place: str = "") -> None:
@@ -134,7 +134,7 @@ class EvalConfig(RunConfig):
         """
         super().check()
         if not self.measured:
-            _expect_factor(self.scale)
+            _expect_factor(self.scale, "; downsampling=measured takes a sensor's map of any ratio")
         number = isinstance(self.scale, (int, float)) and not isinstance(self.scale, bool) and self.scale >= 1
         if not number and self.scale != NATIVE:
             raise ConfigError(

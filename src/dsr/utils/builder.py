@@ -134,12 +134,14 @@ def _describe(hint: Any) -> str:
     """Return a type for a reader."""
     origin = get_origin(hint)
     if origin in (Union, types.UnionType):
-        return " or ".join(_describe(choice) for choice in get_args(hint))
+        *others, last = (_describe(choice) for choice in get_args(hint))
+        return f"{', '.join(others)} or {last}"
     if origin is Literal:
-        return "one of " + ", ".join(map(str, get_args(hint)))
+        names = [str(choice) for choice in get_args(hint)]
+        return names[0] if len(names) == 1 else f"one of {', '.join(names)}"
     if origin is not None and issubclass(origin, Sequence):
         return f"a list of {_describe(get_args(hint)[0])}"
     if origin is not None and issubclass(origin, Mapping):
         return f"keys, each with {_describe(get_args(hint)[1])}"
-    names = {float: "a number", int: "a whole number", str: "text", bool: "true or false", type(None): "null"}
-    return names.get(hint, getattr(hint, "__name__", str(hint)))
+    types_of = {float: "a number", int: "a whole number", str: "text", bool: "true or false", type(None): "null"}
+    return types_of.get(hint, getattr(hint, "__name__", str(hint)))
