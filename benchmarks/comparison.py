@@ -4,10 +4,11 @@
 
 Writes ``comparison.csv`` (one row per data set, scale, degradation and method, the means over the scenes of all
 metrics, worst of four lights, raw units) and ``comparison.md``: for each scale and degradation a table of RMSE_v,
-DSSIM_v, LPIPS_v and RMSE_d. In each column the best value is bold. A mean over less scenes than the other methods have
-is marked with their number. With ``--crop DATASET SCENE SCALE DEGRADATION TOP LEFT SIDE`` it draws ``crop.jpg``, too:
-that window of the photo, the input and all results, rendered, beside the truth; captions are the scene's DSSIM_v and
-RMSE_v.
+DSSIM_v, LPIPS_v and RMSE_d, and one of all sensors' maps, by the metrics of ``metrics=sensor``. In each column the best
+value is bold. A mean over less scenes than the other methods have is marked with their number.
+
+With ``--crop DATASET SCENE SCALE DEGRADATION TOP LEFT SIDE`` it draws ``crop.jpg``, too: that window of the photo, the
+input and all results, rendered, beside the truth; captions are the scene's DSSIM_v and RMSE_v.
 """
 
 from __future__ import annotations
@@ -26,12 +27,26 @@ from dsr.evaluation.results import BenchmarkSetting, Results, load_results
 from dsr.metrics.formats import HEADLINES
 from dsr.report.figures.scenes import Shown, rendering, shown_scenes
 
-SHOWN = (("RMSE_v", 1e3, 0), ("DSSIM_v", 1e3, 0), ("LPIPS_v", 1e3, 0), ("RMSE_d", 1e3, 1))
+Columns = tuple[tuple[str, float, int], ...]
+SHOWN: Columns = (("RMSE_v", 1e3, 0), ("DSSIM_v", 1e3, 0), ("LPIPS_v", 1e3, 0), ("RMSE_d", 1e3, 1))
 """Metrics of a cell, their factors and digits."""
+SHOWN_OF_SENSORS: Columns = (
+    ("Sensor_RMSE_v", 1e3, 0),
+    ("Sensor_DSSIM_v", 1e3, 0),
+    ("Sensor_angle_mean", 1, 1),
+    ("Sensor_RMSE_d", 1e3, 1),
+)
 APART = ("folder",)
 """Data sets whose scenes have columns of their own."""
-TITLES = {"simgeo": "SimGeo", "lucy": "Lucy", "plant": "Plant", "middlebury": "Middlebury", "icl": "ICL"}
+TITLES = {
+    "simgeo": "SimGeo", "lucy": "Lucy", "plant": "Plant", "middlebury": "Middlebury", "icl": "ICL",
+    "ddrnet": "ddrnet, x1", "rgbdd_real": "rgbdd_real, x2.67",
+}  # fmt: skip
 """Data sets in the order of the columns."""
+FIRST = ("Facets", "MSG-V", "MSG-V (published)", "MSG-V (noisy)", "MSG", "MSG (published)")
+"""Labels of the rows that come first, if there are such rows."""
+PEERS = ("PGSR", "DCTNet", "DORNet-T", "FDKN", "SVLRM")
+"""Labels of the rows that come last."""
 COLUMNS = 6
 """Panels of a row of the picture."""
 
@@ -49,10 +64,10 @@ def table_of(results: Results) -> pd.DataFrame:
     return means.reset_index()
 
 
-def cell(row: pd.Series, best: pd.Series, most: int) -> str:
+def cell(row: pd.Series, best: pd.Series, most: int, columns: Columns) -> str:
     """Return a method's values on a data set as the text of a table's cell."""
     parts = []
-    for name, factor, digits in SHOWN:
+    for name, factor, digits in columns:
         if name not in row or pd.isna(row[name]):
             parts.append("-")
             continue
@@ -63,30 +78,38 @@ def cell(row: pd.Series, best: pd.Series, most: int) -> str:
 
 
 def markdown(means: pd.DataFrame, methods: list[str]) -> str:
-    """Return one Markdown table for each scale and degradation."""
+    """Return one Markdown table for each scale and degradation, and one of the sensors' maps."""
     lines: list[str] = []
-    settings = means[["downsampling", "scale"]].drop_duplicates()
-    settings = settings.sort_values(["downsampling", "scale"], key=lambda keys: keys.replace("box", ""))
-    for downsampling, scale in settings.itertuples(index=False):
-        part = means[(means["downsampling"] == downsampling) & (means["scale"] == scale)]
-        order = list(TITLES.values())
-        datasets = sorted(
-            dict.fromkeys(part["dataset"]), key=lambda name: (name not in order, [*order, name].index(name))
-        )
-        lines += [f"x{scale:g}, {downsampling}:", "", f"| method | {' | '.join(datasets)} |"]
-        lines += ["| --- |" + " --- |" * len(datasets)]
-        for label in methods:
-            cells = []
-            for dataset in datasets:
-                those = part[part["dataset"] == dataset]
-                complete = those[those["scenes"] == those["scenes"].max()]
-                mine = those[those["label"] == label]
-                best = complete.min(numeric_only=True)
-                cells.append(cell(mine.iloc[0], best, those["scenes"].max()) if len(mine) else "-")
-            if any(text != "-" for text in cells):
-                lines.append(f"| {label} | {' | '.join(cells)} |")
-        lines.append("")
+    for downsampling, of_kind in sorted(means.groupby("downsampling"), key=lambda group: group[0].replace("box", "")):
+        if downsampling == "measured":
+            lines += ["measured:", "", *table(of_kind, methods, SHOWN_OF_SENSORS)]
+            continue
+        for scale, part in of_kind.groupby("scale"):
+            lines += [f"x{scale:g}, {downsampling}:", "", *table(part, methods, SHOWN)]
     return "\n".join(lines)
+
+
+def table(means: pd.DataFrame, methods: list[str], columns: Columns) -> list[str]:
+    """Return the lines of a table with a row for each method and a column for each data set."""
+    order = [*TITLES.values(), *means["dataset"]]
+    datasets = sorted(set(means["dataset"]), key=order.index)
+    lines = [f"| method | {' | '.join(datasets)} |", "| --- |" + " --- |" * len(datasets)]
+    for label in methods:
+        cells = []
+        for dataset in datasets:
+            those = means[means["dataset"] == dataset]
+            most = those["scenes"].max()
+            best = those[those["scenes"] == most].min(numeric_only=True)
+            mine = those[those["label"] == label]
+            cells.append(cell(mine.iloc[0], best, most, columns) if len(mine) else "-")
+        if any(text != "-" for text in cells):
+            lines.append(f"| {label} | {' | '.join(cells)} |")
+    return [*lines, ""]
+
+
+def ordered(methods: list[str]) -> list[str]:
+    """Return the labels of methods in the order of the rows."""
+    return sorted(methods, key=lambda label: FIRST.index(label) if label in FIRST else len(FIRST) + (label in PEERS))
 
 
 def picture(shown: Shown, top: int, left: int, side: int) -> Figure:
@@ -100,7 +123,8 @@ def picture(shown: Shown, top: int, left: int, side: int) -> Figure:
         ("photo", scene.rgb.permute(1, 2, 0).numpy()[window]),
         ("input", enlarged[window]),
     ]
-    for label, depth in shown.depths.items():
+    for label in ordered(list(shown.depths)):
+        depth = shown.depths[label]
         if depth is not None:
             found = shown.scores[label]
             caption = f"{label}\n{1e3 * found['DSSIM_v']:.0f} / {1e3 * found['RMSE_v']:.0f}"
@@ -141,7 +165,7 @@ def main() -> None:
     means = table_of(results)
     options.output.mkdir(parents=True, exist_ok=True)
     means.to_csv(options.output / "comparison.csv", index=False, float_format="%.6g")
-    (options.output / "comparison.md").write_text(markdown(means, results.methods()), encoding="utf-8")
+    (options.output / "comparison.md").write_text(markdown(means, ordered(results.methods())), encoding="utf-8")
     if options.crop:
         draw_crop(results, options.output / "crop.jpg", options.crop)
     for note in results.notes:

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from dsr.data.diml import DIML
-from dsr.data.formats.diml import find_frames, load_frame
-from dsr.data.formats.shared import NO_CAMERA
+from dsr.data.formats.diml import find_frames
+from dsr.data.formats.shared import NO_CAMERA, load_pair
 
 DEPTH = (1000 + 2 * np.arange(16)[:, None] + np.arange(28)).astype(np.uint16)
 
@@ -31,7 +31,7 @@ def frame(room, name="in_01_160217_123138"):
 
 
 def test_frame_is_metres_with_sixty_degrees_of_view(tmp_path):
-    scene = load_frame(*frame(tmp_path), "diml", "in_01")
+    scene = load_pair(*frame(tmp_path), "diml", "in_01")
     assert scene.depth[0, 10, 20].item() == pytest.approx(1.040)
     assert math.degrees(2 * math.atan(14 / scene.camera.fx)) == pytest.approx(60)
     assert scene.rgb.unique().tolist() == pytest.approx([0.2])
@@ -80,7 +80,7 @@ def test_damaged_or_foreign_file_is_refused_in_one_line_that_names_it(tmp_path, 
     files = frame(tmp_path)
     files[which].write_bytes(content)
     with pytest.raises(ValueError, match=message) as caught:
-        load_frame(*files, "diml", "in_01")
+        load_pair(*files, "diml", "in_01")
     assert capfd.readouterr() == ("", "")
     assert str(caught.value).startswith(f"{files[which]}: expected ")
     assert "\n" not in str(caught.value)

@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 import pytest
 
-from dsr.data.formats.rgbdd import find_frames, load_frame, load_measured_frame
-from dsr.data.formats.shared import NO_CAMERA
+from dsr.data.formats.rgbdd import find_frames, load_measured_frame
+from dsr.data.formats.shared import NO_CAMERA, load_pair
 from dsr.data.rgbdd import RGBDD
 
 ROWS, COLUMNS = np.mgrid[0:384, 0:512]
@@ -48,7 +48,7 @@ def test_image_is_metres_with_sixty_degrees_of_view(tmp_path):
     assert math.degrees(2 * math.atan(256 / scene.camera.fx)) == pytest.approx(60)
     assert (scene.camera.cx, scene.camera.cy, scene.camera.fx) == (255.5, 191.5, scene.camera.fy)
     assert scene.rgb.unique().tolist() == pytest.approx([0.2])
-    depth_alone = load_frame(*image(tmp_path, "1", count=2), "rgbdd", "1")
+    depth_alone = load_pair(*image(tmp_path, "1", count=2), "rgbdd", "1")
     assert (depth_alone.name, dict(depth_alone.measured)) == ("1", {})
 
 

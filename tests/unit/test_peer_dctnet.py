@@ -8,8 +8,8 @@ import scipy.fft
 import scipy.ndimage
 import torch
 
+from dsr.methods.networks.dct import dct2, idct2
 from dsr.methods.networks.peers import dctnet
-from dsr.methods.networks.peers.dct import dct2, idct2
 from dsr.methods.networks.peers.dctnet import DCTNet, laplacian, transfer_edges
 
 SIZES = [(4, 6), (5, 7), (5, 4), (6, 5), (1, 3), (4, 1), (1, 2), (1, 1)]

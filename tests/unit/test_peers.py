@@ -17,7 +17,8 @@ from torch import Tensor, nn
 from dsr.geometry.camera import Camera, from_range
 from dsr.methods.base import Cost
 from dsr.methods.networks.inpainting import inpaint
-from dsr.methods.networks.peers.base import PeerNetwork, PeerUpsampler, upsample_pillow
+from dsr.methods.networks.maps import resize_bicubic
+from dsr.methods.networks.peers.base import PeerNetwork, PeerUpsampler
 from dsr.methods.networks.peers.build import PEERS, build_peer
 from dsr.methods.networks.peers.files import fold_batch_norm, load_peer, nearest_scale
 from dsr.methods.networks.peers.svlrm import SVLRM
@@ -41,7 +42,7 @@ class Enlarged(PeerNetwork):
         self.seen: list[Tensor] = []
 
     def enlarge(self, values_lr: Tensor, size: tuple[int, int]) -> Tensor:
-        return upsample_pillow(values_lr, size)
+        return resize_bicubic(values_lr, size)
 
     def forward(self, rgb: Tensor, values: Tensor) -> Tensor:
         assert not any(n % self.multiple for n in values.shape[-2:])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import sys
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,7 +14,7 @@ import torchmetrics
 from dsr.app.schema import MetricsConfig
 from dsr.metrics.catalogue import PROTOCOLS, Metric, catalogue
 from dsr.metrics.classes import visual_metrics
-from dsr.metrics.lpips import LPIPS, TRUNK_URL, load_lpips
+from dsr.metrics.lpips import GET_TRUNK, LPIPS, load_lpips
 from dsr.utils.builder import ConfigError, load_object
 from dsr.utils.console import one_line
 
@@ -25,13 +26,15 @@ def chosen_metrics(settings: MetricsConfig, device: torch.device) -> tuple[Metri
         ConfigError: a metric or the network's file is not valid.
 
     """
-    return catalogue(_network_on(settings, device), extra_metrics(settings), settings.protocols)
+    extra = extra_metrics(settings)
+    return catalogue(_network_on(settings, extra, device), extra, settings.protocols)
 
 
 def metric_collection(settings: MetricsConfig, device: torch.device) -> torchmetrics.MetricCollection:
     """Return the same metrics as one collection, for a validation pass, which is always judged by the paper's too."""
     settings = replace(settings, protocols=list(dict.fromkeys((*settings.protocols, "paper"))))
-    return visual_metrics(_network_on(settings, device), extra_metrics(settings), settings.protocols)
+    extra = extra_metrics(settings)
+    return visual_metrics(_network_on(settings, extra, device), extra, settings.protocols)
 
 
 def check_metrics(settings: MetricsConfig) -> None:
@@ -66,9 +69,9 @@ def extra_metrics(settings: MetricsConfig) -> tuple[Metric, ...]:
     return metrics
 
 
-def _network_on(settings: MetricsConfig, device: torch.device) -> LPIPS | None:
+def _network_on(settings: MetricsConfig, extra: Sequence[Metric], device: torch.device) -> LPIPS | None:
     """Return the LPIPS network; None if it is disabled, not used, or not available."""
-    chosen = (*(metric for name in settings.protocols for metric in PROTOCOLS[name]), *extra_metrics(settings))
+    chosen = (*(metric for name in settings.protocols for metric in PROTOCOLS[name]), *extra)
     used = any(metric.perceptual for metric in chosen)
     network = perceptual_network(settings.lpips_trunk) if settings.lpips and used else None
     return None if network is None else network.to(device)
@@ -83,8 +86,7 @@ def perceptual_network(trunk: str | None) -> LPIPS | None:
         if trunk is not None:
             raise ConfigError(f"metrics.lpips_trunk: {error}") from error
         print(  # noqa: T201
-            f"LPIPS_v is left out: AlexNet's weights {one_line(error)}; "
-            f"get {TRUNK_URL} and set metrics.lpips_trunk=FILE or $DSR_LPIPS_TRUNK",
+            f"LPIPS_v is left out: AlexNet's weights {one_line(error)}; {GET_TRUNK}",
             file=sys.stderr,
         )
         return None

@@ -5,11 +5,9 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 from dsr.data.base import SceneSelection
 from dsr.data.formats import arkitscenes
-from dsr.data.preparation.dataset import Preparation, PreparedDataset, list_frames, make_records
+from dsr.data.preparation.dataset import Preparation, PreparedDataset, add_note, list_frames, make_records
 from dsr.geometry.camera import ASSUMED_FOV
 
 NOTE = f"there is no .pincam file: {ASSUMED_FOV:g} degrees of horizontal view are assumed"
@@ -44,9 +42,6 @@ class ARKitScenes(PreparedDataset):
             raise ValueError(f"min_confidence: expected 0, 1 or 2, got {min_confidence}")
         frames = list_frames(arkitscenes.find_frames, root, split)
         records = make_records(frames, arkitscenes.load_frame, "arkitscenes", min_confidence=min_confidence)
-        found = {
-            name: record if frames[name][-1] is not None else replace(record, note=NOTE)
-            for name, record in records.items()
-        }
+        found = records | add_note({name: records[name] for name, files in frames.items() if files[-1] is None}, NOTE)
         super().__init__("arkitscenes", root, found, None, scenes, Preparation(None))
         self.evaluation = split == "validation"

@@ -23,6 +23,7 @@ from dsr.data.formats import (
     tartanair,
     tofmark,
 )
+from dsr.data.formats.shared import load_pair
 from dsr.sample import Scene
 
 Loader = Callable[[], Scene]
@@ -34,10 +35,10 @@ _FRAMES: tuple[tuple[Callable[[Path], Mapping[str, tuple[Any, ...]]], Callable[.
     (sintel.find_frames, sintel.load_frame, "sintel"),
     (tofmark.find_frames, tofmark.load_frame, "tofmark"),
     (ddrnet.find_frames, ddrnet.load_frame, "ddrnet"),
-    (rgbdd.find_frames, rgbdd.load_frame, "rgbdd"),
+    (rgbdd.find_frames, load_pair, "rgbdd"),
     (nyu.find_files, nyu.load_files, "nyu"),
     (arkitscenes.find_frames, arkitscenes.load_frame, "arkitscenes"),
-    (diml.find_frames, diml.load_frame, "diml"),
+    (diml.find_frames, load_pair, "diml"),
     *(
         (functools.partial(eight_bit.find_frames, dataset=benchmark), eight_bit.load_frame, benchmark)
         for benchmark in eight_bit.BENCHMARKS

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import get_args
 
 from dsr.data.base import SceneSelection
 from dsr.data.formats import diml
-from dsr.data.formats.shared import NO_CAMERA
-from dsr.data.preparation.dataset import Preparation, PreparedDataset, list_frames, make_records
+from dsr.data.formats.shared import NO_CAMERA, load_pair
+from dsr.data.preparation.dataset import Preparation, PreparedDataset, add_note, list_frames, make_records
 
 
 class DIML(PreparedDataset):
@@ -36,7 +35,7 @@ class DIML(PreparedDataset):
         for name, value, choices in (("split", split, diml.Split), ("resolution", resolution, diml.Resolution)):
             if value not in get_args(choices):
                 raise ValueError(f"{name}: expected one of {', '.join(get_args(choices))}, got {value}")
-        records = make_records(list_frames(diml.find_frames, root, split, resolution), diml.load_frame, "diml")
-        found = {scene: replace(record, note=NO_CAMERA) for scene, record in records.items()}
+        frames = list_frames(diml.find_frames, root, split, resolution)
+        found = add_note(make_records(frames, load_pair, "diml"), NO_CAMERA)
         super().__init__("diml", root, found, None, scenes, Preparation(None), count=diml.COUNTS[split])
         self.evaluation = split == "test"

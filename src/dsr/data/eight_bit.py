@@ -5,12 +5,11 @@ The field computes their errors in levels; see :mod:`dsr.data.formats.eight_bit`
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Literal
 
 from dsr.data.base import SceneSelection
 from dsr.data.formats import eight_bit
-from dsr.data.preparation.dataset import Preparation, PreparedDataset, list_frames, make_records
+from dsr.data.preparation.dataset import Preparation, PreparedDataset, add_note, list_frames, make_records
 
 NOTE = "depth is not metric: the camera is invented, and levels are taken for disparity"
 
@@ -33,6 +32,5 @@ class EightBit(PreparedDataset):
         if benchmark not in eight_bit.BENCHMARKS:
             raise ValueError(f"benchmark: expected one of {', '.join(eight_bit.BENCHMARKS)}, got {benchmark}")
         frames = list_frames(eight_bit.find_frames, root, benchmark)
-        records = make_records(frames, eight_bit.load_frame, benchmark)
-        found = {name: replace(record, note=NOTE) for name, record in records.items()}
+        found = add_note(make_records(frames, eight_bit.load_frame, benchmark), NOTE)
         super().__init__(benchmark, root, found, eight_bit.BENCHMARKS[benchmark].scenes, scenes, Preparation(None))

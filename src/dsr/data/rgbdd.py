@@ -6,12 +6,10 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 from dsr.data.base import SceneSelection
 from dsr.data.formats import rgbdd
-from dsr.data.formats.shared import NO_CAMERA
-from dsr.data.preparation.dataset import Preparation, PreparedDataset, list_frames, make_records
+from dsr.data.formats.shared import NO_CAMERA, load_pair
+from dsr.data.preparation.dataset import Preparation, PreparedDataset, add_note, list_frames, make_records
 
 
 class RGBDD(PreparedDataset):
@@ -32,8 +30,8 @@ class RGBDD(PreparedDataset):
     def __init__(self, root: str, real: bool, split: rgbdd.Split = "test", scenes: SceneSelection = None) -> None:
         if split not in rgbdd.COUNTS:
             raise ValueError(f"split: expected one of {', '.join(rgbdd.COUNTS)}, got {split}")
-        name, load = ("rgbdd_real", rgbdd.load_measured_frame) if real else ("rgbdd", rgbdd.load_frame)
-        records = make_records(list_frames(rgbdd.find_frames, root, split, real), load, name)
-        found = {scene: replace(record, note=NO_CAMERA) for scene, record in records.items()}
+        name, load = ("rgbdd_real", rgbdd.load_measured_frame) if real else ("rgbdd", load_pair)
+        frames = list_frames(rgbdd.find_frames, root, split, real)
+        found = add_note(make_records(frames, load, name), NO_CAMERA)
         super().__init__(name, root, found, None, scenes, Preparation(None), count=rgbdd.COUNTS[split])
         self.evaluation = split == "test"

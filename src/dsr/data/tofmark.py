@@ -10,11 +10,10 @@ without distortion, with a root mean square error of 0.95 pixels.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 
 from dsr.data.base import SceneSelection
 from dsr.data.formats import tofmark
-from dsr.data.preparation.dataset import Preparation, PreparedDataset, list_frames, make_records
+from dsr.data.preparation.dataset import Preparation, PreparedDataset, add_note, list_frames, make_records
 
 SCENES = ("books", "devil", "shark")
 ESTIMATED = (549.2, 549.2, 375.2, 334.3)
@@ -54,6 +53,5 @@ class ToFMark(PreparedDataset):
         }
         found = make_records(list_frames(tofmark.find_frames, root), tofmark.load_frame, "tofmark", **settings)
         if intrinsics is None:
-            note = "the benchmark has no camera: it is an estimate"
-            found = {name: replace(record, note=note) for name, record in found.items()}
+            found = add_note(found, "the benchmark has no camera: it is an estimate")
         super().__init__("tofmark", root, found, SCENES, scenes, Preparation(None))

@@ -127,10 +127,10 @@ def _bilinear(x: Tensor, _: float) -> Tensor:
     return (1 - x).clamp(min=0)
 
 
-def cubic_kernel(x: Tensor) -> Tensor:
-    """Return the weights of cubic convolution (Keys 1981) with a = -0.5 at distances of ``x`` pixels, 0 or more."""
-    near = (1.5 * x - 2.5) * x * x + 1
-    far = ((-0.5 * x + 2.5) * x - 4) * x + 2
+def cubic_kernel(x: Tensor, a: float = -0.5) -> Tensor:
+    """Return the weights of cubic convolution (Keys 1981) at distances of ``x`` pixels, 0 or more."""
+    near = ((a + 2) * x - (a + 3)) * x * x + 1
+    far = ((x - 5) * x + 8) * x * a - 4 * a
     return torch.where(x < 1, near, torch.where(x < 2, far, 0))
 
 

@@ -17,10 +17,9 @@ from dsr.degradation.scales import SCALES
 from dsr.geometry.camera import RangeType
 from dsr.inference.engine import DECIDED, MethodChoice, upsample_depth
 from dsr.inference.planning import read_ability
-from dsr.methods.networks.peers.build import build_peer
 from dsr.methods.registry import find_weights, read_method
 from dsr.sample import DepthSample
-from dsr.utils.builder import load_target, takes, trait
+from dsr.utils.builder import takes, trait
 from dsr.utils.progress import Steps
 
 _NOT_SETTINGS = ("name", "label", "target", *DECIDED)
@@ -35,7 +34,7 @@ def takes_scale(node: Mapping[str, Any], scale: float) -> bool:
         scale: ratio of the photo's width to the depth map's.
 
     """
-    ratios = "any" if load_target("method", node) is build_peer else trait("method", node, "ratios")
+    ratios = trait("method", node, "ratios")
     return scale in SCALES or ratios == "any" or (ratios == "whole" and isinstance(scale, int))
 
 

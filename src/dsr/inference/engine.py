@@ -141,11 +141,11 @@ def upsample_depth(
         inverse = _resize_nearest(inverse, size)
         block = enlarged_by(inverse)
         repeated = block > 1 and not any(n % block for n in size)
-        if repeated or choice.plan(size, size, scale).coarsened == 1:
+        factor = 1 if repeated else choice.plan(size, size, scale).coarsened
+        if factor == 1:
             inverse = inverse[:, ::block, ::block] if repeated else inverse
             inverse_hr = _upsample_inverse(rgb, inverse, camera, None, choice, progress)
         else:
-            factor = choice.plan(size, size, scale).scale
             padded = _pad_photo(rgb, factor)
             inverse_lr = Downsampling("box")(_pad_inverse(inverse, factor), factor)
             camera_padded = Camera(padded.shape[-1], padded.shape[-2], camera.fx, camera.fy, camera.cx, camera.cy)

@@ -172,11 +172,10 @@ def score_image(
         maps = (values[window][None] for values in (prediction, target, rays))
         return SurfacePair(*maps, unit=unit, image_dtype=torch.float32)
 
-    rows, columns = _covered(prediction)
-    whole = pair_of((...,))
-    covered = pair_of((..., rows, columns))
-    if covered.target.shape == whole.target.shape:
-        covered = whole
+    window = (..., *_covered(prediction))
+    whole = covered = pair_of((...,))
+    if prediction[window].shape != prediction.shape:
+        covered = pair_of(window)
     for metric in metrics:
         pair = whole if metric.whole else covered
         if not metric.applies(pair):

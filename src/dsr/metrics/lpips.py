@@ -21,6 +21,8 @@ from dsr.metrics.functional import SurfacePair
 
 TRUNK_FILE = "alexnet-owt-7be5be79.pth"
 TRUNK_URL = f"https://download.pytorch.org/models/{TRUNK_FILE}"
+GET_TRUNK = f"get {TRUNK_URL} and set metrics.lpips_trunk=FILE or $DSR_LPIPS_TRUNK"
+"""What to do where the trunk is missing, for messages."""
 TRUNK_HASH = "7be5be79"
 """First digits of the official file's SHA-256, as in its name."""
 _MEAN = (-0.030, -0.088, -0.188)

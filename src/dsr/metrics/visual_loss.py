@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from dsr.metrics.functional import SSIM_WINDOW, SurfacePair, dssim_v, mse_v
-from dsr.metrics.lpips import LPIPS, MIN_SIZE, TRUNK_URL, load_lpips, lpips_v
+from dsr.metrics.lpips import GET_TRUNK, LPIPS, MIN_SIZE, load_lpips, lpips_v
 from dsr.utils.console import one_line
 
 VisualLossName = Literal["mse_v", "dssim", "lpips"]
@@ -88,10 +88,7 @@ def make_visual_loss(name: VisualLossName, trunk: Path | None = None) -> VisualL
     try:
         return VisualLoss(name, load_lpips(trunk))
     except (OSError, ValueError) as error:
-        raise ValueError(
-            f"visual: lpips needs AlexNet's weights: {one_line(error)}; "
-            f"get {TRUNK_URL} and set metrics.lpips_trunk=FILE or $DSR_LPIPS_TRUNK"
-        ) from error
+        raise ValueError(f"visual: lpips needs AlexNet's weights: {one_line(error)}; {GET_TRUNK}") from error
 
 
 @torch.no_grad()

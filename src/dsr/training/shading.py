@@ -13,13 +13,11 @@ Image Algorithms*, ICCV 2009). DDRNet's authors compute it in advance, for which
 
 from __future__ import annotations
 
-import math
-
 import torch
 from torch import Tensor
 
 from dsr.methods.classical.finite_differences import grey
-from dsr.methods.networks.peers.dct import dct2, idct2
+from dsr.methods.networks.dct import dct2, idct2, laplacian_eigenvalues
 from dsr.metrics.functional import SurfacePair
 
 _RIDGE = 1e-4
@@ -105,12 +103,9 @@ def integrate(along_u: Tensor, along_v: Tensor) -> Tensor:
 
     """
     zeros_u, zeros_v = torch.zeros_like(along_u[..., :1]), torch.zeros_like(along_v[..., :1, :])
-    divergence = torch.cat((zeros_u, along_u), dim=-1) - torch.cat((along_u, zeros_u), dim=-1)
-    divergence = divergence + torch.cat((zeros_v, along_v), dim=-2) - torch.cat((along_v, zeros_v), dim=-2)
-    second_v, second_u = (
-        2 - 2 * torch.cos(math.pi / n * torch.arange(n, dtype=divergence.dtype, device=divergence.device))
-        for n in divergence.shape[-2:]
-    )
-    eigenvalues = second_v[:, None] + second_u
+    divergence = torch.cat((along_u, zeros_u), dim=-1) - torch.cat((zeros_u, along_u), dim=-1)
+    divergence = divergence + torch.cat((along_v, zeros_v), dim=-2) - torch.cat((zeros_v, along_v), dim=-2)
+    height, width = divergence.shape[-2:]
+    eigenvalues = laplacian_eigenvalues(height, width, divergence)
     eigenvalues[0, 0] = torch.inf  # the mean is free
     return idct2(dct2(divergence) / eigenvalues)

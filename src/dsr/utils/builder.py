@@ -64,8 +64,9 @@ def takes(group: str, node: Mapping[str, Any], key: str) -> bool:
 
 
 def trait(group: str, node: Mapping[str, Any], name: str) -> Any:
-    """Return an attribute of a group's target, such as ``optimises``; None if it has none."""
-    return getattr(load_target(group, node), name, None)
+    """Return an attribute of the class that a group's target is or returns, such as ``optimises``; None without it."""
+    target = load_target(group, node)
+    return getattr(target if inspect.isclass(target) else get_type_hints(target).get("return"), name, None)
 
 
 def with_key(message: str, group: str, parameters: Collection[str]) -> str:

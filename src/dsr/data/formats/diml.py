@@ -17,9 +17,7 @@ import re
 from pathlib import Path
 from typing import Literal
 
-from dsr.data.formats.shared import expect_size, find_beside, read_millimetres, read_picture
-from dsr.geometry.camera import Camera
-from dsr.sample import Scene
+from dsr.data.formats.shared import find_beside
 
 Split = Literal["test", "train"]
 Resolution = Literal["HR", "LR"]
@@ -31,7 +29,7 @@ _PHOTO = re.compile(r"(.+)_c\.png")
 def find_frames(
     root: Path, split: Split | None = None, resolution: Resolution | None = None
 ) -> dict[str, tuple[Path, Path]]:
-    """Return photos and depths, the first two arguments of :func:`load_frame`, by name "in_01_160217_123138", in order.
+    """Return photos and depths by name "in_01_160217_123138", in order.
 
     Args:
         root: directory of the data, or any directory above a room.
@@ -48,16 +46,3 @@ def find_frames(
         if split in (None, at_split) and resolution in (None, at_resolution):
             found.setdefault(frame, (photo, depth))
     return dict(sorted(found.items()))
-
-
-def load_frame(rgb_path: Path, depth_path: Path, dataset: str, name: str) -> Scene:
-    """Return one frame.
-
-    Raises:
-        ValueError: a file is missing, damaged, or does not fit the other; the message names it.
-
-    """
-    rgb, depth = read_picture(rgb_path), read_millimetres(depth_path)
-    height, width = rgb.shape[1:]
-    expect_size(depth_path, tuple(depth.shape[1:]), (height, width))
-    return Scene(dataset, name, rgb, Camera.from_fov(width, height), depth)

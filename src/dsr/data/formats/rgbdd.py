@@ -23,8 +23,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
-from dsr.data.formats.shared import expect_size, find_beside, read_millimetres, read_picture, walk
-from dsr.geometry.camera import Camera
+from dsr.data.formats.shared import expect_size, find_beside, load_pair, read_millimetres, walk
 from dsr.sample import Scene
 
 Split = Literal["test", "train"]
@@ -60,27 +59,14 @@ def find_frames(root: Path, split: Split | None = None, measured: bool = False) 
     return dict(sorted(found.items()))
 
 
-def load_frame(rgb_path: Path, depth_path: Path, dataset: str, name: str) -> Scene:
-    """Return one image with the industrial sensor's depth as the truth.
-
-    Raises:
-        ValueError: a file is missing, damaged, or does not fit the other; the message names it.
-
-    """
-    rgb, depth = read_picture(rgb_path), read_millimetres(depth_path)
-    height, width = rgb.shape[1:]
-    expect_size(depth_path, tuple(depth.shape[1:]), (height, width))
-    return Scene(dataset, name, rgb, Camera.from_fov(width, height), depth)
-
-
 def load_measured_frame(rgb_path: Path, depth_path: Path, measured_path: Path, dataset: str, name: str) -> Scene:
-    """Return one image as :func:`load_frame` does, with the phone's depth as the measured map.
+    """Return one image as :func:`~dsr.data.formats.shared.load_pair` does, with the phone's depth as the measured map.
 
     Raises:
         ValueError: a file is missing, damaged, or does not fit the others; the message names it.
 
     """
-    scene, measured = load_frame(rgb_path, depth_path, dataset, name), read_millimetres(measured_path)
+    scene, measured = load_pair(rgb_path, depth_path, dataset, name), read_millimetres(measured_path)
     size = (round(scene.camera.height / RATIO), round(scene.camera.width / RATIO))
     expect_size(measured_path, tuple(measured.shape[1:]), size)
     return replace(scene, measured={scene.camera.width / size[1]: measured})

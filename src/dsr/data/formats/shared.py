@@ -15,6 +15,7 @@ from torch import Tensor
 
 from dsr.data.formats.files import read_pixels
 from dsr.geometry.camera import ASSUMED_FOV, Camera
+from dsr.sample import Scene
 
 NO_CAMERA = f"no camera is published: {ASSUMED_FOV:g} degrees of horizontal view are assumed"
 """Note of scenes whose camera is :meth:`dsr.geometry.camera.Camera.from_fov`."""
@@ -159,6 +160,19 @@ def given_camera(intrinsics: tuple[float, float, float, float], size: tuple[int,
     """
     fx, fy, cx, cy = intrinsics
     return to_camera("intrinsics", np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]), size)
+
+
+def load_pair(rgb_path: Path, depth_path: Path, dataset: str, name: str) -> Scene:
+    """Return a photo and its depth in millimetres, for which no camera is published, as a scene.
+
+    Raises:
+        ValueError: a file is missing, damaged, or does not fit the other; the message names it.
+
+    """
+    rgb, depth = read_picture(rgb_path), read_millimetres(depth_path)
+    height, width = rgb.shape[1:]
+    expect_size(depth_path, tuple(depth.shape[1:]), (height, width))
+    return Scene(dataset, name, rgb, Camera.from_fov(width, height), depth)
 
 
 def walk(root: Path) -> Iterator[tuple[Path, list[str], list[str]]]:

@@ -82,6 +82,11 @@ def make_records(
     return records
 
 
+def add_note(records: Mapping[str, SceneRecord], note: str) -> dict[str, SceneRecord]:
+    """Return records with a remark for readers of the scenes' scores."""
+    return {name: replace(record, note=note) for name, record in records.items()}
+
+
 def _files_of(path: Path) -> list[Path]:
     """Return a file, or the files of a folder and those below it."""
     return [path] if not path.is_dir() else sorted(file for file in path.rglob("*") if file.is_file())

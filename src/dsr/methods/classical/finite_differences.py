@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 from torch.nn import functional
@@ -58,9 +60,9 @@ def repeat_blocks(x: Tensor, scale: int) -> Tensor:
     return x.repeat_interleave(scale, -2).repeat_interleave(scale, -1)
 
 
-def grey(rgb: Tensor) -> Tensor:
-    """Return the luma of (B, 3, H, W) images, (B, 1, H, W)."""
-    return (rgb * rgb.new_tensor(LUMA)[:, None, None]).sum(dim=1, keepdim=True)
+def grey(rgb: Tensor, weights: Sequence[float] = LUMA) -> Tensor:
+    """Return the weighted sum of the channels of (B, 3, H, W) images, by default the luma, (B, 1, H, W)."""
+    return (rgb * rgb.new_tensor(weights)[:, None, None]).sum(dim=1, keepdim=True)
 
 
 def extend_linearly(x: Tensor, border: int) -> Tensor:

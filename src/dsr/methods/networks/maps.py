@@ -60,7 +60,12 @@ def upsample_bicubic(x: Tensor, scale: int) -> Tensor:
 
     At the border, the kernel is truncated and renormalised.
     """
-    size = [scale * n for n in x.shape[-2:]]
+    height, width = x.shape[-2:]
+    return resize_bicubic(x, (scale * height, scale * width))
+
+
+def resize_bicubic(x: Tensor, size: tuple[int, int]) -> Tensor:
+    """Enlarge (B, 1, h, w) to (B, 1, *size), as :func:`upsample_bicubic` does by a whole factor."""
     return functional.interpolate(x, size=size, mode="bicubic", align_corners=False, antialias=True)
 
 

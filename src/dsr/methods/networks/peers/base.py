@@ -18,7 +18,8 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from dsr.geometry.camera import RANGE_TYPES, RangeType, from_range, to_range
-from dsr.methods.base import Cost
+from dsr.methods.base import Cost, Ratios
+from dsr.methods.classical.finite_differences import LUMA
 from dsr.methods.networks.base import DTYPES, TILE, UNTILED, Precision
 from dsr.methods.networks.inpainting import inpaint
 from dsr.methods.networks.maps import compute_min_max, normalise
@@ -27,6 +28,8 @@ from dsr.sample import DepthSample
 from dsr.utils.progress import Steps
 
 Range = Literal["measured", "truth"]
+SWAPPED_LUMA = LUMA[::-1]
+"""Weights of red, green and blue: those of the luma in reverse, as some authors' code applies them to RGB."""
 _OVERLAP = 16
 """Overlap of neighbouring tiles in pixels."""
 
@@ -121,6 +124,8 @@ class PeerUpsampler:
         ValueError: a value is not supported.
 
     """
+
+    ratios: ClassVar[Ratios] = "any"
 
     def __init__(
         self,
@@ -233,14 +238,6 @@ class PeerUpsampler:
         if sample.depth is None:
             raise ValueError(f"{sample.scene}: range=truth expects a scene with a true depth map, there is none")
         return compute_min_max(to_range(sample.depth, sample.camera, self.range_type)[None])
-
-
-def upsample_pillow(values_lr: Tensor, size: tuple[int, int]) -> Tensor:
-    """Enlarge (B, 1, h, w) to (B, 1, *size) as Pillow resizes: Keys' cubic kernel with a = -0.5.
-
-    At the border, the kernel is truncated and renormalised.
-    """
-    return functional.interpolate(values_lr, size, mode="bicubic", align_corners=False, antialias=True)
 
 
 def _expect(name: str, value: str, accepted: Iterable[str]) -> None:

@@ -10,7 +10,6 @@ the left-hand side the eigenvalues of the Laplacian of four neighbours.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from types import MappingProxyType
 from typing import ClassVar
@@ -20,9 +19,9 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from dsr.methods.base import Cost
-from dsr.methods.networks.maps import normalise_imagenet
-from dsr.methods.networks.peers.base import PeerNetwork, upsample_pillow
-from dsr.methods.networks.peers.dct import dct2, idct2
+from dsr.methods.networks.dct import dct2, idct2, laplacian_eigenvalues
+from dsr.methods.networks.maps import normalise_imagenet, resize_bicubic
+from dsr.methods.networks.peers.base import PeerNetwork
 from dsr.methods.networks.peers.files import rename
 
 FEATURES = 64
@@ -141,7 +140,7 @@ class DCTNet(PeerNetwork):
 
     def enlarge(self, values_lr: Tensor, size: tuple[int, int]) -> Tensor:
         """Enlarge as Pillow's bicubic filter does."""
-        return upsample_pillow(values_lr, size)
+        return resize_bicubic(values_lr, size)
 
     def forward(self, rgb: Tensor, values: Tensor) -> Tensor:
         """Refine an enlarged map; see :meth:`PeerNetwork.forward`. The result is not negative."""
@@ -167,7 +166,7 @@ def transfer_edges(depth: Tensor, guide: Tensor, weight: Tensor, strength: Tenso
     """
     dtype = torch.promote_types(strength.dtype, torch.float32)
     height, width = depth.shape[-2:]
-    eigenvalues = _laplacian_eigenvalues(height, width, strength).square()
+    eigenvalues = laplacian_eigenvalues(height, width, strength).square()
     parts = [each.split(max(1, _CHUNK // (height * width)), dim=1) for each in (depth, guide, weight, strength)]
     solved = []
     for part in zip(*parts, strict=True):
@@ -187,12 +186,3 @@ def laplacian(x: Tensor) -> Tensor:
     padded = functional.pad(x, (1, 1, 1, 1), mode="reflect")
     rows = padded[..., :-2, :] + padded[..., 1:-1, :] + padded[..., 2:, :]
     return (rows[..., :-2] + rows[..., 1:-1] + rows[..., 2:] - 9 * x) / 16
-
-
-def _laplacian_eigenvalues(height: int, width: int, like: Tensor) -> Tensor:
-    """Return the eigenvalues of the Laplacian of four neighbours in the cosine basis, (height, width)."""
-    rows, columns = (
-        torch.cos(math.pi / size * torch.arange(size, dtype=torch.float64, device=like.device))
-        for size in (height, width)
-    )
-    return (2 * (rows[:, None] + columns - 2)).to(like)

@@ -17,7 +17,8 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from dsr.methods.base import Cost
-from dsr.methods.networks.peers.base import PeerNetwork, upsample_pillow
+from dsr.methods.networks.maps import resize_bicubic
+from dsr.methods.networks.peers.base import PeerNetwork
 from dsr.methods.networks.peers.deformable import deformable_conv3x3
 from dsr.methods.networks.peers.files import fold_batch_norm, rename
 
@@ -213,7 +214,7 @@ class DORNet(PeerNetwork):
 
     def enlarge(self, values_lr: Tensor, size: tuple[int, int]) -> Tensor:
         """Enlarge as Pillow's bicubic filter does."""
-        return upsample_pillow(values_lr, size)
+        return resize_bicubic(values_lr, size)
 
     def forward(self, rgb: Tensor, values: Tensor) -> Tensor:
         """Refine an enlarged map; see :meth:`PeerNetwork.forward`."""

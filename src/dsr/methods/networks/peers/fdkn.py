@@ -17,12 +17,12 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from dsr.methods.base import Cost
-from dsr.methods.networks.peers.base import PeerNetwork, upsample_pillow
+from dsr.methods.classical.finite_differences import grey
+from dsr.methods.networks.maps import resize_bicubic
+from dsr.methods.networks.peers.base import SWAPPED_LUMA, PeerNetwork
 from dsr.methods.networks.peers.files import fold_batch_norm, rename
 
 _FACTOR, _TAPS, _RADIUS = 4, 3, 7
-_GREY = (0.114, 0.587, 0.299)
-"""Weights of red, green and blue: those of ITU-R BT.601 in reverse, as the authors' code applies them to RGB."""
 _WIDTHS = (16, 32, 32, 64, 64, 128, 128)
 _NAMES = {
     r"^ImageKernel\.": "rgb_kernel.",
@@ -56,13 +56,12 @@ class FDKN(PeerNetwork):
         return rename(tensors, _NAMES)
 
     def enlarge(self, values_lr: Tensor, size: tuple[int, int]) -> Tensor:
-        """Enlarge a map; see :func:`~dsr.methods.networks.peers.base.upsample_pillow`."""
-        return upsample_pillow(values_lr, size)
+        """Enlarge as Pillow's bicubic filter does."""
+        return resize_bicubic(values_lr, size)
 
     def forward(self, rgb: Tensor, values: Tensor) -> Tensor:
         """Refine an enlarged map; see :meth:`PeerNetwork.forward`."""
-        grey = (rgb * rgb.new_tensor(_GREY).view(3, 1, 1)).sum(dim=1, keepdim=True)
-        branches = zip(self.rgb_kernel(grey), self.depth_kernel(values), strict=True)
+        branches = zip(self.rgb_kernel(grey(rgb, SWAPPED_LUMA)), self.depth_kernel(values), strict=True)
         weights, offsets = (functional.pixel_shuffle(rgb * depth, _FACTOR).float() for rgb, depth in branches)
         return values + _sample(values, weights - weights.mean(dim=1, keepdim=True), offsets)
 

@@ -19,14 +19,13 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from dsr.methods.base import Cost
+from dsr.methods.classical.finite_differences import grey
 from dsr.methods.networks.maps import normalise_imagenet
-from dsr.methods.networks.peers.base import PeerNetwork
+from dsr.methods.networks.peers.base import SWAPPED_LUMA, PeerNetwork
 from dsr.methods.networks.peers.files import fold_batch_norm, rename
 
 _FACTOR, _WIDTH, _SHARED, _LAST = 4, 32, 16, 64
 _ROUNDS, _GROUPS, _BLOCKS, _SQUEEZED = 3, 2, 2, 2
-_GREY = (0.114, 0.587, 0.299)
-"""Weights of red, green and blue: those of ITU-R BT.601 in reverse, as the authors' code applies them to RGB."""
 _SLOPE, _BLOCK_SLOPE = 0.1, 0.01
 _LARGEST_OFFSET, _STEPS = 0.1, 3
 _TINY = 1e-6
@@ -107,8 +106,8 @@ class PGSR(PeerNetwork):
 
     def forward(self, rgb: Tensor, values: Tensor) -> Tensor:
         """Refine an enlarged map; see :meth:`PeerNetwork.forward`."""
-        grey = (normalise_imagenet(rgb) * rgb.new_tensor(_GREY).view(3, 1, 1)).sum(dim=1, keepdim=True)
-        depth, photo = (functional.pixel_unshuffle(each, _FACTOR) for each in (values, grey))
+        luma = grey(normalise_imagenet(rgb), SWAPPED_LUMA)
+        depth, photo = (functional.pixel_unshuffle(each, _FACTOR) for each in (values, luma))
         of_depth, of_photo = self._extract("shared", torch.cat((depth, photo))).chunk(2)
         depth = _apply(self.merges["depth"], self._extract("depth", depth), of_depth)
         photo = _apply(self.merges["rgb"], self._extract("rgb", photo), of_photo)

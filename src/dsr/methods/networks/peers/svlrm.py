@@ -15,12 +15,12 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from dsr.degradation.downsampling import cubic_kernel
 from dsr.methods.base import Cost
+from dsr.methods.classical.finite_differences import grey
 from dsr.methods.networks.peers.base import PeerNetwork
 
 _WIDTH, _DEPTH, _SLOPE = 64, 10, 0.1
-_GREY = (0.299, 0.587, 0.114)
-"""Weights of red, green and blue, ITU-R BT.601."""
 _CUBIC = -0.75
 """Parameter of the cubic kernel."""
 
@@ -55,12 +55,12 @@ class SVLRM(PeerNetwork):
 
     def forward(self, rgb: Tensor, values: Tensor) -> Tensor:
         """Refine an enlarged map; see :meth:`PeerNetwork.forward`."""
-        grey = (rgb * rgb.new_tensor(_GREY).view(3, 1, 1)).sum(dim=1, keepdim=True)
-        x = functional.leaky_relu(self.first_layer(torch.cat((values, grey), dim=1)), _SLOPE)
+        luma = grey(rgb)
+        x = functional.leaky_relu(self.first_layer(torch.cat((values, luma), dim=1)), _SLOPE)
         for layer in self.feature_block.values():
             x = functional.leaky_relu(layer(x), _SLOPE)
         gain, offset = self.final_layer(x).split(1, dim=1)
-        return gain * grey + offset
+        return gain * luma + offset
 
 
 def _resize(values: Tensor, dim: int, new: int, shift: float) -> Tensor:
@@ -69,13 +69,6 @@ def _resize(values: Tensor, dim: int, new: int, shift: float) -> Tensor:
     place = (torch.arange(new, dtype=torch.float64) + 0.5 + shift) * (old / new) - 0.5
     first = place.floor()
     index = first.long()[:, None] + torch.arange(-1, 3)
-    weight = _cubic((place[:, None] - index).abs())
+    weight = cubic_kernel((place[:, None] - index).abs(), _CUBIC)
     matrix = torch.zeros(new, old, dtype=torch.float64).scatter_add_(1, index.clamp(0, old - 1), weight).to(values)
     return matrix @ values if dim == -2 else values @ matrix.T
-
-
-def _cubic(x: Tensor) -> Tensor:
-    """Cubic convolution (Keys 1981)."""
-    near = ((_CUBIC + 2) * x - (_CUBIC + 3)) * x * x + 1
-    far = ((x - 5) * x + 8) * x * _CUBIC - 4 * _CUBIC
-    return torch.where(x < 1, near, torch.where(x < 2, far, 0))

@@ -46,6 +46,18 @@ def idct2(coefficients: Tensor) -> Tensor:
     return shuffled[..., rows[:, None], columns]
 
 
+def laplacian_eigenvalues(height: int, width: int, like: Tensor) -> Tensor:
+    """Return the eigenvalues of the Laplacian of four neighbours in the basis of :func:`dct2`, (height, width).
+
+    The border is mirrored. None is positive; dtype and device are those of ``like``.
+    """
+    rows, columns = (
+        torch.cos(math.pi / size * torch.arange(size, dtype=torch.float64, device=like.device))
+        for size in (height, width)
+    )
+    return (2 * (rows[:, None] + columns - 2)).to(like)
+
+
 def _order(size: int, like: Tensor) -> Tensor:
     """Return the indices of an axis, the even ones first and then the odd ones in reverse order, (size,)."""
     indices = torch.arange(size, device=like.device)
