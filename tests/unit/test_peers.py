@@ -119,6 +119,13 @@ def test_weights_trained_on_a_range_of_depth_get_depth_normalised_by_it() -> Non
         PeerUpsampler(Metric(), value_range="truth")
 
 
+def test_other_factor_than_that_of_the_weights_is_noted() -> None:
+    upsampler = PeerUpsampler(Enlarged(8))
+    assert upsampler.describe(_sample(scale=8)) == ""
+    assert upsampler.describe(_sample(scale=4)) == "weights trained for x8"
+    assert PeerUpsampler(Enlarged(8 / 3)).describe(_sample(scale=4)) == "weights trained for x2.67"
+
+
 def test_true_range_is_flagged_and_needs_the_truth() -> None:
     upsampler, sample = PeerUpsampler(Enlarged(), value_range="truth"), _sample(scale=1)
     depth = upsampler(sample)

@@ -164,7 +164,7 @@ def _study(
         noise=build("noise", settings.noise),
         holes=build("holes", settings.holes),
         label=_flagged(str(settings.method.get("label", name)), method, " ({})"),
-        note=None if adapted is None else adapted.describe,
+        note=getattr(method, "describe", None),
     )
 
 

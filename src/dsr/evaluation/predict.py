@@ -50,7 +50,7 @@ class Evaluation:
         noise: noise of the low-resolution maps.
         holes: holes of the low-resolution maps.
         label: displayed name of the method; empty for ``method_name``.
-        note: says of a sample how the method is run, for a note on the scores; None for nothing to say.
+        note: says of a sample how the method is run, for a note on the scores, or nothing; None if it never does.
 
     """
 
@@ -78,7 +78,8 @@ class Evaluation:
         loaded = self.source.load(scene)
         kind = self.method.range_type
         sample = make_sample(loaded, self.scale, self.downsampling, kind, self.noise, self.seed, self.holes)
-        return sample if self.note is None else replace(sample, notes=(*sample.notes, self.note(sample)))
+        note = "" if self.note is None else self.note(sample)
+        return replace(sample, notes=(*sample.notes, note)) if note else sample
 
     def stored_config(self, scene: str) -> dict[str, Any]:
         """Return the settings that a prediction of this scene depends on."""

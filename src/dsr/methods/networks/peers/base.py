@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import abc
 import copy
+import math
 from collections.abc import Iterable, Mapping
 from typing import ClassVar, Literal, get_args
 
@@ -158,6 +159,11 @@ class PeerUpsampler:
     def flag(self) -> str:
         """Mark for scores: ``true-range`` if the true map's minimum and maximum were used, else empty."""
         return "true-range" if self._uses_truth else ""
+
+    def describe(self, sample: DepthSample) -> str:
+        """Return a note for the scores where the weights were trained for another factor, else an empty text."""
+        trained = self.net.scale
+        return "" if math.isclose(trained, sample.scale, rel_tol=0.01) else f"weights trained for x{trained:.3g}"
 
     @torch.inference_mode()
     def __call__(self, sample: DepthSample, progress: Steps | None = None) -> Tensor:
