@@ -24,16 +24,8 @@ PDN = ["model=pdn", *FULL, "trainer.average=0.998"]
 DG = ["model=dg", "model.depth_loss=lap1", "model.visual=true", "dataset.count=800", "trainer.weight_decay=0",
       "trainer.average=0.998", "precision=float32"]  # fmt: skip
 DDRNET = ["model=ddrnet", "dataset.count=360", "trainer.average=0.998", "trainer.photo=0", "precision=float32"]
-SPARSE_TO_DENSE = [
-    "model=sparse_to_dense",
-    "dataset.count=360",
-    "trainer.photo=0",
-    "precision=float32",
-    "trainer.learning_rate=2e-3",
-]
-SPARSE_TO_DENSE_2 = [*SPARSE_TO_DENSE, "model.settled=true", "trainer.steps=2200", "trainer.warmup=50",
-                     "trainer.validate_every=1100", "trainer.average=0.995", "trainer.patch=160",
-                     "trainer.batch=3"]  # fmt: skip
+SPARSE_TO_DENSE = ["model=sparse_to_dense", "dataset.count=360", "trainer.photo=0", "trainer.patch=192",
+                   "trainer.batch=4", "precision=bfloat16"]  # fmt: skip
 FACETS = ["model=facets", *FULL, "trainer.patch=128", "trainer.batch=4", "trainer.photo=0"]
 MSG_V = ["model=msg_v", *FULL, "loss.w=1.5"]
 RECIPES = {
@@ -57,10 +49,9 @@ RECIPES = {
               "trainer.warmup=100", "trainer.patch=64", "trainer.batch=5"],
     "dg_x8": [*DG, "scale=8", "trainer.steps=1200", "trainer.validate_every=400", "trainer.learning_rate=0.01",
               "trainer.warmup=50", "trainer.batch=3"],
-    "sparse_to_dense_x4_stage1": [*SPARSE_TO_DENSE, "trainer.steps=5000", "trainer.warmup=200",
-                                  "trainer.validate_every=1250", "trainer.average=0.998"],
-    "sparse_to_dense_x4": [*SPARSE_TO_DENSE_2, "trainer.learning_rate=5e-4"],
-    "sparse_to_dense_x8": [*SPARSE_TO_DENSE_2, "trainer.learning_rate=1e-3", "scale=8"],
+    "sparse_to_dense_x4": [*SPARSE_TO_DENSE, "trainer.steps=16000"],
+    "sparse_to_dense_x8": [*SPARSE_TO_DENSE, "scale=8", "trainer.steps=5000", "trainer.learning_rate=5e-4",
+                           "trainer.warmup=100"],
     "ddrnet_x4": [*DDRNET, "trainer.steps=4000", "trainer.warmup=200", "trainer.patch=64", "trainer.batch=4"],
     "ddrnet_x8": [*DDRNET, "scale=8", "trainer.steps=2000", "trainer.learning_rate=5e-4", "trainer.warmup=50",
                   "trainer.batch=2"],
@@ -75,8 +66,7 @@ STARTS = {
     "pdn_x8": "outputs/train/pdn_x4/weights.safetensors",
     "dg_x8": "outputs/train/dg_x4/weights.safetensors",
     "ddrnet_x8": "outputs/train/ddrnet_x4/weights.safetensors",
-    "sparse_to_dense_x4": "outputs/train/sparse_to_dense_x4_stage1/weights.safetensors",
-    "sparse_to_dense_x8": "outputs/train/sparse_to_dense_x4_stage1/weights.safetensors",
+    "sparse_to_dense_x8": "outputs/train/sparse_to_dense_x4/weights.safetensors",
 }
 """What they started from."""
 

@@ -237,8 +237,7 @@ def test_every_method_upsamples_any_size_and_its_holes(method: str) -> None:
     assert int(kept.isnan().sum()) == int(_resize_nearest(depth.isnan(), (31, 42)).sum())
     assert all(done == total for done, total in steps[-1:])
     if not quick:
-        limit = 0.2 if method == "sparse_to_dense" else 0.1  # it has no interpolation to fall back on
-        assert float((full / _plane(31, 42, camera) - 1).abs().max()) < limit
+        assert float((full / _plane(31, 42, camera) - 1).abs().max()) < 0.1
 
 
 def test_settings_change_the_result_and_are_checked() -> None:

@@ -34,8 +34,6 @@ from dsr.methods.networks.base import RangeNetwork, expect_rgb_size
 _STRIDE = 32
 """The photo's pixels, along an axis, for each pixel of the encoder's result."""
 _STAGES = 4
-_MOMENTUM = 0.01
-"""Weight of a batch in the moving averages of a settled training."""
 
 
 class SparseToDense(RangeNetwork):
@@ -47,15 +45,13 @@ class SparseToDense(RangeNetwork):
     Args:
         scale: upsampling factor, 2, 4, 8 or 16.
         width: channels of the first residual blocks, a multiple of 4; the original has 64.
-        settled: whether a training normalises with the moving averages of the statistics, as use does, instead of with
-            those of the batch; for a last stage, since a few patches say little of the depth of all.
 
     Raises:
         ValueError: a value is out of range.
 
     """
 
-    def __init__(self, scale: int, width: int = 32, settled: bool = False) -> None:
+    def __init__(self, scale: int, width: int = 32) -> None:
         super().__init__()
         check_scale(scale)
         if width < 4 or width % 4:
@@ -71,8 +67,6 @@ class SparseToDense(RangeNetwork):
         self.decoder = nn.Sequential(*(UpProjection(half // 2**stage) for stage in range(_STAGES)))
         self.head = nn.Conv2d(half // 2**_STAGES, 1, 3, padding=1, bias=False)
         for layer in self.modules():
-            if isinstance(layer, BatchNorm):
-                layer.settled = settled
             if isinstance(layer, nn.Conv2d | nn.ConvTranspose2d):
                 nn.init.kaiming_normal_(layer.weight, mode="fan_out", nonlinearity="relu")
         nn.init.kaiming_normal_(self.head.weight, nonlinearity="linear")
@@ -169,14 +163,10 @@ class BatchNorm(nn.Module):
     Args:
         channels: channels of the input.
 
-    Attributes:
-        settled: whether a training, too, normalises with the moving averages.
-
     """
 
     running_mean: Tensor
     running_var: Tensor
-    settled = False
 
     def __init__(self, channels: int) -> None:
         super().__init__()
@@ -187,13 +177,7 @@ class BatchNorm(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """Normalise (B, C, H, W) with the statistics of the batch in a training, and else with their moving average."""
-        by_batch = self.training and not self.settled
-        if self.training and self.settled:
-            with torch.no_grad():
-                var, mean = torch.var_mean(x.float(), dim=(0, 2, 3))
-                self.running_mean.lerp_(mean.to(self.running_mean), _MOMENTUM)
-                self.running_var.lerp_(var.to(self.running_var), _MOMENTUM)
-        return functional.batch_norm(x, self.running_mean, self.running_var, self.weight, self.bias, by_batch)
+        return functional.batch_norm(x, self.running_mean, self.running_var, self.weight, self.bias, self.training)
 
 
 def place_samples(values: Tensor, scale: int) -> Tensor:
