@@ -21,7 +21,7 @@ from hydra.errors import HydraException, MissingConfigException, OverrideParseEx
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from dsr.app.experiments import register_resolvers, without_overridden_sweeps
+from dsr.app.experiments import register_resolvers, with_keys_of_swept_groups, without_overridden_sweeps
 from dsr.app.schema import EvalConfig, TrainConfig, plain_config, register
 from dsr.utils.builder import ConfigError
 from dsr.utils.config_files import config_directories, list_choices, list_groups
@@ -74,7 +74,7 @@ def run_command(name: str, command: Callable[[DictConfig], Any], arguments: Sequ
     except ValueError as error:
         fail(str(error))
     _expect_choices(name, arguments, directories)
-    arguments = without_overridden_sweeps(arguments, directories)
+    arguments = with_keys_of_swept_groups(without_overridden_sweeps(arguments, directories), directories)
     process = sys.argv
 
     def job(config: DictConfig) -> None:

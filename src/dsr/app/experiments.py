@@ -32,6 +32,20 @@ def without_overridden_sweeps(arguments: Sequence[str], directories: Sequence[Pa
     return [*arguments, *(f"~hydra.sweeper.params.{key}" for key in sorted(swept & given))]
 
 
+def with_keys_of_swept_groups(arguments: Sequence[str], directories: Sequence[Path]) -> list[str]:
+    """Return a command's arguments, with keys of groups that it sweeps over as overrides that may add them.
+
+    Before Hydra composes the jobs, it checks overrides that are not swept against the defaults: with
+    ``method=pgsr,svlrm method.range_type=orthogonal``, against the default method, which has no such key.
+    """
+    if not {"-m", "--multirun"} & set(arguments):
+        return list(arguments)
+    swept = {key for argument in arguments for key in _swept_keys(argument, directories)}
+    swept |= {key for key, _, value in (argument.partition("=") for argument in arguments) if "," in value}
+    return [f"++{each}" if re.match(r"(\w+)\.[\w.]+=", each) and each.partition(".")[0] in swept else each
+            for each in arguments]  # fmt: skip
+
+
 def _swept_keys(argument: str, directories: Sequence[Path]) -> list[str]:
     """Return the keys that the experiment of an argument sweeps over."""
     name = re.fullmatch(r"\+experiment=([\w-]+)", argument)
