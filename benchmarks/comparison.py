@@ -28,7 +28,7 @@ from dsr.metrics.formats import HEADLINES
 from dsr.report.figures.scenes import Shown, rendering, shown_scenes
 
 Columns = tuple[tuple[str, float, int], ...]
-SHOWN: Columns = (("RMSE_v", 1e3, 0), ("DSSIM_v", 1e3, 0), ("LPIPS_v", 1e3, 0), ("RMSE_d", 1e3, 1))
+SHOWN: Columns = (("RMSE_v", 1e3, 0), ("DSSIM_v", 1e3, 0), ("LPIPS_v", 1e3, 0), ("RMSE_d", 1e3, 0))
 """Metrics of a cell, their factors and digits."""
 SHOWN_OF_SENSORS: Columns = (
     ("Sensor_RMSE_v", 1e3, 0),

@@ -54,8 +54,9 @@ def measured(options: argparse.Namespace) -> dict[str, float]:
     torch.set_num_threads(options.threads)
     name, scale = options.methods, int(options.scale)
     device = torch.device(options.device)
-    given = {"precision": "float32", "device": device, "downsampling": Downsampling("box"), "weights": options.weights}
     node = read_method(name, scale)
+    weights = None if "weights_packaged" in node else options.weights
+    given = {"precision": "float32", "device": device, "downsampling": Downsampling("box"), "weights": weights}
     if options.ensemble is not None and "ensemble" in node:
         node["ensemble"] = options.ensemble
     method = build_method(node, scale, **given)
