@@ -51,7 +51,7 @@ EXPERIMENTS = (
     "all_methods, ddrnet_x4, ddrnet_x8, dg_x4, dg_x8, downsampling_mismatch, facets_x4, facets_x8, field_benchmarks, "
     "msg_v_x4, msg_v_x4_noisy, msg_v_x4_stage1, msg_v_x4_stage2, msg_v_x4_stage3, msg_v_x8, msg_v_x8_stage1, msg_x4, "
     "msg_x8, noise, paper_tables, pdn_x4, pdn_x8, published_networks, sensors, sparse_to_dense_x4, "
-    "sparse_to_dense_x4_stage1, sparse_to_dense_x8, visual_losses"
+    "sparse_to_dense_x8, visual_losses"
 )
 USAGE_ERRORS = {
     "dataset=fodler": f"dataset=fodler: unknown; expected one of {DATASETS}",
