@@ -40,7 +40,7 @@ CHROMIUM_ARGUMENTS = (
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Give every test its tiers.
+    """Give every test its tiers, and put those that run whole commands first.
 
     ``shared`` tests need the shared material, ``browser`` tests a browser, and ``slow`` tests run whole commands or are
     marked so. All others are ``unit``.
@@ -55,6 +55,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             item.add_marker("slow")
         if not any(item.get_closest_marker(tier) for tier in ("shared", "browser", "slow")):
             item.add_marker("unit")
+    items.sort(key=lambda item: UNIT_TESTS in item.path.parents)  # so that at the end no worker has a long file alone
 
 
 @pytest.fixture(scope="session", autouse=True)
