@@ -66,8 +66,10 @@ def _two_threads() -> None:
 
 @pytest.fixture(scope="session", autouse=True)
 def dsr_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    """$DSR_CACHE, one for all tests: the user's own stays as it is."""
-    folder = tmp_path_factory.mktemp("dsr_cache")
+    """$DSR_CACHE, one for all tests and workers: the user's own stays as it is."""
+    own = tmp_path_factory.getbasetemp()
+    folder = (own.parent if "PYTEST_XDIST_WORKER" in os.environ else own) / "dsr_cache"
+    folder.mkdir(exist_ok=True)
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("DSR_CACHE", str(folder))
         yield folder
