@@ -1,11 +1,11 @@
 """Write the tables of docs/comparison.md: every method on every data set, from runs of eval.py.
 
-    python benchmarks/comparison.py outputs/eval -o comparison [--crop simgeo statue 4 box 96 160 96]
+    python benchmarks/comparison.py outputs/eval -o comparison [--crop simgeo statue 4 box 120 180 110]
 
 Writes ``comparison.csv`` (one row per data set, scale, degradation and method, the means over the scenes of all
 metrics, worst of four lights, raw units) and ``comparison.md``: for each scale and degradation a table of RMSE_v,
 DSSIM_v, LPIPS_v and RMSE_d, and one of all sensors' maps, by the metrics of ``metrics=sensor``. In each column the best
-value is bold. A mean over less scenes than the other methods have is marked with their number.
+value is bold. A mean over fewer scenes than the other methods have is marked with their number.
 
 With ``--crop DATASET SCENE SCALE DEGRADATION TOP LEFT SIDE`` it draws ``crop.jpg``, too: that window of the photo, the
 input and all results, rendered, beside the truth; captions are the scene's DSSIM_v and RMSE_v.
@@ -27,10 +27,10 @@ from dsr.evaluation.results import BenchmarkSetting, Results, load_results
 from dsr.metrics.formats import HEADLINES
 from dsr.report.figures.scenes import Shown, rendering, shown_scenes
 
-Columns = tuple[tuple[str, float, int], ...]
-SHOWN: Columns = (("RMSE_v", 1e3, 0), ("DSSIM_v", 1e3, 0), ("LPIPS_v", 1e3, 0), ("RMSE_d", 1e3, 0))
+Metrics = tuple[tuple[str, float, int], ...]
+SHOWN: Metrics = (("RMSE_v", 1e3, 0), ("DSSIM_v", 1e3, 0), ("LPIPS_v", 1e3, 0), ("RMSE_d", 1e3, 0))
 """Metrics of a cell, their factors and digits."""
-SHOWN_OF_SENSORS: Columns = (
+SHOWN_OF_SENSORS: Metrics = (
     ("Sensor_RMSE_v", 1e3, 0),
     ("Sensor_DSSIM_v", 1e3, 0),
     ("Sensor_angle_mean", 1, 1),
@@ -47,7 +47,7 @@ FIRST = ("Facets", "MSG-V", "MSG-V (published)", "MSG-V (noisy)", "MSG", "MSG (p
 """Labels of the rows that come first, if there are such rows."""
 PEERS = ("PGSR", "DCTNet", "DORNet-T", "FDKN", "SVLRM")
 """Labels of the rows that come last."""
-COLUMNS = 6
+PANELS = 6
 """Panels of a row of the picture."""
 
 
@@ -64,10 +64,10 @@ def table_of(results: Results) -> pd.DataFrame:
     return means.reset_index()
 
 
-def cell(row: pd.Series, best: pd.Series, most: int, columns: Columns) -> str:
+def cell(row: pd.Series, best: pd.Series, most: int, metrics: Metrics) -> str:
     """Return a method's values on a data set as the text of a table's cell."""
     parts = []
-    for name, factor, digits in columns:
+    for name, factor, digits in metrics:
         if name not in row or pd.isna(row[name]):
             parts.append("-")
             continue
@@ -89,7 +89,7 @@ def markdown(means: pd.DataFrame, methods: list[str]) -> str:
     return "\n".join(lines)
 
 
-def table(means: pd.DataFrame, methods: list[str], columns: Columns) -> list[str]:
+def table(means: pd.DataFrame, methods: list[str], metrics: Metrics) -> list[str]:
     """Return the lines of a table with a row for each method and a column for each data set."""
     order = [*TITLES.values(), *means["dataset"]]
     datasets = sorted(set(means["dataset"]), key=order.index)
@@ -101,7 +101,7 @@ def table(means: pd.DataFrame, methods: list[str], columns: Columns) -> list[str
             most = those["scenes"].max()
             best = those[those["scenes"] == most].min(numeric_only=True)
             mine = those[those["label"] == label]
-            cells.append(cell(mine.iloc[0], best, most, columns) if len(mine) else "-")
+            cells.append(cell(mine.iloc[0], best, most, metrics) if len(mine) else "-")
         if any(text != "-" for text in cells):
             lines.append(f"| {label} | {' | '.join(cells)} |")
     return [*lines, ""]
@@ -131,11 +131,11 @@ def picture(shown: Shown, top: int, left: int, side: int) -> Figure:
             panels.append((caption, rendering(depth, scene.camera, "e1")[window]))
     if scene.depth is not None:
         panels.append(("truth", rendering(scene.depth, scene.camera, "e1")[window]))
-    rows = -(-len(panels) // COLUMNS)
-    figure = Figure(figsize=(1.6 * COLUMNS, 1.95 * rows), layout="constrained")
+    rows = -(-len(panels) // PANELS)
+    figure = Figure(figsize=(1.6 * PANELS, 1.95 * rows), layout="constrained")
     FigureCanvasAgg(figure)
     for number, (caption, image) in enumerate(panels, start=1):
-        axes = figure.add_subplot(rows, COLUMNS, number)
+        axes = figure.add_subplot(rows, PANELS, number)
         axes.imshow(image, cmap="gray", vmin=0, vmax=1, interpolation="nearest")
         axes.set_title(caption, fontsize=8)
         axes.set_axis_off()

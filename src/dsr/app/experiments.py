@@ -27,7 +27,7 @@ def without_overridden_sweeps(arguments: Sequence[str], directories: Sequence[Pa
 
     Otherwise the sweep of the experiment would run in addition to the value of the command line.
     """
-    swept = {key for argument in arguments for key in _swept_keys(argument, directories)}
+    swept = _swept_keys(arguments, directories)
     given = {argument.partition("=")[0] for argument in arguments}
     return [*arguments, *(f"~hydra.sweeper.params.{key}" for key in sorted(swept & given))]
 
@@ -40,20 +40,20 @@ def with_keys_of_swept_groups(arguments: Sequence[str], directories: Sequence[Pa
     """
     if not {"-m", "--multirun"} & set(arguments):
         return list(arguments)
-    swept = {key for argument in arguments for key in _swept_keys(argument, directories)}
-    swept |= {key for key, _, value in (argument.partition("=") for argument in arguments) if "," in value}
-    return [f"++{each}" if re.match(r"(\w+)\.[\w.]+=", each) and each.partition(".")[0] in swept else each
-            for each in arguments]  # fmt: skip
+    swept = _swept_keys(arguments, directories) | {
+        key for key, _, value in (argument.partition("=") for argument in arguments) if "," in value
+    }
+    of_group = re.compile(rf"({'|'.join(map(re.escape, sorted(swept)))})\.[\w.]+=")
+    return [f"++{argument}" if swept and of_group.match(argument) else argument for argument in arguments]
 
 
-def _swept_keys(argument: str, directories: Sequence[Path]) -> list[str]:
-    """Return the keys that the experiment of an argument sweeps over."""
-    name = re.fullmatch(r"\+experiment=([\w-]+)", argument)
-    files = [directory / "experiment" / f"{name[1]}.yaml" for directory in directories] if name else []
-    for file in files:
-        if file.is_file():
-            return [str(key) for key in OmegaConf.select(OmegaConf.load(file), "hydra.sweeper.params") or ()]
-    return []
+def _swept_keys(arguments: Sequence[str], directories: Sequence[Path]) -> set[str]:
+    """Return the keys that the experiment of a command sweeps over; none without an experiment."""
+    names = (re.fullmatch(r"\+experiment=([\w-]+)", argument) for argument in arguments)
+    files = (directory / "experiment" / f"{name[1]}.yaml" for name in names if name for directory in directories)
+    file = next((each for each in files if each.is_file()), None)
+    params = None if file is None else OmegaConf.select(OmegaConf.load(file), "hydra.sweeper.params")
+    return set(map(str, params or ()))
 
 
 def _present(*names: str) -> str:

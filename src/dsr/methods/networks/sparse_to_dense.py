@@ -72,7 +72,7 @@ class SparseToDense(RangeNetwork):
         nn.init.kaiming_normal_(self.head.weight, nonlinearity="linear")
 
     def arguments(self) -> dict[str, Any]:
-        """Return the constructor's arguments that matter in use."""
+        """Return the constructor's arguments."""
         return {"scale": self.scale, "width": self.width}
 
     def forward(self, rgb: Tensor, values: Tensor) -> Tensor:
