@@ -47,7 +47,7 @@ FIRST = ("Facets", "MSG-V", "MSG-V (published)", "MSG-V (noisy)", "MSG", "MSG (p
 """Labels of the rows that come first, if there are such rows."""
 PEERS = ("PGSR", "DCTNet", "DORNet-T", "FDKN", "SVLRM")
 """Labels of the rows that come last."""
-PANELS = 6
+PANELS = 5
 """Panels of a row of the picture."""
 
 
@@ -113,7 +113,7 @@ def ordered(methods: list[str]) -> list[str]:
 
 
 def picture(shown: Shown, top: int, left: int, side: int) -> Figure:
-    """Draw a window of the photo, the input, all results and the truth, the surfaces lit by e1."""
+    """Draw a window of the photo, the input, the truth and all results, the surfaces lit by e1."""
     scene = shown.scene
     window = (slice(top, top + side), slice(left, left + side))
     scale = math.ceil(scene.scale)
@@ -123,14 +123,14 @@ def picture(shown: Shown, top: int, left: int, side: int) -> Figure:
         ("photo", scene.rgb.permute(1, 2, 0).numpy()[window]),
         ("input", enlarged[window]),
     ]
+    if scene.depth is not None:
+        panels.append(("truth", rendering(scene.depth, scene.camera, "e1")[window]))
     for label in ordered(list(shown.depths)):
         depth = shown.depths[label]
         if depth is not None:
             found = shown.scores[label]
             caption = f"{label}\n{1e3 * found['DSSIM_v']:.0f} / {1e3 * found['RMSE_v']:.0f}"
             panels.append((caption, rendering(depth, scene.camera, "e1")[window]))
-    if scene.depth is not None:
-        panels.append(("truth", rendering(scene.depth, scene.camera, "e1")[window]))
     rows = -(-len(panels) // PANELS)
     figure = Figure(figsize=(1.6 * PANELS, 1.95 * rows), layout="constrained")
     FigureCanvasAgg(figure)
