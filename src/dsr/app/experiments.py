@@ -16,6 +16,9 @@ from omegaconf import OmegaConf
 from dsr.data.download.catalogue import CATALOGUE
 from dsr.data.download.location import data_root
 
+_KEY_OF_GROUP = re.compile(r"(\w+)\.[\w.]+=")
+"""An argument that sets a key of a group, such as ``method.range_type=orthogonal``."""
+
 
 def register_resolvers() -> None:
     """Let configuration files use ``${present:NAME,NAME}``: those of the named data sets that are on this machine."""
@@ -43,8 +46,8 @@ def with_keys_of_swept_groups(arguments: Sequence[str], directories: Sequence[Pa
     swept = _swept_keys(arguments, directories) | {
         key for key, _, value in (argument.partition("=") for argument in arguments) if "," in value
     }
-    of_group = re.compile(rf"({'|'.join(map(re.escape, sorted(swept)))})\.[\w.]+=")
-    return [f"++{argument}" if swept and of_group.match(argument) else argument for argument in arguments]
+    groups = {argument: match[1] for argument in arguments if (match := _KEY_OF_GROUP.match(argument))}
+    return [f"++{argument}" if groups.get(argument) in swept else argument for argument in arguments]
 
 
 def _swept_keys(arguments: Sequence[str], directories: Sequence[Path]) -> set[str]:
