@@ -46,8 +46,10 @@ def with_keys_of_swept_groups(arguments: Sequence[str], directories: Sequence[Pa
     swept = _swept_keys(arguments, directories) | {
         key for key, _, value in (argument.partition("=") for argument in arguments) if "," in value
     }
-    groups = {argument: match[1] for argument in arguments if (match := _KEY_OF_GROUP.match(argument))}
-    return [f"++{argument}" if groups.get(argument) in swept else argument for argument in arguments]
+    return [
+        f"++{argument}" if (match := _KEY_OF_GROUP.match(argument)) and match[1] in swept else argument
+        for argument in arguments
+    ]
 
 
 def _swept_keys(arguments: Sequence[str], directories: Sequence[Path]) -> set[str]:
