@@ -32,13 +32,13 @@ METRICS = ("RMSE_v", "DSSIM_v", "BadPix_v_5", "Bumpiness_d", "LPIPS_v", "RMSE_d"
 
 
 def scores(
-    shared: Path, weights: Path, scene: str, metrics: tuple[Metric, ...], ensemble: int | None = None
+    shared: Path, name: str, weights: Path, scene: str, metrics: tuple[Metric, ...], ensemble: int | None = None
 ) -> dict[str, float]:
-    """Return the worst-of-four scores of a network on one scene."""
-    head = read_header(weights)
-    scale = head["arguments"]["scale"]
-    node = read_method(head["model"], scale, {} if ensemble is None else {"ensemble": ensemble})
-    method = build_method(node, scale, weights=weights)
+    """Return the worst-of-four scores of a method's network on one scene."""
+    scale = read_header(weights)["arguments"]["scale"]
+    node = read_method(name, scale, {} if ensemble is None else {"ensemble": ensemble})
+    told = {"kernel": "box", "edges": "sharp", "clean": True}
+    method = build_method(node, scale, weights=weights, told=told)
     sample = make_sample(
         Folder(str(shared / "scenes"), [scene]).load(scene), scale, Downsampling("box"), method.range_type
     )
@@ -58,7 +58,10 @@ def table(shared: Path, methods: list[str], files: dict[str, Path], ensemble: in
             name = f"{method}_x{scale}"
             weights = files.get(name) or packaged_weights(name)
             for scene in SCENES if weights is not None else ():
-                ours, theirs = scores(shared, weights, scene, metrics, ensemble), expected[scene][f"x{scale}"]["MSG-V"]
+                ours, theirs = (
+                    scores(shared, method, weights, scene, metrics, ensemble),
+                    expected[scene][f"x{scale}"]["MSG-V"],
+                )
                 worst = {metric: max(value) if isinstance(value, list) else value for metric, value in theirs.items()}
                 ratios = {metric: ours[metric] / worst[metric] for metric in METRICS}
                 rows.append({"method": method, "scale": scale, "scene": scene, **ratios})

@@ -14,18 +14,16 @@ input and all results, rendered, beside the truth; captions are the scene's DSSI
 from __future__ import annotations
 
 import argparse
-import math
 from pathlib import Path
-from typing import Any
 
-import numpy as np
 import pandas as pd
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
+from panel_grid import LIGHT, Panel, rendering_of_input, save_panels
 
-from dsr.evaluation.results import BenchmarkSetting, Results, load_results
+from dsr.evaluation.results import BenchmarkSetting, Results
+from dsr.evaluation.run_files import load_results
 from dsr.metrics.formats import HEADLINES
 from dsr.report.figures.scenes import Shown, rendering, shown_scenes
+from dsr.viz.panels import Window
 
 Metrics = tuple[tuple[str, float, int], ...]
 SHOWN: Metrics = (("RMSE_v", 1e3, 0), ("DSSIM_v", 1e3, 0), ("LPIPS_v", 1e3, 0), ("RMSE_d", 1e3, 0))
@@ -43,7 +41,7 @@ TITLES = {
     "ddrnet": "ddrnet, x1", "rgbdd_real": "rgbdd_real, x2.67",
 }  # fmt: skip
 """Data sets in the order of the columns."""
-FIRST = ("Facets", "MSG-V", "MSG-V (published)", "MSG-V (noisy)", "MSG", "MSG (published)")
+FIRST = ("Facets", "Facets (box)", "MSG-V", "MSG-V (published)", "MSG-V (noisy)", "MSG", "MSG (published)")
 """Labels of the rows that come first, if there are such rows."""
 PEERS = ("PGSR", "DCTNet", "DORNet-T", "FDKN", "SVLRM")
 """Labels of the rows that come last."""
@@ -112,34 +110,22 @@ def ordered(methods: list[str]) -> list[str]:
     return sorted(methods, key=lambda label: FIRST.index(label) if label in FIRST else len(FIRST) + (label in PEERS))
 
 
-def picture(shown: Shown, top: int, left: int, side: int) -> Figure:
-    """Draw a window of the photo, the input, the truth and all results, the surfaces lit by e1."""
-    scene = shown.scene
-    window = (slice(top, top + side), slice(left, left + side))
-    scale = math.ceil(scene.scale)
-    low = rendering(scene.depth_lr, scene.camera_lr, "e1")
-    enlarged = np.repeat(np.repeat(low, scale, axis=0), scale, axis=1)
-    panels: list[tuple[str, np.ndarray]] = [
-        ("photo", scene.rgb.permute(1, 2, 0).numpy()[window]),
-        ("input", enlarged[window]),
+def picture(shown: Shown, top: int, left: int, side: int) -> list[Panel]:
+    """Return a window of the photo, the input, all results and the truth, the surfaces lit by e1."""
+    scene, window = shown.scene, Window(top, left, side, side).slices
+    panels = [
+        Panel("photo", scene.rgb.permute(1, 2, 0).numpy()[window]),
+        Panel("input", rendering_of_input(scene)[window]),
     ]
     if scene.depth is not None:
-        panels.append(("truth", rendering(scene.depth, scene.camera, "e1")[window]))
+        panels.append(Panel("truth", rendering(scene.depth, scene.camera, LIGHT)[window]))
     for label in ordered(list(shown.depths)):
         depth = shown.depths[label]
         if depth is not None:
             found = shown.scores[label]
             caption = f"{label}\n{1e3 * found['DSSIM_v']:.0f} / {1e3 * found['RMSE_v']:.0f}"
-            panels.append((caption, rendering(depth, scene.camera, "e1")[window]))
-    rows = -(-len(panels) // PANELS)
-    figure = Figure(figsize=(1.6 * PANELS, 1.95 * rows), layout="constrained")
-    FigureCanvasAgg(figure)
-    for number, (caption, image) in enumerate(panels, start=1):
-        axes = figure.add_subplot(rows, PANELS, number)
-        axes.imshow(image, cmap="gray", vmin=0, vmax=1, interpolation="nearest")
-        axes.set_title(caption, fontsize=8)
-        axes.set_axis_off()
-    return figure
+            panels.append(Panel(caption, rendering(depth, scene.camera, LIGHT)[window]))
+    return panels
 
 
 def draw_crop(results: Results, path: Path, words: list[str]) -> None:
@@ -150,8 +136,8 @@ def draw_crop(results: Results, path: Path, words: list[str]) -> None:
     shown = next((each for each in shown_scenes(results, problem, notes) if each.name == name), None)
     if shown is None:
         raise SystemExit(f"--crop: expected a scene of the runs, got {' '.join(words[:4])}")
-    options: dict[str, Any] = {"dpi": 150, "pil_kwargs": {"quality": 88}}
-    picture(shown, *map(int, words[4:])).savefig(path, **options)
+    top, left, side = map(int, words[4:])
+    save_panels(path, picture(shown, top, left, side), PANELS, width=240)
 
 
 def main() -> None:

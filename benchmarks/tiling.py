@@ -1,6 +1,6 @@
 """Measure what upsampling a large photo costs, and whether its tiles show.
 
-    OMP_NUM_THREADS=1 python benchmarks/tiling.py --shared DIR [--method facets] [--width 4000 --height 3000]
+    OMP_NUM_THREADS=1 python benchmarks/tiling.py --shared DIR [--method facets_box] [--width 4000 --height 3000]
 
 The picture is made of a real scene and its mirror images. Memory is the peak of the whole process. Seams: the largest
 difference to the answer with tiles of another size, as a share of the range of inverse depth (with one answer instead
@@ -45,7 +45,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--shared", type=Path, required=True, help="the folder that holds scenes/")
     parser.add_argument("--scene", default="plant")
-    parser.add_argument("--method", default="facets", choices=list_methods())
+    parser.add_argument("--method", default="facets_box", choices=list_methods())
     parser.add_argument("--scale", type=int, default=4)
     parser.add_argument("--width", type=int, default=4000)
     parser.add_argument("--height", type=int, default=3000)

@@ -3,7 +3,8 @@
 >>> import dsr
 >>> camera = dsr.Camera(width=640, height=480, fx=525.0, fy=525.0, cx=319.5, cy=239.5)
 
-and ``dsr.upsample(photo, depth, camera)``, see :func:`dsr.inference.api.upsample`.
+and ``dsr.upsample(photo, depth, camera)``, see :func:`dsr.inference.api.upsample`;
+``dsr.upsample_with_errors`` also says how far off the result may be.
 """
 
 from __future__ import annotations
@@ -13,12 +14,16 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from dsr.geometry.camera import Camera
-    from dsr.inference.api import upsample
+    from dsr.inference.api import upsample, upsample_with_errors
 
 __version__ = "0.1.0"
-__all__ = ["Camera", "__version__", "upsample"]
+__all__ = ["Camera", "__version__", "upsample", "upsample_with_errors"]
 
-_HOMES = {"Camera": "dsr.geometry.camera", "upsample": "dsr.inference.api"}
+_HOMES = {
+    "Camera": "dsr.geometry.camera",
+    "upsample": "dsr.inference.api",
+    "upsample_with_errors": "dsr.inference.api",
+}
 
 
 def __getattr__(name: str) -> Any:

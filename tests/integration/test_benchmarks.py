@@ -7,6 +7,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 
 BENCHMARKS = Path(__file__).resolve().parents[2] / "benchmarks"
@@ -35,3 +37,61 @@ def test_method_cost_benchmark_measures(shared: Path) -> None:
     )
     assert done.returncode == 0, done.stderr
     assert re.fullmatch(r"\| `nearest` \| - \| \d+\.\d\d \| \d+ \|", done.stdout.splitlines()[-1])
+
+
+def run_benchmark(name: str, *arguments: str) -> str:
+    """Run a benchmark and return what it printed."""
+    command = [sys.executable, str(BENCHMARKS / name), *arguments]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+@pytest.fixture
+def wall(tmp_path: Path) -> Path:
+    """A folder like the shared one, whose cameras all saw a wall at 1 m, one of them with noise of 2 mm."""
+    noise = np.random.default_rng(0).normal(0, 2, (480, 640))
+    photo, exact = np.full((480, 640, 3), 128, np.uint8), np.full((480, 640), 1000, np.uint16)
+    camera, ddrnet = tmp_path / "real" / "depth_camera" / "0", tmp_path / "real" / "ddrnet"
+    pictures = {
+        camera / "rgb.png": photo,
+        camera / "raw_depth.png": (exact + noise).round().astype(np.uint16),
+        ddrnet / "color_map" / "frame_000001.png": photo,
+        ddrnet / "depth_map" / "frame_000001.png": exact,
+        ddrnet / "high_quality_depth" / "frame_000001.png": exact,
+    }
+    for path, pixels in pictures.items():
+        path.parent.mkdir(parents=True, exist_ok=True)
+        assert cv2.imwrite(str(path), pixels)
+    (camera / "intrinsics.txt").write_text("460 0 319.5\n0 460 239.5\n0 0 1\n")
+    return tmp_path
+
+
+def test_crops_have_one_panel_for_each_method(wall: Path, tmp_path: Path) -> None:
+    arguments = ("--only", "depth_camera_0", "--methods", "bilateral", "--output", str(tmp_path / "crops"))
+    printed = run_benchmark("crops.py", "--shared", str(wall), *arguments)
+    path = tmp_path / "crops" / "depth_camera_0.jpg"
+    assert printed.splitlines() == ["depth_camera_0", "  Bilateral", str(path)]
+    picture = cv2.imread(str(path))
+    assert picture.shape[1] == 4 * 384 + 3 * 8 + 2 * 10
+    panels = [picture[100:200, 10 + column * 392 :][:, 100:284].std() for column in range(4)]
+    assert panels[0] < 1 < panels[2] < panels[1] / 2, "the photo is grey, the input has noise, the result less of it"
+    assert panels[3] == 0, "there is no fourth panel"
+
+
+def test_flatness_of_a_wall(wall: Path) -> None:
+    printed = run_benchmark(
+        "flatness.py", "--shared", str(wall), "--floors", "depth_camera_0", "--methods", "bilateral"
+    )
+    rows = [line.strip("| ").split(" | ") for line in printed.splitlines()[2:]]
+    assert [row[0] for row in rows] == ["input", "bilateral filter of OpenCV", "Bilateral"]
+    floors = [float(row[1]) for row in rows]
+    assert floors[0] > 2 * floors[1] > 0
+    assert all(row[2:] == ["0.0", "0", "100"] for row in rows)
+
+
+def test_flatness_is_the_published_one(shared: Path) -> None:
+    arguments = ("--floors", "depth_camera_0", "--methods", "", "--frames", "1")
+    raw, filtered = run_benchmark("flatness.py", "--shared", str(shared), *arguments).splitlines()[2:]
+    assert raw.startswith("| input | 36.8 |")
+    assert filtered.startswith("| bilateral filter of OpenCV | 15.8 |")

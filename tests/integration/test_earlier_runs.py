@@ -14,7 +14,7 @@ from dsr.app.schema import TrainConfig
 from dsr.app.training_runs import read_config, studies_of_run, training_data
 from dsr.cli import main
 from dsr.data.procedural import Procedural
-from dsr.evaluation.results import load_results
+from dsr.evaluation.run_files import load_results
 from dsr.methods.networks.msg_net import MSGNet
 from dsr.utils.builder import build, load_object
 

@@ -151,7 +151,7 @@ def test_every_scene_has_lines_with_named_times_off_a_terminal(default_run):
 
 @pytest.mark.usefixtures("line_per_report")
 def test_network_reports_its_steps_within_a_scene(within):
-    code, output, errors = within("method=facets", "dataset.scenes=[statue]", "dataset.size=64", "output_dir=out")
+    code, output, errors = within("method=facets_box", "dataset.scenes=[statue]", "dataset.size=64", "output_dir=out")
     assert (code, errors) == (0, [])
     steps = r"predict statue \(0 of 1\): steps: (\d+) of (\d+), elapsed \d:\d\d:\d\d, remaining \d:\d\d:\d\d"
     found = re.findall(f"^{steps}$", output, re.MULTILINE)
@@ -401,7 +401,8 @@ def test_help_lists_the_choices(within):
         "middlebury2005, middlebury2006, middlebury8, middlebury_train, mixture, nyu, paper_train, procedural, rgbdd, "
         "rgbdd_real, simgeo, sintel, sunrgbd, tartanair, tofmark",
         "method: anisotropic_diffusion, bicubic, bilateral, bilinear, cubic_convolution, dctnet, ddrnet, dg, dip, "
-        "dip_v, dip_v_warm, dornet, eg, facets, fast_global_smoother, fdkn, guided_filter, joint_bilateral, msg, msg_v",
+        "dip_v, dip_v_warm, dornet, eg, facets, facets_box, fast_global_smoother, fdkn, guided_filter, "
+        "joint_bilateral, msg, msg_v",
     ):
         assert line in output
 

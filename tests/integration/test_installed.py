@@ -86,7 +86,7 @@ def test_installed_help_lists_the_commands_and_choices(dsr):
         assert line in choices
     choices = dsr("train", "-h")
     for line in (
-        "model: ddrnet, dg, facets, msg, msg_v, pdn, sparse_to_dense",
+        "model: ddrnet, dg, facets, facets_box, msg, msg_v, pdn, sparse_to_dense",
         "trainer: default, full, smoke",
         "experiment: ",
     ):

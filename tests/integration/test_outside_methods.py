@@ -35,6 +35,14 @@ class Constant:
         return torch.full(size, float(sample.depth_lr.nanmean()) + self.offset, dtype=sample.depth_lr.dtype)
 
 
+class Told(Constant):
+    """Says what it was told of the maps."""
+
+    def __init__(self, kernel: str | None = None, edges: str = "auto", clean: bool = False) -> None:
+        super().__init__()
+        print(f"told {kernel} {edges} {clean}")
+
+
 class Shifted(DisparityNetwork):
     """Repeats the low-resolution disparity and adds a learned number."""
 
@@ -53,6 +61,7 @@ class Shifted(DisparityNetwork):
 FILES = {
     "modules/outside.py": MODULE,
     "conf/method/constant.yaml": "name: constant\nlabel: Constant\ntarget: outside.Constant\noffset: 0.0\n",
+    "conf/method/told.yaml": "name: told\nlabel: Told\ntarget: outside.Told\nkernel: null\nedges: auto\n",
     "conf/model/shifted.yaml": "name: shifted\ntarget: outside.Shifted\ndepth_loss: lap1\nvisual: false\n",
     "conf/method/shifted.yaml": (
         "name: shifted\ntarget: dsr.methods.networks.trained.build_trained\nmodel: shifted\nensemble: 1\n"
@@ -125,6 +134,20 @@ def test_changed_code_of_a_method_from_outside_makes_another_run(home):
     assert "holds a run with another outside_code" in done.stderr
     identity = json.loads((home / "runs" / "constant" / "versions.json").read_text())["identity"]
     assert len(identity["outside_code"]) == 16
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        (("downsampling=bicubic",), "bicubic sharp True"),
+        (("noise=gaussian_multiplicative",), "box sharp False"),
+        (("method.edges=soft", "method.kernel=nearest"), "nearest soft True"),
+    ],
+)
+def test_methods_are_told_what_is_known_of_the_maps(home, arguments, told):
+    done = evaluate(home, "method=told", *arguments, f"output_dir=runs/{told.replace(' ', '_')}")
+    assert (done.returncode, done.stderr) == (0, "")
+    assert f"told {told}" in done.stdout.splitlines()
 
 
 def test_upsample_runs_a_method_from_outside_with_settings(home):

@@ -3,12 +3,15 @@
 import base64
 import dataclasses
 import functools
+import re
 
 import cv2
+import matplotlib as mpl
 import numpy as np
 import pytest
 
-from dsr.evaluation.results import Results, load_results
+from dsr.evaluation.results import Results
+from dsr.evaluation.run_files import load_results
 from dsr.geometry.shading import lights, render, shade
 from dsr.report.page import save_page
 from dsr.viz.panels import normals_seen_by
@@ -259,6 +262,110 @@ def test_error_map_is_red_where_the_result_is_farther_and_blue_where_it_is_neare
     assert (drawn[..., 0] > drawn[..., 2])[error > large].all()
     assert (drawn[..., 0] < drawn[..., 2])[error < -large].all()
     assert "cm" in page.inner_text(".stage-scale") or "mm" in page.inner_text(".stage-scale")
+
+
+@pytest.fixture
+def sure(make_run, tmp_path):
+    """Return a run with expected errors, one without, and the address of the page about them."""
+    make_run(tmp_path / "plain", size=SIZE)
+    make_run(tmp_path / "sure", method="sure", label="Sure", size=SIZE, confident=True)
+    runs = load_results([tmp_path])
+    save_page(tmp_path / "index.html", runs)
+    return runs, (tmp_path / "index.html").as_uri()
+
+
+def test_expected_errors_have_the_colours_and_limits_of_the_measured_ones(opened, sure):
+    results, address = sure
+    page = opened(address)
+    choose(page, "left", "Sure")
+    run = run_of(results, "Sure")
+    errors = [each[0].double().numpy() for each in run.expected_errors(SCENES[0])]
+    measured = [np.abs((each.prediction(SCENES[0]) - each.sample(SCENES[0]).depth).numpy()) for each in results.runs]
+    limit = np.median([np.percentile(each, 98) for each in measured])
+    scaled = {"expectedError": (errors[0] / limit + 1) / 2, "expectedAngle": errors[1] / 60}
+    for view, colours in (("expectedError", "RdBu_r"), ("expectedAngle", "magma")):
+        page.click(f"[data-view={view}]")
+        settle(page)
+        expected = 255 * mpl.colormaps[colours](scaled[view])[..., :3]
+        assert np.abs(pixels(page, ".pane-left canvas") - expected).max() <= 6
+        truth = pixels(page, ".pane-right canvas")
+        assert (truth == truth[0, 0]).all()
+        assert page.locator(".pane .silent").all_inner_texts() == ["", ""]
+        assert "expected error" in page.inner_text(".stage-scale")
+    page.click("[data-view=expectedError]")
+    end = page.inner_text(".stage-scale").split("≥")[1]
+    page.click("[data-view=error]")
+    assert page.inner_text(".stage-scale").split("≥")[1].replace("+", "") == end
+
+
+def test_expected_errors_are_read_out_under_the_pointer(opened, sure):
+    results, address = sure
+    page = opened(address)
+    choose(page, "left", "Sure")
+    depth, angle = (each[0].numpy() for each in run_of(results, "Sure").expected_errors(SCENES[0]))
+    box = page.locator(".stage").bounding_box()
+    for row, across in ((20, 33), (50, 10)):
+        page.mouse.move(box["x"] + (across + 0.5) * box["width"] / SIZE, box["y"] + (row + 0.5) * box["height"] / SIZE)
+        settle(page)
+        found = re.search(
+            r"Sure .*expected errors: depth (\S+) (cm|mm), normal (\S+)°", page.inner_text(".readout >> nth=0")
+        )
+        metres = float(found[1]) / {"cm": 100, "mm": 1000}[found[2]]
+        assert metres == pytest.approx(depth[row, across], abs=0.0007)
+        assert float(found[3]) == pytest.approx(angle[row, across], abs=0.2)
+
+
+def test_method_without_expected_errors_is_said_to_have_none(opened, sure):
+    page = opened(sure[1])
+    choose(page, "left", "Sure")
+    choose(page, "right", "Bicubic")
+    page.click("[data-view=expectedError]")
+    settle(page)
+    assert page.locator(".pane .silent").all_inner_texts() == ["", "says nothing of its errors"]
+    assert page.locator(".strip button:has-text('Bicubic') .silent").inner_text() == "says nothing of its errors"
+    box = page.locator(".stage").bounding_box()
+    page.mouse.move(box["x"] + 9, box["y"] + 99)
+    assert re.search("Bicubic .*says nothing of its errors", page.inner_text(".readout >> nth=0"))
+    image = seen(page)
+    empty = image[image.shape[0] // 4, 5 * image.shape[1] // 8 :]
+    assert (empty == empty[0]).all()  # the left picture does not shine through
+    page.click("[data-view=depth]")
+    settle(page)
+    assert set(page.locator(".silent").all_inner_texts()) == {""}
+
+
+def test_expected_errors_are_shown_without_a_truth_and_their_holes_are_pink(opened, sure, tmp_path):
+    run = dataclasses.replace(run_of(sure[0], "Sure"))
+    stored, depth = dataclasses.replace(run.sample(SCENES[0]), depth=None), run.prediction(SCENES[0]).clone()
+    depth[0, 10:20, 10:20] = np.nan
+    object.__setattr__(run, "sample", lambda _: stored)
+    object.__setattr__(run, "prediction", lambda _: depth)
+    save_page(tmp_path / "index.html", Results((run,)))
+    page = opened((tmp_path / "index.html").as_uri())
+    choose(page, "left", "Sure")
+    assert page.locator("[data-view=error]").is_hidden()
+    assert page.locator("#calibration").is_hidden()
+    for view, first in (("expectedError", 10), ("expectedAngle", 9)):
+        page.click(f"[data-view={view}]")
+        settle(page)
+        hole = (pixels(page, ".pane-left canvas") == [214, 132, 180]).all(axis=-1)
+        assert hole[first:20, 10:20].all()
+        assert not hole[:first].any()
+        assert not hole[20:].any()
+
+
+def test_calibration_is_a_table_where_a_method_has_expected_errors(opened, sure, address):
+    page = opened(address)
+    assert page.locator("[data-view=expectedError]").is_hidden()
+    assert page.locator("#calibration").is_hidden()
+    assert page.locator("nav [href='#calibration']").is_hidden()
+    page = opened(sure[1])
+    rows = page.locator("#calibration tbody tr")
+    assert [row.split("\t")[:2] for row in rows.all_inner_texts()] == [["Sure", "depth"], ["Sure", "normal"]]
+    assert all(float(each) > 0 for row in rows.all_inner_texts() for each in row.split("\t")[2:12])
+    assert page.locator("nav [href='#calibration']").is_visible()
+    page.set_viewport_size({"width": 360, "height": 780})
+    assert page.evaluate("document.documentElement.scrollWidth") == 360
 
 
 def test_depth_has_the_colours_of_the_other_pictures_and_the_photo_is_unchanged(opened, results):

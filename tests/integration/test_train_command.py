@@ -332,7 +332,7 @@ USAGE_ERRORS = {
     "a negative weight": (["loss.w=-1"], "loss.w: expected auto or a number, 0 or more, got -1"),
     "a mistyped model": (
         ["model=foo"],
-        "model=foo: unknown; expected one of ddrnet, dg, facets, msg, msg_v, pdn, sparse_to_dense",
+        "model=foo: unknown; expected one of ddrnet, dg, facets, facets_box, msg, msg_v, pdn, sparse_to_dense",
     ),
     "a model taken away": (["~model"], "model: missing; give it as model=..."),
     "a mistyped loss": (["model.depth_loss=l3"], "model.depth_loss: expected one of lap1, l1, mse, got 'l3'"),
@@ -383,7 +383,7 @@ def test_help_lists_the_choices(within):
     assert (code, errors) == (0, [])
     noises = "noise: gaussian_multiplicative, kinect, none, tof"
     for line in (
-        "model: ddrnet, dg, facets, msg, msg_v, pdn, sparse_to_dense",
+        "model: ddrnet, dg, facets, facets_box, msg, msg_v, pdn, sparse_to_dense",
         "trainer: default, full, smoke",
         noises,
     ):
@@ -661,15 +661,60 @@ def test_network_that_depends_on_the_scale_refuses_weights_of_another(smoke, wit
     assert errors[0].endswith("weights are for scale 4, the run is at scale 8, where MSGNet has other parameters")
 
 
-def test_facets_train_and_their_weights_are_those_of_method_facets(tmp_path, within):
-    code, output, errors = within(*SMOKE, "model=facets", "model.width=8", "model.blocks=1", "output_dir=out")
+@pytest.mark.parametrize(
+    ("model", "size"),
+    [("facets", ("degradation=everything", "model.deep=8", "model.blocks=3")), ("facets_box", ("model.blocks=1",))],
+)
+def test_facets_train_and_their_weights_are_those_of_the_method(tmp_path, within, model, size):
+    code, output, errors = within(*SMOKE, f"model={model}", "model.width=8", *size, "output_dir=out")
     assert (code, errors) == (0, [])
-    assert output.startswith("model  facets x4")
+    assert output.startswith(f"model  {model} x4")
+    assert ("loss   20 Lap_1 + RMSE_v + 8 RMSE" in output) == (model == "facets")
     code, _, errors = within(
-        "method=facets", "weights=out/weights.safetensors", "dataset.size=64", "dataset.scenes=[statue]",
+        f"method={model}", "weights=out/weights.safetensors", "dataset.size=64", "dataset.scenes=[statue]",
         "metrics.lpips=false", "output_dir=scores", name="eval",
     )  # fmt: skip
     assert (code, errors) == (0, [])
+    given = ("trainer.init=out/weights.safetensors", "trainer.shared=out/weights.safetensors", "scale=8")
+    given = (*given, "trainer.frozen=[errors.bias]")
+    code, _, errors = within(*SMOKE, f"model={model}", "model.width=8", *size, *given, "output_dir=larger")
+    if model == "facets_box":
+        assert code == 2
+        assert "weights are for scale 4, the run is at scale 8" in errors[0]
+        return
+    assert (code, errors) == (0, [])
+    first, larger = (load_file(tmp_path / name / "weights.safetensors") for name in ("out", "larger"))
+    same = {name.split(".")[0] for name, value in first.items() if torch.equal(value, larger.get(name, value + 1))}
+    assert same >= {"trunk", "planes", "blend", "wide"}
+    assert "choice" not in same
+    assert torch.equal(first["errors.bias"], larger["errors.bias"])
+    assert not torch.equal(first["errors.weight"], larger["errors.weight"])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("model=facets",), "degradation: expected everything or another distribution for model=facets"),
+        (("model=msg", "model.depth_loss=surface"), "model.depth_loss: expected surface for model=facets"),
+        (("model=facets", "degradation=everything", "loss.w=2"), "loss: model=facets has a loss of its own"),
+        (("trainer.frozen=[wide.*]",), "trainer.frozen: expected patterns of parameters' names, such as "),
+        (("degradation=everything", "degradation.soft=2"), "degradation.soft: expected a fraction from 0 to 1, got 2"),
+        (
+            ("model=facets", "degradation=everything", "degradation.scales={4: 1, 8: 1}"),
+            "degradation.scales: expected factors that weights for 4 serve, got 8",
+        ),
+        (
+            ("model=facets", "degradation=everything", "model.width=8", "trainer.init=SMOKE"),
+            "expected weights of FacetsUNet or Facets with {'width': 8, 'blocks': 6, 'facets': 2}, got those of MSGNet",
+        ),
+    ],
+)
+def test_losses_and_degradations_that_do_not_fit_are_refused(smoke, within, arguments, message):
+    given = [each.replace("SMOKE", f"'{smoke[1]}/weights.safetensors'") for each in arguments]
+    code, _, errors = within(*SMOKE, *given, "output_dir=refused")
+    assert code == 2
+    assert len(errors) == 1
+    assert message in errors[0]
 
 
 def test_two_devices_train_as_one_with_twice_the_batch(tmp_path, within, environment):

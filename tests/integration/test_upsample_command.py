@@ -23,6 +23,7 @@ PARTS = {
     "cloud": ("cloud.ply",),
     "mesh": ("mesh.ply", "mesh.glb"),
     "before_after": ("before_after.png",),
+    "confidence": ("confidence.png", "confidence.npz"),
 }
 BICUBIC = ("--method", "bicubic")
 DEPTH_ONLY = (*BICUBIC, "--only", "depth")
@@ -86,7 +87,12 @@ def test_two_files_are_enough_and_all_assumptions_are_printed(pair, cube, tmp_pa
     assert stored.dtype == np.uint16
     np.testing.assert_array_equal(stored, np.round(metres.astype(float) * 1000))
     told = info(out)
-    assert (told["complete"], told["scale"], told["method"], told["settings"]["method"]) == (True, 4, "facets", "auto")
+    assert (told["complete"], told["scale"], told["method"], told["settings"]["method"]) == (
+        True,
+        4,
+        "facets",
+        "facets",
+    )
     assert told["depth_file"] == {
         "suffix": ".png",
         "dtype": "uint16",
@@ -96,8 +102,37 @@ def test_two_files_are_enough_and_all_assumptions_are_printed(pair, cube, tmp_pa
     }
     assert told["photo_size"] == [64, 64]
     assert Camera(**told["camera"]).fx == pytest.approx(32 / np.tan(np.pi / 6))
-    assert len(told["assumptions"]) == 4
+    assert "noise of the depth map (about " in said
+    assert 0 <= told["noise"]["deviation"] < 0.02
+    assert told["noise"]["extent"] >= 1
+    errors = np.load(out / "confidence.npz")
+    assert {name: (each.shape, bool((each > 0).all())) for name, each in errors.items()} == {
+        "depth_error": ((64, 64), True), "angle_error": ((64, 64), True),
+    }  # fmt: skip
     assert told["files"] == [name for names in PARTS.values() for name in names]
+
+
+def test_methods_without_expected_errors_are_complete_without_them(pair, tmp_path, capsys):
+    out = tmp_path / "out"
+    assert of(pair, out, "--method", "bicubic") == 0
+    assert files_in(out) == {*sum(PARTS.values(), ()), "info.json"} - set(PARTS["confidence"])
+    capsys.readouterr()
+    assert of(pair, out, "--method", "bicubic") == 0
+    assert "complete already" in capsys.readouterr().out
+    message = refused(capsys, of(pair, tmp_path / "other", "--method", "bicubic", "--only", "confidence"))
+    assert message == "--only confidence: expected a method that says how sure it is, such as facets, got bicubic"
+
+
+def test_noise_of_an_earlier_run_is_kept_where_parts_are_added(pair, tmp_path, capsys):
+    out = tmp_path / "out"
+    assert of(pair, out, "--only", "depth,confidence") == 0
+    told = info(out)["noise"]
+    assert told["deviation"] > 0
+    capsys.readouterr()
+    assert of(pair, out, "--only", "depth,confidence,mesh") == 0
+    assert "noise of the depth map" not in capsys.readouterr().out  # nothing is computed again
+    assert (out / "mesh.ply").is_file()
+    assert info(out)["noise"] == told
 
 
 @pytest.mark.parametrize(
@@ -164,7 +199,7 @@ def test_repeated_command_does_nothing_and_new_outputs_need_no_new_depth(pair, t
     assert of(pair, out, *DEPTH_ONLY) == 0
     assert "photo: complete already" in capsys.readouterr().out
     assert times == {name: (out / name).stat().st_mtime_ns for name in files_in(out)}
-    monkeypatch.setattr("dsr.app.upsample.run.upsample_depth", None)
+    monkeypatch.setattr("dsr.app.upsample.run.upsample_surface", None)
     assert of(pair, out, *BICUBIC, "--only", "normals") == 0
     assert (
         files_in(out)
@@ -332,13 +367,54 @@ def test_enlarged_depth_gives_as_good_a_result(pair, tmp_path, capsys):
     np.testing.assert_array_equal(small, large)
 
 
-def test_noisy_depth_gets_the_network_trained_on_noise(cube, tmp_path, capsys):
+def test_noise_is_estimated_and_may_be_told(cube, tmp_path, capsys):
     coarse = cube.depth.reshape(16, 4, 16, 4).mean((1, 3))
     noise = np.random.default_rng(0).normal(size=coarse.shape)
     np.save(tmp_path / "noisy.npy", coarse * (1 + 0.01 * noise))
     Image.fromarray(cube.rgb).save(tmp_path / "photo.png")
-    assert of((tmp_path / "photo.png", tmp_path / "noisy.npy"), tmp_path / "out", "--only", "depth") == 0
+    given = (tmp_path / "photo.png", tmp_path / "noisy.npy")
+    results = {}
+    for name, options in {
+        "own": (),
+        "none": ("--noise", "0"),
+        "much": ("--noise", "0.05"),
+        "keep": ("--smooth", "0"),
+    }.items():
+        assert of(given, tmp_path / name, "--only", "depth", *options) == 0
+        said = capsys.readouterr().out
+        assert ("noise of the depth map (about " in said) == ("--noise" not in options)
+        if "--noise" not in options:
+            estimate = float(said.split("noise of the depth map (about ")[1].split(" mm")[0])
+            assert 0.2 * 10 * np.median(coarse) < estimate < 5 * 10 * np.median(coarse)
+        results[name] = np.load(tmp_path / name / "depth_metres.npy")
+    assert info(tmp_path / "much")["settings"]["set"] == {"noise": 0.05}
+    for name, other in (("own", "none"), ("own", "much"), ("none", "much"), ("own", "keep")):
+        assert not np.array_equal(results[name], results[other])
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (("--noise", "-1"), "--noise: expected metres, 0 or more and less than 1, got -1.0"),
+        (("--smooth", "3"), "--smooth: expected a number from 0 to 2, got 3.0"),
+        (("--noise", "0.1", "--set", "noise=0.2"), "--noise: expected it once, got --set noise=0.2, too"),
+        (("--noise", "0.1", "--method", "tgv"), "--noise: unknown key; method=tgv takes"),
+        (("--max-error", "0"), "--max-error: expected a positive percentage of the depth, got 0"),
+    ],
+)
+def test_a_wrong_noise_is_refused(pair, tmp_path, capsys, options, message):
+    assert message in refused(capsys, of(pair, tmp_path / "out", *options))
+    assert not (tmp_path / "out").exists()
+
+
+def test_what_is_likely_to_be_wrong_is_left_out_of_the_mesh(pair, tmp_path, capsys):
+    assert of(pair, tmp_path / "all", "--only", "mesh,depth", "--max-error", "1000") == 0
+    assert "left out of cloud and mesh" not in capsys.readouterr().out
+    assert of(pair, tmp_path / "sure", "--only", "mesh,depth", "--max-error", "1e-9") == 0
     said = capsys.readouterr().out
-    assert "the depth map is noisy: msg_v_noisy, which was trained for that (--method facets keeps more)" in said
-    assert "by msg_v_noisy x4" in said
-    assert info(tmp_path / "out")["method"] == "msg_v_noisy"
+    assert "left out of cloud and mesh (100.0% of the pixels, expected to be off by more than" in said
+    assert "no mesh" in said
+    assert (tmp_path / "all" / "mesh.ply").stat().st_size > 10_000
+    assert not (tmp_path / "sure" / "mesh.ply").exists()
+    whole, kept = (np.load(tmp_path / name / "depth_metres.npy") for name in ("all", "sure"))
+    np.testing.assert_array_equal(whole, kept)

@@ -40,7 +40,7 @@ def _sample(width: int, height: int, hole: bool = False) -> DepthSample:
         ("anisotropic_diffusion", (1, 2, 3)),
         ("dip", (1, 2, 3)),
         ("dip_v_warm", (2,)),
-        ("facets", (2,)),
+        ("facets_box", (2,)),
         ("srfs", (2,)),
         ("eg", (2,)),
     ],
@@ -90,10 +90,10 @@ def test_method_of_whole_scales_refuses_another_by_itself(name: str) -> None:
 
 
 @pytest.mark.parametrize("size", [(48, 36), (32, 24)])
-@pytest.mark.parametrize("name", ["facets", "eg"])
+@pytest.mark.parametrize("name", ["facets_box", "eg"])
 def test_any_scale_gives_what_upsample_gives(name: str, size: tuple[int, int]) -> None:
     sample = _sample(*size, hole=True)
-    settings = {"ensemble": 1} if name == "facets" else {"radius": 2}
+    settings = {"ensemble": 1} if name == "facets_box" else {"radius": 2}
     depth = AnyScale(read_method(name, sample.scale, settings))(sample)  # type: ignore[arg-type]
     expected = upsample_depth(
         sample.rgb, sample.depth_lr, CAMERA, method=name, settings=settings, device="cpu", keep_holes=name == "eg"
@@ -104,7 +104,7 @@ def test_any_scale_gives_what_upsample_gives(name: str, size: tuple[int, int]) -
 
 
 def test_any_scale_describes_how_the_map_is_resized() -> None:
-    adapted = AnyScale(read_method("facets", 1))
-    assert adapted.describe(_sample(48, 36)) == "36 x 48 depth averaged over 4 x 4 pixels, to 36 x 48 by facets x4"
-    assert adapted.describe(_sample(7, 5)) == "5 x 7 depth to 36 x 48 by facets x8"
-    assert [path.stem for path in adapted.weights()] == ["facets_x4", "facets_x8"]
+    adapted = AnyScale(read_method("facets_box", 1))
+    assert adapted.describe(_sample(48, 36)) == "36 x 48 depth averaged over 4 x 4 pixels, to 36 x 48 by facets_box x4"
+    assert adapted.describe(_sample(7, 5)) == "5 x 7 depth to 36 x 48 by facets_box x8"
+    assert [path.stem for path in adapted.weights()] == ["facets_box_x4", "facets_box_x8"]

@@ -3,6 +3,7 @@
 import json
 
 import cv2
+import matplotlib as mpl
 import numpy as np
 import pytest
 import torch
@@ -10,11 +11,11 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from tensorboard.plugins.custom_scalar import layout_pb2
 from tensorboard.plugins.hparams import plugin_data_pb2
 
-from dsr.evaluation.results import load_results
+from dsr.evaluation.run_files import load_results
 from dsr.evaluation.store import sample_path
 from dsr.geometry.shading import render
 from dsr.report.dashboard import save_dashboard
-from dsr.viz.panels import normals_seen_by
+from dsr.viz.panels import HOLE_COLOUR, normals_seen_by
 
 SCENES = ("b", "a")
 
@@ -100,6 +101,26 @@ def test_error_colours_are_the_same_for_all_methods(make_run, tmp_path):
     assert (shown[0] == shown[1]).all()
     blue, _, red = shown[0][0, 0].astype(int)
     assert red > blue
+
+
+def test_expected_errors_have_the_colours_of_measured_ones_of_the_same_size(make_run, tmp_path):
+    folder = make_run(tmp_path, scenes=("s",))
+    truth = load_results([folder]).runs[0].sample("s").depth[0].numpy()
+    step = np.full(truth.shape, 0.005 * np.nanmedian(truth), np.float16)
+    depth = truth + step
+    depth[4:8] = np.nan
+    errors = {"depth_error": step, "angle_error": np.zeros_like(step)}
+    np.savez_compressed(folder / "predictions" / "s.npz", depth=depth, config="{}", seconds=1, **errors)
+    save_dashboard(folder)
+    log = read(folder)
+    measured, expected = (
+        cv2.imdecode(np.frombuffer(log.Images(f"{name}/s")[0].encoded_image_string, np.uint8), cv2.IMREAD_COLOR)
+        for name in ("depth_error", "expected_error")
+    )
+    assert (measured == expected).all()
+    hole = mpl.colors.to_rgb(HOLE_COLOUR)
+    assert (expected[4:8] == np.rint(255 * np.array(hole[::-1]))).all()
+    assert not (expected[:4] == expected[4]).all(axis=-1).any()
 
 
 def test_second_log_replaces_the_first(make_run, tmp_path):

@@ -44,14 +44,16 @@ DATASETS = (
 )
 METHODS = (
     "anisotropic_diffusion, bicubic, bilateral, bilinear, cubic_convolution, dctnet, ddrnet, dg, dip, dip_v, "
-    "dip_v_warm, dornet, eg, facets, fast_global_smoother, fdkn, guided_filter, joint_bilateral, msg, msg_v, "
-    "msg_v_noisy, nearest, pdn, pgsr, sparse_to_dense, srfs, svlrm, tgv"
+    "dip_v_warm, dornet, eg, facets, facets_box, fast_global_smoother, fdkn, guided_filter, joint_bilateral, msg, "
+    "msg_v, msg_v_noisy, nearest, pdn, pgsr, sparse_to_dense, srfs, svlrm, tgv"
 )
 EXPERIMENTS = (
-    "all_methods, ddrnet_x4, ddrnet_x8, dg_x4, dg_x8, downsampling_mismatch, facets_x4, facets_x8, field_benchmarks, "
-    "msg_v_x4, msg_v_x4_noisy, msg_v_x4_stage1, msg_v_x4_stage2, msg_v_x4_stage3, msg_v_x8, msg_v_x8_stage1, msg_x4, "
-    "msg_x8, noise, paper_tables, pdn_x4, pdn_x8, published_networks, sensors, sparse_to_dense_x4, "
-    "sparse_to_dense_x8, visual_losses"
+    "all_methods, ddrnet_x4, ddrnet_x8, dg_x4, dg_x8, downsampling_mismatch, facets_box_x4, facets_box_x8, facets_x16, "
+    "facets_x2, facets_x2_stage1, facets_x4, facets_x4_clean, facets_x4_stage1, facets_x8, facets_x8_clean, "
+    "facets_x8_stage1, field_benchmarks, msg_v_x4, "
+    "msg_v_x4_noisy, msg_v_x4_stage1, msg_v_x4_stage2, msg_v_x4_stage3, msg_v_x8, msg_v_x8_stage1, msg_x4, msg_x8, "
+    "noise, paper_tables, pdn_x4, pdn_x8, published_networks, sensors, sparse_to_dense_x4, sparse_to_dense_x8, "
+    "visual_losses"
 )
 USAGE_ERRORS = {
     "dataset=fodler": f"dataset=fodler: unknown; expected one of {DATASETS}",

@@ -26,7 +26,27 @@ DG = ["model=dg", "model.depth_loss=lap1", "model.visual=true", "dataset.count=8
 DDRNET = ["model=ddrnet", "dataset.count=360", "trainer.average=0.998", "trainer.photo=0", "precision=float32"]
 SPARSE_TO_DENSE = ["model=sparse_to_dense", "dataset.count=360", "trainer.photo=0", "trainer.patch=192",
                    "trainer.batch=4", "precision=bfloat16"]  # fmt: skip
-FACETS = ["model=facets", *FULL, "trainer.patch=128", "trainer.batch=4", "trainer.photo=0"]
+FACETS_BOX = ["model=facets_box", *FULL, "trainer.patch=128", "trainer.batch=4", "trainer.photo=0"]
+FACETS = ["model=facets", "degradation=everything", "dataset.count=800", "trainer.patch=384", "trainer.batch=1",
+          "trainer.validate_every=2000", "trainer.photo=0", "trainer.learning_rate=4e-4", "trainer.warmup=500",
+          "trainer.average=0.9995", "precision=bfloat16"]  # fmt: skip
+FIRST = [*FACETS, "degradation.folds=0"]
+SECOND = [*FACETS, "trainer.warmup=300", "seed=1"]
+SHORT = ["trainer.steps=1000", "trainer.validate_every=500", "trainer.warmup=100", "trainer.average=0.998",
+         "trainer.learning_rate=3e-4"]  # fmt: skip
+MORE_NOISE = [
+    "degradation.kernels={box: 0.3, nearest: 0.12, bilinear: 0.12, bicubic: 0.28, gaussian: 0.1, spread: 0.08}",
+    "degradation.noises={none: 0.32, white: 0.22, correlated: 0.08, structured: 0.13, flight: 0.12, lidar: 0.05, "
+    "stereo: 0.08}",
+]  # fmt: skip
+CLEAN = [
+    *FIRST, "trainer.validate_every=1000", "trainer.patch=192", "trainer.batch=4", "seed=2",
+    "degradation.kernels={box: 1, nearest: 0, bilinear: 0, bicubic: 0, gaussian: 0, spread: 0}",
+    "degradation.noises={none: 1, white: 0, correlated: 0, structured: 0, flight: 0, lidar: 0, stereo: 0}",
+    "degradation.holes={none: 1, blobs: 0, shadows: 0, steps: 0, dark: 0, pixels: 0}",
+    "degradation.displaced=0", "degradation.rounded=0", "degradation.soft=0", "degradation.relief=0.15",
+    "degradation.photo=0.1", "degradation.textured=0.04", "degradation.told=1",
+]  # fmt: skip
 MSG_V = ["model=msg_v", *FULL, "loss.w=1.5"]
 RECIPES = {
     "msg_v_x4_stage1": ["model=msg_v", *FULL, "loss.w=0.36", "trainer.photo=0"],
@@ -40,8 +60,23 @@ RECIPES = {
     "msg_x8": ["model=msg", *FULL, "trainer.steps=10000", "scale=8"],
     "msg_v_x4_noisy": [*MSG_V, "noise=gaussian_multiplicative", "noise.std=0.003", "trainer.steps=5000",
                        "trainer.learning_rate=6e-4", "seed=2"],
-    "facets_x4": [*FACETS, "loss.w=0.27"],
-    "facets_x8": [*FACETS, "loss.w=0.28", "scale=8"],
+    "facets_box_x4": [*FACETS_BOX, "loss.w=0.27"],
+    "facets_box_x8": [*FACETS_BOX, "loss.w=0.28", "scale=8"],
+    "facets_x2_stage1": [*FIRST, "scale=2", "degradation.scales={1: 0.6, 2: 0.4}", "trainer.patch=192",
+                         "trainer.steps=12000"],
+    "facets_x2": [*SECOND, "scale=2", "degradation.scales={1: 0.75, 2: 0.25}", "degradation.folds=0.4",
+                  "degradation.noises={none: 0.2, white: 0.15, correlated: 0.15, structured: 0.2, flight: 0.1, "
+                  "lidar: 0.05, stereo: 0.15}", "trainer.patch=256", "trainer.steps=4200"],
+    "facets_x4_stage1": [*FIRST, "trainer.steps=26000"],
+    "facets_x4": [*SECOND, *MORE_NOISE, "trainer.steps=5600"],
+    "facets_x4_clean": [*CLEAN, "trainer.steps=7200"],
+    "facets_x8_stage1": [*FIRST, "scale=8", "trainer.steps=10000", "trainer.patch=512", "trainer.learning_rate=3e-4"],
+    "facets_x8": [*SECOND, *MORE_NOISE, "scale=8", *SHORT, "trainer.patch=512",
+                  "trainer.shared=outputs/train/facets_x4/weights.safetensors"],
+    "facets_x8_clean": [*CLEAN, "scale=8", "trainer.steps=3000", "trainer.patch=256", "trainer.batch=2",
+                        "trainer.warmup=300", "trainer.average=0.999"],
+    "facets_x16": [*FACETS, "scale=16", *SHORT, "trainer.patch=512",
+                   "trainer.shared=outputs/train/facets_x4/weights.safetensors"],
     "pdn_x4": [*PDN, "trainer.steps=3000", "trainer.warmup=200", "trainer.validate_every=1000"],
     "pdn_x8": [*PDN, "scale=8", "trainer.steps=1000", "trainer.warmup=50", "trainer.learning_rate=5e-4",
                "trainer.validate_every=500"],
@@ -66,6 +101,15 @@ STARTS = {
     "pdn_x8": "outputs/train/pdn_x4/weights.safetensors",
     "dg_x8": "outputs/train/dg_x4/weights.safetensors",
     "ddrnet_x8": "outputs/train/ddrnet_x4/weights.safetensors",
+    "facets_x2_stage1": "outputs/train/facets_x4_stage1/weights.safetensors",
+    "facets_x2": "outputs/train/facets_x2_stage1/weights.safetensors",
+    "facets_x4_clean": "outputs/train/facets_box_x4/weights.safetensors",
+    "facets_x8_clean": "outputs/train/facets_box_x8/weights.safetensors",
+    "facets_x4_stage1": "outputs/train/facets_box_x4/weights.safetensors",
+    "facets_x4": "outputs/train/facets_x4_stage1/weights.safetensors",
+    "facets_x8_stage1": "outputs/train/facets_x4_stage1/weights.safetensors",
+    "facets_x8": "outputs/train/facets_x8_stage1/weights.safetensors",
+    "facets_x16": "outputs/train/facets_x8/weights.safetensors",
     "sparse_to_dense_x8": "outputs/train/sparse_to_dense_x4/weights.safetensors",
 }
 """What they started from."""
@@ -176,5 +220,5 @@ def test_own_experiments_are_narrowed_too(tmp_path):
 
 
 def test_an_experiment_without_a_sweep_is_left_as_it_is():
-    arguments = ["+experiment=facets_x4", "scale=8"]
+    arguments = ["+experiment=facets_box_x4", "scale=8"]
     assert without_overridden_sweeps(arguments, DIRECTORIES) == arguments

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from dsr.evaluation.results import load_results
+from dsr.evaluation.run_files import load_results
 from dsr.geometry.shading import lights
 from dsr.report.figures import (
     grids,

@@ -14,13 +14,12 @@ from torch import Tensor
 
 import dsr
 from dsr.geometry.camera import Camera
+from dsr.geometry.resampling import resize_inverse_depth
 from dsr.inference import api as people
 from dsr.inference import plan, upsample_depth
 from dsr.inference.engine import _resize_nearest, enlarged_by
-from dsr.inference.inspection import suited_method
 from dsr.inference.planning import OWN_SIZE
-from dsr.inference.resampling import resize_inverse_depth
-from dsr.methods.registry import list_methods, read_method
+from dsr.methods.registry import find_weights, list_methods, read_method
 
 
 def _camera(height: int, width: int) -> Camera:
@@ -120,12 +119,14 @@ def test_resizing_keeps_planes_to_rounding_up_to_the_border(size: tuple[int, int
 def test_plan_describes_the_steps() -> None:
     assert plan((480, 640), (120, 160)).scale == 4
     assert plan((1440, 1920), (192, 256)).scale == 8  # 7.5
-    assert plan((720, 1280), (240, 426)).steps == (4,)
-    assert plan((3024, 4032), (192, 256)).steps == (8, 4)  # 15.75
-    assert plan((480, 640), (480, 640)).coarsened == 4
+    assert plan((720, 1280), (240, 426), method="facets_box").steps == (4,)
+    assert plan((3024, 4032), (192, 256), method="facets_box").steps == (8, 4)  # 15.75
+    assert plan((480, 640), (480, 640), method="facets_box").coarsened == 4
     assert plan((480, 640), (480, 640), 8).coarsened == 8
-    assert plan((480, 640), (120, 160), 8).steps == (8,)
-    assert plan((480, 640), (160, 213), method="bicubic").scale == 4
+    assert plan((480, 640), (120, 160), 8, method="facets_box").steps == (8,)
+    assert plan((480, 640), (480, 640)).coarsened == 1  # at its own size
+    assert plan((480, 640), (160, 213), method="bicubic").scale == 3  # 3.005
+    assert plan((480, 640), (152, 203), method="bicubic").scale == 4  # 3.16
     assert plan((480, 640), (160, 214), method="bicubic").steps == ()
     text = plan((3000, 4000), (750, 1000)).text
     assert "750 x 1000 depth to 3000 x 4000 by facets x4" in text
@@ -138,12 +139,12 @@ def test_plan_describes_the_steps() -> None:
     ("arguments", "message"),
     [
         (((48, 64), (12, 16), 4, "fcets"), "method: expected one of anisotropic_diffusion, .*, tgv, got 'fcets'"),
-        (((48, 64), (12, 16), 2, "facets"), "scale: expected one of 4, 8, 16, 32 for facets, got 2"),
+        (((48, 64), (12, 16), 2, "facets_box"), "scale: expected one of 4, 8, 16, 32 for facets_box, got 2"),
         (((48, 64), (12, 16), 8, "msg_v_noisy"), "scale: expected one of 4, 16 for msg_v_noisy, got 8"),
         (((48, 64), (12, 16), 0, "bicubic"), "scale: expected a positive whole number, got 0"),
         (((480, 640), (120, 150), None, "facets"), "aspect within 2%, got 120 x 150 for a photo of 480 x 640"),
         (((480, 640), (960, 1280), None, "facets"), "expected no more pixels than the photo, got 960 x 1280"),
-        (((4800, 6400), (96, 128), None, "facets"), "at least 1/32 of the photo's size for facets, got 1/50"),
+        (((4800, 6400), (96, 128), None, "facets_box"), "at least 1/32 of the photo's size for facets_box, got 1/50"),
         (((2000, 2000), (500, 500), None, "dip_v"), "method=dip_v: expected a photo of up to 1048576 pixels"),
     ],
 )
@@ -214,7 +215,8 @@ def test_mask_makes_holes() -> None:
 
 def test_progress_covers_all_steps() -> None:
     camera, parts = _camera(64, 96), []
-    upsample_depth(_photo(64, 96), _plane(4, 6, camera), camera, progress=lambda *part: parts.append(part))
+    given = _photo(64, 96), _plane(4, 6, camera), camera
+    upsample_depth(*given, method="facets_box", progress=lambda *part: parts.append(part))
     assert parts == [(i + 1, 8) for i in range(8)]  # x8, then x4, each an ensemble of four
 
 
@@ -264,10 +266,32 @@ def test_plan_states_the_time_of_slow_methods() -> None:
 
 
 def test_depth_almost_of_the_photos_size_counts_as_such() -> None:
-    assert plan((480, 640), (int(480 / OWN_SIZE), int(640 / OWN_SIZE))).coarsened == 4
+    assert plan((480, 640), (int(480 / OWN_SIZE), int(640 / OWN_SIZE)), method="facets_box").coarsened == 4
     camera = _camera(40, 60)
-    fine = upsample_depth(_photo(40, 60), _plane(38, 57, camera), camera)
+    fine = upsample_depth(_photo(40, 60), _plane(38, 57, camera), camera, method="facets_box")
     assert float((fine / _plane(40, 60, camera) - 1).abs().max()) < 0.02
+
+
+@pytest.mark.parametrize("method", ["facets", "facets_box", "bilateral"])
+def test_depth_a_little_larger_than_the_photo_is_taken(method: str) -> None:
+    camera = _camera(40, 60)
+    found = upsample_depth(_photo(40, 60), _plane(42, 63, camera), camera, method=method)
+    assert float((found / _plane(40, 60, camera) - 1).abs().max()) < 0.06
+
+
+@pytest.mark.parametrize(
+    ("photo", "depth", "factor"),
+    [
+        ((968, 1296), (480, 640), 2),
+        ((964, 1286), (240, 320), 4),
+        ((1440, 1920), (192, 256), 8),
+        ((480, 640), (480, 640), 1),
+    ],
+)
+def test_ratios_next_to_a_factor_take_its_weights(photo: tuple[int, int], depth: tuple[int, int], factor: int) -> None:
+    assert plan(photo, depth).scale == factor
+    node = read_method("facets", factor)
+    assert find_weights(node, max(photo[1] / depth[1], 1)).name == f"facets_x{max(factor, 2)}.safetensors"
 
 
 def test_example_of_the_documentation_runs() -> None:
@@ -283,26 +307,3 @@ def test_import_of_the_package_loads_nothing_heavy() -> None:
     assert answer.stdout.strip() == "[]"
     with pytest.raises(AttributeError, match="module 'dsr' has no attribute 'upsampled'"):
         dsr.upsampled  # noqa: B018
-
-
-@pytest.mark.parametrize("repeats", [1, 4])
-@pytest.mark.parametrize(("noise", "method"), [(0.0005, "facets"), (0.004, "msg_v_noisy")])
-def test_suited_method_depends_on_the_normal_noise(noise, method, repeats):
-    camera = Camera(128, 128, 128.0, 128.0, 63.5, 63.5)  # noise of 0.002 tilts by 5.2 degrees at 32 x 32
-    coarse = 2 * (1 + noise * torch.randn(1, 32, 32, generator=torch.Generator().manual_seed(0)))
-    given = coarse.repeat_interleave(repeats, 1).repeat_interleave(repeats, 2)
-    assert suited_method(given, camera) == method
-
-
-def test_depth_of_the_photos_size_is_judged_after_averaging():
-    camera = Camera(128, 128, 128.0, 128.0, 63.5, 63.5)
-    fine = 2 * (1 + 0.008 * torch.randn(1, 128, 128, generator=torch.Generator().manual_seed(0)))
-    assert suited_method(fine, camera) == "facets"  # averages of 16 have a quarter of the noise
-    assert suited_method(2 + 2 * (fine - 2), camera) == "msg_v_noisy"
-
-
-def test_missing_noisy_weights_are_replaced_by_the_others():
-    camera = Camera(256, 256, 256.0, 256.0, 127.5, 127.5)
-    noisy = 2 + 0.05 * torch.rand(1, 32, 32, generator=torch.Generator().manual_seed(0))
-    assert suited_method(noisy, camera) == "facets"
-    assert suited_method(noisy, Camera(128, 128, 128.0, 128.0, 63.5, 63.5), scale=8) == "facets"

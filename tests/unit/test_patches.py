@@ -15,6 +15,7 @@ from torch import Tensor
 
 from dsr.data.base import SceneSource
 from dsr.degradation.downsampling import Downsampling, Measured, make_sample
+from dsr.degradation.everything import Everything
 from dsr.degradation.noise import GaussianMultiplicative, Kinect
 from dsr.geometry.camera import Camera
 from dsr.methods.networks.maps import normalise
@@ -567,3 +568,55 @@ def test_window_that_noise_leaves_empty_is_replaced_by_another() -> None:
         ValueError, match="patches: expected low-resolution maps with a known pixel or more; noise makes all"
     ):
         Patches([[far]], _settings(), degradation)[0]
+
+
+def _degraded(scenes: list[Scene], everything: Everything, batch: int = 2, size: int = SIZE, **changes: Any) -> Patches:
+    return Patches([scenes], _settings(patch=size, batch=batch, **changes), X4, count=36, everything=everything)
+
+
+def test_degraded_patches_are_pure_functions_of_their_number_and_tell_what_they_are() -> None:
+    scenes = [_scene(number) for number in range(3)]
+    first, again = (_degraded(scenes, Everything(soft=0.5)) for _ in range(2))
+    for index in (7, 0, 3):
+        for name, value in first[index].items():
+            torch.testing.assert_close(again[index][name], value, rtol=0, atol=0, equal_nan=True)
+    found = [first[index] for index in range(12)]
+    assert {float(patch["soft"]) for patch in found} == {0.0, 1.0}
+    for patch in found:
+        assert patch["depth"].shape == (1, SIZE, SIZE)
+        assert patch["noise"].shape == patch["disparity_lr"].shape == (1, SIZE // 4, SIZE // 4)
+        told = patch["facts"][5:7]
+        assert not bool(told.any()) or bool(told[int(patch["soft"])])
+
+
+def test_all_patches_of_a_batch_have_one_factor() -> None:
+    patches = _degraded([_scene()], Everything(scales={1: 0.5, 2: 0.5}, holes={"none": 1}), batch=3)
+    factors = [SIZE // patches[index]["disparity_lr"].shape[-1] for index in range(36)]
+    assert all(len(set(factors[i : i + 3])) == 1 for i in range(0, 36, 3))
+    assert set(factors) == {1, 2}
+
+
+def test_soft_patches_of_scenes_with_holes_of_several_sizes_are_soft() -> None:
+    """A step gets mixed pixels, holes stay holes, and a map of a sensor is no obstacle."""
+    scenes = []
+    for number, (height, width) in enumerate(((16, 16), (44, 60), (80, 64))):
+        camera = Camera(width, height, 50.0, 50.0, width / 2, height / 2)
+        depth = torch.full((1, height, width), 2.0, dtype=torch.float64)
+        depth[..., ::2] = 1.0
+        depth[:, :3] = torch.nan
+        scene = _scene(number, camera, depth)
+        scenes.append(replace(scene, measured={4.0: depth[:, : height // 4, : width // 4]}))
+    everything = Everything(soft=1, folds=0, relief=0, noises={"none": 1}, holes={"none": 1}, displaced=0, rounded=0)
+    patches = _degraded(scenes, everything)
+    for index in range(12):
+        depth = patches[index]["depth"]
+        inside = depth[depth.isfinite()]
+        mixed = (inside > 1.02) & (inside < 1.96)
+        assert float(mixed.double().mean()) > 0.9
+    sharp = _degraded(scenes, replace(everything, soft=0))[0]["depth"]
+    assert set(sharp[sharp.isfinite()].tolist()) == {1.0, 2.0}
+
+
+def test_every_factor_has_to_divide_the_patches() -> None:
+    with pytest.raises(ValueError, match=r"16"):
+        _degraded([_scene()], Everything(scales={4: 1, 16: 1}), size=24)

@@ -11,10 +11,21 @@ import numpy as np
 import pytest
 import torch
 
-from dsr.evaluation.results import Results, load_results
+from dsr.evaluation.results import Results
+from dsr.evaluation.run_files import load_results
 from dsr.geometry.shading import render
-from dsr.report.page import save_page
-from dsr.report.page.encoding import LEVELS, Pool, depth_picture, error_picture, mask_picture, shading_picture
+from dsr.report.page import calibration, save_page
+from dsr.report.page.calibration import calibration_data
+from dsr.report.page.encoding import (
+    LEVELS,
+    Pool,
+    depth_picture,
+    error_picture,
+    expected_picture,
+    mask_picture,
+    shading_picture,
+)
+from dsr.report.page.scenes import views_of
 from dsr.viz.panels import normals_seen_by
 
 SPITEFUL = "<img src=x onerror=alert(1)>\"'&</script><script>alert(2)</script>"
@@ -96,6 +107,11 @@ def test_error_is_stored_by_the_root_of_its_fraction_of_the_largest(error, level
     assert error_picture(np.array([[float(error)]]), 2.0)[0, 0] == pytest.approx(level, abs=1)
 
 
+@pytest.mark.parametrize(("error", "level"), [(0, 0), (2, 255), (9, 255), (0.5, 128), (0.02, 26)])
+def test_expected_error_is_stored_by_the_root_of_its_fraction_of_the_largest(error, level):
+    assert expected_picture(np.array([[float(error)]]), 2.0)[0, 0] == pytest.approx(level, abs=1)
+
+
 def test_depth_is_stored_between_its_limits():
     assert depth_picture(np.array([[0.5, 1, 2, 3, 9.0]]), 1, 3).tolist() == [[0, 0, 128, 255, 255]]
 
@@ -121,6 +137,88 @@ def test_holes_of_a_result_are_masked_and_their_neighbours_have_no_normal(make_r
     assert mask[9, 20] == mask[10, 19] == 128
     assert picture(content, scene["surfaces"][1]["error"]["mask"])[10, 20] == 0
     assert "mask" not in scene["surfaces"][2]
+
+
+def test_stored_expected_errors_are_those_of_the_run(make_run, tmp_path):
+    results = load_results([make_run(tmp_path / "run", confident=True)])
+    content, _, scene = saved(tmp_path, results)
+    stored = scene["surfaces"][1]["expected"]
+    for name, expected in zip(("depth", "angle"), results.runs[0].expected_errors("cube_no_texture"), strict=True):
+        largest = scene["expected"][name]
+        assert largest == pytest.approx(np.percentile(expected, 99.9))
+        found = (picture(content, stored[name]) / 255.0) ** 2 * largest
+        assert np.abs(found - expected[0].clamp(max=largest).numpy()).max() <= 1.001 * largest / 255
+    assert "mask" not in stored
+
+
+def test_expected_errors_of_holes_are_masked_and_the_normals_beside_them_have_none(make_run, tmp_path):
+    [run] = load_results([make_run(tmp_path / "run", confident=True)]).runs
+    depth = run.prediction("cube_no_texture").clone()
+    depth[0, 10, 20] = torch.nan
+    depth_error, angle_error = run.expected_errors("cube_no_texture")
+    depth_error[0, 3, 5] = torch.nan
+    with_holes = changed(run, prediction=lambda _: depth, expected_errors=lambda _: (depth_error, angle_error))
+    content, _, scene = saved(tmp_path, Results((with_holes,)))
+    mask = picture(content, scene["surfaces"][1]["expected"]["mask"])
+    assert {tuple(place) for place in np.argwhere(mask != 255)} == {(3, 5), (10, 20), (10, 19), (9, 20)}
+    assert mask[10, 20] == mask[3, 5] == 0
+    assert mask[9, 20] == mask[10, 19] == 128
+
+
+def test_expected_errors_do_not_change_the_limits_of_the_measured_ones(make_run, tmp_path):
+    runs = [make_run(tmp_path / str(confident), confident=confident) for confident in (False, True)]
+    plain, sure = (saved(folder, load_results([folder]))[2] for folder in runs)
+    assert sure["error"] == plain["error"]
+    assert "expected" not in plain
+    assert "expected" not in plain["surfaces"][1]
+
+
+def test_expected_errors_of_another_size_are_left_out_and_named(make_run, tmp_path):
+    [run] = load_results([make_run(tmp_path / "run", confident=True)]).runs
+    small = changed(run, expected_errors=lambda _: (torch.ones(1, 8, 8), torch.ones(1, 8, 8)))
+    _, data, scene = saved(tmp_path, Results((small,)))
+    assert "expected" not in scene
+    assert any("expected errors of (1, 32, 32), got (1, 8, 8)" in note for note in data["notes"])
+    assert data["problems"][0]["calibration"] == []
+
+
+def test_calibration_compares_expected_and_measured_errors_of_all_scenes(make_run, tmp_path):
+    make_run(tmp_path / "runs" / "plain", scenes=("a", "b"))
+    make_run(tmp_path / "runs" / "sure", method="sure", label="Sure", scenes=("a", "b"), confident=True)
+    results = load_results([tmp_path / "runs"])
+    _, data, _ = saved(tmp_path, results)
+    [row] = data["problems"][0]["calibration"]
+    assert (row["method"], row["scenes"]) == ("Sure", 2)
+    run = results.runs[-1]
+    expected = np.concatenate([run.expected_errors(scene)[0].numpy().ravel() for scene in "ab"])
+    measured = np.concatenate([(run.prediction(s) - run.sample(s).depth).abs().numpy().ravel() for s in "ab"])
+    order = np.argsort(expected, kind="stable")
+    ratios = [measured[part].mean() / expected[part].mean() for part in np.array_split(order, 10)]
+    assert row["depth"]["ratios"] == pytest.approx(ratios, rel=1e-5)
+    kept = order[: round(0.8 * len(order))]
+    assert row["depth"]["share"] == pytest.approx((measured[kept] ** 2).sum() / (measured**2).sum(), rel=1e-5)
+    best = np.sort(measured)[: len(kept)]
+    assert row["depth"]["least"] == pytest.approx((best**2).sum() / (measured**2).sum(), rel=1e-5)
+    assert len(row["angle"]["ratios"]) == 10
+
+
+def test_calibration_of_many_pixels_uses_every_few_of_them(make_run, tmp_path, monkeypatch):
+    views = views_of(load_results([make_run(tmp_path / "run", scenes=("a", "b"), size=64, confident=True)]))
+    [every] = calibration_data(views)
+    monkeypatch.setattr(calibration, "_MOST_PIXELS", 1500)
+    [some] = calibration_data(views)
+    assert some["depth"] != every["depth"]
+    assert some["depth"]["ratios"] == pytest.approx(every["depth"]["ratios"], rel=0.25)
+
+
+def test_calibration_without_a_defined_value_has_none(make_run, tmp_path):
+    [run] = load_results([make_run(tmp_path / "run", confident=True)]).runs
+    truth = run.sample("cube_no_texture").depth
+    zeros = (torch.zeros(1, 32, 32), torch.zeros(1, 32, 32))
+    exact = changed(run, prediction=lambda _: truth, expected_errors=lambda _: zeros)
+    _, data, _ = saved(tmp_path, Results((exact,)))
+    [row] = data["problems"][0]["calibration"]
+    assert row["depth"] == {"ratios": [None] * 10, "share": None, "least": None}
 
 
 def test_limits_of_errors_and_depth_are_the_same_for_all_methods(make_run, tmp_path):
@@ -230,6 +328,16 @@ def test_scene_without_truth_has_renderings_and_no_errors(make_run, tmp_path):
     assert [surface["kind"] for surface in scene["surfaces"]] == ["input", "method"]
     assert "error" not in scene
     assert "error" not in scene["surfaces"][1]
+
+
+def test_scene_without_truth_has_expected_errors_with_limits_of_their_own(make_run, tmp_path):
+    [run] = load_results([make_run(tmp_path / "run", confident=True)]).runs
+    stored = dataclasses.replace(run.sample("cube_no_texture"), depth=None)
+    _, data, scene = saved(tmp_path, Results((changed(run, sample=lambda _: stored),)))
+    assert scene["error"]["limit"] == pytest.approx(np.percentile(run.expected_errors("cube_no_texture")[0], 98))
+    assert "error" not in scene["surfaces"][1]
+    assert scene["surfaces"][1]["expected"].keys() == {"depth", "angle"}
+    assert data["problems"][0]["calibration"] == []
 
 
 def test_names_with_tags_are_escaped(make_run, tmp_path):

@@ -6,7 +6,8 @@ import os
 import pytest
 import torch
 
-from dsr.evaluation.results import BenchmarkSetting, load_results
+from dsr.evaluation.results import BenchmarkSetting
+from dsr.evaluation.run_files import load_results
 from dsr.evaluation.store import prediction_path, sample_path
 from dsr.sample import DepthSample
 
@@ -32,6 +33,18 @@ def test_run_is_read_with_its_scenes_predictions_and_scores(make_run, tmp_path):
     assert run.versions["python"] == "3.11.7"
     assert "identity" not in run.versions
     assert run.settings["method"]["name"] == "bicubic"
+
+
+def test_expected_errors_are_read_and_a_method_without_them_has_none(make_run, tmp_path):
+    make_run(tmp_path / "a", scenes=("b",))
+    make_run(tmp_path / "c", scenes=("b",), method="sure", label="Sure", confident=True)
+    plain, sure = load_results([tmp_path]).runs
+    assert plain.expected_errors("b") is None
+    depth, angle = sure.expected_errors("b")
+    assert depth.shape == angle.shape == (1, 32, 32)
+    assert depth.dtype == torch.float32
+    assert float(depth[0, 0, 16]) == pytest.approx(0.007, rel=1e-3)
+    assert float(angle[0, 16, 0]) == pytest.approx(15)
 
 
 def test_stored_scene_is_the_sample_that_the_method_was_given(make_run, tmp_path):

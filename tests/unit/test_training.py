@@ -21,6 +21,8 @@ from torch.utils.data import DataLoader
 from dsr.app.trainer import seconds_per_step
 from dsr.degradation.downsampling import Downsampling, make_sample
 from dsr.geometry.camera import Camera
+from dsr.methods.networks.any_map import AnyMap
+from dsr.methods.networks.facets_unet import FacetsUNet
 from dsr.methods.networks.msg_net import MSGNet, upsample_disparity
 from dsr.methods.networks.sparse_to_dense import SparseToDense
 from dsr.metrics import functional as scores
@@ -31,7 +33,7 @@ from dsr.sample import CENTIMETRES, Scene, Unit
 from dsr.training.data_module import WholeScenes, collate_scene
 from dsr.training.degradation import Batch, Degradation, to_tensors
 from dsr.training.module import SuperResolution
-from dsr.training.objective import Objective, balance_weight, to_depth
+from dsr.training.objective import Objective, SurfaceObjective, balance_weight, to_depth
 from dsr.training.patches import Patches
 from dsr.training.settings import PatchSettings, Schedule
 from dsr.training.shading import shading_loss
@@ -428,6 +430,26 @@ def test_validation_logs_the_mean_over_the_scenes_under_the_worst_light(tmp_path
         values["Bumpiness_d"].append(float(scores.bumpiness_d(pair)))
     for name, each in values.items():
         assert logged[f"val/{name}"] == pytest.approx(np.mean(each), rel=1e-4), name
+
+
+def test_a_network_that_takes_hints_is_validated_as_it_is_evaluated(tmp_path: Path) -> None:
+    """That is, told the kernel, sharp steps, and that there is no noise."""
+    torch.manual_seed(0)
+    net = FacetsUNet(2, 8, 8, 4)
+    with torch.no_grad():
+        for parameter in net.parameters():
+            parameter.add_(0.1 * torch.randn(parameter.shape))
+    module = SuperResolution(copy.deepcopy(net), SurfaceObjective(), Schedule(1), visual_metrics, ("a",))
+    [logged] = _trainer(tmp_path).validate(module, _loader(WholeScenes([_scene(3)], X2, told=True)), verbose=False)
+    sample = X2.sample(_scene(3))
+    assert sample.depth is not None
+
+    def rmse(**told: Any) -> float:
+        depth = AnyMap(net.eval(), **told)(sample)
+        return float(scores.rmse_v(SurfacePair(depth[None], sample.depth[None], CAMERA.rays()[None])))  # type: ignore[index]
+
+    assert logged["val/RMSE_v"] == pytest.approx(rmse(kernel="box", edges="sharp", clean=True), rel=1e-4)
+    assert logged["val/RMSE_v"] != pytest.approx(rmse(), rel=1e-3)
 
 
 def test_validation_starts_anew_each_time(tmp_path: Path) -> None:

@@ -18,7 +18,7 @@ from PIL import Image
 from scipy.stats import binomtest
 
 from dsr.cli import study as command
-from dsr.evaluation.results import load_results
+from dsr.evaluation.run_files import load_results
 from dsr.geometry.camera import Camera
 from dsr.user_study.answers import files_of, read_all, read_answers
 from dsr.user_study.build import Choice, build_study

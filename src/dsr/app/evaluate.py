@@ -21,9 +21,11 @@ from dsr.app.metrics import check_metrics, chosen_metrics, metric_collection
 from dsr.app.schema import EvalConfig, given_keys, plain_config, user_directories
 from dsr.app.training_runs import studies_of_run
 from dsr.data.base import SceneSource, prepare_scenes
+from dsr.degradation.downsampling import Downsampling, Measured
 from dsr.degradation.scales import NATIVE, match_ratio
 from dsr.evaluation.predict import Evaluation, Outcome, StalePredictionError, failure_line, predict
 from dsr.evaluation.score import score
+from dsr.evaluation.store import load_errors, prediction_path
 from dsr.inference.adapter import AnyScale
 from dsr.methods.dip.upsampler import WORKSPACE
 from dsr.methods.registry import build_method, target_paths
@@ -34,6 +36,7 @@ from dsr.sample import DepthSample
 from dsr.utils.builder import ConfigError, build, takes, trait
 from dsr.utils.console import ConsoleProgress, open_console, print_error, show
 from dsr.utils.devices import fast_precision, pick_device
+from dsr.viz.confidence import write_confidence
 from dsr.viz.panels import save_picture
 
 
@@ -147,6 +150,7 @@ def _study(
         precision=settings.precision,
         seed=settings.seed,
         downsampling=downsampling.assumed_model(),
+        told=_known_of_maps(settings, downsampling, source),
         lpips_trunk=settings.metrics.lpips_trunk,
         metrics=functools.partial(metric_collection, settings.metrics, given["device"]),
         **given,
@@ -166,6 +170,17 @@ def _study(
         label=_flagged(str(settings.method.get("label", name)), method, " ({})"),
         note=getattr(method, "describe", None),
     )
+
+
+def _known_of_maps(settings: EvalConfig, downsampling: Downsampling | Measured, source: SceneSource) -> dict[str, Any]:
+    """Return what is known of low-resolution maps, for methods that can be told; nothing of those of a sensor."""
+    if not isinstance(downsampling, Downsampling):
+        return {}
+    return {
+        "kernel": downsampling.assumed_model().kernel,
+        "edges": "soft" if getattr(source, "soft_edges", False) else "sharp",
+        "clean": settings.noise["name"] == "none",
+    }
 
 
 def _flagged(name: str, method: Any, form: str) -> str:
@@ -206,6 +221,10 @@ def _illustrate(
     folder: Path, label: str, formats: Formats, sample: DepthSample, depth: torch.Tensor, scores: Mapping[str, float]
 ) -> None:
     save_picture(folder / "pictures" / f"{sample.scene}.png", sample, depth, scores, label, formats)
+    errors = load_errors(prediction_path(folder, sample.scene))
+    if errors is not None:
+        path = folder / "confidence" / f"{sample.scene}.png"
+        write_confidence(path, depth, *errors, sample.depth, sample.camera)
 
 
 def _report(

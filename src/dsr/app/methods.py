@@ -10,6 +10,7 @@ import torch
 
 from dsr.app.schema import EvalConfig, user_directories
 from dsr.inference.adapter import AnyScale, takes_scale
+from dsr.methods.networks.weight_files import files_of_weights
 from dsr.methods.registry import find_weights, has_weights
 from dsr.utils.builder import ConfigError, takes
 from dsr.utils.hashing import file_hash
@@ -46,8 +47,8 @@ def weights_of(settings: EvalConfig) -> Path | None:
 
 
 def hash_weights(files: list[Path]) -> str | None:
-    """Return the SHA-256 of a file of weights, or of those of several; None without any."""
-    hashes = [file_hash(file) for file in files]
+    """Return the SHA-256 of a file of weights, or of those of several and of those that they need; None without any."""
+    hashes = [file_hash(each) for file in files for each in files_of_weights(file)]
     if len(hashes) < 2:
         return next(iter(hashes), None)
     return hashlib.sha256("".join(hashes).encode()).hexdigest()

@@ -12,7 +12,8 @@ from pathlib import Path
 import pandas as pd
 from rich.console import Console
 
-from dsr.evaluation.results import Results, load_results
+from dsr.evaluation.results import Results
+from dsr.evaluation.run_files import load_results
 from dsr.geometry.shading import LIGHT_NAMES
 from dsr.report.correlation_figure import save_scatter_matrix
 from dsr.report.correlations import write_correlations

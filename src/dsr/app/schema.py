@@ -17,7 +17,7 @@ from dsr.training.settings import PatchSettings, Schedule
 from dsr.utils.builder import ConfigError
 
 PRECISIONS = ("float32", "bfloat16", "auto")
-_GROUPS = ("dataset", "downsampling", "noise", "holes", "method", "metrics", "model", "trainer", "loss")
+_GROUPS = ("dataset", "downsampling", "noise", "holes", "degradation", "method", "metrics", "model", "trainer", "loss")
 
 
 @dataclass
@@ -167,6 +167,8 @@ class TrainerConfig:
     workers: int = PatchSettings.workers
     devices: Any = 1
     init: str | None = None
+    shared: str | None = None
+    frozen: list[str] = field(default_factory=list)
 
 
 @dataclass
@@ -182,6 +184,9 @@ class TrainConfig(RunConfig):
     """The configuration of ``train.py``."""
 
     model: dict[str, Any] = MISSING
+    degradation: dict[str, Any] = field(
+        default_factory=lambda: {"name": "plain", "target": "dsr.degradation.everything.plain"}
+    )
     trainer: TrainerConfig = field(default_factory=TrainerConfig)
     loss: LossConfig = field(default_factory=LossConfig)
     validation: dict[str, Any] = field(default_factory=dict)

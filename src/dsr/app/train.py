@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fnmatch
 import functools
 import os
 import shutil
@@ -22,12 +23,13 @@ from dsr.app.trainer import seconds_per_step, training_trainer
 from dsr.app.training_runs import WEIGHTS, common, keyed, read_config, training_data
 from dsr.data.base import prepare_scenes
 from dsr.methods.networks.base import DisparityNetwork
+from dsr.methods.networks.facets_unet import FacetsUNet
 from dsr.methods.networks.trained import NETWORKS
 from dsr.methods.networks.weight_files import load_network, network_name, save_network
 from dsr.metrics.visual_loss import VisualLoss, make_visual_loss
 from dsr.training.data_module import PatchData
 from dsr.training.module import SuperResolution
-from dsr.training.objective import Objective, balance_weight
+from dsr.training.objective import Objective, SurfaceObjective, balance_weight
 from dsr.training.settings import Schedule
 from dsr.utils.builder import ConfigError, build
 from dsr.utils.console import ConsoleProgress
@@ -118,31 +120,27 @@ def _resumed(plain: dict[str, Any]) -> dict[str, Any]:
 def _network(settings: TrainConfig) -> DisparityNetwork:
     """Build the network, with initial weights if they are given."""
     net: DisparityNetwork = build("model", settings.model, {"scale": settings.scale})
-    if settings.trainer.init is None:
-        return net
-    try:
-        networks = {**NETWORKS, network_name(type(net)): type(net)}
-        first = load_network(Path(settings.trainer.init).expanduser(), networks)
-    except (ValueError, OSError) as error:
-        raise ConfigError(f"trainer.init: {error}") from error
-    of_another_scale = {**first.arguments(), "scale": settings.scale}
-    if type(first) is not type(net) or of_another_scale != net.arguments():
-        raise ConfigError(
-            f"trainer.init: {settings.trainer.init}: expected weights of {type(net).__name__} {net.arguments()}, "
-            f"got those of {type(first).__name__} {first.arguments()}"
-        )
-    if _shapes(first) != _shapes(net):
-        raise ConfigError(
-            f"trainer.init: {settings.trainer.init}: weights are for scale {first.scale}, the run is at scale "
-            f"{net.scale}, where {type(net).__name__} has other parameters"
-        )
-    net.load_state_dict(first.state_dict())
+    for key, take in (("init", net.start_from), ("shared", net.share)):
+        given = getattr(settings.trainer, key)
+        if given is None:
+            continue
+        try:
+            networks = {**NETWORKS, network_name(type(net)): type(net)}
+            first = load_network(Path(given).expanduser(), networks)
+        except (ValueError, OSError) as error:
+            raise ConfigError(f"trainer.{key}: {error}") from error
+        try:
+            take(first)
+        except ValueError as error:
+            raise ConfigError(f"trainer.{key}: {given}: {error}") from error
+    for pattern in settings.trainer.frozen:
+        found = [value for name, value in net.named_parameters() if fnmatch.fnmatchcase(name, pattern)]
+        if not found:
+            kinds = ", ".join(dict.fromkeys(f"{name.split('.')[0]}.*" for name, _ in net.named_parameters()))
+            raise ConfigError(f"trainer.frozen: expected patterns of parameters' names, such as {kinds}; got {pattern}")
+        for value in found:
+            value.requires_grad_(False)
     return net
-
-
-def _shapes(net: DisparityNetwork) -> dict[str, torch.Size]:
-    """Return the shapes of a network's parameters."""
-    return {name: value.shape for name, value in net.state_dict().items()}
 
 
 def _module(settings: TrainConfig, net: DisparityNetwork, data: PatchData, metrics: Any) -> SuperResolution:
@@ -154,15 +152,42 @@ def _module(settings: TrainConfig, net: DisparityNetwork, data: PatchData, metri
     if not visual and settings.loss.visual != "mse_v":
         name = settings.model["name"]
         raise ConfigError(f"loss.visual: model={name} has no visual loss, which model.visual=true adds; leave it out")
+    _check_surface_loss(settings, net)
     w = (1.0 if settings.loss.w == "auto" else float(settings.loss.w)) if visual else 0.0
     try:
         loss = _visual_loss(settings)
         mixed = settings.precision == "bfloat16"
         schedule = Schedule(mixed=mixed, **common(Schedule, settings.trainer))
-        objective = Objective(depth_loss, w, loss, settings.model.get("shading", 0.0))
+        objective: Objective | SurfaceObjective = (
+            SurfaceObjective()
+            if depth_loss == "surface"
+            else Objective(depth_loss, w, loss, settings.model.get("shading", 0.0))
+        )
         return SuperResolution(net, objective, schedule, metrics, data.validation_sets)
     except (ValueError, OSError) as error:
         raise keyed(error) from error
+
+
+def _check_surface_loss(settings: TrainConfig, net: DisparityNetwork) -> None:
+    """Check that the loss of networks that say how sure they are has such a network, and the hints that it needs."""
+    name, surface = settings.model["name"], settings.model.get("depth_loss") == "surface"
+    if surface != isinstance(net, FacetsUNet):
+        raise ConfigError(
+            f"model.depth_loss: expected surface for model=facets, and another for other networks, got "
+            f"{settings.model.get('depth_loss')!r} for model={name}"
+        )
+    if surface and settings.degradation["name"] == "plain":
+        raise ConfigError(
+            f"degradation: expected everything or another distribution for model={name}, whose training needs hints, "
+            "got plain"
+        )
+    for scale in settings.degradation.get("scales") or () if surface else ():
+        if not net.serves(settings.scale, int(scale)):
+            raise ConfigError(
+                f"degradation.scales: expected factors that weights for {settings.scale} serve, got {scale}"
+            )
+    if surface and (settings.loss.w != "auto" or settings.loss.visual != "mse_v"):
+        raise ConfigError(f"loss: model={name} has a loss of its own, without w and loss.visual; leave them out")
 
 
 def _visual_loss(settings: TrainConfig) -> VisualLoss:
@@ -180,10 +205,10 @@ def _load(progress: Progress, settings: TrainConfig, module: SuperResolution, da
         prepare_scenes(source, names, progress)
     try:
         data.setup()
-        if _computes_w(settings):
+        if isinstance(module.objective, Objective) and _computes_w(settings):
             w = balance_weight(data.first_patches(_PATCHES_FOR_W), module.objective.visual)
             module.objective = replace(module.objective, w=w)
-            progress.say(f"loss   {_formula(module.objective)}")
+            progress.say(f"loss   {module.objective.formula}")
     except (ValueError, OSError) as error:
         raise keyed(error) from error
 
@@ -214,11 +239,13 @@ def _announce(
     held_out = ", ".join(f"{len(names)} of {kind}" for kind, (_, names) in data.validation_scenes().items())
     parameters = sum(each.numel() for each in module.net.parameters())
     accumulate = f" x {trainer.accumulate} batches" if trainer.accumulate > 1 else ""
-    computed = f"{objective.depth_loss} + w {objective.visual.title}; w is computed from the scenes"
+    loss = objective.formula
+    if isinstance(objective, Objective) and _computes_w(settings):
+        loss = f"{objective.depth_loss} + w {objective.visual.title}; w is computed from the scenes"
     lines: Mapping[str, Any] = {
         "model": f"{settings.model['name']} x{settings.scale}, {parameters:,} parameters, {settings.precision}",
         "data": f"{data.training_count} scenes of {settings.dataset['name']} to train on, {held_out} to validate with",
-        "loss": computed if _computes_w(settings) else _formula(objective),
+        "loss": loss,
         "steps": f"{trainer.steps} of {trainer.batch} patches of {trainer.patch} x {trainer.patch}{accumulate}"
         + (", resumed" if resume else ""),
         "time": f"about {duration(step * trainer.steps)} ({step:.2g} s a step as measured now), and the validations",
@@ -228,30 +255,22 @@ def _announce(
         progress.say(f"{name:<6} {line}")
 
 
-def _formula(objective: Objective) -> str:
-    """Return the loss as a formula."""
-    terms = {objective.visual.title: objective.w, "shading": objective.shading}
-    return " + ".join([objective.depth_loss, *(f"{weight:.3g} {name}" for name, weight in terms.items() if weight)])
-
-
 def _describe(trainer: lightning.Trainer, plain: Mapping[str, Any], module: SuperResolution) -> None:
     """Write the configuration and the resulting w to TensorBoard's log."""
     writer: Any = trainer.logger.experiment  # type: ignore[union-attr]
-    text = OmegaConf.to_yaml(OmegaConf.create({**plain, "loss": {**plain["loss"], "w": module.objective.w}}))
+    loss = {**plain["loss"], "w": module.objective.w} if isinstance(module.objective, Objective) else {}
+    text = OmegaConf.to_yaml(OmegaConf.create({**plain, "loss": loss}))
     writer.add_text("config", f"```yaml\n{text}```")
 
 
 def _facts(plain: Mapping[str, Any], module: SuperResolution) -> dict[str, Any]:
     """Return the training's main settings, for the weights' header and the log."""
-    groups = ("model", "dataset", "downsampling", "noise", "trainer")
+    groups = ("model", "dataset", "downsampling", "noise", "degradation", "trainer")
     return {
         **{group: plain[group]["name"] for group in groups},
         **{key: plain[key] for key in ("scale", "seed", "precision")},
         **{key: plain["trainer"][key] for key in ("steps", "learning_rate", "batch", "patch")},
-        "loss": module.objective.depth_loss,
-        "visual": module.objective.visual.name if module.objective.w else "none",
-        "w": module.objective.w,
-        "shading": module.objective.shading,
+        **module.objective.facts,
     }
 
 

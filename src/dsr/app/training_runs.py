@@ -13,10 +13,11 @@ from dsr.app.moved_targets import update_targets
 from dsr.app.schema import TrainConfig, TrainerConfig
 from dsr.data.base import SceneSource, SceneSubset
 from dsr.degradation.downsampling import Downsampling
+from dsr.methods.networks.facets_unet import FacetsUNet
 from dsr.training.data_module import Part, PatchData
 from dsr.training.degradation import Degradation
 from dsr.training.settings import PatchSettings
-from dsr.utils.builder import ConfigError, build, with_key
+from dsr.utils.builder import ConfigError, build, load_target, with_key
 
 WEIGHTS = "weights.safetensors"
 _FROM_RUN = ("scale", "downsampling", "noise", "seed", "dataset")
@@ -63,8 +64,7 @@ def studies_of_run(
     chosen = {key.partition(".")[0] for key in given}
     own = {key: run[key] for key in _FROM_RUN if key not in chosen}
     name = run["model"]["name"]
-    target = "dsr.methods.networks.trained.build_trained"
-    method = {"name": name, "label": name, "target": target, "model": name, "ensemble": 1}  # as validations scored it
+    method = {"name": name, "label": name, "model": name, **_as_validated(run["model"])}
     network = str(run["model"]["target"])
     if not network.startswith("dsr."):
         method["network"] = network
@@ -79,6 +79,13 @@ def studies_of_run(
         yield {**base, **place, "dataset": {"name": kind, "validation_of": str(folder)}}, SceneSubset(source, names)
 
 
+def _as_validated(model: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the settings of the method that runs a network as validations do: one pass, told what is known of maps."""
+    if issubclass(load_target("model", model), FacetsUNet):
+        return {"target": "dsr.methods.networks.any_map.build_any_map"}
+    return {"target": "dsr.methods.networks.trained.build_trained", "ensemble": 1}
+
+
 def training_data(settings: TrainConfig) -> PatchData:
     """Build the patches that the configuration describes."""
     trainer = settings.trainer
@@ -86,10 +93,18 @@ def training_data(settings: TrainConfig) -> PatchData:
     if not isinstance(downsampling, Downsampling):
         raise ConfigError("downsampling: training needs a model such as box, measured is none")
     degradation = Degradation(settings.scale, downsampling, build("noise", settings.noise))
+    everything = build("degradation", settings.degradation)
     validation = {name: build(f"validation.{name}", node) for name, node in settings.validation.items()}
     try:
         patches = PatchSettings(**common(PatchSettings, trainer))
-        return PatchData(_parts(settings.dataset), patches, degradation, seed=settings.seed, validation=validation)
+        return PatchData(
+            _parts(settings.dataset),
+            patches,
+            degradation,
+            seed=settings.seed,
+            validation=validation,
+            everything=everything,
+        )
     except ValueError as error:
         raise keyed(error) from error
 

@@ -76,7 +76,7 @@ def add(commands: Any) -> None:
 
 def _build(options: argparse.Namespace, console: Console, _: object) -> list[str]:
     """Make the page and its key."""
-    from dsr.evaluation.results import load_results  # noqa: PLC0415 - torch and pandas take seconds to import
+    from dsr.evaluation.run_files import load_results  # noqa: PLC0415 - torch and pandas take seconds to import
     from dsr.user_study.build import Choice, build_study  # noqa: PLC0415
 
     words = {name: text for name, text in (("title", options.title), ("send_to", options.send_to)) if text is not None}

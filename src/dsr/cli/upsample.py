@@ -26,8 +26,9 @@ examples:
   dsr upsample recordings --dry-run -o out       what would be done, and what would be assumed
 
 The results of a single pair are in OUT, those of several in OUT/NAME: depth.* as the input is stored, depth_metres.npy,
-renderings/, normals.png, cloud.ply, mesh.ply, mesh.glb, before_after.png, and info.json with all settings and
-assumptions. Run the same command again to continue after an interruption. More in docs/upsample.md.
+renderings/, normals.png, cloud.ply, mesh.ply, mesh.glb, before_after.png, confidence.png and confidence.npz, and
+info.json with all settings and assumptions. Run the same command again to continue after an interruption. More in
+docs/upsample.md.
 """
 
 
@@ -76,9 +77,15 @@ def _add_method(parser: argparse.ArgumentParser) -> None:
     method = parser.add_argument_group("method")
     method.add_argument(
         "--method",
-        default="auto",
+        default="facets",
         metavar="NAME",
-        help="auto (default): msg_v_noisy for noisy depth, else facets; or another: tgv, guided_filter, dip_v, ...",
+        help="facets (default), for clean and noisy depth; or another: tgv, guided_filter, dip_v, ...",
+    )
+    method.add_argument(
+        "--noise", type=float, metavar="METRES", help="standard deviation of the depth map's noise (default: estimated)"
+    )
+    method.add_argument(
+        "--smooth", type=float, metavar="0..2", help="0 keeps what may be noise, 2 smooths more; 1 is neutral"
     )
     method.add_argument(
         "--set",
@@ -106,10 +113,17 @@ def _add_results(parser: argparse.ArgumentParser) -> None:
     results = parser.add_argument_group("what is written")
     results.add_argument("-o", "--output", type=Path, required=True, metavar="OUT", help="folder of the results")
     results.add_argument("--format", metavar="FORMAT", help="of the depth: png, tiff, npy, npz, pfm, exr (the input's)")
-    parts = "depth,renderings,normals,cloud,mesh,before_after"
+    parts = "depth,renderings,normals,cloud,mesh,before_after,confidence"
     chosen = results.add_mutually_exclusive_group()
     chosen.add_argument("--only", type=_words, metavar="PARTS", help=f"some of {parts}")
     chosen.add_argument("--without", type=_words, default=(), metavar="PARTS", help="all but these")
+    results.add_argument(
+        "--max-error",
+        type=float,
+        default=2.0,
+        metavar="PERCENT",
+        help="leave pixels out of cloud and mesh whose depth is expected to be off by more (default: 2)",
+    )
     results.add_argument("--overwrite", action="store_true", help="redo existing results, replace other ones")
     results.add_argument("--dry-run", action="store_true", help="read the files and say what would be done")
 
@@ -119,11 +133,25 @@ def _words(text: str) -> tuple[str, ...]:
     return tuple(word.strip() for word in text.split(",") if word.strip())
 
 
+def _settings(options: argparse.Namespace) -> dict[str, Any]:
+    """Return the method's settings, those with an option of their own among them."""
+    from dsr.app.upsample.request import SHORTCUTS  # noqa: PLC0415 - they take seconds to import
+    from dsr.app.upsample.settings import parse_settings  # noqa: PLC0415
+
+    settings = parse_settings(options.settings)
+    for name in SHORTCUTS:
+        value = getattr(options, name)
+        if value is not None and name in settings:
+            raise ValueError(f"--{name}: expected it once, got --set {name}={settings[name]}, too")
+        if value is not None:
+            settings[name] = value
+    return settings
+
+
 def _run(options: argparse.Namespace, console: Console, _: object) -> list[str]:
     """Upsample, and return the problems."""
     from dsr.app.upsample.outputs import PARTS  # noqa: PLC0415
     from dsr.app.upsample.run import UpsampleRequest, run  # noqa: PLC0415
-    from dsr.app.upsample.settings import parse_settings  # noqa: PLC0415
     from dsr.io.cameras import CameraChoice  # noqa: PLC0415 - they take seconds to import
     from dsr.io.encoding import parse_unit  # noqa: PLC0415
     from dsr.io.inputs import Reading  # noqa: PLC0415
@@ -145,11 +173,12 @@ def _run(options: argparse.Namespace, console: Console, _: object) -> list[str]:
         mask=tuple(options.mask),
         reading=Reading(choice, unit, options.range_type, options.baseline, options.hole_value),
         method=options.method,
-        settings=parse_settings(options.settings),
+        settings=_settings(options),
         directories=tuple(options.config_dir),
         scale=options.scale,
         device=options.device,
         keep_holes=options.keep_holes,
+        max_error=options.max_error / 100,
         depth_format=options.format,
         parts=(*parts, *unknown),
         overwrite=options.overwrite,

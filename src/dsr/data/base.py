@@ -21,6 +21,8 @@ class SceneSource(Protocol):
         name: name in ``scores.csv``.
         evaluation: whether methods are compared on its scenes, so that none may be trained on them.
 
+    Where the true depth's steps are soft, it also has ``soft_edges``, true.
+
     """
 
     name: str
@@ -84,6 +86,7 @@ class SceneSubset:
 
     def __init__(self, source: SceneSource, names: Sequence[str]) -> None:
         self.name, self.evaluation = source.name, source.evaluation
+        self.soft_edges = bool(getattr(source, "soft_edges", False))
         self._source, self._names = source, list(names)
 
     def scenes(self) -> list[str]:

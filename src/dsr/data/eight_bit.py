@@ -5,7 +5,7 @@ The field computes their errors in levels; see :mod:`dsr.data.formats.eight_bit`
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import ClassVar, Literal
 
 from dsr.data.base import SceneSelection
 from dsr.data.formats import eight_bit
@@ -27,6 +27,9 @@ class EightBit(PreparedDataset):
         ValueError: a scene is not on disk, or a value is out of range.
 
     """
+
+    soft_edges: ClassVar[bool] = True
+    """Pixels at depth steps are mixtures of both sides."""
 
     def __init__(self, root: str, benchmark: Literal["lu", "middlebury8"], scenes: SceneSelection = None) -> None:
         if benchmark not in eight_bit.BENCHMARKS:

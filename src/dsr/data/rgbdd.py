@@ -6,6 +6,8 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 from dsr.data.base import SceneSelection
 from dsr.data.formats import rgbdd
 from dsr.data.formats.shared import NO_CAMERA, load_pair
@@ -26,6 +28,9 @@ class RGBDD(PreparedDataset):
         ValueError: a scene is not on disk, or a value is out of range.
 
     """
+
+    soft_edges: ClassVar[bool] = True
+    """Pixels at depth steps are mixtures of both sides."""
 
     def __init__(self, root: str, real: bool, split: rgbdd.Split = "test", scenes: SceneSelection = None) -> None:
         if split not in rgbdd.COUNTS:

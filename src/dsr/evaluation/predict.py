@@ -1,9 +1,10 @@
 """The first pass of an evaluation: predictions to files. The second one scores them, see :mod:`dsr.evaluation.score`.
 
-A prediction is ``predictions/SCENE.npz``: ``depth`` (H, W) in metres, NaN where missing; ``config``, a JSON text of all
-settings that it depends on; and ``seconds``, its computing time. Its sample is stored too, see
-:mod:`dsr.evaluation.store`. Predictions whose stored config equals the requested one are reused, so an interrupted run
-continues where it stopped. A scene that fails, or without a solution, does not affect the others.
+A prediction is ``predictions/SCENE.npz``: ``depth`` (H, W) in metres, NaN where missing; from a method that says how
+sure it is its expected absolute errors, ``depth_error`` in metres and ``angle_error`` of the normal in degrees;
+``config``, a JSON text of all settings that it depends on; and ``seconds``, its computing time. Its sample is stored
+too, see :mod:`dsr.evaluation.store`. Predictions whose stored config equals the requested one are reused, so an
+interrupted run continues where it stopped. A scene that fails, or without a solution, does not affect the others.
 """
 
 from __future__ import annotations
@@ -19,14 +20,13 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import torch
-from torch import Tensor
 
 from dsr.data.base import SceneSource
 from dsr.degradation.downsampling import Downsampling, Measured, make_sample
 from dsr.degradation.holes import Holes
 from dsr.degradation.noise import Noise
 from dsr.evaluation.store import iterations_path, prediction_path, sample_path
-from dsr.methods.base import Iterative, NoSolutionError, Upsampler
+from dsr.methods.base import Confident, Iterative, NoSolutionError, Surface, Upsampler
 from dsr.sample import DepthSample
 from dsr.utils.console import one_line
 from dsr.utils.files import read_arrays, replacing
@@ -179,8 +179,9 @@ def _predict_scene(study: Evaluation, scene: str, folder: Path, config: Mapping[
     """Compute one prediction; write it, its sample and the iteration's history; return the method's seconds."""
     sample = study.sample(scene)
     start = time.perf_counter()
-    depth = _run(study.method, sample, progress)
+    surface = _run(study.method, sample, progress)
     seconds = time.perf_counter() - start
+    depth = surface.depth
     expected = (1, sample.camera.height, sample.camera.width)
     if tuple(depth.shape) != expected:
         raise ValueError(f"{scene}: {study.method_name} gave depth of shape {tuple(depth.shape)}, expected {expected}")
@@ -190,12 +191,17 @@ def _predict_scene(study: Evaluation, scene: str, folder: Path, config: Mapping[
     sample.save(sample_path(folder, scene))
     with replacing(prediction_path(folder, scene)) as temporary:
         np.savez_compressed(
-            temporary, depth=depth[0].cpu().numpy(), config=json.dumps(dict(config), sort_keys=True), seconds=seconds
+            temporary,
+            allow_pickle=False,
+            depth=depth[0].cpu().numpy(),
+            config=json.dumps(dict(config), sort_keys=True),
+            seconds=seconds,
+            **surface.error_arrays(),
         )
     return seconds
 
 
-def _run(method: Upsampler, sample: DepthSample, progress: Progress) -> Tensor:
+def _run(method: Upsampler, sample: DepthSample, progress: Progress) -> Surface:
     """Run a method and display its steps."""
     with progress.task("steps") as step:
-        return method(sample, step)
+        return method.surface(sample, step) if isinstance(method, Confident) else Surface(method(sample, step))

@@ -2,8 +2,8 @@
 
 ``scenes/SCENE.npz`` is the sample that the method was given, see :meth:`dsr.sample.DepthSample.save`. It is written
 with the prediction, so that scoring and drawing need only the directory. ``predictions/SCENE.npz`` has ``depth``
-(H, W) in metres, NaN where missing, and what it was made from. ``iterations/SCENE.csv`` is the history of a method that
-iterates.
+(H, W) in metres, NaN where missing, its expected errors where the method says them, and what it was made from.
+``iterations/SCENE.csv`` is the history of a method that iterates.
 """
 
 from __future__ import annotations
@@ -14,6 +14,8 @@ import torch
 from torch import Tensor
 
 from dsr.utils.files import read_arrays
+
+_ERRORS = ("depth_error", "angle_error")
 
 
 def prediction_path(folder: Path, scene: str) -> Path:
@@ -31,6 +33,23 @@ def iterations_path(folder: Path, scene: str) -> Path:
     return folder / "iterations" / f"{scene}.csv"
 
 
+def load_errors(path: Path) -> tuple[Tensor, Tensor] | None:
+    """Return the expected errors of a prediction, (1, H, W): depth in metres, normal in degrees; None without them.
+
+    Raises:
+        ValueError: the file is missing or damaged.
+
+    """
+    try:
+        arrays = read_arrays(path, _ERRORS)
+        if "depth_error" not in arrays:
+            return None
+        depth, angle = (torch.from_numpy(arrays[name])[None].float() for name in _ERRORS)
+    except (OSError, KeyError, ValueError, TypeError) as error:
+        raise ValueError(f"{path}: expected a prediction, got a missing or damaged file") from error
+    return depth, angle
+
+
 def load_prediction(path: Path) -> Tensor:
     """Return a predicted depth map, (1, H, W) in metres.
 
@@ -39,6 +58,6 @@ def load_prediction(path: Path) -> Tensor:
 
     """
     try:
-        return torch.from_numpy(read_arrays(path)["depth"])[None]
+        return torch.from_numpy(read_arrays(path, ("depth",))["depth"])[None]
     except (OSError, KeyError, ValueError, TypeError) as error:
         raise ValueError(f"{path}: expected a prediction, got a missing or damaged file") from error

@@ -70,6 +70,14 @@ def length(vectors: Tensor) -> Tensor:
     return (x.square() + y.square() + z.square()).sqrt()
 
 
+def angle_between(first: Tensor, second: Tensor) -> Tensor:
+    """Return the angle between unit vectors, (..., 3, H, W) each, in degrees: (..., 1, H, W).
+
+    It is computed from the chord, which is precise for small angles, too.
+    """
+    return torch.rad2deg(2 * (length(first - second) / 2).clamp(max=1).asin())
+
+
 def normal_mask(mask: Tensor) -> Tensor:
     """Return the valid mask of normals: a normal needs its pixel and the two that its differences use.
 

@@ -1,19 +1,19 @@
 """Upsample the depth map of a photo: any size, any ratio of the sizes, maps with holes, bounded memory."""
 
-from dsr.inference.api import upsample
-from dsr.inference.engine import MethodChoice, check_settings, upsample_depth
-from dsr.inference.inspection import NOISY, enlarged_by, suited_method
-from dsr.inference.planning import AUTO, Plan, plan
+from dsr.inference.api import upsample, upsample_with_errors
+from dsr.inference.engine import MethodChoice, check_settings, upsample_depth, upsample_surface
+from dsr.inference.inspection import enlarged_by
+from dsr.inference.planning import DEFAULT, Plan, plan
 
 __all__ = [
-    "AUTO",
-    "NOISY",
+    "DEFAULT",
     "MethodChoice",
     "Plan",
     "check_settings",
     "enlarged_by",
     "plan",
-    "suited_method",
     "upsample",
     "upsample_depth",
+    "upsample_surface",
+    "upsample_with_errors",
 ]

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Any, TypeVar, cast
+from typing import Any, Generic, NamedTuple, TypeVar, cast
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from dsr.geometry.camera import Camera
-from dsr.inference.engine import upsample_depth
-from dsr.inference.planning import AUTO
+from dsr.inference.engine import upsample_surface
+from dsr.inference.planning import DEFAULT
+from dsr.methods.base import MapNoise
 from dsr.utils.progress import Steps
 
 Array = TypeVar("Array", np.ndarray, Tensor)
@@ -22,7 +23,7 @@ def upsample(
     camera: Camera,
     scale: int | None = None,
     *,
-    method: str = AUTO,
+    method: str = DEFAULT,
     mask: Array | None = None,
     device: str = "auto",
     keep_holes: bool = False,
@@ -39,16 +40,17 @@ def upsample(
             (3, H, W) with the same values.
         depth: distance to the image plane in metres, as floats, NaN in holes: (h, w), a tensor may be (1, h, w).
         camera: the photo's, ``dsr.Camera(width, height, fx, fy, cx, cy)``, all values in the photo's pixels.
-        scale: the upsampling factor, 4 or 8 for networks; None to choose it by the sizes. A depth map that already has
-            the photo's size is first averaged over blocks of scale x scale pixels, 4 x 4 for None.
-        method: ``auto`` for ``msg_v_noisy`` if the depth is noisy, else ``facets``; or any other method in
-            ``conf/method``, such as ``msg_v``, ``tgv``, ``guided_filter``, ``bicubic``, and ``dip_v``, which
-            takes minutes.
+        scale: the upsampling factor; None to choose it by the sizes. ``facets`` refines a depth map that already has
+            the photo's size as it is; for a given scale, and for other networks, it is first averaged over blocks of
+            scale x scale pixels, 4 x 4 for None.
+        method: ``facets``; or any other method in ``conf/method``, such as ``msg_v``, ``tgv``, ``guided_filter``,
+            ``bicubic``, and ``dip_v``, which takes minutes.
         mask: valid mask of the depth's shape, for maps whose holes are not NaN.
         device: ``auto`` for a GPU if there is one; or ``cpu``, ``cuda``, ``cuda:1``.
         keep_holes: whether holes stay NaN; otherwise they are inpainted.
         progress: a function that is called with the number of parts done and their total.
-        **settings: the method's arguments, by their names in its file in ``conf/method``, such as ``data_weight=30``.
+        **settings: the method's arguments, by their names in its file in ``conf/method``, such as ``noise=0.002`` of
+            ``facets``, the standard deviation of the map's noise in metres, if it is known.
 
     Returns:
         Depth in metres, float32: (H, W) for an array, (1, H, W) for a tensor.
@@ -74,6 +76,50 @@ def upsample(
         (1.0, 2.0)
 
     """
+    return upsample_with_errors(
+        rgb,
+        depth,
+        camera,
+        scale,
+        method=method,
+        mask=mask,
+        device=device,
+        keep_holes=keep_holes,
+        progress=progress,
+        **settings,
+    ).depth
+
+
+class SurfaceArrays(NamedTuple, Generic[Array]):
+    """A result with its expected errors, (H, W) as arrays or (1, H, W) as tensors.
+
+    ``depth`` and ``depth_error`` are in metres, ``angle_error``, that of the normal, in degrees. The errors and
+    ``noise``, the estimated noise of the input, are None for a method that does not say.
+    """
+
+    depth: Array
+    depth_error: Array | None
+    angle_error: Array | None
+    noise: MapNoise | None
+
+
+def upsample_with_errors(
+    rgb: Array,
+    depth: Array,
+    camera: Camera,
+    scale: int | None = None,
+    *,
+    method: str = DEFAULT,
+    mask: Array | None = None,
+    device: str = "auto",
+    keep_holes: bool = False,
+    progress: Steps | None = None,
+    **settings: Any,
+) -> SurfaceArrays[Array]:
+    """Upsample a depth map as :func:`upsample` does, and return its expected errors, too; see there.
+
+    ``facets`` says them: the mean absolute errors of depth and normal that are to be expected at each pixel.
+    """
     arrays = isinstance(rgb, np.ndarray)
     if isinstance(depth, np.ndarray) != arrays:
         raise ValueError(
@@ -89,7 +135,7 @@ def upsample(
                 f"mask: expected the depth's shape {tuple(depth_lr.shape[-2:])}, got {tuple(valid.shape[-2:])}"
             )
         depth_lr = depth_lr.masked_fill(~valid, torch.nan) if depth_lr.is_floating_point() else depth_lr
-    depth_hr = upsample_depth(
+    surface = upsample_surface(
         photo,
         depth_lr,
         camera,
@@ -100,7 +146,10 @@ def upsample(
         keep_holes=keep_holes,
         progress=progress,
     )
-    return cast("Array", depth_hr[0].cpu().numpy() if arrays else depth_hr)
+    depth_hr, depth_error, angle_error = (
+        cast("Array", None if each is None else each[0].cpu().numpy() if arrays else each) for each in surface[:3]
+    )
+    return SurfaceArrays(depth_hr, depth_error, angle_error, surface.noise)
 
 
 def _photo(rgb: np.ndarray | Tensor) -> Tensor:

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -15,17 +15,17 @@ from torch.nn import functional
 
 from dsr.degradation.downsampling import Downsampling
 from dsr.geometry.camera import Camera
-from dsr.inference.inspection import CLEAN, enlarged_by, suited_method
-from dsr.inference.planning import AUTO, OWN_SIZE, USUAL_SCALE, Plan, plan, read_ability
-from dsr.inference.resampling import resize_inverse_depth
-from dsr.methods.base import Upsampler
+from dsr.geometry.resampling import pad_inverse_depth, resize_inverse_depth
+from dsr.inference.inspection import enlarged_by
+from dsr.inference.planning import DEFAULT, OWN_SIZE, USUAL_SCALE, Plan, plan, read_ability
+from dsr.methods.base import Confident, MapNoise, Surface, Upsampler
 from dsr.methods.classical.interpolation import Interpolation
 from dsr.methods.networks.base import NetworkUpsampler
 from dsr.methods.networks.inpainting import inpaint
 from dsr.methods.registry import build_method, read_method
 from dsr.sample import DepthSample
-from dsr.utils.builder import ConfigError
-from dsr.utils.devices import pick_device
+from dsr.utils.builder import ConfigError, trait
+from dsr.utils.devices import inference_precision, pick_device
 from dsr.utils.progress import Steps, part_of
 
 DECIDED = MappingProxyType({"fill_holes": True, "validate_every": 0})
@@ -60,7 +60,7 @@ class MethodChoice:
         node = {key: value for key, value in node.items() if key not in DECIDED or key in self.settings}
         given: dict[str, Any] = {
             "device": self.device,
-            "precision": "float32",
+            "precision": inference_precision(self.device) if trait("method", node, "tolerant") else "float32",
             "downsampling": Downsampling("box"),
             **DECIDED,
         }
@@ -82,7 +82,6 @@ def check_settings(choice: MethodChoice) -> None:
             name and a colon.
 
     """
-    choice = replace(choice, name=CLEAN if choice.name == AUTO else choice.name)
     choice.build(next(iter(read_ability(choice.name, choice.directories, choice.settings).steps), USUAL_SCALE))
 
 
@@ -92,20 +91,48 @@ def upsample_depth(
     camera: Camera,
     scale: int | None = None,
     *,
-    method: str = AUTO,
+    method: str = DEFAULT,
     settings: Mapping[str, Any] | None = None,
     directories: Sequence[Path] = (),
     device: str = "auto",
     keep_holes: bool = False,
     progress: Steps | None = None,
 ) -> Tensor:
-    """Upsample a depth map to the photo's size.
+    """Upsample a depth map to the photo's size: the depth of :func:`upsample_surface`, (1, H, W) float32 in metres."""
+    return upsample_surface(
+        rgb,
+        depth,
+        camera,
+        scale,
+        method=method,
+        settings=settings,
+        directories=directories,
+        device=device,
+        keep_holes=keep_holes,
+        progress=progress,
+    ).depth
+
+
+def upsample_surface(
+    rgb: Tensor,
+    depth: Tensor,
+    camera: Camera,
+    scale: int | None = None,
+    *,
+    method: str = DEFAULT,
+    settings: Mapping[str, Any] | None = None,
+    directories: Sequence[Path] = (),
+    device: str = "auto",
+    keep_holes: bool = False,
+    progress: Steps | None = None,
+) -> Surface:
+    """Upsample a depth map to the photo's size, with the expected errors if the method says them.
 
     The depth map is registered to the photo: the same view and field of view, outer edge on outer edge. A
-    low-resolution map is upsampled as :mod:`dsr.inference.planning` describes. A map of the photo's size is first
-    downsampled by ``scale``, by averaging the inverse depth of its valid pixels; if it was enlarged by repeating
-    pixels, the repeated ones are dropped instead. ``bilateral`` without a scale filters it as it is. The averages may
-    cross depth steps, as in the networks' training.
+    low-resolution map is upsampled as :mod:`dsr.inference.planning` describes. ``facets`` and ``bilateral`` take a map
+    of the photo's size as it is, unless a scale is given; for other methods it is first downsampled by ``scale``, by
+    averaging the inverse depth of its valid pixels; if it was enlarged by repeating pixels, the repeated ones are
+    dropped instead. The averages may cross depth steps, as in the networks' training.
     (With a tenth of the map missing, RMSE_v on Lucy is 0.127, against 0.142 or more with means, medians or planes of
     one surface.)
 
@@ -114,8 +141,7 @@ def upsample_depth(
         depth: (1, h, w) orthogonal depth in metres, NaN in holes.
         camera: the photo's; only interpolation and deep image priors depend on it.
         scale: see :func:`dsr.inference.plan`.
-        method: the name of one in :mod:`dsr.methods.registry`, or ``auto``, see
-            :func:`dsr.inference.inspection.suited_method`.
+        method: the name of one in :mod:`dsr.methods.registry`.
         settings: arguments of the method that differ from its file, by name.
         directories: the user's configuration directories.
         device: ``auto`` for a GPU if there is one, or a device as torch names it.
@@ -124,7 +150,7 @@ def upsample_depth(
         progress: is called with the number of parts done and their total.
 
     Returns:
-        (1, H, W) float32 in metres, on the device of ``depth``.
+        Depth, (1, H, W) float32 in metres, and what the method says of it, on the device of ``depth``.
 
     Raises:
         ValueError: a shape, value, method, setting or scale is not as above, or the method has no solution.
@@ -132,52 +158,71 @@ def upsample_depth(
     """
     _check(rgb, depth, camera)
     size = (camera.height, camera.width)
-    method = suited_method(depth, camera, scale) if method == AUTO else method
     choice = MethodChoice(method, settings or {}, tuple(directories), pick_device(device))
     choice.plan(size, _size(depth), scale)  # raises ValueError for sizes or a scale that cannot be used
     inverse = depth.float().reciprocal()
     valid = inverse.isfinite()
-    if size[0] <= OWN_SIZE * inverse.shape[-2] and size[1] <= OWN_SIZE * inverse.shape[-1]:
+    near = size[0] <= OWN_SIZE * inverse.shape[-2] and size[1] <= OWN_SIZE * inverse.shape[-1]
+    larger = any(n > m for n, m in zip(_size(inverse), size, strict=True))
+    if near and (_size(inverse) == size or larger or choice.plan(size, _size(depth), scale).coarsened > 1):
         inverse = _resize_nearest(inverse, size)
         block = enlarged_by(inverse)
         repeated = block > 1 and not any(n % block for n in size)
         factor = 1 if repeated else choice.plan(size, size, scale).coarsened
         if factor == 1:
             inverse = inverse[:, ::block, ::block] if repeated else inverse
-            inverse_hr = _upsample_inverse(rgb, inverse, camera, None, choice, progress)
+            found = _upsample_inverse(rgb, inverse, camera, None, choice, progress)
         else:
             padded = _pad_photo(rgb, factor)
-            inverse_lr = Downsampling("box")(_pad_inverse(inverse, factor), factor)
+            inverse_lr = Downsampling("box")(pad_inverse_depth(inverse, factor), factor)
             camera_padded = Camera(padded.shape[-1], padded.shape[-2], camera.fx, camera.fy, camera.cx, camera.cy)
-            inverse_hr = _upsample_inverse(padded, inverse_lr, camera_padded, factor, choice, progress)
-            inverse_hr = inverse_hr[:, : size[0], : size[1]]
+            found = _upsample_inverse(padded, inverse_lr, camera_padded, factor, choice, progress)
+            found = found.crop(size)
     else:
-        inverse_hr = _upsample_inverse(rgb, inverse, camera, scale, choice, progress)
+        found = _upsample_inverse(rgb, inverse, camera, scale, choice, progress)
     lowest = inverse.nan_to_num(nan=torch.inf).amin()
-    inverse_hr = torch.where(inverse_hr > 0, inverse_hr, lowest.to(inverse_hr.device))  # 0 is infinitely far
+    inverse_hr = torch.where(found.inverse > 0, found.inverse, lowest.to(found.inverse.device))  # 0 is infinitely far
     result = inverse_hr.reciprocal_()
+    surface = Surface(result, None if found.spread is None else found.spread * result, found.angle, found.noise)
     if keep_holes and not bool(valid.all()):
-        result = result.masked_fill(~_resize_nearest(valid, size).to(result.device), torch.nan)
-    return result.to(depth.device)
+        holes = ~_resize_nearest(valid, size).to(result.device)
+        surface = surface.map(lambda values: values.masked_fill(holes, torch.nan))
+    return surface.map(lambda values: values.to(depth.device))
+
+
+class _Found(NamedTuple):
+    """High-resolution inverse depth, (1, H, W), its expected relative error, the normal's in degrees, and the noise."""
+
+    inverse: Tensor
+    spread: Tensor | None = None
+    angle: Tensor | None = None
+    noise: MapNoise | None = None
+
+    def crop(self, size: tuple[int, int]) -> _Found:
+        """Return the upper left window of a size."""
+        window = (..., slice(size[0]), slice(size[1]))
+        inverse, spread, angle = (None if each is None else each[window] for each in self[:3])
+        assert inverse is not None  # noqa: S101 - for the type checker
+        return _Found(inverse, spread, angle, self.noise)
 
 
 def _upsample_inverse(
     rgb: Tensor, inverse: Tensor, camera: Camera, scale: int | None, choice: MethodChoice, progress: Steps | None
-) -> Tensor:
-    """Return high-resolution inverse depth, (1, H, W), of low-resolution inverse depth, (1, h, w)."""
+) -> _Found:
+    """Return high-resolution inverse depth of low-resolution inverse depth, (1, h, w)."""
     size = (camera.height, camera.width)
     planned = choice.plan(size, _size(inverse), scale)
     methods = [choice.build(step) for step in planned.steps or (planned.scale,)]
     method = methods[0]
     if isinstance(method, Interpolation):
         camera_lr = camera.rescale(inverse.shape[-1], inverse.shape[-2])
-        return method.interpolate(inverse.reciprocal(), camera_lr, camera).reciprocal()
+        return _Found(method.interpolate(inverse.reciprocal(), camera_lr, camera).reciprocal())
     networks = [method for method in methods if isinstance(method, NetworkUpsampler)]
     if networks:
-        return _run_networks(rgb, inverse, size, networks, choice.device, progress)
+        return _Found(_run_networks(rgb, inverse, size, networks, choice.device, progress))
     if not planned.steps:
         return _run_at_ratio(rgb, inverse, camera, method, progress)
-    return _run_method(rgb, inverse, camera, planned.steps[0], method, progress)
+    return _Found(_run_method(rgb, inverse, camera, planned.steps[0], method, progress))
 
 
 def _run_networks(
@@ -215,14 +260,18 @@ def _run_method(
     return resize_inverse_depth(result, (camera.height, camera.width))
 
 
-def _run_at_ratio(rgb: Tensor, inverse: Tensor, camera: Camera, method: Upsampler, progress: Steps | None) -> Tensor:
+def _run_at_ratio(rgb: Tensor, inverse: Tensor, camera: Camera, method: Upsampler, progress: Steps | None) -> _Found:
     """Return the high-resolution inverse depth of a method that takes any ratio of the sizes."""
     height, width = _size(inverse)
     camera_lr = camera.rescale(width, height)
     down, across = camera.height / height, camera.width / width
     ratio = down if across.is_integer() else across  # whole only if both are
     sample = DepthSample("upsample", "depth", rgb, inverse.reciprocal(), camera, camera_lr, ratio)
-    return inpaint(method(sample, progress).reciprocal()[None])[0]
+    if not isinstance(method, Confident):
+        return _Found(inpaint(method(sample, progress).reciprocal()[None])[0])
+    surface = method.surface(sample, progress)
+    spread = None if surface.depth_error is None else surface.depth_error / surface.depth
+    return _Found(surface.depth.reciprocal(), spread, surface.angle_error, surface.noise)
 
 
 def resize_rgb(rgb: Tensor, size: tuple[int, int]) -> Tensor:
@@ -247,21 +296,6 @@ def _pad_photo(rgb: Tensor, factor: int) -> Tensor:
     """Pad a photo at the right and the bottom to a multiple of the factor, by repeating its border pixels."""
     padding = [-n % factor for n in (rgb.shape[-1], rgb.shape[-2])]
     return functional.pad(rgb[None], (0, padding[0], 0, padding[1]), mode="replicate")[0] if any(padding) else rgb
-
-
-def _pad_inverse(inverse: Tensor, factor: int) -> Tensor:
-    """Pad inverse depth, (1, H, W), by linear extrapolation, so that averages of a slanted plane stay on the plane."""
-    for dim in (-2, -1):
-        more, size = -inverse.shape[dim] % factor, inverse.shape[dim]
-        if not more:
-            continue
-        last = inverse.narrow(dim, size - 1, 1)
-        slope = (last - inverse.narrow(dim, max(size - 1 - factor, 0), 1)) / min(factor, max(size - 1, 1))
-        slope = torch.where(slope.abs() * factor <= 0.1 * last, slope, 0)  # a depth step or a hole, not a plane
-        steps = torch.arange(1, more + 1, dtype=inverse.dtype, device=inverse.device)
-        further = last + slope * (steps[:, None] if dim == -2 else steps)
-        inverse = torch.cat((inverse, further), dim)
-    return inverse
 
 
 def _size(values: Tensor) -> tuple[int, int]:

@@ -1,8 +1,9 @@
 """Plan how a depth map is upsampled to a photo's size, and estimate the memory and time that it takes.
 
-Networks are trained for fixed factors. A low-resolution depth map is not resized: the photo is resized to a multiple
-of its size, and the network's result is resized to the photo's size (:mod:`dsr.inference.resampling`).
-RMSE_v and RMSE_d in mm of Facets on Lucy and Plant, box averages at the given ratio, means of both scenes:
+Facets and filters take any ratio of the sizes. Other networks are trained for fixed factors. A low-resolution depth map
+is not resized: the photo is resized to a multiple of its size, and the network's result to the photo's size
+(:mod:`dsr.geometry.resampling`).
+RMSE_v and RMSE_d in mm of ``facets_box`` on Lucy and Plant, box averages at the given ratio, means of both scenes:
 
 | ratio | photo resized, x4 | x8 | depth resized instead, x4 | x8 | cubic spline |
 | --- | --- | --- | --- | --- | --- |
@@ -21,7 +22,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
@@ -30,11 +31,13 @@ from dsr.methods.base import Cost
 from dsr.methods.classical.interpolation import Interpolation
 from dsr.methods.networks.base import TILE, UNTILED
 from dsr.methods.networks.peers.build import PEERS, build_peer
+from dsr.methods.networks.peers.files import nearest_scale
 from dsr.methods.networks.trained import build_trained
 from dsr.methods.registry import find_weights, has_weights, read_method
 from dsr.utils.builder import load_target, takes, trait
 
-AUTO = "auto"
+DEFAULT = "facets"
+"""The method where none is chosen."""
 LARGEST_OPTIMISED = 2**20
 """Pixels; optimising a network for a larger picture takes hours."""
 OWN_SIZE = 1.25
@@ -57,6 +60,8 @@ class Ability:
         optimises: whether it optimises a network for each picture.
         cost: the method's rough cost; None if it states none.
         own_resolution: whether it takes a depth map of the photo's own size as it is.
+        confident: whether it says how far off its result may be.
+        factors: those at which a method of any ratio computes, by names of weights, if it has only some.
 
     """
 
@@ -65,6 +70,8 @@ class Ability:
     optimises: bool = False
     cost: Cost | None = None
     own_resolution: bool = False
+    confident: bool = False
+    factors: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -78,6 +85,7 @@ class Plan:
         coarsened: the factor by which depth of the photo's own size is downsampled first; 1 for low-resolution depth.
         way: the sizes and the method in one line.
         text: the same and the memory that it takes.
+        confident: whether the result comes with its expected errors.
 
     """
 
@@ -87,6 +95,7 @@ class Plan:
     coarsened: int
     way: str
     text: str
+    confident: bool = False
 
 
 def read_ability(method: str, directories: Sequence[Path] = (), settings: Mapping[str, Any] | None = None) -> Ability:
@@ -98,7 +107,7 @@ def read_ability(method: str, directories: Sequence[Path] = (), settings: Mappin
         settings: its arguments that differ from its file, by name.
 
     Raises:
-        ValueError: there is no such method, or it has no weights for any factor.
+        ValueError: there is no such method, or one of fixed factors has no weights for any.
 
     """
     node = read_method(method, USUAL_SCALE, settings, directories)
@@ -107,7 +116,10 @@ def read_ability(method: str, directories: Sequence[Path] = (), settings: Mappin
         return Ability("interpolation", {})
     optimises, cost = bool(trait("method", node, "optimises")), trait("method", node, "cost")
     if trait("method", node, "own_resolution"):
-        return Ability("sample", {}, optimises, cost, own_resolution=True)
+        confident = trait("method", node, "surface") is not None
+        packaged = node.get("weights_packaged")
+        computed = packaged if isinstance(packaged, Mapping) else {}
+        return Ability("sample", {}, optimises, cost, own_resolution=True, confident=confident, factors=computed)
     factors: tuple[int, ...] = SCALES
     if takes("method", node, "weights"):
         nodes = {scale: read_method(method, scale, settings, directories) for scale in SCALES}
@@ -134,7 +146,7 @@ def plan(
     photo_size: tuple[int, int],
     depth_size: tuple[int, int],
     scale: int | None = None,
-    method: str = "facets",
+    method: str = DEFAULT,
     directories: Sequence[Path] = (),
     settings: Mapping[str, Any] | None = None,
 ) -> Plan:
@@ -165,7 +177,7 @@ def plan(
     if ability.optimises and pixels > LARGEST_OPTIMISED:
         raise ValueError(
             f"method={method}: expected a photo of up to {LARGEST_OPTIMISED} pixels, as it is optimised for each "
-            f"picture, got {photo_size[0]} x {photo_size[1]}; method=facets takes any"
+            f"picture, got {photo_size[0]} x {photo_size[1]}; method={DEFAULT} takes any"
         )
     coarsened = chosen if own else 1
     before = f"averaged over {chosen} x {chosen} pixels, " if own else ""
@@ -173,11 +185,13 @@ def plan(
         f" in two steps ({', '.join(f'x{step}' for step in steps)})" if len(steps) > 1 else ""
     )
     worked_on = _worked_on(photo_size, depth_size, steps, coarsened)
+    if ability.factors and not as_it_is:
+        worked_on = round(math.prod(depth_size) * nearest_scale(ability.factors, chosen) ** 2)
     way = f"{depth_size[0]} x {depth_size[1]} depth {before}to {photo_size[0]} x {photo_size[1]} by {what}"
     text = f"{way}, in about {_memory(pixels, worked_on, ability) / 2**30:.1f} GB of memory"
     if ability.cost is not None:
         text += f" and {_duration(ability.cost.seconds * worked_on / 1e6)} on two CPU cores"
-    return Plan(method, chosen, steps, coarsened, way, text)
+    return Plan(method, chosen, steps, coarsened, way, text, ability.confident)
 
 
 def _ratio(photo_size: tuple[int, int], depth_size: tuple[int, int]) -> float:
@@ -200,7 +214,7 @@ def _scale(requested: int | None, ratio: float, method: str, ability: Ability) -
     if not factors:
         if requested is not None and requested < 1:
             raise ValueError(f"scale: expected a positive whole number, got {requested}")
-        return requested or math.ceil(ratio - 1e-9)
+        return requested or math.ceil(ratio / _SLACK - 1e-9)
     if requested is not None and requested not in factors:
         raise ValueError(f"scale: expected one of {', '.join(map(str, sorted(factors)))} for {method}, got {requested}")
     enough = [scale for scale in sorted(factors) if ratio <= _SLACK * scale]

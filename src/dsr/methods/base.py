@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal, Protocol, runtime_checkable
+from typing import Literal, NamedTuple, Protocol, runtime_checkable
 
+import numpy as np
 from torch import Tensor
 
 from dsr.geometry.camera import RangeType
@@ -61,6 +63,50 @@ class Upsampler(Protocol):
             NoSolutionError: the method has no solution for this image.
 
         """
+        ...
+
+
+class MapNoise(NamedTuple):
+    """Estimated noise of a low-resolution map.
+
+    ``deviation``: its standard deviation in metres. ``extent``: over how many low-resolution pixels it is alike, the
+    full width at half maximum of its autocorrelation; 1 for white noise.
+    """
+
+    deviation: float
+    extent: float
+
+
+class Surface(NamedTuple):
+    """A result with its expected errors.
+
+    ``depth`` (1, H, W): orthogonal depth in metres, NaN where missing. ``depth_error``, ``angle_error`` (1, H, W): the
+    expected absolute error of the depth in metres and that of the normal in degrees; None for a method that does not
+    say. ``noise``: of the low-resolution map; None for a method that does not estimate it.
+    """
+
+    depth: Tensor
+    depth_error: Tensor | None = None
+    angle_error: Tensor | None = None
+    noise: MapNoise | None = None
+
+    def map(self, function: Callable[[Tensor], Tensor]) -> Surface:
+        """Return the surface with a function applied to each of its maps."""
+        depth_error, angle_error = (None if each is None else function(each) for each in self[1:3])
+        return Surface(function(self.depth), depth_error, angle_error, self.noise)
+
+    def error_arrays(self) -> dict[str, np.ndarray]:
+        """Return the expected errors by name, (H, W) in half precision, as they are stored; empty without them."""
+        named = {"depth_error": self.depth_error, "angle_error": self.angle_error}
+        return {name: each[0].cpu().numpy().astype(np.float16) for name, each in named.items() if each is not None}
+
+
+@runtime_checkable
+class Confident(Protocol):
+    """An :class:`Upsampler` that says how far off its result may be."""
+
+    def surface(self, sample: DepthSample, progress: Steps | None = None) -> Surface:
+        """Return the result of a call with its expected errors."""
         ...
 
 

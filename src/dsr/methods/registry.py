@@ -25,8 +25,12 @@ from dsr.utils.builder import ConfigError, build, load_target, takes
 from dsr.utils.config_files import config_directories, list_choices
 from dsr.utils.ratios import round_ratio
 
+_SLACK = 1.05
+"""By how much a scale may exceed the factor of weights that are used for it."""
 _NETWORK = "network"
 """Key of a method's node: the dotted path of the network's class, for a method whose weights come from a training."""
+_OPEN = (None, "auto")
+"""Values of a method's keys that leave them to what is known of the maps."""
 
 
 def list_methods(directories: Sequence[Path] = ()) -> list[str]:
@@ -68,7 +72,13 @@ def read_method(
 
 
 def build_method(
-    node: Mapping[str, Any], scale: int, *, directories: Sequence[Path] = (), weights: Path | None = None, **given: Any
+    node: Mapping[str, Any],
+    scale: int,
+    *,
+    directories: Sequence[Path] = (),
+    weights: Path | None = None,
+    told: Mapping[str, Any] | None = None,
+    **given: Any,
 ) -> Upsampler:
     """Build the method that a node describes.
 
@@ -77,6 +87,8 @@ def build_method(
         scale: the upsampling factor.
         directories: the user's configuration directories.
         weights: a file of weights, or a directory with the published files; None for those that the node names.
+        told: what is known of the maps, such as ``kernel``; a target gets what its signature names and the node leaves
+            open, by null or ``auto``.
         **given: values that the run sets, not the method's file, such as ``device``, ``precision``, ``seed`` and
             ``downsampling``, the assumed model; a target gets those that its signature names.
 
@@ -86,10 +98,11 @@ def build_method(
     """
     trunk = os.environ.get("DSR_LPIPS_TRUNK")
     run = {**dict.fromkeys(("metrics", "workspace", "display")), "lpips_trunk": trunk, "seed": 0}
-    available = {**run, **given, "scale": scale}
+    told = {key: value for key, value in (told or {}).items() if node.get(key) in _OPEN}
+    available = {**run, **told, **given, "scale": scale}
     if takes("method", node, "weights"):
         available |= {"weights": find_weights(node, scale, weights), "networks": _networks(node, directories)}
-    arguments = {key: value for key, value in node.items() if key not in ("weights", _NETWORK)}
+    arguments = {key: value for key, value in node.items() if key not in ("weights", _NETWORK, *told)}
     method: Upsampler = build("method", arguments, available)
     return method
 
@@ -98,7 +111,8 @@ def find_weights(node: Mapping[str, Any], scale: int, given: Path | None = None)
     """Find the file of weights of a method that takes one.
 
     Args:
-        node: the method's; ``weights`` names its file, or ``weights_packaged`` one that comes with dsr.
+        node: the method's; ``weights`` names its file, or ``weights_packaged`` one that comes with dsr, or several and
+            the factor of each.
         scale: the upsampling factor.
         given: a file of weights, or a directory in which ``weights_file`` or one of ``weights_files`` is looked for;
             None for the node's own.
@@ -128,8 +142,7 @@ def has_weights(node: Mapping[str, Any], scale: int) -> bool:
         return any((path / file).is_file() for file in files)
     if path is not None and not path.is_dir():
         return path.is_file() and (not is_dsr_weights(path) or read_header(path)["arguments"].get("scale") == scale)
-    packaged = node.get("weights_packaged")
-    return packaged is not None and packaged_weights(str(packaged)) is not None
+    return _packaged_file(node, scale) is not None
 
 
 def target_paths(node: Mapping[str, Any], directories: Sequence[Path] = ()) -> Iterator[str]:
@@ -143,8 +156,7 @@ def target_paths(node: Mapping[str, Any], directories: Sequence[Path] = ()) -> I
 
 def _packaged(node: Mapping[str, Any], scale: float) -> Path:
     """Return the file of the weights that come with dsr."""
-    packaged = node.get("weights_packaged")
-    found = None if packaged is None else packaged_weights(str(packaged))
+    found = _packaged_file(node, scale)
     if found is not None:
         return found
     files, source = _files_for(node, scale), node.get("weights_source")
@@ -153,6 +165,17 @@ def _packaged(node: Mapping[str, Any], scale: float) -> Path:
     if "weights_files" in node:
         raise ConfigError(f"weights: {needs}; its authors publish them, dsr does not come with them")
     raise ConfigError(f"weights: dsr comes with {', '.join(packaged_names())}; {needs}")
+
+
+def _packaged_file(node: Mapping[str, Any], scale: float) -> Path | None:
+    """Return the file of packaged weights, the one for a scale where the node names several by their factors."""
+    packaged = node.get("weights_packaged")
+    if isinstance(packaged, Mapping):
+        there = {str(name): factor for name, factor in packaged.items() if packaged_weights(str(name)) is not None}
+        packaged = next(
+            (name for name, factor in there.items() if factor == nearest_scale(there, scale / _SLACK)), None
+        )
+    return None if packaged is None else packaged_weights(str(packaged))
 
 
 def _files_for(node: Mapping[str, Any], scale: float) -> list[str]:

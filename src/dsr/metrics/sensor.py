@@ -15,7 +15,7 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from dsr.geometry.surface import length
+from dsr.geometry.surface import angle_between
 from dsr.metrics.formats import BEFORE_THE_PAPER, MetricFormat
 from dsr.metrics.functional import SSIM_WINDOW, SurfacePair, masked_mean, ssim_map
 from dsr.metrics.metric import Metric
@@ -58,8 +58,7 @@ class SensorComparison:
     @cached_property
     def angle(self) -> Tensor:
         """(B, 1, H, W) angle between the normals in degrees."""
-        first, second = self.surfaces.normals
-        return torch.rad2deg(2 * (length(first - second) / 2).clamp(max=1).asin())  # precise for small angles, too
+        return angle_between(*self.surfaces.normals)
 
 
 def erode(mask: Tensor, steps: int) -> Tensor:

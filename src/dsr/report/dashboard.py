@@ -18,7 +18,8 @@ from torch import Tensor
 from torch.utils.tensorboard import SummaryWriter
 from torch.utils.tensorboard.summary import hparams
 
-from dsr.evaluation.results import Run, formats_of, method_settings, read_run
+from dsr.evaluation.results import Run, formats_of, method_settings
+from dsr.evaluation.run_files import read_run
 from dsr.geometry.shading import LIGHT_NAMES, render
 from dsr.metrics.formats import HEADLINES
 from dsr.sample import DepthSample
@@ -35,7 +36,8 @@ def save_dashboard(folder: Path) -> None:
 
     Scalars, in the units of the paper's tables: ``mean/METRIC``; ``scene/METRIC`` over the scenes; ``METRIC/SCENE``;
     ``light/METRIC/SCENE`` over the lights e1..e4. Pictures of each scene: renderings of the result above those of the
-    truth, and errors. A custom layout has a chart per metric; the table of runs (hparams) has settings and means.
+    truth, errors, and expected errors if the method has them. A custom layout has a chart per metric; the table of runs
+    (hparams) has settings and means.
 
     Args:
         folder: directory of a run; only its files are read.
@@ -51,7 +53,8 @@ def save_dashboard(folder: Path) -> None:
             _write_scores(writer, run)
             for number, scene in enumerate(run.scenes):
                 if run.has_sample(scene):
-                    _write_pictures(writer, number, run.sample(scene), run.prediction(scene))
+                    sample, depth = run.sample(scene), run.prediction(scene)
+                    _write_pictures(writer, number, sample, depth, run.expected_errors(scene))
         for old in folder.glob(_EVENTS):
             old.unlink()
         for new in temporary.glob(_EVENTS):
@@ -106,15 +109,22 @@ def _hyperparameters(run: Run) -> dict[str, Any]:
     }
 
 
-def _write_pictures(writer: SummaryWriter, number: int, scene: DepthSample, depth: Tensor) -> None:
-    """Write a scene's renderings, result above truth, and the errors of depth and normals."""
+def _write_pictures(
+    writer: SummaryWriter, number: int, scene: DepthSample, depth: Tensor, errors: tuple[Tensor, Tensor] | None
+) -> None:
+    """Write a scene's renderings, result above truth, the error of the depth, and the expected one."""
     shades = [render(normals_seen_by(scene.camera, depth))[0]]
     if scene.depth is not None:
         shades.append(render(normals_seen_by(scene.camera, scene.depth))[0])
     rows = [torch.cat(list(reduced(each, _PANEL)), dim=-1) for each in shades]
     writer.add_image(f"renderings/{scene.scene}", _grey(torch.cat(rows, dim=-2)), number, dataformats="HWC")
+    reference = depth if scene.depth is None else scene.depth
     if scene.depth is not None:
-        writer.add_image(f"depth_error/{scene.scene}", _error(depth, scene.depth), number, dataformats="HWC")
+        picture = _error(depth - scene.depth, reference)
+        writer.add_image(f"depth_error/{scene.scene}", picture, number, dataformats="HWC")
+    if errors is not None:
+        picture = _error(torch.where(depth.isfinite(), errors[0], torch.nan), reference)
+        writer.add_image(f"expected_error/{scene.scene}", picture, number, dataformats="HWC")
 
 
 def _grey(values: Tensor) -> np.ndarray:
@@ -122,11 +132,12 @@ def _grey(values: Tensor) -> np.ndarray:
     return (colours("gray")(np.ma.masked_invalid(values.numpy()))[..., :3] * 255).round().astype(np.uint8)
 
 
-def _error(depth: Tensor, truth: Tensor) -> np.ndarray:
-    """Draw the signed error, blue where the result is too near, (H, W, 3) uint8.
+def _error(error: Tensor, reference: Tensor) -> np.ndarray:
+    """Draw a signed error, blue where the result is too near, or an expected one, which is red; (H, W, 3) uint8.
 
-    The colour limits are +-1 % of the scene's median depth for every method, so that runs can be compared.
+    The colour limits are +-1 % of the median of the reference, the true depth if it is known: those of all methods are
+    the same, so that runs can be compared.
     """
-    limit = 0.01 * float(truth.nanmedian())
-    scaled = Normalize(-limit, limit)(np.ma.masked_invalid(reduced(depth - truth, _PANEL)[0].numpy()))
+    limit = 0.01 * float(reference.nanmedian())
+    scaled = Normalize(-limit, limit)(np.ma.masked_invalid(reduced(error, _PANEL)[0].numpy()))
     return (colours("RdBu_r")(scaled)[..., :3] * 255).round().astype(np.uint8)

@@ -9,7 +9,9 @@ import numpy as np
 import torch
 from scipy import ndimage
 from torch import Tensor
+from torch.nn import functional
 
+from dsr.degradation.downsampling import Downsampling
 from dsr.sample import Scene
 from dsr.training.settings import PatchSettings
 
@@ -45,6 +47,31 @@ def simulate_camera(rgb: Tensor, random: np.random.Generator) -> Tensor:
     pixels = ndimage.gaussian_filter(pixels, (0, sigma, sigma), mode="nearest")
     pixels = pixels + random.uniform(0, _NOISE) * random.standard_normal(pixels.shape)
     return torch.from_numpy(pixels.astype(np.float32)).clamp(0, 1)
+
+
+def soften(scene: Scene, sigma: float = 0.0, *, halve: bool = True) -> Scene:
+    """Return a scene whose depth steps are soft: truths of benchmarks have 2 to 5 mixed pixels across a step.
+
+    Args:
+        scene: a scene with a true depth.
+        sigma: standard deviation in pixels of the result of a Gaussian that blurs inverse depth.
+        halve: whether the result is half as large, of means of 2 x 2 pixels of the photo and of blurred inverse depth.
+
+    """
+    assert scene.depth is not None  # noqa: S101 - for the type checker
+    inverse = scene.depth.reciprocal()
+    if sigma:
+        valid, width = inverse.isfinite(), sigma * (1 + halve)
+        sums, weights = (
+            ndimage.gaussian_filter(each.numpy(), (0, width, width), mode="nearest", truncate=3)
+            for each in (inverse.nan_to_num(0), valid.to(inverse))
+        )
+        inverse = torch.where(valid, torch.from_numpy(sums) / torch.from_numpy(weights), torch.nan)
+    if not halve:
+        return replace(scene, depth=inverse.reciprocal())
+    inverse = Downsampling("box")(inverse, 2)
+    camera = scene.camera.downscale(2)
+    return replace(scene, rgb=functional.avg_pool2d(scene.rgb[None], 2)[0], depth=inverse.reciprocal(), camera=camera)
 
 
 def mirror(scene: Scene, *, vertical: bool = False) -> Scene:

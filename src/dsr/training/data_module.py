@@ -14,6 +14,8 @@ import torch
 from torch.utils.data import DataLoader, Dataset, default_collate
 
 from dsr.data.base import SceneSource, content_key
+from dsr.degradation.everything import Everything
+from dsr.degradation.hints import FACTS, encode_facts
 from dsr.geometry.camera import Camera
 from dsr.sample import Scene
 from dsr.training.degradation import Batch, Degradation, to_tensors
@@ -50,19 +52,27 @@ class WholeScenes(Dataset[Batch]):
         scenes: scenes with a true depth.
         degradation: how their low-resolution maps are made.
         seed: seed of the noise.
+        told: whether there are hints on the maps, the same as ``eval.py`` gives.
 
     """
 
-    def __init__(self, scenes: Sequence[Scene], degradation: Degradation, seed: int = 0) -> None:
+    def __init__(self, scenes: Sequence[Scene], degradation: Degradation, seed: int = 0, *, told: bool = False) -> None:
         self._samples = [degradation.sample(scene, seed) for scene in scenes]
+        self._facts = None
+        if told:
+            kernel = degradation.downsampling.assumed_model().kernel
+            self._facts = encode_facts(kernel, soft=False, noise=degradation.noise is None)
 
     def __len__(self) -> int:
         return len(self._samples)
 
     def __getitem__(self, index: int) -> Batch:
-        """Return one sample's tensors, and ``unit``."""
+        """Return one sample's tensors, ``noise`` and ``facts`` if the maps have hints, and ``unit``."""
         sample = self._samples[index]
-        return {**to_tensors(sample, torch.float64), "unit": asdict(sample.unit)}
+        tensors = to_tensors(sample, torch.float64)
+        if self._facts is not None:
+            tensors |= {"noise": torch.zeros_like(tensors["disparity_lr"]).float(), "facts": self._facts}
+        return {**tensors, "unit": asdict(sample.unit)}
 
 
 def collate_scene(samples: Sequence[Batch]) -> Batch:
@@ -81,6 +91,7 @@ class PatchData(lightning.LightningDataModule):
         degradation: how low-resolution maps are made.
         seed: seed of the patches and of the noise of validation scenes.
         validation: more data sets to validate with, by name; their scenes without a true depth are left out.
+        everything: the distribution of degradations to train on in place of ``degradation``.
 
     Raises:
         ValueError: a data set is one to evaluate on or has too few scenes, a scene is to be trained on and validated
@@ -96,9 +107,11 @@ class PatchData(lightning.LightningDataModule):
         *,
         seed: int = 0,
         validation: Mapping[str, SceneSource] | None = None,
+        everything: Everything | None = None,
     ) -> None:
         super().__init__()
         check_patches((), settings, degradation.scale)
+        self._everything = everything
         self._parts, self._settings, self._degradation, self._seed = list(parts), settings, degradation, seed
         self._training_names: list[list[str]] = []
         self._held_out: dict[str, tuple[SceneSource, list[str]]] = {}
@@ -146,7 +159,9 @@ class PatchData(lightning.LightningDataModule):
             for part, names in zip(self._parts, self._training_names, strict=True)
         ]
         shares = [part.share for part in self._parts]
-        self._patches = Patches(groups, self._settings, self._degradation, shares=shares, seed=self._seed)
+        self._patches = Patches(
+            groups, self._settings, self._degradation, shares=shares, seed=self._seed, everything=self._everything
+        )
         for kind, (source, names) in self._held_out.items():
             scenes = [scene for scene in map(source.load, names) if scene.depth is not None]
             if not scenes:
@@ -161,6 +176,9 @@ class PatchData(lightning.LightningDataModule):
         depth = torch.linspace(1, 2, size, dtype=torch.float64).repeat(1, size, 1)
         scene = Scene("example", "slope", torch.full((3, size, size), 0.5), camera, depth)
         tensors = to_tensors(self._degradation.sample(scene, clean=True))
+        if self._everything is not None:
+            nothing = {"facts": torch.zeros(FACTS), "soft": torch.zeros(())}
+            tensors |= {"noise": torch.zeros_like(tensors["disparity_lr"]), **nothing}
         return default_collate([tensors] * self._settings.batch)
 
     def first_patches(self, count: int) -> list[Batch]:
@@ -186,7 +204,11 @@ class PatchData(lightning.LightningDataModule):
     def val_dataloader(self) -> list[DataLoader[Batch]]:
         """Return a loader for each validation set, of whole scenes, one at a time."""
         return [
-            DataLoader(WholeScenes(scenes, self._degradation, self._seed), batch_size=1, collate_fn=collate_scene)
+            DataLoader(
+                WholeScenes(scenes, self._degradation, self._seed, told=self._everything is not None),
+                batch_size=1,
+                collate_fn=collate_scene,
+            )
             for scenes in self._validation
         ]
 

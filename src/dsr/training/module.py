@@ -18,7 +18,7 @@ from dsr.metrics.classes import compute_means
 from dsr.metrics.functional import SurfacePair
 from dsr.sample import Unit
 from dsr.training.degradation import Batch
-from dsr.training.objective import Objective, to_depth
+from dsr.training.objective import Objective, SurfaceObjective, to_depth
 from dsr.training.settings import Schedule
 
 _RENDERED_SCENES = 4
@@ -44,7 +44,7 @@ class SuperResolution(lightning.LightningModule):
     def __init__(
         self,
         net: DisparityNetwork,
-        objective: Objective,
+        objective: Objective | SurfaceObjective,
         schedule: Schedule,
         metrics: Callable[[], torchmetrics.MetricCollection],
         validation_sets: Sequence[str] = ("val",),
@@ -67,6 +67,11 @@ class SuperResolution(lightning.LightningModule):
 
     def loss_terms(self, batch: Batch) -> dict[str, Tensor]:
         """Return ``loss`` and its terms."""
+        if isinstance(self.objective, SurfaceObjective):
+            with torch.autocast(self.device.type, torch.bfloat16, enabled=self.schedule.mixed):
+                inverse = batch["disparity_lr"] + batch["doffs"]
+                answer = self.net.answer(batch["rgb"], inverse, batch["noise"], batch["facts"])
+            return self.objective(answer, batch)
         with torch.autocast(self.device.type, torch.bfloat16, enabled=self.schedule.mixed):
             stages = self.net.upsample_stages(batch["rgb"], batch["disparity_lr"], batch["min_max"])
         *intermediate, disparity = (stage.float() for stage in stages)
@@ -89,7 +94,13 @@ class SuperResolution(lightning.LightningModule):
 
     def validation_step(self, batch: Batch, index: int, dataloader_idx: int = 0) -> None:
         """Score a whole scene; render the first few for TensorBoard."""
-        disparity = self.average.upsample(batch["rgb"], batch["disparity_lr"])
+        offset = batch["doffs"] if self.average.of_inverse_depth else 0
+        values = batch["disparity_lr"] + offset
+        if isinstance(self.objective, SurfaceObjective):
+            disparity = self.average.answer(batch["rgb"], values, batch.get("noise"), batch.get("facts")).disparity
+        else:
+            disparity = self.average.upsample(batch["rgb"], values)
+        disparity = disparity - offset
         depth = to_depth(disparity.to(batch["depth"].dtype), batch)
         self.metrics[dataloader_idx].update(  # type: ignore[operator]
             SurfacePair(depth, batch["depth"], batch["rays"], unit=Unit(**batch["unit"]), image_dtype=torch.float32)

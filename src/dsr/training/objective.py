@@ -10,9 +10,11 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from dsr.geometry.surface import angle_between
+from dsr.methods.networks.facets_unet import Answer
 from dsr.methods.networks.maps import compute_min_max, upsample_bicubic
 from dsr.metrics import losses
-from dsr.metrics.functional import SurfacePair
+from dsr.metrics.functional import SurfacePair, masked_mean, mse_v
 from dsr.metrics.visual_loss import MSE_V, VisualLoss, match_weight
 from dsr.training.degradation import Batch
 from dsr.training.shading import shading_loss
@@ -20,6 +22,7 @@ from dsr.training.shading import shading_loss
 DepthLoss = Literal["lap1", "l1", "mse"]
 _TILT = math.asin(5 / 255)
 """1.1 degrees: it changes the rendering of a surface lit from the side by 5 of 255, the threshold of BadPix_v(5)."""
+_TINY, _FAINT = 1e-5, 1e-7
 _DEPTH_LOSSES = {"lap1": losses.lap1, "l1": losses.l1, "mse": losses.mse}
 
 
@@ -53,6 +56,18 @@ class Objective:
         if self.depth_loss not in _DEPTH_LOSSES:
             raise ValueError(f"depth_loss: expected one of {', '.join(_DEPTH_LOSSES)}, got {self.depth_loss!r}")
 
+    @property
+    def formula(self) -> str:
+        """The loss as a formula."""
+        terms = {self.visual.title: self.w, "shading": self.shading}
+        return " + ".join([self.depth_loss, *(f"{weight:.3g} {name}" for name, weight in terms.items() if weight)])
+
+    @property
+    def facts(self) -> dict[str, str | float]:
+        """What the header of weights says of the loss."""
+        visual = self.visual.name if self.w else "none"
+        return {"loss": self.depth_loss, "visual": visual, "w": self.w, "shading": self.shading}
+
     def __call__(self, disparity: Tensor, batch: Batch, intermediate: Sequence[Tensor] = ()) -> dict[str, Tensor]:
         """Return ``loss`` and its terms, means over the images of the batch that have valid depth.
 
@@ -81,6 +96,72 @@ class Objective:
         if self.shading:
             terms["shading"] = shading_loss(pair, batch["rgb"]).nanmean()
             loss = loss + self.shading * terms["shading"]
+        return {"loss": loss, **terms}
+
+
+@dataclass(frozen=True)
+class SurfaceObjective:
+    """The loss of a network that says how sure it is: K Lap_1 + RMSE_v, and the likelihoods of its expected errors.
+
+    Lap_1 compares disparities divided by the truth's median. RMSE_v is that of each image, and not its square, so that
+    noisy maps do not outweigh clean ones. Where the truth's depth steps are soft, the RMSE of the divided disparities
+    is added, so that a step whose place is uncertain gets soft, too. The expected errors are the scales of Laplace
+    distributions, of the logarithm of disparity and of the angle between the normals.
+
+    Args:
+        depth: K.
+        soft: weight of the RMSE of soft maps.
+        errors: weight of each of the two negative logarithms of likelihoods.
+
+    """
+
+    depth: float = 20.0
+    soft: float = 8.0
+    errors: float = 0.02
+
+    @property
+    def formula(self) -> str:
+        """The loss as a formula."""
+        terms = f"{self.depth:g} Lap_1 + RMSE_v + {self.soft:g} RMSE of soft maps"
+        return f"{terms} + {self.errors:g} (likelihoods of the expected errors)"
+
+    @property
+    def facts(self) -> dict[str, str | float]:
+        """What the header of weights says of the loss."""
+        return {"loss": "surface", "depth": self.depth, "soft": self.soft, "errors": self.errors}
+
+    def __call__(self, answer: Answer, batch: Batch) -> dict[str, Tensor]:
+        """Return ``loss`` and its terms, means over the images of the batch that have valid depth.
+
+        Args:
+            answer: of the network, whose ``disparity`` is without offset: baseline times focal length over depth.
+            batch: tensors of :func:`dsr.training.degradation.to_tensors`, and ``soft``, (B,), 1 where the truth's depth
+                steps are soft.
+
+        """
+        target = batch["bf"] / batch["depth"]
+        unit = target.flatten(1).nanmedian(dim=1).values.view(-1, 1, 1, 1)
+        positive = answer.disparity > 0
+        depth = torch.where(positive, batch["bf"] / torch.where(positive, answer.disparity, 1), torch.nan)
+        pair = SurfacePair(depth, batch["depth"], batch["rays"])
+        terms = {
+            "lap1": losses.lap1(answer.disparity / unit, target / unit).nanmean(),
+            "rmse_v": (mse_v(pair) + _TINY).sqrt().nanmean(),
+        }
+        missed = (answer.disparity - target) / unit
+        missed = masked_mean(missed.nan_to_num(0).square(), target.isfinite())
+        terms["rmse_soft"] = (batch["soft"] * (missed[:, 0] + _FAINT).sqrt()).nanmean()
+        with torch.no_grad():
+            off = (answer.disparity.clamp(min=1e-6) / target).log().abs()
+            angle = torch.deg2rad(angle_between(*pair.normals))
+        for name, expected, error, valid in (
+            ("spread", answer.spread, off, off.isfinite()),
+            ("angle", answer.angle, angle, pair.normal_mask & angle.isfinite()),
+        ):
+            likelihood = expected.log() + torch.where(valid, error, 0) / expected
+            terms[name] = masked_mean(likelihood, valid).nanmean()
+        loss = self.depth * terms["lap1"] + self.soft * terms["rmse_soft"] + terms["rmse_v"]
+        loss = loss + self.errors * (terms["spread"] + terms["angle"])
         return {"loss": loss, **terms}
 
 

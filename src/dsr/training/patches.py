@@ -1,12 +1,13 @@
 """Training patches: random windows of scenes.
 
-Patch number i of a run is a pure function of (seed, i). So an interrupted run continues with the same patches, whatever
-the number of workers.
+Patch number i of a run is a pure function of (seed, i), and of the size of a batch where factors are drawn. So an
+interrupted run continues with the same patches, whatever the number of workers.
 """
 
 from __future__ import annotations
 
 import contextlib
+import itertools
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -15,15 +16,18 @@ import torch
 from torch import Tensor
 from torch.utils.data import Dataset
 
+from dsr.degradation.everything import Everything
 from dsr.geometry.camera import baseline_times_focal
 from dsr.methods.networks.maps import compute_min_max
 from dsr.sample import AllHolesError, DepthSample, Scene
-from dsr.training.augmentation import augment
+from dsr.training.augmentation import augment, soften
 from dsr.training.degradation import Batch, Degradation, to_tensors
 from dsr.training.settings import PatchSettings
 
 _WINDOW_TRIES, _SCENE_TRIES = 10, 100
 _MIN_VALID_FRACTION = 0.5
+_SOFT, _SOFTEST = 0.5, 1.3
+"""Pixels; the smallest and the largest standard deviation of what blurs soft depth steps, 0 where means do it, too."""
 
 
 class Patches(Dataset[Batch]):
@@ -37,6 +41,8 @@ class Patches(Dataset[Batch]):
         seed: seed of the run.
         first: number of the first patch.
         count: number of patches.
+        everything: the distribution of degradations to draw from in place of ``degradation``; all patches of a batch
+            have one factor.
 
     Raises:
         ValueError: a scene is too small or has no true depth, or there is no scene.
@@ -53,9 +59,14 @@ class Patches(Dataset[Batch]):
         seed: int = 0,
         first: int = 0,
         count: int = 1,
+        everything: Everything | None = None,
     ) -> None:
-        for group in groups:
-            check_patches(group, settings, degradation.scale)
+        scales = [degradation.scale]
+        if everything is not None and everything.scales is not None:
+            scales = [int(scale) for scale in everything.scales]
+        for group, scale in itertools.product(groups, scales):
+            check_patches(group, settings, scale)
+        self._everything = everything
         weights = np.array([1.0] * len(groups) if shares is None else shares, dtype=np.float64)
         if not groups or not all(groups):
             raise ValueError("patches: expected a scene or more to train on")
@@ -80,10 +91,13 @@ class Patches(Dataset[Batch]):
 
         Another window is taken where noise makes all of its depth missing, as a sensor's limits of range may.
         """
-        random = np.random.default_rng([self._seed, self._first + index])
+        number = self._first + index
+        random = np.random.default_rng([self._seed, number])
         for _ in range(_SCENE_TRIES):
             with contextlib.suppress(AllHolesError):
-                return self._patch(random)
+                return (
+                    self._patch(random) if self._everything is None else self._degrade(self._everything, number, random)
+                )
         raise ValueError(
             "patches: expected low-resolution maps with a known pixel or more; noise makes all of them holes"
         )
@@ -105,13 +119,33 @@ class Patches(Dataset[Batch]):
         )
         return patch
 
-    def _window(self, group: int, random: np.random.Generator) -> tuple[int, int, int]:
+    def _degrade(self, everything: Everything, number: int, random: np.random.Generator) -> Batch:
+        """Return a random patch with a degradation from a distribution; ``noise`` and ``facts`` are hints."""
+        of_batch = np.random.default_rng([self._seed, number // self._settings.batch, 1])
+        drawing = torch.Generator().manual_seed(int(of_batch.integers(2**62)))
+        scale = everything.draw_scale(self._degradation.scale, drawing)
+        size = self._settings.patch
+        group = min(int(np.searchsorted(self._limits, random.random(), "right")), len(self._groups) - 1)
+        soft = random.random() < everything.soft
+        halved = soft and min(min(scene.rgb.shape[-2:]) for scene in self._groups[group]) >= 2 * size
+        window = 2 * size if halved else size
+        number, top, left = self._window(group, random, window)
+        cropped = replace(self._groups[group][number].crop(top, left, window, window), measured={})
+        if soft:
+            cropped = soften(cropped, random.uniform(0 if halved else _SOFT, _SOFTEST), halve=halved)
+        scene, _ = augment(cropped, self._settings, random)
+        generator = torch.Generator().manual_seed(int(random.integers(2**63)))
+        sample, hints = everything(scene, scale, generator, soft=soft)
+        told = {"noise": hints.noise, "facts": hints.facts, "soft": torch.tensor(float(soft))}
+        return {**to_tensors(sample), **told}
+
+    def _window(self, group: int, random: np.random.Generator, size: int | None = None) -> tuple[int, int, int]:
         """Return a random window of a group: the number of the scene, the top and the left.
 
         The first window of a random scene with enough valid depth is taken, else the best of ten. Another scene is
         taken only where all ten have no valid depth, so that scenes with many holes are not trained on less often.
         """
-        size, scenes = self._settings.patch, self._groups[group]
+        size, scenes = size or self._settings.patch, self._groups[group]
         for _ in range(_SCENE_TRIES):
             number, best, highest = int(random.integers(len(scenes))), None, 0.0
             for _ in range(_WINDOW_TRIES):

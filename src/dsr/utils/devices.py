@@ -15,6 +15,12 @@ def fast_precision(device: torch.device) -> str:
     return "bfloat16" if device.type == "cpu" and amx is not None and amx() else "float32"
 
 
+def inference_precision(device: torch.device) -> str:
+    """Return the precision in which convolutions without gradients are fast; a CPU may have AVX-512 for bfloat16."""
+    avx = getattr(torch.cpu, "_is_avx512_bf16_supported", None)
+    return "bfloat16" if device.type == "cpu" and avx is not None and avx() else fast_precision(device)
+
+
 def pick_device(name: str) -> torch.device:
     """Return the device of that name; ``auto`` is the first GPU where there is one, else the CPU.
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Container, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -29,8 +29,12 @@ def replacing(path: Path) -> Iterator[Path]:
         temporary.unlink(missing_ok=True)
 
 
-def read_arrays(path: Path) -> dict[str, np.ndarray]:
+def read_arrays(path: Path, names: Container[str] | None = None) -> dict[str, np.ndarray]:
     """Return the arrays of an ``.npz`` file.
+
+    Args:
+        path: the file.
+        names: of the arrays to read, of which it need not have all; None for all that it has.
 
     Raises:
         FileNotFoundError: the file does not exist.
@@ -39,7 +43,8 @@ def read_arrays(path: Path) -> dict[str, np.ndarray]:
     """
     with path.open("rb") as file:
         try:
-            return dict(np.load(file).items())
+            arrays = np.load(file)
+            return {name: arrays[name] for name in arrays.files if names is None or name in names}
         except Exception as error:  # a damaged archive makes NumPy raise BadZipFile, EOFError, zlib.error, ...
             raise ValueError(f"{path}: expected an archive of arrays, got a damaged or foreign file") from error
 

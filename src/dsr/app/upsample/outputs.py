@@ -14,19 +14,25 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from dsr.evaluation.store import load_errors
 from dsr.geometry.camera import Camera
 from dsr.geometry.shading import LIGHT_NAMES
 from dsr.io.depth_files import DEPTH_SUFFIXES, write_depth_file
 from dsr.io.encoding import Assumption, Encoding, encode
 from dsr.io.exports import write_cloud, write_mesh, write_normals, write_renderings
 from dsr.io.inputs import Picture
+from dsr.methods.base import Surface
 from dsr.utils.files import replacing, write_text
 from dsr.viz.before_after import write_before_after
+from dsr.viz.confidence import write_confidence
 
-PARTS = ("depth", "renderings", "normals", "cloud", "mesh", "before_after")
+PARTS = ("depth", "renderings", "normals", "cloud", "mesh", "before_after", "confidence")
 FORMATS = ("png", "tiff", "npy", "npz", "pfm", "exr")
 INFO = "info.json"
 METRES = "depth_metres.npy"
+ERRORS = "confidence.npz"
+LARGEST_ERROR = 0.02
+"""Expected error of a pixel's depth, as a fraction of it, from which the pixel is left out of cloud and mesh."""
 _FILES: Mapping[str, tuple[str, ...]] = {
     "depth": (*(f"depth{suffix}" for suffix in DEPTH_SUFFIXES), METRES),
     "renderings": tuple(f"renderings/{name}.png" for name in LIGHT_NAMES),
@@ -34,7 +40,10 @@ _FILES: Mapping[str, tuple[str, ...]] = {
     "cloud": ("cloud.ply",),
     "mesh": ("mesh.ply", "mesh.glb"),
     "before_after": ("before_after.png",),
+    "confidence": ("confidence.png", ERRORS),
 }
+_WORTH_SAYING = 1e-3
+"""Smallest fraction of the pixels that is reported as left out."""
 
 
 @dataclass(frozen=True)
@@ -45,6 +54,7 @@ class PreviousRun:
         complete: whether it finished.
         settings, inputs: those of the run, as JSON has them.
         files: names of the files that it wrote.
+        noise: that of its input, as JSON has it; None if it was not estimated.
 
     """
 
@@ -52,6 +62,7 @@ class PreviousRun:
     settings: Mapping[str, Any]
     inputs: Mapping[str, Any]
     files: tuple[str, ...]
+    noise: Mapping[str, Any] | None = None
 
 
 def output_encoding(encoding: Encoding, chosen: str | None) -> Encoding:
@@ -82,8 +93,13 @@ def read_previous_run(folder: Path) -> PreviousRun | None:
         return None
     try:
         entries = json.loads(path.read_text(encoding="utf-8"))
+        noise = entries.get("noise")
         return PreviousRun(
-            entries["complete"] is True, dict(entries["settings"]), dict(entries["inputs"]), tuple(entries["files"])
+            entries["complete"] is True,
+            dict(entries["settings"]),
+            dict(entries["inputs"]),
+            tuple(entries["files"]),
+            None if noise is None else dict(noise),
         )
     except (ValueError, KeyError, TypeError, RecursionError) as error:
         raise ValueError(f"{path}: expected a file of `dsr upsample`, got something else; take another -o") from error
@@ -111,23 +127,30 @@ def expect_free(folder: Path, inputs: Iterable[Path], *, ours: bool) -> None:
 
 
 def write_parts(
-    folder: Path, picture: Picture, depth: Tensor, parts: Sequence[str], encoding: Encoding, title: str
+    folder: Path,
+    picture: Picture,
+    surface: Surface,
+    parts: Sequence[str],
+    encoding: Encoding,
+    title: str,
+    max_error: float = LARGEST_ERROR,
 ) -> tuple[list[str], list[Assumption]]:
     """Write the parts of a result.
 
     Args:
         folder: the result's folder, created if it is missing.
         picture: the input.
-        depth: (1, H, W) the resulting orthogonal depth in metres, NaN in holes.
+        surface: the result.
         parts: some of :data:`PARTS`.
         encoding: the depth file's encoding.
         title: the title of the before-and-after picture.
+        max_error: expected relative error of the depth from which a pixel is left out of cloud and mesh.
 
     Returns:
         The names of the files, and notes for the user.
 
     """
-    rgb, camera = picture.rgb, picture.camera
+    rgb, camera, depth = picture.rgb, picture.camera, surface.depth
     facts: list[Assumption] = []
     files: list[str] = []
     if "depth" in parts:
@@ -136,17 +159,50 @@ def write_parts(
         write_renderings(folder / "renderings", depth, camera)
     if "normals" in parts:
         write_normals(folder / "normals.png", depth, camera)
-    if "cloud" in parts:
-        write_cloud(folder / "cloud.ply", rgb, depth, camera)
-    if "mesh" in parts:
-        try:
-            write_mesh([folder / name for name in _FILES["mesh"]], rgb, depth, camera)
-        except ValueError as error:
-            facts.append(Assumption("no mesh", str(error)))
-            parts = [part for part in parts if part != "mesh"]
+    if {"cloud", "mesh"} & set(parts):
+        missing, notes = _write_shapes(folder, picture, surface, parts, max_error)
+        parts = [part for part in parts if part not in missing]
+        facts += notes
     if "before_after" in parts:
         write_before_after(folder / "before_after.png", rgb, picture.depth_lr, depth, camera, title)
+    if "confidence" in parts and not _write_errors(folder, surface):
+        parts = [part for part in parts if part != "confidence"]
     return [*files, *(name for part in parts if part != "depth" for name in _FILES[part])], facts
+
+
+def _write_shapes(
+    folder: Path, picture: Picture, surface: Surface, parts: Sequence[str], max_error: float
+) -> tuple[list[str], list[Assumption]]:
+    """Write cloud and mesh without pixels that are likely to be wrong; return parts that could not be, and notes."""
+    facts: list[Assumption] = []
+    depth = surface.depth
+    if surface.depth_error is not None:
+        doubtful = surface.depth_error > max_error * depth
+        depth = depth.masked_fill(doubtful, torch.nan)
+        share = float(doubtful.float().mean())
+        if share >= _WORTH_SAYING:
+            text = f"expected to be off by more than {max_error:.1%} of their depth"
+            facts.append(Assumption("left out of cloud and mesh", f"{share:.1%} of the pixels, {text}"))
+    if not bool(depth.isfinite().any()):
+        return ["cloud", "mesh"], [*facts, Assumption("no cloud and no mesh", "no pixel is left")]
+    if "cloud" in parts:
+        write_cloud(folder / "cloud.ply", picture.rgb, depth, picture.camera)
+    if "mesh" in parts:
+        try:
+            write_mesh([folder / name for name in _FILES["mesh"]], picture.rgb, depth, picture.camera)
+        except ValueError as error:
+            return ["mesh"], [*facts, Assumption("no mesh", str(error))]
+    return [], facts
+
+
+def _write_errors(folder: Path, surface: Surface) -> bool:
+    """Write the expected errors as a picture and as arrays; return whether there are any."""
+    if surface.depth_error is None or surface.angle_error is None:
+        return False
+    write_confidence(folder / "confidence.png", surface.depth, surface.depth_error, surface.angle_error)
+    with replacing(folder / ERRORS) as temporary, temporary.open("wb") as file:
+        np.savez(file, allow_pickle=False, **surface.error_arrays())
+    return True
 
 
 def _write_depth(folder: Path, depth: Tensor, camera: Camera, encoding: Encoding) -> tuple[list[str], list[Assumption]]:
@@ -167,12 +223,26 @@ def _write_depth(folder: Path, depth: Tensor, camera: Camera, encoding: Encoding
     return [name, METRES], facts
 
 
-def kept_depth(folder: Path, camera: Camera) -> Tensor | None:
-    """Load the depth in metres of an earlier complete run, (1, H, W); None if it is missing."""
-    with contextlib.suppress(OSError, ValueError, EOFError):
+def kept_surface(folder: Path, camera: Camera, *, errors: bool) -> Surface | None:
+    """Load the result of an earlier complete run; None if a file of it is missing.
+
+    Args:
+        folder: the result's folder.
+        camera: the photo's.
+        errors: whether its expected errors are needed.
+
+    """
+    size = (camera.height, camera.width)
+    with contextlib.suppress(OSError, ValueError, EOFError, KeyError):
         values = np.load(folder / METRES)
-        if values.shape == (camera.height, camera.width) and values.dtype == np.float32:
-            return torch.from_numpy(values)[None]
+        if values.shape != size or values.dtype != np.float32:
+            return None
+        depth = torch.from_numpy(values)[None]
+        if not errors:
+            return Surface(depth)
+        expected = load_errors(folder / ERRORS)
+        if expected is not None and all(each.shape == depth.shape for each in expected):
+            return Surface(depth, *expected)
     return None
 
 

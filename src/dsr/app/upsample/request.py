@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from dsr.app.upsample.outputs import FORMATS, PARTS
-from dsr.inference import AUTO, MethodChoice, check_settings
-from dsr.inference.planning import USUAL_SCALE
+from dsr.app.upsample.outputs import FORMATS, LARGEST_ERROR, PARTS
+from dsr.inference import DEFAULT, MethodChoice, check_settings
+from dsr.inference.planning import USUAL_SCALE, read_ability
 from dsr.io.inputs import Reading
 from dsr.io.pairs import Pair
 from dsr.methods.registry import list_methods, read_method, target_paths
 from dsr.utils.hashing import file_hash, hash_outside_code
+
+SHORTCUTS = ("noise", "smooth")
+"""Settings of the method that have an option of their own."""
 
 
 @dataclass(frozen=True)
@@ -26,6 +30,7 @@ class UpsampleRequest:
         rgb, depth, mask: files, or one folder each of the first two.
         reading: how to read the files.
         method, settings, directories, scale, device, keep_holes: see :func:`dsr.inference.upsample_depth`.
+        max_error: expected relative error of the depth from which a pixel is left out of cloud and mesh.
         depth_format: the result's format; None for the input's.
         parts: what to write, some of :data:`dsr.app.upsample.outputs.PARTS`.
         overwrite: whether to replace existing results.
@@ -39,12 +44,13 @@ class UpsampleRequest:
     depth: tuple[Path, ...] = ()
     mask: tuple[Path, ...] = ()
     reading: Reading = field(default_factory=Reading)
-    method: str = AUTO
+    method: str = DEFAULT
     settings: Mapping[str, Any] = field(default_factory=dict)
     directories: tuple[Path, ...] = ()
     scale: int | None = None
     device: str = "auto"
     keep_holes: bool = False
+    max_error: float = LARGEST_ERROR
     depth_format: str | None = None
     parts: tuple[str, ...] = PARTS
     overwrite: bool = False
@@ -53,7 +59,7 @@ class UpsampleRequest:
     def __post_init__(self) -> None:
         """Check everything that does not depend on the files."""
         for name, value, choices in (
-            ("--method", self.method, (AUTO, *list_methods(self.directories))),
+            ("--method", self.method, list_methods(self.directories)),
             ("--format", self.depth_format, FORMATS),
         ):
             if value is not None and value not in choices:
@@ -67,16 +73,31 @@ class UpsampleRequest:
             raise ValueError("expected --rgb and --depth, or folders that hold both")
         if self.folders and self.mask:
             raise ValueError("--mask: expected --rgb and --depth with it, got folders")
-        if self.settings:
-            self._check_settings()
+        if not self.max_error > 0:
+            raise ValueError(f"--max-error: expected a positive percentage of the depth, got {100 * self.max_error:g}")
+        self._check_method()
 
-    def _check_settings(self) -> None:
-        """Check that the method accepts the settings."""
+    @functools.cached_property
+    def wanted(self) -> tuple[str, ...]:
+        """Parts that the method can have."""
+        if "confidence" not in self.parts or read_ability(self.method, self.directories, self.settings).confident:
+            return self.parts
+        return tuple(part for part in self.parts if part != "confidence")
+
+    def _check_method(self) -> None:
+        """Check that the method accepts the settings and can write something of what is requested."""
+        if not self.wanted:
+            raise ValueError(
+                f"--only confidence: expected a method that says how sure it is, such as {DEFAULT}, got {self.method}"
+            )
+        if not self.settings:
+            return
         try:
             check_settings(MethodChoice(self.method, self.settings, self.directories))
         except ValueError as error:
-            named = str(error).partition(":")[0] in self.settings
-            raise ValueError(f"--set {error}" if named else str(error)) from error
+            key = str(error).partition(":")[0]
+            option = f"--{error}" if key in SHORTCUTS else f"--set {error}"
+            raise ValueError(option if key in self.settings else str(error)) from error
 
 
 def settings_of(request: UpsampleRequest) -> dict[str, Any]:
@@ -87,6 +108,7 @@ def settings_of(request: UpsampleRequest) -> dict[str, Any]:
         "method": request.method,
         "scale": request.scale,
         "keep_holes": request.keep_holes,
+        "max_error": request.max_error,
         "format": request.depth_format,
         **reading,
         "fov": choice["fov"],
@@ -97,9 +119,7 @@ def settings_of(request: UpsampleRequest) -> dict[str, Any]:
 
 
 def _targets(request: UpsampleRequest) -> list[str]:
-    """Return the dotted paths of the code that the method's file names; none where the method is chosen later."""
-    if request.method == AUTO:
-        return []
+    """Return the dotted paths of the code that the method's file names."""
     return list(
         target_paths(read_method(request.method, USUAL_SCALE, directories=request.directories), request.directories)
     )

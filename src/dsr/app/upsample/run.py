@@ -12,7 +12,6 @@ from typing import Any
 
 import torch
 from rich.console import Console
-from torch import Tensor
 
 from dsr.app.upsample.outputs import (
     PreviousRun,
@@ -20,22 +19,27 @@ from dsr.app.upsample.outputs import (
     described,
     expect_free,
     finish,
-    kept_depth,
+    kept_surface,
     output_encoding,
     read_previous_run,
     write_parts,
 )
 from dsr.app.upsample.reporting import Reporter, listed, problem_line
 from dsr.app.upsample.request import UpsampleRequest, files_of, inputs_of, settings_of
-from dsr.inference import AUTO, NOISY, Plan, enlarged_by, plan, suited_method, upsample_depth
+from dsr.inference import Plan, enlarged_by, plan, upsample_surface
 from dsr.io.encoding import Assumption
 from dsr.io.inputs import Picture, UnitMemory, read_picture
 from dsr.io.layouts import find_pairs_of_folder
 from dsr.io.pairs import Pair, PairingResult, find_pairs_of_lists
+from dsr.methods.base import MapNoise, Surface
 from dsr.utils.console import ConsoleProgress, show
 from dsr.utils.progress import Progress
 from dsr.utils.versions import package_versions
 
+_WHITE = 1.5
+"""Noise that is alike over fewer pixels counts as white."""
+_SHAPED_BY_ERRORS = frozenset({"cloud", "mesh", "confidence"})
+"""Parts of a result that depend on its expected errors."""
 _PACKAGES = ("dsr", "torch", "numpy", "opencv-python-headless")
 
 
@@ -146,7 +150,7 @@ class _Job:
         if not self.reusable or self.earlier is None:
             return False
         there = {name.split("/")[0].split(".")[0] for name in self.earlier.files if (self.target / name).is_file()}
-        return there >= set(self.request.parts)
+        return there >= set(self.request.wanted)
 
 
 def _one(
@@ -160,38 +164,26 @@ def _one(
         return "complete already"
     picture = _without_repeats(read_picture(pair, request.reading, units))
     size_lr = (picture.depth_lr.shape[-2], picture.depth_lr.shape[-1])
-    method, suits = _method(picture, request)
-    picture = replace(picture, assumptions=(*picture.assumptions, *suits))
     size = (picture.camera.height, picture.camera.width)
-    planned = plan(size, size_lr, request.scale, method, request.directories, request.settings)
+    planned = plan(size, size_lr, request.scale, request.method, request.directories, request.settings)
     reporter.facts(picture.assumptions)
     if request.dry_run:
         reporter.say(f"{pair.name}: {planned.text} -> {target}")
         return "to do"
     inputs = files_of(pair, request.reading).values()
     expect_free(target, inputs, ours=request.overwrite or job.earlier is not None)
-    depth = kept_depth(target, picture.camera) if job.reusable else None
+    errors = planned.confident and bool(_SHAPED_BY_ERRORS & set(request.parts))
+    surface = kept_surface(target, picture.camera, errors=errors) if job.reusable else None
     begin(target, job.settings, job.inputs, () if job.earlier is None else job.earlier.files)
     started = time.perf_counter()
-    if depth is None:
-        depth = _upsample(job, picture, planned.method, progress)
+    if surface is None:
+        surface = _upsample(job, picture, progress)
+        reporter.facts(_describe(surface.noise, given="noise" in request.settings))
     seconds = time.perf_counter() - started
-    facts = _write(job, picture, depth, planned, seconds)
+    facts = _write(job, picture, surface, planned, seconds)
     reporter.facts(facts)
     reporter.say(f"{pair.name}: {planned.text}, {seconds:.1f} s -> {target}")
     return "done"
-
-
-def _method(picture: Picture, request: UpsampleRequest) -> tuple[str, list[Assumption]]:
-    """Return the method to use, and notes on the choice."""
-    if request.method != AUTO:
-        return request.method, []
-    method = suited_method(picture.depth_lr, picture.camera, request.scale)
-    if method == NOISY:
-        return method, [
-            Assumption(f"the depth map is noisy: {NOISY}, which was trained for that (--method facets keeps more)")
-        ]
-    return method, []
 
 
 def _without_repeats(picture: Picture) -> Picture:
@@ -204,36 +196,46 @@ def _without_repeats(picture: Picture) -> Picture:
     return replace(picture, depth_lr=picture.depth_lr[:, ::block, ::block], assumptions=(*picture.assumptions, fact))
 
 
-def _upsample(job: _Job, picture: Picture, method: str, progress: Progress) -> Tensor:
-    """Compute the high-resolution depth, (1, H, W) in metres."""
+def _upsample(job: _Job, picture: Picture, progress: Progress) -> Surface:
+    """Compute the high-resolution depth with its expected errors, on the CPU."""
     request = job.request
     with progress.task("steps") as step:
-        return upsample_depth(
+        surface = upsample_surface(
             picture.rgb,
             picture.depth_lr,
             picture.camera,
             request.scale,
-            method=method,
+            method=request.method,
             settings=request.settings,
             directories=request.directories,
             device=request.device,
             keep_holes=request.keep_holes,
             progress=step,
-        ).cpu()
+        )
+    return surface.map(lambda values: values.cpu())
 
 
-def _write(job: _Job, picture: Picture, depth: Tensor, planned: Plan, seconds: float) -> list[Assumption]:
+def _describe(noise: MapNoise | None, *, given: bool) -> list[Assumption]:
+    """Return a note on the noise of the input, if it was estimated and not given."""
+    if noise is None or given:
+        return []
+    extent = f", correlated over {noise.extent:.0f} pixels" if noise.extent > _WHITE else ""
+    return [Assumption("noise of the depth map", f"about {1e3 * noise.deviation:.2g} mm{extent}; --noise overrides it")]
+
+
+def _write(job: _Job, picture: Picture, surface: Surface, planned: Plan, seconds: float) -> list[Assumption]:
     """Write all parts and ``info.json``, and return notes for the user."""
     started = time.perf_counter()
     encoding = output_encoding(picture.encoding, job.request.depth_format)
     title = f"{job.pair.name}, {planned.method} x{planned.scale}"
-    files, facts = write_parts(job.target, picture, depth, job.request.parts, encoding, title)
+    files, facts = write_parts(job.target, picture, surface, job.request.wanted, encoding, title, job.request.max_error)
     entries = {
         "inputs": job.inputs,
         "settings": job.settings,
         "method": planned.method,
         "scale": planned.scale,
         "plan": planned.text,
+        "noise": surface.noise._asdict() if surface.noise else job.earlier.noise if job.earlier and job.same else None,
         **described(picture, encoding),
         "assumptions": [str(fact) for fact in (*picture.assumptions, *facts)],
         "seconds": {"upsampling": round(seconds, 3), "writing": round(time.perf_counter() - started, 3)},

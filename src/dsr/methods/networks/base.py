@@ -51,12 +51,48 @@ class DisparityNetwork(nn.Module, abc.ABC):
 
     Attributes:
         scale: upsampling factor.
+        of_inverse_depth: whether it takes inverse depth in place of disparity, which may have an offset.
         covers: whether the output covers the whole image; some published networks leave out a row and a column.
 
     """
 
     scale: int
     covers: bool = True
+    of_inverse_depth: bool = False
+
+    @classmethod
+    def serves(cls, trained: int, scale: int) -> bool:
+        """Return whether weights trained for a factor are for another one, too."""
+        return trained == scale
+
+    def start_from(self, first: DisparityNetwork) -> None:
+        """Take over the weights of a trained network, perhaps for another factor.
+
+        Raises:
+            ValueError: it is another kind of network, of another size, or for a factor with other parameters.
+
+        """
+        if type(first) is not type(self) or {**first.arguments(), "scale": self.scale} != self.arguments():
+            raise ValueError(
+                f"expected weights of {type(self).__name__} {self.arguments()}, got those of {type(first).__name__} "
+                f"{first.arguments()}"
+            )
+        shapes = [{name: value.shape for name, value in net.state_dict().items()} for net in (self, first)]
+        if shapes[0] != shapes[1]:
+            raise ValueError(
+                f"weights are for scale {first.scale}, the run is at scale {self.scale}, where {type(self).__name__} "
+                "has other parameters"
+            )
+        self.load_state_dict(first.state_dict())
+
+    def share(self, first: DisparityNetwork) -> None:
+        """Take over layers that do not depend on the factor from a trained network, and do not train them.
+
+        Raises:
+            ValueError: there are no such layers, or ``first`` has others.
+
+        """
+        raise ValueError(f"{type(self).__name__} has no layers that do not depend on the factor")
 
     @abc.abstractmethod
     def arguments(self) -> dict[str, Any]:
@@ -214,9 +250,10 @@ class NetworkUpsampler:
         if sample.scale != self.net.scale:
             raise ValueError(f"{sample.scene}: expected scale {self.net.scale}, the network's, got {sample.scale}")
         # in pixels of sample.camera
-        disparity_lr = to_range(sample.depth_lr, sample.camera_lr, "disparity") * sample.scale
+        offset = sample.camera.doffs if self.net.of_inverse_depth else 0.0  # such a network gets inverse depth
+        disparity_lr = to_range(sample.depth_lr, sample.camera_lr, "disparity") * sample.scale + offset
         rgb = sample.rgb.to(self.device)[None]
-        disparity = self.upsample_disparity(rgb, disparity_lr.to(self.device)[None], progress)[0]
+        disparity = self.upsample_disparity(rgb, disparity_lr.to(self.device)[None], progress)[0] - offset
         missing = (sample.camera.width - disparity.shape[-1], sample.camera.height - disparity.shape[-2])
         if any(missing):
             disparity = functional.pad(disparity, (0, missing[0], 0, missing[1]), value=torch.nan)

@@ -12,7 +12,7 @@ What differs from the original:
   original's is bilinear. The convolutions see its differences from local means and its slopes, faint ones enlarged,
   instead of its values, so that bfloat16 is enough for them; and the photo's colours instead of its grey.
 - The residual is in multiples of the low-resolution map's *bend* (the largest second difference around, see
-  :mod:`dsr.methods.networks.facets`), so that it is 0 on a plane whatever the weights are. Without that, a short
+  :mod:`dsr.methods.networks.facets_planes`), so that it is 0 on a plane whatever the weights are. Without that, a short
   training left a DSSIM_v of 0.30 instead of 0.22 on procedural scenes.
 - The window is 5 x 5, 12 offsets, the original's 7 x 7, 24 offsets, in twice the time; 10 steps, the code has 20.
 - Convolutions are padded with zeros, the original's answer is smaller than its input.
@@ -35,7 +35,7 @@ from torch.nn import functional
 from dsr.degradation.downsampling import check_scale
 from dsr.methods.classical.finite_differences import extend_linearly, upsample_linear_border
 from dsr.methods.networks.base import NormalisedNetwork, expect_rgb_size
-from dsr.methods.networks.facets import stencil
+from dsr.methods.networks.facets_planes import stencil
 from dsr.methods.networks.primal_dual import UnrolledHuber
 
 _FAINT = 1e-3
@@ -130,7 +130,7 @@ class PrimalDualNetwork(NormalisedNetwork):
         that small values count; and the second difference divided by the bend.
         """
         around = stencil(values)
-        slopes_lr = torch.cat((around.along_u[:, 1:2], around.along_v[:, 1:2], around.value - around.mean), dim=1)
+        slopes_lr = torch.cat((around.slopes[:, :, 1], around.value - around.mean), dim=1)
         size = tuple(hr.shape[-2:])
         bend = functional.interpolate(around.bend.float(), size=size, mode="bilinear")
         slopes = functional.interpolate(slopes_lr.float(), size=size, mode="bilinear")

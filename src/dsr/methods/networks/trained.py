@@ -13,6 +13,7 @@ from dsr.methods.networks.base import DisparityNetwork, NetworkUpsampler, Precis
 from dsr.methods.networks.ddrnet import DDRNet
 from dsr.methods.networks.dg import DynamicGuidance
 from dsr.methods.networks.facets import Facets
+from dsr.methods.networks.facets_unet import FacetsUNet
 from dsr.methods.networks.msg_guidance import VariantName
 from dsr.methods.networks.msg_net import MSGNet
 from dsr.methods.networks.pdn import PrimalDualNetwork
@@ -24,6 +25,7 @@ NETWORKS: MappingProxyType[str, type[DisparityNetwork]] = MappingProxyType(
     {
         "MSGNet": MSGNet,
         "Facets": Facets,
+        "FacetsUNet": FacetsUNet,
         "PrimalDualNetwork": PrimalDualNetwork,
         "DynamicGuidance": DynamicGuidance,
         "SparseToDense": SparseToDense,

@@ -17,10 +17,21 @@ from dsr.methods.networks.base import DisparityNetwork
 
 FORMAT = "dsr-network-1"
 _KEY = "dsr"
+_SHARED, _CLEAN = "shared", "clean"
+"""Keys of the file beside it from which a file takes the tensors that it does not have, and of that for clean maps."""
+_EARLIER = {("facets_box", "Facets"): "facets"}
+"""The name that files of a model and a network had earlier."""
 
 
 def save_network(
-    path: Path, net: DisparityNetwork, model: str, facts: Mapping[str, Any] | None = None, *, half: bool = False
+    path: Path,
+    net: DisparityNetwork,
+    model: str,
+    facts: Mapping[str, Any] | None = None,
+    *,
+    half: bool = False,
+    shared: Path | None = None,
+    clean: Path | None = None,
 ) -> None:
     """Write a network's weights; equal networks and facts give equal bytes.
 
@@ -30,6 +41,8 @@ def save_network(
         model: name of the model in ``conf/model/``, such as ``msg_v``.
         facts: further plain values for readers of the file, such as data, steps and scores.
         half: whether to store the kernels of convolutions in half precision; biases and normalisations are not.
+        shared: another file of weights, of the same folder; tensors that it has, too, are not written again.
+        clean: another file of weights, of the same folder, for clean maps of box means; see :func:`clean_weights`.
 
     """
     header = {
@@ -43,6 +56,16 @@ def save_network(
         name: value.detach().to("cpu", torch.float16 if half and value.dim() > 1 else value.dtype).contiguous()
         for name, value in net.state_dict().items()
     }
+    if clean is not None:
+        header[_CLEAN] = clean.name
+    if shared is not None:
+        header[_SHARED] = shared.name
+        there = _read_tensors(shared)
+        tensors = {
+            name: value
+            for name, value in tensors.items()
+            if name not in there or there[name].dtype != value.dtype or not torch.equal(there[name], value)
+        }
     safetensors.torch.save_file(tensors, path, {_KEY: json.dumps(header, sort_keys=True)})
 
 
@@ -100,11 +123,14 @@ def load_network(
     """
     path = Path(path)
     header = read_header(path)
-    if model is not None and header["model"] != model:
+    if model is not None and header["model"] not in (model, _EARLIER.get((model, header["network"]))):
         raise ValueError(f"{path}: expected weights of model {model}, got those of {header['model']}")
     try:
         with torch.random.fork_rng(devices=[]):  # the initial weights draw random numbers
-            net = networks[header["network"]](**header["arguments"])
+            kind, arguments = networks[header["network"]], dict(header["arguments"])
+            if scale is not None and kind.serves(arguments["scale"], scale):
+                arguments["scale"] = scale
+            net = kind(**arguments)
     except (KeyError, TypeError, ValueError) as error:
         names = ", ".join(networks)
         raise ValueError(
@@ -112,12 +138,57 @@ def load_network(
         ) from error
     if scale is not None and net.scale != scale:
         raise ValueError(f"{path}: weights are for scale {net.scale}, the run is at scale {scale}")
-    try:
-        tensors = safetensors.torch.load(path.read_bytes())
-    except Exception as error:  # the library names no set of errors for damaged files
-        raise ValueError(f"{path}: expected a safetensors file, got a damaged one ({type(error).__name__})") from error
+    tensors = _read_tensors(path)
+    if (other := _beside(path, header, _SHARED)) is not None:
+        needed = net.state_dict().keys()
+        tensors = {name: value for name, value in _read_tensors(other).items() if name in needed} | tensors
     load_parameters(net, tensors, path, f"{header['network']} at scale {net.scale}")
     return net
+
+
+def clean_weights(path: Path) -> Path | None:
+    """Return the file of weights for maps that are box means without noise, if the file names one beside it.
+
+    Raises:
+        FileNotFoundError: there is no such file, or the other one is missing.
+        ValueError: the file is damaged or not a dsr weights file.
+
+    """
+    return _beside(path, read_header(path), _CLEAN)
+
+
+def files_of_weights(path: Path) -> list[Path]:
+    """Return a file of weights and those beside it that it needs; one that is not dsr's is alone.
+
+    Raises:
+        FileNotFoundError: one is missing.
+        ValueError: one is damaged.
+
+    """
+    if not is_dsr_weights(path):
+        return [path]
+    header = read_header(path)
+    others = [other for key in (_SHARED, _CLEAN) if (other := _beside(path, header, key)) is not None]
+    return [path, *(file for other in others for file in files_of_weights(other))]
+
+
+def _beside(path: Path, header: Mapping[str, Any], key: str) -> Path | None:
+    """Return the file that a header names, in the folder of ``path``."""
+    if header.get(key) is None:
+        return None
+    other = path.with_name(Path(str(header[key])).name)
+    if not other.is_file():
+        use = "whose layers it shares" if key == _SHARED else "for clean maps"
+        raise FileNotFoundError(f"{path}: expected {other.name} beside it, {use}; there is none")
+    return other
+
+
+def _read_tensors(path: Path) -> dict[str, Tensor]:
+    """Return the tensors of a safetensors file by name."""
+    try:
+        return dict(safetensors.torch.load(path.read_bytes()))
+    except Exception as error:  # the library names no set of errors for damaged files
+        raise ValueError(f"{path}: expected a safetensors file, got a damaged one ({type(error).__name__})") from error
 
 
 def read_torch_file(path: Path) -> Any:

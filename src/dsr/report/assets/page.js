@@ -97,6 +97,7 @@ showSummary(data);
 const viewer = data.scenes.length ? new Viewer(data) : null;
 if (viewer === null) document.querySelectorAll("[data-needs=scenes]").forEach((each) => { each.hidden = true; });
 showTables(data, data.scenes, (problem, scene, method) => viewer.open(problem, scene, method));
+showCalibration(data);
 showTimes(data);
 showRuns(data);
 unfoldForPrint();

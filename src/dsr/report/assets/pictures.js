@@ -1,6 +1,7 @@
 // Pictures of values: decoding them, and what is drawn from them.
 
-const HOLE = 0, NORMAL = 255;
+const HOLE = 0, DEPTH = 128, NORMAL = 255;
+const ANGLE_LIMIT = 60;
 const decoded = new Map();
 
 /** Return the pixels of a stored picture, RGBA, without any colour conversion. */
@@ -24,7 +25,7 @@ async function bytesOf(id) {
   return values;
 }
 
-/** Decode a scene once: the photo, and of each surface its shadings, depth, error and what is known of them. */
+/** Decode a scene once: the photo, and of each surface its shadings, depth, errors and what is known of them. */
 async function loadScene(entry) {
   if (decoded.has(entry.data)) return decoded.get(entry.data);
   const scene = block(entry.data);
@@ -57,12 +58,20 @@ async function loadSurface(surface) {
     surface.errors = await bytesOf(surface.error.values);
     surface.errorsKnown = surface.error.mask ? await bytesOf(surface.error.mask) : null;
   }
+  if (surface.expected) {
+    const { depth, angle, mask } = surface.expected;
+    surface.expectedValues = { depth: await bytesOf(depth), angle: await bytesOf(angle) };
+    surface.expectedKnown = mask ? await bytesOf(mask) : null;
+  }
 }
 
 const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
 
 /** Return the error in metres that a stored value stands for. */
 const errorOf = (stored, largest) => (Math.sign(stored - 128) * (stored - 128) ** 2 * largest) / 127 ** 2;
+
+/** Return the error of the truth at its pixel i: 0, NaN where its mask is less than `least`. */
+const ofTruth = (truth, i, least) => (truth.known && truth.known[i] < least ? NaN : 0);
 
 /** What can be asked of a surface at its pixel i; NaN where it is not known. */
 const probe = {
@@ -78,6 +87,12 @@ const probe = {
   error(surface, i, largest) {
     if (!surface.errors || (surface.errorsKnown && surface.errorsKnown[i] === HOLE)) return NaN;
     return errorOf(surface.errors[i], largest);
+  },
+  /** The expected error of the depth in metres, or of the normal, the "angle", in degrees. */
+  expected(surface, i, name, largest) {
+    if (!surface.expected) return NaN;
+    const known = surface.expectedKnown?.[i] ?? NORMAL;
+    return known === HOLE || (name === "angle" && known !== NORMAL) ? NaN : (surface.expectedValues[name][i] / 255) ** 2 * largest[name];
   },
   /** Degrees between two normals; from the chord, which loses no digits where they are close. */
   angle(surface, i, other, j) {
@@ -100,19 +115,28 @@ function colourMap(digits) {
 /** Return the weights of e1, e2, e3 that make up a light. */
 const weightsOf = (light, lights) => ["e1", "e2", "e3"].map((name) => dot(light, lights[name]));
 
+/** The views of expected errors, and under which name their values are stored. */
+const EXPECTED = { expectedError: "depth", expectedAngle: "angle" };
+
 /**
- * Return what draws a view: the function of a surface's pixel, the colours and limits of its values, and whether a
- * surface has it at all.
+ * Return what draws a view: the function of a surface's pixel, the colours and limits of its values, whether a surface
+ * has it at all, and what stands in place of the picture if not.
  */
 function viewOf(name, scene, state) {
   const truth = scene.surfaces.find((surface) => surface.kind === "truth");
   if (name === "depth") return { of: (s, i) => probe.depth(s, i, scene.depth), colours: "depth", low: scene.depth[0], high: scene.depth[1] };
   if (name === "error") {
     const { limit, largest } = scene.error;
-    const of = (s, i) => (s.kind === "truth" ? 0 : probe.error(s, i, largest));
-    return { of, has: (s) => s.kind === "truth" || Boolean(s.errors), colours: "error", low: -limit, high: limit };
+    const of = (s, i) => (s.kind === "truth" ? ofTruth(s, i, DEPTH) : probe.error(s, i, largest));
+    return { of, has: (s) => s.kind === "truth" || Boolean(s.errors), silent: "is not compared with the truth", colours: "error", low: -limit, high: limit };
   }
-  if (name === "angle") return { of: (s, i, u, v) => probe.angle(s, i, truth, pixelAt(truth, scene, u, v)), colours: "angle", low: 0, high: 60 };
+  if (name in EXPECTED) {
+    const what = EXPECTED[name];
+    const of = (s, i) => (s.kind === "truth" ? ofTruth(s, i, what === "angle" ? NORMAL : DEPTH) : probe.expected(s, i, what, scene.expected));
+    const limits = what === "angle" ? { colours: "angle", low: 0, high: ANGLE_LIMIT } : { colours: "error", low: -scene.error.limit, high: scene.error.limit };
+    return { of, has: (s) => s.kind === "truth" || Boolean(s.expected), silent: "says nothing of its errors", ...limits };
+  }
+  if (name === "angle") return { of: (s, i, u, v) => probe.angle(s, i, truth, pixelAt(truth, scene, u, v)), colours: "angle", low: 0, high: ANGLE_LIMIT };
   return { of: (s, i) => probe.shade(s, i, state.weights), weights: state.weights, colours: null, low: 0, high: 1 };
 }
 
@@ -191,12 +215,12 @@ function packed(colour) {
   return new Uint32Array(bytes.buffer)[0];
 }
 
-/** Fill an element with a colour bar and what its ends and middle stand for. */
-function colourBar(element, map, texts) {
-  const canvas = make("canvas", { width: 256, height: 1, "aria-hidden": "true" });
+/** Fill an element with a colour bar, of the colours from the `first` on, and what its ends and middle stand for. */
+function colourBar(element, map, texts, first = 0) {
+  const canvas = make("canvas", { width: 256 - first, height: 1, "aria-hidden": "true" });
   const context = canvas.getContext("2d");
-  const image = context.createImageData(256, 1);
-  new Uint32Array(image.data.buffer).set(lookup(map));
+  const image = context.createImageData(256 - first, 1);
+  new Uint32Array(image.data.buffer).set(lookup(map).subarray(first));
   context.putImageData(image, 0, 0);
   element.replaceChildren(canvas, make("div", {}, ...texts.map((text) => make("span", { textContent: text }))));
 }

@@ -169,6 +169,33 @@ function showTables(data, entries, open) {
   });
 }
 
+/** Fill the section of expected errors, which is hidden where no method has any. */
+function showCalibration(data) {
+  const KINDS = { depth: "depth", angle: "normal" };
+  const percent = (value) => (isMissing(value) ? null : `${number(100 * value, 1)} %`);
+  const shown = data.problems.filter((problem) => problem.calibration.length);
+  find("#calibration").hidden = find("nav [href='#calibration']").hidden = !shown.length;
+  for (const problem of shown) {
+    const rows = problem.calibration.flatMap((row) => Object.entries(KINDS).map(([kind, text]) => ({ ...row[kind], text, method: row.method, scenes: row.scenes })));
+    const deciles = rows[0].ratios.map((_, k) => ({
+      title: String(k + 1), unit: k === 0 ? "smallest" : k === rows[0].ratios.length - 1 ? "largest" : "\u00a0",
+      value: (row) => row.ratios[k], cell: (row) => (isMissing(row.ratios[k]) ? null : number(row.ratios[k], 2)),
+    }));
+    const columns = [
+      { title: "Method", unit: "\u00a0", word: true, value: (row) => row.method },
+      { title: "Error", unit: "of the", word: true, value: (row) => row.text },
+      ...deciles,
+      { title: "Squared error", unit: "in 80 % of the pixels", value: (row) => row.share, cell: (row) => percent(row.share) },
+      { title: "Least", unit: "possible", value: (row) => row.least, cell: (row) => percent(row.least) },
+    ];
+    const table = sortable(columns, rows, { caption: `${problemName(problem)}: measured over expected errors` });
+    const counts = [...new Set(rows.map((row) => row.scenes))];
+    find("#calibration .calibrations").append(make("div", { className: "block" },
+      make("h3", {}, problemName(problem), make("small", { textContent: ` \u00b7 over ${counts.length === 1 ? plural(counts[0], "scene") : `${Math.min(...counts)} to ${Math.max(...counts)} scenes`}` })),
+      table.element));
+  }
+}
+
 /** Fill the section of times. */
 function showTimes(data) {
   const home = find("#times .times");

@@ -1,6 +1,10 @@
 // The viewer of scenes: two pictures with a divider, lights, zoom, thumbnails, scores and error maps.
 
-const VIEWS = [["shade", "Rendering"], ["depth", "Depth"], ["error", "Depth error"], ["angle", "Normal error"]];
+const VIEWS = [
+  ["shade", "Rendering"], ["depth", "Depth"],
+  ["error", "Depth error"], ["expectedError", "expected", "Expected error of the depth"],
+  ["angle", "Normal error"], ["expectedAngle", "expected", "Expected error of the normal"],
+];
 const LIGHTS = ["e1", "e2", "e3", "e4"];
 const PHOTO = "photo";
 const MOST_ZOOM = 32;
@@ -40,7 +44,7 @@ class Viewer {
       find(`.${side}`, this.root).addEventListener("change", (event) => this.setSide(side, event.target.value));
     }
     find(".swap", this.root).addEventListener("click", () => this.swap());
-    this.viewButtons = VIEWS.map(([name, text]) => make("button", { type: "button", textContent: text, "data-view": name, onclick: () => this.setView(name) }));
+    this.viewButtons = VIEWS.map(([name, text, title]) => make("button", { type: "button", textContent: text, "data-view": name, onclick: () => this.setView(name), ...(title && { title, "aria-label": title }) }));
     find(".views", this.root).append(...this.viewButtons);
     this.lightButtons = [...LIGHTS, "free"].map((name, k) => make("button", {
       type: "button", textContent: name, "data-light": name, title: name === "free" ? "A light that follows the pointer (F)" : `Light ${name} (${k + 1})`, onclick: () => this.setLight(name),
@@ -82,7 +86,8 @@ class Viewer {
     const left = keep(method ?? this.state.leftLabel) ?? String(methods[0] ?? 0);
     const other = this.truth >= 0 ? this.truth : methods.find((k) => String(k) !== left) ?? 0;
     const right = (method && this.truth >= 0 ? undefined : keep(this.state.rightLabel)) ?? String(other);
-    for (const button of this.viewButtons) button.hidden = ["error", "angle"].includes(button.dataset.view) && !(this.truth >= 0 && (button.dataset.view === "angle" || scene.error));
+    const has = { shade: true, depth: true, error: this.truth >= 0 && scene.error, angle: this.truth >= 0, expectedError: scene.expected, expectedAngle: scene.expected };
+    for (const button of this.viewButtons) button.hidden = !has[button.dataset.view];
     if (this.viewButtons.some((button) => button.hidden && button.dataset.view === this.state.view)) this.state.view = "shade";
     this.state.about = null;
     this.fit();
@@ -91,7 +96,7 @@ class Viewer {
     this.setSide("right", right, false);
     this.setView(this.state.view);
     this.setZoom(1, 0, 0);
-    const holes = scene.surfaces.some((surface) => surface.mask || surface.error?.mask) ? ["pink: holes"] : [];
+    const holes = scene.surfaces.some((surface) => surface.mask || surface.error?.mask || surface.expected?.mask) ? ["pink: holes"] : [];
     const wrong = pixelsAreTrue() ? [] : ["this browser changes pixels that a page reads (to hide from trackers): renderings and values are wrong"];
     find(".scene-notes", this.root).textContent = [...holes, ...scene.notes, ...wrong].join(" \u00b7 ");
     this.stage.removeAttribute("aria-busy");
@@ -196,7 +201,10 @@ class Viewer {
 
   draw() {
     const view = viewOf(this.state.view, this.scene, this.state);
-    for (const side of ["left", "right"]) paint(this.canvases[side], this.surfaceOf(side), this.scene, view, this.colours, this.hole);
+    for (const side of ["left", "right"]) {
+      paint(this.canvases[side], this.surfaceOf(side), this.scene, view, this.colours, this.hole);
+      find(`.pane-${side} .silent`, this.root).textContent = silence(view, this.surfaceOf(side));
+    }
     clearTimeout(this.later);
     if (this.state.light === "free") this.later = setTimeout(() => this.drawStrip(view), 150);
     else this.drawStrip(view);
@@ -212,7 +220,7 @@ class Viewer {
       const canvas = make("canvas", { "aria-hidden": "true" });
       canvas.style.aspectRatio = `${this.scene.width} / ${this.scene.height}`;
       const button = make("button", { type: "button", "data-value": value, title: surface?.text ?? "" },
-        canvas,
+        make("span", { className: "picture" }, canvas, make("span", { className: "silent" })),
         make("span", { className: "text", textContent: surface?.label ?? "photo" }),
         make("span", { className: "which text" }));
       button.addEventListener("click", (event) => this.setSide(event.shiftKey ? "left" : "right", value));
@@ -232,6 +240,7 @@ class Viewer {
       const key = `${this.state.view} ${surface ? this.state.weights : ""}`;
       if (canvas.dataset.drawn !== key) {
         this.drawThumb(canvas, surface, view);
+        find(".silent", button).textContent = silence(view, surface);
         canvas.dataset.drawn = key;
       }
       const sides = ["left", "right"].filter((side) => this.state[side] === value);
@@ -269,8 +278,12 @@ class Viewer {
 
   writeScale(element, name, view) {
     const { text } = this.unitOf(name);
+    if (name === "expectedError") {
+      colourBar(element, this.colours[view.colours], ["0", "expected error of the depth", `\u2265 ${text(view.high)}`], 128);
+      return;
+    }
     const ends = name === "depth" ? [`\u2264 ${text(view.low)}`, "depth", `\u2265 ${text(view.high)}`]
-      : name === "angle" ? ["0\u00b0", "30\u00b0", "\u2265 60\u00b0"]
+      : view.colours === "angle" ? ["0\u00b0", name === "angle" ? "30\u00b0" : "expected error of the normal", "\u2265 60\u00b0"]
         : [`\u2264 ${text(view.low)}`, "0", `\u2265 ${text(view.high)}`];
     colourBar(element, this.colours[view.colours], ends);
   }
@@ -278,9 +291,10 @@ class Viewer {
   /** Return how values of a kind are written. */
   unitOf(name) {
     if (name === "depth") return { text: (value) => (isMissing(value) ? "hole" : `${number(value, 3)} m`) };
-    if (name === "angle") return { text: (value) => (isMissing(value) ? DASH : `${number(value, 1)}\u00b0`) };
-    const fine = this.scene.error && this.scene.error.limit < 0.02;
-    return { text: (value) => (isMissing(value) ? DASH : fine ? `${signed(1000 * value, 1)} mm` : `${signed(100 * value, 1)} cm`) };
+    if (name === "angle" || name === "expectedAngle") return { text: (value) => (isMissing(value) ? DASH : `${number(value, 1)}\u00b0`) };
+    const [factor, unit] = this.scene.error && this.scene.error.limit < 0.02 ? [1000, "mm"] : [100, "cm"];
+    const written = name === "expectedError" ? number : signed;
+    return { text: (value) => (isMissing(value) ? DASH : `${written(factor * value, 1)} ${unit}`) };
   }
 
   // Scores and errors beside the pictures.
@@ -340,6 +354,10 @@ class Viewer {
       const truth = this.scene.surfaces[this.truth];
       words.push(`normal off by ${this.unitOf("angle").text(probe.angle(surface, i, truth, pixelAt(truth, this.scene, u, v)))}`);
     }
+    if (surface.expected) {
+      const [error, angle] = Object.entries(EXPECTED).map(([name, what]) => this.unitOf(name).text(probe.expected(surface, i, what, this.scene.expected)));
+      words.push(`expected errors: depth ${error}, normal ${angle}`);
+    } else if (this.state.view in EXPECTED && surface.kind !== "truth") words.push(viewOf(this.state.view, this.scene, this.state).silent);
     return words.join(", ");
   }
 
@@ -536,6 +554,9 @@ class Viewer {
     if (entry || !this.scene) this.show(entry ?? this.data.scenes[0]);
   }
 }
+
+/** Return what stands in place of the picture of a surface that a view does not have, "" where it has it. */
+const silence = (view, surface) => (surface !== null && view.has && !view.has(surface) ? view.silent : "");
 
 /** Return where a light comes from, in words. */
 function lightText(light) {

@@ -18,6 +18,7 @@ import numpy as np
 
 from dsr.evaluation.results import Results
 from dsr.geometry.shading import LIGHT_NAMES, lights
+from dsr.report.page.calibration import calibration_data
 from dsr.report.page.content import links, metrics_data, problem_data, run_data
 from dsr.report.page.encoding import LEVELS, Level, Pool, megabytes
 from dsr.report.page.scenes import View, scene_data, views_of
@@ -84,7 +85,7 @@ def save_page(
         notes = [f"pictures: {stored.pool.level.text(stored.pool.reduced)}; {megabytes(stored.pool.size)}", *notes]
     problems = results.problems()
     data = {
-        **_data(path, results, tables, title),
+        **_data(path, results, views, tables, title),
         "notes": [*results.notes, *notes],
         "scenes": [
             {"problem": problems.index(view.problem), "name": view.scene, "data": f"s{number}"}
@@ -135,13 +136,18 @@ def _spread(count: int) -> Iterator[int]:
     yield from (number for number in range(count) if number not in first)
 
 
-def _data(path: Path, results: Results, tables: Sequence[Path] | None, title: str) -> dict[str, Any]:
+def _data(
+    path: Path, results: Results, views: Sequence[View], tables: Sequence[Path] | None, title: str
+) -> dict[str, Any]:
     """Return the data of the page without scenes and pictures."""
     problems = results.problems()
+    own = {problem: [view for view in views if view.problem == problem] for problem in problems}
     return {
         "title": title,
         "metrics": metrics_data(results),
-        "problems": [problem_data(results, problem) for problem in problems],
+        "problems": [
+            {**problem_data(results, problem), "calibration": calibration_data(own[problem])} for problem in problems
+        ],
         "methods": results.methods(),
         "seeds": sorted({run.seed for run in results.runs}),
         "runs": [run_data(run) for run in results.runs],

@@ -6,6 +6,7 @@ The page computes renderings, colours and readouts itself from stored values:
   e4 = (e1 + e2 + e3) / sqrt(3). A value s in [-1, 1] is stored as 255 (s + 1) / 2; the three maps are side by side.
 - Depth is stored linearly between two limits.
 - The error is sign(q - 128) (q - 128)^2 / 127^2 times the largest error, so that small errors have small steps.
+- Expected errors, which have no sign, are q^2 / 255^2 times the largest one.
 - The valid mask is a separate lossless picture, since lossy compression changes every value.
 """
 
@@ -116,6 +117,11 @@ def error_picture(error: np.ndarray, largest: float) -> np.ndarray:
     """Encode (H, W) signed errors as a picture: 128 is zero, 1 and 255 are -``largest`` and ``largest`` or beyond."""
     relative = np.clip(error / largest, -1, 1)
     return (128 + np.rint(127 * np.sign(relative) * np.sqrt(np.abs(relative)))).astype(np.uint8)
+
+
+def expected_picture(error: np.ndarray, largest: float) -> np.ndarray:
+    """Encode (H, W) expected errors, 0 or more, as a picture: 255 is ``largest`` or beyond."""
+    return np.rint(255 * np.sqrt(np.clip(error / largest, 0, 1))).astype(np.uint8)
 
 
 def mask_picture(depth_valid: np.ndarray, normal_valid: np.ndarray) -> np.ndarray | None:

@@ -2,22 +2,33 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import torch
 from torch import Tensor
 
 from dsr.evaluation.results import BenchmarkSetting, Results, Run, one_per_method
 from dsr.geometry.camera import Camera
 from dsr.geometry.shading import lights, shade
-from dsr.report.page.encoding import Pool, depth_picture, error_picture, mask_picture, shading_picture
+from dsr.geometry.surface import normal_mask
+from dsr.report.page.encoding import (
+    Pool,
+    depth_picture,
+    error_picture,
+    expected_picture,
+    mask_picture,
+    shading_picture,
+)
 from dsr.sample import DepthSample
 from dsr.viz.panels import limits_of, normals_seen_by
 
 _LEAST_ERROR = 1e-4
 """Minimum limit of the error colours, metres."""
+_LEAST_ANGLE = 0.1
+"""Minimum of the largest stored angle, degrees."""
 
 
 @dataclass(frozen=True)
@@ -30,12 +41,21 @@ class View:
 
 
 @dataclass(frozen=True)
-class _Result:
-    """The prediction of a method, (1, H, W) in metres."""
+class Result:
+    """The prediction of a method.
+
+    Args:
+        label: name of the method.
+        seed: of the run.
+        depth: (1, H, W) in metres, NaN in holes.
+        errors: expected errors of depth in metres and of normals in degrees, (1, H, W); None without them.
+
+    """
 
     label: str
     seed: int | None
     depth: Tensor
+    errors: tuple[Tensor, Tensor] | None
 
 
 def views_of(results: Results) -> list[View]:
@@ -62,10 +82,10 @@ def scene_data(view: View, pool: Pool, notes: list[str]) -> dict[str, Any] | Non
         Values that JSON can represent; None if no run has stored the scene.
 
     """
-    stored = _stored(view, notes)
+    stored = stored_sample(view, notes)
     if stored is None:
         return None
-    predictions = _results(view, stored, notes)
+    predictions = results_of(view, stored, notes)
     reference = stored.depth if stored.depth is not None else (predictions[0].depth if predictions else stored.depth_lr)
     low, high = limits_of(reference)
     data: dict[str, Any] = {
@@ -75,9 +95,18 @@ def scene_data(view: View, pool: Pool, notes: list[str]) -> dict[str, Any] | Non
         "depth": [low, high],
         "photo": _photo(stored.rgb, pool),
     }
+    expected = [each.errors for each in predictions if each.errors is not None]
     largest = None
     if stored.depth is not None:
         largest, data["error"] = _error_limits([each.depth - stored.depth for each in predictions])
+    elif expected:  # the colours of expected errors are those of measured ones
+        _, data["error"] = _error_limits([depth_error for depth_error, _ in expected])
+    if expected:
+        depth_errors, angle_errors = zip(*expected, strict=True)
+        data["expected"] = {
+            "depth": _largest(depth_errors, _LEAST_ERROR),
+            "angle": _largest(angle_errors, _LEAST_ANGLE),
+        }
     size_lr = f"{stored.camera_lr.width} x {stored.camera_lr.height}"
     surfaces = [
         {"label": "input", "kind": "input", "text": size_lr, **_surface(stored.depth_lr, stored.camera_lr, data, pool)}
@@ -86,6 +115,8 @@ def scene_data(view: View, pool: Pool, notes: list[str]) -> dict[str, Any] | Non
         surface = _surface(each.depth, stored.camera, data, pool)
         if stored.depth is not None and largest is not None:
             surface["error"] = _error(each.depth - stored.depth, largest, pool)
+        if each.errors is not None:
+            surface["expected"] = _expected(each.depth, each.errors, data["expected"], pool)
         text = "" if each.seed is None else f"seed {each.seed}"
         surfaces.append({"label": each.label, "kind": "method", "text": text, **surface})
     if stored.depth is not None:
@@ -93,8 +124,8 @@ def scene_data(view: View, pool: Pool, notes: list[str]) -> dict[str, Any] | Non
     return {**data, "surfaces": surfaces}
 
 
-def _stored(view: View, notes: list[str]) -> DepthSample | None:
-    """Return the scene from the first run that has stored it."""
+def stored_sample(view: View, notes: list[str]) -> DepthSample | None:
+    """Return the scene from the first run that has stored it, None if none has; ``notes`` takes the reasons."""
     for run in view.runs:
         if run.has_sample(view.scene):
             try:
@@ -108,12 +139,12 @@ def _stored(view: View, notes: list[str]) -> DepthSample | None:
     return None
 
 
-def _results(view: View, stored: DepthSample, notes: list[str]) -> list[_Result]:
-    """Return the predictions that have the size of the scene."""
+def results_of(view: View, stored: DepthSample, notes: list[str]) -> list[Result]:
+    """Return the predictions that have the size of the scene; ``notes`` takes the others."""
     found = []
     for run in view.runs:
         try:
-            depth = run.prediction(view.scene)
+            depth, errors = run.prediction(view.scene), run.expected_errors(view.scene)
         except (ValueError, OSError) as error:
             notes.append(str(error))
             continue
@@ -121,7 +152,11 @@ def _results(view: View, stored: DepthSample, notes: list[str]) -> list[_Result]
         if tuple(depth.shape) != size:
             notes.append(f"{run.folder.name}: {view.scene}: expected a prediction of {size}, got {tuple(depth.shape)}")
             continue
-        found.append(_Result(run.label, run.seed, depth.double()))
+        if errors is not None and not all(tuple(each.shape) == size for each in errors):
+            shapes = " and ".join(str(tuple(each.shape)) for each in errors)
+            notes.append(f"{run.folder.name}: {view.scene}: expected errors of {size}, got {shapes}")
+            errors = None
+        found.append(Result(run.label, run.seed, depth.double(), errors))
     return found
 
 
@@ -157,15 +192,37 @@ def _error(difference: Tensor, largest: float, pool: Pool) -> dict[str, str]:
     return stored if mask is None else {**stored, "mask": pool.add(mask, exact=True)}
 
 
+def _expected(depth: Tensor, errors: tuple[Tensor, Tensor], largest: Mapping[str, float], pool: Pool) -> dict[str, str]:
+    """Store the expected errors, (1, H, W) in metres and degrees, where the depth and its normals are known."""
+    known = depth.isfinite()
+    valid = {"depth": known, "angle": normal_mask(known) if min(known.shape[-2:]) > 1 else torch.zeros_like(known)}
+    stored, fitted = {}, []
+    for (name, where), error in zip(valid.items(), errors, strict=True):
+        values, inside = pool.fit(error[0].double().numpy(), (where & error.isfinite())[0].numpy())
+        stored[name] = pool.add(expected_picture(values, largest[name]))
+        fitted.append(inside)
+    mask = mask_picture(*fitted)
+    return stored if mask is None else {**stored, "mask": pool.add(mask, exact=True)}
+
+
 def _error_limits(differences: Sequence[Tensor]) -> tuple[float, dict[str, float]]:
     """Return the largest stored error, and the page's error limits; the same for all methods.
 
     The largest is the 99.9th percentile of the worst method, the limit of the colours the 98th of the median method.
     """
-    sizes = [difference[difference.isfinite()].abs().numpy() for difference in differences]
-    sizes = [values for values in sizes if values.size]
-    largest = max((float(np.percentile(values, 99.9)) for values in sizes), default=0.0)
+    sizes = _sizes(differences)
     limit = float(np.median([np.percentile(values, 98) for values in sizes])) if sizes else 0.0
     limit = max(limit, _LEAST_ERROR)
-    largest = max(largest, limit)
+    largest = _largest(differences, limit)
     return largest, {"largest": largest, "limit": limit}
+
+
+def _largest(errors: Sequence[Tensor], least: float) -> float:
+    """Return the 99.9th percentile of the errors' sizes for the worst method, at least ``least``."""
+    return max([least, *(float(np.percentile(values, 99.9)) for values in _sizes(errors))])
+
+
+def _sizes(errors: Sequence[Tensor]) -> list[np.ndarray]:
+    """Return the sizes of the known errors of each map that has any."""
+    sizes = [error[error.isfinite()].abs().numpy() for error in errors]
+    return [values for values in sizes if values.size]

@@ -1,4 +1,4 @@
-"""Resize inverse depth to the photo's size without blurring depth steps.
+"""Resize and pad inverse depth without blurring depth steps.
 
 Along each axis, a line is fitted to the old pixels around each new one, with triangular weights wide enough for
 antialiasing; the new pixel is the value of the line at its centre. Planes, whose inverse depth is linear in the pixel,
@@ -49,6 +49,21 @@ def resize_inverse_depth(inverse: Tensor, size: tuple[int, int], jump: float = J
         strip.index -= read.start
         parts.append(_resize_strip(inverse[:, read], strip, columns, jump))
     return torch.cat(parts, dim=-2)
+
+
+def pad_inverse_depth(inverse: Tensor, factor: int) -> Tensor:
+    """Pad inverse depth, (..., H, W), at the right and the bottom to a multiple of a factor; planes are continued."""
+    for dim in (-2, -1):
+        more, size = -inverse.shape[dim] % factor, inverse.shape[dim]
+        if not more:
+            continue
+        last = inverse.narrow(dim, size - 1, 1)
+        slope = (last - inverse.narrow(dim, max(size - 1 - factor, 0), 1)) / min(factor, max(size - 1, 1))
+        slope = torch.where(slope.abs() * factor <= 0.1 * last, slope, 0)  # a depth step or a hole, not a plane
+        steps = torch.arange(1, more + 1, dtype=inverse.dtype, device=inverse.device)
+        further = last + slope * (steps[:, None] if dim == -2 else steps)
+        inverse = torch.cat((inverse, further), dim)
+    return inverse
 
 
 class _Axis:

@@ -1,0 +1,146 @@
+"""Draw what ``degradation=everything`` makes of training patches, kind by kind, and maps of real sensors below.
+
+    python benchmarks/degradations.py -o sheet.png [--shared DIR] [--scale 4] [--columns 4] [--seed 0]
+
+Each pair of pictures is a true surface and the low-resolution map made of it, both lit from one side; above the map are
+its noise as a share of depth and the share of its holes. Where the photo is changed, it is shown before and after.
+``DIR`` has ``real/ddrnet``, ``real/rgbdd_real`` and ``real/iphone_lidar``, whose photos stand in for the truth.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from dsr.data.ddrnet import DDRNetFrames
+from dsr.data.formats.shared import read_16bit, read_picture
+from dsr.data.procedural import Procedural
+from dsr.data.rgbdd import RGBDD
+from dsr.degradation.everything import Everything
+from dsr.geometry.camera import Camera
+from dsr.report.figures.scenes import rendering
+from dsr.training.augmentation import soften
+
+SIDE = 256
+"""Pixels of a patch, along an axis."""
+GROUPS = ("kernels", "noises", "holes")
+FRACTIONS = ("folds", "relief", "displaced", "rounded", "soft", "photo", "textured")
+
+
+@dataclass(frozen=True)
+class Pair:
+    """Two pictures and what to write above them."""
+
+    left: np.ndarray
+    right: np.ndarray
+    titles: tuple[str, str]
+
+
+def kinds() -> list[str]:
+    """Return the names of all kinds of degradations, and of the fractions that are a kind of their own."""
+    groups = [name for group in GROUPS for name in getattr(Everything(), group) if name != "none"]
+    return [*dict.fromkeys(groups), *FRACTIONS]
+
+
+def only(kind: str) -> Everything:
+    """Return the distribution of one kind of degradation."""
+    shares = {group: {"none": 1.0} for group in GROUPS} | {"kernels": {"box": 1.0}}
+    shares |= {group: {kind: 1.0} for group in GROUPS if kind in getattr(Everything(), group)}
+    if kind == "displaced":  # happens to noisy maps
+        shares["noises"] = {"correlated": 1.0}
+    return Everything(**shares, **{name: float(name == kind) for name in FRACTIONS}, told=1)  # type: ignore[arg-type]
+
+
+def synthetic(kind: str, scale: int, columns: int, seed: int) -> list[Pair]:
+    """Return pairs of one kind of degradation: the truth and the map, or both photos where those are changed."""
+    everything, source = only(kind), Procedural()
+    generator, pairs = torch.Generator().manual_seed(seed), []
+    for number in range(columns):
+        scene = source.load(source.scenes()[7 * number + seed])
+        patch = scene.crop(100, 100, SIDE, SIDE)
+        if kind == "soft":
+            patch = soften(patch, 1.0, halve=False)
+        sample, hints = everything(patch, scale, generator)
+        assert sample.depth is not None  # noqa: S101 - for the type checker
+        if kind in ("photo", "textured"):
+            pairs.append(Pair(_shown(patch.rgb), _shown(sample.rgb), ("as rendered", kind)))
+            continue
+        left = rendering(sample.depth.double(), patch.camera, "e1")
+        right = rendering(sample.depth_lr.double(), sample.camera_lr, "e1")
+        noise = 100 * float(hints.noise.square().mean().sqrt())
+        holes = float(sample.depth_lr.isnan().float().mean())
+        titles = f"{kind}, {float(sample.depth.nanmedian()):.1f} m", f"{noise:.2f} %, holes {holes:.2f}"
+        pairs.append(Pair(left, right, titles))
+    return pairs
+
+
+def _shown(rgb: torch.Tensor) -> np.ndarray:
+    return rgb.permute(1, 2, 0).numpy()
+
+
+def real(shared: Path, columns: int) -> list[list[Pair]]:
+    """Return pairs of photos and maps of real sensors."""
+    rows = []
+    folder = shared / "real"
+    sources = DDRNetFrames(str(folder / "ddrnet"), "found"), RGBDD(str(folder / "rgbdd_real"), True, scenes="found")
+    for source in sources:
+        pairs = []
+        for name in source.scenes()[:columns]:
+            scene = source.load(name)
+            [(ratio, depth)] = scene.measured.items()
+            camera = scene.camera.reduce(depth.shape[-1], depth.shape[-2]) if ratio != 1 else scene.camera
+            pairs.append(
+                Pair(_shown(scene.rgb), rendering(depth, camera, "e1"), (f"{source.name} {name}", f"x{ratio:.3g}"))
+            )
+        rows.append(pairs)
+    phone = folder / "iphone_lidar"
+    levels, picture = read_16bit(phone / "arkit_depth.png"), read_picture(phone / "image.jpg")
+    height, width = levels.shape
+    values = torch.from_numpy(np.where(levels > 0, levels / 1000, np.nan))[None]
+    camera = Camera.centred(width, height, 1440 * width / picture.shape[-1])
+    shown = cv2.resize(picture.permute(1, 2, 0).numpy(), (width, height))
+    rows.append([Pair(shown, rendering(values, camera, "e1"), ("iphone_lidar", f"{height} x {width}"))])
+    return rows
+
+
+def draw(rows: list[list[Pair]], path: Path) -> None:
+    """Write the sheet."""
+    columns = max(map(len, rows))
+    figure = Figure(figsize=(3.6 * columns, 1.95 * len(rows)), layout="constrained")
+    FigureCanvasAgg(figure)
+    for row, pairs in enumerate(rows):
+        for column, pair in enumerate(pairs):
+            for side, (image, title) in enumerate(zip((pair.left, pair.right), pair.titles, strict=True)):
+                axes = figure.add_subplot(len(rows), 2 * columns, 2 * (row * columns + column) + side + 1)
+                axes.imshow(image, cmap="gray", vmin=0, vmax=1, interpolation="nearest")
+                axes.set_title(title, fontsize=7)
+                axes.set_axis_off()
+    figure.savefig(path, dpi=110)
+
+
+def main() -> None:
+    """Draw the sheet."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("-o", "--output", type=Path, required=True)
+    parser.add_argument("--shared", type=Path, default=Path(os.environ.get("DSR_SHARED", "../shared")))
+    parser.add_argument("--scale", type=int, default=4)
+    parser.add_argument("--columns", type=int, default=4)
+    parser.add_argument("--seed", type=int, default=0)
+    options = parser.parse_args()
+    rows = [synthetic(kind, options.scale, options.columns, options.seed) for kind in kinds()]
+    if (options.shared / "real").is_dir():
+        rows += real(options.shared, options.columns)
+    draw(rows, options.output)
+    print(options.output)
+
+
+if __name__ == "__main__":
+    main()

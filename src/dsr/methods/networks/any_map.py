@@ -1,0 +1,215 @@
+"""The method around :class:`~dsr.methods.networks.facets_unet.FacetsUNet`: maps of any ratio, told or estimated noise.
+
+There are weights for maps whose size is the photo's over 1 and 2, over 4, over 8 and over 16. For any other ratio the
+photo is resized to a multiple of the map, and the result to the photo's size.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import ClassVar, Literal, get_args
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from dsr.degradation.downsampling import Kernel
+from dsr.degradation.hints import encode_facts, local_noise, relative_error
+from dsr.geometry.camera import RangeType
+from dsr.geometry.resampling import pad_inverse_depth, resize_inverse_depth
+from dsr.methods.base import Cost, MapNoise, Ratios, Surface
+from dsr.methods.networks.base import DTYPES, DisparityNetwork, Precision
+from dsr.methods.networks.facets_unet import Answer, FacetsUNet
+from dsr.methods.networks.trained import NETWORKS
+from dsr.methods.networks.weight_files import clean_weights, load_network
+from dsr.sample import DepthSample
+from dsr.utils.progress import Steps
+
+Edges = Literal["auto", "sharp", "soft"]
+_TOLERANCE = 0.02
+"""A map is taken for one of the photo's own size up to this relative difference."""
+
+
+class AnyMap:
+    """An :class:`~dsr.methods.base.Upsampler` of maps of any ratio, kernel and noise.
+
+    Args:
+        net: the network; it is used as it is.
+        noise: standard deviation of the map's depth in metres, the same everywhere; None if it is not known.
+        smooth: 0 takes the map for free of noise, 2 its noise for twice as large as estimated; 1 is neutral.
+        edges: whether the result's depth steps are to be ``sharp`` or ``soft``, a pixel's value then being a mean over
+            its area; ``auto``: as the map shows.
+        kernel: of the downsampling that made the map, if it is known.
+        clean: whether the map is known to have no noise, unless ``noise`` or ``smooth`` say otherwise.
+        max_error: share of the depth; pixels that are expected to be further off are left as holes; None for no limit.
+        device: device of the computations.
+
+    Raises:
+        ValueError: a value is out of range.
+
+    """
+
+    range_type: RangeType = "disparity"
+    ratios: ClassVar[Ratios] = "any"
+    own_resolution: ClassVar[bool] = True
+    tolerant: ClassVar[bool] = True
+    """Convolutions in bfloat16 change its scores in the fourth digit only."""
+    cost: ClassVar[Cost] = Cost(250, 2.5)
+
+    def __init__(
+        self,
+        net: FacetsUNet,
+        noise: float | None = None,
+        smooth: float = 1.0,
+        edges: Edges = "auto",
+        kernel: Kernel | None = None,
+        clean: bool = False,
+        max_error: float | None = None,
+        device: torch.device | str = "cpu",
+    ) -> None:
+        if noise is None and clean and smooth == 1:
+            noise = 0.0
+        if edges not in get_args(Edges):
+            raise ValueError(f"edges: expected one of {', '.join(get_args(Edges))}, got {edges}")
+        if not 0 <= smooth <= 2:
+            raise ValueError(f"smooth: expected a number from 0 to 2, got {smooth}")
+        if noise is not None and not 0 <= noise < 1:
+            raise ValueError(f"noise: expected metres, 0 or more and less than 1, got {noise}")
+        if max_error is not None and not max_error > 0:
+            raise ValueError(f"max_error: expected a positive share of the depth, got {max_error}")
+        self._max_error = max_error
+        self._net = net.to(device, memory_format=torch.channels_last)  # type: ignore[call-overload]  # torch's stubs
+        self._device, self._noise, self._smooth = torch.device(device), noise, smooth
+        self._facts = encode_facts(kernel, None if edges == "auto" else edges == "soft")[None]
+
+    @torch.no_grad()
+    def __call__(self, sample: DepthSample, progress: Steps | None = None) -> Tensor:
+        """Return the high-resolution depth, (1, H, W) in metres on the sample's device."""
+        return self.surface(sample, progress).depth
+
+    @torch.no_grad()
+    def surface(self, sample: DepthSample, progress: Steps | None = None) -> Surface:
+        """Return the high-resolution depth with its expected errors, and the noise of the low-resolution map."""
+        inverse = sample.depth_lr.to(self._device).reciprocal()[None]
+        size = sample.rgb.shape[-2:]
+        factor = self._factor(sample.scale)
+        rows, columns = inverse.shape[-2:]
+        rgb = _resize(sample.rgb.to(self._device).float()[None], (factor * rows, factor * columns)).clamp(0, 1)
+        padded = inverse
+        if factor == 1:  # in pairs
+            rgb = functional.pad(rgb, (0, columns % 2, 0, rows % 2), mode="replicate")
+            padded = pad_inverse_depth(inverse, 2)
+        level = None if self._noise is None else (self._noise * padded).nan_to_num(0)
+        passes = 1
+        if self._smooth != 1:
+            if level is None:
+                passes = 2
+                level = local_noise(padded, self._answer(rgb, padded, None, _half(progress, 0)).disparity)
+            level = self._smooth * level
+        answer = self._answer(rgb, padded, level, progress if passes == 1 else _half(progress, 1))
+        noise = _describe_noise(padded, answer)
+        inside = (..., slice(factor * rows), slice(factor * columns))
+        result = resize_inverse_depth(answer.disparity[inside][0], (size[0], size[1]))
+        depth = torch.where(result > 0, result, torch.nan).reciprocal().to(sample.depth_lr.device)
+        errors = (_resize(each[inside], (size[0], size[1]))[0].to(depth) for each in (answer.spread, answer.angle))
+        spread, angle = errors
+        if self._max_error is not None:
+            depth = depth.masked_fill(spread > self._max_error, torch.nan)
+        return Surface(depth, spread * depth, torch.rad2deg(angle), noise)
+
+    def _factor(self, ratio: float) -> int:
+        """Return the factor at which the network is run for a ratio of the sizes."""
+        return 1 if self._net.serves(self._net.scale, 1) and ratio <= 1 + _TOLERANCE else self._net.scale
+
+    def _answer(self, rgb: Tensor, inverse: Tensor, noise: Tensor | None, progress: Steps | None) -> Answer:
+        """Return the network's answer, told the noise if there is any to tell."""
+        facts = self._facts.to(self._device).clone()
+        facts[0, -1] = noise is not None
+        return self._net.answer(rgb, inverse, None if noise is None else noise.float(), facts, progress)
+
+
+def build_any_map(
+    weights: Path,
+    model: str = "facets",
+    noise: float | None = None,
+    smooth: float = 1.0,
+    edges: Edges = "auto",
+    kernel: Kernel | None = None,
+    clean: bool = False,
+    max_error: float | None = None,
+    precision: Precision = "float32",
+    device: torch.device | str = "cpu",
+    networks: Mapping[str, type[DisparityNetwork]] = NETWORKS,
+) -> AnyMap:
+    """Build the method from a file that ``train.py model=facets`` wrote.
+
+    Of maps that are told to be box means without noise, with sharp depth steps, the result is computed with the weights
+    for them, if the file names one with such weights.
+
+    Args:
+        weights: the file.
+        model: name of the model that it must contain.
+        noise: see :class:`AnyMap`, also for the next ones.
+        smooth: see there.
+        edges: see there.
+        kernel: see there.
+        clean: see there.
+        max_error: see there.
+        precision: dtype of the convolutions.
+        device: device of the computations.
+        networks: network classes by their names in weights files.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: the file is damaged or of another model, or a value is out of range.
+
+    """
+    weights = Path(weights)
+    if kernel == "box" and edges == "sharp" and clean and noise is None and smooth == 1:
+        weights = clean_weights(weights) or weights
+    net = load_network(weights, networks, None, model)
+    if not isinstance(net, FacetsUNet):
+        raise ValueError(
+            f"{weights}: expected weights of {FacetsUNet.__name__}, got those of {type(net).__name__}, which "
+            "method=facets_box takes"
+        )
+    net = net.eval().requires_grad_(False).to(DTYPES[precision])
+    return AnyMap(net, noise, smooth, edges, kernel, clean, max_error, device)
+
+
+def _half(progress: Steps | None, before: int) -> Steps | None:
+    """Return the progress of the first or the second of two passes of the same number of steps."""
+    return None if progress is None else lambda done, total: progress(before * total + done, 2 * total)
+
+
+def _describe_noise(given: Tensor, answer: Answer) -> MapNoise:
+    """Return the noise of a map, from its difference to the result where that is smooth."""
+    error, known = relative_error(given, answer.disparity)
+    scale = answer.disparity.shape[-1] // given.shape[-1]
+    calm = functional.avg_pool2d(answer.angle, scale)
+    known = known * (calm <= calm.flatten().median())
+    count = known.sum().clamp(min=1)
+    error = (error - (error * known).sum() / count) * known
+    variance = error.square().sum() / count
+    depth = given[given.isfinite()].median().reciprocal()
+    return MapNoise(float(variance.sqrt() * depth), _extent(error, known, float(variance)))
+
+
+def _extent(error: Tensor, known: Tensor, variance: float) -> float:
+    """Return the full width at half maximum of the correlation of neighbours, in pixels, 1 for white noise."""
+    before = 1.0
+    for step in range(1, min(16, error.shape[-1])):
+        both = (known[..., step:] * known[..., :-step]).sum().clamp(min=1)
+        now = float((error[..., step:] * error[..., :-step]).sum() / both) / max(variance, 1e-20)
+        if now < 0.5:
+            return max(1.0, 2 * (step - 1 + (before - 0.5) / max(before - now, 1e-6)))
+        before = now
+    return 2.0 * 16
+
+
+def _resize(x: Tensor, size: tuple[int, int]) -> Tensor:
+    """Return (B, C, *size), bilinear, antialiased where it shrinks."""
+    if tuple(x.shape[-2:]) == tuple(size):
+        return x
+    return functional.interpolate(x, size, mode="bilinear", align_corners=False, antialias=True)

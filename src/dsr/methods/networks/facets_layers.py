@@ -1,0 +1,148 @@
+"""Layers of the networks of planes: residual blocks, a U-net at the low resolution, the pyramid of the photo."""
+
+from __future__ import annotations
+
+import itertools
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+FULL, HALF = 16, 32
+"""Channels of the photo's features at the full and at half the resolution."""
+HEAD = 24
+"""Channels of the layers that choose the planes, at the full resolution."""
+
+
+class Pyramid(NamedTuple):
+    """Layers from the photo's resolution to the map's, ``photo`` and ``down``, and back, ``up`` and ``join``."""
+
+    photo: nn.Conv2d
+    down: nn.ModuleList
+    up: nn.ModuleList
+    join: nn.ModuleList
+
+
+def make_pyramid(levels: int, width: int, inputs: int = 4) -> Pyramid:
+    """Return the layers between the photo's resolution and the map's.
+
+    Args:
+        levels: how many times the resolution is halved.
+        width: channels at the map's resolution.
+        inputs: channels of the photo.
+
+    """
+    channels = [*[FULL, HALF, width, width][:levels], width]
+    outputs = [HEAD, *channels[1:-1]]
+    return Pyramid(
+        nn.Conv2d(inputs, channels[0], 5, padding=2),
+        nn.ModuleList(nn.Conv2d(a, b, 4, stride=2, padding=1) for a, b in itertools.pairwise(channels)),
+        nn.ModuleList(nn.Conv2d(channels[i + 1], 4 * outputs[i], 1) for i in reversed(range(levels))),
+        nn.ModuleList(nn.Conv2d(outputs[i] + channels[i], outputs[i], 3, padding=1) for i in reversed(range(levels))),
+    )
+
+
+class Residual(nn.Module):
+    """x + conv(relu(conv(x))), initialised close to the identity."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.first = nn.Conv2d(width, width, 3, padding=1)
+        self.second = nn.Conv2d(width, width, 3, padding=1)
+        with torch.no_grad():
+            self.second.weight.mul_(0.3)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Map (B, C, h, w) to the same shape."""
+        return x + self.second(functional.relu(self.first(x)))
+
+
+class MixedResidual(nn.Module):
+    """A residual block whose weights are a mixture of two sets, scaled and shifted; another one for each image."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.ways = nn.ModuleList(Residual(width) for _ in range(2))
+        self.ways[1].load_state_dict(self.ways[0].state_dict())
+
+    def forward(self, x: Tensor, shares: Tensor, gains: Tensor, shifts: Tensor) -> Tensor:
+        """Map (B, C, h, w) to the same shape.
+
+        Args:
+            x: (B, C, h, w).
+            shares: (B,) share of the second set.
+            gains: (B, C) by which the features after the first convolution are multiplied, minus 1.
+            shifts: (B, C) what is added to them.
+
+        """
+        each = zip(x.split(1), shares.float(), 1 + gains.float(), shifts.float(), strict=True)
+        return torch.cat([self._map(*parts) for parts in each])
+
+    def _map(self, x: Tensor, share: Tensor, gain: Tensor, shift: Tensor) -> Tensor:
+        """Map one image; gain and shift become part of the convolution."""
+        mixed = [
+            torch.lerp(one.float(), other.float(), share) for one, other in zip(*self._parameters_of(), strict=True)
+        ]
+        weights = [mixed[0] * gain.view(-1, 1, 1, 1), torch.addcmul(shift, mixed[1], gain), *mixed[2:]]
+        first, first_bias, second, second_bias = (each.to(x.dtype) for each in weights)
+        hidden = functional.relu(functional.conv2d(x, first, first_bias, padding=1))
+        return x + functional.conv2d(hidden, second, second_bias, padding=1)
+
+    def _parameters_of(self) -> list[list[Tensor]]:
+        """Return the weights and biases of both convolutions, for both sets."""
+        return [list(way.parameters()) for way in self.ways]
+
+
+class Context(nn.Module):
+    """What a U-net adds to the trunk, nothing at first; its coarsest level is an eighth, and knows its mean."""
+
+    def __init__(self, width: int, deep: int) -> None:
+        super().__init__()
+        widths = (width, deep, deep, deep)
+        self.shrink = nn.ModuleList(nn.Conv2d(a, b, 2, stride=2) for a, b in itertools.pairwise(widths))
+        self.encoder = nn.ModuleList(nn.Sequential(Residual(deep), Residual(deep)) for _ in widths[1:])
+        self.overall = silence(nn.Linear(deep, deep))
+        self.grow = nn.ModuleList(nn.Conv2d(deep, 4 * a, 1) for a in widths[:-1])
+        self.decoder = nn.ModuleList(Residual(deep) for _ in widths[1:-1])
+        silence(self.grow[0])
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Map (B, C, h, w) to the same shape; the sizes are padded to multiples of eight."""
+        height, width = x.shape[-2:]
+        x = functional.pad(x, (0, -width % 8, 0, -height % 8), mode="replicate")
+        kept = []
+        for shrink, encode in zip(self.shrink, self.encoder, strict=True):
+            x = encode(functional.relu(shrink(x)))
+            kept.append(x)
+        x = x + self.overall(x.mean(dim=(-2, -1)))[..., None, None]
+        for i in (2, 1):
+            x = self.decoder[i - 1](functional.relu(kept[i - 1] + functional.pixel_shuffle(self.grow[i](x), 2)))
+        return functional.pixel_shuffle(self.grow[0](x), 2)[..., :height, :width]
+
+
+def scale_down(conv: nn.Conv2d) -> nn.Conv2d:
+    """Return the convolution with small initial weights."""
+    with torch.no_grad():
+        conv.weight.mul_(0.1)
+    if conv.bias is not None:
+        nn.init.zeros_(conv.bias)
+    return conv
+
+
+def silence(layer: nn.Module) -> Any:
+    """Return a layer whose results are 0 at first."""
+    for parameter in layer.parameters():
+        nn.init.zeros_(parameter)
+    return layer
+
+
+def mean_colour(rgb: Tensor) -> Tensor:
+    """Return the mean colour of images, (B, 3, 1, 1)."""
+    return rgb.mean(dim=(-2, -1), keepdim=True)
+
+
+def photo_input(rgb: Tensor, mean: Tensor | None = None) -> Tensor:
+    """Return (B, 4, H, W): the colours, and the brightness relative to the image's mean."""
+    brightness = (rgb - (mean_colour(rgb) if mean is None else mean)).mean(dim=1, keepdim=True)
+    return torch.cat((rgb - 0.5, 2 * brightness), dim=1)

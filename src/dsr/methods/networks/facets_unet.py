@@ -1,0 +1,426 @@
+"""Facets with context: a network for low-resolution maps of any kernel and noise, which says how sure it is.
+
+It is :mod:`dsr.methods.networks.facets`, where low-resolution pixels propose planes and high-resolution pixels mix the
+planes of the 3 x 3 low-resolution pixels around them, and can start from its weights. What is new:
+
+- **Context.** Within the trunk, a U-net sees the low-resolution grid down to an eighth of its size (Ronneberger,
+  Fischer, Brox, *U-Net*, MICCAI 2015), and the mean of that.
+- **Noise.** The value and the slopes of a plane are a choice among those of the map itself and of three smoothed copies
+  of it. Then planes are averaged with those around them, extended to the pixel, with weights that the network chooses,
+  in five steps of 1 to 16 pixels: a wall may become one plane over 60 pixels, and an edge stays where the weights end.
+  How rough the whole map is, at four resolutions, is an input, as are the hints: both scale and shift the features of
+  each block (Perez et al., *FiLM*, AAAI 2018), and mix its weights from two sets, so that noisy maps do not cost clean
+  ones their weights (Yang et al., *CondConv*, NeurIPS 2019).
+- **Hints.** The network may be told what is known of the map: the noise of each pixel (Zhang et al., *FFDNet*, TIP
+  2018), the kernel that made it, and whether depth steps are sharp. Each hint may be missing.
+- **Exact means.** Where the kernel is told, its residual is added to the result twice (back-projection: Irani, Peleg,
+  *Improving Resolution by Image Registration*, CVGIP 1991), multiplied by a factor that the network chooses per pixel.
+- **Maps of the photo's own size.** They are averaged over 2 x 2 pixels for the trunk, and seen at full resolution by
+  the layers that choose the planes. The weights are those of factor 2.
+- **Confidence.** Two more outputs are the expected error of the logarithm of disparity and that of the normal.
+
+The layers at the low resolution are alike for all factors, so that they can be taken from a training for another one.
+
+Disparity is divided by its median, so that the result does not depend on the unit; planes are reproduced exactly.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from dsr.degradation.downsampling import Downsampling
+from dsr.degradation.hints import FACTS, KERNELS
+from dsr.methods.classical.finite_differences import repeat_blocks
+from dsr.methods.networks.base import DisparityNetwork, expect_rgb_size
+from dsr.methods.networks.facets import Facets
+from dsr.methods.networks.facets_layers import (
+    HEAD,
+    Context,
+    MixedResidual,
+    make_pyramid,
+    photo_input,
+    scale_down,
+    silence,
+)
+from dsr.methods.networks.facets_planes import NEIGHBOURS, Stencil, average_planes, mix_planes, smooth, stencil
+from dsr.methods.networks.facets_start import start_from_another_factor, start_from_facets
+from dsr.methods.networks.inpainting import inpaint
+from dsr.methods.networks.maps import upsample_bicubic
+from dsr.utils.progress import Steps
+
+_SHARED = ("coarse", "hints", "modulation", "shares", "trunk", "wide", "planes", "blend")
+"""Layers at the low resolution."""
+_LEVELS = 3
+"""Smoothed copies of the map."""
+_LR_CHANNELS = 10 + 4 * _LEVELS + 3
+_REACHES = (1, 2, 4, 8, 16)
+"""Low-resolution pixels between the planes that are averaged, step by step."""
+_OWN = 8.0
+"""What is added to the logit of a pixel's own plane."""
+_PROJECTIONS = 2
+_CLOSED = -3.0
+"""Logit of the factor of the residual, at first."""
+_BEFORE = 3
+"""Residual blocks before the U-net."""
+_FAINT, _STRONG = 5e-4, 0.125
+"""Relative differences of disparity that become about 1 in the compressed and in the linear inputs."""
+_KINDS = 32
+"""Features of what is known of the whole map."""
+_SLOPE, _ROUGH = 6.0, 0.5
+"""At first the share of a block's second weights is logistic in the roughness, and a half where it is the second."""
+_QUANTILES = (0.1, 0.5)
+_ROUGHNESS = len(_QUANTILES) * (1 + _LEVELS)
+_SAMPLES = 2**16
+"""About how many low-resolution pixels tell how rough a map is."""
+_BAND = 2**20
+"""Pixels of the photo that are processed at a time, beside the trunk, which sees the whole map."""
+_MARGIN = 4
+"""Low-resolution rows beyond a band that its result depends on."""
+
+
+class Answer(NamedTuple):
+    """What the network says of an image: all (B, 1, H, W).
+
+    ``disparity`` in the unit of the input; ``spread``, the expected absolute error of the logarithm of disparity;
+    ``angle``, that of the normal in radians.
+    """
+
+    disparity: Tensor
+    spread: Tensor
+    angle: Tensor
+
+
+class _Band(NamedTuple):
+    """Low-resolution rows: ``rows`` with their margins, and where among them those are that are kept, ``inner``."""
+
+    rows: slice
+    inner: slice
+
+    @classmethod
+    def of(cls, first: int, end: int, height: int) -> _Band:
+        """Return the band of the rows ``first`` to ``end`` of ``height``."""
+        above = max(0, first - _MARGIN)
+        return cls(slice(above, min(end + _MARGIN, height)), slice(first - above, end - above))
+
+
+class FacetsUNet(DisparityNetwork):
+    """The network.
+
+    Args:
+        scale: upsampling factor, 1, 2, 4, 8 or 16; 1 and 2 have the same weights.
+        width: channels of the trunk at the low resolution.
+        deep: channels of its coarser levels.
+        blocks: residual blocks at the low resolution, of two sets of weights each.
+        facets: number of planes that each low-resolution pixel proposes.
+
+    Raises:
+        ValueError: a value is out of range.
+
+    """
+
+    of_inverse_depth = True
+
+    def __init__(self, scale: int = 4, width: int = 96, deep: int = 88, blocks: int = 6, facets: int = 2) -> None:
+        super().__init__()
+        if scale not in (1, 2, 4, 8, 16):
+            raise ValueError(f"scale: expected 1, 2, 4, 8 or 16, got {scale}")
+        if min(width, deep, facets) < 1 or blocks < _BEFORE:
+            raise ValueError(
+                f"model: expected positive sizes and blocks of at least {_BEFORE}, got width {width}, deep {deep}, "
+                f"facets {facets}, blocks {blocks}"
+            )
+        self.scale, self.width, self.deep, self.blocks, self.facets = scale, width, deep, blocks, facets
+        levels = max(scale, 2).bit_length() - 1
+        inputs = 4 + 3 * (levels == 1)
+        self.photo, self.down, up, join = make_pyramid(levels, width, inputs)
+        self.coarse = nn.Conv2d(_LR_CHANNELS, width, 3, padding=1)
+        self.hints = nn.Linear(FACTS + _ROUGHNESS, _KINDS)
+        self.modulation = nn.ModuleList(silence(nn.Linear(_KINDS, 2 * width)) for _ in range(blocks))
+        self.shares = silence(nn.Linear(FACTS + _ROUGHNESS, blocks))
+        with torch.no_grad():  # at first by how rough the map is at its own resolution
+            self.shares.weight[:, FACTS] = _SLOPE
+            self.shares.bias.fill_(-_SLOPE * _ROUGH)
+        self.trunk = nn.ModuleList(MixedResidual(width) for _ in range(blocks))
+        self.wide = Context(width, deep)
+        self.planes = scale_down(nn.Conv2d(width, (1 + _LEVELS + 2 * (3 + _LEVELS) + 3) * facets, 3, padding=1))
+        self.up, self.join = up, join
+        self.choice = scale_down(nn.Conv2d(HEAD, NEIGHBOURS * facets, 3, padding=1))
+        self.errors = scale_down(nn.Conv2d(HEAD, 2, 3, padding=1))
+        self.blend = silence(nn.Conv2d(width, facets * len(_REACHES) * NEIGHBOURS, 3, padding=1))
+        self.gate = silence(nn.Conv2d(HEAD, 1, 3, padding=1))
+
+    @classmethod
+    def serves(cls, trained: int, scale: int) -> bool:
+        """Return whether weights trained for a factor are for another one, too."""
+        return max(trained, 2) == max(scale, 2)
+
+    @torch.no_grad()
+    def start_from(self, first: DisparityNetwork) -> None:
+        """Take over the weights of a trained network for the same or another factor, or of Facets.
+
+        From Facets for the same factor, the results for clean maps are nearly the same. Where the factors differ, so do
+        the photo's layers.
+
+        Raises:
+            ValueError: it is another kind of network, or of another size.
+
+        """
+        sizes = {key: self.arguments()[key] for key in ("width", "blocks", "facets")}
+        theirs = {key: first.arguments().get(key) for key in sizes}
+        if not isinstance(first, Facets | FacetsUNet) or theirs != sizes:
+            raise ValueError(
+                f"expected weights of FacetsUNet or Facets with {sizes}, got those of {type(first).__name__} "
+                f"{first.arguments()}"
+            )
+        if isinstance(first, Facets):
+            start_from_facets(self, first, _LEVELS)
+        else:
+            start_from_another_factor(self, first)
+
+    @torch.no_grad()
+    def share(self, first: DisparityNetwork) -> None:
+        """Take over the layers at the low resolution from a network for another factor, and do not train them.
+
+        Raises:
+            ValueError: it is another kind of network, or of another size.
+
+        """
+        own = {**self.arguments(), "scale": None}
+        if not isinstance(first, FacetsUNet) or {**first.arguments(), "scale": None} != own:
+            raise ValueError(
+                f"expected weights of FacetsUNet with {own}, got those of {type(first).__name__} {first.arguments()}"
+            )
+        theirs = first.state_dict()
+        for name, parameter in self.named_parameters():
+            if name.split(".")[0] in _SHARED:
+                parameter.copy_(theirs[name])
+                parameter.requires_grad_(False)
+
+    def arguments(self) -> dict[str, Any]:
+        """Return the constructor's arguments."""
+        sizes = {"scale": self.scale, "width": self.width, "deep": self.deep}
+        return {**sizes, "blocks": self.blocks, "facets": self.facets}
+
+    def upsample(self, rgb: Tensor, disparity: Tensor, min_max: Tensor | None = None) -> Tensor:
+        """Return high-resolution disparity; see :meth:`~dsr.methods.networks.base.DisparityNetwork.upsample`."""
+        return self.answer(rgb, disparity).disparity
+
+    def answer(
+        self,
+        rgb: Tensor,
+        disparity: Tensor,
+        noise: Tensor | None = None,
+        hints: Tensor | None = None,
+        progress: Steps | None = None,
+    ) -> Answer:
+        """Return high-resolution disparity and its expected errors.
+
+        Args:
+            rgb: (B, 3, H, W) in [0, 1].
+            disparity: (B, 1, h, w), positive; non-finite values are holes.
+            noise: (B, 1, h, w) standard deviation of the logarithm of disparity; None for not known.
+            hints: (B, ``FACTS``) what is known of the maps; None for nothing.
+            progress: called after each band of rows that is done.
+
+        Raises:
+            ValueError: the photo's size is not a multiple of the map's by a factor of the network.
+
+        """
+        expect_rgb_size(rgb, disparity, 1 if self.scale < 4 and rgb.shape[-1] == disparity.shape[-1] else self.scale)
+        known = disparity.isfinite()
+        unit = disparity.masked_fill(~known, torch.nan).flatten(1).nanmedian(dim=1).values.view(-1, 1, 1, 1)
+        values = inpaint(disparity) / unit
+        batch = disparity.shape[0]
+        if hints is None:
+            hints = disparity.new_zeros((batch, FACTS))
+        if noise is None:
+            noise = torch.zeros_like(values)
+        result, errors = self(rgb, values, known, noise, hints, progress)
+        spread, angle = errors.clamp(-12, 4).exp().split(1, dim=1)
+        return Answer(result * unit, spread, angle)
+
+    def forward(
+        self,
+        rgb: Tensor,
+        values: Tensor,
+        known: Tensor,
+        noise: Tensor,
+        hints: Tensor,
+        progress: Steps | None = None,
+    ) -> tuple[Tensor, Tensor]:
+        """Return high-resolution values, (B, 1, H, W), and the logarithms of both expected errors, (B, 2, H, W).
+
+        Args:
+            rgb: (B, 3, H, W).
+            values: (B, 1, h, w) disparity over its median, without holes.
+            known: (B, 1, h, w) bool, false where a value was filled in.
+            noise: (B, 1, h, w) standard deviation of the logarithm of the values, where that is known.
+            hints: (B, ``FACTS``).
+            progress: called after each band of rows.
+
+        """
+        scale, given = rgb.shape[-1] // values.shape[-1], values
+        dtype = self.photo.weight.dtype
+        with torch.autocast(rgb.device.type, enabled=False):  # the map keeps its precision
+            parts = [photo_input(rgb)]
+            weight = known.to(values.dtype)
+            if scale == 1:
+                values, fine, weight, noise = _pair_up(values, weight, noise)
+                scale = 2
+                parts.append(fine)
+            elif scale == 2:
+                parts.append(torch.zeros_like(rgb[:, :3]))
+            around, smoothed = stencil(values), smooth(values, weight, _LEVELS)
+            lr_input = _lr_input(around, smoothed, weight, noise, hints)
+            told = torch.cat((hints.float(), _roughness([around, *smoothed], weight)), dim=1)
+        photo, bands = torch.cat(parts, dim=1), self._split(values.shape[-2], rgb.shape)
+        kept = [self._see(photo, scale, bands[0])] if len(bands) == 1 else None
+        seen = kept or (self._see(photo, scale, band) for band in bands)
+        features = [pyramid[-1][..., band.inner, :] for pyramid, band in zip(seen, bands, strict=True)]
+        x = functional.relu(self.coarse(lr_input.to(dtype)) + torch.cat(features, dim=-2))
+        kind, shares = functional.relu(self.hints(told.to(dtype))), self.shares(told.to(dtype)).sigmoid()
+        for number, (block, modulate) in enumerate(zip(self.trunk, self.modulation, strict=True)):
+            if number == _BEFORE:
+                x = x + self.wide(x)
+            x = block(x, shares[:, number], *modulate(kind).chunk(2, dim=1))
+        planes = self._blend_planes(self._propose_planes(self.planes(x), around, smoothed), self.blend(x))
+        bits = []
+        for number, band in enumerate(bands, 1):
+            pyramid = kept[0] if kept else self._see(photo, scale, band)
+            found = self._choose(x[..., band.rows, :], planes[..., band.rows, :], pyramid, scale)
+            rows = slice(scale * band.inner.start, scale * band.inner.stop)
+            bits.append([each[..., rows, :] for each in found])
+            if progress is not None:
+                progress(number, len(bands))
+        result, errors, gate = (torch.cat(each, dim=-2) for each in zip(*bits, strict=True))
+        if given.shape == values.shape:  # not for a map of the photo's own size
+            with torch.autocast(rgb.device.type, enabled=False):
+                result = _project(result, given, known, gate, hints)
+        return result, errors
+
+    def _split(self, height: int, shape: torch.Size) -> list[_Band]:
+        """Return the bands of low-resolution rows that are processed one after another; all rows in a training."""
+        rows = height if self.training else max(1, height * _BAND // (shape[0] * shape[-2] * shape[-1]))
+        return [_Band.of(first, min(first + rows, height), height) for first in range(0, height, rows)]
+
+    def _see(self, photo: Tensor, scale: int, band: _Band) -> list[Tensor]:
+        """Return the photo's features in a band with its margins, from the full to the low resolution."""
+        window = photo[..., scale * band.rows.start : scale * band.rows.stop, :]
+        pyramid = [functional.relu(self.photo(window.to(self.photo.weight.dtype)))]
+        for layer in self.down:
+            pyramid.append(functional.relu(layer(pyramid[-1])))
+        return pyramid
+
+    def _choose(self, x: Tensor, planes: Tensor, pyramid: list[Tensor], scale: int) -> tuple[Tensor, Tensor, Tensor]:
+        """Return the mixture of planes, the logarithms of the expected errors, (B, 2, H, W), and residuals' factors."""
+        for up, join, features in zip(self.up, self.join, reversed(pyramid[:-1]), strict=True):
+            x = functional.relu(join(torch.cat((functional.pixel_shuffle(up(x), 2), features), dim=1)))
+        gate = torch.sigmoid(self.gate(x).float() + _CLOSED)
+        return mix_planes(planes, self.choice(x), scale), self.errors(x).float() - 5, gate
+
+    def _propose_planes(self, output: Tensor, around: Stencil, smoothed: list[Stencil]) -> Tensor:
+        """Return the planes of each low-resolution pixel, (B, facets, 3, h, w): value at its centre and slopes."""
+        output = output.to(torch.promote_types(around.value.dtype, torch.float32))
+        output = output.unflatten(1, (self.facets, -1))
+        values, slopes, moves = output.split((1 + _LEVELS, 2 * (3 + _LEVELS), 3), dim=2)
+        values = _favour(values, 0).softmax(dim=2)
+        value = (values * torch.stack([around.value, *(each.value for each in smoothed)], dim=2)).sum(dim=2)
+        slopes = _favour(slopes.unflatten(2, (2, -1)), 1).softmax(dim=3)  # (B, facets, 2, 3 + levels, h, w)
+        offered = torch.cat((around.slopes, torch.stack([each.slopes[:, :, 1] for each in smoothed], dim=2)), dim=2)
+        slope = (slopes * offered[:, None]).sum(dim=3)
+        return torch.cat((value[:, :, None], slope), dim=2) + moves * around.bend[:, None]
+
+    def _blend_planes(self, planes: Tensor, logits: Tensor) -> Tensor:
+        """Return planes averaged with those around them, (B, facets, 3, h, w)."""
+        logits = logits.to(planes.dtype).unflatten(1, (self.facets, len(_REACHES), NEIGHBOURS))
+        own = logits.new_zeros(NEIGHBOURS)
+        own[NEIGHBOURS // 2] = _OWN
+        weights = (logits + own[:, None, None]).softmax(dim=3)
+        for step, reach in enumerate(_REACHES):
+            planes = average_planes(planes, weights[:, :, step], reach)
+        return planes
+
+
+def _favour(logits: Tensor, index: int) -> Tensor:
+    """Return logits of (B, facets, ..., n, h, w) with 2 added to one of the n."""
+    first = logits.new_zeros(logits.shape[-3])
+    first[index] = 2
+    return logits + first[:, None, None]
+
+
+def _pair_up(values: Tensor, weight: Tensor, noise: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Return the means of 2 x 2 pixels of a map, what they leave over, and the means of its weights and noise."""
+    share = functional.avg_pool2d(weight, 2)
+    mean = functional.avg_pool2d(values * weight, 2) / share.clamp(min=0.25)
+    mean = torch.where(share > 0, mean, functional.avg_pool2d(values, 2))
+    rest = (values - repeat_blocks(mean, 2)).float()
+    fine = torch.cat((torch.asinh(rest / _FAINT) / 3, rest / _STRONG, weight.float() - 0.5), dim=1)
+    return mean, fine, share, functional.avg_pool2d(noise, 2)
+
+
+def _lr_input(around: Stencil, smoothed: list[Stencil], weight: Tensor, noise: Tensor, hints: Tensor) -> Tensor:
+    """Return the trunk's input, (B, channels, h, w) in float32."""
+    central = around.slopes[:, :, 1]
+    differences = torch.cat((around.value - around.mean, central, around.bend), dim=1).float()
+    tiny = torch.finfo(torch.float32).tiny
+    turns = around.turns.float() / around.bend.float().clamp(min=tiny)
+    wide = torch.cat(
+        [torch.cat((around.value - each.value, each.slopes[:, :, 1], each.bend), dim=1) for each in smoothed], dim=1
+    ).float()
+    told = hints[:, -1:, None, None].float().expand_as(weight)
+    level = torch.where(told > 0, torch.log10(noise.float().clamp(min=1e-5) / 1e-3), 0)
+    parts = (
+        torch.asinh(differences / _FAINT) / 3,
+        differences / _STRONG,
+        turns,
+        torch.asinh(wide / _FAINT) / 3,
+        weight.float() - 0.5,
+        told,
+        level,
+    )
+    return torch.cat(parts, dim=1)
+
+
+def _project(result: Tensor, values: Tensor, known: Tensor, gate: Tensor, hints: Tensor) -> Tensor:
+    """Return results closer to what was measured, where the kernel is known.
+
+    Args:
+        result: (B, 1, H, W).
+        values: (B, 1, h, w) what was measured.
+        known: (B, 1, h, w) bool.
+        gate: (B, 1, H, W) factor of the residual.
+        hints: (B, ``FACTS``).
+
+    """
+    scale = result.shape[-1] // values.shape[-1]
+    told = hints[:, : len(KERNELS)]
+    if scale == 1 or not bool(told.any()):
+        return result
+    parts = []
+    for i, hint in enumerate(told.tolist()):
+        part = slice(i, i + 1)
+        x = result[part]
+        if any(hint):
+            model = Downsampling(KERNELS[hint.index(max(hint))])  # type: ignore[arg-type]  # one of them
+            for _ in range(_PROJECTIONS):
+                residual = torch.where(known[part], values[part] - model(x, scale), 0)
+                x = x + gate[part].to(x.dtype) * upsample_bicubic(residual, scale)
+        parts.append(x)
+    return torch.cat(parts)
+
+
+def _roughness(levels: list[Stencil], weight: Tensor) -> Tensor:
+    """Return how rough maps are, (B, channels): logarithms of quantiles of the bend where the map is known."""
+    step = max(1, math.isqrt(weight.shape[-2] * weight.shape[-1] // _SAMPLES))
+    known = weight[..., ::step, ::step].flatten(1) > 0.5
+    quantiles = weight.new_tensor(_QUANTILES).float()
+    found = []
+    for level in levels:
+        bends = level.bend[..., ::step, ::step].flatten(1).float().masked_fill(~known, torch.nan)
+        found.append(torch.nanquantile(bends, quantiles, dim=1).T.nan_to_num(0))
+    return (torch.log10(torch.cat(found, dim=1) + 1e-6) + 4) / 2

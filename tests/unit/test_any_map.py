@@ -1,0 +1,209 @@
+"""The method for maps of any ratio: sizes, units, the estimate of the noise, and its settings."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from dsr.degradation.hints import FACTS
+from dsr.geometry.camera import Camera
+from dsr.methods.networks.any_map import AnyMap, build_any_map
+from dsr.methods.networks.facets_unet import Answer, FacetsUNet
+from dsr.methods.networks.weight_files import files_of_weights, save_network
+from dsr.sample import DepthSample
+
+
+class Told(nn.Module):
+    """A network that returns a plane, whatever it gets, and remembers what it was told."""
+
+    def __init__(self, scale: int = 4) -> None:
+        super().__init__()
+        self.scale = scale
+        self.calls: list[tuple[tuple[int, ...], tuple[int, ...], Tensor | None, Tensor]] = []
+
+    serves = FacetsUNet.serves
+
+    def answer(self, rgb: Tensor, disparity: Tensor, noise: Tensor | None, hints: Tensor, progress: object) -> Answer:
+        self.calls.append((tuple(rgb.shape), tuple(disparity.shape), noise, hints))
+        height, width = rgb.shape[-2:]
+        plane = _plane(height, width)
+        return Answer(plane, torch.full_like(plane, 0.01), torch.full_like(plane, math.radians(3)))
+
+
+class Reporting(Told):
+    """Reports three steps."""
+
+    def answer(self, rgb: Tensor, disparity: Tensor, noise: Tensor | None, hints: Tensor, progress: object) -> Answer:
+        for done in (1, 2, 3):
+            progress(done, 3)  # type: ignore[operator]
+        return super().answer(rgb, disparity, noise, hints, progress)
+
+
+def _plane(height: int, width: int) -> Tensor:
+    """Return inverse depth from 0.5 to 0.6 across an image, (1, 1, height, width)."""
+    across = (torch.arange(width, dtype=torch.float64) + 0.5) / width
+    return (0.5 + 0.1 * across).expand(1, 1, height, width).contiguous()
+
+
+def _sample(size_lr: tuple[int, int], ratio: float, error: Tensor | float = 0.0) -> DepthSample:
+    """Return a plane with a relative error of its inverse depth."""
+    height, width = (round(ratio * n) for n in size_lr)
+    camera = Camera.from_fov(width, height)
+    depth_lr = (_plane(*size_lr)[0] * (1 + error)).reciprocal()
+    rgb = torch.rand((3, height, width), generator=torch.Generator().manual_seed(0))
+    camera_lr = camera if ratio == 1 else camera.reduce(size_lr[1], size_lr[0])
+    return DepthSample("test", "plane", rgb, depth_lr, camera, camera_lr, ratio)
+
+
+@pytest.mark.parametrize(
+    ("size_lr", "ratio", "factor"),
+    [((12, 16), 1, 1), ((11, 15), 1, 1), ((12, 16), 2, 2), ((12, 18), 8 / 3, 4), ((12, 16), 4, 4), ((8, 12), 7.5, 8),
+     ((6, 8), 16, 16)],
+)  # fmt: skip
+def test_photo_is_resized_to_the_next_factor_and_the_result_to_the_photo(size_lr, ratio, factor) -> None:
+    net, sample = Told(max(factor, 2)), _sample(size_lr, ratio)
+    surface = AnyMap(net).surface(sample)  # type: ignore[arg-type]
+    [(rgb, disparity, noise, hints)] = net.calls
+    even = tuple(n + n % 2 if factor == 1 else n for n in size_lr)
+    assert disparity == (1, 1, *even)
+    assert rgb == (1, 3, *(factor * n for n in even))
+    assert noise is None
+    assert not bool(hints.any())
+    height, width = sample.rgb.shape[-2:]
+    assert surface.depth.shape == surface.depth_error.shape == surface.angle_error.shape == (1, height, width)
+    inside = (..., slice(2, -2), slice(2, -2))
+    if even == size_lr:
+        torch.testing.assert_close(
+            surface.depth[inside], _plane(height, width)[0].reciprocal()[inside], rtol=1e-3, atol=0
+        )
+    else:  # cropped, not squeezed
+        expected = _plane(even[0], even[1])[0].reciprocal()[..., : size_lr[0], : size_lr[1]]
+        torch.testing.assert_close(surface.depth, expected, rtol=1e-6, atol=0)
+    torch.testing.assert_close(surface.depth_error, 0.01 * surface.depth)
+    torch.testing.assert_close(surface.angle_error, torch.full_like(surface.depth, 3.0))
+
+
+def test_noise_is_described_in_metres_and_low_resolution_pixels() -> None:
+    draws = torch.randn((1, 60, 80), generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    white = AnyMap(Told()).surface(_sample((60, 80), 4, 0.004 * draws)).noise  # type: ignore[arg-type]
+    assert white.deviation == pytest.approx(0.004 / 0.55, rel=0.06)
+    assert white.extent == pytest.approx(1, abs=0.2)
+    wide = 5 * functional.avg_pool2d(draws[None], 5, stride=1, padding=2)[0]
+    alike = AnyMap(Told()).surface(_sample((60, 80), 4, 0.004 * wide)).noise  # type: ignore[arg-type]
+    assert alike.extent == pytest.approx(5, abs=1)
+
+
+def test_settings_are_told_to_the_network() -> None:
+    sample = _sample((12, 16), 4)
+    net = Told()
+    AnyMap(net, noise=0.01, edges="soft", kernel="bicubic").surface(sample)  # type: ignore[arg-type]
+    [(_, _, noise, hints)] = net.calls
+    expected = torch.zeros(1, FACTS)
+    expected[0, [3, 6, 7]] = 1
+    assert torch.equal(hints, expected)
+    torch.testing.assert_close(noise, (0.01 * _plane(12, 16)).float())  # relative to depth
+
+
+@pytest.mark.parametrize("smooth", [0.0, 2.0])
+def test_smooth_tells_more_or_less_noise_than_estimated(smooth: float) -> None:
+    draws = torch.randn((1, 24, 32), generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    sample, net = _sample((24, 32), 4, 0.004 * draws), Told()
+    AnyMap(net, smooth=smooth).surface(sample)  # type: ignore[arg-type]
+    [(_, _, first, _), (_, _, second, hints)] = net.calls
+    assert first is None
+    assert second is not None
+    assert float(second.mean()) == pytest.approx(0.004 * smooth, rel=0.1)
+    assert float(hints[0, -1]) == 1
+
+
+def test_smooth_scales_a_given_noise_without_another_pass() -> None:
+    net, sample = Told(), _sample((12, 16), 4)
+    AnyMap(net, noise=0.01, smooth=2).surface(sample)  # type: ignore[arg-type]
+    [(_, _, noise, _)] = net.calls
+    torch.testing.assert_close(noise, (0.02 * _plane(12, 16)).float())
+
+
+def test_progress_of_two_passes_is_one() -> None:
+    seen: list[tuple[int, int]] = []
+    AnyMap(Reporting(), smooth=2).surface(_sample((12, 16), 4), lambda *now: seen.append(now))  # type: ignore[arg-type]
+    assert seen == [(1, 6), (2, 6), (3, 6), (4, 6), (5, 6), (6, 6)]
+
+
+def test_what_lies_behind_infinity_is_a_hole() -> None:
+    net, sample = Told(), _sample((12, 16), 4)
+    negative = net.answer(torch.zeros(1, 3, 48, 64), torch.zeros(1, 1, 12, 16), None, torch.zeros(1, FACTS), None)
+    negative.disparity[..., 3, 5] = -0.1
+    net.answer = lambda *_: negative  # type: ignore[method-assign]
+    surface = AnyMap(net).surface(sample)  # type: ignore[arg-type]
+    assert surface.depth_error is not None
+    for each in (surface.depth, surface.depth_error):
+        assert torch.equal(each.isnan().nonzero(), torch.tensor([[0, 3, 5]]))
+        assert bool((each[each.isfinite()] > 0).all())
+
+
+def test_method_is_built_from_a_file_and_values_are_checked(tmp_path: Path) -> None:
+    save_network(tmp_path / "weights", FacetsUNet(4, 8, 8), "facets")
+    depth = build_any_map(tmp_path / "weights")(_sample((12, 18), 8 / 3))
+    assert depth.shape == (1, 32, 48)
+    for settings, message in (
+        ({"smooth": 3}, "smooth: expected a number from 0 to 2, got 3"),
+        ({"noise": -1}, "noise: expected metres"),
+        ({"kernel": "sinc"}, "kernel: expected one of box, nearest, bilinear, bicubic, gaussian, got sinc"),
+        ({"edges": "round"}, "edges: expected one of auto, sharp, soft, got round"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            build_any_map(tmp_path / "weights", **settings)  # type: ignore[arg-type]
+
+
+def test_clean_box_means_have_weights_of_their_own(tmp_path: Path) -> None:
+    """Only where everything is told that they were trained for."""
+    nets = {}
+    for number, name in enumerate(("facets_x2", "facets_x2_clean")):
+        torch.manual_seed(number)
+        nets[name] = FacetsUNet(2, 8, 8, 4).eval()
+    files = {name: tmp_path / f"{name}.safetensors" for name in nets}
+    save_network(files["facets_x2_clean"], nets["facets_x2_clean"], "facets")
+    save_network(files["facets_x2"], nets["facets_x2"], "facets", clean=files["facets_x2_clean"])
+    told: dict[str, Any] = {"kernel": "box", "edges": "sharp", "clean": True}
+
+    def used(**settings: Any) -> str:
+        found = build_any_map(files["facets_x2"], **settings)._net.state_dict()
+        return next(
+            name for name, net in nets.items() if torch.equal(net.state_dict()["photo.weight"], found["photo.weight"])
+        )
+
+    assert used(**told) == "facets_x2_clean"
+    others = (
+        {"kernel": "bicubic"},
+        {"edges": "soft"},
+        {"edges": "auto"},
+        {"clean": False},
+        {"noise": 0.001},
+        {"smooth": 2.0},
+    )
+    assert {used(**told | other) for other in others} == {"facets_x2"}
+    assert files_of_weights(files["facets_x2"]) == list(files.values())
+    files["facets_x2_clean"].unlink()
+    with pytest.raises(FileNotFoundError, match=r"expected facets_x2_clean\.safetensors beside it, for clean maps"):
+        build_any_map(files["facets_x2"], **told)
+
+
+def test_dubious_pixels_may_be_left_as_holes() -> None:
+    torch.manual_seed(0)
+    net, sample = FacetsUNet(2, 8, 8, 4).eval(), _sample((24, 32), 2, 0.01 * torch.randn(24, 32))
+    whole = AnyMap(net).surface(sample)
+    assert whole.depth_error is not None
+    share = whole.depth_error / whole.depth
+    limit = float(share.median())
+    cut = AnyMap(net, max_error=limit).surface(sample)
+    assert torch.equal(cut.depth.isnan(), share > limit)
+    kept = cut.depth.isfinite()
+    assert torch.equal(cut.depth[kept], whole.depth[kept])
+    with pytest.raises(ValueError, match="max_error: expected a positive share of the depth, got 0"):
+        AnyMap(net, max_error=0)

@@ -1,0 +1,303 @@
+"""Random degradations: reproducible, of the stated size and shape, and told truly by the hints."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from dsr.degradation import random_noise
+from dsr.degradation.downsampling import Downsampling
+from dsr.degradation.everything import Everything
+from dsr.degradation.hints import FACTS, KERNELS
+from dsr.degradation.random_scenes import add_folds, displace
+from dsr.geometry.camera import Camera
+from dsr.sample import Scene
+from dsr.training.augmentation import soften
+
+CLEAN = Everything(noises={"none": 1}, holes={"none": 1}, displaced=0, rounded=0, folds=0, relief=0, told=1)
+
+
+def _scene(size: int = 128, step: bool = True) -> Scene:
+    """Return a slope with a nearer square on it."""
+    depth = torch.linspace(2, 3, size, dtype=torch.float64).repeat(1, size, 1)
+    if step:
+        depth[:, size // 4 : size // 2, size // 4 : size // 2] = 1.2
+    rgb = torch.rand((3, size, size), generator=torch.Generator().manual_seed(0))
+    return Scene("test", "slope", rgb, Camera.from_fov(size, size), depth)
+
+
+def _generator(seed: int = 0) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+def _relative_error(kind: str, seed: int, scale: int = 2) -> Tensor:
+    """Return the relative error of inverse depth that a kind of noise makes on a slope, (1, h, w)."""
+    everything = replace(CLEAN, noises={kind: 1}, kernels={"box": 1})
+    sample, _ = everything(_scene(256, step=False), scale, _generator(seed))
+    clean, _ = replace(everything, noises={"none": 1})(_scene(256, step=False), scale, _generator(seed))
+    return (clean.depth_lr / sample.depth_lr).float() - 1
+
+
+@pytest.mark.parametrize("scale", [1, 2, 4, 8, 16])
+def test_a_degradation_is_a_function_of_its_generator(scale: int) -> None:
+    scene = _scene(32 * max(4, scale))
+    for seed in range(12):
+        first, again = (Everything()(scene, scale, _generator(seed)) for _ in range(2))
+        torch.testing.assert_close(first[0].depth_lr, again[0].depth_lr, rtol=0, atol=0, equal_nan=True)
+        assert torch.equal(first[1].facts, again[1].facts)
+        assert first[0].depth_lr.shape == (1, *(n // scale for n in scene.rgb.shape[1:]))
+        assert bool((first[0].depth_lr.nan_to_num(1) > 0).all())
+    other, _ = Everything()(scene, scale, _generator(100))
+    assert not torch.equal(other.depth_lr.nan_to_num(0), first[0].depth_lr.nan_to_num(0))
+
+
+@pytest.mark.parametrize("kernel", KERNELS)
+def test_clean_maps_are_those_of_the_kernel_and_hints_tell_it(kernel: str) -> None:
+    everything = replace(CLEAN, kernels={kernel: 1})
+    found = set()
+    for seed in range(20):
+        sample, hints = everything(_scene(), 4, _generator(seed), soft=seed % 2 == 1)
+        for range_of in (torch.reciprocal, torch.Tensor.clone):  # averages of inverse depth or, at times, of depth
+            expected = range_of(Downsampling(kernel)(range_of(_scene().depth.float()), 4))
+            if torch.allclose(sample.depth_lr, expected, rtol=1e-5):
+                found.add(range_of)
+                break
+        else:
+            raise AssertionError(seed)
+        facts = torch.zeros(FACTS)
+        facts[KERNELS.index(kernel)] = facts[len(KERNELS) + seed % 2] = facts[-1] = 1
+        assert torch.equal(hints.facts, facts)
+        assert float(hints.noise.max()) < 1e-6
+    assert found == {torch.reciprocal, torch.Tensor.clone} or kernel == "nearest"
+
+
+def test_nothing_is_told_where_nothing_is_to_be_told() -> None:
+    for seed in range(10):
+        _, hints = replace(Everything(), told=0)(_scene(), 4, _generator(seed))
+        assert not bool(hints.facts.any())
+        assert not bool(hints.noise.any())
+
+
+@pytest.mark.parametrize("kind", ["white", "correlated", "structured", "flight", "lidar", "stereo"])
+def test_noise_is_told_as_large_as_it_is(kind: str) -> None:
+    everything = replace(CLEAN, noises={kind: 1}, kernels={"box": 1})
+    for seed in range(6):
+        sample, hints = everything(_scene(256, step=False), 2, _generator(seed))
+        error = _relative_error(kind, seed)
+        measured = float(error[error.isfinite()].clamp(-0.1, 0.1).square().mean().sqrt())
+        assert 1e-4 < measured < 0.1
+        assert float(hints.noise.square().mean().sqrt()) == pytest.approx(measured, rel=0.6)
+        assert bool(sample.depth_lr.isfinite().any())
+
+
+def test_white_noise_is_white_and_correlated_noise_is_not() -> None:
+    def neighbours(kind: str, seed: int) -> float:
+        error = _relative_error(kind, seed).nan_to_num(0)
+        error = error - error.mean()
+        return float((error[..., 1:] * error[..., :-1]).mean() / error.square().mean())
+
+    assert max(abs(neighbours("white", seed)) for seed in range(5)) < 0.05
+    assert sum(neighbours("correlated", seed) for seed in range(8)) / 8 > 0.5
+
+
+@pytest.mark.parametrize("kind", ["blobs", "shadows", "steps", "dark", "pixels"])
+def test_holes_are_made_and_never_everywhere(kind: str) -> None:
+    everything = replace(CLEAN, holes={kind: 1})
+    shares = []
+    for seed in range(10):
+        sample, _ = everything(_scene(), 2, _generator(seed))
+        shares.append(float(sample.depth_lr.isnan().float().mean()))
+    assert 0 < sum(shares) / 10 < 0.5
+    assert max(shares) < 0.8
+
+
+def test_displacement_moves_the_map_by_a_low_resolution_pixel_at_most() -> None:
+    moved = 0
+    for seed in range(8):
+        generator = _generator(seed)
+        everything = replace(CLEAN, kernels={"nearest": 1}, noises={"white": 1}, displaced=1)
+        sample, _ = everything(_scene(), 4, generator)
+        edge = int((sample.depth_lr[0, 12] < 1.5).nonzero()[0])
+        assert abs(edge - 8) <= 1
+        moved += edge != 8
+    assert moved
+
+
+def test_displacement_is_a_shift_or_a_magnification() -> None:
+    places = torch.arange(200.0).repeat(1, 200, 1)
+    shifts = magnified = 0
+    for seed in range(30):
+        moves = (displace(places, 8, _generator(seed)) - places)[0, 0, 10:-10]
+        assert float(moves.abs().max()) <= 8
+        shifts += bool(moves.min() == moves.max())
+        magnified += bool(moves.max() - moves.min() > 4)
+        assert bool((moves.diff().abs() <= 1).all())
+    assert shifts > 5
+    assert magnified > 5
+
+
+def test_soft_scenes_have_half_the_size_and_mixed_values_at_steps() -> None:
+    scene = _scene(126)
+    soft = soften(scene)
+    assert (soft.camera.width, soft.camera.height) == (63, 63)
+    assert soft.depth is not None
+    assert scene.depth is not None
+    blocks = scene.depth.reciprocal().unfold(1, 2, 2).unfold(2, 2, 2).mean(dim=(-2, -1)).reciprocal()
+    torch.testing.assert_close(soft.depth, blocks)
+    assert soft.camera.fx == pytest.approx(scene.camera.fx / 2)
+    assert bool(((soft.depth > 1.25) & (soft.depth < 1.95)).any())  # neither the square nor the slope
+
+
+def test_soft_scenes_may_keep_their_size() -> None:
+    scene = _scene(96)
+    soft = soften(scene, 1.0, halve=False)
+    assert soft.camera == scene.camera
+    assert torch.equal(soft.rgb, scene.rgb)
+    assert soft.depth is not None
+    assert scene.depth is not None
+    mixed = (soft.depth > 1.25) & (soft.depth < 1.95)
+    assert 2 <= int(mixed[0, 36].sum()) <= 10  # across both edges of the square
+    torch.testing.assert_close(soft.depth[0, 80:, 4:-4], scene.depth[0, 80:, 4:-4], rtol=1e-3, atol=0)
+
+
+def test_factors_are_drawn_as_often_as_their_shares_say() -> None:
+    generator = _generator()
+    shares = {1: 0.6, 2: 0.3, 16: 0.1}
+    drawn = [Everything(shares).draw_scale(4, generator) for _ in range(2000)]
+    assert Everything().draw_scale(4, generator) == 4  # that of the run
+    for scale, share in shares.items():
+        assert drawn.count(scale) / 2000 == pytest.approx(share, abs=4 * math.sqrt(share / 2000))
+
+
+def test_relief_is_in_the_truth_and_its_means_in_the_map() -> None:
+    everything = replace(CLEAN, kernels={"box": 1}, relief=1)
+    scene, rough = _scene(step=False), 0
+    assert scene.depth is not None
+    for seed in range(20):
+        sample, hints = everything(scene, 4, _generator(seed))
+        assert sample.depth is not None
+        change = (sample.depth / scene.depth - 1).abs()
+        assert 1e-6 < float(change.mean()) < 0.02
+        rough += float(change.mean()) > 1e-4
+        for range_of in (torch.reciprocal, torch.Tensor.clone):
+            expected = range_of(Downsampling("box")(range_of(sample.depth.float()), 4))
+            if torch.allclose(sample.depth_lr, expected, rtol=1e-5):
+                break
+        else:
+            raise AssertionError(seed)
+        assert float(hints.noise.max()) < 1e-6, "the map has no noise"
+    assert 3 < rough < 20
+    same, _ = replace(everything, noises={"white": 1})(scene, 1, _generator())
+    assert same.depth is scene.depth, "at factor 1 relief could not be told from noise"
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"kernels": {"sinc": 1}}, "kernels: expected some of box, .*, spread, got sinc"),
+        ({"noises": {"foo": 0.1}}, "noises: expected some of none, white, .*, got foo"),
+        ({"holes": {"none": -1}}, "holes: expected frequencies of 0 or more"),
+        ({"noises": {"none": 0}}, "noises: expected frequencies of 0 or more, one of them positive"),
+        ({"soft": 1.5}, "soft: expected a fraction from 0 to 1, got 1.5"),
+        ({"scales": {3: 1}}, "scales: expected some of 1, 2, 4, 8, 16, got 3"),
+    ],
+)
+def test_unknown_kinds_and_impossible_fractions_are_refused(wrong: dict[str, object], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        Everything(**wrong)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("kind", ["white", "correlated", "structured", "flight", "lidar", "stereo"])
+def test_holes_of_the_truth_leave_their_surroundings_alone(kind: str) -> None:
+    """Noise beside a hole is as large as elsewhere, and nothing is taken for a depth of 0 or of the mean."""
+    scene = _scene(256, step=False)
+    assert scene.depth is not None
+    depth = scene.depth.clone()
+    depth[:, 100:140, 60:180] = torch.nan
+    everything = replace(CLEAN, noises={kind: 1}, kernels={"nearest": 1}, told=0)
+    for seed in range(12):
+        sample, _ = everything(replace(scene, depth=depth), 2, _generator(seed))
+        clean, _ = everything(scene, 2, _generator(100))
+        truth = Downsampling("nearest")(scene.depth.float(), 2)
+        error = (sample.depth_lr.float() / truth - 1).abs()
+        beside = error[:, 45:75, 25:95]
+        assert clean.depth_lr.shape == sample.depth_lr.shape
+        assert float(beside.nan_to_num(0).max()) < 0.02 + 3 * float(error[:, 90:].nan_to_num(0).max()), seed
+
+
+def test_folds_are_in_truth_map_and_photo_and_only_in_places() -> None:
+    scene = _scene(256, step=False)
+    scene = replace(scene, rgb=torch.full_like(scene.rgb, 0.5))
+    assert scene.depth is not None
+    everything = replace(CLEAN, kernels={"box": 1}, folds=1, photo=0, textured=0)
+    shaded, places = 0, []
+    for seed in range(20):
+        sample, _ = everything(scene, 2, _generator(seed))
+        assert sample.depth is not None
+        change = (sample.depth / scene.depth - 1).abs()[0]
+        assert 1e-6 < float(change.max()) < 0.2
+        places.append(float((change > 0.2 * change.max()).float().mean()))
+        steepest = change.diff(dim=1).abs().amax() * scene.camera.fx
+        assert float(steepest) < 4, "a slope of 0.63 at most, times the field's"
+        light = (sample.rgb - 0.5).abs().amax(dim=0)
+        shaded += bool(light.max() > 1e-3)
+        near = functional.max_pool2d(change[None], 5, stride=1, padding=2)[0]
+        assert not bool(light[near < 1e-6].gt(0.02).any()), "no shade without folds"
+        for range_of in (torch.reciprocal, torch.Tensor.clone):
+            expected = range_of(Downsampling("box")(range_of(sample.depth.float()), 2))
+            if torch.allclose(sample.depth_lr, expected, rtol=1e-5):
+                break
+        else:
+            raise AssertionError(seed)
+    assert 5 < shaded < 20, "in some photos they cannot be seen"
+    assert min(places) < 0.2
+
+
+def test_folds_keep_holes_and_shade_their_surroundings() -> None:
+    scene = _scene(64)
+    assert scene.depth is not None
+    depth = scene.depth.clone()
+    depth[:, 30:40, 10:20] = torch.nan
+    for seed in range(5):
+        folded = add_folds(replace(scene, depth=depth), _generator(seed))
+        assert folded.depth is not None
+        assert torch.equal(folded.depth.isnan(), depth.isnan())
+        assert bool(folded.rgb.isfinite().all())
+        assert float(folded.depth.nan_to_num(1).min()) > 0
+
+
+def test_weak_noise_leaves_the_stairs_of_a_sensor_that_counts_in_steps() -> None:
+    """On a slanted wall; its steps are those of one of the sensors, and most values lie at whole multiples."""
+    ramp = torch.linspace(10, 14, 200).repeat(1, 100, 1)
+    stairs = smoothed = drawn = 0
+    for seed in range(60):
+        counted = random_noise._count(
+            ramp, 0.02 * torch.randn(ramp.shape, generator=_generator(seed)), _generator(seed)
+        )
+        assert float((counted - ramp).abs().max()) < 0.4
+        eighths = (8 * counted - (8 * counted).round()).abs()
+        stairs += bool(eighths.max() < 1e-3)
+        smoothed += bool((eighths.median() > 1e-3) & ((counted - ramp).std() > 0.015))
+        whole = (counted - counted.round()).abs()
+        drawn += bool((whole < 0.1).float().mean() > 0.28)  # 0.2 where no value is favoured
+    assert stairs > 3
+    assert smoothed > 3
+    assert drawn > 3
+
+
+def test_structured_light_loses_pixels_at_steps_and_on_steep_surfaces() -> None:
+    """Of a sphere, more at its border than in its middle, and nothing on a wall that faces the sensor."""
+    v, u = torch.meshgrid(torch.linspace(-1.2, 1.2, 128), torch.linspace(-1.2, 1.2, 128), indexing="ij")
+    radius = (v.square() + u.square()).sqrt()
+    values = torch.where(radius < 1, 1 / (2 - (1 - radius.square()).clamp(min=0).sqrt()), 0.4)[None]
+    lost = torch.zeros_like(values)
+    for seed in range(60):
+        lost += random_noise.NOISES["structured"](values, torch.ones_like(values), _generator(seed)).isnan()
+    rim, rest = (radius > 0.85) & (radius < 0.95), (radius > 1.15) | (radius < 0.3)
+    assert float(lost[0, rim].mean()) > 3
+    assert float(lost[0, rest].mean()) < 1

@@ -1,0 +1,265 @@
+"""Facets with context: planes at every factor, units, holes, hints, confidence, and what it starts from."""
+
+from __future__ import annotations
+
+import itertools
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+from dsr.degradation.downsampling import Downsampling
+from dsr.degradation.hints import FACTS, KERNELS, encode_facts
+from dsr.methods.networks import facets_unet
+from dsr.methods.networks.facets import Facets
+from dsr.methods.networks.facets_planes import NEIGHBOURS, average_planes
+from dsr.methods.networks.facets_unet import FacetsUNet
+from dsr.methods.networks.trained import NETWORKS
+from dsr.methods.networks.weight_files import load_network, save_network
+
+SCALES = (1, 2, 4, 8, 16)
+
+
+def _net(scale: int = 4, width: int = 8, deep: int = 12) -> FacetsUNet:
+    """Return a small network with random weights, also in the layers that begin small."""
+    torch.manual_seed(3)
+    net = FacetsUNet(scale, width, deep, 4).eval()
+    with torch.no_grad():
+        for parameter in net.parameters():
+            parameter.add_(0.05 * torch.randn_like(parameter))
+    return net
+
+
+def _inputs(scale: int, height: int = 12, width: int = 10) -> tuple[Tensor, Tensor]:
+    """Return a photo and a rough map whose median is 1 or so."""
+    generator = torch.Generator().manual_seed(scale)
+    if scale == 1:
+        height, width = 2 * height, 2 * width
+    rgb = torch.rand((1, 3, scale * height, scale * width), generator=generator)
+    return rgb, 1 + 0.1 * torch.rand((1, 1, height, width), generator=generator).double()
+
+
+def _plane(height: int, width: int, scale: int) -> Tensor:
+    """Return a plane at the centres of the pixels of a map of a factor, (1, 1, height, width)."""
+    v, u = ((scale * (torch.arange(n, dtype=torch.float64) + 0.5)) for n in (height, width))
+    return (2 + 0.003 * u - 0.002 * v[:, None])[None, None]
+
+
+@pytest.mark.parametrize("scale", SCALES)
+def test_planes_are_reproduced_by_any_weights(scale: int) -> None:
+    rgb, values = _inputs(scale)
+    height, width = values.shape[-2:]
+    found = _net(scale).upsample(rgb, _plane(height, width, scale))
+    torch.testing.assert_close(found, _plane(*rgb.shape[-2:], 1), rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("scale", SCALES)
+def test_result_scales_with_the_map(scale: int) -> None:
+    rgb, values = _inputs(scale)
+    net = _net(scale)
+    once, thrice = (net.answer(rgb, factor * values) for factor in (1, 3))
+    torch.testing.assert_close(thrice.disparity, 3 * once.disparity, rtol=1e-5, atol=0)
+    torch.testing.assert_close(thrice.spread, once.spread, rtol=1e-4, atol=0)
+    assert not torch.allclose(once.disparity[..., ::scale, ::scale], values, atol=1e-3)
+
+
+@pytest.mark.parametrize("scale", SCALES)
+def test_bands_change_nothing(scale: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    rgb, values = _inputs(scale, 40, 6)
+    net, steps = _net(scale), []
+    whole = net.answer(rgb, values)
+    monkeypatch.setattr(facets_unet, "_BAND", rgb[0, 0].numel() // 5)
+    banded = net.answer(rgb, values, progress=lambda *step: steps.append(step))
+    for one, other in zip(whole, banded, strict=True):
+        torch.testing.assert_close(other, one, rtol=1e-4, atol=1e-7)
+    assert steps == [(number, 5) for number in range(1, 6)]
+
+
+@pytest.mark.parametrize("scale", [1, 4])
+def test_holes_are_filled(scale: int) -> None:
+    rgb, values = _inputs(scale)
+    values[..., 3:7, 2:6] = torch.nan
+    answer = _net(scale).answer(rgb, values)
+    for each in answer:
+        assert each.shape == (1, 1, *rgb.shape[-2:])
+        assert bool(each.isfinite().all())
+    assert bool((answer.spread > 0).all())
+    assert bool((answer.angle > 0).all())
+
+
+def test_hints_and_noise_change_the_result() -> None:
+    rgb, values = _inputs(4)
+    net = _net()
+    nothing = net.answer(rgb, values).disparity
+    facts = torch.zeros(1, FACTS)
+    assert torch.equal(net.answer(rgb, values, torch.full_like(values, 0.01), facts).disparity, nothing)  # not told
+    facts[0, 0] = 1
+    told = net.answer(rgb, values, None, facts).disparity
+    assert not torch.allclose(told, nothing, rtol=1e-6, atol=0)
+    facts[0, -1] = 1
+    little, much = (net.answer(rgb, values, torch.full_like(values, level), facts).disparity for level in (1e-3, 1e-2))
+    assert not torch.allclose(little, much, rtol=1e-6, atol=0)
+
+
+@pytest.mark.parametrize("scale", [2, 4, 8, 16])
+def test_every_parameter_serves(scale: int) -> None:
+    net = _net(scale).train()
+    for factor in (1, 2) if scale == 2 else (scale,):
+        rgb, values = _inputs(factor)
+        answer = net.answer(rgb, values.float(), None, torch.ones(1, FACTS))
+        sum(each.square().mean() for each in answer).backward()  # type: ignore[union-attr]
+    for name, parameter in net.named_parameters():
+        assert parameter.grad is not None, name
+        assert bool(parameter.grad.any()), name
+
+
+def test_weights_of_factor_2_serve_maps_of_the_photos_size(tmp_path: Path) -> None:
+    net = _net(2)
+    save_network(tmp_path / "weights", net, "facets")
+    for scale in (1, 2):
+        rgb, values = _inputs(scale)
+        loaded = load_network(tmp_path / "weights", NETWORKS, scale, "facets").eval()
+        assert loaded.scale == scale
+        assert torch.equal(loaded.upsample(rgb, values), net.upsample(rgb, values))
+    with pytest.raises(ValueError, match="weights are for scale 2, the run is at scale 4"):
+        load_network(tmp_path / "weights", NETWORKS, 4, "facets")
+
+
+@pytest.mark.parametrize("scale", [2, 4, 8, 16])
+def test_it_starts_near_facets(scale: int) -> None:
+    torch.manual_seed(1)
+    first = Facets(4 if scale < 8 else 8, width=8, blocks=4).eval()
+    net = FacetsUNet(scale, 8, 12, 4)
+    fresh = {name: value.clone() for name, value in net.state_dict().items()}
+    net.start_from(first)
+    assert all(bool(value.isfinite().all()) for value in net.state_dict().values())
+    taken = [name for name, value in net.state_dict().items() if not torch.equal(value, fresh[name])]
+    assert {"coarse.weight", "trunk.0.ways.1.first.weight", "planes.weight", "choice.weight"} <= set(taken)
+    if scale == first.scale:
+        rgb, values = _inputs(scale)
+        with torch.inference_mode():
+            near, far = (each.eval().upsample(rgb, values) for each in (net, FacetsUNet(scale, 8, 12, 4)))
+            expected = first.upsample(rgb, values)
+        assert float((near - expected).abs().mean()) < 0.5 * float((far - expected).abs().mean())
+
+
+@pytest.mark.parametrize("scale", [2, 4, 8, 16])
+def test_it_starts_from_another_factor_near_what_that_one_does(scale: int) -> None:
+    torch.manual_seed(1)
+    first = FacetsUNet(4, 8, 12, 4)
+    first.start_from(Facets(4, width=8, blocks=4))
+    net = FacetsUNet(scale, 8, 12, 4)
+    net.start_from(first.eval())
+    photo, values = _inputs(4)
+    rgb = nn.functional.interpolate(photo, scale_factor=scale / 4, mode="bilinear", antialias=scale < 4)
+    with torch.inference_mode():
+        found, expected = net.eval().upsample(rgb, values), first.upsample(photo, values)
+        fresh = FacetsUNet(scale, 8, 12, 4).eval().upsample(rgb, values)
+    grown = nn.functional.interpolate(expected, found.shape[-2:], mode="bilinear", antialias=scale < 4)
+    assert float((found - grown).abs().mean()) < 0.7 * float((fresh - grown).abs().mean())
+    assert all(
+        torch.equal(value, net.state_dict()[name]) for name, value in first.state_dict().items() if "trunk" in name
+    )
+
+
+@pytest.mark.parametrize("kernel", KERNELS)
+def test_an_open_gate_reproduces_what_was_measured(kernel: str) -> None:
+    rgb, values = _inputs(4)
+    net, hints = _net(), torch.zeros(1, FACTS)
+    hints[0, KERNELS.index(kernel)] = 1
+    model = Downsampling(kernel)
+    left = []
+    for logit in (-50.0, 50.0):
+        with torch.no_grad():
+            net.gate.weight.zero_()
+            net.gate.bias.fill_(logit)
+        with torch.inference_mode():
+            found = net.answer(rgb, values, None, hints).disparity
+        left.append(float((model(found[0], 4) - values[0]).abs().mean()))
+    assert left[1] < 0.4 * left[0]
+    values[..., 4:6, 4:6] = torch.nan
+    assert bool(net.answer(rgb, values, None, hints).disparity.isfinite().all())
+
+
+@pytest.mark.parametrize("reach", [1, 2, 16])
+def test_planes_are_averaged_with_those_around_extended_to_the_pixel(reach: int) -> None:
+    generator = torch.Generator().manual_seed(reach)
+    planes = torch.randn((1, 1, 3, 5, 7), generator=generator, dtype=torch.float64)
+    weights = torch.rand((1, 1, NEIGHBOURS, 5, 7), generator=generator, dtype=torch.float64)
+    expected = torch.zeros_like(planes)
+    for row, column in itertools.product(range(5), range(7)):
+        for k in range(NEIGHBOURS):
+            i = min(max(row + reach * (k // 3 - 1), 0), 4)
+            j = min(max(column + reach * (k % 3 - 1), 0), 6)
+            value, slope_u, slope_v = planes[0, 0, :, i, j]
+            here = torch.stack((value + (column - j) * slope_u + (row - i) * slope_v, slope_u, slope_v))
+            expected[0, 0, :, row, column] += weights[0, 0, k, row, column] * here
+    torch.testing.assert_close(average_planes(planes, weights, reach), expected)
+
+
+def test_sizes_are_checked() -> None:
+    with pytest.raises(ValueError, match="scale: expected 1, 2, 4, 8 or 16, got 3"):
+        FacetsUNet(3)
+    with pytest.raises(ValueError, match=r"model: expected positive sizes.*got width 0"):
+        FacetsUNet(4, 0)
+    with pytest.raises(ValueError, match=r"blocks of at least 3, got .* blocks 2"):
+        FacetsUNet(4, blocks=2)
+
+
+def test_images_of_a_batch_do_not_see_each_other() -> None:
+    """With kernels of their own, one of them unknown, and holes in one."""
+    net = _net()
+    rgb = torch.rand((3, 3, 48, 40), generator=torch.Generator().manual_seed(5))
+    values = 1 + 0.1 * torch.rand((3, 1, 12, 10), generator=torch.Generator().manual_seed(6)).double()
+    values[1, :, 3:6, 2:5] = torch.nan
+    facts = torch.stack([encode_facts("box", noise=True), encode_facts("bicubic", soft=True), encode_facts()])
+    noise = torch.full_like(values, 0.01)
+    with torch.inference_mode():
+        together = net.answer(rgb, values, noise, facts)
+        for i in range(3):
+            alone = net.answer(rgb[i : i + 1], values[i : i + 1], noise[i : i + 1], facts[i : i + 1])
+            for one, all_of_them in zip(alone, together, strict=True):
+                torch.testing.assert_close(one, all_of_them[i : i + 1], rtol=1e-4, atol=1e-6)
+
+
+def test_photos_of_another_size_and_other_networks_are_refused() -> None:
+    rgb, values = _inputs(4)
+    with pytest.raises(ValueError, match="rgb: expected"):
+        _net(8).answer(rgb, values)
+    for first in (FacetsUNet(4, 12, 12, 4), Facets(4, width=8, blocks=5)):
+        with pytest.raises(ValueError, match=r"expected weights of FacetsUNet or Facets with {'width': 8, 'blocks': 4"):
+            _net().start_from(first)
+
+
+def test_a_unet_of_another_width_starts_from_nothing() -> None:
+    """Neither a part of its weights nor a bias of them is taken over."""
+    first, net = _net(8), FacetsUNet(16, 8, 10, 4)
+    fresh = {name: value.clone() for name, value in net.state_dict().items() if name.startswith("wide.")}
+    net.start_from(first)
+    assert all(torch.equal(net.state_dict()[name], value) for name, value in fresh.items())
+
+
+def test_layers_at_the_low_resolution_are_shared_and_not_trained(tmp_path: Path) -> None:
+    first, net = _net(4), _net(8)
+    with torch.no_grad():
+        for parameter in first.parameters():
+            parameter.add_(0.01)
+    before = {name: value.clone() for name, value in net.state_dict().items()}
+    net.share(first)
+    low = {name for name, value in first.state_dict().items() if torch.equal(net.state_dict()[name], value)}
+    assert {name.split(".")[0] for name in low} == set(facets_unet._SHARED)
+    assert all(torch.equal(before[name], value) for name, value in net.state_dict().items() if name not in low)
+    assert {name for name, value in net.named_parameters() if not value.requires_grad} == low
+    with pytest.raises(ValueError, match=r"expected weights of FacetsUNet with .*'width': 8.*, got those of Facets"):
+        net.share(Facets(4, width=8, blocks=4))
+    # a file beside the other's has only what differs
+    for name, each, shared in (("x4", first, None), ("x8", net, tmp_path / "x4"), ("whole", net, None)):
+        save_network(tmp_path / name, each, "facets", half=True, shared=shared)
+    assert (tmp_path / "x8").stat().st_size < 0.7 * (tmp_path / "whole").stat().st_size
+    whole, parts = (load_network(tmp_path / name, NETWORKS, 8, "facets").state_dict() for name in ("whole", "x8"))
+    for name, value in whole.items():
+        assert torch.equal(parts[name], value), name
+    (tmp_path / "x4").unlink()
+    with pytest.raises(FileNotFoundError, match="x8: expected x4 beside it, whose layers it shares; there is none"):
+        load_network(tmp_path / "x8", NETWORKS)
