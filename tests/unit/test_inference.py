@@ -16,7 +16,7 @@ import dsr
 from dsr.geometry.camera import Camera
 from dsr.geometry.resampling import resize_inverse_depth
 from dsr.inference import api as people
-from dsr.inference import plan, upsample_depth
+from dsr.inference import plan, upsample_depth, upsample_surface
 from dsr.inference.engine import _resize_nearest, enlarged_by
 from dsr.inference.planning import OWN_SIZE
 from dsr.methods.registry import find_weights, list_methods, read_method
@@ -307,3 +307,19 @@ def test_import_of_the_package_loads_nothing_heavy() -> None:
     assert answer.stdout.strip() == "[]"
     with pytest.raises(AttributeError, match="module 'dsr' has no attribute 'upsampled'"):
         dsr.upsampled  # noqa: B018
+
+
+def test_pixels_that_a_method_leaves_out_stay_holes() -> None:
+    """They are not taken for infinitely far ones."""
+    camera, photo = _camera(48, 64), _photo(48, 64)
+    depth = _plane(24, 32, camera)
+    depth = depth + 0.02 * torch.randn(depth.shape, generator=torch.Generator().manual_seed(0))
+    whole = upsample_surface(photo, depth, camera, settings={})
+    assert whole.depth_error is not None
+    share = whole.depth_error / whole.depth
+    limit = float(share.median())
+    cut = upsample_depth(photo, depth, camera, settings={"max_error": limit})
+    dubious = share > limit
+    certain = (share - limit).abs() > 1e-4 * limit
+    assert torch.equal(cut.isnan()[certain], dubious[certain])
+    torch.testing.assert_close(cut[cut.isfinite()], whole.depth[cut.isfinite()])

@@ -159,12 +159,12 @@ def upsample_surface(
     _check(rgb, depth, camera)
     size = (camera.height, camera.width)
     choice = MethodChoice(method, settings or {}, tuple(directories), pick_device(device))
-    choice.plan(size, _size(depth), scale)  # raises ValueError for sizes or a scale that cannot be used
+    planned = choice.plan(size, _size(depth), scale)  # raises ValueError for sizes or a scale that cannot be used
     inverse = depth.float().reciprocal()
     valid = inverse.isfinite()
     near = size[0] <= OWN_SIZE * inverse.shape[-2] and size[1] <= OWN_SIZE * inverse.shape[-1]
     larger = any(n > m for n, m in zip(_size(inverse), size, strict=True))
-    if near and (_size(inverse) == size or larger or choice.plan(size, _size(depth), scale).coarsened > 1):
+    if near and (_size(inverse) == size or larger or planned.coarsened > 1):
         inverse = _resize_nearest(inverse, size)
         block = enlarged_by(inverse)
         repeated = block > 1 and not any(n % block for n in size)
@@ -182,6 +182,8 @@ def upsample_surface(
         found = _upsample_inverse(rgb, inverse, camera, scale, choice, progress)
     lowest = inverse.nan_to_num(nan=torch.inf).amin()
     inverse_hr = torch.where(found.inverse > 0, found.inverse, lowest.to(found.inverse.device))  # 0 is infinitely far
+    if found.left_out is not None:
+        inverse_hr = inverse_hr.masked_fill(found.left_out, torch.nan)
     result = inverse_hr.reciprocal_()
     surface = Surface(result, None if found.spread is None else found.spread * result, found.angle, found.noise)
     if keep_holes and not bool(valid.all()):
@@ -191,19 +193,23 @@ def upsample_surface(
 
 
 class _Found(NamedTuple):
-    """High-resolution inverse depth, (1, H, W), its expected relative error, the normal's in degrees, and the noise."""
+    """High-resolution inverse depth, (1, H, W), its expected relative error, the normal's in degrees, and the noise.
+
+    ``left_out`` (1, H, W) marks pixels that the method leaves as holes.
+    """
 
     inverse: Tensor
     spread: Tensor | None = None
     angle: Tensor | None = None
+    left_out: Tensor | None = None
     noise: MapNoise | None = None
 
     def crop(self, size: tuple[int, int]) -> _Found:
         """Return the upper left window of a size."""
         window = (..., slice(size[0]), slice(size[1]))
-        inverse, spread, angle = (None if each is None else each[window] for each in self[:3])
+        inverse, spread, angle, left_out = (None if each is None else each[window] for each in self[:4])
         assert inverse is not None  # noqa: S101 - for the type checker
-        return _Found(inverse, spread, angle, self.noise)
+        return _Found(inverse, spread, angle, left_out, self.noise)
 
 
 def _upsample_inverse(
@@ -270,8 +276,11 @@ def _run_at_ratio(rgb: Tensor, inverse: Tensor, camera: Camera, method: Upsample
     if not isinstance(method, Confident):
         return _Found(inpaint(method(sample, progress).reciprocal()[None])[0])
     surface = method.surface(sample, progress)
-    spread = None if surface.depth_error is None else surface.depth_error / surface.depth
-    return _Found(surface.depth.reciprocal(), spread, surface.angle_error, surface.noise)
+    if surface.depth_error is None:
+        return _Found(surface.depth.reciprocal(), None, surface.angle_error, None, surface.noise)
+    left_out = surface.depth.isnan() & surface.depth_error.isfinite()
+    spread = surface.depth_error / surface.depth
+    return _Found(surface.depth.reciprocal(), spread, surface.angle_error, left_out, surface.noise)
 
 
 def resize_rgb(rgb: Tensor, size: tuple[int, int]) -> Tensor:

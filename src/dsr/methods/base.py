@@ -82,7 +82,8 @@ class Surface(NamedTuple):
 
     ``depth`` (1, H, W): orthogonal depth in metres, NaN where missing. ``depth_error``, ``angle_error`` (1, H, W): the
     expected absolute error of the depth in metres and that of the normal in degrees; None for a method that does not
-    say. ``noise``: of the low-resolution map; None for a method that does not estimate it.
+    say. Pixels that a method leaves out on purpose have errors and no depth. ``noise``: of the low-resolution map; None
+    for a method that does not estimate it.
     """
 
     depth: Tensor

@@ -114,9 +114,10 @@ class AnyMap:
         depth = torch.where(result > 0, result, torch.nan).reciprocal().to(sample.depth_lr.device)
         errors = (_resize(each[inside], (size[0], size[1]))[0].to(depth) for each in (answer.spread, answer.angle))
         spread, angle = errors
+        depth_error = spread * depth
         if self._max_error is not None:
             depth = depth.masked_fill(spread > self._max_error, torch.nan)
-        return Surface(depth, spread * depth, torch.rad2deg(angle), noise)
+        return Surface(depth, depth_error, torch.rad2deg(angle), noise)
 
     def _factor(self, ratio: float) -> int:
         """Return the factor at which the network is run for a ratio of the sizes."""
