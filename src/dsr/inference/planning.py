@@ -33,7 +33,7 @@ from dsr.methods.networks.base import TILE, UNTILED
 from dsr.methods.networks.peers.build import PEERS, build_peer
 from dsr.methods.networks.peers.files import nearest_scale
 from dsr.methods.networks.trained import build_trained
-from dsr.methods.registry import find_weights, has_weights, read_method
+from dsr.methods.registry import SLACK, find_weights, has_weights, read_method
 from dsr.utils.builder import load_target, takes, trait
 
 DEFAULT = "facets"
@@ -44,7 +44,6 @@ OWN_SIZE = 1.25
 """A depth map whose sides differ from the photo's by no more than this factor is treated as having the photo's size."""
 USUAL_SCALE = 4
 _ASPECT = 0.02
-_SLACK = 1.05
 _UNKNOWN_COST = Cost(1000, 0)
 """The cost of a method that states none."""
 
@@ -214,10 +213,10 @@ def _scale(requested: int | None, ratio: float, method: str, ability: Ability) -
     if not factors:
         if requested is not None and requested < 1:
             raise ValueError(f"scale: expected a positive whole number, got {requested}")
-        return requested or math.ceil(ratio / _SLACK - 1e-9)
+        return requested or math.ceil(ratio / SLACK - 1e-9)
     if requested is not None and requested not in factors:
         raise ValueError(f"scale: expected one of {', '.join(map(str, sorted(factors)))} for {method}, got {requested}")
-    enough = [scale for scale in sorted(factors) if ratio <= _SLACK * scale]
+    enough = [scale for scale in sorted(factors) if ratio <= SLACK * scale]
     if requested is None and not enough:
         raise ValueError(
             f"depth: expected at least 1/{max(factors)} of the photo's size for {method}, got 1/{ratio:.3g}"

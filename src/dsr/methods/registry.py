@@ -25,7 +25,7 @@ from dsr.utils.builder import ConfigError, build, load_target, takes
 from dsr.utils.config_files import config_directories, list_choices
 from dsr.utils.ratios import round_ratio
 
-_SLACK = 1.05
+SLACK = 1.05
 """By how much a scale may exceed the factor of weights that are used for it."""
 _NETWORK = "network"
 """Key of a method's node: the dotted path of the network's class, for a method whose weights come from a training."""
@@ -172,9 +172,8 @@ def _packaged_file(node: Mapping[str, Any], scale: float) -> Path | None:
     packaged = node.get("weights_packaged")
     if isinstance(packaged, Mapping):
         there = {str(name): factor for name, factor in packaged.items() if packaged_weights(str(name)) is not None}
-        packaged = next(
-            (name for name, factor in there.items() if factor == nearest_scale(there, scale / _SLACK)), None
-        )
+        nearest = nearest_scale(there, scale / SLACK) if there else None
+        packaged = next((name for name, factor in there.items() if factor == nearest), None)
     return None if packaged is None else packaged_weights(str(packaged))
 
 
