@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ from torch.nn import functional
 
 from dsr.degradation.hints import FACTS
 from dsr.geometry.camera import Camera
-from dsr.methods.networks.any_map import AnyMap, build_any_map
+from dsr.methods.networks.any_map import CAUTION, AnyMap, build_any_map
 from dsr.methods.networks.facets_unet import Answer, FacetsUNet
 from dsr.methods.networks.weight_files import files_of_weights, save_network
 from dsr.sample import DepthSample
@@ -34,6 +35,14 @@ class Told(nn.Module):
         height, width = rgb.shape[-2:]
         plane = _plane(height, width)
         return Answer(plane, torch.full_like(plane, 0.01), torch.full_like(plane, math.radians(3)))
+
+
+class Sure(Told):
+    """Expects next to no errors."""
+
+    def answer(self, rgb: Tensor, disparity: Tensor, noise: Tensor | None, hints: Tensor, progress: object) -> Answer:
+        answer = super().answer(rgb, disparity, noise, hints, progress)
+        return answer._replace(spread=torch.full_like(answer.spread, 1e-5))
 
 
 class Reporting(Told):
@@ -85,8 +94,8 @@ def test_photo_is_resized_to_the_next_factor_and_the_result_to_the_photo(size_lr
     else:  # cropped, not squeezed
         expected = _plane(even[0], even[1])[0].reciprocal()[..., : size_lr[0], : size_lr[1]]
         torch.testing.assert_close(surface.depth, expected, rtol=1e-6, atol=0)
-    torch.testing.assert_close(surface.depth_error, 0.01 * surface.depth)
-    torch.testing.assert_close(surface.angle_error, torch.full_like(surface.depth, 3.0))
+    torch.testing.assert_close(surface.depth_error, CAUTION * 0.01 * surface.depth)
+    torch.testing.assert_close(surface.angle_error, torch.full_like(surface.depth, CAUTION * 3.0))
 
 
 def test_noise_is_described_in_metres_and_low_resolution_pixels() -> None:
@@ -207,3 +216,26 @@ def test_dubious_pixels_may_be_left_as_holes() -> None:
     assert torch.equal(cut.depth[kept], whole.depth[kept])
     with pytest.raises(ValueError, match="max_error: expected a positive share of the depth, got 0"):
         AnyMap(net, max_error=0)
+
+
+def test_flat_parts_of_rounded_maps_are_at_best_as_sure_as_the_rounding() -> None:
+    rows, columns = 24, 32
+    steps = torch.tensor([0.50, 0.52, 0.56, 0.64]).double()
+    inverse = steps.repeat_interleave(columns // 4).expand(1, rows, columns)
+    sample = _sample((rows, columns), 4)
+    sample = replace(sample, depth_lr=inverse.reciprocal())
+    net = Sure(4)
+    surface = AnyMap(net).surface(sample)  # type: ignore[arg-type]
+    assert surface.depth_error is not None
+    share = (surface.depth_error / surface.depth)[0, rows * 2]
+    nearest = torch.tensor([0.02, 0.02, 0.04, 0.08]).double()
+    middles = share[torch.tensor([16, 48, 80, 112])]
+    torch.testing.assert_close(middles, nearest / steps / 4)  # half a step at most, so a quarter on average
+    assert float(share[32]) < 1e-3  # where values change, the network says it
+    exact = AnyMap(net).surface(_sample((rows, columns), 4))  # type: ignore[arg-type]
+    assert exact.depth_error is not None
+    assert float((exact.depth_error / exact.depth).max()) < 1e-3
+    constant = replace(sample, depth_lr=torch.full_like(inverse, 2.0))
+    alone = AnyMap(net).surface(constant)  # type: ignore[arg-type]  # no other value tells the step
+    assert alone.depth_error is not None
+    assert float(alone.depth_error.max()) < 1e-3

@@ -52,15 +52,19 @@ def test_a_perfect_answer_has_no_loss_but_its_doubts() -> None:
 
 def test_the_terms_are_added_with_their_weights() -> None:
     batch = _batch(soft=1.0)
-    objective = SurfaceObjective(depth=3.0, soft=5.0, errors=0.1)
+    objective = SurfaceObjective(depth=3.0, soft=5.0, sharp=1.5, errors=0.1)
     terms = objective(_answer(batch, 1.02 * _inverse(batch)), batch)
-    expected = 3 * terms["lap1"] + 5 * terms["rmse_soft"] + terms["rmse_v"] + 0.1 * (terms["spread"] + terms["angle"])
-    torch.testing.assert_close(terms["loss"], expected)
+    others = 3 * terms["lap1"] + terms["rmse_v"] + 0.1 * (terms["spread"] + terms["angle"])
+    torch.testing.assert_close(terms["loss"], others + 5 * terms["rmse_soft"])
     unit = _inverse(batch).flatten().median()
     missed = (0.02 * _inverse(batch) / unit).square().mean().sqrt()
     torch.testing.assert_close(terms["rmse_soft"], missed, rtol=1e-3, atol=0)
-    assert float(objective(_answer(batch, 1.02 * _inverse(batch)), _batch())["rmse_soft"]) == 0
-    assert objective.formula == "3 Lap_1 + RMSE_v + 5 RMSE of soft maps + 0.1 (likelihoods of the expected errors)"
+    sharp = objective(_answer(batch, 1.02 * _inverse(batch)), _batch())
+    assert float(sharp["rmse_soft"]) == float(terms["rmse_sharp"]) == 0
+    torch.testing.assert_close(sharp["rmse_sharp"], terms["rmse_soft"])
+    torch.testing.assert_close(sharp["loss"], others + 1.5 * sharp["rmse_sharp"])
+    formula = "3 Lap_1 + RMSE_v + 1.5 RMSE (5 of soft maps) + 0.1 (likelihoods of the expected errors)"
+    assert objective.formula == formula
 
 
 def test_the_likelihood_is_best_where_the_expected_error_is_the_mean_error() -> None:

@@ -104,31 +104,33 @@ class SurfaceObjective:
     """The loss of a network that says how sure it is: K Lap_1 + RMSE_v, and the likelihoods of its expected errors.
 
     Lap_1 compares disparities divided by the truth's median. RMSE_v is that of each image, and not its square, so that
-    noisy maps do not outweigh clean ones. Where the truth's depth steps are soft, the RMSE of the divided disparities
-    is added, so that a step whose place is uncertain gets soft, too. The expected errors are the scales of Laplace
-    distributions, of the logarithm of disparity and of the angle between the normals.
+    noisy maps do not outweigh clean ones. The RMSE of the divided disparities is added, with a larger weight where the
+    truth's depth steps are soft, so that a step whose place is uncertain gets soft, too. The expected errors are the
+    scales of Laplace distributions, of the logarithm of disparity and of the angle between the normals.
 
     Args:
         depth: K.
-        soft: weight of the RMSE of soft maps.
+        soft: weight of the RMSE of maps with soft depth steps.
+        sharp: weight of the RMSE of maps with sharp depth steps.
         errors: weight of each of the two negative logarithms of likelihoods.
 
     """
 
     depth: float = 20.0
     soft: float = 8.0
+    sharp: float = 2.0
     errors: float = 0.02
 
     @property
     def formula(self) -> str:
         """The loss as a formula."""
-        terms = f"{self.depth:g} Lap_1 + RMSE_v + {self.soft:g} RMSE of soft maps"
+        terms = f"{self.depth:g} Lap_1 + RMSE_v + {self.sharp:g} RMSE ({self.soft:g} of soft maps)"
         return f"{terms} + {self.errors:g} (likelihoods of the expected errors)"
 
     @property
     def facts(self) -> dict[str, str | float]:
         """What the header of weights says of the loss."""
-        return {"loss": "surface", "depth": self.depth, "soft": self.soft, "errors": self.errors}
+        return {"loss": "surface", "depth": self.depth, "soft": self.soft, "sharp": self.sharp, "errors": self.errors}
 
     def __call__(self, answer: Answer, batch: Batch) -> dict[str, Tensor]:
         """Return ``loss`` and its terms, means over the images of the batch that have valid depth.
@@ -150,7 +152,9 @@ class SurfaceObjective:
         }
         missed = (answer.disparity - target) / unit
         missed = masked_mean(missed.nan_to_num(0).square(), target.isfinite())
-        terms["rmse_soft"] = (batch["soft"] * (missed[:, 0] + _FAINT).sqrt()).nanmean()
+        missed = (missed[:, 0] + _FAINT).sqrt()
+        terms["rmse_soft"] = (batch["soft"] * missed).nanmean()
+        terms["rmse_sharp"] = ((1 - batch["soft"]) * missed).nanmean()
         with torch.no_grad():
             off = (answer.disparity.clamp(min=1e-6) / target).log().abs()
             angle = torch.deg2rad(angle_between(*pair.normals))
@@ -160,7 +164,8 @@ class SurfaceObjective:
         ):
             likelihood = expected.log() + torch.where(valid, error, 0) / expected
             terms[name] = masked_mean(likelihood, valid).nanmean()
-        loss = self.depth * terms["lap1"] + self.soft * terms["rmse_soft"] + terms["rmse_v"]
+        loss = self.depth * terms["lap1"] + terms["rmse_v"]
+        loss = loss + self.soft * terms["rmse_soft"] + self.sharp * terms["rmse_sharp"]
         loss = loss + self.errors * (terms["spread"] + terms["angle"])
         return {"loss": loss, **terms}
 

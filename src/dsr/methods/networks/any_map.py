@@ -29,6 +29,10 @@ from dsr.utils.progress import Steps
 Edges = Literal["auto", "sharp", "soft"]
 _TOLERANCE = 0.02
 """A map is taken for one of the photo's own size up to this relative difference."""
+CAUTION = 1.1
+"""Measured errors over expected ones on rendered scenes that are not trained on, see ``benchmarks/confidence.py``."""
+_ROUNDED = 16
+"""A map with fewer different values than one per so many pixels is taken for a rounded one."""
 
 
 class AnyMap:
@@ -113,7 +117,8 @@ class AnyMap:
         result = resize_inverse_depth(answer.disparity[inside][0], (size[0], size[1]))
         depth = torch.where(result > 0, result, torch.nan).reciprocal().to(sample.depth_lr.device)
         errors = (_resize(each[inside], (size[0], size[1]))[0].to(depth) for each in (answer.spread, answer.angle))
-        spread, angle = errors
+        spread, angle = (CAUTION * each for each in errors)
+        spread = torch.maximum(spread, _resize(_rounding(inverse).to(depth), (size[0], size[1]))[0])
         depth_error = spread * depth
         if self._max_error is not None:
             depth = depth.masked_fill(spread > self._max_error, torch.nan)
@@ -195,6 +200,28 @@ def _describe_noise(given: Tensor, answer: Answer) -> MapNoise:
     variance = error.square().sum() / count
     depth = given[given.isfinite()].median().reciprocal()
     return MapNoise(float(variance.sqrt() * depth), _extent(error, known, float(variance)))
+
+
+def _rounding(inverse: Tensor) -> Tensor:
+    """Return the expected relative error of the rounding of maps that are rounded to few values, (B, 1, h, w).
+
+    It is a quarter of the step to the next value, the mean of errors that are equally likely up to half a step, where
+    the map has no other value around a pixel from which the truth could be told more exactly. It is 0 elsewhere.
+
+    """
+    known = inverse.isfinite()
+    values = inverse[known].unique()
+    if values.numel() < 2 or values.numel() * _ROUNDED >= known.sum():
+        return torch.zeros_like(inverse)
+    gaps = values.diff()
+    step = torch.cat((gaps[:1], torch.minimum(gaps[:-1], gaps[1:]), gaps[-1:]))
+    filled = torch.where(known, inverse, values[0])
+    relative = (step / values)[torch.searchsorted(values, filled).clamp(max=len(values) - 1)] / 4
+    low, high = (
+        -functional.max_pool2d(-torch.where(known, inverse, torch.inf), 3, stride=1, padding=1),
+        functional.max_pool2d(torch.where(known, inverse, -torch.inf), 3, stride=1, padding=1),
+    )
+    return torch.where(known & (low == high), relative, 0)
 
 
 def _extent(error: Tensor, known: Tensor, variance: float) -> float:
