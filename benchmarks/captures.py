@@ -110,7 +110,13 @@ def run_method(capture: Capture, name: str, shared: Path) -> Tensor:
     sample = capture.sample
     keep = capture.keep_holes or node.get("fill_holes") is False
     return upsample_depth(
-        sample.rgb, sample.depth_lr, sample.camera, method=name, settings=settings, keep_holes=keep, device="cpu"
+        sample.rgb,
+        sample.depth_lr,
+        sample.camera,
+        method=name,
+        settings=settings,
+        fill="none" if keep else "all",
+        device="cpu",
     )
 
 

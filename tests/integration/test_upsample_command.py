@@ -112,15 +112,36 @@ def test_two_files_are_enough_and_all_assumptions_are_printed(pair, cube, tmp_pa
     assert told["files"] == [name for names in PARTS.values() for name in names]
 
 
-def test_methods_without_expected_errors_are_complete_without_them(pair, tmp_path, capsys):
+def test_expected_errors_are_estimated_for_methods_that_say_none(pair, tmp_path, capsys):
     out = tmp_path / "out"
     assert of(pair, out, "--method", "bicubic") == 0
-    assert files_in(out) == {*sum(PARTS.values(), ()), "info.json"} - set(PARTS["confidence"])
+    assert files_in(out) == {*sum(PARTS.values(), ()), "info.json"}
+    errors = np.load(out / "confidence.npz")
+    assert all((errors[name] >= 0).all() for name in ("depth_error", "angle_error"))
+    hole = errors["depth_error"][22:26, 14:22] / np.load(out / "depth_metres.npy")[22:26, 14:22]
+    assert (hole > 0.02).all()
     capsys.readouterr()
     assert of(pair, out, "--method", "bicubic") == 0
     assert "complete already" in capsys.readouterr().out
-    message = refused(capsys, of(pair, tmp_path / "other", "--method", "bicubic", "--only", "confidence"))
-    assert message == "--only confidence: expected a method that says how sure it is, such as facets, got bicubic"
+
+
+def test_wide_holes_stay_holes_and_it_is_said(pair, tmp_path, capsys):
+    mask = np.full((16, 16), 255, np.uint8)
+    mask[2:10, 2:10] = 0
+    Image.fromarray(mask).save(tmp_path / "mask.png")
+    options = (*DEPTH_ONLY, "--mask", tmp_path / "mask.png")
+    assert of(pair, tmp_path / "small", *options) == 0
+    said = capsys.readouterr().out
+    depth = np.asarray(Image.open(tmp_path / "small" / "depth.png"))
+    assert (depth[20:28, 20:28] == 0).all()
+    share = (depth == 0).mean()
+    assert f"holes wider than 2 degrees stay holes ({share:.1%} of the pixels; --fill all fills them, too)" in said
+    for name, extra in (("wide", ("--max-hole", "90")), ("all", ("--fill", "all"))):
+        assert of(pair, tmp_path / name, *options, *extra) == 0
+        assert np.asarray(Image.open(tmp_path / name / "depth.png")).min() > 0
+        assert "stay holes" not in capsys.readouterr().out
+    message = refused(capsys, of(pair, tmp_path / "wrong", *options, "--max-hole", "-1"))
+    assert message == "--max-hole: expected a positive number of degrees, got -1"
 
 
 def test_noise_of_an_earlier_run_is_kept_where_parts_are_added(pair, tmp_path, capsys):
@@ -145,7 +166,7 @@ def test_result_has_the_inputs_format_type_unit_and_holes(pair, tmp_path, suffix
     depth = tmp_path / f"d.{suffix}"
     write_depth_file(depth, (metres * factor).astype(dtype))
     out = tmp_path / "out"
-    assert of((photo, depth), out, *DEPTH_ONLY, "--keep-holes") == 0
+    assert of((photo, depth), out, *DEPTH_ONLY, "--fill", "none") == 0
     stored = read_depth_file(out / f"depth.{suffix}")
     plain = "depth.npy" if not (out / "depth_metres.npy").exists() else "depth_metres.npy"
     result = np.load(out / plain)
@@ -165,7 +186,7 @@ def test_other_format_is_in_metres_or_whole_millimetres(pair, tmp_path):
 
 def test_holes_are_filled_unless_kept_on_request(pair, tmp_path):
     assert of(pair, tmp_path / "filled", *DEPTH_ONLY) == 0
-    assert of(pair, tmp_path / "kept", *DEPTH_ONLY, "--keep-holes") == 0
+    assert of(pair, tmp_path / "kept", *DEPTH_ONLY, "--fill", "none") == 0
     filled, kept = (np.asarray(Image.open(tmp_path / name / "depth.png")) for name in ("filled", "kept"))
     assert filled.min() > 0
     assert (kept[22:26, 14:22] == 0).all()
@@ -175,7 +196,7 @@ def test_mask_makes_holes(pair, tmp_path):
     mask = np.full((16, 16), 255, np.uint8)
     mask[:, 10:] = 0
     Image.fromarray(mask).save(tmp_path / "mask.png")
-    assert of(pair, tmp_path / "out", *DEPTH_ONLY, "--keep-holes", "--mask", tmp_path / "mask.png") == 0
+    assert of(pair, tmp_path / "out", *DEPTH_ONLY, "--fill", "none", "--mask", tmp_path / "mask.png") == 0
     assert (np.asarray(Image.open(tmp_path / "out" / "depth.png"))[:, 44:] == 0).all()
     assert set(info(tmp_path / "out")["inputs"]) == {"rgb", "depth", "mask"}
 

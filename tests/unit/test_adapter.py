@@ -96,7 +96,13 @@ def test_any_scale_gives_what_upsample_gives(name: str, size: tuple[int, int]) -
     settings = {"ensemble": 1} if name == "facets_box" else {"radius": 2}
     depth = AnyScale(read_method(name, sample.scale, settings))(sample)  # type: ignore[arg-type]
     expected = upsample_depth(
-        sample.rgb, sample.depth_lr, CAMERA, method=name, settings=settings, device="cpu", keep_holes=name == "eg"
+        sample.rgb,
+        sample.depth_lr,
+        CAMERA,
+        method=name,
+        settings=settings,
+        device="cpu",
+        fill="none" if name == "eg" else "all",
     )
     assert torch.equal(depth.isnan(), expected.isnan())
     assert torch.equal(depth.nan_to_num(), expected.nan_to_num())

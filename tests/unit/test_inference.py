@@ -64,7 +64,7 @@ def test_holes_are_filled_or_kept() -> None:
     depth[:, 2, 3] = torch.nan
     rgb = _photo(32, 48)
     for method in ("facets", "bicubic", "nearest"):
-        filled, kept = (upsample_depth(rgb, depth, camera, method=method, keep_holes=keep) for keep in (False, True))
+        filled, kept = (upsample_depth(rgb, depth, camera, method=method, fill=fill) for fill in ("small", "none"))
         assert bool(filled.isfinite().all())
         assert kept.isnan().nonzero()[:, 1:].amin(0).tolist() == [8, 12]
         assert kept.isnan().nonzero()[:, 1:].amax(0).tolist() == [11, 15]
@@ -78,7 +78,7 @@ def test_depth_of_the_photos_size_keeps_its_own_holes() -> None:
     holes = torch.rand(depth.shape, generator=torch.Generator().manual_seed(1)) < 0.3
     depth = depth.masked_fill(holes, torch.nan)
     rgb = _photo(33, 46)
-    kept = upsample_depth(rgb, depth, camera, keep_holes=True)
+    kept = upsample_depth(rgb, depth, camera, fill="none")
     torch.testing.assert_close(kept.isnan(), holes)
     filled = upsample_depth(rgb, depth, camera)
     assert bool(filled.isfinite().all())
@@ -229,10 +229,10 @@ def test_every_method_upsamples_any_size_and_its_holes(method: str) -> None:
     steps: list[tuple[int, int]] = []
     full, kept = (
         upsample_depth(
-            _photo(31, 42), depth, camera, method=method, settings=quick, keep_holes=keep,
+            _photo(31, 42), depth, camera, method=method, settings=quick, fill=fill,
             progress=lambda *step: steps.append(step),
         )
-        for keep in (False, True)
+        for fill in ("all", "none")
     )  # fmt: skip
     assert full.shape == (1, 31, 42)
     assert bool(full.isfinite().all())
@@ -323,3 +323,26 @@ def test_pixels_that_a_method_leaves_out_stay_holes() -> None:
     certain = (share - limit).abs() > 1e-4 * limit
     assert torch.equal(cut.isnan()[certain], dubious[certain])
     torch.testing.assert_close(cut[cut.isfinite()], whole.depth[cut.isfinite()])
+
+
+def test_wide_holes_stay_unless_all_are_to_be_filled() -> None:
+    camera = _camera(96, 128)
+    depth = _plane(48, 64, camera)
+    depth[:, 10:40, 10:40] = torch.nan
+    depth[:, 4:6, 50:53] = torch.nan
+    rgb = _photo(96, 128)
+    for method in ("facets", "bicubic"):
+        small, wider, everything, none = (
+            upsample_depth(rgb, depth, camera, method=method, **options)
+            for options in ({}, {"max_hole": 60}, {"fill": "all"}, {"fill": "none"})
+        )
+        assert bool(small[:, 30:70, 30:70].isnan().all())
+        assert bool(small[:, 8:12, 100:106].isfinite().all())
+        assert bool(everything.isfinite().all())
+        assert bool(wider.isfinite().all())
+        assert int(none.isnan().sum()) == 4 * (900 + 6)
+        there = small.isfinite()
+        assert torch.equal(small[there], everything[there])
+    for wrong in ({"fill": "some"}, {"max_hole": 0}, {"max_hole": math.inf}):
+        with pytest.raises(ValueError, match=f"^{next(iter(wrong))}: expected"):
+            upsample_depth(rgb, depth, camera, **wrong)

@@ -105,7 +105,16 @@ def _add_method(parser: argparse.ArgumentParser) -> None:
     )
     method.add_argument("--scale", type=int, metavar="N", help="upsampling factor (default: from the sizes)")
     method.add_argument("--device", default="auto", metavar="DEVICE", help="auto (default), cpu, cuda, cuda:1, ...")
-    method.add_argument("--keep-holes", action="store_true", help="keep the input's holes")
+    method.add_argument(
+        "--fill", choices=("all", "small", "none"), default="small", help="which of the input's holes are filled"
+    )
+    method.add_argument(
+        "--max-hole",
+        type=float,
+        default=2.0,
+        metavar="DEGREES",
+        help="width of the widest hole that --fill small fills, degrees of view (default: 2)",
+    )
 
 
 def _add_results(parser: argparse.ArgumentParser) -> None:
@@ -177,7 +186,8 @@ def _run(options: argparse.Namespace, console: Console, _: object) -> list[str]:
         directories=tuple(options.config_dir),
         scale=options.scale,
         device=options.device,
-        keep_holes=options.keep_holes,
+        fill=options.fill,
+        max_hole=options.max_hole,
         max_error=options.max_error / 100,
         depth_format=options.format,
         parts=(*parts, *unknown),

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from dsr.degradation.scales import SCALES
 from dsr.geometry.camera import RangeType
-from dsr.inference.engine import DECIDED, MethodChoice, upsample_depth
+from dsr.inference.engine import DECIDED, Fill, MethodChoice, upsample_depth
 from dsr.inference.planning import read_ability
 from dsr.methods.registry import find_weights, read_method
 from dsr.sample import DepthSample
@@ -65,7 +65,7 @@ class AnyScale:
         if weights is not None and takes("method", node, "weights"):
             settings["weights"] = str(weights)
         self._choice = MethodChoice(str(node["name"]), settings, tuple(directories), device or torch.device("cpu"))
-        self._keep_holes = node.get("fill_holes") is False
+        self._fill: Fill = "none" if node.get("fill_holes") is False else "all"
         self.flag = getattr(self._choice.build(self._steps()[0]), "flag", "")
 
     def __call__(self, sample: DepthSample, progress: Steps | None = None) -> Tensor:
@@ -78,7 +78,7 @@ class AnyScale:
             settings=self._choice.settings,
             directories=self._choice.directories,
             device=str(self._choice.device),
-            keep_holes=self._keep_holes,
+            fill=self._fill,
             progress=progress,
         ).to(sample.depth_lr)
 

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from dsr.geometry.camera import Camera
-from dsr.inference.engine import upsample_surface
+from dsr.inference.engine import WIDEST, Fill, upsample_surface
 from dsr.inference.planning import DEFAULT
 from dsr.methods.base import MapNoise
 from dsr.utils.progress import Steps
@@ -26,7 +26,8 @@ def upsample(
     method: str = DEFAULT,
     mask: Array | None = None,
     device: str = "auto",
-    keep_holes: bool = False,
+    fill: Fill = "small",
+    max_hole: float = WIDEST,
     progress: Steps | None = None,
     **settings: Any,
 ) -> Array:
@@ -47,7 +48,8 @@ def upsample(
             ``bicubic``, and ``dip_v``, which takes minutes.
         mask: valid mask of the depth's shape, for maps whose holes are not NaN.
         device: ``auto`` for a GPU if there is one; or ``cpu``, ``cuda``, ``cuda:1``.
-        keep_holes: whether holes stay NaN; otherwise they are inpainted.
+        fill: which holes are filled: ``all``, only ``small`` ones, or ``none``. The others stay NaN.
+        max_hole: width of the widest hole that counts as small, in degrees of view; one of 5 pixels always does.
         progress: a function that is called with the number of parts done and their total.
         **settings: the method's arguments, by their names in its file in ``conf/method``, such as ``noise=0.002`` of
             ``facets``, the standard deviation of the map's noise in metres, if it is known.
@@ -84,7 +86,8 @@ def upsample(
         method=method,
         mask=mask,
         device=device,
-        keep_holes=keep_holes,
+        fill=fill,
+        max_hole=max_hole,
         progress=progress,
         **settings,
     ).depth
@@ -93,13 +96,13 @@ def upsample(
 class SurfaceArrays(NamedTuple, Generic[Array]):
     """A result with its expected errors, (H, W) as arrays or (1, H, W) as tensors.
 
-    ``depth`` and ``depth_error`` are in metres, ``angle_error``, that of the normal, in degrees. The errors and
-    ``noise``, the estimated noise of the input, are None for a method that does not say.
+    ``depth`` and ``depth_error`` are in metres, ``angle_error``, that of the normal, in degrees. ``noise``, the
+    estimated noise of the input, is None for a method that does not say.
     """
 
     depth: Array
-    depth_error: Array | None
-    angle_error: Array | None
+    depth_error: Array
+    angle_error: Array
     noise: MapNoise | None
 
 
@@ -112,13 +115,15 @@ def upsample_with_errors(
     method: str = DEFAULT,
     mask: Array | None = None,
     device: str = "auto",
-    keep_holes: bool = False,
+    fill: Fill = "small",
+    max_hole: float = WIDEST,
     progress: Steps | None = None,
     **settings: Any,
 ) -> SurfaceArrays[Array]:
     """Upsample a depth map as :func:`upsample` does, and return its expected errors, too; see there.
 
-    ``facets`` says them: the mean absolute errors of depth and normal that are to be expected at each pixel.
+    They are the mean absolute errors of depth and normal that are to be expected at each pixel. ``facets`` says them;
+    for other methods they are estimated, see :mod:`dsr.inference.agreement`.
     """
     arrays = isinstance(rgb, np.ndarray)
     if isinstance(depth, np.ndarray) != arrays:
@@ -143,11 +148,12 @@ def upsample_with_errors(
         method=method,
         settings=settings,
         device=device,
-        keep_holes=keep_holes,
+        fill=fill,
+        max_hole=max_hole,
         progress=progress,
     )
     depth_hr, depth_error, angle_error = (
-        cast("Array", None if each is None else each[0].cpu().numpy() if arrays else each) for each in surface[:3]
+        cast("Array", each[0].cpu().numpy() if arrays and each is not None else each) for each in surface[:3]
     )
     return SurfaceArrays(depth_hr, depth_error, angle_error, surface.noise)
 

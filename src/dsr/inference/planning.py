@@ -59,7 +59,6 @@ class Ability:
         optimises: whether it optimises a network for each picture.
         cost: the method's rough cost; None if it states none.
         own_resolution: whether it takes a depth map of the photo's own size as it is.
-        confident: whether it says how far off its result may be.
         factors: those at which a method of any ratio computes, by names of weights, if it has only some.
 
     """
@@ -69,7 +68,6 @@ class Ability:
     optimises: bool = False
     cost: Cost | None = None
     own_resolution: bool = False
-    confident: bool = False
     factors: Mapping[str, float] = field(default_factory=dict)
 
 
@@ -84,7 +82,6 @@ class Plan:
         coarsened: the factor by which depth of the photo's own size is downsampled first; 1 for low-resolution depth.
         way: the sizes and the method in one line.
         text: the same and the memory that it takes.
-        confident: whether the result comes with its expected errors.
 
     """
 
@@ -94,7 +91,6 @@ class Plan:
     coarsened: int
     way: str
     text: str
-    confident: bool = False
 
 
 def read_ability(method: str, directories: Sequence[Path] = (), settings: Mapping[str, Any] | None = None) -> Ability:
@@ -115,10 +111,9 @@ def read_ability(method: str, directories: Sequence[Path] = (), settings: Mappin
         return Ability("interpolation", {})
     optimises, cost = bool(trait("method", node, "optimises")), trait("method", node, "cost")
     if trait("method", node, "own_resolution"):
-        confident = trait("method", node, "surface") is not None
         packaged = node.get("weights_packaged")
         computed = packaged if isinstance(packaged, Mapping) else {}
-        return Ability("sample", {}, optimises, cost, own_resolution=True, confident=confident, factors=computed)
+        return Ability("sample", {}, optimises, cost, own_resolution=True, factors=computed)
     factors: tuple[int, ...] = SCALES
     if takes("method", node, "weights"):
         nodes = {scale: read_method(method, scale, settings, directories) for scale in SCALES}
@@ -190,7 +185,7 @@ def plan(
     text = f"{way}, in about {_memory(pixels, worked_on, ability) / 2**30:.1f} GB of memory"
     if ability.cost is not None:
         text += f" and {_duration(ability.cost.seconds * worked_on / 1e6)} on two CPU cores"
-    return Plan(method, chosen, steps, coarsened, way, text, ability.confident)
+    return Plan(method, chosen, steps, coarsened, way, text)
 
 
 def _ratio(photo_size: tuple[int, int], depth_size: tuple[int, int]) -> float:

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import functools
+import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
 from dsr.app.upsample.outputs import FORMATS, LARGEST_ERROR, PARTS
-from dsr.inference import DEFAULT, MethodChoice, check_settings
-from dsr.inference.planning import USUAL_SCALE, read_ability
+from dsr.inference import DEFAULT, WIDEST, Fill, MethodChoice, check_settings
+from dsr.inference.planning import USUAL_SCALE
 from dsr.io.inputs import Reading
 from dsr.io.pairs import Pair
 from dsr.methods.registry import list_methods, read_method, target_paths
@@ -29,7 +29,7 @@ class UpsampleRequest:
         folders: the folders that are searched for pairs.
         rgb, depth, mask: files, or one folder each of the first two.
         reading: how to read the files.
-        method, settings, directories, scale, device, keep_holes: see :func:`dsr.inference.upsample_depth`.
+        method, settings, directories, scale, device, fill, max_hole: see :func:`dsr.inference.upsample_depth`.
         max_error: expected relative error of the depth from which a pixel is left out of cloud and mesh.
         depth_format: the result's format; None for the input's.
         parts: what to write, some of :data:`dsr.app.upsample.outputs.PARTS`.
@@ -49,7 +49,8 @@ class UpsampleRequest:
     directories: tuple[Path, ...] = ()
     scale: int | None = None
     device: str = "auto"
-    keep_holes: bool = False
+    fill: Fill = "small"
+    max_hole: float = WIDEST
     max_error: float = LARGEST_ERROR
     depth_format: str | None = None
     parts: tuple[str, ...] = PARTS
@@ -75,21 +76,12 @@ class UpsampleRequest:
             raise ValueError("--mask: expected --rgb and --depth with it, got folders")
         if not self.max_error > 0:
             raise ValueError(f"--max-error: expected a positive percentage of the depth, got {100 * self.max_error:g}")
+        if not 0 < self.max_hole < math.inf:
+            raise ValueError(f"--max-hole: expected a positive number of degrees, got {self.max_hole:g}")
         self._check_method()
 
-    @functools.cached_property
-    def wanted(self) -> tuple[str, ...]:
-        """Parts that the method can have."""
-        if "confidence" not in self.parts or read_ability(self.method, self.directories, self.settings).confident:
-            return self.parts
-        return tuple(part for part in self.parts if part != "confidence")
-
     def _check_method(self) -> None:
-        """Check that the method accepts the settings and can write something of what is requested."""
-        if not self.wanted:
-            raise ValueError(
-                f"--only confidence: expected a method that says how sure it is, such as {DEFAULT}, got {self.method}"
-            )
+        """Check that the method accepts the settings."""
         if not self.settings:
             return
         try:
@@ -107,7 +99,8 @@ def settings_of(request: UpsampleRequest) -> dict[str, Any]:
     return {
         "method": request.method,
         "scale": request.scale,
-        "keep_holes": request.keep_holes,
+        "fill": request.fill,
+        "max_hole": request.max_hole,
         "max_error": request.max_error,
         "format": request.depth_format,
         **reading,

@@ -150,7 +150,7 @@ class _Job:
         if not self.reusable or self.earlier is None:
             return False
         there = {name.split("/")[0].split(".")[0] for name in self.earlier.files if (self.target / name).is_file()}
-        return there >= set(self.request.wanted)
+        return there >= set(self.request.parts)
 
 
 def _one(
@@ -172,13 +172,14 @@ def _one(
         return "to do"
     inputs = files_of(pair, request.reading).values()
     expect_free(target, inputs, ours=request.overwrite or job.earlier is not None)
-    errors = planned.confident and bool(_SHAPED_BY_ERRORS & set(request.parts))
+    errors = bool(_SHAPED_BY_ERRORS & set(request.parts))
     surface = kept_surface(target, picture.camera, errors=errors) if job.reusable else None
     begin(target, job.settings, job.inputs, () if job.earlier is None else job.earlier.files)
     started = time.perf_counter()
     if surface is None:
         surface = _upsample(job, picture, progress)
         reporter.facts(_describe(surface.noise, given="noise" in request.settings))
+        reporter.facts(_describe_holes(surface, request))
     seconds = time.perf_counter() - started
     facts = _write(job, picture, surface, planned, seconds)
     reporter.facts(facts)
@@ -209,7 +210,8 @@ def _upsample(job: _Job, picture: Picture, progress: Progress) -> Surface:
             settings=request.settings,
             directories=request.directories,
             device=request.device,
-            keep_holes=request.keep_holes,
+            fill=request.fill,
+            max_hole=request.max_hole,
             progress=step,
         )
     return surface.map(lambda values: values.cpu())
@@ -223,12 +225,21 @@ def _describe(noise: MapNoise | None, *, given: bool) -> list[Assumption]:
     return [Assumption("noise of the depth map", f"about {1e3 * noise.deviation:.2g} mm{extent}; --noise overrides it")]
 
 
+def _describe_holes(surface: Surface, request: UpsampleRequest) -> list[Assumption]:
+    """Return a note on wide holes, if there are any."""
+    share = float(surface.depth.isnan().float().mean())
+    if request.fill != "small" or not share:
+        return []
+    text = f"holes wider than {request.max_hole:g} degrees stay holes"
+    return [Assumption(text, f"{share:.1%} of the pixels; --fill all fills them, too")]
+
+
 def _write(job: _Job, picture: Picture, surface: Surface, planned: Plan, seconds: float) -> list[Assumption]:
     """Write all parts and ``info.json``, and return notes for the user."""
     started = time.perf_counter()
     encoding = output_encoding(picture.encoding, job.request.depth_format)
     title = f"{job.pair.name}, {planned.method} x{planned.scale}"
-    files, facts = write_parts(job.target, picture, surface, job.request.wanted, encoding, title, job.request.max_error)
+    files, facts = write_parts(job.target, picture, surface, job.request.parts, encoding, title, job.request.max_error)
     entries = {
         "inputs": job.inputs,
         "settings": job.settings,

@@ -234,7 +234,7 @@ class FacetsUNet(DisparityNetwork):
         expect_rgb_size(rgb, disparity, 1 if self.scale < 4 and rgb.shape[-1] == disparity.shape[-1] else self.scale)
         known = disparity.isfinite()
         unit = disparity.masked_fill(~known, torch.nan).flatten(1).nanmedian(dim=1).values.view(-1, 1, 1, 1)
-        values = inpaint(disparity) / unit
+        values = inpaint(disparity, rgb) / unit
         batch = disparity.shape[0]
         if hints is None:
             hints = disparity.new_zeros((batch, FACTS))

@@ -6,15 +6,37 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+_CONTRAST = 0.02
+"""Standard deviation of the difference of the colours of a surface's neighbouring pixels, on the scale of [0, 1]."""
+_ALIKE = 0.3
+"""Affinity from which two pixels count as of one surface."""
+_LEAST = 1e-4
+"""Affinity of pixels of different surfaces."""
 
-def inpaint(x: Tensor) -> Tensor:
-    """Replace the non-finite values of (B, 1, h, w) by the mean of the valid ones in 3 x 3 pixels, from outside in.
 
-    An image without a valid value stays unchanged.
+def inpaint(x: Tensor, photo: Tensor | None = None) -> Tensor:
+    """Replace the non-finite values of (B, 1, h, w) by means of the valid ones in 3 x 3 pixels, from outside in.
+
+    With a photo, the means are weighted by how alike the colours are, and pixels of the colour of a valid neighbour are
+    filled before others, so that values stop at the photo's edges. An image without a valid value stays unchanged.
+
+    Args:
+        x: the maps.
+        photo: (B, 3, H, W) in [0, 1], of any size.
+
     """
-    valid = x.isfinite()
-    if bool(valid.all()):
+    if bool(x.isfinite().all()):
         return x
+    if photo is None:
+        return _fill_evenly(x)
+    colours = functional.adaptive_avg_pool2d(photo.to(x.dtype), x.shape[-2:])
+    colours = functional.avg_pool2d(functional.pad(colours, (1, 1, 1, 1), mode="replicate"), 3, stride=1)
+    return torch.stack([_fill_by_colour(each[0], colour) for each, colour in zip(x, colours, strict=True)])[:, None]
+
+
+def _fill_evenly(x: Tensor) -> Tensor:
+    """Return the maps, (B, 1, h, w), filled with plain means."""
+    valid = x.isfinite()
     values, weight = torch.where(valid, x, 0), valid.to(x.dtype)
     for _ in range(max(x.shape[-2:])):
         total, fraction = (functional.avg_pool2d(each, 3, stride=1, padding=1) for each in (values, weight))
@@ -24,3 +46,30 @@ def inpaint(x: Tensor) -> Tensor:
         values = torch.where(new, total / torch.where(fraction > 0, fraction, 1), values)
         weight = torch.where(new, 1, weight)
     return torch.where(weight > 0, values, torch.nan)
+
+
+def _fill_by_colour(x: Tensor, colours: Tensor) -> Tensor:
+    """Return a map, (h, w), filled with means weighted by the colours, (3, h, w)."""
+    height, width = x.shape
+    values = functional.pad(x, (1, 1, 1, 1), value=torch.nan).flatten()
+    colour = functional.pad(colours, (1, 1, 1, 1)).flatten(1)
+    inside = functional.pad(torch.ones_like(x, dtype=torch.bool), (1, 1, 1, 1)).flatten()
+    steps = [row * (width + 2) + column for row in (-1, 0, 1) for column in (-1, 0, 1) if row or column]
+    around = torch.tensor(steps, device=x.device)
+    unknown = values.isnan() & inside
+    known = values.isfinite()
+    places = unknown.nonzero()[:, 0]
+    front = places[known[places[:, None] + around].any(dim=1)]
+    while front.numel():
+        beside = front[:, None] + around  # (n, 8)
+        difference = (colour[:, beside] - colour[:, front, None]).square().sum(dim=0)
+        affinity = (difference / (-2 * _CONTRAST**2)).exp().clamp(min=_LEAST) * known[beside]
+        nearest = affinity.amax(dim=1)
+        first = nearest >= nearest.median().clamp(max=_ALIKE)
+        filled, affinity, beside = front[first], affinity[first], beside[first]
+        values[filled] = (affinity * values[beside].nan_to_num(0)).sum(dim=1) / affinity.sum(dim=1)
+        known[filled] = True
+        unknown[filled] = False
+        beside = beside.flatten()
+        front = torch.cat((front[~first], beside[unknown[beside]])).unique()
+    return values.view(height + 2, width + 2)[1:-1, 1:-1]

@@ -1,0 +1,61 @@
+"""Holes of depth maps: how far their pixels are from measured ones, and which holes are wide."""
+
+from __future__ import annotations
+
+import math
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor
+
+_NARROW = 2.5
+"""Pixels; a hole whose pixels are nearer than that to measured ones is not wide, however coarse the map is."""
+
+
+def distance_to_known(known: Tensor) -> Tensor:
+    """Return each pixel's distance to the nearest known pixel.
+
+    Args:
+        known: (1, h, w) bool.
+
+    Returns:
+        (1, h, w) float32 in pixels, between centres; 0 at known pixels, infinite if there is none.
+
+    """
+    if not bool(known.any()):
+        return torch.full(known.shape, math.inf, device=known.device)
+    return _distance(~known)
+
+
+def degrees_per_pixel(focal: float) -> float:
+    """Return the angle of view of a pixel in the middle of an image, in degrees, for a focal length in pixels."""
+    return math.degrees(math.atan(1 / focal))
+
+
+def wide_holes(known: Tensor, width: float) -> Tensor:
+    """Return the holes, or parts of holes, that are wider than a limit.
+
+    It is the morphological opening of the holes by a disc: what is left of them where no disc of this width fits. A
+    narrow part of a wide hole is not wide. At the border of the map, a hole is wide from half of the width on, since it
+    can be filled from one side only.
+
+    Args:
+        known: (1, h, w) bool, false in holes.
+        width: of the widest hole that is not wide, in pixels; it is taken for 5 if it is less.
+
+    Returns:
+        (1, h, w) bool.
+
+    """
+    radius = max(width / 2, _NARROW)
+    core = distance_to_known(known) - 0.5 > radius  # from the known pixel's edge
+    if not bool(core.any()):
+        return torch.zeros_like(known)
+    return ~known & (_distance(~core) <= radius + 0.5)
+
+
+def _distance(mask: Tensor) -> Tensor:
+    """Return the distance to the nearest pixel outside of a mask, (1, h, w), some of which there must be."""
+    found = cv2.distanceTransform(mask[0].cpu().numpy().astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    return torch.from_numpy(found)[None].to(mask.device)
