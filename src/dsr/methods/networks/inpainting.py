@@ -29,7 +29,7 @@ def inpaint(x: Tensor, photo: Tensor | None = None) -> Tensor:
         return x
     if photo is None:
         return _fill_evenly(x)
-    colours = functional.adaptive_avg_pool2d(photo.to(x.dtype), x.shape[-2:])
+    colours = functional.adaptive_avg_pool2d(photo.to(x.dtype), (x.shape[-2], x.shape[-1]))
     colours = functional.avg_pool2d(functional.pad(colours, (1, 1, 1, 1), mode="replicate"), 3, stride=1)
     return torch.stack([_fill_by_colour(each[0], colour) for each, colour in zip(x, colours, strict=True)])[:, None]
 
