@@ -231,6 +231,11 @@ def test_flat_parts_of_rounded_maps_are_at_best_as_sure_as_the_rounding() -> Non
     nearest = torch.tensor([0.02, 0.02, 0.04, 0.08]).double()
     middles = share[torch.tensor([16, 48, 80, 112])]
     torch.testing.assert_close(middles, nearest / steps / 4)  # half a step at most, so a quarter on average
+    assert surface.angle_error is not None
+    angle = surface.angle_error[0, rows * 2]
+    slope = (nearest[2] / steps[2] / 4) * sample.camera_lr.fx / 4  # gained over the 4 pixels to the next value
+    assert float(angle[80]) == pytest.approx(math.degrees(math.atan(slope)), rel=0.05)
+    assert float(angle[32]) == pytest.approx(3 * CAUTION)
     assert float(share[32]) < 1e-3  # where values change, the network says it
     exact = AnyMap(net).surface(_sample((rows, columns), 4))  # type: ignore[arg-type]
     assert exact.depth_error is not None

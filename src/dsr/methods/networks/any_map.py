@@ -123,9 +123,10 @@ class AnyMap:
         depth = torch.where(result > 0, result, torch.nan).reciprocal().to(sample.depth_lr.device)
         errors = (_resize(each[inside], (size[0], size[1]))[0].to(depth) for each in (answer.spread, answer.angle))
         spread, angle = (CAUTION * each for each in errors)
-        least = _rounding(inverse).to(depth), _guessing(inverse, sample.camera_lr.fx).to(depth)
-        rounding, guessing = (_resize(each, (size[0], size[1]))[0] for each in least)
-        spread = torch.maximum(spread, rounding) + guessing
+        focal = sample.camera_lr.fx
+        more = (each.to(depth) for each in (*_rounding(inverse, focal), _guessing(inverse, focal)))
+        rounding, tilt, guessing = (_resize(each, (size[0], size[1]))[0] for each in more)
+        spread, angle = torch.maximum(spread, rounding) + guessing, torch.maximum(angle, tilt)
         depth_error = spread * depth
         if self._max_error is not None:
             depth = depth.masked_fill(spread > self._max_error, torch.nan)
@@ -218,17 +219,18 @@ def _guessing(inverse: Tensor, focal: float) -> Tensor:
     return (_PER_DEGREE * degrees_per_pixel(focal) * distance).clamp(max=1)
 
 
-def _rounding(inverse: Tensor) -> Tensor:
-    """Return the expected relative error of the rounding of maps that are rounded to few values, (B, 1, h, w).
+def _rounding(inverse: Tensor, focal: float) -> tuple[Tensor, Tensor]:
+    """Return the expected errors of maps that are rounded to few values, where there is one value around a pixel.
 
-    It is a quarter of the step to the next value, the mean of errors that are equally likely up to half a step, where
-    the map has no other value around a pixel from which the truth could be told more exactly. It is 0 elsewhere.
+    That of depth is relative: a quarter of the step to the next value, the mean of errors that are equally likely up to
+    half a step. That of the normal, in radians, is the tilt of a surface that gains it up to the next other value. Both
+    are (B, 1, h, w), and 0 where the values around a pixel differ, from which the truth can be told more exactly.
 
     """
     known = inverse.isfinite()
     values = inverse[known].unique()
     if values.numel() < 2 or values.numel() * _ROUNDED >= known.sum():
-        return torch.zeros_like(inverse)
+        return torch.zeros_like(inverse), torch.zeros_like(inverse)
     gaps = values.diff()
     step = torch.cat((gaps[:1], torch.minimum(gaps[:-1], gaps[1:]), gaps[-1:]))
     filled = torch.where(known, inverse, values[0])
@@ -237,7 +239,9 @@ def _rounding(inverse: Tensor) -> Tensor:
         -functional.max_pool2d(-torch.where(known, inverse, torch.inf), 3, stride=1, padding=1),
         functional.max_pool2d(torch.where(known, inverse, -torch.inf), 3, stride=1, padding=1),
     )
-    return torch.where(known & (low == high), relative, 0)
+    flat = known & (low == high)
+    away = torch.stack([distance_to_known(each) for each in ~flat])
+    return torch.where(flat, relative, 0), torch.where(flat, torch.atan(focal * relative / (away + 1)), 0)
 
 
 def _extent(error: Tensor, known: Tensor, variance: float) -> float:
