@@ -32,10 +32,10 @@ _TOLERANCE = 0.02
 """A map is taken for one of the photo's own size up to this relative difference."""
 CAUTION = 1.1
 """Measured errors over expected ones on rendered scenes that are not trained on, see ``benchmarks/confidence.py``."""
-_PER_DEGREE = 0.025
+_PER_DEGREE = 0.012
 """Relative error of depth in holes that the network does not expect, per degree from the nearest measured pixel. On
-Middlebury 2014 and ICL-NUIM with holes cut into them it expects 2.2 %, and depth is off by 4.8 % at 0.7 to 1 degree and
-by 7.3 % at 2 to 3 degrees."""
+Middlebury 2014 and ICL-NUIM with holes cut into them it expects 2 % everywhere, and depth is off by 3 % at 0.5 to 1
+degree and by 4 % at 1 to 3 degrees."""
 _ROUNDED = 16
 """A map with fewer different values than one per so many pixels is taken for a rounded one."""
 
