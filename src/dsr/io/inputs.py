@@ -141,9 +141,13 @@ def _photo(pair: Pair, size_lr: Size) -> tuple[np.ndarray, list[Assumption]]:
 
 def _suffix(pair: Pair) -> str:
     """Return the suffix of the result: the input's, or that of NumPy's format where the input's cannot be written."""
-    suffix = pair.depth.suffix.lower()
     inside = pair.capture is not None and pair.capture.depth is not None
-    return ".npy" if inside or suffix == ICL_SUFFIX else suffix
+    return ".npy" if inside or _is_icl(pair) else pair.depth.suffix.lower()
+
+
+def _is_icl(pair: Pair) -> bool:
+    """Return whether the depth map is a text file of ICL-NUIM."""
+    return pair.capture is None and pair.depth.suffix.lower() == ICL_SUFFIX
 
 
 def _confidence(
@@ -200,7 +204,7 @@ def _camera(
     if pair.capture is not None and geometry.camera is not None:
         content, scaled = scale_to_photo(pair.capture.told_by, camera_only(geometry.camera), size)
         return content, [*geometry.assumptions, *scaled]
-    if pair.camera is None and pair.depth.suffix.lower() == ICL_SUFFIX and size == size_lr:
+    if pair.camera is None and _is_icl(pair) and size == size_lr:
         return camera_only(ICL_CAMERA), [Assumption("camera: that of ICL-NUIM")]
     if pair.camera is None:
         content, assumed = find_camera(reading.camera, pair.rgb, size, size_lr)
@@ -231,7 +235,7 @@ def _range_type(
     elif _DISPARITY_WORDS & set(words_of(pair.depth.stem)):
         range_type = "disparity"
         assumptions.append(Assumption("values are taken for disparities, by the file's name"))
-    elif pair.depth.suffix.lower() == ICL_SUFFIX:
+    elif _is_icl(pair):
         range_type = "perspective"
         assumptions.append(Assumption("values are distances along the rays in centimetres, as in ICL-NUIM's .depth"))
     else:
@@ -256,6 +260,6 @@ def _unit(
         return described.depth_unit, [Assumption(f"unit: {described.depth_unit:g} m per value, says the camera file")]
     if pair.unit is not None:
         return pair.unit, []
-    if pair.depth.suffix.lower() == ICL_SUFFIX:
+    if _is_icl(pair):
         return 1e-2, []
     return units.guess(pair, stored, holes, described.hole_value if reading.hole_value is None else reading.hole_value)

@@ -124,7 +124,8 @@ def _numbers(place: str, row: _Row, names: tuple[str, ...]) -> list[float]:
     try:
         return [float(row[name]) for name in names]
     except (KeyError, ValueError) as error:
-        raise ValueError(f"{place}: expected numbers for {', '.join(names)}, got {dict(row)!r:.120}") from error
+        came = ", ".join(row.get(name, "nothing") for name in names)
+        raise ValueError(f"{place}: expected numbers for {', '.join(names)}, got {came:.120}") from error
 
 
 def _read_matrix(path: Path, text: str) -> list[float]:
