@@ -33,7 +33,8 @@ def test_capture_of_a_phone_has_nothing_left_to_assume(tmp_path, capsys):
     folder, out = captures.stray(tmp_path / "scan"), tmp_path / "out"
     assert upsample(folder, "-o", out, *DEPTH_ONLY) == 0
     said = capsys.readouterr().out
-    assert f"{FRAMES} pairs of photo and depth map\n  a capture of Stray Scanner: depth in millimetres" in said
+    assert f"{FRAMES} pairs of photo and depth map\n  a capture of Stray Scanner: depth in millimetres; " in said
+    assert "; from the capture: intrinsics, poses, confidence\n" in said
     assert "assumed" not in said
     assert "taken for" not in said
     for number in range(FRAMES):

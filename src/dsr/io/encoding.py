@@ -174,7 +174,7 @@ def guess_unit(name: str, values: np.ndarray, holes: np.ndarray) -> tuple[float,
         if middle * 1e-3 > _FAR_FOR_A_SENSOR:
             assumptions.append(
                 Assumption(
-                    "that is far for a sensor: TUM and ICL-NUIM store 1/5000 m, SUN RGB-D 1/8000 m (--depth-unit)"
+                    "that is far for a sensor: TUM and ICL-NUIM store 1/5000 m (--depth-unit), SUN RGB-D sunrgbd"
                 )
             )
         if holes.mean() > _SPARSE_FRACTION:

@@ -63,19 +63,24 @@ class Archive:
 
         """
         place = self.path / name
-        if self.path.is_dir():
-            size = place.stat().st_size if place.is_file() else None
-        else:
-            archive = _open(self.path, _state(self.path))
-            size = archive.getinfo(name).file_size if name in archive.NameToInfo else None
+        size = self._declared(name)
         if size is None:
             raise ValueError(f"{place}: expected it in the capture, there is none")
         if size > limit:
             raise ValueError(f"{place}: expected at most {limit} bytes, the archive declares {size}")
         try:
-            return place.read_bytes() if self.path.is_dir() else archive.read(name)
+            return place.read_bytes() if self.path.is_dir() else _open(self.path, _state(self.path)).read(name)
         except _DAMAGED as error:
             raise ValueError(f"{place}: expected a member of the archive, got a damaged one") from error
+
+    def _declared(self, name: str) -> int | None:
+        """Return the size of a member, which an archive declares; None if there is no such member."""
+        if self.path.is_dir():
+            return (self.path / name).stat().st_size if (self.path / name).is_file() else None
+        try:
+            return _open(self.path, _state(self.path)).getinfo(name).file_size
+        except KeyError:
+            return None
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from dsr.data.formats.shared import read_numbers
-from dsr.io.captures.poses import check_pose, intrinsics_camera, read_text
+from dsr.io.captures.poses import check_pose, describe_capture, intrinsics_camera, read_text
 from dsr.io.confidence import HIGHEST_LEVEL, ConfidenceMap
 from dsr.io.encoding import Assumption
 from dsr.io.frames import CaptureFrame, Geometry
@@ -52,9 +52,10 @@ def find_arkitscenes(folder: Path) -> PairingResult | None:
         path = folder / "confidence" / f"{stem}.png"
         known = ConfidenceMap(path, HIGHEST_LEVEL) if path.is_file() else None
         pairs.append(Pair(stem, photos[stem], depths[stem], unit=1e-3, capture=frame, confidence=known))
-    text = f"a video of {_APP}, photos of {kind}: depth in millimetres, intrinsics, poses and confidence are its own"
+    text = f"a video of {_APP}, photos of {kind}"
+    note = describe_capture(text, "millimetres", pairs, poses=bool(motions))
     lone = [each[stem] for each in (photos, depths) for stem in each if not (stem in photos and stem in depths)]
-    return PairingResult(tuple(pairs), (Assumption(text),), tuple(lone))
+    return PairingResult(tuple(pairs), (note,), tuple(lone))
 
 
 def _read_trajectory(path: Path) -> dict[float, _Motion]:

@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 from pydantic import BaseModel, ValidationError
 
-from dsr.io.captures.poses import check_pose, intrinsics_camera, read_text
+from dsr.io.captures.poses import check_pose, describe_capture, intrinsics_camera, read_text
 from dsr.io.confidence import ConfidenceMap
 from dsr.io.encoding import Assumption
 from dsr.io.frames import CaptureFrame, Geometry
@@ -70,8 +70,7 @@ def find_polycam(folder: Path) -> PairingResult | None:
         confidence = frames / "confidence" / depth.name
         known = ConfidenceMap(confidence, 255) if confidence.is_file() else None
         pairs.append(Pair(depth.stem, photos[kind][depth.stem], depth, unit=1e-3, capture=frame, confidence=known))
-    text = f"a capture of {_APP}: depth in millimetres, intrinsics, poses and confidence are its own"
-    notes = [Assumption(text)]
+    notes = [describe_capture(f"a capture of {_APP}", "millimetres", pairs, poses=True)]
     corrected = sum(pair.rgb.parent.name == _KINDS[0] for pair in pairs)
     if corrected:
         notes.append(Assumption("photos and cameras are the corrected ones", f"{corrected} of {len(pairs)}"))

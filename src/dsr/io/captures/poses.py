@@ -10,6 +10,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from dsr.geometry.camera import Camera
+from dsr.io.encoding import Assumption
+from dsr.io.pairs import Pair
 
 _TOLERANCE = 1e-3
 """Largest deviation of a rotation's entries, and of a quaternion's length, from those of a rigid motion."""
@@ -81,6 +83,21 @@ def intrinsics_camera(source: str, size: tuple[int, int], numbers: Sequence[floa
         return Camera(size[1], size[0], fx, fy, cx, cy)
     except ValueError as error:
         raise ValueError(f"{source}: {error}") from error
+
+
+def describe_capture(app: str, unit: str, pairs: Sequence[Pair], *, poses: bool) -> Assumption:
+    """Return what a capture says itself, as a line for the user.
+
+    Args:
+        app: what it is a capture of.
+        unit: of its depth maps.
+        pairs: its frames.
+        poses: whether it has poses.
+
+    """
+    parts = ["intrinsics", *(["poses"] if poses else [])]
+    parts += ["confidence"] if any(pair.confidence is not None for pair in pairs) else []
+    return Assumption(f"{app}: depth in {unit}; from the capture: {', '.join(parts)}")
 
 
 def read_text(path: Path, limit: int = 1 << 26) -> str:

@@ -17,7 +17,7 @@ from __future__ import annotations
 import functools
 import json
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
 from typing import Annotated, Any
@@ -25,7 +25,7 @@ from typing import Annotated, Any
 from pydantic import BaseModel, Field, ValidationError
 
 from dsr.io.captures.archive import PHOTO_LIMIT, Archive, Member, decode_lzfse, decode_photo
-from dsr.io.captures.poses import intrinsics_camera, pose_from_quaternion
+from dsr.io.captures.poses import describe_capture, intrinsics_camera, pose_from_quaternion
 from dsr.io.confidence import HIGHEST_LEVEL, ConfidenceMap
 from dsr.io.encoding import Assumption
 from dsr.io.frames import CaptureFrame, Geometry
@@ -103,7 +103,7 @@ def _read_archive(archive: Archive, name: str) -> PairingResult:
                 if number not in photos.keys() & depths.keys()]  # fmt: skip
     if not pairs:
         raise ValueError(f"{archive.path}: expected photos and depth maps of {_APP} in rgbd/, found no pair")
-    return PairingResult(tuple(pairs), _found(metadata), tuple(unpaired))
+    return PairingResult(tuple(pairs), _found(metadata, pairs), tuple(unpaired))
 
 
 def _read_export(folder: Path) -> PairingResult | None:
@@ -124,13 +124,13 @@ def _read_export(folder: Path) -> PairingResult | None:
         for number in both
     ]  # fmt: skip
     unpaired = [each[number] for each in (photos, depths) for number in each if number not in both]
-    return PairingResult(tuple(pairs), _found(metadata), tuple(unpaired))
+    return PairingResult(tuple(pairs), _found(metadata, pairs), tuple(unpaired))
 
 
-def _found(metadata: _Metadata) -> tuple[Assumption, ...]:
+def _found(metadata: _Metadata, pairs: Sequence[Pair]) -> tuple[Assumption, ...]:
     """Return what was found out about a capture."""
-    found = [Assumption(f"a capture of {_APP}: depth in metres, intrinsics, poses and confidence are its own")]
-    if not metadata.moves:
+    found = [describe_capture(f"a capture of {_APP}", "metres", pairs, poses=metadata.moves)]
+    if metadata.poses and not metadata.moves:
         found.append(Assumption("no poses: those of the capture are all the same"))
     return tuple(found)
 

@@ -12,6 +12,7 @@ not read.
 
 from __future__ import annotations
 
+import atexit
 import functools
 import hashlib
 import struct
@@ -118,6 +119,7 @@ def _read(path: Path, prefix: str = "") -> PairingResult:
         photo_topic, depth_topic = _choose(path, topics, "rgb"), _choose(path, topics, "depth")
         photos, depths = _times(reader, path, photo_topic), _times(reader, path, depth_topic)
         info = _camera_info(reader, photo_topic)
+        kind = depths[0][0].read().dtype.kind
     named = {kind: {Path(f"{i:09}"): stamp for i, (_, stamp) in enumerate(each)} for kind, each in
              (("rgb", photos), ("depth", depths))}  # fmt: skip
     partner = match_times(named["rgb"], named["depth"])
@@ -130,8 +132,11 @@ def _read(path: Path, prefix: str = "") -> PairingResult:
         photo, depth = photos[int(first.name)][0], depths[int(second.name)][0]
         frame = CaptureFrame("ROS", geometry, path, told, photo, depth)
         name = f"{prefix}{int(first.name):06}"
-        pairs.append(Pair(name, Path(f"{path}{photo_topic}"), Path(f"{path}{depth_topic}"), capture=frame))
-    notes = [Assumption(f"a recording of ROS: photos of {photo_topic}, depth of {depth_topic}")]
+        pairs.append(
+            Pair(name, Path(f"{path}{photo_topic}"), Path(f"{path}{depth_topic}"), unit=_UNITS[kind], capture=frame)
+        )
+    unit = "millimetres" if kind == "u" else "metres"
+    notes = [Assumption(f"a recording of ROS: photos of {photo_topic}, depth in {unit} of {depth_topic}")]
     others = sorted(topic for topic, kind in topics.items() if kind[0] and topic not in (photo_topic, depth_topic))
     if others:
         notes.append(Assumption(f"topics that are not looked at: {', '.join(others)}"))
@@ -281,9 +286,30 @@ def _state(path: Path) -> tuple[int, ...]:
     return tuple(number for file in files for number in (file.stat().st_size, file.stat().st_mtime_ns))
 
 
-@functools.lru_cache(maxsize=1)
-def _reader(path: Path, _: tuple[int, ...]) -> Any:
-    """Return the open recording."""
+def _reader(path: Path, state: tuple[int, ...]) -> Any:
+    """Return the open recording; the one before it is closed."""
+    key = (path, state)
+    if _OPEN.get("key") != key:
+        _close()
+        _OPEN.update(reader=_open(path), key=key)
+    return _OPEN["reader"]
+
+
+_OPEN: dict[str, Any] = {}
+"""The open recording with its path and state; empty if there is none."""
+
+
+@atexit.register
+def _close() -> None:
+    """Close the open recording."""
+    reader = _OPEN.get("reader")
+    _OPEN.clear()
+    if reader is not None:
+        reader.close()
+
+
+def _open(path: Path) -> Any:
+    """Open a recording."""
     try:
         from rosbags.highlevel import AnyReader  # noqa: PLC0415 - an extra
         from rosbags.typesys import Stores, get_typestore  # noqa: PLC0415

@@ -24,7 +24,7 @@ from pathlib import Path
 import numpy as np
 
 from dsr.geometry.camera import Camera
-from dsr.io.captures.poses import intrinsics_camera, pose_from_quaternion, read_text
+from dsr.io.captures.poses import describe_capture, intrinsics_camera, pose_from_quaternion, read_text
 from dsr.io.captures.video import VideoFrame, video_size
 from dsr.io.confidence import HIGHEST_LEVEL, ConfidenceMap
 from dsr.io.encoding import Assumption
@@ -68,7 +68,7 @@ def find_stray(folder: Path) -> PairingResult | None:
         rgb = photo or video / f"{number:06}"
         pairs.append(Pair(f"{number:06}", rgb, depth, unit=1e-3, capture=frame, confidence=known))
     unpaired += [path for number, path in photos.items() if number not in depths]
-    found = Assumption(f"a capture of {_APP}: depth in millimetres, intrinsics, poses and confidence are its own")
+    found = describe_capture(f"a capture of {_APP}", "millimetres", pairs, poses=bool(rows))
     return PairingResult(tuple(pairs), (found,), tuple(unpaired))
 
 
