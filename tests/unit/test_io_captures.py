@@ -1,9 +1,12 @@
 """Captures in the layouts of apps: camera, unit, holes, pose and confidence of each frame, and every refusal."""
 
 import json
+import pickle
 import re
 import struct
+import sys
 import zipfile
+from types import SimpleNamespace
 
 import captures
 import cv2
@@ -16,6 +19,7 @@ from captures import FRAMES, INTRINSICS, SIZE, SIZE_LR
 from dsr.geometry.camera import Camera
 from dsr.io.captures.archive import decode_lzfse
 from dsr.io.captures.poses import check_pose
+from dsr.io.captures.ros_images import decode_message
 from dsr.io.inputs import Reading, read_picture
 from dsr.io.layouts import find_pairs_of_folder
 from dsr.io.units import FolderUnits
@@ -94,6 +98,14 @@ def test_pixels_of_too_little_confidence_become_holes(folder, layout, least, col
     np.testing.assert_allclose(picture.confidence[0], captures.levels() / 2, atol=0.002)
 
 
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_frames_can_be_handed_to_other_processes(folder, layout):
+    pairs = find_pairs_of_folder(LAYOUTS[layout](folder)).pairs
+    here, there = (read_picture(pair, Reading()) for pair in (pairs[1], pickle.loads(pickle.dumps(pairs[1]))))
+    assert torch.equal(here.rgb, there.rgb)
+    np.testing.assert_array_equal(here.pose, there.pose)
+
+
 def test_pose_of_arkit_looks_forward_with_y_down(folder):
     """A camera at rest in ARKit's world, y up, looks along -z: forward is (0, 0, -1), down is (0, -1, 0)."""
     captures.polycam(folder)
@@ -148,6 +160,37 @@ def test_damaged_recording_or_one_without_depth_is_refused(folder):
         find_pairs_of_folder(folder)
 
 
+@pytest.mark.parametrize("floats", [False, True])
+def test_compressed_depth_of_ros_is_decoded(floats):
+    """Floats are stored as a / z + b, rounded, behind the two numbers of this quantisation."""
+    a, b = 20_000.0, 3.0
+    stored = np.round(a / captures.depth() + b).astype(np.uint16) if floats else captures.millimetres()
+    stored[0, 0] = 0
+    header = struct.pack("<iff", 0, a if floats else 0, b if floats else 0)
+    data = header + cv2.imencode(".png", stored)[1].tobytes()
+    kind = "32FC1" if floats else "16UC1"
+    message = SimpleNamespace(format=f"{kind}; compressedDepth png", data=np.frombuffer(data, np.uint8))
+    values = decode_message("topic", message)
+    expected = captures.depth() * (1 if floats else 1000)
+    expected[0, 0] = np.nan if floats else 0
+    np.testing.assert_allclose(values, expected, rtol=1e-3)
+    message.data = message.data[:40]
+    with pytest.raises(ValueError, match=r"^topic: expected depth as a 16-bit PNG \(compressedDepth\), got 40 bytes"):
+        decode_message("topic", message)
+
+
+@pytest.mark.parametrize(("encoding", "order"), [("rgb8", (0, 1, 2)), ("bgr8", (2, 1, 0)), ("rgba8", (0, 1, 2, 0))])
+def test_images_of_ros_have_their_channels_in_order_and_may_have_padded_rows(encoding, order):
+    pixels = captures.photo()[..., list(order)]
+    rows = np.pad(pixels.reshape(SIZE[0], -1), ((0, 0), (0, 5)))
+    about = {"height": SIZE[0], "width": SIZE[1], "step": rows.shape[1], "is_bigendian": 0}
+    message = SimpleNamespace(encoding=encoding, data=rows.reshape(-1), **about)
+    np.testing.assert_array_equal(decode_message("topic", message), captures.photo())
+    message.height += 1
+    with pytest.raises(ValueError, match=r"^topic: expected an image of 64 x 49 pixels in rows of \d+ bytes, got"):
+        decode_message("topic", message)
+
+
 def test_camera_matrix_of_stray_scanner_is_used_where_frames_have_none(folder):
     captures.stray(folder, own_intrinsics=False)
     picture = read_all(folder)[2]
@@ -189,6 +232,7 @@ def test_first_frame_that_an_edit_list_hides_is_decoded(folder):
     assert count == FRAMES - 1
     for number, picture in enumerate(read_all(folder)):
         assert abs(255 * float(picture.rgb[0].mean()) - captures.photo(number)[..., 0].mean()) < 8
+    assert len(find_pairs_of_folder(folder).assumptions) == 1  # nothing is said of other numbers of frames
 
 
 def test_poses_that_never_change_are_none(folder):
@@ -216,6 +260,20 @@ def test_lzfse_data_of_the_real_compressor_are_read(folder):
 def test_lzfse_data_that_are_damaged_or_declare_another_size_are_not_unpacked(content, message):
     with pytest.raises(ValueError, match=re.escape(message)):
         decode_lzfse(content, SIZE_LR, "<f4")
+
+
+def test_missing_package_is_named_with_the_extra_that_has_it(folder, monkeypatch):
+    captures.record3d(folder / "scan.r3d")
+    (folder / "bag").mkdir()
+    (folder / "bag" / "scan.bag").write_bytes(b"#ROSBAG V2.0")
+    for module in ("lzfse", "rosbags.highlevel"):
+        monkeypatch.setitem(sys.modules, module, None)
+    with pytest.raises(
+        ValueError, match=r"rgbd/0.depth: LZFSE data need the package lzfse: pip install 'dsr\[captures\]'"
+    ):
+        read_all(folder)
+    with pytest.raises(ValueError, match=r"need the package rosbags: pip install 'dsr\[captures\]'"):
+        find_pairs_of_folder(folder / "bag")
 
 
 def test_archive_that_is_truncated_foreign_or_a_bomb_is_refused(folder):
@@ -338,7 +396,9 @@ def test_broken_frame_is_refused_in_one_line_and_the_others_are_read(folder, wha
 
 def test_video_that_ends_early_or_is_none_is_refused(folder):
     break_video(folder)
-    pairs = find_pairs_of_folder(folder).pairs
+    found = find_pairs_of_folder(folder)
+    assert found.assumptions[1].text.startswith("rgb.mp4 has 2 frames, the depth maps count to 8: photos may be")
+    pairs = found.pairs
     with pytest.raises(ValueError, match=r"rgb.mp4: expected a frame 7, the video is damaged or ends after 2 frames"):
         read_picture(pairs[-1], Reading())
     assert read_picture(pairs[0], Reading()).pose is not None

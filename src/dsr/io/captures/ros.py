@@ -1,8 +1,7 @@
 """Recordings of ROS 1 (``.bag``) and ROS 2 (a folder with ``metadata.yaml``), read by the package rosbags.
 
 Messages of sensor_msgs: Image, CompressedImage and CameraInfo, http://docs.ros.org/en/api/sensor_msgs/html/index-msg.html;
-depth is in millimetres as whole numbers and in metres as floats, https://ros.org/reps/rep-0118.html;
-``compressedDepth`` is that of https://github.com/ros-perception/image_transport_plugins.
+depth is in millimetres as whole numbers and in metres as floats, https://ros.org/reps/rep-0118.html.
 
 Of the topics of depth one named *aligned* or *registered* is taken before others, then one with more messages, then the
 first by name; of those of colour one named *color*, *colour* or *rgb*, then the same. The photo's camera is that of the
@@ -21,32 +20,18 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-import cv2
 import numpy as np
 
-from dsr.data.formats.files import quiet_decoders
-from dsr.io.captures.archive import PHOTO_LIMIT, decode_photo
 from dsr.io.captures.poses import intrinsics_camera
+from dsr.io.captures.ros_images import COLOURS, DEPTHS, decode_message
 from dsr.io.encoding import Assumption
 from dsr.io.frames import CaptureFrame, Geometry, Record
 from dsr.io.names import match_times
 from dsr.io.pairs import Pair, PairingResult
 
 _IMAGE, _COMPRESSED, _INFO = (f"sensor_msgs/msg/{name}" for name in ("Image", "CompressedImage", "CameraInfo"))
-_COLOURS = {
-    "rgb8": (3, cv2.COLOR_RGB2BGR),
-    "bgr8": (3, None),
-    "8UC3": (3, None),
-    "rgba8": (4, cv2.COLOR_RGBA2BGR),
-    "bgra8": (4, cv2.COLOR_BGRA2BGR),
-    "8UC4": (4, cv2.COLOR_BGRA2BGR),
-}
-"""Channels of encodings of colour, and OpenCV's conversion to BGR."""
-_DEPTHS = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}
 _UNITS = {"u": 1e-3, "f": 1.0}
 _PREFERRED = {"depth": ("aligned", "registered"), "rgb": ("color", "colour", "rgb")}
-_CONFIG = struct.Struct("<iff")
-"""Header of compressedDepth: format, and two numbers of the quantisation of floats."""
 
 
 @dataclass(frozen=True)
@@ -78,12 +63,12 @@ class Message:
     def _message(self) -> Any:
         """Return the message."""
         kind, raw = self._raw()
-        with _said_of(self.file):
+        with _NamedErrors(self.file):
             return _reader(self.file, _state(self.file)).deserialize(raw, kind)
 
     def _raw(self) -> tuple[str, bytes]:
         """Return the message's type and bytes."""
-        with _said_of(self.file):
+        with _NamedErrors(self.file):
             reader = _reader(self.file, _state(self.file))
             connections = [each for each in reader.connections if each.topic == self.topic]
             found = list(reader.messages(connections, start=self.time, stop=self.time + 1))
@@ -113,7 +98,7 @@ def find_ros(folder: Path) -> PairingResult | None:
 
 def _read(path: Path, prefix: str = "") -> PairingResult:
     """Return the frames of a recording."""
-    with _said_of(path):
+    with _NamedErrors(path):
         reader = _reader(path, _state(path))
         topics = _topics(reader)
         photo_topic, depth_topic = _choose(path, topics, "rgb"), _choose(path, topics, "depth")
@@ -160,7 +145,7 @@ def _topics(reader: Any) -> dict[str, tuple[str, int]]:
 def _role(message: Any) -> str:
     """Return whether a message is a photo or a depth map; an empty text if it is neither, such as an infrared image."""
     if hasattr(message, "encoding"):
-        return "depth" if message.encoding in _DEPTHS else "rgb" if message.encoding in _COLOURS else ""
+        return "depth" if message.encoding in DEPTHS else "rgb" if message.encoding in COLOURS else ""
     words = message.format.lower()
     if "compresseddepth" in words:
         return "depth"
@@ -215,55 +200,7 @@ def _geometry(place: str, info: tuple[int, int, tuple[float, ...], bool] | None,
     return Geometry(intrinsics_camera(place, (height, width), numbers), None, (Assumption(text),) if distorted else ())
 
 
-def decode_message(place: str, message: Any) -> np.ndarray:
-    """Return the pixels of an Image or a CompressedImage: (H, W, 3) uint8 RGB, or (h, w) of depth as it is stored.
-
-    Raises:
-        ValueError: its size does not fit its data, or they are damaged; the message begins with ``place``.
-
-    """
-    data = np.asarray(message.data, np.uint8)
-    if not hasattr(message, "encoding"):
-        if "compresseddepth" in message.format.lower():
-            return _decode_compressed_depth(place, message.format, data)
-        if data.size > PHOTO_LIMIT:
-            raise ValueError(f"{place}: expected a photo of at most {PHOTO_LIMIT} bytes, got {data.size}")
-        try:
-            return decode_photo(data.tobytes())
-        except ValueError as error:
-            raise ValueError(f"{place}: {error}") from error
-    channels, code = _COLOURS.get(message.encoding, (1, None))
-    dtype = np.dtype(_DEPTHS.get(message.encoding, "u1")).newbyteorder(">" if message.is_bigendian else "<")
-    height, width, step = message.height, message.width, message.step
-    if min(height, width) < 1 or step < width * channels * dtype.itemsize or data.size != height * step:
-        raise ValueError(
-            f"{place}: expected an image of {width} x {height} pixels in rows of {step} bytes, got {data.size} bytes"
-        )
-    rows = data.reshape(height, step)[:, : width * channels * dtype.itemsize]
-    values = np.ascontiguousarray(rows).view(dtype).reshape(height, width, *([channels] if channels > 1 else []))
-    if message.encoding in _DEPTHS:
-        return values.astype(dtype.newbyteorder("="))
-    return cv2.cvtColor(values if code is None else cv2.cvtColor(values, code), cv2.COLOR_BGR2RGB)
-
-
-def _decode_compressed_depth(place: str, encoding: str, data: np.ndarray) -> np.ndarray:
-    """Return the map of a message of compressedDepth: a PNG of whole numbers, or of quantised inverse metres."""
-    pixels = None
-    if _CONFIG.size < data.size <= PHOTO_LIMIT:
-        with quiet_decoders():
-            pixels = cv2.imdecode(data[_CONFIG.size :], cv2.IMREAD_UNCHANGED)
-    if pixels is None or pixels.ndim != 2 or pixels.dtype != np.uint16:
-        raise ValueError(
-            f"{place}: expected depth as a 16-bit PNG (compressedDepth), got {data.size} bytes of another kind"
-        )
-    if "32fc1" not in encoding.lower():
-        return pixels
-    _, a, b = _CONFIG.unpack(data[: _CONFIG.size].tobytes())
-    with np.errstate(divide="ignore"):
-        return np.where(pixels > 0, a / (pixels - np.float32(b)), np.nan).astype(np.float32)
-
-
-class _said_of:  # noqa: N801 - used like a function
+class _NamedErrors:
     """A context in which rosbags' errors become one that names the recording."""
 
     def __init__(self, path: Path) -> None:

@@ -25,7 +25,7 @@ import numpy as np
 
 from dsr.geometry.camera import Camera
 from dsr.io.captures.poses import describe_capture, intrinsics_camera, pose_from_quaternion, read_text
-from dsr.io.captures.video import VideoFrame, video_size
+from dsr.io.captures.video import VideoFrame, count_frames, video_size
 from dsr.io.confidence import HIGHEST_LEVEL, ConfidenceMap
 from dsr.io.encoding import Assumption
 from dsr.io.frames import CaptureFrame, Geometry
@@ -69,7 +69,20 @@ def find_stray(folder: Path) -> PairingResult | None:
         pairs.append(Pair(f"{number:06}", rgb, depth, unit=1e-3, capture=frame, confidence=known))
     unpaired += [path for number, path in photos.items() if number not in depths]
     found = describe_capture(f"a capture of {_APP}", "millimetres", pairs, poses=bool(rows))
-    return PairingResult(tuple(pairs), (found,), tuple(unpaired))
+    notes = (found,) if photos else (found, *_check_count(video, max(depths) + 1))
+    return PairingResult(tuple(pairs), notes, tuple(unpaired))
+
+
+def _check_count(video: Path, expected: int) -> list[Assumption]:
+    """Return a warning if a video has another number of frames than there are maps: they may belong to others."""
+    try:
+        count = count_frames(video)
+    except ValueError:  # each frame says so when it is read
+        return []
+    if count == expected:
+        return []
+    text = f"{video.name} has {count} frames, the depth maps count to {expected}: photos may be some frames off"
+    return [Assumption(text)]
 
 
 def _numbered(folder: Path, suffixes: tuple[str, ...]) -> dict[int, Path]:

@@ -68,6 +68,11 @@ class _Player:
         self._path, self._next = path, 0
         self._capture = self._open()
 
+    @property
+    def count(self) -> int:
+        """Number of frames that the file declares."""
+        return int(self._capture.get(cv2.CAP_PROP_FRAME_COUNT))
+
     def read(self, index: int) -> np.ndarray:
         """Return a frame; the frames between the last one and this one are skipped."""
         if index < self._next:
@@ -95,6 +100,17 @@ class _Player:
             raise ValueError(f"{self._path}: expected a video, got a damaged or foreign file")
         capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)  # intrinsics are those of the pixels as they are stored
         return capture
+
+
+def count_frames(path: Path) -> int:
+    """Return how many frames a video declares, those that an edit list hides among them.
+
+    Raises:
+        ValueError: the file is no video.
+
+    """
+    with _LOCK:
+        return _player(path, _state(path)).count
 
 
 def video_size(path: Path) -> tuple[int, int]:
