@@ -11,6 +11,7 @@ from dsr.geometry.camera import Camera
 from dsr.io.cameras import CameraChoice
 from dsr.io.inputs import Reading, read_picture
 from dsr.io.pairs import Pair
+from dsr.io.units import FolderUnits
 
 OWN = {"width": 16, "height": 12, "fx": 15.0, "fy": 15.0, "cx": 7.5, "cy": 5.5}
 
@@ -34,7 +35,7 @@ def make(tmp_path):
 
 
 def read(pair, units=None, **reading):
-    return read_picture(pair, Reading(**reading), {} if units is None else units)
+    return read_picture(pair, Reading(**reading), units)
 
 
 def texts(picture):
@@ -61,11 +62,25 @@ def test_unit_is_the_users_then_the_camera_files_then_the_layouts(make, given, e
     assert float(picture.depth_lr[0, 0, 0]) == pytest.approx(metres)
 
 
-def test_maps_of_a_folder_have_the_unit_of_the_first(make):
-    units = {}
-    assert float(read(make(np.full((3, 4), 2.0)), units).depth_lr[0, 0, 0]) == 2
-    assert float(read(make(np.full((3, 4), 300.0)), units).depth_lr[0, 0, 0]) == 300
-    assert float(read(make(np.full((3, 4), 300.0))).depth_lr[0, 0, 0]) == pytest.approx(0.3)
+def test_maps_of_a_folder_have_the_unit_of_the_first_by_name_in_whatever_order_they_are_read(make):
+    pairs = [make(np.full((3, 4), value), name) for name, value in (("b.npy", 300.0), ("a.npy", 2.0), ("c.npy", 3.0))]
+    for order in (pairs, pairs[::-1], pairs[:1] + pairs[1:]):
+        units = FolderUnits(order)
+        assert [float(read(pair, units).depth_lr[0, 0, 0]) for pair in pairs] == [300, 2, 3]
+    assert float(read(pairs[0]).depth_lr[0, 0, 0]) == pytest.approx(0.3)
+
+
+def test_unit_of_a_folder_skips_maps_that_are_damaged_all_holes_or_of_another_type(make, tmp_path):
+    damaged, empty, whole = tmp_path / "a.npy", np.full((3, 4), np.nan), np.full((3, 4), 2000, np.uint16)
+    pairs = [
+        make(empty, "b.npy"),
+        make(whole, "c.npy"),
+        make(np.full((3, 4), 250.0), "d.npy"),
+        make(whole * 0.5, "e.npy"),
+    ]
+    damaged.write_bytes(b"none")
+    units = FolderUnits([Pair("a", tmp_path / "photo.png", damaged), *pairs])
+    assert [float(read(pair, units).depth_lr[0, 0, 0]) for pair in pairs[1:]] == pytest.approx([2.0, 0.25, 1.0])
 
 
 def test_camera_file_sets_range_type_and_hole_value(make):

@@ -22,6 +22,7 @@ examples:
   dsr upsample --rgb a.jpg b.jpg --depth a.png b.png --intrinsics 615 615 319.5 239.5 -o out
   dsr upsample --rgb rgb/ --depth depth/ --depth-unit 1/5000 -o out
   dsr upsample rgbd_dataset_freiburg1_xyz -o out
+  dsr upsample scan.r3d --min-confidence 0.5 -o out
   dsr upsample --rgb photo.jpg --depth depth.png --method tgv --set data_weight=30 -o out
   dsr upsample recordings --dry-run -o out       what would be done, and what would be assumed
 
@@ -42,11 +43,16 @@ def add(commands: Any) -> None:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     what = parser.add_argument_group("what to work on")
-    what.add_argument("folders", nargs="*", type=Path, metavar="FOLDER", help="folders of photos and depth maps")
+    what.add_argument(
+        "folders", nargs="*", type=Path, metavar="FOLDER", help="folders of photos and depth maps, or captures"
+    )
     what.add_argument("--rgb", nargs="+", type=Path, default=[], metavar="PHOTO", help="photos, or a folder of them")
     what.add_argument("--depth", nargs="+", type=Path, default=[], metavar="MAP", help="depth maps, one for each photo")
     what.add_argument(
         "--mask", nargs="+", type=Path, default=[], metavar="MASK", help="pictures, 0 where depth is missing"
+    )
+    what.add_argument(
+        "--confidence", nargs="+", type=Path, default=[], metavar="MAP", help="confidence maps, or a folder of them"
     )
     _add_reading(parser)
     _add_method(parser)
@@ -63,13 +69,19 @@ def _add_reading(parser: argparse.ArgumentParser) -> None:
     camera.add_argument("--camera", type=Path, metavar="FILE", help="camera.json, Open3D's JSON, or a 3 x 3 matrix")
     camera.add_argument("--fov", type=float, metavar="DEGREES", help="horizontal field of view of the photo")
     camera.add_argument("--intrinsics", nargs=4, type=float, metavar=("FX", "FY", "CX", "CY"), help="photo pixels")
-    reading.add_argument("--depth-unit", metavar="UNIT", help="m, cm, mm, or metres per value: 0.0002, 1/5000")
+    reading.add_argument("--depth-unit", metavar="UNIT", help="m, cm, mm, metres per value: 0.0002, 1/5000; sunrgbd")
     types = ("orthogonal", "perspective", "disparity")
     reading.add_argument(
         "--range-type", choices=types, help="depth along the axis (default), along the ray, or disparity"
     )
     reading.add_argument("--baseline", type=float, metavar="METRES", help="between the cameras, for disparity")
     reading.add_argument("--hole-value", type=float, metavar="VALUE", help="another value that marks missing depth")
+    reading.add_argument(
+        "--min-confidence",
+        type=float,
+        metavar="0..1",
+        help="less confident pixels count as holes; levels 0, 1, 2 are 0, 0.5, 1",
+    )
 
 
 def _add_method(parser: argparse.ArgumentParser) -> None:
@@ -162,7 +174,7 @@ def _run(options: argparse.Namespace, console: Console, _: object) -> list[str]:
     from dsr.app.upsample.outputs import PARTS  # noqa: PLC0415
     from dsr.app.upsample.run import UpsampleRequest, run  # noqa: PLC0415
     from dsr.io.cameras import CameraChoice  # noqa: PLC0415 - they take seconds to import
-    from dsr.io.encoding import parse_unit  # noqa: PLC0415
+    from dsr.io.encoding import SUNRGBD_BITS, parse_unit  # noqa: PLC0415
     from dsr.io.inputs import Reading  # noqa: PLC0415
 
     intrinsics = None if options.intrinsics is None else tuple(options.intrinsics)
@@ -172,6 +184,10 @@ def _run(options: argparse.Namespace, console: Console, _: object) -> list[str]:
     if options.hole_value is not None and math.isnan(options.hole_value):  # NaN always marks missing depth
         options.hole_value = None
     choice = CameraChoice(options.camera, options.fov, intrinsics)
+    bits = SUNRGBD_BITS if options.depth_unit == "sunrgbd" else 0
+    reading = Reading(
+        choice, unit, options.range_type, options.baseline, options.hole_value, options.min_confidence, bits
+    )
     unknown = [part for part in options.without if part not in PARTS]
     parts = options.only if options.only is not None else tuple(part for part in PARTS if part not in options.without)
     wanted = UpsampleRequest(
@@ -180,7 +196,8 @@ def _run(options: argparse.Namespace, console: Console, _: object) -> list[str]:
         rgb=tuple(options.rgb),
         depth=tuple(options.depth),
         mask=tuple(options.mask),
-        reading=Reading(choice, unit, options.range_type, options.baseline, options.hole_value),
+        confidence=tuple(options.confidence),
+        reading=reading,
         method=options.method,
         settings=_settings(options),
         directories=tuple(options.config_dir),

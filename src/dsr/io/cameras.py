@@ -65,9 +65,9 @@ def find_camera(choice: CameraChoice, photo: Path, size: Size, size_lr: Size) ->
     if choice.file is not None:
         return _fit_to_photo(choice.file, read_any_camera(choice.file), size, size_lr)
     if choice.intrinsics is not None:
-        return _camera_only(Camera(width, height, *choice.intrinsics)), []
+        return camera_only(Camera(width, height, *choice.intrinsics)), []
     if choice.fov is not None:
-        return _camera_only(Camera.from_fov(width, height, choice.fov)), []
+        return camera_only(Camera.from_fov(width, height, choice.fov)), []
     equivalent = focal_in_exif(photo)
     if equivalent is not None:
         focal = equivalent / _FILM_DIAGONAL * math.hypot(width, height)
@@ -75,10 +75,10 @@ def find_camera(choice: CameraChoice, photo: Path, size: Size, size_lr: Size) ->
             "camera: focal length from the photo's EXIF data, principal point in the middle",
             f"{equivalent:g} mm for 35 mm film = {focal:.5g} pixels",
         )
-        return _camera_only(Camera.centred(width, height, focal)), [assumption]
+        return camera_only(Camera.centred(width, height, focal)), [assumption]
     camera = Camera.from_fov(width, height)
     text = f"camera: none given, {ASSUMED_FOV:g} degrees of horizontal view assumed (--camera, --fov or --intrinsics)"
-    return _camera_only(camera), [Assumption(text, f"{camera.fx:.5g} pixels")]
+    return camera_only(camera), [Assumption(text, f"{camera.fx:.5g} pixels")]
 
 
 def read_any_camera(path: Path) -> CameraFile | np.ndarray:
@@ -100,7 +100,7 @@ def read_any_camera(path: Path) -> CameraFile | np.ndarray:
     return _open3d(path, text) if '"intrinsic_matrix"' in text else read_camera(path)
 
 
-def _camera_only(camera: Camera) -> CameraFile:
+def camera_only(camera: Camera) -> CameraFile:
     """Return a camera file that says nothing about depth."""
     return CameraFile(camera, None, None, None)
 
@@ -109,21 +109,37 @@ def _fit_to_photo(
     path: Path, content: CameraFile | np.ndarray, size: Size, size_lr: Size
 ) -> tuple[CameraFile, list[Assumption]]:
     """Return the camera of a file for the pixels of the photo, and the assumptions."""
-    height, width = size
     if isinstance(content, np.ndarray):
         content, assumptions = _camera_of_matrix(path, content, size, size_lr)
     else:
         assumptions = []
+    content, scaled = scale_to_photo(path, content, size)
+    return content, [*assumptions, *scaled]
+
+
+def scale_to_photo(path: Path, content: CameraFile, size: Size) -> tuple[CameraFile, list[Assumption]]:
+    """Return a camera scaled to the photo's (height, width), and the assumptions.
+
+    Args:
+        path: file that the camera comes from, for the message.
+        content: the camera.
+        size: of the photo.
+
+    Raises:
+        ValueError: the camera's image has another aspect than the photo.
+
+    """
+    height, width = size
     camera = content.camera
     if (camera.height, camera.width) == size:
-        return content, assumptions
+        return content, []
     if not same_aspect((camera.height, camera.width), size):
         raise ValueError(
             f"{path}: the camera is of {camera.width} x {camera.height} pixels (width x height), the photo has "
             f"{width} x {height}, another aspect"
         )
     text = f"camera: that of {camera.width} x {camera.height} pixels is scaled to the photo's {width} x {height}"
-    return replace(content, camera=camera.rescale(width, height)), [*assumptions, Assumption(text)]
+    return replace(content, camera=camera.rescale(width, height)), [Assumption(text)]
 
 
 def _camera_of_matrix(path: Path, matrix: np.ndarray, size: Size, size_lr: Size) -> tuple[CameraFile, list[Assumption]]:
@@ -132,7 +148,7 @@ def _camera_of_matrix(path: Path, matrix: np.ndarray, size: Size, size_lr: Size)
         cx, cy = matrix[0, 2], matrix[1, 2]
         if max(abs((cx + 0.5) / width - 0.5), abs((cy + 0.5) / height - 0.5)) <= _MAX_OFF_CENTRE:
             camera = Camera(width, height, matrix[0, 0], matrix[1, 1], cx, cy)
-            return _camera_only(camera), [Assumption(f"camera: the matrix is taken for one of the {name}'s pixels")]
+            return camera_only(camera), [Assumption(f"camera: the matrix is taken for one of the {name}'s pixels")]
     raise ValueError(
         f"{path}: expected a principal point near the middle of the photo, {size[1]} x {size[0]} pixels (width x "
         f"height), or of the depth map, {size_lr[1]} x {size_lr[0]}; got {cx:g}, {cy:g}"
@@ -166,7 +182,7 @@ def _open3d(path: Path, text: str) -> CameraFile:
     except ValidationError as error:
         raise ValueError(f"{path}: {describe(error)}") from error
     matrix = _check_matrix(path, np.array(stored.intrinsic_matrix).reshape(3, 3).T)
-    return _camera_only(Camera(stored.width, stored.height, matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]))
+    return camera_only(Camera(stored.width, stored.height, matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]))
 
 
 def _check_matrix(path: Path, matrix: np.ndarray) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Depth maps read and written with their stored values: PNG, TIFF, NPY, NPZ, PFM and OpenEXR.
+"""Depth maps read and written with their stored values: PNG, TIFF, NPY, NPZ, PFM and OpenEXR; ICL-NUIM's are read.
 
 :mod:`dsr.io.encoding` converts the values to metres and handles holes.
 """
@@ -13,10 +13,16 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from dsr.data.formats.files import expect_depth_values, quiet_decoders, read_values
+from dsr.data.formats.files import expect_depth_values, quiet_decoders, read_array, read_values
+from dsr.data.formats.icl_nuim import CAMERA as ICL_CAMERA
+from dsr.data.formats.shared import read_numbers
 from dsr.utils.files import read_arrays, replacing
 
 DEPTH_SUFFIXES = (".png", ".tiff", ".tif", ".npy", ".npz", ".pfm", ".exr")
+"""Of the formats that are read and written."""
+ICL_SUFFIX = ".depth"
+"""Of ICL-NUIM's text, distances along the rays in centimetres, :mod:`dsr.data.formats.icl_nuim`."""
+READ_SUFFIXES = (*DEPTH_SUFFIXES, ICL_SUFFIX)
 _STORABLE = {
     ".png": ("uint16",),
     ".tiff": ("uint16", "int16", "int32", "uint32", "float32", "float64"),
@@ -37,15 +43,26 @@ def read_depth_file(path: Path) -> np.ndarray:
 
     """
     suffix = path.suffix.lower()
-    if suffix not in DEPTH_SUFFIXES:
-        raise ValueError(f"{path}: expected a depth map as {', '.join(DEPTH_SUFFIXES)}, got {suffix or 'no suffix'}")
+    if suffix not in READ_SUFFIXES:
+        raise ValueError(f"{path}: expected a depth map as {', '.join(READ_SUFFIXES)}, got {suffix or 'no suffix'}")
     if not path.is_file():
         raise ValueError(f"{path}: expected a depth map, there is no such file")
-    readers = {".exr": _read_exr, ".npz": _read_npz}
+    readers = {".exr": _read_exr, ".npz": _read_npz, ICL_SUFFIX: _read_icl}
     values = expect_depth_values(path, readers[suffix](path)) if suffix in readers else read_values(path)
     if values.size == 0:
         raise ValueError(f"{path}: expected a depth map, got one of {values.shape[0]} x {values.shape[1]} pixels")
     return np.ascontiguousarray(values, values.dtype.newbyteorder("="))
+
+
+def read_array_file(path: Path) -> np.ndarray:
+    """Return the array of an NPY, NPZ, PFM or OpenEXR file, of any type and shape; see :func:`read_depth_file`.
+
+    Raises:
+        ValueError: it is missing or damaged.
+
+    """
+    suffix = path.suffix.lower()
+    return _read_exr(path) if suffix == ".exr" else _read_npz(path) if suffix == ".npz" else read_array(path)
 
 
 def write_depth_file(path: Path, values: np.ndarray) -> None:
@@ -87,6 +104,11 @@ def can_hold(suffix: str, dtype: np.dtype) -> bool:
 def _format(suffix: str) -> str:
     """Return the first of the suffixes that mean one format."""
     return ".tiff" if suffix == ".tif" else suffix
+
+
+def _read_icl(path: Path) -> np.ndarray:
+    """Return the numbers of a file of ICL-NUIM, (480, 640) float64."""
+    return read_numbers(path, ICL_CAMERA.height * ICL_CAMERA.width).reshape(ICL_CAMERA.height, ICL_CAMERA.width)
 
 
 def _read_npz(path: Path) -> np.ndarray:

@@ -22,7 +22,9 @@ _FAR_FOR_A_SENSOR = 10.0
 """Largest depth in metres of depth cameras that store millimetres."""
 _FLOAT_MILLIMETRES = 200.0
 """Median above which floats are millimetres."""
-_UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
+_UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "sunrgbd": 1e-3}
+SUNRGBD_BITS = 3
+"""How far SUN RGB-D turns the 16 bits of its millimetres to the left (``read3dPoints.m`` of its toolbox)."""
 _LARGEST_UNIT = 1e6
 
 
@@ -63,7 +65,7 @@ class Encoding:
 
 
 def parse_unit(text: str) -> float:
-    """Return the metres per value that a text names: m, cm, mm, a number, or a fraction such as 1/5000.
+    """Return the metres per value that a text names: m, cm, mm, sunrgbd, a number, or a fraction such as 1/5000.
 
     Raises:
         ValueError: it is none of these.
@@ -77,8 +79,28 @@ def parse_unit(text: str) -> float:
     except (ValueError, ZeroDivisionError):
         unit = math.nan
     if not 0 < unit <= _LARGEST_UNIT:
-        raise ValueError(f"--depth-unit: expected m, cm, mm or metres per value such as 0.0002 or 1/5000, got {text!r}")
+        raise ValueError(
+            f"--depth-unit: expected m, cm, mm or metres per value such as 0.0002 or 1/5000, or sunrgbd, got {text!r}"
+        )
     return unit
+
+
+def turn_back_bits(name: str, values: np.ndarray, bits: int) -> tuple[np.ndarray, list[Assumption]]:
+    """Return values of 16 bits that were turned to the left, turned back, and the assumption.
+
+    Args:
+        name: name of the file, for the error.
+        values: (h, w) uint16 as stored.
+        bits: how far they were turned.
+
+    Raises:
+        ValueError: they have not 16 bits.
+
+    """
+    if values.dtype != np.uint16:
+        raise ValueError(f"{name}: expected 16-bit values for --depth-unit sunrgbd, got {values.dtype}")
+    text = f"bits are turned back by {bits}, as SUN RGB-D turns them: millimetres, also in the result"
+    return (values >> bits) | (values << (16 - bits)), [Assumption(text)]
 
 
 def find_holes(values: np.ndarray, hole_value: float | None) -> tuple[np.ndarray, float, list[Assumption]]:
@@ -152,7 +174,7 @@ def guess_unit(name: str, values: np.ndarray, holes: np.ndarray) -> tuple[float,
         if middle * 1e-3 > _FAR_FOR_A_SENSOR:
             assumptions.append(
                 Assumption(
-                    "that is far for a sensor: TUM and ICL-NUIM store 1/5000 m, SUN RGB-D 1/8000 m (--depth-unit)"
+                    "that is far for a sensor: TUM and ICL-NUIM store 1/5000 m (--depth-unit), SUN RGB-D sunrgbd"
                 )
             )
         if holes.mean() > _SPARSE_FRACTION:

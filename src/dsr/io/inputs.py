@@ -10,13 +10,17 @@ import torch
 from torch import Tensor
 
 from dsr.data.formats.files import CameraFile, read_mask
+from dsr.data.formats.icl_nuim import CAMERA as ICL_CAMERA
 from dsr.geometry.camera import Camera, RangeType
-from dsr.io.cameras import CameraChoice, find_camera
-from dsr.io.depth_files import read_depth_file
-from dsr.io.encoding import Assumption, Encoding, decode, find_holes, guess_unit
+from dsr.io.cameras import CameraChoice, camera_only, find_camera, scale_to_photo
+from dsr.io.confidence import SLACK
+from dsr.io.depth_files import ICL_SUFFIX
+from dsr.io.encoding import Assumption, Encoding, decode, find_holes, turn_back_bits
+from dsr.io.frames import Geometry
 from dsr.io.names import words_of
 from dsr.io.pairs import Pair
 from dsr.io.photos import Size, read_photo, same_aspect
+from dsr.io.units import FolderUnits, read_values_of
 
 _DISPARITY_WORDS = frozenset({"disparity", "disp"})
 
@@ -31,6 +35,8 @@ class Reading:
         range_type: quantity that the values measure.
         baseline: distance in metres between the two cameras of disparities.
         hole_value: value that stands for a hole, in addition to the usual ones.
+        min_confidence: fraction; pixels of less confidence become holes. None for no limit.
+        turned_bits: how far the bits of the values are turned left, 3 in SUN RGB-D.
 
     """
 
@@ -39,6 +45,13 @@ class Reading:
     range_type: RangeType | None = None
     baseline: float | None = None
     hole_value: float | None = None
+    min_confidence: float | None = None
+    turned_bits: int = 0
+
+    def __post_init__(self) -> None:
+        """Check the numbers."""
+        if self.min_confidence is not None and not 0 <= self.min_confidence <= 1:
+            raise ValueError(f"--min-confidence: expected a fraction from 0 to 1, got {self.min_confidence:g}")
 
 
 @dataclass(frozen=True)
@@ -51,6 +64,9 @@ class Picture:
         camera: camera of the photo's pixels.
         encoding: encoding of the depth file.
         assumptions: assumptions about the files.
+        pose: from camera to world, (4, 4) float64 in metres, of a camera with the axes x right, y down, z forward, in
+            the world of the capture; None where there is none.
+        confidence: (1, h, w) float32 from 0 to 1, of the low-resolution map; None where there is none.
 
     """
 
@@ -59,28 +75,27 @@ class Picture:
     camera: Camera
     encoding: Encoding
     assumptions: tuple[Assumption, ...]
+    pose: np.ndarray | None = None
+    confidence: Tensor | None = None
 
 
-UnitMemory = dict[tuple[Path, str, str], tuple[float, list[Assumption]]]
-"""Units by folder, suffix and type of value: the first depth map of each determines that of the others."""
-
-
-def read_picture(pair: Pair, reading: Reading, units: UnitMemory) -> Picture:
+def read_picture(pair: Pair, reading: Reading, units: FolderUnits | None = None) -> Picture:
     """Return a pair of files as tensors.
 
     Args:
         pair: the files.
         reading: what the user says about them.
-        units: units of depth maps read before, to which this function adds.
+        units: guesses the unit for the whole folder; None to guess it from this map alone.
 
     Raises:
         ValueError: a file is missing or damaged, or the files do not fit each other.
 
     """
-    stored = read_depth_file(pair.depth)
+    stored = read_values_of(pair)
     size_lr: Size = (stored.shape[0], stored.shape[1])
-    pixels, assumptions = read_photo(pair.rgb, size_lr)
-    described, camera_assumptions = _camera(pair, reading, (pixels.shape[0], pixels.shape[1]), size_lr)
+    pixels, assumptions = _photo(pair, size_lr)
+    geometry = Geometry() if pair.capture is None else pair.capture.geometry((pixels.shape[0], pixels.shape[1]))
+    described, camera_assumptions = _camera(pair, reading, geometry, (pixels.shape[0], pixels.shape[1]), size_lr)
     pixels, crop_assumptions = _crop_to_multiple(pixels, pair.factor, size_lr)
     size: Size = (pixels.shape[0], pixels.shape[1])
     _expect_lower_resolution(pair, size, size_lr)
@@ -91,11 +106,16 @@ def read_picture(pair: Pair, reading: Reading, units: UnitMemory) -> Picture:
     holes, mark, hole_assumptions = find_holes(stored, hole_value)
     if pair.mask is not None:
         holes |= ~_mask(pair.mask, size_lr)
+    confidence, confidence_assumptions = _confidence(pair, reading, size_lr, holes)
     if holes.all():
         raise ValueError(f"{pair.depth}: expected at least one known pixel, all are holes")
     range_type, range_assumptions = _range_type(pair, reading, described, camera)
-    unit, unit_assumptions = _unit(pair, reading, described, range_type, stored, holes, units)
-    encoding = Encoding(pair.depth.suffix.lower(), str(stored.dtype), unit, mark, range_type)
+    if reading.turned_bits:
+        stored, bit_assumptions = turn_back_bits(str(pair.depth), stored, reading.turned_bits)
+        hole_assumptions += bit_assumptions
+    guesses = FolderUnits() if units is None else units
+    unit, unit_assumptions = _unit(pair, reading, described, range_type, stored, holes, guesses)
+    encoding = Encoding(_suffix(pair), str(stored.dtype), unit, mark, range_type)
     depth_lr = decode(stored, holes, encoding, camera.rescale(size_lr[1], size_lr[0]))
     if not bool(depth_lr.isfinite().any()):
         raise ValueError(f"{pair.depth}: expected at least one disparity above 0, got none")
@@ -107,8 +127,45 @@ def read_picture(pair: Pair, reading: Reading, units: UnitMemory) -> Picture:
         *range_assumptions,
         *unit_assumptions,
         *hole_assumptions,
+        *confidence_assumptions,
     )
-    return Picture(rgb, depth_lr, camera, encoding, all_assumptions)
+    return Picture(rgb, depth_lr, camera, encoding, all_assumptions, geometry.pose, confidence)
+
+
+def _photo(pair: Pair, size_lr: Size) -> tuple[np.ndarray, list[Assumption]]:
+    """Return the photo, (H, W, 3) uint8 RGB, and the assumptions."""
+    if pair.capture is not None and pair.capture.photo is not None:
+        return pair.capture.photo.read(), []
+    return read_photo(pair.rgb, size_lr)
+
+
+def _suffix(pair: Pair) -> str:
+    """Return the suffix of the result: the input's, or that of NumPy's format where the input's cannot be written."""
+    inside = pair.capture is not None and pair.capture.depth is not None
+    return ".npy" if inside or _is_icl(pair) else pair.depth.suffix.lower()
+
+
+def _is_icl(pair: Pair) -> bool:
+    """Return whether the depth map is a text file of ICL-NUIM."""
+    return pair.capture is None and pair.depth.suffix.lower() == ICL_SUFFIX
+
+
+def _confidence(
+    pair: Pair, reading: Reading, size_lr: Size, holes: np.ndarray
+) -> tuple[Tensor | None, list[Assumption]]:
+    """Return the confidence, (1, h, w), after adding pixels of too little of it to the holes, and the assumptions."""
+    if pair.confidence is None:
+        if reading.min_confidence is not None:
+            raise ValueError(f"{pair.depth}: expected a confidence map for --min-confidence, there is none")
+        return None, []
+    confidence = pair.confidence.read(size_lr)
+    assumptions = []
+    if reading.min_confidence is not None:
+        unsure = confidence < reading.min_confidence - SLACK
+        holes |= unsure
+        text = f"confidence below {reading.min_confidence:g} counts as a hole"
+        assumptions = [Assumption(text, f"{float(unsure.mean()):.1%}")]
+    return torch.from_numpy(confidence)[None], assumptions
 
 
 def _crop_to_multiple(pixels: np.ndarray, factor: int | None, size_lr: Size) -> tuple[np.ndarray, list[Assumption]]:
@@ -138,12 +195,23 @@ def _expect_lower_resolution(pair: Pair, size: Size, size_lr: Size) -> None:
         raise ValueError(f"{pair.depth}: expected at least 2 x 2 pixels, got {narrow} x {low}")
 
 
-def _camera(pair: Pair, reading: Reading, size: Size, size_lr: Size) -> tuple[CameraFile, list[Assumption]]:
-    """Return the camera that the user gives, else that of a file beside the pictures, else an assumed one."""
-    if reading.camera != CameraChoice() or pair.camera is None:
+def _camera(
+    pair: Pair, reading: Reading, geometry: Geometry, size: Size, size_lr: Size
+) -> tuple[CameraFile, list[Assumption]]:
+    """Return the camera that the user gives, else the capture's, else that of a file beside it, else an assumed one."""
+    if reading.camera != CameraChoice():
         return find_camera(reading.camera, pair.rgb, size, size_lr)
+    if pair.capture is not None and geometry.camera is not None:
+        content, scaled = scale_to_photo(pair.capture.told_by, camera_only(geometry.camera), size)
+        return content, [*geometry.assumptions, *scaled]
+    if pair.camera is None and _is_icl(pair) and size == size_lr:
+        return camera_only(ICL_CAMERA), [Assumption("camera: that of ICL-NUIM")]
+    if pair.camera is None:
+        content, assumed = find_camera(reading.camera, pair.rgb, size, size_lr)
+        return content, [*geometry.assumptions, *assumed]
     described, assumptions = find_camera(CameraChoice(file=pair.camera), pair.rgb, size, size_lr)
-    return described, [Assumption(f"camera: {pair.camera.name} beside the pictures"), *assumptions]
+    found = Assumption(f"camera: {pair.camera.name} beside the pictures")
+    return described, [*geometry.assumptions, found, *assumptions]
 
 
 def _mask(path: Path, size: Size) -> np.ndarray:
@@ -167,6 +235,9 @@ def _range_type(
     elif _DISPARITY_WORDS & set(words_of(pair.depth.stem)):
         range_type = "disparity"
         assumptions.append(Assumption("values are taken for disparities, by the file's name"))
+    elif _is_icl(pair):
+        range_type = "perspective"
+        assumptions.append(Assumption("values are distances along the rays in centimetres, as in ICL-NUIM's .depth"))
     else:
         range_type = described.range_type or "orthogonal"
         if described.range_type not in (None, "orthogonal"):
@@ -178,7 +249,7 @@ def _range_type(
 
 def _unit(
     pair: Pair, reading: Reading, described: CameraFile, range_type: RangeType,
-    stored: np.ndarray, holes: np.ndarray, units: UnitMemory,
+    stored: np.ndarray, holes: np.ndarray, units: FolderUnits,
 ) -> tuple[float, list[Assumption]]:  # fmt: skip
     """Return metres per value, or pixels per value of disparities, and the assumptions."""
     if reading.unit is not None:
@@ -189,7 +260,6 @@ def _unit(
         return described.depth_unit, [Assumption(f"unit: {described.depth_unit:g} m per value, says the camera file")]
     if pair.unit is not None:
         return pair.unit, []
-    kind = (pair.depth.parent, pair.depth.suffix.lower(), str(stored.dtype))
-    if kind not in units:
-        units[kind] = guess_unit(str(pair.depth), stored, holes)
-    return units[kind]
+    if _is_icl(pair):
+        return 1e-2, []
+    return units.guess(pair, stored, holes, described.hole_value if reading.hole_value is None else reading.hole_value)

@@ -10,6 +10,8 @@ import cv2
 import numpy as np
 
 from dsr.data.formats.files import read_pixels
+from dsr.io.captures.find import CAPTURE_FILES, find_capture
+from dsr.io.captures.open3d import add_trajectory
 from dsr.io.depth_files import DEPTH_SUFFIXES
 from dsr.io.encoding import Assumption
 from dsr.io.names import match_times, role_of, role_of_words, words_of
@@ -32,18 +34,24 @@ _MAX_DEPTH = 3
 def find_pairs_of_folder(folder: Path, leave: Path | None = None) -> PairingResult:
     """Return the pairs in a folder of any of these layouts, or in its subfolders.
 
-    The layouts are: a scene of dsr (``rgb.png``, ``camera.json`` and ``depth*`` or ``disparity*``); lists of TUM RGB-D
-    (``rgb.txt`` and ``depth.txt``, https://cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats); two folders named
-    for photos and depth maps; and files side by side, told apart by their names or by what they hold.
+    The layouts are: a capture (:mod:`dsr.io.captures`), which may be a single file, too; a scene of dsr (``rgb.png``,
+    ``camera.json`` and ``depth*`` or ``disparity*``); lists of TUM RGB-D (``rgb.txt`` and ``depth.txt``,
+    https://cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats); two folders named for photos and depth maps; and
+    files side by side, told apart by their names or by what they hold.
 
     Args:
-        folder: folder to search.
+        folder: folder to search, or a capture's file.
         leave: folder that is skipped, such as that of the results.
 
     Raises:
         ValueError: there is no such folder, or no pair in it.
 
     """
+    if folder.is_file():
+        single = find_capture(folder)
+        if single is None:
+            raise ValueError(f"{folder}: expected a folder, or a capture as {', '.join(CAPTURE_FILES)}")
+        return replace(single, pairs=make_names_unique(single.pairs))
     if not folder.is_dir():
         raise ValueError(f"{folder}: expected a folder of photos and depth maps, there is none")
     found = _search(folder, folder, None if leave is None else leave.resolve(), 0)
@@ -55,8 +63,11 @@ def find_pairs_of_folder(folder: Path, leave: Path | None = None) -> PairingResu
 
 def _search(folder: Path, root: Path, leave: Path | None, depth: int) -> PairingResult:
     """Return the pairs in a folder or, if there are none, those in its subfolders."""
+    capture = find_capture(folder)
+    if capture is not None and capture.pairs:
+        return capture
     for layout in (_scene, _tum, _role_folders, _side_by_side):
-        found = layout(folder)
+        found = add_trajectory(folder, layout(folder))
         if found.pairs:
             camera = find_camera_file(folder, root)
             return replace(found, pairs=tuple(replace(pair, camera=pair.camera or camera) for pair in found.pairs))

@@ -7,16 +7,17 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Literal
 
-from dsr.io.depth_files import DEPTH_SUFFIXES
+from dsr.io.depth_files import READ_SUFFIXES
 
 Role = Literal["rgb", "depth", "other"]
 PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".ppm")
-_DEPTH_ONLY = (".npy", ".npz", ".pfm", ".exr")
+_DEPTH_ONLY = (".npy", ".npz", ".pfm", ".exr", ".depth")
 _RGB_WORDS = frozenset({"rgb", "color", "colour", "image", "images", "img", "imgs", "photo", "photos", "picture"})
 _DEPTH_WORDS = frozenset({"depth", "depths", "depthmap", "disparity", "disp", "range"})
 _OTHER_WORDS = frozenset(
     {"mask", "masks", "confidence", "conf", "ir", "infrared", "normal", "normals", "label", "labels"}
 )
+_CONFIDENCE_WORDS = frozenset({"confidence", "conf"})
 _FILLERS = frozenset({"raw", "aligned", "registered", "map", "to", "frame", "in"})
 _SECONDS_BY_DIGITS = {10: 1.0, 13: 1e-3, 16: 1e-6, 19: 1e-9}
 """Times since 1970 as whole seconds, milli-, micro- and nanoseconds."""
@@ -34,7 +35,7 @@ def role_of(path: Path) -> Role:
     """Return the role of a file by its suffix and the words of its name, ``rgb`` where they say nothing."""
     suffix = path.suffix.lower()
     found = role_of_words(words_of(path.stem))
-    if found == "other" or suffix not in (*PHOTO_SUFFIXES, *DEPTH_SUFFIXES):
+    if found == "other" or suffix not in (*PHOTO_SUFFIXES, *READ_SUFFIXES):
         return "other"
     if suffix in _DEPTH_ONLY:
         return "depth"
@@ -55,6 +56,11 @@ def key_of(path: Path) -> tuple[str, ...]:
     """Return the words of a name without those that say its role, which are equal for the two files of a pair."""
     words = words_of(path.stem)
     return tuple(word for word in words if word not in _RGB_WORDS | _DEPTH_WORDS | _FILLERS)
+
+
+def confidence_key(path: Path) -> tuple[str, ...]:
+    """Return the key of the depth map that a confidence map belongs to, see :func:`key_of`."""
+    return tuple(word for word in key_of(path) if word not in _CONFIDENCE_WORDS)
 
 
 def time_of(path: Path) -> float | None:

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from dsr.io.depth_files import DEPTH_SUFFIXES
+from dsr.io.confidence import CONFIDENCE_SUFFIXES, ConfidenceMap, find_highest
+from dsr.io.depth_files import READ_SUFFIXES
 from dsr.io.encoding import Assumption
-from dsr.io.names import PHOTO_SUFFIXES, match_names
+from dsr.io.frames import CaptureFrame
+from dsr.io.names import PHOTO_SUFFIXES, confidence_key, key_of, match_names
 
 CAMERA_NAMES = (
-    "camera.json", "intrinsics.json", "intrinsic.json", "camera_intrinsic.json",
+    "camera.json", "intrinsics.json", "intrinsic.json", "camera_intrinsic.json", "camera_primesense.json",
     "intrinsic_color.txt", "intrinsics.txt", "intrinsic.txt",
 )  # fmt: skip
 
@@ -22,11 +24,13 @@ class Pair:
 
     Args:
         name: name of the result, unique among the pairs found together.
-        rgb, depth: files of the photo and the depth map.
+        rgb, depth: files of the photo and the depth map; names of their places in a capture that has no such files.
         camera: camera file beside them; None for none.
         mask: picture that is 0 where depth is missing; None for none.
         unit: metres per value if the layout defines it.
         factor: upsampling factor if the file's name has it, as in ``depth_lr4.npy``.
+        capture: what the capture that the pair is of says about it; None if it is of none.
+        confidence: where its confidence map is; None for none.
 
     """
 
@@ -37,6 +41,8 @@ class Pair:
     mask: Path | None = None
     unit: float | None = None
     factor: int | None = None
+    capture: CaptureFrame | None = field(default=None, compare=False)
+    confidence: ConfidenceMap | None = field(default=None, compare=False)
 
 
 @dataclass(frozen=True)
@@ -79,7 +85,7 @@ def find_pairs_of_lists(photos: Sequence[Path], depths: Sequence[Path], masks: S
         counts = f"{len(photos)} for --rgb, {len(depths)} for --depth" + (f", {len(masks)} for --mask" if masks else "")
         raise ValueError(f"expected as many depth maps (and masks, if any) as photos, got {counts}")
     pairs = [
-        Pair(rgb.stem, rgb, depth, find_camera_file(rgb.parent, rgb.parent))
+        Pair(rgb.stem, rgb, depth, find_camera_file(rgb.parent, _common_folder(rgb, depth)))
         for rgb, depth in zip(photos, depths, strict=True)
     ]
     if masks:
@@ -87,12 +93,22 @@ def find_pairs_of_lists(photos: Sequence[Path], depths: Sequence[Path], masks: S
     return PairingResult(make_names_unique(pairs))
 
 
+def _common_folder(rgb: Path, depth: Path) -> Path:
+    """Return up to which folder a photo's camera file is searched: that of two folders side by side, as SUN RGB-D has.
+
+    Files of any other places have theirs beside the photo.
+    """
+    folders = rgb.parent.absolute(), depth.parent.absolute()
+    beside = folders[0] != folders[1] and folders[0].parent == folders[1].parent
+    return rgb.parent.parent if beside and rgb.parent.name else rgb.parent
+
+
 def find_pairs_of_two_folders(photos: Path, depths: Path, masks: Sequence[Path]) -> PairingResult:
     """Return the pairs of two folders by name."""
     if masks:
         raise ValueError("--mask: expected photos and depth maps as files, one for each mask; got folders")
     left = [path for path in list_pictures(photos) if path.suffix.lower() in PHOTO_SUFFIXES]
-    right = [path for path in list_pictures(depths) if path.suffix.lower() in DEPTH_SUFFIXES]
+    right = [path for path in list_pictures(depths) if path.suffix.lower() in READ_SUFFIXES]
     found = match_pairs(left, right)
     if not found.pairs:
         raise ValueError(
@@ -121,9 +137,52 @@ def match_pairs(photos: Iterable[Path], depths: Iterable[Path]) -> PairingResult
     return PairingResult(tuple(Pair(rgb.stem, rgb, depth) for rgb, depth in matches), (), unpaired)
 
 
+def add_confidence(pairs: Sequence[Pair], given: Sequence[Path]) -> tuple[Pair, ...]:
+    """Return pairs with the confidence maps that the user gives.
+
+    Args:
+        pairs: the pairs, in the order of the maps.
+        given: one map for each pair, or a folder of maps with the pairs' names, numbers or times.
+
+    Raises:
+        ValueError: there are fewer or more maps than pairs, a map is missing, or the values have no known range.
+
+    """
+    for path in given:
+        if not path.exists():
+            raise ValueError(f"--confidence: {path}: no such file or folder")
+    if len(given) == 1 and given[0].is_dir():
+        paths = _match_confidence(pairs, given[0])
+    elif any(path.is_dir() for path in given) or len(given) != len(pairs):
+        raise ValueError(
+            f"--confidence: expected a folder, or as many maps as photos, got {len(given)} for {len(pairs)} photos"
+        )
+    else:
+        paths = list(given)
+    highest = find_highest(paths)
+    return tuple(
+        replace(pair, confidence=ConfidenceMap(path, highest)) for pair, path in zip(pairs, paths, strict=True)
+    )
+
+
+def _match_confidence(pairs: Sequence[Pair], folder: Path) -> list[Path]:
+    """Return the maps of a folder that have the names of the pairs' depth maps or photos."""
+    maps = {
+        confidence_key(path): path for path in sorted(folder.iterdir()) if path.suffix.lower() in CONFIDENCE_SUFFIXES
+    }
+    found = [maps.get(key_of(pair.depth)) or maps.get(key_of(pair.rgb)) for pair in pairs]
+    missing = [pair.name for pair, path in zip(pairs, found, strict=True) if path is None]
+    if missing:
+        raise ValueError(
+            f"--confidence: {folder}: expected a map for each of the {len(pairs)} depth maps, there is none for "
+            f"{len(missing)}, such as {missing[0]}"
+        )
+    return [path for path in found if path is not None]
+
+
 def list_pictures(folder: Path) -> list[Path]:
     """Return the pictures and maps in a folder."""
-    suffixes = (*PHOTO_SUFFIXES, *DEPTH_SUFFIXES)
+    suffixes = (*PHOTO_SUFFIXES, *READ_SUFFIXES)
     return sorted(
         path for path in folder.iterdir()
         if path.is_file() and path.suffix.lower() in suffixes and not path.name.startswith(".")

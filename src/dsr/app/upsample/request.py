@@ -11,6 +11,7 @@ from typing import Any
 from dsr.app.upsample.outputs import FORMATS, LARGEST_ERROR, PARTS
 from dsr.inference import DEFAULT, WIDEST, Fill, MethodChoice, check_settings
 from dsr.inference.planning import USUAL_SCALE
+from dsr.io.frames import Record, Source
 from dsr.io.inputs import Reading
 from dsr.io.pairs import Pair
 from dsr.methods.registry import list_methods, read_method, target_paths
@@ -28,6 +29,7 @@ class UpsampleRequest:
         output: the folder of the results.
         folders: the folders that are searched for pairs.
         rgb, depth, mask: files, or one folder each of the first two.
+        confidence: files of confidence maps, or a folder of them.
         reading: how to read the files.
         method, settings, directories, scale, device, fill, max_hole: see :func:`dsr.inference.upsample_depth`.
         max_error: expected relative error of the depth from which a pixel is left out of cloud and mesh.
@@ -43,6 +45,7 @@ class UpsampleRequest:
     rgb: tuple[Path, ...] = ()
     depth: tuple[Path, ...] = ()
     mask: tuple[Path, ...] = ()
+    confidence: tuple[Path, ...] = ()
     reading: Reading = field(default_factory=Reading)
     method: str = DEFAULT
     settings: Mapping[str, Any] = field(default_factory=dict)
@@ -74,6 +77,10 @@ class UpsampleRequest:
             raise ValueError("expected --rgb and --depth, or folders that hold both")
         if self.folders and self.mask:
             raise ValueError("--mask: expected --rgb and --depth with it, got folders")
+        if self.confidence and self.reading.min_confidence is None:
+            raise ValueError(
+                "--confidence: expected --min-confidence with it, the fraction below which pixels are holes"
+            )
         if not self.max_error > 0:
             raise ValueError(f"--max-error: expected a positive percentage of the depth, got {100 * self.max_error:g}")
         if not 0 < self.max_hole < math.inf:
@@ -92,10 +99,15 @@ class UpsampleRequest:
             raise ValueError(option if key in self.settings else str(error)) from error
 
 
+_NEW: Mapping[str, Any] = {"min_confidence": None, "turned_bits": 0}
+"""Settings that are stored only where they are not these, so that results of earlier versions stay valid."""
+
+
 def settings_of(request: UpsampleRequest) -> dict[str, Any]:
     """Return the settings that a result depends on, as values for JSON."""
     reading = asdict(request.reading)
     choice = reading.pop("camera")
+    reading = {name: value for name, value in reading.items() if name not in _NEW or value != _NEW[name]}
     return {
         "method": request.method,
         "scale": request.scale,
@@ -123,14 +135,32 @@ def files_of(pair: Pair, reading: Reading) -> dict[str, Path]:
     given = reading.camera.fov is not None or reading.camera.intrinsics is not None
     camera = reading.camera.file or (None if given else pair.camera)
     found = {"rgb": pair.rgb, "depth": pair.depth, "camera": camera, "mask": pair.mask}
-    return {name: path for name, path in found.items() if path is not None}
+    if pair.confidence is not None and reading.min_confidence is not None:
+        found["confidence"] = pair.confidence.path
+    return {name: path for name, path in found.items() if path is not None} | {
+        name: source.file for name, source in _sources(pair, reading).items()
+    }
 
 
-def inputs_of(pair: Pair, reading: Reading) -> dict[str, dict[str, str]]:
+def inputs_of(pair: Pair, reading: Reading) -> dict[str, Record]:
     """Return the inputs and their hashes, as values for JSON."""
-    inputs = {}
+    inputs: dict[str, Record] = {}
+    sources = _sources(pair, reading)
     for name, path in files_of(pair, reading).items():
+        if name in sources:
+            inputs[name] = sources[name].record()
+            continue
         if not path.is_file():
             raise ValueError(f"{path}: there is no such file")
         inputs[name] = {"file": path.name, "sha256": file_hash(path)}
-    return inputs
+    return inputs if pair.capture is None else {**inputs, "capture": pair.capture.record()}
+
+
+def _sources(pair: Pair, reading: Reading) -> dict[str, Source]:
+    """Return the inputs of a capture that are no files of their own."""
+    found: dict[str, Source | None] = {}
+    if pair.capture is not None:
+        found = {"rgb": pair.capture.photo, "depth": pair.capture.depth}
+    if pair.confidence is not None and reading.min_confidence is not None:
+        found["confidence"] = pair.confidence.source
+    return {name: source for name, source in found.items() if source is not None}

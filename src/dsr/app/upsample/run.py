@@ -28,9 +28,10 @@ from dsr.app.upsample.reporting import Reporter, listed, problem_line
 from dsr.app.upsample.request import UpsampleRequest, files_of, inputs_of, settings_of
 from dsr.inference import Plan, enlarged_by, plan, upsample_surface
 from dsr.io.encoding import Assumption
-from dsr.io.inputs import Picture, UnitMemory, read_picture
+from dsr.io.inputs import Picture, read_picture
 from dsr.io.layouts import find_pairs_of_folder
-from dsr.io.pairs import Pair, PairingResult, find_pairs_of_lists
+from dsr.io.pairs import Pair, PairingResult, add_confidence, find_pairs_of_lists
+from dsr.io.units import FolderUnits
 from dsr.methods.base import MapNoise, Surface
 from dsr.utils.console import ConsoleProgress, show
 from dsr.utils.progress import Progress
@@ -58,9 +59,11 @@ def run(request: UpsampleRequest, console: Console) -> list[str]:
 
     """
     found = _find(request)
+    if request.confidence:
+        found = replace(found, pairs=add_confidence(found.pairs, request.confidence))
     single = len(found.pairs) == 1 and not request.folders and not request.rgb[0].is_dir()
     _show_found(console, found)
-    reporter, units = Reporter(console), UnitMemory()
+    reporter, units = Reporter(console), FolderUnits(found.pairs)
     problems: dict[str, list[str]] = {}
     outcomes: Counter[str] = Counter()
     progress = ConsoleProgress(console)
@@ -154,7 +157,7 @@ class _Job:
 
 
 def _one(
-    request: UpsampleRequest, pair: Pair, target: Path, units: UnitMemory, reporter: Reporter, progress: Progress
+    request: UpsampleRequest, pair: Pair, target: Path, units: FolderUnits, reporter: Reporter, progress: Progress
 ) -> str:
     """Upsample one picture, and return the outcome."""
     job = _Job(request, pair, target, settings_of(request), inputs_of(pair, request.reading), read_previous_run(target))
@@ -194,7 +197,9 @@ def _without_repeats(picture: Picture) -> Picture:
     if block == 1 or height % block or width % block:
         return picture
     fact = Assumption(f"the depth map was enlarged x{block} by repeating pixels, which are dropped")
-    return replace(picture, depth_lr=picture.depth_lr[:, ::block, ::block], assumptions=(*picture.assumptions, fact))
+    depth_lr = picture.depth_lr[:, ::block, ::block]
+    confidence = None if picture.confidence is None else picture.confidence[:, ::block, ::block]
+    return replace(picture, depth_lr=depth_lr, confidence=confidence, assumptions=(*picture.assumptions, fact))
 
 
 def _upsample(job: _Job, picture: Picture, progress: Progress) -> Surface:

@@ -50,10 +50,19 @@ def read_values(path: Path) -> np.ndarray:
         ValueError: as for :func:`read_map`.
 
     """
+    return expect_depth_values(path, read_array(path))
+
+
+def read_array(path: Path) -> np.ndarray:
+    """Return the values of a map in the type and shape that it is stored in.
+
+    Raises:
+        ValueError: it is missing or damaged.
+
+    """
     readers = {".npy": _load_npy, ".pfm": _load_pfm}
     reader = readers.get(path.suffix.lower())
-    values = read_pixels(path, cv2.IMREAD_UNCHANGED) if reader is None else reader(path)
-    return expect_depth_values(path, values)
+    return read_pixels(path, cv2.IMREAD_UNCHANGED) if reader is None else reader(path)
 
 
 def expect_depth_values(path: Path, values: np.ndarray) -> np.ndarray:

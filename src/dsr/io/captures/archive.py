@@ -1,0 +1,211 @@
+"""Archives and folders with the same members, and LZFSE data; sizes are checked before anything is unpacked.
+
+LZFSE: https://github.com/lzfse/lzfse, of which lzfse_internal.h describes the blocks.
+"""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import struct
+import zipfile
+import zlib
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from dsr.data.formats.files import quiet_decoders
+from dsr.io.frames import Record
+
+PHOTO_LIMIT = 1 << 26
+"""Largest size in bytes of an encoded photo."""
+_LARGEST_PHOTO = 1 << 27
+"""Largest number of pixels of a photo."""
+_DAMAGED = (zipfile.BadZipFile, zlib.error, OSError, EOFError, RuntimeError, NotImplementedError, struct.error)
+"""What reading a damaged or encrypted archive raises."""
+
+
+@dataclass(frozen=True)
+class Archive:
+    """The members of a ZIP file, or the files of a folder with the same ones.
+
+    Args:
+        path: the file or folder.
+
+    """
+
+    path: Path
+
+    def names(self) -> list[str]:
+        """Return the names of the members.
+
+        Raises:
+            ValueError: the file is damaged or no archive.
+
+        """
+        if self.path.is_dir():
+            paths = sorted(path for path in self.path.rglob("*") if path.is_file())
+            return [path.relative_to(self.path).as_posix() for path in paths]
+        return _open(self.path, _state(self.path)).namelist()
+
+    def read(self, name: str, limit: int) -> bytes:
+        """Return a member's content.
+
+        Args:
+            name: its name.
+            limit: largest number of bytes that it may have.
+
+        Raises:
+            ValueError: there is none, it is larger by what the archive declares, or damaged.
+
+        """
+        place = self.path / name
+        size = self._declared(name)
+        if size is None:
+            raise ValueError(f"{place}: expected it in the capture, there is none")
+        if size > limit:
+            raise ValueError(f"{place}: expected at most {limit} bytes, the archive declares {size}")
+        try:
+            return place.read_bytes() if self.path.is_dir() else _open(self.path, _state(self.path)).read(name)
+        except _DAMAGED as error:
+            raise ValueError(f"{place}: expected a member of the archive, got a damaged one") from error
+
+    def _declared(self, name: str) -> int | None:
+        """Return the size of a member, which an archive declares; None if there is no such member."""
+        if self.path.is_dir():
+            return (self.path / name).stat().st_size if (self.path / name).is_file() else None
+        try:
+            return _open(self.path, _state(self.path)).getinfo(name).file_size
+        except KeyError:
+            return None
+
+
+@dataclass(frozen=True)
+class Member:
+    """A :class:`~dsr.io.frames.Source` of a member of an archive.
+
+    Args:
+        archive: the archive.
+        name: the member's name.
+        limit: largest number of bytes.
+        decode: returns the pixels of the content, or raises a ValueError without the file's name.
+
+    """
+
+    archive: Archive
+    name: str
+    limit: int
+    decode: Callable[[bytes], np.ndarray]
+
+    @property
+    def file(self) -> Path:
+        """The archive, or the file in the folder."""
+        return self.archive.path / self.name if self.archive.path.is_dir() else self.archive.path
+
+    def read(self) -> np.ndarray:
+        """Return the pixels."""
+        try:
+            return self.decode(self.archive.read(self.name, self.limit))
+        except ValueError as error:
+            text, place = str(error), str(self.archive.path / self.name)
+            raise ValueError(text if text.startswith(place) else f"{place}: {text}") from error
+
+    def record(self) -> Record:
+        """Return the member's name and hash."""
+        content = self.archive.read(self.name, self.limit)
+        name = f"{self.archive.path.name}/{self.name}"
+        return {"file": name, "sha256": hashlib.sha256(content).hexdigest()}
+
+
+def decode_photo(content: bytes) -> np.ndarray:
+    """Return the pixels of an encoded photo, (H, W, 3) uint8 RGB.
+
+    Raises:
+        ValueError: it is damaged, or larger than a photo is.
+
+    """
+    try:
+        with quiet_decoders():
+            flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
+            pixels = cv2.imdecode(np.frombuffer(content, np.uint8), flags) if content else None
+    except cv2.error:
+        pixels = None
+    if pixels is None or pixels.shape[0] * pixels.shape[1] > _LARGEST_PHOTO:
+        raise ValueError(f"expected a photo, got {len(content)} bytes that are none")
+    return cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB)
+
+
+def decode_lzfse(content: bytes, size: tuple[int, int], dtype: str) -> np.ndarray:
+    """Return the map (h, w) that LZFSE data hold.
+
+    Args:
+        content: compressed data.
+        size: (h, w) of the map.
+        dtype: type of its values.
+
+    Raises:
+        ValueError: they are damaged, or of another size; or the package that reads them is missing.
+
+    """
+    expected = size[0] * size[1] * np.dtype(dtype).itemsize
+    declared = _declared_size(content)
+    if declared != expected:
+        raise ValueError(
+            f"expected {size[1]} x {size[0]} values of {np.dtype(dtype)} ({expected} bytes), "
+            f"got LZFSE data of {declared}"
+        )
+    try:
+        import lzfse  # noqa: PLC0415 - an extra
+    except ImportError as error:
+        raise ValueError("LZFSE data need the package lzfse: pip install 'dsr[captures]'") from error
+    try:
+        values = lzfse.decompress(content)
+    except (lzfse.error, MemoryError) as error:
+        raise ValueError("expected LZFSE data, got damaged ones") from error
+    if len(values) != expected:
+        raise ValueError(f"expected LZFSE data of {expected} bytes, got {len(values)}")
+    return np.frombuffer(values, dtype).reshape(size)
+
+
+def _declared_size(content: bytes) -> int:
+    """Return the number of bytes that the headers of LZFSE blocks declare.
+
+    Raises:
+        ValueError: these are no complete LZFSE data.
+
+    """
+    place, total = 0, 0
+    while content[place : place + 4] != b"bvx$":
+        magic, (raw,) = content[place : place + 4], struct.unpack_from("<I", content.ljust(place + 8, b"\0"), place + 4)
+        if magic == b"bvx-":
+            length = 8 + raw
+        elif magic == b"bvxn" and len(content) >= place + 12:
+            length = 12 + int(struct.unpack_from("<I", content, place + 8)[0])
+        elif magic == b"bvx2" and len(content) >= place + 32:
+            literals, matches, header = struct.unpack_from("<3Q", content, place + 8)
+            length = (header & 0xFFFFFFFF) + (literals >> 20 & 0xFFFFF) + (matches >> 40 & 0xFFFFF)
+        else:
+            raise ValueError(f"expected LZFSE data, got {len(content)} bytes that are damaged or none")
+        total, place = total + raw, place + max(length, 8)
+        if place > len(content):
+            raise ValueError(f"expected LZFSE data, they end early, after {len(content)} bytes")
+    return total
+
+
+def _state(path: Path) -> tuple[int, int]:
+    """Return size and time of a file, which tell whether it was replaced."""
+    if not path.is_file():
+        raise ValueError(f"{path}: expected an archive, there is none")
+    return path.stat().st_size, path.stat().st_mtime_ns
+
+
+@functools.lru_cache(maxsize=1)
+def _open(path: Path, _: tuple[int, int]) -> zipfile.ZipFile:
+    """Return the open archive."""
+    try:
+        return zipfile.ZipFile(path)
+    except _DAMAGED as error:
+        raise ValueError(f"{path}: expected a ZIP archive, got a damaged, truncated or foreign file") from error

@@ -1,0 +1,169 @@
+"""Stray Scanner, an app for iPhones and iPads with lidar; https://github.com/strayrobots/scanner, docs/format.md.
+
+    rgb.mp4                  the photos, 1920 x 1440; or extracted ones in rgb/000000.png
+    depth/000000.png         16-bit millimetres, 256 x 192; .npy of millimetres in old versions
+    confidence/000000.png    0 (low) to 2 (high), of the depth map's size
+    camera_matrix.csv        3 x 3 intrinsics of the last frame, in pixels of the video
+    odometry.csv             timestamp, frame, x, y, z, qx, qy, qz, qw; fx, fy, cx, cy since 2026
+
+The odometry's quaternion turns a camera with the axes x right, y down, z forward into ARKit's world, y up: the app
+turns ARKit's camera by 180 degrees around x before it writes the pose (OdometryEncoder.swift). ``frame`` numbers the
+maps, and the video's frames if those are counted that its edit list hides: the app writes the first one at a time
+before 0 (VideoEncoder.swift).
+"""
+
+from __future__ import annotations
+
+import csv
+import functools
+import io
+import re
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from dsr.geometry.camera import Camera
+from dsr.io.captures.poses import describe_capture, intrinsics_camera, pose_from_quaternion, read_text
+from dsr.io.captures.video import VideoFrame, count_frames, video_size
+from dsr.io.confidence import HIGHEST_LEVEL, ConfidenceMap
+from dsr.io.encoding import Assumption
+from dsr.io.frames import CaptureFrame, Geometry
+from dsr.io.names import PHOTO_SUFFIXES
+from dsr.io.pairs import Pair, PairingResult
+
+_APP = "Stray Scanner"
+_POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")
+_INTRINSICS = ("fx", "fy", "cx", "cy")
+_USUAL_SIZE = (1440, 1920)
+"""Of the video, for extracted frames that were made smaller."""
+_MAX_OFF_CENTRE = 0.25
+_Row = Mapping[str, str]
+
+
+def find_stray(folder: Path) -> PairingResult | None:
+    """Return the frames of a folder of Stray Scanner; None if it is none.
+
+    Raises:
+        ValueError: it is one, and a file that all frames need is damaged.
+
+    """
+    video, matrix, odometry = folder / "rgb.mp4", folder / "camera_matrix.csv", folder / "odometry.csv"
+    photos, depths = _numbered(folder / "rgb", PHOTO_SUFFIXES), _numbered(folder / "depth", (".png", ".npy"))
+    if not (matrix.is_file() or odometry.is_file()) or not depths or not (photos or video.is_file()):
+        return None
+    confidence, rows = _numbered(folder / "confidence", (".png",)), _read_odometry(odometry)
+    text = read_text(matrix) if matrix.is_file() else ""
+    pairs, unpaired = [], []
+    for number, depth in depths.items():
+        photo = photos.get(number)
+        if photo is None and photos:
+            unpaired.append(depth)
+            continue
+        row = rows.get(number, {})
+        told = (odometry if row else matrix, repr((text, sorted(row.items()))).encode())
+        geometry = functools.partial(_geometry, folder, number, row, text)
+        frame = CaptureFrame(_APP, geometry, *told, photo=None if photo else VideoFrame(video, number))
+        known = ConfidenceMap(confidence[number], HIGHEST_LEVEL) if number in confidence else None
+        rgb = photo or video / f"{number:06}"
+        pairs.append(Pair(f"{number:06}", rgb, depth, unit=1e-3, capture=frame, confidence=known))
+    unpaired += [path for number, path in photos.items() if number not in depths]
+    found = describe_capture(f"a capture of {_APP}", "millimetres", pairs, poses=bool(rows))
+    notes = (found,) if photos else (found, *_check_count(video, max(depths) + 1))
+    return PairingResult(tuple(pairs), notes, tuple(unpaired))
+
+
+def _check_count(video: Path, expected: int) -> list[Assumption]:
+    """Return a warning if a video has another number of frames than there are maps: they may belong to others."""
+    try:
+        count = count_frames(video)
+    except ValueError:  # each frame says so when it is read
+        return []
+    if count == expected:
+        return []
+    text = f"{video.name} has {count} frames, the depth maps count to {expected}: photos may be some frames off"
+    return [Assumption(text)]
+
+
+def _numbered(folder: Path, suffixes: tuple[str, ...]) -> dict[int, Path]:
+    """Return the files of a folder by their numbers, in order."""
+    if not folder.is_dir():
+        return {}
+    paths = [path for path in folder.iterdir() if path.suffix.lower() in suffixes]
+    return dict(sorted((int(path.stem), path) for path in paths if re.fullmatch(r"\d{1,9}", path.stem)))
+
+
+def _read_odometry(path: Path) -> dict[int, _Row]:
+    """Return the rows of the odometry by frame, with their values as text; empty without the file."""
+    if not path.is_file():
+        return {}
+    lines = csv.reader(io.StringIO(read_text(path)), skipinitialspace=True)
+    names = [name.strip() for name in next(lines, [])]
+    missing = [name for name in ("frame", *_POSE) if name not in names]
+    if missing:
+        raise ValueError(f"{path}: expected {_APP}'s columns, there is no {', '.join(missing)}")
+    rows: dict[int, _Row] = {}
+    for values in lines:
+        row = dict(zip(names, (value.strip() for value in values), strict=False))
+        if re.fullmatch(r"\d{1,9}", row.get("frame", "")):
+            rows.setdefault(int(row["frame"]), row)
+    return rows
+
+
+def _geometry(folder: Path, number: int, row: _Row, matrix: str, size: tuple[int, int]) -> Geometry:
+    """Return camera and pose of a frame."""
+    place = f"{folder / 'odometry.csv'}: frame {number}"
+    assumptions = []
+    pose = None
+    if row:
+        values = _numbers(place, row, _POSE)
+        pose = pose_from_quaternion(place, values[3:], values[:3])
+    else:
+        assumptions.append(Assumption("no pose: odometry.csv has none of the frame"))
+    own = all(row.get(name) for name in _INTRINSICS)
+    if own:
+        return Geometry(_camera(folder, place, _numbers(place, row, _INTRINSICS), size), pose, tuple(assumptions))
+    if not matrix:
+        return Geometry(None, pose, tuple(assumptions))
+    assumptions.append(
+        Assumption("camera: camera_matrix.csv of the whole capture; odometry.csv has none of each frame")
+    )
+    path = folder / "camera_matrix.csv"
+    return Geometry(_camera(folder, str(path), _read_matrix(path, matrix), size), pose, tuple(assumptions))
+
+
+def _numbers(place: str, row: _Row, names: tuple[str, ...]) -> list[float]:
+    """Return values of a row as numbers."""
+    try:
+        return [float(row[name]) for name in names]
+    except (KeyError, ValueError) as error:
+        came = ", ".join(row.get(name, "nothing") for name in names)
+        raise ValueError(f"{place}: expected numbers for {', '.join(names)}, got {came:.120}") from error
+
+
+def _read_matrix(path: Path, text: str) -> list[float]:
+    """Return fx, fy, cx, cy of the matrix."""
+    try:
+        values = [float(word) for word in text.replace(",", " ").split()]
+    except ValueError:
+        values = []
+    matrix = np.array(values).reshape(3, 3) if len(values) == 9 else np.full((3, 3), np.nan)
+    if not np.isfinite(matrix).all() or not np.allclose(matrix[2], (0, 0, 1)):
+        raise ValueError(f"{path}: expected a 3 x 3 matrix of intrinsics, got {text!r:.80}")
+    return [matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]]
+
+
+def _camera(folder: Path, place: str, numbers: list[float], size: tuple[int, int]) -> Camera:
+    """Return the camera, of the photo's pixels, or of the video's if extracted photos were made smaller."""
+    cx, cy = numbers[2:]
+    sizes = [size]
+    if (folder / "rgb.mp4").is_file() and (folder / "rgb").is_dir():
+        sizes.append(video_size(folder / "rgb.mp4"))
+    for height, width in (*sizes, _USUAL_SIZE):
+        if max(abs((cx + 0.5) / width - 0.5), abs((cy + 0.5) / height - 0.5)) <= _MAX_OFF_CENTRE:
+            return intrinsics_camera(place, (height, width), numbers)
+    intrinsics_camera(place, size, numbers)  # says what is wrong with numbers that are not finite
+    raise ValueError(
+        f"{place}: expected a principal point near the middle of the {size[1]} x {size[0]} photo (width x height), "
+        f"got {cx:g}, {cy:g}"
+    )

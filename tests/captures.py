@@ -1,0 +1,235 @@
+"""Small captures in the layouts of apps, written with poses and intrinsics that are known."""
+
+import json
+import struct
+import zipfile
+
+import cv2
+import numpy as np
+from PIL import Image
+from scipy.spatial.transform import Rotation
+
+SIZE, SIZE_LR = (48, 64), (12, 16)
+INTRINSICS = (50.0, 51.0, 31.0, 24.0)
+FRAMES = 3
+FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
+"""From ARKit's and OpenGL's axes of the camera to dsr's, and back."""
+
+
+def photo(number=0):
+    """A smooth photo, so that encoders keep it, (48, 64, 3) uint8 RGB; its red grows with the number."""
+    y, x = np.mgrid[0:48, 0:64]
+    return np.stack((40 * number + x, 2 * y + 60, x + y), -1).astype(np.uint8)
+
+
+def depth(number=0):
+    """Depth in metres, (12, 16), a slope without holes; 0.5 m farther with each number."""
+    y, x = np.mgrid[0:12, 0:16]
+    return 1.5 + 0.5 * number + 0.01 * x + 0.02 * y
+
+
+def levels():
+    """Confidence, (12, 16) uint8: 0 in the first two columns, 1 in the next two, then 2."""
+    return np.broadcast_to(np.repeat([0, 1, 2], [2, 2, 12]).astype(np.uint8), SIZE_LR).copy()
+
+
+def pose(number=0):
+    """A pose from camera (x right, y down, z forward) to world, (4, 4)."""
+    matrix = np.eye(4)
+    matrix[:3, :3] = Rotation.from_euler("xyz", (10 + number, 20, -30), degrees=True).as_matrix()
+    matrix[:3, 3] = (0.1 * number, 0.2, -0.3)
+    return matrix
+
+
+def save(path, values):
+    """Write a picture."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(values).save(path)
+
+
+def millimetres(number=0):
+    return np.round(1000 * depth(number)).astype(np.uint16)
+
+
+def write_video(path, frames):
+    """Write a video of RGB frames, without loss as far as the codec can."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"mp4v"), 30, frames[0].shape[1::-1])
+    for frame in frames:
+        writer.write(cv2.cvtColor(frame, cv2.COLOR_RGB2BGR))
+    writer.release()
+
+
+def stray(folder, *, video=True, own_intrinsics=True):
+    """Write a capture of Stray Scanner: photos in a video or in files, intrinsics of each frame or of all."""
+    for number in range(FRAMES):
+        save(folder / "depth" / f"{number:06}.png", millimetres(number))
+        save(folder / "confidence" / f"{number:06}.png", levels())
+        if not video:
+            save(folder / "rgb" / f"{number:06}.png", photo(number))
+    if video:
+        write_video(folder / "rgb.mp4", [photo(number) for number in range(FRAMES)])
+    fx, fy, cx, cy = INTRINSICS
+    (folder / "camera_matrix.csv").write_text(f"{fx}, 0.0, {cx}\n0.0, {fy}, {cy}\n0.0, 0.0, 1.0\n")
+    more = ", fx, fy, cx, cy, distortion_center_x, distortion_center_y" if own_intrinsics else ""
+    lines = ["timestamp, frame, x, y, z, qx, qy, qz, qw" + more]
+    for number in range(FRAMES):
+        values = [*pose(number)[:3, 3], *Rotation.from_matrix(pose(number)[:3, :3]).as_quat()]
+        values += [fx + number, fy, cx, cy] if own_intrinsics else []
+        end = ", , " if own_intrinsics else ""
+        lines.append(f"{10 + number / 60}, {number:06}, " + ", ".join(f"{value:.9f}" for value in values) + end)
+    (folder / "odometry.csv").write_text("\n".join(lines) + "\n")
+    return folder
+
+
+def lzfse_block(values):
+    """Return the bytes of an array as LZFSE data that are not compressed."""
+    content = values.tobytes()
+    return b"bvx-" + struct.pack("<I", len(content)) + content + b"bvx$"
+
+
+def record3d_metadata(**changes):
+    """The metadata of Record3D; the camera of later frames has a larger fx."""
+    fx, fy, cx, cy = INTRINSICS
+    poses = [
+        [*Rotation.from_matrix((pose(number) @ FLIP)[:3, :3]).as_quat(), *pose(number)[:3, 3]]
+        for number in range(FRAMES)
+    ]
+    own = [[fx + number, fy, cx, cy] for number in range(FRAMES)]
+    sizes = {"w": SIZE[1], "h": SIZE[0], "dw": SIZE_LR[1], "dh": SIZE_LR[0], "fps": 30}
+    K = [fx, 0, 0, 0, fy, 0, cx, cy, 1]
+    return {**sizes, "K": K, "poses": poses, "perFrameIntrinsicCoeffs": own, **changes}
+
+
+def record3d(path, compress=lzfse_block, **changes):
+    """Write an .r3d archive."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("metadata", json.dumps(record3d_metadata(**changes)))
+        for number in range(FRAMES):
+            encoded = cv2.imencode(".jpg", photo(number)[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 98])[1]
+            archive.writestr(f"rgbd/{number}.jpg", encoded.tobytes())
+            archive.writestr(f"rgbd/{number}.depth", compress(depth(number).astype("<f4")))
+            archive.writestr(f"rgbd/{number}.conf", compress(levels()))
+    return path
+
+
+def polycam_camera(number=0, **changes):
+    """A camera of Polycam."""
+    fx, fy, cx, cy = INTRINSICS
+    matrix = pose(number) @ FLIP
+    entries = {f"t_{row}{column}": matrix[row, column] for row in range(3) for column in range(4)}
+    sizes = {"width": SIZE[1], "height": SIZE[0], "blur_score": 100.0}
+    return {"fx": fx + number, "fy": fy, "cx": cx, "cy": cy, **sizes, **entries, **changes}
+
+
+def polycam(folder):
+    """Write a raw export of Polycam whose last frame has no corrected photo."""
+    for number in range(FRAMES):
+        name = f"{1000 + number}"
+        for kind in ("", "corrected_")[: 2 if number < FRAMES - 1 else 1]:
+            brighter = photo(number) + np.uint8(10 if kind else 0)
+            save(folder / "keyframes" / f"{kind}images" / f"{name}.jpg", brighter)
+            path = folder / "keyframes" / f"{kind}cameras" / f"{name}.json"
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_text(json.dumps(polycam_camera(number, cy=INTRINSICS[3] - 1 if kind else INTRINSICS[3])))
+        save(folder / "keyframes" / "depth" / f"{name}.png", millimetres(number))
+        save(folder / "keyframes" / "confidence" / f"{name}.png", np.array([0, 127, 255], np.uint8)[levels()])
+    return folder
+
+
+def arkitscenes(folder):
+    """Write a video of ARKitScenes whose last frame has no pose, and whose intrinsics are a millisecond off."""
+    lines = []
+    for number in range(FRAMES):
+        time = 10 + 0.1 * number
+        stem = f"41069021_{time:.3f}"
+        save(folder / "lowres_wide" / f"{stem}.png", photo(number))
+        save(folder / "lowres_depth" / f"{stem}.png", millimetres(number))
+        save(folder / "confidence" / f"{stem}.png", levels())
+        fx, fy, cx, cy = INTRINSICS
+        path = folder / "lowres_wide_intrinsics" / f"41069021_{time + 0.001:.3f}.pincam"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(f"{SIZE[1]} {SIZE[0]} {fx + number} {fy} {cx} {cy}\n")
+        back = np.linalg.inv(pose(number))
+        if number < FRAMES - 1:
+            values = [time + 0.004, *Rotation.from_matrix(back[:3, :3]).as_rotvec(), *back[:3, 3]]
+            lines.append(" ".join(f"{value:.9f}" for value in values))
+    (folder / "lowres_wide.traj").write_text("\n".join(lines) + "\n")
+    return folder
+
+
+def open3d(folder, camera="camera_intrinsic.json"):
+    """Write a folder of Open3D's reconstruction system with its trajectory."""
+    fx, fy, cx, cy = INTRINSICS
+    lines = []
+    for number in range(FRAMES):
+        save(folder / "color" / f"{number:06}.jpg", photo(number))
+        save(folder / "depth" / f"{number:06}.png", millimetres(number))
+        lines.append(f"{number} {number} {number + 1}")
+        lines += [" ".join(f"{value:.10f}" for value in row) for row in pose(number)]
+    entries = {"width": SIZE[1], "height": SIZE[0], "intrinsic_matrix": [fx, 0, 0, 0, fy, 0, cx, cy, 1]}
+    (folder / camera).write_text(json.dumps(entries))
+    (folder / "scene").mkdir()
+    (folder / "scene" / "trajectory.log").write_text("\n".join(lines) + "\n")
+    return folder
+
+
+def ros(path, version, *, floats=False, compressed=False):
+    """Write a recording of ROS 1 or 2 with colour, depth aligned to it, raw depth and infrared."""
+    from rosbags.rosbag1 import Writer as Writer1  # noqa: PLC0415 - an extra
+    from rosbags.rosbag2 import Writer as Writer2  # noqa: PLC0415
+    from rosbags.typesys import Stores, get_typestore  # noqa: PLC0415
+
+    store = get_typestore(Stores.ROS1_NOETIC if version == 1 else Stores.ROS2_HUMBLE)
+    types = store.types
+
+    def header(number, late=0):
+        time = types["builtin_interfaces/msg/Time"](100, int(33e6 * number + late))
+        own = {"seq": number} if version == 1 else {}
+        return types["std_msgs/msg/Header"](stamp=time, frame_id="camera", **own)
+
+    def image(number, values, encoding, late=0):
+        return types["sensor_msgs/msg/Image"](
+            header=header(number, late), height=values.shape[0], width=values.shape[1], encoding=encoding,
+            is_bigendian=0, step=values[0].nbytes, data=np.frombuffer(values.tobytes(), np.uint8),
+        )  # fmt: skip
+
+    def jpeg(number):
+        data = cv2.imencode(".jpg", photo(number)[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 98])[1]
+        kind = types["sensor_msgs/msg/CompressedImage"]
+        return kind(header=header(number), format="rgb8; jpeg compressed bgr8", data=data.reshape(-1))
+
+    def info(number):
+        fx, fy, cx, cy = INTRINSICS
+        k = np.array([fx, 0, cx, 0, fy, cy, 0, 0, 1.0])
+        arrays = {"d": np.zeros(5), "k": k, "r": np.eye(3).reshape(-1), "p": np.zeros(12)}
+        if version == 1:
+            arrays = {name.upper(): value for name, value in arrays.items()}
+        roi = types["sensor_msgs/msg/RegionOfInterest"](0, 0, 0, 0, False)
+        return types["sensor_msgs/msg/CameraInfo"](
+            header=header(number), height=SIZE[0], width=SIZE[1], distortion_model="plumb_bob", binning_x=0,
+            binning_y=0, roi=roi, **arrays,
+        )  # fmt: skip
+
+    name = "/camera/color/image_raw"
+    topics = {
+        name + "/compressed" if compressed else name:
+            jpeg if compressed else lambda number: image(number, photo(number)[..., ::-1], "bgr8"),
+        "/camera/color/camera_info": info,
+        "/camera/depth/image_rect_raw": lambda number: image(number, 2 * millimetres(number), "16UC1"),
+        "/camera/aligned_depth_to_color/image_raw": lambda number: image(
+            number, depth(number).astype(np.float32) if floats else millimetres(number),
+            "32FC1" if floats else "16UC1", late=5e6,
+        ),
+        "/camera/infra1/image_rect_raw": lambda number: image(number, levels(), "mono8"),
+    }  # fmt: skip
+    make = Writer1(path) if version == 1 else Writer2(path, version=9)
+    with make as writer:
+        for topic, message in topics.items():
+            kind = message(0).__msgtype__
+            connection = writer.add_connection(topic, kind, typestore=store)
+            for number in range(FRAMES):
+                raw = store.serialize_ros1 if version == 1 else store.serialize_cdr
+                writer.write(connection, int(100e9 + 33e6 * number), bytes(raw(message(number), kind)))
+    return path

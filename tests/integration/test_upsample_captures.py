@@ -1,0 +1,199 @@
+"""``dsr upsample`` on captures: what is printed, what info.json keeps, confidence, units of folders, refusals."""
+
+import json
+
+import captures
+import numpy as np
+import pytest
+from captures import FRAMES, INTRINSICS, SIZE, SIZE_LR
+from PIL import Image
+
+from dsr.cli import main
+from dsr.io.inputs import read_picture
+
+DEPTH_ONLY = ("--method", "bicubic", "--only", "depth")
+
+
+def upsample(*arguments):
+    return main(["upsample", *map(str, arguments)])
+
+
+def info(folder):
+    return json.loads((folder / "info.json").read_text())
+
+
+def refused(capsys, code):
+    """Return the one line on stderr of a command that ended with 2."""
+    error = capsys.readouterr().err
+    assert (code, error.count("\n"), error[:7]) == (2, 1, "error: ")
+    return error[7:-1]
+
+
+def test_capture_of_a_phone_has_nothing_left_to_assume(tmp_path, capsys):
+    folder, out = captures.stray(tmp_path / "scan"), tmp_path / "out"
+    assert upsample(folder, "-o", out, *DEPTH_ONLY) == 0
+    said = capsys.readouterr().out
+    assert f"{FRAMES} pairs of photo and depth map\n  a capture of Stray Scanner: depth in millimetres; " in said
+    assert "; from the capture: intrinsics, poses, confidence\n" in said
+    assert "assumed" not in said
+    assert "taken for" not in said
+    for number in range(FRAMES):
+        told = info(out / f"{number:06}")
+        np.testing.assert_allclose(told["pose"], captures.pose(number), atol=1e-6)
+        assert [told["camera"][name] for name in ("fx", "fy", "cx", "cy")] == [INTRINSICS[0] + number, *INTRINSICS[1:]]
+        assert told["input_depth"]["unit"] == 0.001
+        assert (told["inputs"]["rgb"]["file"], told["inputs"]["rgb"]["frame"]) == ("rgb.mp4", number)
+        assert np.abs(np.load(out / f"{number:06}" / "depth_metres.npy") - captures.depth(number).mean()).max() < 0.3
+    assert upsample(folder, "-o", out, *DEPTH_ONLY) == 0
+    assert f"{FRAMES} complete already" in capsys.readouterr().out
+
+
+def test_archive_of_record3d_is_given_as_a_file(tmp_path):
+    out = tmp_path / "out"
+    assert upsample(captures.record3d(tmp_path / "scan.r3d"), "-o", out, *DEPTH_ONLY, "--keep-holes") == 0
+    told = info(out / "000001")
+    assert told["inputs"]["depth"]["file"] == "scan.r3d/rgbd/1.depth"
+    assert told["depth_file"] == {
+        "suffix": ".npy", "dtype": "float32", "unit": 1.0, "hole": "nan", "range_type": "orthogonal",
+    }  # fmt: skip
+    np.testing.assert_allclose(told["pose"], captures.pose(1), atol=1e-6)
+
+
+def test_least_confidence_makes_holes_and_is_kept_with_the_settings(tmp_path, capsys):
+    folder, out = captures.polycam(tmp_path / "scan"), tmp_path / "out"
+    assert upsample(folder, "-o", out, *DEPTH_ONLY, "--keep-holes", "--min-confidence", 0.5) == 0
+    assert "confidence below 0.5 counts as a hole (12.5%)" in capsys.readouterr().out
+    stored = np.asarray(Image.open(out / "1000" / "depth.png"))
+    assert (stored[:, :8] == 0).all()
+    assert (stored[:, 8:] > 0).all()
+    told = info(out / "1000")
+    assert told["settings"]["min_confidence"] == 0.5
+    assert set(told["inputs"]) == {"rgb", "depth", "confidence", "capture"}
+
+
+@pytest.fixture
+def lists(tmp_path):
+    """Two pairs in folders, with confidence maps in a folder of their own."""
+    for number in range(2):
+        captures.save(tmp_path / "rgb" / f"{number}.png", captures.photo(number))
+        captures.save(tmp_path / "depth" / f"{number}.png", captures.millimetres(number))
+        captures.save(tmp_path / "sure" / f"confidence_{number:03}.png", captures.levels())
+    return tmp_path
+
+
+@pytest.mark.parametrize("kind", ["levels", "bytes", "fractions"])
+def test_confidence_maps_may_be_levels_bytes_or_fractions(lists, kind):
+    for number in range(2):
+        path = lists / "sure" / f"confidence_{number:03}.png"
+        if kind == "bytes":
+            captures.save(path, np.array([1, 130, 255], np.uint8)[captures.levels()])
+        if kind == "fractions":
+            path.unlink()
+            np.save(path.with_suffix(".npy"), captures.levels().astype(np.float32) / 2)
+    given = ("--rgb", lists / "rgb", "--depth", lists / "depth", "--confidence", lists / "sure")
+    out = lists / "out"
+    assert upsample(*given, "--min-confidence", 0.5, "--keep-holes", "-o", out, *DEPTH_ONLY) == 0
+    for number in range(2):
+        holes = np.asarray(Image.open(out / str(number) / "depth.png")) == 0
+        np.testing.assert_array_equal(np.flatnonzero(holes.any(axis=0)), np.arange(8))
+
+
+def test_confidence_that_does_not_fit_is_refused_in_one_line(lists, capsys):
+    given = ("--rgb", lists / "rgb", "--depth", lists / "depth", "-o", lists / "out", *DEPTH_ONLY)
+    sure = ("--confidence", lists / "sure")
+    assert "--confidence: expected --min-confidence with it" in refused(capsys, upsample(*given, *sure))
+    assert "--min-confidence: expected a fraction from 0 to 1, got 2" in refused(
+        capsys, upsample(*given, *sure, "--min-confidence", 2)
+    )
+    assert "expected a confidence map for --min-confidence, there is none" in refused(
+        capsys, upsample("--rgb", lists / "rgb" / "0.png", "--depth", lists / "depth" / "0.png", "-o", lists / "out",
+                         *DEPTH_ONLY, "--min-confidence", 0.5)
+    )  # fmt: skip
+    captures.save(lists / "sure" / "confidence_000.png", np.ones((5, 7), np.uint8))
+    message = refused(capsys, upsample(*given, *sure, "--min-confidence", 0.5))
+    assert (
+        "confidence_000.png: expected confidence of the depth map's 16 x 12 pixels (width x height), got 7 x 5"
+        in message
+    )
+    assert (lists / "out" / "1" / "depth.png").is_file()
+    (lists / "sure" / "confidence_001.png").unlink()
+    message = refused(capsys, upsample(*given, *sure, "--min-confidence", 0.5))
+    assert "expected a map for each of the 2 depth maps, there is none for 1, such as 1" in message
+
+
+def test_resumed_folder_of_millimetre_floats_keeps_its_unit(tmp_path, monkeypatch):
+    """The first map is far and says millimetres; the second is so near that alone it would be taken for metres."""
+    folder = tmp_path / "scan"
+    (folder / "depth").mkdir(parents=True)
+    for number, far in enumerate((1500.0, 150.0, 180.0)):
+        captures.save(folder / "rgb" / f"{number}.png", captures.photo(number))
+        np.save(folder / "depth" / f"{number}.npy", np.full(SIZE_LR, far, np.float32))
+
+    def read_first_only(pair, *arguments):
+        if pair.name != "0":
+            raise KeyboardInterrupt
+        return read_picture(pair, *arguments)
+
+    assert upsample(folder, "-o", tmp_path / "whole", *DEPTH_ONLY) == 0
+    out = tmp_path / "resumed"
+    with monkeypatch.context() as patch:
+        patch.setattr("dsr.app.upsample.run.read_picture", read_first_only)
+        assert upsample(folder, "-o", out, *DEPTH_ONLY) == 130
+    assert [path.name for path in out.iterdir()] == ["0"]
+    assert upsample(folder, "-o", out, *DEPTH_ONLY) == 0
+    for number, metres in enumerate((1.5, 0.15, 0.18)):
+        for place in (tmp_path / "whole", out):
+            assert info(place / str(number))["input_depth"]["unit"] == 0.001
+            np.testing.assert_allclose(np.load(place / str(number) / "depth_metres.npy"), metres, rtol=0.03)
+        told = [{**info(place / str(number)), "seconds": None} for place in (tmp_path / "whole", out)]
+        assert told[0] == told[1]
+
+
+def test_sun_rgbd_has_its_intrinsics_one_folder_up_and_turned_bits(tmp_path, capsys):
+    scene, out = tmp_path / "scene", tmp_path / "out"
+    millimetres = 4 * captures.millimetres(2)
+    assert millimetres.max() > 8192
+    captures.save(scene / "image" / "a.jpg", captures.photo())
+    captures.save(scene / "depth" / "b.png", (millimetres << 3) | (millimetres >> 13))
+    (scene / "intrinsics.txt").write_text("50 0 31 0 51 24 0 0 1\n")
+    files = ("--rgb", scene / "image" / "a.jpg", "--depth", scene / "depth" / "b.png")
+    assert upsample(*files, "-o", out, *DEPTH_ONLY, "--depth-unit", "sunrgbd", "--keep-holes") == 0
+    assert "bits are turned back by 3, as SUN RGB-D turns them" in capsys.readouterr().out
+    told = info(out)
+    assert (told["camera"]["fx"], told["camera"]["cx"], told["settings"]["turned_bits"]) == (50, 31, 3)
+    assert abs(np.load(out / "depth_metres.npy").mean() - millimetres.mean() / 1000) < 0.02
+    np.save(scene / "depth.npy", captures.depth())
+    assert "expected 16-bit values for --depth-unit sunrgbd, got float64" in refused(
+        capsys, upsample(*files[:3], scene / "depth.npy", "-o", tmp_path / "x", *DEPTH_ONLY, "--depth-unit", "sunrgbd")
+    )
+
+
+def test_depth_text_of_icl_nuim_is_read_beside_a_bmp(tmp_path, capsys):
+    y, x = np.mgrid[0:480, 0:640]
+    Image.fromarray(np.stack((x % 256, y % 256, x % 99), -1).astype(np.uint8)).save(tmp_path / "scene_00_0000.bmp")
+    rays = np.sqrt(((x - 319.5) / 481.2) ** 2 + ((y - 239.5) / 480.0) ** 2 + 1)
+    (tmp_path / "scene_00_0000.depth").write_text(" ".join(f"{value:.3f}" for value in (250 * rays).ravel()))
+    out = tmp_path / "out"
+    assert upsample(tmp_path, "-o", out, "--method", "bilateral", "--only", "depth") == 0
+    said = capsys.readouterr().out
+    assert "camera: that of ICL-NUIM" in said
+    assert "distances along the rays in centimetres" in said
+    told = info(out / "scene_00_0000")
+    assert told["input_depth"]["range_type"] == "perspective"
+    np.testing.assert_allclose(np.load(out / "scene_00_0000" / "depth_metres.npy"), 2.5, rtol=1e-3)
+    np.testing.assert_allclose(np.load(out / "scene_00_0000" / "depth.npy"), 250 * rays, rtol=1e-3)
+    (tmp_path / "scene_00_0000.depth").write_text("1 2 3")
+    assert "scene_00_0000.depth: expected 307200 numbers, got 3" in refused(
+        capsys, upsample(tmp_path, "-o", tmp_path / "other", "--method", "bilateral", "--only", "depth")
+    )
+
+
+def test_broken_frame_of_a_capture_does_not_stop_the_others(tmp_path, capsys):
+    folder, out = captures.polycam(tmp_path / "scan"), tmp_path / "out"
+    path = folder / "keyframes" / "corrected_cameras" / "1001.json"
+    path.write_text(json.dumps(captures.polycam_camera(1, fx=float("nan"))))
+    assert upsample(folder, "-o", out, *DEPTH_ONLY) == 2
+    told = capsys.readouterr()
+    assert told.err == f"error: 1001: {path}: camera fx: expected a finite number, got nan\n"
+    assert f"{FRAMES} pictures: {FRAMES - 1} done, 1 failed" in told.out
+    assert tuple(info(out / "1002")["photo_size"]) == SIZE[::-1]
