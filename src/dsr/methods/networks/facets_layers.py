@@ -9,6 +9,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from dsr.methods.networks.exportable import pad_to_multiple
+
 FULL, HALF = 16, 32
 """Channels of the photo's features at the full and at half the resolution."""
 HEAD = 24
@@ -110,7 +112,7 @@ class Context(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         """Map (B, C, h, w) to the same shape; the sizes are padded to multiples of eight."""
         height, width = x.shape[-2:]
-        x = functional.pad(x, (0, -width % 8, 0, -height % 8), mode="replicate")
+        x = pad_to_multiple(x, 8)
         kept = []
         for shrink, encode in zip(self.shrink, self.encoder, strict=True):
             x = encode(functional.relu(shrink(x)))
