@@ -8,7 +8,10 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from dsr.app.upsample.outputs import FORMATS, LARGEST_ERROR, PARTS
+from dsr.app.upsample.limits import LARGEST_ERROR, Limits
+from dsr.app.upsample.outputs import FORMATS, MORE_PARTS, PARTS
+from dsr.app.upsample.scene import SCENE_PARTS, check_libraries
+from dsr.geometry.simplification import MOST_FACES, MOST_POINTS
 from dsr.inference import DEFAULT, MethodChoice, check_settings
 from dsr.inference.planning import USUAL_SCALE, read_ability
 from dsr.io.inputs import Reading
@@ -31,8 +34,10 @@ class UpsampleRequest:
         reading: how to read the files.
         method, settings, directories, scale, device, keep_holes: see :func:`dsr.inference.upsample_depth`.
         max_error: expected relative error of the depth from which a pixel is left out of cloud and mesh.
+        max_faces: triangles from which a mesh is simplified.
+        max_points: points from which a cloud is thinned.
         depth_format: the result's format; None for the input's.
-        parts: what to write, some of :data:`dsr.app.upsample.outputs.PARTS`.
+        parts: what to write, some of :data:`dsr.app.upsample.outputs.PARTS` and ``MORE_PARTS``.
         overwrite: whether to replace existing results.
         dry_run: whether to show only what would be done.
 
@@ -51,6 +56,8 @@ class UpsampleRequest:
     device: str = "auto"
     keep_holes: bool = False
     max_error: float = LARGEST_ERROR
+    max_faces: int = MOST_FACES
+    max_points: int = MOST_POINTS
     depth_format: str | None = None
     parts: tuple[str, ...] = PARTS
     overwrite: bool = False
@@ -65,24 +72,37 @@ class UpsampleRequest:
             if value is not None and value not in choices:
                 raise ValueError(f"{name}: expected one of {', '.join(choices)}, got {value!r}")
         for part in self.parts:
-            if part not in PARTS:
-                raise ValueError(f"--only, --without: expected some of {', '.join(PARTS)}, got {part!r}")
+            if part not in (*PARTS, *MORE_PARTS):
+                known = ", ".join((*PARTS, *MORE_PARTS))
+                raise ValueError(f"--only, --with, --without: expected some of {known}, got {part!r}")
         if not self.parts:
             raise ValueError("--only, --without: expected something to be left to write, got nothing")
         if bool(self.folders) == bool(self.rgb or self.depth) or bool(self.rgb) != bool(self.depth):
             raise ValueError("expected --rgb and --depth, or folders that hold both")
         if self.folders and self.mask:
             raise ValueError("--mask: expected --rgb and --depth with it, got folders")
-        if not self.max_error > 0:
-            raise ValueError(f"--max-error: expected a positive percentage of the depth, got {100 * self.max_error:g}")
+        self.limits.check()
+        check_libraries(self.scene_parts)
         self._check_method()
+
+    @property
+    def limits(self) -> Limits:
+        """What cloud and mesh leave out."""
+        return Limits(self.max_error, self.max_faces, self.max_points)
+
+    @property
+    def scene_parts(self) -> tuple[str, ...]:
+        """Parts of all frames together."""
+        return tuple(part for part in self.parts if part in SCENE_PARTS)
 
     @functools.cached_property
     def wanted(self) -> tuple[str, ...]:
-        """Parts that the method can have."""
-        if "confidence" not in self.parts or read_ability(self.method, self.directories, self.settings).confident:
-            return self.parts
-        return tuple(part for part in self.parts if part != "confidence")
+        """Parts of each frame that the method can have; those of all frames are made of its depth and ``rgbd``."""
+        needed = ("depth", "rgbd") if self.scene_parts else ()
+        parts = tuple(dict.fromkeys((*(part for part in self.parts if part not in SCENE_PARTS), *needed)))
+        if "confidence" not in parts or read_ability(self.method, self.directories, self.settings).confident:
+            return parts
+        return tuple(part for part in parts if part != "confidence")
 
     def _check_method(self) -> None:
         """Check that the method accepts the settings and can write something of what is requested."""
@@ -113,6 +133,8 @@ def settings_of(request: UpsampleRequest) -> dict[str, Any]:
         **reading,
         "fov": choice["fov"],
         "intrinsics": None if choice["intrinsics"] is None else list(choice["intrinsics"]),
+        **({"max_faces": request.max_faces} if request.max_faces != MOST_FACES else {}),
+        **({"max_points": request.max_points} if request.max_points != MOST_POINTS else {}),
         **({"set": dict(request.settings)} if request.settings else {}),
         **({"code": code} if (code := hash_outside_code(_targets(request))) else {}),
     }

@@ -2,9 +2,9 @@
 
 Depth is 16-bit PNG in millimetres, 0 in holes, which ``open3d.geometry.RGBDImage.create_from_color_and_depth`` takes
 with its default ``depth_scale=1000``; its ``depth_trunc`` leaves out what is beyond 3 m unless it is told otherwise.
-Intrinsics are those of ``open3d.io.read_pinhole_camera_intrinsic``: ``intrinsic_matrix`` column by column, pixel centres
-at integers. ``trajectory.log`` has a line of three numbers and a camera-to-world matrix for each frame, in the camera
-frame that dsr has, too: x right, y down, z forward (https://www.open3d.org/docs/release, file formats and the
+Intrinsics are those of ``open3d.io.read_pinhole_camera_intrinsic``: ``intrinsic_matrix`` column by column, with pixel
+centres at integers. ``trajectory.log`` has a line of three numbers and a camera-to-world matrix for each frame, of a
+camera with x right, y down, z forward, as in dsr (https://www.open3d.org/docs/release, file formats and the
 reconstruction system).
 """
 
@@ -15,33 +15,36 @@ import shutil
 from collections.abc import Sequence
 from pathlib import Path
 
-import numpy as np
+from torch import Tensor
 
 from dsr.geometry.camera import Camera
+from dsr.io.encoding import Assumption
 from dsr.io.frames.frame import Frame, one_camera, to_millimetres, write_colour, write_sixteen_bits
 from dsr.utils.files import replacing, write_text
 
 RGBD = ("color.png", "depth.png", "intrinsic.json")
 
 
-def write_rgbd(folder: Path, rgb: np.ndarray, depth: np.ndarray, camera: Camera) -> int:
+def write_rgbd(folder: Path, rgb: Tensor, depth: Tensor, camera: Camera) -> list[Assumption]:
     """Write colour, depth and intrinsics of one frame: ``color.png``, ``depth.png`` and ``intrinsic.json``.
 
     Args:
         folder: is created if it is missing.
-        rgb: (H, W, 3) uint8.
-        depth: (H, W) orthogonal depth in metres, NaN in holes.
+        rgb: (3, H, W) in [0, 1].
+        depth: (1, H, W) orthogonal depth in metres, NaN in holes.
         camera: of these pixels.
 
     Returns:
-        How many pixels are too far for 16-bit millimetres, and holes in ``depth.png``.
+        A note on pixels that are too far for 16-bit millimetres, if there are any.
 
     """
-    millimetres, lost = to_millimetres(depth)
-    write_colour(folder / RGBD[0], rgb)
+    millimetres, lost = to_millimetres(depth[0].cpu().numpy())
+    write_colour(folder / RGBD[0], (rgb * 255).round().clamp(0, 255).byte().permute(1, 2, 0).cpu().numpy())
     write_sixteen_bits(folder / RGBD[1], millimetres)
     _write_intrinsics(folder / RGBD[2], camera)
-    return lost
+    if not lost:
+        return []
+    return [Assumption(f"{folder.name}/{RGBD[1]}: what is beyond 65.5 m is written as a hole", f"{lost} pixels")]
 
 
 def write_open3d(folder: Path, frames: Sequence[Frame]) -> list[Path]:

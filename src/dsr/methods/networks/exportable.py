@@ -7,6 +7,9 @@ those that need one of them.
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+from typing import Any
+
 import torch
 from torch import Tensor
 from torch.nn import functional
@@ -38,6 +41,13 @@ def fill_in_graph(values: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
         values = torch.where(new, total / torch.where(fraction > 0, fraction, torch.ones_like(fraction)), values)
         weight = torch.where(new, torch.ones_like(weight), weight)
     return values, weight
+
+
+def apply(function: type[torch.autograd.Function], *arguments: Any) -> Any:
+    """Apply a function that has a derivative of its own; a graph gets its operations, without the derivative."""
+    if not exporting():
+        return function.apply(*arguments)
+    return function.forward(SimpleNamespace(save_for_backward=lambda *_: None), *arguments)
 
 
 def median_in_graph(x: Tensor, known: Tensor) -> Tensor:

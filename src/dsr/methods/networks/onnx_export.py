@@ -12,8 +12,9 @@ from __future__ import annotations
 
 import contextlib
 import importlib
+import math
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -53,7 +54,8 @@ class OnnxGraph(nn.Module):
         super().__init__()
         if scale != net.scale and not net.serves(net.scale, scale):
             raise ValueError(f"scale: expected {net.scale}, the network's, got {scale}")
-        self.net, self.scale = net.eval().requires_grad_(False), scale
+        self.net, self.scale = net.requires_grad_(False), scale
+        self.eval()
 
     @property
     def outputs(self) -> tuple[str, ...]:
@@ -79,7 +81,7 @@ class OnnxGraph(nn.Module):
         if self.scale == 1:  # its pixels are averaged in pairs
             photo, values = (pad_to_multiple(each, 2) for each in (photo, values))
         answer = self.net.answer(photo, values)
-        results = (answer.disparity, answer.spread, torch.rad2deg(answer.angle))
+        results = (answer.disparity, answer.spread, answer.angle * (180 / math.pi))
         return tuple(each[..., :height, :width] for each in results)
 
 
@@ -107,7 +109,10 @@ def write_onnx(path: Path, graph: OnnxGraph, facts: Mapping[str, Any]) -> float:
         session = runtime.InferenceSession(str(temporary), providers=["CPUExecutionProvider"])
         difference = _compare(session, graph)
         if not difference <= _TOLERANCE:
-            raise ValueError(f"{path}: expected the network's results to {_TOLERANCE:g}, got a difference {difference:g}")
+            raise ValueError(
+                f"{path}: expected the network's results to {_TOLERANCE:g} of the range, got a difference of "
+                f"{difference:g}"
+            )
     return difference
 
 
@@ -147,7 +152,7 @@ def _trace(path: Path, graph: OnnxGraph) -> None:
 @contextlib.contextmanager
 def _operators() -> Iterator[None]:
     """Make known to the exporter the operators that it lacks, and silence what it warns of."""
-    added = {"aten::asinh": _asinh, "aten::_upsample_bicubic2d_aa": _bicubic}
+    added: dict[str, Callable[..., Any]] = {"aten::asinh": _asinh, "aten::_upsample_bicubic2d_aa": _bicubic}
     for name, function in added.items():
         torch.onnx.register_custom_op_symbolic(name, function, _OPSET)
     try:
