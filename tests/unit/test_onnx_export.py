@@ -1,5 +1,6 @@
 """Networks as ONNX files: onnxruntime computes what PyTorch does, for any size, with holes."""
 
+import functools
 import sys
 
 import numpy as np
@@ -52,18 +53,30 @@ def random_network(name):
     return net, scale
 
 
+@pytest.fixture(scope="module")
+def exported(tmp_path_factory):
+    """Return a function that gives the graph of a random network and its file, which is written once."""
+
+    @functools.cache
+    def export(name):
+        path = tmp_path_factory.mktemp("onnx") / "net.onnx"
+        graph = OnnxGraph(*random_network(name))
+        assert write_onnx(path, graph, {}) <= 1e-4
+        return graph, path
+
+    return export
+
+
 def test_every_network_is_tested():
     assert {type(build()).__name__ for build, _ in SMALL.values()} == set(NETWORKS)
 
 
 @pytest.mark.parametrize("name", SMALL)
-def test_graph_computes_what_the_network_does_at_any_size(name, tmp_path):
-    net, scale = random_network(name)
-    graph = OnnxGraph(net, scale)
-    assert write_onnx(tmp_path / "net.onnx", graph, {}) <= 1e-4
+def test_graph_computes_what_the_network_does_at_any_size(name, exported):
+    graph, path = exported(name)
     for size in SIZES:
-        inputs = example_inputs(size, scale)
-        found = run(tmp_path / "net.onnx", inputs)
+        inputs = example_inputs(size, graph.scale)
+        found = run(path, inputs)
         with torch.no_grad():
             expected = graph(*inputs)
         assert len(found) == len(expected) == len(graph.outputs)
@@ -72,12 +85,11 @@ def test_graph_computes_what_the_network_does_at_any_size(name, tmp_path):
             assert np.abs(mine - theirs.numpy()).max() <= 1e-4 * float(theirs.max() - theirs.min())
 
 
-def test_graph_does_not_depend_on_values_in_holes_or_on_the_unit(tmp_path):
-    net, scale = random_network("facets")
-    write_onnx(tmp_path / "net.onnx", OnnxGraph(net, scale), {})
-    photo, inverse, valid = example_inputs((16, 20), scale)
-    first = run(tmp_path / "net.onnx", (photo, inverse, valid))
-    again = run(tmp_path / "net.onnx", (photo, torch.where(valid, 1000 * inverse, -7), valid))
+def test_graph_does_not_depend_on_values_in_holes_or_on_the_unit(exported):
+    graph, path = exported("facets")
+    photo, inverse, valid = example_inputs((16, 20), graph.scale)
+    first = run(path, (photo, inverse, valid))
+    again = run(path, (photo, torch.where(valid, 1000 * inverse, -7), valid))
     np.testing.assert_allclose(again[0], 1000 * first[0], rtol=1e-4)
     np.testing.assert_allclose(again[1], first[1], rtol=1e-3)
 

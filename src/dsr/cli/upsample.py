@@ -130,7 +130,7 @@ def _add_results(parser: argparse.ArgumentParser) -> None:
         "--with", type=_words, default=(), dest="more", metavar="PARTS", help=f"also these: {more}; see docs/export.md"
     )
     for name, what in (("faces", "simplify the mesh beyond N triangles"), ("points", "thin the cloud beyond N points")):
-        default = {"faces": 10_000_000, "points": 20_000_000}[name]
+        default = {"faces": 25_000_000, "points": 20_000_000}[name]
         text = f"{what} (default: {default // 10**6} million)"
         results.add_argument(f"--max-{name}", type=int, default=default, metavar="N", help=text)
     results.add_argument("--overwrite", action="store_true", help="redo existing results, replace other ones")

@@ -43,9 +43,8 @@ def write_rerun(path: Path, frames: Sequence[Frame]) -> list[Path]:
         for number, frame in enumerate(frames):
             camera = frame.camera
             recording.set_time(_TIMELINE, sequence=number)
-            if frame.pose is not None:
-                pose = frame.pose.numpy()
-                recording.log("camera", rerun.Transform3D(translation=pose[:3, 3], mat3x3=pose[:3, :3]))
+            pose = np.eye(4) if frame.pose is None else frame.pose.numpy()
+            recording.log("camera", rerun.Transform3D(translation=pose[:3, 3], mat3x3=pose[:3, :3]))
             matrix = [[camera.fx, 0, camera.cx + 0.5], [0, camera.fy, camera.cy + 0.5], [0, 0, 1]]
             size = [camera.width, camera.height]
             view = rerun.Pinhole(image_from_camera=matrix, resolution=size, camera_xyz=rerun.ViewCoordinates.RDF)
