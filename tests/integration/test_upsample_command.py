@@ -319,8 +319,8 @@ def test_published_scenes_are_read_with_their_cameras(shared, tmp_path, capsys):
     [
         (("--method", "magic"), "--method: expected one of"),
         (("--format", "jpg"), "--format: expected one of png, tiff, npy, npz, pfm, exr, got 'jpg'"),
-        (("--only", "depth,film"), "--only, --without: expected some of depth, renderings"),
-        (("--without", "film"), "--only, --without: expected some of depth, renderings"),
+        (("--only", "depth,film"), "--only, --with, --without: expected some of depth, renderings"),
+        (("--without", "film"), "--only, --with, --without: expected some of depth, renderings"),
         (("--only", ","), "expected something to be left to write"),
         (("--depth-unit", "inch"), "--depth-unit: expected m, cm, mm or metres per value"),
         (("--baseline", "0"), "--baseline: expected a positive number of metres, got 0"),

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 import torch
 
+from dsr.geometry import mesh as mesh_module
 from dsr.geometry.camera import Camera
-from dsr.geometry.mesh import stride_for, triangulate, vertex_normals
+from dsr.geometry.mesh import triangulate, vertex_normals
 
 CAMERA = Camera(40, 30, 50, 50, 19.5, 14.5)
 
@@ -174,16 +175,22 @@ def test_diagonal_follows_the_smaller_change_of_depth():
     assert all({1, 2} <= set(face) for face in mesh.faces.tolist())
 
 
-@pytest.mark.parametrize("most", [1200, 1199, 300, 100, 7, 1])
-def test_large_map_is_thinned_to_the_requested_size(most):
-    mesh = triangulate(wall(), CAMERA, most=most, isolated=True)
-    stride = stride_for(wall(), most)
-    assert len(mesh.vertices) <= most
+@pytest.mark.parametrize("stride", [1, 2, 3, 7])
+def test_stride_takes_every_which_row_and_column(stride):
+    mesh = triangulate(wall(), CAMERA, stride=stride, isolated=True)
     assert len(mesh.vertices) == len(range(0, 30, stride)) * len(range(0, 40, stride))
-    finer = len(range(0, 30, stride - 1)) * len(range(0, 40, stride - 1)) if stride > 1 else most + 1
-    assert finer > most
     points = (CAMERA.rays() * 2).flatten(1).T.numpy()
     np.testing.assert_allclose(mesh.vertices, points[mesh.pixels], rtol=1e-6, atol=1e-7)
+
+
+def test_strips_of_rows_and_triangles_leave_no_seam(monkeypatch):
+    depth = wall() + torch.rand(1, 30, 40, generator=torch.Generator().manual_seed(0))
+    whole = triangulate(depth, CAMERA, largest_step=0.2)
+    normals = vertex_normals(whole)
+    monkeypatch.setattr(mesh_module, "_STRIP", 70)
+    strips = triangulate(depth, CAMERA, largest_step=0.2)
+    np.testing.assert_array_equal(strips.faces, whole.faces)
+    np.testing.assert_allclose(vertex_normals(strips), normals, atol=1e-6)
 
 
 def test_mesh_of_holes_is_empty():
@@ -199,9 +206,9 @@ def test_mesh_of_a_tiny_map_is_valid(size):
     assert len(triangulate(wall(camera=camera), camera).faces) == 2 * (height - 1) * (width - 1)
 
 
-@pytest.mark.parametrize("values", [{"largest_step": 0}, {"largest_step": float("nan")}, {"most": 0}])
+@pytest.mark.parametrize("values", [{"largest_step": 0}, {"largest_step": float("nan")}, {"stride": 0}])
 def test_number_that_is_not_positive_is_refused(values):
-    with pytest.raises(ValueError, match="expected a positive step and number of vertices"):
+    with pytest.raises(ValueError, match="expected a positive step and stride"):
         triangulate(wall(), CAMERA, **values)
 
 

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 
 from rich.console import Console
 
-from dsr.cli import data, doctor, hydra_commands, report, study, upsample
+from dsr.cli import data, doctor, export, hydra_commands, report, study, upsample
 from dsr.data.download.catalogue import CATALOGUE, Collection
 from dsr.utils.console import INTERRUPTED, USAGE_ERROR, one_line, open_console, print_error, show
 
@@ -22,10 +22,11 @@ examples:
   dsr data list                                            all data sets, and which of them are on this machine
   dsr data get middlebury                                  download the seven scenes of the paper's tables
   dsr doctor my_scenes                                     check a directory of your own scenes
+  dsr export --onnx facets_x4.onnx                         a network for programs without PyTorch
 
 In a checkout of the project, `python eval.py` and `python train.py` are the same as `dsr eval` and `dsr train`.
 """
-_COMMANDS = (upsample, hydra_commands, report, study, data, doctor)
+_COMMANDS = (upsample, hydra_commands, report, study, data, doctor, export)
 
 
 def main(arguments: Sequence[str] | None = None, catalogue: Mapping[str, Collection] | None = None) -> int:

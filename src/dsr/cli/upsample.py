@@ -24,6 +24,7 @@ examples:
   dsr upsample rgbd_dataset_freiburg1_xyz -o out
   dsr upsample scan.r3d --min-confidence 0.5 -o out
   dsr upsample --rgb photo.jpg --depth depth.png --method tgv --set data_weight=30 -o out
+  dsr upsample recordings --with nerfstudio,open3d -o out
   dsr upsample recordings --dry-run -o out       what would be done, and what would be assumed
 
 The results of a single pair are in OUT, those of several in OUT/NAME: depth.* as the input is stored, depth_metres.npy,
@@ -136,7 +137,8 @@ def _add_results(parser: argparse.ArgumentParser) -> None:
     results.add_argument("--format", metavar="FORMAT", help="of the depth: png, tiff, npy, npz, pfm, exr (the input's)")
     parts = "depth,renderings,normals,cloud,mesh,before_after,confidence"
     chosen = results.add_mutually_exclusive_group()
-    chosen.add_argument("--only", type=_words, metavar="PARTS", help=f"some of {parts}")
+    more = "rgbd,open3d,nerfstudio,gaussian,rerun"
+    chosen.add_argument("--only", type=_words, metavar="PARTS", help=f"some of {parts},{more}")
     chosen.add_argument("--without", type=_words, default=(), metavar="PARTS", help="all but these")
     results.add_argument(
         "--max-error",
@@ -145,6 +147,13 @@ def _add_results(parser: argparse.ArgumentParser) -> None:
         metavar="PERCENT",
         help="leave pixels out of cloud and mesh whose depth is expected to be off by more (default: 2)",
     )
+    results.add_argument(
+        "--with", type=_words, default=(), dest="more", metavar="PARTS", help=f"also these: {more}; see docs/export.md"
+    )
+    for name, what in (("faces", "simplify the mesh beyond N triangles"), ("points", "thin the cloud beyond N points")):
+        default = {"faces": 25_000_000, "points": 20_000_000}[name]
+        text = f"{what} (default: {default // 10**6} million)"
+        results.add_argument(f"--max-{name}", type=int, default=default, metavar="N", help=text)
     results.add_argument("--overwrite", action="store_true", help="redo existing results, replace other ones")
     results.add_argument("--dry-run", action="store_true", help="read the files and say what would be done")
 
@@ -207,7 +216,9 @@ def _run(options: argparse.Namespace, console: Console, _: object) -> list[str]:
         max_hole=options.max_hole,
         max_error=options.max_error / 100,
         depth_format=options.format,
-        parts=(*parts, *unknown),
+        max_faces=options.max_faces,
+        max_points=options.max_points,
+        parts=tuple(dict.fromkeys((*parts, *options.more, *unknown))),
         overwrite=options.overwrite,
         dry_run=options.dry_run,
     )

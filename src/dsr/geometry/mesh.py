@@ -8,7 +8,6 @@ change over windows of up to five pairs of pixels.
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 import numpy as np
@@ -18,11 +17,12 @@ from dsr.geometry.camera import Camera
 
 LARGEST_STEP = 0.02
 """Maximum relative deviation of a neighbour's depth from the slope of the surface."""
-MOST_VERTICES = 2_000_000
 _HALF_WIDTHS = (1, 2, 3)
 """Half widths of the windows in pixels."""
 _OWN_FRACTION = 0.25
 """Fraction of ``largest_step`` by which a pair within a wider window must itself change to be cut."""
+_STRIP = 1 << 21
+"""Pixels whose steps are found, and triangles whose normals are summed, at a time."""
 
 
 class Mesh(NamedTuple):
@@ -45,19 +45,19 @@ def triangulate(
     camera: Camera,
     *,
     largest_step: float = LARGEST_STEP,
-    most: int = MOST_VERTICES,
+    stride: int = 1,
     isolated: bool = False,
 ) -> Mesh:
     """Join neighbouring valid pixels by triangles, two per square of four pixels, except across steps in depth.
 
     The diagonal of a square is the one with the smaller change of depth. A square with one missing pixel gives one
-    triangle. Memory: at most 120 bytes per vertex, and 240 bytes for :func:`vertex_normals`.
+    triangle. Memory: about 110 bytes per pixel, and 80 bytes for :func:`vertex_normals`.
 
     Args:
         depth: (1, H, W) orthogonal depth in metres, NaN in holes.
         camera: of these pixels.
         largest_step: relative change of depth, beyond what the slopes on both sides predict, from which a pair is cut.
-        most: maximum number of vertices; a larger map is subsampled by a whole stride.
+        stride: every which row and column becomes vertices.
         isolated: whether vertices without a triangle are kept.
 
     Raises:
@@ -66,9 +66,8 @@ def triangulate(
     """
     if tuple(depth.shape) != (1, camera.height, camera.width):
         raise ValueError(f"depth: expected shape {(1, camera.height, camera.width)}, got {tuple(depth.shape)}")
-    if not largest_step > 0 or most < 1:
-        raise ValueError(f"mesh: expected a positive step and number of vertices, got {largest_step} and {most}")
-    stride = stride_for(depth, most)
+    if not largest_step > 0 or stride < 1:
+        raise ValueError(f"mesh: expected a positive step and stride, got {largest_step} and {stride}")
     strided = depth[0, ::stride, ::stride].detach().cpu().double().numpy()
     valid = np.isfinite(strided)
     faces = _faces(1 / strided, largest_step)
@@ -84,25 +83,18 @@ def triangulate(
     return Mesh(vertices.astype(np.float32), vertex_of[faces], rows * camera.width + columns)
 
 
-def stride_for(depth: Tensor, most: int) -> int:
-    """Return the smallest stride at which a map, (1, H, W), has at most ``most`` valid pixels."""
-    valid = depth[0].isfinite()
-    stride = max(1, math.isqrt(int(valid.sum()) // most))
-    while int(valid[::stride, ::stride].sum()) > most:
-        stride += 1
-    return stride
-
-
 def vertex_normals(mesh: Mesh) -> np.ndarray:
     """Return the unit normals of the vertices, (N, 3) float32: the mean of their triangles', weighted by area.
 
     The normal of a vertex without a triangle points to the camera.
     """
-    corners = mesh.vertices[mesh.faces]  # (M, 3, 3)
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    at = mesh.faces.ravel()
-    sums = [np.bincount(at, np.repeat(normals[:, axis], 3), len(mesh.vertices)) for axis in range(3)]
-    total = np.stack(sums, axis=1)
+    total = np.zeros((len(mesh.vertices), 3))
+    for start in range(0, len(mesh.faces), _STRIP):
+        faces = mesh.faces[start : start + _STRIP]
+        corners = mesh.vertices[faces]  # (M, 3, 3)
+        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        for axis in range(3):
+            total[:, axis] += np.bincount(faces.ravel(), np.repeat(normals[:, axis], 3), len(total))
     lengths = np.linalg.norm(total, axis=1, keepdims=True)
     towards = -mesh.vertices / np.linalg.norm(mesh.vertices, axis=1, keepdims=True)
     return np.where(lengths > 0, total / np.where(lengths > 0, lengths, 1), towards).astype(np.float32)
@@ -130,6 +122,13 @@ def _faces(inverse: np.ndarray, largest_step: float) -> np.ndarray:
 
 def _connected(inverse: np.ndarray, largest_step: float) -> np.ndarray:
     """Return whether each pixel and its right neighbour lie on one surface, (H, W - 1) bool; False beside holes."""
+    rows = max(1, _STRIP // inverse.shape[1])
+    strips = [inverse[start : start + rows] for start in range(0, len(inverse), rows)]
+    return np.concatenate([_connected_strip(strip, largest_step) for strip in strips])
+
+
+def _connected_strip(inverse: np.ndarray, largest_step: float) -> np.ndarray:
+    """Return :func:`_connected` of a few rows."""
     change = np.diff(inverse, axis=1)  # (H, W - 1)
     scale = largest_step * np.minimum(inverse[:, :-1], inverse[:, 1:])
     step = np.zeros(change.shape, dtype=bool)

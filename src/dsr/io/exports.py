@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -11,14 +12,30 @@ import torch
 from torch import Tensor
 
 from dsr.geometry.camera import Camera
-from dsr.geometry.mesh import LARGEST_STEP, MOST_VERTICES, Mesh, triangulate, vertex_normals
+from dsr.geometry.mesh import LARGEST_STEP, Mesh, triangulate, vertex_normals
 from dsr.geometry.shading import LIGHT_NAMES, render
+from dsr.geometry.simplification import MOST_FACES, MOST_POINTS, QUADRIC, project, select_points, simplify, thin
 from dsr.geometry.surface import depth_to_normals
 from dsr.io.model_files import write_glb, write_ply
 from dsr.utils.files import replacing
 
 _STRIP = 1 << 20
 """Pixels whose normals are held in memory at a time."""
+
+
+class Written(NamedTuple):
+    """How much of a surface was written.
+
+    ``before`` and ``after``: triangles of the mesh, or points of the cloud, at full density and as written; ``how``:
+    what made them fewer, empty if nothing did.
+    """
+
+    before: int
+    after: int
+    how: str = ""
+
+    def __str__(self) -> str:
+        return f"{self.after} of {self.before}, by {self.how}"
 
 
 def normal_strips(depth: Tensor, camera: Camera) -> Iterator[tuple[slice, Tensor]]:
@@ -86,7 +103,7 @@ def write_normals(path: Path, depth: Tensor, camera: Camera) -> None:
     _write_png(path, picture, known)
 
 
-def write_cloud(path: Path, rgb: Tensor, depth: Tensor, camera: Camera, *, most: int = MOST_VERTICES) -> int:
+def write_cloud(path: Path, rgb: Tensor, depth: Tensor, camera: Camera, *, most: int = MOST_POINTS) -> Written:
     """Write the known pixels as a coloured PLY cloud with normals, in metres; x right, y down, z forward.
 
     Args:
@@ -94,15 +111,17 @@ def write_cloud(path: Path, rgb: Tensor, depth: Tensor, camera: Camera, *, most:
         rgb: (3, H, W) in [0, 1].
         depth: (1, H, W) orthogonal depth in metres, NaN in holes.
         camera: of these pixels.
-        most: points; of a larger map every second, third, ... row and column is taken.
+        most: points; of more, those in rows and columns at equal distances are taken.
 
     Returns:
-        The number of points.
+        The numbers of points.
 
     """
-    mesh = triangulate(depth, camera, most=most, isolated=True)
-    write_ply(path, mesh.vertices, vertex_normals(mesh), _colours(rgb, mesh))
-    return len(mesh.vertices)
+    mesh = triangulate(depth, camera, isolated=True)
+    chosen, normals = select_points(mesh, most, camera), vertex_normals(mesh)
+    write_ply(path, mesh.vertices[chosen], normals[chosen], _colours(rgb, mesh.pixels[chosen]))
+    fewer = len(chosen) < len(mesh.vertices)
+    return Written(len(mesh.vertices), len(chosen), "leaving out rows and columns" if fewer else "")
 
 
 def write_mesh(
@@ -112,8 +131,8 @@ def write_mesh(
     camera: Camera,
     *,
     largest_step: float = LARGEST_STEP,
-    most: int = MOST_VERTICES,
-) -> Mesh:
+    most: int = MOST_FACES,
+) -> Written:
     """Write the surface as a mesh with the photo's colours, cut at depth steps.
 
     A PLY file is in the camera frame (x right, y down, z forward) and has a colour at each vertex, a GLB file in glTF's
@@ -125,10 +144,10 @@ def write_mesh(
         depth: (1, H, W) orthogonal depth in metres, NaN in holes.
         camera: of these pixels.
         largest_step: see :func:`dsr.geometry.mesh.triangulate`.
-        most: vertices; of a larger map every second, third, ... row and column is taken.
+        most: triangles; a larger mesh is simplified, see :mod:`dsr.geometry.simplification`.
 
     Returns:
-        The mesh.
+        The numbers of triangles.
 
     Raises:
         ValueError: a suffix is another, or no two neighbours are known, so that there is nothing to write.
@@ -138,22 +157,34 @@ def write_mesh(
     for path in paths:  # before anything is written
         if path.suffix.lower() not in (".ply", ".glb"):
             raise ValueError(f"{path}: expected a mesh file, .ply or .glb, got {path.suffix or 'no suffix'}")
-    mesh = triangulate(depth, camera, largest_step=largest_step, most=most)
+    mesh = triangulate(depth, camera, largest_step=largest_step)
     if not len(mesh.faces):
         raise ValueError(f"{paths[0]}: expected neighbours of known depth to make a surface of, got none")
+    before, how = len(mesh.faces), ""
+    if before > most:
+        mesh, how = _reduce(mesh, depth, camera, most, largest_step)
     normals = vertex_normals(mesh)
     for path in paths:
         if path.suffix.lower() == ".ply":
-            write_ply(path, mesh.vertices, normals, _colours(rgb, mesh), mesh.faces)
+            write_ply(path, mesh.vertices, normals, _colours(rgb, mesh.pixels), mesh.faces)
         else:
-            places = np.stack((mesh.pixels % camera.width, mesh.pixels // camera.width), axis=1)
+            places = project(mesh.vertices, camera)
             write_glb(path, mesh.vertices, normals, mesh.faces, places, _bytes(rgb).transpose(1, 2, 0).copy())
-    return mesh
+    return Written(before, len(mesh.faces), how)
 
 
-def _colours(rgb: Tensor, mesh: Mesh) -> np.ndarray:
-    """Return the photo's colours at the vertices, (N, 3) uint8."""
-    return _bytes(rgb.flatten(1)[:, torch.from_numpy(mesh.pixels)]).T
+def _reduce(mesh: Mesh, depth: Tensor, camera: Camera, most: int, largest_step: float) -> tuple[Mesh, str]:
+    """Return a mesh of fewer triangles, and what made them fewer."""
+    try:
+        return simplify(mesh, most, camera), QUADRIC
+    except ImportError:
+        thinned, stride = thin(depth, camera, most, largest_step)
+        return thinned, f"a stride of {stride} pixels; `pip install dsr[mesh]` simplifies and keeps more detail"
+
+
+def _colours(rgb: Tensor, pixels: np.ndarray) -> np.ndarray:
+    """Return the photo's colours at some pixels, (N, 3) uint8; ``pixels`` are indices of the flattened map."""
+    return _bytes(rgb.flatten(1)[:, torch.from_numpy(pixels)]).T
 
 
 def _bytes(values: Tensor) -> np.ndarray:

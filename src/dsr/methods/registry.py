@@ -19,8 +19,9 @@ from omegaconf.errors import OmegaConfBaseException
 from dsr.methods.base import Upsampler
 from dsr.methods.networks.base import DisparityNetwork
 from dsr.methods.networks.peers.files import nearest_scale
+from dsr.methods.networks.published import load_msg_weights
 from dsr.methods.networks.trained import NETWORKS, packaged_names, packaged_weights
-from dsr.methods.networks.weight_files import is_dsr_weights, network_name, read_header
+from dsr.methods.networks.weight_files import is_dsr_weights, load_network, network_name, read_header
 from dsr.utils.builder import ConfigError, build, load_target, takes
 from dsr.utils.config_files import config_directories, list_choices
 from dsr.utils.ratios import round_ratio
@@ -29,6 +30,8 @@ SLACK = 1.05
 """By how much a scale may exceed the factor of weights that are used for it."""
 _NETWORK = "network"
 """Key of a method's node: the dotted path of the network's class, for a method whose weights come from a training."""
+_NETWORK_TARGETS = ("dsr.methods.networks.trained.build_trained", "dsr.methods.networks.any_map.build_any_map")
+"""Targets of the methods that are one pass of a network of dsr."""
 _OPEN = (None, "auto")
 """Values of a method's keys that leave them to what is known of the maps."""
 
@@ -132,6 +135,39 @@ def find_weights(node: Mapping[str, Any], scale: int, given: Path | None = None)
         name = node["name"]
         raise ConfigError(f"weights: expected a file of weights for method={name}, got {given} (no such file)")
     return given
+
+
+def load_method_network(
+    name: str, scale: int, *, directories: Sequence[Path] = (), weights: Path | None = None
+) -> DisparityNetwork:
+    """Load the network of a method, in float32 on the CPU.
+
+    Args:
+        name: the method's name.
+        scale: the upsampling factor.
+        directories: the user's configuration directories.
+        weights: a file of weights, or a directory with the published files; None for those that the method names.
+
+    Raises:
+        ConfigError: there is no such method, it has no network of dsr, or there are no weights.
+        FileNotFoundError: the weights share layers with a file that is missing.
+        ValueError: the weights are damaged or of another model or scale.
+
+    """
+    node = read_method(name, scale, directories=directories)
+    if node.get("target") not in _NETWORK_TARGETS:
+        nodes = {each: read_method(each, scale, directories=directories) for each in list_methods(directories)}
+        known = [each for each, other in nodes.items() if other.get("target") in _NETWORK_TARGETS]
+        raise ConfigError(f"method: expected one with a network of dsr, {', '.join(known)}; got {name!r}")
+    path, model = find_weights(node, scale, weights), str(node["model"])
+    variant = node.get("variant")
+    if variant is not None and not is_dsr_weights(path):
+        return load_msg_weights(path, scale, variant)
+    networks = _networks(node, directories)
+    trained = read_header(path)["arguments"].get("scale")
+    kind = networks.get(read_header(path)["network"])
+    serves = kind is not None and trained is not None and kind.serves(trained, scale)
+    return load_network(path, networks, None if serves else scale, model)
 
 
 def has_weights(node: Mapping[str, Any], scale: int) -> bool:

@@ -6,7 +6,7 @@ import contextlib
 import json
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,25 +14,28 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from dsr.app.upsample.limits import Limits, describe_reduction
 from dsr.evaluation.store import load_errors
 from dsr.geometry.camera import Camera
 from dsr.geometry.shading import LIGHT_NAMES
 from dsr.io.depth_files import DEPTH_SUFFIXES, write_depth_file
 from dsr.io.encoding import Assumption, Encoding, encode
-from dsr.io.exports import write_cloud, write_mesh, write_normals, write_renderings
+from dsr.io.exports import Written, write_cloud, write_mesh, write_normals, write_renderings
 from dsr.io.inputs import Picture
+from dsr.io.scene_files.open3d import RGBD, write_rgbd
 from dsr.methods.base import Surface
 from dsr.utils.files import replacing, write_text
 from dsr.viz.before_after import write_before_after
 from dsr.viz.confidence import write_confidence
 
 PARTS = ("depth", "renderings", "normals", "cloud", "mesh", "before_after", "confidence")
+"""What is written unless something else is asked for."""
+MORE_PARTS = ("rgbd", "open3d", "nerfstudio", "gaussian", "rerun")
+"""What is written if it is asked for; all but the first are of all frames, see :mod:`dsr.app.upsample.scene`."""
 FORMATS = ("png", "tiff", "npy", "npz", "pfm", "exr")
 INFO = "info.json"
 METRES = "depth_metres.npy"
 ERRORS = "confidence.npz"
-LARGEST_ERROR = 0.02
-"""Expected error of a pixel's depth, as a fraction of it, from which the pixel is left out of cloud and mesh."""
 _FILES: Mapping[str, tuple[str, ...]] = {
     "depth": (*(f"depth{suffix}" for suffix in DEPTH_SUFFIXES), METRES),
     "renderings": tuple(f"renderings/{name}.png" for name in LIGHT_NAMES),
@@ -41,6 +44,7 @@ _FILES: Mapping[str, tuple[str, ...]] = {
     "mesh": ("mesh.ply", "mesh.glb"),
     "before_after": ("before_after.png",),
     "confidence": ("confidence.png", ERRORS),
+    "rgbd": tuple(f"rgbd/{name}" for name in RGBD),
 }
 _WORTH_SAYING = 1e-3
 """Smallest fraction of the pixels that is reported as left out."""
@@ -55,6 +59,7 @@ class PreviousRun:
         settings, inputs: those of the run, as JSON has them.
         files: names of the files that it wrote.
         noise: that of its input, as JSON has it; None if it was not estimated.
+        shapes: numbers of points and triangles of its cloud and mesh.
 
     """
 
@@ -63,6 +68,7 @@ class PreviousRun:
     inputs: Mapping[str, Any]
     files: tuple[str, ...]
     noise: Mapping[str, Any] | None = None
+    shapes: Mapping[str, Any] = field(default_factory=dict)
 
 
 def output_encoding(encoding: Encoding, chosen: str | None) -> Encoding:
@@ -100,6 +106,7 @@ def read_previous_run(folder: Path) -> PreviousRun | None:
             dict(entries["inputs"]),
             tuple(entries["files"]),
             None if noise is None else dict(noise),
+            {part: entries[part] for part in ("cloud", "mesh") if part in entries},
         )
     except (ValueError, KeyError, TypeError, RecursionError) as error:
         raise ValueError(f"{path}: expected a file of `dsr upsample`, got something else; take another -o") from error
@@ -133,25 +140,26 @@ def write_parts(
     parts: Sequence[str],
     encoding: Encoding,
     title: str,
-    max_error: float = LARGEST_ERROR,
-) -> tuple[list[str], list[Assumption]]:
+    limits: Limits | None = None,
+) -> tuple[list[str], list[Assumption], dict[str, Written]]:
     """Write the parts of a result.
 
     Args:
         folder: the result's folder, created if it is missing.
         picture: the input.
         surface: the result.
-        parts: some of :data:`PARTS`.
+        parts: some of :data:`PARTS`, and ``rgbd``.
         encoding: the depth file's encoding.
         title: the title of the before-and-after picture.
-        max_error: expected relative error of the depth from which a pixel is left out of cloud and mesh.
+        limits: what cloud and mesh leave out.
 
     Returns:
-        The names of the files, and notes for the user.
+        The names of the files, notes for the user, and the numbers of points and triangles by part.
 
     """
     rgb, camera, depth = picture.rgb, picture.camera, surface.depth
     facts: list[Assumption] = []
+    shapes: dict[str, Written] = {}
     files: list[str] = []
     if "depth" in parts:
         files, facts = _write_depth(folder, depth, camera, encoding)
@@ -160,39 +168,47 @@ def write_parts(
     if "normals" in parts:
         write_normals(folder / "normals.png", depth, camera)
     if {"cloud", "mesh"} & set(parts):
-        missing, notes = _write_shapes(folder, picture, surface, parts, max_error)
+        missing, notes, shapes = _write_shapes(folder, picture, surface, parts, limits or Limits())
         parts = [part for part in parts if part not in missing]
         facts += notes
     if "before_after" in parts:
         write_before_after(folder / "before_after.png", rgb, picture.depth_lr, depth, camera, title)
     if "confidence" in parts and not _write_errors(folder, surface):
         parts = [part for part in parts if part != "confidence"]
-    return [*files, *(name for part in parts if part != "depth" for name in _FILES[part])], facts
+    if "rgbd" in parts:
+        facts += write_rgbd(folder / "rgbd", rgb, depth, camera)
+    return [*files, *(name for part in parts if part != "depth" for name in _FILES[part])], facts, shapes
 
 
 def _write_shapes(
-    folder: Path, picture: Picture, surface: Surface, parts: Sequence[str], max_error: float
-) -> tuple[list[str], list[Assumption]]:
-    """Write cloud and mesh without pixels that are likely to be wrong; return parts that could not be, and notes."""
+    folder: Path, picture: Picture, surface: Surface, parts: Sequence[str], limits: Limits
+) -> tuple[list[str], list[Assumption], dict[str, Written]]:
+    """Write cloud and mesh without pixels that are likely to be wrong; return what could not be, notes and numbers."""
     facts: list[Assumption] = []
+    shapes: dict[str, Written] = {}
     depth = surface.depth
     if surface.depth_error is not None:
-        doubtful = surface.depth_error > max_error * depth
+        doubtful = surface.depth_error > limits.error * depth
         depth = depth.masked_fill(doubtful, torch.nan)
         share = float(doubtful.float().mean())
         if share >= _WORTH_SAYING:
-            text = f"expected to be off by more than {max_error:.1%} of their depth"
+            text = f"expected to be off by more than {limits.error:.1%} of their depth"
             facts.append(Assumption("left out of cloud and mesh", f"{share:.1%} of the pixels, {text}"))
     if not bool(depth.isfinite().any()):
-        return ["cloud", "mesh"], [*facts, Assumption("no cloud and no mesh", "no pixel is left")]
+        return ["cloud", "mesh"], [*facts, Assumption("no cloud and no mesh", "no pixel is left")], shapes
+    rgb, camera = picture.rgb, picture.camera
     if "cloud" in parts:
-        write_cloud(folder / "cloud.ply", picture.rgb, depth, picture.camera)
+        shapes["cloud"] = write_cloud(folder / "cloud.ply", rgb, depth, camera, most=limits.points)
+    missing = []
     if "mesh" in parts:
+        files = [folder / name for name in _FILES["mesh"]]
         try:
-            write_mesh([folder / name for name in _FILES["mesh"]], picture.rgb, depth, picture.camera)
+            shapes["mesh"] = write_mesh(files, rgb, depth, camera, most=limits.faces)
         except ValueError as error:
-            return ["mesh"], [*facts, Assumption("no mesh", str(error))]
-    return [], facts
+            missing.append("mesh")
+            facts.append(Assumption("no mesh", str(error)))
+    facts += describe_reduction(shapes)
+    return missing, facts, shapes
 
 
 def _write_errors(folder: Path, surface: Surface) -> bool:

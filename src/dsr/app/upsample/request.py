@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from dsr.app.upsample.outputs import FORMATS, LARGEST_ERROR, PARTS
+from dsr.app.upsample.limits import LARGEST_ERROR, Limits
+from dsr.app.upsample.outputs import FORMATS, MORE_PARTS, PARTS
+from dsr.app.upsample.scene import SCENE_PARTS, check_libraries
+from dsr.geometry.simplification import MOST_FACES, MOST_POINTS
 from dsr.inference import DEFAULT, WIDEST, Fill, MethodChoice, check_settings
 from dsr.inference.planning import USUAL_SCALE
 from dsr.io.frames import Record, Source
@@ -33,8 +37,10 @@ class UpsampleRequest:
         reading: how to read the files.
         method, settings, directories, scale, device, fill, max_hole: see :func:`dsr.inference.upsample_depth`.
         max_error: expected relative error of the depth from which a pixel is left out of cloud and mesh.
+        max_faces: triangles from which a mesh is simplified.
+        max_points: points from which a cloud is thinned.
         depth_format: the result's format; None for the input's.
-        parts: what to write, some of :data:`dsr.app.upsample.outputs.PARTS`.
+        parts: what to write, some of :data:`dsr.app.upsample.outputs.PARTS` and ``MORE_PARTS``.
         overwrite: whether to replace existing results.
         dry_run: whether to show only what would be done.
 
@@ -55,6 +61,8 @@ class UpsampleRequest:
     fill: Fill = "small"
     max_hole: float = WIDEST
     max_error: float = LARGEST_ERROR
+    max_faces: int = MOST_FACES
+    max_points: int = MOST_POINTS
     depth_format: str | None = None
     parts: tuple[str, ...] = PARTS
     overwrite: bool = False
@@ -69,8 +77,9 @@ class UpsampleRequest:
             if value is not None and value not in choices:
                 raise ValueError(f"{name}: expected one of {', '.join(choices)}, got {value!r}")
         for part in self.parts:
-            if part not in PARTS:
-                raise ValueError(f"--only, --without: expected some of {', '.join(PARTS)}, got {part!r}")
+            if part not in (*PARTS, *MORE_PARTS):
+                known = ", ".join((*PARTS, *MORE_PARTS))
+                raise ValueError(f"--only, --with, --without: expected some of {known}, got {part!r}")
         if not self.parts:
             raise ValueError("--only, --without: expected something to be left to write, got nothing")
         if bool(self.folders) == bool(self.rgb or self.depth) or bool(self.rgb) != bool(self.depth):
@@ -81,11 +90,27 @@ class UpsampleRequest:
             raise ValueError(
                 "--confidence: expected --min-confidence with it, the fraction below which pixels are holes"
             )
-        if not self.max_error > 0:
-            raise ValueError(f"--max-error: expected a positive percentage of the depth, got {100 * self.max_error:g}")
         if not 0 < self.max_hole < math.inf:
             raise ValueError(f"--max-hole: expected a positive number of degrees, got {self.max_hole:g}")
+        self.limits.check()
+        check_libraries(self.scene_parts)
         self._check_method()
+
+    @property
+    def limits(self) -> Limits:
+        """What cloud and mesh leave out."""
+        return Limits(self.max_error, self.max_faces, self.max_points)
+
+    @property
+    def scene_parts(self) -> tuple[str, ...]:
+        """Parts of all frames together."""
+        return tuple(part for part in self.parts if part in SCENE_PARTS)
+
+    @functools.cached_property
+    def wanted(self) -> tuple[str, ...]:
+        """Parts of each frame; those of all frames are made of its depth and ``rgbd``."""
+        needed = ("depth", "rgbd") if self.scene_parts else ()
+        return tuple(dict.fromkeys((*(part for part in self.parts if part not in SCENE_PARTS), *needed)))
 
     def _check_method(self) -> None:
         """Check that the method accepts the settings."""
@@ -118,6 +143,8 @@ def settings_of(request: UpsampleRequest) -> dict[str, Any]:
         **reading,
         "fov": choice["fov"],
         "intrinsics": None if choice["intrinsics"] is None else list(choice["intrinsics"]),
+        **({"max_faces": request.max_faces} if request.max_faces != MOST_FACES else {}),
+        **({"max_points": request.max_points} if request.max_points != MOST_POINTS else {}),
         **({"set": dict(request.settings)} if request.settings else {}),
         **({"code": code} if (code := hash_outside_code(_targets(request))) else {}),
     }

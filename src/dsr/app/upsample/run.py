@@ -26,6 +26,7 @@ from dsr.app.upsample.outputs import (
 )
 from dsr.app.upsample.reporting import Reporter, listed, problem_line
 from dsr.app.upsample.request import UpsampleRequest, files_of, inputs_of, settings_of
+from dsr.app.upsample.scene import write_scene
 from dsr.inference import Plan, enlarged_by, plan, upsample_surface
 from dsr.io.encoding import Assumption
 from dsr.io.inputs import Picture, read_picture
@@ -66,20 +67,29 @@ def run(request: UpsampleRequest, console: Console) -> list[str]:
     reporter, units = Reporter(console), FolderUnits(found.pairs)
     problems: dict[str, list[str]] = {}
     outcomes: Counter[str] = Counter()
+    targets: dict[str, Path] = {}
+    scene_problems: list[str] = []
     progress = ConsoleProgress(console)
     for pair in progress.track(found.pairs, "upsample", label=lambda pair: pair.name, lines=False):
         target = request.output if single else request.output / pair.name
         try:
             outcomes[_one(request, pair, target, units, reporter, progress)] += 1
+            targets[pair.name] = target
         except (ValueError, OSError, MemoryError, torch.OutOfMemoryError) as error:
             problems.setdefault(problem_line(error), []).append(pair.name)
+    if targets and request.scene_parts and not request.dry_run:
+        scene = write_scene(request.output, targets, request.scene_parts, overwrite=request.overwrite)
+        for part, path in scene.files.items():
+            reporter.say(f"{part}: {len(targets)} frames -> {path}")
+        scene_problems = scene.problems
     if not single:
         reporter.summary(outcomes["done"] + outcomes["to do"])
         counts = [f"{count} {outcome}" for outcome, count in outcomes.items()]
         counts += [f"{sum(map(len, problems.values()))} failed"] if problems else []
         pictures = "1 picture" if len(found.pairs) == 1 else f"{len(found.pairs)} pictures"
         show(console, f"{pictures}: {', '.join(counts)} -> {request.output}")
-    return [f"{listed(names)}: {message}" if len(found.pairs) > 1 else message for message, names in problems.items()]
+    lines = [f"{listed(names)}: {message}" if len(found.pairs) > 1 else message for message, names in problems.items()]
+    return lines + scene_problems
 
 
 def _find(request: UpsampleRequest) -> PairingResult:
@@ -244,19 +254,23 @@ def _write(job: _Job, picture: Picture, surface: Surface, planned: Plan, seconds
     started = time.perf_counter()
     encoding = output_encoding(picture.encoding, job.request.depth_format)
     title = f"{job.pair.name}, {planned.method} x{planned.scale}"
-    files, facts = write_parts(job.target, picture, surface, job.request.parts, encoding, title, job.request.max_error)
+    request = job.request
+    files, facts, shapes = write_parts(job.target, picture, surface, request.wanted, encoding, title, request.limits)
+    kept = job.earlier if job.earlier is not None and job.same else None
+    counts = {**(kept.shapes if kept else {}), **{part: written._asdict() for part, written in shapes.items()}}
     entries = {
         "inputs": job.inputs,
         "settings": job.settings,
         "method": planned.method,
         "scale": planned.scale,
         "plan": planned.text,
-        "noise": surface.noise._asdict() if surface.noise else job.earlier.noise if job.earlier and job.same else None,
+        "noise": surface.noise._asdict() if surface.noise else kept.noise if kept else None,
         **described(picture, encoding),
+        **counts,
         "assumptions": [str(fact) for fact in (*picture.assumptions, *facts)],
         "seconds": {"upsampling": round(seconds, 3), "writing": round(time.perf_counter() - started, 3)},
         "versions": {"python": platform.python_version(), **package_versions(_PACKAGES)},
     }
-    kept = job.earlier.files if job.earlier is not None and job.same else ()
-    finish(job.target, job.earlier, entries, [*files, *(name for name in kept if name not in files)])
+    others = [name for name in (kept.files if kept else ()) if name not in files]
+    finish(job.target, job.earlier, entries, [*files, *others])
     return facts

@@ -57,7 +57,9 @@ def box_mean(x: Tensor, scale: int) -> Tensor:
 
 def repeat_blocks(x: Tensor, scale: int) -> Tensor:
     """Repeat each pixel as a scale x scale block, (B, C, h, w) -> (B, C, scale h, scale w)."""
-    return x.repeat_interleave(scale, -2).repeat_interleave(scale, -1)
+    batch, channels, height, width = x.shape
+    blocks = x[:, :, :, None, :, None].expand(batch, channels, height, scale, width, scale)
+    return blocks.reshape(batch, channels, height * scale, width * scale)
 
 
 def grey(rgb: Tensor, weights: Sequence[float] = LUMA) -> Tensor:

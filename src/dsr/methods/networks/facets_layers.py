@@ -9,6 +9,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from dsr.methods.networks.exportable import exporting, pad_to_multiple
+
 FULL, HALF = 16, 32
 """Channels of the photo's features at the full and at half the resolution."""
 HEAD = 24
@@ -63,6 +65,7 @@ class MixedResidual(nn.Module):
 
     def __init__(self, width: int) -> None:
         super().__init__()
+        self.width = width
         self.ways = nn.ModuleList(Residual(width) for _ in range(2))
         self.ways[1].load_state_dict(self.ways[0].state_dict())
 
@@ -76,6 +79,9 @@ class MixedResidual(nn.Module):
             shifts: (B, C) what is added to them.
 
         """
+        if exporting():  # a graph is for one image, and has to know the shapes of its weights
+            width = self.width
+            return self._map(x, shares.reshape(1), 1 + gains.reshape(width), shifts.reshape(width))
         each = zip(x.split(1), shares.float(), 1 + gains.float(), shifts.float(), strict=True)
         return torch.cat([self._map(*parts) for parts in each])
 
@@ -110,7 +116,7 @@ class Context(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         """Map (B, C, h, w) to the same shape; the sizes are padded to multiples of eight."""
         height, width = x.shape[-2:]
-        x = functional.pad(x, (0, -width % 8, 0, -height % 8), mode="replicate")
+        x = pad_to_multiple(x, 8)
         kept = []
         for shrink, encode in zip(self.shrink, self.encoder, strict=True):
             x = encode(functional.relu(shrink(x)))

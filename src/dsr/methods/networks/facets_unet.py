@@ -37,6 +37,7 @@ from dsr.degradation.downsampling import Downsampling
 from dsr.degradation.hints import FACTS, KERNELS
 from dsr.methods.classical.finite_differences import repeat_blocks
 from dsr.methods.networks.base import DisparityNetwork, expect_rgb_size
+from dsr.methods.networks.exportable import every, exporting, median_in_graph, quantiles_in_graph
 from dsr.methods.networks.facets import Facets
 from dsr.methods.networks.facets_layers import (
     HEAD,
@@ -233,7 +234,7 @@ class FacetsUNet(DisparityNetwork):
         """
         expect_rgb_size(rgb, disparity, 1 if self.scale < 4 and rgb.shape[-1] == disparity.shape[-1] else self.scale)
         known = disparity.isfinite()
-        unit = disparity.masked_fill(~known, torch.nan).flatten(1).nanmedian(dim=1).values.view(-1, 1, 1, 1)
+        unit = _median(disparity, known)
         values = inpaint(disparity, rgb) / unit
         batch = disparity.shape[0]
         if hints is None:
@@ -305,6 +306,8 @@ class FacetsUNet(DisparityNetwork):
 
     def _split(self, height: int, shape: torch.Size) -> list[_Band]:
         """Return the bands of low-resolution rows that are processed one after another; all rows in a training."""
+        if exporting():
+            return [_Band(slice(0, height), slice(0, height))]
         rows = height if self.training else max(1, height * _BAND // (shape[0] * shape[-2] * shape[-1]))
         return [_Band.of(first, min(first + rows, height), height) for first in range(0, height, rows)]
 
@@ -399,7 +402,7 @@ def _project(result: Tensor, values: Tensor, known: Tensor, gate: Tensor, hints:
     """
     scale = result.shape[-1] // values.shape[-1]
     told = hints[:, : len(KERNELS)]
-    if scale == 1 or not bool(told.any()):
+    if scale == 1 or exporting() or not bool(told.any()):  # an exported network is told no kernel
         return result
     parts = []
     for i, hint in enumerate(told.tolist()):
@@ -416,11 +419,32 @@ def _project(result: Tensor, values: Tensor, known: Tensor, gate: Tensor, hints:
 
 def _roughness(levels: list[Stencil], weight: Tensor) -> Tensor:
     """Return how rough maps are, (B, channels): logarithms of quantiles of the bend where the map is known."""
+    if exporting():
+        return _scale_roughness([_quantiles_in_graph(level.bend.float(), weight) for level in levels])
     step = max(1, math.isqrt(weight.shape[-2] * weight.shape[-1] // _SAMPLES))
     known = weight[..., ::step, ::step].flatten(1) > 0.5
     quantiles = weight.new_tensor(_QUANTILES).float()
     found = []
     for level in levels:
         bends = level.bend[..., ::step, ::step].flatten(1).float().masked_fill(~known, torch.nan)
-        found.append(torch.nanquantile(bends, quantiles, dim=1).T.nan_to_num(0))
-    return (torch.log10(torch.cat(found, dim=1) + 1e-6) + 4) / 2
+        found.append(torch.nanquantile(bends, quantiles, dim=1).T)
+    return _scale_roughness(found)
+
+
+def _quantiles_in_graph(bend: Tensor, weight: Tensor) -> Tensor:
+    """Return the quantiles of :func:`_roughness` of one map, (B, quantiles)."""
+    step = (torch.ones_like(weight[0, 0]).sum() / _SAMPLES).sqrt().floor().clamp(min=1)
+    known = (weight > 0.5) & every(step, weight)
+    return quantiles_in_graph(bend.flatten(1), known.flatten(1), bend.new_tensor(_QUANTILES))
+
+
+def _scale_roughness(quantiles: list[Tensor]) -> Tensor:
+    """Return quantiles of the bend, (B, n) each and NaN where nothing is known, as inputs of the network."""
+    return (torch.log10(torch.cat([each.nan_to_num(0) for each in quantiles], dim=1) + 1e-6) + 4) / 2
+
+
+def _median(values: Tensor, known: Tensor) -> Tensor:
+    """Return the lower median of the known values of maps, (B, 1, h, w) to (B, 1, 1, 1)."""
+    if exporting():
+        return median_in_graph(values.flatten(1), known.flatten(1))[..., None, None]
+    return values.masked_fill(~known, torch.nan).flatten(1).nanmedian(dim=1).values.view(-1, 1, 1, 1)

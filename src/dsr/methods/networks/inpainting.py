@@ -6,6 +6,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from dsr.methods.networks.exportable import exporting, fill_in_graph
+
 _CONTRAST = 0.02
 """Standard deviation of the difference of the colours of a surface's neighbouring pixels, on the scale of [0, 1]."""
 _ALIKE = 0.3
@@ -18,16 +20,17 @@ def inpaint(x: Tensor, photo: Tensor | None = None) -> Tensor:
     """Replace the non-finite values of (B, 1, h, w) by means of the valid ones in 3 x 3 pixels, from outside in.
 
     With a photo, the means are weighted by how alike the colours are, and pixels of the colour of a valid neighbour are
-    filled before others, so that values stop at the photo's edges. An image without a valid value stays unchanged.
+    filled before others, so that values stop at the photo's edges; not so in exported networks, whose graph has no room
+    for a list of pixels. An image without a valid value stays unchanged.
 
     Args:
         x: the maps.
         photo: (B, 3, H, W) in [0, 1], of any size.
 
     """
-    if bool(x.isfinite().all()):
+    if not exporting() and bool(x.isfinite().all()):
         return x
-    if photo is None:
+    if photo is None or exporting():
         return _fill_evenly(x)
     colours = functional.adaptive_avg_pool2d(photo.to(x.dtype), (x.shape[-2], x.shape[-1]))
     colours = functional.avg_pool2d(functional.pad(colours, (1, 1, 1, 1), mode="replicate"), 3, stride=1)
@@ -38,6 +41,9 @@ def _fill_evenly(x: Tensor) -> Tensor:
     """Return the maps, (B, 1, h, w), filled with plain means."""
     valid = x.isfinite()
     values, weight = torch.where(valid, x, 0), valid.to(x.dtype)
+    if exporting():
+        values, weight = fill_in_graph(values, weight)
+        return torch.where(weight > 0, values, torch.nan)
     for _ in range(max(x.shape[-2:])):
         total, fraction = (functional.avg_pool2d(each, 3, stride=1, padding=1) for each in (values, weight))
         new = (weight == 0) & (fraction > 0)

@@ -8,6 +8,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from dsr.methods.networks.exportable import exporting
+
 
 class ConvLayer(nn.Module):
     """A convolution that keeps the size, or a transposed one that doubles it, followed by a PReLU."""
@@ -21,7 +23,7 @@ class ConvLayer(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         """Map (B, C_in, H, W) to (B, C_out, H', W')."""
         x = self.conv(x)
-        if isinstance(self.activation, nn.PReLU) and self.activation.num_parameters == 1:
+        if isinstance(self.activation, nn.PReLU) and self.activation.num_parameters == 1 and not exporting():
             # In place, to save memory, but only in inference mode, where no gradient can be requested.
             if torch.is_inference(x):
                 return functional.leaky_relu_(x, float(self.activation.weight))

@@ -35,6 +35,8 @@ from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 from torch.nn import functional
 
+from dsr.methods.networks.exportable import apply
+
 Offset = tuple[int, int]
 
 
@@ -168,9 +170,9 @@ def unroll(
     p = (slopes / (huber * most)).clamp(-1, 1) * most
     moved = ahead = slopes.new_zeros(weights.shape[0], 1, *weights.shape[-2:])
     for k, step in enumerate(steps):
-        now = slopes if k == 0 else slopes + _Differences.apply(ahead, offsets)
-        p = _DualStep.apply(p, now, torch.as_tensor(step.sigma).to(huber), huber, most)
-        before, moved = moved, (moved - step.tau * _Sums.apply(p, offsets)) / (1 + step.tau * data)
+        now = slopes if k == 0 else slopes + apply(_Differences, ahead, offsets)
+        p = apply(_DualStep, p, now, torch.as_tensor(step.sigma).to(huber), huber, most)
+        before, moved = moved, (moved - step.tau * apply(_Sums, p, offsets)) / (1 + step.tau * data)
         ahead = moved + step.theta * (moved - before)
     return moved
 

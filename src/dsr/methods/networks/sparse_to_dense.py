@@ -30,6 +30,7 @@ from torch.nn import functional
 
 from dsr.degradation.scales import check_scale
 from dsr.methods.networks.base import RangeNetwork, expect_rgb_size
+from dsr.methods.networks.exportable import pad_to_multiple
 
 _STRIDE = 32
 """The photo's pixels, along an axis, for each pixel of the encoder's result."""
@@ -91,10 +92,9 @@ class SparseToDense(RangeNetwork):
         """
         expect_rgb_size(rgb, values, self.scale)
         height, width = rgb.shape[-2:]
-        bottom, right = (-n % max(_STRIDE // self.scale, 1) for n in values.shape[-2:])
-        samples = place_samples(functional.pad(values, (0, right, 0, bottom), mode="replicate") + 1, self.scale)
-        padded = functional.pad(rgb, (0, self.scale * right, 0, self.scale * bottom), mode="replicate")
-        x = torch.cat((padded, samples.to(rgb)), dim=1).to(self.head.weight.dtype)
+        factor = max(_STRIDE // self.scale, 1)
+        samples = place_samples(pad_to_multiple(values, factor) + 1, self.scale)
+        x = torch.cat((pad_to_multiple(rgb, self.scale * factor), samples.to(rgb)), dim=1).to(self.head.weight.dtype)
         x = functional.max_pool2d(self.stem(x), 3, stride=2, padding=1)
         x = self.decoder(self.middle(self.encoder(x)))  # (B, C, H / 2, W / 2)
         with torch.autocast(rgb.device.type, enabled=False):
@@ -183,8 +183,8 @@ class BatchNorm(nn.Module):
 def place_samples(values: Tensor, scale: int) -> Tensor:
     """Return (B, 1, scale h, scale w) with values (B, 1, h, w) at the pixel next to each block's centre, else 0."""
     *lead, height, width = values.shape
-    blocks = values.new_zeros(*lead, height, scale, width, scale)
-    blocks[..., scale // 2, :, scale // 2] = values
+    before, after = scale // 2, scale - 1 - scale // 2
+    blocks = functional.pad(values.view(*lead, height, 1, width, 1), (before, after, 0, 0, before, after))
     return blocks.view(*lead, height * scale, width * scale)
 
 

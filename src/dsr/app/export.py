@@ -1,0 +1,63 @@
+"""The command behind ``dsr export``: write a method's network as an ONNX file."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from rich.console import Console
+
+import dsr
+from dsr.methods.networks.onnx_export import OnnxGraph, write_onnx
+from dsr.methods.registry import load_method_network
+from dsr.utils.console import show
+from dsr.utils.units import megabytes
+
+
+@dataclass(frozen=True)
+class ExportRequest:
+    """Which network to write, and where.
+
+    Args:
+        path: the file.
+        method: the method's name.
+        scale: the upsampling factor.
+        weights: a file of weights; None for those that the method names.
+        directories: the user's configuration directories.
+
+    """
+
+    path: Path
+    method: str
+    scale: int
+    weights: Path | None = None
+    directories: tuple[Path, ...] = ()
+
+    def __post_init__(self) -> None:
+        """Check what does not depend on files."""
+        if self.scale < 1:
+            raise ValueError(f"--scale: expected a factor of 1 or more, got {self.scale}")
+        if self.path.is_dir():
+            raise ValueError(f"--onnx: expected a file, got the folder {self.path}")
+
+
+def export_onnx(request: ExportRequest, console: Console) -> None:
+    """Write the file, check it, and show its inputs and outputs.
+
+    Raises:
+        ValueError: the method has no network, there are no weights for the factor, or a library is missing.
+
+    """
+    net = load_method_network(request.method, request.scale, directories=request.directories, weights=request.weights)
+    graph = OnnxGraph(net, request.scale)
+    facts = {"dsr": dsr.__version__, "method": request.method, "scale": request.scale, "network": type(net).__name__}
+    difference = write_onnx(request.path, graph, facts)
+    size = megabytes(request.path.stat().st_size)
+    lines = (
+        f"{request.method} x{request.scale} -> {request.path}, {size}",
+        f"  inputs: photo (1, 3, H, W), inverse_depth and valid (1, 1, H / {request.scale}, W / {request.scale})",
+        f"  outputs: {', '.join(graph.outputs)} (1, 1, H, W)",
+        f"  onnxruntime differs from PyTorch by at most {difference:.1g} of the range",
+    )
+    for line in lines:
+        show(console, line)

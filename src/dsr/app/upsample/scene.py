@@ -1,0 +1,132 @@
+"""Exports of all frames of a run together, made of the frames' folders."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from dsr.geometry.camera import Camera
+from dsr.io.scene_files.frame import Frame, parse_pose
+from dsr.io.scene_files.nerfstudio import write_transforms
+from dsr.io.scene_files.open3d import RGBD, write_open3d
+from dsr.io.scene_files.rerun import write_rerun
+from dsr.io.scene_files.splatting import write_splatting
+from dsr.utils.files import write_text
+
+_RECORD = "exports.json"
+_INFO = "info.json"
+_DEPTHS = ("depth_metres.npy", "depth.npy")
+_WRITERS: Mapping[str, tuple[str, Callable[[Path, Sequence[Frame]], list[Path]]]] = {
+    "open3d": ("open3d", write_open3d),
+    "nerfstudio": ("transforms.json", write_transforms),
+    "gaussian": ("gaussian", write_splatting),
+    "rerun": ("scene.rrd", write_rerun),
+}
+"""The file or folder of each part in the folder of the results, and what writes it."""
+SCENE_PARTS = tuple(_WRITERS)
+
+
+@dataclass
+class SceneResult:
+    """What was written, by part, and the problems, one line each."""
+
+    files: dict[str, Path] = field(default_factory=dict)
+    problems: list[str] = field(default_factory=list)
+
+
+def check_libraries(parts: Sequence[str]) -> None:
+    """Check that the libraries of some parts are installed.
+
+    Raises:
+        ValueError: one is not.
+
+    """
+    if "rerun" in parts and importlib.util.find_spec("rerun") is None:
+        raise ValueError("--with rerun: expected the library rerun-sdk, which `pip install dsr[rerun]` installs")
+
+
+def write_scene(output: Path, folders: Mapping[str, Path], parts: Sequence[str], *, overwrite: bool) -> SceneResult:
+    """Write exports of frames that are complete, and record them in ``exports.json``.
+
+    A problem with one export does not stop the others.
+
+    Args:
+        output: the folder of the results.
+        folders: the folder of each frame, by its name.
+        parts: some of :data:`SCENE_PARTS`.
+        overwrite: whether to replace what is there and not recorded.
+
+    """
+    result = SceneResult()
+    try:
+        frames = [read_frame(name, folder) for name, folder in folders.items()]
+        expect_distinct(frames)
+        recorded = _read_record(output)
+    except (ValueError, OSError) as error:
+        result.problems.append(str(error))
+        return result
+    for part in parts:
+        name, write = _WRITERS[part]
+        path = output / name
+        if path.exists() and name not in recorded and not overwrite:
+            result.problems.append(f"{path}: is there already and not of an earlier run; --overwrite replaces it")
+            continue
+        try:
+            files = write(path, frames)
+        except (ValueError, OSError) as error:
+            result.problems.append(str(error))
+            continue
+        stale = set(recorded.get(name, ())) - {file.relative_to(output).as_posix() for file in files}
+        for old in stale:  # of frames that are no longer there
+            if old.split("/")[0] == name:
+                (output / old).unlink(missing_ok=True)
+        recorded[name] = sorted(file.relative_to(output).as_posix() for file in files)
+        write_text(output / _RECORD, json.dumps({"exports": recorded}, indent=2) + "\n")
+        result.files[part] = path
+    return result
+
+
+def read_frame(name: str, folder: Path) -> Frame:
+    """Return the frame whose results are in a folder.
+
+    Its pose is the entry ``pose`` of ``info.json``: a camera-to-world matrix of four lists of four numbers, in metres.
+
+    Raises:
+        ValueError: the folder is not complete, or the pose is none.
+
+    """
+    path = folder / _INFO
+    entries = json.loads(path.read_text(encoding="utf-8"))
+    depth = next((folder / each for each in _DEPTHS if (folder / each).is_file()), None)
+    colour = folder / "rgbd" / RGBD[0]
+    if depth is None or not colour.is_file():
+        raise ValueError(f"{folder}: expected {_DEPTHS[0]} and rgbd/{RGBD[0]} of this run, one is missing")
+    return Frame(name, Camera(**entries["camera"]), parse_pose(f"{path}: pose", entries.get("pose")), colour, depth)
+
+
+def expect_distinct(frames: Sequence[Frame]) -> None:
+    """Check that frames have different names as files.
+
+    Raises:
+        ValueError: two have the same.
+
+    """
+    seen: dict[str, str] = {}
+    for frame in frames:
+        if frame.stem in seen:
+            raise ValueError(f"expected frames of different names as files, got {seen[frame.stem]} and {frame.name}")
+        seen[frame.stem] = frame.name
+
+
+def _read_record(output: Path) -> dict[str, list[str]]:
+    """Return the exports of earlier runs, with their files."""
+    path = output / _RECORD
+    if not path.is_file():
+        return {}
+    try:
+        return dict(json.loads(path.read_text(encoding="utf-8"))["exports"])
+    except (ValueError, KeyError, TypeError) as error:
+        raise ValueError(f"{path}: expected a file of `dsr upsample`, got something else") from error

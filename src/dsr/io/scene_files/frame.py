@@ -1,0 +1,133 @@
+"""A frame: a photo and a depth map of one size, the camera, and where it stood."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor
+
+from dsr.geometry.camera import Camera
+from dsr.utils.files import replacing
+
+MILLIMETRES = 1000
+MOST_MILLIMETRES = 65535
+_RIGID = 1e-3
+"""Largest difference of R R' from the identity."""
+
+
+@dataclass(frozen=True)
+class Frame:
+    """A photo and a depth map of one size.
+
+    Args:
+        name: the frame's, perhaps with folders: ``kitchen/000012``.
+        camera: of the pixels.
+        pose: (4, 4) float64 camera-to-world transform in metres, of a camera with x right, y down, z forward; None if
+            it is not known.
+        colour: an 8-bit PNG.
+        depth: an NPY of (H, W) orthogonal depth in metres, NaN in holes.
+
+    """
+
+    name: str
+    camera: Camera
+    pose: Tensor | None
+    colour: Path
+    depth: Path
+
+    @property
+    def stem(self) -> str:
+        """The name as that of a file."""
+        return self.name.replace("/", "_")
+
+    def read_depth(self) -> np.ndarray:
+        """Return the depth, (H, W) float32 in metres, NaN in holes.
+
+        Raises:
+            ValueError: the file is damaged, or not of the camera's size.
+
+        """
+        values = np.load(self.depth, mmap_mode="r", allow_pickle=False)
+        if values.shape != (self.camera.height, self.camera.width):
+            size = f"{self.camera.height} x {self.camera.width}"
+            raise ValueError(f"{self.depth}: expected depth of {size} pixels (height x width), got {values.shape}")
+        return np.array(values, np.float32)
+
+    def read_colour(self) -> np.ndarray:
+        """Return the photo, (H, W, 3) uint8, red first.
+
+        Raises:
+            ValueError: the file is damaged.
+
+        """
+        picture = cv2.imread(str(self.colour), cv2.IMREAD_COLOR)
+        if picture is None:
+            raise ValueError(f"{self.colour}: expected a picture, got a damaged file")
+        return picture[..., ::-1]
+
+
+def parse_pose(where: str, value: object) -> Tensor | None:
+    """Return a camera-to-world transform, (4, 4) float64, that a file holds as a list of lists; None for none.
+
+    Args:
+        where: the file and the key, for the message.
+        value: what the file holds there.
+
+    Raises:
+        ValueError: it is no rigid transform.
+
+    """
+    if value is None:
+        return None
+    try:
+        pose = torch.tensor(value, dtype=torch.float64)
+    except (TypeError, ValueError, RuntimeError):
+        pose = torch.empty(0, dtype=torch.float64)
+    rigid = pose.shape == (4, 4) and bool(pose.isfinite().all()) and pose[3].tolist() == [0, 0, 0, 1]
+    if rigid:
+        turn = pose[:3, :3]
+        error = (turn @ turn.T - torch.eye(3, dtype=torch.float64)).abs().max()
+        rigid = float(error) <= _RIGID and float(torch.linalg.det(turn)) > 0
+    if not rigid:
+        raise ValueError(f"{where}: expected a rigid transform of 4 x 4 numbers, got {value}")
+    return pose
+
+
+def one_camera(frames: Sequence[Frame]) -> Camera | None:
+    """Return the camera of all frames, or None if they differ."""
+    cameras = {frame.camera for frame in frames}
+    return cameras.pop() if len(cameras) == 1 else None
+
+
+def write_colour(path: Path, rgb: np.ndarray) -> None:
+    """Write (H, W, 3) uint8, red first, as a PNG, atomically."""
+    _write_png(path, np.ascontiguousarray(rgb[..., ::-1]))
+
+
+def write_sixteen_bits(path: Path, values: np.ndarray) -> None:
+    """Write (H, W) uint16 as a PNG, atomically."""
+    _write_png(path, values)
+
+
+def to_millimetres(depth: np.ndarray) -> tuple[np.ndarray, int]:
+    """Return depth in metres as whole millimetres, (H, W) uint16 with 0 in holes, and how many pixels are too far.
+
+    Depth of 65.535 m and more does not fit, and becomes a hole.
+    """
+    values = np.rint(depth.astype(np.float64) * MILLIMETRES)
+    fits = (values > 0) & (values <= MOST_MILLIMETRES)
+    return np.where(fits, values, 0).astype(np.uint16), int((values > MOST_MILLIMETRES).sum())
+
+
+def _write_png(path: Path, values: np.ndarray) -> None:
+    """Write a picture atomically."""
+    done, content = cv2.imencode(".png", values)
+    if not done:
+        raise OSError(f"{path}: the picture of {values.shape} could not be encoded")
+    with replacing(path) as temporary:
+        temporary.write_bytes(content.tobytes())

@@ -1,0 +1,94 @@
+"""What the networks compute differently while they are turned into an ONNX graph, with the same values.
+
+A graph has no loop that ends when nothing is missing, unless it is written as one, and no tensor in it has a size that
+depends on values, such as that of the known pixels of a map. While a network is exported, the functions here replace
+those that need one of them.
+"""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+
+def exporting() -> bool:
+    """Return whether a network is being turned into a graph."""
+    return bool(torch.onnx.is_in_onnx_export())
+
+
+@torch.jit.script
+def fill_in_graph(values: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
+    """Fill the holes of maps as :func:`dsr.methods.networks.inpainting.inpaint` does, as a loop in the graph.
+
+    Args:
+        values: (B, 1, h, w), 0 in holes.
+        weight: (B, 1, h, w), 1 where a value is known and 0 in holes.
+
+    Returns:
+        Both for the filled map; the weight is 0 in an image without a known value.
+
+    """
+    before = torch.zeros_like(weight.sum())
+    while bool(weight.sum() != before):
+        before = weight.sum()
+        total = functional.avg_pool2d(values, [3, 3], [1, 1], [1, 1])
+        fraction = functional.avg_pool2d(weight, [3, 3], [1, 1], [1, 1])
+        new = (weight == 0) & (fraction > 0)
+        values = torch.where(new, total / torch.where(fraction > 0, fraction, torch.ones_like(fraction)), values)
+        weight = torch.where(new, torch.ones_like(weight), weight)
+    return values, weight
+
+
+def apply(function: type[torch.autograd.Function], *arguments: Any) -> Any:
+    """Apply a function that has a derivative of its own; a graph gets its operations, without the derivative."""
+    if not exporting():
+        return function.apply(*arguments)
+    return function.forward(SimpleNamespace(save_for_backward=lambda *_: None), *arguments)
+
+
+def median_in_graph(x: Tensor, known: Tensor) -> Tensor:
+    """Return the lower median of the known values of each row, (B, N) to (B, 1); infinity for a row without one."""
+    ordered = torch.where(known, x, torch.inf).sort(dim=1).values
+    middle = (known.sum(dim=1, keepdim=True) - 1).clamp(min=0) // 2
+    return ordered.gather(1, middle)
+
+
+def quantiles_in_graph(x: Tensor, known: Tensor, fractions: Tensor) -> Tensor:
+    """Return quantiles of the known values of each row, interpolated linearly; NaN for a row without one.
+
+    Args:
+        x: (B, N).
+        known: (B, N) bool.
+        fractions: (Q,) in 0..1.
+
+    Returns:
+        (B, Q).
+
+    """
+    count = known.sum(dim=1, keepdim=True)
+    ordered = torch.where(known, x, torch.inf).sort(dim=1).values
+    place = fractions * (count - 1).clamp(min=0).to(x.dtype)  # (B, Q)
+    below, above = place.floor().long(), place.ceil().long()
+    low, high = ordered.gather(1, below), ordered.gather(1, above)
+    return torch.where(count > 0, torch.lerp(low, high, place - below.to(x.dtype)), torch.nan)
+
+
+def every(step: Tensor, like: Tensor) -> Tensor:
+    """Return whether both indices of a pixel are multiples of ``step``, (1, 1, h, w) bool; ``like`` is (B, C, h, w)."""
+    rows, columns = (torch.arange(n, device=like.device, dtype=torch.float32) for n in like.shape[-2:])
+    first = (torch.fmod(rows, step) == 0)[:, None] & (torch.fmod(columns, step) == 0)
+    return first[None, None]
+
+
+def pad_to_multiple(x: Tensor, factor: int) -> Tensor:
+    """Repeat the last row and column of (B, C, h, w) so that both sizes become multiples of ``factor``."""
+    height, width = x.shape[-2:]
+    if not exporting():
+        return functional.pad(x, (0, -width % factor, 0, -height % factor), mode="replicate")
+    more = functional.pad(x, (0, factor - 1, 0, factor - 1), mode="replicate")
+    rows, columns = (factor * ((n + factor - 1) // factor) for n in (height, width))
+    return more[..., :rows, :columns]

@@ -1,0 +1,209 @@
+"""The networks as ONNX files, for programs without PyTorch.
+
+A file takes a photo and a map of inverse depth of any size, and holds everything between: filling of holes,
+normalisation, the network, and the way back to the unit of the input. It is one pass of the network: test-time
+augmentation, tiles, and the resizing for ratios between the factors are left to the caller.
+
+PyTorch's tracing exporter makes the graph. The other one (``dynamo=True``) gives the same values for the networks of
+fixed ranges; for Facets it needs minutes instead of seconds, and rules out sizes because of layouts in memory.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import math
+import warnings
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from dsr.methods.networks.base import DisparityNetwork
+from dsr.methods.networks.exportable import pad_to_multiple
+from dsr.methods.networks.facets_unet import FacetsUNet
+from dsr.utils.files import replacing
+
+INPUTS = ("photo", "inverse_depth", "valid")
+RESULT = "inverse_depth_hr"
+ERRORS = ("relative_error", "angle_error")
+_OPSET = 18
+"""The first one whose Resize knows the border of Keys' kernel."""
+_TRACED, _CHECKED = (24, 40), (19, 33)
+"""Low-resolution sizes, height and width, of the maps that the graph is traced and checked with."""
+_TOLERANCE = 1e-4
+"""Largest difference between the graph's and the network's result, over the range of the result."""
+
+
+class OnnxGraph(nn.Module):
+    """What an ONNX file computes, as a module.
+
+    Args:
+        net: the network, which is changed to evaluate.
+        scale: upsampling factor: the network's, or 1 for a network that serves it.
+
+    Raises:
+        ValueError: the network is not for this factor.
+
+    """
+
+    def __init__(self, net: DisparityNetwork, scale: int) -> None:
+        super().__init__()
+        if scale != net.scale and not net.serves(net.scale, scale):
+            raise ValueError(f"scale: expected {net.scale}, the network's, got {scale}")
+        self.net, self.scale = net.requires_grad_(False), scale
+        self.eval()
+
+    @property
+    def outputs(self) -> tuple[str, ...]:
+        """Names of the results."""
+        return (RESULT, *ERRORS) if isinstance(self.net, FacetsUNet) else (RESULT,)
+
+    def forward(self, photo: Tensor, inverse_depth: Tensor, valid: Tensor) -> tuple[Tensor, ...]:
+        """Return high-resolution inverse depth, (1, 1, H, W) in the unit of the input, and the expected errors.
+
+        The errors are those of Facets: the expected absolute error of the depth over the depth, and that of the normal
+        in degrees, (1, 1, H, W) each.
+
+        Args:
+            photo: (1, 3, H, W) in 0..1, red first; H = scale h and W = scale w.
+            inverse_depth: (1, 1, h, w) in 1 / metres or any other unit, positive where ``valid``.
+            valid: (1, 1, h, w) bool, false in holes.
+
+        """
+        height, width = photo.shape[-2:]
+        values = torch.where(valid, inverse_depth, torch.nan)
+        if not isinstance(self.net, FacetsUNet):
+            return (self.net.upsample(photo, values),)
+        if self.scale == 1:  # its pixels are averaged in pairs
+            photo, values = (pad_to_multiple(each, 2) for each in (photo, values))
+        answer = self.net.answer(photo, values)
+        results = (answer.disparity, answer.spread, answer.angle * (180 / math.pi))
+        return tuple(each[..., :height, :width] for each in results)
+
+
+def write_onnx(path: Path, graph: OnnxGraph, facts: Mapping[str, Any]) -> float:
+    """Write a network as an ONNX file, atomically, after checking that its results are the network's.
+
+    Args:
+        path: the file.
+        graph: the network.
+        facts: plain values that become the file's metadata.
+
+    Returns:
+        The largest difference in the check, over the range of the result.
+
+    Raises:
+        ValueError: `onnx` or `onnxruntime` is not installed, or the results differ.
+
+    """
+    onnx, runtime = _import("onnx"), _import("onnxruntime")
+    with replacing(path) as temporary:
+        _trace(temporary, graph)
+        model = onnx.load(str(temporary))
+        onnx.helper.set_model_props(model, {key: str(value) for key, value in facts.items()})
+        onnx.save(model, str(temporary))
+        session = runtime.InferenceSession(str(temporary), providers=["CPUExecutionProvider"])
+        difference = _compare(session, graph)
+        if not difference <= _TOLERANCE:
+            raise ValueError(
+                f"{path}: expected the network's results to {_TOLERANCE:g} of the range, got a difference of "
+                f"{difference:g}"
+            )
+    return difference
+
+
+def example_inputs(size_lr: tuple[int, int], scale: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Return a photo, inverse depth and a valid mask to try a graph with: a disc before a wall, with holes."""
+    height, width = size_lr
+    rows, columns = torch.meshgrid(torch.linspace(0, 1, height), torch.linspace(0, 1, width), indexing="ij")
+    noise = torch.Generator().manual_seed(0)
+    disc = (rows - 0.5) ** 2 + (columns - 0.5) ** 2 < 0.1
+    inverse = 0.4 + 0.1 * rows + 0.2 * columns + 0.3 * disc + 0.002 * torch.rand(size_lr, generator=noise)
+    valid = torch.ones(size_lr, dtype=torch.bool)
+    valid[height // 4 : height // 2, width // 3 : width // 2] = False
+    valid[0] = False
+    photo = torch.rand((1, 3, scale * height, scale * width), generator=noise)
+    return photo, inverse[None, None], valid[None, None]
+
+
+@torch.no_grad()
+def _trace(path: Path, graph: OnnxGraph) -> None:
+    """Write the graph of a network."""
+    low = {2: "h", 3: "w"}
+    high = low if graph.scale == 1 else {2: "H", 3: "W"}
+    axes = {"photo": high, "inverse_depth": low, "valid": low, **dict.fromkeys(graph.outputs, high)}
+    with _operators():
+        torch.onnx.export(
+            graph,
+            example_inputs(_TRACED, graph.scale),
+            str(path),
+            input_names=list(INPUTS),
+            output_names=list(graph.outputs),
+            dynamic_axes=axes,
+            opset_version=_OPSET,
+            dynamo=False,
+        )
+
+
+@contextlib.contextmanager
+def _operators() -> Iterator[None]:
+    """Make known to the exporter the operators that it lacks, and silence what it warns of."""
+    added: dict[str, Callable[..., Any]] = {"aten::asinh": _asinh, "aten::_upsample_bicubic2d_aa": _bicubic}
+    for name, function in added.items():
+        torch.onnx.register_custom_op_symbolic(name, function, _OPSET)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of sizes that a trace might fix, which the check would find
+            yield
+    finally:
+        for name in added:
+            torch.onnx.unregister_custom_op_symbolic(name, _OPSET)
+
+
+def _asinh(context: Any, x: Any) -> Any:
+    """Return the node of an inverse hyperbolic sine."""
+    return context.op("Asinh", x)
+
+
+def _bicubic(context: Any, x: Any, size: Any, _align: Any, *_scales: Any) -> Any:
+    """Return the node of an enlargement with Keys' kernel, renormalised at the border."""
+    start = context.op("Constant", value_t=torch.tensor([0]))
+    end = context.op("Constant", value_t=torch.tensor([2]))
+    lead = context.op("Slice", context.op("Shape", x), start, end)
+    sizes = context.op("Concat", lead, context.op("Cast", size, to_i=7), axis_i=0)  # 7: int64
+    empty = context.op("Constant", value_t=torch.tensor([], dtype=torch.float32))
+    return context.op(
+        "Resize",
+        x,
+        empty,
+        empty,
+        sizes,
+        mode_s="cubic",
+        cubic_coeff_a_f=-0.5,
+        exclude_outside_i=1,
+        coordinate_transformation_mode_s="half_pixel",
+    )
+
+
+@torch.no_grad()
+def _compare(session: Any, graph: OnnxGraph) -> float:
+    """Return the largest difference between what a graph and its network compute for a size it was not traced with."""
+    inputs = example_inputs(_CHECKED, graph.scale)
+    found = session.run(None, {name: each.numpy() for name, each in zip(INPUTS, inputs, strict=True)})
+    differences = []
+    for mine, theirs in zip(found, graph(*inputs), strict=True):
+        value_range = float(theirs.max() - theirs.min())
+        differences.append(float(np.abs(mine - theirs.numpy()).max()) / (value_range or 1))
+    return max(differences)
+
+
+def _import(name: str) -> Any:
+    """Return a library of the extra ``onnx``."""
+    try:
+        return importlib.import_module(name)
+    except ImportError as error:
+        raise ValueError(f"--onnx: expected the library {name}, which `pip install dsr[onnx]` installs") from error

@@ -1,0 +1,135 @@
+"""Exports of ``dsr upsample``: what is asked for is written, numbers are said, and refusals write nothing."""
+
+import json
+import sys
+
+import numpy as np
+import pytest
+import trimesh
+from PIL import Image
+
+from dsr.cli import main
+
+FRAMES = ("000", "001")
+
+
+@pytest.fixture
+def capture(tmp_path):
+    """Two frames of 48 x 64, depth of 12 x 16 in millimetres."""
+    rows, columns = np.mgrid[0:12, 0:16]
+    for number, name in enumerate(FRAMES):
+        for folder in ("rgb", "depth"):
+            (tmp_path / "capture" / folder).mkdir(parents=True, exist_ok=True)
+        photo = np.random.default_rng(number).integers(0, 256, (48, 64, 3), np.uint8)
+        Image.fromarray(photo).save(tmp_path / "capture" / "rgb" / f"{name}.png")
+        depth = (1500 + 10 * rows + 5 * columns + 100 * number).astype(np.uint16)
+        Image.fromarray(depth).save(tmp_path / "capture" / "depth" / f"{name}.png")
+    return tmp_path / "capture"
+
+
+def upsample(*arguments):
+    return main(["upsample", *map(str, arguments), "--method", "bicubic"])
+
+
+def names_in(folder):
+    return {path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()}
+
+
+def set_poses(out):
+    """Add poses to the frames of a run, as captures have them."""
+    for number, name in enumerate(FRAMES):
+        path = out / name / "info.json"
+        entries = json.loads(path.read_text())
+        entries["pose"] = [[1, 0, 0, number], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
+        path.write_text(json.dumps(entries))
+
+
+def test_exports_are_written_beside_the_frames_and_again_after_a_resumption(capture, tmp_path, capsys):
+    out = tmp_path / "out"
+    asked = ("--only", "open3d,gaussian", "-o", out)
+    assert upsample(capture, *asked) == 0
+    said = capsys.readouterr().out
+    assert f"open3d: 2 frames -> {out / 'open3d'}" in said
+    frame = {"info.json", "depth.png", "depth_metres.npy", "rgbd/color.png", "rgbd/depth.png", "rgbd/intrinsic.json"}
+    assert names_in(out / "000") == frame
+    assert "open3d/trajectory.log" not in names_in(out)
+    set_poses(out)
+    assert upsample(capture, "--only", "open3d,nerfstudio", "-o", out) == 0
+    assert "2 complete already" in capsys.readouterr().out
+    assert "open3d/trajectory.log" in names_in(out)
+    frames = json.loads((out / "transforms.json").read_text())["frames"]
+    assert [entry["file_path"] for entry in frames] == ["000/rgbd/color.png", "001/rgbd/color.png"]
+    assert [entry["transform_matrix"][0][3] for entry in frames] == [0, 1]
+    recorded = json.loads((out / "exports.json").read_text())["exports"]
+    assert set(recorded) == {"open3d", "gaussian", "transforms.json"}
+    assert all((out / name).is_file() for names in recorded.values() for name in names)
+
+
+def test_frames_without_poses_are_one_line_and_the_other_exports_are_written(capture, tmp_path, capsys):
+    assert upsample(capture, "--only", "depth,nerfstudio,open3d", "-o", tmp_path / "out") == 2
+    error = capsys.readouterr().err
+    assert error.startswith("error: nerfstudio: expected a pose of each frame, got none for 2 of 2")
+    assert error.count("\n") == 1
+    assert not (tmp_path / "out" / "transforms.json").exists()
+    assert (tmp_path / "out" / "open3d" / "intrinsic.json").is_file()
+
+
+def test_foreign_file_in_place_of_an_export_is_left_alone(capture, tmp_path, capsys):
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / "open3d").write_text("mine")
+    assert upsample(capture, "--only", "open3d", "-o", out) == 2
+    assert "open3d: is there already and not of an earlier run" in capsys.readouterr().err
+    assert (out / "open3d").read_text() == "mine"
+
+
+def test_pose_that_is_not_rigid_is_one_line(capture, tmp_path, capsys):
+    out = tmp_path / "out"
+    assert upsample(capture, "--only", "depth,rgbd", "-o", out) == 0
+    set_poses(out)
+    path = out / "001" / "info.json"
+    path.write_text(path.read_text().replace('"pose": [[1, 0', '"pose": [[3, 0'))
+    capsys.readouterr()
+    assert upsample(capture, "--only", "nerfstudio", "-o", out) == 2
+    error = capsys.readouterr().err
+    assert "info.json: pose: expected a rigid transform of 4 x 4 numbers" in error
+    assert error.count("\n") == 1
+
+
+def test_mesh_and_cloud_beyond_limits_are_said_and_recorded(capture, tmp_path, capsys):
+    pytest.importorskip("fast_simplification", reason="pip install dsr[mesh]")
+    out = tmp_path / "out"
+    limits = ("--max-faces", 500, "--max-points", 1000)
+    assert upsample(capture, "--only", "depth,mesh,cloud", *limits, "-o", out) == 0
+    said = capsys.readouterr().out
+    entries = json.loads((out / "000" / "info.json").read_text())
+    faces = trimesh.load(out / "000" / "mesh.ply", process=False).faces
+    points = trimesh.load(out / "000" / "cloud.ply").vertices
+    assert entries["mesh"] == {"before": 2 * 47 * 63, "after": len(faces), "how": "quadric decimation"}
+    assert entries["cloud"]["before"] == 48 * 64
+    assert entries["cloud"]["after"] == len(points) <= 1000
+    assert (
+        f"the mesh has fewer triangles than the depth map gives (--max-faces) ({len(faces)} of 5922, by quadric" in said
+    )
+    assert "the cloud has fewer points than the depth map gives (--max-points)" in said
+
+
+@pytest.mark.parametrize(
+    ("arguments", "text"),
+    [
+        (("--with", "nosuch"), "--only, --with, --without: expected some of depth, renderings, "),
+        (("--max-faces", "99"), "--max-faces: expected at least 100, got 99"),
+        (("--max-points", "0"), "--max-points: expected at least 100, got 0"),
+    ],
+)
+def test_refusals_write_nothing(arguments, text, capture, tmp_path, capsys):
+    assert upsample(capture, *arguments, "-o", tmp_path / "out") == 2
+    assert text in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def test_missing_rerun_is_one_line_before_anything_is_computed(capture, tmp_path, capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, "rerun", None)
+    assert upsample(capture, "--with", "rerun", "-o", tmp_path / "out") == 2
+    assert "rerun-sdk, which `pip install dsr[rerun]` installs" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()

@@ -1,0 +1,246 @@
+"""Frames as other programs read them: axes, units, intrinsics and poses, read back by code of their own."""
+
+import json
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from dsr.geometry.camera import Camera
+from dsr.io.scene_files.frame import Frame, parse_pose, to_millimetres
+from dsr.io.scene_files.nerfstudio import write_transforms
+from dsr.io.scene_files.open3d import write_open3d, write_rgbd
+from dsr.io.scene_files.rerun import write_rerun
+from dsr.io.scene_files.splatting import write_splatting
+
+CAMERA = Camera(12, 8, 10.0, 11.0, 5.25, 3.5)
+POSE = torch.tensor(
+    [[0.0, 0.0, 1.0, 0.5], [1.0, 0.0, 0.0, -2.0], [0.0, 1.0, 0.0, 3.0], [0.0, 0.0, 0.0, 1.0]], dtype=torch.float64
+)
+
+
+def depth_map(number=0):
+    rows, columns = np.mgrid[0:8, 0:12]
+    depth = (1.5 + 0.01 * rows + 0.02 * columns + number).astype(np.float32)
+    depth[2, 3:5] = np.nan
+    return depth
+
+
+@pytest.fixture
+def make(tmp_path):
+    """Return a function that writes a frame's folder, and returns the frame."""
+
+    def frame(number, pose=POSE, camera=CAMERA):
+        folder = tmp_path / "out" / f"room/{number:03}"
+        rgb = torch.zeros(3, camera.height, camera.width)
+        rgb[0], rgb[2, 0] = number / 10, 1
+        depth = torch.from_numpy(depth_map(number))[None]
+        assert write_rgbd(folder / "rgbd", rgb, depth, camera) == []
+        np.save(folder / "depth_metres.npy", depth[0].numpy())
+        name = f"room/{number:03}"
+        return Frame(name, camera, pose, folder / "rgbd" / "color.png", folder / "depth_metres.npy")
+
+    return frame
+
+
+def world_points(frame):
+    """Return the points of a frame in the world, (3, H, W), by the definition of a pinhole camera."""
+    rows, columns = np.mgrid[0 : frame.camera.height, 0 : frame.camera.width]
+    z, camera = np.load(frame.depth), frame.camera
+    points = np.stack(((columns - camera.cx) / camera.fx * z, (rows - camera.cy) / camera.fy * z, z))
+    pose = frame.pose.numpy()
+    return np.einsum("ij,jhw->ihw", pose[:3, :3], points) + pose[:3, 3, None, None]
+
+
+def test_rgbd_has_millimetres_and_column_major_intrinsics(make):
+    folder = make(1).colour.parent
+    values = np.array(Image.open(folder / "depth.png"))
+    assert values.dtype == np.uint16
+    np.testing.assert_array_equal(values, np.nan_to_num(np.round(1000 * depth_map(1).astype(float)), nan=0))
+    colours = np.array(Image.open(folder / "color.png"))
+    assert colours.shape == (8, 12, 3)
+    assert colours[0, 0].tolist() == [26, 0, 255]
+    entries = json.loads((folder / "intrinsic.json").read_text())
+    matrix = np.array(entries["intrinsic_matrix"]).reshape(3, 3).T
+    assert (entries["width"], entries["height"]) == (12, 8)
+    np.testing.assert_array_equal(matrix, [[10, 0, 5.25], [0, 11, 3.5], [0, 0, 1]])
+
+
+def test_depth_beyond_sixteen_bits_is_a_hole_and_said(tmp_path):
+    values, lost = to_millimetres(np.array([[65.535, 65.536, np.nan, 0.0004]]))
+    assert (values.tolist(), lost) == ([[65535, 0, 0, 0]], 1)
+    [fact] = write_rgbd(tmp_path / "rgbd", torch.zeros(3, 8, 12), torch.full((1, 8, 12), 70.0), CAMERA)
+    assert str(fact) == "rgbd/depth.png: what is beyond 65.5 m is written as a hole (96 pixels)"
+
+
+def test_transforms_have_opengl_axes_and_find_their_files(make, tmp_path):
+    frames = [make(0), make(1)]
+    path = tmp_path / "out" / "transforms.json"
+    assert write_transforms(path, frames) == [path]
+    entries = json.loads(path.read_text())
+    assert [entries[key] for key in ("w", "h", "fl_x", "fl_y", "cx", "cy")] == [12, 8, 10, 11, 5.75, 4]
+    for frame, entry in zip(frames, entries["frames"], strict=True):
+        z = np.array(Image.open(path.parent / entry["depth_file_path"])) / 1000
+        assert cv2.imread(str(path.parent / entry["file_path"])).shape == (8, 12, 3)
+        v, u = np.mgrid[0:8, 0:12] + 0.5
+        points = np.stack(((u - entries["cx"]) / 10 * z, -(v - entries["cy"]) / 11 * z, -z, np.ones_like(z)))
+        world = np.einsum("ij,jhw->ihw", np.array(entry["transform_matrix"]), points)[:3]
+        known = z > 0
+        np.testing.assert_allclose(world[:, known], world_points(frame)[:, known], atol=1e-3)
+
+
+def test_transforms_of_different_cameras_have_intrinsics_for_each_frame(make, tmp_path):
+    frames = [make(0), make(1, camera=Camera(12, 8, 20.0, 21.0, 5.25, 3.5))]
+    write_transforms(tmp_path / "t.json", frames)
+    entries = json.loads((tmp_path / "t.json").read_text())
+    assert "fl_x" not in entries
+    assert [each["fl_x"] for each in entries["frames"]] == [10, 20]
+
+
+def test_single_frame_without_a_pose_stands_at_the_origin(make, tmp_path):
+    write_transforms(tmp_path / "t.json", [make(0, pose=None)])
+    [entry] = json.loads((tmp_path / "t.json").read_text())["frames"]
+    assert entry["transform_matrix"] == np.diag([1.0, -1, -1, 1]).tolist()
+
+
+def test_frames_without_poses_are_refused_in_one_line(make, tmp_path):
+    with pytest.raises(
+        ValueError, match=r"^nerfstudio: expected a pose of each frame, got none for 1 of 2, .*room/001"
+    ):
+        write_transforms(tmp_path / "t.json", [make(0), make(1, pose=None)])
+    assert not (tmp_path / "t.json").exists()
+
+
+def test_open3d_folder_has_colour_depth_intrinsics_and_trajectory(make, tmp_path):
+    frames = [make(0), make(1)]
+    files = write_open3d(tmp_path / "o", frames)
+    assert {file.relative_to(tmp_path / "o").as_posix() for file in files} == {
+        "color/room_000.png", "color/room_001.png", "depth/room_000.png", "depth/room_001.png",
+        "intrinsic.json", "trajectory.log",
+    }  # fmt: skip
+    assert all(file.is_file() for file in files)
+    for frame in frames:
+        for kind, original in (("color", "color.png"), ("depth", "depth.png")):
+            ours = cv2.imread(str(tmp_path / "o" / kind / f"{frame.stem}.png"), cv2.IMREAD_UNCHANGED)
+            np.testing.assert_array_equal(ours, cv2.imread(str(frame.colour.with_name(original)), cv2.IMREAD_UNCHANGED))
+    lines = (tmp_path / "o" / "trajectory.log").read_text().splitlines()
+    assert lines[0::5] == ["0 0 1", "1 1 2"]
+    np.testing.assert_array_equal(np.loadtxt(lines[6:10]), POSE)
+
+
+def test_open3d_folder_without_poses_or_with_two_cameras_says_what_it_has(make, tmp_path):
+    frames = [make(0), make(1, pose=None, camera=Camera(12, 8, 20.0, 21.0, 5.25, 3.5))]
+    names = {file.relative_to(tmp_path).as_posix() for file in write_open3d(tmp_path, frames)}
+    assert {"intrinsics/room_000.json", "intrinsics/room_001.json"} <= names
+    assert not {"trajectory.log", "intrinsic.json"} & names
+
+
+def test_splatting_depth_is_inverse_depth_after_scale_and_offset(make, tmp_path):
+    frames = [make(0), make(4)]
+    write_splatting(tmp_path / "g", frames)
+    parameters = json.loads((tmp_path / "g/sparse/0/depth_params.json").read_text())
+    assert len({entry["scale"] for entry in parameters.values()}) == 1
+    for frame in frames:
+        values = cv2.imread(str(tmp_path / "g/depths" / f"{frame.stem}.png"), cv2.IMREAD_UNCHANGED)
+        assert values.dtype == np.uint16
+        inverse = values / 65536 * parameters[frame.stem]["scale"] + parameters[frame.stem]["offset"]
+        expected = np.nan_to_num(1 / np.load(frame.depth), nan=0)
+        np.testing.assert_allclose(inverse, expected, atol=1e-5)
+    assert cv2.imread(str(tmp_path / "g/depths/room_000.png"), cv2.IMREAD_UNCHANGED).max() == 65535
+
+
+def test_splatting_scene_is_a_colmap_model_of_the_same_points(make, tmp_path):
+    frame = make(0)
+    write_splatting(tmp_path, [frame])
+    sparse = tmp_path / "sparse" / "0"
+    camera = (sparse / "cameras.txt").read_text().splitlines()[1].split()
+    assert camera == ["1", "PINHOLE", "12", "8", "10", "11", "5.75", "4"]
+    image = (sparse / "images.txt").read_text().splitlines()
+    assert image[2] == ""
+    number, *numbers, camera_id, name = image[1].split()
+    assert (number, camera_id, name) == ("1", "1", "room_000.png")
+    w, x, y, z, *shift = map(float, numbers)
+    turn = np.array([
+        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+    ])  # fmt: skip
+    points = np.loadtxt(sparse / "points3D.txt")
+    assert len(points) == 8 * 12 - 2
+    seen = points[:, 1:4] @ turn.T + shift
+    pixels = seen[:, :2] / seen[:, 2:] * (10, 11) + (5.75, 4)
+    rows, columns = np.nonzero(np.isfinite(depth_map()))
+    expected = np.stack((columns, rows), axis=1) + 0.5
+    np.testing.assert_allclose(pixels, expected, atol=1e-5)
+    assert points[0, 4:7].tolist() == [0, 0, 255]
+
+
+def test_splatting_without_poses_has_depth_alone_and_holes_alone_are_refused(make, tmp_path):
+    frame = make(0, pose=None)
+    write_splatting(tmp_path / "g", [frame])
+    assert [file.name for file in (tmp_path / "g/sparse/0").iterdir()] == ["depth_params.json"]
+    np.save(frame.depth, np.full((8, 12), np.nan, np.float32))
+    with pytest.raises(ValueError, match=r"^gaussian: expected some depth, got holes alone"):
+        write_splatting(tmp_path / "h", [frame])
+    assert not (tmp_path / "h").exists()
+
+
+def test_rerun_recording_is_read_back(make, tmp_path):
+    chunk = pytest.importorskip("rerun.chunk", reason="pip install dsr[rerun]")
+    frames = [make(0), make(1, pose=None)]
+    path = tmp_path / "scene.rrd"
+    assert write_rerun(path, frames) == [path]
+    assert [each.name for each in tmp_path.iterdir() if each.is_file()] == ["scene.rrd"]
+    columns = {}
+    for part in chunk.RrdReader(str(path)).stream():
+        batch = part.to_record_batch()
+        for name in batch.schema.names:
+            columns[part.entity_path, name] = batch.column(name).to_pylist()
+    matrices = np.array(columns["/camera", "Pinhole:image_from_camera"]).reshape(2, 3, 3)
+    np.testing.assert_allclose(matrices[0].T, [[10, 0, 5.75], [0, 11, 4], [0, 0, 1]])
+    shifts = np.array(columns["/camera", "Transform3D:translation"]).reshape(2, 3)
+    np.testing.assert_allclose(shifts, [POSE[:3, 3], [0, 0, 0]])
+    turns = np.array(columns["/camera", "Transform3D:mat3x3"]).reshape(2, 3, 3)
+    np.testing.assert_allclose(turns[0].T, POSE[:3, :3])
+    for number, values in enumerate(columns["/camera/depth", "DepthImage:buffer"]):
+        depth = np.frombuffer(bytes(values[0]), np.float32).reshape(8, 12)
+        np.testing.assert_array_equal(depth, np.nan_to_num(depth_map(number)))
+    assert len(columns["/camera/rgb", "EncodedImage:blob"]) == 2
+
+
+def test_rerun_without_the_library_names_the_extra(make, tmp_path, monkeypatch):
+    monkeypatch.setitem(__import__("sys").modules, "rerun", None)
+    with pytest.raises(ValueError, match=r"^rerun: expected the library rerun-sdk, which `pip install dsr\[rerun\]`"):
+        write_rerun(tmp_path / "scene.rrd", [make(0)])
+    assert not (tmp_path / "scene.rrd").exists()
+
+
+@pytest.mark.parametrize(
+    "value",
+    [
+        "no list",
+        [[1, 0], [0, 1]],
+        [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]],
+        [[2, 0, 0, 0], [0, 2, 0, 0], [0, 0, 2, 0], [0, 0, 0, 1]],
+        [[-1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]],
+        [[float("nan"), 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]],
+        [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 1, 1]],
+    ],
+)
+def test_pose_that_is_not_rigid_is_refused(value):
+    with pytest.raises(ValueError, match=r"^info.json: pose: expected a rigid transform of 4 x 4 numbers, got "):
+        parse_pose("info.json: pose", value)
+
+
+def test_pose_is_read_and_none_stays_none():
+    assert parse_pose("x", None) is None
+    assert torch.equal(parse_pose("x", POSE.tolist()), POSE)
+
+
+def test_damaged_depth_of_a_frame_is_refused(make):
+    frame = make(0)
+    np.save(frame.depth, np.zeros((2, 2), np.float32))
+    with pytest.raises(ValueError, match=r"depth_metres.npy: expected depth of 8 x 12 pixels \(height x width\), got"):
+        frame.read_depth()
