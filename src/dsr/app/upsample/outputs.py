@@ -20,13 +20,14 @@ from dsr.geometry.shading import LIGHT_NAMES
 from dsr.io.depth_files import DEPTH_SUFFIXES, write_depth_file
 from dsr.io.encoding import Assumption, Encoding, encode
 from dsr.io.exports import write_cloud, write_mesh, write_normals, write_renderings
+from dsr.io.input_files import INPUT, write_input
 from dsr.io.inputs import Picture
 from dsr.methods.base import Surface
 from dsr.utils.files import replacing, write_text
 from dsr.viz.before_after import write_before_after
 from dsr.viz.confidence import write_confidence
 
-PARTS = ("depth", "renderings", "normals", "cloud", "mesh", "before_after", "confidence")
+PARTS = ("depth", "renderings", "normals", "cloud", "mesh", "before_after", "confidence", "input")
 FORMATS = ("png", "tiff", "npy", "npz", "pfm", "exr")
 INFO = "info.json"
 METRES = "depth_metres.npy"
@@ -41,6 +42,7 @@ _FILES: Mapping[str, tuple[str, ...]] = {
     "mesh": ("mesh.ply", "mesh.glb"),
     "before_after": ("before_after.png",),
     "confidence": ("confidence.png", ERRORS),
+    "input": (INPUT,),
 }
 _WORTH_SAYING = 1e-3
 """Smallest fraction of the pixels that is reported as left out."""
@@ -165,6 +167,8 @@ def write_parts(
         facts += notes
     if "before_after" in parts:
         write_before_after(folder / "before_after.png", rgb, picture.depth_lr, depth, camera, title)
+    if "input" in parts:
+        write_input(folder / INPUT, rgb, picture.depth_lr)
     if "confidence" in parts and not _write_errors(folder, surface):
         parts = [part for part in parts if part != "confidence"]
     return [*files, *(name for part in parts if part != "depth" for name in _FILES[part])], facts
