@@ -1,9 +1,9 @@
 """Surfaces as compact data for the page: inverse depth in 24 bits, what is joined to what, and expected errors.
 
-Inverse depth is linear in the pixel on every plane, so that the upper left, upper and left neighbours predict a pixel of
-a plane exactly. Only the deviation from this prediction is stored, and compressed as zlib does (RFC 1950), which
-browsers undo by themselves. 24 bits are the precision of the 32-bit floats that graphics cards compute with: 16 bits over
-a range from 0.3 to 10 m would be steps of 5 mm at its end, which a light shows as terraces.
+Inverse depth is linear in the pixel on every plane, so the upper left, upper and left neighbours predict a pixel of a
+plane exactly. Only the deviation from this prediction is stored, compressed in zlib's format (RFC 1950), which browsers
+can read. 24 bits are the precision of the 32-bit floats that graphics cards compute with. 16 bits would not be enough:
+for a range of 0.3 to 10 m they mean steps of 5 mm at the far end, which are visible as terraces.
 """
 
 from __future__ import annotations
@@ -105,8 +105,7 @@ def pack_grid(grid: Grid) -> tuple[dict[str, Any], str]:
     """Return what the page needs to know of a surface, and its data as base64.
 
     The data are bytes compressed by zlib, in planes of h x w bytes: the high, middle and low byte of the deviation of
-    inverse depth from its prediction modulo 2**24, the flags, and the levels of each error in order. Pixel (0, 0) of the
-    first is the top left one.
+    inverse depth from its prediction modulo 2**24, the flags, and the levels of each error in order.
     """
     camera, valid = grid.camera, np.isfinite(grid.depth)
     inverse = 1 / grid.depth

@@ -3,6 +3,8 @@
 const NAMES = { grey: "grey", photo: "the photo", depth: "the expected error of the depth", angle: "the expected error of the normal" };
 const UNITS = { depth: { factor: 1000, unit: "mm", title: "Expected error of the depth, mm" }, angle: { factor: 1, unit: "degrees", title: "Expected error of the normal, degrees" } };
 
+const TURN = (2 * Math.PI) / 3; // by dragging over the whole stage
+
 class View {
   constructor(content) {
     this.content = content;
@@ -94,6 +96,7 @@ class View {
     find(".name-right").textContent = this.sides()[1] ?? "";
     find(".name-right").hidden = !both;
     this.stage.classList.toggle("lighting", this.state.drag === "light");
+    this.stage.classList.toggle("errors", this.state.colour in UNITS); // the smallest errors are black, holes must not be
     if (name === "colour" || name === "side") this.showScale();
     this.refresh();
   }
@@ -175,7 +178,7 @@ class View {
       tick.style.left = `${(100 * Math.log(value / low)) / Math.log(high / low)}%`;
       return tick;
     }));
-    const before = this.sides().includes("before") ? "The depth map before says nothing of its errors and stays grey." : "";
+    const before = this.sides().includes("before") ? "The input has no expected errors and stays grey." : "";
     find(".scale-note").textContent = before;
   }
 
@@ -200,7 +203,7 @@ class View {
     }
     const pixels = () => Math.min(this.stage.clientWidth, this.stage.clientHeight);
     const actions = {
-      turn: (right, down) => this.look((pose) => pose.turnBy((Math.PI * right) / pixels(), (Math.PI * down) / pixels())),
+      turn: (right, down) => this.look((pose) => pose.turnBy((TURN * right) / pixels(), (TURN * down) / pixels())),
       move: (right, down) => this.look((pose) => {
         const { lens, width } = this.grids.after;
         const across = Math.min(this.stage.clientWidth, this.stage.clientHeight * this.aspect);
