@@ -43,7 +43,7 @@ def cut(path):
 
 def spoil_camera(folder):
     info = json.loads((folder / "info.json").read_text())
-    (folder / "info.json").write_text(json.dumps({**info, "camera": {**info["camera"], "fx": -1}}))
+    (folder / "info.json").write_text(json.dumps({**info, "camera": {**info["camera"], "fx": 10**400}}))
 
 
 def test_what_upsample_writes_is_shown_with_photo_input_and_errors(tmp_path, opened, capsys):
@@ -142,6 +142,13 @@ def test_damaged_result_is_refused_on_one_line_and_nothing_is_written(tmp_path, 
     assert message in refused(capsys, view(folder))
     assert sorted(tmp_path.rglob("*")) == before
     assert opened == []
+
+
+def test_odd_values_in_info_json_do_not_matter(tmp_path):
+    folder = write_result(tmp_path / "r", assumptions=3, settings=[], noise="much", photo_size="large", method=None)
+    assert view(folder, "--no-open") == 0
+    (result,) = content(folder / "view.html")["results"]
+    assert (result["notes"], result["facts"]["photo"]) == ([], "unknown")
 
 
 def test_damaged_result_among_others_is_left_out_and_named(tmp_path, capsys):

@@ -105,7 +105,7 @@ def test_rendering_for_viewing_is_the_half_lambert_curve_of_its_light() -> None:
     normals = _normals(5)
     light = np.array([-0.4, -0.7, -np.sqrt(0.35)])
     cosine = (normals.numpy() * light[None, :, None, None]).sum(axis=1, keepdims=True)
-    expected = 0.06 + 0.9 * ((1 + cosine) / 2) ** 1.25
+    expected = 0.06 + 0.84 * ((1 + cosine) / 2) ** 1.25
     np.testing.assert_allclose(render_for_viewing(normals).numpy(), expected, rtol=0, atol=1e-14)
 
 

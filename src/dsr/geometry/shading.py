@@ -45,7 +45,7 @@ def render(normals: Tensor) -> Tensor:
 
 VIEWING_LIGHT = (-0.4, -0.7, -math.sqrt(1 - 0.4**2 - 0.7**2))
 """Unit vector towards a light at the upper left of the viewer, in the camera frame."""
-VIEWING_TONES = (0.06, 0.96, 1.25)
+VIEWING_TONES = (0.06, 0.9, 1.25)
 """Brightness of a surface that faces away from the light and of one that faces it, and the exponent between them."""
 
 

@@ -58,7 +58,8 @@ def read_result(folder: Path, name: str) -> ViewedResult:
     info = _read_info(folder / INFO)
     camera = _camera(folder / INFO, info)
     depth = _read_depth(folder, camera)
-    notes = [str(text) for text in info.get("assumptions") or ()]
+    said = info.get("assumptions")
+    notes = [str(text) for text in said] if isinstance(said, list) else []
     errors: tuple[np.ndarray, np.ndarray] | None = None
     if (folder / ERRORS).is_file():
         errors = _read_errors(folder / ERRORS, camera)
@@ -67,8 +68,6 @@ def read_result(folder: Path, name: str) -> ViewedResult:
         photo, depth_lr = read_input(folder / INPUT)
     except FileNotFoundError:
         notes.append(f"without {INPUT} there is neither the photo nor the input; the same `dsr upsample` again adds it")
-    settings = info.get("settings")
-    limit = settings.get("max_error") if isinstance(settings, dict) else None
     return ViewedResult(
         name=name,
         depth=depth,
@@ -77,7 +76,7 @@ def read_result(folder: Path, name: str) -> ViewedResult:
         depth_lr=depth_lr,
         depth_error=None if errors is None else errors[0],
         angle_error=None if errors is None else errors[1],
-        max_error=float(limit) if isinstance(limit, int | float) else LARGEST_ERROR,
+        max_error=_max_error(info.get("settings")),
         facts=_facts(info, depth),
         notes=notes,
     )
@@ -106,8 +105,14 @@ def _camera(path: Path, info: Mapping[str, Any]) -> Camera:
     """Return the camera of the photo."""
     try:
         return Camera(**info["camera"])
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise ValueError(f"{path}: expected the photo's camera under `camera`, got {info.get('camera')!r}") from error
+
+
+def _max_error(settings: Any) -> float:
+    """Return the expected error from which pixels are left out, as a fraction of the depth."""
+    limit = settings.get("max_error") if isinstance(settings, dict) else None
+    return float(limit) if isinstance(limit, int | float) and 0 < limit < 1e9 else LARGEST_ERROR
 
 
 def _read_depth(folder: Path, camera: Camera) -> np.ndarray:
