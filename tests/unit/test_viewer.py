@@ -14,7 +14,16 @@ from small_results import CAMERA, HOLE, waves
 
 from dsr.geometry.camera import Camera
 from dsr.geometry.mesh import triangulate
-from dsr.viewer.packing import Grid, error_levels, factor_for, pack_grid, reduce_depth, reduce_errors, reduce_mask
+from dsr.viewer.packing import (
+    Grid,
+    error_levels,
+    factor_for,
+    find_joints,
+    pack_grid,
+    reduce_depth,
+    reduce_errors,
+    reduce_mask,
+)
 from dsr.viewer.page import is_view, save_view
 from dsr.viewer.surfaces import ViewedResult, pack_result
 
@@ -36,8 +45,10 @@ def unpack(about, text):
     return inverse, planes[3], planes[4:]
 
 
-def grid(depth, camera=CAMERA, doubtful=None, **errors):
-    return Grid(depth.astype(float), camera, 1, np.zeros(depth.shape, bool) if doubtful is None else doubtful, errors)
+def grid(depth, doubtful=None):
+    doubtful = np.zeros(depth.shape, bool) if doubtful is None else doubtful
+    certain = find_joints(np.where(doubtful, np.nan, depth), 1)
+    return Grid(depth.astype(float), CAMERA, 1, find_joints(depth, 1), doubtful, certain, {})
 
 
 def faces_by(flags, inverse, right, below):
@@ -99,6 +110,26 @@ def test_flags_join_what_the_mesh_joins(kind):
     expected = faces_of(depth)
     assert len(expected) > 6000
     assert found == expected
+
+
+def test_reduced_surface_is_cut_where_the_whole_one_is():
+    _, u = np.mgrid[:60, :60] / 60
+    depth = 2 + 0.06 * np.sin(9 * u)  # bends by more than a cut allows from block to block, not from pixel to pixel
+    depth[30:, 20:40] += 0.5
+    across, down = find_joints(depth, 5)
+    expected_across, expected_down = np.ones((12, 11), bool), np.ones((11, 12), bool)
+    expected_across[6:, [3, 7]] = False
+    expected_down[5, 4:8] = False
+    np.testing.assert_array_equal(across, expected_across)
+    np.testing.assert_array_equal(down, expected_down)
+    assert not find_joints(reduce_depth(depth, 5), 1)[0][:6].all()
+
+
+def test_joints_do_not_depend_on_how_many_pixels_are_held_at_a_time(monkeypatch):
+    whole = find_joints(waves(), 3)
+    monkeypatch.setattr("dsr.viewer.packing._STRIP", 500)
+    for found, expected in zip(find_joints(waves(), 3), whole, strict=True):
+        np.testing.assert_array_equal(found, expected)
 
 
 def test_error_levels_are_logarithmic_between_the_ends():

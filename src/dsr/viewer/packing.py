@@ -19,12 +19,17 @@ import numpy as np
 from dsr.geometry.camera import Camera
 from dsr.geometry.mesh import LARGEST_STEP, find_connections
 
+Joints = tuple[np.ndarray, np.ndarray]
+"""Which pixels of an (h, w) map are joined: with their right neighbours, (h, w - 1), and those below, (h - 1, w)."""
+
 LEVELS = 2**24 - 1
 """Highest level of inverse depth; 1 is the lowest, 0 is a hole."""
 ERROR_LEVELS = 255
 """Highest level of an error; 1 is the lowest, 0 is unknown."""
 RIGHT, BELOW, RIGHT_WITH_DOUBTFUL, BELOW_WITH_DOUBTFUL, DOUBTFUL = 1, 2, 4, 8, 16
 """Flags of a pixel: joined to its right neighbour and to the one below, without and with doubtful pixels; doubtful."""
+_STRIP = 1 << 20
+"""Pixels whose joints are looked for at a time."""
 
 
 @dataclass(frozen=True)
@@ -35,7 +40,9 @@ class Grid:
         depth: (h, w) orthogonal depth in metres, NaN in holes.
         camera: of these pixels.
         factor: pixels of the whole map side by side in one of these.
+        joints: of these pixels.
         doubtful: (h, w) bool, pixels that the mesh leaves out.
+        certain: joints without doubtful pixels.
         errors: levels of the expected errors by name, (h, w) uint8 each.
 
     """
@@ -43,7 +50,9 @@ class Grid:
     depth: np.ndarray
     camera: Camera
     factor: int
+    joints: Joints
     doubtful: np.ndarray
+    certain: Joints
     errors: Mapping[str, np.ndarray]
 
 
@@ -92,6 +101,15 @@ def reduce_mask(mask: np.ndarray, factor: int) -> np.ndarray:
     return mask if factor == 1 else 2 * _blocks(mask, factor).sum(axis=-1) >= factor * factor
 
 
+def find_joints(depth: np.ndarray, factor: int) -> Joints:
+    """Return which blocks of a map, (H, W) in metres, a mesh of the whole map joins.
+
+    Two neighbouring blocks are joined if at least half of the rows (or columns) have no cut between the middles of the
+    two. Cuts found in the reduced map would be too many: the larger the pixels, the more a surface bends between them.
+    """
+    return _joined_along(depth, factor), _joined_along(depth.T, factor).T
+
+
 def error_levels(errors: np.ndarray, low: float, high: float) -> np.ndarray:
     """Return errors, (h, w), on a logarithmic scale as uint8: 1 is ``low`` or less, 255 ``high`` or more, 0 unknown."""
     known = np.isfinite(errors)
@@ -115,7 +133,7 @@ def pack_grid(grid: Grid) -> tuple[dict[str, Any], str]:
     levels = np.where(valid, 1 + np.rint(steps * (LEVELS - 1)), 0).astype(np.int64)
     rest = _unpredicted(levels)
     planes = [(rest >> shift & 255).astype(np.uint8) for shift in (16, 8, 0)]
-    planes += [_flags(grid, inverse), *grid.errors.values()]
+    planes += [_flags(grid), *grid.errors.values()]
     data = zlib.compress(b"".join(plane.tobytes() for plane in planes), 9)
     about = {
         "width": camera.width,
@@ -142,12 +160,29 @@ def _unpredicted(levels: np.ndarray) -> np.ndarray:
     return (levels - padded[1:, :-1] - padded[:-1, 1:] + padded[:-1, :-1]) & LEVELS
 
 
-def _flags(grid: Grid, inverse: np.ndarray) -> np.ndarray:
+def _flags(grid: Grid) -> np.ndarray:
     """Return the flags of the pixels, (h, w) uint8."""
     flags = np.where(grid.doubtful, DOUBTFUL, 0).astype(np.uint8)
-    certain = np.where(grid.doubtful, np.nan, inverse)
-    for values, right, below in ((certain, RIGHT, BELOW), (inverse, RIGHT_WITH_DOUBTFUL, BELOW_WITH_DOUBTFUL)):
-        across, down = find_connections(values)
-        flags[:, :-1] |= np.where(across, right, 0).astype(np.uint8)
-        flags[:-1] |= np.where(down, below, 0).astype(np.uint8)
+    valid = np.isfinite(grid.depth)
+    for (across, down), there, right, below in (
+        (grid.certain, valid & ~grid.doubtful, RIGHT, BELOW),
+        (grid.joints, valid, RIGHT_WITH_DOUBTFUL, BELOW_WITH_DOUBTFUL),
+    ):
+        flags[:, :-1] |= np.where(across & there[:, 1:] & there[:, :-1], right, 0).astype(np.uint8)
+        flags[:-1] |= np.where(down & there[1:] & there[:-1], below, 0).astype(np.uint8)
     return flags
+
+
+def _joined_along(depth: np.ndarray, factor: int) -> np.ndarray:
+    """Return which blocks of a map, (H, W), are joined with their right neighbours."""
+    height, width = depth.shape[0] // factor, depth.shape[1] // factor
+    joined = np.empty((height, width - 1), bool)
+    rows = max(1, _STRIP // (depth.shape[1] * factor))
+    for start in range(0, height, rows):
+        stop = min(start + rows, height)
+        across, _ = find_connections(1 / depth[start * factor : stop * factor].astype(np.float64))
+        broken = np.pad(np.cumsum(~across, axis=1), ((0, 0), (1, 0)))  # number of cuts left of each pixel
+        middles = factor // 2 + factor * np.arange(width)
+        whole = broken[:, middles[1:]] == broken[:, middles[:-1]]
+        joined[start:stop] = 2 * whole.reshape(stop - start, factor, width - 1).sum(axis=1) >= factor
+    return joined

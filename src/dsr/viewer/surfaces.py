@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -19,6 +19,7 @@ from dsr.viewer.packing import (
     Grid,
     error_levels,
     factor_for,
+    find_joints,
     pack_grid,
     reduce_depth,
     reduce_errors,
@@ -119,13 +120,15 @@ def _after(result: ViewedResult, vertices: int, limits: Mapping[str, tuple[float
     if result.depth_error is None or result.angle_error is None:
         return grid
     with np.errstate(invalid="ignore"):
-        doubtful = reduce_mask(result.depth_error > result.max_error * result.depth, grid.factor)
+        left_out = result.depth_error > result.max_error * result.depth
+    certain = find_joints(np.where(left_out, np.nan, result.depth), grid.factor) if left_out.any() else grid.joints
     known = np.isfinite(grid.depth)
     errors = {}
     for name, values in (("depth", result.depth_error), ("angle", result.angle_error)):
         fitted = np.where(known, reduce_errors(values, grid.factor), np.nan)
         errors[name] = error_levels(fitted, *limits[name])
-    return Grid(grid.depth, grid.camera, grid.factor, doubtful & known, errors)
+    doubtful = reduce_mask(left_out, grid.factor) & known
+    return replace(grid, doubtful=doubtful, certain=certain, errors=errors)
 
 
 def _reduce(depth: np.ndarray, camera: Camera, vertices: int) -> Grid:
@@ -134,7 +137,8 @@ def _reduce(depth: np.ndarray, camera: Camera, vertices: int) -> Grid:
     factor = factor_for(height, width, vertices)
     fitted = reduce_depth(depth, factor)
     own = camera if (camera.height, camera.width) == (height, width) else camera.rescale(width, height)
-    return Grid(fitted, own if factor == 1 else own.downscale(factor), factor, np.zeros(fitted.shape, bool), {})
+    joints = find_joints(depth, factor)
+    return Grid(fitted, own.downscale(factor), factor, joints, np.zeros(fitted.shape, bool), joints, {})
 
 
 def _pivot(depth: np.ndarray, camera: Camera, middle: float) -> list[float]:
