@@ -135,6 +135,17 @@ def browser() -> Iterator[Any]:
         started.close()
 
 
+@pytest.fixture(scope="session")
+def webgl_browser(browser: Any) -> Iterator[Any]:
+    """A headless Chromium that has WebGL, computed by the CPU."""
+    path = os.environ.get("DSR_CHROMIUM") or next(filter(None, map(shutil.which, CHROMIUMS)), None)
+    plain = [argument for argument in CHROMIUM_ARGUMENTS if argument != "--disable-gpu"]
+    graphics = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"]
+    started = browser.browser_type.launch(executable_path=path, args=plain + graphics)
+    yield started
+    started.close()
+
+
 @pytest.fixture
 def line_per_report(monkeypatch: pytest.MonkeyPatch) -> None:
     """Make commands print a line for each report of progress, as if seconds lay between them."""

@@ -24,6 +24,7 @@ PARTS = {
     "mesh": ("mesh.ply", "mesh.glb"),
     "before_after": ("before_after.png",),
     "confidence": ("confidence.png", "confidence.npz"),
+    "input": ("input.npz",),
 }
 BICUBIC = ("--method", "bicubic")
 DEPTH_ONLY = (*BICUBIC, "--only", "depth")

@@ -12,7 +12,7 @@ LAYERS = (
     ("dsr.data", "dsr.methods"),
     ("dsr.training", "dsr.evaluation", "dsr.inference", "dsr.io"),
     ("dsr.viz",),
-    ("dsr.doctor", "dsr.report", "dsr.user_study"),
+    ("dsr.doctor", "dsr.report", "dsr.user_study", "dsr.viewer"),
     ("dsr.app",),
     ("dsr.cli",),
 )

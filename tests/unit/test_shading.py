@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 from dsr.geometry.camera import Camera
-from dsr.geometry.shading import LIGHT_NAMES, lights, render, shade
+from dsr.geometry.shading import LIGHT_NAMES, lights, render, render_for_viewing, shade
 from dsr.geometry.surface import depth_to_normals
 
 PROTOCOL = -np.array(
@@ -76,3 +76,38 @@ def test_floor_is_lit_from_above_and_a_wall_on_the_right_from_the_left() -> None
 def test_lights_have_the_requested_precision() -> None:
     assert lights(dtype=torch.float32).dtype == torch.float32
     assert render(_normals(0).float()).dtype == torch.float32
+
+
+FLOOR, CEILING, WALL, FROM_LEFT, FROM_RIGHT = (0, -1, 0), (0, 1, 0), (0, 0, -1), (1, 0, 0), (-1, 0, 0)
+
+
+def _brightness(*normals: tuple[float, float, float]) -> np.ndarray:
+    vectors = torch.tensor(normals, dtype=torch.float64).T[None, :, None]
+    return render_for_viewing(vectors / vectors.norm(dim=1, keepdim=True))[0, 0, 0].numpy()
+
+
+def test_rendering_for_viewing_keeps_floor_walls_and_ceiling_apart_from_each_other_and_from_black_and_white() -> None:
+    shades = _brightness(FLOOR, WALL, FROM_RIGHT, FROM_LEFT, CEILING)
+    assert shades.max() < 0.9
+    assert shades.min() > 0.1
+    assert (np.diff(shades) < -0.04).all()  # floors are the brightest: the light is above
+
+
+def test_rendering_for_viewing_shows_a_tilt_of_two_degrees_on_floors_walls_and_ceilings() -> None:
+    tilt = np.tan(np.deg2rad(2))
+    for normal in (FLOOR, CEILING, WALL, FROM_LEFT, FROM_RIGHT):
+        tilted = [np.array(normal) + tilt * np.eye(3)[axis] for axis in range(3) if not normal[axis]]
+        steps = _brightness(normal, *map(tuple, tilted))
+        assert np.abs(steps[1:] - steps[0]).max() > 1.5 / 255
+
+
+def test_rendering_for_viewing_is_the_half_lambert_curve_of_its_light() -> None:
+    normals = _normals(5)
+    light = np.array([-0.4, -0.7, -np.sqrt(0.35)])
+    cosine = (normals.numpy() * light[None, :, None, None]).sum(axis=1, keepdims=True)
+    expected = 0.06 + 0.84 * ((1 + cosine) / 2) ** 1.25
+    np.testing.assert_allclose(render_for_viewing(normals).numpy(), expected, rtol=0, atol=1e-14)
+
+
+def test_rendering_for_viewing_keeps_holes() -> None:
+    assert bool(render_for_viewing(torch.full((1, 3, 2, 2), torch.nan)).isnan().all())

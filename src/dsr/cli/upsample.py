@@ -28,9 +28,9 @@ examples:
   dsr upsample recordings --dry-run -o out       what would be done, and what would be assumed
 
 The results of a single pair are in OUT, those of several in OUT/NAME: depth.* as the input is stored, depth_metres.npy,
-renderings/, normals.png, cloud.ply, mesh.ply, mesh.glb, before_after.png, confidence.png and confidence.npz, and
-info.json with all settings and assumptions. Run the same command again to continue after an interruption. More in
-docs/upsample.md.
+renderings/, normals.png, cloud.ply, mesh.ply, mesh.glb, before_after.png, confidence.png, confidence.npz,
+input.npz, and info.json with all settings and assumptions. Look at them with `dsr view OUT`. Run the same command again
+to continue after an interruption. More in docs/upsample.md.
 """
 
 
@@ -135,7 +135,7 @@ def _add_results(parser: argparse.ArgumentParser) -> None:
     results = parser.add_argument_group("what is written")
     results.add_argument("-o", "--output", type=Path, required=True, metavar="OUT", help="folder of the results")
     results.add_argument("--format", metavar="FORMAT", help="of the depth: png, tiff, npy, npz, pfm, exr (the input's)")
-    parts = "depth,renderings,normals,cloud,mesh,before_after,confidence"
+    parts = "depth,renderings,normals,cloud,mesh,before_after,confidence,input"
     chosen = results.add_mutually_exclusive_group()
     more = "rgbd,open3d,nerfstudio,gaussian,rerun"
     chosen.add_argument("--only", type=_words, metavar="PARTS", help=f"some of {parts},{more}")

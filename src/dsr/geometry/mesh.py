@@ -103,7 +103,7 @@ def vertex_normals(mesh: Mesh) -> np.ndarray:
 def _faces(inverse: np.ndarray, largest_step: float) -> np.ndarray:
     """Return the triangles of a map of inverse depth, (H, W), as (M, 3) indices into the flattened map."""
     height, width = inverse.shape
-    across, down = _connected(inverse, largest_step), _connected(inverse.T, largest_step).T
+    across, down = find_connections(inverse, largest_step)
     top, bottom, left, right = across[:-1], across[1:], down[:, :-1], down[:, 1:]
     falling = np.abs(inverse[:-1, :-1] - inverse[1:, 1:])  # from the upper left pixel to the lower right one
     rising = np.abs(inverse[1:, :-1] - inverse[:-1, 1:])
@@ -118,6 +118,20 @@ def _faces(inverse: np.ndarray, largest_step: float) -> np.ndarray:
         (~first & bottom & right, (lower_left, lower_right, upper_right)),
     )
     return np.concatenate([np.stack([corner[where] for corner in corners], axis=1) for where, corners in choices])
+
+
+def find_connections(inverse: np.ndarray, largest_step: float = LARGEST_STEP) -> tuple[np.ndarray, np.ndarray]:
+    """Return which neighbouring pixels lie on one surface, those that a mesh joins.
+
+    Args:
+        inverse: (H, W) inverse depth in 1/m, NaN in holes.
+        largest_step: see :func:`triangulate`.
+
+    Returns:
+        Whether each pixel and its right neighbour do, (H, W - 1) bool, and each pixel and the one below, (H - 1, W).
+
+    """
+    return _connected(inverse, largest_step), _connected(inverse.T, largest_step).T
 
 
 def _connected(inverse: np.ndarray, largest_step: float) -> np.ndarray:

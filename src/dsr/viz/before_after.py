@@ -17,7 +17,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from dsr.geometry.camera import Camera
-from dsr.geometry.shading import lights
+from dsr.geometry.shading import render_for_viewing
 from dsr.io.exports import normal_strips
 from dsr.viz.panels import colours, limits_of, reduced, strongest_window, write_figure
 
@@ -31,7 +31,6 @@ _LONGEST = 1536
 _DETAIL = 4
 """The detail is 1/4 of the picture wide and high."""
 _FRAME = "#ff8c00"
-_LIGHT = 0
 _ROWS = ("lit from above", "detail", "normals | depth")
 
 
@@ -48,10 +47,11 @@ _WHOLE = _Part(0, 1, 0, 1)
 
 
 def write_before_after(path: Path, rgb: Tensor, depth_lr: Tensor, depth: Tensor, camera: Camera, title: str) -> None:
-    """Draw the photo, the input and the result, both as a surface under light e1 and as depth.
+    """Draw the photo, the input and the result, both as a surface lit from above and as depth.
 
-    The input is rendered at its own resolution, without interpolation. The detail is the window in which the two
-    renderings differ most. The picture is at most 2400 pixels wide.
+    The input is rendered at its own resolution, without interpolation, and both by
+    :func:`dsr.geometry.shading.render_for_viewing`. The detail is the window in which the two renderings differ most.
+    The picture is at most 2400 pixels wide.
 
     Args:
         path: PNG file, written atomically.
@@ -66,8 +66,8 @@ def write_before_after(path: Path, rgb: Tensor, depth_lr: Tensor, depth: Tensor,
 
     """
     normals = _normals(depth, camera)
-    before = _render_light(_normals(depth_lr, camera.rescale(depth_lr.shape[-1], depth_lr.shape[-2])))
-    after = _render_light(normals)
+    before = render_for_viewing(_normals(depth_lr, camera.rescale(depth_lr.shape[-1], depth_lr.shape[-2]))[None])[0]
+    after = render_for_viewing(normals[None])[0]
     part = _detail(before, after)
     size, size_lr = (f"{each.shape[-1]} x {each.shape[-2]}" for each in (depth, depth_lr))
     sheet = _Sheet(camera.height / camera.width, title)
@@ -93,12 +93,6 @@ def _normals(depth: Tensor, camera: Camera) -> Tensor:
     for rows, part in normal_strips(depth, camera):
         normals[:, rows] = part
     return normals
-
-
-def _render_light(normals: Tensor) -> Tensor:
-    """Render normals under the light, (1, H, W)."""
-    x, y, z = lights()[_LIGHT].tolist()
-    return (x * normals[:1] + y * normals[1:2] + z * normals[2:]).clamp(0, 1)
 
 
 def _detail(before: Tensor, after: Tensor) -> _Part:

@@ -21,6 +21,7 @@ from dsr.geometry.shading import LIGHT_NAMES
 from dsr.io.depth_files import DEPTH_SUFFIXES, write_depth_file
 from dsr.io.encoding import Assumption, Encoding, encode
 from dsr.io.exports import Written, write_cloud, write_mesh, write_normals, write_renderings
+from dsr.io.input_files import INPUT, write_input
 from dsr.io.inputs import Picture
 from dsr.io.scene_files.open3d import RGBD, write_rgbd
 from dsr.methods.base import Surface
@@ -28,7 +29,7 @@ from dsr.utils.files import replacing, write_text
 from dsr.viz.before_after import write_before_after
 from dsr.viz.confidence import write_confidence
 
-PARTS = ("depth", "renderings", "normals", "cloud", "mesh", "before_after", "confidence")
+PARTS = ("depth", "renderings", "normals", "cloud", "mesh", "before_after", "confidence", "input")
 """What is written unless something else is asked for."""
 MORE_PARTS = ("rgbd", "open3d", "nerfstudio", "gaussian", "rerun")
 """What is written if it is asked for; all but the first are of all frames, see :mod:`dsr.app.upsample.scene`."""
@@ -45,6 +46,7 @@ _FILES: Mapping[str, tuple[str, ...]] = {
     "before_after": ("before_after.png",),
     "confidence": ("confidence.png", ERRORS),
     "rgbd": tuple(f"rgbd/{name}" for name in RGBD),
+    "input": (INPUT,),
 }
 _WORTH_SAYING = 1e-3
 """Smallest fraction of the pixels that is reported as left out."""
@@ -173,6 +175,8 @@ def write_parts(
         facts += notes
     if "before_after" in parts:
         write_before_after(folder / "before_after.png", rgb, picture.depth_lr, depth, camera, title)
+    if "input" in parts:
+        write_input(folder / INPUT, rgb, picture.depth_lr)
     if "confidence" in parts and not _write_errors(folder, surface):
         parts = [part for part in parts if part != "confidence"]
     if "rgbd" in parts:

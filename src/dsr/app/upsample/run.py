@@ -163,7 +163,7 @@ class _Job:
         if not self.reusable or self.earlier is None:
             return False
         there = {name.split("/")[0].split(".")[0] for name in self.earlier.files if (self.target / name).is_file()}
-        return there >= set(self.request.parts)
+        return there >= set(self.request.wanted)
 
 
 def _one(

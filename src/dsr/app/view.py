@@ -1,0 +1,111 @@
+"""The command behind ``dsr view``: one page of a result, or of a folder of results."""
+
+from __future__ import annotations
+
+import webbrowser
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from rich.console import Console
+
+from dsr.app.upsample.reporting import problem_line
+from dsr.app.upsample.stored import find_results, read_result
+from dsr.utils.console import ConsoleProgress, show
+from dsr.utils.units import megabytes
+from dsr.viewer.page import is_view, save_view
+from dsr.viewer.surfaces import Packed, pack_result
+
+_WHOLE_PAGE = 6
+"""The page has at most this many times the vertices of one surface."""
+_PHOTO, _SMALL_PHOTO, _FEW = 2048, 1024, 4
+"""Longer side of the photos on a page of at most ``_FEW`` results, and of more, pixels."""
+
+
+@dataclass(frozen=True)
+class ViewRequest:
+    """What to look at.
+
+    Args:
+        output: a result, or a folder of results.
+        page: the HTML file.
+        most: maximum number of results.
+        vertices: maximum number of vertices of a surface.
+        open_page: whether to open the page in the browser.
+
+    """
+
+    output: Path
+    page: Path
+    most: int
+    vertices: int
+    open_page: bool
+
+    def __post_init__(self) -> None:
+        """Check the numbers."""
+        if self.most < 1:
+            raise ValueError(f"--most: expected at least 1, got {self.most}")
+        if self.vertices < 1000:
+            raise ValueError(f"--vertices: expected at least 1000, got {self.vertices}")
+
+
+def view(request: ViewRequest, console: Console) -> list[str]:
+    """Write the page and open it.
+
+    Returns:
+        The problems, one line each; results that cannot be read are left out.
+
+    Raises:
+        ValueError: there is no result, none can be read, or the page would replace another file.
+
+    """
+    if request.page.exists() and not (request.page.is_file() and is_view(request.page)):
+        raise ValueError(f"{request.page}: is there already and no page of `dsr view`; take another -o")
+    folders = find_results(request.output)
+    chosen = [folders[at] for at in _spread(len(folders), request.most)]
+    packed, problems = _pack(request, chosen, console)
+    if not packed:
+        raise ValueError("; ".join(problems))
+    notes = []
+    if len(chosen) < len(folders):
+        notes.append(f"{len(chosen)} of {len(folders)} results, taken at equal distances; --most N shows more.")
+    if problems:
+        notes.append(f"{len(problems)} of {len(chosen)} results could not be read and are left out.")
+    name = request.output.resolve().name
+    save_view(request.page, packed, title=f"{name}: depth before and after", notes=notes)
+    for note in notes:
+        show(console, f"  {note}")
+    show(console, _summary(request.page, packed))
+    if request.open_page and not webbrowser.open(request.page.resolve().as_uri()):
+        show(console, "there is no browser to open it with; open it yourself, or copy it to where there is one")
+    return problems
+
+
+def _pack(request: ViewRequest, folders: Sequence[Path], console: Console) -> tuple[list[Packed], list[str]]:
+    """Return the packed results, and what is wrong with the others."""
+    each = min(request.vertices, _WHOLE_PAGE * request.vertices // len(folders))
+    photo_side = _PHOTO if len(folders) <= _FEW else _SMALL_PHOTO
+    packed: list[Packed] = []
+    problems: list[str] = []
+    for folder in ConsoleProgress(console).track(folders, "read", label=lambda path: path.name, lines=False):
+        name = "/".join(folder.relative_to(request.output).parts) or request.output.resolve().name
+        try:
+            packed.append(pack_result(read_result(folder, name), each, photo_side))
+        except (ValueError, OSError, MemoryError) as error:
+            problems.append(problem_line(error))
+    return packed, problems
+
+
+def _spread(count: int, most: int) -> list[int]:
+    """Return at most ``most`` of the numbers below ``count``, at equal distances, the first and the last among them."""
+    return sorted({int(at) for at in np.linspace(0, count - 1, min(count, most)).round()})
+
+
+def _summary(page: Path, packed: Sequence[Packed]) -> str:
+    """Return what was written, and how surfaces were reduced."""
+    count = "1 result" if len(packed) == 1 else f"{len(packed)} results"
+    largest = max(each.vertices for each in packed)
+    factors = sorted({each.about["after"]["factor"] for each in packed})
+    reduced = "" if factors == [1] else f", maps reduced by {' or '.join(map(str, factors))} each way"
+    return f"{count}, at most {largest:,} vertices each{reduced}, {megabytes(page.stat().st_size)} -> {page}"

@@ -1,0 +1,233 @@
+"""What `dsr view` stores of surfaces: read back by other means, and compared with dsr's own mesh."""
+
+import base64
+import hashlib
+import json
+import math
+import re
+import zlib
+
+import numpy as np
+import pytest
+import torch
+from small_results import CAMERA, HOLE, waves
+
+from dsr.geometry.camera import Camera
+from dsr.geometry.mesh import triangulate
+from dsr.viewer.packing import (
+    Grid,
+    error_levels,
+    factor_for,
+    find_joints,
+    pack_grid,
+    reduce_depth,
+    reduce_errors,
+    reduce_mask,
+)
+from dsr.viewer.page import is_view, save_view
+from dsr.viewer.surfaces import ViewedResult, pack_result
+
+SPITEFUL = "<img src=x onerror=alert(1)>\"'&</script><script>alert(2)</script>"
+
+
+def unpack(about, text):
+    """Return inverse depth (NaN in holes), flags and error levels, pixel by pixel as the page's script does."""
+    height, width = about["height"], about["width"]
+    planes = np.frombuffer(zlib.decompress(base64.b64decode(text)), np.uint8).reshape(-1, height, width).astype(int)
+    rest = (planes[0] << 16) + (planes[1] << 8) + planes[2]
+    levels = np.zeros((height + 1, width + 1), int)
+    for v in range(height):
+        for u in range(width):
+            levels[v + 1, u + 1] = (rest[v, u] + levels[v + 1, u] + levels[v, u + 1] - levels[v, u]) % 2**24
+    levels = levels[1:, 1:]
+    low, high = about["range"]
+    inverse = np.where(levels == 0, np.nan, low + (levels - 1) / (about["levels"] - 1) * (high - low))
+    return inverse, planes[3], planes[4:]
+
+
+def grid(depth, doubtful=None):
+    doubtful = np.zeros(depth.shape, bool) if doubtful is None else doubtful
+    certain = find_joints(np.where(doubtful, np.nan, depth), 1)
+    return Grid(depth.astype(float), CAMERA, 1, find_joints(depth, 1), doubtful, certain, {})
+
+
+def faces_by(flags, inverse, right, below):
+    """Return the triangles that the flags allow, as sets of three pixels."""
+    height, width = inverse.shape
+    found = set()
+    change = lambda i, j: np.nan_to_num(abs(inverse.flat[i] - inverse.flat[j]), nan=np.inf)  # noqa: E731
+    for v in range(height - 1):
+        for u in range(width - 1):
+            a, c = v * width + u, (v + 1) * width + u
+            b, d = a + 1, c + 1
+            top, left = flags[v, u] & right, flags[v, u] & below
+            bottom, end = flags[v + 1, u] & right, flags[v, u + 1] & below
+            if not change(a, d) > change(c, b):
+                found |= {(a, c, d)} if left and bottom else set()
+                found |= {(a, d, b)} if top and end else set()
+            else:
+                found |= {(a, c, b)} if left and top else set()
+                found |= {(c, d, b)} if bottom and end else set()
+    return {tuple(sorted(face)) for face in found}
+
+
+def faces_of(depth, camera=CAMERA):
+    mesh = triangulate(torch.from_numpy(depth)[None].double(), camera)
+    return {tuple(sorted(mesh.pixels[face])) for face in mesh.faces}
+
+
+def test_inverse_depth_is_read_back_to_24_bits():
+    depth = waves()
+    inverse, _, _ = unpack(*pack_grid(grid(depth)))
+    np.testing.assert_array_equal(np.isnan(inverse), np.isnan(depth))
+    expected = 1 / depth.astype(float)
+    step = (np.nanmax(expected) - np.nanmin(expected)) / (2**24 - 2)
+    assert np.nanmax(np.abs(inverse - expected)) <= 0.51 * step
+
+
+def test_map_of_one_depth_is_read_back():
+    inverse, _, _ = unpack(*pack_grid(grid(np.full((64, 64), 3.0))))
+    np.testing.assert_allclose(inverse, 1 / 3, rtol=1e-9)
+
+
+def test_plane_takes_few_bytes():
+    v, u = np.mgrid[:64, :64]
+    _, text = pack_grid(grid(1 / (0.2 + 0.003 * u + 0.002 * v)))
+    assert len(text) < 64 * 64
+
+
+@pytest.mark.parametrize("kind", ["certain", "all"])
+def test_flags_join_what_the_mesh_joins(kind):
+    depth = waves()
+    doubtful = np.zeros(depth.shape, bool)
+    doubtful[5:9, 30:50] = True
+    inverse, flags, _ = unpack(*pack_grid(grid(depth, doubtful=doubtful)))
+    np.testing.assert_array_equal(flags & 16 > 0, doubtful)
+    if kind == "certain":
+        inverse = np.where(doubtful, np.nan, inverse)
+        depth = np.where(doubtful, np.nan, depth)
+    found = faces_by(flags, inverse, *((1, 2) if kind == "certain" else (4, 8)))
+    expected = faces_of(depth)
+    assert len(expected) > 6000
+    assert found == expected
+
+
+def test_reduced_surface_is_cut_where_the_whole_one_is():
+    _, u = np.mgrid[:60, :60] / 60
+    depth = 2 + 0.06 * np.sin(9 * u)  # bends by more than a cut allows from block to block, not from pixel to pixel
+    depth[30:, 20:40] += 0.5
+    across, down = find_joints(depth, 5)
+    expected_across, expected_down = np.ones((12, 11), bool), np.ones((11, 12), bool)
+    expected_across[6:, [3, 7]] = False
+    expected_down[5, 4:8] = False
+    np.testing.assert_array_equal(across, expected_across)
+    np.testing.assert_array_equal(down, expected_down)
+    assert not find_joints(reduce_depth(depth, 5), 1)[0][:6].all()
+
+
+def test_joints_do_not_depend_on_how_many_pixels_are_held_at_a_time(monkeypatch):
+    whole = find_joints(waves(), 3)
+    monkeypatch.setattr("dsr.viewer.packing._STRIP", 500)
+    for found, expected in zip(find_joints(waves(), 3), whole, strict=True):
+        np.testing.assert_array_equal(found, expected)
+
+
+def test_error_levels_are_logarithmic_between_the_ends():
+    values = np.array([[0.0, 1.0, math.sqrt(60), 60, 1e9, np.nan]])
+    assert error_levels(values, 1, 60).tolist() == [[1, 1, 128, 255, 255, 0]]
+
+
+@pytest.mark.parametrize(
+    ("size", "most", "factor"),
+    [((1440, 1920), 500_000, 3), ((480, 640), 307_200, 1), ((480, 640), 307_199, 2), ((4, 100_000), 10, 2)],
+)
+def test_factor_is_the_smallest_that_keeps_the_limit(size, most, factor):
+    assert factor_for(*size, most) == factor
+
+
+def test_reduced_plane_is_the_plane_seen_by_the_reduced_camera():
+    camera = Camera(30, 21, 40.0, 42.0, 14.0, 9.0)
+    inverse_of = lambda camera: 0.3 + (camera.rays()[0] * 0.2 + camera.rays()[1] * 0.1).numpy()  # noqa: E731
+    found = reduce_depth(1 / inverse_of(camera), 3)
+    np.testing.assert_allclose(1 / found, inverse_of(camera.downscale(3)), rtol=1e-12)
+
+
+def test_reduction_does_not_mix_surfaces_and_keeps_holes():
+    depth = np.full((12, 12), 2.0)
+    depth[:, 7:] = 3.0
+    depth[:5, :5] = np.nan
+    found = reduce_depth(depth, 3)
+    assert set(found[np.isfinite(found)].round(12)) == {2.0, 3.0}
+    assert np.isnan(found).tolist()[0] == [True, True, False, False]  # of the second block six pixels are holes
+    assert not np.isnan(found[2:]).any()
+
+
+def test_reduced_errors_are_the_mean_of_the_known_ones():
+    errors = np.array([[1.0, 3, np.nan, np.nan], [5, np.nan, np.nan, np.nan]])
+    np.testing.assert_array_equal(reduce_errors(errors, 2), [[3, np.nan]])
+
+
+def test_reduced_mask_is_where_half_of_a_block_is():
+    mask = np.array([[1, 1, 1, 0], [0, 0, 0, 0]]) > 0
+    assert reduce_mask(mask, 2).tolist() == [[True, False]]
+
+
+def result(name="r", **values):
+    depth = waves()
+    errors = {"depth_error": np.full(depth.shape, 0.01, np.float32), "angle_error": np.full(depth.shape, 8.0)}
+    errors["depth_error"][:, :10] = 0.1
+    return ViewedResult(name, depth, CAMERA, **({**errors, "max_error": 0.02} | values))
+
+
+def test_pixels_with_a_large_expected_error_are_doubtful():
+    packed = pack_result(result(), 10**6, 512)
+    _, flags, errors = unpack(packed.about["after"], packed.data["after"])
+    doubtful = np.zeros((64, 64), bool)
+    doubtful[:, :10] = True
+    doubtful[HOLE] = False
+    np.testing.assert_array_equal(flags & 16 > 0, doubtful)
+    assert packed.about["doubtful"] == doubtful.mean()
+    assert set(errors[0][HOLE].ravel()) == {0}
+    middle = float(np.nanmedian(waves()))
+    assert packed.about["errors"]["depth"] == {"low": 1e-3 * middle, "high": 1e-1 * middle}
+    assert errors[0][0, 63] == round(1 + 254 * math.log(0.01 / (1e-3 * middle)) / math.log(100))
+
+
+def test_large_result_is_reduced_and_says_so():
+    packed = pack_result(result(), 1024, 512)
+    about = packed.about["after"]
+    assert (about["width"], about["height"], about["factor"], about["size"]) == (32, 32, 2, [64, 64])
+    assert packed.vertices == 1024
+    inverse, _, _ = unpack(about, packed.data["after"])
+    blocks = 1 / waves().reshape(32, 2, 32, 2).astype(float)
+    np.testing.assert_allclose(inverse[:10, :10], blocks.mean(axis=(1, 3))[:10, :10], rtol=1e-6)
+    assert about["lens"] == pytest.approx([40, 40, 15.25, 16.0])
+
+
+def test_input_keeps_its_own_size_and_camera():
+    packed = pack_result(result(depth_lr=waves()[::4, ::4]), 10**6, 512)
+    about = packed.about["before"]
+    assert (about["width"], about["height"], about["errors"]) == (16, 16, [])
+    assert about["lens"] == pytest.approx([20, 20, (31 + 0.5) / 4 - 0.5, (32.5 + 0.5) / 4 - 0.5])
+
+
+def test_page_asks_nobody_and_escapes_every_name(tmp_path):
+    packed = [pack_result(result(SPITEFUL, notes=[SPITEFUL], facts={SPITEFUL: SPITEFUL}), 10**6, 512)]
+    save_view(tmp_path / "page.html", packed, title=SPITEFUL, notes=[SPITEFUL])
+    text = (tmp_path / "page.html").read_text()
+    assert is_view(tmp_path / "page.html")
+    assert "<img src=x" not in text
+    assert "alert(2)</script>" not in text
+    assert not re.search(r"""(src|href)\s*=\s*["']?(https?:)?//""", text)
+    content = json.loads(re.search(r'id="content">(.*?)</script>', text, re.DOTALL)[1])
+    assert (content["results"][0]["name"], content["title"]) == (SPITEFUL, SPITEFUL)
+    for tag, source in (("style", "style-src"), ("script", "script-src")):
+        inner = re.findall(rf"<{tag}>(.*?)</{tag}>", text, re.DOTALL)[-1]
+        digest = base64.b64encode(hashlib.sha256(inner.encode()).digest()).decode()
+        assert f"{source} 'sha256-{digest}'" in text
+    assert 'alt="&lt;img' in text
+
+
+def test_page_says_that_another_file_is_none_of_its_kind(tmp_path):
+    (tmp_path / "page.html").write_text("<!DOCTYPE html><p>mine</p>")
+    assert not is_view(tmp_path / "page.html")
