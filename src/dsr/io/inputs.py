@@ -17,6 +17,7 @@ from dsr.io.encoding import Assumption, Encoding, decode, find_holes, guess_unit
 from dsr.io.names import words_of
 from dsr.io.pairs import Pair
 from dsr.io.photos import Size, read_photo, same_aspect
+from dsr.io.rigs import RigFiles, read_rig, to_photo
 
 _DISPARITY_WORDS = frozenset({"disparity", "disp"})
 
@@ -31,6 +32,8 @@ class Reading:
         range_type: quantity that the values measure.
         baseline: distance in metres between the two cameras of disparities.
         hole_value: value that stands for a hole, in addition to the usual ones.
+        rig: depth camera elsewhere than the photo's, whose map is to be warped into the photo's view; None where the
+            depth map is registered.
 
     """
 
@@ -39,6 +42,7 @@ class Reading:
     range_type: RangeType | None = None
     baseline: float | None = None
     hole_value: float | None = None
+    rig: RigFiles | None = None
 
 
 @dataclass(frozen=True)
@@ -51,6 +55,8 @@ class Picture:
         camera: camera of the photo's pixels.
         encoding: encoding of the depth file.
         assumptions: assumptions about the files.
+        pose: from camera to world, (4, 4) float64 in metres, of a camera with the axes x right, y down, z forward, in
+            the world of the capture; None where there is none.
 
     """
 
@@ -59,6 +65,7 @@ class Picture:
     camera: Camera
     encoding: Encoding
     assumptions: tuple[Assumption, ...]
+    pose: np.ndarray | None = None
 
 
 UnitMemory = dict[tuple[Path, str, str], tuple[float, list[Assumption]]]
@@ -83,7 +90,9 @@ def read_picture(pair: Pair, reading: Reading, units: UnitMemory) -> Picture:
     described, camera_assumptions = _camera(pair, reading, (pixels.shape[0], pixels.shape[1]), size_lr)
     pixels, crop_assumptions = _crop_to_multiple(pixels, pair.factor, size_lr)
     size: Size = (pixels.shape[0], pixels.shape[1])
-    _expect_lower_resolution(pair, size, size_lr)
+    rig = None if reading.rig is None else read_rig(reading.rig, size_lr, reading.baseline)
+    if rig is None:
+        _expect_lower_resolution(pair, size, size_lr)
     camera = described.camera.crop(0, 0, *size)
     if reading.baseline is not None:
         camera = replace(camera, baseline=reading.baseline)
@@ -96,7 +105,8 @@ def read_picture(pair: Pair, reading: Reading, units: UnitMemory) -> Picture:
     range_type, range_assumptions = _range_type(pair, reading, described, camera)
     unit, unit_assumptions = _unit(pair, reading, described, range_type, stored, holes, units)
     encoding = Encoding(pair.depth.suffix.lower(), str(stored.dtype), unit, mark, range_type)
-    depth_lr = decode(stored, holes, encoding, camera.rescale(size_lr[1], size_lr[0]))
+    of_depth = camera.rescale(size_lr[1], size_lr[0]) if rig is None else rig.camera
+    depth_lr = decode(stored, holes, encoding, of_depth)
     if not bool(depth_lr.isfinite().any()):
         raise ValueError(f"{pair.depth}: expected at least one disparity above 0, got none")
     rgb = torch.from_numpy(np.ascontiguousarray(pixels.transpose(2, 0, 1))).float() / 255
@@ -108,6 +118,9 @@ def read_picture(pair: Pair, reading: Reading, units: UnitMemory) -> Picture:
         *unit_assumptions,
         *hole_assumptions,
     )
+    if rig is not None:
+        depth_lr, warped = to_photo(depth_lr, rig, camera)
+        all_assumptions = (*all_assumptions, warped)
     return Picture(rgb, depth_lr, camera, encoding, all_assumptions)
 
 

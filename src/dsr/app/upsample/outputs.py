@@ -261,12 +261,13 @@ def finish(folder: Path, earlier: PreviousRun | None, entries: Mapping[str, Any]
 
 
 def described(picture: Picture, encoding: Encoding) -> dict[str, Any]:
-    """Return the sizes, the camera and the files' encodings for ``info.json``."""
+    """Return the sizes, the camera with its pose, and the files' encodings for ``info.json``."""
     return {
         "photo_size": [picture.camera.width, picture.camera.height],
         "input_size": [picture.depth_lr.shape[-1], picture.depth_lr.shape[-2]],
         "input_holes": round(1 - float(picture.depth_lr.isfinite().float().mean()), 6),
         "camera": asdict(picture.camera),
+        "pose": None if picture.pose is None else picture.pose.tolist(),
         "input_depth": _plain(picture.encoding),
         "depth_file": _plain(encoding),
     }

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -32,6 +32,9 @@ class UpsampleRequest:
         method, settings, directories, scale, device, keep_holes: see :func:`dsr.inference.upsample_depth`.
         max_error: expected relative error of the depth from which a pixel is left out of cloud and mesh.
         depth_format: the result's format; None for the input's.
+        register: whether to move each depth map to the photo's edges.
+        neighbours: number of frames beside itself that vote on each frame's depth.
+        poses: file of the frames' poses; None for those of the capture.
         parts: what to write, some of :data:`dsr.app.upsample.outputs.PARTS`.
         overwrite: whether to replace existing results.
         dry_run: whether to show only what would be done.
@@ -52,6 +55,9 @@ class UpsampleRequest:
     keep_holes: bool = False
     max_error: float = LARGEST_ERROR
     depth_format: str | None = None
+    register: bool = False
+    neighbours: int = 0
+    poses: Path | None = None
     parts: tuple[str, ...] = PARTS
     overwrite: bool = False
     dry_run: bool = False
@@ -75,6 +81,10 @@ class UpsampleRequest:
             raise ValueError("--mask: expected --rgb and --depth with it, got folders")
         if not self.max_error > 0:
             raise ValueError(f"--max-error: expected a positive percentage of the depth, got {100 * self.max_error:g}")
+        if self.neighbours < 0:
+            raise ValueError(f"--neighbours: expected 0 or a positive number of frames, got {self.neighbours}")
+        if self.poses is not None and len(self.folders) > 1:
+            raise ValueError(f"--poses: expected the frames of one folder, got {len(self.folders)} folders")
         self._check_method()
 
     @functools.cached_property
@@ -104,6 +114,7 @@ def settings_of(request: UpsampleRequest) -> dict[str, Any]:
     """Return the settings that a result depends on, as values for JSON."""
     reading = asdict(request.reading)
     choice = reading.pop("camera")
+    rig = reading.pop("rig")
     return {
         "method": request.method,
         "scale": request.scale,
@@ -113,6 +124,9 @@ def settings_of(request: UpsampleRequest) -> dict[str, Any]:
         **reading,
         "fov": choice["fov"],
         "intrinsics": None if choice["intrinsics"] is None else list(choice["intrinsics"]),
+        **({"registered_by": "extrinsics"} if rig is not None else {}),
+        **({"register": True} if request.register else {}),
+        **({"neighbours": request.neighbours} if request.neighbours else {}),
         **({"set": dict(request.settings)} if request.settings else {}),
         **({"code": code} if (code := hash_outside_code(_targets(request))) else {}),
     }
@@ -130,6 +144,8 @@ def files_of(pair: Pair, reading: Reading) -> dict[str, Path]:
     given = reading.camera.fov is not None or reading.camera.intrinsics is not None
     camera = reading.camera.file or (None if given else pair.camera)
     found = {"rgb": pair.rgb, "depth": pair.depth, "camera": camera, "mask": pair.mask}
+    if reading.rig is not None:
+        found |= {"depth_camera": reading.rig.camera, "extrinsics": reading.rig.extrinsics}
     return {name: path for name, path in found.items() if path is not None}
 
 
@@ -140,4 +156,17 @@ def inputs_of(pair: Pair, reading: Reading) -> dict[str, dict[str, str]]:
         if not path.is_file():
             raise ValueError(f"{path}: there is no such file")
         inputs[name] = {"file": path.name, "sha256": file_hash(path)}
+    return inputs
+
+
+def inputs_with_neighbours(
+    request: UpsampleRequest, pair: Pair, neighbours: Sequence[Pair]
+) -> dict[str, dict[str, str]]:
+    """Return the inputs of a frame, its neighbours and its pose, and their hashes, as values for JSON."""
+    inputs = inputs_of(pair, request.reading)
+    for number, other in enumerate(neighbours, 1):
+        inputs |= {f"neighbour_{number}_{name}": each for name, each in inputs_of(other, request.reading).items()
+                   if name not in ("rgb", "depth_camera", "extrinsics")}  # fmt: skip
+    if request.poses is not None:
+        inputs["poses"] = {"file": request.poses.name, "sha256": file_hash(request.poses)}
     return inputs
