@@ -1,6 +1,6 @@
 """What ``dsr upsample --register`` finds on a pair of photo and depth map, as a picture of the edges before and after.
 
-    python benchmarks/registration.py --rgb PHOTO --depth MAP [--depth-unit UNIT] --picture FILE.jpg
+python benchmarks/registration.py --rgb PHOTO --depth MAP [--depth-unit UNIT] --picture FILE.jpg
 """
 
 from __future__ import annotations

@@ -7,13 +7,14 @@ from collections.abc import Mapping, Sequence
 
 from rich.console import Console
 
-from dsr.cli import data, doctor, hydra_commands, report, study, upsample
+from dsr.cli import data, doctor, fuse, hydra_commands, report, study, upsample
 from dsr.data.download.catalogue import CATALOGUE, Collection
 from dsr.utils.console import INTERRUPTED, USAGE_ERROR, one_line, open_console, print_error, show
 
 _EXAMPLES = """\
 examples:
   dsr upsample --rgb photo.jpg --depth depth.png -o out    high-resolution depth, mesh and pictures
+  dsr fuse out -o mesh.ply                                 one mesh of the results of a sequence with poses
   dsr eval method=facets dataset=simgeo scale=8            evaluate a method; more with dsr eval --help
   dsr train model=facets trainer=smoke                     train a network; more with dsr train --help
   dsr report outputs/eval -o report                        tables, figures and a page of all evaluations
@@ -25,7 +26,7 @@ examples:
 
 In a checkout of the project, `python eval.py` and `python train.py` are the same as `dsr eval` and `dsr train`.
 """
-_COMMANDS = (upsample, hydra_commands, report, study, data, doctor)
+_COMMANDS = (upsample, fuse, hydra_commands, report, study, data, doctor)
 
 
 def main(arguments: Sequence[str] | None = None, catalogue: Mapping[str, Collection] | None = None) -> int:

@@ -170,7 +170,9 @@ def _rig(options: argparse.Namespace) -> Any:
     from dsr.io.rigs import RigFiles  # noqa: PLC0415 - it takes seconds to import
 
     if (options.depth_camera is None) != (options.extrinsics is None):
-        given, missing = ("--extrinsics", "--depth-camera") if options.extrinsics else ("--depth-camera", "--extrinsics")
+        given, missing = (
+            ("--extrinsics", "--depth-camera") if options.extrinsics else ("--depth-camera", "--extrinsics")
+        )
         raise ValueError(f"{given}: expected {missing} with it")
     return None if options.depth_camera is None else RigFiles(options.depth_camera, options.extrinsics)
 

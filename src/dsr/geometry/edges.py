@@ -195,7 +195,7 @@ def sum_by_tile(
         ndimage.map_coordinates(gradient, places + np.array(shift)[:, None], order=1, mode="constant")
         for places, gradient in zip((edges.right, edges.below), gradients, strict=True)
     ]
-    return np.bincount(tiles, np.concatenate(found))
+    return np.asarray(np.bincount(tiles, np.concatenate(found)), dtype=np.float64)
 
 
 def standard_errors(gains: Array) -> float:

@@ -48,7 +48,9 @@ def _with_rotation(matrix: Matrix, name: str) -> Matrix:
     error = float(np.abs(turn @ turn.T - np.eye(3)).max())
     if error > _TOLERANCE:
         lengths = np.linalg.norm(turn, axis=1)
-        raise ValueError(f"{name}: expected a rigid transform, got rows of length {_text(lengths)} that do not form one")
+        raise ValueError(
+            f"{name}: expected a rigid transform, got rows of length {_text(lengths)} that do not form one"
+        )
     if np.linalg.det(turn) < 0:
         raise ValueError(f"{name}: expected a rigid transform, got one that mirrors")
     left, _, right = np.linalg.svd(turn)

@@ -36,7 +36,7 @@ _LEAST_RADIUS = 4
 _SCALES = tuple(1 + step / 200 for step in range(-10, 11))
 """Scales that are searched, in steps of 0.5 %."""
 _ABOVE_CHANCE, _ABOVE_OTHERS, _CONTRAST = 2.8, 2.0, 1.2
-"""Standard errors by which the gradients must exceed those at a typical shift, and at the best other one; and factor."""
+"""Standard errors by which the gradients must exceed those at a typical and at the best other shift; and a factor."""
 _WEAK = 2.0
 """Standard errors below which a shift along one axis is left out: its edges may all run along that axis."""
 _ABOVE_NONE, _ABOVE_SHIFT = 3.0, 2.5
@@ -227,9 +227,7 @@ def _best_shift(
     """Return the largest mean gradient of the shifts by every second pixel, and down, right and scale."""
     right, below = (each[::_COARSE, ::_COARSE] for each in gradients)
     edges = comparison.scaled(scale)
-    mean = mean_gradients(
-        Edges(edges.right / _COARSE, edges.below / _COARSE), (right, below), radius // _COARSE
-    )
+    mean = mean_gradients(Edges(edges.right / _COARSE, edges.below / _COARSE), (right, below), radius // _COARSE)
     row, column = np.unravel_index(mean.argmax(), mean.shape)
     down, across = (float(_COARSE * (place - radius // _COARSE)) for place in (row, column))
     return float(mean.max()), down, across, scale
@@ -258,9 +256,7 @@ def _refine(
     return float(best[0]), float(best[1]), float(best[2] / reach) if scaling else start[2]
 
 
-def _without_weak_axis(
-    comparison: _Comparison, found: tuple[float, float, float]
-) -> tuple[float, float, float]:
+def _without_weak_axis(comparison: _Comparison, found: tuple[float, float, float]) -> tuple[float, float, float]:
     """Return the displacement without its shift along an axis on which the evidence for it is weak."""
     down, right, scale = found
     sums = comparison.sums(*found)

@@ -58,6 +58,8 @@ def warp_depth(depth: Tensor, camera: Camera, transforms: Tensor, target: Camera
 
     """
     batch, size = depth.shape[0], (camera.height, camera.width)
+    if min(size) < 2:
+        raise ValueError(f"depth: expected a map of at least 2 x 2 pixels, got {size[0]} x {size[1]}")
     if depth.dim() != 4 or tuple(depth.shape[1:]) != (1, *size):
         raise ValueError(f"depth: expected shape (B, 1, {size[0]}, {size[1]}), got {tuple(depth.shape)}")
     if transforms.dim() != 3 or tuple(transforms.shape[1:]) != (4, 4) or len(transforms) not in (1, batch):
@@ -79,7 +81,9 @@ def source_pixels(depth: Tensor, camera: Camera, transforms: Tensor, target: Cam
 
     Args:
         depth: (B, 1, H, W) of :func:`warp_depth`.
-        camera, transforms, target: as there.
+        camera: camera of the maps that were warped.
+        transforms: (B or 1, 4, 4) transforms from the frame of ``camera`` to that of ``target``, metres.
+        target: camera of ``depth``.
 
     Returns:
         Columns and rows in pixels of ``camera``, (B, H, W) float64, NaN in holes.

@@ -3,8 +3,8 @@
 The maps are warped into the reference frame. A neighbour's pixel counts where its surface is the reference's: where the
 two inverse depths differ by less than their expected noise explains. What hides the surface, what it hides, and what
 has moved is thereby left out. The votes are averaged in inverse depth with weights by expected noise and agreement. A
-single reading on which no other frame agrees gives way to several that agree with each other, and a hole is filled
-where at least two frames agree.
+single reading on which no other frame agrees gives way to several that agree with each other, and a hole takes what
+most of the frames that see something there agree on.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from dsr.methods.noise import estimate_sensor_noise
 
 _DEVIATIONS = 3.0
 """Difference of two readings of a surface, in standard deviations of the difference, beyond which they disagree."""
-_SLACK = 0.005
+_SLACK = 0.01
 """Difference that counts as none, relative to inverse depth: poses and cameras are not exact."""
 _LEAST_NOISE = 2e-4
 """Smallest standard deviation of inverse depth, relative to its median: depth maps are stored in whole millimetres."""
@@ -97,7 +97,8 @@ def fuse_views(reference: View, neighbours: Sequence[View]) -> Fused:
     votes = (weight > 0).sum(0)
     spread = weight.sum(0).rsqrt() / centre.square()
     depth = centre.reciprocal()
-    return Fused(*(each[None].to(reference.depth) for each in (depth, spread.masked_fill(depth.isnan(), torch.nan), votes)))
+    spread = spread.masked_fill(depth.isnan(), torch.nan)
+    return Fused(*(each[None].to(reference.depth) for each in (depth, spread, votes)))
 
 
 def _own(view: View) -> tuple[Tensor, Tensor]:
@@ -138,7 +139,8 @@ def _most_voted(inverse: Tensor, deviation: Tensor) -> Tensor:
     """Return the reading with which most others agree, the reference's own if any does, (h, w); NaN in holes.
 
     Args:
-        inverse, deviation: (N, h, w), the reference first.
+        inverse: (N, h, w), the reference first.
+        deviation: (N, h, w), its standard deviation.
 
     """
     support = torch.stack(
@@ -150,9 +152,8 @@ def _most_voted(inverse: Tensor, deviation: Tensor) -> Tensor:
     most, winner = support.max(0)
     chosen = inverse.gather(0, winner[None])[0]
     own = inverse[0]
-    enough = most >= 2
     keep = own.isfinite() & ((support[0] >= 2) | (most < 3))
-    return torch.where(keep, own, torch.where(enough, chosen, torch.nan))
+    return torch.where(keep, own, torch.where(most >= 1, chosen, torch.nan))
 
 
 def _weights(inverse: Tensor, deviation: Tensor, centre: Tensor) -> Tensor:

@@ -81,10 +81,7 @@ class UpsampleRequest:
             raise ValueError("--mask: expected --rgb and --depth with it, got folders")
         if not self.max_error > 0:
             raise ValueError(f"--max-error: expected a positive percentage of the depth, got {100 * self.max_error:g}")
-        if self.neighbours < 0:
-            raise ValueError(f"--neighbours: expected 0 or a positive number of frames, got {self.neighbours}")
-        if self.poses is not None and len(self.folders) > 1:
-            raise ValueError(f"--poses: expected the frames of one folder, got {len(self.folders)} folders")
+        self._check_sequence()
         self._check_method()
 
     @functools.cached_property
@@ -93,6 +90,13 @@ class UpsampleRequest:
         if "confidence" not in self.parts or read_ability(self.method, self.directories, self.settings).confident:
             return self.parts
         return tuple(part for part in self.parts if part != "confidence")
+
+    def _check_sequence(self) -> None:
+        """Check what is said about a sequence."""
+        if self.neighbours < 0:
+            raise ValueError(f"--neighbours: expected 0 or a positive number of frames, got {self.neighbours}")
+        if self.poses is not None and len(self.folders) > 1:
+            raise ValueError(f"--poses: expected the frames of one folder, got {len(self.folders)} folders")
 
     def _check_method(self) -> None:
         """Check that the method accepts the settings and can write something of what is requested."""
