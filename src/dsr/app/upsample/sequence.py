@@ -65,8 +65,8 @@ class FrameSequence:
         if self._poses is not None:
             picture = replace(picture, pose=self._poses.get(pair.name))
         if picture.pose is None and self._count:
-            where = "this capture has none; give --poses" if self._file is None else f"{self._file} has none for it"
-            raise ValueError(f"{pair.depth.name}: --neighbours: expected a pose for each frame, {where}")
+            where = "this capture has none; give --poses" if self._file is None else f"{self._file} has none"
+            raise ValueError(f"--neighbours: expected a pose for each frame, {where}")
         return picture
 
     def fuse(self, pair: Pair, picture: Picture) -> Picture:
