@@ -1,6 +1,7 @@
 """What neighbouring frames gain: RMSE_v and flicker with 1, 3 and 5 frames, fused before or after the network.
 
     python benchmarks/sequences.py [--size 192] [--scale 2] [--noise kinect] [--procedural 3] [--ddrnet DIR]
+                                   [--picture FILE.jpg]
 
 On SimGeo's solids, rendered from seven places along a path, with the noise of a simulated sensor and exact poses; on
 procedural scenes likewise, whose relief is finer than the noise; and on the six frames of DDRNet's sensor, whose poses
@@ -20,6 +21,7 @@ from pathlib import Path
 from statistics import mean
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 import torch
 from scipy.ndimage import uniform_filter
@@ -30,6 +32,7 @@ from dsr.degradation.downsampling import Downsampling, make_sample
 from dsr.degradation.noise import Kinect, Noise, TimeOfFlight
 from dsr.geometry.camera import Camera
 from dsr.geometry.poses import Matrix, relative
+from dsr.geometry.shading import render as render_lights
 from dsr.geometry.surface import depth_to_normals
 from dsr.geometry.warping import warp_depth
 from dsr.inference import upsample_surface
@@ -239,6 +242,24 @@ def ddrnet(folder: Path) -> list[Frame]:
     return frames
 
 
+def draw(path: Path, frames: Sequence[Frame], method: str) -> None:
+    """Draw the photo, the results of 1 and 5 frames and the truth, lit from above."""
+    centre = frames[len(frames) // 2]
+    group = window(frames, len(frames) // 2, 5)
+    depths = (before(group[:1], method), before(group, method), centre.truth.float())
+    rays = centre.camera.rays()[None]
+    lit = [render_lights(depth_to_normals(depth[None].double(), rays))[0, 0].clamp(0, 1).numpy() for depth in depths]
+    photo = centre.rgb.permute(1, 2, 0).numpy()[..., ::-1]
+    panels = [photo, *(np.repeat(each[..., None], 3, axis=2) for each in lit)]
+    titled = []
+    for panel, title in zip(panels, ("photo", "1 frame", "5 frames", "truth"), strict=True):
+        picture = cv2.resize((255 * panel).astype(np.uint8), None, fx=2, fy=2, interpolation=cv2.INTER_NEAREST)
+        bar = np.full((28, picture.shape[1], 3), 255, np.uint8)
+        cv2.putText(bar, title, (6, 20), cv2.FONT_HERSHEY_SIMPLEX, 0.6, (0, 0, 0), 1, cv2.LINE_AA)
+        titled.append(np.vstack((bar, picture)))
+    cv2.imwrite(str(path), np.hstack(titled), [cv2.IMWRITE_JPEG_QUALITY, 88])
+
+
 def show(found: dict[str, tuple[float, float]]) -> None:
     """Print a table."""
     single = found["1 frame"][0]
@@ -256,9 +277,13 @@ def main() -> None:
     parser.add_argument("--method", default="facets")
     shared = Path(os.environ.get("DSR_SHARED", "../shared"))
     parser.add_argument("--ddrnet", type=Path, default=shared / "real" / "ddrnet")
+    parser.add_argument("--picture", type=Path, help="draw one scene, and measure nothing")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     noise = NOISES[arguments.noise]()
+    if arguments.picture:
+        draw(arguments.picture, solids(SOLIDS[-1], arguments.size, arguments.scale, noise), arguments.method)
+        return
     made: dict[str, list[Callable[[], list[Frame]]]] = {
         "SimGeo's solids": [partial(solids, name, arguments.size, arguments.scale, noise) for name in SOLIDS],
         "procedural scenes": [

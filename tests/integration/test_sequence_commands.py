@@ -279,7 +279,7 @@ def test_results_with_poses_become_one_mesh(capture, capsys):
     assert "5 results -> " in " ".join(capsys.readouterr().out.split())
     mesh = trimesh.load(capture.parent / "mesh.ply", process=False)
     wall = mesh.vertices[mesh.vertices[:, 2] > 1.8]
-    box = mesh.vertices[(mesh.vertices[:, 2] < 1.4)]
+    box = mesh.vertices[mesh.vertices[:, 2] < 1.25]
     assert len(wall) > 500
     assert abs(wall[:, 2].mean() - 2.0) < 0.01
     assert abs(np.median(box[:, 2]) - 1.2) < 0.02

@@ -16,7 +16,7 @@ def world(seed=0, count=14):
     rows, columns = np.mgrid[:SIZE, :SIZE]
     depth, photo = np.full((SIZE, SIZE), 4.0), np.full((3, SIZE, SIZE), 0.5)
     for near in np.linspace(3.5, 1.0, count):
-        v, u, radius = rng.uniform(0.1, 0.9, 2).tolist() + [rng.uniform(0.05, 0.11)]
+        v, u, radius = *rng.uniform(0.1, 0.9, 2), rng.uniform(0.05, 0.11)
         dv, du = rows - v * SIZE, columns - u * SIZE
         inside = np.hypot(dv, du) < radius * SIZE if rng.random() < 0.5 else np.fmax(abs(dv), abs(du)) < radius * SIZE
         depth[inside] = near

@@ -18,6 +18,8 @@ from skimage.measure import marching_cubes
 from dsr.geometry.camera import Camera
 from dsr.geometry.poses import Matrix, invert
 
+_STEEPEST = 0.9
+"""Largest change of the distance within a cell, in units of the truncation; at a surface it is at most 0.43."""
 _SIDE = 8
 """Voxels along a side of a block."""
 _TRUNCATION = 4.0
@@ -175,11 +177,18 @@ def _extract(blocks: NDArray[np.int64], distance: np.ndarray, weight: np.ndarray
 
 
 def _march(volume: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
-    """Return vertices in voxels, normals and faces of a volume, without cells that have an unknown corner."""
-    known = np.isfinite(volume)
-    cells = known.copy()[1:, 1:, 1:]
+    """Return vertices in voxels, normals and faces of a volume, without cells that have an unknown corner.
+
+    Behind the rim of a surface, free space borders on what the surface hides: there the distance jumps, and no triangle
+    is made.
+    """
+    low, high = volume[1:, 1:, 1:].copy(), volume[1:, 1:, 1:].copy()
     for i, j, k in np.ndindex(2, 2, 2):
-        cells &= known[i : i + cells.shape[0], j : j + cells.shape[1], k : k + cells.shape[2]]
+        corner = volume[i : i + low.shape[0], j : j + low.shape[1], k : k + low.shape[2]]
+        np.minimum(low, corner, out=low)  # NaN if a corner is
+        np.maximum(high, corner, out=high)
+    cells = high - low < _STEEPEST
+    known = np.isfinite(volume)
     values = np.where(known, volume, 1.0)
     if not cells.any() or not (values.min() < 0 < values.max()):
         return None
