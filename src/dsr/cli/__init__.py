@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 
 from rich.console import Console
 
-from dsr.cli import data, doctor, export, hydra_commands, report, study, upsample, view
+from dsr.cli import data, doctor, export, fuse, hydra_commands, report, study, upsample, view
 from dsr.data.download.catalogue import CATALOGUE, Collection
 from dsr.utils.console import INTERRUPTED, USAGE_ERROR, one_line, open_console, print_error, show
 
@@ -15,6 +15,7 @@ _EXAMPLES = """\
 examples:
   dsr upsample --rgb photo.jpg --depth depth.png -o out    high-resolution depth, mesh and pictures
   dsr view out                                             its surfaces, before and after, in the browser
+  dsr fuse out -o mesh.ply                                 one mesh of the results of a sequence with poses
   dsr eval method=facets dataset=simgeo scale=8            evaluate a method; more with dsr eval --help
   dsr train model=facets trainer=smoke                     train a network; more with dsr train --help
   dsr report outputs/eval -o report                        tables, figures and a page of all evaluations
@@ -27,7 +28,7 @@ examples:
 
 In a checkout of the project, `python eval.py` and `python train.py` are the same as `dsr eval` and `dsr train`.
 """
-_COMMANDS = (upsample, view, hydra_commands, report, study, data, doctor, export)
+_COMMANDS = (upsample, view, fuse, hydra_commands, report, study, data, doctor, export)
 
 
 def main(arguments: Sequence[str] | None = None, catalogue: Mapping[str, Collection] | None = None) -> int:

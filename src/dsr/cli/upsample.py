@@ -25,6 +25,8 @@ examples:
   dsr upsample scan.r3d --min-confidence 0.5 -o out
   dsr upsample --rgb photo.jpg --depth depth.png --method tgv --set data_weight=30 -o out
   dsr upsample recordings --with nerfstudio,open3d -o out
+  dsr upsample --rgb photo.jpg --depth depth.png --depth-camera ir.json --extrinsics ir_to_rgb.txt -o out
+  dsr upsample recording --poses groundtruth.txt --neighbours 4 -o out
   dsr upsample recordings --dry-run -o out       what would be done, and what would be assumed
 
 The results of a single pair are in OUT, those of several in OUT/NAME: depth.* as the input is stored, depth_metres.npy,
@@ -76,6 +78,13 @@ def _add_reading(parser: argparse.ArgumentParser) -> None:
         "--range-type", choices=types, help="depth along the axis (default), along the ray, or disparity"
     )
     reading.add_argument("--baseline", type=float, metavar="METRES", help="between the cameras, for disparity")
+    reading.add_argument("--depth-camera", type=Path, metavar="FILE", help="camera file of a depth camera elsewhere")
+    reading.add_argument(
+        "--extrinsics", type=Path, metavar="FILE", help="matrix from the depth camera to the photo's, metres"
+    )
+    reading.add_argument(
+        "--register", action="store_true", help="move the depth map to the photo's edges, if it lies beside them"
+    )
     reading.add_argument("--hole-value", type=float, metavar="VALUE", help="another value that marks missing depth")
     reading.add_argument(
         "--min-confidence",
@@ -117,6 +126,14 @@ def _add_method(parser: argparse.ArgumentParser) -> None:
         help="a folder with a method/ of your own YAML files; may be repeated",
     )
     method.add_argument("--scale", type=int, metavar="N", help="upsampling factor (default: from the sizes)")
+    method.add_argument(
+        "--neighbours",
+        type=int,
+        default=0,
+        metavar="N",
+        help="frames of a folder that vote on each frame's depth, 4 for two on either side; needs poses",
+    )
+    method.add_argument("--poses", type=Path, metavar="FILE", help="camera poses: TUM's format, or 4 x 4 matrices")
     method.add_argument("--device", default="auto", metavar="DEVICE", help="auto (default), cpu, cuda, cuda:1, ...")
     method.add_argument(
         "--fill", choices=("all", "small", "none"), default="small", help="which of the input's holes are filled"
@@ -178,6 +195,18 @@ def _settings(options: argparse.Namespace) -> dict[str, Any]:
     return settings
 
 
+def _rig(options: argparse.Namespace) -> Any:
+    """Return the files of a depth camera elsewhere than the photo's; None if there are none."""
+    from dsr.io.rigs import RigFiles  # noqa: PLC0415 - it takes seconds to import
+
+    if (options.depth_camera is None) != (options.extrinsics is None):
+        given, missing = (
+            ("--extrinsics", "--depth-camera") if options.extrinsics else ("--depth-camera", "--extrinsics")
+        )
+        raise ValueError(f"{given}: expected {missing} with it")
+    return None if options.depth_camera is None else RigFiles(options.depth_camera, options.extrinsics)
+
+
 def _run(options: argparse.Namespace, console: Console, _: object) -> list[str]:
     """Upsample, and return the problems."""
     from dsr.app.upsample.outputs import PARTS  # noqa: PLC0415
@@ -195,7 +224,14 @@ def _run(options: argparse.Namespace, console: Console, _: object) -> list[str]:
     choice = CameraChoice(options.camera, options.fov, intrinsics)
     bits = SUNRGBD_BITS if options.depth_unit == "sunrgbd" else 0
     reading = Reading(
-        choice, unit, options.range_type, options.baseline, options.hole_value, options.min_confidence, bits
+        choice,
+        unit,
+        options.range_type,
+        options.baseline,
+        options.hole_value,
+        rig=_rig(options),
+        min_confidence=options.min_confidence,
+        turned_bits=bits,
     )
     unknown = [part for part in options.without if part not in PARTS]
     parts = options.only if options.only is not None else tuple(part for part in PARTS if part not in options.without)
@@ -218,6 +254,9 @@ def _run(options: argparse.Namespace, console: Console, _: object) -> list[str]:
         depth_format=options.format,
         max_faces=options.max_faces,
         max_points=options.max_points,
+        register=options.register,
+        neighbours=options.neighbours,
+        poses=options.poses,
         parts=tuple(dict.fromkeys((*parts, *options.more, *unknown))),
         overwrite=options.overwrite,
         dry_run=options.dry_run,

@@ -20,6 +20,7 @@ from dsr.io.frames import Geometry
 from dsr.io.names import words_of
 from dsr.io.pairs import Pair
 from dsr.io.photos import Size, read_photo, same_aspect
+from dsr.io.rigs import RigFiles, read_rig, to_photo
 from dsr.io.units import FolderUnits, read_values_of
 
 _DISPARITY_WORDS = frozenset({"disparity", "disp"})
@@ -37,6 +38,8 @@ class Reading:
         hole_value: value that stands for a hole, in addition to the usual ones.
         min_confidence: fraction; pixels of less confidence become holes. None for no limit.
         turned_bits: how far the bits of the values are turned left, 3 in SUN RGB-D.
+        rig: depth camera elsewhere than the photo's, whose map is to be warped into the photo's view; None where the
+            depth map is registered.
 
     """
 
@@ -45,6 +48,7 @@ class Reading:
     range_type: RangeType | None = None
     baseline: float | None = None
     hole_value: float | None = None
+    rig: RigFiles | None = None
     min_confidence: float | None = None
     turned_bits: int = 0
 
@@ -98,7 +102,9 @@ def read_picture(pair: Pair, reading: Reading, units: FolderUnits | None = None)
     described, camera_assumptions = _camera(pair, reading, geometry, (pixels.shape[0], pixels.shape[1]), size_lr)
     pixels, crop_assumptions = _crop_to_multiple(pixels, pair.factor, size_lr)
     size: Size = (pixels.shape[0], pixels.shape[1])
-    _expect_lower_resolution(pair, size, size_lr)
+    rig = None if reading.rig is None else read_rig(reading.rig, size_lr, reading.baseline)
+    if rig is None:
+        _expect_lower_resolution(pair, size, size_lr)
     camera = described.camera.crop(0, 0, *size)
     if reading.baseline is not None:
         camera = replace(camera, baseline=reading.baseline)
@@ -116,7 +122,8 @@ def read_picture(pair: Pair, reading: Reading, units: FolderUnits | None = None)
     guesses = FolderUnits() if units is None else units
     unit, unit_assumptions = _unit(pair, reading, described, range_type, stored, holes, guesses)
     encoding = Encoding(_suffix(pair), str(stored.dtype), unit, mark, range_type)
-    depth_lr = decode(stored, holes, encoding, camera.rescale(size_lr[1], size_lr[0]))
+    of_depth = camera.rescale(size_lr[1], size_lr[0]) if rig is None else rig.camera
+    depth_lr = decode(stored, holes, encoding, of_depth)
     if not bool(depth_lr.isfinite().any()):
         raise ValueError(f"{pair.depth}: expected at least one disparity above 0, got none")
     rgb = torch.from_numpy(np.ascontiguousarray(pixels.transpose(2, 0, 1))).float() / 255
@@ -129,6 +136,9 @@ def read_picture(pair: Pair, reading: Reading, units: FolderUnits | None = None)
         *hole_assumptions,
         *confidence_assumptions,
     )
+    if rig is not None:
+        depth_lr, warped = to_photo(depth_lr, rig, camera)
+        all_assumptions, confidence = (*all_assumptions, warped), None
     return Picture(rgb, depth_lr, camera, encoding, all_assumptions, geometry.pose, confidence)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -40,6 +40,9 @@ class UpsampleRequest:
         max_faces: triangles from which a mesh is simplified.
         max_points: points from which a cloud is thinned.
         depth_format: the result's format; None for the input's.
+        register: whether to move each depth map to the photo's edges.
+        neighbours: number of frames beside itself that vote on each frame's depth.
+        poses: file of the frames' poses; None for those of the capture.
         parts: what to write, some of :data:`dsr.app.upsample.outputs.PARTS` and ``MORE_PARTS``.
         overwrite: whether to replace existing results.
         dry_run: whether to show only what would be done.
@@ -64,6 +67,9 @@ class UpsampleRequest:
     max_faces: int = MOST_FACES
     max_points: int = MOST_POINTS
     depth_format: str | None = None
+    register: bool = False
+    neighbours: int = 0
+    poses: Path | None = None
     parts: tuple[str, ...] = PARTS
     overwrite: bool = False
     dry_run: bool = False
@@ -94,6 +100,7 @@ class UpsampleRequest:
             raise ValueError(f"--max-hole: expected a positive number of degrees, got {self.max_hole:g}")
         self.limits.check()
         check_libraries(self.scene_parts)
+        self._check_sequence()
         self._check_method()
 
     @property
@@ -111,6 +118,13 @@ class UpsampleRequest:
         """Parts of each frame; those of all frames are made of its depth and ``rgbd``."""
         needed = ("depth", "rgbd") if self.scene_parts else ()
         return tuple(dict.fromkeys((*(part for part in self.parts if part not in SCENE_PARTS), *needed)))
+
+    def _check_sequence(self) -> None:
+        """Check what is said about a sequence."""
+        if self.neighbours < 0:
+            raise ValueError(f"--neighbours: expected 0 or a positive number of frames, got {self.neighbours}")
+        if self.poses is not None and len(self.folders) > 1:
+            raise ValueError(f"--poses: expected the frames of one folder, got {len(self.folders)} folders")
 
     def _check_method(self) -> None:
         """Check that the method accepts the settings."""
@@ -133,6 +147,7 @@ def settings_of(request: UpsampleRequest) -> dict[str, Any]:
     reading = asdict(request.reading)
     choice = reading.pop("camera")
     reading = {name: value for name, value in reading.items() if name not in _NEW or value != _NEW[name]}
+    rig = reading.pop("rig")
     return {
         "method": request.method,
         "scale": request.scale,
@@ -145,6 +160,9 @@ def settings_of(request: UpsampleRequest) -> dict[str, Any]:
         "intrinsics": None if choice["intrinsics"] is None else list(choice["intrinsics"]),
         **({"max_faces": request.max_faces} if request.max_faces != MOST_FACES else {}),
         **({"max_points": request.max_points} if request.max_points != MOST_POINTS else {}),
+        **({"registered_by": "extrinsics"} if rig is not None else {}),
+        **({"register": True} if request.register else {}),
+        **({"neighbours": request.neighbours} if request.neighbours else {}),
         **({"set": dict(request.settings)} if request.settings else {}),
         **({"code": code} if (code := hash_outside_code(_targets(request))) else {}),
     }
@@ -164,6 +182,8 @@ def files_of(pair: Pair, reading: Reading) -> dict[str, Path]:
     found = {"rgb": pair.rgb, "depth": pair.depth, "camera": camera, "mask": pair.mask}
     if pair.confidence is not None and reading.min_confidence is not None:
         found["confidence"] = pair.confidence.path
+    if reading.rig is not None:
+        found |= {"depth_camera": reading.rig.camera, "extrinsics": reading.rig.extrinsics}
     return {name: path for name, path in found.items() if path is not None} | {
         name: source.file for name, source in _sources(pair, reading).items()
     }
@@ -181,6 +201,17 @@ def inputs_of(pair: Pair, reading: Reading) -> dict[str, Record]:
             raise ValueError(f"{path}: there is no such file")
         inputs[name] = {"file": path.name, "sha256": file_hash(path)}
     return inputs if pair.capture is None else {**inputs, "capture": pair.capture.record()}
+
+
+def inputs_with_neighbours(request: UpsampleRequest, pair: Pair, neighbours: Sequence[Pair]) -> dict[str, Record]:
+    """Return the inputs of a frame, its neighbours and its pose, and their hashes, as values for JSON."""
+    inputs = inputs_of(pair, request.reading)
+    for number, other in enumerate(neighbours, 1):
+        inputs |= {f"neighbour_{number}_{name}": each for name, each in inputs_of(other, request.reading).items()
+                   if name not in ("rgb", "depth_camera", "extrinsics")}  # fmt: skip
+    if request.poses is not None:
+        inputs["poses"] = {"file": request.poses.name, "sha256": file_hash(request.poses)}
+    return inputs
 
 
 def _sources(pair: Pair, reading: Reading) -> dict[str, Source]:

@@ -13,6 +13,7 @@ from typing import Any
 import torch
 from rich.console import Console
 
+from dsr.app.upsample.alignment import align
 from dsr.app.upsample.outputs import (
     PreviousRun,
     begin,
@@ -25,8 +26,9 @@ from dsr.app.upsample.outputs import (
     write_parts,
 )
 from dsr.app.upsample.reporting import Reporter, listed, problem_line
-from dsr.app.upsample.request import UpsampleRequest, files_of, inputs_of, settings_of
+from dsr.app.upsample.request import UpsampleRequest, files_of, inputs_with_neighbours, settings_of
 from dsr.app.upsample.scene import write_scene
+from dsr.app.upsample.sequence import FrameSequence
 from dsr.inference import Plan, enlarged_by, plan, upsample_surface
 from dsr.io.encoding import Assumption
 from dsr.io.inputs import Picture, read_picture
@@ -65,6 +67,12 @@ def run(request: UpsampleRequest, console: Console) -> list[str]:
     single = len(found.pairs) == 1 and not request.folders and not request.rgb[0].is_dir()
     _show_found(console, found)
     reporter, units = Reporter(console), FolderUnits(found.pairs)
+    sequence = FrameSequence(
+        found.pairs,
+        lambda pair: _without_repeats(read_picture(pair, request.reading, units)),
+        request.neighbours,
+        request.poses,
+    )
     problems: dict[str, list[str]] = {}
     outcomes: Counter[str] = Counter()
     targets: dict[str, Path] = {}
@@ -73,7 +81,7 @@ def run(request: UpsampleRequest, console: Console) -> list[str]:
     for pair in progress.track(found.pairs, "upsample", label=lambda pair: pair.name, lines=False):
         target = request.output if single else request.output / pair.name
         try:
-            outcomes[_one(request, pair, target, units, reporter, progress)] += 1
+            outcomes[_one(request, pair, target, units, sequence, reporter, progress)] += 1
             targets[pair.name] = target
         except (ValueError, OSError, MemoryError, torch.OutOfMemoryError) as error:
             problems.setdefault(problem_line(error), []).append(pair.name)
@@ -167,15 +175,23 @@ class _Job:
 
 
 def _one(
-    request: UpsampleRequest, pair: Pair, target: Path, units: FolderUnits, reporter: Reporter, progress: Progress
+    request: UpsampleRequest,
+    pair: Pair,
+    target: Path,
+    units: FolderUnits,
+    sequence: FrameSequence,
+    reporter: Reporter,
+    progress: Progress,
 ) -> str:
     """Upsample one picture, and return the outcome."""
-    job = _Job(request, pair, target, settings_of(request), inputs_of(pair, request.reading), read_previous_run(target))
+    depends_on = inputs_with_neighbours(request, pair, sequence.neighbours(pair))
+    job = _Job(request, pair, target, settings_of(request), depends_on, read_previous_run(target))
     job.expect_agreement()
     if job.is_done():
         reporter.say(f"{pair.name}: complete already, in {target}")
         return "complete already"
-    picture = _without_repeats(read_picture(pair, request.reading, units))
+    picture = sequence.fuse(pair, _without_repeats(read_picture(pair, request.reading, units)))
+    picture = align(picture, register=request.register)
     size_lr = (picture.depth_lr.shape[-2], picture.depth_lr.shape[-1])
     size = (picture.camera.height, picture.camera.width)
     planned = plan(size, size_lr, request.scale, request.method, request.directories, request.settings)

@@ -12,7 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from dsr.app.upsample.outputs import ERRORS, INFO, LARGEST_ERROR, METRES
+from dsr.app.upsample.limits import LARGEST_ERROR
+from dsr.app.upsample.outputs import ERRORS, INFO, METRES
 from dsr.evaluation.store import load_errors
 from dsr.geometry.camera import Camera
 from dsr.io.input_files import INPUT, read_input

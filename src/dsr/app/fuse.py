@@ -1,0 +1,136 @@
+"""The command behind ``dsr fuse``: one mesh of the results of a sequence."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from rich.console import Console
+
+from dsr.app.upsample.outputs import ERRORS, INFO, METRES
+from dsr.evaluation.store import load_errors
+from dsr.geometry.camera import Camera
+from dsr.geometry.poses import as_rigid
+from dsr.geometry.tsdf import PosedMap, fuse_maps, suggest_voxel
+from dsr.io.model_files import write_ply
+from dsr.utils.console import one_line, show
+
+_GREY = 190
+_LEAST_ERROR = 1e-4
+"""Smallest expected error in metres that a weight distinguishes."""
+
+
+@dataclass(frozen=True)
+class FuseRequest:
+    """What to fuse.
+
+    Args:
+        folders: results of ``dsr upsample``, or folders of them.
+        output: the mesh, a ``.ply`` file.
+        voxel: edge length of a voxel in metres; None for the median width of a pixel on the surfaces.
+        max_error: expected relative error of the depth from which a pixel is left out.
+
+    Raises:
+        ValueError: a value is out of range.
+
+    """
+
+    folders: tuple[Path, ...]
+    output: Path
+    voxel: float | None = None
+    max_error: float = 0.02
+
+    def __post_init__(self) -> None:
+        """Check the values."""
+        if self.output.suffix.lower() != ".ply":
+            raise ValueError(f"-o: expected a file that ends in .ply, got {self.output}")
+        if self.voxel is not None and not 0 < self.voxel < float("inf"):
+            raise ValueError(f"--voxel: expected a positive number of metres, got {self.voxel:g}")
+        if not self.max_error > 0:
+            raise ValueError(f"--max-error: expected a positive percentage of the depth, got {100 * self.max_error:g}")
+
+
+def fuse(request: FuseRequest, console: Console) -> list[str]:
+    """Fuse the depth of results into a mesh, and return the problems, one line each.
+
+    Raises:
+        ValueError: there is no result with a pose, or no surface.
+
+    """
+    found = sorted({path.parent for folder in request.folders for path in folder.rglob(INFO)})
+    frames, problems = [], []
+    for folder in found:
+        try:
+            _load(folder, request.max_error)
+            frames.append(folder)
+        except (ValueError, OSError) as error:
+            problems.append(one_line(error))
+    if not frames:
+        what = problems[0] if problems else f"{request.folders[0]}: found no {INFO}"
+        raise ValueError(f"expected results of `dsr upsample` with poses; {what}")
+
+    def maps() -> Iterator[PosedMap]:
+        return (_load(folder, request.max_error) for folder in frames)
+
+    voxel = suggest_voxel(maps()) if request.voxel is None else request.voxel
+    mesh = fuse_maps(maps, voxel)
+    write_ply(request.output, mesh.vertices, mesh.normals, np.full(mesh.vertices.shape, _GREY, np.uint8), mesh.faces)
+    size = f"{len(mesh.vertices)} vertices, {len(mesh.faces)} triangles, voxels of {1e3 * voxel:.3g} mm"
+    show(console, f"{_count(frames)} -> {request.output}: {size}; in the world's frame of the poses")
+    return problems
+
+
+def _load(folder: Path, max_error: float) -> PosedMap:
+    """Return a result.
+
+    Raises:
+        ValueError: it is not complete, has no pose, or a file of it is missing or damaged.
+
+    """
+    try:
+        info = json.loads((folder / INFO).read_text(encoding="utf-8"))
+        complete, pose, camera = info["complete"], info.get("pose"), dict(info.get("camera", {}))
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
+        raise ValueError(f"{folder / INFO}: expected a file of `dsr upsample`, got something else") from None
+    if complete is not True:
+        raise ValueError(f"{folder}: expected a complete result; run `dsr upsample` again")
+    if pose is None:
+        raise ValueError(
+            f"{folder / INFO}: expected a pose; run `dsr upsample` on a capture with poses, or with --poses"
+        )
+    try:
+        own = Camera(**camera)
+    except TypeError:
+        raise ValueError(f"{folder / INFO}: camera: expected that of `dsr upsample`, got something else") from None
+    depth = _depth(folder, (own.height, own.width))
+    errors = load_errors(folder / ERRORS) if (folder / ERRORS).is_file() else None
+    deviation = None if errors is None else np.maximum(errors[0][0].double().numpy(), _LEAST_ERROR)
+    if deviation is not None:
+        if deviation.shape != depth.shape:
+            raise ValueError(f"{folder / ERRORS}: expected errors of {depth.shape}, got {deviation.shape}")
+        with np.errstate(invalid="ignore"):
+            depth = np.where(deviation <= max_error * depth, depth, np.nan)
+    return PosedMap(depth, own, as_rigid(pose, f"{folder / INFO}: pose"), deviation)
+
+
+def _depth(folder: Path, size: tuple[int, int]) -> np.ndarray:
+    """Return the depth in metres of a result, (H, W) float64."""
+    path = folder / METRES if (folder / METRES).is_file() else folder / "depth.npy"
+    if not path.is_file():
+        raise ValueError(f"{folder / METRES}: expected the depth of a result, there is none")
+    try:
+        with path.open("rb") as file:
+            values = np.lib.format.read_array(file, allow_pickle=False)
+    except Exception as error:  # a damaged header makes NumPy raise OSError, MemoryError, TokenError, ...
+        raise ValueError(f"{path}: expected a NumPy array, got a damaged or foreign file") from error
+    if values.shape != size or values.dtype.kind != "f":
+        raise ValueError(f"{path}: expected floats of shape {size}, got {values.dtype} {values.shape}")
+    return values.astype(np.float64)
+
+
+def _count(frames: Sequence[Path]) -> str:
+    """Return how many results there are."""
+    return "1 result" if len(frames) == 1 else f"{len(frames)} results"

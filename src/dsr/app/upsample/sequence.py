@@ -1,0 +1,107 @@
+"""Frames of a sequence for ``dsr upsample``: their poses, and the neighbours that vote on each frame's depth."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from torch import Tensor
+
+from dsr.geometry.camera import Camera
+from dsr.inference.sequences import View, fuse_views
+from dsr.io.encoding import Assumption
+from dsr.io.inputs import Picture
+from dsr.io.pairs import Pair
+from dsr.io.poses import read_poses
+
+_Frame = tuple[Tensor, Camera, np.ndarray | None]
+"""Depth map, camera of its pixels, and pose."""
+
+
+class FrameSequence:
+    """The frames of a folder in order, with their poses.
+
+    Args:
+        pairs: the frames.
+        read: reads one of them.
+        neighbours: number of frames that vote on each frame's depth beside itself.
+        poses: file of poses; None for those that the frames themselves have.
+
+    Raises:
+        ValueError: the file is damaged, or does not fit the frames.
+
+    """
+
+    def __init__(
+        self, pairs: Sequence[Pair], read: Callable[[Pair], Picture], neighbours: int, poses: Path | None
+    ) -> None:
+        self._pairs, self._read, self._count, self._file = tuple(pairs), read, neighbours, poses
+        self._poses: Mapping[str, np.ndarray] | None = None if poses is None else read_poses(poses).assign(pairs)
+        self._places = {pair.name: place for place, pair in enumerate(self._pairs)}
+        self._kept: OrderedDict[str, _Frame] = OrderedDict()
+
+    def neighbours(self, pair: Pair) -> list[Pair]:
+        """Return the neighbours of a frame, the nearest first; those of its own folder that have a pose."""
+        place = self._places[pair.name]
+        others = [
+            (abs(number - place), number)
+            for number, other in enumerate(self._pairs)
+            if other is not pair
+            and other.depth.parent == pair.depth.parent
+            and (self._poses is None or other.name in self._poses)
+        ]
+        return [self._pairs[number] for _, number in sorted(others)[: self._count]]
+
+    def with_pose(self, pair: Pair, picture: Picture) -> Picture:
+        """Return a frame with its pose from the file, if there is one.
+
+        Raises:
+            ValueError: neighbours are to vote, and the frame has no pose.
+
+        """
+        if self._poses is not None:
+            picture = replace(picture, pose=self._poses.get(pair.name))
+        if picture.pose is None and self._count:
+            where = "this capture has none; give --poses" if self._file is None else f"{self._file} has none"
+            raise ValueError(f"--neighbours: expected a pose for each frame, {where}")
+        return picture
+
+    def fuse(self, pair: Pair, picture: Picture) -> Picture:
+        """Return a frame with its pose, its depth fused with that of its neighbours."""
+        picture = self.with_pose(pair, picture)
+        if not self._count or picture.pose is None:
+            return picture
+        views, failed = [], 0
+        for other in self.neighbours(pair):
+            try:
+                depth, camera, pose = self._frame(other)
+            except (ValueError, OSError):  # it is reported as a frame of its own
+                failed += 1
+                continue
+            if pose is not None:
+                views.append(View(depth, camera, pose))
+        fused = fuse_views(View(picture.depth_lr, _camera_lr(picture), picture.pose), views)
+        votes = float(fused.votes[fused.depth.isfinite()].mean())
+        detail = f"{votes:.1f} frames agree on a pixel" + (f"; {failed} could not be read" if failed else "")
+        note = Assumption(f"{self._count} neighbouring frames vote on the depth", detail)
+        return replace(picture, depth_lr=fused.depth, assumptions=(*picture.assumptions, note))
+
+    def _frame(self, pair: Pair) -> _Frame:
+        """Return what a neighbour contributes; the latest ones are kept."""
+        if pair.name not in self._kept:
+            picture = self._read(pair)
+            pose = picture.pose if self._poses is None else self._poses.get(pair.name)
+            self._kept[pair.name] = (picture.depth_lr, _camera_lr(picture), pose)
+            while len(self._kept) > self._count + 2:
+                self._kept.popitem(last=False)
+        self._kept.move_to_end(pair.name)
+        return self._kept[pair.name]
+
+
+def _camera_lr(picture: Picture) -> Camera:
+    """Return the camera of a picture's depth map."""
+    height, width = picture.depth_lr.shape[-2:]
+    return picture.camera.rescale(width, height)

@@ -1,0 +1,218 @@
+"""Depth maps as another camera sees them: forward warping with a z-buffer.
+
+Neighbouring pixels of one surface span triangles, two per square of four pixels, which are rasterised in the other
+camera. The reciprocal of depth is linear over the picture of a triangle, so planes stay planes to rounding. Surfaces
+have no pinholes at any ratio of the resolutions. Pixels beside a depth step, a hole or the border cover the square of
+their own area instead, continued at the slope of their surface. Behind a step, where the first camera sees nothing, the
+result has holes.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from dsr.geometry.camera import Camera
+
+STEP = 0.03
+"""Change of inverse depth between neighbours, beyond the slopes on both sides, that is a step; relative to it."""
+_NEAREST = 1e-3
+"""Nearest depth in metres that the other camera sees."""
+_RIM = 0.02
+"""Relative difference of depth from which a pixel's square may hide a triangle."""
+_INSIDE = -1e-6
+"""Smallest barycentric coordinate inside a triangle: neighbouring triangles leave no gap."""
+_FRAGMENTS = 1 << 21
+"""Pairs of triangle and pixel that are rasterised at a time."""
+
+
+class _Corners(NamedTuple):
+    """Triangles: their corners' places in pixels and inverse depth, (N, 3) each, and the numbers of their maps, (N,).
+
+    Seen from the front, the corners are in clockwise order on the screen, where y points down.
+    """
+
+    u: Tensor
+    v: Tensor
+    inverse: Tensor
+    item: Tensor
+
+
+def warp_depth(depth: Tensor, camera: Camera, transforms: Tensor, target: Camera) -> Tensor:
+    """Return depth maps as another camera sees their surfaces.
+
+    Args:
+        depth: (B, 1, h, w) orthogonal depth in metres, NaN in holes.
+        camera: camera of these maps.
+        transforms: (B or 1, 4, 4) rigid transforms from the frame of ``camera`` to that of ``target``, metres.
+        target: the other camera.
+
+    Returns:
+        (B, 1, H, W) orthogonal depth of the nearest surface at each pixel centre of ``target``, in the dtype of
+        ``depth``; NaN where the maps have no surface.
+
+    Raises:
+        ValueError: a shape is not as above.
+
+    """
+    batch, size = depth.shape[0], (camera.height, camera.width)
+    if min(size) < 2:
+        raise ValueError(f"depth: expected a map of at least 2 x 2 pixels, got {size[0]} x {size[1]}")
+    if depth.dim() != 4 or tuple(depth.shape[1:]) != (1, *size):
+        raise ValueError(f"depth: expected shape (B, 1, {size[0]}, {size[1]}), got {tuple(depth.shape)}")
+    if transforms.dim() != 3 or tuple(transforms.shape[1:]) != (4, 4) or len(transforms) not in (1, batch):
+        raise ValueError(f"transforms: expected shape ({batch}, 4, 4), got {tuple(transforms.shape)}")
+    inverse = depth[:, 0].double().reciprocal()  # (B, h, w)
+    inverse = torch.where(inverse.isfinite() & (inverse > 0), inverse, torch.nan)
+    transforms = transforms.to(inverse).expand(batch, 4, 4)
+    across, down = _joined(inverse, 2), _joined(inverse, 1)
+    surfaces = _rasterise(_project(_triangles(inverse, across, down), camera, transforms, target), batch, target)
+    rims = _rasterise(_project(_squares(inverse, across, down), camera, transforms, target), batch, target)
+    hidden = (surfaces > 0) & (rims <= (1 + _RIM) * surfaces)
+    nearest = torch.where(hidden, surfaces, rims)
+    seen = torch.where(nearest > 0, nearest, torch.nan).reciprocal()
+    return seen.view(batch, 1, target.height, target.width).to(depth.dtype)
+
+
+def source_pixels(depth: Tensor, camera: Camera, transforms: Tensor, target: Camera) -> tuple[Tensor, Tensor]:
+    """Return where the pixels of a warped map come from.
+
+    Args:
+        depth: (B, 1, H, W) of :func:`warp_depth`.
+        camera: camera of the maps that were warped.
+        transforms: (B or 1, 4, 4) transforms from the frame of ``camera`` to that of ``target``, metres.
+        target: camera of ``depth``.
+
+    Returns:
+        Columns and rows in pixels of ``camera``, (B, H, W) float64, NaN in holes.
+
+    """
+    inverse = torch.linalg.inv(transforms.double())
+    points = depth.double() * target.rays(device=depth.device)  # (B, 3, H, W)
+    x, y, z = (
+        torch.einsum("bij,bjhw->bihw", inverse[:, :3, :3].expand(len(depth), 3, 3), points)
+        + inverse[:, :3, 3][:, :, None, None]
+    ).unbind(1)
+    return camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
+
+
+def registered_camera(camera: Camera, photo: Camera) -> Camera:
+    """Return the camera of a low-resolution map in a photo's view that keeps what another camera's map shows.
+
+    Args:
+        camera: camera of the map to be warped.
+        photo: camera of the photo.
+
+    Returns:
+        Camera with the photo's field of view whose pixels are as fine as those of ``camera``, or as the photo's where
+        these are coarser.
+
+    """
+    scale = min(max(camera.fx / photo.fx, camera.fy / photo.fy), 1.0)
+    return photo.rescale(max(round(scale * photo.width), 2), max(round(scale * photo.height), 2))
+
+
+def _joined(inverse: Tensor, dim: int) -> Tensor:
+    """Return whether each pixel and its next one along a dimension are on one surface; one less in that dimension."""
+    steps = inverse.diff(dim=dim)
+    padding = torch.full_like(steps.narrow(dim, 0, 1), torch.nan)
+    before = torch.cat((padding, steps.narrow(dim, 0, steps.shape[dim] - 1)), dim)
+    after = torch.cat((steps.narrow(dim, 1, steps.shape[dim] - 1), padding), dim)
+    beyond = torch.stack((steps.abs(), (steps - before).abs(), (steps - after).abs())).nan_to_num(torch.inf).amin(0)
+    size = steps.shape[dim]
+    near = torch.maximum(inverse.narrow(dim, 0, size), inverse.narrow(dim, 1, size))
+    return steps.isfinite() & (beyond <= STEP * near)
+
+
+def _triangles(inverse: Tensor, across: Tensor, down: Tensor) -> _Corners:
+    """Return two triangles for every square of four joined pixels, and one where only three are joined."""
+    top, bottom, left, right = across[:, :-1], across[:, 1:], down[:, :, :-1], down[:, :, 1:]
+    # corners as (row, column) offsets, clockwise on the screen; a triangle needs the two sides at its right angle
+    upper_left = (top & left, ((0, 0), (0, 1), (1, 0)))
+    lower_right = (bottom & right, ((1, 1), (1, 0), (0, 1)))
+    upper_right = (top & right & ~(left & bottom), ((0, 1), (1, 1), (0, 0)))
+    lower_left = (bottom & left & ~(top & right), ((1, 0), (0, 0), (1, 1)))
+    parts = []
+    for exists, corners in (upper_left, lower_right, upper_right, lower_left):
+        item, row, column = torch.nonzero(exists, as_tuple=True)
+        rows = torch.stack([row + i for i, _ in corners], 1)
+        columns = torch.stack([column + j for _, j in corners], 1)
+        parts.append(_Corners(columns.to(inverse), rows.to(inverse), inverse[item[:, None], rows, columns], item))
+    return _Corners(*(torch.cat(each) for each in zip(*parts, strict=True)))
+
+
+def _squares(inverse: Tensor, across: Tensor, down: Tensor) -> _Corners:
+    """Return the squares of pixels that are not the corner of four squares of joined pixels, two triangles each."""
+    whole = across[:, :-1] & across[:, 1:] & down[:, :, :-1] & down[:, :, 1:]
+    complete = torch.zeros_like(inverse, dtype=torch.bool)
+    complete[:, 1:-1, 1:-1] = whole[:, :-1, :-1] & whole[:, :-1, 1:] & whole[:, 1:, :-1] & whole[:, 1:, 1:]
+    item, row, column = torch.nonzero(inverse.isfinite() & ~complete, as_tuple=True)
+    centre = inverse[item, row, column]
+    slope_u = _slope(inverse, across, 2)[item, row, column]
+    slope_v = _slope(inverse, down, 1)[item, row, column]
+    parts = []
+    for corners in (((-1, -1), (-1, 1), (1, -1)), ((1, 1), (1, -1), (-1, 1))):  # (down, right), in half pixels
+        dv, du = (torch.tensor(each).to(inverse) / 2 for each in zip(*corners, strict=True))
+        value = centre[:, None] + slope_u[:, None] * du + slope_v[:, None] * dv
+        parts.append(_Corners(column[:, None] + du, row[:, None] + dv, value.clamp(min=0.5 * centre[:, None]), item))
+    return _Corners(*(torch.cat(each) for each in zip(*parts, strict=True)))
+
+
+def _slope(inverse: Tensor, joined: Tensor, dim: int) -> Tensor:
+    """Return the mean change to the neighbours on the same surface along a dimension, 0 without one."""
+    steps = torch.where(joined, inverse.diff(dim=dim), 0)
+    none = torch.zeros_like(inverse.narrow(dim, 0, 1))
+    total = torch.cat((steps, none), dim) + torch.cat((none, steps), dim)
+    count = torch.cat((joined.to(none), none), dim) + torch.cat((none, joined.to(none)), dim)
+    return total / count.clamp(min=1)
+
+
+def _project(corners: _Corners, camera: Camera, transforms: Tensor, target: Camera) -> _Corners:
+    """Return triangles as the target sees them, without those that it sees from behind or that reach behind it."""
+    depth = corners.inverse.reciprocal()
+    x, y = (corners.u - camera.cx) / camera.fx * depth, (corners.v - camera.cy) / camera.fy * depth
+    m = transforms[corners.item][:, :3]  # (N, 3, 4)
+    x, y, z = (m[:, i, 0, None] * x + m[:, i, 1, None] * y + m[:, i, 2, None] * depth + m[:, i, 3, None]
+               for i in range(3))  # fmt: skip
+    u, v = target.fx * x / z + target.cx, target.fy * y / z + target.cy
+    area = (u[:, 1] - u[:, 0]) * (v[:, 2] - v[:, 0]) - (u[:, 2] - u[:, 0]) * (v[:, 1] - v[:, 0])
+    kept = (z > _NEAREST).all(1) & (area > 1e-12)
+    return _Corners(u[kept], v[kept], z[kept].reciprocal(), corners.item[kept])
+
+
+def _rasterise(corners: _Corners, batch: int, target: Camera) -> Tensor:
+    """Return the largest inverse depth of the triangles at each pixel, (B * H * W,), 0 where there is none."""
+    buffer = corners.inverse.new_zeros(batch * target.height * target.width)
+    first_u, last_u = corners.u.amin(1).ceil().clamp(min=0), corners.u.amax(1).floor().clamp(max=target.width - 1)
+    first_v, last_v = corners.v.amin(1).ceil().clamp(min=0), corners.v.amax(1).floor().clamp(max=target.height - 1)
+    wide = (last_u - first_u + 1).clamp(min=0)
+    counts = (wide * (last_v - first_v + 1).clamp(min=0)).long()
+    chosen = torch.nonzero(counts)[:, 0]
+    ends = counts[chosen].cumsum(0)
+    start = 0
+    while start < len(chosen):
+        done = int(ends[start - 1]) if start else 0
+        stop = max(int(torch.searchsorted(ends, done + _FRAGMENTS)), start + 1)
+        part = chosen[start:stop]
+        number = torch.repeat_interleave(counts[part])  # of the triangle of each fragment within the part
+        within = torch.arange(len(number), device=number.device) - (ends[start:stop] - counts[part] - done)[number]
+        one = part[number]
+        across = wide[one].long()
+        u, v = first_u[one] + within % across, first_v[one] + within // across
+        inverse, inside = _interpolate(corners, one, u, v)
+        place = (corners.item[one] * target.height + v.long()) * target.width + u.long()
+        buffer.scatter_reduce_(0, place[inside], inverse[inside], "amax")
+        start = stop
+    return buffer
+
+
+def _interpolate(corners: _Corners, one: Tensor, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the inverse depth of triangles ``one`` at pixels, and whether these are inside."""
+    (u0, u1, u2), (v0, v1, v2) = corners.u[one].unbind(1), corners.v[one].unbind(1)
+    area = (u1 - u0) * (v2 - v0) - (u2 - u0) * (v1 - v0)
+    second = ((u - u0) * (v2 - v0) - (u2 - u0) * (v - v0)) / area
+    third = ((u1 - u0) * (v - v0) - (u - u0) * (v1 - v0)) / area
+    weights = torch.stack((1 - second - third, second, third), 1)
+    return (weights * corners.inverse[one]).sum(1), (weights >= _INSIDE).all(1)

@@ -1,0 +1,163 @@
+"""Depth maps of neighbouring frames with known poses, which vote on the depth of one of them.
+
+The maps are warped into the reference frame. A neighbour's pixel counts where its surface is the reference's: where the
+two inverse depths differ by less than their expected noise explains. What hides the surface, what it hides, and what
+has moved is thereby left out. The votes are averaged in inverse depth with weights by expected noise and agreement. A
+single reading on which no other frame agrees gives way to several that agree with each other, and a hole takes what
+most of the frames that see something there agree on.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from dsr.geometry.camera import Camera
+from dsr.geometry.poses import Matrix, as_rigid, relative
+from dsr.geometry.warping import source_pixels, warp_depth
+from dsr.methods.noise import estimate_sensor_noise
+
+_DEVIATIONS = 3.0
+"""Difference of two readings of a surface, in standard deviations of the difference, beyond which they disagree."""
+_SLACK = 0.01
+"""Difference that counts as none, relative to inverse depth: poses and cameras are not exact."""
+_LEAST_NOISE = 2e-4
+"""Smallest standard deviation of inverse depth, relative to its median: depth maps are stored in whole millimetres."""
+_PASSES = 2
+"""Passes of the robust mean."""
+
+
+@dataclass(frozen=True)
+class View:
+    """A depth map with its camera's place.
+
+    Args:
+        depth: (1, h, w) orthogonal depth in metres, NaN in holes.
+        camera: camera of these pixels.
+        pose: transform from the camera's frame (x right, y down, z forward) to the world's, 4 x 4, metres.
+        deviation: (1, h, w) expected standard deviation of each pixel in metres; None to estimate it from the map, as
+            one number for inverse depth.
+
+    Raises:
+        ValueError: a shape is not as above, or the pose is not rigid.
+
+    """
+
+    depth: Tensor
+    camera: Camera
+    pose: Matrix
+    deviation: Tensor | None = None
+
+    def __post_init__(self) -> None:
+        """Check the shapes and the pose."""
+        shape = (1, self.camera.height, self.camera.width)
+        if tuple(self.depth.shape) != shape:
+            raise ValueError(f"depth: expected shape {shape}, the camera's, got {tuple(self.depth.shape)}")
+        if self.deviation is not None and self.deviation.shape != self.depth.shape:
+            raise ValueError(f"deviation: expected shape {shape}, got {tuple(self.deviation.shape)}")
+        object.__setattr__(self, "pose", as_rigid(self.pose, "pose"))
+
+
+class Fused(NamedTuple):
+    """Depth on which frames voted.
+
+    ``depth`` (1, h, w): orthogonal depth in metres, NaN in holes. ``deviation`` (1, h, w): its expected standard
+    deviation in metres, if the frames' noise is independent. ``votes`` (1, h, w): the number of frames that agree.
+    """
+
+    depth: Tensor
+    deviation: Tensor
+    votes: Tensor
+
+
+def fuse_views(reference: View, neighbours: Sequence[View]) -> Fused:
+    """Fuse the depth of neighbouring frames into that of a reference frame.
+
+    Args:
+        reference: frame whose view the result has.
+        neighbours: frames that see the same surfaces; none leaves the reference as it is.
+
+    Returns:
+        The depth in the dtype of the reference.
+
+    """
+    readings = [_own(reference), *(_seen_from(reference, view) for view in neighbours)]
+    inverse, deviation = (torch.stack(each) for each in zip(*readings, strict=True))  # (N + 1, h, w)
+    centre = _most_voted(inverse, deviation)
+    for _ in range(_PASSES):
+        weight = _weights(inverse, deviation, centre)
+        total = weight.sum(0)
+        mean = (weight * inverse.nan_to_num(0)).sum(0) / total
+        centre = torch.where(total > 0, mean, centre)
+    weight = _weights(inverse, deviation, centre)
+    votes = (weight > 0).sum(0)
+    spread = weight.sum(0).rsqrt() / centre.square()
+    depth = centre.reciprocal()
+    spread = spread.masked_fill(depth.isnan(), torch.nan)
+    return Fused(*(each[None].to(reference.depth) for each in (depth, spread, votes)))
+
+
+def _own(view: View) -> tuple[Tensor, Tensor]:
+    """Return a view's inverse depth and the standard deviation of it, (h, w) float64 each."""
+    inverse = view.depth[0].double().reciprocal()
+    inverse = inverse.masked_fill(~inverse.isfinite(), torch.nan)
+    least = _LEAST_NOISE * float(inverse.nanmedian().nan_to_num(1.0))
+    if view.deviation is None:
+        noise = max(estimate_sensor_noise(inverse[None, None]), least)
+        return inverse, torch.full_like(inverse, noise)
+    return inverse, (view.deviation[0].double() * inverse.square()).clamp(min=least)
+
+
+def _seen_from(reference: View, view: View) -> tuple[Tensor, Tensor]:
+    """Return another view's inverse depth and its standard deviation as the reference sees it, (h, w) each."""
+    move = torch.from_numpy(relative(view.pose, reference.pose))[None]
+    depth = warp_depth(view.depth[None].double().cpu(), view.camera, move, reference.camera)
+    _, deviation = _own(view)
+    u, v = source_pixels(depth, view.camera, move, reference.camera)
+    rows, columns = (
+        place[0].nan_to_num(0).round().long().clamp(0, n - 1)
+        for place, n in ((v, view.camera.height), (u, view.camera.width))
+    )
+    before = view.depth[0].double().cpu()[rows, columns]  # inverse depth's deviation scales with its square
+    seen = depth[0, 0].reciprocal()
+    ratio = (seen * before).square().nan_to_num(1.0)
+    found = deviation.cpu()[rows, columns] * ratio
+    device = reference.depth.device
+    return seen.to(device), torch.where(found.isfinite(), found, torch.inf).to(device)
+
+
+def _tolerance(inverse: Tensor, deviation: Tensor, centre: Tensor, own: Tensor | float) -> Tensor:
+    """Return the difference from a centre, itself a reading of deviation ``own``, up to which readings agree."""
+    return _DEVIATIONS * (deviation.square() + own**2).sqrt() + _SLACK * centre.abs().nan_to_num(0)
+
+
+def _most_voted(inverse: Tensor, deviation: Tensor) -> Tensor:
+    """Return the reading with which most others agree, the reference's own if any does, (h, w); NaN in holes.
+
+    Args:
+        inverse: (N, h, w), the reference first.
+        deviation: (N, h, w), its standard deviation.
+
+    """
+    support = torch.stack(
+        [
+            ((inverse - each).abs() <= _tolerance(inverse, deviation, each, own)).sum(0)
+            for each, own in zip(inverse, deviation, strict=True)
+        ]
+    )
+    most, winner = support.max(0)
+    chosen = inverse.gather(0, winner[None])[0]
+    own = inverse[0]
+    keep = own.isfinite() & ((support[0] >= 2) | (most < 3))
+    return torch.where(keep, own, torch.where(most >= 1, chosen, torch.nan))
+
+
+def _weights(inverse: Tensor, deviation: Tensor, centre: Tensor) -> Tensor:
+    """Return the weights of the readings, (N, h, w): Tukey's biweight of the difference, over the variance."""
+    tolerance = _tolerance(inverse, deviation, centre, deviation[0].nan_to_num(0))
+    ratio = ((inverse - centre).abs() / tolerance).nan_to_num(1.0).clamp(max=1)
+    return (1 - ratio.square()).square() / deviation.square()

@@ -1,0 +1,186 @@
+"""Poses of frames and transforms between cameras, from text and JSON files."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from dsr.geometry.poses import Matrix, as_rigid, from_quaternion
+from dsr.io.names import time_of
+from dsr.io.pairs import Pair
+
+_LARGEST_FILE = 256 << 20
+_MAX_GAP = 0.02
+"""Largest time in seconds between a frame and its pose."""
+_MOST_BETWEEN = 10.0
+"""Largest plausible distance in metres between the two cameras of a rig; more is taken for millimetres."""
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """Poses in a file.
+
+    Args:
+        file: the file.
+        poses: camera to world, 4 x 4, metres, in order.
+        times: time of each in seconds, or its frame's number; None where the file has none.
+
+    """
+
+    file: Path
+    poses: tuple[Matrix, ...]
+    times: tuple[float, ...] | None = None
+
+    def assign(self, pairs: Sequence[Pair]) -> Mapping[str, Matrix]:
+        """Return the poses of frames by their names, without those of frames that have none.
+
+        Frames whose names are times get the pose nearest in time, within 20 ms; those whose names end in the number
+        that the file has for a time get that; others are taken in order.
+
+        Raises:
+            ValueError: the poses are to be taken in order, and there are not as many as frames.
+
+        """
+        taken = [time_of(pair.depth) or time_of(pair.rgb) for pair in pairs]
+        if self.times is not None:
+            times = np.array(self.times)
+            if all(time is not None for time in taken):
+                return self._nearest(pairs, np.array(taken, dtype=np.float64), times, _MAX_GAP)
+            numbers = [_number(pair) for pair in pairs]
+            known = set(self.times)
+            if all(number is not None for number in numbers) and known.intersection(numbers):
+                return self._nearest(pairs, np.array(numbers, dtype=np.float64), times, 0)
+        if len(self.poses) != len(pairs):
+            raise ValueError(
+                f"{self.file}: expected a pose for each of the {len(pairs)} frames, or times as in their names, got "
+                f"{len(self.poses)} poses"
+            )
+        return {pair.name: pose for pair, pose in zip(pairs, self.poses, strict=True)}
+
+    def _nearest(
+        self, pairs: Sequence[Pair], wanted: np.ndarray, times: np.ndarray, gap: float
+    ) -> Mapping[str, Matrix]:
+        """Return the poses nearest in time."""
+        order = np.argsort(times)
+        after = np.searchsorted(times[order], wanted).clip(1, max(len(order) - 1, 1))
+        candidates = order[np.stack((after - 1, np.minimum(after, len(order) - 1)))]  # (2, frames)
+        gaps = np.abs(times[candidates] - wanted)
+        best = candidates[gaps.argmin(0), np.arange(len(wanted))]
+        return {
+            pair.name: self.poses[number]
+            for pair, number, distance in zip(pairs, best, gaps.min(0), strict=True)
+            if distance <= gap
+        }
+
+
+def read_transform(path: Path) -> Matrix:
+    """Read a rigid transform from one camera to another, in metres.
+
+    Args:
+        path: text of 3 x 4 or 4 x 4 numbers; or JSON, nested lists of these, alone or as the only matrix of an object.
+
+    Raises:
+        ValueError: the file is missing or holds something else, or the transform is not rigid.
+
+    """
+    text = _text(path)
+    if path.suffix.lower() == ".json" or text.lstrip().startswith(("{", "[")):
+        matrix = as_rigid(_matrix_of_json(path, text), str(path))
+    else:
+        rows = _numbers(path, text)
+        if len(rows) == 1 and len(rows[0]) in (12, 16):
+            rows = np.reshape(rows[0], (-1, 4)).tolist()
+        if len({len(row) for row in rows}) > 1:
+            raise ValueError(f"{path}: expected a matrix of 3 x 4 or 4 x 4 numbers, got rows of different lengths")
+        matrix = as_rigid(rows, str(path))
+    distance = float(np.linalg.norm(matrix[:3, 3]))
+    if distance > _MOST_BETWEEN:
+        raise ValueError(f"{path}: expected a translation in metres, got one of {distance:g}; are these millimetres?")
+    return matrix
+
+
+def read_poses(path: Path) -> Trajectory:
+    """Read poses from camera to world, in metres.
+
+    The formats are that of TUM RGB-D (``timestamp tx ty tz qx qy qz qw`` in each line,
+    https://cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats); matrices of 12 or 16 numbers in each line, as
+    KITTI's odometry has them; and matrices of four lines each, as in Redwood's and Open3D's ``.log``, whose lines of
+    three whole numbers before each matrix are left out. Lines that begin with ``#`` are comments.
+
+    Raises:
+        ValueError: the file is missing or holds something else, or a pose is not rigid; the message names the line or
+            the pose.
+
+    """
+    rows = [row for row in _numbers(path, _text(path)) if len(row) != 3]
+    lengths = {len(row) for row in rows}
+    if lengths == {8}:
+        poses = tuple(
+            from_quaternion(row[1:4], row[4:], f"{path}: pose {number}") for number, row in enumerate(rows, 1)
+        )
+        times = tuple(row[0] for row in rows)
+        if not all(map(math.isfinite, times)):
+            raise ValueError(f"{path}: expected finite times, got another")
+        return Trajectory(path, poses, times)
+    if lengths == {4} and len(rows) % 4 == 0:
+        rows = np.reshape(rows, (-1, 16)).tolist()
+    elif lengths not in ({12}, {16}):
+        raise ValueError(
+            f"{path}: expected lines of 8 numbers (time, translation, quaternion), of 12 or 16 (a matrix), or four "
+            f"lines of 4 for each matrix, got lines of {', '.join(map(str, sorted(lengths))) or 'no'} numbers"
+        )
+    return Trajectory(
+        path,
+        tuple(as_rigid(np.reshape(row, (-1, 4)), f"{path}: pose {number}") for number, row in enumerate(rows, 1)),
+    )
+
+
+def _text(path: Path) -> str:
+    """Return the text of a file of moderate size."""
+    if not path.is_file():
+        raise ValueError(f"{path}: expected a file, there is none")
+    if path.stat().st_size > _LARGEST_FILE:
+        raise ValueError(f"{path}: expected a text file, got {path.stat().st_size} bytes")
+    return path.read_text(encoding="utf-8", errors="replace")
+
+
+def _numbers(path: Path, text: str) -> list[list[float]]:
+    """Return the numbers in each line that has any."""
+    rows = []
+    for number, line in enumerate(text.splitlines(), 1):
+        words = re.split(r"[\s,;]+", line.partition("#")[0].strip())
+        if words == [""]:
+            continue
+        try:
+            rows.append([float(word) for word in words])
+        except ValueError:
+            raise ValueError(f"{path}: line {number}: expected numbers, got {line!r:.60}") from None
+    return rows
+
+
+def _matrix_of_json(path: Path, text: str) -> list[list[float]]:
+    """Return the nested lists that JSON holds."""
+    try:
+        content = json.loads(text)
+    except (ValueError, RecursionError):
+        raise ValueError(f"{path}: expected JSON or rows of numbers, got something else") from None
+    if isinstance(content, dict):
+        lists = [value for value in content.values() if isinstance(value, list)]
+        content = lists[0] if len(lists) == 1 else None
+    if isinstance(content, list) and len(content) in (12, 16) and not any(isinstance(each, list) for each in content):
+        content = [content[start : start + 4] for start in range(0, len(content), 4)]
+    if not isinstance(content, list):
+        raise ValueError(f"{path}: expected a matrix of 3 x 4 or 4 x 4 numbers, got something else")
+    return content
+
+
+def _number(pair: Pair) -> float | None:
+    """Return the last number in a frame's name."""
+    numbers = re.findall(r"\d+", pair.depth.stem)
+    return float(numbers[-1]) if numbers and len(numbers[-1]) < 16 else None

@@ -1,0 +1,315 @@
+"""``dsr upsample`` on rigs and sequences, and ``dsr fuse``: what a user gets, and every refusal."""
+
+import json
+
+import cv2
+import numpy as np
+import pytest
+import torch
+import trimesh
+from PIL import Image
+
+from dsr.cli import main
+from dsr.geometry.camera import Camera
+from dsr.geometry.warping import warp_depth
+
+CAMERA = Camera.centred(96, 72, 90.0)
+DEPTH_ONLY = ("--method", "bicubic", "--only", "depth")
+COLOURS = np.array([[200, 60, 60], [60, 120, 200]], np.uint8)
+
+
+def world(camera, right=0.0):
+    """Return photo and depth of a box before a wall, from a camera that is moved to the right; metres."""
+    rays = camera.rays().numpy()
+    x, y = 1.2 * rays[0] + right, 1.2 * rays[1]
+    inside = (np.abs(x) < 0.3) & (np.abs(y) < 0.2)
+    return COLOURS[inside.astype(int)], np.where(inside, 1.2, 2.0)
+
+
+def pose(right):
+    matrix = np.eye(4)
+    matrix[0, 3] = right
+    return matrix
+
+
+def text(matrix):
+    return "\n".join(" ".join(f"{value:.9f}" for value in row) for row in matrix) + "\n"
+
+
+def camera_json(camera):
+    return json.dumps({name: getattr(camera, name) for name in ("width", "height", "fx", "fy", "cx", "cy")})
+
+
+@pytest.fixture
+def capture(tmp_path):
+    """Five frames with noise, from cameras 4 cm apart, and their poses."""
+    folder = tmp_path / "capture"
+    rng = np.random.default_rng(0)
+    for name in ("rgb", "depth"):
+        (folder / name).mkdir(parents=True)
+    for number in range(5):
+        photo, depth = world(CAMERA, 0.04 * number)
+        low = depth.reshape(36, 2, 48, 2).mean((1, 3)) * (1 + 0.01 * rng.standard_normal((36, 48)))
+        Image.fromarray(photo).save(folder / "rgb" / f"{number:03}.png")
+        cv2.imwrite(str(folder / "depth" / f"{number:03}.png"), np.round(1000 * low).astype(np.uint16))
+    (folder / "camera.json").write_text(camera_json(CAMERA))
+    (tmp_path / "poses.txt").write_text("".join(text(pose(0.04 * number)) for number in range(5)))
+    return folder
+
+
+def upsample(*arguments):
+    return main(["upsample", *map(str, arguments)])
+
+
+def info(folder):
+    return json.loads((folder / "info.json").read_text())
+
+
+def error_of(capsys, code):
+    """Return the only line on stderr of a command that failed."""
+    assert code == 2
+    lines = capsys.readouterr().err.strip().splitlines()
+    assert len(lines) == 1, lines
+    return lines[0]
+
+
+# a depth camera elsewhere
+
+
+@pytest.fixture
+def rig(tmp_path):
+    """A photo, and the depth map of a camera 10 cm to its left with another focal length."""
+    sensor = Camera(80, 64, 70.0, 70.0, 40.0, 31.0)
+    Image.fromarray(world(CAMERA)[0]).save(tmp_path / "photo.png")
+    np.save(tmp_path / "depth.npy", world(sensor, -0.1)[1])
+    (tmp_path / "ir.json").write_text(camera_json(sensor))
+    (tmp_path / "photo.json").write_text(camera_json(CAMERA))
+    (tmp_path / "move.txt").write_text(text(pose(-0.1)))
+    return tmp_path
+
+
+def with_rig(folder, *more, extrinsics="move.txt"):
+    files = ("--rgb", folder / "photo.png", "--depth", folder / "depth.npy", "--camera", folder / "photo.json")
+    rig = ("--depth-camera", folder / "ir.json", "--extrinsics", folder / extrinsics)
+    return upsample(*files, *rig, *DEPTH_ONLY, "-o", folder / "out", *more)
+
+
+def test_rig_gives_depth_in_the_photos_view(rig, capsys):
+    assert with_rig(rig, "--keep-holes") == 0
+    assert "the depth map is warped into the photo's view (75 x 56, " in capsys.readouterr().out
+    depth, truth = np.load(rig / "out" / "depth.npy"), world(CAMERA)[1]
+    known = np.isfinite(depth)
+    assert 0.75 < known.mean() < 0.99  # the sensor does not see all
+    assert (np.abs(depth - truth)[known] < 0.02).mean() > 0.88  # all but the steps, which bicubic blurs
+    assert {"depth_camera", "extrinsics"} <= info(rig / "out")["inputs"].keys()
+
+
+def test_rig_that_changed_is_another_result(rig, capsys):
+    assert with_rig(rig) == 0
+    (rig / "move.txt").write_text(text(pose(-0.05)))
+    capsys.readouterr()
+    assert "holds a result of other inputs" in error_of(capsys, with_rig(rig))
+
+
+@pytest.mark.parametrize(
+    ("matrix", "message"),
+    [
+        (1.1 * np.eye(4)[:3], "move.txt: expected a rigid transform"),
+        (np.full((3, 4), np.nan), "move.txt: expected finite numbers"),
+        (np.eye(3), "move.txt: expected a matrix of 3 x 4 or 4 x 4 numbers"),
+        (pose(-90.0), "move.txt: expected a translation in metres"),
+        (pose(-9.0), "--extrinsics: expected the transform from the depth camera's frame"),
+    ],
+)
+def test_bad_extrinsics_end_in_one_line(rig, capsys, matrix, message):
+    (rig / "move.txt").write_text(text(matrix))
+    assert message in error_of(capsys, with_rig(rig))
+    assert not (rig / "out").exists()
+
+
+def test_depth_camera_of_another_aspect_is_refused(rig, capsys):
+    (rig / "ir.json").write_text(camera_json(CAMERA))
+    assert "ir.json: the camera is of 96 x 72 pixels" in error_of(capsys, with_rig(rig))
+
+
+def test_depth_camera_needs_extrinsics(rig, capsys):
+    files = ("--rgb", rig / "photo.png", "--depth", rig / "depth.npy", "--depth-camera", rig / "ir.json")
+    assert "--depth-camera: expected --extrinsics with it" in error_of(capsys, upsample(*files, "-o", rig / "out"))
+
+
+# registration
+
+
+@pytest.fixture
+def apart(tmp_path):
+    """A photo of many boxes, and a depth map that lies 6 pixels beside it."""
+    rng = np.random.default_rng(1)
+    depth, photo = np.full((240, 320), 3.0), np.full((240, 320, 3), 110.0)
+    for near in np.linspace(2.5, 1, 16):
+        top, left, height, width = rng.integers((0, 0, 20, 20), (200, 280, 60, 60))
+        depth[top : top + height, left : left + width] = near
+        photo[top : top + height, left : left + width] = rng.integers(30, 220, 3)
+    Image.fromarray((photo + 3 * rng.standard_normal(photo.shape)).clip(0, 255).astype(np.uint8)).save(
+        tmp_path / "photo.png"
+    )
+    np.save(tmp_path / "depth.npy", np.roll(depth, (4, -6), (0, 1)))
+    return tmp_path, depth
+
+
+def test_displaced_pair_is_warned_of_and_register_cures_it(apart, capsys):
+    folder, depth = apart
+    files = ("--rgb", folder / "photo.png", "--depth", folder / "depth.npy", "--fov", "60", *DEPTH_ONLY, "--keep-holes")
+    files = (*files, "--method", "bilateral")
+    assert upsample(*files, "-o", folder / "out") == 0
+    out = " ".join(capsys.readouterr().out.split())
+    assert "the photo's edges lie beside the depth edges (6.0 px to the right, 4.0 px above" in out
+    assert "--register" in out
+    assert upsample(*files, "--register", "-o", folder / "cured") == 0
+    assert "the depth map is moved to the photo's edges (by 6.0 px to the right, 4.0 px up)" in " ".join(
+        capsys.readouterr().out.split()
+    )
+    result = np.load(folder / "cured" / "depth.npy")
+    inner = (slice(8, -8), slice(8, -8))
+    assert (np.abs(result - depth)[inner] < 0.05).mean() > 0.97
+    assert info(folder / "cured")["settings"]["register"] is True
+
+
+def test_register_leaves_an_aligned_pair_alone(apart, capsys):
+    folder, depth = apart
+    np.save(folder / "depth.npy", depth)
+    files = ("--rgb", folder / "photo.png", "--depth", folder / "depth.npy", "--fov", "60", *DEPTH_ONLY)
+    assert upsample(*files, "--register", "-o", folder / "out") == 0
+    assert "no displacement is certain, the depth map stays where it is" in " ".join(capsys.readouterr().out.split())
+    assert upsample(*files, "-o", folder / "other") == 0
+    assert "warning" not in capsys.readouterr().out
+    assert np.array_equal(np.load(folder / "out" / "depth.npy"), np.load(folder / "other" / "depth.npy"))
+
+
+# sequences
+
+
+def test_neighbours_lower_the_noise_and_keep_the_pose(capture, capsys):
+    poses = ("--poses", capture.parent / "poses.txt")
+    assert upsample(capture, *poses, *DEPTH_ONLY, "-o", capture.parent / "one") == 0
+    assert upsample(capture, *poses, "--neighbours", "4", *DEPTH_ONLY, "-o", capture.parent / "five") == 0
+    assert "4 neighbouring frames vote on the depth" in capsys.readouterr().out
+    truth = world(CAMERA, 0.08)[1]
+    noise = {
+        name: np.std((np.load(capture.parent / name / "002" / "depth_metres.npy") - truth)[5:15, 20:-20])
+        for name in ("one", "five")
+    }
+    assert noise["five"] < 0.55 * noise["one"]
+    about = info(capture.parent / "five" / "002")
+    assert about["pose"] == pose(0.08).tolist()
+    assert about["settings"]["neighbours"] == 4
+    assert {"poses", "neighbour_1_depth", "neighbour_4_depth"} <= about["inputs"].keys()
+
+
+def test_same_command_again_is_complete_and_a_changed_neighbour_is_not(capture, capsys):
+    command = (capture, "--poses", capture.parent / "poses.txt", "--neighbours", "2", *DEPTH_ONLY)
+    command = (*command, "-o", capture.parent / "out")
+    assert upsample(*command) == 0
+    capsys.readouterr()
+    assert upsample(*command) == 0
+    assert "5 complete already" in capsys.readouterr().out
+    depth = cv2.imread(str(capture / "depth" / "000.png"), cv2.IMREAD_UNCHANGED)
+    cv2.imwrite(str(capture / "depth" / "000.png"), depth + 1)
+    assert upsample(*command) == 2
+    outcome = capsys.readouterr()
+    assert all(f"{name}: holds a result of other inputs" in outcome.err for name in ("000", "001"))
+    assert "3 complete already" in outcome.out  # the others do not depend on frame 000
+
+
+def test_broken_neighbour_does_not_stop_the_others(capture, capsys):
+    (capture / "depth" / "003.png").write_bytes(b"\x89PNG broken")
+    code = upsample(
+        capture, "--poses", capture.parent / "poses.txt", "--neighbours", "2", *DEPTH_ONLY, "-o", capture.parent / "out"
+    )
+    assert "003" in error_of(capsys, code)
+    assert sorted(path.parent.name for path in (capture.parent / "out").glob("*/depth.png")) == [
+        "000",
+        "001",
+        "002",
+        "004",
+    ]
+
+
+def test_frame_without_a_pose_is_named_and_the_others_are_done(capture, capsys):
+    lines = [f"{number} {0.04 * number} 0 0 0 0 0 1" for number in (0, 1, 3, 4)]
+    (capture.parent / "poses.txt").write_text("\n".join(lines))
+    code = upsample(
+        capture, "--poses", capture.parent / "poses.txt", "--neighbours", "2", *DEPTH_ONLY, "-o", capture.parent / "out"
+    )
+    message = error_of(capsys, code)
+    assert "002" in message
+    assert "expected a pose for each frame" in message
+    assert len(list((capture.parent / "out").glob("*/depth.png"))) == 4
+
+
+@pytest.mark.parametrize(
+    ("poses", "message"),
+    [
+        ("", "poses.txt: expected lines of 8 numbers"),
+        (text(np.diag([1.0, 1.0, 1.5, 1.0])), "poses.txt: pose 1: expected a rigid transform"),
+        (text(pose(np.nan)), "poses.txt: pose 1: expected finite numbers"),
+        (text(pose(0.0)), "poses.txt: expected a pose for each of the 5 frames"),
+    ],
+)
+def test_bad_poses_end_in_one_line(capture, capsys, poses, message):
+    (capture.parent / "poses.txt").write_text(poses)
+    code = upsample(capture, "--poses", capture.parent / "poses.txt", "--neighbours", "2", "-o", capture.parent / "out")
+    assert message in error_of(capsys, code)
+    assert not (capture.parent / "out").exists()
+
+
+def test_neighbours_without_poses_are_refused(capture, capsys):
+    code = upsample(capture, "--neighbours", "2", *DEPTH_ONLY, "-o", capture.parent / "out")
+    assert "expected a pose for each frame, this capture has none; give --poses" in error_of(capsys, code)
+    code = upsample(capture, "--neighbours", "-1", "-o", capture.parent / "out")
+    assert "--neighbours: expected 0 or a positive number of frames, got -1" in error_of(capsys, code)
+
+
+# fuse
+
+
+def test_results_with_poses_become_one_mesh(capture, capsys):
+    out = capture.parent / "out"
+    assert upsample(capture, "--poses", capture.parent / "poses.txt", *DEPTH_ONLY, "-o", out) == 0
+    assert main(["fuse", str(out), "-o", str(capture.parent / "mesh.ply"), "--voxel", "0.03"]) == 0
+    assert "5 results -> " in " ".join(capsys.readouterr().out.split())
+    mesh = trimesh.load(capture.parent / "mesh.ply", process=False)
+    wall = mesh.vertices[mesh.vertices[:, 2] > 1.8]
+    box = mesh.vertices[mesh.vertices[:, 2] < 1.25]
+    assert len(wall) > 500
+    assert abs(wall[:, 2].mean() - 2.0) < 0.01
+    assert abs(np.median(box[:, 2]) - 1.2) < 0.02
+    assert abs(np.ptp(box[:, 0]) - 0.6) < 0.12  # the frames' boxes coincide
+
+
+def test_results_without_poses_and_damaged_ones_are_refused(capture, capsys):
+    out, mesh = capture.parent / "out", capture.parent / "mesh.ply"
+    assert upsample(capture, *DEPTH_ONLY, "-o", out) == 0
+    capsys.readouterr()
+    assert "expected a pose; run" in error_of(capsys, main(["fuse", str(out), "-o", str(mesh)]))
+    for number, change in enumerate(({"pose": np.ones((4, 4)).tolist()}, {"camera": 3}, {"complete": False})):
+        path = out / f"{number:03}" / "info.json"
+        path.write_text(json.dumps({**json.loads(path.read_text()), "pose": pose(0.0).tolist(), **change}))
+    (out / "003" / "depth_metres.npy").write_bytes(b"broken")
+    path = out / "003" / "info.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), "pose": pose(0.0).tolist()}))
+    path = out / "004" / "info.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), "pose": pose(0.0).tolist()}))
+    assert main(["fuse", str(out), "-o", str(mesh)]) == 2
+    lines = capsys.readouterr().err.strip().splitlines()
+    assert len(lines) == 4
+    assert mesh.is_file()
+    assert ".ply" in error_of(capsys, main(["fuse", str(out), "-o", str(capture.parent / "mesh.obj")]))
+    assert "found no info.json" in error_of(capsys, main(["fuse", str(capture), "-o", str(mesh)]))
+
+
+def test_warped_depth_agrees_with_the_library(rig):
+    assert with_rig(rig, "--keep-holes") == 0
+    depth = torch.from_numpy(np.load(rig / "depth.npy"))[None, None]
+    sensor = Camera(80, 64, 70.0, 70.0, 40.0, 31.0)
+    seen = warp_depth(depth, sensor, torch.from_numpy(pose(-0.1))[None], CAMERA.rescale(75, 56))
+    assert info(rig / "out")["input_holes"] == pytest.approx(float(seen.isnan().double().mean()), abs=1e-6)

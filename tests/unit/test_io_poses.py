@@ -1,0 +1,130 @@
+"""Files of poses and of extrinsics in every format, and every refusal."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from dsr.io.pairs import Pair
+from dsr.io.poses import read_poses, read_transform
+
+TURN = Rotation.from_euler("xyz", (10, -20, 30), degrees=True)
+MATRIX = np.eye(4)
+MATRIX[:3, :3], MATRIX[:3, 3] = TURN.as_matrix(), (0.1, -0.2, 0.3)
+TUM = "{time} 0.1 -0.2 0.3 " + " ".join(f"{value:.9f}" for value in TURN.as_quat())
+
+
+def text(matrix):
+    return "\n".join(" ".join(f"{value:.9f}" for value in row) for row in matrix) + "\n"
+
+
+def pairs(*names):
+    return [Pair(name, Path(f"rgb/{name}.png"), Path(f"depth/{name}.png")) for name in names]
+
+
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        ("x.txt", text(MATRIX)),
+        ("x.txt", text(MATRIX[:3])),
+        ("x.txt", "# depth to colour\n" + text(MATRIX).replace(" ", ", ")),
+        ("x.txt", " ".join(str(value) for value in MATRIX.ravel())),
+        ("x.json", json.dumps(MATRIX.tolist())),
+        ("x.json", json.dumps({"unit": "m", "depth_to_photo": MATRIX[:3].tolist()})),
+        ("x.json", json.dumps(MATRIX.ravel().tolist())),
+    ],
+)
+def test_extrinsics_are_read_in_every_format(tmp_path, name, content):
+    (tmp_path / name).write_text(content)
+    assert read_transform(tmp_path / name) == pytest.approx(MATRIX, abs=1e-8)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("x.txt", text(MATRIX[:2]), "3 x 4 or 4 x 4 numbers, got 2 x 4"),
+        ("x.txt", "1 0 0 0\n0 1 0\n", "rows of different lengths"),
+        ("x.txt", text(1.2 * MATRIX), "0 0 0 1 as the last row"),
+        ("x.txt", text(1.2 * MATRIX[:3]), "rigid transform"),
+        ("x.txt", text(MATRIX).replace("0.100000000", "nan", 1), "finite numbers, got nan"),
+        ("x.txt", "hello\n", "line 1: expected numbers, got 'hello'"),
+        ("x.txt", "", "3 x 4 or 4 x 4 numbers"),
+        ("x.json", "{", "expected JSON"),
+        ("x.json", '{"a": 1}', "got something else"),
+        ("x.json", '[["a", 1]]', "got something else"),
+        ("x.txt", text(np.block([[np.eye(3), np.array([[15.0], [0], [0]])]])), "are these millimetres"),
+    ],
+)
+def test_bad_extrinsics_are_refused_in_one_line(tmp_path, name, content, message):
+    (tmp_path / name).write_text(content)
+    with pytest.raises(ValueError, match=message) as caught:
+        read_transform(tmp_path / name)
+    assert str(caught.value).startswith(str(tmp_path / name))
+    assert "\n" not in str(caught.value)
+
+
+def test_missing_file_is_named(tmp_path):
+    with pytest.raises(ValueError, match=r"none\.txt: expected a file, there is none"):
+        read_transform(tmp_path / "none.txt")
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        TUM.format(time=0) + "\n" + TUM.format(time=1) + "\n",
+        text(MATRIX) + text(MATRIX),
+        "0 0 1\n" + text(MATRIX) + "1 1 2\n" + text(MATRIX),
+        2 * (" ".join(str(value) for value in MATRIX.ravel()) + "\n"),
+        2 * (" ".join(str(value) for value in MATRIX[:3].ravel()) + "\n"),
+    ],
+)
+def test_poses_are_read_in_every_format(tmp_path, content):
+    (tmp_path / "poses.txt").write_text(content)
+    found = read_poses(tmp_path / "poses.txt").assign(pairs("a", "b"))
+    assert list(found) == ["a", "b"]
+    assert found["b"] == pytest.approx(MATRIX, abs=1e-8)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("", "got lines of no numbers"),
+        ("1 2\n", "got lines of 2 numbers"),
+        (text(MATRIX)[:-40], "expected lines of 8 numbers"),
+        (TUM.format(time=0).rsplit(" ", 1)[0] + " 3\n", "pose 1: expected a quaternion of length 1"),
+        (TUM.format(time=0).replace("0.1", "nan", 1) + "\n", "pose 1: expected finite numbers"),
+        (TUM.format(time="nan") + "\n", "expected finite times"),
+        (text(MATRIX) + text(np.diag([1.0, 1.0, 2.0, 1.0])), "pose 2: expected a rigid transform"),
+        ("x y z\n", "line 1: expected numbers"),
+    ],
+)
+def test_bad_poses_are_refused_in_one_line(tmp_path, content, message):
+    (tmp_path / "poses.txt").write_text(content)
+    with pytest.raises(ValueError, match=message) as caught:
+        read_poses(tmp_path / "poses.txt")
+    assert "\n" not in str(caught.value)
+
+
+def write_tum(folder, *times):
+    path = folder / "poses.txt"
+    path.write_text("".join(f"{time} {number} 0 0 0 0 0 1\n" for number, time in enumerate(times)))
+    return read_poses(path)
+
+
+def test_times_in_names_get_the_nearest_pose_within_20_ms(tmp_path):
+    trajectory = write_tum(tmp_path, 1305031102.00, 1305031102.03, 1305031102.06)
+    found = trajectory.assign(pairs("1305031102.035", "1305031102.055", "1305031102.5"))
+    assert {name: pose[0, 3] for name, pose in found.items()} == {"1305031102.035": 1, "1305031102.055": 2}
+
+
+def test_numbers_in_names_get_the_pose_of_that_number(tmp_path):
+    found = write_tum(tmp_path, 7, 8, 9).assign(pairs("frame_0009", "frame_0007", "frame_0011"))
+    assert {name: pose[0, 3] for name, pose in found.items()} == {"frame_0009": 2, "frame_0007": 0}
+
+
+def test_poses_without_times_have_to_be_as_many_as_frames(tmp_path):
+    (tmp_path / "poses.txt").write_text(text(MATRIX))
+    with pytest.raises(ValueError, match="a pose for each of the 2 frames"):
+        read_poses(tmp_path / "poses.txt").assign(pairs("a", "b"))
