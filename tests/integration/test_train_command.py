@@ -669,7 +669,7 @@ def test_facets_train_and_their_weights_are_those_of_the_method(tmp_path, within
     code, output, errors = within(*SMOKE, f"model={model}", "model.width=8", *size, "output_dir=out")
     assert (code, errors) == (0, [])
     assert output.startswith(f"model  {model} x4")
-    assert ("loss   20 Lap_1 + RMSE_v + 8 RMSE" in output) == (model == "facets")
+    assert ("loss   20 Lap_1 + RMSE_v + 2 RMSE (8 of soft maps)" in output) == (model == "facets")
     code, _, errors = within(
         f"method={model}", "weights=out/weights.safetensors", "dataset.size=64", "dataset.scenes=[statue]",
         "metrics.lpips=false", "output_dir=scores", name="eval",
