@@ -95,7 +95,7 @@ def with_rig(folder, *more, extrinsics="move.txt"):
 
 
 def test_rig_gives_depth_in_the_photos_view(rig, capsys):
-    assert with_rig(rig, "--keep-holes") == 0
+    assert with_rig(rig, "--fill", "none") == 0
     assert "the depth map is warped into the photo's view (75 x 56, " in capsys.readouterr().out
     depth, truth = np.load(rig / "out" / "depth.npy"), world(CAMERA)[1]
     known = np.isfinite(depth)
@@ -158,7 +158,7 @@ def apart(tmp_path):
 
 def test_displaced_pair_is_warned_of_and_register_cures_it(apart, capsys):
     folder, depth = apart
-    files = ("--rgb", folder / "photo.png", "--depth", folder / "depth.npy", "--fov", "60", *DEPTH_ONLY, "--keep-holes")
+    files = ("--rgb", folder / "photo.png", "--depth", folder / "depth.npy", "--fov", "60", *DEPTH_ONLY, "--fill", "none")
     files = (*files, "--method", "bilateral")
     assert upsample(*files, "-o", folder / "out") == 0
     out = " ".join(capsys.readouterr().out.split())
@@ -308,7 +308,7 @@ def test_results_without_poses_and_damaged_ones_are_refused(capture, capsys):
 
 
 def test_warped_depth_agrees_with_the_library(rig):
-    assert with_rig(rig, "--keep-holes") == 0
+    assert with_rig(rig, "--fill", "none") == 0
     depth = torch.from_numpy(np.load(rig / "depth.npy"))[None, None]
     sensor = Camera(80, 64, 70.0, 70.0, 40.0, 31.0)
     seen = warp_depth(depth, sensor, torch.from_numpy(pose(-0.1))[None], CAMERA.rescale(75, 56))

@@ -50,7 +50,7 @@ def test_capture_of_a_phone_has_nothing_left_to_assume(tmp_path, capsys):
 
 def test_archive_of_record3d_is_given_as_a_file(tmp_path):
     out = tmp_path / "out"
-    assert upsample(captures.record3d(tmp_path / "scan.r3d"), "-o", out, *DEPTH_ONLY, "--keep-holes") == 0
+    assert upsample(captures.record3d(tmp_path / "scan.r3d"), "-o", out, *DEPTH_ONLY, "--fill", "none") == 0
     told = info(out / "000001")
     assert told["inputs"]["depth"]["file"] == "scan.r3d/rgbd/1.depth"
     assert told["depth_file"] == {
@@ -61,7 +61,7 @@ def test_archive_of_record3d_is_given_as_a_file(tmp_path):
 
 def test_least_confidence_makes_holes_and_is_kept_with_the_settings(tmp_path, capsys):
     folder, out = captures.polycam(tmp_path / "scan"), tmp_path / "out"
-    assert upsample(folder, "-o", out, *DEPTH_ONLY, "--keep-holes", "--min-confidence", 0.5) == 0
+    assert upsample(folder, "-o", out, *DEPTH_ONLY, "--fill", "none", "--min-confidence", 0.5) == 0
     assert "confidence below 0.5 counts as a hole (12.5%)" in capsys.readouterr().out
     stored = np.asarray(Image.open(out / "1000" / "depth.png"))
     assert (stored[:, :8] == 0).all()
@@ -92,7 +92,7 @@ def test_confidence_maps_may_be_levels_bytes_or_fractions(lists, kind):
             np.save(path.with_suffix(".npy"), captures.levels().astype(np.float32) / 2)
     given = ("--rgb", lists / "rgb", "--depth", lists / "depth", "--confidence", lists / "sure")
     out = lists / "out"
-    assert upsample(*given, "--min-confidence", 0.5, "--keep-holes", "-o", out, *DEPTH_ONLY) == 0
+    assert upsample(*given, "--min-confidence", 0.5, "--fill", "none", "-o", out, *DEPTH_ONLY) == 0
     for number in range(2):
         holes = np.asarray(Image.open(out / str(number) / "depth.png")) == 0
         np.testing.assert_array_equal(np.flatnonzero(holes.any(axis=0)), np.arange(8))
@@ -157,7 +157,7 @@ def test_sun_rgbd_has_its_intrinsics_one_folder_up_and_turned_bits(tmp_path, cap
     captures.save(scene / "depth" / "b.png", (millimetres << 3) | (millimetres >> 13))
     (scene / "intrinsics.txt").write_text("50 0 31 0 51 24 0 0 1\n")
     files = ("--rgb", scene / "image" / "a.jpg", "--depth", scene / "depth" / "b.png")
-    assert upsample(*files, "-o", out, *DEPTH_ONLY, "--depth-unit", "sunrgbd", "--keep-holes") == 0
+    assert upsample(*files, "-o", out, *DEPTH_ONLY, "--depth-unit", "sunrgbd", "--fill", "none") == 0
     assert "bits are turned back by 3, as SUN RGB-D turns them" in capsys.readouterr().out
     told = info(out)
     assert (told["camera"]["fx"], told["camera"]["cx"], told["settings"]["turned_bits"]) == (50, 31, 3)

@@ -43,6 +43,50 @@ def fill_in_graph(values: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
     return values, weight
 
 
+@torch.jit.script
+def neighbours_of(x: Tensor) -> Tensor:
+    """Return the eight neighbours of each pixel, row by row, (B, C, h, w) to (B, 8, C, h, w); 0 beyond the border."""
+    height, width = x.shape[-2], x.shape[-1]
+    padded = functional.pad(x, [1, 1, 1, 1])
+    rows = [padded[:, :, :height], padded[:, :, 1 : height + 1], padded[:, :, 2 : height + 2]]
+    around = [
+        rows[0][..., :width], rows[0][..., 1 : width + 1], rows[0][..., 2 : width + 2],
+        rows[1][..., :width], rows[1][..., 2 : width + 2],
+        rows[2][..., :width], rows[2][..., 1 : width + 1], rows[2][..., 2 : width + 2],
+    ]  # fmt: skip
+    return torch.stack(around, dim=1)
+
+
+@torch.jit.script
+def fill_by_colour_in_graph(x: Tensor, affinity: Tensor, alike: float) -> Tensor:
+    """Fill the holes of a map as :func:`dsr.methods.networks.inpainting.inpaint` does with a photo.
+
+    Args:
+        x: (1, 1, h, w), NaN in holes.
+        affinity: (1, 8, h, w) of each pixel and its neighbours.
+        alike: affinity from which a pixel is filled before others.
+
+    Returns:
+        (1, 1, h, w), NaN in an image without a known value.
+
+    """
+    known = torch.isfinite(x).to(affinity.dtype)
+    values = torch.where(known > 0, x, torch.zeros_like(x))
+    before = torch.zeros_like(known.sum()) - 1
+    while bool(known.sum() != before):
+        before = known.sum()
+        weights = affinity * neighbours_of(known)[:, :, 0]
+        nearest = weights.amax(dim=1, keepdim=True)
+        front = (known == 0) & (nearest > 0)
+        likely = front & (nearest >= alike)
+        first = likely | (front & ~likely.any())
+        total = weights.sum(dim=1, keepdim=True)
+        mean = (weights * neighbours_of(values)[:, :, 0]).sum(dim=1, keepdim=True)
+        values = torch.where(first, mean / torch.where(total > 0, total, torch.ones_like(total)), values)
+        known = torch.where(first, torch.ones_like(known), known)
+    return torch.where(known > 0, values, torch.full_like(values, float("nan")))
+
+
 def apply(function: type[torch.autograd.Function], *arguments: Any) -> Any:
     """Apply a function that has a derivative of its own; a graph gets its operations, without the derivative."""
     if not exporting():

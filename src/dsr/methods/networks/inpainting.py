@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from dsr.methods.networks.exportable import exporting, fill_in_graph
+from dsr.methods.networks.exportable import exporting, fill_by_colour_in_graph, fill_in_graph, neighbours_of
 
 _CONTRAST = 0.02
 """Standard deviation of the difference of the colours of a surface's neighbouring pixels, on the scale of [0, 1]."""
@@ -20,8 +20,7 @@ def inpaint(x: Tensor, photo: Tensor | None = None) -> Tensor:
     """Replace the non-finite values of (B, 1, h, w) by means of the valid ones in 3 x 3 pixels, from outside in.
 
     With a photo, the means are weighted by how alike the colours are, and pixels of the colour of a valid neighbour are
-    filled before others, so that values stop at the photo's edges; not so in exported networks, whose graph has no room
-    for a list of pixels. An image without a valid value stays unchanged.
+    filled before others, so that values stop at the photo's edges. An image without a valid value stays unchanged.
 
     Args:
         x: the maps.
@@ -30,10 +29,15 @@ def inpaint(x: Tensor, photo: Tensor | None = None) -> Tensor:
     """
     if not exporting() and bool(x.isfinite().all()):
         return x
-    if photo is None or exporting():
+    if photo is None:
         return _fill_evenly(x)
-    colours = functional.adaptive_avg_pool2d(photo.to(x.dtype), (x.shape[-2], x.shape[-1]))
+    if exporting():  # one factor for both axes
+        colours = functional.avg_pool2d(photo.to(x.dtype), int(photo.shape[-1] // x.shape[-1]))
+    else:
+        colours = functional.adaptive_avg_pool2d(photo.to(x.dtype), (x.shape[-2], x.shape[-1]))
     colours = functional.avg_pool2d(functional.pad(colours, (1, 1, 1, 1), mode="replicate"), 3, stride=1)
+    if exporting():
+        return fill_by_colour_in_graph(x, _affinity(colours), _ALIKE)
     return torch.stack([_fill_by_colour(each[0], colour) for each, colour in zip(x, colours, strict=True)])[:, None]
 
 
@@ -54,6 +58,12 @@ def _fill_evenly(x: Tensor) -> Tensor:
     return torch.where(weight > 0, values, torch.nan)
 
 
+def _affinity(colours: Tensor) -> Tensor:
+    """Return how alike the colours of each pixel and its eight neighbours are, (B, 3, h, w) to (B, 8, h, w)."""
+    difference = (neighbours_of(colours) - colours[:, None]).square().sum(dim=2)
+    return (difference / (-2 * _CONTRAST**2)).exp().clamp(min=_LEAST)
+
+
 def _fill_by_colour(x: Tensor, colours: Tensor) -> Tensor:
     """Return a map, (h, w), filled with means weighted by the colours, (3, h, w)."""
     height, width = x.shape
@@ -71,7 +81,9 @@ def _fill_by_colour(x: Tensor, colours: Tensor) -> Tensor:
         difference = (colour[:, beside] - colour[:, front, None]).square().sum(dim=0)
         affinity = (difference / (-2 * _CONTRAST**2)).exp().clamp(min=_LEAST) * known[beside]
         nearest = affinity.amax(dim=1)
-        first = nearest >= nearest.median().clamp(max=_ALIKE)
+        first = nearest >= _ALIKE
+        if not bool(first.any()):
+            first = torch.ones_like(first)
         filled, affinity, beside = front[first], affinity[first], beside[first]
         values[filled] = (affinity * values[beside].nan_to_num(0)).sum(dim=1) / affinity.sum(dim=1)
         known[filled] = True
