@@ -158,7 +158,17 @@ def apart(tmp_path):
 
 def test_displaced_pair_is_warned_of_and_register_cures_it(apart, capsys):
     folder, depth = apart
-    files = ("--rgb", folder / "photo.png", "--depth", folder / "depth.npy", "--fov", "60", *DEPTH_ONLY, "--fill", "none")
+    files = (
+        "--rgb",
+        folder / "photo.png",
+        "--depth",
+        folder / "depth.npy",
+        "--fov",
+        "60",
+        *DEPTH_ONLY,
+        "--fill",
+        "none",
+    )
     files = (*files, "--method", "bilateral")
     assert upsample(*files, "-o", folder / "out") == 0
     out = " ".join(capsys.readouterr().out.split())

@@ -137,7 +137,7 @@ def test_resumed_folder_of_millimetre_floats_keeps_its_unit(tmp_path, monkeypatc
     assert upsample(folder, "-o", tmp_path / "whole", *DEPTH_ONLY) == 0
     out = tmp_path / "resumed"
     with monkeypatch.context() as patch:
-        patch.setattr("dsr.app.upsample.run.read_picture", read_first_only)
+        patch.setattr("dsr.app.upsample.frame.read_picture", read_first_only)
         assert upsample(folder, "-o", out, *DEPTH_ONLY) == 130
     assert [path.name for path in out.iterdir()] == ["0"]
     assert upsample(folder, "-o", out, *DEPTH_ONLY) == 0

@@ -134,6 +134,13 @@ def _add_method(parser: argparse.ArgumentParser) -> None:
         help="frames of a folder that vote on each frame's depth, 4 for two on either side; needs poses",
     )
     method.add_argument("--poses", type=Path, metavar="FILE", help="camera poses: TUM's format, or 4 x 4 matrices")
+    method.add_argument(
+        "--workers",
+        type=int,
+        default=1,
+        metavar="N",
+        help="pictures at a time, each in its own process (default: 1)",
+    )
     method.add_argument("--device", default="auto", metavar="DEVICE", help="auto (default), cpu, cuda, cuda:1, ...")
     method.add_argument(
         "--fill", choices=("all", "small", "none"), default="small", help="which of the input's holes are filled"
@@ -254,6 +261,7 @@ def _run(options: argparse.Namespace, console: Console, _: object) -> list[str]:
         depth_format=options.format,
         max_faces=options.max_faces,
         max_points=options.max_points,
+        workers=options.workers,
         register=options.register,
         neighbours=options.neighbours,
         poses=options.poses,

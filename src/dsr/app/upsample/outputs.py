@@ -6,6 +6,7 @@ import contextlib
 import json
 import math
 from collections.abc import Iterable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -163,25 +164,28 @@ def write_parts(
     facts: list[Assumption] = []
     shapes: dict[str, Written] = {}
     files: list[str] = []
-    if "depth" in parts:
-        files, facts = _write_depth(folder, depth, camera, encoding)
-    if "renderings" in parts:
-        write_renderings(folder / "renderings", depth, camera)
-    if "normals" in parts:
-        write_normals(folder / "normals.png", depth, camera)
-    if {"cloud", "mesh"} & set(parts):
-        missing, notes, shapes = _write_shapes(folder, picture, surface, parts, limits or Limits())
-        parts = [part for part in parts if part not in missing]
-        facts += notes
-    if "before_after" in parts:
-        write_before_after(folder / "before_after.png", rgb, picture.depth_lr, depth, camera, title)
-    if "input" in parts:
-        write_input(folder / INPUT, rgb, picture.depth_lr)
-    if "confidence" in parts and not _write_errors(folder, surface):
-        parts = [part for part in parts if part != "confidence"]
-    if "rgbd" in parts:
-        facts += write_rgbd(folder / "rgbd", rgb, depth, camera)
-    return [*files, *(name for part in parts if part != "depth" for name in _FILES[part])], facts, shapes
+    with ThreadPoolExecutor(1) as beside:  # shapes take as long as all the rest
+        wanted = {"cloud", "mesh"} & set(parts)
+        shaping = beside.submit(_write_shapes, folder, picture, surface, parts, limits or Limits()) if wanted else None
+        if "depth" in parts:
+            files, facts = _write_depth(folder, depth, camera, encoding)
+        if "renderings" in parts:
+            write_renderings(folder / "renderings", depth, camera)
+        if "normals" in parts:
+            write_normals(folder / "normals.png", depth, camera)
+        if "before_after" in parts:
+            write_before_after(folder / "before_after.png", rgb, picture.depth_lr, depth, camera, title)
+        if "input" in parts:
+            write_input(folder / INPUT, rgb, picture.depth_lr)
+        if "confidence" in parts and not _write_errors(folder, surface):
+            parts = [part for part in parts if part != "confidence"]
+        rgbd_facts = write_rgbd(folder / "rgbd", rgb, depth, camera) if "rgbd" in parts else []
+        if shaping is not None:
+            missing, notes, shapes = shaping.result()
+            parts = [part for part in parts if part not in missing]
+            facts += notes
+    files += [name for part in parts if part != "depth" for name in _FILES[part]]
+    return files, [*facts, *rgbd_facts], shapes
 
 
 def _write_shapes(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
+from typing import Protocol
 
 import torch
 from rich.console import Console
@@ -13,6 +14,41 @@ from dsr.utils.console import one_line, show
 
 _SHOWN = 5
 """Number of names that a line lists; further ones are only counted."""
+
+
+class Messages(Protocol):
+    """What takes lines and notes: a :class:`Reporter`, or a :class:`Record` for one."""
+
+    def say(self, line: str) -> None:
+        """Take a line."""
+        ...
+
+    def facts(self, facts: Sequence[Assumption]) -> None:
+        """Take notes."""
+        ...
+
+
+class Record:
+    """Keeps lines and notes for a :class:`Reporter` in another process."""
+
+    def __init__(self) -> None:
+        self._said: list[str | Sequence[Assumption]] = []
+
+    def say(self, line: str) -> None:
+        """Keep a line."""
+        self._said.append(line)
+
+    def facts(self, facts: Sequence[Assumption]) -> None:
+        """Keep notes."""
+        self._said.append(tuple(facts))
+
+    def replay(self, reporter: Messages) -> None:
+        """Report what was kept, in its order."""
+        for each in self._said:
+            if isinstance(each, str):
+                reporter.say(each)
+            else:
+                reporter.facts(each)
 
 
 class Reporter:

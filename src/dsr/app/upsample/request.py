@@ -40,6 +40,7 @@ class UpsampleRequest:
         max_faces: triangles from which a mesh is simplified.
         max_points: points from which a cloud is thinned.
         depth_format: the result's format; None for the input's.
+        workers: number of processes that work at a time.
         register: whether to move each depth map to the photo's edges.
         neighbours: number of frames beside itself that vote on each frame's depth.
         poses: file of the frames' poses; None for those of the capture.
@@ -67,6 +68,7 @@ class UpsampleRequest:
     max_faces: int = MOST_FACES
     max_points: int = MOST_POINTS
     depth_format: str | None = None
+    workers: int = 1
     register: bool = False
     neighbours: int = 0
     poses: Path | None = None
@@ -100,7 +102,7 @@ class UpsampleRequest:
             raise ValueError(f"--max-hole: expected a positive number of degrees, got {self.max_hole:g}")
         self.limits.check()
         check_libraries(self.scene_parts)
-        self._check_sequence()
+        self._check_frames()
         self._check_method()
 
     @property
@@ -119,8 +121,10 @@ class UpsampleRequest:
         needed = ("depth", "rgbd") if self.scene_parts else ()
         return tuple(dict.fromkeys((*(part for part in self.parts if part not in SCENE_PARTS), *needed)))
 
-    def _check_sequence(self) -> None:
+    def _check_frames(self) -> None:
         """Check what is said about a sequence."""
+        if self.workers < 1:
+            raise ValueError(f"--workers: expected 1 or more, got {self.workers}")
         if self.neighbours < 0:
             raise ValueError(f"--neighbours: expected 0 or a positive number of frames, got {self.neighbours}")
         if self.poses is not None and len(self.folders) > 1:

@@ -1,0 +1,107 @@
+"""The pictures of ``dsr upsample``, one after another, or several at a time in processes of their own."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from pathlib import Path
+from typing import NamedTuple
+
+import cv2
+import torch
+
+from dsr.app.upsample.frame import FrameWork
+from dsr.app.upsample.reporting import Messages, Record, Reporter, problem_line
+from dsr.app.upsample.request import UpsampleRequest
+from dsr.io.pairs import Pair
+from dsr.utils.progress import Progress
+
+_FAILURES = (ValueError, OSError, MemoryError, torch.OutOfMemoryError)
+"""What a picture may fail with, while the others go on."""
+_work: FrameWork | None = None
+"""The work of this process, if it is a worker."""
+
+
+class Done(NamedTuple):
+    """A picture that was worked on: what became of it, or the problem in one line."""
+
+    pair: Pair
+    target: Path
+    outcome: str
+    problem: str | None
+
+
+def work_through(
+    request: UpsampleRequest, jobs: Sequence[tuple[Pair, Path]], reporter: Reporter, progress: Progress
+) -> Iterator[Done]:
+    """Upsample pictures.
+
+    Args:
+        request: the request; ``workers`` of it work at a time, each with its share of the cores and its own memory.
+        jobs: the pictures and the folders of their results.
+        reporter: where notes are shown: in the order of the pictures, or as they come from several workers.
+        progress: where the progress is shown.
+
+    Yields:
+        Each picture once it is done.
+
+    Raises:
+        ValueError: the file of poses is damaged, or does not fit the pictures.
+
+    """
+    workers = min(request.workers, len(jobs))
+    pairs = [pair for pair, _ in jobs]
+    if workers == 1:
+        work = FrameWork(request, pairs)
+        for pair, target in progress.track(jobs, "upsample", label=lambda job: job[0].name, lines=False):
+            yield _try(work, pair, target, reporter, progress)
+        return
+    FrameWork(request, pairs)  # raises for poses that do not fit
+    cores = max(1, (os.cpu_count() or 1) // workers)
+    context = multiprocessing.get_context("spawn")
+    pool = ProcessPoolExecutor(workers, context, _begin, (request, pairs, cores))
+    try:
+        futures = [pool.submit(_remote, pair, target) for pair, target in jobs]
+        places = dict(zip(futures, jobs, strict=True))
+        finished = progress.track(as_completed(futures), "upsample", len(jobs), label=lambda each: places[each][0].name)
+        for future in finished:
+            pair, target = places[future]
+            try:
+                done, record = future.result()
+            except BrokenProcessPool:
+                yield Done(pair, target, "", "a worker ended, perhaps for want of memory; fewer --workers need less")
+                continue
+            record.replay(reporter)
+            yield done
+    finally:
+        for process in list((pool._processes or {}).values()):
+            process.terminate()
+        pool.shutdown(wait=True, cancel_futures=True)
+
+
+def _begin(request: UpsampleRequest, pairs: Sequence[Pair], cores: int) -> None:
+    """Prepare a worker."""
+    global _work  # noqa: PLW0603 - the process's own
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent stops its workers
+    torch.set_num_threads(cores)
+    cv2.setNumThreads(cores)
+    _work = FrameWork(request, pairs)
+
+
+def _remote(pair: Pair, target: Path) -> tuple[Done, Record]:
+    """Upsample a picture in a worker."""
+    assert _work is not None  # noqa: S101 - workers begin with _begin
+    record = Record()
+    return _try(_work, pair, target, record, Progress()), record
+
+
+def _try(work: FrameWork, pair: Pair, target: Path, reporter: Messages, progress: Progress) -> Done:
+    """Upsample a picture, and return what became of it."""
+    try:
+        return Done(pair, target, work(pair, target, reporter, progress), None)
+    except _FAILURES as error:
+        return Done(pair, target, "", problem_line(error))
