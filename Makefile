@@ -1,6 +1,8 @@
 # make run   evaluate on the embedded scenes (ARGS="scale=8 method=..." are handed on to eval.py)
 # make test  lint, types and tests
 # make unit  the unit tests alone, about a minute
+# make fuzz  10,000 damaged, foreign and malicious files for every reader (ARGS="--cases 1000 --seed 1")
+# make chaos commands that are killed, run out of space and run at once (ARGS="--kills 100 --seed 0")
 # make docs  the documentation as a site in outputs/site
 # All of them set everything up in .venv first; they need Python >= 3.11 and nothing else.
 
@@ -12,7 +14,7 @@ ARGS ?=
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest --dist loadfile --no-loadscope-reorder --maxprocesses 8 \
 	--numprocesses $$(( $$(getconf _NPROCESSORS_ONLN) + 1 ))
 
-.PHONY: run test unit lint docs benchmark clean
+.PHONY: run test unit fuzz chaos lint docs benchmark clean
 
 run: $(VENV)/installed
 	$(BIN)/python eval.py $(ARGS)
@@ -23,6 +25,9 @@ test: lint
 unit: $(VENV)/installed-dev
 	$(PYTEST) -m unit
 
+fuzz: $(VENV)/installed-dev
+	OMP_NUM_THREADS=1 PYTHONPATH=$(CURDIR)/tests nice -n 10 $(BIN)/python -m fuzz $(ARGS)
+
 lint: $(VENV)/installed-dev
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
@@ -30,6 +35,9 @@ lint: $(VENV)/installed-dev
 
 docs: $(VENV)/installed-dev
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build
+
+chaos: $(VENV)/installed-dev
+	PYTHONPATH=tests $(BIN)/python -m chaos $(ARGS)
 
 benchmark: $(VENV)/installed-dev
 	for file in benchmarks/*_speed.py; do $(BIN)/python $$file || exit 1; done

@@ -1,6 +1,6 @@
 """Evaluate a depth super-resolution method: ``python eval.py --help``."""
 
-from dsr.app.entry import run_eval
+from dsr.utils.interruption import start
 
 if __name__ == "__main__":
-    run_eval()
+    start("dsr.app.entry", "run_eval")

@@ -1,6 +1,6 @@
 """Train a depth super-resolution network: ``python train.py --help``."""
 
-from dsr.app.entry import run_train
+from dsr.utils.interruption import start
 
 if __name__ == "__main__":
-    run_train()
+    start("dsr.app.entry", "run_train")

@@ -1,6 +1,7 @@
 """Small captures in the layouts of apps, written with poses and intrinsics that are known."""
 
 import json
+import os
 import struct
 import zipfile
 
@@ -54,6 +55,7 @@ def millimetres(number=0):
 def write_video(path, frames):
     """Write a video of RGB frames, without loss as far as the codec can."""
     path.parent.mkdir(parents=True, exist_ok=True)
+    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # as in dsr, which only reads videos; it is read once
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"mp4v"), 30, frames[0].shape[1::-1])
     for frame in frames:
         writer.write(cv2.cvtColor(frame, cv2.COLOR_RGB2BGR))

@@ -1,4 +1,4 @@
-"""Write the generated pages of the documentation: commands, configuration, Python API, model card and change log.
+"""Write the generated pages of the documentation: commands, configuration, Python API, weights, changes and security.
 
 MkDocs calls :func:`on_files` at every build, so these pages always agree with the code and none of them is stored.
 """
@@ -74,6 +74,7 @@ def generated_pages() -> dict[str, str]:
         "reference/configuration.md": configuration_reference(CONF),
         "weights.md": model_card(),
         "changelog.md": (ROOT / "CHANGELOG.md").read_text(),
+        "security.md": (ROOT / "SECURITY.md").read_text(),
     }
     return pages | {f"api/{package}.md": f"# dsr.{package}\n\n::: dsr.{package}\n" for package in PACKAGES}
 

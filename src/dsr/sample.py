@@ -19,7 +19,13 @@ from torch import Tensor
 
 from dsr.geometry.camera import Camera, to_range
 from dsr.utils.files import read_arrays, replacing
+from dsr.utils.limits import TooLargeError
+from dsr.utils.parsing import parse_json
 from dsr.utils.ratios import as_ratio, fits_ratio, round_ratio
+
+NEAREST, FARTHEST = 1e-6, 1e9
+"""Limits of depth in metres: a micrometre, nearer than any lens focuses, and beyond the Moon. Within them, the inverse
+and the cube of a depth are ordinary float32 numbers; what lies outside has a wrong unit, or marks a hole or the sky."""
 
 
 class AllHolesError(ValueError):
@@ -217,7 +223,7 @@ class DepthSample:
         """
         try:
             arrays = read_arrays(path)
-            about: dict[str, Any] = json.loads(str(arrays["about"]))
+            about: dict[str, Any] = parse_json(str(arrays["about"]))
             depth_lr = arrays["depth_lr"] if "depth_lr" in arrays else arrays["coarse"]
             return cls(
                 str(about["dataset"]),
@@ -233,7 +239,9 @@ class DepthSample:
             )
         except FileNotFoundError:
             raise ValueError(f"{path}: expected the sample of a scene, there is none") from None
-        except (OSError, KeyError, ValueError, TypeError, RuntimeError) as error:
+        except TooLargeError:
+            raise
+        except (OSError, KeyError, ValueError, TypeError, RuntimeError, AttributeError) as error:
             raise ValueError(f"{path}: expected the sample of a scene, got a damaged or foreign file") from error
 
     @property
@@ -303,6 +311,26 @@ def _expect_rgb(scene: str, rgb: Tensor, camera: Camera) -> None:
         raise ValueError(f"{scene}: rgb: expected floating point values in [0, 1]")
 
 
+def expect_distances(place: str, depth: Tensor) -> None:
+    """Check that depth is within :data:`NEAREST` and :data:`FARTHEST`.
+
+    Args:
+        place: the file, or the scene and the map, for the message.
+        depth: metres, of any shape; NaN in holes.
+
+    Raises:
+        ValueError: a value is nearer or farther.
+
+    """
+    beyond = depth[(depth < NEAREST) | (depth > FARTHEST)]
+    if beyond.numel():
+        share = beyond.numel() / depth.numel()
+        raise ValueError(
+            f"{place}: expected depths of {NEAREST:g} to {FARTHEST:g} m, got {float(beyond[0]):g} m in {share:.2%} of "
+            "the pixels; another unit, or sky that should be a hole (NaN)?"
+        )
+
+
 def _expect_depth(scene: str, name: str, depth: Tensor, size: tuple[int, int]) -> None:
     _expect_shape(scene, name, depth, (1, *size))
     if not depth.is_floating_point():
@@ -310,5 +338,6 @@ def _expect_depth(scene: str, name: str, depth: Tensor, size: tuple[int, int]) -
     if bool((depth.isinf() | (depth <= 0)).any()):
         came = "inf" if bool(depth.isinf().any()) else f"{depth.nan_to_num(nan=torch.inf).min().item():g}"
         raise ValueError(f"{scene}: {name}: expected positive depth, and NaN where a pixel is a hole; got {came}")
+    expect_distances(f"{scene}: {name}", depth)
     if not bool(depth.isfinite().any()):
         raise AllHolesError(f"{scene}: {name}: expected at least one known pixel, all are holes")

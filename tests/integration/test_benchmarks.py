@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import re
-import subprocess
-import sys
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from commands import run_python
 
 BENCHMARKS = Path(__file__).resolve().parents[2] / "benchmarks"
 SMALL = {
@@ -23,26 +22,21 @@ SMALL = {
 @pytest.mark.parametrize("name", SMALL)
 def test_benchmark_prints_ratios(name: str) -> None:
     arguments, ratios = SMALL[name]
-    done = subprocess.run(
-        [sys.executable, str(BENCHMARKS / name), *arguments], capture_output=True, text=True, timeout=120, check=False
-    )
+    done = run_python(str(BENCHMARKS / name), *arguments, cwd=BENCHMARKS.parent)
     assert done.returncode == 0, done.stderr
     assert len(re.findall(r"\d\.\d+ times as fast", done.stdout)) == ratios
 
 
 def test_method_cost_benchmark_measures(shared: Path) -> None:
-    command = [sys.executable, str(BENCHMARKS / "methods_cost.py"), "--scenes", str(shared / "scenes")]
-    done = subprocess.run(
-        [*command, "--methods", "nearest", "--scale", "4"], capture_output=True, text=True, timeout=120, check=False
-    )
+    command = (str(BENCHMARKS / "methods_cost.py"), "--scenes", str(shared / "scenes"))
+    done = run_python(*command, "--methods", "nearest", "--scale", "4", cwd=BENCHMARKS.parent)
     assert done.returncode == 0, done.stderr
     assert re.fullmatch(r"\| `nearest` \| - \| \d+\.\d\d \| \d+ \|", done.stdout.splitlines()[-1])
 
 
 def run_benchmark(name: str, *arguments: str) -> str:
     """Run a benchmark and return what it printed."""
-    command = [sys.executable, str(BENCHMARKS / name), *arguments]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+    done = run_python(str(BENCHMARKS / name), *arguments, cwd=BENCHMARKS.parent)
     assert done.returncode == 0, done.stderr
     return done.stdout
 

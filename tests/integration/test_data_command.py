@@ -136,7 +136,7 @@ def test_interrupted_command_resumes(mirror, root):
     _, errors = process.communicate(timeout=30)
     assert (process.returncode, errors) == (
         130,
-        "interrupted; finished work is kept, run the same command again to continue\n",
+        "interrupted; what is finished is kept, the same command goes on from there\n",
     )
     had = part.stat().st_size
     assert not (root / NAMES[0]).exists()

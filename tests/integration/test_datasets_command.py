@@ -2,13 +2,13 @@
 
 import os
 import shutil
-import subprocess
 import sys
 from pathlib import Path
 
 import cv2
 import pandas as pd
 import pytest
+from commands import run_python
 
 from dsr.app.entry import run_command
 from dsr.app.evaluate import evaluate
@@ -25,11 +25,8 @@ def run(tmp_path, dsr_cache):
 
     def call(script, *arguments, **environment):
         kept = {key: value for key, value in os.environ.items() if key not in ("DSR_DATA", "DSR_LPIPS_TRUNK")}
-        return subprocess.run(
-            [sys.executable, str(REPOSITORY / script), *arguments, *QUICK],
-            cwd=tmp_path, env={**kept, "DSR_CACHE": str(dsr_cache), "OMP_NUM_THREADS": "1", **environment},
-            capture_output=True, text=True, timeout=120, check=False,
-        )  # fmt: skip
+        env = {**kept, "DSR_CACHE": str(dsr_cache), "OMP_NUM_THREADS": "1", **environment}
+        return run_python(str(REPOSITORY / script), *arguments, *QUICK, cwd=tmp_path, env=env)
 
     return call
 

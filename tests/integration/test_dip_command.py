@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from commands import run_python
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from dsr.app.entry import run_command
@@ -72,10 +73,8 @@ def _rows(home: Path) -> list[dict[str, str]]:
 def both(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, subprocess.CompletedProcess[str]]:
     """The run's directory and the finished process of an evaluation of two scenes."""
     folder = tmp_path_factory.mktemp("both")
-    done = subprocess.run(
-        _command("method=dip_v", "dataset.scenes=[statue,cube_no_texture]", "output_dir=out"),
-        cwd=folder, env=ENVIRONMENT, capture_output=True, text=True, timeout=120, check=False,
-    )  # fmt: skip
+    _, *command = _command("method=dip_v", "dataset.scenes=[statue,cube_no_texture]", "output_dir=out")
+    done = run_python(*command, cwd=folder, env=ENVIRONMENT)
     return folder / "out", done
 
 
@@ -152,7 +151,7 @@ def test_interrupted_run_resumes_within_the_image(tmp_path: Path, run: Run) -> N
             time.sleep(0.02)
         process.send_signal(signal.SIGTERM)
         _, errors = process.communicate(timeout=60)
-    assert process.returncode == 130
+    assert process.returncode == 143
     step = re.fullmatch(r"interrupted at step (\d+) of statue; the same command goes on from there\n", errors)
     assert step is not None, errors
     assert 10 <= int(step[1]) < 100

@@ -6,8 +6,6 @@ import importlib.util
 import os
 import re
 import shlex
-import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
@@ -16,6 +14,7 @@ from typing import Any
 import pandas as pd
 import pytest
 import yaml
+from commands import run_python
 from hydra import compose, initialize_config_dir
 
 from dsr.app.schema import EvalConfig, TrainConfig, plain_config, register
@@ -133,15 +132,8 @@ def run_example(about: str, extension: Path, *added: str) -> str:
     """Run the first Python command of the page that contains ``about``, with more arguments; return its output."""
     line = next(line for line in EXTENDING.read_text().splitlines() if line.startswith("PYTHONPATH") and about in line)
     _, _, name, *arguments = shlex.split(line)
-    done = subprocess.run(
-        [sys.executable, str(ROOT / name), *arguments, *added],
-        cwd=extension,
-        env={**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT / "src"), "."]), "OMP_NUM_THREADS": "1"},
-        capture_output=True,
-        text=True,
-        timeout=300,
-        check=False,
-    )
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT / "src"), "."]), "OMP_NUM_THREADS": "1"}
+    done = run_python(str(ROOT / name), *arguments, *added, cwd=extension, env=environment)
     assert (done.returncode, done.stderr) == (0, "")
     return done.stdout
 

@@ -1,13 +1,11 @@
 """The real ``dsr doctor DIR``: what it prints, and its exit codes."""
 
 import json
-import os
-import subprocess
-import sys
 
 import cv2
 import numpy as np
 import pytest
+from commands import run_python
 
 from dsr.cli import main
 from dsr.synthetic.simgeo.scenes import render_scene
@@ -15,14 +13,7 @@ from dsr.synthetic.simgeo.scenes import render_scene
 
 def doctor(folder):
     """Run the command in a process of its own."""
-    return subprocess.run(
-        [sys.executable, "-m", "dsr.cli", "doctor", str(folder)],
-        capture_output=True,
-        text=True,
-        timeout=300,
-        check=False,
-        env={**os.environ, "OMP_NUM_THREADS": "1"},
-    )
+    return run_python("-m", "dsr.cli", "doctor", str(folder), cwd=folder.parent)
 
 
 @pytest.fixture(scope="module")

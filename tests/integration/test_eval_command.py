@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from commands import run_python
 
 from dsr.app.entry import run_command
 from dsr.app.evaluate import evaluate
@@ -57,9 +58,7 @@ def command(*arguments):
 
 def run(folder, environment, *arguments):
     """Run the command in a process of its own."""
-    return subprocess.run(
-        command(*arguments), cwd=folder, env=environment, capture_output=True, text=True, timeout=120, check=False
-    )
+    return run_python(*command(*arguments)[1:], cwd=folder, env=environment)
 
 
 @pytest.fixture
@@ -409,10 +408,7 @@ def test_help_lists_the_choices(within):
 
 def test_default_method_is_msg_v_with_packaged_weights(tmp_path, offline):
     arguments = ("dataset.size=64", "dataset.scenes=[statue,cube_no_texture]", "metrics.lpips=false")
-    done = subprocess.run(
-        [sys.executable, str(REPOSITORY / "eval.py"), *arguments],
-        cwd=tmp_path, env=offline, capture_output=True, text=True, timeout=120, check=False,
-    )  # fmt: skip
+    done = run_python(str(REPOSITORY / "eval.py"), *arguments, cwd=tmp_path, env=offline)
     assert (done.returncode, done.stderr) == (0, "")
     [home] = (tmp_path / "outputs" / "eval").iterdir()
     assert home.name.startswith("simgeo_box_x4_msg_v_")

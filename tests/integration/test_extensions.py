@@ -6,12 +6,11 @@ import json
 import os
 import re
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 
 import pandas as pd
 import pytest
+from commands import run_python
 
 from dsr.app.metrics import extra_metrics
 from dsr.app.schema import MetricsConfig
@@ -72,15 +71,7 @@ def run(folder, *command, outside):
     """Run a Python command in a folder, with or without the module outside of the package."""
     paths = [str(REPOSITORY / "src"), *([str(folder / "modules")] if outside else [])]
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(paths), "OMP_NUM_THREADS": "1"}
-    return subprocess.run(
-        [sys.executable, *command],
-        cwd=folder,
-        env=environment,
-        capture_output=True,
-        text=True,
-        timeout=300,
-        check=False,
-    )
+    return run_python(*command, cwd=folder, env=environment)
 
 
 @pytest.fixture(scope="module")

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import json
 import os
-import subprocess
-import sys
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from commands import run_python
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 MODULE = '''
@@ -78,15 +77,7 @@ TRAINING = (
 def run(folder, *command):
     """Run a Python command in a folder, with the module outside of the package on the path."""
     paths = os.pathsep.join([str(REPOSITORY / "src"), str(folder / "modules")])
-    return subprocess.run(
-        [sys.executable, *command],
-        cwd=folder,
-        env={**os.environ, "PYTHONPATH": paths, "OMP_NUM_THREADS": "1"},
-        capture_output=True,
-        text=True,
-        timeout=300,
-        check=False,
-    )
+    return run_python(*command, cwd=folder, env={**os.environ, "PYTHONPATH": paths, "OMP_NUM_THREADS": "1"})
 
 
 def evaluate(folder, *arguments):
@@ -171,11 +162,15 @@ def test_network_from_outside_is_trained_evaluated_and_used(home):
     small = ("dataset.size=32", "metrics.lpips=false", "device=cpu")
     for command in (
         (str(REPOSITORY / "train.py"), "--config-dir", "conf", *TRAINING),
-        (program, "run=training", "metrics.lpips=false", "device=cpu", "output_dir=runs/run"),
+        (program, "run=training", "metrics.lpips=false", "device=cpu", "output_dir=runs/run", "trust=outside.Shifted"),
         (program, "--config-dir", "conf", "method=shifted", *small, "output_dir=runs/shifted"),
     ):
         done = run(home, *command)
         assert done.returncode == 0, done.stderr
+    done = run(home, program, "run=training", "output_dir=runs/refused")
+    assert done.returncode == 2
+    assert "training/config.yaml: model.target: expected a target of dsr's own model group" in done.stderr
+    assert "if you trust it, trust=outside.Shifted allows it" in done.stderr
     done = upsample(home, "--method", "shifted", "-o", "by_network")
     assert done.returncode == 0, done.stderr
     assert np.load(home / "by_network" / "depth_metres.npy").shape == (32, 48)

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import json
-import os
-import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
+from commands import run_python
 
 from dsr.app import report
 from dsr.cli import main
@@ -36,9 +34,7 @@ def refused(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
 
 
 def test_report_has_tables_figures_the_metric_study_and_a_page(runs: Path, tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "dsr.cli", "report", str(runs), "-o", "report", "--title", "Ours"]
-    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
-    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
+    done = run_python("-m", "dsr.cli", "report", str(runs), "-o", "report", "--title", "Ours", cwd=tmp_path)
     assert (done.returncode, done.stderr) == (0, "")
     folder = tmp_path / "report"
     for name in (

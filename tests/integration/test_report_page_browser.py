@@ -3,16 +3,19 @@
 import base64
 import dataclasses
 import functools
+import json
 import re
 
 import cv2
 import matplotlib as mpl
 import numpy as np
+import pandas as pd
 import pytest
 
 from dsr.evaluation.results import Results
 from dsr.evaluation.run_files import load_results
 from dsr.geometry.shading import lights, render, shade
+from dsr.report.markup import write_tables
 from dsr.report.page import save_page
 from dsr.viz.panels import normals_seen_by
 
@@ -454,6 +457,27 @@ def test_names_that_are_code_are_shown_and_not_run(opened, results, tmp_path):
     assert page.title() == SPITEFUL
     assert page.inner_text("h1") == SPITEFUL
     assert page.inner_text(".name-left") == SPITEFUL
+    assert page.locator("img").count() == 0
+
+
+def test_names_in_the_files_of_a_run_are_shown_and_not_run(opened, make_run, tmp_path):
+    folder = make_run(tmp_path / "run", label=SPITEFUL, method=SPITEFUL, dataset=SPITEFUL)
+    name = SPITEFUL.replace("/", "")
+    for kind in ("scenes", "predictions"):
+        (folder / kind / "cube_no_texture.npz").rename(folder / kind / f"{name}.npz")
+    scores = pd.read_csv(folder / "scores.csv", keep_default_na=False)
+    scores["scene"] = name
+    scores.loc[scores["metric"] == "Bumpiness_d", "metric"] = SPITEFUL
+    scores.to_csv(folder / "scores.csv", index=False)
+    summary = json.loads((folder / "summary.json").read_text())
+    summary["seconds"] = {name: 0.25}
+    summary["metrics"] = {SPITEFUL: {"heading": SPITEFUL, "unit": SPITEFUL, "digits": 1}}
+    (folder / "summary.json").write_text(json.dumps(summary))
+    results = load_results([folder])
+    save_page(tmp_path / "index.html", results, tables=write_tables(tmp_path / "tables", results))
+    page = opened((tmp_path / "index.html").as_uri())
+    assert SPITEFUL in page.inner_text("#tables")
+    assert name in page.inner_text("body")
     assert page.locator("img").count() == 0
 
 

@@ -15,6 +15,7 @@ from pathlib import Path
 import pytest
 import torch
 import yaml
+from commands import run_python
 from safetensors.torch import load_file
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
@@ -54,10 +55,7 @@ def environment(dsr_cache):
 def smoke(tmp_path_factory, environment):
     """The working directory, the run's directory and the finished process of a smoke training."""
     folder = tmp_path_factory.mktemp("smoke")
-    done = subprocess.run(
-        [sys.executable, str(REPOSITORY / "train.py"), *SMOKE],
-        cwd=folder, env=environment, capture_output=True, text=True, timeout=120, check=False,
-    )  # fmt: skip
+    done = run_python(str(REPOSITORY / "train.py"), *SMOKE, cwd=folder, env=environment)
     assert done.returncode == 0, done.stderr
     [home] = (folder / "outputs" / "train").iterdir()
     return folder, home, done
@@ -317,6 +315,21 @@ def test_last_steps_are_validated_where_the_interval_does_not_divide_them(tmp_pa
     assert last_step(tmp_path / "out") == 3
 
 
+def test_diverged_training_writes_no_weights_and_does_not_diverge_twice(within):
+    settings = (*SMOKE, "trainer.learning_rate=1e30", "output_dir=out")
+    code, _, errors = within(*settings)
+    what = "out: the training diverged at step 1: the validation's RMSE_d is nan, at a learning rate of 1e+30"
+    assert (code, len(errors)) == (2, 1)
+    assert errors[0].startswith(f"error: {what}; it has no earlier checkpoint; a lower trainer.learning_rate")
+    assert not [name for name in tree(Path("out")) if name.endswith((".safetensors", ".ckpt"))]
+    code, output, errors = within(*settings)
+    assert (code, len(errors)) == (2, 1)
+    assert errors[0].startswith(f"error: {what}, and would again; a lower trainer.learning_rate")
+    assert "steps" not in output
+    command._clear(Path("out"))  # as overwrite=true does
+    assert "diverged.json" not in tree(Path("out"))
+
+
 def test_mixed_precision_losses_are_close_to_full_precision(smoke, tmp_path, within):
     code, _, errors = within(*SMOKE, "precision=bfloat16", "output_dir=out")
     assert (code, errors) == (0, [])
@@ -461,15 +474,64 @@ def running(tmp_path, environment, *arguments):
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_interruption_exits_with_130_saves_its_step_and_says_how_to_resume(tmp_path, environment, number):
+def test_interruption_exits_with_its_signal_saves_its_step_and_says_how_to_resume(tmp_path, environment, number):
     with running(tmp_path, environment, "trainer.steps=500", "trainer.validate_every=3") as process:
         process.send_signal(number)
         _, errors = process.communicate(timeout=60)
-    assert process.returncode == 130
+    assert process.returncode == 128 + number
     assert not (tmp_path / "out" / "weights.safetensors").exists()
     step = last_step(tmp_path / "out")
     assert 3 <= step < 500
     assert errors == f"{interrupted(step)}\n"
+
+
+@pytest.mark.parametrize(("steps", "step", "again"), [(6, 4, [4, 6]), (6, 6, []), (5, 5, [])])
+def test_training_interrupted_during_a_validation_goes_on_with_that_validation(
+    tmp_path, within, monkeypatch, steps, step, again
+):
+    arguments = (*SMOKE, f"trainer.steps={steps}", "trainer.validate_every=2")
+    assert within(*arguments, "output_dir=whole")[0] == 0
+    begin = trainer_module.Interruption.on_validation_batch_start
+
+    def stop(self, trainer, *rest):
+        self._interruption.requested = trainer.global_step == step
+        begin(self, trainer, *rest)
+
+    monkeypatch.setattr(trainer_module.Interruption, "on_validation_batch_start", stop)
+    code, _, errors = within(*arguments, "output_dir=out")
+    assert (code, errors) == (130, [interrupted(step)])
+    assert last_step(tmp_path / "out") == step
+    monkeypatch.setattr(trainer_module.Interruption, "on_validation_batch_start", begin)
+    code, output, errors = within("resume=out")
+    assert (code, errors) == (0, [])
+    assert validated(output) == again
+    assert same_weights(tmp_path / "out", tmp_path / "whole")
+    assert (tmp_path / "out" / "validation.csv").read_text() == (tmp_path / "whole" / "validation.csv").read_text()
+    assert sorted(path.name for path in (tmp_path / "out" / "checkpoints").iterdir()) == ["best.ckpt", "last.ckpt"]
+
+
+def test_training_interrupted_during_two_validations_does_each_of_them(tmp_path, within, monkeypatch):
+    arguments = (*SMOKE, "trainer.steps=6", "trainer.validate_every=2")
+    assert within(*arguments, "output_dir=whole")[0] == 0
+    begin = trainer_module.Interruption.on_validation_batch_start
+    for step in (2, 4):
+
+        def stop(self, trainer, *rest, step=step):
+            self._interruption.requested = trainer.global_step == step
+            begin(self, trainer, *rest)
+
+        monkeypatch.setattr(trainer_module.Interruption, "on_validation_batch_start", stop)
+        assert within(*arguments, "output_dir=out")[::2] == (130, [interrupted(step)])
+    monkeypatch.setattr(trainer_module.Interruption, "on_validation_batch_start", begin)
+    code, output, errors = within("resume=out")
+    assert (code, errors) == (0, [])
+    assert validated(output) == [4, 6]
+    assert (tmp_path / "out" / "validation.csv").read_text() == (tmp_path / "whole" / "validation.csv").read_text()
+    progress, whole = (
+        torch.load(tmp_path / home / "checkpoints" / "last.ckpt", weights_only=True)["loops"]
+        for home in ("out", "whole")
+    )
+    assert progress == whole
 
 
 def test_resume_from_any_step_gives_bit_identical_weights(tmp_path, within, monkeypatch, interrupt):
@@ -478,7 +540,7 @@ def test_resume_from_any_step_gives_bit_identical_weights(tmp_path, within, monk
     end = trainer_module.Interruption.on_train_batch_end
 
     def stop(self, trainer, *rest):
-        self._requested = trainer.global_step == 3
+        self._interruption.requested = trainer.global_step == 3
         end(self, trainer, *rest)
 
     monkeypatch.setattr(trainer_module.Interruption, "on_train_batch_end", stop)

@@ -255,7 +255,7 @@ def test_interrupted_run_resumes(pair, tmp_path, capsys, monkeypatch):
     with monkeypatch.context() as patch:
         patch.setattr("dsr.app.upsample.outputs.write_normals", interrupt)
         assert of(pair, out, *BICUBIC, "--only", "depth,normals") == 130
-    assert "run the same command again to continue" in capsys.readouterr().err
+    assert "the same command goes on from there" in capsys.readouterr().err
     assert info(out)["complete"] is False
     assert of(pair, out, *BICUBIC, "--only", "depth,normals") == 0
     assert info(out)["complete"] is True

@@ -161,6 +161,27 @@ def test_device_that_this_machine_lacks_is_refused(name):
         pick_device(name)
 
 
+@pytest.mark.parametrize(("key", "value", "expected"), [
+    ("root", "", "a text of one character or more, or null for none; got ''"),
+    ("root", "a\0b", r"a text of one character or more, or null for none; got 'a\x00b'"),
+    ("file", " ", "a text of one character or more, or null for none; got ' '"),
+    ("count", 10**23, f"a number that 64 bits hold, got {10**23}"),
+    ("share", 10**400, f"a number that 64 bits hold, got 1{'0' * 59}"),
+])  # fmt: skip
+def test_value_that_no_argument_can_use_is_refused(key, value, expected):
+    assert refusal(node(**{"root": "r", key: value})) == f"dataset.{key}: expected {expected}"
+
+
+def test_home_of_an_unknown_user_is_refused():
+    assert refusal(node(root="~nobody-of-this-name/x")).startswith("dataset.root: expected a path, got '~nobody-of-")
+
+
+@pytest.mark.parametrize("group", [5, "simgeo", ["a"], None])
+def test_group_without_keys_is_refused(group):
+    with pytest.raises(ConfigError, match=r"^validation.x: expected keys, name and target among them, got "):
+        build("validation.x", group)
+
+
 def settings(**changes):
     groups = {"dataset": {}, "downsampling": {}, "method": {}, "metrics": {"lpips": True, "lpips_trunk": None}}
     return {**groups, "scale": 4, "precision": "float32", "seed": 0, **changes}
@@ -179,6 +200,12 @@ def test_run_settings_are_checked():
         ),
         ({"precision": "float16"}, "precision: expected one of float32, bfloat16, auto, got float16"),
         ({"seed": -1}, "seed: expected 0 or a positive number, got -1"),
+        ({"seed": 10**23}, f"seed: expected a number that 64 bits hold, got {10**23}"),
+        ({"seed": True}, "seed: expected a whole number, got True"),
+        ({"output_dir": ""}, "output_dir: expected a text of one character or more, or null for none; got ''"),
+        ({"weights": " "}, "weights: expected a text of one character or more, or null for none; got ' '"),
+        ({"metrics": {"lpips": 1}}, "metrics.lpips: expected true or false, got 1"),
+        ({"dataset": 5}, "dataset: expected keys, each with a value, got 5"),
         ({"method": "???"}, "method: missing; give it as method=..."),
         ({"dataset": None}, "dataset: missing; give it as dataset=..."),
     ],

@@ -147,6 +147,13 @@ def test_diverging_optimisation_is_reported(monkeypatch: pytest.MonkeyPatch) -> 
         _prior(steps=1)(_sample())
 
 
+def test_optimisation_stops_at_the_first_loss_that_is_not_finite_and_keeps_no_checkpoint(tmp_path: Path) -> None:
+    what = r"step: the optimisation diverged at step \d+: the loss is nan, at a learning rate of 1e\+30; a lower method"
+    with pytest.raises(ValueError, match=what):
+        _prior(steps=50, learning_rate=1e30, workspace=tmp_path)(_sample())
+    assert not list(tmp_path.rglob("*.ckpt"))
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("stopping", ["fixed", "variance", "oracle"])
 def test_interrupted_optimisation_gives_bit_identical_results(tmp_path: Path, stopping: str) -> None:
@@ -167,11 +174,21 @@ def test_interrupted_optimisation_gives_bit_identical_results(tmp_path: Path, st
     assert "80,val,RMSE_v," in tables[0]
 
 
+def test_signals_act_as_before_after_an_optimisation_that_ended_early(tmp_path: Path) -> None:
+    before = signal.getsignal(signal.SIGTERM)
+    with pytest.raises(KeyboardInterrupt):
+        _prior(workspace=tmp_path, display=Stopper(2))(_sample())
+    assert signal.getsignal(signal.SIGTERM) is before
+    with pytest.raises(ValueError, match="diverged"):
+        _prior(workspace=tmp_path, learning_rate=1e30, steps=50)(_sample())
+    assert signal.getsignal(signal.SIGTERM) is before
+
+
 @pytest.mark.slow
 def test_killed_optimisation_resumes_from_the_last_minute(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     sample, settings = _sample(), {"steps": 30}
     whole = _prior(**settings)(sample)
-    monkeypatch.setattr("dsr.methods.dip.callbacks._SECONDS_BETWEEN_CHECKPOINTS", -1.0)  # each step is a minute
+    monkeypatch.setattr("dsr.methods.dip.upsampler._SECONDS_BETWEEN_CHECKPOINTS", -1.0)  # each step is a minute
 
     def kill(*_: object) -> None:
         raise RuntimeError("killed")

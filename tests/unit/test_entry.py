@@ -1,8 +1,10 @@
 """The command line: whatever is wrong ends as one clear line on stderr and exit code 2, before anything is written."""
 
+import math
 import sys
 
 import pytest
+from hydra.core.plugins import Plugins
 
 from dsr.app.entry import run_command
 from dsr.utils.builder import ConfigError
@@ -20,8 +22,7 @@ def command(monkeypatch, tmp_path, capfd):
 
         def remember(config):
             seen.append(config)
-            if job is not None:
-                job(config)
+            return None if job is None else job(config)
 
         code = 0
         try:
@@ -35,7 +36,7 @@ def command(monkeypatch, tmp_path, capfd):
 
 SETTINGS = (
     "dataset, downsampling, noise, metrics, scale, device, precision, seed, output_dir, overwrite, holes, "
-    "method, weights, run"
+    "method, weights, run, trust"
 )
 DATASETS = (
     "arkitscenes, ddrnet, diml, folder, icl, lu, middlebury, middlebury2001, middlebury2003, middlebury2005, "
@@ -91,6 +92,12 @@ USAGE_ERRORS = {
     "+experiment=papers": f"experiment=papers: unknown; expected one of {EXPERIMENTS}",
     "experiment=paper_tables": f"experiment: write +experiment=NAME, NAME one of {EXPERIMENTS}",
     "model=msg": f"model: unknown key; expected {SETTINGS}",
+    "--resolve": "--resolve: expected with --cfg job, which shows the configuration",
+    "=3": "'=3': expected KEY=VALUE",
+    "+=3": "'+=3': expected KEY=VALUE",
+    "": "'': expected KEY=VALUE",
+    f"--config-dir={'x' * 300}": f"--config-dir: expected a directory, got {'x' * 300}",
+    "hydra.run.dir=/dev/null/x": "[Errno 20] Not a directory: '/dev/null/x'",
 }
 
 
@@ -163,8 +170,52 @@ def test_failing_job_of_a_multirun_keeps_the_others_and_sets_the_exit_code(comma
             raise ConfigError("scale: not this one")
 
     code, error, seen = command("-m", "scale=2,4,8", job=job)
-    assert (code, error) == (2, "error: scale: not this one\n")
+    assert code == 2
+    assert error.splitlines() == [
+        "error: scale=4: scale: not this one",
+        "error: 1 of 3 jobs failed",
+        "error: scale=4: scale: not this one",
+    ]
     assert [config.scale for config in seen] == [2, 4, 8]
+
+
+@pytest.mark.slow
+def test_jobs_that_fail_in_processes_of_a_launcher_are_told(command):
+    def job(config):
+        if config.scale == 4:
+            raise ConfigError("scale: not this one")
+        return 1.0
+
+    code, error, _ = command("-m", "scale=2,4", "hydra/launcher=joblib", "hydra.launcher.n_jobs=2", job=job)
+    assert code == 2
+    assert error.splitlines()[-2:] == ["error: 1 of 2 jobs failed", "error: scale=4: scale: not this one"]
+
+
+def test_broken_launcher_is_one_line(command, monkeypatch):
+    class Broken:
+        def launch(self, *_, **__):
+            raise RuntimeError("a worker was killed")
+
+    monkeypatch.setattr(Plugins, "instantiate_launcher", lambda *_, **__: Broken())
+    code, error, _ = command("-m", "scale=2,4")
+    assert code == 2
+    assert error == (
+        "error: hydra/launcher: Broken ended before its jobs did (RuntimeError: a worker was killed); "
+        "what is finished is kept, the same command goes on from there\n"
+    )
+
+
+def test_sweepers_get_the_number_that_a_job_returns(command, monkeypatch):
+    seen = []
+    monkeypatch.setattr("dsr.app.entry.failure_summary", lambda jobs: seen.extend(jobs) or [])
+
+    def job(config):
+        if config.scale == 8:
+            raise ConfigError("scale: not this one")
+        return config.scale / 100
+
+    command("-m", "scale=2,4,8", job=job)
+    assert [float(each.return_value) for each in seen] == pytest.approx([0.02, 0.04, math.nan], nan_ok=True)
 
 
 def test_multirun_with_an_unknown_choice_starts_no_job(command):
@@ -192,3 +243,12 @@ def test_run_command_takes_arguments_and_the_process_keeps_its_own(monkeypatch, 
     run_command("eval", lambda config: seen.append((config.scale, list(sys.argv))), ["scale=8"])
     assert seen == [(8, ["dsr", "eval", "scale=8"])]
     assert sys.argv == ["dsr", "eval", "scale=8"]
+
+
+@pytest.mark.parametrize(
+    ("argument", "trust"),
+    [("--trust", True), ("trust=mine.Net", "mine.Net"), ("trust=[mine.Net,mine.Data]", ["mine.Net", "mine.Data"])],
+)
+def test_trust_is_an_option_and_a_key(command, argument, trust):
+    code, error, [config] = command("run=x", argument)
+    assert (code, error, config.trust) == (0, "", trust)

@@ -7,7 +7,7 @@ from itertools import product
 import pytest
 from omegaconf import OmegaConf
 
-from dsr.app.entry import compose
+from dsr.app.composition import compose
 from dsr.app.experiments import register_resolvers, with_keys_of_swept_groups, without_overridden_sweeps
 from dsr.app.schema import EvalConfig, TrainConfig, plain_config
 from dsr.app.training_runs import training_data

@@ -15,6 +15,7 @@ LAYERS = (
     ("dsr.doctor", "dsr.report", "dsr.user_study", "dsr.viewer"),
     ("dsr.app",),
     ("dsr.cli",),
+    ("dsr.__main__",),
 )
 """From the lowest up. A package stands for all its modules; those in one line do not import each other."""
 MORE_FORBIDDEN = {
@@ -122,5 +123,5 @@ def test_module_graph_finds_the_modules():
     assert "dsr.data.base" in IMPORTS["dsr.data.folder"]
 
 
-def test_package_root_holds_no_module_but_the_sample():
-    assert {path.name for path in (SOURCE / "dsr").glob("*.py")} == {"__init__.py", "sample.py"}
+def test_package_root_holds_no_module_but_the_sample_and_the_command():
+    assert {path.name for path in (SOURCE / "dsr").glob("*.py")} == {"__init__.py", "__main__.py", "sample.py"}

@@ -203,6 +203,37 @@ def test_arrays_and_tensors_give_the_same_result() -> None:
     np.testing.assert_allclose(floats, of_arrays, rtol=1e-4)
 
 
+def test_result_without_any_depth_is_refused_rather_than_filled(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(
+        "dsr.methods.classical.interpolation.Interpolation.interpolate",
+        lambda _, depth, lr, hr: torch.full((1, hr.height, hr.width), math.nan),
+    )
+    camera = _camera(48, 64)
+    with pytest.raises(ValueError, match=r"^bicubic gave no finite positive depth in any of the 3072 pixels$"):
+        upsample_depth(_photo(48, 64), _plane(12, 16, camera), camera, method="bicubic")
+
+
+def test_pixel_that_a_method_has_no_depth_for_stays_a_hole(monkeypatch: pytest.MonkeyPatch) -> None:
+    def interpolate(_: object, depth: Tensor, lr: Camera, hr: Camera) -> Tensor:
+        result = torch.full((1, hr.height, hr.width), 2.0)
+        result[0, 3, 5] = math.nan
+        return result
+
+    monkeypatch.setattr("dsr.methods.classical.interpolation.Interpolation.interpolate", interpolate)
+    camera = _camera(48, 64)
+    fine = upsample_depth(_photo(48, 64), _plane(12, 16, camera), camera, method="bicubic")
+    assert fine.isnan().nonzero().tolist() == [[0, 3, 5]]
+
+
+@pytest.mark.parametrize("value", [1e19, 1e-12])
+def test_depth_that_is_no_distance_is_refused(value: float) -> None:
+    camera = _camera(48, 64)
+    depth = _plane(12, 16, camera)
+    depth[0, 0, 0] = value
+    with pytest.raises(ValueError, match=r"^depth: expected depths of 1e-06 to 1e\+09 m, got 1e[+-]\d+ m in 0.52% of"):
+        upsample_depth(_photo(48, 64), depth, camera, method="bicubic")
+
+
 def test_mask_makes_holes() -> None:
     camera, depth = _camera(48, 64), _plane(12, 16, _camera(48, 64))
     mask = torch.ones(12, 16)

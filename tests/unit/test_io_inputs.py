@@ -122,3 +122,20 @@ def test_disparity_without_a_baseline_or_a_positive_value_is_refused(make):
     pair = make(np.full((3, 4), 2.0), "disparity.npy", baseline=0.1, doffs=-20)
     with pytest.raises(ValueError, match=r"disparity.npy: expected at least one disparity above 0, got none"):
         read(pair)
+
+
+@pytest.mark.parametrize("value", [1e19, 1e10, 1e-9, 1e-317])
+def test_values_that_are_no_distances_are_holes_and_said(make, value):
+    depth = np.full((3, 4), 2.0)
+    depth[1, 2] = value
+    picture = read(make(depth))
+    assert picture.depth_lr.isnan().nonzero().tolist() == [[0, 1, 2]]
+    said = [str(each) for each in picture.assumptions if "farther" in each.text]
+    assert said == ["depths nearer than 1e-06 m or farther than 1e+09 m count as holes (8.3%)"]
+
+
+@pytest.mark.parametrize("entries", [{"depth_unit": 1e-12}, {"depth_unit": 1e12}])
+def test_map_without_any_distance_is_refused(make, entries):
+    pair = make(np.full((3, 4), 2.0), **entries)
+    with pytest.raises(ValueError, match=r"depth.npy: expected at least one depth of 1e-06 to 1e\+09 m, got none$"):
+        read(pair)

@@ -20,12 +20,13 @@ from dsr.evaluation.predict import (
     predict,
 )
 from dsr.evaluation.score import SCORE_COLUMNS, score
-from dsr.evaluation.store import load_prediction
+from dsr.evaluation.store import load_prediction, prediction_path
 from dsr.geometry.camera import Camera
 from dsr.methods.base import NoSolutionError
 from dsr.metrics.catalogue import catalogue, score_image
 from dsr.sample import DepthSample, Scene
 from dsr.utils.progress import SILENT, Progress
+from dsr.utils.space import FullDiskError
 
 SIZE, SCALE = 16, 2
 CAMERA = Camera(SIZE, SIZE, 20.0, 20.0, 7.5, 7.5)
@@ -382,7 +383,7 @@ def test_interruption_while_a_prediction_is_written_leaves_no_partial_file(tmp_p
     assert files(tmp_path) == ["predictions/a.npz", "scenes/a.npz"]
 
 
-def test_failed_rewrite_keeps_the_former_prediction(tmp_path, monkeypatch):
+def test_full_disk_ends_the_pass_and_keeps_the_former_prediction(tmp_path, monkeypatch):
     run(toy_study(), tmp_path)
     before = (tmp_path / "predictions" / "a.npz").read_bytes()
 
@@ -391,8 +392,8 @@ def test_failed_rewrite_keeps_the_former_prediction(tmp_path, monkeypatch):
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(np, "savez_compressed", full)
-    outcome = predict(toy_study(), tmp_path, overwrite=True)
-    assert list(outcome.failures) == ["a", "b"]
+    with pytest.raises(FullDiskError, match=r"a\.npz: expected space to write the file"):
+        predict(toy_study(), tmp_path, overwrite=True)
     assert (tmp_path / "predictions" / "a.npz").read_bytes() == before
 
 
@@ -498,6 +499,25 @@ def test_predict_stores_a_sample_that_is_missing_beside_its_prediction(tmp_path)
     assert (method.calls, outcome.reused, outcome.failures) == ([], ["a", "b"], {})
     assert torch.equal(DepthSample.load(tmp_path / "scenes" / "a.npz").depth_lr, before.depth_lr)
     assert set(scores["scene"]) == {"a", "b"}
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, 0.0, -1.0])
+def test_prediction_without_a_finite_positive_depth_is_a_failure_of_the_scene(tmp_path, value):
+    outcome, scores, pictures = run(toy_study(method=ToyMethod(a=torch.full_like(RAMP, value))), tmp_path)
+    said = f"a: toy_method gave no finite positive depth in any of the {RAMP.numel()} pixels"
+    assert outcome.failures == {"a": said}
+    assert set(scores["scene"]) == {"b"}
+    assert not prediction_path(tmp_path, "a").exists()
+    assert len(pictures) == 1
+
+
+def test_depths_that_are_not_finite_and_positive_count_as_holes(tmp_path):
+    wrong, holes = RAMP.clone(), RAMP.clone()
+    wrong[0, 0, :3] = torch.tensor([math.inf, 0.0, -1.0])
+    holes[0, 0, :3] = math.nan
+    scores = [run(toy_study(method=ToyMethod(a=depth)), tmp_path / name)[1]
+              for name, depth in (("wrong", wrong), ("holes", holes))]  # fmt: skip
+    pd.testing.assert_frame_equal(*scores)
 
 
 def test_score_names_a_damaged_sample_and_keeps_the_other_scenes(tmp_path):

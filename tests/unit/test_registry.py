@@ -55,6 +55,7 @@ def test_unknown_method_is_refused_with_those_that_there_are(tmp_path: Path) -> 
         ("- 1", r"bad.yaml: expected keys and values"),
         ("defaults: [nowhere]", "expected a file nowhere.yaml that bad.yaml begins with"),
         ("defaults: [bad]", "expected a file bad.yaml that bad.yaml begins with"),
+        ("defaults: 5", "defaults: expected a list of names, got 5"),
         ("name: ${nowhere}", "method=bad: Interpolation key 'nowhere' not found"),
     ],
 )

@@ -10,7 +10,15 @@ from omegaconf import OmegaConf
 
 import dsr
 from dsr.app import run_directory as rundir
-from dsr.app.run_directory import PREDICTING_CODE, claim, code_hash, default_directory, expect_free, identity_of
+from dsr.app.run_directory import (
+    PREDICTING_CODE,
+    claim,
+    code_hash,
+    default_directory,
+    expect_free,
+    folder_of,
+    identity_of,
+)
 from dsr.utils import hashing
 from dsr.utils.builder import ConfigError
 from dsr.utils.hashing import file_hash, hash_of_code
@@ -93,10 +101,18 @@ NOT_PREDICTING = (
     "__init__.py",
     "utils/__init__.py",
     "utils/files.py",
+    "utils/limits.py",
+    "utils/picture_headers.py",
+    "utils/tables.py",
     "utils/hashing.py",
+    "utils/checkpoints.py",
     "utils/console.py",
+    "utils/interruption.py",
     "utils/progress.py",
+    "utils/space.py",
+    "utils/temporary.py",
     "utils/units.py",
+    "utils/workers.py",
     "evaluation/__init__.py",
     "evaluation/store.py",
     "data/download",
@@ -262,3 +278,17 @@ def test_versions_outside_of_a_checkout_have_no_commit(monkeypatch, tmp_path):
 def test_missing_package_is_recorded_as_such():
     found = package_versions(["dsr", "no-such-package-here"])
     assert found == {"dsr": importlib.metadata.version("dsr"), "no-such-package-here": "not installed"}
+
+
+@pytest.mark.parametrize(("name", "reason"), [
+    ("x" * 300, "got xxx.*xxx \\(File name too long\\)$"),
+    ("~nobody-of-this-name/x", "got '~nobody-of-this-name/x'"),
+])  # fmt: skip
+def test_directory_that_cannot_be_named_so_is_refused_in_one_short_line(name, reason):
+    with pytest.raises(ConfigError, match=f"^output_dir: expected a (directory|path), {reason}") as caught:
+        folder_of(name)
+    assert len(str(caught.value)) < 150
+
+
+def test_directory_of_a_run_need_not_exist(tmp_path):
+    assert folder_of(tmp_path / "a" / "b") == tmp_path / "a" / "b"

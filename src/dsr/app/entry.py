@@ -17,15 +17,20 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 import hydra
-from hydra.errors import HydraException, MissingConfigException, OverrideParseException
+from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
+from yaml import YAMLError
 
 from dsr.app.experiments import register_resolvers, with_keys_of_swept_groups, without_overridden_sweeps
+from dsr.app.explain import explain, explain_arguments, explain_damage
+from dsr.app.multirun import JobResult, collected_jobs, failure_summary, job_name
 from dsr.app.schema import EvalConfig, TrainConfig, plain_config, register
+from dsr.utils import interruption
 from dsr.utils.builder import ConfigError
-from dsr.utils.config_files import config_directories, list_choices, list_groups
-from dsr.utils.console import INTERRUPTED, USAGE_ERROR, print_error
+from dsr.utils.config_files import config_directories, list_choices
+from dsr.utils.console import USAGE_ERROR, one_line, print_error
+from dsr.utils.space import FullDiskError, silence_threads, space_for
 
 
 def run_eval(arguments: Sequence[str] | None = None) -> None:
@@ -38,37 +43,40 @@ def run_train(arguments: Sequence[str] | None = None) -> None:
     run_command("train", _train, arguments)
 
 
-def _evaluate(config: DictConfig) -> None:
+def _evaluate(config: DictConfig) -> float:
     EvalConfig.of(plain_config(config))
-    from dsr.app.evaluate import evaluate  # noqa: PLC0415 - it imports torch
+    from dsr.app.evaluate import evaluate, objective  # noqa: PLC0415 - they import torch
 
-    evaluate(config)
+    return objective(evaluate(config))
 
 
-def _train(config: DictConfig) -> None:
+def _train(config: DictConfig) -> float:
     TrainConfig.of(plain_config(config))
     from dsr.app.train import train  # noqa: PLC0415 - it imports torch
 
-    train(config)
+    return train(config)
 
 
 def run_command(name: str, command: Callable[[DictConfig], Any], arguments: Sequence[str] | None = None) -> None:
     """Compose a configuration from the command line, and run the command on it.
 
-    Exits with 2 and one line on stderr when the configuration cannot be run, with 130 when interrupted.
+    Exits with 2 and one line on stderr when the configuration cannot be run, with 130 or 143 when interrupted. The
+    other jobs of a multirun go on, and lines at its end say which ones failed.
 
     Args:
         name: the configuration's name, without ``.yaml``.
-        command: the function to run; a multirun calls it once per combination.
+        command: the function to run; a multirun calls it once per combination. If it returns a number, sweepers
+            minimise it.
         arguments: command-line arguments, Hydra's options and overrides; None for those of the process.
 
     """
     register()
     register_resolvers()
+    silence_threads()
     arguments = sys.argv[1:] if arguments is None else list(arguments)
+    arguments = ["trust=true" if argument == "--trust" else argument for argument in arguments]
     os.environ.setdefault("HYDRA_FULL_ERROR", "1")  # Hydra then raises exceptions instead of printing them
     logging.getLogger("matplotlib").setLevel(logging.WARNING)  # Hydra would show when it caches fonts
-    failures: list[str] = []
     try:
         directories = config_directories(_config_dirs(arguments))
     except ValueError as error:
@@ -76,43 +84,62 @@ def run_command(name: str, command: Callable[[DictConfig], Any], arguments: Sequ
     _expect_choices(name, arguments, directories)
     arguments = with_keys_of_swept_groups(without_overridden_sweeps(arguments, directories), directories)
     process = sys.argv
-
-    def job(config: DictConfig) -> None:
+    failed: list[str] = []  # of this process; those of a launcher's processes come back with their jobs
+    begun: list[bool] = []
+    job = _job(command, process, failed, begun)
+    with collected_jobs() as jobs:
         try:
-            with _argv(process):  # Lightning starts the processes of further devices from it
-                command(config)
-        except ConfigError as error:  # a multirun continues with its other jobs
-            failures.append(str(error))
-            print_error(str(error))
-
-    try:
-        with _argv([process[0], *arguments]):  # parsed by Hydra
-            hydra.main(version_base="1.3", config_path=str(directories[0]), config_name=name)(job)()
-    except KeyboardInterrupt as interruption:
-        message = str(interruption) or "interrupted; what is finished is kept, the same command goes on from there"
-        print(message, file=sys.stderr)  # noqa: T201
-        sys.exit(INTERRUPTED)
-    except (HydraException, OmegaConfBaseException) as error:
-        fail(explain(error, name, arguments, directories))
-    if failures:
+            with _argv([process[0], *arguments]), space_for(Path("outputs")):  # parsed by Hydra
+                hydra.main(version_base="1.3", config_path=str(directories[0]), config_name=name)(job)()
+        except KeyboardInterrupt as interrupted:
+            sys.exit(interruption.stop(str(interrupted)))
+        except (HydraException, OmegaConfBaseException) as error:
+            fail(explain(error, name, arguments, directories))
+        except (ConfigError, OSError, FullDiskError) as error:  # of a launcher, or of Hydra's own files
+            fail(one_line(error))
+        except (YAMLError, ValueError, RecursionError) as error:
+            if begun:  # of the command
+                raise
+            fail(explain_damage(error, directories))
+        finally:
+            summary = failure_summary(jobs)
+            for line in summary:
+                print_error(line)
+    if failed or summary:
         sys.exit(USAGE_ERROR)
 
 
-def compose(name: str, overrides: Sequence[str], directories: Sequence[Path]) -> DictConfig:
-    """Compose a configuration outside of a command.
+def _job(
+    command: Callable[[DictConfig], Any], argv: list[str], failed: list[str], begun: list[bool]
+) -> Callable[[DictConfig], JobResult]:
+    """Return the function that Hydra calls for each job, perhaps in a process of a launcher.
 
     Args:
-        name: without ``.yaml``.
-        overrides: as on the command line.
-        directories: those of :func:`dsr.utils.config_files.config_directories`.
+        command: see :func:`run_command`.
+        argv: those of the process, from which Lightning starts the processes of further devices.
+        failed: where problems of jobs in this process are added.
+        begun: where each job that begins in this process is added.
 
     """
-    register()
-    register_resolvers()
-    places = ",".join(f'"file://{directory.resolve()}"' for directory in directories[1:])
-    more = [f"hydra.searchpath=[{places}]"] if places else []
-    with hydra.initialize_config_dir(str(directories[0]), version_base="1.3"):
-        return hydra.compose(name, [*overrides, *more])
+    pid = os.getpid()
+
+    def job(config: DictConfig) -> JobResult:
+        if os.getpid() != pid:
+            register_resolvers()
+            if os.getppid() == pid:  # of a launcher on this machine
+                interruption.end_with(pid)
+        try:
+            begun.append(True)
+            with _argv(argv), interruption.working():
+                value = command(config)
+            return JobResult(value if isinstance(value, int | float) else 0.0)
+        except (ConfigError, OSError, FullDiskError) as error:  # a multirun continues with its other jobs
+            problem = one_line(error)
+            failed.append(problem)
+            print_error(": ".join(filter(None, (job_name(), problem))))
+            return JobResult.failed(problem)
+
+    return job
 
 
 def fail(message: str) -> NoReturn:
@@ -121,76 +148,11 @@ def fail(message: str) -> NoReturn:
     sys.exit(USAGE_ERROR)
 
 
-def explain(error: Exception, name: str, arguments: Sequence[str], directories: Sequence[Path]) -> str:
-    """Explain an error of a configuration in one line, with the choices if a name is mistyped.
-
-    Args:
-        error: the exception of Hydra or OmegaConf.
-        name: the configuration's name.
-        arguments: the arguments that it was composed from.
-        directories: directories of configuration files.
-
-    """
-    if isinstance(error, MissingConfigException) and error.missing_cfg_file is not None:
-        return _explain_missing(str(error.missing_cfg_file), name, directories)
-    if isinstance(error, OverrideParseException):
-        return _explain_syntax(error.override)
-    text = " ".join(str(error).split())
-    several = re.match(r"Ambiguous value for argument '([^=]+)=(.*?)' 1\.", text)
-    if several:
-        key, values = several.groups()
-        return (
-            f"{key}: got several values; -m runs each of them, {key}=[{values}] is a list, '{key}=\"{values}\"' a text"
-        )
-    return _explain_value(error, text, name, arguments, directories)
-
-
-def _explain_value(
-    error: Exception, text: str, name: str, arguments: Sequence[str], directories: Sequence[Path]
-) -> str:
-    """Explain which key of an override is unknown or has an invalid value."""
-    cause = error.__cause__
-    key = re.search(r"Could not override '([^']+)'", text)
-    if key:
-        if cause is not None and "not in struct" not in str(cause) and "not in '" not in str(cause):
-            return f"{key[1]}: {_first_line(cause)}"
-        return _explain_key(key[1], name, arguments, directories)
-    value = re.match(r"Error merging override (\S+?)=", text)
-    return f"{value[1]}: {_first_line(cause)}" if value and cause is not None else text
-
-
-def _explain_key(key: str, name: str, arguments: Sequence[str], directories: Sequence[Path]) -> str:
-    """Explain which keys exist instead of an unknown one."""
-    if key == "experiment":
-        return f"experiment: write +experiment=NAME, NAME one of {', '.join(list_choices(key, directories))}"
-    prefix = key.rpartition(".")[0]
-    node = _node_of(key, name, arguments, directories)
-    siblings = [f"{prefix}.{child!s}" if prefix else str(child) for child in node if child != "target"]
-    return f"{key}: unknown key; expected {', '.join(siblings)}"
-
-
-def _explain_missing(file: str, name: str, directories: Sequence[Path]) -> str:
-    """Explain which files exist instead of a missing configuration file."""
-    group, _, choice = file.rpartition("/")
-    if not group:
-        return f"--config-name {choice}: unknown; expected {name}"
-    choices = list_choices(group, directories)
-    if choices:
-        return f"{group}={choice}: unknown; expected one of {', '.join(choices)}"
-    return f"{group}: no such group of choices; expected one of {', '.join(list_groups(directories))}"
-
-
-def _explain_syntax(override: str) -> str:
-    """Explain how to write an argument that Hydra cannot parse."""
-    key, equals, value = override.partition("=")
-    if not equals:
-        return f"{override}: expected KEY=VALUE"
-    quoted = re.sub(r"[^\[\],{}:]+", r'"\g<0>"', value) if value.startswith("[") else f'"{value}"'
-    return f"{key}: cannot read the value {value}; special characters need quotes within quotes: '{key}={quoted}'"
-
-
 def _expect_choices(name: str, arguments: Sequence[str], directories: Sequence[Path]) -> None:
     """Exit if the command line names a choice that does not exist, or removes a required one."""
+    problem = explain_arguments(arguments)
+    if problem is not None:
+        fail(problem)
     if any(argument.startswith("hydra.searchpath=") for argument in arguments):
         return  # other directories may have further choices
     defaults = OmegaConf.load(directories[0] / f"{name}.yaml").defaults
@@ -207,28 +169,8 @@ def _expect_choice(argument: str, group: str, choice: str, directories: Sequence
     if choice in ("", "null"):
         fail(f"{argument}: expected one of {', '.join(choices)}")
     for each in choice.split(","):
-        if re.fullmatch(r"[\w-]+", each) and each not in choices:
+        if re.fullmatch(r"[\w.+-]+", each) and each not in choices:
             fail(f"{group}={each}: unknown; expected one of {', '.join(choices)}")
-
-
-def _first_line(error: BaseException) -> str:
-    return str(error).splitlines()[0] if str(error) else type(error).__name__
-
-
-def _node_of(key: str, name: str, arguments: Sequence[str], directories: Sequence[Path]) -> DictConfig:
-    """Return the node in which ``key`` was looked for, or the innermost one above it."""
-    choice = re.compile(rf"({'|'.join(list_groups(directories))})=[\w-]+")
-    overrides = [argument for argument in arguments if choice.fullmatch(argument)]
-    try:
-        node = compose(name, overrides, directories)
-    except HydraException:  # one of these choices is invalid
-        node = compose(name, [], directories)
-    for part in key.split(".")[:-1]:
-        child = OmegaConf.select(node, part)
-        if not isinstance(child, DictConfig):
-            break
-        node = child
-    return node
 
 
 def _config_dirs(arguments: Sequence[str]) -> list[Path]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import math
 import random
 import shutil
 from collections.abc import Mapping
@@ -29,7 +30,7 @@ from dsr.evaluation.store import load_errors, prediction_path
 from dsr.inference.adapter import AnyScale
 from dsr.methods.dip.upsampler import WORKSPACE
 from dsr.methods.registry import build_method, target_paths
-from dsr.metrics.formats import Formats
+from dsr.metrics.formats import HEADLINES, Formats
 from dsr.report.dashboard import save_dashboard
 from dsr.report.tables import score_table
 from dsr.sample import DepthSample
@@ -38,6 +39,8 @@ from dsr.utils.console import ConsoleProgress, open_console, print_error, show
 from dsr.utils.devices import fast_precision, pick_device
 from dsr.viz.confidence import write_confidence
 from dsr.viz.panels import save_picture
+
+_OBJECTIVE = "RMSE_v"
 
 
 def evaluate(config: DictConfig) -> pd.DataFrame:
@@ -62,6 +65,20 @@ def evaluate(config: DictConfig) -> pd.DataFrame:
     return pd.concat(scores, ignore_index=True)
 
 
+def objective(scores: pd.DataFrame) -> float:
+    """Return what sweepers minimise: the mean over the scenes of RMSE_v, or of the first metric if that is not there.
+
+    Args:
+        scores: the content of ``scores.csv``.
+
+    """
+    worst = scores[scores["variant"].isin(HEADLINES)]
+    means = worst.groupby("metric", sort=False)["value"].mean()
+    if means.empty:
+        return math.nan
+    return float(means.get(_OBJECTIVE, means.iloc[0]))
+
+
 def _evaluate(plain: dict[str, Any], source: SceneSource | None) -> pd.DataFrame:
     """Evaluate on ``source``, or on the data set that the configuration describes."""
     settings = EvalConfig.of(plain)
@@ -75,7 +92,7 @@ def _evaluate(plain: dict[str, Any], source: SceneSource | None) -> pd.DataFrame
     files = adapted.weights() if adapted is not None else [weights] if weights is not None else []
     targets = target_paths(settings.method, user_directories())
     identity = rundir.identity_of(plain, hash_weights(files), device, targets)
-    folder = Path(settings.output_dir or rundir.default_directory("eval", plain, identity)).expanduser()
+    folder = rundir.folder_of(settings.output_dir or rundir.default_directory("eval", plain, identity))
     progress = ConsoleProgress(console)
     given = {"device": device, "weights": weights, "workspace": folder, "display": progress}
     study = _study(settings, identity, given, source, adapted)

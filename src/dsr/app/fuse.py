@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,9 +9,8 @@ from pathlib import Path
 import numpy as np
 from rich.console import Console
 
-from dsr.app.upsample.outputs import ERRORS, INFO, METRES
-from dsr.evaluation.store import load_errors
-from dsr.geometry.camera import Camera
+from dsr.app.upsample.outputs import ERRORS, INFO
+from dsr.app.upsample.stored import read_camera, read_depth, read_errors, read_info
 from dsr.geometry.poses import as_rigid
 from dsr.geometry.tsdf import PosedMap, fuse_maps, suggest_voxel
 from dsr.io.model_files import write_ply
@@ -75,8 +73,11 @@ def fuse(request: FuseRequest, console: Console) -> list[str]:
     def maps() -> Iterator[PosedMap]:
         return (_load(folder, request.max_error) for folder in frames)
 
-    voxel = suggest_voxel(maps()) if request.voxel is None else request.voxel
-    mesh = fuse_maps(maps, voxel)
+    try:
+        voxel = suggest_voxel(maps()) if request.voxel is None else request.voxel
+        mesh = fuse_maps(maps, voxel)
+    except ValueError as error:
+        raise ValueError(f"{frames[0]}{' and others' if len(frames) > 1 else ''}: {error}") from error
     write_ply(request.output, mesh.vertices, mesh.normals, np.full(mesh.vertices.shape, _GREY, np.uint8), mesh.faces)
     size = f"{len(mesh.vertices)} vertices, {len(mesh.faces)} triangles, voxels of {1e3 * voxel:.3g} mm"
     show(console, f"{_count(frames)} -> {request.output}: {size}; in the world's frame of the poses")
@@ -90,45 +91,18 @@ def _load(folder: Path, max_error: float) -> PosedMap:
         ValueError: it is not complete, has no pose, or a file of it is missing or damaged.
 
     """
-    try:
-        info = json.loads((folder / INFO).read_text(encoding="utf-8"))
-        complete, pose, camera = info["complete"], info.get("pose"), dict(info.get("camera", {}))
-    except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
-        raise ValueError(f"{folder / INFO}: expected a file of `dsr upsample`, got something else") from None
-    if complete is not True:
-        raise ValueError(f"{folder}: expected a complete result; run `dsr upsample` again")
-    if pose is None:
-        raise ValueError(
-            f"{folder / INFO}: expected a pose; run `dsr upsample` on a capture with poses, or with --poses"
-        )
-    try:
-        own = Camera(**camera)
-    except TypeError:
-        raise ValueError(f"{folder / INFO}: camera: expected that of `dsr upsample`, got something else") from None
-    depth = _depth(folder, (own.height, own.width))
-    errors = load_errors(folder / ERRORS) if (folder / ERRORS).is_file() else None
-    deviation = None if errors is None else np.maximum(errors[0][0].double().numpy(), _LEAST_ERROR)
-    if deviation is not None:
-        if deviation.shape != depth.shape:
-            raise ValueError(f"{folder / ERRORS}: expected errors of {depth.shape}, got {deviation.shape}")
+    path = folder / INFO
+    info = read_info(path)
+    if info.get("pose") is None:
+        raise ValueError(f"{path}: expected a pose; run `dsr upsample` on a capture with poses, or with --poses")
+    camera = read_camera(path, info)
+    depth = read_depth(folder, camera).astype(np.float64)
+    deviation = None
+    if (folder / ERRORS).is_file():
+        deviation = np.maximum(read_errors(folder / ERRORS, camera)[0].astype(np.float64), _LEAST_ERROR)
         with np.errstate(invalid="ignore"):
             depth = np.where(deviation <= max_error * depth, depth, np.nan)
-    return PosedMap(depth, own, as_rigid(pose, f"{folder / INFO}: pose"), deviation)
-
-
-def _depth(folder: Path, size: tuple[int, int]) -> np.ndarray:
-    """Return the depth in metres of a result, (H, W) float64."""
-    path = folder / METRES if (folder / METRES).is_file() else folder / "depth.npy"
-    if not path.is_file():
-        raise ValueError(f"{folder / METRES}: expected the depth of a result, there is none")
-    try:
-        with path.open("rb") as file:
-            values = np.lib.format.read_array(file, allow_pickle=False)
-    except Exception as error:  # a damaged header makes NumPy raise OSError, MemoryError, TokenError, ...
-        raise ValueError(f"{path}: expected a NumPy array, got a damaged or foreign file") from error
-    if values.shape != size or values.dtype.kind != "f":
-        raise ValueError(f"{path}: expected floats of shape {size}, got {values.dtype} {values.shape}")
-    return values.astype(np.float64)
+    return PosedMap(depth, camera, as_rigid(info["pose"], f"{path}: pose"), deviation)
 
 
 def _count(frames: Sequence[Path]) -> str:

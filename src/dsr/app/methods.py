@@ -47,8 +47,16 @@ def weights_of(settings: EvalConfig) -> Path | None:
 
 
 def hash_weights(files: list[Path]) -> str | None:
-    """Return the SHA-256 of a file of weights, or of those of several and of those that they need; None without any."""
-    hashes = [file_hash(each) for file in files for each in files_of_weights(file)]
+    """Return the SHA-256 of a file of weights, or of those of several and of those that they need; None without any.
+
+    Raises:
+        ConfigError: one is missing or damaged.
+
+    """
+    try:
+        hashes = [file_hash(each) for file in files for each in files_of_weights(file)]
+    except (ValueError, OSError) as error:
+        raise ConfigError(str(error)) from error
     if len(hashes) < 2:
         return next(iter(hashes), None)
     return hashlib.sha256("".join(hashes).encode()).hexdigest()

@@ -9,7 +9,8 @@ from hydra.errors import HydraException
 from omegaconf.errors import OmegaConfBaseException
 from rich.console import Console
 
-from dsr.app.entry import compose, explain
+from dsr.app.composition import compose
+from dsr.app.explain import explain
 from dsr.app.schema import plain_config
 from dsr.data.base import SceneSource, prepare_scenes
 from dsr.sample import Scene

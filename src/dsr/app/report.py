@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
-import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,7 +20,7 @@ from dsr.report.markup import write_tables
 from dsr.report.page import save_page
 from dsr.report.user_study import read_study
 from dsr.utils.console import ConsoleProgress, show
-from dsr.utils.files import write_text
+from dsr.utils.files import replacing_folder, write_text
 from dsr.utils.progress import Progress
 
 _MARK = "report.json"
@@ -79,17 +77,9 @@ def make_report(
     results = load_results(runs)
     results = results.only(request.methods, request.datasets, request.scales)
     answers = None if study is None else read_study(study)
-    output.parent.mkdir(parents=True, exist_ok=True)
-    temporary = Path(tempfile.mkdtemp(prefix=f".{output.name}-", dir=output.parent))
-    try:
+    with replacing_folder(output) as temporary:
         notes = _write(temporary, results, answers, request, ConsoleProgress(console))
         write_text(temporary / _MARK, json.dumps({"runs": [str(run.folder) for run in results.runs]}, indent=1) + "\n")
-        temporary.chmod(0o755)
-        if output.exists():
-            shutil.rmtree(output)
-        temporary.replace(output)
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
     for note in (*results.notes, *notes):
         show(console, f"note: {note}")
     for what, file in _MAIN.items():

@@ -13,18 +13,30 @@ import torch
 from omegaconf import OmegaConf
 
 from dsr.app.moved_targets import update_targets
-from dsr.utils.builder import ConfigError
+from dsr.utils.builder import ConfigError, expand_home
+from dsr.utils.console import shorten
 from dsr.utils.files import write_text
 from dsr.utils.hashing import hash_of_code, hash_outside_code
+from dsr.utils.limits import read_limited
+from dsr.utils.parsing import parse_json
 from dsr.utils.ratios import round_ratio
 from dsr.utils.versions import versions
 
 _RECORD = "versions.json"
-_NOT_IDENTITY = ("output_dir", "overwrite", "metrics", "weights", "resume", "run")  # weights count by their content
+_NOT_IDENTITY = (
+    "output_dir",
+    "overwrite",
+    "metrics",
+    "weights",
+    "resume",
+    "run",
+    "trust",
+)  # weights count by their content
 PREDICTING_CODE = (
     "sample.py", "degradation", "geometry", "metrics", "synthetic", "methods", "data", "training", "inference",
-    "utils/builder.py", "utils/config_files.py", "utils/devices.py", "utils/hashing.py", "utils/lightning.py",
-    "utils/progress.py", "utils/ratios.py", "utils/validation.py", "evaluation/predict.py",
+    "utils/builder.py", "utils/config_files.py", "utils/devices.py", "utils/divergence.py", "utils/hashing.py",
+    "utils/lightning.py", "utils/parsing.py", "utils/progress.py", "utils/ratios.py", "utils/validation.py",
+    "evaluation/predict.py",
 )  # fmt: skip
 """Modules and packages that determine a prediction, by their paths below the package."""
 
@@ -64,6 +76,25 @@ def default_directory(kind: str, config: Mapping[str, Any], identity: Mapping[st
     return Path("outputs") / kind / "_".join((*names, digest))
 
 
+def folder_of(output_dir: str | Path) -> Path:
+    """Return the directory of a run, which need not exist.
+
+    Raises:
+        ConfigError: no directory can have such a name.
+
+    """
+    folder = expand_home("output_dir", str(output_dir))
+    try:
+        folder.lstat()
+    except (FileNotFoundError, NotADirectoryError, PermissionError):
+        pass
+    except OSError as error:
+        raise ConfigError(
+            f"output_dir: expected a directory, got {shorten(str(folder), 60)} ({error.strerror})"
+        ) from error
+    return folder
+
+
 def expect_free(
     folder: Path, config: Mapping[str, Any], identity: Mapping[str, Any], tolerated: Sequence[str] = ()
 ) -> list[str]:
@@ -87,7 +118,7 @@ def expect_free(
     if not folder.is_dir() or _is_unused(folder) or config["overwrite"]:
         return []
     try:
-        before = update_targets(dict(json.loads((folder / _RECORD).read_text(encoding="utf-8"))["identity"]))
+        before = update_targets(dict(parse_json(read_limited(folder / _RECORD), finite=False)["identity"]))
     except (OSError, ValueError, KeyError, TypeError):
         raise ConfigError(
             f"output_dir: {folder} holds files of something else; another output_dir keeps them"

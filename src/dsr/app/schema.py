@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, fields, is_dataclass
 from pathlib import Path
@@ -14,7 +13,8 @@ from omegaconf import MISSING, DictConfig, OmegaConf
 
 from dsr.degradation.scales import NATIVE, check_scale
 from dsr.training.settings import PatchSettings, Schedule
-from dsr.utils.builder import ConfigError
+from dsr.utils.builder import ConfigError, check_types
+from dsr.utils.parsing import is_number
 
 PRECISIONS = ("float32", "bfloat16", "auto")
 _GROUPS = ("dataset", "downsampling", "noise", "holes", "degradation", "method", "metrics", "model", "trainer", "loss")
@@ -48,6 +48,8 @@ class Checked:
                 raise ConfigError(f"{key}: missing; give it as {key}=...")
             if is_dataclass(parts[key]):
                 _refuse_unknown(value, [entry.name for entry in fields(parts[key])], f"{key}.")
+                check_types(parts[key], value, f"{key}.")
+        check_types(cls, plain)
         settings = cls(**{k: parts[k](**v) if is_dataclass(parts[k]) else v for k, v in plain.items()})
         settings.check()
         return settings
@@ -119,6 +121,7 @@ class EvalConfig(RunConfig):
     method: dict[str, Any] = MISSING
     weights: str | None = None
     run: str | None = None
+    trust: Any = None
 
     @property
     def measured(self) -> bool:
@@ -135,8 +138,7 @@ class EvalConfig(RunConfig):
         super().check()
         if not self.measured:
             _expect_factor(self.scale, "; downsampling=measured takes a sensor's map of any ratio")
-        number = isinstance(self.scale, (int, float)) and not isinstance(self.scale, bool) and self.scale >= 1
-        if not number and self.scale != NATIVE:
+        if not (is_number(self.scale) and self.scale >= 1) and self.scale != NATIVE:
             raise ConfigError(
                 f"scale: expected {NATIVE} or the ratio of the measured maps, 1 or more, got {self.scale!r}"
             )
@@ -191,6 +193,7 @@ class TrainConfig(RunConfig):
     loss: LossConfig = field(default_factory=LossConfig)
     validation: dict[str, Any] = field(default_factory=dict)
     resume: str | None = None
+    trust: Any = None
 
     def check(self) -> None:
         """Check values beyond their types.
@@ -202,7 +205,7 @@ class TrainConfig(RunConfig):
         super().check()
         _expect_factor(self.scale)
         w = self.loss.w
-        if w != "auto" and (isinstance(w, bool) or not isinstance(w, (int, float)) or not 0 <= w < math.inf):
+        if w != "auto" and (not is_number(w) or w < 0):
             raise ConfigError(f"loss.w: expected auto or a number, 0 or more, got {w!r}")
         for name in ("validate_every", "accumulate"):
             if not getattr(self.trainer, name) > 0:

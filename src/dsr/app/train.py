@@ -4,19 +4,21 @@ from __future__ import annotations
 
 import fnmatch
 import functools
+import math
 import os
 import shutil
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from zipfile import BadZipFile
 
 import lightning
-import torch
 from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 
 from dsr.app import run_directory as rundir
+from dsr.app.divergence import NOTE, expect_no_divergence, note_divergence
 from dsr.app.metrics import check_metrics, metric_collection
 from dsr.app.schema import TrainConfig, given_keys, plain_config
 from dsr.app.trainer import seconds_per_step, training_trainer
@@ -25,26 +27,29 @@ from dsr.data.base import prepare_scenes
 from dsr.methods.networks.base import DisparityNetwork
 from dsr.methods.networks.facets_unet import FacetsUNet
 from dsr.methods.networks.trained import NETWORKS
-from dsr.methods.networks.weight_files import load_network, network_name, save_network
+from dsr.methods.networks.weight_files import load_network, network_name, read_torch_file, save_network
 from dsr.metrics.visual_loss import VisualLoss, make_visual_loss
 from dsr.training.data_module import PatchData
 from dsr.training.module import SuperResolution
 from dsr.training.objective import Objective, SurfaceObjective, balance_weight
 from dsr.training.settings import Schedule
 from dsr.utils.builder import ConfigError, build
+from dsr.utils.checkpoints import CheckpointError
 from dsr.utils.console import ConsoleProgress
 from dsr.utils.devices import fast_precision, pick_device
+from dsr.utils.divergence import DivergenceError
 from dsr.utils.files import replacing
 from dsr.utils.lightning import fit
+from dsr.utils.limits import expect_stored
 from dsr.utils.progress import Progress
 from dsr.utils.units import duration
 
 _PATCHES_FOR_W = 64
 _LARGEST_SEED = 2**32 - 1
-_RESUMABLE = ("resume", "device")
+_RESUMABLE = ("resume", "device", "trust")
 
 
-def train(config: DictConfig) -> Path:
+def train(config: DictConfig) -> float:
     """Train a network: checkpoints, a TensorBoard log, and the weights of the best validation RMSE_v.
 
     An interrupted run is continued from its last checkpoint by the same command or by ``resume=RUN_DIR``.
@@ -53,7 +58,7 @@ def train(config: DictConfig) -> Path:
         config: composed from ``conf/train.yaml``.
 
     Returns:
-        The file of weights.
+        The best score of the validations, their mean RMSE_v.
 
     Raises:
         ConfigError: the configuration cannot be run, or its training is already complete.
@@ -74,7 +79,7 @@ def train(config: DictConfig) -> Path:
     data = training_data(settings)
     check_metrics(settings.metrics)
     identity = rundir.identity_of(plain, None, device)
-    folder = Path(settings.output_dir or rundir.default_directory("train", plain, identity)).expanduser()
+    folder = rundir.folder_of(settings.output_dir or rundir.default_directory("train", plain, identity))
     weights, last = folder / WEIGHTS, folder / "checkpoints" / "last.ckpt"
     if weights.exists() and not settings.overwrite:
         raise ConfigError(f"output_dir: {weights} is trained already; overwrite=true trains it again")
@@ -82,6 +87,8 @@ def train(config: DictConfig) -> Path:
     module = _module(settings, net, data, metrics)
     tolerated = ("code", "device") if "resume" in given_keys() else ()
     rundir.expect_free(folder, plain, identity, tolerated)
+    if not settings.overwrite:
+        expect_no_divergence(folder, identity)
     resume = last if last.is_file() and not settings.overwrite else None
     _announce(progress, settings, module, data, folder, resume)
     _load(progress, settings, module, data)
@@ -94,6 +101,8 @@ def train(config: DictConfig) -> Path:
     _describe(trainer, plain, module)
     try:
         fit(trainer, module, data, resume)
+    except DivergenceError as error:
+        raise note_divergence(folder, last, identity, error) from error
     except KeyboardInterrupt:
         raise KeyboardInterrupt(
             f"interrupted at step {trainer.global_step}; resume={folder} goes on from there"
@@ -101,7 +110,7 @@ def train(config: DictConfig) -> Path:
     if trainer.is_global_zero:
         _export(module, Path(best.best_model_path), weights, facts)
     progress.say(f"weights: {weights}")
-    return weights
+    return math.nan if best.best_model_score is None else float(best.best_model_score)
 
 
 def _resumed(plain: dict[str, Any]) -> dict[str, Any]:
@@ -112,9 +121,13 @@ def _resumed(plain: dict[str, Any]) -> dict[str, Any]:
     others = [key for key in given_keys() if key not in _RESUMABLE]
     if others:
         raise ConfigError(f"resume: goes on under the run's own configuration; {', '.join(others)} cannot be changed")
-    before = read_config(folder)
+    before = read_config(folder, plain["trust"])
+    try:
+        expect_stored(folder / "checkpoints" / "last.ckpt")
+    except (ValueError, OSError, BadZipFile) as error:
+        raise ConfigError(f"resume: {error}") from error
     device = {"device": plain["device"]} if "device" in given_keys() else {}
-    return {**before, **device, "resume": None, "output_dir": str(folder), "overwrite": False}
+    return {**before, **device, "resume": None, "output_dir": str(folder), "overwrite": False, "trust": None}
 
 
 def _network(settings: TrainConfig) -> DisparityNetwork:
@@ -220,7 +233,8 @@ def _computes_w(settings: TrainConfig) -> bool:
 
 def _clear(folder: Path) -> None:
     """Remove the files of an earlier training, so that they are not taken for this one's if it is interrupted."""
-    (folder / WEIGHTS).unlink(missing_ok=True)
+    for name in (WEIGHTS, NOTE):
+        (folder / name).unlink(missing_ok=True)
     for name in ("checkpoints", "tensorboard"):
         shutil.rmtree(folder / name, ignore_errors=True)
 
@@ -276,9 +290,12 @@ def _facts(plain: Mapping[str, Any], module: SuperResolution) -> dict[str, Any]:
 
 def _export(module: SuperResolution, best: Path, weights: Path, facts: Mapping[str, Any]) -> None:
     """Write the averaged weights of the best checkpoint, with the training's main settings."""
-    checkpoint = torch.load(best, map_location="cpu", weights_only=True)
-    state = checkpoint["state_dict"]
     prefix = "average."
-    module.average.load_state_dict({k.removeprefix(prefix): v for k, v in state.items() if k.startswith(prefix)})
+    try:
+        checkpoint = read_torch_file(best)
+        state, steps = checkpoint["state_dict"], int(checkpoint["global_step"])
+        module.average.load_state_dict({k.removeprefix(prefix): v for k, v in state.items() if k.startswith(prefix)})
+    except (ValueError, KeyError, TypeError, AttributeError, RuntimeError, OSError) as error:
+        raise CheckpointError(best, error) from error
     with replacing(weights) as temporary:
-        save_network(temporary, module.average, facts["model"], {**facts, "steps": int(checkpoint["global_step"])})
+        save_network(temporary, module.average, facts["model"], {**facts, "steps": steps})

@@ -14,11 +14,14 @@ from lightning.pytorch.callbacks import Callback, LearningRateMonitor, ModelChec
 from dsr.app.schema import TrainerConfig
 from dsr.training.degradation import Batch
 from dsr.training.module import SuperResolution
-from dsr.utils.lightning import Interruption, Log, StepProgress, ValidationTable, make_trainer
+from dsr.utils.checkpoints import Interruption, Keep
+from dsr.utils.divergence import Divergence
+from dsr.utils.lightning import Log, StepProgress, ValidationTable, make_trainer
 from dsr.utils.progress import Progress
 
 MONITOR = "val/RMSE_v"
 VALIDATION = "validation.csv"
+_SECONDS_BETWEEN_CHECKPOINTS = 600.0
 
 
 class Throughput(Callback):
@@ -58,17 +61,21 @@ def training_trainer(
 
     """
     checkpoints = folder / "checkpoints"
-    best = ModelCheckpoint(checkpoints, "best", monitor=MONITOR, mode="min", save_on_train_epoch_end=False)
+    best = ModelCheckpoint(
+        checkpoints, "best", monitor=MONITOR, mode="min", enable_version_counter=False, save_on_train_epoch_end=False
+    )
     latest = ModelCheckpoint(
         checkpoints, "last", enable_version_counter=False, save_on_train_epoch_end=False
     )  # save_last=True keeps the best's
     callbacks = [
+        Divergence(),
         Throughput(),
         ValidationTable(folder / VALIDATION),
         best,
         latest,
         LearningRateMonitor("step"),
         StepProgress(progress, "train"),
+        Keep(checkpoints / "last.ckpt", _SECONDS_BETWEEN_CHECKPOINTS),
         Interruption(checkpoints / "last.ckpt"),
     ]
     logger = Log(folder, name="", version="tensorboard", default_hp_metric=False)

@@ -5,39 +5,75 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
-
-from omegaconf import OmegaConf
+from typing import Any, get_type_hints
 
 from dsr.app.moved_targets import update_targets
-from dsr.app.schema import TrainConfig, TrainerConfig
+from dsr.app.schema import RunConfig, TrainConfig, TrainerConfig, user_directories
+from dsr.app.trust import Trust, expect_trusted, read_plain_yaml
 from dsr.data.base import SceneSource, SceneSubset
 from dsr.degradation.downsampling import Downsampling
 from dsr.methods.networks.facets_unet import FacetsUNet
 from dsr.training.data_module import Part, PatchData
 from dsr.training.degradation import Degradation
 from dsr.training.settings import PatchSettings
-from dsr.utils.builder import ConfigError, build, load_target, with_key
+from dsr.utils.builder import ConfigError, build, check_types, load_target, with_key
+from dsr.utils.parsing import is_number
 
 WEIGHTS = "weights.safetensors"
 _FROM_RUN = ("scale", "downsampling", "noise", "seed", "dataset")
 _NOT_WITH_RUN = ("method", "scale", "weights")
 
 
-def read_config(folder: Path) -> dict[str, Any]:
+def read_config(folder: Path, trust: Any = None) -> dict[str, Any]:
     """Read the configuration of a training, with the current paths of its targets.
 
+    Args:
+        folder: the run's directory, which may come from somebody else.
+        trust: the command line's value of the key; see :meth:`dsr.app.trust.Trust.of`.
+
     Raises:
-        ConfigError: the directory is not that of a training.
+        ConfigError: the directory is not that of a training, or a target is neither dsr's nor trusted.
 
     """
-    try:
-        config = OmegaConf.to_container(OmegaConf.load(folder / "config.yaml"))
-    except Exception as error:  # a file that is missing, not text or not YAML raises many types
-        raise ConfigError(f"{folder}: expected the directory of a training, it has no readable config.yaml") from error
-    if not isinstance(config, dict) or "model" not in config:
+    path = folder / "config.yaml"
+    if not path.is_file():
+        raise ConfigError(f"{folder}: expected the directory of a training, it has no readable config.yaml")
+    config = read_plain_yaml(path)
+    if "model" not in config:
         raise ConfigError(f"{folder}: expected the directory of a training, its config.yaml names no model")
-    return {str(key): update_targets(value) for key, value in config.items()}
+    config = {key: update_targets(value) for key, value in config.items()}
+    _check_types(path, config)
+    expect_trusted(path, config, Trust.of(trust, user_directories()))
+    return config
+
+
+def _check_types(file: Path, config: Mapping[Any, Any]) -> None:
+    """Check that the values of a run's configuration have the types of the schema, as the command line checks its own.
+
+    Raises:
+        ConfigError: one has not, or one that an evaluation needs is missing.
+
+    """
+    kinds = get_type_hints(TrainConfig)
+    try:
+        for key in (*_FROM_RUN, "model"):
+            if key not in config:
+                raise ConfigError(f"{key}: missing")
+        check_types(TrainConfig, {key: value for key, value in config.items() if key in kinds})
+        for key in ("trainer", "loss", "metrics"):
+            part = config.get(key, {})
+            if not isinstance(part, Mapping):
+                raise ConfigError(f"{key}: expected keys, got {part!r:.60}")
+            names = {entry.name for entry in dataclasses.fields(kinds[key])}
+            check_types(kinds[key], {name: value for name, value in part.items() if name in names}, f"{key}.")
+        for key in ("model", "dataset", "downsampling", "noise"):
+            if not isinstance(config[key].get("name"), str):
+                raise ConfigError(f"{key}.name: expected text, got {config[key].get('name')!r:.60}")
+        if "target" not in config["model"]:
+            raise ConfigError("model.target: missing")
+        RunConfig.check(RunConfig(precision=config.get("precision", "auto"), seed=config["seed"]))
+    except ConfigError as error:
+        raise ConfigError(f"{file}: {error}") from error
 
 
 def studies_of_run(
@@ -54,7 +90,7 @@ def studies_of_run(
 
     """
     folder = Path(plain["run"]).expanduser()
-    run = read_config(folder)
+    run = read_config(folder, plain.get("trust"))
     weights = folder / WEIGHTS
     if not weights.is_file():
         raise ConfigError(f"run: {folder} has no {WEIGHTS}; the training is not finished")
@@ -65,7 +101,7 @@ def studies_of_run(
     own = {key: run[key] for key in _FROM_RUN if key not in chosen}
     name = run["model"]["name"]
     method = {"name": name, "label": name, "model": name, **_as_validated(run["model"])}
-    network = str(run["model"]["target"])
+    network = str(run["model"].get("target"))
     if not network.startswith("dsr."):
         method["network"] = network
     base = {**plain, **own, "method": method, "weights": str(weights)}
@@ -127,10 +163,12 @@ def _parts(node: Mapping[str, Any]) -> list[Part]:
     if "parts" not in node:
         return [Part(build("dataset", node))]
     parts, fractions = node["parts"], node.get("shares")
-    if not isinstance(parts, Mapping) or not isinstance(fractions, Mapping) or parts.keys() != fractions.keys():
+    if not isinstance(parts, Mapping) or not parts:
+        raise ConfigError(f"dataset.parts: expected data sets by name, got {parts!r:.60}")
+    if not isinstance(fractions, Mapping) or parts.keys() != fractions.keys():
         raise ConfigError(f"dataset.shares: expected a number for each of {', '.join(parts)}, got {fractions}")
     for name, fraction in fractions.items():
-        if isinstance(fraction, bool) or not isinstance(fraction, (int, float)) or not fraction >= 0:
+        if not is_number(fraction) or fraction < 0:
             raise ConfigError(f"dataset.shares.{name}: expected 0 or a positive number, got {fraction!r}")
     used = {name: fraction for name, fraction in fractions.items() if fraction > 0}
     if not used:

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Mapping, Sequence
-
-from rich.console import Console
+from pathlib import Path
+from typing import Any
 
 from dsr.cli import data, doctor, export, fuse, hydra_commands, report, study, upsample, view
 from dsr.data.download.catalogue import CATALOGUE, Collection
-from dsr.utils.console import INTERRUPTED, USAGE_ERROR, one_line, open_console, print_error, show
+from dsr.utils import interruption
+from dsr.utils.console import USAGE_ERROR, one_line, open_console, print_error
+from dsr.utils.space import FullDiskError
 
 _EXAMPLES = """\
 examples:
@@ -32,7 +34,7 @@ _COMMANDS = (upsample, view, fuse, hydra_commands, report, study, data, doctor, 
 
 
 def main(arguments: Sequence[str] | None = None, catalogue: Mapping[str, Collection] | None = None) -> int:
-    """Run the command, and return its exit code: 0, 2 after an error, 130 when interrupted.
+    """Run the command, and return its exit code: 0, 2 after an error, 130 or 143 when interrupted.
 
     Args:
         arguments: command-line arguments; None for those of the process.
@@ -42,11 +44,11 @@ def main(arguments: Sequence[str] | None = None, catalogue: Mapping[str, Collect
     options = _parser().parse_args(arguments)
     console = open_console()
     try:
-        problems = options.run(options, console, CATALOGUE if catalogue is None else catalogue)
-    except KeyboardInterrupt:
-        show(Console(stderr=True), "interrupted; finished work is kept, run the same command again to continue")
-        return INTERRUPTED
-    except (ValueError, OSError) as error:
+        with interruption.working():
+            problems = options.run(options, console, CATALOGUE if catalogue is None else catalogue)
+    except KeyboardInterrupt as interrupted:
+        return interruption.stop(str(interrupted))
+    except (ValueError, OSError, FullDiskError) as error:
         problems = [one_line(error)]
     if isinstance(problems, int):
         return problems
@@ -55,9 +57,24 @@ def main(arguments: Sequence[str] | None = None, catalogue: Mapping[str, Collect
     return USAGE_ERROR if problems else 0
 
 
+class _Parser(argparse.ArgumentParser):
+    """A parser, and those of its commands, that refuses an empty text as a path: it would be the current directory."""
+
+    def __init__(self, *arguments: Any, **named: Any) -> None:
+        super().__init__(*arguments, **named)
+        self.register("type", Path, _path)
+
+
+def _path(text: str) -> Path:
+    """Return the path that an argument names."""
+    if not text.strip():
+        raise argparse.ArgumentTypeError("expected a path, got an empty text")
+    return Path(text)
+
+
 def _parser() -> argparse.ArgumentParser:
     """Return the command line."""
-    parser = argparse.ArgumentParser(
+    parser = _Parser(
         "dsr",
         description="Guided depth super-resolution.",
         epilog=_EXAMPLES,

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import sys
+from dsr.utils.interruption import start
 
-from dsr.cli import main
-
-sys.exit(main())
+start("dsr.cli", "main")

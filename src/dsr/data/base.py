@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import Literal, Protocol, runtime_checkable
 
 from dsr.sample import Scene
+from dsr.utils.parsing import readable
 from dsr.utils.progress import Progress
 
 SceneSelection = Sequence[str] | Literal["found"] | None
@@ -106,7 +107,7 @@ def select_scenes(available: Sequence[str], wanted: SceneSelection) -> list[str]
     """Return the ``wanted`` scenes, or all available ones for None.
 
     Raises:
-        ValueError: a wanted scene is not available or is named twice, or the list is empty.
+        ValueError: a wanted scene is not available or is named twice, the list is empty, or a name is not UTF-8.
 
     """
     if wanted == "found":
@@ -119,4 +120,8 @@ def select_scenes(available: Sequence[str], wanted: SceneSelection) -> list[str]
             rest = f", ... ({len(available)} in all)" if len(available) > _MAX_LISTED else ""
             some = ", ".join(available[:_MAX_LISTED])
             raise ValueError(f"scenes: {name!r} is not there; expected some of {some}{rest}")
-    return list(available) if wanted is None else list(wanted)
+    chosen = list(available) if wanted is None else list(wanted)
+    for name in chosen:
+        if name != readable(name):
+            raise ValueError(f"scenes: expected names in UTF-8, got {name!r}; rename it, or name other scenes")
+    return chosen

@@ -14,6 +14,7 @@ Depth and disparity follow ``camera.json``; see :func:`dsr.data.formats.files.re
 from __future__ import annotations
 
 import hashlib
+import os
 import re
 from collections.abc import Sequence
 from pathlib import Path
@@ -25,7 +26,8 @@ from torch import Tensor
 from dsr.data.base import SceneSelection, select_scenes
 from dsr.data.formats.files import MAP_SUFFIXES, CameraFile, read_camera, read_map, read_mask, read_rgb
 from dsr.geometry.camera import Camera, RangeType, from_range
-from dsr.sample import Scene
+from dsr.sample import Scene, expect_distances
+from dsr.utils.limits import opened, pixels_beside
 from dsr.utils.ratios import fits_ratio, round_ratio
 
 _RGB_NAMES = ("rgb.png", "rgb.jpg", "rgb.jpeg")
@@ -70,7 +72,10 @@ class Folder:
         """Return the SHA-256 of the scene's files."""
         digest = hashlib.sha256()
         for path in sorted(path for path in (self._root / scene).iterdir() if path.is_file()):
-            digest.update(path.name.encode() + b"\0" + path.read_bytes())
+            digest.update(os.fsencode(path.name) + b"\0")
+            with opened(path) as file:
+                while chunk := file.read(1 << 20):
+                    digest.update(chunk)
         return digest.hexdigest()
 
 
@@ -111,7 +116,7 @@ def _read_measured(path: Path, quantity: str, factor: str, description: CameraFi
         if not int(factor) or not all(size):
             raise ValueError(f"{path}: expected a factor that the {camera.height} x {camera.width} photo allows")
         return int(factor), _read_depth(path, quantity, description, camera.downscale(int(factor)))
-    height, width = read_map(path).shape
+    height, width = read_map(path, pixels_beside(camera.height, camera.width)).shape
     camera_lr, ratio = camera.reduce(width, height), camera.ratio_to(width, height)
     if ratio < 1 or not fits_ratio((camera.height, camera.width), (height, width), ratio):
         raise ValueError(
@@ -141,14 +146,14 @@ def _read_depth(
     path: Path, quantity: str, description: CameraFile, camera: Camera, mask_path: Path | None = None
 ) -> Tensor:
     """Return a map as orthogonal depth, (1, H, W) in metres, NaN in holes."""
-    values = read_map(path)
+    values = read_map(path, pixels_beside(camera.height, camera.width))
     _expect_size(path, values.shape, (camera.height, camera.width))
     unit = 1.0 if quantity == "disparity" else _depth_unit(path, description)
     values[np.isinf(values)] = np.nan  # infinity stands for an unknown disparity at Middlebury
     if description.hole_value is not None:
         values[values == description.hole_value] = np.nan
     if mask_path is not None and mask_path.is_file():
-        mask = read_mask(mask_path)
+        mask = read_mask(mask_path, pixels_beside(camera.height, camera.width))
         _expect_size(mask_path, mask.shape, values.shape)
         values[~mask] = np.nan
     if np.isnan(values).all():
@@ -159,7 +164,9 @@ def _read_depth(
             f"{path}: expected positive values, got {low:g} in {np.mean(values <= 0):.2%} of the pixels "
             '(mark holes by NaN, by mask.png, or by "hole_value" in camera.json)'
         )
-    return from_range(torch.from_numpy(values)[None] * unit, camera, _range_type(path, quantity, description))
+    depth = from_range(torch.from_numpy(values)[None] * unit, camera, _range_type(path, quantity, description))
+    expect_distances(str(path), depth)
+    return depth
 
 
 def _depth_unit(path: Path, description: CameraFile) -> float:

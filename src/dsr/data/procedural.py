@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from multiprocessing import get_context
+from concurrent.futures import as_completed
+from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 
 from dsr.sample import Scene
 from dsr.synthetic.procedural.scenes import PROCEDURAL_VERSION, render_random_scene
 from dsr.synthetic.rendering import cache_directory, load_or_render
+from dsr.utils.workers import WorkerPool
 
 
 class Procedural:
@@ -50,22 +51,27 @@ class Procedural:
         return f"procedural-v{PROCEDURAL_VERSION}-{self._seed}-{self._size}-{scene}"
 
     def prepare(self, scenes: Sequence[str]) -> Iterable[str]:
-        """Render scenes that are not in the cache, on all processors, and yield the name of each that is ready."""
+        """Render scenes that are not in the cache, on all processors, and yield the name of each that is ready.
+
+        Raises:
+            ChildProcessError: a process that renders was ended.
+
+        """
         there = {scene: (cache_directory() / self._path(scene)).is_file() for scene in scenes}
         missing = [scene for scene in scenes if not there[scene]]
         yield from (scene for scene in scenes if there[scene])
         if not missing:
             return
         workers = min(len(missing), os.cpu_count() or 1)
-        with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
+        with WorkerPool(workers) as pool:
             jobs = {pool.submit(self._render, scene): scene for scene in missing}
-            try:
-                for job in as_completed(jobs):
+            for job in as_completed(jobs):
+                try:
                     job.result()
-                    yield jobs[job]
-            except BaseException:
-                pool.shutdown(cancel_futures=True)
-                raise
+                except BrokenProcessPool as error:
+                    message = "dataset=procedural: a process that renders scenes ended, perhaps for want of memory"
+                    raise ChildProcessError(message) from error
+                yield jobs[job]
 
     def _render(self, scene: str) -> None:
         """Render a scene into the cache unless it is there."""

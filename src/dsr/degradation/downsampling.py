@@ -25,7 +25,7 @@ from dsr.degradation.holes import Holes
 from dsr.degradation.noise import Noise
 from dsr.degradation.scales import check_scale, match_ratio
 from dsr.geometry.camera import Camera, RangeType, from_range, to_range
-from dsr.sample import DepthSample, Scene
+from dsr.sample import FARTHEST, NEAREST, DepthSample, Scene
 
 Kernel = Literal["box", "nearest", "bilinear", "bicubic", "gaussian"]
 _LEAST_WEIGHT = 0.5
@@ -291,4 +291,5 @@ def downsample_depth(
             range_type, values = kind.range_type, to_range(averages, camera_lr, kind.range_type)
         values = kind(values, generator)
     depth_lr = from_range(values, camera_lr, range_type)
-    return torch.where(depth_lr > 0, depth_lr, torch.nan), camera_lr  # bicubic may undershoot beside a depth step
+    held = (depth_lr >= NEAREST) & (depth_lr <= FARTHEST)  # bicubic may undershoot beside a depth step
+    return torch.where(held, depth_lr, torch.nan), camera_lr

@@ -2,7 +2,8 @@
 
 A prediction is ``predictions/SCENE.npz``: ``depth`` (H, W) in metres, NaN where missing; from a method that says how
 sure it is its expected absolute errors, ``depth_error`` in metres and ``angle_error`` of the normal in degrees;
-``config``, a JSON text of all settings that it depends on; and ``seconds``, its computing time. Its sample is stored
+``config``, a JSON text of all settings that it depends on; and ``seconds``, its computing time. Infinite, zero and
+negative depths are stored as they come and count as missing; a prediction without any other fails. Its sample is stored
 too, see :mod:`dsr.evaluation.store`. Predictions whose stored config equals the requested one are reused, so an
 interrupted run continues where it stopped. A scene that fails, or without a solution, does not affect the others.
 """
@@ -26,11 +27,13 @@ from dsr.degradation.downsampling import Downsampling, Measured, make_sample
 from dsr.degradation.holes import Holes
 from dsr.degradation.noise import Noise
 from dsr.evaluation.store import iterations_path, prediction_path, sample_path
-from dsr.methods.base import Confident, Iterative, NoSolutionError, Surface, Upsampler
+from dsr.methods.base import Confident, Iterative, NoSolutionError, Surface, Upsampler, expect_some_depth
 from dsr.sample import DepthSample
 from dsr.utils.console import one_line
 from dsr.utils.files import read_arrays, replacing
+from dsr.utils.parsing import parse_json
 from dsr.utils.progress import SILENT, Progress
+from dsr.utils.tables import guarded
 
 
 @dataclass(frozen=True)
@@ -161,7 +164,7 @@ def _seconds_of_current(path: Path, config: Mapping[str, Any]) -> float | None:
     """Return the computing time of the stored prediction if its config is ``config``; None if there is none."""
     try:
         arrays = read_arrays(path)
-        stored, seconds = dict(json.loads(str(arrays["config"]))), float(arrays["seconds"])
+        stored, seconds = dict(parse_json(str(arrays["config"]), finite=False)), float(arrays["seconds"])
     except FileNotFoundError:
         return None
     except (OSError, KeyError, ValueError, TypeError):
@@ -185,9 +188,10 @@ def _predict_scene(study: Evaluation, scene: str, folder: Path, config: Mapping[
     expected = (1, sample.camera.height, sample.camera.width)
     if tuple(depth.shape) != expected:
         raise ValueError(f"{scene}: {study.method_name} gave depth of shape {tuple(depth.shape)}, expected {expected}")
+    expect_some_depth(depth, f"{scene}: {study.method_name}")
     if isinstance(study.method, Iterative):
         with replacing(iterations_path(folder, scene)) as temporary:
-            pd.DataFrame(study.method.history).to_csv(temporary, index=False)
+            guarded(pd.DataFrame(study.method.history)).to_csv(temporary, index=False)
     sample.save(sample_path(folder, scene))
     with replacing(prediction_path(folder, scene)) as temporary:
         np.savez_compressed(

@@ -5,23 +5,27 @@ Only files are read: ``scores.csv``, ``summary.json``, ``versions.json``, predic
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Annotated, Any, TypeVar
 
 import pandas as pd
-from pydantic import BaseModel, ValidationError
+from pydantic import BaseModel, Field, ValidationError
 
 from dsr.evaluation.results import Results, Run, method_key, method_settings, problem_key
-from dsr.evaluation.store import prediction_path
+from dsr.evaluation.store import prediction_path, sample_path
 from dsr.metrics.formats import MetricFormat
+from dsr.utils.files import array_headers
+from dsr.utils.limits import MOST_TABLE, TooLargeError, expect_bytes, read_limited
 from dsr.utils.ratios import as_ratio
-from dsr.utils.validation import describe
+from dsr.utils.tables import unguarded
+from dsr.utils.validation import Number, Whole, describe
 
 _SCORES, _SUMMARY, _VERSIONS = "scores.csv", "summary.json", "versions.json"
 _TEXT_COLUMNS = ("dataset", "scene", "downsampling", "method", "metric", "variant")
 _NUMBER_COLUMNS = ("scale", "seed", "value", "valid_share")
+_LARGEST_SCALE = 1e6
 _DIGEST = 8
 """Number of displayed digits of a hash."""
 _Content = TypeVar("_Content", bound=BaseModel)
@@ -40,9 +44,13 @@ def load_results(paths: Sequence[Path]) -> Results:
     notes: list[str] = []
     for folder in _folders(paths):
         try:
-            runs.append(read_run(folder))
-        except ValueError as error:
+            run = read_run(folder)
+        except (ValueError, OSError) as error:
             notes.append(f"left out: {error}")
+            continue
+        unfit = {scene: problem for scene in run.scenes if (problem := _unfit_prediction(run, scene))}
+        notes += [f"left out: {problem}" for problem in unfit.values()]
+        runs.append(_without(run, unfit))
     if not runs:
         where = ", ".join(map(str, paths))
         detail = f"; {notes[0]}" if notes else ""
@@ -59,6 +67,33 @@ def load_results(paths: Sequence[Path]) -> Results:
         raise ValueError(f"{', '.join(map(str, paths))}: expected runs with a prediction, found none{reason}")
     runs.sort(key=lambda run: (problem_key(run.problem), method_key(run.label), run.seed))
     return Results(tuple(runs), (*notes, *older, *unsolved))
+
+
+def _unfit_prediction(run: Run, scene: str) -> str:
+    """Return what is wrong with the type or size of a prediction, empty for nothing; its values are not read.
+
+    A file that is damaged, or a run that stored no scene, is left to those that draw it.
+    """
+    path = prediction_path(run.folder, scene)
+    try:
+        shape, dtype = array_headers(path)["depth"]
+        photo = array_headers(sample_path(run.folder, scene))["rgb"][0] if run.has_sample(scene) else shape
+    except (ValueError, OSError, KeyError):
+        return ""
+    if dtype.kind != "f" or len(shape) != 2:
+        return f"{path}: expected floating point depth (height x width), got {dtype} of shape {shape}"
+    if shape != photo[:2]:
+        expected, came = (" x ".join(map(str, size)) for size in (photo[:2], shape))
+        return f"{path}: expected depth of the photo's {expected} pixels, got {came}"
+    return ""
+
+
+def _without(run: Run, scenes: Collection[str]) -> Run:
+    """Return a run without some of its scenes."""
+    if not scenes:
+        return run
+    kept = tuple(scene for scene in run.scenes if scene not in scenes)
+    return replace(run, scenes=kept, scores=run.scores[run.scores["scene"].isin(kept)])
 
 
 def _folders(paths: Sequence[Path]) -> Iterator[Path]:
@@ -81,10 +116,9 @@ def read_run(folder: Path) -> Run:
 
     """
     summary, versions = _read(_Summary, folder / _SUMMARY), _read(_Versions, folder / _VERSIONS)
-    settings = versions.identity
+    settings = versions.identity.model_dump(exclude_unset=True)
     scores = _read_scores(folder / _SCORES)
-    method = settings.get("method")
-    label = summary.label or (method.get("label") if isinstance(method, Mapping) else None) or summary.method
+    label = summary.label or versions.identity.method.get("label") or summary.method
     dataset = str(scores["dataset"].iloc[0]) if len(scores) else summary.dataset
     scenes = tuple(scene for scene in summary.seconds if prediction_path(folder, scene).is_file())
     scores = scores[scores["scene"].isin(scenes)]
@@ -101,30 +135,37 @@ def read_run(folder: Path) -> Run:
     )
 
 
-class _Summary(BaseModel):
+class _Summary(BaseModel, strict=True, allow_inf_nan=False):
     """The content of ``summary.json``; runs of earlier versions lack the keys with defaults."""
 
     dataset: str
-    scale: float
+    scale: Annotated[Number, Field(ge=1, le=_LARGEST_SCALE)]
     downsampling: str
     method: str
-    seed: int
-    seconds: dict[str, float]
+    seed: Annotated[Whole, Field(ge=0)]
+    seconds: dict[str, Annotated[Number, Field(ge=0)]]
     label: str | None = None
     unanswered: dict[str, str] = {}
     metrics: dict[str, MetricFormat] = {}
 
 
+class _Identity(BaseModel, extra="allow", strict=True):
+    """A run's settings; those of its groups that are read have keys."""
+
+    method: dict[str, Any] = {}
+    dataset: dict[str, Any] = {}
+
+
 class _Versions(BaseModel, extra="allow"):
     """``versions.json``: versions of packages, Python and the project, and the run's settings."""
 
-    identity: dict[str, Any] = {}
+    identity: _Identity = _Identity()
 
 
 def _read(kind: type[_Content], path: Path) -> _Content:
     """Read and check a JSON file of a run."""
     try:
-        return kind.model_validate_json(path.read_bytes())
+        return kind.model_validate_json(read_limited(path))
     except OSError as error:
         raise ValueError(f"{path}: expected a run's JSON, got {error.strerror or error}") from error
     except ValidationError as error:
@@ -135,10 +176,24 @@ def _read_scores(path: Path) -> pd.DataFrame:
     """Return a run's ``scores.csv``; an empty variant is ""."""
     try:
         missing = {name: [""] for name in _NUMBER_COLUMNS}
-        scores = pd.read_csv(path, dtype=dict.fromkeys(_TEXT_COLUMNS, str), keep_default_na=False, na_values=missing)
-        scores = scores[[*_TEXT_COLUMNS, *_NUMBER_COLUMNS]].astype({"seed": int, "value": float})
+        expect_bytes(path, path.stat().st_size, MOST_TABLE)
+        scores = pd.read_csv(
+            path,
+            usecols=[*_TEXT_COLUMNS, *_NUMBER_COLUMNS],
+            dtype=dict.fromkeys(_TEXT_COLUMNS, str),
+            keep_default_na=False,
+            na_values=missing,
+        )
+        scores = unguarded(scores[[*_TEXT_COLUMNS, *_NUMBER_COLUMNS]])
+        if any(scores[name].dtype == bool for name in _NUMBER_COLUMNS):
+            raise ValueError("true is no number")
+        scores = scores.astype({"seed": int, "value": float, "valid_share": float})
         scores["scale"] = pd.to_numeric(scores["scale"])
-    except (OSError, ValueError, KeyError, pd.errors.ParserError) as error:
+        if not scores["scale"].between(1, _LARGEST_SCALE).all() or not scores["seed"].between(0, 2**63 - 1).all():
+            raise ValueError("a scale or seed is none")
+    except TooLargeError:
+        raise
+    except (OSError, ValueError, KeyError, OverflowError, pd.errors.ParserError) as error:
         raise ValueError(f"{path}: expected a run's scores, got a damaged or foreign file") from error
     return scores
 
@@ -189,8 +244,8 @@ def _newest(runs: Sequence[Run]) -> tuple[list[Run], list[str]]:
         if again:
             newer = taken[keys[again[0]]]
             notes.append(f"left out: {run.folder}: {', '.join(again)}; {newer} is newer and of the same settings")
-        scenes = tuple(scene for scene in run.scenes if scene not in again)
-        taken |= {keys[scene]: run.folder for scene in scenes}
-        if scenes:
-            kept.append(replace(run, scenes=scenes, scores=run.scores[run.scores["scene"].isin(scenes)]))
+        fresh = _without(run, again)
+        taken |= {keys[scene]: run.folder for scene in fresh.scenes}
+        if fresh.scenes:
+            kept.append(fresh)
     return kept, notes

@@ -20,6 +20,7 @@ from dsr.sample import DepthSample
 from dsr.utils.files import replacing, write_text
 from dsr.utils.progress import Progress
 from dsr.utils.ratios import round_ratio
+from dsr.utils.tables import guarded
 
 SCORE_COLUMNS = (
     "dataset",
@@ -73,7 +74,7 @@ def score(
             outcome.failures[scene] = failure_line(scene, error)
     scores = pd.DataFrame(rows, columns=list(SCORE_COLUMNS))
     with replacing(folder / "scores.csv") as temporary:
-        scores.to_csv(temporary, index=False)
+        guarded(scores).to_csv(temporary, index=False)
     write_text(folder / "summary.json", json.dumps(summary(study, scores, outcome, metrics), indent=1) + "\n")
     return scores
 

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from dsr.utils.files import read_arrays
+from dsr.utils.limits import TooLargeError
 
 _ERRORS = ("depth_error", "angle_error")
 
@@ -44,7 +45,11 @@ def load_errors(path: Path) -> tuple[Tensor, Tensor] | None:
         arrays = read_arrays(path, _ERRORS)
         if "depth_error" not in arrays:
             return None
+        if any(array.ndim != 2 or array.dtype.kind != "f" for array in arrays.values()):
+            raise TypeError
         depth, angle = (torch.from_numpy(arrays[name])[None].float() for name in _ERRORS)
+    except TooLargeError:
+        raise
     except (OSError, KeyError, ValueError, TypeError) as error:
         raise ValueError(f"{path}: expected a prediction, got a missing or damaged file") from error
     return depth, angle
@@ -54,10 +59,15 @@ def load_prediction(path: Path) -> Tensor:
     """Return a predicted depth map, (1, H, W) in metres.
 
     Raises:
-        ValueError: the file is missing or damaged.
+        ValueError: the file is missing or damaged, or its depth is no map of floating point numbers.
 
     """
     try:
-        return torch.from_numpy(read_arrays(path, ("depth",))["depth"])[None]
+        depth = read_arrays(path, ("depth",))["depth"]
+        if depth.ndim != 2 or depth.dtype.kind != "f":
+            raise TypeError
+        return torch.from_numpy(depth)[None]
+    except TooLargeError:
+        raise
     except (OSError, KeyError, ValueError, TypeError) as error:
         raise ValueError(f"{path}: expected a prediction, got a missing or damaged file") from error

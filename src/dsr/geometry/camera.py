@@ -8,8 +8,10 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from numbers import Real
 from typing import Literal, Self, get_args
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -51,16 +53,16 @@ class Camera:
         """Check every field and take the absolute value of ``fy``."""
         for name in ("width", "height"):
             value = getattr(self, name)
-            if not float(value).is_integer() or value < 1:
-                raise ValueError(f"camera {name}: expected a positive whole number, got {value!r}")
+            if not _is_number(value) or not float(value).is_integer() or value < 1:
+                raise ValueError(f"camera {name}: expected a positive whole number, got {value!r:.60}")
         for name in ("fx", "fy", "cx", "cy", "doffs"):
-            if not math.isfinite(getattr(self, name)):
-                raise ValueError(f"camera {name}: expected a finite number, got {getattr(self, name)!r}")
+            if not _is_number(getattr(self, name)):
+                raise ValueError(f"camera {name}: expected a finite number, got {getattr(self, name)!r:.60}")
         if self.fx <= 0:
             raise ValueError(f"camera fx: expected a positive number of pixels, got {self.fx!r}")
         if self.fy == 0:
             raise ValueError("camera fy: expected a number of pixels other than 0")
-        if self.baseline is not None and not (math.isfinite(self.baseline) and self.baseline > 0):
+        if self.baseline is not None and not (_is_number(self.baseline) and self.baseline > 0):
             raise ValueError(f"camera baseline: expected a positive number of metres, got {self.baseline!r}")
         object.__setattr__(self, "fy", abs(self.fy))
 
@@ -165,6 +167,16 @@ class Camera:
     def ray_lengths(self, *, dtype: torch.dtype = torch.float64, device: torch.device | str = "cpu") -> Tensor:
         """Return |r(u, v)|, shape (H, W): the perspective depth of a point with orthogonal depth 1."""
         return self.rays(dtype=dtype, device=device).square().sum(dim=0).sqrt()
+
+
+def _is_number(value: object) -> bool:
+    """Return whether a value is a finite number; true and false are none, and neither is 10**400."""
+    if isinstance(value, (bool, np.bool_)) or not isinstance(value, Real):
+        return False
+    try:
+        return math.isfinite(value)
+    except OverflowError:
+        return False
 
 
 def to_range(depth: Tensor, camera: Camera, range_type: RangeType) -> Tensor:

@@ -5,10 +5,12 @@ A pose is the transform from a camera's frame (x right, y down, z forward) to th
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 Matrix = NDArray[np.float64]
 
@@ -28,6 +30,8 @@ def as_rigid(values: Sequence[Sequence[float]] | np.ndarray, name: str) -> Matri
 
     """
     try:
+        if not isinstance(values, np.ndarray) and any(isinstance(each, bool | str) for row in values for each in row):
+            raise TypeError
         matrix = np.asarray(values, dtype=np.float64)
     except (TypeError, ValueError, OverflowError):
         raise ValueError(f"{name}: expected a matrix of 3 x 4 or 4 x 4 numbers, got something else") from None
@@ -42,12 +46,25 @@ def as_rigid(values: Sequence[Sequence[float]] | np.ndarray, name: str) -> Matri
     return _with_rotation(matrix, name)
 
 
+def orthonormal_error(turn: np.ndarray) -> float:
+    """Return how far the rows of a matrix R, (3, 3), are from orthonormal: the largest magnitude in R R' - 1.
+
+    It is infinite or NaN where the numbers are too large for that.
+    """
+    with np.errstate(over="ignore", invalid="ignore"):
+        return float(np.abs(turn @ turn.T - np.eye(3)).max())
+
+
+def is_rotation(turn: np.ndarray, tolerance: float) -> bool:
+    """Return whether a matrix, (3, 3), is a rotation to within a tolerance of :func:`orthonormal_error`."""
+    return orthonormal_error(turn) <= tolerance and float(np.linalg.det(turn)) > 0
+
+
 def _with_rotation(matrix: Matrix, name: str) -> Matrix:
     """Return the transform with the nearest rotation, after checking that it has one."""
     turn = matrix[:3, :3]
-    error = float(np.abs(turn @ turn.T - np.eye(3)).max())
-    if error > _TOLERANCE:
-        lengths = np.linalg.norm(turn, axis=1)
+    if not orthonormal_error(turn) <= _TOLERANCE:  # NaN is none either
+        lengths = [math.hypot(*row) for row in turn]
         raise ValueError(
             f"{name}: expected a rigid transform, got rows of length {_text(lengths)} that do not form one"
         )
@@ -66,18 +83,10 @@ def from_quaternion(translation: Sequence[float], quaternion: Sequence[float], n
         ValueError: a number is not finite, or the quaternion's length is not 1 to within 1 %.
 
     """
-    x, y, z, w = np.asarray(quaternion, dtype=np.float64)
-    length = float(np.sqrt(x * x + y * y + z * z + w * w))
+    length = math.hypot(*quaternion)
     if not abs(length - 1) <= 0.01:
         raise ValueError(f"{name}: expected a quaternion of length 1, got {length:g}")
-    x, y, z, w = (value / length for value in (x, y, z, w))
-    turn = np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+    turn = Rotation.from_quat(quaternion).as_matrix()
     return as_rigid(np.column_stack((turn, np.asarray(translation, dtype=np.float64))), name)
 
 
@@ -94,6 +103,6 @@ def relative(pose: Matrix, to: Matrix) -> Matrix:
     return invert(to) @ pose
 
 
-def _text(values: np.ndarray) -> str:
+def _text(values: Iterable[float]) -> str:
     """Return numbers for a message."""
     return " ".join(f"{value:.4g}" for value in values)

@@ -8,6 +8,7 @@ are those of scikit-image's marching cubes (Lewiner et al. 2003).
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable
 from typing import NamedTuple
 
@@ -67,7 +68,7 @@ def fuse_maps(maps: Callable[[], Iterable[PosedMap]], voxel: float) -> FusedMesh
     if not 0 < voxel < np.inf:
         raise ValueError(f"voxel: expected a positive number of metres, got {voxel}")
     blocks = _touched_blocks(maps(), voxel)
-    layer = int(np.prod(np.ptp(blocks[:, :2], axis=0) + 1))
+    layer = math.prod(int(extent) + 1 for extent in np.ptp(blocks[:, :2], axis=0))  # of any size
     excess = max(len(blocks) / MOST_BLOCKS, layer / _LARGEST_LAYER)
     if excess > 1:
         raise ValueError(

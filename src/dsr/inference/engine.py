@@ -20,12 +20,12 @@ from dsr.geometry.resampling import pad_inverse_depth, resize_inverse_depth
 from dsr.inference.agreement import expect_errors
 from dsr.inference.inspection import enlarged_by
 from dsr.inference.planning import DEFAULT, OWN_SIZE, USUAL_SCALE, Plan, plan, read_ability
-from dsr.methods.base import Confident, MapNoise, Surface, Upsampler
+from dsr.methods.base import Confident, MapNoise, Surface, Upsampler, expect_some_depth
 from dsr.methods.classical.interpolation import Interpolation
 from dsr.methods.networks.base import NetworkUpsampler
 from dsr.methods.networks.inpainting import inpaint
 from dsr.methods.registry import build_method, read_method
-from dsr.sample import DepthSample
+from dsr.sample import DepthSample, expect_distances
 from dsr.utils.builder import ConfigError, trait
 from dsr.utils.devices import inference_precision, pick_device
 from dsr.utils.progress import Steps, part_of
@@ -200,8 +200,10 @@ def upsample_surface(
             found = found.crop(size)
     else:
         found = _upsample_inverse(rgb, inverse, camera, scale, choice, progress)
+    expect_some_depth(found.inverse, method)  # as good as of the depth: 0 and infinity change places
     lowest = inverse.nan_to_num(nan=torch.inf).amin()
-    inverse_hr = torch.where(found.inverse > 0, found.inverse, lowest.to(found.inverse.device))  # 0 is infinitely far
+    infinite = found.inverse <= 0  # but what is NaN has no depth
+    inverse_hr = torch.where(infinite, lowest.to(found.inverse.device), found.inverse)
     if found.left_out is not None:
         inverse_hr = inverse_hr.masked_fill(found.left_out, torch.nan)
     spread, angle = found.spread, found.angle
@@ -352,5 +354,6 @@ def _check(rgb: Tensor, depth: Tensor, camera: Camera) -> None:
             f"depth: expected metres above 0, and NaN (float('nan')) to mark holes, got {float(wrong[0]):g} "
             f"in {wrong.numel()} of {depth.numel()} pixels"
         )
+    expect_distances("depth", depth)
     if not bool(depth.isfinite().any()):
         raise ValueError("depth: expected at least one known pixel, all are holes")

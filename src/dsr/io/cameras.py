@@ -14,6 +14,7 @@ from dsr.data.formats.files import CameraFile, Pixels, read_camera
 from dsr.geometry.camera import ASSUMED_FOV, Camera
 from dsr.io.encoding import Assumption
 from dsr.io.photos import Size, focal_in_exif, same_aspect
+from dsr.utils.limits import read_limited
 from dsr.utils.validation import describe
 
 _FILM_DIAGONAL = math.hypot(36, 24)
@@ -94,7 +95,7 @@ def read_any_camera(path: Path) -> CameraFile | np.ndarray:
     """
     if not path.is_file():
         raise ValueError(f"{path}: expected a camera file, there is none")
-    text = path.read_text(encoding="utf-8", errors="replace")
+    text = read_limited(path).decode("utf-8", "replace")
     if path.suffix.lower() != ".json" and not text.lstrip().startswith("{"):
         return _matrix(path, text)
     return _open3d(path, text) if '"intrinsic_matrix"' in text else read_camera(path)

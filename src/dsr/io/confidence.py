@@ -12,6 +12,7 @@ import numpy as np
 from dsr.data.formats.files import read_pixels
 from dsr.io.depth_files import DEPTH_SUFFIXES, read_array_file
 from dsr.io.frames import Source
+from dsr.utils.limits import pixels_beside
 
 HIGHEST_LEVEL = 2
 """ARKit's levels are 0 (low), 1 (medium) and 2 (high)."""
@@ -44,7 +45,7 @@ class ConfidenceMap:
             ValueError: it is missing, damaged, of another size, or has values out of range.
 
         """
-        values = read_values(self.path) if self.source is None else self.source.read()
+        values = read_values(self.path, pixels_beside(*size)) if self.source is None else self.source.read()
         if values.shape != size:
             raise ValueError(
                 f"{self.path}: expected confidence of the depth map's {size[1]} x {size[0]} pixels (width x height), "
@@ -56,17 +57,21 @@ class ConfidenceMap:
         return values.astype(np.float32) / np.float32(self.highest)
 
 
-def read_values(path: Path) -> np.ndarray:
+def read_values(path: Path, most: int | None = None) -> np.ndarray:
     """Return a confidence map as it is stored, (h, w).
 
+    Args:
+        path: the file.
+        most: largest number of pixels; None for what the size of the file explains.
+
     Raises:
-        ValueError: it is missing, damaged, or has several channels.
+        ValueError: it is missing, damaged, too large, or has several channels.
 
     """
     if not path.is_file():
         raise ValueError(f"{path}: expected a confidence map, there is no such file")
     array = path.suffix.lower() in _ARRAYS
-    values = read_array_file(path) if array else read_pixels(path, cv2.IMREAD_UNCHANGED)
+    values = read_array_file(path, most) if array else read_pixels(path, cv2.IMREAD_UNCHANGED, most)
     if values.ndim != 2 or values.dtype.kind not in "fiub" or not values.size:
         raise ValueError(f"{path}: expected one channel of numbers, got {values.dtype} of shape {values.shape}")
     return values

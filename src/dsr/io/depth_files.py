@@ -9,14 +9,17 @@ import contextlib
 import io
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 
-from dsr.data.formats.files import expect_depth_values, quiet_decoders, read_array, read_values
+from dsr.data.formats.decoding import quiet_decoders
+from dsr.data.formats.files import expect_depth_values, read_array
 from dsr.data.formats.icl_nuim import CAMERA as ICL_CAMERA
 from dsr.data.formats.shared import read_numbers
-from dsr.utils.files import read_arrays, replacing
+from dsr.utils.files import array_headers, read_arrays, replacing
+from dsr.utils.limits import MOST_PIXELS, bytes_of_archive, expect_bytes, expect_pixels
 
 DEPTH_SUFFIXES = (".png", ".tiff", ".tif", ".npy", ".npz", ".pfm", ".exr")
 """Of the formats that are read and written."""
@@ -32,14 +35,18 @@ _STORABLE = {
 """Types of value by file format; NumPy's formats take any."""
 
 
-def read_depth_file(path: Path) -> np.ndarray:
+def read_depth_file(path: Path, most: int | None = None) -> np.ndarray:
     """Return a map as it is stored, (H, W), floats or whole numbers of 16 bits or more in this machine's byte order.
 
     Of an OpenEXR file the channel named Z or depth is taken (of any layer), else Y, else the only one, else R; of an
     ``.npz`` file the array named depth, else the only one.
 
+    Args:
+        path: the file.
+        most: largest number of pixels; None for what the size of the file explains.
+
     Raises:
-        ValueError: it is missing, damaged, of another format or shape, or has 8-bit values.
+        ValueError: it is missing, damaged, too large, of another format or shape, or has 8-bit values.
 
     """
     suffix = path.suffix.lower()
@@ -47,22 +54,21 @@ def read_depth_file(path: Path) -> np.ndarray:
         raise ValueError(f"{path}: expected a depth map as {', '.join(READ_SUFFIXES)}, got {suffix or 'no suffix'}")
     if not path.is_file():
         raise ValueError(f"{path}: expected a depth map, there is no such file")
-    readers = {".exr": _read_exr, ".npz": _read_npz, ICL_SUFFIX: _read_icl}
-    values = expect_depth_values(path, readers[suffix](path)) if suffix in readers else read_values(path)
+    values = _read_icl(path) if suffix == ICL_SUFFIX else expect_depth_values(path, read_array_file(path, most))
     if values.size == 0:
         raise ValueError(f"{path}: expected a depth map, got one of {values.shape[0]} x {values.shape[1]} pixels")
     return np.ascontiguousarray(values, values.dtype.newbyteorder("="))
 
 
-def read_array_file(path: Path) -> np.ndarray:
+def read_array_file(path: Path, most: int | None = None) -> np.ndarray:
     """Return the array of an NPY, NPZ, PFM or OpenEXR file, of any type and shape; see :func:`read_depth_file`.
 
     Raises:
-        ValueError: it is missing or damaged.
+        ValueError: it is missing, damaged or too large.
 
     """
-    suffix = path.suffix.lower()
-    return _read_exr(path) if suffix == ".exr" else _read_npz(path) if suffix == ".npz" else read_array(path)
+    readers = {".exr": _read_exr, ".npz": _read_npz}
+    return readers.get(path.suffix.lower(), read_array)(path, most)
 
 
 def write_depth_file(path: Path, values: np.ndarray) -> None:
@@ -111,27 +117,44 @@ def _read_icl(path: Path) -> np.ndarray:
     return read_numbers(path, ICL_CAMERA.height * ICL_CAMERA.width).reshape(ICL_CAMERA.height, ICL_CAMERA.width)
 
 
-def _read_npz(path: Path) -> np.ndarray:
+def _read_npz(path: Path, most: int | None) -> np.ndarray:
     """Return the array named depth, or the only one."""
-    arrays = read_arrays(path)
-    if len(arrays) == 1:
-        return next(iter(arrays.values()))
-    if "depth" not in arrays:
-        raise ValueError(f"{path}: expected one array, or one named depth; got {', '.join(sorted(arrays)) or 'none'}")
-    return arrays["depth"]
+    names = sorted(array_headers(path))
+    if len(names) != 1 and "depth" not in names:
+        raise ValueError(f"{path}: expected one array, or one named depth; got {', '.join(names) or 'none'}")
+    name = names[0] if len(names) == 1 else "depth"
+    return read_arrays(path, (name,), None if most is None else 8 * most)[name]
 
 
-def _read_exr(path: Path) -> np.ndarray:
+def _read_exr(path: Path, most: int | None) -> np.ndarray:
     """Return the depth channel of an OpenEXR file; see https://openexr.com/en/latest/StandardOptions.html."""
     import OpenEXR  # noqa: PLC0415 - only where somebody has such a file
 
-    try:  # damaged files print on both streams
-        quiet = contextlib.redirect_stdout(io.StringIO())
-        with quiet_decoders(), quiet, OpenEXR.File(str(path), separate_channels=True) as file:
-            channels = {name: channel.pixels for name, channel in file.channels().items()}
-    except Exception as error:  # RuntimeError, ValueError, MemoryError, ...
-        raise ValueError(f"{path}: expected an OpenEXR file, got a damaged or foreign one") from error
+    def read(*, header: bool) -> list[Any]:
+        try:  # damaged files print on both streams
+            quiet = contextlib.redirect_stdout(io.StringIO())
+            with quiet_decoders(), quiet, OpenEXR.File(str(path), separate_channels=True, header_only=header) as file:
+                if header:
+                    return [_exr_size(part.header) for part in file.parts]
+                return [(name, channel.pixels) for name, channel in file.channels().items()]
+        except Exception as error:  # RuntimeError, ValueError, MemoryError, ...
+            raise ValueError(f"{path}: expected an OpenEXR file, got a damaged or foreign one") from error
+
+    sizes = read(header=True)
+    for height, width, _ in sizes:
+        expect_pixels(path, height, width, MOST_PIXELS if most is None else most)
+    expect_bytes(path, sum(size for *_, size in sizes), bytes_of_archive(path.stat().st_size))
+    channels = dict(read(header=False))
     return channels[_depth_channel(path, channels)]
+
+
+def _exr_size(header: Mapping[str, Any]) -> tuple[int, int, int]:
+    """Return height, width and bytes in memory of a part's channels, or of its tiles if those are larger."""
+    (left, top), (right, bottom) = (corner.astype(int).tolist() for corner in header["dataWindow"])
+    tile = header.get("tiles")
+    height, width = max(0, bottom - top + 1), max(0, right - left + 1)
+    pixels = max(height * width, 0 if tile is None else int(tile.xSize) * int(tile.ySize))
+    return height, width, 4 * len(header["channels"]) * pixels
 
 
 def _depth_channel(path: Path, channels: Mapping[str, np.ndarray]) -> str:

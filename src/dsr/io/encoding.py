@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from dsr.geometry.camera import Camera, RangeType, from_range, to_range
+from dsr.sample import FARTHEST, NEAREST
 
 _MIN_MEDIAN, _MAX_MEDIAN = 0.05, 80.0
 """Range of plausible medians in metres; a unit that gives another median is not assumed."""
@@ -190,7 +191,10 @@ def guess_unit(name: str, values: np.ndarray, holes: np.ndarray) -> tuple[float,
 
 
 def decode(values: np.ndarray, holes: np.ndarray, encoding: Encoding, camera: Camera) -> Tensor:
-    """Return orthogonal depth in metres, (1, h, w) float32, NaN in holes.
+    """Return orthogonal depth in metres, (1, h, w) float32, NaN in holes and where a distance is none.
+
+    That is what lies beyond :data:`dsr.sample.NEAREST` and :data:`dsr.sample.FARTHEST`: the sky of renderings, which
+    Blender writes as 1e10 m, and disparities of 0.
 
     Args:
         values: (h, w) stored values.
@@ -200,7 +204,8 @@ def decode(values: np.ndarray, holes: np.ndarray, encoding: Encoding, camera: Ca
 
     """
     known = np.where(holes, np.nan, values.astype(np.float64)) * encoding.unit
-    return from_range(torch.from_numpy(known)[None], camera, encoding.range_type).float()
+    depth = from_range(torch.from_numpy(known)[None], camera, encoding.range_type)
+    return depth.masked_fill((depth < NEAREST) | (depth > FARTHEST), torch.nan).float()
 
 
 def encode(depth: Tensor, encoding: Encoding, camera: Camera) -> tuple[np.ndarray, int]:

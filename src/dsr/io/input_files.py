@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 from torch import Tensor
 
+from dsr.data.formats.decoding import decode_pixels
 from dsr.utils.files import array_headers, read_arrays, replacing
 
 INPUT = "input.npz"
@@ -74,10 +75,7 @@ def to_jpeg(pixels: np.ndarray, longest: int, quality: int) -> bytes:
 
 def _decode(path: Path, content: np.ndarray) -> np.ndarray:
     """Decode the photo."""
-    try:
-        picture = cv2.imdecode(content, cv2.IMREAD_COLOR)
-    except cv2.error as error:
-        raise ValueError(f"{path}: expected the bytes of a JPEG as photo, got something else") from error
+    picture = decode_pixels(path, content.tobytes(), cv2.IMREAD_COLOR, LONGEST**2)
     if picture is None:
         raise ValueError(f"{path}: expected the bytes of a JPEG as photo, got something else")
     return picture[..., ::-1]

@@ -22,6 +22,8 @@ from dsr.io.pairs import Pair
 from dsr.io.photos import Size, read_photo, same_aspect
 from dsr.io.rigs import RigFiles, read_rig, to_photo
 from dsr.io.units import FolderUnits, read_values_of
+from dsr.sample import FARTHEST, NEAREST
+from dsr.utils.limits import pixels_beside
 
 _DISPARITY_WORDS = frozenset({"disparity", "disp"})
 
@@ -124,8 +126,7 @@ def read_picture(pair: Pair, reading: Reading, units: FolderUnits | None = None)
     encoding = Encoding(_suffix(pair), str(stored.dtype), unit, mark, range_type)
     of_depth = camera.rescale(size_lr[1], size_lr[0]) if rig is None else rig.camera
     depth_lr = decode(stored, holes, encoding, of_depth)
-    if not bool(depth_lr.isfinite().any()):
-        raise ValueError(f"{pair.depth}: expected at least one disparity above 0, got none")
+    hole_assumptions += _expect_distances(pair.depth, depth_lr, holes, range_type)
     rgb = torch.from_numpy(np.ascontiguousarray(pixels.transpose(2, 0, 1))).float() / 255
     all_assumptions = (
         *assumptions,
@@ -140,6 +141,19 @@ def read_picture(pair: Pair, reading: Reading, units: FolderUnits | None = None)
         depth_lr, warped = to_photo(depth_lr, rig, camera)
         all_assumptions, confidence = (*all_assumptions, warped), None
     return Picture(rgb, depth_lr, camera, encoding, all_assumptions, geometry.pose, confidence)
+
+
+def _expect_distances(path: Path, depth_lr: Tensor, holes: np.ndarray, range_type: RangeType) -> list[Assumption]:
+    """Return a note on values that became holes because they are no distances, after checking that some are."""
+    lost = float((depth_lr.isnan()[0].numpy() & ~holes).mean())
+    if not bool(depth_lr.isfinite().any()):
+        what = "disparity above 0" if range_type == "disparity" else f"depth of {NEAREST:g} to {FARTHEST:g} m"
+        raise ValueError(f"{path}: expected at least one {what}, got none")
+    if not lost or range_type == "disparity":
+        return []
+    return [
+        Assumption(f"depths nearer than {NEAREST:g} m or farther than {FARTHEST:g} m count as holes", f"{lost:.1%}")
+    ]
 
 
 def _photo(pair: Pair, size_lr: Size) -> tuple[np.ndarray, list[Assumption]]:
@@ -226,7 +240,7 @@ def _camera(
 
 def _mask(path: Path, size: Size) -> np.ndarray:
     """Return the valid mask in a file, (h, w) bool."""
-    mask = read_mask(path)
+    mask = read_mask(path, pixels_beside(*size))
     if mask.shape != size:
         raise ValueError(
             f"{path}: expected a mask of the depth map's {size[1]} x {size[0]} pixels (width x height), "

@@ -24,6 +24,7 @@ from dsr.io.pairs import (
     make_names_unique,
     match_pairs,
 )
+from dsr.utils.limits import MOST_TABLE, read_limited
 
 _DEPTH_LR = re.compile(r"(depth|disparity)_lr(\d+)")
 _TUM_UNIT = 1 / 5000
@@ -118,7 +119,7 @@ def _tum(folder: Path) -> PairingResult:
 def _timed(path: Path) -> dict[Path, float]:
     """Return the files in a list of TUM RGB-D, with their times in seconds."""
     times: dict[Path, float] = {}
-    for number, line in enumerate(path.read_text(encoding="utf-8", errors="replace").splitlines(), 1):
+    for number, line in enumerate(read_limited(path, MOST_TABLE).decode("utf-8", "replace").splitlines(), 1):
         words = line.split()
         if not words or words[0].startswith("#"):
             continue

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -63,9 +64,11 @@ def _exif(photo: Path) -> dict[int, Any]:
     from PIL import Image  # noqa: PLC0415 - it takes its time to import
 
     try:
-        with Image.open(photo) as image:
-            exif = image.getexif()
-            return {**dict(exif), **exif.get_ifd(_EXIF_IFD)}
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of data that are damaged
+            with Image.open(photo) as image:
+                exif = image.getexif()
+                return {**dict(exif), **exif.get_ifd(_EXIF_IFD)}
     except Exception:  # damaged data are ignored
         return {}
 

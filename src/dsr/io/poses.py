@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import re
 from collections.abc import Mapping, Sequence
@@ -14,6 +13,8 @@ import numpy as np
 from dsr.geometry.poses import Matrix, as_rigid, from_quaternion
 from dsr.io.names import time_of
 from dsr.io.pairs import Pair
+from dsr.utils.limits import read_limited
+from dsr.utils.parsing import parse_json
 
 _LARGEST_FILE = 256 << 20
 _MAX_GAP = 0.02
@@ -145,9 +146,7 @@ def _text(path: Path) -> str:
     """Return the text of a file of moderate size."""
     if not path.is_file():
         raise ValueError(f"{path}: expected a file, there is none")
-    if path.stat().st_size > _LARGEST_FILE:
-        raise ValueError(f"{path}: expected a text file, got {path.stat().st_size} bytes")
-    return path.read_text(encoding="utf-8", errors="replace")
+    return read_limited(path, _LARGEST_FILE).decode(errors="replace")
 
 
 def _numbers(path: Path, text: str) -> list[list[float]]:
@@ -167,8 +166,8 @@ def _numbers(path: Path, text: str) -> list[list[float]]:
 def _matrix_of_json(path: Path, text: str) -> list[list[float]]:
     """Return the nested lists that JSON holds."""
     try:
-        content = json.loads(text)
-    except (ValueError, RecursionError):
+        content = parse_json(text)
+    except ValueError:
         raise ValueError(f"{path}: expected JSON or rows of numbers, got something else") from None
     if isinstance(content, dict):
         lists = [value for value in content.values() if isinstance(value, list)]

@@ -7,9 +7,11 @@ from pathlib import Path
 
 import numpy as np
 
+from dsr.data.formats.decoding import pixels_in_header
 from dsr.io.depth_files import read_depth_file
 from dsr.io.encoding import Assumption, find_holes, guess_unit
 from dsr.io.pairs import Pair
+from dsr.utils.limits import pixels_beside
 
 Kind = tuple[Path, str, str]
 """Folder, suffix and type of value: maps alike in them have one unit."""
@@ -74,7 +76,8 @@ def read_values_of(pair: Pair) -> np.ndarray:
     """
     if pair.capture is not None and pair.capture.depth is not None:
         return pair.capture.depth.read()
-    return read_depth_file(pair.depth)
+    photo = pixels_in_header(pair.rgb)
+    return read_depth_file(pair.depth, None if photo is None else pixels_beside(*photo))
 
 
 def _kind(pair: Pair, stored: np.ndarray) -> Kind:

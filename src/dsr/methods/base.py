@@ -124,6 +124,21 @@ class Iterative(Protocol):
     history: list[dict[str, float]]
 
 
+def expect_some_depth(depth: Tensor, name: str) -> None:
+    """Check that a result has a depth; values that are not finite and positive are holes, as metrics and files have it.
+
+    Args:
+        depth: (1, H, W) in metres.
+        name: of the method, for the message.
+
+    Raises:
+        ValueError: every pixel is a hole.
+
+    """
+    if not bool((depth.isfinite() & (depth > 0)).any()):
+        raise ValueError(f"{name} gave no finite positive depth in any of the {depth.numel()} pixels")
+
+
 def whole_scale(sample: DepthSample) -> int:
     """Return the scale of a sample for a method that needs a whole one.
 

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import yaml
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from dsr.methods.base import Upsampler
@@ -248,14 +248,19 @@ def _read_file(group: str, name: str, places: Sequence[Path], above: tuple[str, 
         (place / group / f"{name}.yaml" for place in places if (place / group / f"{name}.yaml").is_file()), None
     )
     if path is None or name in above:
-        raise ConfigError(f"{group}: expected a file {name}.yaml that {above[-1]}.yaml begins with")
+        wanted = f"a file {name}.yaml that {above[-1]}.yaml begins with" if above else f"a readable file {name}.yaml"
+        raise ConfigError(f"{group}: expected {wanted}")
     try:
         own = OmegaConf.load(path)
-    except (OSError, yaml.YAMLError, UnicodeDecodeError) as error:
+    except (OSError, yaml.YAMLError, ValueError, RecursionError) as error:
         raise ConfigError(f"{path}: expected a readable YAML file, got {type(error).__name__}") from error
     if not isinstance(own, DictConfig):
         raise ConfigError(f"{path}: expected keys and values")
-    defaults = [str(each) for each in own.pop("defaults", [])]
+    listed = own.pop("defaults", None)
+    listed = ListConfig([]) if listed is None else listed
+    if not isinstance(listed, ListConfig):
+        raise ConfigError(f"{path}: defaults: expected a list of names, got {listed!r:.60}")
+    defaults = [str(each) for each in listed]
     parts = [
         own if each == "_self_" else _read_file(group, each, places, (*above, name))
         for each in (defaults if "_self_" in defaults else [*defaults, "_self_"])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
@@ -9,6 +10,7 @@ BEFORE_THE_PAPER = 0
 """The position of metrics that stand before those of the paper's tables."""
 AFTER_THE_PAPER = 100
 """The position of metrics that the paper's tables do not have."""
+_MOST_DIGITS = 20
 HEADLINES = ("", "max", "min")
 """Variants of the value that stands for an image: without lights, or the worst of four lights (the smallest value where
 higher is better)."""
@@ -27,7 +29,7 @@ class MetricFormat:
         position: place among the columns of a table, from the left; None for a metric that is only in ``scores.csv``.
 
     Raises:
-        ValueError: ``factor`` is not positive, or ``digits`` is negative.
+        ValueError: ``factor`` is not positive and finite, or ``digits`` is out of range.
 
     """
 
@@ -40,10 +42,10 @@ class MetricFormat:
 
     def __post_init__(self) -> None:
         """Check the values."""
-        if not self.factor > 0:
+        if not 0 < self.factor < math.inf:
             raise ValueError(f"{self.heading}: factor: expected a positive number, got {self.factor}")
-        if self.digits < 0:
-            raise ValueError(f"{self.heading}: digits: expected 0 or more, got {self.digits}")
+        if not 0 <= self.digits <= _MOST_DIGITS:
+            raise ValueError(f"{self.heading}: digits: expected 0 to {_MOST_DIGITS}, got {self.digits}")
 
     def text(self, value: float) -> str:
         """Return a shown value with its digits."""

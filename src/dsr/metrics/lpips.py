@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import http.client
 import socket
+import warnings
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -18,6 +19,7 @@ from torch import Tensor, nn
 from torch.nn.utils import skip_init
 
 from dsr.metrics.functional import SurfacePair
+from dsr.utils.limits import expect_stored
 
 TRUNK_FILE = "alexnet-owt-7be5be79.pth"
 TRUNK_URL = f"https://download.pytorch.org/models/{TRUNK_FILE}"
@@ -171,7 +173,10 @@ def load_lpips(configured: Path | None = None) -> LPIPS:
     """
     path = find_trunk(configured)
     try:
-        trunk = torch.load(path, map_location="cpu", weights_only=True)
+        expect_stored(path)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # on files that it then refuses
+            trunk = torch.load(path, map_location="cpu", weights_only=True)
         if not isinstance(trunk, dict):
             raise ValueError(f"expected a state dict, got {type(trunk).__name__}")
         return LPIPS(trunk)

@@ -214,8 +214,12 @@ def _head(figure: Figure, count: int, colours: Mapping[str, str], *, has_referen
         Line2D([], [], marker="o", linestyle="", markersize=4, color=each) for each in colours.values()
     ]
     columns = max(1, int(width / (0.45 + 0.075 * max(map(len, colours), default=0))))
-    figure.legend(handles, list(colours), loc="upper left", bbox_to_anchor=(0.6 / width - 0.01, 1 - 0.42 / height),
-                  ncols=min(columns, len(handles)), frameon=False, handletextpad=0.1, columnspacing=1.2)  # fmt: skip
+    legend = figure.legend(
+        handles, list(colours), loc="upper left", bbox_to_anchor=(0.6 / width - 0.01, 1 - 0.42 / height),
+        ncols=min(columns, len(handles)), frameon=False, handletextpad=0.1, columnspacing=1.2,
+    )  # fmt: skip
+    for name in legend.get_texts():
+        name.set_parse_math(False)
 
 
 def _ranking(ranking: pd.DataFrame, count: int) -> Figure:

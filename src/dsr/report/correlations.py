@@ -16,6 +16,7 @@ from dsr.evaluation.results import Results
 from dsr.metrics.formats import HEADLINES
 from dsr.report.markup import MISSING, aligned, escaped
 from dsr.utils.files import replacing, write_text
+from dsr.utils.tables import guarded
 
 Kind = Literal["pearson", "spearman"]
 KINDS: tuple[Kind, ...] = ("pearson", "spearman")
@@ -112,10 +113,10 @@ def write_correlations(folder: Path, results: Results) -> list[Path]:
     for name, table in tables.items():
         paths.append(folder / f"{name}.csv")
         with replacing(paths[-1]) as temporary:
-            table.to_csv(temporary, index_label="metric")
+            guarded(table).to_csv(temporary, index_label="metric")
     paths.append(folder / "with_lpips.csv")
     with replacing(paths[-1]) as temporary:
-        ranking.to_csv(temporary, index=False)
+        guarded(ranking).to_csv(temporary, index=False)
     paths.append(folder / "with_lpips.md")
     write_text(paths[-1], _ranking_text(ranking, len(matrix)))
     return paths

@@ -6,8 +6,6 @@ number is which scene.
 
 from __future__ import annotations
 
-import shutil
-import tempfile
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +21,7 @@ from dsr.evaluation.run_files import read_run
 from dsr.geometry.shading import LIGHT_NAMES, render
 from dsr.metrics.formats import HEADLINES
 from dsr.sample import DepthSample
+from dsr.utils.temporary import temporary_folder
 from dsr.viz.panels import colours, normals_seen_by, reduced
 
 WORST = "worst of four lights"
@@ -47,8 +46,7 @@ def save_dashboard(folder: Path) -> None:
 
     """
     run = read_run(folder)
-    temporary = Path(tempfile.mkdtemp(prefix=".tensorboard-", dir=folder))
-    try:
+    with temporary_folder(folder, "tensorboard") as temporary:
         with SummaryWriter(temporary) as writer:
             _write_scores(writer, run)
             for number, scene in enumerate(run.scenes):
@@ -59,8 +57,6 @@ def save_dashboard(folder: Path) -> None:
             old.unlink()
         for new in temporary.glob(_EVENTS):
             new.replace(folder / new.name)
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
 
 
 def _write_scores(writer: SummaryWriter, run: Run) -> None:

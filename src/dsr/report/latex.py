@@ -136,6 +136,9 @@ def _rows(table: PaperTable, group: Group, columns: Sequence[Column], *, publish
     for row in shown:
         cells = [_beside(c, row) if published else _STYLE.text(c, row.cells.get(c.key), row.seeds) for c in columns]
         seeds = [str(row.seeds)] if table.seeded and not published else []
+        title = (
+            f"{{}}{title}" if title.startswith(("[", "*")) else title
+        )  # else it would be an option of the rule before
         yield " & ".join([title, latex_text(row.label), *seeds, *cells]) + " \\\\"
         title = ""
     for name, values in group.paper_only.items() if published and compared else ():

@@ -13,6 +13,7 @@ from dsr.report.latex import to_document, to_latex
 from dsr.report.paper_tables import build_tables
 from dsr.report.table_parts import STAR_NOTE, Column, Group, PaperTable, Row, Style
 from dsr.utils.files import write_text
+from dsr.utils.tables import guarded
 
 __all__ = ["aligned", "to_csv", "to_latex", "to_markdown", "write_tables"]
 
@@ -55,7 +56,11 @@ def to_markdown(table: PaperTable) -> str:
     """Format a table as Markdown, followed by a comparison with the paper's values if there are any."""
     head = ["scene", "method", *(["seeds"] if table.seeded else []), *map(_heading, table.columns)]
     rows = [row for group in table.groups for row in _rows(table, group)]
-    parts = [f"## {escaped(table.title)}", aligned(head, rows, 2), "\n".join(f"- {note}" for note in table.notes)]
+    parts = [
+        f"## {escaped(table.title)}",
+        aligned(head, rows, 2),
+        "\n".join(f"- {escaped(note)}" for note in table.notes),
+    ]
     if table.has_published:
         columns = table.published_columns()
         rows = [row for group in table.groups for row in _compared(columns, group)]
@@ -88,7 +93,8 @@ def to_csv(table: PaperTable) -> str:
     frame = pd.DataFrame(rows)
     empty = [name for name in frame.columns[_FACTS_FROM:] if frame[name].isna().all()]
     counts = [name for name in frame.columns if name.endswith(("seeds", " scenes")) and name not in empty]
-    return frame.drop(columns=empty).astype(dict.fromkeys(counts, "Int64")).to_csv(index=False, lineterminator="\n")
+    frame = frame.drop(columns=empty).astype(dict.fromkeys(counts, "Int64"))
+    return guarded(frame).to_csv(index=False, lineterminator="\n")
 
 
 def aligned(head: Sequence[str], rows: Sequence[Sequence[str]], texts: int) -> str:
@@ -135,7 +141,7 @@ def _facts(column: Column, row: Row) -> Iterator[tuple[str, float | int | None]]
 
 
 def _heading(column: Column) -> str:
-    return f"{column.heading} ({column.unit})" if column.unit else column.heading
+    return escaped(f"{column.heading} ({column.unit})" if column.unit else column.heading)
 
 
 def _rows(table: PaperTable, group: Group) -> Iterator[list[str]]:

@@ -8,10 +8,15 @@ from typing import NamedTuple
 
 import pandas as pd
 
+from dsr.utils.limits import MOST_TABLE, expect_bytes
+from dsr.utils.tables import unguarded
+
 USER_COLUMNS = {"user_first": "User 1st", "user_second": "User 2nd", "user_top2": "User Top 2"}
 """The paper's columns: percentage of answers with a method as most similar, second most similar, or either."""
 _TEXTS = ("dataset", "scene", "downsampling", "label")
 _KEYS = (*_TEXTS, "scale")
+_COLUMNS = frozenset({*_KEYS, *(f"{column}{end}" for column in USER_COLUMNS for end in ("", "_low", "_high"))})
+"""What is read of a table."""
 _AVERAGE, _ALL = "average", "all"
 """Scene name of the study's own averages, and data set name of the average over all data sets."""
 
@@ -39,9 +44,14 @@ def read_study(path: Path) -> pd.DataFrame:
 
     """
     try:
-        study = pd.read_csv(path, dtype=dict.fromkeys(_TEXTS, str), keep_default_na=False, na_values=[""])
+        expect_bytes(path, path.stat().st_size, MOST_TABLE)
+        texts = dict.fromkeys(_TEXTS, str)
+        study = pd.read_csv(
+            path, dtype=texts, keep_default_na=False, na_values=[""], usecols=lambda name: name in _COLUMNS
+        )
     except (OSError, ValueError) as error:  # pandas raises subclasses of ValueError for damaged files
         raise ValueError(f"{path}: expected the table of dsr study collect, got {type(error).__name__}") from error
+    study = unguarded(study)
     check_study(study, str(path))
     return study
 

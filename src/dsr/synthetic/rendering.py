@@ -17,6 +17,7 @@ from platformdirs import user_cache_path
 from dsr.geometry.camera import Camera
 from dsr.sample import Scene
 from dsr.utils.files import read_arrays, replacing
+from dsr.utils.parsing import parse_json
 
 
 @dataclass(frozen=True)
@@ -48,7 +49,7 @@ def load_or_render(path: Path, make: Callable[[], Rendering]) -> Rendering:
     path = cache_directory() / path
     with contextlib.suppress(OSError, ValueError, KeyError, TypeError):  # missing or damaged
         kept = read_arrays(path)
-        return Rendering(kept["rgb"], kept["depth"], Camera(**json.loads(str(kept["camera"]))))
+        return Rendering(kept["rgb"], kept["depth"], Camera(**parse_json(str(kept["camera"]))))
     rendering = make()
     with contextlib.suppress(OSError), replacing(path) as temporary:
         camera = json.dumps(asdict(rendering.camera))

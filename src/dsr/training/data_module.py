@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import functools
 import itertools
 import math
+import os
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -21,6 +23,7 @@ from dsr.sample import Scene
 from dsr.training.degradation import Batch, Degradation, to_tensors
 from dsr.training.patches import Patches, check_patches
 from dsr.training.settings import PatchSettings
+from dsr.utils import interruption
 
 
 @dataclass(frozen=True)
@@ -198,6 +201,8 @@ class PatchData(lightning.LightningDataModule):
         stride = 1 if self.trainer is None else self.trainer.world_size
         numbers = _PatchNumbers(done * per_step, self._settings.batch, rank, stride)
         workers: dict[str, Any] = {"num_workers": self._settings.workers}
+        if self._settings.workers:
+            workers["worker_init_fn"] = functools.partial(_begin_worker, os.getpid())
         pin = torch.cuda.is_available()
         return DataLoader(self._load_patches().select(0, sys.maxsize), batch_sampler=numbers, pin_memory=pin, **workers)
 
@@ -264,6 +269,11 @@ class _PatchNumbers:
     def __iter__(self) -> Iterator[list[int]]:
         for start in itertools.count(self._first + self._rank * self._batch, self._stride * self._batch):
             yield list(range(start, start + self._batch))
+
+
+def _begin_worker(parent: int, _: int) -> None:
+    """Prepare a worker, the number of which is not needed; torch looks after the parent only every five seconds."""
+    interruption.end_with(parent)
 
 
 def _make_unique(name: str, names: Mapping[str, Any]) -> str:

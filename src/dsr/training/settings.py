@@ -8,6 +8,8 @@ from dataclasses import dataclass
 _MAX_DEPTH_SCALE = 3.0
 """Depth changes by a factor of exp(3) = 20 at most."""
 _MIN_SIZE = 16
+_LARGEST_RATE = 1e36
+"""A larger learning rate, divided by the correction of Adam's first step, is no float32 number."""
 
 
 @dataclass(frozen=True)
@@ -90,7 +92,11 @@ class Schedule:
 
     def __post_init__(self) -> None:
         """Check the values."""
-        for name in ("steps", "learning_rate", "clip"):
+        if not 0 < self.learning_rate <= _LARGEST_RATE:
+            raise ValueError(
+                f"learning_rate: expected a positive number up to {_LARGEST_RATE:g}, got {self.learning_rate}"
+            )
+        for name in ("steps", "clip"):
             if not 0 < getattr(self, name) < math.inf:
                 raise ValueError(f"{name}: expected a positive number, got {getattr(self, name)}")
         for name in ("warmup", "weight_decay"):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from codecs import BOM_UTF8
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
@@ -13,8 +14,11 @@ from typing import Annotated, Any
 from pydantic import AfterValidator, BaseModel, BeforeValidator, Field, ValidationError, ValidationInfo
 
 from dsr.user_study.key import PAGE_VERSION, Key
-from dsr.utils.validation import describe
+from dsr.utils.limits import read_limited
+from dsr.utils.validation import Number, Whole, describe
 
+_LONGEST = 1e12
+"""Maximum time of an answer in milliseconds, 30 years."""
 _LARGEST = 10_000_000
 """Maximum file size, bytes; an answer file has a few thousand."""
 
@@ -68,7 +72,7 @@ def files_of(paths: Iterable[Path]) -> list[Path]:
     found: dict[Path, Path] = {}
     for path in paths:
         for file in sorted(path.rglob("*.json")) if path.is_dir() else [path]:
-            found.setdefault(file.resolve(), file)
+            found.setdefault(Path(os.path.realpath(file)), file)  # unlike resolve, it takes loops
     if not found:
         raise ValueError("answers: expected files that the page's last screen saved, found none")
     return list(found.values())
@@ -138,14 +142,14 @@ class _Trial(BaseModel, strict=True, extra="allow"):
     order: list[str]
     first: str | None
     second: str | None
-    ms: Annotated[float, Field(ge=0, allow_inf_nan=False)]
+    ms: Annotated[Number, Field(ge=0, le=_LONGEST)]
 
 
 class _Stored(BaseModel, strict=True):
     """Content of an answer file; ``finished`` is None until the last scene is answered."""
 
     study: Annotated[str, AfterValidator(_expect)]
-    page: Annotated[int, AfterValidator(_expect)]
+    page: Annotated[Whole, AfterValidator(_expect)]
     participant: Annotated[str, Field(min_length=1)]
     finished: Annotated[datetime, BeforeValidator(_time)] | None
     trials: list[_Trial]
@@ -156,7 +160,7 @@ def _read(file: Path, key: Key) -> _Stored:
     try:
         if file.stat().st_size > _LARGEST:
             raise ValueError(f"{file}: expected a file of answers, got one of {file.stat().st_size / 1e6:.0f} MB")
-        content = file.read_bytes().removeprefix(BOM_UTF8)
+        content = read_limited(file, _LARGEST).removeprefix(BOM_UTF8)
         return _Stored.model_validate_json(content, context={"study": key.study, "page": PAGE_VERSION})
     except OSError as error:
         raise ValueError(f"{file}: expected a file of answers, got {error.strerror or error}") from error

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Annotated
 
-from pydantic import TypeAdapter, ValidationError
+from pydantic import BaseModel, Field, ValidationError
 
 from dsr.utils.files import write_text
-from dsr.utils.validation import describe
+from dsr.utils.limits import read_limited
+from dsr.utils.ratios import as_ratio
+from dsr.utils.validation import Number, Whole, describe
 
 PAGE_VERSION = 1
 """Version of the page and of the answer files that it writes."""
@@ -45,7 +48,7 @@ class Trial:
 
     dataset: str
     scene: str
-    scale: int | float  # as two types, so that a stored whole number is read as one
+    scale: float
     downsampling: str
     candidates: Mapping[str, Candidate]
 
@@ -83,7 +86,7 @@ def read_key(path: Path) -> Key:
 
     """
     try:
-        stored = _KEY.validate_json(path.read_bytes())
+        stored = _StoredKey.model_validate_json(read_limited(path))
     except FileNotFoundError:
         raise ValueError(f"{path}: expected the key of a study that dsr study build made, there is none") from None
     except ValidationError as error:
@@ -92,14 +95,29 @@ def read_key(path: Path) -> Key:
         raise ValueError(f"{path}: expected the key of a study, got {error.strerror or error}") from error
     if stored.page != PAGE_VERSION:
         raise ValueError(f"{path}: expected the key of a study of version {PAGE_VERSION}, got {stored.page!r}")
-    return Key(**{each.name: getattr(stored, each.name) for each in fields(Key)})
+    trials = {
+        name: Trial(each.dataset, each.scene, as_ratio(each.scale), each.downsampling, each.candidates)
+        for name, each in stored.trials.items()
+    }
+    return Key(stored.study, stored.light, stored.scenes_per_person, stored.repeat, trials)
 
 
-@dataclass(frozen=True)
-class _StoredKey(Key):
-    """A key with the version stored in its file."""
+class _StoredTrial(BaseModel, strict=True):
+    """A :class:`Trial` as it is stored."""
 
-    page: int
+    dataset: str
+    scene: str
+    scale: Annotated[Number, Field(ge=1, le=1e6)]
+    downsampling: str
+    candidates: Annotated[dict[str, Candidate], Field(min_length=2)]
 
 
-_KEY = TypeAdapter(_StoredKey)
+class _StoredKey(BaseModel, strict=True):
+    """A :class:`Key` as it is stored, with the version of its page."""
+
+    page: Whole
+    study: str
+    light: str
+    scenes_per_person: Annotated[Whole, Field(ge=1, le=1e6)]
+    repeat: Annotated[Whole, Field(ge=0, le=1e6)]
+    trials: dict[str, _StoredTrial]

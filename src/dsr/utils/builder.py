@@ -8,6 +8,7 @@ begins with an argument's name (``sharpness: expected ...``) is shown with the k
 
 from __future__ import annotations
 
+import dataclasses
 import importlib
 import inspect
 import types
@@ -48,10 +49,11 @@ def build(group: str, node: Mapping[str, Any], given: Mapping[str, Any] | None =
         if key not in own:
             accepted = ", ".join(own) or "none"
             raise ConfigError(f"{group}.{key}: unknown key; {group}={node.get('name')} takes {accepted}")
+        expect_usable(f"{group}.{key}", value)
         if value == _MISSING:
             raise ConfigError(f"{group}.{key}: {group}={node.get('name')} needs it: {group}.{key}=...")
         if key in hints and not _fits(value, hints[key]):
-            raise ConfigError(f"{group}.{key}: expected {_describe(hints[key])}, got {value!r}")
+            raise ConfigError(f"{group}.{key}: expected {_describe(hints[key])}, got {value!r:.60}")
     try:
         return target(**arguments, **given)
     except (ValueError, OSError) as error:
@@ -67,6 +69,55 @@ def trait(group: str, node: Mapping[str, Any], name: str) -> Any:
     """Return an attribute of the class that a group's target is or returns, such as ``optimises``; None without it."""
     target = load_target(group, node)
     return getattr(target if inspect.isclass(target) else get_type_hints(target).get("return"), name, None)
+
+
+def check_types(kind: type, values: Mapping[str, Any], place: str = "") -> None:
+    """Check values for the fields of a dataclass that have a plain type.
+
+    Args:
+        kind: the dataclass; fields that are dataclasses are left out.
+        values: by name, as a configuration has them.
+        place: what stands before the names in messages, such as ``trainer.``.
+
+    Raises:
+        ConfigError: a value is of another type than its field, or an empty text.
+
+    """
+    hints = get_type_hints(kind)
+    for name, value in values.items():
+        if dataclasses.is_dataclass(hints[name]) or value == _MISSING:
+            continue
+        expect_usable(f"{place}{name}", value)
+        if not _fits(value, hints[name]):
+            raise ConfigError(f"{place}{name}: expected {_describe(hints[name])}, got {value!r:.60}")
+
+
+def expect_usable(key: str, value: Any) -> None:
+    """Refuse a text without characters, which as a path would be the current directory, and a number beyond 64 bits.
+
+    Raises:
+        ConfigError: the value is such a text or number.
+
+    """
+    if isinstance(value, str) and (not value.strip() or "\0" in value):
+        raise ConfigError(f"{key}: expected a text of one character or more, or null for none; got {value!r:.60}")
+    if isinstance(value, str) and value.startswith("~"):
+        expand_home(key, value)
+    if isinstance(value, int) and not -(2**63) <= value < 2**63:
+        raise ConfigError(f"{key}: expected a number that 64 bits hold, got {value!r:.60}")
+
+
+def expand_home(key: str, path: str) -> Path:
+    """Return a path with ~ replaced by the user's directory.
+
+    Raises:
+        ConfigError: there is no such user.
+
+    """
+    try:
+        return Path(path).expanduser()
+    except RuntimeError as error:
+        raise ConfigError(f"{key}: expected a path, got {path!r:.60} ({error})") from error
 
 
 def with_key(message: str, group: str, parameters: Collection[str]) -> str:
@@ -88,6 +139,8 @@ def load_target(group: str, node: Mapping[str, Any]) -> Any:
         ConfigError: it cannot be imported, or is not a class or function.
 
     """
+    if not isinstance(node, Mapping):
+        raise ConfigError(f"{group}: expected keys, name and target among them, got {node!r:.60}")
     path = node.get("target")
     target = load_object(f"{group}.target", path, "a class or function")
     if not callable(target):
@@ -127,8 +180,8 @@ def _fits(value: Any, hint: Any) -> bool:
         return isinstance(value, list) and all(_fits(item, get_args(hint)[0]) for item in value)
     if origin is not None and issubclass(origin, Mapping):
         return isinstance(value, Mapping) and all(_fits(item, get_args(hint)[1]) for item in value.values())
-    accepted: Any = {float: (int, float), Path: str}.get(hint, hint)
-    return isinstance(value, accepted) and (hint is bool or not isinstance(value, bool))
+    accepted: Any = {float: (int, float), Path: str, Any: object}.get(hint, hint)
+    return isinstance(value, accepted) and (hint in (bool, Any) or not isinstance(value, bool))
 
 
 def _describe(hint: Any) -> str:
@@ -144,5 +197,6 @@ def _describe(hint: Any) -> str:
         return f"a list of {_describe(get_args(hint)[0])}"
     if origin is not None and issubclass(origin, Mapping):
         return f"keys, each with {_describe(get_args(hint)[1])}"
-    types_of = {float: "a number", int: "a whole number", str: "text", bool: "true or false", type(None): "null"}
+    types_of = {float: "a number", int: "a whole number", str: "text", bool: "true or false", Any: "a value",
+                type(None): "null"}  # fmt: skip
     return types_of.get(hint, getattr(hint, "__name__", str(hint)))

@@ -27,8 +27,15 @@ def config_directories(more: Sequence[Path] = ()) -> tuple[Path, ...]:
     if own is None:
         raise ValueError(f"{_PLACES[0]}: expected the configuration files of dsr; the installation is incomplete")
     for directory in more:
-        if not directory.is_dir():
+        try:
+            there = directory.is_dir()
+        except OSError:  # such as a name that is too long
+            there = False
+        if not there:
             raise ValueError(f"--config-dir: expected a directory, got {directory}")
+        for path in directory.glob("*/*.yaml"):
+            if path.exists() and not path.is_file():  # a pipe would be waited for
+                raise ValueError(f"{path}: expected a file, got something else")
     return (own, *more)
 
 

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import contextlib
+import errno
+import io
 import sys
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
+from unicodedata import category
 
 from rich.console import Console
 from rich.live import Live
@@ -18,7 +21,12 @@ from dsr.utils.progress import Item, Progress, Unit
 from dsr.utils.units import clock, megabytes
 
 USAGE_ERROR = 2
-INTERRUPTED = 130
+_OUTPUT = {errno.ENOSPC, errno.EPIPE}
+"""Errors without a file's name that are those of printing, as a file without space raises FullDiskError."""
+_LONGEST = 1000
+"""Most characters of an error's line."""
+_TURNING = "\u202a\u202b\u202c\u202d\u202e\u2066\u2067\u2068\u2069"
+"""Characters that turn the direction of text, so that the name of a file reads as another."""
 _LOG_WIDTH = 110
 """Columns where the output is not a terminal."""
 _FIRST_LINE, _NEXT_LINE = 3.0, 10.0
@@ -32,24 +40,48 @@ terminal."""
 
 
 def open_console() -> Console:
-    """Return a console on stdout, wide enough for tables if that is not a terminal."""
+    """Return a console on stdout, wide enough for tables if that is not a terminal.
+
+    What stdout cannot encode, such as the name of a file that is no text, is shown with escapes.
+    """
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="backslashreplace")
     console = Console()
     return console if console.is_terminal else Console(width=_LOG_WIDTH)
 
 
 def show(console: Console, line: str) -> None:
     """Show a line without markup or highlighting."""
-    console.print(line, markup=False, highlight=False, soft_wrap=True)
+    console.print(printable(line), markup=False, highlight=False, soft_wrap=True)
 
 
 def print_error(message: str) -> None:
-    """Print one line on stderr."""
-    print(f"error: {' '.join(message.split())}", file=sys.stderr, flush=True)  # noqa: T201
+    """Print one line on stderr; of a very long message the beginning, which names the file or key, and the end."""
+    text = printable(shorten(" ".join(message.split())))
+    print(f"error: {text}", file=sys.stderr, flush=True)  # noqa: T201
+
+
+def shorten(text: str, most: int = _LONGEST) -> str:
+    """Return a text of at most ``most`` characters: three quarters from its beginning and the rest from its end."""
+    if len(text) <= most:
+        return text
+    first = 3 * most // 4
+    return f"{text[:first]} ... {text[len(text) - (most - first - 5) :]}"
+
+
+def printable(text: str) -> str:
+    """Return a text without the characters that control a terminal or turn text, which names of files may have."""
+    return "".join(
+        "\N{REPLACEMENT CHARACTER}" if (category(each) == "Cc" and each != "\n") or each in _TURNING else each
+        for each in text
+    )
 
 
 def one_line(error: BaseException) -> str:
     """Return an error's message on one line."""
-    return " ".join(str(error).split()) or type(error).__name__
+    if isinstance(error, OSError) and error.filename is None and error.errno in _OUTPUT:
+        return f"standard output: expected to be writable, got: {error.strerror}"
+    return shorten(printable(" ".join(str(error).split()))) or type(error).__name__
 
 
 class ConsoleProgress(Progress):
@@ -139,8 +171,9 @@ class ConsoleProgress(Progress):
         ended = threading.Event()
 
         def run() -> None:
-            while not ended.wait(_TICK):
-                self.tick()
+            with contextlib.suppress(OSError):  # the main thread meets a full disk, too
+                while not ended.wait(_TICK):
+                    self.tick()
 
         thread = threading.Thread(target=run, daemon=True)
         thread.start()

@@ -7,13 +7,20 @@ import importlib.util
 from collections.abc import Iterable
 from pathlib import Path
 
+from dsr.utils.limits import opened
+
 PACKAGE = Path(__file__).parents[1]
 """The folder of the package."""
 
 
 def file_hash(path: Path) -> str:
-    """Return the SHA-256 of a file."""
-    with path.open("rb") as file:
+    """Return the SHA-256 of a file.
+
+    Raises:
+        OSError: it cannot be read.
+
+    """
+    with opened(path) as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 

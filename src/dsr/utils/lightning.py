@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import csv
 import logging
-import signal
 import time
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
@@ -19,11 +18,14 @@ from lightning.pytorch.loggers import TensorBoardLogger
 from lightning.pytorch.utilities import rank_zero_only
 from torch.utils.tensorboard.summary import hparams
 
+from dsr.utils import interruption
+from dsr.utils.checkpoints import AtomicCheckpoints, CheckpointError, Resumed
 from dsr.utils.files import replacing
 from dsr.utils.progress import Progress, Task
+from dsr.utils.space import FullDiskError, space_for
+from dsr.utils.tables import guard
 
 IN_TABLE = ("RMSE_v", "DSSIM_v", "LPIPS_v", "BadPix_v_5", "Bumpiness_d", "RMSE_d")
-_SIGNALS = (signal.SIGINT, signal.SIGTERM)
 _LOG_EVERY = 10
 """Steps between two values of a training in TensorBoard's log."""
 _SECONDS_BETWEEN_LOSSES = 0.2
@@ -34,43 +36,6 @@ class Scored(Protocol):
     """A module that keeps the scores of its last validation: by set, by metric."""
 
     validation_scores: dict[str, dict[str, float]]
-
-
-class Interruption(Callback):
-    """Ends a training between two steps at Ctrl-C or SIGTERM, with a checkpoint of that step.
-
-    Args:
-        path: the checkpoint's path.
-
-    """
-
-    def __init__(self, path: Path) -> None:
-        self._path, self._requested = path, False
-        self._before: dict[int, Any] = {}
-
-    def on_train_start(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
-        """Install the signal handlers."""
-        with contextlib.suppress(ValueError):  # not in the main thread
-            self._before = {number: signal.signal(number, self._request) for number in _SIGNALS}
-
-    def on_train_batch_end(self, trainer: lightning.Trainer, *_: Any) -> None:
-        """Save and stop, if an interruption was requested and no gradient is being accumulated."""
-        if self._requested and trainer.fit_loop.batch_idx % trainer.accumulate_grad_batches == (
-            trainer.accumulate_grad_batches - 1
-        ):
-            save_checkpoint(trainer, self._path)
-            raise KeyboardInterrupt
-
-    def teardown(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule, stage: str) -> None:
-        """Restore the signal handlers."""
-        for number, handler in self._before.items():
-            signal.signal(number, handler)
-        self._before = {}
-
-    def _request(self, number: int, _: Any) -> None:
-        """Remember the first signal; the default handler applies to the second one."""
-        self._requested = True
-        signal.signal(number, signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL)
 
 
 class ValidationTable(Callback):
@@ -95,7 +60,7 @@ class ValidationTable(Callback):
         if self._path.is_file():
             with self._path.open(newline="", encoding="utf-8") as file:
                 before = list(csv.reader(file))[1:]
-        rows = [[str(step), kind, name, repr(value)]
+        rows = [[str(step), guard(kind), guard(name), repr(value)]
                 for kind, each in scored.validation_scores.items() for name, value in each.items()]  # fmt: skip
         with replacing(self._path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
             kept = (row for row in before if int(row[0]) < step)
@@ -237,18 +202,13 @@ def make_trainer(
             log_every_n_steps=min(_LOG_EVERY, interval),
             logger=logger,
             callbacks=[LastValidation(interval), *callbacks],
+            plugins=[AtomicCheckpoints()],
             enable_progress_bar=False,
             enable_model_summary=False,
             num_sanity_val_steps=0,
             use_distributed_sampler=False,
             **named,
         )
-
-
-def save_checkpoint(trainer: lightning.Trainer, path: Path) -> None:
-    """Write a checkpoint atomically."""
-    with replacing(path) as temporary:
-        trainer.save_checkpoint(temporary)
 
 
 def fit(
@@ -258,13 +218,28 @@ def fit(
     resume: Path | None = None,
     **named: Any,
 ) -> None:
-    """Train; an interruption raises KeyboardInterrupt."""
+    """Train.
+
+    Raises:
+        KeyboardInterrupt: the training was interrupted.
+        FullDiskError: there is no space for its log or a checkpoint.
+        CheckpointError: the checkpoint to go on from is damaged, or one of another training.
+
+    """
+    resumed = Resumed()
+    trainer.callbacks.append(resumed)  # type: ignore[attr-defined]
     try:
-        with without_chatter():
+        with without_chatter(), space_for(Path(trainer.log_dir or trainer.default_root_dir)):
             trainer.fit(module, data, ckpt_path=resume, weights_only=True, **named)
     except SystemExit:  # Lightning turns an interruption into an exit with code 1
         if not trainer.interrupted:
             raise
+    except Exception as error:
+        if resume is None or resumed.begun or isinstance(error, OSError | FullDiskError):
+            raise
+        raise CheckpointError(resume, error) from error
+    finally:
+        interruption.reinstall()  # Lightning ignores SIGINT after an interruption
     if trainer.interrupted:
         raise KeyboardInterrupt
 
@@ -301,7 +276,7 @@ def without_chatter() -> Iterator[None]:
             warnings.filterwarnings("ignore", ".*does not have many workers.*")
             warnings.filterwarnings("ignore", ".*smaller than the logging interval.*")
             warnings.filterwarnings("ignore", ".*sync_dist=True.*")  # metrics are the same on every device
-            for resumed in ("exists and is not empty", "that ended before the epoch ended"):
+            for resumed in ("exists and is not empty", "that ended before the epoch ended", "dirpath has changed"):
                 warnings.filterwarnings("ignore", f".*{resumed}.*")
             warnings.filterwarnings("ignore", ".*LeafSpec.*", FutureWarning)
             warnings.filterwarnings("ignore", ".*LeafSpec.*", DeprecationWarning)

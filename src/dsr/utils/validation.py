@@ -1,11 +1,23 @@
-"""Format errors of pydantic as one line: the key, the expected and the actual value."""
+"""Numbers of files for pydantic, and its errors as one line: the key, the expected and the actual value."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Iterable
+from typing import Annotated, Any
 
-from pydantic import ValidationError
+from pydantic import BeforeValidator, Field, ValidationError
+
+
+def _whole(value: Any) -> Any:
+    """Return a whole float, such as 640.0, as int and anything else as it is."""
+    return int(value) if isinstance(value, float) and value.is_integer() else value
+
+
+Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
+"""A finite number of a file; true, text, NaN and infinity are none."""
+Whole = Annotated[int, Field(strict=True, ge=-(2**63), lt=2**63), BeforeValidator(_whole)]
+"""A whole number of a file that 64 bits hold, which may be written as 640.0; true and text are none."""
 
 
 def describe(error: ValidationError, known: Iterable[str] = ()) -> str:

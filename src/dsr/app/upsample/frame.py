@@ -30,6 +30,7 @@ from dsr.io.inputs import Picture, read_picture
 from dsr.io.pairs import Pair
 from dsr.io.units import FolderUnits
 from dsr.methods.base import MapNoise, Surface
+from dsr.utils.parsing import readable
 from dsr.utils.progress import Progress
 from dsr.utils.versions import package_versions
 
@@ -189,7 +190,7 @@ def _write(job: _Job, picture: Picture, surface: Surface, planned: Plan, seconds
     """Write all parts and ``info.json``, and return notes for the user."""
     started = time.perf_counter()
     encoding = output_encoding(picture.encoding, job.request.depth_format)
-    title = f"{job.pair.name}, {planned.method} x{planned.scale}"
+    title = f"{readable(job.pair.name)}, {planned.method} x{planned.scale}"
     request = job.request
     files, facts, shapes = write_parts(job.target, picture, surface, request.wanted, encoding, title, request.limits)
     kept = job.earlier if job.earlier is not None and job.same else None

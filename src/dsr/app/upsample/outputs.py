@@ -26,7 +26,10 @@ from dsr.io.input_files import INPUT, write_input
 from dsr.io.inputs import Picture
 from dsr.io.scene_files.open3d import RGBD, write_rgbd
 from dsr.methods.base import Surface
-from dsr.utils.files import replacing, write_text
+from dsr.sample import FARTHEST, NEAREST
+from dsr.utils.files import open_array, replacing, write_text
+from dsr.utils.limits import read_limited
+from dsr.utils.parsing import parse_json
 from dsr.viz.before_after import write_before_after
 from dsr.viz.confidence import write_confidence
 
@@ -101,7 +104,7 @@ def read_previous_run(folder: Path) -> PreviousRun | None:
     if not path.is_file():
         return None
     try:
-        entries = json.loads(path.read_text(encoding="utf-8"))
+        entries = parse_json(read_limited(path), finite=False)
         noise = entries.get("noise")
         return PreviousRun(
             entries["complete"] is True,
@@ -111,7 +114,7 @@ def read_previous_run(folder: Path) -> PreviousRun | None:
             None if noise is None else dict(noise),
             {part: entries[part] for part in ("cloud", "mesh") if part in entries},
         )
-    except (ValueError, KeyError, TypeError, RecursionError) as error:
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise ValueError(f"{path}: expected a file of `dsr upsample`, got something else; take another -o") from error
 
 
@@ -257,11 +260,13 @@ def kept_surface(folder: Path, camera: Camera, *, errors: bool) -> Surface | Non
 
     """
     size = (camera.height, camera.width)
-    with contextlib.suppress(OSError, ValueError, EOFError, KeyError):
-        values = np.load(folder / METRES)
+    with contextlib.suppress(OSError, ValueError):
+        values = open_array(folder / METRES)
         if values.shape != size or values.dtype != np.float32:
             return None
-        depth = torch.from_numpy(values)[None]
+        depth = torch.from_numpy(np.array(values))[None]
+        if not bool((depth > 0).any()) or bool(((depth < NEAREST) | (depth > FARTHEST)).any()):
+            return None
         if not errors:
             return Surface(depth)
         expected = load_errors(folder / ERRORS)

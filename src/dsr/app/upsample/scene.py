@@ -8,17 +8,18 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from dsr.geometry.camera import Camera
+from dsr.app.upsample.outputs import INFO, METRES
+from dsr.app.upsample.stored import DEPTHS, read_camera, read_info
 from dsr.io.scene_files.frame import Frame, parse_pose
 from dsr.io.scene_files.nerfstudio import write_transforms
 from dsr.io.scene_files.open3d import RGBD, write_open3d
 from dsr.io.scene_files.rerun import write_rerun
 from dsr.io.scene_files.splatting import write_splatting
 from dsr.utils.files import write_text
+from dsr.utils.limits import read_limited
+from dsr.utils.parsing import parse_json
 
 _RECORD = "exports.json"
-_INFO = "info.json"
-_DEPTHS = ("depth_metres.npy", "depth.npy")
 _WRITERS: Mapping[str, tuple[str, Callable[[Path, Sequence[Frame]], list[Path]]]] = {
     "open3d": ("open3d", write_open3d),
     "nerfstudio": ("transforms.json", write_transforms),
@@ -81,7 +82,7 @@ def write_scene(output: Path, folders: Mapping[str, Path], parts: Sequence[str],
             continue
         stale = set(recorded.get(name, ())) - {file.relative_to(output).as_posix() for file in files}
         for old in stale:  # of frames that are no longer there
-            if old.split("/")[0] == name:
+            if old.split("/")[0] == name and ".." not in old.split("/"):
                 (output / old).unlink(missing_ok=True)
         recorded[name] = sorted(file.relative_to(output).as_posix() for file in files)
         write_text(output / _RECORD, json.dumps({"exports": recorded}, indent=2) + "\n")
@@ -98,13 +99,13 @@ def read_frame(name: str, folder: Path) -> Frame:
         ValueError: the folder is not complete, or the pose is none.
 
     """
-    path = folder / _INFO
-    entries = json.loads(path.read_text(encoding="utf-8"))
-    depth = next((folder / each for each in _DEPTHS if (folder / each).is_file()), None)
+    path = folder / INFO
+    info = read_info(path)
+    depth = next((folder / each for each in DEPTHS if (folder / each).is_file()), None)
     colour = folder / "rgbd" / RGBD[0]
     if depth is None or not colour.is_file():
-        raise ValueError(f"{folder}: expected {_DEPTHS[0]} and rgbd/{RGBD[0]} of this run, one is missing")
-    return Frame(name, Camera(**entries["camera"]), parse_pose(f"{path}: pose", entries.get("pose")), colour, depth)
+        raise ValueError(f"{folder}: expected {METRES} and rgbd/{RGBD[0]} of this run, one is missing")
+    return Frame(name, read_camera(path, info), parse_pose(f"{path}: pose", info.get("pose")), colour, depth)
 
 
 def expect_distinct(frames: Sequence[Frame]) -> None:
@@ -127,6 +128,10 @@ def _read_record(output: Path) -> dict[str, list[str]]:
     if not path.is_file():
         return {}
     try:
-        return dict(json.loads(path.read_text(encoding="utf-8"))["exports"])
+        exports = dict(parse_json(read_limited(path))["exports"])
+        lists = [files if isinstance(files, list) else [None] for files in exports.values()]
+        if not all(isinstance(file, str) for files in lists for file in files):
+            raise TypeError
+        return exports
     except (ValueError, KeyError, TypeError) as error:
         raise ValueError(f"{path}: expected a file of `dsr upsample`, got something else") from error

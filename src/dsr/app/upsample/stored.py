@@ -1,8 +1,7 @@
-"""Results of ``dsr upsample`` as they lie in folders, for looking at."""
+"""Results of ``dsr upsample`` as they lie in folders: read for looking at them, for a mesh, and for exports."""
 
 from __future__ import annotations
 
-import json
 import math
 import os
 import re
@@ -11,17 +10,23 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
 from dsr.app.upsample.limits import LARGEST_ERROR
 from dsr.app.upsample.outputs import ERRORS, INFO, METRES
 from dsr.evaluation.store import load_errors
 from dsr.geometry.camera import Camera
 from dsr.io.input_files import INPUT, read_input
-from dsr.utils.files import array_headers
+from dsr.sample import FARTHEST, NEAREST, expect_distances
+from dsr.utils.files import array_headers, open_array
+from dsr.utils.limits import read_limited
+from dsr.utils.parsing import is_number, parse_json
 from dsr.viewer.surfaces import ViewedResult
 
 _DEEPEST = 6
 """Folders below the given one in which results are looked for."""
+DEPTHS = (METRES, "depth.npy")
+"""The files that hold a result's depth in metres, the first that is there."""
 _LARGEST_INFO = 16 << 20
 
 
@@ -56,14 +61,14 @@ def read_result(folder: Path, name: str) -> ViewedResult:
         ValueError: the folder holds no complete result, or a file is damaged.
 
     """
-    info = _read_info(folder / INFO)
-    camera = _camera(folder / INFO, info)
-    depth = _read_depth(folder, camera)
+    info = read_info(folder / INFO)
+    camera = read_camera(folder / INFO, info)
+    depth = read_depth(folder, camera)
     said = info.get("assumptions")
     notes = [str(text) for text in said] if isinstance(said, list) else []
     errors: tuple[np.ndarray, np.ndarray] | None = None
     if (folder / ERRORS).is_file():
-        errors = _read_errors(folder / ERRORS, camera)
+        errors = read_errors(folder / ERRORS, camera)
     photo = depth_lr = None
     try:
         photo, depth_lr = read_input(folder / INPUT)
@@ -88,59 +93,83 @@ def _natural(text: str) -> list[tuple[int, str]]:
     return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", text)]
 
 
-def _read_info(path: Path) -> Mapping[str, Any]:
-    """Read ``info.json`` of a complete result."""
+def read_info(path: Path) -> Mapping[str, Any]:
+    """Read ``info.json`` of a complete result.
+
+    Raises:
+        ValueError: it is damaged or foreign, or the run was interrupted.
+
+    """
     try:
-        if path.stat().st_size > _LARGEST_INFO:
-            raise ValueError("too large")
-        info = json.loads(path.read_text(encoding="utf-8"))
+        info = parse_json(read_limited(path, _LARGEST_INFO), finite=False)
         complete, _ = info["complete"], info["files"]
-    except (ValueError, KeyError, TypeError, RecursionError) as error:
+    except (ValueError, KeyError, TypeError) as error:
         raise ValueError(f"{path}: expected a file of `dsr upsample`, got something else") from error
     if complete is not True:
         raise ValueError(f"{path}: expected a complete result, got that of an interrupted run; run it again")
     return info
 
 
-def _camera(path: Path, info: Mapping[str, Any]) -> Camera:
-    """Return the camera of the photo."""
+def read_camera(path: Path, info: Mapping[str, Any]) -> Camera:
+    """Return the camera of the photo.
+
+    Args:
+        path: ``info.json``, named in an error.
+        info: its entries.
+
+    Raises:
+        ValueError: they hold no camera.
+
+    """
     try:
         return Camera(**info["camera"])
     except (KeyError, TypeError, ValueError, OverflowError) as error:
-        raise ValueError(f"{path}: expected the photo's camera under `camera`, got {info.get('camera')!r}") from error
+        came = f"{info.get('camera')!r:.200}"
+        raise ValueError(f"{path}: expected the photo's camera under `camera`, got {came}") from error
 
 
 def _max_error(settings: Any) -> float:
     """Return the expected error from which pixels are left out, as a fraction of the depth."""
     limit = settings.get("max_error") if isinstance(settings, dict) else None
-    return float(limit) if isinstance(limit, int | float) and 0 < limit < 1e9 else LARGEST_ERROR
+    return float(limit) if is_number(limit) and 0 < limit < 1e9 else LARGEST_ERROR
 
 
-def _read_depth(folder: Path, camera: Camera) -> np.ndarray:
-    """Return the depth, (H, W) float32 in metres, NaN in holes."""
-    for name in (METRES, "depth.npy"):
+def read_depth(folder: Path, camera: Camera) -> np.ndarray:
+    """Return the depth of a result, (H, W) float32 in metres, NaN in holes.
+
+    Raises:
+        ValueError: the file is missing, damaged or foreign, or has no depth.
+
+    """
+    for name in DEPTHS:
         path = folder / name
         if not path.is_file():
             continue
         try:
-            stored = np.load(path, mmap_mode="r", allow_pickle=False)  # checks the size before anything is read
-        except (ValueError, EOFError, OSError) as error:
+            stored = open_array(path)  # checks the size before anything is read
+        except (ValueError, OSError) as error:
             raise ValueError(f"{path}: expected a map of depths, got a damaged or foreign file") from error
         size = (camera.height, camera.width)
-        if not isinstance(stored, np.ndarray) or stored.shape != size or stored.dtype != np.float32:
-            text = f"{stored.dtype} of shape {stored.shape}" if isinstance(stored, np.ndarray) else "an archive"
+        if stored.shape != size or stored.dtype != np.float32:
+            text = f"{stored.dtype} of shape {stored.shape}"
             raise ValueError(f"{path}: expected float32 of shape {size}, the photo's, got {text}")
         if min(size) < 2:
             raise ValueError(f"{path}: expected a map of at least 2 x 2 pixels, got {size}")
-        depth = np.where(np.isfinite(stored) & (stored > 0), stored, np.float32(math.nan))
+        depth = np.where((stored >= NEAREST) & (stored <= FARTHEST), stored, np.float32(math.nan))
         if not np.isfinite(depth).any():
             raise ValueError(f"{path}: expected depths, all pixels are holes")
+        expect_distances(str(path), torch.from_numpy(depth))
         return depth
     raise ValueError(f"{folder}: expected a result with depth, got one without {METRES}; run it with --only depth")
 
 
-def _read_errors(path: Path, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """Return the expected errors, (H, W) each, in metres and degrees."""
+def read_errors(path: Path, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+    """Return the expected errors of depth and normal, (H, W) float32 each, in metres and degrees.
+
+    Raises:
+        ValueError: the file is damaged or foreign.
+
+    """
     size = (camera.height, camera.width)
     shapes = {name: shape for name, (shape, _) in array_headers(path).items()}
     if any(shapes.get(name) != size for name in ("depth_error", "angle_error")):
@@ -162,7 +191,7 @@ def _facts(info: Mapping[str, Any], depth: np.ndarray) -> dict[str, str]:
         "depth": f"{near:.2f} to {far:.2f} m, median {middle:.2f} m",
     }
     noise = info.get("noise")
-    if isinstance(noise, dict) and isinstance(noise.get("deviation"), int | float):
+    if isinstance(noise, dict) and is_number(noise.get("deviation")):
         facts["noise of the input"] = f"about {1e3 * noise['deviation']:.2g} mm"
     return facts
 

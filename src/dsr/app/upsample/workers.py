@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import multiprocessing
 import os
-import signal
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import as_completed
 from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 from typing import NamedTuple
@@ -19,6 +17,7 @@ from dsr.app.upsample.reporting import Messages, Record, Reporter, problem_line
 from dsr.app.upsample.request import UpsampleRequest
 from dsr.io.pairs import Pair
 from dsr.utils.progress import Progress
+from dsr.utils.workers import WorkerPool
 
 _FAILURES = (ValueError, OSError, MemoryError, torch.OutOfMemoryError)
 """What a picture may fail with, while the others go on."""
@@ -62,9 +61,7 @@ def work_through(
         return
     FrameWork(request, pairs)  # raises for poses that do not fit
     cores = max(1, (os.cpu_count() or 1) // workers)
-    context = multiprocessing.get_context("spawn")
-    pool = ProcessPoolExecutor(workers, context, _begin, (request, pairs, cores))
-    try:
+    with WorkerPool(workers, _begin, (request, pairs, cores)) as pool:
         futures = [pool.submit(_remote, pair, target) for pair, target in jobs]
         places = dict(zip(futures, jobs, strict=True))
         finished = progress.track(as_completed(futures), "upsample", len(jobs), label=lambda each: places[each][0].name)
@@ -77,16 +74,11 @@ def work_through(
                 continue
             record.replay(reporter)
             yield done
-    finally:
-        for process in list((pool._processes or {}).values()):
-            process.terminate()
-        pool.shutdown(wait=True, cancel_futures=True)
 
 
 def _begin(request: UpsampleRequest, pairs: Sequence[Pair], cores: int) -> None:
     """Prepare a worker."""
     global _work  # noqa: PLW0603 - the process's own
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent stops its workers
     torch.set_num_threads(cores)
     cv2.setNumThreads(cores)
     _work = FrameWork(request, pairs)

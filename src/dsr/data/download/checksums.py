@@ -6,6 +6,7 @@ import contextlib
 import hashlib
 import json
 import os
+import re
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -14,6 +15,8 @@ from typing import Any
 from filelock import FileLock, Timeout
 
 from dsr.utils.files import write_text
+from dsr.utils.limits import opened, read_limited
+from dsr.utils.parsing import parse_json
 from dsr.utils.progress import Task
 
 _CHUNK = 1 << 20
@@ -51,9 +54,9 @@ class Checksums(Mapping[str, Entry]):
         self._entries: dict[str, Entry] = {}
         if self.path.is_file():
             try:
-                entries = json.loads(self.path.read_text(encoding="utf-8"))
+                entries = parse_json(read_limited(self.path))
                 self._entries = {str(name): _entry(fields) for name, fields in entries.items()}
-            except (ValueError, TypeError, AttributeError, RecursionError) as error:
+            except (ValueError, TypeError, AttributeError) as error:
                 raise ValueError(
                     f"{self.path}: expected the checksums of the data sets, got a damaged file ({error}); delete it to "
                     "record them anew"
@@ -81,17 +84,22 @@ class Checksums(Mapping[str, Entry]):
 def _entry(fields: Any) -> Entry:
     """Return an entry from its JSON."""
     sha256, size, files = fields.get("sha256"), fields.get("size"), fields.get("files")
-    digest = sha256 is None or (isinstance(sha256, str) and len(sha256) == 64)
-    sizes = files is None or all(isinstance(value, int) for value in files.values())
-    if not (isinstance(size, int) and digest and sizes):
+    digest = sha256 is None or (isinstance(sha256, str) and re.fullmatch(r"[0-9a-f]{64}", sha256) is not None)
+    sizes = files is None or all(map(_is_size, files.values()))
+    if not (_is_size(size) and digest and sizes):
         raise ValueError(f"{fields!s:.60} is no entry")
     return Entry(sha256, size, files)
+
+
+def _is_size(value: Any) -> bool:
+    """Return whether a value is a number of bytes."""
+    return isinstance(value, int) and not isinstance(value, bool) and 0 <= value < 2**63
 
 
 def sha256_of(path: Path, moved: Task | None = None) -> str:
     """Return the SHA-256 of a file, 64 hexadecimal digits."""
     digest, done, total = hashlib.sha256(), 0, path.stat().st_size
-    with path.open("rb") as file:
+    with opened(path) as file:
         while chunk := file.read(_CHUNK):
             digest.update(chunk)
             done += len(chunk)

@@ -18,6 +18,7 @@ import urllib3
 
 from dsr.utils.console import one_line
 from dsr.utils.files import write_text
+from dsr.utils.parsing import parse_json
 from dsr.utils.progress import Task
 from dsr.utils.units import megabytes
 
@@ -203,8 +204,10 @@ def _note(part: Path) -> Path:
 def _read_note(part: Path, url: str) -> dict[str, Any]:
     """Return what is known of the version that ``part`` is the beginning of; empty where it may be of another."""
     try:
-        note = json.loads(_note(part).read_text(encoding="utf-8"))
+        note = parse_json(_note(part).read_text(encoding="utf-8"))
         known = {"mark": note["mark"], "total": note["total"]}
+        if not isinstance(known["mark"], str | None) or isinstance(known["total"], bool):
+            return {}
         return known if note["url"] == url or known["mark"] else {}
     except (OSError, ValueError, KeyError, TypeError):
         return {}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import posixpath
 import re
 import shutil
@@ -17,11 +18,15 @@ from typing import IO
 
 from dsr.data.download.transfer import disk_errors, expect_room
 from dsr.utils.console import one_line
+from dsr.utils.limits import opened
 from dsr.utils.progress import Task
 
 _CHUNK = 1 << 20
-_DAMAGE = (zipfile.BadZipFile, tarfile.TarError, EOFError, zlib.error, KeyError, RuntimeError, OSError)
-"""What a damaged or encrypted archive raises; an OSError without a number is gzip's."""
+_DAMAGE = (
+    zipfile.BadZipFile, tarfile.TarError, EOFError, zlib.error, KeyError, RuntimeError, UnicodeError, OSError,
+)  # fmt: skip
+"""What a damaged or encrypted archive raises; an OSError without a number is gzip's, and an invalid
+argument is a place before the file's beginning."""
 
 
 @dataclass(frozen=True)
@@ -96,7 +101,7 @@ def _damage(archive: Path) -> Iterator[None]:
     try:
         yield
     except _DAMAGE as error:
-        if isinstance(error, OSError) and error.errno is not None:
+        if isinstance(error, OSError) and error.errno not in (None, errno.EINVAL):
             raise
         raise ValueError(f"{archive}: expected an archive, got a damaged one: {one_line(error)}") from error
 
@@ -104,7 +109,7 @@ def _damage(archive: Path) -> Iterator[None]:
 @contextlib.contextmanager
 def _opened(archive: Path) -> Iterator[list[_Member]]:
     """Yield the members of an archive, its directories left out."""
-    with archive.open("rb") as file:
+    with opened(archive) as file:
         is_zip = file.read(2) == b"PK"
     if is_zip:
         with zipfile.ZipFile(archive) as packed:

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import math
-import os
 import re
-import threading
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -14,8 +12,18 @@ import cv2
 import numpy as np
 from pydantic import BaseModel, BeforeValidator, Field, ValidationError
 
+from dsr.data.formats.decoding import decode_pixels
 from dsr.geometry.camera import Camera, RangeType
-from dsr.utils.validation import describe
+from dsr.utils.files import read_array_header
+from dsr.utils.limits import (
+    MOST_FILE,
+    array_bytes,
+    expect_bytes,
+    expect_pixels,
+    pixels_of_file,
+    read_limited,
+)
+from dsr.utils.validation import Number, Whole, describe
 
 MAP_SUFFIXES = (".npy", ".png", ".tiff", ".tif", ".pfm")
 _METRES = {"m": 1.0, "mm": 1e-3}
@@ -32,37 +40,45 @@ def read_rgb(path: Path) -> np.ndarray:
     return cv2.cvtColor(picture, cv2.COLOR_BGR2RGB)
 
 
-def read_map(path: Path) -> np.ndarray:
+def read_map(path: Path, most: int | None = None) -> np.ndarray:
     """Return a one-channel map of floats, 16- or 32-bit whole numbers as float64, (H, W).
+
+    Args:
+        path: the file.
+        most: largest number of pixels; None for what the size of the file explains.
 
     Raises:
         ValueError: it is missing, damaged, of another shape, or has 8-bit values (too coarse for a surface).
 
     """
     with np.errstate(invalid="ignore"):  # a damaged file may hold signalling NaNs
-        return read_values(path).astype(np.float64)
+        return read_values(path, most).astype(np.float64)
 
 
-def read_values(path: Path) -> np.ndarray:
+def read_values(path: Path, most: int | None = None) -> np.ndarray:
     """Return a one-channel map in the type that it is stored in, (H, W); see :func:`read_map`.
 
     Raises:
         ValueError: as for :func:`read_map`.
 
     """
-    return expect_depth_values(path, read_array(path))
+    return expect_depth_values(path, read_array(path, most))
 
 
-def read_array(path: Path) -> np.ndarray:
+def read_array(path: Path, most: int | None = None) -> np.ndarray:
     """Return the values of a map in the type and shape that it is stored in.
 
+    Args:
+        path: the file.
+        most: largest number of pixels; None for what the size of the file explains.
+
     Raises:
-        ValueError: it is missing or damaged.
+        ValueError: it is missing, damaged or too large.
 
     """
     readers = {".npy": _load_npy, ".pfm": _load_pfm}
     reader = readers.get(path.suffix.lower())
-    return read_pixels(path, cv2.IMREAD_UNCHANGED) if reader is None else reader(path)
+    return read_pixels(path, cv2.IMREAD_UNCHANGED, most) if reader is None else reader(path, most)
 
 
 def expect_depth_values(path: Path, values: np.ndarray) -> np.ndarray:
@@ -92,14 +108,18 @@ def read_levels(path: Path) -> np.ndarray:
     return levels
 
 
-def read_mask(path: Path) -> np.ndarray:
+def read_mask(path: Path, most: int | None = None) -> np.ndarray:
     """Return a mask, (H, W) bool: True where the picture is not 0.
 
+    Args:
+        path: the file.
+        most: largest number of pixels; None for what the size of the file explains.
+
     Raises:
-        ValueError: it is missing or damaged.
+        ValueError: it is missing, damaged or too large.
 
     """
-    return read_pixels(path, cv2.IMREAD_GRAYSCALE) > 0
+    return read_pixels(path, cv2.IMREAD_GRAYSCALE, most) > 0
 
 
 @dataclass(frozen=True)
@@ -130,7 +150,7 @@ def read_camera(path: Path) -> CameraFile:
     if not path.is_file():
         raise ValueError(f"{path}: expected a camera file, there is none")
     try:
-        entries = _CameraJson.model_validate_json(path.read_bytes()).model_dump(exclude_unset=True, exclude_none=True)
+        entries = _CameraJson.model_validate_json(read_limited(path)).model_dump(exclude_unset=True, exclude_none=True)
         if "baseline" in entries:
             entries["baseline"] *= _METRES[entries.get("baseline_unit", "m")]
         camera = Camera(**{each.name: entries[each.name] for each in fields(Camera) if each.name in entries})
@@ -139,11 +159,6 @@ def read_camera(path: Path) -> CameraFile:
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
     return CameraFile(camera, *map(entries.get, ("range_type", "depth_unit", "hole_value")))
-
-
-def _whole(value: Any) -> Any:
-    """Return a whole float, such as 640.0, as int and anything else as it is."""
-    return int(value) if isinstance(value, float) and value.is_integer() else value
 
 
 def _metres(unit: Any) -> Any:
@@ -155,9 +170,9 @@ def _metres(unit: Any) -> Any:
     return _METRES[unit]
 
 
-_Number = Annotated[float, Field(ge=-1e12, le=1e12, allow_inf_nan=False)]
+_Number = Annotated[Number, Field(ge=-1e12, le=1e12)]
 """Beyond these limits, no number in a camera file means anything."""
-Pixels = Annotated[int, Field(ge=1, le=1e12), BeforeValidator(_whole)]
+Pixels = Annotated[Whole, Field(ge=1, le=1e12)]
 """A size in a camera file."""
 
 
@@ -182,10 +197,10 @@ def _content(path: Path) -> bytes:
     """Return what is in a picture file."""
     if not path.is_file():
         raise ValueError(f"{path}: expected a picture, there is none")
-    return path.read_bytes()
+    return read_limited(path, MOST_FILE)
 
 
-def _load_pfm(path: Path) -> np.ndarray:
+def _load_pfm(path: Path, most: int | None) -> np.ndarray:
     """Return a PFM file's values as they are, (H, W).
 
     The header's scale says the byte order by its sign; its magnitude, which OpenCV multiplies by, is left alone, as the
@@ -202,72 +217,42 @@ def _load_pfm(path: Path) -> np.ndarray:
         scale = float(header[4])
     except ValueError:
         scale = 0.0
-    pixels = data[header.end() :]
+    if most is not None:
+        expect_pixels(path, height, width, most)
+    pixels = memoryview(data)[header.end() :]
     if not 0 < abs(scale) < math.inf or not width or not height or len(pixels) != 4 * width * height:
         raise ValueError(f"{path}: expected a PFM file of {width} x {height} floats, got a damaged one")
     return np.frombuffer(pixels, "<f4" if scale < 0 else ">f4").reshape(height, width)[::-1]
 
 
-def _load_npy(path: Path) -> np.ndarray:
+def _load_npy(path: Path, most: int | None) -> np.ndarray:
     if not path.is_file():
         raise ValueError(f"{path}: expected a file, there is none")
     try:
         with path.open("rb") as file:
+            shape, dtype = read_array_header(file)
+            count = pixels_of_file(path.stat().st_size) if most is None else most
+            expect_bytes("the array", array_bytes(shape, dtype.itemsize), min(8 * count, path.stat().st_size))
+            file.seek(0)
             return np.lib.format.read_array(file, allow_pickle=False)
     except Exception as error:  # a damaged header makes NumPy raise OSError, MemoryError, TokenError, ...
         raise ValueError(f"{path}: expected a NumPy array, got a damaged or foreign file ({error})") from error
 
 
-def read_pixels(path: Path, flags: int) -> np.ndarray:
+def read_pixels(path: Path, flags: int, most: int | None = None) -> np.ndarray:
     """Return the pixels of a picture file as OpenCV decodes them.
 
     Args:
         path: the file.
         flags: OpenCV's.
+        most: largest number of pixels; None for what the size of the file explains.
 
     Raises:
-        ValueError: it is missing, damaged or no picture.
+        ValueError: it is missing, damaged, too large or no picture.
 
     """
     content = _content(path)
-    try:
-        with _QUIET_STDERR:
-            pixels = cv2.imdecode(np.frombuffer(content, np.uint8), flags) if content else None
-    except cv2.error:
-        pixels = None
+    pixels = decode_pixels(path, content, flags, most)
     if pixels is None:
         raise ValueError(f"{path}: expected a picture, got a damaged or foreign file of {len(content)} bytes")
     return pixels
-
-
-class _QuietStderr:
-    """A context in which stderr is discarded, so that messages of decoders (libpng, OpenCV) are not shown.
-
-    Threads may be in it at the same time: the first redirects stderr and the last restores it.
-    """
-
-    def __init__(self) -> None:
-        self._lock, self._within, self._kept = threading.Lock(), 0, -1
-
-    def __enter__(self) -> None:
-        with self._lock:
-            if not self._within:
-                self._kept = os.dup(2)
-                with open(os.devnull, "wb") as nowhere:  # noqa: PTH123 - a device
-                    os.dup2(nowhere.fileno(), 2)
-            self._within += 1
-
-    def __exit__(self, *_: object) -> None:
-        with self._lock:
-            self._within -= 1
-            if not self._within:
-                os.dup2(self._kept, 2)
-                os.close(self._kept)
-
-
-_QUIET_STDERR = _QuietStderr()
-
-
-def quiet_decoders() -> _QuietStderr:
-    """Return a context in which messages of decoders about damaged files are not shown."""
-    return _QUIET_STDERR

@@ -31,6 +31,7 @@ from dsr.data.formats.shared import expect_size, read_picture
 from dsr.data.preparation.dequantization import smooth_levels
 from dsr.geometry.camera import Camera, from_range
 from dsr.sample import Scene
+from dsr.utils.limits import read_limited
 
 YEARS = (2001, 2003, 2005, 2006)
 _MATRIX = re.compile(r"\[\s*(\S+)\s+0\s+(\S+)\s*;\s*0\s+(\S+)\s+(\S+)\s*;\s*0\s+0\s+1\s*\]")
@@ -165,7 +166,7 @@ def read_calibration(path: Path) -> Camera:
     """
     if not path.is_file():
         raise ValueError(f"{path}: expected a calibration, there is none")
-    lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
+    lines = read_limited(path).decode("utf-8", "replace").splitlines()
     entries = {key.strip(): value.strip() for key, equals, value in (line.partition("=") for line in lines) if equals}
     matrix = _MATRIX.fullmatch(entries.get("cam0", ""))
     if matrix is None:
@@ -210,7 +211,7 @@ def _camera_2006(files: Files, height: int, width: int) -> tuple[Camera, float]:
         raise ValueError(f"{files.disparity}: expected a height near {_FULL_HEIGHT}, a half or a third, got {height}")
     shift = _ASSUMED_SHIFT
     if files.shift is not None:
-        text = files.shift.read_text(encoding="utf-8", errors="replace").strip()
+        text = read_limited(files.shift).decode("utf-8", "replace").strip()
         shift = _number(files.shift, "dmin", text)
     focal = _FULL_FOCAL / per_pixel
     centre = ((width - 1) / 2, (height - 1) / 2)

@@ -32,6 +32,7 @@ import numpy as np
 import torch
 
 from dsr.data.formats.files import read_map
+from dsr.data.formats.matlab import expect_own_values
 from dsr.data.formats.shared import expect_size, find_beside, read_picture, to_depth
 from dsr.geometry.camera import Camera
 from dsr.sample import Scene
@@ -152,6 +153,10 @@ def _checked(path: Path, file: h5py.File, key: str) -> h5py.Dataset:
         raise ValueError(f"{path}: expected the array {key}, got a damaged or foreign file") from error
     if came is None:
         raise ValueError(f"{path}: expected the array {key}, got none of that name")
+    try:
+        expect_own_values(array)
+    except ValueError as error:
+        raise ValueError(f"{path}: expected the array {key}, {error}") from error
     if came != (dtype, (*count, *shape)):
         sizes = ", ".join(map(str, shape))
         raise ValueError(f"{path}: {key}: expected {dtype} (frames, {sizes}), got {came[0]} {came[1]}")

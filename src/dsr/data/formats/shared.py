@@ -16,6 +16,7 @@ from torch import Tensor
 from dsr.data.formats.files import read_pixels
 from dsr.geometry.camera import ASSUMED_FOV, Camera
 from dsr.sample import Scene
+from dsr.utils.limits import MOST_FILE, read_limited
 
 NO_CAMERA = f"no camera is published: {ASSUMED_FOV:g} degrees of horizontal view are assumed"
 """Note of scenes whose camera is :meth:`dsr.geometry.camera.Camera.from_fov`."""
@@ -36,7 +37,7 @@ def read_numbers(path: Path, count: int) -> np.ndarray:
     size = path.stat().st_size
     if size > _LONGEST * count:
         raise ValueError(f"{path}: expected {count} numbers, got {size} bytes, too many for that")
-    content = path.read_bytes()
+    content = read_limited(path, size)
     try:
         values = np.array(content.split() if _TEXT.fullmatch(content) else "", dtype=np.float64)
     except ValueError as error:
@@ -55,7 +56,7 @@ def read_bytes(path: Path, what: str) -> bytes:
     """
     if not path.is_file():
         raise ValueError(f"{path}: expected {what}, there is none")
-    return path.read_bytes()
+    return read_limited(path, MOST_FILE)
 
 
 def read_picture(path: Path) -> Tensor:

@@ -221,7 +221,8 @@ def _picture(path: Path, name: str, array: np.ndarray) -> Tensor:
     if array.ndim not in (2, 3) or (array.ndim == 3 and array.shape[2] != 3):
         raise ValueError(f"{path}: {name}: expected an image, got shape {array.shape}")
     top = np.iinfo(array.dtype).max if array.dtype.kind in "iu" else 255.0 if array.max(initial=0) > 1 else 1.0
-    values = np.atleast_3d(array).astype(np.float32) / top
+    with np.errstate(over="ignore"):  # what is too large is no image
+        values = np.atleast_3d(array).astype(np.float32) / top
     if not ((values >= 0) & (values <= 1)).all():
         raise ValueError(
             f"{path}: {name}: expected an image from 0 to 1 or 255, got {array.min():g} to {array.max():g}"

@@ -17,13 +17,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from dsr.data.formats.files import quiet_decoders
+from dsr.data.formats.decoding import decode_pixels
 from dsr.io.frames import Record
+from dsr.utils.limits import read_limited, read_member
 
 PHOTO_LIMIT = 1 << 26
 """Largest size in bytes of an encoded photo."""
-_LARGEST_PHOTO = 1 << 27
-"""Largest number of pixels of a photo."""
 _DAMAGED = (zipfile.BadZipFile, zlib.error, OSError, EOFError, RuntimeError, NotImplementedError, struct.error)
 """What reading a damaged or encrypted archive raises."""
 
@@ -69,7 +68,9 @@ class Archive:
         if size > limit:
             raise ValueError(f"{place}: expected at most {limit} bytes, the archive declares {size}")
         try:
-            return place.read_bytes() if self.path.is_dir() else _open(self.path, _state(self.path)).read(name)
+            if self.path.is_dir():
+                return read_limited(place, limit)
+            return read_member(_open(self.path, _state(self.path)), name)
         except _DAMAGED as error:
             raise ValueError(f"{place}: expected a member of the archive, got a damaged one") from error
 
@@ -127,13 +128,8 @@ def decode_photo(content: bytes) -> np.ndarray:
         ValueError: it is damaged, or larger than a photo is.
 
     """
-    try:
-        with quiet_decoders():
-            flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
-            pixels = cv2.imdecode(np.frombuffer(content, np.uint8), flags) if content else None
-    except cv2.error:
-        pixels = None
-    if pixels is None or pixels.shape[0] * pixels.shape[1] > _LARGEST_PHOTO:
+    pixels = decode_pixels("photo", content, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    if pixels is None:
         raise ValueError(f"expected a photo, got {len(content)} bytes that are none")
     return cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB)
 

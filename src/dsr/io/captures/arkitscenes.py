@@ -14,6 +14,7 @@ takes that within 10 ms of it. Intrinsics may be a millisecond off.
 from __future__ import annotations
 
 import functools
+import math
 from pathlib import Path
 
 import numpy as np
@@ -25,8 +26,11 @@ from dsr.io.confidence import HIGHEST_LEVEL, ConfidenceMap
 from dsr.io.encoding import Assumption
 from dsr.io.frames import CaptureFrame, Geometry
 from dsr.io.pairs import Pair, PairingResult
+from dsr.utils.limits import read_limited
 
 _APP = "ARKitScenes"
+_LARGEST = 1 << 16
+"""Largest file of a camera in bytes."""
 _PHOTOS = ("wide", "color", "lowres_wide")
 _MAX_GAP = 0.010
 """Largest time in seconds between a frame and its pose."""
@@ -47,7 +51,7 @@ def find_arkitscenes(folder: Path) -> PairingResult | None:
         intrinsics, motion = _intrinsics(folder / f"{kind}_intrinsics", stem), _nearest(motions, stem)
         place = f"{folder / 'lowres_wide.traj'}: frame {stem}"
         geometry = functools.partial(_geometry, place, intrinsics, motion)
-        told = (b"" if intrinsics is None else intrinsics.read_bytes()) + repr(motion).encode()
+        told = (b"" if intrinsics is None else read_limited(intrinsics, _LARGEST)) + repr(motion).encode()
         frame = CaptureFrame(_APP, geometry, intrinsics or folder / "lowres_wide.traj", told)
         path = folder / "confidence" / f"{stem}.png"
         known = ConfidenceMap(path, HIGHEST_LEVEL) if path.is_file() else None
@@ -64,7 +68,7 @@ def _read_trajectory(path: Path) -> dict[float, _Motion]:
     for number, line in enumerate(read_text(path).splitlines() if path.is_file() else (), 1):
         try:
             time, *motion = map(float, line.split())
-            if len(motion) != 6:
+            if len(motion) != 6 or not math.isfinite(time):
                 raise ValueError
         except ValueError as error:
             raise ValueError(f"{path}: line {number}: expected 7 numbers, got {line!r:.80}") from error

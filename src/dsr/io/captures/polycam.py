@@ -17,27 +17,31 @@ from pathlib import Path
 import numpy as np
 from pydantic import BaseModel, ValidationError
 
+from dsr.data.formats.files import Pixels
 from dsr.io.captures.poses import check_pose, describe_capture, intrinsics_camera, read_text
 from dsr.io.confidence import ConfidenceMap
 from dsr.io.encoding import Assumption
 from dsr.io.frames import CaptureFrame, Geometry
 from dsr.io.pairs import Pair, PairingResult
+from dsr.utils.limits import read_limited
 from dsr.utils.validation import describe
 
 _APP = "Polycam"
+_LARGEST = 1 << 20
+"""Largest file of a camera in bytes."""
 _KINDS = ("corrected_images", "images")
 _CAMERAS = {"corrected_images": "corrected_cameras", "images": "cameras"}
 
 
-class _Camera(BaseModel):
+class _Camera(BaseModel, strict=True):
     """A file of ``cameras``; numbers may be NaN here."""
 
     fx: float
     fy: float
     cx: float
     cy: float
-    width: int
-    height: int
+    width: Pixels
+    height: Pixels
     t_00: float
     t_01: float
     t_02: float
@@ -66,7 +70,7 @@ def find_polycam(folder: Path) -> PairingResult | None:
             unpaired.append(depth)
             continue
         path = frames / _CAMERAS[kind] / f"{depth.stem}.json"
-        frame = CaptureFrame(_APP, functools.partial(_geometry, path), path, path.read_bytes())
+        frame = CaptureFrame(_APP, functools.partial(_geometry, path), path, read_limited(path, _LARGEST))
         confidence = frames / "confidence" / depth.name
         known = ConfidenceMap(confidence, 255) if confidence.is_file() else None
         pairs.append(Pair(depth.stem, photos[kind][depth.stem], depth, unit=1e-3, capture=frame, confidence=known))
@@ -85,11 +89,9 @@ def _camera_of(frames: Path, kind: str, depth: Path) -> bool:
 def _geometry(path: Path, _: tuple[int, int]) -> Geometry:
     """Return camera and pose of a frame."""
     try:
-        told = _Camera.model_validate_json(read_text(path, 1 << 20))
+        told = _Camera.model_validate_json(read_text(path, _LARGEST))
     except ValidationError as error:
         raise ValueError(f"{path}: expected {_APP}'s camera; {describe(error)}") from error
-    if min(told.width, told.height) < 1:
-        raise ValueError(f"{path}: expected a positive width and height, got {told.width} x {told.height}")
     camera = intrinsics_camera(str(path), (told.height, told.width), (told.fx, told.fy, told.cx, told.cy))
     rows = [[getattr(told, f"t_{row}{column}") for column in range(4)] for row in range(3)]
     return Geometry(camera, check_pose(str(path), np.array([*rows, [0, 0, 0, 1]], dtype=np.float64), opengl=True))

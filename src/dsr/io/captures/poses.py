@@ -7,11 +7,12 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from dsr.geometry.camera import Camera
+from dsr.geometry.poses import from_quaternion, is_rotation
 from dsr.io.encoding import Assumption
 from dsr.io.pairs import Pair
+from dsr.utils.limits import read_limited
 
 _TOLERANCE = 1e-3
 """Largest deviation of a rotation's entries, and of a quaternion's length, from those of a rigid motion."""
@@ -38,9 +39,7 @@ def pose_from_quaternion(
     if not math.isfinite(length) or abs(length - 1) > _TOLERANCE or not np.isfinite(position).all():
         came = " ".join(f"{value:g}" for value in (*quaternion, *position))
         raise ValueError(f"{source}: expected a rigid pose (a quaternion of length 1 and a position), got {came}")
-    pose = np.eye(4)
-    pose[:3, :3] = Rotation.from_quat(quaternion).as_matrix()
-    pose[:3, 3] = position
+    pose = from_quaternion(position, quaternion, source)
     return pose @ _ARKIT_TO_DSR if opengl else pose
 
 
@@ -56,11 +55,9 @@ def check_pose(source: str, matrix: np.ndarray, *, opengl: bool = False) -> np.n
         ValueError: it is no rigid motion.
 
     """
-    turn = matrix[:3, :3]
     rigid = (
         bool(np.isfinite(matrix).all())
-        and np.allclose(turn.T @ turn, np.eye(3), atol=_TOLERANCE)
-        and np.linalg.det(turn) > 0
+        and is_rotation(matrix[:3, :3], _TOLERANCE)
         and np.allclose(matrix[3], (0, 0, 0, 1), atol=1e-6)
     )
     if not rigid:
@@ -109,6 +106,4 @@ def read_text(path: Path, limit: int = 1 << 26) -> str:
     """
     if not path.is_file():
         raise ValueError(f"{path}: expected a file of the capture, there is none")
-    if path.stat().st_size > limit:
-        raise ValueError(f"{path}: expected at most {limit} bytes, got {path.stat().st_size}")
-    return path.read_text(encoding="utf-8-sig", errors="replace")
+    return read_limited(path, limit).decode("utf-8-sig", errors="replace")

@@ -30,16 +30,16 @@ from dsr.io.confidence import HIGHEST_LEVEL, ConfidenceMap
 from dsr.io.encoding import Assumption
 from dsr.io.frames import CaptureFrame, Geometry
 from dsr.io.pairs import Pair, PairingResult
-from dsr.utils.validation import describe
+from dsr.utils.validation import Whole, describe
 
 _APP = "Record3D"
 _METADATA_LIMIT = 1 << 27
 _EXPORT_PHOTOS = (".jpg", ".jpeg", ".png")
-_Side = Annotated[int, Field(ge=1, le=1 << 14)]
+_Side = Annotated[Whole, Field(ge=1, le=1 << 14)]
 _Numbers = list[float]
 
 
-class _Metadata(BaseModel):
+class _Metadata(BaseModel, strict=True):
     """What is read of the metadata; numbers may be NaN here, each frame's are checked when it is read."""
 
     w: _Side
@@ -159,7 +159,7 @@ def _parse(path: Path, content: bytes) -> _Metadata:
         return _Metadata.model_validate(entries)
     except ValidationError as error:
         raise ValueError(f"{path}: expected {_APP}'s metadata; {describe(error)}") from error
-    except (ValueError, RecursionError) as error:
+    except (ValueError, RecursionError, OverflowError) as error:
         raise ValueError(f"{path}: expected {_APP}'s metadata as JSON, got something else") from error
 
 

@@ -12,10 +12,12 @@ not read.
 from __future__ import annotations
 
 import atexit
+import bz2
 import functools
 import hashlib
+import importlib
 import struct
-from collections.abc import Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -219,7 +221,10 @@ class _NamedErrors:
 
 def _state(path: Path) -> tuple[int, ...]:
     """Return sizes and times of the files of a recording, which tell whether it was replaced."""
-    files: Iterator[Path] = iter(sorted(path.iterdir())) if path.is_dir() else iter([path])
+    files = sorted(path.iterdir()) if path.is_dir() else [path]
+    for file in files:
+        if file.exists() and not file.is_file() and not file.is_dir():  # a pipe would be waited for
+            raise ValueError(f"{file}: expected a file of the recording, got something else")
     return tuple(number for file in files for number in (file.stat().st_size, file.stat().st_mtime_ns))
 
 
@@ -252,6 +257,34 @@ def _open(path: Path) -> Any:
         from rosbags.typesys import Stores, get_typestore  # noqa: PLC0415
     except ImportError as error:
         raise ValueError(f"{path}: recordings of ROS need the package rosbags: pip install 'dsr[captures]'") from error
+    _limit_chunks()
     reader = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
     reader.open()
     return reader
+
+
+_CHUNK = 1 << 28
+"""Largest number of bytes that a compressed chunk of a recording may unpack to; writers make chunks of a few MB."""
+
+
+def _limit_chunks() -> None:
+    """Make rosbags unpack no chunk to more than :data:`_CHUNK`: a bzip2 chunk of 700 bytes may stand for 1 GB."""
+    lz4: Any = importlib.import_module("lz4.frame")  # with the extra alone
+    from rosbags.rosbag1 import reader  # noqa: PLC0415
+    from rosbags.rosbag2 import storage_mcap  # noqa: PLC0415
+
+    def bounded(make: Callable[[], Any], data: bytes, *_: int) -> bytes:
+        unpacking = make()
+        content: bytes = unpacking.decompress(data, _CHUNK)
+        if not unpacking.eof:
+            raise ValueError(f"a chunk without end, or of more than {_CHUNK} bytes")
+        return content
+
+    kinds: dict[str, Callable[[], Any]] = {
+        "bz2": bz2.BZ2Decompressor,
+        "lz4": lz4.LZ4FrameDecompressor,
+        "zstd": storage_mcap.zstd.ZstdDecompressor,
+    }
+    for table in (reader.decompressors, storage_mcap.DECOMPRESSORS):
+        for name in kinds.keys() & table.keys():
+            table[name] = functools.partial(bounded, kinds[name])

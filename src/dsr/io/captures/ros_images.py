@@ -11,7 +11,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from dsr.data.formats.files import quiet_decoders
+from dsr.data.formats.decoding import decode_pixels
 from dsr.io.captures.archive import PHOTO_LIMIT, decode_photo
 
 COLOURS = {
@@ -63,8 +63,7 @@ def _decode_compressed_depth(place: str, encoding: str, data: np.ndarray) -> np.
     """Return the map of a message of compressedDepth: a PNG of whole numbers, or of quantised inverse metres."""
     pixels = None
     if _CONFIG.size < data.size <= PHOTO_LIMIT:
-        with quiet_decoders():
-            pixels = cv2.imdecode(data[_CONFIG.size :], cv2.IMREAD_UNCHANGED)
+        pixels = decode_pixels(place, data[_CONFIG.size :].tobytes(), cv2.IMREAD_UNCHANGED)
     if pixels is None or pixels.ndim != 2 or pixels.dtype != np.uint16:
         raise ValueError(
             f"{place}: expected depth as a 16-bit PNG (compressedDepth), got {data.size} bytes of another kind"

@@ -16,7 +16,6 @@ from __future__ import annotations
 
 import csv
 import functools
-import io
 import re
 from collections.abc import Mapping
 from pathlib import Path
@@ -97,8 +96,11 @@ def _read_odometry(path: Path) -> dict[int, _Row]:
     """Return the rows of the odometry by frame, with their values as text; empty without the file."""
     if not path.is_file():
         return {}
-    lines = csv.reader(io.StringIO(read_text(path)), skipinitialspace=True)
-    names = [name.strip() for name in next(lines, [])]
+    try:
+        names, *lines = list(csv.reader(read_text(path).splitlines(), skipinitialspace=True)) or [[]]
+    except csv.Error as error:
+        raise ValueError(f"{path}: expected a table of {_APP}, got a damaged or foreign file ({error})") from error
+    names = [name.strip() for name in names]
     missing = [name for name in ("frame", *_POSE) if name not in names]
     if missing:
         raise ValueError(f"{path}: expected {_APP}'s columns, there is no {', '.join(missing)}")

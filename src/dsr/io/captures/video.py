@@ -13,15 +13,17 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from dsr.data.formats.files import quiet_decoders
+from dsr.data.formats.decoding import quiet_decoders
 from dsr.io.frames import Record
 from dsr.utils.hashing import file_hash
+from dsr.utils.limits import expect_pixels
 
 _OPTIONS = "OPENCV_FFMPEG_CAPTURE_OPTIONS"
 _ALL_FRAMES = "ignore_editlist;1"
 """Makes FFmpeg decode the frames that the file's edit list hides: Stray Scanner's first one."""
-_LARGEST = 1 << 27
-"""Largest number of pixels of a frame."""
+_LOG_LEVEL, _SILENT = "OPENCV_FFMPEG_LOGLEVEL", "-8"
+_LARGEST = 1 << 25
+"""Largest number of pixels of a frame, that of 8K; a decoder keeps many frames."""
 _LOCK = threading.Lock()
 
 
@@ -93,11 +95,13 @@ class _Player:
         """Open the video at its first frame."""
         if not self._path.is_file():
             raise ValueError(f"{self._path}: expected a video, there is none")
+        os.environ.setdefault(_LOG_LEVEL, _SILENT)  # read once; its threads may speak after they were asked
         with quiet_decoders(), _environment(_OPTIONS, _ALL_FRAMES):
             capture = cv2.VideoCapture(str(self._path), cv2.CAP_FFMPEG)
         width, height = (capture.get(key) for key in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
-        if not capture.isOpened() or not 0 < width * height <= _LARGEST:
+        if not capture.isOpened() or not width * height > 0:
             raise ValueError(f"{self._path}: expected a video, got a damaged or foreign file")
+        expect_pixels(self._path, int(height), int(width), _LARGEST)
         capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)  # intrinsics are those of the pixels as they are stored
         return capture
 

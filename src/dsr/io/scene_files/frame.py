@@ -11,8 +11,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from dsr.data.formats.files import read_pixels
 from dsr.geometry.camera import Camera
+from dsr.geometry.poses import is_rotation
 from dsr.utils.files import replacing
+from dsr.utils.limits import pixels_beside
 
 MILLIMETRES = 1000
 MOST_MILLIMETRES = 65535
@@ -65,10 +68,8 @@ class Frame:
             ValueError: the file is damaged.
 
         """
-        picture = cv2.imread(str(self.colour), cv2.IMREAD_COLOR)
-        if picture is None:
-            raise ValueError(f"{self.colour}: expected a picture, got a damaged file")
-        return picture[..., ::-1]
+        most = pixels_beside(self.camera.height, self.camera.width)
+        return read_pixels(self.colour, cv2.IMREAD_COLOR, most)[..., ::-1]
 
 
 def parse_pose(where: str, value: object) -> Tensor | None:
@@ -89,11 +90,7 @@ def parse_pose(where: str, value: object) -> Tensor | None:
     except (TypeError, ValueError, RuntimeError):
         pose = torch.empty(0, dtype=torch.float64)
     rigid = pose.shape == (4, 4) and bool(pose.isfinite().all()) and pose[3].tolist() == [0, 0, 0, 1]
-    if rigid:
-        turn = pose[:3, :3]
-        error = (turn @ turn.T - torch.eye(3, dtype=torch.float64)).abs().max()
-        rigid = float(error) <= _RIGID and float(torch.linalg.det(turn)) > 0
-    if not rigid:
+    if not rigid or not is_rotation(pose[:3, :3].numpy(), _RIGID):
         raise ValueError(f"{where}: expected a rigid transform of 4 x 4 numbers, got {value}")
     return pose
 

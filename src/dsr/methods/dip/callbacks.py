@@ -12,9 +12,7 @@ from lightning.pytorch.callbacks import Callback
 from torch import Tensor
 
 from dsr.methods.dip.optimisation import PriorOptimisation
-from dsr.utils.lightning import save_checkpoint
 
-_SECONDS_BETWEEN_CHECKPOINTS = 60.0
 _TEMPORARY = 1.6
 """Measured ratio of the peak memory of a step to the memory that the forward pass saves for the backward pass."""
 
@@ -30,20 +28,6 @@ class Provenance(Callback):
     ) -> None:
         """Store the digest."""
         checkpoint["origin"] = self._origin
-
-
-class Keep(Callback):
-    """Saves a checkpoint once a minute."""
-
-    def __init__(self, path: Path) -> None:
-        self._path, self._last = path, time.monotonic()
-
-    def on_train_batch_end(self, trainer: lightning.Trainer, *_: Any) -> None:
-        """Save a checkpoint if a minute has passed."""
-        now = time.monotonic()
-        if now - self._last > _SECONDS_BETWEEN_CHECKPOINTS:
-            self._last = now
-            save_checkpoint(trainer, self._path)
 
 
 def cost_of_step(module: PriorOptimisation) -> tuple[float, float]:

@@ -21,6 +21,8 @@ from dsr.metrics.classes import compute_means
 from dsr.metrics.functional import SurfacePair, rmse_v
 
 _NOISE_CHANNELS = 32
+_LARGEST_RATE = 1e36
+"""A larger learning rate, divided by the correction of Adam's first step, is no float32 number."""
 
 
 @dataclass(frozen=True)
@@ -62,9 +64,12 @@ class PriorSettings:
 
     def __post_init__(self) -> None:
         """Check the values."""
-        for name in ("steps", "learning_rate"):
-            if not 0 < getattr(self, name) < math.inf:
-                raise ValueError(f"{name}: expected a positive number, got {getattr(self, name)}")
+        if self.steps <= 0:
+            raise ValueError(f"steps: expected a positive number, got {self.steps}")
+        if not 0 < self.learning_rate <= _LARGEST_RATE:
+            raise ValueError(
+                f"learning_rate: expected a positive number up to {_LARGEST_RATE:g}, got {self.learning_rate}"
+            )
         for name in ("input_noise", "perturbation", "guide_perturbation", "margin"):
             if not 0 <= getattr(self, name) < math.inf:
                 raise ValueError(f"{name}: expected 0 or a positive number, got {getattr(self, name)}")

@@ -24,7 +24,7 @@ from torch.utils.data import DataLoader
 from dsr.degradation.downsampling import Downsampling, scene_generator
 from dsr.geometry.camera import RangeType
 from dsr.methods.base import Cost, Ratios
-from dsr.methods.dip.callbacks import Keep, Provenance, checkpoint_of, cost_of_step
+from dsr.methods.dip.callbacks import Provenance, checkpoint_of, cost_of_step
 from dsr.methods.dip.optimisation import PriorOptimisation, PriorSettings
 from dsr.methods.dip.problem import DataLoss, ImageProblem, PriorObjective
 from dsr.methods.dip.skip_net import Padding
@@ -34,11 +34,15 @@ from dsr.methods.networks.trained import build_trained
 from dsr.methods.noise import estimate_noise, normal_noise_deg
 from dsr.metrics.visual_loss import VisualLossName, make_visual_loss
 from dsr.sample import DepthSample
-from dsr.utils.lightning import Interruption, Log, StepProgress, ValidationTable, fit, make_trainer
+from dsr.utils.checkpoints import Interruption, Keep
+from dsr.utils.divergence import Divergence, DivergenceError
+from dsr.utils.lightning import Log, StepProgress, ValidationTable, fit, make_trainer
 from dsr.utils.progress import Progress, Steps, StepsProgress
 from dsr.utils.units import duration
 
 WORKSPACE = "optimisation"
+_SECONDS_BETWEEN_CHECKPOINTS = 60.0
+_ADVICE = "a lower method.learning_rate may help"
 
 
 @dataclass(kw_only=True)
@@ -169,13 +173,15 @@ class DeepImagePrior:
             trainer = self._trainer(module, folder, origin, display, sample.scene)
             try:
                 fit(trainer, module, _numbers(self.steps), resume, val_dataloaders=_numbers(1))
+            except DivergenceError as error:
+                raise ValueError(f"{sample.scene}: the optimisation {error}; {_ADVICE}") from error
             except KeyboardInterrupt:
                 where = f"interrupted at step {trainer.global_step} of {sample.scene}"
                 on = "; the same command goes on from there" if folder is not None else ""
                 raise KeyboardInterrupt(where + on) from None
             depth = module.result()
         if not bool(depth.isfinite().all()):
-            raise ValueError(f"{sample.scene}: the optimisation diverged; a lower method.learning_rate may help")
+            raise ValueError(f"{sample.scene}: the optimisation diverged; {_ADVICE}")
         if folder is not None:
             (folder / "last.ckpt").unlink(missing_ok=True)
         if trainer.global_step < self.steps:
@@ -244,10 +250,14 @@ class DeepImagePrior:
         self, module: PriorOptimisation, folder: Path | None, origin: str, display: Progress, scene: str
     ) -> lightning.Trainer:
         """Return Lightning's trainer for one image."""
-        callbacks: list[Callback] = [StepProgress(display, "steps", scene)]
+        callbacks: list[Callback] = [Divergence(patience=1), StepProgress(display, "steps", scene)]
         logger: Any = False
         if folder is not None:
-            callbacks += [Provenance(origin), Keep(folder / "last.ckpt"), Interruption(folder / "last.ckpt")]
+            callbacks += [
+                Provenance(origin),
+                Keep(folder / "last.ckpt", _SECONDS_BETWEEN_CHECKPOINTS),
+                Interruption(folder / "last.ckpt"),
+            ]
             if module.metrics is not None and self.validate_every:
                 callbacks.append(ValidationTable(folder / "validation.csv"))
             logger = Log(folder.parent, name="", version=scene, default_hp_metric=False)

@@ -21,6 +21,7 @@ from dsr.degradation.scales import SCALES
 from dsr.methods.networks.msg_guidance import VariantName
 from dsr.methods.networks.msg_net import MSGNet
 from dsr.methods.networks.weight_files import load_parameters, read_torch_file
+from dsr.utils.limits import MOST_FILE, read_limited
 
 TORCH_MAGIC = (b"PK\x03\x04", b"\x80")
 PARTS = ("conv.weight", "conv.bias", "activation.weight")
@@ -66,7 +67,7 @@ def read_msg_weights(path: Path) -> MSGWeights:
     """Read a file's tensors, variant and scale; shapes are not checked."""
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such weights file")
-    data = path.read_bytes()
+    data = read_limited(path, MOST_FILE)
     return _from_torch(path) if data.startswith(TORCH_MAGIC) else _from_caffe(path, data)
 
 

@@ -14,9 +14,13 @@ import torch
 from torch import Tensor, nn
 
 from dsr.methods.networks.base import DisparityNetwork
+from dsr.utils.limits import expect_bytes, expect_stored
+from dsr.utils.parsing import parse_json
 
 FORMAT = "dsr-network-1"
 _KEY = "dsr"
+_LARGEST_ARGUMENT = 4096
+"""Largest whole number among the arguments of a network in a file of weights."""
 _SHARED, _CLEAN = "shared", "clean"
 """Keys of the file beside it from which a file takes the tensors that it does not have, and of that for clean maps."""
 _EARLIER = {("facets_box", "Facets"): "facets"}
@@ -97,7 +101,7 @@ def read_header(path: Path) -> dict[str, Any]:
     except Exception as error:  # the library names no set of errors for damaged files
         raise ValueError(f"{path}: expected a safetensors file, got a damaged one ({type(error).__name__})") from error
     try:
-        header = dict(json.loads(metadata[_KEY]))
+        header = dict(parse_json(metadata[_KEY]))
         if header["format"] == FORMAT and header.keys() >= {"network", "arguments", "model"}:
             return header
     except (KeyError, ValueError, TypeError):
@@ -130,6 +134,7 @@ def load_network(
             kind, arguments = networks[header["network"]], dict(header["arguments"])
             if scale is not None and kind.serves(arguments["scale"], scale):
                 arguments["scale"] = scale
+            _expect_explained(path, kind, arguments, _beside(path, header, _SHARED))
             net = kind(**arguments)
     except (KeyError, TypeError, ValueError) as error:
         names = ", ".join(networks)
@@ -183,6 +188,24 @@ def _beside(path: Path, header: Mapping[str, Any], key: str) -> Path | None:
     return other
 
 
+def _expect_explained(
+    path: Path, kind: type[DisparityNetwork], arguments: Mapping[str, Any], shared: Path | None
+) -> None:
+    """Refuse arguments of one of dsr's networks that ask for more weights than the files hold, before it is made.
+
+    Raises:
+        ValueError: they do.
+
+    """
+    if any(isinstance(value, int) and abs(value) > _LARGEST_ARGUMENT for value in arguments.values()):
+        raise ValueError(f"{path}: expected sizes of a network of at most {_LARGEST_ARGUMENT}")
+    if kind.__module__.partition(".")[0] != __name__.partition(".")[0]:
+        return
+    with torch.device("meta"):  # takes no memory
+        count = sum(value.numel() for value in kind(**arguments).parameters())
+    expect_bytes(path, count, sum(file.stat().st_size for file in (path, shared) if file is not None))
+
+
 def _read_tensors(path: Path) -> dict[str, Tensor]:
     """Return the tensors of a safetensors file by name."""
     try:
@@ -202,14 +225,31 @@ def read_torch_file(path: Path) -> Any:
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such weights file")
     try:
+        expect_stored(path)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # on files that it then refuses
-            return torch.load(path, map_location="cpu", weights_only=True)
+            content = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:  # torch names no set of errors for damaged files
         raise ValueError(
             f"{path}: expected a torch file of plain tensors, got one that is damaged or holds other Python objects, "
             f"which are never loaded ({type(error).__name__})"
         ) from error
+    _expect_plain_tensors(path, content)
+    return content
+
+
+def _expect_plain_tensors(path: Path, content: Any) -> None:
+    """Refuse a file with a tensor without values (of the device ``meta``), or one that is sparse or quantised."""
+    todo, seen = [content], set()
+    while todo:
+        value = todo.pop()
+        if isinstance(value, Tensor):
+            if value.is_meta or value.layout != torch.strided or value.is_quantized:
+                what = "one without values" if value.is_meta else f"one of {value.layout}, {value.dtype}"
+                raise ValueError(f"{path}: expected a torch file of plain tensors, got {what}")
+        elif isinstance(value, (Mapping, list, tuple)) and id(value) not in seen:
+            seen.add(id(value))
+            todo += value.values() if isinstance(value, Mapping) else value
 
 
 def load_parameters(net: nn.Module, tensors: Mapping[str, Tensor], path: Path, expected: str) -> None:

@@ -1,0 +1,29 @@
+"""Compose a configuration outside of a Hydra command."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import hydra
+from omegaconf import DictConfig
+
+from dsr.app.experiments import register_resolvers
+from dsr.app.schema import register
+
+
+def compose(name: str, overrides: Sequence[str], directories: Sequence[Path]) -> DictConfig:
+    """Compose a configuration.
+
+    Args:
+        name: without ``.yaml``.
+        overrides: as on the command line.
+        directories: those of :func:`dsr.utils.config_files.config_directories`.
+
+    """
+    register()
+    register_resolvers()
+    places = ",".join(f'"file://{directory.resolve()}"' for directory in directories[1:])
+    more = [f"hydra.searchpath=[{places}]"] if places else []
+    with hydra.initialize_config_dir(str(directories[0]), version_base="1.3"):
+        return hydra.compose(name, [*overrides, *more])

@@ -1,0 +1,66 @@
+"""What is left of a training that diverged: its last checkpoint, and a note so that it does not diverge again."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from dsr.utils.builder import ConfigError
+from dsr.utils.divergence import DivergenceError
+from dsr.utils.files import write_text
+from dsr.utils.limits import read_limited
+from dsr.utils.parsing import parse_json
+
+NOTE = "diverged.json"
+_ADVICE = (
+    "a lower trainer.learning_rate or trainer.clip, or a longer trainer.warmup, may help, with another output_dir or "
+    "overwrite=true"
+)
+
+
+def note_divergence(folder: Path, last: Path, identity: Mapping[str, Any], error: DivergenceError) -> ConfigError:
+    """Write down that a training diverged, and return the error that says what is left and what may help.
+
+    Args:
+        folder: the run's directory.
+        last: path of its last checkpoint, which need not exist.
+        identity: the run's, see :func:`dsr.app.run_directory.identity_of`.
+        error: the divergence.
+
+    """
+    step = _step_of(last)
+    kept = "it has no earlier checkpoint" if step is None else f"{last} of step {step} is kept"
+    write_text(folder / NOTE, json.dumps({"what": str(error), "identity": dict(identity)}, indent=1) + "\n")
+    return ConfigError(f"{folder}: the training {error}; {kept}; {_ADVICE}")
+
+
+def expect_no_divergence(folder: Path, identity: Mapping[str, Any]) -> None:
+    """Refuse a training that diverged before with the same settings, code and device, as it would again.
+
+    Raises:
+        ConfigError: it did.
+
+    """
+    note = folder / NOTE
+    try:
+        stored = parse_json(read_limited(note))
+        what, before = str(stored["what"]), stored["identity"]
+    except (OSError, ValueError, KeyError, TypeError):  # there is none, or not of this kind
+        return
+    if before == json.loads(json.dumps(dict(identity))):
+        raise ConfigError(
+            f"{folder}: the training {what}, and would again; {_ADVICE} (without {note} it goes on from its last "
+            "checkpoint)"
+        )
+
+
+def _step_of(checkpoint: Path) -> int | None:
+    """Return the step of a checkpoint, None if there is none."""
+    try:
+        return int(torch.load(checkpoint, map_location="cpu", weights_only=True)["global_step"])
+    except Exception:  # torch names no set of errors for damaged files
+        return None

@@ -1,0 +1,292 @@
+"""Ctrl-C and SIGTERM: a command ends within five seconds, in one line, with exit code 128 + the signal's number.
+
+Python turns SIGINT into an exception wherever the program happens to be: in an import, in a callback of the garbage
+collector, which drops it, or in a library that catches everything. SIGTERM ends it without a word. :func:`start`, which
+runs the commands, therefore installs a handler before anything else is imported:
+
+- While a command works (:func:`working`), the first signal raises KeyboardInterrupt, so that temporary files are
+  removed and worker processes stopped. Within :func:`deferred` it is only noted, so that a training can save its step.
+- If this has not ended the process after a few seconds, at a second signal, and at any other time, such as during
+  imports, the process ends at once. Files are replaced atomically, so only temporary ones are left, which a later run
+  removes.
+"""
+
+from __future__ import annotations
+
+import atexit
+import contextlib
+import importlib
+import os
+import select
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from types import FrameType
+from typing import Any, NoReturn
+
+MESSAGE = "interrupted; what is finished is kept, the same command goes on from there"
+"""The line of an interrupted command that has nothing more precise to say."""
+_SIGNALS = (signal.SIGINT, signal.SIGTERM)
+_GRACE = 4.0
+"""Seconds that an interrupted command has to end by itself."""
+_BETWEEN_LOOKS = 0.5
+"""Seconds between two looks of a worker after its parent."""
+_SHOW_CURSOR = b"\x1b[?25h"
+"""The control sequence of terminals that undoes what a progress display hides."""
+
+
+class Deferred:
+    """Tells whether a signal has come that was only noted.
+
+    Args:
+        message: the line that the process ends with if the signal is not acted upon in time.
+
+    """
+
+    def __init__(self, message: str) -> None:
+        self.message, self.requested = message, False
+
+    def note(self, number: int, _: FrameType | None) -> None:
+        """Note the first signal; the default handler applies to the second one."""
+        self.requested = True
+        signal.signal(number, signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL)
+
+
+class _State:
+    """What the handler knows of the process.
+
+    Attributes:
+        installed: whether the handler is that of the process.
+        numbers: the signals that are acted upon: not SIGINT in a shell's background job, which is started to ignore it.
+        working: whether a command is at work.
+        number: the signal that came; 0 for none.
+        handled: whether the handler has acted upon a signal.
+        deferred: what notes a signal; None if signals raise.
+        ending: held by the thread that ends the process.
+
+    """
+
+    installed = False
+    numbers: tuple[int, ...] = ()
+    working = False
+    number = 0
+    handled = False
+    deferred: Deferred | None = None
+    ending = threading.Lock()
+
+
+def start(module: str, function: str) -> NoReturn:
+    """Import a function, call it, and end the process with its exit code, or with that of an interruption.
+
+    Args:
+        module: dotted path of a module.
+        function: name of its function; it takes no arguments, and returns an exit code, or None for 0.
+
+    """
+    install()
+    code: object = 0
+    try:
+        code = getattr(importlib.import_module(module), function)()
+    except SystemExit as ending:
+        code = ending.code
+    except KeyboardInterrupt:
+        end(MESSAGE)
+    _State.working = False
+    if isinstance(code, str):
+        print(code, file=sys.stderr)  # noqa: T201 - as sys.exit does
+    _finish(code if isinstance(code, int) else int(code is not None))
+
+
+def install() -> None:
+    """Make the handler that of this process; only from its main thread."""
+    _State.installed = True
+    _State.numbers = tuple(number for number in _SIGNALS if signal.getsignal(number) != signal.SIG_IGN)
+    sys.unraisablehook = _unraisable
+    sys.warnoptions.append("ignore:resource_tracker")  # it warns on stderr of what it cleans up after a sudden end
+    os.register_at_fork(after_in_child=_forget)
+    reading, writing = os.pipe()
+    os.set_blocking(writing, False)
+    signal.set_wakeup_fd(writing, warn_on_full_buffer=False)
+    threading.Thread(target=_watch, args=(reading,), name="interruption", daemon=True).start()
+    reinstall()
+
+
+def reinstall() -> None:
+    """Install the handler again after a library has replaced it; without :func:`install` nothing happens."""
+    if _State.installed and threading.current_thread() is threading.main_thread():
+        for number in _State.numbers:
+            signal.signal(number, _handle)
+
+
+@contextlib.contextmanager
+def working() -> Iterator[None]:
+    """Within this context a signal raises KeyboardInterrupt, rather than ending the process at once."""
+    before, _State.working = _State.working, True
+    try:
+        yield
+    finally:
+        _State.working = before
+
+
+@contextlib.contextmanager
+def deferred(message: str) -> Iterator[Deferred]:
+    """Within this context the first signal is only noted; the code in it looks for it and ends by itself.
+
+    Where the handler is not that of the process, as in a notebook, the process is never ended.
+
+    Args:
+        message: the line that the process ends with if the signal is not acted upon in time.
+
+    """
+    noted, before = Deferred(message), {}
+    if _State.installed:
+        _State.deferred = noted
+        reinstall()
+    elif threading.current_thread() is threading.main_thread():
+        before = {number: signal.signal(number, noted.note) for number in _SIGNALS}
+    try:
+        yield noted
+    finally:
+        _State.deferred = None
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+@contextlib.contextmanager
+def starting_workers() -> Iterator[None]:
+    """Within this context started processes do not get SIGINT, which would meet them before :func:`end_with`."""
+    if not hasattr(signal, "pthread_sigmask"):
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def end_with(parent: int) -> None:
+    """End this process, a worker, once its parent is gone, and leave it to the parent to end it at Ctrl-C.
+
+    Args:
+        parent: number of the parent process.
+
+    """
+
+    def watch() -> None:
+        while os.getppid() == parent:
+            time.sleep(_BETWEEN_LOOKS)
+        os._exit(exit_code())
+
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=watch, daemon=True).start()
+
+
+def exit_code() -> int:
+    """Return the exit code of an interrupted command: 128 + the number of the signal that came, by default SIGINT."""
+    return 128 + (_State.number or signal.SIGINT)
+
+
+def stop(message: str) -> int:
+    """End an interrupted command that has cleaned up, with a line on stderr; in other processes return the exit code.
+
+    Args:
+        message: the line; empty for :data:`MESSAGE`.
+
+    """
+    if _State.installed:
+        end(message or MESSAGE)
+    print(message or MESSAGE, file=sys.stderr)  # noqa: T201
+    return exit_code()
+
+
+def end(message: str) -> NoReturn:
+    """End the process at once, and its worker processes, with a line on stderr."""
+    if not _State.ending.acquire(blocking=False):
+        threading.Event().wait()  # another thread is ending the process
+    with contextlib.suppress(BaseException):
+        if sys.stdout.isatty():
+            os.write(1, _SHOW_CURSOR)
+        os.write(2, f"{message}\n".encode())
+        _end_children()
+    os._exit(exit_code())
+
+
+def _message() -> str:
+    """Return the line of a process that has to end at once."""
+    return MESSAGE if _State.deferred is None else _State.deferred.message
+
+
+def _handle(number: int, frame: FrameType | None) -> None:
+    """Act upon a signal, in the main thread."""
+    again, _State.handled = _State.handled, True
+    _State.number = _State.number or number
+    if again or not _State.working or _in_import(frame):
+        end(_message())
+    if _State.deferred is None:
+        raise KeyboardInterrupt
+    _State.deferred.requested = True
+
+
+def _watch(pipe: int) -> None:
+    """End the process some seconds after a signal, or at a second one, whatever the main thread is busy with."""
+    signals = 0
+    while True:
+        if signals and not select.select([pipe], [], [], _GRACE)[0]:
+            end(_message())
+        number = os.read(pipe, 1)[0]
+        if number in _SIGNALS:
+            _State.number = _State.number or number
+            signals += 1
+            if signals > 1:
+                end(_message())
+
+
+def _unraisable(problem: Any) -> None:
+    """End the process if an interruption came where exceptions are dropped; else report as Python does."""
+    if issubclass(problem.exc_type, KeyboardInterrupt) and _State.number:
+        end(_message())
+    sys.__unraisablehook__(problem)
+
+
+def _in_import(frame: FrameType | None) -> bool:
+    """Return whether a module is being imported, which takes no exception."""
+    while frame is not None:
+        if frame.f_code.co_filename.startswith("<frozen importlib"):
+            return True
+        frame = frame.f_back
+    return False
+
+
+def _end_children() -> None:
+    """End the worker processes."""
+    processes = sys.modules.get("multiprocessing.process")
+    for child in [] if processes is None else processes.active_children():
+        with contextlib.suppress(OSError):
+            os.kill(child.pid, signal.SIGKILL)
+
+
+def _forget() -> None:
+    """Leave signals to the parent process, in a process that was forked from it; SIGTERM ends it."""
+    _State.installed = False
+    signal.set_wakeup_fd(-1)
+    sys.unraisablehook = sys.__unraisablehook__
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
+
+
+def _finish(code: int) -> NoReturn:
+    """End the process as the interpreter does, but without taking it down, when no signal could be answered."""
+    shut_down_threads: Callable[[], None] = vars(threading)["_shutdown"]
+    try:
+        shut_down_threads()
+        atexit._run_exitfuncs()
+        sys.stdout.flush()
+    except OSError as error:
+        print(f"error: standard output: {error.strerror}", file=sys.stderr)  # noqa: T201
+        code = code or 2
+    with contextlib.suppress(OSError):
+        sys.stderr.flush()
+    os._exit(code)

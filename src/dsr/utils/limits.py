@@ -1,0 +1,152 @@
+"""How much a file may make of itself in memory: sizes are read from headers and checked before any content is.
+
+A few kilobytes of compressed zeros declare gigabytes. What is allowed grows with what can explain it: a map's size with
+its photo's, otherwise the unpacked size with the size of the file. Real photos and maps stay far below.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import math
+import os
+import zipfile
+from collections.abc import Iterator
+from io import BufferedReader
+from pathlib import Path
+
+MOST_PIXELS = 1 << 27
+"""Largest number of pixels of a photo or map, 134 megapixels."""
+MOST_FILE = 1 << 30
+"""Largest size in bytes of a picture or map that is read at once."""
+MOST_TEXT = 1 << 24
+"""Largest size in bytes of JSON and text about a run, a result or a camera."""
+MOST_TABLE = 1 << 26
+"""Largest size in bytes of a table."""
+_PIXELS, _PIXELS_PER_BYTE = 1 << 25, 64
+"""Pixels that any file may have, and that each byte of a larger one explains; photos as JPEG have at most 20."""
+_UNPACKED, _RATIO = 1 << 28, 16
+"""Bytes that any archive of arrays may unpack to, and that each byte of a larger one explains."""
+_PER_PHOTO, _FLOOR = 4, 1 << 22
+"""Pixels of a map for each of its photo's, and pixels that any photo explains."""
+_CHUNK = 1 << 20
+
+
+class TooLargeError(ValueError):
+    """A file or what its header declares is larger than :mod:`dsr.utils.limits` allows."""
+
+
+def expect_pixels(place: str | Path, height: int, width: int, most: int = MOST_PIXELS) -> None:
+    """Check the size of a picture or map that its header declares.
+
+    Raises:
+        TooLargeError: it has more than ``most`` pixels; the message begins with ``place``.
+
+    """
+    if height * width > most:
+        raise TooLargeError(f"{place}: expected at most {most} pixels, got {width} x {height} (width x height)")
+
+
+def expect_bytes(place: str | Path, size: int, most: int) -> None:
+    """Check how many bytes something takes in memory, by what its header declares.
+
+    Raises:
+        TooLargeError: they are more than ``most``; the message begins with ``place``.
+
+    """
+    if size > most:
+        raise TooLargeError(f"{place}: expected at most {most} bytes, got {size}")
+
+
+def pixels_of_file(size: int) -> int:
+    """Return how many pixels a picture file of ``size`` bytes may have."""
+    return min(MOST_PIXELS, max(_PIXELS, _PIXELS_PER_BYTE * size))
+
+
+def pixels_beside(height: int, width: int) -> int:
+    """Return how many pixels a map may have that belongs to a photo or map of this size.
+
+    It is more than fits, so that the reader can tell the two sizes.
+    """
+    return min(MOST_PIXELS, max(_FLOOR, _PER_PHOTO * height * width))
+
+
+def bytes_of_archive(size: int) -> int:
+    """Return to how many bytes an archive of arrays of ``size`` bytes may unpack."""
+    return max(_UNPACKED, _RATIO * size)
+
+
+def array_bytes(shape: tuple[int, ...], itemsize: int) -> int:
+    """Return the size of an array, in Python's numbers, which do not overflow."""
+    return math.prod(map(int, shape)) * itemsize
+
+
+def read_limited(path: Path, most: int = MOST_TEXT) -> bytes:
+    """Return the content of a file of moderate size.
+
+    Raises:
+        OSError: there is no such file, or it is none (a folder, a pipe, a device), or it cannot be read.
+        TooLargeError: it is larger than ``most`` bytes.
+
+    """
+    with opened(path) as file:
+        expect_bytes(path, path.stat().st_size, most)
+        return file.read(most)
+
+
+@contextlib.contextmanager
+def opened(path: Path) -> Iterator[BufferedReader]:
+    """Return a context with a file that is open for reading.
+
+    Raises:
+        OSError: there is no such file, or it is none (a folder, a pipe that nobody writes to, a device), or it cannot
+            be read; it has the file's name.
+
+    """
+    if not path.is_file():
+        code = errno.EISDIR if path.is_dir() else errno.EINVAL if path.exists() else errno.ENOENT
+        raise OSError(code, os.strerror(code), str(path))
+    try:
+        with path.open("rb") as file:
+            yield file
+    except OSError as error:
+        if error.errno is None or error.filename is not None:
+            raise
+        raise OSError(error.errno, error.strerror, str(path)) from error
+
+
+def expect_stored(path: Path) -> None:
+    """Check that no member of a torch file is compressed or shared; torch writes none so.
+
+    Raises:
+        ValueError: one is, so that the file would take more memory than its size.
+
+    """
+    if not zipfile.is_zipfile(path):  # as of torch before version 1.6
+        return
+    with zipfile.ZipFile(path) as packed:
+        members = packed.infolist()
+    if any(member.compress_type != zipfile.ZIP_STORED for member in members):
+        raise ValueError(f"{path}: expected members that are not compressed")
+    expect_bytes(path, sum(member.file_size for member in members), path.stat().st_size)
+
+
+def read_member(packed: zipfile.ZipFile, name: str) -> bytes:
+    """Return a member of an archive, in no more memory than the size that the archive declares for it.
+
+    The caller checks that size. A member that unpacks to more, which :meth:`zipfile.ZipFile.read` unpacks whole before
+    it cuts it off, is damaged.
+
+    Raises:
+        zipfile.BadZipFile: it unpacks to less or more than declared, or to something else.
+
+    """
+    declared = packed.getinfo(name).file_size
+    parts, length = [], 0
+    with packed.open(name) as member:
+        while part := member.read(_CHUNK):
+            parts.append(part)
+            length += len(part)
+    if length != declared:
+        raise zipfile.BadZipFile(f"{name}: {length} bytes instead of {declared}")
+    return b"".join(parts)

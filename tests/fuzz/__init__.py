@@ -1,0 +1,1 @@
+"""Every reader of other people's files on damaged, foreign and malicious ones; ``make fuzz`` runs many cases."""

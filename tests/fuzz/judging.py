@@ -1,0 +1,219 @@
+"""One case: a reader on its files, and whether it ended as it must."""
+
+from __future__ import annotations
+
+import contextlib
+import gc
+import io
+import os
+import re
+import resource
+import signal
+import sys
+import tempfile
+import time
+import traceback
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from dsr.utils.console import one_line, printable
+from fuzz.guard import watching
+from fuzz.place import Place
+
+SECONDS, MEGABYTES = 20.0, 2000.0
+"""Limits of a case: seconds of computing, and memory."""
+_WAITING = 60.0
+"""Seconds that a case may take on a machine that does much else."""
+_LONGEST_LINE = 1000
+_SHORTEST_NAME = 3
+"""Names of fewer letters are found in any message."""
+_SILENT = (DeprecationWarning, PendingDeprecationWarning, ImportWarning, ResourceWarning)
+"""Warnings that Python does not show to users."""
+
+
+class RefusedError(Exception):
+    """A command that ended with exit code 2 and these lines on stderr."""
+
+    def __init__(self, lines: Sequence[str]) -> None:
+        super().__init__(" | ".join(lines))
+        self.lines = list(lines)
+
+
+class EscapedError(Exception):
+    """An exception that a command did not turn into a line, which would show a traceback; it is the cause."""
+
+
+class _TooLongError(BaseException):
+    """A case that did not end in time; no ``except Exception`` catches it."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How a case ended.
+
+    Args:
+        kind: with a value, with a refusal of a line for each problem, or neither.
+        text: the refusal, or what is wrong.
+        seconds: that it took.
+        megabytes: by which the memory grew at most.
+
+    """
+
+    kind: Literal["value", "refusal", "unclean"]
+    text: str
+    seconds: float
+    megabytes: float
+
+
+def judge(read: Callable[[Place], Any], place: Place, refusals: tuple[type[BaseException], ...]) -> Outcome:
+    """Run a reader on the files of a place.
+
+    Args:
+        read: the reader.
+        place: the folders of the case.
+        refusals: exceptions that the commands turn into a line.
+
+    """
+    names = _names(place)
+    before = _begin_memory()
+    started = time.process_time()
+    problems: list[str] = []
+    lines: list[str] = []
+    with (
+        _captured() as printed,
+        watching(place.input, place.out) as watch,
+        warnings.catch_warnings(record=True) as told,
+    ):
+        warnings.simplefilter("default")
+        try:
+            with _limited():
+                read(place)
+        except RefusedError as refusal:
+            lines = refusal.lines
+            problems += [] if lines else ["ends with exit code 2 without a line"]
+        except refusals as error:
+            lines = [one_line(error)]
+            problems += _of_chain(error)
+        except _TooLongError as error:
+            problems.append(f"takes longer than {SECONDS:g} s, or waits: {_where(error)}")
+        except BaseException as error:
+            cause = error.__cause__ or error if isinstance(error, EscapedError) else error
+            problems.append(f"{type(cause).__name__}: {str(cause)[:300]} {_where(cause)}")
+    seconds, megabytes = time.process_time() - started, _end_memory(before)
+    problems += [f"does what a reader must not: {each}" for each in watch.seen[:3]]
+    problems += [f"leaves {name!r} beside its folders" for name in place.strangers()]
+    problems += [f"warns: {each.message!s:.200}" for each in told if not issubclass(each.category, _SILENT)][:2]
+    problems += [f"prints {printed[0]:.200}"] if printed else []
+    problems += [f"takes {megabytes:.0f} MB"] if megabytes > MEGABYTES else []
+    for line in lines:
+        problems += _wrong_with(line, names)
+    if problems:
+        return Outcome("unclean", "; ".join(problems), seconds, megabytes)
+    return Outcome("refusal" if lines else "value", " | ".join(lines), seconds, megabytes)
+
+
+def _wrong_with(line: str, names: Sequence[str]) -> list[str]:
+    """Return what is wrong with the line of a refusal."""
+    problems = [f"a line of {len(line)} characters: {line[:200]}"] if len(line) > _LONGEST_LINE else []
+    if not any(name in line for name in names):
+        problems.append(f"names no file: {line[:300]}")
+    if line != printable(line) or "\n" in line:
+        problems.append(f"has characters that do not print: {line[:300]!r}")
+    return problems
+
+
+def _names(place: Place) -> list[str]:
+    """Return the names of the files and folders of a case, in which a refusal must find one."""
+    found = {place.input.name + "/", str(place.input), str(place.out)}
+    for folder, folders, files in os.walk(place.input):
+        found.update(name for name in (*folders, *files) if len(name) >= _SHORTEST_NAME)
+        found.update(Path(name).stem for name in files if len(Path(name).stem) >= _SHORTEST_NAME)
+        found.add(folder)
+    return sorted(found)
+
+
+def _of_chain(error: BaseException) -> list[str]:
+    """Return whether an error is only that there was no memory for what a file claims."""
+    seen: BaseException | None = error
+    while seen is not None:
+        if isinstance(seen, MemoryError):
+            return [f"refused only after asking for the memory that the file claims: {str(error)[:200]}"]
+        seen = seen.__cause__ or seen.__context__
+    return []
+
+
+def _where(error: BaseException) -> str:
+    """Return the last places of a traceback that are in dsr, and the last of all."""
+    frames = traceback.extract_tb(error.__traceback__)
+    ours = [each for each in frames if "/dsr/" in each.filename][-2:]
+    shown = [f"{Path(each.filename).name}:{each.lineno} {each.name}" for each in (*ours, *frames[-1:])]
+    return f"({', '.join(dict.fromkeys(shown))})"
+
+
+@contextlib.contextmanager
+def _limited() -> Iterator[None]:
+    """Raise in the block when it takes too long."""
+    limits = ((signal.SIGPROF, signal.ITIMER_PROF, SECONDS), (signal.SIGALRM, signal.ITIMER_REAL, _WAITING))
+
+    def late(*_: Any) -> None:
+        raise _TooLongError
+
+    before = [signal.signal(number, late) for number, _, _ in limits]
+    for _, timer, seconds in limits:
+        signal.setitimer(timer, seconds)
+    try:
+        yield
+    finally:
+        for (number, timer, _), handler in zip(limits, before, strict=True):
+            signal.setitimer(timer, 0)
+            signal.signal(number, handler)
+
+
+@contextlib.contextmanager
+def _captured() -> Iterator[list[str]]:
+    """Return the list of what libraries print on the file descriptors in the block; what Python prints is dropped."""
+    found: list[str] = []
+    sys.stdout.flush()
+    sys.stderr.flush()
+    with tempfile.TemporaryFile() as file:
+        kept = os.dup(1), os.dup(2)
+        os.dup2(file.fileno(), 1)
+        os.dup2(file.fileno(), 2)
+        try:
+            with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
+                yield found
+        finally:
+            for number, descriptor in enumerate(kept, 1):
+                os.dup2(descriptor, number)
+                os.close(descriptor)
+            file.seek(0)
+            text = file.read(4000).decode(errors="replace").strip()
+            found += [text] if text else []
+
+
+def _begin_memory() -> float:
+    """Forget the highest memory so far, and return the present one in MB."""
+    gc.collect(0)
+    with contextlib.suppress(OSError), open("/proc/self/clear_refs", "w") as file:  # noqa: PTH123 - Linux's
+        file.write("5")
+    return _status("VmRSS") or _highest()
+
+
+def _end_memory(before: float) -> float:
+    """Return by how many MB the memory grew at most."""
+    return max(0.0, (_status("VmHWM") or _highest()) - before)
+
+
+def _status(key: str) -> float:
+    """Return a figure of Linux in MB; 0 elsewhere."""
+    with contextlib.suppress(OSError), open("/proc/self/status") as file:  # noqa: PTH123 - Linux's
+        found = re.search(rf"{key}:\s+(\d+) kB", file.read())
+        return int(found[1]) / 1e3 if found else 0.0
+    return 0.0
+
+
+def _highest() -> float:
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3

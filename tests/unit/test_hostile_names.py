@@ -1,0 +1,156 @@
+"""Names that are formulas, commands or code come out of every file as the texts that they are."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import io
+import json
+import re
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from dsr.evaluation.run_files import load_results, read_run
+from dsr.report.correlation_figure import save_scatter_matrix
+from dsr.report.latex import latex_text
+from dsr.report.markup import escaped, to_csv, to_latex, to_markdown
+from dsr.report.paper_tables import build_tables
+from dsr.report.user_study import USER_COLUMNS, read_study
+from dsr.utils.console import print_error
+from dsr.utils.tables import guard, guarded, unguard, unguarded
+
+NAMES = (
+    "=cmd|' /C calc'!A0",
+    "+1",
+    "-0.5",
+    "@SUM(A1)",
+    "\tx",
+    "\rx",
+    "x\r=y",
+    "\nx",
+    "'=x",
+    "''-x",
+    "'",
+    "'x",
+    "plain",
+    "",
+    "é=",
+    "<script>alert(1)</script>",
+    "\\input{/etc/passwd}",
+    "`id`",
+    "a|b",
+    "$\\frac$",
+    "[2pt]",
+)
+HOSTILE = "=cmd|' \\input{/etc/passwd} `id` <script>alert(1)</script> $\\frac$"
+FORMULA = re.compile(r"^[=+\-@\t\r\n]")
+
+
+def cells(text):
+    """Return the cells of a CSV file that are no numbers."""
+    rows = csv.reader(io.StringIO(text, newline=""))
+    return [cell for row in rows for cell in row if not re.fullmatch(r"-?\d+(\.\d*)?(e[+-]?\d+)?", cell)]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_text_is_no_formula_and_is_read_as_it_was(name):
+    assert not FORMULA.match(guard(name))
+    assert unguard(guard(name)) == name
+
+
+@pytest.mark.parametrize("value", [-0.5, -1, float("nan"), None, np.float64(-2), True])
+def test_numbers_stay_as_they_are(value):
+    assert guard(value) is value
+    assert unguard(value) is value
+
+
+def test_table_is_written_without_formulas_and_read_as_it_was():
+    table = pd.DataFrame({"=name": NAMES, "value": -np.arange(len(NAMES)) - 0.5}, index=[f"@{name}" for name in NAMES])
+    text = guarded(table).to_csv(lineterminator="\n")
+    assert not [cell for cell in cells(text) if FORMULA.match(cell)]
+    assert "-0.5" in text
+    again = pd.read_csv(io.StringIO(text, newline=""), dtype={0: str, 1: str}, keep_default_na=False)
+    assert tuple(unguarded(again).iloc[:, 1]) == NAMES
+    assert list(again["value"]) == list(table["value"])
+    assert list(table.columns) == ["=name", "value"]  # the table itself is left alone
+
+
+@pytest.fixture
+def results(make_run, tmp_path):
+    """A run whose method, data set, scene and a metric have a hostile name."""
+    folder = make_run(tmp_path / "run", label=HOSTILE, method=HOSTILE, dataset=HOSTILE)
+    scene = HOSTILE.replace("/", "")
+    for kind in ("scenes", "predictions"):
+        (folder / kind / "cube_no_texture.npz").rename(folder / kind / f"{scene}.npz")
+    scores = pd.read_csv(folder / "scores.csv", keep_default_na=False)
+    scores["scene"] = scene
+    scores.loc[scores["metric"] == "Bumpiness_d", "metric"] = HOSTILE
+    guarded(scores).to_csv(folder / "scores.csv", index=False)
+    summary = json.loads((folder / "summary.json").read_text())
+    summary["seconds"] = {scene: 0.25}
+    summary["metrics"] = {HOSTILE: {"heading": HOSTILE, "unit": HOSTILE, "digits": 1}}
+    (folder / "summary.json").write_text(json.dumps(summary))
+    assert set(read_run(folder).scores["method"]) == {HOSTILE}
+    return load_results([folder])
+
+
+def test_tables_of_a_report_have_no_formula_command_or_tag(results):
+    for table in build_tables(results, None):
+        text = to_csv(table)
+        assert not [cell for cell in cells(text) if FORMULA.match(cell)]
+        assert f"'{HOSTILE}" in pd.read_csv(io.StringIO(text), dtype=str)["method"].tolist()
+        markdown = to_markdown(table)
+        assert "\\<script\\>" in markdown
+        assert not re.search(r"(?<!\\)[<`|](?=script|id|/script|\s*\\\\input)", markdown)
+        latex = to_latex(table)
+        assert "\\textbackslash{}input\\{/etc/passwd\\}" in latex
+        assert not re.search(r"\\input\b|\\frac\b|(?<!\\)\$\\textb", latex)
+        assert "/" not in table.name
+
+
+def test_markdown_rows_have_as_many_cells_as_the_head(results):
+    for table in build_tables(results, None):
+        for part in to_markdown(table).split("\n\n"):
+            lines = [line for line in part.splitlines() if line.startswith("|")]
+            assert len({len(re.findall(r"(?<!\\)\|", line)) for line in lines}) <= 1
+
+
+def test_latex_rows_do_not_begin_with_an_option(results):
+    [run] = results.runs
+    scene = run.scenes[0]
+    odd = dataclasses.replace(
+        run,
+        scenes=("[2pt]",),
+        scores=run.scores.assign(scene="[2pt]"),
+        seconds={"[2pt]": run.seconds[scene]},
+    )
+    tables = build_tables(dataclasses.replace(results, runs=(odd,)), None)
+    assert any("\n{}[2pt] & " in to_latex(table) for table in tables)
+    assert not any(re.search(r"(\\\\|rule)\s*[\[*]", to_latex(table)) for table in tables)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_no_name_is_a_command_of_latex_or_markdown(name):
+    assert not re.search(r"\\(?!textbackslash|textasci|textless|textgreater|textbar|[{}$&#%_])[a-z]", latex_text(name))
+    assert not re.search(r"(?<!\\)[`<>|]", escaped(name))
+
+
+def test_figures_show_names_that_look_like_formulas_of_tex(results, tmp_path):
+    more = dataclasses.replace(results.runs[0], label="$\\frac$ $x", folder=results.runs[0].folder)
+    both = dataclasses.replace(results, runs=(results.runs[0], more))
+    assert all(path.stat().st_size > 1000 for path in save_scatter_matrix(tmp_path / "figures", both))
+
+
+def test_study_is_read_with_its_names(tmp_path):
+    shares = dict.fromkeys(USER_COLUMNS, 50.0)
+    about = {"dataset": "-1", "scene": "@x", "scale": 4, "downsampling": "box", "label": HOSTILE}
+    (tmp_path / "study.csv").write_text(guarded(pd.DataFrame([{**about, **shares}])).to_csv(index=False))
+    assert not [cell for cell in cells((tmp_path / "study.csv").read_text()) if FORMULA.match(cell)]
+    assert read_study(tmp_path / "study.csv").iloc[0][[*about]].to_dict() == about
+
+
+def test_message_has_no_characters_that_control_a_terminal(capsys):
+    print_error("a\x1b]0;title\x07b\x9bc\nd")
+    assert capsys.readouterr().err == "error: a#]0;title#b#c d\n".replace("#", "\N{REPLACEMENT CHARACTER}")
