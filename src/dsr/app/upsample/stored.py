@@ -17,7 +17,7 @@ from dsr.app.upsample.outputs import ERRORS, INFO, METRES
 from dsr.evaluation.store import load_errors
 from dsr.geometry.camera import Camera
 from dsr.io.input_files import INPUT, read_input
-from dsr.sample import FARTHEST, NEAREST, expect_distances
+from dsr.sample import expect_distances
 from dsr.utils.files import array_headers, open_array
 from dsr.utils.limits import read_limited
 from dsr.utils.parsing import is_number, parse_json
@@ -155,7 +155,7 @@ def read_depth(folder: Path, camera: Camera) -> np.ndarray:
             raise ValueError(f"{path}: expected float32 of shape {size}, the photo's, got {text}")
         if min(size) < 2:
             raise ValueError(f"{path}: expected a map of at least 2 x 2 pixels, got {size}")
-        depth = np.where((stored >= NEAREST) & (stored <= FARTHEST), stored, np.float32(math.nan))
+        depth = np.where(np.isfinite(stored) & (stored > 0), stored, np.float32(math.nan))
         if not np.isfinite(depth).any():
             raise ValueError(f"{path}: expected depths, all pixels are holes")
         expect_distances(str(path), torch.from_numpy(depth))
