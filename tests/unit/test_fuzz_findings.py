@@ -1,0 +1,119 @@
+"""Files that the fuzz campaign found to end in a traceback, in gigabytes or in no answer; each once more, quickly."""
+
+import io
+import struct
+import tracemalloc
+import zipfile
+import zlib
+from unittest.mock import Mock
+
+import captures
+import cv2
+import numpy as np
+import pytest
+import scipy.io
+
+from dsr.data.download.unpack import unpack
+from dsr.data.formats.tofmark import read_matrices
+from dsr.io.captures.arkitscenes import find_arkitscenes
+from dsr.io.captures.stray import find_stray
+from dsr.io.photos import read_photo
+from dsr.methods.registry import read_method
+from dsr.user_study.answers import files_of
+from dsr.utils.builder import ConfigError
+from dsr.utils.files import open_array
+from dsr.utils.picture_headers import picture_size
+
+
+def png_chunk(kind, content, length=None):
+    size = struct.pack(">I", len(content) if length is None else length)
+    return size + kind + content + struct.pack(">I", zlib.crc32(kind + content))
+
+
+def png(*between):
+    encoded = cv2.imencode(".png", np.full((48, 64, 3), 90, np.uint8))[1].tobytes()
+    end_of_header = 8 + 12 + 13
+    return encoded[:end_of_header] + b"".join(between) + encoded[end_of_header:]
+
+
+def test_png_with_a_long_text_is_read_and_one_that_claims_gigabytes_is_not(tmp_path):
+    sound = png(png_chunk(b"tEXt", b"comment\0" + b"x" * 5000))
+    assert picture_size(io.BytesIO(sound)).height == 48
+    claiming = png(png_chunk(b"tEXt", b"comment\0x", length=0x7FFFFFFF))
+    assert picture_size(io.BytesIO(claiming)) is None
+    path = tmp_path / "photo.png"
+    path.write_bytes(claiming)
+    with pytest.raises(ValueError, match=r"photo\.png"):
+        read_photo(path, (12, 16))
+
+
+def test_loop_of_links_among_answers_is_one_file_and_no_error(tmp_path):
+    (tmp_path / "a.json").symlink_to(tmp_path / "b.json")
+    (tmp_path / "b.json").symlink_to(tmp_path / "a.json")
+    (tmp_path / "c.json").write_text("{}")
+    assert tmp_path / "c.json" in files_of([tmp_path])
+
+
+@pytest.mark.parametrize("time", ["nan", "inf", "x", "1_0_"])
+def test_trajectory_at_a_time_that_is_no_number_is_refused(tmp_path, time):
+    captures.arkitscenes(tmp_path)
+    path = tmp_path / "lowres_wide.traj"
+    lines = path.read_text().splitlines()
+    lines[0] = " ".join([time, *lines[0].split()[1:]])
+    path.write_text("\n".join(lines))
+    with pytest.raises(ValueError, match=r"lowres_wide\.traj: line 1: expected 7 numbers, got"):
+        find_arkitscenes(tmp_path)
+
+
+def test_odometry_with_a_field_longer_than_a_table_may_have_is_refused(tmp_path):
+    captures.stray(tmp_path)
+    path = tmp_path / "odometry.csv"
+    path.write_text(path.read_text() + "x" * 200_000 + "\n")
+    with pytest.raises(ValueError, match=r"odometry\.csv: expected a table of .*field larger than field limit"):
+        find_stray(tmp_path)
+
+
+def test_zip_whose_member_lies_before_its_start_is_a_damaged_archive(tmp_path):
+    packed = io.BytesIO()
+    with zipfile.ZipFile(packed, "w") as file:
+        file.writestr("depth.png", b"x" * 100)
+    content = bytearray(packed.getvalue())
+    place = len(content) - 22 + 16  # of the directory's offset, which zipfile subtracts from the members'
+    struct.pack_into("<L", content, place, struct.unpack_from("<L", content, place)[0] + 50)
+    path = tmp_path / "data.zip"
+    path.write_bytes(content)
+    with pytest.raises(ValueError, match=r"data\.zip: expected an archive, got a damaged one: .*Invalid argument"):
+        unpack(path, tmp_path / "out", Mock())
+    assert not (tmp_path / "out").exists()
+
+
+def test_number_of_5000_digits_in_the_file_of_a_method_is_refused(tmp_path):
+    (tmp_path / "method").mkdir()
+    (tmp_path / "method" / "bad.yaml").write_text("iterations: 1" + "0" * 5000)
+    with pytest.raises(ConfigError, match=r"bad\.yaml: ") as caught:
+        read_method("bad", 4, directories=[tmp_path])
+    assert len(str(caught.value)) < 1000
+
+
+@pytest.mark.parametrize("shape", ["(9223372036854775807, 2)", "(-5, 4)", "(4294967296, 4294967296)", "(1e3,)", "(("])
+def test_array_of_a_shape_that_no_file_has_is_refused_without_its_memory(tmp_path, shape):
+    header = f"{{'descr': '<f4', 'fortran_order': False, 'shape': {shape}, }}"
+    path = tmp_path / "depth.npy"
+    path.write_bytes(b"\x93NUMPY\x01\x00" + struct.pack("<H", len(header) + 1) + header.encode() + b"\n" + b"\0" * 64)
+    tracemalloc.start()
+    try:
+        with pytest.raises(ValueError, match=r"depth\.npy: expected an array, got a damaged or foreign file"):
+            open_array(path)
+        assert tracemalloc.get_traced_memory()[1] < 5 << 20
+    finally:
+        tracemalloc.stop()
+
+
+def test_intensities_beyond_float32_in_a_file_of_tofmark_are_refused_in_one_line(tmp_path, recwarn):
+    path = tmp_path / "scene.mat"
+    picture = np.full((64, 64), 1e300)
+    scipy.io.savemat(path, {"intensity": picture, "depth": np.full((64, 64), 2.0), "samples": np.eye(64)})
+    with pytest.raises(ValueError, match=r"scene\.mat: ") as caught:
+        read_matrices(path)
+    assert "\n" not in str(caught.value)
+    assert not recwarn.list
