@@ -278,6 +278,7 @@ def without_chatter() -> Iterator[None]:
             warnings.filterwarnings("ignore", ".*sync_dist=True.*")  # metrics are the same on every device
             for resumed in ("exists and is not empty", "that ended before the epoch ended", "dirpath has changed"):
                 warnings.filterwarnings("ignore", f".*{resumed}.*")
+            warnings.filterwarnings("ignore", ".*`srun` command is available.*")  # a sweep's or a login node's Slurm
             warnings.filterwarnings("ignore", ".*LeafSpec.*", FutureWarning)
             warnings.filterwarnings("ignore", ".*LeafSpec.*", DeprecationWarning)
             yield
