@@ -13,6 +13,8 @@ import yaml
 
 from fuzz import values
 
+_LONGEST = 256 << 20
+"""Characters of a line that is made longer, and of all lines that are added."""
 _HOLE = "\ue000hole\ue000"
 _NUMBER = re.compile(r"[-+]?\d+(?:\.\d*)?(?:[eE][-+]?\d+)?")
 _YAML = (
@@ -144,10 +146,12 @@ def _lines(random: Random, text: str, _: Path) -> bytes:
         lines[at] = lines[at][: random.randrange(len(lines[at]) + 1)]
     elif kind == 4:
         lines = lines[:at]
-    elif kind == 5:
-        lines[at] = lines[at] * 2000
-    else:
-        lines[at:at] = [lines[at]] * 3000
+    else:  # a long line, or many lines, within what a worker can hold
+        fits = max(2, _LONGEST // (len(lines[at]) + 1))
+        if kind == 5:
+            lines[at] = lines[at] * min(2000, fits)
+        else:
+            lines[at:at] = [lines[at]] * min(3000, fits)
     return "\n".join(lines).encode(errors="replace")
 
 
