@@ -27,6 +27,7 @@ examples:
   dsr upsample recordings --with nerfstudio,open3d -o out
   dsr upsample --rgb photo.jpg --depth depth.png --depth-camera ir.json --extrinsics ir_to_rgb.txt -o out
   dsr upsample recording --poses groundtruth.txt --neighbours 4 -o out
+  dsr upsample recordings --shard 3/16 -o out    the third of 16 parts, for a task of an array
   dsr upsample recordings --dry-run -o out       what would be done, and what would be assumed
 
 The results of a single pair are in OUT, those of several in OUT/NAME: depth.* as the input is stored, depth_metres.npy,
@@ -57,6 +58,15 @@ def add(commands: Any) -> None:
     what.add_argument(
         "--confidence", nargs="+", type=Path, default=[], metavar="MAP", help="confidence maps, or a folder of them"
     )
+    what.add_argument(
+        "--shard",
+        metavar="K/N",
+        help="only the K-th of N blocks of the frames, for a task of an array; see docs/sequences.md",
+    )
+    what.add_argument(
+        "--manifest", type=Path, metavar="FILE", help="list of frames instead of FOLDER; written if --shards is given"
+    )
+    what.add_argument("--shards", type=int, metavar="N", help="only list the frames for N shards in --manifest FILE")
     _add_reading(parser)
     _add_method(parser)
     _add_results(parser)
@@ -221,6 +231,7 @@ def _run(options: argparse.Namespace, console: Console, _: object) -> list[str]:
     from dsr.io.cameras import CameraChoice  # noqa: PLC0415 - they take seconds to import
     from dsr.io.encoding import SUNRGBD_BITS, parse_unit  # noqa: PLC0415
     from dsr.io.inputs import Reading  # noqa: PLC0415
+    from dsr.io.shards import parse_shard  # noqa: PLC0415
 
     intrinsics = None if options.intrinsics is None else tuple(options.intrinsics)
     unit = None if options.depth_unit is None else parse_unit(options.depth_unit)
@@ -261,6 +272,9 @@ def _run(options: argparse.Namespace, console: Console, _: object) -> list[str]:
         depth_format=options.format,
         max_faces=options.max_faces,
         max_points=options.max_points,
+        shard=None if options.shard is None else parse_shard(options.shard),
+        manifest=options.manifest,
+        shards=options.shards,
         workers=options.workers,
         register=options.register,
         neighbours=options.neighbours,

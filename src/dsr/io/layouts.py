@@ -16,10 +16,12 @@ from dsr.io.depth_files import DEPTH_SUFFIXES
 from dsr.io.encoding import Assumption
 from dsr.io.names import match_times, role_of, role_of_words, words_of
 from dsr.io.pairs import (
+    Origin,
     Pair,
     PairingResult,
     find_camera_file,
     find_pairs_of_two_folders,
+    has_pictures,
     list_pictures,
     make_names_unique,
     match_pairs,
@@ -49,9 +51,7 @@ def find_pairs_of_folder(folder: Path, leave: Path | None = None) -> PairingResu
 
     """
     if folder.is_file():
-        single = find_capture(folder)
-        if single is None:
-            raise ValueError(f"{folder}: expected a folder, or a capture as {', '.join(CAPTURE_FILES)}")
+        single = find_pairs_at(folder)
         return replace(single, pairs=make_names_unique(single.pairs))
     if not folder.is_dir():
         raise ValueError(f"{folder}: expected a folder of photos and depth maps, there is none")
@@ -64,14 +64,9 @@ def find_pairs_of_folder(folder: Path, leave: Path | None = None) -> PairingResu
 
 def _search(folder: Path, root: Path, leave: Path | None, depth: int) -> PairingResult:
     """Return the pairs in a folder or, if there are none, those in its subfolders."""
-    capture = find_capture(folder)
-    if capture is not None and capture.pairs:
-        return capture
-    for layout in (_scene, _tum, _role_folders, _side_by_side):
-        found = add_trajectory(folder, layout(folder))
-        if found.pairs:
-            camera = find_camera_file(folder, root)
-            return replace(found, pairs=tuple(replace(pair, camera=pair.camera or camera) for pair in found.pairs))
+    found = find_pairs_at(folder, root)
+    if found.pairs:
+        return found
     deeper = [
         (path, _search(path, root, leave, depth + 1))
         for path in sorted(folder.iterdir())
@@ -85,6 +80,44 @@ def _search(folder: Path, root: Path, leave: Path | None, depth: int) -> Pairing
     assumptions = tuple(dict.fromkeys(assumption for _, below in deeper for assumption in below.assumptions))
     unpaired = (*found.unpaired, *(path for _, below in deeper for path in below.unpaired))
     return PairingResult(tuple(pairs), assumptions, unpaired)
+
+
+def find_pairs_at(place: Path, root: Path | None = None) -> PairingResult:
+    """Return the pairs of a capture or a folder, without those in subfolders of a folder that has none itself.
+
+    Args:
+        place: a folder, or a capture's file.
+        root: folder up to which a camera file is searched; None for the folder itself.
+
+    Raises:
+        ValueError: it is a file and no capture.
+
+    """
+    capture = find_capture(place)
+    if capture is not None and (capture.pairs or place.is_file()):
+        return _with_origin(place, capture)
+    if place.is_file():
+        raise ValueError(f"{place}: expected a folder, or a capture as {', '.join(CAPTURE_FILES)}")
+    found = PairingResult(())
+    for layout in (_scene, _tum, _role_folders, _side_by_side):
+        found = add_trajectory(place, layout(place))
+        if found.pairs:
+            camera = find_camera_file(place, root or place)
+            if camera is not None and any(pair.camera is None for pair in found.pairs):
+                pairs = tuple(replace(pair, camera=pair.camera or camera) for pair in found.pairs)
+                found = replace(found, pairs=pairs)
+            break
+    return _with_origin(place, found)
+
+
+def _with_origin(place: Path, found: PairingResult) -> PairingResult:
+    """Return pairs of which those of a capture know where they were found."""
+    if all(pair.capture is None for pair in found.pairs):
+        return found
+    pairs = tuple(
+        pair if pair.capture is None else replace(pair, origin=Origin(place, pair.name)) for pair in found.pairs
+    )
+    return replace(found, pairs=pairs)
 
 
 def _scene(folder: Path) -> PairingResult:
@@ -112,7 +145,8 @@ def _tum(folder: Path) -> PairingResult:
     photos, depths = (_timed(path) for path in lists)
     partner = match_times(photos, depths)
     pairs = tuple(Pair(path.stem, path, partner[path], unit=_TUM_UNIT) for path in photos if path in partner)
-    unpaired = [path for path in (*photos, *depths) if path not in partner and path not in partner.values()]
+    used = {*partner, *partner.values()}
+    unpaired = [path for path in (*photos, *depths) if path not in used]
     return PairingResult(pairs, (Assumption("rgb.txt and depth.txt of TUM RGB-D: depth in 1/5000 m"),), tuple(unpaired))
 
 
@@ -135,7 +169,7 @@ def _role_folders(folder: Path) -> PairingResult:
     named: dict[str, list[Path]] = {"rgb": [], "depth": [], "other": []}
     for path in sorted(folder.iterdir(), key=lambda path: (len(path.name), path.name)):
         role = role_of_words(words_of(path.name)) if path.is_dir() else None
-        if role is not None and list_pictures(path):
+        if role is not None and has_pictures(path):
             named[role].append(path)
     if not named["rgb"] or not named["depth"]:
         return PairingResult(())

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import os
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import NamedTuple
 
 from dsr.io.confidence import CONFIDENCE_SUFFIXES, ConfidenceMap, find_highest
 from dsr.io.depth_files import READ_SUFFIXES
@@ -16,6 +19,14 @@ CAMERA_NAMES = (
     "camera.json", "intrinsics.json", "intrinsic.json", "camera_intrinsic.json", "camera_primesense.json",
     "intrinsic_color.txt", "intrinsics.txt", "intrinsic.txt",
 )  # fmt: skip
+_SUFFIXES = frozenset((*PHOTO_SUFFIXES, *READ_SUFFIXES))
+
+
+class Origin(NamedTuple):
+    """Where a frame of a capture is found: the capture's folder or file, and the frame's name in it."""
+
+    place: Path
+    name: str
 
 
 @dataclass(frozen=True)
@@ -30,6 +41,7 @@ class Pair:
         unit: metres per value if the layout defines it.
         factor: upsampling factor if the file's name has it, as in ``depth_lr4.npy``.
         capture: what the capture that the pair is of says about it; None if it is of none.
+        origin: where such a pair is found, and its name there; None if the files alone say everything.
         confidence: where its confidence map is; None for none.
 
     """
@@ -42,6 +54,7 @@ class Pair:
     unit: float | None = None
     factor: int | None = None
     capture: CaptureFrame | None = field(default=None, compare=False)
+    origin: Origin | None = field(default=None, compare=False)
     confidence: ConfidenceMap | None = field(default=None, compare=False)
 
 
@@ -109,14 +122,13 @@ def find_pairs_of_two_folders(photos: Path, depths: Path, masks: Sequence[Path])
         raise ValueError("--mask: expected photos and depth maps as files, one for each mask; got folders")
     left = [path for path in list_pictures(photos) if path.suffix.lower() in PHOTO_SUFFIXES]
     right = [path for path in list_pictures(depths) if path.suffix.lower() in READ_SUFFIXES]
-    found = match_pairs(left, right)
+    found = match_pairs(left, right, find_camera_file(photos, photos.parent))
     if not found.pairs:
         raise ValueError(
             f"{photos} and {depths}: expected photos and depth maps of the same names, numbers or times (within 20 "
             f"ms); of {len(left)} and {len(right)} none belong together"
         )
-    camera = find_camera_file(photos, photos.parent)
-    return replace(found, pairs=tuple(replace(pair, camera=camera) for pair in found.pairs))
+    return found
 
 
 def find_camera_file(folder: Path, root: Path) -> Path | None:
@@ -128,13 +140,13 @@ def find_camera_file(folder: Path, root: Path) -> Path | None:
     return next((place / name for place in places for name in CAMERA_NAMES if (place / name).is_file()), None)
 
 
-def match_pairs(photos: Iterable[Path], depths: Iterable[Path]) -> PairingResult:
-    """Return the pairs among photos and depth maps by name; see :func:`dsr.io.names.match_names`."""
+def match_pairs(photos: Iterable[Path], depths: Iterable[Path], camera: Path | None = None) -> PairingResult:
+    """Return the pairs among photos and depth maps by name, all of one camera; see :func:`dsr.io.names.match_names`."""
     photos, depths = list(photos), list(depths)
     matches = match_names(photos, depths)
     used = {path for match in matches for path in match}
     unpaired = tuple(path for path in (*photos, *depths) if path not in used)
-    return PairingResult(tuple(Pair(rgb.stem, rgb, depth) for rgb, depth in matches), (), unpaired)
+    return PairingResult(tuple(Pair(rgb.stem, rgb, depth, camera) for rgb, depth in matches), (), unpaired)
 
 
 def add_confidence(pairs: Sequence[Pair], given: Sequence[Path]) -> tuple[Pair, ...]:
@@ -182,24 +194,40 @@ def _match_confidence(pairs: Sequence[Pair], folder: Path) -> list[Path]:
 
 def list_pictures(folder: Path) -> list[Path]:
     """Return the pictures and maps in a folder."""
-    suffixes = (*PHOTO_SUFFIXES, *READ_SUFFIXES)
-    return sorted(
-        path for path in folder.iterdir()
-        if path.is_file() and path.suffix.lower() in suffixes and not path.name.startswith(".")
-    )  # fmt: skip
+    with os.scandir(folder) as entries:  # knows files from folders without asking for each
+        names = sorted(entry.name for entry in entries if _is_picture(entry))
+    return [folder / name for name in names]
+
+
+def has_pictures(folder: Path) -> bool:
+    """Return whether there is a picture or map in a folder."""
+    with os.scandir(folder) as entries:
+        return any(_is_picture(entry) for entry in entries)
+
+
+def _is_picture(entry: os.DirEntry[str]) -> bool:
+    """Return whether an entry of a folder is a picture or map."""
+    suffix = os.path.splitext(entry.name)[1]  # noqa: PTH122 - a folder may have a million
+    if suffix.lower() not in _SUFFIXES or entry.name.startswith("."):
+        return False
+    try:
+        return entry.is_file()
+    except OSError:  # a link to itself
+        return False
 
 
 def make_names_unique(pairs: Iterable[Pair]) -> tuple[Pair, ...]:
     """Return the pairs under names of their own: that of the folder in front where two are the same, else a number."""
     pairs = list(pairs)
     names = [pair.name for pair in pairs]
-    if len(set(names)) < len(names):
-        names = [f"{pair.rgb.parent.name}_{name}" if names.count(name) > 1 else name
+    counts = Counter(names)
+    if len(counts) < len(names):
+        names = [f"{pair.rgb.parent.name}_{name}" if counts[name] > 1 else name
                  for pair, name in zip(pairs, names, strict=True)]  # fmt: skip
     unique: dict[str, Pair] = {}
     for pair, name in zip(pairs, names, strict=True):
         number, own = 2, name
         while own.casefold() in unique:
             number, own = number + 1, f"{name}_{number}"
-        unique[own.casefold()] = replace(pair, name=own)
+        unique[own.casefold()] = pair if pair.name == own else replace(pair, name=own)
     return tuple(unique.values())

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator, Sequence
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -23,12 +24,14 @@ class FolderUnits:
     The guess depends on the pairs alone, not on their order, nor on which of them were read or finished before.
 
     Args:
-        pairs: all pairs that are worked on.
+        pairs: all pairs of the folder, which are iterated over if ``firsts`` do not decide.
+        firsts: the first pair by name of each folder and suffix.
 
     """
 
-    def __init__(self, pairs: Iterable[Pair] = ()) -> None:
-        self._pairs = sorted(pairs, key=lambda pair: (pair.depth.name, pair.name))
+    def __init__(self, pairs: Iterable[Pair] = (), firsts: Sequence[Pair] = ()) -> None:
+        self._all, self._firsts = pairs, firsts
+        self._pairs: list[Pair] | None = None
         self._units: dict[Kind, tuple[float, list[Assumption]]] = {}
 
     def guess(
@@ -54,7 +57,7 @@ class FolderUnits:
 
     def _first(self, kind: Kind, hole_value: float | None) -> tuple[Path, np.ndarray, np.ndarray] | None:
         """Return the first map of a kind that has a known pixel, and its holes."""
-        for pair in self._pairs:
+        for pair in chain(self._firsts, self._in_order()):
             if (pair.depth.parent, pair.depth.suffix.lower()) != kind[:2]:
                 continue
             try:
@@ -65,6 +68,17 @@ class FolderUnits:
             if _kind(pair, stored) == kind and not holes.all():
                 return pair.depth, stored, holes
         return None
+
+    def _in_order(self) -> Iterator[Pair]:
+        """Yield all pairs by name."""
+        if self._pairs is None:
+            self._pairs = sorted(self._all, key=order_of_maps)
+        yield from self._pairs
+
+
+def order_of_maps(pair: Pair) -> tuple[str, str]:
+    """Return the key by which the maps of a folder are looked at for their unit."""
+    return pair.depth.name, pair.name
 
 
 def read_values_of(pair: Pair) -> np.ndarray:

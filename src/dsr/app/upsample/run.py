@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
+import json
+import time
 from collections import Counter
-from dataclasses import replace
 from pathlib import Path
 
 from rich.console import Console
 
+from dsr.app.upsample.frames import Frames, find_frames
 from dsr.app.upsample.reporting import Reporter, listed
 from dsr.app.upsample.request import UpsampleRequest
 from dsr.app.upsample.scene import write_scene
 from dsr.app.upsample.workers import work_through
-from dsr.io.layouts import find_pairs_of_folder
-from dsr.io.pairs import PairingResult, add_confidence, find_pairs_of_lists
+from dsr.io.manifest import write_manifest
+from dsr.io.shards import Shard
 from dsr.utils.console import ConsoleProgress, show
+from dsr.utils.files import write_text
 
 
 def run(request: UpsampleRequest, console: Console) -> list[str]:
@@ -31,24 +34,25 @@ def run(request: UpsampleRequest, console: Console) -> list[str]:
         ValueError: the pairs cannot be determined.
 
     """
-    found = _find(request)
-    if request.confidence:
-        found = replace(found, pairs=add_confidence(found.pairs, request.confidence))
-    single = len(found.pairs) == 1 and not request.folders and not request.rgb[0].is_dir()
-    _show_found(console, found)
+    frames = find_frames(request)
+    if request.shards is not None and request.manifest is not None:
+        _write_manifest(request, request.manifest, frames, console)
+        return []
+    started = time.perf_counter()
+    found, single = frames.found, frames.single
+    _show_found(console, request, frames)
     reporter, progress = Reporter(console), ConsoleProgress(console)
-    jobs = [(pair, request.output if single else request.output / pair.name) for pair in found.pairs]
     problems: dict[str, list[str]] = {}
     outcomes: Counter[str] = Counter()
     targets: dict[str, Path] = {}
     scene_problems: list[str] = []
-    for done in work_through(request, jobs, reporter, progress):
+    for done in work_through(request, frames, reporter, progress):
         if done.problem is None:
             outcomes[done.outcome] += 1
             targets[done.pair.name] = done.target
         else:
             problems.setdefault(done.problem, []).append(done.pair.name)
-    if targets and request.scene_parts and not request.dry_run:
+    if targets and request.scene_parts and not request.dry_run and request.shard is None:
         scene = write_scene(request.output, targets, request.scene_parts, overwrite=request.overwrite)
         for part, path in scene.files.items():
             reporter.say(f"{part}: {len(targets)} frames -> {path}")
@@ -57,40 +61,62 @@ def run(request: UpsampleRequest, console: Console) -> list[str]:
         reporter.summary(outcomes["done"] + outcomes["to do"])
         counts = [f"{count} {outcome}" for outcome, count in outcomes.items()]
         counts += [f"{sum(map(len, problems.values()))} failed"] if problems else []
+        counts = counts or ["nothing to do"]
         pictures = "1 picture" if len(found.pairs) == 1 else f"{len(found.pairs)} pictures"
         show(console, f"{pictures}: {', '.join(counts)} -> {request.output}")
+    if request.shard is not None and not request.dry_run:
+        _write_summary(request.output, request.shard, outcomes, problems, time.perf_counter() - started)
     lines = [f"{listed(names)}: {message}" if len(found.pairs) > 1 else message for message, names in problems.items()]
     return lines + scene_problems
 
 
-def _find(request: UpsampleRequest) -> PairingResult:
-    """Return the pairs."""
-    if not request.folders:
-        return find_pairs_of_lists(request.rgb, request.depth, request.mask)
-    parts = [find_pairs_of_folder(folder, request.output) for folder in request.folders]
-    if len(parts) == 1:
-        return parts[0]
-    pairs = [
-        replace(pair, name=f"{folder.resolve().name}/{pair.name}")
-        for folder, part in zip(request.folders, parts, strict=True)
-        for pair in part.pairs
-    ]
-    if len({pair.name for pair in pairs}) < len(pairs):
-        raise ValueError("expected folders of different names; give those of one name in commands of their own")
-    facts = tuple(dict.fromkeys(fact for part in parts for fact in part.assumptions))
-    return PairingResult(tuple(pairs), facts, tuple(path for part in parts for path in part.unpaired))
+def _write_manifest(request: UpsampleRequest, path: Path, frames: Frames, console: Console) -> None:
+    """Write a manifest."""
+    count = request.shards or 1
+    if frames.single:
+        raise ValueError("--manifest: expected several frames, got a single photo")
+    if path.exists() and not request.overwrite:
+        raise ValueError(f"{path}: is there already, and shards may depend on it; --overwrite replaces it")
+    for line in _described(frames):
+        show(console, line)
+    if not request.dry_run:
+        write_manifest(path, frames.found, count)
+        shards = "1 shard" if count == 1 else f"{count} shards"
+        show(console, f"{frames.total} frames for {shards} -> {path}")
 
 
-def _show_found(console: Console, found: PairingResult) -> None:
-    """Show how many pairs there are, and which files have no partner."""
-    count = len(found.pairs)
+def _write_summary(
+    output: Path, shard: Shard, outcomes: Counter[str], problems: dict[str, list[str]], seconds: float
+) -> None:
+    """Write how many frames of a shard have which outcome, and those that failed, into the folder of the results."""
+    failed = [{"problem": problem, "frames": names} for problem, names in problems.items()]
+    summary = {"shard": str(shard), "outcomes": outcomes, "failed": failed, "seconds": round(seconds, 3)}
+    write_text(output / f"shard-{shard.number}-of-{shard.count}.json", json.dumps(summary, indent=2) + "\n")
+
+
+def _show_found(console: Console, request: UpsampleRequest, frames: Frames) -> None:
+    """Show how many pairs there are, and which of them a shard works on."""
+    lines = _described(frames)
+    if request.shard is not None:
+        block = request.shard.block(frames.total)
+        which = f"frames {block.start + 1} to {block.stop}" if block else "no frame"
+        lines.append(f"shard {request.shard}: {which} of {frames.total}")
+        if request.scene_parts:
+            lines.append(f"  {', '.join(request.scene_parts)}: of all frames, by the same command without --shard")
+    for line in lines:
+        show(console, line)
+
+
+def _described(frames: Frames) -> list[str]:
+    """Return what was found, and which files have no partner, as lines."""
+    found = frames.found
+    named = frames.total == 1 and len(found.pairs) == 1
     lines = [
-        f"{count} pairs of photo and depth map" if count > 1 else f"{found.pairs[0].rgb} and {found.pairs[0].depth}"
+        f"{found.pairs[0].rgb} and {found.pairs[0].depth}" if named else f"{frames.total} pairs of photo and depth map"
     ]
     lines += [f"  {fact}" for fact in found.assumptions]
     if found.unpaired:
         lines.append(
             f"  {len(found.unpaired)} without a partner, left out: {listed([path.name for path in found.unpaired])}"
         )
-    for line in lines:
-        show(console, line)
+    return lines

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -25,7 +25,7 @@ class FrameSequence:
     """The frames of a folder in order, with their poses.
 
     Args:
-        pairs: the frames.
+        pairs: the frames, which are iterated over if poses or neighbours are asked for.
         read: reads one of them.
         neighbours: number of frames that vote on each frame's depth beside itself.
         poses: file of poses; None for those that the frames themselves have.
@@ -36,24 +36,30 @@ class FrameSequence:
     """
 
     def __init__(
-        self, pairs: Sequence[Pair], read: Callable[[Pair], Picture], neighbours: int, poses: Path | None
+        self, pairs: Iterable[Pair], read: Callable[[Pair], Picture], neighbours: int, poses: Path | None
     ) -> None:
-        self._pairs, self._read, self._count, self._file = tuple(pairs), read, neighbours, poses
-        self._poses: Mapping[str, np.ndarray] | None = None if poses is None else read_poses(poses).assign(pairs)
-        self._places = {pair.name: place for place, pair in enumerate(self._pairs)}
+        self._read, self._count, self._file = read, neighbours, poses
+        kept = tuple(pairs) if poses is not None or neighbours else ()
+        self._poses: Mapping[str, np.ndarray] | None = None if poses is None else read_poses(poses).assign(kept)
+        self._folders: dict[Path, list[Pair]] = {}
+        for pair in kept if neighbours else ():
+            self._folders.setdefault(pair.depth.parent, []).append(pair)
+        self._places = {pair.name: place for folder in self._folders.values() for place, pair in enumerate(folder)}
         self._kept: OrderedDict[str, _Frame] = OrderedDict()
 
     def neighbours(self, pair: Pair) -> list[Pair]:
         """Return the neighbours of a frame, the nearest first; those of its own folder that have a pose."""
-        place = self._places[pair.name]
-        others = [
-            (abs(number - place), number)
-            for number, other in enumerate(self._pairs)
-            if other is not pair
-            and other.depth.parent == pair.depth.parent
-            and (self._poses is None or other.name in self._poses)
-        ]
-        return [self._pairs[number] for _, number in sorted(others)[: self._count]]
+        if not self._count:
+            return []
+        folder, place = self._folders[pair.depth.parent], self._places[pair.name]
+        found: list[Pair] = []
+        for distance in range(1, len(folder)):
+            for number in (place - distance, place + distance):
+                if 0 <= number < len(folder) and (self._poses is None or folder[number].name in self._poses):
+                    found.append(folder[number])
+            if len(found) >= self._count:
+                break
+        return found[: self._count]
 
     def with_pose(self, pair: Pair, picture: Picture) -> Picture:
         """Return a frame with its pose from the file, if there is one.

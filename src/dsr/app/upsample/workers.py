@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import as_completed
 from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
@@ -13,6 +13,7 @@ import cv2
 import torch
 
 from dsr.app.upsample.frame import FrameWork
+from dsr.app.upsample.frames import Frames
 from dsr.app.upsample.reporting import Messages, Record, Reporter, problem_line
 from dsr.app.upsample.request import UpsampleRequest
 from dsr.io.pairs import Pair
@@ -34,14 +35,12 @@ class Done(NamedTuple):
     problem: str | None
 
 
-def work_through(
-    request: UpsampleRequest, jobs: Sequence[tuple[Pair, Path]], reporter: Reporter, progress: Progress
-) -> Iterator[Done]:
+def work_through(request: UpsampleRequest, frames: Frames, reporter: Reporter, progress: Progress) -> Iterator[Done]:
     """Upsample pictures.
 
     Args:
         request: the request; ``workers`` of it work at a time, each with its share of the cores and its own memory.
-        jobs: the pictures and the folders of their results.
+        frames: the pictures.
         reporter: where notes are shown: in the order of the pictures, or as they come from several workers.
         progress: where the progress is shown.
 
@@ -52,16 +51,16 @@ def work_through(
         ValueError: the file of poses is damaged, or does not fit the pictures.
 
     """
+    jobs = [(pair, frames.target(request.output, pair)) for pair in frames.found.pairs]
     workers = min(request.workers, len(jobs))
-    pairs = [pair for pair, _ in jobs]
-    if workers == 1:
-        work = FrameWork(request, pairs)
+    if workers <= 1:
+        work = FrameWork(request, frames.whole, frames.firsts)
         for pair, target in progress.track(jobs, "upsample", label=lambda job: job[0].name, lines=False):
             yield _try(work, pair, target, reporter, progress)
         return
-    FrameWork(request, pairs)  # raises for poses that do not fit
+    FrameWork(request, frames.whole, frames.firsts)  # raises for poses that do not fit
     cores = max(1, (os.cpu_count() or 1) // workers)
-    with WorkerPool(workers, _begin, (request, pairs, cores)) as pool:
+    with WorkerPool(workers, _begin, (request, frames.whole, frames.firsts, cores)) as pool:
         futures = [pool.submit(_remote, pair, target) for pair, target in jobs]
         places = dict(zip(futures, jobs, strict=True))
         finished = progress.track(as_completed(futures), "upsample", len(jobs), label=lambda each: places[each][0].name)
@@ -76,12 +75,12 @@ def work_through(
             yield done
 
 
-def _begin(request: UpsampleRequest, pairs: Sequence[Pair], cores: int) -> None:
+def _begin(request: UpsampleRequest, pairs: Iterable[Pair], firsts: Sequence[Pair], cores: int) -> None:
     """Prepare a worker."""
     global _work  # noqa: PLW0603 - the process's own
     torch.set_num_threads(cores)
     cv2.setNumThreads(cores)
-    _work = FrameWork(request, pairs)
+    _work = FrameWork(request, pairs, firsts)
 
 
 def _remote(pair: Pair, target: Path) -> tuple[Done, Record]:

@@ -48,8 +48,10 @@ def find_stray(folder: Path) -> PairingResult | None:
 
     """
     video, matrix, odometry = folder / "rgb.mp4", folder / "camera_matrix.csv", folder / "odometry.csv"
+    if not (matrix.is_file() or odometry.is_file()):
+        return None
     photos, depths = _numbered(folder / "rgb", PHOTO_SUFFIXES), _numbered(folder / "depth", (".png", ".npy"))
-    if not (matrix.is_file() or odometry.is_file()) or not depths or not (photos or video.is_file()):
+    if not depths or not (photos or video.is_file()):
         return None
     confidence, rows = _numbered(folder / "confidence", (".png",)), _read_odometry(odometry)
     text = read_text(matrix) if matrix.is_file() else ""

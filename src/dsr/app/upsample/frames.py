@@ -1,0 +1,83 @@
+"""The frames that ``dsr upsample`` works on: all, or a shard, from folders or from a manifest."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from dsr.app.upsample.request import UpsampleRequest
+from dsr.io.layouts import find_pairs_of_folder
+from dsr.io.manifest import Manifest
+from dsr.io.pairs import Pair, PairingResult, add_confidence, find_pairs_of_lists
+
+
+@dataclass(frozen=True)
+class Frames:
+    """Frames to work on, and what they depend on.
+
+    Args:
+        found: the frames to work on, and what is said about them.
+        whole: all frames that were found, to iterate over; poses, neighbours and units depend on them.
+        firsts: the first frames by name of the folders, if known: units depend on them.
+        total: number of all frames.
+        single: whether there is a single picture, whose results are in the output folder itself.
+
+    """
+
+    found: PairingResult
+    whole: Iterable[Pair]
+    firsts: tuple[Pair, ...]
+    total: int
+    single: bool
+
+    def target(self, output: Path, pair: Pair) -> Path:
+        """Return the folder of a frame's results."""
+        return output if self.single else output / pair.name
+
+
+def find_frames(request: UpsampleRequest) -> Frames:
+    """Return the frames of a request.
+
+    Raises:
+        ValueError: there are none, or the manifest is damaged or of another number of shards.
+
+    """
+    if request.manifest is not None and request.shards is None:
+        return _of_manifest(request, request.manifest)
+    found = _search(request)
+    if request.confidence:
+        found = replace(found, pairs=add_confidence(found.pairs, request.confidence))
+    total, whole = len(found.pairs), found.pairs
+    single = total == 1 and not request.folders and not request.rgb[0].is_dir()
+    if request.shard is not None:
+        found = replace(found, pairs=tuple(whole[number] for number in request.shard.block(total)))
+    return Frames(found, whole, (), total, single)
+
+
+def _of_manifest(request: UpsampleRequest, path: Path) -> Frames:
+    """Return the frames in a manifest."""
+    manifest = Manifest(path)
+    if request.shard is None:
+        pairs = tuple(manifest)
+        return Frames(PairingResult(pairs, manifest.assumptions), pairs, (), len(pairs), single=False)
+    pairs, firsts = manifest.read(request.shard)
+    return Frames(PairingResult(pairs, manifest.assumptions), manifest, firsts, manifest.frames, single=False)
+
+
+def _search(request: UpsampleRequest) -> PairingResult:
+    """Return the pairs in the user's files and folders."""
+    if not request.folders:
+        return find_pairs_of_lists(request.rgb, request.depth, request.mask)
+    parts = [find_pairs_of_folder(folder, request.output) for folder in request.folders]
+    if len(parts) == 1:
+        return parts[0]
+    pairs = [
+        replace(pair, name=f"{folder.resolve().name}/{pair.name}")
+        for folder, part in zip(request.folders, parts, strict=True)
+        for pair in part.pairs
+    ]
+    if len({pair.name for pair in pairs}) < len(pairs):
+        raise ValueError("expected folders of different names; give those of one name in commands of their own")
+    facts = tuple(dict.fromkeys(fact for part in parts for fact in part.assumptions))
+    return PairingResult(tuple(pairs), facts, tuple(path for part in parts for path in part.unpaired))
