@@ -56,7 +56,7 @@ def work_through(request: UpsampleRequest, frames: Frames, reporter: Reporter, p
     if workers <= 1:
         work = FrameWork(request, frames.whole, frames.firsts)
         for pair, target in progress.track(jobs, "upsample", label=lambda job: job[0].name, lines=False):
-            yield _try(work, pair, target, reporter, progress)
+            yield attempt(work, pair, target, reporter, progress)
         return
     FrameWork(request, frames.whole, frames.firsts)  # raises for poses that do not fit
     cores = max(1, (os.cpu_count() or 1) // workers)
@@ -87,10 +87,10 @@ def _remote(pair: Pair, target: Path) -> tuple[Done, Record]:
     """Upsample a picture in a worker."""
     assert _work is not None  # noqa: S101 - workers begin with _begin
     record = Record()
-    return _try(_work, pair, target, record, Progress()), record
+    return attempt(_work, pair, target, record, Progress()), record
 
 
-def _try(work: FrameWork, pair: Pair, target: Path, reporter: Messages, progress: Progress) -> Done:
+def attempt(work: FrameWork, pair: Pair, target: Path, reporter: Messages, progress: Progress) -> Done:
     """Upsample a picture, and return what became of it."""
     try:
         return Done(pair, target, work(pair, target, reporter, progress), None)
