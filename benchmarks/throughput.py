@@ -1,40 +1,42 @@
 """Frames a second of ``dsr upsample`` per core, with one and with two workers, and where the time goes.
 
     python benchmarks/throughput.py [--frames 24] [--rounds 3] [--rgb PHOTO --depth MAP] [--method facets]
+                                   [--only depth]
+    python benchmarks/throughput.py --profile
     python benchmarks/throughput.py --list 100000
 
 Frames are a photo of 640 x 480 and a noisy map of 160 x 120 in millimetres, rendered unless a pair is given, each under
-a name of its own; what is written is ``--only depth`` and, in a second row, everything. One worker runs on one core,
-two on two, in turns, and the fastest round of each counts; the time to start is that of a sixth of the frames and is
-taken off. The profile is of one worker, with everything written. ``--list`` measures nothing else but the seconds to
-list small files, to write a manifest of them for 16 shards and to read one shard of it.
+a name of its own. One worker runs on one core, two on two, in turns, and the fastest round of each counts; what a sixth
+of the frames takes is taken off, for the time to start. Seconds of a core are those in which a process has one, so they
+depend less than those on the clock on what else runs. ``--profile`` says instead where one worker's time goes, and
+``--list`` how long it takes to list small files, to write a manifest of them for 16 shards and to read one shard of it.
 """
 
 from __future__ import annotations
 
 import argparse
-import cProfile
 import os
-import pstats
 import shutil
 import subprocess
 import sys
 import tempfile
 import time
+from collections import Counter
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
 
-PARTS = {"depth alone": ("--only", "depth"), "everything": ()}
-STEPS = (
-    ("read the pair", "inputs.py", "read_picture"),
-    ("hash the files", "request.py", "inputs_with_neighbours"),
-    ("find the displacement", "alignment.py", "align"),
-    ("upsample", "frame.py", "_upsample"),
-    ("write all parts", "outputs.py", "write_parts"),
-)
-"""What a frame's time is spent with: a name, and the function with its file."""
+STEPS = {
+    "frame": ("read_picture", "inputs_with_neighbours", "align", "_upsample", "write_parts"),
+    "outputs": (
+        "_write_depth", "write_renderings", "write_normals", "write_before_after", "write_input", "_write_errors",
+        "_write_shapes",
+    ),
+}  # fmt: skip
+"""Functions that a frame's time is spent with, by the module of :mod:`dsr.app.upsample` that calls them."""
 
 
 def render(folder: Path) -> tuple[Path, Path]:
@@ -49,7 +51,7 @@ def render(folder: Path) -> tuple[Path, Path]:
 
     scene = random_scene(np.random.default_rng(5))
     made = render_scene(scene, 640)
-    camera = make_camera(scene.viewpoint, 640).crop(0, 80, 480, 640)
+    camera = make_camera(scene.viewpoint, 640).crop(80, 0, 480, 640)
     rgb, depth = made.rgb[80:560], made.depth[80:560]
     photo = torch.from_numpy(np.ascontiguousarray(rgb)).permute(2, 0, 1).float() / 255
     sample = make_sample(
@@ -62,74 +64,89 @@ def render(folder: Path) -> tuple[Path, Path]:
     return folder / "photo.jpg", folder / "map.png"
 
 
-def upsample(arguments: list[str], cores: set[int]) -> float:
-    """Run the command on some cores with one thread each, and return the seconds it takes."""
+class Cost(NamedTuple):
+    """What a command took: seconds on the clock, and seconds of all its processes on their cores."""
+
+    wall: float
+    cpu: float
+
+
+def upsample(arguments: list[str], cores: set[int]) -> Cost:
+    """Run the command on some cores with one thread each, and return what it took."""
     started = time.perf_counter()
-    subprocess.run(  # noqa: S603 - this project's command
+    process = subprocess.Popen(  # noqa: S603 - this project's command
         [sys.executable, "-m", "dsr.cli", "upsample", *arguments],
-        check=True,
         env={**os.environ, "OMP_NUM_THREADS": "1"},
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
-        preexec_fn=lambda: os.sched_setaffinity(0, cores),
+        preexec_fn=lambda: os.sched_setaffinity(0, cores),  # noqa: PLW1509 - there are no threads
     )
-    return time.perf_counter() - started
+    _, code, used = os.wait4(process.pid, 0)
+    if code:
+        raise RuntimeError(f"dsr upsample {arguments} ended with {os.waitstatus_to_exitcode(code)}")
+    return Cost(time.perf_counter() - started, used.ru_utime + used.ru_stime)
 
 
-def measure(folder: Path, source: Path, frames: int, rounds: int, method: str) -> None:
+def measure(folder: Path, source: Path, frames: int, rounds: int, options: list[str]) -> None:
     """Print the rates."""
     cores = sorted(os.sched_getaffinity(0))[:2]
-    for name, parts in PARTS.items():
-        seconds: dict[tuple[str, int], list[float]] = {}
-        options = [str(source), "--method", method, *parts, "--fov", "60"]
-        for _ in range(rounds):
-            for workers in (1, 2):
-                used = set(cores[:workers])
-                work = ["--workers", str(workers), "-o", str(folder / f"out{workers}")]
-                seconds.setdefault(("some", workers), []).append(upsample([*options, *work, "--shard", "1/6"], used))
-                shutil.rmtree(folder / f"out{workers}")
-                seconds.setdefault(("all", workers), []).append(upsample([*options, *work], used))
-                if workers == 1:
-                    seconds.setdefault(("again", 1), []).append(upsample([*options, *work], used))
-                    seconds.setdefault(("some again", 1), []).append(
-                        upsample([*options, *work, "--shard", "1/6"], used)
-                    )
-                shutil.rmtree(folder / f"out{workers}")
-        best = {key: min(values) for key, values in seconds.items()}
-        more = frames - frames // 6
-        rates = {workers: more / (best["all", workers] - best["some", workers]) for workers in (1, 2)}
-        again = (best["again", 1] - best["some again", 1]) / more
+    taken: dict[tuple[str, int], list[Cost]] = {}
+    for _ in range(rounds):
+        for workers in (1, 2):
+            output = folder / f"out{workers}"
+            command = [str(source), *options, "--fov", "60", "--workers", str(workers), "-o", str(output)]
+            for name, shard in (("some", ["--shard", "1/6"]), ("all", [])):
+                cost = upsample([*command, *shard], set(cores[:workers]))
+                taken.setdefault((name, workers), []).append(cost)
+                shutil.rmtree(output)
+    best = {
+        key: Cost(min(each.wall for each in costs), min(each.cpu for each in costs)) for key, costs in taken.items()
+    }
+    more = frames - frames // 6
+    cost = {
+        workers: Cost(*((all_ - some) / more for all_, some in zip(best["all", workers], best["some", workers], strict=True)))
+        for workers in (1, 2)
+    }  # fmt: skip
+    for workers, each in cost.items():
         print(
-            f"{name}: {rates[1]:.2f} frames/s with one worker on one core, {rates[2]:.2f} with two on two "
-            f"({rates[2] / rates[1]:.2f} times); {1e3 * again:.0f} ms a frame that is complete already",
-            flush=True,
+            f"workers: {workers}, cores: {workers}: {1 / each.wall:.2f} frames/s on the clock, {each.cpu:.2f} s of a "
+            f"core for a frame, which is {1 / each.cpu:.2f} frames/s per core"
         )
+    print(f"two workers: {cost[1].wall / cost[2].wall:.2f} times as many frames on the clock, ", end="")
+    print(f"{2 * cost[1].cpu / cost[2].cpu:.2f} times if their cores are idle")
 
 
-def profile(folder: Path, source: Path, method: str) -> None:
-    """Print where one worker's time goes, in milliseconds a frame."""
+def profile(folder: Path, source: Path, given: list[str], frames: int) -> None:
+    """Print where one worker's time goes, in milliseconds of a core for a frame."""
     import torch  # noqa: PLC0415
 
+    from dsr.app.upsample import frame, outputs  # noqa: PLC0415
     from dsr.cli import main as dsr  # noqa: PLC0415
 
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
-    options = ["upsample", str(source), "--method", method, "--fov", "60", "-o"]
-    dsr([*options, str(folder / "warm")])
-    watch = cProfile.Profile()
-    watch.enable()
-    dsr([*options, str(folder / "profile")])
-    watch.disable()
-    entries = pstats.Stats(watch).stats  # type: ignore[attr-defined]
-    found = {(Path(file).name, function): value for (file, _, function), value in entries.items()}
-    calls, _, _, total, _ = found["frame.py", "__call__"]
-    print(f"profile, everything written: {1e3 * total / calls:.0f} ms a frame")
-    rest = total
-    for name, file, function in STEPS:
-        spent = found[file, function][3]
-        rest -= spent
-        print(f"  {name:24s} {1e3 * spent / calls:7.1f} ms  {spent / total:4.0%}")
-    print(f"  {'other':24s} {1e3 * rest / calls:7.1f} ms  {rest / total:4.0%}")
+    spent: Counter[str] = Counter()
+
+    def timed(name: str, function: Callable[..., Any]) -> Callable[..., Any]:
+        def call(*arguments: Any, **named: Any) -> Any:
+            started = time.thread_time()
+            try:
+                return function(*arguments, **named)
+            finally:
+                spent[name] += time.thread_time() - started
+
+        return call
+
+    command = ["upsample", str(source), *given, "--fov", "60", "-o"]
+    dsr([*command, str(folder / "warm")])
+    for module in (frame, outputs):
+        for name in STEPS[module.__name__.rpartition(".")[2]]:
+            setattr(module, name, timed(name, getattr(module, name)))
+    started = time.process_time()
+    dsr([*command, str(folder / "profile")])
+    print(f"{1e3 * (time.process_time() - started) / frames:.0f} ms of a core for a frame, of which")
+    for name in (*STEPS["frame"], *STEPS["outputs"]):
+        print(f"  {name:24s} {1e3 * spent[name] / frames:7.0f} ms", flush=True)
 
 
 def measure_listing(folder: Path, count: int) -> None:
@@ -166,6 +183,8 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=24)
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--method", default="facets")
+    parser.add_argument("--only", default="", help="parts to write; everything by default")
+    parser.add_argument("--profile", action="store_true", help="only say where the time goes")
     parser.add_argument("--list", type=int, metavar="N", help="only list N small files")
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as place:
@@ -180,8 +199,11 @@ def main() -> None:
                     target = folder / name / kind / f"{number:05}{path.suffix}"
                     target.parent.mkdir(parents=True, exist_ok=True)
                     shutil.copy(path, target)
-        profile(folder, folder / "few", options.method)
-        measure(folder, folder / "many", options.frames, options.rounds, options.method)
+        given = ["--method", options.method, *(["--only", options.only] if options.only else [])]
+        if options.profile:
+            profile(folder, folder / "few", given, 6)
+        else:
+            measure(folder, folder / "many", options.frames, options.rounds, given)
 
 
 if __name__ == "__main__":

@@ -5,19 +5,21 @@ might find other files than the one before. A manifest is text, one JSON object 
 
     {"dsr_manifest": 1, "frames": 1000000, "assumptions": [], "shards": [{"frames": 62500, "bytes": 10187500}, ...]}
     {"shard": 1, "firsts": []}
-    {"name": "000000", "rgb": "/data/rgb/000000.jpg", "depth": "/data/depth/000000.png", "camera": "/data/camera.json"}
+    {"name": "000000", "rgb": "rgb/000000.jpg", "depth": "depth/000000.png", "camera": "camera.json"}
     ...
     {"shard": 2, "firsts": [{"name": "000000", ...}]}
     ...
 
-The sizes in the first line tell where a shard begins, so that a task reads that line and its own. ``firsts`` are the
-frames of other shards that a unit may be guessed from, see :class:`dsr.io.units.FolderUnits`. What a capture says
-about a frame is read from the capture again: ``capture`` has its folder or file, and the frame's name in it.
+Paths are absolute, or those from the manifest's folder to what is in it. The sizes in the first line tell where a shard
+begins, so that a task reads that line and its own. ``firsts`` are the frames of other shards that a unit may be guessed
+from, see :class:`dsr.io.units.FolderUnits`. What a capture says about a frame is read from the capture again:
+``capture`` has its folder or file, and the frame's name in it.
 """
 
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 from itertools import accumulate
@@ -51,7 +53,7 @@ class ShardFrames(NamedTuple):
 
 
 def write_manifest(path: Path, found: PairingResult, count: int) -> None:
-    """Write a manifest atomically, with absolute paths.
+    """Write a manifest atomically, with absolute paths, or relative ones for what is in its folder.
 
     Args:
         path: the file.
@@ -67,9 +69,12 @@ def write_manifest(path: Path, found: PairingResult, count: int) -> None:
             firsts[folder] = pair
     shards = [Shard(number, count) for number in range(1, count + 1)]
     room = len(_head(found, [_LARGEST] * count))
+    base = str(path.absolute().parent)
     with replacing(path) as temporary, temporary.open("wb") as file:
         file.write(b" " * room)
-        sizes = [_write_shard(file, shard, [pairs[i] for i in shard.block(len(pairs))], firsts) for shard in shards]
+        sizes = [
+            _write_shard(file, shard, [pairs[i] for i in shard.block(len(pairs))], firsts, base) for shard in shards
+        ]
         file.seek(0)
         file.write(_head(found, sizes)[:-1].ljust(room - 1) + b"\n")
 
@@ -163,14 +168,14 @@ def _head(found: PairingResult, sizes: Iterable[int]) -> bytes:
     return _line({"dsr_manifest": _VERSION, "frames": len(found.pairs), "assumptions": facts, "shards": shards})
 
 
-def _write_shard(file: BinaryIO, shard: Shard, pairs: list[Pair], firsts: Mapping[_Folder, Pair]) -> int:
+def _write_shard(file: BinaryIO, shard: Shard, pairs: list[Pair], firsts: Mapping[_Folder, Pair], base: str) -> int:
     """Write the lines of a shard, and return their size in bytes."""
     begin = file.tell()
     own = {pair.name for pair in pairs}
     needed = [firsts[folder] for folder in dict.fromkeys(map(_folder, pairs))]
-    elsewhere = [_record(pair) for pair in needed if pair.name not in own]
+    elsewhere = [_record(pair, base) for pair in needed if pair.name not in own]
     file.write(_line({"shard": shard.number, "firsts": elsewhere}))
-    file.writelines(_line(_record(pair)) for pair in pairs)
+    file.writelines(_line(_record(pair, base)) for pair in pairs)
     return file.tell() - begin
 
 
@@ -178,20 +183,24 @@ def _line(values: Mapping[str, Any]) -> bytes:
     return json.dumps(values, separators=(",", ":")).encode() + b"\n"
 
 
-def _record(pair: Pair) -> dict[str, Any]:
-    """Return a pair as values for JSON."""
-    record: dict[str, Any] = {"name": pair.name, "rgb": str(pair.rgb.absolute()), "depth": str(pair.depth.absolute())}
+def _record(pair: Pair, base: str) -> dict[str, Any]:
+    """Return a pair as values for JSON, with paths relative to a folder if they lie below it."""
+
+    def place(path: Path) -> str:
+        return str(path.absolute()).removeprefix(os.path.join(base, ""))  # noqa: PTH118 - with a separator at its end
+
+    record: dict[str, Any] = {"name": pair.name, "rgb": place(pair.rgb), "depth": place(pair.depth)}
     for name in ("camera", "mask"):
         path = getattr(pair, name)
         if path is not None:
-            record[name] = str(path.absolute())
+            record[name] = place(path)
     for name in ("unit", "factor"):
         if getattr(pair, name) is not None:
             record[name] = getattr(pair, name)
     if pair.origin is not None:
-        record["capture"] = [str(pair.origin.place.absolute()), pair.origin.name]
+        record["capture"] = [place(pair.origin.place), pair.origin.name]
     if pair.confidence is not None and pair.confidence.source is None:
-        record["confidence"] = [str(pair.confidence.path.absolute()), pair.confidence.highest]
+        record["confidence"] = [place(pair.confidence.path), pair.confidence.highest]
     return record
 
 
@@ -199,7 +208,7 @@ class _Reader:
     """Makes pairs of the lines of a manifest."""
 
     def __init__(self, path: Path) -> None:
-        self._path = path
+        self._path, self._base = path, path.absolute().parent
         self._capture: tuple[Path, dict[tuple[str, Path, Path], Pair]] | None = None
 
     def damaged(self) -> ValueError:
@@ -216,26 +225,32 @@ class _Reader:
             raise self.damaged()
         return values
 
+    def _place(self, value: Any) -> Path:
+        """Return a path, relative ones from the folder of the manifest."""
+        if not isinstance(value, str) or not value or "\0" in value:
+            raise ValueError
+        return self._base / value
+
     def pair(self, record: Any) -> Pair:
         """Return the pair that an object describes."""
         try:
             name = _name(record["name"])
             pair = Pair(
                 name,
-                _path(record["rgb"]),
-                _path(record["depth"]),
-                None if "camera" not in record else _path(record["camera"]),
-                None if "mask" not in record else _path(record["mask"]),
+                self._place(record["rgb"]),
+                self._place(record["depth"]),
+                None if "camera" not in record else self._place(record["camera"]),
+                None if "mask" not in record else self._place(record["mask"]),
                 None if "unit" not in record else _positive(record["unit"]),
                 None if "factor" not in record else _count(record["factor"]),
             )
             if "confidence" in record:
                 path, highest = record["confidence"]
-                pair = replace(pair, confidence=ConfidenceMap(_path(path), _positive(highest)))
+                pair = replace(pair, confidence=ConfidenceMap(self._place(path), _positive(highest)))
             origin = None
             if "capture" in record:
                 place, own = record["capture"]
-                origin = Origin(_path(place), str(own))
+                origin = Origin(self._place(place), str(own))
         except (KeyError, TypeError, ValueError) as error:
             raise self.damaged() from error
         return pair if origin is None else self._of_capture(pair, origin)
@@ -262,13 +277,6 @@ def _name(value: Any) -> str:
     if not isinstance(value, str) or not parts or {"..", "/", "//"} & set(parts) or "\\" in value or "\0" in value:
         raise ValueError
     return value
-
-
-def _path(value: Any) -> Path:
-    """Return an absolute path."""
-    if not isinstance(value, str) or "\0" in value or not Path(value).is_absolute():
-        raise ValueError
-    return Path(value)
 
 
 def _count(value: Any) -> int:

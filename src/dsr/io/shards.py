@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import re
-from typing import NamedTuple
+from dataclasses import dataclass
 
 
-class Shard(NamedTuple):
+@dataclass(frozen=True)
+class Shard:
     """One of the blocks into which frames are split, in their order and as equally as possible.
 
-    ``number``: counts from 1. ``count``: number of blocks.
+    Args:
+        number: which one, from 1.
+        count: number of blocks.
+
     """
 
     number: int
