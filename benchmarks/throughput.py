@@ -103,10 +103,10 @@ def measure(folder: Path, source: Path, frames: int, rounds: int, options: list[
         key: Cost(min(each.wall for each in costs), min(each.cpu for each in costs)) for key, costs in taken.items()
     }
     more = frames - frames // 6
-    cost = {
-        workers: Cost(*((all_ - some) / more for all_, some in zip(best["all", workers], best["some", workers], strict=True)))
-        for workers in (1, 2)
-    }  # fmt: skip
+    cost = {}
+    for workers in (1, 2):
+        long, short = best["all", workers], best["some", workers]
+        cost[workers] = Cost((long.wall - short.wall) / more, (long.cpu - short.cpu) / more)
     for workers, each in cost.items():
         print(
             f"workers: {workers}, cores: {workers}: {1 / each.wall:.2f} frames/s on the clock, {each.cpu:.2f} s of a "
