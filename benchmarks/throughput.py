@@ -187,6 +187,8 @@ def main() -> None:
     parser.add_argument("--profile", action="store_true", help="only say where the time goes")
     parser.add_argument("--list", type=int, metavar="N", help="only list N small files")
     options = parser.parse_args()
+    if options.frames < 12:
+        parser.error("--frames: expected 12 or more, so that a sixth of them keeps two workers busy")
     with tempfile.TemporaryDirectory() as place:
         folder = Path(place)
         if options.list:
