@@ -249,6 +249,28 @@ def test_pictures_above_the_budget_are_reduced_and_the_page_says_so(make_run, tm
     assert (tmp_path / "small.html").stat().st_size < (tmp_path / "large.html").stat().st_size
 
 
+def test_pictures_of_the_first_levels_are_lossless_and_the_second_takes_what_the_first_is_too_large_for():
+    picture = np.random.default_rng(0).integers(0, 256, (40, 60, 3), dtype=np.uint8)
+    smooth = np.add.outer(np.arange(200), np.arange(300)).astype(np.uint8)
+    for level in LEVELS[:2]:
+        pool = Pool(level)
+        for each in (picture, smooth):
+            content = base64.b64decode(pool.pictures[pool.add(each)])
+            image = np.asarray(Image.open(io.BytesIO(content)).convert("RGB"))
+            np.testing.assert_array_equal(image, each if each.ndim == 3 else np.stack([each] * 3, axis=-1))
+        assert (content[:4] == b"RIFF") == (not level.fast)
+
+
+def test_report_too_large_for_fast_compression_stays_lossless(make_run, tmp_path):
+    results = load_results([make_run(tmp_path / "run", size=208)])
+    fast, small = (
+        sum(Pool.size for _, Pool, _ in Pictures(Work(results))._encode(level)) for level in LEVELS[:2]
+    )
+    assert small < fast
+    [note] = save_page(tmp_path / "page.html", results, budget_mb=(small + fast) / 2e6)
+    assert note == f"pictures: lossless, 8 bits; {small / 1e6:.1f} MB"
+
+
 def test_reduced_values_are_averages_of_valid_pixels():
     pool = Pool(dataclasses.replace(LEVELS[0], longest=2))
     values = np.array([[1.0, 3, 5, np.nan], [1, 3, 7, 9], [np.nan, np.nan, 2, 2], [np.nan, 4, 2, 2]])

@@ -13,7 +13,7 @@ from rich.console import Console
 from dsr.evaluation.results import Results
 from dsr.evaluation.run_files import load_results
 from dsr.geometry.shading import LIGHT_NAMES
-from dsr.report.correlation_figure import save_scatter_matrix
+from dsr.report.correlation_figure import draw_study
 from dsr.report.correlations import write_correlations
 from dsr.report.figures import Figures
 from dsr.report.markup import write_tables
@@ -117,8 +117,8 @@ def _write(
     results = work.results
     notes: list[str] = []
     scored = any(not run.scores.empty for run in results.runs)
+    scatter = work.map(draw_study, [folder / "metrics"] if "metrics" in request.parts and scored else [])
     drawn = Figures(folder / "figures", work, request.light) if "figures" in request.parts else None
-    scatter = work.map(_draw_scatter, [folder / "metrics"] if "metrics" in request.parts and scored else [])
     pictures = Pictures(work) if "page" in request.parts else None
 
     def tables() -> None:
@@ -155,8 +155,3 @@ def _write(
     for part in progress.track(todo, "report"):
         parts[part]()
     return notes
-
-
-def _draw_scatter(results: Results, folder: Path) -> None:
-    """Draw the figures of the metric study."""
-    save_scatter_matrix(folder, results)
