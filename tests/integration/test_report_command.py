@@ -53,32 +53,19 @@ def test_report_has_tables_figures_the_metric_study_and_a_page(runs: Path, tmp_p
     assert sorted(path.name for path in tmp_path.iterdir()) == ["report", "runs"]
 
 
-def test_workers_make_the_same_files_as_the_command_alone(runs: Path, tmp_path: Path) -> None:
-    folders = {}
-    for workers in ("1", "2"):
-        folders[workers] = tmp_path / workers
-        done = run_python(
-            "-m", "dsr.cli", "report", str(runs), "-o", workers, "--workers", workers, cwd=tmp_path
-        )  # fmt: skip
-        assert (done.returncode, done.stderr) == (0, "")
-    files = {
-        workers: {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
-        for workers, folder in folders.items()
-    }
-    assert "figures/renderings_simgeo_x4_box_1.pdf" in files["1"]
-    assert files["1"].keys() == files["2"].keys()
-    assert [name for name, content in files["1"].items() if content != files["2"][name]] == []
-
-
-def test_damaged_scene_in_a_worker_is_a_note_as_without_workers(runs: Path, tmp_path: Path) -> None:
+def test_workers_make_the_same_files_and_notes_as_the_command_alone(runs: Path, tmp_path: Path) -> None:
     for file in runs.rglob("scenes/statue.npz"):
         file.write_bytes(b"damaged")
-    arguments = ["-m", "dsr.cli", "report", str(runs), "--only", "figures,page"]
-    notes = []
+    files, notes = [], []
     for workers in ("1", "2"):
-        done = run_python(*arguments, "-o", workers, "--workers", workers, cwd=tmp_path)
+        done = run_python("-m", "dsr.cli", "report", str(runs), "-o", workers, "--workers", workers, cwd=tmp_path)
         assert (done.returncode, done.stderr) == (0, "")
+        folder = tmp_path / workers
+        files.append({path.relative_to(folder): path.read_bytes() for path in folder.rglob("*") if path.is_file()})
         notes.append([line for line in done.stdout.splitlines() if line.startswith("note:")])
+    assert Path("figures/renderings_simgeo_x4_box_1.pdf") in files[0]
+    assert files[0].keys() == files[1].keys()
+    assert [name for name, content in files[0].items() if content != files[1][name]] == []
     assert notes[0] == notes[1]
     assert any("no figures of statue" in note for note in notes[0])
 

@@ -10,7 +10,6 @@ from pathlib import Path
 import pandas as pd
 from rich.console import Console
 
-from dsr.evaluation.results import Results
 from dsr.evaluation.run_files import load_results
 from dsr.geometry.shading import LIGHT_NAMES
 from dsr.report.correlation_figure import draw_study

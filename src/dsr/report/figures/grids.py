@@ -55,9 +55,7 @@ _KINDS = {
     "renderings": _Kind(
         ("photo", "input"), ("truth",), "surfaces lit by {light}; below: DSSIM_v / RMSE_v, 1/1000, lower is better"
     ),
-    "depth": _Kind(
-        ("photo", "input"), ("truth",), "distance to the image plane; below: RMSE_d, mm, lower is better"
-    ),
+    "depth": _Kind(("photo", "input"), ("truth",), "distance to the image plane; below: RMSE_d, mm, lower is better"),
     "errors": _Kind(
         ("photo",), (), "result - truth: red is too far, blue too near; below: RMSE_d, mm, lower is better"
     ),
