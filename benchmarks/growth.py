@@ -5,9 +5,10 @@
     python benchmarks/growth.py --what runs [--points 1,10,30,100,300]
     python benchmarks/growth.py --figure docs/pictures/growth.svg [--csv growth.csv]
 
-pixels: ``dsr upsample`` with ``facets``, all its outputs, on a square photo of so many pixels a side. scenes: ``eval.py``
-with ``nearest`` on a folder of so many scenes of 64 x 64 pixels, listing included. runs: ``dsr report`` of so many runs
-of two scenes of 64 x 64 pixels: tables, metric study and page.
+pixels: ``dsr upsample`` with ``facets``, all its outputs, on a square photo of so many pixels a side. scenes: ``dsr
+upsample`` with ``nearest`` on folders of so many photos and maps of 64 x 64 pixels, listing and pairing included, the
+depth alone as output. runs: ``dsr report`` of so many runs of two scenes of 64 x 64 pixels: tables, metric study and
+page.
 
 A point is one command, a process of its own on one thread: CPU seconds, and the most memory that it held. Prints them
 beside the straight line through the first and the last point: a point is on the line at 1. ``--csv`` keeps the points,
@@ -89,9 +90,22 @@ def scene(side: int, number: int) -> tuple[np.ndarray, np.ndarray, Camera]:
 
 def prepare_photo(folder: Path, side: int) -> None:
     """Write a photo and a depth map with an eighth of its pixels a side."""
-    photo, depth, _ = scene(side, 0)
-    cv2.imwrite(str(folder / "rgb.png"), photo)
-    cv2.imwrite(str(folder / "depth.png"), np.rint(1000 * depth[4::8, 4::8]).astype(np.uint16))
+    _write_pair(folder / "rgb.png", folder / "depth.png", side, 0, 8)
+
+
+def prepare_photos(folder: Path, count: int) -> None:
+    """Write small photos, and depth maps with half of their pixels a side."""
+    for kind in ("rgb", "depth"):
+        (folder / kind).mkdir()
+    for number in range(count):
+        _write_pair(folder / "rgb" / f"{number:04}.png", folder / "depth" / f"{number:04}.png", _SIDE, number, 2)
+
+
+def _write_pair(rgb: Path, depth_lr: Path, side: int, number: int, scale: int) -> None:
+    """Write a photo, and a depth map in millimetres."""
+    photo, depth, _ = scene(side, number)
+    cv2.imwrite(str(rgb), photo)
+    cv2.imwrite(str(depth_lr), np.rint(1000 * depth[scale // 2 :: scale, scale // 2 :: scale]).astype(np.uint16))
 
 
 def prepare_scenes(folder: Path, count: int) -> None:
@@ -128,14 +142,16 @@ def _label_identity(versions: dict[str, Any], number: int) -> None:
 
 _EVALUATE = (str(ROOT / "eval.py"), "dataset=folder", "dataset.root=scenes", "method=nearest", "metrics.lpips=false")
 _UPSAMPLE = ("-m", "dsr", "upsample", "--rgb", "rgb.png", "--depth", "depth.png", "--depth-unit", "mm", "--fov", "45")
+_UPSAMPLE_FOLDER = ("-m", "dsr", "upsample", "--rgb", "rgb", "--depth", "depth", "--depth-unit", "mm", "--fov", "45",
+                    "--method", "nearest", "--only", "depth")  # fmt: skip
 AXES = {
     "pixels": Axis(
         (256, 512, 1024, 2048, 3464), "million pixels", "dsr upsample", prepare_photo,
         (*_UPSAMPLE, "-o", "out"), lambda side: side * side / 1e6,
     ),
     "scenes": Axis(
-        (1, 10, 100, 1000), "scenes of 64 x 64", "eval.py method=nearest", prepare_scenes,
-        (*_EVALUATE, "scale=4", "output_dir=run"),
+        (1, 10, 100, 1000), "scenes of 64 x 64", "dsr upsample of a folder", prepare_photos,
+        (*_UPSAMPLE_FOLDER, "-o", "out"),
     ),
     "runs": Axis(
         (1, 10, 30, 100, 300), "runs of two scenes of 64 x 64", "dsr report", prepare_runs,
@@ -154,7 +170,7 @@ def measure(folder: Path, command: Sequence[str]) -> tuple[float, float]:
     paths = os.pathsep.join(filter(None, (str(ROOT / "src"), os.environ.get("PYTHONPATH"))))
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": paths}
     with tempfile.TemporaryFile() as output:
-        process = subprocess.Popen(
+        process = subprocess.Popen(  # noqa: S603 - this project's commands
             [sys.executable, *command], cwd=folder, env=environment, stdout=output, stderr=subprocess.STDOUT
         )
         _, status, usage = os.wait4(process.pid, 0)
