@@ -7,6 +7,8 @@ import os
 from collections.abc import Callable, Generator, Sequence
 from concurrent.futures import Future
 from concurrent.futures.process import BrokenProcessPool
+from multiprocessing import get_context
+from multiprocessing.queues import Queue
 from types import TracebackType
 from typing import Self, TypeVar
 
@@ -43,8 +45,14 @@ class Work:
 
     def __init__(self, results: Results, workers: int = 1) -> None:
         self.results = results
-        cores = max(1, (os.cpu_count() or 1) // workers)
-        self._pool = WorkerPool(workers, _begin, (results, cores)) if workers > 1 else None
+        self._pool: WorkerPool | None = None
+        if workers > 1:
+            # arguments larger than a pipe's buffer would be cut off by Ctrl-C while a worker starts, so it asks for them
+            queue: Queue[Results] = get_context("spawn").Queue()
+            queue.cancel_join_thread()
+            for _ in range(workers):
+                queue.put(results)
+            self._pool = WorkerPool(workers, _begin, (queue, max(1, (os.cpu_count() or 1) // workers)))
 
     def map(self, function: Callable[[Results, _Item], _Value], items: Sequence[_Item]) -> Generator[_Value]:
         """Return the values of ``function(results, item)`` in the order of the items.
@@ -88,14 +96,14 @@ def _in_order(futures: Sequence[Future[_Value]]) -> Generator[_Value]:
             future.cancel()
 
 
-def _begin(results: Results, cores: int) -> None:
+def _begin(queue: Queue[Results], cores: int) -> None:
     """Prepare a worker.
 
     Garbage is collected after each call: Matplotlib makes so many objects that the automatic collections would take a
     third of the time of a figure.
     """
     global _results  # noqa: PLW0603 - the worker's own
-    _results = results
+    _results = queue.get()
     gc.disable()
     torch.set_num_threads(cores)
     cv2.setNumThreads(cores)
