@@ -47,7 +47,7 @@ class Work:
         self.results = results
         self._pool: WorkerPool | None = None
         if workers > 1:
-            # arguments larger than a pipe's buffer would be cut off by Ctrl-C while a worker starts, so it asks for them
+            # Ctrl-C would cut off arguments larger than a pipe's buffer while a worker starts, so it asks for them
             queue: Queue[Results] = get_context("spawn").Queue()
             queue.cancel_join_thread()
             for _ in range(workers):
