@@ -53,6 +53,23 @@ def test_report_has_tables_figures_the_metric_study_and_a_page(runs: Path, tmp_p
     assert sorted(path.name for path in tmp_path.iterdir()) == ["report", "runs"]
 
 
+def test_workers_make_the_same_files_and_notes_as_the_command_alone(runs: Path, tmp_path: Path) -> None:
+    for file in runs.rglob("scenes/statue.npz"):
+        file.write_bytes(b"damaged")
+    files, notes = [], []
+    for workers in ("1", "2"):
+        done = run_python("-m", "dsr.cli", "report", str(runs), "-o", workers, "--workers", workers, cwd=tmp_path)
+        assert (done.returncode, done.stderr) == (0, "")
+        folder = tmp_path / workers
+        files.append({path.relative_to(folder): path.read_bytes() for path in folder.rglob("*") if path.is_file()})
+        notes.append([line for line in done.stdout.splitlines() if line.startswith("note:")])
+    assert Path("figures/renderings_simgeo_x4_box_1.pdf") in files[0]
+    assert files[0].keys() == files[1].keys()
+    assert [name for name, content in files[0].items() if content != files[1][name]] == []
+    assert notes[0] == notes[1]
+    assert any("no figures of statue" in note for note in notes[0])
+
+
 def test_report_replaces_an_earlier_one_whole(runs: Path, tmp_path: Path) -> None:
     output = tmp_path / "report"
     arguments = ["report", str(runs), "-o", str(output), "--only", "tables"]

@@ -2,6 +2,7 @@
 
 import base64
 import dataclasses
+import io
 import json
 import math
 import re
@@ -10,6 +11,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from dsr.evaluation.results import Results
 from dsr.evaluation.run_files import load_results
@@ -247,6 +249,29 @@ def test_pictures_above_the_budget_are_reduced_and_the_page_says_so(make_run, tm
     assert notes[0] in json.loads(blocks(tmp_path / "small.html")["data"])["notes"]
     assert save_page(tmp_path / "large.html", results)[0].startswith("pictures: lossless, 8 bits;")
     assert (tmp_path / "small.html").stat().st_size < (tmp_path / "large.html").stat().st_size
+
+
+def test_pictures_of_the_first_levels_are_lossless_and_the_second_takes_what_the_first_is_too_large_for():
+    picture = np.random.default_rng(0).integers(0, 256, (40, 60, 3), dtype=np.uint8)
+    smooth = np.add.outer(np.arange(200), np.arange(300)).astype(np.uint8)
+    for level in LEVELS[:2]:
+        pool = Pool(level)
+        for each in (picture, smooth):
+            content = base64.b64decode(pool.pictures[pool.add(each)])
+            image = np.asarray(Image.open(io.BytesIO(content)).convert("RGB"))
+            np.testing.assert_array_equal(image, each if each.ndim == 3 else np.stack([each] * 3, axis=-1))
+        assert (content[:4] == b"RIFF") == (not level.fast)
+
+
+def test_report_too_large_for_fast_compression_stays_lossless(make_run, tmp_path):
+    results = load_results([make_run(tmp_path / "run", size=208)])
+    pictures = {}
+    for budget in (60, None):
+        page = tmp_path / "page.html"
+        [note] = save_page(page, results, budget_mb=budget or 0.999 * pictures[60] / 1e6)
+        assert note.startswith("pictures: lossless, 8 bits; ")
+        pictures[budget] = sum(len(content) for name, content in blocks(page).items() if name.startswith("p"))
+    assert pictures[None] < pictures[60]
 
 
 def test_reduced_values_are_averages_of_valid_pixels():

@@ -10,21 +10,22 @@ from pathlib import Path
 import pandas as pd
 from rich.console import Console
 
-from dsr.evaluation.results import Results
 from dsr.evaluation.run_files import load_results
 from dsr.geometry.shading import LIGHT_NAMES
-from dsr.report.correlation_figure import save_scatter_matrix
+from dsr.report.correlation_figure import draw_study
 from dsr.report.correlations import write_correlations
-from dsr.report.figures import save_figures
+from dsr.report.figures import Figures
 from dsr.report.markup import write_tables
-from dsr.report.page import save_page
+from dsr.report.page import Pictures, save_page
 from dsr.report.user_study import read_study
+from dsr.report.work import Work, default_workers
 from dsr.utils.console import ConsoleProgress, show
 from dsr.utils.files import replacing_folder, write_text
 from dsr.utils.progress import Progress
 
 _MARK = "report.json"
 """A file that marks a directory as a report, which a new one may replace."""
+_MOST_WORKERS = 256
 PARTS = ("tables", "metrics", "figures", "page")
 _MAIN = {
     "page": "index.html",
@@ -45,6 +46,7 @@ class ReportRequest:
         light: the figures' light.
         title: the page's title.
         page_mb: the maximum size of the page in MB.
+        workers: number of worker processes; None for one per core if there is enough to do.
 
     """
 
@@ -55,6 +57,7 @@ class ReportRequest:
     light: str
     title: str
     page_mb: float
+    workers: int | None = None
 
 
 def make_report(
@@ -77,8 +80,9 @@ def make_report(
     results = load_results(runs)
     results = results.only(request.methods, request.datasets, request.scales)
     answers = None if study is None else read_study(study)
-    with replacing_folder(output) as temporary:
-        notes = _write(temporary, results, answers, request, ConsoleProgress(console))
+    workers = default_workers(results) if request.workers is None else request.workers
+    with replacing_folder(output) as temporary, Work(results, workers) as work:
+        notes = _write(temporary, work, answers, request, ConsoleProgress(console))
         write_text(temporary / _MARK, json.dumps({"runs": [str(run.folder) for run in results.runs]}, indent=1) + "\n")
     for note in (*results.notes, *notes):
         show(console, f"note: {note}")
@@ -94,6 +98,8 @@ def _check(output: Path, request: ReportRequest) -> None:
             raise ValueError(f"--only: expected some of {', '.join(PARTS)}, got {part}")
     if request.light not in LIGHT_NAMES:
         raise ValueError(f"--light: expected one of {', '.join(LIGHT_NAMES)}, got {request.light}")
+    if request.workers is not None and not 1 <= request.workers <= _MOST_WORKERS:
+        raise ValueError(f"--workers: expected 1..{_MOST_WORKERS}, got {request.workers}")
     if not request.page_mb > 0:
         raise ValueError(f"--page-mb: expected a positive number, got {request.page_mb:g}")
     if output.exists() and not (output.is_dir() and ((output / _MARK).is_file() or not any(output.iterdir()))):
@@ -101,31 +107,48 @@ def _check(output: Path, request: ReportRequest) -> None:
 
 
 def _write(
-    folder: Path, results: Results, study: pd.DataFrame | None, request: ReportRequest, progress: Progress
+    folder: Path, work: Work, study: pd.DataFrame | None, request: ReportRequest, progress: Progress
 ) -> list[str]:
-    """Write the parts, and return notes for the reader."""
+    """Write the parts, and return notes for the reader.
+
+    Workers begin with what takes them longest while the tables are written here.
+    """
+    results = work.results
     notes: list[str] = []
+    scored = any(not run.scores.empty for run in results.runs)
+    scatter = work.map(draw_study, [folder / "metrics"] if "metrics" in request.parts and scored else [])
+    drawn = Figures(folder / "figures", work, request.light) if "figures" in request.parts else None
+    pictures = Pictures(work) if "page" in request.parts else None
 
     def tables() -> None:
         write_tables(folder / "tables", results, study)
 
     def metrics() -> None:
         write_correlations(folder / "metrics", results)
-        save_scatter_matrix(folder / "metrics", results)
+        list(scatter)
 
     def figures() -> None:
-        with progress.task("figures") as task:
-            save_figures(folder / "figures", results, task, light=request.light, notes=notes)
+        if drawn is not None:
+            with progress.task("figures") as task:
+                drawn.save(task)
+            notes.extend(drawn.notes)
 
     def page() -> None:  # last, as it links to the other parts' files
         with progress.task("scenes") as task:
             notes.extend(
-                save_page(folder / "index.html", results, title=request.title, budget_mb=request.page_mb, progress=task)
+                save_page(
+                    folder / "index.html",
+                    results,
+                    title=request.title,
+                    budget_mb=request.page_mb,
+                    progress=task,
+                    pictures=pictures,
+                )
             )
 
     parts = {"tables": tables, "metrics": metrics, "figures": figures, "page": page}
     todo = [part for part in parts if part in request.parts]
-    if all(run.scores.empty for run in results.runs):
+    if not scored:
         notes.append("no scene has a truth to score against, so there are no tables and no metric study")
         todo = [part for part in todo if part not in ("tables", "metrics")]
     for part in progress.track(todo, "report"):

@@ -46,6 +46,9 @@ def add(commands: Any) -> None:
     parser.add_argument("--title", default="Depth super-resolution", help="of the page")
     parser.add_argument("--page-mb", type=float, default=60.0, metavar="MB", help="maximum size of the page; 60")
     parser.add_argument("--only", metavar="A,B", help="these parts alone, of tables, metrics, figures, page")
+    parser.add_argument(
+        "--workers", type=int, metavar="N", help="processes that draw and encode (default: one per core, at most 8)"
+    )
     parser.set_defaults(run=_run)
 
 
@@ -61,6 +64,7 @@ def _run(options: argparse.Namespace, console: Console, _: object) -> list[str]:
         options.light,
         options.title,
         options.page_mb,
+        options.workers,
     )
     make_report(options.runs, options.output, options.study, request, console)
     return []

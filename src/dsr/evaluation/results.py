@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -12,7 +13,7 @@ from torch import Tensor
 
 from dsr.evaluation.store import load_errors, load_prediction, prediction_path, sample_path
 from dsr.metrics.catalogue import KNOWN_FORMATS
-from dsr.metrics.formats import MetricFormat, complete_formats, in_tables
+from dsr.metrics.formats import HEADLINES, MetricFormat, complete_formats, in_tables
 from dsr.sample import DepthSample
 
 METHOD_ORDER = (
@@ -70,6 +71,15 @@ class Run:
     def problem(self) -> BenchmarkSetting:
         """The setting of the run."""
         return BenchmarkSetting(self.dataset, self.scale, self.downsampling)
+
+    @functools.cached_property
+    def headlines(self) -> dict[str, dict[str, float]]:
+        """The scores by scene and metric in raw units, worst of four lights for metrics of renderings."""
+        rows = self.scores[self.scores["variant"].fillna("").isin(HEADLINES)]
+        found: dict[str, dict[str, float]] = {}
+        for scene, metric, value in zip(rows["scene"], rows["metric"], rows["value"], strict=True):
+            found.setdefault(str(scene), {})[str(metric)] = float(value)
+        return found
 
     def prediction(self, scene: str) -> Tensor:
         """Return the predicted depth, (1, H, W) in metres, NaN in holes.

@@ -11,10 +11,10 @@ import http.client
 import socket
 import warnings
 from collections.abc import Iterator
+from importlib.util import find_spec
 from pathlib import Path
 
 import torch
-import torchmetrics.functional.image as heads_home
 from torch import Tensor, nn
 from torch.nn.utils import skip_init
 
@@ -187,7 +187,10 @@ def load_lpips(configured: Path | None = None) -> LPIPS:
 
 def _linear_heads() -> list[Tensor]:
     """Return the five linear heads of LPIPS v0.1, each (1, C, 1, 1), from the torchmetrics wheel."""
-    file = Path(heads_home.__file__).parent / "lpips_models" / "alex.pth"
+    found = find_spec("torchmetrics")  # importing it takes two seconds
+    if found is None or found.origin is None:
+        raise ModuleNotFoundError("torchmetrics: expected the package with the linear heads of LPIPS, found none")
+    file = Path(found.origin).parent / "functional" / "image" / "lpips_models" / "alex.pth"
     state = torch.load(file, map_location="cpu", weights_only=True)
     return [state[f"lin{level}.model.1.weight"] for level in range(len(_CONVOLUTIONS))]
 

@@ -17,7 +17,6 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from scipy.stats import gaussian_kde
 
 from dsr.evaluation.results import Results
 from dsr.metrics.formats import Formats
@@ -42,6 +41,11 @@ _MANY = 3000
 """Number of points above which the PDF has them as an image, since it would take minutes to open otherwise."""
 
 
+def draw_study(results: Results, folder: Path) -> list[Path]:
+    """Call :func:`save_scatter_matrix` with the arguments in the order of :meth:`dsr.report.work.Work.map`."""
+    return save_scatter_matrix(folder, results)
+
+
 def save_scatter_matrix(folder: Path, results: Results) -> list[Path]:
     """Draw the scatter matrix of the paper's metrics, and the correlations of all versions with LPIPS_v.
 
@@ -64,7 +68,7 @@ def save_scatter_matrix(folder: Path, results: Results) -> list[Path]:
         for name, figure in figures.items():
             for suffix in ("pdf", "png"):
                 paths.append(folder / f"{name}.{suffix}")
-                write_figure(paths[-1], figure, _DPI)
+                write_figure(paths[-1], figure, _DPI, {"CreationDate": None} if suffix == "pdf" else None)
     return paths
 
 
@@ -154,6 +158,8 @@ def density_of(values: np.ndarray, grid: np.ndarray) -> np.ndarray | None:
         grid: (M,) points of the density.
 
     """
+    from scipy.stats import gaussian_kde  # noqa: PLC0415 - it takes half a second to import
+
     if len(np.unique(values)) < 3:
         return None
     density = gaussian_kde(values)(grid)

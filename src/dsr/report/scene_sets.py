@@ -74,7 +74,8 @@ def sets_of_summary(places: Sequence[Place], complete: Callable[[Place], bool]) 
     if any(name not in PAPER_SCENES for name in datasets):
         others = [place for place in places if place.dataset not in PAPER_SCENES]
         without_holes = [place for place in others if complete(place)]
-        with_holes = [place for place in others if place not in without_holes]
+        whole = frozenset(without_holes)
+        with_holes = [place for place in others if place not in whole]
         found += [_counted("Other scenes without missing measurements", without_holes)] if without_holes else []
         found += [_counted("Other scenes with missing measurements", with_holes)] if with_holes else []
     distinct: dict[frozenset[Place], SceneSet] = {}

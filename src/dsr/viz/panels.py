@@ -33,6 +33,8 @@ _BETWEEN = 0.95
 """Panel width, space for the heading, and space between rows for a colour bar and a title, inches."""
 _DPI = 160
 """A panel of 3.2 inches has 512 pixels."""
+_PNG_LEVEL = 3
+"""Compression of PNG files: half the time of the usual level 6, for files that are 7 % larger."""
 
 
 def save_picture(
@@ -82,9 +84,10 @@ def save_picture(
 
 def write_figure(path: Path, figure: Figure, dpi: int, metadata: Mapping[str, Any] | None = None) -> None:
     """Write a figure atomically, in the format given by the suffix."""
+    options = {"pil_kwargs": {"compress_level": _PNG_LEVEL}} if path.suffix == ".png" else {}
     with replacing(path) as temporary, warnings.catch_warnings():
         warnings.filterwarnings("ignore", "Glyph .* missing from font")  # a name may have letters that the font lacks
-        figure.savefig(temporary, dpi=dpi, metadata=metadata)
+        figure.savefig(temporary, dpi=dpi, metadata=metadata, **options)
 
 
 def limits_of(depth: Tensor) -> tuple[float, float]:

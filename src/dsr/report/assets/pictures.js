@@ -8,7 +8,7 @@ const decoded = new Map();
 async function pixelsOf(id) {
   const text = atob(document.getElementById(id).textContent);
   const bytes = Uint8Array.from(text, (letter) => letter.charCodeAt(0));
-  const blob = new Blob([bytes], { type: "image/webp" });
+  const blob = new Blob([bytes], { type: bytes[0] === 0x89 ? "image/png" : "image/webp" });
   const bitmap = await createImageBitmap(blob, { colorSpaceConversion: "none", premultiplyAlpha: "none" });
   const canvas = make("canvas", { width: bitmap.width, height: bitmap.height });
   const context = canvas.getContext("2d", { willReadFrequently: true });

@@ -2,21 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from torch import Tensor
 
 from dsr.evaluation.results import BenchmarkSetting, Results, Run
+from dsr.evaluation.store import sample_path
 from dsr.geometry.camera import Camera
 from dsr.geometry.shading import LIGHT_NAMES, lights, shade
-from dsr.metrics.formats import HEADLINES
 from dsr.sample import DepthSample
+from dsr.utils.files import array_headers
 from dsr.viz.panels import Window, normals_seen_by, strongest_window
 
 _DETAIL = 5
 """The side of a detail is 1/5 of the shorter side of the picture."""
+_NOT_STORED = "no run has stored its photo and input"
 
 
 @dataclass(frozen=True)
@@ -54,17 +56,52 @@ def scene_names(runs: dict[str, list[Run]]) -> list[str]:
     return list(dict.fromkeys(scene for each in runs.values() for run in each for scene in run.scenes))
 
 
-def shown_scenes(results: Results, problem: BenchmarkSetting, notes: list[str]) -> Iterator[Shown]:
-    """Yield the scenes of a benchmark setting one by one.
+def drawable_scenes(
+    results: Results, problem: BenchmarkSetting, notes: list[str], *, with_truth: bool = False
+) -> list[str]:
+    """Return the scenes of a benchmark setting that a run has stored, without reading their pictures.
+
+    Args:
+        results: all runs.
+        problem: benchmark setting.
+        notes: list to which one line is added per scene left out because no run has stored it.
+        with_truth: whether scenes without ground truth are left out, too.
+
+    """
+    runs = first_runs(results, problem)
+    ordered = [run for each in runs.values() for run in each]
+    names = []
+    for name in scene_names(runs):
+        stored = next((run for run in ordered if run.has_sample(name)), None)
+        if stored is None:
+            _note(notes, f"no figures of {name}: {_NOT_STORED}")
+        elif not with_truth or _has_truth(stored, name):
+            names.append(name)
+    return names
+
+
+def _has_truth(run: Run, name: str) -> bool:
+    """Return whether a stored scene has ground truth; a damaged one may have it elsewhere."""
+    try:
+        return "depth" in array_headers(sample_path(run.folder, name))
+    except (ValueError, OSError):
+        return True
+
+
+def shown_scenes(
+    results: Results, problem: BenchmarkSetting, notes: list[str], names: Iterable[str] | None = None
+) -> Iterator[Shown]:
+    """Yield scenes of a benchmark setting one by one.
 
     Args:
         results: all runs.
         problem: benchmark setting.
         notes: list to which one line is added per scene or result left out.
+        names: names of the scenes; None for all.
 
     """
     runs = first_runs(results, problem)
-    for name in scene_names(runs):
+    for name in scene_names(runs) if names is None else names:
         scene = _stored(name, [run for each in runs.values() for run in each], notes)
         if scene is None:
             continue
@@ -73,13 +110,13 @@ def shown_scenes(results: Results, problem: BenchmarkSetting, notes: list[str]) 
         for label, each in runs.items():
             run = next((run for run in each if name in run.scenes), None)
             depths[label] = None if run is None else _prediction(run, name, scene.camera, notes)
-            scores[label] = {} if run is None else _scores(run, name)
+            scores[label] = {} if run is None else run.headlines.get(name, {})
         yield Shown(name, scene, depths, scores)
 
 
 def _stored(name: str, runs: Sequence[Run], notes: list[str]) -> DepthSample | None:
     """Return the scene from the first run that has stored it."""
-    reason = "no run has stored its photo and input"
+    reason = _NOT_STORED
     for run in runs:
         if run.has_sample(name):
             try:
@@ -107,12 +144,6 @@ def _prediction(run: Run, name: str, camera: Camera, notes: list[str]) -> Tensor
 def _note(notes: list[str], line: str) -> None:
     if line not in notes:
         notes.append(line)
-
-
-def _scores(run: Run, name: str) -> dict[str, float]:
-    """Return the scores of a scene by metric, worst of four lights for metrics of renderings."""
-    rows = run.scores[(run.scores["scene"] == name) & run.scores["variant"].fillna("").isin(HEADLINES)]
-    return {str(metric): float(value) for metric, value in zip(rows["metric"], rows["value"], strict=True)}
 
 
 def rendering(depth: Tensor, camera: Camera, light: str) -> np.ndarray:

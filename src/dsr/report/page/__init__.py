@@ -2,26 +2,26 @@
 
 from __future__ import annotations
 
-import contextlib
 import functools
 import html
 import json
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import matplotlib as mpl
 import numpy as np
 
-from dsr.evaluation.results import Results
+from dsr.evaluation.results import BenchmarkSetting, Results
 from dsr.geometry.shading import LIGHT_NAMES, lights
 from dsr.report.page.calibration import calibration_data
 from dsr.report.page.content import links, metrics_data, problem_data, run_data
 from dsr.report.page.encoding import LEVELS, Level, Pool, megabytes
 from dsr.report.page.scenes import View, scene_data, views_of
+from dsr.report.work import Work
 from dsr.utils.files import write_text
 from dsr.utils.progress import Steps
 from dsr.viz.panels import HOLE_COLOUR
@@ -45,6 +45,67 @@ class _Stored:
     notes: list[str]
 
 
+class _Scene(NamedTuple):
+    """A view: its setting, its scene, and the numbers of its runs."""
+
+    problem: BenchmarkSetting
+    name: str
+    runs: tuple[int, ...]
+
+
+class Pictures:
+    """The pictures of all scenes and the agreement of the errors, which the workers of ``work`` begin at once.
+
+    Args:
+        work: runs, and what encodes their pictures.
+
+    """
+
+    def __init__(self, work: Work) -> None:
+        self.results = work.results
+        self.views = views_of(work.results)
+        self._work = work
+        self._first = self._encode(LEVELS[0])
+        self._calibration = work.map(_calibrate, work.results.problems())
+
+    def stored(self, budget: float, progress: Steps) -> _Stored:
+        """Encode the pictures at the best level within the budget in bytes, otherwise at the last level."""
+        for level in LEVELS[:-1]:
+            encoded = self._first if level is LEVELS[0] else self._encode(level)
+            try:
+                return _at_level(encoded, level, len(self.views), budget, progress)
+            except _TooLargeError:
+                encoded.close()
+        return _at_level(self._encode(LEVELS[-1]), LEVELS[-1], len(self.views), math.inf, progress)
+
+    def calibration(self) -> list[list[dict[str, Any]]]:
+        """Return the result of :func:`dsr.report.page.calibration.calibration_data` of each setting."""
+        return list(self._calibration)
+
+    def _encode(self, level: Level) -> Generator[_Encoded]:
+        """Return the encoded scenes in the order of :func:`_spread`."""
+        numbers = {id(run): number for number, run in enumerate(self.results.runs)}
+        views = [self.views[number] for number in _spread(len(self.views))]
+        scenes = [_Scene(view.problem, view.scene, tuple(numbers[id(run)] for run in view.runs)) for view in views]
+        return self._work.map(functools.partial(_encode_scene, level), scenes)
+
+
+_Encoded = tuple[dict[str, Any] | None, Pool, list[str]]
+"""Data of a scene, its pictures, and notes."""
+
+
+def _encode_scene(level: Level, results: Results, scene: _Scene) -> _Encoded:
+    """Encode the pictures of a scene."""
+    pool, notes = Pool(level), list[str]()
+    view = View(scene.problem, scene.name, tuple(results.runs[number] for number in scene.runs))
+    return scene_data(view, pool, notes), pool, notes
+
+
+def _calibrate(results: Results, problem: BenchmarkSetting) -> list[dict[str, Any]]:
+    """Compare the expected errors of a setting with the measured ones."""
+    return calibration_data(views_of(results, problem))
+
+
 def save_page(
     path: Path,
     results: Results,
@@ -53,6 +114,7 @@ def save_page(
     title: str = "dsr report",
     budget_mb: float = 60,
     progress: Steps | None = None,
+    pictures: Pictures | None = None,
 ) -> list[str]:
     """Write a page with the scores, renderings, errors, times and settings of runs, atomically.
 
@@ -67,6 +129,7 @@ def save_page(
         budget_mb: maximum size of the pictures, megabytes. Pictures are stored losslessly if they fit, otherwise with
             increasing compression, then at lower resolution; the page reports the choice.
         progress: called with the number of finished scenes and of all; restarts if more compression is needed.
+        pictures: the runs' pictures, if they are under way; None to encode them here.
 
     Returns:
         Notes on what could not be shown and how the pictures were stored.
@@ -77,15 +140,16 @@ def save_page(
     """
     if not budget_mb > 0:
         raise ValueError(f"budget_mb: expected a positive number of megabytes, got {budget_mb!r}")
-    views = views_of(results)
-    stored = _pictures(views, 1e6 * budget_mb, progress or (lambda done, total: None))
+    pictures = Pictures(Work(results)) if pictures is None else pictures
+    views = pictures.views
+    stored = pictures.stored(1e6 * budget_mb, progress or (lambda done, total: None))
     shown = [(view, scene) for view, scene in zip(views, stored.scenes, strict=True) if scene is not None]
     notes = stored.notes
     if shown:
         notes = [f"pictures: {stored.pool.level.text(stored.pool.reduced)}; {megabytes(stored.pool.size)}", *notes]
     problems = results.problems()
     data = {
-        **_data(path, results, views, tables, title),
+        **_data(path, results, pictures.calibration(), tables, title),
         "notes": [*results.notes, *notes],
         "scenes": [
             {"problem": problems.index(view.problem), "name": view.scene, "data": f"s{number}"}
@@ -99,16 +163,8 @@ def save_page(
     return notes
 
 
-def _pictures(views: Sequence[View], budget: float, progress: Steps) -> _Stored:
-    """Encode the pictures of all scenes at the best level within the budget, otherwise at the last level."""
-    for level in LEVELS[:-1]:
-        with contextlib.suppress(_TooLargeError):
-            return _at_level(views, level, budget, progress)
-    return _at_level(views, LEVELS[-1], math.inf, progress)
-
-
-def _at_level(views: Sequence[View], level: Level, budget: float, progress: Steps) -> _Stored:
-    """Encode the pictures of all scenes.
+def _at_level(encoded: Iterable[_Encoded], level: Level, count: int, budget: float, progress: Steps) -> _Stored:
+    """Collect the pictures of all scenes.
 
     Raises:
         _TooLargeError: the size, or its estimate from the first scenes, exceeds the budget.
@@ -117,14 +173,14 @@ def _at_level(views: Sequence[View], level: Level, budget: float, progress: Step
     pool = Pool(level)
     notes: dict[int, list[str]] = {}
     scenes: dict[int, dict[str, Any] | None] = {}
-    for done, number in enumerate(_spread(len(views)), start=1):
-        notes[number] = []
-        scenes[number] = scene_data(views[number], pool, notes[number])
-        expected = pool.size * len(views) / done if done == _SAMPLE else pool.size
+    for done, (number, (scene, pictures, remarks)) in enumerate(zip(_spread(count), encoded, strict=True), start=1):
+        pool.merge(pictures)
+        scenes[number], notes[number] = scene, remarks
+        expected = pool.size * count / done if done == _SAMPLE else pool.size
         if expected > budget:
             raise _TooLargeError
-        progress(done, len(views))
-    ordered = range(len(views))
+        progress(done, count)
+    ordered = range(count)
     distinct_notes = dict.fromkeys(note for number in ordered for note in notes[number])
     return _Stored(pool, [scenes[number] for number in ordered], list(distinct_notes))
 
@@ -137,16 +193,20 @@ def _spread(count: int) -> Iterator[int]:
 
 
 def _data(
-    path: Path, results: Results, views: Sequence[View], tables: Sequence[Path] | None, title: str
+    path: Path,
+    results: Results,
+    calibration: Sequence[list[dict[str, Any]]],
+    tables: Sequence[Path] | None,
+    title: str,
 ) -> dict[str, Any]:
     """Return the data of the page without scenes and pictures."""
     problems = results.problems()
-    own = {problem: [view for view in views if view.problem == problem] for problem in problems}
     return {
         "title": title,
         "metrics": metrics_data(results),
         "problems": [
-            {**problem_data(results, problem), "calibration": calibration_data(own[problem])} for problem in problems
+            {**problem_data(results, problem), "calibration": agreement}
+            for problem, agreement in zip(problems, calibration, strict=True)
         ],
         "methods": results.methods(),
         "seeds": sorted({run.seed for run in results.runs}),

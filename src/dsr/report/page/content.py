@@ -35,6 +35,7 @@ def problem_data(results: Results, problem: BenchmarkSetting) -> dict[str, Any]:
     formats = results.formats
     wide = {id(run): _by_scene(run, formats) for run in runs}
     scenes = list(dict.fromkeys(scene for run in runs for scene in wide[id(run)].index))
+    places = {scene: place for place, scene in enumerate(scenes)}
     rows: list[dict[str, Any]] = []
     means: list[dict[str, Any]] = []
     for method in methods:
@@ -54,7 +55,7 @@ def problem_data(results: Results, problem: BenchmarkSetting) -> dict[str, Any]:
         "methods": methods,
         "scenes": scenes,
         "means": means,
-        "rows": sorted(rows, key=lambda row: scenes.index(row["scene"])),
+        "rows": sorted(rows, key=lambda row: places[row["scene"]]),
         "seconds": _seconds(runs, methods),
     }
 

@@ -22,8 +22,10 @@ import numpy as np
 
 NOTHING_VALID, DEPTH_VALID, ALL_VALID = 0, 128, 255
 """Values of a mask: missing; valid depth without a normal; valid depth and normal."""
-_LOSSLESS = 101
+_WEBP_LOSSLESS = 101
 """OpenCV's WebP quality for lossless compression."""
+_PNG = (cv2.IMWRITE_PNG_COMPRESSION, 6, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_FILTERED)
+"""The least time for a size: 60 pictures of a report in 0.8 s and 3.9 MB, lossless WebP in 4.7 s and 3.2 MB."""
 
 
 @dataclass(frozen=True)
@@ -33,11 +35,13 @@ class Level:
     Args:
         quality: WebP quality, 1..100; None for lossless.
         longest: maximum longer side, pixels; larger pictures are reduced.
+        fast: whether lossless pictures are PNG, which takes a sixth of the time of WebP and is a fifth larger.
 
     """
 
     quality: int | None
     longest: int
+    fast: bool = False
 
     def text(self, reduced: bool) -> str:
         """Describe the compression and reduction for users."""
@@ -50,6 +54,7 @@ class Level:
 
 
 LEVELS = (
+    Level(None, 4096, fast=True),
     Level(None, 4096),
     Level(92, 4096),
     Level(88, 640),
@@ -77,14 +82,25 @@ class Pool:
 
     def add(self, picture: np.ndarray, *, exact: bool = False) -> str:
         """Encode an 8-bit picture, (H, W) or (H, W, 3) RGB, and return its name; ``exact`` forces lossless encoding."""
-        quality = _LOSSLESS if exact or self.level.quality is None else self.level.quality
-        ordered = picture if picture.ndim == 2 else picture[..., ::-1]
-        _, content = cv2.imencode(".webp", np.ascontiguousarray(ordered), [cv2.IMWRITE_WEBP_QUALITY, quality])
+        quality = _WEBP_LOSSLESS if exact or self.level.quality is None else self.level.quality
+        settings = _PNG if self.level.fast else (cv2.IMWRITE_WEBP_QUALITY, quality)
+        ordered = np.ascontiguousarray(picture if picture.ndim == 2 else picture[..., ::-1])
+        _, content = cv2.imencode(".png" if self.level.fast else ".webp", ordered, settings)
         name = "p" + hashlib.sha256(content.tobytes()).hexdigest()[:16]
-        if name not in self.pictures:
-            self.pictures[name] = base64.b64encode(content.tobytes()).decode("ascii")
-            self.size += len(self.pictures[name])
+        self._keep(name, base64.b64encode(content.tobytes()).decode("ascii"))
         return name
+
+    def merge(self, other: Pool) -> None:
+        """Add the pictures of another pool."""
+        for name, content in other.pictures.items():
+            self._keep(name, content)
+        self.reduced |= other.reduced
+
+    def _keep(self, name: str, content: str) -> None:
+        """Add an encoded picture unless it is there."""
+        if name not in self.pictures:
+            self.pictures[name] = content
+            self.size += len(content)
 
     def fit(self, values: np.ndarray, valid: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
         """Resize (H, W) or (H, W, C) values to the level by averaging valid pixels; return them and the valid mask."""

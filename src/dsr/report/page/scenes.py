@@ -58,15 +58,15 @@ class Result:
     errors: tuple[Tensor, Tensor] | None
 
 
-def views_of(results: Results) -> list[View]:
-    """Return all scenes with predictions, by setting; of several seeds of a method the lowest is used."""
+def views_of(results: Results, setting: BenchmarkSetting | None = None) -> list[View]:
+    """Return the scenes with predictions of a setting, or of all; of several seeds of a method the lowest is used."""
     views: list[View] = []
-    for problem in results.problems():
-        runs = results.of(problem)
-        scenes = dict.fromkeys(scene for run in runs for scene in run.scenes)
-        views += [
-            View(problem, scene, one_per_method([run for run in runs if scene in run.scenes])) for scene in scenes
-        ]
+    for problem in results.problems() if setting is None else [setting]:
+        having: dict[str, list[Run]] = {}
+        for run in results.of(problem):
+            for scene in run.scenes:
+                having.setdefault(scene, []).append(run)
+        views += [View(problem, scene, one_per_method(runs)) for scene, runs in having.items()]
     return views
 
 
