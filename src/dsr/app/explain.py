@@ -10,6 +10,7 @@ from hydra.errors import HydraException, MissingConfigException, OverrideParseEx
 from omegaconf import DictConfig, OmegaConf
 
 from dsr.app.composition import compose
+from dsr.app.multirun import LAUNCHERS
 from dsr.utils.config_files import list_choices, list_groups
 from dsr.utils.console import one_line
 
@@ -101,6 +102,8 @@ def _explain_missing(file: str, name: str, directories: Sequence[Path]) -> str:
     if not group:
         return f"--config-name {choice}: unknown; expected {name}"
     choices = list_choices(group, directories)
+    if group == "hydra/launcher":
+        choices = sorted({*choices, *LAUNCHERS})
     if choices:
         return f"{group}={choice}: unknown; expected one of {', '.join(choices)}"
     return f"{group}: no such group of choices; expected one of {', '.join(list_groups(directories))}"
