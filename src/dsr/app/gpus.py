@@ -42,7 +42,7 @@ def take_gpu(folder: Path) -> None:
     if _taken or len(gpus) < 2:
         return
     (folder / _FOLDER).mkdir(parents=True, exist_ok=True)
-    for turn, gpu in itertools.product(itertools.count(), gpus):
+    for turn, gpu in ((turn, gpu) for turn in itertools.count() for gpu in gpus):
         lock = FileLock(folder / _FOLDER / f"{gpu}.{turn}")
         try:
             lock.acquire(blocking=False)

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
 import logging
+import shutil
 import subprocess
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -22,6 +25,8 @@ _LOOK = 0.5
 """Seconds between two looks for results."""
 _ASK = (2.0, 60.0)
 """The fewest and most seconds between two questions to Slurm."""
+_STOP = 3.0
+"""The most seconds to wait for processes that are stopped."""
 _CONFIRMATIONS = 3
 """Answers in a row without a result after which a job has ended: network file systems show files late."""
 _ENDED = {
@@ -48,7 +53,7 @@ class SlurmSettings:
     max_num_timeout: int
     array_parallelism: int
     setup: list[str] | None = None
-    additional_parameters: dict[str, Any] = field(default_factory=dict)
+    additional_parameters: dict[str, Any] | None = None
 
     def __post_init__(self) -> None:
         for name in ("gpus_per_node", "cpus_per_task", "mem_gb", "timeout_min", "array_parallelism"):
@@ -96,17 +101,17 @@ class SlurmLauncher(JobsLauncher):
                         yield number, result
                 time.sleep(_LOOK if submitted else 0)
         finally:
-            for handle in submitted.values():
-                handle.cancel(check=False)
+            _stop(list(submitted.values()), settings.cluster)
 
 
 def _submit(jobs: Sequence[Job], settings: SlurmSettings, folder: Path) -> Sequence[Any]:
     """Submit jobs, and return submitit's handles of them."""
     import submitit  # noqa: PLC0415 - plugins have to be importable without
 
+    place = folder / ".submitit"
     try:
         executor = submitit.AutoExecutor(
-            folder / ".submitit" / "%j",
+            place / "%j",
             cluster=settings.cluster,
             **{f"{settings.cluster}_max_num_timeout": settings.max_num_timeout},
         )
@@ -125,8 +130,10 @@ def _submit(jobs: Sequence[Job], settings: SlurmSettings, folder: Path) -> Seque
             slurm_setup=settings.setup,
             slurm_additional_parameters=settings.additional_parameters,
         )
-        handles: Sequence[Any] = executor.submit_array([_Resumable(job) for job in jobs])
+        with contextlib.redirect_stderr(io.StringIO()):  # sbatch's words come with its error
+            handles: Sequence[Any] = executor.submit_array([_Resumable(job) for job in jobs])
     except (RuntimeError, OSError, subprocess.SubprocessError) as error:  # no Slurm, or sbatch refuses
+        shutil.rmtree(place, ignore_errors=True)
         raise ConfigError(f"hydra/launcher={_NAME}: {_refusal(error)}") from error
     return handles
 
@@ -135,6 +142,15 @@ def _refusal(error: Exception) -> str:
     """Return why jobs could not be submitted, one line: what sbatch says."""
     said = [line for line in str(error).splitlines() if "error:" in line]
     return said[-1].strip() if said else one_line(error)
+
+
+def _stop(handles: Sequence[Any], cluster: str) -> None:
+    """Stop jobs; processes on this machine are waited for."""
+    for handle in handles:
+        handle.cancel(check=False)
+    deadline = time.monotonic() + _STOP
+    while cluster == "local" and time.monotonic() < deadline and not all(handle.done() for handle in handles):
+        time.sleep(0.05)
 
 
 class _Waiting:
