@@ -124,9 +124,7 @@ def test_sweep_without_slurm_is_one_line(sweep, monkeypatch, tmp_path):
     monkeypatch.setattr(shutil, "which", lambda *_: None)
     code, lines = sweep(eventful, (0,), *ONE_NODE)
     assert code == 2
-    assert lines == [
-        'error: hydra/launcher=slurm: Could not detect "srun", are you indeed on a slurm cluster?'
-    ]
+    assert lines == ['error: hydra/launcher=slurm: Could not detect "srun", are you indeed on a slurm cluster?']
     assert [path.name for path in tmp_path.rglob("*") if path.is_file()] == ["multirun.yaml"]
 
 

@@ -92,7 +92,9 @@ def _explain_key(key: str, name: str, arguments: Sequence[str], directories: Seq
         return f"experiment: write +experiment=NAME, NAME one of {', '.join(list_choices(key, directories))}"
     prefix = key.rpartition(".")[0]
     node = _node_of(key, name, arguments, directories)
-    siblings = [f"{prefix}.{child!s}" if prefix else str(child) for child in node if child not in ("target", "_target_")]
+    siblings = [
+        f"{prefix}.{child!s}" if prefix else str(child) for child in node if child not in ("target", "_target_")
+    ]
     return f"{key}: unknown key; expected {', '.join(siblings) or 'none'}"
 
 

@@ -52,7 +52,9 @@ class RayLauncher(JobsLauncher):
             _connect(ray, settings)
         try:
             options = _options(ray, settings)
-            submitted = {ray.remote(_call).options(**options, name=f"job {job.number}").remote(job): job for job in jobs}
+            submitted = {
+                ray.remote(_call).options(**options, name=f"job {job.number}").remote(job): job for job in jobs
+            }
             while submitted:
                 ready, _ = ray.wait(list(submitted), timeout=_LOOK)
                 for reference in ready:

@@ -185,14 +185,15 @@ class _Waiting:
 def _slurm_states(names: Sequence[str]) -> dict[str, str]:
     """Return the states of jobs by their numbers; nothing if Slurm does not answer now."""
     arrays = ",".join(sorted({name.partition("_")[0] for name in names}))
-    command = ["squeue", "--noheader", "--array", "--states=all", "--format=%F_%K %T", f"--jobs={arrays}"]
+    command = ["squeue", "--noheader", "--array", "--states=all", "--format=%F %K %T", f"--jobs={arrays}"]
     try:
         answer = subprocess.run(command, capture_output=True, text=True, timeout=30, check=False)  # noqa: S603
     except (OSError, subprocess.TimeoutExpired):
         return {}
     if answer.returncode and "Invalid job id" not in answer.stderr:
         return {}
-    states = dict(line.split() for line in answer.stdout.splitlines())
+    rows = [line.split() for line in answer.stdout.splitlines()]
+    states = {f"{array}_{task}" if task.isdecimal() else array: state for array, task, state in rows}  # N/A: no array
     return {name: states.get(name, "COMPLETED") for name in names}  # Slurm forgets them some minutes after their end
 
 
