@@ -74,7 +74,7 @@ eventful.__module__ = "__main__"  # is sent to the jobs' processes as it is
 
 
 def expect_told(lines, *, killed):
-    assert lines[0] == "error: 2 of 4 jobs failed"
+    assert lines[0] == "error: 2 of 4 jobs failed", lines
     assert lines[1] == "error: seed=1: seed: not this one"
     assert lines[2].startswith(f"error: seed=2: ended without a result ({killed}); what it finished is kept; see ")
     assert len(lines) == 3
@@ -196,6 +196,8 @@ def job(config):
     if os.environ["RAY_NODE"] == "second" and first:
         Path("on-second").touch()
         time.sleep(60)
+    while config.seed == 0 and not Path("on-second").exists():
+        time.sleep(0.05)  # so that a job that lasts gets to the second node
     return 0.0
 
 cluster = Cluster()
@@ -233,7 +235,5 @@ def test_jobs_of_ray_go_on_when_a_process_and_a_node_are_lost(tmp_path):
     assert told[at + 1] == "error: seed=1: seed: not this one"
     assert told[at + 2].startswith("error: seed=2: WorkerCrashedError: ")
     begun = {seed: (tmp_path / f"begun-{seed}").read_text().split() for seed in range(5)}
-    lost = [seed for seed, nodes in begun.items() if nodes == ["second", "head"] and seed not in (2, 3)]
-    assert (tmp_path / "on-second").exists()
-    assert len(lost) == 1
+    assert [begun[seed] for seed in (0, 4)].count(["second", "head"]) == 1
     assert len(begun[2]) == len(begun[3]) == 2
