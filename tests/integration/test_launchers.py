@@ -106,7 +106,8 @@ def one_node_slurm(shared, monkeypatch, tmp_path_factory):
 
 @needs("submitit")
 @pytest.mark.usefixtures("one_node_slurm")
-def test_jobs_of_slurm_come_back_when_one_is_killed_and_one_requeued(sweep, tmp_path):
+def test_jobs_of_slurm_come_back_when_one_is_killed_and_one_requeued(sweep, tmp_path, monkeypatch):
+    monkeypatch.setattr(slurm, "_ASK", (1.0, 1.0))
     start = "scontrol update jobid={} starttime=now"  # Slurm waits two minutes with a requeued job
     helper = f"while sleep 0.3; do for j in $(squeue -h -t PD -o %A); do {start.format('$j')}; done; done"
     with subprocess.Popen(["bash", "-c", helper], stderr=subprocess.DEVNULL) as process:
