@@ -108,8 +108,9 @@ def one_node_slurm(shared, monkeypatch, tmp_path_factory):
 @pytest.mark.usefixtures("one_node_slurm")
 def test_jobs_of_slurm_come_back_when_one_is_killed_and_one_requeued(sweep, tmp_path, monkeypatch):
     monkeypatch.setattr(slurm, "_ASK", (1.0, 1.0))
-    start = "scontrol update jobid={} starttime=now"  # Slurm waits two minutes with a requeued job
-    helper = f"while sleep 0.3; do for j in $(squeue -h -t PD -o %A); do {start.format('$j')}; done; done"
+    held = "squeue -h -t PD -o '%A %r' | grep BeginTime | cut -d' ' -f1"  # Slurm waits two minutes with a requeued job
+    start = "sleep 2; scontrol update jobid=$j starttime=now"  # at once, its credentials would count as revoked
+    helper = f"while sleep 0.3; do for j in $({held}); do {start}; done; done"
     with subprocess.Popen(["bash", "-c", helper], stderr=subprocess.DEVNULL) as process:
         try:
             code, lines = sweep(eventful, range(4), *ONE_NODE)
