@@ -107,18 +107,21 @@ def all_parsers(parser: argparse.ArgumentParser) -> Iterator[argparse.ArgumentPa
 def configuration_reference(conf: Path) -> str:
     """Return the files of a configuration directory as Markdown: the two commands first, then each group."""
     commands = [f"## {name}.py\n\n{_file_text(conf / f'{name}.yaml')}" for name in ("eval", "train")]
-    groups = [_group_section(folder) for folder in sorted(conf.iterdir()) if folder.is_dir()]
+    folders = [folder for folder in sorted(conf.iterdir()) if folder.is_dir() and folder.name != "hydra"]
+    groups = [_group_section(folder, folder.name) for folder in folders]
+    launchers = conf / "hydra" / "launcher"
+    groups += [_group_section(launchers, "hydra/launcher")] if launchers.is_dir() else []
     return "\n".join([_HEAD_CONFIGURATION, *commands, *groups])
 
 
-def _group_section(folder: Path) -> str:
+def _group_section(folder: Path, group: str) -> str:
     """Return a group: a table of its choices, then each file."""
-    paths = sorted(folder.glob("*.yaml"))
-    lines = [f"## {folder.name}\n", "| choice | what |", "| --- | --- |"]
-    lines += [f"| [`{path.stem}`](#{folder.name}-{path.stem}) | {_escape(_summary(path))} |" for path in paths]
+    paths, anchor = sorted(folder.glob("*.yaml")), group.replace("/", "-")
+    lines = [f"## {group}\n", "| choice | what |", "| --- | --- |"]
+    lines += [f"| [`{path.stem}`](#{anchor}-{path.stem}) | {_escape(_summary(path))} |" for path in paths]
     lines.append("")
     for path in paths:
-        lines.append(f"### {folder.name}={path.stem} {{ #{folder.name}-{path.stem} }}\n\n{_file_text(path)}")
+        lines.append(f"### {group}={path.stem} {{ #{anchor}-{path.stem} }}\n\n{_file_text(path)}")
     return "\n".join(lines)
 
 

@@ -173,11 +173,12 @@ def leaves(node: Any, above: str = "") -> Iterator[tuple[str, Any]]:
 )
 def test_configuration_reference_has_every_key_and_default(path: Path, generated: dict[str, str]) -> None:
     page = generated["reference/configuration.md"]
-    group = path.parent.name
-    heading = f"\n## {path.stem}.py\n" if group == "conf" else f"\n### {group}={path.stem} {{ #{group}-{path.stem} }}\n"
-    if group != "conf":
+    group = path.parent.relative_to(ROOT / "conf").as_posix()
+    anchor = f"{group.replace('/', '-')}-{path.stem}"
+    heading = f"\n## {path.stem}.py\n" if group == "." else f"\n### {group}={path.stem} {{ #{anchor} }}\n"
+    if group != ".":
         assert f"\n## {group}\n" in page
-        assert f"| [`{path.stem}`](#{group}-{path.stem}) |" in page
+        assert f"| [`{path.stem}`](#{anchor}) |" in page
     section = re.split(r"\n##", page.partition(heading)[2], maxsplit=1)[0]
     if group == "experiment":
         assert path.read_text().strip() in section

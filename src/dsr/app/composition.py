@@ -12,13 +12,16 @@ from dsr.app.experiments import register_resolvers
 from dsr.app.schema import register
 
 
-def compose(name: str, overrides: Sequence[str], directories: Sequence[Path]) -> DictConfig:
+def compose(
+    name: str, overrides: Sequence[str], directories: Sequence[Path], *, with_hydra: bool = False
+) -> DictConfig:
     """Compose a configuration.
 
     Args:
         name: without ``.yaml``.
         overrides: as on the command line.
         directories: those of :func:`dsr.utils.config_files.config_directories`.
+        with_hydra: whether Hydra's own settings are there, too.
 
     """
     register()
@@ -26,4 +29,4 @@ def compose(name: str, overrides: Sequence[str], directories: Sequence[Path]) ->
     places = ",".join(f'"file://{directory.resolve()}"' for directory in directories[1:])
     more = [f"hydra.searchpath=[{places}]"] if places else []
     with hydra.initialize_config_dir(str(directories[0]), version_base="1.3"):
-        return hydra.compose(name, [*overrides, *more])
+        return hydra.compose(name, [*overrides, *more], return_hydra_config=with_hydra)

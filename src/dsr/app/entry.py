@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 import hydra
+from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
@@ -24,7 +25,8 @@ from yaml import YAMLError
 
 from dsr.app.experiments import register_resolvers, with_keys_of_swept_groups, without_overridden_sweeps
 from dsr.app.explain import explain, explain_arguments, explain_damage
-from dsr.app.multirun import JobResult, collected_jobs, failure_summary, job_name
+from dsr.app.gpus import count_gpus, take_gpu
+from dsr.app.multirun import JobResult, collected_jobs, expect_launcher, failure_summary, job_name
 from dsr.app.schema import EvalConfig, TrainConfig, plain_config, register
 from dsr.utils import interruption
 from dsr.utils.builder import ConfigError
@@ -72,6 +74,7 @@ def run_command(name: str, command: Callable[[DictConfig], Any], arguments: Sequ
     """
     register()
     register_resolvers()
+    OmegaConf.register_new_resolver("gpus", count_gpus, replace=True)
     silence_threads()
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     arguments = ["trust=true" if argument == "--trust" else argument for argument in arguments]
@@ -79,6 +82,7 @@ def run_command(name: str, command: Callable[[DictConfig], Any], arguments: Sequ
     logging.getLogger("matplotlib").setLevel(logging.WARNING)  # Hydra would show when it caches fonts
     try:
         directories = config_directories(_config_dirs(arguments))
+        expect_launcher(arguments)
     except ValueError as error:
         fail(str(error))
     _expect_choices(name, arguments, directories)
@@ -128,9 +132,10 @@ def _job(
             register_resolvers()
             if os.getppid() == pid:  # of a launcher on this machine
                 interruption.end_with(pid)
+                take_gpu(Path(HydraConfig.get().sweep.dir))
         try:
             begun.append(True)
-            with _argv(argv), interruption.working():
+            with _argv(argv), interruption.requeued(), interruption.working():
                 value = command(config)
             return JobResult(value if isinstance(value, int | float) else 0.0)
         except (ConfigError, OSError, FullDiskError) as error:  # a multirun continues with its other jobs

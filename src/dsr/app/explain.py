@@ -10,6 +10,7 @@ from hydra.errors import HydraException, MissingConfigException, OverrideParseEx
 from omegaconf import DictConfig, OmegaConf
 
 from dsr.app.composition import compose
+from dsr.app.multirun import LAUNCHERS
 from dsr.utils.config_files import list_choices, list_groups
 from dsr.utils.console import one_line
 
@@ -91,8 +92,10 @@ def _explain_key(key: str, name: str, arguments: Sequence[str], directories: Seq
         return f"experiment: write +experiment=NAME, NAME one of {', '.join(list_choices(key, directories))}"
     prefix = key.rpartition(".")[0]
     node = _node_of(key, name, arguments, directories)
-    siblings = [f"{prefix}.{child!s}" if prefix else str(child) for child in node if child != "target"]
-    return f"{key}: unknown key; expected {', '.join(siblings)}"
+    siblings = [
+        f"{prefix}.{child!s}" if prefix else str(child) for child in node if child not in ("target", "_target_")
+    ]
+    return f"{key}: unknown key; expected {', '.join(siblings) or 'none'}"
 
 
 def _explain_missing(file: str, name: str, directories: Sequence[Path]) -> str:
@@ -101,6 +104,8 @@ def _explain_missing(file: str, name: str, directories: Sequence[Path]) -> str:
     if not group:
         return f"--config-name {choice}: unknown; expected {name}"
     choices = list_choices(group, directories)
+    if group == "hydra/launcher":
+        choices = sorted({*choices, *LAUNCHERS})
     if choices:
         return f"{group}={choice}: unknown; expected one of {', '.join(choices)}"
     return f"{group}: no such group of choices; expected one of {', '.join(list_groups(directories))}"
@@ -121,12 +126,13 @@ def _first_line(error: BaseException) -> str:
 
 def _node_of(key: str, name: str, arguments: Sequence[str], directories: Sequence[Path]) -> DictConfig:
     """Return the node in which ``key`` was looked for, or the innermost one above it."""
-    choice = re.compile(rf"({'|'.join(list_groups(directories))})=[\w-]+")
+    choice = re.compile(rf"({'|'.join(list_groups(directories))}|hydra/launcher)=[\w-]+")
     overrides = [argument for argument in arguments if choice.fullmatch(argument)]
+    with_hydra = key.startswith("hydra.")
     try:
-        node = compose(name, overrides, directories)
+        node = compose(name, overrides, directories, with_hydra=with_hydra)
     except HydraException:  # one of these choices is invalid
-        node = compose(name, [], directories)
+        node = compose(name, [], directories, with_hydra=with_hydra)
     for part in key.split(".")[:-1]:
         child = OmegaConf.select(node, part)
         if not isinstance(child, DictConfig):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import importlib.util
 from collections.abc import Iterator, Sequence
 from typing import Any
 
@@ -14,6 +15,16 @@ from hydra.types import RunMode
 from dsr.utils.builder import ConfigError
 from dsr.utils.console import one_line
 
+LAUNCHERS = {
+    "basic": "hydra",
+    "gpus": "hydra_plugins.hydra_joblib_launcher",
+    "joblib": "hydra_plugins.hydra_joblib_launcher",
+    "ray": "ray",
+    "slurm": "submitit",
+    "submitit_local": "hydra_plugins.hydra_submitit_launcher",
+    "submitit_slurm": "hydra_plugins.hydra_submitit_launcher",
+}
+"""The launchers that ``pip install dsr[cluster]`` brings, and what each needs."""
 _MADE_BY = "instantiate_launcher"
 """The method of Hydra's plugins with which sweepers make their launcher."""
 
@@ -34,6 +45,26 @@ class JobResult(float):
         result = cls("nan")
         result.problem = problem
         return result
+
+
+def expect_launcher(arguments: Sequence[str]) -> None:
+    """Check that the launcher that a command line names, if dsr knows it, is installed.
+
+    Args:
+        arguments: of the command line.
+
+    Raises:
+        ConfigError: it is not.
+
+    """
+    for argument in arguments:
+        group, _, choice = argument.partition("=")
+        if group != "hydra/launcher":
+            continue
+        module = LAUNCHERS.get(choice)
+        if module is not None and importlib.util.find_spec(module) is None:
+            library = module.rpartition(".")[2]
+            raise ConfigError(f"{argument}: expected {library}, which is not installed; pip install dsr[cluster]")
 
 
 def job_name() -> str:
@@ -58,6 +89,8 @@ def collected_jobs() -> Iterator[list[JobReturn]]:
         def launch_collecting(job_overrides: Sequence[Sequence[str]], initial_job_idx: int) -> Sequence[JobReturn]:
             try:
                 results = launch(job_overrides, initial_job_idx)
+            except ConfigError:
+                raise
             except Exception as error:
                 kind = type(launcher).__name__
                 raise ConfigError(

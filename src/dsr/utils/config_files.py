@@ -45,5 +45,6 @@ def list_choices(group: str, directories: Sequence[Path]) -> list[str]:
 
 
 def list_groups(directories: Sequence[Path]) -> list[str]:
-    """Return the sorted names of the groups in all directories."""
-    return sorted({path.name for directory in directories for path in directory.iterdir() if path.is_dir()})
+    """Return the sorted names of the groups in all directories, without those of Hydra's own settings."""
+    names = {path.name for directory in directories for path in directory.iterdir() if path.is_dir()}
+    return sorted(names - {"hydra"})

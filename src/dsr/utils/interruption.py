@@ -29,6 +29,8 @@ from typing import Any, NoReturn
 MESSAGE = "interrupted; what is finished is kept, the same command goes on from there"
 """The line of an interrupted command that has nothing more precise to say."""
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
+_PREEMPTION: signal.Signals | None = getattr(signal, "SIGUSR2", None)
+"""The signal with which submitit ends a job that is preempted or out of time; Windows has none."""
 _GRACE = 4.0
 """Seconds that an interrupted command has to end by itself."""
 _BETWEEN_LOOKS = 0.5
@@ -64,6 +66,7 @@ class _State:
         number: the signal that came; 0 for none.
         handled: whether the handler has acted upon a signal.
         deferred: what notes a signal; None if signals raise.
+        requeues: whether a scheduler requeues the job of this process, see :func:`requeued`.
         ending: held by the thread that ends the process.
 
     """
@@ -74,6 +77,7 @@ class _State:
     number = 0
     handled = False
     deferred: Deferred | None = None
+    requeues = False
     ending = threading.Lock()
 
 
@@ -141,10 +145,12 @@ def deferred(message: str) -> Iterator[Deferred]:
 
     """
     noted, before = Deferred(message), {}
-    if _State.installed:
+    if _State.installed or _State.requeues:
         _State.deferred = noted
         reinstall()
-    elif threading.current_thread() is threading.main_thread():
+    if _State.requeues:
+        before = {signal.SIGTERM: signal.signal(signal.SIGTERM, signal.SIG_IGN)}  # Lightning ends a training at it
+    elif not _State.installed and threading.current_thread() is threading.main_thread():
         before = {number: signal.signal(number, noted.note) for number in _SIGNALS}
     try:
         yield noted
@@ -152,6 +158,43 @@ def deferred(message: str) -> Iterator[Deferred]:
         _State.deferred = None
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+@contextlib.contextmanager
+def requeued() -> Iterator[None]:
+    """Within this context a job that its scheduler wants to stop is stopped as by Ctrl-C, and only then requeued.
+
+    submitit, in whose processes the jobs of sweeps run, requeues a job and ends its process at once when SIGUSR2 says
+    that its time is up or that it is preempted. Here the signal first raises KeyboardInterrupt, or is noted within
+    :func:`deferred`, so that a training saves its step. SIGTERM, which some clusters send before, stays without effect,
+    as submitit has it. In other processes nothing changes.
+    """
+    requeue = signal.getsignal(_PREEMPTION) if _PREEMPTION is not None else None
+    if _PREEMPTION is None or not callable(requeue) or _State.installed:
+        yield
+        return
+    came: list[FrameType | None] = []
+
+    def note(number: int, frame: FrameType | None) -> None:
+        came.append(frame)
+        if _in_import(frame):
+            requeue(number, frame)
+        elif _State.deferred is not None:
+            _State.deferred.requested = True
+        elif len(came) == 1:  # a second one would disturb what the first one has begun
+            raise KeyboardInterrupt
+
+    signal.signal(_PREEMPTION, note)
+    _State.requeues = True
+    try:
+        yield
+    except KeyboardInterrupt:
+        if came:
+            requeue(_PREEMPTION, came[0])
+        raise
+    finally:
+        _State.requeues = False
+        signal.signal(_PREEMPTION, requeue)
 
 
 @contextlib.contextmanager

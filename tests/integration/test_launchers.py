@@ -1,0 +1,241 @@
+"""Sweeps on other launchers than Hydra's own: every job comes back, also one that is killed or has to leave."""
+
+import contextlib
+import importlib.util
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from dsr.app.entry import run_command
+from dsr.app.launchers import slurm
+from dsr.utils import interruption
+from dsr.utils.builder import ConfigError
+
+REPOSITORY = Path(__file__).resolve().parents[2]
+LOCAL = ("hydra/launcher=slurm", "hydra.launcher.cluster=local", "hydra.launcher.gpus_per_node=null")
+ONE_NODE = (
+    "hydra/launcher=slurm", "hydra.launcher.gpus_per_node=null", "hydra.launcher.cpus_per_task=1",
+    "hydra.launcher.mem_gb=1",
+)  # fmt: skip
+
+
+def needs(module):
+    return pytest.mark.skipif(importlib.util.find_spec(module) is None, reason="pip install dsr[cluster]")
+
+
+@pytest.fixture
+def sweep(monkeypatch, tmp_path, capfd):
+    """Return a runner of a sweep over values of the seed: the exit code and the lines of errors."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("HYDRA_FULL_ERROR", "1")
+    monkeypatch.setenv("PYTHONPATH", str(REPOSITORY / "src"))
+    monkeypatch.setattr(slurm, "_ASK", (0.2, 0.4))
+
+    def run(job, seeds, *arguments):
+        monkeypatch.setattr(sys, "argv", ["eval.py"])
+        code = 0
+        try:
+            run_command("eval", job, ["-m", f"seed={','.join(map(str, seeds))}", *arguments])
+        except SystemExit as ended:
+            code = ended.code
+        return code, [line for line in capfd.readouterr().err.splitlines() if line.startswith(("error", "interr"))]
+
+    return run
+
+
+def eventful(config):
+    """Do what the seed says: 0 work, 1 fail, 2 be killed, 3 have to leave at the first time, and be begun again."""
+    with Path(f"begun-{config.seed}").open("a") as file:
+        file.write("begun\n")
+    if config.seed == 1:
+        raise ConfigError("seed: not this one")
+    if config.seed == 2:
+        os.kill(os.getpid(), signal.SIGKILL)
+    if config.seed == 3 and len(Path("begun-3").read_text().splitlines()) == 1:
+        with interruption.deferred("") as noted:
+            os.kill(os.getpid(), signal.SIGTERM)  # as some clusters do before
+            assert not noted.requested
+            os.kill(os.getpid(), signal.SIGUSR2)
+            assert noted.requested
+            Path("saved").touch()
+            raise KeyboardInterrupt
+    if config.seed == 3:
+        assert Path("saved").exists()
+    return float(config.seed)
+
+
+eventful.__module__ = "__main__"  # is sent to the jobs' processes as it is
+
+
+def expect_told(lines, *, killed):
+    assert lines[0] == "error: 2 of 4 jobs failed", lines
+    assert lines[1] == "error: seed=1: seed: not this one"
+    assert lines[2].startswith(f"error: seed=2: ended without a result ({killed}); what it finished is kept; see ")
+    assert len(lines) == 3
+
+
+@needs("submitit")
+def test_jobs_of_submitit_come_back_when_one_is_killed_and_one_requeued(sweep, tmp_path):
+    code, lines = sweep(eventful, range(4), *LOCAL)
+    assert code == 2
+    expect_told(lines, killed="FINISHED")
+    assert (tmp_path / "begun-3").read_text() == "begun\n" * 2
+
+
+@pytest.fixture
+def one_node_slurm(shared, monkeypatch, tmp_path_factory):
+    """Start a Slurm of one node."""
+    if shutil.which("slurmctld") is None or os.geteuid() != 0:
+        pytest.skip("needs Debian's slurmctld, slurmd, slurm-client and munge, and root")
+    script, folder = str(shared / "slurm" / "one-node.sh"), str(tmp_path_factory.mktemp("slurm"))
+    monkeypatch.delenv("SLURM_CONF", raising=False)
+    began = subprocess.run(["bash", script, "start", folder], capture_output=True, text=True, check=False, timeout=60)
+    try:
+        assert began.returncode == 0, began.stderr
+        monkeypatch.setenv("SLURM_CONF", began.stdout.strip())
+        yield
+    finally:
+        subprocess.run(["bash", script, "stop", folder], check=True, timeout=60)
+
+
+@needs("submitit")
+@pytest.mark.usefixtures("one_node_slurm")
+def test_jobs_of_slurm_come_back_when_one_is_killed_and_one_requeued(sweep, tmp_path, monkeypatch):
+    monkeypatch.setattr(slurm, "_ASK", (1.0, 1.0))
+    held = "squeue -h -t PD -o '%A %r' | grep BeginTime | cut -d' ' -f1"  # Slurm waits two minutes with a requeued job
+    start = "sleep 2; scontrol update jobid=$j starttime=now"  # at once, its credentials would count as revoked
+    helper = f"while sleep 0.3; do for j in $({held}); do {start}; done; done"
+    with subprocess.Popen(["bash", "-c", helper], stderr=subprocess.DEVNULL) as process:
+        try:
+            code, lines = sweep(eventful, range(4), *ONE_NODE)
+        finally:
+            process.kill()
+    assert code == 2
+    expect_told(lines, killed="FAILED")
+    assert (tmp_path / "begun-3").read_text() == "begun\n" * 2
+
+
+@needs("submitit")
+def test_sweep_without_slurm_is_one_line(sweep, monkeypatch, tmp_path):
+    monkeypatch.setattr(shutil, "which", lambda *_: None)
+    code, lines = sweep(eventful, (0,), *ONE_NODE)
+    assert code == 2
+    assert lines == ['error: hydra/launcher=slurm: Could not detect "srun", are you indeed on a slurm cluster?']
+    assert [path.name for path in tmp_path.rglob("*") if path.is_file()] == ["multirun.yaml"]
+
+
+@needs("submitit")
+def test_interrupted_sweep_stops_its_jobs(sweep, tmp_path):
+    def lasting(config):
+        Path("pid").write_text(str(os.getpid()))
+        time.sleep(60)
+
+    lasting.__module__ = "__main__"
+    interrupted = interrupt_when(tmp_path / "pid")
+    code, lines = sweep(lasting, (0,), *LOCAL)
+    interrupted.wait(10)
+    assert code == 130
+    assert lines == ["interrupted; what is finished is kept, the same command goes on from there"]
+    deadline = time.monotonic() + 10
+    while is_alive(int((tmp_path / "pid").read_text())) and time.monotonic() < deadline:
+        time.sleep(0.1)
+    assert not is_alive(int((tmp_path / "pid").read_text()))
+
+
+def interrupt_when(path):
+    """Send this process SIGINT as soon as a file has a content."""
+    watch = f"until [ -s {path} ]; do sleep 0.1; done; kill -INT {os.getpid()}"
+    return subprocess.Popen(["bash", "-c", watch])
+
+
+def is_alive(pid):
+    with contextlib.suppress(OSError):
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    return False
+
+
+def on_a_gpu(config):
+    """Note which GPUs this process sees, and wait for the others, so that each job has a process of its own."""
+    Path(f"gpu-{config.seed}").write_text(os.environ["CUDA_VISIBLE_DEVICES"])
+    deadline = time.monotonic() + 30
+    while len(list(Path().glob("gpu-*"))) < 4 and time.monotonic() < deadline:
+        time.sleep(0.05)
+
+
+on_a_gpu.__module__ = "__main__"
+
+
+@needs("joblib")
+def test_jobs_of_joblib_have_a_gpu_each_and_share_them_evenly(sweep, monkeypatch, tmp_path):
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "4,GPU-7a")
+    code, lines = sweep(on_a_gpu, range(4), "hydra/launcher=gpus", "hydra.launcher.n_jobs=4")
+    assert (code, lines) == (0, []), lines
+    assert sorted((tmp_path / f"gpu-{seed}").read_text() for seed in range(4)) == ["4", "4", "GPU-7a", "GPU-7a"]
+
+
+RAY = """
+import os, signal, sys, threading, time
+from pathlib import Path
+from ray.cluster_utils import Cluster
+from dsr.app.entry import run_command
+from dsr.utils.builder import ConfigError
+
+def job(config):
+    place = Path(f"begun-{config.seed}")
+    with place.open("a") as file:
+        file.write(os.environ["RAY_NODE"] + "\\n")
+    first = len(place.read_text().splitlines()) == 1
+    if config.seed == 1:
+        raise ConfigError("seed: not this one")
+    if config.seed == 2 or (config.seed == 3 and first):
+        os.kill(os.getpid(), signal.SIGKILL)
+    if os.environ["RAY_NODE"] == "second" and first:
+        Path("on-second").touch()
+        time.sleep(60)
+    while config.seed == 0 and not Path("on-second").exists():
+        time.sleep(0.05)  # so that a job that lasts gets to the second node
+    return 0.0
+
+cluster = Cluster()
+os.environ["RAY_NODE"] = "head"
+cluster.add_node(num_cpus=1, include_dashboard=False)
+os.environ["RAY_NODE"] = "second"
+second = cluster.add_node(num_cpus=1)
+
+def lose_node():
+    while not Path("on-second").exists():
+        time.sleep(0.05)
+    cluster.remove_node(second, allow_graceful=False)
+
+threading.Thread(target=lose_node, daemon=True).start()
+os.environ["RAY_ADDRESS"] = cluster.address
+try:
+    run_command("eval", job, ["-m", "seed=0,1,2,3,4", "hydra/launcher=ray", "hydra.launcher.num_cpus=1",
+                              "hydra.launcher.max_retries=1"])
+finally:
+    cluster.shutdown()
+"""
+
+
+@needs("ray")
+def test_jobs_of_ray_go_on_when_a_process_and_a_node_are_lost(tmp_path):
+    (tmp_path / "sweep.py").write_text(RAY)
+    environment = {**os.environ, "PYTHONPATH": str(REPOSITORY / "src"), "RAY_ENABLE_UV_RUN_RUNTIME_ENV": "0"}
+    done = subprocess.run(
+        [sys.executable, "sweep.py"], cwd=tmp_path, env=environment, capture_output=True, text=True, check=False,
+        timeout=100,
+    )  # fmt: skip
+    assert done.returncode == 2, done.stderr
+    told = done.stderr.splitlines()
+    at = told.index("error: 2 of 5 jobs failed")
+    assert told[at + 1] == "error: seed=1: seed: not this one"
+    assert told[at + 2].startswith("error: seed=2: WorkerCrashedError: ")
+    begun = {seed: (tmp_path / f"begun-{seed}").read_text().split() for seed in range(5)}
+    assert [begun[seed] for seed in (0, 4)].count(["second", "head"]) == 1
+    assert len(begun[2]) == len(begun[3]) == 2
