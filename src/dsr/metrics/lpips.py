@@ -8,13 +8,13 @@ from __future__ import annotations
 
 import contextlib
 import http.client
+import importlib.util
 import socket
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
 
 import torch
-import torchmetrics.functional.image as heads_home
 from torch import Tensor, nn
 from torch.nn.utils import skip_init
 
@@ -186,8 +186,11 @@ def load_lpips(configured: Path | None = None) -> LPIPS:
 
 
 def _linear_heads() -> list[Tensor]:
-    """Return the five linear heads of LPIPS v0.1, each (1, C, 1, 1), from the torchmetrics wheel."""
-    file = Path(heads_home.__file__).parent / "lpips_models" / "alex.pth"
+    """Return the five linear heads of LPIPS v0.1, each (1, C, 1, 1), from the torchmetrics wheel, not imported."""
+    package = importlib.util.find_spec("torchmetrics")
+    if package is None or package.origin is None:
+        raise ModuleNotFoundError("torchmetrics: expected the package, which has the linear heads of LPIPS")
+    file = Path(package.origin).parent / "functional" / "image" / "lpips_models" / "alex.pth"
     state = torch.load(file, map_location="cpu", weights_only=True)
     return [state[f"lin{level}.model.1.weight"] for level in range(len(_CONVOLUTIONS))]
 
