@@ -341,6 +341,9 @@ USAGE_ERRORS = {
     "a device without numbers": (["device=meta"], "device: expected auto, cpu or a device of this machine"),
     "a precision": (["precision=half"], "precision: expected one of float32, bfloat16, auto, got half"),
     "a seed": (["seed=-1"], "seed: expected 0 or a positive number"),
+    "no worker": (["workers=0"], "workers: expected auto or a whole number, 1 or more, got 0"),
+    "workers that are none": (["workers=abc"], "workers: expected auto or a whole number, 1 or more, got 'abc'"),
+    "half a thread": (["threads=0.5"], "threads: expected auto or a whole number, 1 or more, got 0.5"),
     "no root": (["dataset=folder"], "dataset.root: dataset=folder needs it: dataset.root=..."),
     "a missing root": (["dataset=folder", "dataset.root=no where"], "dataset.root: expected a directory of scenes"),
     "an empty root": (["dataset=folder", "dataset.root=empty"], "dataset.root: expected a folder per scene in empty"),
@@ -517,6 +520,23 @@ def test_concurrent_runs_do_not_disturb_each_other(tmp_path, offline):
     errors = [process.communicate(timeout=100)[1] for process in pair]
     assert [process.returncode for process in pair] == [0, 0], errors
     assert tree(tmp_path / "out") == written(["a", "b"])
+
+
+def test_several_workers_and_commands_give_the_files_of_one(tmp_path, offline):
+    shared = ("dataset.size=64", "metrics.lpips=false", "threads=1", "method=msg_v")
+    assert run(tmp_path, offline, *shared, "workers=1", "output_dir=one").returncode == 0
+    done = run(tmp_path, offline, *shared, "workers=3", "output_dir=three")
+    assert (done.returncode, done.stderr) == (0, "")
+    assert tree(tmp_path / "three") == tree(tmp_path / "one") == written(SIMGEO)
+    scores = [(tmp_path / name / "scores.csv").read_bytes() for name in ("one", "three")]
+    assert scores[0] == scores[1]
+    for scene in SIMGEO:
+        maps = [np.load(tmp_path / name / "predictions" / f"{scene}.npz")["depth"] for name in ("one", "three")]
+        np.testing.assert_array_equal(*maps)
+    again = run(tmp_path, offline, *shared, "workers=2", "output_dir=three")
+    assert "predictions re-used: 6" in again.stdout
+    summaries = [json.loads((tmp_path / name / "summary.json").read_text()) for name in ("one", "three")]
+    assert [list(each["seconds"]) for each in summaries] == [list(SIMGEO)] * 2
 
 
 def test_msg_v_reproduces_the_protocol_on_the_released_scenes(shared, tmp_path, within):

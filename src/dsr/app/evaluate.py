@@ -20,25 +20,22 @@ from dsr.app import run_directory as rundir
 from dsr.app.methods import adapt_method, hash_weights, weights_of
 from dsr.app.metrics import check_metrics, chosen_metrics, metric_collection
 from dsr.app.schema import EvalConfig, given_keys, plain_config, user_directories
-from dsr.app.training_runs import studies_of_run
 from dsr.data.base import SceneSource, prepare_scenes
 from dsr.degradation.downsampling import Downsampling, Measured
 from dsr.degradation.scales import NATIVE, match_ratio
 from dsr.evaluation.predict import Evaluation, Outcome, StalePredictionError, failure_line, predict
 from dsr.evaluation.score import score
+from dsr.evaluation.sharing import Workers, can_fork, choose_workers
 from dsr.evaluation.store import load_errors, prediction_path
 from dsr.inference.adapter import AnyScale
 from dsr.methods.dip.upsampler import WORKSPACE
 from dsr.methods.registry import build_method, target_paths
 from dsr.metrics.formats import HEADLINES, Formats
-from dsr.report.dashboard import save_dashboard
 from dsr.report.tables import score_table
 from dsr.sample import DepthSample
 from dsr.utils.builder import ConfigError, build, takes, trait
 from dsr.utils.console import ConsoleProgress, open_console, print_error, show
 from dsr.utils.devices import fast_precision, pick_device
-from dsr.viz.confidence import write_confidence
-from dsr.viz.panels import save_picture
 
 _OBJECTIVE = "RMSE_v"
 
@@ -61,6 +58,8 @@ def evaluate(config: DictConfig) -> pd.DataFrame:
     plain = plain_config(config)
     if plain["run"] is None:
         return _evaluate(plain, None)
+    from dsr.app.training_runs import studies_of_run  # noqa: PLC0415 - it imports Lightning, which takes seconds
+
     scores = [_evaluate(each, source) for each, source in studies_of_run(plain, given_keys())]
     return pd.concat(scores, ignore_index=True)
 
@@ -81,6 +80,16 @@ def objective(scores: pd.DataFrame) -> float:
 
 def _evaluate(plain: dict[str, Any], source: SceneSource | None) -> pd.DataFrame:
     """Evaluate on ``source``, or on the data set that the configuration describes."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)  # until it is decided who computes: threads would not survive a fork
+    try:
+        return _evaluate_with(plain, source, threads)
+    finally:
+        torch.set_num_threads(threads)
+
+
+def _evaluate_with(plain: dict[str, Any], source: SceneSource | None, cores: int) -> pd.DataFrame:
+    """Evaluate as :func:`_evaluate` does; ``cores`` is the number of threads that computations may have."""
     settings = EvalConfig.of(plain)
     console = open_console()
     device = pick_device(settings.device)
@@ -97,26 +106,61 @@ def _evaluate(plain: dict[str, Any], source: SceneSource | None) -> pd.DataFrame
     given = {"device": device, "weights": weights, "workspace": folder, "display": progress}
     study = _study(settings, identity, given, source, adapted)
     check_metrics(settings.metrics)
+    workers = _workers(settings, device, len(study.source.scenes()), cores)
     rundir.claim(folder, plain, identity)
     if settings.overwrite:
         shutil.rmtree(folder / WORKSPACE, ignore_errors=True)
     _seed(settings.seed)
     prepare_scenes(study.source, study.source.scenes(), progress)
     try:
-        outcome = predict(study, folder, progress, overwrite=settings.overwrite)
+        outcome = predict(
+            study, folder, progress, overwrite=settings.overwrite, workers=workers, meanwhile=_import_report
+        )
     except StalePredictionError as error:
         raise ConfigError(str(error)) from error
     metrics = chosen_metrics(settings.metrics, device)
     formats = {metric.name: metric.format for metric in metrics}
     illustrate = functools.partial(_illustrate, folder, study.label, formats)
-    scores = score(study, folder, metrics, outcome, progress, illustrate)
-    save_dashboard(folder)
+    scores = score(study, folder, metrics, outcome, progress, illustrate, workers=workers)
+    _save_dashboard(folder)
     _report(console, folder, scores, study.label, outcome, formats)
     if outcome.failures:
         total = len(study.source.scenes())
         rest = f"; the others are in {folder}" if len(outcome.failures) < total else ""
         raise ConfigError(f"{len(outcome.failures)} of {total} scenes failed: {', '.join(outcome.failures)}{rest}")
     return scores
+
+
+def _workers(settings: EvalConfig, device: torch.device, scenes: int, cores: int) -> Workers:
+    """Return the worker processes that the configuration describes.
+
+    Raises:
+        ConfigError: this device or system has no use for several.
+
+    """
+    count, threads = (None if value == "auto" else int(value) for value in (settings.workers, settings.threads))
+    forks = device.type == "cpu" and can_fork()
+    if count is not None and count > 1 and not forks:
+        raise ConfigError(
+            f"workers: expected 1 with device={device}, got {count}; "
+            "start the command once per device, with the same output_dir"
+        )
+    return choose_workers(
+        count, threads, scenes, cores, together=forks and not trait("method", settings.method, "optimises")
+    )
+
+
+def _import_report() -> None:
+    """Import what draws and logs, while workers predict."""
+    import dsr.report.dashboard  # noqa: PLC0415
+    import dsr.viz.confidence  # noqa: F401, PLC0415
+
+
+def _save_dashboard(folder: Path) -> None:
+    """Write the run's TensorBoard log."""
+    from dsr.report.dashboard import save_dashboard  # noqa: PLC0415 - see _import_report
+
+    save_dashboard(folder)
 
 
 def _source(settings: EvalConfig) -> SceneSource:
@@ -237,6 +281,10 @@ def _seed(seed: int) -> None:
 def _illustrate(
     folder: Path, label: str, formats: Formats, sample: DepthSample, depth: torch.Tensor, scores: Mapping[str, float]
 ) -> None:
+    """Draw the result of a scene, and its expected errors if there are any."""
+    from dsr.viz.confidence import write_confidence  # noqa: PLC0415 - see _import_report
+    from dsr.viz.panels import save_picture  # noqa: PLC0415
+
     save_picture(folder / "pictures" / f"{sample.scene}.png", sample, depth, scores, label, formats)
     errors = load_errors(prediction_path(folder, sample.scene))
     if errors is not None:

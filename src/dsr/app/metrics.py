@@ -7,16 +7,18 @@ import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import torch
-import torchmetrics
 
 from dsr.app.schema import MetricsConfig
 from dsr.metrics.catalogue import PROTOCOLS, Metric, catalogue
-from dsr.metrics.classes import visual_metrics
 from dsr.metrics.lpips import GET_TRUNK, LPIPS, load_lpips
 from dsr.utils.builder import ConfigError, load_object
 from dsr.utils.console import one_line
+
+if TYPE_CHECKING:
+    import torchmetrics
 
 
 def chosen_metrics(settings: MetricsConfig, device: torch.device) -> tuple[Metric, ...]:
@@ -32,6 +34,8 @@ def chosen_metrics(settings: MetricsConfig, device: torch.device) -> tuple[Metri
 
 def metric_collection(settings: MetricsConfig, device: torch.device) -> torchmetrics.MetricCollection:
     """Return the same metrics as one collection, for a validation pass, which is always judged by the paper's too."""
+    from dsr.metrics.classes import visual_metrics  # noqa: PLC0415 - torchmetrics takes seconds to import
+
     settings = replace(settings, protocols=list(dict.fromkeys((*settings.protocols, "paper"))))
     extra = extra_metrics(settings)
     return visual_metrics(_network_on(settings, extra, device), extra, settings.protocols)

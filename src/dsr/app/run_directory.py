@@ -31,6 +31,8 @@ _NOT_IDENTITY = (
     "resume",
     "run",
     "trust",
+    "workers",
+    "threads",
 )  # weights count by their content
 PREDICTING_CODE = (
     "sample.py", "degradation", "geometry", "metrics", "synthetic", "methods", "data", "training", "inference",

@@ -122,6 +122,8 @@ class EvalConfig(RunConfig):
     weights: str | None = None
     run: str | None = None
     trust: Any = None
+    workers: Any = "auto"
+    threads: Any = "auto"
 
     @property
     def measured(self) -> bool:
@@ -136,6 +138,10 @@ class EvalConfig(RunConfig):
 
         """
         super().check()
+        for name in ("workers", "threads"):
+            value = getattr(self, name)
+            if value != "auto" and (isinstance(value, bool) or not isinstance(value, int) or value < 1):
+                raise ConfigError(f"{name}: expected auto or a whole number, 1 or more, got {value!r}")
         if not self.measured:
             _expect_factor(self.scale, "; downsampling=measured takes a sensor's map of any ratio")
         if not (is_number(self.scale) and self.scale >= 1) and self.scale != NATIVE:

@@ -11,6 +11,7 @@ interrupted run continues where it stopped. A scene that fails, or without a sol
 from __future__ import annotations
 
 import json
+import math
 import re
 import time
 from collections.abc import Callable, Mapping
@@ -26,6 +27,8 @@ from dsr.data.base import SceneSource
 from dsr.degradation.downsampling import Downsampling, Measured, make_sample
 from dsr.degradation.holes import Holes
 from dsr.degradation.noise import Noise
+from dsr.evaluation.claims import Claims
+from dsr.evaluation.sharing import ALONE, LOST_WORKERS, Workers, share
 from dsr.evaluation.store import iterations_path, prediction_path, sample_path
 from dsr.methods.base import Confident, Iterative, NoSolutionError, Surface, Upsampler, expect_some_depth
 from dsr.sample import DepthSample
@@ -116,41 +119,108 @@ class StalePredictionError(ValueError):
     """A stored prediction has other settings, and overwriting is not enabled."""
 
 
-def predict(study: Evaluation, folder: Path, progress: Progress = SILENT, *, overwrite: bool = False) -> Outcome:
+@dataclass(frozen=True)
+class _Predicted:
+    """What became of a scene: its computing time, or why there is no prediction, in one line."""
+
+    seconds: float = math.nan
+    reused: bool = False
+    failure: str = ""
+    unsolved: str = ""
+
+
+def predict(
+    study: Evaluation,
+    folder: Path,
+    progress: Progress = SILENT,
+    *,
+    overwrite: bool = False,
+    workers: Workers = ALONE,
+    meanwhile: Callable[[], None] | None = None,
+) -> Outcome:
     """Write the samples and predictions of all scenes without one.
+
+    Other processes may do the same in the same directory at the same time: each scene is predicted by one of them.
 
     Args:
         study: evaluation to run.
         folder: directory of the run.
         progress: display of the completed scenes, and of the method's steps within a scene.
-        overwrite: whether stored predictions are recomputed.
+        overwrite: whether stored predictions are recomputed, but for those that another process stores meanwhile.
+        workers: how many scenes are predicted at a time, each in a process of its own.
+        meanwhile: function that is called while the first scenes are predicted; None for none.
 
     Raises:
         StalePredictionError: a stored prediction has another configuration and ``overwrite`` is not set.
 
     """
+    with Claims(folder) as claims:
+        since = claims.now() if overwrite else -math.inf
+
+        def ready(scene: str) -> _Predicted | None:
+            return _attempt(study, scene, folder, lambda config: _reuse(study, scene, folder, config, since))
+
+        def work(scene: str, steps: Progress) -> _Predicted:
+            def compute(config: Mapping[str, Any]) -> _Predicted:
+                return _Predicted(_predict_scene(study, scene, folder, config, steps))
+
+            result = _attempt(study, scene, folder, compute)
+            assert result is not None  # noqa: S101 - only reusing may find nothing
+            return result
+
+        scenes = study.source.scenes()
+        found = share(scenes, claims, "predict", ready, work, _lost, workers, progress, meanwhile)
+    return _outcome(found)
+
+
+def _outcome(found: Mapping[str, _Predicted]) -> Outcome:
+    """Return what became of all scenes."""
     outcome = Outcome()
-    for scene in progress.track(study.source.scenes(), "predict"):
-        path = prediction_path(folder, scene)
-        try:
-            config = study.stored_config(scene)
-            seconds = None if overwrite else _seconds_of_current(path, config)
-            if seconds is None:
-                outcome.seconds[scene] = _predict_scene(study, scene, folder, config, progress)
-                outcome.made.append(scene)
-            else:
-                if not sample_path(folder, scene).is_file():
-                    study.sample(scene).save(sample_path(folder, scene))
-                outcome.seconds[scene] = seconds
-                outcome.reused.append(scene)
-        except StalePredictionError:
-            raise
-        except NoSolutionError as error:
-            outcome.unsolved[scene] = failure_line(scene, error)
-            path.unlink(missing_ok=True)
-        except (ValueError, OSError) as error:
-            outcome.failures[scene] = failure_line(scene, error)
+    for scene, each in found.items():
+        if each.failure:
+            outcome.failures[scene] = each.failure
+        elif each.unsolved:
+            outcome.unsolved[scene] = each.unsolved
+        else:
+            outcome.seconds[scene] = each.seconds
+            (outcome.reused if each.reused else outcome.made).append(scene)
     return outcome
+
+
+def _attempt(
+    study: Evaluation, scene: str, folder: Path, function: Callable[[Mapping[str, Any]], _Predicted | None]
+) -> _Predicted | None:
+    """Return what a function of a scene's settings returns, or what became of the scene instead."""
+    try:
+        return function(study.stored_config(scene))
+    except StalePredictionError:
+        raise
+    except NoSolutionError as error:
+        prediction_path(folder, scene).unlink(missing_ok=True)
+        return _Predicted(unsolved=failure_line(scene, error))
+    except (ValueError, OSError) as error:
+        return _Predicted(failure=failure_line(scene, error))
+
+
+def _reuse(study: Evaluation, scene: str, folder: Path, config: Mapping[str, Any], since: float) -> _Predicted | None:
+    """Return the outcome of a stored prediction, which then has a sample, too; None if there is none.
+
+    A prediction from before the time ``since`` counts as none, unless that is minus infinity.
+    """
+    path = prediction_path(folder, scene)
+    if since > -math.inf and (not path.is_file() or path.stat().st_mtime <= since):
+        return None
+    seconds = _seconds_of_current(path, config)
+    if seconds is None:
+        return None
+    if not sample_path(folder, scene).is_file():
+        study.sample(scene).save(sample_path(folder, scene))
+    return _Predicted(seconds, reused=True)
+
+
+def _lost(scene: str) -> _Predicted:
+    """Return the outcome of a scene whose workers were killed."""
+    return _Predicted(failure=f"{scene}: {LOST_WORKERS}")
 
 
 def failure_line(scene: str, error: BaseException) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +12,9 @@ import pandas as pd
 import torch
 from torch import Tensor
 
+from dsr.evaluation.claims import Claims
 from dsr.evaluation.predict import Evaluation, Outcome, failure_line
+from dsr.evaluation.sharing import ALONE, LOST_WORKERS, Workers, share
 from dsr.evaluation.store import load_prediction, prediction_path, sample_path
 from dsr.metrics.catalogue import Metric, score_image
 from dsr.metrics.formats import HEADLINES
@@ -43,8 +45,12 @@ def score(
     outcome: Outcome,
     progress: Progress,
     illustrate: Callable[[DepthSample, Tensor, Mapping[str, float]], None],
+    *,
+    workers: Workers = ALONE,
 ) -> pd.DataFrame:
     """Score the predictions in ``folder`` against the samples there; write ``scores.csv`` and ``summary.json``.
+
+    Other processes may do the same in the same directory at the same time: each scene is scored by one of them.
 
     Args:
         study: the evaluation; its data set is not read.
@@ -53,30 +59,91 @@ def score(
         outcome: outcome of :func:`predict`; failures and scenes without true depth are added to it.
         progress: display of the completed scenes.
         illustrate: function that draws a picture of a sample, the predicted depth and its worst-of-four scores.
+        workers: how many scenes are scored at a time, each in a process of its own.
 
     Returns:
         The content of ``scores.csv``.
 
     """
+    names = [metric.name for metric in metrics]
     rows: list[dict[str, Any]] = []
-    for scene in progress.track(outcome.seconds, "score"):
-        try:
-            sample = DepthSample.load(sample_path(folder, scene))
-            depth = load_prediction(prediction_path(folder, scene))
-            new = list(_score_scene(study, sample, depth, metrics))
-            rows += new
-            if sample.depth is None:
+    with Claims(folder) as claims:
+
+        def ready(scene: str) -> _Scored | None:
+            return _recorded(claims, scene, _record_key(folder, scene, names))
+
+        def work(scene: str, _: Progress) -> _Scored:
+            result = _score_and_illustrate(study, scene, folder, metrics, illustrate)
+            claims.write_record(f"score {scene}", {"key": _record_key(folder, scene, names), **asdict(result)})
+            return result
+
+        scored = share(list(outcome.seconds), claims, "score", ready, work, _lost, workers, progress)
+        for scene, each in scored.items():
+            rows += each.rows
+            if each.unscored:
                 outcome.unscored.append(scene)
-            if sample.notes:
-                outcome.notes[scene] = list(sample.notes)
-            illustrate(sample, depth, {row["metric"]: row["value"] for row in new if row["variant"] in HEADLINES})
-        except (ValueError, OSError) as error:
-            outcome.failures[scene] = failure_line(scene, error)
-    scores = pd.DataFrame(rows, columns=list(SCORE_COLUMNS))
-    with replacing(folder / "scores.csv") as temporary:
-        guarded(scores).to_csv(temporary, index=False)
-    write_text(folder / "summary.json", json.dumps(summary(study, scores, outcome, metrics), indent=1) + "\n")
+            if each.notes:
+                outcome.notes[scene] = each.notes
+            if each.failure:
+                outcome.failures[scene] = each.failure
+        scores = pd.DataFrame(rows, columns=list(SCORE_COLUMNS))
+        with replacing(folder / "scores.csv") as temporary:
+            guarded(scores).to_csv(temporary, index=False)
+        write_text(folder / "summary.json", json.dumps(summary(study, scores, outcome, metrics), indent=1) + "\n")
     return scores
+
+
+@dataclass
+class _Scored:
+    """The scores of a scene, and what there is to say of it."""
+
+    rows: list[dict[str, Any]] = field(default_factory=list)
+    unscored: bool = False
+    notes: list[str] = field(default_factory=list)
+    failure: str = ""
+
+
+def _score_and_illustrate(
+    study: Evaluation,
+    scene: str,
+    folder: Path,
+    metrics: tuple[Metric, ...],
+    illustrate: Callable[[DepthSample, Tensor, Mapping[str, float]], None],
+) -> _Scored:
+    """Score and draw one scene."""
+    result = _Scored()
+    try:
+        sample = DepthSample.load(sample_path(folder, scene))
+        depth = load_prediction(prediction_path(folder, scene))
+        result.rows = list(_score_scene(study, sample, depth, metrics))
+        result.unscored = sample.depth is None
+        result.notes = list(sample.notes)
+        illustrate(sample, depth, {row["metric"]: row["value"] for row in result.rows if row["variant"] in HEADLINES})
+    except (ValueError, OSError) as error:
+        result.failure = failure_line(scene, error)
+    return result
+
+
+def _recorded(claims: Claims, scene: str, key: Sequence[Any]) -> _Scored | None:
+    """Return the scores of a scene that another process has recorded; None if there are none of this prediction."""
+    record = claims.record(f"score {scene}")
+    if record is None or record.pop("key") != list(key):
+        return None
+    return _Scored(**record)
+
+
+def _record_key(folder: Path, scene: str, names: Sequence[str]) -> list[Any]:
+    """Return what recorded scores are of: the files of a scene and the metrics."""
+    files = (prediction_path(folder, scene), sample_path(folder, scene))
+    try:
+        return [[[each.stat().st_mtime_ns, each.stat().st_size] for each in files], list(names)]
+    except OSError:
+        return [None, list(names)]
+
+
+def _lost(scene: str) -> _Scored:
+    """Return the outcome of a scene whose workers were killed."""
+    return _Scored(failure=f"{scene}: {LOST_WORKERS}")
 
 
 def summary(study: Evaluation, scores: pd.DataFrame, outcome: Outcome, metrics: Sequence[Metric]) -> dict[str, Any]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import io
+import os
 import sys
 import threading
 import time
@@ -87,7 +88,8 @@ def one_line(error: BaseException) -> str:
 class ConsoleProgress(Progress):
     """Shows progress with named times: bars on a terminal, elsewhere plain lines.
 
-    If the output is not a terminal, each finished item gets a line, and running work gets one every ten seconds.
+    If the output is not a terminal, each finished item gets a line, and running work gets one every ten seconds. In a
+    process that is forked from the one that made it, only lines of text are shown.
 
     Args:
         console: where it is shown.
@@ -96,13 +98,13 @@ class ConsoleProgress(Progress):
     """
 
     def __init__(self, console: Console, now: Callable[[], float] = time.monotonic) -> None:
-        self._console, self._now = console, now
+        self._console, self._now, self._process = console, now, os.getpid()
         self._tasks: list[_ConsoleTask] = []  # from the outermost to the innermost
         self._next_line = 0.0
 
     def say(self, line: str) -> None:
         """Show a line of text, above the bars if there are any."""
-        show(self._console, line)
+        show(self._console if os.getpid() == self._process else open_console(), line)
 
     @contextlib.contextmanager
     def task(
@@ -110,6 +112,9 @@ class ConsoleProgress(Progress):
     ) -> Iterator[_ConsoleTask]:
         """Return a context in which a piece of work is shown; see :class:`dsr.utils.progress.Progress`."""
         task = _ConsoleTask(name, total, done, unit, self._now)
+        if os.getpid() != self._process:
+            yield task
+            return
         outermost = not self._tasks
         self._tasks.append(task)
         try:

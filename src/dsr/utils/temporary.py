@@ -46,24 +46,41 @@ def remove_abandoned(folder: Path) -> None:
     """Delete temporary files and directories in a folder whose process is gone; once per folder and process."""
     for path in folder.iterdir():
         found = _TEMPORARY.search(path.name)
-        if found and found["machine"] == _machine() and not _is_running(int(found["process"])):
+        if found and found["machine"] == machine() and not _is_running(int(found["process"])):
             with contextlib.suppress(OSError):
                 shutil.rmtree(path) if path.is_dir() and not path.is_symlink() else path.unlink()
 
 
 def owner() -> str:
     """Return this process as names of temporary files have it: the machine, and the process's number on it."""
-    return f"{_machine()}-{os.getpid()}"
+    return f"{machine()}-{os.getpid()}"
 
 
 @functools.cache
-def _machine() -> str:
+def machine() -> str:
     """Return a short name of what numbers processes: the machine, or the container on it."""
     try:
         numbering = str(Path("/proc/self/ns/pid").readlink())
     except OSError:
         numbering = ""
     return hashlib.sha256(f"{socket.gethostname()} {numbering}".encode()).hexdigest()[:6]
+
+
+def birth(process: int) -> str | None:
+    """Return when a process of this machine was started, which tells it from a later one of its number.
+
+    Args:
+        process: its number.
+
+    Returns:
+        A text that the process keeps, empty where the system does not tell it; None if the process has ended.
+
+    """
+    try:
+        fields = Path(f"/proc/{process}/stat").read_text(encoding="utf-8", errors="replace").rpartition(")")[2].split()
+        return None if fields[0] in "ZX" else fields[19]
+    except (OSError, IndexError):
+        return "" if _is_running(process) else None
 
 
 def _is_running(process: int) -> bool:
