@@ -5,19 +5,21 @@ from __future__ import annotations
 import fnmatch
 import functools
 import math
-import os
 import shutil
-from collections.abc import Mapping
+import sys
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from zipfile import BadZipFile
 
 import lightning
+import torch
 from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 
 from dsr.app import run_directory as rundir
+from dsr.app.devices import Processes, find_processes
 from dsr.app.divergence import NOTE, expect_no_divergence, note_divergence
 from dsr.app.metrics import check_metrics, metric_collection
 from dsr.app.schema import TrainConfig, given_keys, plain_config
@@ -33,9 +35,10 @@ from dsr.training.data_module import PatchData
 from dsr.training.module import SuperResolution
 from dsr.training.objective import Objective, SurfaceObjective, balance_weight
 from dsr.training.settings import Schedule
+from dsr.utils import interruption
 from dsr.utils.builder import ConfigError, build
 from dsr.utils.checkpoints import CheckpointError
-from dsr.utils.console import ConsoleProgress
+from dsr.utils.console import USAGE_ERROR, ConsoleProgress
 from dsr.utils.devices import fast_precision, pick_device
 from dsr.utils.divergence import DivergenceError
 from dsr.utils.files import replacing
@@ -70,34 +73,45 @@ def train(config: DictConfig) -> float:
     device = pick_device(settings.device)
     if settings.precision == "auto":
         plain["precision"] = settings.precision = fast_precision(device)
-    first = os.environ.get("LOCAL_RANK", "0") == "0"  # Lightning runs this command once per device
+    processes = find_processes(device, settings.trainer.devices, settings.trainer.strategy)
+    with processes.running():
+        if processes.first:
+            return _train(plain, settings, device, processes)
+        try:
+            return _train(plain, settings, device, processes)
+        except (ConfigError, KeyboardInterrupt) as error:  # the first process says so
+            sys.exit(interruption.exit_code() if isinstance(error, KeyboardInterrupt) else USAGE_ERROR)
+
+
+def _train(plain: dict[str, Any], settings: TrainConfig, device: torch.device, processes: Processes) -> float:
+    """Train in one of the processes, and return the best score."""
+    first = processes.first
     progress = ConsoleProgress(Console(quiet=not first))
     if settings.seed > _LARGEST_SEED:
         raise ConfigError(f"seed: expected at most {_LARGEST_SEED}, got {settings.seed}")
     lightning.seed_everything(settings.seed, workers=True, verbose=False)
     net = _network(settings)
-    data = training_data(settings)
+    data = training_data(settings, processes.count)
     check_metrics(settings.metrics)
     identity = rundir.identity_of(plain, None, device)
     folder = rundir.folder_of(settings.output_dir or rundir.default_directory("train", plain, identity))
     weights, last = folder / WEIGHTS, folder / "checkpoints" / "last.ckpt"
-    if weights.exists() and not settings.overwrite:
-        raise ConfigError(f"output_dir: {weights} is trained already; overwrite=true trains it again")
     metrics = functools.partial(metric_collection, settings.metrics, device)
     module = _module(settings, net, data, metrics)
     tolerated = ("code", "device") if "resume" in given_keys() else ()
-    rundir.expect_free(folder, plain, identity, tolerated)
-    if not settings.overwrite:
-        expect_no_divergence(folder, identity)
+    if first:
+        _expect_trainable(folder, plain, identity, tolerated)
     resume = last if last.is_file() and not settings.overwrite else None
-    _announce(progress, settings, module, data, folder, resume)
+    if first:
+        _announce(progress, settings, module, data, folder, resume, processes.count)
     _load(progress, settings, module, data)
-    for key in rundir.claim(folder, plain, identity, tolerated):
-        progress.say(f"note: the run began with another {key}")
-    if settings.overwrite and first:
-        _clear(folder)
+    if first:
+        for key in rundir.claim(folder, plain, identity, tolerated):
+            progress.say(f"note: the run began with another {key}")
+        if settings.overwrite:
+            _clear(folder)
     facts = _facts(plain, module)
-    trainer, best = training_trainer(settings.trainer, folder, device, progress, facts)
+    trainer, best = training_trainer(settings.trainer, folder, device, progress, facts, processes)
     _describe(trainer, plain, module)
     try:
         fit(trainer, module, data, resume)
@@ -111,6 +125,17 @@ def train(config: DictConfig) -> float:
         _export(module, Path(best.best_model_path), weights, facts)
     progress.say(f"weights: {weights}")
     return math.nan if best.best_model_score is None else float(best.best_model_score)
+
+
+def _expect_trainable(
+    folder: Path, plain: Mapping[str, Any], identity: Mapping[str, Any], tolerated: Sequence[str]
+) -> None:
+    """Check that the directory is free or that of this training, which is neither complete nor diverges again."""
+    if not plain["overwrite"] and (folder / WEIGHTS).exists():
+        raise ConfigError(f"output_dir: {folder / WEIGHTS} is trained already; overwrite=true trains it again")
+    rundir.expect_free(folder, plain, identity, tolerated)
+    if not plain["overwrite"]:
+        expect_no_divergence(folder, identity)
 
 
 def _resumed(plain: dict[str, Any]) -> dict[str, Any]:
@@ -246,6 +271,7 @@ def _announce(
     data: PatchData,
     folder: Path,
     resume: Path | None,
+    devices: int,
 ) -> None:
     """Show what the run will do, and how long it will take."""
     trainer, objective = settings.trainer, module.objective
@@ -253,6 +279,7 @@ def _announce(
     held_out = ", ".join(f"{len(names)} of {kind}" for kind, (_, names) in data.validation_scenes().items())
     parameters = sum(each.numel() for each in module.net.parameters())
     accumulate = f" x {trainer.accumulate} batches" if trainer.accumulate > 1 else ""
+    accumulate += f" x {devices} devices" if devices > 1 else ""
     loss = objective.formula
     if isinstance(objective, Objective) and _computes_w(settings):
         loss = f"{objective.depth_loss} + w {objective.visual.title}; w is computed from the scenes"

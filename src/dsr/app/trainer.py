@@ -11,6 +11,7 @@ import lightning
 import torch
 from lightning.pytorch.callbacks import Callback, LearningRateMonitor, ModelCheckpoint
 
+from dsr.app.devices import Processes
 from dsr.app.schema import TrainerConfig
 from dsr.training.degradation import Batch
 from dsr.training.module import SuperResolution
@@ -48,7 +49,12 @@ class Throughput(Callback):
 
 
 def training_trainer(
-    settings: TrainerConfig, folder: Path, device: torch.device, progress: Progress, table: Mapping[str, Any]
+    settings: TrainerConfig,
+    folder: Path,
+    device: torch.device,
+    progress: Progress,
+    table: Mapping[str, Any],
+    processes: Processes,
 ) -> tuple[lightning.Trainer, ModelCheckpoint]:
     """Return the trainer, and the callback that keeps the best checkpoint.
 
@@ -58,6 +64,7 @@ def training_trainer(
         device: to train on.
         progress: shows the steps.
         table: the run's entries in TensorBoard's table of runs.
+        processes: of the training.
 
     """
     checkpoints = folder / "checkpoints"
@@ -86,8 +93,10 @@ def training_trainer(
         min(settings.validate_every, settings.steps),
         callbacks=callbacks,
         logger=logger,
-        devices=settings.devices,
+        devices=processes.count,
         accumulate=settings.accumulate,
+        environment=processes.environment,
+        strategy="ddp" if processes.count > 1 else "auto",
     )
     return trainer, best
 

@@ -93,7 +93,9 @@ class SuperResolution(lightning.LightningModule):
             average.copy_(current)  # such as the statistics of batch normalisation, which are averages already
 
     def validation_step(self, batch: Batch, index: int, dataloader_idx: int = 0) -> None:
-        """Score a whole scene; render the first few for TensorBoard."""
+        """Score a whole scene, if the batch has one; render the first few for TensorBoard."""
+        if not batch:
+            return
         offset = batch["doffs"] if self.average.of_inverse_depth else 0
         values = batch["disparity_lr"] + offset
         if isinstance(self.objective, SurfaceObjective):
@@ -112,6 +114,7 @@ class SuperResolution(lightning.LightningModule):
 
     def on_validation_epoch_end(self) -> None:
         """Log the mean scores over the scenes, worst of four lights, of all sets and, if there are several, of each."""
+        self._gather_scores()
         collections: Any = self.metrics
         scores = [{name: value.double() for name, value in compute_means(each).items()} for each in collections]
         names = dict.fromkeys(name for each in scores for name in each)
@@ -125,6 +128,16 @@ class SuperResolution(lightning.LightningModule):
         self.log_dict({f"{kind}/{name}": v for kind, each in named.items() for name, v in each.items()})
         for each in self.metrics:
             each.reset()  # type: ignore[operator]
+
+    def _gather_scores(self) -> None:
+        """Let the metrics of all devices know which of them apply; torchmetrics adds up what they have counted."""
+        collections: Any = self.metrics
+        metrics = [metric for each in collections for metric in each.values() if hasattr(metric, "applied")]
+        if self.trainer.world_size > 1 and metrics:
+            applied: list[Any] = [None] * self.trainer.world_size
+            torch.distributed.all_gather_object(applied, [metric.applied for metric in metrics])
+            for metric, each in zip(metrics, zip(*applied, strict=True), strict=True):
+                metric.applied = any(each)
 
     def configure_optimizers(self) -> Any:
         """Return AdamW and its learning-rate schedule, which is updated after every step."""
