@@ -31,6 +31,7 @@ _NOT_IDENTITY = (
     "resume",
     "run",
     "trust",
+    "logger",
 )  # weights count by their content
 PREDICTING_CODE = (
     "sample.py", "degradation", "geometry", "metrics", "synthetic", "methods", "data", "training", "inference",

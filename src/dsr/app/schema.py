@@ -18,7 +18,19 @@ from dsr.utils.parsing import is_number
 
 STRATEGIES = ("auto", "ddp")
 PRECISIONS = ("float32", "bfloat16", "auto")
-_GROUPS = ("dataset", "downsampling", "noise", "holes", "degradation", "method", "metrics", "model", "trainer", "loss")
+_GROUPS = (
+    "dataset",
+    "downsampling",
+    "noise",
+    "holes",
+    "degradation",
+    "method",
+    "metrics",
+    "model",
+    "trainer",
+    "loss",
+    "logger",
+)
 
 
 @dataclass
@@ -192,6 +204,9 @@ class TrainConfig(RunConfig):
         default_factory=lambda: {"name": "plain", "target": "dsr.degradation.everything.plain"}
     )
     trainer: TrainerConfig = field(default_factory=TrainerConfig)
+    logger: dict[str, Any] = field(
+        default_factory=lambda: {"name": "tensorboard", "target": "dsr.training.loggers.tensorboard"}
+    )
     loss: LossConfig = field(default_factory=LossConfig)
     validation: dict[str, Any] = field(default_factory=dict)
     resume: str | None = None

@@ -15,6 +15,7 @@ from zipfile import BadZipFile
 
 import lightning
 import torch
+from lightning.pytorch.loggers import TensorBoardLogger
 from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 
@@ -32,6 +33,7 @@ from dsr.methods.networks.trained import NETWORKS
 from dsr.methods.networks.weight_files import load_network, network_name, read_torch_file, save_network
 from dsr.metrics.visual_loss import VisualLoss, make_visual_loss
 from dsr.training.data_module import PatchData
+from dsr.training.loggers import RUN_ID, log_layout, log_settings
 from dsr.training.module import SuperResolution
 from dsr.training.objective import Objective, SurfaceObjective, balance_weight
 from dsr.training.settings import Schedule
@@ -99,20 +101,17 @@ def _train(plain: dict[str, Any], settings: TrainConfig, device: torch.device, p
     metrics = functools.partial(metric_collection, settings.metrics, device)
     module = _module(settings, net, data, metrics)
     tolerated = ("code", "device") if "resume" in given_keys() else ()
-    if first:
-        _expect_trainable(folder, plain, identity, tolerated)
     resume = last if last.is_file() and not settings.overwrite else None
     if first:
+        _expect_trainable(folder, plain, identity, tolerated)
         _announce(progress, settings, module, data, folder, resume, processes.count)
     _load(progress, settings, module, data)
     if first:
-        for key in rundir.claim(folder, plain, identity, tolerated):
-            progress.say(f"note: the run began with another {key}")
-        if settings.overwrite:
-            _clear(folder)
+        _claim(folder, plain, identity, tolerated, progress)
     facts = _facts(plain, module)
-    trainer, best = training_trainer(settings.trainer, folder, device, progress, facts, processes)
-    _describe(trainer, plain, module)
+    trainer, best = training_trainer(settings, folder, device, progress, processes)
+    if first:
+        _describe(trainer, plain, module, facts, resumed=resume is not None)
     try:
         fit(trainer, module, data, resume)
     except DivergenceError as error:
@@ -121,10 +120,10 @@ def _train(plain: dict[str, Any], settings: TrainConfig, device: torch.device, p
         raise KeyboardInterrupt(
             f"interrupted at step {trainer.global_step}; resume={folder} goes on from there"
         ) from None
-    if trainer.is_global_zero:
+    if first:
         _export(module, Path(best.best_model_path), weights, facts)
     progress.say(f"weights: {weights}")
-    return math.nan if best.best_model_score is None else float(best.best_model_score)
+    return float(best.best_model_score if best.best_model_score is not None else math.nan)
 
 
 def _expect_trainable(
@@ -136,6 +135,16 @@ def _expect_trainable(
     rundir.expect_free(folder, plain, identity, tolerated)
     if not plain["overwrite"]:
         expect_no_divergence(folder, identity)
+
+
+def _claim(
+    folder: Path, plain: Mapping[str, Any], identity: Mapping[str, Any], tolerated: Sequence[str], progress: Progress
+) -> None:
+    """Make the directory that of this training, without the files of one that it replaces."""
+    for key in rundir.claim(folder, plain, identity, tolerated):
+        progress.say(f"note: the run began with another {key}")
+    if plain["overwrite"]:
+        _clear(folder)
 
 
 def _resumed(plain: dict[str, Any]) -> dict[str, Any]:
@@ -258,9 +267,9 @@ def _computes_w(settings: TrainConfig) -> bool:
 
 def _clear(folder: Path) -> None:
     """Remove the files of an earlier training, so that they are not taken for this one's if it is interrupted."""
-    for name in (WEIGHTS, NOTE):
+    for name in (WEIGHTS, NOTE, RUN_ID):
         (folder / name).unlink(missing_ok=True)
-    for name in ("checkpoints", "tensorboard"):
+    for name in ("checkpoints", "tensorboard", "csv", "wandb", "mlruns"):
         shutil.rmtree(folder / name, ignore_errors=True)
 
 
@@ -290,18 +299,25 @@ def _announce(
         "steps": f"{trainer.steps} of {trainer.batch} patches of {trainer.patch} x {trainer.patch}{accumulate}"
         + (", resumed" if resume else ""),
         "time": f"about {duration(step * trainer.steps)} ({step:.2g} s a step as measured now), and the validations",
-        "log": f"tensorboard --logdir {folder}",
+        "log": f"tensorboard --logdir {folder}"
+        if settings.logger["name"] == "tensorboard"
+        else settings.logger["name"],
     }
     for name, line in lines.items():
         progress.say(f"{name:<6} {line}")
 
 
-def _describe(trainer: lightning.Trainer, plain: Mapping[str, Any], module: SuperResolution) -> None:
-    """Write the configuration and the resulting w to TensorBoard's log."""
-    writer: Any = trainer.logger.experiment  # type: ignore[union-attr]
+def _describe(
+    trainer: lightning.Trainer, plain: Mapping[str, Any], module: SuperResolution, facts: Mapping[str, Any], *,
+    resumed: bool,
+) -> None:  # fmt: skip
+    """Write the configuration and the resulting w to the log, and lay it out."""
     loss = {**plain["loss"], "w": module.objective.w} if isinstance(module.objective, Objective) else {}
-    text = OmegaConf.to_yaml(OmegaConf.create({**plain, "loss": loss}))
-    writer.add_text("config", f"```yaml\n{text}```")
+    config = {**plain, "loss": loss}
+    if isinstance(trainer.logger, TensorBoardLogger) or not resumed:  # MLflow refuses another device, say
+        log_settings(trainer.logger, facts, f"```yaml\n{OmegaConf.to_yaml(OmegaConf.create(config))}```", config)
+    collections: Any = module.metrics
+    log_layout(trainer.logger, list(collections[0]))
 
 
 def _facts(plain: Mapping[str, Any], module: SuperResolution) -> dict[str, Any]:

@@ -27,8 +27,8 @@ from dsr.utils.space import FullDiskError, space_for
 from dsr.utils.tables import guard
 
 IN_TABLE = ("RMSE_v", "DSSIM_v", "LPIPS_v", "BadPix_v_5", "Bumpiness_d", "RMSE_d")
-_LOG_EVERY = 10
-"""Steps between two values of a training in TensorBoard's log."""
+LOG_EVERY = 10
+"""Steps between two values of a training in its log."""
 _SECONDS_BETWEEN_LOSSES = 0.2
 """Between two losses that are fetched from the device to be shown, each of which waits for it."""
 
@@ -203,7 +203,7 @@ def make_trainer(
             accumulate_grad_batches=accumulate,
             val_check_interval=interval * accumulate,
             check_val_every_n_epoch=None,
-            log_every_n_steps=min(_LOG_EVERY, interval),
+            log_every_n_steps=min(LOG_EVERY, interval),
             logger=logger,
             callbacks=[LastValidation(interval), *callbacks],
             plugins=[AtomicCheckpoints(), environment or LightningEnvironment()],
