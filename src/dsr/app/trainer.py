@@ -121,6 +121,7 @@ def training_trainer(
     ]
     with without_chatter():
         logger = build("logger", config.logger, {"folder": folder})
+    varying = "_find_unused_parameters_true" if config.degradation.get("scales") else ""  # layers of one factor alone
     trainer = make_trainer(
         device,
         settings.steps,
@@ -130,7 +131,7 @@ def training_trainer(
         devices=processes.count,
         accumulate=settings.accumulate,
         environment=processes.environment,
-        strategy="ddp" if processes.count > 1 else "auto",
+        strategy=f"ddp{varying}" if processes.count > 1 else "auto",
     )
     return trainer, best
 
