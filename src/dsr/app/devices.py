@@ -55,7 +55,7 @@ class Processes:
     def running(self) -> Iterator[None]:
         """Join the processes within this context; those that Lightning has started end with the first one."""
         before = {name: os.environ.get(name) for name in (*_OF_PROCESSES, _STARTED_BY)}
-        rank_zero_only.rank = self.rank
+        rank_zero_only.rank = self.rank  # type: ignore[attr-defined]
         if self.first:
             os.environ[_STARTED_BY] = str(os.getpid())
         else:
@@ -107,10 +107,11 @@ def _count(device: torch.device, devices: int | Literal["auto"]) -> int:
     """Return the number of devices to train on."""
     if device.type == "cpu":
         return 1 if devices == "auto" else devices
-    there = torch.cuda.device_count() if device.type == "cuda" and device.index is None else 1
+    index: int | None = device.index  # torch's stubs say int
+    there = torch.cuda.device_count() if device.type == "cuda" and index is None else 1
     count = there if devices == "auto" else devices
     if count > there:
-        what = f"of {device.type} here" if device.index is None else f"for device={device}"
+        what = f"of {device.type} here" if index is None else f"for device={device}"
         raise ConfigError(f"trainer.devices: expected at most {there}, the number {what}, got {count}")
     return count
 

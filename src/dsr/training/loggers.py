@@ -38,9 +38,9 @@ class CsvLog(CSVLogger):
         self._before = _read_table(folder / "csv" / "metrics.csv")
 
     @rank_zero_only
-    def log_metrics(self, metrics: Mapping[str, float], step: int | None = None) -> None:
+    def log_metrics(self, metrics: Any, step: int | None = None) -> None:
         """Add values to the table, all but the epoch, as there is only one."""
-        values = {name: float(value) for name, value in metrics.items() if name != "epoch"}
+        values: dict[str, Tensor | float] = {name: float(value) for name, value in metrics.items() if name != "epoch"}
         if not values:
             return
         if self._before:
@@ -176,7 +176,7 @@ def log_layout(logger: Logger | None, metrics: Sequence[str], losses: Sequence[s
     logger.experiment.add_custom_scalars({title: charts for title, charts in layout.items() if charts})
 
 
-def log_picture(logger: Logger | None, tag: str, picture: Tensor, step: int) -> None:
+def log_picture(logger: Any, tag: str, picture: Tensor, step: int) -> None:
     """Log a picture where pictures are shown.
 
     Args:
