@@ -8,6 +8,7 @@ from __future__ import annotations
 import csv as tables
 import os
 import re
+import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
@@ -21,6 +22,8 @@ from dsr.utils.files import write_text
 from dsr.utils.lightning import Log
 
 _CURVES = ("loss", "gradient_norm")
+_ROWS_AT_ONCE = 10
+"""Rows of a table that are written together."""
 RUN_ID = "logger_run.txt"
 """The file in a run's directory with the number that a service has given to the run."""
 
@@ -34,7 +37,7 @@ class CsvLog(CSVLogger):
     """
 
     def __init__(self, folder: Path) -> None:
-        super().__init__(folder, name="", version="csv", flush_logs_every_n_steps=10)
+        super().__init__(folder, name="", version="csv", flush_logs_every_n_steps=sys.maxsize)
         self._before = _read_table(folder / "csv" / "metrics.csv")
 
     @rank_zero_only
@@ -51,6 +54,8 @@ class CsvLog(CSVLogger):
         if rows and step is not None and rows[-1]["step"] == step:
             rows[-1].update(values)
         else:
+            if len(rows) >= _ROWS_AT_ONCE:
+                self.save()
             super().log_metrics(values, step)
 
 
