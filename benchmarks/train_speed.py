@@ -1,6 +1,10 @@
-"""How much faster a training step of MSG-V is than in a plain float32 loop, data included.
+"""How much faster a training step of MSG-V is than in a plain float32 loop, data included; and where its time goes.
 
     python benchmarks/train_speed.py [--patch 96] [--batch 5] [--steps 9]
+    python benchmarks/train_speed.py --profile [--steps 40] [model=facets degradation=everything ...]
+
+With --profile a training as train.py does it, with its log and checks, is timed: the network and its losses forward and
+backward, the patches, the optimiser, and everything else. Other arguments are overrides of train.py's configuration.
 
 The plain way is what a tutorial would write: float32, PyTorch's default memory layout, its own PReLU. Both take turns
 within the run on the same patches; the ratio of the medians is the result.
@@ -10,12 +14,26 @@ from __future__ import annotations
 
 import argparse
 import copy
+import functools
 import statistics
+import tempfile
 import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
 
+import hydra
 import torch
+from lightning.pytorch.callbacks import Callback
 from torch import nn
 
+from dsr.app.devices import find_processes
+from dsr.app.metrics import metric_collection
+from dsr.app.schema import TrainConfig, plain_config, register
+from dsr.app.train import _module, _network
+from dsr.app.trainer import training_trainer
+from dsr.app.training_runs import training_data
 from dsr.data.simgeo import SimGeo
 from dsr.degradation.downsampling import Downsampling
 from dsr.methods.networks.msg_net import MSGNet
@@ -23,6 +41,8 @@ from dsr.training.degradation import Batch, Degradation
 from dsr.training.objective import Objective
 from dsr.training.patches import Patches
 from dsr.training.settings import PatchSettings
+from dsr.utils.lightning import fit
+from dsr.utils.progress import SILENT
 
 SCALE = 4
 
@@ -54,13 +74,102 @@ def step(net: MSGNet, objective: Objective, batch: Batch, *, mixed: bool) -> flo
     return time.perf_counter() - start
 
 
+class StepTimes(Callback):
+    """Collects the seconds of the parts of each step; the last part is what no other has."""
+
+    def __init__(self) -> None:
+        self.now: dict[str, float] = {}
+        self.steps: list[dict[str, float]] = []
+        self._begun = 0.0
+
+    @contextmanager
+    def part(self, name: str) -> Iterator[None]:
+        """Add the time of this context to a part."""
+        start = time.perf_counter()
+        yield
+        self.now[name] = self.now.get(name, 0.0) + time.perf_counter() - start
+
+    def timed(self, name: str, function: Callable[..., Any]) -> Callable[..., Any]:
+        """Return a function with its time added to a part."""
+
+        def call(*arguments: Any, **named: Any) -> Any:
+            with self.part(name):
+                return function(*arguments, **named)
+
+        return call
+
+    def end_step(self) -> None:
+        """Close the account of a step."""
+        now = time.perf_counter()
+        if self._begun:
+            self.now["everything else"] = now - self._begun - sum(self.now.values())
+            self.steps.append(self.now)
+        self.now, self._begun = {}, now
+
+
+class LastCallback(Callback):
+    """Ends the account of a step after all other callbacks."""
+
+    def __init__(self, times: StepTimes) -> None:
+        self._times = times
+
+    def on_train_batch_end(self, *_: Any) -> None:
+        """End it."""
+        self._times.end_step()
+
+
+def profile(steps: int, overrides: Sequence[str]) -> None:
+    """Time the parts of the steps of a training, and print their medians."""
+    register()
+    conf = Path(__file__).resolve().parents[1] / "conf"
+    with hydra.initialize_config_dir(str(conf), version_base="1.3"):
+        small = ["dataset.count=8", "metrics.lpips=false", f"trainer.steps={steps}", f"trainer.validate_every={steps}"]
+        settings = TrainConfig.of(plain_config(hydra.compose("train", [*small, "loss.w=1", *overrides])))
+    device = torch.device("cpu")
+    settings.precision = "float32" if settings.precision == "auto" else settings.precision
+    times = StepTimes()
+    data = training_data(settings)
+    module = _module(settings, _network(settings), data, functools.partial(metric_collection, settings.metrics, device))
+    data.setup()
+    processes = find_processes(device, 1, "auto")
+    with tempfile.TemporaryDirectory() as folder:
+        trainer, _ = training_trainer(settings, Path(folder), device, SILENT, processes)
+        trainer.callbacks.append(LastCallback(times))  # type: ignore[attr-defined]
+        trainer.limit_val_batches = 0
+        network = "network and losses"
+        module.loss_terms = times.timed(network, module.loss_terms)  # type: ignore[method-assign]
+        module.backward = times.timed(network, module.backward)  # type: ignore[method-assign]
+        Patches.__getitem__ = times.timed("patches", Patches.__getitem__)  # type: ignore[method-assign]
+        module.optimizer_step = times.timed("optimiser", module.optimizer_step)  # type: ignore[method-assign]
+        fit(trainer, module, data)
+    print_parts(times.steps[len(times.steps) // 4 :])
+
+
+def print_parts(steps: Sequence[dict[str, float]]) -> None:
+    """Print the median of each part, and the fraction of the step."""
+    for step in steps:  # the optimiser's step calls the closure with everything else in it
+        step["optimiser"] = max(step["optimiser"] - step["network and losses"], 0.0)
+        step["everything else"] += step["network and losses"]
+    medians = {name: statistics.median(step[name] for step in steps) for name in steps[0]}
+    total = statistics.median(sum(step.values()) for step in steps)
+    for name, each in medians.items():
+        print(f"{name:<20} {1000 * each:8.1f} ms   {100 * each / total:5.1f} %")
+    print(f"{'outside the network':<20} {1000 * (total - medians['network and losses']):8.1f} ms   "
+          f"{100 * (1 - medians['network and losses'] / total):5.1f} %")  # fmt: skip
+
+
 def main() -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--profile", action="store_true")
+    parser.add_argument("overrides", nargs="*")
     parser.add_argument("--patch", type=int, default=96)
     parser.add_argument("--batch", type=int, default=5)
     parser.add_argument("--steps", type=int, default=9)
     arguments = parser.parse_args()
+    if arguments.profile:
+        profile(arguments.steps, arguments.overrides)
+        return
     source = SimGeo(size=256)
     scenes = [source.load(name) for name in source.scenes()]
     settings = PatchSettings(patch=arguments.patch, batch=arguments.batch)

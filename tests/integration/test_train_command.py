@@ -203,7 +203,7 @@ def test_log_has_losses_scores_rates_renderings_and_the_configuration(smoke):
     assert list(scalars_of(home, "train/learning_rate").values()) == pytest.approx([1e-3, 1e-3])
     assert tags["images"] == ["renderings/procedural_0"]
     image = events.Images("renderings/procedural_0")[0]
-    assert (image.height, image.width) == (128, 192)
+    assert (image.height, image.width) == (4 * (128 + 16), 4 * 128)
     [text] = events.Tensors("config/text_summary")
     assert "validation_scenes: 1" in text.tensor_proto.string_val[0].decode()
 

@@ -1,6 +1,7 @@
 """The TensorBoard log of an evaluation: what it holds, read back by TensorBoard's own reader."""
 
 import json
+import re
 
 import cv2
 import matplotlib as mpl
@@ -39,7 +40,7 @@ def test_scalars_are_the_scores_in_table_units(log, tmp_path):
     scores = load_results([tmp_path]).scores.set_index(["metric", "variant", "scene"])["value"]
     assert scalars(log, "RMSE_d/a") == {0: pytest.approx(1000 * scores["RMSE_d", "", "a"])}
     assert scalars(log, "DSSIM_v/b") == {0: pytest.approx(1000 * scores["DSSIM_v", "max", "b"])}
-    assert scalars(log, "scene/BadPix_v_5") == {
+    assert scalars(log, "scene/BadPix_v_5/simgeo") == {
         number: pytest.approx(100 * scores["BadPix_v_5", "max", scene]) for number, scene in enumerate(SCENES)
     }
     assert scalars(log, "light/DSSIM_v/a") == {
@@ -53,11 +54,14 @@ def test_layout_groups_the_metrics_that_are_the_worst_of_four_lights(log):
     content = log.Tensors("custom_scalars__config__")[0].tensor_proto.string_val[0]
     layout = layout_pb2.Layout.FromString(content)
     charts = {category.title: [chart.title for chart in category.chart] for category in layout.category}
-    assert charts["Looks, worst of four lights"] == ["BadPix_v_5", "DSSIM_v"]
-    assert charts["Depth and normals"] == ["RMSE_d", "BadPix_d_5cm", "Bumpiness_d", "RMSE_v"]
+    assert list(charts)[:2] == ["Looks, worst of four lights, simgeo", "Depth and normals, simgeo"]
+    assert charts["Looks, worst of four lights, simgeo"] == ["DSSIM_v", "BadPix_v_5"]
+    assert charts["Depth and normals, simgeo"] == ["RMSE_d", "BadPix_d_5cm", "Bumpiness_d", "RMSE_v"]
     tags = set(log.Tags()["scalars"])
     for category in layout.category[:2]:
-        assert {tag for chart in category.chart for tag in chart.multiline.tag} <= tags
+        for chart in category.chart:
+            (pattern,) = chart.multiline.tag
+            assert [tag for tag in tags if re.match(pattern, tag)] == [f"scene/{chart.title}/simgeo"]
 
 
 def test_table_of_runs_has_the_method_and_its_settings(make_run, tmp_path):

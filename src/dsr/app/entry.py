@@ -19,6 +19,7 @@ from typing import Any, NoReturn
 import hydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
+from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
@@ -135,7 +136,7 @@ def _job(
                 take_gpu(Path(HydraConfig.get().sweep.dir))
         try:
             begun.append(True)
-            with _argv(argv), interruption.requeued(), interruption.working():
+            with _argv(_argv_of_job(argv)), interruption.requeued(), interruption.working():
                 value = command(config)
             return JobResult(value if isinstance(value, int | float) else 0.0)
         except (ConfigError, OSError, FullDiskError) as error:  # a multirun continues with its other jobs
@@ -145,6 +146,16 @@ def _job(
             return JobResult.failed(problem)
 
     return job
+
+
+def _argv_of_job(argv: list[str]) -> list[str]:
+    """Return the arguments that run the current job alone: those of the process, or of a multirun's job."""
+    hydra_config = HydraConfig.get()
+    if hydra_config.mode != RunMode.MULTIRUN:
+        return argv
+    own = [part for path in _config_dirs(argv[1:]) for part in ("--config-dir", str(path))]
+    command = argv[1:2] if argv[1:2] in (["train"], ["eval"]) else []  # of dsr
+    return [argv[0], *command, *own, *hydra_config.overrides.task]
 
 
 def fail(message: str) -> NoReturn:

@@ -31,8 +31,12 @@ _NOT_IDENTITY = (
     "resume",
     "run",
     "trust",
+<<<<<<< HEAD
     "workers",
     "threads",
+=======
+    "logger",
+>>>>>>> ddp
 )  # weights count by their content
 PREDICTING_CODE = (
     "sample.py", "degradation", "geometry", "metrics", "synthetic", "methods", "data", "training", "inference",

@@ -16,8 +16,21 @@ from dsr.training.settings import PatchSettings, Schedule
 from dsr.utils.builder import ConfigError, check_types
 from dsr.utils.parsing import is_number
 
+STRATEGIES = ("auto", "ddp")
 PRECISIONS = ("float32", "bfloat16", "auto")
-_GROUPS = ("dataset", "downsampling", "noise", "holes", "degradation", "method", "metrics", "model", "trainer", "loss")
+_GROUPS = (
+    "dataset",
+    "downsampling",
+    "noise",
+    "holes",
+    "degradation",
+    "method",
+    "metrics",
+    "model",
+    "trainer",
+    "loss",
+    "logger",
+)
 
 
 @dataclass
@@ -174,6 +187,7 @@ class TrainerConfig:
     photo: float = PatchSettings.photo
     workers: int = PatchSettings.workers
     devices: Any = 1
+    strategy: str = "auto"
     init: str | None = None
     shared: str | None = None
     frozen: list[str] = field(default_factory=list)
@@ -196,6 +210,9 @@ class TrainConfig(RunConfig):
         default_factory=lambda: {"name": "plain", "target": "dsr.degradation.everything.plain"}
     )
     trainer: TrainerConfig = field(default_factory=TrainerConfig)
+    logger: dict[str, Any] = field(
+        default_factory=lambda: {"name": "tensorboard", "target": "dsr.training.loggers.tensorboard"}
+    )
     loss: LossConfig = field(default_factory=LossConfig)
     validation: dict[str, Any] = field(default_factory=dict)
     resume: str | None = None
@@ -219,6 +236,8 @@ class TrainConfig(RunConfig):
         devices = self.trainer.devices
         if devices != "auto" and (isinstance(devices, bool) or not isinstance(devices, int) or devices < 1):
             raise ConfigError(f"trainer.devices: expected auto or a positive number, got {devices!r}")
+        if self.trainer.strategy not in STRATEGIES:
+            raise ConfigError(f"trainer.strategy: expected one of {', '.join(STRATEGIES)}, got {self.trainer.strategy}")
 
 
 def given_keys() -> list[str]:

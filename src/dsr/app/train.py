@@ -5,19 +5,22 @@ from __future__ import annotations
 import fnmatch
 import functools
 import math
-import os
 import shutil
-from collections.abc import Mapping
+import sys
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from zipfile import BadZipFile
 
 import lightning
+import torch
+from lightning.pytorch.loggers import TensorBoardLogger
 from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 
 from dsr.app import run_directory as rundir
+from dsr.app.devices import Processes, find_processes
 from dsr.app.divergence import NOTE, expect_no_divergence, note_divergence
 from dsr.app.metrics import check_metrics, metric_collection
 from dsr.app.schema import TrainConfig, given_keys, plain_config
@@ -30,12 +33,14 @@ from dsr.methods.networks.trained import NETWORKS
 from dsr.methods.networks.weight_files import load_network, network_name, read_torch_file, save_network
 from dsr.metrics.visual_loss import VisualLoss, make_visual_loss
 from dsr.training.data_module import PatchData
+from dsr.training.loggers import RUN_ID, log_layout, log_settings
 from dsr.training.module import SuperResolution
 from dsr.training.objective import Objective, SurfaceObjective, balance_weight
 from dsr.training.settings import Schedule
+from dsr.utils import interruption
 from dsr.utils.builder import ConfigError, build
 from dsr.utils.checkpoints import CheckpointError
-from dsr.utils.console import ConsoleProgress
+from dsr.utils.console import USAGE_ERROR, ConsoleProgress
 from dsr.utils.devices import fast_precision, pick_device
 from dsr.utils.divergence import DivergenceError
 from dsr.utils.files import replacing
@@ -70,35 +75,43 @@ def train(config: DictConfig) -> float:
     device = pick_device(settings.device)
     if settings.precision == "auto":
         plain["precision"] = settings.precision = fast_precision(device)
-    first = os.environ.get("LOCAL_RANK", "0") == "0"  # Lightning runs this command once per device
+    processes = find_processes(device, settings.trainer.devices, settings.trainer.strategy)
+    with processes.running():
+        if processes.first:
+            return _train(plain, settings, device, processes)
+        try:
+            return _train(plain, settings, device, processes)
+        except (ConfigError, KeyboardInterrupt) as error:  # the first process says so
+            sys.exit(interruption.exit_code() if isinstance(error, KeyboardInterrupt) else USAGE_ERROR)
+
+
+def _train(plain: dict[str, Any], settings: TrainConfig, device: torch.device, processes: Processes) -> float:
+    """Train in one of the processes, and return the best score."""
+    first = processes.first
     progress = ConsoleProgress(Console(quiet=not first))
     if settings.seed > _LARGEST_SEED:
         raise ConfigError(f"seed: expected at most {_LARGEST_SEED}, got {settings.seed}")
     lightning.seed_everything(settings.seed, workers=True, verbose=False)
     net = _network(settings)
-    data = training_data(settings)
+    data = training_data(settings, processes.count)
     check_metrics(settings.metrics)
     identity = rundir.identity_of(plain, None, device)
     folder = rundir.folder_of(settings.output_dir or rundir.default_directory("train", plain, identity))
     weights, last = folder / WEIGHTS, folder / "checkpoints" / "last.ckpt"
-    if weights.exists() and not settings.overwrite:
-        raise ConfigError(f"output_dir: {weights} is trained already; overwrite=true trains it again")
     metrics = functools.partial(metric_collection, settings.metrics, device)
     module = _module(settings, net, data, metrics)
     tolerated = ("code", "device") if "resume" in given_keys() else ()
-    rundir.expect_free(folder, plain, identity, tolerated)
-    if not settings.overwrite:
-        expect_no_divergence(folder, identity)
     resume = last if last.is_file() and not settings.overwrite else None
-    _announce(progress, settings, module, data, folder, resume)
+    if first:
+        _expect_trainable(folder, plain, identity, tolerated)
+        _announce(progress, settings, module, data, folder, resume, processes.count)
     _load(progress, settings, module, data)
-    for key in rundir.claim(folder, plain, identity, tolerated):
-        progress.say(f"note: the run began with another {key}")
-    if settings.overwrite and first:
-        _clear(folder)
+    if first:
+        _claim(folder, plain, identity, tolerated, progress)
     facts = _facts(plain, module)
-    trainer, best = training_trainer(settings.trainer, folder, device, progress, facts)
-    _describe(trainer, plain, module)
+    trainer, best = training_trainer(settings, folder, device, progress, processes)
+    if first:
+        _describe(trainer, plain, module, facts, resumed=resume is not None)
     try:
         fit(trainer, module, data, resume)
     except DivergenceError as error:
@@ -107,10 +120,31 @@ def train(config: DictConfig) -> float:
         raise KeyboardInterrupt(
             f"interrupted at step {trainer.global_step}; resume={folder} goes on from there"
         ) from None
-    if trainer.is_global_zero:
+    if first:
         _export(module, Path(best.best_model_path), weights, facts)
     progress.say(f"weights: {weights}")
-    return math.nan if best.best_model_score is None else float(best.best_model_score)
+    return float(best.best_model_score if best.best_model_score is not None else math.nan)
+
+
+def _expect_trainable(
+    folder: Path, plain: Mapping[str, Any], identity: Mapping[str, Any], tolerated: Sequence[str]
+) -> None:
+    """Check that the directory is free or that of this training, which is neither complete nor diverges again."""
+    if not plain["overwrite"] and (folder / WEIGHTS).exists():
+        raise ConfigError(f"output_dir: {folder / WEIGHTS} is trained already; overwrite=true trains it again")
+    rundir.expect_free(folder, plain, identity, tolerated)
+    if not plain["overwrite"]:
+        expect_no_divergence(folder, identity)
+
+
+def _claim(
+    folder: Path, plain: Mapping[str, Any], identity: Mapping[str, Any], tolerated: Sequence[str], progress: Progress
+) -> None:
+    """Make the directory that of this training, without the files of one that it replaces."""
+    for key in rundir.claim(folder, plain, identity, tolerated):
+        progress.say(f"note: the run began with another {key}")
+    if plain["overwrite"]:
+        _clear(folder)
 
 
 def _resumed(plain: dict[str, Any]) -> dict[str, Any]:
@@ -233,9 +267,9 @@ def _computes_w(settings: TrainConfig) -> bool:
 
 def _clear(folder: Path) -> None:
     """Remove the files of an earlier training, so that they are not taken for this one's if it is interrupted."""
-    for name in (WEIGHTS, NOTE):
+    for name in (WEIGHTS, NOTE, RUN_ID):
         (folder / name).unlink(missing_ok=True)
-    for name in ("checkpoints", "tensorboard"):
+    for name in ("checkpoints", "tensorboard", "csv", "wandb", "mlruns"):
         shutil.rmtree(folder / name, ignore_errors=True)
 
 
@@ -246,6 +280,7 @@ def _announce(
     data: PatchData,
     folder: Path,
     resume: Path | None,
+    devices: int,
 ) -> None:
     """Show what the run will do, and how long it will take."""
     trainer, objective = settings.trainer, module.objective
@@ -253,6 +288,7 @@ def _announce(
     held_out = ", ".join(f"{len(names)} of {kind}" for kind, (_, names) in data.validation_scenes().items())
     parameters = sum(each.numel() for each in module.net.parameters())
     accumulate = f" x {trainer.accumulate} batches" if trainer.accumulate > 1 else ""
+    accumulate += f" x {devices} devices" if devices > 1 else ""
     loss = objective.formula
     if isinstance(objective, Objective) and _computes_w(settings):
         loss = f"{objective.depth_loss} + w {objective.visual.title}; w is computed from the scenes"
@@ -263,18 +299,25 @@ def _announce(
         "steps": f"{trainer.steps} of {trainer.batch} patches of {trainer.patch} x {trainer.patch}{accumulate}"
         + (", resumed" if resume else ""),
         "time": f"about {duration(step * trainer.steps)} ({step:.2g} s a step as measured now), and the validations",
-        "log": f"tensorboard --logdir {folder}",
+        "log": f"tensorboard --logdir {folder}"
+        if settings.logger["name"] == "tensorboard"
+        else settings.logger["name"],
     }
     for name, line in lines.items():
         progress.say(f"{name:<6} {line}")
 
 
-def _describe(trainer: lightning.Trainer, plain: Mapping[str, Any], module: SuperResolution) -> None:
-    """Write the configuration and the resulting w to TensorBoard's log."""
-    writer: Any = trainer.logger.experiment  # type: ignore[union-attr]
+def _describe(
+    trainer: lightning.Trainer, plain: Mapping[str, Any], module: SuperResolution, facts: Mapping[str, Any], *,
+    resumed: bool,
+) -> None:  # fmt: skip
+    """Write the configuration and the resulting w to the log, and lay it out."""
     loss = {**plain["loss"], "w": module.objective.w} if isinstance(module.objective, Objective) else {}
-    text = OmegaConf.to_yaml(OmegaConf.create({**plain, "loss": loss}))
-    writer.add_text("config", f"```yaml\n{text}```")
+    config = {**plain, "loss": loss}
+    if isinstance(trainer.logger, TensorBoardLogger) or not resumed:  # MLflow refuses another device, say
+        log_settings(trainer.logger, facts, f"```yaml\n{OmegaConf.to_yaml(OmegaConf.create(config))}```", config)
+    collections: Any = module.metrics
+    log_layout(trainer.logger, list(collections[0]))
 
 
 def _facts(plain: Mapping[str, Any], module: SuperResolution) -> dict[str, Any]:

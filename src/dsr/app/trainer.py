@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -11,12 +10,14 @@ import lightning
 import torch
 from lightning.pytorch.callbacks import Callback, LearningRateMonitor, ModelCheckpoint
 
-from dsr.app.schema import TrainerConfig
+from dsr.app.devices import Processes
+from dsr.app.schema import TrainConfig
 from dsr.training.degradation import Batch
 from dsr.training.module import SuperResolution
-from dsr.utils.checkpoints import Interruption, Keep
+from dsr.utils.builder import build
+from dsr.utils.checkpoints import Interruption, Keep, ends_step
 from dsr.utils.divergence import Divergence
-from dsr.utils.lightning import Log, StepProgress, ValidationTable, make_trainer
+from dsr.utils.lightning import LOG_EVERY, StepProgress, ValidationTable, make_trainer, without_chatter
 from dsr.utils.progress import Progress
 
 MONITOR = "val/RMSE_v"
@@ -24,11 +25,28 @@ VALIDATION = "validation.csv"
 _SECONDS_BETWEEN_CHECKPOINTS = 600.0
 
 
-class Throughput(Callback):
-    """Logs patches per second, without the time of validations."""
+class Curves(Callback):
+    """Logs the losses and the norm of the gradient as means over the steps since the last values, and the speed.
 
-    def __init__(self) -> None:
-        self._start = time.perf_counter()
+    Single values of small batches are too noisy to read; these curves need no smoothing. Values that are not finite are
+    left out. The means are those of all devices.
+
+    Args:
+        every: steps between two values.
+
+    """
+
+    def __init__(self, every: int) -> None:
+        self._every, self._start, self._patches = every, time.perf_counter(), 0
+        self._sums: dict[str, torch.Tensor] = {}
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return the sums since the last values, so that a training that goes on logs the same ones."""
+        return {"sums": self._sums}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Restore the sums since the last values."""
+        self._sums = dict(state_dict["sums"])
 
     def on_train_start(self, *_: Any) -> None:
         """Start the clock."""
@@ -37,29 +55,52 @@ class Throughput(Callback):
     def on_train_batch_end(
         self, trainer: lightning.Trainer, pl_module: lightning.LightningModule, outputs: Any, batch: Batch, *_: Any
     ) -> None:
-        """Log the speed of the batch, including its loading time."""
+        """Add the values of a batch, and log their means when it is time."""
+        self._patches += len(batch["rgb"]) * trainer.world_size
+        for name, value in trainer.callback_metrics.items():
+            if name.startswith("train/") and name != "train/learning_rate":
+                entry = torch.stack((value.detach(), torch.ones_like(value))) * value.isfinite()
+                self._sums[name] = self._sums.get(name, 0) + entry.nan_to_num().to(pl_module.device)
+        if trainer.global_step % self._every or not ends_step(trainer):
+            return
+        totals = trainer.strategy.reduce(torch.stack(list(self._sums.values())), reduce_op="sum")
+        means = {name: float(total / count) for name, (total, count) in zip(self._sums, totals.cpu(), strict=True)}
         now = time.perf_counter()
-        pl_module.log("train/patches_per_second", len(batch["rgb"]) * trainer.world_size / (now - self._start))
-        self._start = now
+        means["train/patches_per_second"] = self._patches / (now - self._start)
+        for logger in trainer.loggers:
+            logger.log_metrics(means, trainer.global_step - 1)
+        self._sums, self._start, self._patches = {}, now, 0
+
+    def on_validation_start(self, *_: Any) -> None:
+        """Stop the clock: the time so far counts, that of the validation does not."""
+        self._start -= time.perf_counter()
 
     def on_validation_end(self, *_: Any) -> None:
-        """Restart the clock, so that the validation is not counted."""
-        self._start = time.perf_counter()
+        """Start the clock again."""
+        self._start += time.perf_counter()
 
 
 def training_trainer(
-    settings: TrainerConfig, folder: Path, device: torch.device, progress: Progress, table: Mapping[str, Any]
+    config: TrainConfig,
+    folder: Path,
+    device: torch.device,
+    progress: Progress,
+    processes: Processes,
 ) -> tuple[lightning.Trainer, ModelCheckpoint]:
     """Return the trainer, and the callback that keeps the best checkpoint.
 
     Args:
-        settings: of the training.
+        config: of the training.
         folder: the run's directory.
         device: to train on.
         progress: shows the steps.
-        table: the run's entries in TensorBoard's table of runs.
+        processes: of the training.
+
+    Raises:
+        ConfigError: the log cannot be written, such as without an optional package.
 
     """
+    settings = config.trainer
     checkpoints = folder / "checkpoints"
     best = ModelCheckpoint(
         checkpoints, "best", monitor=MONITOR, mode="min", enable_version_counter=False, save_on_train_epoch_end=False
@@ -69,7 +110,7 @@ def training_trainer(
     )  # save_last=True keeps the best's
     callbacks = [
         Divergence(),
-        Throughput(),
+        Curves(min(LOG_EVERY, settings.validate_every, settings.steps)),
         ValidationTable(folder / VALIDATION),
         best,
         latest,
@@ -78,16 +119,19 @@ def training_trainer(
         Keep(checkpoints / "last.ckpt", _SECONDS_BETWEEN_CHECKPOINTS),
         Interruption(checkpoints / "last.ckpt"),
     ]
-    logger = Log(folder, name="", version="tensorboard", default_hp_metric=False)
-    logger.list_run(table)
+    with without_chatter():
+        logger = build("logger", config.logger, {"folder": folder})
+    varying = "_find_unused_parameters_true" if config.degradation.get("scales") else ""  # layers of one factor alone
     trainer = make_trainer(
         device,
         settings.steps,
         min(settings.validate_every, settings.steps),
         callbacks=callbacks,
         logger=logger,
-        devices=settings.devices,
+        devices=processes.count,
         accumulate=settings.accumulate,
+        environment=processes.environment,
+        strategy=f"ddp{varying}" if processes.count > 1 else "auto",
     )
     return trainer, best
 

@@ -122,8 +122,8 @@ def _as_validated(model: Mapping[str, Any]) -> dict[str, Any]:
     return {"target": "dsr.methods.networks.trained.build_trained", "ensemble": 1}
 
 
-def training_data(settings: TrainConfig) -> PatchData:
-    """Build the patches that the configuration describes."""
+def training_data(settings: TrainConfig, devices: int = 1) -> PatchData:
+    """Build the patches that the configuration describes, for a number of devices."""
     trainer = settings.trainer
     downsampling = build("downsampling", settings.downsampling)
     if not isinstance(downsampling, Downsampling):
@@ -140,6 +140,7 @@ def training_data(settings: TrainConfig) -> PatchData:
             seed=settings.seed,
             validation=validation,
             everything=everything,
+            patches_per_step=patches.batch * trainer.accumulate * devices,
         )
     except ValueError as error:
         raise keyed(error) from error

@@ -11,6 +11,8 @@ BEFORE_THE_PAPER = 0
 AFTER_THE_PAPER = 100
 """The position of metrics that the paper's tables do not have."""
 _MOST_DIGITS = 20
+LOOKS = ("RMSE_v", "DSSIM_v", "LPIPS_v")
+"""The metrics of how a surface looks, the worst of four lights, by which results are compared first."""
 HEADLINES = ("", "max", "min")
 """Variants of the value that stands for an image: without lights, or the worst of four lights (the smallest value where
 higher is better)."""
@@ -90,3 +92,8 @@ def complete_formats(names: Iterable[str], *defined: Formats) -> dict[str, Metri
         formats = (each[name] for each in defined if name in each)
         found[name] = next(formats, MetricFormat(name))
     return found
+
+
+def main_first(names: Iterable[str]) -> list[str]:
+    """Return the names of metrics with those of :data:`LOOKS` first; the others keep their order."""
+    return sorted(names, key=lambda name: LOOKS.index(name) if name in LOOKS else len(LOOKS))

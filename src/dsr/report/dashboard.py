@@ -1,11 +1,12 @@
 """The TensorBoard log of an evaluation, so that many can be compared in one dashboard.
 
 A scalar's step is what it is plotted over: the number of the scene, or of the light. A run's text ``scenes`` says which
-number is which scene.
+number is which scene. Each data set has charts of its own, so that scenes of different ones do not share a place.
 """
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,7 @@ from torch.utils.tensorboard.summary import hparams
 from dsr.evaluation.results import Run, formats_of, method_settings
 from dsr.evaluation.run_files import read_run
 from dsr.geometry.shading import LIGHT_NAMES, render
-from dsr.metrics.formats import HEADLINES
+from dsr.metrics.formats import HEADLINES, main_first
 from dsr.sample import DepthSample
 from dsr.utils.temporary import temporary_folder
 from dsr.viz.panels import colours, normals_seen_by, reduced
@@ -33,10 +34,10 @@ _PANEL = 320
 def save_dashboard(folder: Path) -> None:
     """Write the TensorBoard log of a run into its directory, replacing an earlier one.
 
-    Scalars, in the units of the paper's tables: ``mean/METRIC``; ``scene/METRIC`` over the scenes; ``METRIC/SCENE``;
-    ``light/METRIC/SCENE`` over the lights e1..e4. Pictures of each scene: renderings of the result above those of the
-    truth, errors, and expected errors if the method has them. A custom layout has a chart per metric; the table of runs
-    (hparams) has settings and means.
+    Scalars, in the units of the paper's tables: ``mean/METRIC``; ``scene/METRIC/DATASET`` over the scenes;
+    ``METRIC/SCENE``; ``light/METRIC/SCENE`` over the lights e1..e4. Pictures of each scene: renderings of the result
+    above those of the truth, errors, and expected errors if the method has them. A custom layout has a chart per
+    metric; the table of runs (hparams) has settings and means.
 
     Args:
         folder: directory of a run; only its files are read.
@@ -63,25 +64,28 @@ def _write_scores(writer: SummaryWriter, run: Run) -> None:
     """Write scalars, their layout, and the run's row in the table of runs."""
     scored = list(run.scores["scene"].unique())
     means: dict[str, float] = {}
-    scenes: dict[str, list[str]] = {"Depth and normals": [], f"Looks, {WORST}": []}
+    looks, depth = f"Looks, {WORST}, {run.dataset}", f"Depth and normals, {run.dataset}"
+    scenes: dict[str, list[str]] = {looks: [], depth: []}
     for name, each in formats_of([run]).items():
         rows = run.scores[run.scores["metric"] == name]
         by_light = bool((rows["variant"] != "").any())
-        scenes[f"Looks, {WORST}" if by_light else "Depth and normals"].append(name)
+        scenes[looks if by_light else depth].append(name)
         headline = rows[rows["variant"].isin(HEADLINES)].set_index("scene")["value"] * each.factor
         means[name] = float(headline.mean())
         for number, scene in enumerate(scored):
-            writer.add_scalar(f"scene/{name}", headline[scene], number)
+            writer.add_scalar(f"scene/{name}/{run.dataset}", headline[scene], number)
             writer.add_scalar(f"{name}/{scene}", headline[scene], 0)
         for row in rows[rows["variant"].isin(LIGHT_NAMES)].itertuples():
             light = LIGHT_NAMES.index(row.variant) + 1
             writer.add_scalar(f"light/{name}/{row.scene}", row.value * each.factor, light)
     for name, value in means.items():
         writer.add_scalar(f"mean/{name}", value, 0)
+    scenes[looks] = main_first(scenes[looks])
     layout = {
-        title: {name: ["Multiline", [f"scene/{name}"]] for name in names} for title, names in scenes.items() if names
+        title: {name: ["Multiline", [f"scene/{name}/{re.escape(run.dataset)}$"]] for name in names}
+        for title, names in scenes.items()
     }
-    layout["By light, e1 to e4"] = {name: ["Multiline", [f"light/{name}/.*"]] for name in scenes[f"Looks, {WORST}"]}
+    layout[f"By light, e1 to e4, {run.dataset}"] = {name: ["Multiline", [f"light/{name}/.*"]] for name in scenes[looks]}
     writer.add_custom_scalars({title: charts for title, charts in layout.items() if charts})
     writer.add_text("scenes", "\n".join(f"{number}. {scene}" for number, scene in enumerate(scored)))
     for part in hparams(_hyperparameters(run), {f"mean/{name}": value for name, value in means.items()}):

@@ -79,8 +79,10 @@ class WholeScenes(Dataset[Batch]):
 
 
 def collate_scene(samples: Sequence[Batch]) -> Batch:
-    """Return a batch of one whole scene."""
+    """Return a batch of one whole scene, empty as its sample."""
     (sample,) = samples
+    if not sample:
+        return {}
     tensors = {name: value for name, value in sample.items() if name != "unit"}
     return {**default_collate([tensors]), "unit": sample["unit"]}
 
@@ -95,6 +97,7 @@ class PatchData(lightning.LightningDataModule):
         seed: seed of the patches and of the noise of validation scenes.
         validation: more data sets to validate with, by name; their scenes without a true depth are left out.
         everything: the distribution of degradations to train on in place of ``degradation``.
+        patches_per_step: of all devices and batches of a step; None for those of one batch.
 
     Raises:
         ValueError: a data set is one to evaluate on or has too few scenes, a scene is to be trained on and validated
@@ -111,10 +114,11 @@ class PatchData(lightning.LightningDataModule):
         seed: int = 0,
         validation: Mapping[str, SceneSource] | None = None,
         everything: Everything | None = None,
+        patches_per_step: int | None = None,
     ) -> None:
         super().__init__()
         check_patches((), settings, degradation.scale)
-        self._everything = everything
+        self._everything, self._per_step = everything, patches_per_step
         self._parts, self._settings, self._degradation, self._seed = list(parts), settings, degradation, seed
         self._training_names: list[list[str]] = []
         self._held_out: dict[str, tuple[SceneSource, list[str]]] = {}
@@ -163,7 +167,13 @@ class PatchData(lightning.LightningDataModule):
         ]
         shares = [part.share for part in self._parts]
         self._patches = Patches(
-            groups, self._settings, self._degradation, shares=shares, seed=self._seed, everything=self._everything
+            groups,
+            self._settings,
+            self._degradation,
+            shares=shares,
+            seed=self._seed,
+            everything=self._everything,
+            per_step=self._per_step,
         )
         for kind, (source, names) in self._held_out.items():
             scenes = [scene for scene in map(source.load, names) if scene.depth is not None]
@@ -207,15 +217,16 @@ class PatchData(lightning.LightningDataModule):
         return DataLoader(self._load_patches().select(0, sys.maxsize), batch_sampler=numbers, pin_memory=pin, **workers)
 
     def val_dataloader(self) -> list[DataLoader[Batch]]:
-        """Return a loader for each validation set, of whole scenes, one at a time."""
-        return [
-            DataLoader(
-                WholeScenes(scenes, self._degradation, self._seed, told=self._everything is not None),
-                batch_size=1,
-                collate_fn=collate_scene,
-            )
-            for scenes in self._validation
-        ]
+        """Return a loader for each validation set, of whole scenes, one at a time.
+
+        Each device has a part of the scenes; one without a scene has an empty batch, as Lightning would not let it take
+        part in the validation.
+        """
+        rank, devices = (0, 1) if self.trainer is None else (self.trainer.global_rank, self.trainer.world_size)
+        parts = (scenes[rank::devices] for scenes in self._validation)
+        told = self._everything is not None
+        samples: Any = (WholeScenes(part, self._degradation, self._seed, told=told) if part else [{}] for part in parts)
+        return [DataLoader(each, batch_size=1, collate_fn=collate_scene) for each in samples]
 
     def _load_patches(self) -> Patches:
         if self._patches is None:

@@ -18,6 +18,7 @@ from dsr.metrics.classes import compute_means
 from dsr.metrics.functional import SurfacePair
 from dsr.sample import Unit
 from dsr.training.degradation import Batch
+from dsr.training.loggers import log_picture
 from dsr.training.objective import Objective, SurfaceObjective, to_depth
 from dsr.training.settings import Schedule
 
@@ -58,11 +59,12 @@ class SuperResolution(lightning.LightningModule):
         self.sets = tuple(validation_sets)
         self.metrics = nn.ModuleList(metrics() for _ in self.sets)
         self.validation_scores: dict[str, dict[str, float]] = {}
+        self._pictures: dict[str, Tensor] = {}
 
     def training_step(self, batch: Batch, _: int) -> Tensor:
         """Return the loss of a batch of patches."""
         terms = self.loss_terms(batch)
-        self.log_dict({f"train/{name}": value.detach() for name, value in terms.items()})
+        self.log_dict({f"train/{name}": value.detach() for name, value in terms.items()}, logger=False)
         return terms["loss"]
 
     def loss_terms(self, batch: Batch) -> dict[str, Tensor]:
@@ -80,7 +82,7 @@ class SuperResolution(lightning.LightningModule):
     def configure_gradient_clipping(self, optimizer: Any, *_: Any, **__: Any) -> None:
         """Clip the gradient and log its norm; drop a gradient that is not finite, so that the step changes nothing."""
         norm = nn.utils.clip_grad_norm_(self.net.parameters(), self.schedule.clip)
-        self.log("train/gradient_norm", norm.detach())
+        self.log("train/gradient_norm", norm.detach(), logger=False)
         if not bool(norm.isfinite()):
             optimizer.zero_grad(set_to_none=True)
 
@@ -93,7 +95,9 @@ class SuperResolution(lightning.LightningModule):
             average.copy_(current)  # such as the statistics of batch normalisation, which are averages already
 
     def validation_step(self, batch: Batch, index: int, dataloader_idx: int = 0) -> None:
-        """Score a whole scene; render the first few for TensorBoard."""
+        """Score a whole scene, if the batch has one; render the first few for TensorBoard."""
+        if not batch:
+            return
         offset = batch["doffs"] if self.average.of_inverse_depth else 0
         values = batch["disparity_lr"] + offset
         if isinstance(self.objective, SurfaceObjective):
@@ -105,13 +109,18 @@ class SuperResolution(lightning.LightningModule):
         self.metrics[dataloader_idx].update(  # type: ignore[operator]
             SurfacePair(depth, batch["depth"], batch["rays"], unit=Unit(**batch["unit"]), image_dtype=torch.float32)
         )
-        writer: Any = getattr(self.logger, "experiment", None)
-        if hasattr(writer, "add_image") and index < _RENDERED_SCENES:
-            name = f"renderings/{self.sets[dataloader_idx]}_{index}"
-            writer.add_image(name, comparison(depth, batch["depth"], batch["rays"]), self.global_step)
+        number = index * self.trainer.world_size + self.trainer.global_rank  # of the scene
+        if self.trainer.loggers and number < _RENDERED_SCENES:
+            depth_lr = to_depth(batch["disparity_lr"].to(batch["depth"].dtype), batch)
+            picture = comparison(depth, batch["depth"], batch["rays"], batch["rgb"], depth_lr)
+            self._pictures[f"renderings/{self.sets[dataloader_idx]}_{number}"] = picture
 
     def on_validation_epoch_end(self) -> None:
         """Log the mean scores over the scenes, worst of four lights, of all sets and, if there are several, of each."""
+        self._gather()
+        for name in sorted(self._pictures):
+            log_picture(self.logger, name, self._pictures[name], self.global_step)
+        self._pictures = {}
         collections: Any = self.metrics
         scores = [{name: value.double() for name, value in compute_means(each).items()} for each in collections]
         names = dict.fromkeys(name for each in scores for name in each)
@@ -125,6 +134,18 @@ class SuperResolution(lightning.LightningModule):
         self.log_dict({f"{kind}/{name}": v for kind, each in named.items() for name, v in each.items()})
         for each in self.metrics:
             each.reset()  # type: ignore[operator]
+
+    def _gather(self) -> None:
+        """Gather what torchmetrics does not: which metrics apply to the scenes of any device, and the pictures."""
+        if self.trainer.world_size == 1:
+            return
+        collections: Any = self.metrics
+        metrics = [metric for each in collections for metric in each.values() if hasattr(metric, "applied")]
+        all_devices: list[Any] = [None] * self.trainer.world_size
+        torch.distributed.all_gather_object(all_devices, ([metric.applied for metric in metrics], self._pictures))
+        for number, metric in enumerate(metrics):
+            metric.applied = any(applied[number] for applied, _ in all_devices)
+        self._pictures = {name: picture for _, pictures in all_devices for name, picture in pictures.items()}
 
     def configure_optimizers(self) -> Any:
         """Return AdamW and its learning-rate schedule, which is updated after every step."""

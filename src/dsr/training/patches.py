@@ -1,7 +1,8 @@
 """Training patches: random windows of scenes.
 
-Patch number i of a run is a pure function of (seed, i), and of the size of a batch where factors are drawn. So an
-interrupted run continues with the same patches, whatever the number of workers.
+Patch number i of a run is a pure function of (seed, i), and of the number of patches of a step where factors are drawn.
+So an interrupted run continues with the same patches, whatever the number of workers, and the patches of a step are the
+same on one device and on several.
 """
 
 from __future__ import annotations
@@ -41,8 +42,9 @@ class Patches(Dataset[Batch]):
         seed: seed of the run.
         first: number of the first patch.
         count: number of patches.
-        everything: the distribution of degradations to draw from in place of ``degradation``; all patches of a batch
+        everything: the distribution of degradations to draw from in place of ``degradation``; all patches of a step
             have one factor.
+        per_step: number of patches of a step; None for those of a batch.
 
     Raises:
         ValueError: a scene is too small or has no true depth, or there is no scene.
@@ -60,13 +62,14 @@ class Patches(Dataset[Batch]):
         first: int = 0,
         count: int = 1,
         everything: Everything | None = None,
+        per_step: int | None = None,
     ) -> None:
         scales = [degradation.scale]
         if everything is not None and everything.scales is not None:
             scales = [int(scale) for scale in everything.scales]
         for group, scale in itertools.product(groups, scales):
             check_patches(group, settings, scale)
-        self._everything = everything
+        self._everything, self._per_step = everything, per_step or settings.batch
         weights = np.array([1.0] * len(groups) if shares is None else shares, dtype=np.float64)
         if not groups or not all(groups):
             raise ValueError("patches: expected a scene or more to train on")
@@ -121,8 +124,8 @@ class Patches(Dataset[Batch]):
 
     def _degrade(self, everything: Everything, number: int, random: np.random.Generator) -> Batch:
         """Return a random patch with a degradation from a distribution; ``noise`` and ``facts`` are hints."""
-        of_batch = np.random.default_rng([self._seed, number // self._settings.batch, 1])
-        drawing = torch.Generator().manual_seed(int(of_batch.integers(2**62)))
+        of_step = np.random.default_rng([self._seed, number // self._per_step, 1])
+        drawing = torch.Generator().manual_seed(int(of_step.integers(2**62)))
         scale = everything.draw_scale(self._degradation.scale, drawing)
         size = self._settings.patch
         group = min(int(np.searchsorted(self._limits, random.random(), "right")), len(self._groups) - 1)

@@ -49,6 +49,9 @@ class Interruption(Callback):
     If a validation follows that step, it ends between two scenes of the validation, which is done again later. Only the
     validation after the last step is waited for, as nothing would be left to do again.
 
+    Of several processes, the states of which are the same, the first one acts upon the signal, and the others end with
+    it.
+
     Args:
         path: the checkpoint's path.
 
@@ -58,10 +61,12 @@ class Interruption(Callback):
         self._path = path
         self._stack = contextlib.ExitStack()
         self._interruption: interruption.Deferred | None = None
+        self._acts = True
         self._checkpoint: dict[str, Any] | None = None
 
     def on_train_start(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
         """Only note signals from now on."""
+        self._acts = trainer.is_global_zero
         message = f"interrupted; {self._path} is the latest checkpoint, the same command goes on from there"
         self._interruption = self._stack.enter_context(interruption.deferred(message))
 
@@ -71,7 +76,7 @@ class Interruption(Callback):
         validates = trainer.should_stop or batches % (trainer.val_check_batch or 1) == 0
         if self._requested and ends_step(trainer) and not validates:
             if not in_doubt(trainer):
-                trainer.save_checkpoint(self._path)
+                save_alone(trainer, self._path)
             raise KeyboardInterrupt
 
     def on_validation_start(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
@@ -117,8 +122,8 @@ class Interruption(Callback):
 
     @property
     def _requested(self) -> bool:
-        """Whether a signal came."""
-        return self._interruption is not None and self._interruption.requested
+        """Whether a signal came that this process acts upon."""
+        return self._acts and self._interruption is not None and self._interruption.requested
 
 
 def _of_begun_validation(trainer: lightning.Trainer) -> dict[str, Any]:
@@ -148,7 +153,13 @@ class Keep(Callback):
         now = time.monotonic()
         if now - self._last > self._seconds and ends_step(trainer) and not in_doubt(trainer):
             self._last = now
-            trainer.save_checkpoint(self._path)
+            save_alone(trainer, self._path)
+
+
+def save_alone(trainer: lightning.Trainer, path: Path) -> None:
+    """Save a checkpoint from the first process; the others, which do not know of it, are not waited for."""
+    if trainer.is_global_zero:
+        trainer.strategy.save_checkpoint(trainer._checkpoint_connector.dump_checkpoint(weights_only=False), path)
 
 
 class AtomicCheckpoints(TorchCheckpointIO):

@@ -67,6 +67,7 @@ class _State:
         handled: whether the handler has acted upon a signal.
         deferred: what notes a signal; None if signals raise.
         requeues: whether a scheduler requeues the job of this process, see :func:`requeued`.
+        silent: whether the process ends without a line, as another one of the same command says it.
         ending: held by the thread that ends the process.
 
     """
@@ -78,6 +79,7 @@ class _State:
     handled = False
     deferred: Deferred | None = None
     requeues = False
+    silent = False
     ending = threading.Lock()
 
 
@@ -106,6 +108,7 @@ def start(module: str, function: str) -> NoReturn:
 def install() -> None:
     """Make the handler that of this process; only from its main thread."""
     _State.installed = True
+    _State.silent = os.environ.get("LOCAL_RANK", "0") != "0"  # a further process of a training on several devices
     _State.numbers = tuple(number for number in _SIGNALS if signal.getsignal(number) != signal.SIG_IGN)
     sys.unraisablehook = _unraisable
     sys.warnoptions.append("ignore:resource_tracker")  # it warns on stderr of what it cleans up after a sudden end
@@ -115,6 +118,11 @@ def install() -> None:
     signal.set_wakeup_fd(writing, warn_on_full_buffer=False)
     threading.Thread(target=_watch, args=(reading,), name="interruption", daemon=True).start()
     reinstall()
+
+
+def silence() -> None:
+    """End this process without a line at a signal: it is one of several of a command, another one of which has it."""
+    _State.silent = True
 
 
 def reinstall() -> None:
@@ -252,7 +260,8 @@ def end(message: str) -> NoReturn:
     with contextlib.suppress(BaseException):
         if sys.stdout.isatty():
             os.write(1, _SHOW_CURSOR)
-        os.write(2, f"{message}\n".encode())
+        if not _State.silent:
+            os.write(2, f"{message}\n".encode())
         _end_children()
     os._exit(exit_code())
 

@@ -9,12 +9,13 @@ import time
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal, Protocol
+from typing import Any, Protocol
 
 import lightning
 import torch
 from lightning.pytorch.callbacks import Callback
 from lightning.pytorch.loggers import TensorBoardLogger
+from lightning.pytorch.plugins.environments import ClusterEnvironment, LightningEnvironment
 from lightning.pytorch.utilities import rank_zero_only
 from torch.utils.tensorboard.summary import hparams
 
@@ -26,8 +27,8 @@ from dsr.utils.space import FullDiskError, space_for
 from dsr.utils.tables import guard
 
 IN_TABLE = ("RMSE_v", "DSSIM_v", "LPIPS_v", "BadPix_v_5", "Bumpiness_d", "RMSE_d")
-_LOG_EVERY = 10
-"""Steps between two values of a training in TensorBoard's log."""
+LOG_EVERY = 10
+"""Steps between two values of a training in its log."""
 _SECONDS_BETWEEN_LOSSES = 0.2
 """Between two losses that are fetched from the device to be shown, each of which waits for it."""
 
@@ -174,8 +175,9 @@ def make_trainer(
     *,
     callbacks: Sequence[Callback],
     logger: Any,
-    devices: int | Literal["auto"] = 1,
+    devices: int = 1,
     accumulate: int = 1,
+    environment: ClusterEnvironment | None = None,
     **named: Any,
 ) -> lightning.Trainer:
     """Return a trainer for a number of steps, with a validation after every few and after the last one.
@@ -186,8 +188,10 @@ def make_trainer(
         interval: steps between two validations.
         callbacks: of Lightning.
         logger: of Lightning; False for none.
-        devices: how many devices of that kind to train on; ``auto`` for all that there are.
+        devices: how many devices of that kind to train on.
         accumulate: batches of a step.
+        environment: what Lightning learns of the processes of several devices from; None where it starts them itself,
+            whatever Slurm or MPI say.
         **named: more settings of :class:`lightning.Trainer`.
 
     """
@@ -199,10 +203,10 @@ def make_trainer(
             accumulate_grad_batches=accumulate,
             val_check_interval=interval * accumulate,
             check_val_every_n_epoch=None,
-            log_every_n_steps=min(_LOG_EVERY, interval),
+            log_every_n_steps=min(LOG_EVERY, interval),
             logger=logger,
             callbacks=[LastValidation(interval), *callbacks],
-            plugins=[AtomicCheckpoints()],
+            plugins=[AtomicCheckpoints(), environment or LightningEnvironment()],
             enable_progress_bar=False,
             enable_model_summary=False,
             num_sanity_val_steps=0,
@@ -244,10 +248,8 @@ def fit(
         raise KeyboardInterrupt
 
 
-def _lightning_devices(device: torch.device, count: int | Literal["auto"]) -> Any:
+def _lightning_devices(device: torch.device, count: int) -> Any:
     """Return the devices for Lightning: their number, or a list of one."""
-    if device.type == "cpu" and count == "auto":
-        return 1
     if device.type != "cpu" and count == 1 and device.index is not None:
         return [device.index]
     return count
@@ -268,9 +270,10 @@ def scores_line(trainer: lightning.Trainer) -> str:
 @contextlib.contextmanager
 def without_chatter() -> Iterator[None]:
     """Keep Lightning's tips, and its warnings of what is intended, off the terminal."""
-    logger = logging.getLogger("lightning.pytorch")
-    level = logger.level
-    logger.setLevel(logging.ERROR)
+    loggers = [logging.getLogger(name) for name in ("lightning.pytorch", "lightning.fabric")]
+    levels = [logger.level for logger in loggers]
+    for logger in loggers:
+        logger.setLevel(logging.ERROR)
     try:
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", ".*does not have many workers.*")
@@ -283,4 +286,5 @@ def without_chatter() -> Iterator[None]:
             warnings.filterwarnings("ignore", ".*LeafSpec.*", DeprecationWarning)
             yield
     finally:
-        logger.setLevel(level)
+        for logger, level in zip(loggers, levels, strict=True):
+            logger.setLevel(level)

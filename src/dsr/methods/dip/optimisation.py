@@ -174,7 +174,9 @@ class PriorOptimisation(lightning.LightningModule):
                 self.log_dict({"step": float(self.global_step), **named}, batch_size=1)  # else Lightning counts from 0
         writer: Any = getattr(self.logger, "experiment", None)
         if hasattr(writer, "add_image"):
-            writer.add_image("renderings", comparison(depth, self.truth, self.problem.rays), self.global_step)
+            problem = self.problem
+            picture = comparison(depth, self.truth, problem.rays, problem.rgb, problem.depth_lr)
+            writer.add_image("renderings", picture, self.global_step)
 
     def configure_optimizers(self) -> torch.optim.Optimizer:
         """Return Adam."""

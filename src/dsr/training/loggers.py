@@ -1,0 +1,223 @@
+"""Where a training is logged: Lightning's loggers, made for the directory of a run.
+
+A run that goes on after an interruption goes on with its log.
+"""
+
+from __future__ import annotations
+
+import csv as tables
+import os
+import re
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+from lightning.pytorch.loggers import CSVLogger, Logger, MLFlowLogger, WandbLogger
+from lightning.pytorch.utilities import rank_zero_only
+from torch import Tensor
+
+from dsr.metrics.formats import main_first
+from dsr.utils.files import write_text
+from dsr.utils.lightning import Log
+
+_CURVES = ("loss", "gradient_norm")
+_ROWS_AT_ONCE = 10
+"""Rows of a table that are written together."""
+RUN_ID = "logger_run.txt"
+"""The file in a run's directory with the number that a service has given to the run."""
+
+
+class CsvLog(CSVLogger):
+    """A table of all logged values, a row for each step; rows of later steps, from before an interruption, go.
+
+    Args:
+        folder: the run's directory; the table is ``csv/metrics.csv`` in it.
+
+    """
+
+    def __init__(self, folder: Path) -> None:
+        super().__init__(folder, name="", version="csv", flush_logs_every_n_steps=sys.maxsize)
+        self._before = _read_table(folder / "csv" / "metrics.csv")
+
+    @rank_zero_only
+    def log_metrics(self, metrics: Any, step: int | None = None) -> None:
+        """Add values to the table, all but the epoch, as there is only one."""
+        values: dict[str, Tensor | float] = {name: float(value) for name, value in metrics.items() if name != "epoch"}
+        if not values:
+            return
+        if self._before:
+            kept = [row for row in self._before if step is None or int(row["step"]) < step]
+            self._before = []
+            self.experiment.metrics.extend(kept)
+        rows = self.experiment.metrics
+        if rows and step is not None and rows[-1]["step"] == step:
+            rows[-1].update(values)
+        else:
+            if len(rows) >= _ROWS_AT_ONCE:
+                self.save()
+            super().log_metrics(values, step)
+
+
+class WandbLog(WandbLogger):
+    """Weights & Biases, a run of which ends with the training."""
+
+    @rank_zero_only
+    def finalize(self, status: str) -> None:
+        """End the run, so that the next training of a multirun has one of its own."""
+        super().finalize(status)
+        if self._experiment is not None:
+            self._experiment.finish(exit_code=0 if status == "success" else 1)
+            self._experiment = None
+
+
+def tensorboard(folder: Path) -> Logger:
+    """Return TensorBoard's logger, which writes to ``tensorboard`` in a run's directory."""
+    return Log(folder, name="", version="tensorboard", default_hp_metric=False)
+
+
+def csv(folder: Path) -> Logger:
+    """Return a logger that writes ``csv/metrics.csv`` in a run's directory."""
+    return CsvLog(folder)
+
+
+def wandb(
+    folder: Path, project: str = "dsr", entity: str | None = None, mode: Literal["online", "offline"] = "online"
+) -> Logger:
+    """Return the logger of Weights & Biases.
+
+    Args:
+        folder: the run's directory, which gives the run its name; local files are written to ``wandb`` in it.
+        project: of the service.
+        entity: user or team; None for the user's default.
+        mode: ``offline`` for local files alone, which ``wandb sync`` uploads later.
+
+    Raises:
+        ValueError: wandb is not installed, or refuses to begin a run, such as without a login.
+
+    """
+    try:
+        import wandb as client  # noqa: PLC0415 - optional
+    except ImportError:
+        raise ValueError("name: wandb is not installed; pip install dsr[wandb]") from None
+    logger = WandbLog(
+        name=folder.name, save_dir=folder, project=project, entity=entity, mode=mode, id=_read_number(folder),
+        settings=client.Settings(silent=True, console="off"),
+    )  # fmt: skip
+    logger._wandb_init.pop("anonymous", None)  # of which wandb would warn
+    try:
+        number = logger.experiment.id
+    except client.Error as error:
+        raise ValueError(f"mode: wandb: {error}; wandb login, or logger.mode=offline for local files") from error
+    _write_number(folder, number)
+    return logger
+
+
+def mlflow(folder: Path, experiment: str = "dsr", tracking_uri: str | None = None) -> Logger:
+    """Return the logger of MLflow.
+
+    Args:
+        folder: the run's directory, which gives the run its name.
+        experiment: name of the experiment that the run belongs to.
+        tracking_uri: address of a server or a store; None for ``$MLFLOW_TRACKING_URI``, or files in ``mlruns`` of the
+            run's directory.
+
+    Raises:
+        ValueError: MLflow is not installed, or the store cannot be used.
+
+    """
+    try:
+        from mlflow.exceptions import MlflowException  # noqa: PLC0415 - optional
+    except ImportError:
+        raise ValueError("name: mlflow is not installed; pip install dsr[mlflow]") from None
+    uri = tracking_uri or os.environ.get("MLFLOW_TRACKING_URI") or (folder / "mlruns").absolute().as_uri()
+    if uri.startswith("file:"):
+        os.environ.setdefault("MLFLOW_ALLOW_FILE_STORE", "true")
+    try:
+        logger = MLFlowLogger(experiment, folder.name, uri, run_id=_read_number(folder))
+        _write_number(folder, logger.run_id)
+    except MlflowException as error:
+        raise ValueError(f"tracking_uri: {uri}: {error}") from error
+    return logger
+
+
+def log_settings(logger: Logger | None, table: Mapping[str, Any], text: str, config: Mapping[str, Any]) -> None:
+    """Log what a training was made with.
+
+    Args:
+        logger: of the training.
+        table: the main settings, for TensorBoard's table of runs.
+        text: the complete configuration for readers, for TensorBoard.
+        config: the complete configuration, for other loggers.
+
+    """
+    if isinstance(logger, Log):
+        logger.list_run(table)
+        logger.experiment.add_text("config", text)
+    elif logger is not None:
+        logger.log_hyperparams(dict(config))
+
+
+def log_layout(logger: Logger | None, metrics: Sequence[str], losses: Sequence[str] = _CURVES) -> None:
+    """Lay out TensorBoard's *Custom scalars*: the worst of four lights first, then depth and normals, then losses.
+
+    A chart has a metric's mean over all validation sets and, if there are several, that of each.
+
+    Args:
+        logger: of the training; others than TensorBoard's have no layout.
+        metrics: names of the validation's metrics.
+        losses: names of values of the training.
+
+    """
+    if not isinstance(logger, Log):
+        return
+    looks = main_first(name for name in metrics if "_v" in name)
+    groups = {
+        "Looks, worst of four lights": {name: rf"val(_[^/]*)?/{re.escape(name)}$" for name in looks},
+        "Depth and normals": {name: rf"val(_[^/]*)?/{re.escape(name)}$" for name in metrics if name not in looks},
+        "Training": {name: f"train/{name}$" for name in losses},
+    }
+    layout = {title: {name: ["Multiline", [tag]] for name, tag in charts.items()} for title, charts in groups.items()}
+    logger.experiment.add_custom_scalars({title: charts for title, charts in layout.items() if charts})
+
+
+def log_picture(logger: Any, tag: str, picture: Tensor, step: int) -> None:
+    """Log a picture where pictures are shown.
+
+    Args:
+        logger: of the training.
+        tag: the picture's name.
+        picture: (3, H, W) uint8.
+        step: of the training.
+
+    """
+    array = picture.permute(1, 2, 0).numpy()
+    if isinstance(logger, Log):
+        logger.experiment.add_image(tag, picture, step)
+    elif isinstance(logger, WandbLogger):
+        logger.log_image(tag, [array], caption=[f"step {step}"])
+    elif isinstance(logger, MLFlowLogger):
+        logger.experiment.log_image(logger.run_id, array, artifact_file=f"{tag}/{step:06}.png")
+
+
+def _read_table(path: Path) -> list[dict[str, Any]]:
+    """Return the rows of a table without empty cells; a row that was cut off is left out."""
+    if not path.is_file():
+        return []
+    with path.open(newline="", encoding="utf-8") as file:
+        rows = [row for row in tables.DictReader(file) if None not in row and None not in row.values()]
+    whole = [row for row in rows if row["step"].isdecimal()]
+    return [{name: value for name, value in row.items() if value} | {"step": int(row["step"])} for row in whole]
+
+
+def _read_number(folder: Path) -> str | None:
+    """Return the number that a service has given to the run, None for a new run."""
+    path = folder / RUN_ID
+    text = path.read_text(encoding="utf-8").strip() if path.is_file() else ""
+    return text if re.fullmatch(r"\w{1,64}", text) else None
+
+
+@rank_zero_only
+def _write_number(folder: Path, number: Any) -> None:
+    """Keep the number that a service has given to the run."""
+    write_text(folder / RUN_ID, f"{number}\n")
