@@ -41,6 +41,7 @@ from dsr.training.module import SuperResolution
 from dsr.training.objective import Objective, SurfaceObjective
 from dsr.training.patches import Patches
 from dsr.training.settings import PatchSettings, Schedule
+from dsr.utils.devices import pick_device
 
 SHORT: dict[str, dict[str, Any]] = {
     "dip": {"steps": 2},
@@ -258,3 +259,11 @@ def test_what_cuda_allows_is_no_error(gpu: torch.device) -> None:
     there[2:3].copy_(torch.tensor([9.0]))
     assert there.tolist() == [0, 7, 9, 3, 4, 5]
     assert (there.cpu().numpy() == [0, 7, 9, 3, 4, 5]).all()
+
+
+def test_auto_is_the_device_of_the_environment(monkeypatch: pytest.MonkeyPatch, gpu: torch.device) -> None:
+    monkeypatch.setenv("DSR_DEVICE", "cpu")
+    assert pick_device("auto") == CPU
+    monkeypatch.setenv("DSR_DEVICE", str(gpu))
+    assert pick_device("auto") == gpu
+    assert pick_device("cpu") == CPU
