@@ -1,6 +1,6 @@
 """All metrics of one 512 x 512 pair without LPIPS_v: dsr against scikit-image and numpy, float64, on the CPU.
 
-    python benchmarks/metrics_speed.py [--repeats 15]
+    python benchmarks/metrics_speed.py [--repeats 15] [--device cpu]
 
 Both ways share what can be shared (normals and renderings are computed once) and take turns within the run; the ratio
 of the medians is the result. The largest relative difference of their values is printed too.
@@ -87,11 +87,14 @@ def main() -> None:
     """Time both ways and print their ratio."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--repeats", type=int, default=15)
-    repeats = parser.parse_args().repeats
+    parser.add_argument("--device", default="cpu", help="of dsr; NumPy stays on the CPU")
+    options = parser.parse_args()
+    repeats, device = options.repeats, torch.device(options.device)
     torch.set_num_threads(2)
     prediction, target = surfaces()
     rays = CAMERA.rays()
-    tensors = [torch.from_numpy(values)[None] for values in (prediction, target)]
+    tensors = [torch.from_numpy(values)[None].to(device) for values in (prediction, target)]
+    device_rays = rays.to(device)
     numpy_rays = np.ascontiguousarray(rays.permute(1, 2, 0).numpy())
     metrics = catalogue()
     seconds: dict[str, list[float]] = {"scikit-image and numpy": [], "dsr": []}
@@ -99,7 +102,7 @@ def main() -> None:
         start = time.perf_counter()
         expected = numpy_way(prediction, target, numpy_rays)
         middle = time.perf_counter()
-        ours = [score.value for score in score_image(*tensors, rays, metrics)]
+        ours = [score.value for score in score_image(*tensors, device_rays, metrics)]
         end = time.perf_counter()
         if turn:  # the first turn warms up
             seconds["scikit-image and numpy"].append(middle - start)

@@ -49,6 +49,7 @@ def main() -> None:
     parser.add_argument("--scale", type=int, default=4)
     parser.add_argument("--width", type=int, default=4000)
     parser.add_argument("--height", type=int, default=3000)
+    parser.add_argument("--device", default="cpu")
     parser.add_argument("--seams", action="store_true", help="measure the seams, too")
     options = parser.parse_args()
     scene = Folder(str(options.shared / "scenes")).load(options.scene)
@@ -59,7 +60,7 @@ def main() -> None:
     camera = Camera(width, height, scene.camera.fx, scene.camera.fy, width / 2, height / 2)
     del depth, scene
     before, start = peak(), time.perf_counter()
-    upsample_depth(rgb, coarse, camera, scale, method=options.method, device="cpu")
+    upsample_depth(rgb, coarse, camera, scale, method=options.method, device=options.device)
     seconds = time.perf_counter() - start
     print(
         f"{options.method} x{scale}, {width} x {height}: {seconds:.0f} s, {peak():.2f} GB at most, {before:.2f} before"

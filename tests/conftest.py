@@ -24,6 +24,7 @@ from dsr.geometry.camera import Camera
 from dsr.metrics.catalogue import catalogue, score_image
 from dsr.sample import Scene
 from dsr.utils.console import ConsoleProgress, _ConsoleTask
+from dsr.utils.devices import pick_device
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 UNIT_TESTS = REPOSITORY / "tests" / "unit"
@@ -62,6 +63,12 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 def _two_threads() -> None:
     several = "PYTEST_XDIST_WORKER" in os.environ
     torch.set_num_threads(int(os.environ.get("DSR_TEST_THREADS", "1" if several else "2")))
+
+
+@pytest.fixture(scope="session")
+def device() -> torch.device:
+    """The device to test on: $DSR_DEVICE, or the CPU."""
+    return pick_device(os.environ.get("DSR_DEVICE", "cpu"))
 
 
 @pytest.fixture(scope="session", autouse=True)

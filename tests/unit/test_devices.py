@@ -1,3 +1,4 @@
+<<<<<<< HEAD
 """The devices and processes of a training."""
 
 import os
@@ -88,3 +89,274 @@ def test_environment_is_as_before_when_the_processes_have_ended(monkeypatch):
     with find_processes(CPU, 1, "auto").running():
         os.environ.update(LOCAL_RANK="0", MASTER_PORT="6")
     assert dict(os.environ) == before
+=======
+"""Nothing is left behind on the CPU: methods, metrics, losses and trainings on a GPU, a pretended one by default.
+
+The results have to be those of the CPU. ``DSR_DEVICE=cuda`` runs the same tests on a real GPU.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from pretend_cuda import pretend_cuda
+from small_scenes import sample_of
+from torch import Tensor, nn
+from torch.utils.data import DataLoader
+
+from dsr.degradation.downsampling import Downsampling, Holes, make_sample
+from dsr.degradation.everything import Everything
+from dsr.degradation.holes import Blobs, Shadows
+from dsr.degradation.noise import GaussianMultiplicative, Kinect, Noise, TimeOfFlight
+from dsr.inference.engine import upsample_surface
+from dsr.methods.networks.facets_unet import FacetsUNet
+from dsr.methods.networks.msg_net import MSGNet
+from dsr.methods.networks.pdn import PrimalDualNetwork
+from dsr.methods.networks.peers.build import PEERS
+from dsr.methods.registry import build_method, list_methods, read_method
+from dsr.metrics import losses
+from dsr.metrics.catalogue import PROTOCOLS, catalogue, score_image
+from dsr.metrics.classes import compute_means, visual_metrics
+from dsr.metrics.functional import SurfacePair
+from dsr.metrics.lpips import LPIPS
+from dsr.metrics.visual_loss import VisualLoss
+from dsr.sample import CENTIMETRES, DepthSample, Scene
+from dsr.training.degradation import Degradation
+from dsr.training.module import SuperResolution
+from dsr.training.objective import Objective, SurfaceObjective
+from dsr.training.patches import Patches
+from dsr.training.settings import PatchSettings, Schedule
+from dsr.utils.devices import pick_device
+
+SHORT: dict[str, dict[str, Any]] = {
+    "dip": {"steps": 2},
+    "dip_v": {"steps": 2},
+    "dip_v_warm": {"steps": 2},
+    "tgv": {"iterations": 20},
+    "srfs": {"iterations": 1},
+    "anisotropic_diffusion": {"steps": 20},
+}
+CPU = torch.device("cpu")
+TRUNK = ((3, 64, 11), (64, 192, 5), (192, 384, 3), (384, 256, 3), (256, 256, 3))
+
+
+@pytest.fixture
+def gpu(device: torch.device) -> Iterator[torch.device]:
+    """The device of $DSR_DEVICE, or a pretended GPU where that is the CPU."""
+    if device.type != "cpu":
+        yield device
+        return
+    with pretend_cuda() as pretended:
+        yield pretended
+
+
+def _sample(size: int = 48) -> DepthSample:
+    """Return a slope and a nearer plate with an oblique edge, and a photo that shows it, waves and noise."""
+    v, u = torch.meshgrid(*2 * [torch.arange(size).double()], indexing="ij")
+    near = u > 0.6 * v + 9
+    disparity = torch.where(near, 9 - 0.01 * v, 5 + 0.02 * u)
+    noise = torch.rand(3, size, size, generator=torch.Generator().manual_seed(0))
+    rgb = (0.3 + 0.4 * near + 0.1 * torch.sin(u / 3) + 0.1 * noise).float()
+    return sample_of(disparity, rgb)
+
+
+def _on(sample: DepthSample, device: torch.device) -> DepthSample:
+    assert sample.depth is not None
+    maps = {name: getattr(sample, name).to(device) for name in ("rgb", "depth_lr", "depth")}
+    return replace(sample, **maps)
+
+
+def _build(name: str, device: torch.device, folder: Path) -> Any:
+    node = read_method(name, 4, SHORT.get(name))
+    given: dict[str, Any] = {"precision": "float32", "downsampling": Downsampling("box"), "device": device}
+    if "peer" in node:
+        torch.manual_seed(0)
+        given["weights"] = folder / f"{name}.pth"
+        if not given["weights"].exists():
+            torch.save(PEERS[name](4).state_dict(), given["weights"])
+    return build_method(node, 4, **given)
+
+
+@pytest.mark.parametrize("name", list_methods())
+def test_method_predicts_on_a_gpu_what_it_predicts_on_the_cpu(name: str, tmp_path: Path, gpu: torch.device) -> None:
+    sample = _sample(96 if name == "eg" else 48)
+    expected = _build(name, CPU, tmp_path)(sample)
+    method = _build(name, gpu, tmp_path)
+    slow = name in {"eg", "srfs"} or "steps" in SHORT.get(name, {})
+    for given in (_on(sample, gpu),) if slow else (sample, _on(sample, gpu)):
+        found = method(given)
+        assert found.device == given.depth_lr.device
+        torch.testing.assert_close(found.cpu(), expected, rtol=1e-3, atol=1e-3, equal_nan=True)
+
+
+@pytest.mark.parametrize("model", ["facets", "msg_v", "pdn"])
+@pytest.mark.filterwarnings("ignore:You are trying to `self.log.*")
+def test_training_step_on_a_gpu_is_that_of_the_cpu(model: str, gpu: torch.device) -> None:
+    settings = PatchSettings(patch=32, batch=2, photo=1.0)
+    everything = Everything() if model == "facets" else None
+    noise = GaussianMultiplicative(0.01) if model == "msg_v" else None
+    degradation = Degradation(4, Downsampling("box"), noise)
+    sample = _sample()
+    scene = Scene("set", "hall", sample.rgb, sample.camera, sample.depth)
+    patches = Patches([[scene]], settings, degradation, count=2, everything=everything)
+    batch = next(iter(DataLoader(patches, batch_size=2)))
+    found = []
+    for device in (CPU, gpu):
+        torch.manual_seed(0)
+        net = {"facets": FacetsUNet, "msg_v": partial(MSGNet, variant="dsr"), "pdn": PrimalDualNetwork}[model](4)
+        objective = SurfaceObjective() if model == "facets" else Objective("lap1", 0.1, shading=0.1)
+        module = SuperResolution(net, objective, Schedule(10, warmup=1, mixed=False), visual_metrics).to(device)
+        moved = {key: value.to(device) for key, value in batch.items()}
+        made = module.configure_optimizers()
+        loss = module.training_step(moved, 0)
+        loss.backward()
+        loss = loss.detach()
+        norm = nn.utils.clip_grad_norm_(module.net.parameters(), 1.0)
+        made["optimizer"].step()
+        with torch.no_grad():
+            module.validation_step({**moved, "unit": asdict(CENTIMETRES)}, 0)
+        means = compute_means(module.metrics[0])
+        found.append([float(loss), float(norm), *(float(each) for each in means.values())])
+    np.testing.assert_allclose(found[1], found[0], rtol=1e-3)
+
+
+@pytest.mark.parametrize("noise", [Kinect(), TimeOfFlight(), GaussianMultiplicative(0.01)])
+@pytest.mark.parametrize("holes", [Blobs(), Shadows()])
+def test_scene_of_a_gpu_is_degraded_like_one_of_the_cpu(noise: Noise, holes: Holes, gpu: torch.device) -> None:
+    """The random numbers are the CPU's, so that a seed gives the same map on all devices."""
+    sample, found = _sample(), []
+    assert sample.depth is not None
+    for device in (CPU, gpu):
+        scene = Scene("set", "hall", sample.rgb.to(device), sample.camera, sample.depth.to(device))
+        made = make_sample(scene, 4, Downsampling("box"), "disparity", noise, 0, holes)
+        assert made.depth_lr.device.type == device.type
+        found.append(made.depth_lr.cpu())
+    torch.testing.assert_close(found[1], found[0], equal_nan=True)
+
+
+def _pair(device: torch.device, *, holes: bool = True) -> SurfacePair:
+    sample, generator = _sample(), torch.Generator().manual_seed(1)
+    assert sample.depth is not None
+    target = sample.depth[None].repeat(2, 1, 1, 1)
+    prediction = target + 0.01 * torch.randn(target.shape, generator=generator, dtype=target.dtype)
+    if holes:
+        prediction[0, :, 5:9, 3:11] = torch.nan
+    return SurfacePair(prediction.to(device), target.to(device), sample.camera.rays(device=device)[None])
+
+
+def _lpips() -> LPIPS:
+    """Return the network with a random trunk."""
+    torch.manual_seed(0)
+    layers = zip((0, 3, 6, 8, 10), TRUNK, strict=True)
+    modules = {f"features.{i}": nn.Conv2d(a, b, k) for i, (a, b, k) in layers}
+    return LPIPS({f"{key}.{name}": value for key, m in modules.items() for name, value in m.state_dict().items()})
+
+
+@pytest.mark.parametrize("holes", [False, True])
+def test_metrics_have_the_values_of_the_cpu(gpu: torch.device, holes: bool) -> None:
+    network = _lpips()
+    found = []
+    for device in (CPU, gpu):
+        pair, metrics = _pair(device, holes=holes), catalogue(network.to(device), (), tuple(PROTOCOLS))
+        prediction, target = pair.given
+        scores = score_image(prediction[0], target[0], pair.rays[0], metrics)
+        means = visual_metrics(network, (), tuple(PROTOCOLS)).to(device)
+        means.update(pair)
+        found.append([each.value for each in scores] + [float(each) for each in compute_means(means).values()])
+        network.to(CPU)
+    np.testing.assert_allclose(found[1], found[0], rtol=1e-4)
+    assert len(found[0]) > 40
+
+
+def _depth_loss(pair: SurfacePair, loss: Callable[..., Tensor]) -> Tensor:
+    return loss(*pair.given)
+
+
+LOSSES: dict[str, Callable[[], Callable[[SurfacePair], Tensor]]] = {
+    **{each.__name__: partial(partial, _depth_loss, loss=each) for each in (losses.l1, losses.mse, losses.lap1)},
+    "mse_v": VisualLoss,
+    "dssim": lambda: VisualLoss("dssim"),
+    "lpips": lambda: VisualLoss("lpips", _lpips()),
+}
+
+
+@pytest.mark.parametrize("name", LOSSES)
+def test_losses_and_their_gradients_are_those_of_the_cpu(name: str, gpu: torch.device) -> None:
+    found = []
+    for device in (CPU, gpu):
+        pair = _pair(device)
+        prediction = pair.given[0].detach().requires_grad_()
+        value = LOSSES[name]()(SurfacePair(prediction, pair.given[1], pair.rays)).sum()
+        (gradient,) = torch.autograd.grad(value, prediction)
+        found.append((value.detach().cpu(), gradient.cpu()))
+    for expected, other in zip(*found, strict=True):
+        torch.testing.assert_close(other, expected, rtol=1e-4, atol=1e-6, equal_nan=True)
+
+
+@pytest.mark.parametrize("method", ["facets", "msg_v", "tgv", "bicubic"])
+@pytest.mark.parametrize("of", ["cpu", "gpu"])
+def test_any_photo_and_map_are_upsampled_on_a_gpu(method: str, of: str, gpu: torch.device) -> None:
+    sample = _sample()
+    depth = sample.depth_lr.clone()
+    depth[:, 2:4, 5:6] = torch.nan
+    settings = SHORT.get(method, {})
+    expected = upsample_surface(sample.rgb, depth, sample.camera, method=method, settings=settings, device="cpu")
+    rgb, depth = (each.to(gpu if of == "gpu" else CPU) for each in (sample.rgb, depth))
+    found = upsample_surface(rgb, depth, sample.camera, method=method, settings=settings, device=str(gpu))
+    assert found.depth.device == depth.device
+    for mine, other in zip(found[:3], expected[:3], strict=True):
+        if other is not None:
+            torch.testing.assert_close(mine.cpu(), other, rtol=2e-2, atol=1e-3, equal_nan=True)
+
+
+KINDS: dict[str, Callable[[Tensor, Tensor], Any]] = {
+    "sum": lambda there, here: there + here,
+    "comparison": lambda there, here: there > here,
+    "matrix product": lambda there, here: there @ here,
+    "convolution": lambda there, here: nn.functional.conv2d(there[None, None], here[None, None, :3, :3]),
+    "layer": lambda there, _: nn.Linear(8, 8)(there),
+    "choice": lambda there, here: torch.where(there > 0, there, here),
+    "parts": lambda there, here: torch.cat((there, here)),
+    "stack of numbers": lambda there, here: torch.stack((there.sum(), here.sum())),
+    "values at indices": lambda there, here: there.index_add(0, torch.arange(8, device=there.device), here),
+    "indices": lambda there, here: here[there > 0],
+    "assignment to indices": lambda there, here: there.masked_scatter_(there > 0, here),
+    "NumPy": lambda there, _: there.numpy(),
+    "NumPy's functions": lambda there, _: np.sqrt(there),
+    "generator": lambda there, _: torch.randn(3, device=there.device, generator=torch.Generator()),
+    "draws in place": lambda there, _: there.normal_(generator=torch.Generator()),
+}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_what_is_left_on_the_cpu_is_an_error(kind: str, gpu: torch.device) -> None:
+    here = torch.rand(8, 8)
+    there = here.to(gpu)
+    with pytest.raises((RuntimeError, TypeError), match=r"device|cuda|numpy"):
+        KINDS[kind](there, here)
+
+
+def test_what_cuda_allows_is_no_error(gpu: torch.device) -> None:
+    there = torch.arange(6.0, device=gpu)
+    assert (there + torch.tensor(1.0))[torch.tensor([0, 1])][[1]].item() == 2
+    assert bool((there > 4).any())
+    there[torch.tensor([1])] = 7
+    there[2:3].copy_(torch.tensor([9.0]))
+    assert there.tolist() == [0, 7, 9, 3, 4, 5]
+    assert (there.cpu().numpy() == [0, 7, 9, 3, 4, 5]).all()
+
+
+def test_auto_is_the_device_of_the_environment(monkeypatch: pytest.MonkeyPatch, gpu: torch.device) -> None:
+    monkeypatch.setenv("DSR_DEVICE", "cpu")
+    assert pick_device("auto") == CPU
+    monkeypatch.setenv("DSR_DEVICE", str(gpu))
+    assert pick_device("auto") == gpu
+    assert pick_device("cpu") == CPU
+>>>>>>> devices

@@ -75,6 +75,7 @@ class LPIPS(nn.Module):
         self.register_buffer("mean", torch.tensor(_MEAN).view(1, 3, 1, 1))
         self.register_buffer("std", torch.tensor(_STD).view(1, 3, 1, 1))
         self.requires_grad_(requires_grad=False)
+        self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # torch's stubs
         self.eval()
 
     def features(self, images: Tensor) -> list[Tensor]:
@@ -108,7 +109,9 @@ class LPIPS(nn.Module):
             came = tuple(first.shape[-2:])
             raise ValueError(f"LPIPS: expected images of at least {MIN_SIZE} x {MIN_SIZE} pixels, got {came}")
         total = first.new_zeros(len(first))
-        for level, (a, b) in enumerate(zip(self.features(first), self.features(second), strict=True)):
+        images = torch.cat((first, second)).contiguous(memory_format=torch.channels_last)
+        for level, features in enumerate(self.features(images)):
+            a, b = features.chunk(2)
             distance = ((a - b).square() * getattr(self, f"head{level}")).sum(dim=1)  # (B, h, w)
             if mask is None:
                 total = total + distance.mean(dim=(-2, -1))

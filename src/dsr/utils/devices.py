@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+
 import torch
 
 from dsr.utils.builder import ConfigError
@@ -22,12 +24,14 @@ def inference_precision(device: torch.device) -> str:
 
 
 def pick_device(name: str) -> torch.device:
-    """Return the device of that name; ``auto`` is the first GPU where there is one, else the CPU.
+    """Return the device of that name; ``auto`` is $DSR_DEVICE, else the first GPU where there is one, else the CPU.
 
     Raises:
         ConfigError: there is no such device here.
 
     """
+    if name == "auto":
+        name = os.environ.get("DSR_DEVICE") or "auto"
     if name == "auto":
         return torch.device("cuda" if torch.cuda.is_available() else "cpu")
     try:
