@@ -31,12 +31,9 @@ _NOT_IDENTITY = (
     "resume",
     "run",
     "trust",
-<<<<<<< HEAD
     "workers",
     "threads",
-=======
     "logger",
->>>>>>> ddp
 )  # weights count by their content
 PREDICTING_CODE = (
     "sample.py", "degradation", "geometry", "metrics", "synthetic", "methods", "data", "training", "inference",
