@@ -51,6 +51,8 @@ SHORT: dict[str, dict[str, Any]] = {
     "srfs": {"iterations": 1},
     "anisotropic_diffusion": {"steps": 20},
 }
+SLOW = {"eg", "srfs", "dip", "dip_v", "dip_v_warm"}
+METHODS = [pytest.param(name, marks=[pytest.mark.slow] if name in SLOW else []) for name in list_methods()]
 CPU = torch.device("cpu")
 TRUNK = ((3, 64, 11), (64, 192, 5), (192, 384, 3), (384, 256, 3), (256, 256, 3))
 
@@ -92,13 +94,12 @@ def _build(name: str, device: torch.device, folder: Path) -> Any:
     return build_method(node, 4, **given)
 
 
-@pytest.mark.parametrize("name", list_methods())
+@pytest.mark.parametrize("name", METHODS)
 def test_method_predicts_on_a_gpu_what_it_predicts_on_the_cpu(name: str, tmp_path: Path, gpu: torch.device) -> None:
     sample = _sample(96 if name == "eg" else 48)
     expected = _build(name, CPU, tmp_path)(sample)
     method = _build(name, gpu, tmp_path)
-    slow = name in {"eg", "srfs"} or "steps" in SHORT.get(name, {})
-    for given in (_on(sample, gpu),) if slow else (sample, _on(sample, gpu)):
+    for given in (_on(sample, gpu),) if name in SLOW else (sample, _on(sample, gpu)):
         found = method(given)
         assert found.device == given.depth_lr.device
         torch.testing.assert_close(found.cpu(), expected, rtol=1e-3, atol=1e-3, equal_nan=True)
