@@ -27,7 +27,7 @@ from dsr.metrics.catalogue import Metric, catalogue, score_image
 from dsr.metrics.lpips import load_lpips
 from dsr.metrics.metric import WORST
 
-SCENES, SCALES = ("lucy", "plant"), (4, 8)
+SCENES = ("lucy", "plant")
 METRICS = ("RMSE_v", "DSSIM_v", "BadPix_v_5", "Bumpiness_d", "LPIPS_v", "RMSE_d")
 
 
@@ -48,13 +48,15 @@ def scores(
         return {row.metric: row.value for row in rows if row.variant in ("", WORST)}
 
 
-def table(shared: Path, methods: list[str], files: dict[str, Path], ensemble: int | None = None) -> pd.DataFrame:
+def table(
+    shared: Path, methods: list[str], scales: list[int], files: dict[str, Path], ensemble: int | None = None
+) -> pd.DataFrame:
     """Return the ratios: a row per method, scale and scene, a column per metric."""
     expected = json.loads((shared / "expected" / "metrics.json").read_text())
     metrics = catalogue(load_lpips(shared / "weights" / "alexnet_imagenet_features.pth"))
     rows = []
     for method in methods:
-        for scale in SCALES:
+        for scale in scales:
             name = f"{method}_x{scale}"
             weights = files.get(name) or packaged_weights(name)
             for scene in SCENES if weights is not None else ():
@@ -73,6 +75,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--shared", type=Path, default=Path(os.environ.get("DSR_SHARED", "../shared")))
     parser.add_argument("--methods", default="msg_v,facets,msg")
+    parser.add_argument("--scales", type=int, nargs="+", default=[4, 8])
     parser.add_argument("--weights", type=Path, nargs="*", default=[], help="files to take instead of packaged ones")
     parser.add_argument("--ensemble", type=int, help="passes to average; that of eval.py unless given")
     parser.add_argument("--csv", type=Path, help="where to write the table to")
@@ -82,7 +85,8 @@ def main() -> None:
         return
     heads = {path: read_header(path) for path in arguments.weights}
     files = {f"{head['model']}_x{head['arguments']['scale']}": path for path, head in heads.items()}
-    ratios = table(arguments.shared, arguments.methods.split(","), files, arguments.ensemble)
+    methods = arguments.methods.split(",")
+    ratios = table(arguments.shared, methods, arguments.scales, files, arguments.ensemble)
     if arguments.csv:
         ratios.to_csv(arguments.csv, index=False)
     for method, group in ratios.groupby("method", sort=False):

@@ -779,23 +779,6 @@ def test_losses_and_degradations_that_do_not_fit_are_refused(smoke, within, argu
     assert message in errors[0]
 
 
-def test_two_devices_train_as_one_with_twice_the_batch(tmp_path, within, environment):
-    arguments = (*SMOKE, "precision=float32", "trainer.validate_every=2")
-    done = subprocess.run(
-        [sys.executable, str(REPOSITORY / "train.py"), *arguments, "trainer.devices=2", "output_dir=two"],
-        cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=120, check=False,
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr
-    assert done.stdout.count("weights: ") == 1
-    assert within(*arguments, "trainer.batch=4", "output_dir=one")[0] == 0
-    one, two = (load_file(tmp_path / name / "weights.safetensors") for name in ("one", "two"))
-    for name in one:
-        torch.testing.assert_close(one[name], two[name], rtol=0, atol=2e-4)
-    assert validation_of(tmp_path / "two")["val", "RMSE_v"] == pytest.approx(
-        validation_of(tmp_path / "one")["val", "RMSE_v"], rel=1e-2
-    )
-
-
 def test_table_of_runs_has_the_settings_and_the_scores(smoke):
     assert not any("epoch" in tag for tag in events_of(smoke[1]).Tags()["scalars"])
     hparams = yaml.safe_load((smoke[1] / "tensorboard" / "hparams.yaml").read_text())

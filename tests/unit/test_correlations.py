@@ -120,7 +120,7 @@ def test_missing_lpips_leaves_the_rest_and_one_line_says_so(tmp_path, monkeypatc
     text = write_correlations(tmp_path, results)[-1].read_text(encoding="utf-8")
     assert "There is no LPIPS_v in these 5 results" in text
     drawn = {}
-    monkeypatch.setattr(correlation_figure, "write_figure", lambda path, figure, _: drawn.update({path.name: figure}))
+    monkeypatch.setattr(correlation_figure, "write_figure", lambda path, figure, *_: drawn.update({path.name: figure}))
     save_scatter_matrix(tmp_path, results)
     assert list(drawn) == ["scatter_matrix.pdf", "scatter_matrix.png"]
     assert "no LPIPS_v in these results" in drawn["scatter_matrix.pdf"].texts[0].get_text()

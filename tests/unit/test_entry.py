@@ -36,7 +36,7 @@ def command(monkeypatch, tmp_path, capfd):
 
 SETTINGS = (
     "dataset, downsampling, noise, metrics, scale, device, precision, seed, output_dir, overwrite, holes, "
-    "method, weights, run, trust"
+    "method, weights, run, trust, workers, threads"
 )
 DATASETS = (
     "arkitscenes, ddrnet, diml, folder, icl, lu, middlebury, middlebury2001, middlebury2003, middlebury2005, "

@@ -105,6 +105,8 @@ def share(
         if meanwhile is not None:
             meanwhile()
         with _threads(workers.threads):
+            if torch.get_num_threads() > 1:
+                _threaded.append(True)
             attempts = _attempts(scenes, claims, name, ready)
             for scene, attempt in progress.track(attempts, name, len(scenes), label=_scene_of):
                 if isinstance(attempt, Claim):
@@ -124,7 +126,9 @@ def share(
             return work(scene, Progress()) if result is None else result
 
     count = min(workers.count, len(scenes))
-    with Forks(count, attempt_once, lost, progress.say, lambda: _set_threads(workers.threads)) as forks:
+    # The workers inherit the number of threads: setting it in a forked process can wait for ever for a thread of torch
+    # that only its parent has.
+    with _threads(workers.threads), Forks(count, attempt_once, lost, progress.say) as forks:
         results = forks.results(scenes, meanwhile)
         for scene, result in progress.track(results, name, len(scenes), label=_scene_of):
             found[scene] = result
@@ -167,20 +171,13 @@ def _free_memory() -> int:
         return 1 << 40
 
 
-def _set_threads(count: int | None) -> None:
-    """Set the number of threads of this process; None leaves it."""
-    if count is not None:
-        torch.set_num_threads(count)
-        cv2.setNumThreads(count)
-
-
 @contextlib.contextmanager
 def _threads(count: int | None) -> Iterator[None]:
     """Set the number of threads of this process within the context; None leaves it."""
     before = torch.get_num_threads(), cv2.getNumThreads()
-    _set_threads(count)
-    if torch.get_num_threads() > 1:
-        _threaded.append(True)
+    if count is not None:
+        torch.set_num_threads(count)
+        cv2.setNumThreads(count)
     try:
         yield
     finally:

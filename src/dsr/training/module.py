@@ -109,8 +109,10 @@ class SuperResolution(lightning.LightningModule):
         self.metrics[dataloader_idx].update(  # type: ignore[operator]
             SurfacePair(depth, batch["depth"], batch["rays"], unit=Unit(**batch["unit"]), image_dtype=torch.float32)
         )
+        if self._trainer is None or not self._trainer.loggers:
+            return
         number = index * self.trainer.world_size + self.trainer.global_rank  # of the scene
-        if self.trainer.loggers and number < _RENDERED_SCENES:
+        if number < _RENDERED_SCENES:
             depth_lr = to_depth(batch["disparity_lr"].to(batch["depth"].dtype), batch)
             picture = comparison(depth, batch["depth"], batch["rays"], batch["rgb"], depth_lr)
             self._pictures[f"renderings/{self.sets[dataloader_idx]}_{number}"] = picture

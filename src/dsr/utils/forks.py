@@ -39,7 +39,6 @@ class Forks(Generic[_T, _R]):
             has to be tried again. What it raises is raised here and ends the work.
         lost: function of an item that returns its result after it has cost two workers their lives.
         say: shows a line of text.
-        prepare: function that each worker calls once; None for none.
 
     """
 
@@ -49,9 +48,8 @@ class Forks(Generic[_T, _R]):
         work: Callable[[_T], _R | None],
         lost: Callable[[_T], _R],
         say: Callable[[str], None],
-        prepare: Callable[[], None] | None = None,
     ) -> None:
-        self._work, self._lost, self._say, self._prepare = work, lost, say, prepare
+        self._work, self._lost, self._say = work, lost, say
         self._busy: dict[Connection, _T | None] = {}
         self._processes: dict[Connection, BaseProcess] = {}
         self._count = count
@@ -141,7 +139,7 @@ class Forks(Generic[_T, _R]):
         """Start a worker."""
         context = multiprocessing.get_context("fork")
         here, there = context.Pipe()
-        process = context.Process(target=_serve, args=(there, os.getpid(), self._work, self._prepare), daemon=True)
+        process = context.Process(target=_serve, args=(there, os.getpid(), self._work), daemon=True)
         with interruption.starting_workers(), warnings.catch_warnings():
             warnings.simplefilter("ignore", DeprecationWarning)  # of forking with threads: those of this process sleep
             process.start()
@@ -167,11 +165,9 @@ class Forks(Generic[_T, _R]):
         self._processes, self._busy = {}, {}
 
 
-def _serve(connection: Connection, parent: int, work: Callable[[Any], Any], prepare: Callable[[], None] | None) -> None:
+def _serve(connection: Connection, parent: int, work: Callable[[Any], Any]) -> None:
     """Work on items in a worker, until it is terminated."""
     interruption.end_with(parent)
-    if prepare is not None:
-        prepare()
     while True:
         item = connection.recv()
         try:
