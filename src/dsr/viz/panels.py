@@ -84,7 +84,7 @@ def save_picture(
 
 def write_figure(path: Path, figure: Figure, dpi: int, metadata: Mapping[str, Any] | None = None) -> None:
     """Write a figure atomically, in the format given by the suffix."""
-    options = {"pil_kwargs": {"compress_level": _PNG_LEVEL}} if path.suffix == ".png" else {}
+    options: dict[str, Any] = {"pil_kwargs": {"compress_level": _PNG_LEVEL}} if path.suffix == ".png" else {}
     with replacing(path) as temporary, warnings.catch_warnings():
         warnings.filterwarnings("ignore", "Glyph .* missing from font")  # a name may have letters that the font lacks
         figure.savefig(temporary, dpi=dpi, metadata=metadata, **options)
