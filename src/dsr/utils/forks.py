@@ -24,6 +24,8 @@ _T = TypeVar("_T")
 _R = TypeVar("_R")
 _BETWEEN_TRIES = 0.3
 """Seconds until an item is tried again that somebody else is working on."""
+_SECONDS_TO_END = 2.0
+"""Seconds in which a worker may end by itself."""
 
 
 class _Died:
@@ -160,6 +162,8 @@ class Forks(Generic[_T, _R]):
         for process in self._processes.values():
             process.terminate()
         for connection, process in self._processes.items():
+            process.join(_SECONDS_TO_END)
+            process.kill()  # whatever kept it from ending
             process.join()
             connection.close()
         self._processes, self._busy = {}, {}
