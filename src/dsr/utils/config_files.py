@@ -36,6 +36,13 @@ def config_directories(more: Sequence[Path] = ()) -> tuple[Path, ...]:
         for path in directory.glob("*/*.yaml"):
             if path.exists() and not path.is_file():  # a pipe would be waited for
                 raise ValueError(f"{path}: expected a file, got something else")
+            try:
+                with path.open("rb") as file:
+                    file.read(1)
+            except FileNotFoundError:  # a link to nowhere
+                continue
+            except OSError as error:  # whose own message does not always name the file
+                raise ValueError(f"{path}: expected a readable file, got {error.strerror}") from error
     return (own, *more)
 
 
