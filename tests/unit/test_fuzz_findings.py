@@ -15,6 +15,7 @@ import scipy.io
 
 from dsr.data.download.unpack import unpack
 from dsr.data.formats.tofmark import read_matrices
+from dsr.inference import MethodChoice
 from dsr.io.captures.arkitscenes import find_arkitscenes
 from dsr.io.captures.stray import find_stray
 from dsr.io.photos import read_photo
@@ -93,6 +94,27 @@ def test_number_of_5000_digits_in_the_file_of_a_method_is_refused(tmp_path):
     with pytest.raises(ConfigError, match=r"bad\.yaml: ") as caught:
         read_method("bad", 4, directories=[tmp_path])
     assert len(str(caught.value)) < 1000
+
+
+def test_method_whose_aliases_stand_for_a_billion_values_is_refused_at_once(tmp_path):
+    (tmp_path / "method").mkdir()
+    levels = [f"a{n}: &a{n} [{', '.join([f'*a{n - 1}'] * 10)}]" for n in range(1, 10)]
+    (tmp_path / "method" / "bad.yaml").write_text("\n".join(["a0: &a0 [1]", *levels]))
+    with pytest.raises(ValueError, match=r"bad\.yaml: expected at most 100000 values, got more by its aliases"):
+        read_method("bad", 4, directories=[tmp_path])
+
+
+def test_aliases_of_a_few_values_are_read(tmp_path):
+    (tmp_path / "method").mkdir()
+    (tmp_path / "method" / "good.yaml").write_text("name: good\nfirst: &a [1, 2]\nsecond: *a\n")
+    assert read_method("good", 4, directories=[tmp_path])["second"] == [1, 2]
+
+
+def test_wrong_value_in_the_file_of_a_method_is_told_with_the_method(tmp_path):
+    (tmp_path / "method").mkdir()
+    (tmp_path / "method" / "mine.yaml").write_text("defaults: [tgv]\nname: mine\nsharpness: sharp\n")
+    with pytest.raises(ValueError, match=r"^method=mine: sharpness: expected a number.*, got 'sharp'$"):
+        MethodChoice("mine", {"iterations": 5}, (tmp_path,)).build(4)
 
 
 @pytest.mark.parametrize("shape", ["(9223372036854775807, 2)", "(-5, 4)", "(4294967296, 4294967296)", "(1e3,)", "(("])

@@ -75,7 +75,9 @@ class MethodChoice:
         try:
             return build_method(node, scale, directories=self.directories, **given)
         except ConfigError as error:
-            raise ValueError(str(error).removeprefix("method.")) from error
+            text = str(error).removeprefix("method.")
+            set_here = text.partition(":")[0] in self.settings
+            raise ValueError(text if set_here else f"method={self.name}: {text}") from error
 
     def plan(self, size: tuple[int, int], size_lr: tuple[int, int], scale: int | None) -> Plan:
         """Return the plan for a photo and a depth map of these heights and widths."""
@@ -86,8 +88,8 @@ def check_settings(choice: MethodChoice) -> None:
     """Check that a method accepts the settings.
 
     Raises:
-        ValueError: a setting is unknown, of another type, or the method rejects it; the message begins with its
-            name and a colon.
+        ValueError: a setting is unknown, of another type, or the method rejects it: the message begins with its
+            name and a colon; or the method's own file has such a value: it begins with ``method=NAME:``.
 
     """
     choice.build(next(iter(read_ability(choice.name, choice.directories, choice.settings).steps), USUAL_SCALE))

@@ -5,7 +5,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
+import yaml
+
+from dsr.utils.limits import TooLargeError, read_limited
+
 _PACKAGE = Path(__file__).resolve().parents[1]
+_LARGEST = 2**20
+"""Bytes of a file of the user's."""
+_MOST_VALUES = 100_000
+"""Values of a file of the user's, where each alias counts as what it stands for."""
 _PLACES = (_PACKAGE / "conf", _PACKAGE.parents[1] / "conf")
 """Where the project's own files are: in an installed package, and in a checkout."""
 
@@ -37,8 +45,7 @@ def config_directories(more: Sequence[Path] = ()) -> tuple[Path, ...]:
             if path.exists() and not path.is_file():  # a pipe would be waited for
                 raise ValueError(f"{path}: expected a file, got something else")
             try:
-                with path.open("rb") as file:
-                    file.read(1)
+                _expect_moderate(path)
             except FileNotFoundError:  # a link to nowhere
                 continue
             except OSError as error:  # whose own message does not always name the file
@@ -55,3 +62,35 @@ def list_groups(directories: Sequence[Path]) -> list[str]:
     """Return the sorted names of the groups in all directories, without those of Hydra's own settings."""
     names = {path.name for directory in directories for path in directory.iterdir() if path.is_dir()}
     return sorted(names - {"hydra"})
+
+
+def _expect_moderate(path: Path) -> None:
+    """Refuse a file that is huge, or a short one whose aliases stand for something huge.
+
+    Raises:
+        OSError: it cannot be read.
+        ValueError: it is too large.
+
+    """
+    try:
+        content = read_limited(path, _LARGEST)
+        if b"*" not in content:
+            return
+        values = _count(yaml.compose(content, Loader=yaml.SafeLoader), {})
+    except TooLargeError as error:
+        raise ValueError(str(error)) from error
+    except (ValueError, RecursionError, yaml.YAMLError):  # told where it is composed
+        return
+    if values > _MOST_VALUES:
+        raise ValueError(f"{path}: expected at most {_MOST_VALUES} values, got more by its aliases")
+
+
+def _count(node: yaml.Node | None, counted: dict[int, int]) -> int:
+    """Return the number of values of a node, each node counted once but added wherever it stands."""
+    if not isinstance(node, yaml.CollectionNode):
+        return 1
+    if id(node) not in counted:
+        counted[id(node)] = 1
+        parts = [part for pair in node.value for part in (pair if isinstance(pair, tuple) else (pair,))]
+        counted[id(node)] += sum(_count(part, counted) for part in parts)
+    return counted[id(node)]
