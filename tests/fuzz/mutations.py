@@ -240,7 +240,7 @@ def _change_hdf5(random: Random, path: Path) -> str:
             opened[name] = h5py.SoftLink("/" + name)
         elif kind == 4:
             opened[name] = np.array([b"text"] * 3, dtype=h5py.string_dtype())
-        elif kind == 5:
+        elif kind == 5 and dtype.kind in "fiu":  # it may be text of an earlier change
             shape = tuple(min(each, 2000) for each in shape)  # it may be that of a data set of gigabytes from above
             opened.create_dataset(name, data=np.full(shape, random.choice((0, 1e19, -1, 250))).astype(dtype))
         elif kind == 6:

@@ -67,14 +67,24 @@ def mutate_yaml(random: Random, text: str, canary: Path) -> bytes:
     return yaml.safe_dump(_changed(random, content, canary), sort_keys=False).encode(errors="surrogatepass")
 
 
-def _places(content: Any, depth: int = 0) -> list[tuple[Any, Any]]:
-    """Return the containers in a content with each of their keys; long lists count with a few."""
-    keys = (
-        list(content) if isinstance(content, dict) else list(range(len(content))) if isinstance(content, list) else []
-    )
-    keys = keys if len(keys) < 40 else [*keys[:10], *keys[-5:]]
-    found = [(content, key) for key in keys]
-    return found + [each for key in keys for each in (_places(content[key], depth + 1) if depth < 12 else [])]
+def _places(content: Any) -> list[tuple[Any, Any]]:
+    """Return the containers in a content with each of their keys; long lists count with a few.
+
+    A container that stands in several places, as by the aliases of a bomb from an earlier change, is counted once.
+    """
+    found: list[tuple[Any, Any]] = []
+    seen: set[int] = set()
+    containers = [(content, 0)]
+    while containers:
+        each, depth = containers.pop(0)
+        if id(each) in seen or depth > 12 or not isinstance(each, dict | list):
+            continue
+        seen.add(id(each))
+        keys = list(each) if isinstance(each, dict) else list(range(len(each)))
+        keys = keys if len(keys) < 40 else [*keys[:10], *keys[-5:]]
+        found += [(each, key) for key in keys]
+        containers += [(each[key], depth + 1) for key in keys]
+    return found
 
 
 def _replaced(random: Random, content: Any, value: Any) -> Any:

@@ -41,6 +41,7 @@ from dsr.training.module import SuperResolution
 from dsr.training.objective import Objective, SurfaceObjective
 from dsr.training.patches import Patches
 from dsr.training.settings import PatchSettings, Schedule
+from dsr.utils.builder import ConfigError
 from dsr.utils.devices import pick_device
 
 SHORT: dict[str, dict[str, Any]] = {
@@ -268,3 +269,9 @@ def test_auto_is_the_device_of_the_environment(monkeypatch: pytest.MonkeyPatch, 
     monkeypatch.setenv("DSR_DEVICE", str(gpu))
     assert pick_device("auto") == gpu
     assert pick_device("cpu") == CPU
+
+
+def test_unknown_device_of_the_environment_is_told_with_the_variable(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("DSR_DEVICE", "abacus")
+    with pytest.raises(ConfigError, match=r"^\$DSR_DEVICE: expected auto, .*, got 'abacus'"):
+        pick_device("auto")

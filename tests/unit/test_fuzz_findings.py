@@ -1,6 +1,7 @@
 """Files that the fuzz campaign found to end in a traceback, in gigabytes or in no answer; each once more, quickly."""
 
 import io
+import os
 import struct
 import tracemalloc
 import zipfile
@@ -12,18 +13,25 @@ import cv2
 import numpy as np
 import pytest
 import scipy.io
+import torch
 
+from dsr.app.entry import run_command
+from dsr.app.trust import read_plain_yaml
 from dsr.data.download.unpack import unpack
 from dsr.data.formats.tofmark import read_matrices
 from dsr.inference import MethodChoice
 from dsr.io.captures.arkitscenes import find_arkitscenes
 from dsr.io.captures.stray import find_stray
+from dsr.io.input_files import read_input, write_input
 from dsr.io.photos import read_photo
+from dsr.methods.networks.weight_files import is_dsr_weights
 from dsr.methods.registry import read_method
+from dsr.report.user_study import read_study
 from dsr.user_study.answers import files_of
 from dsr.utils.builder import ConfigError
 from dsr.utils.files import open_array
 from dsr.utils.picture_headers import picture_size
+from dsr.viewer.page import is_view
 
 
 def png_chunk(kind, content, length=None):
@@ -139,3 +147,36 @@ def test_intensities_beyond_float32_in_a_file_of_tofmark_are_refused_in_one_line
         read_matrices(path)
     assert "\n" not in str(caught.value)
     assert not recwarn.list
+
+
+@pytest.mark.parametrize("read", [open_array, read_study, is_dsr_weights, is_view], ids=lambda each: each.__name__)
+def test_pipe_that_nobody_writes_to_is_not_waited_for(tmp_path, read):
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises((ValueError, OSError), match="pipe"):
+        read(tmp_path / "pipe")
+
+
+def test_configuration_of_10000_nested_lists_is_refused_at_once(tmp_path):
+    path = tmp_path / "config.yaml"
+    path.write_text("model: " + "[" * 10_000 + "]" * 10_000)
+    with pytest.raises(ConfigError, match=r"config\.yaml: line 1: expected plain values, got nested ones"):
+        read_plain_yaml(path)
+
+
+@pytest.mark.parametrize("content", ["3.5", "name: tgv\nsharpness: !!set {a, b}\n"])
+def test_unusable_file_of_a_method_is_named_by_the_commands(tmp_path, capfd, content):
+    (tmp_path / "method").mkdir()
+    (tmp_path / "method" / "mine.yaml").write_text(content)
+    with pytest.raises(SystemExit) as ended:
+        run_command("eval", Mock(), ["--config-dir", str(tmp_path), "method=mine"])
+    assert ended.value.code == 2
+    assert f"{tmp_path}/method/mine.yaml: expected a readable YAML file" in capfd.readouterr().err
+
+
+@pytest.mark.parametrize("depth", [0.0, 4e-41, 1e12])
+def test_stored_input_with_a_depth_out_of_range_is_refused(tmp_path, depth):
+    depth_lr = torch.full((1, 4, 4), 2.0)
+    depth_lr[0, 1, 2] = depth
+    write_input(tmp_path / "input.npz", torch.rand(3, 16, 16), depth_lr)
+    with pytest.raises(ValueError, match=r"input\.npz: expected depths of 1e-06 to 1e\+09 m"):
+        read_input(tmp_path / "input.npz")

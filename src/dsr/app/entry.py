@@ -99,13 +99,14 @@ def run_command(name: str, command: Callable[[DictConfig], Any], arguments: Sequ
         except KeyboardInterrupt as interrupted:
             sys.exit(interruption.stop(str(interrupted)))
         except (HydraException, OmegaConfBaseException) as error:
-            fail(explain(error, name, arguments, directories))
-        except (ConfigError, OSError, FullDiskError) as error:  # of a launcher, or of Hydra's own files
+            fail(explain(error, name, arguments, directories) or explain_damage(error, directories))
+        except (ConfigError, FullDiskError) as error:  # of a launcher
             fail(one_line(error))
-        except (YAMLError, ValueError, RecursionError) as error:
-            if begun:  # of the command
+        except (OSError, YAMLError, ValueError, RecursionError) as error:
+            if begun and not isinstance(error, OSError):  # of the command
                 raise
-            fail(explain_damage(error, directories))
+            named = begun or getattr(error, "filename", None) is not None
+            fail(one_line(error) if named else explain_damage(error, directories))
         finally:
             summary = failure_summary(jobs)
             for line in summary:

@@ -24,6 +24,8 @@ from dsr.utils.limits import TooLargeError, read_limited
 
 _LARGEST = 1 << 18
 """Largest size of a run's configuration in bytes."""
+_DEEPEST = 30
+"""Largest depth of nested keys and lists."""
 _TARGETS = ("target", "_target_", "network")
 """Keys whose value is imported."""
 _EXTRA = ("metrics", "extra")
@@ -86,8 +88,12 @@ def read_plain_yaml(path: Path) -> dict[str, Any]:
     except (OSError, ValueError) as error:
         raise ConfigError(f"{path}: expected a readable YAML file, got {type(error).__name__}") from error
     try:
+        depth = 0
         for event in yaml.parse(text, Loader=yaml.SafeLoader):
             _expect_plain(path, event)
+            depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
+            if depth > _DEEPEST:  # OmegaConf needs a long time for them
+                raise ConfigError(f"{path}: line {event.start_mark.line + 1}: expected plain values, got nested ones")
         content = OmegaConf.to_container(OmegaConf.create(text), resolve=False) if text.strip() else None
     except ConfigError:
         raise

@@ -5,6 +5,7 @@ Only files are read: ``scores.csv``, ``summary.json``, ``versions.json``, predic
 
 from __future__ import annotations
 
+import io
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -17,7 +18,7 @@ from dsr.evaluation.results import Results, Run, method_key, method_settings, pr
 from dsr.evaluation.store import prediction_path, sample_path
 from dsr.metrics.formats import MetricFormat
 from dsr.utils.files import array_headers
-from dsr.utils.limits import MOST_TABLE, TooLargeError, expect_bytes, read_limited
+from dsr.utils.limits import MOST_TABLE, TooLargeError, read_limited
 from dsr.utils.ratios import as_ratio
 from dsr.utils.tables import unguarded
 from dsr.utils.validation import Number, Whole, describe
@@ -176,9 +177,8 @@ def _read_scores(path: Path) -> pd.DataFrame:
     """Return a run's ``scores.csv``; an empty variant is ""."""
     try:
         missing = {name: [""] for name in _NUMBER_COLUMNS}
-        expect_bytes(path, path.stat().st_size, MOST_TABLE)
         scores = pd.read_csv(
-            path,
+            io.BytesIO(read_limited(path, MOST_TABLE)),
             usecols=[*_TEXT_COLUMNS, *_NUMBER_COLUMNS],
             dtype=dict.fromkeys(_TEXT_COLUMNS, str),
             keep_default_na=False,

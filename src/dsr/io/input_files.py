@@ -10,9 +10,11 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import torch
 from torch import Tensor
 
 from dsr.data.formats.decoding import decode_pixels
+from dsr.sample import expect_distances
 from dsr.utils.files import array_headers, read_arrays, replacing
 
 INPUT = "input.npz"
@@ -44,7 +46,7 @@ def read_input(path: Path) -> tuple[np.ndarray, np.ndarray]:
 
     Raises:
         FileNotFoundError: the file does not exist.
-        ValueError: the file is damaged, or something else.
+        ValueError: the file is damaged, or something else, or a depth is out of range.
 
     """
     headers = array_headers(path)
@@ -56,7 +58,9 @@ def read_input(path: Path) -> tuple[np.ndarray, np.ndarray]:
     if min(height, width) < 2 or height * width > _MOST_PIXELS or length > _MOST_BYTES:
         raise ValueError(f"{path}: expected a depth map of 2 x 2 pixels or more and a photo, got {headers}")
     arrays = read_arrays(path)
-    return _decode(path, arrays["photo"]), arrays["depth_lr"]
+    depth = arrays["depth_lr"]
+    expect_distances(str(path), torch.from_numpy(depth[np.isfinite(depth)]))
+    return _decode(path, arrays["photo"]), np.where(np.isfinite(depth), depth, np.float32(np.nan))
 
 
 def to_jpeg(pixels: np.ndarray, longest: int, quality: int) -> bytes:

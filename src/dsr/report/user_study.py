@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import pandas as pd
 
-from dsr.utils.limits import MOST_TABLE, expect_bytes
+from dsr.utils.limits import MOST_TABLE, read_limited
 from dsr.utils.tables import unguarded
 
 USER_COLUMNS = {"user_first": "User 1st", "user_second": "User 2nd", "user_top2": "User Top 2"}
@@ -44,10 +45,12 @@ def read_study(path: Path) -> pd.DataFrame:
 
     """
     try:
-        expect_bytes(path, path.stat().st_size, MOST_TABLE)
-        texts = dict.fromkeys(_TEXTS, str)
         study = pd.read_csv(
-            path, dtype=texts, keep_default_na=False, na_values=[""], usecols=lambda name: name in _COLUMNS
+            io.BytesIO(read_limited(path, MOST_TABLE)),
+            dtype=dict.fromkeys(_TEXTS, str),
+            keep_default_na=False,
+            na_values=[""],
+            usecols=lambda name: name in _COLUMNS,
         )
     except (OSError, ValueError) as error:  # pandas raises subclasses of ValueError for damaged files
         raise ValueError(f"{path}: expected the table of dsr study collect, got {type(error).__name__}") from error

@@ -30,13 +30,14 @@ def pick_device(name: str) -> torch.device:
         ConfigError: there is no such device here.
 
     """
-    if name == "auto":
-        name = os.environ.get("DSR_DEVICE") or "auto"
+    given_by = "device"
+    if name == "auto" and os.environ.get("DSR_DEVICE"):
+        given_by, name = "$DSR_DEVICE", os.environ["DSR_DEVICE"]
     if name == "auto":
         return torch.device("cuda" if torch.cuda.is_available() else "cpu")
     try:
         device = torch.device(name)
         torch.zeros(1, device=device).item()
     except (RuntimeError, AssertionError) as error:  # torch asserts that it was built for CUDA
-        raise ConfigError(f"device: expected auto, cpu or a device of this machine, got {name!r}") from error
+        raise ConfigError(f"{given_by}: expected auto, cpu or a device of this machine, got {name!r}") from error
     return device

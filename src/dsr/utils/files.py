@@ -144,7 +144,7 @@ def open_array(path: Path) -> np.ndarray:
 
     """
     try:
-        with np.errstate(over="ignore"):  # of sizes that no file has, which are refused
+        with opened(path), np.errstate(over="ignore"):  # of sizes that no file has, which are refused
             array: np.ndarray = np.lib.format.open_memmap(path, mode="r")
     except FileNotFoundError:
         raise

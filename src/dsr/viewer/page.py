@@ -17,6 +17,7 @@ import numpy as np
 
 from dsr.geometry.shading import VIEWING_LIGHT, VIEWING_TONES
 from dsr.utils.files import write_text
+from dsr.utils.limits import opened
 from dsr.viewer.surfaces import Packed
 
 MARK = '<meta name="generator" content="dsr view">'
@@ -66,7 +67,7 @@ def save_view(path: Path, results: Sequence[Packed], *, title: str, notes: Seque
 
 def is_view(path: Path) -> bool:
     """Return whether a file is a page of this command."""
-    with path.open("rb") as file:
+    with opened(path) as file:
         return MARK.encode() in file.read(1024)
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 from dsr.data.download.checksums import Checksums, Entry, lock_directory, sha256_of
 from dsr.data.download.collection import Collection, Item
 from dsr.data.download.transfer import is_page
+from dsr.utils.limits import opened
 from dsr.utils.progress import Progress
 
 _BEGINNINGS: Mapping[str, tuple[bytes, ...]] = {
@@ -145,7 +146,7 @@ def expect_kind(path: Path, suffix: str, source: str) -> None:
         ValueError: it begins otherwise.
 
     """
-    with path.open("rb") as file:
+    with opened(path) as file:
         beginning = file.read(512)
     expected = _BEGINNINGS.get(suffix.lower())
     if is_page(beginning):

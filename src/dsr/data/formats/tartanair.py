@@ -18,6 +18,7 @@ from dsr.data.formats.files import read_map
 from dsr.data.formats.shared import expect_size, name_of, read_picture, to_depth, walk
 from dsr.geometry.camera import Camera
 from dsr.sample import Scene
+from dsr.utils.limits import opened
 
 CAMERA = Camera(640, 480, 320.0, 320.0, 320.0, 240.0)
 FARTHEST = 1000.0
@@ -81,7 +82,7 @@ def load_frame(rgb_path: Path, depth_path: Path, dataset: str, name: str, *, far
 
 def _header(path: Path) -> tuple[tuple[int, ...], np.dtype, int]:
     """Return the shape and the type in the header of a .npy file, and the number of bytes behind it."""
-    with path.open("rb") as file:
+    with opened(path) as file:
         try:
             version = np.lib.format.read_magic(file)
             read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0

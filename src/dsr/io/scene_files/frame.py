@@ -14,7 +14,7 @@ from torch import Tensor
 from dsr.data.formats.files import read_pixels
 from dsr.geometry.camera import Camera
 from dsr.geometry.poses import is_rotation
-from dsr.utils.files import replacing
+from dsr.utils.files import open_array, replacing
 from dsr.utils.limits import pixels_beside
 
 MILLIMETRES = 1000
@@ -55,7 +55,7 @@ class Frame:
             ValueError: the file is damaged, or not of the camera's size.
 
         """
-        values = np.load(self.depth, mmap_mode="r", allow_pickle=False)
+        values = open_array(self.depth)
         if values.shape != (self.camera.height, self.camera.width):
             size = f"{self.camera.height} x {self.camera.width}"
             raise ValueError(f"{self.depth}: expected depth of {size} pixels (height x width), got {values.shape}")

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from dsr.methods.networks.base import DisparityNetwork
-from dsr.utils.limits import expect_bytes, expect_stored
+from dsr.utils.limits import expect_bytes, expect_stored, opened
 from dsr.utils.parsing import parse_json
 
 FORMAT = "dsr-network-1"
@@ -81,7 +81,7 @@ def network_name(network: type[DisparityNetwork]) -> str:
 
 def is_dsr_weights(path: Path) -> bool:
     """Return whether a file starts like a safetensors file; the published networks' files do not."""
-    with path.open("rb") as file:
+    with opened(path) as file:
         return file.read(9)[8:] == b"{"
 
 
