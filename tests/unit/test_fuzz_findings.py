@@ -1,6 +1,7 @@
 """Files that the fuzz campaign found to end in a traceback, in gigabytes or in no answer; each once more, quickly."""
 
 import io
+import json
 import os
 import struct
 import tracemalloc
@@ -17,6 +18,7 @@ import torch
 
 from dsr.app.entry import run_command
 from dsr.app.trust import read_plain_yaml
+from dsr.app.upsample.outputs import read_previous_run
 from dsr.data.download.unpack import unpack
 from dsr.data.formats.tofmark import read_matrices
 from dsr.inference import MethodChoice
@@ -180,3 +182,11 @@ def test_stored_input_with_a_depth_out_of_range_is_refused(tmp_path, depth):
     write_input(tmp_path / "input.npz", torch.rand(3, 16, 16), depth_lr)
     with pytest.raises(ValueError, match=r"input\.npz: expected depths of 1e-06 to 1e\+09 m"):
         read_input(tmp_path / "input.npz")
+
+
+@pytest.mark.parametrize("wrong", [{"files": [1.5]}, {"files": "depth.png"}, {"inputs": {"rgb": 3}}])
+def test_record_of_an_earlier_result_with_values_of_other_types_is_refused(tmp_path, wrong):
+    entries = {"complete": True, "settings": {}, "inputs": {}, "files": ["depth.png"], **wrong}
+    (tmp_path / "info.json").write_text(json.dumps(entries))
+    with pytest.raises(ValueError, match=r"info\.json: expected a file of `dsr upsample`, got something else"):
+        read_previous_run(tmp_path)

@@ -105,12 +105,16 @@ def read_previous_run(folder: Path) -> PreviousRun | None:
         return None
     try:
         entries = parse_json(read_limited(path), finite=False)
-        noise = entries.get("noise")
+        noise, files, inputs = entries.get("noise"), entries["files"], dict(entries["inputs"])
+        if not isinstance(files, list) or not all(isinstance(name, str) for name in files):
+            raise TypeError(f"files: expected names, got {files!r}")
+        if not all(isinstance(entry, dict) for entry in inputs.values()):
+            raise TypeError(f"inputs: expected facts of each, got {inputs!r}")
         return PreviousRun(
             entries["complete"] is True,
             dict(entries["settings"]),
-            dict(entries["inputs"]),
-            tuple(entries["files"]),
+            inputs,
+            tuple(files),
             None if noise is None else dict(noise),
             {part: entries[part] for part in ("cloud", "mesh") if part in entries},
         )
