@@ -28,7 +28,7 @@ from dsr.evaluation.score import score
 from dsr.evaluation.sharing import Workers, can_fork, choose_workers
 from dsr.evaluation.store import load_errors, prediction_path
 from dsr.inference.adapter import AnyScale
-from dsr.methods.dip.upsampler import WORKSPACE
+from dsr.methods.base import WORKSPACE
 from dsr.methods.registry import build_method, target_paths
 from dsr.metrics.formats import HEADLINES, Formats
 from dsr.report.tables import score_table

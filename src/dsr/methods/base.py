@@ -111,6 +111,10 @@ class Confident(Protocol):
         ...
 
 
+WORKSPACE = "optimisation"
+"""Folder in which a method that optimises keeps what it needs to go on after an interruption."""
+
+
 @runtime_checkable
 class Iterative(Protocol):
     """An :class:`Upsampler` that iterates, and records its progress.

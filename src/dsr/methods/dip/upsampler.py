@@ -23,7 +23,7 @@ from torch.utils.data import DataLoader
 
 from dsr.degradation.downsampling import Downsampling, scene_generator
 from dsr.geometry.camera import RangeType
-from dsr.methods.base import Cost, Ratios
+from dsr.methods.base import WORKSPACE, Cost, Ratios
 from dsr.methods.dip.callbacks import Provenance, checkpoint_of, cost_of_step
 from dsr.methods.dip.optimisation import PriorOptimisation, PriorSettings
 from dsr.methods.dip.problem import DataLoss, ImageProblem, PriorObjective
@@ -40,7 +40,6 @@ from dsr.utils.lightning import Log, StepProgress, ValidationTable, fit, make_tr
 from dsr.utils.progress import Progress, Steps, StepsProgress
 from dsr.utils.units import duration
 
-WORKSPACE = "optimisation"
 _SECONDS_BETWEEN_CHECKPOINTS = 60.0
 _ADVICE = "a lower method.learning_rate may help"
 
