@@ -26,6 +26,7 @@ from dsr.methods.registry import build_method, read_method
 from dsr.metrics.catalogue import Metric, catalogue, score_image
 from dsr.metrics.lpips import load_lpips
 from dsr.metrics.metric import WORST
+from dsr.utils.builder import takes
 
 SCENES = ("lucy", "plant")
 METRICS = ("RMSE_v", "DSSIM_v", "BadPix_v_5", "Bumpiness_d", "LPIPS_v", "RMSE_d")
@@ -36,7 +37,9 @@ def scores(
 ) -> dict[str, float]:
     """Return the worst-of-four scores of a method's network on one scene."""
     scale = read_header(weights)["arguments"]["scale"]
-    node = read_method(name, scale, {} if ensemble is None else {"ensemble": ensemble})
+    node = read_method(name, scale)
+    if ensemble is not None and takes("method", node, "ensemble"):
+        node = {**node, "ensemble": ensemble}
     told = {"kernel": "box", "edges": "sharp", "clean": True}
     method = build_method(node, scale, weights=weights, told=told)
     sample = make_sample(
@@ -77,7 +80,9 @@ def main() -> None:
     parser.add_argument("--methods", default="msg_v,facets,msg")
     parser.add_argument("--scales", type=int, nargs="+", default=[4, 8])
     parser.add_argument("--weights", type=Path, nargs="*", default=[], help="files to take instead of packaged ones")
-    parser.add_argument("--ensemble", type=int, help="passes to average; that of eval.py unless given")
+    parser.add_argument(
+        "--ensemble", type=int, help="passes to average where the method can; that of eval.py unless given"
+    )
     parser.add_argument("--csv", type=Path, help="where to write the table to")
     arguments = parser.parse_args()
     if not (arguments.shared / "expected" / "metrics.json").is_file():

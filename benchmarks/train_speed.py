@@ -170,7 +170,7 @@ def main() -> None:
     if arguments.profile:
         profile(arguments.steps, arguments.overrides)
         return
-    source = SimGeo(size=256)
+    source = SimGeo(size=2 * arguments.patch)
     scenes = [source.load(name) for name in source.scenes()]
     settings = PatchSettings(patch=arguments.patch, batch=arguments.batch)
     patches = Patches([scenes], settings, Degradation(SCALE, Downsampling("box")), count=arguments.batch)

@@ -29,9 +29,16 @@ VISUAL = ("RMSE_v", "DSSIM_v", "BadPix_v_5", "Bumpiness_d", "LPIPS_v")
 
 @pytest.fixture(scope="module")
 def ratios(shared: Path, tmp_path_factory: pytest.TempPathFactory) -> pd.DataFrame:
-    """Ours / published MSG-V on Lucy and Plant at x4, as the benchmark prints them."""
+    """Ours / published MSG-V on Lucy and Plant at x4, one pass each, as the benchmark prints them."""
     file = tmp_path_factory.mktemp("ratios") / "ratios.csv"
-    command = [sys.executable, str(REPOSITORY / "benchmarks" / "against_published.py"), "--scales", "4"]
+    command = [
+        sys.executable,
+        str(REPOSITORY / "benchmarks" / "against_published.py"),
+        "--scales",
+        "4",
+        "--ensemble",
+        "1",
+    ]
     done = subprocess.run(
         [*command, "--shared", str(shared), "--csv", str(file)], capture_output=True, text=True, check=False
     )
@@ -40,7 +47,7 @@ def ratios(shared: Path, tmp_path_factory: pytest.TempPathFactory) -> pd.DataFra
     return pd.read_csv(file)
 
 
-@pytest.mark.parametrize(("method", "rmse_v", "all_metrics"), [("msg_v", 0.85, 0.90), ("facets", 0.75, 0.80)])
+@pytest.mark.parametrize(("method", "rmse_v", "all_metrics"), [("msg_v", 0.85, 0.93), ("facets", 0.75, 0.80)])
 def test_our_networks_beat_the_published_one_in_every_visual_metric_of_every_case(
     ratios: pd.DataFrame, method: str, rmse_v: float, all_metrics: float
 ) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import os
+import sys
 from collections.abc import Callable, Generator, Sequence
 from concurrent.futures import Future
 from concurrent.futures.process import BrokenProcessPool
@@ -46,13 +47,13 @@ class Work:
     def __init__(self, results: Results, workers: int = 1) -> None:
         self.results = results
         self._pool: WorkerPool | None = None
+        self._threads = torch.get_num_threads(), cv2.getNumThreads()
         if workers > 1:
-            # Ctrl-C would cut off arguments larger than a pipe's buffer while a worker starts, so it asks for them
-            queue: Queue[Results] = get_context("spawn").Queue()
-            queue.cancel_join_thread()
-            for _ in range(workers):
-                queue.put(results)
-            self._pool = WorkerPool(workers, _begin, (queue, max(1, (os.cpu_count() or 1) // workers)))
+            _set_threads(cores := max(1, (os.cpu_count() or 1) // workers))  # a fork inherits them, and cannot set them
+            if sys.platform == "linux":
+                self._pool = WorkerPool(workers, _begin, (results,), "fork")
+            else:
+                self._pool = WorkerPool(workers, _begin, (_queued(results, workers), cores))
 
     def map(self, function: Callable[[Results, _Item], _Value], items: Sequence[_Item]) -> Generator[_Value]:
         """Return the values of ``function(results, item)`` in the order of the items.
@@ -81,6 +82,7 @@ class Work:
         """Terminate the workers."""
         if self._pool is not None:
             self._pool.__exit__(kind, error, trace)
+            _set_threads(*self._threads)
 
 
 def _in_order(futures: Sequence[Future[_Value]]) -> Generator[_Value]:
@@ -96,17 +98,35 @@ def _in_order(futures: Sequence[Future[_Value]]) -> Generator[_Value]:
             future.cancel()
 
 
-def _begin(queue: Queue[Results], cores: int) -> None:
+def _queued(results: Results, workers: int) -> Queue[Results]:
+    """Return a queue with the results for each worker.
+
+    Ctrl-C would cut off arguments larger than a pipe's buffer while a worker starts, so it asks for them.
+    """
+    queue: Queue[Results] = get_context("spawn").Queue()
+    queue.cancel_join_thread()
+    for _ in range(workers):
+        queue.put(results)
+    return queue
+
+
+def _set_threads(of_torch: int, of_opencv: int | None = None) -> None:
+    """Set the numbers of threads that torch and OpenCV compute with, equal ones if one is given."""
+    torch.set_num_threads(of_torch)
+    cv2.setNumThreads(of_torch if of_opencv is None else of_opencv)
+
+
+def _begin(results: Results | Queue[Results], cores: int | None = None) -> None:
     """Prepare a worker.
 
     Garbage is collected after each call: Matplotlib makes so many objects that the automatic collections would take a
     third of the time of a figure.
     """
     global _results  # noqa: PLW0603 - the worker's own
-    _results = queue.get()
+    _results = results if isinstance(results, Results) else results.get()
     gc.disable()
-    torch.set_num_threads(cores)
-    cv2.setNumThreads(cores)
+    if cores is not None:
+        _set_threads(cores)
 
 
 def _call(function: Callable[[Results, _Item], _Value], item: _Item) -> _Value:

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import os
+import signal
+import warnings
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
 from multiprocessing import get_context
 from types import TracebackType
-from typing import Any, ParamSpec, TypeVar
+from typing import Any, Literal, ParamSpec, TypeVar
 
 from dsr.utils import interruption
 
@@ -22,15 +24,24 @@ class WorkerPool(ProcessPoolExecutor):
         count: how many.
         prepare: function that each worker calls once; None for none.
         arguments: its arguments.
+        start: ``spawn`` for new interpreters; ``fork`` for processes that share what this one has loaded, which must
+            not have computed with several threads before, as these do not survive a fork.
 
     """
 
-    def __init__(self, count: int, prepare: Callable[..., None] | None = None, arguments: Sequence[Any] = ()) -> None:
-        super().__init__(count, get_context("spawn"), _begin, (os.getpid(), prepare, arguments))
+    def __init__(
+        self,
+        count: int,
+        prepare: Callable[..., None] | None = None,
+        arguments: Sequence[Any] = (),
+        start: Literal["spawn", "fork"] = "spawn",
+    ) -> None:
+        super().__init__(count, get_context(start), _begin, (os.getpid(), prepare, arguments))
 
     def submit(self, fn: Callable[_P, _T], /, *args: _P.args, **kwargs: _P.kwargs) -> Future[_T]:
         """Let a worker call a function; it is started if none is idle."""
-        with interruption.starting_workers():
+        with interruption.starting_workers(), warnings.catch_warnings():
+            warnings.simplefilter("ignore", DeprecationWarning)  # of forking with threads: those of this process sleep
             return super().submit(fn, *args, **kwargs)
 
     def __exit__(
@@ -43,7 +54,8 @@ class WorkerPool(ProcessPoolExecutor):
 
 
 def _begin(parent: int, prepare: Callable[..., None] | None, arguments: Sequence[Any]) -> None:
-    """Prepare a worker."""
+    """Prepare a worker; if it was forked, it has its parent's handler of SIGTERM."""
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
     interruption.end_with(parent)
     if prepare is not None:
         prepare(*arguments)
