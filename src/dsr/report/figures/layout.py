@@ -10,12 +10,12 @@ from typing import Any
 
 import matplotlib as mpl
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import Colormap
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from matplotlib.ticker import MaxNLocator, ScalarFormatter
+from matplotlib.transforms import Bbox
 
 from dsr.viz.panels import Window, colours, write_figure
 
@@ -81,7 +81,7 @@ class Row:
 def save_both(folder: Path, name: str, figure: Figure) -> list[Path]:
     """Write a figure as PDF and PNG atomically, and return the files.
 
-    In the PDF text is stored as text, and pictures are not resampled.
+    In the PDF text is stored as text, and pictures are stored one by one, not resampled.
     """
     paths = []
     for suffix, interpolation, metadata in ((".pdf", "none", {"CreationDate": None}), (".png", "auto", {})):
@@ -89,7 +89,7 @@ def save_both(folder: Path, name: str, figure: Figure) -> list[Path]:
             for image in axes.images:
                 image.set_interpolation(interpolation)
         paths.append(folder / f"{name}{suffix}")
-        with mpl.rc_context({"pdf.fonttype": 42}):
+        with mpl.rc_context({"pdf.fonttype": 42, "image.composite_image": False}):
             write_figure(paths[-1], figure, DPI, metadata)
     return paths
 
@@ -143,75 +143,86 @@ def _wrap(text: str, length: float) -> str:
 
 
 class _Page:
-    """A figure with positions in inches from the lower left corner."""
+    """A figure with positions in inches from the lower left corner.
+
+    All pictures are in one :class:`~matplotlib.axes.Axes` of the figure's size, as each further one takes long to make.
+    A picture's label is ``ROW: panel`` or ``ROW: detail``, as is that of the frame of an empty panel.
+    """
 
     def __init__(self, width: float, height: float) -> None:
         self.figure = Figure(figsize=(width, height))
         FigureCanvasAgg(self.figure)
+        self._canvas = self.figure.add_axes((0, 0, 1, 1), label="pictures", autoscale_on=False)
+        self._canvas.set(xlim=(0, width), ylim=(0, height))
+        self._canvas.set_axis_off()
 
     def text(self, x: float, y: float, text: str, **style: Any) -> None:
         """Write a text."""
         width, height = self.figure.get_size_inches()
         self.figure.text(x / width, y / height, text, fontsize=_FONT, parse_math=False, linespacing=1.1, **style)
 
-    def axes(self, left: float, bottom: float, width: float, height: float, label: str = "") -> Axes:
-        """Add axes without ticks."""
-        page_width, page_height = self.figure.get_size_inches()
-        axes = self.figure.add_axes(
-            (left / page_width, bottom / page_height, width / page_width, height / page_height), label=label
-        )
-        axes.set(xticks=[], yticks=[])
-        for spine in axes.spines.values():
-            spine.set_visible(False)
-        return axes
-
     def cell(
         self, row: Row, cell: Cell, left: float, top: float, panel: float, box: tuple[float, float, float, float]
     ) -> None:
         """Draw a panel, its details and its caption; ``top`` is the upper edge of the picture."""
         width, height, below, _ = box
-        axes = self.axes(left + (panel - width) / 2, top - height, width, height, label=f"{row.label}: panel")
+        place = Bbox.from_bounds(left + (panel - width) / 2, top - height, width, height)
         if cell.picture is None:
-            axes.set_facecolor(_EMPTY)
-            axes.text(0.5, 0.5, cell.caption, ha="center", va="center", fontsize=_FONT, color="0.45")
+            self._frame(place, f"{row.label}: panel", facecolor=_EMPTY)
+            middle = ((place.x0 + place.x1) / 2, (place.y0 + place.y1) / 2)
+            self.text(*middle, cell.caption, ha="center", va="center", color="0.45")
             return
-        _show(axes, cell, cell.picture)
+        self._show(place, cell, cell.picture, f"{row.label}: panel")
         size = below - _SEAM
         for number, (window, colour) in enumerate(zip(row.details, FRAMES, strict=False)):
             part = _scale_window(window, row.size, cell.picture.shape[:2])
-            axes.add_patch(_frame(part, colour))
-            inset = self.axes(left + number * (size + _SEAM), top - height - below, size, size, f"{row.label}: detail")
-            _show(inset, cell, cell.picture[part.slices])
-            for spine in inset.spines.values():
-                spine.set(visible=True, color=colour, linewidth=1.0)
+            frame = _part_of(place, part, cell.picture.shape[:2])
+            self._frame(frame, f"{row.label}: frame", facecolor="none", edgecolor=colour, linewidth=0.9)
+            inset = Bbox.from_bounds(left + number * (size + _SEAM), top - height - below, size, size)
+            self._show(inset, cell, cell.picture[part.slices], f"{row.label}: detail")
+            self._frame(inset, f"{row.label}: edge", facecolor="none", edgecolor=colour, linewidth=1.0)
         self.text(left + panel / 2, top - height - below - 0.02, cell.caption, ha="center", va="top",
                   weight="bold" if cell.bold else "normal")  # fmt: skip
 
     def bar(self, row: Row, left: float, top: float, height: float) -> None:
         """Draw a row's colour bar, beside its panels."""
-        panels = [axes for axes in self.figure.axes if axes.get_label() == f"{row.label}: panel" and axes.images]
-        shown = [cell.picture for cell in row.cells if cell.picture is not None]
-        mapped = [axes for axes, picture in zip(panels, shown, strict=True) if picture.ndim == 2]
+        panels = [image for image in self._canvas.images if image.get_label() == f"{row.label}: panel"]
+        mapped = [image for image in panels if np.asarray(image.get_array()).ndim == 2]
         if not mapped:
             return
-        place = self.axes(left, top - height, _BAR, height, f"{row.label}: bar")
-        bar = self.figure.colorbar(mapped[-1].images[0], cax=place, extend=row.extend, ticks=MaxNLocator(5),
+        width, page_height = self.figure.get_size_inches()
+        place = self.figure.add_axes(
+            (left / width, (top - height) / page_height, _BAR / width, height / page_height), label=f"{row.label}: bar"
+        )
+        bar = self.figure.colorbar(mapped[-1], cax=place, extend=row.extend, ticks=MaxNLocator(5),
                                    format=ScalarFormatter(useOffset=False))  # fmt: skip
         bar.outline.set_linewidth(0.4)
         bar.ax.tick_params(labelsize=_FONT - 1, length=2, width=0.4, pad=1.5)
         bar.set_label(row.bar, fontsize=_FONT, labelpad=1.5)
 
+    def _show(self, place: Bbox, cell: Cell, picture: np.ndarray, label: str) -> None:
+        """Draw a picture."""
+        low, high = cell.limits
+        extent = (place.x0, place.x1, place.y0, place.y1)
+        image = self._canvas.imshow(
+            picture, cmap=colours(cell.colour_map), vmin=low, vmax=high, extent=extent, aspect="auto"
+        )
+        image.set_label(label)
 
-def _show(axes: Axes, cell: Cell, picture: np.ndarray) -> None:
-    """Draw a picture."""
-    low, high = cell.limits
-    axes.imshow(picture, cmap=colours(cell.colour_map), vmin=low, vmax=high, aspect="auto")
+    def _frame(self, place: Bbox, label: str, **style: Any) -> None:
+        """Draw a rectangle."""
+        self._canvas.add_patch(Rectangle(place.p0, place.width, place.height, label=label, **style))
 
 
-def _frame(window: Window, colour: str) -> Rectangle:
-    """Return the frame around a window."""
-    corner = (window.left - 0.5, window.top - 0.5)
-    return Rectangle(corner, window.width, window.height, fill=False, edgecolor=colour, linewidth=0.9)
+def _part_of(place: Bbox, window: Window, shape: tuple[int, ...]) -> Bbox:
+    """Return where a window of a picture of (height, width) pixels is that is shown at ``place``."""
+    across, down = place.width / shape[1], place.height / shape[0]
+    return Bbox.from_bounds(
+        place.x0 + across * window.left,
+        place.y1 - down * (window.top + window.height),
+        across * window.width,
+        down * window.height,
+    )
 
 
 def _scale_window(window: Window, size: tuple[int, int], shape: tuple[int, ...]) -> Window:
