@@ -1,6 +1,6 @@
 """How much faster a step of DIP-V is than the plain way, and that nothing is lost by it.
 
-    python benchmarks/dip_speed.py [--size 256] [--steps 5] [--threads N] [--quality-steps 0]
+    python benchmarks/dip_speed.py [--size 256] [--steps 5] [--threads N] [--quality-steps 0] [--device cpu]
 
 The plain way is that of the original's code: float32, PyTorch's default memory layout, reflected borders, the library's
 bilinear upsampling, 128 channels in each level. ``same network`` is ours with these channels, ``default`` with ours.
@@ -41,13 +41,15 @@ def library(x: Tensor) -> Tensor:
     return functional.interpolate(x, scale_factor=2, mode="bilinear", align_corners=False)
 
 
-def module_of(sample: DepthSample, *, plain: bool, widths: tuple[int, ...] | None = None) -> PriorOptimisation:
+def module_of(
+    sample: DepthSample, device: torch.device, *, plain: bool, widths: tuple[int, ...] | None = None
+) -> PriorOptimisation:
     """Return an optimisation, in the plain way or ours."""
     given: dict[str, object] = {} if widths is None else {"widths": widths}
-    precision = "float32" if plain else fast_precision(torch.device("cpu"))
+    precision = "float32" if plain else fast_precision(device)
     if plain:
         given |= {"padding": "reflect", "border": 0}
-    prior = DeepImagePrior(scale=4, downsampling=BOX, precision=precision, **given)  # type: ignore[arg-type]
+    prior = DeepImagePrior(scale=4, downsampling=BOX, precision=precision, device=device, **given)  # type: ignore[arg-type]
     module, _ = prior.module(sample)
     if plain:
         module.net.to(memory_format=torch.contiguous_format)  # type: ignore[call-overload]
@@ -57,7 +59,7 @@ def module_of(sample: DepthSample, *, plain: bool, widths: tuple[int, ...] | Non
 
 def in_plain_layout(module: PriorOptimisation) -> tuple[Tensor, Tensor]:
     """Return the answer as :meth:`PriorOptimisation.answer` does, without a memory layout of its own."""
-    draws = torch.randn(module.start.shape, generator=module.generator)
+    draws = torch.randn(module.start.shape, generator=module.generator, device=module.start.device)
     before, skip_net.upsample_2x = skip_net.upsample_2x, library
     try:
         y = module.net(torch.addcmul(module.start, draws, module.spread).contiguous())
@@ -88,6 +90,8 @@ def seconds(steps: dict[str, Callable[[], object]], count: int) -> dict[str, flo
         for name, step in steps.items():
             start = time.perf_counter()
             step()
+            if torch.cuda.is_available():
+                torch.cuda.synchronize()
             if turn:  # the first one warms up
                 taken[name].append(time.perf_counter() - start)
     return {name: statistics.median(each) for name, each in taken.items()}
@@ -109,16 +113,16 @@ def grouped(net: nn.Module, images: int) -> nn.Module:
     return net
 
 
-def network_step(images: int, size: int) -> Callable[[], None]:
+def network_step(images: int, size: int, device: torch.device) -> Callable[[], None]:
     """Return a function that goes forward and back through the network of several images."""
     settings = DeepImagePrior(scale=4, downsampling=BOX)
     net = grouped(skip_net.SkipNet(35, 2, settings.widths, settings.skips), images)
-    net = net.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-    x = torch.rand(1, 35 * images, size, size).to(memory_format=torch.channels_last)
-    mixed = fast_precision(torch.device("cpu")) == "bfloat16"
+    net = net.to(device, memory_format=torch.channels_last)  # type: ignore[call-overload]
+    x = torch.rand(1, 35 * images, size, size, device=device).to(memory_format=torch.channels_last)
+    mixed = fast_precision(device) == "bfloat16"
 
     def step() -> None:
-        with torch.autocast("cpu", torch.bfloat16, enabled=mixed):
+        with torch.autocast(device.type, torch.bfloat16, enabled=mixed):
             y = net(x)
         y.float().square().mean().backward()
         net.zero_grad(set_to_none=True)
@@ -132,7 +136,7 @@ def scores_after(module: PriorOptimisation, sample: DepthSample, steps: int) -> 
     average = step()
     for count in range(2, steps + 1):
         average.lerp_(step(), 1 - min(0.99, (count - 1) / (count + 9)))
-    metrics, truth = visual_metrics(), sample.depth
+    metrics, truth, average = visual_metrics(), sample.depth, average.cpu()
     if truth is not None:
         metrics.update(SurfacePair(average.double(), truth[None].double(), sample.camera.rays()[None]))
     return {name: float(value) for name, value in metrics.compute().items()}
@@ -145,25 +149,27 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=5)
     parser.add_argument("--threads", type=int, default=torch.get_num_threads())
     parser.add_argument("--quality-steps", type=int, default=0)
+    parser.add_argument("--device", type=torch.device, default="cpu")
     options = parser.parse_args()
     torch.set_num_threads(options.threads)
+    device: torch.device = options.device
     sample = make_sample(SimGeo(size=options.size).load("statue"), 4, BOX, "orthogonal")
     kinds = {
         "plain": {"plain": True, "widths": WIDE},
         "same network": {"plain": False, "widths": WIDE},
         "default": {"plain": False},
     }
-    times = seconds({name: stepper(module_of(sample, **kind)) for name, kind in kinds.items()}, options.steps)  # type: ignore[arg-type]
+    times = seconds({name: stepper(module_of(sample, device, **kind)) for name, kind in kinds.items()}, options.steps)  # type: ignore[arg-type]
     for name in ("same network", "default"):
         print(f"{name}: {times['plain'] / times[name]:.1f} times as fast as the plain way at {options.size} pixels")
     side = min(options.size, 128)
-    groups = seconds({str(images): network_step(images, side) for images in (1, 2, 4)}, options.steps)
+    groups = seconds({str(images): network_step(images, side, device) for images in (1, 2, 4)}, options.steps)
     for images in (2, 4):
         ratio = groups["1"] / (groups[str(images)] / images)
         print(f"{images} images at once: {ratio:.2f} times as fast per image as one at {side} pixels")
     if options.quality_steps:
         for name in ("plain", "same network"):
-            found = scores_after(module_of(sample, **kinds[name]), sample, options.quality_steps)  # type: ignore[arg-type]
+            found = scores_after(module_of(sample, device, **kinds[name]), sample, options.quality_steps)  # type: ignore[arg-type]
             text = "  ".join(f"{metric} {found[metric]:.4f}" for metric in ("RMSE_d", "DSSIM_v", "RMSE_v"))
             print(f"{name} after {options.quality_steps} steps: {text}")
 

@@ -1,9 +1,9 @@
-"""How much faster than plain code MSG-V runs on a CPU, drift compensation included, and how far its output is from it.
+"""How much faster than plain code MSG-V runs, drift compensation included, and how far its output is from it.
 
 The plain way runs the whole network twice, in float32 and PyTorch's default memory layout. Each line below it adds one
 measure; all are timed in turns within the same run, so that only the ratios matter:
 
-    python benchmarks/msg_speed.py                              # random weights
+    python benchmarks/msg_speed.py [--device cuda]              # random weights
     python benchmarks/msg_speed.py --weights msg_v_x4_clean.pth
 """
 
@@ -38,11 +38,11 @@ def scene(size: int) -> tuple[Tensor, Tensor]:
     return rgb[None], torch.nn.functional.avg_pool2d(disparity[None, None], SCALE)
 
 
-def ways(net: MSGNet, size: int) -> dict[str, Callable[[], Tensor]]:
+def ways(net: MSGNet, size: int, device: torch.device) -> dict[str, Callable[[], Tensor]]:
     """Return the plain way first, then the measures one by one, each on top of those before."""
-    rgb, disparity = scene(size)
-    float32, bfloat16 = NetworkUpsampler(net).net, NetworkUpsampler(net, "bfloat16").net
-    plain = copy.deepcopy(net).eval()
+    rgb, disparity = (values.to(device) for values in scene(size))
+    float32, bfloat16 = (NetworkUpsampler(net, each, device).net for each in ("float32", "bfloat16"))
+    plain = copy.deepcopy(net).eval().to(device)
 
     def run(net: MSGNet, *, crop: bool, inference: bool) -> Callable[[], Tensor]:
         mode = torch.inference_mode if inference else torch.no_grad
@@ -63,7 +63,8 @@ def measure(functions: dict[str, Callable[[], Tensor]], runs: int) -> dict[str, 
     for i in range(runs + 1):
         for name, function in functions.items():
             start = time.perf_counter()
-            function()
+            if function().is_cuda:
+                torch.cuda.synchronize()
             if i > 0:
                 times[name].append(time.perf_counter() - start)
     return {name: statistics.median(values) for name, values in times.items()}
@@ -76,12 +77,13 @@ def main() -> None:
     parser.add_argument("--size", type=int, default=512, help="rows and columns of the output, a multiple of 4")
     parser.add_argument("--runs", type=int, default=5)
     parser.add_argument("--threads", type=int, default=2)
+    parser.add_argument("--device", type=torch.device, default="cpu")
     arguments = parser.parse_args()
     torch.set_num_threads(arguments.threads)
     torch.manual_seed(0)
     net = MSGNet(SCALE) if arguments.weights is None else load_msg_weights(arguments.weights, SCALE, "voynov")
 
-    functions = ways(net, arguments.size)
+    functions = ways(net, arguments.size, arguments.device)
     seconds = measure(functions, arguments.runs)
     exact = functions["plain"]()
     least, most = scene(arguments.size)[1].aminmax()
