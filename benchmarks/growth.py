@@ -249,7 +249,9 @@ def draw(path: Path, points: Sequence[Point]) -> None:
             if own:
                 ends = [own[0].amount, own[-1].amount]
                 panel.plot(ends, list(map(line_of(own, field), ends)), color="0.7", linewidth=1)
-            panel.plot([each.amount for each in own], [getattr(each, field) for each in own], "o", color=colour, clip_on=False)
+            panel.plot(
+                [each.amount for each in own], [getattr(each, field) for each in own], "o", color=colour, clip_on=False
+            )
             panel.set_xlim(left=0)
             panel.set_ylim(bottom=0)
             panel.spines[["top", "right"]].set_visible(False)
