@@ -3,7 +3,12 @@
 from __future__ import annotations
 
 import itertools
+import multiprocessing.connection
+import os
 import pickle
+import signal
+import sys
+import time
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
@@ -24,6 +29,7 @@ from dsr.training.data_module import Part, PatchData, WholeScenes
 from dsr.training.degradation import Batch, Degradation, to_tensors
 from dsr.training.patches import Patches
 from dsr.training.settings import PatchSettings
+from dsr.utils import interruption
 
 BOX = Downsampling("box")
 X4 = Degradation(4, BOX)
@@ -128,6 +134,27 @@ def test_patches_neither_use_nor_change_the_global_random_states() -> None:
 def test_workers_cut_the_same_patches_as_the_trainer() -> None:
     alone, helped = (_batches(_data(colour=0.1, workers=workers), 3, 1) for workers in (0, 2))
     assert _equal(alone, helped)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="needs signals")
+def test_workers_outlast_a_signal_to_the_whole_group_until_the_trainer_has_ended(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(interruption, "_GRACE", 3.0)
+    data, alone, before = _data(workers=2), _batches(_data(), 6), set(multiprocessing.active_children())
+    data.setup()
+    batches = iter(data.train_dataloader())
+    first = next(batches)
+    workers = set(multiprocessing.active_children()) - before
+    assert len(workers) == 2
+    for worker in workers:
+        assert worker.pid is not None
+        os.kill(worker.pid, signal.SIGTERM)
+    time.sleep(0.3)  # a worker that has ended is an error as soon as its parent hears of it
+    assert _equal([first, *itertools.islice(batches, 5)], alone)
+    assert all(worker.is_alive() for worker in workers)
+    with pytest.raises(RuntimeError, match="exited unexpectedly with exit code 143"):
+        multiprocessing.connection.wait([worker.sentinel for worker in workers], 10)
 
 
 def test_loader_begins_at_the_trainers_step_and_has_no_length() -> None:

@@ -6,6 +6,7 @@ import functools
 import itertools
 import math
 import os
+import signal
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -214,7 +215,8 @@ class PatchData(lightning.LightningDataModule):
         if self._settings.workers:
             workers["worker_init_fn"] = functools.partial(_begin_worker, os.getpid())
         pin = torch.cuda.is_available()
-        return DataLoader(self._load_patches().select(0, sys.maxsize), batch_sampler=numbers, pin_memory=pin, **workers)
+        patches = self._load_patches().select(0, sys.maxsize)
+        return _PatchLoader(patches, batch_sampler=numbers, pin_memory=pin, **workers)
 
     def val_dataloader(self) -> list[DataLoader[Batch]]:
         """Return a loader for each validation set, of whole scenes, one at a time.
@@ -282,9 +284,19 @@ class _PatchNumbers:
             yield list(range(start, start + self._batch))
 
 
+class _PatchLoader(DataLoader[Batch]):
+    """A loader whose workers do not end before the training, if all get a signal, as from a cluster or a terminal."""
+
+    def __iter__(self) -> Any:  # a type that torch does not export
+        """Start the workers."""
+        with interruption.starting_workers(signal.SIGTERM):
+            return super().__iter__()
+
+
 def _begin_worker(parent: int, _: int) -> None:
     """Prepare a worker, the number of which is not needed; torch looks after the parent only every five seconds."""
     interruption.end_with(parent)
+    interruption.outlast_group()
 
 
 def _make_unique(name: str, names: Mapping[str, Any]) -> str:

@@ -206,12 +206,17 @@ def requeued() -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def starting_workers() -> Iterator[None]:
-    """Within this context started processes do not get SIGINT, which would meet them before :func:`end_with`."""
+def starting_workers(*further: signal.Signals) -> Iterator[None]:
+    """Within this context started processes do not get SIGINT, which would meet them before :func:`end_with`.
+
+    Args:
+        further: other signals that they do not get either.
+
+    """
     if not hasattr(signal, "pthread_sigmask"):
         yield
         return
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, *further})
     try:
         yield
     finally:
@@ -233,6 +238,22 @@ def end_with(parent: int) -> None:
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=watch, daemon=True).start()
+
+
+def outlast_group() -> None:
+    """End this process, a worker, only some seconds after SIGTERM, in which its parent, if it got it too, ends both.
+
+    The parent may need the worker to complete its step, or take its sudden end for an error.
+    """
+
+    def wait(number: int, _: FrameType | None) -> None:
+        timer = threading.Timer(_GRACE, os._exit, (128 + number,))
+        timer.daemon = True
+        timer.start()
+
+    signal.signal(signal.SIGTERM, wait)
+    if hasattr(signal, "pthread_sigmask"):
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGTERM})
 
 
 def exit_code() -> int:
