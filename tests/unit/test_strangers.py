@@ -111,6 +111,25 @@ def test_checkpoint_of_something_else_is_refused(tmp_path, content):
     assert "\n" not in str(refused.value)
 
 
+class _Interrupted:
+    """A loader that is interrupted as it starts, after Lightning has tried whether it can."""
+
+    tried = False
+
+    def __iter__(self):
+        if self.tried:
+            raise KeyboardInterrupt
+        self.tried = True
+        return iter([torch.ones(1)])
+
+
+def test_interruption_of_a_trainings_start_is_no_other_error(tmp_path):
+    trainer = make_trainer(torch.device("cpu"), 1, 1, callbacks=[], logger=False, default_root_dir=tmp_path)
+    with pytest.raises(KeyboardInterrupt) as interrupted:
+        fit(trainer, OneWeight(), _Interrupted())
+    assert isinstance(interrupted.value.__cause__, RuntimeError)  # that of Lightning's teardown, which must not be told
+
+
 @pytest.mark.parametrize("rows", [[[1e308, 1e308, 0], [1e308, -1e308, 0], [0, 0, 1]], [[1e200, 0, 0]] * 3])
 def test_rotation_whose_squares_are_beyond_floats_is_refused_without_a_warning(rows):
     assert not is_rotation(np.array(rows), 0.1)

@@ -239,6 +239,8 @@ def fit(
         if not trainer.interrupted:
             raise
     except Exception as error:
+        if _follows_interruption(error):  # Lightning's teardown fails if the interruption met its setup
+            raise KeyboardInterrupt from error
         if resume is None or resumed.begun or isinstance(error, OSError | FullDiskError):
             raise
         raise CheckpointError(resume, error) from error
@@ -246,6 +248,13 @@ def fit(
         interruption.reinstall()  # Lightning ignores SIGINT after an interruption
     if trainer.interrupted:
         raise KeyboardInterrupt
+
+
+def _follows_interruption(error: BaseException | None) -> bool:
+    """Return whether an error arose while an interruption was handled."""
+    while error is not None and not isinstance(error, KeyboardInterrupt):
+        error = error.__context__
+    return error is not None
 
 
 def _lightning_devices(device: torch.device, count: int) -> Any:
