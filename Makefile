@@ -11,7 +11,8 @@ VENV := .venv
 BIN := $(VENV)/bin
 ARGS ?=
 # One worker more than there are processors, as tests of commands wait for them; each computes with one thread.
-PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest --dist loadfile --no-loadscope-reorder --maxprocesses 8 \
+# Modules are compiled once, also where the environment says otherwise: hundreds of processes import them.
+PYTEST := PYTHONDONTWRITEBYTECODE= OMP_NUM_THREADS=1 $(BIN)/python -m pytest --dist loadfile --no-loadscope-reorder --maxprocesses 8 \
 	--numprocesses $$(( $$(getconf _NPROCESSORS_ONLN) + 1 ))
 
 .PHONY: run test unit fuzz chaos lint docs benchmark clean

@@ -3,12 +3,13 @@
 import importlib.util
 import os
 import signal
+import socket
 import stat
 
 import pytest
 
 from dsr.app import gpus
-from dsr.app.launchers import slurm
+from dsr.app.launchers import ray_cluster, slurm
 from dsr.app.launchers.ray_cluster import RaySettings
 from dsr.app.launchers.slurm import SlurmSettings
 from dsr.app.multirun import LAUNCHERS, expect_launcher
@@ -48,6 +49,49 @@ def test_setting_out_of_range_is_refused_by_name(settings, values, key, value):
     settings(**values)
     with pytest.raises(ConfigError, match=rf"^hydra\.launcher\.{key}: expected .*, got {value}$"):
         settings(**{**values, key: value})
+
+
+class Ray:
+    """What the launcher asks of Ray to connect."""
+
+    def __init__(self):
+        self.asked = []
+
+    def init(self, *, address, **_):
+        self.asked.append(address)
+
+
+def listening():
+    """Return a socket that other processes can connect to, and its address."""
+    server = socket.create_server(("127.0.0.1", 0))
+    return server, "127.0.0.1:{}".format(server.getsockname()[1])
+
+
+@pytest.mark.parametrize(
+    ("given", "variable", "key"),
+    [("{}", None, "hydra.launcher.address"), ("ray://{}", "auto", "hydra.launcher.address"),
+     (None, "{}", r"\$RAY_ADDRESS")],
+)  # fmt: skip
+def test_ray_cluster_that_does_not_answer_is_named_at_once(monkeypatch, given, variable, key):
+    server, place = listening()
+    address = given and given.format(place)
+    if variable:
+        monkeypatch.setenv("RAY_ADDRESS", variable.format(place))
+    settings, ray = RaySettings(**{**RAY, "address": address}), Ray()
+    with server:
+        ray_cluster._connect(ray, settings)
+    assert ray.asked == [address]
+    with pytest.raises(ConfigError, match=rf"^{key}: no Ray cluster at {address or place}: .*refused"):
+        ray_cluster._connect(ray, settings)
+    assert len(ray.asked) == 1
+
+
+@pytest.mark.parametrize("address", [None, "auto", "local"])
+def test_ray_finds_clusters_without_an_address_itself(monkeypatch, address):
+    monkeypatch.delenv("RAY_ADDRESS", raising=False)
+    ray = Ray()
+    ray_cluster._connect(ray, RaySettings(**{**RAY, "address": address}))
+    assert ray.asked == [address]
 
 
 @pytest.fixture

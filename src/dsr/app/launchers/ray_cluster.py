@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import re
+import socket
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +18,11 @@ from dsr.utils.builder import ConfigError
 from dsr.utils.console import one_line
 
 _NAME = "ray"
+_VARIABLE = "RAY_ADDRESS"
+_ADDRESS = re.compile(r"(?:ray://)?\[?(?P<host>[^/\[\]]+)\]?:(?P<port>[0-9]{1,5})")
+"""Address of a cluster that is not found by Ray itself, as ``auto`` is."""
+_PATIENCE = 10.0
+"""Seconds after which a cluster that does not answer is not there; Ray itself waits for minutes."""
 _LOOK = 1.0
 """Seconds after which waiting looks for signals."""
 
@@ -72,10 +80,14 @@ def _call(job: Job) -> JobReturn:
 
 def _connect(ray: Any, settings: RaySettings) -> None:
     """Connect to the cluster, or start Ray on this machine."""
+    given, variable = settings.address, os.environ.get(_VARIABLE)
+    key, address = ("hydra.launcher.address", given) if given or not variable else (f"${_VARIABLE}", variable)
     try:
-        ray.init(address=settings.address, include_dashboard=False, logging_level="warning")
-    except (ConnectionError, ValueError, RuntimeError, TimeoutError) as error:
-        raise ConfigError(f"hydra.launcher.address: no Ray cluster at {settings.address}: {one_line(error)}") from error
+        if address is not None and (named := _ADDRESS.fullmatch(address)):
+            socket.create_connection((named["host"], int(named["port"])), _PATIENCE).close()
+        ray.init(address=given, include_dashboard=False, logging_level="warning")
+    except (OSError, OverflowError, ValueError, RuntimeError) as error:
+        raise ConfigError(f"{key}: no Ray cluster at {address}: {one_line(error)}") from error
     finally:
         interruption.reinstall()  # Ray takes SIGTERM
 
