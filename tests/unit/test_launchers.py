@@ -64,7 +64,7 @@ class Ray:
 def listening():
     """Return a socket that other processes can connect to, and its address."""
     server = socket.create_server(("127.0.0.1", 0))
-    return server, "127.0.0.1:{}".format(server.getsockname()[1])
+    return server, f"127.0.0.1:{server.getsockname()[1]}"
 
 
 @pytest.mark.parametrize(
