@@ -41,6 +41,19 @@ def test_ratios_of_errors_that_do_not_depend_on_the_expected_ones_fall_as_these_
     np.testing.assert_allclose(error_ratios(expected, measured).numpy(), 0.5 / middles, rtol=1e-3)
 
 
+@pytest.mark.parametrize("lowest", [0.0, -0.5])
+def test_values_of_half_precision_are_ordered_as_others_and_equal_ones_as_they_come(lowest: float) -> None:
+    random = np.random.default_rng(2)
+    expected = torch.from_numpy(random.uniform(lowest, 2, 20_000).astype(np.float16).astype(float))
+    expected[:50], expected[50:70] = 0.0, -0.0
+    measured = torch.from_numpy(random.uniform(0, 1, 20_000))
+    assert len(expected.unique()) < 10_000
+    order = np.argsort(expected.numpy(), kind="stable")
+    parts = zip(*(np.array_split(each.numpy()[order], 10) for each in (expected, measured)), strict=True)
+    ratios = [theirs.mean() / own.mean() for own, theirs in parts]
+    np.testing.assert_allclose(error_ratios(expected, measured).numpy(), ratios, rtol=1e-12)
+
+
 def test_ratios_and_share_are_those_of_numpy_over_pixels_that_have_both_errors() -> None:
     random = np.random.default_rng(1)
     expected, measured = random.uniform(0, 2, (2, 3, 1, 17, 23)).astype(np.float32)

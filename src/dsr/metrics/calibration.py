@@ -7,6 +7,7 @@ Expected errors are calibrated if they are right on average both where they are 
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -85,5 +86,19 @@ def _ordered(expected: Tensor, measured: Tensor) -> tuple[Tensor, Tensor]:
         came = f"{tuple(expected.shape)} and {tuple(measured.shape)}"
         raise ValueError(f"expected, measured: expected errors of the same pixels, got shapes {came}")
     valid = expected.isfinite() & measured.isfinite()
-    expected, order = expected[valid].double().sort(stable=True)
-    return expected, measured[valid].double()[order]
+    expected = expected[valid].double()
+    order = _stable_order(expected)
+    return expected[order], measured[valid].double()[order]
+
+
+def _stable_order(values: Tensor) -> Tensor:
+    """Return the indices that sort (N,) values; equal ones keep their order.
+
+    Non-negative values of half precision, as expected errors are stored in, are sorted by radix, which takes a tenth
+    of the time.
+    """
+    halves = values.half()
+    if values.device.type == "cpu" and torch.equal(halves.double(), values) and bool((values >= 0).all()):
+        bits = halves.abs().view(torch.int16)  # ordered as the numbers are
+        return torch.from_numpy(np.argsort(bits.numpy(), kind="stable"))
+    return values.argsort(stable=True)

@@ -24,8 +24,8 @@ NOTHING_VALID, DEPTH_VALID, ALL_VALID = 0, 128, 255
 """Values of a mask: missing; valid depth without a normal; valid depth and normal."""
 _WEBP_LOSSLESS = 101
 """OpenCV's WebP quality for lossless compression."""
-_PNG = (cv2.IMWRITE_PNG_COMPRESSION, 6, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_FILTERED)
-"""The least time for a size: 60 pictures of a report in 0.8 s and 3.9 MB, lossless WebP in 4.7 s and 3.2 MB."""
+_PNG = (cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE)
+"""A third of the time of zlib's level 6 for 8 % more bytes, a fifteenth of that of lossless WebP."""
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ class Level:
     Args:
         quality: WebP quality, 1..100; None for lossless.
         longest: maximum longer side, pixels; larger pictures are reduced.
-        fast: whether lossless pictures are PNG, which takes a sixth of the time of WebP and is a fifth larger.
+        fast: whether lossless pictures are PNG, which takes a fifteenth of the time of WebP and is a third larger.
 
     """
 
