@@ -1,16 +1,19 @@
-"""All metrics of one 512 x 512 pair without LPIPS_v: dsr against scikit-image and numpy, float64, on the CPU.
+"""All metrics of one 512 x 512 pair: dsr against scikit-image and numpy, float64, on the CPU; then LPIPS_v alone.
 
     python benchmarks/metrics_speed.py [--repeats 15] [--device cpu]
 
 Both ways share what can be shared (normals and renderings are computed once) and take turns within the run; the ratio
-of the medians is the result. The largest relative difference of their values is printed too.
+of the medians is the result. The largest relative difference of their values is printed too. LPIPS_v, whose trunk has
+random weights here, is compared with a pass for each image of each light, channel after channel in memory.
 """
 
 from __future__ import annotations
 
 import argparse
+import copy
 import statistics
 import time
+from collections.abc import Callable
 
 import numpy as np
 import torch
@@ -20,7 +23,8 @@ from skimage.metrics import structural_similarity
 from dsr.geometry.camera import Camera
 from dsr.geometry.shading import lights
 from dsr.metrics.catalogue import catalogue, score_image
-from dsr.metrics.functional import BUMPINESS_DISPARITY
+from dsr.metrics.functional import BUMPINESS_DISPARITY, SurfacePair
+from dsr.metrics.lpips import _CONVOLUTIONS, LPIPS, lpips_v
 
 CAMERA = Camera(width=512, height=512, fx=618.0, fy=618.0, cx=255.5, cy=255.5)
 THRESHOLDS = (1, 5, 10)
@@ -83,6 +87,49 @@ def numpy_way(prediction: np.ndarray, target: np.ndarray, rays: np.ndarray) -> l
     return [float(value) for value in values]
 
 
+def in_turns(ways: dict[str, Callable[[], list[float]]], repeats: int) -> None:
+    """Print the median time of each way, its ratio to the first, and how far the values of the last are from its."""
+    seconds: dict[str, list[float]] = {name: [] for name in ways}
+    values: dict[str, list[float]] = {}
+    for turn in range(repeats + 1):
+        for name, way in ways.items():
+            start = time.perf_counter()
+            values[name] = way()
+            if turn:  # the first turn warms up
+                seconds[name].append(time.perf_counter() - start)
+    medians = {name: statistics.median(each) for name, each in seconds.items()}
+    (first, *_), (*_, last) = ways, ways
+    for name, median in medians.items():
+        print(f"{name:<32}{1e3 * median:8.1f} ms{medians[first] / median:8.2f}x")
+    worst = max(abs(a - b) / max(abs(b), 1e-3) for a, b in zip(values[last], values[first], strict=True))
+    print(f"largest difference of {len(values[last])} values, relative: {worst:.1e}")
+
+
+def random_trunk() -> dict[str, torch.Tensor]:
+    """Return random weights for the trunk of LPIPS."""
+    generator, weights = torch.Generator().manual_seed(0), {}
+    for index, (inputs, outputs, kernel, _, _) in _CONVOLUTIONS.items():
+        shape = (outputs, inputs, kernel, kernel)
+        scale = (inputs * kernel**2) ** -0.5
+        weights[f"features.{index}.weight"] = scale * torch.randn(shape, generator=generator)
+        weights[f"features.{index}.bias"] = torch.zeros(outputs)
+    return weights
+
+
+def image_by_image(pair: SurfacePair, network: LPIPS) -> list[float]:
+    """Return LPIPS_v of each light, with a pass of the trunk for each image."""
+    images = [(2 * maps[0].float() - 1)[:, None].expand(-1, 3, -1, -1) for maps in pair.renderings]
+    values = []
+    for light in range(len(images[0])):
+        first, second = (network.features(each[light : light + 1].contiguous()) for each in images)
+        levels = [
+            ((a - b).square() * getattr(network, f"head{level}")).sum(dim=1).mean()
+            for level, (a, b) in enumerate(zip(first, second, strict=True))
+        ]
+        values.append(float(torch.stack(levels).sum()))
+    return values
+
+
 def main() -> None:
     """Time both ways and print their ratio."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
@@ -97,22 +144,19 @@ def main() -> None:
     device_rays = rays.to(device)
     numpy_rays = np.ascontiguousarray(rays.permute(1, 2, 0).numpy())
     metrics = catalogue()
-    seconds: dict[str, list[float]] = {"scikit-image and numpy": [], "dsr": []}
-    for turn in range(repeats + 1):
-        start = time.perf_counter()
-        expected = numpy_way(prediction, target, numpy_rays)
-        middle = time.perf_counter()
-        ours = [score.value for score in score_image(*tensors, device_rays, metrics)]
-        end = time.perf_counter()
-        if turn:  # the first turn warms up
-            seconds["scikit-image and numpy"].append(middle - start)
-            seconds["dsr"].append(end - middle)
-    worst = max(abs(a - b) / max(abs(b), 1e-3) for a, b in zip(ours, expected, strict=True))
-    medians = {name: statistics.median(values) for name, values in seconds.items()}
-    for name, median in medians.items():
-        ratio = medians["scikit-image and numpy"] / median
-        print(f"{name:<24}{1e3 * median:8.1f} ms{ratio:8.2f}x")
-    print(f"largest difference of {len(ours)} values, relative: {worst:.1e}")
+    ours = lambda: [score.value for score in score_image(*tensors, device_rays, metrics)]  # noqa: E731
+    theirs = lambda: numpy_way(prediction, target, numpy_rays)  # noqa: E731
+    in_turns({"scikit-image and numpy": theirs, "dsr": ours}, repeats)
+    pair = SurfacePair(*(each[:, None] for each in tensors), device_rays[None])
+    _ = pair.renderings  # computed before
+    network = LPIPS(random_trunk()).to(device)
+    plain = copy.deepcopy(network).to(memory_format=torch.contiguous_format)  # type: ignore[call-overload]
+
+    def one_pass() -> list[float]:
+        return [float(value) for value in lpips_v(pair, network)[0]]
+
+    with torch.inference_mode():
+        in_turns({"LPIPS_v, image by image": lambda: image_by_image(pair, plain), "LPIPS_v": one_pass}, repeats)
 
 
 if __name__ == "__main__":
