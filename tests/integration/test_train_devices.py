@@ -101,6 +101,14 @@ def test_killed_training_of_two_devices_goes_on_to_the_same_weights(two, environ
     assert same_weights(folder / "two", folder / name)
 
 
+def test_network_with_layers_that_have_no_part_in_it_trains_on_two_devices(tmp_path, environment):
+    fixed = [each for each in SMALL if "scales" not in each]  # three blocks come before the wide layers
+    done = run_python(
+        TRAIN, *fixed, *TWO, "trainer.steps=2", "output_dir=out", cwd=tmp_path, env=environment
+    )  # with layers idle, the second step fails if torch does not look for them
+    assert (done.returncode, done.stderr) == (0, "")
+
+
 def test_job_of_slurm_with_one_task_trains_on_one_device_and_keeps_the_requeue_signal(tmp_path, environment):
     program = tmp_path / "handlers.py"
     program.write_text(

@@ -24,7 +24,7 @@ from dsr.app.devices import Processes, find_processes
 from dsr.app.divergence import NOTE, expect_no_divergence, note_divergence
 from dsr.app.metrics import check_metrics, metric_collection
 from dsr.app.schema import TrainConfig, given_keys, plain_config
-from dsr.app.trainer import seconds_per_step, training_trainer
+from dsr.app.trainer import has_idle_layers, seconds_per_step, training_trainer
 from dsr.app.training_runs import WEIGHTS, common, keyed, read_config, training_data
 from dsr.data.base import prepare_scenes
 from dsr.methods.networks.base import DisparityNetwork
@@ -109,7 +109,8 @@ def _train(plain: dict[str, Any], settings: TrainConfig, device: torch.device, p
     if first:
         _claim(folder, plain, identity, tolerated, progress)
     facts = _facts(plain, module)
-    trainer, best = training_trainer(settings, folder, device, progress, processes)
+    idle = processes.count > 1 and has_idle_layers(module, data.example_batch())
+    trainer, best = training_trainer(settings, folder, device, progress, processes, idle=idle)
     if first:
         _describe(trainer, plain, module, facts, resumed=resume is not None)
     try:

@@ -86,6 +86,8 @@ def training_trainer(
     device: torch.device,
     progress: Progress,
     processes: Processes,
+    *,
+    idle: bool = False,
 ) -> tuple[lightning.Trainer, ModelCheckpoint]:
     """Return the trainer, and the callback that keeps the best checkpoint.
 
@@ -95,6 +97,8 @@ def training_trainer(
         device: to train on.
         progress: shows the steps.
         processes: of the training.
+        idle: whether some layers have no part in some steps, see :func:`has_idle_layers`; several devices have to
+            know.
 
     Raises:
         ConfigError: the log cannot be written, such as without an optional package.
@@ -121,7 +125,7 @@ def training_trainer(
     ]
     with without_chatter():
         logger = build("logger", config.logger, {"folder": folder})
-    varying = "_find_unused_parameters_true" if config.degradation.get("scales") else ""  # layers of one factor alone
+    varying = "_find_unused_parameters_true" if idle or config.degradation.get("scales") else ""  # layers of one factor
     trainer = make_trainer(
         device,
         settings.steps,
@@ -138,12 +142,23 @@ def training_trainer(
 
 def seconds_per_step(module: SuperResolution, batch: Batch) -> float:
     """Measure the seconds of a step; the module is left unchanged."""
+    return _try_steps(module, batch, 2)[0]  # the first one warms up
+
+
+def has_idle_layers(module: SuperResolution, batch: Batch) -> bool:
+    """Return whether a step gives some parameters no gradient; the module is left unchanged."""
+    return _try_steps(module, batch, 1)[1]
+
+
+def _try_steps(module: SuperResolution, batch: Batch, count: int) -> tuple[float, bool]:
+    """Return the seconds of the last of some steps, and whether it left parameters without a gradient."""
     batch = {name: value.to(module.device) for name, value in batch.items()}
     taken, buffers = 0.0, {name: value.clone() for name, value in module.net.named_buffers()}
-    for _ in range(2):  # the first one warms up
+    for _ in range(count):
         start = time.perf_counter()
         module.loss_terms(batch)["loss"].backward()
         taken = time.perf_counter() - start
+    idle = any(each.grad is None for each in module.net.parameters() if each.requires_grad)
     module.net.zero_grad(set_to_none=True)
     module.net.load_state_dict(buffers, strict=False)
-    return taken
+    return taken, idle
