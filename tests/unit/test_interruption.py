@@ -121,6 +121,16 @@ def test_worker_ends_with_its_parent(tmp_path: Path) -> None:
     assert not _is_running(child)
 
 
+def test_worker_that_outlasts_a_signal_to_the_whole_group_ends_some_seconds_later() -> None:
+    worker = (
+        "import os, signal, time\nfrom dsr.utils import interruption\n"
+        "interruption._GRACE = 0.5\ninterruption.outlast_group()\nos.kill(os.getpid(), signal.SIGTERM)\n"
+        "time.sleep(0.2)\nprint('at work', flush=True)\ntime.sleep(60)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", worker], capture_output=True, text=True, timeout=30, check=False)
+    assert (done.returncode, done.stdout, done.stderr) == (143, "at work\n", "")
+
+
 def test_forked_process_leaves_signals_to_its_parent(tmp_path: Path) -> None:
     script = (
         "import os, signal\ndef main():\n    print('ready', flush=True)\n    child = os.fork()\n    if child == 0:\n"

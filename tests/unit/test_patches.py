@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-import multiprocessing.connection
+import multiprocessing
 import os
 import pickle
 import signal
@@ -29,7 +29,6 @@ from dsr.training.data_module import Part, PatchData, WholeScenes
 from dsr.training.degradation import Batch, Degradation, to_tensors
 from dsr.training.patches import Patches
 from dsr.training.settings import PatchSettings
-from dsr.utils import interruption
 
 BOX = Downsampling("box")
 X4 = Degradation(4, BOX)
@@ -137,10 +136,7 @@ def test_workers_cut_the_same_patches_as_the_trainer() -> None:
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="needs signals")
-def test_workers_outlast_a_signal_to_the_whole_group_until_the_trainer_has_ended(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr(interruption, "_GRACE", 3.0)
+def test_workers_outlast_a_signal_to_the_whole_group_until_the_trainer_has_ended() -> None:
     data, alone, before = _data(workers=2), _batches(_data(), 6), set(multiprocessing.active_children())
     data.setup()
     batches = iter(data.train_dataloader())
@@ -153,8 +149,8 @@ def test_workers_outlast_a_signal_to_the_whole_group_until_the_trainer_has_ended
     time.sleep(0.3)  # a worker that has ended is an error as soon as its parent hears of it
     assert _equal([first, *itertools.islice(batches, 5)], alone)
     assert all(worker.is_alive() for worker in workers)
-    with pytest.raises(RuntimeError, match="exited unexpectedly with exit code 143"):
-        multiprocessing.connection.wait([worker.sentinel for worker in workers], 10)
+    del batches  # ends the workers
+    assert not any(worker.is_alive() for worker in workers)
 
 
 def test_loader_begins_at_the_trainers_step_and_has_no_length() -> None:
