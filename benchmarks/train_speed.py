@@ -1,7 +1,7 @@
 """How much faster a training step of MSG-V is than in a plain float32 loop, data included; and where its time goes.
 
-    python benchmarks/train_speed.py [--patch 96] [--batch 5] [--steps 9]
-    python benchmarks/train_speed.py --profile [--steps 40] [model=facets degradation=everything ...]
+    python benchmarks/train_speed.py [--patch 96] [--batch 5] [--steps 9] [--device cuda]
+    python benchmarks/train_speed.py --profile [--steps 40] [--device cuda] [model=facets degradation=everything ...]
 
 With --profile a training as train.py does it, with its log and checks, is timed: the network and its losses forward and
 backward, the patches, the optimiser, and everything else. Other arguments are overrides of train.py's configuration.
@@ -67,17 +67,25 @@ def plain(net: MSGNet) -> MSGNet:
 def step(net: MSGNet, objective: Objective, batch: Batch, *, mixed: bool) -> float:
     """Do forward, loss and backward; return the seconds."""
     start = time.perf_counter()
-    with torch.autocast("cpu", torch.bfloat16, enabled=mixed):
+    with torch.autocast(batch["rgb"].device.type, torch.bfloat16, enabled=mixed):
         disparity = net.upsample(batch["rgb"], batch["disparity_lr"], batch["min_max"])
     objective(disparity.float(), batch)["loss"].backward()
     net.zero_grad(set_to_none=True)
+    wait(batch["rgb"].device)
     return time.perf_counter() - start
+
+
+def wait(device: torch.device) -> None:
+    """Wait until a device has done what it was asked to."""
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
 
 
 class StepTimes(Callback):
     """Collects the seconds of the parts of each step; the last part is what no other has."""
 
-    def __init__(self) -> None:
+    def __init__(self, device: torch.device) -> None:
+        self._device = device
         self.now: dict[str, float] = {}
         self.steps: list[dict[str, float]] = []
         self._begun = 0.0
@@ -87,6 +95,7 @@ class StepTimes(Callback):
         """Add the time of this context to a part."""
         start = time.perf_counter()
         yield
+        wait(self._device)
         self.now[name] = self.now.get(name, 0.0) + time.perf_counter() - start
 
     def timed(self, name: str, function: Callable[..., Any]) -> Callable[..., Any]:
@@ -118,16 +127,15 @@ class LastCallback(Callback):
         self._times.end_step()
 
 
-def profile(steps: int, overrides: Sequence[str]) -> None:
+def profile(steps: int, device: torch.device, overrides: Sequence[str]) -> None:
     """Time the parts of the steps of a training, and print their medians."""
     register()
     conf = Path(__file__).resolve().parents[1] / "conf"
     with hydra.initialize_config_dir(str(conf), version_base="1.3"):
         small = ["dataset.count=8", "metrics.lpips=false", f"trainer.steps={steps}", f"trainer.validate_every={steps}"]
         settings = TrainConfig.of(plain_config(hydra.compose("train", [*small, "loss.w=1", *overrides])))
-    device = torch.device("cpu")
     settings.precision = "float32" if settings.precision == "auto" else settings.precision
-    times = StepTimes()
+    times = StepTimes(device)
     data = training_data(settings)
     module = _module(settings, _network(settings), data, functools.partial(metric_collection, settings.metrics, device))
     data.setup()
@@ -166,9 +174,10 @@ def main() -> None:
     parser.add_argument("--patch", type=int, default=96)
     parser.add_argument("--batch", type=int, default=5)
     parser.add_argument("--steps", type=int, default=9)
+    parser.add_argument("--device", type=torch.device, default="cpu")
     arguments = parser.parse_args()
     if arguments.profile:
-        profile(arguments.steps, arguments.overrides)
+        profile(arguments.steps, arguments.device, arguments.overrides)
         return
     source = SimGeo(size=2 * arguments.patch)
     scenes = [source.load(name) for name in source.scenes()]
@@ -176,8 +185,10 @@ def main() -> None:
     patches = Patches([scenes], settings, Degradation(SCALE, Downsampling("box")), count=arguments.batch)
     start = time.perf_counter()
     batch = torch.utils.data.default_collate([patches[i] for i in range(arguments.batch)])
+    batch = {name: values.to(arguments.device) for name, values in batch.items()}
     loading = time.perf_counter() - start
     net, objective = MSGNet(SCALE, "dsr"), Objective("lap1", 0.1)
+    net = net.to(arguments.device)
     slow = plain(net)
     fast = net.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     ways = {
