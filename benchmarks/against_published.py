@@ -1,7 +1,7 @@
 """The weights that come with dsr against the published MSG-V: the paper's Lucy and Plant, x4 and x8, box downsampling.
 
     python benchmarks/against_published.py --shared DIR [--methods msg_v,facets] [--weights FILE ...]
-        [--ensemble N] [--csv FILE]
+        [--ensemble N] [--csv FILE] [--device cpu]
 
 ``DIR`` has ``scenes/lucy``, ``scenes/plant``, ``expected/metrics.json`` with the published network's scores, and
 ``weights/alexnet_imagenet_features.pth`` for LPIPS_v. Each figure is ours / published, lower is better; none of these
@@ -33,7 +33,7 @@ METRICS = ("RMSE_v", "DSSIM_v", "BadPix_v_5", "Bumpiness_d", "LPIPS_v", "RMSE_d"
 
 
 def scores(
-    shared: Path, name: str, weights: Path, scene: str, metrics: tuple[Metric, ...], ensemble: int | None = None
+    shared: Path, name: str, weights: Path, scene: str, metrics: tuple[Metric, ...], ensemble: int | None, device: str
 ) -> dict[str, float]:
     """Return the worst-of-four scores of a method's network on one scene."""
     scale = read_header(weights)["arguments"]["scale"]
@@ -41,7 +41,7 @@ def scores(
     if ensemble is not None and takes("method", node, "ensemble"):
         node = {**node, "ensemble": ensemble}
     told = {"kernel": "box", "edges": "sharp", "clean": True}
-    method = build_method(node, scale, weights=weights, told=told)
+    method = build_method(node, scale, weights=weights, told=told, device=device)
     sample = make_sample(
         Folder(str(shared / "scenes"), [scene]).load(scene), scale, Downsampling("box"), method.range_type
     )
@@ -52,7 +52,7 @@ def scores(
 
 
 def table(
-    shared: Path, methods: list[str], scales: list[int], files: dict[str, Path], ensemble: int | None = None
+    shared: Path, methods: list[str], scales: list[int], files: dict[str, Path], ensemble: int | None, device: str
 ) -> pd.DataFrame:
     """Return the ratios: a row per method, scale and scene, a column per metric."""
     expected = json.loads((shared / "expected" / "metrics.json").read_text())
@@ -64,7 +64,7 @@ def table(
             weights = files.get(name) or packaged_weights(name)
             for scene in SCENES if weights is not None else ():
                 ours, theirs = (
-                    scores(shared, method, weights, scene, metrics, ensemble),
+                    scores(shared, method, weights, scene, metrics, ensemble, device),
                     expected[scene][f"x{scale}"]["MSG-V"],
                 )
                 worst = {metric: max(value) if isinstance(value, list) else value for metric, value in theirs.items()}
@@ -83,6 +83,7 @@ def main() -> None:
     parser.add_argument(
         "--ensemble", type=int, help="passes to average where the method can; that of eval.py unless given"
     )
+    parser.add_argument("--device", default="cpu")
     parser.add_argument("--csv", type=Path, help="where to write the table to")
     arguments = parser.parse_args()
     if not (arguments.shared / "expected" / "metrics.json").is_file():
@@ -91,7 +92,7 @@ def main() -> None:
     heads = {path: read_header(path) for path in arguments.weights}
     files = {f"{head['model']}_x{head['arguments']['scale']}": path for path, head in heads.items()}
     methods = arguments.methods.split(",")
-    ratios = table(arguments.shared, methods, arguments.scales, files, arguments.ensemble)
+    ratios = table(arguments.shared, methods, arguments.scales, files, arguments.ensemble, arguments.device)
     if arguments.csv:
         ratios.to_csv(arguments.csv, index=False)
     for method, group in ratios.groupby("method", sort=False):

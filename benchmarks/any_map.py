@@ -1,6 +1,7 @@
 """One network on every kind of map: clean and noisy ones, other kernels, real sensors, a simulated phone, the field's.
 
-    python benchmarks/any_map.py --shared DIR WEIGHTS... [--parts clean,kernels,noise,sensor,phone,field] [--hints]
+    python benchmarks/any_map.py --shared DIR WEIGHTS... [--parts clean,kernels,noise,sensor,phone,field]
+        [--hints] [--device cpu]
 
 ``WEIGHTS`` are of trainings of ``model=facets``. Figures with _v are in 1/1000, of the worst of four lights; one pass
 without augmentation. ``--hints`` tells the network what ``eval.py`` does, the kernel and that there is no noise, where
@@ -48,7 +49,8 @@ PAPER = tuple(metric for metric in PROTOCOLS["paper"] if not metric.perceptual)
 class Runner:
     """The method with the weights that suit a map, told what ``eval.py`` tells it."""
 
-    def __init__(self, weights: list[Path], *, hints: bool) -> None:
+    def __init__(self, weights: list[Path], *, hints: bool, device: str) -> None:
+        self.device = device
         self.hints, self.files = hints, {read_header(path)["arguments"]["scale"]: path for path in weights}
         self.scales = [scale for scale in SCALES if scale in self.files]
 
@@ -57,13 +59,14 @@ class Runner:
     ) -> torch.Tensor:
         """Return the high-resolution depth, (1, H, W)."""
         weights = self.files[min(scale for scale in self.files if 1.05 * scale >= sample.scale)]
-        return self._method(weights, *((kernel, "soft" if soft else "sharp", clean) if self.hints else ()))(sample)
+        told = (kernel, "soft" if soft else "sharp", clean) if self.hints else ()
+        return self._method(weights, self.device, *told)(sample)
 
     @staticmethod
     @functools.cache
-    def _method(weights: Path, kernel: Any = None, edges: Edges = "auto", clean: bool = False) -> AnyMap:
+    def _method(weights: Path, device: str, kernel: Any = None, edges: Edges = "auto", clean: bool = False) -> AnyMap:
         """Return the method that is told these facts."""
-        return build_any_map(weights, edges=edges, kernel=kernel, clean=clean)
+        return build_any_map(weights, edges=edges, kernel=kernel, clean=clean, device=device)
 
 
 def scores(depth: torch.Tensor, sample: DepthSample, metrics: Any = PAPER) -> dict[str, float]:
@@ -184,9 +187,10 @@ def main() -> None:
     parser.add_argument("--parts", default=",".join(parts))
     parser.add_argument("--scales", default="4,8")
     parser.add_argument("--hints", action="store_true")
+    parser.add_argument("--device", default="cpu")
     arguments = parser.parse_args()
     SCALES[:] = map(int, arguments.scales.split(","))
-    run = Runner(arguments.weights, hints=arguments.hints)
+    run = Runner(arguments.weights, hints=arguments.hints, device=arguments.device)
     for part in arguments.parts.split(","):
         parts[part](run, arguments.shared)
 

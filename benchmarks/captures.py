@@ -95,7 +95,7 @@ class Capture:
         return {"angle": float(angle.nanmean()), "RMSE_v": values["RMSE_v"], "covered": covered}
 
 
-def run_method(capture: Capture, name: str, shared: Path) -> Tensor:
+def run_method(capture: Capture, name: str, shared: Path, device: str) -> Tensor:
     """Return a method's result as :func:`dsr.inference.upsample_depth` gives it, (1, H, W) in metres.
 
     TGV weights a noisy map by its noise, and networks of other authors take their weights from the shared material.
@@ -116,7 +116,7 @@ def run_method(capture: Capture, name: str, shared: Path) -> Tensor:
         method=name,
         settings=settings,
         fill="none" if keep else "all",
-        device="cpu",
+        device=device,
     )
 
 

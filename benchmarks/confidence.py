@@ -53,8 +53,10 @@ def main() -> None:
     parser.add_argument("--draws", type=int, default=2)
     parser.add_argument("--weights", type=Path)
     parser.add_argument("--picture", type=Path)
+    parser.add_argument("--device", default="cpu")
     arguments = parser.parse_args()
-    method = build_method(read_method("facets", arguments.scale), arguments.scale, weights=arguments.weights)
+    node = read_method("facets", arguments.scale)
+    method = build_method(node, arguments.scale, weights=arguments.weights, device=arguments.device)
     if not isinstance(method, Confident):
         raise TypeError(f"expected a method with expected errors, got {method}")
     expected: dict[str, list[torch.Tensor]] = {"depth": [], "normal": []}

@@ -1,6 +1,7 @@
 """Draw enlarged crops of real and simulated captures, rendered, to look at and for the documentation.
 
     python benchmarks/crops.py --shared DIR [--only NAME,...] [--methods bilateral,tgv,...] [--output DIR]
+        [--device cpu]
 
 Writes ``NAME.jpg`` for each capture: windows of the photo, the input, the methods' results and the truth where there
 is one, all lit by e1, holes in pink. ``DIR`` holds ``real``, ``scenes``, ``weights/peers`` and ``simulate_phone.py``.
@@ -34,7 +35,7 @@ def describe(capture: Capture, found: dict[str, float] | None) -> str:
     return f"{text} / {100 * found['covered']:.0f} %" if capture.measured else text
 
 
-def panels_of(capture: Capture, methods: list[str], shared: Path) -> list[Panel]:
+def panels_of(capture: Capture, methods: list[str], shared: Path, device: str) -> list[Panel]:
     """Return the pictures of a whole capture: photo, input, results and truth, each (H, W) or (H, W, 3)."""
     sample = capture.sample
     size = (sample.camera.height, sample.camera.width)
@@ -44,7 +45,7 @@ def panels_of(capture: Capture, methods: list[str], shared: Path) -> list[Panel]
         Panel("input" + describe(capture, raw), rendering_of_input(sample)),
     ]
     for name in methods:
-        depth = run_method(capture, name, shared)
+        depth = run_method(capture, name, shared, device)
         caption = f"{read_method(name, 4).get('label', name)}{describe(capture, capture.scores(depth))}"
         panels.append(Panel(caption, rendering(depth, sample.camera, LIGHT)))
         print(f"  {caption}".replace("\n", ": "), flush=True)
@@ -65,9 +66,9 @@ def heading_of(name: str, capture: Capture) -> str:
     return f"{text}; whole frame: mean angle between normals / RMSE_v, 1/1000{share}"
 
 
-def draw(name: str, capture: Capture, methods: list[str], shared: Path, output: Path) -> Path:
+def draw(name: str, capture: Capture, methods: list[str], shared: Path, output: Path, device: str) -> Path:
     """Write the picture of a capture."""
-    panels = panels_of(capture, methods, shared)
+    panels = panels_of(capture, methods, shared, device)
     cropped: list[Panel] = []
     for window in capture.windows:
         row = [Panel(panel.caption, panel.picture[window.slices]) for panel in panels]
@@ -84,6 +85,7 @@ def main() -> None:
     parser.add_argument("--only", default=",".join(CAPTURES), help="names of captures; all are the default")
     parser.add_argument("--methods", default=METHODS)
     parser.add_argument("-o", "--output", type=Path, default=Path("outputs/crops"))
+    parser.add_argument("--device", default="cpu")
     options = parser.parse_args()
     options.output.mkdir(parents=True, exist_ok=True)
     for name in options.only.split(","):
@@ -91,7 +93,8 @@ def main() -> None:
             raise SystemExit(f"--only: expected some of {', '.join(CAPTURES)}, got {name}")
         capture = CAPTURES[name](options.shared)
         print(name, flush=True)
-        print(draw(name, capture, options.methods.split(","), options.shared, options.output), flush=True)
+        methods = options.methods.split(",")
+        print(draw(name, capture, methods, options.shared, options.output, options.device), flush=True)
 
 
 if __name__ == "__main__":

@@ -80,14 +80,15 @@ def scores_of(depth: Tensor, sample: DepthSample) -> dict[str, float]:
     return {name: float(value) for name, value in metrics.compute().items()}
 
 
-def optimise(sample: DepthSample, every: int, **settings: Any) -> dict[int, dict[str, float]]:
+def optimise(sample: DepthSample, every: int, device: torch.device, **settings: Any) -> dict[int, dict[str, float]]:
     """Return the scores of the running average at every validation."""
     kind = WarmStarted if "weights" in settings else DeepImagePrior
     with tempfile.TemporaryDirectory() as folder:
         prior = kind(
             scale=sample.scale,
             downsampling=BOX,
-            precision=fast_precision(torch.device("cpu")),  # type: ignore[arg-type]
+            precision=fast_precision(device),  # type: ignore[arg-type]
+            device=device,
             validate_every=every,
             metrics=visual_metrics,
             workspace=Path(folder),
@@ -114,7 +115,7 @@ def ablation(options: argparse.Namespace) -> None:
     print(line("bicubic", scores_of(Interpolation("bicubic")(sample), sample)), flush=True)
     for name, settings in ABLATION.items():
         if not options.only or name.strip() in options.only:
-            found = optimise(sample, options.steps, steps=options.steps, **settings)
+            found = optimise(sample, options.steps, options.device, steps=options.steps, **settings)
             print(line(name, found[options.steps]), flush=True)
 
 
@@ -161,7 +162,7 @@ def stopping(options: argparse.Namespace) -> None:
             for method, loss in (("dip", DIP), ("dip_v", {})):
                 prior = Watched(
                     scale=4, downsampling=BOX, steps=options.steps, validate_every=50, patience=options.patience,
-                    precision=fast_precision(torch.device("cpu")), **loss,  # type: ignore[arg-type]
+                    device=options.device, precision=fast_precision(options.device), **loss,  # type: ignore[arg-type]
                 )  # fmt: skip
                 final, watch = prior(sample), prior.watch
                 kept = {"fixed": (options.steps, final[None])} | watch.stopped
@@ -181,7 +182,9 @@ def warm(options: argparse.Namespace) -> None:
             if given:
                 start = WarmStarted(scale=4, downsampling=BOX, steps=1, **given).base(sample)  # type: ignore[arg-type]
                 print(line(f"{scene}, {model}, 0", scores_of(start, sample)), flush=True)
-            for step, values in optimise(sample, options.steps // 10, steps=options.steps, **given).items():
+            every = options.steps // 10
+            found = optimise(sample, every, options.device, steps=options.steps, **given)
+            for step, values in found.items():
                 print(line(f"{scene}, {model or 'from scratch'}, {step}", values), flush=True)
 
 
@@ -195,6 +198,7 @@ def main() -> None:
     parser.add_argument("--patience", type=int, default=200)
     parser.add_argument("--only", nargs="*", help="names of the ablation's rows")
     parser.add_argument("--threads", type=int, default=torch.get_num_threads())
+    parser.add_argument("--device", type=torch.device, default="cpu")
     options = parser.parse_args()
     torch.set_num_threads(options.threads)
     print("| | " + " | ".join(("RMSE_d, mm", *NAMES[1:])) + " |\n" + "| --- " * (len(NAMES) + 1) + "|")

@@ -1,6 +1,6 @@
 """Measure how flat methods leave two floors that real sensors saw, and beside it how true they leave a person.
 
-    python benchmarks/flatness.py --shared DIR [--methods facets,bilateral,...]
+    python benchmarks/flatness.py --shared DIR [--methods facets,bilateral,...] [--device cpu]
 
 Flatness is the mean angle in degrees between the normals inside a polygon, which is a plane, and their mean: of a
 phone's map at x7.5 (``iphone_lidar``) and of a stereo depth camera's at x1 (``depth_camera_0``). As blur is flat, too,
@@ -88,6 +88,7 @@ def main() -> None:
     parser.add_argument("--methods", default=METHODS)
     parser.add_argument("--floors", default=",".join(FLOORS), help="the floors to measure; both are the default")
     parser.add_argument("--frames", type=int, help="number of frames of ddrnet; all are the default")
+    parser.add_argument("--device", default="cpu")
     options = parser.parse_args()
     shared = options.shared
     floors = {name: CAPTURES[name](shared) for name in options.floors.split(",")}
@@ -100,7 +101,7 @@ def main() -> None:
     for name in filter(None, options.methods.split(",")):
 
         def result(capture: Capture, name: str = name) -> Tensor:
-            return run_method(capture, name, shared)
+            return run_method(capture, name, shared, options.device)
 
         print(row_of(str(read_method(name, 4).get("label", name)), result, floors, frames), flush=True)
 

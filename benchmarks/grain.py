@@ -1,6 +1,7 @@
 """Measure how metrics of renderings react to grain: white noise that is added to a method's depth.
 
     python benchmarks/grain.py --scenes DIR [--method facets] [--scale 4] [--levels 0,0.0001,0.0002,0.0005]
+        [--device cpu]
 
 Noise is normal, its standard deviation a fraction of the depth. Prints a Markdown table; metrics with _v are the worst
 of four lights. LPIPS_v needs AlexNet's weights, see docs/evaluate.md.
@@ -33,9 +34,11 @@ def main() -> None:
     parser.add_argument("--scale", type=int, default=4)
     parser.add_argument("--levels", default="0,0.0001,0.0002,0.0005")
     parser.add_argument("--lpips-trunk", help="AlexNet's weights; without it, as for eval.py")
+    parser.add_argument("--device", default="cpu")
     options = parser.parse_args()
     box = Downsampling("box")
-    method = build_method(read_method(options.method, options.scale), options.scale, downsampling=box)
+    node = read_method(options.method, options.scale)
+    method = build_method(node, options.scale, downsampling=box, device=options.device)
     metrics = chosen_metrics(MetricsConfig(lpips_trunk=options.lpips_trunk), torch.device("cpu"))
     print("| scene | grain | RMSE_v | DSSIM_v | LPIPS_v | RMSE_d, mm |\n| --- | --- | ---: | ---: | ---: | ---: |")
     for name in options.names.split(","):

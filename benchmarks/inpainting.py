@@ -1,6 +1,7 @@
 """How well DIP-V fills holes: its error inside of them against interpolation after a fill with the nearest known pixel.
 
     python benchmarks/inpainting.py --scenes DIR [--steps 400] [--scale 4] [--picture FILE] [--crop N]
+        [--device cpu]
 
 Two kinds of holes are cut into the low-resolution maps of Lucy and Plant: random blobs of 10 % of the pixels, and the
 shadows that a second camera 20 cm to the right would leave. Errors are those of the high-resolution pixels under the
@@ -39,18 +40,19 @@ def centre(scene: Scene, size: int) -> Scene:
     return scene.crop((scene.camera.height - size) // 2, (scene.camera.width - size) // 2, size, size)
 
 
-def results(sample: DepthSample, steps: int) -> dict[str, Tensor]:
+def results(sample: DepthSample, steps: int, device: torch.device) -> dict[str, Tensor]:
     """Return what each method makes of a sample with holes."""
     methods: dict[str, tuple[str, dict[str, Any], str]] = {
         "Bicubic, nearest fill": ("bicubic", {"fill_holes": True}, "float32"),
         "MSG-V": ("msg_v", {}, "float32"),
-        "DIP-V": ("dip_v", {"steps": steps, "validate_every": 0}, fast_precision(torch.device("cpu"))),
+        "DIP-V": ("dip_v", {"steps": steps, "validate_every": 0}, fast_precision(device)),
     }
     found = {}
     for label, (name, settings, precision) in methods.items():
         node = read_method(name, sample.scale, settings)
         if name != "msg_v" or has_weights(node, sample.scale):
-            found[label] = build_method(node, sample.scale, downsampling=BOX, precision=precision)(sample)
+            method = build_method(node, sample.scale, downsampling=BOX, precision=precision, device=device)
+            found[label] = method(sample)
     return found
 
 
@@ -100,6 +102,7 @@ def main() -> None:
     parser.add_argument("--crop", type=int, help="the middle of the scenes alone, so many pixels of it")
     parser.add_argument("--picture", type=Path)
     parser.add_argument("--threads", type=int, default=torch.get_num_threads())
+    parser.add_argument("--device", type=torch.device, default="cpu")
     options = parser.parse_args()
     torch.set_num_threads(options.threads)
     print("| scene, holes, share | method | RMSE_d in holes, mm | RMSE_v in holes |\n| --- | --- | --- | --- |")
@@ -111,7 +114,7 @@ def main() -> None:
             sample = make_sample(scene, options.scale, BOX, "orthogonal", holes=holes)
             cut = sample.depth_lr.isnan()
             under = cut.repeat_interleave(options.scale, 1).repeat_interleave(options.scale, 2)
-            found = results(sample, options.steps)
+            found = results(sample, options.steps, options.device)
             rows.append((f"{name}, {kind}", sample, found))
             for method, depth in found.items():
                 millimetres, visual = errors(depth, sample, under)

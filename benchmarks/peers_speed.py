@@ -1,11 +1,12 @@
-"""How fast the published networks of the field run here, against their authors' own code on the same CPU.
+"""How fast the published networks of the field run here, against their authors' own code on the same device.
 
-Both run on the same enlarged map and photo in one process, in turns, on one thread; the ratios are of CPU seconds. The
-authors' code and weights are not part of dsr: the first argument is a directory with their repositories under the names
-that `git clone` gives them, the second one with their weights (docs/methods.md):
+Both run on the same enlarged map and photo in one process, in turns; the ratios are of CPU seconds on one thread, or of
+the seconds until a GPU is done. The authors' code and weights are not part of dsr: the first argument is a directory
+with their repositories under the names that `git clone` gives them, the second one with their weights
+(docs/methods.md):
 
     python benchmarks/peers_speed.py CHECKOUTS WEIGHTS
-    python benchmarks/peers_speed.py CHECKOUTS WEIGHTS --only pgsr fdkn --size 256
+    python benchmarks/peers_speed.py CHECKOUTS WEIGHTS --only pgsr fdkn --size 256 [--device cuda]
 
 What the authors' files import for their training only and is not installed is replaced by a placeholder.
 """
@@ -71,7 +72,7 @@ def svlrm(checkouts: Path) -> tuple[nn.Module, Callable[[nn.Module, Tensor, Tens
     """Return the authors' network and how it is called with a photo and an enlarged map."""
     net: nn.Module = load_module(checkouts / "SVLRM", "model").SVLRM()
     grey = torch.tensor((0.299, 0.587, 0.114)).view(3, 1, 1)
-    return net, lambda net, rgb, values: net(values, (rgb * grey).sum(dim=1, keepdim=True))[0]
+    return net, lambda net, rgb, values: net(values, (rgb * grey.to(rgb)).sum(dim=1, keepdim=True))[0]
 
 
 def dctnet(checkouts: Path) -> tuple[nn.Module, Callable[[nn.Module, Tensor, Tensor], Tensor]]:
@@ -111,17 +112,17 @@ def scene(size: int) -> tuple[Tensor, Tensor]:
     return rgb[None], (0.3 + 0.1 * torch.sin(9 * x + 4 * y) + 0.5 * disc)[None, None]
 
 
-def ways(name: str, checkouts: Path, weights: Path, size: int) -> dict[str, Callable[[], Tensor]]:
+def ways(name: str, checkouts: Path, weights: Path, size: int, device: torch.device) -> dict[str, Callable[[], Tensor]]:
     """Return the authors' way and ours of refining the same map."""
     scale = SCALES.get(name, 4)
     node = read_method(name, scale)
-    upsampler = build_method(node, scale, weights=weights, device="cpu", precision="float32")
+    upsampler = build_method(node, scale, weights=weights, device=device, precision="float32")
     if not isinstance(upsampler, PeerUpsampler):
         raise TypeError(f"method={name}: expected a published network of the field")
     theirs, call = AUTHORS[name](checkouts)
     theirs.load_state_dict(read_tensors(find_weights(node, scale, weights)))
-    theirs.eval()
-    rgb, values = scene(size)
+    theirs.eval().to(device)
+    rgb, values = (each.to(device) for each in scene(size))
     return {
         "authors": torch.no_grad()(lambda: call(theirs, rgb, values)),
         "dsr": torch.inference_mode()(lambda: upsampler.net(rgb, values)),
@@ -129,14 +130,15 @@ def ways(name: str, checkouts: Path, weights: Path, size: int) -> dict[str, Call
 
 
 def measure(functions: dict[str, Callable[[], Tensor]], runs: int) -> dict[str, float]:
-    """Return the median CPU seconds of each function; they take turns, after one run to warm up."""
+    """Return the median seconds of each function, of the CPU or until the GPU is done; they take turns."""
     seconds: dict[str, list[float]] = {name: [] for name in functions}
     for i in range(runs + 1):
         for name, function in functions.items():
-            start = time.process_time()
-            function()
-            if i > 0:
-                seconds[name].append(time.process_time() - start)
+            start, cpu = time.perf_counter(), time.process_time()
+            if on_gpu := function().is_cuda:
+                torch.cuda.synchronize()
+            if i > 0:  # the first run warms up
+                seconds[name].append(time.perf_counter() - start if on_gpu else time.process_time() - cpu)
     return {name: statistics.median(values) for name, values in seconds.items()}
 
 
@@ -148,19 +150,20 @@ def main() -> None:
     parser.add_argument("--only", nargs="+", choices=AUTHORS, default=list(AUTHORS))
     parser.add_argument("--size", type=int, default=512, help="rows and columns, a multiple of 16")
     parser.add_argument("--runs", type=int, default=3)
+    parser.add_argument("--device", type=torch.device, default="cpu")
     arguments = parser.parse_args()
     if arguments.weights is None:
         print("published networks of the field: skipped, needs their authors' repositories and weights (see --help)")
         return
     torch.set_num_threads(1)
-    if not torch.cuda.is_available():  # the authors' code asks for a GPU
+    if arguments.device.type != "cuda":  # the authors' code asks for a GPU
         torch.Tensor.cuda = lambda self, *_, **__: self  # type: ignore[method-assign,assignment]
     print(f"{'method':10} {'authors, s':>10} {'dsr, s':>8} {'ratio':>6}  max difference")
     for name in arguments.only:
         if name in NEEDED and importlib.util.find_spec(NEEDED[name]) is None:
             print(f"{name:10} left out: its authors' code needs {NEEDED[name]}")
             continue
-        functions = ways(name, arguments.checkouts, arguments.weights, arguments.size)
+        functions = ways(name, arguments.checkouts, arguments.weights, arguments.size, arguments.device)
         seconds = measure(functions, arguments.runs)
         difference = float((functions["dsr"]() - functions["authors"]()).abs().max())
         ratio = seconds["authors"] / seconds["dsr"]

@@ -125,10 +125,10 @@ def window(frames: Sequence[Frame], place: int, count: int) -> list[Frame]:
     return [frames[number] for number in order[:count]]
 
 
-def before(frames: Sequence[Frame], method: str) -> Tensor:
+def before(frames: Sequence[Frame], method: str, device: str) -> Tensor:
     """Return the result of the first frame, from its depth map fused with those of the others."""
     depth_lr = fuse_views(frames[0].view, [frame.view for frame in frames[1:]]).depth
-    return upsample_surface(frames[0].rgb, depth_lr, frames[0].camera, method=method, device="cpu").depth
+    return upsample_surface(frames[0].rgb, depth_lr, frames[0].camera, method=method, device=device).depth
 
 
 def after(frames: Sequence[Frame], results: Sequence[Surface]) -> Tensor:
@@ -165,14 +165,14 @@ def score(result: Tensor, frame: Frame, *, measured: bool) -> float:
     return float(rmse_v(pair))
 
 
-def measure(frames: Sequence[Frame], method: str, *, measured: bool) -> dict[str, tuple[float, float]]:
+def measure(frames: Sequence[Frame], method: str, device: str, *, measured: bool) -> dict[str, tuple[float, float]]:
     """Return RMSE_v and flicker by the way of fusing."""
     middle = range((len(frames) - RESULTS) // 2, (len(frames) - RESULTS) // 2 + RESULTS)
-    singles = [upsample_surface(f.rgb, f.depth_lr, f.camera, method=method, device="cpu") for f in frames]
+    singles = [upsample_surface(f.rgb, f.depth_lr, f.camera, method=method, device=device) for f in frames]
     ways: dict[str, list[Tensor]] = {"1 frame": [singles[place].depth for place in middle]}
     for count in (3, 5):
         groups = [window(frames, place, count) for place in middle]
-        ways[f"{count} frames, before"] = [before(group, method) for group in groups]
+        ways[f"{count} frames, before"] = [before(group, method, device) for group in groups]
         numbers = [[next(i for i, f in enumerate(frames) if f is frame) for frame in group] for group in groups]
         ways[f"{count} frames, after"] = [
             after(group, [singles[number] for number in each]) for group, each in zip(groups, numbers, strict=True)
@@ -242,11 +242,11 @@ def ddrnet(folder: Path) -> list[Frame]:
     return frames
 
 
-def draw(path: Path, frames: Sequence[Frame], method: str) -> None:
+def draw(path: Path, frames: Sequence[Frame], method: str, device: str) -> None:
     """Draw the photo, the results of 1 and 5 frames and the truth, lit from above."""
     centre = frames[len(frames) // 2]
     group = window(frames, len(frames) // 2, 5)
-    depths = (before(group[:1], method), before(group, method), centre.truth.float())
+    depths = (before(group[:1], method, device), before(group, method, device), centre.truth.float())
     rays = centre.camera.rays()[None]
     lit = [render_lights(depth_to_normals(depth[None].double(), rays))[0, 0].clamp(0, 1).numpy() for depth in depths]
     photo = centre.rgb.permute(1, 2, 0).numpy()[..., ::-1]
@@ -278,11 +278,13 @@ def main() -> None:
     shared = Path(os.environ.get("DSR_SHARED", "../shared"))
     parser.add_argument("--ddrnet", type=Path, default=shared / "real" / "ddrnet")
     parser.add_argument("--picture", type=Path, help="draw one scene, and measure nothing")
+    parser.add_argument("--device", default="cpu")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     noise = NOISES[arguments.noise]()
     if arguments.picture:
-        draw(arguments.picture, solids(SOLIDS[-1], arguments.size, arguments.scale, noise), arguments.method)
+        frames = solids(SOLIDS[-1], arguments.size, arguments.scale, noise)
+        draw(arguments.picture, frames, arguments.method, arguments.device)
         return
     made: dict[str, list[Callable[[], list[Frame]]]] = {
         "SimGeo's solids": [partial(solids, name, arguments.size, arguments.scale, noise) for name in SOLIDS],
@@ -291,14 +293,14 @@ def main() -> None:
         ],
     }
     for group, makers in made.items():
-        found = [measure(make(), arguments.method, measured=False) for make in makers]
+        found = [measure(make(), arguments.method, arguments.device, measured=False) for make in makers]
         if found:
             print(f"{group}, {len(found)}, x{arguments.scale}, noise={arguments.noise}", flush=True)
             show({name: (mean(each[name][0] for each in found), mean(each[name][1] for each in found))
                   for name in found[0]})  # fmt: skip
     if arguments.ddrnet.is_dir():
         print("DDRNet's sensor")
-        show(measure(ddrnet(arguments.ddrnet), arguments.method, measured=True))
+        show(measure(ddrnet(arguments.ddrnet), arguments.method, arguments.device, measured=True))
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
 """Frames a second of ``dsr upsample`` per core, with one and with two workers, and where the time goes.
 
     python benchmarks/throughput.py [--frames 24] [--rounds 3] [--rgb PHOTO --depth MAP] [--method facets]
-                                   [--only depth]
+                                   [--only depth] [--device cpu]
     python benchmarks/throughput.py --profile
     python benchmarks/throughput.py --list 100000
 
@@ -184,6 +184,7 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--method", default="facets")
     parser.add_argument("--only", default="", help="parts to write; everything by default")
+    parser.add_argument("--device", default="cpu", help="of the networks; one GPU is shared by the workers")
     parser.add_argument("--profile", action="store_true", help="only say where the time goes")
     parser.add_argument("--list", type=int, metavar="N", help="only list N small files")
     options = parser.parse_args()
@@ -201,7 +202,8 @@ def main() -> None:
                     target = folder / name / kind / f"{number:05}{path.suffix}"
                     target.parent.mkdir(parents=True, exist_ok=True)
                     shutil.copy(path, target)
-        given = ["--method", options.method, *(["--only", options.only] if options.only else [])]
+        given = ["--method", options.method, "--device", options.device]
+        given += ["--only", options.only] if options.only else []
         if options.profile:
             profile(folder, folder / "few", given, 6)
         else:

@@ -66,12 +66,13 @@ def main() -> None:
         f"{options.method} x{scale}, {width} x {height}: {seconds:.0f} s, {peak():.2f} GB at most, {before:.2f} before"
     )
     if options.seams:
-        seams(rgb, coarse.reciprocal(), options.method, scale)
+        seams(rgb, coarse.reciprocal(), options.method, scale, options.device)
 
 
-def seams(rgb: Tensor, inverse: Tensor, method: str, scale: int) -> None:
+def seams(rgb: Tensor, inverse: Tensor, method: str, scale: int, device: str) -> None:
     """Print how much answers with tiles of two sizes differ."""
-    net = build_method(read_method(method, scale, {"ensemble": 1}), scale, device="cpu", precision="float32")
+    net = build_method(read_method(method, scale, {"ensemble": 1}), scale, device=device, precision="float32")
+    rgb, inverse = rgb.to(device), inverse.to(device)
     with torch.inference_mode():
         usual = net.upsample_disparity(rgb[None], inverse[None])
         net.tile = network.TILE * 5 // 8

@@ -1,6 +1,7 @@
 """Time of ``dsr upsample`` on a phone's frame, and how the rate of many frames grows with workers; peak memory.
 
     python benchmarks/upsample_speed.py --rgb PHOTO --depth MAP [--frames 20] [--method facets]
+        [--device cpu]
 
 Prints the seconds of one frame without the mesh, then those of a frame in a folder of copies: with one worker on one
 core, and with two workers on two. Memory is the largest of a process.
@@ -41,9 +42,10 @@ def main() -> None:
     parser.add_argument("--depth", type=Path, required=True)
     parser.add_argument("--frames", type=int, default=20)
     parser.add_argument("--method", default="facets")
+    parser.add_argument("--device", default="cpu")
     options = parser.parse_args()
     cores = sorted(os.sched_getaffinity(0))[:2]
-    method = ["--method", options.method]
+    method = ["--method", options.method, "--device", options.device]
     with tempfile.TemporaryDirectory() as place:
         folder = Path(place)
         for number in range(options.frames + 1):
