@@ -121,11 +121,16 @@ def render(scene: World, camera: Camera) -> tuple[NDArray[np.uint8], Array]:
 
 def _supersample(scene: World, camera: Camera, rays: Array) -> Array:
     """Return the mean linear RGB (3, N) of 3 x 3 rays around each of ``rays``; each uses a ninth of the light."""
+    offsets = np.array([(du / camera.fx, dv / camera.fy, 0.0) for du, dv in _SUBPIXELS])
+    moved = (rays[:, None] + offsets.T[..., None]).reshape(3, -1)
+    depth, index = np.empty(moved.shape[1]), np.empty(moved.shape[1], np.intp)
+    for start in range(0, depth.size, _CHUNK):
+        part = slice(start, start + _CHUNK)
+        depth[part], index[part] = cast(scene, moved[:, part])
     total = np.zeros_like(rays)
-    for number, (du, dv) in enumerate(_SUBPIXELS):
-        moved = rays + np.array([[du / camera.fx], [dv / camera.fy], [0.0]])
-        depth, index = cast(scene, moved)
-        total += shade(scene, depth * moved, index, scene.lights[:, number::9])
+    for number in range(len(_SUBPIXELS)):
+        part = slice(number * rays.shape[1], (number + 1) * rays.shape[1])
+        total += shade(scene, depth[part] * moved[:, part], index[part], scene.lights[:, number::9])
     return total / len(_SUBPIXELS)
 
 
