@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Sequence
+import time
+from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import as_completed
 from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
@@ -12,6 +13,9 @@ from dsr.sample import Scene
 from dsr.synthetic.procedural.scenes import PROCEDURAL_VERSION, render_random_scene
 from dsr.synthetic.rendering import cache_directory, load_or_render
 from dsr.utils.workers import WorkerPool
+
+_WORTH_WORKERS = 5.0
+"""Seconds of rendering from which worker processes are used; they take some seconds to start."""
 
 
 class Procedural:
@@ -51,7 +55,9 @@ class Procedural:
         return f"procedural-v{PROCEDURAL_VERSION}-{self._seed}-{self._size}-{scene}"
 
     def prepare(self, scenes: Sequence[str]) -> Iterable[str]:
-        """Render scenes that are not in the cache, on all processors, and yield the name of each that is ready.
+        """Render scenes that are not in the cache, and yield the name of each that is ready.
+
+        Where it takes longer than a few seconds, all processors take part.
 
         Raises:
             ChildProcessError: a process that renders was ended.
@@ -60,10 +66,18 @@ class Procedural:
         there = {scene: (cache_directory() / self._path(scene)).is_file() for scene in scenes}
         missing = [scene for scene in scenes if not there[scene]]
         yield from (scene for scene in scenes if there[scene])
-        if not missing:
-            return
-        workers = min(len(missing), os.cpu_count() or 1)
-        with WorkerPool(workers) as pool:
+        begun = time.perf_counter()
+        for number, scene in enumerate(missing, start=1):
+            self._render(scene)
+            yield scene
+            rest = missing[number:]
+            if len(rest) * (time.perf_counter() - begun) / number > _WORTH_WORKERS:
+                yield from self._render_in_workers(rest)
+                return
+
+    def _render_in_workers(self, missing: Sequence[str]) -> Iterator[str]:
+        """Render scenes on all processors."""
+        with WorkerPool(min(len(missing), os.cpu_count() or 1)) as pool:
             jobs = {pool.submit(self._render, scene): scene for scene in missing}
             for job in as_completed(jobs):
                 try:
