@@ -82,7 +82,10 @@ def train(config: DictConfig) -> float:
         try:
             return _train(plain, settings, device, processes)
         except (ConfigError, KeyboardInterrupt) as error:  # the first process says so
-            sys.exit(interruption.exit_code() if isinstance(error, KeyboardInterrupt) else USAGE_ERROR)
+            if not isinstance(error, KeyboardInterrupt):
+                sys.exit(USAGE_ERROR)
+            interruption.await_requeue()
+            sys.exit(interruption.exit_code())
 
 
 def _train(plain: dict[str, Any], settings: TrainConfig, device: torch.device, processes: Processes) -> float:

@@ -55,13 +55,16 @@ class Interruption(Callback):
     Args:
         path: the checkpoint's path.
 
+    Attributes:
+        requested: whether this process was asked to end, also if it does not act upon that.
+
     """
 
     def __init__(self, path: Path) -> None:
         self._path = path
         self._stack = contextlib.ExitStack()
         self._interruption: interruption.Deferred | None = None
-        self._acts = True
+        self.requested, self._acts = False, True
         self._checkpoint: dict[str, Any] | None = None
 
     def on_train_start(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
@@ -117,6 +120,8 @@ class Interruption(Callback):
         self._close()
 
     def _close(self) -> None:
+        if self._interruption is not None:
+            self.requested = self._interruption.requested
         self._stack.close()
         self._interruption = self._checkpoint = None
 

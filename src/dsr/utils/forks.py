@@ -176,6 +176,8 @@ def _serve(connection: Connection, parent: int, work: Callable[[Any], Any]) -> N
         item = connection.recv()
         try:
             answer = (True, work(item))
+        except KeyboardInterrupt:  # SIGTERM came while the work noted signals, to save what it has
+            return
         except Exception as error:
             answer = (False, error)
         connection.send(answer)

@@ -205,6 +205,12 @@ def requeued() -> Iterator[None]:
         signal.signal(_PREEMPTION, requeue)
 
 
+def await_requeue() -> None:
+    """Leave the first process of a job the time to ask for its requeue: the end of a process may end the whole job."""
+    if _State.requeues:
+        time.sleep(_GRACE)
+
+
 @contextlib.contextmanager
 def starting_workers(*further: signal.Signals) -> Iterator[None]:
     """Within this context started processes do not get SIGINT, which would meet them before :func:`end_with`.
@@ -307,7 +313,8 @@ def _watch(pipe: int) -> None:
     """End the process some seconds after a signal, or at a second one, whatever the main thread is busy with."""
     signals = 0
     while True:
-        if signals and not select.select([pipe], [], [], _GRACE)[0]:
+        grace = 2 * _GRACE if _State.silent else _GRACE  # another process may need this one to complete its step
+        if signals and not select.select([pipe], [], [], grace)[0]:
             end(_message())
         number = os.read(pipe, 1)[0]
         if number in _SIGNALS:

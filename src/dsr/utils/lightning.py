@@ -20,7 +20,8 @@ from lightning.pytorch.utilities import rank_zero_only
 from torch.utils.tensorboard.summary import hparams
 
 from dsr.utils import interruption
-from dsr.utils.checkpoints import AtomicCheckpoints, CheckpointError, Resumed
+from dsr.utils.builder import ConfigError
+from dsr.utils.checkpoints import AtomicCheckpoints, CheckpointError, Interruption, Resumed
 from dsr.utils.files import replacing
 from dsr.utils.progress import Progress, Task
 from dsr.utils.space import FullDiskError, space_for
@@ -31,6 +32,26 @@ LOG_EVERY = 10
 """Steps between two values of a training in its log."""
 _SECONDS_BETWEEN_LOSSES = 0.2
 """Between two losses that are fetched from the device to be shown, each of which waits for it."""
+
+
+_LOST = ("Connection closed", "Connection reset", "Broken pipe")
+"""What gloo says when another process is gone."""
+
+
+class LostProcessError(ConfigError):
+    """Another process of a training on several devices has ended.
+
+    Args:
+        error: what a communication with it raised.
+
+    """
+
+    def __init__(self, error: Exception) -> None:
+        text = str(error).partition("]")[2] or str(error)
+        reason = text.strip().partition("\n")[0].partition(". ")[0]
+        super().__init__(
+            f"another process of the training has ended ({reason}); the same command goes on from the latest checkpoint"
+        )
 
 
 class Scored(Protocol):
@@ -228,6 +249,7 @@ def fit(
         KeyboardInterrupt: the training was interrupted.
         FullDiskError: there is no space for its log or a checkpoint.
         CheckpointError: the checkpoint to go on from is damaged, or one of another training.
+        LostProcessError: another process of it has ended, and this one has not been interrupted.
 
     """
     resumed = Resumed()
@@ -241,6 +263,10 @@ def fit(
     except Exception as error:
         if _follows_interruption(error):  # Lightning's teardown fails if the interruption met its setup
             raise KeyboardInterrupt from error
+        if _is_lost(error):
+            if any(each.requested for each in trainer.callbacks if isinstance(each, Interruption)):  # type: ignore[attr-defined]
+                raise KeyboardInterrupt from error  # the first process has saved the step
+            raise LostProcessError(error) from error
         if resume is None or resumed.begun or isinstance(error, OSError | FullDiskError):
             raise
         raise CheckpointError(resume, error) from error
@@ -255,6 +281,14 @@ def _follows_interruption(error: BaseException | None) -> bool:
     while error is not None and not isinstance(error, KeyboardInterrupt):
         error = error.__context__
     return error is not None
+
+
+def _is_lost(error: Exception) -> bool:
+    """Return whether an error says that another process of the training is gone."""
+    if not torch.distributed.is_available():
+        return False
+    gone = isinstance(error, RuntimeError) and "gloo" in str(error) and any(text in str(error) for text in _LOST)
+    return gone or isinstance(error, torch.distributed.DistError)
 
 
 def _lightning_devices(device: torch.device, count: int) -> Any:
@@ -288,6 +322,7 @@ def without_chatter() -> Iterator[None]:
             warnings.filterwarnings("ignore", ".*does not have many workers.*")
             warnings.filterwarnings("ignore", ".*smaller than the logging interval.*")
             warnings.filterwarnings("ignore", ".*sync_dist=True.*")  # metrics are the same on every device
+            warnings.filterwarnings("ignore", ".*was called before the ``update``.*")  # devices may have no scene
             for resumed in ("exists and is not empty", "that ended before the epoch ended", "dirpath has changed"):
                 warnings.filterwarnings("ignore", f".*{resumed}.*")
             warnings.filterwarnings("ignore", ".*`srun` command is available.*")  # a sweep's or a login node's Slurm
