@@ -1,21 +1,24 @@
 """Python programs as processes of their own, without the seconds that each takes to import torch and Lightning.
 
 A process per worker of the tests imports them once, and each program runs in a fork of it: with a directory, an
-environment, arguments, output and an exit code of its own. Tests of how commands start and of signals use
-:mod:`subprocess` itself.
+environment, arguments, output and an exit code of its own. Tests of how commands start use :mod:`subprocess` itself.
 """
 
 from __future__ import annotations
 
 import atexit
+import contextlib
 import functools
 import json
 import os
+import select
+import signal
 import subprocess
 import sys
 import tempfile
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any, Self
 
 SERVER = Path(__file__).with_name("command_server.py")
 
@@ -31,31 +34,92 @@ def _server() -> subprocess.Popen[str]:
     return process
 
 
-def run_python(
-    *arguments: str, cwd: Path, env: Mapping[str, str] | None = None, timeout: float = 300
-) -> subprocess.CompletedProcess[str]:
-    """Run a Python program.
+def _ask(request: Mapping[str, Any]) -> Any:
+    """Return the answer of the process."""
+    server = _server()
+    assert server.stdin is not None
+    assert server.stdout is not None
+    print(json.dumps(request), file=server.stdin, flush=True)
+    return json.loads(server.stdout.readline())
+
+
+class Program:
+    """A Python program at work; used as a context manager, it is killed at the end if it is still at work.
 
     Args:
         arguments: the program's path, or ``-m`` and a module's name, and its arguments.
         cwd: directory that it runs in.
         env: its environment; None for that of the tests.
+
+    Attributes:
+        pid: number of the process, which leads a group of its own.
+        returncode: the exit code, None until :meth:`communicate` has seen its end.
+
+    """
+
+    def __init__(self, *arguments: str, cwd: Path, env: Mapping[str, str] | None = None) -> None:
+        self.arguments = arguments
+        self.returncode: int | None = None
+        self._folder = tempfile.TemporaryDirectory()
+        self._outputs = [Path(self._folder.name) / name for name in ("stdout", "stderr")]
+        stdout, stderr = map(str, self._outputs)
+        environment = dict(os.environ if env is None else env)
+        self.pid: int = _ask({"arguments": arguments, "cwd": str(cwd), "env": environment, "stdout": stdout,
+                              "stderr": stderr})  # fmt: skip
+        self._handle = os.pidfd_open(self.pid)
+
+    def __enter__(self) -> Self:
+        """Return itself."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Kill it if it is still at work."""
+        if self.returncode is None:
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                self.communicate(0)
+
+    @property
+    def ended(self) -> bool:
+        """Whether it has ended."""
+        return self.returncode is not None or bool(select.select([self._handle], [], [], 0)[0])
+
+    def send_signal(self, number: int) -> None:
+        """Send it a signal."""
+        signal.pidfd_send_signal(self._handle, number)
+
+    def communicate(self, timeout: float = 300) -> tuple[str, str]:
+        """Wait for its end, and return what it wrote to stdout and stderr.
+
+        Raises:
+            subprocess.TimeoutExpired: it took longer, and was killed.
+
+        """
+        self.returncode = _ask({"process": self.pid, "timeout": timeout})
+        os.close(self._handle)
+        stdout, stderr = (path.read_text(encoding="utf-8") if path.exists() else "" for path in self._outputs)
+        self._folder.cleanup()
+        if self.returncode is None:
+            self.returncode = -signal.SIGKILL
+            raise subprocess.TimeoutExpired(self.arguments, timeout, stdout, stderr)
+        return stdout, stderr
+
+
+def run_python(
+    *arguments: str, cwd: Path, env: Mapping[str, str] | None = None, timeout: float = 300
+) -> subprocess.CompletedProcess[str]:
+    """Run a Python program to its end.
+
+    Args:
+        arguments: see :class:`Program`, also for the next ones.
+        cwd: see there.
+        env: see there.
         timeout: seconds after which it is killed.
 
     Raises:
         subprocess.TimeoutExpired: it took longer.
 
     """
-    server = _server()
-    assert server.stdin is not None
-    assert server.stdout is not None
-    with tempfile.TemporaryDirectory() as folder:
-        outputs = [str(Path(folder) / name) for name in ("stdout", "stderr")]
-        request = {"arguments": arguments, "cwd": str(cwd), "env": dict(os.environ if env is None else env),
-                   "timeout": timeout, "stdout": outputs[0], "stderr": outputs[1]}  # fmt: skip
-        print(json.dumps(request), file=server.stdin, flush=True)
-        code = json.loads(server.stdout.readline())
-        texts = [Path(name).read_text(encoding="utf-8") if Path(name).exists() else "" for name in outputs]
-    if code is None:
-        raise subprocess.TimeoutExpired(arguments, timeout, *texts)
-    return subprocess.CompletedProcess(arguments, code, *texts)
+    program = Program(*arguments, cwd=cwd, env=env)
+    outputs = program.communicate(timeout)
+    assert program.returncode is not None
+    return subprocess.CompletedProcess(arguments, program.returncode, *outputs)

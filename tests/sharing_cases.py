@@ -16,6 +16,7 @@ from dsr.geometry.camera import Camera
 from dsr.methods.base import NoSolutionError
 from dsr.metrics.catalogue import catalogue
 from dsr.sample import Scene
+from dsr.utils import interruption
 from dsr.utils.forks import Forks
 from dsr.utils.progress import SILENT, Progress
 
@@ -191,6 +192,23 @@ def test_forks_try_again_what_somebody_else_has(tmp_path):
 
     with Forks(2, work, lambda item: "lost", lambda line: None) as forks:
         assert sorted(forks.results(["a", "b", "c"])) == [("a", "A"), ("b", "B"), ("c", "C")]
+
+
+def test_worker_that_stops_at_a_signal_ends_without_a_word_and_another_begins_again(tmp_path, capfd):
+    def work(item):
+        if not (tmp_path / item).exists():
+            (tmp_path / item).touch()
+            with interruption.deferred("") as noted:
+                os.kill(os.getpid(), signal.SIGTERM)  # as of a scheduler, to all processes
+                assert noted.requested
+            raise KeyboardInterrupt("saved")
+        return item.upper()
+
+    told = Told()
+    with Forks(1, work, lambda item: "lost", told.say) as forks:
+        assert list(forks.results(["a"])) == [("a", "A")]
+    assert told.lines == ["a: the worker was ended before it had a result; another one begins it again"]
+    assert capfd.readouterr().err == ""
 
 
 def test_forks_end_with_their_context():

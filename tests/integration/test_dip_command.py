@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import json
-import os
 import re
 import signal
 import subprocess
@@ -17,14 +16,13 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from commands import run_python
+from commands import Program, run_python
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from dsr.app.entry import run_command
 from dsr.app.evaluate import evaluate
 
 REPOSITORY = Path(__file__).resolve().parents[2]
-ENVIRONMENT = {**os.environ, "OMP_NUM_THREADS": "1"}
 QUICK = (
     "dataset.size=48", "metrics.lpips=false", "method.steps=40", "method.widths=[8,16]", "method.skips=[2,2]",
     "method.validate_every=20",
@@ -74,7 +72,7 @@ def both(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, subprocess.Com
     """The run's directory and the finished process of an evaluation of two scenes."""
     folder = tmp_path_factory.mktemp("both")
     _, *command = _command("method=dip_v", "dataset.scenes=[statue,cube_no_texture]", "output_dir=out")
-    done = run_python(*command, cwd=folder, env=ENVIRONMENT)
+    done = run_python(*command, cwd=folder)
     return folder / "out", done
 
 
@@ -142,10 +140,7 @@ def test_second_run_reuses_what_is_there(both: tuple[Path, subprocess.CompletedP
 
 def test_interrupted_run_resumes_within_the_image(tmp_path: Path, run: Run) -> None:
     arguments = ("method=dip_v", "dataset.scenes=[statue]", "method.steps=60", "method.validate_every=10")
-    with subprocess.Popen(
-        _command(*arguments, "output_dir=out"), cwd=tmp_path, env=ENVIRONMENT, stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE, text=True,
-    ) as process:  # fmt: skip
+    with Program(*_command(*arguments, "output_dir=out")[1:], cwd=tmp_path) as process:
         table, deadline = tmp_path / "out" / "optimisation" / "statue" / "validation.csv", time.monotonic() + 60
         while not table.is_file() and time.monotonic() < deadline:
             time.sleep(0.02)

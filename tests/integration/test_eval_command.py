@@ -6,7 +6,6 @@ import math
 import os
 import re
 import signal
-import subprocess
 import sys
 import time
 from pathlib import Path
@@ -15,7 +14,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from commands import run_python
+from commands import Program, run_python
 
 from dsr.app.entry import run_command
 from dsr.app.evaluate import evaluate
@@ -490,10 +489,7 @@ def test_picture_too_small_for_the_scale_is_refused_by_name(tmp_path, within, si
 
 def test_interrupted_run_keeps_finished_scenes_and_resumes(tmp_path, offline):
     arguments = ("dataset=simgeo", "dataset.size=256", "output_dir=out", "metrics.lpips=false")
-    with subprocess.Popen(
-        command(*arguments), cwd=tmp_path, env=offline, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # noqa: PLW1509 - background jobs ignore it
-    ) as process:  # fmt: skip
+    with Program(*command(*arguments)[1:], cwd=tmp_path, env=offline) as process:
         deadline = time.monotonic() + 60
         while not list((tmp_path / "out" / "predictions").glob("[!.]*.npz")) and time.monotonic() < deadline:
             time.sleep(0.02)
@@ -510,33 +506,30 @@ def test_interrupted_run_keeps_finished_scenes_and_resumes(tmp_path, offline):
 def test_concurrent_runs_do_not_disturb_each_other(tmp_path, offline):
     for name in ("a", "b"):
         write_scene(tmp_path / "data" / name)
-    arguments = command("dataset=folder", "dataset.root=data", "metrics.lpips=false", "output_dir=out")
-    pair = [
-        subprocess.Popen(
-            arguments, cwd=tmp_path, env=offline, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
-        )
-        for _ in range(2)
-    ]
+    arguments = command("dataset=folder", "dataset.root=data", "metrics.lpips=false", "output_dir=out")[1:]
+    pair = [Program(*arguments, cwd=tmp_path, env=offline) for _ in range(2)]
     errors = [process.communicate(timeout=100)[1] for process in pair]
     assert [process.returncode for process in pair] == [0, 0], errors
     assert tree(tmp_path / "out") == written(["a", "b"])
 
 
 def test_several_workers_and_commands_give_the_files_of_one(tmp_path, offline):
-    shared = ("dataset.size=64", "metrics.lpips=false", "threads=1", "method=msg_v")
+    scenes = ["cube_no_texture", "sphere_cylinder_low_freq", "statue"]
+    shared = ("dataset.size=64", f"dataset.scenes=[{','.join(scenes)}]", "metrics.lpips=false", "threads=1",
+              "method=msg_v")  # fmt: skip
     assert run(tmp_path, offline, *shared, "workers=1", "output_dir=one").returncode == 0
     done = run(tmp_path, offline, *shared, "workers=3", "output_dir=three")
     assert (done.returncode, done.stderr) == (0, "")
-    assert tree(tmp_path / "three") == tree(tmp_path / "one") == written(SIMGEO)
+    assert tree(tmp_path / "three") == tree(tmp_path / "one") == written(scenes)
     scores = [(tmp_path / name / "scores.csv").read_bytes() for name in ("one", "three")]
     assert scores[0] == scores[1]
-    for scene in SIMGEO:
+    for scene in scenes:
         maps = [np.load(tmp_path / name / "predictions" / f"{scene}.npz")["depth"] for name in ("one", "three")]
         np.testing.assert_array_equal(*maps)
     again = run(tmp_path, offline, *shared, "workers=2", "output_dir=three")
-    assert "predictions re-used: 6" in again.stdout
+    assert "predictions re-used: 3" in again.stdout
     summaries = [json.loads((tmp_path / name / "summary.json").read_text()) for name in ("one", "three")]
-    assert [list(each["seconds"]) for each in summaries] == [list(SIMGEO)] * 2
+    assert [list(each["seconds"]) for each in summaries] == [scenes] * 2
 
 
 def test_msg_v_reproduces_the_protocol_on_the_released_scenes(shared, tmp_path, within):

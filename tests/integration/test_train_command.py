@@ -7,7 +7,6 @@ import os
 import re
 import shutil
 import signal
-import subprocess
 import sys
 import time
 from pathlib import Path
@@ -15,7 +14,7 @@ from pathlib import Path
 import pytest
 import torch
 import yaml
-from commands import run_python
+from commands import Program, run_python
 from safetensors.torch import load_file
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
@@ -462,13 +461,11 @@ def test_training_that_lacks_only_its_weights_file_gets_it(smoke, tmp_path, with
 @contextlib.contextmanager
 def running(tmp_path, environment, *arguments):
     """Run a training of many steps in a process of its own; yield it once there is something to go on from."""
-    with subprocess.Popen(
-        [sys.executable, str(REPOSITORY / "train.py"), *SMOKE, "output_dir=out", *arguments],
-        cwd=tmp_path, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-    ) as process:  # fmt: skip
+    command = (str(REPOSITORY / "train.py"), *SMOKE, "output_dir=out", *arguments)
+    with Program(*command, cwd=tmp_path, env=environment) as process:
         deadline = time.monotonic() + 60
         last = tmp_path / "out" / "checkpoints" / "last.ckpt"
-        while not last.exists() and process.poll() is None and time.monotonic() < deadline:
+        while not last.exists() and not process.ended and time.monotonic() < deadline:
             time.sleep(0.02)
         yield process
 
@@ -561,7 +558,8 @@ def test_resume_from_any_step_gives_bit_identical_weights(tmp_path, within, monk
 def test_killed_run_resumes_to_bit_identical_weights(tmp_path, within, environment):
     many = ("trainer.steps=24", "trainer.validate_every=4")
     with running(tmp_path, environment, *many) as process:
-        process.kill()
+        process.send_signal(signal.SIGKILL)
+        process.communicate()
     assert process.returncode == -signal.SIGKILL
     assert not (tmp_path / "out" / "weights.safetensors").exists()
     code, output, errors = within("resume=out")

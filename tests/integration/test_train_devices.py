@@ -2,11 +2,12 @@
 
 import csv
 import os
+import socket
 from pathlib import Path
 
 import pytest
 import torch
-from commands import run_python
+from commands import Program, run_python
 from safetensors.torch import load_file
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
@@ -76,7 +77,7 @@ import dsr.app.trainer as trainer
 
 class Killing(trainer.StepProgress):
     def on_train_batch_start(self, each, *_):
-        if each.global_step == {step} and each.is_global_zero:
+        if each.global_step == {step} and each.global_rank in {ranks}:
             os.kill(os.getpid(), signal.{name})
 
 trainer.StepProgress = Killing
@@ -86,20 +87,53 @@ if __name__ == "__main__":
 """
 
 
+def killer(folder, step, name, ranks):
+    """Write a program that trains until a step at which some of its processes get a signal, and return its path."""
+    program = folder / f"{name}_{step}.py"
+    program.write_text(KILLER.format(source=str(REPOSITORY / "src"), step=step, name=name, ranks=ranks))
+    return str(program)
+
+
+def as_torchrun(program, folder, environment, *arguments):
+    """Run the two processes of a training as torchrun starts them; return their exit codes and lines of errors."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = str(free.getsockname()[1])
+    common = {"TORCHELASTIC_RUN_ID": "1", "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": port, "WORLD_SIZE": "2",
+              "LOCAL_WORLD_SIZE": "2", "GROUP_RANK": "0"}  # fmt: skip
+    pair = [
+        Program(program, *SMALL, *TWO, *arguments, cwd=folder,
+                env={**environment, **common, "RANK": str(rank), "LOCAL_RANK": str(rank)})
+        for rank in range(2)
+    ]  # fmt: skip
+    errors = [each.communicate(100)[1].splitlines() for each in pair]
+    return [each.returncode for each in pair], errors
+
+
 def test_killed_training_of_two_devices_goes_on_to_the_same_weights(two, environment):
     folder, _ = two
-    for step, name, code in [(1, "SIGTERM", 143), (3, "SIGKILL", -9)]:
-        program = folder / f"killed_{name}.py"
-        program.write_text(KILLER.format(source=str(REPOSITORY / "src"), step=step, name=name))
-        done = run_python(str(program), *SMALL, *TWO, "output_dir=killed", cwd=folder, env=environment)
-        assert done.returncode == code, done.stderr
-        assert ("resumed" in done.stdout) == (name == "SIGKILL")
-        if name == "SIGTERM":
-            assert done.stderr.splitlines() == ["interrupted at step 2; resume=killed goes on from there"]
+    codes, errors = as_torchrun(killer(folder, 1, "SIGTERM", (0, 1)), folder, environment, "output_dir=killed")
+    assert codes == [143, 143], errors
+    assert errors == [["interrupted at step 2; resume=killed goes on from there"], []]
+    program = killer(folder, 3, "SIGKILL", (0,))
+    done = run_python(program, *SMALL, *TWO, "output_dir=killed", cwd=folder, env=environment)
+    assert done.returncode == -9, done.stderr
+    assert "resumed" in done.stdout
     done = run_python(TRAIN, *SMALL, *TWO, "output_dir=killed", cwd=folder, env=environment)
     assert done.returncode == 0, done.stderr
     assert "resumed" in done.stdout
     assert same_weights(folder / "two", folder / "killed")
+
+
+def test_process_that_is_lost_ends_the_others_in_one_line(tmp_path, environment):
+    some = ("trainer.validation_scenes=1", "output_dir=out")  # which the first one validates alone
+    codes, errors = as_torchrun(killer(tmp_path, 3, "SIGKILL", (1,)), tmp_path, environment, *some)
+    assert codes == [2, -9], errors
+    assert len(errors[0]) == 1, errors
+    start, end = errors[0][0].split(" (")[0], errors[0][0].rpartition("); ")[2]
+    assert start == "error: another process of the training has ended"
+    assert end == "the same command goes on from the latest checkpoint"
+    assert errors[1] == []
 
 
 def test_network_with_layers_that_have_no_part_in_it_trains_on_two_devices(tmp_path, environment):

@@ -158,10 +158,10 @@ def test_optimisation_stops_at_the_first_loss_that_is_not_finite_and_keeps_no_ch
 @pytest.mark.parametrize("stopping", ["fixed", "variance", "oracle"])
 def test_interrupted_optimisation_gives_bit_identical_results(tmp_path: Path, stopping: str) -> None:
     sample = _sample()
-    settings = {"steps": 90, "stopping": stopping, "patience": 30, "validate_every": 20, "metrics": visual_metrics}
+    settings = {"steps": 50, "stopping": stopping, "patience": 15, "validate_every": 20, "metrics": visual_metrics}
     whole = _prior(workspace=tmp_path / "whole", **settings)(sample)
-    stopper = Stopper(67)
-    with pytest.raises(KeyboardInterrupt, match="interrupted at step 67 of step; the same command goes on"):
+    stopper = Stopper(33)
+    with pytest.raises(KeyboardInterrupt, match="interrupted at step 33 of step; the same command goes on"):
         _prior(workspace=tmp_path / "parts", display=stopper, **settings)(sample)
     last = tmp_path / "parts" / "optimisation" / "step" / "last.ckpt"
     assert last.is_file()
@@ -171,7 +171,7 @@ def test_interrupted_optimisation_gives_bit_identical_results(tmp_path: Path, st
     assert not last.exists()
     tables = [(tmp_path / name / "optimisation" / "step" / "validation.csv").read_text() for name in ("whole", "parts")]
     assert tables[0] == tables[1]
-    assert "80,val,RMSE_v," in tables[0]
+    assert "40,val,RMSE_v," in tables[0]
 
 
 def test_signals_act_as_before_after_an_optimisation_that_ended_early(tmp_path: Path) -> None:

@@ -29,7 +29,7 @@ SMALL = {
     "msg": (lambda: MSGNet(4, "dsr"), 4),
     "msg as published": (lambda: MSGNet(2, "hui"), 2),
     "msg_v as published": (lambda: MSGNet(2, "voynov"), 2),
-    "pdn": (lambda: PrimalDualNetwork(4, 8, 3), 4),
+    "pdn": (lambda: PrimalDualNetwork(4, 8, 3, iterations=3), 4),
     "dg": (lambda: DynamicGuidance(4, 2, 8, 5), 4),
     "sparse_to_dense": (lambda: SparseToDense(4, 4), 4),
     "ddrnet": (lambda: DDRNet(4, 4, 4), 4),
