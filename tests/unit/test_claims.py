@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import pytest
 
@@ -94,6 +95,17 @@ def test_claim_of_a_living_owner_is_not_taken_over(tmp_path, case):
             written_by(path, host="other", age=claims_module.LOST - 30)
         else:
             path.write_text("")
+        assert claims.take("a") is None
+
+
+def test_time_of_a_claim_is_not_one_that_was_remembered(tmp_path, monkeypatch):
+    with Claims(tmp_path) as claims:
+        claims.take("a")
+        [path] = claim_files(tmp_path)
+        written_by(path, host="other", age=claims_module.LOST + 30)
+        remembered, stat = path.stat(), Path.stat
+        written_by(path, host="other")
+        monkeypatch.setattr(Path, "stat", lambda each, **_: remembered if each == path else stat(each))  # as NFS does
         assert claims.take("a") is None
 
 

@@ -222,6 +222,20 @@ def test_second_run_reuses_predictions_without_calling_the_method(tmp_path):
     assert len(pictures) == 2
 
 
+def test_prediction_of_another_machine_is_seen_where_missing_files_are_remembered(tmp_path, monkeypatch):
+    run(toy_study(), tmp_path)
+    (tmp_path / "predictions").rename(tmp_path / "unseen")
+
+    def ask_server(folder):  # as a client of NFS does when a directory is opened
+        if folder.name == "predictions" and not folder.exists():
+            (tmp_path / "unseen").rename(folder)
+
+    monkeypatch.setattr("dsr.evaluation.predict.look_anew", ask_server)
+    method = ToyMethod()
+    outcome, *_ = run(toy_study(method=method), tmp_path)
+    assert (method.calls, outcome.reused) == ([], ["a", "b"])
+
+
 def test_overwrite_makes_every_prediction_anew(tmp_path):
     run(toy_study(), tmp_path)
     method = ToyMethod(a=RAMP)

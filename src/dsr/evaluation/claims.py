@@ -6,8 +6,9 @@ when it is deleted, when its process is gone from the same machine, or when it h
 seconds. It is then taken over by a claim of the next number, which again only one process can create, so that no
 deletion can meet a newer claim. What has been found out under a claim can be left for the others as a record.
 
-All files are made by ``O_EXCL`` or renaming and times are compared with those that the same file system gives, so that
-a shared directory (NFS) will do.
+All files are made by ``O_EXCL`` or renaming, and times are compared with those that the same file system gives. The time
+of a claim and what a directory contains are asked for anew, as clients of NFS remember both for up to a minute. So a
+shared directory will do.
 """
 
 from __future__ import annotations
@@ -118,13 +119,18 @@ class Claims:
     def _is_over(self, path: Path) -> bool:
         """Return whether a claim has lost its process."""
         try:
-            age = self.now() - path.stat().st_mtime
-            owner = json.loads(path.read_text(encoding="utf-8"))
+            with path.open(encoding="utf-8") as file:  # a client of NFS asks for a file's time when it is opened
+                age = self.now() - os.fstat(file.fileno()).st_mtime
+                text = file.read()
+        except PermissionError:
+            return self.now() - path.stat().st_mtime > LOST
+        except OSError:
+            return False  # just deleted: whoever looks again sees that it is free
+        try:
+            owner = json.loads(text)
             if owner["machine"] == machine():
                 return birth(int(owner["process"])) != owner["birth"]
-        except FileNotFoundError:
-            return False  # just deleted: whoever looks again sees that it is free
-        except (OSError, ValueError, KeyError, TypeError):
+        except (ValueError, KeyError, TypeError):
             pass  # its process is about to write it, or was killed before it did
         return age > LOST
 

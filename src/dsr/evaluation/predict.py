@@ -33,7 +33,7 @@ from dsr.evaluation.store import iterations_path, prediction_path, sample_path
 from dsr.methods.base import Confident, Iterative, NoSolutionError, Surface, Upsampler, expect_some_depth
 from dsr.sample import DepthSample
 from dsr.utils.console import one_line
-from dsr.utils.files import read_arrays, replacing
+from dsr.utils.files import look_anew, read_arrays, replacing
 from dsr.utils.parsing import parse_json
 from dsr.utils.progress import SILENT, Progress
 from dsr.utils.tables import guarded
@@ -158,6 +158,7 @@ def predict(
         since = claims.now() if overwrite else -math.inf
 
         def ready(scene: str) -> _Predicted | None:
+            look_anew(prediction_path(folder, scene).parent)
             return _attempt(study, scene, folder, lambda config: _reuse(study, scene, folder, config, since))
 
         def work(scene: str, steps: Progress) -> _Predicted:

@@ -153,6 +153,12 @@ def open_array(path: Path) -> np.ndarray:
     return array
 
 
+def look_anew(folder: Path) -> None:
+    """Have a client of NFS ask its server what a directory contains; it remembers for a while which files it lacks."""
+    with contextlib.suppress(OSError):  # there is no such directory, or the system opens none
+        os.close(os.open(folder, os.O_RDONLY))
+
+
 def write_text(path: Path, text: str) -> None:
     """Write a text file atomically."""
     with replacing(path) as temporary:
