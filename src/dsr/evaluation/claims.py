@@ -7,8 +7,8 @@ seconds. It is then taken over by a claim of the next number, which again only o
 deletion can meet a newer claim. What has been found out under a claim can be left for the others as a record.
 
 All files are made by ``O_EXCL`` or renaming, and times are compared with those that the same file system gives. The
-time of a claim and what a directory contains are asked for anew, as clients of NFS remember both for up to a minute. So a
-shared directory will do.
+time of a claim and what a directory contains are asked for anew, as clients of NFS remember both for up to a minute. So
+a shared directory will do.
 """
 
 from __future__ import annotations
