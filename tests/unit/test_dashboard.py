@@ -50,13 +50,14 @@ def test_scalars_are_the_scores_in_table_units(log, tmp_path):
     assert scalars(log, "mean/RMSE_v") == {0: pytest.approx(mean)}
 
 
-def test_layout_groups_the_metrics_that_are_the_worst_of_four_lights(log):
+def test_layout_begins_with_the_metrics_of_looks_as_that_of_trainings_does(log):
     content = log.Tensors("custom_scalars__config__")[0].tensor_proto.string_val[0]
     layout = layout_pb2.Layout.FromString(content)
     charts = {category.title: [chart.title for chart in category.chart] for category in layout.category}
     assert list(charts)[:2] == ["Looks, worst of four lights, simgeo", "Depth and normals, simgeo"]
-    assert charts["Looks, worst of four lights, simgeo"] == ["DSSIM_v", "BadPix_v_5"]
-    assert charts["Depth and normals, simgeo"] == ["RMSE_d", "BadPix_d_5cm", "Bumpiness_d", "RMSE_v"]
+    assert charts["Looks, worst of four lights, simgeo"] == ["RMSE_v", "DSSIM_v", "BadPix_v_5"]
+    assert charts["Depth and normals, simgeo"] == ["RMSE_d", "BadPix_d_5cm", "Bumpiness_d"]
+    assert charts["By light, e1 to e4, simgeo"] == ["DSSIM_v", "BadPix_v_5"]
     tags = set(log.Tags()["scalars"])
     for category in layout.category[:2]:
         for chart in category.chart:

@@ -66,10 +66,12 @@ def _write_scores(writer: SummaryWriter, run: Run) -> None:
     means: dict[str, float] = {}
     looks, depth = f"Looks, {WORST}, {run.dataset}", f"Depth and normals, {run.dataset}"
     scenes: dict[str, list[str]] = {looks: [], depth: []}
+    by_light: list[str] = []
     for name, each in formats_of([run]).items():
         rows = run.scores[run.scores["metric"] == name]
-        by_light = bool((rows["variant"] != "").any())
-        scenes[looks if by_light else depth].append(name)
+        scenes[looks if "_v" in name else depth].append(name)
+        if rows["variant"].isin(LIGHT_NAMES).any():
+            by_light.append(name)
         headline = rows[rows["variant"].isin(HEADLINES)].set_index("scene")["value"] * each.factor
         means[name] = float(headline.mean())
         for number, scene in enumerate(scored):
@@ -85,7 +87,9 @@ def _write_scores(writer: SummaryWriter, run: Run) -> None:
         title: {name: ["Multiline", [f"scene/{name}/{re.escape(run.dataset)}$"]] for name in names}
         for title, names in scenes.items()
     }
-    layout[f"By light, e1 to e4, {run.dataset}"] = {name: ["Multiline", [f"light/{name}/.*"]] for name in scenes[looks]}
+    layout[f"By light, e1 to e4, {run.dataset}"] = {
+        name: ["Multiline", [f"light/{name}/.*"]] for name in main_first(by_light)
+    }
     writer.add_custom_scalars({title: charts for title, charts in layout.items() if charts})
     writer.add_text("scenes", "\n".join(f"{number}. {scene}" for number, scene in enumerate(scored)))
     for part in hparams(_hyperparameters(run), {f"mean/{name}": value for name, value in means.items()}):
