@@ -121,6 +121,26 @@ def test_jobs_of_slurm_come_back_when_one_is_killed_and_one_requeued(sweep, tmp_
     assert (tmp_path / "begun-3").read_text() == "begun\n" * 2
 
 
+def in_a_task(config):
+    """Note which process of the job this is; one that is not the first one has no say in its result."""
+    Path(f"task-{os.environ['SLURM_PROCID']}").touch()
+    if os.environ["SLURM_PROCID"] != "0":
+        raise ConfigError("not here")
+    return 0.0
+
+
+in_a_task.__module__ = "__main__"
+
+
+@needs("submitit")
+@pytest.mark.usefixtures("one_node_slurm")
+def test_jobs_of_slurm_have_several_processes_for_several_devices(sweep, tmp_path, monkeypatch):
+    monkeypatch.setattr(slurm, "_ASK", (1.0, 1.0))
+    code, lines = sweep(in_a_task, (0,), *ONE_NODE, "hydra.launcher.tasks_per_node=2")
+    assert (code, lines) == (0, [])
+    assert sorted(path.name for path in tmp_path.glob("task-*")) == ["task-0", "task-1"]
+
+
 @needs("submitit")
 def test_sweep_without_slurm_is_one_line(sweep, monkeypatch, tmp_path):
     monkeypatch.setattr(shutil, "which", lambda *_: None)

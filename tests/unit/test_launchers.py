@@ -17,7 +17,7 @@ from dsr.utils import interruption
 from dsr.utils.builder import ConfigError
 
 SLURM = {
-    "cluster": "slurm", "partition": None, "account": None, "qos": None, "constraint": None, "gpus_per_node": 1,
+    "cluster": "slurm", "partition": None, "account": None, "qos": None, "constraint": None, "gpus_per_node": 1, "tasks_per_node": 1,
     "cpus_per_task": 8, "mem_gb": 32, "timeout_min": 240, "signal_delay_s": 120, "max_num_timeout": 20,
     "array_parallelism": 16,
 }  # fmt: skip
@@ -40,6 +40,8 @@ def test_launcher_that_is_not_installed_names_the_extra(monkeypatch, name):
     [
         (SlurmSettings, SLURM, "timeout_min", 0),
         (SlurmSettings, SLURM, "gpus_per_node", -1),
+        (SlurmSettings, SLURM, "tasks_per_node", 0),
+        (SlurmSettings, SLURM | {"cluster": "local"}, "tasks_per_node", 2),
         (SlurmSettings, SLURM, "max_num_timeout", -1),
         (RaySettings, RAY, "num_cpus", -1),
         (RaySettings, RAY, "max_retries", -2),

@@ -46,6 +46,7 @@ class SlurmSettings:
     qos: str | None
     constraint: str | None
     gpus_per_node: int | None
+    tasks_per_node: int
     cpus_per_task: int | None
     mem_gb: float | None
     timeout_min: int
@@ -56,13 +57,17 @@ class SlurmSettings:
     additional_parameters: dict[str, Any] | None = None
 
     def __post_init__(self) -> None:
-        for name in ("gpus_per_node", "cpus_per_task", "mem_gb", "timeout_min", "array_parallelism"):
+        for name in (
+            "gpus_per_node", "tasks_per_node", "cpus_per_task", "mem_gb", "timeout_min", "array_parallelism"
+        ):  # fmt: skip
             value = getattr(self, name)
             if value is not None and value <= 0:
                 raise ConfigError(f"hydra.launcher.{name}: expected a positive number, got {value}")
         for name in ("signal_delay_s", "max_num_timeout"):
             if getattr(self, name) < 0:
                 raise ConfigError(f"hydra.launcher.{name}: expected 0 or more, got {getattr(self, name)}")
+        if self.cluster == "local" and self.tasks_per_node > 1:
+            raise ConfigError(f"hydra.launcher.tasks_per_node: expected 1 without Slurm, got {self.tasks_per_node}")
 
 
 @dataclass(frozen=True)
@@ -119,6 +124,7 @@ def _submit(jobs: Sequence[Job], settings: SlurmSettings, folder: Path) -> Seque
             name="dsr",
             timeout_min=settings.timeout_min,
             gpus_per_node=settings.gpus_per_node,
+            tasks_per_node=settings.tasks_per_node,
             cpus_per_task=settings.cpus_per_task,
             mem_gb=settings.mem_gb,
             slurm_partition=settings.partition,
@@ -131,11 +137,12 @@ def _submit(jobs: Sequence[Job], settings: SlurmSettings, folder: Path) -> Seque
             slurm_additional_parameters=settings.additional_parameters,
         )
         with contextlib.redirect_stderr(io.StringIO()):  # sbatch's words come with its error
-            handles: Sequence[Any] = executor.submit_array([_Resumable(job) for job in jobs])
+            handles = executor.submit_array([_Resumable(job) for job in jobs])
+            first = [handle.task(0) for handle in handles]  # of several processes of a job it has the result
     except (RuntimeError, OSError, subprocess.SubprocessError) as error:  # no Slurm, or sbatch refuses
         shutil.rmtree(place, ignore_errors=True)
         raise ConfigError(f"hydra/launcher={_NAME}: {_refusal(error)}") from error
-    return handles
+    return first
 
 
 def _refusal(error: Exception) -> str:
