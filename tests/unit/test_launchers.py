@@ -17,9 +17,9 @@ from dsr.utils import interruption
 from dsr.utils.builder import ConfigError
 
 SLURM = {
-    "cluster": "slurm", "partition": None, "account": None, "qos": None, "constraint": None, "gpus_per_node": 1, "tasks_per_node": 1,
-    "cpus_per_task": 8, "mem_gb": 32, "timeout_min": 240, "signal_delay_s": 120, "max_num_timeout": 20,
-    "array_parallelism": 16,
+    "cluster": "slurm", "partition": None, "account": None, "qos": None, "constraint": None, "gpus_per_node": 1,
+    "tasks_per_node": 1, "cpus_per_task": 8, "mem_gb": 32, "timeout_min": 240, "signal_delay_s": 120,
+    "max_num_timeout": 20, "array_parallelism": 16,
 }  # fmt: skip
 RAY = {"address": None, "num_cpus": 2, "num_gpus": None, "memory_gb": None, "max_retries": 3}
 
