@@ -95,7 +95,10 @@ def one_node_slurm(shared, monkeypatch, tmp_path_factory):
         pytest.skip("needs Debian's slurmctld, slurmd, slurm-client and munge, and root")
     script, folder = str(shared / "slurm" / "one-node.sh"), str(tmp_path_factory.mktemp("slurm"))
     monkeypatch.delenv("SLURM_CONF", raising=False)
-    began = subprocess.run(["bash", script, "start", folder], capture_output=True, text=True, check=False, timeout=60)
+    environment = {key: value for key, value in os.environ.items() if key != "OMP_NUM_THREADS"}  # that nproc obeys
+    began = subprocess.run(
+        ["bash", script, "start", folder], capture_output=True, text=True, check=False, timeout=60, env=environment
+    )
     try:
         assert began.returncode == 0, began.stderr
         monkeypatch.setenv("SLURM_CONF", began.stdout.strip())
