@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 
 from dsr.report.figures.scenes import rendering
 from dsr.sample import DepthSample
-from dsr.viz.panels import HOLE_COLOUR
+from dsr.viz.canvas import HOLE_COLOUR
 
 LIGHT = "e1"
 """The light of all renderings."""

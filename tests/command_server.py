@@ -1,6 +1,7 @@
 """Runs programs in processes that are forked from this one, which has imported what takes seconds; see ``commands``."""
 
 import contextlib
+import gc
 import json
 import os
 import runpy
@@ -64,6 +65,8 @@ def wait_for(process, seconds):
 
 
 if __name__ == "__main__":
+    gc.collect()
+    gc.freeze()  # so that programs' garbage collections leave alone what they share with this process
     for line in sys.stdin:
         asked = json.loads(line)
         answer = wait_for(asked["process"], asked["timeout"]) if "process" in asked else os.fork()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import gc
 import json
 import os
 import shutil
@@ -57,6 +58,12 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         if not any(item.get_closest_marker(tier) for tier in ("shared", "browser", "slow")):
             item.add_marker("unit")
     items.sort(key=lambda item: UNIT_TESTS in item.path.parents)  # so that at the end no worker has a long file alone
+
+
+def pytest_collection_finish() -> None:
+    """Take what collecting has made out of garbage collections, which would go through it thousands of times."""
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -1,6 +1,7 @@
 """Which modules the package has, and which of them import which."""
 
 import ast
+import functools
 from pathlib import Path
 
 SOURCE = Path(__file__).resolve().parents[1] / "src"
@@ -37,15 +38,18 @@ def imports_of(text, module, *, package=False, known=()):
     return found
 
 
-IMPORTS = {
-    name: imports_of(path.read_text(encoding="utf-8"), name, package=path.name == "__init__.py", known=MODULES)
-    for name, path in MODULES.items()
-}
+@functools.cache
+def import_graph():
+    """Return what each module imports."""
+    return {
+        name: imports_of(path.read_text(encoding="utf-8"), name, package=path.name == "__init__.py", known=MODULES)
+        for name, path in MODULES.items()
+    }
 
 
 def closure_of(names, imports=None):
     """Return the modules, and all that they import, directly or through others."""
-    imports = IMPORTS if imports is None else imports
+    imports = import_graph() if imports is None else imports
     found, left = set(), list(names)
     while left:
         name = left.pop()

@@ -354,7 +354,7 @@ READERS = (
     Reader("msg caffe", seeds.caffe_weights, _published("hui.caffemodel")),
     Reader("peers", seeds.peer_weights, _peers, 2),
     Reader("lpips", seeds.peer_weights, _lpips, 2),
-    Reader("report", run_seeds.runs, _report("tables", "metrics"), 2),
+    Reader("report", run_seeds.runs, _report("tables", "metrics"), 1),
     Reader("report page", run_seeds.runs, _report("figures", "page"), 1),
     Reader("report study", run_seeds.study_table, _report_with_study, 2),
     Reader("study build", run_seeds.runs,

@@ -16,7 +16,8 @@ from dsr.evaluation.run_files import load_results
 from dsr.evaluation.store import sample_path
 from dsr.geometry.shading import render
 from dsr.report.dashboard import save_dashboard
-from dsr.viz.panels import HOLE_COLOUR, normals_seen_by
+from dsr.viz.canvas import HOLE_COLOUR
+from dsr.viz.panels import normals_seen_by
 
 SCENES = ("b", "a")
 

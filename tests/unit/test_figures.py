@@ -24,7 +24,8 @@ from dsr.report.figures import lights as lights_figure
 from dsr.report.figures.layout import Cell, Row, draw_grid
 from dsr.report.figures.lights import sphere_normals
 from dsr.report.figures.scenes import details_of
-from dsr.viz.panels import HOLE_COLOUR, Window, colours, strongest_window
+from dsr.viz.canvas import HOLE_COLOUR, colours
+from dsr.viz.panels import Window, strongest_window
 
 pytestmark = pytest.mark.slow  # drawing takes a second
 

@@ -147,6 +147,15 @@ def test_recordings_of_ros_are_paired_by_time_with_the_aligned_depth(folder, ver
         assert (picture.pose, picture.encoding.suffix) == (None, ".npy")
 
 
+def test_recording_whose_description_is_too_large_is_refused_before_it_is_read(folder):
+    pytest.importorskip("rosbags")
+    captures.ros(folder / "scan", 2)
+    with (folder / "scan" / "metadata.yaml").open("ab") as file:
+        file.truncate(3 << 30)  # of which nothing is on the disk
+    with pytest.raises(ValueError, match=r"metadata.yaml: expected at most 16777216 bytes, got 3221225472"):
+        find_pairs_of_folder(folder)
+
+
 def test_damaged_recording_or_one_without_depth_is_refused(folder):
     pytest.importorskip("rosbags")
     path = captures.ros(folder / "scan.bag", 1)

@@ -189,8 +189,8 @@ def test_before_after_picture_is_at_most_2400_pixels_wide(tmp_path, drawn, size,
     [(figure, dpi)] = drawn
     assert 1200 < figure.get_figwidth() * dpi <= 2400
     assert figure.get_figheight() * dpi < 3300
-    width, height = figure.axes[0].get_position().size * figure.get_size_inches()
-    assert height / width == pytest.approx(size[0] / size[1])
+    left, right, bottom, top = figure.axes[0].images[0].get_extent()
+    assert (top - bottom) / (right - left) == pytest.approx(size[0] / size[1])
 
 
 @pytest.mark.slow
@@ -207,15 +207,49 @@ def test_detail_of_a_before_after_picture_is_where_the_surface_changed(tmp_path,
     depth[0, 10:13, 15:19] += 0.05 * torch.rand(3, 4, generator=torch.Generator().manual_seed(1))
     write_before_after(tmp_path / "b.png", photo(), wall(), depth, CAMERA, "t")
     [(figure, _)] = drawn
-    frames = [axes.patches[0] for axes in figure.axes if axes.patches]
+    pictures = figure.axes[0].images
+    frames = figure.axes[0].patches[::2]
     assert len(frames) == 3
-    for frame in frames:
-        left, top = frame.get_x() * 24, frame.get_y() * 18
-        assert left <= 14
-        assert top <= 9
-        assert left + frame.get_width() * 24 >= 19
-        assert top + frame.get_height() * 18 >= 13
-    limits = {
-        axes.images[0].get_clim() for axes in figure.axes if axes.images and axes.images[0].cmap.name == "viridis"
-    }
-    assert len(limits) == 1
+    for frame, picture in zip(frames, pictures[:6:2], strict=True):
+        x0, x1, y0, y1 = picture.get_extent()
+        left, right = (24 * (at - x0) / (x1 - x0) for at in (frame.get_x(), frame.get_x() + frame.get_width()))
+        bottom, top = (18 * (y1 - at) / (y1 - y0) for at in (frame.get_y(), frame.get_y() + frame.get_height()))
+        assert left <= 14 + 1e-9
+        assert top <= 9 + 1e-9
+        assert right >= 19 - 1e-9
+        assert bottom >= 13 - 1e-9
+    assert len({picture.get_clim() for picture in pictures if picture.cmap.name == "viridis"}) == 1
+
+
+def test_details_of_before_and_after_are_parts_of_the_pictures_above_them(tmp_path, drawn):
+    write_before_after(tmp_path / "b.png", photo(), bumpy(CAMERA.rescale(7, 5)), bumpy(), CAMERA, "t")
+    [(figure, _)] = drawn
+    axes = figure.axes[0]
+    for whole, detail, frame, edge in zip(
+        axes.images[:6:2], axes.images[1:6:2], axes.patches[::2], axes.patches[1::2], strict=True
+    ):
+        left, right, bottom, top = detail.get_extent()
+        across, down = frame.get_width() / edge.get_width(), frame.get_height() / edge.get_height()
+        columns = columns_of(whole, frame.get_x() + across * (np.array([left, right]) - edge.get_x()))
+        rows = rows_of(whole, frame.get_y() + down * (np.array([top, bottom]) - edge.get_y()))
+        part = whole.get_array()[slice(*rows), slice(*columns)]
+        np.testing.assert_array_equal(detail.get_array(), part)
+        clip = detail.get_clip_box().transformed(axes.transData.inverted())
+        assert clip.bounds == pytest.approx((edge.get_x(), edge.get_y(), edge.get_width(), edge.get_height()))
+
+
+def columns_of(image, x):
+    """Columns of a picture at whole pixels, from positions in inches."""
+    left, right, _, _ = image.get_extent()
+    return whole_numbers((x - left) / (right - left) * image.get_array().shape[1])
+
+
+def rows_of(image, y):
+    """Rows, likewise."""
+    _, _, bottom, top = image.get_extent()
+    return whole_numbers((top - y) / (top - bottom) * image.get_array().shape[0])
+
+
+def whole_numbers(values):
+    assert values == pytest.approx(values.round())
+    return values.round().astype(int)

@@ -5,7 +5,7 @@ import json
 
 import pytest
 import torch
-from module_graph import IMPORTS, SOURCE, closure_of, modules_in, path_below_package
+from module_graph import SOURCE, closure_of, import_graph, modules_in, path_below_package
 from omegaconf import OmegaConf
 
 import dsr
@@ -133,8 +133,8 @@ def test_prediction_code_lists_every_module_that_determines_a_prediction():
 
 def test_prediction_code_lacking_an_imported_module_is_found():
     imports = {
-        **IMPORTS,
-        "dsr.methods.networks.facets": IMPORTS["dsr.methods.networks.facets"] | {"dsr.viz.palette"},
+        **import_graph(),
+        "dsr.methods.networks.facets": import_graph()["dsr.methods.networks.facets"] | {"dsr.viz.palette"},
     }
     assert lacking(closure_of(["dsr.methods.networks.facets"], imports)) == ["viz/palette.py"]
     without = [name for name in PREDICTING_CODE if name != "utils/lightning.py"]

@@ -23,7 +23,8 @@ from dsr.geometry.shading import LIGHT_NAMES, render
 from dsr.metrics.formats import HEADLINES, main_first
 from dsr.sample import DepthSample
 from dsr.utils.temporary import temporary_folder
-from dsr.viz.panels import colours, normals_seen_by, reduced
+from dsr.viz.canvas import colours
+from dsr.viz.panels import normals_seen_by, reduced
 
 WORST = "worst of four lights"
 _EVENTS = "events.out.tfevents.*"

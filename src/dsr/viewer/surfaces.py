@@ -25,7 +25,8 @@ from dsr.viewer.packing import (
     reduce_errors,
     reduce_mask,
 )
-from dsr.viz.panels import HOLE_COLOUR, reduced
+from dsr.viz.canvas import HOLE_COLOUR
+from dsr.viz.panels import reduced
 
 ANGLES = (1.0, 60.0)
 """Ends of the colours of the normals' expected errors in degrees, those of ``confidence.png``."""

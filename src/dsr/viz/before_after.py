@@ -8,18 +8,17 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
-from matplotlib.patches import Rectangle
+from matplotlib.image import AxesImage
 from matplotlib.ticker import MaxNLocator, ScalarFormatter
+from matplotlib.transforms import Bbox
 from torch import Tensor
 from torch.nn import functional
 
 from dsr.geometry.camera import Camera
 from dsr.geometry.shading import render_for_viewing
 from dsr.io.exports import normal_strips
-from dsr.viz.panels import colours, limits_of, reduced, strongest_window, write_figure
+from dsr.viz.canvas import Canvas, colours
+from dsr.viz.panels import limits_of, reduced, strongest_window, without_collections, write_figure
 
 _DPI = 200
 _PANEL, _TALLEST, _NARROWEST = 3.78, 4.6, 2.2
@@ -46,6 +45,7 @@ class _Part(NamedTuple):
 _WHOLE = _Part(0, 1, 0, 1)
 
 
+@without_collections()
 def write_before_after(path: Path, rgb: Tensor, depth_lr: Tensor, depth: Tensor, camera: Camera, title: str) -> None:
     """Draw the photo, the input and the result, both as a surface lit from above and as depth.
 
@@ -73,17 +73,18 @@ def write_before_after(path: Path, rgb: Tensor, depth_lr: Tensor, depth: Tensor,
     sheet = _Sheet(camera.height / camera.width, title)
     pictures = ((rgb.float(), f"photo, {size}"), (before, f"before, {size_lr}"), (after, f"after, {size}"))
     for column, (picture, heading) in enumerate(pictures):
-        axes = sheet.panel(0, column, reduced(picture, _LONGEST), heading=heading)
-        frame = (part.right - part.left, part.bottom - part.top)
-        axes.add_patch(Rectangle((part.left, part.top), *frame, fill=False, color=_FRAME, linewidth=1.8))
-        sheet.panel(1, column, picture, part, frame=_FRAME)
+        sheet.heading(column, heading)
+        sheet.panel(0, column, reduced(picture, _LONGEST))
+        sheet.frame(_part_of(sheet.place(0, column), part), facecolor="none", edgecolor=_FRAME, linewidth=1.8)
+        sheet.panel(1, column, picture, part)
+        sheet.frame(sheet.place(1, column), facecolor="none", edgecolor=_FRAME, linewidth=2.5)
     sheet.panel(2, 0, (1 + torch.tensor([1, -1, -1])[:, None, None] * reduced(normals, _LONGEST)) / 2)
     limits = limits_of(depth_lr)
     for column, values in ((1, depth_lr), (2, depth)):
-        axes = sheet.panel(2, column, reduced(values.float(), _LONGEST), depth=limits)
-    sheet.colour_bar(axes)
+        image = sheet.panel(2, column, reduced(values.float(), _LONGEST), depth=limits)
+    sheet.colour_bar(image)
     if not (depth_lr.isfinite().all() and depth.isfinite().all()):
-        sheet.figure.text(0.99, sheet.line, "pink: holes", ha="right", va="center", fontsize=11)
+        sheet.text(0.99 * sheet.figure.get_figwidth(), 0.3, "pink: holes", ha="right", va="center", fontsize=11)
     write_figure(path, sheet.figure, _DPI)
 
 
@@ -107,7 +108,7 @@ def _detail(before: Tensor, after: Tensor) -> _Part:
     return _Part(window.left / width, right / width, window.top / height, bottom / height)
 
 
-class _Sheet:
+class _Sheet(Canvas):
     """Three by three panels under a heading.
 
     Args:
@@ -120,64 +121,66 @@ class _Sheet:
         width = min(_PANEL, _TALLEST / aspect)
         self._size = (width, width * aspect)
         self._pitch = max(width, _NARROWEST) + _GAP
-        page_size = (_LEFT + 3 * self._pitch, _HEADING + 3 * (self._size[1] + _BETWEEN) + _BELOW)
-        self.figure = Figure(figsize=page_size)
-        FigureCanvasAgg(self.figure)
-        self.line = 0.3 / page_size[1]
-        self.figure.text(_LEFT / page_size[0], 1 - 0.3 / page_size[1], title, fontsize=16, va="center", weight="bold",
-                         parse_math=False)  # fmt: skip
+        height = _HEADING + 3 * (self._size[1] + _BETWEEN) + _BELOW
+        super().__init__(_LEFT + 3 * self._pitch, height)
+        self.text(_LEFT, height - 0.3, title, fontsize=16, va="center", weight="bold")
+        for row, label in enumerate(_ROWS if self._size[1] > 1 else ()):
+            place = self.place(row, 0)
+            middle = (place.y0 + place.y1) / 2
+            self.text(0.5 * _LEFT, middle, label, rotation=90, ha="center", va="center", fontsize=12)
 
-    def _axes(self, left: float, bottom: float, width: float, height: float) -> Axes:
-        """Add axes at a position given in inches."""
-        page_width, page_height = self.figure.get_size_inches()
-        return self.figure.add_axes((left / page_width, bottom / page_height, width / page_width, height / page_height))
+    def place(self, row: int, column: int) -> Bbox:
+        """Return where a panel is."""
+        width, height = self._size
+        left = _LEFT + column * self._pitch + (self._pitch - _GAP - width) / 2
+        top = self.figure.get_figheight() - _HEADING - row * (height + _BETWEEN)
+        return Bbox.from_bounds(left, top - height, width, height)
+
+    def heading(self, column: int, text: str) -> None:
+        """Write the heading of a column."""
+        place = self.place(0, column)
+        self.text((place.x0 + place.x1) / 2, place.y1 + 0.08, text, fontsize=13, ha="center")
 
     def panel(
-        self,
-        row: int,
-        column: int,
-        values: Tensor,
-        part: _Part = _WHOLE,
-        *,
-        heading: str = "",
-        frame: str = "none",
-        depth: tuple[float, float] | None = None,
-    ) -> Axes:
+        self, row: int, column: int, values: Tensor, part: _Part = _WHOLE, depth: tuple[float, float] | None = None
+    ) -> AxesImage:
         """Draw a picture (3, H, W), a rendering (1, H, W) or depth (1, H, W) within two limits, or a part of it."""
-        width, height = self._size
-        total = float(self.figure.get_size_inches()[1])
-        left = _LEFT + column * self._pitch + (self._pitch - _GAP - width) / 2
-        axes = self._axes(left, total - _HEADING - (row + 1) * (height + _BETWEEN) + _BETWEEN, width, height)
-        axes.set(xticks=[], yticks=[])
-        for spine in axes.spines.values():
-            spine.set(color=frame, linewidth=2.5)
-        shown, extent = _cut(values, part)
-        low, high = depth or (0.0, 1.0)
-        colour_map = colours("gray" if depth is None else "viridis")
+        shown, covered = _cut(values, part)
+        place = self.place(row, column)
         picture = _with_holes(shown) if len(shown) == 3 else shown[0].numpy()
-        axes.imshow(picture, cmap=colour_map, vmin=low, vmax=high, extent=extent, aspect="auto")
-        axes.set(xlim=(part.left, part.right), ylim=(part.bottom, part.top))
-        axes.set_title(heading, fontsize=13)
-        if column == 0:
-            label = _ROWS[row] if height > 1 else ""
-            self.figure.text(0.5 * _LEFT / self.figure.get_figwidth(), sum(axes.get_position().intervaly) / 2, label,
-                             rotation=90, ha="center", va="center", fontsize=12)  # fmt: skip
-        return axes
+        colour_map = "gray" if depth is None else "viridis"
+        whole = _whole_of(place, part)
+        return self.show(
+            _part_of(whole, covered), picture, colour_map=colour_map, limits=depth or (0.0, 1.0), within=place
+        )
 
-    def colour_bar(self, axes: Axes) -> None:
+    def colour_bar(self, image: AxesImage) -> None:
         """Draw the colour bar of the depth in the last row."""
-        place = self._axes(_LEFT + 1.25 * self._pitch, 0.42, 1.5 * self._pitch - _GAP, 0.1)
-        bar = self.figure.colorbar(axes.images[0], cax=place, orientation="horizontal", ticks=MaxNLocator(6),
-                                   format=ScalarFormatter(useOffset=False))  # fmt: skip
+        place = Bbox.from_bounds(_LEFT + 1.25 * self._pitch, 0.42, 1.5 * self._pitch - _GAP, 0.1)
+        bar = self.bar(image, place, orientation="horizontal", ticks=MaxNLocator(6),
+                       format=ScalarFormatter(useOffset=False))  # fmt: skip
         bar.set_label("depth, m", fontsize=11, labelpad=1)
 
 
-def _cut(values: Tensor, part: _Part) -> tuple[Tensor, tuple[float, float, float, float]]:
-    """Return the pixels of a (C, H, W) picture that overlap a part of it, and their extent for Matplotlib."""
+def _cut(values: Tensor, part: _Part) -> tuple[Tensor, _Part]:
+    """Return the pixels of a (C, H, W) picture that overlap a part of it, and which part they are."""
     height, width = values.shape[-2:]
     top, bottom = math.floor(part.top * height), math.ceil(part.bottom * height)
     left, right = math.floor(part.left * width), math.ceil(part.right * width)
-    return values[:, top:bottom, left:right], (left / width, right / width, bottom / height, top / height)
+    return values[:, top:bottom, left:right], _Part(left / width, right / width, top / height, bottom / height)
+
+
+def _part_of(place: Bbox, part: _Part) -> Bbox:
+    """Return where a part of a picture is that is drawn at a place."""
+    x0, x1 = (place.x0 + at * place.width for at in (part.left, part.right))
+    y1, y0 = (place.y1 - at * place.height for at in (part.top, part.bottom))
+    return Bbox.from_extents(x0, y0, x1, y1)
+
+
+def _whole_of(place: Bbox, part: _Part) -> Bbox:
+    """Return where a picture would be of which a part is at a place."""
+    width, height = place.width / (part.right - part.left), place.height / (part.bottom - part.top)
+    return Bbox.from_bounds(place.x0 - part.left * width, place.y1 + (part.top - 1) * height, width, height)
 
 
 def _with_holes(picture: Tensor) -> np.ndarray:

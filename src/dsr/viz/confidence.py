@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
-from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import LogNorm
-from matplotlib.figure import Figure
+from matplotlib.transforms import Bbox
 from torch import Tensor
 
 from dsr.geometry.camera import Camera
-from dsr.viz.panels import colours, normals_seen_by, reduced, write_figure
+from dsr.viz.canvas import Canvas, fitted
+from dsr.viz.panels import normals_seen_by, reduced, without_collections, write_figure
 
 _PANEL, _ABOVE, _BELOW, _LEFT = 4.6, 0.4, 0.75, 0.4
 """Width of a panel, space above and below it, and left of all panels, inches."""
@@ -23,6 +21,7 @@ _DPI, _LONGEST = 160, 1472
 _DEGREES = (1.0, 60.0)
 
 
+@without_collections()
 def write_confidence(
     path: Path,
     depth: Tensor,
@@ -49,8 +48,7 @@ def write_confidence(
     height, width = depth.shape[-2:]
     panel = _PANEL * min(max(height / width, 0.4), 2.5)
     row = panel + _ABOVE + _BELOW
-    figure = Figure(figsize=(2 * _PANEL + 3 * _LEFT, len(rows) * row))
-    FigureCanvasAgg(figure)
+    page = Canvas(2 * _PANEL + 3 * _LEFT, len(rows) * row)
     valid = depth[depth.isfinite()]
     middle = 1e3 * float(valid.median()) if valid.numel() else 1e3
     limits = ((1e-3 * middle, 0.1 * middle), _DEGREES)
@@ -59,21 +57,10 @@ def write_confidence(
             zip(maps, limits, ("depth", "normal"), ("mm", "degrees"), strict=True)
         ):
             left, bottom = _LEFT + j * (_PANEL + _LEFT), (len(rows) - 1 - i) * row + _BELOW
-            size = figure.get_size_inches()
-            axis = figure.add_axes((left / size[0], bottom / size[1], _PANEL / size[0], panel / size[1]))
-            _show(axis, values, LogNorm(low, high), f"{kind} error of the {what}", unit)
-    write_figure(path, figure, _DPI)
-
-
-def _show(axis: Axes, values: Tensor, norm: LogNorm, title: str, unit: str) -> None:
-    """Draw errors, (1, H, W), with a logarithmic colour bar."""
-    axis.set_axis_off()
-    shown = reduced(values.float(), _LONGEST)[0].numpy()
-    image: Any = axis.imshow(
-        np.clip(shown, norm.vmin, None), cmap=colours("magma"), norm=norm, interpolation="nearest", aspect="equal"
-    )
-    axis.set_title(title)
-    height = axis.get_window_extent().height / axis.figure.dpi
-    place = axis.inset_axes((0.1, -0.2 / height, 0.8, 0.1 / height))
-    bar = axis.figure.colorbar(image, cax=place, orientation="horizontal", extend="both")
-    bar.set_label(unit, labelpad=1)
+            place = fitted(Bbox.from_bounds(left, bottom, _PANEL, panel), height / width)
+            shown = np.clip(reduced(values.float(), _LONGEST)[0].numpy(), low, None)
+            image = page.show(place, shown, colour_map="magma", limits=LogNorm(low, high), interpolation="nearest")
+            page.text(left + _PANEL / 2, place.y1 + 0.08, f"{kind} error of the {what}", fontsize=12, ha="center")
+            below = Bbox.from_bounds(left + 0.1 * _PANEL, place.y0 - 0.2, 0.8 * _PANEL, 0.1)
+            page.bar(image, below, orientation="horizontal", extend="both").set_label(unit, labelpad=1)
+    write_figure(path, page.figure, _DPI)

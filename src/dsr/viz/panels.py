@@ -10,13 +10,13 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import matplotlib as mpl
 import numpy as np
 import torch
-from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.colors import Colormap
 from matplotlib.figure import Figure
+from matplotlib.image import AxesImage
+from matplotlib.transforms import Bbox
+from PIL import Image
 from torch import Tensor
 from torch.nn import functional
 
@@ -27,12 +27,10 @@ from dsr.metrics.formats import Formats, describe_directions, in_tables
 from dsr.sample import DepthSample
 from dsr.utils.files import replacing
 from dsr.utils.ratios import round_ratio
+from dsr.viz.canvas import Canvas, fitted
 
-HOLE_COLOUR = "#d684b4"
-_PANEL = 3.2
-_ABOVE = 0.8
-_BETWEEN = 0.95
-"""Panel width, space for the heading, and space between rows for a colour bar and a title, inches."""
+_PANEL, _GAP, _ABOVE, _BETWEEN = 3.2, 0.1, 0.8, 0.95
+"""Panel width, space beside panels, for the heading, and between rows for a colour bar and a title, inches."""
 _DPI = 160
 """A panel of 3.2 inches has 512 pixels."""
 _PNG_LEVEL = 3
@@ -67,42 +65,130 @@ def save_picture(
 
     """
     truth = sample.depth
-    rows = 2 if truth is None else 3
+    page = _Page(sample, 2 if truth is None else 3)
     height, width = depth.shape[-2:]
-    panel = _PANEL * min(max(height / width, 0.4), 2.5)
-    figure_height = _ABOVE + rows * (panel + _BETWEEN)
-    figure = Figure(figsize=(5 * _PANEL + 0.6, figure_height))
-    FigureCanvasAgg(figure)
-    axes = figure.subplots(rows, 5, squeeze=False)
-    bottom, top = _BETWEEN / figure_height, 1 - _ABOVE / figure_height
-    figure.subplots_adjust(left=0.01, right=0.99, bottom=bottom, top=top, wspace=0.04, hspace=_BETWEEN / panel)
-    for axis in axes.flat:
-        axis.set_axis_off()
-    limits = limits_of(depth if truth is None else truth)
-    axes[0, 0].imshow(sample.rgb.permute(1, 2, 0).numpy())
-    _title(axes[0, 0], f"photo, {width} x {height}")
-    _show_depth(axes[0, 1], sample.depth_lr, limits, f"input, {sample.camera_lr.width} x {sample.camera_lr.height}")
-    _show_depth(axes[0, 2], depth, limits, label)
-    _show_renderings(axes[1], sample, depth, label)
+    maps = [(sample.depth_lr, f"input, {sample.camera_lr.width} x {sample.camera_lr.height}"), (depth, label)]
     if truth is not None:
-        _show_depth(axes[0, 3], truth, limits, "truth")
-        _show_error(axes[0, 4], depth - truth)
-        _show_renderings(axes[2], sample, truth, "truth")
-        _show_angles(axes[1, 4], sample, depth, truth)
-        _write_scores(axes[2, 4], scores, formats)
-    maps = (depth, sample.depth_lr) if truth is None else (depth, sample.depth_lr, truth)
-    holes = "" if all(bool(values.isfinite().all()) for values in maps) else " (pink: holes)"
-    heading = f"{sample.dataset} / {sample.scene}, {label} x{round_ratio(sample.scale)}{holes}"
-    figure.suptitle(heading, fontsize=16, y=1 - 0.12 / figure_height, parse_math=False)
-    write_figure(path, figure, _DPI)
+        maps.append((truth, "truth"))
+    page.photo(0, 0, sample.rgb, f"photo, {width} x {height}")
+    page.depths(0, 1, maps, limits_of(depth if truth is None else truth))
+    page.renderings(1, depth, label)
+    if truth is not None:
+        page.error(0, 4, depth - truth)
+        page.renderings(2, truth, "truth")
+        page.angles(1, 4, depth, truth)
+        page.scores(2, 4, scores, formats)
+    holes = "" if all(bool(values.isfinite().all()) for values, _ in maps) else " (pink: holes)"
+    page.heading(f"{sample.dataset} / {sample.scene}, {label} x{round_ratio(sample.scale)}{holes}")
+    write_figure(path, page.figure, _DPI)
+
+
+class _Page(Canvas):
+    """The page of a scene: rows of five panels.
+
+    Args:
+        sample: the scene.
+        rows: number of rows.
+
+    """
+
+    def __init__(self, sample: DepthSample, rows: int) -> None:
+        self._camera = sample.camera
+        self._aspect = sample.camera.height / sample.camera.width
+        self._panel_height = _PANEL * min(max(self._aspect, 0.4), 2.5)
+        super().__init__(5 * _PANEL + 6 * _GAP, _ABOVE + rows * (self._panel_height + _BETWEEN))
+
+    def photo(self, row: int, column: int, rgb: Tensor, title: str) -> None:
+        """Draw a photo, (3, H, W)."""
+        self.show(self._place(row, column), rgb.permute(1, 2, 0).numpy())
+        self._title(row, column, title)
+
+    def depths(self, row: int, column: int, maps: Sequence[tuple[Tensor, str]], limits: tuple[float, float]) -> None:
+        """Draw depth maps beside each other, each (1, H, W) in metres with its title, and their colour bar."""
+        for number, (depth, title) in enumerate(maps, column):
+            image = self._map(row, number, depth[0].numpy(), title, "viridis", limits)
+        self._bar(image, row, column, number, "depth, m")
+
+    def renderings(self, row: int, depth: Tensor, title: str) -> None:
+        """Draw the renderings of a depth map, (1, H, W), under the four lights."""
+        shaded = render(normals_seen_by(self._camera, depth))[0]
+        for column, (name, shades) in enumerate(zip(LIGHT_NAMES, shaded, strict=False)):
+            self._map(row, column, shades.numpy(), f"{title} under {name}", "gray", (0, 1))
+
+    def error(self, row: int, column: int, difference: Tensor) -> None:
+        """Draw a signed error, (1, H, W) in metres, in centimetres."""
+        centimetres = 100 * difference[0].numpy()
+        valid = centimetres[np.isfinite(centimetres)]
+        limit = max(float(np.percentile(np.abs(valid), 98)), 0.1) if valid.size else 1.0
+        image = self._map(row, column, centimetres, "error", "RdBu_r", (-limit, limit))
+        self._bar(image, row, column, column, "result - truth, cm", extend="both")
+
+    def angles(self, row: int, column: int, depth: Tensor, truth: Tensor) -> None:
+        """Draw the angle between the two normals in degrees."""
+        cosine = (normals_seen_by(self._camera, depth) * normals_seen_by(self._camera, truth)).sum(dim=1)[0]
+        degrees = torch.rad2deg(torch.arccos(cosine.clamp(-1, 1))).numpy()
+        image = self._map(row, column, degrees, "error of the normals", "magma", (0, 60))
+        self._bar(image, row, column, column, "degrees", extend="max")
+
+    def scores(self, row: int, column: int, scores: Mapping[str, float], formats: Formats) -> None:
+        """Write the scores in the units of tables."""
+        shown = {name: each for name, each in in_tables(formats).items() if name in scores}
+        lines = [
+            f"{each.heading:<9}{each.unit:<8}{each.text(scores[name] * each.factor):>9}" for name, each in shown.items()
+        ]
+        text = "\n".join([f"scores, {describe_directions(shown)}", *lines])
+        panel = self._panel(row, column)
+        top = panel.y1 - 0.05 * panel.height
+        self.text(panel.x0, top, text, family="monospace", fontsize=11, va="top", linespacing=1.6)
+
+    def heading(self, text: str) -> None:
+        """Write the heading."""
+        width, height = self.figure.get_size_inches()
+        self.text(width / 2, height - 0.12, text, fontsize=16, ha="center", va="top")
+
+    def _panel(self, row: int, column: int) -> Bbox:
+        """Return the space of a panel."""
+        top = self.figure.get_figheight() - _ABOVE - row * (self._panel_height + _BETWEEN)
+        left = _GAP + column * (_PANEL + _GAP)
+        return Bbox.from_bounds(left, top - self._panel_height, _PANEL, self._panel_height)
+
+    def _place(self, row: int, column: int) -> Bbox:
+        """Return where the picture of a panel is, in the middle of its space."""
+        return fitted(self._panel(row, column), self._aspect)
+
+    def _map(
+        self, row: int, column: int, values: np.ndarray, title: str, colour_map: str, limits: tuple[float, float]
+    ) -> AxesImage:
+        """Draw a panel of values, (H, W)."""
+        self._title(row, column, title)
+        place = self._place(row, column)
+        return self.show(place, values, colour_map=colour_map, limits=limits, interpolation="nearest")
+
+    def _title(self, row: int, column: int, text: str) -> None:
+        """Write the title above a panel."""
+        panel = self._panel(row, column)
+        self.text((panel.x0 + panel.x1) / 2, self._place(row, column).y1 + 0.08, text, fontsize=12, ha="center")
+
+    def _bar(self, image: AxesImage, row: int, first: int, last: int, label: str, extend: str = "neither") -> None:
+        """Draw a colour bar below the panels from one column to another."""
+        left, right = self._panel(row, first).x0, self._panel(row, last).x1
+        width = min(right - left, 1.6 * _PANEL) - 0.2 * _PANEL
+        place = Bbox.from_bounds((left + right - width) / 2, self._place(row, last).y0 - 0.19, width, 0.09)
+        self.bar(image, place, extend=extend, orientation="horizontal").set_label(label, labelpad=1)
 
 
 def write_figure(path: Path, figure: Figure, dpi: int, metadata: Mapping[str, Any] | None = None) -> None:
     """Write a figure atomically, in the format given by the suffix."""
-    options: dict[str, Any] = {"pil_kwargs": {"compress_level": _PNG_LEVEL}} if path.suffix == ".png" else {}
     with replacing(path) as temporary, warnings.catch_warnings():
         warnings.filterwarnings("ignore", "Glyph .* missing from font")  # a name may have letters that the font lacks
-        figure.savefig(temporary, dpi=dpi, metadata=metadata, **options)
+        if path.suffix != ".png":
+            figure.savefig(temporary, dpi=dpi, metadata=metadata)
+            return
+        canvas = FigureCanvasAgg(figure)
+        figure.set_dpi(dpi)
+        canvas.draw()
+        opaque = Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")  # 3 channels are written faster
+        opaque.save(temporary, "PNG", compress_level=_PNG_LEVEL, dpi=(dpi, dpi))
 
 
 def limits_of(depth: Tensor) -> tuple[float, float]:
@@ -110,11 +196,6 @@ def limits_of(depth: Tensor) -> tuple[float, float]:
     valid = depth[depth.isfinite()].numpy()
     low, high = np.percentile(valid, [1, 99]) if valid.size else (0, 1)
     return float(low), float(max(high, low + 1e-6))
-
-
-def colours(name: str | Colormap) -> Any:
-    """Return a colour map that shows NaN in the hole colour."""
-    return mpl.colormaps.get_cmap(name).with_extremes(bad=HOLE_COLOUR)
 
 
 class Window(NamedTuple):
@@ -172,74 +253,6 @@ def reduced(values: Tensor, longest: int) -> Tensor:
     return torch.where(weight >= 0.5, total / weight.clamp(min=0.5), torch.nan)
 
 
-def _show_depth(axis: Axes, depth: Tensor, limits: tuple[float, float], title: str) -> None:
-    """Draw depth in metres, (1, H, W)."""
-    low, high = limits
-    image = axis.imshow(depth[0].numpy(), cmap=colours("viridis"), vmin=low, vmax=high, interpolation="nearest")
-    _title(axis, title)
-    _colour_bar(axis, image, "depth, m")
-
-
-def _show_error(axis: Axes, difference: Tensor) -> None:
-    """Draw a signed error, (1, H, W) in metres, in centimetres."""
-    centimetres = 100 * difference[0].numpy()
-    valid = centimetres[np.isfinite(centimetres)]
-    limit = max(float(np.percentile(np.abs(valid), 98)), 0.1) if valid.size else 1.0
-    image = axis.imshow(centimetres, cmap=colours("RdBu_r"), vmin=-limit, vmax=limit, interpolation="nearest")
-    _title(axis, "error")
-    _colour_bar(axis, image, "result - truth, cm", extend="both")
-
-
-def _show_renderings(axes: np.ndarray, sample: DepthSample, depth: Tensor, title: str) -> None:
-    """Draw the renderings of a depth map, (1, H, W), under the four lights."""
-    normals = normals_seen_by(sample.camera, depth)
-    for axis, name, shades in zip(axes, LIGHT_NAMES, render(normals)[0], strict=False):
-        axis.imshow(shades.numpy(), cmap=colours("gray"), vmin=0, vmax=1, interpolation="nearest")
-        _title(axis, f"{title} under {name}")
-
-
-def _show_angles(axis: Axes, sample: DepthSample, depth: Tensor, truth: Tensor) -> None:
-    """Draw the angle between the two normals in degrees."""
-    cosine = (normals_seen_by(sample.camera, depth) * normals_seen_by(sample.camera, truth)).sum(dim=1)[0]
-    degrees = torch.rad2deg(torch.arccos(cosine.clamp(-1, 1))).numpy()
-    image = axis.imshow(degrees, cmap=colours("magma"), vmin=0, vmax=60, interpolation="nearest")
-    _title(axis, "error of the normals")
-    _colour_bar(axis, image, "degrees", extend="max")
-
-
-def _title(axis: Axes, text: str) -> None:
-    """Write a title at the upper edge of a panel; Matplotlib would look for a place above ticks, which takes longer."""
-    axis.set_title(text, y=1.0, parse_math=False)
-
-
-def _colour_bar(axis: Axes, image: Any, label: str, extend: str = "neither") -> None:
-    """Put a colour bar under a panel without moving it."""
-    height = axis.get_window_extent().height / axis.figure.dpi
-    place = axis.inset_axes((0.1, -0.19 / height, 0.8, 0.09 / height))
-    bar = axis.figure.colorbar(image, cax=place, orientation="horizontal", extend=extend)
-    bar.set_label(label, labelpad=1)
-
-
 def normals_seen_by(camera: Camera, depth: Tensor) -> Tensor:
     """Compute the normals of a depth map, (1, H, W) in metres, as (1, 3, H, W); NaN where they are undefined."""
     return depth_to_normals(depth.double()[None], camera.rays()[None])
-
-
-def _write_scores(axis: Axes, scores: Mapping[str, float], formats: Formats) -> None:
-    """Write the scores in the units of tables."""
-    shown = {name: each for name, each in in_tables(formats).items() if name in scores}
-    lines = [
-        f"{each.heading:<9}{each.unit:<8}{each.text(scores[name] * each.factor):>9}" for name, each in shown.items()
-    ]
-    text = "\n".join([f"scores, {describe_directions(shown)}", *lines])
-    axis.text(
-        0,
-        0.95,
-        text,
-        family="monospace",
-        fontsize=11,
-        parse_math=False,
-        va="top",
-        linespacing=1.6,
-        transform=axis.transAxes,
-    )

@@ -22,7 +22,8 @@ from dsr.geometry.camera import Camera
 from dsr.geometry.shading import LIGHT_NAMES, render
 from dsr.sample import Scene
 from dsr.utils.ratios import round_ratio
-from dsr.viz.panels import HOLE_COLOUR, colours, limits_of, normals_seen_by, reduced, write_figure
+from dsr.viz.canvas import HOLE_COLOUR, colours
+from dsr.viz.panels import limits_of, normals_seen_by, reduced, write_figure
 
 _ROWS = 6
 _DPI = 100

@@ -30,6 +30,7 @@ from dsr.io.encoding import Assumption
 from dsr.io.frames import CaptureFrame, Geometry, Record
 from dsr.io.names import match_times
 from dsr.io.pairs import Pair, PairingResult
+from dsr.utils.limits import MOST_TEXT, expect_bytes
 
 _IMAGE, _COMPRESSED, _INFO = (f"sensor_msgs/msg/{name}" for name in ("Image", "CompressedImage", "CameraInfo"))
 _UNITS = {"u": 1e-3, "f": 1.0}
@@ -258,6 +259,9 @@ def _open(path: Path) -> Any:
     except ImportError as error:
         raise ValueError(f"{path}: recordings of ROS need the package rosbags: pip install 'dsr[captures]'") from error
     _limit_chunks()
+    description = path / "metadata.yaml"
+    if path.is_dir() and description.is_file():
+        expect_bytes(description, description.stat().st_size, MOST_TEXT)
     reader = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
     reader.open()
     return reader

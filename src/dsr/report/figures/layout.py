@@ -10,14 +10,13 @@ from typing import Any
 
 import matplotlib as mpl
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import Colormap
 from matplotlib.figure import Figure
-from matplotlib.patches import Rectangle
 from matplotlib.ticker import MaxNLocator, ScalarFormatter
 from matplotlib.transforms import Bbox
 
-from dsr.viz.panels import Window, colours, write_figure
+from dsr.viz.canvas import Canvas
+from dsr.viz.panels import Window, write_figure
 
 DPI = 300
 FRAMES = ("#ff8c00", "#00a5e3")
@@ -124,7 +123,7 @@ def draw_grid(columns: Sequence[str], rows: Sequence[Row], texts: tuple[str, str
         for column, cell in enumerate(row.cells):
             page.cell(row, cell, left + column * (panel + _GAP), level, panel, box)
         if row.bar:
-            page.bar(row, left + len(columns) * (panel + _GAP), level, box[1])
+            page.bar_of(row, left + len(columns) * (panel + _GAP), level, box[1])
         level -= sum(box[1:]) + _GAP
     return page.figure
 
@@ -142,24 +141,15 @@ def _wrap(text: str, length: float) -> str:
     return "\n".join(textwrap.wrap(text, max(int(length / _LETTER_WIDTH), 4), break_on_hyphens=False)) or text
 
 
-class _Page:
-    """A figure with positions in inches from the lower left corner.
+class _Page(Canvas):
+    """A page of panels.
 
-    All pictures are in one :class:`~matplotlib.axes.Axes` of the figure's size, as each further one takes long to make.
     A picture's label is ``ROW: panel`` or ``ROW: detail``, as is that of the frame of an empty panel.
     """
 
-    def __init__(self, width: float, height: float) -> None:
-        self.figure = Figure(figsize=(width, height))
-        FigureCanvasAgg(self.figure)
-        self._canvas = self.figure.add_axes((0, 0, 1, 1), label="pictures", autoscale_on=False)
-        self._canvas.set(xlim=(0, width), ylim=(0, height))
-        self._canvas.set_axis_off()
-
     def text(self, x: float, y: float, text: str, **style: Any) -> None:
         """Write a text."""
-        width, height = self.figure.get_size_inches()
-        self.figure.text(x / width, y / height, text, fontsize=_FONT, parse_math=False, linespacing=1.1, **style)
+        super().text(x, y, text, **{"fontsize": _FONT, "linespacing": 1.1, **style})
 
     def cell(
         self, row: Row, cell: Cell, left: float, top: float, panel: float, box: tuple[float, float, float, float]
@@ -168,7 +158,7 @@ class _Page:
         width, height, below, _ = box
         place = Bbox.from_bounds(left + (panel - width) / 2, top - height, width, height)
         if cell.picture is None:
-            self._frame(place, f"{row.label}: panel", facecolor=_EMPTY)
+            self.frame(place, f"{row.label}: panel", facecolor=_EMPTY)
             middle = ((place.x0 + place.x1) / 2, (place.y0 + place.y1) / 2)
             self.text(*middle, cell.caption, ha="center", va="center", color="0.45")
             return
@@ -177,41 +167,29 @@ class _Page:
         for number, (window, colour) in enumerate(zip(row.details, FRAMES, strict=False)):
             part = _scale_window(window, row.size, cell.picture.shape[:2])
             frame = _part_of(place, part, cell.picture.shape[:2])
-            self._frame(frame, f"{row.label}: frame", facecolor="none", edgecolor=colour, linewidth=0.9)
+            self.frame(frame, f"{row.label}: frame", facecolor="none", edgecolor=colour, linewidth=0.9)
             inset = Bbox.from_bounds(left + number * (size + _SEAM), top - height - below, size, size)
             self._show(inset, cell, cell.picture[part.slices], f"{row.label}: detail")
-            self._frame(inset, f"{row.label}: edge", facecolor="none", edgecolor=colour, linewidth=1.0)
+            self.frame(inset, f"{row.label}: edge", facecolor="none", edgecolor=colour, linewidth=1.0)
         self.text(left + panel / 2, top - height - below - 0.02, cell.caption, ha="center", va="top",
                   weight="bold" if cell.bold else "normal")  # fmt: skip
 
-    def bar(self, row: Row, left: float, top: float, height: float) -> None:
+    def bar_of(self, row: Row, left: float, top: float, height: float) -> None:
         """Draw a row's colour bar, beside its panels."""
-        panels = [image for image in self._canvas.images if image.get_label() == f"{row.label}: panel"]
+        panels = [image for image in self.images if image.get_label() == f"{row.label}: panel"]
         mapped = [image for image in panels if np.asarray(image.get_array()).ndim == 2]
         if not mapped:
             return
-        width, page_height = self.figure.get_size_inches()
-        place = self.figure.add_axes(
-            (left / width, (top - height) / page_height, _BAR / width, height / page_height), label=f"{row.label}: bar"
-        )
-        bar = self.figure.colorbar(mapped[-1], cax=place, extend=row.extend, ticks=MaxNLocator(5),
-                                   format=ScalarFormatter(useOffset=False))  # fmt: skip
+        place = Bbox.from_bounds(left, top - height, _BAR, height)
+        bar = self.bar(mapped[-1], place, f"{row.label}: bar", extend=row.extend, ticks=MaxNLocator(5),
+                       format=ScalarFormatter(useOffset=False))  # fmt: skip
         bar.outline.set_linewidth(0.4)
         bar.ax.tick_params(labelsize=_FONT - 1, length=2, width=0.4, pad=1.5)
         bar.set_label(row.bar, fontsize=_FONT, labelpad=1.5)
 
     def _show(self, place: Bbox, cell: Cell, picture: np.ndarray, label: str) -> None:
         """Draw a picture."""
-        low, high = cell.limits
-        extent = (place.x0, place.x1, place.y0, place.y1)
-        image = self._canvas.imshow(
-            picture, cmap=colours(cell.colour_map), vmin=low, vmax=high, extent=extent, aspect="auto"
-        )
-        image.set_label(label)
-
-    def _frame(self, place: Bbox, label: str, **style: Any) -> None:
-        """Draw a rectangle."""
-        self._canvas.add_patch(Rectangle(place.p0, place.width, place.height, label=label, **style))
+        self.show(place, picture, label, colour_map=cell.colour_map, limits=cell.limits)
 
 
 def _part_of(place: Bbox, window: Window, shape: tuple[int, ...]) -> Bbox:

@@ -17,7 +17,7 @@ from dsr.geometry.shading import LIGHT_NAMES, lights, render
 from dsr.report.figures.layout import save_both
 from dsr.report.figures.scenes import rendering
 from dsr.sample import DepthSample
-from dsr.viz.panels import colours
+from dsr.viz.canvas import colours
 
 _SPHERE = 401
 """Diameter of a sphere, pixels."""

@@ -24,7 +24,7 @@ from dsr.report.page.scenes import View, scene_data, views_of
 from dsr.report.work import Work
 from dsr.utils.files import write_text
 from dsr.utils.progress import Steps
-from dsr.viz.panels import HOLE_COLOUR
+from dsr.viz.canvas import HOLE_COLOUR
 
 _COLOUR_MAPS = {"depth": "viridis", "error": "RdBu_r", "angle": "magma"}
 _SCRIPTS = ("dom.js", "pictures.js", "tables.js", "viewer.js", "page.js")
