@@ -141,6 +141,9 @@ def test_jobs_of_slurm_have_several_processes_for_several_devices(sweep, tmp_pat
     monkeypatch.setattr(slurm, "_ASK", (1.0, 1.0))
     code, lines = sweep(in_a_task, (0,), *ONE_NODE, "hydra.launcher.tasks_per_node=2")
     assert (code, lines) == (0, [])
+    deadline = time.monotonic() + 30  # the sweep ends with the result of task 0, the other one may still start
+    while not (tmp_path / "task-1").exists() and time.monotonic() < deadline:
+        time.sleep(0.1)
     assert sorted(path.name for path in tmp_path.glob("task-*")) == ["task-0", "task-1"]
 
 
