@@ -33,7 +33,7 @@ PARTS = {
     "figures: PDF": ("backend_pdf.py", "print_pdf"),
     "PDF: fonts": ("backend_pdf.py", "writeFonts"),
     "PDF: pictures": ("backend_pdf.py", "writeImages"),
-    "figures: PNG": ("backend_agg.py", "print_png"),
+    "figures: PNG": ("viz/panels.py", "_write_png"),
     "page: scenes": ("page/scenes.py", "scene_data"),
     "page: compression of pictures": ("page/encoding.py", "add"),
     "page: expected errors": ("page/calibration.py", "calibration_data"),

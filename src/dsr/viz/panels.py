@@ -181,14 +181,18 @@ def write_figure(path: Path, figure: Figure, dpi: int, metadata: Mapping[str, An
     """Write a figure atomically, in the format given by the suffix."""
     with replacing(path) as temporary, warnings.catch_warnings():
         warnings.filterwarnings("ignore", "Glyph .* missing from font")  # a name may have letters that the font lacks
-        if path.suffix != ".png":
+        if path.suffix == ".png":
+            _write_png(temporary, figure, dpi)
+        else:
             figure.savefig(temporary, dpi=dpi, metadata=metadata)
-            return
-        canvas = FigureCanvasAgg(figure)
-        figure.set_dpi(dpi)
-        canvas.draw()
-        opaque = Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")  # 3 channels are written faster
-        opaque.save(temporary, "PNG", compress_level=_PNG_LEVEL, dpi=(dpi, dpi))
+
+
+def _write_png(path: Path, figure: Figure, dpi: int) -> None:
+    canvas = FigureCanvasAgg(figure)
+    figure.set_dpi(dpi)
+    canvas.draw()
+    opaque = Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")  # 3 channels are written faster
+    opaque.save(path, "PNG", compress_level=_PNG_LEVEL, dpi=(dpi, dpi))
 
 
 def limits_of(depth: Tensor) -> tuple[float, float]:
