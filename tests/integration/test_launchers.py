@@ -103,6 +103,8 @@ def one_node_slurm(shared, monkeypatch, tmp_path_factory):
         assert began.returncode == 0, began.stderr
         monkeypatch.setenv("SLURM_CONF", began.stdout.strip())
         yield
+        drain = 'for i in $(seq 150); do [ -n "$(squeue -h -t R,CG)" ] || break; sleep 0.2; done'
+        subprocess.run(["bash", "-c", drain], check=True, timeout=60)  # else its end is told to the next test's Slurm
     finally:
         subprocess.run(["bash", script, "stop", folder], check=True, timeout=60)
 
