@@ -2,6 +2,7 @@
 
 import contextlib
 import csv
+import importlib.util
 import json
 import os
 import re
@@ -22,6 +23,7 @@ import dsr.app.train as command
 import dsr.app.trainer as trainer_module
 from dsr.app.entry import run_command
 from dsr.app.evaluate import evaluate
+from dsr.training import loggers
 from dsr.training.module import SuperResolution
 
 REPOSITORY = Path(__file__).resolve().parents[2]
@@ -380,6 +382,15 @@ def test_usage_error_is_one_line_with_exit_code_2_and_writes_nothing(tmp_path, w
     assert errors[0].startswith(f"error: {start}")
     assert tree(tmp_path) == ["file", "foreign/thesis.txt"]
     assert not (tmp_path / "outputs").exists()
+
+
+@pytest.mark.parametrize("name", loggers.OPTIONAL)
+def test_logger_that_is_not_installed_is_named_before_anything_is_written(tmp_path, within, name):
+    if importlib.util.find_spec(name) is not None:
+        pytest.skip(f"{name} is installed")
+    line = f"error: logger={name}: expected {name}, which is not installed; pip install dsr[{name}]"
+    assert within(*SMOKE, f"logger={name}") == (2, "", [line])
+    assert tree(tmp_path) == []
 
 
 def test_patch_larger_than_a_scene_is_refused_when_the_scenes_are_there(tmp_path, within):

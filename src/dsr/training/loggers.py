@@ -24,6 +24,8 @@ from dsr.utils.lightning import Log
 _CURVES = ("loss", "gradient_norm")
 _ROWS_AT_ONCE = 10
 """Rows of a table that are written together."""
+OPTIONAL = ("wandb", "mlflow")
+"""Loggers that need the library of their name, which an extra of that name installs."""
 RUN_ID = "logger_run.txt"
 """The file in a run's directory with the number that a service has given to the run."""
 
@@ -99,7 +101,7 @@ def wandb(
     try:
         import wandb as client  # noqa: PLC0415 - optional
     except ImportError:
-        raise ValueError("name: wandb is not installed; pip install dsr[wandb]") from None
+        raise ValueError("expected wandb, which is not installed; pip install dsr[wandb]") from None
     logger = WandbLog(
         name=folder.name, save_dir=folder, project=project, entity=entity, mode=mode, id=_read_number(folder),
         settings=client.Settings(silent=True, console="off"),
@@ -129,7 +131,7 @@ def mlflow(folder: Path, experiment: str = "dsr", tracking_uri: str | None = Non
     try:
         from mlflow.exceptions import MlflowException  # noqa: PLC0415 - optional
     except ImportError:
-        raise ValueError("name: mlflow is not installed; pip install dsr[mlflow]") from None
+        raise ValueError("expected mlflow, which is not installed; pip install dsr[mlflow]") from None
     uri = tracking_uri or os.environ.get("MLFLOW_TRACKING_URI") or (folder / "mlruns").absolute().as_uri()
     if uri.startswith("file:"):
         os.environ.setdefault("MLFLOW_ALLOW_FILE_STORE", "true")
