@@ -5,6 +5,7 @@ import os
 import signal
 import socket
 import stat
+from types import SimpleNamespace
 
 import pytest
 
@@ -110,11 +111,14 @@ def squeue(monkeypatch, tmp_path):
 
 
 def test_slurm_state_of_a_job_is_that_of_squeue_or_ended_where_slurm_forgot_it(squeue):
-    squeue("7 0 RUNNING\n7 1 OUT_OF_MEMORY\n8 N/A PENDING")
-    states = {"7_0": "RUNNING", "7_1": "OUT_OF_MEMORY", "7_2": "COMPLETED", "8": "PENDING"}
+    squeue("7 0 RUNNING\n7 1 OUT_OF_MEMORY OutOfMemory\n8 N/A PENDING ReqNodeNotAvail, May be reserved")
+    states = {
+        "7_0": ("RUNNING", ""), "7_1": ("OUT_OF_MEMORY", "OutOfMemory"), "7_2": ("COMPLETED", ""),
+        "8": ("PENDING", "ReqNodeNotAvail, May be reserved"),
+    }  # fmt: skip
     assert slurm._slurm_states(["7_0", "7_1", "7_2", "8"]) == states
     squeue("slurm_load_jobs error: Invalid job id specified", 1)
-    assert slurm._slurm_states(["7_0"]) == {"7_0": "COMPLETED"}
+    assert slurm._slurm_states(["7_0"]) == {"7_0": ("COMPLETED", "")}
     squeue("slurm_load_jobs error: Unable to contact slurm controller (connect failure)", 1)
     assert slurm._slurm_states(["7_0"]) == {}
 
@@ -129,12 +133,25 @@ def test_slurm_job_has_ended_only_after_several_answers_in_a_row(squeue, monkeyp
     def states(*answers):
         seen = []
         for answer in answers:
-            squeue(f"7 0 {answer}")
+            squeue(f"7 0 {answer} None")
             seen.append(dict(waiting.states([Handle])))
         return seen
 
     assert states("FAILED", "FAILED", "PENDING", "FAILED", "FAILED") == [{}] * 5
     assert states("FAILED") == [{"7_0": "FAILED"}]
+
+
+def test_reason_that_jobs_have_not_begun_is_told_once(squeue, monkeypatch, caplog):
+    monkeypatch.setattr(slurm, "_ASK", (0.0, 0.0))
+    caplog.set_level("INFO", "dsr.app.launchers.slurm")
+    waiting = slurm._Waiting("slurm")
+    jobs = [SimpleNamespace(job_id=f"7_{number}") for number in range(3)]
+    for reasons in (("None",) * 3, ("Resources", "Resources", "JobArrayTaskLimit"), ("Resources", "PartitionConfig")):
+        squeue("\n".join(f"7 {number} PENDING {reason}" for number, reason in enumerate(reasons)))
+        assert waiting.states(jobs) == {}
+    assert caplog.messages == [
+        "Jobs that Slurm has not begun: 2 (Resources)", "Jobs that Slurm has not begun: 1 (PartitionConfig)"
+    ]  # fmt: skip
 
 
 @pytest.fixture

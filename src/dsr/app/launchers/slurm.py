@@ -34,6 +34,8 @@ _ENDED = {
     "REVOKED",
 }  # fmt: skip
 """Slurm's states of jobs that do not run any more; those that are requeued leave them at once."""
+_NO_REASONS = {"None", "BeginTime", "JobArrayTaskLimit"}
+"""Slurm's words for jobs that it has not looked at yet, that are requeued, and that array_parallelism keeps waiting."""
 
 
 @dataclass(frozen=True)
@@ -172,6 +174,7 @@ class _Waiting:
         self._cluster = cluster
         self._begun = self._asked = time.monotonic()
         self._without_result: dict[str, int] = {}
+        self._told: set[str] = set()
 
     def states(self, handles: Sequence[Any]) -> Mapping[str, str]:
         """Return the states of jobs that have certainly ended without a result, by their numbers."""
@@ -181,27 +184,39 @@ class _Waiting:
             return {}
         self._asked = now
         if self._cluster == "slurm":
-            states = _slurm_states([handle.job_id for handle in handles])
+            answer = _slurm_states([handle.job_id for handle in handles])
+            self._tell([reason for state, reason in answer.values() if state == "PENDING"])
+            states = {name: state for name, (state, _) in answer.items()}
         else:
             states = {handle.job_id: handle.state for handle in handles if handle.done()}
         ended = {name: state for name, state in states.items() if state in _ENDED or self._cluster != "slurm"}
         self._without_result = {name: self._without_result.get(name, 0) + 1 for name in ended}
         return {name: state for name, state in ended.items() if self._without_result[name] >= _CONFIRMATIONS}
 
+    def _tell(self, reasons: Sequence[str]) -> None:
+        """Tell why jobs have not begun, once for each reason; some, such as ``PartitionConfig``, do not pass."""
+        for reason in dict.fromkeys(reasons):
+            if reason not in self._told | _NO_REASONS:
+                self._told.add(reason)
+                _log.info(f"Jobs that Slurm has not begun: {reasons.count(reason)} ({reason})")
 
-def _slurm_states(names: Sequence[str]) -> dict[str, str]:
-    """Return the states of jobs by their numbers; nothing if Slurm does not answer now."""
+
+def _slurm_states(names: Sequence[str]) -> dict[str, tuple[str, str]]:
+    """Return the states of jobs, and Slurm's reason, by their numbers; nothing if Slurm does not answer now."""
     arrays = ",".join(sorted({name.partition("_")[0] for name in names}))
-    command = ["squeue", "--noheader", "--array", "--states=all", "--format=%F %K %T", f"--jobs={arrays}"]
+    command = ["squeue", "--noheader", "--array", "--states=all", "--format=%F %K %T %r", f"--jobs={arrays}"]
     try:
         answer = subprocess.run(command, capture_output=True, text=True, timeout=30, check=False)  # noqa: S603
     except (OSError, subprocess.TimeoutExpired):
         return {}
     if answer.returncode and "Invalid job id" not in answer.stderr:
         return {}
-    rows = [line.split() for line in answer.stdout.splitlines()]
-    states = {f"{array}_{task}" if task.isdecimal() else array: state for array, task, state in rows}  # N/A: no array
-    return {name: states.get(name, "COMPLETED") for name in names}  # Slurm forgets them some minutes after their end
+    rows = [line.split(maxsplit=3) for line in answer.stdout.splitlines()]
+    states = {
+        f"{array}_{task}" if task.isdecimal() else array: (state, "".join(reason))
+        for array, task, state, *reason in rows
+    }
+    return {name: states.get(name, ("COMPLETED", "")) for name in names}  # Slurm forgets them minutes after their end
 
 
 def _result(job: Job, handle: Any, state: str | None) -> JobReturn | None:
