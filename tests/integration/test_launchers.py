@@ -143,9 +143,7 @@ def test_jobs_of_slurm_have_several_processes_for_several_devices(sweep, tmp_pat
     monkeypatch.setattr(slurm, "_ASK", (1.0, 1.0))
     code, lines = sweep(in_a_task, (0,), *ONE_NODE, "hydra.launcher.tasks_per_node=2")
     assert (code, lines) == (0, [])
-    deadline = time.monotonic() + 30  # the sweep ends with the result of task 0, the other one may still start
-    while not (tmp_path / "task-1").exists() and time.monotonic() < deadline:
-        time.sleep(0.1)
+    wait_until((tmp_path / "task-1").exists, 30)  # the sweep ends with the result of task 0
     assert sorted(path.name for path in tmp_path.glob("task-*")) == ["task-0", "task-1"]
 
 
@@ -170,9 +168,7 @@ def test_interrupted_sweep_stops_its_jobs(sweep, tmp_path):
     interrupted.wait(10)
     assert code == 130
     assert lines == ["interrupted; what is finished is kept, the same command goes on from there"]
-    deadline = time.monotonic() + 10
-    while is_alive(int((tmp_path / "pid").read_text())) and time.monotonic() < deadline:
-        time.sleep(0.1)
+    wait_until(lambda: not is_alive(int((tmp_path / "pid").read_text())), 10)
     assert not is_alive(int((tmp_path / "pid").read_text()))
 
 
@@ -180,6 +176,13 @@ def interrupt_when(path):
     """Send this process SIGINT as soon as a file has a content."""
     watch = f"until [ -s {path} ]; do sleep 0.1; done; kill -INT {os.getpid()}"
     return subprocess.Popen(["bash", "-c", watch])
+
+
+def wait_until(condition, seconds):
+    """Wait for a condition, but no longer than some seconds; what follows checks it."""
+    deadline = time.monotonic() + seconds
+    while not condition() and time.monotonic() < deadline:
+        time.sleep(0.1)
 
 
 def is_alive(pid):

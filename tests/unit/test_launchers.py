@@ -141,7 +141,7 @@ def test_slurm_job_has_ended_only_after_several_answers_in_a_row(squeue, monkeyp
     assert states("FAILED") == [{"7_0": "FAILED"}]
 
 
-def test_reason_that_jobs_have_not_begun_is_told_once(squeue, monkeypatch, caplog):
+def test_reason_that_jobs_are_pending_is_told_once(squeue, monkeypatch, caplog):
     monkeypatch.setattr(slurm, "_ASK", (0.0, 0.0))
     caplog.set_level("INFO", "dsr.app.launchers.slurm")
     waiting = slurm._Waiting("slurm")
@@ -150,7 +150,7 @@ def test_reason_that_jobs_have_not_begun_is_told_once(squeue, monkeypatch, caplo
         squeue("\n".join(f"7 {number} PENDING {reason}" for number, reason in enumerate(reasons)))
         assert waiting.states(jobs) == {}
     assert caplog.messages == [
-        "Jobs that Slurm has not begun: 2 (Resources)", "Jobs that Slurm has not begun: 1 (PartitionConfig)"
+        "Jobs pending in Slurm: 2 (Resources)", "Jobs pending in Slurm: 1 (PartitionConfig)"
     ]  # fmt: skip
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import importlib.util
 from collections.abc import Iterator, Sequence
 from typing import Any
 
@@ -12,7 +11,7 @@ from hydra.core.plugins import Plugins
 from hydra.core.utils import JobReturn, JobStatus
 from hydra.types import RunMode
 
-from dsr.utils.builder import ConfigError
+from dsr.utils.builder import ConfigError, expect_library
 from dsr.utils.console import one_line
 
 LAUNCHERS = {
@@ -59,12 +58,8 @@ def expect_launcher(arguments: Sequence[str]) -> None:
     """
     for argument in arguments:
         group, _, choice = argument.partition("=")
-        if group != "hydra/launcher":
-            continue
-        module = LAUNCHERS.get(choice)
-        if module is not None and importlib.util.find_spec(module) is None:
-            library = module.rpartition(".")[2]
-            raise ConfigError(f"{argument}: expected {library}, which is not installed; pip install dsr[cluster]")
+        if group == "hydra/launcher" and choice in LAUNCHERS:
+            expect_library(argument, LAUNCHERS[choice], "cluster")
 
 
 def job_name() -> str:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import fnmatch
 import functools
-import importlib.util
 import math
 import shutil
 import sys
@@ -34,7 +33,7 @@ from dsr.methods.networks.trained import NETWORKS
 from dsr.methods.networks.weight_files import load_network, network_name, read_torch_file, save_network
 from dsr.metrics.visual_loss import VisualLoss, make_visual_loss
 from dsr.training.data_module import PatchData
-from dsr.training.loggers import OPTIONAL, RUN_ID, log_layout, log_settings
+from dsr.training.loggers import RUN_ID, expect_installed, log_layout, log_settings
 from dsr.training.module import SuperResolution
 from dsr.training.objective import Objective, SurfaceObjective, balance_weight
 from dsr.training.settings import Schedule
@@ -99,7 +98,7 @@ def _train(plain: dict[str, Any], settings: TrainConfig, device: torch.device, p
     net = _network(settings)
     data = training_data(settings, processes.count)
     check_metrics(settings.metrics)
-    _expect_logger(settings.logger["name"])
+    expect_installed(settings.logger["name"])
     identity = rundir.identity_of(plain, None, device)
     folder = rundir.folder_of(settings.output_dir or rundir.default_directory("train", plain, identity))
     weights, last = folder / WEIGHTS, folder / "checkpoints" / "last.ckpt"
@@ -130,12 +129,6 @@ def _train(plain: dict[str, Any], settings: TrainConfig, device: torch.device, p
         _export(module, Path(best.best_model_path), weights, facts)
     progress.say(f"weights: {weights}")
     return float(best.best_model_score if best.best_model_score is not None else math.nan)
-
-
-def _expect_logger(name: str) -> None:
-    """Check that the library of a logger is installed."""
-    if name in OPTIONAL and importlib.util.find_spec(name) is None:
-        raise ConfigError(f"logger={name}: expected {name}, which is not installed; pip install dsr[{name}]")
 
 
 def _expect_trainable(

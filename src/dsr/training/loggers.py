@@ -18,6 +18,7 @@ from lightning.pytorch.utilities import rank_zero_only
 from torch import Tensor
 
 from dsr.metrics.formats import main_first
+from dsr.utils.builder import expect_library
 from dsr.utils.files import write_text
 from dsr.utils.lightning import Log
 
@@ -28,6 +29,20 @@ OPTIONAL = ("wandb", "mlflow")
 """Loggers that need the library of their name, which an extra of that name installs."""
 RUN_ID = "logger_run.txt"
 """The file in a run's directory with the number that a service has given to the run."""
+
+
+def expect_installed(name: str) -> None:
+    """Check that the library of a logger, if it needs one, is installed.
+
+    Args:
+        name: the logger's.
+
+    Raises:
+        ConfigError: it is not.
+
+    """
+    if name in OPTIONAL:
+        expect_library(f"logger={name}", name, name)
 
 
 class CsvLog(CSVLogger):
@@ -98,10 +113,9 @@ def wandb(
         ValueError: wandb is not installed, or refuses to begin a run, such as without a login.
 
     """
-    try:
-        import wandb as client  # noqa: PLC0415 - optional
-    except ImportError:
-        raise ValueError("expected wandb, which is not installed; pip install dsr[wandb]") from None
+    expect_installed("wandb")
+    import wandb as client  # noqa: PLC0415 - optional
+
     logger = WandbLog(
         name=folder.name, save_dir=folder, project=project, entity=entity, mode=mode, id=_read_number(folder),
         settings=client.Settings(silent=True, console="off"),
@@ -128,10 +142,9 @@ def mlflow(folder: Path, experiment: str = "dsr", tracking_uri: str | None = Non
         ValueError: MLflow is not installed, or the store cannot be used.
 
     """
-    try:
-        from mlflow.exceptions import MlflowException  # noqa: PLC0415 - optional
-    except ImportError:
-        raise ValueError("expected mlflow, which is not installed; pip install dsr[mlflow]") from None
+    expect_installed("mlflow")
+    from mlflow.exceptions import MlflowException  # noqa: PLC0415 - optional
+
     uri = tracking_uri or os.environ.get("MLFLOW_TRACKING_URI") or (folder / "mlruns").absolute().as_uri()
     if uri.startswith("file:"):
         os.environ.setdefault("MLFLOW_ALLOW_FILE_STORE", "true")

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 import importlib
+import importlib.util
 import inspect
 import types
 from collections.abc import Collection, Mapping, Sequence
@@ -25,6 +26,23 @@ _ABOUT = (
 
 class ConfigError(ValueError):
     """A configuration that cannot be run: one line that names the key, what was expected and what came."""
+
+
+def expect_library(key: str, module: str, extra: str) -> None:
+    """Check that a library is installed, without importing it.
+
+    Args:
+        key: what needs it, for the message.
+        module: of the library.
+        extra: of dsr, which has the library.
+
+    Raises:
+        ConfigError: it is not.
+
+    """
+    if importlib.util.find_spec(module) is None:
+        library = module.rpartition(".")[2]
+        raise ConfigError(f"{key}: expected {library}, which is not installed; pip install dsr[{extra}]")
 
 
 def build(group: str, node: Mapping[str, Any], given: Mapping[str, Any] | None = None) -> Any:

@@ -194,11 +194,11 @@ class _Waiting:
         return {name: state for name, state in ended.items() if self._without_result[name] >= _CONFIRMATIONS}
 
     def _tell(self, reasons: Sequence[str]) -> None:
-        """Tell why jobs have not begun, once for each reason; some, such as ``PartitionConfig``, do not pass."""
+        """Tell why jobs are pending, once for each reason; some, such as ``PartitionConfig``, do not pass."""
         for reason in dict.fromkeys(reasons):
             if reason not in self._told | _NO_REASONS:
                 self._told.add(reason)
-                _log.info(f"Jobs that Slurm has not begun: {reasons.count(reason)} ({reason})")
+                _log.info(f"Jobs pending in Slurm: {reasons.count(reason)} ({reason})")
 
 
 def _slurm_states(names: Sequence[str]) -> dict[str, tuple[str, str]]:

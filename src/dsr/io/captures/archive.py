@@ -23,7 +23,7 @@ from dsr.utils.limits import read_limited, read_member
 
 PHOTO_LIMIT = 1 << 26
 """Largest size in bytes of an encoded photo."""
-_DAMAGED = (zipfile.BadZipFile, zlib.error, OSError, EOFError, RuntimeError, NotImplementedError, struct.error)
+_DAMAGED = (zipfile.BadZipFile, zlib.error, OSError, EOFError, RuntimeError, struct.error)
 """What reading a damaged or encrypted archive raises."""
 
 
