@@ -27,7 +27,7 @@ from dsr.degradation.downsampling import Downsampling, make_sample
 from dsr.geometry.camera import Camera
 from dsr.methods.registry import build_method, read_method
 from dsr.sample import DepthSample, Scene
-from dsr.utils.devices import inference_precision
+from dsr.utils.devices import fast_precision
 
 _TYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16}
 _SQUARE = 2048
@@ -123,7 +123,7 @@ def random_sample(size: int, scale: int) -> DepthSample:
 @torch.inference_mode()
 def measure(name: str, options: argparse.Namespace, device: torch.device, rate: float, copied: float) -> None:
     """Print the profile of a network's answer."""
-    precision = inference_precision(device)
+    precision = fast_precision(device)
     node = read_method(name, options.scale)
     if "ensemble" in node:
         node["ensemble"] = 1
@@ -189,7 +189,7 @@ def main() -> None:
         + f", copy: {copied / 1e9:.1f} GB/s"
     )
     for name in options.networks.split(","):
-        measure(name, options, device, rates[inference_precision(device)], copied)
+        measure(name, options, device, rates[fast_precision(device)], copied)
 
 
 if __name__ == "__main__":

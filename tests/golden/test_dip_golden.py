@@ -15,6 +15,7 @@ from dsr.methods.classical.interpolation import Interpolation
 from dsr.methods.dip.upsampler import DeepImagePrior
 from dsr.metrics.functional import SurfacePair, dssim_v, rmse_d, rmse_v
 from dsr.sample import DepthSample
+from dsr.utils.devices import fast_precision
 
 BOX = Downsampling("box")
 
@@ -38,7 +39,7 @@ def _scores(depth: Tensor, sample: DepthSample) -> dict[str, float]:
 
 def test_dip_v_is_better_than_bicubic_in_depth_and_in_looks(sample: DepthSample) -> None:
     bicubic = _scores(Interpolation("bicubic")(sample), sample)
-    precision = "bfloat16" if torch.cpu._is_amx_tile_supported() else "float32"
+    precision = fast_precision(torch.device("cpu"))
     prior = DeepImagePrior(scale=4, downsampling=BOX, steps=140, average=0.97, validate_every=0, precision=precision)
     ours = _scores(prior(sample), sample)
     assert ours["RMSE_v"] < 0.85 * bicubic["RMSE_v"]

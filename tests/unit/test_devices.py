@@ -42,7 +42,7 @@ from dsr.training.objective import Objective, SurfaceObjective
 from dsr.training.patches import Patches
 from dsr.training.settings import PatchSettings, Schedule
 from dsr.utils.builder import ConfigError
-from dsr.utils.devices import pick_device
+from dsr.utils.devices import fast_precision, pick_device
 
 SHORT: dict[str, dict[str, Any]] = {
     "dip": {"steps": 2},
@@ -275,3 +275,12 @@ def test_unknown_device_of_the_environment_is_told_with_the_variable(monkeypatch
     monkeypatch.setenv("DSR_DEVICE", "abacus")
     with pytest.raises(ConfigError, match=r"^\$DSR_DEVICE: expected auto, .*, got 'abacus'"):
         pick_device("auto")
+
+
+@pytest.mark.parametrize(
+    ("avx", "amx", "expected"), [(False, False, "float32"), (True, False, "bfloat16"), (True, True, "bfloat16")]
+)
+def test_fast_precision_of_a_cpu_is_what_it_has_instructions_for(monkeypatch, avx, amx, expected):
+    monkeypatch.setattr(torch.cpu, "_is_avx512_bf16_supported", lambda: avx)
+    monkeypatch.setattr(torch.cpu, "_is_amx_tile_supported", lambda: amx)
+    assert fast_precision(CPU) == expected

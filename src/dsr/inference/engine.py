@@ -27,7 +27,7 @@ from dsr.methods.networks.inpainting import inpaint
 from dsr.methods.registry import build_method, read_method
 from dsr.sample import DepthSample, expect_distances
 from dsr.utils.builder import ConfigError, trait
-from dsr.utils.devices import inference_precision, pick_device
+from dsr.utils.devices import fast_precision, pick_device
 from dsr.utils.progress import Steps, part_of
 
 Fill = Literal["all", "small", "none"]
@@ -68,7 +68,7 @@ class MethodChoice:
         node = {key: value for key, value in node.items() if key not in DECIDED or key in self.settings}
         given: dict[str, Any] = {
             "device": self.device,
-            "precision": inference_precision(self.device) if trait("method", node, "tolerant") else "float32",
+            "precision": fast_precision(self.device) if trait("method", node, "tolerant") else "float32",
             "downsampling": Downsampling("box"),
             **DECIDED,
         }

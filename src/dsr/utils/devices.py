@@ -8,19 +8,16 @@ import torch
 
 from dsr.utils.builder import ConfigError
 
+_FAST_ON_CPU = ("_is_avx512_bf16_supported", "_is_amx_tile_supported")
+"""What a CPU has where convolutions in bfloat16 are faster, also with gradients (``benchmarks/train_speed.py``)."""
+
 
 def fast_precision(device: torch.device) -> str:
-    """Return the precision that convolutions are fast in: bfloat16 on a GPU that has it and on a CPU with AMX."""
+    """Return the precision that convolutions are fast in: bfloat16 on a GPU or CPU with instructions for it."""
     if device.type == "cuda":
         return "bfloat16" if torch.cuda.is_bf16_supported(including_emulation=False) else "float32"
-    amx = getattr(torch.cpu, "_is_amx_tile_supported", None)
-    return "bfloat16" if device.type == "cpu" and amx is not None and amx() else "float32"
-
-
-def inference_precision(device: torch.device) -> str:
-    """Return the precision in which convolutions without gradients are fast; a CPU may have AVX-512 for bfloat16."""
-    avx = getattr(torch.cpu, "_is_avx512_bf16_supported", None)
-    return "bfloat16" if device.type == "cpu" and avx is not None and avx() else fast_precision(device)
+    flags = (getattr(torch.cpu, name, lambda: False) for name in _FAST_ON_CPU)
+    return "bfloat16" if device.type == "cpu" and any(flag() for flag in flags) else "float32"
 
 
 def pick_device(name: str) -> torch.device:
