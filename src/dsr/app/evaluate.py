@@ -26,7 +26,7 @@ from dsr.degradation.scales import NATIVE, match_ratio
 from dsr.evaluation.predict import Evaluation, Outcome, StalePredictionError, failure_line, predict
 from dsr.evaluation.score import score
 from dsr.evaluation.sharing import Workers, can_fork, choose_workers
-from dsr.evaluation.store import load_errors, picture_path, prediction_path
+from dsr.evaluation.store import load_errors, prediction_path
 from dsr.inference.adapter import AnyScale
 from dsr.methods.base import WORKSPACE
 from dsr.methods.registry import build_method, target_paths
@@ -285,10 +285,10 @@ def _illustrate(
     from dsr.viz.confidence import write_confidence  # noqa: PLC0415 - see _import_report
     from dsr.viz.panels import save_picture  # noqa: PLC0415
 
-    save_picture(picture_path(folder, sample.scene, "pictures"), sample, depth, scores, label, formats)
+    save_picture(folder / "pictures" / f"{sample.scene}.png", sample, depth, scores, label, formats)
     errors = load_errors(prediction_path(folder, sample.scene))
     if errors is not None:
-        path = picture_path(folder, sample.scene, "confidence")
+        path = folder / "confidence" / f"{sample.scene}.png"
         write_confidence(path, depth, *errors, sample.depth, sample.camera)
 
 

@@ -47,11 +47,6 @@ def iterations_path(folder: Path, scene: str) -> Path:
     return _path(folder, scene, "iterations/{}.csv")
 
 
-def picture_path(folder: Path, scene: str, kind: str) -> Path:
-    """Return where a run keeps a picture of a scene, in a folder for its kind; see :func:`prediction_path`."""
-    return _path(folder, scene, f"{kind}/{{}}.png")
-
-
 def _path(folder: Path, scene: str, form: str) -> Path:
     return path_within(folder, scene, f"{folder}: scene", form)
 

@@ -8,9 +8,9 @@ from pathlib import Path, PurePath, PurePosixPath
 
 _LONGEST = 100
 """Characters of a name that a message shows."""
-_NUMBER = re.compile("([0-9]+)")
+_TURNS = re.compile("([0-9]+|/)")
 NaturalKey = tuple[tuple[str | tuple[int, str], ...], str]
-"""Texts and numbers of a name in turns, numbers as their number of digits and the digits; and the name."""
+"""Texts and numbers of a name in turns, numbers as their number of digits and the digits, ``/`` as -1; and the name."""
 
 
 class OutsideError(ValueError):
@@ -51,8 +51,8 @@ def path_within(folder: Path, name: str, source: object, form: str = "{}") -> Pa
 def natural_key(name: str | PurePath) -> NaturalKey:
     """Return a key that sorts names, or paths folder by folder, with the numbers in them by value: 2 before 10."""
     text = str(name).replace(os.sep, "/")
-    parts: list[str | tuple[int, str]] = list(_NUMBER.split(text.replace("/", "\0")))  # which comes before all others
+    parts: list[str | tuple[int, str]] = list(_TURNS.split(text))
     for place in range(1, len(parts), 2):
         digits = str(parts[place]).lstrip("0")
-        parts[place] = len(digits), digits
+        parts[place] = (-1, "") if digits == "/" else (len(digits), digits)
     return tuple(parts), text
