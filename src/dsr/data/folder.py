@@ -93,7 +93,7 @@ def load_scene(folder: Path, dataset: str) -> Scene:
     rgb = read_rgb(rgb_path)
     _expect_size(rgb_path, rgb.shape[:2], (camera.height, camera.width))
     measured: dict[float, Tensor] = {}
-    for path in sorted(folder.iterdir(), key=natural_key):
+    for path in sorted(folder.iterdir()):
         match = _MEASURED.fullmatch(path.stem)
         if match and path.suffix.lower() in MAP_SUFFIXES:
             ratio, depth_lr = _read_measured(path, match[1], match[2], description)
