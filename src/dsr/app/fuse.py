@@ -15,6 +15,7 @@ from dsr.geometry.poses import as_rigid
 from dsr.geometry.tsdf import PosedMap, fuse_maps, suggest_voxel
 from dsr.io.model_files import write_ply
 from dsr.utils.console import one_line, show
+from dsr.utils.paths import natural_key
 
 _GREY = 190
 _LEAST_ERROR = 1e-4
@@ -58,7 +59,7 @@ def fuse(request: FuseRequest, console: Console) -> list[str]:
         ValueError: there is no result with a pose, or no surface.
 
     """
-    found = sorted({path.parent for folder in request.folders for path in folder.rglob(INFO)})
+    found = sorted({path.parent for folder in request.folders for path in folder.rglob(INFO)}, key=natural_key)
     frames, problems = [], []
     for folder in found:
         try:

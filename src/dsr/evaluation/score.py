@@ -114,6 +114,8 @@ def _score_and_illustrate(
     result = _Scored()
     try:
         sample = DepthSample.load(sample_path(folder, scene))
+        if sample.scene != scene:  # its name becomes that of pictures
+            raise ValueError(f"{sample_path(folder, scene)}: expected the scene {scene}, got {sample.scene!r:.100}")
         depth = load_prediction(prediction_path(folder, scene))
         result.rows = list(_score_scene(study, sample, depth, metrics))
         result.unscored = sample.depth is None

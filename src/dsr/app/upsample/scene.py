@@ -18,6 +18,7 @@ from dsr.io.scene_files.splatting import write_splatting
 from dsr.utils.files import write_text
 from dsr.utils.limits import read_limited
 from dsr.utils.parsing import parse_json
+from dsr.utils.paths import path_within
 
 _RECORD = "exports.json"
 _WRITERS: Mapping[str, tuple[str, Callable[[Path, Sequence[Frame]], list[Path]]]] = {
@@ -82,7 +83,7 @@ def write_scene(output: Path, folders: Mapping[str, Path], parts: Sequence[str],
             continue
         stale = set(recorded.get(name, ())) - {file.relative_to(output).as_posix() for file in files}
         for old in stale:  # of frames that are no longer there
-            if old.split("/")[0] == name and ".." not in old.split("/"):
+            if old.split("/")[0] == name:
                 (output / old).unlink(missing_ok=True)
         recorded[name] = sorted(file.relative_to(output).as_posix() for file in files)
         write_text(output / _RECORD, json.dumps({"exports": recorded}, indent=2) + "\n")
@@ -132,6 +133,9 @@ def _read_record(output: Path) -> dict[str, list[str]]:
         lists = [files if isinstance(files, list) else [None] for files in exports.values()]
         if not all(isinstance(file, str) for files in lists for file in files):
             raise TypeError
-        return exports
     except (ValueError, KeyError, TypeError) as error:
         raise ValueError(f"{path}: expected a file of `dsr upsample`, got something else") from error
+    for name, files in exports.items():
+        for file in files:
+            path_within(output, file, f"{path}: exports.{name}")
+    return exports

@@ -13,6 +13,7 @@ import pandas as pd
 from dsr.evaluation.results import BenchmarkSetting, Results, Run
 from dsr.metrics.formats import Formats
 from dsr.report.tables import AVERAGES, OTHER_FRAMES, RECREATED, in_shown_units, paper_row
+from dsr.utils.paths import natural_key
 
 _FOLDERS = {"tables": (".csv", ".md", ".tex"), "metrics": (".csv",), "figures": (".pdf",)}
 """Folders beside the page with files to link to, and their suffixes."""
@@ -148,7 +149,7 @@ def links(folder: Path, tables: Sequence[Path] | None) -> list[dict[str, str]]:
         path
         for name, suffixes in _FOLDERS.items()
         if name != "tables" or tables is None
-        for path in sorted((folder / name).glob("*"))
+        for path in sorted((folder / name).glob("*"), key=natural_key)
         if path.suffix in suffixes and path.is_file()
     ]
     named = [path for path in tables or () if path.is_file() and path.resolve().is_relative_to(folder.resolve())]
