@@ -95,5 +95,4 @@ class AnyScale:
 
     def _steps(self) -> list[int]:
         """Return the factors that the method is made for."""
-        ability = read_ability(self._choice.name, self._choice.directories, self._choice.settings)
-        return sorted({step for steps in ability.steps.values() for step in steps})
+        return read_ability(self._choice.name, self._choice.directories, self._choice.settings).single_steps

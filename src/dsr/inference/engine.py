@@ -92,7 +92,8 @@ def check_settings(choice: MethodChoice) -> None:
             name and a colon; or the method's own file has such a value: it begins with ``method=NAME:``.
 
     """
-    choice.build(next(iter(read_ability(choice.name, choice.directories, choice.settings).steps), USUAL_SCALE))
+    ability = read_ability(choice.name, choice.directories, choice.settings)
+    choice.build(next(iter(ability.single_steps), USUAL_SCALE))
 
 
 def upsample_depth(

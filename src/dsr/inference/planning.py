@@ -70,6 +70,11 @@ class Ability:
     own_resolution: bool = False
     factors: Mapping[str, float] = field(default_factory=dict)
 
+    @property
+    def single_steps(self) -> list[int]:
+        """The factors of single calls, which the method is built for; empty for one that takes any."""
+        return sorted({step for steps in self.steps.values() for step in steps})
+
 
 @dataclass(frozen=True)
 class Plan:
