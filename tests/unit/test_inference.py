@@ -15,8 +15,8 @@ from torch import Tensor
 import dsr
 from dsr.geometry.camera import Camera
 from dsr.geometry.resampling import resize_inverse_depth
-from dsr.inference import api as people
 from dsr.inference import MethodChoice, check_settings, plan, upsample_depth, upsample_surface
+from dsr.inference import api as people
 from dsr.inference.engine import _resize_nearest, enlarged_by
 from dsr.inference.planning import OWN_SIZE
 from dsr.methods.registry import find_weights, list_methods, read_method
@@ -305,7 +305,7 @@ def test_settings_change_the_result_and_are_checked() -> None:
 @pytest.mark.parametrize("method", [name for name in list_methods() if "ensemble" in read_method(name, 4)])
 def test_settings_of_every_trained_network_are_checked_at_a_factor_that_has_weights(method: str) -> None:
     check_settings(MethodChoice(method, {"ensemble": 1}))
-    with pytest.raises(ValueError, match="^ensemble: "):
+    with pytest.raises(ValueError, match=r"^ensemble: "):
         check_settings(MethodChoice(method, {"ensemble": 3}))
 
 
