@@ -199,7 +199,7 @@ def _words(text: str) -> tuple[str, ...]:
 
 def _settings(options: argparse.Namespace) -> dict[str, Any]:
     """Return the method's settings, those with an option of their own among them."""
-    from dsr.app.upsample.request import SHORTCUTS  # noqa: PLC0415 - they take seconds to import
+    from dsr.app.upsample.request import SHORTCUTS  # noqa: PLC0415 - it is needed for this command alone
     from dsr.app.upsample.settings import parse_settings  # noqa: PLC0415
 
     settings = parse_settings(options.settings)
@@ -214,7 +214,7 @@ def _settings(options: argparse.Namespace) -> dict[str, Any]:
 
 def _rig(options: argparse.Namespace) -> Any:
     """Return the files of a depth camera elsewhere than the photo's; None if there are none."""
-    from dsr.io.rigs import RigFiles  # noqa: PLC0415 - it takes seconds to import
+    from dsr.io.reading import RigFiles  # noqa: PLC0415 - it is needed for this command alone
 
     if (options.depth_camera is None) != (options.extrinsics is None):
         given, missing = (
@@ -226,11 +226,9 @@ def _rig(options: argparse.Namespace) -> Any:
 
 def _run(options: argparse.Namespace, console: Console, _: object) -> list[str]:
     """Upsample, and return the problems."""
-    from dsr.app.upsample.outputs import PARTS  # noqa: PLC0415
-    from dsr.app.upsample.run import UpsampleRequest, run  # noqa: PLC0415
-    from dsr.io.cameras import CameraChoice  # noqa: PLC0415 - they take seconds to import
-    from dsr.io.encoding import SUNRGBD_BITS, parse_unit  # noqa: PLC0415
-    from dsr.io.inputs import Reading  # noqa: PLC0415
+    from dsr.app.upsample.parts import PARTS  # noqa: PLC0415 - they are needed for this command alone
+    from dsr.app.upsample.request import UpsampleRequest  # noqa: PLC0415
+    from dsr.io.reading import SUNRGBD_BITS, CameraChoice, Reading, parse_unit  # noqa: PLC0415
     from dsr.io.shards import parse_shard  # noqa: PLC0415
 
     intrinsics = None if options.intrinsics is None else tuple(options.intrinsics)
@@ -283,4 +281,6 @@ def _run(options: argparse.Namespace, console: Console, _: object) -> list[str]:
         overwrite=options.overwrite,
         dry_run=options.dry_run,
     )
+    from dsr.app.upsample.run import run  # noqa: PLC0415 - it takes seconds to import: after all values are checked
+
     return run(wanted, console)

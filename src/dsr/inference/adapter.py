@@ -15,7 +15,8 @@ from torch import Tensor
 
 from dsr.degradation.scales import SCALES
 from dsr.geometry.camera import RangeType
-from dsr.inference.engine import DECIDED, Fill, MethodChoice, upsample_depth
+from dsr.inference.engine import DECIDED, MethodChoice, upsample_depth
+from dsr.inference.options import Fill
 from dsr.inference.planning import read_ability
 from dsr.methods.registry import find_weights, read_method
 from dsr.sample import DepthSample

@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from dsr.geometry.camera import Camera
-from dsr.inference.engine import WIDEST, Fill, upsample_surface
-from dsr.inference.planning import DEFAULT
+from dsr.inference.engine import upsample_surface
+from dsr.inference.options import DEFAULT, WIDEST, Fill
 from dsr.methods.base import MapNoise
 from dsr.utils.progress import Steps
 
