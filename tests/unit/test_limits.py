@@ -27,9 +27,10 @@ from dsr.io.captures import ros, video
 from dsr.io.captures.record3d import find_record3d
 from dsr.io.depth_files import read_depth_file
 from dsr.io.input_files import read_input
-from dsr.io.inputs import Reading, read_picture
+from dsr.io.inputs import read_picture
 from dsr.io.pairs import Pair
 from dsr.io.photos import read_photo
+from dsr.io.reading import Reading
 from dsr.methods.networks.trained import NETWORKS, packaged_weights
 from dsr.methods.networks.weight_files import load_network, read_torch_file
 from dsr.sample import DepthSample

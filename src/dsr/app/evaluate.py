@@ -80,16 +80,6 @@ def objective(scores: pd.DataFrame) -> float:
 
 def _evaluate(plain: dict[str, Any], source: SceneSource | None) -> pd.DataFrame:
     """Evaluate on ``source``, or on the data set that the configuration describes."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)  # until it is decided who computes: threads would not survive a fork
-    try:
-        return _evaluate_with(plain, source, threads)
-    finally:
-        torch.set_num_threads(threads)
-
-
-def _evaluate_with(plain: dict[str, Any], source: SceneSource | None, cores: int) -> pd.DataFrame:
-    """Evaluate as :func:`_evaluate` does; ``cores`` is the number of threads that computations may have."""
     settings = EvalConfig.of(plain)
     console = open_console()
     device = pick_device(settings.device)
@@ -106,7 +96,7 @@ def _evaluate_with(plain: dict[str, Any], source: SceneSource | None, cores: int
     given = {"device": device, "weights": weights, "workspace": folder, "display": progress}
     study = _study(settings, identity, given, source, adapted)
     check_metrics(settings.metrics)
-    workers = _workers(settings, device, len(study.source.scenes()), cores)
+    workers = _workers(settings, device, len(study.source.scenes()))
     rundir.claim(folder, plain, identity)
     if settings.overwrite:
         shutil.rmtree(folder / WORKSPACE, ignore_errors=True)
@@ -131,7 +121,7 @@ def _evaluate_with(plain: dict[str, Any], source: SceneSource | None, cores: int
     return scores
 
 
-def _workers(settings: EvalConfig, device: torch.device, scenes: int, cores: int) -> Workers:
+def _workers(settings: EvalConfig, device: torch.device, scenes: int) -> Workers:
     """Return the worker processes that the configuration describes.
 
     Raises:
@@ -145,9 +135,8 @@ def _workers(settings: EvalConfig, device: torch.device, scenes: int, cores: int
             f"workers: expected 1 with device={device}, got {count}; "
             "start the command once per device, with the same output_dir"
         )
-    return choose_workers(
-        count, threads, scenes, cores, together=forks and not trait("method", settings.method, "optimises")
-    )
+    together = forks and not trait("method", settings.method, "optimises")
+    return choose_workers(count, threads, scenes, torch.get_num_threads(), together=together)
 
 
 def _import_report() -> None:

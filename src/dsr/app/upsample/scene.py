@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -28,7 +27,6 @@ _WRITERS: Mapping[str, tuple[str, Callable[[Path, Sequence[Frame]], list[Path]]]
     "rerun": ("scene.rrd", write_rerun),
 }
 """The file or folder of each part in the folder of the results, and what writes it."""
-SCENE_PARTS = tuple(_WRITERS)
 
 
 @dataclass
@@ -39,17 +37,6 @@ class SceneResult:
     problems: list[str] = field(default_factory=list)
 
 
-def check_libraries(parts: Sequence[str]) -> None:
-    """Check that the libraries of some parts are installed.
-
-    Raises:
-        ValueError: one is not.
-
-    """
-    if "rerun" in parts and importlib.util.find_spec("rerun") is None:
-        raise ValueError("--with rerun: expected the library rerun-sdk, which `pip install dsr[rerun]` installs")
-
-
 def write_scene(output: Path, folders: Mapping[str, Path], parts: Sequence[str], *, overwrite: bool) -> SceneResult:
     """Write exports of frames that are complete, and record them in ``exports.json``.
 
@@ -58,7 +45,7 @@ def write_scene(output: Path, folders: Mapping[str, Path], parts: Sequence[str],
     Args:
         output: the folder of the results.
         folders: the folder of each frame, by its name.
-        parts: some of :data:`SCENE_PARTS`.
+        parts: some of :data:`dsr.app.upsample.parts.SCENE_PARTS`.
         overwrite: whether to replace what is there and not recorded.
 
     """
