@@ -113,7 +113,7 @@ def test_log_has_the_losses_all_scores_and_renderings(
     assert [event.step for event in log.Images("renderings")] == [20, 40]
     logged = log.Scalars("val/RMSE_v")[-1].value
     [scored] = [row for row in _rows(home) if (row["scene"], row["metric"]) == ("statue", "RMSE_v")]
-    assert logged == pytest.approx(float(scored["value"]), rel=1e-4)
+    assert logged == pytest.approx(1000 * float(scored["value"]), rel=1e-4)
     table = (home / "optimisation" / "statue" / "validation.csv").read_text()
     assert "40,val,DSSIM_v," in table
 

@@ -305,9 +305,10 @@ def _loss_text(trainer: lightning.Trainer) -> str:
 
 
 def scores_line(trainer: lightning.Trainer) -> str:
-    """Return the main scores of the last validation for a reader; empty if there are none."""
-    scores = {name: trainer.callback_metrics.get(f"val/{name}") for name in ("RMSE_d", "RMSE_v", "DSSIM_v", "LPIPS_v")}
-    return "  ".join(f"{name} {float(value):.4f}" for name, value in scores.items() if value is not None)
+    """Return the main scores of the last validation for a reader, in mm and 1/1000; empty if there are none."""
+    units = {"RMSE_d": " mm", "RMSE_v": "", "DSSIM_v": "", "LPIPS_v": ""}
+    scores = {name: trainer.callback_metrics.get(f"val/{name}") for name in units}
+    return "  ".join(f"{name} {float(value):.1f}{units[name]}" for name, value in scores.items() if value is not None)
 
 
 @contextlib.contextmanager
