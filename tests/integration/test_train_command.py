@@ -788,14 +788,12 @@ def test_losses_and_degradations_that_do_not_fit_are_refused(smoke, within, argu
     assert message in errors[0]
 
 
-def test_table_of_runs_has_the_settings_and_the_scores(smoke):
+def test_log_has_the_settings_and_the_scores(smoke):
     assert not any("epoch" in tag for tag in events_of(smoke[1]).Tags()["scalars"])
-    hparams = yaml.safe_load((smoke[1] / "tensorboard" / "hparams.yaml").read_text())
+    hparams = yaml.safe_load((smoke[1] / "tensorboard" / "hparams.yaml").read_text())  # the table: test_hparams.py
     assert (hparams["model"], hparams["scale"], hparams["steps"], hparams["loss"]) == ("msg_v", 4, 2, "lap1")
     assert hparams["w"] > 0
     scalars = events_of(smoke[1]).Tags()["scalars"]
     assert {"val/RMSE_v", "train/gradient_norm", "train/patches_per_second"} <= set(scalars)
-    assert {tag.partition("/")[0] for tag in scalars} == {"train", "val"}
-    table = events_of(smoke[1]).summary_metadata["_hparams_/experiment"].plugin_data.content
-    assert all(name in table for name in (b"val/RMSE_v", b"val/DSSIM_v", b"learning_rate"))
+    assert {tag.partition("/")[0] for tag in scalars} == {"train", "val", "score"}
     assert min(scalars_of(smoke[1], "train/patches_per_second").values()) > 0

@@ -109,6 +109,7 @@ NOT_PREDICTING = (
     "utils/console.py",
     "utils/interruption.py",
     "utils/progress.py",
+    "utils/runs_table.py",
     "utils/space.py",
     "utils/temporary.py",
     "utils/units.py",

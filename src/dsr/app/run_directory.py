@@ -13,7 +13,7 @@ import torch
 from omegaconf import OmegaConf
 
 from dsr.app.moved_targets import update_targets
-from dsr.utils.builder import ConfigError, expand_home
+from dsr.utils.builder import ConfigError, expand_home, takes
 from dsr.utils.console import shorten
 from dsr.utils.files import write_text
 from dsr.utils.hashing import hash_of_code, hash_outside_code
@@ -77,6 +77,22 @@ def default_directory(kind: str, config: Mapping[str, Any], identity: Mapping[st
         what["name"],
     )
     return Path("outputs") / kind / "_".join((*names, digest))
+
+
+def degradation_of(config: Mapping[str, Any]) -> str:
+    """Return the name of a run's degradation, as in ``scores.csv``: box, or box+gaussian_multiplicative-0.003."""
+    if config.get("degradation", {}).get("name", "plain") != "plain":
+        return str(config["degradation"]["name"])
+    parts = [str(config["downsampling"]["name"])]
+    assumed = config["downsampling"].get("assumed")
+    if assumed not in (None, parts[0]) and takes("method", config["method"], "downsampling"):
+        parts.append(f"assumed-{assumed}")
+    for group in (config["noise"], config.get("holes", {"name": "none"})):
+        if group["name"] != "none":
+            settings_of = [value for key, value in group.items() if key not in ("name", "target")]
+            values = ["none" if value is None else f"{value:g}" for value in settings_of]
+            parts.append("-".join((str(group["name"]), *values)))
+    return "+".join(parts)
 
 
 def folder_of(output_dir: str | Path) -> Path:

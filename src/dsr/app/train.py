@@ -319,12 +319,14 @@ def _describe(
     resumed: bool,
 ) -> None:  # fmt: skip
     """Write the configuration and the resulting w to the log, and lay it out."""
+    label = plain["model"].get("label", facts["model"])
+    listed = {**facts, "method": label, "degradation": rundir.degradation_of(plain)}
     loss = {**plain["loss"], "w": module.objective.w} if isinstance(module.objective, Objective) else {}
     config = {**plain, "loss": loss}
     if isinstance(trainer.logger, TensorBoardLogger) or not resumed:  # MLflow refuses another device, say
-        log_settings(trainer.logger, facts, f"```yaml\n{OmegaConf.to_yaml(OmegaConf.create(config))}```", config)
+        log_settings(trainer.logger, listed, f"```yaml\n{OmegaConf.to_yaml(OmegaConf.create(config))}```", config)
     collections: Any = module.metrics
-    log_layout(trainer.logger, list(collections[0]))
+    log_layout(trainer.logger, {name: metric.chart_title for name, metric in collections[0].items()})
 
 
 def _facts(plain: Mapping[str, Any], module: SuperResolution) -> dict[str, Any]:
