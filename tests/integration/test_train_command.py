@@ -160,7 +160,7 @@ def test_training_emits_no_warning(smoke):
 
 def test_training_writes_the_documented_files_and_nothing_else(smoke):
     folder, home, _ = smoke
-    assert home.name.startswith("procedural_box_x4_msg_v_")
+    assert home.name == "msg_v_x4_smoke_count6_size64_seed0"
     [events] = (home / "tensorboard").glob("events.*")
     assert tree(home) == [
         "checkpoints/best.ckpt", "checkpoints/last.ckpt", "config.yaml",
@@ -438,7 +438,7 @@ def test_interrupted_training_gives_bit_identical_weights(tmp_path, within, inte
 def test_training_resumes_from_its_last_validation_even_if_it_was_not_the_best(
     tmp_path, within, interrupt, monkeypatch
 ):
-    scores = iter([0.1, 0.2, 0.3])
+    scores = iter([1000.0, 2000.0, 3000.0])
     end = SuperResolution.on_validation_epoch_end
 
     def worse(self):
