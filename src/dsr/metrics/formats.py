@@ -14,6 +14,7 @@ _MOST_DIGITS = 20
 LOOKS = ("RMSE_v", "RMSE_v1", "DSSIM_v", "LPIPS_v")
 """The metrics of how a surface looks, by which results are compared first: RMSE_v, without lights, and three for the
 worst of four lights."""
+LIGHTS_NOTE = "RMSE_v has no lights, the other metrics of renderings are of the worst of four"
 HEADLINES = ("", "max", "min")
 """Variants of the value that stands for an image: without lights, or the worst of four lights (the smallest value where
 higher is better)."""
