@@ -29,8 +29,8 @@ COMMANDS = (
 COLUMNS = ["dataset", "degradation", "method", "scale", "w", "kind", "seed", "steps"]
 NOISY = "box+gaussian_multiplicative-0.003"
 ROWS = {
-    "one/tensorboard": ["procedural", "box", "MSG-V", 4, "0.72", "training", 0, "2"],
-    "two/tensorboard": ["procedural", NOISY, "MSG-V", 2, "0.72", "training", 1, "2"],
+    "one/tensorboard": ["procedural", "box", "msg_v", 4, "0.72", "training", 0, "2"],
+    "two/tensorboard": ["procedural", NOISY, "msg_v", 2, "0.72", "training", 1, "2"],
     "bicubic": ["simgeo", NOISY, "Bicubic", 4, "-", "evaluation", 0, "-"],
     "msg_v": ["simgeo", "box", "MSG-V", 4, "-", "evaluation", 0, "-"],
     "dip": ["simgeo", "box", "DIP-V", 4, "auto", "evaluation", 0, "4"],

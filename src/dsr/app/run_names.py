@@ -35,7 +35,7 @@ NOT_IDENTITY = (
 _ELSEWHERE = (*NOT_IDENTITY, "scale", "seed", "device", "precision")
 """Keys that are no settings that differ: they are in each name, or a matter of the machine."""
 _NO_SETTINGS = ("name", "label", "target", "validation_of")
-_LONGEST, _LONGEST_VALUE = 100, 40
+_LONGEST, _LONGEST_VALUE = 100, 60
 
 
 def run_name(kind: str, config: Mapping[str, Any], identity: Mapping[str, Any]) -> tuple[str, bool]:
@@ -53,7 +53,7 @@ def run_name(kind: str, config: Mapping[str, Any], identity: Mapping[str, Any]) 
     names = [name for group, name in named.items() if name != usual[group] or (kind, group) == ("eval", "dataset")]
     settings = [_setting(key, value) for key, value in _differing(config, defaults, head).items()]
     if config.get("run") is not None:
-        settings.append(_setting("run", str(Path(config["run"]).absolute())))
+        settings.append((_setting("run", Path(config["run"]).absolute().name)[0], False))
     elif config.get("weights") != defaults.get("weights"):
         settings.append((f"weights-{str(identity['weights_sha256'])[:8]}", True))
     if "precision" in given_keys():

@@ -319,8 +319,7 @@ def _describe(
     resumed: bool,
 ) -> None:  # fmt: skip
     """Write the configuration and the resulting w to the log, and lay it out."""
-    label = plain["model"].get("label", facts["model"])
-    listed = {**facts, "method": label, "degradation": rundir.degradation_of(plain)}
+    listed = {**facts, "method": facts["model"], "degradation": rundir.degradation_of(plain)}
     loss = {**plain["loss"], "w": module.objective.w} if isinstance(module.objective, Objective) else {}
     config = {**plain, "loss": loss}
     if isinstance(trainer.logger, TensorBoardLogger) or not resumed:  # MLflow refuses another device, say
