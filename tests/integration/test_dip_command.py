@@ -83,7 +83,7 @@ def test_cost_of_each_scene_is_announced_and_the_run_ends_in_a_table(
     assert (done.returncode, done.stderr) == (0, "")
     for scene in ("statue", "cube_no_texture"):
         assert re.search(rf"^{scene}: 40 steps at 48 x 48 in (float32|bfloat16); about \d+ s \(", done.stdout, re.M)
-        scores = r"RMSE_d 0\.\d+  RMSE_v 0\.\d+  DSSIM_v 0\.\d+"
+        scores = r"RMSE_d \d+\.\d mm  RMSE_v \d+\.\d  DSSIM_v \d+\.\d"
         assert re.search(rf"^{scene}: step +40  loss \d\.\d+  validation: {scores}$", done.stdout, re.M)
         assert re.search(rf"^predict {scene}: \d of 2, \d+\.\d s, elapsed 0:\d\d:\d\d, remaining", done.stdout, re.M)
     assert "DIP-V on simgeo, x4, box downsampling" in done.stdout
@@ -113,7 +113,7 @@ def test_log_has_the_losses_all_scores_and_renderings(
     assert [event.step for event in log.Images("renderings")] == [20, 40]
     logged = log.Scalars("val/RMSE_v")[-1].value
     [scored] = [row for row in _rows(home) if (row["scene"], row["metric"]) == ("statue", "RMSE_v")]
-    assert logged == pytest.approx(float(scored["value"]), rel=1e-4)
+    assert logged == pytest.approx(1000 * float(scored["value"]), rel=1e-4)
     table = (home / "optimisation" / "statue" / "validation.csv").read_text()
     assert "40,val,DSSIM_v," in table
 

@@ -193,6 +193,7 @@ def _study(
     name = str(settings.method["name"])
     if "downsampling.assumed" in given_keys() and not takes("method", settings.method, "downsampling"):
         raise ConfigError(f"downsampling.assumed: method={name} assumes no downsampling model; leave it out")
+    label, degradation = str(settings.method.get("label", name)), rundir.degradation_of(vars(settings))
     method = adapted or build_method(
         settings.method,
         settings.scale,
@@ -202,13 +203,14 @@ def _study(
         downsampling=downsampling.assumed_model(),
         told=_known_of_maps(settings, downsampling, source),
         lpips_trunk=settings.metrics.lpips_trunk,
+        about={"method": label, "degradation": degradation},
         metrics=functools.partial(metric_collection, settings.metrics, given["device"]),
         **given,
     )
     return Evaluation(
         source,
         downsampling,
-        _problem_name(settings),
+        degradation,
         settings.scale,
         method,
         _flagged(name, method, "_{}"),
@@ -217,7 +219,7 @@ def _study(
         given["device"],
         noise=build("noise", settings.noise),
         holes=build("holes", settings.holes),
-        label=_flagged(str(settings.method.get("label", name)), method, " ({})"),
+        label=_flagged(label, method, " ({})"),
         note=getattr(method, "describe", None),
     )
 
@@ -244,20 +246,6 @@ def _precision(settings: EvalConfig, device: torch.device) -> str:
     if settings.precision != "auto":
         return settings.precision
     return fast_precision(device) if trait("method", settings.method, "optimises") else "float32"
-
-
-def _problem_name(settings: EvalConfig) -> str:
-    """Return the name of the degradation, as in ``scores.csv``: box, or box+gaussian_multiplicative-0.003."""
-    parts = [str(settings.downsampling["name"])]
-    assumed = settings.downsampling.get("assumed")
-    if assumed not in (None, parts[0]) and takes("method", settings.method, "downsampling"):
-        parts.append(f"assumed-{assumed}")
-    for group in (settings.noise, settings.holes):
-        if group["name"] != "none":
-            settings_of = [value for key, value in group.items() if key not in ("name", "target")]
-            values = ["none" if value is None else f"{value:g}" for value in settings_of]
-            parts.append("-".join((str(group["name"]), *values)))
-    return "+".join(parts)
 
 
 def _seed(seed: int) -> None:

@@ -31,6 +31,7 @@ from dsr.methods.networks.base import DisparityNetwork
 from dsr.methods.networks.facets_unet import FacetsUNet
 from dsr.methods.networks.trained import NETWORKS
 from dsr.methods.networks.weight_files import load_network, network_name, read_torch_file, save_network
+from dsr.metrics.catalogue import KNOWN_FORMATS
 from dsr.metrics.visual_loss import VisualLoss, make_visual_loss
 from dsr.training.data_module import PatchData
 from dsr.training.loggers import RUN_ID, expect_installed, log_layout, log_settings
@@ -63,7 +64,7 @@ def train(config: DictConfig) -> float:
         config: composed from ``conf/train.yaml``.
 
     Returns:
-        The best score of the validations, their mean RMSE_v.
+        The best score of the validations, their mean RMSE_v, as a fraction like the scores in files.
 
     Raises:
         ConfigError: the configuration cannot be run, or its training is already complete.
@@ -128,7 +129,8 @@ def _train(plain: dict[str, Any], settings: TrainConfig, device: torch.device, p
     if first:
         _export(module, Path(best.best_model_path), weights, facts)
     progress.say(f"weights: {weights}")
-    return float(best.best_model_score if best.best_model_score is not None else math.nan)
+    score = math.nan if best.best_model_score is None else float(best.best_model_score)
+    return score / KNOWN_FORMATS["RMSE_v"].factor
 
 
 def _expect_trainable(
@@ -317,12 +319,13 @@ def _describe(
     resumed: bool,
 ) -> None:  # fmt: skip
     """Write the configuration and the resulting w to the log, and lay it out."""
+    listed = {**facts, "method": facts["model"], "degradation": rundir.degradation_of(plain)}
     loss = {**plain["loss"], "w": module.objective.w} if isinstance(module.objective, Objective) else {}
     config = {**plain, "loss": loss}
     if isinstance(trainer.logger, TensorBoardLogger) or not resumed:  # MLflow refuses another device, say
-        log_settings(trainer.logger, facts, f"```yaml\n{OmegaConf.to_yaml(OmegaConf.create(config))}```", config)
+        log_settings(trainer.logger, listed, f"```yaml\n{OmegaConf.to_yaml(OmegaConf.create(config))}```", config)
     collections: Any = module.metrics
-    log_layout(trainer.logger, list(collections[0]))
+    log_layout(trainer.logger, {name: metric.chart_title for name, metric in collections[0].items()})
 
 
 def _facts(plain: Mapping[str, Any], module: SuperResolution) -> dict[str, Any]:

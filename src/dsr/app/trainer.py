@@ -17,7 +17,7 @@ from dsr.training.module import SuperResolution
 from dsr.utils.builder import build
 from dsr.utils.checkpoints import Interruption, Keep, ends_step
 from dsr.utils.divergence import Divergence
-from dsr.utils.lightning import LOG_EVERY, StepProgress, ValidationTable, make_trainer, without_chatter
+from dsr.utils.lightning import LOG_EVERY, ListedScores, StepProgress, ValidationTable, make_trainer, without_chatter
 from dsr.utils.progress import Progress
 
 MONITOR = "val/RMSE_v"
@@ -116,6 +116,7 @@ def training_trainer(
         Divergence(),
         Curves(min(LOG_EVERY, settings.validate_every, settings.steps)),
         ValidationTable(folder / VALIDATION),
+        ListedScores(best),
         best,
         latest,
         LearningRateMonitor("step"),

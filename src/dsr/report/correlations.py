@@ -13,7 +13,7 @@ import numpy as np
 import pandas as pd
 
 from dsr.evaluation.results import Results
-from dsr.metrics.formats import HEADLINES
+from dsr.metrics.formats import HEADLINES, LIGHTS_NOTE
 from dsr.report.markup import MISSING, aligned, escaped
 from dsr.utils.files import replacing, write_text
 from dsr.utils.tables import guarded
@@ -132,7 +132,7 @@ def _ranking_text(ranking: pd.DataFrame, count: int) -> str:
         for _, row in ranking.iterrows()
     ]
     text = (
-        f"Over {count} results of all methods, scenes and scales. A name by itself is the worst of four lights; "
+        f"Over {count} results of all methods, scenes and scales. {LIGHTS_NOTE}, by a name by itself; "
         f"RMSE_d is clipped at {DEPTH_LIMIT:g} m. n: number of results with both metrics."
     )
     return f"{title}{text}\n\n{aligned(['metric', 'Pearson', 'Spearman', 'n'], rows, 1)}\n"

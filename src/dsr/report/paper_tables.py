@@ -19,7 +19,7 @@ import pandas as pd
 
 from dsr.evaluation.results import Results, Run
 from dsr.metrics.catalogue import KNOWN_FORMATS
-from dsr.metrics.formats import AFTER_THE_PAPER, HEADLINES, Formats, describe_directions, in_tables
+from dsr.metrics.formats import AFTER_THE_PAPER, HEADLINES, LIGHTS_NOTE, Formats, describe_directions, in_tables
 from dsr.report.scene_sets import PAPER_SCENES, TITLES, Place, SceneSet, sets_of_dataset, sets_of_summary
 from dsr.report.table_parts import Cell, Column, Group, PaperTable, Row
 from dsr.report.tables import paper_row, published
@@ -236,7 +236,7 @@ def _notes(groups: Sequence[Group], columns: Sequence[Column], formats: Formats)
     if user:
         direction += " and User columns higher" if " of " in direction else ", of User columns higher"
     yield f"{direction[0].upper()}{direction[1:]}."
-    yield "Metrics of renderings are the worst of four lights."
+    yield f"{LIGHTS_NOTE}."
     yield "In each group our best displayed value is bold, the second best underlined; equal values share the mark."
     of_paper = [name for name, each in in_tables(KNOWN_FORMATS).items() if each.position != AFTER_THE_PAPER]
     missing = [name for name in of_paper if name not in shown]

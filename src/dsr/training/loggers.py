@@ -21,6 +21,7 @@ from dsr.metrics.formats import main_first
 from dsr.utils.builder import expect_library
 from dsr.utils.files import write_text
 from dsr.utils.lightning import Log
+from dsr.utils.runs_table import list_run
 
 _CURVES = ("loss", "gradient_norm")
 _ROWS_AT_ONCE = 10
@@ -161,37 +162,39 @@ def log_settings(logger: Logger | None, table: Mapping[str, Any], text: str, con
 
     Args:
         logger: of the training.
-        table: the main settings, for TensorBoard's table of runs.
+        table: the main settings, among them the columns of TensorBoard's table of runs.
         text: the complete configuration for readers, for TensorBoard.
         config: the complete configuration, for other loggers.
 
     """
     if isinstance(logger, Log):
-        logger.list_run(table)
+        logger.log_hyperparams(dict(table))
+        list_run(logger.experiment, "training", table, {})
         logger.experiment.add_text("config", text)
     elif logger is not None:
         logger.log_hyperparams(dict(config))
 
 
-def log_layout(logger: Logger | None, metrics: Sequence[str], losses: Sequence[str] = _CURVES) -> None:
-    """Lay out TensorBoard's *Custom scalars*: the worst of four lights first, then depth and normals, then losses.
+def log_layout(logger: Logger | None, metrics: Mapping[str, str], losses: Sequence[str] = _CURVES) -> None:
+    """Lay out TensorBoard's *Custom scalars*: metrics of renderings first, then those of depth, then losses.
 
     A chart has a metric's mean over all validation sets and, if there are several, that of each.
 
     Args:
         logger: of the training; others than TensorBoard's have no layout.
-        metrics: names of the validation's metrics.
+        metrics: titles of the validation's metrics, by name.
         losses: names of values of the training.
 
     """
     if not isinstance(logger, Log):
         return
     looks = main_first(name for name in metrics if "_v" in name)
+    depth = [name for name in metrics if name not in looks]
     groups = {
-        "Looks, worst of four lights": {name: rf"val(_[^/]*)?/{re.escape(name)}$" for name in looks},
-        "Depth and normals": {name: rf"val(_[^/]*)?/{re.escape(name)}$" for name in metrics if name not in looks},
+        **{title: {metrics[name]: rf"val(_[^/]*)?/{re.escape(name)}$" for name in names}
+           for title, names in (("Looks", looks), ("Depth and normals", depth))},
         "Training": {name: f"train/{name}$" for name in losses},
-    }
+    }  # fmt: skip
     layout = {title: {name: ["Multiline", [tag]] for name, tag in charts.items()} for title, charts in groups.items()}
     logger.experiment.add_custom_scalars({title: charts for title, charts in layout.items() if charts})
 

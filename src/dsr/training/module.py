@@ -14,7 +14,7 @@ from torch.optim.swa_utils import get_ema_multi_avg_fn
 
 from dsr.geometry.comparison import comparison
 from dsr.methods.networks.base import DisparityNetwork
-from dsr.metrics.classes import compute_means
+from dsr.metrics.classes import compute_means, in_table_units
 from dsr.metrics.functional import SurfacePair
 from dsr.sample import Unit
 from dsr.training.degradation import Batch
@@ -118,7 +118,7 @@ class SuperResolution(lightning.LightningModule):
             self._pictures[f"renderings/{self.sets[dataloader_idx]}_{number}"] = picture
 
     def on_validation_epoch_end(self) -> None:
-        """Log the mean scores over the scenes, worst of four lights, of all sets and, if there are several, of each."""
+        """Log the mean scores in the units of tables, of all sets and, if there are several, of each."""
         self._gather()
         for name in sorted(self._pictures):
             log_picture(self.logger, name, self._pictures[name], self.global_step)
@@ -133,7 +133,9 @@ class SuperResolution(lightning.LightningModule):
         self.validation_scores = {
             kind: {name: float(value) for name, value in each.items()} for kind, each in named.items()
         }
-        self.log_dict({f"{kind}/{name}": v for kind, each in named.items() for name, v in each.items()})
+        metrics: Any = {name: metric for each in collections for name, metric in each.items()}
+        for kind, raw in self.validation_scores.items():
+            self.log_dict({f"{kind}/{name}": value for name, value in in_table_units(metrics, raw).items()})
         for each in self.metrics:
             each.reset()  # type: ignore[operator]
 
