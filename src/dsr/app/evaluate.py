@@ -24,6 +24,7 @@ from dsr.data.base import SceneSource, prepare_scenes
 from dsr.degradation.downsampling import Downsampling, Measured
 from dsr.degradation.scales import NATIVE, match_ratio
 from dsr.evaluation.predict import Evaluation, Outcome, StalePredictionError, failure_line, predict
+from dsr.evaluation.run_files import read_run
 from dsr.evaluation.score import score
 from dsr.evaluation.sharing import Workers, can_fork, choose_workers
 from dsr.evaluation.store import load_errors, prediction_path
@@ -113,7 +114,7 @@ def _evaluate(plain: dict[str, Any], source: SceneSource | None) -> pd.DataFrame
     illustrate = functools.partial(_illustrate, folder, study.label, formats)
     scores = score(study, folder, metrics, outcome, progress, illustrate, workers=workers)
     _save_dashboard(folder)
-    _report(console, folder, scores, study.label, outcome, formats)
+    _report(console, folder, scores, outcome, formats)
     if outcome.failures:
         total = len(study.source.scenes())
         rest = f"; the others are in {folder}" if len(outcome.failures) < total else ""
@@ -269,12 +270,10 @@ def _illustrate(
         write_confidence(path, depth, *errors, sample.depth, sample.camera)
 
 
-def _report(
-    console: Console, folder: Path, scores: pd.DataFrame, label: str, outcome: Outcome, formats: Formats
-) -> None:
+def _report(console: Console, folder: Path, scores: pd.DataFrame, outcome: Outcome, formats: Formats) -> None:
     """Print the table of scores, notes and failures."""
     if not scores.empty:
-        console.print(score_table(scores, label, formats))
+        console.print(score_table(read_run(folder), formats))
     scenes_by_note: dict[str, list[str]] = {}
     for scene, notes in outcome.notes.items():
         scenes_by_note.setdefault("; ".join(notes), []).append(scene)

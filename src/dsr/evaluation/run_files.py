@@ -163,6 +163,7 @@ class _Identity(BaseModel, extra="allow", strict=True):
 
     method: dict[str, Any] = {}
     dataset: dict[str, Any] = {}
+    downsampling: dict[str, Any] = {}
 
 
 class _Versions(BaseModel, extra="allow"):
