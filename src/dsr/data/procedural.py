@@ -58,7 +58,7 @@ class Procedural:
         Where it takes longer than a few seconds, all processors take part.
 
         Raises:
-            ChildProcessError: a process that renders was ended.
+            ChildProcessError: two processes that render were ended at the same scene.
 
         """
         there = {scene: (cache_directory() / self._path(scene)).is_file() for scene in scenes}
