@@ -459,6 +459,39 @@ def test_training_resumes_from_its_last_validation_even_if_it_was_not_the_best(
     assert all(torch.equal(value, best["state_dict"][f"average.{name}"]) for name, value in weights.items())
 
 
+def test_checkpoint_of_a_stranger_removes_nothing_outside_the_run(tmp_path, within, interrupt):
+    (tmp_path / "victim").mkdir()
+    (tmp_path / "victim" / "thesis.txt").write_text("precious")
+    interrupt(3)
+    assert within(*FOUR)[0] == 130
+    interrupt(None)
+    last = tmp_path / "out" / "checkpoints" / "last.ckpt"
+    checkpoint = torch.load(last, weights_only=True)
+    [state] = [each for each in checkpoint["callbacks"].values() if each.get("monitor")]
+    path = f"{last.parent}/../../victim"
+    state |= {"best_k_models": {path: state["kth_value"] + 100}, "kth_best_model_path": path}
+    del state["dirpath"]
+    torch.save(checkpoint, last)
+    code, output, errors = within("resume=out")
+    assert (code, errors) == (0, [])
+    assert (tmp_path / "victim" / "thesis.txt").read_text() == "precious"
+    [line] = [line for line in output.splitlines() if "victim" in line]
+    assert line == f"note: {path} is not taken from the checkpoint, only files in out/checkpoints are"
+
+
+def test_link_in_place_of_the_checkpoints_is_refused(tmp_path, within, interrupt):
+    interrupt(3)
+    assert within(*FOUR)[0] == 130
+    interrupt(None)
+    (tmp_path / "out" / "checkpoints").rename(tmp_path / "mine")
+    (tmp_path / "out" / "checkpoints").symlink_to(tmp_path / "mine")
+    before = tree(tmp_path)
+    line = "error: out/checkpoints: expected a directory of the run's own, got a link"
+    for arguments in (["resume=out"], [*FOUR, "overwrite=true"]):
+        assert within(*arguments) == (2, "", [line])
+    assert tree(tmp_path) == before
+
+
 def test_training_that_lacks_only_its_weights_file_gets_it(smoke, tmp_path, within):
     code, _, _ = within(*SMOKE, "output_dir=out")
     assert code == 0

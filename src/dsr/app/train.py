@@ -51,6 +51,8 @@ from dsr.utils.units import duration
 
 _PATCHES_FOR_W = 64
 _LARGEST_SEED = 2**32 - 1
+_FOLDERS = ("checkpoints", "tensorboard", "csv", "wandb", "mlruns")
+"""What a training writes into its directory beside files."""
 _RESUMABLE = ("resume", "device", "trust")
 
 
@@ -126,7 +128,7 @@ def _train(plain: dict[str, Any], settings: TrainConfig, device: torch.device, p
             f"interrupted at step {trainer.global_step}; resume={folder} goes on from there"
         ) from None
     if first:
-        _export(module, Path(best.best_model_path), weights, facts)
+        _export(module, last.with_name("best.ckpt"), weights, facts)
     progress.say(f"weights: {weights}")
     return float(best.best_model_score if best.best_model_score is not None else math.nan)
 
@@ -135,6 +137,9 @@ def _expect_trainable(
     folder: Path, plain: Mapping[str, Any], identity: Mapping[str, Any], tolerated: Sequence[str]
 ) -> None:
     """Check that the directory is free or that of this training, which is neither complete nor diverges again."""
+    for name in _FOLDERS:
+        if (folder / name).is_symlink():
+            raise ConfigError(f"{folder / name}: expected a directory of the run's own, got a link")
     if not plain["overwrite"] and (folder / WEIGHTS).exists():
         raise ConfigError(f"output_dir: {folder / WEIGHTS} is trained already; overwrite=true trains it again")
     rundir.expect_free(folder, plain, identity, tolerated)
@@ -274,7 +279,7 @@ def _clear(folder: Path) -> None:
     """Remove the files of an earlier training, so that they are not taken for this one's if it is interrupted."""
     for name in (WEIGHTS, NOTE, RUN_ID):
         (folder / name).unlink(missing_ok=True)
-    for name in ("checkpoints", "tensorboard", "csv", "wandb", "mlruns"):
+    for name in _FOLDERS:
         shutil.rmtree(folder / name, ignore_errors=True)
 
 

@@ -15,7 +15,7 @@ from dsr.app.schema import TrainConfig
 from dsr.training.degradation import Batch
 from dsr.training.module import SuperResolution
 from dsr.utils.builder import build
-from dsr.utils.checkpoints import Interruption, Keep, ends_step
+from dsr.utils.checkpoints import Interruption, Keep, OwnFiles, ends_step
 from dsr.utils.divergence import Divergence
 from dsr.utils.lightning import LOG_EVERY, StepProgress, ValidationTable, make_trainer, without_chatter
 from dsr.utils.progress import Progress
@@ -113,6 +113,7 @@ def training_trainer(
         checkpoints, "last", enable_version_counter=False, save_on_train_epoch_end=False
     )  # save_last=True keeps the best's
     callbacks = [
+        OwnFiles(checkpoints, progress.say),
         Divergence(),
         Curves(min(LOG_EVERY, settings.validate_every, settings.steps)),
         ValidationTable(folder / VALIDATION),

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import time
-from pathlib import Path
+from collections.abc import Callable, Mapping
+from pathlib import Path, PurePath
 from typing import Any
 
 import lightning
@@ -14,8 +15,12 @@ from lightning.pytorch.plugins.io import TorchCheckpointIO
 
 from dsr.utils import interruption
 from dsr.utils.builder import ConfigError
+from dsr.utils.console import one_line
 from dsr.utils.divergence import in_doubt
 from dsr.utils.files import replacing
+
+_FILES = ("best_model_path", "kth_best_model_path", "last_model_path")
+"""What Lightning's callback that keeps checkpoints says of files, beside ``best_k_models``."""
 
 
 class CheckpointError(ConfigError):
@@ -41,6 +46,53 @@ class Resumed(Callback):
     def on_train_start(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
         """Note that it begins."""
         self.begun = True
+
+
+class OwnFiles(Callback):
+    """Lets a checkpoint name only files of the run's own directory of checkpoints, as Lightning removes what it names.
+
+    Files are taken by their names alone, so that a run goes on wherever it has been moved to. What a checkpoint says of
+    any other path, of a link or of a directory is dropped with all that the same callback has kept.
+
+    Args:
+        folder: the run's directory of checkpoints.
+        say: shows a line.
+
+    """
+
+    def __init__(self, folder: Path, say: Callable[[str], None]) -> None:
+        self._folder, self._say = folder, say
+
+    def on_load_checkpoint(
+        self, trainer: lightning.Trainer, pl_module: lightning.LightningModule, checkpoint: dict[str, Any]
+    ) -> None:
+        """Replace the paths, before any callback restores its state."""
+        states = checkpoint["callbacks"]
+        for key, state in list(states.items()):
+            if not isinstance(state, Mapping) or not {*_FILES, "best_k_models"} & state.keys():
+                continue
+            try:
+                states[key] = self._with_own_files(state)
+            except ValueError as error:
+                del states[key]
+                self._say(f"note: {one_line(error)} is not taken from the checkpoint, only files in {self._folder} are")
+
+    def _with_own_files(self, state: Mapping[str, Any]) -> dict[str, Any]:
+        """Return the state of a callback that keeps checkpoints with the paths that its files have in this run."""
+        folder = self._folder.resolve()
+
+        def own(path: Any) -> str:
+            given = PurePath(str(path))
+            place = folder / given.name
+            if str(given.parent) != str(state.get("dirpath", folder)) or place.is_symlink() or place.is_dir():
+                raise ValueError(str(path))
+            return str(place)
+
+        files = {key: own(state[key]) if state[key] else "" for key in _FILES if key in state}
+        kept = {own(path): score for path, score in state.get("best_k_models", {}).items()}
+        if kept and files.get("kth_best_model_path") not in kept:
+            raise ValueError("a list of files without the worst of them")
+        return {**state, **files, "best_k_models": kept, "dirpath": str(folder)}
 
 
 class Interruption(Callback):
