@@ -96,7 +96,7 @@ class OwnFiles(Callback):
 
 
 class Interruption(Callback):
-    """Ends a training at Ctrl-C or SIGTERM with a checkpoint of the last complete step.
+    """Ends a training at Ctrl-C or SIGTERM with a checkpoint of the step that it is at, once that is complete.
 
     If a validation follows that step, it ends between two scenes of the validation, which is done again later. Only the
     validation after the last step is waited for, as nothing would be left to do again.
@@ -122,8 +122,7 @@ class Interruption(Callback):
     def on_train_start(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
         """Only note signals from now on."""
         self._acts = trainer.is_global_zero
-        message = f"interrupted; {self._path} is the latest checkpoint, the same command goes on from there"
-        self._interruption = self._stack.enter_context(interruption.deferred(message))
+        self._interruption = self._stack.enter_context(interruption.deferred(self._message))
 
     def on_train_batch_end(self, trainer: lightning.Trainer, *_: Any) -> None:
         """Save and stop, if an interruption was requested, a step is complete and no validation follows."""
@@ -170,6 +169,12 @@ class Interruption(Callback):
     def teardown(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule, stage: str) -> None:
         """Let signals act as before."""
         self._close()
+
+    def _message(self) -> str:
+        """Return the line of a process that ends in the middle of a step."""
+        if self._path.is_file():
+            return f"interrupted; {self._path} is the latest checkpoint, the same command goes on from there"
+        return "interrupted before the first checkpoint; the same command begins this again, what is finished is kept"
 
     def _close(self) -> None:
         if self._interruption is not None:

@@ -7,6 +7,7 @@ have computed with several threads before: the threads of OpenMP do not survive 
 
 from __future__ import annotations
 
+import contextlib
 import multiprocessing
 import os
 import time
@@ -161,11 +162,13 @@ class Forks(Generic[_T, _R]):
         """Terminate the workers."""
         for process in self._processes.values():
             process.terminate()
-        for connection, process in self._processes.items():
-            process.join(_SECONDS_TO_END)
-            process.kill()  # whatever kept it from ending
-            process.join()
-            connection.close()
+        waits = interruption.is_ctrl_c()
+        with interruption.deferred(lambda: interruption.MESSAGE) if waits else contextlib.nullcontext():
+            for connection, process in self._processes.items():
+                process.join(None if waits else _SECONDS_TO_END)  # for the step that it is at
+                process.kill()  # whatever kept it from ending
+                process.join()
+                connection.close()
         self._processes, self._busy = {}, {}
 
 
