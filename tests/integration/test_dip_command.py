@@ -112,6 +112,7 @@ def test_log_has_the_losses_all_scores_and_renderings(
     assert {"train/loss", "train/data_lap1", "train/mse_v", "train/intensity", "val/DSSIM_v", "val/RMSE_v"} <= names
     assert [event.step for event in log.Scalars("val/RMSE_v")] == [20, 40]
     assert [event.step for event in log.Images("renderings")] == [20, 40]
+    assert [event.step for event in log.Scalars("train/loss")] == [10, 20, 30, 40]
     logged = log.Scalars("val/RMSE_v")[-1].value
     [scored] = [row for row in _rows(home) if (row["scene"], row["metric"]) == ("statue", "RMSE_v")]
     assert logged == pytest.approx(float(scored["value"]), rel=1e-4)

@@ -209,6 +209,17 @@ def test_log_has_losses_scores_rates_renderings_and_the_configuration(smoke):
     assert "validation_scenes: 1" in text.tensor_proto.string_val[0].decode()
 
 
+def test_log_table_terminal_and_pictures_agree_on_the_number_of_the_step(smoke):
+    home = smoke[1]
+    with (home / "validation.csv").open(newline="") as file:
+        table = sorted({int(row["step"]) for row in csv.DictReader(file)})
+    assert validated(smoke[2].stdout) == table
+    assert sorted(scalars_of(home, "val/RMSE_v")) == table
+    assert [image.step for image in events_of(home).Images("renderings/procedural_0")] == table
+    for tag in ("train/loss", "train/gradient_norm", "train/learning_rate", "train/patches_per_second"):
+        assert sorted(scalars_of(home, tag)) == [1, 2], tag
+
+
 def test_training_loss_is_the_sum_of_its_terms(smoke):
     loss, depth, visual = (scalars_of(smoke[1], f"train/{name}") for name in ("loss", "lap1", "mse_v"))
     w = float(smoke[2].stdout.split("lap1 + ")[-1].split()[0])
@@ -443,7 +454,7 @@ def test_training_resumes_from_its_last_validation_even_if_it_was_not_the_best(
 
     def worse(self):
         end(self)
-        self.log("val/RMSE_v", next(scores))
+        self.log("val/RMSE_v", next(scores), logger=False)
 
     monkeypatch.setattr(SuperResolution, "on_validation_epoch_end", worse)
     interrupt(2)

@@ -34,9 +34,12 @@ def test_table_has_a_row_for_each_step_and_goes_on_after_an_interruption(tmp_pat
     again = loggers.csv(tmp_path)
     again.log_metrics({"train/loss": 0.125}, 19)  # done again
     again.finalize("success")
-    assert rows_of(tmp_path) == [
-        {"step": "9", "train/loss": "0.5", "val/RMSE_v": "0.25"}, {"step": "19", "train/loss": "0.125"}
-    ]  # fmt: skip
+    both = [{"step": "9", "train/loss": "0.5", "val/RMSE_v": "0.25"}, {"step": "19", "train/loss": "0.125"}]
+    assert rows_of(tmp_path) == both
+    last = loggers.csv(tmp_path)
+    last.log_metrics({"val/RMSE_v": 0.5}, 19)  # of a training that was interrupted during a validation
+    last.finalize("success")
+    assert rows_of(tmp_path) == [both[0], {**both[1], "val/RMSE_v": "0.5"}]
 
 
 def test_layout_of_tensorboard_begins_with_the_worst_of_four_lights(tmp_path):

@@ -8,7 +8,7 @@ from typing import Any
 
 import lightning
 import torch
-from lightning.pytorch.callbacks import Callback, LearningRateMonitor, ModelCheckpoint
+from lightning.pytorch.callbacks import Callback, ModelCheckpoint
 
 from dsr.app.devices import Processes
 from dsr.app.schema import TrainConfig
@@ -26,7 +26,7 @@ _SECONDS_BETWEEN_CHECKPOINTS = 600.0
 
 
 class Curves(Callback):
-    """Logs the losses and the norm of the gradient as means over the steps since the last values, and the speed.
+    """Logs the losses and the gradient's norm, means over the steps since the last values, the rate and the speed.
 
     Single values of small batches are too noisy to read; these curves need no smoothing. Values that are not finite are
     left out. The means are those of all devices.
@@ -39,6 +39,7 @@ class Curves(Callback):
     def __init__(self, every: int) -> None:
         self._every, self._start, self._patches = every, time.perf_counter(), 0
         self._sums: dict[str, torch.Tensor] = {}
+        self._rate = 0.0
 
     def state_dict(self) -> dict[str, Any]:
         """Return the sums since the last values, so that a training that goes on logs the same ones."""
@@ -52,13 +53,17 @@ class Curves(Callback):
         """Start the clock."""
         self._start = time.perf_counter()
 
+    def on_train_batch_start(self, trainer: lightning.Trainer, *_: Any) -> None:
+        """Note the learning rate, before the step sets the next one's."""
+        self._rate = float(trainer.optimizers[0].param_groups[0]["lr"])
+
     def on_train_batch_end(
         self, trainer: lightning.Trainer, pl_module: lightning.LightningModule, outputs: Any, batch: Batch, *_: Any
     ) -> None:
         """Add the values of a batch, and log their means when it is time."""
         self._patches += len(batch["rgb"]) * trainer.world_size
         for name, value in trainer.callback_metrics.items():
-            if name.startswith("train/") and name != "train/learning_rate":
+            if name.startswith("train/"):
                 entry = torch.stack((value.detach(), torch.ones_like(value))) * value.isfinite()
                 self._sums[name] = self._sums.get(name, 0) + entry.nan_to_num().to(pl_module.device)
         if trainer.global_step % self._every or not ends_step(trainer):
@@ -66,9 +71,9 @@ class Curves(Callback):
         totals = trainer.strategy.reduce(torch.stack(list(self._sums.values())), reduce_op="sum")
         means = {name: float(total / count) for name, (total, count) in zip(self._sums, totals.cpu(), strict=True)}
         now = time.perf_counter()
-        means["train/patches_per_second"] = self._patches / (now - self._start)
+        means |= {"train/learning_rate": self._rate, "train/patches_per_second": self._patches / (now - self._start)}
         for logger in trainer.loggers:
-            logger.log_metrics(means, trainer.global_step - 1)
+            logger.log_metrics(means, trainer.global_step)
         self._sums, self._start, self._patches = {}, now, 0
 
     def on_validation_start(self, *_: Any) -> None:
@@ -119,7 +124,6 @@ def training_trainer(
         ValidationTable(folder / VALIDATION),
         best,
         latest,
-        LearningRateMonitor("step"),
         StepProgress(progress, "train"),
         Keep(checkpoints / "last.ckpt", _SECONDS_BETWEEN_CHECKPOINTS),
         Interruption(checkpoints / "last.ckpt"),

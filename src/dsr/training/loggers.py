@@ -64,7 +64,7 @@ class CsvLog(CSVLogger):
         if not values:
             return
         if self._before:
-            kept = [row for row in self._before if step is None or int(row["step"]) < step]
+            kept = [row for row in self._before if step is None or int(row["step"]) <= step]
             self._before = []
             self.experiment.metrics.extend(kept)
         rows = self.experiment.metrics

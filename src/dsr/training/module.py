@@ -133,7 +133,11 @@ class SuperResolution(lightning.LightningModule):
         self.validation_scores = {
             kind: {name: float(value) for name, value in each.items()} for kind, each in named.items()
         }
-        self.log_dict({f"{kind}/{name}": v for kind, each in named.items() for name, v in each.items()})
+        values = {f"{kind}/{name}": v for kind, each in named.items() for name, v in each.items()}
+        self.log_dict(values, logger=False)
+        for logger in self.loggers:  # as Lightning would count from 0
+            logger.log_metrics({name: float(value) for name, value in values.items()}, self.global_step)
+            logger.save()
         for each in self.metrics:
             each.reset()  # type: ignore[operator]
 
@@ -156,5 +160,5 @@ class SuperResolution(lightning.LightningModule):
             self.net.parameters(), lr=schedule.learning_rate, weight_decay=schedule.weight_decay
         )
         rates = torch.optim.lr_scheduler.LambdaLR(optimiser, schedule.factor)
-        named = {"scheduler": rates, "interval": "step", "name": "train/learning_rate"}
+        named = {"scheduler": rates, "interval": "step"}
         return {"optimizer": optimiser, "lr_scheduler": named}
