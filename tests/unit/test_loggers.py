@@ -64,7 +64,7 @@ def test_run_of_mlflow_has_values_settings_and_pictures_and_goes_on(tmp_path, mo
     for value, step in ((0.5, 9), (0.25, 19)):
         logger = loggers.mlflow(tmp_path)
         logger.log_metrics({"train/loss": value}, step)
-    log_settings(logger, {}, "", {"scale": 4, "model": {"name": "msg_v"}})
+    log_settings(logger, {}, {"scale": 4, "model": {"name": "msg_v"}})
     log_picture(logger, "renderings/a_0", torch.zeros(3, 8, 8, dtype=torch.uint8), 20)
     client = MlflowClient((tmp_path / "mlruns").as_uri())
     number = (tmp_path / "logger_run.txt").read_text().strip()

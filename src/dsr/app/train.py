@@ -21,10 +21,16 @@ from rich.console import Console
 
 from dsr.app import run_directory as rundir
 from dsr.app.devices import Processes, find_processes
-from dsr.app.divergence import NOTE, expect_no_divergence, note_divergence
+from dsr.app.divergence import NOTE, expect_no_divergence, note_divergence, step_of
 from dsr.app.metrics import check_metrics, metric_collection
-from dsr.app.schema import TrainConfig, given_keys, plain_config
-from dsr.app.trainer import has_idle_layers, seconds_per_step, training_trainer
+from dsr.app.schema import TrainConfig, TrainerConfig, given_keys, plain_config
+from dsr.app.trainer import (
+    has_idle_layers,
+    seconds_per_step,
+    seconds_per_validation,
+    seconds_to_prepare,
+    training_trainer,
+)
 from dsr.app.training_runs import WEIGHTS, common, keyed, read_config, training_data
 from dsr.data.base import prepare_scenes
 from dsr.methods.networks.base import DisparityNetwork
@@ -33,7 +39,7 @@ from dsr.methods.networks.trained import NETWORKS
 from dsr.methods.networks.weight_files import load_network, network_name, read_torch_file, save_network
 from dsr.metrics.visual_loss import VisualLoss, make_visual_loss
 from dsr.training.data_module import PatchData
-from dsr.training.loggers import RUN_ID, expect_installed, log_layout, log_settings
+from dsr.training.loggers import RUN_ID, expect_installed, log_config, log_layout, log_settings
 from dsr.training.module import SuperResolution
 from dsr.training.objective import Objective, SurfaceObjective, balance_weight
 from dsr.training.settings import Schedule
@@ -108,15 +114,22 @@ def _train(plain: dict[str, Any], settings: TrainConfig, device: torch.device, p
     module = _module(settings, net, data, metrics)
     tolerated = ("code", "device") if "resume" in given_keys() else ()
     resume = last if last.is_file() and not settings.overwrite else None
+    new = False
     if first:
         _expect_trainable(folder, plain, identity, tolerated)
-        _announce(progress, settings, module, data, folder, resume, processes.count)
-    _load(progress, settings, module, data)
-    if first:
-        _claim(folder, plain, identity, tolerated, progress)
-    facts = _facts(plain, module)
+        new = _claim(folder, plain, identity, tolerated, progress)
     idle = processes.count > 1 and has_idle_layers(module, data.example_batch())
     trainer, best = training_trainer(settings, folder, device, progress, processes, idle=idle)
+    try:
+        if first:
+            _open_log(trainer, plain, module)
+            _announce(progress, settings, module.to(device), data, folder, resume, processes.count)
+        _load(progress, settings, module, data)
+    except ConfigError:
+        if new:  # a corrected command begins anew
+            _discard(trainer, folder)
+        raise
+    facts = _facts(plain, module)
     if first:
         _describe(trainer, plain, module, facts, resumed=resume is not None)
     try:
@@ -149,12 +162,21 @@ def _expect_trainable(
 
 def _claim(
     folder: Path, plain: Mapping[str, Any], identity: Mapping[str, Any], tolerated: Sequence[str], progress: Progress
-) -> None:
-    """Make the directory that of this training, without the files of one that it replaces."""
+) -> bool:
+    """Make the directory that of this training, without the files of one that it replaces; return whether it is new."""
+    new = not folder.is_dir() or not any(folder.iterdir())
     for key in rundir.claim(folder, plain, identity, tolerated):
         progress.say(f"note: the run began with another {key}")
     if plain["overwrite"]:
         _clear(folder)
+    return new
+
+
+def _discard(trainer: lightning.Trainer, folder: Path) -> None:
+    """Remove the directory of a training that cannot begin."""
+    for logger in trainer.loggers:
+        logger.finalize("failed")
+    shutil.rmtree(folder)
 
 
 def _resumed(plain: dict[str, Any]) -> dict[str, Any]:
@@ -294,7 +316,6 @@ def _announce(
 ) -> None:
     """Show what the run will do, and how long it will take."""
     trainer, objective = settings.trainer, module.objective
-    step = seconds_per_step(module, data.example_batch()) * trainer.accumulate
     held_out = ", ".join(f"{len(names)} of {kind}" for kind, (_, names) in data.validation_scenes().items())
     parameters = sum(each.numel() for each in module.net.parameters())
     accumulate = f" x {trainer.accumulate} batches" if trainer.accumulate > 1 else ""
@@ -308,26 +329,50 @@ def _announce(
         "loss": loss,
         "steps": f"{trainer.steps} of {trainer.batch} patches of {trainer.patch} x {trainer.patch}{accumulate}"
         + (", resumed" if resume else ""),
-        "time": f"about {duration(step * trainer.steps)} ({step:.2g} s a step as measured now), and the validations",
         "log": f"tensorboard --logdir {folder}"
         if settings.logger["name"] == "tensorboard"
         else settings.logger["name"],
     }
     for name, line in lines.items():
         progress.say(f"{name:<6} {line}")
+    progress.say(f"time   {_time(trainer, module, data, step_of(resume) or 0 if resume else 0, devices)}")
+
+
+def _time(trainer: TrainerConfig, module: SuperResolution, data: PatchData, done: int, devices: int) -> str:
+    """Return how long a training will take from a step on, and what it is made of, as measured now."""
+    steps, interval = trainer.steps - done, min(trainer.validate_every, trainer.steps)
+    validations = math.ceil(trainer.steps / interval) - done // interval + (not done)
+    try:
+        pairs = [seconds_to_prepare(source, names) for source, names in data.used_scenes]
+        validation = seconds_per_validation(module, data) / devices
+    except (ValueError, OSError) as error:
+        raise keyed(error) from error
+    step = seconds_per_step(module, data.example_batch()) * trainer.accumulate
+    preparing, scenes = (sum(each) for each in zip(*pairs, strict=True))
+    parts = {
+        f"{scenes} scenes that are not in the cache": preparing,
+        f"{steps} steps of {step:.2g} s": step * steps,
+        f"{validations} validations of {validation:.2g} s": validation * validations,
+    }
+    named = [f"{duration(seconds)} for {what}" for what, seconds in parts.items() if not what.startswith("0 ")]
+    return f"about {duration(sum(parts.values()))}: {', '.join(named) or 'all steps are done'}, as measured now"
+
+
+def _open_log(trainer: lightning.Trainer, plain: Mapping[str, Any], module: SuperResolution) -> None:
+    """Write the configuration to the log, and lay it out."""
+    log_config(trainer.logger, f"```yaml\n{OmegaConf.to_yaml(OmegaConf.create(dict(plain)))}```")
+    collections: Any = module.metrics
+    log_layout(trainer.logger, list(collections[0]))
 
 
 def _describe(
     trainer: lightning.Trainer, plain: Mapping[str, Any], module: SuperResolution, facts: Mapping[str, Any], *,
     resumed: bool,
 ) -> None:  # fmt: skip
-    """Write the configuration and the resulting w to the log, and lay it out."""
+    """Write the main settings and the resulting w to the log."""
     loss = {**plain["loss"], "w": module.objective.w} if isinstance(module.objective, Objective) else {}
-    config = {**plain, "loss": loss}
     if isinstance(trainer.logger, TensorBoardLogger) or not resumed:  # MLflow refuses another device, say
-        log_settings(trainer.logger, facts, f"```yaml\n{OmegaConf.to_yaml(OmegaConf.create(config))}```", config)
-    collections: Any = module.metrics
-    log_layout(trainer.logger, list(collections[0]))
+        log_settings(trainer.logger, facts, {**plain, "loss": loss})
 
 
 def _facts(plain: Mapping[str, Any], module: SuperResolution) -> dict[str, Any]:

@@ -2,27 +2,34 @@
 
 from __future__ import annotations
 
+import os
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import lightning
 import torch
 from lightning.pytorch.callbacks import Callback, ModelCheckpoint
+from lightning.pytorch.utilities.seed import isolate_rng
 
 from dsr.app.devices import Processes
 from dsr.app.schema import TrainConfig
+from dsr.data.base import SceneSource, prepare_scenes, unprepared
+from dsr.training.data_module import PatchData
 from dsr.training.degradation import Batch
 from dsr.training.module import SuperResolution
 from dsr.utils.builder import build
 from dsr.utils.checkpoints import Interruption, Keep, OwnFiles, ends_step
 from dsr.utils.divergence import Divergence
 from dsr.utils.lightning import LOG_EVERY, StepProgress, ValidationTable, make_trainer, without_chatter
-from dsr.utils.progress import Progress
+from dsr.utils.progress import SILENT, Progress
 
 MONITOR = "val/RMSE_v"
 VALIDATION = "validation.csv"
 _SECONDS_BETWEEN_CHECKPOINTS = 600.0
+_PROBES = 3
+"""Scenes that are prepared to measure how long it takes."""
 
 
 class Curves(Callback):
@@ -85,6 +92,34 @@ class Curves(Callback):
         self._start += time.perf_counter()
 
 
+class FirstValidation(Callback):
+    """Validates before the first step, without any effect on the steps; what the network is then may be its best.
+
+    Args:
+        best: keeps the best checkpoint; by itself only after steps.
+
+    """
+
+    def __init__(self, best: ModelCheckpoint) -> None:
+        self._best = best
+
+    def on_train_start(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
+        """Validate, unless the training goes on."""
+        if trainer.global_step:
+            return
+        with isolate_rng():
+            trainer.validating = True
+            trainer.fit_loop.epoch_loop.val_loop.run()
+            trainer.training = True
+        score = trainer.callback_metrics[MONITOR].clone()
+        if not score.isfinite():
+            return
+        path = str(Path(str(self._best.dirpath), f"{self._best.filename}.ckpt"))
+        trainer.save_checkpoint(path)
+        kept = {"best_model_path": path, "kth_best_model_path": path, "best_k_models": {path: score}}
+        self._best.load_state_dict(self._best.state_dict() | kept | {"best_model_score": score, "kth_value": score})
+
+
 def training_trainer(
     config: TrainConfig,
     folder: Path,
@@ -127,6 +162,7 @@ def training_trainer(
         StepProgress(progress, "train"),
         Keep(checkpoints / "last.ckpt", _SECONDS_BETWEEN_CHECKPOINTS),
         Interruption(checkpoints / "last.ckpt"),
+        FirstValidation(best),
     ]
     with without_chatter():
         logger = build("logger", config.logger, {"folder": folder})
@@ -148,6 +184,39 @@ def training_trainer(
 def seconds_per_step(module: SuperResolution, batch: Batch) -> float:
     """Measure the seconds of a step; the module is left unchanged."""
     return _try_steps(module, batch, 2)[0]  # the first one warms up
+
+
+def seconds_per_validation(module: SuperResolution, data: PatchData) -> float:
+    """Measure the seconds of a validation with the first scene of each set; the module is left unchanged."""
+    total = 0.0
+    module.average.eval()
+    for index, (kind, (_, names)) in enumerate(data.validation_scenes().items()):
+        batch = {
+            name: value.to(module.device) if torch.is_tensor(value) else value
+            for name, value in data.example_scene(kind).items()
+        }
+        start = time.perf_counter()
+        with torch.no_grad():
+            module.validation_step(batch, 0, index)
+        total += (time.perf_counter() - start) * len(names)
+        module.metrics[index].reset()  # type: ignore[operator]
+    module.average.train()
+    return total
+
+
+def seconds_to_prepare(source: SceneSource, names: Sequence[str]) -> tuple[float, int]:
+    """Prepare a few of the scenes that are not ready; return the seconds for the others and their number.
+
+    All cores will work on them. The first one, which may have to compile, does not count.
+    """
+    missing = unprepared(source, names)
+    taken = []
+    for name in missing[:_PROBES]:
+        start = time.perf_counter()
+        prepare_scenes(source, [name], SILENT)
+        taken.append(time.perf_counter() - start)
+    rest = len(missing) - len(taken)
+    return sum(taken[1:]) / (_PROBES - 1) * rest / (os.cpu_count() or 1), rest
 
 
 def has_idle_layers(module: SuperResolution, batch: Batch) -> bool:

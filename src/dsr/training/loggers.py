@@ -156,19 +156,30 @@ def mlflow(folder: Path, experiment: str = "dsr", tracking_uri: str | None = Non
     return logger
 
 
-def log_settings(logger: Logger | None, table: Mapping[str, Any], text: str, config: Mapping[str, Any]) -> None:
+def log_config(logger: Logger | None, text: str) -> None:
+    """Log the complete configuration for readers, so that TensorBoard shows the run before it has values.
+
+    Args:
+        logger: of the training; others than TensorBoard's are left out.
+        text: in Markdown.
+
+    """
+    if isinstance(logger, Log):
+        logger.experiment.add_text("config", text)
+        logger.experiment.flush()
+
+
+def log_settings(logger: Logger | None, table: Mapping[str, Any], config: Mapping[str, Any]) -> None:
     """Log what a training was made with.
 
     Args:
         logger: of the training.
         table: the main settings, for TensorBoard's table of runs.
-        text: the complete configuration for readers, for TensorBoard.
         config: the complete configuration, for other loggers.
 
     """
     if isinstance(logger, Log):
         logger.list_run(table)
-        logger.experiment.add_text("config", text)
     elif logger is not None:
         logger.log_hyperparams(dict(config))
 
@@ -176,7 +187,8 @@ def log_settings(logger: Logger | None, table: Mapping[str, Any], text: str, con
 def log_layout(logger: Logger | None, metrics: Sequence[str], losses: Sequence[str] = _CURVES) -> None:
     """Lay out TensorBoard's *Custom scalars*: the worst of four lights first, then depth and normals, then losses.
 
-    A chart has a metric's mean over all validation sets and, if there are several, that of each.
+    A chart has a metric's mean over all validation sets and, if there are several, that of each, of the network and of
+    bicubic interpolation.
 
     Args:
         logger: of the training; others than TensorBoard's have no layout.
@@ -188,8 +200,10 @@ def log_layout(logger: Logger | None, metrics: Sequence[str], losses: Sequence[s
         return
     looks = main_first(name for name in metrics if "_v" in name)
     groups = {
-        "Looks, worst of four lights": {name: rf"val(_[^/]*)?/{re.escape(name)}$" for name in looks},
-        "Depth and normals": {name: rf"val(_[^/]*)?/{re.escape(name)}$" for name in metrics if name not in looks},
+        "Looks, worst of four lights": {name: rf"(val|bicubic)(_[^/]*)?/{re.escape(name)}$" for name in looks},
+        "Depth and normals": {
+            name: rf"(val|bicubic)(_[^/]*)?/{re.escape(name)}$" for name in metrics if name not in looks
+        },
         "Training": {name: f"train/{name}$" for name in losses},
     }
     layout = {title: {name: ["Multiline", [tag]] for name, tag in charts.items()} for title, charts in groups.items()}

@@ -143,13 +143,16 @@ class Interruption(Callback):
     def on_validation_batch_start(
         self, trainer: lightning.Trainer, pl_module: lightning.LightningModule, batch: Any, batch_idx: int, *_: Any
     ) -> None:
-        """Save the state at the beginning of the validation and stop, if an interruption was requested."""
+        """Save the state at the beginning of the validation and stop, if an interruption was requested.
+
+        Before the first step there is nothing to save.
+        """
         if trainer.should_stop or trainer.global_step >= trainer.max_steps:
             return
-        if self._checkpoint is None:
+        if self._checkpoint is None and trainer.global_step:
             self._checkpoint = _of_begun_validation(trainer)
         if self._requested:
-            if not in_doubt(trainer):
+            if self._checkpoint is not None and not in_doubt(trainer):
                 trainer.strategy.save_checkpoint(self._checkpoint, self._path)
             raise KeyboardInterrupt
 

@@ -55,7 +55,7 @@ class LostProcessError(ConfigError):
 
 
 class Scored(Protocol):
-    """A module that keeps the scores of its last validation: by set, by metric."""
+    """A module that keeps the scores of its last validation, and those that it is compared with: by set, by metric."""
 
     validation_scores: dict[str, dict[str, float]]
 
@@ -158,6 +158,9 @@ class StepProgress(Callback):
             subject = f"{self._subject}: " if self._subject else ""
             parts = (f"{subject}step {trainer.global_step:>6}", _loss_text(trainer), f"validation: {scores}")
             self._progress.say("  ".join(filter(None, parts)))
+        bicubic = scores_line(trainer, "bicubic")
+        if bicubic and not trainer.global_step:
+            self._progress.say(f"             bicubic:    {bicubic}")
 
     def on_train_end(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
         """Stop showing steps."""
@@ -304,9 +307,11 @@ def _loss_text(trainer: lightning.Trainer) -> str:
     return "" if loss is None else f"loss {float(loss):.4f}"
 
 
-def scores_line(trainer: lightning.Trainer) -> str:
+def scores_line(trainer: lightning.Trainer, kind: str = "val") -> str:
     """Return the main scores of the last validation for a reader; empty if there are none."""
-    scores = {name: trainer.callback_metrics.get(f"val/{name}") for name in ("RMSE_d", "RMSE_v", "DSSIM_v", "LPIPS_v")}
+    scores = {
+        name: trainer.callback_metrics.get(f"{kind}/{name}") for name in ("RMSE_d", "RMSE_v", "DSSIM_v", "LPIPS_v")
+    }
     return "  ".join(f"{name} {float(value):.4f}" for name, value in scores.items() if value is not None)
 
 
