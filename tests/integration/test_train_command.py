@@ -25,6 +25,7 @@ from dsr.app.entry import run_command
 from dsr.app.evaluate import evaluate
 from dsr.training import loggers
 from dsr.training.module import SuperResolution
+from dsr.utils.progress import SILENT
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 SMOKE = (
@@ -134,7 +135,8 @@ def test_training_reports_its_plan_and_where_the_weights_are(smoke):
     assert lines[3] == "steps  2 of 2 patches of 32 x 32"
     assert lines[4] == f"log    tensorboard --logdir outputs/train/{home.name}"
     parts = r"(\d+ s for \d scenes that are not in the cache, )?\d+ s for 2 steps of \S+ s, \d+ s for 3 validations of "
-    assert re.fullmatch(rf"time   about \d+ s: {parts}\S+ s, as measured now", lines[5])
+    [time_line] = [line for line in lines if line.startswith("time ")]
+    assert re.fullmatch(rf"time   about \d+ s: {parts}\S+ s, as measured now", time_line)
     prepared = [line for line in lines if line.startswith("prepare ")]
     assert re.fullmatch(r"prepare \d+: 1 of 5, \d+\.\d s, elapsed \d:\d\d:\d\d, remaining \d:\d\d:\d\d", prepared[0])
     assert [line.split(": ")[1].split(",")[0] for line in prepared] == [*(f"{n} of 5" for n in range(1, 6)), "1 of 1"]
@@ -429,7 +431,7 @@ def test_help_lists_the_choices(within):
 
 
 def test_estimate_is_the_sum_of_scenes_to_prepare_steps_and_validations(within, interrupt, monkeypatch):
-    monkeypatch.setattr(command, "seconds_to_prepare", lambda *_: (50.0, 7))  # of two sets
+    monkeypatch.setattr(command, "seconds_to_prepare", lambda *_: (100.0, 14))
     monkeypatch.setattr(command, "seconds_per_step", lambda *_: 20.0)
     monkeypatch.setattr(command, "seconds_per_validation", lambda *_: 3.0)
     interrupt(3)
@@ -462,10 +464,10 @@ def test_scenes_that_are_not_ready_are_counted_and_a_few_measured(monkeypatch):
 
     monkeypatch.setattr(os, "cpu_count", lambda: 2)
     source = Slow()
-    seconds, count = trainer_module.seconds_to_prepare(source, list("abcdefgh"))
+    seconds, count = trainer_module.seconds_to_prepare(source, list("abcdefgh"), SILENT)
     assert (count, source.ready) == (4, list("abcd"))
     assert 0.1 <= seconds < 0.4
-    assert trainer_module.seconds_to_prepare(source, list("abcd")) == (0, 0)
+    assert trainer_module.seconds_to_prepare(source, list("abcd"), SILENT) == (0, 0)
 
 
 def test_run_and_its_log_are_there_before_scenes_are_prepared_and_the_same_command_goes_on(

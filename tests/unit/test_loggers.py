@@ -2,6 +2,7 @@
 
 import csv
 import importlib.util
+import re
 
 import pytest
 import torch
@@ -52,6 +53,10 @@ def test_layout_of_tensorboard_begins_with_the_worst_of_four_lights(tmp_path):
     assert list(charts) == ["Looks, worst of four lights", "Depth and normals", "Training"]
     assert charts["Looks, worst of four lights"] == ["RMSE_v", "DSSIM_v", "LPIPS_v", "BadPix_v_5", "RMSE_v1"]
     assert charts["Depth and normals"] == ["RMSE_d"]
+    [tag] = layout.category[0].chart[0].multiline.tag
+    shown = ("val/RMSE_v", "bicubic/RMSE_v", "val_a/RMSE_v", "bicubic_a/RMSE_v")
+    assert all(re.match(tag, name) for name in shown)
+    assert not any(re.match(tag, name) for name in ("val/RMSE_v1", "bicubic/RMSE_d"))
 
 
 def test_run_of_mlflow_has_values_settings_and_pictures_and_goes_on(tmp_path, monkeypatch):

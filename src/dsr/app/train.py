@@ -32,7 +32,7 @@ from dsr.app.trainer import (
     training_trainer,
 )
 from dsr.app.training_runs import WEIGHTS, common, keyed, read_config, training_data
-from dsr.data.base import prepare_scenes
+from dsr.data.base import SceneSource, prepare_scenes
 from dsr.methods.networks.base import DisparityNetwork
 from dsr.methods.networks.facets_unet import FacetsUNet
 from dsr.methods.networks.trained import NETWORKS
@@ -335,15 +335,18 @@ def _announce(
     }
     for name, line in lines.items():
         progress.say(f"{name:<6} {line}")
-    progress.say(f"time   {_time(trainer, module, data, step_of(resume) or 0 if resume else 0, devices)}")
+    done = 0 if resume is None else step_of(resume) or 0
+    progress.say(f"time   {_time(trainer, module, data, done, devices, progress)}")
 
 
-def _time(trainer: TrainerConfig, module: SuperResolution, data: PatchData, done: int, devices: int) -> str:
+def _time(
+    trainer: TrainerConfig, module: SuperResolution, data: PatchData, done: int, devices: int, progress: Progress
+) -> str:
     """Return how long a training will take from a step on, and what it is made of, as measured now."""
     steps, interval = trainer.steps - done, min(trainer.validate_every, trainer.steps)
     validations = math.ceil(trainer.steps / interval) - done // interval + (not done)
     try:
-        pairs = [seconds_to_prepare(source, names) for source, names in data.used_scenes]
+        pairs = [seconds_to_prepare(source, names, progress) for source, names in _by_source(data)]
         validation = seconds_per_validation(module, data) / devices
     except (ValueError, OSError) as error:
         raise keyed(error) from error
@@ -356,6 +359,14 @@ def _time(trainer: TrainerConfig, module: SuperResolution, data: PatchData, done
     }
     named = [f"{duration(seconds)} for {what}" for what, seconds in parts.items() if not what.startswith("0 ")]
     return f"about {duration(sum(parts.values()))}: {', '.join(named) or 'all steps are done'}, as measured now"
+
+
+def _by_source(data: PatchData) -> list[tuple[SceneSource, list[str]]]:
+    """Return the scenes of each data set, those to validate with first, as one of them is measured with, too."""
+    sources: dict[int, tuple[SceneSource, list[str]]] = {}
+    for source, names in reversed(data.used_scenes):
+        sources.setdefault(id(source), (source, []))[1].extend(names)
+    return list(sources.values())
 
 
 def _open_log(trainer: lightning.Trainer, plain: Mapping[str, Any], module: SuperResolution) -> None:

@@ -204,14 +204,14 @@ def seconds_per_validation(module: SuperResolution, data: PatchData) -> float:
     return total
 
 
-def seconds_to_prepare(source: SceneSource, names: Sequence[str]) -> tuple[float, int]:
+def seconds_to_prepare(source: SceneSource, names: Sequence[str], progress: Progress) -> tuple[float, int]:
     """Prepare a few of the scenes that are not ready; return the seconds for the others and their number.
 
     All cores will work on them. The first one, which may have to compile, does not count.
     """
     missing = unprepared(source, names)
     taken = []
-    for name in missing[:_PROBES]:
+    for name in progress.track(missing[:_PROBES], "measure"):
         start = time.perf_counter()
         prepare_scenes(source, [name], SILENT)
         taken.append(time.perf_counter() - start)
