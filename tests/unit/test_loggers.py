@@ -2,6 +2,7 @@
 
 import csv
 import importlib.util
+import re
 
 import pytest
 import torch
@@ -34,9 +35,12 @@ def test_table_has_a_row_for_each_step_and_goes_on_after_an_interruption(tmp_pat
     again = loggers.csv(tmp_path)
     again.log_metrics({"train/loss": 0.125}, 19)  # done again
     again.finalize("success")
-    assert rows_of(tmp_path) == [
-        {"step": "9", "train/loss": "0.5", "val/RMSE_v": "0.25"}, {"step": "19", "train/loss": "0.125"}
-    ]  # fmt: skip
+    both = [{"step": "9", "train/loss": "0.5", "val/RMSE_v": "0.25"}, {"step": "19", "train/loss": "0.125"}]
+    assert rows_of(tmp_path) == both
+    last = loggers.csv(tmp_path)
+    last.log_metrics({"val/RMSE_v": 0.5}, 19)  # of a training that was interrupted during a validation
+    last.finalize("success")
+    assert rows_of(tmp_path) == [both[0], {**both[1], "val/RMSE_v": "0.5"}]
 
 
 def test_layout_of_tensorboard_begins_with_looks(tmp_path):
@@ -50,6 +54,10 @@ def test_layout_of_tensorboard_begins_with_looks(tmp_path):
     assert list(charts) == ["Looks", "Depth and normals", "Training"]
     assert charts["Looks"] == [f"{name}, title" for name in ("RMSE_v", "RMSE_v1", "DSSIM_v", "LPIPS_v", "BadPix_v_5")]
     assert charts["Depth and normals"] == ["RMSE_d, title"]
+    [tag] = layout.category[0].chart[0].multiline.tag
+    shown = ("val/RMSE_v", "bicubic/RMSE_v", "val_a/RMSE_v", "bicubic_a/RMSE_v")
+    assert all(re.match(tag, name) for name in shown)
+    assert not any(re.match(tag, name) for name in ("val/RMSE_v1", "bicubic/RMSE_d"))
 
 
 def test_run_of_mlflow_has_values_settings_and_pictures_and_goes_on(tmp_path, monkeypatch):
@@ -62,7 +70,7 @@ def test_run_of_mlflow_has_values_settings_and_pictures_and_goes_on(tmp_path, mo
     for value, step in ((0.5, 9), (0.25, 19)):
         logger = loggers.mlflow(tmp_path)
         logger.log_metrics({"train/loss": value}, step)
-    log_settings(logger, {}, "", {"scale": 4, "model": {"name": "msg_v"}})
+    log_settings(logger, {}, {"scale": 4, "model": {"name": "msg_v"}})
     log_picture(logger, "renderings/a_0", torch.zeros(3, 8, 8, dtype=torch.uint8), 20)
     client = MlflowClient((tmp_path / "mlruns").as_uri())
     number = (tmp_path / "logger_run.txt").read_text().strip()

@@ -25,6 +25,7 @@ from dsr.methods.networks.any_map import AnyMap
 from dsr.methods.networks.facets_unet import FacetsUNet
 from dsr.methods.networks.msg_net import MSGNet, upsample_disparity
 from dsr.methods.networks.sparse_to_dense import SparseToDense
+from dsr.methods.registry import build_method, read_method
 from dsr.metrics import functional as scores
 from dsr.metrics.classes import visual_metrics
 from dsr.metrics.functional import SurfacePair
@@ -464,6 +465,21 @@ def test_a_network_that_takes_hints_is_validated_as_it_is_evaluated(tmp_path: Pa
 
     assert logged["val/RMSE_v"] == pytest.approx(1000 * rmse(kernel="box", edges="sharp", clean=True), rel=1e-4)
     assert logged["val/RMSE_v"] != pytest.approx(1000 * rmse(), rel=1e-3)
+
+
+def test_validation_scores_bicubic_interpolation_of_the_same_maps_as_the_method_does(tmp_path: Path) -> None:
+    scenes = [_scene(3), _scene(4, holes=0.05)]
+    module = _module()
+    [logged] = _trainer(tmp_path).validate(module, _loader(WholeScenes(scenes, X2)), verbose=False)
+    method, expected = build_method(read_method("bicubic", 2), 2), []
+    for scene in scenes:
+        sample = X2.sample(scene)
+        assert sample.depth is not None
+        pair = SurfacePair(method(sample)[None].double(), sample.depth[None].double(), CAMERA.rays()[None])
+        expected.append((float(scores.rmse_v(pair)), float(scores.rmse_d(pair))))
+    found = logged["bicubic/RMSE_v"], logged["bicubic/RMSE_d"]
+    assert found == pytest.approx(np.mean(expected, axis=0), rel=1e-4)
+    assert module.validation_scores.keys() == {"val", "bicubic"}
 
 
 def test_validation_starts_anew_each_time(tmp_path: Path) -> None:

@@ -21,12 +21,18 @@ from rich.console import Console
 
 from dsr.app import run_directory as rundir
 from dsr.app.devices import Processes, find_processes
-from dsr.app.divergence import NOTE, expect_no_divergence, note_divergence
+from dsr.app.divergence import NOTE, expect_no_divergence, note_divergence, step_of
 from dsr.app.metrics import check_metrics, metric_collection
-from dsr.app.schema import TrainConfig, given_keys, plain_config
-from dsr.app.trainer import has_idle_layers, seconds_per_step, training_trainer
+from dsr.app.schema import TrainConfig, TrainerConfig, given_keys, plain_config
+from dsr.app.trainer import (
+    has_idle_layers,
+    seconds_per_step,
+    seconds_per_validation,
+    seconds_to_prepare,
+    training_trainer,
+)
 from dsr.app.training_runs import WEIGHTS, common, keyed, read_config, training_data
-from dsr.data.base import prepare_scenes
+from dsr.data.base import SceneSource, prepare_scenes
 from dsr.methods.networks.base import DisparityNetwork
 from dsr.methods.networks.facets_unet import FacetsUNet
 from dsr.methods.networks.trained import NETWORKS
@@ -34,7 +40,7 @@ from dsr.methods.networks.weight_files import load_network, network_name, read_t
 from dsr.metrics.catalogue import KNOWN_FORMATS
 from dsr.metrics.visual_loss import VisualLoss, make_visual_loss
 from dsr.training.data_module import PatchData
-from dsr.training.loggers import RUN_ID, expect_installed, log_layout, log_settings
+from dsr.training.loggers import RUN_ID, expect_installed, log_config, log_layout, log_settings
 from dsr.training.module import SuperResolution
 from dsr.training.objective import Objective, SurfaceObjective, balance_weight
 from dsr.training.settings import Schedule
@@ -52,6 +58,8 @@ from dsr.utils.units import duration
 
 _PATCHES_FOR_W = 64
 _LARGEST_SEED = 2**32 - 1
+_FOLDERS = ("checkpoints", "tensorboard", "csv", "wandb", "mlruns")
+"""What a training writes into its directory beside files."""
 _RESUMABLE = ("resume", "device", "trust")
 
 
@@ -107,15 +115,22 @@ def _train(plain: dict[str, Any], settings: TrainConfig, device: torch.device, p
     module = _module(settings, net, data, metrics)
     tolerated = ("code", "device") if "resume" in given_keys() else ()
     resume = last if last.is_file() and not settings.overwrite else None
+    new = False
     if first:
         _expect_trainable(folder, plain, identity, tolerated)
-        _announce(progress, settings, module, data, folder, resume, processes.count)
-    _load(progress, settings, module, data)
-    if first:
-        _claim(folder, plain, identity, tolerated, progress)
-    facts = _facts(plain, module)
+        new = _claim(folder, plain, identity, tolerated, progress)
     idle = processes.count > 1 and has_idle_layers(module, data.example_batch())
     trainer, best = training_trainer(settings, folder, device, progress, processes, idle=idle)
+    try:
+        if first:
+            _open_log(trainer, plain, module)
+            _announce(progress, settings, module.to(device), data, folder, resume, processes.count)
+        _load(progress, settings, module, data)
+    except ConfigError:
+        if new:  # a corrected command begins anew
+            _discard(trainer, folder)
+        raise
+    facts = _facts(plain, module)
     if first:
         _describe(trainer, plain, module, facts, resumed=resume is not None)
     try:
@@ -127,7 +142,7 @@ def _train(plain: dict[str, Any], settings: TrainConfig, device: torch.device, p
             f"interrupted at step {trainer.global_step}; resume={folder} goes on from there"
         ) from None
     if first:
-        _export(module, Path(best.best_model_path), weights, facts)
+        _export(module, last.with_name("best.ckpt"), weights, facts)
     progress.say(f"weights: {weights}")
     score = math.nan if best.best_model_score is None else float(best.best_model_score)
     return score / KNOWN_FORMATS["RMSE_v"].factor
@@ -137,6 +152,9 @@ def _expect_trainable(
     folder: Path, plain: Mapping[str, Any], identity: Mapping[str, Any], tolerated: Sequence[str]
 ) -> None:
     """Check that the directory is free or that of this training, which is neither complete nor diverges again."""
+    for name in _FOLDERS:
+        if (folder / name).is_symlink():
+            raise ConfigError(f"{folder / name}: expected a directory of the run's own, got a link")
     if not plain["overwrite"] and (folder / WEIGHTS).exists():
         raise ConfigError(f"output_dir: {folder / WEIGHTS} is trained already; overwrite=true trains it again")
     rundir.expect_free(folder, plain, identity, tolerated)
@@ -146,12 +164,21 @@ def _expect_trainable(
 
 def _claim(
     folder: Path, plain: Mapping[str, Any], identity: Mapping[str, Any], tolerated: Sequence[str], progress: Progress
-) -> None:
-    """Make the directory that of this training, without the files of one that it replaces."""
+) -> bool:
+    """Make the directory that of this training, without the files of one that it replaces; return whether it is new."""
+    new = not folder.is_dir() or not any(folder.iterdir())
     for key in rundir.claim(folder, plain, identity, tolerated):
         progress.say(f"note: the run began with another {key}")
     if plain["overwrite"]:
         _clear(folder)
+    return new
+
+
+def _discard(trainer: lightning.Trainer, folder: Path) -> None:
+    """Remove the directory of a training that cannot begin."""
+    for logger in trainer.loggers:
+        logger.finalize("failed")
+    shutil.rmtree(folder)
 
 
 def _resumed(plain: dict[str, Any]) -> dict[str, Any]:
@@ -276,7 +303,7 @@ def _clear(folder: Path) -> None:
     """Remove the files of an earlier training, so that they are not taken for this one's if it is interrupted."""
     for name in (WEIGHTS, NOTE, RUN_ID):
         (folder / name).unlink(missing_ok=True)
-    for name in ("checkpoints", "tensorboard", "csv", "wandb", "mlruns"):
+    for name in _FOLDERS:
         shutil.rmtree(folder / name, ignore_errors=True)
 
 
@@ -291,7 +318,6 @@ def _announce(
 ) -> None:
     """Show what the run will do, and how long it will take."""
     trainer, objective = settings.trainer, module.objective
-    step = seconds_per_step(module, data.example_batch()) * trainer.accumulate
     held_out = ", ".join(f"{len(names)} of {kind}" for kind, (_, names) in data.validation_scenes().items())
     parameters = sum(each.numel() for each in module.net.parameters())
     accumulate = f" x {trainer.accumulate} batches" if trainer.accumulate > 1 else ""
@@ -305,27 +331,62 @@ def _announce(
         "loss": loss,
         "steps": f"{trainer.steps} of {trainer.batch} patches of {trainer.patch} x {trainer.patch}{accumulate}"
         + (", resumed" if resume else ""),
-        "time": f"about {duration(step * trainer.steps)} ({step:.2g} s a step as measured now), and the validations",
         "log": f"tensorboard --logdir {folder}"
         if settings.logger["name"] == "tensorboard"
         else settings.logger["name"],
     }
     for name, line in lines.items():
         progress.say(f"{name:<6} {line}")
+    done = 0 if resume is None else step_of(resume) or 0
+    progress.say(f"time   {_time(trainer, module, data, done, devices, progress)}")
+
+
+def _time(
+    trainer: TrainerConfig, module: SuperResolution, data: PatchData, done: int, devices: int, progress: Progress
+) -> str:
+    """Return how long a training will take from a step on, and what it is made of, as measured now."""
+    steps, interval = trainer.steps - done, min(trainer.validate_every, trainer.steps)
+    validations = math.ceil(trainer.steps / interval) - done // interval + (not done)
+    try:
+        pairs = [seconds_to_prepare(source, names, progress) for source, names in _by_source(data)]
+        validation = seconds_per_validation(module, data) / devices
+    except (ValueError, OSError) as error:
+        raise keyed(error) from error
+    step = seconds_per_step(module, data.example_batch()) * trainer.accumulate
+    preparing, scenes = (sum(each) for each in zip(*pairs, strict=True))
+    parts = {
+        f"{scenes} scenes that are not in the cache": preparing,
+        f"{steps} steps of {step:.2g} s": step * steps,
+        f"{validations} validations of {validation:.2g} s": validation * validations,
+    }
+    named = [f"{duration(seconds)} for {what}" for what, seconds in parts.items() if not what.startswith("0 ")]
+    return f"about {duration(sum(parts.values()))}: {', '.join(named) or 'all steps are done'}, as measured now"
+
+
+def _by_source(data: PatchData) -> list[tuple[SceneSource, list[str]]]:
+    """Return the scenes of each data set, those to validate with first, as one of them is measured with, too."""
+    sources: dict[int, tuple[SceneSource, list[str]]] = {}
+    for source, names in reversed(data.used_scenes):
+        sources.setdefault(id(source), (source, []))[1].extend(names)
+    return list(sources.values())
+
+
+def _open_log(trainer: lightning.Trainer, plain: Mapping[str, Any], module: SuperResolution) -> None:
+    """Write the configuration to the log, and lay it out."""
+    log_config(trainer.logger, f"```yaml\n{OmegaConf.to_yaml(OmegaConf.create(dict(plain)))}```")
+    collections: Any = module.metrics
+    log_layout(trainer.logger, {name: metric.chart_title for name, metric in collections[0].items()})
 
 
 def _describe(
     trainer: lightning.Trainer, plain: Mapping[str, Any], module: SuperResolution, facts: Mapping[str, Any], *,
     resumed: bool,
 ) -> None:  # fmt: skip
-    """Write the configuration and the resulting w to the log, and lay it out."""
+    """Write the main settings and the resulting w to the log."""
     listed = {**facts, "method": facts["model"], "degradation": rundir.degradation_of(plain)}
     loss = {**plain["loss"], "w": module.objective.w} if isinstance(module.objective, Objective) else {}
-    config = {**plain, "loss": loss}
     if isinstance(trainer.logger, TensorBoardLogger) or not resumed:  # MLflow refuses another device, say
-        log_settings(trainer.logger, listed, f"```yaml\n{OmegaConf.to_yaml(OmegaConf.create(config))}```", config)
-    collections: Any = module.metrics
-    log_layout(trainer.logger, {name: metric.chart_title for name, metric in collections[0].items()})
+        log_settings(trainer.logger, listed, {**plain, "loss": loss})
 
 
 def _facts(plain: Mapping[str, Any], module: SuperResolution) -> dict[str, Any]:

@@ -52,6 +52,10 @@ class Procedural:
         """Return the version, seed, size and number that determine the scene."""
         return f"procedural-v{PROCEDURAL_VERSION}-{self._seed}-{self._size}-{scene}"
 
+    def unprepared(self, scenes: Sequence[str]) -> list[str]:
+        """Return those of some scenes that are not in the cache."""
+        return [scene for scene in scenes if not (cache_directory() / self._path(scene)).is_file()]
+
     def prepare(self, scenes: Sequence[str]) -> Iterable[str]:
         """Render scenes that are not in the cache, and yield the name of each that is ready.
 
@@ -61,9 +65,8 @@ class Procedural:
             ChildProcessError: two processes that render were ended at the same scene.
 
         """
-        there = {scene: (cache_directory() / self._path(scene)).is_file() for scene in scenes}
-        missing = [scene for scene in scenes if not there[scene]]
-        yield from (scene for scene in scenes if there[scene])
+        missing = self.unprepared(scenes)
+        yield from (scene for scene in scenes if scene not in missing)
         begun = time.perf_counter()
         for number, scene in enumerate(missing, start=1):
             self._render(scene)

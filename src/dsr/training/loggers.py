@@ -65,7 +65,7 @@ class CsvLog(CSVLogger):
         if not values:
             return
         if self._before:
-            kept = [row for row in self._before if step is None or int(row["step"]) < step]
+            kept = [row for row in self._before if step is None or int(row["step"]) <= step]
             self._before = []
             self.experiment.metrics.extend(kept)
         rows = self.experiment.metrics
@@ -157,20 +157,31 @@ def mlflow(folder: Path, experiment: str = "dsr", tracking_uri: str | None = Non
     return logger
 
 
-def log_settings(logger: Logger | None, table: Mapping[str, Any], text: str, config: Mapping[str, Any]) -> None:
+def log_config(logger: Logger | None, text: str) -> None:
+    """Log the complete configuration for readers, so that TensorBoard shows the run before it has values.
+
+    Args:
+        logger: of the training; others than TensorBoard's are left out.
+        text: in Markdown.
+
+    """
+    if isinstance(logger, Log):
+        logger.experiment.add_text("config", text)
+        logger.experiment.flush()
+
+
+def log_settings(logger: Logger | None, table: Mapping[str, Any], config: Mapping[str, Any]) -> None:
     """Log what a training was made with.
 
     Args:
         logger: of the training.
         table: the main settings, among them the columns of TensorBoard's table of runs.
-        text: the complete configuration for readers, for TensorBoard.
         config: the complete configuration, for other loggers.
 
     """
     if isinstance(logger, Log):
         logger.log_hyperparams(dict(table))
         list_run(logger.experiment, "training", table, {})
-        logger.experiment.add_text("config", text)
     elif logger is not None:
         logger.log_hyperparams(dict(config))
 
@@ -178,7 +189,8 @@ def log_settings(logger: Logger | None, table: Mapping[str, Any], text: str, con
 def log_layout(logger: Logger | None, metrics: Mapping[str, str], losses: Sequence[str] = _CURVES) -> None:
     """Lay out TensorBoard's *Custom scalars*: metrics of renderings first, then those of depth, then losses.
 
-    A chart has a metric's mean over all validation sets and, if there are several, that of each.
+    A chart has a metric's mean over all validation sets and, if there are several, that of each, of the network and of
+    bicubic interpolation.
 
     Args:
         logger: of the training; others than TensorBoard's have no layout.
@@ -191,7 +203,7 @@ def log_layout(logger: Logger | None, metrics: Mapping[str, str], losses: Sequen
     looks = main_first(name for name in metrics if "_v" in name)
     depth = [name for name in metrics if name not in looks]
     groups = {
-        **{title: {metrics[name]: rf"val(_[^/]*)?/{re.escape(name)}$" for name in names}
+        **{title: {metrics[name]: rf"(val|bicubic)(_[^/]*)?/{re.escape(name)}$" for name in names}
            for title, names in (("Looks", looks), ("Depth and normals", depth))},
         "Training": {name: f"train/{name}$" for name in losses},
     }  # fmt: skip

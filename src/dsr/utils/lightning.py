@@ -53,7 +53,10 @@ class LostProcessError(ConfigError):
 
 
 class Scored(Protocol):
-    """A module that keeps the raw scores of its last validation, by set, by metric; it logs them in tables' units."""
+    """A module that keeps the raw scores of its last validation, and those that it is compared with, by set, by metric.
+
+    It logs them in the units of tables.
+    """
 
     validation_scores: dict[str, dict[str, float]]
 
@@ -181,6 +184,9 @@ class StepProgress(Callback):
             subject = f"{self._subject}: " if self._subject else ""
             parts = (f"{subject}step {trainer.global_step:>6}", _loss_text(trainer), f"validation: {scores}")
             self._progress.say("  ".join(filter(None, parts)))
+        bicubic = scores_line(trainer, "bicubic")
+        if bicubic and not trainer.global_step:
+            self._progress.say(f"             bicubic:    {bicubic}")
 
     def on_train_end(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
         """Stop showing steps."""
@@ -319,10 +325,10 @@ def _loss_text(trainer: lightning.Trainer) -> str:
     return "" if loss is None else f"loss {float(loss):.4f}"
 
 
-def scores_line(trainer: lightning.Trainer) -> str:
+def scores_line(trainer: lightning.Trainer, kind: str = "val") -> str:
     """Return the main scores of the last validation for a reader, in mm and 1/1000; empty if there are none."""
     units = {"RMSE_d": " mm", "RMSE_v": "", "DSSIM_v": "", "LPIPS_v": ""}
-    scores = {name: trainer.callback_metrics.get(f"val/{name}") for name in units}
+    scores = {name: trainer.callback_metrics.get(f"{kind}/{name}") for name in units}
     return "  ".join(f"{name} {float(value):.1f}{units[name]}" for name, value in scores.items() if value is not None)
 
 

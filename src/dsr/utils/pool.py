@@ -97,11 +97,13 @@ class Pool(Generic[_T, _R]):
         """Terminate the workers, whatever they are doing."""
         for process in self._processes.values():
             process.terminate()
-        for connection, process in self._processes.items():
-            process.join(_SECONDS_TO_END)
-            process.kill()  # whatever kept it from ending
-            process.join()
-            connection.close()
+        waits = interruption.is_ctrl_c()
+        with interruption.deferred(lambda: interruption.MESSAGE) if waits else contextlib.nullcontext():
+            for connection, process in self._processes.items():
+                process.join(None if waits else _SECONDS_TO_END)  # for the step that it is at
+                process.kill()  # whatever kept it from ending
+                process.join()
+                connection.close()
         self._processes, self._busy = {}, {}
 
     def results(self, items: Sequence[_T], *, ordered: bool = False) -> Generator[tuple[_T, _R]]:

@@ -137,8 +137,9 @@ class PriorOptimisation(lightning.LightningModule):
         """Return the loss of this step's depth map, and update the average."""
         depth, intensity = self.answer()
         terms = self.objective(depth, intensity, self.problem)
-        self.log_dict({f"train/{name}": value.detach() for name, value in terms.items()}, batch_size=1)
         step = self.global_step + 1
+        named = {f"train/{name}": value.detach() for name, value in terms.items()}
+        self.log_dict({"step": float(step), **named}, batch_size=1)  # else Lightning counts from 0
         with torch.no_grad():
             self.average.lerp_(depth, 1 - min(self.settings.average, (step - 1) / (step + 9)))
             if self.stopping.observe(step, depth, self.average):
@@ -172,7 +173,7 @@ class PriorOptimisation(lightning.LightningModule):
                 scores = {name: float(value) for name, value in compute_means(self.metrics).items()}
                 self.validation_scores = {"val": scores}
                 named = {f"val/{name}": value for name, value in in_table_units(self.metrics, scores).items()}
-                self.log_dict({"step": float(self.global_step), **named}, batch_size=1)  # else Lightning counts from 0
+                self.log_dict({"step": float(self.global_step), **named}, batch_size=1)
         writer: Any = getattr(self.logger, "experiment", None)
         if hasattr(writer, "add_image"):
             problem = self.problem

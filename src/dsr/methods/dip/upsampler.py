@@ -168,6 +168,8 @@ class DeepImagePrior:
             display = self.display or StepsProgress(progress)
             folder = None if self.workspace is None else self.workspace / WORKSPACE / sample.scene
             resume = None if folder is None else checkpoint_of(folder / "last.ckpt", origin)
+            if folder is not None and resume is None:
+                (folder / "last.ckpt").unlink(missing_ok=True)
             display.say(self._announcement(module, sample.scene, resume is not None))
             if not module.objective.w and self._objective.w:
                 title = module.objective.visual.title
