@@ -84,9 +84,20 @@ USAGE_ERRORS = {
         "dataset.scenes: cannot read the value [ünï,b]; special characters need quotes within quotes: "
         '\'dataset.scenes=["ünï","b"]\''
     ),
-    "method=msg,msg_v": (
-        "method: got several values; -m runs each of them, method=[msg,msg_v] is a list, 'method=\"msg,msg_v\"' a text"
+    "method=msg,msg_v": "method: got several values; -m runs each of them",
+    "metrics.protocols=paper,field": (
+        "metrics.protocols: got several values; -m runs each of them, metrics.protocols=[paper,field] is a list, "
+        "'metrics.protocols=\"paper,field\"' a text"
     ),
+    "downsampling=[box,nearest]": (
+        "downsampling=[box,nearest]: expected one choice, got a list; -m downsampling=A,B runs each of several"
+    ),
+    "dataset=[ simgeo , icl ]": (
+        "dataset=[ simgeo , icl ]: expected one choice, got a list; -m dataset=A,B runs each of several"
+    ),
+    "method=[]": "method=[]: expected one choice, got a list; -m method=A,B runs each of several",
+    "metrics=[field]": "metrics=[field]: expected one choice, got a list; -m metrics=A,B runs each of several",
+    "hydra/launcher=[joblib,basic]": "hydra/launcher=[joblib,basic]: expected one choice, got a list",
     "--config-name=other": "--config-name other: unknown; expected eval",
     "--config-dir=nowhere": "--config-dir: expected a directory, got nowhere",
     "+experiment=papers": f"experiment=papers: unknown; expected one of {EXPERIMENTS}",

@@ -28,12 +28,15 @@ from dsr.app.experiments import register_resolvers, with_keys_of_swept_groups, w
 from dsr.app.explain import explain, explain_arguments, explain_damage
 from dsr.app.gpus import count_gpus, take_gpu
 from dsr.app.multirun import JobResult, collected_jobs, expect_launcher, failure_summary, job_name
-from dsr.app.schema import EvalConfig, TrainConfig, plain_config, register
+from dsr.app.schema import SEVERAL, EvalConfig, TrainConfig, plain_config, register
 from dsr.utils import interruption
 from dsr.utils.builder import ConfigError
 from dsr.utils.config_files import config_directories, list_choices
 from dsr.utils.console import USAGE_ERROR, one_line, print_error
 from dsr.utils.space import FullDiskError, silence_threads, space_for
+
+_LIST = re.compile(r"(^|,)\s*\[")
+"""Where a list begins in the value of an argument, or in one of several that -m runs."""
 
 
 def run_eval(arguments: Sequence[str] | None = None) -> None:
@@ -170,22 +173,25 @@ def _expect_choices(name: str, arguments: Sequence[str], directories: Sequence[P
     problem = explain_arguments(arguments)
     if problem is not None:
         fail(problem)
-    if any(argument.startswith("hydra.searchpath=") for argument in arguments):
-        return  # other directories may have further choices
     defaults = OmegaConf.load(directories[0] / f"{name}.yaml").defaults
-    groups = {str(key) for entry in defaults if isinstance(entry, DictConfig) for key in entry} | {"+experiment"}
+    groups = {str(key) for entry in defaults if isinstance(entry, DictConfig) for key in entry} | {"experiment"}
+    elsewhere = any(argument.startswith("hydra.searchpath=") for argument in arguments)  # there may be further choices
     for argument in arguments:
-        group, equals, choice = argument.partition("=")
-        if equals and group in groups:
-            _expect_choice(argument, group.lstrip("+"), choice, directories)
+        key, equals, choice = argument.partition("=")
+        group, at, _ = key.lstrip("+").partition("@")
+        if _LIST.search(choice) and group in {*groups, "hydra/launcher", "hydra/sweeper"} - {*SEVERAL}:
+            each = f"; -m {key}=A,B runs each of several" if group in groups else ""
+            fail(f"{argument}: expected one choice, got a list{each}")
+        if equals and not at and not elsewhere and group in groups and key != "experiment":
+            _expect_choice(argument, group, choice, directories)
 
 
 def _expect_choice(argument: str, group: str, choice: str, directories: Sequence[Path]) -> None:
-    """Exit if ``choice``, or one of several separated by commas, is not a file of the group."""
+    """Exit if ``choice``, or one of several separated by commas or in lists, is not a file of the group."""
     choices = list_choices(group, directories)
     if choice in ("", "null"):
         fail(f"{argument}: expected one of {', '.join(choices)}")
-    for each in choice.split(","):
+    for each in re.split(r"[\[\],\s]+", choice.strip("[] ")):
         if re.fullmatch(r"[\w.+-]+", each) and each not in choices:
             fail(f"{group}={each}: unknown; expected one of {', '.join(choices)}")
 

@@ -11,6 +11,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from dsr.app.composition import compose
 from dsr.app.multirun import LAUNCHERS
+from dsr.app.schema import SEVERAL
 from dsr.utils.config_files import list_choices, list_groups
 from dsr.utils.console import one_line
 
@@ -49,9 +50,11 @@ def explain(error: Exception, name: str, arguments: Sequence[str], directories: 
     several = re.match(r"Ambiguous value for argument '([^=]+)=(.*?)' 1\.", text)
     if several:
         key, values = several.groups()
-        return (
-            f"{key}: got several values; -m runs each of them, {key}=[{values}] is a list, '{key}=\"{values}\"' a text"
-        )
+        texts = [f"{key}: got several values; -m runs each of them"]
+        single = key in list_groups(directories)
+        texts += [] if single and key not in SEVERAL else [f"{key}=[{values}] is a list"]
+        texts += [] if single else [f"'{key}=\"{values}\"' a text"]
+        return ", ".join(texts)
     return _explain_value(error, text, name, arguments, directories)
 
 

@@ -33,7 +33,7 @@ from dsr.methods.networks.trained import NETWORKS
 from dsr.methods.networks.weight_files import load_network, network_name, read_torch_file, save_network
 from dsr.metrics.visual_loss import VisualLoss, make_visual_loss
 from dsr.training.data_module import PatchData
-from dsr.training.loggers import RUN_ID, expect_installed, log_layout, log_settings
+from dsr.training.loggers import RUN_IDS, expect_installed, log_layout, log_settings
 from dsr.training.module import SuperResolution
 from dsr.training.objective import Objective, SurfaceObjective, balance_weight
 from dsr.training.settings import Schedule
@@ -98,7 +98,8 @@ def _train(plain: dict[str, Any], settings: TrainConfig, device: torch.device, p
     net = _network(settings)
     data = training_data(settings, processes.count)
     check_metrics(settings.metrics)
-    expect_installed(settings.logger["name"])
+    for name in settings.logger:
+        expect_installed(name)
     identity = rundir.identity_of(plain, None, device)
     folder = rundir.folder_of(settings.output_dir or rundir.default_directory("train", plain, identity))
     weights, last = folder / WEIGHTS, folder / "checkpoints" / "last.ckpt"
@@ -272,7 +273,7 @@ def _computes_w(settings: TrainConfig) -> bool:
 
 def _clear(folder: Path) -> None:
     """Remove the files of an earlier training, so that they are not taken for this one's if it is interrupted."""
-    for name in (WEIGHTS, NOTE, RUN_ID):
+    for name in (WEIGHTS, NOTE, *RUN_IDS.values()):
         (folder / name).unlink(missing_ok=True)
     for name in ("checkpoints", "tensorboard", "csv", "wandb", "mlruns"):
         shutil.rmtree(folder / name, ignore_errors=True)
@@ -304,9 +305,9 @@ def _announce(
         "steps": f"{trainer.steps} of {trainer.batch} patches of {trainer.patch} x {trainer.patch}{accumulate}"
         + (", resumed" if resume else ""),
         "time": f"about {duration(step * trainer.steps)} ({step:.2g} s a step as measured now), and the validations",
-        "log": f"tensorboard --logdir {folder}"
-        if settings.logger["name"] == "tensorboard"
-        else settings.logger["name"],
+        "log": ", ".join(
+            f"tensorboard --logdir {folder}" if name == "tensorboard" else name for name in settings.logger
+        ),
     }
     for name, line in lines.items():
         progress.say(f"{name:<6} {line}")
@@ -316,13 +317,14 @@ def _describe(
     trainer: lightning.Trainer, plain: Mapping[str, Any], module: SuperResolution, facts: Mapping[str, Any], *,
     resumed: bool,
 ) -> None:  # fmt: skip
-    """Write the configuration and the resulting w to the log, and lay it out."""
+    """Write the configuration and the resulting w to the logs, and lay them out."""
     loss = {**plain["loss"], "w": module.objective.w} if isinstance(module.objective, Objective) else {}
     config = {**plain, "loss": loss}
-    if isinstance(trainer.logger, TensorBoardLogger) or not resumed:  # MLflow refuses another device, say
-        log_settings(trainer.logger, facts, f"```yaml\n{OmegaConf.to_yaml(OmegaConf.create(config))}```", config)
     collections: Any = module.metrics
-    log_layout(trainer.logger, list(collections[0]))
+    for logger in trainer.loggers:
+        if isinstance(logger, TensorBoardLogger) or not resumed:  # MLflow refuses another device, say
+            log_settings(logger, facts, f"```yaml\n{OmegaConf.to_yaml(OmegaConf.create(config))}```", config)
+        log_layout(logger, list(collections[0]))
 
 
 def _facts(plain: Mapping[str, Any], module: SuperResolution) -> dict[str, Any]:

@@ -118,20 +118,20 @@ def training_trainer(
         ValidationTable(folder / VALIDATION),
         best,
         latest,
-        LearningRateMonitor("step"),
+        *([LearningRateMonitor("step")] if config.logger else []),
         StepProgress(progress, "train"),
         Keep(checkpoints / "last.ckpt", _SECONDS_BETWEEN_CHECKPOINTS),
         Interruption(checkpoints / "last.ckpt"),
     ]
     with without_chatter():
-        logger = build("logger", config.logger, {"folder": folder})
+        loggers = [build(f"logger.{name}", node, {"folder": folder}) for name, node in config.logger.items()]
     varying = "_find_unused_parameters_true" if idle or config.degradation.get("scales") else ""  # layers of one factor
     trainer = make_trainer(
         device,
         settings.steps,
         min(settings.validate_every, settings.steps),
         callbacks=callbacks,
-        logger=logger,
+        logger=loggers,
         devices=processes.count,
         accumulate=settings.accumulate,
         environment=processes.environment,

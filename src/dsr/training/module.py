@@ -121,7 +121,8 @@ class SuperResolution(lightning.LightningModule):
         """Log the mean scores over the scenes, worst of four lights, of all sets and, if there are several, of each."""
         self._gather()
         for name in sorted(self._pictures):
-            log_picture(self.logger, name, self._pictures[name], self.global_step)
+            for logger in self.loggers:
+                log_picture(logger, name, self._pictures[name], self.global_step)
         self._pictures = {}
         collections: Any = self.metrics
         scores = [{name: value.double() for name, value in compute_means(each).items()} for each in collections]
