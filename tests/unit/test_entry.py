@@ -4,6 +4,7 @@ import math
 import sys
 
 import pytest
+from hydra.core.hydra_config import HydraConfig
 from hydra.core.plugins import Plugins
 
 from dsr.app.entry import run_command
@@ -16,7 +17,7 @@ def command(monkeypatch, tmp_path, capfd):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("HYDRA_FULL_ERROR", "1")
 
-    def run(*arguments, job=None):
+    def run(*arguments, job=None, check=None):
         monkeypatch.setattr(sys, "argv", ["eval.py", *arguments])
         seen = []
 
@@ -26,7 +27,7 @@ def command(monkeypatch, tmp_path, capfd):
 
         code = 0
         try:
-            run_command("eval", remember)
+            run_command("eval", remember, check=check)
         except SystemExit as ended:
             code = ended.code
         return code, capfd.readouterr().err, seen
@@ -188,6 +189,36 @@ def test_failing_job_of_a_multirun_keeps_the_others_and_sets_the_exit_code(comma
         "error: scale=4: scale: not this one",
     ]
     assert [config.scale for config in seen] == [2, 4, 8]
+
+
+def test_job_that_cannot_be_run_keeps_the_jobs_launched_with_it_from_beginning(command, tmp_path):
+    def check(config):
+        if config.scale == 8:
+            raise ConfigError("scale: not this one")
+        return []
+
+    code, error, seen = command("-m", "scale=2,4,8", check=check)
+    assert (code, seen) == (2, [])
+    lines = ["error: 1 of 3 jobs cannot be run, so none is begun", "error: scale=8: scale: not this one"]
+    assert error.splitlines() == lines
+    assert list(tmp_path.iterdir()) == []
+    code, error, seen = command("-m", "scale=2,4,8,16", "hydra.sweeper.max_batch_size=2", check=check)
+    assert (code, [config.scale for config in seen]) == (2, [2, 4])
+    assert error.splitlines()[0] == "error: 1 of 2 jobs cannot be run, so none is begun"
+
+
+def test_check_of_a_job_sees_its_configuration_as_the_job_does(command):
+    checked = []
+
+    def check(config):
+        checked.append((config, list(HydraConfig.get().overrides.task), HydraConfig.get().job.num))
+        return []
+
+    code, _, seen = command("-m", "scale=2,4", check=check)
+    assert code == 0
+    assert [config for config, _, _ in checked] == seen
+    assert [given for _, given, _ in checked] == [["scale=2"], ["scale=4"]]
+    assert [number for _, _, number in checked] == [0, 1]
 
 
 @pytest.mark.slow

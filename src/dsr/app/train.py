@@ -8,7 +8,7 @@ import math
 import shutil
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 from zipfile import BadZipFile
@@ -23,10 +23,12 @@ from dsr.app import run_directory as rundir
 from dsr.app.devices import Processes, find_processes
 from dsr.app.divergence import NOTE, expect_no_divergence, note_divergence
 from dsr.app.metrics import check_metrics, metric_collection
+from dsr.app.multirun import Plan, runs_here
 from dsr.app.schema import TrainConfig, given_keys, plain_config
 from dsr.app.trainer import has_idle_layers, seconds_per_step, training_trainer
 from dsr.app.training_runs import WEIGHTS, common, keyed, read_config, training_data
 from dsr.data.base import prepare_scenes
+from dsr.evaluation.sharing import apart
 from dsr.methods.networks.base import DisparityNetwork
 from dsr.methods.networks.facets_unet import FacetsUNet
 from dsr.methods.networks.trained import NETWORKS
@@ -51,6 +53,8 @@ from dsr.utils.units import duration
 
 _PATCHES_FOR_W = 64
 _LARGEST_SEED = 2**32 - 1
+_LAST = Path("checkpoints", "last.ckpt")
+"""The checkpoint that a training goes on from, in the directory of its run."""
 _RESUMABLE = ("resume", "device", "trust")
 
 
@@ -70,11 +74,7 @@ def train(config: DictConfig) -> float:
         KeyboardInterrupt: the training was interrupted; the message says how to resume it.
 
     """
-    plain = _resumed(plain_config(config))
-    settings = TrainConfig.of(plain)
-    device = pick_device(settings.device)
-    if settings.precision == "auto":
-        plain["precision"] = settings.precision = fast_precision(device)
+    plain, settings, device = _read(config)
     processes = find_processes(device, settings.trainer.devices, settings.trainer.strategy)
     with processes.running():
         if processes.first:
@@ -88,25 +88,108 @@ def train(config: DictConfig) -> float:
             sys.exit(interruption.exit_code())
 
 
-def _train(plain: dict[str, Any], settings: TrainConfig, device: torch.device, processes: Processes) -> float:
-    """Train in one of the processes, and return the best score."""
-    first = processes.first
-    progress = ConsoleProgress(Console(quiet=not first))
+def plan(config: DictConfig) -> list[Plan]:
+    """Check what :func:`train` would do as a job of a multirun; nothing is computed or written.
+
+    A training that is complete, or that would diverge again, is no work, and keeps no other one from its own.
+
+    Args:
+        config: composed from ``conf/train.yaml``.
+
+    Raises:
+        ConfigError: the configuration cannot be run.
+
+    """
+    here, cores = runs_here(), torch.get_num_threads()
+    torch.set_num_threads(1)  # threads would not survive a fork
+    try:
+        plain, settings, device = _read(config, here=here)
+        devices = settings.trainer.devices
+        count = find_processes(device, devices, settings.trainer.strategy).count if here else 1
+        prepared = _prepare(plain, settings, device, count)
+        elsewhere = () if here else ("device", "precision")
+        rundir.expect_free(prepared.folder, plain, prepared.identity, (*prepared.tolerated, *elsewhere))
+        left = _steps_left(prepared, settings)
+    finally:
+        torch.set_num_threads(cores)
+
+    def seconds() -> float:
+        batch, accumulate = prepared.data.example_batch(), settings.trainer.accumulate
+        return left * accumulate * apart(lambda: seconds_per_step(prepared.module, batch), None, device)
+
+    done = settings.trainer.steps - left
+    return [Plan(prepared.folder, prepared.identity, "step", left, done, seconds if here else None)]
+
+
+def _steps_left(prepared: _Prepared, settings: TrainConfig) -> int:
+    """Return how many steps are to be done; none if the training is complete or would diverge again."""
+    try:
+        _expect_unfinished(prepared.folder, prepared.identity, overwrite=settings.overwrite)
+    except ConfigError:
+        return 0
+    if prepared.resume is None:
+        return settings.trainer.steps
+    try:
+        return settings.trainer.steps - int(read_torch_file(prepared.resume)["global_step"])
+    except (ValueError, KeyError, TypeError, OSError) as error:
+        raise CheckpointError(prepared.resume, error) from error
+
+
+def _read(config: DictConfig, *, here: bool = True) -> tuple[dict[str, Any], TrainConfig, torch.device]:
+    """Return the configuration, perhaps of the run to resume, its checked settings and the device to train on.
+
+    Args:
+        config: composed.
+        here: whether this process has the device.
+
+    """
+    plain = _resumed(plain_config(config))
+    settings = TrainConfig.of(plain)
+    device = pick_device(settings.device) if here else torch.device("cpu")
+    if settings.precision == "auto":
+        plain["precision"] = settings.precision = fast_precision(device)
+    return plain, settings, device
+
+
+@dataclass(frozen=True)
+class _Prepared:
+    """A training that can be run, in the directory of its run."""
+
+    data: PatchData
+    module: SuperResolution
+    identity: Mapping[str, Any]
+    folder: Path
+    resume: Path | None
+    tolerated: tuple[str, ...]
+
+
+def _prepare(plain: dict[str, Any], settings: TrainConfig, device: torch.device, devices: int) -> _Prepared:
+    """Check and build all that a training on a number of devices needs, and write nothing."""
     if settings.seed > _LARGEST_SEED:
         raise ConfigError(f"seed: expected at most {_LARGEST_SEED}, got {settings.seed}")
     lightning.seed_everything(settings.seed, workers=True, verbose=False)
     net = _network(settings)
-    data = training_data(settings, processes.count)
+    data = training_data(settings, devices)
     check_metrics(settings.metrics)
     for name in settings.logger:
         expect_installed(name)
     identity = rundir.identity_of(plain, None, device)
     folder = rundir.folder_of(settings.output_dir or rundir.default_directory("train", plain, identity))
-    weights, last = folder / WEIGHTS, folder / "checkpoints" / "last.ckpt"
+    last = folder / _LAST
     metrics = functools.partial(metric_collection, settings.metrics, device)
     module = _module(settings, net, data, metrics)
     tolerated = ("code", "device") if "resume" in given_keys() else ()
     resume = last if last.is_file() and not settings.overwrite else None
+    return _Prepared(data, module, identity, folder, resume, tolerated)
+
+
+def _train(plain: dict[str, Any], settings: TrainConfig, device: torch.device, processes: Processes) -> float:
+    """Train in one of the processes, and return the best score."""
+    first = processes.first
+    progress = ConsoleProgress(Console(quiet=not first))
+    prepared = _prepare(plain, settings, device, processes.count)
+    data, module, identity, folder = prepared.data, prepared.module, prepared.identity, prepared.folder
+    resume, tolerated, weights = prepared.resume, prepared.tolerated, folder / WEIGHTS
     if first:
         _expect_trainable(folder, plain, identity, tolerated)
         _announce(progress, settings, module, data, folder, resume, processes.count)
@@ -121,7 +204,7 @@ def _train(plain: dict[str, Any], settings: TrainConfig, device: torch.device, p
     try:
         fit(trainer, module, data, resume)
     except DivergenceError as error:
-        raise note_divergence(folder, last, identity, error) from error
+        raise note_divergence(folder, folder / _LAST, identity, error) from error
     except KeyboardInterrupt:
         raise KeyboardInterrupt(
             f"interrupted at step {trainer.global_step}; resume={folder} goes on from there"
@@ -136,11 +219,17 @@ def _expect_trainable(
     folder: Path, plain: Mapping[str, Any], identity: Mapping[str, Any], tolerated: Sequence[str]
 ) -> None:
     """Check that the directory is free or that of this training, which is neither complete nor diverges again."""
-    if not plain["overwrite"] and (folder / WEIGHTS).exists():
-        raise ConfigError(f"output_dir: {folder / WEIGHTS} is trained already; overwrite=true trains it again")
     rundir.expect_free(folder, plain, identity, tolerated)
-    if not plain["overwrite"]:
-        expect_no_divergence(folder, identity)
+    _expect_unfinished(folder, identity, overwrite=plain["overwrite"])
+
+
+def _expect_unfinished(folder: Path, identity: Mapping[str, Any], *, overwrite: bool) -> None:
+    """Check that a training is neither complete nor diverges again."""
+    if overwrite:
+        return
+    if (folder / WEIGHTS).exists():
+        raise ConfigError(f"output_dir: {folder / WEIGHTS} is trained already; overwrite=true trains it again")
+    expect_no_divergence(folder, identity)
 
 
 def _claim(

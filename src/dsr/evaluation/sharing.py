@@ -6,6 +6,7 @@ See :mod:`dsr.evaluation.claims` for commands that share a directory, perhaps fr
 from __future__ import annotations
 
 import contextlib
+import math
 import os
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -70,6 +71,26 @@ def choose_workers(workers: int | None, threads: int | None, scenes: int, cores:
 def can_fork() -> bool:
     """Return whether this system has the processes that several workers need."""
     return hasattr(os, "fork")
+
+
+def apart(function: Callable[[], float], threads: int | None, device: torch.device) -> float:
+    """Return what a function returns that computes with several threads: if this process has not, in one of its own.
+
+    Args:
+        function: to call.
+        threads: number of threads; None for those that torch has.
+        device: that it computes on.
+
+    Returns:
+        Its result; NaN if its process was killed twice.
+
+    """
+    with _threads(threads):
+        if device.type != "cpu" or not can_fork() or _threaded:
+            return function()
+        forks: Forks[str, float] = Forks(1, lambda _: function(), lambda _: math.nan, lambda _: None)
+        with forks:
+            return next(result for _, result in forks.results([""]))
 
 
 def share(
