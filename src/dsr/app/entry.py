@@ -25,7 +25,7 @@ from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
 from dsr.app.experiments import register_resolvers, with_keys_of_swept_groups, without_overridden_sweeps
-from dsr.app.explain import explain, explain_arguments, explain_damage
+from dsr.app.explain import explain, explain_arguments, explain_choice, explain_damage
 from dsr.app.gpus import count_gpus, take_gpu
 from dsr.app.multirun import Check, JobResult, Plan, collected_jobs, expect_launcher, failure_summary, job_name
 from dsr.app.schema import SEVERAL, EvalConfig, TrainConfig, plain_config, register
@@ -214,7 +214,7 @@ def _expect_choice(argument: str, group: str, choice: str, directories: Sequence
         fail(f"{argument}: expected one of {', '.join(choices)}")
     for each in re.split(r"[\[\],\s]+", choice.strip("[] ")):
         if re.fullmatch(r"[\w.+-]+", each) and each not in choices:
-            fail(f"{group}={each}: unknown; expected one of {', '.join(choices)}")
+            fail(explain_choice(group, each, directories))
 
 
 def _config_dirs(arguments: Sequence[str]) -> list[Path]:
