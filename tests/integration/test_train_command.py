@@ -411,6 +411,45 @@ def test_logger_that_is_not_installed_is_named_before_anything_is_written(tmp_pa
     assert tree(tmp_path) == []
 
 
+def test_list_of_loggers_logs_to_each_and_goes_on_with_each(tmp_path, within, interrupt):
+    interrupt(3)
+    assert within(*FOUR, "logger=[tensorboard,csv]")[0] == 130
+    interrupt(None)
+    code, output, errors = within("resume=out")
+    assert (code, errors) == (0, [])
+    assert "log    tensorboard --logdir out, csv\n" in output
+    home = tmp_path / "out"
+    with (home / "csv" / "metrics.csv").open(newline="") as file:
+        rows = {int(row["step"]): row for row in csv.DictReader(file)}
+    table = {step: float(row["val/RMSE_v"]) for step, row in rows.items() if row["val/RMSE_v"]}
+    assert table == pytest.approx(scalars_of(home, "val/RMSE_v"))
+    assert len(table) == 2
+    assert yaml.safe_load((home / "csv" / "hparams.yaml").read_text())["model"]["name"] == "msg_v"
+    tags = events_of(home).Tags()
+    assert tags["images"] == ["renderings/procedural_0"]
+    assert {"config/text_summary", "custom_scalars__config__"} <= set(tags["tensors"])
+
+
+def test_training_without_a_logger_has_its_table_of_validations(tmp_path, within):
+    code, _, errors = within(*SMOKE, "output_dir=out", "~logger")
+    assert (code, errors) == (0, [])
+    assert not {path.name for path in (tmp_path / "out").iterdir()} & {"tensorboard", "csv"}
+    assert (tmp_path / "out" / "validation.csv").is_file()
+
+
+def test_training_of_before_loggers_had_names_goes_on_with_its_own(tmp_path, within, interrupt):
+    interrupt(1)
+    assert within(*SMOKE, "output_dir=out", "logger=csv")[0] == 130
+    path = tmp_path / "out" / "config.yaml"
+    config = yaml.safe_load(path.read_text())
+    path.write_text(yaml.safe_dump({**config, "logger": {"name": "csv", "target": "dsr.training.loggers.csv"}}))
+    interrupt(None)
+    code, output, errors = within("resume=out")
+    assert (code, errors) == (0, [])
+    assert "log    csv\n" in output
+    assert not (tmp_path / "out" / "tensorboard").exists()
+
+
 def test_patch_larger_than_a_scene_is_refused_when_the_scenes_are_there(tmp_path, within):
     code, output, errors = within(*SMOKE, "trainer.patch=128")
     assert code == 2

@@ -73,7 +73,7 @@ def test_run_of_mlflow_has_values_settings_and_pictures_and_goes_on(tmp_path, mo
     log_settings(logger, {}, {"scale": 4, "model": {"name": "msg_v"}})
     log_picture(logger, "renderings/a_0", torch.zeros(3, 8, 8, dtype=torch.uint8), 20)
     client = MlflowClient((tmp_path / "mlruns").as_uri())
-    number = (tmp_path / "logger_run.txt").read_text().strip()
+    number = (tmp_path / "mlflow_run.txt").read_text().strip()
     assert [(each.step, each.value) for each in client.get_metric_history(number, "train/loss")] == [
         (9, 0.5), (19, 0.25)
     ]  # fmt: skip
@@ -88,7 +88,7 @@ def test_run_of_wandb_without_the_service_is_in_files_of_the_run(tmp_path, monke
     logger.log_metrics({"train/loss": 0.5}, 9)
     log_picture(logger, "renderings/a_0", torch.zeros(3, 8, 8, dtype=torch.uint8), 20)
     logger.finalize("success")
-    number = (tmp_path / "logger_run.txt").read_text().strip()
+    number = (tmp_path / "wandb_run.txt").read_text().strip()
     [folder] = (tmp_path / "wandb").glob("offline-run-*")
     assert (folder / f"run-{number}.wandb").stat().st_size > 0
     assert len(list(folder.glob("files/media/images/renderings/*.png"))) == 1

@@ -6,7 +6,8 @@ import functools
 import math
 import random
 import shutil
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,9 +20,11 @@ from rich.console import Console
 from dsr.app import run_directory as rundir
 from dsr.app.methods import adapt_method, hash_weights, weights_of
 from dsr.app.metrics import check_metrics, chosen_metrics, metric_collection
+from dsr.app.multirun import Plan, runs_here
 from dsr.app.schema import EvalConfig, given_keys, plain_config, user_directories
 from dsr.data.base import SceneSource, prepare_scenes
-from dsr.degradation.downsampling import Downsampling, Measured
+from dsr.data.folder import Folder
+from dsr.degradation.downsampling import Downsampling, Measured, make_sample
 from dsr.degradation.scales import NATIVE, match_ratio
 from dsr.evaluation.predict import Evaluation, Outcome, StalePredictionError, failure_line, predict
 from dsr.evaluation.run_files import read_run
@@ -33,7 +36,7 @@ from dsr.methods.base import WORKSPACE
 from dsr.methods.registry import build_method, target_paths
 from dsr.metrics.formats import HEADLINES, Formats
 from dsr.report.tables import score_table
-from dsr.sample import DepthSample
+from dsr.sample import DepthSample, slope
 from dsr.utils.builder import ConfigError, build, takes, trait
 from dsr.utils.console import ConsoleProgress, open_console, print_error, show
 from dsr.utils.devices import fast_precision, pick_device
@@ -56,13 +59,21 @@ def evaluate(config: DictConfig) -> pd.DataFrame:
         ConfigError: the configuration cannot be run, or a scene failed (the others' results are written).
 
     """
-    plain = plain_config(config)
-    if plain["run"] is None:
-        return _evaluate(plain, None)
-    from dsr.app.training_runs import studies_of_run  # noqa: PLC0415 - it imports Lightning, which takes seconds
-
-    scores = [_evaluate(each, source) for each, source in studies_of_run(plain, given_keys())]
+    scores = [_run(_prepare(plain, source)) for plain, source in _studies(config)]
     return pd.concat(scores, ignore_index=True)
+
+
+def plan(config: DictConfig) -> list[Plan]:
+    """Check what :func:`evaluate` would run as a job of a multirun; nothing is computed or written.
+
+    Args:
+        config: composed from ``conf/eval.yaml``.
+
+    Raises:
+        ConfigError: the configuration cannot be run.
+
+    """
+    return [_plan(_prepare(plain, source, here=runs_here())) for plain, source in _studies(config)]
 
 
 def objective(scores: pd.DataFrame) -> float:
@@ -79,11 +90,41 @@ def objective(scores: pd.DataFrame) -> float:
     return float(means.get(_OBJECTIVE, means.iloc[0]))
 
 
-def _evaluate(plain: dict[str, Any], source: SceneSource | None) -> pd.DataFrame:
-    """Evaluate on ``source``, or on the data set that the configuration describes."""
+def _studies(config: DictConfig) -> Iterator[tuple[dict[str, Any], SceneSource | None]]:
+    """Yield the configurations to evaluate, with data sets; None for the one that the configuration describes."""
+    plain = plain_config(config)
+    if plain["run"] is None:
+        yield plain, None
+        return
+    from dsr.app.training_runs import studies_of_run  # noqa: PLC0415 - it imports Lightning, which takes seconds
+
+    yield from studies_of_run(plain, given_keys())
+
+
+@dataclass(frozen=True)
+class _Prepared:
+    """An evaluation that can be run, in the directory of its run."""
+
+    settings: EvalConfig
+    plain: Mapping[str, Any]
+    identity: Mapping[str, Any]
+    folder: Path
+    study: Evaluation
+    workers: Workers
+    progress: ConsoleProgress
+
+
+def _prepare(plain: dict[str, Any], source: SceneSource | None, *, here: bool = True) -> _Prepared:
+    """Check and build all that an evaluation needs, and write nothing.
+
+    Args:
+        plain: the configuration.
+        source: the data set; None for the one that the configuration describes.
+        here: whether this process has the device that will compute.
+
+    """
     settings = EvalConfig.of(plain)
-    console = open_console()
-    device = pick_device(settings.device)
+    device = pick_device(settings.device) if here else torch.device("cpu")
     source = source or _source(settings)
     plain = {**plain, "precision": _precision(settings, device), "scale": _scale(settings, source)}
     settings = EvalConfig.of(plain)
@@ -93,12 +134,55 @@ def _evaluate(plain: dict[str, Any], source: SceneSource | None) -> pd.DataFrame
     targets = target_paths(settings.method, user_directories())
     identity = rundir.identity_of(plain, hash_weights(files), device, targets)
     folder = rundir.folder_of(settings.output_dir or rundir.default_directory("eval", plain, identity))
-    progress = ConsoleProgress(console)
+    progress = ConsoleProgress(open_console())
     given = {"device": device, "weights": weights, "workspace": folder, "display": progress}
     study = _study(settings, identity, given, source, adapted)
     check_metrics(settings.metrics)
     workers = _workers(settings, device, len(study.source.scenes()))
-    rundir.claim(folder, plain, identity)
+    rundir.expect_free(folder, plain, identity, () if here else ("device", "precision"))
+    return _Prepared(settings, plain, identity, folder, study, workers, progress)
+
+
+def _plan(prepared: _Prepared) -> Plan:
+    """Return what an evaluation will do."""
+    study, folder = prepared.study, prepared.folder
+    scenes = study.source.scenes()
+    done = 0 if prepared.settings.overwrite else sum(prediction_path(folder, scene).is_file() for scene in scenes)
+    left = len(scenes) - done
+
+    def seconds() -> float:
+        example = _example(prepared)
+        if example is None:
+            return math.nan
+        each: Callable[[DepthSample], float] = study.method.seconds  # type: ignore[attr-defined]
+        return left * each(example)
+
+    measured = runs_here() and hasattr(study.method, "seconds")
+    return Plan(folder, prepared.identity, "scene", left, done, seconds if measured else None)
+
+
+def _example(prepared: _Prepared) -> DepthSample | None:
+    """Return a sample as large as the first scene's; None if its size is not known before the scenes are prepared."""
+    study, size = prepared.study, prepared.settings.dataset.get("size")
+    if isinstance(study.downsampling, Measured):
+        return None
+    if isinstance(size, int):
+        scene = slope(size)
+    elif isinstance(study.source, Folder):
+        scene = study.source.load(study.source.scenes()[0])
+    else:
+        return None
+    return make_sample(
+        scene, study.scale, study.downsampling, study.method.range_type, study.noise, study.seed, study.holes
+    )
+
+
+def _run(prepared: _Prepared) -> pd.DataFrame:
+    """Evaluate, and return the scores."""
+    settings, folder, study = prepared.settings, prepared.folder, prepared.study
+    workers, progress = prepared.workers, prepared.progress
+    console = open_console()
+    rundir.claim(folder, prepared.plain, prepared.identity)
     if settings.overwrite:
         shutil.rmtree(folder / WORKSPACE, ignore_errors=True)
     _seed(settings.seed)
@@ -109,7 +193,7 @@ def _evaluate(plain: dict[str, Any], source: SceneSource | None) -> pd.DataFrame
         )
     except StalePredictionError as error:
         raise ConfigError(str(error)) from error
-    metrics = chosen_metrics(settings.metrics, device)
+    metrics = chosen_metrics(settings.metrics, study.device)
     formats = {metric.name: metric.format for metric in metrics}
     illustrate = functools.partial(_illustrate, folder, study.label, formats)
     scores = score(study, folder, metrics, outcome, progress, illustrate, workers=workers)

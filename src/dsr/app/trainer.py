@@ -166,14 +166,14 @@ def training_trainer(
         FirstValidation(best),
     ]
     with without_chatter():
-        logger = build("logger", config.logger, {"folder": folder})
+        loggers = [build(f"logger.{name}", node, {"folder": folder}) for name, node in config.logger.items()]
     varying = "_find_unused_parameters_true" if idle or config.degradation.get("scales") else ""  # layers of one factor
     trainer = make_trainer(
         device,
         settings.steps,
         min(settings.validate_every, settings.steps),
         callbacks=callbacks,
-        logger=logger,
+        logger=loggers,
         devices=processes.count,
         accumulate=settings.accumulate,
         environment=processes.environment,

@@ -19,9 +19,8 @@ from torch.utils.data import DataLoader, Dataset, default_collate
 from dsr.data.base import SceneSource, content_key
 from dsr.degradation.everything import Everything
 from dsr.degradation.hints import FACTS, encode_facts
-from dsr.geometry.camera import Camera
 from dsr.methods.classical.interpolation import Interpolation
-from dsr.sample import Scene
+from dsr.sample import Scene, slope
 from dsr.training.degradation import Batch, Degradation, to_tensors
 from dsr.training.patches import Patches, check_patches
 from dsr.training.settings import PatchSettings
@@ -190,11 +189,7 @@ class PatchData(lightning.LightningDataModule):
 
     def example_batch(self) -> Batch:
         """Return a batch of the run's size that needs no scene: a grey slope, repeated."""
-        size = self._settings.patch
-        camera = Camera(size, size, size, size, (size - 1) / 2, (size - 1) / 2)
-        depth = torch.linspace(1, 2, size, dtype=torch.float64).repeat(1, size, 1)
-        scene = Scene("example", "slope", torch.full((3, size, size), 0.5), camera, depth)
-        tensors = to_tensors(self._degradation.sample(scene, clean=True))
+        tensors = to_tensors(self._degradation.sample(slope(self._settings.patch), clean=True))
         if self._everything is not None:
             nothing = {"facts": torch.zeros(FACTS), "soft": torch.zeros(())}
             tensors |= {"noise": torch.zeros_like(tensors["disparity_lr"]), **nothing}

@@ -28,8 +28,8 @@ _ROWS_AT_ONCE = 10
 """Rows of a table that are written together."""
 OPTIONAL = ("wandb", "mlflow")
 """Loggers that need the library of their name, which an extra of that name installs."""
-RUN_ID = "logger_run.txt"
-"""The file in a run's directory with the number that a service has given to the run."""
+RUN_IDS = {name: f"{name}_run.txt" for name in OPTIONAL}
+"""The files in a run's directory with the numbers that services have given to the run."""
 
 
 def expect_installed(name: str) -> None:
@@ -118,15 +118,15 @@ def wandb(
     import wandb as client  # noqa: PLC0415 - optional
 
     logger = WandbLog(
-        name=folder.name, save_dir=folder, project=project, entity=entity, mode=mode, id=_read_number(folder),
-        settings=client.Settings(silent=True, console="off"),
+        name=folder.name, save_dir=folder, project=project, entity=entity, mode=mode,
+        id=_read_number(folder, "wandb"), settings=client.Settings(silent=True, console="off"),
     )  # fmt: skip
     logger._wandb_init.pop("anonymous", None)  # of which wandb would warn
     try:
         number = logger.experiment.id
     except client.Error as error:
-        raise ValueError(f"mode: wandb: {error}; wandb login, or logger.mode=offline for local files") from error
-    _write_number(folder, number)
+        raise ValueError(f"mode: wandb: {error}; wandb login, or logger.wandb.mode=offline for local files") from error
+    _write_number(folder, "wandb", number)
     return logger
 
 
@@ -150,8 +150,8 @@ def mlflow(folder: Path, experiment: str = "dsr", tracking_uri: str | None = Non
     if uri.startswith("file:"):
         os.environ.setdefault("MLFLOW_ALLOW_FILE_STORE", "true")
     try:
-        logger = MLFlowLogger(experiment, folder.name, uri, run_id=_read_number(folder))
-        _write_number(folder, logger.run_id)
+        logger = MLFlowLogger(experiment, folder.name, uri, run_id=_read_number(folder, "mlflow"))
+        _write_number(folder, "mlflow", logger.run_id)
     except MlflowException as error:
         raise ValueError(f"tracking_uri: {uri}: {error}") from error
     return logger
@@ -240,14 +240,14 @@ def _read_table(path: Path) -> list[dict[str, Any]]:
     return [{name: value for name, value in row.items() if value} | {"step": int(row["step"])} for row in whole]
 
 
-def _read_number(folder: Path) -> str | None:
+def _read_number(folder: Path, service: str) -> str | None:
     """Return the number that a service has given to the run, None for a new run."""
-    path = folder / RUN_ID
+    path = folder / RUN_IDS[service]
     text = path.read_text(encoding="utf-8").strip() if path.is_file() else ""
     return text if re.fullmatch(r"\w{1,64}", text) else None
 
 
 @rank_zero_only
-def _write_number(folder: Path, number: Any) -> None:
+def _write_number(folder: Path, service: str, number: Any) -> None:
     """Keep the number that a service has given to the run."""
-    write_text(folder / RUN_ID, f"{number}\n")
+    write_text(folder / RUN_IDS[service], f"{number}\n")

@@ -138,7 +138,8 @@ class SuperResolution(lightning.LightningModule):
         """Log the mean scores in the units of tables, of all sets and, if there are several, of each."""
         self._gather()
         for name in sorted(self._pictures):
-            log_picture(self.logger, name, self._pictures[name], self.global_step)
+            for logger in self.loggers:
+                log_picture(logger, name, self._pictures[name], self.global_step)
         self._pictures = {}
         named: dict[str, Any] = self._means("val", self.metrics)
         if self._bicubic_metrics:
