@@ -189,7 +189,7 @@ def line_per_report(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("dsr.utils.console._NEXT_LINE", 0.0)
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def make_run() -> Callable[..., Path]:
     """Return what writes the directory of a run, whole and with real depth maps, without running a method."""
     return write_run

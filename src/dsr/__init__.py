@@ -12,6 +12,8 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
+import dsr.utils.threads  # noqa: F401 - for forks
+
 if TYPE_CHECKING:
     from dsr.geometry.camera import Camera
     from dsr.inference.api import upsample, upsample_with_errors

@@ -106,7 +106,7 @@ def scores_of(folder):
     path = folder / "validation.csv" if (folder / "validation.csv").is_file() else folder.parent / "validation.csv"
     by_step = {}
     with path.open(newline="") as file:
-        for row in csv.DictReader(file):
+        for row in (row for row in csv.DictReader(file) if row["set"] == "val"):
             by_step.setdefault(int(row["step"]), {})[row["metric"]] = float(row["value"])
     if path.parent == folder:
         return by_step[max(by_step)]

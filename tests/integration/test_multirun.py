@@ -101,10 +101,10 @@ def test_training_that_cannot_be_run_refuses_the_others(multirun, tmp_path):
 def test_time_of_all_trainings_is_said_once_and_a_complete_one_is_no_work(multirun):
     code, output, errors = multirun("train", *TRAINING, "seed=0", RECORDS)
     assert (code, errors) == (0, [])
-    assert re.fullmatch(r"1 job, 2 steps: about \d+ s, and the validations", output[0])
+    assert re.fullmatch(r"1 job, 2 steps: about \d+ s", output[0])
     code, output, errors = multirun("train", *TRAINING, "seed=0,1", RECORDS)
     assert code == 2
-    assert re.fullmatch(r"2 jobs, 2 steps \(2 more are complete\): about \d+ s, and the validations", output[0])
+    assert re.fullmatch(r"2 jobs, 2 steps \(2 more are complete\): about \d+ s", output[0])
     assert [line.partition("; ")[0].partition(" outputs")[0] for line in errors][1:] == [
         "error: 1 of 2 jobs failed", "error: seed=0: output_dir:"
     ]  # fmt: skip

@@ -143,7 +143,8 @@ def test_changed_code_of_a_method_from_outside_makes_another_run(home):
 def test_methods_are_told_what_is_known_of_the_maps(home, arguments, told):
     done = evaluate(home, "method=told", *arguments)
     assert (done.returncode, done.stderr) == (0, "")
-    assert [line.removeprefix("told ") for line in done.stdout.splitlines() if line.startswith("told ")] == told
+    lines = [line.removeprefix("told ") for line in done.stdout.splitlines() if line.startswith("told ")]
+    assert lines == (2 * told if "-m" in arguments else told)  # a multirun checks its jobs first
 
 
 def test_upsample_runs_a_method_from_outside_with_settings(home):

@@ -40,6 +40,7 @@ COMMANDS = {
     "dsr upsample --rgb a -o out": 2,
     "dsr report runs -o out --only nosuch": 2,
     "dsr report runs -o out --workers 0": 2,
+    "dsr report runs -o out --light e9": 2,
     "dsr fuse out -o mesh.ply --voxel 0": 2,
     "dsr view out --most 0": 2,
     "dsr export --onnx file.onnx --method nosuch": 2,

@@ -121,10 +121,9 @@ def _explain_key(key: str, name: str, arguments: Sequence[str], directories: Seq
     config = _composed_for(key, name, arguments, directories)
     prefix, node = _innermost(config, key)
     children = [str(child) for child in node if child not in ("target", "_target_")]
-    wanted = _meant(key, value, name, config, directories)
-    if not wanted:
-        alike = get_close_matches(key.rpartition(".")[2], children, 1, _ALIKE)
-        wanted = [f"{prefix}{child}={value}" for child in alike]
+    alike = [f"{prefix}{each}={value}" for each in get_close_matches(key.rpartition(".")[2], children, 1, _ALIKE)]
+    meant = _meant(key, value, name, config, directories)
+    wanted = alike or meant if prefix else meant or alike  # a key of a group is one of this group first
     beside = ", ".join(f"{prefix}{child}" for child in children)
     return f"{key}: unknown key; expected {' or '.join(wanted) or beside or 'none'}"
 

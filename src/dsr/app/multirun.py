@@ -134,7 +134,7 @@ def collected_jobs(check: Check | None = None) -> Iterator[list[JobReturn]]:
                 configs = _composed(hydra_context.config_loader, config, job_overrides, initial_job_idx)
                 try:
                     _announce(_plans(configs, check))
-                except SystemExit:
+                except BaseException:
                     if initial_job_idx == 0:
                         _remove_record(Path(config.hydra.sweep.dir))
                     raise
@@ -189,7 +189,7 @@ def _plans(configs: Iterator[DictConfig], check: Check) -> list[list[Plan]]:
         results.append(job)
         try:
             plans.append(list(check(config)))
-            for plan in plans[-1]:
+            for plan in plans[-1] if config.output_dir is not None else ():
                 if owners.setdefault(plan.folder.resolve(), plan.identity) != plan.identity:
                     raise ConfigError(
                         f"output_dir: expected a directory for each job, got {plan.folder} for several; without "
@@ -219,7 +219,6 @@ def _announce(plans: Sequence[Sequence[Plan]]) -> None:
         some = sum(count for count, _ in known)
         line += ": about " if some == left else f"; {some} of them take about "
         line += duration(sum(seconds for _, seconds in known))
-        line += ", and the validations" if unit == "step" else ""
     show(open_console(), line)
 
 

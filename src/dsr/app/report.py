@@ -11,7 +11,6 @@ from rich.console import Console
 
 from dsr.app.requests import ReportRequest
 from dsr.evaluation.run_files import load_results
-from dsr.geometry.shading import LIGHT_NAMES
 from dsr.report.correlation_figure import draw_study
 from dsr.report.correlations import write_correlations
 from dsr.report.figures import Figures
@@ -67,8 +66,6 @@ def make_report(
 
 def _check(output: Path, request: ReportRequest) -> None:
     """Check the request, before anything is read."""
-    if request.light not in LIGHT_NAMES:
-        raise ValueError(f"--light: expected one of {', '.join(LIGHT_NAMES)}, got {request.light}")
     if output.exists() and not (output.is_dir() and ((output / _MARK).is_file() or not any(output.iterdir()))):
         raise ValueError(f"{output}: expected a new directory or an earlier report, it holds something else")
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+from dsr.geometry.lights import LIGHT_NAMES
 from dsr.utils.config_files import config_directories, list_choices
 
 REPORT_PARTS = ("tables", "metrics", "figures", "page")
@@ -35,7 +36,9 @@ class ReportRequest:
     workers: int | None = None
 
     def __post_init__(self) -> None:
-        """Check the values, but for the light's name."""
+        """Check the values."""
+        if self.light not in LIGHT_NAMES:
+            raise ValueError(f"--light: expected one of {', '.join(LIGHT_NAMES)}, got {self.light}")
         for part in self.parts:
             if part not in REPORT_PARTS:
                 raise ValueError(f"--only: expected some of {', '.join(REPORT_PARTS)}, got {part}")

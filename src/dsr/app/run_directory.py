@@ -92,7 +92,8 @@ def degradation_of(config: Mapping[str, Any]) -> str:
         return str(config["degradation"]["name"])
     parts = [str(config["downsampling"]["name"])]
     assumed = config["downsampling"].get("assumed")
-    if assumed not in (None, parts[0]) and takes("method", config["method"], "downsampling"):
+    told = "method" in config and takes("method", config["method"], "downsampling")
+    if told and assumed not in (None, parts[0]):
         parts.append(f"assumed-{assumed}")
     for group in (config["noise"], config.get("holes", {"name": "none"})):
         if group["name"] != "none":

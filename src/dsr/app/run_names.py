@@ -7,6 +7,7 @@ What a run computes, such as the weight ``w`` for ``loss.w=auto``, is not in its
 
 from __future__ import annotations
 
+import functools
 import re
 from collections.abc import Mapping
 from pathlib import Path
@@ -71,8 +72,13 @@ def _defaults(kind: str, config: Mapping[str, Any]) -> tuple[dict[str, str], dic
              for group, name in each.items() if group not in NOT_IDENTITY and group in config}  # fmt: skip
     chosen = {group: str(config[group]["name"]) for group in usual}
     known = [f"{group}={name}" for group, name in chosen.items() if name in list_choices(group, places)]
-    composed = plain_config(compose(kind, [*known, f"scale={config['scale']}"], places))
-    return usual, composed, len(known) == len(chosen)
+    return usual, _compose(kind, (*known, f"scale={config['scale']}"), tuple(places)), len(known) == len(chosen)
+
+
+@functools.lru_cache(maxsize=256)
+def _compose(kind: str, overrides: tuple[str, ...], places: tuple[Path, ...]) -> dict[str, Any]:
+    """Return a composed configuration, which is not to be changed."""
+    return plain_config(compose(kind, overrides, places))
 
 
 def _differing(config: Mapping[str, Any], defaults: Mapping[str, Any], head: str) -> dict[str, Any]:

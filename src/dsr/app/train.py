@@ -38,7 +38,6 @@ from dsr.methods.networks.base import DisparityNetwork
 from dsr.methods.networks.facets_unet import FacetsUNet
 from dsr.methods.networks.trained import NETWORKS
 from dsr.methods.networks.weight_files import load_network, network_name, read_torch_file, save_network
-from dsr.metrics.catalogue import KNOWN_FORMATS
 from dsr.metrics.visual_loss import VisualLoss, make_visual_loss
 from dsr.training.data_module import PatchData
 from dsr.training.loggers import RUN_IDS, expect_installed, log_config, log_layout, log_settings
@@ -166,6 +165,7 @@ def _read(config: DictConfig, *, here: bool = True) -> tuple[dict[str, Any], Tra
 class _Prepared:
     """A training that can be run, in the directory of its run."""
 
+    device: torch.device
     data: PatchData
     module: SuperResolution
     identity: Mapping[str, Any]
@@ -189,9 +189,11 @@ def _prepare(plain: dict[str, Any], settings: TrainConfig, device: torch.device,
     last = folder / _LAST
     metrics = functools.partial(metric_collection, settings.metrics, device)
     module = _module(settings, net, data, metrics)
+    if last.parent.is_symlink():
+        raise ConfigError(f"{last.parent}: expected a directory of the run's own, got a link")
     tolerated = ("code", "device") if "resume" in given_keys() else ()
     resume = last if last.is_file() and not settings.overwrite else None
-    return _Prepared(data, module, identity, folder, resume, tolerated)
+    return _Prepared(device, data, module, identity, folder, resume, tolerated)
 
 
 def _train(plain: dict[str, Any], settings: TrainConfig, device: torch.device, processes: Processes) -> float:
@@ -206,11 +208,11 @@ def _train(plain: dict[str, Any], settings: TrainConfig, device: torch.device, p
         _expect_trainable(folder, plain, identity, tolerated)
         new = _claim(folder, plain, identity, tolerated, progress)
     idle = processes.count > 1 and has_idle_layers(module, data.example_batch())
-    trainer, best = training_trainer(settings, folder, device, progress, processes, idle=idle)
+    trainer = None
     try:
+        trainer, best = training_trainer(settings, folder, device, progress, processes, idle=idle)
         if first:
             _open_log(trainer, plain, module)
-            module.to(device)
             _announce(progress, settings, prepared, processes.count)
         _load(progress, settings, module, data)
     except ConfigError:
@@ -231,17 +233,13 @@ def _train(plain: dict[str, Any], settings: TrainConfig, device: torch.device, p
     if first:
         _export(module, folder / _LAST.with_name("best.ckpt"), weights, facts)
     progress.say(f"weights: {weights}")
-    score = math.nan if best.best_model_score is None else float(best.best_model_score)
-    return score / KNOWN_FORMATS["RMSE_v"].factor
+    return math.nan if best.best_model_score is None else float(best.best_model_score)
 
 
 def _expect_trainable(
     folder: Path, plain: Mapping[str, Any], identity: Mapping[str, Any], tolerated: Sequence[str]
 ) -> None:
     """Check that the directory is free or that of this training, which is neither complete nor diverges again."""
-    for name in _FOLDERS:
-        if (folder / name).is_symlink():
-            raise ConfigError(f"{folder / name}: expected a directory of the run's own, got a link")
     rundir.expect_free(folder, plain, identity, tolerated)
     _expect_unfinished(folder, identity, overwrite=plain["overwrite"])
 
@@ -259,7 +257,7 @@ def _claim(
     folder: Path, plain: Mapping[str, Any], identity: Mapping[str, Any], tolerated: Sequence[str], progress: Progress
 ) -> bool:
     """Make the directory that of this training, without the files of one that it replaces; return whether it is new."""
-    new = not folder.is_dir() or not any(folder.iterdir())
+    new = not folder.exists()
     for key in rundir.claim(folder, plain, identity, tolerated):
         progress.say(f"note: the run began with another {key}")
     if plain["overwrite"]:
@@ -267,9 +265,9 @@ def _claim(
     return new
 
 
-def _discard(trainer: lightning.Trainer, folder: Path) -> None:
+def _discard(trainer: lightning.Trainer | None, folder: Path) -> None:
     """Remove the directory of a training that cannot begin."""
-    for logger in trainer.loggers:
+    for logger in trainer.loggers if trainer is not None else ():
         logger.finalize("failed")
     shutil.rmtree(folder)
 
@@ -430,7 +428,11 @@ def _announce(progress: Progress, settings: TrainConfig, prepared: _Prepared, de
 
 def _costs(trainer: TrainerConfig, prepared: _Prepared, *, devices: int, progress: Progress) -> dict[str, float]:
     """Return the seconds of what is left of a training, as measured now, by what it is."""
-    data, module, interval = prepared.data, prepared.module, min(trainer.validate_every, trainer.steps)
+    data, module, interval = (
+        prepared.data,
+        prepared.module.to(prepared.device),
+        min(trainer.validate_every, trainer.steps),
+    )
     done = 0 if prepared.resume is None else step_of(prepared.resume) or 0
     steps, validations = trainer.steps - done, math.ceil(trainer.steps / interval) - done // interval + (not done)
     try:
@@ -442,8 +444,8 @@ def _costs(trainer: TrainerConfig, prepared: _Prepared, *, devices: int, progres
     preparing, scenes = (sum(each) for each in zip(*pairs, strict=True))
     parts = {
         f"{scenes} {_SCENES}": preparing,
-        f"{steps} steps of {step:.2g} s": step * steps,
-        f"{validations} validations of {validation:.2g} s": validation * validations,
+        f"{steps} step{'s' * (steps != 1)} of {step:.2g} s": step * steps,
+        f"{validations} validation{'s' * (validations != 1)} of {validation:.2g} s": validation * validations,
     }
     return {what: seconds for what, seconds in parts.items() if not what.startswith("0 ")}
 

@@ -9,7 +9,8 @@ from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 from torch.nn import functional
 
-from dsr.geometry.shading import LIGHT_NAMES, render
+from dsr.geometry.lights import LIGHT_NAMES
+from dsr.geometry.shading import render
 from dsr.geometry.surface import depth_to_normals
 
 _SHORTEST, _LONGEST = 128, 256

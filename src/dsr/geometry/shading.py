@@ -7,7 +7,6 @@ import math
 import torch
 from torch import Tensor
 
-LIGHT_NAMES: tuple[str, ...] = ("e1", "e2", "e3", "e4")
 _LIGHTS = (
     (0.0, -math.sqrt(2 / 3), -1 / math.sqrt(3)),
     (-1 / math.sqrt(2), 1 / math.sqrt(6), -1 / math.sqrt(3)),

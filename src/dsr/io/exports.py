@@ -12,8 +12,9 @@ import torch
 from torch import Tensor
 
 from dsr.geometry.camera import Camera
+from dsr.geometry.lights import LIGHT_NAMES
 from dsr.geometry.mesh import LARGEST_STEP, Mesh, triangulate, vertex_normals
-from dsr.geometry.shading import LIGHT_NAMES, render
+from dsr.geometry.shading import render
 from dsr.geometry.simplification import QUADRIC, project, select_points, simplify, thin
 from dsr.geometry.surface import depth_to_normals
 from dsr.io.model_files import write_glb, write_ply

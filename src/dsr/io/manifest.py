@@ -188,7 +188,9 @@ def _record(pair: Pair, base: str) -> dict[str, Any]:
     """Return a pair as values for JSON, with paths relative to a folder if they lie below it."""
 
     def place(path: Path) -> str:
-        return str(path.absolute()).removeprefix(os.path.join(base, ""))  # noqa: PTH118 - with a separator at its end
+        whole = str(path.absolute())
+        inside = whole.removeprefix(os.path.join(base, ""))  # noqa: PTH118 - with a separator at its end
+        return whole if leads_outside(inside) else inside
 
     record: dict[str, Any] = {"name": pair.name, "rgb": place(pair.rgb), "depth": place(pair.depth)}
     for name in ("camera", "mask"):

@@ -17,7 +17,8 @@ from torch.utils.tensorboard import SummaryWriter
 
 from dsr.evaluation.results import Run, formats_of, method_settings
 from dsr.evaluation.run_files import read_run
-from dsr.geometry.shading import LIGHT_NAMES, render
+from dsr.geometry.lights import LIGHT_NAMES
+from dsr.geometry.shading import render
 from dsr.metrics.catalogue import KNOWN_FORMATS
 from dsr.metrics.formats import HEADLINES, LOOKS, MetricFormat, main_first
 from dsr.sample import DepthSample

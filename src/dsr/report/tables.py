@@ -67,7 +67,8 @@ def _is_papers(run: Run, scene: str) -> bool:
     dataset = run.settings.get("dataset", {})
     own = PAPER_FILES.get(run.dataset.partition(" (")[0], ())
     return (
-        scene in (_RELEASED if dataset.get("target") == _FOLDER else own)
+        "validation_of" not in dataset
+        and scene in (_RELEASED if dataset.get("target") == _FOLDER else own)
         and run.downsampling == "box"
         and run.settings.get("downsampling", {}).get("range_type") is None
         and all(dataset.get(key, value) == value for key, value in _PAPER_SETTINGS.items())

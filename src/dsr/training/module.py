@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import lightning
@@ -66,6 +66,7 @@ class SuperResolution(lightning.LightningModule):
         self._bicubic_metrics: list[torchmetrics.MetricCollection] = []
         self.bicubic: dict[str, dict[str, float]] = {}
         self.validation_scores: dict[str, dict[str, float]] = {}
+        self.shown_scores: dict[str, dict[str, float]] = {}
         self._pictures: dict[str, Tensor] = {}
 
     def training_step(self, batch: Batch, _: int) -> Tensor:
@@ -135,7 +136,7 @@ class SuperResolution(lightning.LightningModule):
             self._pictures[f"renderings/{self.sets[dataloader_idx]}_{number}"] = picture
 
     def on_validation_epoch_end(self) -> None:
-        """Log the mean scores in the units of tables, of all sets and, if there are several, of each."""
+        """Log the mean scores of all sets and, if there are several, of each, to loggers in the units of tables."""
         self._gather()
         for name in sorted(self._pictures):
             for logger in self.loggers:
@@ -150,15 +151,12 @@ class SuperResolution(lightning.LightningModule):
         self.validation_scores = {
             kind: {name: float(value) for name, value in each.items()} for kind, each in named.items()
         }
-        shown: Any = {name: metric for each in self.metrics for name, metric in each.items()}  # type: ignore[operator]
-        values = {
-            f"{kind}/{name}": value
-            for kind, raw in self.validation_scores.items()
-            for name, value in in_table_units(shown, raw).items()
-        }
-        self.log_dict(values, logger=False if self._fits else None)
+        metrics: Any = {name: metric for each in self.metrics for name, metric in each.items()}  # type: ignore[operator]
+        self.shown_scores = {kind: in_table_units(metrics, raw) for kind, raw in self.validation_scores.items()}
+        shown = _by_tag(self.shown_scores)
+        self.log_dict(_by_tag(self.validation_scores) if self._fits else shown, logger=False if self._fits else None)
         for logger in self.loggers if self._fits else ():  # Lightning would count steps from 0
-            logger.log_metrics(values, self.global_step)
+            logger.log_metrics(shown, self.global_step)
             logger.save()
         for each in self.metrics:
             each.reset()  # type: ignore[operator]
@@ -206,3 +204,8 @@ class SuperResolution(lightning.LightningModule):
         rates = torch.optim.lr_scheduler.LambdaLR(optimiser, schedule.factor)
         named = {"scheduler": rates, "interval": "step"}
         return {"optimizer": optimiser, "lr_scheduler": named}
+
+
+def _by_tag(scores: Mapping[str, Mapping[str, float]]) -> dict[str, float]:
+    """Return the scores of sets by the names that they are logged by."""
+    return {f"{kind}/{name}": value for kind, each in scores.items() for name, value in each.items()}

@@ -35,6 +35,11 @@ class CheckpointError(ConfigError):
     def __init__(self, path: Path, error: Exception) -> None:
         text = f"expected a checkpoint of this training, got a damaged or foreign one ({type(error).__name__})"
         super().__init__(f"{path}: {text}; overwrite=true begins anew")
+        self._made_of = (path, error)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Return how a worker's is made anew in another process."""
+        return type(self), self._made_of
 
 
 class Resumed(Callback):

@@ -336,7 +336,7 @@ def _watch(pipe: int) -> None:
             if came:
                 end(_message())
             came, deadline = time.monotonic(), time.monotonic() + grace
-        elif _State.deferred is not None and is_ctrl_c():
+        elif _State.deferred is not None and is_ctrl_c() and not _State.silent:
             deadline = time.monotonic() + grace
             if not told and time.monotonic() - came >= _SILENCE:
                 told = True

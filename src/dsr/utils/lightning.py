@@ -53,12 +53,13 @@ class LostProcessError(ConfigError):
 
 
 class Scored(Protocol):
-    """A module that keeps the raw scores of its last validation, and those that it is compared with, by set, by metric.
+    """A module that keeps the scores of its last validation, and those that it is compared with: by set, by metric.
 
-    It logs them in the units of tables.
+    ``validation_scores`` are in metres and fractions, ``shown_scores``, which are logged, in the units of tables.
     """
 
     validation_scores: dict[str, dict[str, float]]
+    shown_scores: dict[str, dict[str, float]]
 
 
 class ValidationTable(Callback):
@@ -105,8 +106,8 @@ class ListedScores(Callback):
         """Write the scores, unless those of an earlier validation are better."""
         if trainer.sanity_checking or not trainer.is_global_zero:
             return
-        found = {name: trainer.callback_metrics.get(f"val/{name}") for name in SCORES}
-        scores = {name: float(value) for name, value in found.items() if value is not None}
+        scored: Any = pl_module
+        scores = {name: value for name, value in scored.shown_scores.get("val", {}).items() if name in SCORES}
         best = None if self._best is None else self._best.best_model_score  # so far: checkpoints are the last callbacks
         if best is not None and trainer.callback_metrics[str(self._best.monitor)] >= best:  # type: ignore[union-attr]
             return
@@ -179,12 +180,13 @@ class StepProgress(Callback):
     def on_validation_end(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
         """Print the scores of the validation."""
         self._validation.close()
-        scores = scores_line(trainer)
+        scored: Any = pl_module
+        scores = scores_line(scored.shown_scores.get("val", {}))
         if scores:
             subject = f"{self._subject}: " if self._subject else ""
             parts = (f"{subject}step {trainer.global_step:>6}", _loss_text(trainer), f"validation: {scores}")
             self._progress.say("  ".join(filter(None, parts)))
-        bicubic = scores_line(trainer, "bicubic")
+        bicubic = scores_line(scored.shown_scores.get("bicubic", {}))
         if bicubic and not trainer.global_step:
             self._progress.say(f"             bicubic:    {bicubic}")
 
@@ -325,11 +327,10 @@ def _loss_text(trainer: lightning.Trainer) -> str:
     return "" if loss is None else f"loss {float(loss):.4f}"
 
 
-def scores_line(trainer: lightning.Trainer, kind: str = "val") -> str:
-    """Return the main scores of the last validation for a reader, in mm and 1/1000; empty if there are none."""
+def scores_line(scores: Mapping[str, float]) -> str:
+    """Return the main ones of scores in the units of tables, mm and 1/1000, for a reader; empty if there are none."""
     units = {"RMSE_d": " mm", "RMSE_v": "", "DSSIM_v": "", "LPIPS_v": ""}
-    scores = {name: trainer.callback_metrics.get(f"{kind}/{name}") for name in units}
-    return "  ".join(f"{name} {float(value):.1f}{units[name]}" for name, value in scores.items() if value is not None)
+    return "  ".join(f"{name} {scores[name]:.1f}{unit}" for name, unit in units.items() if name in scores)
 
 
 @contextlib.contextmanager

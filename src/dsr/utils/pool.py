@@ -1,14 +1,13 @@
 """Worker processes that outlive each other: one that is killed is replaced, and its item is given to another, once.
 
 Forked workers begin at once, share what this process has loaded, and take functions that cannot be pickled; spawned
-ones are new interpreters. Whatever this process has computed before, forked ones do not hang: the threads that it
-computes with end before a fork, also one of a data loader or of the user's own, and start anew when they are needed.
+ones are new interpreters. Whatever this process has computed before, forked ones do not hang, see
+:mod:`dsr.utils.threads`.
 """
 
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import multiprocessing
 import os
 import signal
@@ -29,8 +28,6 @@ _BETWEEN_TRIES = 0.3
 """Seconds until an item is tried again that somebody else is working on."""
 _SECONDS_TO_END = 2.0
 """Seconds in which a worker may end by itself."""
-_PAUSE_HARD = 2
-"""OpenMP's ``omp_pause_hard``."""
 LOST = "two workers ended at it without a result, perhaps for want of memory; fewer workers need less"
 """Why there is no result of an item, for a message that names it."""
 
@@ -216,19 +213,6 @@ class Pool(Generic[_T, _R]):
         if not forked:
             self._without_plan.add(here)  # it gets it when all are started: one that is large waits for the worker
         return here
-
-
-def _end_threads() -> None:
-    """End the threads of OpenMP that this thread computes with: a forked process would wait for them for ever.
-
-    GNU's OpenMP, that of torch on Linux, needs this, and then starts new ones, in either process; others notice a fork.
-    """
-    with contextlib.suppress(AttributeError):  # no OpenMP, or one of before 2018
-        ctypes.CDLL(None).omp_pause_resource_all(_PAUSE_HARD)
-
-
-if hasattr(os, "register_at_fork"):
-    os.register_at_fork(before=_end_threads)
 
 
 def _serve(connection: Connection, parent: int, plan: tuple[Any, Any, Any] | None) -> None:

@@ -21,7 +21,8 @@ from torch import Tensor
 from torch.nn import functional
 
 from dsr.geometry.camera import Camera
-from dsr.geometry.shading import LIGHT_NAMES, render
+from dsr.geometry.lights import LIGHT_NAMES
+from dsr.geometry.shading import render
 from dsr.geometry.surface import depth_to_normals
 from dsr.metrics.formats import Formats, describe_directions, in_tables
 from dsr.sample import DepthSample

@@ -19,7 +19,8 @@ from matplotlib.ticker import MaxNLocator, ScalarFormatter
 from torch import Tensor
 
 from dsr.geometry.camera import Camera
-from dsr.geometry.shading import LIGHT_NAMES, render
+from dsr.geometry.lights import LIGHT_NAMES
+from dsr.geometry.shading import render
 from dsr.sample import Scene
 from dsr.utils.ratios import round_ratio
 from dsr.viz.canvas import HOLE_COLOUR, colours

@@ -18,7 +18,7 @@ from torch import Tensor
 from dsr.app.upsample.limits import Limits
 from dsr.evaluation.store import load_errors
 from dsr.geometry.camera import Camera
-from dsr.geometry.shading import LIGHT_NAMES
+from dsr.geometry.lights import LIGHT_NAMES
 from dsr.io.depth_files import DEPTH_SUFFIXES, write_depth_file
 from dsr.io.encoding import Assumption, Encoding, encode
 from dsr.io.exports import Written, write_cloud, write_mesh, write_normals, write_renderings

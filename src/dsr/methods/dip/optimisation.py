@@ -118,6 +118,7 @@ class PriorOptimisation(lightning.LightningModule):
         self.problem, self.objective, self.settings, self.stopping = problem, objective, settings, stopping
         self.metrics, self.truth, self.base = metrics, truth, base
         self.validation_scores: dict[str, dict[str, float]] = {}
+        self.shown_scores: dict[str, dict[str, float]] = {}
         device, size = problem.rgb.device, problem.rgb.shape[-2:]
         self._border = min(settings.border, min(size) - 1)  # reflection needs as many pixels
         self.generator = torch.Generator(device).manual_seed(seed)
@@ -172,7 +173,8 @@ class PriorOptimisation(lightning.LightningModule):
                 self.metrics.update(pair)
                 scores = {name: float(value) for name, value in compute_means(self.metrics).items()}
                 self.validation_scores = {"val": scores}
-                named = {f"val/{name}": value for name, value in in_table_units(self.metrics, scores).items()}
+                self.shown_scores = {"val": in_table_units(self.metrics, scores)}
+                named = {f"val/{name}": value for name, value in self.shown_scores["val"].items()}
                 self.log_dict({"step": float(self.global_step), **named}, batch_size=1)
         writer: Any = getattr(self.logger, "experiment", None)
         if hasattr(writer, "add_image"):

@@ -13,7 +13,8 @@ from matplotlib.patches import Circle
 from torch import Tensor
 
 from dsr.evaluation.results import Results
-from dsr.geometry.shading import LIGHT_NAMES, lights, render
+from dsr.geometry.lights import LIGHT_NAMES
+from dsr.geometry.shading import lights, render
 from dsr.report.figures.layout import save_both
 from dsr.report.figures.scenes import rendering
 from dsr.sample import DepthSample
