@@ -177,6 +177,7 @@ NOT_PREDICTING = (
     "utils/interruption.py",
     "utils/progress.py",
     "utils/runs_table.py",
+    "utils/paths.py",
     "utils/space.py",
     "utils/temporary.py",
     "utils/units.py",

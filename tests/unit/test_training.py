@@ -478,7 +478,7 @@ def test_validation_scores_bicubic_interpolation_of_the_same_maps_as_the_method_
         pair = SurfacePair(method(sample)[None].double(), sample.depth[None].double(), CAMERA.rays()[None])
         expected.append((float(scores.rmse_v(pair)), float(scores.rmse_d(pair))))
     found = logged["bicubic/RMSE_v"], logged["bicubic/RMSE_d"]
-    assert found == pytest.approx(np.mean(expected, axis=0), rel=1e-4)
+    assert found == pytest.approx(1000 * np.mean(expected, axis=0), rel=1e-4)
     assert module.validation_scores.keys() == {"val", "bicubic"}
 
 
