@@ -377,6 +377,7 @@ USAGE_ERRORS = {
     "a negative warm-up": (["trainer.warmup=-1"], "trainer.warmup: expected 0 or more, got -1"),
     "a negative decay": (["trainer.weight_decay=-1"], "trainer.weight_decay: expected 0 or more, got -1"),
     "a learning rate of nan": (["trainer.learning_rate=nan"], "trainer.learning_rate: expected a positive number"),
+    "an assumed model": (["downsampling.assumed=nearest"], "downsampling.assumed: a training assumes no downsampling "),
     "a mistyped key": (["trainer.step=3"], "trainer.step: unknown key; expected trainer.steps=3"),
     "too few scenes": (["dataset.count=1"], "trainer.validation_scenes: expected fewer than the 1 scenes"),
     "a measured map": (["downsampling=measured"], "downsampling: training needs a model such as box, measured is none"),

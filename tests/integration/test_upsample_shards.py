@@ -156,6 +156,15 @@ def test_manifest_of_files_added_later_is_the_same(folder, tmp_path):
     assert list(Manifest(tmp_path / "m")) == before
 
 
+def test_manifest_of_a_folder_beside_it_is_read_again(folder, tmp_path, monkeypatch, capsys):
+    (tmp_path / "run").mkdir()
+    monkeypatch.chdir(tmp_path / "run")
+    upsample(f"../{folder.name}", "--manifest", "list.jsonl", "--shards", "1", "-o", "out", *FAST)
+    capsys.readouterr()
+    upsample("--manifest", "list.jsonl", "--shard", "1/1", "-o", "again", *FAST)
+    assert "5 done, 2 failed -> again" in capsys.readouterr().out
+
+
 def test_shard_is_read_without_the_others(folder, tmp_path):
     write_manifest(tmp_path / "m", find_pairs_of_folder(folder), 3)
     lines = (tmp_path / "m").read_bytes().splitlines(keepends=True)

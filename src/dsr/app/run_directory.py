@@ -92,8 +92,7 @@ def degradation_of(config: Mapping[str, Any]) -> str:
         return str(config["degradation"]["name"])
     parts = [str(config["downsampling"]["name"])]
     assumed = config["downsampling"].get("assumed")
-    told = "method" in config and takes("method", config["method"], "downsampling")
-    if told and assumed not in (None, parts[0]):
+    if assumed not in (None, parts[0]) and takes("method", config["method"], "downsampling"):
         parts.append(f"assumed-{assumed}")
     for group in (config["noise"], config.get("holes", {"name": "none"})):
         if group["name"] != "none":
