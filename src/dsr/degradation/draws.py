@@ -66,22 +66,24 @@ def field_of(like: Tensor, sigma: float | tuple[float, float], generator: torch.
     return fine[0, :, top : top + height, left : left + width]
 
 
-def waves_of(like: Tensor, length: float, generator: torch.Generator) -> Tensor:
+def waves_of(like: Tensor, length: float, generator: torch.Generator, stretch: float = 1) -> Tensor:
     """Return normal noise of several octaves with a variance of 1, (1, h, w).
 
     Args:
         like: a map of that size.
         length: full width at half maximum of its autocorrelation in pixels; white noise for 1 and less.
         generator: source of the random numbers.
+        stretch: by how much it is longer along rows, and shorter along columns.
 
     """
     if length <= 1:
         return field_of(like, 0, generator)
     ratio = uniform(0.1, 0.6, generator)  # of one octave's standard deviation to that of the next longer one
     sigma = length / (4 * math.sqrt(math.log(2)) * (1 - 0.7 * ratio**2))  # fits the sum of the octaves within 5 %
-    field, variance = field_of(like, sigma, generator), 1.0
-    for octave in (1, 2):
-        field = field + ratio**octave * field_of(like, sigma / 2**octave, generator)
+    field, variance = torch.zeros(like.shape), 0.0
+    for octave in range(3):
+        size = sigma / 2**octave
+        field += ratio**octave * field_of(like, (size / stretch, size * stretch), generator)
         variance += ratio ** (2 * octave)
     return field / math.sqrt(variance)
 

@@ -211,7 +211,7 @@ def _stereo(values: Tensor, luma: Tensor, generator: torch.Generator) -> Tensor:
     Matching windows and filters that stop at steps make disparity noise alike over several octaves; what only one
     camera sees is lost or filled.
     """
-    length = _longest(values) ** float(torch.rand(1, generator=generator))  # of the waves, in pixels of this map
+    length = _longest(values) ** math.sqrt(uniform(0, 1, generator))  # of the waves, in pixels of this map
     ratio = uniform(1, max(1.0, min(3.4, length / 2)), generator) if chance(0.7, generator) else 1.0
     rows, columns = (_repeated(size, ratio, generator) for size in values.shape[-2:])
     seen, shades = (each[:, rows[1]][..., columns[1]] for each in (values, luma))
@@ -234,12 +234,16 @@ def _match(values: Tensor, luma: Tensor, length: float, generator: torch.Generat
     flat = 0.3 + torch.exp(-(luma - window_means(luma, 5)).abs() / 0.03)
     reach = int(torch.randint(5, (1,), generator=generator))  # half the matching window
     seen = _fatten(values, reach, generator) if reach else values
-    waves = waves_of(values, length, generator)
+    stretch = uniform(1, 1.6, generator)
+    waves = waves_of(values, length, generator, stretch)
     if length > 3:  # filters stop at steps
-        waves = torch.where(
-            near_steps(values, max(1, int(length / 4))), waves_of(values, length / 2.5, generator), waves
-        )
+        beside = near_steps(values, max(1, int(length / 4)))
+        waves = torch.where(beside, waves_of(values, length / 2.5, generator, stretch), waves)
+    if chance(0.4, generator):  # rows are matched one by one
+        waves = waves + uniform(0, 0.4, generator) * field_of(values, (0.3, max(length / 3, 0.3)), generator)
     counted = _count(stereo_constant * seen, amplitude * (flat / flat.mean()) * waves, generator, 0.15)
+    if chance(0.35, generator):  # filters that do not stop at steps
+        counted = _means(counted, torch.ones_like(counted), 2 * int(torch.randint(1, 4, (1,), generator=generator)) + 1)
     return _lose(counted, values, luma, stereo_constant, generator) / stereo_constant
 
 
@@ -258,9 +262,12 @@ def _lose(
         lost |= shining & (field_of(values, 2, generator) > -0.5)
     if chance(0.25, generator):  # bare surfaces
         bare = window_means((luma - window_means(luma, 5)).abs(), 5) < 0.01
-        lost |= bare & (field_of(values, 5, generator) > uniform(0.3, 2, generator))
+        lost |= bare & (field_of(values, 5, generator) > uniform(0.8, 2.5, generator))
     if chance(0.25, generator):
         lost |= _steep(values, generator)
+    if chance(0.5, generator):  # windows that see two surfaces
+        reach = int(torch.randint(1, 5, (1,), generator=generator))
+        lost |= near_steps(values, reach) & (field_of(values, 1.5, generator) > uniform(-2, 1, generator))
     return disparity.masked_fill(lost, torch.nan)
 
 
