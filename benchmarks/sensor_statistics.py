@@ -240,13 +240,10 @@ def _range(values: np.ndarray, factor: float = 1.0, digits: int = 2, *, spread: 
     return f"{middle:.{digits}f}" + (f" ({low:.{digits}f} to {high:.{digits}f})" if spread else "")
 
 
-def _compared(real: np.ndarray, simulated: np.ndarray, factor: float, digits: int) -> str:
-    """Return two medians and the two-sample statistic."""
+def _two_sample(real: np.ndarray, simulated: np.ndarray) -> str:
+    """Return the two-sample statistic as text; nothing where a sample is empty."""
     both = [each[np.isfinite(each)] for each in (real, simulated)]
-    if min(map(len, both)) == 0:
-        return f"{_range(real, factor, digits)}, {_range(simulated, factor, digits)}"
-    medians = ", ".join(_range(each, factor, digits) for each in both)
-    return f"{medians}; {stats.ks_2samp(*both).statistic:.2f}"
+    return f"; {stats.ks_2samp(*both).statistic:.2f}" if min(map(len, both)) else ""
 
 
 def print_tables(real: Mapping[str, Statistics], simulated: Mapping[str, Statistics]) -> None:
@@ -265,12 +262,16 @@ def print_tables(real: Mapping[str, Statistics], simulated: Mapping[str, Statist
             f"| {name} | {amplitude} | {length} | {equal} | {gaps} | {', '.join(holes[:3])} | {', '.join(holes[3:])} |"
         )
     columns = ("deviation, %", "length, px", "slope", *(f"step within {reach} px, %" for reach in (1, 2, 3)))
-    print(f"\nReal, simulated median; two-sample statistic\n\n| real | {' | '.join(columns)} |\n|{' --- |' * 7}")
-    for name, found in real.items():
-        other = simulated[SENSORS[name].kind]
-        cells = [_compared(found.windows[:, n], other.windows[:, n], (100, 1, 1)[n], (2, 1, 2)[n]) for n in range(3)]
-        cells += [_compared(found.steps[:, n], other.steps[:, n], 100, 0) for n in range(3)]
-        print(f"| {name} | {' | '.join(cells)} |", flush=True)
+    print(f"\n| map; two-sample statistic | {' | '.join(columns)} |\n|{' --- |' * 7}")
+    formats = ((100, 2), (1, 1), (1, 2), (100, 0), (100, 0), (100, 0))
+    for kind, other in simulated.items():
+        there = (*other.windows.T, *other.steps.T)
+        for name in (name for name in real if SENSORS[name].kind == kind):
+            here = (*real[name].windows.T, *real[name].steps.T)
+            cells = [f"{_range(a, *form)}{_two_sample(a, b)}" for a, b, form in zip(here, there, formats, strict=True)]
+            print(f"| {name} | {' | '.join(cells)} |")
+        cells = [_range(each, *form, spread=True) for each, form in zip(there, formats, strict=True)]
+        print(f"| simulated {kind} | {' | '.join(cells)} |")
 
 
 def panels_of(name: str, values: Map, size: int = 192) -> list[Panel]:

@@ -56,7 +56,9 @@ def _structured(values: Tensor, luma: Tensor, generator: torch.Generator) -> Ten
     if chance(0.4, generator):
         grain = grain + uniform(0.2, 1, generator) * _bands(values, generator)
     result = _count(stereo_constant * seen, noise.nan_to_num(0) * grain, generator) / stereo_constant
-    lost = (torch.rand(values.shape, generator=generator) < uniform(0, 0.9, generator)) & near_steps(values, 1)
+    lost = (torch.rand(values.shape, generator=generator) < uniform(0, 1, generator)) & near_steps(values, 1)
+    if chance(0.4, generator):  # the projector's light does not get there
+        lost |= occluded(stereo_constant * values)
     if chance(0.3, generator):
         lost |= dark(values, luma, None, generator)
     if chance(0.25, generator):
@@ -97,7 +99,7 @@ def _bands(values: Tensor, generator: torch.Generator) -> Tensor:
     return functional.interpolate(bands, width, mode="nearest-exact").expand_as(values)
 
 
-def _count(disparity: Tensor, noise: Tensor, generator: torch.Generator, weak: float = 0.4) -> Tensor:
+def _count(disparity: Tensor, noise: Tensor, generator: torch.Generator, *, stereo: bool = False) -> Tensor:
     """Return disparity in pixels as matching windows finds it: drawn to whole pixels, in steps, and smoothed again.
 
     Where the noise is weak against the step, a slanted wall becomes a stair.
@@ -106,11 +108,12 @@ def _count(disparity: Tensor, noise: Tensor, generator: torch.Generator, weak: f
         disparity: (1, h, w) exact disparity in pixels.
         noise: (1, h, w) what is added to it.
         generator: source of all random numbers.
-        weak: how often the noise is weakened to less than a step.
+        stereo: whether two cameras match, which count in finer steps and are noisier than a projector and a camera.
 
     """
-    step = (0.0, 1 / 32, 1 / 16, 1 / 8)[int(torch.randint(4, (1,), generator=generator))]
-    if step and chance(weak, generator):
+    steps = (0.0, 1 / 64, 1 / 32, 1 / 32) if stereo else (1 / 32, 1 / 16, 1 / 8, 1 / 8)
+    step = steps[int(torch.randint(4, (1,), generator=generator))]
+    if step and chance(0.15 if stereo else 0.4, generator):
         noise = noise * (uniform(0.1, 0.6, generator) * step / noise.std().clamp(min=1e-9)).clamp(max=1)
     counted = disparity + noise
     if chance(0.3, generator):  # fits of a parabola to the costs favour whole pixels (Shimizu, Okutomi, IJCV 2005)
@@ -136,12 +139,13 @@ def _flight(values: Tensor, luma: Tensor, generator: torch.Generator) -> Tensor:
     depth = values.reciprocal()
     amplitude = (luma + 0.05) * values.square()
     if chance(0.6, generator):  # flying pixels on both sides of steps: depth, weighted by the light, is averaged
-        size = 3 + 2 * int(chance(0.4, generator))
+        size = 3 + 2 * int(torch.randint(4, (1,), generator=generator))
         mixed = _means(depth, amplitude, size)
         depth = torch.where(depth.isfinite() & (field_of(depth, 1, generator) > -0.5), mixed, depth)
     exact = depth
-    strength = power(-3.5, -2.4, generator) * depth ** uniform(1, 3, generator) / (luma + 0.05).sqrt()
-    grain = field_of(depth, uniform(0, 1.5, generator) if chance(0.5, generator) else 0, generator)
+    strength = power(-3.8, -2.5, generator) * depth ** uniform(1, 3, generator) / (luma + 0.05).sqrt()
+    length = min(uniform(1, 9, generator), _longest(values)) if chance(0.5, generator) else 1
+    grain = waves_of(depth, length, generator)
     if chance(0.5, generator):  # light that comes by other surfaces
         rounded = (_surroundings(exact, power(0.6, 1.3, generator)) / exact - 1).clamp(min=-0.1)
         rounded = rounded.clamp(max=0) * torch.exp(-(rounded / 0.04).square())  # inner corners, not steps
@@ -155,7 +159,12 @@ def _flight(values: Tensor, luma: Tensor, generator: torch.Generator) -> Tensor:
     if chance(0.4, generator):  # dark surfaces seem too far
         depth = depth + uniform(0, 0.02, generator) * torch.exp(-luma / 0.1)
     noisy = (depth + torch.minimum(strength, 0.05 * exact) * grain).clamp(min=1e-3).reciprocal()
-    return noisy.masked_fill(dark(values, luma, None, generator), torch.nan) if chance(0.2, generator) else noisy
+    if chance(0.2, generator):
+        noisy = noisy.masked_fill(dark(values, luma, None, generator), torch.nan)
+    if chance(0.4, generator):  # cameras leave out what flies
+        mixed = _beside_steps(values, int(torch.randint(1, 4, (1,), generator=generator)))
+        noisy = noisy.masked_fill(mixed & (field_of(values, 1, generator) > uniform(-2, 1, generator)), torch.nan)
+    return noisy
 
 
 def _means(values: Tensor, weights: Tensor, size: int) -> Tensor:
@@ -178,15 +187,15 @@ def _surroundings(values: Tensor, size: float) -> Tensor:
 def _lidar(values: Tensor, luma: Tensor, generator: torch.Generator) -> Tensor:
     """A phone's lidar: a grid of dots coarser than the map, interpolated, with blobs of doubtful pixels."""
     height, width = values.shape[-2:]
-    stride = uniform(3, 8, generator)
+    stride = uniform(1.5, 8, generator)
     size = max(2, round(height / stride)), max(2, round(width / stride))
     dots = _dots(values, size, uniform(0, 0.5, generator), generator)
     smooth = functional.interpolate(dots[None], (height, width), mode="bilinear", align_corners=False)[0]
     smooth = torch.where(smooth.isfinite(), smooth, values)  # not beside holes of the truth
-    weight = uniform(0.7, 1, generator)
+    weight = uniform(0.5, 1, generator)
     result = weight * smooth + (1 - weight) * values
     length = min(uniform(3, 9, generator), _longest(values))
-    strength = power(-3.4, -2.5, generator) * (1 + torch.exp(-luma / 0.1))  # twice on dark surfaces
+    strength = power(-3.8, -2.6, generator) * (1 + torch.exp(-luma / 0.1))  # twice on dark surfaces
     doubtful = field_of(values, min(5.0, _longest(values)), generator) > uniform(0.8, 2, generator)
     result = result * (1 + strength * (1 + 4 * doubtful) * waves_of(values, length, generator).clamp(-3, 3))
     if chance(0.4, generator):  # 2.9 % at 0.35 m, 1.6 % at 1.1 m, 0.6 % at 3 m; whether near or far is not known
@@ -237,11 +246,11 @@ def _match(values: Tensor, luma: Tensor, length: float, generator: torch.Generat
     stretch = uniform(1, 1.6, generator)
     waves = waves_of(values, length, generator, stretch)
     if length > 3:  # filters stop at steps
-        beside = near_steps(values, max(1, int(length / 4)))
+        beside = _beside_steps(values, max(1, int(length / 4)))
         waves = torch.where(beside, waves_of(values, length / 2.5, generator, stretch), waves)
     if chance(0.4, generator):  # rows are matched one by one
         waves = waves + uniform(0, 0.4, generator) * field_of(values, (0.3, max(length / 3, 0.3)), generator)
-    counted = _count(stereo_constant * seen, amplitude * (flat / flat.mean()) * waves, generator, 0.15)
+    counted = _count(stereo_constant * seen, amplitude * (flat / flat.mean()) * waves, generator, stereo=True)
     if chance(0.35, generator):  # filters that do not stop at steps
         counted = _means(counted, torch.ones_like(counted), 2 * int(torch.randint(1, 4, (1,), generator=generator)) + 1)
     return _lose(counted, values, luma, stereo_constant, generator) / stereo_constant
@@ -267,8 +276,13 @@ def _lose(
         lost |= _steep(values, generator)
     if chance(0.5, generator):  # windows that see two surfaces
         reach = int(torch.randint(1, 5, (1,), generator=generator))
-        lost |= near_steps(values, reach) & (field_of(values, 1.5, generator) > uniform(-2, 1, generator))
+        lost |= _beside_steps(values, reach) & (field_of(values, 1.5, generator) > uniform(-2, 1, generator))
     return disparity.masked_fill(lost, torch.nan)
+
+
+def _beside_steps(values: Tensor, reach: int) -> Tensor:
+    """Return the mask of the pixels within ``reach`` pixels of a step between neighbours, (1, h, w)."""
+    return window_maxima(near_steps(values, 1).to(values), reach) > 0
 
 
 def _fill(values: Tensor, missing: Tensor) -> Tensor:
