@@ -248,7 +248,7 @@ def _two_sample(real: np.ndarray, simulated: np.ndarray) -> str:
 
 def print_tables(real: Mapping[str, Statistics], simulated: Mapping[str, Statistics]) -> None:
     """Print the tables, real sensors beside the simulated kind."""
-    print("| map | amplitude, % | length, px | equal neighbours, % | gap, mm | holes, %: up to 3, 10, more px from steps "
+    print("| map | amplitude, % | length, px | equal neighbours, % | gap, mm | holes, %: to 3, 10, more px from steps "
           "| dark, medium, bright |\n| --- | --- | --- | --- | --- | --- | --- |")  # fmt: skip
     for name, found in (*real.items(), *((f"simulated {kind}", each) for kind, each in simulated.items())):
         spread = name.startswith("simulated")
@@ -256,7 +256,7 @@ def print_tables(real: Mapping[str, Statistics], simulated: Mapping[str, Statist
             _range(found.noise[:, 0], 100, spread=spread),
             _range(found.noise[:, 1], 1, 1, spread=spread),
         )
-        holes = [f"{100 * share:.1f}" for share in np.nanmean(found.holes, axis=0)]
+        holes = ["-" if np.isnan(each).all() else f"{100 * np.nanmean(each):.1f}" for each in found.holes.T]
         equal, gaps = _range(found.equal, 100, 0, spread=spread), _range(found.gaps, 1, 1, spread=spread)
         print(
             f"| {name} | {amplitude} | {length} | {equal} | {gaps} | {', '.join(holes[:3])} | {', '.join(holes[3:])} |"
@@ -274,29 +274,34 @@ def print_tables(real: Mapping[str, Statistics], simulated: Mapping[str, Statist
         print(f"| simulated {kind} | {' | '.join(cells)} |")
 
 
-def panels_of(name: str, values: Map, size: int = 192) -> list[Panel]:
+def flattest_window(depth: np.ndarray) -> tuple[int, int, int]:
+    """Return size, row and column of the flattest window of those of the largest size of which 95 % are known."""
+    for size in (192, 96, 48):
+        found = []
+        for top in range(0, depth.shape[0] - size + 1, size // 4):
+            for left in range(0, depth.shape[1] - size + 1, size // 4):
+                for window in residuals(depth[top : top + size, left : left + size], size):
+                    found.append((float(np.nanmedian(np.abs(window))), top, left))
+        if found:
+            return (size, *min(found)[1:])
+    raise ValueError("no window of 48 pixels is known")
+
+
+def panels_of(name: str, values: Map) -> list[Panel]:
     """Return photo, relit depth, residual about a plane and its spectrum in the flattest well-known window."""
-    size = min(size, *(int(0.75 * each) for each in values.depth.shape))
-    found = [(np.inf, 0, 0)]
-    for top in range(0, values.depth.shape[0] - size + 1, size // 4):
-        for left in range(0, values.depth.shape[1] - size + 1, size // 4):
-            window = residuals(values.depth[top : top + size, left : left + size], size)
-            if len(window):
-                found.append((float(np.median(np.abs(window[0][np.isfinite(window[0])]))), top, left))
-    _, top, left = min(found)
+    size, top, left = flattest_window(values.depth)
     place = np.s_[top : top + size, left : left + size]
     depth = torch.from_numpy(values.depth[place].astype(np.float64))[None]
     camera = Camera.from_fov(*values.depth.shape[::-1]).crop(top, left, size, size)
     relit = render_for_viewing(normals_seen_by(camera, depth))[0, 0].numpy()
-    windows = residuals(values.depth[place], size)
-    residual = windows[0] if len(windows) else np.full((size, size), np.nan)
+    residual = residuals(values.depth[place], size)[0]
     power = (
         np.abs(np.fft.fftshift(np.fft.fft2(np.nan_to_num(residual) * np.hanning(size) * np.hanning(size)[:, None])))
         ** 2
     )
     spectrum = np.log10(power + 1e-20) - np.log10(power.max() + 1e-20)
     return [
-        Panel(name, np.repeat(values.luma[place][..., None], 3, axis=2)),
+        Panel(f"{name}, {size} pixels", np.repeat(values.luma[place][..., None], 3, axis=2)),
         Panel("relit", relit),
         Panel("residual, -2 to 2 %", np.clip(residual / 0.04 + 0.5, 0, 1)),
         Panel("its spectrum, 5 decades", np.clip(1 + spectrum / 5, 0, 1)),

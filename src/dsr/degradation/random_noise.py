@@ -34,8 +34,11 @@ def _waves(values: Tensor, _: Tensor, generator: torch.Generator) -> Tensor:
 
 
 def _longest(values: Tensor) -> float:
-    """Return the longest waves of a map in pixels: longer ones could not be told from its shape."""
-    return max(1.0, min(45.0, min(values.shape[-2:]) / 4))
+    """Return the longest waves of a map in pixels: longer ones could not be told from its shape.
+
+    With what is added to the longest ones, and planes taken off, they measure about 45 pixels.
+    """
+    return max(1.0, min(56.0, min(values.shape[-2:]) / 4))
 
 
 def _structured(values: Tensor, luma: Tensor, generator: torch.Generator) -> Tensor:
@@ -144,7 +147,7 @@ def _flight(values: Tensor, luma: Tensor, generator: torch.Generator) -> Tensor:
         depth = torch.where(depth.isfinite() & (field_of(depth, 1, generator) > -0.5), mixed, depth)
     exact = depth
     strength = power(-3.8, -2.5, generator) * depth ** uniform(1, 3, generator) / (luma + 0.05).sqrt()
-    length = min(uniform(1, 9, generator), _longest(values)) if chance(0.5, generator) else 1
+    length = min(uniform(1, 9, generator), _longest(values)) if chance(0.6, generator) else 1
     grain = waves_of(depth, length, generator)
     if chance(0.5, generator):  # light that comes by other surfaces
         rounded = (_surroundings(exact, power(0.6, 1.3, generator)) / exact - 1).clamp(min=-0.1)
@@ -196,7 +199,7 @@ def _lidar(values: Tensor, luma: Tensor, generator: torch.Generator) -> Tensor:
     result = weight * smooth + (1 - weight) * values
     length = min(uniform(3, 9, generator), _longest(values))
     strength = power(-3.8, -2.6, generator) * (1 + torch.exp(-luma / 0.1))  # twice on dark surfaces
-    doubtful = field_of(values, min(5.0, _longest(values)), generator) > uniform(0.8, 2, generator)
+    doubtful = torch.sigmoid(3 * (field_of(values, min(5.0, _longest(values)), generator) - uniform(1, 3, generator)))
     result = result * (1 + strength * (1 + 4 * doubtful) * waves_of(values, length, generator).clamp(-3, 3))
     if chance(0.4, generator):  # 2.9 % at 0.35 m, 1.6 % at 1.1 m, 0.6 % at 3 m; whether near or far is not known
         result = result * (1 + uniform(-1, 1, generator) * (0.015 * values**0.7).clamp(max=0.03))
