@@ -4,18 +4,18 @@
 
 ``DIR`` holds ``real``. Simulated maps are drawn at factor 1 from rendered scenes (``dataset=procedural``), in
 millimetres as cameras write them. The first table has a map's amplitude of noise and its correlation length: those of
-the largest window in which the residual about a plane stays shorter than a fifth of the window, in its flattest tenth;
-medians of the maps and, of simulated ones, the 5th to 95th percentiles. The second compares windows of 48 pixels, the
-flattest tenth of each map, and steps of depth: medians, and the two-sample statistic of Kolmogorov and Smirnov (0 for
-equal distributions, 1 for disjoint ones). One device has one setting while simulated ones have many, so what counts is
-that the real medians lie within the simulated range. ``--sheet`` draws photo, relit depth, residual about a plane and
-its power spectrum of each real sensor above those of simulated ones.
+the largest window in which the residual about a plane stays shorter than a fifth of the window, in its flattest tenth,
+of simulated sensors before a wall; medians of the maps and, of simulated ones, the 5th to 95th percentiles. The second
+compares windows of 48 pixels, the flattest tenth of each map, and steps of depth: medians, and the two-sample statistic
+of Kolmogorov and Smirnov (0 for equal distributions, 1 for disjoint ones). One device has one setting while simulated
+ones have many, so what counts is that the real medians lie within the simulated range. ``--sheet`` draws photo, relit
+depth, residual about a plane and its power spectrum of each real sensor above those of simulated ones.
 """
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import NamedTuple
 
@@ -87,16 +87,19 @@ def read_map(sensor: Sensor, depth: Path, photo: Path) -> Map:
     return Map(values, cv2.resize(grey, values.shape[::-1], interpolation=cv2.INTER_AREA).astype(np.float32) / 255)
 
 
-def simulate(kind: str, scenes: int, draws: int) -> Iterator[Map]:
-    """Yield maps of a simulated sensor at the size of rendered scenes, rounded to millimetres."""
+def simulate(kind: str, scenes: int, draws: int, *, wall: bool = False) -> Iterator[Map]:
+    """Yield maps of a simulated sensor at the size of rendered scenes, or of a wall there, rounded to millimetres."""
     source = Procedural(count=scenes)
     for number, name in enumerate(source.scenes()):
         scene = source.load(name)
         assert scene.depth is not None  # noqa: S101 - rendered scenes have their depth
+        values = scene.depth.float().reciprocal()
+        if wall:
+            values = values.nanmedian() * torch.linspace(1, 1.1, values.shape[-1]).expand_as(values)
         luma = scene.rgb.float().mean(dim=0, keepdim=True)
         for draw in range(draws):
             generator = torch.Generator().manual_seed(1000 * number + draw)
-            depth = NOISES[kind](scene.depth.float().reciprocal(), luma, generator).reciprocal()
+            depth = NOISES[kind](values, luma, generator).reciprocal()
             yield Map((1000 * depth[0]).round().numpy() / 1000, luma[0].numpy())
 
 
@@ -121,6 +124,8 @@ def residuals(depth: np.ndarray, size: int, most: int = 1500) -> np.ndarray:
 def correlation_length(residual: np.ndarray) -> float:
     """Return the full width at half maximum of the autocorrelation of windows along rows and columns, pixels."""
     power, before = np.nanmean(residual**2), 1.0
+    if power == 0:
+        return np.nan
     for lag in range(1, residual.shape[1] // 2 + 1):
         along = np.nanmean(residual[:, :, lag:] * residual[:, :, :-lag])
         now = (along + np.nanmean(residual[:, lag:] * residual[:, :-lag])) / 2 / power
@@ -213,11 +218,11 @@ class Statistics(NamedTuple):
     gaps: np.ndarray
 
 
-def measure(maps: Iterator[Map]) -> Statistics:
-    """Measure maps: noise (n, 2); windows' deviation, length, slope; steps; holes; equal neighbours; gaps, in mm."""
-    noise, windows, steps, holes, equal, gaps = [], [], [np.zeros((0, 3))], [], [], []
+def measure(maps: Iterable[Map], flat: Iterable[Map]) -> Statistics:
+    """Measure maps: noise (n, 2), of ``flat``; windows' deviation, length, slope; steps; holes; and values, mm."""
+    noise = [noise_of(each.depth) or (np.nan, np.nan) for each in flat]
+    windows, steps, holes, equal, gaps = [], [np.zeros((0, 3))], [], [], []
     for each in maps:
-        noise.append(noise_of(each.depth) or (np.nan, np.nan))
         found = residuals(each.depth, WINDOW)
         for residual in flattest(found) if len(found) else ():
             length = correlation_length(residual[None])
@@ -332,8 +337,9 @@ def main() -> None:
             for number, each in enumerate(simulate(kind, 3, 2)):
                 panels += panels_of(f"simulated {kind} {number}", each)
             save_panels(options.sheet.with_name(f"{kind}_{options.sheet.name}"), panels, 4, width=256)
-    simulated = {kind: measure(simulate(kind, options.scenes, options.draws)) for kind in kinds}
-    print_tables({name: measure(iter(each)) for name, each in maps.items()}, simulated)
+    count = options.scenes, options.draws
+    simulated = {kind: measure(simulate(kind, *count), simulate(kind, *count, wall=True)) for kind in kinds}
+    print_tables({name: measure(each, each) for name, each in maps.items()}, simulated)
 
 
 if __name__ == "__main__":

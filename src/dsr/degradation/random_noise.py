@@ -36,9 +36,9 @@ def _waves(values: Tensor, _: Tensor, generator: torch.Generator) -> Tensor:
 def _longest(values: Tensor) -> float:
     """Return the longest waves of a map in pixels: longer ones could not be told from its shape.
 
-    With what is added to the longest ones, and planes taken off, they measure about 45 pixels.
+    With what is added to them, and planes taken off, the longest measure about 45 pixels.
     """
-    return max(1.0, min(56.0, min(values.shape[-2:]) / 4))
+    return max(1.0, min(64.0, min(values.shape[-2:]) / 4))
 
 
 def _structured(values: Tensor, luma: Tensor, generator: torch.Generator) -> Tensor:
@@ -62,6 +62,8 @@ def _structured(values: Tensor, luma: Tensor, generator: torch.Generator) -> Ten
     lost = (torch.rand(values.shape, generator=generator) < uniform(0, 1, generator)) & near_steps(values, 1)
     if chance(0.4, generator):  # the projector's light does not get there
         lost |= occluded(stereo_constant * values)
+    if chance(0.4, generator):
+        lost |= _between(values, 3, generator)
     if chance(0.3, generator):
         lost |= dark(values, luma, None, generator)
     if chance(0.25, generator):
@@ -142,7 +144,7 @@ def _flight(values: Tensor, luma: Tensor, generator: torch.Generator) -> Tensor:
     depth = values.reciprocal()
     amplitude = (luma + 0.05) * values.square()
     if chance(0.6, generator):  # flying pixels on both sides of steps: depth, weighted by the light, is averaged
-        size = 3 + 2 * int(torch.randint(4, (1,), generator=generator))
+        size = 3 + 2 * int(torch.randint(5, (1,), generator=generator))
         mixed = _means(depth, amplitude, size)
         depth = torch.where(depth.isfinite() & (field_of(depth, 1, generator) > -0.5), mixed, depth)
     exact = depth
@@ -165,8 +167,7 @@ def _flight(values: Tensor, luma: Tensor, generator: torch.Generator) -> Tensor:
     if chance(0.2, generator):
         noisy = noisy.masked_fill(dark(values, luma, None, generator), torch.nan)
     if chance(0.4, generator):  # cameras leave out what flies
-        mixed = _beside_steps(values, int(torch.randint(1, 4, (1,), generator=generator)))
-        noisy = noisy.masked_fill(mixed & (field_of(values, 1, generator) > uniform(-2, 1, generator)), torch.nan)
+        noisy = noisy.masked_fill(_between(values, 3, generator), torch.nan)
     return noisy
 
 
@@ -242,7 +243,7 @@ def _match(values: Tensor, luma: Tensor, length: float, generator: torch.Generat
     middle = values.nanmedian().clamp(min=1e-6)  # of a map of holes, NaN
     pixels = power(0.7, 1.8, generator)  # disparity at the middle
     stereo_constant = float(pixels / middle)
-    amplitude = min(max(power(-3, -1.92, generator) * pixels, 0.02), 0.35)
+    amplitude = min(max(power(-2.9, -1.8, generator) * pixels, 0.02), 0.4)
     flat = 0.3 + torch.exp(-(luma - window_means(luma, 5)).abs() / 0.03)
     reach = int(torch.randint(5, (1,), generator=generator))  # half the matching window
     seen = _fatten(values, reach, generator) if reach else values
@@ -278,14 +279,19 @@ def _lose(
     if chance(0.25, generator):
         lost |= _steep(values, generator)
     if chance(0.5, generator):  # windows that see two surfaces
-        reach = int(torch.randint(1, 5, (1,), generator=generator))
-        lost |= _beside_steps(values, reach) & (field_of(values, 1.5, generator) > uniform(-2, 1, generator))
+        lost |= _between(values, 4, generator)
     return disparity.masked_fill(lost, torch.nan)
 
 
 def _beside_steps(values: Tensor, reach: int) -> Tensor:
     """Return the mask of the pixels within ``reach`` pixels of a step between neighbours, (1, h, w)."""
     return window_maxima(near_steps(values, 1).to(values), reach) > 0
+
+
+def _between(values: Tensor, most: int, generator: torch.Generator) -> Tensor:
+    """Return the mask of pixels lost where two surfaces are seen, up to ``most`` pixels from steps, (1, h, w)."""
+    reach = int(torch.randint(1, most + 1, (1,), generator=generator))
+    return _beside_steps(values, reach) & (field_of(values, 1.5, generator) > uniform(-2, 1, generator))
 
 
 def _fill(values: Tensor, missing: Tensor) -> Tensor:
