@@ -39,6 +39,8 @@ def normal(generator: torch.Generator) -> float:
 def field_of(like: Tensor, sigma: float | tuple[float, float], generator: torch.Generator) -> Tensor:
     """Return normal noise with a variance of 1, (1, h, w), blurred by a Gaussian.
 
+    Wide Gaussians are drawn on a coarse grid and enlarged, which costs little.
+
     Args:
         like: a map of that size.
         sigma: standard deviation of the Gaussian in pixels, or one along v and one along u.
@@ -47,10 +49,43 @@ def field_of(like: Tensor, sigma: float | tuple[float, float], generator: torch.
     """
     if sigma == 0:
         return torch.randn(like.shape, generator=generator)
-    down, across = (_normalised_taps(each) for each in (sigma if isinstance(sigma, tuple) else (sigma, sigma)))
+    sigmas = sigma if isinstance(sigma, tuple) else (sigma, sigma)
+    factors = [max(int(each / 1.25), 1) for each in sigmas]
     height, width = like.shape[-2:]
-    draws = torch.randn((1, 1, height + len(down) - 1, width + len(across) - 1), generator=generator)
-    return functional.conv2d(functional.conv2d(draws, down.view(1, 1, -1, 1)), across.view(1, 1, 1, -1))[0]
+    down, across = (_normalised_taps(each / factor) for each, factor in zip(sigmas, factors, strict=True))
+    rows, columns = (
+        -(-size // factor) + 2 * (factor > 1) for size, factor in zip((height, width), factors, strict=True)
+    )
+    draws = torch.randn((1, 1, rows + len(down) - 1, columns + len(across) - 1), generator=generator)
+    field = _weighted_sums(_weighted_sums(draws, down, -2), across, -1)
+    if max(factors) == 1:
+        return field[0]
+    size = rows * factors[0], columns * factors[1]
+    top, left = (factor if factor > 1 else 0 for factor in factors)
+    fine = functional.interpolate(field, size, mode="bicubic", align_corners=False)
+    return fine[0, :, top : top + height, left : left + width]
+
+
+def waves_of(like: Tensor, length: float, generator: torch.Generator, stretch: float = 1) -> Tensor:
+    """Return normal noise of several octaves with a variance of 1, (1, h, w).
+
+    Args:
+        like: a map of that size.
+        length: full width at half maximum of its autocorrelation in pixels; white noise for 1 and less.
+        generator: source of the random numbers.
+        stretch: by how much it is longer along rows, and shorter along columns.
+
+    """
+    if length <= 1:
+        return field_of(like, 0, generator)
+    ratio = uniform(0.1, 0.6, generator)  # of one octave's standard deviation to that of the next longer one
+    sigma = length / (4 * math.sqrt(math.log(2)) * (1 - 0.7 * ratio**2))  # fits the sum of the octaves within 5 %
+    field, variance = torch.zeros(like.shape), 0.0
+    for octave in range(3):
+        size = sigma / 2**octave
+        field += ratio**octave * field_of(like, (size / stretch, size * stretch), generator)
+        variance += ratio ** (2 * octave)
+    return field / math.sqrt(variance)
 
 
 def _normalised_taps(sigma: float) -> Tensor:
@@ -58,6 +93,15 @@ def _normalised_taps(sigma: float) -> Tensor:
     radius = max(math.ceil(3.5 * sigma), 1)
     taps = torch.exp(-0.5 * (torch.arange(-radius, radius + 1) / sigma).square())
     return taps / taps.norm()
+
+
+def _weighted_sums(values: Tensor, taps: Tensor, dim: int) -> Tensor:
+    """Convolve along a dimension without padding; for a single channel faster than a convolution."""
+    size = values.shape[dim] - len(taps) + 1
+    result = values.narrow(dim, 0, size) * taps[0]
+    for place, tap in enumerate(taps[1:].tolist(), 1):
+        result.add_(values.narrow(dim, place, size), alpha=tap)
+    return result
 
 
 def window_means(values: Tensor, size: int) -> Tensor:
@@ -68,7 +112,19 @@ def window_means(values: Tensor, size: int) -> Tensor:
 
 def near_steps(values: Tensor, reach: int, jump: float = 0.04) -> Tensor:
     """Return the mask of pixels within ``reach`` pixels of a step, (1, h, w)."""
-    size = 2 * reach + 1
-    high = functional.max_pool2d(values.nan_to_num(-math.inf)[None], size, stride=1, padding=reach)
-    low = -functional.max_pool2d((-values).nan_to_num(-math.inf)[None], size, stride=1, padding=reach)
-    return (high > (1 + jump) * low)[0]
+    high = window_maxima(values.nan_to_num(-math.inf), reach)
+    low = -window_maxima((-values).nan_to_num(-math.inf), reach)
+    return high > (1 + jump) * low
+
+
+def window_maxima(values: Tensor, reach: int) -> Tensor:
+    """Return the largest values within ``reach`` rows and columns, (1, h, w)."""
+    result = functional.pad(values, (reach,) * 4, value=-math.inf)
+    for dim in (-2, -1):
+        size = 1
+        while size < 2 * reach + 1:  # of windows twice as large, until they are large enough
+            shift = min(size, 2 * reach + 1 - size)
+            rest = result.shape[dim] - shift
+            result = torch.maximum(result.narrow(dim, 0, rest), result.narrow(dim, shift, rest))
+            size += shift
+    return result

@@ -5,8 +5,8 @@ A degradation is drawn in three stages, each kind with its share:
 - a *kernel*: box, nearest, bilinear, bicubic, gaussian, or ``spread``, a wider gaussian, as of a sensor; after a small
   displacement of depth against the photo in some cases, and after folds, and fine relief which the map shows only in
   part, are added to the truth in some;
-- *noise*: none, white, correlated, or that of structured light, of time of flight, of a phone's lidar and of stereo
-  matching; some maps are rounded to the levels of a file;
+- *noise*: none, white, correlated, waves, or that of structured light, of time of flight, of a phone's lidar and of
+  stereo matching, which also lose pixels; some maps are rounded to the levels of a file;
 - *holes*: none, blobs, shadows, bands beside depth steps, dark surfaces, single pixels.
 
 All random numbers come from one generator. Maps are inverse depth, in which planes are linear, in 1/m.
@@ -75,8 +75,8 @@ class Everything:
     )  # fmt: skip
     noises: Mapping[str, float] = field(
         default_factory=lambda: {
-            "none": 0.48, "white": 0.14, "correlated": 0.1, "structured": 0.09, "flight": 0.08, "lidar": 0.05,
-            "stereo": 0.06,
+            "none": 0.48, "white": 0.14, "correlated": 0.1, "waves": 0, "structured": 0.09, "flight": 0.08,
+            "lidar": 0.05, "stereo": 0.06,
         }
     )  # fmt: skip
     holes: Mapping[str, float] = field(
@@ -136,6 +136,7 @@ class Everything:
         size = clean.shape[-2], clean.shape[-1]
         luma = functional.adaptive_avg_pool2d(scene.rgb.float().mean(dim=0, keepdim=True)[None], size)[0]
         noisy = clean if kind == "none" else NOISES[kind](clean, luma, generator)
+        noisy = torch.where(clean.isfinite(), noisy, torch.nan)  # what is not known of the truth stays unknown
         if chance(self.rounded, generator):
             noisy = round_values(noisy, generator)
         holes = draw(self.holes, generator)

@@ -74,14 +74,23 @@ class Shadows:
 
     def __call__(self, depth: Tensor, camera: Camera, generator: torch.Generator) -> Tensor:
         """Return the mask of the holes, (1, h, w) bool: points that a nearer one covers in the second image."""
-        columns = torch.arange(depth.shape[-1], dtype=torch.float64, device=depth.device)
-        seen_at = columns - self.baseline * camera.fx / depth.double()  # the column in the second image
-        missing = seen_at.isnan()
-        if self.baseline > 0:  # points to the right that are nearer cover it
-            nearest = seen_at.masked_fill(missing, torch.inf).flip(-1).cummin(dim=-1).values.flip(-1)
-            return seen_at > nearest
-        nearest = seen_at.masked_fill(missing, -torch.inf).cummax(dim=-1).values
-        return seen_at < nearest
+        return occluded(self.baseline * camera.fx / depth.double())
+
+
+def occluded(disparity: Tensor) -> Tensor:
+    """Return the mask of the pixels that a nearer one covers in a second image, (..., h, w) bool.
+
+    Beside a step from d1 to d2 it is d1 - d2 pixels wide: on the left where the second camera is to the right.
+
+    Args:
+        disparity: (..., h, w) in pixels, NaN where missing; negative if the second camera is to the left.
+
+    """
+    if bool((disparity < 0).any()):
+        return occluded(-disparity.flip(-1)).flip(-1)
+    seen_at = torch.arange(disparity.shape[-1], device=disparity.device) - disparity  # the column in the second image
+    nearest = seen_at.nan_to_num(torch.inf).flip(-1).cummin(dim=-1).values.flip(-1)
+    return seen_at > nearest  # points to the right that are nearer cover it
 
 
 def no_holes() -> None:

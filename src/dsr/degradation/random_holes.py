@@ -28,7 +28,7 @@ def _beside_steps(values: Tensor, _: Tensor, __: object, generator: torch.Genera
 
 def dark(values: Tensor, luma: Tensor, _: object, generator: torch.Generator) -> Tensor:
     """Return the mask of the darkest pixels, most of them, (1, h, w)."""
-    limit = float(luma.flatten().quantile(uniform(0.02, 0.2, generator)))
+    limit = float(luma[:, ::3, ::3].flatten().quantile(uniform(0.02, 0.2, generator)))
     return (luma < limit) & (field_of(values, 1, generator) > -0.3)
 
 

@@ -9,7 +9,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from dsr.degradation.draws import chance, field_of, near_steps, power, uniform, window_means
+from dsr.degradation.draws import chance, field_of, near_steps, power, uniform, waves_of, window_maxima, window_means
+from dsr.degradation.holes import occluded
 from dsr.degradation.random_holes import dark
 
 
@@ -26,23 +27,84 @@ def _correlated(values: Tensor, _: Tensor, generator: torch.Generator) -> Tensor
     return values * (1 + power(-3.3, -1.8, generator) * mixed)
 
 
+def _waves(values: Tensor, _: Tensor, generator: torch.Generator) -> Tensor:
+    """Waves of 2 to 27 pixels, as far as the map is large enough, of several octaves."""
+    length = min(3.33 * power(-0.22, 0.9, generator), _longest(values))
+    return values * (1 + power(-2.9, -2, generator) * waves_of(values, length, generator))
+
+
+def _longest(values: Tensor) -> float:
+    """Return the longest waves of a map in pixels: longer ones could not be told from its shape.
+
+    With what is added to them, and planes taken off, the longest measure about 45 pixels.
+    """
+    return max(1.0, min(64.0, min(values.shape[-2:]) / 4))
+
+
 def _structured(values: Tensor, luma: Tensor, generator: torch.Generator) -> Tensor:
-    """A projector and a camera that match windows and count disparity in steps."""
-    stereo_constant = uniform(0.04, 0.12, generator) * uniform(300, 700, generator)
-    window = 2 * int(torch.randint(4, (1,), generator=generator)) + 1
-    seen = _fatten(values, generator) if chance(0.5, generator) else values
-    grain = window_means(field_of(values, 0, generator), window) * window
-    result = _count(stereo_constant * seen, power(-1.8, -0.7, generator) * grain, generator) / stereo_constant
-    lost = (torch.rand(values.shape, generator=generator) < uniform(0, 0.9, generator)) & near_steps(values, 1)
+    """A projector and a camera that match windows and count disparity in steps.
+
+    The noise is that of Nguyen et al., Modeling Kinect sensor noise, 3DIMPVT 2012: axial 1.2 mm + 1.9 mm (z - 0.4)^2
+    and more at grazing incidence, lateral 0.8 pixels.
+    """
+    focal = uniform(300, 700, generator)
+    stereo_constant = uniform(0.04, 0.12, generator) * focal
+    seen = _fatten(values, 1, generator) if chance(0.5, generator) else values
+    seen = _jitter(seen, uniform(0, 0.8, generator), generator)
+    depth = values.reciprocal()
+    axial = 0.0012 + 0.0019 * (depth - 0.4).square()
+    axial = axial + 0.0001 / depth.sqrt() * _grazing(values, focal)
+    noise = stereo_constant * values.square() * axial * power(-0.4, 0.4, generator)
+    grain = waves_of(values, min(power(0, 1.1, generator), _longest(values)), generator)
+    if chance(0.4, generator):
+        grain = grain + uniform(0.2, 1, generator) * _bands(values, generator)
+    result = _count(stereo_constant * seen, noise.nan_to_num(0) * grain, generator) / stereo_constant
+    lost = (torch.rand(values.shape, generator=generator) < uniform(0, 1, generator)) & near_steps(values, 1)
+    if chance(0.4, generator):  # the projector's light does not get there
+        lost |= occluded(stereo_constant * values)
+    if chance(0.4, generator):
+        lost |= _between(values, 3, generator)
     if chance(0.3, generator):
         lost |= dark(values, luma, None, generator)
-    if chance(0.25, generator):  # surfaces at grazing incidence
-        steep = near_steps(values, 1, uniform(0.02, 0.06, generator))
-        lost |= steep & (torch.rand(values.shape, generator=generator) < uniform(0.3, 0.9, generator))
+    if chance(0.25, generator):
+        lost |= _steep(values, generator)
     return result.masked_fill(lost, torch.nan)
 
 
-def _count(disparity: Tensor, noise: Tensor, generator: torch.Generator) -> Tensor:
+def _grazing(values: Tensor, focal: float) -> Tensor:
+    """Return angle^2 / (90 degrees - angle)^2 of the angle between a surface and the view, in radians, at most 25."""
+    slope = (
+        values.diff(dim=-1, append=values[..., -1:]).square() + values.diff(dim=-2, append=values[:, -1:]).square()
+    ).sqrt()
+    angle = torch.atan(focal * slope / values)
+    return (angle / (math.pi / 2 - angle)).square().clamp(max=25).nan_to_num(0)
+
+
+def _steep(values: Tensor, generator: torch.Generator) -> Tensor:
+    """Return the mask of pixels lost on surfaces at grazing incidence."""
+    steep = near_steps(values, 1, uniform(0.02, 0.06, generator))
+    return steep & (torch.rand(values.shape, generator=generator) < uniform(0.3, 0.9, generator))
+
+
+def _jitter(values: Tensor, strength: float, generator: torch.Generator) -> Tensor:
+    """Return a map whose edges are displaced by normal noise of ``strength`` pixels, alike over few pixels."""
+    height, width = values.shape[-2:]
+    down, across = (
+        (strength * field_of(values, uniform(0.3, 1.2, generator), generator)[0]).round().long() for _ in range(2)
+    )
+    rows = (torch.arange(height)[:, None] + down).clamp(0, height - 1)
+    columns = (torch.arange(width) + across).clamp(0, width - 1)
+    return torch.where(near_steps(values, 2), values[:, rows, columns], values)
+
+
+def _bands(values: Tensor, generator: torch.Generator) -> Tensor:
+    """Return vertical bands of 8 to 80 pixels, normal numbers of (1, h, w)."""
+    width = values.shape[-1]
+    bands = torch.randn((1, 1, max(2, round(width / power(0.9, 1.9, generator)))), generator=generator)
+    return functional.interpolate(bands, width, mode="nearest-exact").expand_as(values)
+
+
+def _count(disparity: Tensor, noise: Tensor, generator: torch.Generator, *, stereo: bool = False) -> Tensor:
     """Return disparity in pixels as matching windows finds it: drawn to whole pixels, in steps, and smoothed again.
 
     Where the noise is weak against the step, a slanted wall becomes a stair.
@@ -51,10 +113,12 @@ def _count(disparity: Tensor, noise: Tensor, generator: torch.Generator) -> Tens
         disparity: (1, h, w) exact disparity in pixels.
         noise: (1, h, w) what is added to it.
         generator: source of all random numbers.
+        stereo: whether two cameras match, which count in finer steps and are noisier than a projector and a camera.
 
     """
-    step = (0.0, 1 / 32, 1 / 16, 1 / 8)[int(torch.randint(4, (1,), generator=generator))]
-    if step and chance(0.4, generator):
+    steps = (0.0, 1 / 64, 1 / 32, 1 / 32) if stereo else (1 / 32, 1 / 16, 1 / 8, 1 / 8)
+    step = steps[int(torch.randint(4, (1,), generator=generator))]
+    if step and chance(0.15 if stereo else 0.4, generator):
         noise = noise * (uniform(0.1, 0.6, generator) * step / noise.std().clamp(min=1e-9)).clamp(max=1)
     counted = disparity + noise
     if chance(0.3, generator):  # fits of a parabola to the costs favour whole pixels (Shimizu, Okutomi, IJCV 2005)
@@ -69,55 +133,174 @@ def _count(disparity: Tensor, noise: Tensor, generator: torch.Generator) -> Tens
     return counted
 
 
-def _fatten(values: Tensor, generator: torch.Generator) -> Tensor:
-    """Return a map in which near objects are a pixel wider in random places, as window matching makes them."""
-    wide = functional.max_pool2d(values.nan_to_num(0)[None], 3, stride=1, padding=1)[0]
+def _fatten(values: Tensor, reach: int, generator: torch.Generator) -> Tensor:
+    """Return a map in which near objects are ``reach`` pixels wider in random places, as window matching makes them."""
+    wide = window_maxima(values.nan_to_num(0), reach)
     return torch.where((field_of(values, 3, generator) > 0) & (wide > 0), wide, values)
 
 
 def _flight(values: Tensor, luma: Tensor, generator: torch.Generator) -> Tensor:
-    """Time of flight: noise that grows with distance and on dark surfaces, flying pixels, and a smooth bias."""
+    """Time of flight: noise where little light returns, flying pixels, light by several ways, wiggling by distance."""
     depth = values.reciprocal()
-    if chance(0.6, generator):  # flying pixels: depth itself is averaged at steps
-        taps = torch.tensor([0.25, 0.5, 0.25])
-        known = depth.isfinite().to(depth)
-        padded = functional.pad(torch.stack((depth.nan_to_num(0), known)), (1, 1, 1, 1), mode="replicate")
-        sums, weights = functional.conv2d(padded, (taps[:, None] * taps).view(1, 1, 3, 3))
-        mixed = sums / weights.clamp(min=1e-6)
+    amplitude = (luma + 0.05) * values.square()
+    if chance(0.6, generator):  # flying pixels on both sides of steps: depth, weighted by the light, is averaged
+        size = 3 + 2 * int(torch.randint(5, (1,), generator=generator))
+        mixed = _means(depth, amplitude, size)
         depth = torch.where(depth.isfinite() & (field_of(depth, 1, generator) > -0.5), mixed, depth)
-    strength = power(-3.5, -2.4, generator) * depth ** uniform(1, 3, generator) / (luma + 0.05).sqrt()
-    grain = field_of(depth, uniform(0, 1.5, generator) if chance(0.5, generator) else 0, generator)
-    bias = field_of(depth, uniform(6, 15, generator), generator) * uniform(0, 0.006, generator) * depth
-    return (depth + torch.minimum(strength, 0.05 * depth) * grain + bias).clamp(min=1e-3).reciprocal()
+    exact = depth
+    strength = power(-3.8, -2.5, generator) * depth ** uniform(1, 3, generator) / (luma + 0.05).sqrt()
+    length = min(uniform(1, 9, generator), _longest(values)) if chance(0.6, generator) else 1
+    grain = waves_of(depth, length, generator)
+    if chance(0.5, generator):  # light that comes by other surfaces
+        rounded = (_surroundings(exact, power(0.6, 1.3, generator)) / exact - 1).clamp(min=-0.1)
+        rounded = rounded.clamp(max=0) * torch.exp(-(rounded / 0.04).square())  # inner corners, not steps
+        wide = field_of(depth, min(power(0.8, 1.4, generator), _longest(values)), generator)
+        depth = depth + exact * (uniform(0, 1, generator) * rounded + uniform(0, 0.01, generator) * (wide + 1))
+    if chance(0.4, generator):  # harmonics of the modulation
+        wave = uniform(0.4, 1.5, generator)
+        depth = depth + uniform(0, 0.01, generator) * torch.sin(
+            2 * math.pi * exact / wave + uniform(0, 6.28, generator)
+        )
+    if chance(0.4, generator):  # dark surfaces seem too far
+        depth = depth + uniform(0, 0.02, generator) * torch.exp(-luma / 0.1)
+    noisy = (depth + torch.minimum(strength, 0.05 * exact) * grain).clamp(min=1e-3).reciprocal()
+    if chance(0.2, generator):
+        noisy = noisy.masked_fill(dark(values, luma, None, generator), torch.nan)
+    if chance(0.4, generator):  # cameras leave out what flies
+        noisy = noisy.masked_fill(_between(values, 3, generator), torch.nan)
+    return noisy
 
 
-def _lidar(values: Tensor, _: Tensor, generator: torch.Generator) -> Tensor:
-    """A phone's lidar: sparse dots, interpolated."""
+def _means(values: Tensor, weights: Tensor, size: int) -> Tensor:
+    """Return weighted means of windows, holes left out, (1, h, w)."""
+    weights = torch.where(values.isfinite(), weights, 0)
+    return window_means(values.nan_to_num(0) * weights, size) / window_means(weights, size).clamp(min=1e-9)
+
+
+def _surroundings(values: Tensor, size: float) -> Tensor:
+    """Return smooth means over about twice ``size`` pixels, holes left out, (1, h, w)."""
+    height, width = values.shape[-2:]
+    coarse = max(2, round(height / size)), max(2, round(width / size))
+    stack = torch.stack((values.nan_to_num(0), values.isfinite().to(values)))
+    sums, weights = functional.interpolate(
+        functional.adaptive_avg_pool2d(stack, coarse), (height, width), mode="bilinear", align_corners=False
+    )
+    return sums / weights.clamp(min=1e-6)
+
+
+def _lidar(values: Tensor, luma: Tensor, generator: torch.Generator) -> Tensor:
+    """A phone's lidar: a grid of dots coarser than the map, interpolated, with blobs of doubtful pixels."""
     height, width = values.shape[-2:]
     stride = uniform(1.5, 8, generator)
     size = max(2, round(height / stride)), max(2, round(width / stride))
-    dots = functional.interpolate(values[None], size, mode="nearest-exact")
-    dots = dots * (1 + power(-3.3, -2.3, generator) * torch.randn(dots.shape, generator=generator))
-    smooth = functional.interpolate(dots, (height, width), mode="bilinear", align_corners=False)[0]
-    weight = uniform(0.4, 1, generator)
+    dots = _dots(values, size, uniform(0, 0.5, generator), generator)
+    smooth = functional.interpolate(dots[None], (height, width), mode="bilinear", align_corners=False)[0]
     smooth = torch.where(smooth.isfinite(), smooth, values)  # not beside holes of the truth
+    weight = uniform(0.5, 1, generator)
     result = weight * smooth + (1 - weight) * values
-    grain = field_of(values, uniform(0.7, 3, generator), generator)
-    return result * (1 + power(-3.3, -2.3, generator) * grain)
+    length = min(uniform(3, 9, generator), _longest(values))
+    strength = power(-3.8, -2.6, generator) * (1 + torch.exp(-luma / 0.1))  # twice on dark surfaces
+    doubtful = torch.sigmoid(3 * (field_of(values, min(5.0, _longest(values)), generator) - uniform(1, 3, generator)))
+    result = result * (1 + strength * (1 + 4 * doubtful) * waves_of(values, length, generator).clamp(-3, 3))
+    if chance(0.4, generator):  # 2.9 % at 0.35 m, 1.6 % at 1.1 m, 0.6 % at 3 m; whether near or far is not known
+        result = result * (1 + uniform(-1, 1, generator) * (0.015 * values**0.7).clamp(max=0.03))
+    return result
+
+
+def _dots(values: Tensor, size: tuple[int, int], shift: float, generator: torch.Generator) -> Tensor:
+    """Return a map at a grid of dots, (1, *size), each measured up to ``shift`` of their distance aside."""
+    places = []
+    for axis, count in enumerate(size):
+        middles = (torch.arange(count) + 0.5).view((-1, 1) if axis == 0 else (1, -1))
+        aside = shift * (2 * torch.rand(size, generator=generator) - 1)
+        length = values.shape[axis - 2]
+        places.append(((middles + aside) * (length / count)).long().clamp(0, length - 1))
+    return values[:, places[0], places[1]]
 
 
 def _stereo(values: Tensor, luma: Tensor, generator: torch.Generator) -> Tensor:
-    """Two cameras: disparity noise of windows, more where the photo has no texture."""
-    stereo_constant = uniform(0.05, 0.2, generator) * uniform(400, 900, generator)
-    window = 2 * int(torch.randint(1, 5, (1,), generator=generator)) + 1
-    grain = window_means(field_of(values, 0, generator), window) * window
-    flat = torch.exp(-(luma - window_means(luma, 5)).abs() / 0.03)
-    seen = _fatten(values, generator)
-    strength = power(-1.7, -0.5, generator) * (0.5 + 1.5 * flat)
-    return _count(stereo_constant * seen, strength * grain, generator) / stereo_constant
+    """Two cameras of a size of their own, whose map is enlarged to this one by repeating values.
+
+    Matching windows and filters that stop at steps make disparity noise alike over several octaves; what only one
+    camera sees is lost or filled.
+    """
+    length = _longest(values) ** math.sqrt(uniform(0, 1, generator))  # of the waves, in pixels of this map
+    ratio = uniform(1, max(1.0, min(3.4, length / 2)), generator) if chance(0.7, generator) else 1.0
+    rows, columns = (_repeated(size, ratio, generator) for size in values.shape[-2:])
+    seen, shades = (each[:, rows[1]][..., columns[1]] for each in (values, luma))
+    return _match(seen, shades, length / ratio, generator)[:, rows[0]][..., columns[0]]
+
+
+def _repeated(size: int, ratio: float, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+    """Return which of the sensor's pixels each of a map's repeats, and which of the map's each of the sensor's sees."""
+    shown = ((torch.arange(size) + uniform(0, 1, generator) * (ratio > 1)) / ratio).long()
+    count = int(shown[-1]) + 1
+    return shown, ((torch.arange(count) + 0.5) * (size / count)).long().clamp(max=size - 1)
+
+
+def _match(values: Tensor, luma: Tensor, length: float, generator: torch.Generator) -> Tensor:
+    """Return inverse depth as stereo matching finds it, at the sensor's size, with waves of ``length`` pixels."""
+    middle = values.nanmedian().clamp(min=1e-6)  # of a map of holes, NaN
+    pixels = power(0.7, 1.8, generator)  # disparity at the middle
+    stereo_constant = float(pixels / middle)
+    amplitude = min(max(power(-2.9, -1.8, generator) * pixels, 0.02), 0.4)
+    flat = 0.3 + torch.exp(-(luma - window_means(luma, 5)).abs() / 0.03)
+    reach = int(torch.randint(5, (1,), generator=generator))  # half the matching window
+    seen = _fatten(values, reach, generator) if reach else values
+    stretch = uniform(1, 1.6, generator)
+    waves = waves_of(values, length, generator, stretch)
+    if length > 3:  # filters stop at steps
+        beside = _beside_steps(values, max(1, int(length / 4)))
+        waves = torch.where(beside, waves_of(values, length / 2.5, generator, stretch), waves)
+    if chance(0.4, generator):  # rows are matched one by one
+        waves = waves + uniform(0, 0.4, generator) * field_of(values, (0.3, max(length / 3, 0.3)), generator)
+    counted = _count(stereo_constant * seen, amplitude * (flat / flat.mean()) * waves, generator, stereo=True)
+    if chance(0.35, generator):  # filters that do not stop at steps
+        counted = _means(counted, torch.ones_like(counted), 2 * int(torch.randint(1, 4, (1,), generator=generator)) + 1)
+    return _lose(counted, values, luma, stereo_constant, generator) / stereo_constant
+
+
+def _lose(
+    disparity: Tensor, values: Tensor, luma: Tensor, stereo_constant: float, generator: torch.Generator
+) -> Tensor:
+    """Return disparity with holes where only one camera sees a surface, or where both see too little."""
+    if chance(0.7, generator):
+        hidden = occluded(stereo_constant * values)
+        disparity = _fill(disparity, hidden) if chance(0.25, generator) else disparity.masked_fill(hidden, torch.nan)
+    lost = torch.zeros_like(values, dtype=torch.bool)
+    if chance(0.2, generator):
+        lost |= dark(values, luma, None, generator)
+    if chance(0.2, generator):  # gloss
+        shining = luma > max(0.8, float(luma[:, ::3, ::3].flatten().quantile(uniform(0.9, 0.99, generator))))
+        lost |= shining & (field_of(values, 2, generator) > -0.5)
+    if chance(0.25, generator):  # bare surfaces
+        bare = window_means((luma - window_means(luma, 5)).abs(), 5) < 0.01
+        lost |= bare & (field_of(values, 5, generator) > uniform(0.8, 2.5, generator))
+    if chance(0.25, generator):
+        lost |= _steep(values, generator)
+    if chance(0.5, generator):  # windows that see two surfaces
+        lost |= _between(values, 4, generator)
+    return disparity.masked_fill(lost, torch.nan)
+
+
+def _beside_steps(values: Tensor, reach: int) -> Tensor:
+    """Return the mask of the pixels within ``reach`` pixels of a step between neighbours, (1, h, w)."""
+    return window_maxima(near_steps(values, 1).to(values), reach) > 0
+
+
+def _between(values: Tensor, most: int, generator: torch.Generator) -> Tensor:
+    """Return the mask of pixels lost where two surfaces are seen, up to ``most`` pixels from steps, (1, h, w)."""
+    reach = int(torch.randint(1, most + 1, (1,), generator=generator))
+    return _beside_steps(values, reach) & (field_of(values, 1.5, generator) > uniform(-2, 1, generator))
+
+
+def _fill(values: Tensor, missing: Tensor) -> Tensor:
+    """Return a map in which what is missing has the value to its left, as cameras fill such holes."""
+    places = torch.where(missing, 0, torch.arange(values.shape[-1])).cummax(dim=-1).values
+    return values.gather(-1, places)
 
 
 NOISES: Mapping[str, Callable[[Tensor, Tensor, torch.Generator], Tensor]] = {
-    "white": _white, "correlated": _correlated, "structured": _structured, "flight": _flight, "lidar": _lidar,
-    "stereo": _stereo,
+    "white": _white, "correlated": _correlated, "waves": _waves, "structured": _structured, "flight": _flight,
+    "lidar": _lidar, "stereo": _stereo,
 }  # fmt: skip
