@@ -90,12 +90,11 @@ def within_measured(result: Tensor, given: Tensor, radius: int = RADIUS) -> Tens
     low, high = _bounds(given, known, reach)
     if not bool(known.all()):
         away = distance_to_known(known)
-        wide = _bounds(given, known, 3 * reach)
-        further = away > reach / 3
-        low, high = (torch.where(further, a, b) for a, b in zip(wide, (low, high), strict=True))
-        window = 2 * reach + 1
-        share = functional.avg_pool2d(known[None].to(result), window, 1, reach, count_include_pad=False)[0]
-        silent = ~known & ((share < _SPARSE) | (away > reach))
+        silent = ~known & ((_share(known, reach) < _SPARSE) | (away > reach))
+        further = (away > reach / 3) & ~silent
+        if bool(further.any()):
+            wide = _bounds(given, known, 3 * reach)
+            low, high = (torch.where(further, a, b) for a, b in zip(wide, (low, high), strict=True))
         low, high = low.masked_fill(silent, -torch.inf), high.masked_fill(silent, torch.inf)
     low, high = (functional.interpolate(each[None], size, mode="nearest-exact")[0] for each in (low, high))
     return result.clamp(low, high)
@@ -112,6 +111,13 @@ def _bounds(given: Tensor, known: Tensor, reach: int) -> tuple[Tensor, Tensor]:
         ((1 - _ROUNDING) * lowest).masked_fill(none, -torch.inf),
         ((1 + _ROUNDING) * highest).masked_fill(none, torch.inf),
     )
+
+
+def _share(known: Tensor, reach: int) -> Tensor:
+    """Return the share of known pixels in the square windows, (1, h, w)."""
+    window = (2 * reach + 1, 2 * reach + 1)
+    found = cv2.boxFilter(known[0].cpu().numpy().astype(np.float32), -1, window, borderType=cv2.BORDER_REFLECT)
+    return torch.from_numpy(found)[None].to(known.device)
 
 
 def _running_max(values: Tensor, reach: int) -> Tensor:
