@@ -157,6 +157,25 @@ def test_noise_of_an_earlier_run_is_kept_where_parts_are_added(pair, tmp_path, c
     assert info(out)["noise"] == told
 
 
+def test_outliers_are_holes_and_it_is_said(pair, tmp_path, capsys):
+    clean, out = tmp_path / "clean", tmp_path / "out"
+    assert of(pair, clean, *DEPTH_ONLY) == 0
+    assert "taken for holes" not in capsys.readouterr().out
+    values = pair[2].copy()
+    values[10, 9], values[3, 12] = 25, 64000  # mm
+    Image.fromarray(values).save(pair[1])
+    assert of(pair, out, *DEPTH_ONLY) == 0
+    said = capsys.readouterr().out
+    assert said.count("taken for holes") == 1
+    assert "pixels: 2, patches: 2" in said
+    counted = {"pixels": 2, "patches": 2}
+    assert (info(clean)["outliers"], info(out)["outliers"]) == ({"pixels": 0, "patches": 0}, counted)
+    before, after = (np.load(folder / "depth_metres.npy") for folder in (clean, out))
+    np.testing.assert_allclose(after, before, rtol=0.1)
+    assert of(pair, out, *BICUBIC, "--only", "depth,normals") == 0
+    assert info(out)["outliers"] == counted
+
+
 @pytest.mark.parametrize(
     ("suffix", "factor", "dtype"),
     [("tiff", 1, "f4"), ("npy", 1000, "f4"), ("pfm", 1, "f4"), ("exr", 1, "f4"), ("npz", 1, "f8")],

@@ -70,13 +70,23 @@ def test_unknown_unit_is_refused(text):
 
 
 def test_zeros_and_the_largest_whole_number_are_holes():
-    holes, mark, assumptions = find_holes(np.array([[0, 1, 65535], [0, 65534, 7]], "u2"), None)
+    holes, mark, assumptions = find_holes(np.array([[0, 1, 65535], [0, 64999, 7]], "u2"), None)
     np.testing.assert_array_equal(holes, [[1, 0, 1], [1, 0, 0]])
     assert mark == 0
     assert [str(assumption) for assumption in assumptions] == [
         "zeros count as holes (33.3%)",
         "values that are 65535 count as holes (16.7%)",
     ]
+
+
+def test_a_sensors_end_of_16_bits_is_a_hole_unless_the_map_reaches_that_far():
+    ends = np.array([[900, 65000], [65534, 1200]], "u2")
+    holes, mark, assumptions = find_holes(ends, None)
+    np.testing.assert_array_equal(holes, [[0, 1], [1, 0]])
+    assert mark == 0
+    assert [str(assumption) for assumption in assumptions] == ["values that are 65000 or more count as holes (50.0%)"]
+    assert not find_holes(np.array([[900, 65000], [65534, 51000]], "u2"), None)[0].any()
+    assert not find_holes(ends.astype("i4"), None)[0].any()
 
 
 @pytest.mark.parametrize(

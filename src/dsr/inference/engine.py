@@ -20,6 +20,7 @@ from dsr.geometry.resampling import pad_inverse_depth, resize_inverse_depth
 from dsr.inference.agreement import expect_errors
 from dsr.inference.inspection import enlarged_by
 from dsr.inference.options import DEFAULT, USUAL_SCALE, WIDEST, Fill
+from dsr.inference.outliers import count_patches, find_outliers, within_measured
 from dsr.inference.planning import OWN_SIZE, Plan, plan, read_ability
 from dsr.methods.base import Confident, MapNoise, Surface, Upsampler, expect_some_depth
 from dsr.methods.classical.interpolation import Interpolation
@@ -144,6 +145,8 @@ def upsample_surface(
     of the photo's size as it is, unless a scale is given; for other methods it is first downsampled by ``scale``, by
     averaging the inverse depth of its valid pixels; if it was enlarged by repeating pixels, the repeated ones are
     dropped instead. The averages may cross depth steps, as in the networks' training.
+    Patches that are far from everything around them are taken for holes, and the result stays within what is measured
+    around each pixel, see :mod:`dsr.inference.outliers`.
     (With a tenth of the map missing, RMSE_v on Lucy is 0.127, against 0.142 or more with means, medians or planes of
     one surface.)
 
@@ -162,7 +165,7 @@ def upsample_surface(
         progress: is called with the number of parts done and their total.
 
     Returns:
-        Depth, (1, H, W) float32 in metres, and its expected errors, on the device of ``depth``.
+        Depth, (1, H, W) float32 in metres, and its expected errors, on the device of ``depth``; and its outliers.
 
     Raises:
         ValueError: a shape, value, method, setting or scale is not as above, or the method has no solution.
@@ -176,7 +179,8 @@ def upsample_surface(
     size = (camera.height, camera.width)
     choice = MethodChoice(method, settings or {}, tuple(directories), pick_device(device))
     planned = choice.plan(size, _size(depth), scale)  # raises ValueError for sizes or a scale that cannot be used
-    inverse = depth.float().reciprocal()
+    outliers = find_outliers(depth)
+    inverse = depth.masked_fill(outliers, torch.nan).float().reciprocal()
     valid = inverse.isfinite()
     near = size[0] <= OWN_SIZE * inverse.shape[-2] and size[1] <= OWN_SIZE * inverse.shape[-1]
     larger = any(n > m for n, m in zip(_size(inverse), size, strict=True))
@@ -202,13 +206,14 @@ def upsample_surface(
     lowest = inverse.nan_to_num(nan=torch.inf).amin()
     infinite = found.inverse <= 0  # but what is NaN has no depth
     inverse_hr = torch.where(infinite, lowest.to(found.inverse.device), found.inverse)
+    inverse_hr = within_measured(inverse_hr, inverse)
     if found.left_out is not None:
         inverse_hr = inverse_hr.masked_fill(found.left_out, torch.nan)
     spread, angle = found.spread, found.angle
     if spread is None or angle is None:
         spread, angle = expect_errors(inverse_hr, inverse.to(inverse_hr.device), camera)
     result = inverse_hr.reciprocal_()
-    surface = Surface(result, spread * result, angle, found.noise)
+    surface = Surface(result, spread * result, angle, found.noise, count_patches(outliers))
     if fill != "all" and not bool(valid.all()):
         focal = camera.fx * valid.shape[-1] / camera.width
         left = ~valid if fill == "none" else wide_holes(valid, max_hole / degrees_per_pixel(focal))

@@ -21,6 +21,9 @@ _SPARSE_FRACTION = 0.6
 """Fraction of holes above which whole numbers may come from a laser scanner."""
 _FAR_FOR_A_SENSOR = 10.0
 """Largest depth in metres of depth cameras that store millimetres."""
+_FULL, _NEARLY_FULL = 65000, 50000
+"""Whole numbers of 16 bits from the first on are a sensor's end, not a distance, if there are none from the second on
+up to it."""
 _FLOAT_MILLIMETRES = 200.0
 """Median above which floats are millimetres."""
 
@@ -82,8 +85,8 @@ def turn_back_bits(name: str, values: np.ndarray, bits: int) -> tuple[np.ndarray
 def find_holes(values: np.ndarray, hole_value: float | None) -> tuple[np.ndarray, float, list[Assumption]]:
     """Return where a stored map is missing, the value that most of its holes have, and the assumptions.
 
-    Whole numbers are holes at 0 and at the largest number of their type, floats at 0, below 0, at NaN and at
-    infinity, and both at ``hole_value``.
+    Whole numbers are holes at 0 and at the largest number of their type, those of 16 bits also from 65000 on if the
+    next smaller one is below 50000, floats at 0, below 0, at NaN and at infinity, and both at ``hole_value``.
 
     Args:
         values: (h, w) as stored.
@@ -93,6 +96,8 @@ def find_holes(values: np.ndarray, hole_value: float | None) -> tuple[np.ndarray
     if values.dtype.kind in "iu":
         largest = np.iinfo(values.dtype).max
         kinds = {"0": values == 0, "below 0": values < 0, str(largest): values == largest}
+        if values.dtype == np.uint16:
+            kinds[f"{_FULL} or more"] = _at_sensors_end(values)
     else:
         kinds = {
             "0": values == 0,
@@ -111,6 +116,13 @@ def find_holes(values: np.ndarray, hole_value: float | None) -> tuple[np.ndarray
         for name, fraction in found.items()
     ]
     return holes, _mark(values, found, hole_value), assumptions
+
+
+def _at_sensors_end(values: np.ndarray) -> np.ndarray:
+    """Return where values of 16 bits, but for the largest, are beyond any distance that the map has."""
+    full = (values >= _FULL) & (values < np.iinfo(np.uint16).max)
+    others = values[values < _FULL]
+    return full & bool(others.size and 0 < others.max() < _NEARLY_FULL)
 
 
 def _mark(values: np.ndarray, found: dict[str, float], hole_value: float | None) -> float:

@@ -80,6 +80,9 @@ def read_picture(pair: Pair, reading: Reading, units: FolderUnits | None = None)
     if reading.baseline is not None:
         camera = replace(camera, baseline=reading.baseline)
     hole_value = described.hole_value if reading.hole_value is None else reading.hole_value
+    bit_assumptions: list[Assumption] = []
+    if reading.turned_bits:
+        stored, bit_assumptions = turn_back_bits(str(pair.depth), stored, reading.turned_bits)
     holes, mark, hole_assumptions = find_holes(stored, hole_value)
     if pair.mask is not None:
         holes |= ~_mask(pair.mask, size_lr)
@@ -87,9 +90,6 @@ def read_picture(pair: Pair, reading: Reading, units: FolderUnits | None = None)
     if holes.all():
         raise ValueError(f"{pair.depth}: expected at least one known pixel, all are holes")
     range_type, range_assumptions = _range_type(pair, reading, described, camera)
-    if reading.turned_bits:
-        stored, bit_assumptions = turn_back_bits(str(pair.depth), stored, reading.turned_bits)
-        hole_assumptions += bit_assumptions
     guesses = FolderUnits() if units is None else units
     unit, unit_assumptions = _unit(pair, reading, described, range_type, stored, holes, guesses)
     encoding = Encoding(_suffix(pair), str(stored.dtype), unit, mark, range_type)
@@ -104,6 +104,7 @@ def read_picture(pair: Pair, reading: Reading, units: FolderUnits | None = None)
         *range_assumptions,
         *unit_assumptions,
         *hole_assumptions,
+        *bit_assumptions,
         *confidence_assumptions,
     )
     if rig is not None:

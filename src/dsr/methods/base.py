@@ -77,24 +77,32 @@ class MapNoise(NamedTuple):
     extent: float
 
 
+class Outliers(NamedTuple):
+    """Pixels of a low-resolution map that were taken for holes, and the number of patches that they form."""
+
+    pixels: int
+    patches: int
+
+
 class Surface(NamedTuple):
     """A result with its expected errors.
 
     ``depth`` (1, H, W): orthogonal depth in metres, NaN where missing. ``depth_error``, ``angle_error`` (1, H, W): the
     expected absolute error of the depth in metres and that of the normal in degrees; None for a method that does not
     say. Pixels that a method leaves out on purpose have errors and no depth. ``noise``: of the low-resolution map; None
-    for a method that does not estimate it.
+    for a method that does not estimate it. ``outliers``: what was taken for holes before the method saw the map.
     """
 
     depth: Tensor
     depth_error: Tensor | None = None
     angle_error: Tensor | None = None
     noise: MapNoise | None = None
+    outliers: Outliers | None = None
 
     def map(self, function: Callable[[Tensor], Tensor]) -> Surface:
         """Return the surface with a function applied to each of its maps."""
         depth_error, angle_error = (None if each is None else function(each) for each in self[1:3])
-        return Surface(function(self.depth), depth_error, angle_error, self.noise)
+        return self._replace(depth=function(self.depth), depth_error=depth_error, angle_error=angle_error)
 
     def error_arrays(self) -> dict[str, np.ndarray]:
         """Return the expected errors by name, (H, W) in half precision, as they are stored; empty without them."""

@@ -29,7 +29,7 @@ from dsr.io.encoding import Assumption
 from dsr.io.inputs import Picture, read_picture
 from dsr.io.pairs import Pair
 from dsr.io.units import FolderUnits
-from dsr.methods.base import MapNoise, Surface
+from dsr.methods.base import MapNoise, Outliers, Surface
 from dsr.utils.parsing import readable
 from dsr.utils.progress import Progress
 from dsr.utils.versions import package_versions
@@ -85,7 +85,7 @@ class FrameWork:
         if surface is None:
             surface = _upsample(job, picture, progress)
             reporter.facts(_describe(surface.noise, given="noise" in request.settings))
-            reporter.facts(_describe_holes(surface, request))
+            reporter.facts([*_describe_outliers(surface.outliers), *_describe_holes(surface, request)])
         seconds = time.perf_counter() - started
         facts = _write(job, picture, surface, planned, seconds)
         reporter.facts(facts)
@@ -178,6 +178,14 @@ def _describe(noise: MapNoise | None, *, given: bool) -> list[Assumption]:
     return [Assumption("noise of the depth map", f"about {1e3 * noise.deviation:.2g} mm{extent}; --noise overrides it")]
 
 
+def _describe_outliers(outliers: Outliers | None) -> list[Assumption]:
+    """Return a note on depth that was taken for holes, if there is any."""
+    if outliers is None or not outliers.pixels:
+        return []
+    text = "depth far from everything around it, or nearer than 5 cm, is taken for holes"
+    return [Assumption(text, f"pixels: {outliers.pixels}, patches: {outliers.patches}")]
+
+
 def _describe_holes(surface: Surface, request: UpsampleRequest) -> list[Assumption]:
     """Return a note on wide holes, if there are any."""
     share = float(surface.depth.isnan().float().mean())
@@ -196,6 +204,8 @@ def _write(job: _Job, picture: Picture, surface: Surface, planned: Plan, seconds
     files, facts, shapes = write_parts(job.target, picture, surface, request.wanted, encoding, title, request.limits)
     kept = job.earlier if job.earlier is not None and job.same else None
     counts = {**(kept.shapes if kept else {}), **{part: written._asdict() for part, written in shapes.items()}}
+    if surface.outliers is not None:
+        counts["outliers"] = surface.outliers._asdict()
     entries = {
         "inputs": job.inputs,
         "settings": job.settings,

@@ -60,7 +60,7 @@ class PreviousRun:
         settings, inputs: those of the run, as JSON has them.
         files: names of the files that it wrote.
         noise: that of its input, as JSON has it; None if it was not estimated.
-        shapes: numbers of points and triangles of its cloud and mesh.
+        shapes: numbers of points and triangles of its cloud and mesh, and of its outliers.
 
     """
 
@@ -111,7 +111,7 @@ def read_previous_run(folder: Path) -> PreviousRun | None:
             inputs,
             tuple(files),
             None if noise is None else dict(noise),
-            {part: entries[part] for part in ("cloud", "mesh") if part in entries},
+            {part: entries[part] for part in ("cloud", "mesh", "outliers") if part in entries},
         )
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise ValueError(f"{path}: expected a file of `dsr upsample`, got something else; take another -o") from error

@@ -1,0 +1,177 @@
+"""Depth that cannot be: what is taken for holes, what survives, and where results may lie."""
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from dsr.geometry.camera import Camera
+from dsr.inference import upsample_surface
+from dsr.inference.outliers import count_patches, find_outliers, within_measured
+
+HEIGHT, WIDTH = 96, 640
+FRAMES = {
+    "ddrnet": ("ddrnet/color_map/frame_000001.png", "ddrnet/depth_map/frame_000001.png", 90, 200),
+    "camera": ("depth_camera/0/rgb.png", "depth_camera/0/raw_depth.png", 230, 300),
+}
+"""Photo, depth in mm, and the upper left corner of a window."""
+WINDOW = 208
+
+
+def wall(depth=4.0):
+    """A tilted wall and a few holes, (1, h, w)."""
+    columns = torch.arange(WIDTH, dtype=torch.float32)
+    depth = (depth + 0.0005 * columns).expand(1, HEIGHT, WIDTH).clone()
+    depth[:, 80:90, 300:340] = torch.nan
+    return depth
+
+
+def removed(depth):
+    """Return what is found as row and column slices of its patches' bounding boxes."""
+    _, _, boxes, _ = cv2.connectedComponentsWithStats(find_outliers(depth)[0].numpy().astype(np.uint8))
+    return [(top, left, height, width) for left, top, width, height, _ in boxes[1:].tolist()]
+
+
+@pytest.mark.parametrize("value", [0.025, 0.5, 30.0, 65.5])
+def test_patches_far_from_all_around_them_are_found_to_the_pixel(value):
+    depth = wall()
+    depth[:, 10:16, 50:56] = value
+    depth[:, 0:20, 200:220] = max(value, 30.0)  # the largest, at the border
+    depth[:, 40, 400] = value
+    depth[:, 41, 401] = value
+    depth[:, 83:86, 305:309] = value  # in a hole
+    expected = (depth == value) | (depth == max(value, 30.0))
+    found = find_outliers(depth)
+    torch.testing.assert_close(found, expected)
+    assert count_patches(found) == (36 + 400 + 2 + 12, 4)
+    assert not find_outliers(wall()).any()
+
+
+def test_patch_that_is_too_large_or_not_far_enough_is_none():
+    depth = wall()
+    depth[:, 10:31, 50:70] = 0.5
+    depth[:, 10:16, 200:206] = 1.2
+    depth[:, 10:16, 400:406] = 15.0
+    assert not find_outliers(depth).any()
+
+
+def test_thin_things_survive():
+    depth = wall()
+    depth[:, 20:, 100:102] = 0.6  # a pole
+    for step in range(60):  # a wire of single pixels
+        depth[:, 10 + step, 200 + step] = 0.6
+    depth[:, 50:60, 0:9] = 0.6  # a finger from outside
+    depth[:, 90:, 400:] = 0.7  # a table, and the pieces of a lamp on it
+    for top in range(30, 80, 10):
+        depth[:, top : top + 6, 420:424] = 0.7
+    assert not find_outliers(depth).any()
+
+
+def test_gap_through_which_something_far_is_seen_survives_where_it_is_seen_elsewhere_too():
+    near = torch.full((1, HEIGHT, WIDTH), 0.9)
+    near[:, 40:46, 100:106] = 4.0
+    assert removed(near) == [(40, 100, 6, 6)]
+    near[:, :, 130:300] = 4.1
+    assert removed(near) == []
+
+
+def test_values_nearer_than_five_centimetres_are_holes_unless_the_map_is_of_near_things():
+    depth = wall()
+    depth[:, :, 600:] = 0.049  # larger than any patch
+    torch.testing.assert_close(find_outliers(depth), depth == 0.049)
+    assert not find_outliers(depth / 40).any()
+
+
+def test_patches_of_small_maps_are_smaller():
+    depth = torch.full((1, 60, 128), 4.0)
+    depth[:, 10:14, 10:14] = 0.5
+    depth[:, 30:35, 100:105] = 0.5
+    assert removed(depth) == [(10, 10, 4, 4)]
+
+
+@pytest.mark.parametrize("values", [[[1.0]], [[1.0, 9.0]], [[float("nan"), 2.0], [9.0, float("nan")]]])
+def test_tiny_maps_stay_as_they_are(values):
+    assert not find_outliers(torch.tensor([values])).any()
+
+
+@pytest.mark.parametrize("size", [(48, 64), (12, 16), (18, 24), (3, 4)])
+def test_planes_stay_planes_up_to_the_border_and_across_holes(size):
+    rows, columns = ((torch.arange(n, dtype=torch.float64) + 0.5) / n for n in (144, 192))
+    plane = (0.5 + 0.3 * rows[:, None] - 0.25 * columns)[None]
+    rows, columns = ((torch.arange(n, dtype=torch.float64) + 0.5) / n for n in size)
+    given = (0.5 + 0.3 * rows[:, None] - 0.25 * columns)[None]
+    assert torch.equal(within_measured(plane, given), plane)
+    h, w = size
+    given[:, h // 3 : h // 3 + max(h // 6, 1), w // 4 : w // 2] = torch.nan
+    given[:, :, : w // 12] = torch.nan
+    assert torch.equal(within_measured(plane, given), plane)
+
+
+def test_result_keeps_to_the_measured_values_around_it():
+    given = torch.full((1, 60, 200), 0.5)
+    given[:, :, 100:] = 0.9
+    given[:, 20:24, 30:36] = torch.nan  # a narrow hole
+    given[:, :, 185:] = torch.nan  # and a wide one, whose right end nothing is known of
+    result = given.nan_to_num(0.5)
+    for row, column, value in (
+        (5, 10, 40.0),
+        (22, 33, 0.001),
+        (6, 90, 5.0),
+        (6, 110, 0.01),
+        (7, 150, 1.4),
+        (8, 195, 3),
+    ):
+        result[0, row, column] = value
+    kept = within_measured(result, given)
+    expected = result.clone()
+    for row, column, value in ((5, 10, 0.5), (22, 33, 0.5), (6, 90, 1.1), (6, 110, 0.3), (7, 150, 0.9)):
+        expected[0, row, column] = value
+    torch.testing.assert_close(kept[..., :185], expected[..., :185], rtol=2e-3, atol=0)
+    assert within_measured(result, given[..., :1].expand_as(given).clone()).max() < 0.501
+    torch.testing.assert_close(within_measured(result, torch.full_like(given, torch.nan)), result)
+
+
+def test_result_is_at_most_twice_as_far_as_what_is_measured():
+    given = torch.full((1, 60, 60), 0.1)
+    given[:, :, 30:] = 2.0
+    kept = within_measured(torch.full_like(given, 1e-6), given)
+    torch.testing.assert_close(kept[0, 0, [10, 59]], torch.tensor([0.05, 2.0]), rtol=2e-3, atol=0)
+
+
+@pytest.fixture(scope="module", params=FRAMES)
+def frame(shared, request):
+    """A window of a real frame: photo, depth in metres, camera, and its result."""
+    *files, top, left = FRAMES[request.param]
+    photo, depth = (cv2.imread(str(shared / "real" / file), cv2.IMREAD_UNCHANGED) for file in files)
+    window = (slice(top, top + WINDOW), slice(left, left + WINDOW))
+    photo = torch.from_numpy(photo[window][..., ::-1].copy()).permute(2, 0, 1) / 255
+    depth = torch.from_numpy(depth[window].astype(np.float32))[None] / 1000
+    depth = depth.masked_fill(depth == 0, torch.nan)
+    camera = Camera(WINDOW, WINDOW, 536.6, 536.6, 310.6 - left, 234.8 - top)
+    return photo, depth, camera, upsample_surface(photo, depth, camera)
+
+
+def test_bad_patches_in_a_real_map_change_nothing_around_them(frame):
+    photo, depth, camera, clean = frame
+    assert clean.outliers == (0, 0)
+    places = np.argwhere(depth[0, 8:-14, 8:-14].isfinite().numpy()) + 8
+    bad, touched = depth.clone(), np.ones((WINDOW, WINDOW), np.uint8)
+    chosen = []
+    for row, column in np.random.default_rng(0).permutation(places).tolist():
+        if len(chosen) < 15 and all(max(abs(row - r), abs(column - c)) > 7 for r, c in chosen):
+            chosen.append((row, column))
+            bad[:, row : row + 6, column : column + 6] = (0.025, 65.5)[len(chosen) % 2]
+            touched[row : row + 6, column : column + 6] = 0
+    found = upsample_surface(photo, bad, camera)
+    assert found.outliers == (15 * 36, 15)
+    away = torch.from_numpy(cv2.distanceTransform(touched, cv2.DIST_L2, cv2.DIST_MASK_PRECISE))[None] > 12
+    both = away & clean.depth.isfinite() & found.depth.isfinite()
+    assert torch.equal(clean.depth.isfinite()[away], found.depth.isfinite()[away])
+    assert ((found.depth / clean.depth - 1).abs() > 0.01)[both].double().mean() < 1e-3
+    given = bad.masked_fill(torch.from_numpy(touched == 0)[None], torch.nan).reciprocal()
+    windows = torch.nn.functional.pad(given, (24,) * 4, value=torch.nan)[0].unfold(0, 49, 1).unfold(1, 49, 1)
+    low = windows.nan_to_num(torch.inf).amin((2, 3))[None]
+    high = windows.nan_to_num(-torch.inf).amax((2, 3))[None]
+    inverse, margin = found.depth.reciprocal(), (high - low) / 2 + 1e-5
+    outside = (inverse < low - margin) | (inverse > high + margin)
+    assert not (outside & high.isfinite())[inverse.isfinite()].any()

@@ -1,0 +1,136 @@
+"""Depth cameras by name and by the values of their maps, and the least error that their disparity allows."""
+
+import dataclasses
+import math
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from dsr.degradation.sensors import SENSORS, least_error, recognise, recognise_values
+
+BY_NAME = {each.name: each for each in SENSORS}
+FIGURES = ("stereo_constant", "step", "noise", "extent", "spread", "edges", "dark", "shiny", "clear")
+
+
+@pytest.mark.parametrize(
+    ("device", "name"),
+    [
+        ("Intel RealSense D435I", "RealSense D435"),
+        ("Intel RealSense D415", "RealSense D415"),
+        ("intel realsense d455", "RealSense D455"),
+        ("Intel RealSense L515", "RealSense L515"),
+        ("Azure Kinect 4K Camera", "Azure Kinect"),
+        ("Kinect for Azure", "Azure Kinect"),
+        ("Kinect for Windows v2", "Kinect v2"),
+        ("Xbox Kinect One", "Kinect v2"),
+        ("Xbox NUI Kinect", "Kinect v1"),
+        ("Kinect for Xbox 360", "Kinect v1"),
+        ("ASUS Xtion PRO LIVE", "Xtion"),
+        ("Orbbec Astra S", "Astra"),
+        ("OAK-D-LITE", None),
+        ("OAK-D", "OAK-D"),
+        ("OAK-D-PRO", "OAK-D"),
+        ("iPhone 14 Pro", "ARKit lidar"),
+        ("iPhone 12 Pro Max", "ARKit lidar"),
+        ("iPad Pro (11-inch)", "ARKit lidar"),
+        ("iPhone 14", None),
+        ("NIKON D4300", None),
+        ("Canon EOS 5D", None),
+        ("", None),
+    ],
+)
+def test_sensor_is_recognised_by_the_names_that_devices_state(device, name):
+    found = recognise(device)
+    assert (found and found.name) == name
+
+
+@pytest.mark.parametrize("name", BY_NAME)
+def test_each_figure_has_a_source_and_each_source_a_figure(name):
+    sensor = BY_NAME[name]
+    assert {each for each in FIGURES if getattr(sensor, each) is not None} == set(sensor.sources)
+    assert recognise(name) is sensor
+    numbers = (sensor.stereo_constant, sensor.step, sensor.noise, sensor.extent)
+    assert all(each is None or 0 < each < math.inf for each in numbers)
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        sensor.kind = "lidar"
+
+
+def test_least_error_is_that_of_the_disparity():
+    depth = torch.tensor([[0.5, 1.0, 4.0]])
+    camera = BY_NAME["RealSense D435"]
+    torch.testing.assert_close(least_error(camera, depth), depth**2 * (0.08 / 32))
+    rounded = BY_NAME["OAK-D"]
+    torch.testing.assert_close(least_error(rounded, depth), depth**2 / (8 * math.sqrt(12) * 0.075 * 882.5))
+    assert not least_error(BY_NAME["Azure Kinect"], depth).any()
+
+
+def test_noise_of_the_first_kinect_is_that_of_the_paper_far_away():
+    depth = torch.tensor(4.0)
+    assert float(least_error(BY_NAME["Kinect v1"], depth)) == pytest.approx(1.2e-3 + 1.9e-3 * 3.6**2, rel=0.2)
+
+
+def slanted(near, far):
+    """Return the inverse depth of a slanted wall, (480, 640)."""
+    rows, columns = np.mgrid[:480, :640]
+    return 1 / far + (1 / near - 1 / far) * (columns / 640 * 0.7 + rows / 480 * 0.3)
+
+
+def as_stored(depth, unit):
+    """Return depth rounded to a unit, (1, h, w)."""
+    return torch.from_numpy(np.round(depth / unit) * unit)[None].float()
+
+
+@pytest.mark.parametrize(("constant", "step"), [(43.5, 1 / 8), (33.7, 1 / 32), (66.2, 1 / 8), (43.5, 1.0)])
+@pytest.mark.parametrize("unit", [1e-3, 1e-4])
+def test_values_of_a_stereo_camera_tell_its_constant(constant, step, unit):
+    disparity = np.round(constant * slanted(0.5, 4.0) / step) * step
+    depth = as_stored(constant / disparity, unit)
+    depth[:, 100:150] = torch.nan
+    found = recognise_values(depth)
+    assert found is not None
+    assert found.constant == pytest.approx(constant / step, rel=1e-3)
+    assert 0.85 < found.confidence <= 1
+
+
+def test_steps_that_the_rounding_hides_are_not_seen():
+    disparity = np.round(33.7 * slanted(0.4, 0.7) * 32) / 32
+    assert recognise_values(as_stored(33.7 / disparity, 1e-3)) is None
+
+
+@pytest.mark.parametrize("unit", [1e-3, 1e-4])
+def test_other_maps_have_no_steps_of_disparity(unit):
+    rows, columns = np.mgrid[:480, :640]
+    smooth = 0.5 + 3.1 * np.sin(0.3 + columns / 700 + (rows / 900) ** 1.7) ** 2
+    noise = np.random.default_rng(0).normal(size=smooth.shape)
+    assert recognise_values(as_stored(smooth, unit)) is None
+    assert recognise_values(as_stored(smooth * (1 + 0.003 * noise), unit)) is None
+    filtered = cv2.GaussianBlur(np.round(348 / smooth + noise) / 348, (5, 5), 1.0)
+    assert recognise_values(as_stored(1 / filtered, unit)) is None
+    assert recognise_values(torch.full((1, 48, 64), torch.nan)) is None
+    assert recognise_values(torch.ones(1, 48, 64)) is None
+
+
+@pytest.mark.parametrize(
+    ("file", "unit", "constant"),
+    [
+        ("stereo_board/depth/8.png", 1e-3, 32 * 32.0),
+        ("stereo_board/depth/31.png", 1e-3, 32 * 32.0),
+        ("sunrgbd/open3d_sample/SUN_depth.png", 1e-3 / 8, 8 * 0.075 * 570.3),
+    ],
+)
+def test_values_of_real_cameras_tell_their_constants(shared, file, unit, constant):
+    stored = cv2.imread(str(shared / "real" / file), cv2.IMREAD_UNCHANGED)
+    depth = torch.from_numpy(stored.astype(np.float64) * unit)[None].float()
+    found = recognise_values(depth.masked_fill(depth == 0, torch.nan))
+    assert found is not None
+    assert found.constant == pytest.approx(constant, rel=0.003)
+
+
+@pytest.mark.parametrize(
+    "file", ["iphone_lidar/arkit_depth.png", "rgbdd_real/DepthLR/20200509112638_LR_fill_depth.png"]
+)
+def test_values_of_time_of_flight_tell_none(shared, file):
+    stored = cv2.imread(str(shared / "real" / file), cv2.IMREAD_UNCHANGED)
+    assert recognise_values(torch.from_numpy(stored.astype(np.float32))[None] / 1000) is None
