@@ -3,9 +3,9 @@
     python benchmarks/any_map.py --shared DIR WEIGHTS... [--parts clean,kernels,noise,sensor,phone,field]
         [--hints] [--device cpu]
 
-``WEIGHTS`` are of trainings of ``model=facets``. Figures with _v are in 1/1000, of the worst of four lights; one pass
-without augmentation. ``--hints`` tells the network what ``eval.py`` does, the kernel and that there is no noise, where
-that holds, and ``edges=soft`` on the field's benchmarks.
+``WEIGHTS`` are of trainings of ``model=facets``. Figures with _v are in 1/1000, DSSIM_v and LPIPS_v of the worst light;
+one pass without augmentation. ``--hints`` tells the network what ``eval.py`` does, the kernel and that there is no
+noise, where that holds, and ``edges=soft`` on the field's benchmarks.
 """
 
 from __future__ import annotations

@@ -3,8 +3,8 @@
     python benchmarks/grain.py --scenes DIR [--method facets] [--scale 4] [--levels 0,0.0001,0.0002,0.0005]
         [--device cpu]
 
-Noise is normal, its standard deviation a fraction of the depth. Prints a Markdown table; metrics with _v are the worst
-of four lights. LPIPS_v needs AlexNet's weights, see docs/evaluate.md.
+Noise is normal, its standard deviation a fraction of the depth. Prints a Markdown table; metrics with _v but RMSE_v
+are of the worst of four lights. LPIPS_v needs AlexNet's weights, see docs/evaluate.md.
 """
 
 from __future__ import annotations

@@ -140,11 +140,11 @@ def polycam(folder):
     return folder
 
 
-def arkitscenes(folder):
+def arkitscenes(folder, start=10.0):
     """Write a video of ARKitScenes whose last frame has no pose, and whose intrinsics are a millisecond off."""
     lines = []
     for number in range(FRAMES):
-        time = 10 + 0.1 * number
+        time = start + 0.1 * number
         stem = f"41069021_{time:.3f}"
         save(folder / "lowres_wide" / f"{stem}.png", photo(number))
         save(folder / "lowres_depth" / f"{stem}.png", millimetres(number))

@@ -7,6 +7,7 @@ import time
 
 import pytest
 import torch
+from torch.utils.data import DataLoader
 
 from dsr.degradation.downsampling import Downsampling
 from dsr.evaluation.predict import Evaluation, StalePredictionError, predict
@@ -15,9 +16,10 @@ from dsr.evaluation.sharing import ALONE, Workers, choose_workers
 from dsr.geometry.camera import Camera
 from dsr.methods.base import NoSolutionError
 from dsr.metrics.catalogue import catalogue
+from dsr.report.work import Work
 from dsr.sample import Scene
 from dsr.utils import interruption
-from dsr.utils.forks import Forks
+from dsr.utils.pool import Pool
 from dsr.utils.progress import SILENT, Progress
 
 SCENES = [f"scene{number}" for number in range(6)]
@@ -182,7 +184,7 @@ def test_overwriting_again_computes_again(tmp_path):
     assert len(calls(tmp_path / "log")) == 2 * len(SCENES)
 
 
-def test_forks_try_again_what_somebody_else_has(tmp_path):
+def test_workers_try_again_what_somebody_else_has(tmp_path):
     def work(item):
         file = tmp_path / item
         if not file.exists():
@@ -190,33 +192,91 @@ def test_forks_try_again_what_somebody_else_has(tmp_path):
             return None
         return item.upper()
 
-    with Forks(2, work, lambda item: "lost", lambda line: None) as forks:
-        assert sorted(forks.results(["a", "b", "c"])) == [("a", "A"), ("b", "B"), ("c", "C")]
+    with Pool(2, work, lambda item: "lost") as pool:
+        assert sorted(pool.results(["a", "b", "c"])) == [("a", "A"), ("b", "B"), ("c", "C")]
 
 
 def test_worker_that_stops_at_a_signal_ends_without_a_word_and_another_begins_again(tmp_path, capfd):
     def work(item):
         if not (tmp_path / item).exists():
             (tmp_path / item).touch()
-            with interruption.deferred("") as noted:
+            with interruption.deferred(str) as noted:
                 os.kill(os.getpid(), signal.SIGTERM)  # as of a scheduler, to all processes
                 assert noted.requested
             raise KeyboardInterrupt("saved")
         return item.upper()
 
     told = Told()
-    with Forks(1, work, lambda item: "lost", told.say) as forks:
-        assert list(forks.results(["a"])) == [("a", "A")]
+    with Pool(1, work, lambda item: "lost", told.say) as pool:
+        assert list(pool.results(["a"])) == [("a", "A")]
     assert told.lines == ["a: the worker was ended before it had a result; another one begins it again"]
     assert capfd.readouterr().err == ""
 
 
-def test_forks_end_with_their_context():
-    with Forks(2, lambda _: os.getpid(), lambda _: 0, lambda line: None) as forks:
-        processes = {answer for _, answer in forks.results(range(8))}
+def test_workers_end_with_their_context():
+    with Pool(2, lambda _: os.getpid(), lambda _: 0) as pool:
+        processes = {answer for _, answer in pool.results(range(8))}
     for process in processes:
         with pytest.raises(ProcessLookupError):
             os.kill(process, 0)
+
+
+def draw(_, number):
+    """Compute for a report; at 3 the first process that tries is killed."""
+    if number is not None and number[0] == 3 and not number[1].exists():
+        if number[1].parent.exists():
+            number[1].touch()
+        os.kill(os.getpid(), signal.SIGKILL)
+    return None if number is None else number[0]
+
+
+def test_part_of_a_report_whose_worker_is_killed_is_drawn_by_another(tmp_path):
+    items = [None, *((number, tmp_path / "killed") for number in range(6))]
+    with Work(object(), 2) as work:
+        values, others = work.map(draw, items), work.map(draw, items[::-1])
+        assert list(others) == [5, 4, 3, 2, 1, 0, None]
+        assert list(values) == [None, 0, 1, 2, 3, 4, 5]
+    assert (tmp_path / "killed").exists()
+
+
+def test_part_of_a_report_that_kills_its_workers_is_an_error(tmp_path):
+    with Work(object(), 2) as work, pytest.raises(ChildProcessError, match="two workers ended"):
+        list(work.map(draw, [(3, tmp_path / "no folder" / "mark")]))
+
+
+@pytest.fixture
+def threads_have_computed():
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    compute()
+    yield
+    torch.set_num_threads(before)
+
+
+def compute(*_):
+    """Compute with all threads that torch has."""
+    torch.linspace(0, 1, 1 << 20).sort()
+    torch.nn.functional.conv2d(torch.ones(1, 8, 128, 128), torch.ones(8, 8, 3, 3))
+    return torch.get_num_threads()
+
+
+@pytest.mark.usefixtures("threads_have_computed")
+@pytest.mark.parametrize("threads", [1, 2, None])
+def test_workers_compute_where_several_threads_have_computed_before(tmp_path, threads):
+    for name in ("first", "second"):  # whose workers are forked after threads were started anew
+        study = study_of(tmp_path / f"{name}.log", compute)
+        assert evaluate(study, tmp_path / name, Workers(2, threads)).made == SCENES
+        assert len({process for _, process in calls(tmp_path / f"{name}.log")}) == 2
+        assert compute() == 2
+
+
+@pytest.mark.usefixtures("threads_have_computed")
+def test_forks_of_the_user_and_of_data_loaders_compute_where_several_threads_have_computed_before():
+    with multiprocessing.get_context("fork").Pool(2) as pool:
+        assert pool.map(compute, range(4)) == [2] * 4
+    compute()
+    loader = DataLoader(range(4), num_workers=2, collate_fn=compute, multiprocessing_context="fork")
+    assert list(loader) == [1] * 4
 
 
 @pytest.mark.parametrize(

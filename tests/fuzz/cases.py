@@ -54,6 +54,8 @@ class Cases:
         self.folder = Path(tempfile.mkdtemp(prefix="dsr-fuzz-", dir=above))
         self._seed = seed
         os.environ["DSR_CACHE"] = str(self.folder / "cache")
+        (self.folder / "etc").mkdir()
+        (self.folder / "etc" / "passwd").touch()  # ../../etc/passwd from the folder of a case's files
 
     def run(self, number: int, keep: Path | None = None) -> Case:
         """Run a case, in the working directory, which should be an empty one.

@@ -1,4 +1,4 @@
-"""What a reader must not do: execute what a file says, start a process, connect, or write outside of its folders.
+"""What a reader must not do: execute what a file says, start a process, connect, read or write outside of its folders.
 
 Python tells an audit hook of such things (https://docs.python.org/3/library/audit_events.html). A hook cannot be
 removed, so there is one for the process, which looks only while a case runs.
@@ -35,7 +35,7 @@ class Watch:
     """What was seen while a case ran.
 
     Args:
-        allowed: folders below which files may be written.
+        allowed: folders below which files may be written, and that no name in a file may lead out of.
         seen: what was done that must not be.
 
     """
@@ -55,6 +55,13 @@ class Watch:
             for path in _paths(event, arguments):
                 if not self._may(event, path):
                     self.seen.append(f"{event} of {path!r:.200}")
+        elif event == "open" and any(map(self._leads_out, _paths(event, arguments))):
+            self.seen.append(f"reads {arguments[0]!r:.200}, to which a name in a file leads")
+
+    def _leads_out(self, path: str) -> bool:
+        """Return whether a path begins in a folder that is read or written, and leads out of it."""
+        full = os.path.abspath(path)  # noqa: PTH100 - as below
+        return path.startswith(self.allowed) and not full.startswith(self.allowed)
 
     def _may(self, event: str, path: str) -> bool:
         """Return whether a file may be written."""

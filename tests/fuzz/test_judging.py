@@ -58,6 +58,7 @@ BAD = {
     "imports": (lambda _: __import__("importlib").import_module(MARK), f"imports {MARK}"),
     "runs": (lambda _: exec(f"{MARK} = 1"), "executes code of a file"),
     "writes": (lambda place: (place.root.parent / "x").write_text("x"), "open of"),
+    "reads": (lambda place: (place.input / "../../x").read_bytes(), "reads '"),
     "removes": (lambda place: (place.root.parent / "y").unlink(missing_ok=True), "os.remove of"),
     "prints": (lambda _: os.write(2, b"libpng error"), "prints libpng error"),
     "warns": (lambda _: warnings.warn("overflow", RuntimeWarning, stacklevel=1), "warns: overflow"),

@@ -17,8 +17,8 @@ from dsr.cli import main
 from dsr.data.formats.files import CameraFile, read_camera
 from dsr.geometry.camera import Camera
 from dsr.io.cameras import read_any_camera
-from dsr.io.encoding import parse_unit
 from dsr.io.poses import read_poses, read_transform
+from dsr.io.reading import parse_unit
 from dsr.utils.console import one_line
 from fuzz.values import NUMBERS
 

@@ -137,7 +137,7 @@ def _word(random: Random, text: str, canary: Path) -> bytes:
         return b"x"
     each = random.choice(found)
     value = random.choice(
-        (*values.NUMBERS, *values.RAW, str(canary), "../" * 9 + "etc/passwd", "\0", "\x1b[2J", "%00", "a" * 300)
+        (*values.NUMBERS, *values.RAW, *values.OUTSIDE, str(canary), "\0", "\x1b[2J", "%00", "a" * 300)
     )
     return (text[: each.start()] + value + text[each.end() :]).encode(errors="replace")
 

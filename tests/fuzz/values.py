@@ -30,6 +30,8 @@ NUMBERS = (
     "1e19", "4294967296", "18446744073709551616", "0x1p3", "1_0", "1,5", "٣", "--1", "1e", "3.", ".", "x" * 10_000,
     "2147483647", "1e7",
 )  # fmt: skip
+OUTSIDE = ("../" * 9 + "etc/passwd", "../../etc/passwd", "..\\..\\etc\\passwd", "C:\\etc\\passwd")
+"""Names of files outside of the folder of a case."""
 TARGETS = (
     "os.system", "os.mkdir", "subprocess.run", "subprocess.Popen", "builtins.exec", "builtins.eval", "shutil.rmtree",
     "pathlib.Path", f"{MARK}.run", f"{MARK}", "dsr.cli.main", "dsr.methods", "dsr.nowhere.X", "..", "a b.c", ".x", "x.",

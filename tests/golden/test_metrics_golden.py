@@ -20,7 +20,9 @@ from dsr.degradation.downsampling import Downsampling, make_sample
 from dsr.geometry.camera import Camera, from_range
 from dsr.methods.classical.interpolation import Interpolation
 from dsr.metrics.catalogue import Score, catalogue, score_image
+from dsr.metrics.formats import in_tables
 from dsr.metrics.lpips import LPIPS, load_lpips
+from dsr.report.tables import published_row
 from dsr.sample import Scene
 
 METHODS = {"Bicubic": None, "MSG-V": "msg_v", "MSG": "msg"}
@@ -80,3 +82,21 @@ def test_metrics_equal_the_golden_file(shared: Path, network: LPIPS, method: str
     rows = {(score.metric, score.variant): score for score in scores}
     _check(expected, rows)
     assert {round(row.valid_share, 9) for row in rows.values()} == {round((COVERED[method] / 512) ** 2, 9)}
+
+
+@pytest.mark.parametrize(("scene", "scale"), [("lucy", 4), ("plant", 8)])
+def test_interpolation_over_triangles_has_the_papers_scores_of_bicubic(
+    shared: Path, network: LPIPS, scene: str, scale: int
+) -> None:
+    loaded = _scene(shared, scene)
+    assert loaded.depth is not None
+    sample = make_sample(loaded, scale, Downsampling("box"), Interpolation.range_type)
+    scores = score_image(Interpolation("clough_tocher")(sample), loaded.depth, loaded.camera.rays(), catalogue(network))
+    paper = published_row(scene, "Bicubic", scale)
+    assert paper is not None
+    formats = in_tables({metric.name: metric.format for metric in catalogue(network)})
+    found = {row.metric: formats[row.metric].factor * row.value for row in scores
+             if row.metric in formats and row.variant in ("", "max")}  # fmt: skip
+    compared = {name: value for name, value in found.items() if name in paper}
+    assert len(compared) == 7
+    assert compared == pytest.approx({name: float(paper[name]) for name in compared}, rel=0.015)

@@ -66,7 +66,7 @@ def test_real_scenes_of_several_datasets_are_evaluated_by_one_command(run, tmp_p
     assert scores.groupby("dataset")["scene"].nunique().to_dict() == {"icl": 2, "sunrgbd": 2}
     assert scores["value"].notna().all()
     assert scores[scores["metric"] == "RMSE_d"]["valid_share"].between(0.6, 1).all()
-    pictures = sorted(path.stem for path in tmp_path.glob("outputs/eval/icl*/pictures/*.png"))
+    pictures = sorted(path.stem for path in tmp_path.glob("outputs/eval/*_icl*/pictures/*.png"))
     assert pictures == ["living", "office_0000"]
 
 

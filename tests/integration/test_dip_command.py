@@ -21,6 +21,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from dsr.app.entry import run_command
 from dsr.app.evaluate import evaluate
+from dsr.utils import interruption
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 QUICK = (
@@ -83,7 +84,7 @@ def test_cost_of_each_scene_is_announced_and_the_run_ends_in_a_table(
     assert (done.returncode, done.stderr) == (0, "")
     for scene in ("statue", "cube_no_texture"):
         assert re.search(rf"^{scene}: 40 steps at 48 x 48 in (float32|bfloat16); about \d+ s \(", done.stdout, re.M)
-        scores = r"RMSE_d 0\.\d+  RMSE_v 0\.\d+  DSSIM_v 0\.\d+"
+        scores = r"RMSE_d \d+\.\d mm  RMSE_v \d+\.\d  DSSIM_v \d+\.\d"
         assert re.search(rf"^{scene}: step +40  loss \d\.\d+  validation: {scores}$", done.stdout, re.M)
         assert re.search(rf"^predict {scene}: \d of 2, \d+\.\d s, elapsed 0:\d\d:\d\d, remaining", done.stdout, re.M)
     assert "DIP-V on simgeo, x4, box downsampling" in done.stdout
@@ -111,9 +112,10 @@ def test_log_has_the_losses_all_scores_and_renderings(
     assert {"train/loss", "train/data_lap1", "train/mse_v", "train/intensity", "val/DSSIM_v", "val/RMSE_v"} <= names
     assert [event.step for event in log.Scalars("val/RMSE_v")] == [20, 40]
     assert [event.step for event in log.Images("renderings")] == [20, 40]
+    assert [event.step for event in log.Scalars("train/loss")] == [10, 20, 30, 40]
     logged = log.Scalars("val/RMSE_v")[-1].value
     [scored] = [row for row in _rows(home) if (row["scene"], row["metric"]) == ("statue", "RMSE_v")]
-    assert logged == pytest.approx(float(scored["value"]), rel=1e-4)
+    assert logged == pytest.approx(1000 * float(scored["value"]), rel=1e-4)
     table = (home / "optimisation" / "statue" / "validation.csv").read_text()
     assert "40,val,DSSIM_v," in table
 
@@ -157,6 +159,62 @@ def test_interrupted_run_resumes_within_the_image(tmp_path: Path, run: Run) -> N
     assert run(tmp_path, *arguments, "output_dir=whole")[0] == 0
     assert np.array_equal(_depth(tmp_path / "out", "statue"), _depth(tmp_path / "whole", "statue"))
     assert not (tmp_path / "out" / "optimisation" / "statue" / "last.ckpt").exists()
+
+
+SLOW = """
+import os, signal, sys, time
+sys.path.insert(0, {source!r})
+from dsr.methods.dip.optimisation import PriorOptimisation
+from dsr.utils import interruption
+
+interruption._GRACE = 1.5
+step = PriorOptimisation.training_step
+
+def slow(self, *batch):
+    loss = step(self, *batch)
+    if self.global_step == 2:
+        for number in {numbers}:
+            os.kill({process}(), number)
+            time.sleep(0.1)
+        time.sleep(4)
+    return loss
+
+PriorOptimisation.training_step = slow
+if __name__ == "__main__":
+    interruption.start("dsr.app.entry", "run_eval")
+"""
+
+
+@pytest.mark.parametrize(
+    ("numbers", "workers", "end"),
+    [
+        ((signal.SIGINT,), 1, "interrupted at step 3 of statue; the same command goes on from there"),
+        ((signal.SIGINT,), 2, interruption.MESSAGE),
+        ((signal.SIGINT, signal.SIGINT), 1, "interrupted before the first checkpoint; the same command begins this "),
+        ((signal.SIGTERM,), 1, "interrupted before the first checkpoint; the same command begins this again, "),
+    ],
+)
+def test_step_longer_than_the_grace_is_saved_at_ctrl_c_and_no_checkpoint_named_that_is_not_there(
+    tmp_path: Path, numbers: tuple[int, ...], workers: int, end: str
+) -> None:
+    (tmp_path / "slow.py").write_text(
+        SLOW.format(
+            source=str(REPOSITORY / "src"), numbers=tuple(map(int, numbers)),
+            process="os.getpid" if workers == 1 else "os.getppid",
+        )
+    )  # fmt: skip
+    scenes = "dataset.scenes=[statue]" if workers == 1 else "dataset.scenes=[statue,cube_no_texture]"
+    arguments = ("method=dip_v", scenes, f"workers={workers}", "output_dir=out")
+    done = run_python(str(tmp_path / "slow.py"), *QUICK, *arguments, cwd=tmp_path)
+    assert done.returncode == 128 + numbers[0], done.stderr
+    *told, line = done.stderr.splitlines()
+    assert line.startswith(end)
+    saved = [torch.load(path, weights_only=True)["global_step"] for path in (tmp_path / "out").rglob("last.ckpt")]
+    if numbers == (signal.SIGINT,):
+        assert told == ["stopping after this step (Ctrl-C again stops at once)"]
+        assert 3 in saved
+    else:
+        assert (told, saved) == ([], [])
 
 
 def test_oracle_is_named_in_scores_and_table(tmp_path: Path, run: Run) -> None:

@@ -126,7 +126,7 @@ def default_run(tmp_path_factory, offline):
 def test_default_run_succeeds_and_names_its_results(default_run):
     _, home, done = default_run
     assert done.returncode == 0, done.stderr
-    assert home.name.startswith("simgeo_box_x4_bicubic_")
+    assert home.name.startswith("bicubic_x4_simgeo_size64")
     assert done.stdout.splitlines()[-1] == f"results: outputs/eval/{home.name}"
     assert "statue" in done.stdout
     assert "mean" in done.stdout
@@ -240,9 +240,8 @@ def test_multirun_writes_a_directory_per_combination(tmp_path, offline):
     assert done.returncode == 0, done.stderr
     assert done.stderr.count("LPIPS_v is left out") == 1
     folders = sorted((tmp_path / "outputs" / "eval").iterdir())
-    stems = [folder.name.rpartition("_")[0] for folder in folders]
-    assert stems == sorted(
-        f"{data}_box_x{scale}_{method}"
+    assert [folder.name.rpartition("_seed0-")[0] for folder in folders] == sorted(
+        f"{method}_x{scale}_{data}_root-my-data_scenes-lucy"
         for data in ("simgeo", "folder")
         for scale in (4, 8)
         for method in ("bicubic", "nearest")
@@ -413,7 +412,7 @@ def test_default_method_is_msg_v_with_packaged_weights(tmp_path, offline):
     done = run_python(str(REPOSITORY / "eval.py"), *arguments, cwd=tmp_path, env=offline)
     assert (done.returncode, done.stderr) == (0, "")
     [home] = (tmp_path / "outputs" / "eval").iterdir()
-    assert home.name.startswith("simgeo_box_x4_msg_v_")
+    assert home.name.startswith("msg_v_x4_simgeo_")
     assert run(tmp_path, offline, *arguments, "output_dir=bicubic").returncode == 0
     ours, theirs = (
         json.loads((folder / "summary.json").read_text())["mean"] for folder in (home, tmp_path / "bicubic")
@@ -456,7 +455,7 @@ def test_measured_map_of_any_size_is_upsampled_at_its_own_ratio(tmp_path, within
     assert (code, errors) == (0, [])
     assert f"Bicubic on folder, x{ratio}, measured downsampling" in output
     (folder,) = (tmp_path / "outputs" / "eval").iterdir()
-    assert folder.name.startswith(f"folder_measured_x{ratio}_bicubic_")
+    assert folder.name.startswith(f"bicubic_x{ratio}_folder_measured_")
     with (folder / "scores.csv").open(newline="") as file:
         assert {row["scale"] for row in csv.DictReader(file)} == {ratio}
     with np.load(folder / "predictions" / "a.npz") as kept:

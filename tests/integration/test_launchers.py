@@ -58,7 +58,7 @@ def eventful(config):
     if config.seed == 2:
         os.kill(os.getpid(), signal.SIGKILL)
     if config.seed == 3 and len(Path("begun-3").read_text().splitlines()) == 1:
-        with interruption.deferred("") as noted:
+        with interruption.deferred(str) as noted:
             os.kill(os.getpid(), signal.SIGTERM)  # as some clusters do before
             assert not noted.requested
             os.kill(os.getpid(), signal.SIGUSR2)

@@ -138,6 +138,21 @@ def column(page, table, number):
     )
 
 
+def test_labels_of_bars_are_whole(make_run, tmp_path, opened):
+    labels = ["DIP-V (steps=300, widths=[8, 16])", "DIP-V (steps=600, widths=[8, 16])"]
+    for number, label in enumerate(labels):
+        make_run(tmp_path / str(number), method="dip_v", label=label, scenes=SCENES[:1], size=SIZE)
+    save_page(tmp_path / "index.html", load_results([tmp_path]), title="A report")
+    page = opened((tmp_path / "index.html").as_uri(), pictures=False)
+    for size in (DESKTOP, {"width": 390, "height": 800}):
+        page.set_viewport_size(size)
+        shown = page.evaluate(
+            "[...document.querySelectorAll('.chart')[0].querySelectorAll('.label')]"
+            ".map((label) => [label.innerText, label.scrollWidth <= label.clientWidth])"
+        )
+        assert shown == [[label, True] for label in labels]
+
+
 def test_both_sides_show_the_renderings_of_the_protocol_under_every_light(opened, results):
     page = opened()
     choose(page, "left", "MSG-V")

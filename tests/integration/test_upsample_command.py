@@ -429,6 +429,12 @@ def test_a_wrong_noise_is_refused(pair, tmp_path, capsys, options, message):
     assert not (tmp_path / "out").exists()
 
 
+def test_setting_of_a_trained_network_is_taken(pair, tmp_path):
+    out = tmp_path / "out"
+    assert of(pair, out, "--method", "facets_box", "--set", "ensemble=1", "--only", "depth") == 0
+    assert info(out)["settings"]["set"] == {"ensemble": 1}
+
+
 def test_what_is_likely_to_be_wrong_is_left_out_of_the_mesh(pair, tmp_path, capsys):
     assert of(pair, tmp_path / "all", "--only", "mesh,depth", "--max-error", "1000") == 0
     assert "left out of cloud and mesh" not in capsys.readouterr().out

@@ -50,8 +50,7 @@ import ray
 
 from dsr.app.upsample.ray_data import upsample_frames
 from dsr.app.upsample.request import UpsampleRequest
-from dsr.io.cameras import CameraChoice
-from dsr.io.inputs import Reading
+from dsr.io.reading import CameraChoice, Reading
 
 ray.init("local", num_cpus=2, include_dashboard=False)
 request = UpsampleRequest(

@@ -14,6 +14,7 @@ from dsr.metrics.formats import in_tables
 from dsr.report import correlation_figure
 from dsr.report.correlation_figure import density_of, save_scatter_matrix, scatter_matrix
 from dsr.report.correlations import correlate, metric_matrix, pairs, with_reference, write_correlations
+from dsr.report.tables import published
 from dsr.viz.palette import FIXED, method_colours
 
 VARIANTS = ("e1", "e2", "e3", "e4", "max", "avg")
@@ -113,6 +114,17 @@ def test_correlation_files_hold_the_tables(tmp_path):
     again = pd.read_csv(paths[1], index_col="metric")
     pd.testing.assert_frame_equal(again, correlate(metric_matrix(RESULTS), "spearman"), check_names=False)
     assert "| metric" in paths[-1].read_text(encoding="utf-8")
+
+
+def test_correlations_in_the_papers_tables_stand_beside_ours(tmp_path):
+    ranking = pd.read_csv(write_correlations(tmp_path, RESULTS)[-2], index_col="metric")
+    paper = published()[~published()["scene"].str.startswith("Average")]
+    assert ranking.loc["DSSIM_v", "paper_n"] == len(paper) == 315
+    expected = stats.spearmanr(paper["DSSIM_v"], paper["LPIPS_v"]).statistic
+    assert ranking.loc["DSSIM_v", "paper_spearman"] == pytest.approx(expected)
+    depth = stats.pearsonr(paper["RMSE_d"].clip(upper=500), paper["LPIPS_v"]).statistic
+    assert ranking.loc["RMSE_d", "paper_pearson"] == pytest.approx(depth)
+    assert math.isnan(ranking.loc["DSSIM_v[e2]", "paper_pearson"])
 
 
 def test_missing_lpips_leaves_the_rest_and_one_line_says_so(tmp_path, monkeypatch):

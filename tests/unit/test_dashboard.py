@@ -15,7 +15,9 @@ from tensorboard.plugins.hparams import plugin_data_pb2
 from dsr.evaluation.run_files import load_results
 from dsr.evaluation.store import sample_path
 from dsr.geometry.shading import render
+from dsr.metrics.catalogue import METRICS
 from dsr.report.dashboard import save_dashboard
+from dsr.utils.runs_table import SCORES
 from dsr.viz.canvas import HOLE_COLOUR
 from dsr.viz.panels import normals_seen_by
 
@@ -48,38 +50,45 @@ def test_scalars_are_the_scores_in_table_units(log, tmp_path):
         number: pytest.approx(1000 * scores["DSSIM_v", f"e{number}", "a"]) for number in (1, 2, 3, 4)
     }
     mean = 1000 * (scores["RMSE_v", "", "a"] + scores["RMSE_v", "", "b"]) / 2
-    assert scalars(log, "mean/RMSE_v") == {0: pytest.approx(mean)}
+    assert scalars(log, "score/RMSE_v") == {0: pytest.approx(mean)}
 
 
 def test_layout_begins_with_the_metrics_of_looks_as_that_of_trainings_does(log):
     content = log.Tensors("custom_scalars__config__")[0].tensor_proto.string_val[0]
     layout = layout_pb2.Layout.FromString(content)
     charts = {category.title: [chart.title for chart in category.chart] for category in layout.category}
-    assert list(charts)[:2] == ["Looks, worst of four lights, simgeo", "Depth and normals, simgeo"]
-    assert charts["Looks, worst of four lights, simgeo"] == ["RMSE_v", "DSSIM_v", "BadPix_v_5"]
-    assert charts["Depth and normals, simgeo"] == ["RMSE_d", "BadPix_d_5cm", "Bumpiness_d"]
-    assert charts["By light, e1 to e4, simgeo"] == ["DSSIM_v", "BadPix_v_5"]
+    assert list(charts)[:2] == ["Looks, simgeo", "Depth and normals, simgeo"]
+    assert charts["Looks, simgeo"] == [
+        "RMSE_v (1/1000)",
+        "RMSE_v1 (1/1000), worst light",
+        "DSSIM_v (1/1000), worst light",
+        "BadPix_v (5, %), worst light",
+    ]
+    assert charts["Depth and normals, simgeo"] == ["RMSE_d (mm)", "BadPix_d (5 cm, %)", "Bump_d"]
+    assert charts["By light, e1 to e4, simgeo"] == ["RMSE_v1 (1/1000)", "DSSIM_v (1/1000)", "BadPix_v (5, %)"]
     tags = set(log.Tags()["scalars"])
-    for category in layout.category[:2]:
-        for chart in category.chart:
-            (pattern,) = chart.multiline.tag
-            assert [tag for tag in tags if re.match(pattern, tag)] == [f"scene/{chart.title}/simgeo"]
+    names = ["RMSE_v", "RMSE_v1", "DSSIM_v", "BadPix_v_5", "RMSE_d", "BadPix_d_5cm", "Bumpiness_d"]
+    for name, chart in zip(names, [chart for category in layout.category[:2] for chart in category.chart], strict=True):
+        (pattern,) = chart.multiline.tag
+        assert [tag for tag in tags if re.match(pattern, tag)] == [f"scene/{name}/simgeo"]
 
 
-def test_table_of_runs_has_the_method_and_its_settings(make_run, tmp_path):
+def test_table_of_runs_has_the_columns_of_all_kinds_of_runs(make_run, tmp_path):
     folder = make_run(tmp_path, scenes=("s",), scale=2)
     versions = json.loads((folder / "versions.json").read_text())
-    versions["identity"]["method"] |= {"steps": 600, "w": 1.0, "widths": [1, 2], "target": "dsr.x"}
+    versions["identity"]["method"] |= {"steps": 600, "w": 1.5, "widths": [1, 2], "target": "dsr.x"}
     (folder / "versions.json").write_text(json.dumps(versions))
     save_dashboard(folder)
     content = read(folder).SummaryMetadata("_hparams_/session_start_info").plugin_data.content
     start = plugin_data_pb2.HParamsPluginData.FromString(content).session_start_info
     values = {key: value.string_value or value.number_value for key, value in start.hparams.items()}
-    assert values["method"] == "Bicubic"
-    assert values["scale"] == 2
-    assert values["method.steps"] == 600
-    assert values["method.w"] == 1
-    assert "method.target" not in values
+    assert values == {"method": "Bicubic", "scale": 2, "w": "1.5", "dataset": "simgeo", "degradation": "box", "seed": 0,
+                      "steps": "600", "kind": "evaluation"}  # fmt: skip
+
+
+def test_table_of_runs_has_the_headings_of_tables():
+    metrics = {metric.name: metric for metric in METRICS}
+    assert {name: metrics[name].format.chart_title(by_light=metrics[name].per_light) for name in SCORES} == SCORES
 
 
 def test_picture_has_renderings_of_the_result_above_those_of_the_truth(log, tmp_path):
@@ -135,7 +144,7 @@ def test_second_log_replaces_the_first(make_run, tmp_path):
     save_dashboard(tmp_path)
     assert len(list(tmp_path.glob("events*"))) == 1
     assert not list(tmp_path.glob(".tensorboard*"))
-    assert len(read(tmp_path).Scalars("mean/RMSE_v")) == 1
+    assert len(read(tmp_path).Scalars("score/RMSE_v")) == 1
 
 
 def test_scene_that_is_not_stored_has_scores_and_no_picture(make_run, tmp_path):

@@ -73,6 +73,7 @@ def test_every_setting_of_deep_image_priors_is_in_conf():
         "workspace",
         "display",
         "lpips_trunk",
+        "about",
     }  # of the run, not of the method
     assert defaults_of(DeepImagePrior).keys() - own == read_method("dip", 4).keys() - {"name", "label", "target"}
 

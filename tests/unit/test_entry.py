@@ -4,6 +4,7 @@ import math
 import sys
 
 import pytest
+from hydra.core.hydra_config import HydraConfig
 from hydra.core.plugins import Plugins
 
 from dsr.app.entry import run_command
@@ -16,8 +17,8 @@ def command(monkeypatch, tmp_path, capfd):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("HYDRA_FULL_ERROR", "1")
 
-    def run(*arguments, job=None):
-        monkeypatch.setattr(sys, "argv", ["eval.py", *arguments])
+    def run(*arguments, job=None, check=None, name="eval"):
+        monkeypatch.setattr(sys, "argv", [f"{name}.py", *arguments])
         seen = []
 
         def remember(config):
@@ -26,7 +27,7 @@ def command(monkeypatch, tmp_path, capfd):
 
         code = 0
         try:
-            run_command("eval", remember)
+            run_command(name, remember, check=check)
         except SystemExit as ended:
             code = ended.code
         return code, capfd.readouterr().err, seen
@@ -63,13 +64,13 @@ USAGE_ERRORS = {
         "downsampling=boxx: unknown; expected one of bicubic, bilinear, box, gaussian, measured, nearest"
     ),
     "metrics=none": "metrics=none: unknown; expected one of field, paper, sensor",
-    "datset=folder": f"datset: unknown key; expected {SETTINGS}",
-    "scal=8": f"scal: unknown key; expected {SETTINGS}",
-    "lpips=false": f"lpips: unknown key; expected {SETTINGS}",
-    "dataset.rot=x": "dataset.rot: unknown key; expected dataset.name, dataset.root, dataset.scenes, dataset.size",
-    "metrics.lpip=false": (
-        "metrics.lpip: unknown key; expected metrics.protocols, metrics.lpips, metrics.lpips_trunk, metrics.extra"
-    ),
+    "datset=folder": "datset: unknown key; expected dataset=folder",
+    "scal=8": "scal: unknown key; expected scale=8",
+    "lpips=false": "lpips: unknown key; expected metrics.lpips=false",
+    "colour=8": f"colour: unknown key; expected {SETTINGS}",
+    "dataset.rot=x": "dataset.rot: unknown key; expected dataset.root=x",
+    "dataset.photo=x": "dataset.photo: unknown key; expected dataset.name, dataset.root, dataset.scenes, dataset.size",
+    "metrics.lpip=false": "metrics.lpip: unknown key; expected metrics.lpips=false",
     "seed=four": "seed: Value 'four' of type 'str' could not be converted to Integer",
     "seed=1.5": "seed: Value '1.5' of type 'float' could not be converted to Integer",
     "overwrite=maybe": "overwrite: Value 'maybe' is not a valid bool (type str)",
@@ -84,14 +85,28 @@ USAGE_ERRORS = {
         "dataset.scenes: cannot read the value [ünï,b]; special characters need quotes within quotes: "
         '\'dataset.scenes=["ünï","b"]\''
     ),
-    "method=msg,msg_v": (
-        "method: got several values; -m runs each of them, method=[msg,msg_v] is a list, 'method=\"msg,msg_v\"' a text"
+    "method=msg,msg_v": "method: got several values; -m runs each of them",
+    "metrics.protocols=paper,field": (
+        "metrics.protocols: got several values; -m runs each of them, metrics.protocols=[paper,field] is a list, "
+        "'metrics.protocols=\"paper,field\"' a text"
     ),
+    "downsampling=[box,nearest]": (
+        "downsampling=[box,nearest]: expected one choice, got a list; -m downsampling=A,B runs each of several"
+    ),
+    "dataset=[ simgeo , icl ]": (
+        "dataset=[ simgeo , icl ]: expected one choice, got a list; -m dataset=A,B runs each of several"
+    ),
+    "method=[]": "method=[]: expected one choice, got a list; -m method=A,B runs each of several",
+    "metrics=[field]": "metrics=[field]: expected one choice, got a list; -m metrics=A,B runs each of several",
+    "hydra/launcher=[joblib,basic]": "hydra/launcher=[joblib,basic]: expected one choice, got a list",
     "--config-name=other": "--config-name other: unknown; expected eval",
     "--config-dir=nowhere": "--config-dir: expected a directory, got nowhere",
     "+experiment=papers": f"experiment=papers: unknown; expected one of {EXPERIMENTS}",
     "experiment=paper_tables": f"experiment: write +experiment=NAME, NAME one of {EXPERIMENTS}",
-    "model=msg": f"model: unknown key; expected {SETTINGS}",
+    "model=msg": "model: unknown key; expected method=msg",
+    "model=vgg": f"model: unknown key; expected {SETTINGS}",
+    "trainer=smoke": "trainer: unknown key; expected trainer=smoke of train.py",
+    "w=2": "w: unknown key; expected method.w=2 with method=dip, dip_v, dip_v_warm",
     "--resolve": "--resolve: expected with --cfg job, which shows the configuration",
     "=3": "'=3': expected KEY=VALUE",
     "+=3": "'+=3': expected KEY=VALUE",
@@ -110,11 +125,40 @@ def test_usage_error_is_one_line_with_the_key_and_the_choices(command, tmp_path,
 
 
 def test_mistyped_key_of_a_group_is_compared_with_the_keys_of_that_group(command):
-    code, error, _ = command("dataset=folder", "dataset.rot=x")
+    code, error, _ = command("dataset=folder", "dataset.picture=x")
     assert (code, error) == (
         2,
-        "error: dataset.rot: unknown key; expected dataset.name, dataset.root, dataset.scenes\n",
+        "error: dataset.picture: unknown key; expected dataset.name, dataset.root, dataset.scenes\n",
     )
+
+
+@pytest.mark.parametrize(
+    ("name", "arguments", "meant"),
+    [
+        ("eval", ("method=dip_v", "loss.w=2"), "method.w=2"),
+        ("eval", ("method=dip_v", "steps=100"), "method.steps=100"),
+        ("eval", ("loss.visual=dssim",), "method.visual=dssim with method=dip, dip_v, dip_v_warm"),
+        ("train", ("w=2",), "loss.w=2"),
+        ("train", ("method.w=2",), "loss.w=2"),
+        ("train", ("method=msg_v",), "model=msg_v"),
+        ("train", ("method=tgv",), "method=tgv of eval.py"),
+        ("train", ("steps=100",), "trainer.steps=100"),
+        ("train", ("lr=1e-3",), "trainer.learning_rate=1e-3"),
+        ("train", ("logger.mode=offline",), "logger.wandb.mode=offline with logger=wandb"),
+        ("train", ("logger=[csv,wandb]", "logger.mode=offline"), "logger.wandb.mode=offline"),
+    ],
+)
+def test_key_that_is_elsewhere_is_named_with_its_place(command, name, arguments, meant):
+    code, error, seen = command(*arguments, name=name)
+    key = arguments[-1].partition("=")[0]
+    assert (code, error, seen) == (2, f"error: {key}: unknown key; expected {meant}\n", [])
+
+
+def test_method_that_is_no_network_to_train_is_one_of_the_other_command(command):
+    code, error, _ = command("model=dip_v", name="train")
+    assert (code, error) == (
+        2, "error: model=dip_v: expected a network to train, dip_v is none; eval.py has method=dip_v\n"
+    )  # fmt: skip
 
 
 @pytest.mark.parametrize("quoted", ['output_dir="a=b"', "output_dir='a=b'"])
@@ -179,6 +223,36 @@ def test_failing_job_of_a_multirun_keeps_the_others_and_sets_the_exit_code(comma
     assert [config.scale for config in seen] == [2, 4, 8]
 
 
+def test_job_that_cannot_be_run_keeps_the_jobs_launched_with_it_from_beginning(command, tmp_path):
+    def check(config):
+        if config.scale == 8:
+            raise ConfigError("scale: not this one")
+        return []
+
+    code, error, seen = command("-m", "scale=2,4,8", check=check)
+    assert (code, seen) == (2, [])
+    lines = ["error: 1 of 3 jobs cannot be run, so none is begun", "error: scale=8: scale: not this one"]
+    assert error.splitlines() == lines
+    assert list(tmp_path.iterdir()) == []
+    code, error, seen = command("-m", "scale=2,4,8,16", "hydra.sweeper.max_batch_size=2", check=check)
+    assert (code, [config.scale for config in seen]) == (2, [2, 4])
+    assert error.splitlines()[0] == "error: 1 of 2 jobs cannot be run, so none is begun"
+
+
+def test_check_of_a_job_sees_its_configuration_as_the_job_does(command):
+    checked = []
+
+    def check(config):
+        checked.append((config, list(HydraConfig.get().overrides.task), HydraConfig.get().job.num))
+        return []
+
+    code, _, seen = command("-m", "scale=2,4", check=check)
+    assert code == 0
+    assert [config for config, _, _ in checked] == seen
+    assert [given for _, given, _ in checked] == [["scale=2"], ["scale=4"]]
+    assert [number for _, _, number in checked] == [0, 1]
+
+
 @pytest.mark.slow
 def test_jobs_that_fail_in_processes_of_a_launcher_are_told(command):
     def job(config):
@@ -233,7 +307,7 @@ def test_config_dir_adds_choices(command, tmp_path):
     choices = METHODS.replace("msg,", "mine, msg,")
     assert (code, error) == (2, f"error: method=mein: unknown; expected one of {choices}\n")
     code, error, _ = command("-cd", "own", "method=mine", "method.strenth=2")
-    assert (code, error) == (2, "error: method.strenth: unknown key; expected method.name, method.strength\n")
+    assert (code, error) == (2, "error: method.strenth: unknown key; expected method.strength=2\n")
 
 
 def test_run_command_takes_arguments_and_the_process_keeps_its_own(monkeypatch, tmp_path):

@@ -15,8 +15,8 @@ from torch import Tensor
 import dsr
 from dsr.geometry.camera import Camera
 from dsr.geometry.resampling import resize_inverse_depth
+from dsr.inference import MethodChoice, check_settings, plan, upsample_depth, upsample_surface
 from dsr.inference import api as people
-from dsr.inference import plan, upsample_depth, upsample_surface
 from dsr.inference.engine import _resize_nearest, enlarged_by
 from dsr.inference.planning import OWN_SIZE
 from dsr.methods.registry import find_weights, list_methods, read_method
@@ -203,6 +203,18 @@ def test_arrays_and_tensors_give_the_same_result() -> None:
     np.testing.assert_allclose(floats, of_arrays, rtol=1e-4)
 
 
+def test_arrays_with_negative_strides_are_taken_as_they_read() -> None:
+    camera = _camera(24, 32)
+    photo = (_photo(24, 32).permute(1, 2, 0).numpy() * 255).astype(np.uint8)
+    depth = _plane(12, 16, camera)[0].float().numpy()
+    mask = np.ones_like(depth, dtype=bool)
+    mask[2, 3] = False
+    flipped = [np.flip(np.flip(each).copy()) for each in (photo, depth, mask)]
+    assert all(min(each.strides) < 0 for each in flipped)
+    plain, other = (dsr.upsample(rgb, z, camera, mask=m) for rgb, z, m in ((photo, depth, mask), flipped))
+    np.testing.assert_array_equal(other, plain)
+
+
 def test_result_without_any_depth_is_refused_rather_than_filled(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(
         "dsr.methods.classical.interpolation.Interpolation.interpolate",
@@ -288,6 +300,13 @@ def test_settings_change_the_result_and_are_checked() -> None:
     ):
         with pytest.raises(ValueError, match=f"^{message}"):
             dsr.upsample(_photo(32, 32), depth, camera, method="tgv", **settings)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("method", [name for name in list_methods() if "ensemble" in read_method(name, 4)])
+def test_settings_of_every_trained_network_are_checked_at_a_factor_that_has_weights(method: str) -> None:
+    check_settings(MethodChoice(method, {"ensemble": 1}))
+    with pytest.raises(ValueError, match=r"^ensemble: "):
+        check_settings(MethodChoice(method, {"ensemble": 3}))
 
 
 def test_plan_states_the_time_of_slow_methods() -> None:

@@ -166,5 +166,7 @@ def test_interpolation_works_on_perspective_depth() -> None:
 
 
 def test_unknown_order_is_refused() -> None:
-    with pytest.raises(ValueError, match=r"^order: expected one of nearest, bilinear, bicubic, got 'cubic'"):
+    with pytest.raises(
+        ValueError, match=r"^order: expected one of nearest, bilinear, bicubic, clough_tocher, got 'cubic'"
+    ):
         Interpolation("cubic")  # type: ignore[arg-type]

@@ -29,15 +29,15 @@ CASES = {
         "READY\ninterruption._GRACE = 0.3\nwith working():\n    try: time.sleep(60)\n    finally: time.sleep(60)"
     ),
     "deferred, and not acted upon": (
-        "interruption._GRACE = 0.3\nwith working(), deferred('see the checkpoint'):\n"
+        "interruption._GRACE = 0.3\nwith working(), deferred(lambda: 'see the checkpoint'):\n"
         "    READY\n    while True: time.sleep(0.01)"
     ),
 }
 
 
 def script_of(case: str) -> str:
-    """Return a module that runs a case in its function ``main``."""
-    body = CASES[case].replace("READY", READY).replace("\n", "\n    ")
+    """Return a module that runs a case, or other lines, in its function ``main``."""
+    body = CASES.get(case, case).replace("READY", READY).replace("\n", "\n    ")
     return (
         "import time\nfrom dsr.utils import interruption\nfrom dsr.utils.interruption import deferred, working\n"
         f"def main():\n    {body}\n"
@@ -66,7 +66,7 @@ def run(folder: Path, main: str, *numbers: int) -> tuple[int, str, float]:
 
 @pytest.mark.parametrize("case", CASES)
 def test_signal_ends_the_process_in_one_line(case: str, tmp_path: Path) -> None:
-    number = signal.SIGTERM if case == "in an import" else signal.SIGINT
+    number = signal.SIGTERM if case.startswith(("in an import", "deferred")) else signal.SIGINT
     code, errors, seconds = run(tmp_path, script_of(case), number)
     assert code == 128 + number
     assert errors == ("see the checkpoint\n" if case.startswith("deferred") else f"{MESSAGE}\n")
@@ -83,10 +83,42 @@ def test_second_signal_ends_the_process_at_once(tmp_path: Path) -> None:
 def test_deferred_signal_is_acted_upon_by_the_work(tmp_path: Path) -> None:
     script = (
         "import sys, time\nfrom dsr.utils.interruption import deferred, stop, working\ndef main():\n"
-        "    with working(), deferred('late') as noted:\n        print('ready', flush=True)\n"
+        "    with working(), deferred(lambda: 'late') as noted:\n        print('ready', flush=True)\n"
         "        while not noted.requested: time.sleep(0.01)\n        stop('saved')\n"
     )
     assert run(tmp_path, script, signal.SIGTERM)[:2] == (143, "saved\n")
+
+
+def test_step_that_ctrl_c_has_met_is_done_however_long_it_takes(tmp_path: Path) -> None:
+    step = (
+        "interruption._GRACE = 0.2\n"
+        "interruption._SILENCE = 0.5\n"
+        "with working(), deferred(lambda: 'late') as noted:\n"
+        "    READY\n"
+        "    until = time.monotonic() + 2\n"
+        "    while time.monotonic() < until: pass\n"
+        "    interruption.stop('saved' if noted.requested else 'not told')"
+    )
+    told = "stopping after this step (Ctrl-C again stops at once)\n"
+    script = script_of(step)
+    assert run(tmp_path, script, signal.SIGINT)[:2] == (130, f"{told}saved\n")
+    code, errors, seconds = run(tmp_path, script.replace("+ 2", "+ 60"), signal.SIGINT, signal.SIGINT)
+    assert (code, errors) == (130, "late\n")
+    assert seconds < 5
+
+
+def test_cleaning_up_after_a_step_that_ctrl_c_has_met_takes_only_seconds(tmp_path: Path) -> None:
+    step = (
+        "interruption._GRACE = 0.3\n"
+        "with working():\n"
+        "    with deferred(lambda: 'late') as noted:\n"
+        "        READY\n"
+        "        while not noted.requested: pass\n"
+        "    time.sleep(60)"
+    )
+    code, errors, seconds = run(tmp_path, script_of(step), signal.SIGINT)
+    assert (code, errors) == (130, f"{MESSAGE}\n")
+    assert seconds < 5
 
 
 def test_exit_code_and_output_of_a_command_are_kept(tmp_path: Path) -> None:
@@ -96,7 +128,7 @@ def test_exit_code_and_output_of_a_command_are_kept(tmp_path: Path) -> None:
 
 def test_signals_of_the_host_process_are_its_own_again_after_a_deferral() -> None:
     before = signal.getsignal(signal.SIGTERM)
-    with interruption.deferred("not shown") as noted:
+    with interruption.deferred(lambda: "not shown") as noted:
         assert not noted.requested
         signal.raise_signal(signal.SIGTERM)
         assert noted.requested

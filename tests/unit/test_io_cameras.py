@@ -8,8 +8,9 @@ import pytest
 from PIL import Image
 
 from dsr.geometry.camera import Camera
-from dsr.io.cameras import CameraChoice, find_camera
+from dsr.io.cameras import find_camera
 from dsr.io.photos import read_photo
+from dsr.io.reading import CameraChoice
 
 SIZE, COARSE = (48, 64), (12, 16)
 OWN = {"width": 64, "height": 48, "fx": 60.0, "fy": 61.0, "cx": 31.0, "cy": 24.0}

@@ -7,7 +7,8 @@ import pytest
 import torch
 
 from dsr.geometry.camera import Camera
-from dsr.io.encoding import Encoding, decode, encode, find_holes, guess_unit, parse_unit
+from dsr.io.encoding import Encoding, decode, encode, find_holes, guess_unit
+from dsr.io.reading import parse_unit
 
 CAMERA = Camera(4, 3, 5.0, 6.0, 1.0, 1.5, baseline=0.1)
 

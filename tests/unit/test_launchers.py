@@ -178,7 +178,7 @@ def test_job_that_has_to_leave_is_interrupted_and_then_requeued(requeues):
 
 def test_job_that_has_to_leave_first_saves_what_it_defers(requeues):
     def job():
-        with interruption.requeued(), interruption.deferred("") as noted:
+        with interruption.requeued(), interruption.deferred(str) as noted:
             os.kill(os.getpid(), signal.SIGTERM)
             assert not noted.requested
             os.kill(os.getpid(), signal.SIGUSR2)

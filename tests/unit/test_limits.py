@@ -27,9 +27,10 @@ from dsr.io.captures import ros, video
 from dsr.io.captures.record3d import find_record3d
 from dsr.io.depth_files import read_depth_file
 from dsr.io.input_files import read_input
-from dsr.io.inputs import Reading, read_picture
+from dsr.io.inputs import read_picture
 from dsr.io.pairs import Pair
 from dsr.io.photos import read_photo
+from dsr.io.reading import Reading
 from dsr.methods.networks.trained import NETWORKS, packaged_weights
 from dsr.methods.networks.weight_files import load_network, read_torch_file
 from dsr.sample import DepthSample
@@ -251,7 +252,7 @@ def test_pipe_in_the_place_of_a_file_is_refused_rather_than_waited_for(tmp_path)
         read_limited(tmp_path / "x.json")
 
 
-def test_record_of_exports_removes_nothing_outside_of_them(tmp_path):
+def test_record_of_exports_that_names_files_elsewhere_is_refused_and_nothing_removed(tmp_path):
     (tmp_path / "mine.txt").write_text("mine")
     output = tmp_path / "out"
     output.mkdir()
@@ -265,5 +266,6 @@ def test_record_of_exports_removes_nothing_outside_of_them(tmp_path):
     info = {"complete": True, "files": [], "camera": camera, "pose": np.eye(4).tolist()}
     (frame / "info.json").write_text(json.dumps(info))
     result = write_scene(output, {"frame": frame}, ("nerfstudio", "open3d"), overwrite=True)
-    assert set(result.files) == {"nerfstudio", "open3d"}, result.problems
+    assert not result.files
+    assert f"{output}/exports.json: exports.transforms.json: expected a name within {output}" in result.problems[0]
     assert (tmp_path / "mine.txt").read_text() == "mine"

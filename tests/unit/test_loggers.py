@@ -2,6 +2,7 @@
 
 import csv
 import importlib.util
+import re
 
 import pytest
 import torch
@@ -34,21 +35,29 @@ def test_table_has_a_row_for_each_step_and_goes_on_after_an_interruption(tmp_pat
     again = loggers.csv(tmp_path)
     again.log_metrics({"train/loss": 0.125}, 19)  # done again
     again.finalize("success")
-    assert rows_of(tmp_path) == [
-        {"step": "9", "train/loss": "0.5", "val/RMSE_v": "0.25"}, {"step": "19", "train/loss": "0.125"}
-    ]  # fmt: skip
+    both = [{"step": "9", "train/loss": "0.5", "val/RMSE_v": "0.25"}, {"step": "19", "train/loss": "0.125"}]
+    assert rows_of(tmp_path) == both
+    last = loggers.csv(tmp_path)
+    last.log_metrics({"val/RMSE_v": 0.5}, 19)  # of a training that was interrupted during a validation
+    last.finalize("success")
+    assert rows_of(tmp_path) == [both[0], {**both[1], "val/RMSE_v": "0.5"}]
 
 
-def test_layout_of_tensorboard_begins_with_the_worst_of_four_lights(tmp_path):
+def test_layout_of_tensorboard_begins_with_looks(tmp_path):
     logger = loggers.tensorboard(tmp_path)
-    log_layout(logger, ["BadPix_v_5", "RMSE_d", "LPIPS_v", "RMSE_v1", "DSSIM_v", "RMSE_v"])
+    names = ("BadPix_v_5", "RMSE_d", "LPIPS_v", "RMSE_v1", "DSSIM_v", "RMSE_v")
+    log_layout(logger, {name: f"{name}, title" for name in names})
     logger.finalize("success")
     events = EventAccumulator(str(tmp_path / "tensorboard"), size_guidance={"tensors": 0}).Reload()
     layout = layout_pb2.Layout.FromString(events.Tensors("custom_scalars__config__")[0].tensor_proto.string_val[0])
     charts = {category.title: [chart.title for chart in category.chart] for category in layout.category}
-    assert list(charts) == ["Looks, worst of four lights", "Depth and normals", "Training"]
-    assert charts["Looks, worst of four lights"] == ["RMSE_v", "DSSIM_v", "LPIPS_v", "BadPix_v_5", "RMSE_v1"]
-    assert charts["Depth and normals"] == ["RMSE_d"]
+    assert list(charts) == ["Looks", "Depth and normals", "Training"]
+    assert charts["Looks"] == [f"{name}, title" for name in ("RMSE_v", "RMSE_v1", "DSSIM_v", "LPIPS_v", "BadPix_v_5")]
+    assert charts["Depth and normals"] == ["RMSE_d, title"]
+    [tag] = layout.category[0].chart[0].multiline.tag
+    shown = ("val/RMSE_v", "bicubic/RMSE_v", "val_a/RMSE_v", "bicubic_a/RMSE_v")
+    assert all(re.match(tag, name) for name in shown)
+    assert not any(re.match(tag, name) for name in ("val/RMSE_v1", "bicubic/RMSE_d"))
 
 
 def test_run_of_mlflow_has_values_settings_and_pictures_and_goes_on(tmp_path, monkeypatch):
@@ -61,10 +70,10 @@ def test_run_of_mlflow_has_values_settings_and_pictures_and_goes_on(tmp_path, mo
     for value, step in ((0.5, 9), (0.25, 19)):
         logger = loggers.mlflow(tmp_path)
         logger.log_metrics({"train/loss": value}, step)
-    log_settings(logger, {}, "", {"scale": 4, "model": {"name": "msg_v"}})
+    log_settings(logger, {}, {"scale": 4, "model": {"name": "msg_v"}})
     log_picture(logger, "renderings/a_0", torch.zeros(3, 8, 8, dtype=torch.uint8), 20)
     client = MlflowClient((tmp_path / "mlruns").as_uri())
-    number = (tmp_path / "logger_run.txt").read_text().strip()
+    number = (tmp_path / "mlflow_run.txt").read_text().strip()
     assert [(each.step, each.value) for each in client.get_metric_history(number, "train/loss")] == [
         (9, 0.5), (19, 0.25)
     ]  # fmt: skip
@@ -79,7 +88,7 @@ def test_run_of_wandb_without_the_service_is_in_files_of_the_run(tmp_path, monke
     logger.log_metrics({"train/loss": 0.5}, 9)
     log_picture(logger, "renderings/a_0", torch.zeros(3, 8, 8, dtype=torch.uint8), 20)
     logger.finalize("success")
-    number = (tmp_path / "logger_run.txt").read_text().strip()
+    number = (tmp_path / "wandb_run.txt").read_text().strip()
     [folder] = (tmp_path / "wandb").glob("offline-run-*")
     assert (folder / f"run-{number}.wandb").stat().st_size > 0
     assert len(list(folder.glob("files/media/images/renderings/*.png"))) == 1

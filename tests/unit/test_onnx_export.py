@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from dsr.app.export import ExportRequest
+from dsr.app.requests import ExportRequest
 from dsr.cli import main
 from dsr.methods.networks.ddrnet import DDRNet
 from dsr.methods.networks.dg import DynamicGuidance

@@ -315,15 +315,18 @@ def test_mean_over_fewer_scenes_is_labelled_with_their_number(make_run, tmp_path
     assert counts["Mine"]["RMSE_d"] == 1
 
 
-def test_published_values_stand_with_the_papers_scenes_and_recreated_ones_are_starred(make_run, tmp_path):
-    make_run(tmp_path / "runs" / "a", scenes=("cube_no_texture",))
-    make_run(tmp_path / "runs" / "b", scenes=("lucy", "mine"), dataset="folder")
+def test_published_values_stand_with_the_papers_own_scenes_alone(make_run, tmp_path):
+    make_run(tmp_path / "runs" / "a", scenes=("lucy", "cube_no_texture"), size=512)
+    make_run(tmp_path / "runs" / "b", scenes=("lucy",), downsampling="nearest", size=512)
+    make_run(tmp_path / "runs" / "c", scenes=("lucy",), scale=8, size=64)
     _, data, _ = saved(tmp_path, load_results([tmp_path / "runs"]))
-    rows = {row["scene"]: row for problem in data["problems"] for row in problem["rows"]}
-    assert rows["lucy"]["paper"]["RMSE_d"] == 72
-    assert not rows["lucy"]["starred"]
-    assert rows["cube_no_texture"]["starred"]
-    assert rows["mine"]["paper"] == {}
+    papers = {
+        (problem["downsampling"], problem["scale"], row["scene"]): row["paper"]
+        for problem in data["problems"]
+        for row in problem["rows"]
+    }
+    assert papers.pop(("box", 4, "lucy"))["RMSE_d"] == 72
+    assert papers == {("box", 4, "cube_no_texture"): {}, ("nearest", 4, "lucy"): {}, ("box", 8, "lucy"): {}}
 
 
 def test_run_without_stored_scenes_has_tables_and_says_why_no_pictures(make_run, tmp_path):

@@ -1,16 +1,18 @@
 """Scores in the units of the paper's tables, beside what the paper says."""
 
 import io
-import itertools
 import math
+from pathlib import Path
 
+import numpy as np
 import pandas as pd
 import pytest
 from rich.console import Console
 
+from dsr.evaluation.results import Run
 from dsr.metrics.catalogue import KNOWN_FORMATS
 from dsr.metrics.formats import in_tables
-from dsr.report.tables import RECREATED, in_shown_units, published, published_row, score_table
+from dsr.report.tables import in_shown_units, published, published_row, score_table
 
 RAW = {
     "RMSE_d": 0.0704,
@@ -54,9 +56,13 @@ def scores(*scenes, raw=RAW, downsampling="box", scale=4):
     return pd.DataFrame(rows)
 
 
-def text(table, label="Bicubic"):
+def text(table, label="Bicubic", *, folder=Path("none"), range_type=None, **dataset):
+    first = table.iloc[0]
+    settings = {"dataset": dataset, "downsampling": {"range_type": range_type}}
+    about = (str(first["dataset"]), int(first["scale"]), str(first["downsampling"]), 0, label.lower(), label)
+    run = Run(folder, *about, table, {}, settings, {}, tuple(table["scene"].unique()))
     console = Console(width=120, file=io.StringIO())
-    console.print(score_table(table, label, KNOWN_FORMATS))
+    console.print(score_table(run, KNOWN_FORMATS))
     return console.file.getvalue()
 
 
@@ -99,13 +105,6 @@ def test_scene_that_the_paper_lacks_is_not_found(scene, method, scale):
     assert published_row(scene, method, scale) is None
 
 
-def test_recreated_scenes_are_all_in_the_paper():
-    for scene, method, scale in itertools.product(RECREATED, ("Bicubic", "MSG", "MSG-V"), (4, 8)):
-        found = published_row(scene, method, scale)
-        assert found is not None
-        assert math.isfinite(found["RMSE_d"])
-
-
 def test_published_values_have_no_duplicate_row():
     assert not published().duplicated(["scene", "method", "scale"]).any()
 
@@ -125,10 +124,29 @@ def test_published_values_stand_below_ours_in_the_same_units():
     assert "*" not in printed
 
 
-def test_published_values_of_a_recreated_scene_are_starred_and_explained():
-    printed = text(scores("cube_no_texture"))
-    assert row(printed, [], "paper*")
-    assert "* of the paper's own file" in printed
+def test_published_values_do_not_stand_beside_recreated_scenes_or_other_frames():
+    assert "paper" not in text(scores("cube_no_texture", "sphere_cylinder_low_freq"))
+    assert "paper" not in text(scores("plant").assign(dataset="icl"))
+
+
+@pytest.mark.parametrize("settings", [{"size": 64}, {"range_type": "disparity"}, {"crop": 0.0}], ids=str)
+def test_published_values_are_hidden_under_other_settings(settings):
+    assert "paper" not in text(scores("lucy"), **settings)
+    assert "paper" in text(scores("lucy"), size=512, crop=0.5)
+
+
+@pytest.mark.parametrize("size", [512, 64])
+def test_published_values_stand_beside_the_papers_files_in_a_folder_at_their_own_size(tmp_path, size):
+    (tmp_path / "predictions").mkdir()
+    np.savez_compressed(tmp_path / "predictions" / "plant.npz", depth=np.ones((size, size), np.float32))
+    table = scores("plant", "sofa").assign(dataset="mine")
+    printed = text(table, folder=tmp_path, target="dsr.data.folder.Folder")
+    assert printed.count("paper") == (size == 512)
+
+
+def test_implementation_other_than_the_papers_is_named():
+    assert "PDN: dsr's own implementation" in text(scores("lucy"), "PDN")
+    assert "own implementation" not in text(scores("statue"), "PDN") + text(scores("lucy"), "MSG-V")
 
 
 @pytest.mark.parametrize("downsampling", ["nearest", "measured", "gaussian"])
@@ -157,12 +175,6 @@ def test_published_average_stands_below_the_mean_of_all_scenes():
     assert lines[place + 1].split()[:2] == ["paper", f"{average['RMSE_d'].item():.1f}"]
     six = seven[seven["scene"] != "vintage"]
     assert text(six).split("mean")[1].count("paper") == 0
-
-
-def test_row_is_starred_where_frames_may_differ_from_the_papers():
-    table = scores("coat_rack")
-    table["dataset"] = "icl"
-    assert row(text(table), [], "paper*")
 
 
 def test_unknown_value_is_a_dash_and_left_out_of_the_mean():

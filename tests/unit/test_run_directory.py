@@ -2,6 +2,7 @@
 
 import importlib.metadata
 import json
+import re
 
 import pytest
 import torch
@@ -10,6 +11,7 @@ from omegaconf import OmegaConf
 
 import dsr
 from dsr.app import run_directory as rundir
+from dsr.app.composition import compose
 from dsr.app.run_directory import (
     PREDICTING_CODE,
     claim,
@@ -19,8 +21,10 @@ from dsr.app.run_directory import (
     folder_of,
     identity_of,
 )
+from dsr.app.schema import plain_config
 from dsr.utils import hashing
 from dsr.utils.builder import ConfigError
+from dsr.utils.config_files import config_directories
 from dsr.utils.hashing import file_hash, hash_of_code
 from dsr.utils.versions import package_versions, versions
 
@@ -51,11 +55,69 @@ def claimed(folder, plain, weights="abc"):
     claim(folder, plain, identity_of(plain, weights, CPU))
 
 
+@pytest.fixture(autouse=True)
+def _own_folder(tmp_path_factory, monkeypatch):
+    monkeypatch.chdir(tmp_path_factory.mktemp("work"))
+
+
+def composed(kind, *overrides):
+    return plain_config(compose(kind, overrides, config_directories()))
+
+
+def name_of(kind, *overrides):
+    plain = composed(kind, *overrides)
+    return default_directory(kind, plain, identity_of(plain, None, CPU)).name
+
+
+@pytest.mark.parametrize(
+    ("kind", "overrides", "name"),
+    [
+        ("train", "model=msg_v scale=8", "msg_v_x8_seed0"),
+        ("train", "model=msg_v scale=8 loss.w=0.72", "msg_v_x8_w0.72_seed0"),
+        ("train", "model=msg loss.w=auto seed=3", "msg_x4_seed3"),
+        ("train", "trainer=smoke trainer.steps=4 model.visual=false", "msg_v_x4_smoke_model.visual-false_steps4_seed0"),
+        ("train", "noise=tof trainer.scenes=5", "msg_v_x4_tof_scenes5_seed0"),
+        ("eval", "method=bicubic", "bicubic_x4_simgeo_seed0"),
+        ("eval", "method=dip_v scale=8 dataset=icl method.w=2 method.largest_tilt=null",
+         "dip_v_x8_icl_w2_largest_tilt-null_seed0"),
+        ("eval", "downsampling=nearest noise=gaussian_multiplicative noise.std=0.01 dataset.scenes=[lucy,plant]",
+         "msg_v_x4_simgeo_nearest_gaussian_multiplicative_scenes-lucy+plant_std0.01_seed0"),
+    ],
+)  # fmt: skip
+def test_name_says_what_differs_from_the_defaults(kind, overrides, name):
+    assert name_of(kind, *overrides.split()) == name
+
+
+def test_what_a_name_cannot_say_is_told_apart_by_a_hash():
+    names = {name_of("eval", "dataset=folder", f"dataset.root={root}") for root in ("/a/my/scenes", "/b/my/scenes")}
+    assert len(names) == 2
+    assert all(re.fullmatch(r"msg_v_x4_folder_root-my-scenes_seed0-[0-9a-f]{8}", name) for name in names)
+    longer = name_of("eval", f"dataset.scenes=[{','.join(f'scene_{number}' for number in range(99))}]")
+    assert len(longer) < 130
+    assert re.search(r"-[0-9a-f]{8}$", longer)
+
+
+def test_run_takes_the_directory_of_no_other_run_and_finds_its_own():
+    plain, folders = composed("eval"), []
+    for weights in ("abc", "abd"):
+        identity = identity_of(plain, weights, CPU)
+        folders.append(default_directory("eval", plain, identity))
+        claim(folders[-1], plain, identity)
+    assert folders[0].name == "msg_v_x4_simgeo_seed0"
+    assert re.fullmatch(r"msg_v_x4_simgeo_seed0-[0-9a-f]{8}", folders[1].name)
+    record = json.loads((folders[1] / "versions.json").read_text())
+    assert record["hash"].startswith(folders[1].name.rpartition("-")[2])
+    again = [default_directory("eval", plain, identity_of(plain, weights, CPU)) for weights in ("abc", "abd")]
+    assert again == folders
+    (folders[0] / "versions.json").unlink()
+    (folders[0] / "thesis.txt").touch()
+    assert default_directory("eval", plain, identity_of(plain, "abc", CPU)).name.startswith(f"{folders[0].name}-")
+
+
 def test_same_configuration_gives_the_same_directory():
     assert directory(config()) == directory(config())
     folder = directory(config())
     assert folder.parts[:2] == ("outputs", "eval")
-    assert folder.name.startswith("folder_box_x4_msg_v_")
 
 
 @pytest.mark.parametrize(
@@ -66,14 +128,17 @@ def test_same_configuration_gives_the_same_directory():
     ],
 )  # fmt: skip
 def test_other_configuration_gives_another_directory(changes):
+    claimed(directory(config()), config())
     assert directory(config(**changes)) != directory(config())
 
 
 def test_other_weights_or_kind_of_device_give_another_directory():
-    folders = {directory(config(), *rest) for rest in (("abc", CPU), ("abd", CPU), (None, CPU))}
-    folders.add(directory(config(), "abc", torch.device("cuda")))
-    assert len(folders) == 4
-    assert directory(config(), "abc", torch.device("cuda", 1)) in folders
+    folders = []
+    for weights, device in (("abc", CPU), ("abd", CPU), (None, CPU), ("abc", torch.device("cuda"))):
+        folders.append(directory(config(), weights, device))
+        claim(folders[-1], config(), identity_of(config(), weights, device))
+    assert len(set(folders)) == 4
+    assert directory(config(), "abc", torch.device("cuda", 1)) == folders[3]
 
 
 @pytest.mark.parametrize(
@@ -85,6 +150,7 @@ def test_settings_without_influence_on_predictions_keep_the_directory(changes):
 
 def test_other_code_gives_another_directory(monkeypatch):
     before = directory(config())
+    claimed(before, config())
     monkeypatch.setattr(rundir, "code_hash", lambda: "other")
     assert directory(config()) != before
 
@@ -103,16 +169,17 @@ NOT_PREDICTING = (
     "utils/files.py",
     "utils/limits.py",
     "utils/picture_headers.py",
+    "utils/pool.py",
     "utils/tables.py",
     "utils/hashing.py",
     "utils/checkpoints.py",
     "utils/console.py",
     "utils/interruption.py",
     "utils/progress.py",
+    "utils/runs_table.py",
     "utils/space.py",
     "utils/temporary.py",
     "utils/units.py",
-    "utils/workers.py",
     "evaluation/__init__.py",
     "evaluation/store.py",
     "data/download",

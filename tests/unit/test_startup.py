@@ -1,4 +1,4 @@
-"""Commands answer at once: what takes seconds to import is imported when a configuration has proved valid."""
+"""Commands answer at once: what takes seconds to import is imported when a request has proved valid."""
 
 import os
 import subprocess
@@ -25,6 +25,24 @@ COMMANDS = {
     "dsr --help": 0,
     "dsr upsample --help": 0,
     "dsr upsample --rgb a --depth b -o out --mehtod x": 2,
+    "dsr upsample --rgb a --depth b -o out --max-hole 0": 2,
+    "dsr upsample --rgb a --depth b -o out --fov 270": 2,
+    "dsr upsample --rgb a --depth b -o out --method nosuch": 2,
+    "dsr upsample --rgb a --depth b -o out --depth-unit feet": 2,
+    "dsr upsample --rgb a --depth b -o out --format bmp": 2,
+    "dsr upsample --rgb a --depth b -o out --only nosuch": 2,
+    "dsr upsample --rgb a --depth b -o out --max-faces 1": 2,
+    "dsr upsample --rgb a --depth b -o out --min-confidence 2": 2,
+    "dsr upsample --rgb a --depth b -o out --extrinsics c": 2,
+    "dsr upsample --rgb a --depth b -o out --shard 4/3": 2,
+    "dsr upsample --rgb a --depth b -o out --workers 0": 2,
+    "dsr upsample --rgb a --depth b -o out --set noise": 2,
+    "dsr upsample --rgb a -o out": 2,
+    "dsr report runs -o out --only nosuch": 2,
+    "dsr report runs -o out --workers 0": 2,
+    "dsr fuse out -o mesh.ply --voxel 0": 2,
+    "dsr view out --most 0": 2,
+    "dsr export --onnx file.onnx --method nosuch": 2,
     "dsr data where": 0,
     "dsr eval --help": 0,
     "dsr eval method=nosuch": 2,

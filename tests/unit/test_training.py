@@ -25,6 +25,7 @@ from dsr.methods.networks.any_map import AnyMap
 from dsr.methods.networks.facets_unet import FacetsUNet
 from dsr.methods.networks.msg_net import MSGNet, upsample_disparity
 from dsr.methods.networks.sparse_to_dense import SparseToDense
+from dsr.methods.registry import build_method, read_method
 from dsr.metrics import functional as scores
 from dsr.metrics.classes import visual_metrics
 from dsr.metrics.functional import SurfacePair
@@ -424,10 +425,11 @@ def test_validation_is_in_the_unit_of_its_benchmark(tmp_path: Path) -> None:
     assert in_levels["val/RMSE_levels"] == in_levels["val_a/RMSE_levels"] > 0
 
 
-def test_validation_logs_the_mean_over_the_scenes_under_the_worst_light(tmp_path: Path) -> None:
+def test_validation_logs_the_mean_over_the_scenes_in_the_units_of_tables(tmp_path: Path) -> None:
     module, scenes = _module(mixed=True), WholeScenes([_scene(3), _scene(4, holes=0.05), _scene(5)], X2)
     [logged] = _trainer(tmp_path).validate(module, _loader(scenes), verbose=False)
-    values: dict[str, list[float]] = {"RMSE_d": [], "RMSE_v": [], "DSSIM_v": [], "BadPix_v_5": [], "Bumpiness_d": []}
+    factors = {"RMSE_d": 1000, "RMSE_v": 1000, "RMSE_v1": 1000, "DSSIM_v": 1000, "BadPix_v_5": 100, "Bumpiness_d": 1}
+    values: dict[str, list[float]] = {name: [] for name in factors}
     for i in range(3):
         batch = collate_scene([scenes[i]])
         with torch.no_grad():
@@ -436,11 +438,13 @@ def test_validation_logs_the_mean_over_the_scenes_under_the_worst_light(tmp_path
         pair = SurfacePair(40 * 0.2 / disparity, batch["depth"], CAMERA.rays()[None])
         values["RMSE_d"].append(float(scores.rmse_d(pair)))
         values["RMSE_v"].append(float(scores.rmse_v(pair)))
+        values["RMSE_v1"].append(float(scores.rmse_v1(pair).amax()))
         values["DSSIM_v"].append(float(scores.dssim_v(pair).amax()))
         values["BadPix_v_5"].append(float(scores.bad_pix_v(pair, 5).amax()))
         values["Bumpiness_d"].append(float(scores.bumpiness_d(pair)))
     for name, each in values.items():
-        assert logged[f"val/{name}"] == pytest.approx(np.mean(each), rel=1e-4), name
+        assert logged[f"val/{name}"] == pytest.approx(factors[name] * np.mean(each), rel=1e-4), name
+        assert module.validation_scores["val"][name] == pytest.approx(np.mean(each), rel=1e-4), name
 
 
 def test_a_network_that_takes_hints_is_validated_as_it_is_evaluated(tmp_path: Path) -> None:
@@ -459,8 +463,23 @@ def test_a_network_that_takes_hints_is_validated_as_it_is_evaluated(tmp_path: Pa
         depth = AnyMap(net.eval(), **told)(sample)
         return float(scores.rmse_v(SurfacePair(depth[None], sample.depth[None], CAMERA.rays()[None])))  # type: ignore[index]
 
-    assert logged["val/RMSE_v"] == pytest.approx(rmse(kernel="box", edges="sharp", clean=True), rel=1e-4)
-    assert logged["val/RMSE_v"] != pytest.approx(rmse(), rel=1e-3)
+    assert logged["val/RMSE_v"] == pytest.approx(1000 * rmse(kernel="box", edges="sharp", clean=True), rel=1e-4)
+    assert logged["val/RMSE_v"] != pytest.approx(1000 * rmse(), rel=1e-3)
+
+
+def test_validation_scores_bicubic_interpolation_of_the_same_maps_as_the_method_does(tmp_path: Path) -> None:
+    scenes = [_scene(3), _scene(4, holes=0.05)]
+    module = _module()
+    [logged] = _trainer(tmp_path).validate(module, _loader(WholeScenes(scenes, X2)), verbose=False)
+    method, expected = build_method(read_method("bicubic", 2), 2), []
+    for scene in scenes:
+        sample = X2.sample(scene)
+        assert sample.depth is not None
+        pair = SurfacePair(method(sample)[None].double(), sample.depth[None].double(), CAMERA.rays()[None])
+        expected.append((float(scores.rmse_v(pair)), float(scores.rmse_d(pair))))
+    found = logged["bicubic/RMSE_v"], logged["bicubic/RMSE_d"]
+    assert found == pytest.approx(np.mean(expected, axis=0), rel=1e-4)
+    assert module.validation_scores.keys() == {"val", "bicubic"}
 
 
 def test_validation_starts_anew_each_time(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Compose a configuration outside of a Hydra command."""
+"""Compose a configuration, outside of a Hydra command or within one."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import hydra
+from hydra.core.global_hydra import GlobalHydra
 from omegaconf import DictConfig
 
 from dsr.app.experiments import register_resolvers
@@ -28,5 +29,11 @@ def compose(
     register_resolvers()
     places = ",".join(f'"file://{directory.resolve()}"' for directory in directories[1:])
     more = [f"hydra.searchpath=[{places}]"] if places else []
-    with hydra.initialize_config_dir(str(directories[0]), version_base="1.3"):
-        return hydra.compose(name, [*overrides, *more], return_hydra_config=with_hydra)
+    running = GlobalHydra.instance().hydra
+    GlobalHydra.instance().clear()
+    try:
+        with hydra.initialize_config_dir(str(directories[0]), version_base="1.3"):
+            return hydra.compose(name, [*overrides, *more], return_hydra_config=with_hydra)
+    finally:
+        if running is not None:
+            GlobalHydra.instance().initialize(running)

@@ -32,7 +32,7 @@ def note_divergence(folder: Path, last: Path, identity: Mapping[str, Any], error
         error: the divergence.
 
     """
-    step = _step_of(last)
+    step = step_of(last)
     kept = "it has no earlier checkpoint" if step is None else f"{last} of step {step} is kept"
     write_text(folder / NOTE, json.dumps({"what": str(error), "identity": dict(identity)}, indent=1) + "\n")
     return ConfigError(f"{folder}: the training {error}; {kept}; {_ADVICE}")
@@ -58,8 +58,8 @@ def expect_no_divergence(folder: Path, identity: Mapping[str, Any]) -> None:
         )
 
 
-def _step_of(checkpoint: Path) -> int | None:
-    """Return the step of a checkpoint, None if there is none."""
+def step_of(checkpoint: Path) -> int | None:
+    """Return the step of a training's checkpoint, None if there is none."""
     try:
         return int(torch.load(checkpoint, map_location="cpu", weights_only=True)["global_step"])
     except Exception:  # torch names no set of errors for damaged files

@@ -25,25 +25,28 @@ from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
 from dsr.app.experiments import register_resolvers, with_keys_of_swept_groups, without_overridden_sweeps
-from dsr.app.explain import explain, explain_arguments, explain_damage
+from dsr.app.explain import explain, explain_arguments, explain_choice, explain_damage
 from dsr.app.gpus import count_gpus, take_gpu
-from dsr.app.multirun import JobResult, collected_jobs, expect_launcher, failure_summary, job_name
-from dsr.app.schema import EvalConfig, TrainConfig, plain_config, register
+from dsr.app.multirun import Check, JobResult, Plan, collected_jobs, expect_launcher, failure_summary, job_name
+from dsr.app.schema import SEVERAL, EvalConfig, TrainConfig, plain_config, register
 from dsr.utils import interruption
 from dsr.utils.builder import ConfigError
 from dsr.utils.config_files import config_directories, list_choices
 from dsr.utils.console import USAGE_ERROR, one_line, print_error
 from dsr.utils.space import FullDiskError, silence_threads, space_for
 
+_LIST = re.compile(r"(^|,)\s*\[")
+"""Where a list begins in the value of an argument, or in one of several that -m runs."""
+
 
 def run_eval(arguments: Sequence[str] | None = None) -> None:
     """Run ``eval.py``, which is ``dsr eval``, with the given arguments or those of the process."""
-    run_command("eval", _evaluate, arguments)
+    run_command("eval", _evaluate, arguments, _check_evaluation)
 
 
 def run_train(arguments: Sequence[str] | None = None) -> None:
     """Run ``train.py``, which is ``dsr train``, with the given arguments or those of the process."""
-    run_command("train", _train, arguments)
+    run_command("train", _train, arguments, _check_training)
 
 
 def _evaluate(config: DictConfig) -> float:
@@ -60,17 +63,38 @@ def _train(config: DictConfig) -> float:
     return train(config)
 
 
-def run_command(name: str, command: Callable[[DictConfig], Any], arguments: Sequence[str] | None = None) -> None:
+def _check_evaluation(config: DictConfig) -> list[Plan]:
+    EvalConfig.of(plain_config(config))
+    from dsr.app.evaluate import plan  # noqa: PLC0415 - it imports torch
+
+    return plan(config)
+
+
+def _check_training(config: DictConfig) -> list[Plan]:
+    TrainConfig.of(plain_config(config))
+    from dsr.app.train import plan  # noqa: PLC0415 - it imports torch
+
+    return plan(config)
+
+
+def run_command(
+    name: str,
+    command: Callable[[DictConfig], Any],
+    arguments: Sequence[str] | None = None,
+    check: Check | None = None,
+) -> None:
     """Compose a configuration from the command line, and run the command on it.
 
-    Exits with 2 and one line on stderr when the configuration cannot be run, with 130 or 143 when interrupted. The
-    other jobs of a multirun go on, and lines at its end say which ones failed.
+    Exits with 2 and one line on stderr when the configuration cannot be run, with 130 or 143 when interrupted. A
+    multirun is refused if one of its jobs cannot be run, with a line for each that cannot; if one fails later, the
+    others go on, and lines at the end say which ones failed.
 
     Args:
         name: the configuration's name, without ``.yaml``.
         command: the function to run; a multirun calls it once per combination. If it returns a number, sweepers
             minimise it.
         arguments: command-line arguments, Hydra's options and overrides; None for those of the process.
+        check: of each job of a multirun before the first one begins; None for no check.
 
     """
     register()
@@ -92,7 +116,7 @@ def run_command(name: str, command: Callable[[DictConfig], Any], arguments: Sequ
     failed: list[str] = []  # of this process; those of a launcher's processes come back with their jobs
     begun: list[bool] = []
     job = _job(command, process, failed, begun)
-    with collected_jobs() as jobs:
+    with collected_jobs(check) as jobs:
         try:
             with _argv([process[0], *arguments]), space_for(Path("outputs")):  # parsed by Hydra
                 hydra.main(version_base="1.3", config_path=str(directories[0]), config_name=name)(job)()
@@ -170,24 +194,27 @@ def _expect_choices(name: str, arguments: Sequence[str], directories: Sequence[P
     problem = explain_arguments(arguments)
     if problem is not None:
         fail(problem)
-    if any(argument.startswith("hydra.searchpath=") for argument in arguments):
-        return  # other directories may have further choices
     defaults = OmegaConf.load(directories[0] / f"{name}.yaml").defaults
-    groups = {str(key) for entry in defaults if isinstance(entry, DictConfig) for key in entry} | {"+experiment"}
+    groups = {str(key) for entry in defaults if isinstance(entry, DictConfig) for key in entry} | {"experiment"}
+    elsewhere = any(argument.startswith("hydra.searchpath=") for argument in arguments)  # there may be further choices
     for argument in arguments:
-        group, equals, choice = argument.partition("=")
-        if equals and group in groups:
-            _expect_choice(argument, group.lstrip("+"), choice, directories)
+        key, equals, choice = argument.partition("=")
+        group, at, _ = key.lstrip("+").partition("@")
+        if _LIST.search(choice) and group in {*groups, "hydra/launcher", "hydra/sweeper"} - {*SEVERAL}:
+            each = f"; -m {key}=A,B runs each of several" if group in groups else ""
+            fail(f"{argument}: expected one choice, got a list{each}")
+        if equals and not at and not elsewhere and group in groups and key != "experiment":
+            _expect_choice(argument, group, choice, directories)
 
 
 def _expect_choice(argument: str, group: str, choice: str, directories: Sequence[Path]) -> None:
-    """Exit if ``choice``, or one of several separated by commas, is not a file of the group."""
+    """Exit if ``choice``, or one of several separated by commas or in lists, is not a file of the group."""
     choices = list_choices(group, directories)
     if choice in ("", "null"):
         fail(f"{argument}: expected one of {', '.join(choices)}")
-    for each in choice.split(","):
+    for each in re.split(r"[\[\],\s]+", choice.strip("[] ")):
         if re.fullmatch(r"[\w.+-]+", each) and each not in choices:
-            fail(f"{group}={each}: unknown; expected one of {', '.join(choices)}")
+            fail(explain_choice(group, each, directories))
 
 
 def _config_dirs(arguments: Sequence[str]) -> list[Path]:

@@ -6,7 +6,8 @@ import functools
 import math
 import random
 import shutil
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,11 +20,14 @@ from rich.console import Console
 from dsr.app import run_directory as rundir
 from dsr.app.methods import adapt_method, hash_weights, weights_of
 from dsr.app.metrics import check_metrics, chosen_metrics, metric_collection
+from dsr.app.multirun import Plan, runs_here
 from dsr.app.schema import EvalConfig, given_keys, plain_config, user_directories
 from dsr.data.base import SceneSource, prepare_scenes
-from dsr.degradation.downsampling import Downsampling, Measured
+from dsr.data.folder import Folder
+from dsr.degradation.downsampling import Downsampling, Measured, make_sample
 from dsr.degradation.scales import NATIVE, match_ratio
 from dsr.evaluation.predict import Evaluation, Outcome, StalePredictionError, failure_line, predict
+from dsr.evaluation.run_files import read_run
 from dsr.evaluation.score import score
 from dsr.evaluation.sharing import Workers, can_fork, choose_workers
 from dsr.evaluation.store import load_errors, prediction_path
@@ -32,7 +36,7 @@ from dsr.methods.base import WORKSPACE
 from dsr.methods.registry import build_method, target_paths
 from dsr.metrics.formats import HEADLINES, Formats
 from dsr.report.tables import score_table
-from dsr.sample import DepthSample
+from dsr.sample import DepthSample, slope
 from dsr.utils.builder import ConfigError, build, takes, trait
 from dsr.utils.console import ConsoleProgress, open_console, print_error, show
 from dsr.utils.devices import fast_precision, pick_device
@@ -55,13 +59,21 @@ def evaluate(config: DictConfig) -> pd.DataFrame:
         ConfigError: the configuration cannot be run, or a scene failed (the others' results are written).
 
     """
-    plain = plain_config(config)
-    if plain["run"] is None:
-        return _evaluate(plain, None)
-    from dsr.app.training_runs import studies_of_run  # noqa: PLC0415 - it imports Lightning, which takes seconds
-
-    scores = [_evaluate(each, source) for each, source in studies_of_run(plain, given_keys())]
+    scores = [_run(_prepare(plain, source)) for plain, source in _studies(config)]
     return pd.concat(scores, ignore_index=True)
+
+
+def plan(config: DictConfig) -> list[Plan]:
+    """Check what :func:`evaluate` would run as a job of a multirun; nothing is computed or written.
+
+    Args:
+        config: composed from ``conf/eval.yaml``.
+
+    Raises:
+        ConfigError: the configuration cannot be run.
+
+    """
+    return [_plan(_prepare(plain, source, here=runs_here())) for plain, source in _studies(config)]
 
 
 def objective(scores: pd.DataFrame) -> float:
@@ -78,21 +90,41 @@ def objective(scores: pd.DataFrame) -> float:
     return float(means.get(_OBJECTIVE, means.iloc[0]))
 
 
-def _evaluate(plain: dict[str, Any], source: SceneSource | None) -> pd.DataFrame:
-    """Evaluate on ``source``, or on the data set that the configuration describes."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)  # until it is decided who computes: threads would not survive a fork
-    try:
-        return _evaluate_with(plain, source, threads)
-    finally:
-        torch.set_num_threads(threads)
+def _studies(config: DictConfig) -> Iterator[tuple[dict[str, Any], SceneSource | None]]:
+    """Yield the configurations to evaluate, with data sets; None for the one that the configuration describes."""
+    plain = plain_config(config)
+    if plain["run"] is None:
+        yield plain, None
+        return
+    from dsr.app.training_runs import studies_of_run  # noqa: PLC0415 - it imports Lightning, which takes seconds
+
+    yield from studies_of_run(plain, given_keys())
 
 
-def _evaluate_with(plain: dict[str, Any], source: SceneSource | None, cores: int) -> pd.DataFrame:
-    """Evaluate as :func:`_evaluate` does; ``cores`` is the number of threads that computations may have."""
+@dataclass(frozen=True)
+class _Prepared:
+    """An evaluation that can be run, in the directory of its run."""
+
+    settings: EvalConfig
+    plain: Mapping[str, Any]
+    identity: Mapping[str, Any]
+    folder: Path
+    study: Evaluation
+    workers: Workers
+    progress: ConsoleProgress
+
+
+def _prepare(plain: dict[str, Any], source: SceneSource | None, *, here: bool = True) -> _Prepared:
+    """Check and build all that an evaluation needs, and write nothing.
+
+    Args:
+        plain: the configuration.
+        source: the data set; None for the one that the configuration describes.
+        here: whether this process has the device that will compute.
+
+    """
     settings = EvalConfig.of(plain)
-    console = open_console()
-    device = pick_device(settings.device)
+    device = pick_device(settings.device) if here else torch.device("cpu")
     source = source or _source(settings)
     plain = {**plain, "precision": _precision(settings, device), "scale": _scale(settings, source)}
     settings = EvalConfig.of(plain)
@@ -102,12 +134,55 @@ def _evaluate_with(plain: dict[str, Any], source: SceneSource | None, cores: int
     targets = target_paths(settings.method, user_directories())
     identity = rundir.identity_of(plain, hash_weights(files), device, targets)
     folder = rundir.folder_of(settings.output_dir or rundir.default_directory("eval", plain, identity))
-    progress = ConsoleProgress(console)
+    progress = ConsoleProgress(open_console())
     given = {"device": device, "weights": weights, "workspace": folder, "display": progress}
     study = _study(settings, identity, given, source, adapted)
     check_metrics(settings.metrics)
-    workers = _workers(settings, device, len(study.source.scenes()), cores)
-    rundir.claim(folder, plain, identity)
+    workers = _workers(settings, device, len(study.source.scenes()))
+    rundir.expect_free(folder, plain, identity, () if here else ("device", "precision"))
+    return _Prepared(settings, plain, identity, folder, study, workers, progress)
+
+
+def _plan(prepared: _Prepared) -> Plan:
+    """Return what an evaluation will do."""
+    study, folder = prepared.study, prepared.folder
+    scenes = study.source.scenes()
+    done = 0 if prepared.settings.overwrite else sum(prediction_path(folder, scene).is_file() for scene in scenes)
+    left = len(scenes) - done
+
+    def seconds() -> float:
+        example = _example(prepared)
+        if example is None:
+            return math.nan
+        each: Callable[[DepthSample], float] = study.method.seconds  # type: ignore[attr-defined]
+        return left * each(example)
+
+    measured = runs_here() and hasattr(study.method, "seconds")
+    return Plan(folder, prepared.identity, "scene", left, done, seconds if measured else None)
+
+
+def _example(prepared: _Prepared) -> DepthSample | None:
+    """Return a sample as large as the first scene's; None if its size is not known before the scenes are prepared."""
+    study, size = prepared.study, prepared.settings.dataset.get("size")
+    if isinstance(study.downsampling, Measured):
+        return None
+    if isinstance(size, int):
+        scene = slope(size)
+    elif isinstance(study.source, Folder):
+        scene = study.source.load(study.source.scenes()[0])
+    else:
+        return None
+    return make_sample(
+        scene, study.scale, study.downsampling, study.method.range_type, study.noise, study.seed, study.holes
+    )
+
+
+def _run(prepared: _Prepared) -> pd.DataFrame:
+    """Evaluate, and return the scores."""
+    settings, folder, study = prepared.settings, prepared.folder, prepared.study
+    workers, progress = prepared.workers, prepared.progress
+    console = open_console()
+    rundir.claim(folder, prepared.plain, prepared.identity)
     if settings.overwrite:
         shutil.rmtree(folder / WORKSPACE, ignore_errors=True)
     _seed(settings.seed)
@@ -118,12 +193,12 @@ def _evaluate_with(plain: dict[str, Any], source: SceneSource | None, cores: int
         )
     except StalePredictionError as error:
         raise ConfigError(str(error)) from error
-    metrics = chosen_metrics(settings.metrics, device)
+    metrics = chosen_metrics(settings.metrics, study.device)
     formats = {metric.name: metric.format for metric in metrics}
     illustrate = functools.partial(_illustrate, folder, study.label, formats)
     scores = score(study, folder, metrics, outcome, progress, illustrate, workers=workers)
     _save_dashboard(folder)
-    _report(console, folder, scores, study.label, outcome, formats)
+    _report(console, folder, scores, outcome, formats)
     if outcome.failures:
         total = len(study.source.scenes())
         rest = f"; the others are in {folder}" if len(outcome.failures) < total else ""
@@ -131,7 +206,7 @@ def _evaluate_with(plain: dict[str, Any], source: SceneSource | None, cores: int
     return scores
 
 
-def _workers(settings: EvalConfig, device: torch.device, scenes: int, cores: int) -> Workers:
+def _workers(settings: EvalConfig, device: torch.device, scenes: int) -> Workers:
     """Return the worker processes that the configuration describes.
 
     Raises:
@@ -145,9 +220,8 @@ def _workers(settings: EvalConfig, device: torch.device, scenes: int, cores: int
             f"workers: expected 1 with device={device}, got {count}; "
             "start the command once per device, with the same output_dir"
         )
-    return choose_workers(
-        count, threads, scenes, cores, together=forks and not trait("method", settings.method, "optimises")
-    )
+    together = forks and not trait("method", settings.method, "optimises")
+    return choose_workers(count, threads, scenes, torch.get_num_threads(), together=together)
 
 
 def _import_report() -> None:
@@ -204,6 +278,7 @@ def _study(
     name = str(settings.method["name"])
     if "downsampling.assumed" in given_keys() and not takes("method", settings.method, "downsampling"):
         raise ConfigError(f"downsampling.assumed: method={name} assumes no downsampling model; leave it out")
+    label, degradation = str(settings.method.get("label", name)), rundir.degradation_of(vars(settings))
     method = adapted or build_method(
         settings.method,
         settings.scale,
@@ -213,13 +288,14 @@ def _study(
         downsampling=downsampling.assumed_model(),
         told=_known_of_maps(settings, downsampling, source),
         lpips_trunk=settings.metrics.lpips_trunk,
+        about={"method": label, "degradation": degradation},
         metrics=functools.partial(metric_collection, settings.metrics, given["device"]),
         **given,
     )
     return Evaluation(
         source,
         downsampling,
-        _problem_name(settings),
+        degradation,
         settings.scale,
         method,
         _flagged(name, method, "_{}"),
@@ -228,7 +304,7 @@ def _study(
         given["device"],
         noise=build("noise", settings.noise),
         holes=build("holes", settings.holes),
-        label=_flagged(str(settings.method.get("label", name)), method, " ({})"),
+        label=_flagged(label, method, " ({})"),
         note=getattr(method, "describe", None),
     )
 
@@ -257,20 +333,6 @@ def _precision(settings: EvalConfig, device: torch.device) -> str:
     return fast_precision(device) if trait("method", settings.method, "optimises") else "float32"
 
 
-def _problem_name(settings: EvalConfig) -> str:
-    """Return the name of the degradation, as in ``scores.csv``: box, or box+gaussian_multiplicative-0.003."""
-    parts = [str(settings.downsampling["name"])]
-    assumed = settings.downsampling.get("assumed")
-    if assumed not in (None, parts[0]) and takes("method", settings.method, "downsampling"):
-        parts.append(f"assumed-{assumed}")
-    for group in (settings.noise, settings.holes):
-        if group["name"] != "none":
-            settings_of = [value for key, value in group.items() if key not in ("name", "target")]
-            values = ["none" if value is None else f"{value:g}" for value in settings_of]
-            parts.append("-".join((str(group["name"]), *values)))
-    return "+".join(parts)
-
-
 def _seed(seed: int) -> None:
     """Seed every global generator; dsr itself uses explicit ones."""
     random.seed(seed)
@@ -292,12 +354,10 @@ def _illustrate(
         write_confidence(path, depth, *errors, sample.depth, sample.camera)
 
 
-def _report(
-    console: Console, folder: Path, scores: pd.DataFrame, label: str, outcome: Outcome, formats: Formats
-) -> None:
+def _report(console: Console, folder: Path, scores: pd.DataFrame, outcome: Outcome, formats: Formats) -> None:
     """Print the table of scores, notes and failures."""
     if not scores.empty:
-        console.print(score_table(scores, label, formats))
+        console.print(score_table(read_run(folder), formats))
     scenes_by_note: dict[str, list[str]] = {}
     for scene, notes in outcome.notes.items():
         scenes_by_note.setdefault("; ".join(notes), []).append(scene)

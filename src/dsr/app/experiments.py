@@ -5,9 +5,7 @@ Sweeps over the data sets that are on this machine, and sweeps that the command 
 
 from __future__ import annotations
 
-import functools
 import re
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -15,6 +13,7 @@ from omegaconf import OmegaConf
 
 from dsr.data.download.catalogue import CATALOGUE
 from dsr.data.download.location import data_root
+from dsr.utils.console import note_once
 
 _KEY_OF_GROUP = re.compile(r"(\w+)\.[\w.]+=")
 """An argument that sets a key of a group, such as ``method.range_type=orthogonal``."""
@@ -69,11 +68,5 @@ def _present(*names: str) -> str:
         if not all((data_root() / folder).is_dir() for folder in folders):
             absent.append(name)
     if absent:
-        _note_once(f"left out, as not in {data_root()}: {', '.join(absent)}; `dsr data get NAME` gets one")
+        note_once(f"left out, as not in {data_root()}: {', '.join(absent)}; `dsr data get NAME` gets one")
     return ",".join(name for name in names if name not in absent)
-
-
-@functools.cache
-def _note_once(note: str) -> None:
-    """Print a note on stderr, once in a process, however often a value is resolved."""
-    print(f"note: {note}", file=sys.stderr)  # noqa: T201

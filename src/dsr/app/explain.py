@@ -3,16 +3,26 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from difflib import get_close_matches
 from pathlib import Path
+from typing import Any
 
 from hydra.errors import HydraException, MissingConfigException, OverrideParseException
 from omegaconf import DictConfig, OmegaConf
 
 from dsr.app.composition import compose
 from dsr.app.multirun import LAUNCHERS
+from dsr.app.schema import SEVERAL
 from dsr.utils.config_files import list_choices, list_groups
 from dsr.utils.console import one_line
+
+_ALIASES = {"lr": "learning_rate", "batch_size": "batch", "max_steps": "steps"}
+"""Names that others have for keys."""
+_ALIKE = 0.8
+"""How alike a mistyped key is to the one that is meant, of 1."""
+_OTHERS = {"eval": "train", "train": "eval"}
+"""The other command of each."""
 
 
 def explain_arguments(arguments: Sequence[str]) -> str | None:
@@ -49,9 +59,11 @@ def explain(error: Exception, name: str, arguments: Sequence[str], directories: 
     several = re.match(r"Ambiguous value for argument '([^=]+)=(.*?)' 1\.", text)
     if several:
         key, values = several.groups()
-        return (
-            f"{key}: got several values; -m runs each of them, {key}=[{values}] is a list, '{key}=\"{values}\"' a text"
-        )
+        texts = [f"{key}: got several values; -m runs each of them"]
+        single = key in list_groups(directories)
+        texts += [] if single and key not in SEVERAL else [f"{key}=[{values}] is a list"]
+        texts += [] if single else [f"'{key}=\"{values}\"' a text"]
+        return ", ".join(texts)
     return _explain_value(error, text, name, arguments, directories)
 
 
@@ -86,16 +98,86 @@ def _explain_value(
     return f"{value[1]}: {_first_line(cause)}" if value and cause is not None else text
 
 
+def explain_choice(group: str, choice: str, directories: Sequence[Path]) -> str:
+    """Explain in one line which choices a group has instead of one that it does not have.
+
+    Args:
+        group: such as ``model``.
+        choice: what is not there.
+        directories: directories of configuration files.
+
+    """
+    if group == "model" and choice in list_choices("method", directories):
+        return f"model={choice}: expected a network to train, {choice} is none; eval.py has method={choice}"
+    return f"{group}={choice}: unknown; expected one of {', '.join(list_choices(group, directories))}"
+
+
 def _explain_key(key: str, name: str, arguments: Sequence[str], directories: Sequence[Path]) -> str:
-    """Explain which keys exist instead of an unknown one."""
+    """Explain which keys exist instead of an unknown one: those that are meant, or those beside it."""
     if key == "experiment":
         return f"experiment: write +experiment=NAME, NAME one of {', '.join(list_choices(key, directories))}"
-    prefix = key.rpartition(".")[0]
-    node = _node_of(key, name, arguments, directories)
-    siblings = [
-        f"{prefix}.{child!s}" if prefix else str(child) for child in node if child not in ("target", "_target_")
-    ]
-    return f"{key}: unknown key; expected {', '.join(siblings) or 'none'}"
+    values = (argument.partition("=") for argument in arguments)
+    value = next((value for given, _, value in values if given.lstrip("+~") == key), "...")
+    config = _composed_for(key, name, arguments, directories)
+    prefix, node = _innermost(config, key)
+    children = [str(child) for child in node if child not in ("target", "_target_")]
+    wanted = _meant(key, value, name, config, directories)
+    if not wanted:
+        alike = get_close_matches(key.rpartition(".")[2], children, 1, _ALIKE)
+        wanted = [f"{prefix}{child}={value}" for child in alike]
+    beside = ", ".join(f"{prefix}{child}" for child in children)
+    return f"{key}: unknown key; expected {' or '.join(wanted) or beside or 'none'}"
+
+
+def _meant(key: str, value: str, name: str, config: DictConfig, directories: Sequence[Path]) -> list[str]:
+    """Return the arguments that may be meant by one with an unknown key, as that key is elsewhere; none if it is not.
+
+    Args:
+        key: the unknown key.
+        value: what it was to be set to.
+        name: the configuration's name.
+        config: the configuration, in which it may have another place.
+        directories: directories of configuration files.
+
+    """
+    other = _OTHERS[name]
+    pair = {"model": "method", "method": "model"}.get(key)
+    if pair in config:
+        wanted = f"{pair}={value}" if value in list_choices(str(pair), directories) else f"{key}={value} of {other}.py"
+        return [wanted] if value in list_choices("method", directories) else []
+    last = key.rpartition(".")[2]
+    last = _ALIASES.get(last, last)
+    places = [place for place in _places(OmegaConf.to_container(config)) if place.rpartition(".")[2] == last]
+    if places:
+        return [f"{place}={value}" for place in places]
+    choices: dict[str, list[str]] = {}
+    for group in [str(each) for each in config if each in list_groups(directories)]:
+        for choice in list_choices(group, directories):
+            for place in _places_of(group, choice, directories):
+                if place.rpartition(".")[2] == last:
+                    choices.setdefault(f"{group}.{place}={value} with {group}", []).append(choice)
+    if choices:
+        return [f"{place}={', '.join(names)}" for place, names in choices.items()]
+    there = key in _places(OmegaConf.to_container(compose(other, [], directories)))
+    return [f"{key}={value} of {other}.py"] if there else []
+
+
+def _places(node: Any, above: str = "") -> Iterator[str]:
+    """Yield the dotted keys of a configuration's plain values."""
+    for child, value in node.items():
+        yield f"{above}{child!s}"
+        if isinstance(value, dict):
+            yield from _places(value, f"{above}{child!s}.")
+
+
+def _places_of(group: str, choice: str, directories: Sequence[Path]) -> set[str]:
+    """Return the dotted keys of a choice of a group, with those of the choices that it is made from."""
+    file = next((path for each in directories if (path := each / group / f"{choice}.yaml").is_file()), None)
+    content = None if file is None else OmegaConf.load(file)
+    if not isinstance(content, DictConfig):
+        return set()
+    bases = [each for each in content.get("defaults") or () if isinstance(each, str) and each != choice]
+    return set(_places(OmegaConf.to_container(content))).union(*(_places_of(group, e, directories) for e in bases))
 
 
 def _explain_missing(file: str, name: str, directories: Sequence[Path]) -> str:
@@ -105,9 +187,9 @@ def _explain_missing(file: str, name: str, directories: Sequence[Path]) -> str:
         return f"--config-name {choice}: unknown; expected {name}"
     choices = list_choices(group, directories)
     if group == "hydra/launcher":
-        choices = sorted({*choices, *LAUNCHERS})
+        return f"{group}={choice}: unknown; expected one of {', '.join(sorted({*choices, *LAUNCHERS}))}"
     if choices:
-        return f"{group}={choice}: unknown; expected one of {', '.join(choices)}"
+        return explain_choice(group, choice, directories)
     return f"{group}: no such group of choices; expected one of {', '.join(list_groups(directories))}"
 
 
@@ -124,18 +206,23 @@ def _first_line(error: BaseException) -> str:
     return str(error).splitlines()[0] if str(error) else type(error).__name__
 
 
-def _node_of(key: str, name: str, arguments: Sequence[str], directories: Sequence[Path]) -> DictConfig:
-    """Return the node in which ``key`` was looked for, or the innermost one above it."""
-    choice = re.compile(rf"({'|'.join(list_groups(directories))}|hydra/launcher)=[\w-]+")
+def _composed_for(key: str, name: str, arguments: Sequence[str], directories: Sequence[Path]) -> DictConfig:
+    """Return the configuration in which ``key`` was looked for: with the choices that the arguments name."""
+    choice = re.compile(rf"({'|'.join(list_groups(directories))}|hydra/launcher)=(\[.*\]|[\w-]+)")
     overrides = [argument for argument in arguments if choice.fullmatch(argument)]
     with_hydra = key.startswith("hydra.")
     try:
-        node = compose(name, overrides, directories, with_hydra=with_hydra)
+        return compose(name, overrides, directories, with_hydra=with_hydra)
     except HydraException:  # one of these choices is invalid
-        node = compose(name, [], directories, with_hydra=with_hydra)
+        return compose(name, [], directories, with_hydra=with_hydra)
+
+
+def _innermost(config: DictConfig, key: str) -> tuple[str, DictConfig]:
+    """Return the innermost node above ``key`` that is there, and what stands before the keys in it."""
+    prefix, node = "", config
     for part in key.split(".")[:-1]:
         child = OmegaConf.select(node, part)
         if not isinstance(child, DictConfig):
             break
-        node = child
-    return node
+        prefix, node = f"{prefix}{part}.", child
+    return prefix, node

@@ -2,43 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from pathlib import Path
-
 from rich.console import Console
 
 import dsr
+from dsr.app.requests import ExportRequest
 from dsr.methods.networks.onnx_export import OnnxGraph, write_onnx
 from dsr.methods.registry import load_method_network
 from dsr.utils.console import show
 from dsr.utils.units import megabytes
-
-
-@dataclass(frozen=True)
-class ExportRequest:
-    """Which network to write, and where.
-
-    Args:
-        path: the file.
-        method: the method's name.
-        scale: the upsampling factor.
-        weights: a file of weights; None for those that the method names.
-        directories: the user's configuration directories.
-
-    """
-
-    path: Path
-    method: str
-    scale: int
-    weights: Path | None = None
-    directories: tuple[Path, ...] = ()
-
-    def __post_init__(self) -> None:
-        """Check what does not depend on files."""
-        if self.scale < 1:
-            raise ValueError(f"--scale: expected a factor of 1 or more, got {self.scale}")
-        if self.path.is_dir():
-            raise ValueError(f"--onnx: expected a file, got the folder {self.path}")
 
 
 def export_onnx(request: ExportRequest, console: Console) -> None:

@@ -3,52 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from rich.console import Console
 
+from dsr.app.requests import FuseRequest
 from dsr.app.upsample.outputs import ERRORS, INFO
 from dsr.app.upsample.stored import read_camera, read_depth, read_errors, read_info
 from dsr.geometry.poses import as_rigid
 from dsr.geometry.tsdf import PosedMap, fuse_maps, suggest_voxel
 from dsr.io.model_files import write_ply
 from dsr.utils.console import one_line, show
+from dsr.utils.paths import natural_key
 
 _GREY = 190
 _LEAST_ERROR = 1e-4
 """Smallest expected error in metres that a weight distinguishes."""
-
-
-@dataclass(frozen=True)
-class FuseRequest:
-    """What to fuse.
-
-    Args:
-        folders: results of ``dsr upsample``, or folders of them.
-        output: the mesh, a ``.ply`` file.
-        voxel: edge length of a voxel in metres; None for the median width of a pixel on the surfaces.
-        max_error: expected relative error of the depth from which a pixel is left out.
-
-    Raises:
-        ValueError: a value is out of range.
-
-    """
-
-    folders: tuple[Path, ...]
-    output: Path
-    voxel: float | None = None
-    max_error: float = 0.02
-
-    def __post_init__(self) -> None:
-        """Check the values."""
-        if self.output.suffix.lower() != ".ply":
-            raise ValueError(f"-o: expected a file that ends in .ply, got {self.output}")
-        if self.voxel is not None and not 0 < self.voxel < float("inf"):
-            raise ValueError(f"--voxel: expected a positive number of metres, got {self.voxel:g}")
-        if not self.max_error > 0:
-            raise ValueError(f"--max-error: expected a positive percentage of the depth, got {100 * self.max_error:g}")
 
 
 def fuse(request: FuseRequest, console: Console) -> list[str]:
@@ -58,7 +29,7 @@ def fuse(request: FuseRequest, console: Console) -> list[str]:
         ValueError: there is no result with a pose, or no surface.
 
     """
-    found = sorted({path.parent for folder in request.folders for path in folder.rglob(INFO)})
+    found = sorted({path.parent for folder in request.folders for path in folder.rglob(INFO)}, key=natural_key)
     frames, problems = [], []
     for folder in found:
         try:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import functools
 import hashlib
-import sys
+import os
 from pathlib import Path
 
 import torch
@@ -13,6 +14,7 @@ from dsr.inference.adapter import AnyScale, takes_scale
 from dsr.methods.networks.weight_files import files_of_weights
 from dsr.methods.registry import find_weights, has_weights
 from dsr.utils.builder import ConfigError, takes
+from dsr.utils.console import note_once
 from dsr.utils.hashing import file_hash
 
 
@@ -42,7 +44,7 @@ def weights_of(settings: EvalConfig) -> Path | None:
         return find_weights(settings.method, settings.scale, given)
     if given is not None and not given.is_dir():  # a directory serves all methods of a multirun
         name = settings.method["name"]
-        print(f"note: method={name} has no weights; weights={given} is not used", file=sys.stderr)  # noqa: T201
+        note_once(f"method={name} has no weights; weights={given} is not used")
     return None
 
 
@@ -54,12 +56,18 @@ def hash_weights(files: list[Path]) -> str | None:
 
     """
     try:
-        hashes = [file_hash(each) for file in files for each in files_of_weights(file)]
+        hashes = [_hash(each, each.stat()) for file in files for each in files_of_weights(file)]
     except (ValueError, OSError) as error:
         raise ConfigError(str(error)) from error
     if len(hashes) < 2:
         return next(iter(hashes), None)
     return hashlib.sha256("".join(hashes).encode()).hexdigest()
+
+
+@functools.cache
+def _hash(path: Path, _: os.stat_result) -> str:
+    """Return the SHA-256 of a file, which jobs of a multirun share, as long as it is the same one."""
+    return file_hash(path)
 
 
 def _given_weights(settings: EvalConfig) -> Path | None:

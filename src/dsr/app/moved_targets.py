@@ -1,4 +1,4 @@
-"""The current paths of classes and functions that configurations of earlier runs name as ``target``."""
+"""What configurations of earlier runs say otherwise: paths of classes and functions that have moved, the logger."""
 
 from __future__ import annotations
 
@@ -25,6 +25,13 @@ MOVED_TARGETS = {
     "dsr.noise.no_noise": "dsr.degradation.noise.no_noise",
 }
 """All targets that a training's configuration can name, from the old path to the current one."""
+
+
+def update_logger(node: Any) -> Any:
+    """Return loggers by name; earlier runs had one, with its name beside its settings."""
+    if not isinstance(node, dict) or "name" not in node:
+        return node
+    return {str(node["name"]): {key: value for key, value in node.items() if key != "name"}}
 
 
 def update_targets(node: Any) -> Any:

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import pandas as pd
 from rich.console import Console
 
+from dsr.app.requests import ReportRequest
 from dsr.evaluation.run_files import load_results
 from dsr.geometry.shading import LIGHT_NAMES
 from dsr.report.correlation_figure import draw_study
@@ -25,8 +25,6 @@ from dsr.utils.progress import Progress
 
 _MARK = "report.json"
 """A file that marks a directory as a report, which a new one may replace."""
-_MOST_WORKERS = 256
-PARTS = ("tables", "metrics", "figures", "page")
 _MAIN = {
     "page": "index.html",
     "tables": "tables/all.md",
@@ -34,30 +32,6 @@ _MAIN = {
     "figures": "figures",
     "metrics": "metrics",
 }
-
-
-@dataclass(frozen=True)
-class ReportRequest:
-    """What the report contains.
-
-    Args:
-        methods, datasets, scales: the ones to show; empty for all.
-        parts: some of tables, metrics, figures, page.
-        light: the figures' light.
-        title: the page's title.
-        page_mb: the maximum size of the page in MB.
-        workers: number of worker processes; None for one per core if there is enough to do.
-
-    """
-
-    methods: tuple[str, ...]
-    datasets: tuple[str, ...]
-    scales: tuple[float, ...]
-    parts: tuple[str, ...]
-    light: str
-    title: str
-    page_mb: float
-    workers: int | None = None
 
 
 def make_report(
@@ -93,15 +67,8 @@ def make_report(
 
 def _check(output: Path, request: ReportRequest) -> None:
     """Check the request, before anything is read."""
-    for part in request.parts:
-        if part not in PARTS:
-            raise ValueError(f"--only: expected some of {', '.join(PARTS)}, got {part}")
     if request.light not in LIGHT_NAMES:
         raise ValueError(f"--light: expected one of {', '.join(LIGHT_NAMES)}, got {request.light}")
-    if request.workers is not None and not 1 <= request.workers <= _MOST_WORKERS:
-        raise ValueError(f"--workers: expected 1..{_MOST_WORKERS}, got {request.workers}")
-    if not request.page_mb > 0:
-        raise ValueError(f"--page-mb: expected a positive number, got {request.page_mb:g}")
     if output.exists() and not (output.is_dir() and ((output / _MARK).is_file() or not any(output.iterdir()))):
         raise ValueError(f"{output}: expected a new directory or an earlier report, it holds something else")
 

@@ -13,28 +13,16 @@ import torch
 from omegaconf import OmegaConf
 
 from dsr.app.moved_targets import update_targets
-from dsr.utils.builder import ConfigError, expand_home
+from dsr.app.run_names import NOT_IDENTITY, run_name
+from dsr.utils.builder import ConfigError, expand_home, takes
 from dsr.utils.console import shorten
 from dsr.utils.files import write_text
 from dsr.utils.hashing import hash_of_code, hash_outside_code
 from dsr.utils.limits import read_limited
 from dsr.utils.parsing import parse_json
-from dsr.utils.ratios import round_ratio
 from dsr.utils.versions import versions
 
 _RECORD = "versions.json"
-_NOT_IDENTITY = (
-    "output_dir",
-    "overwrite",
-    "metrics",
-    "weights",
-    "resume",
-    "run",
-    "trust",
-    "workers",
-    "threads",
-    "logger",
-)  # weights count by their content
 PREDICTING_CODE = (
     "sample.py", "degradation", "geometry", "metrics", "synthetic", "methods", "data", "training", "inference",
     "utils/builder.py", "utils/config_files.py", "utils/devices.py", "utils/divergence.py", "utils/hashing.py",
@@ -57,7 +45,7 @@ def identity_of(
             code of those outside dsr is part of the identity.
 
     """
-    kept = {key: value for key, value in config.items() if key not in _NOT_IDENTITY}
+    kept = {key: value for key, value in config.items() if key not in NOT_IDENTITY}
     if isinstance(kept.get("method"), Mapping):
         kept["method"] = {key: value for key, value in kept["method"].items() if key != "weights"}
     named = [str(node["target"]) for node in kept.values() if isinstance(node, Mapping) and "target" in node]
@@ -67,16 +55,51 @@ def identity_of(
 
 
 def default_directory(kind: str, config: Mapping[str, Any], identity: Mapping[str, Any]) -> Path:
-    """Return outputs/KIND/DATASET_DOWNSAMPLING_xSCALE_METHOD_HASH; the same configuration gives the same one."""
-    digest = hashlib.sha256(json.dumps(identity, sort_keys=True).encode()).hexdigest()[:8]
-    what = config["method"] if "method" in config else config["model"]
-    names = (
-        config["dataset"]["name"],
-        config["downsampling"]["name"],
-        f"x{round_ratio(config['scale'])}",
-        what["name"],
-    )
-    return Path("outputs") / kind / "_".join((*names, digest))
+    """Return outputs/KIND/NAME, with the name of :func:`dsr.app.run_names.run_name`.
+
+    The first eight digits of the identity's hash follow where the name does not say everything, or where the directory
+    of that name holds a run of another identity, such as another code's. The same identity gives the same directory.
+    """
+    name, complete = run_name(kind, config, identity)
+    plain = Path("outputs") / kind / name
+    marked = plain.with_name(f"{name}-{_hash_of(identity)[:8]}")
+    return plain if complete and not marked.is_dir() and _may_hold(plain, identity) else marked
+
+
+def _hash_of(identity: Mapping[str, Any]) -> str:
+    """Return the hash of an identity."""
+    return hashlib.sha256(json.dumps(identity, sort_keys=True).encode()).hexdigest()
+
+
+def _identity_in(folder: Path) -> dict[str, Any]:
+    """Return the identity of the run in a directory; an OSError, ValueError, KeyError or TypeError if there is none."""
+    return update_targets(dict(parse_json(read_limited(folder / _RECORD), finite=False)["identity"]))
+
+
+def _may_hold(folder: Path, identity: Mapping[str, Any]) -> bool:
+    """Return whether a directory does not exist yet, or is empty, or is that of a run of this identity."""
+    try:
+        if not folder.is_dir() or _is_unused(folder):
+            return not folder.exists() or folder.is_dir()
+        return not _changes(_identity_in(folder), json.loads(json.dumps(identity)))
+    except (OSError, ValueError, KeyError, TypeError):
+        return False
+
+
+def degradation_of(config: Mapping[str, Any]) -> str:
+    """Return the name of a run's degradation, as in ``scores.csv``: box, or box+gaussian_multiplicative-0.003."""
+    if config.get("degradation", {}).get("name", "plain") != "plain":
+        return str(config["degradation"]["name"])
+    parts = [str(config["downsampling"]["name"])]
+    assumed = config["downsampling"].get("assumed")
+    if assumed not in (None, parts[0]) and takes("method", config["method"], "downsampling"):
+        parts.append(f"assumed-{assumed}")
+    for group in (config["noise"], config.get("holes", {"name": "none"})):
+        if group["name"] != "none":
+            settings_of = [value for key, value in group.items() if key not in ("name", "target")]
+            values = ["none" if value is None else f"{value:g}" for value in settings_of]
+            parts.append("-".join((str(group["name"]), *values)))
+    return "+".join(parts)
 
 
 def folder_of(output_dir: str | Path) -> Path:
@@ -121,7 +144,7 @@ def expect_free(
     if not folder.is_dir() or _is_unused(folder) or config["overwrite"]:
         return []
     try:
-        before = update_targets(dict(parse_json(read_limited(folder / _RECORD), finite=False)["identity"]))
+        before = _identity_in(folder)
     except (OSError, ValueError, KeyError, TypeError):
         raise ConfigError(
             f"output_dir: {folder} holds files of something else; another output_dir keeps them"
@@ -160,8 +183,9 @@ def claim(
 
     """
     different = expect_free(folder, config, identity, tolerated)
+    record = {**versions(), "hash": _hash_of(identity), "identity": dict(identity)}
     try:
-        write_text(folder / _RECORD, json.dumps({**versions(), "identity": dict(identity)}, indent=1) + "\n")
+        write_text(folder / _RECORD, json.dumps(record, indent=1) + "\n")
         write_text(folder / "config.yaml", OmegaConf.to_yaml(OmegaConf.create(dict(config))))
     except OSError as error:
         raise ConfigError(f"output_dir: expected a directory to write to, got {folder} ({error.strerror})") from error

@@ -33,6 +33,10 @@ _GROUPS = (
 )
 
 
+SEVERAL = ("logger", "experiment")
+"""Groups of which several choices go together, as a list."""
+
+
 @dataclass
 class MetricsConfig:
     """Which metrics to compute."""
@@ -210,9 +214,7 @@ class TrainConfig(RunConfig):
         default_factory=lambda: {"name": "plain", "target": "dsr.degradation.everything.plain"}
     )
     trainer: TrainerConfig = field(default_factory=TrainerConfig)
-    logger: dict[str, Any] = field(
-        default_factory=lambda: {"name": "tensorboard", "target": "dsr.training.loggers.tensorboard"}
-    )
+    logger: dict[str, Any] = field(default_factory=dict)
     loss: LossConfig = field(default_factory=LossConfig)
     validation: dict[str, Any] = field(default_factory=dict)
     resume: str | None = None

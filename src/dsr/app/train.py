@@ -8,7 +8,7 @@ import math
 import shutil
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 from zipfile import BadZipFile
@@ -21,19 +21,27 @@ from rich.console import Console
 
 from dsr.app import run_directory as rundir
 from dsr.app.devices import Processes, find_processes
-from dsr.app.divergence import NOTE, expect_no_divergence, note_divergence
+from dsr.app.divergence import NOTE, expect_no_divergence, note_divergence, step_of
 from dsr.app.metrics import check_metrics, metric_collection
-from dsr.app.schema import TrainConfig, given_keys, plain_config
-from dsr.app.trainer import has_idle_layers, seconds_per_step, training_trainer
+from dsr.app.multirun import Plan, runs_here
+from dsr.app.schema import TrainConfig, TrainerConfig, given_keys, plain_config
+from dsr.app.trainer import (
+    has_idle_layers,
+    seconds_per_step,
+    seconds_per_validation,
+    seconds_to_prepare,
+    training_trainer,
+)
 from dsr.app.training_runs import WEIGHTS, common, keyed, read_config, training_data
-from dsr.data.base import prepare_scenes
+from dsr.data.base import SceneSource, prepare_scenes
 from dsr.methods.networks.base import DisparityNetwork
 from dsr.methods.networks.facets_unet import FacetsUNet
 from dsr.methods.networks.trained import NETWORKS
 from dsr.methods.networks.weight_files import load_network, network_name, read_torch_file, save_network
+from dsr.metrics.catalogue import KNOWN_FORMATS
 from dsr.metrics.visual_loss import VisualLoss, make_visual_loss
 from dsr.training.data_module import PatchData
-from dsr.training.loggers import RUN_ID, expect_installed, log_layout, log_settings
+from dsr.training.loggers import RUN_IDS, expect_installed, log_config, log_layout, log_settings
 from dsr.training.module import SuperResolution
 from dsr.training.objective import Objective, SurfaceObjective, balance_weight
 from dsr.training.settings import Schedule
@@ -46,11 +54,18 @@ from dsr.utils.divergence import DivergenceError
 from dsr.utils.files import replacing
 from dsr.utils.lightning import fit
 from dsr.utils.limits import expect_stored
-from dsr.utils.progress import Progress
+from dsr.utils.progress import SILENT, Progress
 from dsr.utils.units import duration
 
 _PATCHES_FOR_W = 64
 _LARGEST_SEED = 2**32 - 1
+_FOLDERS = ("checkpoints", "tensorboard", "csv", "wandb", "mlruns")
+"""What a training writes into its directory beside files."""
+_LAST = Path("checkpoints", "last.ckpt")
+"""The checkpoint that a training goes on from, in the directory of its run."""
+_SCENES = "scenes that are not in the cache"
+_COUNTED: set[str] = set()
+"""Data sets whose preparation is part of an earlier estimate of this process."""
 _RESUMABLE = ("resume", "device", "trust")
 
 
@@ -63,18 +78,14 @@ def train(config: DictConfig) -> float:
         config: composed from ``conf/train.yaml``.
 
     Returns:
-        The best score of the validations, their mean RMSE_v.
+        The best score of the validations, their mean RMSE_v, as a fraction like the scores in files.
 
     Raises:
         ConfigError: the configuration cannot be run, or its training is already complete.
         KeyboardInterrupt: the training was interrupted; the message says how to resume it.
 
     """
-    plain = _resumed(plain_config(config))
-    settings = TrainConfig.of(plain)
-    device = pick_device(settings.device)
-    if settings.precision == "auto":
-        plain["precision"] = settings.precision = fast_precision(device)
+    plain, settings, device = _read(config)
     processes = find_processes(device, settings.trainer.devices, settings.trainer.strategy)
     with processes.running():
         if processes.first:
@@ -88,68 +99,179 @@ def train(config: DictConfig) -> float:
             sys.exit(interruption.exit_code())
 
 
-def _train(plain: dict[str, Any], settings: TrainConfig, device: torch.device, processes: Processes) -> float:
-    """Train in one of the processes, and return the best score."""
-    first = processes.first
-    progress = ConsoleProgress(Console(quiet=not first))
+def plan(config: DictConfig) -> list[Plan]:
+    """Check what :func:`train` would do as a job of a multirun; nothing is computed or written.
+
+    A training that is complete, or that would diverge again, is no work, and keeps no other one from its own.
+
+    Args:
+        config: composed from ``conf/train.yaml``.
+
+    Raises:
+        ConfigError: the configuration cannot be run.
+
+    """
+    here = runs_here()
+    plain, settings, device = _read(config, here=here)
+    devices = settings.trainer.devices
+    count = find_processes(device, devices, settings.trainer.strategy).count if here else 1
+    prepared = _prepare(plain, settings, device, count)
+    elsewhere = () if here else ("device", "precision")
+    rundir.expect_free(prepared.folder, plain, prepared.identity, (*prepared.tolerated, *elsewhere))
+    left = _steps_left(prepared, settings)
+
+    def seconds() -> float:
+        costs = _costs(settings.trainer, prepared, devices=count, progress=SILENT)
+        named = str((plain["dataset"], plain["validation"]))
+        if named in _COUNTED:  # the first job of several prepares the scenes
+            costs = {what: each for what, each in costs.items() if _SCENES not in what}
+        _COUNTED.add(named)
+        return sum(costs.values())
+
+    done = settings.trainer.steps - left
+    return [Plan(prepared.folder, prepared.identity, "step", left, done, seconds if here else None)]
+
+
+def _steps_left(prepared: _Prepared, settings: TrainConfig) -> int:
+    """Return how many steps are to be done; none if the training is complete or would diverge again."""
+    try:
+        _expect_unfinished(prepared.folder, prepared.identity, overwrite=settings.overwrite)
+    except ConfigError:
+        return 0
+    if prepared.resume is None:
+        return settings.trainer.steps
+    try:
+        return settings.trainer.steps - int(read_torch_file(prepared.resume)["global_step"])
+    except (ValueError, KeyError, TypeError, OSError) as error:
+        raise CheckpointError(prepared.resume, error) from error
+
+
+def _read(config: DictConfig, *, here: bool = True) -> tuple[dict[str, Any], TrainConfig, torch.device]:
+    """Return the configuration, perhaps of the run to resume, its checked settings and the device to train on.
+
+    Args:
+        config: composed.
+        here: whether this process has the device.
+
+    """
+    plain = _resumed(plain_config(config))
+    settings = TrainConfig.of(plain)
+    device = pick_device(settings.device) if here else torch.device("cpu")
+    if settings.precision == "auto":
+        plain["precision"] = settings.precision = fast_precision(device)
+    return plain, settings, device
+
+
+@dataclass(frozen=True)
+class _Prepared:
+    """A training that can be run, in the directory of its run."""
+
+    data: PatchData
+    module: SuperResolution
+    identity: Mapping[str, Any]
+    folder: Path
+    resume: Path | None
+    tolerated: tuple[str, ...]
+
+
+def _prepare(plain: dict[str, Any], settings: TrainConfig, device: torch.device, devices: int) -> _Prepared:
+    """Check and build all that a training on a number of devices needs, and write nothing."""
     if settings.seed > _LARGEST_SEED:
         raise ConfigError(f"seed: expected at most {_LARGEST_SEED}, got {settings.seed}")
     lightning.seed_everything(settings.seed, workers=True, verbose=False)
     net = _network(settings)
-    data = training_data(settings, processes.count)
+    data = training_data(settings, devices)
     check_metrics(settings.metrics)
-    expect_installed(settings.logger["name"])
+    for name in settings.logger:
+        expect_installed(name)
     identity = rundir.identity_of(plain, None, device)
     folder = rundir.folder_of(settings.output_dir or rundir.default_directory("train", plain, identity))
-    weights, last = folder / WEIGHTS, folder / "checkpoints" / "last.ckpt"
+    last = folder / _LAST
     metrics = functools.partial(metric_collection, settings.metrics, device)
     module = _module(settings, net, data, metrics)
     tolerated = ("code", "device") if "resume" in given_keys() else ()
     resume = last if last.is_file() and not settings.overwrite else None
+    return _Prepared(data, module, identity, folder, resume, tolerated)
+
+
+def _train(plain: dict[str, Any], settings: TrainConfig, device: torch.device, processes: Processes) -> float:
+    """Train in one of the processes, and return the best score."""
+    first = processes.first
+    progress = ConsoleProgress(Console(quiet=not first))
+    prepared = _prepare(plain, settings, device, processes.count)
+    data, module, identity, folder = prepared.data, prepared.module, prepared.identity, prepared.folder
+    resume, tolerated, weights = prepared.resume, prepared.tolerated, folder / WEIGHTS
+    new = False
     if first:
         _expect_trainable(folder, plain, identity, tolerated)
-        _announce(progress, settings, module, data, folder, resume, processes.count)
-    _load(progress, settings, module, data)
-    if first:
-        _claim(folder, plain, identity, tolerated, progress)
-    facts = _facts(plain, module)
+        new = _claim(folder, plain, identity, tolerated, progress)
     idle = processes.count > 1 and has_idle_layers(module, data.example_batch())
     trainer, best = training_trainer(settings, folder, device, progress, processes, idle=idle)
+    try:
+        if first:
+            _open_log(trainer, plain, module)
+            module.to(device)
+            _announce(progress, settings, prepared, processes.count)
+        _load(progress, settings, module, data)
+    except ConfigError:
+        if new:  # a corrected command begins anew
+            _discard(trainer, folder)
+        raise
+    facts = _facts(plain, module)
     if first:
         _describe(trainer, plain, module, facts, resumed=resume is not None)
     try:
         fit(trainer, module, data, resume)
     except DivergenceError as error:
-        raise note_divergence(folder, last, identity, error) from error
+        raise note_divergence(folder, folder / _LAST, identity, error) from error
     except KeyboardInterrupt:
         raise KeyboardInterrupt(
             f"interrupted at step {trainer.global_step}; resume={folder} goes on from there"
         ) from None
     if first:
-        _export(module, Path(best.best_model_path), weights, facts)
+        _export(module, folder / _LAST.with_name("best.ckpt"), weights, facts)
     progress.say(f"weights: {weights}")
-    return float(best.best_model_score if best.best_model_score is not None else math.nan)
+    score = math.nan if best.best_model_score is None else float(best.best_model_score)
+    return score / KNOWN_FORMATS["RMSE_v"].factor
 
 
 def _expect_trainable(
     folder: Path, plain: Mapping[str, Any], identity: Mapping[str, Any], tolerated: Sequence[str]
 ) -> None:
     """Check that the directory is free or that of this training, which is neither complete nor diverges again."""
-    if not plain["overwrite"] and (folder / WEIGHTS).exists():
-        raise ConfigError(f"output_dir: {folder / WEIGHTS} is trained already; overwrite=true trains it again")
+    for name in _FOLDERS:
+        if (folder / name).is_symlink():
+            raise ConfigError(f"{folder / name}: expected a directory of the run's own, got a link")
     rundir.expect_free(folder, plain, identity, tolerated)
-    if not plain["overwrite"]:
-        expect_no_divergence(folder, identity)
+    _expect_unfinished(folder, identity, overwrite=plain["overwrite"])
+
+
+def _expect_unfinished(folder: Path, identity: Mapping[str, Any], *, overwrite: bool) -> None:
+    """Check that a training is neither complete nor diverges again."""
+    if overwrite:
+        return
+    if (folder / WEIGHTS).exists():
+        raise ConfigError(f"output_dir: {folder / WEIGHTS} is trained already; overwrite=true trains it again")
+    expect_no_divergence(folder, identity)
 
 
 def _claim(
     folder: Path, plain: Mapping[str, Any], identity: Mapping[str, Any], tolerated: Sequence[str], progress: Progress
-) -> None:
-    """Make the directory that of this training, without the files of one that it replaces."""
+) -> bool:
+    """Make the directory that of this training, without the files of one that it replaces; return whether it is new."""
+    new = not folder.is_dir() or not any(folder.iterdir())
     for key in rundir.claim(folder, plain, identity, tolerated):
         progress.say(f"note: the run began with another {key}")
     if plain["overwrite"]:
         _clear(folder)
+    return new
+
+
+def _discard(trainer: lightning.Trainer, folder: Path) -> None:
+    """Remove the directory of a training that cannot begin."""
+    for logger in trainer.loggers:
+        logger.finalize("failed")
+    shutil.rmtree(folder)
 
 
 def _resumed(plain: dict[str, Any]) -> dict[str, Any]:
@@ -162,7 +284,7 @@ def _resumed(plain: dict[str, Any]) -> dict[str, Any]:
         raise ConfigError(f"resume: goes on under the run's own configuration; {', '.join(others)} cannot be changed")
     before = read_config(folder, plain["trust"])
     try:
-        expect_stored(folder / "checkpoints" / "last.ckpt")
+        expect_stored(folder / _LAST)
     except (ValueError, OSError, BadZipFile) as error:
         raise ConfigError(f"resume: {error}") from error
     device = {"device": plain["device"]} if "device" in given_keys() else {}
@@ -272,24 +394,16 @@ def _computes_w(settings: TrainConfig) -> bool:
 
 def _clear(folder: Path) -> None:
     """Remove the files of an earlier training, so that they are not taken for this one's if it is interrupted."""
-    for name in (WEIGHTS, NOTE, RUN_ID):
+    for name in (WEIGHTS, NOTE, *RUN_IDS.values()):
         (folder / name).unlink(missing_ok=True)
-    for name in ("checkpoints", "tensorboard", "csv", "wandb", "mlruns"):
+    for name in _FOLDERS:
         shutil.rmtree(folder / name, ignore_errors=True)
 
 
-def _announce(
-    progress: Progress,
-    settings: TrainConfig,
-    module: SuperResolution,
-    data: PatchData,
-    folder: Path,
-    resume: Path | None,
-    devices: int,
-) -> None:
+def _announce(progress: Progress, settings: TrainConfig, prepared: _Prepared, devices: int) -> None:
     """Show what the run will do, and how long it will take."""
-    trainer, objective = settings.trainer, module.objective
-    step = seconds_per_step(module, data.example_batch()) * trainer.accumulate
+    data, module, trainer = prepared.data, prepared.module, settings.trainer
+    objective = module.objective
     held_out = ", ".join(f"{len(names)} of {kind}" for kind, (_, names) in data.validation_scenes().items())
     parameters = sum(each.numel() for each in module.net.parameters())
     accumulate = f" x {trainer.accumulate} batches" if trainer.accumulate > 1 else ""
@@ -302,27 +416,64 @@ def _announce(
         "data": f"{data.training_count} scenes of {settings.dataset['name']} to train on, {held_out} to validate with",
         "loss": loss,
         "steps": f"{trainer.steps} of {trainer.batch} patches of {trainer.patch} x {trainer.patch}{accumulate}"
-        + (", resumed" if resume else ""),
-        "time": f"about {duration(step * trainer.steps)} ({step:.2g} s a step as measured now), and the validations",
-        "log": f"tensorboard --logdir {folder}"
-        if settings.logger["name"] == "tensorboard"
-        else settings.logger["name"],
+        + (", resumed" if prepared.resume else ""),
+        "log": ", ".join(
+            f"tensorboard --logdir {prepared.folder}" if name == "tensorboard" else name for name in settings.logger
+        ),
     }
     for name, line in lines.items():
         progress.say(f"{name:<6} {line}")
+    costs = _costs(trainer, prepared, devices=devices, progress=progress)
+    named = ", ".join(f"{duration(seconds)} for {what}" for what, seconds in costs.items()) or "all steps are done"
+    progress.say(f"time   about {duration(sum(costs.values()))}: {named}, as measured now")
+
+
+def _costs(trainer: TrainerConfig, prepared: _Prepared, *, devices: int, progress: Progress) -> dict[str, float]:
+    """Return the seconds of what is left of a training, as measured now, by what it is."""
+    data, module, interval = prepared.data, prepared.module, min(trainer.validate_every, trainer.steps)
+    done = 0 if prepared.resume is None else step_of(prepared.resume) or 0
+    steps, validations = trainer.steps - done, math.ceil(trainer.steps / interval) - done // interval + (not done)
+    try:
+        pairs = [seconds_to_prepare(source, names, progress) for source, names in _by_source(data)]
+        validation = seconds_per_validation(module, data) / devices
+    except (ValueError, OSError) as error:
+        raise keyed(error) from error
+    step = seconds_per_step(module, data.example_batch()) * trainer.accumulate
+    preparing, scenes = (sum(each) for each in zip(*pairs, strict=True))
+    parts = {
+        f"{scenes} {_SCENES}": preparing,
+        f"{steps} steps of {step:.2g} s": step * steps,
+        f"{validations} validations of {validation:.2g} s": validation * validations,
+    }
+    return {what: seconds for what, seconds in parts.items() if not what.startswith("0 ")}
+
+
+def _by_source(data: PatchData) -> list[tuple[SceneSource, list[str]]]:
+    """Return the scenes of each data set, those to validate with first, as one of them is measured with, too."""
+    sources: dict[int, tuple[SceneSource, list[str]]] = {}
+    for source, names in reversed(data.used_scenes):
+        sources.setdefault(id(source), (source, []))[1].extend(names)
+    return list(sources.values())
+
+
+def _open_log(trainer: lightning.Trainer, plain: Mapping[str, Any], module: SuperResolution) -> None:
+    """Write the configuration to the logs, and lay them out."""
+    collections: Any = module.metrics
+    for logger in trainer.loggers:
+        log_config(logger, f"```yaml\n{OmegaConf.to_yaml(OmegaConf.create(dict(plain)))}```")
+        log_layout(logger, {name: metric.chart_title for name, metric in collections[0].items()})
 
 
 def _describe(
     trainer: lightning.Trainer, plain: Mapping[str, Any], module: SuperResolution, facts: Mapping[str, Any], *,
     resumed: bool,
 ) -> None:  # fmt: skip
-    """Write the configuration and the resulting w to the log, and lay it out."""
+    """Write the main settings and the resulting w to the logs."""
+    listed = {**facts, "method": facts["model"], "degradation": rundir.degradation_of(plain)}
     loss = {**plain["loss"], "w": module.objective.w} if isinstance(module.objective, Objective) else {}
-    config = {**plain, "loss": loss}
-    if isinstance(trainer.logger, TensorBoardLogger) or not resumed:  # MLflow refuses another device, say
-        log_settings(trainer.logger, facts, f"```yaml\n{OmegaConf.to_yaml(OmegaConf.create(config))}```", config)
-    collections: Any = module.metrics
-    log_layout(trainer.logger, list(collections[0]))
+    for logger in trainer.loggers:
+        if isinstance(logger, TensorBoardLogger) or not resumed:  # MLflow refuses another device, say
+            log_settings(logger, listed, {**plain, "loss": loss})
 
 
 def _facts(plain: Mapping[str, Any], module: SuperResolution) -> dict[str, Any]:

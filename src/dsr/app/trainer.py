@@ -2,31 +2,38 @@
 
 from __future__ import annotations
 
+import os
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import lightning
 import torch
-from lightning.pytorch.callbacks import Callback, LearningRateMonitor, ModelCheckpoint
+from lightning.pytorch.callbacks import Callback, ModelCheckpoint
+from lightning.pytorch.utilities.seed import isolate_rng
 
 from dsr.app.devices import Processes
 from dsr.app.schema import TrainConfig
+from dsr.data.base import SceneSource, prepare_scenes, unprepared
+from dsr.training.data_module import PatchData
 from dsr.training.degradation import Batch
 from dsr.training.module import SuperResolution
 from dsr.utils.builder import build
-from dsr.utils.checkpoints import Interruption, Keep, ends_step
+from dsr.utils.checkpoints import Interruption, Keep, OwnFiles, ends_step
 from dsr.utils.divergence import Divergence
-from dsr.utils.lightning import LOG_EVERY, StepProgress, ValidationTable, make_trainer, without_chatter
-from dsr.utils.progress import Progress
+from dsr.utils.lightning import LOG_EVERY, ListedScores, StepProgress, ValidationTable, make_trainer, without_chatter
+from dsr.utils.progress import SILENT, Progress
 
 MONITOR = "val/RMSE_v"
 VALIDATION = "validation.csv"
 _SECONDS_BETWEEN_CHECKPOINTS = 600.0
+_PROBES = 3
+"""Scenes that are prepared to measure how long it takes."""
 
 
 class Curves(Callback):
-    """Logs the losses and the norm of the gradient as means over the steps since the last values, and the speed.
+    """Logs the losses and the gradient's norm, means over the steps since the last values, the rate and the speed.
 
     Single values of small batches are too noisy to read; these curves need no smoothing. Values that are not finite are
     left out. The means are those of all devices.
@@ -39,6 +46,7 @@ class Curves(Callback):
     def __init__(self, every: int) -> None:
         self._every, self._start, self._patches = every, time.perf_counter(), 0
         self._sums: dict[str, torch.Tensor] = {}
+        self._rate = 0.0
 
     def state_dict(self) -> dict[str, Any]:
         """Return the sums since the last values, so that a training that goes on logs the same ones."""
@@ -52,13 +60,17 @@ class Curves(Callback):
         """Start the clock."""
         self._start = time.perf_counter()
 
+    def on_train_batch_start(self, trainer: lightning.Trainer, *_: Any) -> None:
+        """Note the learning rate, before the step sets the next one's."""
+        self._rate = float(trainer.optimizers[0].param_groups[0]["lr"])
+
     def on_train_batch_end(
         self, trainer: lightning.Trainer, pl_module: lightning.LightningModule, outputs: Any, batch: Batch, *_: Any
     ) -> None:
         """Add the values of a batch, and log their means when it is time."""
         self._patches += len(batch["rgb"]) * trainer.world_size
         for name, value in trainer.callback_metrics.items():
-            if name.startswith("train/") and name != "train/learning_rate":
+            if name.startswith("train/"):
                 entry = torch.stack((value.detach(), torch.ones_like(value))) * value.isfinite()
                 self._sums[name] = self._sums.get(name, 0) + entry.nan_to_num().to(pl_module.device)
         if trainer.global_step % self._every or not ends_step(trainer):
@@ -66,9 +78,9 @@ class Curves(Callback):
         totals = trainer.strategy.reduce(torch.stack(list(self._sums.values())), reduce_op="sum")
         means = {name: float(total / count) for name, (total, count) in zip(self._sums, totals.cpu(), strict=True)}
         now = time.perf_counter()
-        means["train/patches_per_second"] = self._patches / (now - self._start)
+        means |= {"train/learning_rate": self._rate, "train/patches_per_second": self._patches / (now - self._start)}
         for logger in trainer.loggers:
-            logger.log_metrics(means, trainer.global_step - 1)
+            logger.log_metrics(means, trainer.global_step)
         self._sums, self._start, self._patches = {}, now, 0
 
     def on_validation_start(self, *_: Any) -> None:
@@ -78,6 +90,34 @@ class Curves(Callback):
     def on_validation_end(self, *_: Any) -> None:
         """Start the clock again."""
         self._start += time.perf_counter()
+
+
+class FirstValidation(Callback):
+    """Validates before the first step, without any effect on the steps; what the network is then may be its best.
+
+    Args:
+        best: keeps the best checkpoint; by itself only after steps.
+
+    """
+
+    def __init__(self, best: ModelCheckpoint) -> None:
+        self._best = best
+
+    def on_train_start(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
+        """Validate, unless the training goes on."""
+        if trainer.global_step:
+            return
+        with isolate_rng():
+            trainer.validating = True
+            trainer.fit_loop.epoch_loop.val_loop.run()
+            trainer.training = True
+        score = trainer.callback_metrics[MONITOR].clone()
+        if not score.isfinite():
+            return
+        path = str(Path(str(self._best.dirpath), f"{self._best.filename}.ckpt"))
+        trainer.save_checkpoint(path)
+        kept = {"best_model_path": path, "kth_best_model_path": path, "best_k_models": {path: score}}
+        self._best.load_state_dict(self._best.state_dict() | kept | {"best_model_score": score, "kth_value": score})
 
 
 def training_trainer(
@@ -113,25 +153,27 @@ def training_trainer(
         checkpoints, "last", enable_version_counter=False, save_on_train_epoch_end=False
     )  # save_last=True keeps the best's
     callbacks = [
+        OwnFiles(checkpoints, progress.say),
         Divergence(),
         Curves(min(LOG_EVERY, settings.validate_every, settings.steps)),
         ValidationTable(folder / VALIDATION),
+        ListedScores(best),
         best,
         latest,
-        LearningRateMonitor("step"),
         StepProgress(progress, "train"),
         Keep(checkpoints / "last.ckpt", _SECONDS_BETWEEN_CHECKPOINTS),
         Interruption(checkpoints / "last.ckpt"),
+        FirstValidation(best),
     ]
     with without_chatter():
-        logger = build("logger", config.logger, {"folder": folder})
+        loggers = [build(f"logger.{name}", node, {"folder": folder}) for name, node in config.logger.items()]
     varying = "_find_unused_parameters_true" if idle or config.degradation.get("scales") else ""  # layers of one factor
     trainer = make_trainer(
         device,
         settings.steps,
         min(settings.validate_every, settings.steps),
         callbacks=callbacks,
-        logger=logger,
+        logger=loggers,
         devices=processes.count,
         accumulate=settings.accumulate,
         environment=processes.environment,
@@ -143,6 +185,39 @@ def training_trainer(
 def seconds_per_step(module: SuperResolution, batch: Batch) -> float:
     """Measure the seconds of a step; the module is left unchanged."""
     return _try_steps(module, batch, 2)[0]  # the first one warms up
+
+
+def seconds_per_validation(module: SuperResolution, data: PatchData) -> float:
+    """Measure the seconds of a validation with the first scene of each set; the module is left unchanged."""
+    total = 0.0
+    module.average.eval()
+    for index, (kind, (_, names)) in enumerate(data.validation_scenes().items()):
+        batch = {
+            name: value.to(module.device) if torch.is_tensor(value) else value
+            for name, value in data.example_scene(kind).items()
+        }
+        start = time.perf_counter()
+        with torch.no_grad():
+            module.validation_step(batch, 0, index)
+        total += (time.perf_counter() - start) * len(names)
+        module.metrics[index].reset()  # type: ignore[operator]
+    module.average.train()
+    return total
+
+
+def seconds_to_prepare(source: SceneSource, names: Sequence[str], progress: Progress) -> tuple[float, int]:
+    """Prepare a few of the scenes that are not ready; return the seconds for the others and their number.
+
+    All cores will work on them. The first one, which may have to compile, does not count.
+    """
+    missing = unprepared(source, names)
+    taken = []
+    for name in progress.track(missing[:_PROBES], "measure"):
+        start = time.perf_counter()
+        prepare_scenes(source, [name], SILENT)
+        taken.append(time.perf_counter() - start)
+    rest = len(missing) - len(taken)
+    return sum(taken[1:]) / (_PROBES - 1) * rest / (os.cpu_count() or 1), rest
 
 
 def has_idle_layers(module: SuperResolution, batch: Batch) -> bool:

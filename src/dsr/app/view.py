@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import webbrowser
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from rich.console import Console
 
+from dsr.app.requests import ViewRequest
 from dsr.app.upsample.reporting import problem_line
 from dsr.app.upsample.stored import find_results, read_result
 from dsr.utils.console import ConsoleProgress, show
@@ -21,33 +21,6 @@ _WHOLE_PAGE = 6
 """The page has at most this many times the vertices of one surface."""
 _PHOTO, _SMALL_PHOTO, _FEW = 2048, 1024, 4
 """Longer side of the photos on a page of at most ``_FEW`` results, and of more, pixels."""
-
-
-@dataclass(frozen=True)
-class ViewRequest:
-    """What to look at.
-
-    Args:
-        output: a result, or a folder of results.
-        page: the HTML file.
-        most: maximum number of results.
-        vertices: maximum number of vertices of a surface.
-        open_page: whether to open the page in the browser.
-
-    """
-
-    output: Path
-    page: Path
-    most: int
-    vertices: int
-    open_page: bool
-
-    def __post_init__(self) -> None:
-        """Check the numbers."""
-        if self.most < 1:
-            raise ValueError(f"--most: expected at least 1, got {self.most}")
-        if self.vertices < 1000:
-            raise ValueError(f"--vertices: expected at least 1000, got {self.vertices}")
 
 
 def view(request: ViewRequest, console: Console) -> list[str]:

@@ -50,8 +50,10 @@ def add(commands: Any) -> None:
 
 def _run(options: argparse.Namespace, console: Console, _: object) -> list[str]:
     """Write the file."""
-    from dsr.app.export import ExportRequest, export_onnx  # noqa: PLC0415 - it takes seconds to import
+    from dsr.app.requests import ExportRequest  # noqa: PLC0415 - it is needed for few commands
 
     request = ExportRequest(options.onnx, options.method, options.scale, options.weights, tuple(options.config_dir))
+    from dsr.app.export import export_onnx  # noqa: PLC0415 - it takes seconds to import: after the values are checked
+
     export_onnx(request, console)
     return []

@@ -45,6 +45,9 @@ def add(commands: Any) -> None:
 
 def _run(options: argparse.Namespace, console: Console, _: object) -> list[str]:
     """Fuse, and return the problems."""
-    from dsr.app.fuse import FuseRequest, fuse  # noqa: PLC0415 - it takes seconds to import
+    from dsr.app.requests import FuseRequest  # noqa: PLC0415 - it is needed for few commands
 
-    return fuse(FuseRequest(tuple(options.folders), options.output, options.voxel, options.max_error / 100), console)
+    request = FuseRequest(tuple(options.folders), options.output, options.voxel, options.max_error / 100)
+    from dsr.app.fuse import fuse  # noqa: PLC0415 - it takes seconds to import: after the values are checked
+
+    return fuse(request, console)

@@ -54,17 +54,19 @@ def add(commands: Any) -> None:
 
 def _run(options: argparse.Namespace, console: Console, _: object) -> list[str]:
     """Make the report."""
-    from dsr.app.report import PARTS, ReportRequest, make_report  # noqa: PLC0415 - it takes seconds to import
+    from dsr.app.requests import REPORT_PARTS, ReportRequest  # noqa: PLC0415 - it is needed for few commands
 
     request = ReportRequest(
         tuple(options.methods),
         tuple(options.datasets),
         tuple(map(as_ratio, options.scale)),
-        tuple(part.strip() for part in options.only.split(",")) if options.only is not None else PARTS,
+        tuple(part.strip() for part in options.only.split(",")) if options.only is not None else REPORT_PARTS,
         options.light,
         options.title,
         options.page_mb,
         options.workers,
     )
+    from dsr.app.report import make_report  # noqa: PLC0415 - it takes seconds to import: after the values are checked
+
     make_report(options.runs, options.output, options.study, request, console)
     return []

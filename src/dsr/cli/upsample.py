@@ -5,9 +5,13 @@ from __future__ import annotations
 import argparse
 import math
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 from rich.console import Console
+
+from dsr.app.upsample.parts import MORE_PARTS, PARTS
+from dsr.inference.options import DEFAULT, WIDEST, Fill
+from dsr.utils.limits import MOST_FACES, MOST_POINTS
 
 _DESCRIPTION = """\
 Upsample the depth maps of your own photos to the photos' resolution.
@@ -109,7 +113,7 @@ def _add_method(parser: argparse.ArgumentParser) -> None:
     method = parser.add_argument_group("method")
     method.add_argument(
         "--method",
-        default="facets",
+        default=DEFAULT,
         metavar="NAME",
         help="facets (default), for clean and noisy depth; or another: tgv, guided_filter, dip_v, ...",
     )
@@ -152,13 +156,11 @@ def _add_method(parser: argparse.ArgumentParser) -> None:
         help="pictures at a time, each in its own process (default: 1)",
     )
     method.add_argument("--device", default="auto", metavar="DEVICE", help="auto (default), cpu, cuda, cuda:1, ...")
-    method.add_argument(
-        "--fill", choices=("all", "small", "none"), default="small", help="which of the input's holes are filled"
-    )
+    method.add_argument("--fill", choices=get_args(Fill), default="small", help="which of the input's holes are filled")
     method.add_argument(
         "--max-hole",
         type=float,
-        default=2.0,
+        default=WIDEST,
         metavar="DEGREES",
         help="width of the widest hole that --fill small fills, degrees of view (default: 2)",
     )
@@ -169,9 +171,8 @@ def _add_results(parser: argparse.ArgumentParser) -> None:
     results = parser.add_argument_group("what is written")
     results.add_argument("-o", "--output", type=Path, required=True, metavar="OUT", help="folder of the results")
     results.add_argument("--format", metavar="FORMAT", help="of the depth: png, tiff, npy, npz, pfm, exr (the input's)")
-    parts = "depth,renderings,normals,cloud,mesh,before_after,confidence,input"
+    parts, more = ",".join(PARTS), ",".join(MORE_PARTS)
     chosen = results.add_mutually_exclusive_group()
-    more = "rgbd,open3d,nerfstudio,gaussian,rerun"
     chosen.add_argument("--only", type=_words, metavar="PARTS", help=f"some of {parts},{more}")
     chosen.add_argument("--without", type=_words, default=(), metavar="PARTS", help="all but these")
     results.add_argument(
@@ -184,8 +185,10 @@ def _add_results(parser: argparse.ArgumentParser) -> None:
     results.add_argument(
         "--with", type=_words, default=(), dest="more", metavar="PARTS", help=f"also these: {more}; see docs/export.md"
     )
-    for name, what in (("faces", "simplify the mesh beyond N triangles"), ("points", "thin the cloud beyond N points")):
-        default = {"faces": 25_000_000, "points": 20_000_000}[name]
+    for name, what, default in (
+        ("faces", "simplify the mesh beyond N triangles", MOST_FACES),
+        ("points", "thin the cloud beyond N points", MOST_POINTS),
+    ):
         text = f"{what} (default: {default // 10**6} million)"
         results.add_argument(f"--max-{name}", type=int, default=default, metavar="N", help=text)
     results.add_argument("--overwrite", action="store_true", help="redo existing results, replace other ones")
@@ -199,7 +202,7 @@ def _words(text: str) -> tuple[str, ...]:
 
 def _settings(options: argparse.Namespace) -> dict[str, Any]:
     """Return the method's settings, those with an option of their own among them."""
-    from dsr.app.upsample.request import SHORTCUTS  # noqa: PLC0415 - they take seconds to import
+    from dsr.app.upsample.request import SHORTCUTS  # noqa: PLC0415 - it is needed for this command alone
     from dsr.app.upsample.settings import parse_settings  # noqa: PLC0415
 
     settings = parse_settings(options.settings)
@@ -214,7 +217,7 @@ def _settings(options: argparse.Namespace) -> dict[str, Any]:
 
 def _rig(options: argparse.Namespace) -> Any:
     """Return the files of a depth camera elsewhere than the photo's; None if there are none."""
-    from dsr.io.rigs import RigFiles  # noqa: PLC0415 - it takes seconds to import
+    from dsr.io.reading import RigFiles  # noqa: PLC0415 - it is needed for this command alone
 
     if (options.depth_camera is None) != (options.extrinsics is None):
         given, missing = (
@@ -226,11 +229,8 @@ def _rig(options: argparse.Namespace) -> Any:
 
 def _run(options: argparse.Namespace, console: Console, _: object) -> list[str]:
     """Upsample, and return the problems."""
-    from dsr.app.upsample.outputs import PARTS  # noqa: PLC0415
-    from dsr.app.upsample.run import UpsampleRequest, run  # noqa: PLC0415
-    from dsr.io.cameras import CameraChoice  # noqa: PLC0415 - they take seconds to import
-    from dsr.io.encoding import SUNRGBD_BITS, parse_unit  # noqa: PLC0415
-    from dsr.io.inputs import Reading  # noqa: PLC0415
+    from dsr.app.upsample.request import UpsampleRequest  # noqa: PLC0415 - they are needed for this command alone
+    from dsr.io.reading import SUNRGBD_BITS, CameraChoice, Reading, parse_unit  # noqa: PLC0415
     from dsr.io.shards import parse_shard  # noqa: PLC0415
 
     intrinsics = None if options.intrinsics is None else tuple(options.intrinsics)
@@ -283,4 +283,6 @@ def _run(options: argparse.Namespace, console: Console, _: object) -> list[str]:
         overwrite=options.overwrite,
         dry_run=options.dry_run,
     )
+    from dsr.app.upsample.run import run  # noqa: PLC0415 - it takes seconds to import: after all values are checked
+
     return run(wanted, console)

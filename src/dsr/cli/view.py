@@ -47,7 +47,10 @@ def add(commands: Any) -> None:
 
 def _run(options: argparse.Namespace, console: Console, _: object) -> list[str]:
     """Make the page, and open it."""
-    from dsr.app.view import ViewRequest, view  # noqa: PLC0415 - it takes seconds to import
+    from dsr.app.requests import ViewRequest  # noqa: PLC0415 - it is needed for few commands
 
     page = options.page or options.output / "view.html"
-    return view(ViewRequest(options.output, page, options.most, options.vertices, not options.no_open), console)
+    request = ViewRequest(options.output, page, options.most, options.vertices, not options.no_open)
+    from dsr.app.view import view  # noqa: PLC0415 - it takes seconds to import: after the values are checked
+
+    return view(request, console)

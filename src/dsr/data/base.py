@@ -55,7 +55,10 @@ def content_key(source: SceneSource, scene: str) -> str:
 
 @runtime_checkable
 class Prepared(Protocol):
-    """A data set that prepares its scenes once, before they are loaded."""
+    """A data set that prepares its scenes once, before they are loaded.
+
+    It may have a method ``unprepared``, which returns those of some scenes that are not ready.
+    """
 
     def prepare(self, scenes: Sequence[str]) -> Iterable[str]:
         """Prepare scenes, several at a time, and yield the name of each that is ready."""
@@ -74,6 +77,11 @@ def prepare_scenes(source: SceneSource, names: Sequence[str], progress: Progress
     if isinstance(source, Prepared):
         for _ in progress.track(source.prepare(names), "prepare", len(names)):
             pass
+
+
+def unprepared(source: SceneSource, names: Sequence[str]) -> list[str]:
+    """Return those of some scenes that are to be prepared before they are loaded, as far as the data set knows."""
+    return getattr(source, "unprepared", lambda _: [])(names)
 
 
 class SceneSubset:

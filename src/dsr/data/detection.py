@@ -25,6 +25,7 @@ from dsr.data.formats import (
 )
 from dsr.data.formats.shared import load_pair
 from dsr.sample import Scene
+from dsr.utils.paths import natural_key
 
 Loader = Callable[[], Scene]
 _YEARS = {"view1.png": 2006, "im2.png": 2003, "im2.ppm": 2001}
@@ -63,7 +64,8 @@ def find_scenes(folder: Path) -> Iterator[tuple[str, Loader]]:
 
 
 def _subfolders(folder: Path) -> list[Path]:
-    return sorted(path for path in folder.iterdir() if path.is_dir() and not path.name.startswith("."))
+    folders = (path for path in folder.iterdir() if path.is_dir() and not path.name.startswith("."))
+    return sorted(folders, key=natural_key)
 
 
 def _own_layout(place: Path) -> Iterator[tuple[str, Loader]]:

@@ -28,6 +28,7 @@ from dsr.data.formats.files import MAP_SUFFIXES, CameraFile, read_camera, read_m
 from dsr.geometry.camera import Camera, RangeType, from_range
 from dsr.sample import Scene, expect_distances
 from dsr.utils.limits import opened, pixels_beside
+from dsr.utils.paths import natural_key
 from dsr.utils.ratios import fits_ratio, round_ratio
 
 _RGB_NAMES = ("rgb.png", "rgb.jpg", "rgb.jpeg")
@@ -55,10 +56,10 @@ class Folder:
         self._root = Path(root).expanduser()
         if not self._root.is_dir():
             raise ValueError(f"root: expected a directory of scenes, got {root} (no such directory)")
-        found = sorted(path.name for path in self._root.iterdir() if path.is_dir() and not path.name.startswith("."))
+        found = [path.name for path in self._root.iterdir() if path.is_dir() and not path.name.startswith(".")]
         if not found:
             raise ValueError(f"root: expected a folder per scene in {root}, there is none")
-        self._scenes = select_scenes(found, scenes)
+        self._scenes = select_scenes(sorted(found, key=natural_key), scenes)
 
     def scenes(self) -> list[str]:
         """Return the names of the scenes, in order."""

@@ -5,14 +5,12 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Iterable, Iterator, Sequence
-from concurrent.futures import as_completed
-from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 
 from dsr.sample import Scene
 from dsr.synthetic.procedural.scenes import PROCEDURAL_VERSION, render_random_scene
 from dsr.synthetic.rendering import cache_directory, load_or_render
-from dsr.utils.workers import WorkerPool
+from dsr.utils.pool import LOST, Pool
 
 _WORTH_WORKERS = 5.0
 """Seconds of rendering from which worker processes are used; they take some seconds to start."""
@@ -54,18 +52,21 @@ class Procedural:
         """Return the version, seed, size and number that determine the scene."""
         return f"procedural-v{PROCEDURAL_VERSION}-{self._seed}-{self._size}-{scene}"
 
+    def unprepared(self, scenes: Sequence[str]) -> list[str]:
+        """Return those of some scenes that are not in the cache."""
+        return [scene for scene in scenes if not (cache_directory() / self._path(scene)).is_file()]
+
     def prepare(self, scenes: Sequence[str]) -> Iterable[str]:
         """Render scenes that are not in the cache, and yield the name of each that is ready.
 
         Where it takes longer than a few seconds, all processors take part.
 
         Raises:
-            ChildProcessError: a process that renders was ended.
+            ChildProcessError: two processes that render were ended at the same scene.
 
         """
-        there = {scene: (cache_directory() / self._path(scene)).is_file() for scene in scenes}
-        missing = [scene for scene in scenes if not there[scene]]
-        yield from (scene for scene in scenes if there[scene])
+        missing = self.unprepared(scenes)
+        yield from (scene for scene in scenes if scene not in missing)
         begun = time.perf_counter()
         for number, scene in enumerate(missing, start=1):
             self._render(scene)
@@ -77,19 +78,18 @@ class Procedural:
 
     def _render_in_workers(self, missing: Sequence[str]) -> Iterator[str]:
         """Render scenes on all processors."""
-        with WorkerPool(min(len(missing), os.cpu_count() or 1)) as pool:
-            jobs = {pool.submit(self._render, scene): scene for scene in missing}
-            for job in as_completed(jobs):
-                try:
-                    job.result()
-                except BrokenProcessPool as error:
-                    message = "dataset=procedural: a process that renders scenes ended, perhaps for want of memory"
-                    raise ChildProcessError(message) from error
-                yield jobs[job]
+        with Pool(os.cpu_count() or 1, self._render, _lost, start="spawn") as pool:
+            yield from (scene for scene, _ in pool.results(missing))
 
-    def _render(self, scene: str) -> None:
+    def _render(self, scene: str) -> bool:
         """Render a scene into the cache unless it is there."""
         load_or_render(self._path(scene), lambda: render_random_scene(self._seed, int(scene), self._size))
+        return True
 
     def _path(self, scene: str) -> Path:
         return Path(f"procedural-v{PROCEDURAL_VERSION}-{self._seed}-{self._size}", f"{scene}.npz")
+
+
+def _lost(scene: str) -> bool:
+    """Raise an error for a scene whose workers were ended."""
+    raise ChildProcessError(f"dataset=procedural: scene {scene}: {LOST}")

@@ -28,13 +28,14 @@ from dsr.degradation.downsampling import Downsampling, Measured, make_sample
 from dsr.degradation.holes import Holes
 from dsr.degradation.noise import Noise
 from dsr.evaluation.claims import Claims
-from dsr.evaluation.sharing import ALONE, LOST_WORKERS, Workers, share
+from dsr.evaluation.sharing import ALONE, Workers, share
 from dsr.evaluation.store import iterations_path, prediction_path, sample_path
 from dsr.methods.base import Confident, Iterative, NoSolutionError, Surface, Upsampler, expect_some_depth
 from dsr.sample import DepthSample
 from dsr.utils.console import one_line
 from dsr.utils.files import look_anew, read_arrays, replacing
 from dsr.utils.parsing import parse_json
+from dsr.utils.pool import LOST
 from dsr.utils.progress import SILENT, Progress
 from dsr.utils.tables import guarded
 
@@ -221,7 +222,7 @@ def _reuse(study: Evaluation, scene: str, folder: Path, config: Mapping[str, Any
 
 def _lost(scene: str) -> _Predicted:
     """Return the outcome of a scene whose workers were killed."""
-    return _Predicted(failure=f"{scene}: {LOST_WORKERS}")
+    return _Predicted(failure=f"{scene}: {LOST}")
 
 
 def failure_line(scene: str, error: BaseException) -> str:

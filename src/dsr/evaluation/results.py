@@ -15,6 +15,7 @@ from dsr.evaluation.store import load_errors, load_prediction, prediction_path, 
 from dsr.metrics.catalogue import KNOWN_FORMATS
 from dsr.metrics.formats import HEADLINES, MetricFormat, complete_formats, in_tables
 from dsr.sample import DepthSample
+from dsr.utils.files import array_headers
 
 METHOD_ORDER = (
     "Nearest", "Bilinear", "Bicubic", "Bilateral", "GF", "JBU", "FGS", "Diffusion", "TGV",
@@ -80,6 +81,13 @@ class Run:
         for scene, metric, value in zip(rows["scene"], rows["metric"], rows["value"], strict=True):
             found.setdefault(str(scene), {})[str(metric)] = float(value)
         return found
+
+    def size(self, scene: str) -> tuple[int, ...] | None:
+        """Return height and width of a scene's prediction in pixels, None without a readable one."""
+        try:
+            return array_headers(prediction_path(self.folder, scene))["depth"][0]
+        except (OSError, ValueError, KeyError):
+            return None
 
     def prediction(self, scene: str) -> Tensor:
         """Return the predicted depth, (1, H, W) in metres, NaN in holes.

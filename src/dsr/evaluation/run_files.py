@@ -15,10 +15,11 @@ import pandas as pd
 from pydantic import BaseModel, Field, ValidationError
 
 from dsr.evaluation.results import Results, Run, method_key, method_settings, problem_key
-from dsr.evaluation.store import prediction_path, sample_path
+from dsr.evaluation.store import expect_scene, prediction_path, sample_path
 from dsr.metrics.formats import MetricFormat
 from dsr.utils.files import array_headers
 from dsr.utils.limits import MOST_TABLE, TooLargeError, read_limited
+from dsr.utils.paths import OutsideError, natural_key
 from dsr.utils.ratios import as_ratio
 from dsr.utils.tables import unguarded
 from dsr.utils.validation import Number, Whole, describe
@@ -38,7 +39,7 @@ def load_results(paths: Sequence[Path]) -> Results:
     Damaged runs are omitted, and so is the older of two predictions of a scene by the same method. The notes list them.
 
     Raises:
-        ValueError: a path is not a directory, or there is no readable run.
+        ValueError: a path is not a directory, there is no readable run, or a run names files outside of it.
 
     """
     runs: list[Run] = []
@@ -46,6 +47,8 @@ def load_results(paths: Sequence[Path]) -> Results:
     for folder in _folders(paths):
         try:
             run = read_run(folder)
+        except OutsideError:
+            raise
         except (ValueError, OSError) as error:
             notes.append(f"left out: {error}")
             continue
@@ -103,7 +106,7 @@ def _folders(paths: Sequence[Path]) -> Iterator[Path]:
     for path in paths:
         if not path.is_dir():
             raise ValueError(f"{path}: expected a directory with runs of eval.py, there is none")
-        for file in sorted(path.rglob(_SUMMARY)):
+        for file in sorted(path.rglob(_SUMMARY), key=natural_key):
             if file.resolve() not in seen and (file.parent / _SCORES).is_file():
                 seen.add(file.resolve())
                 yield file.parent
@@ -113,12 +116,17 @@ def read_run(folder: Path) -> Run:
     """Return one run, with the label that it has by itself.
 
     Raises:
-        ValueError: a file of the directory is missing or damaged.
+        ValueError: a file of the directory is missing or damaged, or names a scene whose files lie elsewhere.
 
     """
     summary, versions = _read(_Summary, folder / _SUMMARY), _read(_Versions, folder / _VERSIONS)
     settings = versions.identity.model_dump(exclude_unset=True)
     scores = _read_scores(folder / _SCORES)
+    names = [(f"{folder / _SUMMARY}: seconds", scene) for scene in summary.seconds]
+    first = scores["scene"].drop_duplicates()
+    names += [(f"{folder / _SCORES}: line {row + 2}", scene) for row, scene in first.items()]
+    for source, scene in names:
+        expect_scene(folder, scene, source)
     label = summary.label or versions.identity.method.get("label") or summary.method
     dataset = str(scores["dataset"].iloc[0]) if len(scores) else summary.dataset
     scenes = tuple(scene for scene in summary.seconds if prediction_path(folder, scene).is_file())
@@ -155,6 +163,7 @@ class _Identity(BaseModel, extra="allow", strict=True):
 
     method: dict[str, Any] = {}
     dataset: dict[str, Any] = {}
+    downsampling: dict[str, Any] = {}
 
 
 class _Versions(BaseModel, extra="allow"):

@@ -14,12 +14,13 @@ from torch import Tensor
 
 from dsr.evaluation.claims import Claims
 from dsr.evaluation.predict import Evaluation, Outcome, failure_line
-from dsr.evaluation.sharing import ALONE, LOST_WORKERS, Workers, share
+from dsr.evaluation.sharing import ALONE, Workers, share
 from dsr.evaluation.store import load_prediction, prediction_path, sample_path
 from dsr.metrics.catalogue import Metric, score_image
 from dsr.metrics.formats import HEADLINES
 from dsr.sample import DepthSample
 from dsr.utils.files import replacing, write_text
+from dsr.utils.pool import LOST
 from dsr.utils.progress import Progress
 from dsr.utils.ratios import round_ratio
 from dsr.utils.tables import guarded
@@ -114,6 +115,8 @@ def _score_and_illustrate(
     result = _Scored()
     try:
         sample = DepthSample.load(sample_path(folder, scene))
+        if sample.scene != scene:  # its name becomes that of pictures
+            raise ValueError(f"{sample_path(folder, scene)}: expected the scene {scene}, got {sample.scene!r:.100}")
         depth = load_prediction(prediction_path(folder, scene))
         result.rows = list(_score_scene(study, sample, depth, metrics))
         result.unscored = sample.depth is None
@@ -143,7 +146,7 @@ def _record_key(folder: Path, scene: str, names: Sequence[str]) -> list[Any]:
 
 def _lost(scene: str) -> _Scored:
     """Return the outcome of a scene whose workers were killed."""
-    return _Scored(failure=f"{scene}: {LOST_WORKERS}")
+    return _Scored(failure=f"{scene}: {LOST}")
 
 
 def summary(study: Evaluation, scores: pd.DataFrame, outcome: Outcome, metrics: Sequence[Metric]) -> dict[str, Any]:

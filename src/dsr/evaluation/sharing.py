@@ -17,15 +17,13 @@ import cv2
 import torch
 
 from dsr.evaluation.claims import Claim, Claims
-from dsr.utils.forks import Forks
+from dsr.utils.pool import Pool
 from dsr.utils.progress import Progress
 
 _R = TypeVar("_R")
 _BETWEEN_TRIES = 0.3
 _MEMORY = 1 << 30
 """Bytes of free memory that the automatic number of workers leaves to each."""
-_threaded: list[bool] = []
-"""Not empty once this process has computed with several threads, which those that are forked from it could not."""
 
 
 @dataclass(frozen=True)
@@ -44,8 +42,6 @@ class Workers:
 
 
 ALONE = Workers()
-LOST_WORKERS = "two workers ended at it without a result, perhaps for want of memory; fewer workers need less"
-"""Why there is no result of a scene, for a message that names it."""
 
 
 def choose_workers(workers: int | None, threads: int | None, scenes: int, cores: int, *, together: bool) -> Workers:
@@ -101,12 +97,10 @@ def share(
 
     """
     found: dict[str, _R] = {}
-    if workers.count == 1 or len(scenes) < 2 or (_threaded and workers.threads != 1):
+    if workers.count == 1 or len(scenes) < 2:
         if meanwhile is not None:
             meanwhile()
         with _threads(workers.threads):
-            if torch.get_num_threads() > 1:
-                _threaded.append(True)
             attempts = _attempts(scenes, claims, name, ready)
             for scene, attempt in progress.track(attempts, name, len(scenes), label=_scene_of):
                 if isinstance(attempt, Claim):
@@ -125,11 +119,12 @@ def share(
             result = ready(scene)
             return work(scene, Progress()) if result is None else result
 
-    count = min(workers.count, len(scenes))
-    # The workers inherit the number of threads: setting it in a forked process can wait for ever for a thread of torch
+    # The workers inherit the number of threads: setting it in a forked process can wait for ever for a thread of OpenCV
     # that only its parent has.
-    with _threads(workers.threads), Forks(count, attempt_once, lost, progress.say) as forks:
-        results = forks.results(scenes, meanwhile)
+    with _threads(workers.threads), Pool(workers.count, attempt_once, lost, progress.say) as pool:
+        results = pool.results(scenes)
+        if meanwhile is not None:
+            meanwhile()
         for scene, result in progress.track(results, name, len(scenes), label=_scene_of):
             found[scene] = result
     return {scene: found[scene] for scene in scenes}

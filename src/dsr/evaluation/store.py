@@ -15,23 +15,40 @@ from torch import Tensor
 
 from dsr.utils.files import read_arrays
 from dsr.utils.limits import TooLargeError
+from dsr.utils.paths import path_within
 
 _ERRORS = ("depth_error", "angle_error")
+_PREDICTION, _SAMPLE = "predictions/{}.npz", "scenes/{}.npz"
+
+
+def expect_scene(folder: Path, scene: str, source: str) -> None:
+    """Check that the files of a scene that a file of a run names lie in the run.
+
+    Raises:
+        OutsideError: its name leads out of the run; the message begins with ``source``.
+
+    """
+    for form in (_PREDICTION, _SAMPLE):
+        path_within(folder, scene, source, form)
 
 
 def prediction_path(folder: Path, scene: str) -> Path:
-    """Return where a run keeps a scene's prediction."""
-    return folder / "predictions" / f"{scene}.npz"
+    """Return where a run keeps a scene's prediction; a name that leads out of the run is an OutsideError."""
+    return _path(folder, scene, _PREDICTION)
 
 
 def sample_path(folder: Path, scene: str) -> Path:
-    """Return where a run keeps the sample of a scene."""
-    return folder / "scenes" / f"{scene}.npz"
+    """Return where a run keeps the sample of a scene; see :func:`prediction_path`."""
+    return _path(folder, scene, _SAMPLE)
 
 
 def iterations_path(folder: Path, scene: str) -> Path:
-    """Return where a run keeps the history of a scene's iteration."""
-    return folder / "iterations" / f"{scene}.csv"
+    """Return where a run keeps the history of a scene's iteration; see :func:`prediction_path`."""
+    return _path(folder, scene, "iterations/{}.csv")
+
+
+def _path(folder: Path, scene: str, form: str) -> Path:
+    return path_within(folder, scene, f"{folder}: scene", form)
 
 
 def load_errors(path: Path) -> tuple[Tensor, Tensor] | None:

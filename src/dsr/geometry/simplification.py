@@ -16,8 +16,6 @@ from torch import Tensor
 from dsr.geometry.camera import Camera
 from dsr.geometry.mesh import Mesh, triangulate
 
-MOST_FACES = 25_000_000
-MOST_POINTS = 20_000_000
 QUADRIC = "quadric decimation"
 
 

@@ -15,7 +15,8 @@ from torch import Tensor
 
 from dsr.degradation.scales import SCALES
 from dsr.geometry.camera import RangeType
-from dsr.inference.engine import DECIDED, Fill, MethodChoice, upsample_depth
+from dsr.inference.engine import DECIDED, MethodChoice, upsample_depth
+from dsr.inference.options import Fill
 from dsr.inference.planning import read_ability
 from dsr.methods.registry import find_weights, read_method
 from dsr.sample import DepthSample
@@ -95,5 +96,4 @@ class AnyScale:
 
     def _steps(self) -> list[int]:
         """Return the factors that the method is made for."""
-        ability = read_ability(self._choice.name, self._choice.directories, self._choice.settings)
-        return sorted({step for steps in ability.steps.values() for step in steps})
+        return read_ability(self._choice.name, self._choice.directories, self._choice.settings).single_steps

@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from dsr.geometry.camera import Camera
-from dsr.inference.engine import WIDEST, Fill, upsample_surface
-from dsr.inference.planning import DEFAULT
+from dsr.inference.engine import upsample_surface
+from dsr.inference.options import DEFAULT, WIDEST, Fill
 from dsr.methods.base import MapNoise
 from dsr.utils.progress import Steps
 
@@ -130,11 +130,11 @@ def upsample_with_errors(
         raise ValueError(
             f"rgb, depth: expected two NumPy arrays or two tensors, got {type(rgb).__name__} and {type(depth).__name__}"
         )
-    photo, depth_lr = _photo(rgb), torch.as_tensor(depth)
+    photo, depth_lr = _photo(rgb), _tensor(depth)
     if depth_lr.dim() == 2:
         depth_lr = depth_lr[None]
     if mask is not None:
-        valid = torch.as_tensor(mask).bool()
+        valid = _tensor(mask).bool()
         if valid.shape[-2:] != depth_lr.shape[-2:]:
             raise ValueError(
                 f"mask: expected the depth's shape {tuple(depth_lr.shape[-2:])}, got {tuple(valid.shape[-2:])}"
@@ -158,9 +158,14 @@ def upsample_with_errors(
     return SurfaceArrays(depth_hr, depth_error, angle_error, surface.noise)
 
 
+def _tensor(values: np.ndarray | Tensor) -> Tensor:
+    """Return an array as a tensor, also one that torch cannot share: a flipped view has negative strides."""
+    return torch.as_tensor(np.ascontiguousarray(values) if isinstance(values, np.ndarray) else values)
+
+
 def _photo(rgb: np.ndarray | Tensor) -> Tensor:
     """Return a photo as (3, H, W) float32 in [0, 1]; an invalid one is left for :func:`upsample_depth` to reject."""
-    photo = torch.as_tensor(rgb)
+    photo = _tensor(rgb)
     if isinstance(rgb, np.ndarray):
         if rgb.ndim != 3 or rgb.shape[-1] != 3:
             raise ValueError(f"rgb: expected shape (H, W, 3), got {rgb.shape}")

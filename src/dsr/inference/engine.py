@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Any, NamedTuple, get_args
 
 import torch
 from torch import Tensor
@@ -19,7 +19,8 @@ from dsr.geometry.holes import degrees_per_pixel, wide_holes
 from dsr.geometry.resampling import pad_inverse_depth, resize_inverse_depth
 from dsr.inference.agreement import expect_errors
 from dsr.inference.inspection import enlarged_by
-from dsr.inference.planning import DEFAULT, OWN_SIZE, USUAL_SCALE, Plan, plan, read_ability
+from dsr.inference.options import DEFAULT, USUAL_SCALE, WIDEST, Fill
+from dsr.inference.planning import OWN_SIZE, Plan, plan, read_ability
 from dsr.methods.base import Confident, MapNoise, Surface, Upsampler, expect_some_depth
 from dsr.methods.classical.interpolation import Interpolation
 from dsr.methods.networks.base import NetworkUpsampler
@@ -30,12 +31,6 @@ from dsr.utils.builder import ConfigError, trait
 from dsr.utils.devices import fast_precision, pick_device
 from dsr.utils.progress import Steps, part_of
 
-Fill = Literal["all", "small", "none"]
-"""Which holes are filled."""
-WIDEST = 2.0
-"""Degrees of view of the widest hole that counts as small. On Middlebury 2014 and ICL-NUIM with holes cut into them,
-depth that ``facets`` fills in is off by 1.2 % on average at 0.2 to 0.4 degrees from a measured pixel, by 3 % at 0.7 to
-1 degree, and by 6 % and more beyond; half of these pixels are off by more than 2 %."""
 DECIDED = MappingProxyType({"fill_holes": True, "validate_every": 0})
 """Arguments of methods that are set here: holes are restored afterwards, and validation has no ground truth."""
 
@@ -92,7 +87,8 @@ def check_settings(choice: MethodChoice) -> None:
             name and a colon; or the method's own file has such a value: it begins with ``method=NAME:``.
 
     """
-    choice.build(next(iter(read_ability(choice.name, choice.directories, choice.settings).steps), USUAL_SCALE))
+    ability = read_ability(choice.name, choice.directories, choice.settings)
+    choice.build(next(iter(ability.single_steps), USUAL_SCALE))
 
 
 def upsample_depth(

@@ -27,6 +27,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from dsr.degradation.scales import SCALES
+from dsr.inference.options import DEFAULT, USUAL_SCALE
 from dsr.methods.base import Cost
 from dsr.methods.classical.interpolation import Interpolation
 from dsr.methods.networks.base import TILE, UNTILED
@@ -36,13 +37,10 @@ from dsr.methods.networks.trained import build_trained
 from dsr.methods.registry import SLACK, find_weights, has_weights, read_method
 from dsr.utils.builder import load_target, takes, trait
 
-DEFAULT = "facets"
-"""The method where none is chosen."""
 LARGEST_OPTIMISED = 2**20
 """Pixels; optimising a network for a larger picture takes hours."""
 OWN_SIZE = 1.25
 """A depth map whose sides differ from the photo's by no more than this factor is treated as having the photo's size."""
-USUAL_SCALE = 4
 _ASPECT = 0.02
 _UNKNOWN_COST = Cost(1000, 0)
 """The cost of a method that states none."""
@@ -69,6 +67,11 @@ class Ability:
     cost: Cost | None = None
     own_resolution: bool = False
     factors: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def single_steps(self) -> list[int]:
+        """The factors of single calls, which the method is built for; empty for one that takes any."""
+        return sorted({step for steps in self.steps.values() for step in steps})
 
 
 @dataclass(frozen=True)

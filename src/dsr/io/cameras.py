@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -14,6 +14,7 @@ from dsr.data.formats.files import CameraFile, Pixels, read_camera
 from dsr.geometry.camera import ASSUMED_FOV, Camera
 from dsr.io.encoding import Assumption
 from dsr.io.photos import Size, focal_in_exif, same_aspect
+from dsr.io.reading import CameraChoice
 from dsr.utils.limits import read_limited
 from dsr.utils.validation import describe
 
@@ -21,32 +22,6 @@ _FILM_DIAGONAL = math.hypot(36, 24)
 """Diagonal of 35 mm film in millimetres, to which equivalent focal lengths refer (CIPA DCG-001)."""
 _MAX_OFF_CENTRE = 0.25
 """Largest distance of a plausible principal point from the middle as a fraction of the size."""
-
-
-@dataclass(frozen=True)
-class CameraChoice:
-    """What the user says about the camera: at most one of the three.
-
-    Args:
-        file: camera file, see :func:`read_any_camera`.
-        fov: horizontal field of view in degrees.
-        intrinsics: fx, fy, cx, cy in pixels of the photo.
-
-    """
-
-    file: Path | None = None
-    fov: float | None = None
-    intrinsics: tuple[float, float, float, float] | None = None
-
-    def __post_init__(self) -> None:
-        """Check the numbers."""
-        if self.fov is not None and not 1 <= self.fov < 180:
-            raise ValueError(f"--fov: expected degrees from 1 to below 180, got {self.fov:g}")
-        if self.intrinsics is not None and not (
-            min(self.intrinsics[:2]) > 0 and all(map(math.isfinite, self.intrinsics))
-        ):
-            came = " ".join(f"{value:g}" for value in self.intrinsics)
-            raise ValueError(f"--intrinsics: expected FX FY CX CY in pixels, FX and FY above 0, got {came}")
 
 
 def find_camera(choice: CameraChoice, photo: Path, size: Size, size_lr: Size) -> tuple[CameraFile, list[Assumption]]:

@@ -23,10 +23,6 @@ _FAR_FOR_A_SENSOR = 10.0
 """Largest depth in metres of depth cameras that store millimetres."""
 _FLOAT_MILLIMETRES = 200.0
 """Median above which floats are millimetres."""
-_UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "sunrgbd": 1e-3}
-SUNRGBD_BITS = 3
-"""How far SUN RGB-D turns the 16 bits of its millimetres to the left (``read3dPoints.m`` of its toolbox)."""
-_LARGEST_UNIT = 1e6
 
 
 class Assumption(NamedTuple):
@@ -63,27 +59,6 @@ class Encoding:
     unit: float
     hole: float
     range_type: RangeType
-
-
-def parse_unit(text: str) -> float:
-    """Return the metres per value that a text names: m, cm, mm, sunrgbd, a number, or a fraction such as 1/5000.
-
-    Raises:
-        ValueError: it is none of these.
-
-    """
-    if text in _UNITS:
-        return _UNITS[text]
-    above, _, below = text.partition("/")
-    try:
-        unit = float(above) / float(below or 1)
-    except (ValueError, ZeroDivisionError):
-        unit = math.nan
-    if not 0 < unit <= _LARGEST_UNIT:
-        raise ValueError(
-            f"--depth-unit: expected m, cm, mm or metres per value such as 0.0002 or 1/5000, or sunrgbd, got {text!r}"
-        )
-    return unit
 
 
 def turn_back_bits(name: str, values: np.ndarray, bits: int) -> tuple[np.ndarray, list[Assumption]]:

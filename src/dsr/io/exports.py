@@ -14,10 +14,11 @@ from torch import Tensor
 from dsr.geometry.camera import Camera
 from dsr.geometry.mesh import LARGEST_STEP, Mesh, triangulate, vertex_normals
 from dsr.geometry.shading import LIGHT_NAMES, render
-from dsr.geometry.simplification import MOST_FACES, MOST_POINTS, QUADRIC, project, select_points, simplify, thin
+from dsr.geometry.simplification import QUADRIC, project, select_points, simplify, thin
 from dsr.geometry.surface import depth_to_normals
 from dsr.io.model_files import write_glb, write_ply
 from dsr.utils.files import replacing
+from dsr.utils.limits import MOST_FACES, MOST_POINTS
 
 _STRIP = 1 << 20
 """Pixels whose normals are held in memory at a time."""

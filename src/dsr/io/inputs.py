@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +12,7 @@ from torch import Tensor
 from dsr.data.formats.files import CameraFile, read_mask
 from dsr.data.formats.icl_nuim import CAMERA as ICL_CAMERA
 from dsr.geometry.camera import Camera, RangeType
-from dsr.io.cameras import CameraChoice, camera_only, find_camera, scale_to_photo
+from dsr.io.cameras import camera_only, find_camera, scale_to_photo
 from dsr.io.confidence import SLACK
 from dsr.io.depth_files import ICL_SUFFIX
 from dsr.io.encoding import Assumption, Encoding, decode, find_holes, turn_back_bits
@@ -20,44 +20,13 @@ from dsr.io.frames import Geometry
 from dsr.io.names import words_of
 from dsr.io.pairs import Pair
 from dsr.io.photos import Size, read_photo, same_aspect
-from dsr.io.rigs import RigFiles, read_rig, to_photo
+from dsr.io.reading import CameraChoice, Reading
+from dsr.io.rigs import read_rig, to_photo
 from dsr.io.units import FolderUnits, read_values_of
 from dsr.sample import FARTHEST, NEAREST
 from dsr.utils.limits import pixels_beside
 
 _DISPARITY_WORDS = frozenset({"disparity", "disp"})
-
-
-@dataclass(frozen=True)
-class Reading:
-    """What the user says about the files; None where it is to be read from the files or assumed.
-
-    Args:
-        camera: camera of the photo.
-        unit: metres per value of the depth files; pixels per value of disparities.
-        range_type: quantity that the values measure.
-        baseline: distance in metres between the two cameras of disparities.
-        hole_value: value that stands for a hole, in addition to the usual ones.
-        min_confidence: fraction; pixels of less confidence become holes. None for no limit.
-        turned_bits: how far the bits of the values are turned left, 3 in SUN RGB-D.
-        rig: depth camera elsewhere than the photo's, whose map is to be warped into the photo's view; None where the
-            depth map is registered.
-
-    """
-
-    camera: CameraChoice = field(default_factory=CameraChoice)
-    unit: float | None = None
-    range_type: RangeType | None = None
-    baseline: float | None = None
-    hole_value: float | None = None
-    rig: RigFiles | None = None
-    min_confidence: float | None = None
-    turned_bits: int = 0
-
-    def __post_init__(self) -> None:
-        """Check the numbers."""
-        if self.min_confidence is not None and not 0 <= self.min_confidence <= 1:
-            raise ValueError(f"--min-confidence: expected a fraction from 0 to 1, got {self.min_confidence:g}")
 
 
 @dataclass(frozen=True)

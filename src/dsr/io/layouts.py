@@ -27,6 +27,7 @@ from dsr.io.pairs import (
     match_pairs,
 )
 from dsr.utils.limits import MOST_TABLE, read_limited
+from dsr.utils.paths import natural_key, path_within
 
 _DEPTH_LR = re.compile(r"(depth|disparity)_lr(\d+)")
 _TUM_UNIT = 1 / 5000
@@ -69,7 +70,7 @@ def _search(folder: Path, root: Path, leave: Path | None, depth: int) -> Pairing
         return found
     deeper = [
         (path, _search(path, root, leave, depth + 1))
-        for path in sorted(folder.iterdir())
+        for path in sorted(folder.iterdir(), key=natural_key)
         if depth < _MAX_DEPTH and path.is_dir() and not path.name.startswith(".") and path.resolve() != leave
     ]
     pairs = [
@@ -158,9 +159,10 @@ def _timed(path: Path) -> dict[Path, float]:
         if not words or words[0].startswith("#"):
             continue
         try:
-            times[path.parent / words[1]] = float(words[0])
+            time, name = float(words[0]), words[1]
         except (IndexError, ValueError) as error:
             raise ValueError(f"{path}: line {number}: expected a time and a file name, got {line!r:.60}") from error
+        times[path_within(path.parent, name, f"{path}: line {number}")] = time
     return times
 
 

@@ -35,6 +35,7 @@ from dsr.io.units import order_of_maps
 from dsr.utils.files import replacing
 from dsr.utils.limits import opened
 from dsr.utils.parsing import is_number, parse_json
+from dsr.utils.paths import OutsideError, leads_outside
 
 _VERSION = 1
 _LONGEST = 1 << 26
@@ -127,15 +128,15 @@ class Manifest:
         if shard.count != self.shards:
             raise ValueError(f"--shard: expected K/{self.shards}, for which {self.path} was written, got {shard}")
         begin, end = self._begins[shard.number - 1 : shard.number + 1]
-        reader = _Reader(self.path)
+        block = shard.block(self.frames)
+        reader = _Reader(self.path, shard.number + block.start)  # a line for the file, and one for each shard before
         with opened(self.path) as file:
             file.seek(begin)
             head = reader.parse(file.readline(_LONGEST))
             if head.get("shard") != shard.number or not isinstance(head.get("firsts"), list):
                 raise reader.damaged()
             firsts = tuple(reader.pair(record) for record in head["firsts"])
-            count = len(shard.block(self.frames))
-            pairs = tuple(reader.pair(reader.parse(file.readline(_LONGEST))) for _ in range(count))
+            pairs = tuple(reader.pair(reader.parse(file.readline(_LONGEST))) for _ in block)
             if file.tell() != end:
                 raise reader.damaged()
         return ShardFrames(pairs, firsts + _firsts_among(pairs, firsts))
@@ -205,18 +206,21 @@ def _record(pair: Pair, base: str) -> dict[str, Any]:
 
 
 class _Reader:
-    """Makes pairs of the lines of a manifest."""
+    """Makes pairs of the lines of a manifest that follow after some."""
 
-    def __init__(self, path: Path) -> None:
-        self._path, self._base = path, path.absolute().parent
+    def __init__(self, path: Path, line: int) -> None:
+        self._path, self._base, self._line = path, path.absolute().parent, line
         self._capture: tuple[Path, dict[tuple[str, Path, Path], Pair]] | None = None
 
     def damaged(self) -> ValueError:
         """Return the error to raise for a line that is none of a manifest."""
-        return ValueError(f"{self._path}: expected the lines of a manifest of `dsr upsample`, the file is damaged")
+        return ValueError(
+            f"{self._path}: line {self._line}: expected the lines of a manifest of `dsr upsample`, the file is damaged"
+        )
 
     def parse(self, line: bytes) -> dict[str, Any]:
-        """Return the object in a line."""
+        """Return the object in the next line."""
+        self._line += 1
         try:
             values = parse_json(line)
         except ValueError:
@@ -229,7 +233,11 @@ class _Reader:
         """Return a path, relative ones from the folder of the manifest."""
         if not isinstance(value, str) or not value or "\0" in value:
             raise ValueError
-        return self._base / value
+        path = self._base / value
+        if not Path(value).is_absolute() and leads_outside(value):
+            expected = f"expected absolute paths, or those within {self._base}"
+            raise OutsideError(f"{self._path}: line {self._line}: {expected}, got {value!r:.100}")
+        return path
 
     def pair(self, record: Any) -> Pair:
         """Return the pair that an object describes."""
@@ -251,6 +259,8 @@ class _Reader:
             if "capture" in record:
                 place, own = record["capture"]
                 origin = Origin(self._place(place), str(own))
+        except OutsideError:
+            raise
         except (KeyError, TypeError, ValueError) as error:
             raise self.damaged() from error
         return pair if origin is None else self._of_capture(pair, origin)
@@ -274,7 +284,7 @@ class _Reader:
 def _name(value: Any) -> str:
     """Return a name of a result, which is a folder below that of the results."""
     parts = PurePosixPath(value).parts
-    if not isinstance(value, str) or not parts or {"..", "/", "//"} & set(parts) or "\\" in value or "\0" in value:
+    if not isinstance(value, str) or not parts or leads_outside(value) or "\\" in value:
         raise ValueError
     return value
 

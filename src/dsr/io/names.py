@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Literal
 
 from dsr.io.depth_files import READ_SUFFIXES
+from dsr.utils.paths import natural_key
 
 Role = Literal["rgb", "depth", "other"]
 PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".ppm")
@@ -72,6 +73,13 @@ def time_of(path: Path) -> float | None:
     return float(numbers[0]) * _SECONDS_BY_DIGITS[len(numbers[0].split(".")[0])]
 
 
+def in_order(paths: Iterable[Path]) -> list[Path]:
+    """Return files in the order of the times in their names, if all have one, else of the names, numbers by value."""
+    times = {path: time_of(path) for path in paths}
+    named = sorted(times, key=natural_key)
+    return named if None in times.values() else sorted(named, key=lambda path: times[path] or 0.0)
+
+
 def match_names(photos: Iterable[Path], depths: Iterable[Path]) -> list[tuple[Path, Path]]:
     """Return the pairs among photos and depth maps, in the photos' order.
 
@@ -79,7 +87,7 @@ def match_names(photos: Iterable[Path], depths: Iterable[Path]) -> list[tuple[Pa
     nearest within 20 ms that no other pair takes. A single photo and a single depth map are a pair whatever they are
     called.
     """
-    photos, depths = sorted(photos), sorted(depths)
+    photos, depths = in_order(photos), in_order(depths)
     if len(photos) == len(depths) == 1:
         return [(photos[0], depths[0])]
     by_key: dict[tuple[str, ...], list[Path]] = {}

@@ -14,6 +14,7 @@ from dsr.io.depth_files import READ_SUFFIXES
 from dsr.io.encoding import Assumption
 from dsr.io.frames import CaptureFrame
 from dsr.io.names import PHOTO_SUFFIXES, confidence_key, key_of, match_names
+from dsr.utils.paths import natural_key
 
 CAMERA_NAMES = (
     "camera.json", "intrinsics.json", "intrinsic.json", "camera_intrinsic.json", "camera_primesense.json",
@@ -195,8 +196,8 @@ def _match_confidence(pairs: Sequence[Pair], folder: Path) -> list[Path]:
 def list_pictures(folder: Path) -> list[Path]:
     """Return the pictures and maps in a folder."""
     with os.scandir(folder) as entries:  # knows files from folders without asking for each
-        names = sorted(entry.name for entry in entries if _is_picture(entry))
-    return [folder / name for name in names]
+        names = [entry.name for entry in entries if _is_picture(entry)]
+    return [folder / name for name in sorted(names, key=natural_key)]
 
 
 def has_pictures(folder: Path) -> bool:

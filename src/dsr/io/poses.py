@@ -112,14 +112,17 @@ def read_poses(path: Path) -> Trajectory:
     The formats are that of TUM RGB-D (``timestamp tx ty tz qx qy qz qw`` in each line,
     https://cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats); matrices of 12 or 16 numbers in each line, as
     KITTI's odometry has them; and matrices of four lines each, as in Redwood's and Open3D's ``.log``, whose lines of
-    three whole numbers before each matrix are left out. Lines that begin with ``#`` are comments.
+    three whole numbers before each matrix number the poses. Lines that begin with ``#`` are comments.
+
+    Poses with times or numbers that differ are returned in the order of these, others in that of the file.
 
     Raises:
         ValueError: the file is missing or holds something else, or a pose is not rigid; the message names the line or
             the pose.
 
     """
-    rows = [row for row in _numbers(path, _text(path)) if len(row) != 3]
+    content = _numbers(path, _text(path))
+    rows = [row for row in content if len(row) != 3]
     lengths = {len(row) for row in rows}
     if lengths == {8}:
         poses = tuple(
@@ -128,7 +131,8 @@ def read_poses(path: Path) -> Trajectory:
         times = tuple(row[0] for row in rows)
         if not all(map(math.isfinite, times)):
             raise ValueError(f"{path}: expected finite times, got another")
-        return Trajectory(path, poses, times)
+        order = order_of(times)
+        return Trajectory(path, tuple(poses[place] for place in order), tuple(times[place] for place in order))
     if lengths == {4} and len(rows) % 4 == 0:
         rows = np.reshape(rows, (-1, 16)).tolist()
     elif lengths not in ({12}, {16}):
@@ -136,10 +140,15 @@ def read_poses(path: Path) -> Trajectory:
             f"{path}: expected lines of 8 numbers (time, translation, quaternion), of 12 or 16 (a matrix), or four "
             f"lines of 4 for each matrix, got lines of {', '.join(map(str, sorted(lengths))) or 'no'} numbers"
         )
-    return Trajectory(
-        path,
-        tuple(as_rigid(np.reshape(row, (-1, 4)), f"{path}: pose {number}") for number, row in enumerate(rows, 1)),
-    )
+    poses = tuple(as_rigid(np.reshape(row, (-1, 4)), f"{path}: pose {number}") for number, row in enumerate(rows, 1))
+    numbers = [row[0] for row in content if len(row) == 3]
+    return Trajectory(path, tuple(poses[place] for place in order_of(numbers)) if len(numbers) == len(poses) else poses)
+
+
+def order_of(numbers: Sequence[float]) -> list[int]:
+    """Return the places of poses in the order of their times or numbers; as they are if two are equal."""
+    places = range(len(numbers))
+    return sorted(places, key=numbers.__getitem__) if len(set(numbers)) == len(numbers) else list(places)
 
 
 def _text(path: Path) -> str:

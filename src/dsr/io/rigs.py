@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -17,21 +15,7 @@ from dsr.io.cameras import read_any_camera
 from dsr.io.encoding import Assumption
 from dsr.io.photos import Size, same_aspect
 from dsr.io.poses import read_transform
-
-
-@dataclass(frozen=True)
-class RigFiles:
-    """What the user says about a depth map that another camera than the photo's took.
-
-    Args:
-        camera: camera file of the depth camera, see :func:`dsr.io.cameras.read_any_camera`.
-        extrinsics: file of the transform from the depth camera to the photo's, see
-            :func:`dsr.io.poses.read_transform`.
-
-    """
-
-    camera: Path
-    extrinsics: Path
+from dsr.io.reading import RigFiles
 
 
 class Rig(NamedTuple):

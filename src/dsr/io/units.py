@@ -13,6 +13,7 @@ from dsr.io.depth_files import read_depth_file
 from dsr.io.encoding import Assumption, find_holes, guess_unit
 from dsr.io.pairs import Pair
 from dsr.utils.limits import pixels_beside
+from dsr.utils.paths import NaturalKey, natural_key
 
 Kind = tuple[Path, str, str]
 """Folder, suffix and type of value: maps alike in them have one unit."""
@@ -76,9 +77,9 @@ class FolderUnits:
         yield from self._pairs
 
 
-def order_of_maps(pair: Pair) -> tuple[str, str]:
+def order_of_maps(pair: Pair) -> tuple[NaturalKey, NaturalKey]:
     """Return the key by which the maps of a folder are looked at for their unit."""
-    return pair.depth.name, pair.name
+    return natural_key(pair.depth.name), natural_key(pair.name)
 
 
 def read_values_of(pair: Pair) -> np.ndarray:

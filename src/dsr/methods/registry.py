@@ -100,7 +100,7 @@ def build_method(
 
     """
     trunk = os.environ.get("DSR_LPIPS_TRUNK")
-    run = {**dict.fromkeys(("metrics", "workspace", "display")), "lpips_trunk": trunk, "seed": 0}
+    run = {**dict.fromkeys(("metrics", "workspace", "display", "about")), "lpips_trunk": trunk, "seed": 0}
     told = {key: value for key, value in (told or {}).items() if node.get(key) in _OPEN}
     available = {**run, **told, **given, "scale": scale}
     if takes("method", node, "weights"):

@@ -9,7 +9,7 @@ Masks, normals and renderings are computed once for all the metrics of a collect
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
@@ -17,6 +17,7 @@ import torchmetrics
 from torch import Tensor
 
 from dsr.metrics.catalogue import METRICS, catalogue
+from dsr.metrics.formats import MetricFormat
 from dsr.metrics.functional import SurfacePair
 from dsr.metrics.lpips import LPIPS
 from dsr.metrics.metric import VARIANTS, WORST, Metric
@@ -57,6 +58,16 @@ class PerImageMean(torchmetrics.Metric):
         self._variant = named if metric.per_light else ""
         self.add_state("total", torch.zeros((), dtype=torch.float64), dist_reduce_fx="sum")
         self.add_state("count", torch.zeros((), dtype=torch.float64), dist_reduce_fx="sum")
+
+    @property
+    def format(self) -> MetricFormat:
+        """How tables and figures show the metric."""
+        return self._metric.format
+
+    @property
+    def chart_title(self) -> str:
+        """The title of a chart of the metric."""
+        return self.format.chart_title(by_light=self._metric.per_light)
 
     @property
     def higher_is_better(self) -> bool:  # type: ignore[override]  # torchmetrics has a constant per class
@@ -179,3 +190,9 @@ def compute_means(metrics: torchmetrics.MetricCollection) -> dict[str, Tensor]:
     """Return the means of a collection of :func:`visual_metrics` by name, without metrics of other benchmarks."""
     applied = {name for name, metric in metrics.items() if getattr(metric, "applied", True)}
     return {name: value for name, value in metrics.compute().items() if name in applied}
+
+
+def in_table_units(metrics: torchmetrics.MetricCollection, means: Mapping[str, float]) -> dict[str, float]:
+    """Return means of metrics of a collection of :func:`visual_metrics`, by name, in the units of tables."""
+    collection: Any = metrics
+    return {name: value * collection[name].format.factor for name, value in means.items()}

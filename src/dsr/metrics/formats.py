@@ -11,8 +11,10 @@ BEFORE_THE_PAPER = 0
 AFTER_THE_PAPER = 100
 """The position of metrics that the paper's tables do not have."""
 _MOST_DIGITS = 20
-LOOKS = ("RMSE_v", "DSSIM_v", "LPIPS_v")
-"""The metrics of how a surface looks, the worst of four lights, by which results are compared first."""
+LOOKS = ("RMSE_v", "RMSE_v1", "DSSIM_v", "LPIPS_v")
+"""The metrics of how a surface looks, by which results are compared first: RMSE_v, without lights, and three for the
+worst of four lights."""
+LIGHTS_NOTE = "RMSE_v has no lights, the other metrics of renderings are of the worst of four"
 HEADLINES = ("", "max", "min")
 """Variants of the value that stands for an image: without lights, or the worst of four lights (the smallest value where
 higher is better)."""
@@ -57,6 +59,10 @@ class MetricFormat:
     def title(self) -> str:
         """The heading with the unit in parentheses."""
         return f"{self.heading} ({self.unit})" if self.unit else self.heading
+
+    def chart_title(self, *, by_light: bool) -> str:
+        """Return the title of a chart of the metric's values, of the worst light where there is one for each light."""
+        return f"{self.title}, worst light" if by_light else self.title
 
 
 Formats = Mapping[str, MetricFormat]

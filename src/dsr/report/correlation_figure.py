@@ -19,7 +19,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from dsr.evaluation.results import Results
-from dsr.metrics.formats import Formats
+from dsr.metrics.formats import LIGHTS_NOTE, Formats
 from dsr.report.correlations import DEPTH_LIMIT, REFERENCE, correlate, metric_matrix, pairs, with_reference
 from dsr.viz.palette import method_colours
 from dsr.viz.panels import write_figure
@@ -212,7 +212,7 @@ def _head(figure: Figure, count: int, colours: Mapping[str, str], *, has_referen
     width, height = figure.get_size_inches()
     reference = f"{REFERENCE} is highlighted" if has_reference else f"no {REFERENCE} in these results"
     text = (
-        f"{count} results; worst of four lights; RMSE_d clipped at {1000 * DEPTH_LIMIT:g} mm; {reference}\n"
+        f"{count} results; {LIGHTS_NOTE}; RMSE_d clipped at {1000 * DEPTH_LIMIT:g} mm; {reference}\n"
         "r: Pearson, \N{GREEK SMALL LETTER RHO}: Spearman; on the diagonal kernel densities, each scaled to its maximum"
     )
     figure.text(0.6 / width, 1 - 0.12 / height, text, va="top", fontsize=8, parse_math=False)

@@ -1,7 +1,8 @@
 """Correlation of metrics with each other and with LPIPS_v over all results.
 
 This is the study of metrics of Voynov et al., *Perceptual Deep Depth Super-Resolution* (ICCV 2019): every result of any
-method, scene and scale is a point; correlations are Pearson's and Spearman's.
+method, scene and scale is a point; correlations are Pearson's and Spearman's. Beside them stand those of the values in
+the paper's tables.
 """
 
 from __future__ import annotations
@@ -13,8 +14,10 @@ import numpy as np
 import pandas as pd
 
 from dsr.evaluation.results import Results
-from dsr.metrics.formats import HEADLINES
+from dsr.metrics.catalogue import KNOWN_FORMATS
+from dsr.metrics.formats import HEADLINES, LIGHTS_NOTE, in_tables
 from dsr.report.markup import MISSING, aligned, escaped
+from dsr.report.tables import published
 from dsr.utils.files import replacing, write_text
 from dsr.utils.tables import guarded
 
@@ -49,6 +52,16 @@ def metric_matrix(results: Results) -> pd.DataFrame:
     matrix = matrix.reindex(columns=list(dict.fromkeys(name))).rename_axis(columns=None)
     if "RMSE_d" in matrix:
         matrix["RMSE_d"] = matrix["RMSE_d"].clip(upper=DEPTH_LIMIT)
+    return matrix
+
+
+def published_matrix() -> pd.DataFrame:
+    """Return the values in the paper's tables as :func:`metric_matrix` does: one row per scene, method and scale."""
+    table = published()
+    table = table[~table["scene"].str.startswith("Average")].set_index(["scene", "method", "scale"])
+    matrix = pd.DataFrame({name: table[name] / each.factor for name, each in in_tables(KNOWN_FORMATS).items()
+                           if name in table})  # fmt: skip
+    matrix["RMSE_d"] = matrix["RMSE_d"].clip(upper=DEPTH_LIMIT)
     return matrix
 
 
@@ -99,7 +112,7 @@ def write_correlations(folder: Path, results: Results) -> list[Path]:
 
     Args:
         folder: gets ``pearson.csv``, ``spearman.csv``, ``pairs.csv`` (number of results per pair),
-            ``with_lpips.csv`` and ``with_lpips.md``.
+            ``with_lpips.csv`` and ``with_lpips.md``, both with the correlations in the paper's tables beside ours.
         results: the runs.
 
     Returns:
@@ -107,7 +120,8 @@ def write_correlations(folder: Path, results: Results) -> list[Path]:
 
     """
     matrix = metric_matrix(results)
-    ranking = with_reference(matrix)
+    paper = with_reference(published_matrix()).add_prefix("paper_").rename(columns={"paper_metric": "metric"})
+    ranking = with_reference(matrix).merge(paper, "left", "metric").astype({"paper_n": "Int64"})
     tables = {kind: correlate(matrix, kind) for kind in KINDS} | {"pairs": pairs(matrix)}
     paths = []
     for name, table in tables.items():
@@ -128,14 +142,23 @@ def _ranking_text(ranking: pd.DataFrame, count: int) -> str:
     if ranking.empty:
         return f"{title}There is no {REFERENCE} in these {count} results (metrics.lpips=true computes it).\n"
     rows = [
-        [escaped(str(row["metric"])), *(_coefficient(row[kind]) for kind in KINDS), str(row["n"])]
+        [
+            escaped(str(row["metric"])),
+            *(_coefficient(row[kind]) for kind in KINDS),
+            str(row["n"]),
+            *(_coefficient(row[f"paper_{kind}"]) for kind in KINDS),
+        ]
         for _, row in ranking.iterrows()
     ]
+    paper = ranking["paper_n"].max()
     text = (
-        f"Over {count} results of all methods, scenes and scales. A name by itself is the worst of four lights; "
+        f"Over {count} results of all methods, scenes and scales. {LIGHTS_NOTE}, by a name by itself; "
         f"RMSE_d is clipped at {DEPTH_LIMIT:g} m. n: number of results with both metrics."
     )
-    return f"{title}{text}\n\n{aligned(['metric', 'Pearson', 'Spearman', 'n'], rows, 1)}\n"
+    if pd.notna(paper):
+        text += f" Paper: the same over the {paper} results in the tables of Voynov et al. 2019."
+    head = ["metric", "Pearson", "Spearman", "n", "Pearson, paper", "Spearman, paper"]
+    return f"{title}{text}\n\n{aligned(head, rows, 1)}\n"
 
 
 def _coefficient(value: float) -> str:

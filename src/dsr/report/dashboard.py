@@ -8,25 +8,24 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
 from matplotlib.colors import Normalize
 from torch import Tensor
 from torch.utils.tensorboard import SummaryWriter
-from torch.utils.tensorboard.summary import hparams
 
 from dsr.evaluation.results import Run, formats_of, method_settings
 from dsr.evaluation.run_files import read_run
 from dsr.geometry.shading import LIGHT_NAMES, render
-from dsr.metrics.formats import HEADLINES, main_first
+from dsr.metrics.catalogue import KNOWN_FORMATS
+from dsr.metrics.formats import HEADLINES, LOOKS, MetricFormat, main_first
 from dsr.sample import DepthSample
+from dsr.utils.runs_table import list_run
 from dsr.utils.temporary import temporary_folder
 from dsr.viz.canvas import colours
 from dsr.viz.panels import normals_seen_by, reduced
 
-WORST = "worst of four lights"
 _EVENTS = "events.out.tfevents.*"
 _PANEL = 320
 """Maximum longer side of a rendering in a picture, pixels."""
@@ -35,10 +34,10 @@ _PANEL = 320
 def save_dashboard(folder: Path) -> None:
     """Write the TensorBoard log of a run into its directory, replacing an earlier one.
 
-    Scalars, in the units of the paper's tables: ``mean/METRIC``; ``scene/METRIC/DATASET`` over the scenes;
-    ``METRIC/SCENE``; ``light/METRIC/SCENE`` over the lights e1..e4. Pictures of each scene: renderings of the result
-    above those of the truth, errors, and expected errors if the method has them. A custom layout has a chart per
-    metric; the table of runs (hparams) has settings and means.
+    Scalars, in the units of the paper's tables: ``score/METRIC``, the mean over the scenes; ``METRIC/SCENE``;
+    ``scene/METRIC/DATASET`` over the scenes; ``light/METRIC/SCENE`` over the lights e1..e4. Pictures of each scene:
+    renderings of the result above those of the truth, errors, and expected errors if the method has them. A custom
+    layout has a chart per metric; the table of runs (hparams) has settings and means.
 
     Args:
         folder: directory of a run; only its files are read.
@@ -65,12 +64,11 @@ def _write_scores(writer: SummaryWriter, run: Run) -> None:
     """Write scalars, their layout, and the run's row in the table of runs."""
     scored = list(run.scores["scene"].unique())
     means: dict[str, float] = {}
-    looks, depth = f"Looks, {WORST}, {run.dataset}", f"Depth and normals, {run.dataset}"
-    scenes: dict[str, list[str]] = {looks: [], depth: []}
+    formats = _shown_formats(run)
+    looks = main_first(name for name in formats if "_v" in name)
     by_light: list[str] = []
-    for name, each in formats_of([run]).items():
+    for name, each in formats.items():
         rows = run.scores[run.scores["metric"] == name]
-        scenes[looks if "_v" in name else depth].append(name)
         if rows["variant"].isin(LIGHT_NAMES).any():
             by_light.append(name)
         headline = rows[rows["variant"].isin(HEADLINES)].set_index("scene")["value"] * each.factor
@@ -81,37 +79,30 @@ def _write_scores(writer: SummaryWriter, run: Run) -> None:
         for row in rows[rows["variant"].isin(LIGHT_NAMES)].itertuples():
             light = LIGHT_NAMES.index(row.variant) + 1
             writer.add_scalar(f"light/{name}/{row.scene}", row.value * each.factor, light)
-    for name, value in means.items():
-        writer.add_scalar(f"mean/{name}", value, 0)
-    scenes[looks] = main_first(scenes[looks])
+    titles = {name: each.chart_title(by_light=name in by_light) for name, each in formats.items()}
+    depth = [name for name in formats if name not in looks]
     layout = {
-        title: {name: ["Multiline", [f"scene/{name}/{re.escape(run.dataset)}$"]] for name in names}
-        for title, names in scenes.items()
+        f"{title}, {run.dataset}": {
+            titles[name]: ["Multiline", [f"scene/{name}/{re.escape(run.dataset)}$"]] for name in names
+        }
+        for title, names in (("Looks", looks), ("Depth and normals", depth))
     }
     layout[f"By light, e1 to e4, {run.dataset}"] = {
-        name: ["Multiline", [f"light/{name}/.*"]] for name in main_first(by_light)
+        formats[name].title: ["Multiline", [f"light/{name}/.*"]] for name in main_first(by_light)
     }
     writer.add_custom_scalars({title: charts for title, charts in layout.items() if charts})
     writer.add_text("scenes", "\n".join(f"{number}. {scene}" for number, scene in enumerate(scored)))
-    for part in hparams(_hyperparameters(run), {f"mean/{name}": value for name, value in means.items()}):
-        writer.file_writer.add_summary(part)  # type: ignore[attr-defined]  # torch's stubs say None
-
-
-def _hyperparameters(run: Run) -> dict[str, Any]:
-    """Return the hyperparameters of a run: setting, method and settings of the method."""
     settings = {
-        f"method.{key}": value
-        for key, value in method_settings(run.settings).items()
-        if isinstance(value, (bool, int, float, str))
+        **{name: method_settings(run.settings).get(name) for name in ("w", "steps")},
+        **{name: getattr(run, name) for name in ("scale", "dataset", "seed")},
     }
-    return {
-        "method": run.label,
-        "dataset": run.dataset,
-        "scale": run.scale,
-        "downsampling": run.downsampling,
-        "seed": run.seed,
-        **settings,
-    }
+    list_run(writer, "evaluation", {**settings, "method": run.label, "degradation": run.downsampling}, means)
+
+
+def _shown_formats(run: Run) -> dict[str, MetricFormat]:
+    """Return the formats of the metrics of tables, and of others by which results are compared first."""
+    more = {name: KNOWN_FORMATS[name] for name in LOOKS if (run.scores["metric"] == name).any()}
+    return formats_of([run]) | more
 
 
 def _write_pictures(

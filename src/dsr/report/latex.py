@@ -5,7 +5,7 @@ from __future__ import annotations
 import unicodedata
 from collections.abc import Iterator, Sequence
 
-from dsr.report.table_parts import STAR_NOTE, Cell, Column, Group, PaperTable, Row, Style
+from dsr.report.table_parts import Cell, Column, Group, PaperTable, Row, Style
 
 MISSING = "--"
 _END = "\\end{table}\n"
@@ -100,8 +100,7 @@ def _page(
 ) -> str:
     """Return one table environment."""
     title = table.title + (", beside the paper's values (in parentheses)" if published else "")
-    notes = [*table.notes, *([STAR_NOTE] if published and table.starred else [])]
-    caption = f"{title}. {' '.join(notes)}" if number == 0 else f"{title}, continued."
+    caption = f"{title}. {' '.join(table.notes)}" if number == 0 else f"{title}, continued."
     seeds = table.seeded and not published
     kinds = "ll" + "r" * seeds + "r" * len(columns)
     head = ["Scene", "Method", *(["Seeds"] if seeds else []), *(_heading(column) for column in columns)]
@@ -126,7 +125,7 @@ def _page(
 
 def _rows(table: PaperTable, group: Group, columns: Sequence[Column], *, published: bool) -> Iterator[str]:
     """Yield the lines of a group; the title is in the first line, that of an average in a line of its own."""
-    title = latex_text(group.about.title) + ("*" if published and group.about.recreated else "")
+    title = latex_text(group.about.title)
     compared = any(row.published for row in group.rows)  # all of our rows are needed, since the best is marked
     shown = [row for row in group.rows if not published or (compared and row.cells)]
     if group.about.average and shown:

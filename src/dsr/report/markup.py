@@ -11,7 +11,7 @@ import pandas as pd
 from dsr.evaluation.results import Results
 from dsr.report.latex import to_document, to_latex
 from dsr.report.paper_tables import build_tables
-from dsr.report.table_parts import STAR_NOTE, Column, Group, PaperTable, Row, Style
+from dsr.report.table_parts import Column, Group, PaperTable, Row, Style
 from dsr.utils.files import write_text
 from dsr.utils.tables import guarded
 
@@ -64,10 +64,9 @@ def to_markdown(table: PaperTable) -> str:
     if table.has_published:
         columns = table.published_columns()
         rows = [row for group in table.groups for row in _compared(columns, group)]
-        notes = ["- Difference: ours - paper. Ratio: ours / paper.", f"- {STAR_NOTE}".replace("*", "\\*")]
         parts += [f"### {escaped(table.title)}, beside the paper"]
         parts += [aligned(["scene", "method", "", *map(_heading, columns)], rows, 3)]
-        parts += ["\n".join(notes if table.starred else notes[:1])]
+        parts += ["- Difference: ours - paper. Ratio: ours / paper."]
     return "\n\n".join(parts) + "\n"
 
 
@@ -160,7 +159,7 @@ def _rows(table: PaperTable, group: Group) -> Iterator[list[str]]:
 
 def _compared(columns: Sequence[Column], group: Group) -> Iterator[list[str]]:
     """Yield our value, the paper's, difference and ratio of each method in the paper, then its other methods."""
-    title = escaped(group.about.title) + ("\\*" if group.about.recreated else "")
+    title = escaped(group.about.title)
     for row in (row for row in group.rows if row.published):
         both = [_against(column, row) for column in columns]
         yield [title, escaped(row.label), "ours", *(_plain(column, row) for column in columns)]

@@ -19,19 +19,11 @@ import pandas as pd
 
 from dsr.evaluation.results import Results, Run
 from dsr.metrics.catalogue import KNOWN_FORMATS
-from dsr.metrics.formats import AFTER_THE_PAPER, HEADLINES, Formats, describe_directions, in_tables
-from dsr.report.scene_sets import PAPER_SCENES, TITLES, Place, SceneSet, sets_of_dataset, sets_of_summary
+from dsr.metrics.formats import AFTER_THE_PAPER, HEADLINES, LIGHTS_NOTE, Formats, describe_directions, in_tables
+from dsr.report.scene_sets import TITLES, Place, SceneSet, sets_of_dataset, sets_of_summary
 from dsr.report.table_parts import Cell, Column, Group, PaperTable, Row
-from dsr.report.tables import paper_row, published
+from dsr.report.tables import applies, implementation_note, paper_name, paper_row, published, published_row
 from dsr.report.user_study import USER_COLUMNS, check_study, user_cells
-
-PAPER_METHODS = {"bicubic": "Bicubic", "dip": "DIP", "dip_v": "DIP-V", "msg": "MSG", "msg_v": "MSG-V"}
-"""Method names of the paper by name in ``scores.csv``."""
-_PAPER_SIZE = 512
-"""Size of the paper's pictures, pixels; its values do not apply to other sizes."""
-_FOLDER = "dsr.data.folder.Folder"
-"""Reader of users' own folders, which may contain the paper's scenes."""
-
 
 _USER = tuple(Column(key, heading, "%", 1, higher_is_better=True) for key, heading in USER_COLUMNS.items())
 
@@ -56,9 +48,7 @@ def build_tables(results: Results, study: pd.DataFrame | None = None) -> list[Pa
         runs = [run for run in results.runs if (run.scale, run.downsampling) == (scale, downsampling)]
         formats = results.formats
         values = _values(runs, formats)
-        make = _Maker(
-            scale, downsampling, results.methods(), values, _comparable(runs), _paper_names(runs), study, formats
-        )
+        make = _Maker(scale, downsampling, results.methods(), values, runs, study, formats)
         places = list(dict.fromkeys(place for scenes in make.values.values() for place in scenes))
         if not places:
             continue
@@ -81,8 +71,7 @@ class _Maker:
         scale, downsampling: degradation of the runs.
         methods: all labels, in order.
         values: scores.
-        comparable: data sets whose scenes may be those of the paper.
-        names: method names of the paper by label.
+        runs: runs.
         study: table of the user study.
         formats: formats of the metrics, in column order.
 
@@ -92,8 +81,7 @@ class _Maker:
     downsampling: str
     methods: Sequence[str]
     values: Values
-    comparable: frozenset[str]
-    names: Mapping[str, str]
+    runs: Sequence[Run]
     study: pd.DataFrame | None
     formats: Formats
 
@@ -121,22 +109,26 @@ class _Maker:
 
     def _group(self, about: SceneSet, labels: Sequence[str]) -> Group:
         """Build the rows of some methods; a method without values has an empty row."""
-        comparable = about.published != "" and self.comparable.issuperset(place.dataset for place in about.places)
+        here = [run for run in self.runs if run.dataset in {place.dataset for place in about.places}]
+        scenes = [place.scene for place in about.places]
         rows = []
         for label in labels:
-            scenes = [self.values[label].get(place, {}) for place in about.places]
-            cells = {key: _cell([scene.get(key, {}) for scene in scenes]) for key in self.formats}
+            own = [self.values[label].get(place, {}) for place in about.places]
+            cells = {key: _cell([scene.get(key, {}) for scene in own]) for key in self.formats}
             valid = {key: cell for key, cell in cells.items() if cell is not None} | self._user_cells(about, label)
-            paper = self._published(about, self.names[label]) if comparable and valid else {}
-            rows.append(Row(label, valid, paper, max([1, *(cell.seeds for cell in valid.values())])))
-        ran = {self.names[row.label] for row in rows if row.cells}
-        others = [str(name) for name in published()["method"].unique() if name not in ran]
-        only = {name: self._published(about, name) for name in others} if comparable and not about.recreated else {}
+            row = paper_row(about.published, [run for run in here if run.label == label], scenes) if valid else None
+            rows.append(Row(label, valid, self._columns_of(row), max([1, *(cell.seeds for cell in valid.values())])))
+        ran = {paper_name(run) for run in here if any(row.cells for row in rows if row.label == run.label)}
+        others = published()["method"].unique() if about.published and applies(here, scenes) else []
+        only = {
+            str(name): self._columns_of(published_row(about.published, str(name), self.scale))
+            for name in others
+            if name not in ran
+        }
         return Group(about, tuple(rows), {name: values for name, values in only.items() if values})
 
-    def _published(self, about: SceneSet, method: str) -> dict[str, float]:
+    def _columns_of(self, row: pd.Series | None) -> dict[str, float]:
         """Return the paper's values by column."""
-        row = paper_row(about.published, method, self.scale, self.downsampling)
         keys = [column.key for column in self.columns]
         return {} if row is None else {key: float(row[key]) for key in keys if pd.notna(row.get(key))}
 
@@ -157,22 +149,6 @@ def _values(runs: Sequence[Run], formats: Formats) -> Values:
             if math.isfinite(value):
                 by_metric.setdefault(metric, {})[run.seed] = formats[metric].factor * value
     return found
-
-
-def _comparable(runs: Sequence[Run]) -> frozenset[str]:
-    """Return the data sets whose scenes may be those of the paper."""
-    others = set()
-    for run in runs:
-        dataset = run.settings.get("dataset", {})
-        valid = run.dataset in PAPER_SCENES or dataset.get("target") == _FOLDER
-        if not valid or dataset.get("size", _PAPER_SIZE) != _PAPER_SIZE:
-            others.add(run.dataset)
-    return frozenset({run.dataset for run in runs} - others)
-
-
-def _paper_names(runs: Sequence[Run]) -> dict[str, str]:
-    """Return the paper's name of each method by label."""
-    return {run.label: PAPER_METHODS.get(run.method, run.label) for run in runs}
 
 
 def _truth_is_complete(results: Results) -> Callable[[Place], bool]:
@@ -236,7 +212,7 @@ def _notes(groups: Sequence[Group], columns: Sequence[Column], formats: Formats)
     if user:
         direction += " and User columns higher" if " of " in direction else ", of User columns higher"
     yield f"{direction[0].upper()}{direction[1:]}."
-    yield "Metrics of renderings are the worst of four lights."
+    yield f"{LIGHTS_NOTE}."
     yield "In each group our best displayed value is bold, the second best underlined; equal values share the mark."
     of_paper = [name for name, each in in_tables(KNOWN_FORMATS).items() if each.position != AFTER_THE_PAPER]
     missing = [name for name in of_paper if name not in shown]
@@ -246,6 +222,9 @@ def _notes(groups: Sequence[Group], columns: Sequence[Column], formats: Formats)
         yield "Mean ± sample standard deviation over seeds; seeds are averaged within each scene, then scenes."
     if any(not cell.complete for cell in cells):
         yield "(k of n): an average over k of the n scenes; it is not compared with the others."
+    note = implementation_note(row.label for row in rows if row.published)
+    if note:
+        yield note
     if user:
         yield "User: percentage of answers with the method as most similar (1st), second most similar (2nd), or either."
 

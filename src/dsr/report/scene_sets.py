@@ -10,20 +10,25 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from dsr.report.tables import AVERAGES, OTHER_FRAMES, RECREATED
+from dsr.report.tables import PAPER_FILES, average_of
 
 TITLES = {"simgeo": "SimGeo", "icl": "ICL-NUIM", "middlebury": "Middlebury"}
 PAPER_SCENES = {
-    "simgeo": (*RECREATED, "lucy"),
+    "simgeo": (
+        "cube_high_freq",
+        "cube_no_texture",
+        "sphere_cylinder_high_freq",
+        "sphere_cylinder_low_freq",
+        "sphere_cylinder_no_texture",
+        "lucy",
+    ),
     "icl": ("painting", "sofa", "plant", "office", "coat_rack", "displays"),
-    "middlebury": ("vintage", "recycle", "umbrella", "classroom1", "playroom", "backpack", "jadeplant"),
+    "middlebury": PAPER_FILES["middlebury"],
 }
-"""The scenes that the paper averages over, by data set."""
+"""The scenes that the paper averages over, by data set; those not in PAPER_FILES are others of the same description."""
 STAND_IN = "statue"
 """SimGeo scene used if Lucy is not available."""
-_WITHOUT = "Average performance on the scenes without missing measurements (SimGeo, ICL-NUIM, Vintage)"
 _WITH = "Average performance on the scenes with missing measurements (Middlebury excluding Vintage)"
-_ALL = "Average performance on SimGeo, ICL-NUIM, Middlebury"
 
 
 class Place(NamedTuple):
@@ -40,8 +45,8 @@ class SceneSet:
     Args:
         title: display title.
         places: one or more scenes.
-        published: name of the paper's row for these scenes; "" if it has none or if some of its scenes are missing.
-        recreated: whether some of the scenes re-create those of the paper.
+        published: name of the paper's row for these scenes; "" if it has none, or if some of its scenes are missing or
+            not the paper's own.
         average: whether the row is an average, possibly over one scene.
 
     """
@@ -49,7 +54,6 @@ class SceneSet:
     title: str
     places: tuple[Place, ...]
     published: str = ""
-    recreated: bool = False
     average: bool = True
 
 
@@ -91,14 +95,8 @@ def _within(places: Sequence[Place], dataset: str) -> list[Place]:
 def _single(place: Place) -> SceneSet:
     """Return a set of one scene; a scene of an unlisted data set may be a file of the paper in a user's folder."""
     dataset, scene = place
-    in_paper = scene in PAPER_SCENES.get(dataset, (scene,))
-    name = RECREATED.get(scene, scene.replace("_", " ")) if in_paper else ""
-    return SceneSet(scene, (place,), name, _recreated([place]), average=False)
-
-
-def _recreated(places: Sequence[Place]) -> bool:
-    """Return whether some of the scenes are not the paper's own files."""
-    return any(dataset in OTHER_FRAMES or scene in (*RECREATED, STAND_IN) for dataset, scene in places)
+    in_paper = dataset not in PAPER_SCENES or scene in PAPER_FILES.get(dataset, ())
+    return SceneSet(scene, (place,), scene if in_paper else "", average=False)
 
 
 def _of_paper(places: Sequence[Place], dataset: str) -> list[Place]:
@@ -113,7 +111,8 @@ def _averages_of_dataset(dataset: str, places: Sequence[Place]) -> list[SceneSet
     """Return the average over the paper's scenes of a data set, and over all scenes if there are others."""
     title = TITLES.get(dataset, dataset)
     paper = _of_paper(places, dataset)
-    found = [_paper_set(title, paper, len(PAPER_SCENES[dataset]), AVERAGES[dataset][0])] if paper else []
+    name = average_of(dataset, [place.scene for place in paper])
+    found = [_paper_set(title, paper, len(PAPER_SCENES[dataset]), name)] if paper else []
     if len(paper) < len(places):
         found.append(_counted(title, places))
     return found
@@ -125,17 +124,17 @@ def _averages_of_paper(places: Sequence[Place]) -> Iterator[SceneSet]:
     with_holes = [place for place in available if place.dataset == "middlebury" and place.scene != "vintage"]
     without_holes = [place for place in available if place not in with_holes]
     if without_holes:
-        yield _paper_set("Without missing measurements (SimGeo, ICL-NUIM, Vintage)", without_holes, 13, _WITHOUT)
+        yield _paper_set("Without missing measurements (SimGeo, ICL-NUIM, Vintage)", without_holes, 13)
     if with_holes:
         yield _paper_set("With missing measurements (Middlebury excluding Vintage)", with_holes, 6, _WITH)
     if available:
-        yield _paper_set("SimGeo, ICL-NUIM, Middlebury", available, 19, _ALL)
+        yield _paper_set("SimGeo, ICL-NUIM, Middlebury", available, 19)
 
 
-def _paper_set(title: str, places: Sequence[Place], count: int, published: str) -> SceneSet:
+def _paper_set(title: str, places: Sequence[Place], count: int, published: str = "") -> SceneSet:
     """Return an average of the paper; without the paper's values if scenes are missing."""
     if len(places) == count:
-        return SceneSet(f"{title}, average of {count} scenes", tuple(places), published, _recreated(places))
+        return SceneSet(f"{title}, average of {count} scenes", tuple(places), published)
     return SceneSet(f"{title}, average of {len(places)} of the paper's {count} scenes", tuple(places))
 
 

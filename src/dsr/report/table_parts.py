@@ -7,8 +7,6 @@ from dataclasses import dataclass
 
 from dsr.report.scene_sets import SceneSet
 
-STAR_NOTE = "*: the paper's values are of its own files; the scenes here are others of the same description."
-
 
 @dataclass(frozen=True)
 class Column:
@@ -93,7 +91,7 @@ class Group:
     Args:
         about: scenes.
         rows: methods in order.
-        paper_only: the paper's values of methods that were not run; only if the scenes are the paper's own.
+        paper_only: the paper's values of methods that were not run.
 
     """
 
@@ -128,11 +126,6 @@ class PaperTable:
     def has_published(self) -> bool:
         """Whether some rows have values of the paper."""
         return any(row.published for group in self.groups for row in group.rows)
-
-    @property
-    def starred(self) -> bool:
-        """Whether some of the paper's values are of other files of the same description."""
-        return any(row.published for group in self.groups if group.about.recreated for row in group.rows)
 
     @property
     def seeded(self) -> bool:

@@ -6,18 +6,14 @@ import gc
 import os
 import sys
 from collections.abc import Callable, Generator, Sequence
-from concurrent.futures import Future
-from concurrent.futures.process import BrokenProcessPool
-from multiprocessing import get_context
-from multiprocessing.queues import Queue
 from types import TracebackType
-from typing import Self, TypeVar
+from typing import Any, Self, TypeVar
 
 import cv2
 import torch
 
 from dsr.evaluation.results import Results
-from dsr.utils.workers import WorkerPool
+from dsr.utils.pool import LOST, Pool
 
 _FEW = 24
 """Number of predictions below which the start of worker processes takes longer than they save."""
@@ -25,6 +21,8 @@ _MOST = 8
 """Maximum number of workers unless more are requested; each needs about 0.5 GB."""
 _results: Results | None = None
 """The results that this process works on, if it is a worker."""
+_Call = tuple[Callable[[Results, Any], Any], Any]
+"""A function and its second argument."""
 _Item = TypeVar("_Item")
 _Value = TypeVar("_Value")
 
@@ -46,14 +44,19 @@ class Work:
 
     def __init__(self, results: Results, workers: int = 1) -> None:
         self.results = results
-        self._pool: WorkerPool | None = None
+        self._pool: Pool[_Call, tuple[Any]] | None = None
         self._threads = torch.get_num_threads(), cv2.getNumThreads()
         if workers > 1:
             _set_threads(cores := max(1, (os.cpu_count() or 1) // workers))  # a fork inherits them, and cannot set them
-            if sys.platform == "linux":
-                self._pool = WorkerPool(workers, _begin, (results,), "fork")
-            else:
-                self._pool = WorkerPool(workers, _begin, (_queued(results, workers), cores))
+            fork = sys.platform == "linux"
+            self._pool = Pool(
+                workers,
+                _call,
+                _lost,
+                start="fork" if fork else "spawn",
+                prepare=_begin,
+                arguments=(results, None if fork else cores),
+            )
 
     def map(self, function: Callable[[Results, _Item], _Value], items: Sequence[_Item]) -> Generator[_Value]:
         """Return the values of ``function(results, item)`` in the order of the items.
@@ -65,12 +68,13 @@ class Work:
             items: second arguments.
 
         Raises:
-            ChildProcessError: a worker was ended; raised with the value.
+            ChildProcessError: two workers were ended at the same call; raised with the value.
 
         """
         if self._pool is None:
             return (function(self.results, item) for item in items)
-        return _in_order([self._pool.submit(_call, function, item) for item in items])
+        calls: list[_Call] = [(function, item) for item in items]
+        return (value for _, (value,) in self._pool.results(calls, ordered=True))
 
     def __enter__(self) -> Self:
         """Return itself."""
@@ -85,56 +89,37 @@ class Work:
             _set_threads(*self._threads)
 
 
-def _in_order(futures: Sequence[Future[_Value]]) -> Generator[_Value]:
-    """Yield values as they are done; those that nobody asks for are not begun."""
-    try:
-        for future in futures:
-            yield future.result()
-    except BrokenProcessPool as error:
-        message = "a worker of the report ended, perhaps for want of memory; fewer --workers need less"
-        raise ChildProcessError(message) from error
-    finally:
-        for future in futures:
-            future.cancel()
-
-
-def _queued(results: Results, workers: int) -> Queue[Results]:
-    """Return a queue with the results for each worker.
-
-    Ctrl-C would cut off arguments larger than a pipe's buffer while a worker starts, so it asks for them.
-    """
-    queue: Queue[Results] = get_context("spawn").Queue()
-    queue.cancel_join_thread()
-    for _ in range(workers):
-        queue.put(results)
-    return queue
-
-
 def _set_threads(of_torch: int, of_opencv: int | None = None) -> None:
     """Set the numbers of threads that torch and OpenCV compute with, equal ones if one is given."""
     torch.set_num_threads(of_torch)
     cv2.setNumThreads(of_torch if of_opencv is None else of_opencv)
 
 
-def _begin(results: Results | Queue[Results], cores: int | None = None) -> None:
+def _begin(results: Results, cores: int | None) -> None:
     """Prepare a worker.
 
     Garbage is collected after each call: Matplotlib makes so many objects that the automatic collections would take a
     third of the time of a figure.
     """
     global _results  # noqa: PLW0603 - the worker's own
-    _results = results if isinstance(results, Results) else results.get()
+    _results = results
     gc.disable()
     if cores is not None:
         _set_threads(cores)
 
 
-def _call(function: Callable[[Results, _Item], _Value], item: _Item) -> _Value:
-    """Call a function in a worker."""
+def _call(call: _Call) -> tuple[Any]:
+    """Call a function in a worker; its value may be None."""
     if _results is None:
         raise RuntimeError("this process is no worker of a report")
+    function, item = call
     try:
-        return function(_results, item)
+        return (function(_results, item),)
     finally:
         gc.collect()
         gc.freeze()  # what is left stays, such as modules, and is not gone through again
+
+
+def _lost(_: _Call) -> tuple[Any]:
+    """Raise an error for a call whose workers were ended."""
+    raise ChildProcessError(f"a part of the report: {LOST}")

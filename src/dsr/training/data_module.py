@@ -19,8 +19,8 @@ from torch.utils.data import DataLoader, Dataset, default_collate
 from dsr.data.base import SceneSource, content_key
 from dsr.degradation.everything import Everything
 from dsr.degradation.hints import FACTS, encode_facts
-from dsr.geometry.camera import Camera
-from dsr.sample import Scene
+from dsr.methods.classical.interpolation import Interpolation
+from dsr.sample import Scene, slope
 from dsr.training.degradation import Batch, Degradation, to_tensors
 from dsr.training.patches import Patches, check_patches
 from dsr.training.settings import PatchSettings
@@ -71,9 +71,13 @@ class WholeScenes(Dataset[Batch]):
         return len(self._samples)
 
     def __getitem__(self, index: int) -> Batch:
-        """Return one sample's tensors, ``noise`` and ``facts`` if the maps have hints, and ``unit``."""
+        """Return one sample's tensors, ``noise`` and ``facts`` if the maps have hints, ``unit``, and ``bicubic``.
+
+        That is the (1, H, W) depth in metres of bicubic interpolation.
+        """
         sample = self._samples[index]
         tensors = to_tensors(sample, torch.float64)
+        tensors["bicubic"] = Interpolation("bicubic")(sample).double()
         if self._facts is not None:
             tensors |= {"noise": torch.zeros_like(tensors["disparity_lr"]).float(), "facts": self._facts}
         return {**tensors, "unit": asdict(sample.unit)}
@@ -185,15 +189,17 @@ class PatchData(lightning.LightningDataModule):
 
     def example_batch(self) -> Batch:
         """Return a batch of the run's size that needs no scene: a grey slope, repeated."""
-        size = self._settings.patch
-        camera = Camera(size, size, size, size, (size - 1) / 2, (size - 1) / 2)
-        depth = torch.linspace(1, 2, size, dtype=torch.float64).repeat(1, size, 1)
-        scene = Scene("example", "slope", torch.full((3, size, size), 0.5), camera, depth)
-        tensors = to_tensors(self._degradation.sample(scene, clean=True))
+        tensors = to_tensors(self._degradation.sample(slope(self._settings.patch), clean=True))
         if self._everything is not None:
             nothing = {"facts": torch.zeros(FACTS), "soft": torch.zeros(())}
             tensors |= {"noise": torch.zeros_like(tensors["disparity_lr"]), **nothing}
         return default_collate([tensors] * self._settings.batch)
+
+    def example_scene(self, kind: str) -> Batch:
+        """Return the first scene of a validation set as its loader does."""
+        source, names = self._held_out[kind]
+        scenes = [scene for scene in map(source.load, names[:1]) if scene.depth is not None]
+        return collate_scene([self._whole(scenes)[0]]) if scenes else {}
 
     def first_patches(self, count: int) -> list[Batch]:
         """Return the first ``count`` patches of the run."""
@@ -226,9 +232,11 @@ class PatchData(lightning.LightningDataModule):
         """
         rank, devices = (0, 1) if self.trainer is None else (self.trainer.global_rank, self.trainer.world_size)
         parts = (scenes[rank::devices] for scenes in self._validation)
-        told = self._everything is not None
-        samples: Any = (WholeScenes(part, self._degradation, self._seed, told=told) if part else [{}] for part in parts)
+        samples: Any = (self._whole(part) if part else [{}] for part in parts)
         return [DataLoader(each, batch_size=1, collate_fn=collate_scene) for each in samples]
+
+    def _whole(self, scenes: Sequence[Scene]) -> WholeScenes:
+        return WholeScenes(scenes, self._degradation, self._seed, told=self._everything is not None)
 
     def _load_patches(self) -> Patches:
         if self._patches is None:

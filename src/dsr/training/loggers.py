@@ -21,14 +21,15 @@ from dsr.metrics.formats import main_first
 from dsr.utils.builder import expect_library
 from dsr.utils.files import write_text
 from dsr.utils.lightning import Log
+from dsr.utils.runs_table import list_run
 
 _CURVES = ("loss", "gradient_norm")
 _ROWS_AT_ONCE = 10
 """Rows of a table that are written together."""
 OPTIONAL = ("wandb", "mlflow")
 """Loggers that need the library of their name, which an extra of that name installs."""
-RUN_ID = "logger_run.txt"
-"""The file in a run's directory with the number that a service has given to the run."""
+RUN_IDS = {name: f"{name}_run.txt" for name in OPTIONAL}
+"""The files in a run's directory with the numbers that services have given to the run."""
 
 
 def expect_installed(name: str) -> None:
@@ -64,7 +65,7 @@ class CsvLog(CSVLogger):
         if not values:
             return
         if self._before:
-            kept = [row for row in self._before if step is None or int(row["step"]) < step]
+            kept = [row for row in self._before if step is None or int(row["step"]) <= step]
             self._before = []
             self.experiment.metrics.extend(kept)
         rows = self.experiment.metrics
@@ -117,15 +118,15 @@ def wandb(
     import wandb as client  # noqa: PLC0415 - optional
 
     logger = WandbLog(
-        name=folder.name, save_dir=folder, project=project, entity=entity, mode=mode, id=_read_number(folder),
-        settings=client.Settings(silent=True, console="off"),
+        name=folder.name, save_dir=folder, project=project, entity=entity, mode=mode,
+        id=_read_number(folder, "wandb"), settings=client.Settings(silent=True, console="off"),
     )  # fmt: skip
     logger._wandb_init.pop("anonymous", None)  # of which wandb would warn
     try:
         number = logger.experiment.id
     except client.Error as error:
-        raise ValueError(f"mode: wandb: {error}; wandb login, or logger.mode=offline for local files") from error
-    _write_number(folder, number)
+        raise ValueError(f"mode: wandb: {error}; wandb login, or logger.wandb.mode=offline for local files") from error
+    _write_number(folder, "wandb", number)
     return logger
 
 
@@ -149,49 +150,63 @@ def mlflow(folder: Path, experiment: str = "dsr", tracking_uri: str | None = Non
     if uri.startswith("file:"):
         os.environ.setdefault("MLFLOW_ALLOW_FILE_STORE", "true")
     try:
-        logger = MLFlowLogger(experiment, folder.name, uri, run_id=_read_number(folder))
-        _write_number(folder, logger.run_id)
+        logger = MLFlowLogger(experiment, folder.name, uri, run_id=_read_number(folder, "mlflow"))
+        _write_number(folder, "mlflow", logger.run_id)
     except MlflowException as error:
         raise ValueError(f"tracking_uri: {uri}: {error}") from error
     return logger
 
 
-def log_settings(logger: Logger | None, table: Mapping[str, Any], text: str, config: Mapping[str, Any]) -> None:
+def log_config(logger: Logger | None, text: str) -> None:
+    """Log the complete configuration for readers, so that TensorBoard shows the run before it has values.
+
+    Args:
+        logger: of the training; others than TensorBoard's are left out.
+        text: in Markdown.
+
+    """
+    if isinstance(logger, Log):
+        logger.experiment.add_text("config", text)
+        logger.experiment.flush()
+
+
+def log_settings(logger: Logger | None, table: Mapping[str, Any], config: Mapping[str, Any]) -> None:
     """Log what a training was made with.
 
     Args:
         logger: of the training.
-        table: the main settings, for TensorBoard's table of runs.
-        text: the complete configuration for readers, for TensorBoard.
+        table: the main settings, among them the columns of TensorBoard's table of runs.
         config: the complete configuration, for other loggers.
 
     """
     if isinstance(logger, Log):
-        logger.list_run(table)
-        logger.experiment.add_text("config", text)
+        logger.log_hyperparams(dict(table))
+        list_run(logger.experiment, "training", table, {})
     elif logger is not None:
         logger.log_hyperparams(dict(config))
 
 
-def log_layout(logger: Logger | None, metrics: Sequence[str], losses: Sequence[str] = _CURVES) -> None:
-    """Lay out TensorBoard's *Custom scalars*: the worst of four lights first, then depth and normals, then losses.
+def log_layout(logger: Logger | None, metrics: Mapping[str, str], losses: Sequence[str] = _CURVES) -> None:
+    """Lay out TensorBoard's *Custom scalars*: metrics of renderings first, then those of depth, then losses.
 
-    A chart has a metric's mean over all validation sets and, if there are several, that of each.
+    A chart has a metric's mean over all validation sets and, if there are several, that of each, of the network and of
+    bicubic interpolation.
 
     Args:
         logger: of the training; others than TensorBoard's have no layout.
-        metrics: names of the validation's metrics.
+        metrics: titles of the validation's metrics, by name.
         losses: names of values of the training.
 
     """
     if not isinstance(logger, Log):
         return
     looks = main_first(name for name in metrics if "_v" in name)
+    depth = [name for name in metrics if name not in looks]
     groups = {
-        "Looks, worst of four lights": {name: rf"val(_[^/]*)?/{re.escape(name)}$" for name in looks},
-        "Depth and normals": {name: rf"val(_[^/]*)?/{re.escape(name)}$" for name in metrics if name not in looks},
+        **{title: {metrics[name]: rf"(val|bicubic)(_[^/]*)?/{re.escape(name)}$" for name in names}
+           for title, names in (("Looks", looks), ("Depth and normals", depth))},
         "Training": {name: f"train/{name}$" for name in losses},
-    }
+    }  # fmt: skip
     layout = {title: {name: ["Multiline", [tag]] for name, tag in charts.items()} for title, charts in groups.items()}
     logger.experiment.add_custom_scalars({title: charts for title, charts in layout.items() if charts})
 
@@ -225,14 +240,14 @@ def _read_table(path: Path) -> list[dict[str, Any]]:
     return [{name: value for name, value in row.items() if value} | {"step": int(row["step"])} for row in whole]
 
 
-def _read_number(folder: Path) -> str | None:
+def _read_number(folder: Path, service: str) -> str | None:
     """Return the number that a service has given to the run, None for a new run."""
-    path = folder / RUN_ID
+    path = folder / RUN_IDS[service]
     text = path.read_text(encoding="utf-8").strip() if path.is_file() else ""
     return text if re.fullmatch(r"\w{1,64}", text) else None
 
 
 @rank_zero_only
-def _write_number(folder: Path, number: Any) -> None:
+def _write_number(folder: Path, service: str, number: Any) -> None:
     """Keep the number that a service has given to the run."""
-    write_text(folder / RUN_ID, f"{number}\n")
+    write_text(folder / RUN_IDS[service], f"{number}\n")

@@ -9,12 +9,13 @@ from typing import Any
 import lightning
 import torch
 import torchmetrics
+from lightning.pytorch.trainer.states import TrainerFn
 from torch import Tensor, nn
 from torch.optim.swa_utils import get_ema_multi_avg_fn
 
 from dsr.geometry.comparison import comparison
 from dsr.methods.networks.base import DisparityNetwork
-from dsr.metrics.classes import compute_means
+from dsr.metrics.classes import compute_means, in_table_units
 from dsr.metrics.functional import SurfacePair
 from dsr.sample import Unit
 from dsr.training.degradation import Batch
@@ -28,6 +29,9 @@ _RENDERED_SCENES = 4
 
 class SuperResolution(lightning.LightningModule):
     """The training of a network of disparities.
+
+    Beside the scores of the network, ``val/METRIC``, validations log those of bicubic interpolation of the same maps,
+    ``bicubic/METRIC``, which are computed in the first one.
 
     Args:
         net: the network.
@@ -58,6 +62,9 @@ class SuperResolution(lightning.LightningModule):
         self.objective, self.schedule = objective, schedule
         self.sets = tuple(validation_sets)
         self.metrics = nn.ModuleList(metrics() for _ in self.sets)
+        self._make_metrics = metrics
+        self._bicubic_metrics: list[torchmetrics.MetricCollection] = []
+        self.bicubic: dict[str, dict[str, float]] = {}
         self.validation_scores: dict[str, dict[str, float]] = {}
         self._pictures: dict[str, Tensor] = {}
 
@@ -94,6 +101,11 @@ class SuperResolution(lightning.LightningModule):
         for average, current in zip(self.average.buffers(), self.net.buffers(), strict=True):
             average.copy_(current)  # such as the statistics of batch normalisation, which are averages already
 
+    def on_validation_epoch_start(self) -> None:
+        """Score bicubic interpolation, too, unless its scores are known from the training's first validation."""
+        known = self.bicubic and self._fits
+        self._bicubic_metrics = [] if known else [self._make_metrics().to(self.device) for _ in self.sets]
+
     def validation_step(self, batch: Batch, index: int, dataloader_idx: int = 0) -> None:
         """Score a whole scene, if the batch has one; render the first few for TensorBoard."""
         if not batch:
@@ -106,9 +118,14 @@ class SuperResolution(lightning.LightningModule):
             disparity = self.average.upsample(batch["rgb"], values)
         disparity = disparity - offset
         depth = to_depth(disparity.to(batch["depth"].dtype), batch)
-        self.metrics[dataloader_idx].update(  # type: ignore[operator]
-            SurfacePair(depth, batch["depth"], batch["rays"], unit=Unit(**batch["unit"]), image_dtype=torch.float32)
-        )
+        scored = [(self.metrics[dataloader_idx], depth)]
+        if self._bicubic_metrics:
+            scored.append((self._bicubic_metrics[dataloader_idx], batch["bicubic"]))
+        for metrics, each in scored:
+            pair = SurfacePair(
+                each, batch["depth"], batch["rays"], unit=Unit(**batch["unit"]), image_dtype=torch.float32
+            )
+            metrics.update(pair)  # type: ignore[operator]
         if self._trainer is None or not self._trainer.loggers:
             return
         number = index * self.trainer.world_size + self.trainer.global_rank  # of the scene
@@ -118,30 +135,61 @@ class SuperResolution(lightning.LightningModule):
             self._pictures[f"renderings/{self.sets[dataloader_idx]}_{number}"] = picture
 
     def on_validation_epoch_end(self) -> None:
-        """Log the mean scores over the scenes, worst of four lights, of all sets and, if there are several, of each."""
+        """Log the mean scores in the units of tables, of all sets and, if there are several, of each."""
         self._gather()
         for name in sorted(self._pictures):
-            log_picture(self.logger, name, self._pictures[name], self.global_step)
+            for logger in self.loggers:
+                log_picture(logger, name, self._pictures[name], self.global_step)
         self._pictures = {}
-        collections: Any = self.metrics
-        scores = [{name: value.double() for name, value in compute_means(each).items()} for each in collections]
-        names = dict.fromkeys(name for each in scores for name in each)
-        means = {name: torch.stack([each[name] for each in scores if name in each]).nanmean() for name in names}
-        named = {"val": means}
-        if len(self.sets) > 1:
-            named |= {f"val_{name}": each for name, each in zip(self.sets, scores, strict=True)}
+        named: dict[str, Any] = self._means("val", self.metrics)
+        if self._bicubic_metrics:
+            means = self._means("bicubic", self._bicubic_metrics)
+            self.bicubic = {kind: {name: float(v) for name, v in each.items()} for kind, each in means.items()}
+            self._bicubic_metrics = []
+        named |= self.bicubic
         self.validation_scores = {
             kind: {name: float(value) for name, value in each.items()} for kind, each in named.items()
         }
-        self.log_dict({f"{kind}/{name}": v for kind, each in named.items() for name, v in each.items()})
+        shown: Any = {name: metric for each in self.metrics for name, metric in each.items()}  # type: ignore[operator]
+        values = {
+            f"{kind}/{name}": value
+            for kind, raw in self.validation_scores.items()
+            for name, value in in_table_units(shown, raw).items()
+        }
+        self.log_dict(values, logger=False if self._fits else None)
+        for logger in self.loggers if self._fits else ():  # Lightning would count steps from 0
+            logger.log_metrics(values, self.global_step)
+            logger.save()
         for each in self.metrics:
             each.reset()  # type: ignore[operator]
+
+    @property
+    def _fits(self) -> bool:
+        """Whether the validation is one of a training."""
+        return self.trainer.state.fn == TrainerFn.FITTING
+
+    def _means(self, kind: str, collections: Any) -> dict[str, dict[str, Tensor]]:
+        """Return the mean scores over the scenes, by ``kind`` for all sets and, if there are several, for each."""
+        scores = [{name: value.double() for name, value in compute_means(each).items()} for each in collections]
+        names = dict.fromkeys(name for each in scores for name in each)
+        means = {name: torch.stack([each[name] for each in scores if name in each]).nanmean() for name in names}
+        sets = {f"{kind}_{name}": each for name, each in zip(self.sets, scores, strict=True)}
+        return {kind: means} | (sets if len(sets) > 1 else {})
+
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Store the scores of bicubic interpolation."""
+        checkpoint["bicubic"] = self.bicubic
+
+    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Restore the scores of bicubic interpolation, which earlier checkpoints lack."""
+        stored = checkpoint.get("bicubic", {})
+        self.bicubic = {str(kind): {str(k): float(v) for k, v in each.items()} for kind, each in stored.items()}
 
     def _gather(self) -> None:
         """Gather what torchmetrics does not: which metrics apply to the scenes of any device, and the pictures."""
         if self.trainer.world_size == 1:
             return
-        collections: Any = self.metrics
+        collections: list[Any] = [*self.metrics, *self._bicubic_metrics]
         metrics = [metric for each in collections for metric in each.values() if hasattr(metric, "applied")]
         all_devices: list[Any] = [None] * self.trainer.world_size
         torch.distributed.all_gather_object(all_devices, ([metric.applied for metric in metrics], self._pictures))
@@ -156,5 +204,5 @@ class SuperResolution(lightning.LightningModule):
             self.net.parameters(), lr=schedule.learning_rate, weight_decay=schedule.weight_decay
         )
         rates = torch.optim.lr_scheduler.LambdaLR(optimiser, schedule.factor)
-        named = {"scheduler": rates, "interval": "step", "name": "train/learning_rate"}
+        named = {"scheduler": rates, "interval": "step"}
         return {"optimizer": optimiser, "lr_scheduler": named}

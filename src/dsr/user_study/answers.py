@@ -15,6 +15,7 @@ from pydantic import AfterValidator, BaseModel, BeforeValidator, Field, Validati
 
 from dsr.user_study.key import PAGE_VERSION, Key
 from dsr.utils.limits import read_limited
+from dsr.utils.paths import natural_key
 from dsr.utils.validation import Number, Whole, describe
 
 _LONGEST = 1e12
@@ -71,7 +72,7 @@ def files_of(paths: Iterable[Path]) -> list[Path]:
     """
     found: dict[Path, Path] = {}
     for path in paths:
-        for file in sorted(path.rglob("*.json")) if path.is_dir() else [path]:
+        for file in sorted(path.rglob("*.json"), key=natural_key) if path.is_dir() else [path]:
             found.setdefault(Path(os.path.realpath(file)), file)  # unlike resolve, it takes loops
     if not found:
         raise ValueError("answers: expected files that the page's last screen saved, found none")

@@ -63,13 +63,14 @@ def build(group: str, node: Mapping[str, Any], given: Mapping[str, Any] | None =
     given = {key: value for key, value in (given or {}).items() if key in parameters}
     arguments = {key: value for key, value in node.items() if key not in _ABOUT or key in parameters}
     own = [key for key in parameters if key not in given]
+    choice = f"{group}={node['name']}" if "name" in node else group
     for key, value in arguments.items():
         if key not in own:
             accepted = ", ".join(own) or "none"
-            raise ConfigError(f"{group}.{key}: unknown key; {group}={node.get('name')} takes {accepted}")
+            raise ConfigError(f"{group}.{key}: unknown key; {choice} takes {accepted}")
         expect_usable(f"{group}.{key}", value)
         if value == _MISSING:
-            raise ConfigError(f"{group}.{key}: {group}={node.get('name')} needs it: {group}.{key}=...")
+            raise ConfigError(f"{group}.{key}: {choice} needs it: {group}.{key}=...")
         if key in hints and not _fits(value, hints[key]):
             raise ConfigError(f"{group}.{key}: expected {_describe(hints[key])}, got {value!r:.60}")
     try:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import time
-from pathlib import Path
+from collections.abc import Callable, Mapping
+from pathlib import Path, PurePath
 from typing import Any
 
 import lightning
@@ -14,8 +15,12 @@ from lightning.pytorch.plugins.io import TorchCheckpointIO
 
 from dsr.utils import interruption
 from dsr.utils.builder import ConfigError
+from dsr.utils.console import one_line
 from dsr.utils.divergence import in_doubt
 from dsr.utils.files import replacing
+
+_FILES = ("best_model_path", "kth_best_model_path", "last_model_path")
+"""What Lightning's callback that keeps checkpoints says of files, beside ``best_k_models``."""
 
 
 class CheckpointError(ConfigError):
@@ -43,8 +48,55 @@ class Resumed(Callback):
         self.begun = True
 
 
+class OwnFiles(Callback):
+    """Lets a checkpoint name only files of the run's own directory of checkpoints, as Lightning removes what it names.
+
+    Files are taken by their names alone, so that a run goes on wherever it has been moved to. What a checkpoint says of
+    any other path, of a link or of a directory is dropped with all that the same callback has kept.
+
+    Args:
+        folder: the run's directory of checkpoints.
+        say: shows a line.
+
+    """
+
+    def __init__(self, folder: Path, say: Callable[[str], None]) -> None:
+        self._folder, self._say = folder, say
+
+    def on_load_checkpoint(
+        self, trainer: lightning.Trainer, pl_module: lightning.LightningModule, checkpoint: dict[str, Any]
+    ) -> None:
+        """Replace the paths, before any callback restores its state."""
+        states = checkpoint["callbacks"]
+        for key, state in list(states.items()):
+            if not isinstance(state, Mapping) or not {*_FILES, "best_k_models"} & state.keys():
+                continue
+            try:
+                states[key] = self._with_own_files(state)
+            except ValueError as error:
+                del states[key]
+                self._say(f"note: {one_line(error)} is not taken from the checkpoint, only files in {self._folder} are")
+
+    def _with_own_files(self, state: Mapping[str, Any]) -> dict[str, Any]:
+        """Return the state of a callback that keeps checkpoints with the paths that its files have in this run."""
+        folder = self._folder.resolve()
+
+        def own(path: Any) -> str:
+            given = PurePath(str(path))
+            place = folder / given.name
+            if str(given.parent) != str(state.get("dirpath", folder)) or place.is_symlink() or place.is_dir():
+                raise ValueError(str(path))
+            return str(place)
+
+        files = {key: own(state[key]) if state[key] else "" for key in _FILES if key in state}
+        kept = {own(path): score for path, score in state.get("best_k_models", {}).items()}
+        if kept and files.get("kth_best_model_path") not in kept:
+            raise ValueError("a list of files without the worst of them")
+        return {**state, **files, "best_k_models": kept, "dirpath": str(folder)}
+
+
 class Interruption(Callback):
-    """Ends a training at Ctrl-C or SIGTERM with a checkpoint of the last complete step.
+    """Ends a training at Ctrl-C or SIGTERM with a checkpoint of the step that it is at, once that is complete.
 
     If a validation follows that step, it ends between two scenes of the validation, which is done again later. Only the
     validation after the last step is waited for, as nothing would be left to do again.
@@ -70,8 +122,7 @@ class Interruption(Callback):
     def on_train_start(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
         """Only note signals from now on."""
         self._acts = trainer.is_global_zero
-        message = f"interrupted; {self._path} is the latest checkpoint, the same command goes on from there"
-        self._interruption = self._stack.enter_context(interruption.deferred(message))
+        self._interruption = self._stack.enter_context(interruption.deferred(self._message))
 
     def on_train_batch_end(self, trainer: lightning.Trainer, *_: Any) -> None:
         """Save and stop, if an interruption was requested, a step is complete and no validation follows."""
@@ -92,13 +143,16 @@ class Interruption(Callback):
     def on_validation_batch_start(
         self, trainer: lightning.Trainer, pl_module: lightning.LightningModule, batch: Any, batch_idx: int, *_: Any
     ) -> None:
-        """Save the state at the beginning of the validation and stop, if an interruption was requested."""
+        """Save the state at the beginning of the validation and stop, if an interruption was requested.
+
+        Before the first step there is nothing to save.
+        """
         if trainer.should_stop or trainer.global_step >= trainer.max_steps:
             return
-        if self._checkpoint is None:
+        if self._checkpoint is None and trainer.global_step:
             self._checkpoint = _of_begun_validation(trainer)
         if self._requested:
-            if not in_doubt(trainer):
+            if self._checkpoint is not None and not in_doubt(trainer):
                 trainer.strategy.save_checkpoint(self._checkpoint, self._path)
             raise KeyboardInterrupt
 
@@ -118,6 +172,12 @@ class Interruption(Callback):
     def teardown(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule, stage: str) -> None:
         """Let signals act as before."""
         self._close()
+
+    def _message(self) -> str:
+        """Return the line of a process that ends in the middle of a step."""
+        if self._path.is_file():
+            return f"interrupted; {self._path} is the latest checkpoint, the same command goes on from there"
+        return "interrupted before the first checkpoint; the same command begins this again, what is finished is kept"
 
     def _close(self) -> None:
         if self._interruption is not None:

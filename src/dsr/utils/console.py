@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import functools
 import io
 import os
 import sys
@@ -60,6 +61,12 @@ def print_error(message: str) -> None:
     """Print one line on stderr; of a very long message the beginning, which names the file or key, and the end."""
     text = printable(shorten(" ".join(message.split())))
     print(f"error: {text}", file=sys.stderr, flush=True)  # noqa: T201
+
+
+@functools.cache
+def note_once(note: str) -> None:
+    """Print a note on stderr, once in a process."""
+    print(f"note: {note}", file=sys.stderr)  # noqa: T201
 
 
 def shorten(text: str, most: int = _LONGEST) -> str:

@@ -61,9 +61,12 @@ class Divergence(Callback):
             raise _error(trainer, f"the {name} is {value:g}{row}")
 
     def on_validation_end(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
-        """Check the validation's score of depth, which is NaN where a prediction has no finite depth."""
+        """Check the validation's score of depth, which is NaN where a prediction has no finite depth.
+
+        Before the first step it may be.
+        """
         score = trainer.callback_metrics.get(_SCORE)
-        if score is not None and not _is_finite(score) and not trainer.sanity_checking:
+        if score is not None and not _is_finite(score) and trainer.global_step and not trainer.sanity_checking:
             raise _error(trainer, f"the validation's {_SCORE.partition('/')[2]} is {float(score):g}")
 
     def on_save_checkpoint(

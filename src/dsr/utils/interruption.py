@@ -1,4 +1,6 @@
-"""Ctrl-C and SIGTERM: a command ends within five seconds, in one line, with exit code 128 + the signal's number.
+"""Ctrl-C and SIGTERM: a command ends in one line, with exit code 128 + the signal's number.
+
+It ends within five seconds, but that at Ctrl-C a training or an optimisation does the step that it is at to its end.
 
 Python turns SIGINT into an exception wherever the program happens to be: in an import, in a callback of the garbage
 collector, which drops it, or in a library that catches everything. SIGTERM ends it without a word. :func:`start`, which
@@ -6,9 +8,9 @@ runs the commands, therefore installs a handler before anything else is imported
 
 - While a command works (:func:`working`), the first signal raises KeyboardInterrupt, so that temporary files are
   removed and worker processes stopped. Within :func:`deferred` it is only noted, so that a training can save its step.
-- If this has not ended the process after a few seconds, at a second signal, and at any other time, such as during
-  imports, the process ends at once. Files are replaced atomically, so only temporary ones are left, which a later run
-  removes.
+- If this has not ended the process after a few seconds, but not while a step that Ctrl-C has met is being done, at a
+  second signal, and at any other time, such as during imports, the process ends at once. Files are replaced atomically,
+  so only temporary ones are left, which a later run removes.
 """
 
 from __future__ import annotations
@@ -34,7 +36,9 @@ _PREEMPTION: signal.Signals | None = getattr(signal, "SIGUSR2", None)
 _GRACE = 4.0
 """Seconds that an interrupted command has to end by itself."""
 _BETWEEN_LOOKS = 0.5
-"""Seconds between two looks of a worker after its parent."""
+"""Seconds between two looks of a worker after its parent, and of a process that is to end after its work."""
+_SILENCE = 1.0
+"""Seconds after Ctrl-C from which on a step that is still being done is told of."""
 _SHOW_CURSOR = b"\x1b[?25h"
 """The control sequence of terminals that undoes what a progress display hides."""
 
@@ -43,11 +47,11 @@ class Deferred:
     """Tells whether a signal has come that was only noted.
 
     Args:
-        message: the line that the process ends with if the signal is not acted upon in time.
+        message: returns the line that the process ends with if the signal is not acted upon in time.
 
     """
 
-    def __init__(self, message: str) -> None:
+    def __init__(self, message: Callable[[], str]) -> None:
         self.message, self.requested = message, False
 
     def note(self, number: int, _: FrameType | None) -> None:
@@ -143,13 +147,14 @@ def working() -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def deferred(message: str) -> Iterator[Deferred]:
+def deferred(message: Callable[[], str]) -> Iterator[Deferred]:
     """Within this context the first signal is only noted; the code in it looks for it and ends by itself.
 
+    At Ctrl-C it has the time that it needs, at SIGTERM, which batch systems let SIGKILL follow, a few seconds.
     Where the handler is not that of the process, as in a notebook, the process is never ended.
 
     Args:
-        message: the line that the process ends with if the signal is not acted upon in time.
+        message: returns the line that the process ends with if the signal is not acted upon in time.
 
     """
     noted, before = Deferred(message), {}
@@ -262,6 +267,11 @@ def outlast_group() -> None:
         signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGTERM})
 
 
+def is_ctrl_c() -> bool:
+    """Return whether the signal that came first is that of Ctrl-C."""
+    return _State.number == signal.SIGINT
+
+
 def exit_code() -> int:
     """Return the exit code of an interrupted command: 128 + the number of the signal that came, by default SIGINT."""
     return 128 + (_State.number or signal.SIGINT)
@@ -295,7 +305,7 @@ def end(message: str) -> NoReturn:
 
 def _message() -> str:
     """Return the line of a process that has to end at once."""
-    return MESSAGE if _State.deferred is None else _State.deferred.message
+    return MESSAGE if _State.deferred is None else _State.deferred.message()
 
 
 def _handle(number: int, frame: FrameType | None) -> None:
@@ -310,18 +320,30 @@ def _handle(number: int, frame: FrameType | None) -> None:
 
 
 def _watch(pipe: int) -> None:
-    """End the process some seconds after a signal, or at a second one, whatever the main thread is busy with."""
-    signals = 0
+    """End the process some seconds after a signal, or at a second one, whatever the main thread is busy with.
+
+    A step that Ctrl-C has met is waited for however long it takes.
+    """
+    grace = 2 * _GRACE if _State.silent else _GRACE  # another process may need this one to complete its step
+    came, deadline, told = 0.0, 0.0, _State.silent
     while True:
-        grace = 2 * _GRACE if _State.silent else _GRACE  # another process may need this one to complete its step
-        if signals and not select.select([pipe], [], [], grace)[0]:
-            end(_message())
-        number = os.read(pipe, 1)[0]
-        if number in _SIGNALS:
+        left = max(min(deadline - time.monotonic(), _BETWEEN_LOOKS), 0) if came else None
+        if select.select([pipe], [], [], left)[0]:
+            number = os.read(pipe, 1)[0]
+            if number not in _SIGNALS:
+                continue
             _State.number = _State.number or number
-            signals += 1
-            if signals > 1:
+            if came:
                 end(_message())
+            came, deadline = time.monotonic(), time.monotonic() + grace
+        elif _State.deferred is not None and is_ctrl_c():
+            deadline = time.monotonic() + grace
+            if not told and time.monotonic() - came >= _SILENCE:
+                told = True
+                with contextlib.suppress(OSError):
+                    os.write(2, b"stopping after this step (Ctrl-C again stops at once)\n")
+        elif time.monotonic() >= deadline:
+            end(_message())
 
 
 def _unraisable(problem: Any) -> None:

@@ -13,21 +13,19 @@ from typing import Any, Protocol
 
 import lightning
 import torch
-from lightning.pytorch.callbacks import Callback
+from lightning.pytorch.callbacks import Callback, ModelCheckpoint
 from lightning.pytorch.loggers import TensorBoardLogger
 from lightning.pytorch.plugins.environments import ClusterEnvironment, LightningEnvironment
-from lightning.pytorch.utilities import rank_zero_only
-from torch.utils.tensorboard.summary import hparams
 
 from dsr.utils import interruption
 from dsr.utils.builder import ConfigError
 from dsr.utils.checkpoints import AtomicCheckpoints, CheckpointError, Interruption, Resumed
 from dsr.utils.files import replacing
 from dsr.utils.progress import Progress, Task
+from dsr.utils.runs_table import SCORES, list_scores
 from dsr.utils.space import FullDiskError, space_for
 from dsr.utils.tables import guard
 
-IN_TABLE = ("RMSE_v", "DSSIM_v", "LPIPS_v", "BadPix_v_5", "Bumpiness_d", "RMSE_d")
 LOG_EVERY = 10
 """Steps between two values of a training in its log."""
 _SECONDS_BETWEEN_LOSSES = 0.2
@@ -55,13 +53,16 @@ class LostProcessError(ConfigError):
 
 
 class Scored(Protocol):
-    """A module that keeps the scores of its last validation: by set, by metric."""
+    """A module that keeps the raw scores of its last validation, and those that it is compared with, by set, by metric.
+
+    It logs them in the units of tables.
+    """
 
     validation_scores: dict[str, dict[str, float]]
 
 
 class ValidationTable(Callback):
-    """Keeps the scores of all validations of a :class:`Scored` module in a file, to the last digit.
+    """Keeps the raw scores of all validations of a :class:`Scored` module in a file, to the last digit.
 
     Its columns are step, set, metric and value.
 
@@ -87,6 +88,31 @@ class ValidationTable(Callback):
         with replacing(self._path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
             kept = (row for row in before if int(row[0]) < step)
             csv.writer(file, lineterminator="\n").writerows([("step", "set", "metric", "value"), *kept, *rows])
+
+
+class ListedScores(Callback):
+    """Keeps the scores in TensorBoard's table of runs up to date: those of the validation that the result is from.
+
+    Args:
+        best: keeps the best checkpoint, whose validation it is; None for the last one.
+
+    """
+
+    def __init__(self, best: ModelCheckpoint | None = None) -> None:
+        self._best = best
+
+    def on_validation_end(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
+        """Write the scores, unless those of an earlier validation are better."""
+        if trainer.sanity_checking or not trainer.is_global_zero:
+            return
+        found = {name: trainer.callback_metrics.get(f"val/{name}") for name in SCORES}
+        scores = {name: float(value) for name, value in found.items() if value is not None}
+        best = None if self._best is None else self._best.best_model_score  # so far: checkpoints are the last callbacks
+        if best is not None and trainer.callback_metrics[str(self._best.monitor)] >= best:  # type: ignore[union-attr]
+            return
+        for logger in trainer.loggers:
+            if isinstance(logger, TensorBoardLogger):
+                list_scores(logger.experiment, scores, trainer.global_step)
 
 
 class LastValidation(Callback):
@@ -158,6 +184,9 @@ class StepProgress(Callback):
             subject = f"{self._subject}: " if self._subject else ""
             parts = (f"{subject}step {trainer.global_step:>6}", _loss_text(trainer), f"validation: {scores}")
             self._progress.say("  ".join(filter(None, parts)))
+        bicubic = scores_line(trainer, "bicubic")
+        if bicubic and not trainer.global_step:
+            self._progress.say(f"             bicubic:    {bicubic}")
 
     def on_train_end(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
         """Stop showing steps."""
@@ -179,14 +208,6 @@ class Log(TensorBoardLogger):
     def log_metrics(self, metrics: Mapping[str, float], step: int | None = None) -> None:
         """Log all metrics except the epoch."""
         super().log_metrics({name: value for name, value in metrics.items() if name != "epoch"}, step)
-
-    @rank_zero_only
-    def list_run(self, settings: Mapping[str, Any]) -> None:
-        """Put the run into TensorBoard's table of runs, with its settings and the latest scores of its validations."""
-        self.log_hyperparams(dict(settings))
-        scores = dict.fromkeys((f"val/{name}" for name in IN_TABLE), 0.0)  # the names count, values come from the log
-        for part in hparams(dict(settings), scores):
-            self.experiment.file_writer.add_summary(part)
 
 
 def make_trainer(
@@ -304,10 +325,11 @@ def _loss_text(trainer: lightning.Trainer) -> str:
     return "" if loss is None else f"loss {float(loss):.4f}"
 
 
-def scores_line(trainer: lightning.Trainer) -> str:
-    """Return the main scores of the last validation for a reader; empty if there are none."""
-    scores = {name: trainer.callback_metrics.get(f"val/{name}") for name in ("RMSE_d", "RMSE_v", "DSSIM_v", "LPIPS_v")}
-    return "  ".join(f"{name} {float(value):.4f}" for name, value in scores.items() if value is not None)
+def scores_line(trainer: lightning.Trainer, kind: str = "val") -> str:
+    """Return the main scores of the last validation for a reader, in mm and 1/1000; empty if there are none."""
+    units = {"RMSE_d": " mm", "RMSE_v": "", "DSSIM_v": "", "LPIPS_v": ""}
+    scores = {name: trainer.callback_metrics.get(f"{kind}/{name}") for name in units}
+    return "  ".join(f"{name} {float(value):.1f}{units[name]}" for name, value in scores.items() if value is not None)
 
 
 @contextlib.contextmanager

@@ -23,6 +23,8 @@ MOST_TEXT = 1 << 24
 """Largest size in bytes of JSON and text about a run, a result or a camera."""
 MOST_TABLE = 1 << 26
 """Largest size in bytes of a table."""
+MOST_FACES, MOST_POINTS = 25_000_000, 20_000_000
+"""Largest numbers of triangles and points that are written unless others are asked for."""
 _PIXELS, _PIXELS_PER_BYTE = 1 << 25, 64
 """Pixels that any file may have, and that each byte of a larger one explains; photos as JPEG have at most 20."""
 _UNPACKED, _RATIO = 1 << 28, 16

@@ -9,6 +9,7 @@ from pathlib import Path
 from dsr.app.upsample.request import UpsampleRequest
 from dsr.io.layouts import find_pairs_of_folder
 from dsr.io.manifest import Manifest
+from dsr.io.names import in_order
 from dsr.io.pairs import Pair, PairingResult, add_confidence, find_pairs_of_lists
 
 
@@ -48,11 +49,22 @@ def find_frames(request: UpsampleRequest) -> Frames:
     found = _search(request)
     if request.confidence:
         found = replace(found, pairs=add_confidence(found.pairs, request.confidence))
+    if request.rgb:
+        found = replace(found, pairs=_by_number(found.pairs))
     total, whole = len(found.pairs), found.pairs
     single = total == 1 and not request.folders and not request.rgb[0].is_dir()
     if request.shard is not None:
         found = replace(found, pairs=tuple(whole[number] for number in request.shard.block(total)))
     return Frames(found, whole, (), total, single)
+
+
+def _by_number(pairs: tuple[Pair, ...]) -> tuple[Pair, ...]:
+    """Return pairs whose photos come as a shell lists them, 1 10 2, in the order of their numbers; others as given."""
+    photos = [pair.rgb for pair in pairs]
+    if photos != sorted(photos, key=str):
+        return pairs
+    ranks = {photo: rank for rank, photo in enumerate(in_order(photos))}
+    return tuple(sorted(pairs, key=lambda pair: ranks[pair.rgb]))
 
 
 def _of_manifest(request: UpsampleRequest, path: Path) -> Frames:

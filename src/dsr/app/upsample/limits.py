@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 
-from dsr.geometry.simplification import MOST_FACES, MOST_POINTS
-from dsr.io.encoding import Assumption
-from dsr.io.exports import Written
+from dsr.utils.limits import MOST_FACES, MOST_POINTS
 
 LARGEST_ERROR = 0.02
 """Expected error of a pixel's depth, as a fraction of it, from which the pixel is left out of cloud and mesh."""
@@ -43,13 +40,3 @@ class Limits:
         for name, count in (("--max-faces", self.faces), ("--max-points", self.points)):
             if count < _FEWEST:
                 raise ValueError(f"{name}: expected at least {_FEWEST}, got {count}")
-
-
-def describe_reduction(shapes: Mapping[str, Written]) -> list[Assumption]:
-    """Return notes on cloud and mesh, by part, that have less than the depth map gives."""
-    words = {"cloud": ("points", "--max-points"), "mesh": ("triangles", "--max-faces")}
-    return [
-        Assumption("the {} has fewer {} than the depth map gives ({})".format(part, *words[part]), str(written))
-        for part, written in shapes.items()
-        if written.how
-    ]

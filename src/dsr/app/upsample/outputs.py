@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dsr.app.upsample.limits import Limits, describe_reduction
+from dsr.app.upsample.limits import Limits
 from dsr.evaluation.store import load_errors
 from dsr.geometry.camera import Camera
 from dsr.geometry.shading import LIGHT_NAMES
@@ -33,11 +33,6 @@ from dsr.utils.parsing import parse_json
 from dsr.viz.before_after import write_before_after
 from dsr.viz.confidence import write_confidence
 
-PARTS = ("depth", "renderings", "normals", "cloud", "mesh", "before_after", "confidence", "input")
-"""What is written unless something else is asked for."""
-MORE_PARTS = ("rgbd", "open3d", "nerfstudio", "gaussian", "rerun")
-"""What is written if it is asked for; all but the first are of all frames, see :mod:`dsr.app.upsample.scene`."""
-FORMATS = ("png", "tiff", "npy", "npz", "pfm", "exr")
 INFO = "info.json"
 METRES = "depth_metres.npy"
 ERRORS = "confidence.npz"
@@ -82,7 +77,7 @@ def output_encoding(encoding: Encoding, chosen: str | None) -> Encoding:
 
     Args:
         encoding: the input's.
-        chosen: one of :data:`FORMATS`; None for the input's.
+        chosen: one of :data:`dsr.app.upsample.parts.FORMATS`; None for the input's.
 
     """
     own = "tiff" if encoding.suffix == ".tif" else encoding.suffix[1:]
@@ -158,7 +153,7 @@ def write_parts(
         folder: the result's folder, created if it is missing.
         picture: the input.
         surface: the result.
-        parts: some of :data:`PARTS`, and ``rgbd``.
+        parts: some of :data:`dsr.app.upsample.parts.PARTS`, and ``rgbd``.
         encoding: the depth file's encoding.
         title: the title of the before-and-after picture.
         limits: what cloud and mesh leave out.
@@ -222,8 +217,18 @@ def _write_shapes(
         except ValueError as error:
             missing.append("mesh")
             facts.append(Assumption("no mesh", str(error)))
-    facts += describe_reduction(shapes)
+    facts += _describe_reduction(shapes)
     return missing, facts, shapes
+
+
+def _describe_reduction(shapes: Mapping[str, Written]) -> list[Assumption]:
+    """Return notes on cloud and mesh, by part, that have less than the depth map gives."""
+    words = {"cloud": ("points", "--max-points"), "mesh": ("triangles", "--max-faces")}
+    return [
+        Assumption("the {} has fewer {} than the depth map gives ({})".format(part, *words[part]), str(written))
+        for part, written in shapes.items()
+        if written.how
+    ]
 
 
 def _write_errors(folder: Path, surface: Surface) -> bool:

@@ -7,20 +7,20 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from dsr.app.upsample.limits import LARGEST_ERROR, Limits
-from dsr.app.upsample.outputs import FORMATS, MORE_PARTS, PARTS
-from dsr.app.upsample.scene import SCENE_PARTS, check_libraries
-from dsr.geometry.simplification import MOST_FACES, MOST_POINTS
-from dsr.inference import DEFAULT, WIDEST, Fill, MethodChoice, check_settings
-from dsr.inference.planning import USUAL_SCALE
-from dsr.io.frames import Record, Source
-from dsr.io.inputs import Reading
-from dsr.io.pairs import Pair
+from dsr.app.upsample.parts import FORMATS, MORE_PARTS, PARTS, SCENE_PARTS, check_libraries
+from dsr.inference.options import DEFAULT, USUAL_SCALE, WIDEST, Fill
+from dsr.io.reading import Reading
 from dsr.io.shards import Shard
-from dsr.methods.registry import list_methods, read_method, target_paths
+from dsr.utils.config_files import config_directories, list_choices
 from dsr.utils.hashing import file_hash, hash_outside_code
+from dsr.utils.limits import MOST_FACES, MOST_POINTS
+
+if TYPE_CHECKING:
+    from dsr.io.frames import Record, Source
+    from dsr.io.pairs import Pair
 
 SHORTCUTS = ("noise", "smooth")
 """Settings of the method that have an option of their own."""
@@ -48,7 +48,7 @@ class UpsampleRequest:
         register: whether to move each depth map to the photo's edges.
         neighbours: number of frames beside itself that vote on each frame's depth.
         poses: file of the frames' poses; None for those of the capture.
-        parts: what to write, some of :data:`dsr.app.upsample.outputs.PARTS` and ``MORE_PARTS``.
+        parts: what to write, some of :data:`dsr.app.upsample.parts.PARTS` and ``MORE_PARTS``.
         overwrite: whether to replace existing results.
         dry_run: whether to show only what would be done.
 
@@ -86,7 +86,7 @@ class UpsampleRequest:
     def __post_init__(self) -> None:
         """Check everything that does not depend on the files."""
         for name, value, choices in (
-            ("--method", self.method, list_methods(self.directories)),
+            ("--method", self.method, list_choices("method", config_directories(self.directories))),
             ("--format", self.depth_format, FORMATS),
         ):
             if value is not None and value not in choices:
@@ -153,6 +153,8 @@ class UpsampleRequest:
         """Check that the method accepts the settings."""
         if not self.settings:
             return
+        from dsr.inference import MethodChoice, check_settings  # noqa: PLC0415 - other values are refused without torch
+
         try:
             check_settings(MethodChoice(self.method, self.settings, self.directories))
         except ValueError as error:
@@ -193,6 +195,8 @@ def settings_of(request: UpsampleRequest) -> dict[str, Any]:
 
 def _targets(request: UpsampleRequest) -> list[str]:
     """Return the dotted paths of the code that the method's file names."""
+    from dsr.methods.registry import read_method, target_paths  # noqa: PLC0415 - see _check_method
+
     return list(
         target_paths(read_method(request.method, USUAL_SCALE, directories=request.directories), request.directories)
     )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -18,6 +17,7 @@ from dsr.io.scene_files.splatting import write_splatting
 from dsr.utils.files import write_text
 from dsr.utils.limits import read_limited
 from dsr.utils.parsing import parse_json
+from dsr.utils.paths import path_within
 
 _RECORD = "exports.json"
 _WRITERS: Mapping[str, tuple[str, Callable[[Path, Sequence[Frame]], list[Path]]]] = {
@@ -27,7 +27,6 @@ _WRITERS: Mapping[str, tuple[str, Callable[[Path, Sequence[Frame]], list[Path]]]
     "rerun": ("scene.rrd", write_rerun),
 }
 """The file or folder of each part in the folder of the results, and what writes it."""
-SCENE_PARTS = tuple(_WRITERS)
 
 
 @dataclass
@@ -38,17 +37,6 @@ class SceneResult:
     problems: list[str] = field(default_factory=list)
 
 
-def check_libraries(parts: Sequence[str]) -> None:
-    """Check that the libraries of some parts are installed.
-
-    Raises:
-        ValueError: one is not.
-
-    """
-    if "rerun" in parts and importlib.util.find_spec("rerun") is None:
-        raise ValueError("--with rerun: expected the library rerun-sdk, which `pip install dsr[rerun]` installs")
-
-
 def write_scene(output: Path, folders: Mapping[str, Path], parts: Sequence[str], *, overwrite: bool) -> SceneResult:
     """Write exports of frames that are complete, and record them in ``exports.json``.
 
@@ -57,7 +45,7 @@ def write_scene(output: Path, folders: Mapping[str, Path], parts: Sequence[str],
     Args:
         output: the folder of the results.
         folders: the folder of each frame, by its name.
-        parts: some of :data:`SCENE_PARTS`.
+        parts: some of :data:`dsr.app.upsample.parts.SCENE_PARTS`.
         overwrite: whether to replace what is there and not recorded.
 
     """
@@ -82,7 +70,7 @@ def write_scene(output: Path, folders: Mapping[str, Path], parts: Sequence[str],
             continue
         stale = set(recorded.get(name, ())) - {file.relative_to(output).as_posix() for file in files}
         for old in stale:  # of frames that are no longer there
-            if old.split("/")[0] == name and ".." not in old.split("/"):
+            if old.split("/")[0] == name:
                 (output / old).unlink(missing_ok=True)
         recorded[name] = sorted(file.relative_to(output).as_posix() for file in files)
         write_text(output / _RECORD, json.dumps({"exports": recorded}, indent=2) + "\n")
@@ -132,6 +120,9 @@ def _read_record(output: Path) -> dict[str, list[str]]:
         lists = [files if isinstance(files, list) else [None] for files in exports.values()]
         if not all(isinstance(file, str) for files in lists for file in files):
             raise TypeError
-        return exports
     except (ValueError, KeyError, TypeError) as error:
         raise ValueError(f"{path}: expected a file of `dsr upsample`, got something else") from error
+    for name, files in exports.items():
+        for file in files:
+            path_within(output, file, f"{path}: exports.{name}")
+    return exports

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import os
-import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -21,6 +20,7 @@ from dsr.sample import expect_distances
 from dsr.utils.files import array_headers, open_array
 from dsr.utils.limits import read_limited
 from dsr.utils.parsing import is_number, parse_json
+from dsr.utils.paths import natural_key
 from dsr.viewer.surfaces import ViewedResult
 
 _DEEPEST = 6
@@ -47,7 +47,7 @@ def find_results(folder: Path) -> list[Path]:
             names.clear()
     if not found:
         raise ValueError(f"{folder}: expected a result of `dsr upsample`, or a folder of them, got one without {INFO}")
-    return sorted(found, key=lambda path: [_natural(part) for part in path.parts])
+    return sorted(found, key=natural_key)
 
 
 def read_result(folder: Path, name: str) -> ViewedResult:
@@ -86,11 +86,6 @@ def read_result(folder: Path, name: str) -> ViewedResult:
         facts=_facts(info, depth),
         notes=notes,
     )
-
-
-def _natural(text: str) -> list[tuple[int, str]]:
-    """Return a key that sorts the numbers in names by value."""
-    return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", text)]
 
 
 def read_info(path: Path) -> Mapping[str, Any]:

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Iterator, Sequence
-from concurrent.futures import as_completed
-from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 from typing import NamedTuple
 
@@ -17,11 +15,13 @@ from dsr.app.upsample.frames import Frames
 from dsr.app.upsample.reporting import Messages, Record, Reporter, problem_line
 from dsr.app.upsample.request import UpsampleRequest
 from dsr.io.pairs import Pair
+from dsr.utils.pool import LOST, Pool
 from dsr.utils.progress import Progress
-from dsr.utils.workers import WorkerPool
 
 _FAILURES = (ValueError, OSError, MemoryError, torch.OutOfMemoryError)
 """What a picture may fail with, while the others go on."""
+_Job = tuple[Pair, Path]
+"""A picture and the folder of its results."""
 _work: FrameWork | None = None
 """The work of this process, if it is a worker."""
 
@@ -60,17 +60,12 @@ def work_through(request: UpsampleRequest, frames: Frames, reporter: Reporter, p
         return
     FrameWork(request, frames.whole, frames.firsts)  # raises for poses that do not fit
     cores = max(1, (os.cpu_count() or 1) // workers)
-    with WorkerPool(workers, _begin, (request, frames.whole, frames.firsts, cores)) as pool:
-        futures = [pool.submit(_remote, pair, target) for pair, target in jobs]
-        places = dict(zip(futures, jobs, strict=True))
-        finished = progress.track(as_completed(futures), "upsample", len(jobs), label=lambda each: places[each][0].name)
-        for future in finished:
-            pair, target = places[future]
-            try:
-                done, record = future.result()
-            except BrokenProcessPool:
-                yield Done(pair, target, "", "a worker ended, perhaps for want of memory; fewer --workers need less")
-                continue
+    prepare = (request, frames.whole, frames.firsts, cores)
+    with Pool(
+        workers, _remote, _lost, progress.say, start="spawn", prepare=_begin, arguments=prepare, label=_name_of
+    ) as pool:
+        results = progress.track(pool.results(jobs), "upsample", len(jobs), label=lambda each: _name_of(each[0]))
+        for _, (done, record) in results:
             record.replay(reporter)
             yield done
 
@@ -83,11 +78,21 @@ def _begin(request: UpsampleRequest, pairs: Iterable[Pair], firsts: Sequence[Pai
     _work = FrameWork(request, pairs, firsts)
 
 
-def _remote(pair: Pair, target: Path) -> tuple[Done, Record]:
+def _remote(job: _Job) -> tuple[Done, Record]:
     """Upsample a picture in a worker."""
     assert _work is not None  # noqa: S101 - workers begin with _begin
     record = Record()
-    return attempt(_work, pair, target, record, Progress()), record
+    return attempt(_work, *job, record, Progress()), record
+
+
+def _lost(job: _Job) -> tuple[Done, Record]:
+    """Return the result of a picture whose workers were ended."""
+    return Done(*job, "", LOST), Record()
+
+
+def _name_of(job: _Job) -> str:
+    """Return the name of a picture."""
+    return job[0].name
 
 
 def attempt(work: FrameWork, pair: Pair, target: Path, reporter: Messages, progress: Progress) -> Done:

@@ -17,6 +17,7 @@ from filelock import FileLock, Timeout
 from dsr.utils.files import write_text
 from dsr.utils.limits import opened, read_limited
 from dsr.utils.parsing import parse_json
+from dsr.utils.paths import leads_outside
 from dsr.utils.progress import Task
 
 _CHUNK = 1 << 20
@@ -55,7 +56,7 @@ class Checksums(Mapping[str, Entry]):
         if self.path.is_file():
             try:
                 entries = parse_json(read_limited(self.path))
-                self._entries = {str(name): _entry(fields) for name, fields in entries.items()}
+                self._entries = {str(name): _entry(str(name), fields) for name, fields in entries.items()}
             except (ValueError, TypeError, AttributeError) as error:
                 raise ValueError(
                     f"{self.path}: expected the checksums of the data sets, got a damaged file ({error}); delete it to "
@@ -81,13 +82,15 @@ class Checksums(Mapping[str, Entry]):
         write_text(self.path, json.dumps(fields, indent=1) + "\n")
 
 
-def _entry(fields: Any) -> Entry:
+def _entry(name: str, fields: Any) -> Entry:
     """Return an entry from its JSON."""
     sha256, size, files = fields.get("sha256"), fields.get("size"), fields.get("files")
     digest = sha256 is None or (isinstance(sha256, str) and re.fullmatch(r"[0-9a-f]{64}", sha256) is not None)
     sizes = files is None or all(map(_is_size, files.values()))
     if not (_is_size(size) and digest and sizes):
         raise ValueError(f"{fields!s:.60} is no entry")
+    for each in filter(leads_outside, (name, *(files or ()))):
+        raise ValueError(f"{each[:60]!r} leads outside of the directory")
     return Entry(sha256, size, files)
 
 

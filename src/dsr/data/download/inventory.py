@@ -9,6 +9,7 @@ from dsr.data.download.checksums import Checksums, Entry, lock_directory, sha256
 from dsr.data.download.collection import Collection, Item
 from dsr.data.download.transfer import is_page
 from dsr.utils.limits import opened
+from dsr.utils.paths import natural_key
 from dsr.utils.progress import Progress
 
 _BEGINNINGS: Mapping[str, tuple[bytes, ...]] = {
@@ -74,7 +75,7 @@ def verify(collection: Collection, root: Path, progress: Progress, *, accept_cha
             found = [_verify_item(item, root, old, new, progress) for item in collection.items]
         else:
             paths = {path for pattern in collection.patterns for path in _matches(collection, root, pattern)}
-            names = sorted(path.relative_to(root).as_posix() for path in paths)
+            names = sorted((path.relative_to(root).as_posix() for path in paths), key=natural_key)
             found = [*_misses(collection, root, checksums)]
             found += [compare(name, root, old, new, progress) for name in names]
         record(checksums, new, progress)

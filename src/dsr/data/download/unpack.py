@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import errno
 import posixpath
-import re
 import shutil
 import stat
 import tarfile
@@ -19,6 +18,7 @@ from typing import IO
 from dsr.data.download.transfer import disk_errors, expect_room
 from dsr.utils.console import one_line
 from dsr.utils.limits import opened
+from dsr.utils.paths import leads_outside
 from dsr.utils.progress import Task
 
 _CHUNK = 1 << 20
@@ -140,15 +140,10 @@ def _expect_inside(archive: Path, member: _Member) -> None:
     """Refuse a member that is no file, or whose path leads outside."""
     if member.special:
         raise ValueError(f"{archive}: refused: {member.name!r} in it is neither a file nor a directory")
-    if _leads_outside(member.name):
+    if leads_outside(member.name):
         raise ValueError(f"{archive}: refused: {member.name!r} in it leads outside the directory it belongs into")
-    if member.link is not None and _leads_outside(posixpath.normpath(member.link)):
+    if member.link is not None and leads_outside(posixpath.normpath(member.link)):
         raise ValueError(f"{archive}: refused: {member.name!r} in it is a link that leads outside, to {member.link!r}")
-
-
-def _leads_outside(name: str) -> bool:
-    path = PurePosixPath(name.replace("\\", "/"))
-    return path.is_absolute() or ".." in path.parts or "\0" in name or bool(re.match(r"[A-Za-z]:", name))
 
 
 def _extract(members: Sequence[_Member], work: Path, moved: Task) -> dict[str, int]:

@@ -23,7 +23,15 @@ import numpy as np
 import torch
 
 from dsr.data.formats.files import read_levels
-from dsr.data.formats.shared import expect_size, find_beside, read_millimetres, read_numbers, read_picture, to_camera
+from dsr.data.formats.shared import (
+    expect_size,
+    find_beside,
+    in_natural_order,
+    read_millimetres,
+    read_numbers,
+    read_picture,
+    to_camera,
+)
 from dsr.geometry.camera import Camera
 from dsr.sample import Scene
 
@@ -54,7 +62,7 @@ def find_frames(root: Path, split: Split | None = None) -> dict[str, Files]:
                 confidence = place / "confidence" / photo.name
                 known = confidence if confidence.is_file() else None
                 found.setdefault(frame, (photo, truth, measured, known, _find_intrinsics(place, frame)))
-    return dict(sorted(found.items()))
+    return in_natural_order(found)
 
 
 def load_frame(

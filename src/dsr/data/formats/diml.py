@@ -17,7 +17,7 @@ import re
 from pathlib import Path
 from typing import Literal
 
-from dsr.data.formats.shared import find_beside
+from dsr.data.formats.shared import find_beside, in_natural_order
 
 Split = Literal["test", "train"]
 Resolution = Literal["HR", "LR"]
@@ -45,4 +45,4 @@ def find_frames(
         at_split, at_resolution = place.resolve().parts[-3:-1]
         if split in (None, at_split) and resolution in (None, at_resolution):
             found.setdefault(frame, (photo, depth))
-    return dict(sorted(found.items()))
+    return in_natural_order(found)

@@ -28,7 +28,7 @@ from types import MappingProxyType
 import torch
 
 from dsr.data.formats.files import read_levels
-from dsr.data.formats.shared import expect_size, find_beside, read_picture
+from dsr.data.formats.shared import expect_size, find_beside, in_natural_order, read_picture
 from dsr.geometry.camera import Camera, baseline_times_focal, from_range
 from dsr.sample import Scene, Unit
 
@@ -89,7 +89,7 @@ def find_frames(root: Path, dataset: str) -> dict[str, tuple[Path, Path]]:
         pattern = re.compile(rf"({prefix}_\d{{2}})_{spelling}_color\.png")
         for _, frame, (photo, levels) in find_beside(root, "RGB", pattern, ("Depth/{}_output_depth.png",)):
             found.setdefault(frame, (photo, levels))
-    return dict(sorted(found.items()))
+    return in_natural_order(found)
 
 
 def load_frame(rgb_path: Path, levels_path: Path, dataset: str, name: str) -> Scene:

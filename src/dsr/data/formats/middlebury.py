@@ -32,6 +32,7 @@ from dsr.data.preparation.dequantization import smooth_levels
 from dsr.geometry.camera import Camera, from_range
 from dsr.sample import Scene
 from dsr.utils.limits import read_limited
+from dsr.utils.paths import natural_key
 
 YEARS = (2001, 2003, 2005, 2006)
 _MATRIX = re.compile(r"\[\s*(\S+)\s+0\s+(\S+)\s*;\s*0\s+(\S+)\s+(\S+)\s*;\s*0\s+0\s+1\s*\]")
@@ -61,7 +62,7 @@ class Files:
 def find_2014(root: Path) -> dict[str, Path]:
     """Return the folders of the scenes of 2014 below ``root``, by name in lower case, without ``-perfect``."""
     found: dict[str, Path] = {}
-    for folder in sorted(path.parent for path in root.glob("*/calib.txt")):
+    for folder in sorted((path.parent for path in root.glob("*/calib.txt")), key=natural_key):
         found.setdefault(re.sub(r"-(im)?perfect$", "", folder.name).casefold(), folder)  # imperfect sorts first
         if folder.name.endswith("-perfect"):
             found[folder.name.removesuffix("-perfect").casefold()] = folder
@@ -76,11 +77,11 @@ def find_levels(root: Path) -> dict[str, Files]:
     pairs = (("view1.png", "disp1.png"), ("im2.png", "disp2.png"), ("im2.ppm", "disp2.pgm"))
     found: dict[str, Files] = {}
     for photo, disparity in pairs:
-        for path in sorted(root.glob(f"*/{photo}")):
+        for path in sorted(root.glob(f"*/{photo}"), key=natural_key):
             shift = path.with_name("dmin.txt")
             files = Files(path, path.with_name(disparity), shift if shift.is_file() else None, {})
             found[path.parent.name.casefold()] = files
-    for path in sorted(root.glob("*_color.png")):
+    for path in sorted(root.glob("*_color.png"), key=natural_key):
         name = path.name.removesuffix("_color.png")
         level_path = root / f"{name}_big.png"
         if not level_path.is_file():  # other benchmarks' photos are called so, too

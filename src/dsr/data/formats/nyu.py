@@ -33,7 +33,7 @@ import torch
 
 from dsr.data.formats.files import read_map
 from dsr.data.formats.matlab import expect_own_values
-from dsr.data.formats.shared import expect_size, find_beside, read_picture, to_depth
+from dsr.data.formats.shared import expect_size, find_beside, in_natural_order, read_picture, to_depth
 from dsr.geometry.camera import Camera
 from dsr.sample import Scene
 
@@ -111,7 +111,7 @@ def find_files(root: Path) -> dict[str, tuple[Path, Path]]:
     found: dict[str, tuple[Path, Path]] = {}
     for _, number, (photo, depth) in find_beside(root, "RGB", _PHOTO, ("Depth/{}.npy",)):
         found.setdefault(f"{int(number) + 1:04d}", (photo, depth))
-    return dict(sorted(found.items()))
+    return in_natural_order(found)
 
 
 def load_files(rgb_path: Path, depth_path: Path, dataset: str, name: str) -> Scene:

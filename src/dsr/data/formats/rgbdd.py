@@ -23,7 +23,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
-from dsr.data.formats.shared import expect_size, find_beside, load_pair, read_millimetres, walk
+from dsr.data.formats.shared import expect_size, find_beside, in_natural_order, load_pair, read_millimetres, walk
 from dsr.sample import Scene
 
 Split = Literal["test", "train"]
@@ -56,7 +56,7 @@ def find_frames(root: Path, split: Split | None = None, measured: bool = False) 
         others = (f"Depth/{_DEPTH}", f"DepthLR/{_MEASURED}")[: 2 if measured else 1]
         for _, name, files in find_beside(root, "RGB", _PHOTO, others):
             found.setdefault(name, files)
-    return dict(sorted(found.items()))
+    return in_natural_order(found)
 
 
 def load_measured_frame(rgb_path: Path, depth_path: Path, measured_path: Path, dataset: str, name: str) -> Scene:

@@ -5,8 +5,9 @@ from __future__ import annotations
 import math
 import os
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import TypeVar
 
 import cv2
 import numpy as np
@@ -17,11 +18,13 @@ from dsr.data.formats.files import read_pixels
 from dsr.geometry.camera import ASSUMED_FOV, Camera
 from dsr.sample import Scene
 from dsr.utils.limits import MOST_FILE, read_limited
+from dsr.utils.paths import natural_key
 
 NO_CAMERA = f"no camera is published: {ASSUMED_FOV:g} degrees of horizontal view are assumed"
 """Note of scenes whose camera is :meth:`dsr.geometry.camera.Camera.from_fov`."""
 _LONGEST = 40
 """Largest number of bytes of a number and the blank behind it."""
+Found = TypeVar("Found")
 _TEXT = re.compile(rb"[-+.\deEnaifNAIF\s]*")
 
 
@@ -192,8 +195,13 @@ def walk(root: Path) -> Iterator[tuple[Path, list[str], list[str]]]:
     for folder, below, files in os.walk(root, followlinks=True):
         entered.add(os.path.realpath(folder))
         fresh = [name for name in below if os.path.realpath(os.path.join(folder, name)) not in entered]  # noqa: PTH118
-        below[:] = sorted(name for name in fresh if not name.startswith("."))
-        yield Path(folder), below, sorted(files)
+        below[:] = sorted((name for name in fresh if not name.startswith(".")), key=natural_key)
+        yield Path(folder), below, sorted(files, key=natural_key)
+
+
+def in_natural_order(found: Mapping[str, Found]) -> dict[str, Found]:
+    """Return what was found by name, in the order of the names with their numbers by value."""
+    return {name: found[name] for name in sorted(found, key=natural_key)}
 
 
 def name_of(root: Path, folder: Path, frame: str = "") -> str:
@@ -223,7 +231,7 @@ def find_beside(
     """
     for place, below, _ in walk(root):
         if photos in below:
-            for photo in sorted((place / photos).iterdir()):
+            for photo in sorted((place / photos).iterdir(), key=natural_key):
                 if match := pattern.fullmatch(photo.name):
                     files = (photo, *(place / other.format(match[1]) for other in others))
                     if all(path.is_file() for path in files):

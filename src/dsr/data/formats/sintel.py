@@ -21,6 +21,7 @@ from torch import Tensor
 from dsr.data.formats.shared import expect_size, read_bytes, read_picture, to_camera, to_depth
 from dsr.geometry.camera import Camera
 from dsr.sample import Scene
+from dsr.utils.paths import natural_key
 
 SEQUENCES = MappingProxyType({
     "alley_1": 50, "alley_2": 50, "ambush_2": 21, "ambush_4": 33, "ambush_5": 50, "ambush_6": 20, "ambush_7": 50,
@@ -49,7 +50,7 @@ def find_frames(root: Path, rendering: Literal["clean", "final"] = "final") -> d
         raise ValueError(f"{root}: expected a directory, there is none")
     base = root / "training" if (root / "training").is_dir() else root
     found = {}
-    for depth in sorted((base / "depth").glob("*/frame_*.dpt")):
+    for depth in sorted((base / "depth").glob("*/frame_*.dpt"), key=natural_key):
         place = Path(depth.parent.name, depth.stem)
         rgb = (base / rendering / place).with_suffix(".png")
         camera = (base / "camdata_left" / place).with_suffix(".cam")

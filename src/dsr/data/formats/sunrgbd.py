@@ -25,6 +25,7 @@ from torch import Tensor
 from dsr.data.formats.shared import (
     expect_size,
     given_camera,
+    in_natural_order,
     name_of,
     read_16bit,
     read_numbers,
@@ -53,7 +54,7 @@ def find_frames(root: Path) -> dict[str, tuple[Path]]:
         if "image" in below and ("depth" in below or "depth_bfx" in below):
             below.clear()
             found[name_of(root, folder)] = (folder,)
-    return dict(sorted(found.items()))
+    return in_natural_order(found)
 
 
 def read_depth(path: Path) -> Tensor:

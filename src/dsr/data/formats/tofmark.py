@@ -25,7 +25,7 @@ from torch import Tensor
 
 from dsr.data.formats.files import read_levels
 from dsr.data.formats.matlab import read_variables
-from dsr.data.formats.shared import expect_size, given_camera, name_of, read_picture, to_depth, walk
+from dsr.data.formats.shared import expect_size, given_camera, in_natural_order, name_of, read_picture, to_depth, walk
 from dsr.sample import Scene
 
 FACTORS = (4, 8)
@@ -61,7 +61,7 @@ def find_frames(root: Path) -> dict[str, tuple[Path, Path | None]]:
                 found.setdefault(name_of(root, folder, depth[1]), (folder / f"{depth[1]}.bmp", folder / file))
             elif matrix := re.fullmatch(r"benchmarking_dataset_(.+)\.mat", file):
                 found[name_of(root, folder, matrix[1])] = (folder / file, None)
-    return dict(sorted(found.items()))
+    return in_natural_order(found)
 
 
 def load_frame(

@@ -227,15 +227,19 @@ class PreparedDataset:
                 digest.update(content_hash(file).encode())
         return digest.hexdigest()
 
+    def unprepared(self, scenes: Sequence[str]) -> list[str]:
+        """Return those of some scenes that are not in the cache."""
+        return [scene for scene in scenes if not self._is_ready(scene)]
+
     def prepare(self, scenes: Sequence[str]) -> Iterator[str]:
         """Prepare scenes that are not in the cache, several at a time, and yield the name of each that is ready.
 
         The name of a scene that fails is yielded, too; loading the scene raises the error.
         """
         with ThreadPoolExecutor(min(len(scenes), os.cpu_count() or 1) or 1) as pool:
-            ready = {scene: self._is_ready(scene) for scene in scenes}
-            jobs = {pool.submit(self.load, scene): scene for scene in scenes if not ready[scene]}
-            yield from (scene for scene in scenes if ready[scene])
+            missing = self.unprepared(scenes)
+            jobs = {pool.submit(self.load, scene): scene for scene in missing}
+            yield from (scene for scene in scenes if scene not in missing)
             try:
                 for job in as_completed(jobs):
                     yield jobs[job]

@@ -27,6 +27,7 @@ from dsr.io.encoding import Assumption
 from dsr.io.frames import CaptureFrame, Geometry
 from dsr.io.pairs import Pair, PairingResult
 from dsr.utils.limits import read_limited
+from dsr.utils.paths import natural_key
 
 _APP = "ARKitScenes"
 _LARGEST = 1 << 16
@@ -40,11 +41,11 @@ _Motion = tuple[float, ...]
 
 def find_arkitscenes(folder: Path) -> PairingResult | None:
     """Return the frames of a video of ARKitScenes; None if the folder is none."""
-    depths = {path.stem: path for path in sorted((folder / "lowres_depth").glob("*.png"))}
+    depths = {path.stem: path for path in (folder / "lowres_depth").glob("*.png")}
     kind = next((kind for kind in _PHOTOS if any((folder / kind).glob("*.png"))), None)
     if not depths or kind is None:
         return None
-    photos = {path.stem: path for path in sorted((folder / kind).glob("*.png"))}
+    photos = {path.stem: path for path in sorted((folder / kind).glob("*.png"), key=natural_key)}
     motions = _read_trajectory(folder / "lowres_wide.traj")
     pairs = []
     for stem in [stem for stem in photos if stem in depths]:

@@ -8,7 +8,7 @@ http://redwood-data.org/indoor/fileformat.html.
     scene/trajectory.log                   or trajectory.log: for each frame a line of three whole numbers, and the four
                                            rows of the pose from camera (x right, y down, z forward) to world
 
-The n-th pose is that of the n-th photo.
+The n-th pose, by the first of the three numbers, is that of the n-th photo, by the numbers in the names.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ from dsr.io.captures.poses import check_pose, read_text
 from dsr.io.encoding import Assumption
 from dsr.io.frames import CaptureFrame, Geometry
 from dsr.io.pairs import Pair, PairingResult
+from dsr.io.poses import order_of
 
 _APP = "Open3D"
 _TRAJECTORIES = ("scene/trajectory.log", "trajectory.log")
@@ -39,24 +40,26 @@ def add_trajectory(folder: Path, found: PairingResult) -> PairingResult:
         text = f"no poses: {path.name} has {len(entries)}, for {len(found.pairs)} pairs"
         text += f" and {len(found.unpaired)} pictures without a partner" if found.unpaired else ""
         return replace(found, assumptions=(*found.assumptions, Assumption(text)))
-    order = sorted(range(len(entries)), key=lambda i: found.pairs[i].rgb.name)
-    pairs: list[Pair] = list(found.pairs)
-    for rank, i in enumerate(order):
-        geometry = functools.partial(_geometry, f"{path}: pose {rank}", entries[rank])
-        frame = CaptureFrame(_APP, geometry, path, "\n".join(entries[rank]).encode())
-        pairs[i] = replace(pairs[i], capture=frame)
+    pairs: list[Pair] = []
+    for rank, (pair, rows) in enumerate(zip(found.pairs, entries, strict=True)):
+        geometry = functools.partial(_geometry, f"{path}: pose {rank}", rows)
+        pairs.append(replace(pair, capture=CaptureFrame(_APP, geometry, path, "\n".join(rows).encode())))
     text = f"poses: {path.relative_to(folder).as_posix()} of {_APP}, one for each photo"
     return replace(found, pairs=tuple(pairs), assumptions=(*found.assumptions, Assumption(text)))
 
 
 def _read_entries(path: Path) -> list[_Rows]:
-    """Return the four rows of each pose as text."""
+    """Return the four rows of each pose as text, in the order of the poses' numbers."""
     lines = [line for line in read_text(path).splitlines() if line.strip()]
-    if len(lines) % 5 or any(len(line.split()) != 3 for line in lines[::5]):
+    try:
+        if len(lines) % 5 or any(len(line.split()) != 3 for line in lines[::5]):
+            raise ValueError
+        order = order_of([int(line.split()[0]) for line in lines[::5]])
+    except ValueError:
         raise ValueError(
             f"{path}: expected a line of three whole numbers and four of a matrix for each pose, got {len(lines)} lines"
-        )
-    return [tuple(lines[i + 1 : i + 5]) for i in range(0, len(lines), 5)]
+        ) from None
+    return [tuple(lines[5 * place + 1 : 5 * place + 5]) for place in order]
 
 
 def _geometry(place: str, rows: _Rows, _: tuple[int, int]) -> Geometry:

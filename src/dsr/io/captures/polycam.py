@@ -24,6 +24,7 @@ from dsr.io.encoding import Assumption
 from dsr.io.frames import CaptureFrame, Geometry
 from dsr.io.pairs import Pair, PairingResult
 from dsr.utils.limits import read_limited
+from dsr.utils.paths import natural_key
 from dsr.utils.validation import describe
 
 _APP = "Polycam"
@@ -62,9 +63,9 @@ def find_polycam(folder: Path) -> PairingResult | None:
     cameras = [kind for kind in _KINDS if (frames / kind).is_dir() and any((frames / _CAMERAS[kind]).glob("*.json"))]
     if not cameras or not (frames / "depth").is_dir():
         return None
-    photos = {kind: {path.stem: path for path in sorted((frames / kind).glob("*.jpg"))} for kind in cameras}
+    photos = {kind: {path.stem: path for path in (frames / kind).glob("*.jpg")} for kind in cameras}
     pairs, unpaired = [], []
-    for depth in sorted((frames / "depth").glob("*.png")):
+    for depth in sorted((frames / "depth").glob("*.png"), key=natural_key):
         kind = next((kind for kind in cameras if depth.stem in photos[kind] and _camera_of(frames, kind, depth)), None)
         if kind is None:
             unpaired.append(depth)

@@ -30,6 +30,7 @@ from dsr.io.confidence import HIGHEST_LEVEL, ConfidenceMap
 from dsr.io.encoding import Assumption
 from dsr.io.frames import CaptureFrame, Geometry
 from dsr.io.pairs import Pair, PairingResult
+from dsr.utils.paths import natural_key
 from dsr.utils.validation import Whole, describe
 
 _APP = "Record3D"
@@ -65,9 +66,9 @@ def find_record3d(folder: Path) -> PairingResult | None:
     """
     if folder.is_file():
         return _read_archive(Archive(folder), "") if folder.suffix.lower() == ".r3d" else None
-    scans = sorted(path for path in folder.iterdir() if path.suffix.lower() == ".r3d" and path.is_file())
+    scans = [path for path in folder.iterdir() if path.suffix.lower() == ".r3d" and path.is_file()]
     if scans:
-        parts = [_read_archive(Archive(path), path.stem) for path in scans]
+        parts = [_read_archive(Archive(path), path.stem) for path in sorted(scans, key=natural_key)]
         pairs = tuple(pair for part in parts for pair in part.pairs)
         return PairingResult(pairs, parts[0].assumptions, tuple(path for part in parts for path in part.unpaired))
     if (folder / "rgbd").is_dir() and (folder / "metadata").is_file():

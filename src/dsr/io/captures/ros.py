@@ -31,6 +31,7 @@ from dsr.io.frames import CaptureFrame, Geometry, Record
 from dsr.io.names import match_times
 from dsr.io.pairs import Pair, PairingResult
 from dsr.utils.limits import MOST_TEXT, expect_bytes
+from dsr.utils.paths import natural_key, path_within
 
 _IMAGE, _COMPRESSED, _INFO = (f"sensor_msgs/msg/{name}" for name in ("Image", "CompressedImage", "CameraInfo"))
 _UNITS = {"u": 1e-3, "f": 1.0}
@@ -90,10 +91,10 @@ def find_ros(folder: Path) -> PairingResult | None:
         return _read(folder) if folder.suffix.lower() == ".bag" else None
     if (folder / "metadata.yaml").is_file() and any((*folder.glob("*.db3"), *folder.glob("*.mcap"))):
         return _read(folder)
-    bags = sorted(path for path in folder.iterdir() if path.suffix.lower() == ".bag" and path.is_file())
+    bags = [path for path in folder.iterdir() if path.suffix.lower() == ".bag" and path.is_file()]
     if not bags:
         return None
-    parts = [_read(path, f"{path.stem}/") for path in bags]
+    parts = [_read(path, f"{path.stem}/") for path in sorted(bags, key=natural_key)]
     notes = tuple(dict.fromkeys(note for part in parts for note in part.assumptions))
     pairs = tuple(pair for part in parts for pair in part.pairs)
     return PairingResult(pairs, notes, tuple(path for part in parts for path in part.unpaired))
@@ -262,6 +263,8 @@ def _open(path: Path) -> Any:
     description = path / "metadata.yaml"
     if path.is_dir() and description.is_file():
         expect_bytes(description, description.stat().st_size, MOST_TEXT)
+        for file in path.iterdir():  # of which rosbags takes those that the description names
+            path_within(path, file.name, f"{description}: relative_file_paths")
     reader = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
     reader.open()
     return reader

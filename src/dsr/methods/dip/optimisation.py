@@ -17,7 +17,7 @@ from dsr.geometry.comparison import comparison
 from dsr.methods.dip.problem import ImageProblem, PriorObjective
 from dsr.methods.dip.skip_net import Padding, SkipNet, levels_for
 from dsr.methods.dip.stopping import Stopping
-from dsr.metrics.classes import compute_means
+from dsr.metrics.classes import compute_means, in_table_units
 from dsr.metrics.functional import SurfacePair, rmse_v
 
 _NOISE_CHANNELS = 32
@@ -137,8 +137,9 @@ class PriorOptimisation(lightning.LightningModule):
         """Return the loss of this step's depth map, and update the average."""
         depth, intensity = self.answer()
         terms = self.objective(depth, intensity, self.problem)
-        self.log_dict({f"train/{name}": value.detach() for name, value in terms.items()}, batch_size=1)
         step = self.global_step + 1
+        named = {f"train/{name}": value.detach() for name, value in terms.items()}
+        self.log_dict({"step": float(step), **named}, batch_size=1)  # else Lightning counts from 0
         with torch.no_grad():
             self.average.lerp_(depth, 1 - min(self.settings.average, (step - 1) / (step + 9)))
             if self.stopping.observe(step, depth, self.average):
@@ -169,9 +170,10 @@ class PriorOptimisation(lightning.LightningModule):
             if self.metrics is not None:
                 self.metrics.reset()
                 self.metrics.update(pair)
-                self.validation_scores = {"val": {name: float(v) for name, v in compute_means(self.metrics).items()}}
-                named = {f"val/{k}": value for k, value in self.validation_scores["val"].items()}
-                self.log_dict({"step": float(self.global_step), **named}, batch_size=1)  # else Lightning counts from 0
+                scores = {name: float(value) for name, value in compute_means(self.metrics).items()}
+                self.validation_scores = {"val": scores}
+                named = {f"val/{name}": value for name, value in in_table_units(self.metrics, scores).items()}
+                self.log_dict({"step": float(self.global_step), **named}, batch_size=1)
         writer: Any = getattr(self.logger, "experiment", None)
         if hasattr(writer, "add_image"):
             problem = self.problem

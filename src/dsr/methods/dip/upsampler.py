@@ -9,7 +9,7 @@ are inpainted by the network.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any, ClassVar, Literal, get_args
@@ -36,8 +36,9 @@ from dsr.metrics.visual_loss import VisualLossName, make_visual_loss
 from dsr.sample import DepthSample
 from dsr.utils.checkpoints import Interruption, Keep
 from dsr.utils.divergence import Divergence, DivergenceError
-from dsr.utils.lightning import Log, StepProgress, ValidationTable, fit, make_trainer
+from dsr.utils.lightning import ListedScores, Log, StepProgress, ValidationTable, fit, make_trainer
 from dsr.utils.progress import Progress, Steps, StepsProgress
+from dsr.utils.runs_table import list_run
 from dsr.utils.units import duration
 
 _SECONDS_BETWEEN_CHECKPOINTS = 60.0
@@ -73,6 +74,7 @@ class DeepImagePrior:
         metrics: function that returns the metrics of a validation pass; None for none.
         workspace: directory for logs and checkpoints; None for neither.
         display: display of the progress.
+        about: what TensorBoard's table of runs says of an image: ``method`` and ``degradation``; None for not known.
         lpips_trunk: file of AlexNet's weights for ``visual=lpips``; None to use torch's hub cache.
 
     Raises:
@@ -114,6 +116,7 @@ class DeepImagePrior:
     metrics: Callable[[], torchmetrics.MetricCollection] | None = None
     workspace: Path | None = None
     display: Progress | None = None
+    about: Mapping[str, str] | None = None
     lpips_trunk: str | Path | None = None
 
     def __post_init__(self) -> None:
@@ -165,11 +168,13 @@ class DeepImagePrior:
             display = self.display or StepsProgress(progress)
             folder = None if self.workspace is None else self.workspace / WORKSPACE / sample.scene
             resume = None if folder is None else checkpoint_of(folder / "last.ckpt", origin)
+            if folder is not None and resume is None:
+                (folder / "last.ckpt").unlink(missing_ok=True)
             display.say(self._announcement(module, sample.scene, resume is not None))
             if not module.objective.w and self._objective.w:
                 title = module.objective.visual.title
                 display.say(f"{sample.scene}: without {title}; {_noise_of(sample)}, more than largest_tilt")
-            trainer = self._trainer(module, folder, origin, display, sample.scene)
+            trainer = self._trainer(module, folder, origin, display, sample)
             try:
                 fit(trainer, module, _numbers(self.steps), resume, val_dataloaders=_numbers(1))
             except DivergenceError as error:
@@ -186,6 +191,11 @@ class DeepImagePrior:
         if trainer.global_step < self.steps:
             display.say(f"{sample.scene}: stopped at step {trainer.global_step} ({self.stopping})")
         return depth[0].detach().to(sample.depth_lr)
+
+    def seconds(self, sample: DepthSample) -> float:
+        """Return how long an image takes, in seconds, by a step that is measured now."""
+        with torch.inference_mode(mode=False), torch.enable_grad():
+            return self.steps * cost_of_step(self.module(sample)[0])[0]
 
     def module(self, sample: DepthSample) -> tuple[PriorOptimisation, str]:
         """Return an image's LightningModule, and a digest of its problem and settings."""
@@ -246,9 +256,10 @@ class DeepImagePrior:
         )
 
     def _trainer(
-        self, module: PriorOptimisation, folder: Path | None, origin: str, display: Progress, scene: str
+        self, module: PriorOptimisation, folder: Path | None, origin: str, display: Progress, sample: DepthSample
     ) -> lightning.Trainer:
         """Return Lightning's trainer for one image."""
+        scene = sample.scene
         callbacks: list[Callback] = [Divergence(patience=1), StepProgress(display, "steps", scene)]
         logger: Any = False
         if folder is not None:
@@ -258,11 +269,13 @@ class DeepImagePrior:
                 Interruption(folder / "last.ckpt"),
             ]
             if module.metrics is not None and self.validate_every:
-                callbacks.append(ValidationTable(folder / "validation.csv"))
+                callbacks += [ValidationTable(folder / "validation.csv"), ListedScores()]
             logger = Log(folder.parent, name="", version=scene, default_hp_metric=False)
-            logger.list_run({"scene": scene, "scale": self.scale, "stopping": self.stopping, "w": module.objective.w,
-                             "visual": self.visual, "data_loss": self.data_loss, "steps": self.steps,
-                             "seed": self.seed})  # fmt: skip
+            settings = {"scene": scene, "scale": self.scale, "stopping": self.stopping, "w": module.objective.w,
+                        "visual": self.visual, "data_loss": self.data_loss, "steps": self.steps, "seed": self.seed,
+                        "dataset": sample.dataset, **(self.about or {})}  # fmt: skip
+            logger.log_hyperparams(settings)
+            list_run(logger.experiment, "optimisation", settings, {})
         return make_trainer(
             torch.device(self.device),
             self.steps,

@@ -5,7 +5,7 @@ function showSummary(data) {
   document.querySelectorAll(".title").forEach((each) => { each.textContent = data.title; });
   const runs = plural(data.runs.length, "run");
   find("#summary .lead").textContent =
-    `Guided depth super-resolution, judged by depth and by renderings under four lights (worst of four). ${runs}; ${directions(data.metrics)}.`;
+    `Guided depth super-resolution, judged by depth, normals (RMSE_v) and renderings (the worst of four lights). ${runs}; ${directions(data.metrics)}.`;
   const distinct = (of) => [...new Set(data.problems.map(of))];
   const scenes = new Set(data.problems.flatMap((problem) => problem.scenes.map((scene) => JSON.stringify([problem.dataset, scene]))));
   const facts = [

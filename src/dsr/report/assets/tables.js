@@ -87,7 +87,7 @@ function scoreCell(row, metric, places, total, published) {
     }
   } else cell.append(missing());
   if (published) {
-    const text = paper === undefined ? DASH : number(paper, paperDigits(paper, metric)) + (row.starred ? "*" : "");
+    const text = paper === undefined ? DASH : number(paper, paperDigits(paper, metric));
     cell.append(make("span", { className: "paper", textContent: text }));
   }
   return cell;
@@ -151,7 +151,7 @@ function showTables(data, entries, open) {
       make("h3", {}, problemName(problem), make("small", { textContent: ` \u00b7 mean over ${plural(problem.scenes.length, "scene")}${seeds > 1 ? `, mean \u00b1 standard deviation over up to ${seeds} seeds` : ""}` })),
       means.element, details));
   });
-  const foot = make("p", { className: "foot", hidden: true, textContent: "Below ours, the published values. * of the paper's own files; the scenes here are others of the same description." });
+  const foot = make("p", { className: "foot", hidden: true, textContent: "Below ours, the published values." });
   home.append(foot);
   const refresh = () => all.forEach((table) => table.refresh());
   find(".filter-scene").addEventListener("input", (event) => {

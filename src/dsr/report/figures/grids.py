@@ -73,7 +73,7 @@ def save_rendering_grids(
     """Draw photo and renderings of input, results and ground truth, with two details per scene.
 
     Details are the windows in which the methods differ most from the ground truth on average. The captions are DSSIM_v
-    and RMSE_v in 1/1000, worst of four lights, the best in bold. The input is rendered at its own resolution.
+    for the worst of four lights and RMSE_v, in 1/1000, the best in bold. The input is rendered at its own resolution.
 
     Args:
         folder: directory for ``renderings_DATASET_xSCALE_DOWNSAMPLING_PAGE.pdf`` and ``.png``, five scenes per page.

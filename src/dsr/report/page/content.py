@@ -12,12 +12,11 @@ import pandas as pd
 
 from dsr.evaluation.results import BenchmarkSetting, Results, Run
 from dsr.metrics.formats import Formats
-from dsr.report.tables import AVERAGES, OTHER_FRAMES, RECREATED, in_shown_units, paper_row
+from dsr.report.tables import average_of, in_shown_units, paper_row
+from dsr.utils.paths import natural_key
 
 _FOLDERS = {"tables": (".csv", ".md", ".tex"), "metrics": (".csv",), "figures": (".pdf",)}
 """Folders beside the page with files to link to, and their suffixes."""
-_BESIDES = " ("
-"""Start of the suffix that distinguishes data sets of one name: settings other than the paper's."""
 
 
 def metrics_data(results: Results) -> list[dict[str, Any]]:
@@ -39,15 +38,15 @@ def problem_data(results: Results, problem: BenchmarkSetting) -> dict[str, Any]:
     rows: list[dict[str, Any]] = []
     means: list[dict[str, Any]] = []
     for method in methods:
-        tables = [wide[id(run)] for run in runs if run.label == method]
+        own_runs = [run for run in runs if run.label == method]
+        tables = [wide[id(run)] for run in own_runs]
         for scene in scenes:
             own = [table.loc[scene] for table in tables if scene in table.index]
             if own:
-                paper = _published(problem, scene, method, formats)
-                starred = scene in RECREATED or problem.dataset in OTHER_FRAMES or _BESIDES in problem.dataset
-                rows.append({"scene": scene, "method": method, "seeds": len(own), "values": _over_seeds(own),
-                             "paper": paper, "starred": starred and bool(paper)})  # fmt: skip
-        means.append(_mean_row(problem, method, scenes, tables, formats))
+                paper = _published(scene, own_runs, [scene], formats)
+                values = _over_seeds(own)
+                rows.append({"scene": scene, "method": method, "seeds": len(own), "values": values, "paper": paper})
+        means.append(_mean_row(own_runs, scenes, tables, formats))
     return {
         "dataset": problem.dataset,
         "scale": problem.scale,
@@ -79,9 +78,7 @@ def _over_seeds(series: Sequence[pd.Series]) -> dict[str, list[float]]:
     return {name: numbers for name, numbers in values.items() if all(map(math.isfinite, numbers))}
 
 
-def _mean_row(
-    problem: BenchmarkSetting, method: str, scenes: list[str], tables: list[pd.DataFrame], formats: Formats
-) -> dict[str, Any]:
+def _mean_row(runs: Sequence[Run], scenes: list[str], tables: list[pd.DataFrame], formats: Formats) -> dict[str, Any]:
     """Return a method's averages over scenes; ``counts`` has the number of scenes of each incomplete metric."""
     values = _over_seeds([table.mean() for table in tables])
     seen: dict[str, set[str]] = {name: set() for name in values}
@@ -90,16 +87,13 @@ def _mean_row(
             if name in table:
                 seen[name] |= set(table.index[table[name].notna()])
     counts = {name: len(found) for name, found in seen.items() if len(found) < len(scenes)}
-    name, count = AVERAGES.get(problem.dataset, ("", 0))
-    paper = _published(problem, name, method, formats) if len(scenes) == count and not counts else {}
-    starred = problem.dataset in OTHER_FRAMES or any(scene in RECREATED for scene in scenes)
-    return {"method": method, "seeds": len(tables), "values": values, "counts": counts, "paper": paper,
-            "starred": starred and bool(paper)}  # fmt: skip
+    paper = {} if counts else _published(average_of(runs[0].dataset, scenes), runs, scenes, formats)
+    return {"method": runs[0].label, "seeds": len(tables), "values": values, "counts": counts, "paper": paper}
 
 
-def _published(problem: BenchmarkSetting, scene: str, method: str, formats: Formats) -> dict[str, float]:
-    """Return the paper's values by metric; empty for a downsampling other than the paper's."""
-    row = paper_row(scene, method, problem.scale, problem.downsampling)
+def _published(name: str, runs: Sequence[Run], scenes: Sequence[str], formats: Formats) -> dict[str, float]:
+    """Return the paper's values by metric; empty where they do not apply."""
+    row = paper_row(name, runs, scenes)
     return {} if row is None else {name: float(row[name]) for name in formats if pd.notna(row.get(name))}
 
 
@@ -148,7 +142,7 @@ def links(folder: Path, tables: Sequence[Path] | None) -> list[dict[str, str]]:
         path
         for name, suffixes in _FOLDERS.items()
         if name != "tables" or tables is None
-        for path in sorted((folder / name).glob("*"))
+        for path in sorted((folder / name).glob("*"), key=natural_key)
         if path.suffix in suffixes and path.is_file()
     ]
     named = [path for path in tables or () if path.is_file() and path.resolve().is_relative_to(folder.resolve())]

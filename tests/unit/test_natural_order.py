@@ -1,0 +1,235 @@
+"""Frames in the order of the numbers in their names, 2 before 10, so that each gets its own pose in every layout."""
+
+import json
+import random
+import re
+
+import captures
+import numpy as np
+import pytest
+
+from dsr.app.view import find_results
+from dsr.cli import main
+from dsr.data.folder import Folder
+from dsr.data.formats import arkitscenes, ddrnet, diml, icl_nuim, rgbdd, sintel, sunrgbd, tartanair, tofmark
+from dsr.io.inputs import Reading, read_picture
+from dsr.io.layouts import find_pairs_of_folder
+from dsr.io.manifest import Manifest, write_manifest
+from dsr.io.poses import read_poses
+from dsr.utils.paths import natural_key
+
+FRAMES = 12
+NAMES = {
+    "plain": "{0}",
+    "words": "frame_{0}",
+    "gaps": "{gap}",
+    "two numbers": "v2_{0}_{late}",
+    "some zeros": "{0:02}",
+}
+"""Names of frames 0 to 11; as texts they sort otherwise, but for those with enough zeros."""
+
+
+def named(style, number):
+    """Return the name of a frame."""
+    return NAMES[style].format(number, gap=number**2, late=95 + number)
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    monkeypatch.setattr(captures, "FRAMES", FRAMES)
+    path = tmp_path / "capture"
+    path.mkdir()
+    return path
+
+
+def renamed(folder, style, first=0):
+    """Give the files of a capture, numbered from ``first``, the names of a style."""
+    found = [path for path in folder.rglob("*") if re.fullmatch(r"\d+", path.stem) and path.is_file()]
+    for path in found:  # first out of each other's way
+        path.rename(path.with_name(f"old{path.name}"))
+    for path in found:
+        path.with_name(f"old{path.name}").rename(path.with_name(named(style, int(path.stem) - first) + path.suffix))
+    return folder
+
+
+def pairs(folder, style, photo, depth):
+    """Write photos and maps under names with {} for that of the frame."""
+    for number in range(FRAMES):
+        name = named(style, number)
+        captures.save(folder / photo.format(name), captures.photo(number))
+        captures.save(folder / depth.format(name), captures.millimetres(number))
+    return folder
+
+
+def frame_numbers(pairs):
+    """Return the numbers of the frames that maps show, which lie half a metre farther with each number."""
+    pictures = [read_picture(pair, Reading(unit=pair.unit or 1e-3)) for pair in pairs]
+    return [round(2 * float(picture.depth_lr.min() - captures.depth().min())) for picture in pictures], pictures
+
+
+def pose_numbers(poses):
+    """Return the numbers of poses, which lie a decimetre to the right with each number."""
+    return [None if pose is None else round(10 * pose[0, 3]) for pose in poses]
+
+
+CAPTURES = {
+    "stray": (lambda folder, style: renamed(captures.stray(folder, video=False), style), ["plain"]),
+    "polycam": (lambda folder, style: renamed(captures.polycam(folder), style, first=1000), list(NAMES)),
+    "open3d": (lambda folder, style: renamed(captures.open3d(folder), style), list(NAMES)),
+    "record3d": (lambda folder, _: captures.record3d(folder / "scan.r3d").parent, ["plain"]),
+    "arkitscenes": (lambda folder, _: captures.arkitscenes(folder, start=99.5), ["plain"]),
+}
+
+
+@pytest.mark.parametrize(("layout", "style"), [(each, style) for each in CAPTURES for style in CAPTURES[each][1]])
+def test_frames_of_a_capture_have_their_own_poses(folder, layout, style):
+    found = find_pairs_of_folder(CAPTURES[layout][0](folder, style)).pairs
+    numbers, pictures = frame_numbers(found)
+    assert numbers == list(range(FRAMES))
+    last = None if layout == "arkitscenes" else FRAMES - 1
+    assert pose_numbers([picture.pose for picture in pictures]) == [*range(FRAMES - 1), last]
+
+
+def test_poses_of_open3d_belong_to_the_frames_by_their_own_numbers(folder):
+    captures.open3d(folder)
+    path = folder / "scene" / "trajectory.log"
+    lines = path.read_text().splitlines()
+    entries = [lines[start : start + 5] for start in range(0, len(lines), 5)]
+    random.Random(0).shuffle(entries)
+    path.write_text("\n".join(line for entry in entries for line in entry) + "\n")
+    found = find_pairs_of_folder(folder).pairs
+    assert pose_numbers([read_picture(pair, Reading()).pose for pair in found]) == list(range(FRAMES))
+    given = read_poses(path).assign(found)
+    assert pose_numbers([given[pair.name] for pair in found]) == list(range(FRAMES))
+
+
+PAIRS = {
+    "two folders": ("rgb/{}.png", "depth/{}.png"),
+    "side by side": ("{}_color.png", "{}_depth.png"),
+    "words in front": ("color_{}.png", "depth_{}.png"),
+    "a folder for each": ("{}/color.png", "{}/depth.png"),
+}
+
+
+def write_poses(path, kind="matrices"):
+    """Write the poses of the frames in order, without times or with times that no frame has in its name."""
+    rows = [" ".join(f"{value:.9f}" for value in captures.pose(number)[:3].ravel()) for number in range(FRAMES)]
+    if kind == "times":
+        rows = [f"{1e9 + number} {0.1 * number} 0 0 0 0 0 1" for number in range(FRAMES)]
+        random.Random(0).shuffle(rows)
+    path.write_text("\n".join(rows) + "\n")
+    return path
+
+
+@pytest.mark.parametrize("style", NAMES)
+@pytest.mark.parametrize("layout", PAIRS)
+def test_pairs_have_the_poses_of_a_file_in_order(folder, tmp_path, layout, style):
+    found = find_pairs_of_folder(pairs(folder, style, *PAIRS[layout])).pairs
+    assert frame_numbers(found)[0] == list(range(FRAMES))
+    for kind in ("matrices", "times"):
+        given = read_poses(write_poses(tmp_path / "poses.txt", kind)).assign(found)
+        assert pose_numbers([given[pair.name] for pair in found]) == list(range(FRAMES))
+
+
+def test_scenes_of_dsr_and_folders_of_folders_are_in_order(folder):
+    for number in range(FRAMES):
+        for name in ("rgb.png", "camera.json", "depth.npy"):
+            path = folder / f"{number}" / name
+            path.parent.mkdir(exist_ok=True)
+            path.touch()
+    expected = [f"{number}" for number in range(FRAMES)]
+    assert [pair.name for pair in find_pairs_of_folder(folder).pairs] == expected
+    assert Folder(str(folder)).scenes() == expected
+
+
+def test_manifest_keeps_the_order_of_the_numbers(folder, tmp_path):
+    found = find_pairs_of_folder(pairs(folder, "plain", *PAIRS["two folders"]))
+    write_manifest(tmp_path / "frames.jsonl", found, 3)
+    assert [pair.name for pair in Manifest(tmp_path / "frames.jsonl")] == [f"{number}" for number in range(FRAMES)]
+
+
+def test_times_in_names_decide_rather_than_their_digits(folder):
+    """Half a second comes after a quarter, though 25 is more than 5."""
+    times = [repr(1305031102 + number / 8) for number in range(FRAMES)]
+    for number, time in enumerate(times):
+        captures.save(folder / "rgb" / f"{time}.png", captures.photo(number))
+        captures.save(folder / "depth" / f"{time}.png", captures.millimetres(number))
+    assert frame_numbers(find_pairs_of_folder(folder).pairs)[0] == list(range(FRAMES))
+
+
+@pytest.mark.parametrize("given", ["folders", "as a shell lists them"])
+def test_command_gives_each_frame_its_own_pose(folder, tmp_path, capsys, given):
+    pairs(folder, "plain", *PAIRS["two folders"])
+    kinds = {kind: sorted((folder / kind).iterdir()) for kind in ("rgb", "depth")}
+    assert [path.stem for path in kinds["rgb"]][:4] == ["0", "1", "10", "11"]
+    listed = [folder] if given == "folders" else ["--rgb", *kinds["rgb"], "--depth", *kinds["depth"]]
+    arguments = (*listed, "--poses", write_poses(tmp_path / "poses.txt"), "-o", tmp_path / "out")
+    options = ("--method", "nearest", "--only", "depth", "--depth-unit", "mm", "--fov", "60")
+    assert main(["upsample", *map(str, (*arguments, *options))]) == 0
+    capsys.readouterr()
+    for number in range(FRAMES):
+        result = tmp_path / "out" / f"{number}"
+        pose = np.array(json.loads((result / "info.json").read_text())["pose"])
+        assert pose_numbers([pose]) == [number]
+        assert round(2 * float(np.load(result / "depth_metres.npy").min() - captures.depth().min())) == number
+    assert [path.name for path in find_results(tmp_path / "out")] == [f"{number}" for number in range(FRAMES)]
+
+
+def test_photos_in_an_order_of_the_users_own_keep_it(folder, tmp_path, capsys):
+    pairs(folder, "plain", *PAIRS["two folders"])
+    order = list(reversed(range(FRAMES)))
+    listed = [f"--{kind}" if number is None else folder / kind / f"{number}.png"
+              for kind in ("rgb", "depth") for number in (None, *order)]  # fmt: skip
+    options = ("--method", "nearest", "--only", "depth", "--depth-unit", "mm", "--fov", "60")
+    arguments = (*listed, "--poses", write_poses(tmp_path / "poses.txt"), "-o", tmp_path / "out", *options)
+    assert main(["upsample", *map(str, arguments)]) == 0
+    capsys.readouterr()
+    poses = [json.loads((tmp_path / "out" / f"{number}" / "info.json").read_text())["pose"] for number in order]
+    assert pose_numbers(np.array(poses)) == list(range(FRAMES))
+
+
+def test_poses_in_order_have_to_be_as_many_as_frames(folder, tmp_path, capsys):
+    pairs(folder, "plain", *PAIRS["two folders"])
+    (folder / "depth" / "7.png").unlink()
+    path = write_poses(tmp_path / "poses.txt")
+    assert main(["upsample", str(folder), "--poses", str(path), "-o", str(tmp_path / "out")]) == 2
+    [line] = capsys.readouterr().err.splitlines()
+    assert f"{path}: expected a pose for each of the 11 frames" in line
+    assert not (tmp_path / "out").exists()
+
+
+DATA_SETS = {
+    "icl": (icl_nuim.find_frames, ("a/scene_00_{}.png", "a/scene_00_{}.depth")),
+    "icl folders": (icl_nuim.find_frames, ("a{}/rgb.png", "a{}/depth.png")),
+    "sunrgbd": (sunrgbd.find_frames, ("{}/image/a.jpg", "{}/depth/a.png")),
+    "tartanair": (tartanair.find_frames, ("{}_left.png", "{}_left_depth.npy")),
+    "sintel": (sintel.find_frames, ("final/a/frame_{}.png", "depth/a/frame_{}.dpt", "camdata_left/a/frame_{}.cam")),
+    "tofmark": (tofmark.find_frames, ("a{}.bmp", "a{}_depth.bmp")),
+    "ddrnet": (ddrnet.find_frames, ("color_map/{}.png", "depth_map/{}.png", "high_quality_depth/{}.png")),
+    "rgbdd": (rgbdd.find_frames, ("RGB/{}_RGB.jpg", "Depth/{}_HR_gt.png")),
+    "arkitscenes": (arkitscenes.find_frames,
+                    ("wide/7_{}.5.png", "highres_depth/7_{}.5.png", "lowres_depth/7_{}.5.png")),
+    "diml": (diml.find_frames, ("color/in_{}_c.png", "depth_filled/in_{}_depth_filled.png")),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("dataset", DATA_SETS)
+def test_scenes_of_a_data_set_are_in_the_order_of_their_numbers(tmp_path, dataset):
+    find, files = DATA_SETS[dataset]
+    for number in range(1, FRAMES + 1):
+        for file in files:
+            path = tmp_path / file.format(number)
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.touch()
+    names = list(find(tmp_path))
+    found = [int(re.search(r"\d+", name.removeprefix("7_").removeprefix("a/"))[0]) for name in names]
+    assert len(found) == FRAMES
+    assert found == sorted(found)
+
+
+def test_key_sorts_numbers_by_value_and_paths_folder_by_folder():
+    names = ["2/b", "10", "01", "1", "2", "a", "10/a", "2/10", "a1-b", "a/1", "2/9", "9" * 5000, "10a", "é2", "é10"]
+    expected = ["01", "1", "2", "2/9", "2/10", "2/b", "10", "10/a", "10a", "9" * 5000, "a", "a/1", "a1-b", "é2", "é10"]
+    assert sorted(names, key=natural_key) == expected
+    zeros = ["00000", "00001", "00010", "00100"]
+    assert sorted(zeros, key=natural_key) == sorted(zeros)
