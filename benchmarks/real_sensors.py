@@ -11,8 +11,8 @@
 - ``rgbdd``: a phone's time-of-flight map against another sensor's: RMSE_v, angle, stated over true error.
 - ``floors``: the mean angle between the normals of a floor and their mean, before a phone and a stereo camera.
 - ``phone``: a simulated phone, mean angle between normals.
-- ``glass``: clear objects before a stereo camera, beside their painted twins: in the objects, the share of pixels off by
-  more than 20 mm in %, the share of these stated to be off by less than 5 mm, and how well the stated error sorts
+- ``glass``: clear objects before a stereo camera, beside their painted twins: in the objects, the share of pixels off
+  by more than 20 mm in %, the share of these stated to be off by less than 5 mm, and how well the stated error sorts
   pixels into these and the others (area under the curve; 0.5 is chance).
 
 Filters are OpenCV's bilateral filter of the map, enlarged by cubic interpolation where it is smaller than the photo:
@@ -31,6 +31,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 import torch
+import yaml
 from captures import CAPTURES, Capture, ddrnet, ddrnet_frames, rgbdd_real, without_truth
 from flatness import FLOORS, flatness, given
 from scipy.stats import mannwhitneyu
@@ -38,12 +39,10 @@ from torch import Tensor
 
 from dsr.data.formats.shared import read_millimetres, read_picture
 from dsr.geometry.camera import Camera
-from dsr.geometry.surface import angle_between
 from dsr.inference.engine import upsample_surface
 from dsr.methods.base import Surface
 from dsr.methods.classical.bilateral import filter_bilateral
 from dsr.sample import DepthSample
-from dsr.viz.panels import normals_seen_by
 
 FILTERS = ((19, 0.03, 3.0), (41, 0.05, 9.0), (81, 0.06, 18.0))
 INSIDE, EDGE, NEAR = 12, 36, 0.06
@@ -164,9 +163,8 @@ def _exr(path: Path) -> Tensor:
 
 
 def _camera(path: Path, width: int, height: int) -> Camera:
-    """Return the camera of a file of lines ``fx: 1.0``."""
-    lines = (line.partition(":") for line in path.read_text().splitlines() if ":" in line and "#" not in line)
-    values = {key.strip(): value.strip() for key, _, value in lines}
+    """Return the camera of ClearGrasp's file."""
+    values = yaml.safe_load(path.read_text())
     return Camera(width, height, *(float(values[key]) for key in ("fx", "fy", "cx", "cy")))
 
 
