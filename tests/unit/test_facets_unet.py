@@ -11,9 +11,9 @@ from torch import Tensor, nn
 
 from dsr.degradation.downsampling import Downsampling
 from dsr.degradation.hints import FACTS, KERNELS, encode_facts
-from dsr.methods.networks import facets_unet
+from dsr.methods.networks import facets_planes, facets_unet
 from dsr.methods.networks.facets import Facets
-from dsr.methods.networks.facets_planes import NEIGHBOURS, average_planes
+from dsr.methods.networks.facets_planes import NEIGHBOURS, average_planes, mix_planes, spline_logits
 from dsr.methods.networks.facets_unet import FacetsUNet
 from dsr.methods.networks.trained import NETWORKS
 from dsr.methods.networks.weight_files import load_network, save_network
@@ -196,6 +196,42 @@ def test_planes_are_averaged_with_those_around_extended_to_the_pixel(reach: int)
             here = torch.stack((value + (column - j) * slope_u + (row - i) * slope_v, slope_u, slope_v))
             expected[0, 0, :, row, column] += weights[0, 0, k, row, column] * here
     torch.testing.assert_close(average_planes(planes, weights, reach), expected)
+
+
+@pytest.mark.parametrize("reach", [1, 4])
+def test_gradients_of_averaged_planes_are_those_of_differences(reach: int) -> None:
+    generator = torch.Generator().manual_seed(reach)
+    planes = torch.randn((1, 1, 3, 3, 4), generator=generator, dtype=torch.float64, requires_grad=True)
+    weights = torch.rand((1, 1, NEIGHBOURS, 3, 4), generator=generator, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(lambda *given: average_planes(*given, reach), (planes, weights), fast_mode=True)
+
+
+def test_gradients_of_mixed_planes_are_those_of_differences(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(facets_planes, "_CHUNK", 5 * 9 * 4)  # several parts, the last one smaller
+    generator = torch.Generator().manual_seed(0)
+    planes = torch.randn((1, 1, 3, 3, 4), generator=generator, dtype=torch.float64, requires_grad=True)
+    choice = torch.randn((1, NEIGHBOURS, 6, 8), generator=generator, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(lambda *given: mix_planes(*given, 2), (planes, choice), fast_mode=True)
+
+
+def test_mixed_planes_are_planes_at_each_pixel_weighted_by_a_softmax() -> None:
+    generator = torch.Generator().manual_seed(1)
+    planes = torch.randn((1, 2, 3, 3, 4), generator=generator, dtype=torch.float64)
+    choice = torch.randn((1, 2 * NEIGHBOURS, 6, 8), generator=generator, dtype=torch.float64)
+    found = mix_planes(planes, choice, 2)
+    offsets = torch.tensor([-0.25, 0.25], dtype=torch.float64)
+    weights = (choice.view(NEIGHBOURS, 2, 6, 8) + spline_logits(offsets).repeat(1, 3, 4)[:, None]).flatten(0, 1)
+    weights = weights.softmax(dim=0).view(NEIGHBOURS, 2, 6, 8)
+    for row, column in itertools.product(range(6), range(8)):
+        y, x = row // 2, column // 2
+        expected = 0.0
+        for k, facet in itertools.product(range(NEIGHBOURS), range(2)):
+            i, j = y + k // 3 - 1, x + k % 3 - 1
+            i, j = (i if 0 <= i < 3 else y), (j if 0 <= j < 4 else x)
+            value, slope_u, slope_v = planes[0, facet, :, i, j].tolist()
+            u, v = x - j + float(offsets[column % 2]), y - i + float(offsets[row % 2])
+            expected += float(weights[k, facet, row, column]) * (value + u * slope_u + v * slope_v)
+        assert float(found[0, 0, row, column]) == pytest.approx(expected, abs=1e-12)
 
 
 def test_sizes_are_checked() -> None:

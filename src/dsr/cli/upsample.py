@@ -10,7 +10,7 @@ from typing import Any, get_args
 from rich.console import Console
 
 from dsr.app.upsample.parts import MORE_PARTS, PARTS
-from dsr.inference.options import DEFAULT, WIDEST, Fill
+from dsr.inference.options import DEFAULT, SIZES, WIDEST, Fill
 from dsr.utils.limits import MOST_FACES, MOST_POINTS
 
 _DESCRIPTION = """\
@@ -164,6 +164,12 @@ def _add_method(parser: argparse.ArgumentParser) -> None:
         metavar="DEGREES",
         help="width of the widest hole that --fill small fills, degrees of view (default: 2)",
     )
+    method.add_argument(
+        "--working-size",
+        choices=("auto", *map(str, SIZES)),
+        default="auto",
+        help="by what facets divides the map's size first; auto: as its noise suggests",
+    )
 
 
 def _add_results(parser: argparse.ArgumentParser) -> None:
@@ -268,6 +274,7 @@ def _run(options: argparse.Namespace, console: Console, _: object) -> list[str]:
         device=options.device,
         fill=options.fill,
         max_hole=options.max_hole,
+        working_size=None if options.working_size == "auto" else int(options.working_size),
         max_error=options.max_error / 100,
         depth_format=options.format,
         max_faces=options.max_faces,

@@ -19,9 +19,10 @@ from dsr.geometry.holes import degrees_per_pixel, wide_holes
 from dsr.geometry.resampling import pad_inverse_depth, resize_inverse_depth
 from dsr.inference.agreement import expect_errors
 from dsr.inference.inspection import enlarged_by
-from dsr.inference.options import DEFAULT, USUAL_SCALE, WIDEST, Fill
+from dsr.inference.options import DEFAULT, SIZES, USUAL_SCALE, WIDEST, Fill
 from dsr.inference.outliers import count_patches, find_outliers, within_measured
 from dsr.inference.planning import OWN_SIZE, Plan, plan, read_ability
+from dsr.inference.working_size import find_noise, limit_to_noise, reduce_by_medians, working_size_of
 from dsr.methods.base import Confident, MapNoise, Surface, Upsampler, expect_some_depth
 from dsr.methods.classical.interpolation import Interpolation
 from dsr.methods.networks.base import NetworkUpsampler
@@ -34,6 +35,10 @@ from dsr.utils.progress import Steps, part_of
 
 DECIDED = MappingProxyType({"fill_holes": True, "validate_every": 0})
 """Arguments of methods that are set here: holes are restored afterwards, and validation has no ground truth."""
+
+
+_LARGEST_RATIO = 16
+"""Largest ratio of the sizes that a smaller working size may lead to: there are no weights for larger ones."""
 
 
 @dataclass(frozen=True)
@@ -74,6 +79,14 @@ class MethodChoice:
             text = str(error).removeprefix("method.")
             set_here = text.partition(":")[0] in self.settings
             raise ValueError(text if set_here else f"method={self.name}: {text}") from error
+
+    def finds_noise(self) -> bool:
+        """Return whether the method has weights for several ratios of the sizes, and is not told that there is no noise.
+
+        It may then work at a size that the noise suggests.
+        """
+        told = self.settings.get("clean") or self.settings.get("noise") == 0
+        return not told and bool(read_ability(self.name, self.directories, self.settings).factors)
 
     def plan(self, size: tuple[int, int], size_lr: tuple[int, int], scale: int | None) -> Plan:
         """Return the plan for a photo and a depth map of these heights and widths."""
@@ -134,6 +147,7 @@ def upsample_surface(
     device: str = "auto",
     fill: Fill = "small",
     max_hole: float = WIDEST,
+    working_size: int | None = None,
     progress: Steps | None = None,
 ) -> Surface:
     """Upsample a depth map to the photo's size, with the expected errors.
@@ -162,6 +176,8 @@ def upsample_surface(
         fill: which holes are filled: ``all``, the ``small`` ones, or ``none``; in others, pixels whose own depth, or
             whose nearest low-resolution pixel, is missing stay NaN.
         max_hole: width of the widest hole that counts as small, in degrees of view; one of 5 pixels always does.
+        working_size: by what ``facets`` without a scale divides the size of the map first, 1, 2, 4, 8 or 16; None to
+            choose it by the map's noise, see :mod:`dsr.inference.working_size`.
         progress: is called with the number of parts done and their total.
 
     Returns:
@@ -172,36 +188,31 @@ def upsample_surface(
 
     """
     _check(rgb, depth, camera)
-    if fill not in get_args(Fill):
-        raise ValueError(f"fill: expected one of {', '.join(get_args(Fill))}, got {fill!r}")
-    if not 0 < max_hole < math.inf:
-        raise ValueError(f"max_hole: expected a positive number of degrees, got {max_hole}")
+    _check_options(fill, max_hole, working_size)
     size = (camera.height, camera.width)
     choice = MethodChoice(method, settings or {}, tuple(directories), pick_device(device))
     planned = choice.plan(size, _size(depth), scale)  # raises ValueError for sizes or a scale that cannot be used
     outliers = find_outliers(depth)
     inverse = depth.masked_fill(outliers, torch.nan).float().reciprocal()
-    valid = inverse.isfinite()
+    valid, factor = inverse.isfinite(), 1
     near = size[0] <= OWN_SIZE * inverse.shape[-2] and size[1] <= OWN_SIZE * inverse.shape[-1]
     larger = any(n > m for n, m in zip(_size(inverse), size, strict=True))
-    if near and (_size(inverse) == size or larger or planned.coarsened > 1):
+    own = near and (_size(inverse) == size or larger or planned.coarsened > 1)
+    if own:
         inverse = _resize_nearest(inverse, size)
         block = enlarged_by(inverse)
         repeated = block > 1 and not any(n % block for n in size)
         factor = 1 if repeated else choice.plan(size, size, scale).coarsened
-        if factor == 1:
-            if repeated:
-                inverse = inverse[:, ::block, ::block]
-                valid = inverse.isfinite()
-            found = _upsample_inverse(rgb, inverse, camera, None, choice, progress)
-        else:
-            padded = _pad_photo(rgb, factor)
-            inverse_lr = Downsampling("box")(pad_inverse_depth(inverse, factor), factor)
-            camera_padded = Camera(padded.shape[-1], padded.shape[-2], camera.fx, camera.fy, camera.cx, camera.cy)
-            found = _upsample_inverse(padded, inverse_lr, camera_padded, factor, choice, progress)
-            found = found.crop(size)
+        if repeated:
+            inverse = inverse[:, ::block, ::block]
+            valid = inverse.isfinite()
+    if factor > 1:
+        inverse_lr = Downsampling("box")(pad_inverse_depth(inverse, factor), factor)
+        found = _upsample_padded(rgb, inverse_lr, camera, factor, choice, progress, factor)
+    elif scale is None and choice.finds_noise():
+        found = _upsample_at_working_size(rgb, inverse, camera, working_size, choice, progress)
     else:
-        found = _upsample_inverse(rgb, inverse, camera, scale, choice, progress)
+        found = _upsample_inverse(rgb, inverse, camera, None if own else scale, choice, progress)
     expect_some_depth(found.inverse, method)  # as good as of the depth: 0 and infinity change places
     lowest = inverse.nan_to_num(nan=torch.inf).amin()
     infinite = found.inverse <= 0  # but what is NaN has no depth
@@ -240,6 +251,36 @@ class _Found(NamedTuple):
         inverse, spread, angle, left_out = (None if each is None else each[window] for each in self[:4])
         assert inverse is not None  # noqa: S101 - for the type checker
         return _Found(inverse, spread, angle, left_out, self.noise)
+
+
+def _upsample_at_working_size(
+    rgb: Tensor, inverse: Tensor, camera: Camera, size: int | None, choice: MethodChoice, progress: Steps | None
+) -> _Found:
+    """Return high-resolution inverse depth of inverse depth, (1, h, w), whose size may be divided first."""
+    noise = find_noise(inverse.reciprocal()) if size is None else None
+    wanted = size or (1 if noise is None else working_size_of(noise.extent))
+    most = _LARGEST_RATIO * inverse.shape[-1] / camera.width
+    factor = max(each for each in SIZES if each == 1 or each <= min(wanted, most))
+    if factor == 1:
+        return _upsample_inverse(rgb, inverse, camera, None, choice, progress)
+    inverse_lr = reduce_by_medians(pad_inverse_depth(inverse, factor), factor)
+    found = _upsample_padded(rgb, inverse_lr, camera, None, choice, progress, factor * camera.width / inverse.shape[-1])
+    if noise is None or found.spread is None:
+        return found
+    left = limit_to_noise(found.spread, noise, float(inverse.nanmedian()))
+    return found._replace(spread=left, noise=noise._replace(reduced=factor))
+
+
+def _upsample_padded(
+    rgb: Tensor, inverse: Tensor, camera: Camera, scale: int | None, choice: MethodChoice, progress: Steps | None,
+    ratio: float,
+) -> _Found:  # fmt: skip
+    """Return what :func:`_upsample_inverse` returns for the photo, padded to ``ratio`` times the map, cropped again."""
+    size = tuple(max(round(ratio * n), m) for n, m in zip(_size(inverse), _size(rgb), strict=True))
+    padded = _pad_photo(rgb, size)
+    camera_padded = Camera(size[1], size[0], camera.fx, camera.fy, camera.cx, camera.cy)
+    found = _upsample_inverse(padded, inverse, camera_padded, scale, choice, progress)
+    return found.crop((camera.height, camera.width))
 
 
 def _upsample_inverse(
@@ -331,15 +372,25 @@ def _resize_nearest(values: Tensor, size: tuple[int, int]) -> Tensor:
     return values[:, rows][:, :, columns]
 
 
-def _pad_photo(rgb: Tensor, factor: int) -> Tensor:
-    """Pad a photo at the right and the bottom to a multiple of the factor, by repeating its border pixels."""
-    padding = [-n % factor for n in (rgb.shape[-1], rgb.shape[-2])]
-    return functional.pad(rgb[None], (0, padding[0], 0, padding[1]), mode="replicate")[0] if any(padding) else rgb
+def _pad_photo(rgb: Tensor, size: tuple[int, int]) -> Tensor:
+    """Pad a photo at the right and the bottom to a size, by repeating its border pixels."""
+    padding = (0, size[1] - rgb.shape[-1], 0, size[0] - rgb.shape[-2])
+    return functional.pad(rgb[None], padding, mode="replicate")[0] if any(padding) else rgb
 
 
 def _size(values: Tensor) -> tuple[int, int]:
     """Return height and width."""
     return values.shape[-2], values.shape[-1]
+
+
+def _check_options(fill: str, max_hole: float, working_size: int | None) -> None:
+    """Raise ValueError for a value that :func:`upsample_surface` does not know."""
+    if fill not in get_args(Fill):
+        raise ValueError(f"fill: expected one of {', '.join(get_args(Fill))}, got {fill!r}")
+    if not 0 < max_hole < math.inf:
+        raise ValueError(f"max_hole: expected a positive number of degrees, got {max_hole}")
+    if working_size is not None and working_size not in SIZES:
+        raise ValueError(f"working_size: expected one of {', '.join(map(str, SIZES))}, got {working_size}")
 
 
 def _check(rgb: Tensor, depth: Tensor, camera: Camera) -> None:

@@ -11,3 +11,5 @@ WIDEST = 2.0
 """Degrees of view of the widest hole that counts as small. On Middlebury 2014 and ICL-NUIM with holes cut into them,
 depth that ``facets`` fills in is off by 1.2 % on average at 0.2 to 0.4 degrees from a measured pixel, by 3 % at 0.7 to
 1 degree, and by 6 % and more beyond; half of these pixels are off by more than 2 %."""
+SIZES = (1, 2, 4, 8, 16)
+"""By what the size of a sensor's map may be divided before it is worked on."""

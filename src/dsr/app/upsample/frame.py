@@ -165,6 +165,7 @@ def _upsample(job: _Job, picture: Picture, progress: Progress) -> Surface:
             device=request.device,
             fill=request.fill,
             max_hole=request.max_hole,
+            working_size=request.working_size,
             progress=step,
         )
     return surface.map(lambda values: values.cpu())
@@ -175,7 +176,12 @@ def _describe(noise: MapNoise | None, *, given: bool) -> list[Assumption]:
     if noise is None or given:
         return []
     extent = f", correlated over {noise.extent:.0f} pixels" if noise.extent > _WHITE else ""
-    return [Assumption("noise of the depth map", f"about {1e3 * noise.deviation:.2g} mm{extent}; --noise overrides it")]
+    text = f"about {1e3 * noise.deviation:.2g} mm{extent}"
+    if noise.reduced > 1:
+        return [
+            Assumption("noise of the depth map", f"{text}: worked on at 1/{noise.reduced}; --working-size overrides it")
+        ]
+    return [Assumption("noise of the depth map", f"{text}; --noise overrides it")]
 
 
 def _describe_outliers(outliers: Outliers | None) -> list[Assumption]:

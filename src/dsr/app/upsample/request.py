@@ -36,7 +36,7 @@ class UpsampleRequest:
         rgb, depth, mask: files, or one folder each of the first two.
         confidence: files of confidence maps, or a folder of them.
         reading: how to read the files.
-        method, settings, directories, scale, device, fill, max_hole: see :func:`dsr.inference.upsample_depth`.
+        method, settings, directories, scale, device, fill, max_hole, working_size: see :func:`dsr.inference.upsample_depth`.
         max_error: expected relative error of the depth from which a pixel is left out of cloud and mesh.
         max_faces: triangles from which a mesh is simplified.
         max_points: points from which a cloud is thinned.
@@ -68,6 +68,7 @@ class UpsampleRequest:
     device: str = "auto"
     fill: Fill = "small"
     max_hole: float = WIDEST
+    working_size: int | None = None
     max_error: float = LARGEST_ERROR
     max_faces: int = MOST_FACES
     max_points: int = MOST_POINTS
@@ -178,6 +179,7 @@ def settings_of(request: UpsampleRequest) -> dict[str, Any]:
         "scale": request.scale,
         "fill": request.fill,
         "max_hole": request.max_hole,
+        **({} if request.working_size is None else {"working_size": request.working_size}),
         "max_error": request.max_error,
         "format": request.depth_format,
         **reading,

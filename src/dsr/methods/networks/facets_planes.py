@@ -6,16 +6,21 @@ axis but two: (B, facets, 3, h, w). Everything here reproduces planes exactly.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+import math
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 from torch.nn import functional
 
 from dsr.methods.classical.finite_differences import extend_linearly
+from dsr.methods.networks.exportable import exporting
 
 NEIGHBOURS = 9
 """Low-resolution pixels whose planes are mixed or averaged: 3 x 3."""
+_CHUNK = 2**17
+"""Values that a processor's cache holds several of."""
 
 
 class Stencil(NamedTuple):
@@ -89,19 +94,84 @@ def average_planes(planes: Tensor, weights: Tensor, reach: int) -> Tensor:
         reach: low-resolution pixels.
 
     """
+    if exporting():
+        return _average_planes(planes, weights, reach)
+    average: Tensor = _AveragePlanes.apply(planes, weights, reach)
+    return average
+
+
+def _average_planes(planes: Tensor, weights: Tensor, reach: int) -> Tensor:
+    """Return what :func:`average_planes` does, in operations that a graph may have."""
     height, width = planes.shape[-2:]
-    padded = functional.pad(planes.flatten(1, 2), (reach,) * 4, mode="replicate").unflatten(1, planes.shape[1:3])
-    rows, columns = (torch.arange(n, dtype=planes.dtype, device=planes.device) for n in (height, width))
+    padded = _pad(planes, reach)
+    down, across = _offsets(height, reach, planes), _offsets(width, reach, planes)
     total = torch.zeros_like(planes)
     for k in range(NEIGHBOURS):
-        down, across = (reach * (n - 1) for n in divmod(k, 3))
-        near = padded[..., reach + down : reach + down + height, reach + across : reach + across + width]
-        v = (rows + down).clamp(0, height - 1) - rows
-        u = (columns + across).clamp(0, width - 1) - columns
-        value = near[:, :, 0] - u * near[:, :, 1] - v[:, None] * near[:, :, 2]
+        i, j = divmod(k, 3)
+        near = padded[..., i * reach : i * reach + height, j * reach : j * reach + width]
+        value = near[:, :, 0] - across[j] * near[:, :, 1] - down[i][:, None] * near[:, :, 2]
         extended = torch.cat((value[:, :, None], near[:, :, 1:]), dim=2)
         total = total + weights[:, :, k : k + 1] * extended
     return total
+
+
+class _AveragePlanes(torch.autograd.Function):
+    """:func:`average_planes` without a copy of all planes for each of the nine neighbours."""
+
+    @staticmethod
+    def forward(ctx: Any, planes: Tensor, weights: Tensor, reach: int) -> Tensor:
+        """Return (B, facets, 3, h, w)."""
+        height, width = planes.shape[-2:]
+        padded = _pad(planes, reach)
+        down, across = _offsets(height, reach, planes), _offsets(width, reach, planes)
+        total = torch.zeros_like(planes, memory_format=torch.contiguous_format)
+        for k in range(NEIGHBOURS):
+            i, j = divmod(k, 3)
+            near = padded[..., i * reach : i * reach + height, j * reach : j * reach + width]
+            value = near[:, :, 0] - across[j] * near[:, :, 1] - down[i][:, None] * near[:, :, 2]
+            total[:, :, 0].addcmul_(weights[:, :, k], value)
+            total[:, :, 1:].addcmul_(weights[:, :, k, None], near[:, :, 1:])
+        ctx.save_for_backward(padded, weights)
+        ctx.reach = reach
+        return total
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, Tensor, None]:
+        """Return the gradients of the planes and of the weights."""
+        padded, weights = ctx.saved_tensors
+        reach, (height, width) = ctx.reach, gradient.shape[-2:]
+        down, across = _offsets(height, reach, gradient), _offsets(width, reach, gradient)
+        of_padded, of_weights = torch.zeros_like(padded), torch.empty_like(weights)
+        of_value, of_u, of_v = gradient.unbind(dim=2)
+        for k in range(NEIGHBOURS):
+            i, j = divmod(k, 3)
+            window = (..., slice(i * reach, i * reach + height), slice(j * reach, j * reach + width))
+            near, sums = padded[window], of_padded[window]
+            parts = (of_value, of_u - across[j] * of_value, of_v - down[i][:, None] * of_value)
+            torch.mul(parts[0], near[:, :, 0], out=of_weights[:, :, k])
+            for channel, part in enumerate(parts):
+                sums[:, :, channel].addcmul_(weights[:, :, k], part)
+                if channel:
+                    of_weights[:, :, k].addcmul_(part, near[:, :, channel])
+        for dim in (-2, -1):  # what lies beyond the border is the border's
+            size = of_padded.shape[dim] - 2 * reach
+            before, inner, after = of_padded.split((reach, size, reach), dim)
+            inner.narrow(dim, 0, 1).add_(before.sum(dim, keepdim=True))
+            inner.narrow(dim, size - 1, 1).add_(after.sum(dim, keepdim=True))
+            of_padded = inner
+        return of_padded, of_weights, None
+
+
+def _pad(planes: Tensor, reach: int) -> Tensor:
+    """Return planes, (B, facets, 3, h, w), with the border's repeated ``reach`` times."""
+    return functional.pad(planes.flatten(1, 2), (reach,) * 4, mode="replicate").unflatten(1, planes.shape[1:3])
+
+
+def _offsets(size: int, reach: int, like: Tensor) -> list[Tensor]:
+    """Return how far the pixels ``reach`` before, at and after each pixel are, (size,) each, if they are inside."""
+    places = torch.arange(size, dtype=like.dtype, device=like.device)
+    return [(places + step).clamp(0, size - 1) - places for step in (-reach, 0, reach)]
 
 
 def gather_neighbours(planes: Tensor) -> Tensor:
@@ -149,13 +219,56 @@ def mix_planes(planes: Tensor, choice: Tensor, scale: int) -> Tensor:
     s, count = scale, NEIGHBOURS * facets
     # of the high-resolution pixels from the centre of their low-resolution pixel, in low-resolution pixels
     offsets = (torch.arange(s, dtype=planes.dtype, device=planes.device) + 0.5) / s - 0.5
-    prior = spline_logits(offsets).view(NEIGHBOURS, 1, 1, s, 1, s)
-    logits = choice.to(planes.dtype).view(batch, NEIGHBOURS, facets, height, s, width, s) + prior
-    weights = logits.reshape(batch, count, height, s, width, s).softmax(dim=1)
-    near = gather_neighbours(planes).reshape(batch, count, 3, height, 1, width, 1)
-    value, slope_u, slope_v = ((weights * near[:, :, i]).sum(dim=1) for i in range(3))  # (B, h, s, w, s)
-    hr = value + slope_u * offsets + slope_v * offsets[:, None, None]
-    return hr.reshape(batch, 1, height * s, width * s)
+    prior = spline_logits(offsets).repeat_interleave(facets, dim=0).view(count, s * s, 1)
+    near = gather_neighbours(planes).reshape(batch, count, 3, height * width)
+    ones = torch.ones(s, s, dtype=offsets.dtype, device=offsets.device)
+    basis = torch.stack((ones, ones * offsets, ones * offsets[:, None]), dim=-1).view(s * s, 3)
+    # the pixels of a low-resolution pixel become an axis of their own
+    logits = choice.reshape(batch, count, height, s, width, s).permute(0, 1, 3, 5, 2, 4)
+    logits = logits.reshape(batch, count, s * s, height * width)
+    with torch.autocast(planes.device.type, enabled=False):
+        if exporting():
+            weights = (logits.to(planes.dtype) + prior).softmax(dim=1)
+            mixed = (weights * (basis @ near)).sum(dim=1)
+        else:
+            mixed = _MixPlanes.apply(near, logits, prior, basis)
+    return mixed.view(batch, s, s, height, width).permute(0, 3, 1, 4, 2).reshape(batch, 1, height * s, width * s)
+
+
+class _MixPlanes(torch.autograd.Function):
+    """A softmax over proposals times their planes at each pixel, some pixels at a time: no array of all of them."""
+
+    @staticmethod
+    def forward(ctx: Any, near: Tensor, logits: Tensor, prior: Tensor, basis: Tensor) -> Tensor:
+        """Return (B, q, n) values of (B, C, 3, n) planes, (B, C, q, n) and (C, q, 1) logits, at (q, 3) = (1, u, v)."""
+        mixed = near.new_empty(near.shape[0], *logits.shape[-2:])
+        shares = torch.empty_like(logits, dtype=near.dtype) if any(ctx.needs_input_grad) else None
+        for part in _chunks(logits):
+            weights = (logits[part].to(near.dtype) + prior).softmax(dim=1)
+            if shares is not None:
+                shares[part] = weights
+            mixed[part] = (weights * (basis @ near[part])).sum(dim=1)
+        ctx.save_for_backward(near, shares, mixed, basis)
+        ctx.dtype = logits.dtype
+        return mixed
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, Tensor, None, None]:
+        """Return the gradients of the planes and of the logits."""
+        near, shares, mixed, basis = ctx.saved_tensors
+        of_near, of_logits = torch.empty_like(near), torch.empty_like(shares, dtype=ctx.dtype)
+        for part in _chunks(shares):
+            weighted = shares[part] * gradient[part][:, None]
+            of_near[part] = basis.T @ weighted
+            of_logits[part] = weighted * (basis @ near[part] - mixed[part][:, None])
+        return of_near, of_logits, None, None
+
+
+def _chunks(logits: Tensor) -> list[tuple[Any, slice]]:
+    """Return indices of parts of the last axis for which (B, C, q, n) logits fit into a processor's cache."""
+    step = max(1, _CHUNK // math.prod(logits.shape[:-1]))
+    return [(..., slice(first, first + step)) for first in range(0, logits.shape[-1], step)]
 
 
 def spline_logits(offsets: Tensor) -> Tensor:

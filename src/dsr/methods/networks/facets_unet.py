@@ -43,6 +43,8 @@ from dsr.methods.networks.facets_layers import (
     HEAD,
     Context,
     MixedResidual,
+    convolve_together,
+    grow,
     make_pyramid,
     photo_input,
     scale_down,
@@ -322,9 +324,9 @@ class FacetsUNet(DisparityNetwork):
     def _choose(self, x: Tensor, planes: Tensor, pyramid: list[Tensor], scale: int) -> tuple[Tensor, Tensor, Tensor]:
         """Return the mixture of planes, the logarithms of the expected errors, (B, 2, H, W), and residuals' factors."""
         for up, join, features in zip(self.up, self.join, reversed(pyramid[:-1]), strict=True):
-            x = functional.relu(join(torch.cat((functional.pixel_shuffle(up(x), 2), features), dim=1)))
-        gate = torch.sigmoid(self.gate(x).float() + _CLOSED)
-        return mix_planes(planes, self.choice(x), scale), self.errors(x).float() - 5, gate
+            x = functional.relu(join(torch.cat((grow(up, x), features), dim=1)))
+        choice, errors, gate = convolve_together((self.choice, self.errors, self.gate), x)
+        return mix_planes(planes, choice, scale), errors.float() - 5, torch.sigmoid(gate.float() + _CLOSED)
 
     def _propose_planes(self, output: Tensor, around: Stencil, smoothed: list[Stencil]) -> Tensor:
         """Return the planes of each low-resolution pixel, (B, facets, 3, h, w): value at its centre and slopes."""

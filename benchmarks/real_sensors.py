@@ -1,0 +1,262 @@
+"""Every yardstick of real sensors in one command, for methods and beside them for simple filters.
+
+    python benchmarks/real_sensors.py [--shared DIR] [--methods facets,...] [--only board,ddrnet,...] [--frames N]
+        [--filters] [--weights FILE] [--device cpu]
+
+- ``board``: a stereo camera before an exact plane, means of the frames. Standard deviation about the plane in mm, the
+  same 12 to 36 pixels inside the outline (blur across it shows there), the mean angle between the normals and the
+  plane's in degrees, and the median stated error over the median error.
+- ``ddrnet``: a structured-light camera, scored as ``metrics=sensor`` does: RMSE_v in 1/1000, angle, share of the
+  pixels scored in %, RMSE_v against the truth smoothed by 2 pixels, and stated over true error.
+- ``rgbdd``: a phone's time-of-flight map against another sensor's: RMSE_v, angle, stated over true error.
+- ``floors``: the mean angle between the normals of a floor and their mean, before a phone and a stereo camera.
+- ``phone``: a simulated phone, mean angle between normals.
+- ``glass``: clear objects before a stereo camera, beside their painted twins: in the objects, the share of pixels off
+  by more than 20 mm in %, the share of these stated to be off by less than 5 mm, and how well the stated error sorts
+  pixels into these and the others (area under the curve; 0.5 is chance).
+
+Filters are OpenCV's bilateral filter of the map, enlarged by cubic interpolation where it is smaller than the photo:
+window, standard deviation in metres, in pixels. A filter states no error.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+import torch
+import yaml
+from captures import CAPTURES, Capture, ddrnet, ddrnet_frames, rgbdd_real, without_truth
+from flatness import FLOORS, flatness, given
+from scipy.stats import mannwhitneyu
+from torch import Tensor
+
+from dsr.data.formats.shared import read_millimetres, read_picture
+from dsr.geometry.camera import Camera
+from dsr.inference.engine import upsample_surface
+from dsr.methods.base import Surface
+from dsr.methods.classical.bilateral import filter_bilateral
+from dsr.sample import DepthSample
+
+FILTERS = ((19, 0.03, 3.0), (41, 0.05, 9.0), (81, 0.06, 18.0))
+INSIDE, EDGE, NEAR = 12, 36, 0.06
+"""Pixels inside the board's outline that are left out, those that count as its edge, and metres from the plane."""
+OFF, SURE = 0.02, 0.005
+"""Metres: pixels that are further off are wrong, and those stated to be off by less are believed."""
+PARTS = ("board", "ddrnet", "rgbdd", "floors", "phone", "glass")
+Method = Callable[[DepthSample], Surface]
+
+
+class Plane(NamedTuple):
+    """A frame before the board: the sample, the plane's true depth and normal, and the distance inside its outline."""
+
+    sample: DepthSample
+    depth: np.ndarray
+    normal: np.ndarray
+    inside: np.ndarray
+
+
+def boards(shared: Path, count: int | None) -> list[Plane]:
+    """Return the frames before the board."""
+    folder = shared / "real" / "stereo_board"
+    facts = json.loads((folder / "board.json").read_text())
+    camera, found = Camera(**facts["camera"]), []
+    for name, frame in list(facts["frames"].items())[:count]:
+        rgb = read_picture(next(folder.glob(f"color/{name}.*")))
+        sample = without_truth(name, rgb, read_millimetres(folder / "depth" / f"{name}.png"), camera)
+        plane = cv2.imread(str(folder / "plane" / f"{name}.png"), cv2.IMREAD_UNCHANGED) / 1e4
+        inside = np.zeros(plane.shape, np.uint8)
+        cv2.fillPoly(inside, [np.round(frame["polygon"]).astype(np.int32)], 1)
+        distance = cv2.distanceTransform(inside, cv2.DIST_L2, 5)
+        found.append(Plane(sample, np.where(plane > 0, plane, np.nan), np.array(frame["normal"]), distance))
+    return found
+
+
+def score_board(frame: Plane, surface: Surface) -> dict[str, float]:
+    """Score a result before the board."""
+    depth = surface.depth[0].double().numpy()
+    off = depth - frame.depth
+    off -= np.nanmedian(off[frame.inside > INSIDE])
+    inner = (frame.inside > INSIDE) & (np.abs(off) < NEAR)
+    edge = inner & (frame.inside <= EDGE)
+    points = depth * frame.sample.camera.rays().numpy()
+    along_u, along_v = np.full_like(points, np.nan), np.full_like(points, np.nan)
+    along_u[..., 1:-1] = points[..., 2:] - points[..., :-2]
+    along_v[:, 1:-1] = points[:, 2:] - points[:, :-2]
+    normal = np.cross(along_u, along_v, axis=0)[:, inner]
+    cosine = np.abs(frame.normal @ (normal / np.linalg.norm(normal, axis=0)))
+    angle = np.degrees(np.arccos(cosine.clip(max=1)))
+    found = {"std": 1e3 * off[inner].std(), "edge": 1e3 * off[edge].std(), "angle": float(np.nanmean(angle))}
+    if surface.depth_error is not None:
+        found["stated"] = stated(surface.depth_error[0].numpy()[inner], off[inner])
+    return found
+
+
+def stated(expected: np.ndarray, error: np.ndarray) -> float:
+    """Return the median stated error over the median error; pixels without either are left out."""
+    both = np.isfinite(expected) & np.isfinite(error)
+    return float(np.median(expected[both]) / np.median(np.abs(error[both])))
+
+
+def score_capture(capture: Capture, surface: Surface) -> dict[str, float]:
+    """Score a result on a capture with a truth, and its stated errors after the median offset is taken off."""
+    scores = capture.scores(surface.depth)
+    assert scores is not None  # noqa: S101 - for the type checker
+    found = {"RMSE_v": 1e3 * scores["RMSE_v"], "angle": scores["angle"], "covered": 100 * scores["covered"]}
+    assert capture.truth is not None  # noqa: S101 - for the type checker
+    if surface.depth_error is not None:
+        off = (surface.depth - capture.truth.depth)[0].double().numpy()
+        off -= np.nanmedian(off)
+        found["stated"] = stated(np.where(np.abs(off) < 0.1, surface.depth_error[0].numpy(), np.nan), off)
+    return found
+
+
+def smoothed(capture: Capture, deviation: float = 2.0) -> Capture:
+    """Return a capture whose truth is smoothed by a masked Gaussian."""
+    assert capture.truth is not None  # noqa: S101 - for the type checker
+    depth = capture.truth.depth[0].double().numpy()
+    known = np.isfinite(depth)
+    total, weight = (
+        cv2.GaussianBlur(each, (0, 0), deviation) for each in (np.where(known, depth, 0), known.astype(np.float64))
+    )
+    blurred = np.where(known, total / np.where(known, weight, 1), np.nan)
+    truth = capture.truth._replace(depth=torch.from_numpy(blurred)[None])
+    return Capture(capture.sample, capture.windows, truth, capture.noisy, capture.measured, capture.keep_holes)
+
+
+class Glass(NamedTuple):
+    """A capture of clear objects, the depth of their painted twins (1, H, W) in metres, and where they are."""
+
+    sample: DepthSample
+    twin: Tensor
+    mask: Tensor
+
+
+def glasses(shared: Path) -> list[Glass]:
+    """Return the captures of clear objects."""
+    folder = shared / "real" / "cleargrasp"
+    found = []
+    for path in sorted(folder.glob("*-mask.png")):
+        name = path.name.removesuffix("-mask.png")
+        rgb = read_picture(folder / f"{name}-transparent-rgb-img.jpg")
+        camera = _camera(folder / "camera_intrinsics.yaml", rgb.shape[2], rgb.shape[1])
+        depth, twin = (_exr(folder / f"{name}-{kind}-depth-img.exr") for kind in ("transparent", "opaque"))
+        mask = torch.from_numpy(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE))[None] > 0
+        found.append(Glass(without_truth(name, rgb, depth, camera), twin, mask))
+    return found
+
+
+def _exr(path: Path) -> Tensor:
+    """Return the depth of an EXR file, (1, H, W) in metres, NaN in holes."""
+    import OpenEXR  # noqa: PLC0415 - this part alone needs it
+
+    channels = OpenEXR.File(str(path)).channels()
+    values = next(iter(channels.values())).pixels
+    depth = torch.from_numpy(np.ascontiguousarray(values[..., 0] if values.ndim == 3 else values)).float()[None]
+    return depth.masked_fill(~(depth > 0), torch.nan)
+
+
+def _camera(path: Path, width: int, height: int) -> Camera:
+    """Return the camera of ClearGrasp's file."""
+    values = yaml.safe_load(path.read_text())
+    return Camera(width, height, *(float(values[key]) for key in ("fx", "fy", "cx", "cy")))
+
+
+def score_glass(scene: Glass, surface: Surface) -> dict[str, float]:
+    """Score a result in the clear objects."""
+    inside = scene.mask & scene.twin.isfinite() & surface.depth.isfinite()
+    wrong = ((surface.depth - scene.twin).abs() > OFF)[inside]
+    found = {"wrong": 100 * float(wrong.double().mean())}
+    if surface.depth_error is not None:
+        error = surface.depth_error[inside]
+        found["believed"] = 100 * float((error[wrong] < SURE).double().mean())
+        rank = mannwhitneyu(error[wrong].numpy(), error[~wrong].numpy()).statistic
+        found["AUC"] = float(rank) / max(int(wrong.sum()) * int((~wrong).sum()), 1)
+    return found
+
+
+def angle_of_phone(shared: Path, method: Method) -> dict[str, float]:
+    """Return the score of the simulated phone."""
+    capture = CAPTURES["simulated_phone"](shared)
+    scores = capture.scores(method(capture.sample).depth)
+    assert scores is not None  # noqa: S101 - for the type checker
+    return {"angle": scores["angle"]}
+
+
+def measure(part: str, method: Method, shared: Path, count: int | None) -> dict[str, float]:
+    """Return the scores of a method in one part, means over its frames."""
+    if part == "board":
+        return mean([score_board(each, method(each.sample)) for each in boards(shared, count)])
+    if part == "ddrnet":
+        rows = []
+        for name in ddrnet_frames(shared).scenes()[:count]:
+            capture = ddrnet(name, (), shared)
+            surface = method(capture.sample)
+            again = score_capture(smoothed(capture), surface)
+            rows.append({**score_capture(capture, surface), "smoothed": again["RMSE_v"]})
+        return mean(rows)
+    if part == "rgbdd":
+        names = sorted(path.stem.partition("_")[0] for path in (shared / "real" / "rgbdd_real" / "RGB").iterdir())
+        captures = [rgbdd_real(name, (), shared) for name in names[:count]]
+        return mean([score_capture(each, method(each.sample)) for each in captures])
+    if part == "floors":
+        captures_of = {name: CAPTURES[name](shared) for name in FLOORS}
+        return {
+            name: flatness(method(each.sample).depth, each.sample.camera, FLOORS[name])
+            for name, each in captures_of.items()
+        }
+    if part == "phone":
+        return angle_of_phone(shared, method)
+    return mean([score_glass(each, method(each.sample)) for each in glasses(shared)[:count]])
+
+
+def mean(rows: Sequence[dict[str, float]]) -> dict[str, float]:
+    """Return the means of rows with the same keys."""
+    return {key: float(np.mean([row[key] for row in rows])) for key in rows[0]}
+
+
+def filtered(sample: DepthSample, window: int, of_depth: float, of_place: float) -> Surface:
+    """Return OpenCV's bilateral filter of a map."""
+    enlarged = given(Capture(sample, ()))
+    return Surface(filter_bilateral(enlarged, window, of_depth, of_place), None, None, None)
+
+
+def upsampled(sample: DepthSample, name: str, settings: dict[str, str], device: str) -> Surface:
+    """Return what ``dsr upsample`` computes."""
+    return upsample_surface(
+        sample.rgb, sample.depth_lr, sample.camera, method=name, settings=settings, device=device, fill="none"
+    )
+
+
+def main() -> None:
+    """Measure and print a row for each part and method."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--shared", type=Path, default=Path(os.environ.get("DSR_SHARED", "../shared")))
+    parser.add_argument("--methods", default="facets")
+    parser.add_argument("--weights", help="a file of weights for the methods")
+    parser.add_argument("--only", default=",".join(PARTS), help="parts to measure; all are the default")
+    parser.add_argument("--frames", type=int, help="number of frames of each part; all are the default")
+    parser.add_argument("--filters", action="store_true", help="measure the filters, too")
+    parser.add_argument("--device", default="cpu")
+    options = parser.parse_args()
+    methods: dict[str, Method] = {"input": lambda sample: Surface(given(Capture(sample, ())), None, None, None)}
+    if options.filters:
+        for each in FILTERS:
+            methods[f"bilateral {each}"] = lambda sample, each=each: filtered(sample, *each)  # type: ignore[misc]
+    settings = {"weights": options.weights} if options.weights else {}
+    for name in filter(None, options.methods.split(",")):
+        methods[name] = lambda sample, name=name: upsampled(sample, name, settings, options.device)  # type: ignore[misc]
+    for part in options.only.split(","):
+        for label, method in methods.items():
+            scores = measure(part, method, options.shared, options.frames)
+            print(f"{part:<8} {label:<24} " + "  ".join(f"{k} {v:.4g}" for k, v in scores.items()), flush=True)
+
+
+if __name__ == "__main__":
+    main()

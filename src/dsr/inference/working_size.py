@@ -1,0 +1,184 @@
+"""The size at which a sensor's map is worked on: where its noise is alike over many pixels, a fraction of its own.
+
+A network takes waves that are wider than it looks at for the shape of the surface. At a size at which neighbours'
+noise is independent again it averages them, and the details that are lost were drowned in the noise.
+
+The noise is told from shape by what becomes of it in larger and larger windows, less a plane in inverse depth. Noise
+stays alike over the same number of pixels, while bends of surfaces are alike over a third of the window, whatever it
+is. The flattest tenth of the windows counts. A surface that is covered with bumps may look the same. The noise of a
+sensor, however, is never as smooth as a bumpy surface, since depth is counted in steps, and no window is free of it.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from dsr.inference.options import SIZES
+from dsr.methods.base import MapNoise
+
+_WINDOWS = (8, 12, 16, 24, 32, 48, 64, 96, 128, 192, 256, 384)
+"""Pixels."""
+_LARGEST_WINDOW = 0.6
+"""Of the map's smaller side."""
+_MOST = 1500
+"""About how many windows of a size are looked at, and the flattest ones that are correlated."""
+_MOST_CORRELATED = 200
+_FEWEST = 6
+_KNOWN = 0.95
+"""Share of a window's pixels that has to be known."""
+_WIDTHS = 5
+"""Windows are as many correlation lengths wide, or wider, where they hold noise."""
+_LEAST, _LARGEST = 2e-4, 0.02
+"""Standard deviations relative to the depth that count as noise."""
+_FINE = 0.03
+"""Least noise in windows of 8 pixels over that in the windows of noise: 0.06 to 0.4 for sensors, less than 0.01 for
+bumpy surfaces that are rendered, computed or rounded."""
+_LEVEL = 0.4
+"""Least noise of any window over that of the tenth in order: 0.55 to 0.95 for sensors, 0.1 for bumpy surfaces."""
+_LENGTHS = 2.3
+"""Correlation lengths over the factor: noise of that full width is nearly independent after it."""
+_LEFT = 0.6
+"""Standard deviation of the result's error over that of the noise of a map that was worked on at a smaller size: noise is
+alike, a little, even over the distances over which the network averages. 0.5 to 0.75 before an exact plane."""
+_CALM, _UNSURE = 1.5, 4.0
+"""Expected errors over their median up to which they are of noise, and from which on they are of something else."""
+_LARGE = 2**19
+"""Pixels from which on a map is looked at in half its size."""
+
+
+class _Planes(NamedTuple):
+    """Planes a u + b v + c of square windows of inverse depth, (n,) each, and how far the pixels are from them.
+
+    ``rows``, ``columns``: of the upper left pixels; ``deviation``: root mean square, relative to the ``mean``.
+    """
+
+    rows: Tensor
+    columns: Tensor
+    a: Tensor
+    b: Tensor
+    c: Tensor
+    mean: Tensor
+    deviation: Tensor
+
+
+def find_noise(depth: Tensor) -> MapNoise | None:
+    """Return the noise of a sensor's map; None where it has none that can be told from shape.
+
+    Args:
+        depth: (1, h, w) in metres, NaN in holes.
+
+    """
+    inverse = depth[0].double().reciprocal()
+    step = 2 if inverse.numel() > _LARGE else 1
+    if step > 1:
+        inverse = inverse[: inverse.shape[0] // 2 * 2, : inverse.shape[1] // 2 * 2]
+        inverse = functional.avg_pool2d(inverse[None, None], 2)[0, 0]  # a hole makes a hole
+    found, before, finest = None, (0, 0.0), 0.0
+    for size in _WINDOWS:
+        planes = _fit_planes(inverse, size) if size <= _LARGEST_WINDOW * min(inverse.shape) else None
+        if planes is None:
+            break
+        count = max(_FEWEST, len(planes.deviation) // 10)
+        deviations, order = planes.deviation.sort()
+        deviation = float(deviations[:count].median())
+        finest = finest or max(float(deviations[len(deviations) // 10]), 1e-12)
+        steeper = before[1] > _LEAST and deviation > 1.05 * before[1] * (size / before[0]) ** 2
+        if deviation > _LARGEST or steeper:
+            break  # surfaces bend, or end, within the windows
+        if deviation > _LEAST:
+            flattest = order[: min(count, _MOST_CORRELATED)]
+            extent = _extent(inverse, planes, flattest, size, deviation)
+            if extent <= size / _WIDTHS:
+                level = float(deviations[0] / deviations[len(deviations) // 10])
+                fine = finest / deviation
+                metres = deviation / float(planes.mean[flattest].median())
+                found = MapNoise(metres, step * extent) if level >= _LEVEL and fine >= _FINE else None
+        before = (size, deviation)
+    return found
+
+
+def working_size_of(extent: float) -> int:
+    """Return by what the size of a map is divided whose noise is alike over some pixels: a power of 2, 4 or more, or 1.
+
+    Args:
+        extent: full width at half maximum of the noise's autocorrelation, in pixels.
+
+    """
+    factor = 2 ** int(math.log2(max(extent / _LENGTHS, 1)))
+    return 1 if factor < SIZES[2] else min(factor, SIZES[-1])
+
+
+def reduce_by_medians(inverse: Tensor, factor: int) -> Tensor:
+    """Return the medians of blocks of inverse depth, (1, h, w) with sides that the factor divides.
+
+    A block of which less than a quarter is known is a hole.
+    """
+    _, height, width = inverse.shape
+    blocks = inverse.view(height // factor, factor, width // factor, factor).transpose(1, 2).flatten(2)
+    known = blocks.isfinite().sum(dim=2) >= factor**2 / 4
+    return torch.where(known, blocks.nanmedian(dim=2).values, torch.nan)[None]
+
+
+def limit_to_noise(spread: Tensor, noise: MapNoise, inverse: float) -> Tensor:
+    """Return expected relative errors, (1, H, W), that are no more than the noise of the map leaves, where all is calm.
+
+    At a smaller size a network takes the noise for that of neighbours which it knows nothing of.
+
+    Args:
+        spread: of the network.
+        noise: of the map at its own size.
+        inverse: the map's median, in 1/m.
+
+    """
+    left = _LEFT * math.sqrt(2 / math.pi) * noise.deviation * inverse
+    median = spread.nanmedian()
+    share = ((_UNSURE - spread / median) / (_UNSURE - _CALM)).clamp(0, 1)
+    return spread * torch.lerp(torch.ones_like(spread), (left / median).clamp(max=1).expand_as(spread), share)
+
+
+def _fit_planes(inverse: Tensor, size: int) -> _Planes | None:
+    """Return the planes of windows that are known, by least squares; None for too few."""
+    height, width = inverse.shape
+    stride = max(size // 2, int(math.sqrt(height * width / _MOST)))
+    known = inverse.isfinite()
+    m, v = known.to(inverse), torch.where(known, inverse, 0)
+    x = torch.arange(width, dtype=v.dtype, device=v.device) / size
+    y = (torch.arange(height, dtype=v.dtype, device=v.device) / size)[:, None]
+    products = torch.stack((m, m * x, m * y, m * x * x, m * x * y, m * y * y, v, v * x, v * y, v * v))
+    means = functional.avg_pool2d(products[None], size, stride)[0]
+    rows, columns = torch.nonzero(means[0] >= _KNOWN, as_tuple=True)
+    if len(rows) < _FEWEST:
+        return None
+    means = means[:, rows, columns]
+    _, mx, my, xx, xy, yy, mean, vx, vy, vv = means / means[0]
+    xx, xy, yy, vx, vy, vv = xx - mx * mx, xy - mx * my, yy - my * my, vx - mx * mean, vy - my * mean, vv - mean * mean
+    determinant = xx * yy - xy * xy
+    a, b = (vx * yy - vy * xy) / determinant, (vy * xx - vx * xy) / determinant
+    deviation = (vv - a * vx - b * vy).clamp(min=0).sqrt() / mean
+    return _Planes(rows * stride, columns * stride, a / size, b / size, mean - a * mx - b * my, mean, deviation)
+
+
+def _extent(inverse: Tensor, planes: _Planes, chosen: Tensor, size: int, deviation: float) -> float:
+    """Return the full width at half maximum of the autocorrelation within windows; their size if it is wider."""
+    places = torch.arange(size, device=inverse.device)
+    rows, columns = planes.rows[chosen, None, None] + places[:, None], planes.columns[chosen, None, None] + places
+    plane = planes.a[chosen, None, None] * columns + planes.b[chosen, None, None] * rows + planes.c[chosen, None, None]
+    rest = inverse[rows, columns] - plane
+    scale = planes.mean[chosen] * planes.deviation[chosen].clamp(min=deviation / 3)  # all windows count alike
+    known = rest.isfinite()
+    rest, known = torch.where(known, rest / scale[:, None, None], 0).float(), known.float()
+    power, before = float(rest.square().sum() / known.sum()), 1.0
+    for lag in range(1, size // 2 + 1):
+        now = 0.0
+        for dim in (1, 2):
+            pairs = [each.narrow(dim, lag, size - lag) * each.narrow(dim, 0, size - lag) for each in (rest, known)]
+            now += float(pairs[0].sum() / pairs[1].sum()) / power / 2
+        if now < 0.5:
+            return 2 * (lag - 1 + (before - 0.5) / (before - now))
+        before = now
+    return float(size)
