@@ -81,9 +81,9 @@ class MethodChoice:
             raise ValueError(text if set_here else f"method={self.name}: {text}") from error
 
     def finds_noise(self) -> bool:
-        """Return whether the method has weights for several ratios of the sizes, and is not told that there is no noise.
+        """Return whether the method may work at a size that the map's noise suggests.
 
-        It may then work at a size that the noise suggests.
+        It has to have weights for several ratios of the sizes, and not to be told that there is no noise.
         """
         told = self.settings.get("clean") or self.settings.get("noise") == 0
         return not told and bool(read_ability(self.name, self.directories, self.settings).factors)
@@ -276,9 +276,9 @@ def _upsample_padded(
     ratio: float,
 ) -> _Found:  # fmt: skip
     """Return what :func:`_upsample_inverse` returns for the photo, padded to ``ratio`` times the map, cropped again."""
-    size = tuple(max(round(ratio * n), m) for n, m in zip(_size(inverse), _size(rgb), strict=True))
-    padded = _pad_photo(rgb, size)
-    camera_padded = Camera(size[1], size[0], camera.fx, camera.fy, camera.cx, camera.cy)
+    height, width = (max(round(ratio * n), m) for n, m in zip(_size(inverse), _size(rgb), strict=True))
+    padded = _pad_photo(rgb, (height, width))
+    camera_padded = Camera(width, height, camera.fx, camera.fy, camera.cx, camera.cy)
     found = _upsample_inverse(padded, inverse, camera_padded, scale, choice, progress)
     return found.crop((camera.height, camera.width))
 

@@ -43,8 +43,8 @@ _LEVEL = 0.4
 _LENGTHS = 2.3
 """Correlation lengths over the factor: noise of that full width is nearly independent after it."""
 _LEFT = 0.6
-"""Standard deviation of the result's error over that of the noise of a map that was worked on at a smaller size: noise is
-alike, a little, even over the distances over which the network averages. 0.5 to 0.75 before an exact plane."""
+"""Standard deviation of the result's error over that of the noise of a map that was worked on at a smaller size. It is
+alike, a little, even over the distances over which the network averages: 0.5 to 0.75 before an exact plane."""
 _CALM, _UNSURE = 1.5, 4.0
 """Expected errors over their median up to which they are of noise, and from which on they are of something else."""
 _LARGE = 2**19

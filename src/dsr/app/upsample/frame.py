@@ -178,10 +178,9 @@ def _describe(noise: MapNoise | None, *, given: bool) -> list[Assumption]:
     extent = f", correlated over {noise.extent:.0f} pixels" if noise.extent > _WHITE else ""
     text = f"about {1e3 * noise.deviation:.2g} mm{extent}"
     if noise.reduced > 1:
-        return [
-            Assumption("noise of the depth map", f"{text}: worked on at 1/{noise.reduced}; --working-size overrides it")
-        ]
-    return [Assumption("noise of the depth map", f"{text}; --noise overrides it")]
+        text += f": worked on at 1/{noise.reduced}"
+    option = "--noise" if noise.reduced == 1 else "--working-size"
+    return [Assumption("noise of the depth map", f"{text}; {option} overrides it")]
 
 
 def _describe_outliers(outliers: Outliers | None) -> list[Assumption]:

@@ -36,7 +36,8 @@ class UpsampleRequest:
         rgb, depth, mask: files, or one folder each of the first two.
         confidence: files of confidence maps, or a folder of them.
         reading: how to read the files.
-        method, settings, directories, scale, device, fill, max_hole, working_size: see :func:`dsr.inference.upsample_depth`.
+        method, settings, directories, scale, device, fill, max_hole, working_size: see
+            :func:`dsr.inference.engine.upsample_surface`.
         max_error: expected relative error of the depth from which a pixel is left out of cloud and mesh.
         max_faces: triangles from which a mesh is simplified.
         max_points: points from which a cloud is thinned.
