@@ -162,7 +162,7 @@ def test_interrupted_run_resumes_within_the_image(tmp_path: Path, run: Run) -> N
 
 
 SLOW = """
-import os, signal, sys, time
+import os, pathlib, signal, sys, time
 sys.path.insert(0, {source!r})
 from dsr.methods.dip.optimisation import PriorOptimisation
 from dsr.utils import interruption
@@ -172,7 +172,8 @@ step = PriorOptimisation.training_step
 
 def slow(self, *batch):
     loss = step(self, *batch)
-    if self.global_step == 2:
+    if self.global_step == 2 and not pathlib.Path("sent").exists():  # by one worker
+        pathlib.Path("sent").touch()
         for number in {numbers}:
             os.kill({process}(), number)
             time.sleep(0.1)
@@ -211,8 +212,7 @@ def test_step_longer_than_the_grace_is_saved_at_ctrl_c_and_no_checkpoint_named_t
     assert line.startswith(end)
     saved = [torch.load(path, weights_only=True)["global_step"] for path in (tmp_path / "out").rglob("last.ckpt")]
     if numbers == (signal.SIGINT,):
-        line = "stopping after this step (Ctrl-C again stops at once)"
-        assert told == [line] or (workers == 2 and told == [])  # the worker's step may end before its parent waits
+        assert told == ["stopping after this step (Ctrl-C again stops at once)"]
         assert 3 in saved
     else:
         assert (told, saved) == ([], [])

@@ -72,6 +72,7 @@ class _State:
         deferred: what notes a signal; None if signals raise.
         requeues: whether a scheduler requeues the job of this process, see :func:`requeued`.
         silent: whether the process ends without a line, as another one of the same command says it.
+        pools: how many groups of worker processes are at work, see :func:`with_workers`.
         ending: held by the thread that ends the process.
 
     """
@@ -84,6 +85,7 @@ class _State:
     deferred: Deferred | None = None
     requeues = False
     silent = False
+    pools = 0
     ending = threading.Lock()
 
 
@@ -267,6 +269,16 @@ def outlast_group() -> None:
         signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGTERM})
 
 
+@contextlib.contextmanager
+def with_workers() -> Iterator[None]:
+    """Within this context, Ctrl-C waits for steps that worker processes are at, however long it takes to reach them."""
+    _State.pools += 1
+    try:
+        yield
+    finally:
+        _State.pools -= 1
+
+
 def is_ctrl_c() -> bool:
     """Return whether the signal that came first is that of Ctrl-C."""
     return _State.number == signal.SIGINT
@@ -336,7 +348,7 @@ def _watch(pipe: int) -> None:
             if came:
                 end(_message())
             came, deadline = time.monotonic(), time.monotonic() + grace
-        elif _State.deferred is not None and is_ctrl_c() and not _State.silent:
+        elif (_State.deferred is not None or _State.pools) and is_ctrl_c() and not _State.silent:
             deadline = time.monotonic() + grace
             if not told and time.monotonic() - came >= _SILENCE:
                 told = True

@@ -83,9 +83,11 @@ class Pool(Generic[_T, _R]):
         self._busy: dict[Connection, _Task[_T, _R] | None] = {}
         self._processes: dict[Connection, BaseProcess] = {}
         self._without_plan: set[Connection] = set()
+        self._stack = contextlib.ExitStack()
 
     def __enter__(self) -> Self:
         """Return itself."""
+        self._stack.enter_context(interruption.with_workers())
         return self
 
     def __exit__(
@@ -102,6 +104,7 @@ class Pool(Generic[_T, _R]):
                 process.join()
                 connection.close()
         self._processes, self._busy = {}, {}
+        self._stack.close()
 
     def results(self, items: Sequence[_T], *, ordered: bool = False) -> Generator[tuple[_T, _R]]:
         """Begin to work on items, and return each with its result.

@@ -1,0 +1,117 @@
+"""The noise of a sensor's map is told from shape, and the map is worked on at the size that it suggests."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from dsr.data.procedural import Procedural
+from dsr.geometry.camera import Camera
+from dsr.inference.engine import upsample_surface
+from dsr.inference.working_size import find_noise, limit_to_noise, reduce_by_medians, working_size_of
+from dsr.methods.base import MapNoise
+
+SIZE = (480, 640)
+
+
+def room() -> np.ndarray:
+    """Return the inverse depth of a floor and two walls, the nearer one in front."""
+    v, u = np.mgrid[: SIZE[0], : SIZE[1]].astype(np.float64)
+    values = np.where(v > 320, 0.3 + 0.001 * (v - 320), 0.3 + 0.0001 * u)
+    return np.where((u > 60) & (u < 190) & (v > 80) & (v < 400), 0.8 - 0.0002 * v, values)
+
+
+def noisy(width: float, deviation: float = 0.004) -> Tensor:
+    """Return depth of the room, (1, h, w), with noise of a full width at half maximum, in steps of a millimetre."""
+    noise = np.random.default_rng(0).standard_normal(SIZE)
+    if width > 1:
+        noise = cv2.GaussianBlur(noise, (0, 0), width / 2.355 / np.sqrt(2))
+    inverse = room() * (1 + deviation * noise / noise.std())
+    return torch.from_numpy(np.round(1e3 / inverse) / 1e3)[None]
+
+
+@pytest.mark.parametrize("width", [3, 6, 10, 16, 24])
+def test_noise_is_found_with_its_strength_and_extent(width: float) -> None:
+    found = find_noise(noisy(width))
+    assert found is not None
+    assert found.extent == pytest.approx(width, rel=0.2)
+    assert found.deviation == pytest.approx(0.004 * float(noisy(width).median()), rel=0.35)
+
+
+def test_map_without_noise_has_none() -> None:
+    assert find_noise(torch.from_numpy(1 / room())[None]) is None
+
+
+def test_rendered_surfaces_are_not_taken_for_noise(dsr_cache: Path) -> None:
+    source = Procedural(count=3, size=256)
+    found = [find_noise(source.load(name).depth) for name in source.scenes()]  # type: ignore[arg-type]
+    assert all(noise is None or working_size_of(noise.extent) == 1 for noise in found)
+
+
+def test_bumps_are_no_noise() -> None:
+    bumps = cv2.GaussianBlur(np.random.default_rng(0).standard_normal(SIZE), (0, 0), 8)
+    assert find_noise(torch.from_numpy(1 / (room() * (1 + 0.004 * bumps / bumps.std())))[None]) is None
+
+
+@pytest.mark.parametrize(("extent", "factor"), [(1, 1), (9, 1), (10, 4), (20, 8), (37, 16), (200, 16)])
+def test_size_is_divided_by_less_than_half_of_the_extent(extent: float, factor: int) -> None:
+    assert working_size_of(extent) == factor
+
+
+def test_medians_of_planes_are_planes_and_blocks_that_are_mostly_holes_are_holes() -> None:
+    v, u = torch.meshgrid(torch.arange(12).double(), torch.arange(16).double(), indexing="ij")
+    plane = (1 + 0.1 * u + 0.03 * v)[None]
+    found = reduce_by_medians(plane, 4)
+    assert found.shape == (1, 3, 4)
+    steps = found[0].diff(dim=1)
+    torch.testing.assert_close(steps, torch.full_like(steps, 0.4))
+    plane[0, :4, :4] = torch.nan
+    plane[0, 0, :3] = 1.0
+    assert bool(reduce_by_medians(plane, 4)[0, 0, 0].isnan())
+    plane[0, 0, 3] = 1.0
+    assert float(reduce_by_medians(plane, 4)[0, 0, 0]) == 1
+
+
+def test_calm_errors_are_no_larger_than_the_noise_leaves_and_others_stay() -> None:
+    spread = torch.full((1, 8, 8), 0.02)
+    spread[0, 0, 0] = 0.2
+    limited = limit_to_noise(spread, MapNoise(0.01, 20), 1.0)
+    assert float(limited[0, 4, 4]) == pytest.approx(0.6 * np.sqrt(2 / np.pi) * 0.01)
+    assert float(limited[0, 0, 0]) == pytest.approx(0.2)
+    assert torch.equal(limit_to_noise(spread, MapNoise(1.0, 20), 1.0), spread)
+
+
+def test_waves_of_a_sensor_are_averaged_and_size_can_be_chosen() -> None:
+    depth = noisy(20)
+    camera = Camera.centred(SIZE[1], SIZE[0], 600.0)
+    rgb = torch.full((3, *SIZE), 0.5)
+    errors = {}
+    for size in (None, 1, 8):
+        surface = upsample_surface(rgb, depth, camera, working_size=size)
+        wall = surface.depth[0, 20:300, 220:620].double()
+        errors[size] = float((wall.reciprocal() / torch.from_numpy(room()[20:300, 220:620]) - 1).std())
+        assert surface.noise is not None
+    assert errors[None] == errors[8] < 0.75 * errors[1]
+    with pytest.raises(ValueError, match="working_size: expected one of 1, 2, 4, 8, 16, got 3"):
+        upsample_surface(rgb, depth, camera, working_size=3)
+
+
+def test_maps_that_are_known_to_be_clean_are_worked_on_as_they_are() -> None:
+    depth, camera = noisy(20), Camera.centred(SIZE[1], SIZE[0], 600.0)
+    rgb = torch.full((3, *SIZE), 0.5)
+    told = upsample_surface(rgb, depth, camera, settings={"noise": 0.0})
+    assert torch.equal(told.depth, upsample_surface(rgb, depth, camera, working_size=1, settings={"noise": 0.0}).depth)
+
+
+def test_board_before_a_stereo_camera_is_worked_on_at_an_eighth_or_less(shared: Path) -> None:
+    folder = shared / "real" / "stereo_board" / "depth"
+    for name, factor in (("8", 8), ("14", 16)):
+        depth = torch.from_numpy(cv2.imread(str(folder / f"{name}.png"), cv2.IMREAD_UNCHANGED).astype(np.float32))[None]
+        found = find_noise(torch.where(depth > 0, depth / 1000, torch.nan))
+        assert found is not None
+        assert working_size_of(found.extent) == factor
