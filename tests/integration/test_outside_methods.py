@@ -148,10 +148,10 @@ def test_methods_are_told_what_is_known_of_the_maps(home, arguments, told):
 
 
 def test_upsample_runs_a_method_from_outside_with_settings(home):
-    done = upsample(home, "--method", "constant", "--set", "offset=0.25", "-o", "picture")
+    done = upsample(home, "--method", "constant", "--set", "offset=0.001", "-o", "picture")
     assert (done.returncode, done.stderr) == (0, "")
-    np.testing.assert_allclose(np.load(home / "picture" / "depth_metres.npy"), 1.75, rtol=1e-6)
-    done = upsample(home, "--method", "constant", "--set", "ofset=0.25", "-o", "other")
+    np.testing.assert_allclose(np.load(home / "picture" / "depth_metres.npy"), 1.501, rtol=1e-6)
+    done = upsample(home, "--method", "constant", "--set", "ofset=0.001", "-o", "other")
     assert done.returncode == 2
     assert done.stderr == "error: --set ofset: unknown key; method=constant takes offset\n"
     assert not (home / "other").exists()
