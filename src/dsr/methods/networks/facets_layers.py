@@ -124,23 +124,8 @@ class Context(nn.Module):
             kept.append(x)
         x = x + self.overall(x.mean(dim=(-2, -1)))[..., None, None]
         for i in (2, 1):
-            x = self.decoder[i - 1](functional.relu(kept[i - 1] + grow(self.grow[i], x)))
-        return grow(self.grow[0], x)[..., :height, :width]
-
-
-def grow(conv: Any, x: Tensor) -> Tensor:
-    """Return ``pixel_shuffle(conv(x), 2)`` of a 1 x 1 convolution, in channels_last order: (B, C, 2 h, 2 w).
-
-    The convolution's outputs are put into the order in which whole runs of channels are copied.
-    """
-    if exporting():
-        return functional.pixel_shuffle(conv(x), 2)
-    batch, _, height, width = x.shape
-    channels = conv.out_channels // 4
-    weight = conv.weight.view(channels, 4, -1).transpose(0, 1).reshape(conv.weight.shape)
-    bias = None if conv.bias is None else conv.bias.view(channels, 4).T.flatten()
-    y = functional.conv2d(x, weight, bias).permute(0, 2, 3, 1).reshape(batch, height, width, 2, 2, channels)
-    return y.transpose(2, 3).reshape(batch, 2 * height, 2 * width, channels).permute(0, 3, 1, 2)
+            x = self.decoder[i - 1](functional.relu(kept[i - 1] + functional.pixel_shuffle(self.grow[i](x), 2)))
+        return functional.pixel_shuffle(self.grow[0](x), 2)[..., :height, :width]
 
 
 def convolve_together(convs: Sequence[nn.Conv2d], x: Tensor) -> tuple[Tensor, ...]:

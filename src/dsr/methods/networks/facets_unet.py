@@ -44,7 +44,6 @@ from dsr.methods.networks.facets_layers import (
     Context,
     MixedResidual,
     convolve_together,
-    grow,
     make_pyramid,
     photo_input,
     scale_down,
@@ -324,7 +323,7 @@ class FacetsUNet(DisparityNetwork):
     def _choose(self, x: Tensor, planes: Tensor, pyramid: list[Tensor], scale: int) -> tuple[Tensor, Tensor, Tensor]:
         """Return the mixture of planes, the logarithms of the expected errors, (B, 2, H, W), and residuals' factors."""
         for up, join, features in zip(self.up, self.join, reversed(pyramid[:-1]), strict=True):
-            x = functional.relu(join(torch.cat((grow(up, x), features), dim=1)))
+            x = functional.relu(join(torch.cat((functional.pixel_shuffle(up(x), 2), features), dim=1)))
         choice, errors, gate = convolve_together((self.choice, self.errors, self.gate), x)
         return mix_planes(planes, choice, scale), errors.float() - 5, torch.sigmoid(gate.float() + _CLOSED)
 
