@@ -178,11 +178,11 @@ def _prepare(plain: dict[str, Any], settings: TrainConfig, device: torch.device,
     """Check and build all that a training on a number of devices needs, and write nothing."""
     if settings.seed > _LARGEST_SEED:
         raise ConfigError(f"seed: expected at most {_LARGEST_SEED}, got {settings.seed}")
-    if settings.downsampling.get("assumed") is not None:
-        raise ConfigError("downsampling.assumed: a training assumes no downsampling model; leave it out")
     lightning.seed_everything(settings.seed, workers=True, verbose=False)
     net = _network(settings)
     data = training_data(settings, devices)
+    if settings.downsampling.get("assumed") is not None:
+        raise ConfigError("downsampling.assumed: a training assumes no downsampling model; leave it out")
     check_metrics(settings.metrics)
     for name in settings.logger:
         expect_installed(name)
