@@ -131,7 +131,7 @@ class _AveragePlanes(torch.autograd.Function):
             value = near[:, :, 0] - across[j] * near[:, :, 1] - down[i][:, None] * near[:, :, 2]
             total[:, :, 0].addcmul_(weights[:, :, k], value)
             total[:, :, 1:].addcmul_(weights[:, :, k, None], near[:, :, 1:])
-        ctx.save_for_backward(padded, weights)
+        ctx.save_for_backward(padded, weights, *down, *across)
         ctx.reach = reach
         return total
 
@@ -139,9 +139,9 @@ class _AveragePlanes(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, Tensor, None]:
         """Return the gradients of the planes and of the weights."""
-        padded, weights = ctx.saved_tensors
+        padded, weights, *offsets = ctx.saved_tensors
+        down, across = offsets[:3], offsets[3:]
         reach, (height, width) = ctx.reach, gradient.shape[-2:]
-        down, across = _offsets(height, reach, gradient), _offsets(width, reach, gradient)
         of_padded, of_weights = torch.zeros_like(padded), torch.empty_like(weights)
         of_value, of_u, of_v = gradient.unbind(dim=2)
         for k in range(NEIGHBOURS):
