@@ -13,7 +13,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from omegaconf import OmegaConf
+from omegaconf import DictConfig, OmegaConf
 
 from dsr.app.composition import compose
 from dsr.app.schema import given_keys, plain_config, user_directories
@@ -72,13 +72,14 @@ def _defaults(kind: str, config: Mapping[str, Any]) -> tuple[dict[str, str], dic
              for group, name in each.items() if group not in NOT_IDENTITY and group in config}  # fmt: skip
     chosen = {group: str(config[group]["name"]) for group in usual}
     known = [f"{group}={name}" for group, name in chosen.items() if name in list_choices(group, places)]
-    return usual, _compose(kind, (*known, f"scale={config['scale']}"), tuple(places)), len(known) == len(chosen)
+    composed = _compose(kind, (*known, f"scale={config['scale']}"), tuple(places))
+    return usual, plain_config(composed), len(known) == len(chosen)
 
 
 @functools.lru_cache(maxsize=256)
-def _compose(kind: str, overrides: tuple[str, ...], places: tuple[Path, ...]) -> dict[str, Any]:
-    """Return a composed configuration, which is not to be changed."""
-    return plain_config(compose(kind, overrides, places))
+def _compose(kind: str, overrides: tuple[str, ...], places: tuple[Path, ...]) -> DictConfig:
+    """Return a composed configuration, which is not to be changed; what it takes from the environment is read later."""
+    return compose(kind, overrides, places)
 
 
 def _differing(config: Mapping[str, Any], defaults: Mapping[str, Any], head: str) -> dict[str, Any]:
