@@ -150,7 +150,7 @@ def _plan(prepared: _Prepared) -> Plan:
     done = 0 if prepared.settings.overwrite else sum(prediction_path(folder, scene).is_file() for scene in scenes)
     left = len(scenes) - done
 
-    def seconds() -> float:
+    def seconds(_: set[str]) -> float:
         example = _example(prepared)
         if example is None:
             return math.nan

@@ -48,7 +48,8 @@ class Plan:
         unit: what its work is counted in: scenes or steps.
         left: how many of them are left to do.
         done: how many are complete.
-        seconds: measures how long what is left will take, NaN if that is not known; None where nothing can be measured.
+        seconds: measures how long what is left will take, NaN if that is not known; what it shares with other jobs does
+            not count if the given set names it, and is added to it. None where nothing can be measured.
 
     """
 
@@ -57,7 +58,7 @@ class Plan:
     unit: str
     left: int
     done: int = 0
-    seconds: Callable[[], float] | None = None
+    seconds: Callable[[set[str]], float] | None = None
 
 
 Check = Callable[[DictConfig], Sequence[Plan]]
@@ -213,7 +214,8 @@ def _announce(plans: Sequence[Sequence[Plan]]) -> None:
     unit, left, done = every[0].unit, sum(plan.left for plan in every), sum(plan.done for plan in every)
     line = f"{len(plans)} job{'s' * (len(plans) > 1)}, {left} {unit}{'s' * (left != 1)}"
     line += f" ({done} more are complete)" if done else ""
-    measured = [(plan.left, plan.seconds()) for plan in every if plan.left and plan.seconds is not None]
+    shared: set[str] = set()
+    measured = [(plan.left, plan.seconds(shared)) for plan in every if plan.left and plan.seconds is not None]
     known = [(count, seconds) for count, seconds in measured if not math.isnan(seconds)]
     if known:
         some = sum(count for count, _ in known)

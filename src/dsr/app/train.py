@@ -62,9 +62,6 @@ _FOLDERS = ("checkpoints", "tensorboard", "csv", "wandb", "mlruns")
 """What a training writes into its directory beside files."""
 _LAST = Path("checkpoints", "last.ckpt")
 """The checkpoint that a training goes on from, in the directory of its run."""
-_SCENES = "scenes that are not in the cache"
-_COUNTED: set[str] = set()
-"""Data sets whose preparation is part of an earlier estimate of this process."""
 _RESUMABLE = ("resume", "device", "trust")
 
 
@@ -118,16 +115,14 @@ def plan(config: DictConfig) -> list[Plan]:
     elsewhere = () if here else ("device", "precision")
     rundir.expect_free(prepared.folder, plain, prepared.identity, (*prepared.tolerated, *elsewhere))
     left = _steps_left(prepared, settings)
-
-    def seconds() -> float:
-        costs = _costs(settings.trainer, prepared, devices=count, progress=SILENT)
-        named = str((plain["dataset"], plain["validation"]))
-        if named in _COUNTED:  # the first job of several prepares the scenes
-            costs = {what: each for what, each in costs.items() if _SCENES not in what}
-        _COUNTED.add(named)
-        return sum(costs.values())
-
     done = settings.trainer.steps - left
+
+    def seconds(shared: set[str]) -> float:
+        scenes = str((plain["dataset"], plain["validation"]))  # which the first job of several prepares
+        sources = [] if scenes in shared else _by_source(prepared.data)
+        shared.add(scenes)
+        return sum(_costs(settings.trainer, prepared, sources, done, devices=count, progress=SILENT).values())
+
     return [Plan(prepared.folder, prepared.identity, "step", left, done, seconds if here else None)]
 
 
@@ -423,29 +418,33 @@ def _announce(progress: Progress, settings: TrainConfig, prepared: _Prepared, de
     }
     for name, line in lines.items():
         progress.say(f"{name:<6} {line}")
-    costs = _costs(trainer, prepared, devices=devices, progress=progress)
+    done = 0 if prepared.resume is None else step_of(prepared.resume) or 0
+    costs = _costs(trainer, prepared, _by_source(data), done, devices=devices, progress=progress)
     named = ", ".join(f"{duration(seconds)} for {what}" for what, seconds in costs.items()) or "all steps are done"
     progress.say(f"time   about {duration(sum(costs.values()))}: {named}, as measured now")
 
 
-def _costs(trainer: TrainerConfig, prepared: _Prepared, *, devices: int, progress: Progress) -> dict[str, float]:
-    """Return the seconds of what is left of a training, as measured now, by what it is."""
-    data, module, interval = (
-        prepared.data,
-        prepared.module.to(prepared.device),
-        min(trainer.validate_every, trainer.steps),
-    )
-    done = 0 if prepared.resume is None else step_of(prepared.resume) or 0
+def _costs(
+    trainer: TrainerConfig,
+    prepared: _Prepared,
+    sources: Sequence[tuple[SceneSource, list[str]]],
+    done: int,
+    *,
+    devices: int,
+    progress: Progress,
+) -> dict[str, float]:
+    """Return the seconds of what a training has left after ``done`` steps, as measured now, by what it is."""
+    data, module = prepared.data, prepared.module.to(prepared.device)
+    interval = min(trainer.validate_every, trainer.steps)
     steps, validations = trainer.steps - done, math.ceil(trainer.steps / interval) - done // interval + (not done)
     try:
-        pairs = [seconds_to_prepare(source, names, progress) for source, names in _by_source(data)]
+        pairs = [seconds_to_prepare(source, names, progress) for source, names in sources]
         validation = seconds_per_validation(module, data) / devices
     except (ValueError, OSError) as error:
         raise keyed(error) from error
     step = seconds_per_step(module, data.example_batch()) * trainer.accumulate
-    preparing, scenes = (sum(each) for each in zip(*pairs, strict=True))
     parts = {
-        f"{scenes} {_SCENES}": preparing,
+        f"{sum(count for _, count in pairs)} scenes that are not in the cache": sum(seconds for seconds, _ in pairs),
         f"{steps} step{'s' * (steps != 1)} of {step:.2g} s": step * steps,
         f"{validations} validation{'s' * (validations != 1)} of {validation:.2g} s": validation * validations,
     }
