@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -115,3 +116,19 @@ def test_board_before_a_stereo_camera_is_worked_on_at_an_eighth_or_less(shared: 
         found = find_noise(torch.where(depth > 0, depth / 1000, torch.nan))
         assert found is not None
         assert working_size_of(found.extent) == factor
+
+
+@pytest.mark.parametrize(
+    ("scale", "options"),
+    [(None, {"method": "bicubic"}), (4, {}), (None, {"settings": {"noise": 0.0}})],
+)
+def test_size_that_would_have_no_effect_is_refused(scale: int | None, options: dict[str, Any]) -> None:
+    camera = Camera.centred(SIZE[1], SIZE[0], 600.0)
+    with pytest.raises(ValueError, match=r"^working_size: expected .* to take 8"):
+        upsample_surface(torch.full((3, *SIZE), 0.5), noisy(20), camera, scale, working_size=8, **options)
+
+
+def test_size_for_which_there_are_no_weights_is_refused() -> None:
+    camera = Camera.centred(4 * SIZE[1], 4 * SIZE[0], 2400.0)
+    with pytest.raises(ValueError, match=r"^working_size: expected at most 4 for"):
+        upsample_surface(torch.full((3, 4 * SIZE[0], 4 * SIZE[1]), 0.5), noisy(2), camera, working_size=8)

@@ -9,7 +9,13 @@ from dsr.inference.options import DEFAULT, WIDEST, Fill
 
 if TYPE_CHECKING:
     from dsr.inference.api import upsample, upsample_with_errors
-    from dsr.inference.engine import MethodChoice, check_settings, upsample_depth, upsample_surface
+    from dsr.inference.engine import (
+        MethodChoice,
+        check_settings,
+        check_working_size,
+        upsample_depth,
+        upsample_surface,
+    )
     from dsr.inference.inspection import enlarged_by
     from dsr.inference.planning import Plan, plan
 
@@ -20,6 +26,7 @@ __all__ = [
     "MethodChoice",
     "Plan",
     "check_settings",
+    "check_working_size",
     "enlarged_by",
     "plan",
     "upsample",
@@ -30,7 +37,7 @@ __all__ = [
 
 _NAMES = {
     "api": ("upsample", "upsample_with_errors"),
-    "engine": ("MethodChoice", "check_settings", "upsample_depth", "upsample_surface"),
+    "engine": ("MethodChoice", "check_settings", "check_working_size", "upsample_depth", "upsample_surface"),
     "inspection": ("enlarged_by",),
     "planning": ("Plan", "plan"),
 }

@@ -105,6 +105,17 @@ def check_settings(choice: MethodChoice) -> None:
     choice.build(next(iter(ability.single_steps), USUAL_SCALE))
 
 
+def check_working_size(choice: MethodChoice, scale: int | None, size: int | None) -> None:
+    """Check that a working size other than the map's own, 1 or None, has an effect.
+
+    Raises:
+        ValueError: it has none with this method and scale.
+
+    """
+    if size not in (None, 1) and not (scale is None and choice.finds_noise()):
+        raise ValueError(f"working_size: expected facets without a scale, for maps that may have noise, to take {size}")
+
+
 def upsample_depth(
     rgb: Tensor,
     depth: Tensor,
@@ -192,6 +203,7 @@ def upsample_surface(
     size = (camera.height, camera.width)
     choice = MethodChoice(method, settings or {}, tuple(directories), pick_device(device))
     planned = choice.plan(size, _size(depth), scale)  # raises ValueError for sizes or a scale that cannot be used
+    check_working_size(choice, scale, working_size)
     outliers = find_outliers(depth)
     inverse = depth.masked_fill(outliers, torch.nan).float().reciprocal()
     valid, factor = inverse.isfinite(), 1
@@ -257,16 +269,17 @@ def _upsample_at_working_size(
     rgb: Tensor, inverse: Tensor, camera: Camera, size: int | None, choice: MethodChoice, progress: Steps | None
 ) -> _Found:
     """Return high-resolution inverse depth of inverse depth, (1, h, w), whose size may be divided first."""
-    noise = find_noise(inverse.reciprocal()) if size is None else None
-    wanted = size or (1 if noise is None else working_size_of(noise.extent))
-    most = _LARGEST_RATIO * inverse.shape[-1] / camera.width
-    factor = max(each for each in SIZES if each == 1 or each <= min(wanted, most))
+    most = max(each for each in SIZES if each == 1 or each <= _LARGEST_RATIO * inverse.shape[-1] / camera.width)
+    if size is not None and size > most:
+        raise ValueError(f"working_size: expected at most {most} for this map's size and the photo's, got {size}")
+    noise = find_noise(inverse.reciprocal())
+    factor = size or min(1 if noise is None else working_size_of(noise.extent), most)
     if factor == 1:
         return _upsample_inverse(rgb, inverse, camera, None, choice, progress)
     inverse_lr = reduce_by_medians(pad_inverse_depth(inverse, factor), factor)
     found = _upsample_padded(rgb, inverse_lr, camera, None, choice, progress, factor * camera.width / inverse.shape[-1])
-    if noise is None or found.spread is None:
-        return found
+    if noise is None or found.spread is None:  # what the network has found is of the smaller map
+        return found._replace(noise=None)
     left = limit_to_noise(found.spread, noise, float(inverse.nanmedian()))
     return found._replace(spread=left, noise=noise._replace(reduced=factor))
 

@@ -153,12 +153,21 @@ class UpsampleRequest:
 
     def _check_method(self) -> None:
         """Check that the method accepts the settings."""
-        if not self.settings:
+        if not self.settings and self.working_size is None:
             return
-        from dsr.inference import MethodChoice, check_settings  # noqa: PLC0415 - other values are refused without torch
+        from dsr.inference import (  # noqa: PLC0415 - other values are refused without torch
+            MethodChoice,
+            check_settings,
+            check_working_size,
+        )
 
+        choice = MethodChoice(self.method, self.settings, self.directories)
         try:
-            check_settings(MethodChoice(self.method, self.settings, self.directories))
+            check_working_size(choice, self.scale, self.working_size)
+        except ValueError as error:
+            raise ValueError(f"--working-size{str(error).removeprefix('working_size')}") from error
+        try:
+            check_settings(choice)
         except ValueError as error:
             key = str(error).partition(":")[0]
             option = f"--{error}" if key in SHORTCUTS else f"--set {error}"
