@@ -2,6 +2,8 @@
 
 import dataclasses
 import math
+from fractions import Fraction
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -11,6 +13,7 @@ import torch
 from dsr.degradation.sensors import SENSORS, least_error, recognise, recognise_values
 
 BY_NAME = {each.name: each for each in SENSORS}
+PAGE = Path(__file__).parents[2] / "docs" / "sensors.md"
 FIGURES = ("stereo_constant", "step", "noise", "extent", "spread", "edges", "dark", "shiny", "clear")
 
 
@@ -18,24 +21,46 @@ FIGURES = ("stereo_constant", "step", "noise", "extent", "spread", "edges", "dar
     ("device", "name"),
     [
         ("Intel RealSense D435I", "RealSense D435"),
+        ("Intel RealSense D435IF", "RealSense D435"),
+        ("Intel RealSense D430 with Tracking Module", "RealSense D435"),
+        ("Intel RealSense D457", "RealSense D455"),
+        ("Intel RealSense D405", None),
         ("Intel RealSense D415", "RealSense D415"),
         ("intel realsense d455", "RealSense D455"),
         ("Intel RealSense L515", "RealSense L515"),
         ("Azure Kinect 4K Camera", "Azure Kinect"),
+        ("Azure Kinect Depth Camera", "Azure Kinect"),
         ("Kinect for Azure", "Azure Kinect"),
+        ("Orbbec Femto Bolt", "Azure Kinect"),
         ("Kinect for Windows v2", "Kinect v2"),
         ("Xbox Kinect One", "Kinect v2"),
+        ("Microphone Array (Xbox NUI Sensor)", "Kinect v2"),
+        ("kv2", "Kinect v2"),
         ("Xbox NUI Kinect", "Kinect v1"),
+        ("Xbox NUI Camera", "Kinect v1"),
         ("Kinect for Xbox 360", "Kinect v1"),
         ("ASUS Xtion PRO LIVE", "Xtion"),
         ("Orbbec Astra S", "Astra"),
-        ("OAK-D-LITE", None),
+        ("Orbbec Astra 2", None),
+        ("OAK-D-LITE", "OAK-D Lite"),
+        ("OAK-D Lite AF", "OAK-D Lite"),
         ("OAK-D", "OAK-D"),
-        ("OAK-D-PRO", "OAK-D"),
+        ("OAK-D-PRO", "OAK-D Pro"),
+        ("OAK-D-PRO-FF-PB-FF#1", "OAK-D Pro"),
+        ("OAK-D-S2-POE", "OAK-D Pro"),
+        ("OAK-D-W", None),
+        ("oak_d_pro_w_ov9782", None),
         ("iPhone 14 Pro", "ARKit lidar"),
         ("iPhone 12 Pro Max", "ARKit lidar"),
         ("iPad Pro (11-inch)", "ARKit lidar"),
+        ("iPhone13,3", "ARKit lidar"),
         ("iPhone 14", None),
+        ("iPhone 11 Pro", None),
+        ("iPhone13,2", None),
+        ("SM-G988B", "phone time of flight"),
+        ("SM-N976B", "phone time of flight"),
+        ("HUAWEI VOG-L29", "phone time of flight"),
+        ("SM-G973F", None),
         ("NIKON D4300", None),
         ("Canon EOS 5D", None),
         ("", None),
@@ -57,13 +82,49 @@ def test_each_figure_has_a_source_and_each_source_a_figure(name):
         sensor.kind = "lidar"
 
 
+def test_page_has_the_table_and_every_source():
+    lines = [line for line in PAGE.read_text().splitlines() if line.startswith("|")]
+    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
+    figures = {row[0]: row[1:] for row in rows if row[0] in BY_NAME and len(row) == 8}
+    assert list(figures) == list(BY_NAME)
+    for name, (kind, width, constant, step, noise, extent, spread) in figures.items():
+        sensor = BY_NAME[name]
+        assert (kind, int(width)) == (sensor.kind, sensor.width)
+        assert Fraction(step or 0) == (sensor.step or 0)
+        for cell, figure in ((constant, sensor.stereo_constant), (noise, sensor.noise), (extent, sensor.extent)):
+            assert float(cell or 0) == pytest.approx(figure or 0, rel=5e-3)
+        stated = [tuple(map(float, pair.split(" at "))) for pair in spread.split(", ") if pair]
+        assert stated == [(pytest.approx(1000 * deviation), distance) for distance, deviation in sensor.spread or ()]
+    behaviours = {name: row[1:] for row in rows for name in row[0].split(", ") if name in BY_NAME and len(row) == 5}
+    for sensor in SENSORS:
+        for told in (sensor.edges, sensor.dark, sensor.shiny, sensor.clear):
+            assert told is None or told in behaviours[sensor.name]
+        assert set(sensor.sources.values()) <= {row[-1] for row in rows}
+
+
 def test_least_error_is_that_of_the_disparity():
     depth = torch.tensor([[0.5, 1.0, 4.0]])
     camera = BY_NAME["RealSense D435"]
     torch.testing.assert_close(least_error(camera, depth), depth**2 * (0.08 / 32))
     rounded = BY_NAME["OAK-D"]
     torch.testing.assert_close(least_error(rounded, depth), depth**2 / (8 * math.sqrt(12) * 0.075 * 882.5))
-    assert not least_error(BY_NAME["Azure Kinect"], depth).any()
+    coarse = dataclasses.replace(camera, step=1.0)
+    torch.testing.assert_close(least_error(coarse, depth), depth**2 / (math.sqrt(12) * 32))
+    assert not least_error(BY_NAME["Astra"], depth).any()
+
+
+def test_least_error_is_the_spread_of_time_of_flight_at_that_distance():
+    depth = torch.tensor([[0.5, 1.0, 5.0], [9.0, 20.0, torch.nan]])
+    expected = torch.tensor([[0.00125, 0.0025, 0.009], [0.0155, 0.0155, torch.nan]])
+    torch.testing.assert_close(least_error(BY_NAME["RealSense L515"], depth), expected, equal_nan=True)
+    both = dataclasses.replace(BY_NAME["RealSense D435"], spread=((1.0, 0.01), (2.0, 0.01)))
+    torch.testing.assert_close(least_error(both, depth[0]), torch.tensor([0.005, 0.01, 25 * 0.08 / 32]))
+    assert least_error(BY_NAME["Kinect v2"], depth.double()).dtype == torch.float64
+
+
+def test_spread_of_the_second_kinect_is_that_of_the_paper():
+    z = torch.tensor([1.0, 2.0, 3.0, 4.0])
+    torch.testing.assert_close(least_error(BY_NAME["Kinect v2"], z), (1.5 - 0.5 * z + 0.3 * z**2) / 1000)
 
 
 def test_noise_of_the_first_kinect_is_that_of_the_paper_far_away():

@@ -1,18 +1,14 @@
 """Depth cameras by name: how they measure, how exactly, and where they fail, each figure with its source.
 
-What is not known is None. Figures hold at a sensor's native width; in maps of another width focal length, disparity and
-noise in pixels scale with it, so that the errors in metres stay.
-
-Looked up where the sources say: OAK-D's focal length and baseline, the steps of OAK-D and Kinect v1, the D415's focal
-length and baseline, the D400's noise, Azure Kinect's error, ARKit's figures. All others are remembered of the sources
-that are named, and still to be checked there. No command uses this table yet.
+What no source at hand confirms is None. Figures hold at a sensor's native width; in maps of another width focal length,
+disparity and noise in pixels scale with it, so that the errors in metres stay. ``docs/sensors.md`` has the table, too.
 """
 
 from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 from typing import Literal, NamedTuple
 
@@ -36,7 +32,8 @@ class Sensor:
         step: of its disparity, in pixels.
         noise: standard deviation of its disparity on a textured wall, in pixels.
         extent: over how many pixels of its map the noise is alike.
-        spread: standard deviation of depth by distance, pairs of metres; it grows linearly between them.
+        spread: standard deviation of one frame's depth on a bright wall by distance, pairs of metres, nearest first; it
+            grows linearly between them, and from 0 to the first.
         edges: what it does at depth steps.
         dark: on dark surfaces.
         shiny: on glossy and mirroring ones.
@@ -72,82 +69,108 @@ class ValueSteps(NamedTuple):
     confidence: float
 
 
-_D400 = "Intel, RealSense D400 Series Product Family Datasheet (337029): baseline, field of view at 1280 x 720"
 _D400_STEP = "Intel, Subpixel Linearity Improvement for RealSense D400 (dev.intelrealsense.com): 1/32 pixel"
 _D400_NOISE = "A. Grunnet-Jepsen (Intel) in librealsense issue 3904: 0.032 at best, 0.08 as a rule"
-_GRASP = "Sajjan et al., ClearGrasp, ICRA 2020: missing, or that of the background"
+_D400_EXTENT = "measured before a board with a D435: 37 px of a photo of 2.14 times its focal length; the window has 9"
+_GRASP = "Sajjan et al., ClearGrasp, ICRA 2020"
+_L515 = "Intel, L515's product page, in librealsense issue 5808: at 1 m and 9 m on 95 % reflectivity"
+_AZURE = "Microsoft, Azure Kinect DK depth camera (azure-docs, articles/kinect-dk): random error and invalidation"
+_KURILLO = "Kurillo et al., Evaluating the Accuracy of the Azure Kinect and Kinect v2, Sensors 2022: alike to 2.5 m"
+_FANKHAUSER = "Fankhauser et al., Kinect v2 for Mobile Robot Navigation, ICAR 2015: 1.5 - 0.5 z + 0.3 z^2, mm for m"
 _SARBOLANDI = "Sarbolandi et al., Kinect Range Sensing: Structured-Light versus Time-of-Flight Kinect, CVIU 2015"
-_MALLICK = "Mallick et al., Characterizations of Noise in Kinect Depth Images, IEEE Sensors Journal 2014"
+_CORTI = "Corti et al., A metrological characterization of the Kinect V2 time-of-flight camera, RAS 2016"
 _TECHNICAL = "K. Konolige and P. Mihelich, Technical Description of Kinect Calibration (ROS kinect_calibration)"
-_NGUYEN = "Nguyen et al., Modeling Kinect Sensor Noise, 3DIMPVT 2012: 1.2 mm + 1.9 mm (z - 0.4)^2"
-_PRIMESENSE = (
-    "Boehm, Accuracy Investigation for Structured-light Based Consumer 3D Sensors, PFG 2014: PrimeSense's design"
-)
-_AZURE = "Microsoft, Azure Kinect DK hardware specification: random error, at most; confirmed by Tölgyessy et al. 2021"
-_TOLGYESSY = "Tölgyessy et al., Evaluation of the Azure Kinect, Sensors 2021"
-_L515 = "Intel, RealSense LiDAR Camera L515 Datasheet: standard deviation at 1 m and at 9 m, 95 % reflectivity"
-_PROMPT = "PromptMoGe, calibration of a phone's lidar against a laser scanner (promptmoge/train/calibration)"
-_LUXONIS = "Luxonis, documentation of stereo depth: 7.5 cm, 882.5 px at 1280 x 800"
-_STEREO_EDGES = "near surfaces are fattened by about half a matching window; what one camera alone sees is missing"
+_NGUYEN = "Nguyen et al., Modeling Kinect Sensor Noise, 3DIMPVT 2012"
+_MALLICK = "Mallick et al., Characterizations of Noise in Kinect Depth Images, IEEE Sensors Journal 2014"
+_PROMPT = "PromptMoGe (sergmister/PromptMoGe, promptmoge/train/sensor_sim/model.py), against a laser scanner"
 _MULTIPATH = "flying pixels between both sides of a step; concave corners are rounded by multipath"
 
 
-def _d400(name: str, pattern: str, stereo_constant: float, constant_source: str = _D400) -> Sensor:
-    """Return a camera of Intel's D400 series."""
-    return Sensor(
-        name,
-        "stereo",
-        1280,
-        pattern,
-        stereo_constant,
-        1 / 32,
-        0.08,
-        edges=_STEREO_EDGES,
-        clear="missing, or the depth of what is behind",
-        sources=MappingProxyType(
-            {
-                "stereo_constant": constant_source,
-                "step": _D400_STEP,
-                "noise": _D400_NOISE,
-                "edges": "Scharstein and Szeliski, A Taxonomy of Dense Two-Frame Stereo Correspondence, IJCV 2002",
-                "clear": _GRASP,
-            }
-        ),
-    )
+def _stereo(name: str, width: int, pattern: str, constant: float, source: str, of: Sensor) -> Sensor:
+    """Return a stereo camera by f B and its source, with the other figures of its family."""
+    sources = MappingProxyType({**of.sources, "stereo_constant": source})
+    return replace(of, name=name, width=width, pattern=pattern, stereo_constant=constant, sources=sources)
 
 
-def _structured(name: str, pattern: str, stereo_constant: float, sources: Mapping[str, str]) -> Sensor:
-    """Return a camera with PrimeSense's projector of dots, or one like it."""
+def _primesense(name: str, pattern: str, stereo_constant: float, source: str) -> Sensor:
+    """Return a camera with PrimeSense's projector of dots."""
+    noise = 1.9e-3 * 0.075 * 580
     return Sensor(
         name,
         "structured light",
         640,
         pattern,
         stereo_constant,
-        1 / 8 if "step" in sources else None,
-        0.083 if "noise" in sources else None,
-        9.0 if "extent" in sources else None,
+        1 / 8,
+        noise,
+        9.0,
         edges="they jitter along themselves by about 0.8 pixels; a shadow of the projector is missing on one side",
         dark="missing",
         shiny="missing",
         clear="missing, or the depth of what is behind",
-        sources=MappingProxyType({**sources, "edges": _NGUYEN, **dict.fromkeys(("dark", "shiny", "clear"), _MALLICK)}),
+        sources=MappingProxyType(
+            {
+                "stereo_constant": source,
+                "step": _TECHNICAL,
+                "noise": f"{_NGUYEN}: 1.2 mm + 1.9 mm (z - 0.4)^2, z in m, far away",
+                "extent": f"{_TECHNICAL}: windows of 9 x 9 or 9 x 7",
+                "edges": _NGUYEN,
+                **dict.fromkeys(("dark", "shiny", "clear"), _MALLICK),
+            }
+        ),
     )
 
 
-_DOTS = MappingProxyType({"step": _TECHNICAL, "noise": f"{_NGUYEN}, far away", "extent": f"{_TECHNICAL}: its window"})
+_OAK = Sensor(
+    "OAK",
+    "stereo",
+    1280,
+    "",
+    step=1 / 8,
+    edges="near surfaces are fattened by about half a matching window; what one camera alone sees is missing",
+    clear="missing, or the depth of what is behind",
+    sources=MappingProxyType(
+        {
+            "step": "Luxonis, DepthAI StereoDepth: 3 fractional bits in subpixel mode unless more are set",
+            "edges": "Scharstein and Szeliski, A Taxonomy of Dense Two-Frame Stereo Correspondence, IJCV 2002",
+            "clear": _GRASP,
+        }
+    ),
+)
+_D400 = replace(
+    _OAK,
+    step=1 / 32,
+    noise=0.08,
+    extent=17.0,
+    sources=MappingProxyType({**_OAK.sources, "step": _D400_STEP, "noise": _D400_NOISE, "extent": _D400_EXTENT}),
+)
+_WIDE = r"(?!.*([-_ ]w(?![a-z])|lite|[-_ ]sr|[-_ ]lr|tof))"
 
 SENSORS = (
-    _d400(
-        "RealSense D415", r"\bd41[05]i?\b", 51.7, "librealsense, doc/depth-from-stereo.md: a D415's 942.8 px, 54.8 mm"
+    _stereo(
+        "RealSense D415",
+        1280,
+        r"\bd41[05]\b",
+        0.0548 * 941,
+        "librealsense issue 1430: a D415's 940.9 px at 1280 x 720; librealsense, doc/depth-from-stereo.md: 54.8 mm",
+        _D400,
     ),
-    _d400(
+    _stereo(
         "RealSense D435",
-        r"\bd43[05][if]?\b",
-        640 * 0.050,
-        f"{_D400}; Intel, Subpixel Linearity Improvement: 90 degrees",
+        1280,
+        r"\bd43[05]i?f?\b",
+        0.050 * 640,
+        "librealsense issues 3314 (a D435's 638.0 px at 1280 x 720) and 10575 (50 mm); the values of one's maps: 32.0",
+        _D400,
     ),
-    _d400("RealSense D455", r"\bd45[0-7]f?\b", 1280 / 2 / np.tan(np.radians(87 / 2)) * 0.095),
+    _stereo(
+        "RealSense D455",
+        1280,
+        r"\bd45[0-7]f?\b",
+        0.095 * 637,
+        "librealsense issue 8577: a D455's 636.8 px at 1280 x 720; Luxonis, OAK vs RealSense: 95 mm",
+        _D400,
+    ),
     Sensor(
         "RealSense L515",
         "lidar",
@@ -160,63 +183,75 @@ SENSORS = (
         "Azure Kinect",
         "time of flight",
         640,
-        r"azure|kinect 4|\bk4a",
-        spread=((0.5, 0.017), (3.86, 0.017)),
-        edges=_MULTIPATH,
+        r"azure|kinect 4|\bk4a|femto.?bolt",
+        spread=((1.0, 0.0013), (2.0, 0.0017), (2.5, 0.0021)),
+        edges="values between both sides of a step, or missing; so are concave corners",
         dark="noisier, or missing",
-        sources=MappingProxyType({"spread": _AZURE, "edges": _TOLGYESSY, "dark": _TOLGYESSY}),
+        shiny="missing where the light saturates",
+        sources=MappingProxyType({"spread": _KURILLO, **dict.fromkeys(("edges", "dark", "shiny"), _AZURE)}),
     ),
     Sensor(
         "Kinect v2",
         "time of flight",
         512,
-        r"kinect.*(v2|one|2\.0|\b2\b)",
+        r"kinect.*(v2|one|2\.0|\b2\b)|\bkv2\b|xbox nui sensor",
+        spread=((1.0, 0.0013), (2.0, 0.0017), (3.0, 0.0027), (4.0, 0.0043)),
         edges=_MULTIPATH,
-        dark="noisier, and too far",
-        clear="a mixture of the surface and what is behind",
-        sources=MappingProxyType(dict.fromkeys(("edges", "dark", "clear"), _SARBOLANDI)),
+        dark="off by a small offset",
+        sources=MappingProxyType({"spread": _FANKHAUSER, "edges": _SARBOLANDI, "dark": _CORTI}),
     ),
-    _structured("Kinect v1", r"kinect", 0.075 * 580, {"stereo_constant": _TECHNICAL, **_DOTS}),
-    _structured(
+    _primesense(
+        "Kinect v1",
+        r"kinect|\bkv1\b|xbox nui",
+        0.075 * 580,
+        f"{_TECHNICAL}; 43.4 by the slope that OpenKinect's wiki measured (Talk:Imaging Information)",
+    ),
+    _primesense(
         "Xtion",
         r"xtion|primesense|carmine",
-        0.075 * 320 / np.tan(np.radians(58 / 2)),
-        {"stereo_constant": f"ASUS, Xtion Pro Live: 58 degrees; {_PRIMESENSE}", **_DOTS},
+        0.075 * 570.3,
+        "SUN RGB-D's Xtion: 570.3 px, and its values agree; ISPRS Archives XXXIX-B3, 2012: Kinect's chip, about 75 mm",
     ),
-    _structured(
-        "Astra",
-        r"\bastra",
-        0.075 * 320 / np.tan(np.radians(60 / 2)),
-        {"stereo_constant": "Orbbec, Astra Series specification: 75 mm, 60 degrees"},
+    Sensor("Astra", "structured light", 640, r"\bastra(?!.*(\b2\b|stereo))"),
+    _stereo(
+        "OAK-D Lite",
+        640,
+        r"\boak.?d.?lite",
+        0.075 * 433,
+        "Luxonis, OAK-D-Lite (DM9095): 1.3 mm, pixels of 3 um; Luxonis, OAK vs RealSense: 75 mm",
+        _OAK,
     ),
-    Sensor(
-        "OAK-D",
-        "stereo",
+    _stereo(
+        "OAK-D Pro",
         1280,
-        r"\boak.?d\b(?!.?(lite|sr|lr|tof))",
+        rf"\boak.?d.?(s2|pro){_WIDE}",
+        0.075 * 783,
+        "Luxonis, OAK-FFC-OV9282 (its camera): 2.35 mm, pixels of 3 um; Luxonis, OAK vs RealSense: 75 mm",
+        _OAK,
+    ),
+    _stereo(
+        "OAK-D",
+        1280,
+        rf"\boak.?d(?![a-z]){_WIDE}",
         0.075 * 882.5,
-        1 / 8,
-        edges=_STEREO_EDGES,
-        sources=MappingProxyType(
-            {
-                "stereo_constant": _LUXONIS,
-                "step": "Luxonis, DepthAI StereoDepth: 3 fractional bits unless more are set",
-                "edges": "Scharstein and Szeliski, A Taxonomy of Dense Two-Frame Stereo Correspondence, IJCV 2002",
-            }
-        ),
+        "Luxonis, FAQ of stereo depth: 7.5 cm, 882.5 px at 1280 x 800",
+        _OAK,
     ),
     Sensor(
         "ARKit lidar",
         "lidar",
         256,
-        r"arkit|iphone.*\bpro|ipad.*\bpro",
+        r"arkit|iphone ?1[2-9] ?pro|ipad.*\bpro|iphone(13,[34]|14,[23]|15,[23]|16,[12]|17,[12])\b",
         extent=6.0,
         edges="of a step 14 % fall between neighbours and 52 % over three pixels; never a hole",
         dark="twice as noisy",
         sources=MappingProxyType(dict.fromkeys(("extent", "edges", "dark"), _PROMPT)),
     ),
     Sensor(
-        "phone time of flight", "time of flight", 240, r"time.?of.?flight|\btof\b|\bsm-[gn]9[78]\d|huawei.*p[34]0 pro"
+        "phone time of flight",
+        "time of flight",
+        240,
+        r"time.?of.?flight|\btof\b|\bsm-(g977|n97[56]|g98[568])|huawei.*p[34]0 pro|\bvog-",
     ),
 )
 """Of several whose pattern fits a name the first is taken."""
@@ -228,24 +263,28 @@ def recognise(device_name: str) -> Sensor | None:
 
 
 def least_error(sensor: Sensor, depth: Tensor) -> Tensor:
-    """Return the standard deviation of depth below which a sensor's disparity allows none, z^2 noise / (f B).
+    """Return the standard deviation of depth below which a sensor states none.
 
-    Where its noise is not known, the rounding to its step counts: step / sqrt(12).
+    It is the larger of what its disparity allows, z^2 noise / (f B), where the noise is at least the rounding to its
+    step, step / sqrt(12); and of its spread at that distance, which beyond the last known one stays.
 
     Args:
         sensor: the sensor.
         depth: in metres, any shape.
 
     Returns:
-        Metres, in the shape of ``depth``; 0 for a sensor without a known disparity.
+        Metres, in the shape of ``depth``; 0 for a sensor of which neither is known.
 
     """
-    noise = sensor.noise
-    if noise is None and sensor.step is not None:
-        noise = sensor.step / 12**0.5
-    if noise is None or sensor.stereo_constant is None:
-        return torch.zeros_like(depth)
-    return depth.square() * (noise / sensor.stereo_constant)
+    least = torch.zeros_like(depth)
+    noise = max(sensor.noise or 0.0, (sensor.step or 0.0) / 12**0.5)
+    if sensor.stereo_constant is not None:
+        least = depth.square() * (noise / sensor.stereo_constant)
+    if sensor.spread is not None:
+        distances, spreads = zip((0.0, 0.0), *sensor.spread, strict=True)
+        found = np.interp(depth.detach().double().cpu().numpy(), distances, spreads)
+        least = torch.maximum(least, torch.from_numpy(found).to(depth))
+    return least
 
 
 _CONSTANTS = (16.0, 4096.0)
