@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import torch
@@ -143,7 +143,8 @@ class Everything:
         seen = scene.depth
         if self.clear and kind in SENSORS and not soft and chance(self.clear, generator):  # at 0, nothing is drawn
             scene, seen = add_glass(scene, generator)
-        clean, camera_lr = self._downsample(replace(scene, depth=seen), scale, kernel, kind, generator)
+        assert seen is not None  # noqa: S101 - for the type checker
+        clean, camera_lr = self._downsample(seen, scene.camera, scale, kernel, kind, generator)
         size = clean.shape[-2], clean.shape[-1]
         luma = functional.adaptive_avg_pool2d(scene.rgb.float().mean(dim=0, keepdim=True)[None], size)[0]
         noisy = clean if kind == "none" else NOISES[kind](clean, luma, generator)
@@ -182,11 +183,10 @@ class Everything:
         return kernel, kind
 
     def _downsample(
-        self, scene: Scene, scale: int, kernel: str, kind: str, generator: torch.Generator
+        self, depth: Tensor, camera: Camera, scale: int, kernel: str, kind: str, generator: torch.Generator
     ) -> tuple[Tensor, Camera]:
         """Return a map without noise, inverse depth of (1, h, w), perhaps displaced, and its camera."""
-        assert scene.depth is not None  # noqa: S101 - for the type checker
-        values, camera = scene.depth.float().reciprocal(), scene.camera
+        values = depth.float().reciprocal()
         if kind != "none" and chance(self.displaced, generator):
             values = displace(values, scale, generator)
         of_depth = kind == "flight" or chance(0.15, generator)

@@ -24,7 +24,7 @@ from dsr.sample import Scene
 KINDS: Mapping[str, float] = {"vessel": 0.5, "ball": 0.06, "box": 0.1, "pane": 0.12, "mirror": 0.12, "gloss": 0.1}
 """How often each kind of object is drawn."""
 _PLACES: Mapping[str, float] = {"upright": 0.65, "lying": 0.15, "before": 0.2}
-_SIDES: Mapping[str, float] = {"behind": 0.4, "mixed": 0.35, "surface": 0.25}
+_SIDES: Mapping[str, float] = {"behind": 0.45, "mixed": 0.35, "surface": 0.2}
 _HOLES: Mapping[str, float] = {"few": 0.3, "some": 0.5, "most": 0.2}
 _REFLECTED = 0.04
 """Share of the light that glass reflects at normal incidence."""

@@ -106,10 +106,8 @@ def _outline(kind: str, generator: torch.Generator) -> tuple[list[tuple[float, f
             (1.0, some(0.7, 1)),
         ], some(3.5, 6)  # fmt: skip
     if kind == "bowl":
-        flat = some(0.2, 0.5)
-        return [(h, flat + (1 - flat) * math.sqrt(1 - (1 - h) ** 2)) for h in (0, 0.05, 0.15, 0.3, 0.5, 0.75, 1)], some(
-            0.5, 1.2
-        )
+        flat, places = some(0.2, 0.5), [place / 24 for place in range(25)]
+        return [(h, flat + (1 - flat) * math.sqrt(1 - (1 - h) ** 2)) for h in places], some(0.5, 1.2)
     if kind == "jar":
         neck = some(0.7, 0.95)
         return [(0.0, 0.9), (0.05, 1.0), (0.78, 1.0), (0.86, neck), (1.0, neck)], some(1.6, 3)
@@ -124,7 +122,7 @@ def _interpolate(places: Tensor, known: Tensor, values: Tensor) -> Tensor:
     return torch.lerp(values[after - 1], values[after], share)
 
 
-def _smooth(profile: Tensor, reach: int = 6) -> Tensor:
+def _smooth(profile: Tensor, reach: int = 9) -> Tensor:
     """Return a profile with its corners rounded."""
     for _ in range(2):
         padded = torch.nn.functional.pad(profile[None, None], (reach, reach), mode="replicate")
