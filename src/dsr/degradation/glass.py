@@ -39,7 +39,7 @@ class _State(NamedTuple):
 
 
 def add_glass(scene: Scene, generator: torch.Generator, kinds: Mapping[str, float] = KINDS) -> tuple[Scene, Tensor]:
-    """Return a scene with one to four clear, mirroring or glossy objects, and what a sensor sees of it.
+    """Return a scene with up to four clear, mirroring or glossy objects, and what a sensor sees of it.
 
     Args:
         scene: a scene with a true depth.
@@ -76,10 +76,10 @@ def _add_body(state: _State, scene: Scene, kind: str, generator: torch.Generator
         body = ball(pose, radius, size)
     else:
         body = (draw_box if shape == "box" else draw_vessel)(pose, radius, size, generator)
-    if body is None:
+    if body is None or not bool(body.mask.any()):
         return state
     window = slice(None), body.rows, body.columns
-    surface = (pose.depth * (1 - body.near / scene.camera.fx).clamp(min=0.2))[None].to(state.depth)
+    surface = (pose.depth / (1 + body.near / scene.camera.fx).clamp(min=0.2))[None].to(state.depth)
     mask = body.mask & ~(surface >= state.depth[window])[0]
     if kind == "gloss":
         painted, cue = _paint_gloss(state.rgb, body, generator)
