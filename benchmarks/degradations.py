@@ -1,10 +1,14 @@
 """Draw what ``degradation=everything`` makes of training patches, kind by kind, and maps of real sensors below.
 
-    python benchmarks/degradations.py -o sheet.png [--shared DIR] [--scale 4] [--columns 4] [--seed 0]
+    python benchmarks/degradations.py -o sheet.png [--shared DIR] [--scale 4] [--columns 4] [--seed 0] [--clear 0]
 
 Each pair of pictures is a true surface and the low-resolution map made of it, both lit from one side; above the map are
 its noise as a share of depth and the share of its holes. Where the photo is changed, it is shown before and after.
-``DIR`` has ``real/ddrnet``, ``real/rgbdd_real`` and ``real/iphone_lidar``, whose photos stand in for the truth.
+With ``--clear N``, N patches with clear, mirroring and glossy objects are drawn instead: photo and truth, what a sensor
+sees and a stereo camera's map of it, holes red; below, captures of clear objects: photo and depth of their painted
+twins, measured depth and mask.
+``DIR`` has ``real/ddrnet``, ``real/rgbdd_real`` and ``real/iphone_lidar``, whose photos stand in for the truth, and
+``real/cleargrasp``.
 """
 
 from __future__ import annotations
@@ -19,12 +23,15 @@ import numpy as np
 import torch
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from real_sensors import glasses
 
 from dsr.data.ddrnet import DDRNetFrames
 from dsr.data.formats.shared import read_16bit, read_picture
 from dsr.data.procedural import Procedural
 from dsr.data.rgbdd import RGBDD
 from dsr.degradation.everything import Everything
+from dsr.degradation.glass import add_glass
+from dsr.degradation.random_noise import NOISES
 from dsr.geometry.camera import Camera
 from dsr.report.figures.scenes import rendering
 from dsr.training.augmentation import soften
@@ -32,7 +39,7 @@ from dsr.training.augmentation import soften
 SIDE = 256
 """Pixels of a patch, along an axis."""
 GROUPS = ("kernels", "noises", "holes")
-FRACTIONS = ("folds", "relief", "displaced", "rounded", "soft", "photo", "textured")
+FRACTIONS = ("folds", "relief", "displaced", "rounded", "soft", "photo", "textured", "clear")
 
 
 @dataclass(frozen=True)
@@ -56,6 +63,8 @@ def only(kind: str) -> Everything:
     shares |= {group: {kind: 1.0} for group in GROUPS if kind in getattr(Everything(), group)}
     if kind == "displaced":  # happens to noisy maps
         shares["noises"] = {"correlated": 1.0}
+    if kind == "clear":  # to sensors' maps
+        shares["noises"] = {"stereo": 1.0}
     return Everything(**shares, **{name: float(name == kind) for name in FRACTIONS}, told=1)  # type: ignore[arg-type]
 
 
@@ -84,6 +93,34 @@ def synthetic(kind: str, scale: int, columns: int, seed: int) -> list[Pair]:
 
 def _shown(rgb: torch.Tensor) -> np.ndarray:
     return rgb.permute(1, 2, 0).numpy()
+
+
+def clear(count: int, seed: int, columns: int, shared: Path) -> list[list[Pair]]:
+    """Return rows of patches with clear objects, each two pairs, and of captures."""
+    source, generator, pairs = Procedural(), torch.Generator().manual_seed(seed), []
+    for number in range(count):
+        patch = source.load(source.scenes()[7 * number % 200 + seed]).crop(100, 100, SIDE, SIDE)
+        scene, seen = add_glass(patch, generator)
+        photo = scene.rgb.mean(dim=0, keepdim=True)
+        measured = NOISES["stereo"](seen.float().reciprocal(), photo, generator).reciprocal()
+        measured = torch.where(seen.isfinite(), measured, torch.nan)
+        pairs.append(Pair(_shown(scene.rgb), _lit(scene.depth, scene.camera), ("photo", "truth")))
+        pairs.append(Pair(_lit(seen, scene.camera), _lit(measured, scene.camera), ("what is seen", "stereo")))
+    for capture in glasses(shared) if (shared / "real" / "cleargrasp").is_dir() else ():
+        photo, mask = _shown(capture.sample.rgb), capture.mask[0].numpy()
+        depths = (_lit(each, capture.sample.camera) for each in (capture.twin, capture.sample.depth_lr))
+        rows, columns_of = (slice(*np.flatnonzero(mask.any(axis=axis))[[0, -1]]) for axis in (1, 0))
+        photo, twin, found, shown = (each[rows, columns_of] for each in (photo, *depths, mask))
+        pairs += [Pair(photo, twin, ("photo", "twin")), Pair(found, shown, ("measured", "mask"))]
+    return [pairs[start : start + columns] for start in range(0, len(pairs), columns)]
+
+
+def _lit(depth: torch.Tensor | None, camera: Camera) -> np.ndarray:
+    """Return depth lit from one side, holes red, (H, W, 3)."""
+    assert depth is not None  # noqa: S101 - for the type checker
+    lit = np.repeat(rendering(depth.double(), camera, "e1")[..., None], 3, axis=-1).astype(np.float64)
+    lit[depth[0].isnan().numpy()] = 0.8, 0.1, 0.1
+    return lit
 
 
 def real(shared: Path, columns: int) -> list[list[Pair]]:
@@ -134,7 +171,12 @@ def main() -> None:
     parser.add_argument("--scale", type=int, default=4)
     parser.add_argument("--columns", type=int, default=4)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--clear", type=int, default=0)
     options = parser.parse_args()
+    if options.clear:
+        draw(clear(options.clear, options.seed, options.columns, options.shared), options.output)
+        print(options.output)
+        return
     rows = [synthetic(kind, options.scale, options.columns, options.seed) for kind in kinds()]
     if (options.shared / "real").is_dir():
         rows += real(options.shared, options.columns)

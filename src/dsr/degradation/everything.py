@@ -4,7 +4,7 @@ A degradation is drawn in three stages, each kind with its share:
 
 - a *kernel*: box, nearest, bilinear, bicubic, gaussian, or ``spread``, a wider gaussian, as of a sensor; after a small
   displacement of depth against the photo in some cases, and after folds, and fine relief which the map shows only in
-  part, are added to the truth in some;
+  part, are added to the truth in some, and clear, mirroring and glossy objects, which sensors see wrongly;
 - *noise*: none, white, correlated, waves, or that of structured light, of time of flight, of a phone's lidar and of
   stereo matching, which also lose pixels; some maps are rounded to the levels of a file;
 - *holes*: none, blobs, shadows, bands beside depth steps, dark surfaces, single pixels.
@@ -25,6 +25,7 @@ from torch.nn import functional
 
 from dsr.degradation.downsampling import Downsampling
 from dsr.degradation.draws import chance, draw, normal, uniform
+from dsr.degradation.glass import add_glass
 from dsr.degradation.hints import KERNELS, Hints, encode_facts, local_noise
 from dsr.degradation.random_holes import HOLES
 from dsr.degradation.random_noise import NOISES
@@ -38,6 +39,9 @@ from dsr.degradation.random_scenes import (
 )
 from dsr.geometry.camera import Camera
 from dsr.sample import AllHolesError, DepthSample, Scene
+
+SENSORS = ("waves", "structured", "flight", "lidar", "stereo")
+"""Kinds of noise that stand for a sensor, which does not see glass; the others stand for maps made of a surface."""
 
 
 @dataclass(frozen=True)
@@ -60,6 +64,9 @@ class Everything:
         photo: fraction of the photos with another exposure, colour balance, blur, noise and compression; half as many
             of those whose map has no noise.
         textured: fraction of the photos on which a pattern is printed, which is no relief.
+        clear: fraction of the sensors' maps, those whose kind of noise is one of ``SENSORS``, in which clear, mirroring
+            or glossy objects stand. The truth is their surface, the map what a sensor sees. None if depth steps are
+            soft, as their edges are not.
         told: fraction of the maps of which a hint tells the kernel, and the noise, and the steps, independently.
 
     Raises:
@@ -89,6 +96,7 @@ class Everything:
     soft: float = 0.3
     photo: float = 0.5
     textured: float = 0.08
+    clear: float = 0
     told: float = 0.6
 
     def __post_init__(self) -> None:
@@ -100,7 +108,7 @@ class Everything:
                 raise ValueError(f"{name}: expected some of {', '.join(kinds)}, got {wrong[0]}")
             if not all(share >= 0 for share in shares.values()) or not sum(shares.values()) > 0:
                 raise ValueError(f"{name}: expected frequencies of 0 or more, one of them positive, got {dict(shares)}")
-        for name in ("folds", "relief", "displaced", "rounded", "soft", "photo", "textured", "told"):
+        for name in ("folds", "relief", "displaced", "rounded", "soft", "photo", "textured", "clear", "told"):
             if not 0 <= getattr(self, name) <= 1:
                 raise ValueError(f"{name}: expected a fraction from 0 to 1, got {getattr(self, name)}")
         scales = {} if self.scales is None else self.scales
@@ -132,11 +140,17 @@ class Everything:
         """
         scene = self._change_surfaces(scene, scale, generator)
         kernel, kind = self._draw_kinds(scale, generator)
-        clean, camera_lr = self._downsample(scene, scale, kernel, kind, generator)
+        seen = scene.depth
+        if self.clear and kind in SENSORS and not soft and chance(self.clear, generator):  # at 0, nothing is drawn
+            scene, seen = add_glass(scene, generator)
+        assert seen is not None  # noqa: S101 - for the type checker
+        clean, camera_lr = self._downsample(seen, scene.camera, scale, kernel, kind, generator)
         size = clean.shape[-2], clean.shape[-1]
         luma = functional.adaptive_avg_pool2d(scene.rgb.float().mean(dim=0, keepdim=True)[None], size)[0]
         noisy = clean if kind == "none" else NOISES[kind](clean, luma, generator)
-        noisy = torch.where(clean.isfinite(), noisy, torch.nan)  # what is not known of the truth stays unknown
+        noisy = torch.where(
+            clean.isfinite(), noisy, torch.nan
+        )  # what is not known of the truth, or seen, stays unknown
         if chance(self.rounded, generator):
             noisy = round_values(noisy, generator)
         holes = draw(self.holes, generator)
@@ -169,11 +183,10 @@ class Everything:
         return kernel, kind
 
     def _downsample(
-        self, scene: Scene, scale: int, kernel: str, kind: str, generator: torch.Generator
+        self, depth: Tensor, camera: Camera, scale: int, kernel: str, kind: str, generator: torch.Generator
     ) -> tuple[Tensor, Camera]:
         """Return a map without noise, inverse depth of (1, h, w), perhaps displaced, and its camera."""
-        assert scene.depth is not None  # noqa: S101 - for the type checker
-        values, camera = scene.depth.float().reciprocal(), scene.camera
+        values = depth.float().reciprocal()
         if kind != "none" and chance(self.displaced, generator):
             values = displace(values, scale, generator)
         of_depth = kind == "flight" or chance(0.15, generator)
