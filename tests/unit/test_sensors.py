@@ -10,7 +10,10 @@ import numpy as np
 import pytest
 import torch
 
-from dsr.degradation.sensors import SENSORS, least_error, recognise, recognise_values
+from dsr.degradation.sensors import SENSORS, identify, least_error, recognise, recognise_values
+from dsr.geometry.camera import Camera
+from dsr.inference.engine import upsample_surface
+from dsr.inference.working_size import find_noise
 
 BY_NAME = {each.name: each for each in SENSORS}
 PAGE = Path(__file__).parents[2] / "docs" / "sensors.md"
@@ -195,3 +198,61 @@ def test_values_of_real_cameras_tell_their_constants(shared, file, unit, constan
 def test_values_of_time_of_flight_tell_none(shared, file):
     stored = cv2.imread(str(shared / "real" / file), cv2.IMREAD_UNCHANGED)
     assert recognise_values(torch.from_numpy(stored.astype(np.float32))[None] / 1000) is None
+
+
+def counted(constant, unit=1e-4):
+    """Return a map of a slanted wall whose values lie 1 / constant per metre apart in inverse depth."""
+    return as_stored(constant / np.round(slanted(1.0, 6.0) * constant) * 1.0, unit)
+
+
+def test_sensor_is_identified_by_what_is_given_then_by_files_then_by_values():
+    stereo = counted(1024)
+    assert identify(stereo).sensor is BY_NAME["RealSense D435"]
+    assert "1/1024" in identify(stereo).reason
+    assert identify(counted(1024 * 848 / 1280)).sensor is BY_NAME["RealSense D435"]
+    assert identify(stereo, device_name="Intel RealSense D455").sensor is BY_NAME["RealSense D455"]
+    assert identify(stereo, "d435i").sensor is BY_NAME["RealSense D435"]
+    assert identify(stereo, "none") is None
+    plain = as_stored(1 / slanted(1.0, 6.0), 1e-3)
+    assert identify(plain) is None
+    assert identify(plain, "Kinect v1").sensor is BY_NAME["Kinect v1"]
+    assert identify(plain, device_name="Record3D") is None  # 480 x 640: not the lidar's map
+    assert identify(plain[:, :192, :256], device_name="Record3D").sensor is BY_NAME["ARKit lidar"]
+
+
+def test_sensor_that_is_unknown_or_contradicts_the_values_is_refused():
+    with pytest.raises(ValueError, match=r"sensor: expected auto, none or one of .*, got 'Leica'"):
+        identify(counted(1024), "Leica")
+    with pytest.raises(ValueError, match=r"sensor: expected values 1/348 per metre .* got 1/1024"):
+        identify(counted(1024), "Kinect v1")
+
+
+def test_stated_error_is_never_less_than_the_disparity_allows():
+    depth = counted(1024)
+    camera, rgb = Camera.centred(640, 480, 600.0), torch.full((3, 480, 640), 0.5)
+    found = {
+        name: upsample_surface(rgb, depth, camera, method="bicubic", scale=4, sensor=name) for name in ("none", "auto")
+    }
+    least = 0.6 * math.sqrt(2 / math.pi) * least_error(BY_NAME["RealSense D435"], found["auto"].depth)
+    assert torch.equal(found["none"].depth, found["auto"].depth)
+    torch.testing.assert_close(
+        found["auto"].depth_error, torch.maximum(found["none"].depth_error, least), rtol=1e-4, atol=1e-7
+    )
+    assert bool((found["auto"].depth_error > found["none"].depth_error).any())
+
+
+def test_noise_of_a_known_stereo_camera_is_told_as_it_grows():
+    noise = cv2.GaussianBlur(np.random.default_rng(0).standard_normal((480, 640)), (0, 0), 1.7)
+    depth = as_stored(1 / (slanted(1.0, 4.0) + 0.004 * noise / noise.std()), 1e-3)
+    camera, rgb = Camera.centred(640, 480, 600.0), torch.full((3, 480, 640), 0.5)
+    found = find_noise(depth)
+    assert found.deviation == pytest.approx(0.004 * found.distance**2, rel=0.2)
+    told = {"noise": found.deviation / found.distance**2, "noise_growth": 2.0}
+    sensed, set_here, unset = (
+        upsample_surface(rgb, depth, camera, sensor=sensor, settings=settings).depth
+        for sensor, settings in (("Kinect v1", {}), ("none", told), ("none", {}))
+    )
+    torch.testing.assert_close(sensed, set_here)
+    assert not torch.equal(sensed, unset)
+    exact = upsample_surface(rgb, depth, camera, sensor="Kinect v1", settings={"noise": 0.0}).depth
+    assert torch.equal(exact, upsample_surface(rgb, depth, camera, sensor="none", settings={"noise": 0.0}).depth)

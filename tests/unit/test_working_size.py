@@ -81,10 +81,10 @@ def test_medians_of_planes_are_planes_and_blocks_that_are_mostly_holes_are_holes
 def test_calm_errors_are_no_larger_than_the_noise_leaves_and_others_stay() -> None:
     spread = torch.full((1, 8, 8), 0.02)
     spread[0, 0, 0] = 0.2
-    limited = limit_to_noise(spread, MapNoise(0.01, 20), 1.0)
+    limited = limit_to_noise(spread, MapNoise(0.01, 20, 1.0), 1.0)
     assert float(limited[0, 4, 4]) == pytest.approx(0.6 * np.sqrt(2 / np.pi) * 0.01)
     assert float(limited[0, 0, 0]) == pytest.approx(0.2)
-    assert torch.equal(limit_to_noise(spread, MapNoise(1.0, 20), 1.0), spread)
+    assert torch.equal(limit_to_noise(spread, MapNoise(1.0, 20, 1.0), 1.0), spread)
 
 
 def test_waves_of_a_sensor_are_averaged_and_size_can_be_chosen() -> None:

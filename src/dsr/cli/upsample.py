@@ -170,6 +170,12 @@ def _add_method(parser: argparse.ArgumentParser) -> None:
         default="auto",
         help="by what facets divides the map's size first; auto: as its noise suggests",
     )
+    method.add_argument(
+        "--sensor",
+        default="auto",
+        metavar="auto|none|NAME",
+        help="what measured the depth, such as 'RealSense D435'; auto: as the files or the depth values tell",
+    )
 
 
 def _add_results(parser: argparse.ArgumentParser) -> None:
@@ -275,6 +281,7 @@ def _run(options: argparse.Namespace, console: Console, _: object) -> list[str]:
         fill=options.fill,
         max_hole=options.max_hole,
         working_size=None if options.working_size == "auto" else int(options.working_size),
+        sensor=options.sensor,
         max_error=options.max_error / 100,
         depth_format=options.format,
         max_faces=options.max_faces,

@@ -241,7 +241,8 @@ SENSORS = (
         "ARKit lidar",
         "lidar",
         256,
-        r"arkit|iphone ?1[2-9] ?pro|ipad.*\bpro|iphone(13,[34]|14,[23]|15,[23]|16,[12]|17,[12])\b",
+        r"arkit|record3d|stray scanner|polycam|iphone ?1[2-9] ?pro|ipad.*\bpro|"
+        r"iphone(13,[34]|14,[23]|15,[23]|16,[12]|17,[12])\b",
         extent=6.0,
         edges="of a step 14 % fall between neighbours and 52 % over three pixels; never a hole",
         dark="twice as noisy",
@@ -260,6 +261,84 @@ SENSORS = (
 def recognise(device_name: str) -> Sensor | None:
     """Return the sensor of a device's name as recordings, EXIF data and apps state it; None for an unknown one."""
     return next((each for each in SENSORS if re.search(each.pattern, device_name, re.IGNORECASE)), None)
+
+
+def sensor_named(name: str) -> Sensor:
+    """Return the sensor of one of the names of ``SENSORS``, without regard to case, or of a device's name.
+
+    Raises:
+        ValueError: there is none.
+
+    """
+    found = next((each for each in SENSORS if each.name.casefold() == name.casefold()), None) or recognise(name)
+    if found is None:
+        raise ValueError(
+            f"sensor: expected auto, none or one of {', '.join(each.name for each in SENSORS)}, got {name!r}"
+        )
+    return found
+
+
+GIVEN = "given"
+"""The reason of a sensor that was named."""
+
+
+class Identified(NamedTuple):
+    """A map's sensor, and by what it is known."""
+
+    sensor: Sensor
+    reason: str
+
+
+def identify(depth: Tensor, name: str = "auto", device_name: str = "") -> Identified | None:
+    """Return the sensor of a map: the named one, else that of the device's name, else that of the map's values.
+
+    Args:
+        depth: (1, h, w) in metres, NaN in holes, as it was read.
+        name: of one of ``SENSORS`` or of a device; ``auto``, or ``none`` for none.
+        device_name: of the device, as its files state it; empty where they do not.
+
+    Raises:
+        ValueError: there is no such sensor, or the map's values keep to steps that it does not have.
+
+    """
+    if name == "none":
+        return None
+    named = None if name == "auto" else sensor_named(name)
+    steps = recognise_values(depth)
+    if named is not None:
+        if steps is not None and named.stereo_constant is not None and _mismatch(named, steps.constant) > _ALIKE:
+            raise ValueError(
+                f"sensor: expected values 1/{_counts(named):.0f} per metre apart in inverse depth, as those of a "
+                f"{named.name}, got 1/{steps.constant:.0f}"
+            )
+        return Identified(named, GIVEN)
+    told = recognise(device_name)
+    if told is not None and (told.kind != "lidar" or told.width in depth.shape[-2:]):
+        return Identified(told, f"by the name {device_name}")
+    if steps is None:
+        return None
+    best = min((each for each in SENSORS if each.step is not None), key=lambda each: _mismatch(each, steps.constant))
+    if _mismatch(best, steps.constant) > _ALIKE:
+        return None
+    return Identified(best, f"by its values, which lie 1/{steps.constant:.0f} per metre apart in inverse depth")
+
+
+_ALIKE = 0.04
+"""Relative difference up to which the steps of a map are those of a sensor: cameras of a type differ by 2 %."""
+_PARTS = (1.0, 848 / 1280, 0.5, 480 / 1280, 424 / 1280)
+"""Widths of stereo cameras' maps over the native one; disparity is counted in pixels of the chosen width."""
+
+
+def _counts(sensor: Sensor) -> float:
+    """Return f B over the step of a sensor's disparity, in metres; infinite where it is not known."""
+    known = sensor.stereo_constant is not None and sensor.step is not None
+    return sensor.stereo_constant / sensor.step if known else np.inf  # type: ignore[operator]
+
+
+def _mismatch(sensor: Sensor, constant: float) -> float:
+    """Return by how much steps differ from the nearest that a sensor may have, relative."""
+    parts = _PARTS if sensor.kind == "stereo" else _PARTS[:1]
+    return min(abs(constant / (part * _counts(sensor)) - 1) for part in parts)
 
 
 def least_error(sensor: Sensor, depth: Tensor) -> Tensor:

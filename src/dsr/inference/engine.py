@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple, get_args
@@ -14,6 +14,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from dsr.degradation.downsampling import Downsampling
+from dsr.degradation.sensors import Sensor, identify, least_error
 from dsr.geometry.camera import Camera
 from dsr.geometry.holes import degrees_per_pixel, wide_holes
 from dsr.geometry.resampling import pad_inverse_depth, resize_inverse_depth
@@ -22,7 +23,7 @@ from dsr.inference.inspection import enlarged_by
 from dsr.inference.options import DEFAULT, SIZES, USUAL_SCALE, WIDEST, Fill
 from dsr.inference.outliers import count_patches, find_outliers, within_measured
 from dsr.inference.planning import OWN_SIZE, Plan, plan, read_ability
-from dsr.inference.working_size import find_noise, limit_to_noise, reduce_by_medians, working_size_of
+from dsr.inference.working_size import find_noise, left_of, limit_to_noise, reduce_by_medians, working_size_of
 from dsr.methods.base import Confident, MapNoise, Surface, Upsampler, expect_some_depth
 from dsr.methods.classical.interpolation import Interpolation
 from dsr.methods.networks.base import NetworkUpsampler
@@ -159,6 +160,7 @@ def upsample_surface(
     fill: Fill = "small",
     max_hole: float = WIDEST,
     working_size: int | None = None,
+    sensor: Sensor | str | None = "auto",
     progress: Steps | None = None,
 ) -> Surface:
     """Upsample a depth map to the photo's size, with the expected errors.
@@ -189,13 +191,17 @@ def upsample_surface(
         max_hole: width of the widest hole that counts as small, in degrees of view; one of 5 pixels always does.
         working_size: by what ``facets`` without a scale divides the size of the map first, 1, 2, 4, 8 or 16; None to
             choose it by the map's noise, see :mod:`dsr.inference.working_size`.
+        sensor: what measured the map, or its name; ``auto`` to tell it from the map's values, None for none. No
+            expected error is less than what remains of the least noise that it is known to have; and where it counts
+            disparity, ``facets`` without a scale is told how its noise grows, unless ``noise`` is set.
         progress: is called with the number of parts done and their total.
 
     Returns:
         Depth, (1, H, W) float32 in metres, and its expected errors, on the device of ``depth``; and its outliers.
 
     Raises:
-        ValueError: a shape, value, method, setting or scale is not as above, or the method has no solution.
+        ValueError: a shape, value, method, setting or scale is not as above, the method has no solution, or the map's
+            values contradict the named sensor.
 
     """
     _check(rgb, depth, camera)
@@ -204,6 +210,9 @@ def upsample_surface(
     choice = MethodChoice(method, settings or {}, tuple(directories), pick_device(device))
     planned = choice.plan(size, _size(depth), scale)  # raises ValueError for sizes or a scale that cannot be used
     check_working_size(choice, scale, working_size)
+    if isinstance(sensor, str):
+        identified = identify(depth, sensor)
+        sensor = None if identified is None else identified.sensor
     outliers = find_outliers(depth)
     inverse = depth.masked_fill(outliers, torch.nan).float().reciprocal()
     valid, factor = inverse.isfinite(), 1
@@ -222,7 +231,7 @@ def upsample_surface(
         inverse_lr = Downsampling("box")(pad_inverse_depth(inverse, factor), factor)
         found = _upsample_padded(rgb, inverse_lr, camera, factor, choice, progress, factor)
     elif scale is None and choice.finds_noise():
-        found = _upsample_at_working_size(rgb, inverse, camera, working_size, choice, progress)
+        found = _upsample_at_working_size(rgb, inverse, camera, working_size, choice, sensor, progress)
     else:
         found = _upsample_inverse(rgb, inverse, camera, None if own else scale, choice, progress)
     expect_some_depth(found.inverse, method)  # as good as of the depth: 0 and infinity change places
@@ -235,6 +244,8 @@ def upsample_surface(
     spread, angle = found.spread, found.angle
     if spread is None or angle is None:
         spread, angle = expect_errors(inverse_hr, inverse.to(inverse_hr.device), camera)
+    if sensor is not None:
+        spread = torch.fmax(spread, left_of(least_error(sensor, inverse_hr.reciprocal()) * inverse_hr))
     result = inverse_hr.reciprocal_()
     surface = Surface(result, spread * result, angle, found.noise, count_patches(outliers))
     if fill != "all" and not bool(valid.all()):
@@ -266,14 +277,17 @@ class _Found(NamedTuple):
 
 
 def _upsample_at_working_size(
-    rgb: Tensor, inverse: Tensor, camera: Camera, size: int | None, choice: MethodChoice, progress: Steps | None
-) -> _Found:
+    rgb: Tensor, inverse: Tensor, camera: Camera, size: int | None, choice: MethodChoice, sensor: Sensor | None,
+    progress: Steps | None,
+) -> _Found:  # fmt: skip
     """Return high-resolution inverse depth of inverse depth, (1, h, w), whose size may be divided first."""
     most = max(each for each in SIZES if each == 1 or each <= _LARGEST_RATIO * inverse.shape[-1] / camera.width)
     if size is not None and size > most:
         raise ValueError(f"working_size: expected at most {most} for this map's size and the photo's, got {size}")
     noise = find_noise(inverse.reciprocal())
-    factor = size or min(1 if noise is None else working_size_of(noise.extent), most)
+    extent = noise.extent if noise is not None else _expected_extent(sensor, inverse.shape[-1])
+    factor = size or min(working_size_of(extent), most)
+    choice = _tell_noise(choice, sensor, noise, float(inverse.nanmedian()))
     if factor == 1:
         return _upsample_inverse(rgb, inverse, camera, None, choice, progress)
     inverse_lr = reduce_by_medians(pad_inverse_depth(inverse, factor), factor)
@@ -282,6 +296,32 @@ def _upsample_at_working_size(
         return found._replace(noise=None)
     left = limit_to_noise(found.spread, noise, float(inverse.nanmedian()))
     return found._replace(spread=left, noise=noise._replace(reduced=factor))
+
+
+def _expected_extent(sensor: Sensor | None, width: int) -> float:
+    """Return over how many pixels of a map of a width the noise of a sensor that counts disparity is alike; or 1."""
+    if sensor is None or sensor.stereo_constant is None or sensor.extent is None:
+        return 1.0
+    return max(1.0, sensor.extent * width / sensor.width)
+
+
+def _tell_noise(choice: MethodChoice, sensor: Sensor | None, noise: MapNoise | None, inverse: float) -> MethodChoice:
+    """Return a choice whose method is told the noise of a sensor that counts disparity, at least what was found.
+
+    Args:
+        choice: the method.
+        sensor: what measured the map, if that is known.
+        noise: what was found of it.
+        inverse: the map's median, in 1/m.
+
+    """
+    if sensor is None or sensor.stereo_constant is None or "noise" in choice.settings:
+        return choice
+    distance = 1 / inverse if noise is None else noise.distance
+    least = float(least_error(sensor, torch.tensor(distance)))
+    deviation = least if noise is None else max(least, noise.deviation)
+    told = {"noise": deviation / distance**2, "noise_growth": 2.0}
+    return replace(choice, settings={**choice.settings, **told})
 
 
 def _upsample_padded(

@@ -12,7 +12,7 @@ sensor, however, is never as smooth as a bumpy surface, since depth is counted i
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import torch
 from torch import Tensor
@@ -21,6 +21,7 @@ from torch.nn import functional
 from dsr.inference.options import SIZES
 from dsr.methods.base import MapNoise
 
+T = TypeVar("T", float, Tensor)
 _WINDOWS = (8, 12, 16, 24, 32, 48, 64, 96, 128, 192, 256, 384)
 """Pixels."""
 _LARGEST_WINDOW = 0.6
@@ -96,8 +97,9 @@ def find_noise(depth: Tensor) -> MapNoise | None:
             if extent <= size / _WIDTHS:
                 level = float(deviations[0] / deviations[len(deviations) // 10])
                 fine = finest / deviation
-                metres = deviation / float(planes.mean[flattest].median())
-                found = MapNoise(metres, step * extent) if level >= _LEVEL and fine >= _FINE else None
+                distance = 1 / float(planes.mean[flattest].median())
+                noise = MapNoise(deviation * distance, step * extent, distance)
+                found = noise if level >= _LEVEL and fine >= _FINE else None
         before = (size, deviation)
     return found
 
@@ -124,6 +126,11 @@ def reduce_by_medians(inverse: Tensor, factor: int) -> Tensor:
     return torch.where(known, blocks.nanmedian(dim=2).values, torch.nan)[None]
 
 
+def left_of(deviation: T) -> T:
+    """Return the expected absolute error that is left of noise of a standard deviation, in the same unit."""
+    return _LEFT * math.sqrt(2 / math.pi) * deviation
+
+
 def limit_to_noise(spread: Tensor, noise: MapNoise, inverse: float) -> Tensor:
     """Return expected relative errors, (1, H, W), that are no more than the noise of the map leaves, where all is calm.
 
@@ -135,7 +142,7 @@ def limit_to_noise(spread: Tensor, noise: MapNoise, inverse: float) -> Tensor:
         inverse: the map's median, in 1/m.
 
     """
-    left = _LEFT * math.sqrt(2 / math.pi) * noise.deviation * inverse
+    left = left_of(noise.deviation) * inverse
     median = spread.nanmedian()
     share = ((_UNSURE - spread / median) / (_UNSURE - _CALM)).clamp(0, 1)
     return spread * torch.lerp(torch.ones_like(spread), (left / median).clamp(max=1).expand_as(spread), share)

@@ -19,7 +19,7 @@ from dsr.io.encoding import Assumption, Encoding, decode, find_holes, turn_back_
 from dsr.io.frames import Geometry
 from dsr.io.names import words_of
 from dsr.io.pairs import Pair
-from dsr.io.photos import Size, read_photo, same_aspect
+from dsr.io.photos import Size, model_in_exif, read_photo, same_aspect
 from dsr.io.reading import CameraChoice, Reading
 from dsr.io.rigs import read_rig, to_photo
 from dsr.io.units import FolderUnits, read_values_of
@@ -42,6 +42,7 @@ class Picture:
         pose: from camera to world, (4, 4) float64 in metres, of a camera with the axes x right, y down, z forward, in
             the world of the capture; None where there is none.
         confidence: (1, h, w) float32 from 0 to 1, of the low-resolution map; None where there is none.
+        device_name: of the app or the device, as the files state it; empty where they do not.
 
     """
 
@@ -52,6 +53,7 @@ class Picture:
     assumptions: tuple[Assumption, ...]
     pose: np.ndarray | None = None
     confidence: Tensor | None = None
+    device_name: str = ""
 
 
 def read_picture(pair: Pair, reading: Reading, units: FolderUnits | None = None) -> Picture:
@@ -110,7 +112,8 @@ def read_picture(pair: Pair, reading: Reading, units: FolderUnits | None = None)
     if rig is not None:
         depth_lr, warped = to_photo(depth_lr, rig, camera)
         all_assumptions, confidence = (*all_assumptions, warped), None
-    return Picture(rgb, depth_lr, camera, encoding, all_assumptions, geometry.pose, confidence)
+    device_name = model_in_exif(pair.rgb) if pair.capture is None else pair.capture.app
+    return Picture(rgb, depth_lr, camera, encoding, all_assumptions, geometry.pose, confidence, device_name)
 
 
 def _expect_distances(path: Path, depth_lr: Tensor, holes: np.ndarray, range_type: RangeType) -> list[Assumption]:

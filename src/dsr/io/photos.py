@@ -13,7 +13,7 @@ import numpy as np
 from dsr.data.formats.files import read_pixels
 from dsr.io.encoding import Assumption
 
-_ORIENTATION, _EXIF_IFD, _EXIF_FOCAL_35 = 0x0112, 0x8769, 0xA405
+_MODEL, _ORIENTATION, _EXIF_IFD, _EXIF_FOCAL_35 = 0x0110, 0x0112, 0x8769, 0xA405
 _ASPECT_TOLERANCE = 0.02
 _TURNS: dict[int, Callable[[np.ndarray], np.ndarray]] = {
     2: lambda pixels: pixels[:, ::-1],
@@ -57,6 +57,12 @@ def focal_in_exif(photo: Path) -> float | None:
     """Return the equivalent focal length for 35 mm film in the EXIF data, in millimetres; None if there is none."""
     value = _exif(photo).get(_EXIF_FOCAL_35)
     return float(value) if isinstance(value, (int, float)) and 1 < value < 10_000 else None
+
+
+def model_in_exif(photo: Path) -> str:
+    """Return the name of the device in the EXIF data; empty if there is none."""
+    value = _exif(photo).get(_MODEL)
+    return value if isinstance(value, str) else ""
 
 
 def _exif(photo: Path) -> dict[int, Any]:

@@ -69,13 +69,14 @@ class Upsampler(Protocol):
 class MapNoise(NamedTuple):
     """Estimated noise of a low-resolution map.
 
-    ``deviation``: its standard deviation in metres. ``extent``: over how many low-resolution pixels it is alike, the
-    full width at half maximum of its autocorrelation; 1 for white noise. ``reduced``: by what the size of the map was
-    divided because of that.
+    ``deviation``: its standard deviation in metres, at ``distance`` metres. ``extent``: over how many low-resolution
+    pixels it is alike, the full width at half maximum of its autocorrelation; 1 for white noise. ``reduced``: by what
+    the size of the map was divided because of that.
     """
 
     deviation: float
     extent: float
+    distance: float
     reduced: int = 1
 
 

@@ -24,6 +24,7 @@ from dsr.app.upsample.outputs import (
 from dsr.app.upsample.reporting import Messages
 from dsr.app.upsample.request import UpsampleRequest, files_of, inputs_with_neighbours, settings_of
 from dsr.app.upsample.sequence import FrameSequence
+from dsr.degradation.sensors import GIVEN, Identified, Sensor, identify
 from dsr.inference import Plan, enlarged_by, plan, upsample_surface
 from dsr.io.encoding import Assumption
 from dsr.io.inputs import Picture, read_picture
@@ -67,7 +68,12 @@ class FrameWork:
         if job.is_done():
             reporter.say(f"{pair.name}: complete already, in {target}")
             return "complete already"
-        picture = sequence.fuse(pair, self._read(pair))
+        picture = self._read(pair)
+        try:
+            identified = identify(picture.depth_lr, request.sensor, picture.device_name)
+        except ValueError as error:
+            raise ValueError(f"--{error}") from error
+        picture = _with_sensor(sequence.fuse(pair, picture), identified)
         picture = align(picture, register=request.register)
         size_lr = (picture.depth_lr.shape[-2], picture.depth_lr.shape[-1])
         size = (picture.camera.height, picture.camera.width)
@@ -83,7 +89,7 @@ class FrameWork:
         begin(target, job.settings, job.inputs, () if job.earlier is None else job.earlier.files)
         started = time.perf_counter()
         if surface is None:
-            surface = _upsample(job, picture, progress)
+            surface = _upsample(job, picture, None if identified is None else identified.sensor, progress)
             reporter.facts(_describe(surface.noise, given="noise" in request.settings))
             reporter.facts([*_describe_outliers(surface.outliers), *_describe_holes(surface, request)])
         seconds = time.perf_counter() - started
@@ -150,7 +156,15 @@ def _without_repeats(picture: Picture) -> Picture:
     return replace(picture, depth_lr=depth_lr, confidence=confidence, assumptions=(*picture.assumptions, fact))
 
 
-def _upsample(job: _Job, picture: Picture, progress: Progress) -> Surface:
+def _with_sensor(picture: Picture, identified: Identified | None) -> Picture:
+    """Return a picture with a note on the sensor, if it is known and was not given."""
+    if identified is None or identified.reason == GIVEN:
+        return picture
+    fact = Assumption("sensor", f"{identified.sensor.name}, {identified.reason}; --sensor overrides it")
+    return replace(picture, assumptions=(*picture.assumptions, fact))
+
+
+def _upsample(job: _Job, picture: Picture, sensor: Sensor | None, progress: Progress) -> Surface:
     """Compute the high-resolution depth with its expected errors, on the CPU."""
     request = job.request
     with progress.task("steps") as step:
@@ -166,6 +180,7 @@ def _upsample(job: _Job, picture: Picture, progress: Progress) -> Surface:
             fill=request.fill,
             max_hole=request.max_hole,
             working_size=request.working_size,
+            sensor=sensor,
             progress=step,
         )
     return surface.map(lambda values: values.cpu())

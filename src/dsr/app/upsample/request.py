@@ -36,7 +36,7 @@ class UpsampleRequest:
         rgb, depth, mask: files, or one folder each of the first two.
         confidence: files of confidence maps, or a folder of them.
         reading: how to read the files.
-        method, settings, directories, scale, device, fill, max_hole, working_size: see
+        method, settings, directories, scale, device, fill, max_hole, working_size, sensor: see
             :func:`dsr.inference.engine.upsample_surface`.
         max_error: expected relative error of the depth from which a pixel is left out of cloud and mesh.
         max_faces: triangles from which a mesh is simplified.
@@ -70,6 +70,7 @@ class UpsampleRequest:
     fill: Fill = "small"
     max_hole: float = WIDEST
     working_size: int | None = None
+    sensor: str = "auto"
     max_error: float = LARGEST_ERROR
     max_faces: int = MOST_FACES
     max_points: int = MOST_POINTS
@@ -115,6 +116,7 @@ class UpsampleRequest:
         check_libraries(self.scene_parts)
         self._check_frames()
         self._check_method()
+        self._check_sensor()
 
     @property
     def limits(self) -> Limits:
@@ -150,6 +152,17 @@ class UpsampleRequest:
             raise ValueError(f"--neighbours: expected 0 or a positive number of frames, got {self.neighbours}")
         if self.poses is not None and len(self.folders) > 1:
             raise ValueError(f"--poses: expected the frames of one folder, got {len(self.folders)} folders")
+
+    def _check_sensor(self) -> None:
+        """Check the name of the sensor."""
+        if self.sensor in ("auto", "none"):
+            return
+        from dsr.degradation.sensors import sensor_named  # noqa: PLC0415 - other values are refused without torch
+
+        try:
+            sensor_named(self.sensor)
+        except ValueError as error:
+            raise ValueError(f"--{error}") from error
 
     def _check_method(self) -> None:
         """Check that the method accepts the settings."""
@@ -190,6 +203,7 @@ def settings_of(request: UpsampleRequest) -> dict[str, Any]:
         "fill": request.fill,
         "max_hole": request.max_hole,
         **({} if request.working_size is None else {"working_size": request.working_size}),
+        **({} if request.sensor == "auto" else {"sensor": request.sensor}),
         "max_error": request.max_error,
         "format": request.depth_format,
         **reading,

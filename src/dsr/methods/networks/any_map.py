@@ -45,7 +45,8 @@ class AnyMap:
 
     Args:
         net: the network; it is used as it is.
-        noise: standard deviation of the map's depth in metres, the same everywhere; None if it is not known.
+        noise: standard deviation of the map's depth at 1 m, in metres; None if it is not known.
+        noise_growth: the noise grows with this power of the distance: 0 where it is the same everywhere, 2 for stereo.
         smooth: 0 takes the map for free of noise, 2 its noise for twice as large as estimated; 1 is neutral.
         edges: whether the result's depth steps are to be ``sharp`` or ``soft``, a pixel's value then being a mean over
             its area; ``auto``: as the map shows.
@@ -76,6 +77,7 @@ class AnyMap:
         clean: bool = False,
         max_error: float | None = None,
         device: torch.device | str = "cpu",
+        noise_growth: float = 0.0,
     ) -> None:
         if noise is None and clean and smooth == 1:
             noise = 0.0
@@ -85,11 +87,13 @@ class AnyMap:
             raise ValueError(f"smooth: expected a number from 0 to 2, got {smooth}")
         if noise is not None and not 0 <= noise < 1:
             raise ValueError(f"noise: expected metres, 0 or more and less than 1, got {noise}")
+        if not 0 <= noise_growth <= 4:
+            raise ValueError(f"noise_growth: expected a power of the distance from 0 to 4, got {noise_growth}")
         if max_error is not None and not max_error > 0:
             raise ValueError(f"max_error: expected a positive share of the depth, got {max_error}")
         self._max_error = max_error
         self._net = net.to(device, memory_format=torch.channels_last)  # type: ignore[call-overload]  # torch's stubs
-        self._device, self._noise, self._smooth = torch.device(device), noise, smooth
+        self._device, self._noise, self._growth, self._smooth = torch.device(device), noise, noise_growth, smooth
         self._facts = encode_facts(kernel, None if edges == "auto" else edges == "soft")[None]
 
     @torch.no_grad()
@@ -109,7 +113,7 @@ class AnyMap:
         if factor == 1:  # in pairs
             rgb = functional.pad(rgb, (0, columns % 2, 0, rows % 2), mode="replicate")
             padded = pad_inverse_depth(inverse, 2)
-        level = None if self._noise is None else (self._noise * padded).nan_to_num(0)
+        level = None if self._noise is None else (self._noise * padded ** (1 - self._growth)).nan_to_num(0)
         passes = 1
         if self._smooth != 1:
             if level is None:
@@ -154,6 +158,7 @@ def build_any_map(
     max_error: float | None = None,
     precision: Precision = "float32",
     device: torch.device | str = "cpu",
+    noise_growth: float = 0.0,
     networks: Mapping[str, type[DisparityNetwork]] = NETWORKS,
 ) -> AnyMap:
     """Build the method from a file that ``train.py model=facets`` wrote.
@@ -172,6 +177,7 @@ def build_any_map(
         max_error: see there.
         precision: dtype of the convolutions.
         device: device of the computations.
+        noise_growth: see :class:`AnyMap`.
         networks: network classes by their names in weights files.
 
     Raises:
@@ -189,7 +195,7 @@ def build_any_map(
             "method=facets_box takes"
         )
     net = net.eval().requires_grad_(False).to(DTYPES[precision])
-    return AnyMap(net, noise, smooth, edges, kernel, clean, max_error, device)
+    return AnyMap(net, noise, smooth, edges, kernel, clean, max_error, device, noise_growth)
 
 
 def _half(progress: Steps | None, before: int) -> Steps | None:
@@ -207,7 +213,7 @@ def _describe_noise(given: Tensor, answer: Answer) -> MapNoise:
     error = (error - (error * known).sum() / count) * known
     variance = error.square().sum() / count
     depth = given[given.isfinite()].median().reciprocal()
-    return MapNoise(float(variance.sqrt() * depth), _extent(error, known, float(variance)))
+    return MapNoise(float(variance.sqrt() * depth), _extent(error, known, float(variance)), float(depth))
 
 
 def _guessing(inverse: Tensor, focal: float) -> Tensor:
