@@ -1,7 +1,7 @@
 """Every yardstick of real sensors in one command, for methods and beside them for simple filters.
 
     python benchmarks/real_sensors.py [--shared DIR] [--methods facets,...] [--only board,ddrnet,...] [--frames N]
-        [--filters] [--weights FILE] [--device cpu]
+        [--filters] [--weights DIR] [--device cpu]
 
 - ``board``: a stereo camera before an exact plane, means of the frames. Standard deviation about the plane in mm, the
   same 12 to 36 pixels inside the outline (blur across it shows there), the mean angle between the normals and the
@@ -11,6 +11,7 @@
 - ``rgbdd``: a phone's time-of-flight map against another sensor's: RMSE_v, angle, stated over true error.
 - ``floors``: the mean angle between the normals of a floor and their mean, before a phone and a stereo camera.
 - ``phone``: a simulated phone, mean angle between normals.
+- ``clean``: box means of Lucy and Plant at x4 without noise, untold: RMSE_v in 1/1000.
 - ``glass``: clear objects before a stereo camera, beside their painted twins: in the objects, the share of pixels off
   by more than 20 mm in %, the share of these stated to be off by less than 5 mm, and how well the stated error sorts
   pixels into these and the others (area under the curve; 0.5 is chance).
@@ -49,7 +50,9 @@ INSIDE, EDGE, NEAR = 12, 36, 0.06
 """Pixels inside the board's outline that are left out, those that count as its edge, and metres from the plane."""
 OFF, SURE = 0.02, 0.005
 """Metres: pixels that are further off are wrong, and those stated to be off by less are believed."""
-PARTS = ("board", "ddrnet", "rgbdd", "floors", "phone", "glass")
+CONF = Path(__file__).resolve().parent.parent / "conf"
+PARTS = ("board", "ddrnet", "rgbdd", "floors", "phone", "glass", "clean")
+CLEAN = ("lucy_box", "plant_box")
 Method = Callable[[DepthSample], Surface]
 
 
@@ -181,6 +184,35 @@ def score_glass(scene: Glass, surface: Surface) -> dict[str, float]:
     return found
 
 
+def angles_of_floors(shared: Path, method: Method) -> dict[str, float]:
+    """Return how flat floors are, by name."""
+    captures_of = {name: CAPTURES[name](shared) for name in FLOORS}
+    return {
+        name: flatness(method(each.sample).depth, each.sample.camera, FLOORS[name])
+        for name, each in captures_of.items()
+    }
+
+
+def scores_of_clean(shared: Path, method: Method) -> dict[str, float]:
+    """Return RMSE_v of maps without noise, by name."""
+    found = {}
+    for name in CLEAN:
+        capture = CAPTURES[name](shared)
+        scores = capture.scores(method(capture.sample).depth)
+        assert scores is not None  # noqa: S101 - for the type checker
+        found[name] = 1e3 * scores["RMSE_v"]
+    return found
+
+
+def with_weights(folder: Path) -> str:
+    """Add a method, facets with the weights of a folder, to ``folder/method``, and return its name."""
+    node = yaml.safe_load((CONF / "method" / "facets.yaml").read_text())
+    packaged = {str(folder.resolve() / name): factor for name, factor in node["weights_packaged"].items()}
+    (folder / "method").mkdir(exist_ok=True)
+    (folder / "method" / "trained.yaml").write_text(yaml.safe_dump({**node, "weights_packaged": packaged}))
+    return "trained"
+
+
 def angle_of_phone(shared: Path, method: Method) -> dict[str, float]:
     """Return the score of the simulated phone."""
     capture = CAPTURES["simulated_phone"](shared)
@@ -205,14 +237,9 @@ def measure(part: str, method: Method, shared: Path, count: int | None) -> dict[
         names = sorted(path.stem.partition("_")[0] for path in (shared / "real" / "rgbdd_real" / "RGB").iterdir())
         captures = [rgbdd_real(name, (), shared) for name in names[:count]]
         return mean([score_capture(each, method(each.sample)) for each in captures])
-    if part == "floors":
-        captures_of = {name: CAPTURES[name](shared) for name in FLOORS}
-        return {
-            name: flatness(method(each.sample).depth, each.sample.camera, FLOORS[name])
-            for name, each in captures_of.items()
-        }
-    if part == "phone":
-        return angle_of_phone(shared, method)
+    whole = {"floors": angles_of_floors, "phone": angle_of_phone, "clean": scores_of_clean}
+    if part in whole:
+        return whole[part](shared, method)
     return mean([score_glass(each, method(each.sample)) for each in glasses(shared)[:count]])
 
 
@@ -227,11 +254,12 @@ def filtered(sample: DepthSample, window: int, of_depth: float, of_place: float)
     return Surface(filter_bilateral(enlarged, window, of_depth, of_place), None, None, None)
 
 
-def upsampled(sample: DepthSample, name: str, settings: dict[str, str], device: str) -> Surface:
-    """Return what ``dsr upsample`` computes."""
+def upsampled(sample: DepthSample, name: str, device: str, weights: Path | None = None) -> Surface:
+    """Return what ``dsr upsample`` computes, for a method of :func:`with_weights` with those of its folder."""
     return upsample_surface(
-        sample.rgb, sample.depth_lr, sample.camera, method=name, settings=settings, device=device, fill="none"
-    )
+        sample.rgb, sample.depth_lr, sample.camera, method=name, directories=(weights,) if weights else (),
+        device=device, fill="none",
+    )  # fmt: skip
 
 
 def main() -> None:
@@ -239,7 +267,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--shared", type=Path, default=Path(os.environ.get("DSR_SHARED", "../shared")))
     parser.add_argument("--methods", default="facets")
-    parser.add_argument("--weights", help="a file of weights for the methods")
+    parser.add_argument(
+        "--weights", type=Path, help="folder of weights for facets, in place of methods: facets_x2.safetensors, ..."
+    )
     parser.add_argument("--only", default=",".join(PARTS), help="parts to measure; all are the default")
     parser.add_argument("--frames", type=int, help="number of frames of each part; all are the default")
     parser.add_argument("--filters", action="store_true", help="measure the filters, too")
@@ -249,9 +279,9 @@ def main() -> None:
     if options.filters:
         for each in FILTERS:
             methods[f"bilateral {each}"] = lambda sample, each=each: filtered(sample, *each)  # type: ignore[misc]
-    settings = {"weights": options.weights} if options.weights else {}
-    for name in filter(None, options.methods.split(",")):
-        methods[name] = lambda sample, name=name: upsampled(sample, name, settings, options.device)  # type: ignore[misc]
+    names = [with_weights(options.weights)] if options.weights else options.methods.split(",")
+    for name in filter(None, names):
+        methods[name] = lambda sample, name=name: upsampled(sample, name, options.device, options.weights)  # type: ignore[misc]
     for part in options.only.split(","):
         for label, method in methods.items():
             scores = measure(part, method, options.shared, options.frames)

@@ -631,6 +631,24 @@ def test_training_resumes_from_its_last_validation_even_if_it_was_not_the_best(
     assert all(torch.equal(value, best["state_dict"][f"average.{name}"]) for name, value in weights.items())
 
 
+def test_last_weights_are_kept_on_request(tmp_path, within, monkeypatch):
+    scores = iter([0.1, 0.2, 0.3, 0.4])
+    end = SuperResolution.on_validation_epoch_end
+
+    def worse(self):
+        end(self)
+        self.log("val/RMSE_v", next(scores), logger=False)
+
+    monkeypatch.setattr(SuperResolution, "on_validation_epoch_end", worse)
+    assert within(*SMOKE, "trainer.steps=3", "trainer.keep=last", "output_dir=out")[0] == 0
+    last = torch.load(tmp_path / "out" / "checkpoints" / "last.ckpt", weights_only=True)
+    assert last["global_step"] == 3
+    weights = load_file(tmp_path / "out" / "weights.safetensors")
+    assert all(torch.equal(value, last["state_dict"][f"average.{name}"]) for name, value in weights.items())
+    code, _, errors = within(*SMOKE, "trainer.keep=first", "output_dir=other")
+    assert (code, errors) == (2, ["error: trainer.keep: expected one of best, last, got first"])
+
+
 def test_checkpoint_of_a_stranger_removes_nothing_outside_the_run(tmp_path, within, interrupt):
     (tmp_path / "victim").mkdir()
     (tmp_path / "victim" / "thesis.txt").write_text("precious")

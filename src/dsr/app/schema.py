@@ -17,6 +17,7 @@ from dsr.utils.builder import ConfigError, check_types
 from dsr.utils.parsing import is_number
 
 STRATEGIES = ("auto", "ddp")
+KEPT = ("best", "last")
 PRECISIONS = ("float32", "bfloat16", "auto")
 _GROUPS = (
     "dataset",
@@ -195,6 +196,7 @@ class TrainerConfig:
     init: str | None = None
     shared: str | None = None
     frozen: list[str] = field(default_factory=list)
+    keep: str = "best"
 
 
 @dataclass
@@ -238,8 +240,9 @@ class TrainConfig(RunConfig):
         devices = self.trainer.devices
         if devices != "auto" and (isinstance(devices, bool) or not isinstance(devices, int) or devices < 1):
             raise ConfigError(f"trainer.devices: expected auto or a positive number, got {devices!r}")
-        if self.trainer.strategy not in STRATEGIES:
-            raise ConfigError(f"trainer.strategy: expected one of {', '.join(STRATEGIES)}, got {self.trainer.strategy}")
+        for name, choices in (("strategy", STRATEGIES), ("keep", KEPT)):
+            if (value := getattr(self.trainer, name)) not in choices:
+                raise ConfigError(f"trainer.{name}: expected one of {', '.join(choices)}, got {value}")
 
 
 def given_keys() -> list[str]:

@@ -228,7 +228,7 @@ def _train(plain: dict[str, Any], settings: TrainConfig, device: torch.device, p
             f"interrupted at step {trainer.global_step}; resume={folder} goes on from there"
         ) from None
     if first:
-        _export(module, folder / _LAST.with_name("best.ckpt"), weights, facts)
+        _export(module, folder / _LAST.with_name(f"{settings.trainer.keep}.ckpt"), weights, facts)
     progress.say(f"weights: {weights}")
     return math.nan if best.best_model_score is None else float(best.best_model_score)
 
@@ -490,14 +490,14 @@ def _facts(plain: Mapping[str, Any], module: SuperResolution) -> dict[str, Any]:
     }
 
 
-def _export(module: SuperResolution, best: Path, weights: Path, facts: Mapping[str, Any]) -> None:
-    """Write the averaged weights of the best checkpoint, with the training's main settings."""
+def _export(module: SuperResolution, kept: Path, weights: Path, facts: Mapping[str, Any]) -> None:
+    """Write the averaged weights of a checkpoint, with the training's main settings."""
     prefix = "average."
     try:
-        checkpoint = read_torch_file(best)
+        checkpoint = read_torch_file(kept)
         state, steps = checkpoint["state_dict"], int(checkpoint["global_step"])
         module.average.load_state_dict({k.removeprefix(prefix): v for k, v in state.items() if k.startswith(prefix)})
     except (ValueError, KeyError, TypeError, AttributeError, RuntimeError, OSError) as error:
-        raise CheckpointError(best, error) from error
+        raise CheckpointError(kept, error) from error
     with replacing(weights) as temporary:
         save_network(temporary, module.average, facts["model"], {**facts, "steps": steps})

@@ -1,0 +1,125 @@
+"""Train facets for days: stages in turn, each a training of about an hour, and after each a row of all yardsticks.
+
+    python benchmarks/long_training.py [PLAN] [-o DIR] [--shared DIR] [--rounds N]
+
+``PLAN`` is ``long_training.yaml`` beside this file: ``stages``, each with the name of its ``weights``, its ``steps``
+and further ``overrides`` of ``train.py``, and the ``parts`` of ``real_sensors.py`` that are measured. Each stage starts
+from the weights that its name had last, at first those that come with dsr, and its learning rate falls to 0 at its end,
+so that its weights are ready to use. ``DIR`` (``outputs/long_training``) holds the runs, ``weights/`` with the latest
+of each name, in half precision as they are packaged, and ``curve.csv``.
+
+One thread, at the lowest priority. It may be killed at any time: the same command goes on from the last checkpoint.
+Ctrl-C saves one first.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import os
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Iterator, Mapping
+from itertools import count
+from pathlib import Path
+from typing import Any
+
+import torch
+import yaml
+from real_sensors import measure, upsampled, with_weights
+
+from dsr.methods.networks.trained import NETWORKS
+from dsr.methods.networks.weight_files import load_network, read_header, save_network
+from dsr.utils.files import replacing, write_text
+
+HERE = Path(__file__).resolve().parent
+PACKAGED = HERE.parent / "src" / "dsr" / "methods" / "weights"
+
+
+def stages(plan: Mapping[str, Any], out: Path) -> Iterator[tuple[int, Mapping[str, Any], Path]]:
+    """Yield the stages in turn, again and again: their number, what they are, and the folder of their run."""
+    for number in count():
+        stage = plan["stages"][number % len(plan["stages"])]
+        yield number, stage, out / f"{number:03d}_{stage['weights']}"
+
+
+def train(stage: Mapping[str, Any], number: int, run: Path, weights: Path) -> None:
+    """Begin or go on with the training of a stage, unless it is complete."""
+    if (run / "weights.safetensors").is_file():
+        return
+    command = [
+        sys.executable, str(HERE.parent / "train.py"), *stage["overrides"], f"trainer.steps={stage['steps']}",
+        "trainer.keep=last", f"trainer.init={weights}", f"seed={number}", f"output_dir={run}",
+    ]  # fmt: skip
+    code = subprocess.run(command, check=False, env={**os.environ, "OMP_NUM_THREADS": "1"}).returncode  # noqa: S603
+    if code:
+        sys.exit(code)
+
+
+def keep(run: Path, weights: Path) -> None:
+    """Store the weights of a run in place of the latest of its name, with the links of these to other files."""
+    header = read_header(weights)
+    net = load_network(run / "weights.safetensors", NETWORKS)
+    links = {key: weights.parent / header[key] if key in header else None for key in ("shared", "clean")}
+    with replacing(weights) as temporary:
+        save_network(
+            temporary, net, header["model"], read_header(run / "weights.safetensors")["facts"], half=True, **links
+        )
+
+
+def scores(parts: list[str], weights: Path, shared: Path) -> dict[str, float]:
+    """Return the scores of the latest weights in all parts, by part and name."""
+    name = with_weights(weights)
+    rows = {part: measure(part, lambda sample: upsampled(sample, name, "cpu", weights), shared, None) for part in parts}
+    return {f"{part}/{name}": value for part, row in rows.items() for name, value in row.items()}
+
+
+def note(curve: Path, row: Mapping[str, Any]) -> None:
+    """Add a row to the curve."""
+    rows = list(csv.DictReader(curve.read_text().splitlines())) if curve.is_file() else []
+    names = dict.fromkeys((*(rows[0] if rows else ()), *row))
+    lines = [",".join(names), *(",".join(str(each.get(name, "")) for name in names) for each in (*rows, row))]
+    write_text(curve, "\n".join(lines) + "\n")
+    print(
+        "  ".join(
+            f"{name} {value:.4g}" if isinstance(value, float) else f"{name} {value}" for name, value in row.items()
+        )
+    )
+
+
+def main() -> None:
+    """Train and measure."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("plan", nargs="?", type=Path, default=HERE / "long_training.yaml")
+    parser.add_argument("-o", "--output", type=Path, default=Path("outputs/long_training"))
+    parser.add_argument("--shared", type=Path, default=Path(os.environ.get("DSR_SHARED", "../shared")))
+    parser.add_argument("--rounds", type=int, help="stop after so many stages; never is the default")
+    options = parser.parse_args()
+    os.nice(15)
+    torch.set_num_threads(1)
+    plan = yaml.safe_load(options.plan.read_text())
+    folder, curve = options.output.resolve() / "weights", options.output.resolve() / "curve.csv"
+    folder.mkdir(parents=True, exist_ok=True)
+    for packaged in PACKAGED.glob("facets_x*.safetensors"):
+        if not (folder / packaged.name).exists():
+            shutil.copy(packaged, folder)
+    done = len(curve.read_text().splitlines()) - 2 if curve.is_file() else -1  # beside the names and the first row
+    if done < 0:
+        note(curve, {"stage": "packaged", "steps": 0, "minutes": 0, **scores(plan["parts"], folder, options.shared)})
+        done = 0
+    for number, stage, run in stages(plan, options.output.resolve()):
+        if options.rounds is not None and number >= options.rounds:
+            break
+        if number < done:
+            continue
+        started = time.monotonic()
+        train(stage, number, run, folder / f"{stage['weights']}.safetensors")
+        keep(run, folder / f"{stage['weights']}.safetensors")
+        row = {"stage": run.name, "steps": stage["steps"], "minutes": round((time.monotonic() - started) / 60)}
+        note(curve, {**row, **scores(plan["parts"], folder, options.shared)})
+
+
+if __name__ == "__main__":
+    main()
