@@ -161,7 +161,7 @@ def test_structured_light_is_as_noisy_as_measured_ones() -> None:
     """Nguyen et al. 2012: 1.2 mm + 1.9 mm (z - 0.4)^2, times 0.4 to 2.5, and steps of disparity."""
 
     def deviation(depth: float) -> float:
-        errors = torch.stack([error[error.isfinite()].std() for error in _errors("structured", _wall(depth), 24)])
+        errors = torch.stack([error[error.isfinite()].std() for error in _errors("structured", _wall(depth), 80)])
         return depth * float(errors.median())
 
     near, middle, far = (deviation(depth) for depth in (0.5, 1, 3))

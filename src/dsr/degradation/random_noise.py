@@ -55,7 +55,9 @@ def _structured(values: Tensor, luma: Tensor, generator: torch.Generator) -> Ten
     axial = 0.0012 + 0.0019 * (depth - 0.4).square()
     axial = axial + 0.0001 / depth.sqrt() * _grazing(values, focal)
     noise = stereo_constant * values.square() * axial * power(-0.4, 0.4, generator)
-    grain = waves_of(values, min(power(0, 1.1, generator), _longest(values)), generator)
+    length = min(power(0, 1.1, generator), _longest(values))
+    smooth = chance(0.5, generator)  # a matching window averages: where steps are coarser, plateaus with winding edges
+    grain = field_of(values, length / 3.33, generator) if smooth else waves_of(values, length, generator)
     if chance(0.4, generator):
         grain = grain + uniform(0.2, 1, generator) * _bands(values, generator)
     result = _count(stereo_constant * seen, noise.nan_to_num(0) * grain, generator) / stereo_constant
@@ -147,6 +149,9 @@ def _flight(values: Tensor, luma: Tensor, generator: torch.Generator) -> Tensor:
         size = 3 + 2 * int(torch.randint(5, (1,), generator=generator))
         mixed = _means(depth, amplitude, size)
         depth = torch.where(depth.isfinite() & (field_of(depth, 1, generator) > -0.5), mixed, depth)
+    if chance(0.3, generator):  # enlarged by interpolation, or filtered
+        wide = _means(depth, torch.ones_like(depth), 3 + 2 * int(torch.randint(3, (1,), generator=generator)))
+        depth = torch.where(depth.isfinite(), wide, depth)
     exact = depth
     strength = power(-3.8, -2.5, generator) * depth ** uniform(1, 3, generator) / (luma + 0.05).sqrt()
     length = min(uniform(1, 9, generator), _longest(values)) if chance(0.6, generator) else 1
