@@ -368,8 +368,8 @@ def least_error(sensor: Sensor, depth: Tensor) -> Tensor:
 
 _CONSTANTS = (16.0, 4096.0)
 """Range of constants that are looked for, in metres: 16 pixel metres in whole pixels to 128 in steps of 1/32."""
-_ROUNDINGS = (1e-3, 1e-4)
-"""Metres to which maps are rounded."""
+_ROUNDINGS = (1e-3, 1.25e-4, 1e-4)
+"""Metres to which cameras' files are rounded."""
 _SEEN = 2.0
 """A step of depth shows if it is so many times what values are rounded to."""
 _COMMON = 4
@@ -404,12 +404,15 @@ def recognise_values(depth: Tensor) -> ValueSteps | None:
         depth: (1, h, w) in metres, NaN in holes, as it was read: neither resampled nor filtered.
 
     Returns:
-        None where the values keep to no steps, or too few of them are seen.
+        None where the values keep to no steps, or too few of them are seen, or they are not rounded as cameras write
+        them: those of a computed plane may keep to steps, too.
 
     """
     values, counts = torch.unique(depth[depth.isfinite()].double(), return_counts=True)
     distinct = values[(counts >= _COMMON) & (values >= _NEAREST)].cpu().numpy()
-    rounding = next((each for each in _ROUNDINGS if _is_rounded(distinct, each)), 0.0)
+    rounding = next((each for each in _ROUNDINGS if _is_rounded(distinct, each)), None)
+    if rounding is None or not len(distinct):
+        return None
     found: list[ValueSteps] = []
     low = _CONSTANTS[0]
     while low < _CONSTANTS[1]:
