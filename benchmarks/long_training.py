@@ -4,9 +4,10 @@
 
 ``PLAN`` is ``long_training.yaml`` beside this file: ``stages``, each with the name of its ``weights``, its ``steps``
 and further ``overrides`` of ``train.py``, and the ``parts`` of ``real_sensors.py`` that are measured. Each stage starts
-from the weights that its name had last, at first those that come with dsr, and its learning rate falls to 0 at its end,
-so that its weights are ready to use. ``DIR`` (``outputs/long_training``) holds the runs, ``weights/`` with the latest
-of each name, in half precision as they are packaged, and ``curve.csv``.
+from the weights that its name had last, at first those that come with dsr, and its learning rate falls to 0 at its end.
+Its ``share`` is that of its weights in the mean with those it started from, which keeps better what a stage sees less
+of (Wortsman et al., *Robust fine-tuning of zero-shot models*, CVPR 2022). ``DIR`` (``outputs/long_training``) holds
+the runs, ``weights/`` with the latest of each name, in half precision as they are packaged, and ``curve.csv``.
 
 One thread, at the lowest priority. It may be killed at any time: the same command goes on from the last checkpoint.
 Ctrl-C saves one first.
@@ -60,15 +61,17 @@ def train(stage: Mapping[str, Any], number: int, run: Path, weights: Path) -> No
         sys.exit(code)
 
 
-def keep(run: Path, weights: Path) -> None:
-    """Store the weights of a run in place of the latest of its name, with the links of these to other files."""
-    header = read_header(weights)
-    net = load_network(run / "weights.safetensors", NETWORKS)
+def keep(run: Path, weights: Path, share: float) -> None:
+    """Move the latest weights of a name by a share towards those of a run, and keep their links to other files."""
+    header, trained = read_header(weights), run / "weights.safetensors"
+    net, before = (load_network(path, NETWORKS) for path in (trained, weights))
+    state = net.state_dict()
+    for name, old in before.state_dict().items():
+        if old.is_floating_point():
+            state[name].lerp_(old, 1 - share)
     links = {key: weights.parent / header[key] if key in header else None for key in ("shared", "clean")}
     with replacing(weights) as temporary:
-        save_network(
-            temporary, net, header["model"], read_header(run / "weights.safetensors")["facts"], half=True, **links
-        )
+        save_network(temporary, net, header["model"], read_header(trained)["facts"], half=True, **links)
 
 
 def scores(parts: list[str], weights: Path, shared: Path) -> dict[str, float]:
@@ -118,7 +121,7 @@ def main() -> None:
             continue
         started = time.monotonic()
         train(stage, number, run, folder / f"{stage['weights']}.safetensors")
-        keep(run, folder / f"{stage['weights']}.safetensors")
+        keep(run, folder / f"{stage['weights']}.safetensors", stage["share"])
         row = {"stage": run.name, "steps": stage["steps"], "minutes": round((time.monotonic() - started) / 60)}
         note(curve, {**row, **scores(plan["parts"], folder, options.shared)})
 
