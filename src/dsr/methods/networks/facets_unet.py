@@ -44,12 +44,13 @@ from dsr.methods.networks.facets_layers import (
     Context,
     MixedResidual,
     convolve_together,
+    enlarge,
     make_pyramid,
     photo_input,
     scale_down,
     silence,
 )
-from dsr.methods.networks.facets_planes import NEIGHBOURS, Stencil, average_planes, mix_planes, smooth, stencil
+from dsr.methods.networks.facets_planes import NEIGHBOURS, Stencil, average_planes, mix_planes_apart, smooth, stencil
 from dsr.methods.networks.facets_start import start_from_another_factor, start_from_facets
 from dsr.methods.networks.inpainting import inpaint
 from dsr.methods.networks.maps import upsample_bicubic
@@ -315,17 +316,19 @@ class FacetsUNet(DisparityNetwork):
     def _see(self, photo: Tensor, scale: int, band: _Band) -> list[Tensor]:
         """Return the photo's features in a band with its margins, from the full to the low resolution."""
         window = photo[..., scale * band.rows.start : scale * band.rows.stop, :]
-        pyramid = [functional.relu(self.photo(window.to(self.photo.weight.dtype)))]
+        pyramid = [functional.relu(self.photo(window.to(self.photo.weight.dtype)), inplace=True)]
         for layer in self.down:
-            pyramid.append(functional.relu(layer(pyramid[-1])))
+            pyramid.append(functional.relu(layer(pyramid[-1]), inplace=True))
         return pyramid
 
     def _choose(self, x: Tensor, planes: Tensor, pyramid: list[Tensor], scale: int) -> tuple[Tensor, Tensor, Tensor]:
         """Return the mixture of planes, the logarithms of the expected errors, (B, 2, H, W), and residuals' factors."""
         for up, join, features in zip(self.up, self.join, reversed(pyramid[:-1]), strict=True):
-            x = functional.relu(join(torch.cat((functional.pixel_shuffle(up(x), 2), features), dim=1)))
-        choice, errors, gate = convolve_together((self.choice, self.errors, self.gate), x)
-        return mix_planes(planes, choice, scale), errors.float() - 5, torch.sigmoid(gate.float() + _CLOSED)
+            x = functional.relu(join(enlarge(up, x, features)), inplace=True)
+        found = convolve_together((self.choice, self.errors, self.gate), x)
+        mixed, others = mix_planes_apart(planes, found, scale)
+        errors, gate = others.float().split((2, 1), dim=1)
+        return mixed, errors - 5, torch.sigmoid(gate + _CLOSED)
 
     def _propose_planes(self, output: Tensor, around: Stencil, smoothed: list[Stencil]) -> Tensor:
         """Return the planes of each low-resolution pixel, (B, facets, 3, h, w): value at its centre and slopes."""
