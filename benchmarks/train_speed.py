@@ -41,6 +41,7 @@ from dsr.training.degradation import Batch, Degradation
 from dsr.training.objective import Objective
 from dsr.training.patches import Patches
 from dsr.training.settings import PatchSettings
+from dsr.utils.allocation import keep_freed_memory
 from dsr.utils.lightning import fit
 from dsr.utils.progress import SILENT
 
@@ -135,6 +136,7 @@ def profile(steps: int, device: torch.device, overrides: Sequence[str]) -> None:
         small = ["dataset.count=8", "metrics.lpips=false", f"trainer.steps={steps}", f"trainer.validate_every={steps}"]
         settings = TrainConfig.of(plain_config(hydra.compose("train", [*small, *overrides])))
     settings.precision = "float32" if settings.precision == "auto" else settings.precision
+    keep_freed_memory()
     times = StepTimes(device)
     data = training_data(settings)
     module = _module(settings, _network(settings), data, functools.partial(metric_collection, settings.metrics, device))

@@ -45,6 +45,7 @@ from dsr.training.module import SuperResolution
 from dsr.training.objective import Objective, SurfaceObjective, balance_weight
 from dsr.training.settings import Schedule
 from dsr.utils import interruption
+from dsr.utils.allocation import keep_freed_memory
 from dsr.utils.builder import ConfigError, build
 from dsr.utils.checkpoints import CheckpointError
 from dsr.utils.console import USAGE_ERROR, ConsoleProgress
@@ -195,6 +196,7 @@ def _prepare(plain: dict[str, Any], settings: TrainConfig, device: torch.device,
 
 def _train(plain: dict[str, Any], settings: TrainConfig, device: torch.device, processes: Processes) -> float:
     """Train in one of the processes, and return the best score."""
+    keep_freed_memory()
     first = processes.first
     progress = ConsoleProgress(Console(quiet=not first))
     prepared = _prepare(plain, settings, device, processes.count)
