@@ -59,7 +59,8 @@ class Residual(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """Map (B, C, h, w) to the same shape."""
-        return x + self.second(functional.relu(self.first(x), inplace=True))
+        found: Tensor = self.second(functional.relu(self.first(x), inplace=True)).add_(x)
+        return found
 
 
 class MixedResidual(nn.Module):
@@ -85,7 +86,7 @@ class MixedResidual(nn.Module):
             width = self.width
             return self._map(x, shares.reshape(1), 1 + gains.reshape(width), shifts.reshape(width))
         each = zip(x.split(1), shares.float(), 1 + gains.float(), shifts.float(), strict=True)
-        return torch.cat([self._map(*parts) for parts in each])
+        return concatenate([self._map(*parts) for parts in each])
 
     def _map(self, x: Tensor, share: Tensor, gain: Tensor, shift: Tensor) -> Tensor:
         """Map one image; gain and shift become part of the convolution."""
@@ -95,7 +96,7 @@ class MixedResidual(nn.Module):
         weights = [mixed[0] * gain.view(-1, 1, 1, 1), torch.addcmul(shift, mixed[1], gain), *mixed[2:]]
         first, first_bias, second, second_bias = (each.to(x.dtype) for each in weights)
         hidden = functional.relu(functional.conv2d(x, first, first_bias, padding=1), inplace=True)
-        return x + functional.conv2d(hidden, second, second_bias, padding=1)
+        return functional.conv2d(hidden, second, second_bias, padding=1).add_(x)
 
     def _parameters_of(self) -> list[list[Tensor]]:
         """Return the weights and biases of both convolutions, for both sets."""
@@ -127,6 +128,11 @@ class Context(nn.Module):
         for i in (2, 1):
             x = self.decoder[i - 1](functional.relu(kept[i - 1] + enlarge(self.grow[i], x), inplace=True))
         return enlarge(self.grow[0], x)[..., :height, :width]
+
+
+def concatenate(parts: Sequence[Tensor], dim: int = 0) -> Tensor:
+    """Return the concatenation of tensors, a single one as it is."""
+    return parts[0] if len(parts) == 1 else torch.cat(list(parts), dim=dim)
 
 
 def convolve_together(convs: Sequence[nn.Conv2d], x: Tensor) -> Tensor:

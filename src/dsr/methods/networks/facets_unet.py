@@ -43,6 +43,7 @@ from dsr.methods.networks.facets_layers import (
     HEAD,
     Context,
     MixedResidual,
+    concatenate,
     convolve_together,
     enlarge,
     make_pyramid,
@@ -285,7 +286,7 @@ class FacetsUNet(DisparityNetwork):
         kept = [self._see(photo, scale, bands[0])] if len(bands) == 1 else None
         seen = kept or (self._see(photo, scale, band) for band in bands)
         features = [pyramid[-1][..., band.inner, :] for pyramid, band in zip(seen, bands, strict=True)]
-        x = functional.relu(self.coarse(lr_input.to(dtype)) + torch.cat(features, dim=-2))
+        x = functional.relu(self.coarse(lr_input.to(dtype)).add_(concatenate(features, dim=-2)), inplace=True)
         kind, shares = functional.relu(self.hints(told.to(dtype))), self.shares(told.to(dtype)).sigmoid()
         for number, (block, modulate) in enumerate(zip(self.trunk, self.modulation, strict=True)):
             if number == _BEFORE:
@@ -300,7 +301,7 @@ class FacetsUNet(DisparityNetwork):
             bits.append([each[..., rows, :] for each in found])
             if progress is not None:
                 progress(number, len(bands))
-        result, errors, gate = (torch.cat(each, dim=-2) for each in zip(*bits, strict=True))
+        result, errors, gate = (concatenate(each, dim=-2) for each in zip(*bits, strict=True))
         if given.shape == values.shape:  # not for a map of the photo's own size
             with torch.autocast(rgb.device.type, enabled=False):
                 result = _project(result, given, known, gate, hints)
