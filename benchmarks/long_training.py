@@ -36,6 +36,11 @@ from dsr.methods.networks.weight_files import load_network, read_header, save_ne
 from dsr.utils.files import replacing, write_text
 
 HERE = Path(__file__).resolve().parent
+ENVIRONMENT = {
+    "OMP_NUM_THREADS": "1",
+    "MALLOC_MMAP_THRESHOLD_": str(2**30),  # freed memory is kept: the system would clear every page of it anew
+    "MALLOC_TRIM_THRESHOLD_": str(2**31 - 1),
+}
 PACKAGED = HERE.parent / "src" / "dsr" / "methods" / "weights"
 
 
@@ -56,7 +61,7 @@ def train(stage: Mapping[str, Any], number: int, run: Path, weights: Path) -> No
         sys.executable, str(HERE.parent / "train.py"), *stage["overrides"], *shared, f"trainer.steps={stage['steps']}",
         "trainer.keep=last", f"trainer.init={weights}", f"seed={number}", f"output_dir={run}",
     ]  # fmt: skip
-    code = subprocess.run(command, check=False, env={**os.environ, "OMP_NUM_THREADS": "1"}).returncode  # noqa: S603
+    code = subprocess.run(command, check=False, env={**os.environ, **ENVIRONMENT}).returncode  # noqa: S603
     if code:
         sys.exit(code)
 

@@ -32,7 +32,7 @@ from dsr.app.devices import find_processes
 from dsr.app.metrics import metric_collection
 from dsr.app.schema import TrainConfig, plain_config, register
 from dsr.app.train import _module, _network
-from dsr.app.trainer import training_trainer
+from dsr.app.trainer import FirstValidation, training_trainer
 from dsr.app.training_runs import training_data
 from dsr.data.simgeo import SimGeo
 from dsr.degradation.downsampling import Downsampling
@@ -133,7 +133,7 @@ def profile(steps: int, device: torch.device, overrides: Sequence[str]) -> None:
     conf = Path(__file__).resolve().parents[1] / "conf"
     with hydra.initialize_config_dir(str(conf), version_base="1.3"):
         small = ["dataset.count=8", "metrics.lpips=false", f"trainer.steps={steps}", f"trainer.validate_every={steps}"]
-        settings = TrainConfig.of(plain_config(hydra.compose("train", [*small, "loss.w=1", *overrides])))
+        settings = TrainConfig.of(plain_config(hydra.compose("train", [*small, *overrides])))
     settings.precision = "float32" if settings.precision == "auto" else settings.precision
     times = StepTimes(device)
     data = training_data(settings)
@@ -142,7 +142,8 @@ def profile(steps: int, device: torch.device, overrides: Sequence[str]) -> None:
     processes = find_processes(device, 1, "auto")
     with tempfile.TemporaryDirectory() as folder:
         trainer, _ = training_trainer(settings, Path(folder), device, SILENT, processes)
-        trainer.callbacks.append(LastCallback(times))  # type: ignore[attr-defined]
+        without = [each for each in trainer.callbacks if not isinstance(each, FirstValidation)]  # type: ignore[attr-defined]
+        trainer.callbacks = [*without, LastCallback(times)]  # type: ignore[attr-defined]
         trainer.limit_val_batches = 0
         network = "network and losses"
         module.loss_terms = times.timed(network, module.loss_terms)  # type: ignore[method-assign]

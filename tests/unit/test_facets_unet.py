@@ -8,12 +8,20 @@ from pathlib import Path
 import pytest
 import torch
 from torch import Tensor, nn
+from torch.nn import functional
 
 from dsr.degradation.downsampling import Downsampling
 from dsr.degradation.hints import FACTS, KERNELS, encode_facts
 from dsr.methods.networks import facets_planes, facets_unet
 from dsr.methods.networks.facets import Facets
-from dsr.methods.networks.facets_planes import NEIGHBOURS, average_planes, mix_planes, spline_logits
+from dsr.methods.networks.facets_layers import enlarge
+from dsr.methods.networks.facets_planes import (
+    NEIGHBOURS,
+    average_planes,
+    mix_planes,
+    mix_planes_apart,
+    spline_logits,
+)
 from dsr.methods.networks.facets_unet import FacetsUNet
 from dsr.methods.networks.trained import NETWORKS
 from dsr.methods.networks.weight_files import load_network, save_network
@@ -212,6 +220,27 @@ def test_gradients_of_mixed_planes_are_those_of_differences(monkeypatch: pytest.
     planes = torch.randn((1, 1, 3, 3, 4), generator=generator, dtype=torch.float64, requires_grad=True)
     choice = torch.randn((1, NEIGHBOURS, 6, 8), generator=generator, dtype=torch.float64, requires_grad=True)
     assert torch.autograd.gradcheck(lambda *given: mix_planes(*given, 2), (planes, choice), fast_mode=True)
+    found = torch.randn((1, NEIGHBOURS + 2, 6, 8), generator=generator, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(lambda *given: mix_planes_apart(*given, 2), (planes, found), fast_mode=True)
+    mixed, others = mix_planes_apart(planes, found, 2)
+    torch.testing.assert_close(mixed, mix_planes(planes, found[:, :NEIGHBOURS], 2))
+    torch.testing.assert_close(others, found[:, NEIGHBOURS:])
+
+
+@pytest.mark.parametrize("width", [0, 5])
+def test_results_of_a_convolution_are_shuffled_before_features(width: int) -> None:
+    generator = torch.Generator().manual_seed(width)
+    conv = nn.Conv2d(3, 12, 1).double().to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    x = torch.randn((2, 3, 4, 5), generator=generator, dtype=torch.float64, requires_grad=True)
+    features = [torch.randn((2, width, 8, 10), generator=generator, dtype=torch.float64, requires_grad=True)][:width]
+    expected = torch.cat((functional.pixel_shuffle(conv(x), 2), *features), dim=1)
+    found = enlarge(conv, x, *features)
+    torch.testing.assert_close(found, expected)
+    factors = torch.randn(found.shape, generator=generator, dtype=torch.float64)
+    inputs = [x, conv.weight, conv.bias, *features]
+    gradients = [torch.autograd.grad((each * factors).sum(), inputs) for each in (found, expected)]
+    torch.testing.assert_close(*gradients)
+    assert gradients[0][1].stride() == conv.weight.stride()  # which several devices expect
 
 
 def test_mixed_planes_are_planes_at_each_pixel_weighted_by_a_softmax() -> None:

@@ -199,7 +199,7 @@ class SuperResolution(lightning.LightningModule):
         """Return AdamW and its learning-rate schedule, which is updated after every step."""
         schedule = self.schedule
         optimiser = torch.optim.AdamW(
-            self.net.parameters(), lr=schedule.learning_rate, weight_decay=schedule.weight_decay
+            self.net.parameters(), lr=schedule.learning_rate, weight_decay=schedule.weight_decay, fused=True
         )
         rates = torch.optim.lr_scheduler.LambdaLR(optimiser, schedule.factor)
         named = {"scheduler": rates, "interval": "step"}

@@ -23,7 +23,15 @@ from torch.nn import functional
 
 from dsr.degradation.downsampling import check_scale
 from dsr.methods.networks.base import NormalisedNetwork, expect_rgb_size
-from dsr.methods.networks.facets_layers import HEAD, Residual, make_pyramid, mean_colour, photo_input, scale_down
+from dsr.methods.networks.facets_layers import (
+    HEAD,
+    Residual,
+    enlarge,
+    make_pyramid,
+    mean_colour,
+    photo_input,
+    scale_down,
+)
 from dsr.methods.networks.facets_planes import NEIGHBOURS, Stencil, mix_planes, stencil
 
 _FAINT, _STRONG = 1e-3, 0.25
@@ -96,13 +104,13 @@ class Facets(NormalisedNetwork):
         expect_rgb_size(rgb, values, self.scale)
         around = stencil(values)
         dtype = self.photo.weight.dtype
-        pyramid = [functional.relu(self.photo(photo_input(rgb, mean).to(dtype)))]
+        pyramid = [functional.relu(self.photo(photo_input(rgb, mean).to(dtype)), inplace=True)]
         for layer in self.down:
-            pyramid.append(functional.relu(layer(pyramid[-1])))
+            pyramid.append(functional.relu(layer(pyramid[-1]), inplace=True))
         x = self.trunk(functional.relu(pyramid[-1] + self.coarse(_lr_input(around).to(dtype))))
         planes = self._propose_planes(self.planes(x), around)
         for up, join, features in zip(self.up, self.join, reversed(pyramid[:-1]), strict=True):
-            x = functional.relu(join(torch.cat((functional.pixel_shuffle(up(x), 2), features), dim=1)))
+            x = functional.relu(join(enlarge(up, x, features)), inplace=True)
         return mix_planes(planes, self.choice(x), self.scale)
 
     def _propose_planes(self, output: Tensor, around: Stencil) -> Tensor:

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
+from torch.autograd.function import once_differentiable
 from torch.nn import functional
 
 from dsr.methods.networks.exportable import exporting, pad_to_multiple
@@ -58,7 +59,8 @@ class Residual(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """Map (B, C, h, w) to the same shape."""
-        return x + self.second(functional.relu(self.first(x)))
+        found: Tensor = self.second(functional.relu(self.first(x), inplace=True)).add_(x)
+        return found
 
 
 class MixedResidual(nn.Module):
@@ -84,7 +86,7 @@ class MixedResidual(nn.Module):
             width = self.width
             return self._map(x, shares.reshape(1), 1 + gains.reshape(width), shifts.reshape(width))
         each = zip(x.split(1), shares.float(), 1 + gains.float(), shifts.float(), strict=True)
-        return torch.cat([self._map(*parts) for parts in each])
+        return concatenate([self._map(*parts) for parts in each])
 
     def _map(self, x: Tensor, share: Tensor, gain: Tensor, shift: Tensor) -> Tensor:
         """Map one image; gain and shift become part of the convolution."""
@@ -93,8 +95,8 @@ class MixedResidual(nn.Module):
         ]
         weights = [mixed[0] * gain.view(-1, 1, 1, 1), torch.addcmul(shift, mixed[1], gain), *mixed[2:]]
         first, first_bias, second, second_bias = (each.to(x.dtype) for each in weights)
-        hidden = functional.relu(functional.conv2d(x, first, first_bias, padding=1))
-        return x + functional.conv2d(hidden, second, second_bias, padding=1)
+        hidden = functional.relu(functional.conv2d(x, first, first_bias, padding=1), inplace=True)
+        return functional.conv2d(hidden, second, second_bias, padding=1).add_(x)
 
     def _parameters_of(self) -> list[list[Tensor]]:
         """Return the weights and biases of both convolutions, for both sets."""
@@ -120,20 +122,93 @@ class Context(nn.Module):
         x = pad_to_multiple(x, 8)
         kept = []
         for shrink, encode in zip(self.shrink, self.encoder, strict=True):
-            x = encode(functional.relu(shrink(x)))
+            x = encode(functional.relu(shrink(x), inplace=True))
             kept.append(x)
         x = x + self.overall(x.mean(dim=(-2, -1)))[..., None, None]
         for i in (2, 1):
-            x = self.decoder[i - 1](functional.relu(kept[i - 1] + functional.pixel_shuffle(self.grow[i](x), 2)))
-        return functional.pixel_shuffle(self.grow[0](x), 2)[..., :height, :width]
+            x = self.decoder[i - 1](functional.relu(kept[i - 1] + enlarge(self.grow[i], x), inplace=True))
+        return enlarge(self.grow[0], x)[..., :height, :width]
 
 
-def convolve_together(convs: Sequence[nn.Conv2d], x: Tensor) -> tuple[Tensor, ...]:
-    """Return the results of convolutions of the same input and of one kind, computed as one."""
+def concatenate(parts: Sequence[Tensor], dim: int = 0) -> Tensor:
+    """Return the concatenation of tensors, a single one as it is."""
+    return parts[0] if len(parts) == 1 else torch.cat(list(parts), dim=dim)
+
+
+def convolve_together(convs: Sequence[nn.Conv2d], x: Tensor) -> Tensor:
+    """Return the results of convolutions of the same input and of one kind, one behind the other, computed as one."""
     weight = torch.cat([conv.weight for conv in convs])
     bias = torch.cat([conv.bias for conv in convs if conv.bias is not None])
-    found = functional.conv2d(x, weight, bias, padding=convs[0].padding)
-    return found.split([conv.out_channels for conv in convs], dim=1)
+    return functional.conv2d(x, weight, bias, padding=convs[0].padding)
+
+
+def enlarge(conv: nn.Module, x: Tensor, *features: Tensor) -> Tensor:
+    """Return the sub-pixel shuffle of a 1 x 1 convolution's results, with the features behind them.
+
+    Args:
+        conv: a 2-D convolution to 4 C channels.
+        x: (B, channels, h, w).
+        features: (B, n, 2 h, 2 w), or none.
+
+    Returns:
+        (B, C + n, 2 h, 2 w), the channels of a pixel side by side in memory.
+
+    """
+    if exporting():
+        return torch.cat((functional.pixel_shuffle(conv(x), 2), *features), dim=1)
+    x = functional.conv2d(x, *(_BySubPixel.apply(each) for each in (conv.weight, conv.bias)))
+    enlarged: Tensor = _Interleave.apply(x, *features)
+    return enlarged
+
+
+class _BySubPixel(torch.autograd.Function):
+    """The order in which the 4 C outputs of a convolution are C of each sub-pixel, not four of each channel."""
+
+    @staticmethod
+    def forward(ctx: Any, weight: Tensor) -> Tensor:
+        """Return (4 C, ...)."""
+        ctx.save_for_backward(weight)
+        return weight.unflatten(0, (-1, 4)).transpose(0, 1).flatten(0, 1)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, gradient: Tensor) -> Tensor:
+        """Return the gradient in the layout of the weight, as several devices expect it."""
+        (weight,) = ctx.saved_tensors
+        ordered = gradient.unflatten(0, (4, -1)).transpose(0, 1).flatten(0, 1)
+        return torch.empty_like(weight).copy_(ordered)
+
+
+class _Interleave(torch.autograd.Function):
+    """Sub-pixels side by side, (B, 4 C, h, w), as (B, C, 2 h, 2 w), with features behind them, in one copy."""
+
+    @staticmethod
+    def forward(ctx: Any, x: Tensor, *features: Tensor) -> Tensor:
+        """Return (B, C + n, 2 h, 2 w)."""
+        batch, channels, height, width = x.shape
+        ctx.counts = [channels // 4, *(each.shape[1] for each in features)]
+        size = (batch, sum(ctx.counts), 2 * height, 2 * width)
+        found = torch.empty(size, dtype=x.dtype, device=x.device, memory_format=torch.channels_last)
+        own, *others = found.split(ctx.counts, dim=1)
+        _sub_pixels(own).copy_(x.unflatten(1, (2, 2, -1)))
+        for other, each in zip(others, features, strict=True):
+            other.copy_(each)
+        return found
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, ...]:
+        """Return the gradients of all."""
+        own, *others = gradient.split(ctx.counts, dim=1)
+        batch, count, height, width = own.shape
+        of_x = own.new_empty(batch, height // 2, width // 2, 4 * count).permute(0, 3, 1, 2)
+        of_x.unflatten(1, (2, 2, -1)).copy_(_sub_pixels(own))
+        return of_x, *others
+
+
+def _sub_pixels(values: Tensor) -> Tensor:
+    """Return a view of (B, C, 2 h, 2 w) maps as (B, 2, 2, C, h, w)."""
+    return values.unflatten(3, (-1, 2)).unflatten(2, (-1, 2)).permute(0, 3, 5, 1, 2, 4)
 
 
 def scale_down(conv: nn.Conv2d) -> nn.Conv2d:

@@ -215,60 +215,100 @@ def mix_planes(planes: Tensor, choice: Tensor, scale: int) -> Tensor:
         scale: H / h.
 
     """
+    return mix_planes_apart(planes, choice, scale)[0]
+
+
+def mix_planes_apart(planes: Tensor, found: Tensor, scale: int) -> tuple[Tensor, Tensor]:
+    """Return the mixture of the planes around each high-resolution pixel, (B, 1, H, W), and the other channels.
+
+    Args:
+        planes: (B, facets, 3, h, w).
+        found: (B, 9 * facets + n, H, W): logits as for :func:`mix_planes`, and n more channels, which are returned in
+            the type of the planes.
+        scale: H / h.
+
+    """
     batch, facets, _, height, width = planes.shape
     s, count = scale, NEIGHBOURS * facets
     # of the high-resolution pixels from the centre of their low-resolution pixel, in low-resolution pixels
     offsets = (torch.arange(s, dtype=planes.dtype, device=planes.device) + 0.5) / s - 0.5
     prior = spline_logits(offsets).repeat_interleave(facets, dim=0).view(count, s * s, 1)
-    near = gather_neighbours(planes).reshape(batch, count, 3, height * width)
+    near = gather_neighbours(planes).reshape(batch, count, 3, height, width)
     ones = torch.ones(s, s, dtype=offsets.dtype, device=offsets.device)
     basis = torch.stack((ones, ones * offsets, ones * offsets[:, None]), dim=-1).view(s * s, 3)
-    # the pixels of a low-resolution pixel become an axis of their own
-    logits = choice.reshape(batch, count, height, s, width, s).permute(0, 1, 3, 5, 2, 4)
-    logits = logits.reshape(batch, count, s * s, height * width)
     with torch.autocast(planes.device.type, enabled=False):
-        if exporting():
-            weights = (logits.to(planes.dtype) + prior).softmax(dim=1)
-            mixed = (weights * (basis @ near)).sum(dim=1)
-        else:
-            mixed = _MixPlanes.apply(near, logits, prior, basis)
-    return mixed.view(batch, s, s, height, width).permute(0, 3, 1, 4, 2).reshape(batch, 1, height * s, width * s)
+        if not exporting():
+            mixed, others = _MixPlanes.apply(near, found, prior, basis)
+            return mixed, others
+        # the pixels of a low-resolution pixel become an axis of their own
+        logits = found[:, :count].reshape(batch, count, height, s, width, s).permute(0, 1, 3, 5, 2, 4)
+        logits = logits.reshape(batch, count, s * s, height * width)
+        weights = (logits.to(planes.dtype) + prior).softmax(dim=1)
+        mixed = (weights * (basis @ near.flatten(3))).sum(dim=1)
+        mixed = mixed.view(batch, s, s, height, width).permute(0, 3, 1, 4, 2)
+        return mixed.reshape(batch, 1, height * s, width * s), found[:, count:].to(planes.dtype)
 
 
 class _MixPlanes(torch.autograd.Function):
     """A softmax over proposals times their planes at each pixel, some pixels at a time: no array of all of them."""
 
     @staticmethod
-    def forward(ctx: Any, near: Tensor, logits: Tensor, prior: Tensor, basis: Tensor) -> Tensor:
-        """Return (B, q, n) values of (B, C, 3, n) planes, (B, C, q, n) and (C, q, 1) logits, at (q, 3) = (1, u, v)."""
-        mixed = near.new_empty(near.shape[0], *logits.shape[-2:])
-        shares = torch.empty_like(logits, dtype=near.dtype) if any(ctx.needs_input_grad) else None
-        for part in _chunks(logits):
-            weights = (logits[part].to(near.dtype) + prior).softmax(dim=1)
-            if shares is not None:
-                shares[part] = weights
-            mixed[part] = (weights * (basis @ near[part])).sum(dim=1)
-        ctx.save_for_backward(near, shares, mixed, basis)
-        ctx.dtype = logits.dtype
-        return mixed
+    def forward(ctx: Any, near: Tensor, found: Tensor, prior: Tensor, basis: Tensor) -> tuple[Tensor, Tensor]:
+        """Return what :func:`mix_planes_apart` does.
+
+        Args:
+            ctx: of the gradient.
+            near: (B, C, 3, h, w) planes.
+            found: (B, C + n, s h, s w).
+            prior: (C, q, 1) logits, where q = s * s.
+            basis: (q, 3) = (1, u, v).
+
+        """
+        count, (height, width), s = near.shape[1], near.shape[-2:], math.isqrt(len(basis))
+        mixed = near.new_empty(found.shape[0], 1, *found.shape[-2:])
+        logits, target, kept = _blocks(found[:, :count], s), _blocks(mixed, s), []
+        for part in _chunks(near.shape[0] * count * s * s, height, width):
+            weights = logits[part].to(near.dtype, memory_format=torch.contiguous_format).flatten(4).flatten(2, 3)
+            weights = weights.add_(prior).softmax(dim=1)
+            if any(ctx.needs_input_grad):
+                kept.append(weights)
+            offered = basis @ near[part].flatten(3)
+            target[part] = offered.mul_(weights).sum(dim=1).view_as(target[part])
+        ctx.save_for_backward(near, found, mixed, basis, *kept)
+        return mixed, found[:, count:].to(near.dtype, memory_format=torch.contiguous_format, copy=True)
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, Tensor, None, None]:
-        """Return the gradients of the planes and of the logits."""
-        near, shares, mixed, basis = ctx.saved_tensors
-        of_near, of_logits = torch.empty_like(near), torch.empty_like(shares, dtype=ctx.dtype)
-        for part in _chunks(shares):
-            weighted = shares[part] * gradient[part][:, None]
-            of_near[part] = basis.T @ weighted
-            of_logits[part] = weighted * (basis @ near[part] - mixed[part][:, None])
-        return of_near, of_logits, None, None
+    def backward(ctx: Any, gradient: Tensor, of_others: Tensor) -> tuple[Tensor, Tensor, None, None]:
+        """Return the gradients of the planes and of the logits with the other channels."""
+        near, found, mixed, basis, *kept = ctx.saved_tensors
+        count, (height, width), s = near.shape[1], near.shape[-2:], math.isqrt(len(basis))
+        of_near, of_found = torch.empty_like(near), torch.empty_like(found)
+        of_found[:, count:] = of_others
+        target, gradients, values = _blocks(of_found[:, :count], s), _blocks(gradient, s), _blocks(mixed, s)
+        parts = _chunks(near.shape[0] * count * s * s, height, width)
+        for part, weights in zip(parts, kept, strict=True):
+            weighted = weights * gradients[part].flatten(4).flatten(2, 3)
+            of_near[part] = (basis.T @ weighted).view_as(near[part])
+            above = (basis @ near[part].flatten(3)).sub_(values[part].flatten(4).flatten(2, 3))
+            target[part] = above.mul_(weighted).view_as(target[part])
+        return of_near, of_found, None, None
 
 
-def _chunks(logits: Tensor) -> list[tuple[Any, slice]]:
-    """Return indices of parts of the last axis for which (B, C, q, n) logits fit into a processor's cache."""
-    step = max(1, _CHUNK // math.prod(logits.shape[:-1]))
-    return [(..., slice(first, first + step)) for first in range(0, logits.shape[-1], step)]
+def _blocks(values: Tensor, scale: int) -> Tensor:
+    """Return a view of (B, C, s h, s w) maps as (B, C, s, s, h, w)."""
+    return values.unflatten(3, (-1, scale)).unflatten(2, (-1, scale)).permute(0, 1, 3, 5, 2, 4)
+
+
+def _chunks(values: int, height: int, width: int) -> list[tuple[Any, ...]]:
+    """Return indices of parts of the last two axes of (..., h, w) that a cache holds, each pixel with some values."""
+    columns = min(width, max(1, _CHUNK // values))
+    rows = max(1, _CHUNK // (values * columns))
+    return [
+        (..., slice(top, top + rows), slice(left, left + columns))
+        for top in range(0, height, rows)
+        for left in range(0, width, columns)
+    ]
 
 
 def spline_logits(offsets: Tensor) -> Tensor:

@@ -43,13 +43,15 @@ from dsr.methods.networks.facets_layers import (
     HEAD,
     Context,
     MixedResidual,
+    concatenate,
     convolve_together,
+    enlarge,
     make_pyramid,
     photo_input,
     scale_down,
     silence,
 )
-from dsr.methods.networks.facets_planes import NEIGHBOURS, Stencil, average_planes, mix_planes, smooth, stencil
+from dsr.methods.networks.facets_planes import NEIGHBOURS, Stencil, average_planes, mix_planes_apart, smooth, stencil
 from dsr.methods.networks.facets_start import start_from_another_factor, start_from_facets
 from dsr.methods.networks.inpainting import inpaint
 from dsr.methods.networks.maps import upsample_bicubic
@@ -284,7 +286,7 @@ class FacetsUNet(DisparityNetwork):
         kept = [self._see(photo, scale, bands[0])] if len(bands) == 1 else None
         seen = kept or (self._see(photo, scale, band) for band in bands)
         features = [pyramid[-1][..., band.inner, :] for pyramid, band in zip(seen, bands, strict=True)]
-        x = functional.relu(self.coarse(lr_input.to(dtype)) + torch.cat(features, dim=-2))
+        x = functional.relu(self.coarse(lr_input.to(dtype)).add_(concatenate(features, dim=-2)), inplace=True)
         kind, shares = functional.relu(self.hints(told.to(dtype))), self.shares(told.to(dtype)).sigmoid()
         for number, (block, modulate) in enumerate(zip(self.trunk, self.modulation, strict=True)):
             if number == _BEFORE:
@@ -299,7 +301,7 @@ class FacetsUNet(DisparityNetwork):
             bits.append([each[..., rows, :] for each in found])
             if progress is not None:
                 progress(number, len(bands))
-        result, errors, gate = (torch.cat(each, dim=-2) for each in zip(*bits, strict=True))
+        result, errors, gate = (concatenate(each, dim=-2) for each in zip(*bits, strict=True))
         if given.shape == values.shape:  # not for a map of the photo's own size
             with torch.autocast(rgb.device.type, enabled=False):
                 result = _project(result, given, known, gate, hints)
@@ -315,17 +317,19 @@ class FacetsUNet(DisparityNetwork):
     def _see(self, photo: Tensor, scale: int, band: _Band) -> list[Tensor]:
         """Return the photo's features in a band with its margins, from the full to the low resolution."""
         window = photo[..., scale * band.rows.start : scale * band.rows.stop, :]
-        pyramid = [functional.relu(self.photo(window.to(self.photo.weight.dtype)))]
+        pyramid = [functional.relu(self.photo(window.to(self.photo.weight.dtype)), inplace=True)]
         for layer in self.down:
-            pyramid.append(functional.relu(layer(pyramid[-1])))
+            pyramid.append(functional.relu(layer(pyramid[-1]), inplace=True))
         return pyramid
 
     def _choose(self, x: Tensor, planes: Tensor, pyramid: list[Tensor], scale: int) -> tuple[Tensor, Tensor, Tensor]:
         """Return the mixture of planes, the logarithms of the expected errors, (B, 2, H, W), and residuals' factors."""
         for up, join, features in zip(self.up, self.join, reversed(pyramid[:-1]), strict=True):
-            x = functional.relu(join(torch.cat((functional.pixel_shuffle(up(x), 2), features), dim=1)))
-        choice, errors, gate = convolve_together((self.choice, self.errors, self.gate), x)
-        return mix_planes(planes, choice, scale), errors.float() - 5, torch.sigmoid(gate.float() + _CLOSED)
+            x = functional.relu(join(enlarge(up, x, features)), inplace=True)
+        found = convolve_together((self.choice, self.errors, self.gate), x)
+        mixed, others = mix_planes_apart(planes, found, scale)
+        errors, gate = others.float().split((2, 1), dim=1)
+        return mixed, errors - 5, torch.sigmoid(gate + _CLOSED)
 
     def _propose_planes(self, output: Tensor, around: Stencil, smoothed: list[Stencil]) -> Tensor:
         """Return the planes of each low-resolution pixel, (B, facets, 3, h, w): value at its centre and slopes."""

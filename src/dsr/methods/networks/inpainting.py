@@ -75,19 +75,21 @@ def _fill_by_colour(x: Tensor, colours: Tensor) -> Tensor:
     unknown = values.isnan() & inside
     known = values.isfinite()
     places = unknown.nonzero()[:, 0]
-    front = places[known[places[:, None] + around].any(dim=1)]
+    front = places[known[places[:, None] + around].any(dim=1)]  # beside what has just become known
+    waiting, every = torch.zeros_like(known), False  # beside known pixels, none of which is alike
     while front.numel():
         beside = front[:, None] + around  # (n, 8)
         difference = (colour[:, beside] - colour[:, front, None]).square().sum(dim=0)
         affinity = (difference / (-2 * _CONTRAST**2)).exp().clamp(min=_LEAST) * known[beside]
-        nearest = affinity.amax(dim=1)
-        first = nearest >= _ALIKE
-        if not bool(first.any()):
-            first = torch.ones_like(first)
+        first = (affinity.amax(dim=1) >= _ALIKE) | every
+        waiting[front] = ~first
         filled, affinity, beside = front[first], affinity[first], beside[first]
         values[filled] = (affinity * values[beside].nan_to_num(0)).sum(dim=1) / affinity.sum(dim=1)
         known[filled] = True
         unknown[filled] = False
         beside = beside.flatten()
-        front = torch.cat((front[~first], beside[unknown[beside]])).unique()
+        front = beside[unknown[beside]].unique()
+        every = not front.numel()
+        if every:
+            front = waiting.nonzero()[:, 0]
     return values.view(height + 2, width + 2)[1:-1, 1:-1]
