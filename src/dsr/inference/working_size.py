@@ -79,9 +79,9 @@ def find_noise(depth: Tensor) -> MapNoise | None:
     if step > 1:
         inverse = inverse[: inverse.shape[0] // 2 * 2, : inverse.shape[1] // 2 * 2]
         inverse = functional.avg_pool2d(inverse[None, None], 2)[0, 0]  # a hole makes a hole
-    found, before, finest = None, (0, 0.0), 0.0
+    sums, found, before, finest = _sum_up(inverse), None, (0, 0.0), 0.0
     for size in _WINDOWS:
-        planes = _fit_planes(inverse, size) if size <= _LARGEST_WINDOW * min(inverse.shape) else None
+        planes = _fit_planes(sums, size) if size <= _LARGEST_WINDOW * min(inverse.shape) else None
         if planes is None:
             break
         count = max(_FEWEST, len(planes.deviation) // 10)
@@ -148,16 +148,32 @@ def limit_to_noise(spread: Tensor, noise: MapNoise, inverse: float) -> Tensor:
     return spread * torch.lerp(torch.ones_like(spread), (left / median).clamp(max=1).expand_as(spread), share)
 
 
-def _fit_planes(inverse: Tensor, size: int) -> _Planes | None:
-    """Return the planes of windows that are known, by least squares; None for too few."""
+def _sum_up(inverse: Tensor) -> Tensor:
+    """Return sums of 1, x, y, xx, xy, yy, v, vx, vy, vv of the known pixels above and left of corners, (10, h+1, w+1).
+
+    x and y are columns and rows over the width, v is the inverse depth.
+    """
     height, width = inverse.shape
-    stride = max(size // 2, int(math.sqrt(height * width / _MOST)))
     known = inverse.isfinite()
     m, v = known.to(inverse), torch.where(known, inverse, 0)
-    x = torch.arange(width, dtype=v.dtype, device=v.device) / size
-    y = (torch.arange(height, dtype=v.dtype, device=v.device) / size)[:, None]
-    products = torch.stack((m, m * x, m * y, m * x * x, m * x * y, m * y * y, v, v * x, v * y, v * v))
-    means = functional.avg_pool2d(products[None], size, stride)[0]
+    x = torch.arange(width, dtype=v.dtype, device=v.device) / width
+    y = (torch.arange(height, dtype=v.dtype, device=v.device) / width)[:, None]
+    products = (m, m * x, m * y, m * x * x, m * x * y, m * y * y, v, v * x, v * y, v * v)
+    sums = v.new_zeros(len(products), height + 1, width + 1)
+    for place, values in zip(sums, products, strict=True):
+        place[1:, 1:] = values.cumsum(dim=0).cumsum(dim=1)
+    return sums
+
+
+def _fit_planes(sums: Tensor, size: int) -> _Planes | None:
+    """Return the planes of windows that are known, by least squares of :func:`_sum_up`; None for too few."""
+    _, height, width = (n - 1 for n in sums.shape)
+    stride = max(size // 2, int(math.sqrt(height * width / _MOST)))
+    (top, bottom), (left, right) = (
+        (slice(0, n - size + 1, stride), slice(size, n + 1, stride)) for n in (height, width)
+    )
+    means = sums[:, bottom, right] - sums[:, top, right] - sums[:, bottom, left] + sums[:, top, left]
+    means = means / size**2
     rows, columns = torch.nonzero(means[0] >= _KNOWN, as_tuple=True)
     if len(rows) < _FEWEST:
         return None
@@ -167,7 +183,7 @@ def _fit_planes(inverse: Tensor, size: int) -> _Planes | None:
     determinant = xx * yy - xy * xy
     a, b = (vx * yy - vy * xy) / determinant, (vy * xx - vx * xy) / determinant
     deviation = (vv - a * vx - b * vy).clamp(min=0).sqrt() / mean
-    return _Planes(rows * stride, columns * stride, a / size, b / size, mean - a * mx - b * my, mean, deviation)
+    return _Planes(rows * stride, columns * stride, a / width, b / width, mean - a * mx - b * my, mean, deviation)
 
 
 def _extent(inverse: Tensor, planes: _Planes, chosen: Tensor, size: int, deviation: float) -> float:
