@@ -1,6 +1,6 @@
 """Train facets for days: stages in turn, each a training of about an hour, and after each a row of all yardsticks.
 
-    python benchmarks/long_training.py [PLAN] [-o DIR] [--shared DIR] [--rounds N]
+    python benchmarks/long_training.py [PLAN] [-o DIR] [--shared DIR] [--stages N]
 
 ``PLAN`` is ``long_training.yaml`` beside this file: ``stages``, each with the name of its ``weights``, its ``steps``
 and further ``overrides`` of ``train.py``, and the ``parts`` of ``real_sensors.py`` that are measured. Each stage starts
@@ -67,16 +67,25 @@ def train(stage: Mapping[str, Any], number: int, run: Path, weights: Path) -> No
 
 
 def keep(run: Path, weights: Path, share: float) -> None:
-    """Move the latest weights of a name by a share towards those of a run, and keep their links to other files."""
-    header, trained = read_header(weights), run / "weights.safetensors"
-    net, before = (load_network(path, NETWORKS) for path in (trained, weights))
-    state = net.state_dict()
-    for name, old in before.state_dict().items():
-        if old.is_floating_point():
-            state[name].lerp_(old, 1 - share)
-    links = {key: weights.parent / header[key] if key in header else None for key in ("shared", "clean")}
-    with replacing(weights) as temporary:
-        save_network(temporary, net, header["model"], read_header(trained)["facts"], half=True, **links)
+    """Move the latest weights of a name by a share towards those of a run, once, and keep their links to others."""
+    moved, trained = run / "moved.safetensors", run / "weights.safetensors"
+    if not moved.exists():
+        header = read_header(weights)
+        net, before = (load_network(path, NETWORKS) for path in (trained, weights))
+        state = net.state_dict()
+        for name, old in before.state_dict().items():
+            if old.is_floating_point():
+                state[name].lerp_(old, 1 - share)
+        links = {key: weights.parent / header[key] if key in header else None for key in ("shared", "clean")}
+        with replacing(moved) as temporary:
+            save_network(temporary, net, header["model"], read_header(trained)["facts"], half=True, **links)
+    copy(moved, weights)
+
+
+def copy(source: Path, target: Path) -> None:
+    """Copy a file, the whole or nothing."""
+    with replacing(target) as temporary:
+        shutil.copyfile(source, temporary)
 
 
 def scores(parts: list[str], weights: Path, shared: Path) -> dict[str, float]:
@@ -105,7 +114,7 @@ def main() -> None:
     parser.add_argument("plan", nargs="?", type=Path, default=HERE / "long_training.yaml")
     parser.add_argument("-o", "--output", type=Path, default=Path("outputs/long_training"))
     parser.add_argument("--shared", type=Path, default=Path(os.environ.get("DSR_SHARED", "../shared")))
-    parser.add_argument("--rounds", type=int, help="stop after so many stages; never is the default")
+    parser.add_argument("--stages", type=int, help="stop after so many stages in all; never is the default")
     options = parser.parse_args()
     os.nice(15)
     torch.set_num_threads(1)
@@ -114,13 +123,13 @@ def main() -> None:
     folder.mkdir(parents=True, exist_ok=True)
     for packaged in PACKAGED.glob("facets_x*.safetensors"):
         if not (folder / packaged.name).exists():
-            shutil.copy(packaged, folder)
+            copy(packaged, folder / packaged.name)
     done = len(curve.read_text().splitlines()) - 2 if curve.is_file() else -1  # beside the names and the first row
     if done < 0:
         note(curve, {"stage": "packaged", "steps": 0, "minutes": 0, **scores(plan["parts"], folder, options.shared)})
         done = 0
     for number, stage, run in stages(plan, options.output.resolve()):
-        if options.rounds is not None and number >= options.rounds:
+        if options.stages is not None and number >= options.stages:
             break
         if number < done:
             continue

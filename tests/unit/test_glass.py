@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from dsr.degradation.everything import SENSORS, Everything
+from dsr.degradation.everything import SENSOR_NOISES, Everything
 from dsr.degradation.glass import KINDS, add_glass
 from dsr.degradation.glass_shapes import Pose, ball
 from dsr.geometry.camera import Camera
@@ -130,11 +130,11 @@ def _sample(everything: Everything, seed: int, *, soft: bool = False) -> tuple[D
     return sample, hints.noise, generator.get_state()
 
 
-@pytest.mark.parametrize("kind", ["none", "white", "correlated", *SENSORS])
+@pytest.mark.parametrize("kind", ["none", "white", "correlated", *SENSOR_NOISES])
 def test_maps_that_show_no_glass_are_what_they_were(kind: str) -> None:
     without = Everything(noises={kind: 1}, told=0)
     for seed in range(3):
-        for soft in {True, kind in SENSORS}:  # truths with soft steps have no glass in any map
+        for soft in {True, kind in SENSOR_NOISES}:  # truths with soft steps have no glass in any map
             one, other = (_sample(replace(without, clear=share), seed, soft=soft) for share in (0, 1))
             assert torch.equal(one[2], other[2])
             for name in ("rgb", "depth", "depth_lr"):

@@ -26,6 +26,7 @@ from dsr.app.metrics import check_metrics, metric_collection
 from dsr.app.multirun import Plan, runs_here
 from dsr.app.schema import TrainConfig, TrainerConfig, given_keys, plain_config
 from dsr.app.trainer import (
+    MONITOR,
     has_idle_layers,
     seconds_per_step,
     seconds_per_validation,
@@ -74,7 +75,7 @@ def train(config: DictConfig) -> float:
         config: composed from ``conf/train.yaml``.
 
     Returns:
-        The best score of the validations, their mean RMSE_v, as a fraction like the scores in files.
+        The score of the validation of the weights that are kept, their mean RMSE_v, as a fraction like those in files.
 
     Raises:
         ConfigError: the configuration cannot be run, or its training is already complete.
@@ -230,7 +231,8 @@ def _train(plain: dict[str, Any], settings: TrainConfig, device: torch.device, p
     if first:
         _export(module, folder / _LAST.with_name(f"{settings.trainer.keep}.ckpt"), weights, facts)
     progress.say(f"weights: {weights}")
-    return math.nan if best.best_model_score is None else float(best.best_model_score)
+    score = best.best_model_score if settings.trainer.keep == "best" else trainer.callback_metrics.get(MONITOR)
+    return math.nan if score is None else float(score)
 
 
 def _expect_trainable(

@@ -40,7 +40,7 @@ from dsr.degradation.random_scenes import (
 from dsr.geometry.camera import Camera
 from dsr.sample import AllHolesError, DepthSample, Scene
 
-SENSORS = ("waves", "structured", "flight", "lidar", "stereo")
+SENSOR_NOISES = ("waves", "structured", "flight", "lidar", "stereo")
 """Kinds of noise that stand for a sensor, which does not see glass; the others stand for maps made of a surface."""
 
 
@@ -64,9 +64,9 @@ class Everything:
         photo: fraction of the photos with another exposure, colour balance, blur, noise and compression; half as many
             of those whose map has no noise.
         textured: fraction of the photos on which a pattern is printed, which is no relief.
-        clear: fraction of the sensors' maps, those whose kind of noise is one of ``SENSORS``, in which clear, mirroring
-            or glossy objects stand. The truth is their surface, the map what a sensor sees. None if depth steps are
-            soft, as their edges are not.
+        clear: fraction of the sensors' maps, those whose kind of noise is one of ``SENSOR_NOISES``, in which clear,
+            mirroring or glossy objects stand. The truth is their surface, the map what a sensor sees. None if depth
+            steps are soft, as their edges are not.
         told: fraction of the maps of which a hint tells the kernel, and the noise, and the steps, independently.
 
     Raises:
@@ -141,7 +141,9 @@ class Everything:
         scene = self._change_surfaces(scene, scale, generator)
         kernel, kind = self._draw_kinds(scale, generator)
         seen = scene.depth
-        if self.clear and kind in SENSORS and not soft and chance(self.clear, generator):  # at 0, nothing is drawn
+        if (
+            self.clear and kind in SENSOR_NOISES and not soft and chance(self.clear, generator)
+        ):  # at 0, nothing is drawn
             scene, seen = add_glass(scene, generator)
         assert seen is not None  # noqa: S101 - for the type checker
         clean, camera_lr = self._downsample(seen, scene.camera, scale, kernel, kind, generator)

@@ -267,30 +267,40 @@ def sensor_named(name: str) -> Sensor:
     """Return the sensor of one of the names of ``SENSORS``, without regard to case, or of a device's name.
 
     Raises:
-        ValueError: there is none.
+        ValueError: there is none, or none of its figures is known.
 
     """
     found = next((each for each in SENSORS if each.name.casefold() == name.casefold()), None) or recognise(name)
-    if found is None:
-        raise ValueError(
-            f"sensor: expected auto, none or one of {', '.join(each.name for each in SENSORS)}, got {name!r}"
-        )
+    if found is None or not _has_figures(found):
+        known = ", ".join(each.name for each in SENSORS if _has_figures(each))
+        raise ValueError(f"sensor: expected auto, none or one of {known}, got {name!r}")
     return found
 
 
-GIVEN = "given"
-"""The reason of a sensor that was named."""
+def _has_figures(sensor: Sensor) -> bool:
+    """Return whether anything is known of how exact a sensor is."""
+    return sensor.stereo_constant is not None or sensor.spread is not None
 
 
 class Identified(NamedTuple):
-    """A map's sensor, and by what it is known."""
+    """A map's sensor, and by what it is known.
+
+    ``constant``: f B over the step of disparity that the map's values show, in metres; None where they show none.
+    """
 
     sensor: Sensor
-    reason: str
+    by: Literal["request", "file", "values"]
+    constant: float | None = None
+
+    def least_error(self, depth: Tensor) -> Tensor:
+        """Return :func:`least_error`, in the mode of the sensor that the map's values show."""
+        return least_error(self.sensor, depth, self.constant)
 
 
 def identify(depth: Tensor, name: str = "auto", device_name: str = "") -> Identified | None:
-    """Return the sensor of a map: the named one, else that of the device's name, else that of the map's values.
+    """Return the sensor of a map: the named one, else what its values and the device's name tell.
+
+    Where these contradict each other the values count: a device's name may be that of the photo's camera.
 
     Args:
         depth: (1, h, w) in metres, NaN in holes, as it was read.
@@ -305,60 +315,68 @@ def identify(depth: Tensor, name: str = "auto", device_name: str = "") -> Identi
         return None
     named = None if name == "auto" else sensor_named(name)
     steps = recognise_values(depth)
+    constant = None if steps is None else steps.constant
     if named is not None:
-        if steps is not None and named.stereo_constant is not None and _mismatch(named, steps.constant) > _ALIKE:
+        if constant is not None and _mismatch(named, constant) > _ALIKE:
+            own = _counts(named)
             raise ValueError(
-                f"sensor: expected values 1/{_counts(named):.0f} per metre apart in inverse depth, as those of a "
-                f"{named.name}, got 1/{steps.constant:.0f}"
+                f"sensor: expected depth in steps of disparity with f B / step = {own:.0f} m, as of a {named.name}, or "
+                f"of one of its other modes, got {constant:.0f} m"
             )
-        return Identified(named, GIVEN)
+        return Identified(named, "request", constant)
     told = recognise(device_name)
-    if told is not None and (told.kind != "lidar" or told.width in depth.shape[-2:]):
-        return Identified(told, f"by the name {device_name}")
-    if steps is None:
+    if told is not None and _has_figures(told) and (constant is None or _mismatch(told, constant) <= _ALIKE):
+        return Identified(told, "file", constant)
+    if constant is None:
         return None
-    best = min((each for each in SENSORS if each.step is not None), key=lambda each: _mismatch(each, steps.constant))
-    if _mismatch(best, steps.constant) > _ALIKE:
-        return None
-    return Identified(best, f"by its values, which lie 1/{steps.constant:.0f} per metre apart in inverse depth")
+    best = min((each for each in SENSORS if each.step is not None), key=lambda each: _mismatch(each, constant, _USUAL))
+    return Identified(best, "values", constant) if _mismatch(best, constant, _USUAL) <= _NEAR else None
 
 
-_ALIKE = 0.04
-"""Relative difference up to which the steps of a map are those of a sensor: cameras of a type differ by 2 %."""
-_PARTS = (1.0, 848 / 1280, 0.5, 480 / 1280, 424 / 1280)
-"""Widths of stereo cameras' maps over the native one; disparity is counted in pixels of the chosen width."""
+_NEAR, _ALIKE = 0.02, 0.06
+"""Relative difference up to which steps tell a sensor, and beyond which they contradict one; cameras of a type differ
+by 2 %."""
+_USUAL = (1.0, 848 / 1280, 0.6, 0.5)
+_PARTS = (*_USUAL, 2 / 3, 480 / 1280, 424 / 1280, 0.2)
+"""Focal lengths of stereo cameras' modes over that of the native width: 848, 640 x 480 (cropped), 640 x 360 and others;
+disparity is counted in pixels of the mode."""
 
 
 def _counts(sensor: Sensor) -> float:
-    """Return f B over the step of a sensor's disparity, in metres; infinite where it is not known."""
-    known = sensor.stereo_constant is not None and sensor.step is not None
-    return sensor.stereo_constant / sensor.step if known else np.inf  # type: ignore[operator]
+    """Return f B over the step of a sensor's disparity, in metres; 0 where it is not known."""
+    if sensor.stereo_constant is None or sensor.step is None:
+        return 0.0
+    return sensor.stereo_constant / sensor.step
 
 
-def _mismatch(sensor: Sensor, constant: float) -> float:
-    """Return by how much steps differ from the nearest that a sensor may have, relative."""
-    parts = _PARTS if sensor.kind == "stereo" else _PARTS[:1]
-    return min(abs(constant / (part * _counts(sensor)) - 1) for part in parts)
+def _mismatch(sensor: Sensor, constant: float, parts: tuple[float, ...] = _PARTS) -> float:
+    """Return by how much steps differ from the nearest that a sensor may have, relative; 0 where it has none."""
+    own = _counts(sensor)
+    if not own:
+        return 0.0
+    return min(abs(constant / (part * own) - 1) for part in (parts if sensor.kind == "stereo" else parts[:1]))
 
 
-def least_error(sensor: Sensor, depth: Tensor) -> Tensor:
+def least_error(sensor: Sensor, depth: Tensor, constant: float | None = None) -> Tensor:
     """Return the standard deviation of depth below which a sensor states none.
 
-    It is the larger of what its disparity allows, z^2 noise / (f B), where the noise is at least the rounding to its
-    step, step / sqrt(12); and of its spread at that distance, which beyond the last known one stays.
+    That of its disparity, z^2 noise / (f B), where no noise is less than the rounding to steps, and its spread at that
+    distance; the larger one.
 
     Args:
         sensor: the sensor.
         depth: in metres, any shape.
+        constant: f B over the step of disparity, in metres; None for that of its native width.
 
     Returns:
         Metres, in the shape of ``depth``; 0 for a sensor of which neither is known.
 
     """
     least = torch.zeros_like(depth)
-    noise = max(sensor.noise or 0.0, (sensor.step or 0.0) / 12**0.5)
-    if sensor.stereo_constant is not None:
-        least = depth.square() * (noise / sensor.stereo_constant)
+    constant = constant or _counts(sensor)
+    if constant and sensor.step is not None:
+        steps = max((sensor.noise or 0.0) / sensor.step, 12**-0.5)
+        least = depth.square() * (steps / constant)
     if sensor.spread is not None:
         distances, spreads = zip((0.0, 0.0), *sensor.spread, strict=True)
         found = np.interp(depth.detach().double().cpu().numpy(), distances, spreads)
@@ -382,6 +400,8 @@ _CONFIDENT, _SIGNIFICANT = 0.6, 25.0
 """Least confidence; and least N confidence^2 for N values, minus the logarithm of the chance that random ones have."""
 _NEAREST = 0.1
 """Metres; nearer values are left out."""
+_PIXELS = 2**20
+"""About how many pixels are looked at; of larger maps some rows."""
 _MOST = 400
 """Values that are looked at, drawn at random."""
 _DENSE = 1.2
@@ -408,6 +428,7 @@ def recognise_values(depth: Tensor) -> ValueSteps | None:
         them: those of a computed plane may keep to steps, too.
 
     """
+    depth = depth[:, :: max(1, round(depth.numel() / _PIXELS))]
     values, counts = torch.unique(depth[depth.isfinite()].double(), return_counts=True)
     distinct = values[(counts >= _COMMON) & (values >= _NEAREST)].cpu().numpy()
     rounding = next((each for each in _ROUNDINGS if _is_rounded(distinct, each)), None)

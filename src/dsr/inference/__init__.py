@@ -13,6 +13,7 @@ if TYPE_CHECKING:
         MethodChoice,
         check_settings,
         check_working_size,
+        find_sensor,
         upsample_depth,
         upsample_surface,
     )
@@ -28,6 +29,7 @@ __all__ = [
     "check_settings",
     "check_working_size",
     "enlarged_by",
+    "find_sensor",
     "plan",
     "upsample",
     "upsample_depth",
@@ -37,7 +39,14 @@ __all__ = [
 
 _NAMES = {
     "api": ("upsample", "upsample_with_errors"),
-    "engine": ("MethodChoice", "check_settings", "check_working_size", "upsample_depth", "upsample_surface"),
+    "engine": (
+        "MethodChoice",
+        "check_settings",
+        "check_working_size",
+        "find_sensor",
+        "upsample_depth",
+        "upsample_surface",
+    ),
     "inspection": ("enlarged_by",),
     "planning": ("Plan", "plan"),
 }

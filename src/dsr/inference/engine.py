@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from dsr.degradation.downsampling import Downsampling
-from dsr.degradation.sensors import Sensor, identify, least_error
+from dsr.degradation.sensors import Identified, identify
 from dsr.geometry.camera import Camera
 from dsr.geometry.holes import degrees_per_pixel, wide_holes
 from dsr.geometry.resampling import pad_inverse_depth, resize_inverse_depth
@@ -40,6 +40,10 @@ DECIDED = MappingProxyType({"fill_holes": True, "validate_every": 0})
 
 _LARGEST_RATIO = 16
 """Largest ratio of the sizes that a smaller working size may lead to: there are no weights for larger ones."""
+
+
+_CORRELATED = 5.0
+"""Pixels over which noise is correlated that a network takes for shape in part."""
 
 
 @dataclass(frozen=True)
@@ -117,6 +121,24 @@ def check_working_size(choice: MethodChoice, scale: int | None, size: int | None
         raise ValueError(f"working_size: expected facets without a scale, for maps that may have noise, to take {size}")
 
 
+def find_sensor(depth: Tensor, name: str = "auto", device_name: str = "") -> Identified | None:
+    """Return the sensor of a map, see :func:`dsr.degradation.sensors.identify`.
+
+    Its values alone tell it only where the map has a sensor's noise: computed disparity may have the same steps.
+
+    Args:
+        depth: (1, h, w) in metres, NaN in holes, as it was read.
+        name: of a sensor or a device; ``auto``, or ``none`` for none.
+        device_name: of the device, as its files state it; empty where they do not.
+
+    Raises:
+        ValueError: there is no such sensor, or the map's values keep to steps that it does not have.
+
+    """
+    found = identify(depth, name, device_name)
+    return None if found is not None and found.by == "values" and find_noise(depth) is None else found
+
+
 def upsample_depth(
     rgb: Tensor,
     depth: Tensor,
@@ -129,6 +151,8 @@ def upsample_depth(
     device: str = "auto",
     fill: Fill = "small",
     max_hole: float = WIDEST,
+    working_size: int | None = None,
+    sensor: Identified | str | None = "auto",
     progress: Steps | None = None,
 ) -> Tensor:
     """Upsample a depth map to the photo's size: the depth of :func:`upsample_surface`, (1, H, W) float32 in metres."""
@@ -143,6 +167,8 @@ def upsample_depth(
         device=device,
         fill=fill,
         max_hole=max_hole,
+        working_size=working_size,
+        sensor=sensor,
         progress=progress,
     ).depth
 
@@ -160,7 +186,7 @@ def upsample_surface(
     fill: Fill = "small",
     max_hole: float = WIDEST,
     working_size: int | None = None,
-    sensor: Sensor | str | None = "auto",
+    sensor: Identified | str | None = "auto",
     progress: Steps | None = None,
 ) -> Surface:
     """Upsample a depth map to the photo's size, with the expected errors.
@@ -191,9 +217,10 @@ def upsample_surface(
         max_hole: width of the widest hole that counts as small, in degrees of view; one of 5 pixels always does.
         working_size: by what ``facets`` without a scale divides the size of the map first, 1, 2, 4, 8 or 16; None to
             choose it by the map's noise, see :mod:`dsr.inference.working_size`.
-        sensor: what measured the map, or its name; ``auto`` to tell it from the map's values, None for none. No
-            expected error is less than what remains of the least noise that it is known to have; and where it counts
-            disparity, ``facets`` without a scale is told how its noise grows, unless ``noise`` is set.
+        sensor: what measured the map: of :func:`find_sensor`, or its argument; None for none. No expected error is
+            less than what remains of the least noise that the sensor is known to have. Where it counts disparity, and
+            the noise of the map is correlated over 5 pixels or more, ``facets`` without a scale is told how strong the
+            noise is and that it grows with the square of the distance, unless ``noise`` is set.
         progress: is called with the number of parts done and their total.
 
     Returns:
@@ -210,9 +237,7 @@ def upsample_surface(
     choice = MethodChoice(method, settings or {}, tuple(directories), pick_device(device))
     planned = choice.plan(size, _size(depth), scale)  # raises ValueError for sizes or a scale that cannot be used
     check_working_size(choice, scale, working_size)
-    if isinstance(sensor, str):
-        identified = identify(depth, sensor)
-        sensor = None if identified is None else identified.sensor
+    sensor = find_sensor(depth, sensor) if isinstance(sensor, str) else sensor
     outliers = find_outliers(depth)
     inverse = depth.masked_fill(outliers, torch.nan).float().reciprocal()
     valid, factor = inverse.isfinite(), 1
@@ -245,7 +270,7 @@ def upsample_surface(
     if spread is None or angle is None:
         spread, angle = expect_errors(inverse_hr, inverse.to(inverse_hr.device), camera)
     if sensor is not None:
-        spread = torch.fmax(spread, left_of(least_error(sensor, inverse_hr.reciprocal()) * inverse_hr))
+        spread = torch.fmax(spread, left_of(sensor.least_error(inverse_hr.reciprocal()) * inverse_hr))
     result = inverse_hr.reciprocal_()
     surface = Surface(result, spread * result, angle, found.noise, count_patches(outliers))
     if fill != "all" and not bool(valid.all()):
@@ -277,7 +302,7 @@ class _Found(NamedTuple):
 
 
 def _upsample_at_working_size(
-    rgb: Tensor, inverse: Tensor, camera: Camera, size: int | None, choice: MethodChoice, sensor: Sensor | None,
+    rgb: Tensor, inverse: Tensor, camera: Camera, size: int | None, choice: MethodChoice, sensor: Identified | None,
     progress: Steps | None,
 ) -> _Found:  # fmt: skip
     """Return high-resolution inverse depth of inverse depth, (1, h, w), whose size may be divided first."""
@@ -285,9 +310,8 @@ def _upsample_at_working_size(
     if size is not None and size > most:
         raise ValueError(f"working_size: expected at most {most} for this map's size and the photo's, got {size}")
     noise = find_noise(inverse.reciprocal())
-    extent = noise.extent if noise is not None else _expected_extent(sensor, inverse.shape[-1])
-    factor = size or min(working_size_of(extent), most)
-    choice = _tell_noise(choice, sensor, noise, float(inverse.nanmedian()))
+    factor = size or min(1 if noise is None else working_size_of(noise.extent), most)
+    choice = _tell_noise(choice, sensor, noise, factor)
     if factor == 1:
         return _upsample_inverse(rgb, inverse, camera, None, choice, progress)
     inverse_lr = reduce_by_medians(pad_inverse_depth(inverse, factor), factor)
@@ -298,29 +322,22 @@ def _upsample_at_working_size(
     return found._replace(spread=left, noise=noise._replace(reduced=factor))
 
 
-def _expected_extent(sensor: Sensor | None, width: int) -> float:
-    """Return over how many pixels of a map of a width the noise of a sensor that counts disparity is alike; or 1."""
-    if sensor is None or sensor.stereo_constant is None or sensor.extent is None:
-        return 1.0
-    return max(1.0, sensor.extent * width / sensor.width)
+def _tell_noise(choice: MethodChoice, sensor: Identified | None, noise: MapNoise | None, factor: int) -> MethodChoice:
+    """Return a choice whose method is told a map's noise where it may take it for shape.
 
-
-def _tell_noise(choice: MethodChoice, sensor: Sensor | None, noise: MapNoise | None, inverse: float) -> MethodChoice:
-    """Return a choice whose method is told the noise of a sensor that counts disparity, at least what was found.
+    That is correlated noise of a sensor that counts disparity; the method judges other noise better by itself.
 
     Args:
         choice: the method.
         sensor: what measured the map, if that is known.
         noise: what was found of it.
-        inverse: the map's median, in 1/m.
+        factor: by what the size of the map is divided.
 
     """
-    if sensor is None or sensor.stereo_constant is None or "noise" in choice.settings:
+    counts = sensor is not None and sensor.sensor.stereo_constant is not None
+    if not counts or noise is None or noise.extent < max(_CORRELATED, factor) or "noise" in choice.settings:
         return choice
-    distance = 1 / inverse if noise is None else noise.distance
-    least = float(least_error(sensor, torch.tensor(distance)))
-    deviation = least if noise is None else max(least, noise.deviation)
-    told = {"noise": deviation / distance**2, "noise_growth": 2.0}
+    told = {"noise": noise.deviation / noise.distance**2, "noise_growth": 2.0}
     return replace(choice, settings={**choice.settings, **told})
 
 

@@ -24,8 +24,8 @@ from dsr.app.upsample.outputs import (
 from dsr.app.upsample.reporting import Messages
 from dsr.app.upsample.request import UpsampleRequest, files_of, inputs_with_neighbours, settings_of
 from dsr.app.upsample.sequence import FrameSequence
-from dsr.degradation.sensors import GIVEN, Identified, Sensor, identify
-from dsr.inference import Plan, enlarged_by, plan, upsample_surface
+from dsr.degradation.sensors import Identified
+from dsr.inference import Plan, enlarged_by, find_sensor, plan, upsample_surface
 from dsr.io.encoding import Assumption
 from dsr.io.inputs import Picture, read_picture
 from dsr.io.pairs import Pair
@@ -70,7 +70,7 @@ class FrameWork:
             return "complete already"
         picture = self._read(pair)
         try:
-            identified = identify(picture.depth_lr, request.sensor, picture.device_name)
+            identified = find_sensor(picture.depth_lr, request.sensor, picture.device_name)
         except ValueError as error:
             raise ValueError(f"--{error}") from error
         picture = _with_sensor(sequence.fuse(pair, picture), identified)
@@ -89,7 +89,7 @@ class FrameWork:
         begin(target, job.settings, job.inputs, () if job.earlier is None else job.earlier.files)
         started = time.perf_counter()
         if surface is None:
-            surface = _upsample(job, picture, None if identified is None else identified.sensor, progress)
+            surface = _upsample(job, picture, identified, progress)
             reporter.facts(_describe(surface.noise, given="noise" in request.settings))
             reporter.facts([*_describe_outliers(surface.outliers), *_describe_holes(surface, request)])
         seconds = time.perf_counter() - started
@@ -158,13 +158,18 @@ def _without_repeats(picture: Picture) -> Picture:
 
 def _with_sensor(picture: Picture, identified: Identified | None) -> Picture:
     """Return a picture with a note on the sensor, if it is known and was not given."""
-    if identified is None or identified.reason == GIVEN:
+    if identified is None or identified.by == "request":
         return picture
-    fact = Assumption("sensor", f"{identified.sensor.name}, {identified.reason}; --sensor overrides it")
+    reason = (
+        f"named {picture.device_name}"
+        if identified.by == "file"
+        else f"by its depth in steps of disparity with f B / step = {identified.constant:.0f} m"
+    )
+    fact = Assumption("sensor", f"{identified.sensor.name}, {reason}; --sensor overrides it")
     return replace(picture, assumptions=(*picture.assumptions, fact))
 
 
-def _upsample(job: _Job, picture: Picture, sensor: Sensor | None, progress: Progress) -> Surface:
+def _upsample(job: _Job, picture: Picture, sensor: Identified | None, progress: Progress) -> Surface:
     """Compute the high-resolution depth with its expected errors, on the CPU."""
     request = job.request
     with progress.task("steps") as step:

@@ -45,7 +45,7 @@ class AnyMap:
 
     Args:
         net: the network; it is used as it is.
-        noise: standard deviation of the map's depth at 1 m, in metres; None if it is not known.
+        noise: standard deviation of the map's depth in metres, at 1 m if it grows; None if it is not known.
         noise_growth: the noise grows with this power of the distance: 0 where it is the same everywhere, 2 for stereo.
         smooth: 0 takes the map for free of noise, 2 its noise for twice as large as estimated; 1 is neutral.
         edges: whether the result's depth steps are to be ``sharp`` or ``soft``, a pixel's value then being a mean over
@@ -89,6 +89,8 @@ class AnyMap:
             raise ValueError(f"noise: expected metres, 0 or more and less than 1, got {noise}")
         if not 0 <= noise_growth <= 4:
             raise ValueError(f"noise_growth: expected a power of the distance from 0 to 4, got {noise_growth}")
+        if noise_growth and noise is None:
+            raise ValueError(f"noise_growth: expected noise with it, got {noise_growth} and no noise")
         if max_error is not None and not max_error > 0:
             raise ValueError(f"max_error: expected a positive share of the depth, got {max_error}")
         self._max_error = max_error
