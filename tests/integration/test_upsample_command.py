@@ -336,18 +336,17 @@ def test_published_scenes_are_read_with_their_cameras(shared, tmp_path, capsys):
 
 def test_sensor_is_told_from_the_depth_values_and_must_not_contradict_them(tmp_path, capsys):
     v, u = np.mgrid[:240, :320]
-    counts = np.round(1024 * (0.15 + 0.85 * (0.7 * u / 320 + 0.3 * v / 240)))
+    waves = cv2.GaussianBlur(np.random.default_rng(0).standard_normal(v.shape), (0, 0), 2.7)
+    counts = np.round(1024 * (0.15 + 0.85 * (0.7 * u / 320 + 0.3 * v / 240) + 0.004 * waves / waves.std()))
     cv2.imwrite(str(tmp_path / "depth.png"), np.round(1e4 * 1024 / counts).astype(np.uint16))
     cv2.imwrite(str(tmp_path / "rgb.png"), np.full((240, 320, 3), 128, np.uint8))
     given = ("--rgb", tmp_path / "rgb.png", "--depth", tmp_path / "depth.png", "--depth-unit", "0.0001", *DEPTH_ONLY)
     assert upsample(*given, "-o", tmp_path / "out") == 0
-    said = "sensor (RealSense D435, by its values, which lie 1/1024 per metre apart in inverse depth"
+    said = "sensor (RealSense D435, by its depth in steps of disparity with f B / step = 1024 m"
     assert said in capsys.readouterr().out
     assert any(said in each for each in info(tmp_path / "out")["assumptions"])
     message = refused(capsys, upsample(*given, "-o", tmp_path / "other", "--sensor", "Xtion"))
-    assert (
-        "--sensor: expected values 1/342 per metre apart in inverse depth, as those of a Xtion, got 1/1024" in message
-    )
+    assert "--sensor: expected depth in steps of disparity with f B / step = 342 m, as of a Xtion" in message
     assert not (tmp_path / "other").exists()
 
 

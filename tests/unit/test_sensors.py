@@ -12,7 +12,7 @@ import torch
 
 from dsr.degradation.sensors import SENSORS, identify, least_error, recognise, recognise_values
 from dsr.geometry.camera import Camera
-from dsr.inference.engine import upsample_surface
+from dsr.inference.engine import find_sensor, upsample_surface
 from dsr.inference.working_size import find_noise
 
 BY_NAME = {each.name: each for each in SENSORS}
@@ -200,59 +200,92 @@ def test_values_of_time_of_flight_tell_none(shared, file):
     assert recognise_values(torch.from_numpy(stored.astype(np.float32))[None] / 1000) is None
 
 
-def counted(constant, unit=1e-4):
-    """Return a map of a slanted wall whose values lie 1 / constant per metre apart in inverse depth."""
-    return as_stored(constant / np.round(slanted(1.0, 6.0) * constant) * 1.0, unit)
+def counted(constant, unit=1e-4, noise=0.0):
+    """Return a map of a slanted wall in steps of disparity, whose noise is correlated over 9 pixels."""
+    inverse = slanted(1.0, 6.0)
+    waves = cv2.GaussianBlur(np.random.default_rng(0).standard_normal(inverse.shape), (0, 0), 2.7)
+    inverse = inverse + noise * waves / waves.std()
+    return as_stored(constant / np.round(inverse * constant), unit)
 
 
-def test_sensor_is_identified_by_what_is_given_then_by_files_then_by_values():
+def test_sensor_is_identified_by_what_is_given_then_by_values_then_by_files():
     stereo = counted(1024)
-    assert identify(stereo).sensor is BY_NAME["RealSense D435"]
-    assert "1/1024" in identify(stereo).reason
-    assert identify(counted(1024 * 848 / 1280)).sensor is BY_NAME["RealSense D435"]
-    assert identify(stereo, device_name="Intel RealSense D455").sensor is BY_NAME["RealSense D455"]
-    assert identify(stereo, "d435i").sensor is BY_NAME["RealSense D435"]
+    assert identify(stereo)[:2] == (BY_NAME["RealSense D435"], "values")
+    assert identify(stereo).constant == pytest.approx(1024, rel=0.002)
+    for part in (848 / 1280, 0.6, 0.5):  # modes, 640 x 480 is cropped
+        assert identify(counted(1024 * part)).sensor is BY_NAME["RealSense D435"]
+        assert identify(counted(1024 * part), "d435i")[:2] == (BY_NAME["RealSense D435"], "request")
+    assert identify(stereo, device_name="Intel RealSense D435I").by == "file"
+    assert identify(stereo, device_name="Azure Kinect 4K Camera").by == "file"  # of another kind: no steps of its own
+    assert identify(stereo, device_name="Kinect v1")[:2] == (BY_NAME["RealSense D435"], "values")
+    assert identify(stereo, device_name="SM-G988B")[:2] == (BY_NAME["RealSense D435"], "values")
     assert identify(stereo, "none") is None
     plain = as_stored(1 / slanted(1.0, 6.0), 1e-3)
     assert identify(plain) is None
+    assert identify(plain, device_name="Record3D") is None  # no figures are known
     assert identify(plain, "Kinect v1").sensor is BY_NAME["Kinect v1"]
-    assert identify(plain, device_name="Record3D") is None  # 480 x 640: not the lidar's map
-    assert identify(plain[:, :192, :256], device_name="Record3D").sensor is BY_NAME["ARKit lidar"]
 
 
 def test_sensor_that_is_unknown_or_contradicts_the_values_is_refused():
     with pytest.raises(ValueError, match=r"sensor: expected auto, none or one of .*, got 'Leica'"):
         identify(counted(1024), "Leica")
-    with pytest.raises(ValueError, match=r"sensor: expected values 1/348 per metre .* got 1/1024"):
+    with pytest.raises(ValueError, match=r"sensor: expected auto, none or one of .*, got 'Astra'"):
+        identify(counted(1024), "Astra")
+    with pytest.raises(ValueError, match=r"sensor: expected depth .* f B / step = 348 m, as of a Kinect v1, .* 1024 m"):
         identify(counted(1024), "Kinect v1")
 
 
-def test_stated_error_is_never_less_than_the_disparity_allows():
-    depth = counted(1024)
+def test_computed_disparity_is_no_camera():
+    assert find_sensor(counted(1024)) is None
+    assert find_sensor(counted(1024, noise=0.004)).sensor is BY_NAME["RealSense D435"]
     camera, rgb = Camera.centred(640, 480, 600.0), torch.full((3, 480, 640), 0.5)
-    found = {
-        name: upsample_surface(rgb, depth, camera, method="bicubic", scale=4, sensor=name) for name in ("none", "auto")
-    }
-    least = 0.6 * math.sqrt(2 / math.pi) * least_error(BY_NAME["RealSense D435"], found["auto"].depth)
-    assert torch.equal(found["none"].depth, found["auto"].depth)
-    torch.testing.assert_close(
-        found["auto"].depth_error, torch.maximum(found["none"].depth_error, least), rtol=1e-4, atol=1e-7
-    )
-    assert bool((found["auto"].depth_error > found["none"].depth_error).any())
+    depth = counted(1024)
+    auto, none = (upsample_surface(rgb, depth, camera, sensor=name) for name in ("auto", "none"))
+    assert torch.equal(auto.depth, none.depth)
+    assert torch.equal(auto.depth_error, none.depth_error)
 
 
-def test_noise_of_a_known_stereo_camera_is_told_as_it_grows():
-    noise = cv2.GaussianBlur(np.random.default_rng(0).standard_normal((480, 640)), (0, 0), 1.7)
-    depth = as_stored(1 / (slanted(1.0, 4.0) + 0.004 * noise / noise.std()), 1e-3)
+def test_stated_error_is_never_less_than_the_disparity_allows():
+    camera, rgb = Camera.centred(640, 480, 600.0), torch.full((3, 480, 640), 0.5)
+    for part in (1.0, 0.5):
+        depth = counted(1024 * part)
+        found = {
+            name: upsample_surface(rgb, depth, camera, method="bicubic", scale=4, sensor=name)
+            for name in ("none", "D435")
+        }
+        least = 0.6 * math.sqrt(2 / math.pi) * least_error(BY_NAME["RealSense D435"], found["D435"].depth) / part
+        assert torch.equal(found["none"].depth, found["D435"].depth)
+        expected = torch.maximum(found["none"].depth_error, least)
+        torch.testing.assert_close(found["D435"].depth_error, expected, rtol=5e-3, atol=1e-7)
+        assert bool((found["D435"].depth_error > found["none"].depth_error).any())
+
+
+def test_correlated_noise_of_a_stereo_camera_is_told_as_it_grows():
+    depth = counted(1024, 1e-3, noise=0.004)
     camera, rgb = Camera.centred(640, 480, 600.0), torch.full((3, 480, 640), 0.5)
     found = find_noise(depth)
+    assert found.extent == pytest.approx(9, rel=0.2)
     assert found.deviation == pytest.approx(0.004 * found.distance**2, rel=0.2)
     told = {"noise": found.deviation / found.distance**2, "noise_growth": 2.0}
     sensed, set_here, unset = (
         upsample_surface(rgb, depth, camera, sensor=sensor, settings=settings).depth
-        for sensor, settings in (("Kinect v1", {}), ("none", told), ("none", {}))
+        for sensor, settings in (("D435", {}), ("none", told), ("none", {}))
     )
     torch.testing.assert_close(sensed, set_here)
     assert not torch.equal(sensed, unset)
-    exact = upsample_surface(rgb, depth, camera, sensor="Kinect v1", settings={"noise": 0.0}).depth
+    exact = upsample_surface(rgb, depth, camera, sensor="D435", settings={"noise": 0.0}).depth
     assert torch.equal(exact, upsample_surface(rgb, depth, camera, sensor="none", settings={"noise": 0.0}).depth)
+
+
+def test_noise_that_is_not_correlated_is_left_to_the_network():
+    inverse = slanted(1.0, 6.0) + 0.004 * np.random.default_rng(0).standard_normal((480, 640))
+    depth = as_stored(1 / inverse, 1e-3)
+    camera, rgb = Camera.centred(640, 480, 600.0), torch.full((3, 480, 640), 0.5)
+    named, none = (upsample_surface(rgb, depth, camera, sensor=name).depth for name in ("D435", "none"))
+    assert torch.equal(named, none)
+
+
+def test_growth_without_noise_is_refused():
+    camera, rgb = Camera.centred(32, 32, 40.0), torch.full((3, 32, 32), 0.5)
+    with pytest.raises(ValueError, match="noise_growth: expected noise with it"):
+        upsample_surface(rgb, torch.ones(1, 8, 8), camera, settings={"noise_growth": 2.0})

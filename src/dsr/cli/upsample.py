@@ -174,7 +174,7 @@ def _add_method(parser: argparse.ArgumentParser) -> None:
         "--sensor",
         default="auto",
         metavar="auto|none|NAME",
-        help="what measured the depth, such as 'RealSense D435'; auto: as the files or the depth values tell",
+        help="what measured the depth, such as 'RealSense D435'; auto: as the depth values or the files tell",
     )
 
 

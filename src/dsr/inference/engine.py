@@ -42,6 +42,8 @@ _LARGEST_RATIO = 16
 """Largest ratio of the sizes that a smaller working size may lead to: there are no weights for larger ones."""
 
 
+_NOISY = 0.4
+"""Standard deviation of a sensor's disparity in its steps, at least; rounding alone has 0.29."""
 _CORRELATED = 5.0
 """Pixels over which noise is correlated that a network takes for shape in part."""
 
@@ -136,7 +138,11 @@ def find_sensor(depth: Tensor, name: str = "auto", device_name: str = "") -> Ide
 
     """
     found = identify(depth, name, device_name)
-    return None if found is not None and found.by == "values" and find_noise(depth) is None else found
+    if found is None or found.by != "values" or found.constant is None:
+        return found
+    noise = find_noise(depth)
+    steps = 0.0 if noise is None else found.constant * noise.deviation / noise.distance**2
+    return found if steps >= _NOISY else None
 
 
 def upsample_depth(

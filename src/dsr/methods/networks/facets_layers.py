@@ -146,7 +146,7 @@ def enlarge(conv: nn.Module, x: Tensor, *features: Tensor) -> Tensor:
     """Return the sub-pixel shuffle of a 1 x 1 convolution's results, with the features behind them.
 
     Args:
-        conv: a 2-D convolution to 4 C channels.
+        conv: a 1 x 1 convolution with a bias, to 4 C channels.
         x: (B, channels, h, w).
         features: (B, n, 2 h, 2 w), or none.
 
