@@ -53,10 +53,10 @@ def stages(plan: Mapping[str, Any], out: Path) -> Iterator[tuple[int, Mapping[st
 
 def train(stage: Mapping[str, Any], number: int, run: Path, weights: Path) -> None:
     """Begin or go on with the training of a stage, unless it is complete."""
-    links = read_header(weights)
-    shared = [f"trainer.shared={weights.parent / links['shared']}"] if "shared" in links else []
     if (run / "weights.safetensors").is_file():
         return
+    links = read_header(weights)
+    shared = [f"trainer.shared={weights.parent / links['shared']}"] if "shared" in links else []
     command = [
         sys.executable, str(HERE.parent / "train.py"), *stage["overrides"], *shared, f"trainer.steps={stage['steps']}",
         "trainer.keep=last", f"trainer.init={weights}", f"seed={number}", f"output_dir={run}",

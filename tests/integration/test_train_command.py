@@ -607,17 +607,21 @@ def test_interrupted_training_gives_bit_identical_weights(tmp_path, within, inte
         assert scalars_of(tmp_path / "out", tag) == scalars_of(tmp_path / "whole", tag), tag
 
 
+def validate_with(monkeypatch, *scores):
+    """Let validations have these scores, one after the other."""
+    left, end = iter(scores), SuperResolution.on_validation_epoch_end
+
+    def scored(self):
+        end(self)
+        self.log("val/RMSE_v", next(left), logger=False)
+
+    monkeypatch.setattr(SuperResolution, "on_validation_epoch_end", scored)
+
+
 def test_training_resumes_from_its_last_validation_even_if_it_was_not_the_best(
     tmp_path, within, interrupt, monkeypatch
 ):
-    scores = iter([0.3, 0.1, 0.2, 0.3])
-    end = SuperResolution.on_validation_epoch_end
-
-    def worse(self):
-        end(self)
-        self.log("val/RMSE_v", next(scores), logger=False)
-
-    monkeypatch.setattr(SuperResolution, "on_validation_epoch_end", worse)
+    validate_with(monkeypatch, 0.3, 0.1, 0.2, 0.3)
     interrupt(2)
     arguments = (*SMOKE, "trainer.steps=3", "output_dir=out")
     assert within(*arguments)[0] == 130
@@ -632,14 +636,7 @@ def test_training_resumes_from_its_last_validation_even_if_it_was_not_the_best(
 
 
 def test_last_weights_are_kept_on_request(tmp_path, within, monkeypatch):
-    scores = iter([0.1, 0.2, 0.3, 0.4])
-    end = SuperResolution.on_validation_epoch_end
-
-    def worse(self):
-        end(self)
-        self.log("val/RMSE_v", next(scores), logger=False)
-
-    monkeypatch.setattr(SuperResolution, "on_validation_epoch_end", worse)
+    validate_with(monkeypatch, 0.1, 0.2, 0.3, 0.4)
     assert within(*SMOKE, "trainer.steps=3", "trainer.keep=last", "output_dir=out")[0] == 0
     last = torch.load(tmp_path / "out" / "checkpoints" / "last.ckpt", weights_only=True)
     assert last["global_step"] == 3

@@ -210,7 +210,7 @@ SENSORS = (
         "Xtion",
         r"xtion|primesense|carmine",
         0.075 * 570.3,
-        "SUN RGB-D's Xtion: 570.3 px, and its values agree; ISPRS Archives XXXIX-B3, 2012: Kinect's chip, about 75 mm",
+        "SUN RGB-D's Xtion: 570.3 px, and its values agree; ISPRS Archives, part B3: Kinect's chip, about 75 mm",
     ),
     Sensor("Astra", "structured light", 640, r"\bastra(?!.*(\b2\b|stereo))"),
     _stereo(
