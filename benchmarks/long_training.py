@@ -19,6 +19,7 @@ import argparse
 import csv
 import os
 import shutil
+import signal
 import subprocess
 import sys
 import time
@@ -61,7 +62,10 @@ def train(stage: Mapping[str, Any], number: int, run: Path, weights: Path) -> No
         sys.executable, str(HERE.parent / "train.py"), *stage["overrides"], *shared, f"trainer.steps={stage['steps']}",
         "trainer.keep=last", f"trainer.init={weights}", f"seed={number}", f"output_dir={run}",
     ]  # fmt: skip
-    code = subprocess.run(command, check=False, env={**os.environ, **ENVIRONMENT}).returncode  # noqa: S603
+    with subprocess.Popen(command, env={**os.environ, **ENVIRONMENT}) as child:  # noqa: S603
+        before = signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the training, too, which saves itself
+        code = child.wait()
+    signal.signal(signal.SIGINT, before)
     if code:
         sys.exit(code)
 
