@@ -1,15 +1,16 @@
 """Compare the statistics of real sensors' maps with those of the simulated sensors that a network is trained on.
 
-    python benchmarks/sensor_statistics.py --shared DIR [--scenes 6] [--draws 4] [--sheet FILE] [--only KIND,...]
+    python benchmarks/sensor_statistics.py [--shared DIR] [--scenes 6] [--draws 4] [--sheet FILE] [--only KIND,...]
 
-``DIR`` holds ``real``. Simulated maps are drawn at factor 1 from rendered scenes (``dataset=procedural``), in
-millimetres as cameras write them. The first table has a map's amplitude of noise and its correlation length: those of
-the largest window in which the residual about a plane stays shorter than a fifth of the window, in its flattest tenth,
-of simulated sensors before a wall; medians of the maps and, of simulated ones, the 5th to 95th percentiles. The second
-compares windows of 48 pixels, the flattest tenth of each map, and steps of depth: medians, and the two-sample statistic
-of Kolmogorov and Smirnov (0 for equal distributions, 1 for disjoint ones). One device has one setting while simulated
-ones have many, so what counts is that the real medians lie within the simulated range. ``--sheet`` draws photo, relit
-depth, residual about a plane and its power spectrum of each real sensor above those of simulated ones.
+``DIR`` holds ``real``; without it simulated sensors stand alone. Simulated maps are drawn at factor 1 from rendered
+scenes (``dataset=procedural``), in millimetres as cameras write them. The first table has a map's amplitude of noise
+and its correlation length: those of the largest window in which the residual about a plane stays shorter than a fifth
+of the window, in its flattest tenth, of simulated sensors before a wall; medians of the maps and, of simulated ones,
+the 5th to 95th percentiles. The second compares windows of 48 pixels, the flattest tenth of each map, and steps of
+depth: medians, and the two-sample statistic of Kolmogorov and Smirnov (0 for equal distributions, 1 for disjoint ones).
+One device has one setting while simulated ones have many, so what counts is that the real medians lie within the
+simulated range. ``--sheet`` draws photo, relit depth, residual about a plane and its power spectrum of each real sensor
+above those of simulated ones: one sheet for each kind, or one for all where they stand alone.
 """
 
 from __future__ import annotations
@@ -313,30 +314,37 @@ def panels_of(name: str, values: Map) -> list[Panel]:
     ]
 
 
+def draw_sheets(path: Path, kinds: Iterable[str], maps: Mapping[str, list[Map]]) -> None:
+    """Draw the first map of each real sensor above two simulated ones, a sheet for each kind; or these alone."""
+    sheets: dict[Path, list[Panel]] = {}
+    for kind in kinds:
+        panels = sheets.setdefault(path.with_name(f"{kind}_{path.name}") if maps else path, [])
+        for name in (name for name in maps if SENSORS[name].kind == kind):
+            panels += panels_of(name, maps[name][0])
+        for number, each in enumerate(simulate(kind, 3 if maps else 2, 2 if maps else 1)):
+            panels += panels_of(f"simulated {kind} {number}", each)
+    for each, panels in sheets.items():
+        save_panels(each, panels, 4, width=192)
+
+
 def main() -> None:
     """Measure, print and draw."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--shared", type=Path, required=True)
+    parser.add_argument("--shared", type=Path, help="folder that holds real")
     parser.add_argument("--scenes", type=int, default=6)
     parser.add_argument("--draws", type=int, default=4, help="simulated maps of a scene")
     parser.add_argument("--only", help="simulated kinds, separated by commas; all")
-    parser.add_argument("--sheet", type=Path, help="a JPEG file; kinds are written beside it, KIND before its name")
+    parser.add_argument("--sheet", type=Path, help="a JPEG file; with --shared KIND_FILE beside it for each kind")
     options = parser.parse_args()
     kinds = options.only.split(",") if options.only else sorted({sensor.kind for sensor in SENSORS.values()})
-    files = {
-        name: list(sensor.files(options.shared / "real")) for name, sensor in SENSORS.items() if sensor.kind in kinds
-    }
-    if missing := [name for name, found in files.items() if not found]:
-        parser.error(f"--shared: expected maps of {missing[0]} in {options.shared / 'real'}, got none")
-    maps = {name: [read_map(SENSORS[name], *each) for each in found] for name, found in files.items()}
+    maps = {}
+    for name, sensor in SENSORS.items() if options.shared else ():
+        if sensor.kind in kinds:
+            maps[name] = [read_map(sensor, *each) for each in sensor.files(options.shared / "real")]
+            if not maps[name]:
+                parser.error(f"--shared: expected maps of {name} in {options.shared / 'real'}, got none")
     if options.sheet:
-        for kind in kinds:
-            panels = [
-                panel for name, each in maps.items() if SENSORS[name].kind == kind for panel in panels_of(name, each[0])
-            ]
-            for number, each in enumerate(simulate(kind, 3, 2)):
-                panels += panels_of(f"simulated {kind} {number}", each)
-            save_panels(options.sheet.with_name(f"{kind}_{options.sheet.name}"), panels, 4, width=256)
+        draw_sheets(options.sheet, kinds, maps)
     count = options.scenes, options.draws
     simulated = {kind: measure(simulate(kind, *count), simulate(kind, *count, wall=True)) for kind in kinds}
     print_tables({name: measure(each, each) for name, each in maps.items()}, simulated)
