@@ -81,9 +81,14 @@ def print_pattern(rgb: Tensor, generator: torch.Generator) -> Tensor:
 
 
 def take_another_photo(rgb: Tensor, generator: torch.Generator) -> Tensor:
-    """Return a photo, (3, H, W), with another exposure, white balance and contrast, and with blur, noise and JPEG."""
+    """Return a photo, (3, H, W), with another exposure, white balance and contrast, and with blur, noise and JPEG.
+
+    One of twelve shows little, down to nothing, as at night or in fog.
+    """
     gain = math.exp(uniform(-0.7, 0.5, generator)) * (1 + 0.08 * torch.randn((3, 1, 1), generator=generator))
     rgb = (rgb * gain).clamp(0, 1) ** math.exp(uniform(-0.4, 0.4, generator))
+    if chance(1 / 12, generator):
+        rgb = torch.lerp(rgb.mean(dim=(-2, -1), keepdim=True), rgb, uniform(0, 0.3, generator))
     if chance(0.5, generator):
         rgb = _blur(rgb, uniform(0.3, 1.2, generator))
     rgb = (rgb + uniform(0, 0.03, generator) * torch.randn(rgb.shape, generator=generator)).clamp(0, 1)
