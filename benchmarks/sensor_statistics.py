@@ -26,7 +26,7 @@ import torch
 from panel_grid import Panel, save_panels
 from scipy import ndimage, stats
 
-from dsr.data.formats import sunrgbd
+from dsr.data import sunrgbd
 from dsr.data.procedural import Procedural
 from dsr.degradation.random_noise import NOISES
 from dsr.geometry.camera import Camera

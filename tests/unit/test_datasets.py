@@ -6,13 +6,11 @@ import pytest
 import yaml
 
 from dsr.data.folder import Folder
-from dsr.data.formats.sintel import SEQUENCES
 from dsr.data.icl import FRAMES as ICL_FRAMES
 from dsr.data.icl import ICL
-from dsr.data.middlebury import EVALUATION_2014, Middlebury, MiddleburyLevels
-from dsr.data.middlebury_train import MIDDLEBURY, MiddleburyTrain
+from dsr.data.middlebury import EVALUATION_2014, TRAINING, Middlebury, MiddleburyLevels, MiddleburyTrain
 from dsr.data.simgeo import SimGeo
-from dsr.data.sintel import Sintel, sintel_frames
+from dsr.data.sintel import SEQUENCES, Sintel, sintel_frames
 from dsr.data.sunrgbd import FRAMES as SUN_FRAMES
 from dsr.data.sunrgbd import SunRGBD
 from dsr.data.tofmark import SCENES as TOFMARK_SCENES
@@ -108,13 +106,13 @@ def test_sun_rgbd_scenes_are_found_below_any_folder_by_path_or_prefix(tmp_path):
 
 
 def test_evaluation_scenes_are_not_trained_on_by_name(tmp_path):
-    training = {scene for scenes in MIDDLEBURY.values() for scene in scenes}
+    training = {scene for scenes in TRAINING.values() for scene in scenes}
     assert not training & set(EVALUATION_2014)
-    assert not set(MIDDLEBURY[2014]) & (set(ICL_FRAMES) | set(SIMGEO_SCENES) | set(SUN_FRAMES) | set(TOFMARK_SCENES))
-    stereo_2014(tmp_path / "middlebury2014", (*EVALUATION_2014, *MIDDLEBURY[2014]))
+    assert not set(TRAINING[2014]) & (set(ICL_FRAMES) | set(SIMGEO_SCENES) | set(SUN_FRAMES) | set(TOFMARK_SCENES))
+    stereo_2014(tmp_path / "middlebury2014", (*EVALUATION_2014, *TRAINING[2014]))
     root = str(tmp_path)
     found = MiddleburyTrain(root, "found").scenes()
-    assert sorted(found) == sorted(MIDDLEBURY[2014])
+    assert sorted(found) == sorted(TRAINING[2014])
     for scene in EVALUATION_2014:
         with pytest.raises(ValueError, match=f"'{scene}' is not there"):
             MiddleburyTrain(root, [scene])

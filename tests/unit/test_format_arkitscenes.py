@@ -6,8 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from dsr.data.arkitscenes import NOTE, ARKitScenes
-from dsr.data.formats.arkitscenes import find_frames, load_frame, read_confidence, read_intrinsics
+from dsr.data.arkitscenes import NOTE, ARKitScenes, find_frames, load_frame, read_confidence, read_intrinsics
 
 ROWS, COLUMNS = np.mgrid[0:1440, 0:1920]
 TRUTH = (1000 + ROWS + COLUMNS // 2).astype(np.uint16)

@@ -4,8 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from dsr.data.ddrnet import DDRNetFrames
-from dsr.data.formats.ddrnet import CAMERA, find_frames, load_frame
+from dsr.data.ddrnet import CAMERA, DDRNetFrames, find_frames, load_frame
 
 ROWS, COLUMNS = np.mgrid[0:480, 0:640]
 TRUTH = (1000 + ROWS + 2 * COLUMNS).astype(np.uint16)

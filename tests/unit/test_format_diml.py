@@ -6,8 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from dsr.data.diml import DIML
-from dsr.data.formats.diml import find_frames
+from dsr.data.diml import DIML, find_frames
 from dsr.data.formats.shared import NO_CAMERA, load_pair
 
 DEPTH = (1000 + 2 * np.arange(16)[:, None] + np.arange(28)).astype(np.uint16)

@@ -6,8 +6,7 @@ import pytest
 import torch
 from PIL import Image
 
-from dsr.data.eight_bit import NOTE, EightBit
-from dsr.data.formats.eight_bit import BENCHMARKS, find_frames, load_frame
+from dsr.data.eight_bit import BENCHMARKS, NOTE, EightBit, find_frames, load_frame
 from dsr.degradation.downsampling import Downsampling, make_sample
 from dsr.geometry.camera import to_range
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from dsr.data.formats.icl_nuim import CAMERA, find_frames, load_frame, read_depth
+from dsr.data.icl import CAMERA, find_frames, load_frame, read_depth
 
 ROWS, COLUMNS = np.mgrid[0:480, 0:640]
 DISTANCES = 100.0 + ROWS + COLUMNS / 1000

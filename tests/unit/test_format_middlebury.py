@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from dsr.data.formats.middlebury import find_2014, find_levels, load_2014, load_levels, read_calibration
+from dsr.data.middlebury import find_2014, find_levels, load_2014, load_levels, read_calibration
 
 CALIBRATION = (
     "cam0=[ 100.5 0 3.25 ; 0 100.5 2 ; 0 0 1 ] \ncam1=[ 100.5 0 8.25 ; 0 100.5 2 ; 0 0 1 ]\n doffs= 5 \n"

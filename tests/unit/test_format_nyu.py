@@ -4,7 +4,7 @@ import h5py
 import numpy as np
 import pytest
 
-from dsr.data.formats.nyu import CAMERA, find_frames, load_frame
+from dsr.data.nyu import CAMERA, find_frames, load_frame
 
 ROWS, COLUMNS = np.mgrid[0:480, 0:640]
 RAW = np.stack([1.0 + ROWS / 512 + COLUMNS / 8192, 4.0 + ROWS / 512]).astype(np.float32)

@@ -6,9 +6,8 @@ import cv2
 import numpy as np
 import pytest
 
-from dsr.data.formats.rgbdd import find_frames, load_measured_frame
 from dsr.data.formats.shared import NO_CAMERA, load_pair
-from dsr.data.rgbdd import RGBDD
+from dsr.data.rgbdd import RGBDD, find_frames, load_measured_frame
 
 ROWS, COLUMNS = np.mgrid[0:384, 0:512]
 DEPTH = (1000 + 2 * ROWS + COLUMNS).astype(np.uint16)

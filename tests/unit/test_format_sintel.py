@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from dsr.data.formats.sintel import SEQUENCES, find_frames, load_frame, read_camera, read_depth
+from dsr.data.sintel import SEQUENCES, find_frames, load_frame, read_camera, read_depth
 
 VALUES = np.array([[1.5, 2.25, 0.125], [40.0, 999.0, 1e10]])
 """Metres, exact in float32; the last is sky."""

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from dsr.data.formats.sunrgbd import find_frames, frame_files, load_frame, load_pair, read_depth, read_intrinsics
+from dsr.data.sunrgbd import find_frames, frame_files, load_frame, load_pair, read_depth, read_intrinsics
 
 MILLIMETRES = np.array([[0, 1, 640, 3783], [8000, 9870, 8191, 8192], [65535, 5, 6, 7]])
 """0 is a hole; more than 13 bits need the lowest three of a level."""

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from dsr.data.formats.tartanair import CAMERA, find_frames, load_frame, read_depth
+from dsr.data.tartanair import CAMERA, find_frames, load_frame, read_depth
 
 ROWS, COLUMNS = np.mgrid[0:480, 0:640]
 VALUES = 1.0 + ROWS + COLUMNS / 1024

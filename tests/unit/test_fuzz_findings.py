@@ -20,7 +20,7 @@ from dsr.app.entry import run_command
 from dsr.app.trust import read_plain_yaml
 from dsr.app.upsample.outputs import read_previous_run
 from dsr.data.download.unpack import unpack
-from dsr.data.formats.tofmark import read_matrices
+from dsr.data.tofmark import read_matrices
 from dsr.inference import MethodChoice
 from dsr.io.captures.arkitscenes import find_arkitscenes
 from dsr.io.captures.stray import find_stray

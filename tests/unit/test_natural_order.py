@@ -10,8 +10,8 @@ import pytest
 
 from dsr.app.view import find_results
 from dsr.cli import main
+from dsr.data import arkitscenes, ddrnet, diml, icl, rgbdd, sintel, sunrgbd, tartanair, tofmark
 from dsr.data.folder import Folder
-from dsr.data.formats import arkitscenes, ddrnet, diml, icl_nuim, rgbdd, sintel, sunrgbd, tartanair, tofmark
 from dsr.io.inputs import Reading, read_picture
 from dsr.io.layouts import find_pairs_of_folder
 from dsr.io.manifest import Manifest, write_manifest
@@ -199,8 +199,8 @@ def test_poses_in_order_have_to_be_as_many_as_frames(folder, tmp_path, capsys):
 
 
 DATA_SETS = {
-    "icl": (icl_nuim.find_frames, ("a/scene_00_{}.png", "a/scene_00_{}.depth")),
-    "icl folders": (icl_nuim.find_frames, ("a{}/rgb.png", "a{}/depth.png")),
+    "icl": (icl.find_frames, ("a/scene_00_{}.png", "a/scene_00_{}.depth")),
+    "icl folders": (icl.find_frames, ("a{}/rgb.png", "a{}/depth.png")),
     "sunrgbd": (sunrgbd.find_frames, ("{}/image/a.jpg", "{}/depth/a.png")),
     "tartanair": (tartanair.find_frames, ("{}_left.png", "{}_left_depth.npy")),
     "sintel": (sintel.find_frames, ("final/a/frame_{}.png", "depth/a/frame_{}.dpt", "camdata_left/a/frame_{}.cam")),

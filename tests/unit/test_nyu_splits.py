@@ -7,8 +7,7 @@ import h5py
 import numpy as np
 import pytest
 
-from dsr.data.formats.nyu import CAMERA, find_files, load_files
-from dsr.data.nyu import NYU
+from dsr.data.nyu import CAMERA, NYU, find_files, load_files
 
 ROWS, COLUMNS = np.mgrid[0:480, 0:640]
 DEPTH = (1.0 + ROWS / 512 + COLUMNS / 8192).astype(np.float32)

@@ -8,7 +8,7 @@ MOVED_TARGETS = {
     "dsr.data.extras.NYU": "dsr.data.nyu.NYU",
     "dsr.data.extras.TartanAir": "dsr.data.tartanair.TartanAir",
     "dsr.data.procedural.source.Procedural": "dsr.data.procedural.Procedural",
-    "dsr.data.training_sets.MiddleburyTrain": "dsr.data.middlebury_train.MiddleburyTrain",
+    "dsr.data.training_sets.MiddleburyTrain": "dsr.data.middlebury.MiddleburyTrain",
     "dsr.data.training_sets.Sintel": "dsr.data.sintel.Sintel",
     "dsr.degrade.Downsampling": "dsr.degradation.downsampling.Downsampling",
     "dsr.degrade.Measured": "dsr.degradation.downsampling.Measured",

@@ -1,14 +1,149 @@
 """``dataset=arkitscenes``: a tablet's lidar at a ratio of 7.5, with a laser scanner's depth as the truth.
 
 ``downsampling=measured scale=native`` takes the lidar's maps as the input.
+
+Baruch et al., "ARKitScenes: A Diverse Real-World Dataset for 3D Indoor Scene Understanding Using Mobile RGB-D Data",
+NeurIPS Datasets and Benchmarks 2021; DATA.md and the READMEs of github.com/apple/ARKitScenes.
+
+    Validation/41069021/wide/41069021_305.244.png               the photo, 1920 x 1440; the folder may be ``color``
+    Validation/41069021/highres_depth/41069021_305.244.png      the laser scanner's depth, 1920 x 1440, 16 bits, mm
+    Validation/41069021/lowres_depth/41069021_305.244.png       the lidar's depth, 256 x 192, mm
+    Validation/41069021/confidence/41069021_305.244.png         of the lidar, 256 x 192, 8 bits, 0 (low) to 2 (high)
+    Validation/41069021/wide_intrinsics/41069021_305.244.pincam   width height fx fy cx cy
+
+and the same in ``Training``. Depth 0 is a hole. Intrinsics may be a millisecond off, and belong to the raw data; where
+there are none, 60 degrees of horizontal view are assumed. Photos stay as the camera was held.
 """
 
 from __future__ import annotations
 
+import re
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import torch
+
 from dsr.data.base import SceneSelection
-from dsr.data.formats import arkitscenes
+from dsr.data.formats.files import read_levels
+from dsr.data.formats.shared import (
+    expect_size,
+    find_beside,
+    in_natural_order,
+    read_millimetres,
+    read_numbers,
+    read_picture,
+    to_camera,
+)
 from dsr.data.preparation.dataset import Preparation, PreparedDataset, add_note, list_frames, make_records
-from dsr.geometry.camera import ASSUMED_FOV
+from dsr.geometry.camera import ASSUMED_FOV, Camera
+from dsr.sample import Scene
+
+Split = Literal["validation", "training"]
+SPLITS: tuple[Split, ...] = ("validation", "training")
+_SIZE, _SIZE_LR = (1440, 1920), (192, 256)
+_PHOTO = re.compile(r"(\d+_\d+\.\d+)\.png")
+_HIGHEST_CONFIDENCE = 2
+Files = tuple[Path, Path, Path, Path | None, Path | None]
+
+
+def find_frames(root: Path, split: Split | None = None) -> dict[str, Files]:
+    """Return the first five arguments of :func:`load_frame` by name "41069021_305.244", in order.
+
+    Args:
+        root: directory of ``Training`` and ``Validation``, or any directory above or below.
+        split: of the frames; None for all. What is in no directory ``Training`` is for validation.
+
+    Raises:
+        ValueError: there is no such directory.
+
+    """
+    found: dict[str, Files] = {}
+    for folder in ("wide", "color"):
+        others = ("highres_depth/{}.png", "lowres_depth/{}.png")
+        for place, frame, (photo, truth, measured) in find_beside(root, folder, _PHOTO, others):
+            if split is None or ("Training" in place.resolve().parts) == (split == "training"):
+                confidence = place / "confidence" / photo.name
+                known = confidence if confidence.is_file() else None
+                found.setdefault(frame, (photo, truth, measured, known, _find_intrinsics(place, frame)))
+    return in_natural_order(found)
+
+
+def load_frame(
+    rgb_path: Path,
+    depth_path: Path,
+    measured_path: Path,
+    confidence_path: Path | None,
+    intrinsics_path: Path | None,
+    dataset: str,
+    name: str,
+    *,
+    min_confidence: int = 0,
+) -> Scene:
+    """Return one frame with the lidar's map as the measured one.
+
+    Args:
+        rgb_path: photo.
+        depth_path: laser scanner's depth.
+        measured_path: lidar's depth.
+        confidence_path: the lidar's confidence, None where there is none.
+        intrinsics_path: ``.pincam`` file; None for 60 degrees of horizontal view.
+        dataset: of the scene returned.
+        name: the same.
+        min_confidence: pixels of the lidar below this confidence become holes.
+
+    Raises:
+        ValueError: a file is missing, damaged, or of another size; the message names it.
+
+    """
+    rgb, depth, measured = read_picture(rgb_path), read_millimetres(depth_path), read_millimetres(measured_path)
+    for path, image, size in ((rgb_path, rgb, _SIZE), (depth_path, depth, _SIZE), (measured_path, measured, _SIZE_LR)):
+        expect_size(path, tuple(image.shape[1:]), size)
+    if min_confidence > 0:
+        if confidence_path is None:
+            raise ValueError(f"{measured_path}: expected its confidence in the folder confidence, there is none")
+        uncertain = torch.from_numpy(read_confidence(confidence_path) < min_confidence)
+        measured = measured.masked_fill(uncertain, torch.nan)
+        if not measured.isfinite().any():
+            raise ValueError(f"{confidence_path}: expected a pixel of confidence {min_confidence}, there is none")
+    height, width = _SIZE
+    camera = Camera.from_fov(width, height) if intrinsics_path is None else read_intrinsics(intrinsics_path)
+    return Scene(dataset, name, rgb, camera, depth, {width / _SIZE_LR[1]: measured})
+
+
+def read_confidence(path: Path) -> np.ndarray:
+    """Return the lidar's confidence, (192, 256) uint8 from 0 to 2.
+
+    Raises:
+        ValueError: it is missing, damaged, of another size, or has other values.
+
+    """
+    confidence = read_levels(path)
+    expect_size(path, confidence.shape, _SIZE_LR)
+    if confidence.max() > _HIGHEST_CONFIDENCE:
+        raise ValueError(f"{path}: expected confidence from 0 to {_HIGHEST_CONFIDENCE}, got {confidence.max()}")
+    return confidence
+
+
+def read_intrinsics(path: Path) -> Camera:
+    """Return the camera of a ``.pincam`` file, of 1920 x 1440 pixels with their centres at integers.
+
+    Raises:
+        ValueError: it is missing, or that of no such camera.
+
+    """
+    width, height, fx, fy, cx, cy = read_numbers(path, 6).tolist()
+    if (height, width) != _SIZE:
+        raise ValueError(f"{path}: expected a camera of 1440 x 1920 pixels, got {height:g} x {width:g}")
+    return to_camera(path, np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]), _SIZE)
+
+
+def _find_intrinsics(place: Path, frame: str) -> Path | None:
+    """Return the file of a frame's intrinsics, whose time may differ by a millisecond; None where there is none."""
+    video, _, time = frame.rpartition("_")
+    paths = (place / "wide_intrinsics" / f"{video}_{float(time) + shift:.3f}.pincam" for shift in (0.0, -1e-3, 1e-3))
+    return next((path for path in paths if path.is_file()), None)
+
 
 NOTE = f"there is no .pincam file: {ASSUMED_FOV:g} degrees of horizontal view are assumed"
 """Of scenes without intrinsics."""
@@ -32,16 +167,16 @@ class ARKitScenes(PreparedDataset):
     def __init__(
         self,
         root: str,
-        split: arkitscenes.Split = "validation",
+        split: Split = "validation",
         scenes: SceneSelection = None,
         min_confidence: int = 0,
     ) -> None:
-        if split not in arkitscenes.SPLITS:
-            raise ValueError(f"split: expected one of {', '.join(arkitscenes.SPLITS)}, got {split}")
+        if split not in SPLITS:
+            raise ValueError(f"split: expected one of {', '.join(SPLITS)}, got {split}")
         if min_confidence not in range(3):
             raise ValueError(f"min_confidence: expected 0, 1 or 2, got {min_confidence}")
-        frames = list_frames(arkitscenes.find_frames, root, split)
-        records = make_records(frames, arkitscenes.load_frame, "arkitscenes", min_confidence=min_confidence)
+        frames = list_frames(find_frames, root, split)
+        records = make_records(frames, load_frame, "arkitscenes", min_confidence=min_confidence)
         found = records | add_note({name: records[name] for name, files in frames.items() if files[-1] is None}, NOTE)
         super().__init__("arkitscenes", root, found, None, scenes, Preparation(None))
         self.evaluation = split == "validation"

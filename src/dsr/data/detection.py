@@ -8,13 +8,12 @@ from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from dsr.data.folder import load_scene
-from dsr.data.formats import (
+from dsr.data import (
     arkitscenes,
     ddrnet,
     diml,
     eight_bit,
-    icl_nuim,
+    icl,
     middlebury,
     nyu,
     rgbdd,
@@ -23,6 +22,7 @@ from dsr.data.formats import (
     tartanair,
     tofmark,
 )
+from dsr.data.folder import load_scene
 from dsr.data.formats.shared import load_pair
 from dsr.sample import Scene
 from dsr.utils.paths import natural_key
@@ -30,7 +30,7 @@ from dsr.utils.paths import natural_key
 Loader = Callable[[], Scene]
 _YEARS = {"view1.png": 2006, "im2.png": 2003, "im2.ppm": 2001}
 _FRAMES: tuple[tuple[Callable[[Path], Mapping[str, tuple[Any, ...]]], Callable[..., Scene], str], ...] = (
-    (icl_nuim.find_frames, icl_nuim.load_frame, "icl"),
+    (icl.find_frames, icl.load_frame, "icl"),
     (sunrgbd.find_frames, sunrgbd.load_frame, "sunrgbd"),
     (tartanair.find_frames, tartanair.load_frame, "tartanair"),
     (sintel.find_frames, sintel.load_frame, "sintel"),

@@ -1,15 +1,123 @@
 """``dataset=lu`` and ``dataset=middlebury8``: the 8-bit benchmarks of guided depth super-resolution.
 
-The field computes their errors in levels; see :mod:`dsr.data.formats.eight_bit` for what is known of them.
+Lu's six pairs and thirty of Middlebury.
+
+    DIR/RGB/RGBD_01_ouput_color.png            the photo; the name is spelt that way in Lu's, "output" in Middlebury's
+    DIR/Depth/RGBD_01_output_depth.png         8 bits, nearer is brighter, without holes; 0 is a level like any other
+
+Lu et al., "Depth Enhancement via Low-Rank Matrix Completion", CVPR 2014, recorded ``RGBD_01`` to ``RGBD_06`` with a
+structured-light sensor and filled their holes, as well as those of thirty pairs of Middlebury 2001 to 2006
+(``Middlebury_01`` to ``Middlebury_30``, at a third of the size of 2005 and 2006). The field computes errors in levels.
+
+Levels are taken for disparity, but what depth a level stands for is not published. So the cameras here are invented, in
+such a way that disparity in pixels is the level and every level, even some below 0 which interpolation may make, has a
+positive depth: depth = focal * baseline / (level + offset).
+
+- Lu: f = 525 pixels, usual for such sensors; 0.5 m and 75 levels put level 255 at 0.80 m and level 0 at 3.5 m.
+- Middlebury: f = 3740 / 3 pixels and a baseline of 160 mm, published for 2005 and 2006, with three levels to a pixel,
+  which three times the baseline stands for; the offset is the shift of Art, 200 levels. Level 255 is at 1.3 m, level 0
+  at 3.0 m.
 """
 
 from __future__ import annotations
 
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from types import MappingProxyType
 from typing import ClassVar, Literal
 
+import torch
+
 from dsr.data.base import SceneSelection
-from dsr.data.formats import eight_bit
+from dsr.data.formats.files import read_levels
+from dsr.data.formats.shared import expect_size, find_beside, in_natural_order, read_picture
 from dsr.data.preparation.dataset import Preparation, PreparedDataset, add_note, list_frames, make_records
+from dsr.geometry.camera import Camera, baseline_times_focal, from_range
+from dsr.sample import Scene, Unit
+
+
+@dataclass(frozen=True)
+class Benchmark:
+    """A benchmark of 8-bit levels.
+
+    Args:
+        prefix: what its files' names begin with, before the number.
+        count: number of its scenes.
+        focal: focal length in pixels.
+        baseline: distance of the second camera in metres.
+        offset: added to levels to give disparity.
+
+    """
+
+    prefix: str
+    count: int
+    focal: float
+    baseline: float
+    offset: float
+
+    @property
+    def scenes(self) -> tuple[str, ...]:
+        """Names of the scenes."""
+        return tuple(f"{self.prefix}_{number:02d}" for number in range(1, self.count + 1))
+
+    def camera(self, height: int, width: int) -> Camera:
+        """Return the invented camera of pictures of a size; disparity of its depth is the level."""
+        centred = Camera.centred(width, height, self.focal)
+        return replace(centred, baseline=self.baseline, doffs=self.offset)
+
+
+BENCHMARKS: Mapping[str, Benchmark] = MappingProxyType(
+    {
+        "lu": Benchmark("RGBD", 6, 525.0, 0.5, 75.0),
+        "middlebury8": Benchmark("Middlebury", 30, 3740 / 3, 0.48, 200.0),
+    }
+)
+"""The benchmarks by the name of the data set."""
+
+
+def find_frames(root: Path, dataset: str) -> dict[str, tuple[Path, Path]]:
+    """Return the photos and maps of a benchmark, the first two arguments of :func:`load_frame`, by name, in order.
+
+    Args:
+        root: directory of ``RGB`` and ``Depth``, or one above it.
+        dataset: key of ``BENCHMARKS``.
+
+    Raises:
+        ValueError: there is no such directory.
+
+    """
+    found: dict[str, tuple[Path, Path]] = {}
+    prefix = BENCHMARKS[dataset].prefix
+    for spelling in ("output", "ouput"):
+        pattern = re.compile(rf"({prefix}_\d{{2}})_{spelling}_color\.png")
+        for _, frame, (photo, levels) in find_beside(root, "RGB", pattern, ("Depth/{}_output_depth.png",)):
+            found.setdefault(frame, (photo, levels))
+    return in_natural_order(found)
+
+
+def load_frame(rgb_path: Path, levels_path: Path, dataset: str, name: str) -> Scene:
+    """Return one scene, whose errors are counted in levels.
+
+    Args:
+        rgb_path: photo.
+        levels_path: map of 8 bits, in which 0 is a level and no hole.
+        dataset: of the scene returned, a key of ``BENCHMARKS``, which says the camera.
+        name: of the scene returned.
+
+    Raises:
+        ValueError: a file is missing, damaged, or does not fit the other; the message names it.
+
+    """
+    rgb, levels = read_picture(rgb_path), read_levels(levels_path)
+    height, width = rgb.shape[1:]
+    expect_size(levels_path, levels.shape, (height, width))
+    camera = BENCHMARKS[dataset].camera(height, width)
+    depth = from_range(torch.from_numpy(levels).double()[None], camera, "disparity")
+    unit = Unit("levels", inverse=True, factor=baseline_times_focal(camera), offset=camera.doffs, limits=(0.0, 255.0))
+    return Scene(dataset, name, rgb, camera, depth, unit=unit)
+
 
 NOTE = "depth is not metric: the camera is invented, and levels are taken for disparity"
 
@@ -32,8 +140,8 @@ class EightBit(PreparedDataset):
     """Pixels at depth steps are mixtures of both sides."""
 
     def __init__(self, root: str, benchmark: Literal["lu", "middlebury8"], scenes: SceneSelection = None) -> None:
-        if benchmark not in eight_bit.BENCHMARKS:
-            raise ValueError(f"benchmark: expected one of {', '.join(eight_bit.BENCHMARKS)}, got {benchmark}")
-        frames = list_frames(eight_bit.find_frames, root, benchmark)
-        found = add_note(make_records(frames, eight_bit.load_frame, benchmark), NOTE)
-        super().__init__(benchmark, root, found, eight_bit.BENCHMARKS[benchmark].scenes, scenes, Preparation(None))
+        if benchmark not in BENCHMARKS:
+            raise ValueError(f"benchmark: expected one of {', '.join(BENCHMARKS)}, got {benchmark}")
+        frames = list_frames(find_frames, root, benchmark)
+        found = add_note(make_records(frames, load_frame, benchmark), NOTE)
+        super().__init__(benchmark, root, found, BENCHMARKS[benchmark].scenes, scenes, Preparation(None))

@@ -3,16 +3,99 @@
 Voynov et al. 2019 evaluate on six frames, which they name by what they show, not by number. Their size and crop follow
 from their camera of Plant: frames are resized to a height of 512 and cropped to the square in the middle. Which frames
 they used is unknown. Those below are spread over the trajectories; ``dataset.frames`` takes others.
+
+Handa et al., "A Benchmark for RGB-D Visual Odometry, 3D Reconstruction and SLAM", ICRA 2014.
+
+    DIR/scene_00_NNNN.png, .depth     as rendered: colour (8 or 16 bits), distances along the rays in centimetres
+    DIR/rgb/N.png, DIR/depth/N.png    as for the TUM benchmark: orthogonal depth, 5000 levels a metre, 0 for a hole
+    DIR/rgb.png, DIR/depth.png        the same, one frame a folder
+
+All are 640 x 480 of one camera, 481.20, -480.00, 319.50, 239.50. The POV-Ray camera beside a rendered frame (.txt) is
+not read: what it adds is the pose, and its cam_right, cam_up and cam_dir give these intrinsics again
+(640 / 1.33 = 481.2, 480 / 1 = 480).
 """
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
+from pathlib import Path
 from types import MappingProxyType
 
+from torch import Tensor
+
 from dsr.data.base import SceneSelection
-from dsr.data.formats import icl_nuim
+from dsr.data.formats.shared import expect_size, name_of, read_16bit, read_numbers, read_picture, to_depth, walk
 from dsr.data.preparation.dataset import Preparation, PreparedDataset, list_frames, make_records, rename_records
+from dsr.geometry.camera import Camera, from_range
+from dsr.sample import Scene
+
+CAMERA = Camera(640, 480, 481.2, -480.0, 319.5, 239.5)
+FARTHEST = 100.0
+"""Largest depth in metres; longer rays have hit nothing."""
+LEVELS = 5000
+"""Levels per metre of the depth pictures."""
+_RENDERED = re.compile(r"scene_00_(\d+)\.depth")
+_SIZE = (480, 640)
+
+
+def find_frames(root: Path) -> dict[str, tuple[Path, Path]]:
+    """Return colour and depth files, the first two arguments of :func:`load_frame`, by name, in order.
+
+    A name is the frame's folder below ``root`` and its number, such as ``living_room_traj2/0120``, or the folder alone
+    where it holds one frame. A frame that lacks one of its two files is left out.
+
+    Raises:
+        ValueError: there is no such directory.
+
+    """
+    found: dict[str, tuple[Path, Path]] = {}
+    for folder, below, files in walk(root):
+        if "rgb" in below and "depth" in below:
+            below[:] = [name for name in below if name not in ("rgb", "depth")]
+            colours, depths = _numbered(folder / "rgb"), _numbered(folder / "depth")
+            for number in sorted(colours.keys() & depths.keys()):
+                found[name_of(root, folder, f"{number:04d}")] = (colours[number], depths[number])
+        if "rgb.png" in files and "depth.png" in files:
+            found[name_of(root, folder)] = (folder / "rgb.png", folder / "depth.png")
+        for match in filter(None, map(_RENDERED.fullmatch, files)):
+            colour = Path(match[0]).with_suffix(".png").name
+            if colour in files:
+                found[name_of(root, folder, f"{int(match[1]):04d}")] = (folder / colour, folder / match[0])
+    return found
+
+
+def read_depth(path: Path) -> Tensor:
+    """Return a depth file, ``.depth`` or ``.png``, as orthogonal depth, (1, 480, 640) float64 in metres, NaN in holes.
+
+    Raises:
+        ValueError: it is missing, damaged, of another size, or has negative values.
+
+    """
+    if path.suffix.lower() == ".depth":
+        centimetres = read_numbers(path, _SIZE[0] * _SIZE[1]).reshape(_SIZE)
+        return from_range(to_depth(path, centimetres / 100, FARTHEST), CAMERA, "perspective")
+    levels = read_16bit(path)
+    expect_size(path, levels.shape, _SIZE)
+    return to_depth(path, levels / LEVELS)
+
+
+def load_frame(rgb_path: Path, depth_path: Path, dataset: str, name: str) -> Scene:
+    """Return one frame at 640 x 480.
+
+    Raises:
+        ValueError: a file is missing, damaged or of another size; the message names it.
+
+    """
+    rgb = read_picture(rgb_path)
+    expect_size(rgb_path, tuple(rgb.shape[1:]), _SIZE)
+    return Scene(dataset, name, rgb, CAMERA, read_depth(depth_path))
+
+
+def _numbered(folder: Path) -> dict[int, Path]:
+    """Return the pictures of a folder by number."""
+    return {int(path.stem): path for path in folder.glob("*.png") if re.fullmatch(r"\d{1,9}", path.stem)}
+
 
 FRAMES = MappingProxyType(
     {
@@ -49,7 +132,5 @@ class ICL(PreparedDataset):
         crop: float = 0.5,
         frames: Mapping[str, str] = FRAMES,
     ) -> None:
-        found = rename_records(
-            make_records(list_frames(icl_nuim.find_frames, root), icl_nuim.load_frame, "icl"), frames
-        )
+        found = rename_records(make_records(list_frames(find_frames, root), load_frame, "icl"), frames)
         super().__init__("icl", root, found, tuple(FRAMES), scenes, Preparation(size, crop))

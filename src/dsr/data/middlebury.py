@@ -1,19 +1,244 @@
-"""``dataset=middlebury``, ``middlebury2001`` .. ``middlebury2006``: stereo benchmarks to evaluate on.
+"""``dataset=middlebury``, ``middlebury2001`` .. ``middlebury2006``, ``middlebury_train``: stereo benchmarks.
 
 ``middlebury`` has the seven scenes of the 2014 data set on which Voynov et al. 2019 evaluate, the others have all
-scenes of their year. :mod:`dsr.data.middlebury_train` has scenes to train on.
+scenes of their year. ``middlebury_train`` has scenes to train on, none of which is an evaluation scene: Hui et al. 2016
+trained MSG on 34 images of Middlebury (6 of 2001, 10 of 2006, 18 of 2014), and Voynov et al. 2019 MSG-V on patches of
+them. They do not say which. It has all scenes of 2001 and 2006, and those of 2014 without the seven evaluation scenes.
+
+Formats as on vision.middlebury.edu/stereo/data: disparity d in pixels of the left view, z = baseline f / (d + doffs).
+
+- 2014 (Scharstein et al., GCPR 2014): ``im0.png``, ``calib.txt``, ``disp0.pfm`` (``disp0GT.pfm`` in the smaller sizes
+  of the evaluation kit); inf = unknown.
+- 2005, 2006 (Scharstein and Pal, Hirschmueller and Scharstein, CVPR 2007): ``view1.png``, ``disp1.png``, 0 = unknown.
+  f = 3740 pixels at full size, baseline 160 mm. A level is a pixel of the full size, be the map full size, half or a
+  third; ``dmin.txt`` has the disparity, in such pixels, by which the views were shifted. Where it is missing 200 are
+  assumed: those of Art, by the evaluation kit's calibration of it. Depth is not metric then, though planes stay planes.
+- 2003 (Scharstein and Szeliski, CVPR 2003): ``im2.png``, ``disp2.png``, 4 levels a pixel, 0 = unknown. The camera is
+  the one that the evaluation kit has for Teddy.
+- 2001 (Scharstein and Szeliski, IJCV 2002): ``im2.ppm``, ``disp2.pgm``, 8 levels a pixel. No camera was published; it
+  is assumed to be the one of 2003.
 """
 
 from __future__ import annotations
 
 import functools
-from collections.abc import Collection, Sequence
+import re
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
+from types import MappingProxyType
+
+import numpy as np
+import torch
+from torch import Tensor
 
 from dsr.data.base import SceneSelection
 from dsr.data.download import catalogue
-from dsr.data.formats import middlebury
+from dsr.data.formats.files import read_levels, read_map
+from dsr.data.formats.shared import expect_size, read_picture
 from dsr.data.preparation.dataset import Preparation, PreparedDataset, SceneRecord
+from dsr.data.preparation.dequantization import smooth_levels
+from dsr.geometry.camera import Camera, from_range
+from dsr.sample import Scene
+from dsr.utils.limits import read_limited
+from dsr.utils.paths import natural_key
+
+YEARS = (2001, 2003, 2005, 2006)
+_MATRIX = re.compile(r"\[\s*(\S+)\s+0\s+(\S+)\s*;\s*0\s+(\S+)\s+(\S+)\s*;\s*0\s+0\s+1\s*\]")
+_FULL_HEIGHT, _FULL_FOCAL, _BASELINE = 1110, 3740.0, 0.16
+_ASSUMED_SHIFT = 200.0
+_TEDDY = MappingProxyType({"fx": 1500.0, "fy": 1500.0, "baseline": 0.08, "doffs": 52.0, "cx": 199.0, "cy": 187.0})
+_NOISY = MappingProxyType({4: "_depth_2_n.png", 8: "_depth_3_n.png"})
+
+
+@dataclass(frozen=True)
+class Files:
+    """The files of a scene of 2001 to 2006.
+
+    Args:
+        photo, disparity: of the left view.
+        shift: ``dmin.txt``, None where there is none.
+        measured: noisy low-resolution disparities by factor.
+
+    """
+
+    photo: Path
+    disparity: Path
+    shift: Path | None
+    measured: Mapping[int, Path]
+
+
+def find_2014(root: Path) -> dict[str, Path]:
+    """Return the folders of the scenes of 2014 below ``root``, by name in lower case, without ``-perfect``."""
+    found: dict[str, Path] = {}
+    for folder in sorted((path.parent for path in root.glob("*/calib.txt")), key=natural_key):
+        found.setdefault(re.sub(r"-(im)?perfect$", "", folder.name).casefold(), folder)  # imperfect sorts first
+        if folder.name.endswith("-perfect"):
+            found[folder.name.removesuffix("-perfect").casefold()] = folder
+    return found
+
+
+def find_levels(root: Path) -> dict[str, Files]:
+    """Return the files of the scenes of 2001 to 2006 below ``root``, by name in lower case.
+
+    ``NAME/view1.png``, ``NAME/im2.png`` or ``.ppm`` with their disparity, or ``NAME_color.png`` and ``NAME_big.png``.
+    """
+    pairs = (("view1.png", "disp1.png"), ("im2.png", "disp2.png"), ("im2.ppm", "disp2.pgm"))
+    found: dict[str, Files] = {}
+    for photo, disparity in pairs:
+        for path in sorted(root.glob(f"*/{photo}"), key=natural_key):
+            shift = path.with_name("dmin.txt")
+            files = Files(path, path.with_name(disparity), shift if shift.is_file() else None, {})
+            found[path.parent.name.casefold()] = files
+    for path in sorted(root.glob("*_color.png"), key=natural_key):
+        name = path.name.removesuffix("_color.png")
+        level_path = root / f"{name}_big.png"
+        if not level_path.is_file():  # other benchmarks' photos are called so, too
+            continue
+        measured = {factor: root / (name + end) for factor, end in _NOISY.items() if (root / (name + end)).is_file()}
+        found[name.casefold()] = Files(path, level_path, None, measured)
+    return found
+
+
+def load_2014(folder: Path, dataset: str, name: str, *, offset: bool = True) -> Scene:
+    """Return a scene of 2014.
+
+    Args:
+        folder: with the files.
+        dataset: of the scene returned.
+        name: the same.
+        offset: whether doffs of ``calib.txt`` counts, as it has to geometrically, or is taken for 0.
+
+    Raises:
+        ValueError: a file is missing, damaged, or does not fit the others; the message names it.
+
+    """
+    camera = read_calibration(folder / "calib.txt")
+    path = folder / "disp0.pfm"
+    if not path.is_file() and (folder / "disp0GT.pfm").is_file():
+        path = folder / "disp0GT.pfm"
+    values = read_map(path)
+    expect_size(path, values.shape, (camera.height, camera.width))
+    values[~np.isfinite(values)] = np.nan
+    low = -camera.doffs if offset else 0.0
+    if np.nanmin(values, initial=np.inf) <= low:
+        raise ValueError(f"{path}: expected disparities above {low:g} pixels, got {np.nanmin(values):g}")
+    if not offset:
+        camera = replace(camera, doffs=0.0)
+    return Scene(dataset, name, _photo(folder / "im0.png", camera), camera, _depth(path, values, camera))
+
+
+def load_levels(files: Files, dataset: str, name: str, year: int, *, smooth: bool = True) -> Scene:
+    """Return a scene of 2001 to 2006.
+
+    Args:
+        files: of the scene.
+        dataset: of the scene returned.
+        name: the same.
+        year: that of the data set, which says how levels count.
+        smooth: whether the steps of the rounding are smoothed; see :mod:`dsr.data.preparation.dequantization`.
+
+    Raises:
+        ValueError: a file is missing, damaged, or does not fit the others; the message names it.
+
+    """
+    levels = read_levels(files.disparity).astype(np.float64)
+    height, width = levels.shape
+    camera, per_pixel = _CAMERAS[year](files, height, width)
+    levels[levels == 0] = np.nan
+    depth = _depth(files.disparity, (smooth_levels(levels) if smooth else levels) / per_pixel, camera)
+    measured: dict[float, Tensor] = {}
+    for factor, path in files.measured.items():
+        camera_lr = camera.downscale(factor)
+        values = read_levels(path).astype(np.float64)
+        expect_size(path, values.shape, (camera_lr.height, camera_lr.width))
+        values[values == 0] = np.nan
+        measured[factor] = _depth(path, values / (per_pixel * factor), camera_lr)
+    return Scene(dataset, name, _photo(files.photo, camera), camera, depth, measured)
+
+
+def shortcoming(files: Files, year: int) -> str:
+    """Return why the depth of a scene of 2001 to 2006 is not metric; empty where it is."""
+    if year in (2001, 2003):
+        return "depth is not metric: no camera was published, that of Teddy in the evaluation kit is assumed"
+    return "" if files.shift else "depth is not metric: there is no dmin.txt, the shift of Art is assumed"
+
+
+def read_calibration(path: Path) -> Camera:
+    """Return the left camera of a ``calib.txt``.
+
+    Lines are ``key=value`` with blanks anywhere; ``cam0`` is a matrix as MATLAB writes it, ``baseline`` in millimetres,
+    the rest in pixels.
+
+    Raises:
+        ValueError: it is missing or damaged, or a key is missing or out of range.
+
+    """
+    if not path.is_file():
+        raise ValueError(f"{path}: expected a calibration, there is none")
+    lines = read_limited(path).decode("utf-8", "replace").splitlines()
+    entries = {key.strip(): value.strip() for key, equals, value in (line.partition("=") for line in lines) if equals}
+    matrix = _MATRIX.fullmatch(entries.get("cam0", ""))
+    if matrix is None:
+        raise ValueError(f"{path}: cam0: expected [f 0 cx; 0 f cy; 0 0 1], got {entries.get('cam0', 'nothing'):.60}")
+    fx, cx, fy, cy = (_number(path, "cam0", text) for text in matrix.groups())
+    keys = ("doffs", "baseline", "width", "height")
+    doffs, baseline, width, height = (_number(path, key, entries.get(key, "nothing")) for key in keys)
+    try:
+        return Camera(int(width), int(height), fx, fy, cx, cy, baseline / 1000, doffs)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
+
+
+def _number(path: Path, key: str, text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = np.nan
+    if not np.isfinite(value) or (key in ("width", "height") and not value.is_integer()):
+        came = "".join(letter for letter in text if letter.isprintable())
+        raise ValueError(f"{path}: {key}: expected a number, got {came:.40}")
+    return value
+
+
+def _photo(path: Path, camera: Camera) -> Tensor:
+    rgb = read_picture(path)
+    expect_size(path, tuple(rgb.shape[1:]), (camera.height, camera.width))
+    return rgb
+
+
+def _depth(path: Path, disparity: np.ndarray, camera: Camera) -> Tensor:
+    """Return the depth of a disparity map, (1, H, W)."""
+    if np.isnan(disparity).all():
+        raise ValueError(f"{path}: expected at least one known disparity, all are unknown")
+    return from_range(torch.from_numpy(disparity)[None], camera, "disparity")
+
+
+def _camera_2006(files: Files, height: int, width: int) -> tuple[Camera, float]:
+    """Return the camera of 2005 and 2006 at a map's size, and levels per pixel."""
+    per_pixel = round(_FULL_HEIGHT / height)
+    if per_pixel not in (1, 2, 3):
+        raise ValueError(f"{files.disparity}: expected a height near {_FULL_HEIGHT}, a half or a third, got {height}")
+    shift = _ASSUMED_SHIFT
+    if files.shift is not None:
+        text = read_limited(files.shift).decode("utf-8", "replace").strip()
+        shift = _number(files.shift, "dmin", text)
+    focal = _FULL_FOCAL / per_pixel
+    centre = ((width - 1) / 2, (height - 1) / 2)
+    return Camera(width, height, focal, focal, *centre, _BASELINE, shift / per_pixel), per_pixel
+
+
+def _camera_2003(files: Files, height: int, width: int) -> tuple[Camera, float]:
+    return Camera(width, height, **_TEDDY), 4
+
+
+def _camera_2001(files: Files, height: int, width: int) -> tuple[Camera, float]:
+    return Camera(width, height, **{**_TEDDY, "cx": (width - 1) / 2, "cy": (height - 1) / 2}), 8
+
+
+_CAMERAS: Mapping[int, Callable[[Files, int, int], tuple[Camera, float]]] = MappingProxyType(
+    {2001: _camera_2001, 2003: _camera_2003, 2005: _camera_2006, 2006: _camera_2006}
+)
 
 
 def _names(folders: Sequence[str]) -> tuple[str, ...]:
@@ -29,6 +254,8 @@ SCENES = {
     2006: _names(catalogue.SCENES_2006),
 }
 TRAINING_2014 = _names(catalogue.TRAINING_2014)
+TRAINING = {2001: SCENES[2001], 2006: SCENES[2006], 2014: TRAINING_2014}
+"""Scenes to train on by year."""
 _WITHOUT_OFFSET = "depth is not metric: the disparity offset is left out, as in the paper"
 _FILES_2014 = ("im0.png", "calib.txt", "disp0.pfm", "disp0GT.pfm")
 
@@ -89,12 +316,45 @@ class MiddleburyLevels(PreparedDataset):
         fill: Sequence[str] = (),
         smooth: bool = True,
     ) -> None:
-        if year not in middlebury.YEARS:
-            raise ValueError(f"year: expected one of {', '.join(map(str, middlebury.YEARS))}, got {year}")
+        if year not in YEARS:
+            raise ValueError(f"year: expected one of {', '.join(map(str, YEARS))}, got {year}")
         name = f"middlebury{year}"
         found = records_levels(Path(root).expanduser(), name, year, smooth=smooth)
         preparation = Preparation(size, crop, fill=tuple(fill))
         super().__init__(name, root, found, SCENES[year], scenes, preparation)
+
+
+class MiddleburyTrain(PreparedDataset):
+    """Scenes of Middlebury 2001, 2006 and 2014 without the evaluation scenes.
+
+    Args:
+        root: directory of the folders ``middlebury2001``, ``middlebury2006`` and ``middlebury2014``.
+        scenes: names of the scenes to use; None for all of the years, ``found`` for all in ``root``.
+        size: largest length of the shorter side in pixels; None for the original size.
+        years: years to use.
+
+    Raises:
+        ValueError: a scene is not on disk, or a value is out of range.
+
+    """
+
+    evaluation = False
+
+    def __init__(
+        self, root: str, scenes: SceneSelection = None, size: int | None = 720, years: Sequence[int] = tuple(TRAINING)
+    ) -> None:
+        name, folder = "middlebury_train", Path(root).expanduser()
+        found: dict[str, SceneRecord] = {}
+        for year in years:
+            if year not in TRAINING:
+                raise ValueError(f"years: expected some of {', '.join(map(str, TRAINING))}, got {year}")
+            place = folder / f"middlebury{year}"
+            found |= records_2014(place, name) if year == 2014 else records_levels(place, name, year)
+        for scene in EVALUATION_2014:
+            found.pop(scene, None)
+        named = [scene for year in years for scene in TRAINING[year]]
+        preparation = Preparation(size, crop=None, enlarge=False)
+        super().__init__(name, root, found, named, scenes, preparation)
 
 
 def records_2014(folder: Path, dataset: str, without_offset: Collection[str] = ()) -> dict[str, SceneRecord]:
@@ -102,11 +362,11 @@ def records_2014(folder: Path, dataset: str, without_offset: Collection[str] = (
     return {
         name: SceneRecord(
             tuple(path for path in map(place.joinpath, _FILES_2014) if path.is_file()),
-            functools.partial(middlebury.load_2014, place, dataset, name, offset=name not in without_offset),
+            functools.partial(load_2014, place, dataset, name, offset=name not in without_offset),
             settings="without offset" if name in without_offset else "",
             note=_WITHOUT_OFFSET if name in without_offset else "",
         )
-        for name, place in middlebury.find_2014(folder).items()
+        for name, place in find_2014(folder).items()
     }
 
 
@@ -115,9 +375,9 @@ def records_levels(folder: Path, dataset: str, year: int, *, smooth: bool = True
     return {
         name: SceneRecord(
             tuple(path for path in (files.photo, files.disparity, files.shift, *files.measured.values()) if path),
-            functools.partial(middlebury.load_levels, files, dataset, name, year, smooth=smooth),
+            functools.partial(load_levels, files, dataset, name, year, smooth=smooth),
             settings="" if smooth else "terraces",
-            note=middlebury.shortcoming(files, year),
+            note=shortcoming(files, year),
         )
-        for name, files in middlebury.find_levels(folder).items()
+        for name, files in find_levels(folder).items()
     }

@@ -1,12 +1,170 @@
-"""``dataset=nyu``: indoor scenes of a Kinect, which the paper does not use."""
+"""``dataset=nyu``: indoor scenes of a Kinect, which the paper does not use.
+
+NYU Depth v2, the 1449 labelled frames.
+
+Silberman et al., "Indoor Segmentation and Support Inference from RGBD Images", ECCV 2012.
+
+``nyu_depth_v2_labeled.mat`` is a MATLAB 7.3 file, that is HDF5, which turns axes around: images (N, 3, 640, 480) uint8,
+depths and rawDepths (N, 640, 480) float32, orthogonal metres in the colour camera. rawDepths is the Kinect's depth, 0
+for a hole; depths was filled by the authors (colourisation after Levin et al.). One frame is read at a time.
+
+The camera is camera_params.m of the official toolbox, which counts pixels from 1. The toolbox cuts off the white border
+(get_projection_mask.m): rows 45 to 471, columns 41 to 601, counted from 1, which leaves 427 x 561.
+
+Guided depth super-resolution trains on the first 1000 frames and tests on the last 449 (Kim et al., "Deformable Kernel
+Networks for Joint Image Filtering", IJCV 2021), 640 x 480 pixels with the border and the filled depth. DCTNet (Zhao et
+al., CVPR 2022) has the latter as files, whose numbers count from 0:
+
+    DIR/RGB/1000.jpg   DIR/Depth/1000.npy         frame 1001, float32 metres, to frame 1449
+
+The first image of the test split in the repository of Kim et al. is 1000.jpg.
+"""
 
 from __future__ import annotations
 
+import contextlib
+import re
+from collections.abc import Iterator, Mapping
 from pathlib import Path
+from types import MappingProxyType
+from typing import Literal
+
+import h5py
+import numpy as np
+import torch
 
 from dsr.data.base import SceneSelection
-from dsr.data.formats import nyu
+from dsr.data.formats.files import read_map
+from dsr.data.formats.matlab import expect_own_values
+from dsr.data.formats.shared import expect_size, find_beside, in_natural_order, read_picture, to_depth
 from dsr.data.preparation.dataset import Preparation, PreparedDataset, SceneRecord, list_frames, make_records
+from dsr.geometry.camera import Camera
+from dsr.sample import Scene
+
+CAMERA = Camera(640, 480, 518.85790117450188, 519.46961112127485, 325.58244941119034 - 1, 253.73616633400465 - 1)
+BORDER = (44, 40, 427, 561)
+"""First row and column, from 0, height and width of the window that the projected depth covers."""
+Split = Literal["train", "test"]
+SPLITS = MappingProxyType({"train": range(1, 1001), "test": range(1001, 1450)})
+"""Numbers of the frames by what guided depth super-resolution uses them for."""
+_PHOTO = re.compile(r"(\d{1,4})\.jpg")
+_FRAME = MappingProxyType({
+    "images": ((3, 640, 480), np.dtype(np.uint8)),
+    "depths": ((640, 480), np.dtype(np.float32)),
+    "rawDepths": ((640, 480), np.dtype(np.float32)),
+})  # fmt: skip
+
+
+def find_frames(path: Path) -> dict[str, tuple[Path, int]]:
+    """Return the file and the frame's number, the first two arguments of :func:`load_frame`, by name "0001" to "1449".
+
+    Numbers count from 1, as in the official split of the frames.
+
+    Raises:
+        ValueError: the file is missing, damaged or another one.
+
+    """
+    with _opened(path) as arrays:
+        return {f"{number:04d}": (path, number) for number in range(1, len(arrays["images"]) + 1)}
+
+
+def load_frame(path: Path, number: int, dataset: str, name: str, *, filled: bool = False, crop: bool = True) -> Scene:
+    """Return one frame.
+
+    Args:
+        path: the labelled ``.mat`` file.
+        number: of the frame, from 1.
+        dataset: of the scene returned.
+        name: the same.
+        filled: take the authors' filled depth instead of the Kinect's with its holes.
+        crop: cut off the border, which leaves 427 x 561 pixels.
+
+    Raises:
+        ValueError: the file is missing, damaged or another one, or has no such frame.
+
+    """
+    key = "depths" if filled else "rawDepths"
+    with _opened(path) as arrays:
+        count = len(arrays["images"])
+        if not 1 <= number <= count:
+            raise ValueError(f"{path}: expected a frame from 1 to {count}, got {number}")
+        try:
+            pixels, metres = arrays["images"][number - 1], arrays[key][number - 1]
+        except OSError as error:  # a damaged block
+            raise ValueError(f"{path}: expected frame {number} of {key} and images, got a damaged file") from error
+    rgb = torch.from_numpy(pixels).permute(0, 2, 1).contiguous().float() / 255  # (3, 480, 640)
+    depth, camera = to_depth(path, metres.T), CAMERA
+    if crop:
+        top, left, height, width = BORDER
+        rgb, depth = (image[:, top : top + height, left : left + width] for image in (rgb, depth))
+        camera = camera.crop(*BORDER)
+    if not depth.isfinite().any():
+        raise ValueError(f"{path}: expected at least one known pixel in frame {number}, all are holes")
+    return Scene(dataset, name, rgb, camera, depth)
+
+
+def find_files(root: Path) -> dict[str, tuple[Path, Path]]:
+    """Return the photos and depths that lie in files of their own, arguments of :func:`load_files`, by name, in order.
+
+    Names are those of the frames in the labelled file: ``RGB/1000.jpg`` is "1001".
+
+    Raises:
+        ValueError: there is no such directory.
+
+    """
+    found: dict[str, tuple[Path, Path]] = {}
+    for _, number, (photo, depth) in find_beside(root, "RGB", _PHOTO, ("Depth/{}.npy",)):
+        found.setdefault(f"{int(number) + 1:04d}", (photo, depth))
+    return in_natural_order(found)
+
+
+def load_files(rgb_path: Path, depth_path: Path, dataset: str, name: str) -> Scene:
+    """Return one frame of files of their own, with its border and the filled depth.
+
+    Raises:
+        ValueError: a file is missing, damaged, or not of 640 x 480 pixels; the message names it.
+
+    """
+    size = (CAMERA.height, CAMERA.width)
+    rgb, depth = read_picture(rgb_path), to_depth(depth_path, read_map(depth_path))
+    expect_size(rgb_path, tuple(rgb.shape[1:]), size)
+    expect_size(depth_path, tuple(depth.shape[1:]), size)
+    return Scene(dataset, name, rgb, CAMERA, depth)
+
+
+@contextlib.contextmanager
+def _opened(path: Path) -> Iterator[Mapping[str, h5py.Dataset]]:
+    """Open the file and yield its arrays, checked to be as the module says."""
+    if not path.is_file():
+        raise ValueError(f"{path}: expected a MATLAB 7.3 file, there is none")
+    try:
+        file = h5py.File(path, "r")
+    except OSError as error:
+        size = path.stat().st_size
+        raise ValueError(f"{path}: expected a MATLAB 7.3 (HDF5) file, got {size} bytes damaged or foreign") from error
+    with file:
+        yield {key: _checked(path, file, key) for key in _FRAME}
+
+
+def _checked(path: Path, file: h5py.File, key: str) -> h5py.Dataset:
+    """Return one of the arrays, if it has the shape and type of its frames and as many as the others."""
+    shape, dtype = _FRAME[key]
+    try:
+        array = file.get(key)
+        came = (array.dtype, array.shape) if isinstance(array, h5py.Dataset) else None
+        count = file["images"].shape[:1]
+    except Exception as error:  # damaged inside: h5py raises KeyError, RuntimeError, OSError, ...
+        raise ValueError(f"{path}: expected the array {key}, got a damaged or foreign file") from error
+    if came is None:
+        raise ValueError(f"{path}: expected the array {key}, got none of that name")
+    try:
+        expect_own_values(array)
+    except ValueError as error:
+        raise ValueError(f"{path}: expected the array {key}, {error}") from error
+    if came != (dtype, (*count, *shape)):
+        sizes = ", ".join(map(str, shape))
+        raise ValueError(f"{path}: {key}: expected {dtype} (frames, {sizes}), got {came[0]} {came[1]}")
+    return array
 
 
 class NYU(PreparedDataset):
@@ -35,17 +193,17 @@ class NYU(PreparedDataset):
         size: int | None = 512,
         crop: float = 0.5,
         filled: bool = False,
-        split: nyu.Split | None = None,
+        split: Split | None = None,
     ) -> None:
         if split is None:
             found = _records(root, filled=filled)
             super().__init__("nyu", root, found, None, scenes, Preparation(size, crop))
             return
-        if split not in nyu.SPLITS:
-            raise ValueError(f"split: expected one of {', '.join(nyu.SPLITS)}, or null, got {split}")
-        named = [f"{number:04d}" for number in nyu.SPLITS[split]]
+        if split not in SPLITS:
+            raise ValueError(f"split: expected one of {', '.join(SPLITS)}, or null, got {split}")
+        named = [f"{number:04d}" for number in SPLITS[split]]
         found = _records(root, filled=True, crop=False) or make_records(
-            list_frames(nyu.find_files, root), nyu.load_files, "nyu"
+            list_frames(find_files, root), load_files, "nyu"
         )
         found = {name: found[name] for name in named if name in found}
         super().__init__("nyu", root, found, named, scenes, Preparation(None))
@@ -55,4 +213,4 @@ class NYU(PreparedDataset):
 def _records(root: str, **settings: bool) -> dict[str, SceneRecord]:
     """Return the records of the frames of the labelled file; none where there is no such file."""
     path = Path(root).expanduser() / "nyu_depth_v2_labeled.mat"
-    return make_records(nyu.find_frames(path) if path.is_file() else {}, nyu.load_frame, "nyu", **settings)
+    return make_records(find_frames(path) if path.is_file() else {}, load_frame, "nyu", **settings)

@@ -2,16 +2,98 @@
 
 ``rgbdd`` has the industrial sensor's depth to downsample, ``rgbdd_real`` that of a phone beside it, which
 ``downsampling=measured scale=native`` takes as the input, at a ratio of 2.667.
+
+He et al., "Towards Fast and Accurate Real-World Depth Super-Resolution: Benchmark Dataset and Baseline", CVPR 2021;
+github.com/lingzhi96/RGB-D-D-Dataset. As its owners hand it out:
+
+    portraits/portraits_test/ID/ID_RGB.jpg              the photo, 512 x 384
+    portraits/portraits_test/ID/ID_HR_gt.png            the industrial sensor's depth, 512 x 384, 16 bits, mm, filled
+    portraits/portraits_test/ID/ID_LR_fill_depth.png    the phone's depth, 192 x 144, mm, filled
+
+likewise ``plants`` and ``models``, and ``_train`` in place of ``_test``: 2215 to train on, 405 to test. The test images
+are also in circulation, with DCTNet (Zhao et al., CVPR 2022), as
+
+    DIR/RGB/ID_RGB.jpg   DIR/Depth/ID_HR_gt.png   DIR/DepthLR/ID_LR_fill_depth.png
+
+No camera is published; 60 degrees of horizontal view are assumed.
 """
 
 from __future__ import annotations
 
-from typing import ClassVar
+import re
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import ClassVar, Literal
 
 from dsr.data.base import SceneSelection
-from dsr.data.formats import rgbdd
-from dsr.data.formats.shared import NO_CAMERA, load_pair
+from dsr.data.formats.shared import (
+    NO_CAMERA,
+    expect_size,
+    find_beside,
+    in_natural_order,
+    load_pair,
+    read_millimetres,
+    walk,
+)
 from dsr.data.preparation.dataset import Preparation, PreparedDataset, add_note, list_frames, make_records
+from dsr.sample import Scene
+
+Split = Literal["test", "train"]
+COUNTS = {"test": 405, "train": 2215}
+"""Numbers of scenes."""
+RATIO = 8 / 3
+"""Of the photo's size and that of the phone's depth."""
+Files = tuple[Path, ...]
+_PHOTO = re.compile(r"(\d+)_RGB\.jpg")
+_PARTS = ("models", "plants", "portraits")
+_DEPTH, _MEASURED = "{0}_HR_gt.png", "{0}_LR_fill_depth.png"
+
+
+def find_frames(root: Path, split: Split | None = None, measured: bool = False) -> dict[str, Files]:
+    """Return photos, true depth and, if ``measured``, the phone's depth, by their number "20200509112638", in order.
+
+    Args:
+        root: directory of the data set, or one above it.
+        split: of the images, None for both; those in ``RGB`` and ``Depth`` are test images.
+        measured: whether to find only images that have the phone's depth.
+
+    Raises:
+        ValueError: there is no such directory.
+
+    """
+    found: dict[str, Files] = {}
+    for name, files in _find_owners_layout(root, split, measured=measured):
+        found.setdefault(name, files)
+    if split in (None, "test"):
+        others = (f"Depth/{_DEPTH}", f"DepthLR/{_MEASURED}")[: 2 if measured else 1]
+        for _, name, files in find_beside(root, "RGB", _PHOTO, others):
+            found.setdefault(name, files)
+    return in_natural_order(found)
+
+
+def load_measured_frame(rgb_path: Path, depth_path: Path, measured_path: Path, dataset: str, name: str) -> Scene:
+    """Return one image as :func:`~dsr.data.formats.shared.load_pair` does, with the phone's depth as the measured map.
+
+    Raises:
+        ValueError: a file is missing, damaged, or does not fit the others; the message names it.
+
+    """
+    scene, measured = load_pair(rgb_path, depth_path, dataset, name), read_millimetres(measured_path)
+    size = (round(scene.camera.height / RATIO), round(scene.camera.width / RATIO))
+    expect_size(measured_path, tuple(measured.shape[1:]), size)
+    return replace(scene, measured={scene.camera.width / size[1]: measured})
+
+
+def _find_owners_layout(root: Path, split: Split | None, *, measured: bool) -> Iterator[tuple[str, Files]]:
+    """Yield the number and the files of the images that have a folder each."""
+    names = ("{0}_RGB.jpg", _DEPTH, _MEASURED)[: 3 if measured else 2]
+    folders = [f"{part}_{each}" for part in _PARTS for each in COUNTS if split in (None, each)]
+    for folder, _, files in walk(root):
+        if folder.parent.name in folders:
+            wanted = [name.format(folder.name) for name in names]
+            if set(wanted) <= set(files):
+                yield folder.name, tuple(folder / name for name in wanted)
 
 
 class RGBDD(PreparedDataset):
@@ -32,11 +114,11 @@ class RGBDD(PreparedDataset):
     soft_edges: ClassVar[bool] = True
     """Pixels at depth steps are mixtures of both sides."""
 
-    def __init__(self, root: str, real: bool, split: rgbdd.Split = "test", scenes: SceneSelection = None) -> None:
-        if split not in rgbdd.COUNTS:
-            raise ValueError(f"split: expected one of {', '.join(rgbdd.COUNTS)}, got {split}")
-        name, load = ("rgbdd_real", rgbdd.load_measured_frame) if real else ("rgbdd", load_pair)
-        frames = list_frames(rgbdd.find_frames, root, split, real)
+    def __init__(self, root: str, real: bool, split: Split = "test", scenes: SceneSelection = None) -> None:
+        if split not in COUNTS:
+            raise ValueError(f"split: expected one of {', '.join(COUNTS)}, got {split}")
+        name, load = ("rgbdd_real", load_measured_frame) if real else ("rgbdd", load_pair)
+        frames = list_frames(find_frames, root, split, real)
         found = add_note(make_records(frames, load, name), NO_CAMERA)
-        super().__init__(name, root, found, None, scenes, Preparation(None), count=rgbdd.COUNTS[split])
+        super().__init__(name, root, found, None, scenes, Preparation(None), count=COUNTS[split])
         self.evaluation = split == "test"

@@ -2,15 +2,120 @@
 
 Hui et al. 2016 trained MSG on 58 images of MPI Sintel, and Voynov et al. 2019 MSG-V on patches of them. They do not say
 which. This data set has two or three frames of each sequence, 58 in all.
+
+MPI Sintel with depth (Butler et al., ECCV 2012, "A Naturalistic Open Source Movie for Optical Flow Evaluation").
+
+    ROOT/training/{clean,final}/SEQUENCE/frame_0001.png
+    ROOT/training/depth/SEQUENCE/frame_0001.dpt             orthogonal depth in metres
+    ROOT/training/camdata_left/SEQUENCE/frame_0001.cam      intrinsics, pixel centres at integers from 0, and pose
+
+Both binary files are little-endian and start with the number 202021.25 as a float32; then a .dpt has width and height
+(int32) and the depths row by row (float32), a .cam the 3 x 3 intrinsics and the 3 x 4 pose (float64).
 """
 
 from __future__ import annotations
 
+import struct
+from pathlib import Path
+from types import MappingProxyType
 from typing import Literal
 
+import numpy as np
+from torch import Tensor
+
 from dsr.data.base import SceneSelection
-from dsr.data.formats import sintel
+from dsr.data.formats.shared import expect_size, read_bytes, read_picture, to_camera, to_depth
 from dsr.data.preparation.dataset import Preparation, PreparedDataset, list_frames, make_records
+from dsr.geometry.camera import Camera
+from dsr.sample import Scene
+from dsr.utils.paths import natural_key
+
+SEQUENCES = MappingProxyType({
+    "alley_1": 50, "alley_2": 50, "ambush_2": 21, "ambush_4": 33, "ambush_5": 50, "ambush_6": 20, "ambush_7": 50,
+    "bamboo_1": 50, "bamboo_2": 50, "bandage_1": 50, "bandage_2": 50, "cave_2": 50, "cave_4": 50, "market_2": 50,
+    "market_5": 50, "market_6": 40, "mountain_1": 50, "shaman_2": 50, "shaman_3": 50, "sleeping_1": 50,
+    "sleeping_2": 50, "temple_2": 50, "temple_3": 50,
+})  # fmt: skip
+"""Frames of each training sequence, 1064 in all."""
+FARTHEST = 1000.0
+"""Largest depth in metres; the sky has a larger one."""
+_TAG = struct.pack("<f", 202021.25)
+_DPT_HEADER = struct.Struct("<4sii")
+_CAM_LENGTH = 4 + 8 * (9 + 12)
+
+
+def find_frames(root: Path, rendering: Literal["clean", "final"] = "final") -> dict[str, tuple[Path, Path, Path]]:
+    """Return colour, depth and camera files, the first three arguments of :func:`load_frame`, by name, in order.
+
+    A name is ``SEQUENCE/frame_NNNN``. ``root`` holds ``training``, or is it. A frame that lacks a file is left out.
+
+    Raises:
+        ValueError: there is no such directory.
+
+    """
+    if not root.is_dir():
+        raise ValueError(f"{root}: expected a directory, there is none")
+    base = root / "training" if (root / "training").is_dir() else root
+    found = {}
+    for depth in sorted((base / "depth").glob("*/frame_*.dpt"), key=natural_key):
+        place = Path(depth.parent.name, depth.stem)
+        rgb = (base / rendering / place).with_suffix(".png")
+        camera = (base / "camdata_left" / place).with_suffix(".cam")
+        if rgb.is_file() and camera.is_file():
+            found[place.as_posix()] = (rgb, depth, camera)
+    return found
+
+
+def read_depth(path: Path, farthest: float = FARTHEST) -> Tensor:
+    """Return a ``.dpt`` file, (1, H, W) float64 in metres, NaN where it is beyond ``farthest`` metres.
+
+    Raises:
+        ValueError: it is missing, damaged, of another length than its header says, or has negative values.
+
+    """
+    content = read_bytes(path, "a .dpt file")
+    if len(content) < _DPT_HEADER.size or not content.startswith(_TAG):
+        raise ValueError(f"{path}: expected a .dpt file (tag 202021.25), got {_opening(content)}")
+    _, width, height = _DPT_HEADER.unpack_from(content)
+    length = len(content) - _DPT_HEADER.size
+    if width < 1 or height < 1 or length != 4 * width * height:
+        raise ValueError(f"{path}: expected {height} x {width} float32 depths behind the header, got {length} bytes")
+    values = np.frombuffer(content, "<f4", offset=_DPT_HEADER.size).reshape(height, width)
+    return to_depth(path, values, farthest)
+
+
+def read_camera(path: Path, size: tuple[int, int]) -> Camera:
+    """Return the intrinsics of a ``.cam`` file for pictures of ``size`` = (height, width).
+
+    Raises:
+        ValueError: it is missing or damaged, or not the camera of such pictures.
+
+    """
+    content = read_bytes(path, "a .cam file")
+    if len(content) != _CAM_LENGTH or not content.startswith(_TAG):
+        raise ValueError(f"{path}: expected a .cam file (tag 202021.25, {_CAM_LENGTH} bytes), got {_opening(content)}")
+    return to_camera(path, np.frombuffer(content, "<f8", count=9, offset=4).reshape(3, 3), size)
+
+
+def load_frame(
+    rgb_path: Path, depth_path: Path, camera_path: Path, dataset: str, name: str, *, farthest: float = FARTHEST
+) -> Scene:
+    """Return one frame; depths beyond ``farthest`` metres are holes.
+
+    Raises:
+        ValueError: a file is missing, damaged, or does not fit the others; the message names it.
+
+    """
+    rgb, depth = read_picture(rgb_path), read_depth(depth_path, farthest)
+    size = (rgb.shape[1], rgb.shape[2])
+    expect_size(depth_path, tuple(depth.shape[1:]), size)
+    return Scene(dataset, name, rgb, read_camera(camera_path, size), depth)
+
+
+def _opening(content: bytes) -> str:
+    """Return a description of a file of another kind."""
+    return f"{len(content)} bytes that start with {content[:4]!r}"
+
 
 _SEQUENCES_WITH_THREE = 12
 """Number of sequences of which three frames are used, not two: 2 x 23 + 12 = 58."""
@@ -19,7 +124,7 @@ _SEQUENCES_WITH_THREE = 12
 def sintel_frames() -> tuple[str, ...]:
     """Return the 58 frames: those at a third and two thirds of each sequence, and the first of twelve sequences."""
     frames = []
-    for index, (sequence, length) in enumerate(sintel.SEQUENCES.items()):
+    for index, (sequence, length) in enumerate(SEQUENCES.items()):
         numbers = [1] if index < _SEQUENCES_WITH_THREE else []
         frames += [f"{sequence}_frame_{number:04d}" for number in (*numbers, length // 3, 2 * length // 3)]
     return tuple(frames)
@@ -48,9 +153,9 @@ class Sintel(PreparedDataset):
         scenes: SceneSelection = None,
         size: int | None = None,
         rendering: Literal["clean", "final"] = "clean",
-        farthest: float = sintel.FARTHEST,
+        farthest: float = FARTHEST,
     ) -> None:
-        frames = list_frames(sintel.find_frames, root, rendering)
-        found = make_records(frames, sintel.load_frame, "sintel", farthest=farthest)
+        frames = list_frames(find_frames, root, rendering)
+        found = make_records(frames, load_frame, "sintel", farthest=farthest)
         preparation = Preparation(size, crop=None, enlarge=False)
         super().__init__("sintel", root, found, sintel_frames(), scenes, preparation)

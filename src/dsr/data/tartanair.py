@@ -1,10 +1,101 @@
-"""``dataset=tartanair``: rendered outdoor and indoor scenes, which the paper does not use."""
+"""``dataset=tartanair``: rendered outdoor and indoor scenes, which the paper does not use.
+
+TartanAir: rendered flights (Wang et al., IROS 2020, "TartanAir: A Dataset to Push the Limits of Visual SLAM").
+
+    DIR/image_left/000000_left.png, DIR/depth_left/000000_left_depth.npy
+
+or both files in one folder. Pictures are 640 x 480; depth is orthogonal, float32 in metres, and goes up to thousands of
+metres in the sky. The camera is the same throughout: f = 320, centre (320, 240) in pixels, taken as it is published.
+"""
 
 from __future__ import annotations
 
+import re
+from pathlib import Path
+
+import numpy as np
+from torch import Tensor
+
 from dsr.data.base import SceneSelection
-from dsr.data.formats import tartanair
+from dsr.data.formats.files import read_map
+from dsr.data.formats.shared import expect_size, name_of, read_picture, to_depth, walk
 from dsr.data.preparation.dataset import Preparation, PreparedDataset, list_frames, make_records
+from dsr.geometry.camera import Camera
+from dsr.sample import Scene
+from dsr.utils.limits import opened
+
+CAMERA = Camera(640, 480, 320.0, 320.0, 320.0, 240.0)
+FARTHEST = 1000.0
+"""Largest depth in metres; the sky has a larger one."""
+_SIZE = (480, 640)
+_COLOUR = re.compile(r"(\d{1,9})_left\.png")
+
+
+def find_frames(root: Path) -> dict[str, tuple[Path, Path]]:
+    """Return colour and depth files, the first two arguments of :func:`load_frame`, by name, in order.
+
+    A name is the frame's folder below ``root``, without ``image_left``, and its number as the files have it, such as
+    ``office/Easy/P000/000000``. A frame that lacks one of its two files is left out.
+
+    Raises:
+        ValueError: there is no such directory.
+
+    """
+    found = {}
+    for folder, below, files in walk(root):
+        below[:] = [name for name in below if name != "depth_left"]
+        apart = folder.name == "image_left" and folder != root
+        place = folder.parent if apart else folder
+        depths = place / "depth_left" if apart else folder
+        there = {path.name for path in depths.glob("*_left_depth.npy")}
+        for match in filter(None, map(_COLOUR.fullmatch, files)):
+            depth = f"{match[1]}_left_depth.npy"
+            if depth in there:
+                found[name_of(root, place, match[1])] = (folder / match[0], depths / depth)
+    return found
+
+
+def read_depth(path: Path, farthest: float = FARTHEST) -> Tensor:
+    """Return a depth file, (1, 480, 640) float64 in metres, NaN where it is beyond ``farthest`` metres.
+
+    Raises:
+        ValueError: it is missing, damaged, of another size or type, or has negative values.
+
+    """
+    if not path.is_file():
+        raise ValueError(f"{path}: expected a NumPy array, there is none")
+    shape, dtype, length = _header(path)
+    if (shape, dtype) != (_SIZE, np.dtype("<f4")) or length != 4 * _SIZE[0] * _SIZE[1]:
+        raise ValueError(f"{path}: expected 480 x 640 float32, got {length} bytes that say {dtype} of shape {shape}")
+    with np.errstate(invalid="ignore"):  # as in to_depth
+        values = read_map(path)
+    return to_depth(path, values, farthest)
+
+
+def load_frame(rgb_path: Path, depth_path: Path, dataset: str, name: str, *, farthest: float = FARTHEST) -> Scene:
+    """Return one frame at 640 x 480; depths beyond ``farthest`` metres are holes.
+
+    Raises:
+        ValueError: a file is missing, damaged or of another size; the message names it.
+
+    """
+    rgb = read_picture(rgb_path)
+    expect_size(rgb_path, tuple(rgb.shape[1:]), _SIZE)
+    return Scene(dataset, name, rgb, CAMERA, read_depth(depth_path, farthest))
+
+
+def _header(path: Path) -> tuple[tuple[int, ...], np.dtype, int]:
+    """Return the shape and the type in the header of a .npy file, and the number of bytes behind it."""
+    with opened(path) as file:
+        try:
+            version = np.lib.format.read_magic(file)
+            read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+            shape, _, dtype = read(file)
+        except Exception as error:  # a damaged header makes NumPy raise ValueError, TokenError, SyntaxError, ...
+            raise ValueError(
+                f"{path}: expected a NumPy array, got {path.stat().st_size} bytes of another kind"
+            ) from error
+        return shape, dtype, path.stat().st_size - file.tell()
 
 
 class TartanAir(PreparedDataset):
@@ -28,8 +119,8 @@ class TartanAir(PreparedDataset):
         scenes: SceneSelection = None,
         size: int | None = 512,
         crop: float = 0.5,
-        farthest: float = tartanair.FARTHEST,
+        farthest: float = FARTHEST,
     ) -> None:
-        frames = list_frames(tartanair.find_frames, root)
-        found = make_records(frames, tartanair.load_frame, "tartanair", farthest=farthest)
+        frames = list_frames(find_frames, root)
+        found = make_records(frames, load_frame, "tartanair", farthest=farthest)
         super().__init__("tartanair", root, found, None, scenes, Preparation(size, crop))

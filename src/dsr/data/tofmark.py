@@ -5,15 +5,256 @@ Voynov et al. 2019 use Books, Devil and Shark with the maps of the real sensor a
 The benchmark's files hold no camera. It was estimated from the scene Books that the paper's authors published with a
 camera and metric depth: 72 of 100 correspondences between the two photos fit one pose and one camera of square pixels
 without distortion, with a root mean square error of 0.95 pixels.
+
+ToFMark: a time-of-flight camera beside an intensity camera (Ferstl et al., ICCV 2013).
+
+"Image Guided Depth Upsampling using Anisotropic Total Generalized Variation". Books, Devil and Shark, 610 x 810:
+
+    benchmarking_dataset_NAME.mat     intensity, true depth, and the sensor's samples projected into the intensity image
+    NAME.bmp, NAME_depth.bmp          intensity and samples in 8 bits; 0 = no sample, which 97.5 % of the pixels are
+
+No names of variables are published for the ``.mat`` files, so variables are recognised by their names and sizes, or
+named by the caller. Depths are orthogonal, in millimetres where their median exceeds 50, else in metres.
+
+In ``*_depth.bmp`` 255 is the farthest sample: the wall behind the objects is bright, and along Books the levels go with
+metric depth z of the same scene (correlation 0.97; -0.96 with 1/z; linear in z, median residual 16 mm, against 30 mm if
+linear in 1/z). What depth a level stands for is lost, and no file holds a camera: both are the caller's to give.
 """
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
 
 from dsr.data.base import SceneSelection
-from dsr.data.formats import tofmark
+from dsr.data.formats.files import read_levels
+from dsr.data.formats.matlab import read_variables
+from dsr.data.formats.shared import expect_size, given_camera, in_natural_order, name_of, read_picture, to_depth, walk
 from dsr.data.preparation.dataset import Preparation, PreparedDataset, add_note, list_frames, make_records
+from dsr.sample import Scene
+
+FACTORS = (4, 8)
+"""Of the measured maps: about 40 % of the 4 x 4 blocks have a sample, and nearly all of 8 x 8."""
+_MILLIMETRES = 50.0
+_SMALLEST = 16
+_SPARSE = 0.2
+_ROLES: Mapping[str, tuple[str, ...]] = {
+    "intensity": ("intensity", "gr[ae]y", "rgb|colou?r", "im(g|age)?$", "^i$"),
+    "depth": ("truth|gt", "hr|highres", "depth"),
+    "samples": ("tof", "sparse|projected", "lr|mr|lowres", "depth"),
+}
+"""What the names of variables hold, in small letters and digits alone, by what they are; the first counts most."""
+_OTHERS = {
+    "intensity": re.compile("weight|mask|conf|amplitude|depth|tof|disp"),
+    "depth": re.compile("weight|mask|conf|amplitude"),
+    "samples": re.compile("weight|mask|conf|amplitude"),
+}
+
+
+def find_frames(root: Path) -> dict[str, tuple[Path, Path | None]]:
+    """Return the first two arguments of :func:`load_frame` by name ("books"), in order: a .mat file, else the pictures.
+
+    Raises:
+        ValueError: there is no such directory.
+
+    """
+    found: dict[str, tuple[Path, Path | None]] = {}
+    for folder, _, files in walk(root):
+        for file in files:
+            depth = re.fullmatch(r"(.+)_depth\.bmp", file)
+            if depth and f"{depth[1]}.bmp" in files:
+                found.setdefault(name_of(root, folder, depth[1]), (folder / f"{depth[1]}.bmp", folder / file))
+            elif matrix := re.fullmatch(r"benchmarking_dataset_(.+)\.mat", file):
+                found[name_of(root, folder, matrix[1])] = (folder / file, None)
+    return in_natural_order(found)
+
+
+def load_frame(
+    path: Path,
+    samples_path: Path | None,
+    dataset: str,
+    name: str,
+    *,
+    intrinsics: tuple[float, float, float, float] | None = None,
+    depth_range: tuple[float, float] | None = None,
+    variables: Mapping[str, str] | None = None,
+    factors: Sequence[int] = FACTORS,
+) -> Scene:
+    """Return one scene, with the samples as measured low-resolution maps; of pictures the true depth is not known.
+
+    Args:
+        path: the ``.mat`` file, or the intensity picture.
+        samples_path: ``*_depth.bmp``; None with a ``.mat`` file.
+        dataset: of the scene returned.
+        name: the same.
+        intrinsics: (fx, fy, cx, cy) in pixels, pixel centres at integers; needed, as the files hold none.
+        depth_range: metres of level 1 and of level 255 of ``samples_path``, which needs it.
+        variables: names in the ``.mat`` file of "intensity", "depth" and "samples"; the others are found.
+        factors: of the measured maps.
+
+    Raises:
+        ValueError: an argument that the files need is missing, or a file is missing, damaged, or does not fit.
+
+    """
+    if intrinsics is None:
+        raise ValueError(
+            f"{path}: expected intrinsics=(fx, fy, cx, cy) beside it, as the benchmark's files hold no camera"
+        )
+    depth = None
+    if samples_path is None:
+        rgb, depth, samples = read_matrices(path, variables)
+    else:
+        rgb = read_picture(path)
+        samples = _metres(samples_path, *read_samples(samples_path), depth_range)
+        expect_size(samples_path, tuple(samples.shape[1:]), tuple(rgb.shape[1:]))
+    camera = given_camera(intrinsics, (rgb.shape[1], rgb.shape[2]))
+    measured: dict[float, Tensor] = {}
+    if samples is not None:
+        measured = {factor: block_means(samples, factor) for factor in factors}
+    return Scene(dataset, name, rgb, camera, depth, measured)
+
+
+def read_samples(path: Path) -> tuple[Tensor, Tensor]:
+    """Return the levels of a ``*_depth.bmp`` over 255, (1, H, W) float64 in [0, 1], and where there is a sample, bool.
+
+    Raises:
+        ValueError: it is missing, damaged, not of 8 bits, or without a sample.
+
+    """
+    levels = torch.from_numpy(read_levels(path))[None]
+    if not levels.any():
+        raise ValueError(f"{path}: expected at least one sample, all pixels are 0")
+    return levels.double() / 255, levels > 0
+
+
+def read_matrices(
+    path: Path, variables: Mapping[str, str] | None = None
+) -> tuple[Tensor, Tensor | None, Tensor | None]:
+    """Return what a ``.mat`` file holds: the picture, the true depth and the samples.
+
+    Args:
+        path: the file, of MATLAB 5 or 7.3.
+        variables: names of variables, a field of a structure as "structure.field", by "intensity", "depth", "samples".
+
+    Returns:
+        (3, H, W) float32 in [0, 1], and (1, H, W) float64 in metres, NaN in holes, for depth and samples, None for what
+        there is not.
+
+    Raises:
+        ValueError: the file is missing or damaged, or its variables are not told; the message lists them.
+
+    """
+    found = read_variables(path)
+    chosen = dict(variables or {})
+    for role, name in chosen.items():
+        if role not in _ROLES:
+            raise ValueError(f"variables: expected {', '.join(_ROLES)}, got {role}")
+        if name not in found:
+            raise ValueError(f"{path}: expected the variable {name}, got {_listed(found)}")
+    for role in _ROLES:
+        told = chosen.get(role) or _told(path, role, found, chosen)
+        if told is not None:
+            chosen[role] = told
+    if "intensity" not in chosen or len(chosen) == 1:
+        raise ValueError(f"{path}: expected an intensity image and depth or samples of its size, got {_listed(found)}")
+    rgb = _picture(path, chosen["intensity"], found[chosen["intensity"]])
+    maps = {role: _depth(path, chosen[role], found, rgb) for role in ("depth", "samples") if role in chosen}
+    return rgb, maps.get("depth"), maps.get("samples")
+
+
+def block_means(depth: Tensor, factor: int) -> Tensor:
+    """Return the mean of the known depths in each ``factor`` x ``factor`` block, taken of 1/z, as depth.
+
+    Args:
+        depth: (1, H, W) metres, NaN where there is no sample.
+        factor: rows and columns of a block; those beyond the last whole block are left out.
+
+    Returns:
+        (1, H // factor, W // factor) metres, NaN where a block has no sample.
+
+    Raises:
+        ValueError: the factor is not positive, or larger than the map.
+
+    """
+    if not 1 <= factor <= min(depth.shape[1:]):
+        raise ValueError(f"factors: expected from 1 to {min(depth.shape[1:])}, got {factor}")
+    height, width = depth.shape[1] // factor, depth.shape[2] // factor
+    inverse = depth[:, : height * factor, : width * factor].reciprocal().reshape(1, height, factor, width, factor)
+    return inverse.nanmean(dim=(2, 4)).reciprocal()
+
+
+def _metres(path: Path, values: Tensor, known: Tensor, depth_range: tuple[float, float] | None) -> Tensor:
+    """Return the depth of levels over 255, NaN where there is no sample."""
+    if depth_range is None:
+        raise ValueError(
+            f"{path}: expected depth_range=(metres of 1, metres of 255), as 8 bits have lost the metric scale"
+        )
+    near, far = depth_range
+    if not 0 < near < far < np.inf:
+        raise ValueError(f"depth_range: expected 0 < metres of 1 < metres of 255, got {near:g} and {far:g}")
+    return torch.where(known, near + (values * 255 - 1) / 254 * (far - near), torch.nan)
+
+
+def _told(path: Path, role: str, found: Mapping[str, np.ndarray], chosen: Mapping[str, str]) -> str | None:
+    """Return the variable that fits a role by its size and best by its name; None where none fits."""
+    size = found[chosen["intensity"]].shape[:2] if "intensity" in chosen else None
+    names = {name: re.sub(r"[^a-z0-9]", "", name.rpartition(".")[2].lower()) for name in found}
+    fitting = [
+        name
+        for name, array in found.items()
+        if name not in chosen.values() and not _OTHERS[role].search(names[name]) and _fits(role, array, size)
+    ]
+    fitting.sort(key=lambda name: -found[name].size)
+    for words in _ROLES[role]:
+        for name in fitting:
+            if re.search(words, names[name]):
+                return name
+    if len(fitting) > 1 and role != "intensity":
+        raise ValueError(f"{path}: expected one variable for {role}, which is not told among {', '.join(fitting)}")
+    return fitting[0] if fitting and role != "intensity" else None
+
+
+def _fits(role: str, array: np.ndarray, size: tuple[int, ...] | None) -> bool:
+    """Return whether an array may be what a role asks for beside an intensity image of a size."""
+    if role == "intensity":
+        return min(array.shape[:2]) >= _SMALLEST and (array.ndim == 2 or array.shape[2:] == (3,))
+    return array.shape == size and ((array > 0).mean() < _SPARSE) == (role == "samples")
+
+
+def _picture(path: Path, name: str, array: np.ndarray) -> Tensor:
+    """Return an intensity or colour image, (3, H, W) in [0, 1]; floats beyond 1 count up to 255."""
+    if array.ndim not in (2, 3) or (array.ndim == 3 and array.shape[2] != 3):
+        raise ValueError(f"{path}: {name}: expected an image, got shape {array.shape}")
+    top = np.iinfo(array.dtype).max if array.dtype.kind in "iu" else 255.0 if array.max(initial=0) > 1 else 1.0
+    with np.errstate(over="ignore"):  # what is too large is no image
+        values = np.atleast_3d(array).astype(np.float32) / top
+    if not ((values >= 0) & (values <= 1)).all():
+        raise ValueError(
+            f"{path}: {name}: expected an image from 0 to 1 or 255, got {array.min():g} to {array.max():g}"
+        )
+    return torch.from_numpy(values).permute(2, 0, 1).expand(3, -1, -1).contiguous()
+
+
+def _depth(path: Path, name: str, found: Mapping[str, np.ndarray], rgb: Tensor) -> Tensor:
+    """Return a map in metres, (1, H, W)."""
+    array = found[name]
+    if array.shape != tuple(rgb.shape[1:]):
+        raise ValueError(f"{path}: {name}: expected shape {tuple(rgb.shape[1:])} like the image's, got {array.shape}")
+    values = np.where(np.isfinite(array), array, 0.0)
+    known = values[values > 0]
+    unit = 1e-3 if known.size and np.median(known) > _MILLIMETRES else 1.0
+    return to_depth(path, values * unit)
+
+
+def _listed(found: Mapping[str, np.ndarray]) -> str:
+    """Return variables and their shapes in one line."""
+    return ", ".join(f"{name} {' x '.join(map(str, array.shape))}" for name, array in found.items()) or "no matrix"
+
 
 SCENES = ("books", "devil", "shark")
 ESTIMATED = (549.2, 549.2, 375.2, 334.3)
@@ -51,7 +292,7 @@ class ToFMark(PreparedDataset):
             "depth_range": depth_range and tuple(depth_range),
             "variables": variables and dict(variables),
         }
-        found = make_records(list_frames(tofmark.find_frames, root), tofmark.load_frame, "tofmark", **settings)
+        found = make_records(list_frames(find_frames, root), load_frame, "tofmark", **settings)
         if intrinsics is None:
             found = add_note(found, "the benchmark has no camera: it is an estimate")
         super().__init__("tofmark", root, found, SCENES, scenes, Preparation(None))

@@ -16,15 +16,15 @@ import numpy as np
 
 from dsr.data.formats.decoding import quiet_decoders
 from dsr.data.formats.files import expect_depth_values, read_array
-from dsr.data.formats.icl_nuim import CAMERA as ICL_CAMERA
 from dsr.data.formats.shared import read_numbers
+from dsr.data.icl import CAMERA as ICL_CAMERA
 from dsr.utils.files import array_headers, read_arrays, replacing
 from dsr.utils.limits import MOST_PIXELS, bytes_of_archive, expect_bytes, expect_pixels
 
 DEPTH_SUFFIXES = (".png", ".tiff", ".tif", ".npy", ".npz", ".pfm", ".exr")
 """Of the formats that are read and written."""
 ICL_SUFFIX = ".depth"
-"""Of ICL-NUIM's text, distances along the rays in centimetres, :mod:`dsr.data.formats.icl_nuim`."""
+"""Of ICL-NUIM's text, distances along the rays in centimetres, :mod:`dsr.data.icl`."""
 READ_SUFFIXES = (*DEPTH_SUFFIXES, ICL_SUFFIX)
 _STORABLE = {
     ".png": ("uint16",),

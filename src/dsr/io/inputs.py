@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from dsr.data.formats.files import CameraFile, read_mask
-from dsr.data.formats.icl_nuim import CAMERA as ICL_CAMERA
+from dsr.data.icl import CAMERA as ICL_CAMERA
 from dsr.geometry.camera import Camera, RangeType
 from dsr.io.cameras import camera_only, find_camera, scale_to_photo
 from dsr.io.confidence import SLACK
