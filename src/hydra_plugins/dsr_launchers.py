@@ -1,11 +1,7 @@
-"""Where Hydra looks for launchers: those of :mod:`dsr.app.launchers`."""
+"""Where Hydra looks for launchers: that of :mod:`dsr.app.slurm`."""
 
-from dsr.app.launchers import ray_cluster, slurm
+from dsr.app import slurm
 
 
 class SlurmLauncher(slurm.SlurmLauncher):
     """See ``conf/hydra/launcher/slurm.yaml``."""
-
-
-class RayLauncher(ray_cluster.RayLauncher):
-    """See ``conf/hydra/launcher/ray.yaml``."""

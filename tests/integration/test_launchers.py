@@ -12,8 +12,8 @@ from pathlib import Path
 
 import pytest
 
+from dsr.app import slurm
 from dsr.app.entry import run_command
-from dsr.app.launchers import slurm
 from dsr.utils import interruption
 from dsr.utils.builder import ConfigError
 
@@ -208,65 +208,3 @@ def test_jobs_of_joblib_have_a_gpu_each_and_share_them_evenly(sweep, monkeypatch
     code, lines = sweep(on_a_gpu, range(4), "hydra/launcher=gpus", "hydra.launcher.n_jobs=4")
     assert (code, lines) == (0, []), lines
     assert sorted((tmp_path / f"gpu-{seed}").read_text() for seed in range(4)) == ["4", "4", "GPU-7a", "GPU-7a"]
-
-
-RAY = """
-import os, signal, sys, threading, time
-from pathlib import Path
-from ray.cluster_utils import Cluster
-from dsr.app.entry import run_command
-from dsr.utils.builder import ConfigError
-
-def job(config):
-    place = Path(f"begun-{config.seed}")
-    with place.open("a") as file:
-        file.write(os.environ["RAY_NODE"] + "\\n")
-    first = len(place.read_text().splitlines()) == 1
-    if config.seed == 1:
-        raise ConfigError("seed: not this one")
-    if config.seed == 2 or (config.seed == 3 and first):
-        os.kill(os.getpid(), signal.SIGKILL)
-    if os.environ["RAY_NODE"] == "second" and first:
-        Path("on-second").touch()
-        time.sleep(60)
-    while config.seed == 0 and not Path("on-second").exists():
-        time.sleep(0.05)  # so that a job that lasts gets to the second node
-    return 0.0
-
-cluster = Cluster()
-os.environ["RAY_NODE"] = "head"
-cluster.add_node(num_cpus=1, include_dashboard=False)
-os.environ["RAY_NODE"] = "second"
-second = cluster.add_node(num_cpus=1)
-
-def lose_node():
-    while not Path("on-second").exists():
-        time.sleep(0.05)
-    cluster.remove_node(second, allow_graceful=False)
-
-threading.Thread(target=lose_node, daemon=True).start()
-os.environ["RAY_ADDRESS"] = cluster.address
-try:
-    run_command("eval", job, ["-m", "seed=0,1,2,3,4", "hydra/launcher=ray", "hydra.launcher.num_cpus=1",
-                              "hydra.launcher.max_retries=1"])
-finally:
-    cluster.shutdown()
-"""
-
-
-@needs("ray")
-def test_jobs_of_ray_go_on_when_a_process_and_a_node_are_lost(tmp_path):
-    (tmp_path / "sweep.py").write_text(RAY)
-    environment = {**os.environ, "PYTHONPATH": str(REPOSITORY / "src"), "RAY_ENABLE_UV_RUN_RUNTIME_ENV": "0"}
-    done = subprocess.run(
-        [sys.executable, "sweep.py"], cwd=tmp_path, env=environment, capture_output=True, text=True, check=False,
-        timeout=100,
-    )  # fmt: skip
-    assert done.returncode == 2, done.stderr
-    told = done.stderr.splitlines()
-    at = told.index("error: 2 of 5 jobs failed")
-    assert told[at + 1] == "error: seed=1: seed: not this one"
-    assert told[at + 2].startswith("error: seed=2: WorkerCrashedError: ")
-    begun = {seed: (tmp_path / f"begun-{seed}").read_text().split() for seed in range(5)}
-    assert [begun[seed] for seed in (0, 4)].count(["second", "head"]) == 1
-    assert len(begun[2]) == len(begun[3]) == 2

@@ -3,17 +3,14 @@
 import importlib.util
 import os
 import signal
-import socket
 import stat
 from types import SimpleNamespace
 
 import pytest
 
-from dsr.app import gpus
-from dsr.app.launchers import ray_cluster, slurm
-from dsr.app.launchers.ray_cluster import RaySettings
-from dsr.app.launchers.slurm import SlurmSettings
+from dsr.app import gpus, slurm
 from dsr.app.multirun import LAUNCHERS, expect_launcher
+from dsr.app.slurm import SlurmSettings
 from dsr.utils import interruption
 from dsr.utils.builder import ConfigError
 
@@ -22,7 +19,6 @@ SLURM = {
     "tasks_per_node": 1, "cpus_per_task": 8, "mem_gb": 32, "timeout_min": 240, "signal_delay_s": 120,
     "max_num_timeout": 20, "array_parallelism": 16,
 }  # fmt: skip
-RAY = {"address": None, "num_cpus": 2, "num_gpus": None, "memory_gb": None, "max_retries": 3}
 
 
 @pytest.mark.parametrize("name", sorted(LAUNCHERS.keys() - {"basic"}))
@@ -37,64 +33,19 @@ def test_launcher_that_is_not_installed_names_the_extra(monkeypatch, name):
 
 
 @pytest.mark.parametrize(
-    ("settings", "values", "key", "value"),
+    ("values", "key", "value"),
     [
-        (SlurmSettings, SLURM, "timeout_min", 0),
-        (SlurmSettings, SLURM, "gpus_per_node", -1),
-        (SlurmSettings, SLURM, "tasks_per_node", 0),
-        (SlurmSettings, SLURM | {"cluster": "local"}, "tasks_per_node", 2),
-        (SlurmSettings, SLURM, "max_num_timeout", -1),
-        (RaySettings, RAY, "num_cpus", -1),
-        (RaySettings, RAY, "max_retries", -2),
+        (SLURM, "timeout_min", 0),
+        (SLURM, "gpus_per_node", -1),
+        (SLURM, "tasks_per_node", 0),
+        (SLURM | {"cluster": "local"}, "tasks_per_node", 2),
+        (SLURM, "max_num_timeout", -1),
     ],
 )
-def test_setting_out_of_range_is_refused_by_name(settings, values, key, value):
-    settings(**values)
+def test_setting_out_of_range_is_refused_by_name(values, key, value):
+    SlurmSettings(**values)
     with pytest.raises(ConfigError, match=rf"^hydra\.launcher\.{key}: expected .*, got {value}$"):
-        settings(**{**values, key: value})
-
-
-class Ray:
-    """What the launcher asks of Ray to connect."""
-
-    def __init__(self):
-        self.asked = []
-
-    def init(self, *, address, **_):
-        self.asked.append(address)
-
-
-def listening():
-    """Return a socket that other processes can connect to, and its address."""
-    server = socket.create_server(("127.0.0.1", 0))
-    return server, f"127.0.0.1:{server.getsockname()[1]}"
-
-
-@pytest.mark.parametrize(
-    ("given", "variable", "key"),
-    [("{}", None, "hydra.launcher.address"), ("ray://{}", "auto", "hydra.launcher.address"),
-     (None, "{}", r"\$RAY_ADDRESS")],
-)  # fmt: skip
-def test_ray_cluster_that_does_not_answer_is_named_at_once(monkeypatch, given, variable, key):
-    server, place = listening()
-    address = given and given.format(place)
-    if variable:
-        monkeypatch.setenv("RAY_ADDRESS", variable.format(place))
-    settings, ray = RaySettings(**{**RAY, "address": address}), Ray()
-    with server:
-        ray_cluster._connect(ray, settings)
-    assert ray.asked == [address]
-    with pytest.raises(ConfigError, match=rf"^{key}: no Ray cluster at {address or place}: .*refused"):
-        ray_cluster._connect(ray, settings)
-    assert len(ray.asked) == 1
-
-
-@pytest.mark.parametrize("address", [None, "auto", "local"])
-def test_ray_finds_clusters_without_an_address_itself(monkeypatch, address):
-    monkeypatch.delenv("RAY_ADDRESS", raising=False)
-    ray = Ray()
-    ray_cluster._connect(ray, RaySettings(**{**RAY, "address": address}))
-    assert ray.asked == [address]
+        SlurmSettings(**{**values, key: value})
 
 
 @pytest.fixture
@@ -143,7 +94,7 @@ def test_slurm_job_has_ended_only_after_several_answers_in_a_row(squeue, monkeyp
 
 def test_reason_that_jobs_are_pending_is_told_once(squeue, monkeypatch, caplog):
     monkeypatch.setattr(slurm, "_ASK", (0.0, 0.0))
-    caplog.set_level("INFO", "dsr.app.launchers.slurm")
+    caplog.set_level("INFO", "dsr.app.slurm")
     waiting = slurm._Waiting("slurm")
     jobs = [SimpleNamespace(job_id=f"7_{number}") for number in range(3)]
     for reasons in (("None",) * 3, ("Resources", "Resources", "JobArrayTaskLimit"), ("Resources", "PartitionConfig")):

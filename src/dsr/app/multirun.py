@@ -28,7 +28,6 @@ LAUNCHERS = {
     "basic": "hydra",
     "gpus": "hydra_plugins.hydra_joblib_launcher",
     "joblib": "hydra_plugins.hydra_joblib_launcher",
-    "ray": "ray",
     "slurm": "submitit",
     "submitit_local": "hydra_plugins.hydra_submitit_launcher",
     "submitit_slurm": "hydra_plugins.hydra_submitit_launcher",

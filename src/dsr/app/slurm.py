@@ -1,23 +1,34 @@
-"""Sweeps as job arrays of Slurm, through submitit."""
+"""Sweeps as job arrays of Slurm, through submitit; ``conf/hydra/launcher/slurm.yaml`` has the settings.
+
+Unlike hydra-submitit-launcher this waits for every job, also when one is killed or its node is lost, and each job has a
+device of its own.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import io
 import logging
+import os
 import shutil
 import subprocess
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Generator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from hydra.core.utils import JobReturn
+from hydra.core.hydra_config import HydraConfig
+from hydra.core.singleton import Singleton
+from hydra.core.utils import JobReturn, JobStatus, configure_log, filter_overrides, run_job, setup_globals
+from hydra.plugins.launcher import Launcher
+from hydra.types import HydraContext, TaskFunction
+from omegaconf import DictConfig, OmegaConf, open_dict
 
-from dsr.app.launchers.jobs import Ended, Job, JobsLauncher
-from dsr.utils.builder import ConfigError
-from dsr.utils.console import one_line
+from dsr.app.multirun import JobResult
+from dsr.utils import interruption
+from dsr.utils.builder import ConfigError, check_types
+from dsr.utils.console import ConsoleProgress, one_line, open_console
 
 _log = logging.getLogger(__name__)
 _NAME = "slurm"
@@ -73,42 +84,135 @@ class SlurmSettings:
 
 
 @dataclass(frozen=True)
-class _Resumable:
-    """A job that submitit may requeue: it finds what it has done in its run directory."""
+class Job:
+    """A job of a sweep, which is called in a process of its own, perhaps on another machine, perhaps more than once.
 
-    job: Job
+    Args:
+        context: Hydra's.
+        config: of the sweep.
+        function: to call with the job's configuration.
+        overrides: the job's.
+        number: the job's, from 0.
+        singletons: Hydra's state.
+        folder: the directory that relative paths start from, there as here.
+        environment: the user's variables that configurations may use.
+
+    """
+
+    context: HydraContext
+    config: DictConfig
+    function: TaskFunction
+    overrides: tuple[str, ...]
+    number: int
+    singletons: Mapping[Any, Any]
+    folder: str
+    environment: Mapping[str, str]
+
+    @property
+    def name(self) -> str:
+        """Its overrides."""
+        return " ".join(filter_overrides(self.overrides))
 
     def __call__(self) -> JobReturn:
-        return self.job()
+        """Run the job; what it raises is returned, too."""
+        os.chdir(self.folder)
+        os.environ.update(self.environment)
+        Singleton.set_state(dict(self.singletons))
+        setup_globals()
+        config = self.context.config_loader.load_sweep_config(self.config, list(self.overrides))
+        with open_dict(config):
+            config.hydra.job.num, config.hydra.job.id = self.number, f"{config.hydra.job.name}_{self.number}"
+        HydraConfig.instance().set_config(config)
+        return run_job(
+            hydra_context=self.context,
+            task_function=self.function,
+            config=config,
+            job_dir_key="hydra.sweep.dir",
+            job_subdir_key="hydra.sweep.subdir",
+        )
 
     def checkpoint(self) -> Any:
-        """Return what is run instead when the job is requeued: the same."""
+        """Return what submitit runs instead when the job is requeued: the same, which finds what it has done."""
         from submitit.helpers import DelayedSubmission  # noqa: PLC0415 - plugins have to be importable without
 
         return DelayedSubmission(self)
 
+    def ended(self, problem: str) -> JobReturn:
+        """Return what becomes of a job that ended without a result, and why."""
+        return JobReturn(overrides=self.overrides, status=JobStatus.COMPLETED, _return_value=JobResult.failed(problem))
 
-class SlurmLauncher(JobsLauncher):
-    """Submits the jobs of a sweep as an array, waits for them, and takes them back if it is interrupted."""
+
+class SlurmLauncher(Launcher):
+    """Submits the jobs of a sweep as an array, waits for them, and takes them back if it is interrupted.
+
+    Args:
+        **values: of :class:`SlurmSettings`, as configured.
+
+    """
 
     def __init__(self, **values: Any) -> None:
-        super().__init__(SlurmSettings, values)
+        self._values: dict[str, Any] = {
+            key: OmegaConf.to_container(value, resolve=True) if OmegaConf.is_config(value) else value
+            for key, value in values.items()
+        }
+        self._set_up: tuple[HydraContext, TaskFunction, DictConfig] | None = None
 
-    def _run(self, jobs: Sequence[Job], settings: SlurmSettings, folder: Path) -> Ended:
-        submitted = dict(zip((job.number for job in jobs), _submit(jobs, settings, folder), strict=True))
-        _log.info(f"Output of the jobs: {folder / '.submitit'}")
-        waiting, by_number = _Waiting(settings.cluster), {job.number: job for job in jobs}
-        try:
-            while submitted:
-                states = waiting.states(list(submitted.values()))
-                for number, handle in list(submitted.items()):
-                    result = _result(by_number[number], handle, states.get(handle.job_id))
-                    if result is not None:
-                        del submitted[number]
-                        yield number, result
-                time.sleep(_LOOK if submitted else 0)
-        finally:
-            _stop(list(submitted.values()), settings.cluster)
+    def setup(self, *, hydra_context: HydraContext, task_function: TaskFunction, config: DictConfig) -> None:
+        """Keep what the jobs need."""
+        self._set_up = hydra_context, task_function, config
+
+    def launch(self, job_overrides: Sequence[Sequence[str]], initial_job_idx: int) -> Sequence[JobReturn]:
+        """Run jobs, and wait for all of them.
+
+        Raises:
+            ConfigError: they cannot be run with these settings, or there is no Slurm.
+            KeyboardInterrupt: a signal came; jobs that are under way are stopped.
+
+        """
+        assert self._set_up is not None  # noqa: S101 - Hydra calls setup
+        context, function, config = self._set_up
+        setup_globals()
+        configure_log(config.hydra.hydra_logging, config.hydra.verbose)
+        check_types(SlurmSettings, self._values, "hydra.launcher.")
+        settings = SlurmSettings(**self._values)
+        folder = Path(str(config.hydra.sweep.dir))
+        folder.mkdir(parents=True, exist_ok=True)
+        environment = {name: value for name, value in os.environ.items() if name.startswith("DSR_")}
+        jobs = [
+            Job(context, config, function, tuple(overrides), number, Singleton.get_state(), os.getcwd(), environment)  # noqa: PTH109
+            for number, overrides in enumerate(job_overrides, initial_job_idx)
+        ]
+        for job in jobs:
+            _log.info(f"\t#{job.number} : {job.name}")
+        results: dict[int, JobReturn] = {}
+        progress = ConsoleProgress(open_console())
+        with (
+            interruption.working(),
+            progress.task("jobs", len(jobs)) as show,
+            contextlib.closing(_run(jobs, settings, folder.resolve())) as ended,
+        ):
+            for number, result in ended:
+                results[number] = result
+                show(len(results))
+        return [results[job.number] for job in jobs]
+
+
+def _run(jobs: Sequence[Job], settings: SlurmSettings, folder: Path) -> Generator[tuple[int, JobReturn], None, None]:
+    """Run jobs, and yield the number and the result of each, in any order; closed, stop those under way."""
+    submitted = dict(zip((job.number for job in jobs), _submit(jobs, settings, folder), strict=True))
+    _log.info(f"Output of the jobs: {folder / '.submitit'}")
+    waiting, by_number = _Waiting(settings.cluster), {job.number: job for job in jobs}
+    try:
+        while submitted:
+            states = waiting.states(list(submitted.values()))
+            for number, handle in list(submitted.items()):
+                result = _result(by_number[number], handle, states.get(handle.job_id))
+                if result is not None:
+                    del submitted[number]
+                    yield number, result
+            time.sleep(_LOOK if submitted else 0)
+    finally:
+        _stop(list(submitted.values()), settings.cluster)
 
 
 def _submit(jobs: Sequence[Job], settings: SlurmSettings, folder: Path) -> Sequence[Any]:
@@ -139,7 +243,7 @@ def _submit(jobs: Sequence[Job], settings: SlurmSettings, folder: Path) -> Seque
             slurm_additional_parameters=settings.additional_parameters,
         )
         with contextlib.redirect_stderr(io.StringIO()):  # sbatch's words come with its error
-            handles = executor.submit_array([_Resumable(job) for job in jobs])
+            handles = executor.submit_array(list(jobs))
             first = [handle.task(0) for handle in handles]  # of several processes of a job it has the result
     except (RuntimeError, OSError, subprocess.SubprocessError) as error:  # no Slurm, or sbatch refuses
         shutil.rmtree(place, ignore_errors=True)
