@@ -9,7 +9,7 @@ Frames are a photo of 640 x 480 and a noisy map of 160 x 120 in millimetres, ren
 a name of its own. One worker runs on one core, two on two, in turns, and the fastest round of each counts; what a sixth
 of the frames takes is taken off, for the time to start. Seconds of a core are those in which a process has one, so they
 depend less than those on the clock on what else runs. ``--profile`` says instead where one worker's time goes, and
-``--list`` how long it takes to list small files, to write a manifest of them for 16 shards and to read one shard of it.
+``--list`` how long it takes to list small files.
 """
 
 from __future__ import annotations
@@ -150,29 +150,16 @@ def profile(folder: Path, source: Path, given: list[str], frames: int) -> None:
 
 
 def measure_listing(folder: Path, count: int) -> None:
-    """Print the seconds to list frames, to write their manifest and to read a shard of it."""
+    """Print the seconds to list frames and to pair them."""
     from dsr.io.layouts import find_pairs_of_folder  # noqa: PLC0415
-    from dsr.io.manifest import Manifest, write_manifest  # noqa: PLC0415
-    from dsr.io.shards import Shard  # noqa: PLC0415
 
     for kind in ("rgb", "depth"):
         (folder / kind).mkdir()
         for number in range(count):
             (folder / kind / f"{number:07}.png").write_bytes(b"x")
-    times = {}
     started = time.perf_counter()
-    found = find_pairs_of_folder(folder)
-    times["list"] = time.perf_counter() - started
-    started = time.perf_counter()
-    write_manifest(folder / "manifest", found, 16)
-    times["write"] = time.perf_counter() - started
-    started = time.perf_counter()
-    Manifest(folder / "manifest").read(Shard(8, 16))
-    times["shard"] = time.perf_counter() - started
-    print(
-        f"{count} frames: {times['list']:.1f} s to list and to pair, {times['write']:.1f} s to write a manifest of "
-        f"{(folder / 'manifest').stat().st_size / 2**20:.0f} MiB, {times['shard']:.2f} s to read one of 16 shards"
-    )
+    find_pairs_of_folder(folder)
+    print(f"{count} frames: {time.perf_counter() - started:.1f} s to list and to pair")
 
 
 def main() -> None:

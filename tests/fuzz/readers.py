@@ -101,12 +101,6 @@ def _recording(*options: str) -> Callable[[Place], None]:
     return read
 
 
-def _manifest(place: Place) -> None:
-    """Read the frames of a manifest as a shard does, and all of them."""
-    for shard in (("--shard", "2/2"), ()):
-        command("upsample", "--manifest", place.input / "frames.jsonl", *shard, "-o", place.out, "--dry-run")
-
-
 def _confidences(place: Place) -> None:
     command("upsample", "--rgb", place.input / "rgb", "--depth", place.input / "depth", "--confidence",
             place.input / "conf", "--min-confidence", "0.5", "-o", place.out, "--dry-run")  # fmt: skip
@@ -304,7 +298,6 @@ READERS = (
                                                       "--confidence", "confidence.png", "--min-confidence", "0.5")),
     Reader("confidence", seeds.confidence_folder, _confidences),
     Reader("tum", seeds.tum, _recording()),
-    Reader("manifest", seeds.manifest, _manifest, 2),
     Reader("tum poses", seeds.tum, _sequence("groundtruth.txt")),
     Reader("kitti poses", seeds.poses_of_lines, _sequence("kitti.txt", "frames")),
     Reader("log poses", seeds.poses_of_lines, _sequence("trajectory.log", "frames")),

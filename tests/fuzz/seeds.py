@@ -119,16 +119,6 @@ def matrix_camera(folder: Path) -> None:
     captures.save(folder / "confidence.png", captures.levels())
 
 
-def manifest(folder: Path) -> None:
-    """Write a manifest of a sequence in TUM's layout and of a capture."""
-    from dsr.io.layouts import find_pairs_of_folder  # noqa: PLC0415 - only where it is needed
-    from dsr.io.manifest import write_manifest  # noqa: PLC0415
-
-    tum(folder / "tum")
-    captures.stray(folder / "stray", video=False)
-    write_manifest(folder / "frames.jsonl", find_pairs_of_folder(folder), 2)
-
-
 def tum(folder: Path) -> None:
     """Write a sequence in TUM's layout, with poses."""
     lines: dict[str, list[str]] = {"rgb": [], "depth": []}

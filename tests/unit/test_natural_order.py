@@ -14,7 +14,6 @@ from dsr.data import arkitscenes, ddrnet, diml, icl, rgbdd, sintel, sunrgbd, tar
 from dsr.data.folder import Folder
 from dsr.io.inputs import Reading, read_picture
 from dsr.io.layouts import find_pairs_of_folder
-from dsr.io.manifest import Manifest, write_manifest
 from dsr.io.poses import read_poses
 from dsr.utils.paths import natural_key
 
@@ -140,12 +139,6 @@ def test_scenes_of_dsr_and_folders_of_folders_are_in_order(folder):
     expected = [f"{number}" for number in range(FRAMES)]
     assert [pair.name for pair in find_pairs_of_folder(folder).pairs] == expected
     assert Folder(str(folder)).scenes() == expected
-
-
-def test_manifest_keeps_the_order_of_the_numbers(folder, tmp_path):
-    found = find_pairs_of_folder(pairs(folder, "plain", *PAIRS["two folders"]))
-    write_manifest(tmp_path / "frames.jsonl", found, 3)
-    assert [pair.name for pair in Manifest(tmp_path / "frames.jsonl")] == [f"{number}" for number in range(FRAMES)]
 
 
 def test_times_in_names_decide_rather_than_their_digits(folder):

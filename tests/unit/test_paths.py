@@ -12,7 +12,6 @@ from dsr.data.download.checksums import Checksums
 from dsr.evaluation.run_files import load_results
 from dsr.evaluation.store import iterations_path, prediction_path, sample_path
 from dsr.io.layouts import find_pairs_of_folder
-from dsr.io.manifest import write_manifest
 from dsr.sample import DepthSample
 from dsr.utils.paths import OutsideError, path_within
 
@@ -96,27 +95,6 @@ def test_lists_of_tum_name_no_pictures_outside(folder, tmp_path, capsys, kind, n
 def test_recording_that_is_a_link_is_read(folder, tmp_path):
     (tmp_path / "link").symlink_to(write_tum(folder))
     assert len(find_pairs_of_folder(tmp_path / "link").pairs) == 2
-
-
-@pytest.mark.parametrize("key", ["rgb", "depth", "camera", "mask", "confidence", "capture"])
-def test_manifest_has_absolute_paths_or_those_in_its_folder(folder, tmp_path, capsys, key):
-    found = find_pairs_of_folder(write_tum(folder))
-    path = tmp_path / "lists" / "frames.jsonl"
-    path.parent.mkdir()
-    write_manifest(path, found, 2)  # absolute, which are the user's own
-    arguments = ("upsample", "--manifest", path, "-o", tmp_path / "out", "--dry-run")
-    assert main([str(argument) for argument in arguments]) == 0
-    head, *lines = path.read_text().splitlines()
-    frame = json.loads(lines[3])
-    frame[key] = ["../private/x", 1] if key in ("confidence", "capture") else "../private/x"
-    lines[3], head = json.dumps(frame), json.loads(head)
-    for number, shard in enumerate(head["shards"]):
-        shard["bytes"] = sum(len(line) + 1 for line in lines[2 * number : 2 * number + 2])
-    path.write_text("\n".join((json.dumps(head), *lines)) + "\n")
-    capsys.readouterr()
-    for shard in ((), ("--shard", "2/2")):
-        told = refused(capsys, *arguments, *shard)
-        assert told.startswith(f"{path}: line 5: expected absolute paths, or those within {path.parent}, got")
 
 
 def test_recording_of_ros_takes_no_files_outside(folder, tmp_path, capsys):

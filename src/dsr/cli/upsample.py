@@ -67,10 +67,6 @@ def add(commands: Any) -> None:
         metavar="K/N",
         help="only the K-th of N blocks of the frames, for a task of an array; see docs/sequences.md",
     )
-    what.add_argument(
-        "--manifest", type=Path, metavar="FILE", help="list of frames instead of FOLDER; written if --shards is given"
-    )
-    what.add_argument("--shards", type=int, metavar="N", help="only list the frames for N shards in --manifest FILE")
     _add_reading(parser)
     _add_method(parser)
     _add_results(parser)
@@ -287,8 +283,6 @@ def _run(options: argparse.Namespace, console: Console, _: object) -> list[str]:
         max_faces=options.max_faces,
         max_points=options.max_points,
         shard=None if options.shard is None else parse_shard(options.shard),
-        manifest=options.manifest,
-        shards=options.shards,
         workers=options.workers,
         register=options.register,
         neighbours=options.neighbours,

@@ -16,7 +16,6 @@ from dsr.io.depth_files import DEPTH_SUFFIXES
 from dsr.io.encoding import Assumption
 from dsr.io.names import match_times, role_of, role_of_words, words_of
 from dsr.io.pairs import (
-    Origin,
     Pair,
     PairingResult,
     find_camera_file,
@@ -52,7 +51,7 @@ def find_pairs_of_folder(folder: Path, leave: Path | None = None) -> PairingResu
 
     """
     if folder.is_file():
-        single = find_pairs_at(folder)
+        single = _find_at(folder)
         return replace(single, pairs=make_names_unique(single.pairs))
     if not folder.is_dir():
         raise ValueError(f"{folder}: expected a folder of photos and depth maps, there is none")
@@ -65,7 +64,7 @@ def find_pairs_of_folder(folder: Path, leave: Path | None = None) -> PairingResu
 
 def _search(folder: Path, root: Path, leave: Path | None, depth: int) -> PairingResult:
     """Return the pairs in a folder or, if there are none, those in its subfolders."""
-    found = find_pairs_at(folder, root)
+    found = _find_at(folder, root)
     if found.pairs:
         return found
     deeper = [
@@ -83,20 +82,11 @@ def _search(folder: Path, root: Path, leave: Path | None, depth: int) -> Pairing
     return PairingResult(tuple(pairs), assumptions, unpaired)
 
 
-def find_pairs_at(place: Path, root: Path | None = None) -> PairingResult:
-    """Return the pairs of a capture or a folder, without those in subfolders of a folder that has none itself.
-
-    Args:
-        place: a folder, or a capture's file.
-        root: folder up to which a camera file is searched; None for the folder itself.
-
-    Raises:
-        ValueError: it is a file and no capture.
-
-    """
+def _find_at(place: Path, root: Path | None = None) -> PairingResult:
+    """Return the pairs of a capture or a folder, not of subfolders; camera files are searched up to a root."""
     capture = find_capture(place)
     if capture is not None and (capture.pairs or place.is_file()):
-        return _with_origin(place, capture)
+        return capture
     if place.is_file():
         raise ValueError(f"{place}: expected a folder, or a capture as {', '.join(CAPTURE_FILES)}")
     found = PairingResult(())
@@ -108,17 +98,7 @@ def find_pairs_at(place: Path, root: Path | None = None) -> PairingResult:
                 pairs = tuple(replace(pair, camera=pair.camera or camera) for pair in found.pairs)
                 found = replace(found, pairs=pairs)
             break
-    return _with_origin(place, found)
-
-
-def _with_origin(place: Path, found: PairingResult) -> PairingResult:
-    """Return pairs of which those of a capture know where they were found."""
-    if all(pair.capture is None for pair in found.pairs):
-        return found
-    pairs = tuple(
-        pair if pair.capture is None else replace(pair, origin=Origin(place, pair.name)) for pair in found.pairs
-    )
-    return replace(found, pairs=pairs)
+    return found
 
 
 def _scene(folder: Path) -> PairingResult:

@@ -7,7 +7,6 @@ from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import NamedTuple
 
 from dsr.io.confidence import CONFIDENCE_SUFFIXES, ConfidenceMap, find_highest
 from dsr.io.depth_files import READ_SUFFIXES
@@ -23,13 +22,6 @@ CAMERA_NAMES = (
 _SUFFIXES = frozenset((*PHOTO_SUFFIXES, *READ_SUFFIXES))
 
 
-class Origin(NamedTuple):
-    """Where a frame of a capture is found: the capture's folder or file, and the frame's name in it."""
-
-    place: Path
-    name: str
-
-
 @dataclass(frozen=True)
 class Pair:
     """Two files of one view.
@@ -42,7 +34,6 @@ class Pair:
         unit: metres per value if the layout defines it.
         factor: upsampling factor if the file's name has it, as in ``depth_lr4.npy``.
         capture: what the capture that the pair is of says about it; None if it is of none.
-        origin: where such a pair is found, and its name there; None if the files alone say everything.
         confidence: where its confidence map is; None for none.
 
     """
@@ -55,7 +46,6 @@ class Pair:
     unit: float | None = None
     factor: int | None = None
     capture: CaptureFrame | None = field(default=None, compare=False)
-    origin: Origin | None = field(default=None, compare=False)
     confidence: ConfidenceMap | None = field(default=None, compare=False)
 
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
-from itertools import chain
+import functools
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +13,7 @@ from dsr.io.depth_files import read_depth_file
 from dsr.io.encoding import Assumption, find_holes, guess_unit
 from dsr.io.pairs import Pair
 from dsr.utils.limits import pixels_beside
-from dsr.utils.paths import NaturalKey, natural_key
+from dsr.utils.paths import natural_key
 
 Kind = tuple[Path, str, str]
 """Folder, suffix and type of value: maps alike in them have one unit."""
@@ -25,14 +25,12 @@ class FolderUnits:
     The guess depends on the pairs alone, not on their order, nor on which of them were read or finished before.
 
     Args:
-        pairs: all pairs of the folder, which are iterated over if ``firsts`` do not decide.
-        firsts: the first pair by name of each folder and suffix.
+        pairs: all pairs of the folder.
 
     """
 
-    def __init__(self, pairs: Iterable[Pair] = (), firsts: Sequence[Pair] = ()) -> None:
-        self._all, self._firsts = pairs, firsts
-        self._pairs: list[Pair] | None = None
+    def __init__(self, pairs: Sequence[Pair] = ()) -> None:
+        self._pairs = pairs
         self._units: dict[Kind, tuple[float, list[Assumption]]] = {}
 
     def guess(
@@ -58,7 +56,7 @@ class FolderUnits:
 
     def _first(self, kind: Kind, hole_value: float | None) -> tuple[Path, np.ndarray, np.ndarray] | None:
         """Return the first map of a kind that has a known pixel, and its holes."""
-        for pair in chain(self._firsts, self._in_order()):
+        for pair in self._in_order:
             if (pair.depth.parent, pair.depth.suffix.lower()) != kind[:2]:
                 continue
             try:
@@ -70,16 +68,10 @@ class FolderUnits:
                 return pair.depth, stored, holes
         return None
 
-    def _in_order(self) -> Iterator[Pair]:
-        """Yield all pairs by name."""
-        if self._pairs is None:
-            self._pairs = sorted(self._all, key=order_of_maps)
-        yield from self._pairs
-
-
-def order_of_maps(pair: Pair) -> tuple[NaturalKey, NaturalKey]:
-    """Return the key by which the maps of a folder are looked at for their unit."""
-    return natural_key(pair.depth.name), natural_key(pair.name)
+    @functools.cached_property
+    def _in_order(self) -> list[Pair]:
+        """All pairs by name."""
+        return sorted(self._pairs, key=lambda pair: (natural_key(pair.depth.name), natural_key(pair.name)))
 
 
 def read_values_of(pair: Pair) -> np.ndarray:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import platform
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -48,15 +48,14 @@ class FrameWork:
     Args:
         request: the request.
         pairs: all of its pictures, also those of other shards, which determine units and neighbours.
-        firsts: the first ones by name of the folders, if known; see :class:`dsr.io.units.FolderUnits`.
 
     Raises:
         ValueError: the file of poses is damaged, or does not fit the pictures.
 
     """
 
-    def __init__(self, request: UpsampleRequest, pairs: Iterable[Pair], firsts: Sequence[Pair] = ()) -> None:
-        self._request, self._units = request, FolderUnits(pairs, firsts)
+    def __init__(self, request: UpsampleRequest, pairs: Sequence[Pair]) -> None:
+        self._request, self._units = request, FolderUnits(pairs)
         self._sequence = FrameSequence(pairs, self._read, request.neighbours, request.poses)
 
     def __call__(self, pair: Pair, target: Path, reporter: Messages, progress: Progress) -> str:

@@ -1,14 +1,12 @@
-"""The frames that ``dsr upsample`` works on: all, or a shard, from folders or from a manifest."""
+"""The frames that ``dsr upsample`` works on: all, or a shard."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from dsr.app.upsample.request import UpsampleRequest
 from dsr.io.layouts import find_pairs_of_folder
-from dsr.io.manifest import Manifest
 from dsr.io.names import in_order
 from dsr.io.pairs import Pair, PairingResult, add_confidence, find_pairs_of_lists
 
@@ -19,17 +17,13 @@ class Frames:
 
     Args:
         found: the frames to work on, and what is said about them.
-        whole: all frames that were found, to iterate over; poses, neighbours and units depend on them.
-        firsts: the first frames by name of the folders, if known: units depend on them.
-        total: number of all frames.
+        whole: all frames that were found; poses, neighbours and units depend on them.
         single: whether there is a single picture, whose results are in the output folder itself.
 
     """
 
     found: PairingResult
-    whole: Iterable[Pair]
-    firsts: tuple[Pair, ...]
-    total: int
+    whole: tuple[Pair, ...]
     single: bool
 
     def target(self, output: Path, pair: Pair) -> Path:
@@ -41,21 +35,19 @@ def find_frames(request: UpsampleRequest) -> Frames:
     """Return the frames of a request.
 
     Raises:
-        ValueError: there are none, or the manifest is damaged or of another number of shards.
+        ValueError: there are none.
 
     """
-    if request.manifest is not None and request.shards is None:
-        return _of_manifest(request, request.manifest)
     found = _search(request)
     if request.confidence:
         found = replace(found, pairs=add_confidence(found.pairs, request.confidence))
     if request.rgb:
         found = replace(found, pairs=_by_number(found.pairs))
-    total, whole = len(found.pairs), found.pairs
-    single = total == 1 and not request.folders and not request.rgb[0].is_dir()
+    whole = found.pairs
+    single = len(whole) == 1 and not request.folders and not request.rgb[0].is_dir()
     if request.shard is not None:
-        found = replace(found, pairs=tuple(whole[number] for number in request.shard.block(total)))
-    return Frames(found, whole, (), total, single)
+        found = replace(found, pairs=tuple(whole[number] for number in request.shard.block(len(whole))))
+    return Frames(found, whole, single)
 
 
 def _by_number(pairs: tuple[Pair, ...]) -> tuple[Pair, ...]:
@@ -65,16 +57,6 @@ def _by_number(pairs: tuple[Pair, ...]) -> tuple[Pair, ...]:
         return pairs
     ranks = {photo: rank for rank, photo in enumerate(in_order(photos))}
     return tuple(sorted(pairs, key=lambda pair: ranks[pair.rgb]))
-
-
-def _of_manifest(request: UpsampleRequest, path: Path) -> Frames:
-    """Return the frames in a manifest."""
-    manifest = Manifest(path)
-    if request.shard is None:
-        pairs = tuple(manifest)
-        return Frames(PairingResult(pairs, manifest.assumptions), pairs, (), len(pairs), single=False)
-    pairs, firsts = manifest.read(request.shard)
-    return Frames(PairingResult(pairs, manifest.assumptions), manifest, firsts, manifest.frames, single=False)
 
 
 def _search(request: UpsampleRequest) -> PairingResult:

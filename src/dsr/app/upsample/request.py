@@ -43,8 +43,6 @@ class UpsampleRequest:
         max_points: points from which a cloud is thinned.
         depth_format: the result's format; None for the input's.
         shard: the block of the frames to work on; None for all.
-        manifest: file with the frames, read, or written if ``shards`` is given.
-        shards: number of shards for which the manifest is written, and nothing else done.
         workers: number of processes that work at a time.
         register: whether to move each depth map to the photo's edges.
         neighbours: number of frames beside itself that vote on each frame's depth.
@@ -76,8 +74,6 @@ class UpsampleRequest:
     max_points: int = MOST_POINTS
     depth_format: str | None = None
     shard: Shard | None = None
-    manifest: Path | None = None
-    shards: int | None = None
     workers: int = 1
     register: bool = False
     neighbours: int = 0
@@ -100,9 +96,7 @@ class UpsampleRequest:
                 raise ValueError(f"--only, --with, --without: expected some of {known}, got {part!r}")
         if not self.parts:
             raise ValueError("--only, --without: expected something to be left to write, got nothing")
-        self._check_shards()
-        listed = self.manifest is not None and self.shards is None
-        if not listed and (bool(self.folders) == bool(self.rgb or self.depth) or bool(self.rgb) != bool(self.depth)):
+        if bool(self.folders) == bool(self.rgb or self.depth) or bool(self.rgb) != bool(self.depth):
             raise ValueError("expected --rgb and --depth, or folders that hold both")
         if self.folders and self.mask:
             raise ValueError("--mask: expected --rgb and --depth with it, got folders")
@@ -133,16 +127,6 @@ class UpsampleRequest:
         """Parts of each frame; those of all frames are made of its depth and ``rgbd``."""
         needed = ("depth", "rgbd") if self.scene_parts else ()
         return tuple(dict.fromkeys((*(part for part in self.parts if part not in SCENE_PARTS), *needed)))
-
-    def _check_shards(self) -> None:
-        """Check what is said about shards and their manifest."""
-        if self.shards is not None:
-            if self.shards < 1:
-                raise ValueError(f"--shards: expected 1 or more, got {self.shards}")
-            if self.manifest is None or self.shard is not None:
-                raise ValueError("--shards: expected --manifest FILE, which is written for so many, and no --shard")
-        elif self.manifest is not None and (self.folders or self.rgb or self.depth or self.mask or self.confidence):
-            raise ValueError("--manifest: expected --shards N to write it, or no other files to read it")
 
     def _check_frames(self) -> None:
         """Check what is said about a sequence."""

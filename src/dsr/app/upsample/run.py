@@ -14,7 +14,6 @@ from dsr.app.upsample.reporting import Reporter, listed
 from dsr.app.upsample.request import UpsampleRequest
 from dsr.app.upsample.scene import write_scene
 from dsr.app.upsample.workers import work_through
-from dsr.io.manifest import write_manifest
 from dsr.io.shards import Shard
 from dsr.utils.console import ConsoleProgress, show
 from dsr.utils.files import write_text
@@ -35,9 +34,6 @@ def run(request: UpsampleRequest, console: Console) -> list[str]:
 
     """
     frames = find_frames(request)
-    if request.shards is not None and request.manifest is not None:
-        _write_manifest(request, request.manifest, frames, console)
-        return []
     started = time.perf_counter()
     found, single = frames.found, frames.single
     _show_found(console, request, frames)
@@ -70,21 +66,6 @@ def run(request: UpsampleRequest, console: Console) -> list[str]:
     return lines + scene_problems
 
 
-def _write_manifest(request: UpsampleRequest, path: Path, frames: Frames, console: Console) -> None:
-    """Write a manifest."""
-    count = request.shards or 1
-    if frames.single:
-        raise ValueError("--manifest: expected several frames, got a single photo")
-    if path.exists() and not request.overwrite:
-        raise ValueError(f"{path}: is there already, and shards may depend on it; --overwrite replaces it")
-    for line in _described(frames):
-        show(console, line)
-    if not request.dry_run:
-        write_manifest(path, frames.found, count)
-        shards = "1 shard" if count == 1 else f"{count} shards"
-        show(console, f"{frames.total} frames for {shards} -> {path}")
-
-
 def _write_summary(
     output: Path, shard: Shard, outcomes: Counter[str], problems: dict[str, list[str]], seconds: float
 ) -> None:
@@ -95,28 +76,20 @@ def _write_summary(
 
 
 def _show_found(console: Console, request: UpsampleRequest, frames: Frames) -> None:
-    """Show how many pairs there are, and which of them a shard works on."""
-    lines = _described(frames)
-    if request.shard is not None:
-        block = request.shard.block(frames.total)
-        which = f"frames {block.start + 1} to {block.stop}" if block else "no frame"
-        lines.append(f"shard {request.shard}: {which} of {frames.total}")
-        if request.scene_parts:
-            lines.append(f"  {', '.join(request.scene_parts)}: of all frames, by the same command without --shard")
-    for line in lines:
-        show(console, line)
-
-
-def _described(frames: Frames) -> list[str]:
-    """Return what was found, and which files have no partner, as lines."""
-    found = frames.found
-    named = frames.total == 1 and len(found.pairs) == 1
-    lines = [
-        f"{found.pairs[0].rgb} and {found.pairs[0].depth}" if named else f"{frames.total} pairs of photo and depth map"
-    ]
+    """Show what was found, which files have no partner, and which frames a shard works on."""
+    found, total = frames.found, len(frames.whole)
+    named = total == 1 and len(found.pairs) == 1
+    lines = [f"{found.pairs[0].rgb} and {found.pairs[0].depth}" if named else f"{total} pairs of photo and depth map"]
     lines += [f"  {fact}" for fact in found.assumptions]
     if found.unpaired:
         lines.append(
             f"  {len(found.unpaired)} without a partner, left out: {listed([path.name for path in found.unpaired])}"
         )
-    return lines
+    if request.shard is not None:
+        block = request.shard.block(total)
+        which = f"frames {block.start + 1} to {block.stop}" if block else "no frame"
+        lines.append(f"shard {request.shard}: {which} of {total}")
+        if request.scene_parts:
+            lines.append(f"  {', '.join(request.scene_parts)}: of all frames, by the same command without --shard")
+    for line in lines:
+        show(console, line)

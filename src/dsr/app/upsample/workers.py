@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -54,13 +54,13 @@ def work_through(request: UpsampleRequest, frames: Frames, reporter: Reporter, p
     jobs = [(pair, frames.target(request.output, pair)) for pair in frames.found.pairs]
     workers = min(request.workers, len(jobs))
     if workers <= 1:
-        work = FrameWork(request, frames.whole, frames.firsts)
+        work = FrameWork(request, frames.whole)
         for pair, target in progress.track(jobs, "upsample", label=lambda job: job[0].name, lines=False):
             yield attempt(work, pair, target, reporter, progress)
         return
-    FrameWork(request, frames.whole, frames.firsts)  # raises for poses that do not fit
+    FrameWork(request, frames.whole)  # raises for poses that do not fit
     cores = max(1, (os.cpu_count() or 1) // workers)
-    prepare = (request, frames.whole, frames.firsts, cores)
+    prepare = (request, frames.whole, cores)
     with Pool(
         workers, _remote, _lost, progress.say, start="spawn", prepare=_begin, arguments=prepare, label=_name_of
     ) as pool:
@@ -70,12 +70,12 @@ def work_through(request: UpsampleRequest, frames: Frames, reporter: Reporter, p
             yield done
 
 
-def _begin(request: UpsampleRequest, pairs: Iterable[Pair], firsts: Sequence[Pair], cores: int) -> None:
+def _begin(request: UpsampleRequest, pairs: Sequence[Pair], cores: int) -> None:
     """Prepare a worker."""
     global _work  # noqa: PLW0603 - the process's own
     torch.set_num_threads(cores)
     cv2.setNumThreads(cores)
-    _work = FrameWork(request, pairs, firsts)
+    _work = FrameWork(request, pairs)
 
 
 def _remote(job: _Job) -> tuple[Done, Record]:
