@@ -133,9 +133,8 @@ def digest(path: Path) -> str | None:
         with np.load(path) as arrays:
             content = arrays["depth"].tobytes()
     elif path.suffix == ".npz" and path.parent.name == "scenes":
-        with np.load(path) as arrays:  # older versions stored float32, and the low-resolution map as "coarse"
-            lr = arrays["depth_lr" if "depth_lr" in arrays.files else "coarse"].astype(np.float32)
-            content = arrays["depth"].astype(np.float32).tobytes() + arrays["rgb"].tobytes() + lr.tobytes()
+        with np.load(path) as arrays:
+            content = b"".join(arrays[name].tobytes() for name in ("depth", "rgb", "depth_lr"))
     elif path.name == "weights.safetensors":
         content = b"".join(key.encode() + value.tobytes() for key, value in sorted(load_file(path).items()))
     elif path.name == "info.json":

@@ -214,9 +214,6 @@ class DepthSample:
     def load(cls, path: Path) -> Self:
         """Return the sample that :meth:`save` wrote.
 
-        Files of earlier versions have an 8-bit photo, float32 depth, ``depth_lr`` under the name ``coarse``, and no
-        unit, which means centimetres.
-
         Raises:
             ValueError: the file is missing, damaged or something else.
 
@@ -224,18 +221,17 @@ class DepthSample:
         try:
             arrays = read_arrays(path)
             about: dict[str, Any] = parse_json(str(arrays["about"]))
-            depth_lr = arrays["depth_lr"] if "depth_lr" in arrays else arrays["coarse"]
             return cls(
                 str(about["dataset"]),
                 str(about["name"]),
-                torch.from_numpy(_unpack(arrays["rgb"], about.get("rgb", "float32"))).permute(2, 0, 1).contiguous(),
-                torch.from_numpy(depth_lr)[None],
+                torch.from_numpy(_unpack(arrays["rgb"], about["rgb"])).permute(2, 0, 1).contiguous(),
+                torch.from_numpy(arrays["depth_lr"])[None],
                 Camera(**about["camera"]),
                 Camera(**about["camera_lr"]),
                 float(about["scale"]),
                 torch.from_numpy(arrays["depth"])[None] if "depth" in arrays else None,
                 tuple(about["notes"]),
-                _read_unit(about),
+                _read_unit(about["unit"]),
             )
         except FileNotFoundError:
             raise ValueError(f"{path}: expected the sample of a scene, there is none") from None
@@ -272,12 +268,10 @@ def slope(size: int) -> Scene:
     return Scene("example", "slope", torch.full((3, size, size), 0.5), camera, depth)
 
 
-def _read_unit(about: Mapping[str, Any]) -> Unit:
+def _read_unit(entries: Mapping[str, Any]) -> Unit:
     """Return the unit of a sample's description."""
-    if "unit" not in about:
-        return CENTIMETRES
-    limits = about["unit"]["limits"]
-    return Unit(**{**about["unit"], "limits": None if limits is None else tuple(limits)})
+    limits = entries["limits"]
+    return Unit(**{**entries, "limits": None if limits is None else tuple(limits)})
 
 
 _BITS = {"uint8": 255, "uint16": 65535}

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import json
 import math
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -215,20 +214,6 @@ def test_sample_is_read_with_the_same_bits(tmp_path: Path, dtype: torch.dtype, l
 def test_sample_without_truth_is_read_without_truth(tmp_path: Path) -> None:
     _sample(depth=None).save(tmp_path / "hall.npz")
     assert DepthSample.load(tmp_path / "hall.npz").depth is None
-
-
-def test_sample_of_an_earlier_version_is_read(tmp_path: Path) -> None:
-    about = {
-        "dataset": "set", "name": "hall", "scale": 2, "notes": [],
-        "camera": asdict(CAMERA), "camera_lr": asdict(CAMERA.rescale(4, 2)),
-    }  # fmt: skip
-    rgb = np.arange(96, dtype=np.uint8).reshape(4, 8, 3)
-    coarse = np.full((2, 4), 2, np.float32)
-    np.savez(tmp_path / "hall.npz", about=json.dumps(about), rgb=rgb, coarse=coarse)
-    read = DepthSample.load(tmp_path / "hall.npz")
-    torch.testing.assert_close(read.rgb, torch.from_numpy(rgb).permute(2, 0, 1) / 255, rtol=0, atol=0)
-    assert (read.scene, read.depth_lr.dtype, read.depth_lr.shape) == ("hall", torch.float32, (1, 2, 4))
-    assert read.unit == CENTIMETRES
 
 
 def test_unit_of_a_sample_is_read(tmp_path: Path) -> None:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import copy
 import sys
-from pathlib import Path
 
 import pytest
 import yaml
@@ -13,13 +13,19 @@ from dsr.app.trust import Trust, _targets_in, expect_trusted
 from dsr.utils.builder import ConfigError, load_target
 from dsr.utils.config_files import config_directories
 
-EARLIER = Path(__file__).resolve().parents[1] / "golden" / "earlier_runs" / "train"
-CONFIG = yaml.safe_load((EARLIER / "config.yaml").read_text())
+CONFIG = {
+    "model": {"name": "msg_v", "label": "MSG-V", "target": "dsr.methods.networks.msg_net.MSGNet"},
+    "dataset": {"name": "procedural", "target": "dsr.data.procedural.Procedural", "count": 6, "size": 64},
+    "downsampling": {"name": "box", "target": "dsr.degradation.downsampling.Downsampling", "kernel": "box"},
+    "noise": {"name": "none", "target": "dsr.degradation.noise.no_noise"},
+    "scale": 4,
+    "seed": 0,
+}
 
 
 def write(folder, text=None, **changes):
     """Make the directory of a training with some keys changed, by their dotted paths."""
-    config = yaml.safe_load((EARLIER / "config.yaml").read_text())
+    config = copy.deepcopy(CONFIG)
     for path, value in changes.items():
         *above, last = path.split("__")
         node = config

@@ -12,7 +12,6 @@ from typing import Any
 import torch
 from omegaconf import OmegaConf
 
-from dsr.app.moved_targets import update_targets
 from dsr.app.run_names import NOT_IDENTITY, run_name
 from dsr.utils.builder import ConfigError, expand_home, takes
 from dsr.utils.console import shorten
@@ -73,7 +72,7 @@ def _hash_of(identity: Mapping[str, Any]) -> str:
 
 def _identity_in(folder: Path) -> dict[str, Any]:
     """Return the identity of the run in a directory; an OSError, ValueError, KeyError or TypeError if there is none."""
-    return update_targets(dict(parse_json(read_limited(folder / _RECORD), finite=False)["identity"]))
+    return dict(parse_json(read_limited(folder / _RECORD), finite=False)["identity"])
 
 
 def _may_hold(folder: Path, identity: Mapping[str, Any]) -> bool:

@@ -7,7 +7,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, get_type_hints
 
-from dsr.app.moved_targets import update_logger, update_targets
 from dsr.app.schema import RunConfig, TrainConfig, TrainerConfig, user_directories
 from dsr.app.trust import Trust, expect_trusted, read_plain_yaml
 from dsr.data.base import SceneSource, SceneSubset
@@ -25,7 +24,7 @@ _NOT_WITH_RUN = ("method", "scale", "weights")
 
 
 def read_config(folder: Path, trust: Any = None) -> dict[str, Any]:
-    """Read the configuration of a training, with the current paths of its targets.
+    """Read the configuration of a training.
 
     Args:
         folder: the run's directory, which may come from somebody else.
@@ -41,8 +40,6 @@ def read_config(folder: Path, trust: Any = None) -> dict[str, Any]:
     config = read_plain_yaml(path)
     if "model" not in config:
         raise ConfigError(f"{folder}: expected the directory of a training, its config.yaml names no model")
-    config = {key: update_targets(value) for key, value in config.items()}
-    config["logger"] = update_logger(config.get("logger", {}))
     _check_types(path, config)
     expect_trusted(path, config, Trust.of(trust, user_directories()))
     return config

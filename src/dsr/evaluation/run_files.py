@@ -127,7 +127,7 @@ def read_run(folder: Path) -> Run:
     names += [(f"{folder / _SCORES}: line {row + 2}", scene) for row, scene in first.items()]
     for source, scene in names:
         expect_scene(folder, scene, source)
-    label = summary.label or versions.identity.method.get("label") or summary.method
+    label = summary.label or summary.method
     dataset = str(scores["dataset"].iloc[0]) if len(scores) else summary.dataset
     scenes = tuple(scene for scene in summary.seconds if prediction_path(folder, scene).is_file())
     scores = scores[scores["scene"].isin(scenes)]
@@ -145,7 +145,7 @@ def read_run(folder: Path) -> Run:
 
 
 class _Summary(BaseModel, strict=True, allow_inf_nan=False):
-    """The content of ``summary.json``; runs of earlier versions lack the keys with defaults."""
+    """The content of ``summary.json``."""
 
     dataset: str
     scale: Annotated[Number, Field(ge=1, le=_LARGEST_SCALE)]

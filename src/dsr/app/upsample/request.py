@@ -171,15 +171,10 @@ class UpsampleRequest:
             raise ValueError(option if key in self.settings else str(error)) from error
 
 
-_NEW: Mapping[str, Any] = {"min_confidence": None, "turned_bits": 0}
-"""Settings that are stored only where they are not these, so that results of earlier versions stay valid."""
-
-
 def settings_of(request: UpsampleRequest) -> dict[str, Any]:
     """Return the settings that a result depends on, as values for JSON."""
     reading = asdict(request.reading)
     choice = reading.pop("camera")
-    reading = {name: value for name, value in reading.items() if name not in _NEW or value != _NEW[name]}
     rig = reading.pop("rig")
     return {
         "method": request.method,

@@ -23,8 +23,6 @@ _LARGEST_ARGUMENT = 4096
 """Largest whole number among the arguments of a network in a file of weights."""
 _SHARED, _CLEAN = "shared", "clean"
 """Keys of the file beside it from which a file takes the tensors that it does not have, and of that for clean maps."""
-_EARLIER = {("facets_box", "Facets"): "facets"}
-"""The name that files of a model and a network had earlier."""
 
 
 def save_network(
@@ -127,7 +125,7 @@ def load_network(
     """
     path = Path(path)
     header = read_header(path)
-    if model is not None and header["model"] not in (model, _EARLIER.get((model, header["network"]))):
+    if model is not None and header["model"] != model:
         raise ValueError(f"{path}: expected weights of model {model}, got those of {header['model']}")
     try:
         with torch.random.fork_rng(devices=[]):  # the initial weights draw random numbers
