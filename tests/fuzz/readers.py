@@ -161,7 +161,7 @@ class _At(Place):
 
 
 def _unpack(place: Place) -> None:
-    from dsr.data.download.unpack import unpack  # noqa: PLC0415
+    from dsr.data.download.fetching import unpack  # noqa: PLC0415
 
     problems = []
     for name in ("set.zip", "set.tar.gz", "set.tar"):
@@ -176,7 +176,7 @@ def _unpack(place: Place) -> None:
 
 def _verify(place: Place) -> None:
     from dsr.data.download.collection import Collection, Item  # noqa: PLC0415
-    from dsr.data.download.inventory import state, verify  # noqa: PLC0415
+    from dsr.data.download.fetching import state, verify  # noqa: PLC0415
     from dsr.utils.progress import Progress  # noqa: PLC0415
 
     items = (Item("books/b.txt", ("https://localhost/b.txt",)),)

@@ -15,7 +15,7 @@ from http.server import BaseHTTPRequestHandler
 import pytest
 
 from dsr import cli
-from dsr.data.download import transfer as download
+from dsr.data.download import fetching
 from dsr.data.download.catalogue import Collection, Item
 
 PNG = b"\x89PNG\r\n\x1a\n" + bytes(range(256)) * 1000
@@ -56,7 +56,7 @@ class Mirror(BaseHTTPRequestHandler):
 
 @pytest.fixture
 def mirror(monkeypatch, serve):
-    monkeypatch.setattr(download, "PAUSES", (0.0,))
+    monkeypatch.setattr(fetching, "RETRIES", fetching.RETRIES.new(total=1, backoff_factor=0))
     server = serve(Mirror)
     server.files = {f"/{name}": PNG + name.encode() for name in NAMES}
     server.log, server.go_on = [], threading.Event()
@@ -193,7 +193,7 @@ def test_file_found_nowhere_is_one_line_and_the_others_come(mirror, root, capsys
 
 
 def test_files_without_a_network_are_one_line_each(root, capsys, monkeypatch):
-    monkeypatch.setattr(download, "PAUSES", (0.0,))
+    monkeypatch.setattr(fetching, "RETRIES", fetching.RETRIES.new(total=1, backoff_factor=0))
     with socket.socket() as closed:
         closed.bind(("127.0.0.1", 0))
         host = f"127.0.0.1:{closed.getsockname()[1]}"

@@ -19,7 +19,7 @@ import torch
 from dsr.app.entry import run_command
 from dsr.app.trust import read_plain_yaml
 from dsr.app.upsample.outputs import read_previous_run
-from dsr.data.download.unpack import unpack
+from dsr.data.download.fetching import unpack
 from dsr.data.tofmark import read_matrices
 from dsr.inference import MethodChoice
 from dsr.io.captures.arkitscenes import find_arkitscenes

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from dsr.cli import main
-from dsr.data.download.checksums import Checksums
+from dsr.data.download.fetching import Checksums
 from dsr.evaluation.run_files import load_results
 from dsr.evaluation.store import iterations_path, prediction_path, sample_path
 from dsr.io.layouts import find_pairs_of_folder

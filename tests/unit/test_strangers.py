@@ -15,7 +15,7 @@ from dsr.app.entry import run_command
 from dsr.app.run_directory import expect_free
 from dsr.app.upsample.stored import read_result
 from dsr.cli import main
-from dsr.data.download.unpack import unpack
+from dsr.data.download.fetching import unpack
 from dsr.geometry.poses import as_rigid, from_quaternion, is_rotation
 from dsr.io.photos import focal_in_exif
 from dsr.methods.registry import read_method

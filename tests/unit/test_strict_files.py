@@ -16,7 +16,7 @@ from dsr.app.training_runs import read_config
 from dsr.app.upsample.outputs import kept_surface, read_previous_run
 from dsr.app.upsample.scene import _read_record
 from dsr.app.upsample.stored import read_result
-from dsr.data.download.checksums import Checksums
+from dsr.data.download.fetching import Checksums
 from dsr.data.folder import Folder, load_scene
 from dsr.data.formats.files import read_camera
 from dsr.evaluation.run_files import load_results
@@ -226,14 +226,6 @@ def test_damaged_run_is_left_out_with_a_line_and_the_others_are_read(runs, name,
     results = load_results([runs])
     assert results.methods() == ["Bicubic"]
     assert [str(path) in note for note in results.notes] == [True]
-
-
-def test_label_of_a_run_that_is_a_number_is_a_text(runs):
-    path = runs / "damaged" / "versions.json"
-    path.write_text(with_identity(method={"label": 0.5})(path.read_text()))
-    summary = runs / "damaged" / "summary.json"
-    summary.write_text(summary.read_text().replace('"label": "MSG", ', ""))
-    assert load_results([runs]).methods() == ["Bicubic", "0.5"]
 
 
 UNFIT = {

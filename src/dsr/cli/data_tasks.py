@@ -11,8 +11,7 @@ from rich.console import Console
 from rich.table import Table
 
 from dsr.data.download.catalogue import Collection, find
-from dsr.data.download.get import Options, get
-from dsr.data.download.inventory import absent, state, verify
+from dsr.data.download.fetching import absent, get, state, verify
 from dsr.data.download.location import data_root
 from dsr.utils.console import ConsoleProgress, show
 from dsr.utils.units import megabytes
@@ -56,8 +55,8 @@ def get_data_sets(options: argparse.Namespace, console: Console, catalogue: Mapp
         show(console, f"{missing} of {len(items)} files are missing in {root.absolute()}")
     if missing and not options.yes and sys.stdin.isatty() and console.is_terminal and not _agreed(console):
         return []
-    settings = Options(options.mirror, options.accept_changed, options.keep_archives)
-    problems = get(items.values(), root, progress, settings) if items else []
+    given = {name: getattr(options, name) for name in ("mirror", "accept_changed", "keep_archives")}
+    problems = get(items.values(), root, progress, **given) if items else []
     for collection in collections:
         if not collection.items:
             problems += verify(collection, root, progress, accept_changed=options.accept_changed)

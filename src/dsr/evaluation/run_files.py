@@ -127,11 +127,10 @@ def read_run(folder: Path) -> Run:
     names += [(f"{folder / _SCORES}: line {row + 2}", scene) for row, scene in first.items()]
     for source, scene in names:
         expect_scene(folder, scene, source)
-    label = summary.label or summary.method
     dataset = str(scores["dataset"].iloc[0]) if len(scores) else summary.dataset
     scenes = tuple(scene for scene in summary.seconds if prediction_path(folder, scene).is_file())
     scores = scores[scores["scene"].isin(scenes)]
-    about = (folder, dataset, as_ratio(summary.scale), summary.downsampling, summary.seed, summary.method, str(label))
+    about = (folder, dataset, as_ratio(summary.scale), summary.downsampling, summary.seed, summary.method, summary.label)
     return Run(
         *about,
         scores,
@@ -153,7 +152,7 @@ class _Summary(BaseModel, strict=True, allow_inf_nan=False):
     method: str
     seed: Annotated[Whole, Field(ge=0)]
     seconds: dict[str, Annotated[Number, Field(ge=0)]]
-    label: str | None = None
+    label: str
     unanswered: dict[str, str] = {}
     metrics: dict[str, MetricFormat] = {}
 

@@ -23,8 +23,9 @@ class FullDiskError(Exception):
     It is no OSError, so that it ends a run rather than being taken for a problem of one scene or picture.
     """
 
-    def __init__(self, path: Path) -> None:
-        super().__init__(f"{path}: expected space to write the file, got {_free_space(path)}")
+    def __init__(self, path: Path, needed: float | None = None) -> None:
+        space = "space" if needed is None else megabytes(needed)
+        super().__init__(f"{path}: expected {space} to write the file, got {_free_space(path)}")
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Keep the message on the way from a worker process."""
@@ -45,6 +46,17 @@ def space_for(path: Path) -> Iterator[None]:
         if not isinstance(error, FullDiskError) and _is_full(error, path):
             raise FullDiskError(path) from error
         raise
+
+
+def expect_space(path: Path, needed: float) -> None:
+    """Check that there is space for a number of bytes beside a file.
+
+    Raises:
+        FullDiskError: there is not.
+
+    """
+    if needed > shutil.disk_usage(path.parent).free:
+        raise FullDiskError(path, needed)
 
 
 def silence_threads() -> None:
