@@ -170,7 +170,6 @@ NOT_PREDICTING = (
     "utils/limits.py",
     "utils/picture_headers.py",
     "utils/pool.py",
-    "utils/tables.py",
     "utils/hashing.py",
     "utils/checkpoints.py",
     "utils/console.py",

@@ -10,7 +10,6 @@ from rich.console import Console
 
 from dsr.utils.console import ConsoleProgress, show
 from dsr.utils.ratios import as_ratio
-from dsr.utils.tables import guarded
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -126,7 +125,7 @@ def _collect(options: argparse.Namespace, console: Console, _: object) -> list[s
     for line in remarks(answers, key):
         show(console, line)
     path = options.output or options.study / "study.csv"
-    write_text(path, guarded(table).to_csv(index=False, float_format="%.6g"))
+    write_text(path, table.to_csv(index=False, float_format="%.6g"))
     show(console, f"{path}  {len(answers)} of {len(files)} files count{', see above' if left_out else ''}")
     return []
 

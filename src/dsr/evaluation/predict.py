@@ -37,7 +37,6 @@ from dsr.utils.files import look_anew, read_arrays, replacing
 from dsr.utils.parsing import parse_json
 from dsr.utils.pool import LOST
 from dsr.utils.progress import SILENT, Progress
-from dsr.utils.tables import guarded
 
 
 @dataclass(frozen=True)
@@ -263,7 +262,7 @@ def _predict_scene(study: Evaluation, scene: str, folder: Path, config: Mapping[
     expect_some_depth(depth, f"{scene}: {study.method_name}")
     if isinstance(study.method, Iterative):
         with replacing(iterations_path(folder, scene)) as temporary:
-            guarded(pd.DataFrame(study.method.history)).to_csv(temporary, index=False)
+            pd.DataFrame(study.method.history).to_csv(temporary, index=False)
     sample.save(sample_path(folder, scene))
     with replacing(prediction_path(folder, scene)) as temporary:
         np.savez_compressed(

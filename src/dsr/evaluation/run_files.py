@@ -21,7 +21,6 @@ from dsr.utils.files import array_headers
 from dsr.utils.limits import MOST_TABLE, TooLargeError, read_limited
 from dsr.utils.paths import OutsideError, natural_key
 from dsr.utils.ratios import as_ratio
-from dsr.utils.tables import unguarded
 from dsr.utils.validation import Number, Whole, describe
 
 _SCORES, _SUMMARY, _VERSIONS = "scores.csv", "summary.json", "versions.json"
@@ -130,9 +129,14 @@ def read_run(folder: Path) -> Run:
     dataset = str(scores["dataset"].iloc[0]) if len(scores) else summary.dataset
     scenes = tuple(scene for scene in summary.seconds if prediction_path(folder, scene).is_file())
     scores = scores[scores["scene"].isin(scenes)]
-    about = (folder, dataset, as_ratio(summary.scale), summary.downsampling, summary.seed, summary.method, summary.label)
     return Run(
-        *about,
+        folder,
+        dataset,
+        as_ratio(summary.scale),
+        summary.downsampling,
+        summary.seed,
+        summary.method,
+        summary.label,
         scores,
         summary.seconds,
         settings,
@@ -192,7 +196,7 @@ def _read_scores(path: Path) -> pd.DataFrame:
             keep_default_na=False,
             na_values=missing,
         )
-        scores = unguarded(scores[[*_TEXT_COLUMNS, *_NUMBER_COLUMNS]])
+        scores = scores[[*_TEXT_COLUMNS, *_NUMBER_COLUMNS]]
         if any(scores[name].dtype == bool for name in _NUMBER_COLUMNS):
             raise ValueError("true is no number")
         scores = scores.astype({"seed": int, "value": float, "valid_share": float})

@@ -23,7 +23,6 @@ from dsr.utils.files import replacing, write_text
 from dsr.utils.pool import LOST
 from dsr.utils.progress import Progress
 from dsr.utils.ratios import round_ratio
-from dsr.utils.tables import guarded
 
 SCORE_COLUMNS = (
     "dataset",
@@ -89,7 +88,7 @@ def score(
                 outcome.failures[scene] = each.failure
         scores = pd.DataFrame(rows, columns=list(SCORE_COLUMNS))
         with replacing(folder / "scores.csv") as temporary:
-            guarded(scores).to_csv(temporary, index=False)
+            scores.to_csv(temporary, index=False)
         write_text(folder / "summary.json", json.dumps(summary(study, scores, outcome, metrics), indent=1) + "\n")
     return scores
 

@@ -6,7 +6,6 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-import cv2
 import numpy as np
 import torch
 from torch import Tensor
@@ -18,7 +17,7 @@ from dsr.geometry.shading import render
 from dsr.geometry.simplification import QUADRIC, project, select_points, simplify, thin
 from dsr.geometry.surface import depth_to_normals
 from dsr.io.model_files import write_glb, write_ply
-from dsr.utils.files import replacing
+from dsr.io.photos import write_png
 from dsr.utils.limits import MOST_FACES, MOST_POINTS
 
 _STRIP = 1 << 20
@@ -77,7 +76,7 @@ def write_renderings(folder: Path, depth: Tensor, camera: Camera) -> list[Path]:
         shades[:, rows] = _bytes(render(normals[None])[0])
     paths = [folder / f"{name}.png" for name in LIGHT_NAMES]
     for path, picture in zip(paths, shades, strict=True):
-        _write_png(path, picture, known)
+        write_png(path, picture, known)
     return paths
 
 
@@ -102,7 +101,7 @@ def write_normals(path: Path, depth: Tensor, camera: Camera) -> None:
     for rows, normals in normal_strips(depth, camera):
         known[rows] = normals[0].isfinite().numpy()
         picture[rows] = _bytes((1 + signs * normals.flip(0)) / 2).transpose(1, 2, 0)
-    _write_png(path, picture, known)
+    write_png(path, picture, known)
 
 
 def write_cloud(path: Path, rgb: Tensor, depth: Tensor, camera: Camera, *, most: int = MOST_POINTS) -> Written:
@@ -192,15 +191,3 @@ def _colours(rgb: Tensor, pixels: np.ndarray) -> np.ndarray:
 def _bytes(values: Tensor) -> np.ndarray:
     """Return values in [0, 1] as uint8; NaN becomes 0."""
     return (values.nan_to_num(0) * 255).round().clamp(0, 255).byte().cpu().numpy()
-
-
-def _write_png(path: Path, picture: np.ndarray, known: np.ndarray) -> None:
-    """Write a grey (H, W) or blue-green-red (H, W, 3) picture atomically, transparent where not known."""
-    if not known.all():
-        colours = picture if picture.ndim == 3 else np.repeat(picture[..., None], 3, axis=2)
-        picture = np.concatenate((colours, np.where(known, 255, 0).astype(np.uint8)[..., None]), axis=2)
-    done, content = cv2.imencode(".png", picture)
-    if not done:
-        raise OSError(f"{path}: the picture of {picture.shape} could not be encoded")
-    with replacing(path) as temporary:
-        temporary.write_bytes(content.tobytes())

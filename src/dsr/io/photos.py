@@ -1,4 +1,4 @@
-"""Reading of photos and of their EXIF data (CIPA DC-008, JEITA CP-3451)."""
+"""Photos: reading them and their EXIF data (CIPA DC-008, JEITA CP-3451), and writing pictures as PNG."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ import numpy as np
 
 from dsr.data.formats.files import read_pixels
 from dsr.io.encoding import Assumption
+from dsr.utils.files import replacing
 
 _MODEL, _ORIENTATION, _EXIF_IFD, _EXIF_FOCAL_35 = 0x0110, 0x0112, 0x8769, 0xA405
 _ASPECT_TOLERANCE = 0.02
@@ -83,3 +84,25 @@ def orientation_of(photo: Path) -> int:
     """Return the EXIF orientation of the photo, 1 (as it is) to 8; 1 where there is none."""
     value = _exif(photo).get(_ORIENTATION, 1)
     return value if isinstance(value, int) and 1 <= value <= 8 else 1
+
+
+def write_png(path: Path, picture: np.ndarray, known: np.ndarray | None = None) -> None:
+    """Write a picture atomically.
+
+    Args:
+        path: the file.
+        picture: grey (H, W) or blue-green-red (H, W, 3), uint8 or uint16.
+        known: (H, W) bool, an 8-bit picture is transparent elsewhere; None for everywhere.
+
+    Raises:
+        OSError: it cannot be encoded.
+
+    """
+    if known is not None and not known.all():
+        colours = picture if picture.ndim == 3 else np.repeat(picture[..., None], 3, axis=2)
+        picture = np.concatenate((colours, np.where(known, 255, 0).astype(np.uint8)[..., None]), axis=2)
+    done, content = cv2.imencode(".png", picture)
+    if not done:
+        raise OSError(f"{path}: the picture of {picture.shape} could not be encoded")
+    with replacing(path) as temporary:
+        temporary.write_bytes(content.tobytes())

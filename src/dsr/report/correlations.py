@@ -19,7 +19,6 @@ from dsr.metrics.formats import HEADLINES, LIGHTS_NOTE, in_tables
 from dsr.report.markup import MISSING, aligned, escaped
 from dsr.report.tables import published
 from dsr.utils.files import replacing, write_text
-from dsr.utils.tables import guarded
 
 Kind = Literal["pearson", "spearman"]
 KINDS: tuple[Kind, ...] = ("pearson", "spearman")
@@ -127,10 +126,10 @@ def write_correlations(folder: Path, results: Results) -> list[Path]:
     for name, table in tables.items():
         paths.append(folder / f"{name}.csv")
         with replacing(paths[-1]) as temporary:
-            guarded(table).to_csv(temporary, index_label="metric")
+            table.to_csv(temporary, index_label="metric")
     paths.append(folder / "with_lpips.csv")
     with replacing(paths[-1]) as temporary:
-        guarded(ranking).to_csv(temporary, index=False)
+        ranking.to_csv(temporary, index=False)
     paths.append(folder / "with_lpips.md")
     write_text(paths[-1], _ranking_text(ranking, len(matrix)))
     return paths

@@ -13,7 +13,6 @@ from dsr.report.latex import to_document, to_latex
 from dsr.report.paper_tables import build_tables
 from dsr.report.table_parts import Column, Group, PaperTable, Row, Style
 from dsr.utils.files import write_text
-from dsr.utils.tables import guarded
 
 __all__ = ["aligned", "to_csv", "to_latex", "to_markdown", "write_tables"]
 
@@ -93,7 +92,7 @@ def to_csv(table: PaperTable) -> str:
     empty = [name for name in frame.columns[_FACTS_FROM:] if frame[name].isna().all()]
     counts = [name for name in frame.columns if name.endswith(("seeds", " scenes")) and name not in empty]
     frame = frame.drop(columns=empty).astype(dict.fromkeys(counts, "Int64"))
-    return guarded(frame).to_csv(index=False, lineterminator="\n")
+    return frame.to_csv(index=False, lineterminator="\n")
 
 
 def aligned(head: Sequence[str], rows: Sequence[Sequence[str]], texts: int) -> str:

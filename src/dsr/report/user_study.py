@@ -10,7 +10,6 @@ from typing import NamedTuple
 import pandas as pd
 
 from dsr.utils.limits import MOST_TABLE, read_limited
-from dsr.utils.tables import unguarded
 
 USER_COLUMNS = {"user_first": "User 1st", "user_second": "User 2nd", "user_top2": "User Top 2"}
 """The paper's columns: percentage of answers with a method as most similar, second most similar, or either."""
@@ -54,7 +53,6 @@ def read_study(path: Path) -> pd.DataFrame:
         )
     except (OSError, ValueError) as error:  # pandas raises subclasses of ValueError for damaged files
         raise ValueError(f"{path}: expected the table of dsr study collect, got {type(error).__name__}") from error
-    study = unguarded(study)
     check_study(study, str(path))
     return study
 

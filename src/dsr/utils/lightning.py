@@ -24,7 +24,6 @@ from dsr.utils.files import replacing
 from dsr.utils.progress import Progress, Task
 from dsr.utils.runs_table import SCORES, list_scores
 from dsr.utils.space import FullDiskError, space_for
-from dsr.utils.tables import guard
 
 LOG_EVERY = 10
 """Steps between two values of a training in its log."""
@@ -84,7 +83,7 @@ class ValidationTable(Callback):
         if self._path.is_file():
             with self._path.open(newline="", encoding="utf-8") as file:
                 before = list(csv.reader(file))[1:]
-        rows = [[str(step), guard(kind), guard(name), repr(value)]
+        rows = [[str(step), kind, name, repr(value)]
                 for kind, each in scored.validation_scores.items() for name, value in each.items()]  # fmt: skip
         with replacing(self._path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
             kept = (row for row in before if int(row[0]) < step)

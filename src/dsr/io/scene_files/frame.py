@@ -14,7 +14,8 @@ from torch import Tensor
 from dsr.data.formats.files import read_pixels
 from dsr.geometry.camera import Camera
 from dsr.geometry.poses import is_rotation
-from dsr.utils.files import open_array, replacing
+from dsr.io.photos import write_png
+from dsr.utils.files import open_array
 from dsr.utils.limits import pixels_beside
 
 MILLIMETRES = 1000
@@ -103,12 +104,12 @@ def one_camera(frames: Sequence[Frame]) -> Camera | None:
 
 def write_colour(path: Path, rgb: np.ndarray) -> None:
     """Write (H, W, 3) uint8, red first, as a PNG, atomically."""
-    _write_png(path, np.ascontiguousarray(rgb[..., ::-1]))
+    write_png(path, np.ascontiguousarray(rgb[..., ::-1]))
 
 
 def write_sixteen_bits(path: Path, values: np.ndarray) -> None:
     """Write (H, W) uint16 as a PNG, atomically."""
-    _write_png(path, values)
+    write_png(path, values)
 
 
 def to_millimetres(depth: np.ndarray) -> tuple[np.ndarray, int]:
@@ -119,12 +120,3 @@ def to_millimetres(depth: np.ndarray) -> tuple[np.ndarray, int]:
     values = np.rint(depth.astype(np.float64) * MILLIMETRES)
     fits = (values > 0) & (values <= MOST_MILLIMETRES)
     return np.where(fits, values, 0).astype(np.uint16), int((values > MOST_MILLIMETRES).sum())
-
-
-def _write_png(path: Path, values: np.ndarray) -> None:
-    """Write a picture atomically."""
-    done, content = cv2.imencode(".png", values)
-    if not done:
-        raise OSError(f"{path}: the picture of {values.shape} could not be encoded")
-    with replacing(path) as temporary:
-        temporary.write_bytes(content.tobytes())
