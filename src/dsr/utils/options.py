@@ -1,0 +1,337 @@
+"""Options of a command as fields of dataclasses: type, default, help and check of each are stated once.
+
+The type says how an option is read: ``bool`` is a flag, ``Literal`` a choice, ``tuple[T, ...]`` one value or more,
+``tuple[T, T]`` two values, and ``X | None`` may be left out. A field whose type is such a dataclass again is a group.
+
+Example:
+    >>> from argparse import ArgumentParser
+    >>> @dataclass(frozen=True, kw_only=True)
+    ... class Frames(Options):
+    ...     folder: str = option(..., "where they are", "DIR")
+    ...     most: int = option(24, "at most N frames", "N", rule=at_least(1))
+    >>> parser = ArgumentParser()
+    >>> add_options(parser, Frames)
+    >>> build(Frames, parser.parse_args(["--folder", "scans", "--most", "3"])).most
+    3
+    >>> build(Frames, parser.parse_args(["--folder", "scans", "--most", "0"]))
+    Traceback (most recent call last):
+    ...
+    ValueError: --most: expected at least 1, got 0
+
+"""
+
+from __future__ import annotations
+
+import math
+from argparse import SUPPRESS, ArgumentParser, Namespace
+from collections.abc import Callable, Collection, Iterator
+from dataclasses import MISSING, dataclass, field, fields
+from types import EllipsisType, NoneType
+from typing import Any, Literal, NamedTuple, TypeVar, get_args, get_origin, get_type_hints
+
+_KEY = "option"
+
+
+class OptionError(ValueError):
+    """A value is not what its option expects: ``max_hole: expected ...``; on the command line ``--max-hole: ...``."""
+
+    def __init__(self, name: str, message: str) -> None:
+        super().__init__(name, message)
+        self.name, self.message = name, message
+
+    def __str__(self) -> str:
+        return f"{self.name}: {self.message}"
+
+
+def _shown(value: Any) -> str:
+    """Return a value as an error line shows it."""
+    if isinstance(value, tuple):
+        return " ".join(map(_shown, value))
+    return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+class Rule(NamedTuple):
+    """What is expected of a value.
+
+    Args:
+        expected: in words, which follow "expected".
+        holds: whether a value is as expected.
+        each: whether that is said of each value of a tuple.
+        shown: how an error line shows a value.
+
+    """
+
+    expected: str
+    holds: Callable[[Any], bool]
+    each: bool = False
+    shown: Callable[[Any], str] = _shown
+
+
+def at_least(least: int) -> Rule:
+    """Return the rule of a number that is not smaller."""
+    return Rule(f"at least {least}", lambda value: value >= least)
+
+
+def positive(what: str) -> Rule:
+    """Return the rule of a finite number above 0."""
+    return Rule(f"a positive {what}", lambda value: 0 < value < math.inf)
+
+
+def one_of(choices: Collection[str], shown: Callable[[Any], str] = repr) -> Rule:
+    """Return the rule of a value that is one of some."""
+    return Rule(f"one of {', '.join(choices)}", lambda value: value in choices, shown=shown)
+
+
+def some_of(choices: Collection[str], shown: Callable[[Any], str] = repr) -> Rule:
+    """Return the rule of a tuple with values that are each one of some."""
+    return Rule(f"some of {', '.join(choices)}", lambda value: value in choices, each=True, shown=shown)
+
+
+class _Option(NamedTuple):
+    """What :func:`option` says of a field."""
+
+    help: str
+    metavar: str | tuple[str, ...] | None
+    flags: str
+    rule: Rule | None
+    parse: Callable[[Any], Any] | None
+    alone: str
+    repeated: bool
+    recorded: bool
+
+
+def option(
+    default: Any,
+    help: str,  # noqa: A002 - as argparse names it
+    metavar: str | tuple[str, ...] | None = None,
+    *,
+    flags: str = "",
+    rule: Rule | None = None,
+    parse: Callable[[Any], Any] | None = None,
+    alone: str = "",
+    repeated: bool = False,
+    recorded: bool = True,
+) -> Any:
+    """Return a dataclass field that is an option.
+
+    Args:
+        default: the value where it is not given; ``...`` if it has to be given.
+        help: text for ``--help``.
+        metavar: what stands for the value there.
+        flags: its flags, such as ``"-o --output"``, or a name without dashes for an argument by its place; by default
+            the name of the field.
+        rule: what is expected of the value; of a ``Literal`` by default that it is one of its values.
+        parse: makes the value of the text on the command line, or of the list of texts if it is ``repeated``.
+        alone: options of a record with the same word here exclude each other.
+        repeated: whether the option is given once for each value.
+        recorded: whether results depend on it, see :func:`recorded`.
+
+    """
+    metadata = {_KEY: _Option(help, metavar, flags, rule, parse, alone, repeated, recorded)}
+    return field(metadata=metadata) if isinstance(default, EllipsisType) else field(default=default, metadata=metadata)
+
+
+def group(record: Callable[[], Any] | None = None, title: str = "") -> Any:
+    """Return a dataclass field that is a record of options.
+
+    Args:
+        record: the record; None where it may be left out: then all that it needs is given, or nothing of it.
+        title: its heading in ``--help``; without one its options are among those around it.
+
+    """
+    default = {"default": None} if record is None else {"default_factory": record}
+    return field(**default, metadata={_KEY: title})
+
+
+class _Stated(NamedTuple):
+    """A field: its type without None, whether that is allowed, and what was said of it as an option or as a group."""
+
+    name: str
+    hint: Any
+    optional: bool
+    required: bool
+    default: Any
+    option: _Option | None
+    title: str
+
+    @property
+    def flags(self) -> list[str]:
+        """Its flags, the one that errors name last."""
+        said = self.option.flags.split() if self.option is not None else []
+        return said or [f"--{self.name.replace('_', '-')}"]
+
+    @property
+    def by_place(self) -> bool:
+        """Whether it is an argument without a flag."""
+        return not self.flags[-1].startswith("-")
+
+    @property
+    def key(self) -> str:
+        """Where argparse keeps it."""
+        return self.flags[-1].lstrip("-").replace("-", "_")
+
+    @property
+    def rule(self) -> Rule | None:
+        """What is expected of its value."""
+        if self.option is not None and self.option.rule is None and get_origin(self.hint) is Literal:
+            return one_of(get_args(self.hint))
+        return None if self.option is None else self.option.rule
+
+
+def _stated(record: type) -> tuple[_Stated, ...]:
+    """Return the options and groups of a record, in order."""
+    hints, found = get_type_hints(record), []
+    for each in fields(record):
+        if _KEY not in each.metadata:
+            continue
+        kinds = [kind for kind in get_args(hints[each.name]) if kind is not NoneType]
+        optional = NoneType in get_args(hints[each.name])
+        said = each.metadata[_KEY]
+        found.append(
+            _Stated(
+                each.name,
+                kinds[0] if optional else hints[each.name],
+                optional,
+                each.default is MISSING and each.default_factory is MISSING,
+                each.default,
+                said if isinstance(said, _Option) else None,
+                "" if isinstance(said, _Option) else said,
+            )
+        )
+    return tuple(found)
+
+
+@dataclass(frozen=True)
+class Options:
+    """A record of options, which checks its values; dataclasses of options derive from it."""
+
+    def __post_init__(self) -> None:
+        """Check each value by its rule.
+
+        Raises:
+            OptionError: a value is not as expected.
+
+        """
+        for each in _stated(type(self)):
+            value, rule = getattr(self, each.name), each.rule
+            if rule is None or value is None:
+                continue
+            for one in value if rule.each else (value,):
+                if not rule.holds(one):
+                    raise OptionError(each.name, f"expected {rule.expected}, got {rule.shown(one)}")
+
+
+Record = TypeVar("Record", bound=Options)
+
+
+def add_options(parser: ArgumentParser, record: type[Options]) -> None:
+    """Add the options of a record to a command's parser; :func:`build` reads them."""
+    _add(parser, record, {}, needed=True)
+
+
+def _add(place: Any, record: type[Options], alone: dict[tuple[int, str], Any], *, needed: bool) -> None:
+    """Add the options of a record to a parser or a group of it; ``alone`` has the groups of those that exclude."""
+    for each in _stated(record):
+        if each.option is None:
+            inner = place.add_argument_group(each.title) if each.title else place
+            _add(inner, each.hint, alone, needed=needed and not each.optional)
+            continue
+        where, key = place, (id(place), each.option.alone)
+        if each.option.alone:
+            where = alone[key] = alone.get(key) or place.add_mutually_exclusive_group()
+        where.add_argument(*each.flags, **_keywords(each, each.option, needed=needed))
+
+
+def _keywords(each: _Stated, option: _Option, *, needed: bool) -> dict[str, Any]:
+    """Return what argparse is told of an option; what isn't given is absent from what it returns."""
+    keywords: dict[str, Any] = {"help": option.help.replace("%", "%%"), "default": SUPPRESS}
+    if needed and each.required and not each.by_place:
+        keywords["required"] = True
+    if each.hint is bool:
+        return {**keywords, "action": "store_false" if each.default is True else "store_true"}
+    if option.metavar is not None:
+        keywords["metavar"] = option.metavar
+    kinds = get_args(each.hint)
+    if option.repeated:
+        keywords["action"] = "append"
+    if option.parse is not None:
+        return keywords
+    if get_origin(each.hint) is Literal:
+        return {**keywords, "choices": kinds}
+    if get_origin(each.hint) is not tuple:
+        return {**keywords, "type": each.hint}
+    if not option.repeated:
+        several = "*" if each.by_place and not each.required else "+"
+        keywords["nargs"] = several if kinds[-1] is Ellipsis else len(kinds)
+    return {**keywords, "type": kinds[0]}
+
+
+def build(record: type[Record], given: Namespace) -> Record:
+    """Return a record of what was given on the command line.
+
+    Raises:
+        ValueError: a value is not what its option expects; the message begins with the option's flag.
+
+    """
+    values: dict[str, Any] = {}
+    for each in _stated(record):
+        if each.option is not None and hasattr(given, each.key):
+            values[each.name] = _value(each, each.option, getattr(given, each.key))
+        elif each.option is None and not (each.optional and _is_absent(each.hint, given)):
+            values[each.name] = build(each.hint, given)
+    try:
+        return record(**values)
+    except OptionError as error:
+        raise ValueError(f"{_flag_of(record, error.name)}: {error.message}") from error
+
+
+def _value(each: _Stated, option: _Option, came: Any) -> Any:
+    """Return the value that stands for what argparse read."""
+    if option.parse is None:
+        return tuple(came) if get_origin(each.hint) is tuple else came
+    try:
+        return option.parse(came)
+    except OptionError as error:
+        raise ValueError(f"{each.flags[-1]} {error}") from error
+    except ValueError as error:
+        raise ValueError(f"{each.flags[-1]}: {error}") from error
+
+
+def _is_absent(record: type[Options], given: Namespace) -> bool:
+    """Return whether no option of a record is given.
+
+    Raises:
+        ValueError: some are given, and one that is needed with them is not.
+
+    """
+    there = [each for each in _stated(record) if hasattr(given, each.key)]
+    for each in _stated(record) if there else ():
+        if each.required and each not in there:
+            raise ValueError(f"{there[0].flags[-1]}: expected {each.flags[-1]} with it")
+    return not there
+
+
+def _flag_of(record: type[Options], name: str) -> str:
+    """Return the flag of an option, which is of the record itself or of a group in it."""
+    found = [each.flags[-1] for each in _walk(record) if each.name == name]
+    return found[0] if found else name
+
+
+def _walk(record: type[Options]) -> Iterator[_Stated]:
+    """Yield the options of a record, then those of its groups."""
+    inner = [each for each in _stated(record) if each.option is None]
+    yield from (each for each in _stated(record) if each.option is not None)
+    for each in inner:
+        yield from _walk(each.hint)
+
+
+def recorded(record: Options) -> dict[str, Any]:
+    """Return the options that results depend on, under the names of their flags, as values for JSON."""
+    found: dict[str, Any] = {}
+    for each in _stated(type(record)):
+        value = getattr(record, each.name)
+        if each.option is None:
+            found |= {} if value is None else recorded(value)
+        elif each.option.recorded:
+            found[each.key] = list(value) if isinstance(value, tuple) else value
+    return found
