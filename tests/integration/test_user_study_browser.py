@@ -11,7 +11,8 @@ import pytest
 
 from dsr.cli import study as command
 from dsr.evaluation.run_files import load_results
-from dsr.user_study.build import Choice, build_study
+from dsr.user_study.build import build_study
+from dsr.user_study.choice import Choice
 from dsr.user_study.key import read_key
 from dsr.utils.console import open_console
 

@@ -21,7 +21,8 @@ from dsr.cli import study as command
 from dsr.evaluation.run_files import load_results
 from dsr.geometry.camera import Camera
 from dsr.user_study.answers import files_of, read_all, read_answers
-from dsr.user_study.build import Choice, build_study
+from dsr.user_study.build import build_study
+from dsr.user_study.choice import Choice
 from dsr.user_study.collect import ALL, AVERAGE, COLUMNS, collect, remarks
 from dsr.user_study.intervals import agreement, average_fraction, bootstrap_of_average, wilson
 from dsr.user_study.key import Candidate, Key, Trial, read_key, write_key
@@ -442,20 +443,20 @@ def test_lowest_of_several_seeds_is_shown(tmp_path, runs, make_run):
 @pytest.mark.parametrize(
     ("choice", "message"),
     [
-        (Choice(methods=["Bicubic", "EG"]), "method: expected one of .*, got 'EG'"),
-        (Choice(scales=[16]), "scale: expected one of 4, got 16"),
-        (Choice(scenes=["none"]), "scene: expected one of"),
-        (Choice(downsamplings=["nearest"]), "downsampling: expected one of box, got 'nearest'"),
-        (Choice(methods=["Bicubic"]), "2 methods, found none; left out: "),
-        (Choice(light="e5"), "light: expected one of e1, e2, e3, e4, got 'e5'"),
-        (Choice(scenes_per_person=3), "scenes per person: expected 1 to 2, got 3"),
-        (Choice(repeat=-1), "repeat: expected 0 to 2, got -1"),
-        (Choice(title="Is bicubic best?"), "title: expected words without the methods' names, got 'Bicubic'"),
+        ({"methods": ["Bicubic", "EG"]}, "method: expected one of .*, got 'EG'"),
+        ({"scales": [16]}, "scale: expected one of 4, got 16"),
+        ({"scenes": ["none"]}, "scene: expected one of"),
+        ({"downsamplings": ["nearest"]}, "downsampling: expected one of box, got 'nearest'"),
+        ({"methods": ["Bicubic"]}, "2 methods, found none; left out: "),
+        ({"light": "e5"}, "light: expected one of e1, e2, e3, e4, got 'e5'"),
+        ({"scenes_per_person": 3}, "scenes per person: expected 1 to 2, got 3"),
+        ({"repeat": -1}, "repeat: expected 0 to 2, got -1"),
+        ({"title": "Is bicubic best?"}, "title: expected words without the methods' names, got 'Bicubic'"),
     ],
 )
 def test_invalid_study_is_refused_and_leaves_nothing(tmp_path, runs, choice, message):
     with pytest.raises(ValueError, match=message):
-        build_study(load_results([runs]), tmp_path / "study", choice)
+        build_study(load_results([runs]), tmp_path / "study", Choice(**choice))
     assert not (tmp_path / "study").exists()
 
 

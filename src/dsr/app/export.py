@@ -12,7 +12,7 @@ from dsr.utils.console import show
 from dsr.utils.units import megabytes
 
 
-def export_onnx(request: ExportRequest, console: Console) -> None:
+def export_onnx(request: ExportRequest, console: Console) -> list[str]:
     """Write the file, check it, and show its inputs and outputs.
 
     Raises:
@@ -32,3 +32,4 @@ def export_onnx(request: ExportRequest, console: Console) -> None:
     )
     for line in lines:
         show(console, line)
+    return []

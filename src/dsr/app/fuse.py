@@ -29,11 +29,12 @@ def fuse(request: FuseRequest, console: Console) -> list[str]:
         ValueError: there is no result with a pose, or no surface.
 
     """
+    max_error = request.max_error / 100
     found = sorted({path.parent for folder in request.folders for path in folder.rglob(INFO)}, key=natural_key)
     frames, problems = [], []
     for folder in found:
         try:
-            _load(folder, request.max_error)
+            _load(folder, max_error)
             frames.append(folder)
         except (ValueError, OSError) as error:
             problems.append(one_line(error))
@@ -42,7 +43,7 @@ def fuse(request: FuseRequest, console: Console) -> list[str]:
         raise ValueError(f"expected results of `dsr upsample` with poses; {what}")
 
     def maps() -> Iterator[PosedMap]:
-        return (_load(folder, request.max_error) for folder in frames)
+        return (_load(folder, max_error) for folder in frames)
 
     try:
         voxel = suggest_voxel(maps()) if request.voxel is None else request.voxel

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
 from pathlib import Path
 
 import pandas as pd
@@ -21,6 +20,7 @@ from dsr.report.work import Work, default_workers
 from dsr.utils.console import ConsoleProgress, show
 from dsr.utils.files import replacing_folder, write_text
 from dsr.utils.progress import Progress
+from dsr.utils.ratios import as_ratio
 
 _MARK = "report.json"
 """A file that marks a directory as a report, which a new one may replace."""
@@ -33,26 +33,20 @@ _MAIN = {
 }
 
 
-def make_report(
-    runs: Sequence[Path], output: Path, study: Path | None, request: ReportRequest, console: Console
-) -> None:
+def make_report(request: ReportRequest, console: Console) -> list[str]:
     """Write the tables, figures, correlations and page of some runs into a directory, whole or not at all.
 
-    Args:
-        runs: directories of runs, or with runs below them.
-        output: the report's directory; an earlier report in it is replaced.
-        study: the table that ``dsr study collect`` wrote; None for none.
-        request: what the report contains.
-        console: where progress is shown.
+    An earlier report in it is replaced.
 
     Raises:
         ValueError: there is no run, a choice does not exist, or the directory holds something else.
 
     """
-    _check(output, request)
-    results = load_results(runs)
-    results = results.only(request.methods, request.datasets, request.scales)
-    answers = None if study is None else read_study(study)
+    output = request.output
+    _check(output)
+    results = load_results(request.runs)
+    results = results.only(request.methods, request.datasets, tuple(map(as_ratio, request.scales)))
+    answers = None if request.study is None else read_study(request.study)
     workers = default_workers(results) if request.workers is None else request.workers
     with replacing_folder(output) as temporary, Work(results, workers) as work:
         notes = _write(temporary, work, answers, request, ConsoleProgress(console))
@@ -62,10 +56,11 @@ def make_report(
     for what, file in _MAIN.items():
         if (output / file).exists():
             show(console, f"{what:<8} {output / file}")
+    return []
 
 
-def _check(output: Path, request: ReportRequest) -> None:
-    """Check the request, before anything is read."""
+def _check(output: Path) -> None:
+    """Check the directory, before anything is read."""
     if output.exists() and not (output.is_dir() and ((output / _MARK).is_file() or not any(output.iterdir()))):
         raise ValueError(f"{output}: expected a new directory or an earlier report, it holds something else")
 

@@ -6,130 +6,154 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from dsr.geometry.lights import LIGHT_NAMES
+from dsr.user_study.choice import Choice
 from dsr.utils.config_files import config_directories, list_choices
+from dsr.utils.options import OptionError, Options, Rule, at_least, group, one_of, option, positive, some_of
 
 REPORT_PARTS = ("tables", "metrics", "figures", "page")
 _MOST_WORKERS = 256
+ABOVE_NOTHING = Rule("a positive percentage of the depth", lambda value: value > 0)
+"""The rule of an expected error, which may be infinite."""
 
 
-@dataclass(frozen=True)
-class ReportRequest:
-    """What the report contains.
+@dataclass(frozen=True, kw_only=True)
+class ReportRequest(Options):
+    """What the report contains, and where it goes."""
 
-    Args:
-        methods, datasets, scales: the ones to show; empty for all.
-        parts: some of tables, metrics, figures, page.
-        light: the figures' light.
-        title: the page's title.
-        page_mb: the maximum size of the page in MB.
-        workers: number of worker processes; None for one per core if there is enough to do.
+    runs: tuple[Path, ...] = option(..., "directories of runs, or with runs below them", "DIR", flags="runs")
+    output: Path = option(..., "where the report goes", "DIR", flags="-o --output")
+    study: Path | None = option(None, "what `dsr study collect` wrote", "CSV")
+    methods: tuple[str, ...] = option((), "these alone, as the tables name them", "NAME")
+    datasets: tuple[str, ...] = option((), "these alone", "NAME")
+    scales: tuple[float, ...] = option((), "these alone", "N", flags="--scale")
+    light: str = option("e1", "of the figures: e1 (default), e2, e3 or e4", "NAME", rule=one_of(LIGHT_NAMES, str))
+    title: str = option("Depth super-resolution", "of the page")
+    page_mb: float = option(
+        60.0, "maximum size of the page; 60", "MB", rule=Rule("a positive number", lambda size: size > 0)
+    )
+    parts: tuple[str, ...] = option(
+        REPORT_PARTS,
+        "these parts alone, of tables, metrics, figures, page",
+        "A,B",
+        flags="--only",
+        rule=some_of(REPORT_PARTS, str),
+        parse=lambda text: tuple(part.strip() for part in text.split(",")),
+    )
+    workers: int | None = option(
+        None,
+        "processes that draw and encode (default: one per core, at most 8)",
+        "N",
+        rule=Rule(f"1..{_MOST_WORKERS}", lambda count: 1 <= count <= _MOST_WORKERS),
+    )
 
-    """
 
-    methods: tuple[str, ...]
-    datasets: tuple[str, ...]
-    scales: tuple[float, ...]
-    parts: tuple[str, ...]
-    light: str
-    title: str
-    page_mb: float
-    workers: int | None = None
+@dataclass(frozen=True, kw_only=True)
+class FuseRequest(Options):
+    """What to fuse."""
+
+    folders: tuple[Path, ...] = option(..., "folders of results of dsr upsample", "OUT", flags="folders")
+    output: Path = option(
+        ...,
+        "the mesh, a .ply file",
+        "FILE",
+        flags="-o --output",
+        rule=Rule("a file that ends in .ply", lambda path: path.suffix.lower() == ".ply"),
+    )
+    voxel: float | None = option(
+        None,
+        "size of a voxel (default: the width of a pixel on the surfaces)",
+        "METRES",
+        rule=positive("number of metres"),
+    )
+    max_error: float = option(
+        2.0,
+        "leave pixels out whose depth is expected to be off by more (default: 2)",
+        "PERCENT",
+        rule=ABOVE_NOTHING,
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class ViewRequest(Options):
+    """What to look at."""
+
+    output: Path = option(..., "a result of `dsr upsample`, or a folder of several", "OUT", flags="output")
+    page: Path | None = option(None, "the page (default: OUT/view.html)", "FILE", flags="-o --page")
+    open_page: bool = option(True, "only write the page", flags="--no-open")
+    most: int = option(24, "show at most N results, taken at equal distances (24)", "N", rule=at_least(1))
+    vertices: int = option(
+        500_000,
+        "at most N vertices in a surface, and 6 N in the page; larger maps are reduced (500000)",
+        "N",
+        rule=at_least(1000),
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExportRequest(Options):
+    """Which network to write, and where."""
+
+    path: Path = option(..., "the file to write", "FILE", flags="--onnx")
+    method: str = option("facets", "facets (default), msg_v, pdn, ddrnet, ...", "NAME")
+    scale: int = option(
+        4, "upsampling factor (default: 4)", "N", rule=Rule("a factor of 1 or more", lambda factor: factor >= 1)
+    )
+    weights: Path | None = option(None, "of a training (default: those of the method)", "FILE")
+    directories: tuple[Path, ...] = option(
+        (),
+        "a folder with a method/ of your own YAML files; may be repeated",
+        "DIR",
+        flags="--config-dir",
+        repeated=True,
+    )
 
     def __post_init__(self) -> None:
-        """Check the values."""
-        if self.light not in LIGHT_NAMES:
-            raise ValueError(f"--light: expected one of {', '.join(LIGHT_NAMES)}, got {self.light}")
-        for part in self.parts:
-            if part not in REPORT_PARTS:
-                raise ValueError(f"--only: expected some of {', '.join(REPORT_PARTS)}, got {part}")
-        if self.workers is not None and not 1 <= self.workers <= _MOST_WORKERS:
-            raise ValueError(f"--workers: expected 1..{_MOST_WORKERS}, got {self.workers}")
-        if not self.page_mb > 0:
-            raise ValueError(f"--page-mb: expected a positive number, got {self.page_mb:g}")
+        """Check the values, and that there is such a method."""
+        super().__post_init__()
+        if self.path.is_dir():
+            raise OptionError("path", f"expected a file, got the folder {self.path}")
+        check_method(self.method, self.directories)
 
 
-@dataclass(frozen=True)
-class FuseRequest:
-    """What to fuse.
-
-    Args:
-        folders: results of ``dsr upsample``, or folders of them.
-        output: the mesh, a ``.ply`` file.
-        voxel: edge length of a voxel in metres; None for the median width of a pixel on the surfaces.
-        max_error: expected relative error of the depth from which a pixel is left out.
+def check_method(method: str, directories: tuple[Path, ...]) -> None:
+    """Check the name of a method.
 
     Raises:
-        ValueError: a value is out of range.
+        OptionError: there is no such method in the project's or the user's directories.
 
     """
-
-    folders: tuple[Path, ...]
-    output: Path
-    voxel: float | None = None
-    max_error: float = 0.02
-
-    def __post_init__(self) -> None:
-        """Check the values."""
-        if self.output.suffix.lower() != ".ply":
-            raise ValueError(f"-o: expected a file that ends in .ply, got {self.output}")
-        if self.voxel is not None and not 0 < self.voxel < float("inf"):
-            raise ValueError(f"--voxel: expected a positive number of metres, got {self.voxel:g}")
-        if not self.max_error > 0:
-            raise ValueError(f"--max-error: expected a positive percentage of the depth, got {100 * self.max_error:g}")
+    rule = one_of(list_choices("method", config_directories(directories)))
+    if not rule.holds(method):
+        raise OptionError("method", f"expected {rule.expected}, got {method!r}")
 
 
-@dataclass(frozen=True)
-class ViewRequest:
-    """What to look at.
+@dataclass(frozen=True, kw_only=True)
+class DoctorRequest(Options):
+    """What to examine."""
 
-    Args:
-        output: a result, or a folder of results.
-        page: the HTML file.
-        most: maximum number of results.
-        vertices: maximum number of vertices of a surface.
-        open_page: whether to open the page in the browser.
-
-    """
-
-    output: Path
-    page: Path
-    most: int
-    vertices: int
-    open_page: bool
-
-    def __post_init__(self) -> None:
-        """Check the numbers."""
-        if self.most < 1:
-            raise ValueError(f"--most: expected at least 1, got {self.most}")
-        if self.vertices < 1000:
-            raise ValueError(f"--vertices: expected at least 1000, got {self.vertices}")
+    directory: Path = option(..., "a scene, or a directory of scenes", "DIR", flags="directory")
+    most: int | None = option(
+        None,
+        "examine at most N scenes, taken at equal distances from all",
+        "N",
+        rule=Rule("a positive number", lambda count: count >= 1),
+    )
 
 
-@dataclass(frozen=True)
-class ExportRequest:
-    """Which network to write, and where.
+@dataclass(frozen=True, kw_only=True)
+class StudyRequest(Options):
+    """The questions of a study, and where its page goes."""
 
-    Args:
-        path: the file.
-        method: the method's name.
-        scale: the upsampling factor.
-        weights: a file of weights; None for those that the method names.
-        directories: the user's configuration directories.
+    runs: tuple[Path, ...] = option(..., "runs, or directories with runs below", "RUNS", flags="runs")
+    output: Path = option(..., "where to", "DIR", flags="-o --output")
+    choice: Choice = group(Choice)
+    overwrite: bool = option(False, "replace another study, whose answers can then no longer be collected")
 
-    """
 
-    path: Path
-    method: str
-    scale: int
-    weights: Path | None = None
-    directories: tuple[Path, ...] = ()
+@dataclass(frozen=True, kw_only=True)
+class AnswersRequest(Options):
+    """Which answers of a study to collect, and where their table goes."""
 
-    def __post_init__(self) -> None:
-        """Check what does not depend on files."""
-        if self.scale < 1:
-            raise ValueError(f"--scale: expected a factor of 1 or more, got {self.scale}")
-        if self.path.is_dir():
-            raise ValueError(f"--onnx: expected a file, got the folder {self.path}")
-        methods = list_choices("method", config_directories(self.directories))
-        if self.method not in methods:
-            raise ValueError(f"--method: expected one of {', '.join(methods)}, got {self.method!r}")
+    study: Path = option(..., "the study's directory, with key.json", "DIR", flags="study")
+    answers: tuple[Path, ...] = option(..., "files, or directories of them", "ANSWERS", flags="answers")
+    output: Path | None = option(None, "the table; DIR/study.csv by default", "FILE", flags="-o --output")

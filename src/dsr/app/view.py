@@ -33,8 +33,9 @@ def view(request: ViewRequest, console: Console) -> list[str]:
         ValueError: there is no result, none can be read, or the page would replace another file.
 
     """
-    if request.page.exists() and not (request.page.is_file() and is_view(request.page)):
-        raise ValueError(f"{request.page}: is there already and no page of `dsr view`; take another -o")
+    page = request.page or request.output / "view.html"
+    if page.exists() and not (page.is_file() and is_view(page)):
+        raise ValueError(f"{page}: is there already and no page of `dsr view`; take another -o")
     folders = find_results(request.output)
     chosen = [folders[at] for at in _spread(len(folders), request.most)]
     packed, problems = _pack(request, chosen, console)
@@ -46,11 +47,11 @@ def view(request: ViewRequest, console: Console) -> list[str]:
     if problems:
         notes.append(f"{len(problems)} of {len(chosen)} results could not be read and are left out.")
     name = request.output.resolve().name
-    save_view(request.page, packed, title=f"{name}: depth before and after", notes=notes)
+    save_view(page, packed, title=f"{name}: depth before and after", notes=notes)
     for note in notes:
         show(console, f"  {note}")
-    show(console, _summary(request.page, packed))
-    if request.open_page and not webbrowser.open(request.page.resolve().as_uri()):
+    show(console, _summary(page, packed))
+    if request.open_page and not webbrowser.open(page.resolve().as_uri()):
         show(console, "there is no browser to open it with; open it yourself, or copy it to where there is one")
     return problems
 

@@ -2,23 +2,15 @@
 
 from __future__ import annotations
 
-import argparse
-from pathlib import Path
-from typing import Any
+from dsr.app.requests import DoctorRequest
+from dsr.cli.command import Command
 
 
-def add(commands: Any) -> None:
-    """Add the command to the parser's commands."""
-    parser = commands.add_parser("doctor", help="check a directory of your own scenes")
-    parser.add_argument("directory", type=Path, metavar="DIR", help="a scene, or a directory of scenes")
-    parser.add_argument(
-        "--most", type=int, metavar="N", help="examine at most N scenes, taken at equal distances from all"
-    )
-    parser.set_defaults(run=_run)
-
-
-def _run(options: argparse.Namespace, *_: object) -> int:
+def _run(request: DoctorRequest, *_: object) -> int:
     """Examine a directory of scenes."""
-    from dsr.doctor import examine_directory  # noqa: PLC0415 - it takes seconds to import
+    from dsr.doctor import examine_directory  # noqa: PLC0415 - it takes seconds to import: after the values are checked
 
-    return examine_directory(options.directory, options.most)
+    return examine_directory(request.directory, request.most)
+
+
+add = Command("doctor", "check a directory of your own scenes", DoctorRequest, _run).add

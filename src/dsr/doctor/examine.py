@@ -51,8 +51,6 @@ def examine_directory(folder: Path, most: int | None = None) -> int:
     """
     try:
         scenes = list(find_scenes(folder)) if folder.is_dir() else []
-        if most is not None and most < 1:
-            raise ValueError(f"--most: expected a positive number, got {most}")
         if not scenes:
             came = "no scene in it" if folder.is_dir() else "no such directory"
             raise ValueError(f"{folder}: expected a scene or a directory of scenes, got {came}")

@@ -13,42 +13,19 @@ from typing import Any
 from torch import Tensor
 
 from dsr.evaluation.results import BenchmarkSetting, Results, Run, one_per_method
+from dsr.user_study.choice import Choice
 from dsr.user_study.key import KEY_NAME, PAGE_VERSION, Candidate, Key, Trial, read_key, write_key
 from dsr.user_study.page import page_of
 from dsr.user_study.pictures import grey_png, shading_of
 from dsr.utils.files import write_text
 from dsr.utils.progress import SILENT, Progress
+from dsr.utils.ratios import as_ratio
 
 PAGE_NAME = "index.html"
 _DIGITS = 12
 """Digits of a hash that make an id."""
 _FEWEST = 2
 """Minimum number of methods in a question."""
-
-
-@dataclass(frozen=True)
-class Choice:
-    """Selection of the questions, and texts of the page.
-
-    Args:
-        light: light of the renderings, e1..e4.
-        scales, downsamplings, methods, scenes: values to include; all if empty. Methods by label or by name.
-        scenes_per_person: number of scenes that each participant sees, drawn at random; None for all.
-        repeat: number of those scenes shown a second time, to measure consistency.
-        title: title of the page.
-        send_to: instruction on the last screen about the answer file.
-
-    """
-
-    light: str = "e4"
-    scales: Sequence[float] = ()
-    downsamplings: Sequence[str] = ()
-    methods: Sequence[str] = ()
-    scenes: Sequence[str] = ()
-    scenes_per_person: int | None = None
-    repeat: int = 0
-    title: str = "Which picture is most similar?"
-    send_to: str = "Send the file to the person who gave you this page."
 
 
 @dataclass(frozen=True)
@@ -173,7 +150,7 @@ def _is_selected(run: Run, choice: Choice) -> bool:
 def _expect_existing(results: Results, choice: Choice) -> None:
     """Check that each value in the choice occurs in a run."""
     available: dict[str, tuple[Sequence[Any], set[Any]]] = {
-        "scale": (choice.scales, {run.scale for run in results.runs}),
+        "scale": (tuple(map(as_ratio, choice.scales)), {run.scale for run in results.runs}),
         "downsampling": (choice.downsamplings, {run.downsampling for run in results.runs}),
         "method": (choice.methods, {name for run in results.runs for name in (run.label, run.method)}),
         "scene": (choice.scenes, {scene for run in results.runs for scene in run.scenes}),

@@ -118,8 +118,8 @@ def option(
         default: the value where it is not given; ``...`` if it has to be given.
         help: text for ``--help``.
         metavar: what stands for the value there.
-        flags: its flags, such as ``"-o --output"``, or a name without dashes for an argument by its place; by default
-            the name of the field.
+        flags: its flags, such as ``"-o --output"``, of which errors name the first; or a name without dashes for an
+            argument by its place. By default the name of the field.
         rule: what is expected of the value; of a ``Literal`` by default that it is one of its values.
         parse: makes the value of the text on the command line, or of the list of texts if it is ``repeated``.
         alone: options of a record with the same word here exclude each other.
@@ -156,19 +156,20 @@ class _Stated(NamedTuple):
 
     @property
     def flags(self) -> list[str]:
-        """Its flags, the one that errors name last."""
+        """Its flags, the one that errors name first."""
         said = self.option.flags.split() if self.option is not None else []
         return said or [f"--{self.name.replace('_', '-')}"]
 
     @property
     def by_place(self) -> bool:
         """Whether it is an argument without a flag."""
-        return not self.flags[-1].startswith("-")
+        return not self.flags[0].startswith("-")
 
     @property
     def key(self) -> str:
         """Where argparse keeps it."""
-        return self.flags[-1].lstrip("-").replace("-", "_")
+        long = [flag for flag in self.flags if flag.startswith("--")]
+        return (long or self.flags)[0].lstrip("-").replace("-", "_")
 
     @property
     def rule(self) -> Rule | None:
@@ -292,9 +293,9 @@ def _value(each: _Stated, option: _Option, came: Any) -> Any:
     try:
         return option.parse(came)
     except OptionError as error:
-        raise ValueError(f"{each.flags[-1]} {error}") from error
+        raise ValueError(f"{each.flags[0]} {error}") from error
     except ValueError as error:
-        raise ValueError(f"{each.flags[-1]}: {error}") from error
+        raise ValueError(f"{each.flags[0]}: {error}") from error
 
 
 def _is_absent(record: type[Options], given: Namespace) -> bool:
@@ -307,13 +308,13 @@ def _is_absent(record: type[Options], given: Namespace) -> bool:
     there = [each for each in _stated(record) if hasattr(given, each.key)]
     for each in _stated(record) if there else ():
         if each.required and each not in there:
-            raise ValueError(f"{there[0].flags[-1]}: expected {each.flags[-1]} with it")
+            raise ValueError(f"{there[0].flags[0]}: expected {each.flags[0]} with it")
     return not there
 
 
 def _flag_of(record: type[Options], name: str) -> str:
     """Return the flag of an option, which is of the record itself or of a group in it."""
-    found = [each.flags[-1] for each in _walk(record) if each.name == name]
+    found = [each.flags[0] for each in _walk(record) if each.name == name]
     return found[0] if found else name
 
 
