@@ -15,9 +15,9 @@ from torch import Tensor
 
 from dsr.geometry.edges import find_edges
 from dsr.geometry.registration import find_displacement, undo
-from dsr.io.encoding import parse_unit
-from dsr.io.inputs import Reading, read_picture
+from dsr.io.inputs import read_picture
 from dsr.io.pairs import Pair
+from dsr.io.reading import Reading, parse_unit
 
 _WIDTH = 560
 _HOLE, _EDGE = (160, 60, 160), (0, 0, 255)

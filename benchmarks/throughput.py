@@ -29,14 +29,8 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 
-STEPS = {
-    "frame": ("read_picture", "inputs_with_neighbours", "align", "_upsample", "write_parts"),
-    "outputs": (
-        "_write_depth", "write_renderings", "write_normals", "write_before_after", "write_input", "_write_errors",
-        "_write_shapes",
-    ),
-}  # fmt: skip
-"""Functions that a frame's time is spent with, by the module of :mod:`dsr.app.upsample` that calls them."""
+STEPS = ("read_picture", "inputs_with_neighbours", "align", "_upsample", "write_parts")
+"""Functions that :mod:`dsr.app.upsample.frame` spends a frame's time with; the last one writes the parts."""
 
 
 def render(folder: Path) -> tuple[Path, Path]:
@@ -120,7 +114,8 @@ def profile(folder: Path, source: Path, given: list[str], frames: int) -> None:
     """Print where one worker's time goes, in milliseconds of a core for a frame."""
     import torch  # noqa: PLC0415
 
-    from dsr.app.upsample import frame, outputs  # noqa: PLC0415
+    from dsr.app.upsample import frame  # noqa: PLC0415
+    from dsr.app.upsample.parts import PARTS  # noqa: PLC0415
     from dsr.cli import main as dsr  # noqa: PLC0415
 
     torch.set_num_threads(1)
@@ -139,13 +134,15 @@ def profile(folder: Path, source: Path, given: list[str], frames: int) -> None:
 
     command = ["upsample", str(source), *given, "--fov", "60", "-o"]
     dsr([*command, str(folder / "warm")])
-    for module in (frame, outputs):
-        for name in STEPS[module.__name__.rpartition(".")[2]]:
-            setattr(module, name, timed(name, getattr(module, name)))
+    for name in STEPS:
+        setattr(frame, name, timed(name, getattr(frame, name)))
+    for name, part in PARTS.items():
+        if part.write is not None:
+            PARTS[name] = part._replace(write=timed(name, part.write))
     started = time.process_time()
     dsr([*command, str(folder / "profile")])
     print(f"{1e3 * (time.process_time() - started) / frames:.0f} ms of a core for a frame, of which")
-    for name in (*STEPS["frame"], *STEPS["outputs"]):
+    for name in (*STEPS, *PARTS):
         print(f"  {name:24s} {1e3 * spent[name] / frames:7.0f} ms", flush=True)
 
 

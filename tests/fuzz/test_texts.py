@@ -58,7 +58,7 @@ def test_unit_is_a_positive_number_or_refused(text):
     try:
         unit = parse_unit(text)
     except ValueError as error:
-        expect_one_line(error, "--depth-unit: expected")
+        expect_one_line(error, "expected m, cm")
     else:
         assert 0 < unit < math.inf
 

@@ -160,7 +160,7 @@ def test_sun_rgbd_has_its_intrinsics_one_folder_up_and_turned_bits(tmp_path, cap
     assert upsample(*files, "-o", out, *DEPTH_ONLY, "--depth-unit", "sunrgbd", "--fill", "none") == 0
     assert "bits are turned back by 3, as SUN RGB-D turns them" in capsys.readouterr().out
     told = info(out)
-    assert (told["camera"]["fx"], told["camera"]["cx"], told["settings"]["turned_bits"]) == (50, 31, 3)
+    assert (told["camera"]["fx"], told["camera"]["cx"], told["settings"]["depth_unit"]) == (50, 31, "sunrgbd")
     assert abs(np.load(out / "depth_metres.npy").mean() - millimetres.mean() / 1000) < 0.02
     np.save(scene / "depth.npy", captures.depth())
     assert "expected 16-bit values for --depth-unit sunrgbd, got float64" in refused(

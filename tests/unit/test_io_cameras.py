@@ -134,7 +134,7 @@ def test_invalid_exif_focal_length_is_ignored(tmp_path, value):
 
 @pytest.mark.parametrize("choice", [{"fov": 0.0}, {"fov": 180.0}, {"fov": math.nan}, {"intrinsics": (1, 0, 1, 1)}])
 def test_impossible_camera_numbers_are_refused(choice):
-    with pytest.raises(ValueError, match=f"--{next(iter(choice))}: expected"):
+    with pytest.raises(ValueError, match=f"^{next(iter(choice))}: expected"):
         CameraChoice(**choice)
 
 

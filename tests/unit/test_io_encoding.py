@@ -65,7 +65,7 @@ def test_unit_is_a_name_a_number_or_a_fraction(text, unit):
 
 @pytest.mark.parametrize("text", ["inch", "", "0", "-1", "1/0", "nan", "inf", "1/2/3"])
 def test_unknown_unit_is_refused(text):
-    with pytest.raises(ValueError, match="--depth-unit: expected m, cm, mm or metres per value"):
+    with pytest.raises(ValueError, match="expected m, cm, mm or metres per value"):
         parse_unit(text)
 
 

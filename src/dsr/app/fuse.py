@@ -9,7 +9,8 @@ import numpy as np
 from rich.console import Console
 
 from dsr.app.requests import FuseRequest
-from dsr.app.upsample.outputs import ERRORS, INFO
+from dsr.app.upsample.outputs import INFO
+from dsr.app.upsample.parts import ERRORS
 from dsr.app.upsample.stored import read_camera, read_depth, read_errors, read_info
 from dsr.geometry.poses import as_rigid
 from dsr.geometry.tsdf import PosedMap, fuse_maps, suggest_voxel

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+from dsr.app.upsample.parts import EXPECTED_ERROR
 from dsr.geometry.lights import LIGHT_NAMES
 from dsr.user_study.choice import Choice
 from dsr.utils.config_files import config_directories, list_choices
@@ -12,8 +13,6 @@ from dsr.utils.options import OptionError, Options, Rule, at_least, group, one_o
 
 REPORT_PARTS = ("tables", "metrics", "figures", "page")
 _MOST_WORKERS = 256
-ABOVE_NOTHING = Rule("a positive percentage of the depth", lambda value: value > 0)
-"""The rule of an expected error, which may be infinite."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,7 +68,7 @@ class FuseRequest(Options):
         2.0,
         "leave pixels out whose depth is expected to be off by more (default: 2)",
         "PERCENT",
-        rule=ABOVE_NOTHING,
+        rule=EXPECTED_ERROR,
     )
 
 

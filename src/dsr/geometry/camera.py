@@ -9,14 +9,14 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from numbers import Real
-from typing import Literal, Self, get_args
+from typing import Self
 
 import numpy as np
 import torch
 from torch import Tensor
 
-RangeType = Literal["orthogonal", "perspective", "disparity"]
-RANGE_TYPES: tuple[RangeType, ...] = get_args(RangeType)
+from dsr.geometry.range_type import RANGE_TYPES, RangeType
+
 VIRTUAL_BASELINE = 0.2
 """Baseline in metres of the virtual stereo pair of a camera without a second one (Voynov et al. 2019)."""
 ASSUMED_FOV = 60.0

@@ -249,8 +249,8 @@ def _unit(
     stored: np.ndarray, holes: np.ndarray, units: FolderUnits,
 ) -> tuple[float, list[Assumption]]:  # fmt: skip
     """Return metres per value, or pixels per value of disparities, and the assumptions."""
-    if reading.unit is not None:
-        return reading.unit, []
+    if reading.metres is not None:
+        return reading.metres, []
     if range_type == "disparity":
         return 1.0, [Assumption("disparities are taken for pixels of the depth map")]
     if described.depth_unit is not None:

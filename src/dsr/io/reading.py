@@ -3,90 +3,100 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Literal
 
-if TYPE_CHECKING:
-    from dsr.geometry.camera import RangeType
+from dsr.geometry.range_type import RangeType
+from dsr.utils.options import Options, Rule, group, option, positive
 
 _UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "sunrgbd": 1e-3}
-SUNRGBD_BITS = 3
-"""How far SUN RGB-D turns the 16 bits of its millimetres to the left (``read3dPoints.m`` of its toolbox)."""
+_SUNRGBD_BITS = 3
 _LARGEST_UNIT = 1e6
 
 
-@dataclass(frozen=True)
-class CameraChoice:
-    """What the user says about the camera: at most one of the three.
+@dataclass(frozen=True, kw_only=True)
+class CameraChoice(Options):
+    """What the user says about the photo's camera: at most one of the three, the intrinsics in the photo's pixels."""
 
-    Args:
-        file: camera file, see :func:`dsr.io.cameras.read_any_camera`.
-        fov: horizontal field of view in degrees.
-        intrinsics: fx, fy, cx, cy in pixels of the photo.
+    file: Path | None = option(
+        None,
+        "camera.json, Open3D's JSON, or a 3 x 3 matrix",
+        "FILE",
+        flags="--camera",
+        alone="camera",
+        recorded=False,
+    )
+    fov: float | None = option(
+        None,
+        "horizontal field of view of the photo",
+        "DEGREES",
+        alone="camera",
+        rule=Rule("degrees from 1 to below 180", lambda degrees: 1 <= degrees < 180),
+    )
+    intrinsics: tuple[float, float, float, float] | None = option(
+        None,
+        "photo pixels",
+        ("FX", "FY", "CX", "CY"),
+        alone="camera",
+        rule=Rule(
+            "FX FY CX CY in pixels, FX and FY above 0",
+            lambda values: min(values[:2]) > 0 and all(map(math.isfinite, values)),
+        ),
+    )
 
-    """
 
-    file: Path | None = None
-    fov: float | None = None
-    intrinsics: tuple[float, float, float, float] | None = None
+@dataclass(frozen=True, kw_only=True)
+class RigFiles(Options):
+    """What the user says about a depth map that another camera than the photo's took."""
+
+    camera: Path = option(
+        ..., "camera file of a depth camera elsewhere", "FILE", flags="--depth-camera", recorded=False
+    )
+    extrinsics: Path = option(..., "matrix from the depth camera to the photo's, metres", "FILE", recorded=False)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reading(Options):
+    """What the user says about the files; None where it is to be read from the files or assumed."""
+
+    camera: CameraChoice = group(CameraChoice)
+    unit: float | Literal["sunrgbd"] | None = option(
+        None,
+        "m, cm, mm, metres per value: 0.0002, 1/5000; sunrgbd",
+        "UNIT",
+        flags="--depth-unit",
+        parse=lambda text: text if text == "sunrgbd" else parse_unit(text),
+    )
+    range_type: RangeType | None = option(None, "depth along the axis (default), along the ray, or disparity")
+    baseline: float | None = option(
+        None, "between the cameras, for disparity", "METRES", rule=positive("number of metres")
+    )
+    rig: RigFiles | None = group()
+    register: bool = option(False, "move the depth map to the photo's edges, if it lies beside them")
+    hole_value: float | None = option(None, "another value that marks missing depth", "VALUE")
+    min_confidence: float | None = option(
+        None,
+        "less confident pixels count as holes; levels 0, 1, 2 are 0, 0.5, 1",
+        "0..1",
+        rule=Rule("a fraction from 0 to 1", lambda fraction: 0 <= fraction <= 1),
+    )
 
     def __post_init__(self) -> None:
-        """Check the numbers."""
-        if self.fov is not None and not 1 <= self.fov < 180:
-            raise ValueError(f"--fov: expected degrees from 1 to below 180, got {self.fov:g}")
-        if self.intrinsics is not None and not (
-            min(self.intrinsics[:2]) > 0 and all(map(math.isfinite, self.intrinsics))
-        ):
-            came = " ".join(f"{value:g}" for value in self.intrinsics)
-            raise ValueError(f"--intrinsics: expected FX FY CX CY in pixels, FX and FY above 0, got {came}")
+        """Check the values; NaN always marks missing depth, so it is no other value that does."""
+        super().__post_init__()
+        if self.hole_value is not None and math.isnan(self.hole_value):
+            object.__setattr__(self, "hole_value", None)
 
+    @property
+    def metres(self) -> float | None:
+        """Metres per value of the depth files; pixels per value of disparities."""
+        return _UNITS["sunrgbd"] if self.unit == "sunrgbd" else self.unit
 
-@dataclass(frozen=True)
-class RigFiles:
-    """What the user says about a depth map that another camera than the photo's took.
-
-    Args:
-        camera: camera file of the depth camera, see :func:`dsr.io.cameras.read_any_camera`.
-        extrinsics: file of the transform from the depth camera to the photo's, see
-            :func:`dsr.io.poses.read_transform`.
-
-    """
-
-    camera: Path
-    extrinsics: Path
-
-
-@dataclass(frozen=True)
-class Reading:
-    """What the user says about the files; None where it is to be read from the files or assumed.
-
-    Args:
-        camera: camera of the photo.
-        unit: metres per value of the depth files; pixels per value of disparities.
-        range_type: quantity that the values measure.
-        baseline: distance in metres between the two cameras of disparities.
-        hole_value: value that stands for a hole, in addition to the usual ones.
-        min_confidence: fraction; pixels of less confidence become holes. None for no limit.
-        turned_bits: how far the bits of the values are turned left, 3 in SUN RGB-D.
-        rig: depth camera elsewhere than the photo's, whose map is to be warped into the photo's view; None where the
-            depth map is registered.
-
-    """
-
-    camera: CameraChoice = field(default_factory=CameraChoice)
-    unit: float | None = None
-    range_type: RangeType | None = None
-    baseline: float | None = None
-    hole_value: float | None = None
-    rig: RigFiles | None = None
-    min_confidence: float | None = None
-    turned_bits: int = 0
-
-    def __post_init__(self) -> None:
-        """Check the numbers."""
-        if self.min_confidence is not None and not 0 <= self.min_confidence <= 1:
-            raise ValueError(f"--min-confidence: expected a fraction from 0 to 1, got {self.min_confidence:g}")
+    @property
+    def turned_bits(self) -> int:
+        """How far the bits of the values are turned left, as in SUN RGB-D (``read3dPoints.m`` of its toolbox)."""
+        return _SUNRGBD_BITS if self.unit == "sunrgbd" else 0
 
 
 def parse_unit(text: str) -> float:
@@ -104,7 +114,5 @@ def parse_unit(text: str) -> float:
     except (ValueError, ZeroDivisionError):
         unit = math.nan
     if not 0 < unit <= _LARGEST_UNIT:
-        raise ValueError(
-            f"--depth-unit: expected m, cm, mm or metres per value such as 0.0002 or 1/5000, or sunrgbd, got {text!r}"
-        )
+        raise ValueError(f"expected m, cm, mm or metres per value such as 0.0002 or 1/5000, or sunrgbd, got {text!r}")
     return unit

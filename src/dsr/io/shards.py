@@ -31,10 +31,10 @@ def parse_shard(text: str) -> Shard:
     """Parse ``K/N``.
 
     Raises:
-        ValueError: it is something else, or K is not from 1 to N; the message names ``--shard``.
+        ValueError: it is something else, or K is not from 1 to N.
 
     """
     match = re.fullmatch(r"(\d{1,9})/(\d{1,9})", text, re.ASCII)
     if match is None or not 1 <= int(match[1]) <= int(match[2]):
-        raise ValueError(f"--shard: expected K/N with K from 1 to N, such as 3/16, got {text!r:.40}")
+        raise ValueError(f"expected K/N with K from 1 to N, such as 3/16, got {text!r:.40}")
     return Shard(int(match[1]), int(match[2]))

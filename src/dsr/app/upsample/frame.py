@@ -19,10 +19,10 @@ from dsr.app.upsample.outputs import (
     kept_surface,
     output_encoding,
     read_previous_run,
-    write_parts,
 )
+from dsr.app.upsample.parts import Result, write_parts
 from dsr.app.upsample.reporting import Messages
-from dsr.app.upsample.request import UpsampleRequest, files_of, inputs_with_neighbours, settings_of
+from dsr.app.upsample.request import UpsampleRequest, Upsampling, files_of, inputs_with_neighbours, settings_of
 from dsr.app.upsample.sequence import FrameSequence
 from dsr.degradation.sensors import Identified
 from dsr.inference import Plan, enlarged_by, find_sensor, plan, upsample_surface
@@ -37,8 +37,6 @@ from dsr.utils.versions import package_versions
 
 _WHITE = 1.5
 """Noise that is alike over fewer pixels counts as white."""
-_SHAPED_BY_ERRORS = frozenset({"cloud", "mesh", "confidence"})
-"""Parts of a result that depend on its expected errors."""
 _PACKAGES = ("dsr", "torch", "numpy", "opencv-python-headless")
 
 
@@ -56,11 +54,12 @@ class FrameWork:
 
     def __init__(self, request: UpsampleRequest, pairs: Sequence[Pair]) -> None:
         self._request, self._units = request, FolderUnits(pairs)
-        self._sequence = FrameSequence(pairs, self._read, request.neighbours, request.poses)
+        self._sequence = FrameSequence(pairs, self._read, request.frames.neighbours, request.frames.poses)
 
     def __call__(self, pair: Pair, target: Path, reporter: Messages, progress: Progress) -> str:
         """Upsample one picture, and return the outcome."""
         request, sequence = self._request, self._sequence
+        how, wanted = request.upsampling, request.results
         depends_on = inputs_with_neighbours(request, pair, sequence.neighbours(pair))
         job = _Job(request, pair, target, settings_of(request), depends_on, read_previous_run(target))
         job.expect_agreement()
@@ -69,28 +68,28 @@ class FrameWork:
             return "complete already"
         picture = self._read(pair)
         try:
-            identified = find_sensor(picture.depth_lr, request.sensor, picture.device_name)
+            identified = find_sensor(picture.depth_lr, how.sensor, picture.device_name)
         except ValueError as error:
             raise ValueError(f"--{error}") from error
         picture = _with_sensor(sequence.fuse(pair, picture), identified)
-        picture = align(picture, register=request.register)
+        picture = align(picture, register=request.reading.register)
         size_lr = (picture.depth_lr.shape[-2], picture.depth_lr.shape[-1])
         size = (picture.camera.height, picture.camera.width)
-        planned = plan(size, size_lr, request.scale, request.method, request.directories, request.settings)
+        planned = plan(size, size_lr, how.scale, how.method, how.directories, how.arguments)
         reporter.facts(picture.assumptions)
-        if request.dry_run:
+        if wanted.dry_run:
             reporter.say(f"{pair.name}: {planned.text} -> {target}")
             return "to do"
         inputs = files_of(pair, request.reading).values()
-        expect_free(target, inputs, ours=request.overwrite or job.earlier is not None)
-        errors = bool(_SHAPED_BY_ERRORS & set(request.parts))
+        expect_free(target, inputs, ours=wanted.overwrite or job.earlier is not None)
+        errors = any(part.errors for part in wanted.of_frame)
         surface = kept_surface(target, picture.camera, errors=errors) if job.reusable else None
         begin(target, job.settings, job.inputs, () if job.earlier is None else job.earlier.files)
         started = time.perf_counter()
         if surface is None:
             surface = _upsample(job, picture, identified, progress)
-            reporter.facts(_describe(surface.noise, given="noise" in request.settings))
-            reporter.facts([*_describe_outliers(surface.outliers), *_describe_holes(surface, request)])
+            reporter.facts(_describe(surface.noise, given="noise" in how.arguments))
+            reporter.facts([*_describe_outliers(surface.outliers), *_describe_holes(surface, how)])
         seconds = time.perf_counter() - started
         facts = _write(job, picture, surface, planned, seconds)
         reporter.facts(facts)
@@ -116,7 +115,7 @@ class _Job:
     @property
     def reusable(self) -> bool:
         """Whether the earlier run finished with the same inputs and settings, and may be kept."""
-        return self.earlier is not None and self.earlier.complete and self.same and not self.request.overwrite
+        return self.earlier is not None and self.earlier.complete and self.same and not self.request.results.overwrite
 
     @property
     def same(self) -> bool:
@@ -126,7 +125,7 @@ class _Job:
     def expect_agreement(self) -> None:
         """Raise ValueError if the folder holds a complete result of other inputs or settings."""
         earlier = self.earlier
-        if earlier is None or not earlier.complete or self.same or self.request.overwrite:
+        if earlier is None or not earlier.complete or self.same or self.request.results.overwrite:
             return
         if earlier.inputs != self.inputs:
             what = "other inputs: " + ", ".join(str(entry.get("file")) for entry in earlier.inputs.values())
@@ -139,8 +138,8 @@ class _Job:
         """Return whether all requested parts exist."""
         if not self.reusable or self.earlier is None:
             return False
-        there = {name.split("/")[0].split(".")[0] for name in self.earlier.files if (self.target / name).is_file()}
-        return there >= set(self.request.wanted)
+        there = {name for name in self.earlier.files if (self.target / name).is_file()}
+        return all(there & set(part.files) for part in self.request.results.of_frame)
 
 
 def _without_repeats(picture: Picture) -> Picture:
@@ -170,20 +169,20 @@ def _with_sensor(picture: Picture, identified: Identified | None) -> Picture:
 
 def _upsample(job: _Job, picture: Picture, sensor: Identified | None, progress: Progress) -> Surface:
     """Compute the high-resolution depth with its expected errors, on the CPU."""
-    request = job.request
+    how = job.request.upsampling
     with progress.task("steps") as step:
         surface = upsample_surface(
             picture.rgb,
             picture.depth_lr,
             picture.camera,
-            request.scale,
-            method=request.method,
-            settings=request.settings,
-            directories=request.directories,
-            device=request.device,
-            fill=request.fill,
-            max_hole=request.max_hole,
-            working_size=request.working_size,
+            how.scale,
+            method=how.method,
+            settings=how.arguments,
+            directories=how.directories,
+            device=how.device,
+            fill=how.fill,
+            max_hole=how.max_hole,
+            working_size=how.working_size,
             sensor=sensor,
             progress=step,
         )
@@ -210,24 +209,27 @@ def _describe_outliers(outliers: Outliers | None) -> list[Assumption]:
     return [Assumption(text, f"pixels: {outliers.pixels}, patches: {outliers.patches}")]
 
 
-def _describe_holes(surface: Surface, request: UpsampleRequest) -> list[Assumption]:
+def _describe_holes(surface: Surface, how: Upsampling) -> list[Assumption]:
     """Return a note on wide holes, if there are any."""
     share = float(surface.depth.isnan().float().mean())
-    if request.fill != "small" or not share:
+    if how.fill != "small" or not share:
         return []
-    text = f"holes wider than {request.max_hole:g} degrees stay holes"
+    text = f"holes wider than {how.max_hole:g} degrees stay holes"
     return [Assumption(text, f"{share:.1%} of the pixels; --fill all fills them, too")]
 
 
 def _write(job: _Job, picture: Picture, surface: Surface, planned: Plan, seconds: float) -> list[Assumption]:
     """Write all parts and ``info.json``, and return notes for the user."""
     started = time.perf_counter()
-    encoding = output_encoding(picture.encoding, job.request.depth_format)
+    wanted = job.request.results
+    encoding = output_encoding(picture.encoding, wanted.format)
     title = f"{readable(job.pair.name)}, {planned.method} x{planned.scale}"
-    request = job.request
-    files, facts, shapes = write_parts(job.target, picture, surface, request.wanted, encoding, title, request.limits)
+    outputs = write_parts(job.target, Result(picture, surface, encoding, title, wanted))
+    files = [name for output in outputs.values() for name in output.files]
+    facts = list(dict.fromkeys(note for output in outputs.values() for note in output.notes))
+    shapes = {name: output.shape._asdict() for name, output in outputs.items() if output.shape is not None}
     kept = job.earlier if job.earlier is not None and job.same else None
-    counts = {**(kept.shapes if kept else {}), **{part: written._asdict() for part, written in shapes.items()}}
+    counts = {**(kept.shapes if kept else {}), **shapes}
     if surface.outliers is not None:
         counts["outliers"] = surface.outliers._asdict()
     entries = {

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from dsr.app.upsample.request import UpsampleRequest
+from dsr.app.upsample.request import FrameChoice, UpsampleRequest
 from dsr.io.layouts import find_pairs_of_folder
 from dsr.io.names import in_order
 from dsr.io.pairs import Pair, PairingResult, add_confidence, find_pairs_of_lists
@@ -38,15 +38,16 @@ def find_frames(request: UpsampleRequest) -> Frames:
         ValueError: there are none.
 
     """
-    found = _search(request)
-    if request.confidence:
-        found = replace(found, pairs=add_confidence(found.pairs, request.confidence))
-    if request.rgb:
+    choice = request.frames
+    found = _search(choice, request.results.output)
+    if choice.confidence:
+        found = replace(found, pairs=add_confidence(found.pairs, choice.confidence))
+    if choice.rgb:
         found = replace(found, pairs=_by_number(found.pairs))
     whole = found.pairs
-    single = len(whole) == 1 and not request.folders and not request.rgb[0].is_dir()
-    if request.shard is not None:
-        found = replace(found, pairs=tuple(whole[number] for number in request.shard.block(len(whole))))
+    single = len(whole) == 1 and not choice.folders and not choice.rgb[0].is_dir()
+    if choice.shard is not None:
+        found = replace(found, pairs=tuple(whole[number] for number in choice.shard.block(len(whole))))
     return Frames(found, whole, single)
 
 
@@ -59,16 +60,16 @@ def _by_number(pairs: tuple[Pair, ...]) -> tuple[Pair, ...]:
     return tuple(sorted(pairs, key=lambda pair: ranks[pair.rgb]))
 
 
-def _search(request: UpsampleRequest) -> PairingResult:
+def _search(choice: FrameChoice, output: Path) -> PairingResult:
     """Return the pairs in the user's files and folders."""
-    if not request.folders:
-        return find_pairs_of_lists(request.rgb, request.depth, request.mask)
-    parts = [find_pairs_of_folder(folder, request.output) for folder in request.folders]
+    if not choice.folders:
+        return find_pairs_of_lists(choice.rgb, choice.depth, choice.mask)
+    parts = [find_pairs_of_folder(folder, output) for folder in choice.folders]
     if len(parts) == 1:
         return parts[0]
     pairs = [
         replace(pair, name=f"{folder.resolve().name}/{pair.name}")
-        for folder, part in zip(request.folders, parts, strict=True)
+        for folder, part in zip(choice.folders, parts, strict=True)
         for pair in part.pairs
     ]
     if len({pair.name for pair in pairs}) < len(pairs):

@@ -6,49 +6,26 @@ import contextlib
 import json
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
 
-from dsr.app.upsample.limits import Limits
+from dsr.app.upsample.parts import ERRORS, FILES, METRES, PARTS
 from dsr.evaluation.store import load_errors
 from dsr.geometry.camera import Camera
-from dsr.geometry.lights import LIGHT_NAMES
-from dsr.io.depth_files import DEPTH_SUFFIXES, write_depth_file
-from dsr.io.encoding import Assumption, Encoding, encode
-from dsr.io.exports import Written, write_cloud, write_mesh, write_normals, write_renderings
-from dsr.io.input_files import INPUT, write_input
+from dsr.io.encoding import Encoding
 from dsr.io.inputs import Picture
-from dsr.io.scene_files.open3d import RGBD, write_rgbd
 from dsr.methods.base import Surface
 from dsr.sample import FARTHEST, NEAREST
-from dsr.utils.files import open_array, replacing, write_text
+from dsr.utils.files import open_array, write_text
 from dsr.utils.limits import read_limited
 from dsr.utils.parsing import parse_json
-from dsr.viz.before_after import write_before_after
-from dsr.viz.confidence import write_confidence
 
 INFO = "info.json"
-METRES = "depth_metres.npy"
-ERRORS = "confidence.npz"
-_FILES: Mapping[str, tuple[str, ...]] = {
-    "depth": (*(f"depth{suffix}" for suffix in DEPTH_SUFFIXES), METRES),
-    "renderings": tuple(f"renderings/{name}.png" for name in LIGHT_NAMES),
-    "normals": ("normals.png",),
-    "cloud": ("cloud.ply",),
-    "mesh": ("mesh.ply", "mesh.glb"),
-    "before_after": ("before_after.png",),
-    "confidence": ("confidence.png", ERRORS),
-    "rgbd": tuple(f"rgbd/{name}" for name in RGBD),
-    "input": (INPUT,),
-}
-_WORTH_SAYING = 1e-3
-"""Smallest fraction of the pixels that is reported as left out."""
+_SHAPES = tuple(part.name for part in PARTS.values() if part.shape)
 
 
 @dataclass(frozen=True)
@@ -111,7 +88,7 @@ def read_previous_run(folder: Path) -> PreviousRun | None:
             inputs,
             tuple(files),
             None if noise is None else dict(noise),
-            {part: entries[part] for part in ("cloud", "mesh", "outliers") if part in entries},
+            {name: entries[name] for name in (*_SHAPES, "outliers") if name in entries},
         )
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise ValueError(f"{path}: expected a file of `dsr upsample`, got something else; take another -o") from error
@@ -129,134 +106,12 @@ def expect_free(folder: Path, inputs: Iterable[Path], *, ours: bool) -> None:
         ValueError: it would overwrite one of them.
 
     """
-    names = [name for names in _FILES.values() for name in names] + [INFO]
-    there = [folder / name for name in names if (folder / name).exists()]
+    there = [folder / name for name in (*FILES, INFO) if (folder / name).exists()]
     for path in there:
         if any(path.samefile(other) for other in inputs):
             raise ValueError(f"{path}: the result would overwrite its input; take another -o")
     if there and not ours:
         raise ValueError(f"{there[0]}: is there already and not of an earlier run; take another -o, or --overwrite")
-
-
-def write_parts(
-    folder: Path,
-    picture: Picture,
-    surface: Surface,
-    parts: Sequence[str],
-    encoding: Encoding,
-    title: str,
-    limits: Limits | None = None,
-) -> tuple[list[str], list[Assumption], dict[str, Written]]:
-    """Write the parts of a result.
-
-    Args:
-        folder: the result's folder, created if it is missing.
-        picture: the input.
-        surface: the result.
-        parts: some of :data:`dsr.app.upsample.parts.PARTS`, and ``rgbd``.
-        encoding: the depth file's encoding.
-        title: the title of the before-and-after picture.
-        limits: what cloud and mesh leave out.
-
-    Returns:
-        The names of the files, notes for the user, and the numbers of points and triangles by part.
-
-    """
-    rgb, camera, depth = picture.rgb, picture.camera, surface.depth
-    facts: list[Assumption] = []
-    shapes: dict[str, Written] = {}
-    files: list[str] = []
-    with ThreadPoolExecutor(1) as beside:  # shapes take as long as all the rest
-        wanted = {"cloud", "mesh"} & set(parts)
-        shaping = beside.submit(_write_shapes, folder, picture, surface, parts, limits or Limits()) if wanted else None
-        if "depth" in parts:
-            files, facts = _write_depth(folder, depth, camera, encoding)
-        if "renderings" in parts:
-            write_renderings(folder / "renderings", depth, camera)
-        if "normals" in parts:
-            write_normals(folder / "normals.png", depth, camera)
-        if "before_after" in parts:
-            write_before_after(folder / "before_after.png", rgb, picture.depth_lr, depth, camera, title)
-        if "input" in parts:
-            write_input(folder / INPUT, rgb, picture.depth_lr)
-        if "confidence" in parts and not _write_errors(folder, surface):
-            parts = [part for part in parts if part != "confidence"]
-        rgbd_facts = write_rgbd(folder / "rgbd", rgb, depth, camera) if "rgbd" in parts else []
-        if shaping is not None:
-            missing, notes, shapes = shaping.result()
-            parts = [part for part in parts if part not in missing]
-            facts += notes
-    files += [name for part in parts if part != "depth" for name in _FILES[part]]
-    return files, [*facts, *rgbd_facts], shapes
-
-
-def _write_shapes(
-    folder: Path, picture: Picture, surface: Surface, parts: Sequence[str], limits: Limits
-) -> tuple[list[str], list[Assumption], dict[str, Written]]:
-    """Write cloud and mesh without pixels that are likely to be wrong; return what could not be, notes and numbers."""
-    facts: list[Assumption] = []
-    shapes: dict[str, Written] = {}
-    depth = surface.depth
-    if surface.depth_error is not None:
-        doubtful = surface.depth_error > limits.error * depth
-        depth = depth.masked_fill(doubtful, torch.nan)
-        share = float(doubtful.float().mean())
-        if share >= _WORTH_SAYING:
-            text = f"expected to be off by more than {limits.error:.1%} of their depth"
-            facts.append(Assumption("left out of cloud and mesh", f"{share:.1%} of the pixels, {text}"))
-    if not bool(depth.isfinite().any()):
-        return ["cloud", "mesh"], [*facts, Assumption("no cloud and no mesh", "no pixel is left")], shapes
-    rgb, camera = picture.rgb, picture.camera
-    if "cloud" in parts:
-        shapes["cloud"] = write_cloud(folder / "cloud.ply", rgb, depth, camera, most=limits.points)
-    missing = []
-    if "mesh" in parts:
-        files = [folder / name for name in _FILES["mesh"]]
-        try:
-            shapes["mesh"] = write_mesh(files, rgb, depth, camera, most=limits.faces)
-        except ValueError as error:
-            missing.append("mesh")
-            facts.append(Assumption("no mesh", str(error)))
-    facts += _describe_reduction(shapes)
-    return missing, facts, shapes
-
-
-def _describe_reduction(shapes: Mapping[str, Written]) -> list[Assumption]:
-    """Return notes on cloud and mesh, by part, that have less than the depth map gives."""
-    words = {"cloud": ("points", "--max-points"), "mesh": ("triangles", "--max-faces")}
-    return [
-        Assumption("the {} has fewer {} than the depth map gives ({})".format(part, *words[part]), str(written))
-        for part, written in shapes.items()
-        if written.how
-    ]
-
-
-def _write_errors(folder: Path, surface: Surface) -> bool:
-    """Write the expected errors as a picture and as arrays; return whether there are any."""
-    if surface.depth_error is None or surface.angle_error is None:
-        return False
-    write_confidence(folder / "confidence.png", surface.depth, surface.depth_error, surface.angle_error)
-    with replacing(folder / ERRORS) as temporary, temporary.open("wb") as file:
-        np.savez(file, allow_pickle=False, **surface.error_arrays())
-    return True
-
-
-def _write_depth(folder: Path, depth: Tensor, camera: Camera, encoding: Encoding) -> tuple[list[str], list[Assumption]]:
-    """Write the depth in the output's encoding, and also in metres if that is a different one."""
-    values, lost = encode(depth, encoding, camera)
-    name = f"depth{encoding.suffix}"
-    facts = []
-    if lost:
-        text = f"{name}: what {encoding.dtype} values of this unit cannot hold is written as a hole; {METRES} has all"
-        facts.append(Assumption(text, f"{lost} pixels"))
-    write_depth_file(folder / name, values)
-    if replace(encoding, hole=0.0) == Encoding(".npy", "float32", 1.0, 0.0, "orthogonal") and math.isnan(encoding.hole):
-        return [name], facts
-    with replacing(folder / METRES) as temporary:
-        np.save(temporary, depth[0].float().cpu().numpy())
-    if np.dtype(encoding.dtype).kind in "iu":
-        facts.append(Assumption(f"{name} is in whole numbers like the input; {METRES} is not rounded"))
-    return [name, METRES], facts
 
 
 def kept_surface(folder: Path, camera: Camera, *, errors: bool) -> Surface | None:
@@ -293,7 +148,7 @@ def begin(folder: Path, settings: Mapping[str, Any], inputs: Mapping[str, Any], 
 def finish(folder: Path, earlier: PreviousRun | None, entries: Mapping[str, Any], files: Sequence[str]) -> None:
     """Write ``info.json`` of a finished run, and remove files of an earlier run that do not belong to it."""
     for name in () if earlier is None else earlier.files:
-        if name not in files and any(name in names for names in _FILES.values()):
+        if name not in files and name in FILES:
             (folder / name).unlink(missing_ok=True)
     write_text(folder / INFO, json.dumps({"complete": True, **entries, "files": list(files)}, indent=2) + "\n")
 

@@ -1,24 +1,363 @@
-"""The names of what is written."""
+"""What ``dsr upsample`` writes: one table, which its options, its checks and its folders read."""
 
 from __future__ import annotations
 
+import functools
 import importlib.util
-from collections.abc import Sequence
+import math
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
 
-PARTS = ("depth", "renderings", "normals", "cloud", "mesh", "before_after", "confidence", "input")
-"""What is written unless something else is asked for."""
-MORE_PARTS = ("rgbd", "open3d", "nerfstudio", "gaussian", "rerun")
-"""What is written if it is asked for; all but the first are of all frames, see :mod:`dsr.app.upsample.scene`."""
-SCENE_PARTS = MORE_PARTS[1:]
+from dsr.geometry.lights import LIGHT_NAMES
+from dsr.utils.limits import MOST_FACES, MOST_POINTS
+from dsr.utils.options import Options, Rule, at_least, one_of, option
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from dsr.io.encoding import Assumption, Encoding
+    from dsr.io.exports import Written
+    from dsr.io.inputs import Picture
+    from dsr.io.scene_files.frame import Frame
+    from dsr.methods.base import Surface
+
 FORMATS = ("png", "tiff", "npy", "npz", "pfm", "exr")
+METRES = "depth_metres.npy"
+ERRORS = "confidence.npz"
+_WORTH_SAYING = 1e-3
+"""Smallest fraction of the pixels that is reported as left out."""
 
 
-def check_libraries(parts: Sequence[str]) -> None:
-    """Check that the libraries of some parts are installed.
+@dataclass(frozen=True)
+class Result:
+    """A result to write, and what is wanted of it.
 
-    Raises:
-        ValueError: one is not.
+    Args:
+        picture: the input.
+        surface: the depth with its expected errors.
+        encoding: how the depth file stores it.
+        title: the title of the before-and-after picture.
+        wanted: the options of the results.
 
     """
-    if "rerun" in parts and importlib.util.find_spec("rerun") is None:
-        raise ValueError("--with rerun: expected the library rerun-sdk, which `pip install dsr[rerun]` installs")
+
+    picture: Picture
+    surface: Surface
+    encoding: Encoding
+    title: str
+    wanted: Results
+
+    @functools.cached_property
+    def certain(self) -> tuple[Tensor | None, tuple[Assumption, ...]]:
+        """The depth, (1, H, W), without pixels that are likely to be wrong, None if none is left; and notes."""
+        from dsr.io.encoding import Assumption
+
+        depth, notes = self.surface.depth, list[Assumption]()
+        if self.surface.depth_error is not None:
+            limit = self.wanted.max_error / 100
+            doubtful = self.surface.depth_error > limit * depth
+            depth = depth.masked_fill(doubtful, math.nan)
+            share = float(doubtful.float().mean())
+            if share >= _WORTH_SAYING:
+                text = f"{share:.1%} of the pixels, expected to be off by more than {limit:.1%} of their depth"
+                notes.append(Assumption("left out of cloud and mesh", text))
+        if bool(depth.isfinite().any()):
+            return depth, tuple(notes)
+        return None, (*notes, Assumption("no cloud and no mesh", "no pixel is left"))
+
+
+class Output(NamedTuple):
+    """What a part wrote: the names of the files, notes for the user, and how much of a shape."""
+
+    files: Sequence[str]
+    notes: Sequence[Assumption] = ()
+    shape: Written | None = None
+
+
+class Part(NamedTuple):
+    """A part of the results.
+
+    Args:
+        name: its name in the options.
+        files: names of all files or folders that it may write.
+        write: writes it into a picture's folder; None as the result stands for all ``files``.
+        write_all: writes it of all frames together to a path.
+        needs: parts of each frame that it is made of.
+        usual: whether it is written unless something else is asked for.
+        shape: whether it takes as long as all the rest, and is written beside it.
+        errors: whether it depends on the expected errors.
+        library: a module that it needs, its package, and the extra of dsr that installs it.
+
+    """
+
+    name: str
+    files: tuple[str, ...]
+    write: Callable[[Path, Result], Output | None] | None = None
+    write_all: Callable[[Path, Sequence[Frame]], list[Path]] | None = None
+    needs: tuple[str, ...] = ()
+    usual: bool = True
+    shape: bool = False
+    errors: bool = False
+    library: tuple[str, str, str] | None = None
+
+    def check_library(self) -> None:
+        """Raise ValueError if the library is not installed."""
+        if self.library is not None and importlib.util.find_spec(self.library[0]) is None:
+            _, package, extra = self.library
+            install = f"`pip install dsr[{extra}]`"
+            raise ValueError(f"--with {self.name}: expected the library {package}, which {install} installs")
+
+
+def _depth(folder: Path, result: Result) -> Output:
+    """Write the depth in the output's encoding, and also in metres if that is a different one."""
+    import numpy as np
+
+    from dsr.io.depth_files import write_depth_file
+    from dsr.io.encoding import Assumption, Encoding, encode
+    from dsr.utils.files import replacing
+
+    depth, encoding = result.surface.depth, result.encoding
+    values, lost = encode(depth, encoding, result.picture.camera)
+    name = f"depth{encoding.suffix}"
+    notes = []
+    if lost:
+        text = f"{name}: what {encoding.dtype} values of this unit cannot hold is written as a hole; {METRES} has all"
+        notes.append(Assumption(text, f"{lost} pixels"))
+    write_depth_file(folder / name, values)
+    if replace(encoding, hole=0.0) == Encoding(".npy", "float32", 1.0, 0.0, "orthogonal") and math.isnan(encoding.hole):
+        return Output((name,), notes)
+    with replacing(folder / METRES) as temporary:
+        np.save(temporary, depth[0].float().cpu().numpy())
+    if np.dtype(encoding.dtype).kind in "iu":
+        notes.append(Assumption(f"{name} is in whole numbers like the input; {METRES} is not rounded"))
+    return Output((name, METRES), notes)
+
+
+def _renderings(folder: Path, result: Result) -> None:
+    from dsr.io.exports import write_renderings
+
+    write_renderings(folder / "renderings", result.surface.depth, result.picture.camera)
+
+
+def _normals(folder: Path, result: Result) -> None:
+    from dsr.io.exports import write_normals
+
+    write_normals(folder / "normals.png", result.surface.depth, result.picture.camera)
+
+
+def _cloud(folder: Path, result: Result) -> Output:
+    from dsr.io.exports import write_cloud
+
+    depth, notes = result.certain
+    if depth is None:
+        return Output((), notes)
+    picture, most = result.picture, result.wanted.max_points
+    shape = write_cloud(folder / "cloud.ply", picture.rgb, depth, picture.camera, most=most)
+    return Output(("cloud.ply",), (*notes, *_fewer("cloud", "points", "--max-points", shape)), shape)
+
+
+def _mesh(folder: Path, result: Result) -> Output:
+    from dsr.io.encoding import Assumption
+    from dsr.io.exports import write_mesh
+
+    depth, notes = result.certain
+    if depth is None:
+        return Output((), notes)
+    files, picture, most = ("mesh.ply", "mesh.glb"), result.picture, result.wanted.max_faces
+    try:
+        shape = write_mesh([folder / name for name in files], picture.rgb, depth, picture.camera, most=most)
+    except ValueError as error:
+        return Output((), (*notes, Assumption("no mesh", str(error))))
+    return Output(files, (*notes, *_fewer("mesh", "triangles", "--max-faces", shape)), shape)
+
+
+def _fewer(part: str, what: str, option: str, shape: Written) -> list[Assumption]:
+    """Return a note on a shape that has less than the depth map gives."""
+    from dsr.io.encoding import Assumption
+
+    text = f"the {part} has fewer {what} than the depth map gives ({option})"
+    return [Assumption(text, str(shape))] if shape.how else []
+
+
+def _before_after(folder: Path, result: Result) -> None:
+    from dsr.viz.before_after import write_before_after
+
+    picture, depth = result.picture, result.surface.depth
+    path = folder / "before_after.png"
+    write_before_after(path, picture.rgb, picture.depth_lr, depth, picture.camera, result.title)
+
+
+def _confidence(folder: Path, result: Result) -> Output | None:
+    import numpy as np
+
+    from dsr.utils.files import replacing
+    from dsr.viz.confidence import write_confidence
+
+    surface = result.surface
+    if surface.depth_error is None or surface.angle_error is None:
+        return Output(())
+    write_confidence(folder / "confidence.png", surface.depth, surface.depth_error, surface.angle_error)
+    with replacing(folder / ERRORS) as temporary, temporary.open("wb") as file:
+        np.savez(file, allow_pickle=False, **surface.error_arrays())
+    return None
+
+
+def _input(folder: Path, result: Result) -> None:
+    from dsr.io.input_files import INPUT, write_input
+
+    write_input(folder / INPUT, result.picture.rgb, result.picture.depth_lr)
+
+
+def _rgbd(folder: Path, result: Result) -> Output:
+    from dsr.io.scene_files.open3d import RGBD, write_rgbd
+
+    notes = write_rgbd(folder / "rgbd", result.picture.rgb, result.surface.depth, result.picture.camera)
+    return Output([f"rgbd/{name}" for name in RGBD], notes)
+
+
+def _open3d(path: Path, frames: Sequence[Frame]) -> list[Path]:
+    from dsr.io.scene_files.open3d import write_open3d
+
+    return write_open3d(path, frames)
+
+
+def _nerfstudio(path: Path, frames: Sequence[Frame]) -> list[Path]:
+    from dsr.io.scene_files.nerfstudio import write_transforms
+
+    return write_transforms(path, frames)
+
+
+def _gaussian(path: Path, frames: Sequence[Frame]) -> list[Path]:
+    from dsr.io.scene_files.splatting import write_splatting
+
+    return write_splatting(path, frames)
+
+
+def _rerun(path: Path, frames: Sequence[Frame]) -> list[Path]:
+    from dsr.io.scene_files.rerun import write_rerun
+
+    return write_rerun(path, frames)
+
+
+_OF_DEPTH = ("depth", "rgbd")
+PARTS: dict[str, Part] = {
+    part.name: part
+    for part in (
+        Part("depth", (*(f"depth.{suffix}" for suffix in (*FORMATS, "tif")), METRES), _depth),
+        Part("renderings", tuple(f"renderings/{light}.png" for light in LIGHT_NAMES), _renderings),
+        Part("normals", ("normals.png",), _normals),
+        Part("cloud", ("cloud.ply",), _cloud, shape=True, errors=True),
+        Part("mesh", ("mesh.ply", "mesh.glb"), _mesh, shape=True, errors=True),
+        Part("before_after", ("before_after.png",), _before_after),
+        Part("confidence", ("confidence.png", ERRORS), _confidence, errors=True),
+        Part("input", ("input.npz",), _input),
+        Part("rgbd", ("rgbd/color.png", "rgbd/depth.png", "rgbd/intrinsic.json"), _rgbd, usual=False),
+        Part("open3d", ("open3d",), write_all=_open3d, needs=_OF_DEPTH, usual=False),
+        Part("nerfstudio", ("transforms.json",), write_all=_nerfstudio, needs=_OF_DEPTH, usual=False),
+        Part("gaussian", ("gaussian",), write_all=_gaussian, needs=_OF_DEPTH, usual=False),
+        Part("rerun", ("scene.rrd",), write_all=_rerun, needs=_OF_DEPTH, usual=False,
+             library=("rerun", "rerun-sdk", "rerun")),
+    )
+}  # fmt: skip
+"""All parts by their names, in the order in which they are listed."""
+_USUAL = tuple(part.name for part in PARTS.values() if part.usual)
+_MORE = tuple(part.name for part in PARTS.values() if not part.usual)
+FILES = tuple(name for part in PARTS.values() if part.write is not None for name in part.files)
+"""All files that may be in the folder of a picture's results beside ``info.json``."""
+EXPECTED_ERROR = Rule("a positive percentage of the depth", lambda percent: percent > 0)
+
+
+def _words(text: str) -> tuple[str, ...]:
+    """Return the words between commas."""
+    return tuple(word.strip() for word in text.split(",") if word.strip())
+
+
+@dataclass(frozen=True, kw_only=True)
+class Results(Options):
+    """What is written, and where."""
+
+    output: Path = option(..., "folder of the results", "OUT", flags="-o --output", recorded=False)
+    format: str | None = option(
+        None, f"of the depth: {', '.join(FORMATS)} (the input's)", "FORMAT", rule=one_of(FORMATS)
+    )
+    only: tuple[str, ...] | None = option(
+        None, f"some of {','.join(PARTS)}", "PARTS", parse=_words, alone="parts", recorded=False
+    )
+    without: tuple[str, ...] = option((), "all but these", "PARTS", parse=_words, alone="parts", recorded=False)
+    more: tuple[str, ...] = option(
+        (), f"also these: {','.join(_MORE)}; see docs/export.md", "PARTS", flags="--with", parse=_words, recorded=False
+    )
+    max_error: float = option(
+        2.0,
+        "leave pixels out of cloud and mesh whose depth is expected to be off by more (default: 2)",
+        "PERCENT",
+        rule=EXPECTED_ERROR,
+    )
+    max_faces: int = option(
+        MOST_FACES,
+        f"simplify the mesh beyond N triangles (default: {MOST_FACES // 10**6} million)",
+        "N",
+        rule=at_least(100),
+    )
+    max_points: int = option(
+        MOST_POINTS,
+        f"thin the cloud beyond N points (default: {MOST_POINTS // 10**6} million)",
+        "N",
+        rule=at_least(100),
+    )
+    overwrite: bool = option(False, "redo existing results, replace other ones", recorded=False)
+    dry_run: bool = option(False, "read the files and say what would be done", recorded=False)
+
+    def __post_init__(self) -> None:
+        """Check the values, and that there is something to write."""
+        super().__post_init__()
+        for name in (*(self.only or ()), *self.without, *self.more):
+            if name not in PARTS:
+                known = ", ".join(PARTS)
+                raise ValueError(f"--only, --with, --without: expected some of {known}, got {name!r}")
+        if not self.names:
+            raise ValueError("--only, --without: expected something to be left to write, got nothing")
+        for part in self.of_all:
+            part.check_library()
+
+    @functools.cached_property
+    def names(self) -> tuple[str, ...]:
+        """Names of the parts that are asked for, in the table's order."""
+        usual = [name for name in _USUAL if name not in self.without] if self.only is None else self.only
+        return tuple(name for name in PARTS if name in (*usual, *self.more))
+
+    @functools.cached_property
+    def of_frame(self) -> tuple[Part, ...]:
+        """Parts of each frame, and those that others are made of."""
+        needed = {need for name in self.names for need in PARTS[name].needs}
+        return tuple(part for part in PARTS.values() if part.write and part.name in {*self.names, *needed})
+
+    @functools.cached_property
+    def of_all(self) -> tuple[Part, ...]:
+        """Parts of all frames together."""
+        return tuple(PARTS[name] for name in self.names if PARTS[name].write_all)
+
+
+def write_parts(folder: Path, result: Result) -> dict[str, Output]:
+    """Write the parts of a picture's result, and return what each wrote.
+
+    Args:
+        folder: the result's folder, created if it is missing.
+        result: the result.
+
+    """
+    parts = result.wanted.of_frame
+    with ThreadPoolExecutor(1) as beside:  # shapes take as long as all the rest
+        shapes = {part.name: beside.submit(_write, part, folder, result) for part in parts if part.shape}
+        others = {part.name: _write(part, folder, result) for part in parts if not part.shape}
+        written = others | {name: shape.result() for name, shape in shapes.items()}
+    return {part.name: written[part.name] for part in parts}
+
+
+def _write(part: Part, folder: Path, result: Result) -> Output:
+    """Write a part."""
+    output = part.write(folder, result) if part.write is not None else None
+    return Output(part.files) if output is None else output

@@ -2,163 +2,177 @@
 
 from __future__ import annotations
 
-import functools
-import math
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
-from dsr.app.upsample.limits import LARGEST_ERROR, Limits
-from dsr.app.upsample.parts import FORMATS, MORE_PARTS, PARTS, SCENE_PARTS, check_libraries
+from dsr.app.requests import check_method
+from dsr.app.upsample.parts import Results
 from dsr.inference.options import DEFAULT, USUAL_SCALE, WIDEST, Fill
 from dsr.io.reading import Reading
-from dsr.io.shards import Shard
-from dsr.utils.config_files import config_directories, list_choices
+from dsr.io.shards import Shard, parse_shard
 from dsr.utils.hashing import file_hash, hash_outside_code
-from dsr.utils.limits import MOST_FACES, MOST_POINTS
+from dsr.utils.options import OptionError, Options, Rule, group, option, positive, recorded
 
 if TYPE_CHECKING:
     from dsr.io.frames import Record, Source
     from dsr.io.pairs import Pair
 
 SHORTCUTS = ("noise", "smooth")
-"""Settings of the method that have an option of their own."""
+"""Arguments of the method that have an option of their own."""
 
 
-@dataclass(frozen=True)
-class UpsampleRequest:
-    """What to upsample, how, and which results to write.
+def _parse_settings(texts: list[str]) -> tuple[tuple[str, Any], ...]:
+    """Return the arguments of a method."""
+    from dsr.app.upsample.settings import parse_settings  # noqa: PLC0415 - few commands need OmegaConf
 
-    Args:
-        output: the folder of the results.
-        folders: the folders that are searched for pairs.
-        rgb, depth, mask: files, or one folder each of the first two.
-        confidence: files of confidence maps, or a folder of them.
-        reading: how to read the files.
-        method, settings, directories, scale, device, fill, max_hole, working_size, sensor: see
-            :func:`dsr.inference.engine.upsample_surface`.
-        max_error: expected relative error of the depth from which a pixel is left out of cloud and mesh.
-        max_faces: triangles from which a mesh is simplified.
-        max_points: points from which a cloud is thinned.
-        depth_format: the result's format; None for the input's.
-        shard: the block of the frames to work on; None for all.
-        workers: number of processes that work at a time.
-        register: whether to move each depth map to the photo's edges.
-        neighbours: number of frames beside itself that vote on each frame's depth.
-        poses: file of the frames' poses; None for those of the capture.
-        parts: what to write, some of :data:`dsr.app.upsample.parts.PARTS` and ``MORE_PARTS``.
-        overwrite: whether to replace existing results.
-        dry_run: whether to show only what would be done.
+    return tuple(parse_settings(texts).items())
 
-    """
 
-    output: Path
-    folders: tuple[Path, ...] = ()
-    rgb: tuple[Path, ...] = ()
-    depth: tuple[Path, ...] = ()
-    mask: tuple[Path, ...] = ()
-    confidence: tuple[Path, ...] = ()
-    reading: Reading = field(default_factory=Reading)
-    method: str = DEFAULT
-    settings: Mapping[str, Any] = field(default_factory=dict)
-    directories: tuple[Path, ...] = ()
-    scale: int | None = None
-    device: str = "auto"
-    fill: Fill = "small"
-    max_hole: float = WIDEST
-    working_size: int | None = None
-    sensor: str = "auto"
-    max_error: float = LARGEST_ERROR
-    max_faces: int = MOST_FACES
-    max_points: int = MOST_POINTS
-    depth_format: str | None = None
-    shard: Shard | None = None
-    workers: int = 1
-    register: bool = False
-    neighbours: int = 0
-    poses: Path | None = None
-    parts: tuple[str, ...] = PARTS
-    overwrite: bool = False
-    dry_run: bool = False
+@dataclass(frozen=True, kw_only=True)
+class FrameChoice(Options):
+    """Which frames to work on, and how many at a time."""
+
+    folders: tuple[Path, ...] = option(
+        (), "folders of photos and depth maps, or captures", "FOLDER", flags="folders", recorded=False
+    )
+    rgb: tuple[Path, ...] = option((), "photos, or a folder of them", "PHOTO", recorded=False)
+    depth: tuple[Path, ...] = option((), "depth maps, one for each photo", "MAP", recorded=False)
+    mask: tuple[Path, ...] = option((), "pictures, 0 where depth is missing", "MASK", recorded=False)
+    confidence: tuple[Path, ...] = option((), "confidence maps, or a folder of them", "MAP", recorded=False)
+    shard: Shard | None = option(
+        None,
+        "only the K-th of N blocks of the frames, for a task of an array; see docs/sequences.md",
+        "K/N",
+        parse=parse_shard,
+        recorded=False,
+    )
+    neighbours: int = option(
+        0,
+        "frames of a folder that vote on each frame's depth, 4 for two on either side; needs poses",
+        "N",
+        rule=Rule("0 or a positive number of frames", lambda count: count >= 0),
+    )
+    poses: Path | None = option(None, "camera poses: TUM's format, or 4 x 4 matrices", "FILE", recorded=False)
+    workers: int = option(
+        1,
+        "pictures at a time, each in its own process (default: 1)",
+        "N",
+        rule=Rule("1 or more", lambda count: count >= 1),
+        recorded=False,
+    )
 
     def __post_init__(self) -> None:
-        """Check everything that does not depend on the files."""
-        for name, value, choices in (
-            ("--method", self.method, list_choices("method", config_directories(self.directories))),
-            ("--format", self.depth_format, FORMATS),
-        ):
-            if value is not None and value not in choices:
-                raise ValueError(f"{name}: expected one of {', '.join(choices)}, got {value!r}")
-        for part in self.parts:
-            if part not in (*PARTS, *MORE_PARTS):
-                known = ", ".join((*PARTS, *MORE_PARTS))
-                raise ValueError(f"--only, --with, --without: expected some of {known}, got {part!r}")
-        if not self.parts:
-            raise ValueError("--only, --without: expected something to be left to write, got nothing")
+        """Check the values, and that the files fit together."""
+        super().__post_init__()
         if bool(self.folders) == bool(self.rgb or self.depth) or bool(self.rgb) != bool(self.depth):
             raise ValueError("expected --rgb and --depth, or folders that hold both")
         if self.folders and self.mask:
-            raise ValueError("--mask: expected --rgb and --depth with it, got folders")
-        if self.confidence and self.reading.min_confidence is None:
-            raise ValueError(
-                "--confidence: expected --min-confidence with it, the fraction below which pixels are holes"
-            )
-        if not 0 < self.max_hole < math.inf:
-            raise ValueError(f"--max-hole: expected a positive number of degrees, got {self.max_hole:g}")
-        self.limits.check()
-        check_libraries(self.scene_parts)
-        self._check_frames()
-        self._check_method()
-        self._check_sensor()
-
-    @property
-    def limits(self) -> Limits:
-        """What cloud and mesh leave out."""
-        return Limits(self.max_error, self.max_faces, self.max_points)
-
-    @property
-    def scene_parts(self) -> tuple[str, ...]:
-        """Parts of all frames together."""
-        return tuple(part for part in self.parts if part in SCENE_PARTS)
-
-    @functools.cached_property
-    def wanted(self) -> tuple[str, ...]:
-        """Parts of each frame; those of all frames are made of its depth and ``rgbd``."""
-        needed = ("depth", "rgbd") if self.scene_parts else ()
-        return tuple(dict.fromkeys((*(part for part in self.parts if part not in SCENE_PARTS), *needed)))
-
-    def _check_frames(self) -> None:
-        """Check what is said about a sequence."""
-        if self.workers < 1:
-            raise ValueError(f"--workers: expected 1 or more, got {self.workers}")
-        if self.neighbours < 0:
-            raise ValueError(f"--neighbours: expected 0 or a positive number of frames, got {self.neighbours}")
+            raise OptionError("mask", "expected --rgb and --depth with it, got folders")
         if self.poses is not None and len(self.folders) > 1:
-            raise ValueError(f"--poses: expected the frames of one folder, got {len(self.folders)} folders")
+            raise OptionError("poses", f"expected the frames of one folder, got {len(self.folders)} folders")
 
-    def _check_sensor(self) -> None:
-        """Check the name of the sensor."""
-        if self.sensor in ("auto", "none"):
-            return
-        from dsr.degradation.sensors import sensor_named  # noqa: PLC0415 - other values are refused without torch
 
-        try:
-            sensor_named(self.sensor)
-        except ValueError as error:
-            raise ValueError(f"--{error}") from error
+@dataclass(frozen=True, kw_only=True)
+class Upsampling(Options):
+    """The method, and how it works; see :func:`dsr.inference.engine.upsample_surface`."""
+
+    method: str = option(
+        DEFAULT, "facets (default), for clean and noisy depth; or another: tgv, guided_filter, dip_v, ...", "NAME"
+    )
+    noise: float | None = option(
+        None, "standard deviation of the depth map's noise (default: estimated)", "METRES", recorded=False
+    )
+    smooth: float | None = option(
+        None, "0 keeps what may be noise, 2 smooths more; 1 is neutral", "0..2", recorded=False
+    )
+    settings: tuple[tuple[str, Any], ...] = option(
+        (),
+        "an argument of the method, as in its file in conf/method: data_weight=30; may be repeated",
+        "KEY=VALUE",
+        flags="--set",
+        parse=_parse_settings,
+        repeated=True,
+        recorded=False,
+    )
+    directories: tuple[Path, ...] = option(
+        (),
+        "a folder with a method/ of your own YAML files; may be repeated",
+        "DIR",
+        flags="--config-dir",
+        repeated=True,
+        recorded=False,
+    )
+    scale: int | None = option(None, "upsampling factor (default: from the sizes)", "N")
+    device: str = option("auto", "auto (default), cpu, cuda, cuda:1, ...", "DEVICE", recorded=False)
+    fill: Fill = option("small", "which of the input's holes are filled")
+    max_hole: float = option(
+        WIDEST,
+        f"width of the widest hole that --fill small fills, degrees of view (default: {WIDEST:g})",
+        "DEGREES",
+        rule=positive("number of degrees"),
+    )
+    size: Literal["auto", "1", "2", "4", "8", "16"] = option(
+        "auto",
+        "by what facets divides the map's size first; auto: as its noise suggests",
+        flags="--working-size",
+    )
+    sensor: str = option(
+        "auto",
+        "what measured the depth, such as 'RealSense D435'; auto: as the depth values or the files tell",
+        "auto|none|NAME",
+    )
+
+    def __post_init__(self) -> None:
+        """Check the values, and that there is such a method."""
+        super().__post_init__()
+        check_method(self.method, self.directories)
+        for name, value in self.settings:
+            if name in self._shortcuts:
+                raise OptionError(name, f"expected it once, got --set {name}={value}, too")
+
+    @property
+    def _shortcuts(self) -> dict[str, float]:
+        """Those of :data:`SHORTCUTS` that are given."""
+        return {name: value for name in SHORTCUTS if (value := getattr(self, name)) is not None}
+
+    @property
+    def arguments(self) -> dict[str, Any]:
+        """Arguments of the method that are given."""
+        return dict(self.settings) | self._shortcuts
+
+    @property
+    def working_size(self) -> int | None:
+        """By what the map's size is divided first; None where its noise decides."""
+        return None if self.size == "auto" else int(self.size)
+
+    def check_slowly(self) -> None:
+        """Check what takes seconds: that the method accepts its arguments, and the name of the sensor.
+
+        Raises:
+            ValueError: it does not, or there is no such sensor; the message begins with the option.
+
+        """
+        if self.arguments or self.working_size is not None:
+            self._check_method()
+        if self.sensor not in ("auto", "none"):
+            from dsr.degradation.sensors import sensor_named  # noqa: PLC0415 - other values are refused without torch
+
+            try:
+                sensor_named(self.sensor)
+            except ValueError as error:
+                raise ValueError(f"--{error}") from error
 
     def _check_method(self) -> None:
-        """Check that the method accepts the settings."""
-        if not self.settings and self.working_size is None:
-            return
+        """Check that the method accepts its arguments."""
         from dsr.inference import (  # noqa: PLC0415 - other values are refused without torch
             MethodChoice,
             check_settings,
             check_working_size,
         )
 
-        choice = MethodChoice(self.method, self.settings, self.directories)
+        choice = MethodChoice(self.method, self.arguments, self.directories)
         try:
             check_working_size(choice, self.scale, self.working_size)
         except ValueError as error:
@@ -168,43 +182,45 @@ class UpsampleRequest:
         except ValueError as error:
             key = str(error).partition(":")[0]
             option = f"--{error}" if key in SHORTCUTS else f"--set {error}"
-            raise ValueError(option if key in self.settings else str(error)) from error
+            raise ValueError(option if key in self.arguments else str(error)) from error
+
+
+@dataclass(frozen=True, kw_only=True)
+class UpsampleRequest(Options):
+    """What to upsample, how, and which results to write."""
+
+    frames: FrameChoice = group(FrameChoice, "what to work on")
+    reading: Reading = group(
+        Reading, "how to read the files (if not given: read from the files, or assumed and reported)"
+    )
+    upsampling: Upsampling = group(Upsampling, "method")
+    results: Results = group(Results, "what is written")
+
+    def __post_init__(self) -> None:
+        """Check what depends on several options, then what takes seconds to check."""
+        if self.frames.confidence and self.reading.min_confidence is None:
+            raise OptionError(
+                "confidence", "expected --min-confidence with it, the fraction below which pixels are holes"
+            )
+        self.upsampling.check_slowly()
 
 
 def settings_of(request: UpsampleRequest) -> dict[str, Any]:
     """Return the settings that a result depends on, as values for JSON."""
-    reading = asdict(request.reading)
-    choice = reading.pop("camera")
-    rig = reading.pop("rig")
     return {
-        "method": request.method,
-        "scale": request.scale,
-        "fill": request.fill,
-        "max_hole": request.max_hole,
-        **({} if request.working_size is None else {"working_size": request.working_size}),
-        **({} if request.sensor == "auto" else {"sensor": request.sensor}),
-        "max_error": request.max_error,
-        "format": request.depth_format,
-        **reading,
-        "fov": choice["fov"],
-        "intrinsics": None if choice["intrinsics"] is None else list(choice["intrinsics"]),
-        **({"max_faces": request.max_faces} if request.max_faces != MOST_FACES else {}),
-        **({"max_points": request.max_points} if request.max_points != MOST_POINTS else {}),
-        **({"registered_by": "extrinsics"} if rig is not None else {}),
-        **({"register": True} if request.register else {}),
-        **({"neighbours": request.neighbours} if request.neighbours else {}),
-        **({"set": dict(request.settings)} if request.settings else {}),
-        **({"code": code} if (code := hash_outside_code(_targets(request))) else {}),
+        **recorded(request),
+        "max_error": request.results.max_error / 100,
+        "registered_by": None if request.reading.rig is None else "extrinsics",
+        "set": request.upsampling.arguments,
+        "code": hash_outside_code(_targets(request.upsampling)),
     }
 
 
-def _targets(request: UpsampleRequest) -> list[str]:
+def _targets(how: Upsampling) -> list[str]:
     """Return the dotted paths of the code that the method's file names."""
-    from dsr.methods.registry import read_method, target_paths  # noqa: PLC0415 - see _check_method
+    from dsr.methods.registry import read_method, target_paths  # noqa: PLC0415 - it imports torch
 
-    return list(
-        target_paths(read_method(request.method, USUAL_SCALE, directories=request.directories), request.directories)
-    )
+    return list(target_paths(read_method(how.method, USUAL_SCALE, directories=how.directories), how.directories))
 
 
 def files_of(pair: Pair, reading: Reading) -> dict[str, Path]:
@@ -241,8 +257,8 @@ def inputs_with_neighbours(request: UpsampleRequest, pair: Pair, neighbours: Seq
     for number, other in enumerate(neighbours, 1):
         inputs |= {f"neighbour_{number}_{name}": each for name, each in inputs_of(other, request.reading).items()
                    if name not in ("rgb", "depth_camera", "extrinsics")}  # fmt: skip
-    if request.poses is not None:
-        inputs["poses"] = {"file": request.poses.name, "sha256": file_hash(request.poses)}
+    if request.frames.poses is not None:
+        inputs["poses"] = {"file": request.frames.poses.name, "sha256": file_hash(request.frames.poses)}
     return inputs
 
 

@@ -33,7 +33,7 @@ def run(request: UpsampleRequest, console: Console) -> list[str]:
         ValueError: the pairs cannot be determined.
 
     """
-    frames = find_frames(request)
+    frames, wanted, shard = find_frames(request), request.results, request.frames.shard
     started = time.perf_counter()
     found, single = frames.found, frames.single
     _show_found(console, request, frames)
@@ -48,8 +48,8 @@ def run(request: UpsampleRequest, console: Console) -> list[str]:
             targets[done.pair.name] = done.target
         else:
             problems.setdefault(done.problem, []).append(done.pair.name)
-    if targets and request.scene_parts and not request.dry_run and request.shard is None:
-        scene = write_scene(request.output, targets, request.scene_parts, overwrite=request.overwrite)
+    if targets and wanted.of_all and not wanted.dry_run and shard is None:
+        scene = write_scene(wanted.output, targets, wanted.of_all, overwrite=wanted.overwrite)
         for part, path in scene.files.items():
             reporter.say(f"{part}: {len(targets)} frames -> {path}")
         scene_problems = scene.problems
@@ -59,9 +59,9 @@ def run(request: UpsampleRequest, console: Console) -> list[str]:
         counts += [f"{sum(map(len, problems.values()))} failed"] if problems else []
         counts = counts or ["nothing to do"]
         pictures = "1 picture" if len(found.pairs) == 1 else f"{len(found.pairs)} pictures"
-        show(console, f"{pictures}: {', '.join(counts)} -> {request.output}")
-    if request.shard is not None and not request.dry_run:
-        _write_summary(request.output, request.shard, outcomes, problems, time.perf_counter() - started)
+        show(console, f"{pictures}: {', '.join(counts)} -> {wanted.output}")
+    if shard is not None and not wanted.dry_run:
+        _write_summary(wanted.output, shard, outcomes, problems, time.perf_counter() - started)
     lines = [f"{listed(names)}: {message}" if len(found.pairs) > 1 else message for message, names in problems.items()]
     return lines + scene_problems
 
@@ -77,7 +77,7 @@ def _write_summary(
 
 def _show_found(console: Console, request: UpsampleRequest, frames: Frames) -> None:
     """Show what was found, which files have no partner, and which frames a shard works on."""
-    found, total = frames.found, len(frames.whole)
+    found, total, shard = frames.found, len(frames.whole), request.frames.shard
     named = total == 1 and len(found.pairs) == 1
     lines = [f"{found.pairs[0].rgb} and {found.pairs[0].depth}" if named else f"{total} pairs of photo and depth map"]
     lines += [f"  {fact}" for fact in found.assumptions]
@@ -85,11 +85,12 @@ def _show_found(console: Console, request: UpsampleRequest, frames: Frames) -> N
         lines.append(
             f"  {len(found.unpaired)} without a partner, left out: {listed([path.name for path in found.unpaired])}"
         )
-    if request.shard is not None:
-        block = request.shard.block(total)
+    if shard is not None:
+        block = shard.block(total)
         which = f"frames {block.start + 1} to {block.stop}" if block else "no frame"
-        lines.append(f"shard {request.shard}: {which} of {total}")
-        if request.scene_parts:
-            lines.append(f"  {', '.join(request.scene_parts)}: of all frames, by the same command without --shard")
+        lines.append(f"shard {shard}: {which} of {total}")
+        if request.results.of_all:
+            names = ", ".join(part.name for part in request.results.of_all)
+            lines.append(f"  {names}: of all frames, by the same command without --shard")
     for line in lines:
         show(console, line)

@@ -3,30 +3,21 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from dsr.app.upsample.outputs import INFO, METRES
+from dsr.app.upsample.outputs import INFO
+from dsr.app.upsample.parts import METRES, Part
 from dsr.app.upsample.stored import DEPTHS, read_camera, read_info
 from dsr.io.scene_files.frame import Frame, parse_pose
-from dsr.io.scene_files.nerfstudio import write_transforms
-from dsr.io.scene_files.open3d import RGBD, write_open3d
-from dsr.io.scene_files.rerun import write_rerun
-from dsr.io.scene_files.splatting import write_splatting
+from dsr.io.scene_files.open3d import RGBD
 from dsr.utils.files import write_text
 from dsr.utils.limits import read_limited
 from dsr.utils.parsing import parse_json
 from dsr.utils.paths import path_within
 
 _RECORD = "exports.json"
-_WRITERS: Mapping[str, tuple[str, Callable[[Path, Sequence[Frame]], list[Path]]]] = {
-    "open3d": ("open3d", write_open3d),
-    "nerfstudio": ("transforms.json", write_transforms),
-    "gaussian": ("gaussian", write_splatting),
-    "rerun": ("scene.rrd", write_rerun),
-}
-"""The file or folder of each part in the folder of the results, and what writes it."""
 
 
 @dataclass
@@ -37,7 +28,7 @@ class SceneResult:
     problems: list[str] = field(default_factory=list)
 
 
-def write_scene(output: Path, folders: Mapping[str, Path], parts: Sequence[str], *, overwrite: bool) -> SceneResult:
+def write_scene(output: Path, folders: Mapping[str, Path], parts: Sequence[Part], *, overwrite: bool) -> SceneResult:
     """Write exports of frames that are complete, and record them in ``exports.json``.
 
     A problem with one export does not stop the others.
@@ -45,7 +36,7 @@ def write_scene(output: Path, folders: Mapping[str, Path], parts: Sequence[str],
     Args:
         output: the folder of the results.
         folders: the folder of each frame, by its name.
-        parts: some of :data:`dsr.app.upsample.parts.SCENE_PARTS`.
+        parts: parts of all frames together.
         overwrite: whether to replace what is there and not recorded.
 
     """
@@ -58,13 +49,14 @@ def write_scene(output: Path, folders: Mapping[str, Path], parts: Sequence[str],
         result.problems.append(str(error))
         return result
     for part in parts:
-        name, write = _WRITERS[part]
+        assert part.write_all is not None  # noqa: S101 - they are of all frames
+        name = part.files[0]
         path = output / name
         if path.exists() and name not in recorded and not overwrite:
             result.problems.append(f"{path}: is there already and not of an earlier run; --overwrite replaces it")
             continue
         try:
-            files = write(path, frames)
+            files = part.write_all(path, frames)
         except (ValueError, OSError) as error:
             result.problems.append(str(error))
             continue
@@ -74,7 +66,7 @@ def write_scene(output: Path, folders: Mapping[str, Path], parts: Sequence[str],
                 (output / old).unlink(missing_ok=True)
         recorded[name] = sorted(file.relative_to(output).as_posix() for file in files)
         write_text(output / _RECORD, json.dumps({"exports": recorded}, indent=2) + "\n")
-        result.files[part] = path
+        result.files[part.name] = path
     return result
 
 

@@ -9,6 +9,8 @@ import yaml
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from dsr.utils.options import OptionError
+
 
 def parse_settings(arguments: Sequence[str]) -> dict[str, Any]:
     """Parse arguments, with their values read as YAML.
@@ -17,16 +19,16 @@ def parse_settings(arguments: Sequence[str]) -> dict[str, Any]:
         arguments: ``KEY=VALUE`` each.
 
     Raises:
-        ValueError: an argument is not of that form, or its value cannot be read.
+        OptionError: an argument is not of that form, or its value cannot be read.
 
     """
     settings: dict[str, Any] = {}
     for argument in arguments:
         key, equals, value = argument.partition("=")
         if not equals or not key.isidentifier():
-            raise ValueError(f"--set {argument}: expected KEY=VALUE")
+            raise OptionError(argument, "expected KEY=VALUE")
         try:
             settings |= OmegaConf.to_container(OmegaConf.from_dotlist([f"{key}={value}"]), resolve=True)  # type: ignore[arg-type]
         except (yaml.YAMLError, OmegaConfBaseException) as error:
-            raise ValueError(f"--set {key}: expected a value as in a YAML file, got {value!r}") from error
+            raise OptionError(key, f"expected a value as in a YAML file, got {value!r}") from error
     return settings

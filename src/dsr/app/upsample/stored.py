@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from dsr.app.upsample.limits import LARGEST_ERROR
-from dsr.app.upsample.outputs import ERRORS, INFO, METRES
+from dsr.app.upsample.outputs import INFO
+from dsr.app.upsample.parts import ERRORS, METRES, Results
 from dsr.evaluation.store import load_errors
 from dsr.geometry.camera import Camera
 from dsr.io.input_files import INPUT, read_input
@@ -126,7 +126,7 @@ def read_camera(path: Path, info: Mapping[str, Any]) -> Camera:
 def _max_error(settings: Any) -> float:
     """Return the expected error from which pixels are left out, as a fraction of the depth."""
     limit = settings.get("max_error") if isinstance(settings, dict) else None
-    return float(limit) if is_number(limit) and 0 < limit < 1e9 else LARGEST_ERROR
+    return float(limit) if is_number(limit) and 0 < limit < 1e9 else Results.max_error / 100
 
 
 def read_depth(folder: Path, camera: Camera) -> np.ndarray:

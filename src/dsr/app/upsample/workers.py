@@ -39,7 +39,7 @@ def work_through(request: UpsampleRequest, frames: Frames, reporter: Reporter, p
     """Upsample pictures.
 
     Args:
-        request: the request; ``workers`` of it work at a time, each with its share of the cores and its own memory.
+        request: the request; ``frames.workers`` work at a time, each with its share of the cores and its own memory.
         frames: the pictures.
         reporter: where notes are shown: in the order of the pictures, or as they come from several workers.
         progress: where the progress is shown.
@@ -51,8 +51,8 @@ def work_through(request: UpsampleRequest, frames: Frames, reporter: Reporter, p
         ValueError: the file of poses is damaged, or does not fit the pictures.
 
     """
-    jobs = [(pair, frames.target(request.output, pair)) for pair in frames.found.pairs]
-    workers = min(request.workers, len(jobs))
+    jobs = [(pair, frames.target(request.results.output, pair)) for pair in frames.found.pairs]
+    workers = min(request.frames.workers, len(jobs))
     if workers <= 1:
         work = FrameWork(request, frames.whole)
         for pair, target in progress.track(jobs, "upsample", label=lambda job: job[0].name, lines=False):
