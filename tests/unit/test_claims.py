@@ -5,151 +5,200 @@ import multiprocessing
 import os
 import signal
 import subprocess
-import sys
 import time
 from pathlib import Path
 
 import pytest
 
 from dsr.evaluation import claims as claims_module
-from dsr.evaluation.claims import Claims
+from dsr.evaluation.claims import LOST, Claims
 from dsr.utils.temporary import birth, machine
 
+FORK = multiprocessing.get_context("fork")
+NAMES = list(map(str, range(40)))
 
-def claim_files(folder):
-    return sorted(path for path in (folder / ".claims").iterdir() if not path.name.startswith("member-"))
+
+class Command:
+    """A process that takes part, and claims what it is asked for, until it is told to leave or is killed."""
+
+    def __init__(self, folder, host):
+        self._here, there = FORK.Pipe()
+        self.process = FORK.Process(target=self._run, args=(folder, host, there), daemon=True)
+        self.process.start()
+        there.close()
+        assert self._here.recv()
+
+    @staticmethod
+    def _run(folder, host, connection):
+        claims_module.machine = lambda: host
+        claims_module.BEAT = 0.02
+        with Claims(folder) as claims:
+            connection.send(True)
+            while names := connection.recv():
+                taken = {name: claim for name in names if (claim := claims.take(name)) is not None}
+                connection.send(list(taken))
+        connection.send([])
+
+    def ask(self, *names):
+        self._here.send(names)
+
+    def answer(self):
+        return self._here.recv()
+
+    def take(self, *names):
+        self.ask(*names)
+        return self.answer()
+
+    def leave(self):
+        self.ask()
+        self.answer()
+        self.process.join()
+
+    def send(self, number):
+        os.kill(self.process.pid, number)
+        if number == signal.SIGKILL:
+            self.process.join()
+        else:
+            os.waitpid(self.process.pid, os.WUNTRACED)
 
 
 @pytest.fixture
-def ended():
-    """The number of a process that was there and has ended, and when it was started."""
-    with subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) as process:
-        started = birth(process.pid)
-        process.communicate(b"\n")
-    return process.pid, started
+def start(tmp_path):
+    """Return a function that starts a process that takes part, on this machine or on another."""
+    commands = []
+
+    def begin(host=None):
+        commands.append(Command(tmp_path, host or machine()))
+        return commands[-1]
+
+    yield begin
+    for command in commands:
+        command.process.kill()
+        command.process.join()
 
 
-def written_by(path, *, host=None, process=1, started="0", age=0.0):
-    """Make a claim look like that of another process."""
-    path.write_text(json.dumps({"machine": host or machine(), "process": process, "birth": started}))
+def claim_file(folder):
+    [path] = (path for path in (folder / ".claims").iterdir() if not path.name.startswith("member-"))
+    return path
+
+
+def make_old(path, age=LOST + 30):
     os.utime(path, (time.time() - age,) * 2)
 
 
-def test_claim_is_refused_until_it_is_given_back(tmp_path):
+def written_by(path, process, started):
+    path.write_text(json.dumps({"machine": machine(), "process": process, "birth": started}))
+
+
+def test_claim_is_refused_until_it_is_given_back(tmp_path, start):
+    other = start()
     with Claims(tmp_path) as claims:
-        first = claims.take("scene a")
-        assert first is not None
-        with first:
+        with claims.take("scene a"):
             assert claims.take("scene a") is None
-            assert claims.take("scene b") is not None
-        assert claims.take("scene a") is not None
+            assert other.take("scene a", "scene b") == ["scene b"]
+            assert claims.take("scene b") is None
+        assert other.take("scene a") == ["scene a"]
 
 
-def test_last_one_to_leave_deletes_claims_and_records(tmp_path):
+def test_claim_of_a_killed_process_is_taken_over_at_once_by_one(tmp_path, start):
+    killed, other = start(), start()
+    assert killed.take("a") == ["a"]
+    with Claims(tmp_path) as claims:
+        killed.send(signal.SIGKILL)
+        with claims.take("a"):
+            assert claims.take("a") is None
+            assert other.take("a") == []
+        assert other.take("a") == ["a"]
+
+
+def test_claim_of_a_process_that_is_stopped_is_its_own(tmp_path, start):
+    stopped = start()
+    stopped.take("a")
+    stopped.send(signal.SIGSTOP)
+    with Claims(tmp_path) as claims:
+        make_old(claim_file(tmp_path))
+        assert claims.take("a") is None
+
+
+def test_claim_of_another_machine_is_its_own_while_it_is_kept_fresh(tmp_path, start):
+    start("elsewhere").take("a")
+    make_old(path := claim_file(tmp_path))
+    deadline = time.monotonic() + 30
+    while path.stat().st_mtime < time.time() - LOST and time.monotonic() < deadline:
+        time.sleep(0.01)
+    with Claims(tmp_path) as claims:
+        assert claims.take("a") is None
+
+
+@pytest.mark.parametrize("end", [signal.SIGKILL, signal.SIGSTOP])
+def test_claim_of_another_machine_is_taken_over_once_it_is_silent_for_long(tmp_path, start, end):
+    silent, other = start("elsewhere"), start()
+    silent.take("a")
+    silent.send(end)
+    assert other.take("a") == []
+    make_old(claim_file(tmp_path), LOST - 30)
+    assert other.take("a") == []
+    make_old(claim_file(tmp_path))
+    assert other.take("a") == ["a"]
+
+
+def test_last_one_to_leave_deletes_claims_and_records(tmp_path, start):
+    other, killed = start(), start()
+    killed.take("b")
+    killed.send(signal.SIGKILL)
     with Claims(tmp_path) as claims:
         claims.write_record("a", {"x": [0.1, float("nan")]})
         assert claims.record("a")["x"][0] == 0.1
         assert claims.record("b") is None
+    assert len(list((tmp_path / ".claims").glob("*-record.json"))) == 1
+    other.leave()
     assert list(tmp_path.iterdir()) == []
 
 
-def test_directory_stays_while_another_command_takes_part(tmp_path):
-    with Claims(tmp_path) as claims:
-        other = tmp_path / ".claims" / f"member-{machine()}-1"
-        written_by(other, process=os.getppid(), started=birth(os.getppid()))
-        claims.write_record("a", {})
-    assert other.is_file()
-    assert not (tmp_path / ".claims" / f"member-{machine()}-{os.getpid()}").exists()
-
-
-@pytest.mark.parametrize("case", ["ended", "number used again", "other machine silent", "empty and old"])
-def test_claim_without_an_owner_is_taken_over(tmp_path, ended, case):
+@pytest.mark.parametrize("case", ["number used again", "killed before it was written"])
+def test_claim_of_no_process_is_taken_over(tmp_path, case):
     with Claims(tmp_path) as claims:
         claims.take("a")
-        [path] = claim_files(tmp_path)
-        if case == "ended":
-            written_by(path, process=ended[0], started=ended[1])
-        elif case == "number used again":
-            written_by(path, process=os.getppid(), started="12")
-        elif case == "other machine silent":
-            written_by(path, host="other", age=claims_module.LOST + 30)
+        path = claim_file(tmp_path)
+        if case == "number used again":
+            written_by(path, os.getppid(), "12")
         else:
             path.write_text("")
-            os.utime(path, (time.time() - claims_module.LOST - 30,) * 2)
-        second = claims.take("a")
-        assert second is not None
-        assert claims.take("a") is None
-        with second:
-            pass
-        assert claim_files(tmp_path) == []
+            assert claims.take("a") is None
+            make_old(path)
+        with claims.take("a"):
+            assert claims.take("a") is None
+        assert claims.take("a") is not None
 
 
-@pytest.mark.parametrize("case", ["this machine", "other machine", "not yet written"])
-def test_claim_of_a_living_owner_is_not_taken_over(tmp_path, case):
+def test_time_of_a_claim_is_not_one_that_was_remembered(tmp_path, start, monkeypatch):
+    silent = start("elsewhere")
+    silent.take("a")
+    silent.send(signal.SIGSTOP)
     with Claims(tmp_path) as claims:
-        claims.take("a")
-        [path] = claim_files(tmp_path)
-        if case == "this machine":  # however long it has been silent, such as a stopped process
-            written_by(path, process=os.getppid(), started=birth(os.getppid()), age=claims_module.LOST + 30)
-        elif case == "other machine":
-            written_by(path, host="other", age=claims_module.LOST - 30)
-        else:
-            path.write_text("")
-        assert claims.take("a") is None
-
-
-def test_time_of_a_claim_is_not_one_that_was_remembered(tmp_path, monkeypatch):
-    with Claims(tmp_path) as claims:
-        claims.take("a")
-        [path] = claim_files(tmp_path)
-        written_by(path, host="other", age=claims_module.LOST + 30)
+        make_old(path := claim_file(tmp_path))
         remembered, stat = path.stat(), Path.stat
-        written_by(path, host="other")
+        make_old(path, 0)
         monkeypatch.setattr(Path, "stat", lambda each, **_: remembered if each == path else stat(each))  # as NFS does
         assert claims.take("a") is None
 
 
-def test_claim_is_kept_fresh(tmp_path, monkeypatch):
-    monkeypatch.setattr(claims_module, "BEAT", 0.01)
-    with Claims(tmp_path) as claims, claims.take("a"):
-        [path] = claim_files(tmp_path)
-        os.utime(path, (1.0, 1.0))
-        deadline = time.monotonic() + 10
-        while path.stat().st_mtime < 2 and time.monotonic() < deadline:
-            time.sleep(0.01)
-        assert path.stat().st_mtime > 2
+def test_processes_that_race_for_claims_get_different_ones(start):
+    killed, racers = start(), [start() for _ in range(3)]
+    killed.take(*NAMES[:20])  # these have to be taken over
+    killed.send(signal.SIGKILL)
+    for racer in racers:
+        racer.ask(*NAMES)
+    assert sorted((name for racer in racers for name in racer.answer()), key=int) == NAMES
 
 
-def _race(folder, start, queue):
-    with Claims(folder) as claims:
-        start.wait()
-        queue.put([name for name in map(str, range(40)) if claims.take(name) is not None])
-        start.wait()
-
-
-def test_processes_that_race_for_claims_get_different_ones(tmp_path, ended):
-    context = multiprocessing.get_context("fork")
-    with Claims(tmp_path) as claims:
-        for name in map(str, range(20)):  # these have to be taken over
-            claims.take(name)
-        for path in claim_files(tmp_path):
-            written_by(path, process=ended[0], started=ended[1])
-        start, queue = context.Barrier(3), context.Queue()
-        racers = [context.Process(target=_race, args=(tmp_path, start, queue)) for _ in range(3)]
-        for racer in racers:
-            racer.start()
-        taken = [name for _ in racers for name in queue.get(timeout=60)]
-        for racer in racers:
-            racer.join(60)
-    assert sorted(taken, key=int) == list(map(str, range(40)))
-
-
-def test_birth_tells_an_ended_process_even_before_it_is_collected(ended):
+def test_birth_tells_an_ended_process_even_before_it_is_collected():
     assert birth(os.getpid()) not in (None, "")
-    assert birth(ended[0]) != ended[1]
     with subprocess.Popen(["sleep", "60"]) as process:
+        started = birth(process.pid)
         os.kill(process.pid, signal.SIGKILL)
         deadline = time.monotonic() + 10
         while birth(process.pid) is not None and time.monotonic() < deadline:
             time.sleep(0.01)
         assert birth(process.pid) is None
+    assert birth(process.pid) != started

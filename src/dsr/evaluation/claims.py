@@ -8,7 +8,8 @@ deletion can meet a newer claim. What has been found out under a claim can be le
 
 All files are made by ``O_EXCL`` or renaming, and times are compared with those that the same file system gives. The
 time of a claim and what a directory contains are asked for anew, as clients of NFS remember both for up to a minute. So
-a shared directory will do.
+a shared directory will do. (The leases of filelock take over by exchanging two names, which network file systems
+refuse, so that there a claim of a machine that has died would be one for ever.)
 """
 
 from __future__ import annotations
@@ -22,7 +23,6 @@ import socket
 import threading
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Self
 
 from dsr.utils.files import write_text
@@ -33,17 +33,14 @@ from dsr.utils.temporary import birth, machine
 
 BEAT, LOST = 10.0, 60.0
 """Seconds between two refreshments of a claim, and until one of another machine is over without."""
-_DIGITS = 24
+Claim = contextlib.ExitStack
+"""A context at whose end something that is claimed is given back."""
 
 
 class Claims:
     """The claims in the directory of a run, to use in a ``with`` statement by each command that takes part.
 
     The last command that leaves deletes the claims and the records.
-
-    Args:
-        folder: directory of the run.
-
     """
 
     def __init__(self, folder: Path) -> None:
@@ -58,52 +55,48 @@ class Claims:
         self._beating.enter_context(_fresh(self._member))
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         """Leave; the last one deletes everything."""
         self._beating.close()
-        others = [each for each in self._files("member-") if each != self._member and not self._is_over(each)]
-        if others:
+        if any(not self._is_over(each) for each in self._files("member-") if each != self._member):
             self._member.unlink(missing_ok=True)
         else:
             shutil.rmtree(self._folder, ignore_errors=True)
 
     def take(self, name: str) -> Claim | None:
-        """Claim something; return None if somebody else has it.
-
-        Args:
-            name: what is claimed.
-
-        """
+        """Claim something; return None if somebody else has it."""
         stem = f"{_digest(name)}."
         before = sorted(self._files(stem), key=_number)
         if before and not self._is_over(before[-1]):
             return None
         path = self._folder / f"{stem}{_number(before[-1]) + 1 if before else 0}"
-        return Claim((*before, path)) if _create(path) else None
+        if not _create(path):
+            return None
+        claim = contextlib.ExitStack()
+        for each in (path, *reversed(before)):
+            claim.callback(each.unlink, missing_ok=True)  # they are called in the opposite order
+        claim.enter_context(_fresh(path))
+        return claim
 
     def record(self, name: str) -> Any:
-        """Return the values that were recorded for a name; None for none.
-
-        Args:
-            name: what was claimed.
-
-        """
+        """Return the values that were recorded for a name; None for none."""
         try:
             return parse_json(read_limited(self._record(name)), finite=False)
         except (OSError, ValueError):
             return None
 
     def write_record(self, name: str, values: Mapping[str, Any]) -> None:
-        """Record values for the other processes; they are kept until the last one has finished.
-
-        Args:
-            name: what is claimed.
-            values: plain values.
-
-        """
+        """Record plain values for the other processes; they are kept until the last one has finished."""
         write_text(self._record(name), json.dumps(values))
+
+    def now(self) -> float:
+        """Return the time of the file system, which is that of its server, in seconds."""
+        try:
+            os.utime(self._member)
+            return self._member.stat().st_mtime
+        except FileNotFoundError:  # deleted by a command that took this one for lost
+            _create(self._member)
+            return self._member.stat().st_mtime
 
     def _record(self, name: str) -> Path:
         """Return the file of a record."""
@@ -133,41 +126,6 @@ class Claims:
         except (ValueError, KeyError, TypeError):
             pass  # its process is about to write it, or was killed before it did
         return age > LOST
-
-    def now(self) -> float:
-        """Return the time of the file system, which is that of its server, in seconds."""
-        try:
-            os.utime(self._member)
-            return self._member.stat().st_mtime
-        except FileNotFoundError:  # deleted by a command that took this one for lost
-            _create(self._member)
-            return self._member.stat().st_mtime
-
-
-class Claim:
-    """A claim of this process, to use in a ``with`` statement, at whose end it is given back.
-
-    Args:
-        paths: its file, after those of claims that it took over.
-
-    """
-
-    def __init__(self, paths: tuple[Path, ...]) -> None:
-        self._paths = paths
-        self._beating = contextlib.ExitStack()
-
-    def __enter__(self) -> Self:
-        """Begin to refresh the claim."""
-        self._beating.enter_context(_fresh(self._paths[-1]))
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        """Give the claim back."""
-        self._beating.close()
-        for path in self._paths:
-            path.unlink(missing_ok=True)
 
 
 def _create(path: Path) -> bool:
@@ -213,7 +171,7 @@ def _fresh(path: Path) -> Iterator[None]:
 
 def _digest(name: str) -> str:
     """Return a name as files have it."""
-    return hashlib.sha256(name.encode("utf-8", "surrogateescape")).hexdigest()[:_DIGITS]
+    return hashlib.sha256(name.encode("utf-8", "surrogateescape")).hexdigest()[:24]
 
 
 def _number(path: Path) -> int:
