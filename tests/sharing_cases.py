@@ -232,11 +232,13 @@ def draw(_, number):
 
 def test_part_of_a_report_whose_worker_is_killed_is_drawn_by_another(tmp_path):
     items = [None, *((number, tmp_path / "killed") for number in range(6))]
-    with Work(object(), 2) as work:
+    told = Told()
+    with Work(object(), 2, told.say) as work:
         values, others = work.map(draw, items), work.map(draw, items[::-1])
         assert list(others) == [5, 4, 3, 2, 1, 0, None]
         assert list(values) == [None, 0, 1, 2, 3, 4, 5]
-    assert (tmp_path / "killed").exists()
+    [line] = told.lines
+    assert line == "a part of the report: the worker was ended before it had a result; another one begins it again"
 
 
 def test_part_of_a_report_that_kills_its_workers_is_an_error(tmp_path):

@@ -497,7 +497,7 @@ def test_scenes_that_are_not_ready_are_counted_and_a_few_measured(monkeypatch):
         def unprepared(self, scenes):
             return [scene for scene in scenes if scene not in self.ready]
 
-        def prepare(self, scenes):
+        def prepare(self, scenes, say):
             for scene in scenes:
                 self.now += 20.0 if scene == "b" else 5.0  # the first one compiles
                 self.ready.append(scene)

@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+import multiprocessing
+import os
+import threading
+import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -46,6 +51,46 @@ def test_preparing_renders_what_is_missing_and_names_every_scene(cache: Path) ->
     assert sorted(source.prepare(source.scenes())) == ["00000", "00001", "00002"]
     assert len(list(cache.rglob("*.npz"))) == 3
     assert list(source.prepare(["00002", "00000"])) == ["00002", "00000"]
+
+
+@pytest.fixture
+def kill(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[int], None]]:
+    """Let scenes be rendered by a single worker, and return a function that kills so many workers one after another."""
+    monkeypatch.setattr(module, "_WORTH_WORKERS", 0)
+    monkeypatch.setattr(os, "cpu_count", lambda: 1)
+    threads = []
+
+    def kill_workers(times: int) -> None:
+        killed: set[int | None] = set()
+        while len(killed) < times:
+            for worker in multiprocessing.active_children():
+                if worker.pid not in killed:
+                    killed.add(worker.pid)
+                    worker.kill()
+            time.sleep(0.01)
+
+    def begin(times: int) -> None:
+        threads.append(threading.Thread(target=kill_workers, args=(times,), daemon=True))
+        threads[0].start()
+
+    yield begin
+    threads[0].join(60)
+
+
+@pytest.mark.slow
+def test_scene_of_a_killed_worker_is_rendered_by_another(cache: Path, kill: Callable[[int], None]) -> None:
+    said: list[str] = []
+    kill(1)
+    names = ["00000", "00001", "00002"]
+    assert list(Procedural(count=3, size=SIZE).prepare(names, said.append)) == names
+    assert said == ["00001: the worker was ended before it had a result; another one begins it again"]
+    assert len(list(cache.rglob("*.npz"))) == 3
+
+
+def test_scene_that_costs_two_workers_is_an_error(cache: Path, kill: Callable[[int], None]) -> None:
+    kill(2)
+    with pytest.raises(ChildProcessError, match="dataset=procedural: scene 00001: two workers ended"):
+        list(Procedural(count=3, size=SIZE).prepare(["00000", "00001", "00002"]))
 
 
 @pytest.mark.slow

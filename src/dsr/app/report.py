@@ -48,8 +48,9 @@ def make_report(request: ReportRequest, console: Console) -> list[str]:
     results = results.only(request.methods, request.datasets, tuple(map(as_ratio, request.scales)))
     answers = None if request.study is None else read_study(request.study)
     workers = default_workers(results) if request.workers is None else request.workers
-    with replacing_folder(output) as temporary, Work(results, workers) as work:
-        notes = _write(temporary, work, answers, request, ConsoleProgress(console))
+    progress = ConsoleProgress(console)
+    with replacing_folder(output) as temporary, Work(results, workers, progress.say) as work:
+        notes = _write(temporary, work, answers, request, progress)
         write_text(temporary / _MARK, json.dumps({"runs": [str(run.folder) for run in results.runs]}, indent=1) + "\n")
     for note in (*results.notes, *notes):
         show(console, f"note: {note}")

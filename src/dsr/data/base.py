@@ -60,8 +60,8 @@ class Prepared(Protocol):
     It may have a method ``unprepared``, which returns those of some scenes that are not ready.
     """
 
-    def prepare(self, scenes: Sequence[str]) -> Iterable[str]:
-        """Prepare scenes, several at a time, and yield the name of each that is ready."""
+    def prepare(self, scenes: Sequence[str], say: Callable[[str], None], /) -> Iterable[str]:
+        """Prepare scenes, several at a time, and yield the name of each that is ready; ``say`` shows a line of text."""
         ...
 
 
@@ -75,7 +75,7 @@ def prepare_scenes(source: SceneSource, names: Sequence[str], progress: Progress
 
     """
     if isinstance(source, Prepared):
-        for _ in progress.track(source.prepare(names), "prepare", len(names)):
+        for _ in progress.track(source.prepare(names, progress.say), "prepare", len(names)):
             pass
 
 

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 
 from dsr.sample import Scene
 from dsr.synthetic.procedural.scenes import PROCEDURAL_VERSION, render_random_scene
 from dsr.synthetic.rendering import cache_directory, load_or_render
 from dsr.utils.pool import LOST, Pool
+from dsr.utils.progress import SILENT
 
 _WORTH_WORKERS = 5.0
 """Seconds of rendering from which worker processes are used; they take some seconds to start."""
@@ -56,7 +57,7 @@ class Procedural:
         """Return those of some scenes that are not in the cache."""
         return [scene for scene in scenes if not (cache_directory() / self._path(scene)).is_file()]
 
-    def prepare(self, scenes: Sequence[str]) -> Iterable[str]:
+    def prepare(self, scenes: Sequence[str], say: Callable[[str], None] = SILENT.say) -> Iterable[str]:
         """Render scenes that are not in the cache, and yield the name of each that is ready.
 
         Where it takes longer than a few seconds, all processors take part.
@@ -73,13 +74,9 @@ class Procedural:
             yield scene
             rest = missing[number:]
             if len(rest) * (time.perf_counter() - begun) / number > _WORTH_WORKERS:
-                yield from self._render_in_workers(rest)
+                with Pool(os.cpu_count() or 1, self._render, _lost, say, start="spawn") as pool:
+                    yield from (ready for ready, _ in pool.results(rest))
                 return
-
-    def _render_in_workers(self, missing: Sequence[str]) -> Iterator[str]:
-        """Render scenes on all processors."""
-        with Pool(os.cpu_count() or 1, self._render, _lost, start="spawn") as pool:
-            yield from (scene for scene, _ in pool.results(missing))
 
     def _render(self, scene: str) -> bool:
         """Render a scene into the cache unless it is there."""

@@ -14,11 +14,13 @@ import torch
 
 from dsr.evaluation.results import Results
 from dsr.utils.pool import LOST, Pool
+from dsr.utils.progress import SILENT
 
 _FEW = 24
 """Number of predictions below which the start of worker processes takes longer than they save."""
 _MOST = 8
 """Maximum number of workers unless more are requested; each needs about 0.5 GB."""
+_PART = "a part of the report"
 _results: Results | None = None
 """The results that this process works on, if it is a worker."""
 _Call = tuple[Callable[[Results, Any], Any], Any]
@@ -39,10 +41,11 @@ class Work:
     Args:
         results: first argument of all functions; each worker gets it once.
         workers: number of worker processes; 1 for none.
+        say: shows a line of text.
 
     """
 
-    def __init__(self, results: Results, workers: int = 1) -> None:
+    def __init__(self, results: Results, workers: int = 1, say: Callable[[str], None] = SILENT.say) -> None:
         self.results = results
         self._pool: Pool[_Call, tuple[Any]] | None = None
         self._threads = torch.get_num_threads(), cv2.getNumThreads()
@@ -53,9 +56,11 @@ class Work:
                 workers,
                 _call,
                 _lost,
+                say,
                 start="fork" if fork else "spawn",
                 prepare=_begin,
                 arguments=(results, None if fork else cores),
+                label=lambda _: _PART,
             )
 
     def map(self, function: Callable[[Results, _Item], _Value], items: Sequence[_Item]) -> Generator[_Value]:
@@ -122,4 +127,4 @@ def _call(call: _Call) -> tuple[Any]:
 
 def _lost(_: _Call) -> tuple[Any]:
     """Raise an error for a call whose workers were ended."""
-    raise ChildProcessError(f"a part of the report: {LOST}")
+    raise ChildProcessError(f"{_PART}: {LOST}")

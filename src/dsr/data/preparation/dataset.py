@@ -24,6 +24,7 @@ from dsr.data.preparation.resizing import fit
 from dsr.sample import Scene
 from dsr.synthetic.rendering import Rendering, cache_directory, load_or_render
 from dsr.utils.hashing import file_hash, hash_of_code
+from dsr.utils.progress import SILENT
 
 _MIN_SIZE = 32
 _MAX_LISTED = 30
@@ -231,7 +232,7 @@ class PreparedDataset:
         """Return those of some scenes that are not in the cache."""
         return [scene for scene in scenes if not self._is_ready(scene)]
 
-    def prepare(self, scenes: Sequence[str]) -> Iterator[str]:
+    def prepare(self, scenes: Sequence[str], _: Callable[[str], None] = SILENT.say) -> Iterator[str]:
         """Prepare scenes that are not in the cache, several at a time, and yield the name of each that is ready.
 
         The name of a scene that fails is yielded, too; loading the scene raises the error.
