@@ -5,7 +5,6 @@ See :mod:`dsr.evaluation.claims` for commands that share a directory, perhaps fr
 
 from __future__ import annotations
 
-import contextlib
 import os
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -13,11 +12,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
 
-import cv2
-import torch
-
 from dsr.evaluation.claims import Claim, Claims
-from dsr.utils.pool import Pool
+from dsr.utils.pool import Pool, computing_threads
 from dsr.utils.progress import Progress
 
 _R = TypeVar("_R")
@@ -100,7 +96,7 @@ def share(
     if workers.count == 1 or len(scenes) < 2:
         if meanwhile is not None:
             meanwhile()
-        with _threads(workers.threads):
+        with computing_threads(workers.threads):
             attempts = _attempts(scenes, claims, name, ready)
             for scene, attempt in progress.track(attempts, name, len(scenes), label=_scene_of):
                 if isinstance(attempt, Claim):
@@ -119,9 +115,7 @@ def share(
             result = ready(scene)
             return work(scene, Progress()) if result is None else result
 
-    # The workers inherit the number of threads: setting it in a forked process can wait for ever for a thread of OpenCV
-    # that only its parent has.
-    with _threads(workers.threads), Pool(workers.count, attempt_once, lost, progress.say) as pool:
+    with Pool(workers.count, attempt_once, lost, progress.say, threads=workers.threads) as pool:
         results = pool.results(scenes)
         if meanwhile is not None:
             meanwhile()
@@ -164,18 +158,3 @@ def _free_memory() -> int:
         return 1024 * next(int(line.split()[1]) for line in lines if line.startswith("MemAvailable:"))
     except (OSError, ValueError, StopIteration):
         return 1 << 40
-
-
-@contextlib.contextmanager
-def _threads(count: int | None) -> Iterator[None]:
-    """Set the number of threads of this process within the context; None leaves it."""
-    before = torch.get_num_threads(), cv2.getNumThreads()
-    if count is not None:
-        torch.set_num_threads(count)
-        cv2.setNumThreads(count)
-    try:
-        yield
-    finally:
-        if count is not None:
-            torch.set_num_threads(before[0])
-            cv2.setNumThreads(before[1])

@@ -6,11 +6,7 @@ import gc
 import os
 import sys
 from collections.abc import Callable, Generator, Sequence
-from types import TracebackType
 from typing import Any, Self, TypeVar
-
-import cv2
-import torch
 
 from dsr.evaluation.results import Results
 from dsr.utils.pool import LOST, Pool
@@ -48,19 +44,17 @@ class Work:
     def __init__(self, results: Results, workers: int = 1, say: Callable[[str], None] = SILENT.say) -> None:
         self.results = results
         self._pool: Pool[_Call, tuple[Any]] | None = None
-        self._threads = torch.get_num_threads(), cv2.getNumThreads()
         if workers > 1:
-            _set_threads(cores := max(1, (os.cpu_count() or 1) // workers))  # a fork inherits them, and cannot set them
-            fork = sys.platform == "linux"
             self._pool = Pool(
                 workers,
                 _call,
                 _lost,
                 say,
-                start="fork" if fork else "spawn",
+                start="fork" if sys.platform == "linux" else "spawn",
                 prepare=_begin,
-                arguments=(results, None if fork else cores),
+                arguments=(results,),
                 label=lambda _: _PART,
+                threads=max(1, (os.cpu_count() or 1) // workers),
             )
 
     def map(self, function: Callable[[Results, _Item], _Value], items: Sequence[_Item]) -> Generator[_Value]:
@@ -83,24 +77,17 @@ class Work:
 
     def __enter__(self) -> Self:
         """Return itself."""
+        if self._pool is not None:
+            self._pool.__enter__()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         """Terminate the workers."""
         if self._pool is not None:
-            self._pool.__exit__(kind, error, trace)
-            _set_threads(*self._threads)
+            self._pool.__exit__()
 
 
-def _set_threads(of_torch: int, of_opencv: int | None = None) -> None:
-    """Set the numbers of threads that torch and OpenCV compute with, equal ones if one is given."""
-    torch.set_num_threads(of_torch)
-    cv2.setNumThreads(of_torch if of_opencv is None else of_opencv)
-
-
-def _begin(results: Results, cores: int | None) -> None:
+def _begin(results: Results) -> None:
     """Prepare a worker.
 
     Garbage is collected after each call: Matplotlib makes so many objects that the automatic collections would take a
@@ -109,8 +96,6 @@ def _begin(results: Results, cores: int | None) -> None:
     global _results  # noqa: PLW0603 - the worker's own
     _results = results
     gc.disable()
-    if cores is not None:
-        _set_threads(cores)
 
 
 def _call(call: _Call) -> tuple[Any]:

@@ -14,11 +14,13 @@ import signal
 import time
 import warnings
 from collections import deque
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
-from types import TracebackType
 from typing import Any, Generic, Literal, Self, TypeVar, cast
+
+import cv2
+import torch
 
 from dsr.utils import interruption
 
@@ -60,6 +62,7 @@ class Pool(Generic[_T, _R]):
         prepare: function that each worker calls once; None for none.
         arguments: its arguments.
         label: function that returns the name of an item for a line of text.
+        threads: of each worker; None for those that this process has, or a new one takes.
 
     """
 
@@ -74,10 +77,12 @@ class Pool(Generic[_T, _R]):
         prepare: Callable[..., None] | None = None,
         arguments: Sequence[Any] = (),
         label: Callable[[_T], str] = str,
+        threads: int | None = None,
     ) -> None:
         self._count, self._lost, self._say, self._label = count, lost, say, label
         self._context = multiprocessing.get_context(start)
-        self._plan = (work, prepare, arguments)
+        self._forks, self._threads = start == "fork", threads
+        self._plan = (work, prepare, arguments, threads)
         self._queue: deque[_Task[_T, _R]] = deque()
         self._later: list[_Task[_T, _R]] = []
         self._busy: dict[Connection, _Task[_T, _R] | None] = {}
@@ -88,11 +93,11 @@ class Pool(Generic[_T, _R]):
     def __enter__(self) -> Self:
         """Return itself."""
         self._stack.enter_context(interruption.with_workers())
+        if self._forks:  # they inherit it: to set it in them can wait for ever for a thread that only this process has
+            self._stack.enter_context(computing_threads(self._threads))
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         """Terminate the workers, whatever they are doing."""
         for process in self._processes.values():
             process.terminate()
@@ -205,25 +210,26 @@ class Pool(Generic[_T, _R]):
     def _start(self) -> Connection:
         """Start a worker."""
         here, there = self._context.Pipe()
-        forked = self._context.get_start_method() == "fork"
-        arguments = (there, os.getpid(), self._plan if forked else None)
+        arguments = (there, os.getpid(), self._plan if self._forks else None)
         process = self._context.Process(target=_serve, args=arguments, daemon=True)  # type: ignore[attr-defined]
         with interruption.starting_workers(), warnings.catch_warnings():
             warnings.simplefilter("ignore", DeprecationWarning)  # of forking with threads: those of this process sleep
             process.start()
         there.close()
         self._processes[here], self._busy[here] = process, None
-        if not forked:
+        if not self._forks:
             self._without_plan.add(here)  # it gets it when all are started: one that is large waits for the worker
         return here
 
 
-def _serve(connection: Connection, parent: int, plan: tuple[Any, Any, Any] | None) -> None:
+def _serve(connection: Connection, parent: int, plan: tuple[Any, ...] | None) -> None:
     """Work on items in a worker, until it is terminated."""
     signal.signal(signal.SIGTERM, signal.SIG_DFL)  # a fork has its parent's handler
     interruption.end_with(parent)
     with contextlib.suppress(EOFError):  # the parent was interrupted
-        work, prepare, arguments = connection.recv() if plan is None else plan
+        work, prepare, arguments, threads = connection.recv() if plan is None else plan
+        if plan is None:
+            _set_threads(threads)
         if prepare is not None:
             prepare(*arguments)
         while True:
@@ -235,3 +241,23 @@ def _serve(connection: Connection, parent: int, plan: tuple[Any, Any, Any] | Non
             except Exception as error:
                 answer = (False, error)
             connection.send(answer)
+
+
+@contextlib.contextmanager
+def computing_threads(count: int | None) -> Iterator[None]:
+    """Set the number of threads that torch and OpenCV compute with within the context; None leaves it."""
+    before = torch.get_num_threads(), cv2.getNumThreads()
+    _set_threads(count)
+    try:
+        yield
+    finally:
+        if count is not None:
+            torch.set_num_threads(before[0])
+            cv2.setNumThreads(before[1])
+
+
+def _set_threads(count: int | None) -> None:
+    """Set the number of threads that torch and OpenCV compute with; None leaves it."""
+    if count is not None:
+        torch.set_num_threads(count)
+        cv2.setNumThreads(count)

@@ -7,7 +7,6 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-import cv2
 import torch
 
 from dsr.app.upsample.frame import FrameWork
@@ -59,10 +58,16 @@ def work_through(request: UpsampleRequest, frames: Frames, reporter: Reporter, p
             yield attempt(work, pair, target, reporter, progress)
         return
     FrameWork(request, frames.whole)  # raises for poses that do not fit
-    cores = max(1, (os.cpu_count() or 1) // workers)
-    prepare = (request, frames.whole, cores)
     with Pool(
-        workers, _remote, _lost, progress.say, start="spawn", prepare=_begin, arguments=prepare, label=_name_of
+        workers,
+        _remote,
+        _lost,
+        progress.say,
+        start="spawn",
+        prepare=_begin,
+        arguments=(request, frames.whole),
+        label=_name_of,
+        threads=max(1, (os.cpu_count() or 1) // workers),
     ) as pool:
         results = progress.track(pool.results(jobs), "upsample", len(jobs), label=lambda each: _name_of(each[0]))
         for _, (done, record) in results:
@@ -70,11 +75,9 @@ def work_through(request: UpsampleRequest, frames: Frames, reporter: Reporter, p
             yield done
 
 
-def _begin(request: UpsampleRequest, pairs: Sequence[Pair], cores: int) -> None:
+def _begin(request: UpsampleRequest, pairs: Sequence[Pair]) -> None:
     """Prepare a worker."""
     global _work  # noqa: PLW0603 - the process's own
-    torch.set_num_threads(cores)
-    cv2.setNumThreads(cores)
     _work = FrameWork(request, pairs)
 
 
