@@ -36,9 +36,10 @@ from dsr.app.trainer import FirstValidation, training_trainer
 from dsr.app.training_runs import training_data
 from dsr.data.simgeo import SimGeo
 from dsr.degradation.downsampling import Downsampling
+from dsr.methods.networks.base import Answer
 from dsr.methods.networks.msg_net import MSGNet
 from dsr.training.degradation import Batch, Degradation
-from dsr.training.objective import Objective
+from dsr.training.objective import DepthObjective, Objective
 from dsr.training.patches import Patches
 from dsr.training.settings import PatchSettings
 from dsr.utils.lightning import fit
@@ -69,7 +70,7 @@ def step(net: MSGNet, objective: Objective, batch: Batch, *, mixed: bool) -> flo
     start = time.perf_counter()
     with torch.autocast(batch["rgb"].device.type, torch.bfloat16, enabled=mixed):
         disparity = net.upsample(batch["rgb"], batch["disparity_lr"], batch["min_max"])
-    objective(disparity.float(), batch)["loss"].backward()
+    objective(Answer(disparity.float()), batch)["loss"].backward()
     net.zero_grad(set_to_none=True)
     wait(batch["rgb"].device)
     return time.perf_counter() - start
@@ -188,7 +189,7 @@ def main() -> None:
     batch = torch.utils.data.default_collate([patches[i] for i in range(arguments.batch)])
     batch = {name: values.to(arguments.device) for name, values in batch.items()}
     loading = time.perf_counter() - start
-    net, objective = MSGNet(SCALE, "dsr"), Objective("lap1", 0.1)
+    net, objective = MSGNet(SCALE, "dsr"), DepthObjective("lap1", 0.1)
     net = net.to(arguments.device)
     slow = plain(net)
     fast = net.to(memory_format=torch.channels_last)  # type: ignore[call-overload]

@@ -15,7 +15,8 @@ from torch.nn import functional
 from dsr.degradation.hints import FACTS
 from dsr.geometry.camera import Camera
 from dsr.methods.networks.any_map import CAUTION, AnyMap, build_any_map
-from dsr.methods.networks.facets_unet import Answer, FacetsUNet
+from dsr.methods.networks.base import Answer
+from dsr.methods.networks.facets_unet import FacetsUNet
 from dsr.methods.networks.weight_files import files_of_weights, save_network
 from dsr.sample import DepthSample
 
@@ -42,7 +43,7 @@ class Sure(Told):
 
     def answer(self, rgb: Tensor, disparity: Tensor, noise: Tensor | None, hints: Tensor, progress: object) -> Answer:
         answer = super().answer(rgb, disparity, noise, hints, progress)
-        return answer._replace(spread=torch.full_like(answer.spread, 1e-5))
+        return replace(answer, spread=torch.full_like(answer.spread, 1e-5))
 
 
 class Reporting(Told):

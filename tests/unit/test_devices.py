@@ -38,7 +38,7 @@ from dsr.metrics.visual_loss import VisualLoss
 from dsr.sample import CENTIMETRES, DepthSample, Scene
 from dsr.training.degradation import Degradation
 from dsr.training.module import SuperResolution
-from dsr.training.objective import Objective, SurfaceObjective
+from dsr.training.objective import DepthObjective, SurfaceObjective
 from dsr.training.patches import Patches
 from dsr.training.settings import PatchSettings, Schedule
 from dsr.utils.builder import ConfigError
@@ -121,7 +121,7 @@ def test_training_step_on_a_gpu_is_that_of_the_cpu(model: str, gpu: torch.device
     for device in (CPU, gpu):
         torch.manual_seed(0)
         net = {"facets": FacetsUNet, "msg_v": partial(MSGNet, variant="dsr"), "pdn": PrimalDualNetwork}[model](4)
-        objective = SurfaceObjective() if model == "facets" else Objective("lap1", 0.1, shading=0.1)
+        objective = SurfaceObjective() if model == "facets" else DepthObjective("lap1", 0.1, shading=0.1)
         module = SuperResolution(net, objective, Schedule(10, warmup=1, mixed=False), visual_metrics).to(device)
         moved = {key: value.to(device) for key, value in batch.items()}
         made = module.configure_optimizers()

@@ -13,6 +13,7 @@ from torch.nn import functional
 from dsr.degradation.downsampling import Downsampling
 from dsr.degradation.hints import FACTS, KERNELS, encode_facts
 from dsr.methods.networks import facets_planes, facets_unet
+from dsr.methods.networks.base import Answer
 from dsr.methods.networks.facets import Facets
 from dsr.methods.networks.facets_layers import enlarge
 from dsr.methods.networks.facets_planes import (
@@ -37,6 +38,10 @@ def _net(scale: int = 4, width: int = 8, deep: int = 12) -> FacetsUNet:
         for parameter in net.parameters():
             parameter.add_(0.05 * torch.randn_like(parameter))
     return net
+
+
+def _maps(answer: Answer) -> tuple[Tensor, Tensor, Tensor]:
+    return answer.disparity, answer.spread, answer.angle
 
 
 def _inputs(scale: int, height: int = 12, width: int = 10) -> tuple[Tensor, Tensor]:
@@ -79,7 +84,7 @@ def test_bands_change_nothing(scale: int, monkeypatch: pytest.MonkeyPatch) -> No
     whole = net.answer(rgb, values)
     monkeypatch.setattr(facets_unet, "_BAND", rgb[0, 0].numel() // 5)
     banded = net.answer(rgb, values, progress=lambda *step: steps.append(step))
-    for one, other in zip(whole, banded, strict=True):
+    for one, other in zip(_maps(whole), _maps(banded), strict=True):
         torch.testing.assert_close(other, one, rtol=1e-4, atol=1e-7)
     assert steps == [(number, 5) for number in range(1, 6)]
 
@@ -89,7 +94,7 @@ def test_holes_are_filled(scale: int) -> None:
     rgb, values = _inputs(scale)
     values[..., 3:7, 2:6] = torch.nan
     answer = _net(scale).answer(rgb, values)
-    for each in answer:
+    for each in _maps(answer):
         assert each.shape == (1, 1, *rgb.shape[-2:])
         assert bool(each.isfinite().all())
     assert bool((answer.spread > 0).all())
@@ -116,7 +121,7 @@ def test_every_parameter_serves(scale: int) -> None:
     for factor in (1, 2) if scale == 2 else (scale,):
         rgb, values = _inputs(factor)
         answer = net.answer(rgb, values.float(), None, torch.ones(1, FACTS))
-        sum(each.square().mean() for each in answer).backward()  # type: ignore[union-attr]
+        sum(each.square().mean() for each in _maps(answer)).backward()  # type: ignore[union-attr]
     for name, parameter in net.named_parameters():
         assert parameter.grad is not None, name
         assert bool(parameter.grad.any()), name
@@ -284,7 +289,7 @@ def test_images_of_a_batch_do_not_see_each_other() -> None:
         together = net.answer(rgb, values, noise, facts)
         for i in range(3):
             alone = net.answer(rgb[i : i + 1], values[i : i + 1], noise[i : i + 1], facts[i : i + 1])
-            for one, all_of_them in zip(alone, together, strict=True):
+            for one, all_of_them in zip(_maps(alone), _maps(together), strict=True):
                 torch.testing.assert_close(one, all_of_them[i : i + 1], rtol=1e-4, atol=1e-6)
 
 

@@ -11,9 +11,10 @@ import torch
 from torch import Tensor
 
 from dsr.geometry.camera import Camera
+from dsr.methods.networks.base import Answer
 from dsr.metrics.losses import l1, lap1, mse
 from dsr.training.degradation import Batch
-from dsr.training.objective import DepthLoss, Objective
+from dsr.training.objective import DepthLoss, DepthObjective
 
 Loss = Callable[..., Tensor]
 LOSSES: dict[str, Loss] = {"l1": l1, "mse": mse, "lap1": lap1}
@@ -237,19 +238,22 @@ def _guess(batch: Batch) -> Tensor:
 @pytest.mark.parametrize("holes", [0.0, 0.15])
 @pytest.mark.parametrize("depth_loss", LOSSES)
 def test_gradient_of_the_objective_is_that_of_its_value(depth_loss: DepthLoss, holes: float) -> None:
-    batch, objective = _batch(holes=holes), Objective(depth_loss, 0.7)
-    assert torch.autograd.gradcheck(lambda guess: objective(guess, batch)["loss"], _guess(batch).requires_grad_())
+    batch, objective = _batch(holes=holes), DepthObjective(depth_loss, 0.7)
+    assert torch.autograd.gradcheck(
+        lambda guess: objective(Answer(guess), batch)["loss"], _guess(batch).requires_grad_()
+    )
 
 
 @pytest.mark.parametrize("holes", [0.0, 0.15])
 def test_objective_of_a_batch_is_the_mean_of_its_samples(holes: float) -> None:
-    batch, objective = _batch(holes=holes), Objective("lap1", 0.7)
+    batch, objective = _batch(holes=holes), DepthObjective("lap1", 0.7)
     guess = _guess(batch)
     singles = [
-        objective(guess[i : i + 1], {name: value[i : i + 1] for name, value in batch.items()})["loss"] for i in range(2)
+        objective(Answer(guess[i : i + 1]), {name: value[i : i + 1] for name, value in batch.items()})["loss"]
+        for i in range(2)
     ]
     assert singles[0].item() != pytest.approx(singles[1].item(), rel=0.01)
-    assert objective(guess, batch)["loss"].item() == pytest.approx(sum(singles).item() / 2, rel=1e-13)
+    assert objective(Answer(guess), batch)["loss"].item() == pytest.approx(sum(singles).item() / 2, rel=1e-13)
 
 
 def test_objective_has_finite_gradients_at_the_truth_and_beyond_infinity() -> None:
@@ -259,6 +263,6 @@ def test_objective_has_finite_gradients_at_the_truth_and_beyond_infinity() -> No
     behind[1] = -5  # nothing of that surface can be seen
     for start in (truth, behind, torch.full_like(truth, -5)):
         guess = start.clone().requires_grad_()
-        Objective("lap1", 0.7)(guess, batch)["loss"].backward()
+        DepthObjective("lap1", 0.7)(Answer(guess), batch)["loss"].backward()
         assert guess.grad is not None
         assert bool(guess.grad.isfinite().all())

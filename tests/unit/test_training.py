@@ -22,6 +22,7 @@ from dsr.app.trainer import has_idle_layers, seconds_per_step
 from dsr.degradation.downsampling import Downsampling, make_sample
 from dsr.geometry.camera import Camera
 from dsr.methods.networks.any_map import AnyMap
+from dsr.methods.networks.base import Answer
 from dsr.methods.networks.facets_unet import FacetsUNet
 from dsr.methods.networks.msg_net import MSGNet, upsample_disparity
 from dsr.methods.networks.sparse_to_dense import SparseToDense
@@ -34,7 +35,7 @@ from dsr.sample import CENTIMETRES, Scene, Unit
 from dsr.training.data_module import WholeScenes, collate_scene
 from dsr.training.degradation import Batch, Degradation, to_tensors
 from dsr.training.module import SuperResolution
-from dsr.training.objective import Objective, SurfaceObjective, balance_weight, to_depth
+from dsr.training.objective import DepthObjective, SurfaceObjective, balance_weight, to_depth
 from dsr.training.patches import Patches
 from dsr.training.settings import PatchSettings, Schedule
 from dsr.training.shading import shading_loss
@@ -92,14 +93,14 @@ def _ramp(slope: float, height: float = 4.0) -> Tensor:
 def test_loss_is_zero_at_the_truth(depth_loss: Any) -> None:
     depth = torch.from_numpy(np.random.default_rng(0).uniform(1, 3, (1, 12, 13)))
     batch = _batch(depth, STEREO, (3.0, 5.0))
-    terms = Objective(depth_loss, 2.0)(0.5 * 20 / depth[None] - 1, batch)
+    terms = DepthObjective(depth_loss, 2.0)(Answer(0.5 * 20 / depth[None] - 1), batch)
     assert terms.keys() == {"loss", depth_loss, "mse_v"}
     assert all(abs(float(value)) < 1e-25 or float(value) < 1e-14 for value in terms.values())
 
 
 @pytest.mark.parametrize(("depth_loss", "expected"), [("l1", 0.25), ("lap1", 0.25), ("mse", 0.0625)])
 def test_offset_counts_as_its_fraction_of_the_low_resolution_range(depth_loss: Any, expected: float) -> None:
-    terms = Objective(depth_loss, 3.0)(torch.full((1, 1, 12, 13), 4.5, dtype=torch.float64), _wall())
+    terms = DepthObjective(depth_loss, 3.0)(Answer(torch.full((1, 1, 12, 13), 4.5, dtype=torch.float64)), _wall())
     assert float(terms[depth_loss]) == pytest.approx(expected, rel=1e-13)
     assert float(terms["mse_v"]) == pytest.approx(0, abs=1e-25)  # a wall elsewhere looks the same
     assert float(terms["loss"]) == pytest.approx(expected, rel=1e-13)
@@ -110,21 +111,21 @@ def test_visual_term_is_that_of_the_angle_between_two_planes() -> None:
     slope = 0.3
     along, axis = slope * 20, slope * 4 + 5
     expected = (2 - 2 * axis / math.hypot(along, axis)) / 3
-    terms = Objective("l1", 0.5)(_ramp(slope), _wall())
+    terms = DepthObjective("l1", 0.5)(Answer(_ramp(slope)), _wall())
     assert float(terms["mse_v"]) == pytest.approx(expected, rel=1e-12)
     assert float(terms["l1"]) == pytest.approx(slope * 6 / 2, rel=1e-12)
     assert float(terms["loss"]) == pytest.approx(slope * 3 + 0.5 * expected, rel=1e-12)
 
 
 def test_visual_term_without_a_weight_is_left_out() -> None:
-    assert Objective("l1").w == 0
-    terms = Objective("l1")(_ramp(0.3), _wall())
+    assert DepthObjective("l1").w == 0
+    terms = DepthObjective("l1")(Answer(_ramp(0.3)), _wall())
     assert terms.keys() == {"loss", "l1"}
     assert float(terms["loss"]) == pytest.approx(0.9, rel=1e-12)
 
 
 def test_intermediate_stages_get_the_depth_loss_too() -> None:
-    terms = Objective("l1", 2.0)(_ramp(0, 4.0), _wall(), [_ramp(0, 4.5), _ramp(0, 6.0)])
+    terms = DepthObjective("l1", 2.0)(Answer(_ramp(0, 4.0), stages=(_ramp(0, 4.5), _ramp(0, 6.0))), _wall())
     assert {name: float(value) for name, value in terms.items()} == pytest.approx(
         {"loss": 1.25, "l1": 0, "l1_stage1": 0.25, "l1_stage2": 1.0, "mse_v": 0}, abs=1e-13
     )
@@ -134,7 +135,7 @@ def test_shading_term_is_that_of_the_surface_and_the_photo() -> None:
     batch = {**_wall(), "rgb": torch.rand((1, 3, 12, 13), generator=torch.Generator().manual_seed(0)).double()}
     disparity = _ramp(0.3)
     expected = shading_loss(SurfacePair(to_depth(disparity, batch), batch["depth"], batch["rays"]), batch["rgb"])
-    terms = Objective("l1", shading=0.5)(disparity, batch)
+    terms = DepthObjective("l1", shading=0.5)(Answer(disparity), batch)
     assert terms.keys() == {"loss", "l1", "shading"}
     assert float(terms["shading"]) == pytest.approx(float(expected), rel=1e-12)
     assert float(terms["loss"]) == pytest.approx(float(terms["l1"]) + 0.5 * float(expected), rel=1e-12)
@@ -143,24 +144,24 @@ def test_shading_term_is_that_of_the_surface_and_the_photo() -> None:
 @pytest.mark.parametrize("weight", [-0.1, math.nan, math.inf])
 def test_shading_weight_that_is_none_is_refused(weight: float) -> None:
     with pytest.raises(ValueError, match=r"^shading: expected 0 or a positive number, got"):
-        Objective("l1", shading=weight)
+        DepthObjective("l1", shading=weight)
 
 
 def test_flat_low_resolution_map_has_a_nonzero_range() -> None:
     batch = {**_wall(), "disparity_lr": torch.full((1, 1, 1, 2), 4.0, dtype=torch.float64)}
-    terms = Objective("l1")(_ramp(0, 4.001), batch)
+    terms = DepthObjective("l1")(Answer(_ramp(0, 4.001)), batch)
     assert float(terms["loss"]) == pytest.approx(0.001 / 0.004, rel=1e-9)
 
 
 def test_holes_of_the_low_resolution_map_do_not_widen_its_range() -> None:
     batch = _wall()
     batch["disparity_lr"] = torch.tensor([3.0, torch.nan, 5.0], dtype=torch.float64).view(1, 1, 1, 3)
-    assert float(Objective("l1")(_ramp(0, 4.5), batch)["loss"]) == pytest.approx(0.25, rel=1e-13)
+    assert float(DepthObjective("l1")(Answer(_ramp(0, 4.5)), batch)["loss"]) == pytest.approx(0.25, rel=1e-13)
 
 
 def test_unknown_depth_loss_is_refused() -> None:
     with pytest.raises(ValueError, match=r"^depth_loss: expected one of lap1, l1, mse, got 'ssim'"):
-        Objective("ssim")  # type: ignore[arg-type]
+        DepthObjective("ssim")  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("doffs", [0.0, 1.0, -2.5])
@@ -208,7 +209,7 @@ def test_balanced_weight_balances_a_tilt_between_neighbours() -> None:
     batch = {name: value[None].double() for name, value in batch.items()}
     bumps = torch.zeros_like(batch["depth"])
     bumps[..., 5::2] = math.tan(math.asin(5 / 255)) * 2 / 80
-    terms = Objective("l1", w)(batch["bf"] / (batch["depth"] + bumps), batch)
+    terms = DepthObjective("l1", w)(Answer(batch["bf"] / (batch["depth"] + bumps)), batch)
     # l1 sees every second column; MSE_v sees a tilt at every column
     assert float(2 * terms["l1"]) == pytest.approx(float(w * terms["mse_v"]), rel=0.05)
 
@@ -274,7 +275,7 @@ def _module(network: LPIPS | None = None, *, scale: int = 2, **schedule: Any) ->
     torch.manual_seed(0)
     settings = {"steps": 30, "warmup": 1, **schedule}
     metrics = functools.partial(visual_metrics, network)
-    return SuperResolution(MSGNet(scale, "dsr"), Objective("lap1", 0.1), Schedule(**settings), metrics)
+    return SuperResolution(MSGNet(scale, "dsr"), DepthObjective("lap1", 0.1), Schedule(**settings), metrics)
 
 
 def _trainer(folder: Path, **settings: Any) -> lightning.Trainer:
@@ -315,7 +316,7 @@ def test_training_loss_is_the_objective_of_the_networks_output_in_full_precision
     [batch] = _one_batch()
     with torch.no_grad(), torch.autocast("cpu", torch.bfloat16, enabled=mixed):
         disparity = upsample_disparity(module.net, batch["rgb"], batch["disparity_lr"], batch["min_max"])
-    expected = float(module.objective(disparity, batch)["loss"])
+    expected = float(module.objective(Answer(disparity), batch)["loss"])
     _trainer(tmp_path, max_steps=1, callbacks=[losses]).fit(module, _one_batch())
     assert losses.values == pytest.approx([expected], rel=2e-5)
 
@@ -342,7 +343,7 @@ def test_weight_average_follows_the_weights_with_its_decay(tmp_path: Path) -> No
 def test_average_has_the_statistics_of_batch_normalisation(tmp_path: Path) -> None:
     torch.manual_seed(0)
     metrics = functools.partial(visual_metrics, None)
-    module = SuperResolution(SparseToDense(2, width=4), Objective("l1"), Schedule(steps=9, warmup=1), metrics)
+    module = SuperResolution(SparseToDense(2, width=4), DepthObjective("l1"), Schedule(steps=9, warmup=1), metrics)
     seconds_per_step(module, next(iter(_one_batch())))
     assert not any(bool(mean.any()) for name, mean in module.net.named_buffers() if name.endswith("mean"))
     _trainer(tmp_path, max_epochs=2).fit(module, _one_batch())
@@ -414,7 +415,7 @@ def _loader(scenes: WholeScenes) -> DataLoader[Batch]:
 def test_validation_is_in_the_unit_of_its_benchmark(tmp_path: Path) -> None:
     levels = Unit("levels", inverse=True, factor=8.0, limits=(0, 255))
     module = SuperResolution(
-        MSGNet(2, "dsr"), Objective(), Schedule(1), lambda: visual_metrics(protocols=("field",)), ("a", "b")
+        MSGNet(2, "dsr"), DepthObjective(), Schedule(1), lambda: visual_metrics(protocols=("field",)), ("a", "b")
     )
     sets = [_loader(WholeScenes([replace(_scene(3), unit=unit)], X2)) for unit in (levels, CENTIMETRES)]
     in_levels, in_cm = (dict(each) for each in _trainer(tmp_path).validate(module, sets, verbose=False))
@@ -510,4 +511,4 @@ def test_checkpoint_holds_the_networks_tensors_alone_and_loads_as_plain_data(tmp
 
 def test_network_that_leaves_out_pixels_is_refused() -> None:
     with pytest.raises(ValueError, match=r"model: expected a network that covers the whole image"):
-        SuperResolution(MSGNet(4, "hui"), Objective(), Schedule(10), visual_metrics)
+        SuperResolution(MSGNet(4, "hui"), DepthObjective(), Schedule(10), visual_metrics)

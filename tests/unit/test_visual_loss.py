@@ -15,13 +15,15 @@ from dsr.degradation.downsampling import Downsampling, make_sample
 from dsr.geometry.camera import Camera
 from dsr.methods.dip.problem import ImageProblem, PriorObjective
 from dsr.methods.dip.upsampler import DeepImagePrior
+from dsr.methods.networks.base import Answer
 from dsr.methods.networks.maps import mean3x3
+from dsr.methods.networks.msg_net import MSGNet
 from dsr.metrics.functional import SurfacePair, dssim_v, mse_v
 from dsr.metrics.lpips import LPIPS, lpips_v
 from dsr.metrics.visual_loss import MSE_V, VisualLoss, VisualLossName, make_visual_loss, match_weight
 from dsr.sample import DepthSample, Scene
 from dsr.training.degradation import Batch, to_tensors
-from dsr.training.objective import Objective, balance_weight
+from dsr.training.objective import DepthObjective, balance_weight
 from dsr.utils.builder import ConfigError
 
 SIZE = 32
@@ -108,7 +110,7 @@ def test_objectives_have_the_visual_loss_as_a_term(name: VisualLossName, network
     loss, sample = _loss(name, network.float()), _sample(64)
     batch: Batch = {key: value[None] for key, value in to_tensors(sample).items()}
     disparity = 1.02 * batch["bf"] / batch["depth"] + 0.02 * torch.sin(torch.arange(64.0))
-    terms = Objective("l1", 0.3, visual=loss)(disparity, batch)
+    terms = DepthObjective("l1", 0.3, visual=loss)(Answer(disparity), batch)
     assert terms.keys() == {"loss", "l1", name}
     assert terms["loss"].item() == pytest.approx((terms["l1"] + 0.3 * terms[name]).item(), rel=1e-6)
     expected = loss(SurfacePair(batch["bf"] / disparity, batch["depth"], batch["rays"]))
@@ -188,7 +190,7 @@ def test_training_refuses_a_visual_loss_that_it_cannot_use(tmp_path: Path) -> No
         settings.loss.visual, settings.trainer.patch = visual, patch
         settings.metrics.lpips_trunk = str(tmp_path / "none.pth")
         with pytest.raises(ConfigError) as caught:
-            _module(settings, None, None, None)  # type: ignore[arg-type]
+            _module(settings, MSGNet(4), None, None)  # type: ignore[arg-type]
         return str(caught.value)
 
     assert refused({"visual": False}, "dssim") == (

@@ -8,7 +8,7 @@ import math
 import shutil
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 from zipfile import BadZipFile
@@ -36,14 +36,13 @@ from dsr.app.trainer import (
 from dsr.app.training_runs import WEIGHTS, common, keyed, read_config, training_data
 from dsr.data.base import SceneSource, prepare_scenes
 from dsr.methods.networks.base import DisparityNetwork
-from dsr.methods.networks.facets_unet import FacetsUNet
 from dsr.methods.networks.trained import NETWORKS
 from dsr.methods.networks.weight_files import load_network, network_name, read_torch_file, save_network
-from dsr.metrics.visual_loss import VisualLoss, make_visual_loss
+from dsr.metrics.visual_loss import make_visual_loss
 from dsr.training.data_module import PatchData
 from dsr.training.loggers import RUN_IDS, expect_installed, log_config, log_layout, log_settings
 from dsr.training.module import SuperResolution
-from dsr.training.objective import Objective, SurfaceObjective, balance_weight
+from dsr.training.objective import DepthObjective, Objective, SurfaceObjective
 from dsr.training.settings import Schedule
 from dsr.utils import interruption
 from dsr.utils.builder import ConfigError, build
@@ -57,7 +56,6 @@ from dsr.utils.limits import expect_stored
 from dsr.utils.progress import SILENT, Progress
 from dsr.utils.units import duration
 
-_PATCHES_FOR_W = 64
 _LARGEST_SEED = 2**32 - 1
 _FOLDERS = ("checkpoints", "tensorboard", "csv", "wandb", "mlruns")
 """What a training writes into its directory beside files."""
@@ -212,14 +210,14 @@ def _train(plain: dict[str, Any], settings: TrainConfig, device: torch.device, p
         if first:
             _open_log(trainer, plain, module)
             _announce(progress, settings, prepared, processes.count)
-        _load(progress, settings, module, data)
+        _load(progress, module, data)
     except ConfigError:
         if new:  # a corrected command begins anew
             _discard(trainer, folder)
         raise
     facts = _facts(plain, module)
     if first:
-        _describe(trainer, plain, module, facts, resumed=resume is not None)
+        _describe(trainer, plain, facts, resumed=resume is not None)
     try:
         fit(trainer, module, data, resume)
     except DivergenceError as error:
@@ -304,6 +302,11 @@ def _network(settings: TrainConfig) -> DisparityNetwork:
             take(first)
         except ValueError as error:
             raise ConfigError(f"trainer.{key}: {given}: {error}") from error
+    for scale in settings.degradation.get("scales") or ():
+        if not net.serves(settings.scale, int(scale)):
+            raise ConfigError(
+                f"degradation.scales: expected factors that weights for {settings.scale} serve, got {scale}"
+            )
     for pattern in settings.trainer.frozen:
         found = [value for name, value in net.named_parameters() if fnmatch.fnmatchcase(name, pattern)]
         if not found:
@@ -315,78 +318,49 @@ def _network(settings: TrainConfig) -> DisparityNetwork:
 
 
 def _module(settings: TrainConfig, net: DisparityNetwork, data: PatchData, metrics: Any) -> SuperResolution:
-    """Build the training module; if w is computed from the scenes, its loss has a provisional w of 1."""
-    depth_loss: Any = settings.model.get("depth_loss")
-    visual = settings.model.get("visual")
-    if not isinstance(visual, bool):
-        raise ConfigError(f"model.visual: expected true or false, got {visual!r}")
-    if not visual and settings.loss.visual != "mse_v":
-        name = settings.model["name"]
-        raise ConfigError(f"loss.visual: model={name} has no visual loss, which model.visual=true adds; leave it out")
-    _check_surface_loss(settings, net)
-    w = (1.0 if settings.loss.w == "auto" else float(settings.loss.w)) if visual else 0.0
+    """Build the training module."""
     try:
-        loss = _visual_loss(settings)
+        objective = _objective(settings)
+        objective.check(net, settings.trainer.patch, told=settings.degradation["name"] != "plain")
         mixed = settings.precision == "bfloat16"
         schedule = Schedule(mixed=mixed, **common(Schedule, settings.trainer))
-        objective: Objective | SurfaceObjective = (
-            SurfaceObjective()
-            if depth_loss == "surface"
-            else Objective(depth_loss, w, loss, settings.model.get("shading", 0.0))
-        )
         return SuperResolution(net, objective, schedule, metrics, data.validation_sets)
     except (ValueError, OSError) as error:
         raise keyed(error) from error
 
 
-def _check_surface_loss(settings: TrainConfig, net: DisparityNetwork) -> None:
-    """Check that the loss of networks that say how sure they are has such a network, and the hints that it needs."""
-    name, surface = settings.model["name"], settings.model.get("depth_loss") == "surface"
-    if surface != isinstance(net, FacetsUNet):
+def _objective(settings: TrainConfig) -> Objective:
+    """Build the loss."""
+    model, loss, trunk = settings.model, settings.loss, settings.metrics.lpips_trunk
+    visual = model.get("visual")
+    if not isinstance(visual, bool):
+        raise ConfigError(f"model.visual: expected true or false, got {visual!r}")
+    if not visual and loss.visual != "mse_v":
         raise ConfigError(
-            f"model.depth_loss: expected surface for model=facets, and another for other networks, got "
-            f"{settings.model.get('depth_loss')!r} for model={name}"
+            f"loss.visual: model={model['name']} has no visual loss, which model.visual=true adds; leave it out"
         )
-    if surface and settings.degradation["name"] == "plain":
-        raise ConfigError(
-            f"degradation: expected everything or another distribution for model={name}, whose training needs hints, "
-            "got plain"
-        )
-    for scale in settings.degradation.get("scales") or () if surface else ():
-        if not net.serves(settings.scale, int(scale)):
-            raise ConfigError(
-                f"degradation.scales: expected factors that weights for {settings.scale} serve, got {scale}"
-            )
-    if surface and (settings.loss.w != "auto" or settings.loss.visual != "mse_v"):
-        raise ConfigError(f"loss: model={name} has a loss of its own, without w and loss.visual; leave them out")
+    if model.get("depth_loss") == "surface":
+        if loss.w != "auto" or loss.visual != "mse_v":
+            name = model["name"]
+            raise ConfigError(f"loss: model={name} has a loss of its own, without w and loss.visual; leave them out")
+        return SurfaceObjective()
+    made = make_visual_loss(loss.visual, None if trunk is None else Path(trunk).expanduser())  # type: ignore[arg-type]
+    w = loss.w if loss.w == "auto" else float(loss.w)
+    return DepthObjective(model.get("depth_loss"), w if visual else 0.0, made, model.get("shading", 0.0))  # type: ignore[arg-type]
 
 
-def _visual_loss(settings: TrainConfig) -> VisualLoss:
-    """Return the loss on renderings."""
-    name: Any = settings.loss.visual
-    trunk = settings.metrics.lpips_trunk
-    loss = make_visual_loss(name, None if trunk is None else Path(trunk).expanduser())
-    loss.check_size(settings.trainer.patch, settings.trainer.patch)
-    return loss
-
-
-def _load(progress: Progress, settings: TrainConfig, module: SuperResolution, data: PatchData) -> None:
-    """Prepare and load the scenes, and compute w from training patches if it is ``auto``."""
+def _load(progress: Progress, module: SuperResolution, data: PatchData) -> None:
+    """Prepare and load the scenes, and compute the weights of the loss that depend on them."""
     for source, names in data.used_scenes:
         prepare_scenes(source, names, progress)
     try:
         data.setup()
-        if isinstance(module.objective, Objective) and _computes_w(settings):
-            w = balance_weight(data.first_patches(_PATCHES_FOR_W), module.objective.visual)
-            module.objective = replace(module.objective, w=w)
-            progress.say(f"loss   {module.objective.formula}")
+        balanced = module.objective.balanced(data.first_patches)
     except (ValueError, OSError) as error:
         raise keyed(error) from error
-
-
-def _computes_w(settings: TrainConfig) -> bool:
-    """Return whether the weight of the visual loss is to be computed from the scenes."""
-    return bool(settings.model["visual"]) and settings.loss.w == "auto"
+    if balanced is not module.objective:
+        module.objective = balanced
+        progress.say(f"loss   {balanced.formula}")
 
 
 def _clear(folder: Path) -> None:
@@ -400,18 +374,14 @@ def _clear(folder: Path) -> None:
 def _announce(progress: Progress, settings: TrainConfig, prepared: _Prepared, devices: int) -> None:
     """Show what the run will do, and how long it will take."""
     data, module, trainer = prepared.data, prepared.module, settings.trainer
-    objective = module.objective
     held_out = ", ".join(f"{len(names)} of {kind}" for kind, (_, names) in data.validation_scenes().items())
     parameters = sum(each.numel() for each in module.net.parameters())
     accumulate = f" x {trainer.accumulate} batches" if trainer.accumulate > 1 else ""
     accumulate += f" x {devices} devices" if devices > 1 else ""
-    loss = objective.formula
-    if isinstance(objective, Objective) and _computes_w(settings):
-        loss = f"{objective.depth_loss} + w {objective.visual.title}; w is computed from the scenes"
     lines: Mapping[str, Any] = {
         "model": f"{settings.model['name']} x{settings.scale}, {parameters:,} parameters, {settings.precision}",
         "data": f"{data.training_count} scenes of {settings.dataset['name']} to train on, {held_out} to validate with",
-        "loss": loss,
+        "loss": module.objective.formula,
         "steps": f"{trainer.steps} of {trainer.batch} patches of {trainer.patch} x {trainer.patch}{accumulate}"
         + (", resumed" if prepared.resume else ""),
         "log": ", ".join(
@@ -469,13 +439,10 @@ def _open_log(trainer: lightning.Trainer, plain: Mapping[str, Any], module: Supe
         log_layout(logger, {name: metric.chart_title for name, metric in collections[0].items()})
 
 
-def _describe(
-    trainer: lightning.Trainer, plain: Mapping[str, Any], module: SuperResolution, facts: Mapping[str, Any], *,
-    resumed: bool,
-) -> None:  # fmt: skip
+def _describe(trainer: lightning.Trainer, plain: Mapping[str, Any], facts: Mapping[str, Any], *, resumed: bool) -> None:
     """Write the main settings and the resulting w to the logs."""
     listed = {**facts, "method": facts["model"], "degradation": rundir.degradation_of(plain)}
-    loss = {**plain["loss"], "w": module.objective.w} if isinstance(module.objective, Objective) else {}
+    loss = {**plain["loss"], "w": facts["w"]} if "w" in facts else {}
     for logger in trainer.loggers:
         if isinstance(logger, TensorBoardLogger) or not resumed:  # MLflow refuses another device, say
             log_settings(logger, listed, {**plain, "loss": loss})

@@ -11,11 +11,10 @@ from dsr.app.schema import RunConfig, TrainConfig, TrainerConfig, user_directori
 from dsr.app.trust import Trust, expect_trusted, read_plain_yaml
 from dsr.data.base import SceneSource, SceneSubset
 from dsr.degradation.downsampling import Downsampling
-from dsr.methods.networks.facets_unet import FacetsUNet
 from dsr.training.data_module import Part, PatchData
 from dsr.training.degradation import Degradation
 from dsr.training.settings import PatchSettings
-from dsr.utils.builder import ConfigError, build, check_types, load_target, with_key
+from dsr.utils.builder import ConfigError, build, check_types, trait, with_key
 from dsr.utils.parsing import is_number
 
 WEIGHTS = "weights.safetensors"
@@ -115,7 +114,7 @@ def studies_of_run(
 
 def _as_validated(model: Mapping[str, Any]) -> dict[str, Any]:
     """Return the settings of the method that runs a network as validations do: one pass, told what is known of maps."""
-    if issubclass(load_target("model", model), FacetsUNet):
+    if trait("model", model, "states_errors"):
         return {"target": "dsr.methods.networks.any_map.build_any_map"}
     return {"target": "dsr.methods.networks.trained.build_trained", "ensemble": 1}
 

@@ -20,7 +20,7 @@ from dsr.metrics.functional import SurfacePair
 from dsr.sample import Unit
 from dsr.training.degradation import Batch
 from dsr.training.loggers import log_picture
-from dsr.training.objective import Objective, SurfaceObjective, to_depth
+from dsr.training.objective import Objective, to_depth
 from dsr.training.settings import Schedule
 
 _RENDERED_SCENES = 4
@@ -49,7 +49,7 @@ class SuperResolution(lightning.LightningModule):
     def __init__(
         self,
         net: DisparityNetwork,
-        objective: Objective | SurfaceObjective,
+        objective: Objective,
         schedule: Schedule,
         metrics: Callable[[], torchmetrics.MetricCollection],
         validation_sets: Sequence[str] = ("val",),
@@ -77,15 +77,9 @@ class SuperResolution(lightning.LightningModule):
 
     def loss_terms(self, batch: Batch) -> dict[str, Tensor]:
         """Return ``loss`` and its terms."""
-        if isinstance(self.objective, SurfaceObjective):
-            with torch.autocast(self.device.type, torch.bfloat16, enabled=self.schedule.mixed):
-                inverse = batch["disparity_lr"] + batch["doffs"]
-                answer = self.net.answer(batch["rgb"], inverse, batch["noise"], batch["facts"])
-            return self.objective(answer, batch)
         with torch.autocast(self.device.type, torch.bfloat16, enabled=self.schedule.mixed):
-            stages = self.net.upsample_stages(batch["rgb"], batch["disparity_lr"], batch["min_max"])
-        *intermediate, disparity = (stage.float() for stage in stages)
-        return self.objective(disparity, batch, intermediate)
+            answer = self.net.answer_patches(batch)
+        return self.objective(answer, batch)
 
     def configure_gradient_clipping(self, optimizer: Any, *_: Any, **__: Any) -> None:
         """Clip the gradient and log its norm; drop a gradient that is not finite, so that the step changes nothing."""
@@ -111,14 +105,7 @@ class SuperResolution(lightning.LightningModule):
         """Score a whole scene, if the batch has one; render the first few for TensorBoard."""
         if not batch:
             return
-        offset = batch["doffs"] if self.average.of_inverse_depth else 0
-        values = batch["disparity_lr"] + offset
-        if isinstance(self.objective, SurfaceObjective):
-            disparity = self.average.answer(batch["rgb"], values, batch.get("noise"), batch.get("facts")).disparity
-        else:
-            disparity = self.average.upsample(batch["rgb"], values)
-        disparity = disparity - offset
-        depth = to_depth(disparity.to(batch["depth"].dtype), batch)
+        depth = to_depth(self.average.answer_scene(batch).to(batch["depth"].dtype), batch)
         scored = [(self.metrics[dataloader_idx], depth)]
         if self._bicubic_metrics:
             scored.append((self._bicubic_metrics[dataloader_idx], batch["bicubic"]))

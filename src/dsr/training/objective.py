@@ -1,17 +1,18 @@
-"""The training loss: a loss on disparity, plus w times a visual loss, plus a shading loss; and the weight w."""
+"""The losses of trainings: of disparity and renderings, whose weight w may be computed, and of expected errors."""
 
 from __future__ import annotations
 
+import abc
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Literal
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Literal, Self
 
 import torch
 from torch import Tensor
 
 from dsr.geometry.surface import angle_between
-from dsr.methods.networks.facets_unet import Answer
+from dsr.methods.networks.base import Answer, DisparityNetwork
 from dsr.methods.networks.maps import compute_min_max, upsample_bicubic
 from dsr.metrics import losses
 from dsr.metrics.functional import SurfacePair, masked_mean, mse_v
@@ -24,10 +25,58 @@ _TILT = math.asin(5 / 255)
 """1.1 degrees: it changes the rendering of a surface lit from the side by 5 of 255, the threshold of BadPix_v(5)."""
 _TINY, _FAINT = 1e-5, 1e-7
 _DEPTH_LOSSES = {"lap1": losses.lap1, "l1": losses.l1, "mse": losses.mse}
+_PATCHES_FOR_W = 64
+
+
+class Objective(abc.ABC):
+    """What a training minimises."""
+
+    @property
+    @abc.abstractmethod
+    def formula(self) -> str:
+        """The loss as a formula."""
+
+    @property
+    @abc.abstractmethod
+    def facts(self) -> dict[str, str | float]:
+        """What the header of weights says of the loss."""
+
+    @abc.abstractmethod
+    def __call__(self, answer: Answer, batch: Batch) -> dict[str, Tensor]:
+        """Return ``loss`` and its terms, means over the images of the batch that have valid depth.
+
+        Args:
+            answer: of :meth:`dsr.methods.networks.base.DisparityNetwork.answer_patches`.
+            batch: tensors of :func:`dsr.training.degradation.to_tensors`.
+
+        """
+
+    @abc.abstractmethod
+    def check(self, net: DisparityNetwork, patch: int, *, told: bool) -> None:
+        """Check that a network can be trained with this loss.
+
+        Args:
+            net: the network.
+            patch: height and width of the patches in pixels.
+            told: whether there are hints on the maps.
+
+        Raises:
+            ValueError: it cannot.
+
+        """
+
+    def balanced(self, first_patches: Callable[[int], Sequence[Batch]]) -> Self:
+        """Return the loss with weights that are computed from patches, if there are any such; else itself.
+
+        Args:
+            first_patches: returns as many of the training's patches, without a batch axis.
+
+        """
+        return self
 
 
 @dataclass(frozen=True)
-class Objective:
+class DepthObjective(Objective):
     """The loss: depth_loss + w visual (Voynov et al. 2019, eq. 4: Lap_1 + w MSE_v), and perhaps a shading loss.
 
     The depth loss compares disparities divided by the range of the low-resolution ones, so that it does not depend on
@@ -35,7 +84,7 @@ class Objective:
 
     Args:
         depth_loss: ``lap1``, ``l1`` or ``mse``.
-        w: weight of the visual loss; 0 for the depth loss alone.
+        w: weight of the visual loss; 0 for none; ``auto`` is computed by :meth:`balanced`, and 1 before.
         visual: the visual loss.
         shading: weight of :func:`dsr.training.shading.shading_loss`; 0 for none.
 
@@ -45,7 +94,7 @@ class Objective:
     """
 
     depth_loss: DepthLoss = "lap1"
-    w: float = 0.0
+    w: float | Literal["auto"] = 0.0
     visual: VisualLoss = MSE_V
     shading: float = 0.0
 
@@ -59,6 +108,8 @@ class Objective:
     @property
     def formula(self) -> str:
         """The loss as a formula."""
+        if self.w == "auto":
+            return f"{self.depth_loss} + w {self.visual.title}; w is computed from the scenes"
         terms = {self.visual.title: self.w, "shading": self.shading}
         return " + ".join([self.depth_loss, *(f"{weight:.3g} {name}" for name, weight in terms.items() if weight)])
 
@@ -68,15 +119,21 @@ class Objective:
         visual = self.visual.name if self.w else "none"
         return {"loss": self.depth_loss, "visual": visual, "w": self.w, "shading": self.shading}
 
-    def __call__(self, disparity: Tensor, batch: Batch, intermediate: Sequence[Tensor] = ()) -> dict[str, Tensor]:
-        """Return ``loss`` and its terms, means over the images of the batch that have valid depth.
+    def check(self, net: DisparityNetwork, patch: int, *, told: bool) -> None:
+        """Refuse a network that states its errors, and patches that are too small for the visual loss."""
+        if net.states_errors:
+            raise ValueError(
+                f"depth_loss: expected surface for {type(net).__name__}, which states its errors, got {self.depth_loss}"
+            )
+        self.visual.check_size(patch, patch)
 
-        Args:
-            disparity: (B, 1, H, W) the network's disparity in pixels.
-            batch: tensors of :func:`dsr.training.degradation.to_tensors`.
-            intermediate: (B, 1, H, W) results of earlier stages of the network, which get the depth loss, too.
+    def balanced(self, first_patches: Callable[[int], Sequence[Batch]]) -> Self:
+        """Return the loss with a computed weight in place of ``auto``; see :func:`balance_weight`."""
+        return replace(self, w=balance_weight(first_patches(_PATCHES_FOR_W), self.visual)) if self.w == "auto" else self
 
-        """
+    def __call__(self, answer: Answer, batch: Batch) -> dict[str, Tensor]:
+        """Return ``loss`` and its terms; intermediate stages of the network get the depth loss, too."""
+        disparity, w = answer.disparity, 1.0 if self.w == "auto" else self.w
         target = batch["bf"] / batch["depth"] - batch["doffs"]
         extent = _range(batch["disparity_lr"])
 
@@ -85,14 +142,14 @@ class Objective:
 
         loss = compare(disparity)
         terms: dict[str, Tensor] = {self.depth_loss: loss}
-        for number, each in enumerate(intermediate, 1):
+        for number, each in enumerate(answer.stages, 1):
             terms[f"{self.depth_loss}_stage{number}"] = compare(each)
             loss = loss + terms[f"{self.depth_loss}_stage{number}"]
-        if self.w or self.shading:
+        if w or self.shading:
             pair = SurfacePair(to_depth(disparity, batch), batch["depth"], batch["rays"])
-        if self.w:
+        if w:
             terms[self.visual.name] = self.visual(pair).nanmean()
-            loss = loss + self.w * terms[self.visual.name]
+            loss = loss + w * terms[self.visual.name]
         if self.shading:
             terms["shading"] = shading_loss(pair, batch["rgb"]).nanmean()
             loss = loss + self.shading * terms["shading"]
@@ -100,7 +157,7 @@ class Objective:
 
 
 @dataclass(frozen=True)
-class SurfaceObjective:
+class SurfaceObjective(Objective):
     """The loss of a network that says how sure it is: K Lap_1 + RMSE_v, and the likelihoods of its expected errors.
 
     Lap_1 compares disparities divided by the truth's median. RMSE_v is that of each image, and not its square, so that
@@ -132,11 +189,25 @@ class SurfaceObjective:
         """What the header of weights says of the loss."""
         return {"loss": "surface", "depth": self.depth, "soft": self.soft, "sharp": self.sharp, "errors": self.errors}
 
+    def check(self, net: DisparityNetwork, patch: int, *, told: bool) -> None:
+        """Refuse a network that does not state its errors, and maps without hints."""
+        if not net.states_errors:
+            choices = ", ".join(_DEPTH_LOSSES)
+            raise ValueError(
+                f"depth_loss: expected one of {choices} for {type(net).__name__}, which states no errors, got surface"
+            )
+        if not told:
+            raise ValueError(
+                f"degradation: expected everything or another distribution with the hints that {type(net).__name__} is "
+                "told, got plain"
+            )
+
     def __call__(self, answer: Answer, batch: Batch) -> dict[str, Tensor]:
-        """Return ``loss`` and its terms, means over the images of the batch that have valid depth.
+        """Return ``loss`` and its terms.
 
         Args:
-            answer: of the network, whose ``disparity`` is without offset: baseline times focal length over depth.
+            answer: of the network, with expected errors. Its ``disparity`` is without offset: baseline times focal
+                length over depth.
             batch: tensors of :func:`dsr.training.degradation.to_tensors`, and ``soft``, (B,), 1 where the truth's depth
                 steps are soft.
 

@@ -20,8 +20,8 @@ from dsr.geometry.camera import RangeType
 from dsr.geometry.holes import degrees_per_pixel, distance_to_known
 from dsr.geometry.resampling import pad_inverse_depth, resize_inverse_depth
 from dsr.methods.base import Cost, MapNoise, Ratios, Surface
-from dsr.methods.networks.base import DTYPES, DisparityNetwork, Precision
-from dsr.methods.networks.facets_unet import Answer, FacetsUNet
+from dsr.methods.networks.base import DTYPES, Answer, DisparityNetwork, Precision
+from dsr.methods.networks.facets_unet import FacetsUNet
 from dsr.methods.networks.trained import NETWORKS
 from dsr.methods.networks.weight_files import clean_weights, load_network
 from dsr.sample import DepthSample

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import abc
 import copy
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any, Literal
@@ -28,6 +29,25 @@ TILE = 1024
 UNTILED = 2**21
 """Number of high-resolution pixels up to which an image is processed without tiles."""
 _OVERLAP = 4
+_UNKNOWN = torch.tensor(math.nan)
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What a network says of images, all (B, 1, H, W).
+
+    Args:
+        disparity: in the unit of the input.
+        spread: expected absolute error of the logarithm of disparity; NaN of a network that states no errors.
+        angle: expected error of the normal in radians; NaN likewise.
+        stages: disparities of the network's intermediate stages, if any, which a training compares with the truth, too.
+
+    """
+
+    disparity: Tensor
+    spread: Tensor = _UNKNOWN
+    angle: Tensor = _UNKNOWN
+    stages: tuple[Tensor, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -52,6 +72,7 @@ class DisparityNetwork(nn.Module, abc.ABC):
     Attributes:
         scale: upsampling factor.
         of_inverse_depth: whether it takes inverse depth in place of disparity, which may have an offset.
+        states_errors: whether its answers have expected errors, and it is told what is known of the maps.
         covers: whether the output covers the whole image; some published networks leave out a row and a column.
 
     """
@@ -59,6 +80,7 @@ class DisparityNetwork(nn.Module, abc.ABC):
     scale: int
     covers: bool = True
     of_inverse_depth: bool = False
+    states_errors: bool = False
 
     @classmethod
     def serves(cls, trained: int, scale: int) -> bool:
@@ -113,9 +135,23 @@ class DisparityNetwork(nn.Module, abc.ABC):
 
         """
 
-    def upsample_stages(self, rgb: Tensor, disparity: Tensor, min_max: Tensor | None = None) -> tuple[Tensor, ...]:
-        """Return the maps that a training supervises: those of intermediate stages, if any, then :meth:`upsample`'s."""
-        return (self.upsample(rgb, disparity, min_max),)
+    def answer_patches(self, batch: Mapping[str, Tensor]) -> Answer:
+        """Return what a training compares with the truth, in float32.
+
+        Args:
+            batch: patches as of :func:`dsr.training.degradation.to_tensors`, with a batch axis.
+
+        """
+        return Answer(self.upsample(batch["rgb"], batch["disparity_lr"], batch["min_max"]).float())
+
+    def answer_scene(self, batch: Mapping[str, Tensor]) -> Tensor:
+        """Return what a validation scores, high-resolution disparity, (B, 1, H, W).
+
+        Args:
+            batch: a scene as of :class:`dsr.training.data_module.WholeScenes`, with a batch axis.
+
+        """
+        return self.upsample(batch["rgb"], batch["disparity_lr"])
 
 
 class WindowedNetwork(DisparityNetwork):

@@ -19,6 +19,7 @@ What differs from the original:
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import torch
@@ -27,7 +28,7 @@ from torch.nn import functional
 
 from dsr.degradation.scales import check_scale
 from dsr.methods.classical.finite_differences import grey, upsample_linear_border
-from dsr.methods.networks.base import NormalisedNetwork, expect_rgb_size
+from dsr.methods.networks.base import Answer, NormalisedNetwork, expect_rgb_size
 
 _HALVINGS = 2
 _BLOCKS = 2
@@ -76,9 +77,12 @@ class DDRNet(NormalisedNetwork):
         radius_hr = self.denoise.receptive_field_radius + self.refine.receptive_field_radius
         return -(-radius_hr // self.scale) + _UPSAMPLING
 
-    def upsample_stages(self, rgb: Tensor, disparity: Tensor, min_max: Tensor | None = None) -> tuple[Tensor, ...]:
-        """Return the denoised and the refined map."""
-        return self.in_range(disparity, min_max, lambda values: self._compute_stages(rgb, values))
+    def answer_patches(self, batch: Mapping[str, Tensor]) -> Answer:
+        """Return the refined map, and the denoised one as a stage."""
+        denoised, refined = self.in_range(
+            batch["disparity_lr"], batch["min_max"], lambda values: self._compute_stages(batch["rgb"], values)
+        )
+        return Answer(refined.float(), stages=(denoised.float(),))
 
     def forward(self, rgb: Tensor, values: Tensor) -> Tensor:
         """Map an image and normalised low-resolution disparity to high-resolution disparity.

@@ -27,6 +27,7 @@ Disparity is divided by its median, so that the result does not depend on the un
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import torch
@@ -36,7 +37,7 @@ from torch.nn import functional
 from dsr.degradation.downsampling import Downsampling
 from dsr.degradation.hints import FACTS, KERNELS
 from dsr.methods.classical.finite_differences import repeat_blocks
-from dsr.methods.networks.base import DisparityNetwork, expect_rgb_size
+from dsr.methods.networks.base import Answer, DisparityNetwork, expect_rgb_size
 from dsr.methods.networks.exportable import every, exporting, median_in_graph, quantiles_in_graph
 from dsr.methods.networks.facets import Facets
 from dsr.methods.networks.facets_layers import (
@@ -87,18 +88,6 @@ _MARGIN = 4
 """Low-resolution rows beyond a band that its result depends on."""
 
 
-class Answer(NamedTuple):
-    """What the network says of an image: all (B, 1, H, W).
-
-    ``disparity`` in the unit of the input; ``spread``, the expected absolute error of the logarithm of disparity;
-    ``angle``, that of the normal in radians.
-    """
-
-    disparity: Tensor
-    spread: Tensor
-    angle: Tensor
-
-
 class _Band(NamedTuple):
     """Low-resolution rows: ``rows`` with their margins, and where among them those are that are kept, ``inner``."""
 
@@ -128,6 +117,7 @@ class FacetsUNet(DisparityNetwork):
     """
 
     of_inverse_depth = True
+    states_errors = True
 
     def __init__(self, scale: int = 4, width: int = 96, deep: int = 88, blocks: int = 6, facets: int = 2) -> None:
         super().__init__()
@@ -213,6 +203,15 @@ class FacetsUNet(DisparityNetwork):
     def upsample(self, rgb: Tensor, disparity: Tensor, min_max: Tensor | None = None) -> Tensor:
         """Return high-resolution disparity; see :meth:`~dsr.methods.networks.base.DisparityNetwork.upsample`."""
         return self.answer(rgb, disparity).disparity
+
+    def answer_patches(self, batch: Mapping[str, Tensor]) -> Answer:
+        """Return inverse depth, times baseline and focal length, and its expected errors, told the hints if any."""
+        inverse = batch["disparity_lr"] + batch["doffs"]
+        return self.answer(batch["rgb"], inverse, batch.get("noise"), batch.get("facts"))
+
+    def answer_scene(self, batch: Mapping[str, Tensor]) -> Tensor:
+        """Return high-resolution disparity, told the hints if any."""
+        return self.answer_patches(batch).disparity - batch["doffs"]
 
     def answer(
         self,
