@@ -90,7 +90,7 @@ def test_trainer_in_conf_has_the_defaults_of_the_schema():
 @pytest.mark.parametrize("part", [PatchSettings, Schedule])
 def test_trainer_in_conf_has_the_defaults_of_the_parts_of_a_training(part):
     defaults = defaults_of(part)
-    assert defaults.keys() - {"mixed"} <= TRAINER.keys()  # mixed comes from the key precision
+    assert defaults.keys() <= TRAINER.keys()
     assert differences(TRAINER, defaults) == set()
 
 

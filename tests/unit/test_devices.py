@@ -40,7 +40,7 @@ from dsr.training.degradation import Degradation
 from dsr.training.module import SuperResolution
 from dsr.training.objective import DepthObjective, SurfaceObjective
 from dsr.training.patches import Patches
-from dsr.training.settings import PatchSettings, Schedule
+from dsr.training.settings import PatchSettings
 from dsr.utils.builder import ConfigError
 from dsr.utils.devices import fast_precision, pick_device
 
@@ -122,7 +122,7 @@ def test_training_step_on_a_gpu_is_that_of_the_cpu(model: str, gpu: torch.device
         torch.manual_seed(0)
         net = {"facets": FacetsUNet, "msg_v": partial(MSGNet, variant="dsr"), "pdn": PrimalDualNetwork}[model](4)
         objective = SurfaceObjective() if model == "facets" else DepthObjective("lap1", 0.1, shading=0.1)
-        module = SuperResolution(net, objective, Schedule(10, warmup=1, mixed=False), visual_metrics).to(device)
+        module = SuperResolution(net, objective).to(device)
         moved = {key: value.to(device) for key, value in batch.items()}
         made = module.configure_optimizers()
         loss = module.training_step(moved, 0)

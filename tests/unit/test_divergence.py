@@ -11,7 +11,7 @@ from torch.utils.data import DataLoader
 
 from dsr.app.divergence import NOTE, expect_no_divergence, note_divergence
 from dsr.utils.builder import ConfigError
-from dsr.utils.checkpoints import Keep
+from dsr.utils.checkpoints import Interruption
 from dsr.utils.divergence import Divergence, DivergenceError
 from dsr.utils.lightning import fit, make_trainer
 
@@ -98,7 +98,7 @@ def test_steps_count_rather_than_the_batches_of_a_step(tmp_path):
 def test_no_checkpoint_is_kept_of_a_step_in_doubt(tmp_path):
     path = tmp_path / "kept.ckpt"
     with pytest.raises(DivergenceError):
-        train(tmp_path, Scripted({3: NAN, 4: NAN, 5: NAN}), interval=8, callbacks=[Keep(path, 0.0)])
+        train(tmp_path, Scripted({3: NAN, 4: NAN, 5: NAN}), interval=8, callbacks=[Interruption(path, 0.0)])
     assert torch.load(path, weights_only=True)["global_step"] == 2
 
 

@@ -98,7 +98,7 @@ def _batches(
 ) -> list[Batch]:
     """Return the first batches that a trainer at some step gets."""
     data.trainer = SimpleNamespace(  # type: ignore[assignment]
-        global_step=step, accumulate_grad_batches=accumulate, global_rank=rank, world_size=world
+        global_step=step, accumulate_grad_batches=accumulate, global_rank=rank, world_size=world, max_steps=8
     )
     data.setup()
     return list(itertools.islice(data.train_dataloader(), count))
@@ -153,13 +153,17 @@ def test_workers_outlast_a_signal_to_the_whole_group_until_the_trainer_has_ended
     assert not any(worker.is_alive() for worker in workers)
 
 
-def test_loader_begins_at_the_trainers_step_and_has_no_length() -> None:
+def test_loader_begins_at_the_trainers_step_and_has_the_length_of_the_training() -> None:
     data = _data(colour=0.1)
     whole = _batches(data, 6)
     assert _equal(_batches(data, 2, 4), whole[4:])
     assert _equal(_batches(data, 2, 2, accumulate=2), whole[4:])
-    with pytest.raises(TypeError):
-        len(data.train_dataloader())
+    assert len(data.train_dataloader()) == 16  # as Lightning counts the batches that were done, too
+    assert len(list(data.train_dataloader())) == 12
+    data.trainer.max_steps = -1  # type: ignore[union-attr]
+    assert len(data.train_dataloader()) == 1000
+    data.trainer = None
+    assert len(data.train_dataloader()) == 1000
 
 
 def test_devices_share_the_batches_of_a_step() -> None:

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from dsr.degradation.downsampling import Downsampling
 from dsr.geometry.camera import Camera
@@ -18,7 +18,6 @@ from dsr.sample import Scene
 from dsr.training.degradation import Batch, Degradation, to_tensors
 from dsr.training.module import SuperResolution
 from dsr.training.objective import SurfaceObjective
-from dsr.training.settings import Schedule
 
 CAMERA = Camera(width=16, height=12, fx=20.0, fy=20.0, cx=7.5, cy=5.5, baseline=0.2)
 
@@ -113,7 +112,7 @@ def test_networks_of_inverse_depth_get_it_where_disparity_has_an_offset(doffs: f
     torch.manual_seed(0)
     batch = _batch(replace(CAMERA, doffs=doffs))
     net = Remembering(4, 8, 8, 3)
-    module = SuperResolution(net, SurfaceObjective(), Schedule(steps=2, warmup=1), nn.Identity)  # type: ignore[arg-type]
+    module = SuperResolution(net, SurfaceObjective())
     expected = (batch["bf"] * Downsampling("box")(batch["depth"][0].reciprocal(), 4)[None]).to(torch.float32)
     terms = module.loss_terms(batch)
     torch.testing.assert_close(net.seen.float(), expected, rtol=1e-5, atol=0)

@@ -34,7 +34,7 @@ from dsr.metrics.lpips import LPIPS
 from dsr.sample import CENTIMETRES, Scene, Unit
 from dsr.training.data_module import WholeScenes, collate_scene
 from dsr.training.degradation import Batch, Degradation, to_tensors
-from dsr.training.module import SuperResolution
+from dsr.training.module import SuperResolution, WarmupCosine
 from dsr.training.objective import DepthObjective, SurfaceObjective, balance_weight, to_depth
 from dsr.training.patches import Patches
 from dsr.training.settings import PatchSettings, Schedule
@@ -238,17 +238,28 @@ def test_balanced_weight_of_nothing_is_refused() -> None:
 # The schedule
 
 
+def _rates(steps: int, warmup: int, count: int) -> list[float]:
+    """Return the learning rates of a schedule as fractions of the highest."""
+    optimizer = torch.optim.SGD([torch.nn.Parameter(torch.zeros(1))], lr=1.0)
+    schedule, rates = WarmupCosine(optimizer, steps, warmup), []
+    for _ in range(count):
+        rates += schedule.get_last_lr()
+        optimizer.step()
+        schedule.step()
+    return rates
+
+
 def test_learning_rate_warms_up_linearly_and_falls_as_a_cosine_to_zero() -> None:
-    schedule = Schedule(steps=20, warmup=4)
-    assert [schedule.factor(step) for step in range(5)] == pytest.approx([0.25, 0.5, 0.75, 1, 1])
-    assert schedule.factor(12) == pytest.approx(0.5)  # halfway down
-    assert schedule.factor(8) == pytest.approx((1 + math.sqrt(0.5)) / 2)
-    assert schedule.factor(20) == schedule.factor(25) == pytest.approx(0, abs=1e-15)
+    rates = _rates(20, 4, 26)
+    assert rates[:5] == pytest.approx([0.25, 0.5, 0.75, 1, 1])
+    assert rates[12] == pytest.approx(0.5)  # halfway down
+    assert rates[8] == pytest.approx((1 + math.sqrt(0.5)) / 2)
+    assert rates[20] == rates[25] == pytest.approx(0, abs=1e-15)
 
 
 def test_warm_up_may_be_absent_or_longer_than_the_training() -> None:
-    assert Schedule(steps=10, warmup=0).factor(0) == 1
-    assert [Schedule(steps=2, warmup=4).factor(step) for step in range(2)] == [0.25, 0.5]
+    assert _rates(10, 0, 1) == [1]
+    assert _rates(2, 4, 2) == [0.25, 0.5]
 
 
 @pytest.mark.parametrize("changes", [{"warmup": -1}, {"weight_decay": -0.1}, {"weight_decay": math.nan}])
@@ -271,11 +282,10 @@ def _scene(seed: int, holes: float = 0.0) -> Scene:
     return Scene("set", f"s{seed}", rgb, CAMERA, depth)
 
 
-def _module(network: LPIPS | None = None, *, scale: int = 2, **schedule: Any) -> SuperResolution:
+def _module(network: LPIPS | None = None, *, scale: int = 2, **settings: Any) -> SuperResolution:
     torch.manual_seed(0)
-    settings = {"steps": 30, "warmup": 1, **schedule}
     metrics = functools.partial(visual_metrics, network)
-    return SuperResolution(MSGNet(scale, "dsr"), DepthObjective("lap1", 0.1), Schedule(**settings), metrics)
+    return SuperResolution(MSGNet(scale, "dsr"), DepthObjective("lap1", 0.1), metrics=metrics, **settings)
 
 
 def _trainer(folder: Path, **settings: Any) -> lightning.Trainer:
@@ -312,12 +322,13 @@ def test_loss_falls_in_thirty_steps_on_one_batch(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("mixed", [False, True])
 def test_training_loss_is_the_objective_of_the_networks_output_in_full_precision(tmp_path: Path, mixed: bool) -> None:
-    losses, module = _Losses(), _module(mixed=mixed)
+    losses, module = _Losses(), _module()
     [batch] = _one_batch()
     with torch.no_grad(), torch.autocast("cpu", torch.bfloat16, enabled=mixed):
         disparity = upsample_disparity(module.net, batch["rgb"], batch["disparity_lr"], batch["min_max"])
     expected = float(module.objective(Answer(disparity), batch)["loss"])
-    _trainer(tmp_path, max_steps=1, callbacks=[losses]).fit(module, _one_batch())
+    precision = "bf16-mixed" if mixed else "32-true"
+    _trainer(tmp_path, max_steps=1, callbacks=[losses], precision=precision).fit(module, _one_batch())
     assert losses.values == pytest.approx([expected], rel=2e-5)
 
 
@@ -342,8 +353,7 @@ def test_weight_average_follows_the_weights_with_its_decay(tmp_path: Path) -> No
 
 def test_average_has_the_statistics_of_batch_normalisation(tmp_path: Path) -> None:
     torch.manual_seed(0)
-    metrics = functools.partial(visual_metrics, None)
-    module = SuperResolution(SparseToDense(2, width=4), DepthObjective("l1"), Schedule(steps=9, warmup=1), metrics)
+    module = SuperResolution(SparseToDense(2, width=4), DepthObjective("l1"))
     seconds_per_step(module, next(iter(_one_batch())))
     assert not any(bool(mean.any()) for name, mean in module.net.named_buffers() if name.endswith("mean"))
     _trainer(tmp_path, max_epochs=2).fit(module, _one_batch())
@@ -360,7 +370,7 @@ def test_weights_are_stored_themselves_without_an_average(tmp_path: Path) -> Non
 def test_layers_without_a_part_in_a_step_are_found_and_the_module_stays_as_it_was() -> None:
     batch = next(iter(_one_batch()))
     plain = _module()
-    idle = SuperResolution(FacetsUNet(2, 8, 8, 3), plain.objective, plain.schedule, functools.partial(visual_metrics))
+    idle = SuperResolution(FacetsUNet(2, 8, 8, 3), plain.objective)
     for module, expected in ((plain, False), (idle, True)):  # the wide layers come after the third block
         before = copy.deepcopy(module.state_dict())
         assert has_idle_layers(module, batch) is expected
@@ -377,19 +387,35 @@ def test_gradients_add_up_over_accumulated_batches(tmp_path: Path) -> None:
     assert not torch.equal(before, module.average.stem.conv.weight)
 
 
-def test_long_gradient_is_clipped_and_its_norm_logged(tmp_path: Path) -> None:
-    module, norms = _module(clip=1e-3), []
+@pytest.mark.parametrize(
+    ("clipping", "largest"),
+    [
+        ({}, None),
+        ({"gradient_clip_val": 1e-3}, "norm"),
+        ({"gradient_clip_val": 1e-3, "gradient_clip_algorithm": "value"}, "value"),
+    ],
+)
+def test_gradient_is_clipped_as_the_trainer_says_and_its_norm_logged(
+    clipping: dict[str, Any], largest: str | None, tmp_path: Path
+) -> None:
+    grads: list[Tensor] = []
+    logged: list[float] = []
 
-    class _Norm(Callback):
+    class _Gradient(Callback):
         def on_before_zero_grad(self, trainer: Any, pl_module: Any, *_: Any) -> None:
-            grads = [p.grad for p in pl_module.net.parameters() if p.grad is not None]
-            if grads:
-                norms.append(float(torch.cat([grad.flatten() for grad in grads]).norm()))
+            each = [p.grad.flatten() for p in pl_module.net.parameters() if p.grad is not None]
+            if each:  # of the step before
+                grads.append(torch.cat(each))
+                logged.append(float(trainer.callback_metrics["train/gradient_norm"]))
 
-    trainer = _trainer(tmp_path, max_epochs=2, callbacks=[_Norm()])
-    trainer.fit(module, _one_batch())
-    assert norms[-1] == pytest.approx(1e-3, rel=1e-3)
-    assert trainer.callback_metrics["train/gradient_norm"] > 1e-2
+    trainer = _trainer(tmp_path, max_epochs=2, callbacks=[_Gradient()], **clipping)
+    trainer.fit(_module(), _one_batch())
+    assert logged[-1] > 1e-2
+    if largest is None:
+        assert float(grads[-1].norm()) == pytest.approx(logged[-1], rel=1e-5)
+    else:
+        found = grads[-1].norm() if largest == "norm" else grads[-1].abs().max()
+        assert float(found) == pytest.approx(1e-3, rel=1e-3)
 
 
 def test_non_finite_gradient_changes_nothing(tmp_path: Path) -> None:
@@ -402,10 +428,10 @@ def test_non_finite_gradient_changes_nothing(tmp_path: Path) -> None:
     assert all(torch.equal(before[name], value) for name, value in module.net.state_dict().items())
 
 
-@pytest.mark.parametrize("changes", [{"average": 1.0}, {"average": -0.1}, {"average": math.nan}])
-def test_invalid_average_is_refused(changes: dict[str, Any]) -> None:
-    with pytest.raises(ValueError, match=rf"^{next(iter(changes))}: expected "):
-        Schedule(10, **changes)
+@pytest.mark.parametrize("average", [1.0, -0.1, math.nan])
+def test_invalid_average_is_refused(average: float) -> None:
+    with pytest.raises(ValueError, match=r"^average: expected "):
+        _module(average=average)
 
 
 def _loader(scenes: WholeScenes) -> DataLoader[Batch]:
@@ -415,7 +441,10 @@ def _loader(scenes: WholeScenes) -> DataLoader[Batch]:
 def test_validation_is_in_the_unit_of_its_benchmark(tmp_path: Path) -> None:
     levels = Unit("levels", inverse=True, factor=8.0, limits=(0, 255))
     module = SuperResolution(
-        MSGNet(2, "dsr"), DepthObjective(), Schedule(1), lambda: visual_metrics(protocols=("field",)), ("a", "b")
+        MSGNet(2, "dsr"),
+        DepthObjective(),
+        metrics=lambda: visual_metrics(protocols=("field",)),
+        validation_sets=("a", "b"),
     )
     sets = [_loader(WholeScenes([replace(_scene(3), unit=unit)], X2)) for unit in (levels, CENTIMETRES)]
     in_levels, in_cm = (dict(each) for each in _trainer(tmp_path).validate(module, sets, verbose=False))
@@ -427,8 +456,9 @@ def test_validation_is_in_the_unit_of_its_benchmark(tmp_path: Path) -> None:
 
 
 def test_validation_logs_the_mean_over_the_scenes_in_the_units_of_tables(tmp_path: Path) -> None:
-    module, scenes = _module(mixed=True), WholeScenes([_scene(3), _scene(4, holes=0.05), _scene(5)], X2)
-    [logged] = _trainer(tmp_path).validate(module, _loader(scenes), verbose=False)
+    module, scenes = _module(), WholeScenes([_scene(3), _scene(4, holes=0.05), _scene(5)], X2)
+    trainer = _trainer(tmp_path, precision="bf16-mixed")  # of the training alone
+    [logged] = trainer.validate(module, _loader(scenes), verbose=False)
     factors = {"RMSE_d": 1000, "RMSE_v": 1000, "RMSE_v1": 1000, "DSSIM_v": 1000, "BadPix_v_5": 100, "Bumpiness_d": 1}
     values: dict[str, list[float]] = {name: [] for name in factors}
     for i in range(3):
@@ -455,7 +485,7 @@ def test_a_network_that_takes_hints_is_validated_as_it_is_evaluated(tmp_path: Pa
     with torch.no_grad():
         for parameter in net.parameters():
             parameter.add_(0.1 * torch.randn(parameter.shape))
-    module = SuperResolution(copy.deepcopy(net), SurfaceObjective(), Schedule(1), visual_metrics, ("a",))
+    module = SuperResolution(copy.deepcopy(net), SurfaceObjective(), validation_sets=("a",))
     [logged] = _trainer(tmp_path).validate(module, _loader(WholeScenes([_scene(3)], X2, told=True)), verbose=False)
     sample = X2.sample(_scene(3))
     assert sample.depth is not None
@@ -511,4 +541,4 @@ def test_checkpoint_holds_the_networks_tensors_alone_and_loads_as_plain_data(tmp
 
 def test_network_that_leaves_out_pixels_is_refused() -> None:
     with pytest.raises(ValueError, match=r"model: expected a network that covers the whole image"):
-        SuperResolution(MSGNet(4, "hui"), DepthObjective(), Schedule(10), visual_metrics)
+        SuperResolution(MSGNet(4, "hui"), DepthObjective())

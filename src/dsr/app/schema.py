@@ -179,7 +179,7 @@ class TrainerConfig:
     warmup: int = Schedule.warmup
     weight_decay: float = Schedule.weight_decay
     clip: float = Schedule.clip
-    average: float = Schedule.average
+    average: float = 0.999
     patch: int = PatchSettings.patch
     batch: int = PatchSettings.batch
     accumulate: int = 1

@@ -24,7 +24,7 @@ from dsr.app.devices import Processes, find_processes
 from dsr.app.divergence import NOTE, expect_no_divergence, note_divergence, step_of
 from dsr.app.metrics import check_metrics, metric_collection
 from dsr.app.multirun import Plan, runs_here
-from dsr.app.schema import TrainConfig, TrainerConfig, given_keys, plain_config
+from dsr.app.schema import TrainConfig, given_keys, plain_config
 from dsr.app.trainer import (
     MONITOR,
     has_idle_layers,
@@ -41,7 +41,7 @@ from dsr.methods.networks.weight_files import load_network, network_name, read_t
 from dsr.metrics.visual_loss import make_visual_loss
 from dsr.training.data_module import PatchData
 from dsr.training.loggers import RUN_IDS, expect_installed, log_config, log_layout, log_settings
-from dsr.training.module import SuperResolution
+from dsr.training.module import SuperResolution, WarmupCosine
 from dsr.training.objective import DepthObjective, Objective, SurfaceObjective
 from dsr.training.settings import Schedule
 from dsr.utils import interruption
@@ -120,7 +120,7 @@ def plan(config: DictConfig) -> list[Plan]:
         scenes = str((plain["dataset"], plain["validation"]))  # which the first job of several prepares
         sources = [] if scenes in shared else _by_source(prepared.data)
         shared.add(scenes)
-        return sum(_costs(settings.trainer, prepared, sources, done, devices=count, progress=SILENT).values())
+        return sum(_costs(settings, prepared, sources, done, devices=count, progress=SILENT).values())
 
     return [Plan(prepared.folder, prepared.identity, "step", left, done, seconds if here else None)]
 
@@ -322,9 +322,17 @@ def _module(settings: TrainConfig, net: DisparityNetwork, data: PatchData, metri
     try:
         objective = _objective(settings)
         objective.check(net, settings.trainer.patch, told=settings.degradation["name"] != "plain")
-        mixed = settings.precision == "bfloat16"
-        schedule = Schedule(mixed=mixed, **common(Schedule, settings.trainer))
-        return SuperResolution(net, objective, schedule, metrics, data.validation_sets)
+        trainer = Schedule(**common(Schedule, settings.trainer))
+        rate, decay = trainer.learning_rate, trainer.weight_decay
+        return SuperResolution(
+            net,
+            objective,
+            functools.partial(torch.optim.AdamW, lr=rate, weight_decay=decay, fused=True),
+            functools.partial(WarmupCosine, steps=trainer.steps, warmup=trainer.warmup),
+            average=settings.trainer.average,
+            metrics=metrics,
+            validation_sets=data.validation_sets,
+        )
     except (ValueError, OSError) as error:
         raise keyed(error) from error
 
@@ -391,13 +399,13 @@ def _announce(progress: Progress, settings: TrainConfig, prepared: _Prepared, de
     for name, line in lines.items():
         progress.say(f"{name:<6} {line}")
     done = 0 if prepared.resume is None else step_of(prepared.resume) or 0
-    costs = _costs(trainer, prepared, _by_source(data), done, devices=devices, progress=progress)
+    costs = _costs(settings, prepared, _by_source(data), done, devices=devices, progress=progress)
     named = ", ".join(f"{duration(seconds)} for {what}" for what, seconds in costs.items()) or "all steps are done"
     progress.say(f"time   about {duration(sum(costs.values()))}: {named}, as measured now")
 
 
 def _costs(
-    trainer: TrainerConfig,
+    settings: TrainConfig,
     prepared: _Prepared,
     sources: Sequence[tuple[SceneSource, list[str]]],
     done: int,
@@ -406,7 +414,7 @@ def _costs(
     progress: Progress,
 ) -> dict[str, float]:
     """Return the seconds of what a training has left after ``done`` steps, as measured now, by what it is."""
-    data, module = prepared.data, prepared.module.to(prepared.device)
+    data, module, trainer = prepared.data, prepared.module.to(prepared.device), settings.trainer
     interval = min(trainer.validate_every, trainer.steps)
     steps, validations = trainer.steps - done, math.ceil(trainer.steps / interval) - done // interval + (not done)
     try:
@@ -414,7 +422,7 @@ def _costs(
         validation = seconds_per_validation(module, data) / devices
     except (ValueError, OSError) as error:
         raise keyed(error) from error
-    step = seconds_per_step(module, data.example_batch()) * trainer.accumulate
+    step = seconds_per_step(module, data.example_batch(), settings.precision) * trainer.accumulate
     parts = {
         f"{sum(count for _, count in pairs)} scenes that are not in the cache": sum(seconds for seconds, _ in pairs),
         f"{steps} step{'s' * (steps != 1)} of {step:.2g} s": step * steps,

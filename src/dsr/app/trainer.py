@@ -6,7 +6,6 @@ import os
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import lightning
 import torch
@@ -16,13 +15,14 @@ from lightning.pytorch.utilities.seed import isolate_rng
 from dsr.app.devices import Processes
 from dsr.app.schema import TrainConfig
 from dsr.data.base import SceneSource, prepare_scenes, unprepared
+from dsr.training.callbacks import Curves
 from dsr.training.data_module import PatchData
 from dsr.training.degradation import Batch
 from dsr.training.module import SuperResolution
 from dsr.utils.builder import build
-from dsr.utils.checkpoints import Interruption, Keep, OwnFiles, ends_step
+from dsr.utils.checkpoints import Interruption, OwnFiles
 from dsr.utils.divergence import Divergence
-from dsr.utils.lightning import LOG_EVERY, ListedScores, StepProgress, ValidationTable, make_trainer, without_chatter
+from dsr.utils.lightning import ListedScores, StepProgress, ValidationTable, make_trainer, without_chatter
 from dsr.utils.progress import SILENT, Progress
 
 MONITOR = "val/RMSE_v"
@@ -30,66 +30,6 @@ VALIDATION = "validation.csv"
 _SECONDS_BETWEEN_CHECKPOINTS = 600.0
 _PROBES = 3
 """Scenes that are prepared to measure how long it takes."""
-
-
-class Curves(Callback):
-    """Logs the losses and the gradient's norm, means over the steps since the last values, the rate and the speed.
-
-    Single values of small batches are too noisy to read; these curves need no smoothing. Values that are not finite are
-    left out. The means are those of all devices.
-
-    Args:
-        every: steps between two values.
-
-    """
-
-    def __init__(self, every: int) -> None:
-        self._every, self._start, self._patches = every, time.perf_counter(), 0
-        self._sums: dict[str, torch.Tensor] = {}
-        self._rate = 0.0
-
-    def state_dict(self) -> dict[str, Any]:
-        """Return the sums since the last values, so that a training that goes on logs the same ones."""
-        return {"sums": self._sums}
-
-    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Restore the sums since the last values."""
-        self._sums = dict(state_dict["sums"])
-
-    def on_train_start(self, *_: Any) -> None:
-        """Start the clock."""
-        self._start = time.perf_counter()
-
-    def on_train_batch_start(self, trainer: lightning.Trainer, *_: Any) -> None:
-        """Note the learning rate, before the step sets the next one's."""
-        self._rate = float(trainer.optimizers[0].param_groups[0]["lr"])
-
-    def on_train_batch_end(
-        self, trainer: lightning.Trainer, pl_module: lightning.LightningModule, outputs: Any, batch: Batch, *_: Any
-    ) -> None:
-        """Add the values of a batch, and log their means when it is time."""
-        self._patches += len(batch["rgb"]) * trainer.world_size
-        for name, value in trainer.callback_metrics.items():
-            if name.startswith("train/"):
-                entry = torch.stack((value.detach(), torch.ones_like(value))) * value.isfinite()
-                self._sums[name] = self._sums.get(name, 0) + entry.nan_to_num().to(pl_module.device)
-        if trainer.global_step % self._every or not ends_step(trainer):
-            return
-        totals = trainer.strategy.reduce(torch.stack(list(self._sums.values())), reduce_op="sum")
-        means = {name: float(total / count) for name, (total, count) in zip(self._sums, totals.cpu(), strict=True)}
-        now = time.perf_counter()
-        means |= {"train/learning_rate": self._rate, "train/patches_per_second": self._patches / (now - self._start)}
-        for logger in trainer.loggers:
-            logger.log_metrics(means, trainer.global_step)
-        self._sums, self._start, self._patches = {}, now, 0
-
-    def on_validation_start(self, *_: Any) -> None:
-        """Stop the clock: the time so far counts, that of the validation does not."""
-        self._start -= time.perf_counter()
-
-    def on_validation_end(self, *_: Any) -> None:
-        """Start the clock again."""
-        self._start += time.perf_counter()
 
 
 class FirstValidation(Callback):
@@ -155,14 +95,13 @@ def training_trainer(
     callbacks = [
         OwnFiles(checkpoints, progress.say),
         Divergence(),
-        Curves(min(LOG_EVERY, settings.validate_every, settings.steps)),
+        Curves(),
         ValidationTable(folder / VALIDATION),
         ListedScores(best),
         best,
         latest,
         StepProgress(progress, "train"),
-        Keep(checkpoints / "last.ckpt", _SECONDS_BETWEEN_CHECKPOINTS),
-        Interruption(checkpoints / "last.ckpt"),
+        Interruption(checkpoints / "last.ckpt", _SECONDS_BETWEEN_CHECKPOINTS),
         FirstValidation(best),
     ]
     with without_chatter():
@@ -178,13 +117,15 @@ def training_trainer(
         accumulate=settings.accumulate,
         environment=processes.environment,
         strategy=f"ddp{varying}" if processes.count > 1 else "auto",
+        precision="bf16-mixed" if config.precision == "bfloat16" else "32-true",
+        gradient_clip_val=settings.clip,
     )
     return trainer, best
 
 
-def seconds_per_step(module: SuperResolution, batch: Batch) -> float:
+def seconds_per_step(module: SuperResolution, batch: Batch, precision: str = "float32") -> float:
     """Measure the seconds of a step; the module is left unchanged."""
-    return _try_steps(module, batch, 2)[0]  # the first one warms up
+    return _try_steps(module, batch, 2, precision)[0]  # the first one warms up
 
 
 def seconds_per_validation(module: SuperResolution, data: PatchData) -> float:
@@ -225,13 +166,15 @@ def has_idle_layers(module: SuperResolution, batch: Batch) -> bool:
     return _try_steps(module, batch, 1)[1]
 
 
-def _try_steps(module: SuperResolution, batch: Batch, count: int) -> tuple[float, bool]:
+def _try_steps(module: SuperResolution, batch: Batch, count: int, precision: str = "float32") -> tuple[float, bool]:
     """Return the seconds of the last of some steps, and whether it left parameters without a gradient."""
     batch = {name: value.to(module.device) for name, value in batch.items()}
     taken, buffers = 0.0, {name: value.clone() for name, value in module.net.named_buffers()}
     for _ in range(count):
         start = time.perf_counter()
-        module.loss_terms(batch)["loss"].backward()
+        with torch.autocast(module.device.type, torch.bfloat16, enabled=precision == "bfloat16"):
+            loss = module.loss_terms(batch)["loss"]
+        loss.backward()
         taken = time.perf_counter() - start
     idle = any(each.grad is None for each in module.net.parameters() if each.requires_grad)
     module.net.zero_grad(set_to_none=True)

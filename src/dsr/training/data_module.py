@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import itertools
 import math
 import os
 import signal
@@ -25,6 +24,9 @@ from dsr.training.degradation import Batch, Degradation, to_tensors
 from dsr.training.patches import Patches, check_patches
 from dsr.training.settings import PatchSettings
 from dsr.utils import interruption
+
+_EPOCH = 1000
+"""About how many batches an epoch has where the trainer has no number of steps."""
 
 
 @dataclass(frozen=True)
@@ -207,16 +209,12 @@ class PatchData(lightning.LightningDataModule):
         return [patches[index] for index in range(count)]
 
     def train_dataloader(self) -> DataLoader[Batch]:
-        """Return an endless loader of the run's patches, from the trainer's current step on.
+        """Return a loader of an epoch's patches, which begins at the trainer's current step.
 
-        It has no length: Lightning would subtract the steps done before from the length of a loader.
+        An epoch is the whole training or, where the trainer has no number of steps, about 1000 batches. The length is
+        that of the whole epoch, as Lightning subtracts the batches that were done before an interruption.
         """
-        per_step, done, rank = self._settings.batch, 0, 0
-        if self.trainer is not None:
-            per_step *= self.trainer.accumulate_grad_batches * self.trainer.world_size
-            done, rank = self.trainer.global_step, self.trainer.global_rank
-        stride = 1 if self.trainer is None else self.trainer.world_size
-        numbers = _PatchNumbers(done * per_step, self._settings.batch, rank, stride)
+        numbers = _PatchNumbers(self.trainer, self._settings.batch)
         workers: dict[str, Any] = {"num_workers": self._settings.workers}
         if self._settings.workers:
             workers["worker_init_fn"] = functools.partial(_begin_worker, os.getpid())
@@ -234,6 +232,14 @@ class PatchData(lightning.LightningDataModule):
         parts = (scenes[rank::devices] for scenes in self._validation)
         samples: Any = (self._whole(part) if part else [{}] for part in parts)
         return [DataLoader(each, batch_size=1, collate_fn=collate_scene) for each in samples]
+
+    def test_dataloader(self) -> list[DataLoader[Batch]]:
+        """Return the loaders of the validation."""
+        return self.val_dataloader()
+
+    def predict_dataloader(self) -> list[DataLoader[Batch]]:
+        """Return the loaders of the validation."""
+        return self.val_dataloader()
 
     def _whole(self, scenes: Sequence[Scene]) -> WholeScenes:
         return WholeScenes(scenes, self._degradation, self._seed, told=self._everything is not None)
@@ -274,22 +280,30 @@ class PatchData(lightning.LightningDataModule):
 
 
 class _PatchNumbers:
-    """The patch numbers of one device's batches, without an end and hence without a length.
+    """The patch numbers of one device's batches in an epoch, from the trainer's current step on.
 
     Args:
-        first: number of the first patch of all devices.
+        trainer: the trainer; None for one device and nothing done before.
         batch: number of patches per batch.
-        rank: number of the device.
-        stride: number of devices.
 
     """
 
-    def __init__(self, first: int, batch: int, rank: int, stride: int) -> None:
-        self._first, self._batch, self._rank, self._stride = first, batch, rank, stride
+    def __init__(self, trainer: lightning.Trainer | None, batch: int) -> None:
+        self._trainer, self._batch = trainer, batch
+        self._accumulate, steps, self._rank, self._devices = 1, -1, 0, 1
+        if trainer is not None:
+            self._accumulate, steps = trainer.accumulate_grad_batches, trainer.max_steps
+            self._rank, self._devices = trainer.global_rank, trainer.world_size
+        self._length = self._accumulate * (steps if steps > 0 else max(1, _EPOCH // self._accumulate))
+
+    def __len__(self) -> int:
+        return self._length
 
     def __iter__(self) -> Iterator[list[int]]:
-        for start in itertools.count(self._first + self._rank * self._batch, self._stride * self._batch):
-            yield list(range(start, start + self._batch))
+        done = 0 if self._trainer is None else self._trainer.global_step * self._accumulate
+        for number in range(done, done - done % self._length + self._length):
+            first = (number * self._devices + self._rank) * self._batch
+            yield list(range(first, first + self._batch))
 
 
 class _PatchLoader(DataLoader[Batch]):

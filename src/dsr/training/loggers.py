@@ -13,7 +13,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
-from lightning.pytorch.loggers import CSVLogger, Logger, MLFlowLogger, WandbLogger
+from lightning.pytorch.loggers import CSVLogger, Logger, MLFlowLogger, TensorBoardLogger, WandbLogger
 from lightning.pytorch.utilities import rank_zero_only
 from torch import Tensor
 
@@ -222,7 +222,7 @@ def log_picture(logger: Any, tag: str, picture: Tensor, step: int) -> None:
 
     """
     array = picture.permute(1, 2, 0).numpy()
-    if isinstance(logger, Log):
+    if isinstance(logger, TensorBoardLogger):
         logger.experiment.add_image(tag, picture, step)
     elif isinstance(logger, WandbLogger):
         logger.log_image(tag, [array], caption=[f"step {step}"])

@@ -2,33 +2,63 @@
 
 from __future__ import annotations
 
+import contextlib
 import copy
-from collections.abc import Callable, Mapping, Sequence
+import functools
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 import lightning
 import torch
 import torchmetrics
+from lightning.pytorch.callbacks import Callback
 from lightning.pytorch.trainer.states import TrainerFn
 from torch import Tensor, nn
+from torch.optim.lr_scheduler import LambdaLR, LRScheduler
 from torch.optim.swa_utils import get_ema_multi_avg_fn
 
 from dsr.geometry.comparison import comparison
 from dsr.methods.networks.base import DisparityNetwork
-from dsr.metrics.classes import compute_means, in_table_units
+from dsr.metrics.classes import compute_means, in_table_units, visual_metrics
 from dsr.metrics.functional import SurfacePair
 from dsr.sample import Unit
+from dsr.training.callbacks import Curves
 from dsr.training.degradation import Batch
 from dsr.training.loggers import log_picture
 from dsr.training.objective import Objective, to_depth
-from dsr.training.settings import Schedule
 
 _RENDERED_SCENES = 4
 """Number of scenes of each validation set that are rendered for TensorBoard."""
 
 
+ADAMW = functools.partial(torch.optim.AdamW, lr=1e-3, weight_decay=1e-4)
+
+
+class WarmupCosine(LambdaLR):
+    """Linear warm-up of the learning rate, then its decay to zero as a cosine.
+
+    Args:
+        optimizer: whose rate is the highest one.
+        steps: number of steps of the whole training.
+        warmup: number of steps until the highest rate.
+
+    """
+
+    def __init__(self, optimizer: torch.optim.Optimizer, steps: int, warmup: int = 300) -> None:
+        def factor(step: int) -> float:
+            if step < warmup:
+                return (step + 1) / warmup
+            return 0.5 * (1 + math.cos(math.pi * min((step - warmup) / max(steps - warmup, 1), 1.0)))
+
+        super().__init__(optimizer, factor)
+
+
 class SuperResolution(lightning.LightningModule):
-    """The training of a network of disparities.
+    """The training of a network of disparities, under any :class:`lightning.Trainer`.
+
+    The averaged weights are what is validated, tested and used. Under ``precision="bf16-mixed"`` the network's
+    convolutions run in bfloat16, the loss and the metrics in their own precision.
 
     Beside the scores of the network, ``val/METRIC``, validations log those of bicubic interpolation of the same maps,
     ``bicubic/METRIC``, which are computed in the first one.
@@ -36,13 +66,15 @@ class SuperResolution(lightning.LightningModule):
     Args:
         net: the network.
         objective: the loss.
-        schedule: settings of the optimisation.
-        metrics: function that makes the metrics of a validation set, such as
-            :func:`dsr.metrics.classes.visual_metrics`.
+        optimizer: function that makes the optimiser of parameters, such as a ``functools.partial``.
+        scheduler: function that makes the schedule of an optimiser, which is updated after every step; None for none.
+        average: decay of the exponential moving average of the weights; 0 for the weights themselves. The decay is
+            smaller in the first steps.
+        metrics: function that makes the metrics of a validation set.
         validation_sets: names of the validation sets, in the order of the loaders.
 
     Raises:
-        ValueError: the network does not cover the whole image.
+        ValueError: the network does not cover the whole image, or the decay is out of range.
 
     """
 
@@ -50,16 +82,22 @@ class SuperResolution(lightning.LightningModule):
         self,
         net: DisparityNetwork,
         objective: Objective,
-        schedule: Schedule,
-        metrics: Callable[[], torchmetrics.MetricCollection],
+        optimizer: Callable[[Iterable[nn.Parameter]], torch.optim.Optimizer] = ADAMW,
+        scheduler: Callable[[torch.optim.Optimizer], LRScheduler] | None = None,
+        *,
+        average: float = 0.999,
+        metrics: Callable[[], torchmetrics.MetricCollection] = visual_metrics,
         validation_sets: Sequence[str] = ("val",),
     ) -> None:
         super().__init__()
         if not net.covers:
             raise ValueError("model: expected a network that covers the whole image, its variant leaves out pixels")
+        if not 0 <= average < 1:
+            raise ValueError(f"average: expected 0 or more and less than 1, got {average}")
         self.net = net.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         self.average = copy.deepcopy(self.net).requires_grad_(False)
-        self.objective, self.schedule = objective, schedule
+        self.objective, self.decay = objective, average
+        self._make_optimizer, self._make_scheduler = optimizer, scheduler
         self.sets = tuple(validation_sets)
         self.metrics = nn.ModuleList(metrics() for _ in self.sets)
         self._make_metrics = metrics
@@ -69,7 +107,22 @@ class SuperResolution(lightning.LightningModule):
         self.shown_scores: dict[str, dict[str, float]] = {}
         self._pictures: dict[str, Tensor] = {}
 
-    def training_step(self, batch: Batch, _: int) -> Tensor:
+    def configure_callbacks(self) -> list[Callback]:
+        """Return the callback that logs losses and speed, unless the trainer has one; Lightning would replace that."""
+        callbacks: list[Callback] = self.trainer.callbacks  # type: ignore[attr-defined]
+        return [] if any(isinstance(each, Curves) for each in callbacks) else [Curves()]
+
+    def forward(self, batch: Batch) -> Tensor:
+        """Return high-resolution depth by the averaged weights, (B, 1, H, W) in metres; NaN where there is none.
+
+        Args:
+            batch: low-resolution maps and photos, as of :func:`dsr.training.degradation.to_tensors`.
+
+        """
+        with self._exact():
+            return to_depth(self.average.answer_scene(batch).to(batch["disparity_lr"].dtype), batch)
+
+    def training_step(self, batch: Batch, _: int = 0) -> Tensor:
         """Return the loss of a batch of patches."""
         terms = self.loss_terms(batch)
         self.log_dict({f"train/{name}": value.detach() for name, value in terms.items()}, logger=False)
@@ -77,13 +130,25 @@ class SuperResolution(lightning.LightningModule):
 
     def loss_terms(self, batch: Batch) -> dict[str, Tensor]:
         """Return ``loss`` and its terms."""
-        with torch.autocast(self.device.type, torch.bfloat16, enabled=self.schedule.mixed):
-            answer = self.net.answer_patches(batch)
-        return self.objective(answer, batch)
+        answer = self.net.answer_patches(batch)
+        with self._exact():
+            return self.objective(answer, batch)
 
-    def configure_gradient_clipping(self, optimizer: Any, *_: Any, **__: Any) -> None:
+    def _exact(self) -> contextlib.AbstractContextManager[Any]:
+        """Return a context without the mixed precision of the trainer, which losses and metrics are computed in."""
+        return torch.autocast(self.device.type, enabled=False)
+
+    def configure_gradient_clipping(
+        self,
+        optimizer: torch.optim.Optimizer,
+        gradient_clip_val: float | None = None,
+        gradient_clip_algorithm: str | None = None,
+    ) -> None:
         """Clip the gradient and log its norm; drop a gradient that is not finite, so that the step changes nothing."""
-        norm = nn.utils.clip_grad_norm_(self.net.parameters(), self.schedule.clip)
+        by_norm = gradient_clip_algorithm != "value" and gradient_clip_val is not None
+        norm = nn.utils.clip_grad_norm_(self.net.parameters(), gradient_clip_val if by_norm else math.inf)  # type: ignore[arg-type]
+        if gradient_clip_val is not None and not by_norm:
+            nn.utils.clip_grad_value_(self.net.parameters(), gradient_clip_val)
         self.log("train/gradient_norm", norm.detach(), logger=False)
         if not bool(norm.isfinite()):
             optimizer.zero_grad(set_to_none=True)
@@ -91,7 +156,8 @@ class SuperResolution(lightning.LightningModule):
     def optimizer_step(self, *arguments: Any, **named: Any) -> None:
         """Do a step, then update the moving average of the weights."""
         super().optimizer_step(*arguments, **named)
-        update = get_ema_multi_avg_fn(self.schedule.decay(self.global_step + 1))
+        step = self.global_step + 1
+        update = get_ema_multi_avg_fn(min(self.decay, step / (step + 9)))
         update(list(self.average.parameters()), list(self.net.parameters()), None)
         for average, current in zip(self.average.buffers(), self.net.buffers(), strict=True):
             average.copy_(current)  # such as the statistics of batch normalisation, which are averages already
@@ -102,10 +168,22 @@ class SuperResolution(lightning.LightningModule):
         self._bicubic_metrics = [] if known else [self._make_metrics().to(self.device) for _ in self.sets]
 
     def validation_step(self, batch: Batch, index: int, dataloader_idx: int = 0) -> None:
-        """Score a whole scene, if the batch has one; render the first few for TensorBoard."""
-        if not batch:
-            return
-        depth = to_depth(self.average.answer_scene(batch).to(batch["depth"].dtype), batch)
+        """Score a whole scene, if the batch has one; render the first few for the loggers."""
+        if batch:
+            with self._exact():
+                self._score(batch, index, dataloader_idx)
+
+    def test_step(self, batch: Batch, index: int, dataloader_idx: int = 0) -> None:
+        """Score a whole scene as a validation does."""
+        self.validation_step(batch, index, dataloader_idx)
+
+    def predict_step(self, batch: Batch, *_: Any) -> Tensor | None:
+        """Return a scene's depth, as :meth:`forward`; None for an empty batch."""
+        return self(batch) if batch else None
+
+    def _score(self, batch: Batch, index: int, dataloader_idx: int) -> None:
+        """Score a whole scene, and render it if it is one of the first."""
+        depth = self(batch)
         scored = [(self.metrics[dataloader_idx], depth)]
         if self._bicubic_metrics:
             scored.append((self._bicubic_metrics[dataloader_idx], batch["bicubic"]))
@@ -122,14 +200,26 @@ class SuperResolution(lightning.LightningModule):
             picture = comparison(depth, batch["depth"], batch["rays"], batch["rgb"], depth_lr)
             self._pictures[f"renderings/{self.sets[dataloader_idx]}_{number}"] = picture
 
+    def on_test_epoch_start(self) -> None:
+        """Score bicubic interpolation, too."""
+        self.on_validation_epoch_start()
+
+    def on_test_epoch_end(self) -> None:
+        """Log the mean scores as ``test/METRIC``, in the units of tables."""
+        self._log_scores("test")
+
     def on_validation_epoch_end(self) -> None:
         """Log the mean scores of all sets and, if there are several, of each, to loggers in the units of tables."""
+        self._log_scores("val")
+
+    def _log_scores(self, stage: str) -> None:
+        """Log the mean scores of all sets and of each, and the pictures; forget them."""
         self._gather()
         for name in sorted(self._pictures):
             for logger in self.loggers:
                 log_picture(logger, name, self._pictures[name], self.global_step)
         self._pictures = {}
-        named: dict[str, Any] = self._means("val", self.metrics)
+        named: dict[str, Any] = self._means(stage, self.metrics)
         if self._bicubic_metrics:
             means = self._means("bicubic", self._bicubic_metrics)
             self.bicubic = {kind: {name: float(v) for name, v in each.items()} for kind, each in means.items()}
@@ -183,14 +273,12 @@ class SuperResolution(lightning.LightningModule):
         self._pictures = {name: picture for _, pictures in all_devices for name, picture in pictures.items()}
 
     def configure_optimizers(self) -> Any:
-        """Return AdamW and its learning-rate schedule, which is updated after every step."""
-        schedule = self.schedule
-        optimiser = torch.optim.AdamW(
-            self.net.parameters(), lr=schedule.learning_rate, weight_decay=schedule.weight_decay, fused=True
-        )
-        rates = torch.optim.lr_scheduler.LambdaLR(optimiser, schedule.factor)
-        named = {"scheduler": rates, "interval": "step"}
-        return {"optimizer": optimiser, "lr_scheduler": named}
+        """Return the optimiser and, if there is one, its schedule, which is updated after every step."""
+        optimizer = self._make_optimizer(self.net.parameters())
+        if self._make_scheduler is None:
+            return optimizer
+        schedule = {"scheduler": self._make_scheduler(optimizer), "interval": "step"}
+        return {"optimizer": optimizer, "lr_scheduler": schedule}
 
 
 def _by_tag(scores: Mapping[str, Mapping[str, float]]) -> dict[str, float]:

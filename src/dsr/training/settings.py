@@ -65,7 +65,7 @@ class PatchSettings:
 
 @dataclass(frozen=True)
 class Schedule:
-    """Optimisation settings: AdamW with linear warm-up and cosine decay to zero, and an average of the weights.
+    """Optimisation settings: AdamW with linear warm-up and cosine decay to zero.
 
     Args:
         steps: number of steps of the whole training.
@@ -73,9 +73,6 @@ class Schedule:
         warmup: number of steps until the highest learning rate.
         weight_decay: weight decay of AdamW.
         clip: largest norm of the gradient; longer gradients are scaled down to it.
-        average: decay of the exponential moving average of the weights, which is validated and saved; 0 for the weights
-            themselves. The decay is smaller in the first steps.
-        mixed: whether the network's convolutions run in bfloat16; losses and weights stay in float32.
 
     Raises:
         ValueError: a value is out of range.
@@ -87,8 +84,6 @@ class Schedule:
     warmup: int = 300
     weight_decay: float = 1e-4
     clip: float = 1.0
-    average: float = 0.999
-    mixed: bool = False
 
     def __post_init__(self) -> None:
         """Check the values."""
@@ -102,16 +97,3 @@ class Schedule:
         for name in ("warmup", "weight_decay"):
             if not 0 <= getattr(self, name) < math.inf:
                 raise ValueError(f"{name}: expected 0 or more, got {getattr(self, name)}")
-        if not 0 <= self.average < 1:
-            raise ValueError(f"average: expected 0 or more and less than 1, got {self.average}")
-
-    def factor(self, step: int) -> float:
-        """Return the learning rate at a step as a fraction of the highest."""
-        if step < self.warmup:
-            return (step + 1) / self.warmup
-        done = min((step - self.warmup) / max(self.steps - self.warmup, 1), 1.0)
-        return 0.5 * (1 + math.cos(math.pi * done))
-
-    def decay(self, step: int) -> float:
-        """Return the decay of the moving average after a step, counted from 1."""
-        return min(self.average, step / (step + 9))

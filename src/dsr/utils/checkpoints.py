@@ -10,8 +10,9 @@ from typing import Any
 
 import lightning
 import torch
-from lightning.pytorch.callbacks import Callback
+from lightning.pytorch.callbacks import Callback, Checkpoint
 from lightning.pytorch.plugins.io import TorchCheckpointIO
+from lightning.pytorch.trainer.states import TrainerFn
 
 from dsr.utils import interruption
 from dsr.utils.builder import ConfigError
@@ -100,114 +101,11 @@ class OwnFiles(Callback):
         return {**state, **files, "best_k_models": kept, "dirpath": str(folder)}
 
 
-class Interruption(Callback):
-    """Ends a training at Ctrl-C or SIGTERM with a checkpoint of the step that it is at, once that is complete.
+class Interruption(Checkpoint):
+    """Saves a checkpoint every few minutes, and ends a training at Ctrl-C or SIGTERM with one of the step it is at.
 
-    If a validation follows that step, it ends between two scenes of the validation, which is done again later. Only the
-    validation after the last step is waited for, as nothing would be left to do again.
-
-    Of several processes, the states of which are the same, the first one acts upon the signal, and the others end with
-    it.
-
-    Args:
-        path: the checkpoint's path.
-
-    Attributes:
-        requested: whether this process was asked to end, also if it does not act upon that.
-
-    """
-
-    def __init__(self, path: Path) -> None:
-        self._path = path
-        self._stack = contextlib.ExitStack()
-        self._interruption: interruption.Deferred | None = None
-        self.requested, self._acts = False, True
-        self._checkpoint: dict[str, Any] | None = None
-
-    def on_train_start(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
-        """Only note signals from now on."""
-        self._acts = trainer.is_global_zero
-        self._interruption = self._stack.enter_context(interruption.deferred(self._message))
-
-    def on_train_batch_end(self, trainer: lightning.Trainer, *_: Any) -> None:
-        """Save and stop, if an interruption was requested, a step is complete and no validation follows."""
-        batches = trainer.fit_loop.total_batch_idx + 1
-        validates = trainer.should_stop or batches % (trainer.val_check_batch or 1) == 0
-        if self._requested and ends_step(trainer) and not validates:
-            if not in_doubt(trainer):
-                save_alone(trainer, self._path)
-            raise KeyboardInterrupt
-
-    def on_validation_start(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
-        """Do not count the batch twice that was begun before an interruption; Lightning would skip a later one."""
-        loop = trainer.fit_loop.epoch_loop.val_loop
-        if loop.restarted_mid_evaluation:
-            total: Any = loop.batch_progress.total
-            total.ready, total.started = total.ready - 1, total.started - 1
-
-    def on_validation_batch_start(
-        self, trainer: lightning.Trainer, pl_module: lightning.LightningModule, batch: Any, batch_idx: int, *_: Any
-    ) -> None:
-        """Save the state at the beginning of the validation and stop, if an interruption was requested.
-
-        Before the first step there is nothing to save.
-        """
-        if trainer.should_stop or trainer.global_step >= trainer.max_steps:
-            return
-        if self._checkpoint is None and trainer.global_step:
-            self._checkpoint = _of_begun_validation(trainer)
-        if self._requested:
-            if self._checkpoint is not None and not in_doubt(trainer):
-                trainer.strategy.save_checkpoint(self._checkpoint, self._path)
-            raise KeyboardInterrupt
-
-    def on_validation_end(self, *_: Any) -> None:
-        """Forget the beginning of the validation."""
-        self._checkpoint = None
-
-    def on_train_end(self, *_: Any) -> None:
-        """Stop, if an interruption was requested during the last validation."""
-        if self._requested:
-            raise KeyboardInterrupt
-
-    def on_exception(self, *_: Any) -> None:
-        """Let signals act as before; Lightning does not call ``teardown`` after an exception."""
-        self._close()
-
-    def teardown(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule, stage: str) -> None:
-        """Let signals act as before."""
-        self._close()
-
-    def _message(self) -> str:
-        """Return the line of a process that ends in the middle of a step."""
-        if self._path.is_file():
-            return f"interrupted; {self._path} is the latest checkpoint, the same command goes on from there"
-        return "interrupted before the first checkpoint; the same command begins this again, what is finished is kept"
-
-    def _close(self) -> None:
-        if self._interruption is not None:
-            self.requested = self._interruption.requested
-        self._stack.close()
-        self._interruption = self._checkpoint = None
-
-    @property
-    def _requested(self) -> bool:
-        """Whether a signal came that this process acts upon."""
-        return self._acts and self._interruption is not None and self._interruption.requested
-
-
-def _of_begun_validation(trainer: lightning.Trainer) -> dict[str, Any]:
-    """Return the checkpoint of a validation that is about to do its first batch; its values are not copied.
-
-    Lightning goes on with a validation if a batch of it was started, beginning with the first that is not complete.
-    """
-    checkpoint = trainer._checkpoint_connector.dump_checkpoint(weights_only=False)
-    checkpoint["loops"]["fit_loop"]["epoch_loop.val_loop.batch_progress"]["total"]["started"] += 1
-    return checkpoint
-
-
-class Keep(Callback):
-    """Saves a checkpoint every few minutes, for when the process is killed.
+    If a validation follows that step, it is done, too. Lightning calls checkpoint callbacks after all others, so that
+    what those keep of the step is in the checkpoint. All devices save and end together.
 
     Args:
         path: the checkpoint's path.
@@ -216,20 +114,62 @@ class Keep(Callback):
     """
 
     def __init__(self, path: Path, seconds: float) -> None:
-        self._path, self._seconds, self._last = path, seconds, time.monotonic()
+        self._path, self._seconds, self._saved = path, seconds, time.monotonic()
+        self._stack = contextlib.ExitStack()
+        self._signal: interruption.Deferred | None = None
+
+    @property
+    def requested(self) -> bool:
+        """Whether this process was asked to end."""
+        return self._signal is not None and self._signal.requested
+
+    def on_train_start(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
+        """Only note signals from now on."""
+        self._signal = self._stack.enter_context(interruption.deferred(self._message))
 
     def on_train_batch_end(self, trainer: lightning.Trainer, *_: Any) -> None:
-        """Save a checkpoint if it is time, and no gradient is being accumulated."""
-        now = time.monotonic()
-        if now - self._last > self._seconds and ends_step(trainer) and not in_doubt(trainer):
-            self._last = now
-            save_alone(trainer, self._path)
+        """Act once a step is complete that no validation follows; Lightning would skip that after an interruption."""
+        batches = trainer.fit_loop.total_batch_idx + 1
+        validates = trainer.should_stop or batches % (trainer.val_check_batch or 1) == 0
+        if ends_step(trainer) and not validates:
+            self._act(trainer)
 
+    def on_validation_end(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
+        """Act once the validation of a step is complete."""
+        if trainer.state.fn == TrainerFn.FITTING and trainer.global_step:
+            self._act(trainer)
 
-def save_alone(trainer: lightning.Trainer, path: Path) -> None:
-    """Save a checkpoint from the first process; the others, which do not know of it, are not waited for."""
-    if trainer.is_global_zero:
-        trainer.strategy.save_checkpoint(trainer._checkpoint_connector.dump_checkpoint(weights_only=False), path)
+    def on_train_end(self, *_: Any) -> None:
+        """Stop, if this was requested after the last step."""
+        if self.requested:
+            raise KeyboardInterrupt
+
+    def on_exception(self, *_: Any) -> None:
+        """Let signals act as before; Lightning does not call ``teardown`` after an exception."""
+        self._stack.close()
+
+    def teardown(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule, stage: str) -> None:
+        """Let signals act as before."""
+        self._stack.close()
+
+    def _act(self, trainer: lightning.Trainer) -> None:
+        """Save if it is time or if any process was asked to end, and in that case end."""
+        due = time.monotonic() - self._saved > self._seconds
+        agree = trainer.strategy.reduce_boolean_decision
+        if not agree(due or self.requested, all=False):
+            return
+        ends = agree(self.requested, all=False)
+        if not in_doubt(trainer):
+            trainer.save_checkpoint(self._path)
+        self._saved = time.monotonic()
+        if ends:
+            raise KeyboardInterrupt
+
+    def _message(self) -> str:
+        """Return the line of a process that ends in the middle of a step."""
+        if self._path.is_file():
+            return f"interrupted; {self._path} is the latest checkpoint, the same command goes on from there"
+        return "interrupted before the first checkpoint; the same command begins this again, what is finished is kept"
 
 
 class AtomicCheckpoints(TorchCheckpointIO):

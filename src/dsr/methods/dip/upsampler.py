@@ -34,7 +34,7 @@ from dsr.methods.networks.trained import build_trained
 from dsr.methods.noise import estimate_noise, normal_noise_deg
 from dsr.metrics.visual_loss import VisualLossName, make_visual_loss
 from dsr.sample import DepthSample
-from dsr.utils.checkpoints import Interruption, Keep
+from dsr.utils.checkpoints import Interruption
 from dsr.utils.divergence import Divergence, DivergenceError
 from dsr.utils.lightning import ListedScores, Log, StepProgress, ValidationTable, fit, make_trainer
 from dsr.utils.progress import Progress, Steps, StepsProgress
@@ -265,8 +265,7 @@ class DeepImagePrior:
         if folder is not None:
             callbacks += [
                 Provenance(origin),
-                Keep(folder / "last.ckpt", _SECONDS_BETWEEN_CHECKPOINTS),
-                Interruption(folder / "last.ckpt"),
+                Interruption(folder / "last.ckpt", _SECONDS_BETWEEN_CHECKPOINTS),
             ]
             if module.metrics is not None and self.validate_every:
                 callbacks += [ValidationTable(folder / "validation.csv"), ListedScores()]
@@ -283,7 +282,7 @@ class DeepImagePrior:
             callbacks=callbacks,
             logger=logger,
             limit_val_batches=1 if self.validate_every else 0,
-            enable_checkpointing=False,
+            enable_checkpointing=folder is not None,  # the callback above
         )
 
 

@@ -1,0 +1,74 @@
+"""What trainings log beside the scores of validations."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+import lightning
+import torch
+from lightning.pytorch.callbacks import Callback
+
+from dsr.training.degradation import Batch
+from dsr.utils.checkpoints import ends_step
+
+
+class Curves(Callback):
+    """Logs the losses and the gradient's norm, means over the steps since the last values, the rate and the speed.
+
+    Single values of small batches are too noisy to read; these curves need no smoothing. Values that are not finite are
+    left out. The means are those of all devices.
+
+    There is a value every ``log_every_n_steps`` of the trainer, or one after its last step if it has fewer.
+    """
+
+    def __init__(self) -> None:
+        self._start, self._patches = time.perf_counter(), 0
+        self._sums: dict[str, torch.Tensor] = {}
+        self._rate = 0.0
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return the sums since the last values, so that a training that goes on logs the same ones."""
+        return {"sums": self._sums}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Restore the sums since the last values."""
+        self._sums = dict(state_dict["sums"])
+
+    def on_train_start(self, *_: Any) -> None:
+        """Start the clock."""
+        self._start = time.perf_counter()
+
+    def on_train_batch_start(self, trainer: lightning.Trainer, *_: Any) -> None:
+        """Note the learning rate, before the step sets the next one's."""
+        self._rate = float(trainer.optimizers[0].param_groups[0]["lr"])
+
+    def on_train_batch_end(
+        self, trainer: lightning.Trainer, pl_module: lightning.LightningModule, outputs: Any, batch: Batch, *_: Any
+    ) -> None:
+        """Add the values of a batch, and log their means when it is time."""
+        self._patches += len(batch["rgb"]) * trainer.world_size
+        for name, value in trainer.callback_metrics.items():
+            if name.startswith("train/"):
+                entry = torch.stack((value.detach(), torch.ones_like(value))) * value.isfinite()
+                self._sums[name] = self._sums.get(name, 0) + entry.nan_to_num().to(pl_module.device)
+        every: int = trainer.log_every_n_steps  # type: ignore[attr-defined]
+        if trainer.max_steps > 0:
+            every = min(every, trainer.max_steps)
+        if trainer.global_step % every or not ends_step(trainer):
+            return
+        totals = trainer.strategy.reduce(torch.stack(list(self._sums.values())), reduce_op="sum")
+        means = {name: float(total / count) for name, (total, count) in zip(self._sums, totals.cpu(), strict=True)}
+        now = time.perf_counter()
+        means |= {"train/learning_rate": self._rate, "train/patches_per_second": self._patches / (now - self._start)}
+        for logger in trainer.loggers:
+            logger.log_metrics(means, trainer.global_step)
+        self._sums, self._start, self._patches = {}, now, 0
+
+    def on_validation_start(self, *_: Any) -> None:
+        """Stop the clock: the time so far counts, that of the validation does not."""
+        self._start -= time.perf_counter()
+
+    def on_validation_end(self, *_: Any) -> None:
+        """Start the clock again."""
+        self._start += time.perf_counter()
