@@ -7,7 +7,8 @@ import copy
 import functools
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import Any
+from pathlib import Path
+from typing import Any, Self
 
 import lightning
 import torch
@@ -20,6 +21,7 @@ from torch.optim.swa_utils import get_ema_multi_avg_fn
 
 from dsr.geometry.comparison import comparison
 from dsr.methods.networks.base import DisparityNetwork
+from dsr.methods.networks.weight_files import read_torch_file
 from dsr.metrics.classes import compute_means, in_table_units, visual_metrics
 from dsr.metrics.functional import SurfacePair
 from dsr.sample import Unit
@@ -27,11 +29,19 @@ from dsr.training.callbacks import Curves
 from dsr.training.degradation import Batch
 from dsr.training.loggers import log_picture
 from dsr.training.objective import Objective, to_depth
+from dsr.training.parts import node_of, partial_node_of, read_node
 
 _RENDERED_SCENES = 4
 """Number of scenes of each validation set that are rendered for TensorBoard."""
 
 
+_PARTS: dict[str, tuple[type, Callable[..., Any]]] = {
+    "net": (DisparityNetwork, lambda kind, **arguments: kind(**arguments)),
+    "objective": (Objective, lambda kind, **arguments: kind.of(**arguments)),
+    "optimizer": (torch.optim.Optimizer, functools.partial),
+    "scheduler": (LRScheduler, functools.partial),
+}
+"""The parts that a checkpoint names: of what kind they are, and how they are made of a class and its arguments."""
 ADAMW = functools.partial(torch.optim.AdamW, lr=1e-3, weight_decay=1e-4)
 
 
@@ -214,16 +224,17 @@ class SuperResolution(lightning.LightningModule):
 
     def _log_scores(self, stage: str) -> None:
         """Log the mean scores of all sets and of each, and the pictures; forget them."""
+        if self.trainer.sanity_checking:  # of a few scenes
+            self._forget()
+            return
         self._gather()
         for name in sorted(self._pictures):
             for logger in self.loggers:
                 log_picture(logger, name, self._pictures[name], self.global_step)
-        self._pictures = {}
         named: dict[str, Any] = self._means(stage, self.metrics)
         if self._bicubic_metrics:
             means = self._means("bicubic", self._bicubic_metrics)
             self.bicubic = {kind: {name: float(v) for name, v in each.items()} for kind, each in means.items()}
-            self._bicubic_metrics = []
         named |= self.bicubic
         self.validation_scores = {
             kind: {name: float(value) for name, value in each.items()} for kind, each in named.items()
@@ -235,6 +246,11 @@ class SuperResolution(lightning.LightningModule):
         for logger in self.loggers if self._fits else ():  # Lightning would count steps from 0
             logger.log_metrics(shown, self.global_step)
             logger.save()
+        self._forget()
+
+    def _forget(self) -> None:
+        """Forget the scores and the pictures of the scenes so far."""
+        self._pictures, self._bicubic_metrics = {}, []
         for each in self.metrics:
             each.reset()  # type: ignore[operator]
 
@@ -252,8 +268,48 @@ class SuperResolution(lightning.LightningModule):
         return {kind: means} | (sets if len(sets) > 1 else {})
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Store the scores of bicubic interpolation."""
+        """Store the scores of bicubic interpolation, and of what the module is made, as plain values."""
         checkpoint["bicubic"] = self.bicubic
+        nodes = {
+            "net": node_of(type(self.net), self.net.arguments()),
+            "objective": node_of(type(self.objective), self.objective.arguments()),
+            "optimizer": partial_node_of(self._make_optimizer),
+            "scheduler": partial_node_of(self._make_scheduler) if self._make_scheduler is not None else None,
+        }
+        plain = {"average": self.decay, "validation_sets": list(self.sets)}
+        checkpoint["hyper_parameters"] = plain | {name: node for name, node in nodes.items() if node is not None}
+
+    @classmethod
+    def load_from_checkpoint(  # type: ignore[override]  # Lightning's has arguments for another file of arguments
+        cls, checkpoint_path: str | Path, map_location: Any = None, **parts: Any
+    ) -> Self:
+        """Return the module of a checkpoint, with its weights and their average.
+
+        Args:
+            checkpoint_path: the file.
+            map_location: as for :func:`torch.load`.
+            **parts: arguments of the constructor in place of those that the checkpoint names, such as a ``net`` that is
+                not dsr's own. The ``metrics`` are not in it.
+
+        Raises:
+            ValueError: it is no such checkpoint, or a part has to be given.
+
+        """
+        stored = read_torch_file(Path(checkpoint_path)).get("hyper_parameters")
+        if not isinstance(stored, Mapping):
+            raise ValueError(f"{checkpoint_path}: expected a checkpoint of {cls.__name__}, it names no parts")
+        for name, (kind, make) in _PARTS.items():
+            if name in parts:
+                continue
+            if name in stored:
+                found, arguments = read_node(name, stored[name], kind)
+                try:
+                    parts[name] = make(found, **arguments)
+                except TypeError as error:
+                    raise ValueError(f"{checkpoint_path}: {name}: {error}") from error
+            elif name in ("net", "objective"):
+                raise ValueError(f"{checkpoint_path}: expected {name}=, which the checkpoint does not name")
+        return super().load_from_checkpoint(checkpoint_path, map_location, weights_only=True, **parts)
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Restore the scores of bicubic interpolation, which earlier checkpoints lack."""

@@ -6,7 +6,7 @@ import abc
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal, Self
+from typing import Any, Literal, Self
 
 import torch
 from torch import Tensor
@@ -16,7 +16,7 @@ from dsr.methods.networks.base import Answer, DisparityNetwork
 from dsr.methods.networks.maps import compute_min_max, upsample_bicubic
 from dsr.metrics import losses
 from dsr.metrics.functional import SurfacePair, masked_mean, mse_v
-from dsr.metrics.visual_loss import MSE_V, VisualLoss, match_weight
+from dsr.metrics.visual_loss import MSE_V, VisualLoss, VisualLossName, make_visual_loss, match_weight
 from dsr.training.degradation import Batch
 from dsr.training.shading import shading_loss
 
@@ -40,6 +40,15 @@ class Objective(abc.ABC):
     @abc.abstractmethod
     def facts(self) -> dict[str, str | float]:
         """What the header of weights says of the loss."""
+
+    @abc.abstractmethod
+    def arguments(self) -> dict[str, Any]:
+        """Return plain values from which :meth:`of` makes the loss again."""
+
+    @classmethod
+    def of(cls, **arguments: Any) -> Self:
+        """Return the loss of some :meth:`arguments`."""
+        return cls(**arguments)
 
     @abc.abstractmethod
     def __call__(self, answer: Answer, batch: Batch) -> dict[str, Tensor]:
@@ -119,6 +128,15 @@ class DepthObjective(Objective):
         visual = self.visual.name if self.w else "none"
         return {"loss": self.depth_loss, "visual": visual, "w": self.w, "shading": self.shading}
 
+    def arguments(self) -> dict[str, Any]:
+        """Return the constructor's arguments, the visual loss by its name."""
+        return {**vars(self), "visual": self.visual.name}
+
+    @classmethod
+    def of(cls, *, visual: VisualLossName = "mse_v", **arguments: Any) -> Self:
+        """Return the loss of some :meth:`arguments`; ``lpips`` looks for AlexNet's weights."""
+        return cls(visual=make_visual_loss(visual), **arguments)
+
     def check(self, net: DisparityNetwork, patch: int, *, told: bool) -> None:
         """Refuse a network that states its errors, and patches that are too small for the visual loss."""
         if net.states_errors:
@@ -188,6 +206,10 @@ class SurfaceObjective(Objective):
     def facts(self) -> dict[str, str | float]:
         """What the header of weights says of the loss."""
         return {"loss": "surface", "depth": self.depth, "soft": self.soft, "sharp": self.sharp, "errors": self.errors}
+
+    def arguments(self) -> dict[str, Any]:
+        """Return the constructor's arguments."""
+        return dict(vars(self))
 
     def check(self, net: DisparityNetwork, patch: int, *, told: bool) -> None:
         """Refuse a network that does not state its errors, and maps without hints."""
