@@ -34,6 +34,7 @@ pytestmark = [
     pytest.mark.filterwarnings("ignore:.*smaller than the logging interval.*"),
     pytest.mark.filterwarnings("ignore:.*LeafSpec.*"),
     pytest.mark.filterwarnings("ignore:.*sync_dist=True.*"),
+    pytest.mark.filterwarnings("ignore:.*that ended before the epoch ended.*"),
     pytest.mark.filterwarnings("ignore:Precision bf16-mixed is not supported by the model summary.*"),
 ]
 
