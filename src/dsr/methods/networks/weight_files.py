@@ -128,12 +128,10 @@ def load_network(
     if model is not None and header["model"] != model:
         raise ValueError(f"{path}: expected weights of model {model}, got those of {header['model']}")
     try:
-        with torch.random.fork_rng(devices=[]):  # the initial weights draw random numbers
-            kind, arguments = networks[header["network"]], dict(header["arguments"])
-            if scale is not None and kind.serves(arguments["scale"], scale):
-                arguments["scale"] = scale
-            _expect_explained(path, kind, arguments, _beside(path, header, _SHARED))
-            net = kind(**arguments)
+        kind, arguments = networks[header["network"]], dict(header["arguments"])
+        if scale is not None and kind.serves(arguments["scale"], scale):
+            arguments["scale"] = scale
+        net = _make(path, kind, arguments, _beside(path, header, _SHARED))
     except (KeyError, TypeError, ValueError) as error:
         names = ", ".join(networks)
         raise ValueError(
@@ -186,22 +184,25 @@ def _beside(path: Path, header: Mapping[str, Any], key: str) -> Path | None:
     return other
 
 
-def _expect_explained(
+def _make(
     path: Path, kind: type[DisparityNetwork], arguments: Mapping[str, Any], shared: Path | None
-) -> None:
-    """Refuse arguments of one of dsr's networks that ask for more weights than the files hold, before it is made.
+) -> DisparityNetwork:
+    """Return a network without values, or one of the user's with random ones, which may need them as it is made.
 
     Raises:
-        ValueError: they do.
+        ValueError: the arguments ask for more weights than the files of one of dsr's networks hold.
 
     """
     if any(isinstance(value, int) and abs(value) > _LARGEST_ARGUMENT for value in arguments.values()):
         raise ValueError(f"{path}: expected sizes of a network of at most {_LARGEST_ARGUMENT}")
     if kind.__module__.partition(".")[0] != __name__.partition(".")[0]:
-        return
+        with torch.random.fork_rng(devices=[]):  # the initial weights draw random numbers
+            return kind(**arguments)
     with torch.device("meta"):  # takes no memory
-        count = sum(value.numel() for value in kind(**arguments).parameters())
+        net = kind(**arguments)
+    count = sum(value.numel() for value in net.parameters())
     expect_bytes(path, count, sum(file.stat().st_size for file in (path, shared) if file is not None))
+    return net
 
 
 def _read_tensors(path: Path) -> dict[str, Tensor]:

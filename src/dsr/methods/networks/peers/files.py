@@ -31,7 +31,7 @@ def load_peer(path: Path, network: type[PeerNetwork], scale: float) -> PeerNetwo
 
     """
     tensors = network.convert(read_tensors(path))
-    with torch.random.fork_rng(devices=[]):  # the initial weights draw random numbers
+    with torch.device("meta"):  # without memory and random numbers
         net = network(scale)
     load_parameters(net, tensors, path, network.title)
     return net
