@@ -20,13 +20,12 @@ import torch
 
 from dsr.data.folder import Folder
 from dsr.degradation.downsampling import Downsampling, make_sample
-from dsr.methods.networks.trained import packaged_weights
+from dsr.methods.networks.weight_choice import packaged_weights
 from dsr.methods.networks.weight_files import read_header
-from dsr.methods.registry import build_method, read_method
+from dsr.methods.recipe import Known, Run, read_recipe
 from dsr.metrics.catalogue import Metric, catalogue, score_image
 from dsr.metrics.lpips import load_lpips
 from dsr.metrics.metric import WORST
-from dsr.utils.builder import takes
 
 SCENES = ("lucy", "plant")
 METRICS = ("RMSE_v", "DSSIM_v", "BadPix_v_5", "Bumpiness_d", "LPIPS_v", "RMSE_d")
@@ -37,11 +36,11 @@ def scores(
 ) -> dict[str, float]:
     """Return the worst-of-four scores of a method's network on one scene."""
     scale = read_header(weights)["arguments"]["scale"]
-    node = read_method(name, scale)
-    if ensemble is not None and takes("method", node, "ensemble"):
-        node = {**node, "ensemble": ensemble}
-    told = {"kernel": "box", "edges": "sharp", "clean": True}
-    method = build_method(node, scale, weights=weights, told=told, device=device)
+    recipe = read_recipe(name)
+    if ensemble is not None and "ensemble" in recipe.at():
+        recipe = read_recipe(name, {"ensemble": ensemble})
+    run = Run(device=device, known=Known("box", "sharp", clean=True))
+    method = recipe.with_weights(weights).build(scale, run)
     sample = make_sample(
         Folder(str(shared / "scenes"), [scene]).load(scene), scale, Downsampling("box"), method.range_type
     )

@@ -26,8 +26,8 @@ from dsr.data.sunrgbd import SunRGBD, load_pair
 from dsr.degradation.downsampling import Downsampling, Kernel, Measured, make_sample
 from dsr.geometry.camera import Camera
 from dsr.geometry.surface import angle_between, depth_to_normals
-from dsr.inference.engine import upsample_depth
-from dsr.methods.registry import read_method
+from dsr.inference import upsampler
+from dsr.methods.recipe import read_recipe
 from dsr.metrics.catalogue import PROTOCOLS, score_image
 from dsr.metrics.metric import WORST
 from dsr.sample import DepthSample, Scene
@@ -95,28 +95,21 @@ class Capture:
 
 
 def run_method(capture: Capture, name: str, shared: Path, device: str) -> Tensor:
-    """Return a method's result as :func:`dsr.inference.upsample_depth` gives it, (1, H, W) in metres.
+    """Return a method's result as :func:`dsr.inference.upsampler` gives it, (1, H, W) in metres.
 
     TGV weights a noisy map by its noise, and networks of other authors take their weights from the shared material.
     Holes stay holes where a method does not fill them by itself, or the capture asks for it.
     """
     settings: dict[str, Any] = {}
-    node = read_method(name, 4)
+    node = read_recipe(name).at()
     if name == "tgv" and capture.noisy:
         settings["data_weight"] = "auto"
     if "weights_files" in node:
         settings["weights"] = str(shared / "weights" / "peers")
     sample = capture.sample
     keep = capture.keep_holes or node.get("fill_holes") is False
-    return upsample_depth(
-        sample.rgb,
-        sample.depth_lr,
-        sample.camera,
-        method=name,
-        settings=settings,
-        fill="none" if keep else "all",
-        device=device,
-    )
+    run = upsampler(name, settings=settings, fill="none" if keep else "all", device=device)
+    return run.upsample(sample.rgb, sample.depth_lr, sample.camera).depth
 
 
 def measured(source: SceneSource, name: str, windows: tuple[Window, ...]) -> Capture:

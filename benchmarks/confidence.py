@@ -22,8 +22,7 @@ from dsr.data.folder import Folder
 from dsr.data.icl import ICL
 from dsr.data.simgeo import SimGeo
 from dsr.degradation.everything import Everything
-from dsr.methods.base import Confident
-from dsr.methods.registry import build_method, read_method
+from dsr.methods.recipe import Run, read_recipe
 from dsr.metrics.calibration import error_ratios, measured_errors, squared_error_share
 from dsr.sample import DepthSample
 
@@ -55,10 +54,8 @@ def main() -> None:
     parser.add_argument("--picture", type=Path)
     parser.add_argument("--device", default="cpu")
     arguments = parser.parse_args()
-    node = read_method("facets", arguments.scale)
-    method = build_method(node, arguments.scale, weights=arguments.weights, device=arguments.device)
-    if not isinstance(method, Confident):
-        raise TypeError(f"expected a method with expected errors, got {method}")
+    recipe = read_recipe("facets").with_weights(arguments.weights)
+    method = recipe.build(arguments.scale, Run(device=arguments.device))
     expected: dict[str, list[torch.Tensor]] = {"depth": [], "normal": []}
     measured: dict[str, list[torch.Tensor]] = {"depth": [], "normal": []}
     for sample in samples(arguments.shared, arguments.scale, arguments.draws):

@@ -27,9 +27,10 @@ from dsr.degradation.downsampling import Downsampling
 from dsr.degradation.hints import relative_error
 from dsr.geometry.camera import Camera, from_range
 from dsr.geometry.surface import depth_to_normals
-from dsr.inference import MethodChoice
 from dsr.methods.networks.any_map import AnyMap
+from dsr.methods.recipe import Run, read_recipe
 from dsr.sample import DepthSample
+from dsr.utils.devices import fast_precision
 
 CASES = ((0.005, 2.0, 5.0, 0.0), (0.005, 2.0, 5.0, 1.0), (0.003, 3.0, 10.0, 0.0), (0.01, 1.0, 3.0, 1.0))
 """Noise of level 2 in metres, that of levels 1 and 0 over it, and over how many pixels noise is smoothed."""
@@ -96,7 +97,7 @@ def main() -> None:
     parser.add_argument("--scale", type=int, default=8)
     parser.add_argument("--seed", type=int, default=1)
     options = parser.parse_args()
-    method = MethodChoice("facets").build(options.scale)
+    method = read_recipe("facets").build(options.scale, Run(precision=fast_precision(torch.device("cpu"))))
     assert isinstance(method, AnyMap)  # noqa: S101 - for the type checker
     for name in ("lucy", "plant"):
         scene = read_scene(options.scenes / name)

@@ -18,7 +18,7 @@ from pathlib import Path
 from captures import CAPTURES, Capture, run_method
 from panel_grid import EMPTY, LIGHT, Panel, rendering_of_input, repeat_pixels, save_panels
 
-from dsr.methods.registry import read_method
+from dsr.methods.recipe import read_recipe
 from dsr.report.figures.scenes import rendering
 from dsr.utils.ratios import round_ratio
 
@@ -46,7 +46,7 @@ def panels_of(capture: Capture, methods: list[str], shared: Path, device: str) -
     ]
     for name in methods:
         depth = run_method(capture, name, shared, device)
-        caption = f"{read_method(name, 4).get('label', name)}{describe(capture, capture.scores(depth))}"
+        caption = f"{read_recipe(name).at().get('label', name)}{describe(capture, capture.scores(depth))}"
         panels.append(Panel(caption, rendering(depth, sample.camera, LIGHT)))
         print(f"  {caption}".replace("\n", ": "), flush=True)
     if capture.truth is not None:

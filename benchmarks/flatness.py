@@ -27,7 +27,7 @@ from torch import Tensor
 from dsr.geometry.camera import Camera
 from dsr.geometry.surface import angle_between, length
 from dsr.methods.classical.bilateral import filter_bilateral
-from dsr.methods.registry import read_method
+from dsr.methods.recipe import read_recipe
 from dsr.viz.panels import normals_seen_by
 
 METHODS = "bilateral,msg_v,msg_v_noisy,tgv,facets_box,facets"
@@ -103,7 +103,7 @@ def main() -> None:
         def result(capture: Capture, name: str = name) -> Tensor:
             return run_method(capture, name, shared, options.device)
 
-        print(row_of(str(read_method(name, 4).get("label", name)), result, floors, frames), flush=True)
+        print(row_of(str(read_recipe(name).at().get("label", name)), result, floors, frames), flush=True)
 
 
 if __name__ == "__main__":

@@ -18,7 +18,7 @@ from dsr.app.metrics import chosen_metrics
 from dsr.app.schema import MetricsConfig
 from dsr.data.folder import Folder
 from dsr.degradation.downsampling import Downsampling, make_sample
-from dsr.methods.registry import build_method, read_method
+from dsr.methods.recipe import Run, read_recipe
 from dsr.metrics.catalogue import score_image
 from dsr.metrics.formats import HEADLINES
 
@@ -37,8 +37,7 @@ def main() -> None:
     parser.add_argument("--device", default="cpu")
     options = parser.parse_args()
     box = Downsampling("box")
-    node = read_method(options.method, options.scale)
-    method = build_method(node, options.scale, downsampling=box, device=options.device)
+    method = read_recipe(options.method).build(options.scale, Run(device=options.device, downsampling=box))
     metrics = chosen_metrics(MetricsConfig(lpips_trunk=options.lpips_trunk), torch.device("cpu"))
     print("| scene | grain | RMSE_v | DSSIM_v | LPIPS_v | RMSE_d, mm |\n| --- | --- | ---: | ---: | ---: | ---: |")
     for name in options.names.split(","):

@@ -26,7 +26,7 @@ from dsr.degradation.downsampling import Downsampling, make_sample
 from dsr.degradation.holes import Blobs, Holes, Shadows
 from dsr.geometry.shading import render
 from dsr.geometry.surface import depth_to_normals
-from dsr.methods.registry import build_method, has_weights, read_method
+from dsr.methods.recipe import Run, read_recipe
 from dsr.metrics.functional import SurfacePair, rmse_d, rmse_v
 from dsr.sample import DepthSample, Scene
 from dsr.utils.devices import fast_precision
@@ -49,9 +49,9 @@ def results(sample: DepthSample, steps: int, device: torch.device) -> dict[str, 
     }
     found = {}
     for label, (name, settings, precision) in methods.items():
-        node = read_method(name, sample.scale, settings)
-        if name != "msg_v" or has_weights(node, sample.scale):
-            method = build_method(node, sample.scale, downsampling=BOX, precision=precision, device=device)
+        recipe = read_recipe(name, settings)
+        if name != "msg_v" or sample.scale in recipe.factors:
+            method = recipe.build(sample.scale, Run(device=device, precision=precision, downsampling=BOX))
             found[label] = method(sample)
     return found
 

@@ -24,7 +24,7 @@ from torch import nn
 
 from dsr.data.folder import Folder
 from dsr.degradation.downsampling import Downsampling, make_sample
-from dsr.methods.registry import build_method, read_method
+from dsr.methods.recipe import Run, read_recipe
 
 METHODS = (
     "bicubic,bilateral,guided_filter,joint_bilateral,fast_global_smoother,anisotropic_diffusion,tgv,srfs,eg,"
@@ -54,12 +54,12 @@ def measured(options: argparse.Namespace) -> dict[str, float]:
     torch.set_num_threads(options.threads)
     name, scale = options.methods, int(options.scale)
     device = torch.device(options.device)
-    node = read_method(name, scale)
-    weights = None if "weights_packaged" in node else options.weights
-    given = {"precision": "float32", "device": device, "downsampling": Downsampling("box"), "weights": weights}
-    if options.ensemble is not None and "ensemble" in node:
-        node["ensemble"] = options.ensemble
-    method = build_method(node, scale, **given)
+    recipe = read_recipe(name)
+    if options.ensemble is not None and "ensemble" in recipe.at():
+        recipe = read_recipe(name, {"ensemble": options.ensemble})
+    if "weights_packaged" not in recipe.at():
+        recipe = recipe.with_weights(options.weights)
+    method = recipe.build(scale, Run(device=device))
     scene = Folder(str(options.scenes), [options.scene]).load(options.scene)
     sample = make_sample(scene, scale, Downsampling("box"), method.range_type)
     before, seconds = peak(), []

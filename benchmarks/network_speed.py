@@ -25,7 +25,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from dsr.degradation.downsampling import Downsampling, make_sample
 from dsr.geometry.camera import Camera
-from dsr.methods.registry import build_method, read_method
+from dsr.methods.recipe import Run, read_recipe
 from dsr.sample import DepthSample, Scene
 from dsr.utils.devices import fast_precision
 
@@ -124,10 +124,8 @@ def random_sample(size: int, scale: int) -> DepthSample:
 def measure(name: str, options: argparse.Namespace, device: torch.device, rate: float, copied: float) -> None:
     """Print the profile of a network's answer."""
     precision = fast_precision(device)
-    node = read_method(name, options.scale)
-    if "ensemble" in node:
-        node["ensemble"] = 1
-    method = build_method(node, options.scale, device=device, precision=precision)
+    settings = {"ensemble": 1} if "ensemble" in read_recipe(name).at() else {}
+    method = read_recipe(name, settings).build(options.scale, Run(device=device, precision=precision))
     sample = random_sample(options.size, options.scale)
     with Recorder() as recorder:
         method(sample)

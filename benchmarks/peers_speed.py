@@ -30,7 +30,8 @@ from torch import Tensor, nn
 from dsr.methods.networks.maps import normalise_imagenet
 from dsr.methods.networks.peers.base import PeerUpsampler
 from dsr.methods.networks.peers.files import read_tensors
-from dsr.methods.registry import build_method, find_weights, read_method
+from dsr.methods.networks.weight_choice import find_weights
+from dsr.methods.recipe import Run, read_recipe
 
 TRAINING_ONLY = (
     *("h5py", "kornia", "skimage", "skimage.color", "skimage.io"),
@@ -115,12 +116,12 @@ def scene(size: int) -> tuple[Tensor, Tensor]:
 def ways(name: str, checkouts: Path, weights: Path, size: int, device: torch.device) -> dict[str, Callable[[], Tensor]]:
     """Return the authors' way and ours of refining the same map."""
     scale = SCALES.get(name, 4)
-    node = read_method(name, scale)
-    upsampler = build_method(node, scale, weights=weights, device=device, precision="float32")
+    recipe = read_recipe(name).with_weights(weights)
+    upsampler = recipe.build(scale, Run(device=device))
     if not isinstance(upsampler, PeerUpsampler):
         raise TypeError(f"method={name}: expected a published network of the field")
     theirs, call = AUTHORS[name](checkouts)
-    theirs.load_state_dict(read_tensors(find_weights(node, scale, weights)))
+    theirs.load_state_dict(read_tensors(find_weights(recipe.at(scale), scale)))
     theirs.eval().to(device)
     rgb, values = (each.to(device) for each in scene(size))
     return {

@@ -40,7 +40,7 @@ from torch import Tensor
 
 from dsr.data.formats.shared import read_millimetres, read_picture
 from dsr.geometry.camera import Camera
-from dsr.inference.engine import upsample_surface
+from dsr.inference import upsample_surface
 from dsr.methods.base import Surface
 from dsr.methods.classical.bilateral import filter_bilateral
 from dsr.sample import DepthSample

@@ -14,7 +14,7 @@ from dsr.evaluation.predict import Evaluation, StalePredictionError, predict
 from dsr.evaluation.score import score
 from dsr.evaluation.sharing import ALONE, Workers, choose_workers
 from dsr.geometry.camera import Camera
-from dsr.methods.base import NoSolutionError
+from dsr.methods.base import Method, NoSolutionError
 from dsr.metrics.catalogue import catalogue
 from dsr.report.work import Work
 from dsr.sample import Scene
@@ -47,7 +47,7 @@ class Scenes:
         return f"{scene}-{self.version}"
 
 
-class Logged:
+class Logged(Method):
     """Repeats low-resolution pixels, and writes which process worked on which scene; may do something first."""
 
     range_type = "orthogonal"

@@ -188,9 +188,9 @@ def _verify(place: Place) -> None:
 
 
 def _weights(place: Place) -> None:
-    from dsr.methods.networks.trained import build_trained  # noqa: PLC0415
+    from dsr.methods.networks.trained import TrainedNetwork  # noqa: PLC0415
 
-    build_trained(place.input / "weights.safetensors", 2, "msg_v")
+    TrainedNetwork(place.input / "weights.safetensors", 2, "msg_v")
 
 
 def _published(*names: str) -> Callable[[Place], None]:

@@ -25,7 +25,7 @@ from dsr.degradation.downsampling import Downsampling, make_sample
 from dsr.geometry.camera import RangeType
 from dsr.methods.base import Upsampler
 from dsr.methods.classical.cubic_convolution import CubicConvolution
-from dsr.methods.networks.peers.build import build_peer
+from dsr.methods.networks.peers.build import Peer
 from dsr.metrics.catalogue import catalogue, score_image
 from dsr.metrics.formats import HEADLINES
 
@@ -104,7 +104,7 @@ def test_dctnet_has_its_authors_errors_on_lu_with_the_true_range(shared: Path) -
     scale = 8  # at 4 its depth is compared in test_peers_golden
     source, kind = _source(shared, "Lu")
     file = f"DCTNet_{scale}X.pth"
-    method = build_peer("dctnet", shared / "weights" / "peers" / file, scale, {file: scale}, kind, range="truth")
+    method = Peer("dctnet", shared / "weights" / "peers" / file, scale, {file: scale}, kind, range="truth")
     published = _published(shared, "Lu", "DCTNet", scale)
     assert dict(_rmse(source, kind, method, scale)) == pytest.approx(
         {name: published[name] for name in IMAGES["Lu"]}, rel=1e-4

@@ -16,7 +16,7 @@ from dsr.geometry.camera import Camera, from_range, to_range
 from dsr.methods.networks.base import Precision
 from dsr.methods.networks.maps import upsample_bicubic
 from dsr.methods.networks.msg_guidance import VariantName
-from dsr.methods.networks.trained import build_trained
+from dsr.methods.networks.trained import TrainedNetwork
 from dsr.sample import DepthSample
 
 FILES: dict[str, tuple[VariantName, str]] = {
@@ -41,7 +41,7 @@ def _sample(shared: Path, scene: str, scale: int) -> tuple[DepthSample, Tensor]:
 def _upsampled(shared: Path, method: str, sample: DepthSample, precision: Precision = "float32") -> Tensor:
     """Return the method's disparity, (512, 512)."""
     variant, name = FILES[method]
-    upsampler = build_trained(shared / "weights" / name.format(sample.scale), sample.scale, method, variant, precision)
+    upsampler = TrainedNetwork(shared / "weights" / name.format(sample.scale), sample.scale, method, variant, precision)
     return to_range(upsampler(sample), sample.camera, "disparity")[0]
 
 
@@ -76,7 +76,7 @@ def test_other_published_networks_are_better_than_bicubic_too(shared: Path, scal
 
 def test_network_trained_on_noise_loads_and_stays_near_the_truth(shared: Path) -> None:
     sample, truth = _sample(shared, "lucy", 4)
-    upsampler = build_trained(shared / "weights" / "msg_v_x4_noise_std0.003.pth", 4, "msg_v", "voynov")
+    upsampler = TrainedNetwork(shared / "weights" / "msg_v_x4_noise_std0.003.pth", 4, "msg_v", "voynov")
     assert _rmse_mm(sample, to_range(upsampler(sample), sample.camera, "disparity")[0], truth[0]) < 60
 
 
@@ -91,6 +91,6 @@ def test_bfloat16_changes_the_published_error_by_less_than_one_percent(shared: P
 
 def test_published_file_of_the_other_variant_or_scale_is_refused(shared: Path) -> None:
     with pytest.raises(ValueError, match="expected weights of variant voynov, got those of variant hui"):
-        build_trained(shared / "weights" / "MSGNet_x4.caffemodel", 4, "msg_v", "voynov")
+        TrainedNetwork(shared / "weights" / "MSGNet_x4.caffemodel", 4, "msg_v", "voynov")
     with pytest.raises(ValueError, match="weights are for scale 8, the run is at scale 4"):
-        build_trained(shared / "weights" / "msg_v_x8_clean.pth", 4, "msg_v", "voynov")
+        TrainedNetwork(shared / "weights" / "msg_v_x8_clean.pth", 4, "msg_v", "voynov")

@@ -16,7 +16,7 @@ from dsr.data.folder import Folder
 from dsr.data.rgbdd import RGBDD
 from dsr.degradation.downsampling import Downsampling, make_sample
 from dsr.geometry.camera import RangeType
-from dsr.methods.registry import build_method, read_method
+from dsr.methods.recipe import read_recipe
 from dsr.metrics.catalogue import catalogue, score_image
 from dsr.metrics.lpips import LPIPS, load_lpips
 from dsr.sample import Scene
@@ -65,9 +65,8 @@ def _scene(shared: Path, name: str) -> Scene:
 @cache
 def _predict(shared: Path, name: str, method: str, scale: int, variant: str) -> torch.Tensor:
     downsampling, range_type = FEEDS[variant]
-    node = read_method(method, scale, {"range_type": range_type})
     weights = shared / "weights" / "peers"
-    upsampler = build_method(node, scale, weights=weights, device="cpu", precision="float32")
+    upsampler = read_recipe(method, {"range_type": range_type}).with_weights(weights).build(scale)
     return upsampler(make_sample(_scene(shared, name), scale, downsampling, range_type))
 
 
@@ -119,11 +118,9 @@ def test_field_scores_with_the_true_range_are_those_of_the_authors_code(
     scene = source.load(next(name for name in source.scenes() if image.startswith(name)))
     height, width = (n // 16 * 16 for n in (scene.camera.height, scene.camera.width))
     scene = scene.crop(0, 0, height, width)
-    node = read_method(
-        method, scale, {"range": "truth", "range_type": "disparity" if scene.unit.inverse else "orthogonal"}
-    )
-    upsampler = build_method(node, scale, weights=shared / "weights" / "peers", device="cpu", precision="float32")
-    assert getattr(upsampler, "flag", "") == "true-range"
+    settings = {"range": "truth", "range_type": "disparity" if scene.unit.inverse else "orthogonal"}
+    upsampler = read_recipe(method, settings).with_weights(shared / "weights" / "peers").build(scale)
+    assert upsampler.flag == "true-range"
     depth = upsampler(make_sample(scene, scale, Downsampling("bicubic"), upsampler.range_type))
     assert scene.depth is not None
     found, truth = (scene.unit.convert(each) for each in (depth, scene.depth))

@@ -16,8 +16,9 @@ from dsr.data.folder import Folder
 from dsr.data.simgeo import SimGeo
 from dsr.degradation.downsampling import Downsampling, make_sample
 from dsr.methods.networks.base import NetworkUpsampler
-from dsr.methods.networks.trained import build_trained, packaged_weights
-from dsr.methods.registry import build_method, read_method
+from dsr.methods.networks.trained import TrainedNetwork
+from dsr.methods.networks.weight_choice import packaged_weights
+from dsr.methods.recipe import read_recipe
 from dsr.metrics.catalogue import Metric, catalogue, score_image
 from dsr.metrics.lpips import load_lpips
 from dsr.metrics.metric import WORST
@@ -82,7 +83,7 @@ def test_scores_on_lucy_are_those_that_the_recipe_expects(shared: Path, name: st
     found = re.search(r"Expected: .*Lucy (\d+) / (\d+) / (\d+),", header)
     assert found is not None
     model, _, scale = name.rpartition("_x")
-    method = build_method(read_method(model, int(scale)), int(scale))
+    method = read_recipe(model).build(int(scale))
     scene = Folder(str(shared / "scenes"), ["lucy"]).load("lucy")
     sample = make_sample(scene, int(scale), Downsampling("box"), method.range_type)
     scores = _worst(method(sample), sample, catalogue())
@@ -94,7 +95,7 @@ def _packaged(model: str, scale: int) -> NetworkUpsampler:
     """Return the network that comes with dsr, without an ensemble."""
     weights = packaged_weights(f"{model}_x{scale}")
     assert weights is not None
-    return build_trained(weights, scale, model, ensemble=1)
+    return TrainedNetwork(weights, scale, model, ensemble=1)
 
 
 @torch.inference_mode()

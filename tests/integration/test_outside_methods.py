@@ -16,10 +16,11 @@ MODULE = '''
 import torch
 from torch import nn
 
+from dsr.methods.base import Method
 from dsr.methods.networks.base import DisparityNetwork
 
 
-class Constant:
+class Constant(Method):
     """Fills the map with its mean, plus an offset in metres."""
 
     range_type = "orthogonal"
@@ -63,7 +64,7 @@ FILES = {
     "conf/method/told.yaml": "name: told\nlabel: Told\ntarget: outside.Told\nkernel: null\nedges: auto\n",
     "conf/model/shifted.yaml": "name: shifted\ntarget: outside.Shifted\ndepth_loss: lap1\nvisual: false\n",
     "conf/method/shifted.yaml": (
-        "name: shifted\ntarget: dsr.methods.networks.trained.build_trained\nmodel: shifted\nensemble: 1\n"
+        "name: shifted\ntarget: dsr.methods.networks.trained.TrainedNetwork\nmodel: shifted\nensemble: 1\n"
         "weights: training/weights.safetensors\n"
     ),
 }

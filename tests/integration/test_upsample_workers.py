@@ -15,7 +15,9 @@ KILLER = '''
 import os, signal
 from pathlib import Path
 
-class Killer:
+from dsr.methods.base import Method
+
+class Killer(Method):
     """Repeats pixels; is killed at maps of about 1.3 m, several times, as if for want of memory."""
 
     range_type = "orthogonal"

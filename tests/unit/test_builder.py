@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from dsr.app.schema import EvalConfig
-from dsr.utils.builder import ConfigError, build, takes
+from dsr.utils.builder import ConfigError, build
 from dsr.utils.devices import pick_device
 
 Order = Literal["near", "far"]
@@ -82,8 +82,6 @@ def test_target_may_be_a_function_without_arguments():
 
 def test_target_gets_the_run_values_that_it_names():
     assert build("method", node(root="r"), {"scale": 8, "device": "cpu"}).scale == 8
-    assert takes("method", node(), "scale")
-    assert not takes("method", node(), "device")
 
 
 def test_unknown_key_is_refused_with_the_known_keys():

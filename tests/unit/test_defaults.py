@@ -11,7 +11,7 @@ from dsr.app.schema import EvalConfig, MetricsConfig, TrainConfig, TrainerConfig
 from dsr.methods.dip.optimisation import PriorSettings
 from dsr.methods.dip.problem import PriorObjective
 from dsr.methods.dip.upsampler import DeepImagePrior
-from dsr.methods.registry import read_method
+from dsr.methods.recipe import read_recipe
 from dsr.training.settings import PatchSettings, Schedule
 from dsr.utils.builder import load_target
 
@@ -75,7 +75,7 @@ def test_every_setting_of_deep_image_priors_is_in_conf():
         "lpips_trunk",
         "about",
     }  # of the run, not of the method
-    assert defaults_of(DeepImagePrior).keys() - own == read_method("dip", 4).keys() - {"name", "label", "target"}
+    assert defaults_of(DeepImagePrior).keys() - own == read_recipe("dip").at().keys() - {"name", "label", "target"}
 
 
 @pytest.mark.parametrize(("part", "resolved"), [(PriorSettings, set()), (PriorObjective, {"w", "visual"})])

@@ -23,12 +23,12 @@ from dsr.degradation.downsampling import Downsampling, Holes, make_sample
 from dsr.degradation.everything import Everything
 from dsr.degradation.holes import Blobs, Shadows
 from dsr.degradation.noise import GaussianMultiplicative, Kinect, Noise, TimeOfFlight
-from dsr.inference.engine import upsample_surface
+from dsr.inference import upsample_surface
 from dsr.methods.networks.facets_unet import FacetsUNet
 from dsr.methods.networks.msg_net import MSGNet
 from dsr.methods.networks.pdn import PrimalDualNetwork
 from dsr.methods.networks.peers.build import PEERS
-from dsr.methods.registry import build_method, list_methods, read_method
+from dsr.methods.recipe import Run, list_methods, read_recipe
 from dsr.metrics import losses
 from dsr.metrics.catalogue import PROTOCOLS, catalogue, score_image
 from dsr.metrics.classes import compute_means, visual_metrics
@@ -85,14 +85,14 @@ def _on(sample: DepthSample, device: torch.device) -> DepthSample:
 
 
 def _build(name: str, device: torch.device, folder: Path) -> Any:
-    node = read_method(name, 4, SHORT.get(name))
-    given: dict[str, Any] = {"precision": "float32", "downsampling": Downsampling("box"), "device": device}
-    if "peer" in node:
+    recipe = read_recipe(name, SHORT.get(name))
+    if "peer" in recipe.at():
         torch.manual_seed(0)
-        given["weights"] = folder / f"{name}.pth"
-        if not given["weights"].exists():
-            torch.save(PEERS[name](4).state_dict(), given["weights"])
-    return build_method(node, 4, **given)
+        weights = folder / f"{name}.pth"
+        if not weights.exists():
+            torch.save(PEERS[name](4).state_dict(), weights)
+        recipe = recipe.with_weights(weights)
+    return recipe.build(4, Run(device=device))
 
 
 @pytest.mark.parametrize("name", METHODS)

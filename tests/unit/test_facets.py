@@ -10,9 +10,9 @@ from small_scenes import maps, photos, plane_map
 from torch import Tensor
 from torch.nn import functional
 
+from dsr.methods.inpainting import inpaint
 from dsr.methods.networks.facets import Facets
 from dsr.methods.networks.facets_planes import stencil
-from dsr.methods.networks.inpainting import inpaint
 
 SCALES = (2, 4, 8, 16)
 

@@ -21,13 +21,13 @@ from dsr.app.trust import read_plain_yaml
 from dsr.app.upsample.outputs import read_previous_run
 from dsr.data.download.fetching import unpack
 from dsr.data.tofmark import read_matrices
-from dsr.inference import MethodChoice
+from dsr.inference import upsampler
 from dsr.io.captures.arkitscenes import find_arkitscenes
 from dsr.io.captures.stray import find_stray
 from dsr.io.input_files import read_input, write_input
 from dsr.io.photos import read_photo
 from dsr.methods.networks.weight_files import is_dsr_weights
-from dsr.methods.registry import read_method
+from dsr.methods.recipe import read_recipe
 from dsr.report.user_study import read_study
 from dsr.user_study.answers import files_of
 from dsr.utils.builder import ConfigError
@@ -102,7 +102,7 @@ def test_number_of_5000_digits_in_the_file_of_a_method_is_refused(tmp_path):
     (tmp_path / "method").mkdir()
     (tmp_path / "method" / "bad.yaml").write_text("iterations: 1" + "0" * 5000)
     with pytest.raises(ConfigError, match=r"bad\.yaml: ") as caught:
-        read_method("bad", 4, directories=[tmp_path])
+        read_recipe("bad", directories=[tmp_path])
     assert len(str(caught.value)) < 1000
 
 
@@ -111,20 +111,20 @@ def test_method_whose_aliases_stand_for_a_billion_values_is_refused_at_once(tmp_
     levels = [f"a{n}: &a{n} [{', '.join([f'*a{n - 1}'] * 10)}]" for n in range(1, 10)]
     (tmp_path / "method" / "bad.yaml").write_text("\n".join(["a0: &a0 [1]", *levels]))
     with pytest.raises(ValueError, match=r"bad\.yaml: expected at most 100000 values, got more by its aliases"):
-        read_method("bad", 4, directories=[tmp_path])
+        read_recipe("bad", directories=[tmp_path])
 
 
 def test_aliases_of_a_few_values_are_read(tmp_path):
     (tmp_path / "method").mkdir()
     (tmp_path / "method" / "good.yaml").write_text("name: good\nfirst: &a [1, 2]\nsecond: *a\n")
-    assert read_method("good", 4, directories=[tmp_path])["second"] == [1, 2]
+    assert read_recipe("good", directories=[tmp_path]).at(4)["second"] == [1, 2]
 
 
 def test_wrong_value_in_the_file_of_a_method_is_told_with_the_method(tmp_path):
     (tmp_path / "method").mkdir()
     (tmp_path / "method" / "mine.yaml").write_text("defaults: [tgv]\nname: mine\nsharpness: sharp\n")
     with pytest.raises(ValueError, match=r"^method=mine: sharpness: expected a number.*, got 'sharp'$"):
-        MethodChoice("mine", {"iterations": 5}, (tmp_path,)).build(4)
+        upsampler("mine", settings={"iterations": 5}, directories=(tmp_path,), device="cpu").first()
 
 
 @pytest.mark.parametrize("shape", ["(9223372036854775807, 2)", "(-5, 4)", "(4294967296, 4294967296)", "(1e3,)", "(("])

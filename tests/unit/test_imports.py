@@ -35,7 +35,7 @@ MORE_FORBIDDEN = {
 """Beyond the layers: data sets and methods know no metric, and a report reads files alone."""
 ONLY_APP = ("hydra", "omegaconf")
 """Libraries for the configuration of commands."""
-MAY_TOO = {"omegaconf": "dsr.methods.registry"}
+MAY_TOO = {"omegaconf": "dsr.methods.recipe"}
 """A method's file is read there without Hydra."""
 
 

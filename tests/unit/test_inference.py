@@ -6,6 +6,7 @@ import doctest
 import math
 import subprocess
 import sys
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,11 +16,13 @@ from torch import Tensor
 import dsr
 from dsr.geometry.camera import Camera
 from dsr.geometry.resampling import resize_inverse_depth
-from dsr.inference import MethodChoice, check_settings, plan, upsample_depth, upsample_surface
+from dsr.inference import Plan, plan_for, upsample_surface, upsampler
 from dsr.inference import api as people
-from dsr.inference.engine import _resize_nearest, enlarged_by
-from dsr.inference.planning import OWN_SIZE
-from dsr.methods.registry import find_weights, list_methods, read_method
+from dsr.inference.inspection import enlarged_by
+from dsr.inference.plans import OWN_SIZE
+from dsr.inference.resizing import resize_nearest
+from dsr.methods.networks.weight_choice import find_weights
+from dsr.methods.recipe import list_methods, read_recipe
 
 
 def _camera(height: int, width: int) -> Camera:
@@ -31,6 +34,16 @@ def _plane(height: int, width: int, camera: Camera) -> Tensor:
     own = camera.rescale(width, height)
     x, y, _ = own.rays()
     return (0.5 + 0.2 * x - 0.1 * y).reciprocal()[None]
+
+
+def upsample_depth(*given: Any, **options: Any) -> Tensor:
+    """Return the upsampled depth alone."""
+    return upsample_surface(*given, **options).depth
+
+
+def plan(size: tuple[int, int], size_lr: tuple[int, int], scale: int | None = None, method: str = "facets") -> Plan:
+    """Return the plan of a method."""
+    return plan_for(read_recipe(method), size, size_lr, scale)
 
 
 def _photo(height: int, width: int) -> Tensor:
@@ -263,7 +276,7 @@ def test_progress_covers_all_steps() -> None:
     assert parts == [(i + 1, 8) for i in range(8)]  # x8, then x4, each an ensemble of four
 
 
-@pytest.mark.parametrize("method", [name for name in list_methods() if "weights_files" not in read_method(name, 4)])
+@pytest.mark.parametrize("method", [name for name in list_methods() if "weights_files" not in read_recipe(name).at(4)])
 def test_every_method_upsamples_any_size_and_its_holes(method: str) -> None:
     camera = _camera(31, 42)
     depth = _plane(15, 21, camera)
@@ -279,7 +292,7 @@ def test_every_method_upsamples_any_size_and_its_holes(method: str) -> None:
     )  # fmt: skip
     assert full.shape == (1, 31, 42)
     assert bool(full.isfinite().all())
-    assert int(kept.isnan().sum()) == int(_resize_nearest(depth.isnan(), (31, 42)).sum())
+    assert int(kept.isnan().sum()) == int(resize_nearest(depth.isnan(), (31, 42)).sum())
     assert all(done == total for done, total in steps[-1:])
     if not quick:
         assert float((full / _plane(31, 42, camera) - 1).abs().max()) < 0.1
@@ -302,11 +315,11 @@ def test_settings_change_the_result_and_are_checked() -> None:
             dsr.upsample(_photo(32, 32), depth, camera, method="tgv", **settings)  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize("method", [name for name in list_methods() if "ensemble" in read_method(name, 4)])
+@pytest.mark.parametrize("method", [name for name in list_methods() if "ensemble" in read_recipe(name).at(4)])
 def test_settings_of_every_trained_network_are_checked_at_a_factor_that_has_weights(method: str) -> None:
-    check_settings(MethodChoice(method, {"ensemble": 1}))
+    upsampler(method, settings={"ensemble": 1}, device="cpu").first()
     with pytest.raises(ValueError, match=r"^ensemble: "):
-        check_settings(MethodChoice(method, {"ensemble": 3}))
+        upsampler(method, settings={"ensemble": 3}, device="cpu").first()
 
 
 def test_plan_states_the_time_of_slow_methods() -> None:
@@ -340,7 +353,7 @@ def test_depth_a_little_larger_than_the_photo_is_taken(method: str) -> None:
 )
 def test_ratios_next_to_a_factor_take_its_weights(photo: tuple[int, int], depth: tuple[int, int], factor: int) -> None:
     assert plan(photo, depth).scale == factor
-    node = read_method("facets", factor)
+    node = read_recipe("facets").at(factor)
     assert find_weights(node, max(photo[1] / depth[1], 1)).name == f"facets_x{max(factor, 2)}.safetensors"
 
 

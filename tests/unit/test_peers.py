@@ -16,13 +16,14 @@ from torch import Tensor, nn
 
 from dsr.geometry.camera import Camera, from_range
 from dsr.methods.base import Cost
-from dsr.methods.networks.inpainting import inpaint
+from dsr.methods.inpainting import inpaint
 from dsr.methods.networks.maps import resize_bicubic
 from dsr.methods.networks.peers.base import PeerNetwork, PeerUpsampler
-from dsr.methods.networks.peers.build import PEERS, build_peer
-from dsr.methods.networks.peers.files import fold_batch_norm, load_peer, nearest_scale
+from dsr.methods.networks.peers.build import PEERS, Peer
+from dsr.methods.networks.peers.files import fold_batch_norm, load_peer
 from dsr.methods.networks.peers.svlrm import SVLRM
-from dsr.methods.registry import find_weights, has_weights, read_method
+from dsr.methods.networks.weight_choice import find_weights, has_weights, nearest_scale
+from dsr.methods.recipe import read_recipe
 from dsr.sample import DepthSample
 from dsr.utils.builder import ConfigError
 from dsr.utils.hashing import file_hash
@@ -214,12 +215,12 @@ def test_batch_normalisation_that_does_not_fit_is_left_in_place() -> None:
 
 @pytest.mark.parametrize(("scale", "trained"), [(1, 4), (8 / 3, 4), (4, 4), (4.5, 8), (8, 8), (32, 8)])
 def test_weights_are_those_of_the_next_larger_factor(scale: float, trained: float) -> None:
-    assert nearest_scale(FILES, scale) == trained
+    assert nearest_scale(FILES.values(), scale) == trained
 
 
 @pytest.mark.parametrize(("scale", "trained"), [(1, 4), (2, 4), (8 / 3, 8 / 3), (3, 4)])
 def test_weights_of_a_sensor_are_those_of_its_own_factor_alone(scale: float, trained: float) -> None:
-    assert nearest_scale({"sensor.pth": 8 / 3, **FILES}, scale) == trained
+    assert nearest_scale([8 / 3, *FILES.values()], scale) == trained
 
 
 def _state(prefix: str = "") -> dict[str, Tensor]:
@@ -228,7 +229,7 @@ def _state(prefix: str = "") -> dict[str, Tensor]:
 
 
 def _build(path: Path, scale: float = 4) -> PeerUpsampler:
-    return build_peer("svlrm", path, scale, FILES)
+    return Peer("svlrm", path, scale, FILES)
 
 
 def _save(path: Path, content: object) -> Path:
@@ -318,12 +319,12 @@ def test_missing_file_and_unknown_network_are_refused(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError, match="nowhere: no such weights file"):
         _build(tmp_path / "nowhere")
     with pytest.raises(ValueError, match=f"peer: expected one of {', '.join(PEERS)}, got 'svlr'"):
-        build_peer("svlr", tmp_path, 4, FILES)
+        Peer("svlr", tmp_path, 4, FILES)
 
 
 def test_directory_is_searched_for_the_authors_names(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("DSR_WEIGHTS", raising=False)
-    node = read_method("svlrm", 8)
+    node = read_recipe("svlrm").at(8)
     assert not has_weights(node, 8)
     message = (
         r"weights: method=svlrm at scale 8 needs weights=FILE, or a directory with SVLRM_X8.pth "
@@ -332,11 +333,11 @@ def test_directory_is_searched_for_the_authors_names(tmp_path: Path, monkeypatch
     with pytest.raises(ConfigError, match=message):
         find_weights(node, 8)
     monkeypatch.setenv("DSR_WEIGHTS", str(tmp_path))
-    node = read_method("svlrm", 8)
+    node = read_recipe("svlrm").at(8)
     with pytest.raises(ConfigError, match=r"SVLRM_X8.pth \(no such file\)"):
         find_weights(node, 8)
     path = _save(tmp_path / "X8" / "model_177200_iter.pth", _state())
     assert [find_weights(node, scale) for scale in (8, 7.5)] == [path, path]
     assert [has_weights(node, scale) for scale in (4, 8)] == [False, True]
     renamed = _save(tmp_path / "SVLRM_X8.pth", _state())
-    assert find_weights(node, 8, tmp_path) == renamed
+    assert find_weights({**node, "weights": str(tmp_path)}, 8) == renamed

@@ -22,7 +22,7 @@ from dsr.evaluation.predict import (
 from dsr.evaluation.score import SCORE_COLUMNS, score
 from dsr.evaluation.store import load_prediction, prediction_path
 from dsr.geometry.camera import Camera
-from dsr.methods.base import NoSolutionError
+from dsr.methods.base import Method, NoSolutionError
 from dsr.metrics.catalogue import catalogue, score_image
 from dsr.sample import DepthSample, Scene
 from dsr.utils.progress import SILENT, Progress
@@ -56,7 +56,7 @@ class ToySource:
         return f"{scene}-{self.version}"
 
 
-class ToyMethod:
+class ToyMethod(Method):
     """Repeats low-resolution pixels, remembers its calls, and may do something else at a scene."""
 
     range_type = "orthogonal"
@@ -458,8 +458,6 @@ class Recorder(Progress):
 
 class Iterating(ToyMethod):
     """Tells its steps, and how they went."""
-
-    history: list[dict[str, float]] = []  # noqa: RUF012 - of the last call, as the protocol has it
 
     def __call__(self, sample, progress=None):
         for step in range(3):

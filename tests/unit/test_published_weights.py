@@ -14,7 +14,7 @@ from torch import Tensor
 
 from dsr.methods.networks.msg_net import MSGNet
 from dsr.methods.networks.published import load_msg_weights
-from dsr.methods.networks.trained import build_trained
+from dsr.methods.networks.trained import TrainedNetwork
 
 Layer = tuple[str, str, list[Tensor]]
 
@@ -115,8 +115,8 @@ def test_torch_file_round_trips_its_parameters(tmp_path: Path) -> None:
 
 def test_published_networks_default_to_their_published_settings(tmp_path: Path) -> None:
     path = _save(tmp_path / "net.pth", {"model_state_dict": _author_state(MSGNet(4))})
-    assert build_trained(path, 4, "msg_v", "voynov").ensemble == 1
-    assert build_trained(path, 4, "msg_v", "voynov", ensemble=8).ensemble == 8
+    assert TrainedNetwork(path, 4, "msg_v", "voynov").ensemble == 1
+    assert TrainedNetwork(path, 4, "msg_v", "voynov", ensemble=8).ensemble == 8
 
 
 def test_loading_draws_nothing_from_the_random_generator(tmp_path: Path) -> None:

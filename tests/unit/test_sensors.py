@@ -12,7 +12,7 @@ import torch
 
 from dsr.degradation.sensors import SENSORS, identify, least_error, recognise, recognise_values
 from dsr.geometry.camera import Camera
-from dsr.inference.engine import find_sensor, upsample_surface
+from dsr.inference import find_sensor, upsample_surface
 from dsr.inference.working_size import find_noise
 
 BY_NAME = {each.name: each for each in SENSORS}

@@ -18,7 +18,7 @@ from dsr.cli import main
 from dsr.data.download.fetching import unpack
 from dsr.geometry.poses import as_rigid, from_quaternion, is_rotation
 from dsr.io.photos import focal_in_exif
-from dsr.methods.registry import read_method
+from dsr.methods.recipe import read_recipe
 from dsr.report.user_study import read_study
 from dsr.utils.console import one_line, print_error, printable
 from dsr.utils.lightning import fit, make_trainer
@@ -42,7 +42,7 @@ def test_damaged_configuration_file_is_named(tmp_path, monkeypatch, capsys, cont
     path.write_bytes(content)
     expected = f"{path}: expected a readable YAML file, got {reason}"
     with pytest.raises(ValueError, match="expected a readable YAML file") as refused:
-        read_method("mine", 4, directories=[tmp_path / "conf"])
+        read_recipe("mine", directories=[tmp_path / "conf"])
     assert str(refused.value) == expected
     monkeypatch.setenv("HYDRA_FULL_ERROR", "1")
     monkeypatch.chdir(tmp_path)
@@ -55,7 +55,7 @@ def test_configuration_file_that_is_a_link_to_nothing_is_refused(tmp_path):
     (tmp_path / "method").mkdir()
     (tmp_path / "method" / "mine.yaml").symlink_to("nowhere")
     with pytest.raises(ValueError, match=r"method: expected a readable file mine\.yaml"):
-        read_method("mine", 4, directories=[tmp_path])
+        read_recipe("mine", directories=[tmp_path])
 
 
 def test_archive_whose_names_are_no_text_is_refused(tmp_path):

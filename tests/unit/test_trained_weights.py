@@ -15,7 +15,8 @@ from dsr.methods.networks.base import DisparityNetwork
 from dsr.methods.networks.facets import Facets
 from dsr.methods.networks.msg_net import MSGNet
 from dsr.methods.networks.sparse_to_dense import SparseToDense
-from dsr.methods.networks.trained import NETWORKS, build_trained, packaged_names, packaged_weights
+from dsr.methods.networks.trained import NETWORKS, TrainedNetwork
+from dsr.methods.networks.weight_choice import packaged_names, packaged_weights
 from dsr.methods.networks.weight_files import is_dsr_weights, load_network, read_header, save_network
 
 NETS = {
@@ -75,15 +76,15 @@ def test_file_is_told_from_a_published_one_by_its_content(tmp_path: Path) -> Non
     torch.save({"model_state_dict": {}}, tmp_path / "w.caffemodel")
     assert is_dsr_weights(tmp_path / "w.pth")
     assert not is_dsr_weights(tmp_path / "w.caffemodel")
-    assert build_trained(tmp_path / "w.pth", 4, "msg_v", "voynov").net.scale == 4
+    assert TrainedNetwork(tmp_path / "w.pth", 4, "msg_v", "voynov").net.scale == 4
     with pytest.raises(ValueError, match=r"w.caffemodel: expected MSG-Net for a scale"):
-        build_trained(tmp_path / "w.caffemodel", 4, "msg_v", "voynov")
+        TrainedNetwork(tmp_path / "w.caffemodel", 4, "msg_v", "voynov")
 
 
 def test_trained_networks_default_to_averaging_over_quarter_turns(tmp_path: Path) -> None:
     save_network(tmp_path / "w", MSGNet(2, "dsr"), "msg_v")
-    assert build_trained(tmp_path / "w", 2, "msg_v", "voynov").ensemble == 4
-    assert build_trained(tmp_path / "w", 2, "msg_v", "voynov", ensemble=1).ensemble == 1
+    assert TrainedNetwork(tmp_path / "w", 2, "msg_v", "voynov").ensemble == 4
+    assert TrainedNetwork(tmp_path / "w", 2, "msg_v", "voynov", ensemble=1).ensemble == 1
 
 
 def _file(path: Path, changes: dict[str, Any] | None = None, tensors: dict[str, Tensor] | None = None) -> Path:
@@ -115,7 +116,7 @@ def test_weights_of_another_model_or_scale_are_refused(tmp_path: Path) -> None:
     assert _refusal(path, model="msg") == "expected weights of model msg, got those of msg_v"
     assert _refusal(path, 8) == "weights are for scale 4, the run is at scale 8"
     with pytest.raises(ValueError, match=r"expected weights of model facets, got those of msg_v"):
-        build_trained(path, 4, "facets")
+        TrainedNetwork(path, 4, "facets")
 
 
 def test_file_truncated_or_changed_anywhere_is_refused(tmp_path: Path) -> None:

@@ -26,7 +26,7 @@ from dsr.methods.networks.base import Answer
 from dsr.methods.networks.facets_unet import FacetsUNet
 from dsr.methods.networks.msg_net import MSGNet, upsample_disparity
 from dsr.methods.networks.sparse_to_dense import SparseToDense
-from dsr.methods.registry import build_method, read_method
+from dsr.methods.recipe import read_recipe
 from dsr.metrics import functional as scores
 from dsr.metrics.classes import visual_metrics
 from dsr.metrics.functional import SurfacePair
@@ -502,7 +502,7 @@ def test_validation_scores_bicubic_interpolation_of_the_same_maps_as_the_method_
     scenes = [_scene(3), _scene(4, holes=0.05)]
     module = _module()
     [logged] = _trainer(tmp_path).validate(module, _loader(WholeScenes(scenes, X2)), verbose=False)
-    method, expected = build_method(read_method("bicubic", 2), 2), []
+    method, expected = read_recipe("bicubic").build(2), []
     for scene in scenes:
         sample = X2.sample(scene)
         assert sample.depth is not None

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import functools
+import hashlib
 import math
+import os
 import random
 import shutil
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,14 +16,13 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import torch
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 
 from dsr.app import run_directory as rundir
-from dsr.app.methods import adapt_method, hash_weights, weights_of
 from dsr.app.metrics import check_metrics, chosen_metrics, metric_collection
 from dsr.app.multirun import Plan, runs_here
-from dsr.app.schema import EvalConfig, given_keys, plain_config, user_directories
+from dsr.app.schema import EvalConfig, given_keys, plain_config, raw_group, user_directories
 from dsr.data.base import SceneSource, prepare_scenes
 from dsr.data.folder import Folder
 from dsr.degradation.downsampling import Downsampling, Measured, make_sample
@@ -31,15 +32,17 @@ from dsr.evaluation.run_files import read_run
 from dsr.evaluation.score import score
 from dsr.evaluation.sharing import Workers, can_fork, choose_workers
 from dsr.evaluation.store import load_errors, prediction_path
-from dsr.inference.adapter import AnyScale
-from dsr.methods.base import WORKSPACE
-from dsr.methods.registry import build_method, target_paths
+from dsr.inference.selection import select
+from dsr.methods.base import WORKSPACE, Method
+from dsr.methods.networks.weight_files import files_of_weights
+from dsr.methods.recipe import Known, Recipe, Run
 from dsr.metrics.formats import HEADLINES, Formats
 from dsr.report.tables import score_table
 from dsr.sample import DepthSample, slope
-from dsr.utils.builder import ConfigError, build, takes, trait
-from dsr.utils.console import ConsoleProgress, open_console, print_error, show
+from dsr.utils.builder import ConfigError, build
+from dsr.utils.console import ConsoleProgress, note_once, open_console, print_error, show
 from dsr.utils.devices import fast_precision, pick_device
+from dsr.utils.hashing import file_hash
 
 _OBJECTIVE = "RMSE_v"
 
@@ -59,7 +62,7 @@ def evaluate(config: DictConfig) -> pd.DataFrame:
         ConfigError: the configuration cannot be run, or a scene failed (the others' results are written).
 
     """
-    scores = [_run(_prepare(plain, source)) for plain, source in _studies(config)]
+    scores = [_run(_prepare(*study)) for study in _studies(config)]
     return pd.concat(scores, ignore_index=True)
 
 
@@ -73,7 +76,7 @@ def plan(config: DictConfig) -> list[Plan]:
         ConfigError: the configuration cannot be run.
 
     """
-    return [_plan(_prepare(plain, source, here=runs_here())) for plain, source in _studies(config)]
+    return [_plan(_prepare(*study, here=runs_here())) for study in _studies(config)]
 
 
 def objective(scores: pd.DataFrame) -> float:
@@ -90,15 +93,16 @@ def objective(scores: pd.DataFrame) -> float:
     return float(means.get(_OBJECTIVE, means.iloc[0]))
 
 
-def _studies(config: DictConfig) -> Iterator[tuple[dict[str, Any], SceneSource | None]]:
-    """Yield the configurations to evaluate, with data sets; None for the one that the configuration describes."""
+def _studies(config: DictConfig) -> Iterator[tuple[dict[str, Any], Any, SceneSource | None]]:
+    """Yield what to evaluate: configurations, their methods' nodes, data sets (None for the configuration's own)."""
     plain = plain_config(config)
     if plain["run"] is None:
-        yield plain, None
+        yield plain, raw_group(config, "method"), None
         return
     from dsr.app.training_runs import studies_of_run  # noqa: PLC0415 - it imports Lightning, which takes seconds
 
-    yield from studies_of_run(plain, given_keys())
+    for study, source in studies_of_run(plain, given_keys()):
+        yield study, study["method"], source
 
 
 @dataclass(frozen=True)
@@ -114,11 +118,12 @@ class _Prepared:
     progress: ConsoleProgress
 
 
-def _prepare(plain: dict[str, Any], source: SceneSource | None, *, here: bool = True) -> _Prepared:
+def _prepare(plain: dict[str, Any], node: Any, source: SceneSource | None, *, here: bool = True) -> _Prepared:
     """Check and build all that an evaluation needs, and write nothing.
 
     Args:
         plain: the configuration.
+        node: its method's, in which ``${scale}`` is not resolved.
         source: the data set; None for the one that the configuration describes.
         here: whether this process has the device that will compute.
 
@@ -126,19 +131,49 @@ def _prepare(plain: dict[str, Any], source: SceneSource | None, *, here: bool = 
     settings = EvalConfig.of(plain)
     device = pick_device(settings.device) if here else torch.device("cpu")
     source = source or _source(settings)
-    plain = {**plain, "precision": _precision(settings, device), "scale": _scale(settings, source)}
+    name, scale = str(settings.method["name"]), _scale(settings, source)
+    recipe = Recipe(name, OmegaConf.create(node), user_directories(), plain)
+    plain = {**plain, "precision": _precision(settings, recipe, device), "scale": scale}
     settings = EvalConfig.of(plain)
-    adapted = adapt_method(settings, device)
-    weights = weights_of(settings) if adapted is None else None
-    files = adapted.weights() if adapted is not None else [weights] if weights is not None else []
-    targets = target_paths(settings.method, user_directories())
-    identity = rundir.identity_of(plain, hash_weights(files), device, targets)
+    selected = select(recipe, scale, _weights(settings, recipe), measured=settings.measured)
+    identity = rundir.identity_of(plain, _hash_weights(selected.files()), device, recipe.targets())
     folder = rundir.folder_of(settings.output_dir or rundir.default_directory("eval", plain, identity))
     progress = ConsoleProgress(open_console())
-    given = {"device": device, "weights": weights, "workspace": folder, "display": progress}
-    study = _study(settings, identity, given, source, adapted)
+    downsampling = build("downsampling", settings.downsampling)
+    assumes = recipe.abilities.assumes_downsampling
+    if "downsampling.assumed" in given_keys() and not assumes:
+        raise ConfigError(f"downsampling.assumed: method={name} assumes no downsampling model; leave it out")
+    label = str(settings.method.get("label", name))
+    degradation = rundir.degradation_of(vars(settings), assumes=assumes)
+    run = Run(
+        device=device,
+        precision=settings.precision,
+        seed=settings.seed,
+        downsampling=downsampling.assumed_model(),
+        known=_known_of_maps(settings, downsampling, source),
+        metrics=functools.partial(metric_collection, settings.metrics, device),
+        workspace=folder,
+        display=progress,
+        about={"method": label, "degradation": degradation},
+        lpips_trunk=settings.metrics.lpips_trunk,
+    )
+    method = selected.build(run)
+    study = Evaluation(
+        source,
+        downsampling,
+        degradation,
+        scale,
+        method,
+        _flagged(name, method, "_{}"),
+        settings.seed,
+        identity,
+        device,
+        noise=build("noise", settings.noise),
+        holes=build("holes", settings.holes),
+        label=_flagged(label, method, " ({})"),
+    )
     check_metrics(settings.metrics)
-    workers = _workers(settings, device, len(study.source.scenes()))
+    workers = _workers(settings, device, len(source.scenes()), alone=recipe.abilities.optimises)
     rundir.expect_free(folder, plain, identity, () if here else ("device", "precision"))
     return _Prepared(settings, plain, identity, folder, study, workers, progress)
 
@@ -154,10 +189,9 @@ def _plan(prepared: _Prepared) -> Plan:
         example = _example(prepared)
         if example is None:
             return math.nan
-        each: Callable[[DepthSample], float] = study.method.seconds  # type: ignore[attr-defined]
-        return left * each(example)
+        return left * study.method.seconds(example)
 
-    measured = runs_here() and hasattr(study.method, "seconds")
+    measured = runs_here() and study.method.abilities.optimises
     return Plan(folder, prepared.identity, "scene", left, done, seconds if measured else None)
 
 
@@ -206,8 +240,8 @@ def _run(prepared: _Prepared) -> pd.DataFrame:
     return scores
 
 
-def _workers(settings: EvalConfig, device: torch.device, scenes: int) -> Workers:
-    """Return the worker processes that the configuration describes.
+def _workers(settings: EvalConfig, device: torch.device, scenes: int, *, alone: bool) -> Workers:
+    """Return the worker processes that the configuration describes; ``alone`` for one scene at a time.
 
     Raises:
         ConfigError: this device or system has no use for several.
@@ -220,8 +254,7 @@ def _workers(settings: EvalConfig, device: torch.device, scenes: int) -> Workers
             f"workers: expected 1 with device={device}, got {count}; "
             "start the command once per device, with the same output_dir"
         )
-    together = forks and not trait("method", settings.method, "optimises")
-    return choose_workers(count, threads, scenes, torch.get_num_threads(), together=together)
+    return choose_workers(count, threads, scenes, torch.get_num_threads(), together=forks and not alone)
 
 
 def _import_report() -> None:
@@ -257,80 +290,58 @@ def _scale(settings: EvalConfig, source: SceneSource) -> float:
         raise ConfigError(failure_line(first, error)) from error
 
 
-def _study(
-    settings: EvalConfig,
-    identity: Mapping[str, Any],
-    given: Mapping[str, Any],
-    source: SceneSource,
-    adapted: AnyScale | None,
-) -> Evaluation:
-    """Build the evaluation that the configuration describes.
+def _weights(settings: EvalConfig, recipe: Recipe) -> Path | None:
+    """Return the file or directory of weights that the configuration names, if the method takes one."""
+    given = None if settings.weights is None else Path(settings.weights).expanduser()
+    if given is not None and recipe.abilities.needs is None:
+        if not given.is_dir():  # a directory serves all methods of a multirun
+            note_once(f"method={recipe.name} has no weights; weights={given} is not used")
+        return None
+    return given
 
-    Args:
-        settings: the configuration.
-        identity: what identifies its predictions.
-        given: values that a method may take in addition to the configuration's: device, weights, workspace, display.
-        source: the data set.
-        adapted: the method, if it does not take the scale itself; None to build it.
+
+def _hash_weights(files: list[Path]) -> str | None:
+    """Return the SHA-256 of a file of weights, or of those of several and of those that they need; None without any.
+
+    Raises:
+        ConfigError: one is missing or damaged.
 
     """
-    downsampling = build("downsampling", settings.downsampling)
-    name = str(settings.method["name"])
-    if "downsampling.assumed" in given_keys() and not takes("method", settings.method, "downsampling"):
-        raise ConfigError(f"downsampling.assumed: method={name} assumes no downsampling model; leave it out")
-    label, degradation = str(settings.method.get("label", name)), rundir.degradation_of(vars(settings))
-    method = adapted or build_method(
-        settings.method,
-        settings.scale,
-        directories=user_directories(),
-        precision=settings.precision,
-        seed=settings.seed,
-        downsampling=downsampling.assumed_model(),
-        told=_known_of_maps(settings, downsampling, source),
-        lpips_trunk=settings.metrics.lpips_trunk,
-        about={"method": label, "degradation": degradation},
-        metrics=functools.partial(metric_collection, settings.metrics, given["device"]),
-        **given,
-    )
-    return Evaluation(
-        source,
-        downsampling,
-        degradation,
-        settings.scale,
-        method,
-        _flagged(name, method, "_{}"),
-        settings.seed,
-        identity,
-        given["device"],
-        noise=build("noise", settings.noise),
-        holes=build("holes", settings.holes),
-        label=_flagged(label, method, " ({})"),
-        note=getattr(method, "describe", None),
-    )
+    try:
+        hashes = [_hash(each, each.stat()) for file in files for each in files_of_weights(file)]
+    except (ValueError, OSError) as error:
+        raise ConfigError(str(error)) from error
+    if len(hashes) < 2:
+        return next(iter(hashes), None)
+    return hashlib.sha256("".join(hashes).encode()).hexdigest()
 
 
-def _known_of_maps(settings: EvalConfig, downsampling: Downsampling | Measured, source: SceneSource) -> dict[str, Any]:
+@functools.cache
+def _hash(path: Path, _: os.stat_result) -> str:
+    """Return the SHA-256 of a file, which jobs of a multirun share, as long as it is the same one."""
+    return file_hash(path)
+
+
+def _known_of_maps(settings: EvalConfig, downsampling: Downsampling | Measured, source: SceneSource) -> Known:
     """Return what is known of low-resolution maps, for methods that can be told; nothing of those of a sensor."""
     if not isinstance(downsampling, Downsampling):
-        return {}
-    return {
-        "kernel": downsampling.assumed_model().kernel,
-        "edges": "soft" if getattr(source, "soft_edges", False) else "sharp",
-        "clean": settings.noise["name"] == "none",
-    }
+        return Known()
+    soft = getattr(source, "soft_edges", False)
+    return Known(
+        downsampling.assumed_model().kernel, "soft" if soft else "sharp", clean=settings.noise["name"] == "none"
+    )
 
 
-def _flagged(name: str, method: Any, form: str) -> str:
+def _flagged(name: str, method: Method, form: str) -> str:
     """Return the name of a method, with the flag that its scores have to be marked with, if any."""
-    flag = getattr(method, "flag", "")
-    return name + form.format(flag) if flag else name
+    return name + form.format(method.flag) if method.flag else name
 
 
-def _precision(settings: EvalConfig, device: torch.device) -> str:
+def _precision(settings: EvalConfig, recipe: Recipe, device: torch.device) -> str:
     """Return the precision; ``auto`` is float32, or for an optimisation the device's fast one."""
     if settings.precision != "auto":
         return settings.precision
-    return fast_precision(device) if trait("method", settings.method, "optimises") else "float32"
+    return fast_precision(device) if recipe.abilities.optimises else "float32"
 
 
 def _seed(seed: int) -> None:

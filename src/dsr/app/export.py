@@ -7,7 +7,7 @@ from rich.console import Console
 import dsr
 from dsr.app.requests import ExportRequest
 from dsr.methods.networks.onnx_export import OnnxGraph, write_onnx
-from dsr.methods.registry import load_method_network
+from dsr.methods.recipe import read_recipe
 from dsr.utils.console import show
 from dsr.utils.units import megabytes
 
@@ -19,7 +19,7 @@ def export_onnx(request: ExportRequest, console: Console) -> list[str]:
         ValueError: the method has no network, there are no weights for the factor, or a library is missing.
 
     """
-    net = load_method_network(request.method, request.scale, directories=request.directories, weights=request.weights)
+    net = read_recipe(request.method, None, request.directories).with_weights(request.weights).network(request.scale)
     graph = OnnxGraph(net, request.scale)
     facts = {"dsr": dsr.__version__, "method": request.method, "scale": request.scale, "network": type(net).__name__}
     difference = write_onnx(request.path, graph, facts)

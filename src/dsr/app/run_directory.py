@@ -13,7 +13,7 @@ import torch
 from omegaconf import OmegaConf
 
 from dsr.app.run_names import NOT_IDENTITY, run_name
-from dsr.utils.builder import ConfigError, expand_home, takes
+from dsr.utils.builder import ConfigError, expand_home
 from dsr.utils.console import shorten
 from dsr.utils.files import write_text
 from dsr.utils.hashing import hash_of_code, hash_outside_code
@@ -85,13 +85,16 @@ def _may_hold(folder: Path, identity: Mapping[str, Any]) -> bool:
         return False
 
 
-def degradation_of(config: Mapping[str, Any]) -> str:
-    """Return the name of a run's degradation, as in ``scores.csv``: box, or box+gaussian_multiplicative-0.003."""
+def degradation_of(config: Mapping[str, Any], *, assumes: bool = False) -> str:
+    """Return the name of a run's degradation, as in ``scores.csv``: box, or box+gaussian_multiplicative-0.003.
+
+    ``assumes``: whether the run's method assumes a downsampling model.
+    """
     if config.get("degradation", {}).get("name", "plain") != "plain":
         return str(config["degradation"]["name"])
     parts = [str(config["downsampling"]["name"])]
     assumed = config["downsampling"].get("assumed")
-    if assumed not in (None, parts[0]) and takes("method", config["method"], "downsampling"):
+    if assumes and assumed not in (None, parts[0]):
         parts.append(f"assumed-{assumed}")
     for group in (config["noise"], config.get("holes", {"name": "none"})):
         if group["name"] != "none":

@@ -265,6 +265,11 @@ def plain_config(config: DictConfig) -> dict[str, Any]:
     return OmegaConf.to_container(config, resolve=True)  # type: ignore[return-value]
 
 
+def raw_group(config: DictConfig, group: str) -> Any:
+    """Return a group of a composed configuration, its interpolations as they are."""
+    return OmegaConf.to_container(config, resolve=False)[group]  # type: ignore[index,call-overload]
+
+
 def register() -> None:
     """Register the schemas with Hydra."""
     ConfigStore.instance().store(name="eval_schema", node=EvalConfig)

@@ -114,9 +114,9 @@ def studies_of_run(
 
 def _as_validated(model: Mapping[str, Any]) -> dict[str, Any]:
     """Return the settings of the method that runs a network as validations do: one pass, told what is known of maps."""
-    if trait("model", model, "states_errors"):
-        return {"target": "dsr.methods.networks.any_map.build_any_map"}
-    return {"target": "dsr.methods.networks.trained.build_trained", "ensemble": 1}
+    if load_target("model", model).states_errors:
+        return {"target": "dsr.methods.networks.any_map.TrainedFacets"}
+    return {"target": "dsr.methods.networks.trained.TrainedNetwork", "ensemble": 1}
 
 
 def training_data(settings: TrainConfig, devices: int = 1) -> PatchData:

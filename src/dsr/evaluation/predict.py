@@ -30,7 +30,7 @@ from dsr.degradation.noise import Noise
 from dsr.evaluation.claims import Claims
 from dsr.evaluation.sharing import ALONE, Workers, share
 from dsr.evaluation.store import iterations_path, prediction_path, sample_path
-from dsr.methods.base import Confident, Iterative, NoSolutionError, Surface, Upsampler, expect_some_depth
+from dsr.methods.base import Method, NoSolutionError, expect_some_depth
 from dsr.sample import DepthSample
 from dsr.utils.console import one_line
 from dsr.utils.files import look_anew, read_arrays, replacing
@@ -56,7 +56,6 @@ class Evaluation:
         noise: noise of the low-resolution maps.
         holes: holes of the low-resolution maps.
         label: displayed name of the method; empty for ``method_name``.
-        note: says of a sample how the method is run, for a note on the scores, or nothing; None if it never does.
 
     """
 
@@ -64,7 +63,7 @@ class Evaluation:
     downsampling: Downsampling | Measured
     downsampling_name: str
     scale: float
-    method: Upsampler
+    method: Method
     method_name: str
     seed: int
     config: Mapping[str, Any]
@@ -72,7 +71,6 @@ class Evaluation:
     noise: Noise | None = None
     holes: Holes | None = None
     label: str = ""
-    note: Callable[[DepthSample], str] | None = None
 
     def sample(self, scene: str) -> DepthSample:
         """Return the method's input for a scene.
@@ -84,7 +82,7 @@ class Evaluation:
         loaded = self.source.load(scene)
         kind = self.method.range_type
         sample = make_sample(loaded, self.scale, self.downsampling, kind, self.noise, self.seed, self.holes)
-        note = "" if self.note is None else self.note(sample)
+        note = self.method.describe(sample)
         return replace(sample, notes=(*sample.notes, note)) if note else sample
 
     def stored_config(self, scene: str) -> dict[str, Any]:
@@ -253,14 +251,15 @@ def _predict_scene(study: Evaluation, scene: str, folder: Path, config: Mapping[
     """Compute one prediction; write it, its sample and the iteration's history; return the method's seconds."""
     sample = study.sample(scene)
     start = time.perf_counter()
-    surface = _run(study.method, sample, progress)
+    with progress.task("steps") as step:
+        surface = study.method.surface(sample, step)
     seconds = time.perf_counter() - start
     depth = surface.depth
     expected = (1, sample.camera.height, sample.camera.width)
     if tuple(depth.shape) != expected:
         raise ValueError(f"{scene}: {study.method_name} gave depth of shape {tuple(depth.shape)}, expected {expected}")
     expect_some_depth(depth, f"{scene}: {study.method_name}")
-    if isinstance(study.method, Iterative):
+    if study.method.history is not None:
         with replacing(iterations_path(folder, scene)) as temporary:
             pd.DataFrame(study.method.history).to_csv(temporary, index=False)
     sample.save(sample_path(folder, scene))
@@ -274,9 +273,3 @@ def _predict_scene(study: Evaluation, scene: str, folder: Path, config: Mapping[
             **surface.error_arrays(),
         )
     return seconds
-
-
-def _run(method: Upsampler, sample: DepthSample, progress: Progress) -> Surface:
-    """Run a method and display its steps."""
-    with progress.task("steps") as step:
-        return method.surface(sample, step) if isinstance(method, Confident) else Surface(method(sample, step))

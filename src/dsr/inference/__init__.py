@@ -8,47 +8,37 @@ from typing import TYPE_CHECKING, Any
 from dsr.inference.options import DEFAULT, WIDEST, Fill
 
 if TYPE_CHECKING:
+    from dsr.inference.any_ratio import AnyRatio, upsample_surface, upsampler
     from dsr.inference.api import upsample, upsample_with_errors
-    from dsr.inference.engine import (
-        MethodChoice,
-        check_settings,
-        check_working_size,
-        find_sensor,
-        upsample_depth,
-        upsample_surface,
-    )
     from dsr.inference.inspection import enlarged_by
-    from dsr.inference.planning import Plan, plan
+    from dsr.inference.plans import Plan, plan_for
+    from dsr.inference.selection import Selection, select
+    from dsr.inference.working_size import find_sensor
 
 __all__ = [
     "DEFAULT",
     "WIDEST",
+    "AnyRatio",
     "Fill",
-    "MethodChoice",
     "Plan",
-    "check_settings",
-    "check_working_size",
+    "Selection",
     "enlarged_by",
     "find_sensor",
-    "plan",
+    "plan_for",
+    "select",
     "upsample",
-    "upsample_depth",
     "upsample_surface",
     "upsample_with_errors",
+    "upsampler",
 ]
 
 _NAMES = {
+    "any_ratio": ("AnyRatio", "upsample_surface", "upsampler"),
     "api": ("upsample", "upsample_with_errors"),
-    "engine": (
-        "MethodChoice",
-        "check_settings",
-        "check_working_size",
-        "find_sensor",
-        "upsample_depth",
-        "upsample_surface",
-    ),
     "inspection": ("enlarged_by",),
-    "planning": ("Plan", "plan"),
+    "plans": ("Plan", "plan_for"),
+    "selection": ("Selection", "select"),
+    "working_size": ("find_sensor",),
 }
 
 

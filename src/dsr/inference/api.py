@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from dsr.geometry.camera import Camera
-from dsr.inference.engine import upsample_surface
+from dsr.inference.any_ratio import upsampler
 from dsr.inference.options import DEFAULT, WIDEST, Fill
 from dsr.methods.base import MapNoise
 from dsr.utils.progress import Steps
@@ -140,18 +140,8 @@ def upsample_with_errors(
                 f"mask: expected the depth's shape {tuple(depth_lr.shape[-2:])}, got {tuple(valid.shape[-2:])}"
             )
         depth_lr = depth_lr.masked_fill(~valid, torch.nan) if depth_lr.is_floating_point() else depth_lr
-    surface = upsample_surface(
-        photo,
-        depth_lr,
-        camera,
-        scale,
-        method=method,
-        settings=settings,
-        device=device,
-        fill=fill,
-        max_hole=max_hole,
-        progress=progress,
-    )
+    run = upsampler(method, scale, settings=settings, device=device, fill=fill, max_hole=max_hole)
+    surface = run.upsample(photo, depth_lr, camera, progress)
     depth_hr, depth_error, angle_error = (
         cast("Array", each[0].cpu().numpy() if arrays and each is not None else each) for each in surface[:3]
     )
@@ -164,7 +154,7 @@ def _tensor(values: np.ndarray | Tensor) -> Tensor:
 
 
 def _photo(rgb: np.ndarray | Tensor) -> Tensor:
-    """Return a photo as (3, H, W) float32 in [0, 1]; an invalid one is left for :func:`upsample_depth` to reject."""
+    """Return a photo as (3, H, W) float32 in [0, 1]; an invalid one is left for :class:`AnyRatio` to reject."""
     photo = _tensor(rgb)
     if isinstance(rgb, np.ndarray):
         if rgb.ndim != 3 or rgb.shape[-1] != 3:

@@ -18,10 +18,15 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from dsr.degradation.sensors import Identified, identify
 from dsr.inference.options import SIZES
-from dsr.methods.base import MapNoise
+from dsr.methods.base import MapNoise, NoiseLaw
 
 T = TypeVar("T", float, Tensor)
+_NOISY = 0.4
+"""Standard deviation of a sensor's disparity in its steps, at least; rounding alone has 0.29."""
+_CORRELATED = 5.0
+"""Pixels over which noise is correlated that a network takes for shape in part."""
 _WINDOWS = (8, 12, 16, 24, 32, 48, 64, 96, 128, 192, 256, 384)
 """Pixels."""
 _LARGEST_WINDOW = 0.6
@@ -102,6 +107,45 @@ def find_noise(depth: Tensor) -> MapNoise | None:
                 found = noise if level >= _LEVEL and fine >= _FINE else None
         before = (size, deviation)
     return found
+
+
+def find_sensor(depth: Tensor, name: str = "auto", device_name: str = "") -> Identified | None:
+    """Return the sensor of a map, see :func:`dsr.degradation.sensors.identify`.
+
+    Its values alone tell it only where the map has a sensor's noise: computed disparity may have the same steps.
+
+    Args:
+        depth: (1, h, w) in metres, NaN in holes, as it was read.
+        name: of a sensor or a device; ``auto``, or ``none`` for none.
+        device_name: of the device, as its files state it; empty where they do not.
+
+    Raises:
+        ValueError: there is no such sensor, or the map's values keep to steps that it does not have.
+
+    """
+    found = identify(depth, name, device_name)
+    if found is None or found.by != "values" or found.constant is None:
+        return found
+    noise = find_noise(depth)
+    steps = 0.0 if noise is None else found.constant * noise.deviation / noise.distance**2
+    return found if steps >= _NOISY else None
+
+
+def noise_to_tell(sensor: Identified | None, noise: MapNoise | None, factor: int) -> NoiseLaw | None:
+    """Return the noise that a method is told because it may take it for shape; None for noise that it judges better.
+
+    That is correlated noise of a sensor that counts disparity.
+
+    Args:
+        sensor: what measured the map, if that is known.
+        noise: what was found of it.
+        factor: by what the size of the map is divided.
+
+    """
+    counts = sensor is not None and sensor.sensor.stereo_constant is not None
+    if not counts or noise is None or noise.extent < max(_CORRELATED, factor):
+        return None
+    return noise.deviation / noise.distance**2, 2.0
 
 
 def working_size_of(extent: float) -> int:

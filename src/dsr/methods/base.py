@@ -1,15 +1,19 @@
-"""The interface of super-resolution methods: a callable from a sample to high-resolution depth."""
+"""The interface of super-resolution methods: from a sample to high-resolution depth, and what a method can do."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import abc
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Literal, NamedTuple, Protocol, runtime_checkable
+from typing import Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
 from torch import Tensor
 
-from dsr.geometry.camera import RangeType
+from dsr.degradation.scales import SCALES
+from dsr.geometry.camera import Camera, RangeType
+from dsr.methods.inpainting import inpaint
+from dsr.methods.tiling import TILE, UNTILED
 from dsr.sample import DepthSample
 from dsr.utils.progress import Steps
 from dsr.utils.ratios import round_ratio
@@ -21,49 +25,64 @@ class NoSolutionError(ValueError):
 
 @dataclass(frozen=True)
 class Cost:
-    """The rough cost of a method, measured on two CPU cores; a class states it as its attribute ``cost``.
+    """The rough cost of a method, measured on two CPU cores.
 
     Args:
-        memory: bytes for each pixel of the guide image.
-        seconds: seconds for a million of these pixels.
+        memory: bytes for each pixel that it computes.
+        seconds: seconds for a million of these pixels; None if they are not known.
+        photo: bytes for each pixel of the photo.
+        tile: bytes for each pixel of a tile, for a method that computes large pictures in tiles.
+        program: bytes of the program itself.
 
     """
 
     memory: float
-    seconds: float
+    seconds: float | None = None
+    photo: float = 0
+    tile: float = 0
+    program: float = 4e8
+
+    def bytes_for(self, photo: int, computed: int) -> float:
+        """Return the memory in bytes for a photo, and a computed picture, of so many pixels."""
+        window = computed if computed <= UNTILED else (TILE + 160) ** 2
+        return self.program + self.photo * photo + self.memory * computed + self.tile * window
 
 
-Ratios = Literal["any", "whole"]
-"""The scales that a method takes beyond 2, 4, 8 and 16: any of 1 or more, or whole ones of 1 or more. A class states it
-as its attribute ``ratios``; one without it takes no other, see :mod:`dsr.inference.adapter`. At 1 the depth map has the
-photo's size: a filter smooths it, and a method that reproduces block means only fills its holes."""
+Ratios = Literal["factors", "whole", "any"]
+"""Ratios of the photo's size to the map's: 2, 4, 8 and 16; these and any whole one from 1; any from 1. At 1 the map has
+the photo's size: a filter smooths it, and a method that reproduces block means only fills its holes."""
 
 
-class Upsampler(Protocol):
-    """A depth super-resolution method: a network, a per-image optimisation or a classical filter.
+@dataclass(frozen=True, kw_only=True)
+class Abilities:
+    """What a method can do; its class states it as ``abilities``.
 
-    Attributes:
-        range_type: the range type that it works on. By default the downsampling model is applied to that
-            type, too, as in the paper, which evaluates every method on the type that it was designed for.
+    Args:
+        ratios: of the samples that it takes.
+        at_ratio: whether ``dsr.upsample`` runs it at the ratio of the sizes, and does not resize photo and result.
+        own_size: whether it takes a map of the photo's own size as it is.
+        repeats: whether its result may be its input once more, for larger factors.
+        needs: a file of ``weights``, or one of weights from which dsr loads a ``network``.
+        optimises: whether it optimises a network for each picture.
+        tolerant: whether convolutions in bfloat16 change its scores in the fourth digit only.
+        assumes_downsampling: whether it takes the model of the downsampling, as its argument ``downsampling``.
+        cost: its rough cost.
 
     """
 
-    range_type: RangeType
+    ratios: Ratios = "factors"
+    at_ratio: bool = False
+    own_size: bool = False
+    repeats: bool = False
+    needs: Literal["weights", "network"] | None = None
+    optimises: bool = False
+    tolerant: bool = False
+    assumes_downsampling: bool = False
+    cost: Cost = Cost(1000)
 
-    def __call__(self, sample: DepthSample, progress: Steps | None = None) -> Tensor:
-        """Return the HR orthogonal depth, (1, H, W) in metres on the sample's device, NaN where missing.
-
-        A method never reads ``sample.depth``.
-
-        Args:
-            sample: the guide image, the low-resolution depth and the cameras.
-            progress: is called with the steps done and their total, by methods that take more than one.
-
-        Raises:
-            NoSolutionError: the method has no solution for this image.
-
-        """
-        ...
+    def takes(self, ratio: float) -> bool:
+        """Return whether it takes samples of a ratio itself."""
+        return ratio in SCALES or self.ratios == "any" or (self.ratios == "whole" and isinstance(ratio, int))
 
 
 class MapNoise(NamedTuple):
@@ -113,30 +132,120 @@ class Surface(NamedTuple):
         return {name: each[0].cpu().numpy().astype(np.float16) for name, each in named.items() if each is not None}
 
 
-@runtime_checkable
-class Confident(Protocol):
-    """An :class:`Upsampler` that says how far off its result may be."""
+NoiseLaw = tuple[float, float]
+"""Standard deviation of a map's noise in metres at 1 m, and the power of the distance with which it grows."""
+
+
+class InverseSample(NamedTuple):
+    """A problem in inverse depth, whose values are not checked: they may be a method's own.
+
+    ``rgb`` (3, H, W) in [0, 1]; ``inverse`` (1, h, w) in 1/m, NaN in holes; the cameras of both; ``ratio`` of their
+    sizes; the map's ``noise``, where it is known.
+    """
+
+    rgb: Tensor
+    inverse: Tensor
+    camera: Camera
+    camera_lr: Camera
+    ratio: float
+    noise: NoiseLaw | None = None
+
+    def in_depth(self) -> DepthSample:
+        """Return the same as a sample."""
+        depth = self.inverse.reciprocal()
+        return DepthSample("upsample", "depth", self.rgb, depth, self.camera, self.camera_lr, self.ratio)
+
+
+class InverseSurface(NamedTuple):
+    """A result in inverse depth: (1, H, W) in 1/m, NaN where a method leaves a hole.
+
+    ``spread``, ``angle`` (1, H, W): the expected relative error of the depth and that of the normal in degrees; None
+    for a method that does not say. ``noise``: of the low-resolution map, if the method estimates it.
+    """
+
+    inverse: Tensor
+    spread: Tensor | None = None
+    angle: Tensor | None = None
+    noise: MapNoise | None = None
+
+    @classmethod
+    def of(cls, surface: Surface) -> InverseSurface:
+        """Return a result as inverse depth; one without expected errors has no holes on purpose, they are inpainted."""
+        inverse = surface.depth.reciprocal()
+        if surface.depth_error is None:
+            return cls(inpaint(inverse[None])[0], None, surface.angle_error, surface.noise)
+        return cls(inverse, surface.depth_error / surface.depth, surface.angle_error, surface.noise)
+
+    def map(self, function: Callable[[Tensor], Tensor]) -> InverseSurface:
+        """Return the result with a function applied to each of its maps."""
+        spread, angle = (None if each is None else function(each) for each in (self.spread, self.angle))
+        return self._replace(inverse=function(self.inverse), spread=spread, angle=angle)
+
+
+class Method(abc.ABC):
+    """A depth super-resolution method: a network, a per-image optimisation or a classical filter.
+
+    Attributes:
+        abilities: what it can do.
+        range_type: the range type that it works on. By default the downsampling model is applied to that
+            type, too, as in the paper, which evaluates every method on the type that it was designed for.
+        history: of the last call of a method that iterates, one entry per recorded iteration: ``iteration`` first, then
+            the method's own quantities, such as ``objective`` and ``moved``, in an order of its own. None for others.
+
+    """
+
+    abilities: ClassVar[Abilities] = Abilities()
+    range_type: RangeType = "disparity"
+    history: list[dict[str, float]] | None = None
+
+    @classmethod
+    def abilities_of(cls, node: Mapping[str, Any]) -> Abilities:
+        """Return what the method can do that a node of the configuration describes."""
+        return cls.abilities
+
+    @property
+    def flag(self) -> str:
+        """Mark for scores of a method that used the truth, else empty."""
+        return ""
+
+    @abc.abstractmethod
+    def __call__(self, sample: DepthSample, progress: Steps | None = None) -> Tensor:
+        """Return the HR orthogonal depth, (1, H, W) in metres on the sample's device, NaN where missing.
+
+        A method never reads ``sample.depth``.
+
+        Args:
+            sample: the guide image, the low-resolution depth and the cameras.
+            progress: is called with the steps done and their total, by methods that take more than one.
+
+        Raises:
+            NoSolutionError: the method has no solution for this image.
+
+        """
 
     def surface(self, sample: DepthSample, progress: Steps | None = None) -> Surface:
-        """Return the result of a call with its expected errors."""
-        ...
+        """Return the result of a call, with the expected errors of a method that says them."""
+        return Surface(self(sample, progress))
+
+    def upsample_inverse(self, problem: InverseSample, progress: Steps | None = None) -> InverseSurface:
+        """Return the high-resolution inverse depth of a problem in inverse depth."""
+        return InverseSurface.of(self.surface(problem.in_depth(), progress))
+
+    def describe(self, sample: DepthSample) -> str:
+        """Return what is to be said of how a sample is upsampled, beside its scores; nothing by default."""
+        return ""
+
+    def count_steps(self, height: int, width: int) -> int:
+        """Return the total that ``progress`` receives for a photo of height x width pixels, if it is known before."""
+        return 1
+
+    def seconds(self, sample: DepthSample) -> float:
+        """Return how long a sample takes, in seconds; NaN where that is not known before."""
+        return float("nan")
 
 
 WORKSPACE = "optimisation"
 """Folder in which a method that optimises keeps what it needs to go on after an interruption."""
-
-
-@runtime_checkable
-class Iterative(Protocol):
-    """An :class:`Upsampler` that iterates, and records its progress.
-
-    Attributes:
-        history: of the last call, one entry per recorded iteration: ``iteration`` first, then the method's own
-            quantities, such as ``objective`` and ``moved``, in an order of its own.
-
-    """
-
-    history: list[dict[str, float]]
 
 
 def expect_some_depth(depth: Tensor, name: str) -> None:

@@ -16,6 +16,11 @@ from torch import Tensor
 
 from dsr.utils.progress import Steps
 
+TILE = 1024
+"""Side of a tile in high-resolution pixels."""
+UNTILED = 2**21
+"""Number of high-resolution pixels up to which an image is processed without tiles."""
+
 
 @dataclass(frozen=True)
 class AxisTile:

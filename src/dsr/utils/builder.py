@@ -79,17 +79,6 @@ def build(group: str, node: Mapping[str, Any], given: Mapping[str, Any] | None =
         raise ConfigError(with_key(str(error), group, parameters)) from error
 
 
-def takes(group: str, node: Mapping[str, Any], key: str) -> bool:
-    """Return whether the target of a group has a parameter ``key``."""
-    return key in inspect.signature(load_target(group, node)).parameters
-
-
-def trait(group: str, node: Mapping[str, Any], name: str) -> Any:
-    """Return an attribute of the class that a group's target is or returns, such as ``optimises``; None without it."""
-    target = load_target(group, node)
-    return getattr(target if inspect.isclass(target) else get_type_hints(target).get("return"), name, None)
-
-
 def check_types(kind: type, values: Mapping[str, Any], place: str = "") -> None:
     """Check values for the fields of a dataclass that have a plain type.
 

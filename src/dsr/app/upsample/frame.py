@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import platform
 import time
 from collections.abc import Mapping, Sequence
@@ -25,7 +26,7 @@ from dsr.app.upsample.reporting import Messages
 from dsr.app.upsample.request import UpsampleRequest, Upsampling, files_of, inputs_with_neighbours, settings_of
 from dsr.app.upsample.sequence import FrameSequence
 from dsr.degradation.sensors import Identified
-from dsr.inference import Plan, enlarged_by, find_sensor, plan, upsample_surface
+from dsr.inference import AnyRatio, Plan, enlarged_by, find_sensor, upsampler
 from dsr.io.encoding import Assumption
 from dsr.io.inputs import Picture, read_picture
 from dsr.io.pairs import Pair
@@ -75,7 +76,7 @@ class FrameWork:
         picture = align(picture, register=request.reading.register)
         size_lr = (picture.depth_lr.shape[-2], picture.depth_lr.shape[-1])
         size = (picture.camera.height, picture.camera.width)
-        planned = plan(size, size_lr, how.scale, how.method, how.directories, how.arguments)
+        planned = self._upsampler.plan(size, size_lr)
         reporter.facts(picture.assumptions)
         if wanted.dry_run:
             reporter.say(f"{pair.name}: {planned.text} -> {target}")
@@ -87,7 +88,7 @@ class FrameWork:
         begin(target, job.settings, job.inputs, () if job.earlier is None else job.earlier.files)
         started = time.perf_counter()
         if surface is None:
-            surface = _upsample(job, picture, identified, progress)
+            surface = self._upsample(picture, identified, progress)
             reporter.facts(_describe(surface.noise, given="noise" in how.arguments))
             reporter.facts([*_describe_outliers(surface.outliers), *_describe_holes(surface, how)])
         seconds = time.perf_counter() - started
@@ -95,6 +96,27 @@ class FrameWork:
         reporter.facts(facts)
         reporter.say(f"{pair.name}: {planned.text}, {seconds:.1f} s -> {target}")
         return "done"
+
+    @functools.cached_property
+    def _upsampler(self) -> AnyRatio:
+        """The method, whose weights are loaded once."""
+        how = self._request.upsampling
+        return upsampler(
+            how.method,
+            how.scale,
+            settings=how.arguments,
+            directories=how.directories,
+            device=how.device,
+            fill=how.fill,
+            max_hole=how.max_hole,
+            working_size=how.working_size,
+        )
+
+    def _upsample(self, picture: Picture, sensor: Identified | None, progress: Progress) -> Surface:
+        """Compute the high-resolution depth with its expected errors, on the CPU."""
+        with progress.task("steps") as step:
+            surface = self._upsampler.upsample(picture.rgb, picture.depth_lr, picture.camera, step, sensor)
+        return surface.map(lambda values: values.cpu())
 
     def _read(self, pair: Pair) -> Picture:
         """Read a picture."""
@@ -165,28 +187,6 @@ def _with_sensor(picture: Picture, identified: Identified | None) -> Picture:
     )
     fact = Assumption("sensor", f"{identified.sensor.name}, {reason}; --sensor overrides it")
     return replace(picture, assumptions=(*picture.assumptions, fact))
-
-
-def _upsample(job: _Job, picture: Picture, sensor: Identified | None, progress: Progress) -> Surface:
-    """Compute the high-resolution depth with its expected errors, on the CPU."""
-    how = job.request.upsampling
-    with progress.task("steps") as step:
-        surface = upsample_surface(
-            picture.rgb,
-            picture.depth_lr,
-            picture.camera,
-            how.scale,
-            method=how.method,
-            settings=how.arguments,
-            directories=how.directories,
-            device=how.device,
-            fill=how.fill,
-            max_hole=how.max_hole,
-            working_size=how.working_size,
-            sensor=sensor,
-            progress=step,
-        )
-    return surface.map(lambda values: values.cpu())
 
 
 def _describe(noise: MapNoise | None, *, given: bool) -> list[Assumption]:

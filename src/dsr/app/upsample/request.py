@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from dsr.app.requests import check_method
 from dsr.app.upsample.parts import Results
-from dsr.inference.options import DEFAULT, USUAL_SCALE, WIDEST, Fill
+from dsr.inference.options import DEFAULT, WIDEST, Fill
 from dsr.io.reading import Reading
 from dsr.io.shards import Shard, parse_shard
 from dsr.utils.hashing import file_hash, hash_outside_code
@@ -166,19 +166,22 @@ class Upsampling(Options):
 
     def _check_method(self) -> None:
         """Check that the method accepts its arguments."""
-        from dsr.inference import (  # noqa: PLC0415 - other values are refused without torch
-            MethodChoice,
-            check_settings,
-            check_working_size,
-        )
+        from dsr.inference import upsampler  # noqa: PLC0415 - other values are refused without torch
 
-        choice = MethodChoice(self.method, self.arguments, self.directories)
+        run = upsampler(
+            self.method,
+            self.scale,
+            settings=self.arguments,
+            directories=self.directories,
+            device="cpu",
+            working_size=self.working_size,
+        )
         try:
-            check_working_size(choice, self.scale, self.working_size)
+            run.check_working_size()
         except ValueError as error:
             raise ValueError(f"--working-size{str(error).removeprefix('working_size')}") from error
         try:
-            check_settings(choice)
+            run.first()
         except ValueError as error:
             key = str(error).partition(":")[0]
             option = f"--{error}" if key in SHORTCUTS else f"--set {error}"
@@ -218,9 +221,9 @@ def settings_of(request: UpsampleRequest) -> dict[str, Any]:
 
 def _targets(how: Upsampling) -> list[str]:
     """Return the dotted paths of the code that the method's file names."""
-    from dsr.methods.registry import read_method, target_paths  # noqa: PLC0415 - it imports torch
+    from dsr.methods.recipe import read_recipe  # noqa: PLC0415 - it imports torch
 
-    return list(target_paths(read_method(how.method, USUAL_SCALE, directories=how.directories), how.directories))
+    return list(read_recipe(how.method, None, how.directories).targets())
 
 
 def files_of(pair: Pair, reading: Reading) -> dict[str, Path]:

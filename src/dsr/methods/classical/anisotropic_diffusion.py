@@ -23,17 +23,17 @@ What differs from the original:
 
 from __future__ import annotations
 
-from typing import ClassVar, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 from torch.nn import functional
 
-from dsr.geometry.camera import RangeType, from_range, to_range
-from dsr.methods.base import Cost, Ratios, expect_limits, whole_scale
+from dsr.geometry.camera import from_range, to_range
+from dsr.methods.base import Abilities, Cost, Method, expect_limits, whole_scale
 from dsr.methods.classical.convergence import CHECK_EVERY, Movement, history_of
 from dsr.methods.classical.finite_differences import box_mean, extend_linearly, upsample_linear_border
-from dsr.methods.networks.inpainting import inpaint
+from dsr.methods.inpainting import inpaint
 from dsr.methods.networks.maps import compute_min_max, normalise
 from dsr.sample import DepthSample
 from dsr.utils.progress import Steps
@@ -50,7 +50,7 @@ class Diffusion(NamedTuple):
     moved: list[float]
 
 
-class AnisotropicDiffusion:
+class AnisotropicDiffusion(Method):
     """Guided anisotropic diffusion; the block means of its inverse depth equal the input.
 
     Holes of the input are inpainted. Memory: about 15 float64 maps of the image's size, 30 MB for 512 x 512. The
@@ -69,9 +69,7 @@ class AnisotropicDiffusion:
 
     """
 
-    range_type: RangeType = "disparity"
-    cost: ClassVar[Cost] = Cost(120, 2)
-    ratios: ClassVar[Ratios] = "whole"
+    abilities = Abilities(ratios="whole", cost=Cost(120, 2))
 
     def __init__(
         self,

@@ -13,7 +13,6 @@ with weights from a table of 4096 entries over the map's range of depth.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import ClassVar
 
 import cv2
 import numpy as np
@@ -21,9 +20,9 @@ import torch
 from torch import Tensor
 
 from dsr.geometry.camera import RangeType
-from dsr.methods.base import Cost
+from dsr.methods.base import Abilities, Cost
 from dsr.methods.classical.photo_guided import Guided, GuidedMethod, expect_positive
-from dsr.methods.networks.inpainting import inpaint
+from dsr.methods.inpainting import inpaint
 from dsr.sample import DepthSample
 from dsr.utils.progress import Steps
 
@@ -49,9 +48,8 @@ class Bilateral(GuidedMethod):
 
     """
 
+    abilities = Abilities(ratios="any", at_ratio=True, own_size=True, cost=Cost(150, 1))
     range_type: RangeType = "orthogonal"
-    cost: ClassVar[Cost] = Cost(150, 1)
-    own_resolution: ClassVar[bool] = True
 
     def __init__(
         self, window: int = 19, sigma_depth: float = 0.03, sigma_space: float = 3.0, *, fill_holes: bool = False

@@ -7,20 +7,20 @@ does not overshoot beyond them.
 
 from __future__ import annotations
 
-from typing import ClassVar, get_args
+from typing import get_args
 
 import torch
 from torch import Tensor
 
 from dsr.degradation.downsampling import cubic_kernel
 from dsr.geometry.camera import RANGE_TYPES, RangeType, from_range, to_range
-from dsr.methods.base import Ratios
+from dsr.methods.base import Abilities, Method
 from dsr.methods.networks.maps import lr_coordinates
 from dsr.sample import DepthSample
 from dsr.utils.progress import Steps
 
 
-class CubicConvolution:
+class CubicConvolution(Method):
     """Interpolation of low-resolution depth or disparity, without a guide.
 
     Pixels are matched through the cameras. At the border and beside holes, the kernel is truncated and normalised; a
@@ -34,12 +34,12 @@ class CubicConvolution:
 
     """
 
-    ratios: ClassVar[Ratios] = "any"
+    abilities = Abilities(ratios="any")
 
     def __init__(self, range_type: RangeType = "disparity") -> None:
         if range_type not in get_args(RangeType):
             raise ValueError(f"range_type: expected one of {', '.join(RANGE_TYPES)}, got {range_type!r}")
-        self.range_type: RangeType = range_type
+        self.range_type = range_type
 
     def __call__(self, sample: DepthSample, progress: Steps | None = None) -> Tensor:
         """Return the high-resolution depth, (1, H, W) in metres."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import ClassVar, Literal, get_args
+from typing import Literal, get_args
 
 import numpy as np
 import torch
@@ -10,7 +10,7 @@ from scipy import ndimage
 from torch import Tensor
 
 from dsr.geometry.camera import Camera, RangeType, from_range, to_range
-from dsr.methods.base import Ratios
+from dsr.methods.base import Abilities, Cost, InverseSample, InverseSurface, Method
 from dsr.methods.networks.maps import lr_coordinates
 from dsr.sample import DepthSample
 from dsr.utils.progress import Steps
@@ -18,7 +18,7 @@ from dsr.utils.progress import Steps
 Order = Literal["nearest", "bilinear", "bicubic", "clough_tocher"]
 
 
-class Interpolation:
+class Interpolation(Method):
     """Spline interpolation of low-resolution perspective depth, without a guide.
 
     ``bicubic`` is the interpolating cubic spline; ``clough_tocher`` is the smooth piecewise cubic surface over
@@ -36,8 +36,8 @@ class Interpolation:
 
     """
 
+    abilities = Abilities(ratios="any", at_ratio=True, cost=Cost(100))
     range_type: RangeType = "perspective"
-    ratios: ClassVar[Ratios] = "any"
 
     def __init__(self, order: Order = "bicubic", *, fill_holes: bool = False) -> None:
         if order not in get_args(Order):
@@ -48,6 +48,11 @@ class Interpolation:
     def __call__(self, sample: DepthSample, progress: Steps | None = None) -> Tensor:
         """Return the high-resolution depth, (1, H, W) in metres."""
         return self.interpolate(sample.depth_lr, sample.camera_lr, sample.camera)
+
+    def upsample_inverse(self, problem: InverseSample, progress: Steps | None = None) -> InverseSurface:
+        """Return the interpolated depth as inverse depth, with its holes."""
+        depth = self.interpolate(problem.inverse.reciprocal(), problem.camera_lr, problem.camera)
+        return InverseSurface(depth.reciprocal())
 
     def interpolate(self, depth: Tensor, camera: Camera, camera_hr: Camera) -> Tensor:
         """Return depth, (1, h, w) in metres, at the pixels of another camera, whatever the ratio of their sizes."""

@@ -12,16 +12,15 @@ Everything is computed in float64, without randomness, on the sample's device.
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from dataclasses import dataclass
-from typing import ClassVar
 
 import torch
 from torch import Tensor
 
-from dsr.geometry.camera import RangeType, from_range
-from dsr.methods.base import Cost, Ratios
-from dsr.methods.networks.inpainting import inpaint
+from dsr.geometry.camera import from_range
+from dsr.methods.base import Abilities, Cost, Method
+from dsr.methods.inpainting import inpaint
 from dsr.methods.networks.maps import lr_coordinates
 from dsr.sample import DepthSample
 from dsr.utils.progress import Steps
@@ -73,7 +72,7 @@ class Guided:
         return torch.where(confidence > 0, mean, down @ self.maps @ across.T), confidence
 
 
-class GuidedMethod(ABC):
+class GuidedMethod(Method):
     """A guided filter of the low-resolution disparity: everything but :meth:`filter_maps`.
 
     Args:
@@ -83,9 +82,7 @@ class GuidedMethod(ABC):
 
     """
 
-    range_type: RangeType = "disparity"
-    cost: ClassVar[Cost] = Cost(600, 2)
-    ratios: ClassVar[Ratios] = "any"
+    abilities = Abilities(ratios="any", cost=Cost(600, 2))
 
     def __init__(self, *, fill_holes: bool = False, slopes: bool = True) -> None:
         self._fill_holes = fill_holes

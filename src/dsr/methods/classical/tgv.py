@@ -28,13 +28,13 @@ What differs from the original:
 from __future__ import annotations
 
 import math
-from typing import ClassVar, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import torch
 from torch import Tensor
 
-from dsr.geometry.camera import RangeType, from_range
-from dsr.methods.base import Cost, Ratios, expect_limits, whole_scale
+from dsr.geometry.camera import from_range
+from dsr.methods.base import Abilities, Cost, Method, expect_limits, whole_scale
 from dsr.methods.classical.convergence import CHECK_EVERY, Movement, history_of
 from dsr.methods.classical.finite_differences import (
     box_mean,
@@ -45,7 +45,7 @@ from dsr.methods.classical.finite_differences import (
     sum_adjacent,
     upsample_linear_border,
 )
-from dsr.methods.networks.inpainting import inpaint
+from dsr.methods.inpainting import inpaint
 from dsr.methods.networks.maps import normalise
 from dsr.methods.noise import estimate_sensor_noise
 from dsr.sample import DepthSample
@@ -85,7 +85,7 @@ class Solution(NamedTuple):
     moved: list[float]
 
 
-class TotalGeneralisedVariation:
+class TotalGeneralisedVariation(Method):
     """TGV-guided upsampling.
 
     Holes of the input are inpainted. Memory: about 90 float64 maps of the image's size, 180 MB for 512 x 512. The
@@ -107,9 +107,7 @@ class TotalGeneralisedVariation:
 
     """
 
-    range_type: RangeType = "disparity"
-    cost: ClassVar[Cost] = Cost(800, 60)
-    ratios: ClassVar[Ratios] = "whole"
+    abilities = Abilities(ratios="whole", cost=Cost(800, 60))
 
     def __init__(
         self,

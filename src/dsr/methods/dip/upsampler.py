@@ -12,7 +12,7 @@ import hashlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Any, ClassVar, Literal, get_args
+from typing import Any, Literal, get_args
 
 import lightning
 import torch
@@ -22,15 +22,14 @@ from torch import Tensor
 from torch.utils.data import DataLoader
 
 from dsr.degradation.downsampling import Downsampling, scene_generator
-from dsr.geometry.camera import RangeType
-from dsr.methods.base import WORKSPACE, Cost, Ratios
+from dsr.methods.base import WORKSPACE, Abilities, Cost, Method
 from dsr.methods.dip.callbacks import Provenance, checkpoint_of, cost_of_step
 from dsr.methods.dip.optimisation import PriorOptimisation, PriorSettings
 from dsr.methods.dip.problem import DataLoss, ImageProblem, PriorObjective
 from dsr.methods.dip.skip_net import Padding
 from dsr.methods.dip.stopping import Fixed, Oracle, Residual, Stopping, StoppingName, Variance
 from dsr.methods.networks.base import DTYPES, Precision
-from dsr.methods.networks.trained import build_trained
+from dsr.methods.networks.trained import TrainedNetwork
 from dsr.methods.noise import estimate_noise, normal_noise_deg
 from dsr.metrics.visual_loss import VisualLossName, make_visual_loss
 from dsr.sample import DepthSample
@@ -46,8 +45,8 @@ _ADVICE = "a lower method.learning_rate may help"
 
 
 @dataclass(kw_only=True)
-class DeepImagePrior:
-    """An :class:`~dsr.methods.base.Upsampler` that optimises a network for each image.
+class DeepImagePrior(Method):
+    """A method that optimises a network for each image.
 
     Each image has its own network and its own random numbers, which depend on the seed, the data set, the scene and the
     scale only, not on other images.
@@ -82,10 +81,8 @@ class DeepImagePrior:
 
     """
 
-    range_type: ClassVar[RangeType] = "orthogonal"
-    optimises: ClassVar[bool] = True
-    ratios: ClassVar[Ratios | None] = "whole"
-    cost: ClassVar[Cost] = Cost(2500, 2300)
+    abilities = Abilities(ratios="whole", optimises=True, assumes_downsampling=True, cost=Cost(2500, 2300, program=6e8))
+    range_type = "orthogonal"
 
     scale: int
     downsampling: Downsampling
@@ -301,7 +298,7 @@ class WarmStarted(DeepImagePrior):
 
     """
 
-    ratios: ClassVar[Ratios | None] = None
+    abilities = replace(DeepImagePrior.abilities, ratios="factors", needs="weights")
 
     weights: Path
     model: str
@@ -310,7 +307,7 @@ class WarmStarted(DeepImagePrior):
     def __post_init__(self) -> None:
         """Load the network."""
         super().__post_init__()
-        self._trained = build_trained(Path(self.weights), self.scale, self.model, device=self.device)
+        self._trained = TrainedNetwork(Path(self.weights), self.scale, self.model, device=self.device)
 
     def base(self, sample: DepthSample) -> Tensor:
         """Return the trained network's depth; holes are filled with the low-resolution map's mean."""

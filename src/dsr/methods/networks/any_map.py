@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import ClassVar, Literal, get_args
+from typing import Literal, get_args
 
 import torch
 from torch import Tensor
@@ -16,10 +16,9 @@ from torch.nn import functional
 
 from dsr.degradation.downsampling import Kernel
 from dsr.degradation.hints import encode_facts, local_noise, relative_error
-from dsr.geometry.camera import RangeType
 from dsr.geometry.holes import degrees_per_pixel, distance_to_known
 from dsr.geometry.resampling import pad_inverse_depth, resize_inverse_depth
-from dsr.methods.base import Cost, MapNoise, Ratios, Surface
+from dsr.methods.base import Abilities, Cost, InverseSample, InverseSurface, MapNoise, Method, NoiseLaw, Surface
 from dsr.methods.networks.base import DTYPES, Answer, DisparityNetwork, Precision
 from dsr.methods.networks.facets_unet import FacetsUNet
 from dsr.methods.networks.trained import NETWORKS
@@ -40,8 +39,8 @@ _ROUNDED = 16
 """A map with fewer different values than one per so many pixels is taken for a rounded one."""
 
 
-class AnyMap:
-    """An :class:`~dsr.methods.base.Upsampler` of maps of any ratio, kernel and noise.
+class AnyMap(Method):
+    """A method for maps of any ratio, kernel and noise.
 
     Args:
         net: the network; it is used as it is.
@@ -60,12 +59,9 @@ class AnyMap:
 
     """
 
-    range_type: RangeType = "disparity"
-    ratios: ClassVar[Ratios] = "any"
-    own_resolution: ClassVar[bool] = True
-    tolerant: ClassVar[bool] = True
-    """Convolutions in bfloat16 change its scores in the fourth digit only."""
-    cost: ClassVar[Cost] = Cost(250, 2.5)
+    abilities = Abilities(
+        ratios="any", at_ratio=True, own_size=True, needs="network", tolerant=True, cost=Cost(250, 2.5)
+    )
 
     def __init__(
         self,
@@ -95,7 +91,8 @@ class AnyMap:
             raise ValueError(f"max_error: expected a positive share of the depth, got {max_error}")
         self._max_error = max_error
         self._net = net.to(device, memory_format=torch.channels_last)  # type: ignore[call-overload]  # torch's stubs
-        self._device, self._noise, self._growth, self._smooth = torch.device(device), noise, noise_growth, smooth
+        self._device, self._smooth = torch.device(device), smooth
+        self._noise = None if noise is None else (noise, noise_growth)
         self._facts = encode_facts(kernel, None if edges == "auto" else edges == "soft")[None]
 
     @torch.no_grad()
@@ -103,9 +100,17 @@ class AnyMap:
         """Return the high-resolution depth, (1, H, W) in metres on the sample's device."""
         return self.surface(sample, progress).depth
 
-    @torch.no_grad()
     def surface(self, sample: DepthSample, progress: Steps | None = None) -> Surface:
         """Return the high-resolution depth with its expected errors, and the noise of the low-resolution map."""
+        return self._upsample(sample, self._noise, progress)
+
+    def upsample_inverse(self, problem: InverseSample, progress: Steps | None = None) -> InverseSurface:
+        """Return the same as inverse depth, told the noise that is known of the map, unless the method was."""
+        return InverseSurface.of(self._upsample(problem.in_depth(), self._noise or problem.noise, progress))
+
+    @torch.no_grad()
+    def _upsample(self, sample: DepthSample, noise: NoiseLaw | None, progress: Steps | None) -> Surface:
+        """Return the result for a map of this noise; None for one that is not known."""
         inverse = sample.depth_lr.to(self._device).reciprocal()[None]
         size = sample.rgb.shape[-2:]
         factor = self._factor(sample.scale)
@@ -115,7 +120,7 @@ class AnyMap:
         if factor == 1:  # in pairs
             rgb = functional.pad(rgb, (0, columns % 2, 0, rows % 2), mode="replicate")
             padded = pad_inverse_depth(inverse, 2)
-        level = None if self._noise is None else (self._noise * padded ** (1 - self._growth)).nan_to_num(0)
+        level = None if noise is None else (noise[0] * padded ** (1 - noise[1])).nan_to_num(0)
         passes = 1
         if self._smooth != 1:
             if level is None:
@@ -123,7 +128,7 @@ class AnyMap:
                 level = local_noise(padded, self._answer(rgb, padded, None, _half(progress, 0)).disparity)
             level = self._smooth * level
         answer = self._answer(rgb, padded, level, progress if passes == 1 else _half(progress, 1))
-        noise = _describe_noise(padded, answer)
+        found = _describe_noise(padded, answer)
         inside = (..., slice(factor * rows), slice(factor * columns))
         result = resize_inverse_depth(answer.disparity[inside][0], (size[0], size[1]))
         depth = torch.where(result > 0, result, torch.nan).reciprocal().to(sample.depth_lr.device)
@@ -136,7 +141,7 @@ class AnyMap:
         depth_error = spread * depth
         if self._max_error is not None:
             depth = depth.masked_fill(spread > self._max_error, torch.nan)
-        return Surface(depth, depth_error, torch.rad2deg(angle), noise)
+        return Surface(depth, depth_error, torch.rad2deg(angle), found)
 
     def _factor(self, ratio: float) -> int:
         """Return the factor at which the network is run for a ratio of the sizes."""
@@ -149,21 +154,8 @@ class AnyMap:
         return self._net.answer(rgb, inverse, None if noise is None else noise.float(), facts, progress)
 
 
-def build_any_map(
-    weights: Path,
-    model: str = "facets",
-    noise: float | None = None,
-    smooth: float = 1.0,
-    edges: Edges = "auto",
-    kernel: Kernel | None = None,
-    clean: bool = False,
-    max_error: float | None = None,
-    precision: Precision = "float32",
-    device: torch.device | str = "cpu",
-    noise_growth: float = 0.0,
-    networks: Mapping[str, type[DisparityNetwork]] = NETWORKS,
-) -> AnyMap:
-    """Build the method from a file that ``train.py model=facets`` wrote.
+class TrainedFacets(AnyMap):
+    """The method from a file that ``train.py model=facets`` wrote.
 
     Of maps that are told to be box means without noise, with sharp depth steps, the result is computed with the weights
     for them, if the file names one with such weights.
@@ -171,15 +163,8 @@ def build_any_map(
     Args:
         weights: the file.
         model: name of the model that it must contain.
-        noise: see :class:`AnyMap`, also for the next ones.
-        smooth: see there.
-        edges: see there.
-        kernel: see there.
-        clean: see there.
-        max_error: see there.
+        noise, smooth, edges, kernel, clean, max_error, device, noise_growth: see :class:`AnyMap`.
         precision: dtype of the convolutions.
-        device: device of the computations.
-        noise_growth: see :class:`AnyMap`.
         networks: network classes by their names in weights files.
 
     Raises:
@@ -187,17 +172,33 @@ def build_any_map(
         ValueError: the file is damaged or of another model, or a value is out of range.
 
     """
-    weights = Path(weights)
-    if kernel == "box" and edges == "sharp" and clean and noise is None and smooth == 1:
-        weights = clean_weights(weights) or weights
-    net = load_network(weights, networks, None, model)
-    if not isinstance(net, FacetsUNet):
-        raise ValueError(
-            f"{weights}: expected weights of {FacetsUNet.__name__}, got those of {type(net).__name__}, which "
-            "method=facets_box takes"
-        )
-    net = net.eval().requires_grad_(False).to(DTYPES[precision])
-    return AnyMap(net, noise, smooth, edges, kernel, clean, max_error, device, noise_growth)
+
+    def __init__(
+        self,
+        weights: Path,
+        model: str = "facets",
+        noise: float | None = None,
+        smooth: float = 1.0,
+        edges: Edges = "auto",
+        kernel: Kernel | None = None,
+        clean: bool = False,
+        max_error: float | None = None,
+        precision: Precision = "float32",
+        device: torch.device | str = "cpu",
+        noise_growth: float = 0.0,
+        networks: Mapping[str, type[DisparityNetwork]] = NETWORKS,
+    ) -> None:
+        weights = Path(weights)
+        if kernel == "box" and edges == "sharp" and clean and noise is None and smooth == 1:
+            weights = clean_weights(weights) or weights
+        net = load_network(weights, networks, None, model)
+        if not isinstance(net, FacetsUNet):
+            raise ValueError(
+                f"{weights}: expected weights of {FacetsUNet.__name__}, got those of {type(net).__name__}, which "
+                "method=facets_box takes"
+            )
+        net = net.eval().requires_grad_(False).to(DTYPES[precision])
+        super().__init__(net, noise, smooth, edges, kernel, clean, max_error, device, noise_growth)
 
 
 def _half(progress: Steps | None, before: int) -> Steps | None:

@@ -14,20 +14,17 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from dsr.geometry.camera import RangeType, from_range, to_range
-from dsr.methods.networks.inpainting import inpaint
+from dsr.geometry.camera import from_range, to_range
+from dsr.methods.base import Abilities, Cost, InverseSample, InverseSurface, Method
+from dsr.methods.inpainting import inpaint
 from dsr.methods.networks.maps import compute_min_max, normalise
-from dsr.methods.tiling import AxisTile, blend_tiles, split_axis
+from dsr.methods.tiling import TILE, UNTILED, AxisTile, blend_tiles, split_axis
 from dsr.sample import DepthSample
 from dsr.utils.progress import Steps
 
 Precision = Literal["float32", "bfloat16"]
 ENSEMBLES = (1, 4, 8)
 DTYPES = MappingProxyType({"float32": torch.float32, "bfloat16": torch.bfloat16})
-TILE = 1024
-"""Side of a tile in high-resolution pixels."""
-UNTILED = 2**21
-"""Number of high-resolution pixels up to which an image is processed without tiles."""
 _OVERLAP = 4
 _UNKNOWN = torch.tensor(math.nan)
 
@@ -227,8 +224,8 @@ def expect_rgb_size(rgb: Tensor, values_lr: Tensor, scale: int) -> None:
         )
 
 
-class NetworkUpsampler:
-    """An :class:`~dsr.methods.base.Upsampler` around a trained network.
+class NetworkUpsampler(Method):
+    """A method that is a trained network.
 
     Images of more than ``UNTILED`` pixels are processed in tiles, see :mod:`dsr.methods.tiling`. This bounds the memory
     to about 40 bytes per pixel of the image, and 700 to 1300 bytes per pixel of a window (a tile and the network's
@@ -252,7 +249,7 @@ class NetworkUpsampler:
 
     """
 
-    range_type: RangeType = "disparity"
+    abilities = Abilities(repeats=True, needs="network", cost=Cost(40, photo=40, tile=700))
 
     def __init__(
         self,
@@ -294,6 +291,11 @@ class NetworkUpsampler:
         if any(missing):
             disparity = functional.pad(disparity, (0, missing[0], 0, missing[1]), value=torch.nan)
         return from_range(disparity, sample.camera, "disparity").to(sample.depth_lr.device)
+
+    def upsample_inverse(self, problem: InverseSample, progress: Steps | None = None) -> InverseSurface:
+        """Return what the network makes of inverse depth, which may be its own result."""
+        rgb, inverse = (each.to(self.device)[None] for each in (problem.rgb, problem.inverse))
+        return InverseSurface(self.upsample_disparity(rgb, inverse, progress)[0])
 
     def upsample_disparity(self, rgb: Tensor, disparity_lr: Tensor, progress: Steps | None = None) -> Tensor:
         """Return high-resolution disparity, averaged over the test-time augmentations, (B, 1, H, W).

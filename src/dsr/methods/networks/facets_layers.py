@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 from torch.nn import functional
 
-from dsr.methods.networks.exportable import exporting, pad_to_multiple
+from dsr.methods.exportable import exporting, pad_to_multiple
 
 FULL, HALF = 16, 32
 """Channels of the photo's features at the full and at half the resolution."""

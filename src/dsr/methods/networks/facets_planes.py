@@ -15,7 +15,7 @@ from torch.autograd.function import once_differentiable
 from torch.nn import functional
 
 from dsr.methods.classical.finite_differences import extend_linearly
-from dsr.methods.networks.exportable import exporting
+from dsr.methods.exportable import exporting
 
 NEIGHBOURS = 9
 """Low-resolution pixels whose planes are mixed or averaged: 3 x 3."""

@@ -37,8 +37,9 @@ from torch.nn import functional
 from dsr.degradation.downsampling import Downsampling
 from dsr.degradation.hints import FACTS, KERNELS
 from dsr.methods.classical.finite_differences import repeat_blocks
+from dsr.methods.exportable import every, exporting, median_in_graph, quantiles_in_graph
+from dsr.methods.inpainting import inpaint
 from dsr.methods.networks.base import Answer, DisparityNetwork, expect_rgb_size
-from dsr.methods.networks.exportable import every, exporting, median_in_graph, quantiles_in_graph
 from dsr.methods.networks.facets import Facets
 from dsr.methods.networks.facets_layers import (
     HEAD,
@@ -54,7 +55,6 @@ from dsr.methods.networks.facets_layers import (
 )
 from dsr.methods.networks.facets_planes import NEIGHBOURS, Stencil, average_planes, mix_planes_apart, smooth, stencil
 from dsr.methods.networks.facets_start import start_from_another_factor, start_from_facets
-from dsr.methods.networks.inpainting import inpaint
 from dsr.methods.networks.maps import upsample_bicubic
 from dsr.utils.progress import Steps
 

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from dsr.methods.networks.exportable import exporting
+from dsr.methods.exportable import exporting
 
 
 class ConvLayer(nn.Module):

@@ -18,8 +18,8 @@ import torch
 from torch import Tensor, nn
 
 from dsr.degradation.downsampling import check_scale
+from dsr.methods.inpainting import inpaint
 from dsr.methods.networks.base import GlobalContext, WindowedNetwork
-from dsr.methods.networks.inpainting import inpaint
 from dsr.methods.networks.layers import ConvLayer, Level
 from dsr.methods.networks.maps import compute_min_max, mean3x3, normalise, upsample_bicubic
 from dsr.methods.networks.msg_guidance import VARIANTS, Traits, VariantName, guidance_map, intensity_of

@@ -22,8 +22,8 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from dsr.methods.exportable import pad_to_multiple
 from dsr.methods.networks.base import DisparityNetwork
-from dsr.methods.networks.exportable import pad_to_multiple
 from dsr.methods.networks.facets_unet import FacetsUNet
 from dsr.utils.files import replacing
 

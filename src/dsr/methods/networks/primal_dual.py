@@ -35,7 +35,7 @@ from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 from torch.nn import functional
 
-from dsr.methods.networks.exportable import apply
+from dsr.methods.exportable import apply
 
 Offset = tuple[int, int]
 

@@ -29,8 +29,8 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from dsr.degradation.scales import check_scale
+from dsr.methods.exportable import pad_to_multiple
 from dsr.methods.networks.base import RangeNetwork, expect_rgb_size
-from dsr.methods.networks.exportable import pad_to_multiple
 
 _STRIDE = 32
 """The photo's pixels, along an axis, for each pixel of the encoder's result."""

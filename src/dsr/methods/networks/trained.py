@@ -1,9 +1,8 @@
-"""Methods that run a trained network, from weights of this package or published ones."""
+"""The method that runs a trained network, from weights of this package or published ones."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from importlib import resources
 from pathlib import Path
 from types import MappingProxyType
 
@@ -37,17 +36,8 @@ _DSR_ENSEMBLE = 4
 """Test-time augmentations with weights of this package; published networks are run as published."""
 
 
-def build_trained(
-    weights: Path,
-    scale: int,
-    model: str,
-    variant: VariantName | None = None,
-    precision: Precision = "float32",
-    device: torch.device | str = "cpu",
-    ensemble: int | None = None,
-    networks: Mapping[str, type[DisparityNetwork]] = NETWORKS,
-) -> NetworkUpsampler:
-    """Build a method from a weights file.
+class TrainedNetwork(NetworkUpsampler):
+    """A method from a file of weights.
 
     Args:
         weights: file that ``train.py`` wrote; or, with a ``variant``, one that the authors of MSG-Net published.
@@ -65,20 +55,21 @@ def build_trained(
         ValueError: the file is damaged or of another model, variant or scale, or the ensemble is not supported.
 
     """
-    weights = Path(weights)
-    dsr = variant is None or (weights.is_file() and is_dsr_weights(weights))
-    net = load_network(weights, networks, scale, model) if dsr else load_msg_weights(weights, scale, variant)
-    if ensemble is None:
-        ensemble = _DSR_ENSEMBLE if dsr else 1
-    return NetworkUpsampler(net, precision, device, ensemble)
 
-
-def packaged_weights(name: str) -> Path | None:
-    """Return the path of the packaged weights ``name.safetensors``, or None if there are none."""
-    path = Path(str(resources.files("dsr.methods.weights"))) / f"{name}.safetensors"
-    return path if path.is_file() else None
-
-
-def packaged_names() -> list[str]:
-    """Return the names of the packaged weights."""
-    return sorted(path.stem for path in Path(str(resources.files("dsr.methods.weights"))).glob("*.safetensors"))
+    def __init__(
+        self,
+        weights: Path,
+        scale: int,
+        model: str,
+        variant: VariantName | None = None,
+        precision: Precision = "float32",
+        device: torch.device | str = "cpu",
+        ensemble: int | None = None,
+        networks: Mapping[str, type[DisparityNetwork]] = NETWORKS,
+    ) -> None:
+        weights = Path(weights)
+        dsr = variant is None or (weights.is_file() and is_dsr_weights(weights))
+        net = load_network(weights, networks, scale, model) if dsr else load_msg_weights(weights, scale, variant)
+        if ensemble is None:
+            ensemble = _DSR_ENSEMBLE if dsr else 1
+        super().__init__(net, precision, device, ensemble)

@@ -14,7 +14,7 @@ from torch.nn import functional
 
 from dsr.methods.classical.finite_differences import box_mean, repeat_blocks, upsample_linear_border
 from dsr.methods.classical.photo_guided import estimate_slopes
-from dsr.methods.networks.inpainting import inpaint
+from dsr.methods.inpainting import inpaint
 
 _CHUNK = 4096
 """Low-resolution pixels that are flooded at once."""

@@ -45,7 +45,7 @@ from dsr.methods.classical.eg.patches import (
 )
 from dsr.methods.classical.finite_differences import box_mean, extend_linearly, upsample_linear_border
 from dsr.methods.classical.photo_guided import estimate_slopes
-from dsr.methods.networks.inpainting import inpaint
+from dsr.methods.inpainting import inpaint
 from dsr.utils.progress import Steps
 
 KEPT = 0.2

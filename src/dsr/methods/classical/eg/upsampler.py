@@ -36,17 +36,15 @@ pixels; for a statue before a wall at 512 x 512, 165 maps in total.
 
 from __future__ import annotations
 
-from typing import ClassVar
-
 import torch
 from torch import Tensor
 
-from dsr.geometry.camera import RangeType, from_range
-from dsr.methods.base import Cost, whole_scale
+from dsr.geometry.camera import from_range
+from dsr.methods.base import Abilities, Cost, Method, whole_scale
 from dsr.methods.classical.eg.bilateral import bilateral_filter
 from dsr.methods.classical.eg.edge_map import predict_edge_map
 from dsr.methods.classical.photo_guided import expect_positive
-from dsr.methods.networks.inpainting import inpaint
+from dsr.methods.inpainting import inpaint
 from dsr.sample import DepthSample
 from dsr.utils.progress import Steps, part_of
 
@@ -54,7 +52,7 @@ _BEYOND = 4.0
 """Factor by which a result may be farther than the farthest valid low-resolution pixel, or nearer than the nearest."""
 
 
-class EdgeGuided:
+class EdgeGuided(Method):
     """Edge-guided upsampling of the low-resolution disparity.
 
     Args:
@@ -76,8 +74,7 @@ class EdgeGuided:
 
     """
 
-    range_type: RangeType = "disparity"
-    cost: ClassVar[Cost] = Cost(1500, 12)
+    abilities = Abilities(cost=Cost(1500, 12))
 
     def __init__(
         self,

@@ -35,7 +35,6 @@ from __future__ import annotations
 
 import io
 from pathlib import Path
-from typing import ClassVar
 
 import cv2
 import numpy as np
@@ -43,10 +42,10 @@ import torch
 from torch import Tensor
 
 from dsr.geometry.camera import RangeType
-from dsr.methods.base import Cost, expect_limits, whole_scale
+from dsr.methods.base import Abilities, Cost, Method, expect_limits, whole_scale
 from dsr.methods.classical.finite_differences import upsample_linear_border
 from dsr.methods.classical.srfs.admm import ShadingProblem, ShadingSolver, Weights
-from dsr.methods.networks.inpainting import inpaint
+from dsr.methods.inpainting import inpaint
 from dsr.sample import DepthSample
 from dsr.utils.limits import MOST_FILE, expect_pixels, pixels_beside, read_limited
 from dsr.utils.picture_headers import picture_size
@@ -60,7 +59,7 @@ _WHITE = 127
 """Value of a mask above which a pixel is white."""
 
 
-class ShapeFromShading:
+class ShapeFromShading(Method):
     """Variational super-resolution from shading.
 
     Holes of the input are inpainted. Memory: about 130 float64 maps of the image's size. The low-resolution map is
@@ -87,8 +86,8 @@ class ShapeFromShading:
 
     """
 
+    abilities = Abilities(cost=Cost(1300, 60))
     range_type: RangeType = "orthogonal"
-    cost: ClassVar[Cost] = Cost(1300, 60)
 
     def __init__(
         self,

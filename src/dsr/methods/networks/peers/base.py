@@ -19,12 +19,12 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from dsr.geometry.camera import RANGE_TYPES, RangeType, from_range, to_range
-from dsr.methods.base import Cost, Ratios
+from dsr.methods.base import Abilities, Cost, Method
 from dsr.methods.classical.finite_differences import LUMA
-from dsr.methods.networks.base import DTYPES, TILE, UNTILED, Precision
-from dsr.methods.networks.inpainting import inpaint
+from dsr.methods.inpainting import inpaint
+from dsr.methods.networks.base import DTYPES, Precision
 from dsr.methods.networks.maps import compute_min_max, normalise
-from dsr.methods.tiling import AxisTile, blend_tiles, split_axis
+from dsr.methods.tiling import TILE, UNTILED, AxisTile, blend_tiles, split_axis
 from dsr.sample import DepthSample
 from dsr.utils.progress import Steps
 
@@ -104,8 +104,8 @@ class PeerNetwork(nn.Module, abc.ABC):
         return tensors
 
 
-class PeerUpsampler:
-    """An :class:`~dsr.methods.base.Upsampler` around a published network.
+class PeerUpsampler(Method):
+    """A method that is a published network.
 
     It takes a low-resolution map of any ratio, as the network works at the photo's size. Images of more than
     ``UNTILED`` pixels are processed in tiles where the network's receptive field is limited.
@@ -126,7 +126,7 @@ class PeerUpsampler:
 
     """
 
-    ratios: ClassVar[Ratios] = "any"
+    abilities = Abilities(ratios="any", needs="weights")
 
     def __init__(
         self,
@@ -147,7 +147,7 @@ class PeerUpsampler:
             raise ValueError(
                 f"range: expected measured for weights trained on depth of {low:g} to {high:g} m, got truth"
             )
-        self.range_type: RangeType = range_type if net.depth_range is None else "orthogonal"
+        self.range_type = range_type if net.depth_range is None else "orthogonal"
         self.device = torch.device(device)
         self._uses_truth = value_range == "truth"
         self._dtype = DTYPES[precision]

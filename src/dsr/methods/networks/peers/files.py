@@ -37,22 +37,6 @@ def load_peer(path: Path, network: type[PeerNetwork], scale: float) -> PeerNetwo
     return net
 
 
-def nearest_scale(files: Mapping[str, float], scale: float) -> float:
-    """Return the trained factor whose weights suit a factor: itself, else the smallest whole one above, or the largest.
-
-    Weights for a factor that is not whole were trained on one sensor's maps and suit no others.
-
-    Args:
-        files: the trained factors of files of weights by their names.
-        scale: the upsampling factor.
-
-    """
-    if scale in files.values():
-        return scale
-    whole = [trained for trained in files.values() if float(trained).is_integer()]
-    return min((trained for trained in whole if trained >= scale), default=max(whole))
-
-
 def read_tensors(path: Path) -> dict[str, Tensor]:
     """Read the tensors of an authors' file by name, without the prefix of networks trained on several GPUs.
 

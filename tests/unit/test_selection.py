@@ -9,9 +9,8 @@ import pytest
 import torch
 
 from dsr.geometry.camera import Camera
-from dsr.inference import upsample_depth
-from dsr.inference.adapter import AnyScale, takes_scale
-from dsr.methods.registry import build_method, read_method
+from dsr.inference import Selection, upsample_surface
+from dsr.methods.recipe import Run, read_recipe
 from dsr.sample import DepthSample
 
 CAMERA = Camera(48, 36, 50.0, 50.0, 23.5, 17.5)
@@ -46,8 +45,8 @@ def _sample(width: int, height: int, hole: bool = False) -> DepthSample:
     ],
 )
 def test_methods_take_the_scales_that_they_are_made_for(name: str, scales: tuple[float, ...]) -> None:
-    node = read_method(name, 4)
-    assert tuple(scale for scale in (1, 1.5, 2, 3) if takes_scale(node, scale)) == scales
+    abilities = read_recipe(name).abilities
+    assert tuple(scale for scale in (1, 1.5, 2, 3) if abilities.takes(scale)) == scales
 
 
 SETTINGS: dict[str, Any] = {"tgv": {"iterations": 50}, "anisotropic_diffusion": {"steps": 50}}
@@ -65,11 +64,10 @@ WHOLE_RATIOS = ("tgv", "anisotropic_diffusion")
     ],
 )
 def test_methods_reproduce_a_wall_at_any_ratio_that_they_take(name: str, size: tuple[int, int]) -> None:
-    node = read_method(name, 4, SETTINGS.get(name))
     sample = _sample(*size)
     wall = torch.full_like(sample.depth_lr, 2.0)
     sample = DepthSample("set", "hall", sample.rgb, wall, CAMERA, sample.camera_lr, sample.scale)
-    depth = build_method(node, 4)(sample)
+    depth = read_recipe(name, SETTINGS.get(name)).build(4)(sample)
     assert tuple(depth.shape) == (1, 36, 48)
     torch.testing.assert_close(depth, torch.full_like(depth, 2.0), rtol=0.05, atol=0)
 
@@ -77,7 +75,7 @@ def test_methods_reproduce_a_wall_at_any_ratio_that_they_take(name: str, size: t
 @pytest.mark.parametrize("name", ["tgv", "anisotropic_diffusion"])
 def test_method_that_reproduces_block_means_only_fills_holes_at_a_scale_of_1(name: str) -> None:
     sample = _sample(48, 36, hole=True)
-    depth = build_method(read_method(name, 4, SETTINGS[name]), 4)(sample)
+    depth = read_recipe(name, SETTINGS[name]).build(4)(sample)
     valid = sample.mask_lr
     torch.testing.assert_close(depth[valid], sample.depth_lr[valid], rtol=1e-5, atol=0)
     assert bool(depth.isfinite().all())
@@ -86,16 +84,20 @@ def test_method_that_reproduces_block_means_only_fills_holes_at_a_scale_of_1(nam
 @pytest.mark.parametrize("name", ["tgv", "anisotropic_diffusion", "eg", "srfs"])
 def test_method_of_whole_scales_refuses_another_by_itself(name: str) -> None:
     with pytest.raises(ValueError, match=r"^hall: expected a whole scale for this method, got 1\.5$"):
-        build_method(read_method(name, 4), 4)(_sample(32, 24))
+        read_recipe(name).build(4)(_sample(32, 24))
+
+
+def _resized(name: str, scale: float, settings: dict[str, Any] | None = None) -> Selection:
+    return Selection(read_recipe(name, settings), scale, direct=False)
 
 
 @pytest.mark.parametrize("size", [(48, 36), (32, 24)])
 @pytest.mark.parametrize("name", ["facets_box", "eg"])
-def test_any_scale_gives_what_upsample_gives(name: str, size: tuple[int, int]) -> None:
+def test_method_at_another_scale_gives_what_upsample_gives(name: str, size: tuple[int, int]) -> None:
     sample = _sample(*size, hole=True)
     settings = {"ensemble": 1} if name == "facets_box" else {"radius": 2}
-    depth = AnyScale(read_method(name, sample.scale, settings))(sample)  # type: ignore[arg-type]
-    expected = upsample_depth(
+    depth = _resized(name, sample.scale, settings).build(Run())(sample)
+    expected = upsample_surface(
         sample.rgb,
         sample.depth_lr,
         CAMERA,
@@ -103,14 +105,15 @@ def test_any_scale_gives_what_upsample_gives(name: str, size: tuple[int, int]) -
         settings=settings,
         device="cpu",
         fill="none" if name == "eg" else "all",
-    )
+    ).depth
     assert torch.equal(depth.isnan(), expected.isnan())
     assert torch.equal(depth.nan_to_num(), expected.nan_to_num())
     assert bool(depth.isnan().any()) == (name == "eg")
 
 
-def test_any_scale_describes_how_the_map_is_resized() -> None:
-    adapted = AnyScale(read_method("facets_box", 1))
-    assert adapted.describe(_sample(48, 36)) == "36 x 48 depth averaged over 4 x 4 pixels, to 36 x 48 by facets_box x4"
-    assert adapted.describe(_sample(7, 5)) == "5 x 7 depth to 36 x 48 by facets_box x8"
-    assert [path.stem for path in adapted.weights()] == ["facets_box_x4", "facets_box_x8"]
+def test_method_at_another_scale_describes_how_the_map_is_resized() -> None:
+    selected = _resized("facets_box", 1)
+    method = selected.build(Run())
+    assert method.describe(_sample(48, 36)) == "36 x 48 depth averaged over 4 x 4 pixels, to 36 x 48 by facets_box x4"
+    assert method.describe(_sample(7, 5)) == "5 x 7 depth to 36 x 48 by facets_box x8"
+    assert [path.stem for path in selected.files()] == ["facets_box_x4", "facets_box_x8"]

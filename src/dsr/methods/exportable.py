@@ -22,7 +22,7 @@ def exporting() -> bool:
 
 @torch.jit.script
 def fill_in_graph(values: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
-    """Fill the holes of maps as :func:`dsr.methods.networks.inpainting.inpaint` does, as a loop in the graph.
+    """Fill the holes of maps as :func:`dsr.methods.inpainting.inpaint` does, as a loop in the graph.
 
     Args:
         values: (B, 1, h, w), 0 in holes.
@@ -59,7 +59,7 @@ def neighbours_of(x: Tensor) -> Tensor:
 
 @torch.jit.script
 def fill_by_colour_in_graph(x: Tensor, affinity: Tensor, alike: float) -> Tensor:
-    """Fill the holes of a map as :func:`dsr.methods.networks.inpainting.inpaint` does with a photo.
+    """Fill the holes of a map as :func:`dsr.methods.inpainting.inpaint` does with a photo.
 
     Args:
         x: (1, 1, h, w), NaN in holes.

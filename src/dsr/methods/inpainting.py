@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from dsr.methods.networks.exportable import exporting, fill_by_colour_in_graph, fill_in_graph, neighbours_of
+from dsr.methods.exportable import exporting, fill_by_colour_in_graph, fill_in_graph, neighbours_of
 
 _CONTRAST = 0.02
 """Standard deviation of the difference of the colours of a surface's neighbouring pixels, on the scale of [0, 1]."""

@@ -1,0 +1,78 @@
+"""Choose how an evaluation runs its method: itself, or as ``dsr upsample`` does at scales that it is not made for."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+
+from dsr.inference.any_ratio import AnyRatio
+from dsr.inference.options import Fill
+from dsr.inference.plans import steps_of
+from dsr.methods.base import Method
+from dsr.methods.networks.weight_choice import has_weights
+from dsr.methods.recipe import Recipe, Run
+from dsr.utils.builder import ConfigError
+
+
+@dataclass(frozen=True)
+class Selection:
+    """A method for one scale.
+
+    Args:
+        recipe: the method, with its weights.
+        scale: ratio of the photo's width to the depth map's.
+        direct: whether it takes the scale itself; else photo and result are resized around it.
+
+    """
+
+    recipe: Recipe
+    scale: float
+    direct: bool
+
+    def files(self) -> list[Path]:
+        """Return the files of weights that it may use.
+
+        Raises:
+            ConfigError: one is missing.
+
+        """
+        factors = {self.scale} if self.direct else {step for steps in steps_of(self.recipe).values() for step in steps}
+        return [file for factor in sorted(factors) if (file := self.recipe.weights(factor)) is not None]
+
+    def build(self, run: Run) -> Method:
+        """Build the method.
+
+        Raises:
+            ConfigError: it rejects a setting, or has no weights.
+
+        """
+        if self.direct:
+            return self.recipe.build(self.scale, run)
+        try:
+            fill: Fill = "none" if self.recipe.at().get("fill_holes") is False else "all"
+            method = AnyRatio(self.recipe, torch.device(run.device), fill=fill)
+            method.first()
+        except ConfigError:
+            raise
+        except ValueError as error:
+            raise ConfigError(str(error.__cause__ or error)) from error  # with the key as the run names it
+        return method
+
+
+def select(recipe: Recipe, scale: float, weights: Path | None = None, *, measured: bool = False) -> Selection:
+    """Select how to run a method at a scale.
+
+    Args:
+        recipe: the method.
+        scale: ratio of the photo's width to the depth map's.
+        weights: a file of weights, or a directory with published ones; None for those that the method names.
+        measured: whether the maps are a sensor's own. Of a method without packaged weights for their ratio, those for
+            another one are taken; of a model of downsampling, it is told that it needs weights.
+
+    """
+    node = recipe.at()  # with the scale as the run names it
+    packaged = measured and weights is None and node.get("weights_packaged") is not None
+    direct = recipe.abilities.takes(scale) and not (packaged and not has_weights(node, scale))
+    return Selection(recipe.with_weights(weights), scale, direct)

@@ -1,0 +1,315 @@
+"""A method before the factor is known: list, read and build the methods.
+
+A method is a file of ``conf/method``, in the project's configuration or in a directory of the user's: its ``target`` is
+the class that makes it, its other keys are the arguments. ``eval.py`` composes that file with Hydra; everything else
+reads it with :func:`read_recipe`.
+"""
+
+from __future__ import annotations
+
+import functools
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import torch
+import yaml
+from omegaconf import DictConfig, ListConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from dsr.degradation.downsampling import Downsampling
+from dsr.degradation.scales import SCALES
+from dsr.methods.base import Abilities, Method
+from dsr.methods.networks.base import DisparityNetwork
+from dsr.methods.networks.published import load_msg_weights
+from dsr.methods.networks.trained import NETWORKS
+from dsr.methods.networks.weight_choice import find_weights, has_weights
+from dsr.methods.networks.weight_files import is_dsr_weights, load_network, network_name, read_header
+from dsr.utils.builder import ConfigError, build, load_target
+from dsr.utils.config_files import config_directories, list_choices
+
+_NETWORK = "network"
+"""Key of a method's node: the dotted path of the network's class, for a method whose weights come from a training."""
+_OPEN = (None, "auto")
+"""Values of a method's keys that leave them to what is known of the maps."""
+_ALONE: Mapping[str, Any] = {"scale": 4, "seed": 0}
+"""What a method's file may refer to where there is no run."""
+
+
+class Known(NamedTuple):
+    """What is known of low-resolution maps; None for what is not.
+
+    ``kernel``: of their downsampling; ``edges``: whether the scenes' depth steps are sharp or soft; ``clean``: whether
+    they have no noise.
+    """
+
+    kernel: str | None = None
+    edges: Literal["sharp", "soft"] | None = None
+    clean: bool | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Run:
+    """What a run gives to a method, which gets what the signature of its class names.
+
+    Args:
+        device: where to compute.
+        precision: dtype of the convolutions.
+        seed: of random numbers.
+        downsampling: the assumed model.
+        known: what is known of the maps, for arguments that the method's node leaves open, by null or ``auto``.
+        metrics, workspace, display, about, lpips_trunk: see :class:`~dsr.methods.dip.upsampler.DeepImagePrior`.
+
+    """
+
+    device: torch.device | str = "cpu"
+    precision: str = "float32"
+    seed: int = 0
+    downsampling: Downsampling = field(default_factory=lambda: Downsampling("box"))
+    known: Known = field(default_factory=Known)
+    metrics: Any = None
+    workspace: Path | None = None
+    display: Any = None
+    about: Mapping[str, str] | None = None
+    lpips_trunk: str | Path | None = field(default_factory=lambda: os.environ.get("DSR_LPIPS_TRUNK"))
+
+
+@dataclass(frozen=True, eq=False)
+class Recipe:
+    """A method before the factor is known.
+
+    Args:
+        name: the method's.
+        node: its content, in which ``${scale}`` is not resolved.
+        directories: the user's configuration directories.
+        others: values that the node may refer to, the run's ``scale`` among them.
+        settings: keys that the caller has set.
+
+    """
+
+    name: str
+    node: DictConfig
+    directories: tuple[Path, ...] = ()
+    others: Mapping[str, Any] = field(default_factory=lambda: _ALONE)
+    settings: frozenset[str] = frozenset()
+    _resolved: dict[float | None, dict[str, Any]] = field(default_factory=dict, init=False, repr=False)
+
+    def at(self, factor: float | None = None) -> Mapping[str, Any]:
+        """Return the node for a factor, as plain values; None for the run's scale as it is named.
+
+        Raises:
+            ConfigError: it refers to a value that there is not.
+
+        """
+        if factor not in self._resolved:
+            scale = {} if factor is None else {"scale": factor}
+            try:
+                config = OmegaConf.create({**self.others, **scale})
+                config["method"] = self.node
+                self._resolved[factor] = OmegaConf.to_container(config.method, resolve=True)  # type: ignore[assignment]
+            except OmegaConfBaseException as error:
+                raise ConfigError(f"method={self.name}: {str(error).splitlines()[0]}") from error
+        return self._resolved[factor]
+
+    @functools.cached_property
+    def kind(self) -> type[Method]:
+        """The method's class.
+
+        Raises:
+            ConfigError: the node names none.
+
+        """
+        target = load_target("method", self.at())
+        if not (isinstance(target, type) and issubclass(target, Method)):
+            path = self.at()["target"]
+            raise ConfigError(f"method.target: expected a class that derives from dsr.methods.base.Method, got {path}")
+        return target
+
+    @functools.cached_property
+    def abilities(self) -> Abilities:
+        """What the method can do."""
+        return self.kind.abilities_of(self.at())
+
+    @functools.cached_property
+    def factors(self) -> tuple[int, ...]:
+        """The factors that it is made for.
+
+        Raises:
+            ValueError: it has no weights for any.
+
+        """
+        if self.abilities.needs is None:
+            return SCALES
+        factors = tuple(scale for scale in SCALES if has_weights(self.at(scale), scale))
+        if not factors:
+            find_weights(self.at(4), 4)  # its error says where to get them
+            raise ValueError(
+                f"method={self.name}: expected weights that it names, or that come with dsr; there are none"
+            )
+        return factors
+
+    @property
+    def computed_at(self) -> tuple[float, ...]:
+        """Factors at which a method computes that takes a map of any size, if there are only some."""
+        packaged = self.at().get("weights_packaged")
+        return tuple(packaged.values()) if self.abilities.own_size and isinstance(packaged, Mapping) else ()
+
+    def with_weights(self, path: Path | None) -> Recipe:
+        """Return the method with a file of weights, or a directory with published ones; None for its own."""
+        if path is None or self.abilities.needs is None:
+            return self
+        node = OmegaConf.merge(self.node, {"weights": str(path)})
+        assert isinstance(node, DictConfig)  # noqa: S101 - for the type checker
+        return replace(self, node=node)
+
+    def weights(self, factor: float) -> Path | None:
+        """Return the file of weights for a factor; None for a method that needs none.
+
+        Raises:
+            ConfigError: there is none; it says where to get it.
+
+        """
+        return None if self.abilities.needs is None else find_weights(self.at(factor), factor)
+
+    def build(self, factor: float, run: Run | None = None, **decided: Any) -> Method:
+        """Build the method for a factor.
+
+        Args:
+            factor: the upsampling factor.
+            run: what the run gives; None for what :class:`Run` has.
+            **decided: arguments that the caller decides in place of the method's file, if the class names them.
+
+        Raises:
+            ConfigError: a key is unknown, missing or of another type, the method rejects a value, or there are no
+                weights.
+
+        """
+        run = run or Run()
+        node = {key: value for key, value in self.at(factor).items() if key not in decided or key in self.settings}
+        told = {
+            key: value for key, value in run.known._asdict().items() if value is not None and node.get(key) in _OPEN
+        }
+        given = {key: value for key, value in vars(run).items() if key != "known"}
+        given = {**given, **told, **decided, "scale": factor}
+        if self.abilities.needs is not None:
+            given |= {"weights": self.weights(factor), "networks": self._networks}
+        method: Method = build(
+            "method", {key: value for key, value in node.items() if key not in ("weights", _NETWORK, *told)}, given
+        )
+        return method
+
+    def network(self, factor: int) -> DisparityNetwork:
+        """Load the network of dsr that the method runs, in float32 on the CPU.
+
+        Raises:
+            ConfigError: it has no network of dsr, or there are no weights.
+            FileNotFoundError: the weights share layers with a file that is missing.
+            ValueError: the weights are damaged or of another model or scale.
+
+        """
+        if self.abilities.needs != "network":
+            names = list_methods(self.directories)
+            known = [name for name in names if read_recipe(name, None, self.directories).abilities.needs == "network"]
+            raise ConfigError(f"method: expected one with a network of dsr, {', '.join(known)}; got {self.name!r}")
+        node = self.at(factor)
+        path, variant = find_weights(node, factor), node.get("variant")
+        if variant is not None and not is_dsr_weights(path):
+            return load_msg_weights(path, factor, variant)
+        header = read_header(path)
+        trained, kind = header["arguments"].get("scale"), self._networks.get(header["network"])
+        serves = kind is not None and trained is not None and kind.serves(trained, factor)
+        return load_network(path, self._networks, None if serves else factor, str(node["model"]))
+
+    def targets(self) -> Iterator[str]:
+        """Yield the dotted paths of the method's class and of its network's class."""
+        if "target" in self.at():
+            yield str(self.at()["target"])
+        if (network := self._network_path()) is not None:
+            yield network
+
+    @functools.cached_property
+    def _networks(self) -> dict[str, type[DisparityNetwork]]:
+        """The network classes that weights may name: the package's, and the one that the configuration names."""
+        path = self._network_path()
+        if path is None:
+            return dict(NETWORKS)
+        network = load_target("model", {"target": path})
+        return {**NETWORKS, network_name(network): network}
+
+    def _network_path(self) -> str | None:
+        """Return the dotted path of the class of the network, from the node or from ``conf/model``."""
+        node, places = self.at(), config_directories(self.directories)
+        if node.get(_NETWORK) is not None:
+            return str(node[_NETWORK])
+        model = node.get("model")
+        if model is None or model not in list_choices("model", places):
+            return None
+        target = _read_file("model", str(model), places, ()).get("target")
+        return None if target is None else str(target)
+
+
+def list_methods(directories: Sequence[Path] = ()) -> list[str]:
+    """Return the names of all methods.
+
+    Args:
+        directories: the user's configuration directories.
+
+    """
+    return list_choices("method", config_directories(directories))
+
+
+def read_recipe(name: str, settings: Mapping[str, Any] | None = None, directories: Sequence[Path] = ()) -> Recipe:
+    """Read the file of a method.
+
+    Args:
+        name: the method's name.
+        settings: arguments to change, by name.
+        directories: the user's configuration directories.
+
+    Raises:
+        ConfigError: there is no such method, or its file cannot be read.
+
+    """
+    places = config_directories(directories)
+    names = list_choices("method", places)
+    if name not in names:
+        raise ConfigError(f"method: expected one of {', '.join(names)}, got {name!r}")
+    try:
+        node = OmegaConf.merge(_read_file("method", name, places, ()), dict(settings or {}))
+    except OmegaConfBaseException as error:
+        raise ConfigError(f"method={name}: {str(error).splitlines()[0]}") from error
+    assert isinstance(node, DictConfig)  # noqa: S101 - for the type checker
+    recipe = Recipe(name, node, tuple(directories), settings=frozenset(settings or {}))
+    recipe.at()  # its error says what cannot be resolved
+    return recipe
+
+
+def _read_file(group: str, name: str, places: Sequence[Path], above: tuple[str, ...]) -> DictConfig:
+    """Return the content of a group's file, merged with the files of its ``defaults``."""
+    path = next(
+        (place / group / f"{name}.yaml" for place in places if (place / group / f"{name}.yaml").is_file()), None
+    )
+    if path is None or name in above:
+        wanted = f"a file {name}.yaml that {above[-1]}.yaml begins with" if above else f"a readable file {name}.yaml"
+        raise ConfigError(f"{group}: expected {wanted}")
+    try:
+        own = OmegaConf.load(path)
+    except (OSError, yaml.YAMLError, ValueError, RecursionError) as error:
+        raise ConfigError(f"{path}: expected a readable YAML file, got {type(error).__name__}") from error
+    if not isinstance(own, DictConfig):
+        raise ConfigError(f"{path}: expected keys and values")
+    listed = own.pop("defaults", None)
+    listed = ListConfig([]) if listed is None else listed
+    if not isinstance(listed, ListConfig):
+        raise ConfigError(f"{path}: defaults: expected a list of names, got {listed!r:.60}")
+    defaults = [str(each) for each in listed]
+    parts = [
+        own if each == "_self_" else _read_file(group, each, places, (*above, name))
+        for each in (defaults if "_self_" in defaults else [*defaults, "_self_"])
+    ]
+    merged = OmegaConf.merge(*parts)
+    if not isinstance(merged, DictConfig):
+        raise ConfigError(f"{path}: expected keys and values")
+    return merged
