@@ -6,12 +6,18 @@ import itertools
 from typing import Any
 
 import pytest
+import safetensors.torch
 import torch
+from omegaconf import OmegaConf
+from torch import Tensor
 
 from dsr.geometry.camera import Camera
-from dsr.inference import Selection, upsample_surface
-from dsr.methods.recipe import Run, read_recipe
+from dsr.inference import AnyRatio, Selection, upsample_surface, upsampler
+from dsr.methods.base import Method, Surface
+from dsr.methods.recipe import Recipe, Run, read_recipe
 from dsr.sample import DepthSample
+from dsr.utils.builder import ConfigError
+from dsr.utils.progress import Steps
 
 CAMERA = Camera(48, 36, 50.0, 50.0, 23.5, 17.5)
 
@@ -117,3 +123,40 @@ def test_method_at_another_scale_describes_how_the_map_is_resized() -> None:
     assert method.describe(_sample(48, 36)) == "36 x 48 depth averaged over 4 x 4 pixels, to 36 x 48 by facets_box x4"
     assert method.describe(_sample(7, 5)) == "5 x 7 depth to 36 x 48 by facets_box x8"
     assert [path.stem for path in selected.files()] == ["facets_box_x4", "facets_box_x8"]
+
+
+class Sure(Method):
+    """Repeats pixels, and says that it is off by a tenth of the depth."""
+
+    def __call__(self, sample: DepthSample, progress: Steps | None = None) -> Tensor:
+        return sample.depth_lr.repeat_interleave(4, 1).repeat_interleave(4, 2)
+
+    def surface(self, sample: DepthSample, progress: Steps | None = None) -> Surface:
+        depth = self(sample, progress)
+        return Surface(depth, depth / 10, torch.full_like(depth, 7.0))
+
+
+@pytest.mark.parametrize("size", [(12, 9), (16, 12), (48, 36)])
+def test_method_of_fixed_factors_states_its_own_errors(size: tuple[int, int]) -> None:
+    sample = _sample(*size)
+    recipe = Recipe("sure", OmegaConf.create({"name": "sure", "target": f"{__name__}.Sure"}))
+    surface = AnyRatio(recipe, torch.device("cpu"), scale=4).upsample(sample.rgb, sample.depth_lr, CAMERA)
+    assert surface.depth_error is not None
+    assert surface.angle_error is not None
+    torch.testing.assert_close(surface.depth_error, surface.depth / 10)
+    assert bool((surface.angle_error == 7).all())
+
+
+def test_upsampler_loads_its_weights_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    load, read = safetensors.torch.load, []
+    monkeypatch.setattr(safetensors.torch, "load", lambda data: (read.append(len(data)), load(data))[1])
+    run, sample = upsampler("facets_box", device="cpu"), _sample(12, 9)
+    first, second = (run.upsample(sample.rgb, sample.depth_lr, CAMERA).depth for _ in range(2))
+    assert len(read) == 1
+    assert torch.equal(first, second)
+
+
+def test_class_that_is_no_method_is_refused() -> None:
+    recipe = Recipe("plain", OmegaConf.create({"name": "plain", "target": "dsr.geometry.camera.Camera"}))
+    with pytest.raises(ConfigError, match=r"^method\.target: expected a class that derives from .*Method"):
+        recipe.build(4)

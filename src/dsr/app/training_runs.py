@@ -97,7 +97,7 @@ def studies_of_run(
     chosen = {key.partition(".")[0] for key in given}
     own = {key: run[key] for key in _FROM_RUN if key not in chosen}
     name = run["model"]["name"]
-    method = {"name": name, "label": name, "model": name, **_as_validated(run["model"])}
+    method = {"name": name, "label": name, "model": name, **load_target("model", run["model"]).method}
     network = str(run["model"].get("target"))
     if not network.startswith("dsr."):
         method["network"] = network
@@ -110,13 +110,6 @@ def studies_of_run(
         several = len(data.validation_sets) > 1 and base["output_dir"] is not None
         place = {"output_dir": str(Path(base["output_dir"]) / kind)} if several else {}
         yield {**base, **place, "dataset": {"name": kind, "validation_of": str(folder)}}, SceneSubset(source, names)
-
-
-def _as_validated(model: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the settings of the method that runs a network as validations do: one pass, told what is known of maps."""
-    if load_target("model", model).states_errors:
-        return {"target": "dsr.methods.networks.any_map.TrainedFacets"}
-    return {"target": "dsr.methods.networks.trained.TrainedNetwork", "ensemble": 1}
 
 
 def training_data(settings: TrainConfig, devices: int = 1) -> PatchData:

@@ -1,1 +1,1 @@
-"""Super-resolution methods: one module each, all of them Upsamplers."""
+"""Super-resolution methods, one module each."""

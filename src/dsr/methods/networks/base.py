@@ -8,7 +8,7 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import torch
 from torch import Tensor, nn
@@ -71,6 +71,7 @@ class DisparityNetwork(nn.Module, abc.ABC):
         of_inverse_depth: whether it takes inverse depth in place of disparity, which may have an offset.
         states_errors: whether its answers have expected errors, and it is told what is known of the maps.
         covers: whether the output covers the whole image; some published networks leave out a row and a column.
+        method: target and arguments of the method that runs it as validations do: one pass, told what is known of maps.
 
     """
 
@@ -78,6 +79,9 @@ class DisparityNetwork(nn.Module, abc.ABC):
     covers: bool = True
     of_inverse_depth: bool = False
     states_errors: bool = False
+    method: ClassVar[Mapping[str, Any]] = MappingProxyType(
+        {"target": "dsr.methods.networks.trained.TrainedNetwork", "ensemble": 1}
+    )
 
     @classmethod
     def serves(cls, trained: int, scale: int) -> bool:

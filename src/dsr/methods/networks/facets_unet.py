@@ -28,6 +28,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import torch
@@ -118,6 +119,7 @@ class FacetsUNet(DisparityNetwork):
 
     of_inverse_depth = True
     states_errors = True
+    method = MappingProxyType({"target": "dsr.methods.networks.any_map.TrainedFacets"})
 
     def __init__(self, scale: int = 4, width: int = 96, deep: int = 88, blocks: int = 6, facets: int = 2) -> None:
         super().__init__()
