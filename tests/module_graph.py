@@ -45,25 +45,3 @@ def import_graph():
         name: imports_of(path.read_text(encoding="utf-8"), name, package=path.name == "__init__.py", known=MODULES)
         for name, path in MODULES.items()
     }
-
-
-def closure_of(names, imports=None):
-    """Return the modules, and all that they import, directly or through others."""
-    imports = import_graph() if imports is None else imports
-    found, left = set(), list(names)
-    while left:
-        name = left.pop()
-        if name in imports and name not in found:
-            found.add(name)
-            left += imports[name]
-    return found
-
-
-def modules_in(*packages):
-    """Return the names of the modules in some packages."""
-    return {name for name in MODULES if any(within(name, package) for package in packages)}
-
-
-def path_below_package(name):
-    """Return a module's path below the package, as lists of code name it."""
-    return MODULES[name].relative_to(SOURCE / "dsr").as_posix()

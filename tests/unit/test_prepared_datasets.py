@@ -98,7 +98,7 @@ def test_prepared_scene_is_read_from_the_cache(files, monkeypatch):
     assert first.camera == again.camera
 
 
-def test_other_content_settings_or_code_prepare_anew(files, monkeypatch):
+def test_other_content_settings_or_version_prepare_anew(files, monkeypatch):
     plain = source(files)
     plain.load("a")
     assert plain.fingerprint("a") == source(files).fingerprint("a")
@@ -110,7 +110,7 @@ def test_other_content_settings_or_code_prepare_anew(files, monkeypatch):
     for count, each in enumerate(others, 2):
         each.load("a")
         assert len(kept()) == count
-    monkeypatch.setattr(module, "_rules_hash", lambda: "other code")
+    monkeypatch.setattr(module, "SCENES", 0)
     source(files).load("a")
     assert len(kept()) == 6
     files["a"][0].write_text("7")
@@ -186,11 +186,6 @@ def test_folder_fingerprint_covers_all_files_and_large_ones_by_size_and_time(fil
     path = files["a"][0]
     path.write_text("12345")
     assert module.content_hash(path) == f"a.txt 5 {path.stat().st_mtime_ns}"
-
-
-def test_preparation_code_exists_to_be_hashed():
-    package = Path(module.__file__).parents[2]
-    assert all((package / name).exists() for name in module._READING_CODE)
 
 
 @pytest.mark.parametrize(

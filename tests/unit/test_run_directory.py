@@ -6,26 +6,22 @@ import re
 
 import pytest
 import torch
-from module_graph import SOURCE, closure_of, import_graph, modules_in, path_below_package
 from omegaconf import OmegaConf
 
 import dsr
 from dsr.app import run_directory as rundir
 from dsr.app.composition import compose
 from dsr.app.run_directory import (
-    PREDICTING_CODE,
     claim,
-    code_hash,
     default_directory,
     expect_free,
     folder_of,
     identity_of,
 )
 from dsr.app.schema import plain_config
-from dsr.utils import hashing
 from dsr.utils.builder import ConfigError
 from dsr.utils.config_files import config_directories
-from dsr.utils.hashing import file_hash, hash_of_code
+from dsr.utils.hashing import file_hash
 from dsr.utils.versions import package_versions, versions
 
 CPU = torch.device("cpu")
@@ -148,95 +144,12 @@ def test_settings_without_influence_on_predictions_keep_the_directory(changes):
     assert directory(config(**changes)) == directory(config())
 
 
-def test_other_code_gives_another_directory(monkeypatch):
+@pytest.mark.parametrize("name", ["RESULTS", "SCENES"])
+def test_other_version_gives_another_directory(monkeypatch, name):
     before = directory(config())
     claimed(before, config())
-    monkeypatch.setattr(rundir, "code_hash", lambda: "other")
+    monkeypatch.setattr(rundir, name, 0)
     assert directory(config()) != before
-
-
-PREDICTING_PACKAGES = (
-    "dsr.methods",
-    "dsr.data",
-    "dsr.degradation",
-    "dsr.training.module",
-    "dsr.inference",
-)
-"""Where what makes predictions lies: all that these import determines a prediction, too."""
-NOT_PREDICTING = (
-    "__init__.py",
-    "utils/__init__.py",
-    "utils/files.py",
-    "utils/limits.py",
-    "utils/picture_headers.py",
-    "utils/pool.py",
-    "utils/hashing.py",
-    "utils/checkpoints.py",
-    "utils/console.py",
-    "utils/interruption.py",
-    "utils/progress.py",
-    "utils/runs_table.py",
-    "utils/paths.py",
-    "utils/space.py",
-    "utils/temporary.py",
-    "utils/units.py",
-    "evaluation/__init__.py",
-    "evaluation/store.py",
-    "data/download",
-)
-"""What they import and what does not determine one: files, texts, downloads."""
-
-
-def lacking(modules, code=PREDICTING_CODE):
-    """Return the modules' paths that neither list names."""
-    paths = {path_below_package(name) for name in modules}
-    named = (*code, *NOT_PREDICTING)
-    return sorted(path for path in paths if not any(path == each or path.startswith(f"{each}/") for each in named))
-
-
-def test_prediction_code_lists_every_module_that_determines_a_prediction():
-    assert lacking(closure_of(modules_in(*PREDICTING_PACKAGES))) == []
-
-
-def test_prediction_code_lacking_an_imported_module_is_found():
-    imports = {
-        **import_graph(),
-        "dsr.methods.networks.facets": import_graph()["dsr.methods.networks.facets"] | {"dsr.viz.palette"},
-    }
-    assert lacking(closure_of(["dsr.methods.networks.facets"], imports)) == ["viz/palette.py"]
-    without = [name for name in PREDICTING_CODE if name != "utils/lightning.py"]
-    assert lacking(closure_of(["dsr.methods.dip.upsampler"]), without) == ["utils/lightning.py"]
-
-
-def test_prediction_code_names_only_existing_files():
-    for name in (*PREDICTING_CODE, *NOT_PREDICTING):
-        assert (SOURCE / "dsr" / name).exists(), name
-    with pytest.raises(FileNotFoundError, match=r"nowhere\.py"):
-        hash_of_code(["nowhere.py"])
-
-
-def test_code_hash_follows_the_prediction_code_alone(monkeypatch, tmp_path):
-    names = ("methods/a.py", "data/b.py", "geometry/c.py", "sample.py", "degrade.py", "report/d.py")
-    for name in names:
-        (tmp_path / name).parent.mkdir(exist_ok=True)
-        (tmp_path / name).write_text("x = 1\n")
-    monkeypatch.setattr(hashing, "PACKAGE", tmp_path)
-    monkeypatch.setattr(rundir, "PREDICTING_CODE", ("methods", "data", "geometry", "sample.py", "degrade.py"))
-
-    def fresh():
-        code_hash.cache_clear()
-        return code_hash()
-
-    try:
-        hashes = [fresh()]
-        for name in ("methods/a.py", "data/b.py", "geometry/c.py", "sample.py", "degrade.py"):
-            (tmp_path / name).write_text("x = 2\n")
-            hashes.append(fresh())
-        assert len(set(hashes)) == 6
-        (tmp_path / "report/d.py").write_text("x = 2\n")
-        assert fresh() == hashes[-1]
-    finally:
-        code_hash.cache_clear()
 
 
 def test_file_hash_is_its_sha_256(tmp_path):

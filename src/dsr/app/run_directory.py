@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import hashlib
 import json
 from collections.abc import Iterable, Mapping, Sequence
@@ -16,25 +15,20 @@ from dsr.app.run_names import NOT_IDENTITY, run_name
 from dsr.utils.builder import ConfigError, expand_home
 from dsr.utils.console import shorten
 from dsr.utils.files import write_text
-from dsr.utils.hashing import hash_of_code, hash_outside_code
+from dsr.utils.hashing import hash_outside_code
 from dsr.utils.limits import read_limited
 from dsr.utils.parsing import parse_json
-from dsr.utils.versions import versions
+from dsr.utils.versions import RESULTS, SCENES, versions
 
 _RECORD = "versions.json"
-PREDICTING_CODE = (
-    "sample.py", "degradation", "geometry", "metrics", "synthetic", "methods", "data", "training", "inference",
-    "utils/builder.py", "utils/config_files.py", "utils/devices.py", "utils/divergence.py", "utils/hashing.py",
-    "utils/lightning.py", "utils/parsing.py", "utils/progress.py", "utils/ratios.py", "utils/validation.py",
-    "evaluation/predict.py",
-)  # fmt: skip
-"""Modules and packages that determine a prediction, by their paths below the package."""
 
 
 def identity_of(
     config: Mapping[str, Any], weights_hash: str | None, device: torch.device, targets: Iterable[str] = ()
 ) -> dict[str, Any]:
-    """Return everything that a run's predictions depend on, as plain values: settings, weights, kind of device, code.
+    """Return everything that a run's predictions depend on, as plain values: settings, weights, kind of device.
+
+    The code counts by its numbers in :mod:`dsr.utils.versions`, that of the user's own classes by its hash.
 
     Args:
         config: the run's configuration.
@@ -49,15 +43,16 @@ def identity_of(
         kept["method"] = {key: value for key, value in kept["method"].items() if key != "weights"}
     named = [str(node["target"]) for node in kept.values() if isinstance(node, Mapping) and "target" in node]
     outside = hash_outside_code([*named, *targets])
+    code = {"results_version": RESULTS, "scenes_version": SCENES}
     more = {} if outside is None else {"outside_code": outside}
-    return {**kept, "device": device.type, "weights_sha256": weights_hash, "code": code_hash(), **more}
+    return {**kept, "device": device.type, "weights_sha256": weights_hash, **code, **more}
 
 
 def default_directory(kind: str, config: Mapping[str, Any], identity: Mapping[str, Any]) -> Path:
     """Return outputs/KIND/NAME, with the name of :func:`dsr.app.run_names.run_name`.
 
     The first eight digits of the identity's hash follow where the name does not say everything, or where the directory
-    of that name holds a run of another identity, such as another code's. The same identity gives the same directory.
+    of that name holds a run of another identity. The same identity gives the same directory.
     """
     name, complete = run_name(kind, config, identity)
     plain = Path("outputs") / kind / name
@@ -192,12 +187,6 @@ def claim(
     except OSError as error:
         raise ConfigError(f"output_dir: expected a directory to write to, got {folder} ({error.strerror})") from error
     return different
-
-
-@functools.cache
-def code_hash() -> str:
-    """Return a hash of the code that computes predictions, so that those of older code are not used again."""
-    return hash_of_code(PREDICTING_CODE)[:16]
 
 
 def _changes(before: Mapping[str, Any], now: Mapping[str, Any], prefix: str = "") -> list[str]:

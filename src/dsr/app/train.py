@@ -187,7 +187,7 @@ def _prepare(plain: dict[str, Any], settings: TrainConfig, device: torch.device,
     module = _module(settings, net, data, metrics)
     if last.parent.is_symlink():
         raise ConfigError(f"{last.parent}: expected a directory of the run's own, got a link")
-    tolerated = ("code", "device") if "resume" in given_keys() else ()
+    tolerated = ("results_version", "scenes_version", "device") if "resume" in given_keys() else ()
     resume = last if last.is_file() and not settings.overwrite else None
     return _Prepared(device, data, module, identity, folder, resume, tolerated)
 

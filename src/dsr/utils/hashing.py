@@ -1,4 +1,4 @@
-"""Hashes of files and of the package's own code."""
+"""Hashes of files, and of code outside of the package."""
 
 from __future__ import annotations
 
@@ -8,9 +8,6 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from dsr.utils.limits import opened
-
-PACKAGE = Path(__file__).parents[1]
-"""The folder of the package."""
 
 
 def file_hash(path: Path) -> str:
@@ -22,23 +19,6 @@ def file_hash(path: Path) -> str:
     """
     with opened(path) as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
-
-
-def hash_of_code(names: Iterable[str]) -> str:
-    """Return a hash of the code of modules and packages, given by their paths below the package.
-
-    Raises:
-        FileNotFoundError: a module or package does not exist.
-
-    """
-    digest = hashlib.sha256()
-    for name in names:
-        path = PACKAGE / name
-        if not path.exists():
-            raise FileNotFoundError(f"{path}: no such module or package")
-        for file in [path] if path.is_file() else sorted(path.rglob("*.py")):
-            digest.update(file.relative_to(PACKAGE).as_posix().encode() + b"\0" + file.read_bytes())
-    return digest.hexdigest()
 
 
 def hash_outside_code(targets: Iterable[str]) -> str | None:

@@ -1,7 +1,7 @@
 """Data sets in their original formats, whose scenes are resized and cropped once and kept in the cache.
 
-The name of a cached file contains a hash of the scene's files, the settings, and the code that reads and resizes. So a
-change of any of them prepares the scene again.
+The name of a cached file contains a hash of the scene's files, the settings, and :data:`dsr.utils.versions.SCENES`. So
+a change of any of them prepares the scene again.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ from dsr.data.preparation.inpainting import inpaint_depth
 from dsr.data.preparation.resizing import fit
 from dsr.sample import Scene
 from dsr.synthetic.rendering import Rendering, cache_directory, load_or_render
-from dsr.utils.hashing import file_hash, hash_of_code
+from dsr.utils.hashing import file_hash
 from dsr.utils.progress import SILENT
+from dsr.utils.versions import SCENES
 
 _MIN_SIZE = 32
 _MAX_LISTED = 30
-_READING_CODE = ("geometry/camera.py", "data/preparation", "data/formats")
 _MAX_HASHED = 1 << 28
 """Largest size in bytes of files whose content is hashed."""
 
@@ -255,7 +255,7 @@ class PreparedDataset:
             return True
 
     def _path(self, scene: str) -> Path:
-        key = hashlib.sha256((self.fingerprint(scene) + _rules_hash()).encode()).hexdigest()[:16]
+        key = hashlib.sha256(f"{self.fingerprint(scene)}{SCENES}".encode()).hexdigest()[:16]
         return Path("prepared", self.name, f"{scene.replace('/', '_')}-{key}.npz")
 
 
@@ -277,12 +277,6 @@ def content_hash(path: Path) -> str:
         raise ValueError(f"{path}: expected a file, there is none")
     status = path.stat()
     return _hash_of(path, status.st_size, status.st_mtime_ns)
-
-
-@functools.cache
-def _rules_hash() -> str:
-    """Return a hash of the code that reads and resizes."""
-    return hash_of_code(_READING_CODE)
 
 
 def _rendering(scene: Scene) -> Rendering:
