@@ -29,7 +29,7 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 
-STEPS = ("read_picture", "inputs_with_neighbours", "align", "_upsample", "write_parts")
+STEPS = ("read_picture", "inputs_with_neighbours", "align", "write_parts")
 """Functions that :mod:`dsr.app.upsample.frame` spends a frame's time with; the last one writes the parts."""
 
 
@@ -136,13 +136,14 @@ def profile(folder: Path, source: Path, given: list[str], frames: int) -> None:
     dsr([*command, str(folder / "warm")])
     for name in STEPS:
         setattr(frame, name, timed(name, getattr(frame, name)))
+    frame.AnyRatio.upsample = timed("upsample", frame.AnyRatio.upsample)
     for name, part in PARTS.items():
         if part.write is not None:
             PARTS[name] = part._replace(write=timed(name, part.write))
     started = time.process_time()
     dsr([*command, str(folder / "profile")])
     print(f"{1e3 * (time.process_time() - started) / frames:.0f} ms of a core for a frame, of which")
-    for name in (*STEPS, *PARTS):
+    for name in ("upsample", *STEPS, *PARTS):
         print(f"  {name:24s} {1e3 * spent[name] / frames:7.0f} ms", flush=True)
 
 

@@ -240,7 +240,7 @@ def test_repeated_command_does_nothing_and_new_outputs_need_no_new_depth(pair, t
     assert of(pair, out, *DEPTH_ONLY) == 0
     assert "photo: complete already" in capsys.readouterr().out
     assert times == {name: (out / name).stat().st_mtime_ns for name in files_in(out)}
-    monkeypatch.setattr("dsr.app.upsample.frame.upsample_surface", None)
+    monkeypatch.setattr("dsr.inference.AnyRatio.upsample", None)
     assert of(pair, out, *BICUBIC, "--only", "normals") == 0
     assert (
         files_in(out)
@@ -272,7 +272,7 @@ def test_interrupted_run_resumes(pair, tmp_path, capsys, monkeypatch):
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr("dsr.app.upsample.outputs.write_normals", interrupt)
+        patch.setattr("dsr.io.exports.write_normals", interrupt)
         assert of(pair, out, *BICUBIC, "--only", "depth,normals") == 130
     assert "the same command goes on from there" in capsys.readouterr().err
     assert info(out)["complete"] is False

@@ -51,13 +51,13 @@ def test_settings_are_all_options_that_a_result_depends_on():
     request = UpsampleRequest(
         frames=FrameChoice(folders=(Path("in"),), workers=3),
         reading=Reading(camera=CameraChoice(intrinsics=(1.0, 2.0, 3.0, 4.0)), unit="sunrgbd", hole_value=math.nan),
-        upsampling=Upsampling(settings=(("ensemble", 1),), noise=0.01, device="cuda"),
+        upsampling=Upsampling(settings=(("noise_growth", 1.0),), noise=0.01, device="cuda"),
         results=results(max_error=1.0, overwrite=True),
     )
     settings = settings_of(request)
     assert (settings["depth_unit"], settings["intrinsics"]) == ("sunrgbd", [1.0, 2.0, 3.0, 4.0])
     assert settings["hole_value"] is None  # NaN is a hole anyway
-    assert (settings["set"], settings["max_error"]) == ({"ensemble": 1, "noise": 0.01}, 0.01)
+    assert (settings["set"], settings["max_error"]) == ({"noise_growth": 1.0, "noise": 0.01}, 0.01)
     assert {"workers", "device", "overwrite", "output", "folders"} & set(settings) == set()
 
 

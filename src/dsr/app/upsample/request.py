@@ -76,7 +76,7 @@ class FrameChoice(Options):
 
 @dataclass(frozen=True, kw_only=True)
 class Upsampling(Options):
-    """The method, and how it works; see :func:`dsr.inference.engine.upsample_surface`."""
+    """The method, and how it works; see :func:`dsr.inference.upsampler`."""
 
     method: str = option(
         DEFAULT, "facets (default), for clean and noisy depth; or another: tgv, guided_filter, dip_v, ...", "NAME"
