@@ -23,7 +23,7 @@ from dsr.data.eight_bit import EightBit
 from dsr.data.rgbdd import RGBDD
 from dsr.degradation.downsampling import Downsampling, make_sample
 from dsr.geometry.camera import RangeType
-from dsr.methods.base import Upsampler
+from dsr.methods.base import Method
 from dsr.methods.classical.cubic_convolution import CubicConvolution
 from dsr.methods.networks.peers.build import Peer
 from dsr.metrics.catalogue import catalogue, score_image
@@ -80,7 +80,7 @@ def _source(shared: Path, benchmark: str) -> tuple[SceneSource, RangeType]:
     return EightBit(root, "lu" if benchmark == "Lu" else "middlebury8", IMAGES[benchmark]), "disparity"
 
 
-def _rmse(source: SceneSource, kind: RangeType, method: Upsampler, scale: int) -> Iterator[tuple[str, float]]:
+def _rmse(source: SceneSource, kind: RangeType, method: Method, scale: int) -> Iterator[tuple[str, float]]:
     """Yield the RMSE of each image in the benchmark's unit."""
     for name in source.scenes():
         sample = make_sample(source.load(name), scale, Downsampling("bicubic"), kind)

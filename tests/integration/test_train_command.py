@@ -454,19 +454,6 @@ def test_training_without_a_logger_has_its_table_of_validations(tmp_path, within
     assert (tmp_path / "out" / "validation.csv").is_file()
 
 
-def test_training_of_before_loggers_had_names_goes_on_with_its_own(tmp_path, within, interrupt):
-    interrupt(1)
-    assert within(*SMOKE, "output_dir=out", "logger=csv")[0] == 130
-    path = tmp_path / "out" / "config.yaml"
-    config = yaml.safe_load(path.read_text())
-    path.write_text(yaml.safe_dump({**config, "logger": {"name": "csv", "target": "dsr.training.loggers.csv"}}))
-    interrupt(None)
-    code, output, errors = within("resume=out")
-    assert (code, errors) == (0, [])
-    assert "log    csv\n" in output
-    assert not (tmp_path / "out" / "tensorboard").exists()
-
-
 def test_patch_larger_than_a_scene_is_refused_when_the_scenes_are_there(tmp_path, within):
     code, output, errors = within(*SMOKE, "trainer.patch=128")
     assert code == 2

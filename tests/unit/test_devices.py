@@ -124,12 +124,13 @@ def test_training_step_on_a_gpu_is_that_of_the_cpu(model: str, gpu: torch.device
         objective = SurfaceObjective() if model == "facets" else DepthObjective("lap1", 0.1, shading=0.1)
         module = SuperResolution(net, objective).to(device)
         moved = {key: value.to(device) for key, value in batch.items()}
-        made = module.configure_optimizers()
+        optimizer = module.configure_optimizers()
+        assert isinstance(optimizer, torch.optim.Optimizer)
         loss = module.training_step(moved, 0)
         loss.backward()
         loss = loss.detach()
         norm = nn.utils.clip_grad_norm_(module.net.parameters(), 1.0)
-        made["optimizer"].step()
+        optimizer.step()
         with torch.no_grad():
             module.validation_step({**moved, "unit": asdict(CENTIMETRES)}, 0)
         means = compute_means(module.metrics[0])

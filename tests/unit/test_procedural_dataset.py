@@ -60,11 +60,13 @@ def kill(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[int], None]]:
     monkeypatch.setattr(os, "cpu_count", lambda: 1)
     threads = []
 
+    others = {child.pid for child in multiprocessing.active_children()}
+
     def kill_workers(times: int) -> None:
         killed: set[int | None] = set()
         while len(killed) < times:
             for worker in multiprocessing.active_children():
-                if worker.pid not in killed:
+                if worker.pid not in killed | others:
                     killed.add(worker.pid)
                     worker.kill()
             time.sleep(0.01)

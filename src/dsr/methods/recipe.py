@@ -121,10 +121,11 @@ class Recipe:
             ConfigError: the node names none.
 
         """
-        target = load_target("method", self.at())
+        key, node = "method", self.at()
+        target = load_target(key, node)
         if not (isinstance(target, type) and issubclass(target, Method)):
-            path = self.at()["target"]
-            raise ConfigError(f"method.target: expected a class that derives from dsr.methods.base.Method, got {path}")
+            expected = f"{Method.__module__}.{Method.__name__}"
+            raise ConfigError(f"{key}.target: expected a class that derives from {expected}, got {node['target']}")
         return target
 
     @functools.cached_property
