@@ -124,7 +124,7 @@ def digests(name: str, command: list[str], folder: Path) -> dict[str, str]:
 
 
 def digest(path: Path) -> str | None:
-    """Return the digest of a result; None of what holds times, versions or the code's own hash."""
+    """Return the digest of a result; None of what holds times or versions."""
     content: bytes | None = None
     if path.name in {"scores.csv", "validation.csv"} or path.parent.name == "iterations":
         table = pd.read_csv(path)
