@@ -89,7 +89,7 @@ def png_of_16_megapixels(path: Path) -> None:
 def jpeg(path: Path) -> None:
     """Write the beginning of a JPEG of 65500 x 65500 pixels."""
     frame = struct.pack(">BHHB", 8, 65500, 65500, 1) + b"\1\x11\0"
-    path.write_bytes(b"\xff\xd8\xff\xc2" + struct.pack(">H", 2 + len(frame)) + frame + b"\xff\xda\0\x08\1\1\0\0\x3f\0")
+    path.write_bytes(b"\xff\xd8\xff\xc2" + struct.pack(">H", 2 + len(frame)) + frame + b"\xff\xda")
 
 
 def bmp(path: Path) -> None:

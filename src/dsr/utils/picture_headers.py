@@ -1,27 +1,25 @@
 """Sizes of pictures from their headers, without decoding them: PNG, JPEG, TIFF, BMP, WebP and portable maps.
 
-Pillow's plugins read them where they decode nothing and believe no second entry: its reader of PNG takes what chunks
-claim, that of TIFF the last of two equal tags, and that of WebP makes room for the picture. PNG: ISO/IEC 15948. TIFF:
-revision 6.0 of the specification, and BigTIFF. WebP: RFC 9649.
+PNG: ISO/IEC 15948. JPEG: ITU-T T.81, B.2. TIFF: revision 6.0 of the specification, and BigTIFF. BMP: Microsoft's
+BITMAPINFOHEADER. WebP: RFC 9649. Portable maps: https://netpbm.sourceforge.net/doc/pnm.html.
 """
 
 from __future__ import annotations
 
+import re
 import struct
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 from typing import IO
 
-from PIL import ImageFile
-from PIL.BmpImagePlugin import BmpImageFile
-from PIL.JpegImagePlugin import JpegImageFile
-from PIL.PpmImagePlugin import PpmImageFile
-
+_START_OF_FRAME = {*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC}
+_WITHOUT_LENGTH = {0x01, *range(0xD0, 0xD9)}
 _PNG_CHANNELS = {0: 1, 2: 3, 3: 4, 4: 4, 6: 4}
 _TAGS = {256: "width", 257: "height", 258: "bits", 277: "channels", 322: "tile_width", 323: "tile_height"}
 _TAG_TYPES = {1: "B", 3: "H", 4: "I", 16: "Q"}
-_MOST_TAGS, _MOST_CHUNKS = 4096, 1 << 16
+_MOST_SEGMENTS, _MOST_TAGS, _MOST_CHUNKS = 4096, 4096, 1 << 16
+_LARGEST_PNM_HEADER = 1 << 12
+_PNM = re.compile(rb"P[1-6](?:\s+|#[^\n]*\n)+(\d{1,9})(?:\s+|#[^\n]*\n)+(\d{1,9})\s")
 
 
 @dataclass(frozen=True)
@@ -49,7 +47,7 @@ def picture_size(file: IO[bytes]) -> PictureSize | None:
         if start.startswith(magic):
             try:
                 found = read(file)
-            except (struct.error, SyntaxError, ValueError, IndexError, OverflowError, OSError):
+            except (struct.error, ValueError, IndexError, OverflowError, OSError):
                 return None
             return found if found is not None and min(found.height, found.width) > 0 else None
     return None
@@ -77,11 +75,31 @@ def _chunks_fit(file: IO[bytes]) -> bool:
     return True
 
 
-def _by_pillow(plugin: type[ImageFile.ImageFile], bytes_per_pixel: int, file: IO[bytes]) -> PictureSize:
-    """Return the size that a plugin of Pillow reads."""
-    file.seek(0)
-    picture = plugin(file)
-    return PictureSize(picture.height, picture.width, bytes_per_pixel)
+def _jpeg(file: IO[bytes]) -> PictureSize | None:
+    """Follow the segments to the start of the frame."""
+    file.seek(2)
+    for _ in range(_MOST_SEGMENTS):
+        while (byte := file.read(1)) not in (b"\xff", b""):
+            pass
+        while (byte := file.read(1)) == b"\xff":
+            pass
+        if not byte or byte[0] in (0xD9, 0xDA):
+            return None
+        if byte[0] in _WITHOUT_LENGTH or byte[0] == 0:
+            continue
+        (length,) = struct.unpack(">H", file.read(2))
+        if byte[0] in _START_OF_FRAME:
+            _, height, width, channels = struct.unpack(">BHHB", file.read(6))
+            return PictureSize(height, width, max(3, channels))
+        file.seek(length - 2, 1)
+    return None
+
+
+def _bmp(file: IO[bytes]) -> PictureSize | None:
+    file.seek(14)
+    (length,) = struct.unpack("<I", file.read(4))
+    width, height = struct.unpack("<HH", file.read(4)) if length == 12 else struct.unpack("<ii", file.read(8))
+    return PictureSize(abs(height), abs(width), 4)
 
 
 def _tiff(file: IO[bytes]) -> PictureSize | None:
@@ -128,14 +146,20 @@ def _webp(file: IO[bytes]) -> PictureSize | None:
     return PictureSize(height, width, 4)
 
 
+def _pnm(file: IO[bytes]) -> PictureSize | None:
+    file.seek(0)
+    match = _PNM.match(file.read(_LARGEST_PNM_HEADER))
+    return None if match is None else PictureSize(int(match[2]), int(match[1]), 6)
+
+
 _READERS: dict[bytes, Callable[[IO[bytes]], PictureSize | None]] = {
     b"\x89PNG\r\n\x1a\n": _png,
-    b"\xff\xd8": partial(_by_pillow, JpegImageFile, 4),
-    b"BM": partial(_by_pillow, BmpImageFile, 4),
+    b"\xff\xd8": _jpeg,
+    b"BM": _bmp,
     b"II*\0": _tiff,
     b"MM\0*": _tiff,
     b"II+\0": _tiff,
     b"MM\0+": _tiff,
     b"RIFF": _webp,
-    **dict.fromkeys((b"P1", b"P2", b"P3", b"P4", b"P5", b"P6"), partial(_by_pillow, PpmImageFile, 6)),
+    **dict.fromkeys((b"P1", b"P2", b"P3", b"P4", b"P5", b"P6"), _pnm),
 }
