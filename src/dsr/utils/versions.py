@@ -13,7 +13,7 @@ import dsr
 
 RESULTS = 1
 """Version of what predicts and trains, raised with each change of its results, so that older predictions are not used
-again."""
+again. ``tests/golden/test_results.py`` notices such a change."""
 SCENES = 1
 """Version of what reads and resizes the scenes of data sets, raised likewise; prepared scenes are kept under it."""
 _PACKAGES = (

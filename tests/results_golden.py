@@ -1,0 +1,578 @@
+"""Results of the package's own code, to notice when they change: ``python tests/results_golden.py``.
+
+There is an input for each branch: every method at each kind of ratio, noise, holes and maps of sensors, each way to
+make low-resolution maps, patches to train on, losses, geometry, and scenes that are prepared. Of each map the means and
+standard deviations of 6 x 6 blocks are kept. Whether they are right is for other tests to say; these are the results
+that :data:`dsr.utils.versions.RESULTS` and :data:`~dsr.utils.versions.SCENES` stand for.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+import os
+import sys
+import tempfile
+import warnings
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+from unittest import mock
+
+import cv2
+import numpy as np
+import small_golden
+import torch
+from reference_metrics import Array
+from torch import Tensor
+
+import dsr
+from dsr.data.preparation.inpainting import inpaint_depth
+from dsr.data.preparation.resizing import fit
+from dsr.data.procedural import Procedural
+from dsr.data.simgeo import SimGeo
+from dsr.degradation import holes as of_holes
+from dsr.degradation import noise as of_noise
+from dsr.degradation.downsampling import Downsampling, make_sample
+from dsr.degradation.everything import Everything
+from dsr.degradation.random_holes import HOLES
+from dsr.degradation.random_noise import NOISES
+from dsr.geometry.camera import from_range, to_range
+from dsr.geometry.edges import find_edges
+from dsr.geometry.holes import distance_to_known, wide_holes
+from dsr.geometry.mesh import triangulate
+from dsr.geometry.registration import find_displacement, undo
+from dsr.geometry.resampling import pad_inverse_depth, resize_inverse_depth
+from dsr.geometry.shading import render, render_for_viewing
+from dsr.geometry.surface import depth_to_normals
+from dsr.geometry.warping import warp_depth
+from dsr.inference.any_ratio import upsample_surface
+from dsr.inference.outliers import find_outliers, within_measured
+from dsr.inference.sequences import View, fuse_views
+from dsr.inference.working_size import find_noise, find_sensor
+from dsr.methods.inpainting import inpaint
+from dsr.methods.networks.facets_unet import FacetsUNet
+from dsr.methods.networks.msg_net import MSGNet
+from dsr.methods.networks.weight_choice import packaged_names, packaged_weights
+from dsr.methods.noise import estimate_noise, estimate_sensor_noise
+from dsr.methods.recipe import Known, Run, list_methods, read_recipe
+from dsr.sample import Scene
+from dsr.training.degradation import Degradation, to_tensors
+from dsr.training.module import SuperResolution
+from dsr.training.objective import DepthObjective, Objective, SurfaceObjective, balance_weight
+from dsr.training.patches import Patches
+from dsr.training.settings import PatchSettings
+from dsr.utils import devices
+from dsr.utils.hashing import file_hash
+from dsr.utils.versions import RESULTS, SCENES
+
+FILE = Path(__file__).resolve().parent / "golden" / "results.npz"
+TOLERANCE = 1e-4
+"""Relative: processors round differently."""
+_LOOSE = {"dip": 0.1, "srfs": 0.01, "pdn": 1e-3, "random": 1e-3, "facets": 5e-4}
+"""Tolerances by how names begin, where iterations, levels of a photo or errors' own errors make more of roundings."""
+SIZES = {"1": 64, "1.07": 60, "1.23": 52, "1.4": 46, "2": 32, "2.06": 31, "2.67": 24, "4": 16, "8": 8, "16": 4}
+"""Sizes of the low-resolution map by the ratio of the sizes."""
+_NOISY = ("1.4", "2.67", "8")
+_EVERYWHERE = ("facets", "msg_v", "bicubic", "bilateral", "guided_filter", "tgv")
+_NETWORKS = ("msg", "pdn", "dg", "ddrnet", "sparse_to_dense", "facets_box", "dip", "dip_v", "dip_v_warm", "eg", "srfs")
+"""Methods that are run at all ratios, and at those of networks alone, the last ones because they are slow."""
+_BLOCKS = 6
+Job = Callable[[], Any]
+
+
+def upsampling() -> Iterator[tuple[str, Job]]:
+    """Yield upsampled maps and their expected errors: each method at each ratio, and what the options change."""
+    peers = [name for name in list_methods() if "weights_files" in read_recipe(name).node]
+    for method in (name for name in list_methods() if name not in peers):
+        settings = {"steps": 2} if method.startswith("dip") else {}
+        settings |= {"iterations": 30} if method == "tgv" else {"iterations": 4} if method == "srfs" else {}
+        errors = method in ("facets", "bicubic", "msg_v")
+        some = SIZES if method in _EVERYWHERE else ("2.67", "4") if method in _NETWORKS else ("1.4", "2.67", "8")
+        for ratio in ("2", "4") if method == "msg_v_noisy" else some:
+            yield f"{method} {ratio}", _upsampled(ratio, method, errors=errors, **settings)
+    for method in ("dip", "dip_v", "dip_v_warm"):
+        yield f"one step of {method}", _upsampled("4", method, steps=1)
+    for ratio in ("1", "2", "4", "8"):
+        for method in ("facets", "msg_v", "guided_filter"):
+            yield f"{method} {ratio} scale=4", _upsampled(ratio, method, scale=4)
+    for more in ({"fill": "none"}, {"fill": "all"}, {"max_hole": 8}, {"clean": True}, {"noise": 0.01}, {"smooth": 0},
+                 {"smooth": 2}, {"edges": "soft"}, {"kernel": "bicubic"}, {"max_error": 0.02},
+                 {"noise": 0.01, "noise_growth": 2.0}):  # fmt: skip
+        yield f"facets {more}", _upsampled("4", "facets", **more)
+    for method in ("facets", "msg_v"):
+        yield f"{method} repeated", _repeated(method)
+    for scale in (2, 4, 8, 16):
+        yield f"facets told x{scale}", _told(scale)
+    for size in (1.15, 1.35, 1.5):
+        yield f"nearly own size {size}", _of_size(round(64 / size))
+
+
+def _upsampled(ratio: str, method: str, *, errors: bool = False, **more: Any) -> Job:
+    """Return the upsampling of the map of a ratio."""
+
+    def run() -> Any:
+        found = dsr.upsample_with_errors(_photo(), _given(ratio), _camera(), method=method, device="cpu", **more)
+        return [found.depth, found.depth_error, found.angle_error] if errors else found.depth
+
+    return run
+
+
+def _of_size(size: int) -> Job:
+    """Return the upsampling of a map of some size by a method that averages maps of the photo's size first."""
+    return lambda: dsr.upsample(_photo(), _reduced(size), _camera(), method="guided_filter", device="cpu")
+
+
+def _repeated(method: str) -> Job:
+    """Return the upsampling of a map that was enlarged by repeating pixels."""
+    large = np.kron(_given("4"), np.ones((4, 4), np.float32))
+    return lambda: dsr.upsample(_photo(), large, _camera(), method=method, device="cpu")
+
+
+def _told(scale: int) -> Job:
+    """Return what facets makes of block means that it knows to be some."""
+
+    def run() -> Tensor:
+        method = read_recipe("facets").build(scale, Run(known=Known("box", "sharp", clean=True)))
+        return method(make_sample(_scene(), scale, Downsampling("box"), method.range_type))
+
+    return run
+
+
+def sensors() -> Iterator[tuple[str, Job]]:
+    """Yield what is found in maps of sensors, noise and its extent, the sensor, outliers, and what they lead to."""
+    maps = {f"of {extent} pixels": _waves(extent) for extent in (1, 3, 6, 9, 12, 14, 16, 18, 20, 24)}
+    maps |= {f"and {share:.0%} holes": _waves(8, holes=share) for share in (0.03, 0.06, 0.1)}
+    maps |= {f"of strength {each}": _waves(8, each) for each in (1e-4, 3e-4, 1e-3, 0.01, 0.02)}
+    maps |= {f"{each} of it everywhere": _waves(8, floor=each) for each in (0.1, 0.15, 0.2, 0.25, 0.3, 0.4)}
+    for name, depth in maps.items():
+        yield f"noise {name}", lambda depth=depth: _numbers(find_noise(depth))
+    rgb = torch.from_numpy(cv2.resize(_photo(), (192, 144))).permute(2, 0, 1) / 255
+    camera = dsr.Camera(192, 144, 180.0, 180.0, 95.5, 71.5)
+    large, large_rgb = camera.rescale(384, 288), rgb.repeat_interleave(2, 1).repeat_interleave(2, 2)
+
+    slanted = (0.4 + 0.001 * torch.arange(192) + 0.0007 * torch.arange(144)[:, None]).double().reciprocal()[None]
+
+    def surface(extent: int, step: float | None = None, **more: Any) -> Job:
+        def run() -> list[Tensor]:
+            given = (_waves(extent) if step is None else (slanted / step).round() * step).float()
+            found = upsample_surface(rgb, given, camera, method="facets", device="cpu", **more)
+            return [found.depth, found.depth_error, found.angle_error]  # type: ignore[list-item]
+
+        return run
+
+    yield "working size of a smaller map", lambda: upsample_surface(large_rgb, _waves(12).float(), large).depth
+    for extent in (3, 12, 20):
+        yield f"working size of {extent} pixels", surface(extent)
+    for step in (0.02, 0.001, 0.0005):
+        yield f"rounded to {step} m", surface(1, step)
+    yield "working size 4", surface(3, working_size=4)
+    yield "RealSense D435", surface(12, sensor="RealSense D435")
+    yield "PrimeSense", surface(12, sensor="Kinect v1")
+    for strength in (1e-3, 2e-3, 3e-3, 4e-3, 6e-3):
+        counted = ((348 / (348 / _waves(2, strength)).round()) * 1e4).round() / 1e4  # a Kinect's steps
+        yield f"sensor at {strength}", lambda d=counted: _numbers(getattr(find_sensor(d), "constant", None))
+    speckled = _waves(1).clone()
+    speckled[:, 40:44, 60:64] = 0.2
+    speckled[:, 100:103, 20:24] = 30
+    yield "within what is measured", lambda: within_measured(1.6 * _waves(3).reciprocal(), _waves(3).reciprocal())
+    for name, estimate in (("", estimate_noise), ("a sensor's ", estimate_sensor_noise)):
+        yield f"{name}noise estimated", lambda estimate=estimate: _numbers(estimate(_waves(1)[None].reciprocal()))
+    yield "outliers", lambda: find_outliers(speckled).double()
+    yield "outliers left out", lambda: upsample_surface(rgb, speckled.float(), camera, method="bicubic").depth
+
+
+def samples() -> Iterator[tuple[str, Job]]:
+    """Yield low-resolution maps: of each downsampling model, noise and kind of holes."""
+    scene, box = _scene(), Downsampling("box")
+    for kernel in ("box", "nearest", "bilinear", "bicubic", "gaussian"):
+        for kind in ("disparity", "orthogonal", "perspective"):
+            yield (
+                f"{kernel} of {kind}",
+                lambda kernel=kernel, kind=kind: make_sample(scene, 4, Downsampling(kernel), kind).depth_lr,
+            )
+    large = _large_scene()
+    assert large.depth is not None
+    holey = replace(
+        large, depth=large.depth.masked_fill(torch.rand((1, 192, 192), generator=_seeded(0)) < 0.5, torch.nan)
+    )
+    for kernel in ("box", "bicubic", "gaussian"):
+        yield (
+            f"{kernel} of holes",
+            lambda kernel=kernel: make_sample(holey, 4, Downsampling(kernel), "disparity").depth_lr,
+        )
+    for name in ("GaussianMultiplicative", "TimeOfFlight", "Kinect"):
+        kind = getattr(of_noise, name)
+        noise = kind(0.01) if name == "GaussianMultiplicative" else kind()
+        yield f"noise {name}", lambda noise=noise: make_sample(large, 2, box, "disparity", noise).depth_lr
+    for name, kind in (("blobs", of_holes.Blobs), ("shadows", of_holes.Shadows)):
+        yield f"holes {name}", lambda kind=kind: make_sample(large, 2, box, "disparity", holes=kind()).depth_lr
+
+
+def draws() -> Iterator[tuple[str, Job]]:
+    """Yield random degradations of each kind."""
+    only = Everything(holes={"none": 1}, told=1, relief=1, folds=1, textured=1, photo=1)
+    for kind in NOISES:
+        for scale in (1, 4):
+            yield f"random {kind} x{scale}", _degraded(replace(only, noises={kind: 1}, clear=1), scale)
+    for kind in HOLES:
+        yield f"random holes {kind}", _degraded(Everything(holes={kind: 1}), 2)
+    for seed in range(6):
+        yield f"random {seed}", _degraded(Everything(), 2, seed)
+    for name, share in vars(Everything()).items():
+        if share is not None:
+            values = share.values() if isinstance(share, dict) else [share]
+            yield f"share of {name}", lambda values=values: _numbers(tuple(values))
+    for kind in NOISES:
+        yield f"random {kind}, many", _drawn_often(Everything(noises={kind: 1}, holes={"none": 1}))
+
+
+def _drawn_often(everything: Everything) -> Job:
+    """Return the means of many random maps of a part of the scene, each of which takes other branches."""
+
+    def run() -> Tensor:
+        part = _large_scene().crop(60, 60, 64, 64)
+        maps = [everything(part, 2, _seeded(seed))[0].depth_lr for seed in range(24)]
+        return torch.stack([each.nanmean() for each in maps])
+
+    return run
+
+
+def _degraded(everything: Everything, scale: int, seed: int = 0) -> Job:
+    """Return a randomly degraded map, its photo and the hints."""
+
+    def run() -> list[Tensor]:
+        sample, hints = everything(_large_scene(), scale, torch.Generator().manual_seed(seed))
+        return [sample.depth_lr, sample.rgb, sample.depth, hints.noise, hints.facts.double()]  # type: ignore[list-item]
+
+    return run
+
+
+def training() -> Iterator[tuple[str, Job]]:
+    """Yield training patches, losses and the sizes of their gradients."""
+    settings = PatchSettings(patch=48, batch=2)
+    degradation = Degradation(4, Downsampling("box"))
+    plain = Patches([[_large_scene()]], settings, degradation, count=4)
+    drawn = Patches([[_large_scene()]], settings, degradation, count=4, everything=Everything())
+    keys = ("depth", "disparity_lr", "rgb")
+    for number in range(4):
+        for name, patches in (("patch", plain), ("drawn patch", drawn)):
+            yield f"{name} {number}", lambda p=patches, n=number: [p[n][key] for key in keys]
+    many = Patches([[_large_scene()]], settings, degradation, count=48, everything=Everything(soft=1))
+    yield "many drawn patches", lambda: torch.stack([many[n]["disparity_lr"].nanmean() for n in range(48)])
+    flat = replace(_scene(), depth=torch.full((1, 64, 64), 2.0, dtype=torch.float64))
+    yield "range of a flat map", to_tensors(degradation.sample(flat))["min_max"].flatten
+    yield "weight of the visual loss", lambda: _numbers(balance_weight([plain[0], plain[1]]))
+    for name, objective in (
+        ("lap1", DepthObjective(w=1.0)),
+        ("mse", DepthObjective("mse", shading=1.0)),
+        ("surface", SurfaceObjective()),
+    ):
+        yield f"loss {name}", _loss(objective, drawn if name == "surface" else plain)
+
+
+def _loss(objective: Objective, patches: Patches) -> Job:
+    """Return the terms of a loss and the norm of its gradient, and the network's weights after a step."""
+
+    def run() -> list[Tensor]:
+        torch.manual_seed(0)
+        net = FacetsUNet(4) if isinstance(objective, SurfaceObjective) else MSGNet(4)
+        module = SuperResolution(net, objective)
+        batch = torch.utils.data.default_collate([patches[0], patches[1]])
+        terms = module.loss_terms(batch)
+        terms["loss"].backward()
+        norms = [p.grad.norm() for p in module.net.parameters() if p.grad is not None]
+        return [torch.stack([value.detach() for value in terms.values()]), torch.stack(norms)]
+
+    return run
+
+
+def geometry() -> Iterator[tuple[str, Job]]:
+    """Yield what cameras, surfaces, holes and edges are computed to be."""
+    scene, camera = _scene(), _camera()
+    depth = scene.depth
+    assert depth is not None
+    inverse, rays = depth.reciprocal(), camera.rays()
+    others = {
+        "rescaled": camera.rescale(24, 20), "reduced": camera.reduce(24, 24), "downscaled": camera.downscale(4),
+        "decimated": camera.decimate(4, 2.0), "rotated": camera.rotate90(1), "cropped": camera.crop(3, 5, 30, 40),
+        "of a field of view": dsr.Camera.from_fov(64, 48),
+    }  # fmt: skip
+    for name, each in others.items():
+        yield f"rays {name}", each.rays
+    for kind in ("orthogonal", "perspective", "disparity"):
+        values = to_range(depth, camera, kind)  # type: ignore[arg-type]
+        yield f"range {kind}", lambda values=values: values
+        yield f"from range {kind}", lambda values=values, kind=kind: from_range(1.1 * values, camera, kind)
+    yield "normals", lambda: depth_to_normals(depth, rays)
+    yield "renderings", lambda: render(depth_to_normals(depth, rays)[None])[0]
+    yield "rendering to look at", lambda: render_for_viewing(depth_to_normals(depth, rays)[None])[0]
+    holey = inverse.clone()
+    holey[:, 20:31, 24:43] = torch.nan
+    holey[:, 5, 5:50] = torch.nan
+    known = holey.isfinite()
+    for size in ((24, 24), (43, 50), (90, 80)):
+        yield f"inverse depth resized to {size}", lambda size=size: resize_inverse_depth(inverse, size)
+    yield "padded", lambda: pad_inverse_depth(holey[:, :61, :59], 8)
+    yield "distance to known pixels", lambda: distance_to_known(known)
+    for width in (2.0, 6.0, 15.0):
+        yield f"holes wider than {width}", lambda width=width: wide_holes(known, width).double()
+    yield "inpainted by the network's rule", lambda: inpaint(holey[None].float())[0]
+    yield "inpainted by colour", lambda: inpaint(holey[None].float(), scene.rgb[None].float())[0]
+    moved = torch.eye(4, dtype=torch.float64)
+    moved[0, 3], moved[2, 3] = 0.1, 0.05
+    for name, each in (("", depth), (" stairs", _stairs())):
+        yield f"warped{name}", lambda each=each: warp_depth(each[None], camera, moved[None], camera)[0]
+        mesh = triangulate(each, camera)
+        yield f"triangles{name}", lambda mesh=mesh: _numbers((len(mesh.vertices), len(mesh.faces)))
+    for size in (48, 100):
+        yield f"stairs at {size}", lambda size=size: resize_inverse_depth(_stairs().reciprocal(), (size, size))
+    stairs = _stairs().reciprocal().masked_fill(~known, torch.nan)
+    yield "inpainted stairs", lambda: inpaint(stairs[None].float(), scene.rgb[None].float())[0]
+    noisy = [depth * (1 + 0.002 * torch.randn(depth.shape, generator=_seeded(seed))) for seed in range(3)]
+    pose = moved.numpy().copy()
+
+    def fused() -> list[Tensor]:
+        views = [View(each, camera, np.linalg.matrix_power(pose, number)) for number, each in enumerate(noisy)]
+        found = fuse_views(views[0], views[1:])
+        return [found.depth, found.votes.double()]
+
+    yield "frames that vote", fused
+    large = _large_scene()
+    assert large.depth is not None
+    yield "edges", lambda: _numbers(find_edges(large.depth[0].numpy(), 8).count)
+    for shift, larger in ((5, 1.0), (0, 1.01), (0, 1.03), (3, 1.02)):
+        yield f"displacement {shift}, {larger}", lambda shift=shift, larger=larger: _displaced(large, shift, larger)
+
+
+def _displaced(scene: Scene, shift: int, larger: float) -> list[Tensor]:
+    """Return the displacement that is found of a map that is moved and magnified, and the map without it."""
+    assert scene.depth is not None
+    size = round(192 * larger)
+    depth = torch.nn.functional.interpolate(scene.depth[None], (size, size), mode="nearest-exact")
+    start = (size - 192) // 2
+    moved = depth[..., start : start + 192, start : start + 192].roll((3, shift), (2, 3))
+    depth_lr = torch.nn.functional.avg_pool2d(moved, 2)[0]
+    found = find_displacement(depth_lr, scene.rgb)
+    if found is None:
+        return [_numbers(None)]
+    return [_numbers((found.down, found.right, found.scale)), undo(depth_lr, found)]
+
+
+def scenes() -> Iterator[tuple[str, Job]]:
+    """Yield the name and the function of each prepared scene."""
+    scene = _scene()
+    depth = scene.depth.clone()  # type: ignore[union-attr]
+    depth[:, 20:31, 24:43] = torch.nan
+    holey = replace(scene, depth=depth)
+    for size in (24, 48, 64, 90):
+        yield f"fit {size}", lambda size=size: fit(holey, size).depth
+        yield f"fit {size} rgb", lambda size=size: fit(holey, size).rgb
+    wide = scene.crop(0, 0, 40, 64)
+    yield "fit left", lambda: fit(wide, 32, 0.0).depth
+    yield "fit whole", lambda: fit(wide, 32, None).depth
+    stairs = replace(scene, depth=_stairs().masked_fill(depth.isnan(), torch.nan))
+    for each in (holey, stairs):
+        yield f"inpainted {each is stairs}", lambda each=each: inpaint_depth(each.depth)
+    for size in (48, 80):
+        yield f"stairs at {size}", lambda size=size: fit(stairs, size).depth
+    for source in (SimGeo(size=64), Procedural(count=2, size=64)):
+        for name in source.scenes():
+            yield f"{source.name} {name}", lambda source=source, name=name: source.load(name).depth
+            yield f"{source.name} {name} rgb", lambda source=source, name=name: source.load(name).rgb
+
+
+_FILES = [file for name in packaged_names() if (file := packaged_weights(name)) is not None]
+WEIGHTS = hashlib.sha256("".join(map(file_hash, _FILES)).encode()).hexdigest()[:16]
+VERSIONS = {"RESULTS": RESULTS, "SCENES": SCENES, "WEIGHTS": WEIGHTS}
+GROUPS = {
+    "upsampling": ("RESULTS", upsampling),
+    "sensors": ("RESULTS", sensors),
+    "samples": ("RESULTS", samples),
+    "draws": ("RESULTS", draws),
+    "training": ("RESULTS", training),
+    "geometry": ("RESULTS", geometry),
+    "scenes": ("SCENES", scenes),
+}
+"""Which version each group of results has."""
+
+
+@cache
+def _scene() -> Scene:
+    """Return the small scene of the project, 64 x 64, with a little grain in its photo."""
+    depth, rgb = small_golden.trace()
+    grain = np.random.default_rng(0).normal(0, 6, (64, 64, 1))
+    pixels = torch.from_numpy(np.clip(rgb + grain, 0, 255).astype(np.uint8)).permute(2, 0, 1) / 255
+    return Scene("golden", "small", pixels, _camera(), torch.from_numpy(depth.astype(np.float64))[None])
+
+
+def _photo() -> Array:
+    """Return the photo as bytes, (64, 64, 3)."""
+    return (_scene().rgb * 255).round().byte().permute(1, 2, 0).numpy()
+
+
+def _camera() -> dsr.Camera:
+    return dsr.Camera(small_golden.SIZE, small_golden.SIZE, *small_golden.INTRINSICS)
+
+
+@cache
+def _reduced(size: int) -> Array:
+    """Return means of inverse depth over the pixels of a smaller map, as depth."""
+    edges = np.arange(size + 1) * (64 / size)
+    low, high = edges[:-1, None], edges[1:, None]
+    pixels = np.arange(64)
+    weights = np.clip(np.minimum(high, pixels + 1) - np.maximum(low, pixels), 0, None) / (high - low)
+    depth = _scene().depth
+    assert depth is not None
+    return (1 / (weights @ (1 / depth[0].numpy()) @ weights.T)).astype(np.float32)
+
+
+@cache
+def _given(ratio: str) -> Array:
+    """Return the map of a ratio, with holes, and with noise at some ratios."""
+    size = SIZES[ratio]
+    depth = _reduced(size).copy()
+    random = np.random.default_rng(size)
+    if ratio in _NOISY:
+        depth *= 1 + 0.01 * random.standard_normal(depth.shape).astype(np.float32)
+    if size > 4:
+        depth[size // 2 : size // 2 + max(1, size // 6), size // 4 : size // 4 + max(1, size // 5)] = np.nan
+        depth[random.random(depth.shape) < 0.02] = np.nan
+    return depth
+
+
+def _waves(extent: float, strength: float = 0.004, *, floor: float = 1.0, holes: float = 0.0) -> Tensor:
+    """Return depth of a floor, a wall and a box, (1, 144, 192), with noise that is alike over some pixels.
+
+    Args:
+        extent: these pixels.
+        strength: relative standard deviation of the noise.
+        floor: least part of it, in the left of the map; all in the right.
+        holes: share of the pixels that are missing.
+
+    """
+    v, u = np.mgrid[:144, :192].astype(np.float64)
+    inverse = np.where(v > 96, 0.4 + 0.003 * (v - 96), 0.4 + 0.0003 * u)
+    inverse = np.where((u > 20) & (u < 60) & (v > 24) & (v < 120), 0.9 - 0.0005 * v, inverse)
+    random = np.random.default_rng(0)
+    noise = random.standard_normal(inverse.shape)
+    if extent > 1:
+        noise = cv2.GaussianBlur(noise, (0, 0), extent / 2.355 / math.sqrt(2))
+    noise *= floor + (1 - floor) * u / 192
+    inverse *= 1 + strength * noise / noise.std()
+    inverse[random.random(inverse.shape) < holes] = np.nan
+    return torch.from_numpy(1 / inverse)[None]
+
+
+@cache
+def _large_scene() -> Scene:
+    """Return a scene of 192 x 192 pixels: surfaces with and without depth steps between them, and a photo of them."""
+    v, u = np.mgrid[:192, :192].astype(np.float64)
+    depth = np.where(v > 130, 240 / (v + 1), 240 / 131 + 0.001 * (130 - v))
+    ball = 40**2 - (u - 70) ** 2 - (v - 90) ** 2
+    depth = np.where(ball > 0, 1.3 - 0.005 * np.sqrt(np.maximum(ball, 0)), depth)
+    depth = np.where((u > 120) & (u < 170) & (v > 30) & (v < 150), 0.9 + 0.002 * (u - 120), depth)
+    random = np.random.default_rng(1)
+    colour = 0.3 + 0.4 * np.stack([depth / depth.max(), np.sin(u / 9) / 4 + 0.5, np.cos(v / 13) / 4 + 0.5])
+    rgb = np.clip(colour + random.normal(0, 0.01, colour.shape), 0, 1)
+    camera = dsr.Camera(192, 192, 190.0, 190.0, 95.5, 95.5)
+    return Scene("golden", "large", torch.from_numpy(rgb).float(), camera, torch.from_numpy(depth)[None])
+
+
+def _seeded(seed: int) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+def _stairs() -> Tensor:
+    """Return depth, (1, 64, 64), with steps of 0.3 to 14 % along both axes, between surfaces that slope."""
+    steps = np.cumsum(np.where(np.arange(64) % 4 == 0, np.linspace(0.003, 0.12, 64), 0.001))
+    down = np.cumsum(np.where(np.arange(64) % 8 == 0, np.linspace(0.02, 0.005, 64), 0.0005))
+    return torch.from_numpy(np.exp(0.5 + steps - down[:, None]))[None]
+
+
+def _numbers(values: Any) -> Tensor:
+    """Return one or several numbers, or NaN for none, as a tensor."""
+    values = values if isinstance(values, tuple) else (values,)
+    return torch.tensor([math.nan if each is None else float(each) for each in values], dtype=torch.float64)
+
+
+def compute(jobs: Iterator[tuple[str, Job]]) -> dict[str, Array]:
+    """Return the summary of each result, in float32 also where bfloat16 is faster."""
+    found = {}
+    with mock.patch.object(devices, "_FAST_ON_CPU", ()):
+        for name, job in jobs:
+            parts = job()
+            for number, part in enumerate(parts if isinstance(parts, list) else [parts]):
+                found[f"{name}, {number}" if number else name] = summary(part)
+    return found
+
+
+def summary(values: Tensor | Array) -> Array:
+    """Return the means and standard deviations of the known values of 6 x 6 blocks, and the share of known values.
+
+    Of one row of numbers, these.
+    """
+    found = np.asarray(values.detach() if isinstance(values, Tensor) else values, dtype=np.float64)
+    if found.ndim < 2:
+        return found.astype(np.float32)
+    rows, columns = (np.array_split(np.arange(n), min(n, _BLOCKS)) for n in found.shape[-2:])
+    blocks = [found[..., r[0] : r[-1] + 1, c[0] : c[-1] + 1] for r in rows for c in columns]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # of blocks without a known value
+        parts = [np.array([function(each) for each in blocks]) for function in (np.nanmean, np.nanstd)]
+    return np.concatenate([*parts, [np.isfinite(found).mean()]]).astype(np.float32)
+
+
+def differing(before: dict[str, Array], now: dict[str, Array]) -> list[str]:
+    """Return the names of results that differ, with how much."""
+    lines = [f"{name}: {'new' if name in now else 'missing'}" for name in sorted(before.keys() ^ now.keys())]
+    for name in (name for name in before if name in now):
+        old, new = before[name].astype(np.float64), now[name].astype(np.float64)
+        if old.shape != new.shape or not np.array_equal(np.isnan(old), np.isnan(new)):
+            lines.append(f"{name}: other sizes or holes")
+            continue
+        size = np.abs(old) if len(old) < _BLOCKS**2 else np.maximum(np.abs(old), np.nanmean(np.abs(old)))
+        off = np.nan_to_num(np.abs(new - old) / np.maximum(size, 1e-9))
+        tolerance = next((each for method, each in _LOOSE.items() if name.startswith(method)), TOLERANCE)
+        if off.size and off.max() > tolerance:
+            lines.append(f"{name}: off by {off.max():.1e} at most")
+    return lines
+
+
+def read() -> tuple[dict[str, int | str], dict[str, dict[str, Array]]]:
+    """Return the versions in the file, and the results of each group."""
+    with np.load(FILE) as file:
+        parts = np.split(file["values"], np.cumsum(file["sizes"])[:-1])
+        found: dict[str, dict[str, Array]] = {}
+        for name, part in zip(file["names"].tolist(), parts, strict=True):
+            group, _, rest = name.partition(": ")
+            found.setdefault(group, {})[rest] = part
+        return {name: file[name].item() for name in VERSIONS}, found
+
+
+def write(found: dict[str, dict[str, Array]]) -> None:
+    """Write the results of all groups, with 16 of the 23 bits of each number, which take half the room."""
+    results = {f"{group}: {name}": values for group, now in found.items() for name, values in now.items()}
+    values = np.concatenate(list(results.values())).view(np.uint32)
+    rounded = ((values + 64) & 0xFFFFFF80).view(np.float32)
+    sizes = [len(each) for each in results.values()]
+    np.savez_compressed(FILE, values=rounded, sizes=sizes, names=list(results), **VERSIONS)
+
+
+def main() -> None:
+    """Write the file, unless results change whose version does not."""
+    os.environ["DSR_CACHE"] = tempfile.mkdtemp()
+    torch.set_num_threads(1)
+    now = {group: compute(jobs()) for group, (_, jobs) in GROUPS.items()}
+    versions, before = read() if FILE.is_file() else ({}, {})
+    for group, (version, _) in GROUPS.items():
+        lines = [line for line in differing(before.get(group, {}), now[group]) if not line.endswith(": new")]
+        if lines and all(versions[each] == VERSIONS[each] for each in (version, "WEIGHTS")):
+            sys.exit("\n".join([*lines, f"{version} in dsr/utils/versions.py: expected above {VERSIONS[version]}"]))
+    write(now)
+
+
+if __name__ == "__main__":
+    main()
