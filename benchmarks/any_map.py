@@ -36,7 +36,7 @@ from dsr.degradation.downsampling import Downsampling, Kernel, Measured, make_sa
 from dsr.degradation.noise import GaussianMultiplicative, Kinect, TimeOfFlight
 from dsr.geometry.camera import Camera, RangeType
 from dsr.geometry.surface import angle_between, depth_to_normals
-from dsr.methods.networks.any_map import AnyMap, Edges, TrainedFacets
+from dsr.methods.networks.any_map import AnyMap, Edges
 from dsr.methods.networks.weight_files import read_header
 from dsr.metrics.catalogue import PROTOCOLS, score_image
 from dsr.metrics.metric import WORST
@@ -66,7 +66,7 @@ class Runner:
     @functools.cache
     def _method(weights: Path, device: str, kernel: Any = None, edges: Edges = "auto", clean: bool = False) -> AnyMap:
         """Return the method that is told these facts."""
-        return TrainedFacets(weights, edges=edges, kernel=kernel, clean=clean, device=device)
+        return AnyMap(weights, edges=edges, kernel=kernel, clean=clean, device=device)
 
 
 def scores(depth: torch.Tensor, sample: DepthSample, metrics: Any = PAPER) -> dict[str, float]:

@@ -14,7 +14,7 @@ from torch.nn import functional
 
 from dsr.degradation.hints import FACTS
 from dsr.geometry.camera import Camera
-from dsr.methods.networks.any_map import CAUTION, AnyMap, TrainedFacets
+from dsr.methods.networks.any_map import CAUTION, AnyMap
 from dsr.methods.networks.base import Answer
 from dsr.methods.networks.facets_unet import FacetsUNet
 from dsr.methods.networks.weight_files import files_of_weights, save_network
@@ -159,7 +159,7 @@ def test_what_lies_behind_infinity_is_a_hole() -> None:
 
 def test_method_is_built_from_a_file_and_values_are_checked(tmp_path: Path) -> None:
     save_network(tmp_path / "weights", FacetsUNet(4, 8, 8), "facets")
-    depth = TrainedFacets(tmp_path / "weights")(_sample((12, 18), 8 / 3))
+    depth = AnyMap(tmp_path / "weights")(_sample((12, 18), 8 / 3))
     assert depth.shape == (1, 32, 48)
     for settings, message in (
         ({"smooth": 3}, "smooth: expected a number from 0 to 2, got 3"),
@@ -168,7 +168,7 @@ def test_method_is_built_from_a_file_and_values_are_checked(tmp_path: Path) -> N
         ({"edges": "round"}, "edges: expected one of auto, sharp, soft, got round"),
     ):
         with pytest.raises(ValueError, match=message):
-            TrainedFacets(tmp_path / "weights", **settings)  # type: ignore[arg-type]
+            AnyMap(tmp_path / "weights", **settings)  # type: ignore[arg-type]
 
 
 def test_clean_box_means_have_weights_of_their_own(tmp_path: Path) -> None:
@@ -183,7 +183,7 @@ def test_clean_box_means_have_weights_of_their_own(tmp_path: Path) -> None:
     told: dict[str, Any] = {"kernel": "box", "edges": "sharp", "clean": True}
 
     def used(**settings: Any) -> str:
-        found = TrainedFacets(files["facets_x2"], **settings)._net.state_dict()
+        found = AnyMap(files["facets_x2"], **settings)._net.state_dict()
         return next(
             name for name, net in nets.items() if torch.equal(net.state_dict()["photo.weight"], found["photo.weight"])
         )
@@ -201,7 +201,7 @@ def test_clean_box_means_have_weights_of_their_own(tmp_path: Path) -> None:
     assert files_of_weights(files["facets_x2"]) == list(files.values())
     files["facets_x2_clean"].unlink()
     with pytest.raises(FileNotFoundError, match=r"expected facets_x2_clean\.safetensors beside it, for clean maps"):
-        TrainedFacets(files["facets_x2"], **told)
+        AnyMap(files["facets_x2"], **told)
 
 
 def test_dubious_pixels_may_be_left_as_holes() -> None:

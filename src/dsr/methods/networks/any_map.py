@@ -42,8 +42,11 @@ _ROUNDED = 16
 class AnyMap(Method):
     """A method for maps of any ratio, kernel and noise.
 
+    Of maps that are told to be box means without noise, with sharp depth steps, the result is computed with the weights
+    for them, if the file of weights names one with such weights.
+
     Args:
-        net: the network; it is used as it is.
+        weights: file that ``train.py model=facets`` wrote, or a network, which is used as it is.
         noise: standard deviation of the map's depth in metres, at 1 m if it grows; None if it is not known.
         noise_growth: the noise grows with this power of the distance: 0 where it is the same everywhere, 2 for stereo.
         smooth: 0 takes the map for free of noise, 2 its noise for twice as large as estimated; 1 is neutral.
@@ -53,9 +56,13 @@ class AnyMap(Method):
         clean: whether the map is known to have no noise, unless ``noise`` or ``smooth`` say otherwise.
         max_error: share of the depth; pixels that are expected to be further off are left as holes; None for no limit.
         device: device of the computations.
+        model: name of the model that the file must contain.
+        precision: dtype of the convolutions, for a file.
+        networks: network classes by their names in weights files.
 
     Raises:
-        ValueError: a value is out of range.
+        FileNotFoundError: there is no such file.
+        ValueError: the file is damaged or of another model, or a value is out of range.
 
     """
 
@@ -65,7 +72,7 @@ class AnyMap(Method):
 
     def __init__(
         self,
-        net: FacetsUNet,
+        weights: Path | FacetsUNet,
         noise: float | None = None,
         smooth: float = 1.0,
         edges: Edges = "auto",
@@ -74,8 +81,12 @@ class AnyMap(Method):
         max_error: float | None = None,
         device: torch.device | str = "cpu",
         noise_growth: float = 0.0,
+        model: str = "facets",
+        precision: Precision = "float32",
+        networks: Mapping[str, type[DisparityNetwork]] = NETWORKS,
     ) -> None:
-        if noise is None and clean and smooth == 1:
+        cleanly = noise is None and clean and smooth == 1
+        if cleanly:
             noise = 0.0
         if edges not in get_args(Edges):
             raise ValueError(f"edges: expected one of {', '.join(get_args(Edges))}, got {edges}")
@@ -89,8 +100,11 @@ class AnyMap(Method):
             raise ValueError(f"noise_growth: expected noise with it, got {noise_growth} and no noise")
         if max_error is not None and not max_error > 0:
             raise ValueError(f"max_error: expected a positive share of the depth, got {max_error}")
+        if isinstance(weights, str | Path):
+            for_clean = cleanly and (kernel, edges) == ("box", "sharp")
+            weights = _load(Path(weights), model, precision, networks, clean=for_clean)
         self._max_error = max_error
-        self._net = net.to(device, memory_format=torch.channels_last)  # type: ignore[call-overload]  # torch's stubs
+        self._net = weights.to(device, memory_format=torch.channels_last)  # type: ignore[call-overload]  # torch's stubs
         self._device, self._smooth = torch.device(device), smooth
         self._noise = None if noise is None else (noise, noise_growth)
         self._facts = encode_facts(kernel, None if edges == "auto" else edges == "soft")[None]
@@ -154,51 +168,18 @@ class AnyMap(Method):
         return self._net.answer(rgb, inverse, None if noise is None else noise.float(), facts, progress)
 
 
-class TrainedFacets(AnyMap):
-    """The method from a file that ``train.py model=facets`` wrote.
-
-    Of maps that are told to be box means without noise, with sharp depth steps, the result is computed with the weights
-    for them, if the file names one with such weights.
-
-    Args:
-        weights: the file.
-        model: name of the model that it must contain.
-        noise, smooth, edges, kernel, clean, max_error, device, noise_growth: see :class:`AnyMap`.
-        precision: dtype of the convolutions.
-        networks: network classes by their names in weights files.
-
-    Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: the file is damaged or of another model, or a value is out of range.
-
-    """
-
-    def __init__(
-        self,
-        weights: Path,
-        model: str = "facets",
-        noise: float | None = None,
-        smooth: float = 1.0,
-        edges: Edges = "auto",
-        kernel: Kernel | None = None,
-        clean: bool = False,
-        max_error: float | None = None,
-        precision: Precision = "float32",
-        device: torch.device | str = "cpu",
-        noise_growth: float = 0.0,
-        networks: Mapping[str, type[DisparityNetwork]] = NETWORKS,
-    ) -> None:
-        weights = Path(weights)
-        if kernel == "box" and edges == "sharp" and clean and noise is None and smooth == 1:
-            weights = clean_weights(weights) or weights
-        net = load_network(weights, networks, None, model)
-        if not isinstance(net, FacetsUNet):
-            raise ValueError(
-                f"{weights}: expected weights of {FacetsUNet.__name__}, got those of {type(net).__name__}, which "
-                "method=facets_box takes"
-            )
-        net = net.eval().requires_grad_(False).to(DTYPES[precision])
-        super().__init__(net, noise, smooth, edges, kernel, clean, max_error, device, noise_growth)
+def _load(
+    path: Path, model: str, precision: Precision, networks: Mapping[str, type[DisparityNetwork]], *, clean: bool
+) -> FacetsUNet:
+    """Return the network of a file, or of the one for clean maps of box means that the file names."""
+    path = (clean and clean_weights(path)) or path
+    net = load_network(path, networks, None, model)
+    if not isinstance(net, FacetsUNet):
+        raise ValueError(
+            f"{path}: expected weights of {FacetsUNet.__name__}, got those of {type(net).__name__}, which "
+            "method=facets_box takes"
+        )
+    return net.eval().requires_grad_(False).to(DTYPES[precision])
 
 
 def _half(progress: Steps | None, before: int) -> Steps | None:
