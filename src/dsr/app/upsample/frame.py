@@ -26,7 +26,7 @@ from dsr.app.upsample.reporting import Messages
 from dsr.app.upsample.request import UpsampleRequest, Upsampling, files_of, inputs_with_neighbours, settings_of
 from dsr.app.upsample.sequence import FrameSequence
 from dsr.degradation.sensors import Identified
-from dsr.inference import AnyRatio, Plan, enlarged_by, find_sensor, upsampler
+from dsr.inference import AnyRatio, Plan, enlarged_by, find_sensor
 from dsr.io.encoding import Assumption
 from dsr.io.inputs import Picture, read_picture
 from dsr.io.pairs import Pair
@@ -62,7 +62,7 @@ class FrameWork:
         request, sequence = self._request, self._sequence
         how, wanted = request.upsampling, request.results
         depends_on = inputs_with_neighbours(request, pair, sequence.neighbours(pair))
-        job = _Job(request, pair, target, settings_of(request), depends_on, read_previous_run(target))
+        job = _Job(request, pair, target, self._settings, depends_on, read_previous_run(target))
         job.expect_agreement()
         if job.is_done():
             reporter.say(f"{pair.name}: complete already, in {target}")
@@ -100,17 +100,12 @@ class FrameWork:
     @functools.cached_property
     def _upsampler(self) -> AnyRatio:
         """The method, whose weights are loaded once."""
-        how = self._request.upsampling
-        return upsampler(
-            how.method,
-            how.scale,
-            settings=how.arguments,
-            directories=how.directories,
-            device=how.device,
-            fill=how.fill,
-            max_hole=how.max_hole,
-            working_size=how.working_size,
-        )
+        return self._request.upsampling.upsampler()
+
+    @functools.cached_property
+    def _settings(self) -> dict[str, Any]:
+        """The settings that all results depend on; to find them, files of the configuration are read."""
+        return settings_of(self._request)
 
     def _upsample(self, picture: Picture, sensor: Identified | None, progress: Progress) -> Surface:
         """Compute the high-resolution depth with its expected errors, on the CPU."""

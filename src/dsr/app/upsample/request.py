@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -16,6 +16,7 @@ from dsr.utils.hashing import file_hash, hash_outside_code
 from dsr.utils.options import OptionError, Options, Rule, group, option, positive, recorded
 
 if TYPE_CHECKING:
+    from dsr.inference import AnyRatio
     from dsr.io.frames import Record, Source
     from dsr.io.pairs import Pair
 
@@ -164,18 +165,29 @@ class Upsampling(Options):
             except ValueError as error:
                 raise ValueError(f"--{error}") from error
 
-    def _check_method(self) -> None:
-        """Check that the method accepts its arguments."""
+    def upsampler(self) -> AnyRatio:
+        """Return the method, which loads its weights once.
+
+        Raises:
+            ValueError: there is no such device.
+
+        """
         from dsr.inference import upsampler  # noqa: PLC0415 - other values are refused without torch
 
-        run = upsampler(
+        return upsampler(
             self.method,
             self.scale,
             settings=self.arguments,
             directories=self.directories,
-            device="cpu",
+            device=self.device,
+            fill=self.fill,
+            max_hole=self.max_hole,
             working_size=self.working_size,
         )
+
+    def _check_method(self) -> None:
+        """Check that the method accepts its arguments."""
+        run = replace(self, device="cpu").upsampler()
         try:
             run.check_working_size()
         except ValueError as error:
