@@ -8,17 +8,28 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from dsr.utils.limits import opened
+from dsr.utils.progress import Task
+
+_CHUNK = 1 << 20
 
 
-def file_hash(path: Path) -> str:
-    """Return the SHA-256 of a file.
+def file_hash(path: Path, progress: Task = lambda *_: None) -> str:
+    """Return the SHA-256 of a file, 64 hexadecimal digits.
+
+    Args:
+        path: the file.
+        progress: is called with the bytes read and their total.
 
     Raises:
         OSError: it cannot be read.
 
     """
+    digest, total = hashlib.sha256(), path.stat().st_size
     with opened(path) as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
+        while chunk := file.read(_CHUNK):
+            digest.update(chunk)
+            progress(file.tell(), total)
+    return digest.hexdigest()
 
 
 def hash_outside_code(targets: Iterable[str]) -> str | None:

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import contextlib
 import errno
-import hashlib
 import json
 import os
 import re
@@ -34,6 +33,7 @@ from urllib3.exceptions import HTTPError
 from dsr.data.download.collection import Collection, Item
 from dsr.utils.console import one_line
 from dsr.utils.files import write_text
+from dsr.utils.hashing import file_hash
 from dsr.utils.limits import opened, read_limited
 from dsr.utils.parsing import parse_json
 from dsr.utils.paths import leads_outside, natural_key
@@ -275,7 +275,7 @@ class _Job:
     def _digest(self, item: Item, path: Path, source: str) -> str:
         """Return a file's checksum, which must be the recorded one if there is one."""
         entry = None if self.accept_changed else self.checksums.get(item.path)
-        expected, digest = item.sha256 or (entry and entry.sha256), _sha256_of(path)
+        expected, digest = item.sha256 or (entry and entry.sha256), file_hash(path)
         if expected not in (None, digest):
             raise ValueError(
                 f"{source}: expected sha256 {expected} as recorded in {self.checksums.path}, got {digest}; "
@@ -567,7 +567,7 @@ def _difference(
     try:
         _expect_kind(path, path.suffix, str(path))
         with progress.task(name, unit="bytes") as moved:
-            digest = _sha256_of(path, moved)
+            digest = file_hash(path, moved)
     except (ValueError, OSError) as error:
         return str(error)
     if expected not in (None, digest):
@@ -575,16 +575,6 @@ def _difference(
     if entry is None:
         new[name] = Entry(digest, path.stat().st_size)
     return None
-
-
-def _sha256_of(path: Path, moved: Task = lambda *_: None) -> str:
-    """Return the SHA-256 of a file, 64 hexadecimal digits."""
-    digest, total = hashlib.sha256(), path.stat().st_size
-    with opened(path) as file:
-        while chunk := file.read(1 << 20):
-            digest.update(chunk)
-            moved(file.tell(), total)
-    return digest.hexdigest()
 
 
 def _is_page(beginning: bytes) -> bool:
