@@ -142,15 +142,7 @@ def run_command(
 def _job(
     command: Callable[[DictConfig], Any], argv: list[str], failed: list[str], begun: list[bool]
 ) -> Callable[[DictConfig], JobResult]:
-    """Return the function that Hydra calls for each job, perhaps in a process of a launcher.
-
-    Args:
-        command: see :func:`run_command`.
-        argv: those of the process, from which Lightning starts the processes of further devices.
-        failed: where problems of jobs in this process are added.
-        begun: where each job that begins in this process is added.
-
-    """
+    """Return the function that Hydra calls for each job, perhaps in a process of a launcher."""
     pid = os.getpid()
 
     def job(config: DictConfig) -> JobResult:

@@ -119,15 +119,7 @@ class _Prepared:
 
 
 def _prepare(plain: dict[str, Any], node: Any, source: SceneSource | None, *, here: bool = True) -> _Prepared:
-    """Check and build all that an evaluation needs, and write nothing.
-
-    Args:
-        plain: the configuration.
-        node: its method's, in which ``${scale}`` is not resolved.
-        source: the data set; None for the one that the configuration describes.
-        here: whether this process has the device that will compute.
-
-    """
+    """Check and build all that an evaluation needs, and write nothing."""
     settings = EvalConfig.of(plain)
     device = pick_device(settings.device) if here else torch.device("cpu")
     source = source or _source(settings)
@@ -241,12 +233,7 @@ def _run(prepared: _Prepared) -> pd.DataFrame:
 
 
 def _workers(settings: EvalConfig, device: torch.device, scenes: int, *, alone: bool) -> Workers:
-    """Return the worker processes that the configuration describes; ``alone`` for one scene at a time.
-
-    Raises:
-        ConfigError: this device or system has no use for several.
-
-    """
+    """Return the worker processes that the configuration describes; ``alone`` for one scene at a time."""
     count, threads = (None if value == "auto" else int(value) for value in (settings.workers, settings.threads))
     forks = device.type == "cpu" and can_fork()
     if count is not None and count > 1 and not forks:
@@ -301,12 +288,7 @@ def _weights(settings: EvalConfig, recipe: Recipe) -> Path | None:
 
 
 def _hash_weights(files: list[Path]) -> str | None:
-    """Return the SHA-256 of a file of weights, or of those of several and of those that they need; None without any.
-
-    Raises:
-        ConfigError: one is missing or damaged.
-
-    """
+    """Return the SHA-256 of a file of weights, or of those of several and of those that they need; None without any."""
     try:
         hashes = [_hash(each, each.stat()) for file in files for each in files_of_weights(file)]
     except (ValueError, OSError) as error:

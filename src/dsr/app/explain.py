@@ -129,16 +129,7 @@ def _explain_key(key: str, name: str, arguments: Sequence[str], directories: Seq
 
 
 def _meant(key: str, value: str, name: str, config: DictConfig, directories: Sequence[Path]) -> list[str]:
-    """Return the arguments that may be meant by one with an unknown key, as that key is elsewhere; none if it is not.
-
-    Args:
-        key: the unknown key.
-        value: what it was to be set to.
-        name: the configuration's name.
-        config: the configuration, in which it may have another place.
-        directories: directories of configuration files.
-
-    """
+    """Return the arguments that may be meant by one with an unknown key, which is known elsewhere; perhaps none."""
     other = _OTHERS[name]
     pair = {"model": "method", "method": "model"}.get(key)
     if pair in config:

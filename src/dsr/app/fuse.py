@@ -58,12 +58,7 @@ def fuse(request: FuseRequest, console: Console) -> list[str]:
 
 
 def _load(folder: Path, max_error: float) -> PosedMap:
-    """Return a result.
-
-    Raises:
-        ValueError: it is not complete, has no pose, or a file of it is missing or damaged.
-
-    """
+    """Return a result."""
     path = folder / INFO
     info = read_info(path)
     if info.get("pose") is None:

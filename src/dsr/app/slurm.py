@@ -267,12 +267,7 @@ def _stop(handles: Sequence[Any], cluster: str) -> None:
 
 
 class _Waiting:
-    """Asks Slurm what its jobs do, seldom, as it serves many; ``sacct``, which submitit asks, is not on every cluster.
-
-    Args:
-        cluster: Slurm or local.
-
-    """
+    """Asks Slurm what its jobs do, seldom; ``sacct``, which submitit asks, is not on every cluster."""
 
     def __init__(self, cluster: str) -> None:
         self._cluster = cluster
@@ -324,14 +319,7 @@ def _slurm_states(names: Sequence[str]) -> dict[str, tuple[str, str]]:
 
 
 def _result(job: Job, handle: Any, state: str | None) -> JobReturn | None:
-    """Return the result of a job; None if it has none yet.
-
-    Args:
-        job: the job.
-        handle: submitit's.
-        state: the scheduler's word for what has become of it, if it has ended.
-
-    """
+    """Return the result of a job; None if it has none yet."""
     if handle.paths.result_pickle.exists():
         try:
             result: JobReturn = handle.result()

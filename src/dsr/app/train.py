@@ -140,13 +140,7 @@ def _steps_left(prepared: _Prepared, settings: TrainConfig) -> int:
 
 
 def _read(config: DictConfig, *, here: bool = True) -> tuple[dict[str, Any], TrainConfig, torch.device]:
-    """Return the configuration, perhaps of the run to resume, its checked settings and the device to train on.
-
-    Args:
-        config: composed.
-        here: whether this process has the device.
-
-    """
+    """Return the configuration, perhaps of the run to resume, its checked settings and the device to train on."""
     plain = _resumed(plain_config(config))
     settings = TrainConfig.of(plain)
     device = pick_device(settings.device) if here else torch.device("cpu")

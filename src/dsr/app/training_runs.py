@@ -45,12 +45,7 @@ def read_config(folder: Path, trust: Any = None) -> dict[str, Any]:
 
 
 def _check_types(file: Path, config: Mapping[Any, Any]) -> None:
-    """Check that the values of a run's configuration have the types of the schema, as the command line checks its own.
-
-    Raises:
-        ConfigError: one has not, or one that an evaluation needs is missing.
-
-    """
+    """Check that the values of a run's configuration have the types of the schema."""
     kinds = get_type_hints(TrainConfig)
     try:
         for key in (*_FROM_RUN, "model"):

@@ -243,16 +243,7 @@ def _sample(rgb: Tensor, window: Body | Plate, right: Tensor, down: Tensor) -> T
 
 
 def _seen_through(surface: Tensor, behind: Tensor, cue: Tensor, through: Tensor, generator: torch.Generator) -> Tensor:
-    """Return the depth that a sensor gives in a clear object, (1, h, w).
-
-    Args:
-        surface: (1, h, w) depth of its front.
-        behind: (1, h, w) what the sensor sees without it.
-        cue: (h, w) from 0 to 1, where it can be seen: highlights, rims and edges.
-        through: (1, h, w) its thickness, in metres.
-        generator: source of all random numbers.
-
-    """
+    """Return the depth that a sensor gives in a clear object, (1, h, w)."""
     lean = {"behind": uniform(2, 4, generator), "mixed": uniform(-1, 1.5, generator), "surface": -2.0}
     side = draw(_SIDES, generator)
     size = min(surface.shape[1:])

@@ -110,13 +110,6 @@ def _count(disparity: Tensor, noise: Tensor, generator: torch.Generator, *, ster
     """Return disparity in pixels as matching windows finds it: drawn to whole pixels, in steps, and smoothed again.
 
     Where the noise is weak against the step, a slanted wall becomes a stair.
-
-    Args:
-        disparity: (1, h, w) exact disparity in pixels.
-        noise: (1, h, w) what is added to it.
-        generator: source of all random numbers.
-        stereo: whether two cameras match, which count in finer steps and are noisier than a projector and a camera.
-
     """
     steps = (0.0, 1 / 64, 1 / 32, 1 / 32) if stereo else (1 / 32, 1 / 16, 1 / 8, 1 / 8)
     step = steps[int(torch.randint(4, (1,), generator=generator))]

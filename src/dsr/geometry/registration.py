@@ -172,13 +172,7 @@ def undo(depth_lr: Tensor, displacement: Displacement) -> Tensor:
 
 
 def _majority(values: Tensor, weights: Tensor) -> Tensor:
-    """Return the weighted mean of that surface of four pixels which has most weight; NaN where holes have most.
-
-    Args:
-        values: (4, H, W) inverse depth, NaN in holes.
-        weights: (4, H, W) that sum to 1.
-
-    """
+    """Return the weighted mean of that surface of four pixels which has most weight; NaN where holes have most."""
     valid = values.isfinite()
     low = torch.where(valid, values, torch.inf).amin(0)
     high = torch.where(valid, values, -torch.inf).amax(0)

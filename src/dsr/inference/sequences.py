@@ -136,13 +136,7 @@ def _tolerance(inverse: Tensor, deviation: Tensor, centre: Tensor, own: Tensor |
 
 
 def _most_voted(inverse: Tensor, deviation: Tensor) -> Tensor:
-    """Return the reading with which most others agree, the reference's own if any does, (h, w); NaN in holes.
-
-    Args:
-        inverse: (N, h, w), the reference first.
-        deviation: (N, h, w), its standard deviation.
-
-    """
+    """Return the reading with which most others agree, the reference's own if any does, (h, w); NaN in holes."""
     support = torch.stack(
         [
             ((inverse - each).abs() <= _tolerance(inverse, deviation, each, own)).sum(0)

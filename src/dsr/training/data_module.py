@@ -280,13 +280,7 @@ class PatchData(lightning.LightningDataModule):
 
 
 class _PatchNumbers:
-    """The patch numbers of one device's batches in an epoch, from the trainer's current step on.
-
-    Args:
-        trainer: the trainer; None for one device and nothing done before.
-        batch: number of patches per batch.
-
-    """
+    """The patch numbers of one device's batches in an epoch, from the trainer's current step on."""
 
     def __init__(self, trainer: lightning.Trainer | None, batch: int) -> None:
         self._trainer, self._batch = trainer, batch

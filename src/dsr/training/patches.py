@@ -171,14 +171,6 @@ class Patches(Dataset[Batch]):
         In use a network sees whole images, whose disparities have a larger range than a patch's. So half of the patches
         are normalised with the range of the scene's low-resolution map, the others with a random range between it and
         their own.
-
-        Args:
-            own: (2, 1, 1) lowest and highest disparity of the patch.
-            depth_range: nearest and farthest depth of the scene in metres.
-            sample: the patch.
-            factor: factor by which augmentation multiplied its depth.
-            random: source of random numbers.
-
         """
         near, far = depth_range
         bf, doffs = baseline_times_focal(sample.camera), sample.camera.doffs

@@ -65,13 +65,7 @@ def list_groups(directories: Sequence[Path]) -> list[str]:
 
 
 def _expect_moderate(path: Path) -> None:
-    """Refuse a file that is huge, or a short one whose aliases stand for something huge.
-
-    Raises:
-        OSError: it cannot be read.
-        ValueError: it is too large.
-
-    """
+    """Refuse a file that is huge, or a short one whose aliases stand for something huge."""
     try:
         content = read_limited(path, _LARGEST)
         if b"*" not in content:

@@ -208,13 +208,7 @@ class ConsoleProgress(Progress):
 
 
 class _ConsoleTask:
-    """A piece of work under way, with its times.
-
-    Args:
-        name, total, done, unit: see :meth:`dsr.utils.progress.Progress.task`.
-        now: returns the time in seconds.
-
-    """
+    """A piece of work under way, with its times."""
 
     def __init__(self, name: str, total: int | None, done: int, unit: Unit, now: Callable[[], float]) -> None:
         self.name, self.total, self.done, self.remark = name, total, done, ""

@@ -299,12 +299,7 @@ def _value(each: _Stated, option: _Option, came: Any) -> Any:
 
 
 def _is_absent(record: type[Options], given: Namespace) -> bool:
-    """Return whether no option of a record is given.
-
-    Raises:
-        ValueError: some are given, and one that is needed with them is not.
-
-    """
+    """Return whether no option of a record is given."""
     there = [each for each in _stated(record) if hasattr(given, each.key)]
     for each in _stated(record) if there else ():
         if each.required and each not in there:

@@ -109,13 +109,7 @@ def _detail(before: Tensor, after: Tensor) -> _Part:
 
 
 class _Sheet(Canvas):
-    """Three by three panels under a heading.
-
-    Args:
-        aspect: ratio of height to width of the pictures.
-        title: heading.
-
-    """
+    """Three by three panels under a heading."""
 
     def __init__(self, aspect: float, title: str) -> None:
         width = min(_PANEL, _TALLEST / aspect)

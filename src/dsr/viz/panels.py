@@ -85,13 +85,7 @@ def save_picture(
 
 
 class _Page(Canvas):
-    """The page of a scene: rows of five panels.
-
-    Args:
-        sample: the scene.
-        rows: number of rows.
-
-    """
+    """The page of a scene: rows of five panels."""
 
     def __init__(self, sample: DepthSample, rows: int) -> None:
         self._camera = sample.camera

@@ -105,12 +105,7 @@ def resize_depth(depth: Tensor, height: int, width: int) -> Tensor:
 
 
 class _Axis:
-    """New pixels along one axis and the old ones around them.
-
-    Args:
-        old, new: lengths in pixels.
-
-    """
+    """New pixels along one axis and the old ones around them."""
 
     def __init__(self, old: int, new: int) -> None:
         self.radius = max(old / new, _MIN_RADIUS)

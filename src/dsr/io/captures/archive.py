@@ -167,12 +167,7 @@ def decode_lzfse(content: bytes, size: tuple[int, int], dtype: str) -> np.ndarra
 
 
 def _declared_size(content: bytes) -> int:
-    """Return the number of bytes that the headers of LZFSE blocks declare.
-
-    Raises:
-        ValueError: these are no complete LZFSE data.
-
-    """
+    """Return the number of bytes that the headers of LZFSE blocks declare."""
     place, total = 0, 0
     while content[place : place + 4] != b"bvx$":
         magic, (raw,) = content[place : place + 4], struct.unpack_from("<I", content.ljust(place + 8, b"\0"), place + 4)

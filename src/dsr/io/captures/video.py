@@ -56,15 +56,7 @@ class VideoFrame:
 
 
 class _Player:
-    """A video that is open at some frame.
-
-    Args:
-        path: the video.
-
-    Raises:
-        ValueError: it is no video.
-
-    """
+    """A video that is open at some frame."""
 
     def __init__(self, path: Path) -> None:
         self._path, self._next = path, 0

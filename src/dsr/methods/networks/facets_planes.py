@@ -254,16 +254,7 @@ class _MixPlanes(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, near: Tensor, found: Tensor, prior: Tensor, basis: Tensor) -> tuple[Tensor, Tensor]:
-        """Return what :func:`mix_planes_apart` does.
-
-        Args:
-            ctx: of the gradient.
-            near: (B, C, 3, h, w) planes.
-            found: (B, C + n, s h, s w).
-            prior: (C, q, 1) logits, where q = s * s.
-            basis: (q, 3) = (1, u, v).
-
-        """
+        """Return what :func:`mix_planes_apart` does."""
         count, (height, width), s = near.shape[1], near.shape[-2:], math.isqrt(len(basis))
         mixed = near.new_empty(found.shape[0], 1, *found.shape[-2:])
         logits, target, kept = _blocks(found[:, :count], s), _blocks(mixed, s), []

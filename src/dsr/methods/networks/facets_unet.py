@@ -396,16 +396,7 @@ def _lr_input(around: Stencil, smoothed: list[Stencil], weight: Tensor, noise: T
 
 
 def _project(result: Tensor, values: Tensor, known: Tensor, gate: Tensor, hints: Tensor) -> Tensor:
-    """Return results closer to what was measured, where the kernel is known.
-
-    Args:
-        result: (B, 1, H, W).
-        values: (B, 1, h, w) what was measured.
-        known: (B, 1, h, w) bool.
-        gate: (B, 1, H, W) factor of the residual.
-        hints: (B, ``FACTS``).
-
-    """
+    """Return results closer to what was measured, where the kernel is known."""
     scale = result.shape[-1] // values.shape[-1]
     told = hints[:, : len(KERNELS)]
     if scale == 1 or exporting() or not bool(told.any()):  # an exported network is told no kernel

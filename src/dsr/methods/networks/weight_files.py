@@ -187,12 +187,7 @@ def _beside(path: Path, header: Mapping[str, Any], key: str) -> Path | None:
 def _make(
     path: Path, kind: type[DisparityNetwork], arguments: Mapping[str, Any], shared: Path | None
 ) -> DisparityNetwork:
-    """Return a network without values, or one of the user's with random ones, which may need them as it is made.
-
-    Raises:
-        ValueError: the arguments ask for more weights than the files of one of dsr's networks hold.
-
-    """
+    """Return a network without values, or one of the user's with random ones, which may need them as it is made."""
     if any(isinstance(value, int) and abs(value) > _LARGEST_ARGUMENT for value in arguments.values()):
         raise ValueError(f"{path}: expected sizes of a network of at most {_LARGEST_ARGUMENT}")
     if kind.__module__.partition(".")[0] != __name__.partition(".")[0]:

@@ -165,12 +165,7 @@ def save_page(
 
 
 def _at_level(encoded: Iterable[_Encoded], level: Level, count: int, budget: float, progress: Steps) -> _Stored:
-    """Collect the pictures of all scenes.
-
-    Raises:
-        _TooLargeError: the size, or its estimate from the first scenes, exceeds the budget.
-
-    """
+    """Collect the pictures of all scenes."""
     pool = Pool(level)
     notes: dict[int, list[str]] = {}
     scenes: dict[int, dict[str, Any] | None] = {}

@@ -44,17 +44,7 @@ def deformable_conv3x3(x: Tensor, offsets: Tensor, mask: Tensor, weight: Tensor)
 
 
 def _sampling_grid(offsets: Tensor, top: int, height: int) -> Tensor:
-    """Return the positions that the taps of some rows read, as ``grid_sample`` expects them.
-
-    Args:
-        offsets: (B, 18, rows, W) displacements of the rows.
-        top: index of the first row.
-        height: number of rows of the image.
-
-    Returns:
-        (B, 9 * rows, W, 2), x before y; -1 and 1 are the outer edges of the first and the last pixel.
-
-    """
+    """Return the positions that the taps of some rows read, as ``grid_sample`` expects them."""
     rows, width = offsets.shape[-2:]
     taps = torch.arange(-1, 2, device=offsets.device)
     y = torch.arange(top, top + rows, device=offsets.device)[:, None] + taps.repeat_interleave(3)[:, None, None]

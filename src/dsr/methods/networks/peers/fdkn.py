@@ -86,12 +86,6 @@ def _sample(values: Tensor, weights: Tensor, offsets: Tensor) -> Tensor:
     """Return the weighted sum of a map at nine positions around each pixel.
 
     Each pixel sees a window of 15 x 15 pixels, interpolated bilinearly; outside of it and of the map, values are 0.
-
-    Args:
-        values: (B, 1, H, W) map.
-        weights: (B, 9, H, W) weights.
-        offsets: (B, 18, H, W): across and down in pixels, of each position from its place in a 3 x 3 grid.
-
     """
     height, width = values.shape[-2:]
     rows = torch.arange(height, device=values.device, dtype=values.dtype)[:, None]
