@@ -46,7 +46,7 @@ def panels_of(capture: Capture, methods: list[str], shared: Path, device: str) -
     ]
     for name in methods:
         depth = run_method(capture, name, shared, device)
-        caption = f"{read_recipe(name).at().get('label', name)}{describe(capture, capture.scores(depth))}"
+        caption = f"{read_recipe(name).label}{describe(capture, capture.scores(depth))}"
         panels.append(Panel(caption, rendering(depth, sample.camera, LIGHT)))
         print(f"  {caption}".replace("\n", ": "), flush=True)
     if capture.truth is not None:

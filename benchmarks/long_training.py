@@ -57,14 +57,14 @@ def train(stage: Mapping[str, Any], number: int, run: Path, weights: Path) -> No
     if (run / "weights.safetensors").is_file():
         return
     links = read_header(weights)
-    shared = [f"trainer.shared={weights.parent / links['shared']}"] if "shared" in links else []
+    shared = [f"start.shared={weights.parent / links['shared']}"] if "shared" in links else []
     command = [sys.executable, str(HERE.parent / "train.py")]
     if (run / "checkpoints" / "last.ckpt").is_file():
         command += [f"resume={run}"]
     else:
         command += [
-            *stage["overrides"], *shared, f"trainer.steps={stage['steps']}", "trainer.keep=last",
-            f"trainer.init={weights}", f"seed={number}", f"output_dir={run}",
+            *stage["overrides"], *shared, f"trainer.max_steps={stage['steps']}", "keep=last",
+            f"start.weights={weights}", f"seed={number}", f"output_dir={run}",
         ]  # fmt: skip
     with subprocess.Popen(command, env={**os.environ, **ENVIRONMENT}) as child:  # noqa: S603
         before = signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the training, too, which saves itself

@@ -30,7 +30,6 @@ from torch import Tensor, nn
 from dsr.methods.networks.maps import normalise_imagenet
 from dsr.methods.networks.peers.base import PeerUpsampler
 from dsr.methods.networks.peers.files import read_tensors
-from dsr.methods.networks.weight_choice import find_weights
 from dsr.methods.recipe import Run, read_recipe
 
 TRAINING_ONLY = (
@@ -121,7 +120,7 @@ def ways(name: str, checkouts: Path, weights: Path, size: int, device: torch.dev
     if not isinstance(upsampler, PeerUpsampler):
         raise TypeError(f"method={name}: expected a published network of the field")
     theirs, call = AUTHORS[name](checkouts)
-    theirs.load_state_dict(read_tensors(find_weights(recipe.at(scale), scale)))
+    theirs.load_state_dict(read_tensors(recipe.weights(scale)))
     theirs.eval().to(device)
     rgb, values = (each.to(device) for each in scene(size))
     return {

@@ -79,8 +79,20 @@ def jobs(scenes: Path, folder: Path) -> Iterator[tuple[str, list[str]]]:
         "simgeo facets",
         [*python, "method=facets", "dataset.size=128", "metrics.lpips=false", f"output_dir={folder / 'simgeo facets'}"],
     )
-    train = [sys.executable, "train.py", "dataset.count=6", "dataset.size=128", "trainer.steps=60", "trainer.batch=2"]
-    train += ["trainer.warmup=10", "trainer.validate_every=30", "trainer.validation_scenes=1", "trainer.patch=64"]
+    train = [
+        sys.executable,
+        "train.py",
+        "dataset.count=6",
+        "dataset.size=128",
+        "trainer.max_steps=60",
+        "patches.batch=2",
+    ]
+    train += [
+        "model.scheduler.warmup=10",
+        "trainer.val_check_interval=30",
+        "patches.validation_scenes=1",
+        "patches.patch=64",
+    ]
     train += ["precision=float32", "metrics.lpips=false", "device=cpu"]
     for model in ("msg_v", "facets"):
         name = f"train {model}"

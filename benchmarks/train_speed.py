@@ -133,7 +133,12 @@ def profile(steps: int, device: torch.device, overrides: Sequence[str]) -> None:
     register()
     conf = Path(__file__).resolve().parents[1] / "conf"
     with hydra.initialize_config_dir(str(conf), version_base="1.3"):
-        small = ["dataset.count=8", "metrics.lpips=false", f"trainer.steps={steps}", f"trainer.validate_every={steps}"]
+        small = [
+            "dataset.count=8",
+            "metrics.lpips=false",
+            f"trainer.max_steps={steps}",
+            f"trainer.val_check_interval={steps}",
+        ]
         settings = TrainConfig.of(plain_config(hydra.compose("train", [*small, *overrides])))
     settings.precision = "float32" if settings.precision == "auto" else settings.precision
     times = StepTimes(device)

@@ -4,7 +4,8 @@
 >>> camera = dsr.Camera(width=640, height=480, fx=525.0, fy=525.0, cx=319.5, cy=239.5)
 
 and ``dsr.upsample(photo, depth, camera)``, see :func:`dsr.inference.api.upsample`;
-``dsr.upsample_with_errors`` also says how far off the result may be.
+``dsr.upsample_with_errors`` also says how far off the result may be. ``dsr.compose("eval", ["method=facets"])``
+composes the configuration of a command, whose nodes :func:`hydra.utils.instantiate` makes.
 """
 
 from __future__ import annotations
@@ -15,14 +16,16 @@ from typing import TYPE_CHECKING, Any
 import dsr.utils.threads  # noqa: F401 - for forks
 
 if TYPE_CHECKING:
+    from dsr.app.composition import compose
     from dsr.geometry.camera import Camera
     from dsr.inference.api import upsample, upsample_with_errors
 
 __version__ = "0.1.0"
-__all__ = ["Camera", "__version__", "upsample", "upsample_with_errors"]
+__all__ = ["Camera", "__version__", "compose", "upsample", "upsample_with_errors"]
 
 _HOMES = {
     "Camera": "dsr.geometry.camera",
+    "compose": "dsr.app.composition",
     "upsample": "dsr.inference.api",
     "upsample_with_errors": "dsr.inference.api",
 }

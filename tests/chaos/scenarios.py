@@ -93,8 +93,8 @@ _DIP = (
     "method.validate_every=10", "output_dir=out",
 )  # fmt: skip
 _TRAIN = (
-    "train", "trainer=smoke", "trainer.steps=12", "trainer.validate_every=3", "dataset=procedural", "dataset.count=3",
-    "dataset.size=48", "metrics.lpips=false", "device=cpu",
+    "train", "trainer=smoke", "trainer.max_steps=12", "trainer.val_check_interval=3", "dataset=procedural",
+    "dataset.count=3", "dataset.size=48", "metrics.lpips=false", "device=cpu",
 )  # fmt: skip
 _UPSAMPLE = (
     "dsr", "upsample", "frames", "-o", "out", "--poses", "poses.txt", "--depth-unit", "mm", "--method", "facets",
@@ -112,7 +112,7 @@ STRUCK = {
         Scenario("eval", (_FACETS,)),
         Scenario("dip", (_DIP,)),
         Scenario("train", ((*_TRAIN, "output_dir=out"),), complete=_TRAINED),
-        Scenario("train_workers", ((*_TRAIN, "output_dir=out", "trainer.workers=2"),), complete=_TRAINED),
+        Scenario("train_workers", ((*_TRAIN, "output_dir=out", "patches.workers=2"),), complete=_TRAINED),
         Scenario("upsample", (_UPSAMPLE,), _FRAMES),
         Scenario("upsample_workers", ((*_UPSAMPLE, "--workers", "2"),), _FRAMES),
         Scenario("report", (_REPORT,), _TWO_RUNS),

@@ -65,7 +65,7 @@ def _trained() -> Path:
     folder = place / "run"
     quietly(
         "train", "model=msg_v", "scale=2", "trainer=smoke", "dataset=folder", f"dataset.root={place / 'scenes'}",
-        "trainer.scenes=2", "metrics.lpips=false", "device=cpu", "precision=float32", f"output_dir={folder}",
+        "patches.scenes=2", "metrics.lpips=false", "device=cpu", "precision=float32", f"output_dir={folder}",
     )  # fmt: skip
     for log in (folder / "tensorboard").rglob("events*"):
         log.unlink()

@@ -109,11 +109,11 @@ def _changed(random: Random, content: Any, canary: Path) -> Any:
         if pick < 0.72:
             del container[key]
         elif pick < 0.8 and isinstance(container, dict):
-            container[random.choice(("", "x", "target", "__class__", "a" * 300, str(key) + " ", "\x1b[2J"))] = (
+            container[random.choice(("", "x", "_target_", "__class__", "a" * 300, str(key) + " ", "\x1b[2J"))] = (
                 container.pop(key)
             )
         elif pick < 0.9 and isinstance(container, dict):
-            container[random.choice(("target", "extra", "__init__", "defaults", "root", "\u202e"))] = values.plain(
+            container[random.choice(("_target_", "extra", "__init__", "defaults", "root", "\u202e"))] = values.plain(
                 random, canary
             )
         else:

@@ -47,7 +47,7 @@ def plain(random: Random, canary: Path) -> Any:
     if pick < 0.15:
         return str(canary)
     if pick < 0.2:
-        return {"target": random.choice(TARGETS), "name": "x", "command": f"mkdir {canary}", "path": str(canary)}
+        return {"_target_": random.choice(TARGETS), "name": "x", "command": f"mkdir {canary}", "path": str(canary)}
     return random.choice(_PLAIN)
 
 

@@ -72,7 +72,7 @@ def test_real_scenes_of_several_datasets_are_evaluated_by_one_command(run, tmp_p
 
 def test_training_on_real_scenes_with_holes_and_procedural_ones_runs(run, tmp_path, shared):
     done = run(
-        "train.py", "dataset=paper_train", "trainer=smoke", "output_dir=out", "trainer.scenes=4",
+        "train.py", "dataset=paper_train", "trainer=smoke", "output_dir=out", "patches.scenes=4",
         "dataset.parts.middlebury_train.scenes=found", "dataset.shares.sintel=0",
         "dataset.parts.procedural.count=2", "dataset.parts.procedural.size=64", DSR_DATA=str(shared / "real"),
     )  # fmt: skip

@@ -64,7 +64,7 @@ class Waves:
         return f"{scene} {self.size}"
 '''
 METRICS = "defaults: [paper]\nextra: [outside.PSNR, outside.BRIGHTNESS]\nlpips: false\n"
-DATASET = "name: waves\ntarget: outside.Waves\nsize: 32\n"
+DATASET = "_target_: outside.Waves\nsize: 32\n"
 
 
 def run(folder, *command, outside):

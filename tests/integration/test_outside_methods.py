@@ -60,18 +60,25 @@ class Shifted(DisparityNetwork):
 '''
 FILES = {
     "modules/outside.py": MODULE,
-    "conf/method/constant.yaml": "name: constant\nlabel: Constant\ntarget: outside.Constant\noffset: 0.0\n",
-    "conf/method/told.yaml": "name: told\nlabel: Told\ntarget: outside.Told\nkernel: null\nedges: auto\n",
-    "conf/model/shifted.yaml": "name: shifted\ntarget: outside.Shifted\ndepth_loss: lap1\nvisual: false\n",
+    "conf/method/constant.yaml": (
+        "# @package _global_\nlabel: Constant\nmethod:\n  _target_: outside.Constant\n  offset: 0.0\n"
+    ),
+    "conf/method/told.yaml": (
+        "# @package _global_\nlabel: Told\nmethod:\n  _target_: outside.Told\n  kernel: null\n  edges: auto\n"
+    ),
+    "conf/model/shifted.yaml": (
+        "net:\n  _target_: outside.Shifted\n  scale: ${scale}\n"
+        "objective:\n  _target_: dsr.training.objective.DepthObjective\n"
+    ),
     "conf/method/shifted.yaml": (
-        "name: shifted\ntarget: dsr.methods.networks.trained.TrainedNetwork\nmodel: shifted\nensemble: 1\n"
+        "_target_: dsr.methods.networks.trained.TrainedNetwork\nmodel: shifted\nensemble: 1\n"
         "weights: training/weights.safetensors\n"
     ),
 }
 TRAINING = (
-    "dataset.count=2", "dataset.size=64", "trainer=smoke", "trainer.steps=2", "trainer.batch=1", "trainer.patch=32",
-    "trainer.validate_every=2", "trainer.validation_scenes=1", "precision=float32", "metrics.lpips=false", "device=cpu",
-    "model=shifted", "output_dir=training",
+    "dataset.count=2", "dataset.size=64", "trainer=smoke", "trainer.max_steps=2", "patches.batch=1", "patches.patch=32",
+    "trainer.val_check_interval=2", "patches.validation_scenes=1", "precision=float32", "metrics.lpips=false",
+    "device=cpu", "model=shifted", "output_dir=training",
 )  # fmt: skip
 
 
@@ -135,7 +142,7 @@ def test_changed_code_of_a_method_from_outside_makes_another_run(home):
     [
         (
             ("-m", "downsampling=box,bicubic", "noise=none,gaussian_multiplicative",
-             "output_dir=runs/${downsampling.name}_${noise.name}"),
+             "output_dir=runs/${hydra:runtime.choices.downsampling}_${hydra:runtime.choices.noise}"),
             ["box sharp True", "box sharp False", "bicubic sharp True", "bicubic sharp False"],
         ),
         (("method.edges=soft", "method.kernel=nearest", "output_dir=runs/said"), ["nearest soft True"]),
@@ -171,7 +178,7 @@ def test_network_from_outside_is_trained_evaluated_and_used(home):
         assert done.returncode == 0, done.stderr
     done = run(home, program, "run=training", "output_dir=runs/refused")
     assert done.returncode == 2
-    assert "training/config.yaml: model.target: expected a target of dsr's own model group" in done.stderr
+    assert "training/config.yaml: model.net._target_: expected a target of dsr's own model group" in done.stderr
     assert "if you trust it, trust=outside.Shifted allows it" in done.stderr
     done = upsample(home, "--method", "shifted", "-o", "by_network")
     assert done.returncode == 0, done.stderr

@@ -30,8 +30,9 @@ from dsr.utils.progress import SILENT
 REPOSITORY = Path(__file__).resolve().parents[2]
 SMOKE = (
     "trainer=smoke", "dataset=procedural", "dataset.count=6", "dataset.size=64", "metrics.lpips=false", "device=cpu",
+    "model.scheduler.warmup=1",
 )  # fmt: skip
-FOUR = (*SMOKE, "trainer.steps=4", "trainer.validate_every=2", "output_dir=out")
+FOUR = (*SMOKE, "trainer.max_steps=4", "trainer.val_check_interval=2", "output_dir=out")
 
 
 def interrupted(step, home="out"):
@@ -168,7 +169,7 @@ def test_training_reports_its_plan_and_where_the_weights_are(smoke):
 
 @pytest.mark.usefixtures("line_per_report")
 def test_steps_and_validations_have_lines_with_named_times_off_a_terminal(within):
-    code, output, errors = within(*SMOKE, "trainer.validation_scenes=2", "output_dir=out")
+    code, output, errors = within(*SMOKE, "patches.validation_scenes=2", "output_dir=out")
     assert (code, errors) == (0, [])
     times = r"elapsed \d:\d\d:\d\d, remaining \d:\d\d:\d\d"
     assert re.search(rf"^train: 1 of 2, {times}, loss \d+\.\d{{4}}$", output, re.MULTILINE)
@@ -182,7 +183,7 @@ def test_training_emits_no_warning(smoke):
 
 def test_training_writes_the_documented_files_and_nothing_else(smoke):
     folder, home, _ = smoke
-    assert home.name == "msg_v_x4_smoke_count6_size64_seed0"
+    assert home.name == "msg_v_x4_smoke_count6_size64_warmup1_seed0"
     [events] = (home / "tensorboard").glob("events.*")
     assert tree(home) == [
         "checkpoints/best.ckpt", "checkpoints/last.ckpt", "config.yaml",
@@ -197,10 +198,10 @@ def test_config_yaml_is_the_resolved_configuration(smoke):
     assert "${" not in text
     assert "???" not in text
     config = yaml.safe_load(text)
-    assert config["trainer"]["patch"] == 32
-    assert config["trainer"]["name"] == "smoke"
+    assert config["patches"]["patch"] == 32
+    assert config["names"]["trainer"] == "smoke"
     assert config["dataset"]["size"] == 64
-    assert config["model"]["name"] == "msg_v"
+    assert config["names"]["model"] == "msg_v"
     assert config["loss"] == {"visual": "mse_v", "w": "auto"}
 
 
@@ -208,7 +209,7 @@ def test_versions_json_records_what_made_the_weights(smoke):
     record = json.loads((smoke[1] / "versions.json").read_text())
     assert record["packages"]["torch"] == torch.__version__
     assert record["identity"]["device"] == "cpu"
-    assert record["identity"]["trainer"]["steps"] == 2
+    assert record["identity"]["trainer"]["max_steps"] == 2
     assert "method" not in record["identity"]
 
 
@@ -288,10 +289,10 @@ def test_directory_of_another_training_is_kept(tmp_path, within, interrupt):
     interrupt(1)
     assert within(*SMOKE, "output_dir=out")[0] == 130
     before = tree(tmp_path)
-    code, _, errors = within(*SMOKE, "output_dir=out", "seed=1", "trainer.batch=1")
+    code, _, errors = within(*SMOKE, "output_dir=out", "seed=1", "patches.batch=1")
     assert code == 2
     assert errors == [
-        "error: output_dir: out holds a run with another seed, trainer.batch; another output_dir keeps it, "
+        "error: output_dir: out holds a run with another patches.batch, seed; another output_dir keeps it, "
         "overwrite=true replaces it"
     ]
     assert tree(tmp_path) == before
@@ -343,23 +344,23 @@ def test_msg_is_trained_on_depth_alone_and_its_weights_are_those_of_method_msg(t
 
 
 def test_last_steps_are_validated_where_the_interval_does_not_divide_them(tmp_path, within):
-    code, output, errors = within(*SMOKE, "trainer.steps=3", "trainer.validate_every=2", "output_dir=out")
+    code, output, errors = within(*SMOKE, "trainer.max_steps=3", "trainer.val_check_interval=2", "output_dir=out")
     assert (code, errors) == (0, [])
     assert validated(output) == [0, 2, 3]
     assert last_step(tmp_path / "out") == 3
 
 
 def test_diverged_training_writes_no_weights_and_does_not_diverge_twice(within):
-    settings = (*SMOKE, "trainer.learning_rate=1e30", "output_dir=out")
+    settings = (*SMOKE, "model.optimizer.lr=1e30", "output_dir=out")
     code, _, errors = within(*settings)
     what = "out: the training diverged at step 1: the validation's RMSE_d is nan, at a learning rate of 1e+30"
     assert (code, len(errors)) == (2, 1)
-    assert errors[0].startswith(f"error: {what}; it has no earlier checkpoint; a lower trainer.learning_rate")
+    assert errors[0].startswith(f"error: {what}; it has no earlier checkpoint; a lower model.optimizer.lr")
     assert [name for name in tree(Path("out")) if name.endswith((".safetensors", ".ckpt"))] == ["checkpoints/best.ckpt"]
     assert torch.load("out/checkpoints/best.ckpt", weights_only=True)["global_step"] == 0
     code, output, errors = within(*settings)
     assert (code, len(errors)) == (2, 1)
-    assert errors[0].startswith(f"error: {what}, and would again; a lower trainer.learning_rate")
+    assert errors[0].startswith(f"error: {what}, and would again; a lower model.optimizer.lr")
     assert "steps" not in output
     command._clear(Path("out"))  # as overwrite=true does
     assert "diverged.json" not in tree(Path("out"))
@@ -383,19 +384,32 @@ USAGE_ERRORS = {
         "model=foo: unknown; expected one of ddrnet, dg, facets, facets_box, msg, msg_v, pdn, sparse_to_dense",
     ),
     "a model taken away": (["~model"], "model: missing; give it as model=..."),
-    "a mistyped loss": (["model.depth_loss=l3"], "model.depth_loss: expected one of lap1, l1, mse, got 'l3'"),
-    "a negative shading": (["model=ddrnet", "model.shading=-1"], "model.shading: expected 0 or a positive number"),
-    "a network that leaves out pixels": (["model.variant=hui"], "model: expected a network that covers the whole"),
-    "a patch the scale does not divide": (["trainer.patch=30"], "trainer.patch: expected a size that scale=4 divides"),
-    "a patch too small": (["trainer.patch=8"], "trainer.patch: expected at least 16 pixels, got 8"),
-    "no step": (["trainer.steps=0"], "trainer.steps: expected a positive number, got 0"),
-    "no batch": (["trainer.batch=0"], "trainer.batch: expected a positive number, got 0"),
-    "a negative warm-up": (["trainer.warmup=-1"], "trainer.warmup: expected 0 or more, got -1"),
-    "a negative decay": (["trainer.weight_decay=-1"], "trainer.weight_decay: expected 0 or more, got -1"),
-    "a learning rate of nan": (["trainer.learning_rate=nan"], "trainer.learning_rate: expected a positive number"),
+    "a mistyped loss": (
+        ["model.objective.depth_loss=l3"],
+        "model.objective.depth_loss: expected one of lap1, l1, mse, got 'l3'",
+    ),
+    "a negative shading": (
+        ["model=ddrnet", "model.objective.shading=-1"],
+        "model.objective.shading: expected 0 or a positive number",
+    ),
+    "a network that leaves out pixels": (["model.net.variant=hui"], "model: expected a network that covers the whole"),
+    "a patch the scale does not divide": (["patches.patch=30"], "patches.patch: expected a size that scale=4 divides"),
+    "a patch too small": (["patches.patch=8"], "patches.patch: expected at least 16 pixels, got 8"),
+    "no step": (["trainer.max_steps=0"], "trainer.max_steps: expected a whole number, 1 or more, got 0"),
+    "no batch": (["patches.batch=0"], "patches.batch: expected a positive number, got 0"),
+    "a negative warm-up": (["model.scheduler.warmup=-1"], "model.scheduler: warmup: expected 0 or more, got -1"),
+    "a negative decay": (["model.optimizer.weight_decay=-1"], "model.optimizer: Invalid weight_decay value: -1"),
+    "a learning rate of nan": (["model.optimizer.lr=nan"], "model.optimizer: Invalid learning rate: nan"),
+    "an argument of the optimiser that there is not": (
+        ["+model.optimizer.momentum=0.9"],
+        "model.optimizer.momentum: unknown key; model.optimizer takes params, lr, betas",
+    ),
+    "a misspelt argument of the trainer": (["+trainer.max_step=3"], "trainer.max_step: unknown key; expected"),
+    "an unknown argument of the trainer": (["+trainer.tpu_cores=3"], "trainer.tpu_cores: unknown key; trainer takes"),
+    "a callback's unknown argument": (["+callbacks.curves.x=1"], "callbacks.curves.x: unknown key; "),
     "an assumed model": (["downsampling.assumed=nearest"], "downsampling.assumed: a training assumes no downsampling "),
-    "a mistyped key": (["trainer.step=3"], "trainer.step: unknown key; expected trainer.steps=3"),
-    "too few scenes": (["dataset.count=1"], "trainer.validation_scenes: expected fewer than the 1 scenes"),
+    "a mistyped key": (["trainer.step=3"], "trainer.step: unknown key; expected trainer.max_steps=3"),
+    "too few scenes": (["dataset.count=1"], "patches.validation_scenes: expected fewer than the 1 scenes"),
     "a measured map": (["downsampling=measured"], "downsampling: training needs a model such as box, measured is none"),
     "a scale": (["scale=3"], "scale: expected one of 2, 4, 8, 16, got 3"),
     "a seed": (["seed=99999999999"], "seed: expected at most 4294967295, got 99999999999"),
@@ -441,7 +455,7 @@ def test_list_of_loggers_logs_to_each_and_goes_on_with_each(tmp_path, within, in
     table = {step: float(row["val/RMSE_v"]) for step, row in rows.items() if row["val/RMSE_v"]}
     assert table == pytest.approx(scalars_of(home, "val/RMSE_v"))
     assert list(table) == [0, 2, 4]
-    assert yaml.safe_load((home / "csv" / "hparams.yaml").read_text())["model"]["name"] == "msg_v"
+    assert yaml.safe_load((home / "csv" / "hparams.yaml").read_text())["names"]["model"] == "msg_v"
     tags = events_of(home).Tags()
     assert tags["images"] == ["renderings/procedural_0"]
     assert {"config/text_summary", "custom_scalars__config__"} <= set(tags["tensors"])
@@ -455,10 +469,10 @@ def test_training_without_a_logger_has_its_table_of_validations(tmp_path, within
 
 
 def test_patch_larger_than_a_scene_is_refused_when_the_scenes_are_there(tmp_path, within):
-    code, output, errors = within(*SMOKE, "trainer.patch=128")
+    code, output, errors = within(*SMOKE, "patches.patch=128")
     assert code == 2
     assert output.startswith("model  msg_v x4, ")
-    assert errors == ["error: trainer.patch: expected at most 00000's 64 x 64, got 128"]
+    assert errors == ["error: patches.patch: expected at most 00000's 64 x 64, got 128"]
     assert tree(tmp_path) == []
 
 
@@ -479,7 +493,7 @@ def test_estimate_is_the_sum_of_scenes_to_prepare_steps_and_validations(within, 
     monkeypatch.setattr(command, "seconds_per_step", lambda *_: 20.0)
     monkeypatch.setattr(command, "seconds_per_validation", lambda *_: 3.0)
     interrupt(3)
-    code, output, _ = within(*FOUR, "trainer.accumulate=2")
+    code, output, _ = within(*FOUR, "trainer.val_check_interval=4", "trainer.accumulate_grad_batches=2")
     assert code == 130
     scenes = "2 min for 14 scenes that are not in the cache"
     steps, validations = "3 min for 4 steps of 40 s", "9 s for 3 validations of 3 s"
@@ -575,7 +589,7 @@ def test_training_interrupted_during_its_first_validation_begins_with_it_again(s
 
 def test_weights_that_training_makes_worse_stay(smoke, tmp_path, within):
     weights = smoke[1] / "weights.safetensors"
-    code, _, errors = within(*SMOKE, f"trainer.init='{weights}'", "trainer.learning_rate=0.01", "output_dir=out")
+    code, _, errors = within(*SMOKE, f"start.weights='{weights}'", "model.optimizer.lr=0.01", "output_dir=out")
     assert (code, errors) == (0, [])
     scores = scalars_of(tmp_path / "out", "val/RMSE_v")
     assert min(scores, key=scores.get) == 0
@@ -620,7 +634,7 @@ def test_training_resumes_from_its_last_validation_even_if_it_was_not_the_best(
 ):
     validate_with(monkeypatch, 0.3, 0.1, 0.2, 0.3)
     interrupt(2)
-    arguments = (*SMOKE, "trainer.steps=3", "output_dir=out")
+    arguments = (*SMOKE, "trainer.max_steps=3", "output_dir=out")
     assert within(*arguments)[0] == 130
     assert last_step(tmp_path / "out") == 2
     interrupt(None)
@@ -634,13 +648,13 @@ def test_training_resumes_from_its_last_validation_even_if_it_was_not_the_best(
 
 def test_last_weights_are_kept_on_request(tmp_path, within, monkeypatch):
     validate_with(monkeypatch, 0.1, 0.2, 0.3, 0.4)
-    assert within(*SMOKE, "trainer.steps=3", "trainer.keep=last", "output_dir=out")[0] == 0
+    assert within(*SMOKE, "trainer.max_steps=3", "keep=last", "output_dir=out")[0] == 0
     last = torch.load(tmp_path / "out" / "checkpoints" / "last.ckpt", weights_only=True)
     assert last["global_step"] == 3
     weights = load_file(tmp_path / "out" / "weights.safetensors")
     assert all(torch.equal(value, last["state_dict"][f"average.{name}"]) for name, value in weights.items())
-    code, _, errors = within(*SMOKE, "trainer.keep=first", "output_dir=other")
-    assert (code, errors) == (2, ["error: trainer.keep: expected one of best, last, got first"])
+    code, _, errors = within(*SMOKE, "keep=first", "output_dir=other")
+    assert (code, errors) == (2, ["error: keep: expected one of best, last, got first"])
 
 
 def test_checkpoint_of_a_stranger_removes_nothing_outside_the_run(tmp_path, within, interrupt):
@@ -700,7 +714,7 @@ def running(tmp_path, environment, *arguments):
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_interruption_exits_with_its_signal_saves_its_step_and_says_how_to_resume(tmp_path, environment, number):
-    with running(tmp_path, environment, "trainer.steps=500", "trainer.validate_every=3") as process:
+    with running(tmp_path, environment, "trainer.max_steps=500", "trainer.val_check_interval=3") as process:
         process.send_signal(number)
         _, errors = process.communicate(timeout=60)
     assert process.returncode == 128 + number
@@ -712,7 +726,7 @@ def test_interruption_exits_with_its_signal_saves_its_step_and_says_how_to_resum
 
 @pytest.mark.parametrize(("steps", "step", "again"), [(6, 4, [6]), (6, 6, []), (5, 5, [])])
 def test_training_interrupted_during_a_validation_goes_on_after_it(tmp_path, within, stop, steps, step, again):
-    arguments = (*SMOKE, f"trainer.steps={steps}", "trainer.validate_every=2")
+    arguments = (*SMOKE, f"trainer.max_steps={steps}", "trainer.val_check_interval=2")
     assert within(*arguments, "output_dir=whole")[0] == 0
     stop(step)
     code, _, errors = within(*arguments, "output_dir=out")
@@ -728,7 +742,7 @@ def test_training_interrupted_during_a_validation_goes_on_after_it(tmp_path, wit
 
 
 def test_training_interrupted_during_two_validations_does_no_step_differently(tmp_path, within, stop):
-    arguments = (*SMOKE, "trainer.steps=3")  # with a validation after each
+    arguments = (*SMOKE, "trainer.max_steps=3")  # with a validation after each
     assert within(*arguments, "output_dir=whole")[0] == 0
     for step in (1, 2):
         stop(step)
@@ -746,7 +760,7 @@ def test_training_interrupted_during_two_validations_does_no_step_differently(tm
 
 
 def test_resume_from_any_step_gives_bit_identical_weights(tmp_path, within, stop):
-    arguments = (*SMOKE, "trainer.steps=6", "trainer.validate_every=2", "trainer.accumulate=2")
+    arguments = (*SMOKE, "trainer.max_steps=6", "trainer.val_check_interval=4", "trainer.accumulate_grad_batches=2")
     assert within(*arguments, "output_dir=whole")[0] == 0
     stop(3, "on_train_batch_end")
     code, _, errors = within(*arguments, "output_dir=out")
@@ -764,7 +778,7 @@ def test_resume_from_any_step_gives_bit_identical_weights(tmp_path, within, stop
 
 
 def test_killed_run_resumes_to_bit_identical_weights(tmp_path, within, environment):
-    many = ("trainer.steps=24", "trainer.validate_every=4")
+    many = ("trainer.max_steps=24", "trainer.val_check_interval=4")
     with running(tmp_path, environment, *many) as process:
         process.send_signal(signal.SIGKILL)
         process.communicate()
@@ -783,9 +797,9 @@ def test_resume_takes_the_runs_own_configuration_alone(smoke, tmp_path, within):
     assert (code, errors) == (
         2, ["error: nowhere: expected the directory of a training, it has no readable config.yaml"],
     )  # fmt: skip
-    code, _, errors = within(f"resume='{smoke[1]}'", "trainer.steps=5", "scale=2")
+    code, _, errors = within(f"resume='{smoke[1]}'", "trainer.max_steps=5", "scale=2")
     assert (code, errors) == (
-        2, ["error: resume: goes on under the run's own configuration; trainer.steps, scale cannot be changed"],
+        2, ["error: resume: goes on under the run's own configuration; trainer.max_steps, scale cannot be changed"],
     )  # fmt: skip
     code, _, errors = within(f"resume='{smoke[1]}'")
     assert code == 2
@@ -805,7 +819,7 @@ def means_of(folder):
 
 def test_evaluation_of_a_run_gives_the_scores_that_training_logged(tmp_path, within):
     code, _, errors = within(
-        *SMOKE, "trainer.validate_every=2", "trainer.validation_scenes=2", "output_dir=out",
+        *SMOKE, "trainer.val_check_interval=2", "patches.validation_scenes=2", "output_dir=out",
         "noise=gaussian_multiplicative", "noise.std=0.01", "seed=3",
     )  # fmt: skip
     assert (code, errors) == (0, [])
@@ -853,7 +867,7 @@ def test_unfinished_run_cannot_be_evaluated(tmp_path, within, interrupt):
 
 def test_mixtures_train_on_all_parts_and_validate_with_each(tmp_path, within):
     code, output, errors = within(
-        "trainer=smoke", "trainer.validate_every=2", "metrics.lpips=false", "device=cpu", "output_dir=out",
+        "trainer=smoke", "trainer.val_check_interval=2", "metrics.lpips=false", "device=cpu", "output_dir=out",
         "dataset=mixture",
         "dataset.parts.procedural.count=2", "dataset.parts.procedural.size=64",
         "~dataset.parts.folder", "~dataset.shares.folder",
@@ -897,45 +911,54 @@ def test_evaluation_datasets_are_not_trained_on(within, tmp_path):
 
 def test_training_starts_from_given_weights(smoke, tmp_path, within):
     weights = smoke[1] / "weights.safetensors"
-    rate = "trainer.learning_rate=1e-12"
-    code, _, errors = within(*SMOKE, f"trainer.init='{weights}'", rate, "output_dir=out")
+    rate = "model.optimizer.lr=1e-12"
+    code, _, errors = within(*SMOKE, f"start.weights='{weights}'", rate, "output_dir=out")
     assert (code, errors) == (0, [])
     one, other = (load_file(folder / "weights.safetensors") for folder in (smoke[1], tmp_path / "out"))
     assert all(torch.allclose(one[name], other[name], atol=1e-6) for name in one)
-    code, _, errors = within(*SMOKE, f"trainer.init='{weights}'", "model=facets", "output_dir=other")
+    code, _, errors = within(*SMOKE, f"start.weights='{weights}'", "model=facets", "output_dir=other")
     assert code == 2
     assert "expected weights of Facets" in errors[0]
-    code, _, errors = within(*SMOKE, "trainer.init=nowhere", "output_dir=other")
-    assert (code, errors) == (2, ["error: trainer.init: nowhere: no such weights file"])
+    code, _, errors = within(*SMOKE, "start.weights=nowhere", "output_dir=other")
+    assert (code, errors) == (2, ["error: start.weights: nowhere: no such weights file"])
 
 
 def test_network_that_fits_any_scale_starts_from_weights_of_another(tmp_path, within):
-    small = ("model=dg", "model.stages=1", "model.filters=4", "model.size=3")
+    small = ("model=dg", "model.net.stages=1", "model.net.filters=4", "model.net.size=3")
     assert within(*SMOKE, *small, "output_dir=four")[0] == 0
-    weights = "trainer.init=four/weights.safetensors"
+    weights = "start.weights=four/weights.safetensors"
     code, _, errors = within(
-        *SMOKE, *small, "scale=8", weights, "trainer.learning_rate=1e-12", "trainer.weight_decay=0", "output_dir=eight"
+        *SMOKE,
+        *small,
+        "scale=8",
+        weights,
+        "model.optimizer.lr=1e-12",
+        "model.optimizer.weight_decay=0",
+        "output_dir=eight",
     )
     assert (code, errors) == (0, [])
     one, other = (load_file(tmp_path / name / "weights.safetensors") for name in ("four", "eight"))
     assert all(torch.allclose(one[name], other[name], atol=1e-6) for name in one)
-    code, _, errors = within(*SMOKE, *small, "model.filters=5", weights, "output_dir=other")
+    code, _, errors = within(*SMOKE, *small, "model.net.filters=5", weights, "output_dir=other")
     assert code == 2
     assert "expected weights of DynamicGuidance" in errors[0]
 
 
 def test_network_that_depends_on_the_scale_refuses_weights_of_another(smoke, within):
-    code, _, errors = within(*SMOKE, "scale=8", f"trainer.init='{smoke[1]}/weights.safetensors'", "output_dir=other")
+    code, _, errors = within(*SMOKE, "scale=8", f"start.weights='{smoke[1]}/weights.safetensors'", "output_dir=other")
     assert code == 2
     assert errors[0].endswith("weights are for scale 4, the run is at scale 8, where MSGNet has other parameters")
 
 
 @pytest.mark.parametrize(
     ("model", "size"),
-    [("facets", ("degradation=everything", "model.deep=8", "model.blocks=3")), ("facets_box", ("model.blocks=1",))],
+    [
+        ("facets", ("degradation=everything", "model.net.deep=8", "model.net.blocks=3")),
+        ("facets_box", ("model.net.blocks=1",)),
+    ],
 )
 def test_facets_train_and_their_weights_are_those_of_the_method(tmp_path, within, model, size):
-    code, output, errors = within(*SMOKE, f"model={model}", "model.width=8", *size, "output_dir=out")
+    code, output, errors = within(*SMOKE, f"model={model}", "model.net.width=8", *size, "output_dir=out")
     assert (code, errors) == (0, [])
     assert output.startswith(f"model  {model} x4")
     assert ("loss   20 Lap_1 + RMSE_v + 2 RMSE (8 of soft maps)" in output) == (model == "facets")
@@ -944,9 +967,9 @@ def test_facets_train_and_their_weights_are_those_of_the_method(tmp_path, within
         "metrics.lpips=false", "output_dir=scores", name="eval",
     )  # fmt: skip
     assert (code, errors) == (0, [])
-    given = ("trainer.init=out/weights.safetensors", "trainer.shared=out/weights.safetensors", "scale=8")
-    given = (*given, "trainer.frozen=[errors.bias]")
-    code, _, errors = within(*SMOKE, f"model={model}", "model.width=8", *size, *given, "output_dir=larger")
+    given = ("start.weights=out/weights.safetensors", "start.shared=out/weights.safetensors", "scale=8")
+    given = (*given, "start.frozen=[errors.bias]")
+    code, _, errors = within(*SMOKE, f"model={model}", "model.net.width=8", *size, *given, "output_dir=larger")
     if model == "facets_box":
         assert code == 2
         assert "weights are for scale 4, the run is at scale 8" in errors[0]
@@ -966,16 +989,19 @@ def test_facets_train_and_their_weights_are_those_of_the_method(tmp_path, within
     ("arguments", "message"),
     [
         (("model=facets",), "degradation: expected everything or another distribution"),
-        (("model=msg", "model.depth_loss=surface"), "model.depth_loss: expected one of lap1, l1, mse for MSGNet"),
-        (("model=facets", "degradation=everything", "loss.w=2"), "loss: model=facets has a loss of its own"),
-        (("trainer.frozen=[wide.*]",), "trainer.frozen: expected patterns of parameters' names, such as "),
+        (
+            ("model=msg", "model.objective.depth_loss=surface"),
+            "model.objective.depth_loss: expected one of lap1, l1, mse, got 'surface'",
+        ),
+        (("model=facets", "degradation=everything", "loss.w=2"), "loss.w: model=facets has a loss of its own"),
+        (("start.frozen=[wide.*]",), "start.frozen: expected patterns of parameters' names, such as "),
         (("degradation=everything", "degradation.soft=2"), "degradation.soft: expected a fraction from 0 to 1, got 2"),
         (
             ("model=facets", "degradation=everything", "degradation.scales={4: 1, 8: 1}"),
             "degradation.scales: expected factors that weights for 4 serve, got 8",
         ),
         (
-            ("model=facets", "degradation=everything", "model.width=8", "trainer.init=SMOKE"),
+            ("model=facets", "degradation=everything", "model.net.width=8", "start.weights=SMOKE"),
             "expected weights of FacetsUNet or Facets with {'width': 8, 'blocks': 6, 'facets': 2}, got those of MSGNet",
         ),
     ],

@@ -15,8 +15,8 @@ REPOSITORY = Path(__file__).resolve().parents[2]
 TRAIN = str(REPOSITORY / "train.py")
 SMALL = (
     "trainer=smoke", "dataset=procedural", "dataset.count=6", "dataset.size=64", "metrics.lpips=false", "device=cpu",
-    "precision=float32", "trainer.steps=4", "trainer.validate_every=2", "trainer.validation_scenes=3", "seed=3",
-    "model=facets", "model.deep=8", "model.blocks=3", "model.width=8", "degradation=everything",
+    "precision=float32", "trainer.max_steps=4", "trainer.val_check_interval=2", "patches.validation_scenes=3", "seed=3",
+    "model=facets", "model.net.deep=8", "model.net.blocks=3", "model.net.width=8", "degradation=everything",
     "scale=2", "degradation.scales={1: 1, 2: 1}",
 )  # fmt: skip
 TWO = ("trainer.devices=2", "trainer.strategy=ddp")
@@ -32,7 +32,7 @@ def environment(dsr_cache):
 def two(tmp_path_factory, environment):
     """The folder of a training on two devices of 2 patches each, ``two``, and of one on one device of 4, ``one``."""
     folder = tmp_path_factory.mktemp("devices")
-    done = run_python(TRAIN, *SMALL, "trainer.batch=4", "output_dir=one", cwd=folder, env=environment)
+    done = run_python(TRAIN, *SMALL, "patches.batch=4", "output_dir=one", cwd=folder, env=environment)
     assert done.returncode == 0, done.stderr
     done = run_python(TRAIN, *SMALL, *TWO, "output_dir=two", cwd=folder, env=environment)
     assert (done.returncode, done.stderr) == (0, "")
@@ -126,7 +126,7 @@ def test_killed_training_of_two_devices_goes_on_to_the_same_weights(two, environ
 
 
 def test_process_that_is_lost_ends_the_others_in_one_line(tmp_path, environment):
-    some = ("trainer.validation_scenes=1", "output_dir=out")  # which the first one validates alone
+    some = ("patches.validation_scenes=1", "output_dir=out")  # which the first one validates alone
     codes, errors = as_torchrun(killer(tmp_path, 3, "SIGKILL", (1,)), tmp_path, environment, *some)
     assert codes == [2, -9], errors
     assert len(errors[0]) == 1, errors
@@ -139,7 +139,7 @@ def test_process_that_is_lost_ends_the_others_in_one_line(tmp_path, environment)
 def test_network_with_layers_that_have_no_part_in_it_trains_on_two_devices(tmp_path, environment):
     fixed = [each for each in SMALL if "scales" not in each]  # three blocks come before the wide layers
     done = run_python(
-        TRAIN, *fixed, *TWO, "trainer.steps=2", "output_dir=out", cwd=tmp_path, env=environment
+        TRAIN, *fixed, *TWO, "trainer.max_steps=2", "output_dir=out", cwd=tmp_path, env=environment
     )  # with layers idle, the second step fails if torch does not look for them
     assert (done.returncode, done.stderr) == (0, "")
 
@@ -164,7 +164,9 @@ def test_job_of_slurm_with_one_task_trains_on_one_device_and_keeps_the_requeue_s
     )
     slurm = {"SLURM_JOB_ID": "7", "SLURM_JOB_NAME": "wrap", "SLURM_NTASKS": "2", "SLURM_PROCID": "0",
              "SLURM_LOCALID": "0", "SLURM_NODEID": "0", "SLURM_NODELIST": "localhost"}  # fmt: skip
-    done = run_python(str(program), *SMALL, "trainer.steps=1", "output_dir=out", cwd=tmp_path, env=environment | slurm)
+    done = run_python(
+        str(program), *SMALL, "trainer.max_steps=1", "output_dir=out", cwd=tmp_path, env=environment | slurm
+    )
     assert (done.returncode, done.stderr) == (0, "")
     assert "handlers True <function requeued." in done.stdout  # and none of Lightning's
     assert (tmp_path / "out" / "weights.safetensors").is_file()

@@ -62,7 +62,7 @@ def killing(tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(tmp_path / "modules")
     (tmp_path / "conf" / "method").mkdir(parents=True)
     (tmp_path / "marks").mkdir()
-    node = f"name: killer\nlabel: Killer\ntarget: killing.Killer\nmarks: {tmp_path / 'marks'}\ntimes: 0\n"
+    node = f"_target_: killing.Killer\nmarks: {tmp_path / 'marks'}\ntimes: 0\n"
     (tmp_path / "conf" / "method" / "killer.yaml").write_text(node)
     frames = str(make_frames(tmp_path / "frames", 8))
     options = ("--config-dir", str(tmp_path / "conf"), "--only", "depth", "--fov", "60", "--depth-unit", "mm")

@@ -8,6 +8,7 @@ from typing import Literal
 
 import pytest
 import torch
+from hydra.utils import instantiate
 
 from dsr.app.schema import EvalConfig
 from dsr.utils.builder import ConfigError, build
@@ -51,7 +52,7 @@ def module(monkeypatch):
 
 
 def node(**keys):
-    return {"name": "toy", "target": "toy_home.Toy", **keys}
+    return {"_target_": "toy_home.Toy", **keys}
 
 
 def refusal(keys, group="dataset", given=None):
@@ -68,16 +69,22 @@ def test_group_keys_are_the_arguments_of_the_target():
 
 def test_name_is_passed_to_a_target_that_takes_one(tmp_path):
     (tmp_path / "scene").mkdir()
-    node = {"name": "mine", "target": "dsr.data.folder.Folder", "root": str(tmp_path)}
-    assert build("dataset", node).name == "mine"
+    node = {"_target_": "dsr.data.folder.Folder", "root": str(tmp_path)}
+    assert build("dataset", node, {"name": "mine"}).name == "mine"
 
 
-def test_descriptive_keys_are_not_passed_to_the_target():
-    build("method", node(root="r", label="Toy", weights_file="x", weights_source="y"))
+def test_nodes_among_the_arguments_are_built_first_and_a_partial_is_called_later():
+    made = build("dataset", node(root="r", file={"_target_": "toy_home.no_arguments"}))
+    assert made.values[-1] == "built"
+    made = build("dataset", node(_partial_=True, root="r"))(count=7)
+    assert (made.values[0], made.values[3]) == ("r", 7)
+    with pytest.raises(ConfigError, match=r"^dataset\.file\.x: unknown key; dataset\.file takes none"):
+        build("dataset", node(root="r", file={"_target_": "toy_home.no_arguments", "x": 1}))
+    assert instantiate(node(root="r", file={"_target_": "toy_home.no_arguments"})).values[-1] == "built"
 
 
 def test_target_may_be_a_function_without_arguments():
-    assert build("method", {"name": "f", "target": "toy_home.no_arguments"}) == "built"
+    assert build("method", {"_target_": "toy_home.no_arguments"}) == "built"
 
 
 def test_target_gets_the_run_values_that_it_names():
@@ -86,9 +93,7 @@ def test_target_gets_the_run_values_that_it_names():
 
 def test_unknown_key_is_refused_with_the_known_keys():
     message = refusal(node(root="r", rot="x"))
-    assert message == (
-        "dataset.rot: unknown key; dataset=toy takes root, names, share, count, order, scale, flag, file"
-    )
+    assert message == ("dataset.rot: unknown key; dataset takes root, names, share, count, order, scale, flag, file")
 
 
 def test_group_may_not_set_a_value_of_the_run():
@@ -98,12 +103,12 @@ def test_group_may_not_set_a_value_of_the_run():
 
 
 def test_target_without_arguments_refuses_every_key():
-    message = refusal({"name": "f", "target": "toy_home.no_arguments", "x": 1}, "method")
-    assert message == "method.x: unknown key; method=f takes none"
+    message = refusal({"_target_": "toy_home.no_arguments", "x": 1}, "method")
+    assert message == "method.x: unknown key; method takes none"
 
 
 def test_missing_key_is_refused_with_how_to_set_it():
-    assert refusal(node(root="???")) == "dataset.root: dataset=toy needs it: dataset.root=..."
+    assert refusal(node(root="???")) == "dataset.root: dataset needs it: dataset.root=..."
 
 
 @pytest.mark.parametrize(
@@ -145,7 +150,7 @@ def test_value_error_of_the_target_becomes_a_configuration_error(root):
     "target", [None, 3, "toy", "no_such_module.Toy", "toy_home.Tay", "", "..x", "toy_home.__name__"]
 )
 def test_missing_target_is_refused(target):
-    assert refusal({"name": "toy", "target": target}, "method").startswith("method.target: ")
+    assert refusal({"_target_": target}, "method").startswith("method._target_: ")
 
 
 def test_device_auto_is_the_gpu_where_there_is_one():
@@ -176,7 +181,7 @@ def test_home_of_an_unknown_user_is_refused():
 
 @pytest.mark.parametrize("group", [5, "simgeo", ["a"], None])
 def test_group_without_keys_is_refused(group):
-    with pytest.raises(ConfigError, match=r"^validation.x: expected keys, name and target among them, got "):
+    with pytest.raises(ConfigError, match=r"^validation.x: expected keys, _target_ among them, got "):
         build("validation.x", group)
 
 
@@ -215,7 +220,7 @@ def test_value_outside_its_choices_is_refused(changes, message):
 
 
 def test_unknown_setting_is_refused_with_the_known_ones():
-    with pytest.raises(ConfigError, match=r"^scal: unknown key; expected dataset, .*scale, "):
+    with pytest.raises(ConfigError, match=r"^scal: unknown key; expected names, dataset, .*scale, "):
         EvalConfig.of(settings(scal=4))
 
 

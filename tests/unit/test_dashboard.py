@@ -76,7 +76,7 @@ def test_layout_begins_with_the_metrics_of_looks_as_that_of_trainings_does(log):
 def test_table_of_runs_has_the_columns_of_all_kinds_of_runs(make_run, tmp_path):
     folder = make_run(tmp_path, scenes=("s",), scale=2)
     versions = json.loads((folder / "versions.json").read_text())
-    versions["identity"]["method"] |= {"steps": 600, "w": 1.5, "widths": [1, 2], "target": "dsr.x"}
+    versions["identity"]["method"] |= {"steps": 600, "w": 1.5, "widths": [1, 2], "_target_": "dsr.x"}
     (folder / "versions.json").write_text(json.dumps(versions))
     save_dashboard(folder)
     content = read(folder).SummaryMetadata("_hparams_/session_start_info").plugin_data.content

@@ -107,7 +107,7 @@ def test_note_of_a_divergence_refuses_the_same_settings_and_no_others(tmp_path):
     error = DivergenceError("diverged at step 30: the loss is nan, at a learning rate of 2")
     told = str(note_divergence(tmp_path, tmp_path / "last.ckpt", {"scale": 4, "trainer": {"steps": 40}}, error))
     assert told.startswith(f"{tmp_path}: the training diverged at step 30: the loss is nan, at a learning rate of 2; ")
-    assert f"{tmp_path / 'last.ckpt'} of step 20 is kept; a lower trainer.learning_rate" in told
+    assert f"{tmp_path / 'last.ckpt'} of step 20 is kept; a lower model.optimizer.lr" in told
     with pytest.raises(ConfigError, match=r"diverged at step 30: .*, and would again"):
         expect_no_divergence(tmp_path, {"scale": 4, "trainer": {"steps": 40}})
     expect_no_divergence(tmp_path, {"scale": 8, "trainer": {"steps": 40}})

@@ -37,7 +37,7 @@ def command(monkeypatch, tmp_path, capfd):
 
 SETTINGS = (
     "dataset, downsampling, noise, metrics, scale, device, precision, seed, output_dir, overwrite, holes, "
-    "method, weights, run, trust, workers, threads"
+    "method, label, weights, run, trust, workers, threads"
 )
 DATASETS = (
     "arkitscenes, ddrnet, diml, folder, icl, lu, middlebury, middlebury2001, middlebury2003, middlebury2005, "
@@ -69,7 +69,7 @@ USAGE_ERRORS = {
     "lpips=false": "lpips: unknown key; expected metrics.lpips=false",
     "colour=8": f"colour: unknown key; expected {SETTINGS}",
     "dataset.rot=x": "dataset.rot: unknown key; expected dataset.root=x",
-    "dataset.photo=x": "dataset.photo: unknown key; expected dataset.name, dataset.root, dataset.scenes, dataset.size",
+    "dataset.photo=x": "dataset.photo: unknown key; expected dataset.root, dataset.scenes, dataset.size",
     "metrics.lpip=false": "metrics.lpip: unknown key; expected metrics.lpips=false",
     "seed=four": "seed: Value 'four' of type 'str' could not be converted to Integer",
     "seed=1.5": "seed: Value '1.5' of type 'float' could not be converted to Integer",
@@ -128,7 +128,7 @@ def test_mistyped_key_of_a_group_is_compared_with_the_keys_of_that_group(command
     code, error, _ = command("dataset=folder", "dataset.picture=x")
     assert (code, error) == (
         2,
-        "error: dataset.picture: unknown key; expected dataset.name, dataset.root, dataset.scenes\n",
+        "error: dataset.picture: unknown key; expected dataset.root, dataset.scenes\n",
     )
 
 
@@ -138,12 +138,12 @@ def test_mistyped_key_of_a_group_is_compared_with_the_keys_of_that_group(command
         ("eval", ("method=dip_v", "loss.w=2"), "method.w=2"),
         ("eval", ("method=dip_v", "steps=100"), "method.steps=100"),
         ("eval", ("loss.visual=dssim",), "method.visual=dssim with method=dip, dip_v, dip_v_warm"),
-        ("train", ("w=2",), "loss.w=2"),
-        ("train", ("method.w=2",), "loss.w=2"),
+        ("train", ("w=2",), "model.objective.w=2 or loss.w=2"),
+        ("train", ("method.w=2",), "model.objective.w=2 or loss.w=2"),
         ("train", ("method=msg_v",), "model=msg_v"),
         ("train", ("method=tgv",), "method=tgv of eval.py"),
-        ("train", ("steps=100",), "trainer.steps=100"),
-        ("train", ("lr=1e-3",), "trainer.learning_rate=1e-3"),
+        ("train", ("steps=100",), "trainer.max_steps=100"),
+        ("train", ("lr=1e-3",), "model.optimizer.lr=1e-3"),
         ("train", ("logger.mode=offline",), "logger.wandb.mode=offline with logger=wandb"),
         ("train", ("logger=[csv,wandb]", "logger.mode=offline"), "logger.wandb.mode=offline"),
     ],
@@ -170,7 +170,7 @@ def test_quoted_value_of_the_message_is_accepted(command, quoted):
 def test_job_gets_the_composed_configuration_and_no_directory_is_made(command, tmp_path):
     code, error, [config] = command("scale=8", "dataset=folder", "dataset.root=here")
     assert (code, error) == (0, "")
-    assert (config.scale, config.dataset.root, config.method.name) == (8, "here", "msg_v")
+    assert (config.scale, config.dataset.root, config.method.model) == (8, "here", "msg_v")
     assert list(tmp_path.iterdir()) == []
 
 
@@ -203,8 +203,8 @@ def test_program_defect_is_not_reported_as_a_usage_error(command):
 def test_multirun_calls_the_job_for_every_combination(command):
     code, error, seen = command("-m", "scale=4,8", "method=nearest,bicubic")
     assert (code, error) == (0, "")
-    assert [(config.scale, config.method.name) for config in seen] == [
-        (4, "nearest"), (4, "bicubic"), (8, "nearest"), (8, "bicubic"),
+    assert [(config.scale, config.label) for config in seen] == [
+        (4, "Nearest"), (4, "Bicubic"), (8, "Nearest"), (8, "Bicubic"),
     ]  # fmt: skip
 
 
@@ -300,7 +300,7 @@ def test_multirun_with_an_unknown_choice_starts_no_job(command):
 
 def test_config_dir_adds_choices(command, tmp_path):
     (tmp_path / "own" / "method").mkdir(parents=True)
-    (tmp_path / "own" / "method" / "mine.yaml").write_text("name: mine\ntarget: dsr.methods.base.mine\nstrength: 1\n")
+    (tmp_path / "own" / "method" / "mine.yaml").write_text("_target_: dsr.methods.base.mine\nstrength: 1\n")
     code, error, [config] = command("--config-dir", "own", "method=mine", "method.strength=2")
     assert (code, error, config.method.strength) == (0, "", 2)
     code, error, _ = command("method=mein", "--config-dir=own")

@@ -20,28 +20,28 @@ DIRECTORIES = config_directories()
 FOLDER = DIRECTORIES[0] / "experiment"
 EVALUATIONS = ("all_methods", "downsampling_mismatch", "field_benchmarks", "noise", "paper_tables",
                "published_networks", "sensors", "visual_losses")  # fmt: skip
-FULL = ["trainer=full", "dataset.count=800"]
-PDN = ["model=pdn", *FULL, "trainer.average=0.998"]
-DG = ["model=dg", "model.depth_loss=lap1", "model.visual=true", "dataset.count=800", "trainer.weight_decay=0",
-      "trainer.average=0.998", "precision=float32"]  # fmt: skip
-DDRNET = ["model=ddrnet", "dataset.count=360", "trainer.average=0.998", "trainer.photo=0", "precision=float32"]
-SPARSE_TO_DENSE = ["model=sparse_to_dense", "dataset.count=360", "trainer.photo=0", "trainer.patch=192",
-                   "trainer.batch=4", "precision=bfloat16"]  # fmt: skip
-FACETS_BOX = ["model=facets_box", *FULL, "trainer.patch=128", "trainer.batch=4", "trainer.photo=0"]
-FACETS = ["model=facets", "degradation=everything", "dataset.count=800", "trainer.patch=384", "trainer.batch=1",
-          "trainer.validate_every=2000", "trainer.photo=0", "trainer.learning_rate=4e-4", "trainer.warmup=500",
-          "trainer.average=0.9995", "precision=bfloat16"]  # fmt: skip
+FULL = ["trainer=full", "dataset.count=800", "model.scheduler.warmup=500"]
+PDN = ["model=pdn", *FULL, "model.average=0.998"]
+DG = ["model=dg", "model.objective.depth_loss=lap1", "model.objective.w=auto", "dataset.count=800",
+      "model.optimizer.weight_decay=0", "model.average=0.998", "precision=float32"]  # fmt: skip
+DDRNET = ["model=ddrnet", "dataset.count=360", "model.average=0.998", "patches.photo=0", "precision=float32"]
+SPARSE_TO_DENSE = ["model=sparse_to_dense", "dataset.count=360", "patches.photo=0", "patches.patch=192",
+                   "patches.batch=4", "precision=bfloat16"]  # fmt: skip
+FACETS_BOX = ["model=facets_box", *FULL, "patches.patch=128", "patches.batch=4", "patches.photo=0"]
+FACETS = ["model=facets", "degradation=everything", "dataset.count=800", "patches.patch=384", "patches.batch=1",
+          "trainer.val_check_interval=2000", "patches.photo=0", "model.optimizer.lr=4e-4", "model.scheduler.warmup=500",
+          "model.average=0.9995", "precision=bfloat16"]  # fmt: skip
 FIRST = [*FACETS, "degradation.folds=0"]
-SECOND = [*FACETS, "trainer.warmup=300", "seed=1"]
-SHORT = ["trainer.steps=1000", "trainer.validate_every=500", "trainer.warmup=100", "trainer.average=0.998",
-         "trainer.learning_rate=3e-4"]  # fmt: skip
+SECOND = [*FACETS, "model.scheduler.warmup=300", "seed=1"]
+SHORT = ["trainer.max_steps=1000", "trainer.val_check_interval=500", "model.scheduler.warmup=100",
+         "model.average=0.998", "model.optimizer.lr=3e-4"]  # fmt: skip
 MORE_NOISE = [
     "degradation.kernels={box: 0.3, nearest: 0.12, bilinear: 0.12, bicubic: 0.28, gaussian: 0.1, spread: 0.08}",
     "degradation.noises={none: 0.32, white: 0.22, correlated: 0.08, structured: 0.13, flight: 0.12, lidar: 0.05, "
     "stereo: 0.08}",
 ]  # fmt: skip
 CLEAN = [
-    *FIRST, "trainer.validate_every=1000", "trainer.patch=192", "trainer.batch=4", "seed=2",
+    *FIRST, "trainer.val_check_interval=1000", "patches.patch=192", "patches.batch=4", "seed=2",
     "degradation.kernels={box: 1, nearest: 0, bilinear: 0, bicubic: 0, gaussian: 0, spread: 0}",
     "degradation.noises={none: 1, white: 0, correlated: 0, structured: 0, flight: 0, lidar: 0, stereo: 0}",
     "degradation.holes={none: 1, blobs: 0, shadows: 0, steps: 0, dark: 0, pixels: 0}",
@@ -50,49 +50,50 @@ CLEAN = [
 ]  # fmt: skip
 MSG_V = ["model=msg_v", *FULL, "loss.w=1.5"]
 RECIPES = {
-    "msg_v_x4_stage1": ["model=msg_v", *FULL, "loss.w=0.36", "trainer.photo=0"],
-    "msg_v_x4_stage2": [*MSG_V, "trainer.steps=4000", "trainer.learning_rate=4e-4", "trainer.average=0.999",
-                        "trainer.photo=0"],
-    "msg_v_x4_stage3": [*MSG_V, "trainer.steps=4000", "trainer.learning_rate=4e-4", "trainer.average=0.999"],
-    "msg_v_x4": [*MSG_V, "trainer.steps=12000", "trainer.learning_rate=6e-4", "seed=1"],
+    "msg_v_x4_stage1": ["model=msg_v", *FULL, "loss.w=0.36", "patches.photo=0"],
+    "msg_v_x4_stage2": [*MSG_V, "trainer.max_steps=4000", "model.optimizer.lr=4e-4", "model.average=0.999",
+                        "patches.photo=0"],
+    "msg_v_x4_stage3": [*MSG_V, "trainer.max_steps=4000", "model.optimizer.lr=4e-4", "model.average=0.999"],
+    "msg_v_x4": [*MSG_V, "trainer.max_steps=12000", "model.optimizer.lr=6e-4", "seed=1"],
     "msg_v_x8_stage1": ["model=msg_v", "scale=8"],
-    "msg_v_x8": [*MSG_V, "scale=8", "trainer.steps=12000", "trainer.learning_rate=8e-4", "seed=1"],
-    "msg_x4": ["model=msg", *FULL, "trainer.steps=10000"],
-    "msg_x8": ["model=msg", *FULL, "trainer.steps=10000", "scale=8"],
-    "msg_v_x4_noisy": [*MSG_V, "noise=gaussian_multiplicative", "noise.std=0.003", "trainer.steps=5000",
-                       "trainer.learning_rate=6e-4", "seed=2"],
+    "msg_v_x8": [*MSG_V, "scale=8", "trainer.max_steps=12000", "model.optimizer.lr=8e-4", "seed=1"],
+    "msg_x4": ["model=msg", *FULL, "trainer.max_steps=10000"],
+    "msg_x8": ["model=msg", *FULL, "trainer.max_steps=10000", "scale=8"],
+    "msg_v_x4_noisy": [*MSG_V, "noise=gaussian_multiplicative", "noise.std=0.003", "trainer.max_steps=5000",
+                       "model.optimizer.lr=6e-4", "seed=2"],
     "facets_box_x4": [*FACETS_BOX, "loss.w=0.27"],
     "facets_box_x8": [*FACETS_BOX, "loss.w=0.28", "scale=8"],
-    "facets_x2_stage1": [*FIRST, "scale=2", "degradation.scales={1: 0.6, 2: 0.4}", "trainer.patch=192",
-                         "trainer.steps=12000"],
+    "facets_x2_stage1": [*FIRST, "scale=2", "degradation.scales={1: 0.6, 2: 0.4}", "patches.patch=192",
+                         "trainer.max_steps=12000"],
     "facets_x2": [*SECOND, "scale=2", "degradation.scales={1: 0.75, 2: 0.25}", "degradation.folds=0.4",
                   "degradation.noises={none: 0.2, white: 0.15, correlated: 0.15, structured: 0.2, flight: 0.1, "
-                  "lidar: 0.05, stereo: 0.15}", "trainer.patch=256", "trainer.steps=4200"],
-    "facets_x4_stage1": [*FIRST, "trainer.steps=26000"],
-    "facets_x4": [*SECOND, *MORE_NOISE, "trainer.steps=5600"],
-    "facets_x4_clean": [*CLEAN, "trainer.steps=12800"],
-    "facets_x8_stage1": [*FIRST, "scale=8", "trainer.steps=10000", "trainer.patch=512", "trainer.learning_rate=3e-4"],
-    "facets_x8": [*SECOND, *MORE_NOISE, "scale=8", *SHORT, "trainer.patch=512",
-                  "trainer.shared=outputs/train/facets_x4/weights.safetensors"],
-    "facets_x8_clean": [*CLEAN, "scale=8", "trainer.steps=12500", "trainer.patch=256", "trainer.batch=2",
-                        "trainer.warmup=300", "trainer.average=0.999"],
-    "facets_x16": [*FACETS, "scale=16", *SHORT, "trainer.patch=512",
-                   "trainer.shared=outputs/train/facets_x4/weights.safetensors"],
-    "pdn_x4": [*PDN, "trainer.steps=3000", "trainer.warmup=200", "trainer.validate_every=1000"],
-    "pdn_x8": [*PDN, "scale=8", "trainer.steps=1000", "trainer.warmup=50", "trainer.learning_rate=5e-4",
-               "trainer.validate_every=500"],
-    "dg_x4": [*DG, "trainer.steps=2000", "trainer.validate_every=500", "trainer.learning_rate=0.02",
-              "trainer.warmup=100", "trainer.patch=64", "trainer.batch=5"],
-    "dg_x8": [*DG, "scale=8", "trainer.steps=1200", "trainer.validate_every=400", "trainer.learning_rate=0.01",
-              "trainer.warmup=50", "trainer.batch=3"],
-    "sparse_to_dense_x4": [*SPARSE_TO_DENSE, "trainer.steps=16000"],
-    "sparse_to_dense_x8": [*SPARSE_TO_DENSE, "scale=8", "trainer.steps=5000", "trainer.learning_rate=5e-4",
-                           "trainer.warmup=100"],
-    "ddrnet_x4": [*DDRNET, "trainer.steps=4000", "trainer.warmup=200", "trainer.patch=64", "trainer.batch=4"],
-    "ddrnet_x8": [*DDRNET, "scale=8", "trainer.steps=2000", "trainer.learning_rate=5e-4", "trainer.warmup=50",
-                  "trainer.batch=2"],
+                  "lidar: 0.05, stereo: 0.15}", "patches.patch=256", "trainer.max_steps=4200"],
+    "facets_x4_stage1": [*FIRST, "trainer.max_steps=26000"],
+    "facets_x4": [*SECOND, *MORE_NOISE, "trainer.max_steps=5600"],
+    "facets_x4_clean": [*CLEAN, "trainer.max_steps=12800"],
+    "facets_x8_stage1": [*FIRST, "scale=8", "trainer.max_steps=10000", "patches.patch=512", "model.optimizer.lr=3e-4"],
+    "facets_x8": [*SECOND, *MORE_NOISE, "scale=8", *SHORT, "patches.patch=512",
+                  "start.shared=outputs/train/facets_x4/weights.safetensors"],
+    "facets_x8_clean": [*CLEAN, "scale=8", "trainer.max_steps=12500", "patches.patch=256", "patches.batch=2",
+                        "model.scheduler.warmup=300", "model.average=0.999"],
+    "facets_x16": [*FACETS, "scale=16", *SHORT, "patches.patch=512",
+                   "start.shared=outputs/train/facets_x4/weights.safetensors"],
+    "pdn_x4": [*PDN, "trainer.max_steps=3000", "model.scheduler.warmup=200", "trainer.val_check_interval=1000"],
+    "pdn_x8": [*PDN, "scale=8", "trainer.max_steps=1000", "model.scheduler.warmup=50", "model.optimizer.lr=5e-4",
+               "trainer.val_check_interval=500"],
+    "dg_x4": [*DG, "trainer.max_steps=2000", "trainer.val_check_interval=500", "model.optimizer.lr=0.02",
+              "model.scheduler.warmup=100", "patches.patch=64", "patches.batch=5"],
+    "dg_x8": [*DG, "scale=8", "trainer.max_steps=1200", "trainer.val_check_interval=400", "model.optimizer.lr=0.01",
+              "model.scheduler.warmup=50", "patches.batch=3"],
+    "sparse_to_dense_x4": [*SPARSE_TO_DENSE, "trainer.max_steps=16000"],
+    "sparse_to_dense_x8": [*SPARSE_TO_DENSE, "scale=8", "trainer.max_steps=5000", "model.optimizer.lr=5e-4",
+                           "model.scheduler.warmup=100"],
+    "ddrnet_x4": [*DDRNET, "trainer.max_steps=4000", "model.scheduler.warmup=200", "patches.patch=64",
+                  "patches.batch=4"],
+    "ddrnet_x8": [*DDRNET, "scale=8", "trainer.max_steps=2000", "model.optimizer.lr=5e-4", "model.scheduler.warmup=50",
+                  "patches.batch=2"],
 }  # fmt: skip
-"""The overrides of ``train.py`` that each training had, but for ``trainer.init``."""
+"""The overrides of ``train.py`` that each training had, but for ``start.weights``."""
 STARTS = {
     "msg_v_x4_stage2": "outputs/train/msg_v_x4_stage1/weights.safetensors",
     "msg_v_x4_stage3": "outputs/train/msg_v_x4_stage2/weights.safetensors",
@@ -147,7 +148,7 @@ def test_an_experiment_opens_with_its_table_figures_cost_and_command(name):
 @pytest.mark.parametrize("name", RECIPES)
 def test_recipe_is_the_training_that_made_the_weights(name):
     documented = plain_config(compose("train", RECIPES[name], DIRECTORIES))
-    documented["trainer"]["init"] = STARTS.get(name)
+    documented["start"]["weights"] = STARTS.get(name)
     documented["output_dir"] = f"outputs/train/{name}"
     assert experiment(name, "train") == documented
 
@@ -155,7 +156,7 @@ def test_recipe_is_the_training_that_made_the_weights(name):
 @pytest.mark.parametrize("name", RECIPES)
 def test_a_recipe_is_valid(name):
     settings = TrainConfig.of(experiment(name, "train"))
-    build("model", settings.model, {"scale": settings.scale})
+    build("model", settings.model)
     training_data(settings)
 
 
@@ -182,7 +183,7 @@ def test_all_jobs_of_an_experiment_are_valid(name, tmp_path, monkeypatch):
         settings = EvalConfig.of(plain)
         for group in ("downsampling", "noise", "holes"):
             build(group, plain[group])
-        absent = plain["dataset"]["name"] in ("lu", "middlebury8", "ddrnet", "rgbdd_real")
+        absent = plain["names"]["dataset"] in ("lu", "middlebury8", "ddrnet", "rgbdd_real")
         with pytest.raises(ConfigError, match="expected its files in") if absent else contextlib.nullcontext():
             build("dataset", plain["dataset"])
         assert issubclass(load_target("method", settings.method), Method)

@@ -21,7 +21,6 @@ from dsr.inference import api as people
 from dsr.inference.inspection import enlarged_by
 from dsr.inference.plans import OWN_SIZE
 from dsr.inference.resizing import resize_nearest
-from dsr.methods.networks.weight_choice import find_weights
 from dsr.methods.recipe import list_methods, read_recipe
 
 
@@ -353,8 +352,7 @@ def test_depth_a_little_larger_than_the_photo_is_taken(method: str) -> None:
 )
 def test_ratios_next_to_a_factor_take_its_weights(photo: tuple[int, int], depth: tuple[int, int], factor: int) -> None:
     assert plan(photo, depth).scale == factor
-    node = read_recipe("facets").at(factor)
-    assert find_weights(node, max(photo[1] / depth[1], 1)).name == f"facets_x{max(factor, 2)}.safetensors"
+    assert read_recipe("facets").weights(max(photo[1] / depth[1], 1)).name == f"facets_x{max(factor, 2)}.safetensors"
 
 
 def test_example_of_the_documentation_runs() -> None:

@@ -6,6 +6,7 @@ import re
 
 import pytest
 import torch
+from lightning.pytorch.loggers import TensorBoardLogger
 from lightning.pytorch.utilities import rank_zero_only
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from tensorboard.plugins.custom_scalar import layout_pb2
@@ -26,25 +27,25 @@ def rows_of(folder):
 
 @pytest.mark.filterwarnings("ignore:.*exists and is not empty.*")
 def test_table_has_a_row_for_each_step_and_goes_on_after_an_interruption(tmp_path):
-    first = loggers.csv(tmp_path)
+    first = loggers.CsvLog(tmp_path)
     first.log_metrics({"train/loss": 0.5, "epoch": 0.0}, 9)
     first.log_metrics({"val/RMSE_v": 0.25}, 9)
     first.log_metrics({"train/loss": 0.75}, 19)
     first.finalize("failed")
     assert rows_of(tmp_path)[0] == {"step": "9", "train/loss": "0.5", "val/RMSE_v": "0.25"}
-    again = loggers.csv(tmp_path)
+    again = loggers.CsvLog(tmp_path)
     again.log_metrics({"train/loss": 0.125}, 19)  # done again
     again.finalize("success")
     both = [{"step": "9", "train/loss": "0.5", "val/RMSE_v": "0.25"}, {"step": "19", "train/loss": "0.125"}]
     assert rows_of(tmp_path) == both
-    last = loggers.csv(tmp_path)
+    last = loggers.CsvLog(tmp_path)
     last.log_metrics({"val/RMSE_v": 0.5}, 19)  # of a training that was interrupted during a validation
     last.finalize("success")
     assert rows_of(tmp_path) == [both[0], {**both[1], "val/RMSE_v": "0.5"}]
 
 
 def test_layout_of_tensorboard_begins_with_looks(tmp_path):
-    logger = loggers.tensorboard(tmp_path)
+    logger = TensorBoardLogger(tmp_path, name=None, version="tensorboard")
     names = ("BadPix_v_5", "RMSE_d", "LPIPS_v", "RMSE_v1", "DSSIM_v", "RMSE_v")
     log_layout(logger, {name: f"{name}, title" for name in names})
     logger.finalize("success")

@@ -25,7 +25,7 @@ def run(label, values, *, dataset="mine", seed=0, method="other", target=FOLDER)
         for scene, value in values.items()
         for metric, variant in (("RMSE_d", ""), ("DSSIM_v", "max"))
     ]
-    settings = {"dataset": {"target": target}}
+    settings = {"dataset": {"_target_": target}}
     return Run(folder=Path("runs", label), label=label, scores=pd.DataFrame(rows), seconds={}, settings=settings,
                versions={}, scenes=tuple(values), **about)  # fmt: skip
 

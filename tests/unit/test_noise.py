@@ -147,9 +147,8 @@ def test_sensor_draws_the_same_numbers_for_all_settings() -> None:
 def test_configuration_files_hold_the_defaults(name: str, expected: Noise) -> None:
     node = OmegaConf.to_container(OmegaConf.load(REPOSITORY / "conf" / "noise" / f"{name}.yaml"))
     assert isinstance(node, dict)
-    assert node["name"] == name
     assert build("noise", node) == expected  # type: ignore[arg-type]
-    assert set(node) == {"name", "target", *vars(expected)}
+    assert set(node) == {"_target_", *vars(expected)}
 
 
 @pytest.mark.parametrize(

@@ -126,7 +126,7 @@ def test_command_writes_packaged_networks(method, scale, tmp_path, capsys):
         (("--method", "bicubic"), "method: expected one with a network of dsr, ddrnet, dg, facets, facets_box, msg, "),
         (("--scale", "3"), "weights are for scale 4, the run is at scale 3"),
         (("--scale", "0"), "--scale: expected a factor of 1 or more, got 0"),
-        (("--method", "pdn", "--scale", "16"), "method=pdn at scale 16 needs weights=FILE"),
+        (("--method", "pdn", "--scale", "16"), "scale 16 needs weights=FILE"),
         (("--weights", "nowhere.safetensors"), "nowhere.safetensors (no such file)"),
     ],
 )

@@ -229,7 +229,7 @@ def test_holes_of_the_truth_are_told_from_those_of_a_prediction(make_run, tmp_pa
 
 def test_papers_values_of_methods_that_were_not_run_stand_only_beside_its_own_scenes():
     folder = "dsr.data.folder.Folder"
-    table = tables(run("MSG-V", {"lucy": 23.6}, dataset="mine", target=folder))["mine_x4_box"]
+    table = tables(run("MSG-V", {"lucy": 23.6}, dataset="mine", _target_=folder))["mine_x4_box"]
     [group] = table.groups
     assert group.rows[0].published["RMSE_d"] == 74
     assert group.paper_only["PDN"]["RMSE_d"] == published_value("Lucy", "PDN")
@@ -255,7 +255,7 @@ def published_value(scene, method, scale=4, key="RMSE_d"):
         {"method": "mine"},
         {"dataset": "icl", "scene": "plant"},
         {"scene": "cube_no_texture"},
-        {"scene": "cube_no_texture", "dataset": "mine", "target": "dsr.data.folder.Folder"},
+        {"scene": "cube_no_texture", "dataset": "mine", "_target_": "dsr.data.folder.Folder"},
         {"scene": "vintage", "dataset": "middlebury", "without_offset": []},
     ],
     ids=str,

@@ -22,7 +22,7 @@ from dsr.methods.networks.peers.base import PeerNetwork, PeerUpsampler
 from dsr.methods.networks.peers.build import PEERS, Peer
 from dsr.methods.networks.peers.files import fold_batch_norm, load_peer
 from dsr.methods.networks.peers.svlrm import SVLRM
-from dsr.methods.networks.weight_choice import find_weights, has_weights, nearest_scale
+from dsr.methods.networks.weight_choice import WeightChoice, nearest_scale
 from dsr.methods.recipe import read_recipe
 from dsr.sample import DepthSample
 from dsr.utils.builder import ConfigError
@@ -324,20 +324,20 @@ def test_missing_file_and_unknown_network_are_refused(tmp_path: Path) -> None:
 
 def test_directory_is_searched_for_the_authors_names(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("DSR_WEIGHTS", raising=False)
-    node = read_recipe("svlrm").at(8)
-    assert not has_weights(node, 8)
+    recipe = read_recipe("svlrm")
+    assert not WeightChoice.of(recipe.at(8)["weights"], 8).exists()
     message = (
-        r"weights: method=svlrm at scale 8 needs weights=FILE, or a directory with SVLRM_X8.pth "
+        r"weights: scale 8 needs weights=FILE, or a directory with SVLRM_X8.pth "
         r"\(from github.com/sunny2109/SVLRM, weights/\); its authors publish them, dsr does not come with them"
     )
     with pytest.raises(ConfigError, match=message):
-        find_weights(node, 8)
+        recipe.weights(8)
     monkeypatch.setenv("DSR_WEIGHTS", str(tmp_path))
-    node = read_recipe("svlrm").at(8)
+    recipe = read_recipe("svlrm")
     with pytest.raises(ConfigError, match=r"SVLRM_X8.pth \(no such file\)"):
-        find_weights(node, 8)
+        recipe.weights(8)
     path = _save(tmp_path / "X8" / "model_177200_iter.pth", _state())
-    assert [find_weights(node, scale) for scale in (8, 7.5)] == [path, path]
-    assert [has_weights(node, scale) for scale in (4, 8)] == [False, True]
+    assert [recipe.weights(scale) for scale in (8, 7.5)] == [path, path]
+    assert recipe.factors == (8,)
     renamed = _save(tmp_path / "SVLRM_X8.pth", _state())
-    assert find_weights({**node, "weights": str(tmp_path)}, 8) == renamed
+    assert recipe.with_weights(tmp_path).weights(8) == renamed

@@ -6,11 +6,11 @@ from pathlib import Path
 
 import pytest
 from hydra import compose, initialize_config_dir
+from hydra.utils import instantiate
 
 from dsr.app.schema import plain_config, register
 from dsr.methods.classical.tgv import TotalGeneralisedVariation
 from dsr.methods.networks.base import NetworkUpsampler
-from dsr.methods.networks.weight_choice import find_weights
 from dsr.methods.recipe import list_methods, read_recipe
 from dsr.utils.builder import ConfigError
 from dsr.utils.config_files import config_directories
@@ -21,9 +21,10 @@ from dsr.utils.config_files import config_directories
 def test_recipe_reads_what_hydra_composes(name: str, scale: int) -> None:
     register()
     with initialize_config_dir(str(config_directories()[0]), version_base="1.3"):
-        composed = plain_config(compose("eval", [f"method={name}", f"scale={scale}"]))["method"]
-    node = read_recipe(name).at(scale)
-    assert node == composed
+        config = plain_config(compose("eval", [f"method={name}", f"scale={scale}"]))
+    composed, recipe = config["method"], read_recipe(name)
+    node = {**recipe.at(scale), **{key: composed[key] for key in ("downsampling",) if key in composed}}
+    assert (node, recipe.label) == (composed, config["label"])
     assert list(node) == list(composed)
 
 
@@ -40,10 +41,10 @@ def test_unknown_method_is_refused_with_those_that_there_are(tmp_path: Path) -> 
     with pytest.raises(ConfigError, match=r"method: expected one of anisotropic_diffusion, .*tgv, got 'tvg'"):
         read_recipe("tvg")
     (tmp_path / "method").mkdir()
-    (tmp_path / "method" / "mine.yaml").write_text("defaults: [tgv]\nname: mine\niterations: 7\n")
+    (tmp_path / "method" / "mine.yaml").write_text("defaults: [tgv]\niterations: 7\n")
     assert "mine" in list_methods([tmp_path])
     node = read_recipe("mine", directories=[tmp_path]).at(4)
-    assert (node["name"], node["iterations"], node["target"]) == ("mine", 7, read_recipe("tgv").at(4)["target"])
+    assert (node["iterations"], node["_target_"]) == (7, read_recipe("tgv").at(4)["_target_"])
 
 
 @pytest.mark.parametrize(
@@ -68,12 +69,15 @@ def test_damaged_file_of_a_method_is_refused(tmp_path: Path, text: str, message:
 def test_weights_are_those_given_or_named_or_packaged(tmp_path: Path) -> None:
     file = tmp_path / "mine.safetensors"
     file.write_bytes(b"")
-    node = read_recipe("msg_v").at(4)
-    assert find_weights(node, 4).name == "msg_v_x4.safetensors"
-    assert find_weights({**node, "weights": str(file)}, 4) == file
+    recipe = read_recipe("msg_v")
+    assert recipe.weights(4).name == "msg_v_x4.safetensors"
+    assert recipe.with_weights(file).weights(4) == file
     (tmp_path / "msg_v_x4_clean.pth").write_bytes(b"")
-    assert find_weights({**node, "weights": str(tmp_path)}, 4) == tmp_path / "msg_v_x4_clean.pth"
-    with pytest.raises(ConfigError, match=r"weights: dsr comes with .*; method=msg_v at scale 2 needs weights=FILE"):
-        find_weights(read_recipe("msg_v").at(2), 2)
-    with pytest.raises(ConfigError, match=r"expected a file of weights for method=msg_v, got .*no such file"):
-        find_weights({**node, "weights": str(tmp_path / "nowhere")}, 4)
+    assert recipe.with_weights(tmp_path).weights(4) == tmp_path / "msg_v_x4_clean.pth"
+    with pytest.raises(ConfigError, match=r"method=msg_v: weights: dsr comes with .*; scale 2 needs weights=FILE"):
+        recipe.weights(2)
+    with pytest.raises(ConfigError, match=r"method=msg_v: weights: expected a file of weights, got .*no such file"):
+        recipe.with_weights(tmp_path / "nowhere").weights(4)
+    with pytest.raises(ConfigError, match=r"weights\.pack: unknown key; expected file, files, packaged"):
+        read_recipe("msg_v", {"weights": {"pack": "x"}}).weights(4)
+    assert instantiate(recipe.at(4)["weights"]) == recipe.weights(4)

@@ -140,7 +140,7 @@ def test_published_values_stand_beside_the_papers_files_in_a_folder_at_their_own
     (tmp_path / "predictions").mkdir()
     np.savez_compressed(tmp_path / "predictions" / "plant.npz", depth=np.ones((size, size), np.float32))
     table = scores("plant", "sofa").assign(dataset="mine")
-    printed = text(table, folder=tmp_path, target="dsr.data.folder.Folder")
+    printed = text(table, folder=tmp_path, _target_="dsr.data.folder.Folder")
     assert printed.count("paper") == (size == 512)
 
 

@@ -29,9 +29,10 @@ CPU = torch.device("cpu")
 
 def config(**changes):
     return {
-        "dataset": {"name": "folder", "root": "data", "scenes": None},
-        "downsampling": {"name": "box", "kernel": "box"},
-        "method": {"name": "msg_v"},
+        "names": {"dataset": "folder", "downsampling": "box", "method": "msg_v"},
+        "dataset": {"root": "data", "scenes": None},
+        "downsampling": {"kernel": "box"},
+        "method": {},
         "metrics": {"lpips": True},
         "scale": 4,
         "weights": "w.pth",
@@ -71,8 +72,9 @@ def name_of(kind, *overrides):
         ("train", "model=msg_v scale=8", "msg_v_x8_seed0"),
         ("train", "model=msg_v scale=8 loss.w=0.72", "msg_v_x8_w0.72_seed0"),
         ("train", "model=msg loss.w=auto seed=3", "msg_x4_seed3"),
-        ("train", "trainer=smoke trainer.steps=4 model.visual=false", "msg_v_x4_smoke_model.visual-false_steps4_seed0"),
-        ("train", "noise=tof trainer.scenes=5", "msg_v_x4_tof_scenes5_seed0"),
+        ("train", "trainer=smoke trainer.max_steps=4 model.objective.w=0",
+         "msg_v_x4_smoke_model.objective.w0_max_steps4_seed0"),
+        ("train", "noise=tof patches.scenes=5", "msg_v_x4_tof_scenes5_seed0"),
         ("eval", "method=bicubic", "bicubic_x4_simgeo_seed0"),
         ("eval", "method=dip_v scale=8 dataset=icl method.w=2 method.largest_tilt=null",
          "dip_v_x8_icl_w2_largest_tilt-null_seed0"),
@@ -119,8 +121,8 @@ def test_same_configuration_gives_the_same_directory():
 @pytest.mark.parametrize(
     "changes",
     [
-        {"scale": 8}, {"seed": 1}, {"precision": "bfloat16"}, {"dataset": {"name": "folder", "root": "other"}},
-        {"downsampling": {"name": "box", "kernel": "gaussian"}}, {"method": {"name": "msg_v", "variant": "x"}},
+        {"scale": 8}, {"seed": 1}, {"precision": "bfloat16"}, {"dataset": {"root": "other"}},
+        {"downsampling": {"kernel": "gaussian"}}, {"method": {"variant": "x"}},
     ],
 )  # fmt: skip
 def test_other_configuration_gives_another_directory(changes):
@@ -188,7 +190,7 @@ def test_check_before_the_claim_refuses_the_same_and_writes_nothing(tmp_path):
 def test_directory_of_another_run_is_refused_with_the_changed_keys(tmp_path):
     claimed(tmp_path, config())
     before = (tmp_path / "config.yaml").read_bytes()
-    other = config(scale=8, dataset={"name": "folder", "root": "other", "scenes": None})
+    other = config(scale=8, dataset={"root": "other", "scenes": None})
     with pytest.raises(ConfigError) as caught:
         claimed(tmp_path, other, "abd")
     message = str(caught.value)

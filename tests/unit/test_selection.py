@@ -139,7 +139,7 @@ class Sure(Method):
 @pytest.mark.parametrize("size", [(12, 9), (16, 12), (48, 36)])
 def test_method_of_fixed_factors_states_its_own_errors(size: tuple[int, int]) -> None:
     sample = _sample(*size)
-    recipe = Recipe("sure", OmegaConf.create({"name": "sure", "target": f"{__name__}.Sure"}))
+    recipe = Recipe("sure", OmegaConf.create({"_target_": f"{__name__}.Sure"}))
     surface = AnyRatio(recipe, torch.device("cpu"), scale=4).upsample(sample.rgb, sample.depth_lr, CAMERA)
     assert surface.depth_error is not None
     assert surface.angle_error is not None
@@ -157,6 +157,6 @@ def test_upsampler_loads_its_weights_once(monkeypatch: pytest.MonkeyPatch) -> No
 
 
 def test_class_that_is_no_method_is_refused() -> None:
-    recipe = Recipe("plain", OmegaConf.create({"name": "plain", "target": "dsr.geometry.camera.Camera"}))
-    with pytest.raises(ConfigError, match=r"^method\.target: expected a class that derives from .*Method"):
+    recipe = Recipe("plain", OmegaConf.create({"_target_": "dsr.geometry.camera.Camera"}))
+    with pytest.raises(ConfigError, match=r"^method\._target_: expected a class that derives from .*Method"):
         recipe.build(4)

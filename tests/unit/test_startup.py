@@ -57,7 +57,7 @@ COMMANDS = {
     "eval.py --config-dir=nowhere": 2,
     "eval.py dataset=folder dataset.rot=x": 2,
     "train.py model=nosuch": 2,
-    "train.py trainer.steps=many": 2,
+    "train.py trainer.max_steps=many": 2,
     "train.py loss.w=-1": 2,
 }
 

@@ -367,13 +367,14 @@ def test_weights_without_plain_values_are_refused(tmp_path, tensor):
 
 
 RUN = {
-    "model": {"name": "msg_v", "target": "dsr.methods.networks.msg_net.MSGNet"},
-    "dataset": {"name": "simgeo", "target": "dsr.data.simgeo.SimGeo"},
-    "downsampling": {"name": "box", "target": "dsr.degradation.downsampling.Downsampling", "kernel": "box"},
-    "noise": {"name": "none", "target": "dsr.degradation.noise.no_noise"},
+    "names": {"model": "msg_v", "dataset": "simgeo", "downsampling": "box", "noise": "none"},
+    "model": {"net": {"_target_": "dsr.methods.networks.msg_net.MSGNet"}},
+    "dataset": {"_target_": "dsr.data.simgeo.SimGeo"},
+    "downsampling": {"_target_": "dsr.degradation.downsampling.Downsampling", "kernel": "box"},
+    "noise": {"_target_": "dsr.degradation.noise.no_noise"},
     "scale": 4,
     "seed": 0,
-    "trainer": {"steps": 2, "validate_every": 1},
+    "trainer": {"max_steps": 2, "val_check_interval": 1},
 }
 BAD_RUNS = {
     "seed: expected a whole number, got 'abc'": {"seed": "abc"},
@@ -381,11 +382,11 @@ BAD_RUNS = {
     "seed: expected a number that 64 bits hold, got 1000": {"seed": 10**30},
     "seed: expected 0 or a positive number, got -1": {"seed": -1},
     "scale: expected a whole number, got None": {"scale": None},
-    "trainer.validate_every: expected a whole number, got 'abc'": {"trainer": {"validate_every": "abc"}},
-    "trainer.learning_rate: expected a number, got 'fast'": {"trainer": {"learning_rate": "fast"}},
-    "trainer: expected keys, got 5": {"trainer": 5},
+    "start.weights: expected text or null, got 5": {"start": {"weights": 5}},
+    "metrics.lpips: expected true or false, got 'no'": {"metrics": {"lpips": "no"}},
+    "trainer: expected keys, each with a value, got 5": {"trainer": 5},
     "dataset: expected keys, each with a value, got 5": {"dataset": 5},
-    "dataset.name: expected text, got None": {"dataset": {}},
+    "names.dataset: expected text, got None": {"names": {"model": "msg_v"}},
     "model: expected keys, each with a value, got 'msg_v'": {"model": "msg_v"},
     "output_dir: expected a text of one character or more, or null for none; got ''": {"output_dir": ""},
 }

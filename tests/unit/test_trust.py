@@ -14,10 +14,11 @@ from dsr.utils.builder import ConfigError, load_target
 from dsr.utils.config_files import config_directories
 
 CONFIG = {
-    "model": {"name": "msg_v", "label": "MSG-V", "target": "dsr.methods.networks.msg_net.MSGNet"},
-    "dataset": {"name": "procedural", "target": "dsr.data.procedural.Procedural", "count": 6, "size": 64},
-    "downsampling": {"name": "box", "target": "dsr.degradation.downsampling.Downsampling", "kernel": "box"},
-    "noise": {"name": "none", "target": "dsr.degradation.noise.no_noise"},
+    "names": {"model": "msg_v", "dataset": "procedural", "downsampling": "box", "noise": "none"},
+    "model": {"net": {"_target_": "dsr.methods.networks.msg_net.MSGNet"}},
+    "dataset": {"_target_": "dsr.data.procedural.Procedural", "count": 6, "size": 64},
+    "downsampling": {"_target_": "dsr.degradation.downsampling.Downsampling", "kernel": "box"},
+    "noise": {"_target_": "dsr.degradation.noise.no_noise"},
     "scale": 4,
     "seed": 0,
 }
@@ -52,21 +53,24 @@ def evil(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("key", "target"),
     [
-        ("model__target", "os.system"),
-        ("model__target", "evil_targets.Net"),
-        ("model__target", "dsr.data.folder.Folder"),  # dsr's, of another group
-        ("dataset__target", "evil_targets.Net"),
-        ("dataset__target", "dsr.app.entry.os.system"),
-        ("dataset__target", "dsr.utils.files.os.remove"),
-        ("dataset__target", "dsr.cli.main"),
-        ("dataset__parts__mine__target", "evil_targets.Net"),
-        ("validation__own__target", "evil_targets.Net"),
-        ("noise__target", "shutil.rmtree"),
-        ("downsampling__target", "subprocess.run"),
-        ("degradation__target", "evil_targets.Net"),
+        ("model__net___target_", "os.system"),
+        ("model__net___target_", "evil_targets.Net"),
+        ("model__net___target_", "dsr.data.folder.Folder"),  # dsr's, of another group
+        ("dataset___target_", "evil_targets.Net"),
+        ("dataset___target_", "dsr.app.entry.os.system"),
+        ("dataset___target_", "dsr.utils.files.os.remove"),
+        ("dataset___target_", "dsr.cli.main"),
+        ("dataset__parts__mine___target_", "evil_targets.Net"),
+        ("validation__own___target_", "evil_targets.Net"),
+        ("noise___target_", "shutil.rmtree"),
+        ("downsampling___target_", "subprocess.run"),
+        ("degradation___target_", "evil_targets.Net"),
         ("model___target_", "os.system"),
         ("model__network", "evil_targets.Net"),
-        ("model__inner__target", ["evil_targets.Net"]),
+        ("model__inner___target_", ["evil_targets.Net"]),
+        ("model__optimizer___target_", "dsr.methods.networks.msg_net.MSGNet"),
+        ("callbacks__mine___target_", "evil_targets.Net"),
+        ("trainer___target_", "os.system"),
     ],
 )
 def test_target_that_is_not_dsrs_for_its_group_is_refused_before_it_is_imported(evil, key, target):
@@ -87,31 +91,31 @@ def test_metrics_from_outside_are_refused(evil, value):
 
 
 def test_trust_in_the_file_itself_counts_for_nothing(evil):
-    folder = write(evil / "run", trust=True, model__target="evil_targets.Net")
-    with pytest.raises(ConfigError, match=r"model\.target"):
+    folder = write(evil / "run", trust=True, model__net___target_="evil_targets.Net")
+    with pytest.raises(ConfigError, match=r"model\.net\._target_"):
         read_config(folder)
-    with pytest.raises(ConfigError, match=r"model\.target"):
+    with pytest.raises(ConfigError, match=r"model\.net\._target_"):
         [*studies_of_run({"run": str(folder), "output_dir": None, "trust": None}, [])]
 
 
 def test_several_targets_are_named_at_once(tmp_path):
-    folder = write(tmp_path / "run", model__target="mine.Net", noise__target="mine.noise")
+    folder = write(tmp_path / "run", model__net___target_="mine.Net", noise___target_="mine.noise")
     with pytest.raises(ConfigError, match=r"'trust=\[mine\.Net,mine\.noise\]' allows it$"):
         read_config(folder)
 
 
 @pytest.mark.parametrize("trust", [True, "mine.Net", ["other.Net", "mine.Net"]])
 def test_person_at_the_keyboard_allows_a_target_and_is_told(tmp_path, capsys, trust):
-    folder = write(tmp_path / "run", model__target="mine.Net")
-    assert read_config(folder, trust)["model"]["target"] == "mine.Net"
-    note = f"note: {folder / 'config.yaml'}: model.target mine.Net is not dsr's; it is run, as you allow\n"
+    folder = write(tmp_path / "run", model__net___target_="mine.Net")
+    assert read_config(folder, trust)["model"]["net"]["_target_"] == "mine.Net"
+    note = f"note: {folder / 'config.yaml'}: model.net._target_ mine.Net is not dsr's; it is run, as you allow\n"
     assert capsys.readouterr().out == note
 
 
 @pytest.mark.parametrize("trust", [False, None, [], "mine.Other"])
 def test_other_values_of_trust_do_not_allow_it(tmp_path, trust):
     with pytest.raises(ConfigError, match=r"trust=mine\.Net allows it"):
-        read_config(write(tmp_path / "run", model__target="mine.Net"), trust)
+        read_config(write(tmp_path / "run", model__net___target_="mine.Net"), trust)
 
 
 @pytest.mark.parametrize("value", [5, 1.5, {"a": 1}, [3]])
@@ -123,11 +127,11 @@ def test_trust_of_another_type_is_refused(value):
 def test_target_in_the_persons_own_configuration_directory_is_allowed(tmp_path):
     own = tmp_path / "conf" / "model"
     own.mkdir(parents=True)
-    (own / "mine.yaml").write_text("name: mine\ntarget: mine.Net\n")
+    (own / "mine.yaml").write_text("net:\n  _target_: mine.Net\n")
     trust = Trust.of(None, [tmp_path / "conf"])
     assert trust.allows("mine.Net")
     assert not trust.allows("mine.Other")
-    expect_trusted(tmp_path / "config.yaml", {"model": {"name": "mine", "target": "mine.Net"}}, trust)
+    expect_trusted(tmp_path / "config.yaml", {"model": {"net": {"_target_": "mine.Net"}}}, trust)
 
 
 def test_every_target_that_dsr_names_itself_is_one_of_its_own():
@@ -135,7 +139,8 @@ def test_every_target_that_dsr_names_itself_is_one_of_its_own():
     assert {"dataset", "downsampling", "noise", "holes", "degradation", "method", "model"} <= targets.keys()
     for group, names in targets.items():
         for name in names:
-            assert load_target(group, {"target": name}).__module__.partition(".")[0] == "dsr", name
+            home = load_target(group, {"_target_": name}).__module__.partition(".")[0]
+            assert home in ("dsr", "torch", "lightning"), name
 
 
 @pytest.mark.parametrize(
@@ -162,7 +167,7 @@ def test_configuration_of_anything_but_plain_values_is_refused(evil, text, messa
 
 
 @pytest.mark.parametrize("name", ["../../up", "/etc/x", "a\\b", "..", "", "a\nb", "x" * 200])
-@pytest.mark.parametrize("key", ["model__name", "dataset__name", "validation__own__name"])
+@pytest.mark.parametrize("key", ["names__model", "names__dataset"])
 def test_name_that_leads_out_of_a_folder_is_refused(tmp_path, key, name):
     with pytest.raises(ConfigError, match="expected a name without folders"):
         read_config(write(tmp_path / "run", **{key: name}))

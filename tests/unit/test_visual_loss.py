@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 from typing import get_args
 
 import pytest
 import torch
 from torch import Tensor
 
-from dsr.app.schema import TrainConfig
+import dsr
+from dsr.app.schema import TrainConfig, plain_config
 from dsr.app.train import _module
 from dsr.degradation.downsampling import Downsampling, make_sample
 from dsr.geometry.camera import Camera
@@ -18,6 +20,7 @@ from dsr.methods.dip.upsampler import DeepImagePrior
 from dsr.methods.networks.base import Answer
 from dsr.methods.networks.maps import mean3x3
 from dsr.methods.networks.msg_net import MSGNet
+from dsr.metrics.classes import visual_metrics
 from dsr.metrics.functional import SurfacePair, dssim_v, mse_v
 from dsr.metrics.lpips import LPIPS, lpips_v
 from dsr.metrics.visual_loss import MSE_V, VisualLoss, VisualLossName, make_visual_loss, match_weight
@@ -185,18 +188,19 @@ def test_lpips_without_its_weights_is_one_line_that_says_what_to_do(tmp_path: Pa
 
 
 def test_training_refuses_a_visual_loss_that_it_cannot_use(tmp_path: Path) -> None:
-    def refused(model: dict[str, object], visual: str, patch: int = 96) -> str:
-        settings = TrainConfig(model={"name": "msg", "depth_loss": "mse", **model})
-        settings.loss.visual, settings.trainer.patch = visual, patch
-        settings.metrics.lpips_trunk = str(tmp_path / "none.pth")
+    def refused(*overrides: str, patch: int = 96) -> str:
+        trunk = f"metrics.lpips_trunk={tmp_path / 'none.pth'}"
+        data = SimpleNamespace(validation_sets=["val"], patches=SimpleNamespace(patch=patch))
+        plain = plain_config(dsr.compose("train", [*overrides, trunk]))
         with pytest.raises(ConfigError) as caught:
-            _module(settings, MSGNet(4), None, None)  # type: ignore[arg-type]
+            _module(TrainConfig.of(plain), MSGNet(4), data, visual_metrics)  # type: ignore[arg-type]
         return str(caught.value)
 
-    assert refused({"visual": False}, "dssim") == (
-        "loss.visual: model=msg has no visual loss, which model.visual=true adds; leave it out"
+    assert refused("model=msg", "loss.visual=dssim") == (
+        "loss.visual: model=msg has no visual loss, which model.objective.w=auto adds; leave it out"
     )
-    assert refused({"visual": True}, "ssim") == "loss.visual: expected one of mse_v, dssim, lpips, got 'ssim'"
-    assert refused({"visual": True}, "lpips").startswith("loss.visual: lpips needs AlexNet's weights: expected a file")
-    message = refused({"visual": True}, "dssim", patch=6)
+    assert refused("model=msg", "loss.w=1").startswith("loss.w: model=msg has no visual loss, which model.objective.w")
+    assert refused("loss.visual=ssim") == "loss.visual: expected one of mse_v, dssim, lpips, got 'ssim'"
+    assert refused("loss.visual=lpips").startswith("loss.visual: lpips needs AlexNet's weights: expected a file")
+    message = refused("loss.visual=dssim", patch=6)
     assert message == "loss.visual: dssim expects maps of at least 7 x 7 pixels, got 6 x 6"

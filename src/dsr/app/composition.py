@@ -7,33 +7,41 @@ from pathlib import Path
 
 import hydra
 from hydra.core.global_hydra import GlobalHydra
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf, open_dict
 
 from dsr.app.experiments import register_resolvers
-from dsr.app.schema import register
+from dsr.app.schema import NAMED, register
+from dsr.utils.config_files import config_directories
 
 
 def compose(
-    name: str, overrides: Sequence[str], directories: Sequence[Path], *, with_hydra: bool = False
+    name: str, overrides: Sequence[str] = (), directories: Sequence[Path] | None = None, *, with_hydra: bool = False
 ) -> DictConfig:
-    """Compose a configuration.
+    """Compose the configuration of a command, as in ``compose("train", ["model=msg_v", "scale=8"])``.
 
     Args:
-        name: without ``.yaml``.
+        name: ``train`` or ``eval``.
         overrides: as on the command line.
-        directories: those of :func:`dsr.utils.config_files.config_directories`.
+        directories: those of :func:`dsr.utils.config_files.config_directories`; None for the project's.
         with_hydra: whether Hydra's own settings are there, too.
 
     """
     register()
     register_resolvers()
+    directories = config_directories() if directories is None else directories
     places = ",".join(f'"file://{directory.resolve()}"' for directory in directories[1:])
     more = [f"hydra.searchpath=[{places}]"] if places else []
     running = GlobalHydra.instance().hydra
     GlobalHydra.instance().clear()
     try:
         with hydra.initialize_config_dir(str(directories[0]), version_base="1.3"):
-            return hydra.compose(name, [*overrides, *more], return_hydra_config=with_hydra)
+            config = hydra.compose(name, [*overrides, *more], return_hydra_config=True)
+            with open_dict(config):
+                choices = config.hydra.runtime.choices
+                config.names = OmegaConf.merge({each: choices[each] for each in NAMED if each in choices}, config.names)
+                if not with_hydra:
+                    del config["hydra"]
+            return config
     finally:
         if running is not None:
             GlobalHydra.instance().initialize(running)

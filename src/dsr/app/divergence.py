@@ -17,7 +17,8 @@ from dsr.utils.parsing import parse_json
 
 NOTE = "diverged.json"
 _ADVICE = (
-    "a lower trainer.learning_rate or trainer.clip, or a longer trainer.warmup, may help, with another output_dir or "
+    "a lower model.optimizer.lr or trainer.gradient_clip_val, or a longer model.scheduler.warmup, may help, with "
+    "another output_dir or "
     "overwrite=true"
 )
 

@@ -35,11 +35,11 @@ from dsr.evaluation.store import load_errors, prediction_path
 from dsr.inference.selection import select
 from dsr.methods.base import WORKSPACE, Method
 from dsr.methods.networks.weight_files import files_of_weights
-from dsr.methods.recipe import Known, Recipe, Run
+from dsr.methods.recipe import OF_RUN, Known, Recipe, Run
 from dsr.metrics.formats import HEADLINES, Formats
 from dsr.report.tables import score_table
 from dsr.sample import DepthSample, slope
-from dsr.utils.builder import ConfigError, build
+from dsr.utils.builder import ConfigError
 from dsr.utils.console import ConsoleProgress, note_once, open_console, print_error, show
 from dsr.utils.devices import fast_precision, pick_device
 from dsr.utils.hashing import file_hash
@@ -123,19 +123,20 @@ def _prepare(plain: dict[str, Any], node: Any, source: SceneSource | None, *, he
     settings = EvalConfig.of(plain)
     device = pick_device(settings.device) if here else torch.device("cpu")
     source = source or _source(settings)
-    name, scale = str(settings.method["name"]), _scale(settings, source)
+    name, scale = settings.names["method"], _scale(settings, source)
     recipe = Recipe(name, OmegaConf.create(node), user_directories(), plain)
-    plain = {**plain, "precision": _precision(settings, recipe, device), "scale": scale}
+    own = {key: value for key, value in plain["method"].items() if key not in OF_RUN}
+    plain = {**plain, "method": own, "precision": _precision(settings, recipe, device), "scale": scale}
     settings = EvalConfig.of(plain)
     selected = select(recipe, scale, _weights(settings, recipe), measured=settings.measured)
     identity = rundir.identity_of(plain, _hash_weights(selected.files()), device, recipe.targets())
     folder = rundir.folder_of(settings.output_dir or rundir.default_directory("eval", plain, identity))
     progress = ConsoleProgress(open_console())
-    downsampling = build("downsampling", settings.downsampling)
+    downsampling = settings.build("downsampling")
     assumes = recipe.abilities.assumes_downsampling
     if "downsampling.assumed" in given_keys() and not assumes:
         raise ConfigError(f"downsampling.assumed: method={name} assumes no downsampling model; leave it out")
-    label = str(settings.method.get("label", name))
+    label = settings.label or name
     degradation = rundir.degradation_of(vars(settings), assumes=assumes)
     run = Run(
         device=device,
@@ -160,8 +161,8 @@ def _prepare(plain: dict[str, Any], node: Any, source: SceneSource | None, *, he
         settings.seed,
         identity,
         device,
-        noise=build("noise", settings.noise),
-        holes=build("holes", settings.holes),
+        noise=settings.build("noise"),
+        holes=settings.build("holes"),
         label=_flagged(label, method, " ({})"),
     )
     check_metrics(settings.metrics)
@@ -260,9 +261,9 @@ def _save_dashboard(folder: Path) -> None:
 def _source(settings: EvalConfig) -> SceneSource:
     """Build the data set that the configuration describes."""
     if "parts" in settings.dataset:
-        name = settings.dataset["name"]
+        name = settings.names["dataset"]
         raise ConfigError(f"dataset={name}: several data sets are for training; name one of them")
-    source: SceneSource = build("dataset", settings.dataset)
+    source: SceneSource = settings.build("dataset")
     return source
 
 
@@ -310,7 +311,7 @@ def _known_of_maps(settings: EvalConfig, downsampling: Downsampling | Measured, 
         return Known()
     soft = getattr(source, "soft_edges", False)
     return Known(
-        downsampling.assumed_model().kernel, "soft" if soft else "sharp", clean=settings.noise["name"] == "none"
+        downsampling.assumed_model().kernel, "soft" if soft else "sharp", clean=settings.names["noise"] == "none"
     )
 
 

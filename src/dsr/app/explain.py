@@ -13,11 +13,11 @@ from omegaconf import DictConfig, OmegaConf
 
 from dsr.app.composition import compose
 from dsr.app.multirun import LAUNCHERS
-from dsr.app.schema import SEVERAL
+from dsr.app.schema import MOVED, SEVERAL
 from dsr.utils.config_files import list_choices, list_groups
 from dsr.utils.console import one_line
 
-_ALIASES = {"lr": "learning_rate", "batch_size": "batch", "max_steps": "steps"}
+_ALIASES = {"learning_rate": "lr", "batch_size": "batch", "steps": "max_steps"}
 """Names that others have for keys."""
 _ALIKE = 0.8
 """How alike a mistyped key is to the one that is meant, of 1."""
@@ -118,9 +118,11 @@ def _explain_key(key: str, name: str, arguments: Sequence[str], directories: Seq
         return f"experiment: write +experiment=NAME, NAME one of {', '.join(list_choices(key, directories))}"
     values = (argument.partition("=") for argument in arguments)
     value = next((value for given, _, value in values if given.lstrip("+~") == key), "...")
+    if name == "train" and key in MOVED:
+        return f"{key}: unknown key; expected {MOVED[key]}={value}"
     config = _composed_for(key, name, arguments, directories)
     prefix, node = _innermost(config, key)
-    children = [str(child) for child in node if child not in ("target", "_target_")]
+    children = [str(child) for child in node if child not in ("_target_", "_partial_", "names")]
     alike = [f"{prefix}{each}={value}" for each in get_close_matches(key.rpartition(".")[2], children, 1, _ALIKE)]
     meant = _meant(key, value, name, config, directories)
     wanted = alike or meant if prefix else meant or alike  # a key of a group is one of this group first
@@ -136,8 +138,10 @@ def _meant(key: str, value: str, name: str, config: DictConfig, directories: Seq
         wanted = f"{pair}={value}" if value in list_choices(str(pair), directories) else f"{key}={value} of {other}.py"
         return [wanted] if value in list_choices("method", directories) else []
     last = key.rpartition(".")[2]
-    last = _ALIASES.get(last, last)
-    places = [place for place in _places(OmegaConf.to_container(config)) if place.rpartition(".")[2] == last]
+    known = list(_places(OmegaConf.to_container(config)))
+    ends = {place.rpartition(".")[2] for place in known}
+    last = _ALIASES[last] if _ALIASES.get(last) in ends else last
+    places = [place for place in known if place.rpartition(".")[2] == last]
     if places:
         return [f"{place}={value}" for place in places]
     choices: dict[str, list[str]] = {}
@@ -167,6 +171,7 @@ def _places_of(group: str, choice: str, directories: Sequence[Path]) -> set[str]
     if not isinstance(content, DictConfig):
         return set()
     bases = [each for each in content.get("defaults") or () if isinstance(each, str) and each != choice]
+    content = content.get(group, content)  # of a choice that sets other keys, too
     return set(_places(OmegaConf.to_container(content))).union(*(_places_of(group, e, directories) for e in bases))
 
 

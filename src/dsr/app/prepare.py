@@ -11,10 +11,10 @@ from rich.console import Console
 
 from dsr.app.composition import compose
 from dsr.app.explain import explain
-from dsr.app.schema import plain_config
+from dsr.app.schema import EvalConfig, plain_config
 from dsr.data.base import SceneSource, prepare_scenes
 from dsr.sample import Scene
-from dsr.utils.builder import ConfigError, build
+from dsr.utils.builder import ConfigError
 from dsr.utils.config_files import config_directories
 from dsr.utils.console import ConsoleProgress, one_line, show
 from dsr.viz.sheets import save_contact_sheet
@@ -55,12 +55,13 @@ def _source(name: str, overrides: Sequence[str], config_dirs: Sequence[Path]) ->
     directories = config_directories(config_dirs)
     arguments = [f"dataset={name}", *overrides]
     try:
-        node = plain_config(compose("eval", arguments, directories))["dataset"]
+        plain = plain_config(compose("eval", arguments, directories))
     except (HydraException, OmegaConfBaseException) as error:
         raise ConfigError(explain(error, "eval", arguments, directories)) from error
-    if "parts" in node:
-        raise ConfigError(f"dataset={name}: expected one data set, it has the parts {', '.join(node['parts'])}")
-    source: SceneSource = build("dataset", node)
+    if "parts" in plain["dataset"]:
+        parts = ", ".join(plain["dataset"]["parts"])
+        raise ConfigError(f"dataset={name}: expected one data set, it has the parts {parts}")
+    source: SceneSource = EvalConfig.of(plain).build("dataset")
     return source
 
 

@@ -12,6 +12,7 @@ import torch
 from omegaconf import OmegaConf
 
 from dsr.app.run_names import NOT_IDENTITY, run_name
+from dsr.app.trust import imported
 from dsr.utils.builder import ConfigError, expand_home
 from dsr.utils.console import shorten
 from dsr.utils.files import write_text
@@ -21,6 +22,8 @@ from dsr.utils.parsing import parse_json
 from dsr.utils.versions import RESULTS, SCENES, versions
 
 _RECORD = "versions.json"
+_NO_BITS = ("log_every_n_steps", "profiler", "detect_anomaly", "enable_progress_bar", "enable_model_summary")
+"""Arguments of a trainer that change no result."""
 
 
 def identity_of(
@@ -39,10 +42,9 @@ def identity_of(
 
     """
     kept = {key: value for key, value in config.items() if key not in NOT_IDENTITY}
-    if isinstance(kept.get("method"), Mapping):
-        kept["method"] = {key: value for key, value in kept["method"].items() if key != "weights"}
-    named = [str(node["target"]) for node in kept.values() if isinstance(node, Mapping) and "target" in node]
-    outside = hash_outside_code([*named, *targets])
+    if isinstance(kept.get("trainer"), Mapping):
+        kept["trainer"] = {key: value for key, value in kept["trainer"].items() if key not in _NO_BITS}
+    outside = hash_outside_code([*(target for _, target in imported(kept)), *targets])
     code = {"results_version": RESULTS, "scenes_version": SCENES}
     more = {} if outside is None else {"outside_code": outside}
     return {**kept, "device": device.type, "weights_sha256": weights_hash, **code, **more}
@@ -85,17 +87,18 @@ def degradation_of(config: Mapping[str, Any], *, assumes: bool = False) -> str:
 
     ``assumes``: whether the run's method assumes a downsampling model.
     """
-    if config.get("degradation", {}).get("name", "plain") != "plain":
-        return str(config["degradation"]["name"])
-    parts = [str(config["downsampling"]["name"])]
+    names = config["names"]
+    if names.get("degradation", "plain") != "plain":
+        return str(names["degradation"])
+    parts = [str(names["downsampling"])]
     assumed = config["downsampling"].get("assumed")
     if assumes and assumed not in (None, parts[0]):
         parts.append(f"assumed-{assumed}")
-    for group in (config["noise"], config.get("holes", {"name": "none"})):
-        if group["name"] != "none":
-            settings_of = [value for key, value in group.items() if key not in ("name", "target")]
+    for group in ("noise", "holes"):
+        if names.get(group, "none") != "none":
+            settings_of = [value for key, value in config[group].items() if key != "_target_"]
             values = ["none" if value is None else f"{value:g}" for value in settings_of]
-            parts.append("-".join((str(group["name"]), *values)))
+            parts.append("-".join((str(names[group]), *values)))
     return "+".join(parts)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, fields, is_dataclass
 from pathlib import Path
@@ -12,13 +13,41 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import MISSING, DictConfig, OmegaConf
 
 from dsr.degradation.scales import NATIVE, check_scale
-from dsr.training.settings import PatchSettings, Schedule
-from dsr.utils.builder import ConfigError, check_types
+from dsr.utils.builder import ConfigError, build, check_types
 from dsr.utils.parsing import is_number
 
 STRATEGIES = ("auto", "ddp")
 KEPT = ("best", "last")
+VISUAL = ("mse_v", "dssim", "lpips")
 PRECISIONS = ("float32", "bfloat16", "auto")
+_TRAINER = {"max_steps": 12000, "val_check_interval": 1000, "accumulate_grad_batches": 1, "devices": 1,
+            "strategy": "auto", "gradient_clip_val": None}  # fmt: skip
+"""What dsr itself reads of the trainer's arguments, and their defaults."""
+MOVED = {
+    **{f"trainer.{key}": f"trainer.{new}" for key, new in (
+        ("steps", "max_steps"), ("validate_every", "val_check_interval"), ("accumulate", "accumulate_grad_batches"),
+        ("clip", "gradient_clip_val"), ("max_step", "max_steps"), ("step", "max_steps"),
+    )},
+    **{f"trainer.{key}": f"patches.{key}" for key in (
+        "patch", "batch", "validation_scenes", "scenes", "flip", "rotate", "depth_scale", "colour", "photo", "workers"
+    )},
+    "trainer.init": "start.weights",
+    **{f"trainer.{key}": f"start.{key}" for key in ("shared", "frozen")},
+    **{f"trainer.{key}": f"model.{new}" for key, new in (
+        ("learning_rate", "optimizer.lr"), ("lr", "optimizer.lr"), ("weight_decay", "optimizer.weight_decay"),
+        ("warmup", "scheduler.warmup"), ("average", "average"),
+    )},
+    "trainer.keep": "keep",
+    "trainer.precision": "precision",
+    "trainer.accelerator": "device",
+    "trainer.logger": "logger",
+    "trainer.callbacks": "callbacks",
+    "trainer.max_epochs": "trainer.max_steps",
+    "model.depth_loss": "model.objective.depth_loss",
+    "model.shading": "model.objective.shading",
+    "model.visual": "model.objective.w",
+}  # fmt: skip
+"""Keys by other names: what Lightning and torch have names for, and arguments of the trainer that have their own."""
 _GROUPS = (
     "dataset",
     "downsampling",
@@ -31,10 +60,14 @@ _GROUPS = (
     "trainer",
     "loss",
     "logger",
+    "callbacks",
 )
 
 
-SEVERAL = ("logger", "experiment")
+NAMED = ("dataset", "downsampling", "noise", "holes", "degradation", "method", "model", "optimizer", "scheduler",
+         "trainer")  # fmt: skip
+"""Groups whose choice is in ``names``."""
+SEVERAL = ("logger", "callbacks", "experiment")
 """Groups of which several choices go together, as a list."""
 
 
@@ -102,10 +135,12 @@ def _refuse_unknown(plain: Any, names: Collection[str], place: str = "") -> None
 class RunConfig(Checked):
     """The configuration that all commands have.
 
-    The groups (dataset, downsampling, noise, method, model) are made by :func:`dsr.utils.builder.build`, which checks
-    their keys against what the class or function that they name takes.
+    The groups (dataset, downsampling, noise, method, model) are nodes for ``hydra.utils.instantiate``, which
+    :func:`dsr.utils.builder.build` makes, too; it checks their keys against what the class or function that they name
+    takes. ``names`` has the choices of the groups.
     """
 
+    names: dict[str, str] = field(default_factory=dict)
     dataset: dict[str, Any] = MISSING
     downsampling: dict[str, Any] = MISSING
     noise: dict[str, Any] = MISSING
@@ -116,6 +151,16 @@ class RunConfig(Checked):
     seed: int = 0
     output_dir: str | None = None
     overwrite: bool = False
+
+    def build(self, group: str) -> Any:
+        """Build what a group's node describes.
+
+        Raises:
+            ConfigError: a key is unknown, missing or of another type, or a value is refused.
+
+        """
+        name = self.names.get(group)
+        return build(group, getattr(self, group), {} if name is None else {"name": name}, name)
 
     def check(self) -> None:
         """Check values beyond their types.
@@ -137,6 +182,7 @@ class EvalConfig(RunConfig):
     scale: Any = 4
     holes: dict[str, Any] = MISSING
     method: dict[str, Any] = MISSING
+    label: str | None = None
     weights: str | None = None
     run: str | None = None
     trust: Any = None
@@ -146,7 +192,7 @@ class EvalConfig(RunConfig):
     @property
     def measured(self) -> bool:
         """Whether the low-resolution maps are the scenes' own."""
-        return str(self.downsampling.get("target")).endswith(".Measured")
+        return str(self.downsampling.get("_target_")).endswith(".Measured")
 
     def check(self) -> None:
         """Check values beyond their types.
@@ -169,34 +215,12 @@ class EvalConfig(RunConfig):
 
 
 @dataclass
-class TrainerConfig:
-    """The training's steps, data and optimiser; see ``conf/trainer/default.yaml``."""
+class StartConfig:
+    """The weights that a training starts from; see ``conf/train.yaml``."""
 
-    name: str = "default"
-    steps: int = 12000
-    validate_every: int = 1000
-    learning_rate: float = Schedule.learning_rate
-    warmup: int = Schedule.warmup
-    weight_decay: float = Schedule.weight_decay
-    clip: float = Schedule.clip
-    average: float = 0.999
-    patch: int = PatchSettings.patch
-    batch: int = PatchSettings.batch
-    accumulate: int = 1
-    validation_scenes: int = PatchSettings.validation_scenes
-    scenes: int | None = PatchSettings.scenes
-    flip: bool = PatchSettings.flip
-    rotate: bool = PatchSettings.rotate
-    depth_scale: float = PatchSettings.depth_scale
-    colour: float = PatchSettings.colour
-    photo: float = PatchSettings.photo
-    workers: int = PatchSettings.workers
-    devices: Any = 1
-    strategy: str = "auto"
-    init: str | None = None
+    weights: str | None = None
     shared: str | None = None
     frozen: list[str] = field(default_factory=list)
-    keep: str = "best"
 
 
 @dataclass
@@ -212,10 +236,12 @@ class TrainConfig(RunConfig):
     """The configuration of ``train.py``."""
 
     model: dict[str, Any] = MISSING
-    degradation: dict[str, Any] = field(
-        default_factory=lambda: {"name": "plain", "target": "dsr.degradation.everything.plain"}
-    )
-    trainer: TrainerConfig = field(default_factory=TrainerConfig)
+    degradation: dict[str, Any] = field(default_factory=lambda: {"_target_": "dsr.degradation.everything.plain"})
+    trainer: dict[str, Any] = MISSING
+    patches: dict[str, Any] = field(default_factory=lambda: {"_target_": "dsr.training.settings.PatchSettings"})
+    start: StartConfig = field(default_factory=StartConfig)
+    keep: str = "best"
+    callbacks: dict[str, Any] = field(default_factory=dict)
     logger: dict[str, Any] = field(default_factory=dict)
     loss: LossConfig = field(default_factory=LossConfig)
     validation: dict[str, Any] = field(default_factory=dict)
@@ -231,18 +257,53 @@ class TrainConfig(RunConfig):
         """
         super().check()
         _expect_factor(self.scale)
+        if "net" not in self.model:
+            raise ConfigError("model: missing; give it as model=...")
+        if self.loss.visual not in VISUAL:
+            raise ConfigError(f"loss.visual: expected one of {', '.join(VISUAL)}, got {self.loss.visual!r}")
         w = self.loss.w
         if w != "auto" and (not is_number(w) or w < 0):
             raise ConfigError(f"loss.w: expected auto or a number, 0 or more, got {w!r}")
-        for name in ("validate_every", "accumulate"):
-            if not getattr(self.trainer, name) > 0:
-                raise ConfigError(f"trainer.{name}: expected a positive number, got {getattr(self.trainer, name)}")
-        devices = self.trainer.devices
-        if devices != "auto" and (isinstance(devices, bool) or not isinstance(devices, int) or devices < 1):
-            raise ConfigError(f"trainer.devices: expected auto or a positive number, got {devices!r}")
-        for name, choices in (("strategy", STRATEGIES), ("keep", KEPT)):
-            if (value := getattr(self.trainer, name)) not in choices:
-                raise ConfigError(f"trainer.{name}: expected one of {', '.join(choices)}, got {value}")
+        if self.keep not in KEPT:
+            raise ConfigError(f"keep: expected one of {', '.join(KEPT)}, got {self.keep}")
+        for key in (*(f"trainer.{each}" for each in self.trainer), *(f"model.{each}" for each in self.model)):
+            if key in MOVED:
+                raise ConfigError(f"{key}: unknown key; expected {MOVED[key]}")
+        self._check_trainer()
+
+    def _check_trainer(self) -> None:
+        """Check what dsr itself reads of the trainer's arguments, without Lightning, which takes seconds to import."""
+
+        def is_count(value: Any) -> bool:
+            return isinstance(value, int) and not isinstance(value, bool) and value > 0
+
+        for name, fits, expected in (
+            ("max_steps", is_count, "a whole number, 1 or more"),
+            ("val_check_interval", is_count, "a whole number of batches, 1 or more"),
+            ("accumulate_grad_batches", is_count, "a whole number, 1 or more"),
+            ("devices", lambda value: value == "auto" or is_count(value), "auto or a whole number, 1 or more"),
+            ("strategy", lambda value: value in STRATEGIES, f"one of {', '.join(STRATEGIES)}"),
+            ("gradient_clip_val", lambda value: value is None or (is_number(value) and 0 < value < math.inf),
+             "a positive number or null"),
+        ):  # fmt: skip
+            value = self.trainer.setdefault(name, _TRAINER[name])
+            if not fits(value):
+                raise ConfigError(f"trainer.{name}: expected {expected}, got {value!r:.60}")
+
+    @property
+    def steps(self) -> int:
+        """The steps of the whole training."""
+        return int(self.trainer["max_steps"])
+
+    @property
+    def accumulate(self) -> int:
+        """The batches of a step."""
+        return int(self.trainer["accumulate_grad_batches"])
+
+    @property
+    def interval(self) -> int:
+        """The steps between two validations; ``val_check_interval`` counts batches."""
+        return min(math.ceil(self.trainer["val_check_interval"] / self.accumulate), self.steps)
 
 
 def given_keys() -> list[str]:
@@ -261,8 +322,17 @@ def user_directories() -> tuple[Path, ...]:
 
 
 def plain_config(config: DictConfig) -> dict[str, Any]:
-    """Return a composed configuration as plain Python, interpolations resolved; missing values are "???"."""
-    return OmegaConf.to_container(config, resolve=True)  # type: ignore[return-value]
+    """Return a composed configuration as plain Python, interpolations resolved; missing values are "???".
+
+    ``names`` gets the choices of the groups: those of the Hydra command, else the names of their classes.
+    """
+    plain: dict[str, Any] = OmegaConf.to_container(config, resolve=True)  # type: ignore[assignment]
+    nodes = {group: node for group, node in plain.items() if group in NAMED and isinstance(node, Mapping)}
+    named = {group: str(node["_target_"]).rpartition(".")[2] for group, node in nodes.items() if "_target_" in node}
+    if HydraConfig.initialized():
+        named |= {group: name for group, name in HydraConfig.get().runtime.choices.items() if group in NAMED}
+    plain["names"] = named | (plain.get("names") or {})
+    return plain
 
 
 def raw_group(config: DictConfig, group: str) -> Any:

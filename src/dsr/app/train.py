@@ -33,19 +33,17 @@ from dsr.app.trainer import (
     seconds_to_prepare,
     training_trainer,
 )
-from dsr.app.training_runs import WEIGHTS, common, keyed, read_config, training_data
+from dsr.app.training_runs import WEIGHTS, keyed, read_config, training_data
 from dsr.data.base import SceneSource, prepare_scenes
 from dsr.methods.networks.base import DisparityNetwork
 from dsr.methods.networks.trained import NETWORKS
 from dsr.methods.networks.weight_files import load_network, network_name, read_torch_file, save_network
-from dsr.metrics.visual_loss import make_visual_loss
 from dsr.training.data_module import PatchData
 from dsr.training.loggers import RUN_IDS, expect_installed, log_config, log_layout, log_settings
-from dsr.training.module import SuperResolution, WarmupCosine
-from dsr.training.objective import DepthObjective, Objective, SurfaceObjective
-from dsr.training.settings import Schedule
+from dsr.training.module import SuperResolution
+from dsr.training.settings import PatchSettings
 from dsr.utils import interruption
-from dsr.utils.builder import ConfigError, build
+from dsr.utils.builder import ConfigError, build, check
 from dsr.utils.checkpoints import CheckpointError
 from dsr.utils.console import USAGE_ERROR, ConsoleProgress
 from dsr.utils.devices import fast_precision, pick_device
@@ -81,7 +79,7 @@ def train(config: DictConfig) -> float:
 
     """
     plain, settings, device = _read(config)
-    processes = find_processes(device, settings.trainer.devices, settings.trainer.strategy)
+    processes = _processes(settings, device)
     with processes.running():
         if processes.first:
             return _train(plain, settings, device, processes)
@@ -108,13 +106,12 @@ def plan(config: DictConfig) -> list[Plan]:
     """
     here = runs_here()
     plain, settings, device = _read(config, here=here)
-    devices = settings.trainer.devices
-    count = find_processes(device, devices, settings.trainer.strategy).count if here else 1
+    count = _processes(settings, device).count if here else 1
     prepared = _prepare(plain, settings, device, count)
     elsewhere = () if here else ("device", "precision")
     rundir.expect_free(prepared.folder, plain, prepared.identity, (*prepared.tolerated, *elsewhere))
     left = _steps_left(prepared, settings)
-    done = settings.trainer.steps - left
+    done = settings.steps - left
 
     def seconds(shared: set[str]) -> float:
         scenes = str((plain["dataset"], plain["validation"]))  # which the first job of several prepares
@@ -132,11 +129,16 @@ def _steps_left(prepared: _Prepared, settings: TrainConfig) -> int:
     except ConfigError:
         return 0
     if prepared.resume is None:
-        return settings.trainer.steps
+        return settings.steps
     try:
-        return settings.trainer.steps - int(read_torch_file(prepared.resume)["global_step"])
+        return settings.steps - int(read_torch_file(prepared.resume)["global_step"])
     except (ValueError, KeyError, TypeError, OSError) as error:
         raise CheckpointError(prepared.resume, error) from error
+
+
+def _processes(settings: TrainConfig, device: torch.device) -> Processes:
+    """Return the processes of the training."""
+    return find_processes(device, settings.trainer["devices"], settings.trainer["strategy"])
 
 
 def _read(config: DictConfig, *, here: bool = True) -> tuple[dict[str, Any], TrainConfig, torch.device]:
@@ -174,6 +176,10 @@ def _prepare(plain: dict[str, Any], settings: TrainConfig, device: torch.device,
     check_metrics(settings.metrics)
     for name in settings.logger:
         expect_installed(name)
+    check("trainer", {key: value for key, value in settings.trainer.items() if key not in ("devices", "strategy")})
+    for group in ("callbacks", "logger"):
+        for name, node in getattr(settings, group).items():
+            check(f"{group}.{name}", node)
     identity = rundir.identity_of(plain, None, device)
     folder = rundir.folder_of(settings.output_dir or rundir.default_directory("train", plain, identity))
     last = folder / _LAST
@@ -209,7 +215,7 @@ def _train(plain: dict[str, Any], settings: TrainConfig, device: torch.device, p
         if new:  # a corrected command begins anew
             _discard(trainer, folder)
         raise
-    facts = _facts(plain, module)
+    facts = _facts(plain, module, data.patches)
     if first:
         _describe(trainer, plain, facts, resumed=resume is not None)
     try:
@@ -221,9 +227,9 @@ def _train(plain: dict[str, Any], settings: TrainConfig, device: torch.device, p
             f"interrupted at step {trainer.global_step}; resume={folder} goes on from there"
         ) from None
     if first:
-        _export(module, folder / _LAST.with_name(f"{settings.trainer.keep}.ckpt"), weights, facts)
+        _export(module, folder / _LAST.with_name(f"{settings.keep}.ckpt"), weights, facts)
     progress.say(f"weights: {weights}")
-    score = best.best_model_score if settings.trainer.keep == "best" else trainer.callback_metrics.get(MONITOR)
+    score = best.best_model_score if settings.keep == "best" else trainer.callback_metrics.get(MONITOR)
     return math.nan if score is None else float(score)
 
 
@@ -282,73 +288,55 @@ def _resumed(plain: dict[str, Any]) -> dict[str, Any]:
 
 def _network(settings: TrainConfig) -> DisparityNetwork:
     """Build the network, with initial weights if they are given."""
-    net: DisparityNetwork = build("model", settings.model, {"scale": settings.scale})
-    for key, take in (("init", net.start_from), ("shared", net.share)):
-        given = getattr(settings.trainer, key)
+    net: DisparityNetwork = build("model.net", settings.model["net"])
+    for key, take in (("weights", net.start_from), ("shared", net.share)):
+        given = getattr(settings.start, key)
         if given is None:
             continue
         try:
             networks = {**NETWORKS, network_name(type(net)): type(net)}
             first = load_network(Path(given).expanduser(), networks)
         except (ValueError, OSError) as error:
-            raise ConfigError(f"trainer.{key}: {error}") from error
+            raise ConfigError(f"start.{key}: {error}") from error
         try:
             take(first)
         except ValueError as error:
-            raise ConfigError(f"trainer.{key}: {given}: {error}") from error
+            raise ConfigError(f"start.{key}: {given}: {error}") from error
     for scale in settings.degradation.get("scales") or ():
         if not net.serves(settings.scale, int(scale)):
             raise ConfigError(
                 f"degradation.scales: expected factors that weights for {settings.scale} serve, got {scale}"
             )
-    for pattern in settings.trainer.frozen:
+    for pattern in settings.start.frozen:
         found = [value for name, value in net.named_parameters() if fnmatch.fnmatchcase(name, pattern)]
         if not found:
             kinds = ", ".join(dict.fromkeys(f"{name.split('.')[0]}.*" for name, _ in net.named_parameters()))
-            raise ConfigError(f"trainer.frozen: expected patterns of parameters' names, such as {kinds}; got {pattern}")
+            raise ConfigError(f"start.frozen: expected patterns of parameters' names, such as {kinds}; got {pattern}")
         for value in found:
             value.requires_grad_(False)
     return net
 
 
 def _module(settings: TrainConfig, net: DisparityNetwork, data: PatchData, metrics: Any) -> SuperResolution:
-    """Build the training module."""
+    """Build the training module, and its optimiser once, for its errors."""
+    node, names = settings.model, settings.names
+    w, loss = node["objective"].get("w"), settings.loss
+    for key, unused in (("visual", not w and loss.visual != "mse_v"), ("w", loss.w not in ("auto", w))):
+        if unused:
+            what = "a loss of its own" if w is None else "no visual loss, which model.objective.w=auto adds"
+            raise ConfigError(f"loss.{key}: model={names['model']} has {what}; leave it out")
+    given = {"net": net, "metrics": metrics, "validation_sets": data.validation_sets}
     try:
-        objective = _objective(settings)
-        objective.check(net, settings.trainer.patch, told=settings.degradation["name"] != "plain")
-        trainer = Schedule(**common(Schedule, settings.trainer))
-        rate, decay = trainer.learning_rate, trainer.weight_decay
-        return SuperResolution(
-            net,
-            objective,
-            functools.partial(torch.optim.AdamW, lr=rate, weight_decay=decay, fused=True),
-            functools.partial(WarmupCosine, steps=trainer.steps, warmup=trainer.warmup),
-            average=settings.trainer.average,
-            metrics=metrics,
-            validation_sets=data.validation_sets,
-        )
+        module = build("model", {key: value for key, value in node.items() if key not in given}, given, names["model"])
+        module.objective.check(net, data.patches.patch, told=names["degradation"] != "plain")
     except (ValueError, OSError) as error:
         raise keyed(error) from error
-
-
-def _objective(settings: TrainConfig) -> Objective:
-    """Build the loss."""
-    model, loss, trunk = settings.model, settings.loss, settings.metrics.lpips_trunk
-    visual = model.get("visual")
-    if not isinstance(visual, bool):
-        raise ConfigError(f"model.visual: expected true or false, got {visual!r}")
-    if not visual and loss.visual != "mse_v":
-        raise ConfigError(
-            f"loss.visual: model={model['name']} has no visual loss, which model.visual=true adds; leave it out"
-        )
-    if model.get("depth_loss") == "surface":
-        if loss.w != "auto" or loss.visual != "mse_v":
-            name = model["name"]
-            raise ConfigError(f"loss: model={name} has a loss of its own, without w and loss.visual; leave them out")
-        return SurfaceObjective()
-    made = make_visual_loss(loss.visual, None if trunk is None else Path(trunk).expanduser())  # type: ignore[arg-type]
-    w = loss.w if loss.w == "auto" else float(loss.w)
-    return DepthObjective(model.get("depth_loss"), w if visual else 0.0, made, model.get("shading", 0.0))  # type: ignore[arg-type]
+    try:
+        module.configure_optimizers()
+    except (ValueError, TypeError) as error:
+        part = "optimizer" if "nvalid" in str(error) else "scheduler"  # as torch's optimisers say
+        raise ConfigError(f"model.{part}: {error}") from error
+    return module
 
 
 def _load(progress: Progress, module: SuperResolution, data: PatchData) -> None:
@@ -375,16 +363,17 @@ def _clear(folder: Path) -> None:
 
 def _announce(progress: Progress, settings: TrainConfig, prepared: _Prepared, devices: int) -> None:
     """Show what the run will do, and how long it will take."""
-    data, module, trainer = prepared.data, prepared.module, settings.trainer
+    data, module = prepared.data, prepared.module
+    patches = data.patches
     held_out = ", ".join(f"{len(names)} of {kind}" for kind, (_, names) in data.validation_scenes().items())
     parameters = sum(each.numel() for each in module.net.parameters())
-    accumulate = f" x {trainer.accumulate} batches" if trainer.accumulate > 1 else ""
+    accumulate = f" x {settings.accumulate} batches" if settings.accumulate > 1 else ""
     accumulate += f" x {devices} devices" if devices > 1 else ""
     lines: Mapping[str, Any] = {
-        "model": f"{settings.model['name']} x{settings.scale}, {parameters:,} parameters, {settings.precision}",
-        "data": f"{data.training_count} scenes of {settings.dataset['name']} to train on, {held_out} to validate with",
+        "model": f"{settings.names['model']} x{settings.scale}, {parameters:,} parameters, {settings.precision}",
+        "data": f"{data.training_count} scenes of {settings.names['dataset']} to train on, {held_out} to validate with",
         "loss": module.objective.formula,
-        "steps": f"{trainer.steps} of {trainer.batch} patches of {trainer.patch} x {trainer.patch}{accumulate}"
+        "steps": f"{settings.steps} of {patches.batch} patches of {patches.patch} x {patches.patch}{accumulate}"
         + (", resumed" if prepared.resume else ""),
         "log": ", ".join(
             f"tensorboard --logdir {prepared.folder}" if name == "tensorboard" else name for name in settings.logger
@@ -408,15 +397,15 @@ def _costs(
     progress: Progress,
 ) -> dict[str, float]:
     """Return the seconds of what a training has left after ``done`` steps, as measured now, by what it is."""
-    data, module, trainer = prepared.data, prepared.module.to(prepared.device), settings.trainer
-    interval = min(trainer.validate_every, trainer.steps)
-    steps, validations = trainer.steps - done, math.ceil(trainer.steps / interval) - done // interval + (not done)
+    data, module = prepared.data, prepared.module.to(prepared.device)
+    interval = settings.interval
+    steps, validations = settings.steps - done, math.ceil(settings.steps / interval) - done // interval + (not done)
     try:
         pairs = [seconds_to_prepare(source, names, progress) for source, names in sources]
         validation = seconds_per_validation(module, data) / devices
     except (ValueError, OSError) as error:
         raise keyed(error) from error
-    step = seconds_per_step(module, data.example_batch(), settings.precision) * trainer.accumulate
+    step = seconds_per_step(module, data.example_batch(), settings.precision) * settings.accumulate
     parts = {
         f"{sum(count for _, count in pairs)} scenes that are not in the cache": sum(seconds for seconds, _ in pairs),
         f"{steps} step{'s' * (steps != 1)} of {step:.2g} s": step * steps,
@@ -450,13 +439,15 @@ def _describe(trainer: lightning.Trainer, plain: Mapping[str, Any], facts: Mappi
             log_settings(logger, listed, {**plain, "loss": loss})
 
 
-def _facts(plain: Mapping[str, Any], module: SuperResolution) -> dict[str, Any]:
+def _facts(plain: Mapping[str, Any], module: SuperResolution, patches: PatchSettings) -> dict[str, Any]:
     """Return the training's main settings, for the weights' header and the log."""
     groups = ("model", "dataset", "downsampling", "noise", "degradation", "trainer")
     return {
-        **{group: plain[group]["name"] for group in groups},
+        **{group: plain["names"][group] for group in groups},
         **{key: plain[key] for key in ("scale", "seed", "precision")},
-        **{key: plain["trainer"][key] for key in ("steps", "learning_rate", "batch", "patch")},
+        "steps": plain["trainer"]["max_steps"],
+        "learning_rate": plain["model"].get("optimizer", {}).get("lr"),
+        **{key: getattr(patches, key) for key in ("batch", "patch")},
         **module.objective.facts,
     }
 

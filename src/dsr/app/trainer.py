@@ -15,13 +15,11 @@ from lightning.pytorch.utilities.seed import isolate_rng
 from dsr.app.devices import Processes
 from dsr.app.schema import TrainConfig
 from dsr.data.base import SceneSource, prepare_scenes, unprepared
-from dsr.training.callbacks import Curves
 from dsr.training.data_module import PatchData
 from dsr.training.degradation import Batch
 from dsr.training.module import SuperResolution
 from dsr.utils.builder import build
 from dsr.utils.checkpoints import Interruption, OwnFiles
-from dsr.utils.divergence import Divergence
 from dsr.utils.lightning import ListedScores, StepProgress, ValidationTable, make_trainer, without_chatter
 from dsr.utils.progress import SILENT, Progress
 
@@ -84,7 +82,6 @@ def training_trainer(
         ConfigError: the log cannot be written, such as without an optional package.
 
     """
-    settings = config.trainer
     checkpoints = folder / "checkpoints"
     best = ModelCheckpoint(
         checkpoints, "best", monitor=MONITOR, mode="min", enable_version_counter=False, save_on_train_epoch_end=False
@@ -94,8 +91,7 @@ def training_trainer(
     )  # save_last=True keeps the best's
     callbacks = [
         OwnFiles(checkpoints, progress.say),
-        Divergence(),
-        Curves(),
+        *(build(f"callbacks.{name}", node) for name, node in config.callbacks.items()),
         ValidationTable(folder / VALIDATION),
         ListedScores(best),
         best,
@@ -105,20 +101,23 @@ def training_trainer(
         FirstValidation(best),
     ]
     with without_chatter():
-        loggers = [build(f"logger.{name}", node, {"folder": folder}) for name, node in config.logger.items()]
+        loggers = [build(f"logger.{name}", {"save_dir": str(folder), **node}) for name, node in config.logger.items()]
     varying = "_find_unused_parameters_true" if idle or config.degradation.get("scales") else ""  # layers of one factor
+    made = ("max_steps", "val_check_interval", "accumulate_grad_batches", "devices", "strategy")
+    node = {key: value for key, value in config.trainer.items() if key not in made}
     trainer = make_trainer(
         device,
-        settings.steps,
-        min(settings.validate_every, settings.steps),
+        config.steps,
+        config.interval,
         callbacks=callbacks,
         logger=loggers,
         devices=processes.count,
-        accumulate=settings.accumulate,
+        accumulate=config.accumulate,
         environment=processes.environment,
         strategy=f"ddp{varying}" if processes.count > 1 else "auto",
         precision="bf16-mixed" if config.precision == "bfloat16" else "32-true",
-        gradient_clip_val=settings.clip,
+        default_root_dir=folder,
+        make=lambda **given: build("trainer", node, given),
     )
     return trainer, best
 

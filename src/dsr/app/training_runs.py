@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, get_type_hints
 
-from dsr.app.schema import RunConfig, TrainConfig, TrainerConfig, user_directories
+from dsr.app.schema import RunConfig, TrainConfig, user_directories
 from dsr.app.trust import Trust, expect_trusted, read_plain_yaml
 from dsr.data.base import SceneSource, SceneSubset
 from dsr.degradation.downsampling import Downsampling
@@ -52,17 +52,20 @@ def _check_types(file: Path, config: Mapping[Any, Any]) -> None:
             if key not in config:
                 raise ConfigError(f"{key}: missing")
         check_types(TrainConfig, {key: value for key, value in config.items() if key in kinds})
-        for key in ("trainer", "loss", "metrics"):
+        for key in ("start", "loss", "metrics"):
             part = config.get(key, {})
             if not isinstance(part, Mapping):
                 raise ConfigError(f"{key}: expected keys, got {part!r:.60}")
             names = {entry.name for entry in dataclasses.fields(kinds[key])}
             check_types(kinds[key], {name: value for name, value in part.items() if name in names}, f"{key}.")
+        named = config.get("names")
         for key in ("model", "dataset", "downsampling", "noise"):
-            if not isinstance(config[key].get("name"), str):
-                raise ConfigError(f"{key}.name: expected text, got {config[key].get('name')!r:.60}")
-        if "target" not in config["model"]:
-            raise ConfigError("model.target: missing")
+            name = named.get(key) if isinstance(named, Mapping) else None
+            if not isinstance(name, str):
+                raise ConfigError(f"names.{key}: expected text, got {name!r:.60}")
+        net = config["model"].get("net")
+        if not isinstance(net, Mapping) or "_target_" not in net:
+            raise ConfigError("model.net._target_: missing")
         RunConfig.check(RunConfig(precision=config.get("precision", "auto"), seed=config["seed"]))
     except ConfigError as error:
         raise ConfigError(f"{file}: {error}") from error
@@ -91,41 +94,42 @@ def studies_of_run(
             raise ConfigError(f"{key}: run={folder} sets it, too; leave one of them out")
     chosen = {key.partition(".")[0] for key in given}
     own = {key: run[key] for key in _FROM_RUN if key not in chosen}
-    name = run["model"]["name"]
-    method = {"name": name, "label": name, "model": name, **load_target("model", run["model"]).method}
-    network = str(run["model"].get("target"))
-    if not network.startswith("dsr."):
-        method["network"] = network
-    base = {**plain, **own, "method": method, "weights": str(weights)}
+    name = run["names"]["model"]
+    network = run["model"]["net"]
+    method = {"model": name, **load_target("model.net", network).method}
+    if not str(network["_target_"]).startswith("dsr."):
+        method["network"] = str(network["_target_"])
+    names = {**plain["names"], **{key: run["names"][key] for key in own if key in run["names"]}, "method": name}
+    base = {**plain, **own, "names": names, "label": None, "method": method, "weights": str(weights)}
     if "dataset" in chosen:
         yield base, None
         return
     data = training_data(TrainConfig.of(run))
-    for kind, (source, names) in data.validation_scenes().items():
+    for kind, (source, scenes) in data.validation_scenes().items():
         several = len(data.validation_sets) > 1 and base["output_dir"] is not None
         place = {"output_dir": str(Path(base["output_dir"]) / kind)} if several else {}
-        yield {**base, **place, "dataset": {"name": kind, "validation_of": str(folder)}}, SceneSubset(source, names)
+        there = {"names": {**names, "dataset": kind}, "dataset": {"validation_of": str(folder)}}
+        yield {**base, **place, **there}, SceneSubset(source, scenes)
 
 
 def training_data(settings: TrainConfig, devices: int = 1) -> PatchData:
     """Build the patches that the configuration describes, for a number of devices."""
-    trainer = settings.trainer
-    downsampling = build("downsampling", settings.downsampling)
+    downsampling = settings.build("downsampling")
     if not isinstance(downsampling, Downsampling):
         raise ConfigError("downsampling: training needs a model such as box, measured is none")
-    degradation = Degradation(settings.scale, downsampling, build("noise", settings.noise))
-    everything = build("degradation", settings.degradation)
+    degradation = Degradation(settings.scale, downsampling, settings.build("noise"))
+    everything = settings.build("degradation")
     validation = {name: build(f"validation.{name}", node) for name, node in settings.validation.items()}
+    patches: PatchSettings = settings.build("patches")
     try:
-        patches = PatchSettings(**common(PatchSettings, trainer))
         return PatchData(
-            _parts(settings.dataset),
+            _parts(settings),
             patches,
             degradation,
             seed=settings.seed,
             validation=validation,
             everything=everything,
-            patches_per_step=patches.batch * trainer.accumulate * devices,
+            patches_per_step=patches.batch * settings.accumulate * devices,
         )
     except ValueError as error:
         raise keyed(error) from error
@@ -133,21 +137,16 @@ def training_data(settings: TrainConfig, devices: int = 1) -> PatchData:
 
 def keyed(error: Exception) -> ConfigError:
     """Return an error of a training's parts as a ConfigError that names the configuration key."""
-    names = [field.name for field in dataclasses.fields(TrainerConfig)]
-    message = with_key(with_key(str(error), "trainer", names), "model", ["depth_loss", "shading"])
+    names = [field.name for field in dataclasses.fields(PatchSettings)]
+    message = with_key(with_key(str(error), "patches", names), "model.objective", ["depth_loss", "shading"])
     return ConfigError(with_key(message, "loss", ["visual"]))
 
 
-def common(target: type, settings: TrainerConfig) -> dict[str, Any]:
-    """Return the trainer's settings that are also fields of a dataclass, by name."""
-    theirs = {field.name for field in dataclasses.fields(target)}
-    return {name: value for name, value in dataclasses.asdict(settings).items() if name in theirs}
-
-
-def _parts(node: Mapping[str, Any]) -> list[Part]:
+def _parts(settings: TrainConfig) -> list[Part]:
     """Build the data sets to train on, with their fractions."""
+    node = settings.dataset
     if "parts" not in node:
-        return [Part(build("dataset", node))]
+        return [Part(settings.build("dataset"))]
     parts, fractions = node["parts"], node.get("shares")
     if not isinstance(parts, Mapping) or not parts:
         raise ConfigError(f"dataset.parts: expected data sets by name, got {parts!r:.60}")

@@ -1,8 +1,8 @@
 """What the configuration in a run's directory may name, as somebody else may have written it.
 
-A ``target`` is imported and called with the arguments beside it. A person who types one, or keeps it in a directory of
-their own (``--config-dir``), decides that; a ``config.yaml`` in a directory that came from elsewhere does not. Such a
-file may name the targets that the files of dsr's own ``conf/GROUP`` name for the same group. Any other needs ``trust``.
+A ``_target_`` is imported and called with the arguments beside it. A person who types one, or keeps it in a directory
+of their own (``--config-dir``), decides that; a ``config.yaml`` in a directory that came from elsewhere does not. Such
+a file may name the targets that the files of dsr's own ``conf/GROUP`` name for the same group. Others need ``trust``.
 """
 
 from __future__ import annotations
@@ -26,12 +26,16 @@ _LARGEST = 1 << 18
 """Largest size of a run's configuration in bytes."""
 _DEEPEST = 30
 """Largest depth of nested keys and lists."""
-_TARGETS = ("target", "_target_", "network")
+_TARGETS = ("_target_", "network")
 """Keys whose value is imported."""
 _EXTRA = ("metrics", "extra")
 """The key with a list of metrics to import."""
-_GROUP_OF = {"validation": "dataset"}
+_GROUP_OF = {"validation": "dataset", "patches": "trainer"}
 """Groups whose targets are those of another."""
+_PARTS_OF_MODEL = ("optimizer", "scheduler")
+"""Keys of a model that are groups of their own."""
+_TRAINED_MODULE = "dsr.training.module.SuperResolution"
+"""What ``conf/train.yaml`` makes of each model."""
 _LONGEST_NAME = 100
 
 
@@ -117,7 +121,7 @@ def expect_trusted(path: Path, config: Mapping[str, Any], trust: Trust) -> None:
 
     """
     _expect_names(path, config)
-    others = [(key, target) for key, target in _imported(config) if not _is_own(key, target)]
+    others = [(key, target) for key, target in imported(config) if not _is_own(key, target)]
     refused = [(key, target) for key, target in others if not trust.allows(target)]
     if refused:
         key, target = refused[0]
@@ -156,7 +160,7 @@ def _nodes(node: Any, above: _Key = ()) -> Iterator[tuple[_Key, Any]]:
         yield from _nodes(value, key)
 
 
-def _imported(config: Mapping[str, Any]) -> Iterator[tuple[_Key, str]]:
+def imported(config: Mapping[str, Any]) -> Iterator[tuple[_Key, str]]:
     """Yield the key and the value of all entries that are imported."""
     for key, value in _nodes(config):
         metric = key[:2] == _EXTRA and not isinstance(value, list)
@@ -166,6 +170,8 @@ def _imported(config: Mapping[str, Any]) -> Iterator[tuple[_Key, str]]:
 
 def _group_of(key: _Key) -> str:
     """Return the group of choices that a key belongs to."""
+    if key[0] == "model" and key[1] in _PARTS_OF_MODEL:
+        return key[1]
     return _GROUP_OF.get(key[0], key[0])
 
 
@@ -179,7 +185,7 @@ def _is_own(key: _Key, target: str) -> bool:
 def _expect_names(path: Path, config: Mapping[str, Any]) -> None:
     """Refuse names, which become those of files and folders, that would lead elsewhere."""
     for key, value in _nodes(config):
-        names = [value] if key[-1] == "name" else []
+        names = [value] if key[0] == "names" and key[1:] else []
         names += [key[-1]] if key[:-1] in (("validation",), ("dataset", "parts")) else []
         for name in map(str, names):
             leads = name in ("", ".", "..") or {*"/\\"} & {*name} or not name.isprintable()
@@ -196,8 +202,9 @@ def _targets_in(directory: Path) -> dict[str, frozenset[str]]:
             content = yaml.safe_load(read_limited(file))
         except (OSError, ValueError, RecursionError, yaml.YAMLError):  # told where it is composed
             continue
-        named = {target for _, target in _imported(content)} if isinstance(content, dict) else set()
+        named = {target for _, target in imported(content)} if isinstance(content, dict) else set()
         extra = content.get("extra") if isinstance(content, dict) else None
         named |= set(map(str, extra)) if file.parent.name == "metrics" and isinstance(extra, list) else set()
         found.setdefault(file.parent.name, set()).update(named)
+    found.setdefault("model", set()).add(_TRAINED_MODULE)
     return {group: frozenset(targets) for group, targets in found.items()}

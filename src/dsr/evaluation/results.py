@@ -23,7 +23,6 @@ METHOD_ORDER = (
 )  # fmt: skip
 """Order of the methods: simple ones, then those of the paper in the order of its tables; others follow."""
 _DATASET_ORDER = ("simgeo", "icl", "middlebury", "sunrgbd", "tofmark")
-_NAMES = ("name", "label", "target")
 
 
 class BenchmarkSetting(NamedTuple):
@@ -198,7 +197,7 @@ def method_settings(settings: Mapping[str, Any]) -> dict[str, Any]:
     """Return the parameters of a run's method: its configuration without names and the origin of weights."""
     method = settings.get("method")
     known = method if isinstance(method, Mapping) else {}
-    return {key: value for key, value in known.items() if key not in _NAMES and not key.startswith("weights_")}
+    return {key: value for key, value in known.items() if key != "_target_" and not key.startswith("weights_")}
 
 
 def problem_key(problem: BenchmarkSetting) -> tuple[Any, ...]:

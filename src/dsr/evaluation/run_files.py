@@ -216,7 +216,7 @@ def _distinguish(runs: Sequence[Run]) -> list[Run]:
     Examples: "MSG-V (ensemble=1)", "middlebury (size=256)".
     """
     methods = [_identity_of_method(run.settings) for run in runs]
-    datasets = [{**run.settings.get("dataset", {}), "root": None, "scenes": None, "target": None} for run in runs]
+    datasets = [{**run.settings.get("dataset", {}), "root": None, "scenes": None, "_target_": None} for run in runs]
     labels = _distinguishing_suffixes([(run.label, run.scale) for run in runs], methods)
     names = _distinguishing_suffixes([(run.dataset, 0) for run in runs], datasets)
     return [

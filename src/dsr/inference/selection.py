@@ -11,7 +11,7 @@ from dsr.inference.any_ratio import AnyRatio
 from dsr.inference.options import Fill
 from dsr.inference.plans import steps_of
 from dsr.methods.base import Method
-from dsr.methods.networks.weight_choice import has_weights
+from dsr.methods.networks.weight_choice import WeightChoice
 from dsr.methods.recipe import Recipe, Run
 from dsr.utils.builder import ConfigError
 
@@ -73,6 +73,7 @@ def select(recipe: Recipe, scale: float, weights: Path | None = None, *, measure
 
     """
     node = recipe.at()  # with the scale as the run names it
-    packaged = measured and weights is None and node.get("weights_packaged") is not None
-    direct = recipe.abilities.takes(scale) and not (packaged and not has_weights(node, scale))
+    choice = WeightChoice.of(node.get("weights"), scale)
+    packaged = measured and weights is None and choice.packaged is not None
+    direct = recipe.abilities.takes(scale) and not (packaged and not choice.exists())
     return Selection(recipe.with_weights(weights), scale, direct)

@@ -1,8 +1,8 @@
 """A method before the factor is known: list, read and build the methods.
 
-A method is a file of ``conf/method``, in the project's configuration or in a directory of the user's: its ``target`` is
-the class that makes it, its other keys are the arguments. ``eval.py`` composes that file with Hydra; everything else
-reads it with :func:`read_recipe`.
+A method is a file of ``conf/method``, in the project's configuration or in a directory of the user's: its ``method`` is
+a node whose ``_target_`` is the class that makes it, and whose other keys are the arguments; ``label`` is its name in
+tables. ``eval.py`` composes that file with Hydra; everything else reads it with :func:`read_recipe`.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from dsr.methods.base import Abilities, Method
 from dsr.methods.networks.base import DisparityNetwork
 from dsr.methods.networks.published import load_msg_weights
 from dsr.methods.networks.trained import NETWORKS
-from dsr.methods.networks.weight_choice import find_weights, has_weights
+from dsr.methods.networks.weight_choice import WeightChoice
 from dsr.methods.networks.weight_files import is_dsr_weights, load_network, network_name, read_header
 from dsr.utils.builder import ConfigError, build, load_target
 from dsr.utils.config_files import config_directories, list_choices
@@ -34,7 +34,9 @@ _NETWORK = "network"
 """Key of a method's node: the dotted path of the network's class, for a method whose weights come from a training."""
 _OPEN = (None, "auto")
 """Values of a method's keys that leave them to what is known of the maps."""
-_ALONE: Mapping[str, Any] = {"scale": 4, "seed": 0}
+OF_RUN = ("weights", "scale", "downsampling")
+"""Keys of a method's node that a run gives in another way; the node names them for ``hydra.utils.instantiate``."""
+_ALONE: Mapping[str, Any] = {"scale": 4, "seed": 0, "downsampling": None}
 """What a method's file may refer to where there is no run."""
 
 
@@ -86,6 +88,7 @@ class Recipe:
         directories: the user's configuration directories.
         others: values that the node may refer to, the run's ``scale`` among them.
         settings: keys that the caller has set.
+        label: its name in tables; None for ``name``.
 
     """
 
@@ -94,6 +97,7 @@ class Recipe:
     directories: tuple[Path, ...] = ()
     others: Mapping[str, Any] = field(default_factory=lambda: _ALONE)
     settings: frozenset[str] = frozenset()
+    label: str | None = None
     _resolved: dict[float | None, dict[str, Any]] = field(default_factory=dict, init=False, repr=False)
 
     def at(self, factor: float | None = None) -> Mapping[str, Any]:
@@ -125,7 +129,7 @@ class Recipe:
         target = load_target(key, node)
         if not (isinstance(target, type) and issubclass(target, Method)):
             expected = f"{Method.__module__}.{Method.__name__}"
-            raise ConfigError(f"{key}.target: expected a class that derives from {expected}, got {node['target']}")
+            raise ConfigError(f"{key}._target_: expected a class that derives from {expected}, got {node['_target_']}")
         return target
 
     @functools.cached_property
@@ -143,9 +147,9 @@ class Recipe:
         """
         if self.abilities.needs is None:
             return SCALES
-        factors = tuple(scale for scale in SCALES if has_weights(self.at(scale), scale))
+        factors = tuple(scale for scale in SCALES if self._choice(scale).exists())
         if not factors:
-            find_weights(self.at(4), 4)  # its error says where to get them
+            self.weights(4)  # its error says where to get them
             raise ValueError(
                 f"method={self.name}: expected weights that it names, or that come with dsr; there are none"
             )
@@ -154,14 +158,14 @@ class Recipe:
     @property
     def computed_at(self) -> tuple[float, ...]:
         """Factors at which a method computes that takes a map of any size, if there are only some."""
-        packaged = self.at().get("weights_packaged")
+        packaged = self._choice(4).packaged
         return tuple(packaged.values()) if self.abilities.own_size and isinstance(packaged, Mapping) else ()
 
     def with_weights(self, path: Path | None) -> Recipe:
         """Return the method with a file of weights, or a directory with published ones; None for its own."""
         if path is None or self.abilities.needs is None:
             return self
-        node = OmegaConf.merge(self.node, {"weights": str(path)})
+        node = OmegaConf.merge(self.node, {"weights": {"path": str(path)}})
         assert isinstance(node, DictConfig)  # noqa: S101 - for the type checker
         return replace(self, node=node)
 
@@ -172,7 +176,18 @@ class Recipe:
             ConfigError: there is none; it says where to get it.
 
         """
-        return None if self.abilities.needs is None else find_weights(self.at(factor), factor)
+        return None if self.abilities.needs is None else self._found(factor)
+
+    def _found(self, factor: float) -> Path:
+        """Return the file of weights for a factor."""
+        try:
+            return self._choice(factor).find()
+        except ConfigError as error:
+            raise ConfigError(f"method={self.name}: {error}") from error
+
+    def _choice(self, factor: float) -> WeightChoice:
+        """Return where the weights for a factor are."""
+        return WeightChoice.of(self.at(factor).get("weights"), factor)
 
     def build(self, factor: float, run: Run | None = None, **decided: Any) -> Method:
         """Build the method for a factor.
@@ -196,9 +211,8 @@ class Recipe:
         given = {**given, **told, **decided, "scale": factor}
         if self.abilities.needs is not None:
             given |= {"weights": self.weights(factor), "networks": self._networks}
-        method: Method = build(
-            "method", {key: value for key, value in node.items() if key not in ("weights", _NETWORK, *told)}, given
-        )
+        own = {key: value for key, value in node.items() if key not in (*OF_RUN, _NETWORK, *told)}
+        method: Method = build("method", own, given, self.name)
         return method
 
     def network(self, factor: int) -> DisparityNetwork:
@@ -215,7 +229,7 @@ class Recipe:
             known = [name for name in names if read_recipe(name, None, self.directories).abilities.needs == "network"]
             raise ConfigError(f"method: expected one with a network of dsr, {', '.join(known)}; got {self.name!r}")
         node = self.at(factor)
-        path, variant = find_weights(node, factor), node.get("variant")
+        path, variant = self._found(factor), node.get("variant")
         if variant is not None and not is_dsr_weights(path):
             return load_msg_weights(path, factor, variant)
         header = read_header(path)
@@ -225,8 +239,8 @@ class Recipe:
 
     def targets(self) -> Iterator[str]:
         """Yield the dotted paths of the method's class and of its network's class."""
-        if "target" in self.at():
-            yield str(self.at()["target"])
+        if "_target_" in self.at():
+            yield str(self.at()["_target_"])
         if (network := self._network_path()) is not None:
             yield network
 
@@ -236,7 +250,7 @@ class Recipe:
         path = self._network_path()
         if path is None:
             return dict(NETWORKS)
-        network = load_target("model", {"target": path})
+        network = load_target("model", {"_target_": path})
         return {**NETWORKS, network_name(network): network}
 
     def _network_path(self) -> str | None:
@@ -247,7 +261,7 @@ class Recipe:
         model = node.get("model")
         if model is None or model not in list_choices("model", places):
             return None
-        target = _read_file("model", str(model), places, ()).get("target")
+        target = OmegaConf.select(_read_file("model", str(model), places, ()), "net._target_")
         return None if target is None else str(target)
 
 
@@ -278,11 +292,13 @@ def read_recipe(name: str, settings: Mapping[str, Any] | None = None, directorie
     if name not in names:
         raise ConfigError(f"method: expected one of {', '.join(names)}, got {name!r}")
     try:
-        node = OmegaConf.merge(_read_file("method", name, places, ()), dict(settings or {}))
+        content = _read_file("method", name, places, ())
+        node = OmegaConf.merge(content.get("method", {}), dict(settings or {}))
     except OmegaConfBaseException as error:
         raise ConfigError(f"method={name}: {str(error).splitlines()[0]}") from error
     assert isinstance(node, DictConfig)  # noqa: S101 - for the type checker
-    recipe = Recipe(name, node, tuple(directories), settings=frozenset(settings or {}))
+    label = str(content.get("label") or name)
+    recipe = Recipe(name, node, tuple(directories), settings=frozenset(settings or {}), label=label)
     recipe.at()  # its error says what cannot be resolved
     return recipe
 
@@ -305,6 +321,8 @@ def _read_file(group: str, name: str, places: Sequence[Path], above: tuple[str, 
     listed = ListConfig([]) if listed is None else listed
     if not isinstance(listed, ListConfig):
         raise ConfigError(f"{path}: defaults: expected a list of names, got {listed!r:.60}")
+    if group == "method" and not isinstance(own.get(group), DictConfig):  # without "@package _global_"
+        own = OmegaConf.create({group: own})
     defaults = [str(each) for each in listed]
     parts = [
         own if each == "_self_" else _read_file(group, each, places, (*above, name))

@@ -72,7 +72,7 @@ class VisualLoss:
 MSE_V = VisualLoss()
 
 
-def make_visual_loss(name: VisualLossName, trunk: Path | None = None) -> VisualLoss:
+def make_visual_loss(name: VisualLossName, trunk: str | Path | None = None) -> VisualLoss:
     """Return a loss, with the network that ``lpips`` needs.
 
     Args:
@@ -86,7 +86,7 @@ def make_visual_loss(name: VisualLossName, trunk: Path | None = None) -> VisualL
     if name != "lpips":
         return VisualLoss(name)
     try:
-        return VisualLoss(name, load_lpips(trunk))
+        return VisualLoss(name, load_lpips(None if trunk is None else Path(trunk).expanduser()))
     except (OSError, ValueError) as error:
         raise ValueError(f"visual: lpips needs AlexNet's weights: {one_line(error)}; {GET_TRUNK}") from error
 

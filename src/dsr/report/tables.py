@@ -68,7 +68,7 @@ def _is_papers(run: Run, scene: str) -> bool:
     own = PAPER_FILES.get(run.dataset.partition(" (")[0], ())
     return (
         "validation_of" not in dataset
-        and scene in (_RELEASED if dataset.get("target") == _FOLDER else own)
+        and scene in (_RELEASED if dataset.get("_target_") == _FOLDER else own)
         and run.downsampling == "box"
         and run.settings.get("downsampling", {}).get("range_type") is None
         and all(dataset.get(key, value) == value for key, value in _PAPER_SETTINGS.items())

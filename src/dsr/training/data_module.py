@@ -126,7 +126,7 @@ class PatchData(lightning.LightningDataModule):
         super().__init__()
         check_patches((), settings, degradation.scale)
         self._everything, self._per_step = everything, patches_per_step
-        self._parts, self._settings, self._degradation, self._seed = list(parts), settings, degradation, seed
+        self._parts, self.patches, self._degradation, self._seed = list(parts), settings, degradation, seed
         self._training_names: list[list[str]] = []
         self._held_out: dict[str, tuple[SceneSource, list[str]]] = {}
         for part in parts:
@@ -136,7 +136,7 @@ class PatchData(lightning.LightningDataModule):
         if not self._held_out:
             raise ValueError("validation_scenes: expected a positive number where there is no other validation")
         self._refuse_leaks()
-        self._patches: Patches | None = None
+        self._cut: Patches | None = None
         self._validation: list[list[Scene]] = []
 
     @property
@@ -166,16 +166,16 @@ class PatchData(lightning.LightningDataModule):
             ValueError: a scene is smaller than a patch, or lacks a true depth.
 
         """
-        if self._patches is not None:
+        if self._cut is not None:
             return
         groups = [
             [_halve_precision(part.source.load(name)) for name in names]
             for part, names in zip(self._parts, self._training_names, strict=True)
         ]
         shares = [part.share for part in self._parts]
-        self._patches = Patches(
+        self._cut = Patches(
             groups,
-            self._settings,
+            self.patches,
             self._degradation,
             shares=shares,
             seed=self._seed,
@@ -191,11 +191,11 @@ class PatchData(lightning.LightningDataModule):
 
     def example_batch(self) -> Batch:
         """Return a batch of the run's size that needs no scene: a grey slope, repeated."""
-        tensors = to_tensors(self._degradation.sample(slope(self._settings.patch), clean=True))
+        tensors = to_tensors(self._degradation.sample(slope(self.patches.patch), clean=True))
         if self._everything is not None:
             nothing = {"facts": torch.zeros(FACTS), "soft": torch.zeros(())}
             tensors |= {"noise": torch.zeros_like(tensors["disparity_lr"]), **nothing}
-        return default_collate([tensors] * self._settings.batch)
+        return default_collate([tensors] * self.patches.batch)
 
     def example_scene(self, kind: str) -> Batch:
         """Return the first scene of a validation set as its loader does."""
@@ -214,9 +214,9 @@ class PatchData(lightning.LightningDataModule):
         An epoch is the whole training or, where the trainer has no number of steps, about 1000 batches. The length is
         that of the whole epoch, as Lightning subtracts the batches that were done before an interruption.
         """
-        numbers = _PatchNumbers(self.trainer, self._settings.batch)
-        workers: dict[str, Any] = {"num_workers": self._settings.workers}
-        if self._settings.workers:
+        numbers = _PatchNumbers(self.trainer, self.patches.batch)
+        workers: dict[str, Any] = {"num_workers": self.patches.workers}
+        if self.patches.workers:
             workers["worker_init_fn"] = functools.partial(_begin_worker, os.getpid())
         pin = torch.cuda.is_available()
         patches = self._load_patches().select(0, sys.maxsize)
@@ -245,10 +245,10 @@ class PatchData(lightning.LightningDataModule):
         return WholeScenes(scenes, self._degradation, self._seed, told=self._everything is not None)
 
     def _load_patches(self) -> Patches:
-        if self._patches is None:
+        if self._cut is None:
             self.setup()
-        assert self._patches is not None  # noqa: S101 - for the type checker
-        return self._patches
+        assert self._cut is not None  # noqa: S101 - for the type checker
+        return self._cut
 
     def _split(self, source: SceneSource) -> None:
         """Divide the scenes of a data set into those to train on and those to validate with, the last ones."""
@@ -257,7 +257,7 @@ class PatchData(lightning.LightningDataModule):
                 f"dataset={source.name}: its scenes are to evaluate on, not to train on; "
                 f"+dataset@validation.{source.name}={source.name} validates with them"
             )
-        names, count = source.scenes()[: self._settings.scenes], self._settings.validation_scenes
+        names, count = source.scenes()[: self.patches.scenes], self.patches.validation_scenes
         if len(names) <= count:
             raise ValueError(
                 f"validation_scenes: expected fewer than the {len(names)} scenes of {source.name}, got {count}"

@@ -1,7 +1,4 @@
-"""Where a training is logged: Lightning's loggers, made for the directory of a run.
-
-A run that goes on after an interruption goes on with its log.
-"""
+"""Where a training is logged, beside Lightning's TensorBoardLogger: logs that go on after an interruption."""
 
 from __future__ import annotations
 
@@ -20,7 +17,6 @@ from torch import Tensor
 from dsr.metrics.formats import main_first
 from dsr.utils.builder import expect_library
 from dsr.utils.files import write_text
-from dsr.utils.lightning import Log
 from dsr.utils.runs_table import list_run
 
 _CURVES = ("loss", "gradient_norm")
@@ -50,13 +46,13 @@ class CsvLog(CSVLogger):
     """A table of all logged values, a row for each step; rows of later steps, from before an interruption, go.
 
     Args:
-        folder: the run's directory; the table is ``csv/metrics.csv`` in it.
+        save_dir: the run's directory; the table is ``csv/metrics.csv`` in it.
 
     """
 
-    def __init__(self, folder: Path) -> None:
-        super().__init__(folder, name="", version="csv", flush_logs_every_n_steps=sys.maxsize)
-        self._before = _read_table(folder / "csv" / "metrics.csv")
+    def __init__(self, save_dir: str | Path) -> None:
+        super().__init__(save_dir, name="", version="csv", flush_logs_every_n_steps=sys.maxsize)
+        self._before = _read_table(Path(save_dir) / "csv" / "metrics.csv")
 
     @rank_zero_only
     def log_metrics(self, metrics: Any, step: int | None = None) -> None:
@@ -89,23 +85,13 @@ class WandbLog(WandbLogger):
             self._experiment = None
 
 
-def tensorboard(folder: Path) -> Logger:
-    """Return TensorBoard's logger, which writes to ``tensorboard`` in a run's directory."""
-    return Log(folder, name="", version="tensorboard", default_hp_metric=False)
-
-
-def csv(folder: Path) -> Logger:
-    """Return a logger that writes ``csv/metrics.csv`` in a run's directory."""
-    return CsvLog(folder)
-
-
 def wandb(
-    folder: Path, project: str = "dsr", entity: str | None = None, mode: Literal["online", "offline"] = "online"
+    save_dir: str | Path, project: str = "dsr", entity: str | None = None, mode: Literal["online", "offline"] = "online"
 ) -> Logger:
     """Return the logger of Weights & Biases.
 
     Args:
-        folder: the run's directory, which gives the run its name; local files are written to ``wandb`` in it.
+        save_dir: the run's directory, which gives the run its name; local files are written to ``wandb`` in it.
         project: of the service.
         entity: user or team; None for the user's default.
         mode: ``offline`` for local files alone, which ``wandb sync`` uploads later.
@@ -115,6 +101,7 @@ def wandb(
 
     """
     expect_installed("wandb")
+    folder = Path(save_dir)
     import wandb as client  # noqa: PLC0415 - optional
 
     logger = WandbLog(
@@ -130,11 +117,11 @@ def wandb(
     return logger
 
 
-def mlflow(folder: Path, experiment: str = "dsr", tracking_uri: str | None = None) -> Logger:
+def mlflow(save_dir: str | Path, experiment: str = "dsr", tracking_uri: str | None = None) -> Logger:
     """Return the logger of MLflow.
 
     Args:
-        folder: the run's directory, which gives the run its name.
+        save_dir: the run's directory, which gives the run its name.
         experiment: name of the experiment that the run belongs to.
         tracking_uri: address of a server or a store; None for ``$MLFLOW_TRACKING_URI``, or files in ``mlruns`` of the
             run's directory.
@@ -144,6 +131,7 @@ def mlflow(folder: Path, experiment: str = "dsr", tracking_uri: str | None = Non
 
     """
     expect_installed("mlflow")
+    folder = Path(save_dir)
     from mlflow.exceptions import MlflowException  # noqa: PLC0415 - optional
 
     uri = tracking_uri or os.environ.get("MLFLOW_TRACKING_URI") or (folder / "mlruns").absolute().as_uri()
@@ -165,7 +153,7 @@ def log_config(logger: Logger | None, text: str) -> None:
         text: in Markdown.
 
     """
-    if isinstance(logger, Log):
+    if isinstance(logger, TensorBoardLogger):
         logger.experiment.add_text("config", text)
         logger.experiment.flush()
 
@@ -179,7 +167,7 @@ def log_settings(logger: Logger | None, table: Mapping[str, Any], config: Mappin
         config: the complete configuration, for other loggers.
 
     """
-    if isinstance(logger, Log):
+    if isinstance(logger, TensorBoardLogger):
         logger.log_hyperparams(dict(table))
         list_run(logger.experiment, "training", table, {})
     elif logger is not None:
@@ -198,7 +186,7 @@ def log_layout(logger: Logger | None, metrics: Mapping[str, str], losses: Sequen
         losses: names of values of the training.
 
     """
-    if not isinstance(logger, Log):
+    if not isinstance(logger, TensorBoardLogger):
         return
     looks = main_first(name for name in metrics if "_v" in name)
     depth = [name for name in metrics if name not in looks]

@@ -53,9 +53,15 @@ class WarmupCosine(LambdaLR):
         steps: number of steps of the whole training.
         warmup: number of steps until the highest rate.
 
+    Raises:
+        ValueError: the warm-up is negative.
+
     """
 
     def __init__(self, optimizer: torch.optim.Optimizer, steps: int, warmup: int = 300) -> None:
+        if warmup < 0:
+            raise ValueError(f"warmup: expected 0 or more, got {warmup}")
+
         def factor(step: int) -> float:
             if step < warmup:
                 return (step + 1) / warmup

@@ -111,6 +111,8 @@ class DepthObjective(Objective):
         """Check the values."""
         if not 0 <= self.shading < math.inf:
             raise ValueError(f"shading: expected 0 or a positive number, got {self.shading}")
+        if self.w != "auto" and not 0 <= self.w < math.inf:
+            raise ValueError(f"w: expected auto or a number, 0 or more, got {self.w}")
         if self.depth_loss not in _DEPTH_LOSSES:
             raise ValueError(f"depth_loss: expected one of {', '.join(_DEPTH_LOSSES)}, got {self.depth_loss!r}")
 

@@ -1,4 +1,4 @@
-"""The settings of a training, without torch: a configuration is checked before torch is imported."""
+"""The settings of a training's patches, without torch: a configuration is checked before torch is imported."""
 
 from __future__ import annotations
 
@@ -8,8 +8,6 @@ from dataclasses import dataclass
 _MAX_DEPTH_SCALE = 3.0
 """Depth changes by a factor of exp(3) = 20 at most."""
 _MIN_SIZE = 16
-_LARGEST_RATE = 1e36
-"""A larger learning rate, divided by the correction of Adam's first step, is no float32 number."""
 
 
 @dataclass(frozen=True)
@@ -60,40 +58,4 @@ class PatchSettings:
             raise ValueError(f"scenes: expected a positive number, or null for all, got {self.scenes}")
         for name in ("workers", "validation_scenes"):
             if getattr(self, name) < 0:
-                raise ValueError(f"{name}: expected 0 or more, got {getattr(self, name)}")
-
-
-@dataclass(frozen=True)
-class Schedule:
-    """Optimisation settings: AdamW with linear warm-up and cosine decay to zero.
-
-    Args:
-        steps: number of steps of the whole training.
-        learning_rate: highest learning rate.
-        warmup: number of steps until the highest learning rate.
-        weight_decay: weight decay of AdamW.
-        clip: largest norm of the gradient; longer gradients are scaled down to it.
-
-    Raises:
-        ValueError: a value is out of range.
-
-    """
-
-    steps: int
-    learning_rate: float = 1e-3
-    warmup: int = 300
-    weight_decay: float = 1e-4
-    clip: float = 1.0
-
-    def __post_init__(self) -> None:
-        """Check the values."""
-        if not 0 < self.learning_rate <= _LARGEST_RATE:
-            raise ValueError(
-                f"learning_rate: expected a positive number up to {_LARGEST_RATE:g}, got {self.learning_rate}"
-            )
-        for name in ("steps", "clip"):
-            if not 0 < getattr(self, name) < math.inf:
-                raise ValueError(f"{name}: expected a positive number, got {getattr(self, name)}")
-        for name in ("warmup", "weight_decay"):
-            if not 0 <= getattr(self, name) < math.inf:
                 raise ValueError(f"{name}: expected 0 or more, got {getattr(self, name)}")

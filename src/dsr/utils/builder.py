@@ -1,14 +1,16 @@
-"""Build the object that a configuration group describes.
+"""Build the object that a node of the configuration describes, as ``hydra.utils.instantiate`` does.
 
-A group's file names its class or function as ``target``; the other keys are the arguments. The schema of a group is
-therefore the signature of its target, and a new method needs one module and one file. An error of the target that
-begins with an argument's name (``sharpness: expected ...``) is shown with the key that sets it
-(``method.sharpness: expected ...``).
+A node names its class or function as ``_target_``; the other keys are the arguments. Those that are nodes themselves
+are built first; with ``_partial_`` the result is a :func:`functools.partial`. The schema of a node is therefore the
+signature of its target, and a new method needs one module and one file. What Hydra's function lacks are messages that
+name the key, and quickness: an error of the target that begins with an argument's name (``sharpness: expected ...``) is
+shown with the key that sets it (``method.sharpness: expected ...``).
 """
 
 from __future__ import annotations
 
 import dataclasses
+import functools
 import importlib
 import importlib.util
 import inspect
@@ -18,10 +20,7 @@ from pathlib import Path
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
 _MISSING = "???"
-_ABOUT = (
-    "name", "label", "target", "weights_packaged", "weights_file", "weights_files", "weights_source", "depth_loss",
-    "visual", "shading",
-)  # fmt: skip
+_TARGET, _PARTIAL = "_target_", "_partial_"
 
 
 class ConfigError(ValueError):
@@ -45,38 +44,78 @@ def expect_library(key: str, module: str, extra: str) -> None:
         raise ConfigError(f"{key}: expected {library}, which is not installed; pip install dsr[{extra}]")
 
 
-def build(group: str, node: Mapping[str, Any], given: Mapping[str, Any] | None = None) -> Any:
-    """Build the object that a configuration group describes.
+def build(group: str, node: Mapping[str, Any], given: Mapping[str, Any] | None = None, name: str | None = None) -> Any:
+    """Build the object that a node describes.
 
     Args:
-        group: its name, for messages.
-        node: its content: ``name``, ``target``, perhaps ``label``, and arguments of the target.
+        group: the node's place in the configuration, for messages.
+        node: ``_target_``, perhaps ``_partial_``, and arguments of the target.
         given: values of the whole run (scale, weights, device, ...); the target gets those that its signature names.
+        name: of the group's choice, for messages.
 
     Raises:
         ConfigError: a key is unknown, missing or of another type, or the target rejects a value.
 
     """
+    target, arguments = _checked(group, node, given or {}, name)
+    arguments = {key: _built(f"{group}.{key}", value) for key, value in arguments.items()}
+    if node.get(_PARTIAL):
+        return functools.partial(target, **arguments)
+    try:
+        return target(**arguments)
+    except (ValueError, OSError) as error:
+        raise ConfigError(with_key(str(error), group, inspect.signature(target).parameters)) from error
+
+
+def check(group: str, node: Mapping[str, Any], given: Mapping[str, Any] | None = None) -> None:
+    """Check what can be checked before :func:`build`: that a node has the keys of its target, of the right types.
+
+    Raises:
+        ConfigError: it has not.
+
+    """
+    _checked(group, node, given or {}, None)
+
+
+def _checked(
+    group: str, node: Mapping[str, Any], given: Mapping[str, Any], name: str | None
+) -> tuple[Any, dict[str, Any]]:
+    """Return what a node names, and its arguments, those that are given included."""
     target = load_target(group, node)
     parameters = inspect.signature(target).parameters
+    takes_any = any(each.kind is each.VAR_KEYWORD for each in parameters.values())
     hints = get_type_hints(target.__init__ if inspect.isclass(target) else target)
-    given = {key: value for key, value in (given or {}).items() if key in parameters}
-    arguments = {key: value for key, value in node.items() if key not in _ABOUT or key in parameters}
-    own = [key for key in parameters if key not in given]
-    choice = f"{group}={node['name']}" if "name" in node else group
+    given = {key: value for key, value in given.items() if key in parameters}
+    own = [key for key, each in parameters.items() if key not in given and each.kind is not each.VAR_KEYWORD]
+    choice = f"{group}={name}" if name else group
+    arguments = {key: value for key, value in node.items() if key not in (_TARGET, _PARTIAL)}
     for key, value in arguments.items():
-        if key not in own:
+        if key not in own and not takes_any:
             accepted = ", ".join(own) or "none"
             raise ConfigError(f"{group}.{key}: unknown key; {choice} takes {accepted}")
         expect_usable(f"{group}.{key}", value)
         if value == _MISSING:
             raise ConfigError(f"{group}.{key}: {choice} needs it: {group}.{key}=...")
-        if key in hints and not _fits(value, hints[key]):
+        if key in hints and not _is_node(value) and not _fits(value, hints[key]):
             raise ConfigError(f"{group}.{key}: expected {_describe(hints[key])}, got {value!r:.60}")
-    try:
-        return target(**arguments, **given)
-    except (ValueError, OSError) as error:
-        raise ConfigError(with_key(str(error), group, parameters)) from error
+    return target, {**arguments, **given}
+
+
+def _is_node(value: Any) -> bool:
+    """Return whether a value is a node to build, or has some within it."""
+    values = value.values() if isinstance(value, Mapping) else value if isinstance(value, list) else ()
+    return (isinstance(value, Mapping) and _TARGET in value) or any(map(_is_node, values))
+
+
+def _built(key: str, value: Any) -> Any:
+    """Return a value with the nodes in it built."""
+    if not _is_node(value):
+        return value
+    if isinstance(value, list):
+        return [_built(f"{key}.{number}", each) for number, each in enumerate(value)]
+    if _TARGET in value:
+        return build(key, value)
+    return {name: _built(f"{key}.{name}", each) for name, each in value.items()}
 
 
 def check_types(kind: type, values: Mapping[str, Any], place: str = "") -> None:
@@ -148,11 +187,11 @@ def load_target(group: str, node: Mapping[str, Any]) -> Any:
 
     """
     if not isinstance(node, Mapping):
-        raise ConfigError(f"{group}: expected keys, name and target among them, got {node!r:.60}")
-    path = node.get("target")
-    target = load_object(f"{group}.target", path, "a class or function")
+        raise ConfigError(f"{group}: expected keys, {_TARGET} among them, got {node!r:.60}")
+    path = node.get(_TARGET)
+    target = load_object(f"{group}.{_TARGET}", path, "a class or function")
     if not callable(target):
-        raise ConfigError(f"{group}.target: expected a class or function, {path!r} is none")
+        raise ConfigError(f"{group}.{_TARGET}: expected a class or function, {path!r} is none")
     return target
 
 
@@ -189,6 +228,8 @@ def _fits(value: Any, hint: Any) -> bool:
     if origin is not None and issubclass(origin, Mapping):
         return isinstance(value, Mapping) and all(_fits(item, get_args(hint)[1]) for item in value.values())
     accepted: Any = {float: (int, float), Path: str, Any: object}.get(hint, hint)
+    if origin is not None or not isinstance(accepted, type | tuple):
+        return True  # another kind is its target's to check
     return isinstance(value, accepted) and (hint in (bool, Any) or not isinstance(value, bool))
 
 

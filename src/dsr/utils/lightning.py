@@ -7,7 +7,7 @@ import csv
 import logging
 import time
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -203,24 +203,16 @@ class StepProgress(Callback):
         self._stack.close()
 
 
-class Log(TensorBoardLogger):
-    """TensorBoard's log without the number of the epoch, as there is only one epoch."""
-
-    def log_metrics(self, metrics: Mapping[str, float], step: int | None = None) -> None:
-        """Log all metrics except the epoch."""
-        super().log_metrics({name: value for name, value in metrics.items() if name != "epoch"}, step)
-
-
 def make_trainer(
     device: torch.device,
     steps: int,
     interval: int,
     *,
     callbacks: Sequence[Callback],
-    logger: Any,
     devices: int = 1,
     accumulate: int = 1,
     environment: ClusterEnvironment | None = None,
+    make: Callable[..., lightning.Trainer] | None = None,
     **named: Any,
 ) -> lightning.Trainer:
     """Return a trainer for a number of steps, with a validation after every few and after the last one.
@@ -230,31 +222,30 @@ def make_trainer(
         steps: of the training.
         interval: steps between two validations.
         callbacks: of Lightning.
-        logger: of Lightning; False for none.
         devices: how many devices of that kind to train on.
         accumulate: batches of a step.
         environment: what Lightning learns of the processes of several devices from; None where it starts them itself,
             whatever Slurm or MPI say.
-        **named: more settings of :class:`lightning.Trainer`.
+        make: function that makes the trainer; None for :class:`lightning.Trainer`.
+        **named: its other arguments.
 
     """
     with without_chatter():
-        return lightning.Trainer(
+        defaults = {
+            "log_every_n_steps": min(LOG_EVERY, interval), "enable_progress_bar": False, "enable_model_summary": False,
+            "num_sanity_val_steps": 0,
+        }  # fmt: skip
+        return (make or lightning.Trainer)(
             accelerator="gpu" if device.type == "cuda" else device.type,
             devices=_lightning_devices(device, devices),
             max_steps=steps,
             accumulate_grad_batches=accumulate,
             val_check_interval=interval * accumulate,
             check_val_every_n_epoch=None,
-            log_every_n_steps=min(LOG_EVERY, interval),
-            logger=logger,
             callbacks=[LastValidation(interval), *callbacks],
             plugins=[AtomicCheckpoints(), environment or LightningEnvironment()],
-            enable_progress_bar=False,
-            enable_model_summary=False,
-            num_sanity_val_steps=0,
             use_distributed_sampler=False,
-            **named,
+            **{**defaults, **named},
         )
 
 

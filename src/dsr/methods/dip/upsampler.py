@@ -18,6 +18,7 @@ import lightning
 import torch
 import torchmetrics
 from lightning.pytorch.callbacks import Callback
+from lightning.pytorch.loggers import TensorBoardLogger
 from torch import Tensor
 from torch.utils.data import DataLoader
 
@@ -35,7 +36,7 @@ from dsr.metrics.visual_loss import VisualLossName, make_visual_loss
 from dsr.sample import DepthSample
 from dsr.utils.checkpoints import Interruption
 from dsr.utils.divergence import Divergence, DivergenceError
-from dsr.utils.lightning import ListedScores, Log, StepProgress, ValidationTable, fit, make_trainer
+from dsr.utils.lightning import ListedScores, StepProgress, ValidationTable, fit, make_trainer
 from dsr.utils.progress import Progress, Steps, StepsProgress
 from dsr.utils.runs_table import list_run
 from dsr.utils.units import duration
@@ -133,9 +134,7 @@ class DeepImagePrior(Method):
         self._settings = PriorSettings(**given, mixed=self.precision == "bfloat16")
         if self.visual != "mse_v" and self.w == 0:
             raise ValueError(f"visual: expected mse_v where w is 0, as for DIP, got {self.visual}")
-        visual = make_visual_loss(
-            self.visual, None if self.lpips_trunk is None else Path(self.lpips_trunk).expanduser()
-        )
+        visual = make_visual_loss(self.visual, self.lpips_trunk)
         w = 1.0 if self.w == "auto" else self.w
         self._objective = PriorObjective(self.data_loss, self.data_weight, w, self.w_intensity, visual)
 
@@ -266,7 +265,7 @@ class DeepImagePrior(Method):
             ]
             if module.metrics is not None and self.validate_every:
                 callbacks += [ValidationTable(folder / "validation.csv"), ListedScores()]
-            logger = Log(folder.parent, name="", version=scene, default_hp_metric=False)
+            logger = TensorBoardLogger(folder.parent, name="", version=scene, default_hp_metric=False)
             settings = {"scene": scene, "scale": self.scale, "stopping": self.stopping, "w": module.objective.w,
                         "visual": self.visual, "data_loss": self.data_loss, "steps": self.steps, "seed": self.seed,
                         "dataset": sample.dataset, **(self.about or {})}  # fmt: skip

@@ -80,7 +80,7 @@ class DisparityNetwork(nn.Module, abc.ABC):
     of_inverse_depth: bool = False
     states_errors: bool = False
     method: ClassVar[Mapping[str, Any]] = MappingProxyType(
-        {"target": "dsr.methods.networks.trained.TrainedNetwork", "ensemble": 1}
+        {"_target_": "dsr.methods.networks.trained.TrainedNetwork", "ensemble": 1}
     )
 
     @classmethod

@@ -1,12 +1,9 @@
-"""Which file of weights a method takes: functions of the node that describes it, whose ``${scale}`` is resolved.
-
-``weights`` names its file, or ``weights_packaged`` one that comes with dsr, or several and the factor of each. In a
-directory, ``weights_file`` or one of ``weights_files`` is looked for.
-"""
+"""Which file of weights a method takes: what the node ``weights`` of its configuration says."""
 
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field, fields
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -19,39 +16,110 @@ SLACK = 1.05
 """By how much a scale may exceed the factor of weights that are used for it."""
 
 
-def find_weights(node: Mapping[str, Any], scale: float) -> Path:
-    """Find the file of weights of a method that takes one.
+@dataclass(frozen=True)
+class WeightChoice:
+    """Where the weights of a method for one factor are.
 
     Args:
-        node: the method's.
         scale: the upsampling factor.
-
-    Raises:
-        ConfigError: there is no such file.
+        path: a file, or a directory with published files; None for packaged weights.
+        packaged: name of the weights that come with dsr; or the factors of several, by their names.
+        file: name of the published file in a directory.
+        files: the factors of several published files, by their names.
+        source: where the published files are from, for messages.
 
     """
-    given, files = _given(node), _files_for(node, scale)
-    if given is None or (given.is_dir() and not files):
-        found = _packaged_file(node, scale)
-        if found is None:
-            raise ConfigError(f"weights: {_lack(node, scale, files)}")
-        return found
-    if given.is_dir():
-        given = next((given / file for file in files if (given / file).is_file()), given / files[0])
-    if not given.is_file():
-        name = node["name"]
-        raise ConfigError(f"weights: expected a file of weights for method={name}, got {given} (no such file)")
-    return given
+
+    scale: float
+    path: str | Path | None = None
+    packaged: str | Mapping[str, float] | None = None
+    file: str | None = None
+    files: Mapping[str, float] = field(default_factory=dict)
+    source: str | None = None
+
+    @classmethod
+    def of(cls, node: Any, scale: float) -> WeightChoice:
+        """Return what a method's node ``weights`` says, which may be a path alone."""
+        if not isinstance(node, Mapping):
+            return cls(scale, node)
+        names = {each.name for each in fields(cls)}
+        unknown = next((key for key in node if key not in {*names, "_target_"}), None)
+        if unknown is not None:
+            raise ConfigError(f"weights.{unknown}: unknown key; expected {', '.join(sorted(names))}")
+        return cls(**{key: value for key, value in node.items() if key != "_target_"} | {"scale": scale})
+
+    def find(self) -> Path:
+        """Return the file.
+
+        Raises:
+            ConfigError: there is none; it says where to get it.
+
+        """
+        given, files = self._given(), self._published()
+        if given is None or (given.is_dir() and not files):
+            found = self._packaged_file()
+            if found is None:
+                raise ConfigError(f"weights: {self._lack(files)}")
+            return found
+        if given.is_dir():
+            given = next((given / file for file in files if (given / file).is_file()), given / files[0])
+        if not given.is_file():
+            raise ConfigError(f"weights: expected a file of weights, got {given} (no such file)")
+        return given
+
+    def exists(self) -> bool:
+        """Return whether the weights are there."""
+        path, files = self._given(), self._published()
+        if path is not None and path.is_dir() and files:
+            return any((path / file).is_file() for file in files)
+        if path is not None and not path.is_dir():
+            header = read_header(path) if path.is_file() and is_dsr_weights(path) else None
+            return path.is_file() and (header is None or header["arguments"].get("scale") == self.scale)
+        return self._packaged_file() is not None
+
+    def _given(self) -> Path | None:
+        """Return the file or directory that is named."""
+        return None if self.path is None else Path(str(self.path)).expanduser()
+
+    def _lack(self, files: list[str]) -> str:
+        """Say which weights are needed, and where they are."""
+        published = f", or a directory with {files[0]} (from {self.source})" if files else ""
+        needs = f"scale {round_ratio(self.scale)} needs weights=FILE{published}"
+        if self.files:
+            return f"{needs}; its authors publish them, dsr does not come with them"
+        return f"dsr comes with {', '.join(packaged_names())}; {needs}"
+
+    def _packaged_file(self) -> Path | None:
+        """Return the file of packaged weights, of several the one for the scale."""
+        if self.packaged is None or isinstance(self.packaged, str):
+            return None if self.packaged is None else packaged_weights(self.packaged)
+        there = {str(name): factor for name, factor in self.packaged.items() if packaged_weights(str(name)) is not None}
+        nearest = nearest_scale(there.values(), self.scale / SLACK) if there else None
+        return next((packaged_weights(name) for name, factor in there.items() if factor == nearest), None)
+
+    def _published(self) -> list[str]:
+        """Return the names of published files with the weights for the scale, in order of preference."""
+        if not self.files:
+            return [self.file] if self.file else []
+        trained = nearest_scale(self.files.values(), self.scale)
+        return [str(file) for file, factor in self.files.items() if factor == trained]
 
 
-def has_weights(node: Mapping[str, Any], scale: float) -> bool:
-    """Return whether the weights that a method's node names are there, for that scale."""
-    path, files = _given(node), _files_for(node, scale)
-    if path is not None and path.is_dir() and files:
-        return any((path / file).is_file() for file in files)
-    if path is not None and not path.is_dir():
-        return path.is_file() and (not is_dsr_weights(path) or read_header(path)["arguments"].get("scale") == scale)
-    return _packaged_file(node, scale) is not None
+def find_weights(
+    scale: float,
+    path: str | None = None,
+    packaged: str | dict[str, float] | None = None,
+    file: str | None = None,
+    files: dict[str, float] | None = None,
+    source: str | None = None,
+) -> Path:
+    """Return the file of weights of a method, as a node of the configuration names it: see :class:`WeightChoice`.
+
+    Raises:
+        ConfigError: there is none; it says where to get it.
+
+    """
+    return WeightChoice(scale, path, packaged, file, files or {}, source).find()
 
 
 def nearest_scale(trained: Collection[float], scale: float) -> float:
@@ -74,36 +142,3 @@ def packaged_weights(name: str) -> Path | None:
 def packaged_names() -> list[str]:
     """Return the names of the packaged weights."""
     return sorted(path.stem for path in Path(str(resources.files("dsr.methods.weights"))).glob("*.safetensors"))
-
-
-def _given(node: Mapping[str, Any]) -> Path | None:
-    """Return the file or directory of weights that a node names."""
-    return None if node.get("weights") is None else Path(str(node["weights"])).expanduser()
-
-
-def _lack(node: Mapping[str, Any], scale: float, files: list[str]) -> str:
-    """Say which weights a method needs, and where they are."""
-    published = f", or a directory with {files[0]} (from {node.get('weights_source')})" if files else ""
-    needs = f"method={node['name']} at scale {round_ratio(scale)} needs weights=FILE{published}"
-    if "weights_files" in node:
-        return f"{needs}; its authors publish them, dsr does not come with them"
-    return f"dsr comes with {', '.join(packaged_names())}; {needs}"
-
-
-def _packaged_file(node: Mapping[str, Any], scale: float) -> Path | None:
-    """Return the file of packaged weights, the one for a scale where the node names several by their factors."""
-    packaged = node.get("weights_packaged")
-    if isinstance(packaged, Mapping):
-        there = {str(name): factor for name, factor in packaged.items() if packaged_weights(str(name)) is not None}
-        nearest = nearest_scale(there.values(), scale / SLACK) if there else None
-        packaged = next((name for name, factor in there.items() if factor == nearest), None)
-    return None if packaged is None else packaged_weights(str(packaged))
-
-
-def _files_for(node: Mapping[str, Any], scale: float) -> list[str]:
-    """Return the names of published files with the weights for a scale, in order of preference."""
-    files = node.get("weights_files")
-    if files is None:
-        return [str(node["weights_file"])] if node.get("weights_file") else []
-    trained = nearest_scale(files.values(), scale)
-    return [str(file) for file, factor in files.items() if factor == trained]
