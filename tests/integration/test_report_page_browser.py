@@ -15,9 +15,9 @@ import pytest
 from dsr.evaluation.results import Results
 from dsr.evaluation.run_files import load_results
 from dsr.geometry.shading import lights, render, shade
-from dsr.report.markup import write_tables
+from dsr.pictures.depth_views import normals_seen_by
 from dsr.report.page import save_page
-from dsr.viz.panels import normals_seen_by
+from dsr.report.table_layouts import write_tables
 
 SPITEFUL = "<img src=x onerror=alert(1)>\"'&</script><script>alert(2)</script>"
 SIZE = 64

@@ -9,9 +9,18 @@ import pandas as pd
 import pytest
 
 from dsr.evaluation.results import Results, Run
-from dsr.report.latex import latex_text, to_document
-from dsr.report.markup import MISSING, aligned, escaped, to_csv, to_latex, to_markdown, write_tables
-from dsr.report.paper_tables import build_tables
+from dsr.report.table_layouts import (
+    MISSING,
+    aligned,
+    escaped,
+    latex_text,
+    to_csv,
+    to_document,
+    to_latex,
+    to_markdown,
+    write_tables,
+)
+from dsr.report.tables import build_tables
 
 ODD = "a|b_*x* 50% & $1 {c} \\d #e ~f ^g <u> `h` \"i\" 'j'"
 FOLDER = "dsr.data.folder.Folder"
