@@ -1,1 +1,1 @@
-"""Plotting used by several packages: colour maps, panels, contact sheets, comparisons."""
+"""Drawing of scenes and depth maps: panels, grids, contact sheets, before and after; no page and no table."""

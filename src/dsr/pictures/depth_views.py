@@ -22,6 +22,12 @@ def normals_seen_by(camera: Camera, depth: Tensor) -> Tensor:
     return depth_to_normals(depth.double()[None], camera.rays()[None])
 
 
+def angles_between(camera: Camera, first: Tensor, second: Tensor) -> Tensor:
+    """Compute the angles between the normals of two depth maps in degrees, (1, H, W)."""
+    cosine = (normals_seen_by(camera, first) * normals_seen_by(camera, second)).sum(dim=1)
+    return torch.rad2deg(torch.arccos(cosine.clamp(-1, 1)))
+
+
 def rendering(depth: Tensor, camera: Camera, light: str = FIGURE_LIGHT) -> np.ndarray:
     """Render a depth map, (1, H, W), under one light: (H, W) in [0, 1], NaN where undefined.
 

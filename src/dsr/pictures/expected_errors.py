@@ -5,14 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-import torch
 from matplotlib.colors import LogNorm
 from matplotlib.transforms import Bbox
 from torch import Tensor
 
 from dsr.geometry.camera import Camera
 from dsr.pictures.canvas import Canvas, fitted, without_collections, write_figure
-from dsr.pictures.depth_views import normals_seen_by, reduced
+from dsr.pictures.depth_views import angles_between, reduced
 
 _PANEL, _ABOVE, _BELOW, _LEFT = 4.6, 0.4, 0.75, 0.4
 """Width of a panel, space above and below it, and left of all panels, inches."""
@@ -43,8 +42,7 @@ def write_confidence(
     """
     rows = [[1e3 * depth_error, angle_error]]
     if truth is not None and camera is not None:
-        cosine = (normals_seen_by(camera, depth) * normals_seen_by(camera, truth)).sum(dim=1)
-        rows.append([1e3 * (depth - truth).abs(), torch.rad2deg(torch.arccos(cosine.clamp(-1, 1)))])
+        rows.append([1e3 * (depth - truth).abs(), angles_between(camera, depth, truth)])
     height, width = depth.shape[-2:]
     panel = _PANEL * min(max(height / width, 0.4), 2.5)
     row = panel + _ABOVE + _BELOW

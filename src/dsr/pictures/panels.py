@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
-import torch
 from matplotlib.image import AxesImage
 from matplotlib.transforms import Bbox
 from torch import Tensor
@@ -15,7 +14,7 @@ from dsr.geometry.lights import LIGHT_NAMES
 from dsr.geometry.shading import render
 from dsr.metrics.formats import Formats, describe_directions, in_tables
 from dsr.pictures.canvas import Canvas, fitted, without_collections, write_figure
-from dsr.pictures.depth_views import limits_of, normals_seen_by
+from dsr.pictures.depth_views import angles_between, limits_of, normals_seen_by
 from dsr.sample import DepthSample
 from dsr.utils.ratios import round_ratio
 
@@ -95,8 +94,7 @@ class _Page(Canvas):
 
     def angles(self, row: int, column: int, depth: Tensor, truth: Tensor) -> None:
         """Draw the angle between the two normals in degrees."""
-        cosine = (normals_seen_by(self._camera, depth) * normals_seen_by(self._camera, truth)).sum(dim=1)[0]
-        degrees = torch.rad2deg(torch.arccos(cosine.clamp(-1, 1))).numpy()
+        degrees = angles_between(self._camera, depth, truth)[0].numpy()
         image = self._map(row, column, degrees, "error of the normals", "magma", (0, 60))
         self._bar(image, row, column, column, "degrees", extend="max")
 

@@ -34,7 +34,6 @@ from dsr.sample import DepthSample
 
 ROWS = 5
 """Maximum number of scenes on a page."""
-KINDS = ("renderings", "depth", "errors")
 _DETAIL = 5
 """The side of a detail is 1/5 of the shorter side of the picture."""
 _CENTIMETRE_LIMIT = 0.02
@@ -108,26 +107,7 @@ class Page:
     problem: BenchmarkSetting
     name: str
     scenes: tuple[str, ...]
-    light: str = FIGURE_LIGHT
-
-
-class _Kind(NamedTuple):
-    """What a kind of grid shows: the columns before and after the methods, and the text below."""
-
-    before: tuple[str, ...]
-    after: tuple[str, ...]
-    below: str
-
-
-_KINDS = {
-    "renderings": _Kind(
-        ("photo", "input"), ("truth",), "surfaces lit by {light}; below: DSSIM_v / RMSE_v, 1/1000, lower is better"
-    ),
-    "depth": _Kind(("photo", "input"), ("truth",), "distance to the image plane; below: RMSE_d, mm, lower is better"),
-    "errors": _Kind(
-        ("photo",), (), "result - truth: red is too far, blue too near; below: RMSE_d, mm, lower is better"
-    ),
-}
+    light: str
 
 
 def pages_of(results: Results, kinds: Iterable[str], light: str, notes: list[str]) -> list[Page]:
@@ -166,11 +146,9 @@ def save_page(folder: Path, results: Results, page: Page, notes: list[str]) -> l
         ValueError: there is no such light.
 
     """
-    kind = _KINDS[page.kind]
-    draw: dict[str, Callable[[Shown], Row | None]] = {
-        "renderings": functools.partial(rendering_row, light=page.light), "depth": depth_row, "errors": error_row,
-    }  # fmt: skip
-    rows = [row for row in map(draw[page.kind], shown_scenes(results, page.problem, notes, page.scenes)) if row]
+    kind = _GRIDS[page.kind]
+    shown = shown_scenes(results, page.problem, notes, page.scenes)
+    rows = [row for row in (kind.row(each, page.light) for each in shown) if row]
     if not rows:
         return []
     columns = (*kind.before, *first_runs(results, page.problem), *kind.after)
@@ -217,7 +195,7 @@ def rendering_row(shown: Shown, light: str) -> Row:
     return Row(_label(shown), size[0] / size[1], cells, details, size)
 
 
-def depth_row(shown: Shown) -> Row:
+def depth_row(shown: Shown, _: str) -> Row:
     """Build the row of a scene's depth maps."""
     scene = shown.scene
     style = _Style("viridis", limits_of(scene.depth_lr if scene.depth is None else scene.depth))
@@ -232,7 +210,7 @@ def depth_row(shown: Shown) -> Row:
     return Row(_label(shown), size[0] / size[1], cells, bar="depth, m", extend="both")
 
 
-def error_row(shown: Shown) -> Row | None:
+def error_row(shown: Shown, _: str) -> Row | None:
     """Build the row of a scene's errors, None without ground truth or without results."""
     truth = shown.scene.depth
     if truth is None or not shown.existing():
@@ -248,6 +226,32 @@ def error_row(shown: Shown) -> Row | None:
         cells.append(_panel(None if error is None else factor * error[0].numpy(), scores[label], style=style))
     aspect = shown.scene.camera.height / shown.scene.camera.width
     return Row(_label(shown), aspect, cells, bar=f"result - truth, {unit}", extend="both")
+
+
+class _Grid(NamedTuple):
+    """A kind of grid: what makes its rows, its columns before and after the methods, and the text below."""
+
+    row: Callable[[Shown, str], Row | None]
+    before: tuple[str, ...]
+    after: tuple[str, ...]
+    below: str
+
+
+_GRIDS = {
+    "renderings": _Grid(
+        rendering_row,
+        ("photo", "input"),
+        ("truth",),
+        "surfaces lit by {light}; below: DSSIM_v / RMSE_v, 1/1000, lower is better",
+    ),
+    "depth": _Grid(
+        depth_row, ("photo", "input"), ("truth",), "distance to the image plane; below: RMSE_d, mm, lower is better"
+    ),
+    "errors": _Grid(
+        error_row, ("photo",), (), "result - truth: red is too far, blue too near; below: RMSE_d, mm, lower is better"
+    ),
+}
+KINDS = tuple(_GRIDS)
 
 
 def _photo(shown: Shown) -> Cell:
