@@ -30,8 +30,8 @@ from dsr.inference import upsampler
 from dsr.methods.recipe import read_recipe
 from dsr.metrics.catalogue import PROTOCOLS, score_image
 from dsr.metrics.metric import WORST
+from dsr.pictures.depth_views import Window
 from dsr.sample import DepthSample, Scene
-from dsr.viz.panels import Window
 
 RMSE_V = tuple(metric for metric in PROTOCOLS["paper"] if metric.name == "RMSE_v")
 XTION = (525.0, 525.0, 319.5, 239.5)

@@ -17,13 +17,13 @@ import argparse
 from pathlib import Path
 
 import pandas as pd
-from panel_grid import LIGHT, Panel, rendering_of_input, save_panels
+from panel_grid import Panel, rendering_of_input, save_panels
 
 from dsr.evaluation.results import BenchmarkSetting, Results
 from dsr.evaluation.run_files import load_results
 from dsr.metrics.formats import HEADLINES
-from dsr.report.figures.scenes import Shown, rendering, shown_scenes
-from dsr.viz.panels import Window
+from dsr.pictures.depth_views import Window, rendering
+from dsr.report.shown_scenes import Shown, shown_scenes
 
 Metrics = tuple[tuple[str, float, int], ...]
 SHOWN: Metrics = (("RMSE_v", 1e3, 0), ("DSSIM_v", 1e3, 0), ("LPIPS_v", 1e3, 0), ("RMSE_d", 1e3, 0))
@@ -118,13 +118,13 @@ def picture(shown: Shown, top: int, left: int, side: int) -> list[Panel]:
         Panel("input", rendering_of_input(scene)[window]),
     ]
     if scene.depth is not None:
-        panels.append(Panel("truth", rendering(scene.depth, scene.camera, LIGHT)[window]))
+        panels.append(Panel("truth", rendering(scene.depth, scene.camera)[window]))
     for label in ordered(list(shown.depths)):
         depth = shown.depths[label]
         if depth is not None:
             found = shown.scores[label]
             caption = f"{label}\n{1e3 * found['DSSIM_v']:.0f} / {1e3 * found['RMSE_v']:.0f}"
-            panels.append(Panel(caption, rendering(depth, scene.camera, LIGHT)[window]))
+            panels.append(Panel(caption, rendering(depth, scene.camera)[window]))
     return panels
 
 

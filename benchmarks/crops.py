@@ -16,10 +16,11 @@ import os
 from pathlib import Path
 
 from captures import CAPTURES, Capture, run_method
-from panel_grid import EMPTY, LIGHT, Panel, rendering_of_input, repeat_pixels, save_panels
+from panel_grid import EMPTY, Panel, rendering_of_input, repeat_pixels, save_panels
 
+from dsr.geometry.lights import FIGURE_LIGHT
 from dsr.methods.recipe import read_recipe
-from dsr.report.figures.scenes import rendering
+from dsr.pictures.depth_views import rendering
 from dsr.utils.ratios import round_ratio
 
 METHODS = "bilateral,tgv,pgsr,msg_v,facets"
@@ -47,10 +48,10 @@ def panels_of(capture: Capture, methods: list[str], shared: Path, device: str) -
     for name in methods:
         depth = run_method(capture, name, shared, device)
         caption = f"{read_recipe(name).label}{describe(capture, capture.scores(depth))}"
-        panels.append(Panel(caption, rendering(depth, sample.camera, LIGHT)))
+        panels.append(Panel(caption, rendering(depth, sample.camera)))
         print(f"  {caption}".replace("\n", ": "), flush=True)
     if capture.truth is not None:
-        truth = rendering(capture.truth.depth, capture.truth.camera, LIGHT)
+        truth = rendering(capture.truth.depth, capture.truth.camera)
         panels.append(Panel("truth", repeat_pixels(truth, size)))
     return panels
 
@@ -59,7 +60,7 @@ def heading_of(name: str, capture: Capture) -> str:
     """Return the text above a picture."""
     sample = capture.sample
     sizes = (f"{camera.height} x {camera.width}" for camera in (sample.camera_lr, sample.camera))
-    text = f"{name}: {' to '.join(sizes)} (x{round_ratio(sample.scale)}), surfaces lit by {LIGHT}, pink: holes"
+    text = f"{name}: {' to '.join(sizes)} (x{round_ratio(sample.scale)}), surfaces lit by {FIGURE_LIGHT}, pink: holes"
     if capture.truth is None:
         return text
     share = " / share of pixels scored" if capture.measured else ""

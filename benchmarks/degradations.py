@@ -33,7 +33,7 @@ from dsr.degradation.everything import Everything
 from dsr.degradation.glass import add_glass
 from dsr.degradation.random_noise import NOISES
 from dsr.geometry.camera import Camera
-from dsr.report.figures.scenes import rendering
+from dsr.pictures.depth_views import rendering
 from dsr.training.augmentation import soften
 
 SIDE = 256

@@ -28,7 +28,7 @@ from dsr.geometry.camera import Camera
 from dsr.geometry.surface import angle_between, length
 from dsr.methods.classical.bilateral import filter_bilateral
 from dsr.methods.recipe import read_recipe
-from dsr.viz.panels import normals_seen_by
+from dsr.pictures.depth_views import normals_seen_by
 
 METHODS = "bilateral,msg_v,msg_v_noisy,tgv,facets_box,facets"
 FLOORS = {

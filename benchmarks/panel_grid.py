@@ -12,12 +12,10 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 
-from dsr.report.figures.scenes import rendering
+from dsr.pictures.canvas import HOLE_COLOUR
+from dsr.pictures.depth_views import rendering
 from dsr.sample import DepthSample
-from dsr.viz.canvas import HOLE_COLOUR
 
-LIGHT = "e1"
-"""The light of all renderings."""
 _DPI, _FONT, _LINE = 100, 10, 18
 """Dots per inch, size of letters in points, and height of a line of text in pixels."""
 _GAP, _MARGIN = 8, 10
@@ -37,9 +35,7 @@ EMPTY = Panel("", np.ones((1, 1)))
 
 def rendering_of_input(sample: DepthSample) -> np.ndarray:
     """Render the low-resolution map at its own resolution, then repeat its pixels: (H, W), NaN in holes."""
-    return repeat_pixels(
-        rendering(sample.depth_lr, sample.camera_lr, LIGHT), (sample.camera.height, sample.camera.width)
-    )
+    return repeat_pixels(rendering(sample.depth_lr, sample.camera_lr), (sample.camera.height, sample.camera.width))
 
 
 def repeat_pixels(picture: np.ndarray, size: tuple[int, int]) -> np.ndarray:

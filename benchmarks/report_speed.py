@@ -26,17 +26,17 @@ ROOT = Path(__file__).resolve().parents[1]
 METHODS = "nearest,bilinear,bicubic,guided_filter,fast_global_smoother,facets"
 PARTS = {
     "reading runs": ("run_files.py", "load_results"),
-    "tables": ("markup.py", "write_tables"),
+    "tables": ("table_layouts.py", "write_tables"),
     "metric study": ("correlation_figure.py", "save_scatter_matrix"),
-    "figures: reading and rendering": ("figures/scenes.py", "shown_scenes"),
-    "figures: layout": ("figures/layout.py", "draw_grid"),
+    "figures: reading and rendering": ("shown_scenes.py", "shown_scenes"),
+    "figures: layout": ("pictures/grids.py", "draw_grid"),
     "figures: PDF": ("backend_pdf.py", "print_pdf"),
     "PDF: fonts": ("backend_pdf.py", "writeFonts"),
     "PDF: pictures": ("backend_pdf.py", "writeImages"),
-    "figures: PNG": ("viz/panels.py", "_write_png"),
-    "page: scenes": ("page/scenes.py", "scene_data"),
-    "page: compression of pictures": ("page/encoding.py", "add"),
-    "page: expected errors": ("page/calibration.py", "calibration_data"),
+    "figures: PNG": ("pictures/canvas.py", "_write_png"),
+    "page: scenes": ("page/scene_content.py", "scene_data"),
+    "page: compression of pictures": ("page/value_pictures.py", "add"),
+    "page: expected errors": ("page/scene_content.py", "calibration_data"),
 }
 """File and function of each part; some are parts of others."""
 

@@ -32,7 +32,7 @@ from dsr.degradation.random_noise import NOISES
 from dsr.geometry.camera import Camera
 from dsr.geometry.shading import render_for_viewing
 from dsr.io.depth_files import read_depth_file
-from dsr.viz.panels import normals_seen_by
+from dsr.pictures.depth_views import normals_seen_by
 
 WINDOWS = (8, 12, 16, 24, 32, 48, 64, 96, 128, 192, 256, 384)
 WINDOW = 48

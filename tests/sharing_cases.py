@@ -16,7 +16,7 @@ from dsr.evaluation.sharing import ALONE, Workers, choose_workers
 from dsr.geometry.camera import Camera
 from dsr.methods.base import Method, NoSolutionError
 from dsr.metrics.catalogue import catalogue
-from dsr.report.work import Work
+from dsr.report.worker_pool import WorkerPool
 from dsr.sample import Scene
 from dsr.utils import interruption
 from dsr.utils.pool import Pool
@@ -233,7 +233,7 @@ def draw(_, number):
 def test_part_of_a_report_whose_worker_is_killed_is_drawn_by_another(tmp_path):
     items = [None, *((number, tmp_path / "killed") for number in range(6))]
     told = Told()
-    with Work(object(), 2, told.say) as work:
+    with WorkerPool(object(), 2, told.say) as work:
         values, others = work.map(draw, items), work.map(draw, items[::-1])
         assert list(others) == [5, 4, 3, 2, 1, 0, None]
         assert list(values) == [None, 0, 1, 2, 3, 4, 5]
@@ -242,7 +242,7 @@ def test_part_of_a_report_whose_worker_is_killed_is_drawn_by_another(tmp_path):
 
 
 def test_part_of_a_report_that_kills_its_workers_is_an_error(tmp_path):
-    with Work(object(), 2) as work, pytest.raises(ChildProcessError, match="two workers ended"):
+    with WorkerPool(object(), 2) as work, pytest.raises(ChildProcessError, match="two workers ended"):
         list(work.map(draw, [(3, tmp_path / "no folder" / "mark")]))
 
 

@@ -111,7 +111,7 @@ def more_of_results(folder: Path) -> list[str]:
 
 def study(folder: Path) -> None:
     """Write the key of a study, and answers."""
-    from dsr.user_study.key import write_key  # noqa: PLC0415
+    from dsr.report.study.key import write_key  # noqa: PLC0415
 
     tests = unit("test_user_study")
     write_key(folder / "key.json", tests.KEY)
@@ -121,7 +121,7 @@ def study(folder: Path) -> None:
 
 def study_table(folder: Path) -> None:
     """Write runs and the table of a study of them."""
-    from dsr.user_study.collect import COLUMNS  # noqa: PLC0415
+    from dsr.report.study.percentages import COLUMNS  # noqa: PLC0415
 
     write_run(folder / "bicubic")
     rows = [",".join(COLUMNS)]

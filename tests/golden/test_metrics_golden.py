@@ -22,7 +22,7 @@ from dsr.methods.classical.interpolation import Interpolation
 from dsr.metrics.catalogue import Score, catalogue, score_image
 from dsr.metrics.formats import in_tables
 from dsr.metrics.lpips import LPIPS, load_lpips
-from dsr.report.tables import published_row
+from dsr.report.paper import published_row
 from dsr.sample import Scene
 
 METHODS = {"Bicubic": None, "MSG-V": "msg_v", "MSG": "msg"}

@@ -15,9 +15,10 @@ import pytest
 from dsr.evaluation.results import Results
 from dsr.evaluation.run_files import load_results
 from dsr.geometry.shading import lights, render, shade
-from dsr.report.markup import write_tables
-from dsr.report.page import save_page
-from dsr.viz.panels import normals_seen_by
+from dsr.pictures.depth_views import normals_seen_by
+from dsr.report.page import content, save_page
+from dsr.report.table_layouts import write_tables
+from dsr.report.tables import FACTS, Fact
 
 SPITEFUL = "<img src=x onerror=alert(1)>\"'&</script><script>alert(2)</script>"
 SIZE = 64
@@ -174,6 +175,19 @@ def test_both_sides_show_the_renderings_of_the_protocol_under_every_light(opened
             assert drawn.shape == (SIZE, SIZE, 3)
             assert np.abs(drawn[..., 0] - rendering(results, label, light)).max() <= (1.51 if light < 3 else 2.3)
             assert (drawn == drawn[..., :1]).all()
+
+
+def test_another_fact_of_a_row_is_a_column_of_the_tables(make_run, tmp_path, opened, monkeypatch):
+    fact = Fact("size", lambda row: row.runs[0].size(row.about.places[0].scene)[0], lambda _: True, number=True)
+    monkeypatch.setattr(content, "FACTS", (*FACTS, fact))
+    make_run(tmp_path / "run", scenes=SCENES, size=SIZE)
+    save_page(tmp_path / "index.html", load_results([tmp_path]))
+    page = opened((tmp_path / "index.html").as_uri())
+    heads = "[...document.querySelectorAll('#tables table')].map((table) => table.rows[0].innerText.split(/\\s+/))"
+    means, scenes = page.evaluate(heads)
+    assert means[:2] == ["Method", "Size"]
+    assert scenes[:3] == ["Scene", "Method", "Size"]
+    assert column(page, 1, 2) == [str(SIZE)] * 2
 
 
 def test_divider_separates_the_two_pictures_on_the_screen(opened, results):

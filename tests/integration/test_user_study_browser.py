@@ -11,9 +11,9 @@ import pytest
 
 from dsr.cli import study as command
 from dsr.evaluation.run_files import load_results
-from dsr.user_study.build import build_study
-from dsr.user_study.choice import Choice
-from dsr.user_study.key import read_key
+from dsr.report.study.choice import Choice
+from dsr.report.study.key import read_key
+from dsr.report.study.questionnaire import build_study
 from dsr.utils.console import open_console
 
 LABELS = {"msg_v": "MSG-V", "bicubic": "Bicubic", "dip": "DIP"}

@@ -11,7 +11,7 @@ from small_results import CAMERA, HOLE, SIZE, waves, write_result
 from dsr.cli import main
 from dsr.geometry.mesh import triangulate
 from dsr.geometry.shading import render_for_viewing
-from dsr.viz.panels import normals_seen_by
+from dsr.pictures.depth_views import normals_seen_by
 
 SPITEFUL = "<img src=x onerror=alert(1)>'&"
 DESKTOP = {"width": 900, "height": 900}

@@ -12,10 +12,9 @@ from dsr.evaluation.results import Results, Run
 from dsr.metrics.catalogue import KNOWN_FORMATS
 from dsr.metrics.formats import in_tables
 from dsr.report import correlation_figure
-from dsr.report.correlation_figure import density_of, save_scatter_matrix, scatter_matrix
+from dsr.report.correlation_figure import FIXED, density_of, method_colours, save_scatter_matrix, scatter_matrix
 from dsr.report.correlations import correlate, metric_matrix, pairs, with_reference, write_correlations
-from dsr.report.tables import published
-from dsr.viz.palette import FIXED, method_colours
+from dsr.report.paper import published
 
 VARIANTS = ("e1", "e2", "e3", "e4", "max", "avg")
 

@@ -16,10 +16,10 @@ from dsr.evaluation.run_files import load_results
 from dsr.evaluation.store import sample_path
 from dsr.geometry.shading import render
 from dsr.metrics.catalogue import METRICS
+from dsr.pictures.canvas import HOLE_COLOUR
+from dsr.pictures.depth_views import normals_seen_by
 from dsr.report.dashboard import save_dashboard
 from dsr.utils.runs_table import SCORES
-from dsr.viz.canvas import HOLE_COLOUR
-from dsr.viz.panels import normals_seen_by
 
 SCENES = ("b", "a")
 

@@ -11,25 +11,22 @@ import torch
 
 from dsr.evaluation.run_files import load_results
 from dsr.geometry.shading import lights
-from dsr.report.figures import (
-    grids,
-    layout,
-    save_depth_grids,
-    save_error_grids,
-    save_figures,
-    save_lights_figure,
-    save_rendering_grids,
-)
-from dsr.report.figures import lights as lights_figure
-from dsr.report.figures.layout import Cell, Row, draw_grid
-from dsr.report.figures.lights import sphere_normals
-from dsr.report.figures.scenes import details_of
-from dsr.viz.canvas import HOLE_COLOUR, colours
-from dsr.viz.panels import Window, strongest_window
+from dsr.pictures import canvas, lights_figure
+from dsr.pictures.canvas import HOLE_COLOUR, colours
+from dsr.pictures.depth_views import Window, strongest_window
+from dsr.pictures.grids import Cell, Row, draw_grid
+from dsr.pictures.lights_figure import sphere_normals
+from dsr.report import figures as figures_of_runs
+from dsr.report.figures import KINDS, Figures, details_of, pages_of, save_page
+from dsr.report.worker_pool import WorkerPool
 
 pytestmark = pytest.mark.slow  # drawing takes a second
 
-TOGETHER = (save_rendering_grids, save_depth_grids, save_error_grids)
+
+def save_grids(folder, results, *kinds, light="e1", notes=None):
+    notes = [] if notes is None else notes
+    for page in pages_of(results, kinds, light, notes):
+        save_page(folder, results, page, notes)
 
 
 @pytest.fixture
@@ -45,7 +42,7 @@ def results(tmp_path, make_run):
 def drawn(monkeypatch):
     """What would have been written, by name."""
     figures = {}
-    for module in (grids, lights_figure):
+    for module in (figures_of_runs, lights_figure):
         monkeypatch.setattr(module, "save_both", lambda _, name, figure: [figures.setdefault(name, figure)])
     return figures
 
@@ -71,9 +68,9 @@ def change(path, **arrays):
 
 
 def test_figures_are_written_as_pdf_and_png(tmp_path, results, monkeypatch):
-    monkeypatch.setattr(layout, "DPI", 60)  # for speed
+    monkeypatch.setattr(canvas, "_DPI", 60)  # for speed
     told = []
-    paths = save_figures(tmp_path / "new", results, lambda *progress: told.append(progress))
+    paths = Figures(tmp_path / "new", WorkerPool(results)).save(lambda *progress: told.append(progress))
     names = ["renderings_simgeo_x4_box_1", "depth_simgeo_x4_box_1", "errors_simgeo_x4_box_1", "lights"]
     assert [path.name for path in paths] == [f"{name}.{kind}" for name in names for kind in ("pdf", "png")]
     assert sorted(tmp_path.joinpath("new").iterdir()) == sorted(paths)
@@ -90,7 +87,7 @@ def test_figures_are_written_as_pdf_and_png(tmp_path, results, monkeypatch):
 
 
 def test_columns_are_photo_input_methods_in_the_papers_order_and_truth(results, drawn, tmp_path):
-    save_rendering_grids(tmp_path, results)
+    save_grids(tmp_path, results, "renderings")
     [figure] = drawn.values()
     headings = ["photo", "input", "Bicubic", "DIP", "MSG-V", "truth"]
     assert [text for text in texts(figure) if text in headings] == headings
@@ -98,7 +95,7 @@ def test_columns_are_photo_input_methods_in_the_papers_order_and_truth(results, 
 
 
 def test_method_without_a_result_has_an_empty_labelled_panel(results, drawn, tmp_path):
-    save_rendering_grids(tmp_path, results)
+    save_grids(tmp_path, results, "renderings")
     figure = drawn["renderings_simgeo_x4_box_1"]
     [empty] = empty_panels(figure, "two")
     [text] = [text for text in figure.texts if text.get_text() == "no result"]
@@ -107,7 +104,7 @@ def test_method_without_a_result_has_an_empty_labelled_panel(results, drawn, tmp
 
 
 def test_depth_limits_are_shared_across_a_row_with_a_bar(results, drawn, tmp_path):
-    save_depth_grids(tmp_path, results)
+    save_grids(tmp_path, results, "depth")
     [figure] = drawn.values()
     for row in ("one", "two"):
         images = panels(figure, row)
@@ -124,7 +121,7 @@ def test_errors_are_centred_at_zero_and_signed(tmp_path, make_run, drawn, error,
         run = make_run(tmp_path / name, method=name, label=name, size=16, scenes=("one",))
         scene = load_results([run]).runs[0].sample("one")
         change(run / "predictions" / "one.npz", depth=(scene.depth + sign * error)[0].numpy())
-    save_error_grids(tmp_path, load_results([tmp_path]))
+    save_grids(tmp_path, load_results([tmp_path]), "errors")
     [figure] = drawn.values()
     photo, *both = panels(figure, "one")
     assert photo.get_array().ndim == 3
@@ -173,7 +170,7 @@ def test_map_without_room_for_a_window_has_none():
 
 
 def test_details_and_their_frames_are_the_same_for_all_methods(results, drawn, tmp_path):
-    save_rendering_grids(tmp_path, results)
+    save_grids(tmp_path, results, "renderings")
     [figure] = drawn.values()
     boxes = [patch.get_bbox() for patch in figure.axes[0].patches if patch.get_label() == "one: frame"]
     frames = []
@@ -192,7 +189,7 @@ def test_details_and_their_frames_are_the_same_for_all_methods(results, drawn, t
 
 
 def test_scores_are_in_thousandths_and_the_best_is_bold(results, drawn, tmp_path):
-    save_rendering_grids(tmp_path, results)
+    save_grids(tmp_path, results, "renderings")
     [figure] = drawn.values()
     captions = [text for text in figure.texts if re.fullmatch(r"\d+ / \d+", text.get_text())]
     assert len(captions) == 5
@@ -206,8 +203,7 @@ def test_scene_that_no_run_stores_is_left_out_with_a_note(results, drawn, tmp_pa
     for path in (tmp_path / "runs").glob("*/scenes/two.npz"):
         path.unlink()
     notes = []
-    for save in TOGETHER:
-        save(tmp_path, results, notes=notes)
+    save_grids(tmp_path, results, *KINDS, notes=notes)
     assert notes == ["no figures of two: no run has stored its photo and input"]
     assert all(not panels(figure, "two") and panels(figure, "one") for figure in drawn.values())
 
@@ -216,7 +212,7 @@ def test_results_that_cannot_be_drawn_are_left_out_with_a_note(results, drawn, t
     change(tmp_path / "runs" / "a" / "predictions" / "one.npz", depth=np.ones((7, 24)))
     (tmp_path / "runs" / "b" / "predictions" / "one.npz").write_bytes(b"damaged")
     notes = []
-    save_depth_grids(tmp_path, results, notes=notes)
+    save_grids(tmp_path, results, "depth", notes=notes)
     assert len(notes) == 2
     assert any("expected a result of the photo's 24 x 24 pixels, got 7 x 24" in note for note in notes)
     assert any(str(tmp_path / "runs" / "b" / "predictions" / "one.npz") in note for note in notes)
@@ -225,8 +221,7 @@ def test_results_that_cannot_be_drawn_are_left_out_with_a_note(results, drawn, t
 
 def test_holes_have_their_colour_and_are_explained(results, drawn, tmp_path):
     change(tmp_path / "runs" / "a" / "predictions" / "one.npz", depth=np.full((24, 24), np.nan))
-    for save in TOGETHER:
-        save(tmp_path, results)
+    save_grids(tmp_path, results, *KINDS)
     assert len(drawn) == 3
     for figure in drawn.values():
         assert any(text.endswith("pink: holes") for text in texts(figure))
@@ -238,7 +233,7 @@ def test_holes_have_their_colour_and_are_explained(results, drawn, tmp_path):
 def test_figures_have_five_scenes_a_page_and_one_file_per_setting(tmp_path, make_run, drawn):
     make_run(tmp_path / "a", scenes=tuple(f"s{number}" for number in range(6)), size=8)
     make_run(tmp_path / "b", dataset="other", scale=2, downsampling="box, noise 1 %", scenes=("s0",), size=8)
-    save_depth_grids(tmp_path, load_results([tmp_path]))
+    save_grids(tmp_path, load_results([tmp_path]), "depth")
     assert list(drawn) == ["depth_simgeo_x4_box_1", "depth_simgeo_x4_box_2", "depth_other_x2_box_noise_1_1"]
     assert len(panels(drawn["depth_simgeo_x4_box_1"], "s4")) == 4
     assert len(panels(drawn["depth_simgeo_x4_box_2"], "s5")) == 4
@@ -267,7 +262,7 @@ def test_long_names_do_not_overlap_and_aspects_may_differ():
 
 def test_unknown_light_is_refused(results, tmp_path):
     with pytest.raises(ValueError, match="light: expected one of e1, e2, e3, e4, got 'e5'"):
-        save_rendering_grids(tmp_path, results, "e5")
+        save_grids(tmp_path, results, "renderings", light="e5")
 
 
 def test_sphere_normals_are_unit_vectors_that_face_the_camera():
@@ -281,7 +276,7 @@ def test_sphere_normals_are_unit_vectors_that_face_the_camera():
 
 
 def test_figure_of_lights_shows_their_closed_form(drawn, tmp_path):
-    save_lights_figure(tmp_path)
+    lights_figure.save_lights_figure(tmp_path)
     [figure] = drawn.values()
     size = 401
     ramp = np.linspace(-1, 1, size)
@@ -297,7 +292,7 @@ def test_figure_of_lights_shows_their_closed_form(drawn, tmp_path):
             assert np.dot(arrow.xyann, light[:2]) > np.dot(arrow.xy, light[:2]) > 0
 
 
-def test_figure_of_lights_shows_a_truth_of_the_results(results, drawn, tmp_path):
-    save_lights_figure(tmp_path, results)
+def test_figure_of_lights_shows_a_scene(results, drawn, tmp_path):
+    lights_figure.save_lights_figure(tmp_path, results.runs[0].sample("one"))
     [figure] = drawn.values()
-    assert sum(axes.get_label().split(" ")[0] in ("one", "two") for axes in figure.axes) == 4
+    assert sum(axes.get_label().split(" ")[0] == "one" for axes in figure.axes) == 4

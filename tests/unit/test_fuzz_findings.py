@@ -28,12 +28,12 @@ from dsr.io.input_files import read_input, write_input
 from dsr.io.photos import read_photo
 from dsr.methods.networks.weight_files import is_dsr_weights
 from dsr.methods.recipe import read_recipe
-from dsr.report.user_study import read_study
-from dsr.user_study.answers import files_of
+from dsr.report.study.answers import files_of
+from dsr.report.study.study_table import read_study
+from dsr.report.surface_page import is_view
 from dsr.utils.builder import ConfigError
 from dsr.utils.files import open_array
 from dsr.utils.picture_headers import picture_size
-from dsr.viewer.page import is_view
 
 
 def png_chunk(kind, content, length=None):

@@ -12,10 +12,9 @@ import pytest
 
 from dsr.evaluation.run_files import load_results, read_run
 from dsr.report.correlation_figure import save_scatter_matrix
-from dsr.report.latex import latex_text
-from dsr.report.markup import escaped, to_csv, to_latex, to_markdown
-from dsr.report.paper_tables import build_tables
-from dsr.report.user_study import USER_COLUMNS, read_study
+from dsr.report.study.study_table import PERCENTAGES, read_study
+from dsr.report.table_layouts import escaped, latex_text, to_csv, to_latex, to_markdown
+from dsr.report.tables import build_tables
 from dsr.utils.console import print_error
 
 NAMES = (
@@ -109,7 +108,7 @@ def test_figures_show_names_that_look_like_formulas_of_tex(results, tmp_path):
 
 
 def test_study_is_read_with_its_names(tmp_path):
-    shares = dict.fromkeys(USER_COLUMNS, 50.0)
+    shares = dict.fromkeys(PERCENTAGES, 50.0)
     about = {"dataset": "-1", "scene": "@x", "scale": 4, "downsampling": "box", "label": HOSTILE}
     (tmp_path / "study.csv").write_text(pd.DataFrame([{**about, **shares}]).to_csv(index=False))
     assert read_study(tmp_path / "study.csv").iloc[0][[*about]].to_dict() == about

@@ -15,8 +15,8 @@ from dsr.geometry.surface import depth_to_normals
 from dsr.io import exports
 from dsr.io.exports import Written, write_cloud, write_mesh, write_normals, write_renderings
 from dsr.io.model_files import write_glb
-from dsr.viz import before_after
-from dsr.viz.before_after import write_before_after
+from dsr.pictures import before_after
+from dsr.pictures.before_after import write_before_after
 
 CAMERA = Camera(24, 18, 30, 30, 11.5, 8.5)
 NORMAL_OF_A_WALL = [128, 128, 255]

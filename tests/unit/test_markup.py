@@ -9,9 +9,19 @@ import pandas as pd
 import pytest
 
 from dsr.evaluation.results import Results, Run
-from dsr.report.latex import latex_text, to_document
-from dsr.report.markup import MISSING, aligned, escaped, to_csv, to_latex, to_markdown, write_tables
-from dsr.report.paper_tables import build_tables
+from dsr.report import table_layouts, tables
+from dsr.report.table_layouts import (
+    MISSING,
+    aligned,
+    escaped,
+    latex_text,
+    to_csv,
+    to_document,
+    to_latex,
+    to_markdown,
+    write_tables,
+)
+from dsr.report.tables import FACTS, Fact, build_tables
 
 ODD = "a|b_*x* 50% & $1 {c} \\d #e ~f ^g <u> `h` \"i\" 'j'"
 FOLDER = "dsr.data.folder.Folder"
@@ -198,3 +208,22 @@ def test_latex_compiles_and_nothing_runs_off_the_page(tmp_path):
     assert "Overfull" not in done.stdout
     assert "Float too large" not in done.stdout
     assert "Missing character" not in (tmp_path / "all.log").read_text(encoding="latin-1")
+
+
+def test_another_fact_of_a_row_is_a_column_of_every_layout(monkeypatch):
+    runs = Fact("runs", lambda row: len(row.runs) or None, lambda _: True, number=True)
+    for module in (tables, table_layouts):
+        monkeypatch.setattr(module, "FACTS", (*FACTS, runs))
+    table = next(each for each in build_tables(results()) if each.name == "mine_x4_box")
+    head, _, bicubic, dip, *_ = to_markdown(table).split("\n\n")[1].splitlines()
+    assert [line.split("|")[3:5] for line in (head, bicubic, dip)] == [
+        [" seeds ", " runs "], ["     1 ", "    1 "], ["     3 ", "    3 "],
+    ]  # fmt: skip
+    latex = to_latex(table)
+    assert "Scene & Method & Seeds & Runs & RMSE" in latex
+    assert "@{}llrrrr@{}" in latex
+    assert " & DIP & 3 & 3 & " in latex
+    assert "Runs" not in to_latex(table, published=True)
+    frame = pd.read_csv(io.StringIO(to_csv(table)))
+    ours = frame[frame["scene"] == "lucy"].dropna(subset="runs")
+    assert dict(zip(ours["method"], ours["runs"], strict=True)) == {"Bicubic": 1, "DIP": 3, "MSG-V": 1}

@@ -7,8 +7,8 @@ import torch
 
 from dsr.geometry.camera import Camera
 from dsr.metrics.catalogue import KNOWN_FORMATS
+from dsr.pictures.panels import save_picture
 from dsr.sample import DepthSample
-from dsr.viz.panels import save_picture
 
 pytestmark = pytest.mark.slow  # drawing takes a second
 

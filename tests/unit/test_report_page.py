@@ -16,19 +16,18 @@ from PIL import Image
 from dsr.evaluation.results import Results
 from dsr.evaluation.run_files import load_results
 from dsr.geometry.shading import render
-from dsr.report.page import calibration, save_page
-from dsr.report.page.calibration import calibration_data
-from dsr.report.page.encoding import (
+from dsr.pictures.depth_views import normals_seen_by
+from dsr.report.page import save_page, scene_content
+from dsr.report.page.scene_content import calibration_data, views_of
+from dsr.report.page.value_pictures import (
     LEVELS,
-    Pool,
+    PictureStore,
     depth_picture,
     error_picture,
     expected_picture,
     mask_picture,
     shading_picture,
 )
-from dsr.report.page.scenes import views_of
-from dsr.viz.panels import normals_seen_by
 
 SPITEFUL = "<img src=x onerror=alert(1)>\"'&</script><script>alert(2)</script>"
 
@@ -207,7 +206,7 @@ def test_calibration_compares_expected_and_measured_errors_of_all_scenes(make_ru
 def test_calibration_of_many_pixels_uses_every_few_of_them(make_run, tmp_path, monkeypatch):
     views = views_of(load_results([make_run(tmp_path / "run", scenes=("a", "b"), size=64, confident=True)]))
     [every] = calibration_data(views)
-    monkeypatch.setattr(calibration, "_MOST_PIXELS", 1500)
+    monkeypatch.setattr(scene_content, "_MOST_PIXELS", 1500)
     [some] = calibration_data(views)
     assert some["depth"] != every["depth"]
     assert some["depth"]["ratios"] == pytest.approx(every["depth"]["ratios"], rel=0.25)
@@ -255,7 +254,7 @@ def test_pictures_of_the_first_levels_are_lossless_and_the_second_takes_what_the
     picture = np.random.default_rng(0).integers(0, 256, (40, 60, 3), dtype=np.uint8)
     smooth = np.add.outer(np.arange(200), np.arange(300)).astype(np.uint8)
     for level in LEVELS[:2]:
-        pool = Pool(level)
+        pool = PictureStore(level)
         for each in (picture, smooth):
             content = base64.b64decode(pool.pictures[pool.add(each)])
             image = np.asarray(Image.open(io.BytesIO(content)).convert("RGB"))
@@ -275,7 +274,7 @@ def test_report_too_large_for_fast_compression_stays_lossless(make_run, tmp_path
 
 
 def test_reduced_values_are_averages_of_valid_pixels():
-    pool = Pool(dataclasses.replace(LEVELS[0], longest=2))
+    pool = PictureStore(dataclasses.replace(LEVELS[0], longest=2))
     values = np.array([[1.0, 3, 5, np.nan], [1, 3, 7, 9], [np.nan, np.nan, 2, 2], [np.nan, 4, 2, 2]])
     reduced, known = pool.fit(values)
     assert pool.reduced

@@ -12,7 +12,9 @@ from rich.console import Console
 from dsr.evaluation.results import Run
 from dsr.metrics.catalogue import KNOWN_FORMATS
 from dsr.metrics.formats import in_tables
-from dsr.report.tables import in_shown_units, published, published_row, score_table
+from dsr.report.paper import published, published_row
+from dsr.report.table_layouts import score_table
+from dsr.report.tables import in_shown_units
 
 RAW = {
     "RMSE_d": 0.0704,

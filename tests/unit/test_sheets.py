@@ -7,8 +7,8 @@ import torch
 from matplotlib.figure import Figure
 
 from dsr.geometry.camera import Camera
+from dsr.pictures.sheets import save_contact_sheet
 from dsr.sample import Scene
-from dsr.viz.sheets import save_contact_sheet
 
 pytestmark = pytest.mark.slow  # drawing takes a second
 
@@ -120,7 +120,7 @@ def test_measured_map_beside_the_high_resolution_map_is_mentioned(tmp_path, writ
 
 @pytest.mark.parametrize(("count", "pages"), [(3, 2), (4, 2), (5, 3)])
 def test_many_scenes_make_numbered_pages(tmp_path, written, monkeypatch, count, pages):
-    monkeypatch.setattr("dsr.viz.sheets._ROWS", 2)
+    monkeypatch.setattr("dsr.pictures.sheets._ROWS", 2)
     path = tmp_path / "toys.png"
     made = save_contact_sheet(path, (toy_scene(8, 8, f"scene {number}") for number in range(count)), "Toys")
     assert made == [tmp_path / f"toys-{number + 1}.png" for number in range(pages)]
@@ -129,7 +129,7 @@ def test_many_scenes_make_numbered_pages(tmp_path, written, monkeypatch, count, 
 
 
 def test_scenes_are_loaded_one_at_a_time(tmp_path, monkeypatch):
-    monkeypatch.setattr("dsr.viz.sheets._ROWS", 2)
+    monkeypatch.setattr("dsr.pictures.sheets._ROWS", 2)
 
     def scenes():
         for number in range(4):

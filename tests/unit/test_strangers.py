@@ -19,7 +19,7 @@ from dsr.data.download.fetching import unpack
 from dsr.geometry.poses import as_rigid, from_quaternion, is_rotation
 from dsr.io.photos import focal_in_exif
 from dsr.methods.recipe import read_recipe
-from dsr.report.user_study import read_study
+from dsr.report.study.study_table import read_study
 from dsr.utils.console import one_line, print_error, printable
 from dsr.utils.lightning import fit, make_trainer
 

@@ -28,9 +28,9 @@ from dsr.io.captures.record3d import find_record3d
 from dsr.io.poses import read_transform
 from dsr.methods.networks.peers.files import read_tensors
 from dsr.methods.networks.published import read_msg_weights
+from dsr.report.study.answers import read_all
+from dsr.report.study.key import Candidate, Key, Trial, read_key, write_key
 from dsr.sample import FARTHEST, NEAREST, DepthSample, Scene
-from dsr.user_study.answers import read_all
-from dsr.user_study.key import Candidate, Key, Trial, read_key, write_key
 from dsr.utils.builder import ConfigError
 from dsr.utils.console import one_line, print_error
 from dsr.utils.parsing import is_number, parse_json, readable

@@ -20,14 +20,13 @@ from scipy.stats import binomtest
 from dsr.cli import study as command
 from dsr.evaluation.run_files import load_results
 from dsr.geometry.camera import Camera
-from dsr.user_study.answers import files_of, read_all, read_answers
-from dsr.user_study.build import build_study
-from dsr.user_study.choice import Choice
-from dsr.user_study.collect import ALL, AVERAGE, COLUMNS, collect, remarks
-from dsr.user_study.intervals import agreement, average_fraction, bootstrap_of_average, wilson
-from dsr.user_study.key import Candidate, Key, Trial, read_key, write_key
-from dsr.user_study.pictures import grey_png, shading_of
-from dsr.user_study.summary import tables_of
+from dsr.pictures.depth_views import rendering
+from dsr.report.study.answers import files_of, read_all, read_answers
+from dsr.report.study.choice import Choice
+from dsr.report.study.intervals import agreement, average_fraction, bootstrap_of_average, wilson
+from dsr.report.study.key import Candidate, Key, Trial, read_key, write_key
+from dsr.report.study.percentages import ALL, AVERAGE, COLUMNS, collect, remarks, tables_of
+from dsr.report.study.questionnaire import build_study, grey_png
 from dsr.utils.console import open_console
 
 CANDIDATES = {
@@ -381,7 +380,7 @@ def test_page_shows_what_the_key_says(tmp_path, runs):
     for name, candidate in cube[1].candidates.items():
         [run] = [run for run in load_results([runs]).runs if run.label == candidate.label]
         scene = run.sample("cube_no_texture")
-        expected = shading_of(run.prediction("cube_no_texture"), scene.camera, "e4").numpy()
+        expected = rendering(run.prediction("cube_no_texture"), scene.camera, "e4")
         image = decoded(shown["images"][name])
         assert np.abs((image[..., 0] - 1.0) / 254 - expected).max() <= 0.51 / 254
 
@@ -482,17 +481,17 @@ def test_missing_truth_is_hidden_in_every_picture_alike():
     depth = torch.full((1, 6, 8), 2.0)
     truth = depth.clone()
     truth[0, 2, 3] = math.nan
-    known = shading_of(truth, camera, "e4").isfinite()
-    picture = decoded(base64.b64encode(grey_png(shading_of(depth, camera, "e4"), known)))
+    known = np.isfinite(rendering(truth, camera, "e4"))
+    picture = decoded(base64.b64encode(grey_png(rendering(depth, camera, "e4"), known)))
     assert picture.shape == (6, 8, 2)
-    assert np.array_equal(picture[..., 1] == 0, ~known.numpy())
-    assert (~known).nonzero().tolist() == [[1, 3], [2, 2], [2, 3]]
+    assert np.array_equal(picture[..., 1] == 0, ~known)
+    assert np.argwhere(~known).tolist() == [[1, 3], [2, 2], [2, 3]]
 
 
 def test_fourth_rendering_of_a_frontal_wall_is_white():
     camera = Camera(8, 6, 8.0, 8.0, 3.5, 2.5)
-    shades = shading_of(torch.full((1, 6, 8), 2.0), camera, "e4")
-    picture = decoded(base64.b64encode(grey_png(shades, shades.isfinite())))
+    shades = rendering(torch.full((1, 6, 8), 2.0), camera, "e4")
+    picture = decoded(base64.b64encode(grey_png(shades, np.isfinite(shades))))
     assert (picture == 255).all()
 
 

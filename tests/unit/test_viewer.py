@@ -14,7 +14,7 @@ from small_results import CAMERA, HOLE, waves
 
 from dsr.geometry.camera import Camera
 from dsr.geometry.mesh import triangulate
-from dsr.viewer.packing import (
+from dsr.report.surface_packing import (
     Grid,
     error_levels,
     factor_for,
@@ -24,8 +24,7 @@ from dsr.viewer.packing import (
     reduce_errors,
     reduce_mask,
 )
-from dsr.viewer.page import is_view, save_view
-from dsr.viewer.surfaces import ViewedResult, pack_result
+from dsr.report.surface_page import ViewedResult, is_view, pack_result, save_view
 
 SPITEFUL = "<img src=x onerror=alert(1)>\"'&</script><script>alert(2)</script>"
 
@@ -127,7 +126,7 @@ def test_reduced_surface_is_cut_where_the_whole_one_is():
 
 def test_joints_do_not_depend_on_how_many_pixels_are_held_at_a_time(monkeypatch):
     whole = find_joints(waves(), 3)
-    monkeypatch.setattr("dsr.viewer.packing._STRIP", 500)
+    monkeypatch.setattr("dsr.report.surface_packing._STRIP", 500)
     for found, expected in zip(find_joints(waves(), 3), whole, strict=True):
         np.testing.assert_array_equal(found, expected)
 

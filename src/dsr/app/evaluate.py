@@ -37,7 +37,7 @@ from dsr.methods.base import WORKSPACE, Method
 from dsr.methods.networks.weight_files import files_of_weights
 from dsr.methods.recipe import OF_RUN, Known, Recipe, Run
 from dsr.metrics.formats import HEADLINES, Formats
-from dsr.report.tables import score_table
+from dsr.report.table_layouts import score_table
 from dsr.sample import DepthSample, slope
 from dsr.utils.builder import ConfigError
 from dsr.utils.console import ConsoleProgress, note_once, open_console, print_error, show
@@ -247,8 +247,6 @@ def _workers(settings: EvalConfig, device: torch.device, scenes: int, *, alone: 
 
 def _import_report() -> None:
     """Import what draws and logs, while workers predict."""
-    import dsr.report.dashboard  # noqa: PLC0415
-    import dsr.viz.confidence  # noqa: F401, PLC0415
 
 
 def _save_dashboard(folder: Path) -> None:
@@ -338,8 +336,8 @@ def _illustrate(
     folder: Path, label: str, formats: Formats, sample: DepthSample, depth: torch.Tensor, scores: Mapping[str, float]
 ) -> None:
     """Draw the result of a scene, and its expected errors if there are any."""
-    from dsr.viz.confidence import write_confidence  # noqa: PLC0415 - see _import_report
-    from dsr.viz.panels import save_picture  # noqa: PLC0415
+    from dsr.pictures.expected_errors import write_confidence  # noqa: PLC0415 - see _import_report
+    from dsr.pictures.panels import save_picture  # noqa: PLC0415
 
     save_picture(folder / "pictures" / f"{sample.scene}.png", sample, depth, scores, label, formats)
     errors = load_errors(prediction_path(folder, sample.scene))

@@ -13,10 +13,10 @@ from dsr.evaluation.run_files import load_results
 from dsr.report.correlation_figure import draw_study
 from dsr.report.correlations import write_correlations
 from dsr.report.figures import Figures
-from dsr.report.markup import write_tables
 from dsr.report.page import Pictures, save_page
-from dsr.report.user_study import read_study
-from dsr.report.work import Work, default_workers
+from dsr.report.study.study_table import read_study
+from dsr.report.table_layouts import write_tables
+from dsr.report.worker_pool import WorkerPool, default_workers
 from dsr.utils.console import ConsoleProgress, show
 from dsr.utils.files import replacing_folder, write_text
 from dsr.utils.progress import Progress
@@ -49,8 +49,8 @@ def make_report(request: ReportRequest, console: Console) -> list[str]:
     answers = None if request.study is None else read_study(request.study)
     workers = default_workers(results) if request.workers is None else request.workers
     progress = ConsoleProgress(console)
-    with replacing_folder(output) as temporary, Work(results, workers, progress.say) as work:
-        notes = _write(temporary, work, answers, request, progress)
+    with replacing_folder(output) as temporary, WorkerPool(results, workers, progress.say) as pool:
+        notes = _write(temporary, pool, answers, request, progress)
         write_text(temporary / _MARK, json.dumps({"runs": [str(run.folder) for run in results.runs]}, indent=1) + "\n")
     for note in (*results.notes, *notes):
         show(console, f"note: {note}")
@@ -67,18 +67,18 @@ def _check(output: Path) -> None:
 
 
 def _write(
-    folder: Path, work: Work, study: pd.DataFrame | None, request: ReportRequest, progress: Progress
+    folder: Path, pool: WorkerPool, study: pd.DataFrame | None, request: ReportRequest, progress: Progress
 ) -> list[str]:
     """Write the parts, and return notes for the reader.
 
     Workers begin with what takes them longest while the tables are written here.
     """
-    results = work.results
+    results = pool.results
     notes: list[str] = []
     scored = any(not run.scores.empty for run in results.runs)
-    scatter = work.map(draw_study, [folder / "metrics"] if "metrics" in request.parts and scored else [])
-    drawn = Figures(folder / "figures", work, request.light) if "figures" in request.parts else None
-    pictures = Pictures(work) if "page" in request.parts else None
+    scatter = pool.map(draw_study, [folder / "metrics"] if "metrics" in request.parts and scored else [])
+    drawn = Figures(folder / "figures", pool, request.light) if "figures" in request.parts else None
+    pictures = Pictures(pool) if "page" in request.parts else None
 
     def tables() -> None:
         write_tables(folder / "tables", results, study)

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from dsr.app.upsample.parts import EXPECTED_ERROR
-from dsr.geometry.lights import LIGHT_NAMES
-from dsr.user_study.choice import Choice
+from dsr.geometry.lights import FIGURE_LIGHT, LIGHT_CHOICES, LIGHT_NAMES
+from dsr.report.study.choice import Choice
 from dsr.utils.config_files import config_directories, list_choices
 from dsr.utils.options import OptionError, Options, Rule, at_least, group, one_of, option, positive, some_of
 
@@ -25,7 +25,9 @@ class ReportRequest(Options):
     methods: tuple[str, ...] = option((), "these alone, as the tables name them", "NAME")
     datasets: tuple[str, ...] = option((), "these alone", "NAME")
     scales: tuple[float, ...] = option((), "these alone", "N", flags="--scale")
-    light: str = option("e1", "of the figures: e1 (default), e2, e3 or e4", "NAME", rule=one_of(LIGHT_NAMES, str))
+    light: str = option(
+        FIGURE_LIGHT, f"of the figures: {LIGHT_CHOICES}; {FIGURE_LIGHT}", "NAME", rule=one_of(LIGHT_NAMES, str)
+    )
     title: str = option("Depth super-resolution", "of the page")
     page_mb: float = option(
         60.0, "maximum size of the page; 60", "MB", rule=Rule("a positive number", lambda size: size > 0)

@@ -37,7 +37,7 @@ Join the table to a report: dsr report RUNS --study study/study.csv
 def _build(request: StudyRequest, console: Console, _: object) -> list[str]:
     """Make the page and its key."""
     from dsr.evaluation.run_files import load_results  # noqa: PLC0415 - torch and pandas take seconds to import
-    from dsr.user_study.build import build_study  # noqa: PLC0415
+    from dsr.report.study.questionnaire import build_study  # noqa: PLC0415
 
     progress = ConsoleProgress(console)
     built = build_study(
@@ -57,9 +57,9 @@ def _build(request: StudyRequest, console: Console, _: object) -> list[str]:
 
 def _collect(request: AnswersRequest, console: Console, _: object) -> list[str]:
     """Read answers, print and write the table."""
-    from dsr.user_study.answers import files_of, read_all  # noqa: PLC0415
-    from dsr.user_study.collect import collect, remarks  # noqa: PLC0415
-    from dsr.user_study.key import KEY_NAME, read_key  # noqa: PLC0415
+    from dsr.report.study.answers import files_of, read_all  # noqa: PLC0415
+    from dsr.report.study.key import KEY_NAME, read_key  # noqa: PLC0415
+    from dsr.report.study.percentages import collect, remarks  # noqa: PLC0415
     from dsr.utils.files import write_text  # noqa: PLC0415 - pandas takes a second to import
 
     key = read_key(request.study / KEY_NAME)
@@ -82,7 +82,7 @@ def _collect(request: AnswersRequest, console: Console, _: object) -> list[str]:
 
 def _print(console: Console, table: pd.DataFrame) -> None:
     """Print one table for each data set, scale and degradation."""
-    from dsr.user_study.summary import tables_of  # noqa: PLC0415
+    from dsr.report.study.percentages import tables_of  # noqa: PLC0415
 
     for each in tables_of(table):
         console.print(each)

@@ -1,18 +1,11 @@
-"""The paper's four lights and renderings under them, and a softer light for pictures that people look at."""
+"""Renderings under the paper's four lights, and under a softer one for pictures that people look at."""
 
 from __future__ import annotations
-
-import math
 
 import torch
 from torch import Tensor
 
-_LIGHTS = (
-    (0.0, -math.sqrt(2 / 3), -1 / math.sqrt(3)),
-    (-1 / math.sqrt(2), 1 / math.sqrt(6), -1 / math.sqrt(3)),
-    (1 / math.sqrt(2), 1 / math.sqrt(6), -1 / math.sqrt(3)),
-    (0.0, 0.0, -1.0),
-)
+from dsr.geometry.lights import LIGHTS, VIEWING_LIGHT
 
 
 def lights(*, dtype: torch.dtype = torch.float64, device: torch.device | str = "cpu") -> Tensor:
@@ -20,7 +13,7 @@ def lights(*, dtype: torch.dtype = torch.float64, device: torch.device | str = "
 
     e1, e2, e3 are orthonormal, so renderings under them are the normal map in another basis; e4 is frontal.
     """
-    return torch.tensor(_LIGHTS, dtype=dtype, device=device)
+    return torch.tensor([light.direction for light in LIGHTS.values()], dtype=dtype, device=device)
 
 
 def shade(normals: Tensor, directions: Tensor) -> Tensor:
@@ -42,8 +35,6 @@ def render(normals: Tensor) -> Tensor:
     return shade(normals, lights(dtype=normals.dtype, device=normals.device)).clamp(0, 1)
 
 
-VIEWING_LIGHT = (-0.4, -0.7, -math.sqrt(1 - 0.4**2 - 0.7**2))
-"""Unit vector towards a light at the upper left of the viewer, in the camera frame."""
 VIEWING_TONES = (0.06, 0.9, 1.25)
 """Brightness of a surface that faces away from the light and of one that faces it, and the exponent between them."""
 

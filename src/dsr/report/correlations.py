@@ -16,8 +16,8 @@ import pandas as pd
 from dsr.evaluation.results import Results
 from dsr.metrics.catalogue import KNOWN_FORMATS
 from dsr.metrics.formats import HEADLINES, LIGHTS_NOTE, in_tables
-from dsr.report.markup import MISSING, aligned, escaped
-from dsr.report.tables import published
+from dsr.report.paper import published
+from dsr.report.table_layouts import MISSING, aligned, escaped
 from dsr.utils.files import replacing, write_text
 
 Kind = Literal["pearson", "spearman"]

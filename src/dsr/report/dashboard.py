@@ -21,11 +21,11 @@ from dsr.geometry.lights import LIGHT_NAMES
 from dsr.geometry.shading import render
 from dsr.metrics.catalogue import KNOWN_FORMATS
 from dsr.metrics.formats import HEADLINES, LOOKS, MetricFormat, main_first
+from dsr.pictures.canvas import colours
+from dsr.pictures.depth_views import normals_seen_by, reduced
 from dsr.sample import DepthSample
 from dsr.utils.runs_table import list_run
 from dsr.utils.temporary import temporary_folder
-from dsr.viz.canvas import colours
-from dsr.viz.panels import normals_seen_by, reduced
 
 _EVENTS = "events.out.tfevents.*"
 _PANEL = 320
@@ -36,7 +36,7 @@ def save_dashboard(folder: Path) -> None:
     """Write the TensorBoard log of a run into its directory, replacing an earlier one.
 
     Scalars, in the units of the paper's tables: ``score/METRIC``, the mean over the scenes; ``METRIC/SCENE``;
-    ``scene/METRIC/DATASET`` over the scenes; ``light/METRIC/SCENE`` over the lights e1..e4. Pictures of each scene:
+    ``scene/METRIC/DATASET`` over the scenes; ``light/METRIC/SCENE`` over the lights. Pictures of each scene:
     renderings of the result above those of the truth, errors, and expected errors if the method has them. A custom
     layout has a chart per metric; the table of runs (hparams) has settings and means.
 
@@ -88,7 +88,7 @@ def _write_scores(writer: SummaryWriter, run: Run) -> None:
         }
         for title, names in (("Looks", looks), ("Depth and normals", depth))
     }
-    layout[f"By light, e1 to e4, {run.dataset}"] = {
+    layout[f"By light, {LIGHT_NAMES[0]} to {LIGHT_NAMES[-1]}, {run.dataset}"] = {
         formats[name].title: ["Multiline", [f"light/{name}/.*"]] for name in main_first(by_light)
     }
     writer.add_custom_scalars({title: charts for title, charts in layout.items() if charts})

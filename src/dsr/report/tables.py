@@ -1,107 +1,410 @@
-"""Scores in the units of the paper's tables, beside the published values."""
+"""Tables like those of the paper for any number of runs: methods x metrics per scene and averaged over scenes.
+
+The model is Voynov et al., *Perceptual Deep Depth Super-Resolution* (ICCV 2019): its summary table and those of its
+supplement. A table has no layout; :mod:`dsr.report.table_layouts` writes it.
+
+Scores are averaged over the seeds within each scene, then over scenes. A spread is the sample standard deviation over
+seeds; for an average over scenes, over the averages of the seeds that have all of its scenes.
+"""
 
 from __future__ import annotations
 
-import functools
-from collections.abc import Iterable, Sequence
-from importlib import resources
+import math
+import re
+import statistics
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import pandas as pd
-from rich import box
-from rich.markup import escape
-from rich.table import Table
 
-from dsr.evaluation.results import Run
-from dsr.metrics.formats import HEADLINES, Formats, describe_directions, in_tables
-
-PAPER_METHODS = {"bicubic": "Bicubic", "dip": "DIP", "dip_v": "DIP-V", "msg": "MSG", "msg_v": "MSG-V"}
-"""Method names of the paper by name in ``scores.csv``, where the label may differ from them."""
-REIMPLEMENTED = ("SRfS", "EG", "PDN", "DG")
-"""Methods that the paper ran with other programs or weights than dsr's."""
-PAPER_FILES = {
-    "simgeo": ("lucy",),
-    "middlebury": ("vintage", "recycle", "umbrella", "classroom1", "playroom", "backpack", "jadeplant"),
-}
-"""By data set, the scenes that the paper evaluated on: neither re-created nor other frames of the same place."""
-AVERAGES = {"middlebury": "Average performance on Middlebury dataset"}
-"""The paper's averages over those scenes of a data set."""
-_RELEASED = ("lucy", "plant", "vintage")
-"""Scenes that the paper's authors released as files, for a user's own folder."""
-_FOLDER = "dsr.data.folder.Folder"
-"""Reader of users' own folders."""
-_PAPER_SIZE = 512
-"""Height and width of the paper's pictures, pixels."""
-_PAPER_SETTINGS = {"size": _PAPER_SIZE, "crop": 0.5, "fill": ["vintage"], "without_offset": ["vintage"]}
-"""Settings of data sets with which their scenes are the paper's; a data set lacks some."""
-
-
-@functools.cache
-def published() -> pd.DataFrame:
-    """Read the paper's values in its units, one row per scene, method and scale."""
-    with resources.files("dsr.report").joinpath("published.csv").open(encoding="utf-8") as file:
-        return pd.read_csv(file)
+from dsr.evaluation.results import Results, Run
+from dsr.metrics.catalogue import KNOWN_FORMATS
+from dsr.metrics.formats import (
+    AFTER_THE_PAPER,
+    HEADLINES,
+    LIGHTS_NOTE,
+    Formats,
+    MetricFormat,
+    describe_directions,
+    in_tables,
+)  # fmt: skip
+from dsr.report.paper import (
+    TITLES,
+    Place,
+    SceneSet,
+    applies,
+    implementation_note,
+    paper_name,
+    paper_row,
+    published,
+    published_row,
+    sets_of_dataset,
+    sets_of_summary,
+)  # fmt: skip
+from dsr.report.study.study_table import PERCENTAGES, check_study, study_cells
 
 
-def published_row(scene: str, method: str, scale: float) -> pd.Series | None:
-    """Return the paper's values for a scene (by our name or the paper's) and a method (by its name in the paper)."""
-    number = _published_places().get((scene.replace("_", " ").casefold(), method, scale))
-    return None if number is None else published().iloc[number]
-
-
-@functools.cache
-def _published_places() -> dict[tuple[str, str, float], int]:
-    """Return the row number in :func:`published` by scene, method and scale."""
-    table = published()
-    keys = zip(table["scene"].str.casefold(), table["method"], table["scale"], strict=True)
-    return {(scene, method, int(scale)): number for number, (scene, method, scale) in enumerate(keys)}
-
-
-def applies(runs: Iterable[Run], scenes: Iterable[str]) -> bool:
-    """Return whether the paper's values of these scenes, of any method, can be compared with the runs' own."""
-    scenes = list(scenes)
-    return all(_is_papers(run, scene) for run in runs for scene in scenes)
-
-
-def _is_papers(run: Run, scene: str) -> bool:
-    """Return whether a scene is the paper's own, and downsampled and evaluated as in the paper."""
-    dataset = run.settings.get("dataset", {})
-    own = PAPER_FILES.get(run.dataset.partition(" (")[0], ())
-    return (
-        "validation_of" not in dataset
-        and scene in (_RELEASED if dataset.get("_target_") == _FOLDER else own)
-        and run.downsampling == "box"
-        and run.settings.get("downsampling", {}).get("range_type") is None
-        and all(dataset.get(key, value) == value for key, value in _PAPER_SETTINGS.items())
-        and run.size(scene) in (None, (_PAPER_SIZE, _PAPER_SIZE))
-    )
-
-
-def paper_name(run: Run) -> str:
-    """Return the name that a run's method has in the paper, if it is there."""
-    return PAPER_METHODS.get(run.method, run.label)
-
-
-def paper_row(name: str, runs: Sequence[Run], scenes: Iterable[str]) -> pd.Series | None:
-    """Return the paper's values to stand beside those of some runs; None where it has none, or they do not apply.
+@dataclass(frozen=True)
+class Cell:
+    """One value of a table, in its column's unit.
 
     Args:
-        name: scene, or average over scenes; empty for none of the paper's.
-        runs: runs of one method at one scale.
-        scenes: the scene or scenes.
+        mean: mean over seeds, then over scenes.
+        spread: sample standard deviation over seeds; None for one seed.
+        seeds: number of seeds of the spread; 0 for values without seeds.
+        scenes, of: number of scenes with a value, and of all scenes of the row.
+        interval: 95 % confidence interval of a percentage of answers.
+        rank: 1 for the best displayed value, 2 for the second best; 0 for others and for incomplete averages.
 
     """
-    return published_row(name, paper_name(runs[0]), runs[0].scale) if name and runs and applies(runs, scenes) else None
+
+    mean: float
+    spread: float | None = None
+    seeds: int = 1
+    scenes: int = 1
+    of: int = 1
+    interval: tuple[float, float] | None = None
+    rank: int = 0
+
+    def against(self, paper: float | None) -> tuple[float, float | None] | None:
+        """Return the difference from the paper's value and the ratio to it; None if they are not comparable."""
+        if paper is None or not self.complete:
+            return None
+        return self.mean - paper, self.mean / paper if paper else None
+
+    @property
+    def complete(self) -> bool:
+        """Whether all scenes of the row have a value."""
+        return self.scenes == self.of
 
 
-def average_of(dataset: str, scenes: Iterable[str]) -> str:
-    """Return the paper's name of the average over some scenes of a data set, empty for none."""
-    return AVERAGES[dataset] if dataset in AVERAGES and set(scenes) == set(PAPER_FILES[dataset]) else ""
+@dataclass(frozen=True)
+class Row:
+    """The values of a method.
+
+    Args:
+        label: name of the method.
+        about: scenes.
+        scale, downsampling: degradation of the runs.
+        seeds: maximum number of seeds of a cell; 0 for the paper's values alone.
+        runs: runs of the method; none for the paper's values alone.
+        cells: cells by column; missing values have none.
+        published: the paper's values by column, if any.
+
+    """
+
+    label: str
+    about: SceneSet
+    scale: float
+    downsampling: str
+    seeds: int = 1
+    runs: Sequence[Run] = ()
+    cells: Mapping[str, Cell] = field(default_factory=dict)
+    published: Mapping[str, float] = field(default_factory=dict)
 
 
-def implementation_note(methods: Iterable[str]) -> str:
-    """Return what to know of our values of some methods, by their names in the paper; empty for nothing."""
-    own = sorted(set(REIMPLEMENTED).intersection(methods), key=REIMPLEMENTED.index)
-    return f"{', '.join(own)}: dsr's own implementation, not the one that the paper ran." if own else ""
+@dataclass(frozen=True)
+class Group:
+    """The rows of all methods for a scene or an average.
+
+    Args:
+        about: scenes.
+        rows: methods in order.
+        paper_only: the paper's values of methods that were not run.
+
+    """
+
+    about: SceneSet
+    rows: tuple[Row, ...]
+    paper_only: tuple[Row, ...]
+
+
+@dataclass(frozen=True)
+class PaperTable:
+    """A table like those of the paper.
+
+    Args:
+        name: file name without suffix: letters, digits, "_", "-" and "." only.
+        title: one line.
+        notes: remarks, one sentence each.
+        columns: columns with values, in order: metrics as in ``scores.csv``, and percentages of the user study.
+        groups: scenes, then averages.
+
+    """
+
+    name: str
+    title: str
+    notes: tuple[str, ...]
+    columns: Formats
+    groups: tuple[Group, ...]
+
+    @property
+    def rows(self) -> list[Row]:
+        """The rows of all groups."""
+        return [row for group in self.groups for row in group.rows]
+
+    @property
+    def has_published(self) -> bool:
+        """Whether some rows have values of the paper."""
+        return any(row.published for row in self.rows)
+
+    @property
+    def facts(self) -> list[Fact]:
+        """The columns before those of values, in layouts for readers."""
+        return [fact for fact in FACTS if fact.shown(self.rows)]
+
+    def published_columns(self) -> Formats:
+        """Return the columns with values of the paper."""
+        return {key: each for key, each in self.columns.items() if any(key in row.published for row in self.rows)}
+
+
+class Fact(NamedTuple):
+    """A column that says what a row is, before the columns of values. A CSV file has all of them.
+
+    Args:
+        name: of the column.
+        value: of a row; None for a missing one.
+        shown: whether tables for readers have it, by their rows; the page asks with all rows of a benchmark setting.
+        number: whether it is aligned like numbers; these are left out beside the paper's values.
+
+    """
+
+    name: str
+    value: Callable[[Row], str | float | None]
+    shown: Callable[[Sequence[Row]], bool] = lambda _: False
+    number: bool = False
+
+
+FACTS = (
+    Fact("kind", lambda row: "average" if row.about.average else "scene"),
+    Fact("scene", lambda row: row.about.title, lambda _: True),
+    Fact("dataset", lambda row: " ".join(dict.fromkeys(place.dataset for place in row.about.places))),
+    Fact("scale", lambda row: row.scale),
+    Fact("downsampling", lambda row: row.downsampling),
+    Fact("method", lambda row: row.label, lambda _: True),
+    Fact("seeds", lambda row: row.seeds or None, lambda rows: any(row.seeds > 1 for row in rows), number=True),
+)
+"""All such columns, from the left. Another one here is in every table."""
+_SHARES = {key: MetricFormat(heading, "%", digits=1, higher_is_better=True) for key, heading in PERCENTAGES.items()}
+"""The columns of the user study."""
+
+
+def shown(column: MetricFormat, value: float) -> str:
+    """Return a value in its column's unit as text, without a sign before zero."""
+    text = column.text(value)
+    return text.removeprefix("-") if float(text) == 0 else text
+
+
+def build_tables(results: Results, study: pd.DataFrame | None = None) -> list[PaperTable]:
+    """Build the tables of all runs: per scale and degradation a summary, then one table per data set.
+
+    Args:
+        results: runs.
+        study: table written by ``dsr study collect``: columns ``dataset, scene, scale, downsampling, label``, and
+            ``user_first, user_second, user_top2`` in percent with ``_low`` and ``_high`` of each.
+
+    Raises:
+        ValueError: the study lacks a column.
+
+    """
+    if study is not None:
+        check_study(study)
+    complete = _truth_is_complete(results)
+    tables: list[PaperTable] = []
+    for scale, downsampling in dict.fromkeys((run.scale, run.downsampling) for run in results.runs):
+        runs = [run for run in results.runs if (run.scale, run.downsampling) == (scale, downsampling)]
+        formats = results.formats
+        values = _values(runs, formats)
+        make = _Maker(scale, downsampling, results.methods(), values, runs, study, formats)
+        places = list(dict.fromkeys(place for scenes in make.values.values() for place in scenes))
+        if not places:
+            continue
+        tables.append(make.table("summary", "Averages", sets_of_summary(places, complete)))
+        for dataset in dict.fromkeys(place.dataset for place in places):
+            sets = sets_of_dataset([place for place in places if place.dataset == dataset])
+            tables.append(make.table(dataset, TITLES.get(dataset, dataset), sets))
+    return _with_unique_names(tables)
+
+
+Values = Mapping[str, Mapping[Place, Mapping[str, Mapping[int, float]]]]
+"""Scores by label, scene, metric and seed: worst of four lights, in the units of tables; only finite values."""
+
+
+@dataclass(frozen=True)
+class _Maker:
+    """Builder of the tables of one scale and degradation.
+
+    Args:
+        scale, downsampling: degradation of the runs.
+        methods: all labels, in order.
+        values: scores.
+        runs: runs.
+        study: table of the user study.
+        formats: formats of the metrics, in column order.
+
+    """
+
+    scale: float
+    downsampling: str
+    methods: Sequence[str]
+    values: Values
+    runs: Sequence[Run]
+    study: pd.DataFrame | None
+    formats: Formats
+
+    @property
+    def columns(self) -> Formats:
+        """All columns: the metrics, then those of the user study."""
+        return {**self.formats, **_SHARES}
+
+    def table(self, name: str, title: str, sets: Sequence[SceneSet]) -> PaperTable:
+        """Build a table of some sets of scenes."""
+        places = {place for each in sets for place in each.places}
+        labels = [label for label in self.methods if not places.isdisjoint(self.values.get(label, ()))]
+        groups = tuple(_ranked(self._group(each, labels), self.columns) for each in sets)
+        used = {key for group in groups for row in group.rows for key in row.cells}
+        columns = {key: each for key, each in self.columns.items() if key in used}
+        slug = re.sub(r"[^A-Za-z0-9.-]+", "_", f"{name}_x{self.scale}_{self.downsampling}").strip("._-")
+        title = f"{title}, x{self.scale}, {self.downsampling} downsampling"
+        return PaperTable(slug, title, tuple(_notes(groups, columns)), columns, groups)
+
+    def _group(self, about: SceneSet, labels: Sequence[str]) -> Group:
+        """Build the rows of some methods; a method without values has an empty row."""
+        here = [run for run in self.runs if run.dataset in {place.dataset for place in about.places}]
+        scenes = [place.scene for place in about.places]
+        rows = []
+        degradation = (about, self.scale, self.downsampling)
+        for label in labels:
+            runs = [run for run in here if run.label == label]
+            own = [self.values[label].get(place, {}) for place in about.places]
+            cells = {key: _cell([scene.get(key, {}) for scene in own]) for key in self.formats}
+            valid = {key: cell for key, cell in cells.items() if cell is not None} | self._study_cells(about, label)
+            row = paper_row(about.published, runs, scenes) if valid else None
+            seeds = max([1, *(cell.seeds for cell in valid.values())])
+            rows.append(Row(label, *degradation, seeds, runs, valid, self._columns_of(row)))
+        ran = {paper_name(run) for run in here if any(row.cells for row in rows if row.label == run.label)}
+        others = published()["method"].unique() if about.published and applies(here, scenes) else []
+        only = {
+            str(name): self._columns_of(published_row(about.published, str(name), self.scale))
+            for name in others
+            if name not in ran
+        }
+        paper_only = [Row(name, *degradation, 0, published=values) for name, values in only.items() if values]
+        return Group(about, tuple(rows), tuple(paper_only))
+
+    def _columns_of(self, row: pd.Series | None) -> dict[str, float]:
+        """Return the paper's values by column."""
+        return {} if row is None else {key: float(row[key]) for key in self.columns if pd.notna(row.get(key))}
+
+    def _study_cells(self, about: SceneSet, label: str) -> dict[str, Cell]:
+        """Return the study's cells of a method."""
+        found = study_cells(self.study, about.places, self.scale, self.downsampling, label)
+        return {key: Cell(mean, None, 0, count, len(about.places), ci) for key, (mean, count, ci) in found.items()}
+
+
+def _values(runs: Sequence[Run], formats: Formats) -> Values:
+    """Collect the scores of the tables."""
+    found: dict[str, dict[Place, dict[str, dict[int, float]]]] = {}
+    for run in runs:
+        scores = run.scores
+        worst = scores[scores["variant"].fillna("").isin(HEADLINES) & scores["metric"].isin(list(formats))]
+        for scene, metric, value in zip(worst["scene"], worst["metric"], worst["value"], strict=True):
+            by_metric = found.setdefault(run.label, {}).setdefault(Place(run.dataset, scene), {})
+            if math.isfinite(value):
+                by_metric.setdefault(metric, {})[run.seed] = formats[metric].factor * value
+    return found
+
+
+def _truth_is_complete(results: Results) -> Callable[[Place], bool]:
+    """Return what tells whether a scene's truth has no hole.
+
+    Where some method's scores rest on every pixel it has none. Otherwise the stored scene decides; without it the holes
+    are taken for the truth's.
+    """
+    scores = pd.concat([run.scores.assign(dataset=run.dataset) for run in results.runs])
+    depth = scores[scores["metric"] == "RMSE_d"]
+    shares = depth.groupby(["dataset", "scene"])["valid_share"].max()
+
+    def complete(place: Place) -> bool:
+        if shares.get(tuple(place), 0.0) == 1:
+            return True
+        kept = [run for run in results.runs if run.dataset == place.dataset and run.has_sample(place.scene)]
+        truth = kept[0].sample(place.scene).depth if kept else None
+        return truth is not None and bool(truth.isfinite().all())
+
+    return complete
+
+
+def _cell(scenes: Sequence[Mapping[int, float]]) -> Cell | None:
+    """Average one method's values of a metric over seeds, then over scenes; None without values."""
+    valid = [by_seed for by_seed in scenes if by_seed]
+    if not valid:
+        return None
+    mean = statistics.fmean(statistics.fmean(by_seed.values()) for by_seed in valid)
+    seeds = set.intersection(*map(set, valid))  # seeds that have all of these scenes
+    averages = [statistics.fmean(by_seed[seed] for by_seed in valid) for seed in sorted(seeds)]
+    spread = statistics.stdev(averages) if len(averages) > 1 else None
+    return Cell(mean, spread, max(len(averages), 1), len(valid), len(scenes))
+
+
+def _ranked(group: Group, columns: Formats) -> Group:
+    """Return the group with the best and second best marked.
+
+    Values are compared as displayed, so equal texts share a rank. Averages over a subset of the scenes are not ranked,
+    and a single value is not ranked.
+    """
+    ranks: dict[tuple[str, str], int] = {}
+    for name, column in columns.items():
+        cells = {row.label: row.cells[name] for row in group.rows if name in row.cells}
+        values = {label: float(shown(column, cell.mean)) for label, cell in cells.items() if cell.complete}
+        order = sorted(set(values.values()), reverse=column.higher_is_better)[:2] if len(values) > 1 else []
+        ranks |= {(label, name): order.index(value) + 1 for label, value in values.items() if value in order}
+    rows = [
+        replace(row, cells={key: replace(cell, rank=ranks.get((row.label, key), 0)) for key, cell in row.cells.items()})
+        for row in group.rows
+    ]
+    return replace(group, rows=tuple(rows))
+
+
+def _notes(groups: Sequence[Group], columns: Formats) -> Iterator[str]:
+    """Yield the notes of a table."""
+    rows = [row for group in groups for row in group.rows]
+    cells = [cell for row in rows for cell in row.cells.values()]
+    metrics = {key: each for key, each in columns.items() if key not in _SHARES}
+    user = len(metrics) < len(columns)
+    direction = describe_directions(metrics)
+    if user:
+        direction += " and User columns higher" if " of " in direction else ", of User columns higher"
+    yield f"{direction[0].upper()}{direction[1:]}."
+    yield f"{LIGHTS_NOTE}."
+    yield "In each group our best displayed value is bold, the second best underlined; equal values share the mark."
+    of_paper = [name for name, each in in_tables(KNOWN_FORMATS).items() if each.position != AFTER_THE_PAPER]
+    missing = [name for name in of_paper if name not in metrics]
+    if 0 < len(missing) < len(of_paper):
+        yield f"Not computed: {', '.join(missing)}."
+    if any(cell.spread is not None for cell in cells):
+        yield "Mean ± sample standard deviation over seeds; seeds are averaged within each scene, then scenes."
+    if any(not cell.complete for cell in cells):
+        yield "(k of n): an average over k of the n scenes; it is not compared with the others."
+    note = implementation_note(row.label for row in rows if row.published)
+    if note:
+        yield note
+    if user:
+        yield "User: percentage of answers with the method as most similar (1st), second most similar (2nd), or either."
+
+
+def _with_unique_names(tables: Sequence[PaperTable]) -> list[PaperTable]:
+    """Return the tables with names that are unique on any file system."""
+    taken: set[str] = set()
+    named = []
+    for table in tables:
+        name, number = table.name, 2
+        while name.casefold() in taken:
+            name, number = f"{table.name}_{number}", number + 1
+        taken.add(name.casefold())
+        named.append(replace(table, name=name))
+    return named
 
 
 def in_shown_units(scores: pd.DataFrame, formats: Formats) -> pd.DataFrame:
@@ -116,42 +419,3 @@ def in_shown_units(scores: pd.DataFrame, formats: Formats) -> pd.DataFrame:
     wide = worst.pivot_table(index="scene", columns="metric", values="value", sort=False)
     columns = {name: each for name, each in in_tables(formats).items() if name in wide}
     return wide[list(columns)].mul(pd.Series({name: each.factor for name, each in columns.items()}, dtype=float))
-
-
-def score_table(run: Run, formats: Formats) -> Table:
-    """Build the terminal table of one run: per scene our values and the paper's, then the mean."""
-    ours = in_shown_units(run.scores, formats)
-    columns = {str(name): formats[str(name)] for name in ours}
-    about = f"{run.label} on {run.dataset}, x{run.scale}, {run.downsampling} downsampling"
-    title = f"{about} - {describe_directions(columns)}"
-    table = Table(title=escape(title), title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
-    table.add_column("scene", overflow="fold")
-    table.add_column("from")
-    for column in columns.values():
-        table.add_column(escape(f"{column.heading}\n{column.unit}"), justify="right", no_wrap=True)
-    scenes = [str(scene) for scene in ours.index]
-    papers = [paper_row(scene, [run], [scene]) for scene in scenes]
-    for scene, (_, values), paper in zip(scenes, ours.iterrows(), papers, strict=True):
-        table.add_row(escape(scene), "dsr", *_cells(values, columns))
-        if paper is not None and _has_any(paper, columns):
-            table.add_row("", "paper", *_cells(paper, columns), style="dim")
-    if len(ours) > 1:
-        table.add_section()
-        table.add_row("mean", "dsr", *_cells(ours.mean(), columns), style="bold")
-        paper = paper_row(average_of(run.dataset, scenes), [run], scenes)
-        if paper is not None and _has_any(paper, columns):
-            table.add_row("", "paper", *_cells(paper, columns), style="dim")
-    if any(paper is not None for paper in papers):
-        table.caption = implementation_note([paper_name(run)]) or None
-        table.caption_justify = "left"
-    return table
-
-
-def _has_any(values: pd.Series, columns: Formats) -> bool:
-    """Return whether a row has a value for one of the columns."""
-    return bool(values.reindex(list(columns)).notna().any())
-
-
-def _cells(values: pd.Series, columns: Formats) -> list[str]:
-    """Format the values of a row with the digits of each column; "-" for missing values."""
-    return [each.text(values[name]) if pd.notna(values.get(name)) else "-" for name, each in columns.items()]

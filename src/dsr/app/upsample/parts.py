@@ -183,7 +183,7 @@ def _fewer(part: str, what: str, option: str, shape: Written) -> list[Assumption
 
 
 def _before_after(folder: Path, result: Result) -> None:
-    from dsr.viz.before_after import write_before_after
+    from dsr.pictures.before_after import write_before_after
 
     picture, depth = result.picture, result.surface.depth
     path = folder / "before_after.png"
@@ -193,8 +193,8 @@ def _before_after(folder: Path, result: Result) -> None:
 def _confidence(folder: Path, result: Result) -> Output | None:
     import numpy as np
 
+    from dsr.pictures.expected_errors import write_confidence
     from dsr.utils.files import replacing
-    from dsr.viz.confidence import write_confidence
 
     surface = result.surface
     if surface.depth_error is None or surface.angle_error is None:

@@ -1,6 +1,14 @@
 // Tables that sort, by mouse and by keyboard; what is missing stands at the end whichever way.
 
 const DASH = "\u2013";
+const plural = (count, one, many = `${one}s`) => `${count} ${count === 1 ? one : many}`;
+
+/** Return a number with a minus sign and as many digits as asked for. */
+const number = (value, digits) => value.toFixed(digits).replace(/^-(?=.*[1-9])/, "\u2212").replace(/^-/, "");
+const signed = (value, digits) => (Number(value.toFixed(digits)) > 0 ? "+" : "") + number(value, digits);
+
+/** Return what a problem is called. */
+const problemName = (problem) => `${problem.dataset}, \u00d7${problem.scale}, ${problem.downsampling}`;
 
 /**
  * Return a sortable table.
@@ -96,6 +104,10 @@ function scoreCell(row, metric, places, total, published) {
 /** Return with how many digits the paper's value is shown: those that it has. */
 const paperDigits = (value, metric) => Math.min(metric.digits, (String(value).split(".")[1] ?? "").length);
 
+/** Return the columns that say what a row is; some have cells of their own. */
+const factColumns = (facts, cells = {}) => facts.map(({ name, word }) => (
+  { title: name[0].toUpperCase() + name.slice(1), unit: "\u00a0", word, value: (row) => row[name], cell: cells[name] }));
+
 /** Return the columns of the metrics. */
 function metricColumns(metrics, places, total, options) {
   return metrics.map((metric) => ({
@@ -117,7 +129,7 @@ function showTables(data, entries, open) {
     const meanPlaces = new Map(data.metrics.map((metric) => [metric.id, ranked(problem.means, metric)]));
     const means = sortable(
       [
-        { title: "Method", unit: "\u00a0", word: true, value: (row) => row.method },
+        ...factColumns(problem.facts.filter(({ name }) => name !== "scene")),
         ...metricColumns(data.metrics, (_, metric) => meanPlaces.get(metric.id), problem.scenes.length, options),
       ],
       problem.means,
@@ -131,13 +143,9 @@ function showTables(data, entries, open) {
     const has = new Set(entries.filter((entry) => entry.problem === index).map((entry) => entry.name));
     const scenes = sortable(
       [
-        {
-          title: "Scene", unit: "\u00a0", word: true, value: (row) => row.scene,
-          cell: (row) => has.has(row.scene)
-            ? make("button", { type: "button", className: "go", textContent: row.scene, title: "show its pictures", onclick: () => open(index, row.scene, row.method) })
-            : row.scene,
-        },
-        { title: "Method", unit: "\u00a0", word: true, value: (row) => row.method },
+        ...factColumns(problem.facts, { scene: (row) => has.has(row.scene)
+          ? make("button", { type: "button", className: "go", textContent: row.scene, title: "show its pictures", onclick: () => open(index, row.scene, row.method) })
+          : row.scene }),
         ...metricColumns(data.metrics, (row, metric) => places.get(row.scene).get(metric.id), 0, options),
       ],
       problem.rows,

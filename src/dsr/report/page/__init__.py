@@ -4,31 +4,27 @@ from __future__ import annotations
 
 import functools
 import html
-import json
 import math
 from collections.abc import Generator, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from importlib import resources
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import matplotlib as mpl
 import numpy as np
 
 from dsr.evaluation.results import BenchmarkSetting, Results
-from dsr.geometry.lights import LIGHT_NAMES
-from dsr.geometry.shading import lights
-from dsr.report.page.calibration import calibration_data
+from dsr.geometry.lights import BASIS, LIGHTS, VIEWING_LIGHT
+from dsr.pictures.canvas import HOLE_COLOUR
+from dsr.report.html_page import asset, block, fill, json_text, palette
 from dsr.report.page.content import links, metrics_data, problem_data, run_data
-from dsr.report.page.encoding import LEVELS, Level, Pool, megabytes
-from dsr.report.page.scenes import View, scene_data, views_of
-from dsr.report.work import Work
+from dsr.report.page.scene_content import View, calibration_data, scene_data, views_of
+from dsr.report.page.value_pictures import LEVELS, Level, PictureStore, megabytes
+from dsr.report.worker_pool import WorkerPool
 from dsr.utils.files import write_text
 from dsr.utils.progress import Steps
-from dsr.viz.canvas import HOLE_COLOUR
 
 _COLOUR_MAPS = {"depth": "viridis", "error": "RdBu_r", "angle": "magma"}
-_SCRIPTS = ("dom.js", "pictures.js", "tables.js", "viewer.js", "page.js")
+_SCRIPTS = ("core.js", "values.js", "tables.js", "scenes.js", "report.js")
 _SAMPLE = 6
 """Number of scenes from which the total size is estimated."""
 
@@ -41,7 +37,7 @@ class _TooLargeError(Exception):
 class _Stored:
     """Pictures of all scenes, data of the scenes (None for a scene without pictures), and notes."""
 
-    pool: Pool
+    pool: PictureStore
     scenes: list[dict[str, Any] | None]
     notes: list[str]
 
@@ -55,19 +51,19 @@ class _Scene(NamedTuple):
 
 
 class Pictures:
-    """The pictures of all scenes and the agreement of the errors, which the workers of ``work`` begin at once.
+    """The pictures of all scenes and the agreement of the errors, which the workers begin at once.
 
     Args:
-        work: runs, and what encodes their pictures.
+        workers: runs, and what encodes their pictures.
 
     """
 
-    def __init__(self, work: Work) -> None:
-        self.results = work.results
-        self.views = views_of(work.results)
-        self._work = work
+    def __init__(self, workers: WorkerPool) -> None:
+        self.results = workers.results
+        self.views = views_of(workers.results)
+        self._workers = workers
         self._first = self._encode(LEVELS[0])
-        self._calibration = work.map(_calibrate, work.results.problems())
+        self._calibration = workers.map(_calibrate, workers.results.problems())
 
     def stored(self, budget: float, progress: Steps) -> _Stored:
         """Encode the pictures at the best level within the budget in bytes, otherwise at the last level."""
@@ -80,7 +76,7 @@ class Pictures:
         return _at_level(self._encode(LEVELS[-1]), LEVELS[-1], len(self.views), math.inf, progress)
 
     def calibration(self) -> list[list[dict[str, Any]]]:
-        """Return the result of :func:`dsr.report.page.calibration.calibration_data` of each setting."""
+        """Return the result of :func:`dsr.report.page.scene_content.calibration_data` of each setting."""
         return list(self._calibration)
 
     def _encode(self, level: Level) -> Generator[_Encoded]:
@@ -88,16 +84,16 @@ class Pictures:
         numbers = {id(run): number for number, run in enumerate(self.results.runs)}
         views = [self.views[number] for number in _spread(len(self.views))]
         scenes = [_Scene(view.problem, view.scene, tuple(numbers[id(run)] for run in view.runs)) for view in views]
-        return self._work.map(functools.partial(_encode_scene, level), scenes)
+        return self._workers.map(functools.partial(_encode_scene, level), scenes)
 
 
-_Encoded = tuple[dict[str, Any] | None, Pool, list[str]]
+_Encoded = tuple[dict[str, Any] | None, PictureStore, list[str]]
 """Data of a scene, its pictures, and notes."""
 
 
 def _encode_scene(level: Level, results: Results, scene: _Scene) -> _Encoded:
     """Encode the pictures of a scene."""
-    pool, notes = Pool(level), list[str]()
+    pool, notes = PictureStore(level), list[str]()
     view = View(scene.problem, scene.name, tuple(results.runs[number] for number in scene.runs))
     return scene_data(view, pool, notes), pool, notes
 
@@ -141,7 +137,7 @@ def save_page(
     """
     if not budget_mb > 0:
         raise ValueError(f"budget_mb: expected a positive number of megabytes, got {budget_mb!r}")
-    pictures = Pictures(Work(results)) if pictures is None else pictures
+    pictures = Pictures(WorkerPool(results)) if pictures is None else pictures
     views = pictures.views
     stored = pictures.stored(1e6 * budget_mb, progress or (lambda done, total: None))
     shown = [(view, scene) for view, scene in zip(views, stored.scenes, strict=True) if scene is not None]
@@ -157,16 +153,22 @@ def save_page(
             for number, (view, _) in enumerate(shown)
         ],
     }
-    blocks = [_block("data", _json(data))]
-    blocks += [_block(f"s{number}", _json(scene)) for number, (_, scene) in enumerate(shown)]
-    blocks += [_block(name, content, "text/plain") for name, content in stored.pool.pictures.items()]
-    write_text(path, _fill_template(title, blocks))
+    blocks = [block("data", json_text(data))]
+    blocks += [block(f"s{number}", json_text(scene)) for number, (_, scene) in enumerate(shown)]
+    blocks += [block(name, content, "text/plain") for name, content in stored.pool.pictures.items()]
+    parts = {
+        "TITLE": html.escape(title),
+        "STYLE": asset("report.css"),
+        "SCRIPT": asset(*_SCRIPTS),
+        "DATA": "\n".join(blocks),
+    }
+    write_text(path, fill("report.html", parts))
     return notes
 
 
 def _at_level(encoded: Iterable[_Encoded], level: Level, count: int, budget: float, progress: Steps) -> _Stored:
     """Collect the pictures of all scenes."""
-    pool = Pool(level)
+    pool = PictureStore(level)
     notes: dict[int, list[str]] = {}
     scenes: dict[int, dict[str, Any] | None] = {}
     for done, (number, (scene, pictures, remarks)) in enumerate(zip(_spread(count), encoded, strict=True), start=1):
@@ -208,41 +210,9 @@ def _data(
         "seeds": sorted({run.seed for run in results.runs}),
         "runs": [run_data(run) for run in results.runs],
         "links": links(path.parent, tables),
-        "lights": dict(zip(LIGHT_NAMES, lights().tolist(), strict=True)),
+        "lights": {name: light.direction for name, light in LIGHTS.items()},
+        "basis": BASIS,
+        "free": VIEWING_LIGHT,
         "hole": HOLE_COLOUR,
-        "colours": {use: _colours(name) for use, name in _COLOUR_MAPS.items()},
+        "colours": {use: palette(name) for use, name in _COLOUR_MAPS.items()},
     }
-
-
-@functools.cache
-def _colours(name: str) -> str:
-    """Return the 256 colours of a colour map, six hexadecimal digits each."""
-    return mpl.colormaps[name](np.arange(256), bytes=True)[:, :3].tobytes().hex()
-
-
-def _json(value: Any) -> str:
-    """Serialize as JSON without characters that could begin or end an HTML tag."""
-    text = json.dumps(value, ensure_ascii=False, separators=(",", ":"), allow_nan=False)
-    return text.replace("&", "\\u0026").replace("<", "\\u003c").replace(">", "\\u003e")
-
-
-def _block(name: str, content: str, kind: str = "application/json") -> str:
-    return f'<script type="{kind}" id="{name}">{content}</script>'
-
-
-def _asset(name: str) -> str:
-    return resources.files("dsr.report").joinpath("assets", name).read_text(encoding="utf-8")
-
-
-def _fill_template(title: str, blocks: Sequence[str]) -> str:
-    """Fill the page template."""
-    parts = {
-        "TITLE": html.escape(title),
-        "STYLE": _asset("page.css"),
-        "DATA": "\n".join(blocks),
-        "SCRIPT": "\n".join(_asset(name) for name in _SCRIPTS),
-    }
-    page = _asset("page.html")
-    for name, content in parts.items():
-        page = page.replace(f"<!-- {name} -->", content, 1)
-    return page

@@ -12,7 +12,8 @@ import pandas as pd
 
 from dsr.evaluation.results import BenchmarkSetting, Results, Run
 from dsr.metrics.formats import Formats
-from dsr.report.tables import average_of, in_shown_units, paper_row
+from dsr.report.paper import Place, SceneSet, average_of, paper_row
+from dsr.report.tables import FACTS, Row, in_shown_units
 from dsr.utils.paths import natural_key
 
 _FOLDERS = {"tables": (".csv", ".md", ".tex"), "metrics": (".csv",), "figures": (".pdf",)}
@@ -34,19 +35,29 @@ def problem_data(results: Results, problem: BenchmarkSetting) -> dict[str, Any]:
     formats = results.formats
     wide = {id(run): _by_scene(run, formats) for run in runs}
     scenes = list(dict.fromkeys(scene for run in runs for scene in wide[id(run)].index))
-    places = {scene: place for place, scene in enumerate(scenes)}
-    rows: list[dict[str, Any]] = []
-    means: list[dict[str, Any]] = []
-    for method in methods:
-        own_runs = [run for run in runs if run.label == method]
-        tables = [wide[id(run)] for run in own_runs]
-        for scene in scenes:
-            own = [table.loc[scene] for table in tables if scene in table.index]
-            if own:
-                paper = _published(scene, own_runs, [scene], formats)
-                values = _over_seeds(own)
-                rows.append({"scene": scene, "method": method, "seeds": len(own), "values": values, "paper": paper})
-        means.append(_mean_row(own_runs, scenes, tables, formats))
+    places = [Place(problem.dataset, scene) for scene in scenes]
+    of_method = {method: [run for run in runs if run.label == method] for method in methods}
+    single = [
+        (Row(method, SceneSet(place.scene, (place,), average=False), *problem[1:], len(own), own_runs), own)
+        for place in places
+        for method, own_runs in of_method.items()
+        if (own := [table.loc[place.scene] for run in own_runs if place.scene in (table := wide[id(run)]).index])
+    ]
+    facts = [fact for fact in FACTS if fact.name != "seeds" and fact.shown([row for row, _ in single])]
+    rows = [
+        {
+            **{fact.name: fact.value(row) for fact in facts},
+            "seeds": row.seeds,
+            "values": _over_seeds(own),
+            "paper": _published(row.about.title, row.runs, [row.about.title], formats),
+        }
+        for row, own in single
+    ]
+    means = []
+    for method, own_runs in of_method.items():
+        mean = Row(method, SceneSet("mean", tuple(places)), *problem[1:], len(own_runs), own_runs)
+        words = {fact.name: fact.value(mean) for fact in facts if fact.name != "scene"}
+        means.append(words | _mean_row(own_runs, scenes, [wide[id(run)] for run in own_runs], formats))
     return {
         "dataset": problem.dataset,
         "scale": problem.scale,
@@ -54,7 +65,8 @@ def problem_data(results: Results, problem: BenchmarkSetting) -> dict[str, Any]:
         "methods": methods,
         "scenes": scenes,
         "means": means,
-        "rows": sorted(rows, key=lambda row: places[row["scene"]]),
+        "rows": rows,
+        "facts": [{"name": fact.name, "word": not fact.number} for fact in facts],
         "seconds": _seconds(runs, methods),
     }
 
@@ -88,7 +100,7 @@ def _mean_row(runs: Sequence[Run], scenes: list[str], tables: list[pd.DataFrame]
                 seen[name] |= set(table.index[table[name].notna()])
     counts = {name: len(found) for name, found in seen.items() if len(found) < len(scenes)}
     paper = {} if counts else _published(average_of(runs[0].dataset, scenes), runs, scenes, formats)
-    return {"method": runs[0].label, "seeds": len(tables), "values": values, "counts": counts, "paper": paper}
+    return {"seeds": len(tables), "values": values, "counts": counts, "paper": paper}
 
 
 def _published(name: str, runs: Sequence[Run], scenes: Sequence[str], formats: Formats) -> dict[str, float]:

@@ -1,0 +1,151 @@
+"""A figure whose pictures are placed in inches, and how figures are written."""
+
+from __future__ import annotations
+
+import contextlib
+import gc
+import warnings
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colorbar import Colorbar
+from matplotlib.colors import Colormap, Normalize
+from matplotlib.figure import Figure
+from matplotlib.image import AxesImage
+from matplotlib.patches import Rectangle
+from matplotlib.transforms import Bbox, TransformedBbox
+from PIL import Image
+
+from dsr.utils.files import replacing
+
+HOLE_COLOUR = "#d684b4"
+_DPI = 300
+"""Of figures that are written twice."""
+_PNG_LEVEL = 3
+"""Compression of PNG files: half the time of the usual level 6, for files that are 7 % larger."""
+
+
+def colours(name: str | Colormap) -> Any:
+    """Return a colour map that shows NaN in the hole colour."""
+    return mpl.colormaps.get_cmap(name).with_extremes(bad=HOLE_COLOUR)
+
+
+class Canvas:
+    """A figure with positions in inches from the lower left corner.
+
+    All pictures are in one :class:`~matplotlib.axes.Axes` of the figure's size, as each further one takes long to make.
+
+    Args:
+        width: width of the figure, inches.
+        height: its height, inches.
+
+    Attributes:
+        figure: the figure.
+
+    """
+
+    def __init__(self, width: float, height: float) -> None:
+        self.figure = Figure(figsize=(width, height))
+        FigureCanvasAgg(self.figure)
+        self._pictures = self.figure.add_axes((0, 0, 1, 1), label="pictures", autoscale_on=False)
+        self._pictures.set(xlim=(0, width), ylim=(0, height))
+        self._pictures.set_axis_off()
+
+    @property
+    def images(self) -> list[AxesImage]:
+        """The pictures, in the order in which they were drawn."""
+        return list(self._pictures.images)
+
+    def text(self, x: float, y: float, text: str, **style: Any) -> None:
+        """Write a text, none of which is taken as a formula."""
+        width, height = self.figure.get_size_inches()
+        self.figure.text(x / width, y / height, text, parse_math=False, **style)
+
+    def show(
+        self,
+        place: Bbox,
+        picture: np.ndarray,
+        label: str = "",
+        *,
+        colour_map: str | Colormap = "gray",
+        limits: tuple[float, float] | Normalize = (0.0, 1.0),
+        within: Bbox | None = None,
+        **style: Any,
+    ) -> AxesImage:
+        """Draw a picture: (H, W), NaN in holes, or (H, W, 3) in [0, 1]; what is not within a rectangle is cut off."""
+        norm = limits if isinstance(limits, Normalize) else Normalize(*limits)
+        extent = (place.x0, place.x1, place.y0, place.y1)
+        image = self._pictures.imshow(
+            picture, cmap=colours(colour_map), norm=norm, extent=extent, aspect="auto", label=label, **style
+        )
+        if within is not None:
+            image.set_clip_box(TransformedBbox(within, self._pictures.transData))
+        return image
+
+    def bar(self, image: AxesImage, place: Bbox, label: str = "", **style: Any) -> Colorbar:
+        """Draw the colour bar of a picture."""
+        width, height = self.figure.get_size_inches()
+        bounds = (place.x0 / width, place.y0 / height, place.width / width, place.height / height)
+        return self.figure.colorbar(image, cax=self.figure.add_axes(bounds, label=label), **style)
+
+    def frame(self, place: Bbox, label: str = "", **style: Any) -> None:
+        """Draw a rectangle."""
+        self._pictures.add_patch(Rectangle(place.p0, place.width, place.height, label=label, **style))
+
+
+def fitted(space: Bbox, aspect: float) -> Bbox:
+    """Return the largest rectangle of a ratio of height to width in the middle of a space."""
+    width = min(space.width, space.height / aspect)
+    height = width * aspect
+    left, bottom = (space.x0 + space.x1 - width) / 2, (space.y0 + space.y1 - height) / 2
+    return Bbox.from_bounds(left, bottom, width, height)
+
+
+@contextlib.contextmanager
+def without_collections() -> Iterator[None]:
+    """Leave garbage alone within the context: Matplotlib makes so many objects that to go through them takes long."""
+    enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if enabled:
+            gc.enable()
+
+
+def save_both(folder: Path, name: str, figure: Figure) -> list[Path]:
+    """Write a figure as PDF and PNG atomically, and return the files.
+
+    In the PDF text is stored as text, and pictures are stored one by one, not resampled.
+    """
+    paths = []
+    for suffix, interpolation, metadata in ((".pdf", "none", {"CreationDate": None}), (".png", "auto", {})):
+        for axes in figure.axes:
+            for image in axes.images:
+                image.set_interpolation(interpolation)
+        paths.append(folder / f"{name}{suffix}")
+        with mpl.rc_context({"pdf.fonttype": 42, "image.composite_image": False}):
+            write_figure(paths[-1], figure, _DPI, metadata)
+    return paths
+
+
+def write_figure(path: Path, figure: Figure, dpi: int, metadata: Mapping[str, Any] | None = None) -> None:
+    """Write a figure atomically, in the format given by the suffix."""
+    with replacing(path) as temporary, warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "Glyph .* missing from font")  # a name may have letters that the font lacks
+        if path.suffix == ".png":
+            _write_png(temporary, figure, dpi)
+        else:
+            figure.savefig(temporary, dpi=dpi, metadata=metadata)
+
+
+def _write_png(path: Path, figure: Figure, dpi: int) -> None:
+    canvas = FigureCanvasAgg(figure)
+    figure.set_dpi(dpi)
+    canvas.draw()
+    opaque = Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")  # 3 channels are written faster
+    opaque.save(path, "PNG", compress_level=_PNG_LEVEL, dpi=(dpi, dpi))

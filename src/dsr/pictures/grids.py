@@ -1,0 +1,192 @@
+"""Layout of the grids: rows of panels of one width, details below them, and one colour bar per row."""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from matplotlib.colors import Colormap
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator, ScalarFormatter
+from matplotlib.transforms import Bbox
+
+from dsr.pictures.canvas import Canvas
+from dsr.pictures.depth_views import Window
+
+FRAMES = ("#ff8c00", "#00a5e3")
+"""Frame colours of the first and second detail."""
+_WIDTH, _LEAST_PANEL, _MOST_PANEL = 7.0, 0.95, 1.6
+"""Page width, inches, unless a panel would exceed its minimum or maximum width."""
+_TALLEST = 1.5
+"""Maximum ratio of height to width of a panel; taller pictures become narrower."""
+_GAP, _SEAM, _MARGIN, _LINE = 0.05, 0.04, 0.06, 0.125
+"""Space between panels, between details and around the page, and height of a line of text, inches."""
+_BAR, _BAR_TEXT = 0.09, 0.42
+_FONT = 7.0
+_LETTER_WIDTH = 0.062
+"""Upper estimate of the width of a letter, inches."""
+_EMPTY = "#f2f2f2"
+
+
+@dataclass(frozen=True)
+class Cell:
+    """A panel.
+
+    Args:
+        picture: (H, W), NaN in holes, or (H, W, 3) in [0, 1]; None for an empty panel.
+        caption: line below the panel, or text inside an empty panel.
+        bold: whether the caption is bold.
+        colour_map, limits: colours of an (H, W) picture.
+
+    """
+
+    picture: np.ndarray | None
+    caption: str = ""
+    bold: bool = False
+    colour_map: str | Colormap = "gray"
+    limits: tuple[float, float] = (0.0, 1.0)
+
+
+@dataclass(frozen=True)
+class Row:
+    """The row of a scene.
+
+    Args:
+        label: name of the scene.
+        aspect: ratio of height to width of its pictures.
+        cells: one per column.
+        details: square windows shown enlarged, in pixels of a picture of ``size``.
+        size: height and width, pixels.
+        bar: label of the colour bar, which is that of the last (H, W) picture; empty for no bar.
+        extend: Matplotlib's ``extend`` of colour bars.
+
+    """
+
+    label: str
+    aspect: float
+    cells: Sequence[Cell]
+    details: Sequence[Window] = ()
+    size: tuple[int, int] = (1, 1)
+    bar: str = ""
+    extend: str = "neither"
+
+
+def draw_grid(columns: Sequence[str], rows: Sequence[Row], texts: tuple[str, str]) -> Figure:
+    """Draw a page.
+
+    Args:
+        columns: column headings.
+        rows: rows from top to bottom, each with one cell per column.
+        texts: texts above and below the grid.
+
+    """
+    right = _MARGIN + (_BAR + _BAR_TEXT if any(row.bar for row in rows) else 0)
+    panel = min(max((_WIDTH - 0.3 - right) / len(columns) - _GAP, _LEAST_PANEL), _MOST_PANEL)
+    boxes = [_boxes(row, panel) for row in rows]
+    labels = [_wrap(row.label, sum(heights)) for row, (_, *heights) in zip(rows, boxes, strict=True)]
+    left = _MARGIN + _LINE * max(label.count("\n") + 1 for label in labels) + 0.03
+    heads = [_wrap(column, panel) for column in columns]
+    head = _LINE * max(text.count("\n") + 1 for text in heads)
+    top = _MARGIN + _LINE * 1.5 + head
+    total = top + sum(sum(heights) + _GAP for _, *heights in boxes) + _LINE * 1.3 + _MARGIN
+    page = _Page(left + len(columns) * (panel + _GAP) + right, total)
+    page.text(_MARGIN, total - _MARGIN, texts[0], va="top", weight="bold")
+    page.text(_MARGIN, _MARGIN, texts[1], va="bottom")
+    for column, text in enumerate(heads):
+        page.text(left + column * (panel + _GAP) + panel / 2, total - top + 0.06, text, ha="center", va="baseline")
+    level = total - top
+    for row, label, box in zip(rows, labels, boxes, strict=True):
+        middle = level - sum(box[1:]) / 2
+        page.text(left - 0.04, middle, label, ha="right", va="center", rotation=90, multialignment="center")
+        for column, cell in enumerate(row.cells):
+            page.cell(row, cell, left + column * (panel + _GAP), level, panel, box)
+        if row.bar:
+            page.bar_of(row, left + len(columns) * (panel + _GAP), level, box[1])
+        level -= sum(box[1:]) + _GAP
+    return page.figure
+
+
+def _boxes(row: Row, panel: float) -> tuple[float, float, float, float]:
+    """Return the sizes of a row in inches: width and height of a picture, and heights of details and caption."""
+    width = panel * min(1.0, _TALLEST / row.aspect)
+    details = (panel - _SEAM * (len(row.details) - 1)) / len(row.details) + _SEAM if row.details else 0.0
+    caption = _LINE if any(cell.caption and cell.picture is not None for cell in row.cells) else 0.0
+    return width, max(width * row.aspect, 0.15), details, caption
+
+
+def _wrap(text: str, length: float) -> str:
+    """Wrap a text to lines of at most a given length in inches."""
+    return "\n".join(textwrap.wrap(text, max(int(length / _LETTER_WIDTH), 4), break_on_hyphens=False)) or text
+
+
+class _Page(Canvas):
+    """A page of panels.
+
+    A picture's label is ``ROW: panel`` or ``ROW: detail``, as is that of the frame of an empty panel.
+    """
+
+    def text(self, x: float, y: float, text: str, **style: Any) -> None:
+        """Write a text."""
+        super().text(x, y, text, **{"fontsize": _FONT, "linespacing": 1.1, **style})
+
+    def cell(
+        self, row: Row, cell: Cell, left: float, top: float, panel: float, box: tuple[float, float, float, float]
+    ) -> None:
+        """Draw a panel, its details and its caption; ``top`` is the upper edge of the picture."""
+        width, height, below, _ = box
+        place = Bbox.from_bounds(left + (panel - width) / 2, top - height, width, height)
+        if cell.picture is None:
+            self.frame(place, f"{row.label}: panel", facecolor=_EMPTY)
+            middle = ((place.x0 + place.x1) / 2, (place.y0 + place.y1) / 2)
+            self.text(*middle, cell.caption, ha="center", va="center", color="0.45")
+            return
+        self._show(place, cell, cell.picture, f"{row.label}: panel")
+        size = below - _SEAM
+        for number, (window, colour) in enumerate(zip(row.details, FRAMES, strict=False)):
+            part = _scale_window(window, row.size, cell.picture.shape[:2])
+            frame = _part_of(place, part, cell.picture.shape[:2])
+            self.frame(frame, f"{row.label}: frame", facecolor="none", edgecolor=colour, linewidth=0.9)
+            inset = Bbox.from_bounds(left + number * (size + _SEAM), top - height - below, size, size)
+            self._show(inset, cell, cell.picture[part.slices], f"{row.label}: detail")
+            self.frame(inset, f"{row.label}: edge", facecolor="none", edgecolor=colour, linewidth=1.0)
+        self.text(left + panel / 2, top - height - below - 0.02, cell.caption, ha="center", va="top",
+                  weight="bold" if cell.bold else "normal")  # fmt: skip
+
+    def bar_of(self, row: Row, left: float, top: float, height: float) -> None:
+        """Draw a row's colour bar, beside its panels."""
+        panels = [image for image in self.images if image.get_label() == f"{row.label}: panel"]
+        mapped = [image for image in panels if np.asarray(image.get_array()).ndim == 2]
+        if not mapped:
+            return
+        place = Bbox.from_bounds(left, top - height, _BAR, height)
+        bar = self.bar(mapped[-1], place, f"{row.label}: bar", extend=row.extend, ticks=MaxNLocator(5),
+                       format=ScalarFormatter(useOffset=False))  # fmt: skip
+        bar.outline.set_linewidth(0.4)
+        bar.ax.tick_params(labelsize=_FONT - 1, length=2, width=0.4, pad=1.5)
+        bar.set_label(row.bar, fontsize=_FONT, labelpad=1.5)
+
+    def _show(self, place: Bbox, cell: Cell, picture: np.ndarray, label: str) -> None:
+        """Draw a picture."""
+        self.show(place, picture, label, colour_map=cell.colour_map, limits=cell.limits)
+
+
+def _part_of(place: Bbox, window: Window, shape: tuple[int, ...]) -> Bbox:
+    """Return where a window of a picture of (height, width) pixels is that is shown at ``place``."""
+    across, down = place.width / shape[1], place.height / shape[0]
+    return Bbox.from_bounds(
+        place.x0 + across * window.left,
+        place.y1 - down * (window.top + window.height),
+        across * window.width,
+        down * window.height,
+    )
+
+
+def _scale_window(window: Window, size: tuple[int, int], shape: tuple[int, ...]) -> Window:
+    """Convert a window to a picture of another size, rounded to whole pixels, at least one."""
+    down, across = shape[0] / size[0], shape[1] / size[1]
+    top, left = int(window.top * down), int(window.left * across)
+    bottom, right = round((window.top + window.height) * down), round((window.left + window.width) * across)
+    return Window(top, left, max(bottom - top, 1), max(right - left, 1))

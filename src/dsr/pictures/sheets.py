@@ -1,0 +1,248 @@
+"""Contact sheets: one row per scene of a data set, to check that it was read correctly."""
+
+from __future__ import annotations
+
+import itertools
+import math
+import textwrap
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import to_rgb
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator, ScalarFormatter
+from torch import Tensor
+
+from dsr.geometry.camera import Camera
+from dsr.geometry.lights import LIGHT_NAMES
+from dsr.geometry.shading import render
+from dsr.pictures.canvas import HOLE_COLOUR, colours, write_figure
+from dsr.pictures.depth_views import limits_of, normals_seen_by, reduced
+from dsr.sample import Scene
+from dsr.utils.ratios import round_ratio
+
+_ROWS = 6
+_DPI = 100
+_PANEL = 2.56
+"""Longer side of a panel, inches: 256 pixels."""
+_LONGEST = 512
+"""Maximum longer side of a picture, pixels."""
+_LEAST_PANEL = 0.3
+"""Minimum shorter side of a panel, inches."""
+_TEXT, _MARGIN, _GAP, _ABOVE, _BELOW = 2.6, 0.15, 0.14, 0.8, 0.5
+"""Width of the text column, margin, and space between panels, above the first row and below each row, inches."""
+_SEAM, _LEAST_LABELLED = 0.04, 0.35
+"""Space between the renderings, and minimum shorter side of a rendering with a label, inches."""
+_LABEL = {"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 1.2}
+_VALID_COLOUR = "#e4e4e4"
+_LETTERS = 27
+_LINE = 0.165
+"""Maximum letters of a line of text, and its height in inches."""
+
+
+@dataclass(frozen=True)
+class _Row:
+    """What a sheet shows of a scene: pictures (H, W), (H, W, 3) or (4, H, W), reduced to the size drawn."""
+
+    text: str
+    shape: tuple[int, int]
+    photo: np.ndarray
+    depth: np.ndarray
+    limits: tuple[float, float]
+    missing: np.ndarray
+    missing_fraction: float
+    renderings: np.ndarray
+
+
+def save_contact_sheet(path: Path, scenes: Iterable[Scene], title: str) -> list[Path]:
+    """Draw the photo, depth, holes and renderings of scenes, a row each, and write the pages atomically.
+
+    Scenes are read one by one, so they need not fit into memory together. A scene without high-resolution depth shows
+    its measured map of the lowest resolution.
+
+    Args:
+        path: PNG file; more than six scenes are written to ``NAME-1.png``, ``NAME-2.png``, ..., six per file.
+        scenes: one or more scenes.
+        title: heading of every page.
+
+    Returns:
+        The files, in order.
+
+    Raises:
+        ValueError: there is no scene.
+
+    """
+    rows = map(_row, scenes)
+    page, following = list(itertools.islice(rows, _ROWS)), next(rows, None)
+    if not page:
+        raise ValueError(f"{path}: expected a scene or more for a contact sheet, got none")
+    if following is None:
+        _save_page(path, page, title)
+        return [path]
+    paths: list[Path] = []
+    while page:
+        paths.append(path.with_name(f"{path.stem}-{len(paths) + 1}{path.suffix}"))
+        first = _ROWS * (len(paths) - 1) + 1
+        _save_page(paths[-1], page, f"{title}, scenes {first} to {first + len(page) - 1}")
+        page = [] if following is None else [following, *itertools.islice(rows, _ROWS - 1)]
+        following = next(rows, None)
+    return paths
+
+
+def _row(scene: Scene) -> _Row:
+    """Collect what a sheet shows of a scene."""
+    depth, camera, what = _shown_map(scene)
+    valid = depth[depth.isfinite()]
+    missing_fraction = 1 - valid.numel() / depth.numel()
+    lines = [
+        *textwrap.wrap(scene.name, _LETTERS, break_on_hyphens=False),
+        "",
+        *textwrap.wrap(scene.dataset, _LETTERS, break_on_hyphens=False),
+        f"{scene.camera.width} x {scene.camera.height} pixels",
+        "field of view {:.0f} x {:.0f} degrees".format(*_field_of_view(scene.camera)),
+        *what,
+        f"depth {float(valid.min()):.3g} to {float(valid.max()):.3g} m",
+        f"holes: {_percent(missing_fraction)}",
+    ]
+    large_enough = min(depth.shape[-2:]) >= 2
+    shades = render(normals_seen_by(camera, depth))[0] if large_enough else torch.full((4, 2, 2), torch.nan)
+    return _Row(
+        "\n".join(lines),
+        (scene.camera.height, scene.camera.width),
+        _reduced(scene.rgb).permute(1, 2, 0).clamp(0, 1).numpy(),
+        _reduced(depth)[0].numpy(),
+        limits_of(depth),
+        _reduced((~depth.isfinite()).float())[0].numpy(),
+        missing_fraction,
+        _reduced(shades).numpy(),
+    )
+
+
+def _shown_map(scene: Scene) -> tuple[Tensor, Camera, list[str]]:
+    """Return the depth map to show, its camera, and lines of text about the maps measured by a sensor."""
+    measured = ", ".join(f"x{round_ratio(ratio)}" for ratio in sorted(scene.measured))
+    if scene.depth is not None:
+        return scene.depth, scene.camera, [f"also measured: {measured}"] if measured else []
+    ratio = max(scene.measured)
+    depth_lr = scene.measured[ratio]
+    width, height = depth_lr.shape[-1], depth_lr.shape[-2]
+    return (
+        depth_lr,
+        scene.camera.reduce(width, height),
+        [f"measured: {measured}; no high-resolution depth", f"shown: x{round_ratio(ratio)}, {width} x {height}"],
+    )
+
+
+def _field_of_view(camera: Camera) -> tuple[float, float]:
+    """Return the horizontal and vertical field of view in degrees, between the outer edges of the pixels."""
+    axes = ((camera.width, camera.fx, camera.cx), (camera.height, camera.fy, camera.cy))
+    across, down = (math.atan((at + 0.5) / f) + math.atan((size - 0.5 - at) / f) for size, f, at in axes)
+    return math.degrees(across), math.degrees(down)
+
+
+def _percent(fraction: float) -> str:
+    """Format a fraction as a percentage; a small fraction is not rounded to 0."""
+    return "none" if fraction == 0 else f"{100 * fraction:.3g} %"
+
+
+def _reduced(values: Tensor) -> Tensor:
+    """Convert (C, H, W) to float64 and reduce it to at most twice the pixels of a panel."""
+    return reduced(values.double(), _LONGEST)
+
+
+def _save_page(path: Path, rows: list[_Row], title: str) -> None:
+    """Draw a page and write it."""
+    sizes = [_panel_size(*row.shape) for row in rows]
+    heights = [max(size[1] + _BELOW, (row.text.count("\n") + 2) * _LINE) for row, size in zip(rows, sizes, strict=True)]
+    total = _ABOVE + sum(heights)
+    figure = Figure(figsize=(_MARGIN + _TEXT + 4 * (_PANEL + _GAP), total))
+    FigureCanvasAgg(figure)
+    figure.suptitle(f"{title} (pink: holes)", x=_MARGIN / figure.get_figwidth(), y=1 - 0.12 / total, ha="left",
+                    fontsize=14, parse_math=False)  # fmt: skip
+    top = total - _ABOVE
+    for number, (row, size, height) in enumerate(zip(rows, sizes, heights, strict=True)):
+        _draw_row(figure, row, top, size)
+        if number == 0:
+            _head_columns(figure, top)
+        top -= height
+    write_figure(path, figure, _DPI)
+
+
+def _panel_size(height: int, width: int) -> tuple[float, float]:
+    """Return a panel's width and height in inches."""
+    longest = max(height, width)
+    return max(_PANEL * width / longest, _LEAST_PANEL), max(_PANEL * height / longest, _LEAST_PANEL)
+
+
+def _left(column: int) -> float:
+    """Return the left edge of a column of panels, in inches."""
+    return _MARGIN + _TEXT + column * (_PANEL + _GAP)
+
+
+def _head_columns(figure: Figure, top: float) -> None:
+    """Write the headings of the columns."""
+    width, height = figure.get_size_inches()
+    headings = ("photo", "depth, m", "holes", f"under {LIGHT_NAMES[0]} to {LIGHT_NAMES[-1]}")
+    for column, heading in enumerate(headings):
+        figure.text((_left(column) + _PANEL / 2) / width, (top + 0.08) / height, heading, ha="center", fontsize=11)
+
+
+def _draw_row(figure: Figure, row: _Row, top: float, size: tuple[float, float]) -> None:
+    """Draw the text and panels of a scene with their upper edge ``top`` inches above the lower edge of the page."""
+    width, height = figure.get_size_inches()
+    name, _, rest = row.text.partition("\n\n")
+    lines = name.count("\n") + 1
+    for text, below, weight in ((name, 0.0, "bold"), (rest, 0.05 + _LINE * lines, "normal")):
+        figure.text(_MARGIN / width, (top - below) / height, text, va="top", fontsize=9, weight=weight,
+                    linespacing=1.25, parse_math=False)  # fmt: skip
+    photo, depth, holes = (_panel(figure, column, top, size) for column in range(3))
+    photo.imshow(row.photo, aspect="auto")
+    low, high = row.limits
+    high = max(high, 1.01 * low)  # so that the ticks of a constant depth differ
+    image = depth.imshow(row.depth, cmap=colours("viridis"), vmin=low, vmax=high, aspect="auto")
+    place = (_left(1) + 0.1 * _PANEL, top - size[1] - 0.14, 0.8 * _PANEL, 0.07)
+    bar = figure.colorbar(image, cax=_axes(figure, *place), orientation="horizontal", ticks=MaxNLocator(4),
+                          format=ScalarFormatter(useOffset=False))  # fmt: skip
+    bar.ax.tick_params(labelsize=8, pad=1.5, length=2)
+    holes.imshow(_blend_missing(row.missing), aspect="auto")
+    caption = f"{_percent(row.missing_fraction)} missing" if row.missing_fraction else "complete"
+    holes.text(0.5, -0.06 / size[1], caption, transform=holes.transAxes, ha="center", va="top", fontsize=9)
+    _draw_renderings(figure, row.renderings, top, size)
+
+
+def _draw_renderings(figure: Figure, renderings: np.ndarray, top: float, size: tuple[float, float]) -> None:
+    """Draw four renderings, (4, H, W), in a 2 x 2 grid in the last column."""
+    width, height = ((side - _SEAM) / 2 for side in size)
+    left = _left(3) + (_PANEL - size[0]) / 2
+    for number, (name, shades) in enumerate(zip(LIGHT_NAMES, renderings, strict=True)):
+        down, right = divmod(number, 2)
+        place = (left + right * (width + _SEAM), top - height - down * (height + _SEAM), width, height)
+        axes = _axes(figure, *place, frame=False)
+        axes.imshow(shades, cmap=colours("gray"), vmin=0, vmax=1, aspect="auto")
+        if min(width, height) > _LEAST_LABELLED:
+            axes.text(0.05 / width, 0.05 / height, name, transform=axes.transAxes, fontsize=7, bbox=_LABEL)
+
+
+def _panel(figure: Figure, column: int, top: float, size: tuple[float, float]) -> Axes:
+    """Add the axes of a panel, centred in its column."""
+    return _axes(figure, _left(column) + (_PANEL - size[0]) / 2, top - size[1], *size, frame=False)
+
+
+def _axes(figure: Figure, left: float, bottom: float, width: float, height: float, *, frame: bool = True) -> Axes:
+    """Add axes at a position given in inches."""
+    page_width, page_height = figure.get_size_inches()
+    axes = figure.add_axes((left / page_width, bottom / page_height, width / page_width, height / page_height))
+    if not frame:
+        axes.set_axis_off()
+    return axes
+
+
+def _blend_missing(missing_fraction: np.ndarray) -> np.ndarray:
+    """Blend the colours of valid and missing pixels by the fraction missing, (H, W), as (H, W, 3)."""
+    valid, hole = (np.array(to_rgb(colour)) for colour in (_VALID_COLOUR, HOLE_COLOUR))
+    return valid + missing_fraction[..., None] * (hole - valid)

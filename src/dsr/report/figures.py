@@ -1,0 +1,367 @@
+"""Figures of runs for papers and pages, as PDF and PNG: grids of scenes by methods, and the lights.
+
+Grids show renderings with details, depth in pseudo-colour, and signed errors. A page has one data set, scale and
+degradation, and at most five scenes. Of the renderings, details are the windows in which the methods differ most from
+the ground truth on average, and the input is rendered at its own resolution. The limits of depth are the 1st and 99th
+percentile of the ground truth, those of errors the 98th of all methods' absolute errors, each across a row.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+import re
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.colors import Colormap, ListedColormap
+from torch import Tensor
+
+from dsr.evaluation.results import BenchmarkSetting, Results
+from dsr.geometry.lights import FIGURE_LIGHT
+from dsr.metrics.catalogue import KNOWN_FORMATS
+from dsr.pictures.canvas import save_both
+from dsr.pictures.depth_views import Window, limits_of, rendering, strongest_window
+from dsr.pictures.grids import Cell, Row, draw_grid
+from dsr.pictures.lights_figure import save_lights_figure
+from dsr.report.shown_scenes import Shown, drawable_scenes, first_runs, shown_scenes
+from dsr.report.worker_pool import WorkerPool
+from dsr.sample import DepthSample
+
+ROWS = 5
+"""Maximum number of scenes on a page."""
+_DETAIL = 5
+"""The side of a detail is 1/5 of the shorter side of the picture."""
+_CENTIMETRE_LIMIT = 0.02
+"""Limit of a row, metres, from which errors are shown in centimetres."""
+_LEAST_ERROR = 1e-5
+_PREFERRED = ("statue", "lucy")
+"""Scenes to show under the lights."""
+_CANDIDATES = 8
+"""Maximum number of scenes to choose that one from."""
+
+
+class Figures:
+    """All figures, which the workers of ``workers`` begin to draw at once.
+
+    Args:
+        folder: output directory; existing files are replaced.
+        workers: runs to draw, and what draws them.
+        light: light of the renderings.
+
+    """
+
+    def __init__(self, folder: Path, workers: WorkerPool, light: str = FIGURE_LIGHT) -> None:
+        self.notes: list[str] = []
+        """One line per scene or result that could not be drawn."""
+        self._pages = [*pages_of(workers.results, KINDS, light, self.notes), None]
+        self._drawn = workers.map(functools.partial(_draw, folder), self._pages)
+
+    def save(self, progress: Callable[[int, int, str], None] | None = None) -> list[Path]:
+        """Return the paths of the files, a PDF and a PNG of each figure, once they are drawn.
+
+        Args:
+            progress: called before each figure with the number done, the number of all, and the name.
+
+        Raises:
+            ValueError: there is no such light.
+
+        """
+        paths: list[Path] = []
+        for done, page in enumerate(self._pages):
+            if progress is not None:
+                progress(done, len(self._pages), "lights" if page is None else page.name)
+            files, notes = next(self._drawn)
+            paths += files
+            self.notes += [note for note in notes if note not in self.notes]
+        return paths
+
+
+def _draw(folder: Path, results: Results, page: Page | None) -> tuple[list[Path], list[str]]:
+    """Draw a page, or the figure of the lights for None; return the files and notes on what could not be drawn."""
+    notes: list[str] = []
+    paths = (
+        save_lights_figure(folder, _most_varied(results)) if page is None else save_page(folder, results, page, notes)
+    )
+    return paths, notes
+
+
+@dataclass(frozen=True)
+class Page:
+    """A page of a grid.
+
+    Args:
+        kind: ``renderings``, ``depth`` or ``errors``.
+        problem: benchmark setting.
+        name: name of the files, without suffix.
+        scenes: names of the scenes, at most :data:`ROWS`.
+        light: light of the renderings.
+
+    """
+
+    kind: str
+    problem: BenchmarkSetting
+    name: str
+    scenes: tuple[str, ...]
+    light: str
+
+
+def pages_of(results: Results, kinds: Iterable[str], light: str, notes: list[str]) -> list[Page]:
+    """Return the pages of some kinds of grids, from the names of the files alone.
+
+    Args:
+        results: runs to draw.
+        kinds: some of renderings, depth, errors.
+        light: light of the renderings.
+        notes: list to which one line is added per scene that no run has stored.
+
+    """
+    found = []
+    for kind in kinds:
+        for problem, name in zip(results.problems(), _names(results.problems()), strict=True):
+            scenes = drawable_scenes(results, problem, notes, with_truth=kind == "errors")
+            for number, start in enumerate(range(0, len(scenes), ROWS), start=1):
+                rows = tuple(scenes[start : start + ROWS])
+                found.append(Page(kind, problem, f"{kind}_{name}_{number}", rows, light))
+    return found
+
+
+def save_page(folder: Path, results: Results, page: Page, notes: list[str]) -> list[Path]:
+    """Draw a page, unless none of its scenes can be drawn.
+
+    Args:
+        folder: directory of the files.
+        results: runs to draw.
+        page: one of :func:`pages_of`.
+        notes: list to which one line is added per scene or result that could not be drawn.
+
+    Returns:
+        Paths of the PDF and the PNG.
+
+    Raises:
+        ValueError: there is no such light.
+
+    """
+    kind = _GRIDS[page.kind]
+    shown = shown_scenes(results, page.problem, notes, page.scenes)
+    rows = [row for row in (kind.row(each, page.light) for each in shown) if row]
+    if not rows:
+        return []
+    columns = (*kind.before, *first_runs(results, page.problem), *kind.after)
+    title = f"{page.problem.dataset}, x{page.problem.scale}, {page.problem.downsampling}"
+    holes = "; pink: holes" if any(_has_holes(row) for row in rows) else ""
+    below = kind.below.format(light=page.light) + holes
+    return save_both(folder, page.name, draw_grid(columns, rows, (title, below)))
+
+
+def _names(problems: list[BenchmarkSetting]) -> list[str]:
+    """Return a unique part of a file name for each benchmark setting."""
+    names: list[str] = []
+    for dataset, scale, downsampling in problems:
+        name = re.sub(r"[^\w.-]+", "_", f"{dataset}_x{scale}_{downsampling}").strip("_")
+        while name in names:
+            name += "_"
+        names.append(name)
+    return names
+
+
+def _has_holes(row: Row) -> bool:
+    """Return whether a picture of the row has holes."""
+    return any(cell.picture is not None and not np.isfinite(cell.picture).all() for cell in row.cells)
+
+
+def rendering_row(shown: Shown, light: str) -> Row:
+    """Build the row of a scene's renderings."""
+    scene = shown.scene
+    results = {
+        label: None if depth is None else rendering(depth, scene.camera, light) for label, depth in shown.depths.items()
+    }
+    truth = None if scene.depth is None else rendering(scene.depth, scene.camera, light)
+    size = (scene.camera.height, scene.camera.width)
+    scores = _captions(shown, "DSSIM_v", "RMSE_v")
+    cells = [
+        _photo(shown),
+        Cell(_enlarge(rendering(scene.depth_lr, scene.camera_lr, light), size)),
+        *(_panel(picture, scores[label]) for label, picture in results.items()),
+        _panel(truth, missing="no truth"),
+    ]
+    details = details_of(
+        [picture for picture in results.values() if picture is not None], truth, math.ceil(scene.scale)
+    )
+    return Row(_label(shown), size[0] / size[1], cells, details, size)
+
+
+def depth_row(shown: Shown, _: str) -> Row:
+    """Build the row of a scene's depth maps."""
+    scene = shown.scene
+    style = _Style("viridis", limits_of(scene.depth_lr if scene.depth is None else scene.depth))
+    size = (scene.camera.height, scene.camera.width)
+    scores = _captions(shown, "RMSE_d")
+    cells = [
+        _photo(shown),
+        _panel(_enlarge(scene.depth_lr[0].numpy(), size), style=style),
+        *(_panel(_pixels(depth), scores[label], style=style) for label, depth in shown.depths.items()),
+        _panel(_pixels(scene.depth), missing="no truth", style=style),
+    ]
+    return Row(_label(shown), size[0] / size[1], cells, bar="depth, m", extend="both")
+
+
+def error_row(shown: Shown, _: str) -> Row | None:
+    """Build the row of a scene's errors, None without ground truth or without results."""
+    truth = shown.scene.depth
+    if truth is None or not shown.existing():
+        return None
+    errors = {name: None if depth is None else depth.double() - truth for name, depth in shown.depths.items()}
+    valid = [error[error.isfinite()].abs().numpy() for error in errors.values() if error is not None]
+    pooled = np.concatenate(valid)
+    limit = max(float(np.percentile(pooled, 98)) if pooled.size else 0.0, _LEAST_ERROR)
+    factor, unit = (100, "cm") if limit >= _CENTIMETRE_LIMIT else (1000, "mm")
+    style, scores = _Style(_diverging(), (-factor * limit, factor * limit)), _captions(shown, "RMSE_d")
+    cells = [_photo(shown)]
+    for label, error in errors.items():
+        cells.append(_panel(None if error is None else factor * error[0].numpy(), scores[label], style=style))
+    aspect = shown.scene.camera.height / shown.scene.camera.width
+    return Row(_label(shown), aspect, cells, bar=f"result - truth, {unit}", extend="both")
+
+
+class _Grid(NamedTuple):
+    """A kind of grid: what makes its rows, its columns before and after the methods, and the text below."""
+
+    row: Callable[[Shown, str], Row | None]
+    before: tuple[str, ...]
+    after: tuple[str, ...]
+    below: str
+
+
+_GRIDS = {
+    "renderings": _Grid(
+        rendering_row,
+        ("photo", "input"),
+        ("truth",),
+        "surfaces lit by {light}; below: DSSIM_v / RMSE_v, 1/1000, lower is better",
+    ),
+    "depth": _Grid(
+        depth_row, ("photo", "input"), ("truth",), "distance to the image plane; below: RMSE_d, mm, lower is better"
+    ),
+    "errors": _Grid(
+        error_row, ("photo",), (), "result - truth: red is too far, blue too near; below: RMSE_d, mm, lower is better"
+    ),
+}
+KINDS = tuple(_GRIDS)
+
+
+def _photo(shown: Shown) -> Cell:
+    return Cell(shown.scene.rgb.permute(1, 2, 0).clamp(0, 1).numpy())
+
+
+class _Style(NamedTuple):
+    """Colours of a panel."""
+
+    colour_map: str | Colormap
+    limits: tuple[float, float]
+
+
+_GREY = _Style("gray", (0, 1))
+
+
+def _panel(
+    picture: np.ndarray | None,
+    caption: tuple[str, bool] = ("", False),
+    *,
+    missing: str = "no result",
+    style: _Style = _GREY,
+) -> Cell:
+    """Build a panel of (H, W) values, or a panel with the text ``missing``."""
+    return Cell(None, missing) if picture is None else Cell(picture, *caption, *style)
+
+
+def _pixels(values: Tensor | None) -> np.ndarray | None:
+    """Return (1, H, W) as an array, (H, W)."""
+    return None if values is None else values[0].numpy()
+
+
+def _enlarge(picture: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    """Repeat pixels up to a height and width, so that viewers do not smooth a low-resolution picture."""
+    rows, columns = (
+        ((np.arange(new) + 0.5) * old / new).astype(int) for old, new in zip(picture.shape, size, strict=True)
+    )
+    return picture[rows[:, None], columns]
+
+
+def _diverging() -> Colormap:
+    """Return a colour map from blue over white to red, without its nearly black ends."""
+    return ListedColormap(mpl.colormaps["RdBu_r"](np.linspace(0.1, 0.9, 255)), "errors")
+
+
+def _label(shown: Shown) -> str:
+    """Return the name of a scene with spaces, at which it can be wrapped."""
+    return shown.name.replace("_", " ")
+
+
+def _captions(shown: Shown, *metrics: str) -> dict[str, tuple[str, bool]]:
+    """Format the scores of each method in the paper's units, and determine whether the first is the best."""
+    first = {label: scores[metrics[0]] for label, scores in shown.scores.items() if metrics[0] in scores}
+    valid = [value for value in first.values() if np.isfinite(value)]
+    best = min(valid) if len(valid) > 1 else None
+    return {label: (_score_text(scores, metrics), first.get(label) == best) for label, scores in shown.scores.items()}
+
+
+def _score_text(scores: dict[str, float], metrics: tuple[str, ...]) -> str:
+    """Format scores with a dash for each missing one; empty if all are missing."""
+    texts = []
+    for name in metrics:
+        shown = KNOWN_FORMATS[name]
+        value = scores.get(name, np.nan)
+        texts.append(shown.text(shown.factor * value) if np.isfinite(value) else "-")
+    return "" if all(text == "-" for text in texts) else " / ".join(texts)
+
+
+def details_of(pictures: Sequence[np.ndarray], truth: np.ndarray | None, grain: int, count: int = 2) -> list[Window]:
+    """Find square windows in which results differ most, on average, from the ground truth or else from their mean.
+
+    Args:
+        pictures: renderings of the results, (H, W), NaN where undefined.
+        truth: rendering of the ground truth, (H, W), NaN where undefined; None without one.
+        grain: pixels in a block; windows consist of whole blocks, at a whole scale factor of pixels of the input.
+        count: maximum number of windows, which do not overlap.
+
+    """
+    if not pictures:
+        return []
+    stack = np.nan_to_num(np.stack(pictures))
+    difference = np.abs(stack - (stack.mean(axis=0) if truth is None else truth)).mean(axis=0)
+    height, width = (side // grain for side in difference.shape)
+    blocks = np.nan_to_num(difference)[: height * grain, : width * grain].reshape(height, grain, width, grain)
+    side = max(round(min(height, width) / _DETAIL), 1)
+    windows: list[Window] = []
+    for _ in range(count):
+        window = strongest_window(blocks.mean(axis=(1, 3)), side, side, windows)
+        if window is not None:
+            windows.append(window)
+    return [Window(*(grain * value for value in window)) for window in windows]
+
+
+def _most_varied(results: Results) -> DepthSample | None:
+    """Return a scene with ground truth: the first preferred one, otherwise the one with the most varied normals."""
+    found: dict[str, DepthSample] = {}
+    for run in results.runs:
+        for name in run.scenes:
+            if name not in found and len(found) < _CANDIDATES and run.has_sample(name):
+                try:
+                    scene = run.sample(name)
+                except ValueError:
+                    continue
+                if scene.depth is not None and min(scene.depth.shape[-2:]) > 1:
+                    found[name] = scene
+    preferred = [found[name] for name in _PREFERRED if name in found]
+    return next(iter(preferred), max(found.values(), key=_variety, default=None))
+
+
+def _variety(scene: DepthSample) -> float:
+    """Return the standard deviation of the brightness under the light of figures."""
+    values = rendering(scene.depth, scene.camera) if scene.depth is not None else np.zeros(1)
+    return float(np.nan_to_num(np.nanstd(values)))

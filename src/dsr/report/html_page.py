@@ -1,0 +1,59 @@
+"""Self-contained HTML pages without network access: their templates, scripts, styles and embedded data."""
+
+from __future__ import annotations
+
+import base64
+import functools
+import hashlib
+import json
+import re
+from collections.abc import Mapping
+from importlib import resources
+from typing import Any
+
+import matplotlib as mpl
+import numpy as np
+
+
+def asset(*names: str) -> str:
+    """Return the text of files of the package, one after another."""
+    folder = resources.files("dsr.report") / "assets"
+    return "\n".join((folder / name).read_text(encoding="utf-8") for name in names)
+
+
+def fill(template: str, parts: Mapping[str, str]) -> str:
+    """Return a template of the package with its ``{{NAME}}`` replaced."""
+    return re.sub(r"\{\{([A-Z_]+)\}\}", lambda found: parts[found.group(1)], asset(template))
+
+
+def policy(style: str, script: str, images: str) -> str:
+    """Return a content security policy that allows this style, this script and pictures from some sources alone.
+
+    The page cannot ask a server or send it anything (W3C "Content Security Policy Level 3").
+    """
+    return (
+        f"default-src 'none'; img-src {images}; style-src '{_digest(style)}'; script-src '{_digest(script)}'; "
+        "base-uri 'none'; form-action 'none'"
+    )
+
+
+def json_text(value: Any) -> str:
+    """Serialize as JSON without characters that could begin or end an HTML tag."""
+    text = json.dumps(value, ensure_ascii=False, separators=(",", ":"), allow_nan=False)
+    return text.replace("&", "\\u0026").replace("<", "\\u003c").replace(">", "\\u003e")
+
+
+def block(name: str, content: str, kind: str = "application/json") -> str:
+    """Return data as an element that a browser neither shows nor runs."""
+    return f'<script type="{kind}" id="{name}">{content}</script>'
+
+
+@functools.cache
+def palette(name: str) -> str:
+    """Return the 256 colours of a colour map, six hexadecimal digits each."""
+    return mpl.colormaps[name](np.arange(256), bytes=True)[:, :3].tobytes().hex()
+
+
+def _digest(text: str) -> str:
+    """Return the hash of a text in the form of a content security policy."""
+    return "sha256-" + base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()

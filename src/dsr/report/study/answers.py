@@ -1,0 +1,202 @@
+"""Read and check the answer files of a study; each participant counts once."""
+
+from __future__ import annotations
+
+import os
+from codecs import BOM_UTF8
+from collections.abc import Iterable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+from typing import Annotated, Any
+
+from pydantic import AfterValidator, BaseModel, BeforeValidator, Field, ValidationError, ValidationInfo
+
+from dsr.report.study.key import PAGE_VERSION, Key
+from dsr.utils.limits import read_limited
+from dsr.utils.paths import natural_key
+from dsr.utils.validation import Number, Whole, describe
+
+_LONGEST = 1e12
+"""Maximum time of an answer in milliseconds, 30 years."""
+_LARGEST = 10_000_000
+"""Maximum file size, bytes; an answer file has a few thousand."""
+
+
+@dataclass(frozen=True)
+class Answer:
+    """The choice of a participant for one scene.
+
+    Args:
+        scene: id of the scene.
+        again: whether this participant saw the scene for the second time.
+        first, second: ids of the pictures chosen.
+        seconds: time taken.
+
+    """
+
+    scene: str
+    again: bool
+    first: str
+    second: str
+    seconds: float
+
+
+@dataclass(frozen=True)
+class Answers:
+    """A complete answer file.
+
+    Args:
+        file: path of the file.
+        participant: random id.
+        finished: time of the last answer.
+        content: trials as JSON; equal for two files with identical answers.
+        given: one answer per scene shown.
+
+    """
+
+    file: Path
+    participant: str
+    finished: datetime
+    content: str
+    given: tuple[Answer, ...]
+
+
+def files_of(paths: Iterable[Path]) -> list[Path]:
+    """Return the given files and all ``*.json`` files below the given directories, without duplicates.
+
+    Raises:
+        ValueError: there is no file.
+
+    """
+    found: dict[Path, Path] = {}
+    for path in paths:
+        for file in sorted(path.rglob("*.json"), key=natural_key) if path.is_dir() else [path]:
+            found.setdefault(Path(os.path.realpath(file)), file)  # unlike resolve, it takes loops
+    if not found:
+        raise ValueError("answers: expected files that the page's last screen saved, found none")
+    return list(found.values())
+
+
+def read_all(files: Sequence[Path], key: Key) -> tuple[list[Answers], list[str]]:
+    """Read all files; return the accepted answers in file order, and one line per rejected file.
+
+    Of several files of one participant, or with identical answers, the one finished first is accepted.
+    """
+    accepted: list[Answers] = []
+    rejected = []
+    for file in files:
+        try:
+            accepted.append(read_answers(file, key))
+        except ValueError as error:
+            rejected.append(str(error))
+    taken: dict[str, Answers] = {}
+    for answers in sorted(accepted, key=lambda each: (each.finished, str(each.file))):
+        earlier = taken.get(answers.participant) or taken.get(answers.content)
+        if earlier:
+            what = "the same person" if earlier.participant == answers.participant else "identical answers"
+            rejected.append(f"{answers.file}: duplicate of {earlier.file} ({what}), which was finished first")
+            continue
+        taken |= {answers.participant: answers, answers.content: answers}
+    kept = {answers.file for answers in taken.values()}
+    return [answers for answers in accepted if answers.file in kept], rejected
+
+
+def read_answers(file: Path, key: Key) -> Answers:
+    """Read one answer file.
+
+    Raises:
+        ValueError: the file is damaged, incomplete, of another study, or has answers that the page cannot produce.
+
+    """
+    stored = _read(file, key)
+    if stored.finished is None:
+        raise ValueError(f"{file}: incomplete, it was saved before the last scene was answered")
+    given = tuple(_answer(f"{file}: trials.{number}", trial, key) for number, trial in enumerate(stored.trials))
+    _expect_all(file, given, key)
+    return Answers(file, stored.participant, stored.finished, stored.model_dump_json(include={"trials"}), given)
+
+
+def _expect(value: Any, info: ValidationInfo) -> Any:
+    """Check that the answers belong to this study and page version."""
+    expected = (info.context or {})[info.field_name]
+    if value != expected:
+        raise ValueError(repr(expected))
+    return value
+
+
+def _time(text: Any) -> datetime:
+    """Parse an ISO 8601 time with its time zone."""
+    with suppress(TypeError, ValueError):
+        time = datetime.fromisoformat(text)
+        if time.tzinfo is not None:
+            return time
+    raise ValueError("a time such as 2024-05-01T12:00:00Z")
+
+
+class _Trial(BaseModel, strict=True, extra="allow"):
+    """One scene in an answer file; a choice is None until it is made."""
+
+    scene: str
+    again: bool
+    order: list[str]
+    first: str | None
+    second: str | None
+    ms: Annotated[Number, Field(ge=0, le=_LONGEST)]
+
+
+class _Stored(BaseModel, strict=True):
+    """Content of an answer file; ``finished`` is None until the last scene is answered."""
+
+    study: Annotated[str, AfterValidator(_expect)]
+    page: Annotated[Whole, AfterValidator(_expect)]
+    participant: Annotated[str, Field(min_length=1)]
+    finished: Annotated[datetime, BeforeValidator(_time)] | None
+    trials: list[_Trial]
+
+
+def _read(file: Path, key: Key) -> _Stored:
+    """Read and validate a file, unless it is too large."""
+    try:
+        if file.stat().st_size > _LARGEST:
+            raise ValueError(f"{file}: expected a file of answers, got one of {file.stat().st_size / 1e6:.0f} MB")
+        content = read_limited(file, _LARGEST).removeprefix(BOM_UTF8)
+        return _Stored.model_validate_json(content, context={"study": key.study, "page": PAGE_VERSION})
+    except OSError as error:
+        raise ValueError(f"{file}: expected a file of answers, got {error.strerror or error}") from error
+    except ValidationError as error:
+        raise ValueError(f"{file}: {describe(error)}") from error
+
+
+def _answer(where: str, trial: _Trial, key: Key) -> Answer:
+    """Validate one trial."""
+    if trial.scene not in key.trials:
+        raise ValueError(f"{where}.scene: expected one of the study's, got {trial.scene!r}")
+    candidates = key.trials[trial.scene].candidates
+    if sorted(trial.order) != sorted(candidates):
+        raise ValueError(f"{where}.order: expected each picture of the scene once, got others")
+    first, second = trial.first, trial.second
+    if first is None or second is None:
+        raise ValueError(f"{where}: incomplete, no {'first' if first is None else 'second'} choice")
+    for name, choice in (("first", first), ("second", second)):
+        if choice not in candidates:
+            raise ValueError(f"{where}.{name}: expected a picture that was shown, got {choice!r}")
+    if first == second:
+        raise ValueError(f"{where}: expected two different pictures, got the same as first and second")
+    return Answer(trial.scene, trial.again, first, second, trial.ms / 1000)
+
+
+def _expect_all(file: Path, given: Sequence[Answer], key: Key) -> None:
+    """Check that a file has exactly the scenes shown to one participant."""
+    fresh = [answer.scene for answer in given if not answer.again]
+    again = [answer.scene for answer in given if answer.again]
+    for scenes, number, what in ((fresh, key.scenes_per_person, "scenes"), (again, key.repeat, "repeated scenes")):
+        if len(set(scenes)) != len(scenes):
+            raise ValueError(f"{file}: expected {number} different {what}, got one of them twice")
+        if len(scenes) < number:
+            raise ValueError(f"{file}: incomplete, {len(scenes)} of {number} {what}")
+        if len(scenes) > number:
+            raise ValueError(f"{file}: expected {number} {what}, got {len(scenes)}")
+    if not set(again) <= set(fresh):
+        raise ValueError(f"{file}: expected repeated scenes that were asked before, got others")

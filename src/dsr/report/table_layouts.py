@@ -1,0 +1,437 @@
+"""Tables in the layouts of readers and programs: Markdown, LaTeX with booktabs rules, CSV, and a terminal."""
+
+from __future__ import annotations
+
+import re
+import unicodedata
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import pandas as pd
+from rich import box
+from rich.markup import escape
+from rich.table import Table
+
+from dsr.evaluation.results import Results, Run
+from dsr.metrics.formats import Formats, MetricFormat, describe_directions
+from dsr.report.paper import average_of, implementation_note, paper_name, paper_row
+from dsr.report.tables import FACTS, Cell, Fact, Group, PaperTable, Row, build_tables, in_shown_units, shown
+from dsr.utils.files import write_text
+
+MISSING = "\N{EN DASH}"
+_SPECIAL = re.compile(r"[\\`*\[\]<>|~&#]|(?<![A-Za-z0-9])_|_(?![A-Za-z0-9])")
+_END = "\\end{table}\n"
+_ROWS, _ROWS_TURNED = 42, 26
+"""Maximum rows of a portrait and of a landscape page."""
+_WIDE = 135
+"""Maximum characters of a row that is legible on a portrait page."""
+_LATEX_SPECIAL = {
+    "\\": "\\textbackslash{}", "{": "\\{", "}": "\\}", "$": "\\$", "&": "\\&", "#": "\\#", "%": "\\%", "_": "\\_",
+    "~": "\\textasciitilde{}", "^": "\\textasciicircum{}", "<": "\\textless{}", ">": "\\textgreater{}",
+    "|": "\\textbar{}", '"': "\\textquotedbl{}", "`": "\\textasciigrave{}",
+    "\N{PLUS-MINUS SIGN}": "$\\pm$", "\N{EN DASH}": "--", "\N{MULTIPLICATION SIGN}": "$\\times$",
+}  # fmt: skip
+_LAST_LETTER = 0x17F
+"""Last code point of Latin Extended-A; the font encoding T1 has no letters after it."""
+_HEAD = r"""\documentclass{article}
+\usepackage[T1]{fontenc}
+\usepackage[utf8]{inputenc}
+\IfFileExists{lmodern.sty}{\usepackage{lmodern}}{}
+\usepackage{textcomp}
+\usepackage[a4paper,margin=18mm]{geometry}
+\usepackage{booktabs,graphicx,pdflscape}
+\setlength{\parindent}{0pt}
+\begin{document}
+"""
+
+
+def write_tables(folder: Path, results: Results, study: pd.DataFrame | None = None) -> list[Path]:
+    """Write all tables of some runs.
+
+    Args:
+        folder: output directory for ``NAME.md``, ``NAME.tex``, ``NAME_published.tex`` (if the paper has values) and
+            ``NAME.csv`` of each table, and for ``all.md`` and ``all.tex`` with all tables.
+        results: runs.
+        study: see :func:`dsr.report.tables.build_tables`.
+
+    Returns:
+        Paths of the files.
+
+    Raises:
+        ValueError: the table of the study is invalid.
+
+    """
+    tables = build_tables(results, study)
+    texts = {"all.md": "\n".join(map(to_markdown, tables)), "all.tex": to_document(tables)}
+    for table in tables:
+        texts |= {f"{table.name}.md": to_markdown(table), f"{table.name}.tex": to_latex(table)}
+        if table.has_published:
+            texts[f"{table.name}_published.tex"] = to_latex(table, published=True)
+        texts[f"{table.name}.csv"] = to_csv(table)
+    for name, text in texts.items():
+        write_text(folder / name, text)
+    return [folder / name for name in texts]
+
+
+@dataclass(frozen=True)
+class Style:
+    """Formatting of cells in a layout.
+
+    Args:
+        escape: makes a text fit for the layout.
+        missing: text of a missing value.
+        marks: text before and after a value, by rank.
+        plus_minus: separator between a value and its spread.
+        seeds: format of the number of seeds, with ``{}``.
+        number: formats a number.
+
+    """
+
+    escape: Callable[[str], str]
+    missing: str
+    marks: Mapping[int, tuple[str, str]]
+    plus_minus: str
+    seeds: str
+    number: Callable[[str], str] = str
+
+    def text(self, column: MetricFormat, cell: Cell | None, seeds: int) -> str:
+        """Format a cell; the number of seeds is added if it differs from that of the row."""
+        if cell is None:
+            return self.missing
+        before, after = self.marks[cell.rank]
+        text = f"{before}{self.number(shown(column, cell.mean))}{after}"
+        if cell.spread is not None:
+            text += f" {self.plus_minus} {self.number(shown(column, cell.spread))}"
+        if cell.interval is not None:
+            text += " [{}, {}]".format(*(shown(column, bound) for bound in cell.interval))
+        if cell.seeds not in (0, seeds):
+            text += f" ({self.seeds.format(cell.seeds)})"
+        return text if cell.complete else f"{text} ({cell.scenes} of {cell.of})"
+
+    def row(self, row: Row, facts: Sequence[Fact], columns: Formats, *, first: bool) -> list[str]:
+        """Format our values of a row, behind what it is; the scene is named in the first row of a group."""
+        return [*self.facts(row, facts, first=first),
+                *(self.text(each, row.cells.get(key), row.seeds) for key, each in columns.items())]  # fmt: skip
+
+    def facts(self, row: Row, facts: Sequence[Fact], *, first: bool) -> list[str]:
+        """Format what a row is."""
+        values = ("" if fact.name == "scene" and not first else fact.value(row) for fact in facts)
+        return [self.missing if value is None else self.escape(str(value)) for value in values]
+
+    def paper(self, columns: Formats, values: Mapping[str, float], around: str = "{}") -> list[str]:
+        """Format the paper's values with its own number of digits."""
+        return [around.format(f"{values[key]:g}") if key in values else self.missing for key in columns]
+
+
+def to_markdown(table: PaperTable) -> str:
+    """Format a table as Markdown, followed by a comparison with the paper's values if there are any."""
+    facts = table.facts
+    words = [fact for fact in facts if not fact.number]
+    rows = [
+        _MARKDOWN.row(row, facts, table.columns, first=number == 0)
+        for group in table.groups
+        for number, row in enumerate(group.rows)
+    ]
+    parts = [
+        f"## {escaped(table.title)}",
+        aligned([*(fact.name for fact in facts), *map(_heading, table.columns.values())], rows, len(words)),
+        "\n".join(f"- {escaped(note)}" for note in table.notes),
+    ]
+    if table.has_published:
+        columns = table.published_columns()
+        rows = [row for group in table.groups for row in _compared(words, columns, group)]
+        head = [*(fact.name for fact in words), "", *map(_heading, columns.values())]
+        parts += [f"### {escaped(table.title)}, beside the paper", aligned(head, rows, len(words) + 1)]
+        parts += ["- Difference: ours - paper. Ratio: ours / paper."]
+    return "\n\n".join(parts) + "\n"
+
+
+def to_csv(table: PaperTable) -> str:
+    """Format a table as CSV at full precision, in the paper's units: one row per method and scene or average.
+
+    Missing values are empty; columns without any value (spread, interval, paper) are left out.
+    """
+    rows = [
+        {fact.name: fact.value(row) for fact in FACTS}
+        | {name: value for key, column in table.columns.items() for name, value in _values(key, column, row)}
+        for group in table.groups
+        for row in (*group.rows, *map(_of_paper, group.paper_only))
+    ]
+    frame = pd.DataFrame(rows)
+    empty = [name for name in frame.columns[len(FACTS) :] if frame[name].isna().all()]
+    counts = [name for name in frame.columns if name.endswith(("seeds", " scenes")) and name not in empty]
+    frame = frame.drop(columns=empty).astype(dict.fromkeys(counts, "Int64"))
+    return frame.to_csv(index=False, lineterminator="\n")
+
+
+def to_document(tables: Sequence[PaperTable]) -> str:
+    """Return a complete document with all tables, each also with the paper's values."""
+    parts = [_HEAD]
+    for table in tables:
+        for published in (False, True)[: 1 + table.has_published]:
+            text = to_latex(table, published=published)
+            text = text.replace(_END, f"{_END}\\clearpage\n")  # landscape does not turn pages of floats alone
+            turned = _width(table, published=published) > _WIDE
+            parts.append(f"\\begin{{landscape}}\n{text}\\end{{landscape}}\n" if turned else text)
+    return "\n".join([*parts, "\\end{document}\n"])
+
+
+def to_latex(table: PaperTable, *, published: bool = False) -> str:
+    r"""Return a table as LaTeX for ``\input``; it needs the packages booktabs and graphicx, and the encoding T1.
+
+    A table is at most as wide as the text. A table too long for a page is split.
+
+    Args:
+        table: table to write.
+        published: whether to add the paper's values in parentheses, without spreads and intervals.
+
+    """
+    groups = [list(_latex_rows(table, group, published=published)) for group in table.groups]
+    most = _ROWS_TURNED if _width(table, published=published) > _WIDE else _ROWS
+    pages = list(_pages([rows for rows in groups if rows], most))
+    return "\n".join(_page(table, page, number, published) for number, page in enumerate(pages))
+
+
+def aligned(head: Sequence[str], rows: Sequence[Sequence[str]], texts: int) -> str:
+    """Format a Markdown table with aligned columns.
+
+    Args:
+        head: headings, escaped.
+        rows: cells, escaped.
+        texts: number of text columns from the left; the remaining columns are numbers, aligned to the right.
+
+    """
+    widths = [max(3, *map(len, column)) for column in zip(head, *rows, strict=True)]
+    rule = ["-" * width if number < texts else "-" * (width - 1) + ":" for number, width in enumerate(widths)]
+    lines = []
+    for row in (head, rule, *rows):
+        cells = (
+            text.ljust(width) if number < texts else text.rjust(width)
+            for number, (text, width) in enumerate(zip(row, widths, strict=True))
+        )
+        lines.append(f"| {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+def escaped(text: str) -> str:
+    """Escape a text for Markdown, on one line."""
+    return _SPECIAL.sub(r"\\\g<0>", " ".join(text.split()))
+
+
+def latex_text(text: str) -> str:
+    r"""Escape a text for LaTeX, on one line; letters missing from the fonts become code points such as U+65E5."""
+    composed = unicodedata.normalize("NFC", " ".join(text.split()))
+    return "".join(map(_letter, composed))
+
+
+def score_table(run: Run, formats: Formats) -> Table:
+    """Build the terminal table of one run: per scene our values and the paper's, then the mean."""
+    ours = in_shown_units(run.scores, formats)
+    columns = {str(name): formats[str(name)] for name in ours}
+    about = f"{run.label} on {run.dataset}, x{run.scale}, {run.downsampling} downsampling"
+    title = f"{about} - {describe_directions(columns)}"
+    table = Table(title=escape(title), title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
+    table.add_column("scene", overflow="fold")
+    table.add_column("from")
+    for column in columns.values():
+        table.add_column(escape(f"{column.heading}\n{column.unit}"), justify="right", no_wrap=True)
+    scenes = [str(scene) for scene in ours.index]
+    papers = [paper_row(scene, [run], [scene]) for scene in scenes]
+    for scene, (_, values), paper in zip(scenes, ours.iterrows(), papers, strict=True):
+        table.add_row(escape(scene), "dsr", *_cells(values, columns))
+        if paper is not None and _has_any(paper, columns):
+            table.add_row("", "paper", *_cells(paper, columns), style="dim")
+    if len(ours) > 1:
+        table.add_section()
+        table.add_row("mean", "dsr", *_cells(ours.mean(), columns), style="bold")
+        paper = paper_row(average_of(run.dataset, scenes), [run], scenes)
+        if paper is not None and _has_any(paper, columns):
+            table.add_row("", "paper", *_cells(paper, columns), style="dim")
+    if any(paper is not None for paper in papers):
+        table.caption = implementation_note([paper_name(run)]) or None
+        table.caption_justify = "left"
+    return table
+
+
+def _values(key: str, column: MetricFormat, row: Row) -> Iterator[tuple[str, float | int | None]]:
+    """Yield the CSV columns of one metric."""
+    cell, paper = row.cells.get(key), row.published.get(key)
+    unit = f" [{column.unit.split(', ')[-1]}]" if column.unit else ""  # the key names the threshold
+    low, high = (None, None) if cell is None or cell.interval is None else cell.interval
+    difference, ratio = (None if cell is None else cell.against(paper)) or (None, None)
+    yield f"{key}{unit}", None if cell is None else cell.mean
+    yield f"{key} spread{unit}", None if cell is None else cell.spread
+    yield f"{key} seeds", None if cell is None or cell.spread is None else cell.seeds
+    yield f"{key} scenes", None if cell is None else cell.scenes
+    yield f"{key} low{unit}", low
+    yield f"{key} high{unit}", high
+    yield f"{key} paper{unit}", paper
+    yield f"{key} difference{unit}", difference
+    yield f"{key} ratio", ratio
+
+
+def _of_paper(row: Row) -> Row:
+    """Return a row of the paper's values with a label that says so."""
+    return replace(row, label=f"{row.label} (paper)")
+
+
+def _heading(column: MetricFormat) -> str:
+    return escaped(column.title)
+
+
+def _compared(facts: Sequence[Fact], columns: Formats, group: Group) -> Iterator[list[str]]:
+    """Yield our value, the paper's, difference and ratio of each method in the paper, then its other methods."""
+    rows = [row for row in group.rows if row.published]
+    for number, row in enumerate(rows):
+        both = [_against(key, column, row) for key, column in columns.items()]
+        ours = [_plain(column, row.cells.get(key)) for key, column in columns.items()]
+        yield [*_MARKDOWN.facts(row, facts, first=number == 0), "ours", *ours]
+        blank = [""] * len(facts)
+        yield [*blank, "paper", *_MARKDOWN.paper(columns, row.published)]
+        yield [*blank, "difference", *(difference for difference, _ in both)]
+        yield [*blank, "ratio", *(ratio for _, ratio in both)]
+    for number, row in enumerate(group.paper_only, len(rows)):
+        yield [*_MARKDOWN.facts(row, facts, first=number == 0), "paper", *_MARKDOWN.paper(columns, row.published)]
+
+
+def _plain(column: MetricFormat, cell: Cell | None) -> str:
+    """Format a mean, with the number of scenes if some are missing."""
+    if cell is None:
+        return MISSING
+    return shown(column, cell.mean) + ("" if cell.complete else f" ({cell.scenes} of {cell.of})")
+
+
+def _against(key: str, column: MetricFormat, row: Row) -> tuple[str, str]:
+    """Format the difference from the paper's value and the ratio to it."""
+    cell, paper = row.cells.get(key), row.published.get(key)
+    difference, ratio = (None if cell is None else cell.against(paper)) or (None, None)
+    if difference is None:
+        return MISSING, MISSING
+    text = shown(column, difference)
+    return text if text.startswith("-") else f"+{text}", MISSING if ratio is None else f"{ratio:.2f}"
+
+
+def _letter(letter: str) -> str:
+    if letter in _LATEX_SPECIAL:
+        return _LATEX_SPECIAL[letter]
+    plain = letter.isascii() and letter.isprintable()
+    return letter if plain or (letter.isalpha() and ord(letter) <= _LAST_LETTER) else f"[U+{ord(letter):04X}]"
+
+
+def _latex_heading(column: MetricFormat) -> str:
+    """Format the name of a metric with the part after the underscore as a subscript."""
+    name, _, index = column.heading.partition("_")
+    return latex_text(name) + (f"$_{{{latex_text(index)}}}$" if index else "")
+
+
+def _pages(groups: Sequence[list[str]], most: int) -> Iterator[list[list[str]]]:
+    """Yield the rows of each page by group, at most ``most``; a group that fits on one page is not split."""
+    page: list[list[str]] = []
+    for rows in groups:
+        for start in range(0, len(rows), most):
+            part = rows[start : start + most]
+            if page and sum(map(len, page)) + len(part) > most:
+                yield page
+                page = []
+            page.append(part)
+    if page:
+        yield page
+
+
+def _columns(table: PaperTable, *, published: bool) -> tuple[list[Fact], Formats]:
+    """Return the columns of a LaTeX table."""
+    if published:
+        return [fact for fact in table.facts if not fact.number], table.published_columns()
+    return table.facts, table.columns
+
+
+def _page(table: PaperTable, groups: Sequence[Sequence[str]], number: int, published: bool) -> str:
+    """Return one table environment."""
+    facts, columns = _columns(table, published=published)
+    title = table.title + (", beside the paper's values (in parentheses)" if published else "")
+    caption = f"{title}. {' '.join(table.notes)}" if number == 0 else f"{title}, continued."
+    kinds = "".join("r" if fact.number else "l" for fact in facts) + "r" * len(columns)
+    head = [*(fact.name.capitalize() for fact in facts), *map(_latex_heading, columns.values())]
+    units = [*("" for _ in facts), *(latex_text(column.unit) for column in columns.values())]
+    body = "\n\\midrule\n".join("\n".join(rows) for rows in groups)
+    return rf"""\begin{{table}}[htbp]
+\centering
+\caption{{{latex_text(caption)}}}
+\smallskip
+\resizebox{{\ifdim\width>\linewidth \linewidth\else\width\fi}}{{!}}{{%
+\begin{{tabular}}{{@{{}}{kinds}@{{}}}}
+\toprule
+{" & ".join(head)} \\
+{" & ".join(units)} \\
+\midrule
+{body}
+\bottomrule
+\end{{tabular}}%
+}}
+{_END}"""
+
+
+def _latex_rows(table: PaperTable, group: Group, *, published: bool) -> Iterator[str]:
+    """Yield the lines of a group; the title is in the first line, that of an average in a line of its own."""
+    facts, columns = _columns(table, published=published)
+    compared = any(row.published for row in group.rows)  # all of our rows are needed, since the best is marked
+    rows = [row for row in group.rows if not published or (compared and row.cells)]
+    line, average = _beside if published else _LATEX.row, group.about.average
+    lines = [line(row, facts, columns, first=number == 0 and not average) for number, row in enumerate(rows)]
+    for row in map(_of_paper, group.paper_only) if published and compared else ():
+        first = not lines and not average
+        lines.append([*_LATEX.facts(row, facts, first=first), *_LATEX.paper(columns, row.published, "({})")])
+    if average and rows:
+        title = latex_text(group.about.title)
+        yield f"\\multicolumn{{{len(facts) + len(columns)}}}{{@{{}}l}}{{{title}}} \\\\"
+    for texts in lines:
+        guard = "{}" if texts[0].startswith(("[", "*")) else ""  # else it would be an option of the rule before
+        yield f"{guard}{' & '.join(texts)} \\\\"
+
+
+def _beside(row: Row, facts: Sequence[Fact], columns: Formats, *, first: bool) -> list[str]:
+    """Format our values, without spreads and intervals, and the paper's."""
+    cells = {key: replace(cell, spread=None, seeds=1, interval=None) for key, cell in row.cells.items()}
+    ours = _LATEX.row(replace(row, cells=cells, seeds=1), facts, columns, first=first)
+    paper = _LATEX.paper(columns, row.published)
+    return [*ours[: len(facts)], *(f"{own} ({its})" for own, its in zip(ours[len(facts) :], paper, strict=True))]
+
+
+def _width(table: PaperTable, *, published: bool) -> int:
+    """Return the number of characters of the longest row, without markup."""
+    facts, columns = _columns(table, published=published)
+    wide = 0
+    for group in table.groups:
+        every = [*group.rows, *group.paper_only]
+        words = [max(len(str(fact.value(row))) for row in every) for fact in facts
+                 if not (fact.number or (fact.name == "scene" and group.about.average))]  # fmt: skip
+        for row in group.rows:
+            cells = (_beside if published else _LATEX.row)(row, facts, columns, first=True)[len(facts) :]
+            plain = [text.replace("\\textbf", "").replace("\\underline", "").replace("$\\pm$", "+") for text in cells]
+            sizes = [max(len(text), len(each.heading)) + 2 for text, each in zip(plain, columns.values(), strict=True)]
+            wide = max(wide, sum(words) + sum(sizes))
+    return wide
+
+
+def _number(text: str) -> str:
+    """Format a number with a proper minus sign."""
+    return f"${text}$" if text.startswith("-") else text
+
+
+def _has_any(values: pd.Series, columns: Formats) -> bool:
+    """Return whether a row has a value for one of the columns."""
+    return bool(values.reindex(list(columns)).notna().any())
+
+
+def _cells(values: pd.Series, columns: Formats) -> list[str]:
+    """Format the values of a row with the digits of each column; "-" for missing values."""
+    return [each.text(values[name]) if pd.notna(values.get(name)) else "-" for name, each in columns.items()]
+
+
+_MARKDOWN = Style(
+    escaped, MISSING, {0: ("", ""), 1: ("**", "**"), 2: ("<ins>", "</ins>")}, "\N{PLUS-MINUS SIGN}", "n = {}"
+)
+_LATEX = Style(
+    latex_text, "--", {0: ("", ""), 1: ("\\textbf{", "}"), 2: ("\\underline{", "}")}, "$\\pm$", "$n = {}$", _number
+)

@@ -1,1 +1,0 @@
-"""Plotting used by several packages: colour maps, panels, contact sheets, comparisons."""
