@@ -16,11 +16,14 @@ import importlib.util
 import inspect
 import types
 from collections.abc import Collection, Mapping, Sequence
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
 _MISSING = "???"
 _TARGET, _PARTIAL = "_target_", "_partial_"
+_MANY = 20
+"""Of more arguments than these, a message names those like the mistyped one."""
 
 
 class ConfigError(ValueError):
@@ -91,7 +94,8 @@ def _checked(
     arguments = {key: value for key, value in node.items() if key not in (_TARGET, _PARTIAL)}
     for key, value in arguments.items():
         if key not in own and not takes_any:
-            accepted = ", ".join(own) or "none"
+            near = get_close_matches(key, own) if len(own) > _MANY else []
+            accepted = ", ".join(near or own) or "none"
             raise ConfigError(f"{group}.{key}: unknown key; {choice} takes {accepted}")
         expect_usable(f"{group}.{key}", value)
         if value == _MISSING:
