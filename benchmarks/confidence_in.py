@@ -22,11 +22,11 @@ import torch
 from scipy.ndimage import gaussian_filter
 from torch import Tensor
 
-from dsr.data.formats.files import read_camera, read_rgb
 from dsr.degradation.downsampling import Downsampling
 from dsr.degradation.hints import relative_error
 from dsr.geometry.camera import Camera, from_range
 from dsr.geometry.surface import depth_to_normals
+from dsr.io.images import read_camera, read_rgb
 from dsr.methods.networks.any_map import AnyMap
 from dsr.methods.recipe import Run, read_recipe
 from dsr.sample import DepthSample

@@ -11,7 +11,6 @@ import pytest
 import torch
 
 from dsr.data.folder import load_scene
-from dsr.data.formats.files import read_map, read_rgb
 from dsr.doctor import examine_directory
 from dsr.doctor.examine import CHECKS, examine
 from dsr.doctor.finding import length, with_depth
@@ -19,6 +18,7 @@ from dsr.doctor.planes import plane_votes
 from dsr.doctor.precision import find_rounding
 from dsr.doctor.registration import check_registration
 from dsr.geometry.camera import Camera, from_range, to_range
+from dsr.io.images import read_map, read_rgb
 from dsr.sample import Scene
 from dsr.synthetic.procedural.scenes import render_random_scene
 from dsr.synthetic.simgeo.scenes import render_scene

@@ -22,9 +22,9 @@ from dsr.app.upsample.outputs import read_previous_run
 from dsr.data.download.fetching import unpack
 from dsr.data.tofmark import read_matrices
 from dsr.inference import upsampler
-from dsr.io.captures.arkitscenes import find_arkitscenes
+from dsr.io.captures.arkit import find_arkitscenes
 from dsr.io.captures.stray import find_stray
-from dsr.io.input_files import read_input, write_input
+from dsr.io.exports import read_input, write_input
 from dsr.io.photos import read_photo
 from dsr.methods.networks.weight_files import is_dsr_weights
 from dsr.methods.recipe import read_recipe

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from dsr.io.input_files import LONGEST, read_input, write_input
+from dsr.io.exports import LONGEST, read_input, write_input
 from dsr.utils.files import array_headers
 
 

@@ -14,7 +14,7 @@ from dsr.data import arkitscenes, ddrnet, diml, icl, rgbdd, sintel, sunrgbd, tar
 from dsr.data.folder import Folder
 from dsr.io.inputs import Reading, read_picture
 from dsr.io.layouts import find_pairs_of_folder
-from dsr.io.poses import read_poses
+from dsr.io.trajectories import read_poses
 from dsr.utils.paths import natural_key
 
 FRAMES = 12

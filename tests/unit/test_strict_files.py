@@ -18,14 +18,14 @@ from dsr.app.upsample.scene import _read_record
 from dsr.app.upsample.stored import read_result
 from dsr.data.download.fetching import Checksums
 from dsr.data.folder import Folder, load_scene
-from dsr.data.formats.files import read_camera
 from dsr.evaluation.run_files import load_results
 from dsr.evaluation.store import load_errors, load_prediction, prediction_path, sample_path
 from dsr.geometry.camera import Camera
 from dsr.io.cameras import read_any_camera
-from dsr.io.captures.polycam import find_polycam
+from dsr.io.captures.arkit import find_polycam
 from dsr.io.captures.record3d import find_record3d
-from dsr.io.poses import read_transform
+from dsr.io.images import read_camera
+from dsr.io.trajectories import read_transform
 from dsr.methods.networks.peers.files import read_tensors
 from dsr.methods.networks.published import read_msg_weights
 from dsr.sample import FARTHEST, NEAREST, DepthSample, Scene

@@ -14,7 +14,7 @@ from dsr.app.upsample.parts import ERRORS
 from dsr.app.upsample.stored import read_camera, read_depth, read_errors, read_info
 from dsr.geometry.poses import as_rigid
 from dsr.geometry.tsdf import PosedMap, fuse_maps, suggest_voxel
-from dsr.io.model_files import write_ply
+from dsr.io.exports import write_ply
 from dsr.utils.console import one_line, show
 from dsr.utils.paths import natural_key
 

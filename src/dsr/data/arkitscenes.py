@@ -25,18 +25,17 @@ import numpy as np
 import torch
 
 from dsr.data.base import SceneSelection
-from dsr.data.formats.files import read_levels
 from dsr.data.formats.shared import (
     expect_size,
     find_beside,
     in_natural_order,
     read_millimetres,
-    read_numbers,
     read_picture,
     to_camera,
 )
 from dsr.data.preparation.dataset import Preparation, PreparedDataset, add_note, list_frames, make_records
 from dsr.geometry.camera import ASSUMED_FOV, Camera
+from dsr.io.images import read_levels, read_numbers
 from dsr.sample import Scene
 
 Split = Literal["validation", "training"]

@@ -34,11 +34,11 @@ from torch import Tensor
 
 from dsr.data.base import SceneSelection
 from dsr.data.download import catalogue
-from dsr.data.formats.files import read_levels, read_map
 from dsr.data.formats.shared import expect_size, read_picture
 from dsr.data.preparation.dataset import Preparation, PreparedDataset, SceneRecord
 from dsr.data.preparation.dequantization import smooth_levels
 from dsr.geometry.camera import Camera, from_range
+from dsr.io.images import read_levels, read_map
 from dsr.sample import Scene
 from dsr.utils.limits import read_limited
 from dsr.utils.paths import natural_key

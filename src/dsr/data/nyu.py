@@ -34,11 +34,11 @@ import numpy as np
 import torch
 
 from dsr.data.base import SceneSelection
-from dsr.data.formats.files import read_map
 from dsr.data.formats.matlab import expect_own_values
 from dsr.data.formats.shared import expect_size, find_beside, in_natural_order, read_picture, to_depth
 from dsr.data.preparation.dataset import Preparation, PreparedDataset, SceneRecord, list_frames, make_records
 from dsr.geometry.camera import Camera
+from dsr.io.images import read_map
 from dsr.sample import Scene
 
 CAMERA = Camera(640, 480, 518.85790117450188, 519.46961112127485, 325.58244941119034 - 1, 253.73616633400465 - 1)

@@ -33,7 +33,6 @@ from dsr.data.formats.shared import (
     in_natural_order,
     name_of,
     read_16bit,
-    read_numbers,
     read_picture,
     to_camera,
     to_depth,
@@ -48,6 +47,7 @@ from dsr.data.preparation.dataset import (
     rename_records,
 )
 from dsr.geometry.camera import Camera
+from dsr.io.images import read_numbers
 from dsr.sample import Scene
 
 Intrinsics = tuple[float, float, float, float]

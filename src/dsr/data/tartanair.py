@@ -17,10 +17,10 @@ import numpy as np
 from torch import Tensor
 
 from dsr.data.base import SceneSelection
-from dsr.data.formats.files import read_map
 from dsr.data.formats.shared import expect_size, name_of, read_picture, to_depth, walk
 from dsr.data.preparation.dataset import Preparation, PreparedDataset, list_frames, make_records
 from dsr.geometry.camera import Camera
+from dsr.io.images import read_map
 from dsr.sample import Scene
 from dsr.utils.limits import opened
 

@@ -32,10 +32,10 @@ import torch
 from torch import Tensor
 
 from dsr.data.base import SceneSelection
-from dsr.data.formats.files import read_levels
 from dsr.data.formats.matlab import read_variables
 from dsr.data.formats.shared import expect_size, given_camera, in_natural_order, name_of, read_picture, to_depth, walk
 from dsr.data.preparation.dataset import Preparation, PreparedDataset, add_note, list_frames, make_records
+from dsr.io.images import read_levels
 from dsr.sample import Scene
 
 FACTORS = (4, 8)

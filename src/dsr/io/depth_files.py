@@ -14,15 +14,14 @@ from typing import Any
 import cv2
 import numpy as np
 
-from dsr.data.formats.decoding import quiet_decoders
-from dsr.data.formats.files import expect_depth_values, read_array
-from dsr.data.formats.shared import read_numbers
-from dsr.data.icl import CAMERA as ICL_CAMERA
+from dsr.geometry.camera import Camera
+from dsr.io.images import expect_depth_values, quiet_decoders, read_array, read_numbers
 from dsr.utils.files import array_headers, read_arrays, replacing
 from dsr.utils.limits import MOST_PIXELS, bytes_of_archive, expect_bytes, expect_pixels
 
 DEPTH_SUFFIXES = (".png", ".tiff", ".tif", ".npy", ".npz", ".pfm", ".exr")
 """Of the formats that are read and written."""
+ICL_CAMERA = Camera(640, 480, 481.2, -480.0, 319.5, 239.5)
 ICL_SUFFIX = ".depth"
 """Of ICL-NUIM's text, distances along the rays in centimetres, :mod:`dsr.data.icl`."""
 READ_SUFFIXES = (*DEPTH_SUFFIXES, ICL_SUFFIX)

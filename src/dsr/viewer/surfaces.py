@@ -13,8 +13,7 @@ import torch
 
 from dsr.geometry.camera import Camera
 from dsr.geometry.shading import render_for_viewing
-from dsr.io.exports import normal_strips
-from dsr.io.input_files import to_jpeg
+from dsr.io.exports import normal_strips, to_jpeg
 from dsr.viewer.packing import (
     Grid,
     error_levels,

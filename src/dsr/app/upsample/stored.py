@@ -15,7 +15,7 @@ from dsr.app.upsample.outputs import INFO
 from dsr.app.upsample.parts import ERRORS, METRES, Results
 from dsr.evaluation.store import load_errors
 from dsr.geometry.camera import Camera
-from dsr.io.input_files import INPUT, read_input
+from dsr.io.exports import INPUT, read_input
 from dsr.sample import expect_distances
 from dsr.utils.files import array_headers, open_array
 from dsr.utils.limits import read_limited

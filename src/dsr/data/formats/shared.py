@@ -14,40 +14,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dsr.data.formats.files import read_pixels
 from dsr.geometry.camera import ASSUMED_FOV, Camera
+from dsr.io.images import read_pixels
 from dsr.sample import Scene
 from dsr.utils.limits import MOST_FILE, read_limited
 from dsr.utils.paths import natural_key
 
 NO_CAMERA = f"no camera is published: {ASSUMED_FOV:g} degrees of horizontal view are assumed"
 """Note of scenes whose camera is :meth:`dsr.geometry.camera.Camera.from_fov`."""
-_LONGEST = 40
-"""Largest number of bytes of a number and the blank behind it."""
 Found = TypeVar("Found")
-_TEXT = re.compile(rb"[-+.\deEnaifNAIF\s]*")
-
-
-def read_numbers(path: Path, count: int) -> np.ndarray:
-    """Return the numbers of a text file, separated by blanks or line ends, as float64 (count,).
-
-    Raises:
-        ValueError: it is missing, holds something else, or another number of them.
-
-    """
-    if not path.is_file():
-        raise ValueError(f"{path}: expected a text file of {count} numbers, there is none")
-    size = path.stat().st_size
-    if size > _LONGEST * count:
-        raise ValueError(f"{path}: expected {count} numbers, got {size} bytes, too many for that")
-    content = read_limited(path, size)
-    try:
-        values = np.array(content.split() if _TEXT.fullmatch(content) else "", dtype=np.float64)
-    except ValueError as error:
-        raise ValueError(f"{path}: expected {count} numbers, got text or bytes that are none") from error
-    if values.size != count:
-        raise ValueError(f"{path}: expected {count} numbers, got {values.size}")
-    return values
 
 
 def read_bytes(path: Path, what: str) -> bytes:

@@ -17,8 +17,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from dsr.data.formats.decoding import decode_pixels
 from dsr.io.frames import Record
+from dsr.io.images import decode_pixels
 from dsr.utils.limits import read_limited, read_member
 
 PHOTO_LIMIT = 1 << 26

@@ -1,9 +1,12 @@
-"""Readers of pictures, range maps and cameras, whose errors are one line that names the file."""
+"""Readers of pictures, range maps, numbers and cameras, which check sizes first and whose errors name the file."""
 
 from __future__ import annotations
 
+import io
 import math
+import os
 import re
+import threading
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -12,7 +15,6 @@ import cv2
 import numpy as np
 from pydantic import BaseModel, BeforeValidator, Field, ValidationError
 
-from dsr.data.formats.decoding import decode_pixels
 from dsr.geometry.camera import Camera, RangeType
 from dsr.utils.files import read_array_header
 from dsr.utils.limits import (
@@ -20,13 +22,92 @@ from dsr.utils.limits import (
     array_bytes,
     expect_bytes,
     expect_pixels,
+    opened,
     pixels_of_file,
     read_limited,
 )
+from dsr.utils.picture_headers import picture_size
 from dsr.utils.validation import Number, Whole, describe
+
+_BYTES_PER_PIXEL = 16
+"""Bytes in memory for each allowed pixel: four channels of float32."""
 
 MAP_SUFFIXES = (".npy", ".png", ".tiff", ".tif", ".pfm")
 _METRES = {"m": 1.0, "mm": 1e-3}
+_LONGEST = 40
+"""Largest number of bytes of a number and the blank behind it."""
+_TEXT = re.compile(rb"[-+.\deEnaifNAIF\s]*")
+
+
+def decode_pixels(place: str | Path, content: bytes, flags: int, most: int | None = None) -> np.ndarray | None:
+    """Return the pixels of an encoded picture as OpenCV decodes them; None if it is damaged or none.
+
+    Args:
+        place: its name, for messages.
+        content: a PNG, JPEG, TIFF, BMP, WebP or portable map.
+        flags: OpenCV's.
+        most: largest number of pixels; None for what its length explains.
+
+    Raises:
+        ValueError: its header declares more.
+
+    """
+    header = picture_size(io.BytesIO(content))
+    if header is None:
+        return None
+    most = pixels_of_file(len(content)) if most is None else most
+    expect_pixels(place, header.height, header.width, most)
+    expect_bytes(
+        place, header.bytes_per_pixel * max(header.height * header.width, header.tile), _BYTES_PER_PIXEL * most
+    )
+    try:
+        with _QUIET_STDERR:
+            return cv2.imdecode(np.frombuffer(content, np.uint8), flags)
+    except cv2.error:
+        return None
+
+
+def pixels_in_header(path: Path) -> tuple[int, int] | None:
+    """Return height and width that a picture file declares; None if it is missing, damaged or no picture."""
+    try:
+        with opened(path) as file:
+            header = picture_size(file)
+    except OSError:
+        return None
+    return None if header is None else (header.height, header.width)
+
+
+class _QuietStderr:
+    """A context in which stderr is discarded, so that messages of decoders (libpng, OpenCV) are not shown.
+
+    Threads may be in it at the same time: the first redirects stderr and the last restores it.
+    """
+
+    def __init__(self) -> None:
+        self._lock, self._within, self._kept = threading.Lock(), 0, -1
+
+    def __enter__(self) -> None:
+        with self._lock:
+            if not self._within:
+                self._kept = os.dup(2)
+                with open(os.devnull, "wb") as nowhere:  # noqa: PTH123 - a device
+                    os.dup2(nowhere.fileno(), 2)
+            self._within += 1
+
+    def __exit__(self, *_: object) -> None:
+        with self._lock:
+            self._within -= 1
+            if not self._within:
+                os.dup2(self._kept, 2)
+                os.close(self._kept)
+
+
+_QUIET_STDERR = _QuietStderr()
+
+
+def quiet_decoders() -> _QuietStderr:
+    """Return a context in which messages of decoders about damaged files are not shown."""
+    return _QUIET_STDERR
 
 
 def read_rgb(path: Path) -> np.ndarray:
@@ -120,6 +201,28 @@ def read_mask(path: Path, most: int | None = None) -> np.ndarray:
 
     """
     return read_pixels(path, cv2.IMREAD_GRAYSCALE, most) > 0
+
+
+def read_numbers(path: Path, count: int) -> np.ndarray:
+    """Return the numbers of a text file, separated by blanks or line ends, as float64 (count,).
+
+    Raises:
+        ValueError: it is missing, holds something else, or another number of them.
+
+    """
+    if not path.is_file():
+        raise ValueError(f"{path}: expected a text file of {count} numbers, there is none")
+    size = path.stat().st_size
+    if size > _LONGEST * count:
+        raise ValueError(f"{path}: expected {count} numbers, got {size} bytes, too many for that")
+    content = read_limited(path, size)
+    try:
+        values = np.array(content.split() if _TEXT.fullmatch(content) else "", dtype=np.float64)
+    except ValueError as error:
+        raise ValueError(f"{path}: expected {count} numbers, got text or bytes that are none") from error
+    if values.size != count:
+        raise ValueError(f"{path}: expected {count} numbers, got {values.size}")
+    return values
 
 
 @dataclass(frozen=True)
