@@ -27,11 +27,11 @@ import torch
 from scipy.ndimage import uniform_filter
 from torch import Tensor
 
-from dsr.data.ddrnet import DDRNetFrames
+from dsr.data.ddrnet_frames import DDRNetFrames
 from dsr.degradation.downsampling import Downsampling, make_sample
 from dsr.degradation.noise import Kinect, Noise, TimeOfFlight
 from dsr.geometry.camera import Camera
-from dsr.geometry.poses import Matrix, relative
+from dsr.geometry.rigid_motion import Matrix, relative
 from dsr.geometry.shading import render as render_lights
 from dsr.geometry.surface import depth_to_normals
 from dsr.geometry.warping import warp_depth

@@ -175,7 +175,7 @@ def _unpack(place: Place) -> None:
 
 
 def _verify(place: Place) -> None:
-    from dsr.data.download.collection import Collection, Item  # noqa: PLC0415
+    from dsr.data.download.collections import Collection, Item  # noqa: PLC0415
     from dsr.data.download.fetching import state, verify  # noqa: PLC0415
     from dsr.utils.progress import Progress  # noqa: PLC0415
 

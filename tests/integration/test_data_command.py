@@ -16,7 +16,7 @@ import pytest
 
 from dsr import cli
 from dsr.data.download import fetching
-from dsr.data.download.catalogue import Collection, Item
+from dsr.data.download.collections import Collection, Item
 
 PNG = b"\x89PNG\r\n\x1a\n" + bytes(range(256)) * 1000
 NAMES = [f"middlebury2003/{scene}/{name}" for scene in ("cones", "teddy") for name in ("im2.png", "disp2.png")]

@@ -11,7 +11,7 @@ import torch
 
 from dsr.app.schema import EvalConfig
 from dsr.utils.builder import ConfigError, build
-from dsr.utils.devices import pick_device
+from dsr.utils.compute_device import pick_device
 
 Order = Literal["near", "far"]
 

@@ -12,7 +12,7 @@ import pytest
 
 from dsr.evaluation import claims as claims_module
 from dsr.evaluation.claims import LOST, Claims
-from dsr.utils.temporary import birth, machine
+from dsr.utils.files import birth, machine
 
 FORK = multiprocessing.get_context("fork")
 NAMES = list(map(str, range(40)))

@@ -9,7 +9,7 @@ from dsr.data.folder import Folder
 from dsr.data.icl import FRAMES as ICL_FRAMES
 from dsr.data.icl import ICL
 from dsr.data.middlebury import EVALUATION_2014, TRAINING, Middlebury, MiddleburyLevels, MiddleburyTrain
-from dsr.data.simgeo import SimGeo
+from dsr.data.rendered import SimGeo
 from dsr.data.sintel import SEQUENCES, Sintel, sintel_frames
 from dsr.data.sunrgbd import FRAMES as SUN_FRAMES
 from dsr.data.sunrgbd import SunRGBD

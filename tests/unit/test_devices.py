@@ -20,9 +20,9 @@ from torch import Tensor, nn
 from torch.utils.data import DataLoader
 
 from dsr.degradation.downsampling import Downsampling, Holes, make_sample
-from dsr.degradation.everything import Everything
 from dsr.degradation.holes import Blobs, Shadows
 from dsr.degradation.noise import GaussianMultiplicative, Kinect, Noise, TimeOfFlight
+from dsr.degradation.random_degradation import Everything
 from dsr.inference import upsample_surface
 from dsr.methods.networks.facets_unet import FacetsUNet
 from dsr.methods.networks.msg_net import MSGNet
@@ -42,7 +42,7 @@ from dsr.training.objective import DepthObjective, SurfaceObjective
 from dsr.training.patches import Patches
 from dsr.training.settings import PatchSettings
 from dsr.utils.builder import ConfigError
-from dsr.utils.devices import fast_precision, pick_device
+from dsr.utils.compute_device import fast_precision, pick_device
 
 SHORT: dict[str, dict[str, Any]] = {
     "dip": {"steps": 2},

@@ -11,8 +11,7 @@ from torch.utils.data import DataLoader
 
 from dsr.app.divergence import NOTE, expect_no_divergence, note_divergence
 from dsr.utils.builder import ConfigError
-from dsr.utils.checkpoints import Interruption
-from dsr.utils.divergence import Divergence, DivergenceError
+from dsr.utils.checkpoints import Divergence, DivergenceError, Interruption
 from dsr.utils.lightning import fit, make_trainer
 
 NAN = math.nan

@@ -126,7 +126,7 @@ def test_import_check_finds_a_forbidden_import(module, text, offence):
 
 def test_module_graph_finds_the_modules():
     assert {"dsr.sample", "dsr.app.entry", "dsr.data.folder"} <= MODULES.keys()
-    assert "dsr.data.base" in import_graph()["dsr.data.folder"]
+    assert "dsr.data.scene_source" in import_graph()["dsr.data.folder"]
 
 
 def test_package_root_holds_no_module_but_the_sample_and_the_command():

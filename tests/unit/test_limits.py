@@ -18,7 +18,7 @@ import safetensors.torch
 import torch
 
 from dsr.app.upsample.scene import write_scene
-from dsr.data.formats.matlab import read_variables
+from dsr.data.matlab import read_variables
 from dsr.evaluation.run_files import read_run
 from dsr.evaluation.store import load_prediction
 from dsr.io.captures import ros, stray
@@ -34,7 +34,7 @@ from dsr.methods.networks.trained import NETWORKS
 from dsr.methods.networks.weight_choice import packaged_weights
 from dsr.methods.networks.weight_files import load_network, read_torch_file
 from dsr.sample import DepthSample
-from dsr.utils.limits import TooLargeError, bytes_of_archive, pixels_beside, pixels_of_file, read_limited, read_member
+from dsr.utils.guards import TooLargeError, bytes_of_archive, pixels_beside, pixels_of_file, read_limited, read_member
 from dsr.utils.picture_headers import picture_size
 
 MOST = 450 << 20

@@ -18,10 +18,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from dsr.data.base import SceneSource
+from dsr.data.scene_source import SceneSource
 from dsr.degradation.downsampling import Downsampling, Measured, make_sample
-from dsr.degradation.everything import Everything
 from dsr.degradation.noise import GaussianMultiplicative, Kinect
+from dsr.degradation.random_degradation import Everything
 from dsr.geometry.camera import Camera
 from dsr.methods.networks.maps import normalise
 from dsr.sample import CENTIMETRES, Scene, Unit

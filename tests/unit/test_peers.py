@@ -26,7 +26,7 @@ from dsr.methods.networks.weight_choice import find_weights, has_weights, neares
 from dsr.methods.recipe import read_recipe
 from dsr.sample import DepthSample
 from dsr.utils.builder import ConfigError
-from dsr.utils.hashing import file_hash
+from dsr.utils.versions import file_hash
 
 FILES = {"SVLRM_X4.pth": 4, "SVLRM_X8.pth": 8, "X8/model.pth": 8}
 

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from dsr.geometry.camera import Camera
-from dsr.geometry.poses import as_rigid
+from dsr.geometry.rigid_motion import as_rigid
 from dsr.inference.sequences import View, fuse_views
 from dsr.synthetic.surfaces import rotation
 

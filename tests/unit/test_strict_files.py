@@ -33,7 +33,7 @@ from dsr.user_study.answers import read_all
 from dsr.user_study.key import Candidate, Key, Trial, read_key, write_key
 from dsr.utils.builder import ConfigError
 from dsr.utils.console import one_line, print_error
-from dsr.utils.parsing import is_number, parse_json, readable
+from dsr.utils.guards import is_number, parse_json, readable
 
 HUGE = "1" + "0" * 400
 NO_NUMBERS = ("true", "Infinity", "-Infinity", "NaN", HUGE, "1e400", '"4"', "[]", "null", "{}")
@@ -368,7 +368,7 @@ def test_weights_without_plain_values_are_refused(tmp_path, tensor):
 
 RUN = {
     "model": {"name": "msg_v", "target": "dsr.methods.networks.msg_net.MSGNet"},
-    "dataset": {"name": "simgeo", "target": "dsr.data.simgeo.SimGeo"},
+    "dataset": {"name": "simgeo", "target": "dsr.data.rendered.SimGeo"},
     "downsampling": {"name": "box", "target": "dsr.degradation.downsampling.Downsampling", "kernel": "box"},
     "noise": {"name": "none", "target": "dsr.degradation.noise.no_noise"},
     "scale": 4,

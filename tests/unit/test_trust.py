@@ -15,7 +15,7 @@ from dsr.utils.config_files import config_directories
 
 CONFIG = {
     "model": {"name": "msg_v", "label": "MSG-V", "target": "dsr.methods.networks.msg_net.MSGNet"},
-    "dataset": {"name": "procedural", "target": "dsr.data.procedural.Procedural", "count": 6, "size": 64},
+    "dataset": {"name": "procedural", "target": "dsr.data.rendered.Procedural", "count": 6, "size": 64},
     "downsampling": {"name": "box", "target": "dsr.degradation.downsampling.Downsampling", "kernel": "box"},
     "noise": {"name": "none", "target": "dsr.degradation.noise.no_noise"},
     "scale": 4,

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from dsr.geometry.camera import Camera
-from dsr.geometry.poses import as_rigid, from_quaternion, invert, relative
+from dsr.geometry.rigid_motion import as_rigid, from_quaternion, invert, relative
 from dsr.geometry.warping import registered_camera, source_pixels, warp_depth
 from dsr.synthetic.surfaces import rotation
 

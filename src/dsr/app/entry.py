@@ -33,7 +33,7 @@ from dsr.utils import interruption
 from dsr.utils.builder import ConfigError
 from dsr.utils.config_files import config_directories, list_choices
 from dsr.utils.console import USAGE_ERROR, one_line, print_error
-from dsr.utils.space import FullDiskError, silence_threads, space_for
+from dsr.utils.files import FullDiskError, silence_threads, space_for
 
 _LIST = re.compile(r"(^|,)\s*\[")
 """Where a list begins in the value of an argument, or in one of several that -m runs."""

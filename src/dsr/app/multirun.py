@@ -22,7 +22,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from dsr.utils.builder import ConfigError, expect_library
 from dsr.utils.console import USAGE_ERROR, one_line, open_console, print_error, show
-from dsr.utils.units import duration
+from dsr.utils.progress import duration
 
 LAUNCHERS = {
     "basic": "hydra",

@@ -12,7 +12,7 @@ from rich.console import Console
 from dsr.app.composition import compose
 from dsr.app.explain import explain
 from dsr.app.schema import plain_config
-from dsr.data.base import SceneSource, prepare_scenes
+from dsr.data.scene_source import SceneSource, prepare_scenes
 from dsr.sample import Scene
 from dsr.utils.builder import ConfigError, build
 from dsr.utils.config_files import config_directories

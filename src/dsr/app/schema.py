@@ -11,10 +11,10 @@ from hydra.core.config_store import ConfigStore
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import MISSING, DictConfig, OmegaConf
 
-from dsr.degradation.scales import NATIVE, check_scale
 from dsr.training.settings import PatchSettings, Schedule
 from dsr.utils.builder import ConfigError, check_types
-from dsr.utils.parsing import is_number
+from dsr.utils.guards import is_number
+from dsr.utils.ratios import NATIVE, check_scale
 
 STRATEGIES = ("auto", "ddp")
 KEPT = ("best", "last")
@@ -213,7 +213,7 @@ class TrainConfig(RunConfig):
 
     model: dict[str, Any] = MISSING
     degradation: dict[str, Any] = field(
-        default_factory=lambda: {"name": "plain", "target": "dsr.degradation.everything.plain"}
+        default_factory=lambda: {"name": "plain", "target": "dsr.degradation.random_degradation.plain"}
     )
     trainer: TrainerConfig = field(default_factory=TrainerConfig)
     logger: dict[str, Any] = field(default_factory=dict)

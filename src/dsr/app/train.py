@@ -34,7 +34,7 @@ from dsr.app.trainer import (
     training_trainer,
 )
 from dsr.app.training_runs import WEIGHTS, common, keyed, read_config, training_data
-from dsr.data.base import SceneSource, prepare_scenes
+from dsr.data.scene_source import SceneSource, prepare_scenes
 from dsr.methods.networks.base import DisparityNetwork
 from dsr.methods.networks.trained import NETWORKS
 from dsr.methods.networks.weight_files import load_network, network_name, read_torch_file, save_network
@@ -46,15 +46,13 @@ from dsr.training.objective import DepthObjective, Objective, SurfaceObjective
 from dsr.training.settings import Schedule
 from dsr.utils import interruption
 from dsr.utils.builder import ConfigError, build
-from dsr.utils.checkpoints import CheckpointError
+from dsr.utils.checkpoints import CheckpointError, DivergenceError
+from dsr.utils.compute_device import fast_precision, pick_device
 from dsr.utils.console import USAGE_ERROR, ConsoleProgress
-from dsr.utils.devices import fast_precision, pick_device
-from dsr.utils.divergence import DivergenceError
 from dsr.utils.files import replacing
+from dsr.utils.guards import expect_stored
 from dsr.utils.lightning import fit
-from dsr.utils.limits import expect_stored
-from dsr.utils.progress import SILENT, Progress
-from dsr.utils.units import duration
+from dsr.utils.progress import SILENT, Progress, duration
 
 _LARGEST_SEED = 2**32 - 1
 _FOLDERS = ("checkpoints", "tensorboard", "csv", "wandb", "mlruns")

@@ -13,7 +13,7 @@ from dsr.app.requests import ViewRequest
 from dsr.app.upsample.reporting import problem_line
 from dsr.app.upsample.stored import find_results, read_result
 from dsr.utils.console import ConsoleProgress, show
-from dsr.utils.units import megabytes
+from dsr.utils.progress import megabytes
 from dsr.viewer.page import is_view, save_view
 from dsr.viewer.surfaces import Packed, pack_result
 

@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import Any
 
 from dsr.cli import data, doctor, export, fuse, hydra_commands, report, study, upsample, view
-from dsr.data.download.catalogue import CATALOGUE, Collection
+from dsr.data.download.collections import CATALOGUE, Collection
 from dsr.utils import interruption
 from dsr.utils.console import USAGE_ERROR, one_line, open_console, print_error
-from dsr.utils.space import FullDiskError
+from dsr.utils.files import FullDiskError
 
 _EXAMPLES = """\
 examples:
@@ -38,7 +38,7 @@ def main(arguments: Sequence[str] | None = None, catalogue: Mapping[str, Collect
 
     Args:
         arguments: command-line arguments; None for those of the process.
-        catalogue: the data sets to offer; None for :data:`dsr.data.download.catalogue.CATALOGUE`.
+        catalogue: the data sets to offer; None for :data:`dsr.data.download.collections.CATALOGUE`.
 
     """
     options = _parser().parse_args(arguments)

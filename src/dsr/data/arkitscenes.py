@@ -24,8 +24,7 @@ from typing import Literal
 import numpy as np
 import torch
 
-from dsr.data.base import SceneSelection
-from dsr.data.formats.shared import (
+from dsr.data.frame_files import (
     expect_size,
     find_beside,
     in_natural_order,
@@ -33,7 +32,8 @@ from dsr.data.formats.shared import (
     read_picture,
     to_camera,
 )
-from dsr.data.preparation.dataset import Preparation, PreparedDataset, add_note, list_frames, make_records
+from dsr.data.preparation import Preparation, PreparedDataset, add_note, list_frames, make_records
+from dsr.data.scene_source import SceneSelection
 from dsr.geometry.camera import ASSUMED_FOV, Camera
 from dsr.io.images import read_levels, read_numbers
 from dsr.sample import Scene

@@ -30,9 +30,9 @@ from typing import ClassVar, Literal
 
 import torch
 
-from dsr.data.base import SceneSelection
-from dsr.data.formats.shared import expect_size, find_beside, in_natural_order, read_picture
-from dsr.data.preparation.dataset import Preparation, PreparedDataset, add_note, list_frames, make_records
+from dsr.data.frame_files import expect_size, find_beside, in_natural_order, read_picture
+from dsr.data.preparation import Preparation, PreparedDataset, add_note, list_frames, make_records
+from dsr.data.scene_source import SceneSelection
 from dsr.geometry.camera import Camera, baseline_times_focal, from_range
 from dsr.io.images import read_levels
 from dsr.sample import Scene, Unit

@@ -23,12 +23,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dsr.data.base import SceneSelection, select_scenes
+from dsr.data.scene_source import SceneSelection, select_scenes
 from dsr.geometry.camera import Camera, RangeType, from_range
 from dsr.io.images import MAP_SUFFIXES, CameraFile, read_camera, read_map, read_mask, read_rgb
 from dsr.sample import Scene, expect_distances
-from dsr.utils.limits import opened, pixels_beside
-from dsr.utils.paths import natural_key
+from dsr.utils.guards import natural_key, opened, pixels_beside
 from dsr.utils.ratios import fits_ratio, round_ratio
 
 _RGB_NAMES = ("rgb.png", "rgb.jpg", "rgb.jpeg")
@@ -66,7 +65,7 @@ class Folder:
         return list(self._scenes)
 
     def load(self, scene: str) -> Scene:
-        """Return one scene; see :class:`dsr.data.base.SceneSource`."""
+        """Return one scene; see :class:`dsr.data.scene_source.SceneSource`."""
         return load_scene(self._root / scene, self.name)
 
     def fingerprint(self, scene: str) -> str:

@@ -33,10 +33,10 @@ import h5py
 import numpy as np
 import torch
 
-from dsr.data.base import SceneSelection
-from dsr.data.formats.matlab import expect_own_values
-from dsr.data.formats.shared import expect_size, find_beside, in_natural_order, read_picture, to_depth
-from dsr.data.preparation.dataset import Preparation, PreparedDataset, SceneRecord, list_frames, make_records
+from dsr.data.frame_files import expect_size, find_beside, in_natural_order, read_picture, to_depth
+from dsr.data.matlab import expect_own_values
+from dsr.data.preparation import Preparation, PreparedDataset, SceneRecord, list_frames, make_records
+from dsr.data.scene_source import SceneSelection
 from dsr.geometry.camera import Camera
 from dsr.io.images import read_map
 from dsr.sample import Scene
@@ -175,7 +175,7 @@ class NYU(PreparedDataset):
         scenes: names of the scenes to use, ``0001`` to ``1449``; None and ``found`` for all. With a split, None for all
             of it and ``found`` for those on disk.
         size: height and width in pixels; None for the original size without the white border.
-        crop: see :class:`dsr.data.preparation.dataset.Preparation`.
+        crop: see :class:`dsr.data.preparation.Preparation`.
         filled: whether the authors' inpainted depth is the true depth, in place of the sensor's.
         split: ``test``, the last 449 frames, to evaluate on, or ``train``, the first 1000, to train on, as in the
             literature on guided depth super-resolution: 640 x 480 pixels with the border and the inpainted depth,

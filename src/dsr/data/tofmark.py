@@ -31,10 +31,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dsr.data.base import SceneSelection
-from dsr.data.formats.matlab import read_variables
-from dsr.data.formats.shared import expect_size, given_camera, in_natural_order, name_of, read_picture, to_depth, walk
-from dsr.data.preparation.dataset import Preparation, PreparedDataset, add_note, list_frames, make_records
+from dsr.data.frame_files import expect_size, given_camera, in_natural_order, name_of, read_picture, to_depth, walk
+from dsr.data.matlab import read_variables
+from dsr.data.preparation import Preparation, PreparedDataset, add_note, list_frames, make_records
+from dsr.data.scene_source import SceneSelection
 from dsr.io.images import read_levels
 from dsr.sample import Scene
 

@@ -23,9 +23,9 @@ from torch import Tensor
 
 from dsr.degradation.holes import Holes
 from dsr.degradation.noise import Noise
-from dsr.degradation.scales import check_scale, match_ratio
 from dsr.geometry.camera import Camera, RangeType, from_range, to_range
 from dsr.sample import FARTHEST, NEAREST, DepthSample, Scene
+from dsr.utils.ratios import check_scale, match_ratio
 
 Kernel = Literal["box", "nearest", "bilinear", "bicubic", "gaussian"]
 _LEAST_WEIGHT = 0.5

@@ -17,8 +17,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from dsr.degradation.draws import chance, draw, field_of, normal, power, uniform
 from dsr.degradation.glass_shapes import Body, Plate, Pose, ball, draw_box, draw_plate, draw_vessel
+from dsr.degradation.random_fields import chance, draw, field_of, normal, power, uniform
 from dsr.sample import Scene
 
 KINDS: Mapping[str, float] = {"vessel": 0.5, "ball": 0.06, "box": 0.1, "pane": 0.12, "mirror": 0.12, "gloss": 0.1}

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from dsr.degradation.draws import chance, draw, normal, uniform
+from dsr.degradation.random_fields import chance, draw, normal, uniform
 
 
 class Pose(NamedTuple):

@@ -25,11 +25,8 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, Self
 
-from dsr.utils.files import write_text
-from dsr.utils.limits import read_limited
-from dsr.utils.parsing import parse_json
-from dsr.utils.space import space_for
-from dsr.utils.temporary import birth, machine
+from dsr.utils.files import birth, machine, space_for, write_text
+from dsr.utils.guards import parse_json, read_limited
 
 BEAT, LOST = 10.0, 60.0
 """Seconds between two refreshments of a claim, and until one of another machine is over without."""

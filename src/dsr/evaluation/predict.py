@@ -23,7 +23,7 @@ import numpy as np
 import pandas as pd
 import torch
 
-from dsr.data.base import SceneSource
+from dsr.data.scene_source import SceneSource
 from dsr.degradation.downsampling import Downsampling, Measured, make_sample
 from dsr.degradation.holes import Holes
 from dsr.degradation.noise import Noise
@@ -34,7 +34,7 @@ from dsr.methods.base import Method, NoSolutionError, expect_some_depth
 from dsr.sample import DepthSample
 from dsr.utils.console import one_line
 from dsr.utils.files import look_anew, read_arrays, replacing
-from dsr.utils.parsing import parse_json
+from dsr.utils.guards import parse_json
 from dsr.utils.pool import LOST
 from dsr.utils.progress import SILENT, Progress
 

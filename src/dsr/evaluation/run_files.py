@@ -18,8 +18,7 @@ from dsr.evaluation.results import Results, Run, method_key, method_settings, pr
 from dsr.evaluation.store import expect_scene, prediction_path, sample_path
 from dsr.metrics.formats import MetricFormat
 from dsr.utils.files import array_headers
-from dsr.utils.limits import MOST_TABLE, TooLargeError, read_limited
-from dsr.utils.paths import OutsideError, natural_key
+from dsr.utils.guards import MOST_TABLE, OutsideError, TooLargeError, natural_key, read_limited
 from dsr.utils.ratios import as_ratio
 from dsr.utils.validation import Number, Whole, describe
 

@@ -14,8 +14,7 @@ import torch
 from torch import Tensor
 
 from dsr.utils.files import read_arrays
-from dsr.utils.limits import TooLargeError
-from dsr.utils.paths import path_within
+from dsr.utils.guards import TooLargeError, path_within
 
 _ERRORS = ("depth_error", "angle_error")
 _PREDICTION, _SAMPLE = "predictions/{}.npz", "scenes/{}.npz"

@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from dsr.geometry.camera import Camera
-from dsr.geometry.holes import degrees_per_pixel, distance_to_known
+from dsr.geometry.hole_size import degrees_per_pixel, distance_to_known
 from dsr.geometry.surface import angle_between, depth_to_normals
 
 _WINDOW = 5

@@ -15,7 +15,7 @@ from torch import Tensor
 from dsr.degradation.downsampling import Downsampling
 from dsr.degradation.sensors import Identified
 from dsr.geometry.camera import Camera
-from dsr.geometry.holes import degrees_per_pixel, wide_holes
+from dsr.geometry.hole_size import degrees_per_pixel, wide_holes
 from dsr.geometry.resampling import pad_inverse_depth
 from dsr.inference.agreement import expect_errors
 from dsr.inference.inspection import enlarged_by
@@ -36,7 +36,7 @@ from dsr.methods.base import InverseSurface, Method, NoiseLaw, Surface, expect_s
 from dsr.methods.recipe import Recipe, Run, read_recipe
 from dsr.sample import DepthSample, expect_distances
 from dsr.utils.builder import ConfigError
-from dsr.utils.devices import fast_precision, pick_device
+from dsr.utils.compute_device import fast_precision, pick_device
 from dsr.utils.progress import Steps
 
 _DECIDED = MappingProxyType({"fill_holes": True, "validate_every": 0})

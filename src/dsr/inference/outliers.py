@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from dsr.geometry.holes import distance_to_known
+from dsr.geometry.hole_size import distance_to_known
 from dsr.methods.base import Outliers
 
 FAR = 4.0

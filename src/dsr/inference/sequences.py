@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from dsr.geometry.camera import Camera
-from dsr.geometry.poses import Matrix, as_rigid, relative
+from dsr.geometry.rigid_motion import Matrix, as_rigid, relative
 from dsr.geometry.warping import source_pixels, warp_depth
 from dsr.methods.noise import estimate_sensor_noise
 

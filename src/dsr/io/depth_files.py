@@ -17,7 +17,7 @@ import numpy as np
 from dsr.geometry.camera import Camera
 from dsr.io.images import expect_depth_values, quiet_decoders, read_array, read_numbers
 from dsr.utils.files import array_headers, read_arrays, replacing
-from dsr.utils.limits import MOST_PIXELS, bytes_of_archive, expect_bytes, expect_pixels
+from dsr.utils.guards import MOST_PIXELS, bytes_of_archive, expect_bytes, expect_pixels
 
 DEPTH_SUFFIXES = (".png", ".tiff", ".tif", ".npy", ".npz", ".pfm", ".exr")
 """Of the formats that are read and written."""

@@ -26,16 +26,25 @@ from trimesh.visual.material import PBRMaterial
 from trimesh.visual.texture import TextureVisuals
 
 from dsr.geometry.camera import Camera
-from dsr.geometry.lights import LIGHT_NAMES
-from dsr.geometry.mesh import LARGEST_STEP, Mesh, triangulate, vertex_normals
+from dsr.geometry.conventions import LIGHT_NAMES
+from dsr.geometry.mesh import (
+    LARGEST_STEP,
+    QUADRIC,
+    Mesh,
+    project,
+    select_points,
+    simplify,
+    thin,
+    triangulate,
+    vertex_normals,
+)
 from dsr.geometry.shading import render
-from dsr.geometry.simplification import QUADRIC, project, select_points, simplify, thin
 from dsr.geometry.surface import depth_to_normals
 from dsr.io.images import decode_pixels
 from dsr.io.photos import write_png
 from dsr.sample import expect_distances
 from dsr.utils.files import array_headers, read_arrays, replacing
-from dsr.utils.limits import MOST_FACES, MOST_POINTS
+from dsr.utils.guards import MOST_FACES, MOST_POINTS
 
 _TO_GLTF = np.array([1, -1, -1])
 _LARGEST_TEXTURE = 4096
@@ -236,7 +245,7 @@ def write_mesh(
         depth: (1, H, W) orthogonal depth in metres, NaN in holes.
         camera: of these pixels.
         largest_step: see :func:`dsr.geometry.mesh.triangulate`.
-        most: triangles; a larger mesh is simplified, see :mod:`dsr.geometry.simplification`.
+        most: triangles; a larger mesh is simplified, see :mod:`dsr.geometry.mesh`.
 
     Returns:
         The numbers of triangles.

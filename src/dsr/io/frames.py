@@ -15,7 +15,7 @@ from dsr.geometry.camera import Camera
 from dsr.io.depth_files import DEPTH_SUFFIXES, read_array_file
 from dsr.io.encoding import Assumption
 from dsr.io.images import read_pixels
-from dsr.utils.limits import pixels_beside
+from dsr.utils.guards import pixels_beside
 
 Record = dict[str, str | int]
 """What identifies an input in ``info.json``: its name, its SHA-256, and a frame's number if it has one."""

@@ -17,7 +17,7 @@ from pydantic import BaseModel, BeforeValidator, Field, ValidationError
 
 from dsr.geometry.camera import Camera, RangeType
 from dsr.utils.files import read_array_header
-from dsr.utils.limits import (
+from dsr.utils.guards import (
     MOST_FILE,
     array_bytes,
     expect_bytes,

@@ -21,8 +21,7 @@ from dsr.io.pairs import Pair, words_of
 from dsr.io.photos import Size, model_in_exif, read_photo, same_aspect
 from dsr.io.reading import CameraChoice, Reading
 from dsr.sample import FARTHEST, NEAREST
-from dsr.utils.limits import pixels_beside
-from dsr.utils.paths import natural_key
+from dsr.utils.guards import natural_key, pixels_beside
 
 Kind = tuple[Path, str, str]
 """Folder, suffix and type of value: maps alike in them have one unit."""

@@ -34,8 +34,7 @@ from dsr.io.pairs import (
     role_of_words,
     words_of,
 )
-from dsr.utils.limits import MOST_TABLE, read_limited
-from dsr.utils.paths import natural_key, path_within
+from dsr.utils.guards import MOST_TABLE, natural_key, path_within, read_limited
 
 _DEPTH_LR = re.compile(r"(depth|disparity)_lr(\d+)")
 _TUM_UNIT = 1 / 5000

@@ -13,7 +13,7 @@ from typing import Literal
 from dsr.io.depth_files import READ_SUFFIXES
 from dsr.io.encoding import Assumption
 from dsr.io.frames import CONFIDENCE_SUFFIXES, CaptureFrame, ConfidenceMap, find_highest
-from dsr.utils.paths import natural_key
+from dsr.utils.guards import natural_key
 
 Role = Literal["rgb", "depth", "other"]
 PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".ppm")

@@ -11,10 +11,11 @@ Inverse depth for 3D Gaussian Splatting, and its scene where the capture has pos
 
 graphdeco's `train.py -d depths` reads ``depths/NAME.png`` of 16 bits beside ``images/NAME.*``, divides the values by
 65536, multiplies them by the ``scale`` of NAME in ``sparse/0/depth_params.json`` and adds its ``offset``; the result is
-compared with the rendered inverse depth, in the unit of the scene (https://github.com/graphdeco-inria/gaussian-splatting,
-"Depth regularization"). All frames have one scale here, since a frame whose scale is far from the others' is left out.
-The scene itself is COLMAP's text model (https://colmap.github.io/format.html): cameras, world-to-camera transforms with
-x right, y down, z forward, and points to start from. Its principal point is counted from the corner of the image.
+compared with the rendered inverse depth, in the unit of the scene
+(https://github.com/graphdeco-inria/gaussian-splatting, "Depth regularization"). All frames have one scale here, since a
+frame whose scale is far from the others' is left out. The scene itself is COLMAP's text model
+(https://colmap.github.io/format.html): cameras, world-to-camera transforms with x right, y down, z forward, and points
+to start from. Its principal point is counted from the corner of the image.
 
 A recording for the viewer of rerun: colour, depth and poses on a timeline of frames.
 
@@ -40,11 +41,11 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from dsr.geometry.camera import Camera
-from dsr.geometry.poses import is_rotation
+from dsr.geometry.rigid_motion import is_rotation
 from dsr.io.images import read_pixels
 from dsr.io.photos import write_png
 from dsr.utils.files import open_array, replacing, write_text
-from dsr.utils.limits import pixels_beside
+from dsr.utils.guards import pixels_beside
 
 RGBD = ("color.png", "depth.png", "intrinsic.json")
 MILLIMETRES = 1000

@@ -11,11 +11,10 @@ from pathlib import Path
 import numpy as np
 
 from dsr.geometry.camera import Camera
-from dsr.geometry.poses import Matrix, as_rigid, from_quaternion, is_rotation
+from dsr.geometry.rigid_motion import Matrix, as_rigid, from_quaternion, is_rotation
 from dsr.io.encoding import Assumption
 from dsr.io.pairs import Pair, time_of
-from dsr.utils.limits import read_limited
-from dsr.utils.parsing import parse_json
+from dsr.utils.guards import parse_json, read_limited
 
 _LARGEST_FILE = 256 << 20
 _MAX_GAP = 0.02

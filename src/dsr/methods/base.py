@@ -10,13 +10,12 @@ from typing import Any, ClassVar, Literal, NamedTuple
 import numpy as np
 from torch import Tensor
 
-from dsr.degradation.scales import SCALES
 from dsr.geometry.camera import Camera, RangeType
 from dsr.methods.inpainting import inpaint
 from dsr.methods.tiling import TILE, UNTILED
 from dsr.sample import DepthSample
 from dsr.utils.progress import Steps
-from dsr.utils.ratios import round_ratio
+from dsr.utils.ratios import SCALES, round_ratio
 
 
 class NoSolutionError(ValueError):

@@ -20,7 +20,6 @@ from omegaconf import DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from dsr.degradation.downsampling import Downsampling
-from dsr.degradation.scales import SCALES
 from dsr.methods.base import Abilities, Method
 from dsr.methods.networks.base import DisparityNetwork
 from dsr.methods.networks.published import load_msg_weights
@@ -29,6 +28,7 @@ from dsr.methods.networks.weight_choice import find_weights, has_weights
 from dsr.methods.networks.weight_files import is_dsr_weights, load_network, network_name, read_header
 from dsr.utils.builder import ConfigError, build, load_target
 from dsr.utils.config_files import config_directories, list_choices
+from dsr.utils.ratios import SCALES
 
 _NETWORK = "network"
 """Key of a method's node: the dotted path of the network's class, for a method whose weights come from a training."""

@@ -17,13 +17,13 @@ from torch.utils.tensorboard import SummaryWriter
 
 from dsr.evaluation.results import Run, formats_of, method_settings
 from dsr.evaluation.run_files import read_run
-from dsr.geometry.lights import LIGHT_NAMES
+from dsr.geometry.conventions import LIGHT_NAMES
 from dsr.geometry.shading import render
 from dsr.metrics.catalogue import KNOWN_FORMATS
 from dsr.metrics.formats import HEADLINES, LOOKS, MetricFormat, main_first
 from dsr.sample import DepthSample
+from dsr.utils.files import temporary_folder
 from dsr.utils.runs_table import list_run
-from dsr.utils.temporary import temporary_folder
 from dsr.viz.canvas import colours
 from dsr.viz.panels import normals_seen_by, reduced
 

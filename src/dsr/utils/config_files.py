@@ -7,7 +7,7 @@ from pathlib import Path
 
 import yaml
 
-from dsr.utils.limits import TooLargeError, read_limited
+from dsr.utils.guards import TooLargeError, read_limited
 
 _PACKAGE = Path(__file__).resolve().parents[1]
 _LARGEST = 2**20

@@ -17,7 +17,7 @@ import numpy as np
 
 from dsr.geometry.shading import VIEWING_LIGHT, VIEWING_TONES
 from dsr.utils.files import write_text
-from dsr.utils.limits import opened
+from dsr.utils.guards import opened
 from dsr.viewer.surfaces import Packed
 
 MARK = '<meta name="generator" content="dsr view">'

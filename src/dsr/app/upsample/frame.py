@@ -31,7 +31,7 @@ from dsr.io.encoding import Assumption
 from dsr.io.inputs import FolderUnits, Picture, read_picture
 from dsr.io.pairs import Pair
 from dsr.methods.base import MapNoise, Outliers, Surface
-from dsr.utils.parsing import readable
+from dsr.utils.guards import readable
 from dsr.utils.progress import Progress
 from dsr.utils.versions import package_versions
 

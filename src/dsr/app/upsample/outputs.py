@@ -21,8 +21,7 @@ from dsr.io.inputs import Picture
 from dsr.methods.base import Surface
 from dsr.sample import FARTHEST, NEAREST
 from dsr.utils.files import open_array, write_text
-from dsr.utils.limits import read_limited
-from dsr.utils.parsing import parse_json
+from dsr.utils.guards import parse_json, read_limited
 
 INFO = "info.json"
 _SHAPES = tuple(part.name for part in PARTS.values() if part.shape)

@@ -18,9 +18,7 @@ from dsr.geometry.camera import Camera
 from dsr.io.exports import INPUT, read_input
 from dsr.sample import expect_distances
 from dsr.utils.files import array_headers, open_array
-from dsr.utils.limits import read_limited
-from dsr.utils.parsing import is_number, parse_json
-from dsr.utils.paths import natural_key
+from dsr.utils.guards import is_number, natural_key, parse_json, read_limited
 from dsr.viewer.surfaces import ViewedResult
 
 _DEEPEST = 6

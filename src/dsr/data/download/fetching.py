@@ -30,17 +30,12 @@ from requests.adapters import HTTPAdapter
 from urllib3 import Retry
 from urllib3.exceptions import HTTPError
 
-from dsr.data.download.collection import Collection, Item
+from dsr.data.download.collections import Collection, Item
 from dsr.utils.console import one_line
-from dsr.utils.files import write_text
-from dsr.utils.hashing import file_hash
-from dsr.utils.limits import opened, read_limited
-from dsr.utils.parsing import parse_json
-from dsr.utils.paths import leads_outside, natural_key
-from dsr.utils.progress import Progress, Task
-from dsr.utils.space import FullDiskError, expect_space, space_for
-from dsr.utils.temporary import temporary_folder
-from dsr.utils.units import megabytes
+from dsr.utils.files import FullDiskError, expect_space, space_for, temporary_folder, write_text
+from dsr.utils.guards import leads_outside, natural_key, opened, parse_json, read_limited
+from dsr.utils.progress import Progress, Task, megabytes
+from dsr.utils.versions import file_hash
 
 RETRIES = Retry(
     3,

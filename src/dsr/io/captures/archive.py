@@ -19,7 +19,7 @@ import numpy as np
 
 from dsr.io.frames import Record
 from dsr.io.images import decode_pixels
-from dsr.utils.limits import read_limited, read_member
+from dsr.utils.guards import read_limited, read_member
 
 PHOTO_LIMIT = 1 << 26
 """Largest size in bytes of an encoded photo."""

@@ -38,8 +38,7 @@ from dsr.io.frames import HIGHEST_LEVEL, CaptureFrame, ConfidenceMap, Geometry
 from dsr.io.images import Pixels, read_numbers
 from dsr.io.pairs import Pair, PairingResult
 from dsr.io.trajectories import check_pose, describe_capture, intrinsics_camera, read_text
-from dsr.utils.limits import read_limited
-from dsr.utils.paths import natural_key
+from dsr.utils.guards import natural_key, read_limited
 from dsr.utils.validation import describe
 
 _ARKITSCENES = "ARKitScenes"

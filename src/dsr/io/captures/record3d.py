@@ -29,7 +29,7 @@ from dsr.io.encoding import Assumption
 from dsr.io.frames import HIGHEST_LEVEL, CaptureFrame, ConfidenceMap, Geometry
 from dsr.io.pairs import Pair, PairingResult
 from dsr.io.trajectories import describe_capture, intrinsics_camera, pose_from_quaternion
-from dsr.utils.paths import natural_key
+from dsr.utils.guards import natural_key
 from dsr.utils.validation import Whole, describe
 
 _APP = "Record3D"

@@ -1,7 +1,8 @@
 """Recordings of ROS 1 (``.bag``) and ROS 2 (a folder with ``metadata.yaml``), read by the package rosbags.
 
-Messages of sensor_msgs: Image, CompressedImage and CameraInfo, http://docs.ros.org/en/api/sensor_msgs/html/index-msg.html;
-depth is in millimetres as whole numbers and in metres as floats, https://ros.org/reps/rep-0118.html.
+Messages of sensor_msgs: Image, CompressedImage and CameraInfo,
+http://docs.ros.org/en/api/sensor_msgs/html/index-msg.html; depth is in millimetres as whole numbers and in metres as
+floats, https://ros.org/reps/rep-0118.html.
 
 Of the topics of depth one named *aligned* or *registered* is taken before others, then one with more messages, then the
 first by name; of those of colour one named *color*, *colour* or *rgb*, then the same. The photo's camera is that of the
@@ -33,8 +34,7 @@ from dsr.io.frames import CaptureFrame, Geometry, Record
 from dsr.io.images import decode_pixels
 from dsr.io.pairs import Pair, PairingResult, match_times
 from dsr.io.trajectories import intrinsics_camera
-from dsr.utils.limits import MOST_TEXT, expect_bytes
-from dsr.utils.paths import natural_key, path_within
+from dsr.utils.guards import MOST_TEXT, expect_bytes, natural_key, path_within
 
 _IMAGE, _COMPRESSED, _INFO = (f"sensor_msgs/msg/{name}" for name in ("Image", "CompressedImage", "CameraInfo"))
 _UNITS = {"u": 1e-3, "f": 1.0}

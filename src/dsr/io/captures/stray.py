@@ -35,8 +35,8 @@ from dsr.io.frames import HIGHEST_LEVEL, CaptureFrame, ConfidenceMap, Geometry, 
 from dsr.io.images import quiet_decoders
 from dsr.io.pairs import PHOTO_SUFFIXES, Pair, PairingResult
 from dsr.io.trajectories import describe_capture, intrinsics_camera, pose_from_quaternion, read_text
-from dsr.utils.hashing import file_hash
-from dsr.utils.limits import expect_pixels
+from dsr.utils.guards import expect_pixels
+from dsr.utils.versions import file_hash
 
 _APP = "Stray Scanner"
 _POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")

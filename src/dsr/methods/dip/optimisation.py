@@ -13,7 +13,7 @@ import torchmetrics
 from torch import Tensor, nn
 from torch.nn import functional
 
-from dsr.geometry.comparison import comparison
+from dsr.geometry.shading import comparison
 from dsr.methods.dip.problem import ImageProblem, PriorObjective
 from dsr.methods.dip.skip_net import Padding, SkipNet, levels_for
 from dsr.methods.dip.stopping import Stopping

@@ -33,12 +33,10 @@ from dsr.methods.networks.trained import TrainedNetwork
 from dsr.methods.noise import estimate_noise, normal_noise_deg
 from dsr.metrics.visual_loss import VisualLossName, make_visual_loss
 from dsr.sample import DepthSample
-from dsr.utils.checkpoints import Interruption
-from dsr.utils.divergence import Divergence, DivergenceError
+from dsr.utils.checkpoints import Divergence, DivergenceError, Interruption
 from dsr.utils.lightning import ListedScores, Log, StepProgress, ValidationTable, fit, make_trainer
-from dsr.utils.progress import Progress, Steps, StepsProgress
+from dsr.utils.progress import Progress, Steps, StepsProgress, duration
 from dsr.utils.runs_table import list_run
-from dsr.utils.units import duration
 
 _SECONDS_BETWEEN_CHECKPOINTS = 60.0
 _ADVICE = "a lower method.learning_rate may help"

@@ -26,9 +26,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from dsr.degradation.scales import check_scale
 from dsr.methods.classical.finite_differences import grey, upsample_linear_border
 from dsr.methods.networks.base import Answer, NormalisedNetwork, expect_rgb_size
+from dsr.utils.ratios import check_scale
 
 _HALVINGS = 2
 _BLOCKS = 2

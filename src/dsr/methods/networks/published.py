@@ -17,11 +17,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dsr.degradation.scales import SCALES
 from dsr.methods.networks.msg_guidance import VariantName
 from dsr.methods.networks.msg_net import MSGNet
 from dsr.methods.networks.weight_files import load_parameters, read_torch_file
-from dsr.utils.limits import MOST_FILE, read_limited
+from dsr.utils.guards import MOST_FILE, read_limited
+from dsr.utils.ratios import SCALES
 
 TORCH_MAGIC = (b"PK\x03\x04", b"\x80")
 PARTS = ("conv.weight", "conv.bias", "activation.weight")

@@ -28,9 +28,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from dsr.degradation.scales import check_scale
 from dsr.methods.exportable import pad_to_multiple
 from dsr.methods.networks.base import RangeNetwork, expect_rgb_size
+from dsr.utils.ratios import check_scale
 
 _STRIDE = 32
 """The photo's pixels, along an axis, for each pixel of the encoder's result."""

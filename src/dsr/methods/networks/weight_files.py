@@ -14,8 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from dsr.methods.networks.base import DisparityNetwork
-from dsr.utils.limits import expect_bytes, expect_stored, opened
-from dsr.utils.parsing import parse_json
+from dsr.utils.guards import expect_bytes, expect_stored, opened, parse_json
 
 FORMAT = "dsr-network-1"
 _KEY = "dsr"

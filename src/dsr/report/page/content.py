@@ -13,7 +13,7 @@ import pandas as pd
 from dsr.evaluation.results import BenchmarkSetting, Results, Run
 from dsr.metrics.formats import Formats
 from dsr.report.tables import average_of, in_shown_units, paper_row
-from dsr.utils.paths import natural_key
+from dsr.utils.guards import natural_key
 
 _FOLDERS = {"tables": (".csv", ".md", ".tex"), "metrics": (".csv",), "figures": (".pdf",)}
 """Folders beside the page with files to link to, and their suffixes."""

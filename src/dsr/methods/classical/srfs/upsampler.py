@@ -47,7 +47,7 @@ from dsr.methods.classical.finite_differences import upsample_linear_border
 from dsr.methods.classical.srfs.admm import ShadingProblem, ShadingSolver, Weights
 from dsr.methods.inpainting import inpaint
 from dsr.sample import DepthSample
-from dsr.utils.limits import MOST_FILE, expect_pixels, pixels_beside, read_limited
+from dsr.utils.guards import MOST_FILE, expect_pixels, pixels_beside, read_limited
 from dsr.utils.picture_headers import picture_size
 from dsr.utils.progress import Steps
 

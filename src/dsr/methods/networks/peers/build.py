@@ -21,7 +21,7 @@ from dsr.methods.networks.peers.files import load_peer
 from dsr.methods.networks.peers.pgsr import PGSR
 from dsr.methods.networks.peers.svlrm import SVLRM
 from dsr.methods.networks.weight_choice import nearest_scale
-from dsr.utils.hashing import file_hash
+from dsr.utils.versions import file_hash
 
 PEERS: MappingProxyType[str, type[PeerNetwork]] = MappingProxyType(
     {"dctnet": DCTNet, "dornet": DORNet, "fdkn": FDKN, "pgsr": PGSR, "svlrm": SVLRM}

@@ -24,19 +24,22 @@ from torch import Tensor
 from torch.nn import functional
 
 from dsr.degradation.downsampling import Downsampling
-from dsr.degradation.draws import chance, draw, normal, uniform
 from dsr.degradation.glass import add_glass
 from dsr.degradation.hints import KERNELS, Hints, encode_facts, local_noise
-from dsr.degradation.random_holes import HOLES
-from dsr.degradation.random_noise import NOISES
-from dsr.degradation.random_scenes import (
+from dsr.degradation.holes import HOLES
+from dsr.degradation.random_fields import (
     add_folds,
     add_relief,
+    chance,
     displace,
+    draw,
+    normal,
     print_pattern,
     round_values,
     take_another_photo,
+    uniform,
 )
+from dsr.degradation.random_noise import NOISES
 from dsr.geometry.camera import Camera
 from dsr.sample import AllHolesError, DepthSample, Scene
 

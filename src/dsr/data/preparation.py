@@ -18,14 +18,12 @@ from typing import Any
 
 import torch
 
-from dsr.data.base import SceneSelection, select_scenes
-from dsr.data.preparation.inpainting import inpaint_depth
-from dsr.data.preparation.resizing import fit
+from dsr.data.reference_depth import fit, inpaint_depth
+from dsr.data.scene_source import SceneSelection, select_scenes
 from dsr.sample import Scene
 from dsr.synthetic.rendering import Rendering, cache_directory, load_or_render
-from dsr.utils.hashing import file_hash
 from dsr.utils.progress import SILENT
-from dsr.utils.versions import SCENES
+from dsr.utils.versions import SCENES, file_hash
 
 _MIN_SIZE = 32
 _MAX_LISTED = 30
@@ -121,7 +119,7 @@ class Preparation:
         crop: position of a square window along the longer side, from 0 (top or left) to 1 (bottom or right); None for
             no window.
         enlarge: whether smaller scenes are enlarged.
-        fill: names of the scenes whose holes are inpainted; see :mod:`dsr.data.preparation.inpainting`.
+        fill: names of the scenes whose holes are inpainted; see :mod:`dsr.data.reference_depth`.
 
     Raises:
         ValueError: a value is out of range.
@@ -205,7 +203,7 @@ class PreparedDataset:
         return list(self._scenes)
 
     def load(self, scene: str) -> Scene:
-        """Return one scene; see :class:`dsr.data.base.SceneSource`."""
+        """Return one scene; see :class:`dsr.data.scene_source.SceneSource`."""
         record = self._found[scene]
         notes = (record.note,) if record.note else ()
         if self._preparation.size is None and scene not in self._preparation.fill:

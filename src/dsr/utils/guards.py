@@ -1,4 +1,4 @@
-"""How much a file may make of itself in memory: sizes are read from headers and checked before any content is.
+"""Guards against hostile files: how much one may make of itself in memory, and what its numbers, JSON and names may be.
 
 A few kilobytes of compressed zeros declare gigabytes. What is allowed grows with what can explain it: a map's size with
 its photo's, otherwise the unpacked size with the size of the file. Real photos and maps stay far below.
@@ -8,12 +8,16 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import json
 import math
 import os
+import re
 import zipfile
 from collections.abc import Iterator
 from io import BufferedReader
-from pathlib import Path
+from numbers import Real
+from pathlib import Path, PurePath, PurePosixPath
+from typing import Any, NoReturn, TypeGuard
 
 MOST_PIXELS = 1 << 27
 """Largest number of pixels of a photo or map, 134 megapixels."""
@@ -33,9 +37,18 @@ _PER_PHOTO, _FLOOR = 4, 1 << 22
 """Pixels of a map for each of its photo's, and pixels that any photo explains."""
 _CHUNK = 1 << 20
 
+_MOST_DIGITS = 300
+"""Digits of a whole number that a float can still hold."""
+
+_LONGEST = 100
+"""Characters of a name that a message shows."""
+_TURNS = re.compile("([0-9]+|/)")
+NaturalKey = tuple[tuple[str | tuple[int, str], ...], str]
+"""Texts and numbers of a name in turns, numbers as their number of digits and the digits, ``/`` as -1; and the name."""
+
 
 class TooLargeError(ValueError):
-    """A file or what its header declares is larger than :mod:`dsr.utils.limits` allows."""
+    """A file or what its header declares is larger than :mod:`dsr.utils.guards` allows."""
 
 
 def expect_pixels(place: str | Path, height: int, width: int, most: int = MOST_PIXELS) -> None:
@@ -152,3 +165,98 @@ def read_member(packed: zipfile.ZipFile, name: str) -> bytes:
     if length != declared:
         raise zipfile.BadZipFile(f"{name}: {length} bytes instead of {declared}")
     return b"".join(parts)
+
+
+def is_number(value: Any) -> TypeGuard[float]:
+    """Return whether a value is a finite number; true and false are none, and neither is 10**400."""
+    if isinstance(value, bool) or not isinstance(value, Real):
+        return False
+    try:
+        return math.isfinite(value)
+    except OverflowError:
+        return False
+
+
+def readable(name: str) -> str:
+    """Return a file's name as text: bytes that are no UTF-8, which Python reads as surrogates, are escaped."""
+    return name.encode(errors="backslashreplace").decode()
+
+
+def parse_json(text: str | bytes, *, finite: bool = True) -> Any:
+    """Return what JSON holds: Python's reader, without what is no JSON or cannot be computed with.
+
+    Args:
+        text: the JSON.
+        finite: whether NaN and infinity, which Python writes and JSON does not have, are refused.
+
+    Raises:
+        ValueError: it is no JSON, is nested too deeply, or has a number that no float can hold.
+
+    """
+    only: Any = {"parse_constant": _refuse, "parse_float": _parse_float} if finite else {}
+    try:
+        return json.loads(text, parse_int=_parse_int, **only)
+    except RecursionError:
+        raise ValueError("nested too deeply") from None
+
+
+def _refuse(text: str) -> NoReturn:
+    raise ValueError(f"expected finite numbers, got {text[:20]}")
+
+
+def _parse_int(text: str) -> int:
+    if len(text) > _MOST_DIGITS:
+        _refuse(text)
+    return int(text)
+
+
+def _parse_float(text: str) -> float:
+    value = float(text)
+    if math.isinf(value):
+        _refuse(text)
+    return value
+
+
+class OutsideError(ValueError):
+    """A name in a file leads out of the folder that it belongs to."""
+
+
+def leads_outside(name: str) -> bool:
+    """Return whether a name leads out of its folder on any system: absolute, with ``..``, of a drive, or with NUL."""
+    path = PurePosixPath(name.replace("\\", "/"))
+    return path.is_absolute() or ".." in path.parts or "\0" in name or re.match("[A-Za-z]:", name) is not None
+
+
+def path_within(folder: Path, name: str, source: object, form: str = "{}") -> Path:
+    """Return the path of a file that another file names, which has to lie in a folder or below it.
+
+    The folder may be a link; links that the name leads through may not lead out of it.
+
+    Args:
+        folder: the folder.
+        name: the name, from the folder on.
+        source: what gives the name, such as ``FILE: line 3``, for the message.
+        form: the path that the name is a part of, from the folder on, with ``{}`` for the name.
+
+    Raises:
+        OutsideError: the name leads out of the folder; the message begins with ``source``.
+
+    """
+    expected = f"{source}: expected a name within {folder}, got {name[:_LONGEST]!r}"
+    if leads_outside(name):
+        raise OutsideError(expected)
+    path = folder / form.format(name)
+    real = Path(os.path.realpath(path))  # unlike resolve, it takes loops
+    if not real.is_relative_to(os.path.realpath(folder)):
+        raise OutsideError(f"{expected}, a link to {real}; name the folder that has the files themselves, or copy them")
+    return path
+
+
+def natural_key(name: str | PurePath) -> NaturalKey:
+    """Return a key that sorts names, or paths folder by folder, with the numbers in them by value: 2 before 10."""
+    text = str(name).replace(os.sep, "/")
+    parts: list[str | tuple[int, str]] = list(_TURNS.split(text))
+    for place in range(1, len(parts), 2):
+        digits = str(parts[place]).lstrip("0")
+        parts[place] = (-1, "") if digits == "/" else (len(digits), digits)
+    return tuple(parts), text

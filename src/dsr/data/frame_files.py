@@ -17,8 +17,7 @@ from torch import Tensor
 from dsr.geometry.camera import ASSUMED_FOV, Camera
 from dsr.io.images import read_pixels
 from dsr.sample import Scene
-from dsr.utils.limits import MOST_FILE, read_limited
-from dsr.utils.paths import natural_key
+from dsr.utils.guards import MOST_FILE, natural_key, read_limited
 
 NO_CAMERA = f"no camera is published: {ASSUMED_FOV:g} degrees of horizontal view are assumed"
 """Note of scenes whose camera is :meth:`dsr.geometry.camera.Camera.from_fov`."""

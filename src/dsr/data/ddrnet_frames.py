@@ -20,9 +20,9 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from dsr.data.base import SceneSelection
-from dsr.data.formats.shared import expect_size, find_beside, name_of, read_millimetres, read_picture
-from dsr.data.preparation.dataset import Preparation, PreparedDataset, list_frames, make_records
+from dsr.data.frame_files import expect_size, find_beside, name_of, read_millimetres, read_picture
+from dsr.data.preparation import Preparation, PreparedDataset, list_frames, make_records
+from dsr.data.scene_source import SceneSelection
 from dsr.geometry.camera import Camera
 from dsr.sample import Scene
 

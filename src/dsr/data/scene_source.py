@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import Literal, Protocol, runtime_checkable
 
 from dsr.sample import Scene
-from dsr.utils.parsing import readable
+from dsr.utils.guards import readable
 from dsr.utils.progress import Progress
 
 SceneSelection = Sequence[str] | Literal["found"] | None

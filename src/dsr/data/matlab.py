@@ -17,7 +17,7 @@ import h5py
 import numpy as np
 
 from dsr.utils.console import one_line
-from dsr.utils.limits import read_limited
+from dsr.utils.guards import read_limited
 
 _LARGEST = 1 << 25
 """Largest number of elements that the matrices of a file may have together."""
