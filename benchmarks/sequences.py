@@ -41,9 +41,9 @@ from dsr.methods.base import Surface
 from dsr.metrics.functional import SurfacePair, rmse_v
 from dsr.metrics.sensor import SensorComparison
 from dsr.sample import Scene
-from dsr.synthetic.procedural.scenes import make_camera, random_scene, render
+from dsr.synthetic.procedural.random_scene import make_camera, random_scene, render
 from dsr.synthetic.raycast import shade
-from dsr.synthetic.simgeo.scenes import build_scene
+from dsr.synthetic.simgeo import build_scene
 
 NOISES: dict[str, Callable[[], Noise]] = {"kinect": Kinect, "tof": TimeOfFlight}
 SOLIDS = ("cube_no_texture", "cube_high_freq", "sphere_cylinder_low_freq", "sphere_cylinder_high_freq")

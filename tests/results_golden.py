@@ -47,14 +47,14 @@ from dsr.geometry.shading import render, render_for_viewing
 from dsr.geometry.surface import depth_to_normals
 from dsr.geometry.warping import warp_depth
 from dsr.inference.any_ratio import upsample_surface
-from dsr.inference.outliers import find_outliers, within_measured
+from dsr.inference.plausibility import find_outliers, within_measured
 from dsr.inference.sequences import View, fuse_views
 from dsr.inference.working_size import find_noise, find_sensor
 from dsr.methods.inpainting import inpaint
 from dsr.methods.networks.facets_unet import FacetsUNet
 from dsr.methods.networks.msg_net import MSGNet
-from dsr.methods.networks.weight_choice import packaged_names, packaged_weights
-from dsr.methods.noise import estimate_noise, estimate_sensor_noise
+from dsr.methods.networks.weight_files import packaged_names, packaged_weights
+from dsr.methods.noise_level import estimate_noise, estimate_sensor_noise
 from dsr.methods.recipe import Known, Run, list_methods, read_recipe
 from dsr.sample import Scene
 from dsr.training.degradation import Degradation, to_tensors

@@ -24,8 +24,8 @@ from dsr.data.scene_source import SceneSource
 from dsr.degradation.downsampling import Downsampling, make_sample
 from dsr.geometry.camera import RangeType
 from dsr.methods.base import Method
-from dsr.methods.classical.cubic_convolution import CubicConvolution
-from dsr.methods.networks.peers.build import Peer
+from dsr.methods.classical.interpolation import CubicConvolution
+from dsr.methods.networks.peers.peer import Peer
 from dsr.metrics.catalogue import catalogue, score_image
 from dsr.metrics.formats import HEADLINES
 

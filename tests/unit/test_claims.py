@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from dsr.evaluation import claims as claims_module
-from dsr.evaluation.claims import LOST, Claims
+from dsr.evaluation import sharing as claims_module
+from dsr.evaluation.sharing import LOST, Claims
 from dsr.utils.files import birth, machine
 
 FORK = multiprocessing.get_context("fork")

@@ -18,7 +18,7 @@ from dsr.data.tofmark import ToFMark
 from dsr.degradation.downsampling import Downsampling
 from dsr.methods.recipe import read_recipe
 from dsr.report.tables import published_row
-from dsr.synthetic.simgeo.scenes import SCENES as SIMGEO_SCENES
+from dsr.synthetic.simgeo import SCENES as SIMGEO_SCENES
 from dsr.training.data_module import Part, PatchData
 from dsr.training.degradation import Degradation
 from dsr.training.settings import PatchSettings

@@ -27,7 +27,7 @@ from dsr.inference import upsample_surface
 from dsr.methods.networks.facets_unet import FacetsUNet
 from dsr.methods.networks.msg_net import MSGNet
 from dsr.methods.networks.pdn import PrimalDualNetwork
-from dsr.methods.networks.peers.build import PEERS
+from dsr.methods.networks.peers.peer import PEERS
 from dsr.methods.recipe import Run, list_methods, read_recipe
 from dsr.metrics import losses
 from dsr.metrics.catalogue import PROTOCOLS, catalogue, score_image

@@ -19,9 +19,9 @@ from dsr.doctor.finding import length, with_depth
 from dsr.geometry.camera import Camera, from_range, to_range
 from dsr.io.images import read_map, read_rgb
 from dsr.sample import Scene
-from dsr.synthetic.procedural.scenes import render_random_scene
-from dsr.synthetic.simgeo.scenes import render_scene
-from dsr.synthetic.surfaces import rotation
+from dsr.synthetic.procedural.random_scene import render_random_scene
+from dsr.synthetic.ray_surfaces import rotation
+from dsr.synthetic.simgeo import render_scene
 
 SIZE = 256
 CAMERA = Camera(SIZE, SIZE, 240.0, 240.0, 127.5, 127.5, baseline=0.2)

@@ -18,10 +18,10 @@ from dsr.geometry.camera import Camera
 from dsr.geometry.resampling import resize_inverse_depth
 from dsr.inference import Plan, plan_for, upsample_surface, upsampler
 from dsr.inference import api as people
-from dsr.inference.inspection import enlarged_by
 from dsr.inference.plans import OWN_SIZE
 from dsr.inference.resizing import resize_nearest
-from dsr.methods.networks.weight_choice import find_weights
+from dsr.inference.working_size import enlarged_by
+from dsr.methods.networks.weight_files import find_weights
 from dsr.methods.recipe import list_methods, read_recipe
 
 

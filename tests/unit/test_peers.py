@@ -17,12 +17,11 @@ from torch import Tensor, nn
 from dsr.geometry.camera import Camera, from_range
 from dsr.methods.base import Cost
 from dsr.methods.inpainting import inpaint
-from dsr.methods.networks.maps import resize_bicubic
-from dsr.methods.networks.peers.base import PeerNetwork, PeerUpsampler
-from dsr.methods.networks.peers.build import PEERS, Peer
-from dsr.methods.networks.peers.files import fold_batch_norm, load_peer
-from dsr.methods.networks.peers.svlrm import SVLRM
-from dsr.methods.networks.weight_choice import find_weights, has_weights, nearest_scale
+from dsr.methods.networks.normalisation import resize_bicubic
+from dsr.methods.networks.peers.local_filters import SVLRM
+from dsr.methods.networks.peers.peer import PEERS, Peer
+from dsr.methods.networks.peers.peer_network import PeerNetwork, PeerUpsampler, fold_batch_norm, load_peer
+from dsr.methods.networks.weight_files import find_weights, has_weights, nearest_scale
 from dsr.methods.recipe import read_recipe
 from dsr.sample import DepthSample
 from dsr.utils.builder import ConfigError

@@ -14,7 +14,7 @@ import pytest
 
 from dsr.data import rendered as module
 from dsr.data.rendered import Procedural
-from dsr.synthetic.procedural.scenes import render_random_scene
+from dsr.synthetic.procedural.random_scene import render_random_scene
 
 SIZE = 48
 

@@ -9,7 +9,7 @@ import pytest
 from dsr.data import rendered
 from dsr.data.rendered import SimGeo
 from dsr.synthetic.rendering import cache_directory
-from dsr.synthetic.simgeo.scenes import SCENES, render_scene
+from dsr.synthetic.simgeo import SCENES, render_scene
 
 SIZE = 64
 NAME = "cube_no_texture"

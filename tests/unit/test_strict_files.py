@@ -26,8 +26,8 @@ from dsr.io.captures.arkit import find_polycam
 from dsr.io.captures.record3d import find_record3d
 from dsr.io.images import read_camera
 from dsr.io.trajectories import read_transform
-from dsr.methods.networks.peers.files import read_tensors
-from dsr.methods.networks.published import read_msg_weights
+from dsr.methods.networks.peers.peer_network import read_tensors
+from dsr.methods.networks.trained import read_msg_weights
 from dsr.sample import FARTHEST, NEAREST, DepthSample, Scene
 from dsr.user_study.answers import read_all
 from dsr.user_study.key import Candidate, Key, Trial, read_key, write_key

@@ -11,13 +11,19 @@ import torch
 from safetensors.torch import save_file
 from torch import Tensor
 
-from dsr.methods.networks.base import DisparityNetwork
 from dsr.methods.networks.facets import Facets
 from dsr.methods.networks.msg_net import MSGNet
+from dsr.methods.networks.network import DisparityNetwork
 from dsr.methods.networks.sparse_to_dense import SparseToDense
 from dsr.methods.networks.trained import NETWORKS, TrainedNetwork
-from dsr.methods.networks.weight_choice import packaged_names, packaged_weights
-from dsr.methods.networks.weight_files import is_dsr_weights, load_network, read_header, save_network
+from dsr.methods.networks.weight_files import (
+    is_dsr_weights,
+    load_network,
+    packaged_names,
+    packaged_weights,
+    read_header,
+    save_network,
+)
 
 NETS = {
     "msg": lambda: MSGNet(2, "dsr"),

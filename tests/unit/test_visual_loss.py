@@ -15,9 +15,9 @@ from dsr.degradation.downsampling import Downsampling, make_sample
 from dsr.geometry.camera import Camera
 from dsr.methods.dip.problem import ImageProblem, PriorObjective
 from dsr.methods.dip.upsampler import DeepImagePrior
-from dsr.methods.networks.base import Answer
-from dsr.methods.networks.maps import mean3x3
 from dsr.methods.networks.msg_net import MSGNet
+from dsr.methods.networks.network import Answer
+from dsr.methods.networks.normalisation import mean3x3
 from dsr.metrics.functional import SurfacePair, dssim_v, mse_v
 from dsr.metrics.lpips import LPIPS, lpips_v
 from dsr.metrics.visual_loss import MSE_V, VisualLoss, VisualLossName, make_visual_loss, match_weight

@@ -35,7 +35,7 @@ from dsr.app.trainer import (
 )
 from dsr.app.training_runs import WEIGHTS, common, keyed, read_config, training_data
 from dsr.data.scene_source import SceneSource, prepare_scenes
-from dsr.methods.networks.base import DisparityNetwork
+from dsr.methods.networks.network import DisparityNetwork
 from dsr.methods.networks.trained import NETWORKS
 from dsr.methods.networks.weight_files import load_network, network_name, read_torch_file, save_network
 from dsr.metrics.visual_loss import make_visual_loss

@@ -14,9 +14,9 @@ from pathlib import Path
 from dsr.data.folder import Folder
 from dsr.data.scene_source import SceneSelection, select_scenes
 from dsr.sample import Scene
-from dsr.synthetic.procedural.scenes import PROCEDURAL_VERSION, render_random_scene
+from dsr.synthetic.procedural.random_scene import PROCEDURAL_VERSION, render_random_scene
 from dsr.synthetic.rendering import cache_directory, load_or_render
-from dsr.synthetic.simgeo.scenes import SCENES, SCENES_VERSION, render_scene
+from dsr.synthetic.simgeo import SCENES, SCENES_VERSION, render_scene
 from dsr.utils.pool import LOST, Pool
 from dsr.utils.progress import SILENT
 

@@ -27,8 +27,7 @@ from dsr.data.scene_source import SceneSource
 from dsr.degradation.downsampling import Downsampling, Measured, make_sample
 from dsr.degradation.holes import Holes
 from dsr.degradation.noise import Noise
-from dsr.evaluation.claims import Claims
-from dsr.evaluation.sharing import ALONE, Workers, share
+from dsr.evaluation.sharing import ALONE, Claims, Workers, share
 from dsr.evaluation.store import iterations_path, prediction_path, sample_path
 from dsr.methods.base import Method, NoSolutionError, expect_some_depth
 from dsr.sample import DepthSample

@@ -12,9 +12,8 @@ import pandas as pd
 import torch
 from torch import Tensor
 
-from dsr.evaluation.claims import Claims
 from dsr.evaluation.predict import Evaluation, Outcome, failure_line
-from dsr.evaluation.sharing import ALONE, Workers, share
+from dsr.evaluation.sharing import ALONE, Claims, Workers, share
 from dsr.evaluation.store import load_prediction, prediction_path, sample_path
 from dsr.metrics.catalogue import Metric, score_image
 from dsr.metrics.formats import HEADLINES

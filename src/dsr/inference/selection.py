@@ -8,10 +8,10 @@ from pathlib import Path
 import torch
 
 from dsr.inference.any_ratio import AnyRatio
-from dsr.inference.options import Fill
+from dsr.inference.defaults import Fill
 from dsr.inference.plans import steps_of
 from dsr.methods.base import Method
-from dsr.methods.networks.weight_choice import has_weights
+from dsr.methods.networks.weight_files import has_weights
 from dsr.methods.recipe import Recipe, Run
 from dsr.utils.builder import ConfigError
 

@@ -8,7 +8,7 @@ from functools import lru_cache
 import numpy as np
 from scipy.ndimage import map_coordinates
 
-from dsr.synthetic.surfaces import Array, Cylinder, Field, rotation
+from dsr.synthetic.ray_surfaces import Array, Cylinder, Field, rotation
 
 CLAY = ((0.06, 0.07, 0.13), (0.10, 0.26, 0.30), (0.72, 0.64, 0.48), (0.70, 0.28, 0.12), (0.36, 0.09, 0.07))
 CLOUD = ((0.45, 0.10, 0.16), (0.80, 0.30, 0.12), (0.85, 0.72, 0.42), (0.55, 0.62, 0.30), (0.10, 0.36, 0.30))

@@ -31,10 +31,10 @@ from torch.nn import functional
 
 from dsr.geometry.camera import from_range, to_range
 from dsr.methods.base import Abilities, Cost, Method, expect_limits, whole_scale
-from dsr.methods.classical.convergence import CHECK_EVERY, Movement, history_of
 from dsr.methods.classical.finite_differences import box_mean, extend_linearly, upsample_linear_border
+from dsr.methods.classical.iterations import CHECK_EVERY, Movement, history_of
 from dsr.methods.inpainting import inpaint
-from dsr.methods.networks.maps import compute_min_max, normalise
+from dsr.methods.networks.normalisation import compute_min_max, normalise
 from dsr.sample import DepthSample
 from dsr.utils.progress import Steps
 

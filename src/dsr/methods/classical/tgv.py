@@ -35,7 +35,6 @@ from torch import Tensor
 
 from dsr.geometry.camera import from_range
 from dsr.methods.base import Abilities, Cost, Method, expect_limits, whole_scale
-from dsr.methods.classical.convergence import CHECK_EVERY, Movement, history_of
 from dsr.methods.classical.finite_differences import (
     box_mean,
     divergence,
@@ -45,9 +44,10 @@ from dsr.methods.classical.finite_differences import (
     sum_adjacent,
     upsample_linear_border,
 )
+from dsr.methods.classical.iterations import CHECK_EVERY, Movement, history_of
 from dsr.methods.inpainting import inpaint
-from dsr.methods.networks.maps import normalise
-from dsr.methods.noise import estimate_sensor_noise
+from dsr.methods.networks.normalisation import normalise
+from dsr.methods.noise_level import estimate_sensor_noise
 from dsr.sample import DepthSample
 from dsr.utils.progress import Steps
 

@@ -12,7 +12,7 @@ from typing import Literal, Protocol
 import torch
 from torch import Tensor
 
-from dsr.methods.noise import estimate_noise
+from dsr.methods.noise_level import estimate_noise
 
 StoppingName = Literal["fixed", "variance", "residual", "oracle"]
 _EVERY = 20

@@ -23,14 +23,13 @@ from torch.utils.data import DataLoader
 
 from dsr.degradation.downsampling import Downsampling, scene_generator
 from dsr.methods.base import WORKSPACE, Abilities, Cost, Method
-from dsr.methods.dip.callbacks import Provenance, checkpoint_of, cost_of_step
-from dsr.methods.dip.optimisation import PriorOptimisation, PriorSettings
+from dsr.methods.dip.optimisation import PriorOptimisation, PriorSettings, Provenance, checkpoint_of, cost_of_step
 from dsr.methods.dip.problem import DataLoss, ImageProblem, PriorObjective
 from dsr.methods.dip.skip_net import Padding
 from dsr.methods.dip.stopping import Fixed, Oracle, Residual, Stopping, StoppingName, Variance
-from dsr.methods.networks.base import DTYPES, Precision
+from dsr.methods.networks.network import DTYPES, Precision
 from dsr.methods.networks.trained import TrainedNetwork
-from dsr.methods.noise import estimate_noise, normal_noise_deg
+from dsr.methods.noise_level import estimate_noise, normal_noise_deg
 from dsr.metrics.visual_loss import VisualLossName, make_visual_loss
 from dsr.sample import DepthSample
 from dsr.utils.checkpoints import Divergence, DivergenceError, Interruption

@@ -27,7 +27,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from dsr.methods.classical.finite_differences import grey, upsample_linear_border
-from dsr.methods.networks.base import Answer, NormalisedNetwork, expect_rgb_size
+from dsr.methods.networks.network import Answer, NormalisedNetwork, expect_rgb_size
 from dsr.utils.ratios import check_scale
 
 _HALVINGS = 2

@@ -23,8 +23,8 @@ import torch
 from torch import Tensor, nn
 
 from dsr.methods.exportable import pad_to_multiple
-from dsr.methods.networks.base import DisparityNetwork
 from dsr.methods.networks.facets_unet import FacetsUNet
+from dsr.methods.networks.network import DisparityNetwork
 from dsr.utils.files import replacing
 
 INPUTS = ("photo", "inverse_depth", "valid")

@@ -29,7 +29,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from dsr.methods.exportable import pad_to_multiple
-from dsr.methods.networks.base import RangeNetwork, expect_rgb_size
+from dsr.methods.networks.network import RangeNetwork, expect_rgb_size
 from dsr.utils.ratios import check_scale
 
 _STRIDE = 32

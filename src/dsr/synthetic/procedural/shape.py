@@ -1,6 +1,6 @@
 """Triangle meshes with normals and paint coordinates, and general functions that make them.
 
-A shape stands for the curved surface that its vertex normals define (see :mod:`dsr.synthetic.procedural.tracer`), so
+A shape stands for the curved surface that its vertex normals define (see :mod:`dsr.synthetic.procedural.lighting`), so
 the vertices of sharp edges occur twice, with different normals. Local frames have z up; lengths are in metres.
 """
 
@@ -13,7 +13,7 @@ import mapbox_earcut
 import numpy as np
 from numpy.typing import NDArray
 
-from dsr.synthetic.surfaces import Array
+from dsr.synthetic.ray_surfaces import Array
 
 Index = NDArray[np.intp]
 

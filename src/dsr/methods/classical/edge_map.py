@@ -6,7 +6,7 @@ the true ones. The candidates of each patch of edges in the upsampled map are th
 random field selects one of them: its data term is the squared distance of the patches' distance
 transforms plus ``sharp_weight``^2 times that of the sharp edges, by the number of pixels, and its smoothness term the
 squared difference of the true patches where two patches overlap. Loopy belief propagation finds the labels
-(:mod:`dsr.methods.classical.eg.belief_propagation`). The mean of the chosen patches, where it is above ``KEPT``, is the
+(:mod:`dsr.methods.classical.edge_patches`). The mean of the chosen patches, where it is above ``KEPT``, is the
 edge map.
 
 As in the original: patches of 11 x 11 pixels in the self-similar mode, 5 candidates, weight 3, 100 iterations, a mean
@@ -31,15 +31,16 @@ from torch import Tensor
 from torch.nn import functional
 
 from dsr.methods.base import NoSolutionError
-from dsr.methods.classical.eg.belief_propagation import Labelling, label
-from dsr.methods.classical.eg.patches import (
+from dsr.methods.classical.edge_patches import (
     PATCH,
+    Labelling,
     Patches,
     average_patches,
     deduplicate,
     extract_patches,
     find_nearest,
     find_overlaps,
+    label,
     no_patches,
     orient,
 )

@@ -19,8 +19,8 @@ from dsr.degradation.hints import encode_facts, local_noise, relative_error
 from dsr.geometry.hole_size import degrees_per_pixel, distance_to_known
 from dsr.geometry.resampling import pad_inverse_depth, resize_inverse_depth
 from dsr.methods.base import Abilities, Cost, InverseSample, InverseSurface, MapNoise, Method, NoiseLaw, Surface
-from dsr.methods.networks.base import DTYPES, Answer, DisparityNetwork, Precision
 from dsr.methods.networks.facets_unet import FacetsUNet
+from dsr.methods.networks.network import DTYPES, Answer, DisparityNetwork, Precision
 from dsr.methods.networks.trained import NETWORKS
 from dsr.methods.networks.weight_files import clean_weights, load_network
 from dsr.sample import DepthSample

@@ -15,7 +15,7 @@ learned from the result of the stages (task-driven), by back-propagation. A stag
 
 with k_l y at the positions where the filter lies inside, and k_l' the adjoint. w_l(g) = exp(-sum over m of c_lm
 (b_m * g)^2) lies in 0..1, with filters b_m on the three colours and c_lm >= 0: the map may jump
-at an edge of the image. For k_l and rho_l see :mod:`dsr.methods.networks.analysis_filters`.
+at an edge of the image.
 
 What differs from the original:
 
@@ -30,10 +30,19 @@ What differs from the original:
   and RMSE_v, which was not trained for, was lower, .234 against .251.
 - All stages are trained at once, from polynomial filters and weak penalties, without training one after another before.
 - It works on disparity over its range in the low-resolution map.
+
+*Filters.* k_l is a linear combination of basis filters, normalised to unit norm. Its penalty rho_l is a mixture of
+Lorentzians (Student's t, as in Roth and Black, *Fields of Experts*, IJCV 2009) of fixed widths tau_j with ratios of 4,
+
+    rho(z) = sum over j of a_j tau_j^2 / 2 log(1 + z^2 / tau_j^2).
+
+An iteration applies its derivative, the *influence* rho'(z) = z sum over j of a_j / (1 + z^2 / tau_j^2). The a_j are
+learned and can be negative: where rho decreases, responses are amplified, which sharpens edges.
 """
 
 from __future__ import annotations
 
+import functools
 import math
 from typing import Any
 
@@ -43,13 +52,87 @@ from torch.nn import functional
 
 from dsr.degradation.downsampling import check_scale
 from dsr.methods.classical.finite_differences import box_mean, upsample_linear_border
-from dsr.methods.networks.analysis_filters import WIDTHS, influence, penalty, plane_free_basis, zero_mean_basis
-from dsr.methods.networks.base import NormalisedNetwork, expect_rgb_size
+from dsr.methods.networks.network import NormalisedNetwork, expect_rgb_size
+
+WIDTHS = tuple(1e-3 * 4**j for j in range(6))
+"""tau_j, in the unit of the map: from 1/1000 to about 1."""
 
 _HEIGHT, _CONTRAST, _SHARED, _FIDELITY = 0.05, 2.0, 0.02, 0.5
 """Initial height of penalties; scale of the b_m; c_lm for m other than l; size of the data step."""
 _BICUBIC = 2
 """Half width of the bicubic kernel in low-resolution pixels."""
+
+
+def plane_free_basis(size: int) -> Tensor:
+    """Return an orthonormal basis of the filters with response 0 to planes, (size^2 - 3, size, size), float64.
+
+    It consists of products of two discrete orthogonal (Gram) polynomials, one along v and one along u, ordered by
+    degree, without 1, u and v.
+    """
+    return _products(size)[3:]
+
+
+def zero_mean_basis(size: int) -> Tensor:
+    """Return an orthonormal basis of the filters with response 0 to constants, (size^2 - 1, size, size), float64."""
+    return _products(size)[1:]
+
+
+def influence(z: Tensor, heights: Tensor) -> Tensor:
+    """Return rho'(z).
+
+    Args:
+        z: (B, L, H, W) responses of L filters.
+        heights: (L, 6) coefficients a_j of each filter's penalty.
+
+    Returns:
+        (B, L, H, W).
+
+    """
+    return z * _Mixture.apply(z, heights)
+
+
+def penalty(z: Tensor, heights: Tensor) -> Tensor:
+    """Return rho(z); see :func:`influence`."""
+    total = torch.zeros_like(z)
+    for j, width in enumerate(WIDTHS):
+        total = total + heights[:, j, None, None] * (0.5 * width**2) * torch.log1p((z / width) ** 2)
+    return total
+
+
+class _Mixture(torch.autograd.Function):
+    """The sum over j of a_j / (1 + z^2 / tau_j^2), (B, L, H, W); only z is kept for the backward pass."""
+
+    @staticmethod
+    def forward(ctx: Any, z: Tensor, heights: Tensor) -> Tensor:
+        """Return the sum."""
+        ctx.save_for_backward(z, heights)
+        squares, total = z * z, torch.zeros_like(z)
+        for j, width in enumerate(WIDTHS):
+            total.addcmul_((squares + width**2).reciprocal_(), heights[:, j, None, None], value=width**2)
+        return total
+
+    @staticmethod
+    def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the gradients of the responses and of the a_j."""
+        z, heights = ctx.saved_tensors
+        squares, slope, sums = z * z, torch.zeros_like(z), []
+        for j, width in enumerate(WIDTHS):
+            inverse = (squares + width**2).reciprocal_()
+            weighted = upstream[0] * inverse
+            sums.append(width**2 * weighted.sum(dim=(0, 2, 3)))
+            slope.addcmul_(weighted.mul_(inverse), heights[:, j, None, None], value=-2 * width**2)
+        return slope.mul_(z), torch.stack(sums, dim=1)
+
+
+@functools.cache
+def _products(size: int) -> Tensor:
+    """Return the products of orthonormal polynomials along v and u, by their degree, float64 (size^2, size, size)."""
+    with torch.inference_mode(mode=False):  # the cached tensors may later be used with gradients
+        x = torch.linspace(-1, 1, size, dtype=torch.float64)
+        q, r = torch.linalg.qr(torch.stack([x**k for k in range(size)], dim=1))
+        one = (q * r.diagonal().sign()).T  # (degree, size)
+        pairs = sorted(((i, j) for i in range(size) for j in range(size)), key=lambda pair: (sum(pair), pair))
+        return torch.stack([one[i][:, None] * one[j] for i, j in pairs])
 
 
 class Stage(nn.Module):

@@ -12,15 +12,13 @@ import torch
 
 from dsr.geometry.camera import RangeType
 from dsr.methods.base import Abilities
-from dsr.methods.networks.base import Precision
-from dsr.methods.networks.peers.base import PeerNetwork, PeerUpsampler, Range
+from dsr.methods.networks.network import Precision
 from dsr.methods.networks.peers.dctnet import DCTNet
 from dsr.methods.networks.peers.dornet import DORNet
-from dsr.methods.networks.peers.fdkn import FDKN
-from dsr.methods.networks.peers.files import load_peer
+from dsr.methods.networks.peers.local_filters import FDKN, SVLRM
+from dsr.methods.networks.peers.peer_network import PeerNetwork, PeerUpsampler, Range, load_peer
 from dsr.methods.networks.peers.pgsr import PGSR
-from dsr.methods.networks.peers.svlrm import SVLRM
-from dsr.methods.networks.weight_choice import nearest_scale
+from dsr.methods.networks.weight_files import nearest_scale
 from dsr.utils.versions import file_hash
 
 PEERS: MappingProxyType[str, type[PeerNetwork]] = MappingProxyType(
@@ -39,7 +37,7 @@ class Peer(PeerUpsampler):
         weights: the file.
         scale: the upsampling factor of the run.
         weights_files: the trained factors of the authors' files by their names.
-        range_type: see :class:`~dsr.methods.networks.peers.base.PeerUpsampler`.
+        range_type: see :class:`~dsr.methods.networks.peers.peer_network.PeerUpsampler`.
         range: its ``value_range``.
         precision: dtype of the convolutions.
         device: device of the computations.

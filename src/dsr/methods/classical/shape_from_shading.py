@@ -3,10 +3,10 @@
 Haefner, Quéau, Möllenhoff and Cremers, *Fight Ill-Posedness with Ill-Posedness: Single-shot Variational Depth
 Super-Resolution from Shading*, CVPR 2018: the depth z whose block means are the low-resolution map, the piecewise
 constant albedo and the light that explain the image, with minimal surface area. Their section 3 has the
-rendering equation (:mod:`dsr.methods.classical.srfs.shading`) and the priors: minimal surface for the shape, Potts for
-the albedo (:mod:`dsr.methods.classical.srfs.potts`). Their section 4 minimises the energy by alternating directions,
+rendering equation (:mod:`dsr.methods.classical.srfs_admm`) and the priors: minimal surface for the shape, Potts for
+the albedo (:mod:`dsr.methods.classical.potts`). Their section 4 minimises the energy by alternating directions,
 the penalty growing, over albedo, lighting, theta = (z, grad z), z and the multipliers, in this order
-(:mod:`dsr.methods.classical.srfs.admm`).
+(:mod:`dsr.methods.classical.srfs_admm`).
 
 The energy per pixel, with intensities in [0, 1] and z in pixels (times the focal length f, by the median depth):
 
@@ -44,7 +44,7 @@ from torch import Tensor
 from dsr.geometry.camera import RangeType
 from dsr.methods.base import Abilities, Cost, Method, expect_limits, whole_scale
 from dsr.methods.classical.finite_differences import upsample_linear_border
-from dsr.methods.classical.srfs.admm import ShadingProblem, ShadingSolver, Weights
+from dsr.methods.classical.srfs_admm import ShadingProblem, ShadingSolver, Weights
 from dsr.methods.inpainting import inpaint
 from dsr.sample import DepthSample
 from dsr.utils.guards import MOST_FILE, expect_pixels, pixels_beside, read_limited

@@ -17,7 +17,7 @@ from torch.nn import functional
 from dsr.geometry.camera import from_range, to_range
 from dsr.methods.base import Abilities, Cost, InverseSample, InverseSurface, Method
 from dsr.methods.inpainting import inpaint
-from dsr.methods.networks.maps import compute_min_max, normalise
+from dsr.methods.networks.normalisation import compute_min_max, normalise
 from dsr.methods.tiling import TILE, UNTILED, AxisTile, blend_tiles, split_axis
 from dsr.sample import DepthSample
 from dsr.utils.progress import Steps

@@ -7,12 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from dsr.geometry.camera import Camera
-from dsr.synthetic.procedural.layouts import LAYOUTS
-from dsr.synthetic.procedural.lighting import Lighting, random_lighting
+from dsr.synthetic.procedural.arrangements import LAYOUTS
+from dsr.synthetic.procedural.lighting import Hits, Lighting, Tracer, random_lighting
 from dsr.synthetic.procedural.materials import MaterialSampler
-from dsr.synthetic.procedural.photo import View, develop, radiance
-from dsr.synthetic.procedural.scene_layout import SceneLayout, Viewpoint
-from dsr.synthetic.procedural.tracer import Hits, Tracer
+from dsr.synthetic.procedural.photo import SceneLayout, View, Viewpoint, develop, radiance
 from dsr.synthetic.rendering import Rendering
 
 PROCEDURAL_VERSION = 1
@@ -56,7 +54,7 @@ def render_random_scene(seed: int, index: int, size: int = 512) -> Rendering:
 
     Returns:
         The photo and its depth in metres, which is more than 0.2 everywhere and exact for the surfaces that
-        :mod:`dsr.synthetic.procedural.tracer` describes.
+        :mod:`dsr.synthetic.procedural.lighting` describes.
 
     Raises:
         ValueError: a number is negative, or the size is not positive.
