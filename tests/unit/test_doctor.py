@@ -11,10 +11,9 @@ import pytest
 import torch
 
 from dsr.data.folder import load_scene
-from dsr.doctor import examine_directory
 from dsr.doctor.camera_checks import check_registration, plane_votes
 from dsr.doctor.depth_checks import find_rounding
-from dsr.doctor.examine import CHECKS, examine
+from dsr.doctor.examine import CHECKS, examine, examine_directory
 from dsr.doctor.finding import length, with_depth
 from dsr.geometry.camera import Camera, from_range, to_range
 from dsr.io.images import read_map, read_rgb
