@@ -40,7 +40,7 @@ from dsr.data.scene_source import SceneSelection
 from dsr.geometry.camera import Camera, from_range
 from dsr.io.images import read_levels, read_map
 from dsr.sample import Scene
-from dsr.utils.guards import natural_key, read_limited
+from dsr.utils.guards import naming, natural_key, numbers_in, read_limited
 
 YEARS = (2001, 2003, 2005, 2006)
 _MATRIX = re.compile(r"\[\s*(\S+)\s+0\s+(\S+)\s*;\s*0\s+(\S+)\s+(\S+)\s*;\s*0\s+0\s+1\s*\]")
@@ -183,17 +183,12 @@ def read_calibration(path: Path) -> Camera:
     fx, cx, fy, cy = (_number(path, "cam0", text) for text in matrix.groups())
     keys = ("doffs", "baseline", "width", "height")
     doffs, baseline, width, height = (_number(path, key, entries.get(key, "nothing")) for key in keys)
-    try:
+    with naming(path):
         return Camera(int(width), int(height), fx, fy, cx, cy, baseline / 1000, doffs)
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from error
 
 
 def _number(path: Path, key: str, text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = np.nan
+    value = next(iter(numbers_in([text])), np.nan)
     if not np.isfinite(value) or (key in ("width", "height") and not value.is_integer()):
         came = "".join(letter for letter in text if letter.isprintable())
         raise ValueError(f"{path}: {key}: expected a number, got {came:.40}")

@@ -25,6 +25,7 @@ from dsr.degradation.holes import Holes
 from dsr.degradation.noise import Noise
 from dsr.geometry.camera import Camera, RangeType, from_range, to_range
 from dsr.sample import FARTHEST, NEAREST, DepthSample, Scene
+from dsr.utils.guards import naming
 from dsr.utils.ratios import check_scale, match_ratio
 
 Kernel = Literal["box", "nearest", "bilinear", "bicubic", "gaussian"]
@@ -236,10 +237,8 @@ def _true_depth(scene: Scene) -> Tensor:
 
 def _match_measured(scene: Scene, scale: float | str) -> float:
     """Return the ratio of the scene's measured map that a scale names."""
-    try:
+    with naming(scene.name):
         return match_ratio(scale, scene.measured)
-    except ValueError as error:
-        raise ValueError(f"{scene.name}: {error}") from error
 
 
 def _crop_to_multiple(scene: Scene, factor: int) -> tuple[Scene, tuple[str, ...]]:

@@ -149,8 +149,8 @@ def upsample_with_errors(
 
 
 def _tensor(values: np.ndarray | Tensor) -> Tensor:
-    """Return an array as a tensor, also one that torch cannot share: a flipped view has negative strides."""
-    return torch.as_tensor(np.ascontiguousarray(values) if isinstance(values, np.ndarray) else values)
+    """Return an array as a tensor, also one that torch cannot share: flipped, with negative strides, or read-only."""
+    return torch.as_tensor(np.require(values, requirements=("C", "W")) if isinstance(values, np.ndarray) else values)
 
 
 def _photo(rgb: np.ndarray | Tensor) -> Tensor:

@@ -9,7 +9,7 @@ from typing import Annotated, NamedTuple
 
 import numpy as np
 import torch
-from pydantic import BaseModel, Field, ValidationError
+from pydantic import BaseModel, Field
 from torch import Tensor
 
 from dsr.geometry.camera import ASSUMED_FOV, Camera
@@ -20,8 +20,8 @@ from dsr.io.images import CameraFile, Pixels, read_camera
 from dsr.io.photos import Size, focal_in_exif, same_aspect
 from dsr.io.reading import CameraChoice, RigFiles
 from dsr.io.trajectories import read_transform
-from dsr.utils.guards import read_limited
-from dsr.utils.validation import describe
+from dsr.utils.guards import numbers_in, read_limited
+from dsr.utils.validation import parse_model
 
 _FILM_DIAGONAL = math.hypot(36, 24)
 """Diagonal of 35 mm film in millimetres, to which equivalent focal lengths refer (CIPA DCG-001)."""
@@ -138,10 +138,7 @@ def _camera_of_matrix(path: Path, matrix: np.ndarray, size: Size, size_lr: Size)
 
 def _matrix(path: Path, text: str) -> np.ndarray:
     """Return the intrinsics (3, 3) that a text holds."""
-    try:
-        numbers = [float(word) for word in text.replace(",", " ").replace(";", " ").split()]
-    except ValueError:
-        numbers = []
+    numbers = numbers_in(text.replace(",", " ").replace(";", " ").split())
     if len(numbers) not in (9, 16):
         raise ValueError(f"{path}: expected JSON or a matrix of 3 x 3 or 4 x 4 numbers, got something else")
     side = math.isqrt(len(numbers))
@@ -158,10 +155,7 @@ class _Open3d(BaseModel, strict=True):
 
 def _open3d(path: Path, text: str) -> CameraFile:
     """Return the camera of Open3D's JSON."""
-    try:
-        stored = _Open3d.model_validate_json(text)
-    except ValidationError as error:
-        raise ValueError(f"{path}: {describe(error)}") from error
+    stored = parse_model(_Open3d, text, path)
     matrix = _check_matrix(path, np.array(stored.intrinsic_matrix).reshape(3, 3).T)
     return camera_only(Camera(stored.width, stored.height, matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]))
 

@@ -13,7 +13,7 @@ from typing import Annotated, Any, Literal
 
 import cv2
 import numpy as np
-from pydantic import BaseModel, BeforeValidator, Field, ValidationError
+from pydantic import BaseModel, BeforeValidator, Field
 
 from dsr.geometry.camera import Camera, RangeType
 from dsr.utils.files import read_array_header
@@ -22,12 +22,14 @@ from dsr.utils.guards import (
     array_bytes,
     expect_bytes,
     expect_pixels,
+    naming,
+    numbers_in,
     opened,
     pixels_of_file,
     read_limited,
 )
 from dsr.utils.picture_headers import picture_size
-from dsr.utils.validation import Number, Whole, describe
+from dsr.utils.validation import Number, Whole, parse_model
 
 _BYTES_PER_PIXEL = 16
 """Bytes in memory for each allowed pixel: four channels of float32."""
@@ -252,15 +254,11 @@ def read_camera(path: Path) -> CameraFile:
     """
     if not path.is_file():
         raise ValueError(f"{path}: expected a camera file, there is none")
-    try:
-        entries = _CameraJson.model_validate_json(read_limited(path)).model_dump(exclude_unset=True, exclude_none=True)
-        if "baseline" in entries:
-            entries["baseline"] *= _METRES[entries.get("baseline_unit", "m")]
+    entries = parse_model(_CameraJson, read_limited(path), path).model_dump(exclude_unset=True, exclude_none=True)
+    if "baseline" in entries:
+        entries["baseline"] *= _METRES[entries.get("baseline_unit", "m")]
+    with naming(path):
         camera = Camera(**{each.name: entries[each.name] for each in fields(Camera) if each.name in entries})
-    except ValidationError as error:
-        raise ValueError(f"{path}: {describe(error, _CameraJson.model_fields)}") from error
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from error
     return CameraFile(camera, *map(entries.get, ("range_type", "depth_unit", "hole_value")))
 
 
@@ -316,10 +314,7 @@ def _load_pfm(path: Path, most: int | None) -> np.ndarray:
     if header[1] != b"Pf":
         raise ValueError(f"{path}: expected one channel, got a PFM file with three")
     width, height = int(header[2]), int(header[3])
-    try:
-        scale = float(header[4])
-    except ValueError:
-        scale = 0.0
+    scale = next(iter(numbers_in([header[4].decode()])), 0.0)
     if most is not None:
         expect_pixels(path, height, width, most)
     pixels = memoryview(data)[header.end() :]

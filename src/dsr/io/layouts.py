@@ -34,7 +34,7 @@ from dsr.io.pairs import (
     role_of_words,
     words_of,
 )
-from dsr.utils.guards import MOST_TABLE, natural_key, path_within, read_limited
+from dsr.utils.guards import MOST_TABLE, natural_key, numbers_in, path_within, read_limited
 
 _DEPTH_LR = re.compile(r"(depth|disparity)_lr(\d+)")
 _TUM_UNIT = 1 / 5000
@@ -150,11 +150,10 @@ def _timed(path: Path) -> dict[Path, float]:
         words = line.split()
         if not words or words[0].startswith("#"):
             continue
-        try:
-            time, name = float(words[0]), words[1]
-        except (IndexError, ValueError) as error:
-            raise ValueError(f"{path}: line {number}: expected a time and a file name, got {line!r:.60}") from error
-        times[path_within(path.parent, name, f"{path}: line {number}")] = time
+        time = numbers_in(words[:1])
+        if not time or len(words) < 2:
+            raise ValueError(f"{path}: line {number}: expected a time and a file name, got {line!r:.60}")
+        times[path_within(path.parent, words[1], f"{path}: line {number}")] = time[0]
     return times
 
 

@@ -37,6 +37,7 @@ from dsr.io.pairs import Pair, PairingResult
 from dsr.io.scene_files import RGBD, Frame, one_camera, to_millimetres, write_colour, write_sixteen_bits
 from dsr.io.trajectories import check_pose, order_of, read_text
 from dsr.utils.files import replacing, write_text
+from dsr.utils.guards import numbers_in
 
 _APP = "Open3D"
 _TRAJECTORIES = ("scene/trajectory.log", "trajectory.log")
@@ -77,13 +78,10 @@ def _read_entries(path: Path) -> list[_Rows]:
 
 def _geometry(place: str, rows: _Rows, _: tuple[int, int]) -> Geometry:
     """Return the pose of a frame; its camera is read from the file beside the pictures."""
-    try:
-        matrix = np.array([[float(word) for word in row.split()] for row in rows])
-        if matrix.shape != (4, 4):
-            raise ValueError
-    except ValueError as error:
-        raise ValueError(f"{place}: expected a matrix of 4 x 4 numbers, got {' '.join(rows)!r:.80}") from error
-    return Geometry(None, check_pose(place, matrix))
+    values = [numbers_in(row.split()) for row in rows]
+    if [len(row) for row in values] != [4] * 4:
+        raise ValueError(f"{place}: expected a matrix of 4 x 4 numbers, got {' '.join(rows)!r:.80}")
+    return Geometry(None, check_pose(place, np.array(values)))
 
 
 def write_rgbd(folder: Path, rgb: Tensor, depth: Tensor, camera: Camera) -> list[Assumption]:

@@ -14,7 +14,7 @@ from dsr.geometry.camera import Camera
 from dsr.geometry.rigid_motion import Matrix, as_rigid, from_quaternion, is_rotation
 from dsr.io.encoding import Assumption
 from dsr.io.pairs import Pair, time_of
-from dsr.utils.guards import parse_json, read_limited
+from dsr.utils.guards import naming, numbers_in, parse_json, read_limited
 
 _LARGEST_FILE = 256 << 20
 _MAX_GAP = 0.02
@@ -170,10 +170,9 @@ def _numbers(path: Path, text: str) -> list[list[float]]:
         words = re.split(r"[\s,;]+", line.partition("#")[0].strip())
         if words == [""]:
             continue
-        try:
-            rows.append([float(word) for word in words])
-        except ValueError:
-            raise ValueError(f"{path}: line {number}: expected numbers, got {line!r:.60}") from None
+        if not (values := numbers_in(words)):
+            raise ValueError(f"{path}: line {number}: expected numbers, got {line!r:.60}")
+        rows.append(values)
     return rows
 
 
@@ -253,12 +252,10 @@ def intrinsics_camera(source: str, size: tuple[int, int], numbers: Sequence[floa
 
     """
     fx, fy, cx, cy = numbers
-    try:
+    with naming(source):
         if fy <= 0:
             raise ValueError(f"camera fy: expected a positive number of pixels, got {fy!r}")
         return Camera(size[1], size[0], fx, fy, cx, cy)
-    except ValueError as error:
-        raise ValueError(f"{source}: {error}") from error
 
 
 def describe_capture(app: str, unit: str, pairs: Sequence[Pair], *, poses: bool) -> Assumption:

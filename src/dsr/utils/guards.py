@@ -13,7 +13,7 @@ import math
 import os
 import re
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from io import BufferedReader
 from numbers import Real
 from pathlib import Path, PurePath, PurePosixPath
@@ -175,6 +175,23 @@ def is_number(value: Any) -> TypeGuard[float]:
         return math.isfinite(value)
     except OverflowError:
         return False
+
+
+def numbers_in(words: Iterable[str]) -> list[float]:
+    """Return words as numbers, infinite ones and NaN among them; nothing if one is no number."""
+    try:
+        return [float(word) for word in words]
+    except ValueError:
+        return []
+
+
+@contextlib.contextmanager
+def naming(place: object) -> Iterator[None]:
+    """Begin the message of a ValueError that comes from within with the place that it is about, such as a file."""
+    try:
+        yield
+    except ValueError as error:
+        raise ValueError(f"{place}: {error}") from error
 
 
 def readable(name: str) -> str:

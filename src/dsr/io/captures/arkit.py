@@ -30,7 +30,7 @@ import math
 from pathlib import Path
 
 import numpy as np
-from pydantic import BaseModel, ValidationError
+from pydantic import BaseModel
 from scipy.spatial.transform import Rotation
 
 from dsr.io.encoding import Assumption
@@ -38,8 +38,8 @@ from dsr.io.frames import HIGHEST_LEVEL, CaptureFrame, ConfidenceMap, Geometry
 from dsr.io.images import Pixels, read_numbers
 from dsr.io.pairs import Pair, PairingResult
 from dsr.io.trajectories import check_pose, describe_capture, intrinsics_camera, read_text
-from dsr.utils.guards import natural_key, read_limited
-from dsr.utils.validation import describe
+from dsr.utils.guards import natural_key, numbers_in, read_limited
+from dsr.utils.validation import parse_model
 
 _ARKITSCENES = "ARKitScenes"
 _LARGEST_PINCAM = 1 << 16
@@ -85,22 +85,16 @@ def _read_trajectory(path: Path) -> dict[float, _Motion]:
     """Return rotation and translation by time; empty without the file."""
     motions: dict[float, _Motion] = {}
     for number, line in enumerate(read_text(path).splitlines() if path.is_file() else (), 1):
-        try:
-            time, *motion = map(float, line.split())
-            if len(motion) != 6 or not math.isfinite(time):
-                raise ValueError
-        except ValueError as error:
-            raise ValueError(f"{path}: line {number}: expected 7 numbers, got {line!r:.80}") from error
-        motions[time] = tuple(motion)
+        values = numbers_in(line.split())
+        if len(values) != 7 or not math.isfinite(values[0]):
+            raise ValueError(f"{path}: line {number}: expected 7 numbers, got {line!r:.80}")
+        motions[values[0]] = tuple(values[1:])
     return motions
 
 
 def _time(stem: str) -> float:
     """Return the time in a frame's name, NaN if there is none."""
-    try:
-        return float(stem.rpartition("_")[2])
-    except ValueError:
-        return float("nan")
+    return next(iter(numbers_in([stem.rpartition("_")[2]])), math.nan)
 
 
 def _nearest(motions: dict[float, _Motion], stem: str) -> _Motion | None:
@@ -196,10 +190,7 @@ def _camera_of(frames: Path, kind: str, depth: Path) -> bool:
 
 def _polycam_geometry(path: Path, _: tuple[int, int]) -> Geometry:
     """Return camera and pose of a frame."""
-    try:
-        told = _PolycamCamera.model_validate_json(read_text(path, _LARGEST_JSON))
-    except ValidationError as error:
-        raise ValueError(f"{path}: expected {_POLYCAM}'s camera; {describe(error)}") from error
+    told = parse_model(_PolycamCamera, read_text(path, _LARGEST_JSON), path, f"expected {_POLYCAM}'s camera; ")
     camera = intrinsics_camera(str(path), (told.height, told.width), (told.fx, told.fy, told.cx, told.cy))
     rows = [[getattr(told, f"t_{row}{column}") for column in range(4)] for row in range(3)]
     return Geometry(camera, check_pose(str(path), np.array([*rows, [0, 0, 0, 1]], dtype=np.float64), opengl=True))

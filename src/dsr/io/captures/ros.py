@@ -34,7 +34,7 @@ from dsr.io.frames import CaptureFrame, Geometry, Record
 from dsr.io.images import decode_pixels
 from dsr.io.pairs import Pair, PairingResult, match_times
 from dsr.io.trajectories import intrinsics_camera
-from dsr.utils.guards import MOST_TEXT, expect_bytes, natural_key, path_within
+from dsr.utils.guards import MOST_TEXT, expect_bytes, naming, natural_key, path_within
 
 _IMAGE, _COMPRESSED, _INFO = (f"sensor_msgs/msg/{name}" for name in ("Image", "CompressedImage", "CameraInfo"))
 _UNITS = {"u": 1e-3, "f": 1.0}
@@ -326,10 +326,8 @@ def decode_message(place: str, message: Any) -> np.ndarray:
             return _decode_compressed_depth(place, message.format, data)
         if data.size > PHOTO_LIMIT:
             raise ValueError(f"{place}: expected a photo of at most {PHOTO_LIMIT} bytes, got {data.size}")
-        try:
+        with naming(place):
             return decode_photo(data.tobytes())
-        except ValueError as error:
-            raise ValueError(f"{place}: {error}") from error
     channels, code = COLOURS.get(message.encoding, (1, None))
     dtype = np.dtype(DEPTHS.get(message.encoding, "u1")).newbyteorder(">" if message.is_bigendian else "<")
     height, width, step = message.height, message.width, message.step

@@ -35,7 +35,7 @@ from dsr.io.frames import HIGHEST_LEVEL, CaptureFrame, ConfidenceMap, Geometry, 
 from dsr.io.images import quiet_decoders
 from dsr.io.pairs import PHOTO_SUFFIXES, Pair, PairingResult
 from dsr.io.trajectories import describe_capture, intrinsics_camera, pose_from_quaternion, read_text
-from dsr.utils.guards import expect_pixels
+from dsr.utils.guards import expect_pixels, numbers_in
 from dsr.utils.versions import file_hash
 
 _APP = "Stray Scanner"
@@ -153,19 +153,15 @@ def _geometry(folder: Path, number: int, row: _Row, matrix: str, size: tuple[int
 
 def _numbers(place: str, row: _Row, names: tuple[str, ...]) -> list[float]:
     """Return values of a row as numbers."""
-    try:
-        return [float(row[name]) for name in names]
-    except (KeyError, ValueError) as error:
-        came = ", ".join(row.get(name, "nothing") for name in names)
-        raise ValueError(f"{place}: expected numbers for {', '.join(names)}, got {came:.120}") from error
+    came = [row.get(name, "nothing") for name in names]
+    if not (values := numbers_in(came)):
+        raise ValueError(f"{place}: expected numbers for {', '.join(names)}, got {', '.join(came):.120}")
+    return values
 
 
 def _read_matrix(path: Path, text: str) -> list[float]:
     """Return fx, fy, cx, cy of the matrix."""
-    try:
-        values = [float(word) for word in text.replace(",", " ").split()]
-    except ValueError:
-        values = []
+    values = numbers_in(text.replace(",", " ").split())
     matrix = np.array(values).reshape(3, 3) if len(values) == 9 else np.full((3, 3), np.nan)
     if not np.isfinite(matrix).all() or not np.allclose(matrix[2], (0, 0, 1)):
         raise ValueError(f"{path}: expected a 3 x 3 matrix of intrinsics, got {text!r:.80}")
