@@ -44,7 +44,6 @@ def main(arguments: Sequence[str] | None = None, catalogue: Mapping[str, Collect
     """Run the command, and return its exit code: 0, 2 after an error, 130 or 143 when interrupted.
 
     Args:
-        arguments: command-line arguments; None for those of the process.
         catalogue: the data sets to offer; None for :data:`dsr.data.download.collections.CATALOGUE`.
 
     """

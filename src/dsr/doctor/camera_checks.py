@@ -63,12 +63,7 @@ _LEAST_BENT, _MAJORITY_BENT = 6, 0.7
 
 
 def check_intrinsics(scene: Scene) -> list[Finding]:
-    """Check the camera against the image.
-
-    Args:
-        scene: scene at any resolution.
-
-    """
+    """Check the camera against the image."""
     camera = scene.camera
     findings = [*_view(camera), *(_other_picture(camera) or _centre(camera) + _shape(camera))]
     if findings:
@@ -183,12 +178,7 @@ def _shape(camera: Camera) -> list[Finding]:
 
 
 def check_registration(scene: Scene) -> list[Finding]:
-    """Check whether the photo's edges coincide with the depth edges.
-
-    Args:
-        scene: scene with high-resolution depth.
-
-    """
+    """Check whether the photo's edges coincide with the depth edges."""
     every = math.ceil(max(scene.camera.height, scene.camera.width) / WORKING_SIZE)
     depth, photo = _reduce(scene, every)
     radius = max(round(max(depth.shape) * MAX_SHIFT), APART)
@@ -255,12 +245,7 @@ class Windows:
 
 
 def check_planes(scene: Scene) -> list[Finding]:
-    """Check whether planar surfaces are planar if the depth is orthogonal.
-
-    Args:
-        scene: scene with high-resolution depth.
-
-    """
+    """Check whether planar surfaces are planar if the depth is orthogonal."""
     depth = metres(scene)
     rounding = find_rounding(scene)
     votes = plane_votes(depth, scene.camera, 0.0 if rounding is None else rounding.relative)

@@ -76,12 +76,7 @@ _REPEATED = (8, 6, 5, 4, 3, 2)
 
 
 def check_units(scene: Scene) -> list[Finding]:
-    """Check whether depth, baseline and measured maps are plausible in metres.
-
-    Args:
-        scene: scene with high-resolution depth.
-
-    """
+    """Check whether depth, baseline and measured maps are plausible in metres."""
     depth = metres(scene)
     low, middle, high = np.nanpercentile(depth, (1, 50, 99))
     text = f"depth {length(low)} to {length(high)} (1st to 99th percentile), median {length(middle)}"
@@ -149,12 +144,7 @@ def _measured(scene: Scene, depth: Array) -> list[Finding]:
 
 
 def check_holes(scene: Scene) -> list[Finding]:
-    """Check the fraction of missing pixels, and whether a depth value seems to mark missing pixels.
-
-    Args:
-        scene: scene with high-resolution depth.
-
-    """
+    """Check the fraction of missing pixels, and whether a depth value seems to mark missing pixels."""
     depth = metres(scene)
     missing = float(np.isnan(depth).mean())
     text = f"{1 - missing:.1%} of the pixels are valid"
@@ -239,12 +229,7 @@ class Rounding:
 
 
 def check_precision(scene: Scene) -> list[Finding]:
-    """Check whether the rounding of the depth is visible in renderings.
-
-    Args:
-        scene: scene with high-resolution depth.
-
-    """
+    """Check whether the rounding of the depth is visible in renderings."""
     depth = metres(scene)
     factor = find_repetition(depth)
     if factor > 1:

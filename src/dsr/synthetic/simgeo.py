@@ -243,10 +243,6 @@ def render_scene(name: str, size: int = 512) -> Rendering:
     """Return the scene ``name``, one of :data:`SCENES`, at ``size`` x ``size`` pixels.
 
     The view is the same at any size.
-
-    Raises:
-        ValueError: the name is unknown, or the size is not positive.
-
     """
     scene = build_scene(name)
     centre = (size - 1) / 2

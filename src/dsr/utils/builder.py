@@ -29,17 +29,7 @@ class ConfigError(ValueError):
 
 
 def expect_library(key: str, module: str, extra: str) -> None:
-    """Check that a library is installed, without importing it.
-
-    Args:
-        key: what needs it, for the message.
-        module: of the library.
-        extra: of dsr, which has the library.
-
-    Raises:
-        ConfigError: it is not.
-
-    """
+    """Check that a library is installed, without importing it."""
     if importlib.util.find_spec(module) is None:
         library = module.rpartition(".")[2]
         raise ConfigError(f"{key}: expected {library}, which is not installed; pip install dsr[{extra}]")
@@ -83,8 +73,6 @@ def check_types(kind: type, values: Mapping[str, Any], place: str = "") -> None:
     """Check values for the fields of a dataclass that have a plain type.
 
     Args:
-        kind: the dataclass; fields that are dataclasses are left out.
-        values: by name, as a configuration has them.
         place: what stands before the names in messages, such as ``trainer.``.
 
     Raises:
@@ -101,12 +89,7 @@ def check_types(kind: type, values: Mapping[str, Any], place: str = "") -> None:
 
 
 def expect_usable(key: str, value: Any) -> None:
-    """Refuse a text without characters, which as a path would be the current directory, and a number beyond 64 bits.
-
-    Raises:
-        ConfigError: the value is such a text or number.
-
-    """
+    """Refuse a text without characters, which as a path would be the current directory, and a number beyond 64 bits."""
     if isinstance(value, str) and (not value.strip() or "\0" in value):
         raise ConfigError(f"{key}: expected a text of one character or more, or null for none; got {value!r:.60}")
     if isinstance(value, str) and value.startswith("~"):
@@ -116,12 +99,7 @@ def expect_usable(key: str, value: Any) -> None:
 
 
 def expand_home(key: str, path: str) -> Path:
-    """Return a path with ~ replaced by the user's directory.
-
-    Raises:
-        ConfigError: there is no such user.
-
-    """
+    """Return a path with ~ replaced by the user's directory."""
     try:
         return Path(path).expanduser()
     except RuntimeError as error:
@@ -129,24 +107,12 @@ def expand_home(key: str, path: str) -> Path:
 
 
 def with_key(message: str, group: str, parameters: Collection[str]) -> str:
-    """Return an error message with the key that sets the argument which it begins with.
-
-    Args:
-        message: such as ``sharpness: expected ...``.
-        group: the configuration group whose keys set the arguments.
-        parameters: the arguments' names; a message that begins with another word stays as it is.
-
-    """
+    """Return an error message with the key that sets the argument which it begins with."""
     return f"{group}.{message}" if message.partition(":")[0] in parameters else message
 
 
 def load_target(group: str, node: Mapping[str, Any]) -> Any:
-    """Return the class or function that a group names.
-
-    Raises:
-        ConfigError: it cannot be imported, or is not a class or function.
-
-    """
+    """Return the class or function that a group names."""
     if not isinstance(node, Mapping):
         raise ConfigError(f"{group}: expected keys, name and target among them, got {node!r:.60}")
     path = node.get("target")
@@ -157,17 +123,7 @@ def load_target(group: str, node: Mapping[str, Any]) -> Any:
 
 
 def load_object(key: str, path: Any, what: str) -> Any:
-    """Return the object of a module that a configuration value names.
-
-    Args:
-        key: of the value, for messages.
-        path: the value, ``module.name``.
-        what: what the object should be, for messages.
-
-    Raises:
-        ConfigError: the value is not such a path, or the module or the name cannot be imported.
-
-    """
+    """Return the object of a module that a configuration value names."""
     if not isinstance(path, str) or "." not in path:
         raise ConfigError(f"{key}: expected module.name of {what}, got {path!r}")
     module, _, name = path.rpartition(".")

@@ -21,12 +21,7 @@ def fast_precision(device: torch.device) -> str:
 
 
 def pick_device(name: str) -> torch.device:
-    """Return the device of that name; ``auto`` is $DSR_DEVICE, else the first GPU where there is one, else the CPU.
-
-    Raises:
-        ConfigError: there is no such device here.
-
-    """
+    """Return the device of that name; ``auto`` is $DSR_DEVICE, else the first GPU where there is one, else the CPU."""
     given_by = "device"
     if name == "auto" and os.environ.get("DSR_DEVICE"):
         given_by, name = "$DSR_DEVICE", os.environ["DSR_DEVICE"]

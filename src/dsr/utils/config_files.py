@@ -21,14 +21,8 @@ _PLACES = (_PACKAGE / "conf", _PACKAGE.parents[1] / "conf")
 def config_directories(more: Sequence[Path] = ()) -> tuple[Path, ...]:
     """Return the directories of configuration files in the order in which they are searched.
 
-    Args:
-        more: the user's own directories, as given by ``--config-dir``.
-
     Returns:
         The project's directory first, so that no file of the user's replaces one of the project's.
-
-    Raises:
-        ValueError: a directory does not exist.
 
     """
     own = next((place for place in _PLACES if (place / "eval.yaml").is_file()), None)

@@ -48,12 +48,7 @@ class FullDiskError(Exception):
 
 @contextlib.contextmanager
 def space_for(path: Path) -> Iterator[None]:
-    """Raise FullDiskError for whatever goes wrong in this context for want of space.
-
-    Args:
-        path: the file or directory that is written.
-
-    """
+    """Raise FullDiskError for whatever goes wrong in this context for want of space."""
     try:
         yield
     except Exception as error:
@@ -63,12 +58,7 @@ def space_for(path: Path) -> Iterator[None]:
 
 
 def expect_space(path: Path, needed: float) -> None:
-    """Check that there is space for a number of bytes beside a file.
-
-    Raises:
-        FullDiskError: there is not.
-
-    """
+    """Check that there is space for a number of bytes beside a file."""
     if needed > shutil.disk_usage(path.parent).free:
         raise FullDiskError(path, needed)
 
@@ -111,16 +101,7 @@ def _free_space(path: Path) -> str:
 
 @contextlib.contextmanager
 def temporary_folder(folder: Path, name: str) -> Iterator[Path]:
-    """Yield a temporary directory in a folder, which is created if it does not exist; in the end it is deleted.
-
-    Args:
-        folder: where it is.
-        name: the beginning of its name, after a dot.
-
-    Raises:
-        FullDiskError: there is no space for its files.
-
-    """
+    """Yield a temporary directory in a folder, which is created if it does not exist; in the end it is deleted."""
     with space_for(folder / name):
         folder.mkdir(parents=True, exist_ok=True)
         remove_abandoned(folder)
@@ -160,9 +141,6 @@ def machine() -> str:
 def birth(process: int) -> str | None:
     """Return when a process of this machine was started, which tells it from a later one of its number.
 
-    Args:
-        process: its number.
-
     Returns:
         A text that the process keeps, empty where the system does not tell it; None if the process has ended.
 
@@ -191,10 +169,6 @@ def replacing(path: Path) -> Iterator[Path]:
 
     The directory is created if it does not exist. After an error or an interruption the temporary file is deleted; one
     that a killed process has left is deleted the next time that a file is written in its directory.
-
-    Raises:
-        FullDiskError: there is no space for the file.
-
     """
     with space_for(path):
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -213,12 +187,7 @@ def replacing(path: Path) -> Iterator[Path]:
 
 @contextlib.contextmanager
 def replacing_folder(path: Path) -> Iterator[Path]:
-    """Yield a temporary directory beside ``path`` that replaces it when the block ends without error.
-
-    Raises:
-        FullDiskError: there is no space for its files.
-
-    """
+    """Yield a temporary directory beside ``path`` that replaces it when the block ends without error."""
     with temporary_folder(path.parent, path.name) as temporary:
         yield temporary
         temporary.chmod(0o755)
@@ -236,7 +205,6 @@ def read_arrays(path: Path, names: Container[str] | None = None, most: int | Non
     """Return the arrays of an ``.npz`` file.
 
     Args:
-        path: the file.
         names: of the arrays to read, of which it need not have all; None for all that it has.
         most: largest number of bytes that they may have together; None for what the size of the file explains, see
             :func:`dsr.utils.guards.bytes_of_archive`.

@@ -131,12 +131,7 @@ def opened(path: Path) -> Iterator[BufferedReader]:
 
 
 def expect_stored(path: Path) -> None:
-    """Check that no member of a torch file is compressed or shared; torch writes none so.
-
-    Raises:
-        ValueError: one is, so that the file would take more memory than its size.
-
-    """
+    """Check that no member of a torch file is compressed or shared; torch writes none so."""
     if not zipfile.is_zipfile(path):  # as of torch before version 1.6
         return
     with zipfile.ZipFile(path) as packed:
@@ -203,7 +198,6 @@ def parse_json(text: str | bytes, *, finite: bool = True) -> Any:
     """Return what JSON holds: Python's reader, without what is no JSON or cannot be computed with.
 
     Args:
-        text: the JSON.
         finite: whether NaN and infinity, which Python writes and JSON does not have, are refused.
 
     Raises:
@@ -250,8 +244,6 @@ def path_within(folder: Path, name: str, source: object, form: str = "{}") -> Pa
     The folder may be a link; links that the name leads through may not lead out of it.
 
     Args:
-        folder: the folder.
-        name: the name, from the folder on.
         source: what gives the name, such as ``FILE: line 3``, for the message.
         form: the path that the name is a part of, from the folder on, with ``{}`` for the name.
 

@@ -225,16 +225,11 @@ def make_trainer(
     """Return a trainer for a number of steps, with a validation after every few and after the last one.
 
     Args:
-        device: to train on.
-        steps: of the training.
-        interval: steps between two validations.
-        callbacks: of Lightning.
         logger: of Lightning; False for none.
         devices: how many devices of that kind to train on.
         accumulate: batches of a step.
         environment: what Lightning learns of the processes of several devices from; None where it starts them itself,
             whatever Slurm or MPI say.
-        **named: more settings of :class:`lightning.Trainer`.
 
     """
     with without_chatter():

@@ -40,7 +40,6 @@ class Progress:
 
         Args:
             name: what is done, such as ``train``.
-            total: amount of all work; None if not yet known.
             done: amount of work done before.
             unit: what the amounts count.
 
@@ -59,8 +58,6 @@ class Progress:
         """Yield items, and show how many are done.
 
         Args:
-            items: things to work on, one after the other.
-            name: what is done to them, such as ``predict``.
             total: number of items; None where ``items`` can be counted.
             label: returns the name of an item.
             lines: whether each item gets a line if the output is not a terminal; False if the caller prints one.
@@ -103,14 +100,7 @@ class StepsProgress(Progress):
 
 
 def part_of(progress: Steps | None, before: int, total: int) -> Steps | None:
-    """Return a function to which one of several stages reports its steps.
-
-    Args:
-        progress: the function to which all stages are reported; None for no report.
-        before: number of steps of the stages before.
-        total: number of steps of all stages.
-
-    """
+    """Return a function to which one of several stages reports its steps."""
     return None if progress is None else lambda done, _: progress(before + done, total)
 
 

@@ -39,7 +39,6 @@ def match_ratio(scale: float | str, measured: Collection[float]) -> float:
 
     Args:
         scale: the ratio, to within 1 %, or ``native`` for the only one.
-        measured: ratios of the maps that there are.
 
     Raises:
         ValueError: there is no such map, or there are several.

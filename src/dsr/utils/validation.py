@@ -27,8 +27,6 @@ def parse_model(model: type[Content], content: str | bytes, place: object, expec
     """Return what JSON holds as a model.
 
     Args:
-        model: its class.
-        content: the JSON.
         place: where it is from, for the message.
         expected: what the message says after that, such as ``expected a camera; ``.
 
@@ -46,7 +44,6 @@ def describe(error: ValidationError, known: Iterable[str] = ()) -> str:
     """Return the first thing that is wrong, such as ``trials.a1.scale: expected a valid integer, got 'x'``.
 
     Args:
-        error: what the validation raised.
         known: the keys to name where one is unknown.
 
     """

@@ -64,16 +64,7 @@ def _git(*arguments: str) -> str | None:
 
 
 def file_hash(path: Path, progress: Task = lambda *_: None) -> str:
-    """Return the SHA-256 of a file, 64 hexadecimal digits.
-
-    Args:
-        path: the file.
-        progress: is called with the bytes read and their total.
-
-    Raises:
-        OSError: it cannot be read.
-
-    """
+    """Return the SHA-256 of a file, 64 hexadecimal digits."""
     digest, total = hashlib.sha256(), path.stat().st_size
     with opened(path) as file:
         while chunk := file.read(_CHUNK):
@@ -86,10 +77,6 @@ def hash_outside_code(targets: Iterable[str]) -> str | None:
     """Return a hash of the modules outside of this package that classes and functions come from; None for no such.
 
     A module in a package stands for all modules in its folder and the folders below.
-
-    Args:
-        targets: dotted paths, ``module.name``.
-
     """
     own = __name__.partition(".")[0]
     modules = sorted({target.rpartition(".")[0] for target in targets if target.partition(".")[0] != own})

@@ -163,9 +163,6 @@ def random_lighting(rng: np.random.Generator, tracer: Tracer, seen: Hits, low: A
     """Return random lights for the surfaces of a preview.
 
     Args:
-        rng: source of random numbers.
-        tracer: ray tracer of the scene.
-        seen: hits of the preview's rays.
         low: (3,) lower corner of the box in which the lamp may hang, in metres.
         high: (3,) upper corner of the same.
 

@@ -48,7 +48,6 @@ def render_random_scene(seed: int, index: int, size: int = 512) -> Rendering:
     """Return the scene number ``index`` of the endless series ``seed``; the view is the same at any size.
 
     Args:
-        seed: number of the series, from 0.
         index: number of the scene in it, from 0. The scene is a function of these two numbers alone.
         size: height and width in pixels.
 

@@ -172,10 +172,6 @@ def relief(rng: np.random.Generator, maker: Maker, side: float, count: int = 300
     """Return a square relief of ``side`` metres: (x, y) in the middle of the origin, heights along z.
 
     Args:
-        rng: source of random numbers.
-        maker: one of :data:`RELIEFS`.
-        side: length of a side in metres.
-        count: number of grid points per side.
         bend: height of the middle above the edges along x as a fraction of the side.
 
     """

@@ -131,7 +131,6 @@ def lathe(sections: Sequence[Array], segments: int = 80) -> Shape:
 
     Args:
         sections: radius and height along the smooth pieces of the profile, (K, 2) each; edges between pieces are sharp.
-        segments: number of segments around the axis.
 
     """
     angle = np.linspace(0, 2 * np.pi, segments + 1)
