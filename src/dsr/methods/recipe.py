@@ -31,7 +31,7 @@ from dsr.methods.networks.weight_files import (
     network_name,
     read_header,
 )
-from dsr.utils.builder import ConfigError, build, load_target
+from dsr.utils.builder import ConfigError, Node, build, load_target
 from dsr.utils.config_files import config_directories, list_choices
 from dsr.utils.ratios import SCALES
 
@@ -101,7 +101,7 @@ class Recipe:
     settings: frozenset[str] = frozenset()
     _resolved: dict[float | None, dict[str, Any]] = field(default_factory=dict, init=False, repr=False)
 
-    def at(self, factor: float | None = None) -> Mapping[str, Any]:
+    def at(self, factor: float | None = None) -> Node:
         """Return the node for a factor, as plain values; None for the run's scale as it is named.
 
         Raises:

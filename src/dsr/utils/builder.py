@@ -17,6 +17,8 @@ from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
+Node = Mapping[str, Any]
+"""A group of the configuration: ``name``, ``target``, perhaps ``label``, and arguments of the target."""
 _MISSING = "???"
 _ABOUT = (
     "name", "label", "target", "weights_packaged", "weights_file", "weights_files", "weights_source", "depth_loss",
@@ -35,7 +37,7 @@ def expect_library(key: str, module: str, extra: str) -> None:
         raise ConfigError(f"{key}: expected {library}, which is not installed; pip install dsr[{extra}]")
 
 
-def build(group: str, node: Mapping[str, Any], given: Mapping[str, Any] | None = None) -> Any:
+def build(group: str, node: Node, given: Mapping[str, Any] | None = None) -> Any:
     """Build the object that a configuration group describes.
 
     Args:
@@ -111,7 +113,7 @@ def with_key(message: str, group: str, parameters: Collection[str]) -> str:
     return f"{group}.{message}" if message.partition(":")[0] in parameters else message
 
 
-def load_target(group: str, node: Mapping[str, Any]) -> Any:
+def load_target(group: str, node: Node) -> Any:
     """Return the class or function that a group names."""
     if not isinstance(node, Mapping):
         raise ConfigError(f"{group}: expected keys, name and target among them, got {node!r:.60}")

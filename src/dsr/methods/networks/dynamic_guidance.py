@@ -241,19 +241,7 @@ class DynamicGuidance(NormalisedNetwork):
         return _BICUBIC + len(self.stages) * (_BICUBIC + math.ceil((self.size - 1) / self.scale))
 
     def forward(self, rgb: Tensor, values: Tensor) -> Tensor:
-        """Map an image and normalised low-resolution disparity to high-resolution disparity.
-
-        Args:
-            rgb: (B, 3, H, W).
-            values: (B, 1, h, w).
-
-        Returns:
-            (B, 1, H, W) in the dtype of ``values``.
-
-        Raises:
-            ValueError: the photo's size is not scale times the map's.
-
-        """
+        """Return normalised disparity (B, 1, H, W) for (B, 3, H, W) and (B, 1, h, w); see the base class."""
         expect_rgb_size(rgb, values, self.scale)
         weight = next(self.parameters())
         with torch.autocast(rgb.device.type, enabled=False):

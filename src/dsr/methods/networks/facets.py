@@ -17,8 +17,6 @@ A network of planes takes over what it can from a trained one: from Facets, or f
 
 from __future__ import annotations
 
-from typing import Any
-
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
@@ -78,11 +76,6 @@ class Facets(NormalisedNetwork):
         self.up, self.join = up, join
         self.choice = scale_down(nn.Conv2d(HEAD, NEIGHBOURS * facets, 3, padding=1))
 
-    def arguments(self) -> dict[str, Any]:
-        """Return the constructor's arguments."""
-        sizes = {"scale": self.scale, "width": self.width, "blocks": self.blocks, "facets": self.facets}
-        return {**sizes, "slopes": self.slopes}
-
     @property
     def receptive_field_radius(self) -> int:
         """Receptive-field radius in low-resolution pixels.
@@ -98,17 +91,7 @@ class Facets(NormalisedNetwork):
         return (mean_colour(rgb),)
 
     def forward(self, rgb: Tensor, values: Tensor, mean: Tensor | None = None) -> Tensor:
-        """Map an image and normalised low-resolution disparity to high-resolution disparity.
-
-        Args:
-            rgb: (B, 3, H, W).
-            values: (B, 1, h, w).
-            mean: (B, 3, 1, 1) mean colour of the image that ``rgb`` is a window of; None for that of ``rgb``.
-
-        Returns:
-            (B, 1, H, W).
-
-        """
+        """Return normalised disparity; ``mean`` is the mean colour of the image that ``rgb`` is a window of."""
         expect_rgb_size(rgb, values, self.scale)
         around = stencil(values)
         dtype = self.photo.weight.dtype

@@ -29,7 +29,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from types import MappingProxyType
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -195,11 +195,6 @@ class FacetsUNet(DisparityNetwork):
             if name.split(".")[0] in _SHARED:
                 parameter.copy_(theirs[name])
                 parameter.requires_grad_(False)
-
-    def arguments(self) -> dict[str, Any]:
-        """Return the constructor's arguments."""
-        sizes = {"scale": self.scale, "width": self.width, "deep": self.deep}
-        return {**sizes, "blocks": self.blocks, "facets": self.facets}
 
     def upsample(self, rgb: Tensor, disparity: Tensor, min_max: Tensor | None = None) -> Tensor:
         """Return high-resolution disparity; see :meth:`~dsr.methods.networks.network.DisparityNetwork.upsample`."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import abc
 import copy
+import inspect
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -117,9 +118,9 @@ class DisparityNetwork(nn.Module, abc.ABC):
         """
         raise ValueError(f"{type(self).__name__} has no layers that do not depend on the factor")
 
-    @abc.abstractmethod
     def arguments(self) -> dict[str, Any]:
-        """Return the constructor's arguments as plain values; weights files store them."""
+        """Return the constructor's arguments, attributes of these names, as plain values; weights files store them."""
+        return {name: getattr(self, name) for name in inspect.signature(type(self)).parameters}
 
     @abc.abstractmethod
     def upsample(self, rgb: Tensor, disparity: Tensor, min_max: Tensor | None = None) -> Tensor:

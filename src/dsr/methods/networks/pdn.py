@@ -315,11 +315,6 @@ class PrimalDualNetwork(NormalisedNetwork):
         self.head.bias.data.zero_()  # type: ignore[union-attr]
         self.log_strength = nn.Parameter(torch.zeros(()))
 
-    def arguments(self) -> dict[str, Any]:
-        """Return the constructor's arguments."""
-        sizes = {"scale": self.scale, "width": self.width, "layers": self.layers}
-        return {**sizes, "window": self.window, "iterations": self.iterations}
-
     @property
     def receptive_field_radius(self) -> int:
         """Receptive-field radius in low-resolution pixels.
@@ -331,16 +326,7 @@ class PrimalDualNetwork(NormalisedNetwork):
         return -(-radius_hr // self.scale) + 4
 
     def forward(self, rgb: Tensor, values: Tensor) -> Tensor:
-        """Map an image and normalised low-resolution disparity to high-resolution disparity.
-
-        Args:
-            rgb: (B, 3, H, W).
-            values: (B, 1, h, w).
-
-        Returns:
-            (B, 1, H, W).
-
-        """
+        """Return normalised disparity (B, 1, H, W) for (B, 3, H, W) and (B, 1, h, w); see the base class."""
         expect_rgb_size(rgb, values, self.scale)
         hr = upsample_linear_border(values, self.scale)
         inputs, bend = self._inputs(rgb, values, hr)

@@ -20,7 +20,7 @@ import torch
 from torch import Tensor, nn
 
 from dsr.methods.networks.network import DisparityNetwork
-from dsr.utils.builder import ConfigError
+from dsr.utils.builder import ConfigError, Node
 from dsr.utils.guards import expect_bytes, expect_stored, opened, parse_json
 from dsr.utils.ratios import round_ratio
 
@@ -289,7 +289,7 @@ def _find_mismatches(tensors: Mapping[str, Tensor], shapes: Mapping[str, tuple[i
     return problems
 
 
-def find_weights(node: Mapping[str, Any], scale: float) -> Path:
+def find_weights(node: Node, scale: float) -> Path:
     """Find the file of weights of a method that takes one.
 
     Args:
@@ -314,7 +314,7 @@ def find_weights(node: Mapping[str, Any], scale: float) -> Path:
     return given
 
 
-def has_weights(node: Mapping[str, Any], scale: float) -> bool:
+def has_weights(node: Node, scale: float) -> bool:
     """Return whether the weights that a method's node names are there, for that scale."""
     path, files = _given(node), _files_for(node, scale)
     if path is not None and path.is_dir() and files:
@@ -346,12 +346,12 @@ def packaged_names() -> list[str]:
     return sorted(path.stem for path in Path(str(resources.files("dsr.methods.weights"))).glob("*.safetensors"))
 
 
-def _given(node: Mapping[str, Any]) -> Path | None:
+def _given(node: Node) -> Path | None:
     """Return the file or directory of weights that a node names."""
     return None if node.get("weights") is None else Path(str(node["weights"])).expanduser()
 
 
-def _lack(node: Mapping[str, Any], scale: float, files: list[str]) -> str:
+def _lack(node: Node, scale: float, files: list[str]) -> str:
     """Say which weights a method needs, and where they are."""
     published = f", or a directory with {files[0]} (from {node.get('weights_source')})" if files else ""
     needs = f"method={node['name']} at scale {round_ratio(scale)} needs weights=FILE{published}"
@@ -360,7 +360,7 @@ def _lack(node: Mapping[str, Any], scale: float, files: list[str]) -> str:
     return f"dsr comes with {', '.join(packaged_names())}; {needs}"
 
 
-def _packaged_file(node: Mapping[str, Any], scale: float) -> Path | None:
+def _packaged_file(node: Node, scale: float) -> Path | None:
     """Return the file of packaged weights, the one for a scale where the node names several by their factors."""
     packaged = node.get("weights_packaged")
     if isinstance(packaged, Mapping):
@@ -370,7 +370,7 @@ def _packaged_file(node: Mapping[str, Any], scale: float) -> Path | None:
     return None if packaged is None else packaged_weights(str(packaged))
 
 
-def _files_for(node: Mapping[str, Any], scale: float) -> list[str]:
+def _files_for(node: Node, scale: float) -> list[str]:
     """Return the names of published files with the weights for a scale, in order of preference."""
     files = node.get("weights_files")
     if files is None:

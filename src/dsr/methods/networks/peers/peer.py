@@ -6,7 +6,6 @@ from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
 
 import torch
 
@@ -19,6 +18,7 @@ from dsr.methods.networks.peers.local_filters import FDKN, SVLRM
 from dsr.methods.networks.peers.peer_network import PeerNetwork, PeerUpsampler, Range, load_peer
 from dsr.methods.networks.peers.pgsr import PGSR
 from dsr.methods.networks.weight_files import nearest_scale
+from dsr.utils.builder import Node
 from dsr.utils.versions import file_hash
 
 PEERS: MappingProxyType[str, type[PeerNetwork]] = MappingProxyType(
@@ -49,7 +49,7 @@ class Peer(PeerUpsampler):
     """
 
     @classmethod
-    def abilities_of(cls, node: Mapping[str, Any]) -> Abilities:
+    def abilities_of(cls, node: Node) -> Abilities:
         """Return what the network that a node names can do."""
         network = PEERS.get(str(node.get("peer")))
         return cls.abilities if network is None else replace(cls.abilities, cost=network.cost)
