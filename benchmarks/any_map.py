@@ -36,7 +36,7 @@ from dsr.degradation.downsampling import Downsampling, Kernel, Measured, make_sa
 from dsr.degradation.noise import GaussianMultiplicative, Kinect, TimeOfFlight
 from dsr.geometry.camera import Camera, RangeType
 from dsr.geometry.surface import angle_between, depth_to_normals
-from dsr.methods.networks.noise_aware import AnyMap, Edges
+from dsr.methods.networks.facets_method import AnyMap, Edges
 from dsr.methods.networks.weight_files import read_header
 from dsr.metrics.catalogue import PROTOCOLS, score_image
 from dsr.metrics.metric import WORST

@@ -27,7 +27,7 @@ from dsr.degradation.hints import relative_error
 from dsr.geometry.camera import Camera, from_range
 from dsr.geometry.surface import depth_to_normals
 from dsr.io.images import read_camera, read_rgb
-from dsr.methods.networks.noise_aware import AnyMap
+from dsr.methods.networks.facets_method import AnyMap
 from dsr.methods.recipe import Run, read_recipe
 from dsr.sample import DepthSample
 from dsr.utils.compute_device import fast_precision

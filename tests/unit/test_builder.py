@@ -10,8 +10,8 @@ import pytest
 import torch
 
 from dsr.app.schema import EvalConfig
-from dsr.utils.builder import ConfigError, build
 from dsr.utils.compute_device import pick_device
+from dsr.utils.configuration import ConfigError, build
 
 Order = Literal["near", "far"]
 

@@ -22,7 +22,7 @@ from dsr.synthetic.simgeo import SCENES as SIMGEO_SCENES
 from dsr.training.data_module import Part, PatchData
 from dsr.training.degradation import Degradation
 from dsr.training.settings import PatchSettings
-from dsr.utils.builder import ConfigError, build
+from dsr.utils.configuration import ConfigError, build
 
 CONF = Path(__file__).resolve().parents[2] / "conf" / "dataset"
 

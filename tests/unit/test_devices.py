@@ -41,8 +41,8 @@ from dsr.training.module import SuperResolution
 from dsr.training.objective import DepthObjective, SurfaceObjective
 from dsr.training.patches import Patches
 from dsr.training.settings import PatchSettings
-from dsr.utils.builder import ConfigError
 from dsr.utils.compute_device import fast_precision, pick_device
+from dsr.utils.configuration import ConfigError
 
 SHORT: dict[str, dict[str, Any]] = {
     "dip": {"steps": 2},

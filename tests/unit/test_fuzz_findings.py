@@ -30,8 +30,8 @@ from dsr.methods.networks.weight_files import is_dsr_weights
 from dsr.methods.recipe import read_recipe
 from dsr.report.user_study import read_study
 from dsr.user_study.answers import files_of
-from dsr.utils.builder import ConfigError
-from dsr.utils.files import open_array
+from dsr.utils.arrays import open_array
+from dsr.utils.configuration import ConfigError
 from dsr.utils.picture_headers import picture_size
 from dsr.viewer.page import is_view
 

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from dsr.io.exports import LONGEST, read_input, write_input
-from dsr.utils.files import array_headers
+from dsr.utils.arrays import array_headers
 
 
 @pytest.fixture

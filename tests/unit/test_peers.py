@@ -24,7 +24,7 @@ from dsr.methods.networks.peers.peer_network import PeerNetwork, PeerUpsampler, 
 from dsr.methods.networks.weight_files import find_weights, has_weights, nearest_scale
 from dsr.methods.recipe import read_recipe
 from dsr.sample import DepthSample
-from dsr.utils.builder import ConfigError
+from dsr.utils.configuration import ConfigError
 from dsr.utils.versions import file_hash
 
 FILES = {"SVLRM_X4.pth": 4, "SVLRM_X8.pth": 8, "X8/model.pth": 8}

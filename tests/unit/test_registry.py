@@ -12,8 +12,7 @@ from dsr.methods.classical.tgv import TotalGeneralisedVariation
 from dsr.methods.networks.network import NetworkUpsampler
 from dsr.methods.networks.weight_files import find_weights
 from dsr.methods.recipe import list_methods, read_recipe
-from dsr.utils.builder import ConfigError
-from dsr.utils.config_files import config_directories
+from dsr.utils.configuration import ConfigError, config_directories
 
 
 @pytest.mark.parametrize("scale", [4, 8])

@@ -31,7 +31,7 @@ from dsr.methods.networks.trained import read_msg_weights
 from dsr.sample import FARTHEST, NEAREST, DepthSample, Scene
 from dsr.user_study.answers import read_all
 from dsr.user_study.key import Candidate, Key, Trial, read_key, write_key
-from dsr.utils.builder import ConfigError
+from dsr.utils.configuration import ConfigError
 from dsr.utils.console import one_line, print_error
 from dsr.utils.guards import is_number, parse_json, readable
 

@@ -10,8 +10,7 @@ import yaml
 
 from dsr.app.training_runs import read_config, studies_of_run
 from dsr.app.trust import Trust, _targets_in, expect_trusted
-from dsr.utils.builder import ConfigError, load_target
-from dsr.utils.config_files import config_directories
+from dsr.utils.configuration import ConfigError, config_directories, load_target
 
 CONFIG = {
     "model": {"name": "msg_v", "label": "MSG-V", "target": "dsr.methods.networks.msg_net.MSGNet"},

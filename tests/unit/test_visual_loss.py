@@ -24,7 +24,7 @@ from dsr.metrics.visual_loss import MSE_V, VisualLoss, VisualLossName, make_visu
 from dsr.sample import DepthSample, Scene
 from dsr.training.degradation import Batch, to_tensors
 from dsr.training.objective import DepthObjective, balance_weight
-from dsr.utils.builder import ConfigError
+from dsr.utils.configuration import ConfigError
 
 SIZE = 32
 CAMERA = Camera(SIZE, SIZE, 40.0, 40.0, 15.5, 15.5)

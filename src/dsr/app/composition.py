@@ -21,7 +21,7 @@ def compose(
     Args:
         name: without ``.yaml``.
         overrides: as on the command line.
-        directories: those of :func:`dsr.utils.config_files.config_directories`.
+        directories: those of :func:`dsr.utils.configuration.config_directories`.
         with_hydra: whether Hydra's own settings are there, too.
 
     """

@@ -9,8 +9,8 @@ from typing import Any
 
 import torch
 
-from dsr.utils.builder import ConfigError
 from dsr.utils.checkpoints import DivergenceError
+from dsr.utils.configuration import ConfigError
 from dsr.utils.files import write_text
 from dsr.utils.guards import parse_json, read_limited
 

@@ -38,8 +38,8 @@ from dsr.methods.recipe import Known, Recipe, Run
 from dsr.metrics.formats import HEADLINES, Formats
 from dsr.report.tables import score_table
 from dsr.sample import DepthSample, slope
-from dsr.utils.builder import ConfigError, build
 from dsr.utils.compute_device import fast_precision, pick_device
+from dsr.utils.configuration import ConfigError, build
 from dsr.utils.console import ConsoleProgress, note_once, open_console, print_error, show
 from dsr.utils.ratios import NATIVE, match_ratio
 from dsr.utils.versions import file_hash

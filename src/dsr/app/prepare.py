@@ -14,8 +14,7 @@ from dsr.app.explain import explain
 from dsr.app.schema import plain_config
 from dsr.data.scene_source import SceneSource, prepare_scenes
 from dsr.sample import Scene
-from dsr.utils.builder import ConfigError, build
-from dsr.utils.config_files import config_directories
+from dsr.utils.configuration import ConfigError, build, config_directories
 from dsr.utils.console import ConsoleProgress, one_line, show
 from dsr.viz.sheets import save_contact_sheet
 

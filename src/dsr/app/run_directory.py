@@ -12,7 +12,7 @@ import torch
 from omegaconf import OmegaConf
 
 from dsr.app.run_names import NOT_IDENTITY, run_name
-from dsr.utils.builder import ConfigError, expand_home
+from dsr.utils.configuration import ConfigError, expand_home
 from dsr.utils.console import shorten
 from dsr.utils.files import write_text
 from dsr.utils.guards import parse_json, read_limited

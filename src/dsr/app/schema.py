@@ -12,7 +12,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import MISSING, DictConfig, OmegaConf
 
 from dsr.training.settings import PatchSettings, Schedule
-from dsr.utils.builder import ConfigError, check_types
+from dsr.utils.configuration import ConfigError, check_types
 from dsr.utils.guards import is_number
 from dsr.utils.ratios import NATIVE, check_scale
 
@@ -102,8 +102,8 @@ def _refuse_unknown(plain: Any, names: Collection[str], place: str = "") -> None
 class RunConfig(Checked):
     """The configuration that all commands have.
 
-    The groups (dataset, downsampling, noise, method, model) are made by :func:`dsr.utils.builder.build`, which checks
-    their keys against what the class or function that they name takes.
+    The groups (dataset, downsampling, noise, method, model) are made by :func:`dsr.utils.configuration.build`, which
+    checks their keys against what the class or function that they name takes.
     """
 
     dataset: dict[str, Any] = MISSING

@@ -45,9 +45,9 @@ from dsr.training.module import SuperResolution, WarmupCosine
 from dsr.training.objective import DepthObjective, Objective, SurfaceObjective
 from dsr.training.settings import Schedule
 from dsr.utils import interruption
-from dsr.utils.builder import ConfigError, build
 from dsr.utils.checkpoints import CheckpointError, DivergenceError
 from dsr.utils.compute_device import fast_precision, pick_device
+from dsr.utils.configuration import ConfigError, build
 from dsr.utils.console import USAGE_ERROR, ConsoleProgress
 from dsr.utils.files import replacing
 from dsr.utils.guards import expect_stored

@@ -19,8 +19,8 @@ from dsr.training.callbacks import Curves
 from dsr.training.data_module import PatchData
 from dsr.training.degradation import Batch
 from dsr.training.module import SuperResolution
-from dsr.utils.builder import build
 from dsr.utils.checkpoints import Divergence, Interruption, OwnFiles
+from dsr.utils.configuration import build
 from dsr.utils.lightning import ListedScores, StepProgress, ValidationTable, make_trainer, without_chatter
 from dsr.utils.progress import SILENT, Progress
 

@@ -14,7 +14,7 @@ from dsr.degradation.downsampling import Downsampling
 from dsr.training.data_module import Part, PatchData
 from dsr.training.degradation import Degradation
 from dsr.training.settings import PatchSettings
-from dsr.utils.builder import ConfigError, build, check_types, load_target, with_key
+from dsr.utils.configuration import ConfigError, build, check_types, load_target, with_key
 from dsr.utils.guards import is_number
 
 WEIGHTS = "weights.safetensors"

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from rich.console import Console
 
 from dsr.app.requests import AnswersRequest, StudyRequest
-from dsr.cli.command import Command, CommandGroup
+from dsr.cli.commands import Command, CommandGroup
 from dsr.utils.console import ConsoleProgress, show
 
 if TYPE_CHECKING:

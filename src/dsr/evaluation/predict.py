@@ -31,8 +31,9 @@ from dsr.evaluation.sharing import ALONE, Claims, Workers, share
 from dsr.evaluation.store import iterations_path, prediction_path, sample_path
 from dsr.methods.base import Method, NoSolutionError, expect_some_depth
 from dsr.sample import DepthSample
+from dsr.utils.arrays import read_arrays
 from dsr.utils.console import one_line
-from dsr.utils.files import look_anew, read_arrays, replacing
+from dsr.utils.files import look_anew, replacing
 from dsr.utils.guards import parse_json
 from dsr.utils.pool import LOST
 from dsr.utils.progress import SILENT, Progress

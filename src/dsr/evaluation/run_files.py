@@ -17,7 +17,7 @@ from pydantic import BaseModel, Field, ValidationError
 from dsr.evaluation.results import Results, Run, method_key, method_settings, problem_key
 from dsr.evaluation.store import expect_scene, prediction_path, sample_path
 from dsr.metrics.formats import MetricFormat
-from dsr.utils.files import array_headers
+from dsr.utils.arrays import array_headers
 from dsr.utils.guards import MOST_TABLE, OutsideError, TooLargeError, natural_key, read_limited
 from dsr.utils.ratios import as_ratio
 from dsr.utils.validation import Number, Whole, describe

@@ -13,7 +13,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from dsr.utils.files import read_arrays
+from dsr.utils.arrays import read_arrays
 from dsr.utils.guards import TooLargeError, path_within
 
 _ERRORS = ("depth_error", "angle_error")

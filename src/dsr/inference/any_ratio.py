@@ -34,8 +34,8 @@ from dsr.inference.working_size import (
 from dsr.methods.base import InverseSurface, Method, NoiseLaw, Surface, expect_some_depth
 from dsr.methods.recipe import Recipe, Run, read_recipe
 from dsr.sample import DepthSample, expect_distances
-from dsr.utils.builder import ConfigError
 from dsr.utils.compute_device import fast_precision, pick_device
+from dsr.utils.configuration import ConfigError
 from dsr.utils.progress import Steps
 
 _DECIDED = MappingProxyType({"fill_holes": True, "validate_every": 0})

@@ -13,7 +13,7 @@ from dsr.inference.plans import steps_of
 from dsr.methods.base import Method
 from dsr.methods.networks.weight_files import has_weights
 from dsr.methods.recipe import Recipe, Run
-from dsr.utils.builder import ConfigError
+from dsr.utils.configuration import ConfigError
 
 
 @dataclass(frozen=True)

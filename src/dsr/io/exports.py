@@ -43,7 +43,8 @@ from dsr.geometry.surface import depth_to_normals
 from dsr.io.images import decode_pixels
 from dsr.io.photos import write_png
 from dsr.sample import expect_distances
-from dsr.utils.files import array_headers, read_arrays, replacing
+from dsr.utils.arrays import array_headers, read_arrays
+from dsr.utils.files import replacing
 from dsr.utils.guards import MOST_FACES, MOST_POINTS
 
 _TO_GLTF = np.array([1, -1, -1])

@@ -16,7 +16,7 @@ import numpy as np
 from pydantic import BaseModel, BeforeValidator, Field
 
 from dsr.geometry.camera import Camera, RangeType
-from dsr.utils.files import read_array_header
+from dsr.utils.arrays import read_array_header
 from dsr.utils.guards import (
     MOST_FILE,
     array_bytes,

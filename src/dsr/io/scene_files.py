@@ -44,7 +44,8 @@ from dsr.geometry.camera import Camera
 from dsr.geometry.rigid_motion import is_rotation
 from dsr.io.images import read_pixels
 from dsr.io.photos import write_png
-from dsr.utils.files import open_array, replacing, write_text
+from dsr.utils.arrays import open_array
+from dsr.utils.files import replacing, write_text
 from dsr.utils.guards import pixels_beside
 
 RGBD = ("color.png", "depth.png", "intrinsic.json")

@@ -14,7 +14,7 @@ from dsr.geometry.camera import Camera, RangeType
 from dsr.methods.inpainting import inpaint
 from dsr.methods.tiling import TILE, UNTILED
 from dsr.sample import DepthSample
-from dsr.utils.builder import Node
+from dsr.utils.configuration import Node
 from dsr.utils.progress import Steps
 from dsr.utils.ratios import SCALES, round_ratio
 

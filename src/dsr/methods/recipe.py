@@ -31,8 +31,7 @@ from dsr.methods.networks.weight_files import (
     network_name,
     read_header,
 )
-from dsr.utils.builder import ConfigError, Node, build, load_target
-from dsr.utils.config_files import config_directories, list_choices
+from dsr.utils.configuration import ConfigError, Node, build, config_directories, list_choices, load_target
 from dsr.utils.ratios import SCALES
 
 _NETWORK = "network"

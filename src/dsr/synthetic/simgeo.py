@@ -16,10 +16,26 @@ from functools import lru_cache
 import numpy as np
 
 from dsr.geometry.camera import VIRTUAL_BASELINE, Camera
-from dsr.synthetic.ray_surfaces import Array, Box, Cylinder, Field, Plane, Sphere, rotation
+from dsr.synthetic.ray_surfaces import (
+    CLOUD,
+    DUSK,
+    Array,
+    Box,
+    Cylinder,
+    Field,
+    Plane,
+    Sphere,
+    blobs,
+    marble,
+    mosaic,
+    noise,
+    plain,
+    rotation,
+    unroll_chart,
+    weave,
+)
 from dsr.synthetic.raycast import Body, Implicit, World, area_light, render
 from dsr.synthetic.rendering import Rendering
-from dsr.synthetic.textures import CLOUD, DUSK, blobs, marble, mosaic, noise, plain, unroll_chart, weave
 
 Vector = tuple[float, float, float]
 

@@ -22,7 +22,7 @@ from lightning.pytorch.trainer.states import TrainerFn
 from torch import Tensor
 
 from dsr.utils import interruption
-from dsr.utils.builder import ConfigError
+from dsr.utils.configuration import ConfigError
 from dsr.utils.console import one_line
 from dsr.utils.files import replacing
 

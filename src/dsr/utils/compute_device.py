@@ -6,7 +6,7 @@ import os
 
 import torch
 
-from dsr.utils.builder import ConfigError
+from dsr.utils.configuration import ConfigError
 
 _FAST_ON_CPU = ("_is_avx512_bf16_supported", "_is_amx_tile_supported")
 """What a CPU has where convolutions in bfloat16 are faster, also with gradients (``benchmarks/train_speed.py``)."""

@@ -18,8 +18,8 @@ from lightning.pytorch.loggers import TensorBoardLogger
 from lightning.pytorch.plugins.environments import ClusterEnvironment, LightningEnvironment
 
 from dsr.utils import interruption
-from dsr.utils.builder import ConfigError
 from dsr.utils.checkpoints import AtomicCheckpoints, CheckpointError, Interruption, Resumed
+from dsr.utils.configuration import ConfigError
 from dsr.utils.files import FullDiskError, replacing, space_for
 from dsr.utils.progress import Progress, Task
 from dsr.utils.runs_table import SCORES, list_scores

@@ -17,7 +17,7 @@ from dsr.evaluation.store import load_errors
 from dsr.geometry.camera import Camera
 from dsr.io.exports import INPUT, read_input
 from dsr.sample import expect_distances
-from dsr.utils.files import array_headers, open_array
+from dsr.utils.arrays import array_headers, open_array
 from dsr.utils.guards import is_number, natural_key, parse_json, read_limited
 from dsr.viewer.surfaces import ViewedResult
 

@@ -118,7 +118,7 @@ class FacetsUNet(DisparityNetwork):
 
     of_inverse_depth = True
     states_errors = True
-    method = MappingProxyType({"target": "dsr.methods.networks.noise_aware.AnyMap"})
+    method = MappingProxyType({"target": "dsr.methods.networks.facets_method.AnyMap"})
 
     def __init__(self, scale: int = 4, width: int = 96, deep: int = 88, blocks: int = 6, facets: int = 2) -> None:
         super().__init__()

@@ -20,7 +20,7 @@ import torch
 from torch import Tensor, nn
 
 from dsr.methods.networks.network import DisparityNetwork
-from dsr.utils.builder import ConfigError, Node
+from dsr.utils.configuration import ConfigError, Node
 from dsr.utils.guards import expect_bytes, expect_stored, opened, parse_json
 from dsr.utils.ratios import round_ratio
 

@@ -14,7 +14,7 @@ from dsr.geometry.camera import Camera
 from dsr.geometry.conventions import LIGHT_NAMES
 from dsr.geometry.shading import lights, shade
 from dsr.sample import DepthSample
-from dsr.utils.files import array_headers
+from dsr.utils.arrays import array_headers
 from dsr.viz.panels import Window, normals_seen_by, strongest_window
 
 _DETAIL = 5
