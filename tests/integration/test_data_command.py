@@ -302,9 +302,9 @@ def test_help_has_examples(arguments, capsys):
 
 
 def test_doctor_exit_code_is_that_of_the_command(tmp_path, monkeypatch):
-    doctor = types.ModuleType("dsr.doctor")
+    doctor = types.ModuleType("dsr.doctor.examine")
     seen = []
     doctor.examine_directory = lambda *given: seen.append(given) or 3
-    monkeypatch.setitem(sys.modules, "dsr.doctor", doctor)
+    monkeypatch.setitem(sys.modules, "dsr.doctor.examine", doctor)
     assert cli.main(["doctor", str(tmp_path)]) == 3
     assert seen == [(tmp_path, None)]

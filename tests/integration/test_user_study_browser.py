@@ -9,7 +9,7 @@ from collections import Counter
 import pandas as pd
 import pytest
 
-from dsr.cli import study as command
+from dsr.cli.study import STUDY as command
 from dsr.evaluation.run_files import load_results
 from dsr.user_study.build import build_study
 from dsr.user_study.choice import Choice

@@ -17,7 +17,7 @@ import torch
 from PIL import Image
 from scipy.stats import binomtest
 
-from dsr.cli import study as command
+from dsr.cli.study import STUDY as command
 from dsr.evaluation.run_files import load_results
 from dsr.geometry.camera import Camera
 from dsr.user_study.answers import files_of, read_all, read_answers
