@@ -9,7 +9,7 @@ from collections import Counter
 import pandas as pd
 import pytest
 
-from dsr.cli.study import STUDY as command
+from dsr.cli.study import STUDY
 from dsr.evaluation.run_files import load_results
 from dsr.user_study.build import build_study
 from dsr.user_study.choice import Choice
@@ -105,7 +105,7 @@ class Visit:
 
 def run(*arguments):
     parser = argparse.ArgumentParser()
-    command.add(parser.add_subparsers())
+    STUDY.add(parser.add_subparsers())
     options = parser.parse_args(["study", *map(str, arguments)])
     return options.run(options, open_console(), None)
 

@@ -17,7 +17,7 @@ import torch
 from PIL import Image
 from scipy.stats import binomtest
 
-from dsr.cli.study import STUDY as command
+from dsr.cli.study import STUDY
 from dsr.evaluation.run_files import load_results
 from dsr.geometry.camera import Camera
 from dsr.user_study.answers import files_of, read_all, read_answers
@@ -512,7 +512,7 @@ class Commands:
 
     def __init__(self):
         self.parser = argparse.ArgumentParser()
-        command.add(self.parser.add_subparsers())
+        STUDY.add(self.parser.add_subparsers())
 
     def __call__(self, *arguments):
         options = self.parser.parse_args(["study", *map(str, arguments)])
