@@ -87,8 +87,6 @@ def load_frame(
         measured_path: lidar's depth.
         confidence_path: the lidar's confidence, None where there is none.
         intrinsics_path: ``.pincam`` file; None for 60 degrees of horizontal view.
-        dataset: of the scene returned.
-        name: the same.
         min_confidence: pixels of the lidar below this confidence become holes.
 
     Raises:

@@ -104,7 +104,6 @@ def load_frame(rgb_path: Path, levels_path: Path, dataset: str, name: str) -> Sc
         rgb_path: photo.
         levels_path: map of 8 bits, in which 0 is a level and no hole.
         dataset: of the scene returned, a key of ``BENCHMARKS``, which says the camera.
-        name: of the scene returned.
 
     Raises:
         ValueError: a file is missing, damaged, or does not fit the other; the message names it.

@@ -104,8 +104,6 @@ def load_2014(folder: Path, dataset: str, name: str, *, offset: bool = True) -> 
 
     Args:
         folder: with the files.
-        dataset: of the scene returned.
-        name: the same.
         offset: whether doffs of ``calib.txt`` counts, as it has to geometrically, or is taken for 0.
 
     Raises:
@@ -132,8 +130,6 @@ def load_levels(files: Files, dataset: str, name: str, year: int, *, smooth: boo
 
     Args:
         files: of the scene.
-        dataset: of the scene returned.
-        name: the same.
         year: that of the data set, which says how levels count.
         smooth: whether the steps of the rounding are smoothed; see :mod:`dsr.data.reference_depth`.
 

@@ -74,8 +74,6 @@ def load_frame(path: Path, number: int, dataset: str, name: str, *, filled: bool
     Args:
         path: the labelled ``.mat`` file.
         number: of the frame, from 1.
-        dataset: of the scene returned.
-        name: the same.
         filled: take the authors' filled depth instead of the Kinect's with its holes.
         crop: cut off the border, which leaves 427 x 561 pixels.
 

@@ -98,8 +98,6 @@ def load_frame(
 
     Args:
         folder: the scene's.
-        dataset: of the scene returned.
-        name: the same.
         refined: take ``depth_bfx``, the authors' filled depth, instead of ``depth``.
         intrinsics: for a folder without ``intrinsics.txt``.
 

@@ -90,8 +90,6 @@ def load_frame(
     Args:
         path: the ``.mat`` file, or the intensity picture.
         samples_path: ``*_depth.bmp``; None with a ``.mat`` file.
-        dataset: of the scene returned.
-        name: the same.
         intrinsics: (fx, fy, cx, cy) in pixels, pixel centres at integers; needed, as the files hold none.
         depth_range: metres of level 1 and of level 255 of ``samples_path``, which needs it.
         variables: names in the ``.mat`` file of "intensity", "depth" and "samples"; the others are found.

@@ -80,7 +80,6 @@ class Downsampling:
 
         Args:
             values: (..., H, W), NaN where unknown; H and W divisible by ``scale``.
-            scale: the factor.
 
         Returns:
             (..., H / scale, W / scale).

@@ -43,7 +43,6 @@ def add_glass(scene: Scene, generator: torch.Generator, kinds: Mapping[str, floa
 
     Args:
         scene: a scene with a true depth.
-        generator: source of all random numbers.
         kinds: relative frequency of each kind of object, of those of ``KINDS``.
 
     Returns:

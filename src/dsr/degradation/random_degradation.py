@@ -134,7 +134,6 @@ class Everything:
         Args:
             scene: a scene or a patch with a true depth.
             scale: the factor, which divides its size.
-            generator: source of all random numbers.
             soft: whether its depth steps are soft, for the hint.
 
         Raises:

@@ -50,7 +50,6 @@ def field_of(like: Tensor, sigma: float | tuple[float, float], generator: torch.
     Args:
         like: a map of that size.
         sigma: standard deviation of the Gaussian in pixels, or one along v and one along u.
-        generator: source of the random numbers.
 
     """
     if sigma == 0:
@@ -78,7 +77,6 @@ def waves_of(like: Tensor, length: float, generator: torch.Generator, stretch: f
     Args:
         like: a map of that size.
         length: full width at half maximum of its autocorrelation in pixels; white noise for 1 and less.
-        generator: source of the random numbers.
         stretch: by how much it is longer along rows, and shorter along columns.
 
     """
@@ -170,7 +168,6 @@ def displace(values: Tensor, scale: int, generator: torch.Generator) -> Tensor:
     Args:
         values: (1, H, W).
         scale: no pixel moves by more than this many pixels along either axis.
-        generator: source of all random numbers.
 
     """
     for dim in (-2, -1):

@@ -142,7 +142,6 @@ def predict(
 
     Args:
         study: evaluation to run.
-        folder: directory of the run.
         progress: display of the completed scenes, and of the method's steps within a scene.
         overwrite: whether stored predictions are recomputed, but for those that another process stores meanwhile.
         workers: how many scenes are predicted at a time, each in a process of its own.

@@ -53,10 +53,8 @@ def score(
 
     Args:
         study: the evaluation; its data set is not read.
-        folder: directory of the run.
         metrics: from :func:`dsr.metrics.catalogue.catalogue`.
         outcome: outcome of :func:`predict`; failures and scenes without true depth are added to it.
-        progress: display of the completed scenes.
         illustrate: function that draws a picture of a sample, the predicted depth and its worst-of-four scores.
         workers: how many scenes are scored at a time, each in a process of its own.
 

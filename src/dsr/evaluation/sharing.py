@@ -241,14 +241,12 @@ def share(
     """Work through scenes, but for those that other commands work on; wait for these.
 
     Args:
-        scenes: the scenes.
         claims: the claims of this command.
         name: what is done to the scenes, such as ``predict``.
         ready: function that returns the result of a scene if it is there already.
         work: function that makes it, and leaves it where ``ready`` finds it.
         lost: function that returns the result of a scene whose workers were killed.
         workers: how many at a time.
-        progress: display of the completed scenes.
         meanwhile: function that is called while workers are busy, or else at once; None for none.
 
     Returns:

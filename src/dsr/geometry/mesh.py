@@ -245,7 +245,6 @@ def project(points: np.ndarray, camera: Camera) -> np.ndarray:
 
     Args:
         points: (N, 3) in the camera frame, in front of it.
-        camera: the camera.
 
     """
     x, y, z = points.astype(np.float64).T

@@ -285,7 +285,6 @@ def upsampler(
         method: the name of one in ``conf/method``.
         scale: see :class:`AnyRatio`, also for ``fill``, ``max_hole`` and ``working_size``.
         settings: arguments of the method that differ from its file, by name.
-        directories: the user's configuration directories.
         device: ``auto`` for a GPU if there is one, or a device as torch names it.
         fill: see there.
         max_hole: see there.

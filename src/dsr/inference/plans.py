@@ -75,7 +75,6 @@ def plan_for(
     from the low-resolution map that it was before.
 
     Args:
-        recipe: the method.
         photo_size: height and width.
         depth_size: height and width.
         scale: the factor; None to choose it by the sizes, 4 if they are equal.

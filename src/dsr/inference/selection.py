@@ -65,7 +65,6 @@ def select(recipe: Recipe, scale: float, weights: Path | None = None, *, measure
     """Select how to run a method at a scale.
 
     Args:
-        recipe: the method.
         scale: ratio of the photo's width to the depth map's.
         weights: a file of weights, or a directory with published ones; None for those that the method names.
         measured: whether the maps are a sensor's own. Of a method without packaged weights for their ratio, those for

@@ -103,7 +103,6 @@ def scale_to_photo(path: Path, content: CameraFile, size: Size) -> tuple[CameraF
 
     Args:
         path: file that the camera comes from, for the message.
-        content: the camera.
         size: of the photo.
 
     Raises:
@@ -179,7 +178,6 @@ def read_rig(files: RigFiles, size_lr: Size, baseline: float | None) -> Rig:
     """Read the description of a rig.
 
     Args:
-        files: the files.
         size_lr: height and width of the depth map.
         baseline: distance in metres between the two cameras of disparities, if the map has such.
 

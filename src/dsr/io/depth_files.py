@@ -42,7 +42,6 @@ def read_depth_file(path: Path, most: int | None = None) -> np.ndarray:
     ``.npz`` file the array named depth, else the only one.
 
     Args:
-        path: the file.
         most: largest number of pixels; None for what the size of the file explains.
 
     Raises:

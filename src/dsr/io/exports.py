@@ -72,7 +72,6 @@ def write_ply(
     """Write a binary PLY file atomically.
 
     Args:
-        path: the file.
         points: (N, 3) in metres, in the camera frame.
         normals: (N, 3) unit vectors.
         colours: (N, 3) uint8, sRGB.
@@ -94,7 +93,6 @@ def write_glb(
     The material is rough and lit from both sides, so that viewers show the shape as well as the photo.
 
     Args:
-        path: the file.
         points: (N, 3) in metres, in the camera frame.
         normals: (N, 3) unit vectors.
         faces: (M, 3) indices, counterclockwise from outside; one at least.

@@ -134,7 +134,6 @@ def read_values(path: Path, most: int | None = None) -> np.ndarray:
     """Return a confidence map as it is stored, (h, w).
 
     Args:
-        path: the file.
         most: largest number of pixels; None for what the size of the file explains.
 
     Raises:

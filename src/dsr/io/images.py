@@ -47,7 +47,6 @@ def decode_pixels(place: str | Path, content: bytes, flags: int, most: int | Non
     Args:
         place: its name, for messages.
         content: a PNG, JPEG, TIFF, BMP, WebP or portable map.
-        flags: OpenCV's.
         most: largest number of pixels; None for what its length explains.
 
     Raises:
@@ -127,7 +126,6 @@ def read_map(path: Path, most: int | None = None) -> np.ndarray:
     """Return a one-channel map of floats, 16- or 32-bit whole numbers as float64, (H, W).
 
     Args:
-        path: the file.
         most: largest number of pixels; None for what the size of the file explains.
 
     Raises:
@@ -152,7 +150,6 @@ def read_array(path: Path, most: int | None = None) -> np.ndarray:
     """Return the values of a map in the type and shape that it is stored in.
 
     Args:
-        path: the file.
         most: largest number of pixels; None for what the size of the file explains.
 
     Raises:
@@ -195,7 +192,6 @@ def read_mask(path: Path, most: int | None = None) -> np.ndarray:
     """Return a mask, (H, W) bool: True where the picture is not 0.
 
     Args:
-        path: the file.
         most: largest number of pixels; None for what the size of the file explains.
 
     Raises:
@@ -341,8 +337,6 @@ def read_pixels(path: Path, flags: int, most: int | None = None) -> np.ndarray:
     """Return the pixels of a picture file as OpenCV decodes them.
 
     Args:
-        path: the file.
-        flags: OpenCV's.
         most: largest number of pixels; None for what the size of the file explains.
 
     Raises:

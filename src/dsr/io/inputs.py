@@ -133,7 +133,6 @@ def read_picture(pair: Pair, reading: Reading, units: FolderUnits | None = None)
     """Return a pair of files as tensors.
 
     Args:
-        pair: the files.
         reading: what the user says about them.
         units: guesses the unit for the whole folder; None to guess it from this map alone.
 

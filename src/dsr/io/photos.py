@@ -90,7 +90,6 @@ def write_png(path: Path, picture: np.ndarray, known: np.ndarray | None = None) 
     """Write a picture atomically.
 
     Args:
-        path: the file.
         picture: grey (H, W) or blue-green-red (H, W, 3), uint8 or uint16.
         known: (H, W) bool, an 8-bit picture is transparent elsewhere; None for everywhere.
 

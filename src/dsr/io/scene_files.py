@@ -319,7 +319,6 @@ def write_rerun(path: Path, frames: Sequence[Frame]) -> list[Path]:
     """Write a recording ``.rrd``: for each frame the entities ``camera``, ``camera/rgb`` and ``camera/depth``.
 
     Args:
-        path: the file.
         frames: one at least; those without a pose stand at the origin.
 
     Returns:

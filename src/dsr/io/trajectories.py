@@ -264,7 +264,6 @@ def describe_capture(app: str, unit: str, pairs: Sequence[Pair], *, poses: bool)
     Args:
         app: what it is a capture of.
         unit: of its depth maps.
-        pairs: its frames.
         poses: whether it has poses.
 
     """

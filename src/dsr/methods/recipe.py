@@ -182,7 +182,6 @@ class Recipe:
         """Build the method for a factor.
 
         Args:
-            factor: the upsampling factor.
             run: what the run gives; None for what :class:`Run` has.
             **decided: arguments that the caller decides in place of the method's file, if the class names them.
 
@@ -256,12 +255,7 @@ class Recipe:
 
 
 def list_methods(directories: Sequence[Path] = ()) -> list[str]:
-    """Return the names of all methods.
-
-    Args:
-        directories: the user's configuration directories.
-
-    """
+    """Return the names of all methods."""
     return list_choices("method", config_directories(directories))
 
 
@@ -271,7 +265,6 @@ def read_recipe(name: str, settings: Mapping[str, Any] | None = None, directorie
     Args:
         name: the method's name.
         settings: arguments to change, by name.
-        directories: the user's configuration directories.
 
     Raises:
         ConfigError: there is no such method, or its file cannot be read.

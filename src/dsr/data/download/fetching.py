@@ -168,8 +168,6 @@ def get(
 
     Args:
         items: what to fetch; a path that occurs twice is fetched once.
-        root: the directory of the data sets.
-        progress: shows what is done.
         mirror: address of a server to try first; it has each file under its path below the directory of the data sets.
         accept_changed: whether a file may have another checksum than recorded.
         keep_archives: whether archives stay after they were unpacked; those that were there before do anyway.
@@ -399,8 +397,6 @@ def unpack(archive: Path, target: Path, moved: Task, contains: Sequence[str] = (
     copies of the files that they lead to; those to directories are left out.
 
     Args:
-        archive: the file.
-        target: the directory.
         moved: is told how many bytes are unpacked, and of how many.
         contains: what the archive must have.
 
@@ -517,8 +513,6 @@ def verify(collection: Collection, root: Path, progress: Progress, *, accept_cha
 
     Args:
         collection: what to check.
-        root: the directory of the data sets.
-        progress: shows what is done.
         accept_changed: whether to record anew what differs.
 
     Returns:

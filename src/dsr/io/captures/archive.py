@@ -54,7 +54,6 @@ class Archive:
         """Return a member's content.
 
         Args:
-            name: its name.
             limit: largest number of bytes that it may have.
 
         Raises:

@@ -98,7 +98,6 @@ class AnisotropicDiffusion(Method):
         """Return high-resolution depth without holes, (1, H, W) in metres on the sample's device.
 
         Args:
-            sample: the problem.
             progress: is called with the steps done and their maximum.
 
         """
@@ -116,7 +115,6 @@ class AnisotropicDiffusion(Method):
             rgb: (B, 3, H, W) in [0, 1].
             lr: (B, 1, H / scale, W / scale) float64, positive, NaN in holes.
             scale: upsampling factor; at 1, only holes are inpainted.
-            progress: as above.
 
         """
         start = inpaint(lr)

@@ -89,7 +89,6 @@ def filter_bilateral(depth: Tensor, window: int, sigma_depth: float, sigma_space
     """Filter a depth map, (1, h, w) in metres, NaN in holes, which stay holes; see the module.
 
     Args:
-        depth: the map.
         window: diameter in pixels.
         sigma_depth: in metres.
         sigma_space: in pixels.

@@ -81,7 +81,6 @@ def predict_edge_map(
         sharp_weight: weight of the edges relative to that of their distance transform.
         smoothness: weight of the smoothness term.
         iterations: maximum number of iterations of belief propagation.
-        progress: is called with the iterations done and their maximum.
 
     Raises:
         NoSolutionError: the map has edges, but none once it is downsampled.

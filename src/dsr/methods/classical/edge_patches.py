@@ -177,9 +177,7 @@ def label(
         unary: (N, K) costs of each node's labels, finite.
         pairs: (E, 2) nodes, each pair once.
         costs: (E, K, K) of the labels of a pair's first node (rows) and second node (columns), finite.
-        iterations: maximum number of iterations.
         tolerance: largest change of a message, relative to the largest cost, at which it stops.
-        progress: is called with the iterations done and their maximum.
 
     """
     count, labels = unary.shape

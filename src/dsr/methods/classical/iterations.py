@@ -32,7 +32,6 @@ def conjugate_gradients(
             subspace that b - A start lies in; elements do not mix.
         right: b, (B, ...).
         start: the first x, (B, ...).
-        iterations: maximum number of steps.
         tolerance: relative residual |b - A x| / |b|, in all elements, at which it stops.
 
     """

@@ -121,10 +121,6 @@ class ShapeFromShading(Method):
     def __call__(self, sample: DepthSample, progress: Steps | None = None) -> Tensor:
         """Return high-resolution depth without holes, (1, H, W) in metres on the sample's device.
 
-        Args:
-            sample: the problem.
-            progress: is called with the iterations done and their maximum.
-
         Raises:
             ValueError: the sample's mask is missing, or is no image of its size.
 
@@ -186,7 +182,6 @@ def read_foreground(path: Path, size: tuple[int, int]) -> np.ndarray:
     """Return a mask, (H, W) bool, True where the picture is white.
 
     Args:
-        path: a picture.
         size: the height and width that it must have.
 
     Raises:

@@ -145,11 +145,6 @@ class TotalGeneralisedVariation(Method):
         """Return high-resolution depth without holes, (1, H, W) in metres on the sample's device.
 
         A disparity at or beyond infinity becomes NaN.
-
-        Args:
-            sample: the problem.
-            progress: is called with the iterations done and their maximum.
-
         """
         lr = sample.disparity_lr(torch.float64)[None]
         scaled = normalise(lr)
@@ -167,7 +162,6 @@ class TotalGeneralisedVariation(Method):
             rgb: (B, 3, H, W) in [0, 1].
             lr: (B, 1, H / scale, W / scale) of the same type, in [0, 1], NaN in holes.
             scale: upsampling factor; at 1, only holes are inpainted.
-            progress: as above.
 
         """
         start = inpaint(lr)

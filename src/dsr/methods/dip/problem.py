@@ -130,7 +130,6 @@ class PriorObjective:
         Args:
             depth: (1, 1, H, W) in metres.
             intensity: (1, 1, H, W) in [0, 1].
-            problem: the image.
 
         """
         depth_lr, depth_range = problem.downsample(depth), problem.depth_range

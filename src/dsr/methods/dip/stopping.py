@@ -28,7 +28,6 @@ class Stopping(Protocol):
         """Take note of a step, counted from 1; return whether to stop after it.
 
         Args:
-            step: the step.
             depth: (1, 1, H, W) the network's answer at this step.
             average: (1, 1, H, W) the running average of the answers, this one included.
 

@@ -149,7 +149,6 @@ class DeepImagePrior(Method):
         """Return the high-resolution orthogonal depth, (1, H, W) in metres on the sample's device; valid everywhere.
 
         Args:
-            sample: the problem.
             progress: called with the number of steps done and their total, unless there is a display.
 
         Raises:

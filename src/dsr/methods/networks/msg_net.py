@@ -356,7 +356,6 @@ def upsample_disparity(
     """Upsample disparity with a photo's guidance.
 
     Args:
-        net: the network.
         rgb: (B, 3, H, W) in 0..1, with H = scale * h and W = scale * w.
         disparity: (B, 1, h, w); non-finite values are holes.
         min_max: see :meth:`dsr.methods.networks.network.DisparityNetwork.upsample`.

@@ -89,8 +89,6 @@ def write_onnx(path: Path, graph: OnnxGraph, facts: Mapping[str, Any]) -> float:
     """Write a network as an ONNX file, atomically, after checking that its results are the network's.
 
     Args:
-        path: the file.
-        graph: the network.
         facts: plain values that become the file's metadata.
 
     Returns:

@@ -49,7 +49,6 @@ def save_network(
 
     Args:
         path: path of the file; the write is not atomic.
-        net: the network.
         model: name of the model in ``conf/model/``, such as ``msg_v``.
         facts: further plain values for readers of the file, such as data, steps and scores.
         half: whether to store the kernels of convolutions in half precision; biases and normalisations are not.
@@ -123,7 +122,6 @@ def load_network(
     """Load the network of a dsr weights file, in float32 on the CPU.
 
     Args:
-        path: path of the file.
         networks: network classes by name.
         scale: scale that the run requires, None for any.
         model: model that the run requires, None for any.
@@ -260,7 +258,6 @@ def load_parameters(net: nn.Module, tensors: Mapping[str, Tensor], path: Path, e
     """Check the tensors of a file and load them into a network.
 
     Args:
-        net: the network.
         tensors: tensors by parameter name.
         path: path of the file, for the message.
         expected: description of the expected network, for the message.
@@ -294,7 +291,6 @@ def find_weights(node: Node, scale: float) -> Path:
 
     Args:
         node: the method's.
-        scale: the upsampling factor.
 
     Raises:
         ConfigError: there is no such file.

@@ -46,7 +46,6 @@ def load_peer(path: Path, network: type[PeerNetwork], scale: float) -> PeerNetwo
     """Load a network of its authors' file, in float32 on the CPU.
 
     Args:
-        path: path of the file.
         network: the network's class.
         scale: the factor that the weights were trained for.
 
@@ -272,7 +271,6 @@ class PeerUpsampler(Method):
             rgb: (B, 3, H, W) in 0..1.
             values_lr: (B, 1, h, w) low-resolution map; non-finite values are holes.
             min_max: (B, 2, 1, 1) values that map to 0 and 1; None for the map's minimum and maximum.
-            progress: called after each tile.
 
         Returns:
             (B, 1, H, W) in the dtype of ``values_lr``.
