@@ -18,7 +18,7 @@ from dsr.geometry.camera import Camera
 from dsr.io.images import expect_depth_values, quiet_decoders, read_array, read_numbers
 from dsr.utils.arrays import array_headers, read_arrays
 from dsr.utils.files import replacing
-from dsr.utils.guards import MOST_PIXELS, bytes_of_archive, expect_bytes, expect_pixels
+from dsr.utils.guards import MOST_PIXELS, bytes_of_archive, expect_bytes, expect_pixels, refusing
 
 DEPTH_SUFFIXES = (".png", ".tiff", ".tif", ".npy", ".npz", ".pfm", ".exr")
 """Of the formats that are read and written."""
@@ -130,14 +130,13 @@ def _read_exr(path: Path, most: int | None) -> np.ndarray:
     import OpenEXR  # noqa: PLC0415 - only where somebody has such a file
 
     def read(*, header: bool) -> list[Any]:
-        try:  # damaged files print on both streams
+        # damaged files raise RuntimeError, ValueError, MemoryError, ..., and print on both streams
+        with refusing(f"{path}: expected an OpenEXR file, got a damaged or foreign one", Exception):
             quiet = contextlib.redirect_stdout(io.StringIO())
             with quiet_decoders(), quiet, OpenEXR.File(str(path), separate_channels=True, header_only=header) as file:
                 if header:
                     return [_exr_size(part.header) for part in file.parts]
                 return [(name, channel.pixels) for name, channel in file.channels().items()]
-        except Exception as error:  # RuntimeError, ValueError, MemoryError, ...
-            raise ValueError(f"{path}: expected an OpenEXR file, got a damaged or foreign one") from error
 
     sizes = read(header=True)
     for height, width, _ in sizes:

@@ -27,6 +27,7 @@ from dsr.utils.guards import (
     opened,
     pixels_of_file,
     read_limited,
+    refusing,
 )
 from dsr.utils.picture_headers import picture_size
 from dsr.utils.validation import Number, Whole, parse_model
@@ -214,10 +215,8 @@ def read_numbers(path: Path, count: int) -> np.ndarray:
     if size > _LONGEST * count:
         raise ValueError(f"{path}: expected {count} numbers, got {size} bytes, too many for that")
     content = read_limited(path, size)
-    try:
+    with refusing(f"{path}: expected {count} numbers, got text or bytes that are none", ValueError):
         values = np.array(content.split() if _TEXT.fullmatch(content) else "", dtype=np.float64)
-    except ValueError as error:
-        raise ValueError(f"{path}: expected {count} numbers, got text or bytes that are none") from error
     if values.size != count:
         raise ValueError(f"{path}: expected {count} numbers, got {values.size}")
     return values

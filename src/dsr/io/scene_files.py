@@ -46,7 +46,7 @@ from dsr.io.images import read_pixels
 from dsr.io.photos import write_png
 from dsr.utils.arrays import open_array
 from dsr.utils.files import replacing, write_text
-from dsr.utils.guards import pixels_beside
+from dsr.utils.guards import pixels_beside, refusing
 
 RGBD = ("color.png", "depth.png", "intrinsic.json")
 MILLIMETRES = 1000
@@ -328,10 +328,8 @@ def write_rerun(path: Path, frames: Sequence[Frame]) -> list[Path]:
         ValueError: the library is not installed.
 
     """
-    try:
+    with refusing("rerun: expected the library rerun-sdk, which `pip install dsr[rerun]` installs", ImportError):
         rerun = importlib.import_module("rerun")
-    except ImportError as error:
-        raise ValueError("rerun: expected the library rerun-sdk, which `pip install dsr[rerun]` installs") from error
     recording = rerun.RecordingStream("dsr")
     with replacing(path) as temporary:
         recording.save(str(temporary))

@@ -14,7 +14,7 @@ from dsr.geometry.camera import Camera
 from dsr.geometry.rigid_motion import Matrix, as_rigid, from_quaternion, is_rotation
 from dsr.io.encoding import Assumption
 from dsr.io.pairs import Pair, time_of
-from dsr.utils.guards import naming, numbers_in, parse_json, read_limited
+from dsr.utils.guards import naming, numbers_in, parse_json, read_limited, refusing
 
 _LARGEST_FILE = 256 << 20
 _MAX_GAP = 0.02
@@ -178,10 +178,8 @@ def _numbers(path: Path, text: str) -> list[list[float]]:
 
 def _matrix_of_json(path: Path, text: str) -> list[list[float]]:
     """Return the nested lists that JSON holds."""
-    try:
+    with refusing(f"{path}: expected JSON or rows of numbers, got something else", ValueError):
         content = parse_json(text)
-    except ValueError:
-        raise ValueError(f"{path}: expected JSON or rows of numbers, got something else") from None
     if isinstance(content, dict):
         lists = [value for value in content.values() if isinstance(value, list)]
         content = lists[0] if len(lists) == 1 else None

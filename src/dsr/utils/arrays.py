@@ -11,7 +11,7 @@ from typing import IO
 
 import numpy as np
 
-from dsr.utils.guards import array_bytes, bytes_of_archive, expect_bytes, opened
+from dsr.utils.guards import array_bytes, bytes_of_archive, expect_bytes, opened, refusing
 
 _LARGEST_HEADER = 1 << 14
 """Largest size in bytes of the header of an array."""
@@ -33,12 +33,13 @@ def read_arrays(path: Path, names: Container[str] | None = None, most: int | Non
     wanted = {name: header for name, header in array_headers(path).items() if names is None or name in names}
     size = sum(array_bytes(shape, dtype.itemsize) for shape, dtype in wanted.values())
     expect_bytes(path, size, bytes_of_archive(path.stat().st_size) if most is None else most)
-    with opened(path) as file:
-        try:
-            arrays = np.load(file)
-            return {name: arrays[name] for name in arrays.files if name in wanted}
-        except Exception as error:  # a damaged archive makes NumPy raise BadZipFile, EOFError, zlib.error, ...
-            raise ValueError(f"{path}: expected an archive of arrays, got a damaged or foreign file") from error
+    with (
+        opened(path) as file,
+        # a damaged archive makes NumPy raise BadZipFile, EOFError, zlib.error, ...
+        refusing(f"{path}: expected an archive of arrays, got a damaged or foreign file", Exception),
+    ):
+        arrays = np.load(file)
+        return {name: arrays[name] for name in arrays.files if name in wanted}
 
 
 def array_headers(path: Path) -> dict[str, tuple[tuple[int, ...], np.dtype]]:
@@ -50,17 +51,17 @@ def array_headers(path: Path) -> dict[str, tuple[tuple[int, ...], np.dtype]]:
 
     """
     headers = {}
-    with opened(path) as file:
-        try:
-            with zipfile.ZipFile(file) as archive:
-                for name in archive.namelist():
-                    key = name.removesuffix(".npy")
-                    if key in headers:  # which of them NumPy reads is another matter
-                        raise ValueError(f"expected arrays of different names, got two named {key!r}")
-                    with archive.open(name) as member:
-                        headers[key] = read_array_header(member)
-        except Exception as error:  # as in read_arrays
-            raise ValueError(f"{path}: expected an archive of arrays, got a damaged or foreign file") from error
+    with (
+        opened(path) as file,
+        refusing(f"{path}: expected an archive of arrays, got a damaged or foreign file", Exception),  # as above
+        zipfile.ZipFile(file) as archive,
+    ):
+        for name in archive.namelist():
+            key = name.removesuffix(".npy")
+            if key in headers:  # which of them NumPy reads is another matter
+                raise ValueError(f"expected arrays of different names, got two named {key!r}")
+            with archive.open(name) as member:
+                headers[key] = read_array_header(member)
     return headers
 
 

@@ -189,6 +189,15 @@ def naming(place: object) -> Iterator[None]:
         raise ValueError(f"{place}: {error}") from error
 
 
+@contextlib.contextmanager
+def refusing(message: str, *kinds: type[Exception]) -> Iterator[None]:
+    """Raise a ValueError with a message in place of the errors from within that stand for something unexpected."""
+    try:
+        yield
+    except kinds as error:
+        raise ValueError(message) from error
+
+
 def readable(name: str) -> str:
     """Return a file's name as text: bytes that are no UTF-8, which Python reads as surrogates, are escaped."""
     return name.encode(errors="backslashreplace").decode()
@@ -205,10 +214,8 @@ def parse_json(text: str | bytes, *, finite: bool = True) -> Any:
 
     """
     only: Any = {"parse_constant": _refuse, "parse_float": _parse_float} if finite else {}
-    try:
+    with refusing("nested too deeply", RecursionError):
         return json.loads(text, parse_int=_parse_int, **only)
-    except RecursionError:
-        raise ValueError("nested too deeply") from None
 
 
 def _refuse(text: str) -> NoReturn:

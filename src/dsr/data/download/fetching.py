@@ -33,7 +33,7 @@ from urllib3.exceptions import HTTPError
 from dsr.data.download.collections import Collection, Item
 from dsr.utils.console import one_line
 from dsr.utils.files import FullDiskError, expect_space, space_for, temporary_folder, write_text
-from dsr.utils.guards import leads_outside, natural_key, opened, parse_json, read_limited
+from dsr.utils.guards import leads_outside, natural_key, opened, parse_json, read_limited, refusing
 from dsr.utils.progress import Progress, Task, megabytes
 from dsr.utils.versions import file_hash
 
@@ -144,13 +144,11 @@ def lock_directory(root: Path) -> Iterator[None]:
         ValueError: another command has locked it.
 
     """
-    try:
-        with (
-            FileLock(root / ".dsr-data.lock", blocking=False) if os.access(root, os.W_OK) else contextlib.nullcontext()
-        ):
-            yield
-    except Timeout as error:
-        raise ValueError(f"{root}: another `dsr data` command is writing there; wait for it to end") from error
+    with (
+        refusing(f"{root}: another `dsr data` command is writing there; wait for it to end", Timeout),
+        FileLock(root / ".dsr-data.lock", blocking=False) if os.access(root, os.W_OK) else contextlib.nullcontext(),
+    ):
+        yield
 
 
 def get(

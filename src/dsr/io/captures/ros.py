@@ -34,7 +34,7 @@ from dsr.io.frames import CaptureFrame, Geometry, Record
 from dsr.io.images import decode_pixels
 from dsr.io.pairs import Pair, PairingResult, match_times
 from dsr.io.trajectories import intrinsics_camera
-from dsr.utils.guards import MOST_TEXT, expect_bytes, naming, natural_key, path_within
+from dsr.utils.guards import MOST_TEXT, expect_bytes, naming, natural_key, path_within, refusing
 
 _IMAGE, _COMPRESSED, _INFO = (f"sensor_msgs/msg/{name}" for name in ("Image", "CompressedImage", "CameraInfo"))
 _UNITS = {"u": 1e-3, "f": 1.0}
@@ -270,11 +270,9 @@ def _close() -> None:
 
 def _open(path: Path) -> Any:
     """Open a recording."""
-    try:
+    with refusing(f"{path}: recordings of ROS need the package rosbags: pip install 'dsr[captures]'", ImportError):
         from rosbags.highlevel import AnyReader  # noqa: PLC0415 - an extra
         from rosbags.typesys import Stores, get_typestore  # noqa: PLC0415
-    except ImportError as error:
-        raise ValueError(f"{path}: recordings of ROS need the package rosbags: pip install 'dsr[captures]'") from error
     _limit_chunks()
     description = path / "metadata.yaml"
     if path.is_dir() and description.is_file():

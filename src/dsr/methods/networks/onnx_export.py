@@ -26,6 +26,7 @@ from dsr.methods.exportable import pad_to_multiple
 from dsr.methods.networks.facets_unet import FacetsUNet
 from dsr.methods.networks.network import DisparityNetwork
 from dsr.utils.files import replacing
+from dsr.utils.guards import refusing
 
 INPUTS = ("photo", "inverse_depth", "valid")
 RESULT = "inverse_depth_hr"
@@ -201,7 +202,5 @@ def _compare(session: Any, graph: OnnxGraph) -> float:
 
 def _import(name: str) -> Any:
     """Return a library of the extra ``onnx``."""
-    try:
+    with refusing(f"--onnx: expected the library {name}, which `pip install dsr[onnx]` installs", ImportError):
         return importlib.import_module(name)
-    except ImportError as error:
-        raise ValueError(f"--onnx: expected the library {name}, which `pip install dsr[onnx]` installs") from error
