@@ -30,7 +30,7 @@ from dsr.methods.classical.interpolation import Interpolation
 from dsr.methods.dip.problem import ImageProblem
 from dsr.methods.dip.stopping import Fixed, Residual, Stopping, Variance
 from dsr.methods.dip.upsampler import DeepImagePrior, WarmStarted
-from dsr.methods.networks.weight_files import packaged_weights
+from dsr.methods.networks.weight_choice import packaged_weights
 from dsr.metrics.classes import visual_metrics
 from dsr.metrics.functional import SurfacePair
 from dsr.sample import DepthSample, Scene

@@ -29,7 +29,7 @@ from torch import Tensor, nn
 
 from dsr.methods.networks.normalisation import normalise_imagenet
 from dsr.methods.networks.peers.peer_network import PeerUpsampler, read_tensors
-from dsr.methods.networks.weight_files import find_weights
+from dsr.methods.networks.weight_choice import find_weights
 from dsr.methods.recipe import Run, read_recipe
 
 TRAINING_ONLY = (

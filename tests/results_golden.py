@@ -53,7 +53,7 @@ from dsr.inference.working_size import find_noise, find_sensor
 from dsr.methods.inpainting import inpaint
 from dsr.methods.networks.facets_unet import FacetsUNet
 from dsr.methods.networks.msg_net import MSGNet
-from dsr.methods.networks.weight_files import packaged_names, packaged_weights
+from dsr.methods.networks.weight_choice import packaged_names, packaged_weights
 from dsr.methods.noise_level import estimate_noise, estimate_sensor_noise
 from dsr.methods.recipe import Known, Run, list_methods, read_recipe
 from dsr.sample import Scene

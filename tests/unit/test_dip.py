@@ -19,7 +19,7 @@ from dsr.degradation.holes import Blobs
 from dsr.geometry.camera import Camera
 from dsr.methods.dip.optimisation import cost_of_step
 from dsr.methods.dip.upsampler import DeepImagePrior, WarmStarted
-from dsr.methods.networks.weight_files import packaged_weights
+from dsr.methods.networks.weight_choice import packaged_weights
 from dsr.metrics.classes import visual_metrics
 from dsr.metrics.functional import SurfacePair, rmse_v
 from dsr.sample import DepthSample, Scene

@@ -12,7 +12,7 @@ from dsr.app.experiments import register_resolvers, with_keys_of_swept_groups, w
 from dsr.app.schema import EvalConfig, TrainConfig, plain_config
 from dsr.app.training_runs import training_data
 from dsr.methods.base import Method
-from dsr.methods.networks.weight_files import packaged_names
+from dsr.methods.networks.weight_choice import packaged_names
 from dsr.utils.configuration import ConfigError, build, config_directories, list_choices, load_target
 
 DIRECTORIES = config_directories()

@@ -21,7 +21,7 @@ from dsr.inference import api as people
 from dsr.inference.plans import OWN_SIZE
 from dsr.inference.resizing import resize_nearest
 from dsr.inference.working_size import enlarged_by
-from dsr.methods.networks.weight_files import find_weights
+from dsr.methods.networks.weight_choice import find_weights
 from dsr.methods.recipe import list_methods, read_recipe
 
 

@@ -31,7 +31,8 @@ from dsr.io.pairs import Pair
 from dsr.io.photos import read_photo
 from dsr.io.reading import Reading
 from dsr.methods.networks.trained import NETWORKS
-from dsr.methods.networks.weight_files import load_network, packaged_weights, read_torch_file
+from dsr.methods.networks.weight_choice import packaged_weights
+from dsr.methods.networks.weight_files import load_network, read_torch_file
 from dsr.sample import DepthSample
 from dsr.utils.guards import TooLargeError, bytes_of_archive, pixels_beside, pixels_of_file, read_limited, read_member
 from dsr.utils.picture_headers import picture_size

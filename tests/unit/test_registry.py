@@ -10,7 +10,7 @@ from hydra import compose, initialize_config_dir
 from dsr.app.schema import plain_config, register
 from dsr.methods.classical.tgv import TotalGeneralisedVariation
 from dsr.methods.networks.network import NetworkUpsampler
-from dsr.methods.networks.weight_files import find_weights
+from dsr.methods.networks.weight_choice import find_weights
 from dsr.methods.recipe import list_methods, read_recipe
 from dsr.utils.configuration import ConfigError, config_directories
 

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 from dsr.geometry.camera import Camera
-from dsr.geometry.conventions import LIGHT_NAMES
+from dsr.geometry.lights import LIGHT_NAMES
 from dsr.geometry.shading import lights, render, render_for_viewing, shade
 from dsr.geometry.surface import depth_to_normals
 

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dsr.geometry.conventions import RANGE_TYPES, RangeType
+from dsr.geometry.range_type import RANGE_TYPES, RangeType
 
 VIRTUAL_BASELINE = 0.2
 """Baseline in metres of the virtual stereo pair of a camera without a second one (Voynov et al. 2019)."""

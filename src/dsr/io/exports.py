@@ -26,7 +26,7 @@ from trimesh.visual.material import PBRMaterial
 from trimesh.visual.texture import TextureVisuals
 
 from dsr.geometry.camera import Camera
-from dsr.geometry.conventions import LIGHT_NAMES
+from dsr.geometry.lights import LIGHT_NAMES
 from dsr.geometry.mesh import (
     LARGEST_STEP,
     QUADRIC,

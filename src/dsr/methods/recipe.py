@@ -23,14 +23,8 @@ from dsr.degradation.downsampling import Downsampling
 from dsr.methods.base import Abilities, Method
 from dsr.methods.networks.network import DisparityNetwork
 from dsr.methods.networks.trained import NETWORKS, load_msg_weights
-from dsr.methods.networks.weight_files import (
-    find_weights,
-    has_weights,
-    is_dsr_weights,
-    load_network,
-    network_name,
-    read_header,
-)
+from dsr.methods.networks.weight_choice import find_weights, has_weights
+from dsr.methods.networks.weight_files import is_dsr_weights, load_network, network_name, read_header
 from dsr.utils.configuration import ConfigError, Node, build, config_directories, list_choices, load_target
 from dsr.utils.ratios import SCALES
 

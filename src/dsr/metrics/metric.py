@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from dsr.geometry.conventions import LIGHT_NAMES
+from dsr.geometry.lights import LIGHT_NAMES
 from dsr.metrics.formats import MetricFormat
 from dsr.metrics.functional import SurfacePair
 

@@ -10,7 +10,7 @@ from PIL import Image
 from torch import Tensor
 
 from dsr.geometry.camera import Camera
-from dsr.geometry.conventions import LIGHT_NAMES
+from dsr.geometry.lights import LIGHT_NAMES
 from dsr.geometry.shading import render
 from dsr.viz.panels import normals_seen_by
 

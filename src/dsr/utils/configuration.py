@@ -50,7 +50,7 @@ def expect_library(key: str, module: str, extra: str) -> None:
 
 
 def build(group: str, node: Node, given: Mapping[str, Any] | None = None) -> Any:
-    """Find the configuration files, the package's and the user's own, and build the objects that groups describe.
+    """Build the object that a configuration group describes.
 
     Args:
         group: its name, for messages.

@@ -21,7 +21,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from dsr.geometry.camera import Camera
-from dsr.geometry.conventions import LIGHT_NAMES
+from dsr.geometry.lights import LIGHT_NAMES
 from dsr.geometry.shading import render
 from dsr.geometry.surface import depth_to_normals
 from dsr.metrics.formats import Formats, describe_directions, in_tables

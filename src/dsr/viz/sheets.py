@@ -19,7 +19,7 @@ from matplotlib.ticker import MaxNLocator, ScalarFormatter
 from torch import Tensor
 
 from dsr.geometry.camera import Camera
-from dsr.geometry.conventions import LIGHT_NAMES
+from dsr.geometry.lights import LIGHT_NAMES
 from dsr.geometry.shading import render
 from dsr.sample import Scene
 from dsr.utils.ratios import round_ratio

@@ -13,7 +13,7 @@ from matplotlib.patches import Circle
 from torch import Tensor
 
 from dsr.evaluation.results import Results
-from dsr.geometry.conventions import LIGHT_NAMES
+from dsr.geometry.lights import LIGHT_NAMES
 from dsr.geometry.shading import lights, render
 from dsr.report.figures.layout import save_both
 from dsr.report.figures.scenes import rendering

@@ -11,7 +11,7 @@ from torch import Tensor
 from dsr.evaluation.results import BenchmarkSetting, Results, Run
 from dsr.evaluation.store import sample_path
 from dsr.geometry.camera import Camera
-from dsr.geometry.conventions import LIGHT_NAMES
+from dsr.geometry.lights import LIGHT_NAMES
 from dsr.geometry.shading import lights, shade
 from dsr.sample import DepthSample
 from dsr.utils.arrays import array_headers

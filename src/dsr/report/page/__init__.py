@@ -16,7 +16,7 @@ import matplotlib as mpl
 import numpy as np
 
 from dsr.evaluation.results import BenchmarkSetting, Results
-from dsr.geometry.conventions import LIGHT_NAMES
+from dsr.geometry.lights import LIGHT_NAMES
 from dsr.geometry.shading import lights
 from dsr.report.page.calibration import calibration_data
 from dsr.report.page.content import links, metrics_data, problem_data, run_data

@@ -1,8 +1,6 @@
-"""What the values of a depth map measure, and the names of the paper's four lights."""
+"""What the values of a depth map measure: depth along the axis, along the ray, or disparity."""
 
 from typing import Literal, get_args
 
 RangeType = Literal["orthogonal", "perspective", "disparity"]
 RANGE_TYPES: tuple[RangeType, ...] = get_args(RangeType)
-
-LIGHT_NAMES: tuple[str, ...] = ("e1", "e2", "e3", "e4")
