@@ -9,16 +9,17 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping
 from importlib import resources
 from pathlib import Path
+from typing import Any
 
 from dsr.methods.networks.weight_files import is_dsr_weights, read_header
-from dsr.utils.configuration import ConfigError, Node
+from dsr.utils.configuration import ConfigError
 from dsr.utils.ratios import round_ratio
 
 SLACK = 1.05
 """By how much a scale may exceed the factor of weights that are used for it."""
 
 
-def find_weights(node: Node, scale: float) -> Path:
+def find_weights(node: Mapping[str, Any], scale: float) -> Path:
     """Find the file of weights of a method that takes one.
 
     Args:
@@ -43,7 +44,7 @@ def find_weights(node: Node, scale: float) -> Path:
     return given
 
 
-def has_weights(node: Node, scale: float) -> bool:
+def has_weights(node: Mapping[str, Any], scale: float) -> bool:
     """Return whether the weights that a method's node names are there, for that scale."""
     path, files = _given(node), _files_for(node, scale)
     if path is not None and path.is_dir() and files:
@@ -75,12 +76,12 @@ def packaged_names() -> list[str]:
     return sorted(path.stem for path in Path(str(resources.files("dsr.methods.weights"))).glob("*.safetensors"))
 
 
-def _given(node: Node) -> Path | None:
+def _given(node: Mapping[str, Any]) -> Path | None:
     """Return the file or directory of weights that a node names."""
     return None if node.get("weights") is None else Path(str(node["weights"])).expanduser()
 
 
-def _lack(node: Node, scale: float, files: list[str]) -> str:
+def _lack(node: Mapping[str, Any], scale: float, files: list[str]) -> str:
     """Say which weights a method needs, and where they are."""
     published = f", or a directory with {files[0]} (from {node.get('weights_source')})" if files else ""
     needs = f"method={node['name']} at scale {round_ratio(scale)} needs weights=FILE{published}"
@@ -89,7 +90,7 @@ def _lack(node: Node, scale: float, files: list[str]) -> str:
     return f"dsr comes with {', '.join(packaged_names())}; {needs}"
 
 
-def _packaged_file(node: Node, scale: float) -> Path | None:
+def _packaged_file(node: Mapping[str, Any], scale: float) -> Path | None:
     """Return the file of packaged weights, the one for a scale where the node names several by their factors."""
     packaged = node.get("weights_packaged")
     if isinstance(packaged, Mapping):
@@ -99,7 +100,7 @@ def _packaged_file(node: Node, scale: float) -> Path | None:
     return None if packaged is None else packaged_weights(str(packaged))
 
 
-def _files_for(node: Node, scale: float) -> list[str]:
+def _files_for(node: Mapping[str, Any], scale: float) -> list[str]:
     """Return the names of published files with the weights for a scale, in order of preference."""
     files = node.get("weights_files")
     if files is None:
